@@ -1,0 +1,69 @@
+//! A detection as the core sees it: a local pinhole along its viewing ray.
+
+use nalgebra::{Matrix3, RowVector3, Vector3};
+
+/// All rays of a data set, one a detection, ordered by detection id.
+#[derive(Debug, Default, Clone)]
+pub struct Rays {
+    /// The rays themselves.
+    pub rays: Vec<Ray>,
+    /// The image of each ray.
+    pub image: Vec<u32>,
+    /// The class of each ray; rays of different classes have nothing to do with each other.
+    pub class: Vec<u32>,
+}
+
+/// One detection's viewing ray in the world, with the projection around it.
+///
+/// With `(a, b, c) = residual_from_world * (X - center)`, the reprojection error of a world point `X` is
+/// `(a / c, b / c)` in pixels and `c` is its depth in metres; `c > 0` is in front.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Ray {
+    /// The 3x3 matrix above.
+    pub residual_from_world: Matrix3<f64>,
+    /// Camera centre in the world, m.
+    pub center: Vector3<f64>,
+    /// Unit viewing direction in the world.
+    pub direction: Vector3<f64>,
+}
+
+impl Ray {
+    /// `(a, b, c)` of a world point.
+    #[inline]
+    #[must_use]
+    pub fn project(&self, point: &Vector3<f64>) -> Vector3<f64> {
+        self.residual_from_world * (point - self.center)
+    }
+
+    /// Squared reprojection error in px², or infinity for a point that is not in front.
+    #[inline]
+    #[must_use]
+    pub fn squared_error(&self, point: &Vector3<f64>) -> f64 {
+        let p = self.project(point);
+        if p.z > 0.0 { (p.x * p.x + p.y * p.y) / (p.z * p.z) } else { f64::INFINITY }
+    }
+
+    /// Residual `(a / c, b / c)` and its two rows of derivatives by the point, or nothing behind the camera.
+    #[inline]
+    #[must_use]
+    pub fn linearize(&self, point: &Vector3<f64>) -> Option<([f64; 2], [RowVector3<f64>; 2])> {
+        let p = self.project(point);
+        if !(p.z > 0.0) {
+            return None;
+        }
+        let inverse = 1.0 / p.z;
+        let residual = [p.x * inverse, p.y * inverse];
+        let m = &self.residual_from_world;
+        let depth_row = m.row(2);
+        Some((
+            residual,
+            [(m.row(0) - depth_row * residual[0]) * inverse, (m.row(1) - depth_row * residual[1]) * inverse],
+        ))
+    }
+
+    /// The same ray in a world whose origin lies at `origin`.
+    #[must_use]
+    pub fn relative_to(&self, origin: &Vector3<f64>) -> Self {
+        Self { center: self.center - origin, ..*self }
+    }
+}

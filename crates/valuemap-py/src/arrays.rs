@@ -1,0 +1,84 @@
+//! `NumPy` arrays to the core's types and back.
+
+use numpy::{IntoPyArray, PyArray1, PyArray2, PyReadonlyArray2};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use valuemap_core::Vector3;
+use valuemap_core::ray::Ray;
+use valuemap_core::vote::Candidate;
+
+/// Groups of rays: offsets (N + 1) into the members, and the members.
+pub type Groups<'py> = (Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<u32>>);
+
+/// Rows of an (N, 3) array, without a copy.
+pub fn rows_of<'a>(array: &'a PyReadonlyArray2<'_, f64>) -> PyResult<&'a [[f64; 3]]> {
+    let (rows, rest) = array.as_slice()?.as_chunks::<3>();
+    if rest.is_empty() { Ok(rows) } else { Err(PyValueError::new_err("expected an array of shape (N, 3)")) }
+}
+
+/// Rays of row-major matrices, centres and directions.
+pub fn rays_from(matrices: &[[f64; 9]], centers: &[[f64; 3]], directions: &[[f64; 3]]) -> Vec<Ray> {
+    matrices
+        .iter()
+        .zip(centers.iter().zip(directions))
+        .map(|(m, (&center, &direction))| Ray {
+            residual_from_world: [[m[0], m[3], m[6]], [m[1], m[4], m[7]], [m[2], m[5], m[8]]].into(),
+            center: center.into(),
+            direction: direction.into(),
+        })
+        .collect()
+}
+
+/// The members of each group.
+pub fn split<'a>(count: usize, offsets: &[i64], members: &'a [u32]) -> PyResult<Vec<&'a [u32]>> {
+    let bad = || PyValueError::new_err("groups: offsets must rise from 0 to the number of members");
+    if offsets.len() != count + 1 {
+        return Err(bad());
+    }
+    let bounds = |i: usize| usize::try_from(offsets[i]).ok();
+    (0..count).map(|i| members.get(bounds(i)?..bounds(i + 1)?)).collect::<Option<Vec<_>>>().ok_or_else(bad)
+}
+
+/// Candidates of points with groups of voters, each from one cluster.
+pub fn candidates_from(
+    points: &[[f64; 3]],
+    offsets: &[i64],
+    members: &[u32],
+    cluster: &[u32],
+) -> PyResult<Vec<Candidate>> {
+    let groups = split(points.len(), offsets, members)?;
+    if cluster.len() != points.len() || groups.iter().any(|group| group.is_empty()) {
+        return Err(PyValueError::new_err("candidates: one cluster and at least one voter a point are needed"));
+    }
+    Ok(points
+        .iter()
+        .zip(groups.iter().zip(cluster))
+        .map(|(&point, (&voters, &cluster))| Candidate {
+            point: Vector3::from(point),
+            clusters: vec![cluster],
+            voters: voters.to_vec(),
+        })
+        .collect())
+}
+
+/// Positions of candidates, (N, 3).
+pub fn points_of<'py>(py: Python<'py>, candidates: &[Candidate]) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let rows: Vec<Vec<f64>> = candidates.iter().map(|candidate| candidate.point.as_slice().to_vec()).collect();
+    matrix(py, &rows, 3)
+}
+
+/// Rows of equal length as an array of shape (N, width), also where there are none.
+pub fn matrix<'py>(py: Python<'py>, rows: &[Vec<f64>], width: usize) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    if rows.is_empty() { Ok(PyArray2::zeros(py, [0, width], false)) } else { Ok(PyArray2::from_vec2(py, rows)?) }
+}
+
+/// Voters of candidates.
+pub fn groups_of<'py>(py: Python<'py>, candidates: &[Candidate]) -> Groups<'py> {
+    let mut offsets = vec![0_i64];
+    let mut members = Vec::new();
+    for candidate in candidates {
+        members.extend_from_slice(&candidate.voters);
+        offsets.push(members.len() as i64);
+    }
+    (offsets.into_pyarray(py), members.into_pyarray(py))
+}

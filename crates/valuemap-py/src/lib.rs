@@ -1,0 +1,153 @@
+//! The border between Python and `valuemap-core`: arrays and errors across, no logic.
+#![allow(clippy::needless_pass_by_value)] // Python hands its arguments over by value.
+
+mod arrays;
+mod run;
+
+use numpy::{IntoPyArray, PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use valuemap_core::hypothesis::{PairCounts, Viability};
+use valuemap_core::select::Stop;
+use valuemap_core::vote::Candidate;
+use valuemap_core::{merge, partition, triangulate, vote};
+
+use crate::arrays::{Groups, candidates_from, groups_of, points_of, rows_of};
+use crate::run::with_progress;
+
+/// Viewing rays, one a detection, copied once and used by every stage.
+#[pyclass(frozen, module = "valuemap._core")]
+struct Rays(valuemap_core::ray::Rays);
+
+#[pymethods]
+impl Rays {
+    #[new]
+    fn new(
+        residual_from_world: PyReadonlyArray3<'_, f64>,
+        center_in_world_m: PyReadonlyArray2<'_, f64>,
+        direction_in_world: PyReadonlyArray2<'_, f64>,
+        image: PyReadonlyArray1<'_, u32>,
+        class: PyReadonlyArray1<'_, u32>,
+    ) -> PyResult<Self> {
+        let matrices = residual_from_world.as_slice()?.as_chunks::<9>().0;
+        let centers = rows_of(&center_in_world_m)?;
+        let directions = rows_of(&direction_in_world)?;
+        let (image, class) = (image.as_slice()?.to_vec(), class.as_slice()?.to_vec());
+        let lengths = [centers.len(), directions.len(), image.len(), class.len()];
+        if lengths.iter().any(|&length| length != matrices.len()) {
+            return Err(PyValueError::new_err("rays: all arrays must have one row a ray"));
+        }
+        Ok(Self(valuemap_core::ray::Rays { rays: arrays::rays_from(matrices, centers, directions), image, class }))
+    }
+
+    fn __len__(&self) -> usize {
+        self.0.rays.len()
+    }
+}
+
+/// The cluster of each image, `valuemap_core::partition`.
+#[pyfunction(name = "partition")]
+fn partition_images<'py>(
+    py: Python<'py>,
+    center_in_world_m: PyReadonlyArray2<'py, f64>,
+    cluster_radius_m: f64,
+) -> PyResult<Bound<'py, PyArray1<u32>>> {
+    let centers = rows_of(&center_in_world_m)?;
+    Ok(py.detach(|| partition::partition(centers, cluster_radius_m)).into_pyarray(py))
+}
+
+/// Points, their groups of voters, the cluster of each, and the counts of pairs.
+type Voted<'py> = (Bound<'py, PyArray2<f64>>, Groups<'py>, Bound<'py, PyArray1<u32>>, Bound<'py, PyDict>);
+
+/// Algorithm 1 in every cluster, `valuemap_core::vote`.
+#[pyfunction(name = "vote")]
+#[pyo3(signature = (rays, cluster, *, max_reprojection_error_px, min_parallax_rad, min_range_m, max_range_m,
+    min_vote_ratio, min_votes, threads, progress))]
+#[allow(clippy::too_many_arguments)] // The settings by name, as Python sees them.
+fn vote_in_clusters<'py>(
+    py: Python<'py>,
+    rays: &Rays,
+    cluster: PyReadonlyArray1<'py, u32>,
+    max_reprojection_error_px: f64,
+    min_parallax_rad: f64,
+    min_range_m: f64,
+    max_range_m: f64,
+    min_vote_ratio: f64,
+    min_votes: u32,
+    threads: usize,
+    progress: &Bound<'py, PyAny>,
+) -> PyResult<Voted<'py>> {
+    let cluster = cluster.as_slice()?;
+    if cluster.len() != rays.0.rays.len() {
+        return Err(PyValueError::new_err("vote: one cluster a ray is needed"));
+    }
+    let viability = Viability { max_reprojection_error_px, min_parallax_rad, min_range_m, max_range_m };
+    let stop = Stop { min_vote_ratio, min_votes };
+    let total = vote::count_units(&rays.0, cluster);
+    let (candidates, counts) = with_progress(py, threads, total, progress, |progress| {
+        vote::vote(&rays.0, cluster, &viability, &stop, progress)
+    })?;
+    let cluster: Vec<u32> = candidates.iter().map(|candidate| candidate.clusters[0]).collect();
+    Ok((points_of(py, &candidates)?, groups_of(py, &candidates), cluster.into_pyarray(py), counts_of(py, &counts)?))
+}
+
+fn counts_of<'py>(py: Python<'py>, counts: &PairCounts) -> PyResult<Bound<'py, PyDict>> {
+    let dict = PyDict::new(py);
+    dict.set_item("pairs", counts.pairs)?;
+    dict.set_item("pairs_rejected_parallax", counts.parallax)?;
+    dict.set_item("pairs_rejected_reprojection", counts.reprojection)?;
+    dict.set_item("pairs_rejected_behind", counts.behind)?;
+    dict.set_item("pairs_rejected_range", counts.range)?;
+    dict.set_item("hypotheses", counts.hypotheses)?;
+    Ok(dict)
+}
+
+/// Merge labels of different clusters, `valuemap_core::merge`.
+#[pyfunction(name = "merge")]
+fn merge_labels<'py>(
+    py: Python<'py>,
+    rays: &Rays,
+    point_in_world_m: PyReadonlyArray2<'py, f64>,
+    voter_offsets: PyReadonlyArray1<'py, i64>,
+    voters: PyReadonlyArray1<'py, u32>,
+    cluster: PyReadonlyArray1<'py, u32>,
+    merge_radius_m: f64,
+) -> PyResult<(Bound<'py, PyArray2<f64>>, Groups<'py>)> {
+    let candidates: Vec<Candidate> = candidates_from(
+        rows_of(&point_in_world_m)?,
+        voter_offsets.as_slice()?,
+        voters.as_slice()?,
+        cluster.as_slice()?,
+    )?;
+    let merged = py.detach(|| merge::merge(&rays.0, candidates, merge_radius_m));
+    Ok((points_of(py, &merged)?, groups_of(py, &merged)))
+}
+
+/// Covariances for 1 px detections (N, 9), `valuemap_core::triangulate::unit_covariance`.
+#[pyfunction]
+fn unit_covariance<'py>(
+    py: Python<'py>,
+    rays: &Rays,
+    point_in_world_m: PyReadonlyArray2<'py, f64>,
+    voter_offsets: PyReadonlyArray1<'py, i64>,
+    voters: PyReadonlyArray1<'py, u32>,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let points = rows_of(&point_in_world_m)?;
+    let groups = arrays::split(points.len(), voter_offsets.as_slice()?, voters.as_slice()?)?;
+    let rows: Vec<Vec<f64>> = points
+        .iter()
+        .zip(groups)
+        .map(|(&point, voters)| {
+            let supporters = voters.iter().map(|&ray| &rays.0.rays[ray as usize]);
+            triangulate::unit_covariance(supporters, &point.into()).as_slice().to_vec()
+        })
+        .collect();
+    arrays::matrix(py, &rows, 9)
+}
+
+#[pymodule]
+mod _core {
+    #[pymodule_export]
+    use super::{Rays, merge_labels, partition_images, unit_covariance, vote_in_clusters};
+}
