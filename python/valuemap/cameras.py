@@ -1,0 +1,158 @@
+"""Cameras and rays: every detection becomes a local pinhole, so that one kernel serves all camera models.
+
+For a detection at pixel z, in a camera with projection pi, take a virtual image plane (the camera's own for
+perspective models, else the plane orthogonal to the detection's ray) with coordinates p = (x/z, y/z) and let
+J = d pi / d p at the detection. Then with the 3x3 matrix
+
+    M = [ J (V_12 - p_0 V_3) ; V_3 ] R_cam_from_world,        (a, b, c) = M (X - camera centre)
+
+(a/c, b/c) is the reprojection error in pixels, exactly for pinholes without distortion and to first order
+around the detection for all others; c is the depth along the virtual axis and c > 0 means in front.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+import valuemap._core as _core
+from valuemap.dataset import Dataset, rows_of
+from valuemap.tables import Cameras, Floats, Images, Ints
+
+_JACOBIAN_STEP = 1e-5
+"""Half the step, in units of the virtual image plane, of the central differences."""
+_RAY_TOLERANCE_PX = 0.1
+"""A ray that projects farther than this from its pixel is not the ray of the pixel."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """One viewing ray a detection, in the order of the detections.
+
+    `residual_from_world` (N, 3, 3) is M above, `center_in_world_m` (N, 3) the camera centre,
+    `direction_in_world` (N, 3) a unit vector (both NaN where the camera model has no ray for the pixel, so that
+    the detection neither proposes nor votes), `image_row` (N) the row of the detection's image in the
+    images table, `camera_row` (N) that of its camera, `class_code` (N) that of its class.
+    """
+
+    residual_from_world: Floats
+    center_in_world_m: Floats
+    direction_in_world: Floats
+    image_row: Ints
+    camera_row: Ints
+    class_code: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.image_row)
+
+    @cached_property
+    def core(self) -> _core.Rays:
+        """The same rays as the numeric core holds them; copied once."""
+        return _core.Rays(
+            np.ascontiguousarray(self.residual_from_world),
+            np.ascontiguousarray(self.center_in_world_m),
+            np.ascontiguousarray(self.direction_in_world),
+            self.image_row.astype(np.uint32),
+            self.class_code.astype(np.uint32),
+        )
+
+
+def camera_centers(images: Images) -> Floats:
+    """Return the camera centres (N, 3) in metres in the world, -R^T t."""
+    centers: Floats = -np.einsum("nji,nj->ni", rotation_matrices(images), images.cam_from_world_m)
+    return centers
+
+
+def rotation_matrices(images: Images) -> Floats:
+    """Return R (N, 3, 3) with point_in_cam = R point_in_world + t."""
+    # Written out, because importing SciPy's rotations takes longer than mapping a small city.
+    w, x, y, z = images.cam_from_world_quat.T
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return np.ascontiguousarray(np.array(rows).transpose(2, 0, 1))
+
+
+def colmap_camera(cameras: Cameras, row: int) -> pycolmap.Camera:
+    """Return one row of the cameras table as pycolmap's camera."""
+    return pycolmap.Camera(
+        model=cameras.model.names[cameras.model.codes[row]],
+        width=int(cameras.width_px[row]),
+        height=int(cameras.height_px[row]),
+        params=cameras.params[row],
+    )
+
+
+def cast_rays(dataset: Dataset) -> Rays:
+    """Return the viewing ray of every detection of a dataset."""
+    images, cameras, detections = dataset.images, dataset.cameras, dataset.detections
+    image_row = rows_of(detections.image_id, images.image_id)
+    camera_row = rows_of(images.camera_id, cameras.camera_id)[image_row]
+    residual_from_cam = np.empty((len(detections), 3, 3))
+    direction_in_cam = np.empty((len(detections), 3))
+    for row in range(len(cameras)):
+        members = np.flatnonzero(camera_row == row)
+        if len(members):
+            residual_from_cam[members], direction_in_cam[members] = _local_pinholes(
+                colmap_camera(cameras, row), detections.center_px[members]
+            )
+    world_to_cam = rotation_matrices(images)[image_row]
+    return Rays(
+        residual_from_world=residual_from_cam @ world_to_cam,
+        center_in_world_m=camera_centers(images)[image_row],
+        direction_in_world=np.einsum("nji,nj->ni", world_to_cam, direction_in_cam),
+        image_row=image_row,
+        camera_row=camera_row,
+        class_code=detections.class_name.codes,
+    )
+
+
+def _local_pinholes(camera: pycolmap.Camera, center_px: Floats) -> tuple[Floats, Floats]:
+    """Return M in camera axes (N, 3, 3) and the unit ray in camera axes (N, 3) of detections (N, 2)."""
+    ray = np.asarray(camera.cam_ray_from_img(center_px))
+    # Where a model has no ray, e.g. beyond 90 degrees of a fisheye, COLMAP may answer with another one.
+    miss_px = np.linalg.norm(_pixels_between(camera, camera.img_from_cam(ray), center_px), axis=1)
+    ray[~(miss_px <= _RAY_TOLERANCE_PX)] = np.nan
+    virtual_from_cam = (
+        np.broadcast_to(np.eye(3), (len(ray), 3, 3)) if camera.is_perspective_pinhole() else _rotation_onto(ray)
+    )
+    in_virtual = np.einsum("nij,nj->ni", virtual_from_cam, ray)
+    plane = in_virtual[:, :2] / in_virtual[:, 2:]
+    jacobian = np.stack([_pixels_per_step(camera, virtual_from_cam, plane, axis) for axis in (0, 1)], axis=2)
+    offset = virtual_from_cam[:, :2] - plane[:, :, None] * virtual_from_cam[:, 2:]
+    residual_from_cam = np.concatenate([jacobian @ offset, virtual_from_cam[:, 2:]], axis=1)
+    has_no_ray = np.isnan(residual_from_cam).any(axis=(1, 2))
+    residual_from_cam[has_no_ray], ray[has_no_ray] = np.nan, np.nan
+    return residual_from_cam, ray
+
+
+def _pixels_per_step(camera: pycolmap.Camera, virtual_from_cam: Floats, plane: Floats, axis: int) -> Floats:
+    """Return the column (N, 2) of d pi / d p for one axis of the virtual plane, by central differences."""
+    ends = []
+    for step in (_JACOBIAN_STEP, -_JACOBIAN_STEP):
+        point = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
+        point[:, axis] += step
+        ends.append(camera.img_from_cam(np.einsum("nji,nj->ni", virtual_from_cam, point)))
+    return _pixels_between(camera, ends[0], ends[1]) / (2.0 * _JACOBIAN_STEP)
+
+
+def _pixels_between(camera: pycolmap.Camera, first_px: Floats, second_px: Floats) -> Floats:
+    """Return first - second (N, 2); the seam of a panorama is no jump of the world."""
+    difference: Floats = np.asarray(first_px) - np.asarray(second_px)
+    if camera.is_spherical():
+        difference[:, 0] -= camera.width * np.round(difference[:, 0] / camera.width)
+    return difference
+
+
+def _rotation_onto(direction: Floats) -> Floats:
+    """Return rotations (N, 3, 3) whose third rows are the unit directions (N, 3)."""
+    helper = np.eye(3)[np.argmin(np.abs(direction), axis=1)]
+    first = np.cross(helper, direction)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(direction, first), direction], axis=1)

@@ -1,0 +1,454 @@
+"""Every default of the method, once, with its unit and its effect.
+
+One frozen dataclass a stage. The field names are the names that `--set`, `run.json` and the docs use.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal, Self, get_args
+
+from valuemap.errors import SettingError
+
+Method = Literal["paper"]
+
+_TOO_LARGE = 2**63
+"""Whole numbers from here on fit no integer of the core."""
+
+
+def _setting(
+    default: float, *, unit: str, effect: str, low: float = 0.0, high: float = math.inf, open_low: bool = False
+) -> Any:
+    """Declare one setting: default, unit, effect and the range of values that make sense."""
+    return field(
+        default=default,
+        metadata={"unit": unit, "effect": effect, "low": low, "high": high, "open_low": open_low},
+    )
+
+
+@dataclass(frozen=True)
+class PartitionConfig:
+    """How images are split into independent clusters."""
+
+    cluster_radius_m: float = _setting(
+        50.0,
+        unit="m",
+        open_low=True,
+        effect="a seed takes all free images closer than this (N_max of the paper); "
+        "larger sees objects from more images and costs more",
+    )
+
+
+@dataclass(frozen=True)
+class VoteConfig:
+    """Which hypotheses are viable, who votes, and when the greedy selection stops."""
+
+    max_reprojection_error_px: float = _setting(
+        6.0,
+        unit="px",
+        open_low=True,
+        effect="a detection votes for a point that projects closer than this (d_max of the paper)",
+    )
+    min_parallax_deg: float = _setting(
+        2.0,
+        unit="deg",
+        high=90.0,
+        effect="two rays closer than this in angle propose no point (theta_min of the paper)",
+    )
+    min_range_m: float = _setting(
+        2.0, unit="m", effect="a proposed point nearer than this to either of its cameras is dropped"
+    )
+    max_range_m: float = _setting(
+        60.0,
+        unit="m",
+        open_low=True,
+        effect="a proposed point farther than this from either of its cameras is dropped (r_max of the paper)",
+    )
+    min_vote_ratio: float = _setting(
+        1.0,
+        unit="1",
+        effect="a point is accepted while its votes reach this multiple of the mean votes of the hypotheses "
+        "still alive (alpha of the paper); larger is stricter",
+    )
+    min_votes: int = _setting(
+        3, unit="images", low=2, effect="a point is accepted only with votes from at least this many images"
+    )
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    """What one detection is worth when positions and covariances are estimated."""
+
+    detection_sigma_px: float = _setting(
+        2.0,
+        unit="px",
+        open_low=True,
+        effect="standard deviation of a detection's centre, each axis; scales the covariance of the labels",
+    )
+
+
+@dataclass(frozen=True)
+class MergeConfig:
+    """When labels of different clusters are one object."""
+
+    merge_radius_m: float = _setting(1.0, unit="m", effect="labels of different clusters closer than this become one")
+
+
+@dataclass(frozen=True)
+class MapConfig:
+    """All settings of one `map` run, by stage."""
+
+    method: Method = "paper"
+    partition: PartitionConfig = PartitionConfig()
+    vote: VoteConfig = VoteConfig()
+    refine: RefineConfig = RefineConfig()
+    merge: MergeConfig = MergeConfig()
+
+    def __post_init__(self) -> None:
+        if self.method not in get_args(Method):
+            raise SettingError(
+                f"method: expected one of {', '.join(get_args(Method))}, found {self.method!r}",
+                hint="leave --method away for the default",
+            )
+        for stage in self._stages().values():
+            for setting in fields(stage):
+                _check_range(setting, getattr(stage, setting.name))
+        if self.vote.min_range_m >= self.vote.max_range_m:
+            raise SettingError(
+                f"min_range_m ({self.vote.min_range_m}) must be less than max_range_m ({self.vote.max_range_m})",
+                hint="set both, e.g. --set min_range_m=2 --set max_range_m=60",
+            )
+
+    def with_settings(self, assignments: Iterable[str]) -> Self:
+        """Return a copy with `name=value` assignments applied, as given to `--set`.
+
+        Raises
+        ------
+        SettingError
+            A name that no stage has, a value that is not a number, or one out of range.
+        """
+        return dataclasses.replace(self, **_assign(self._stages(), assignments))
+
+    def as_dict(self) -> dict[str, float | str]:
+        """Return all settings, flat, as `run.json` holds them."""
+        flat: dict[str, float | str] = {"method": self.method}
+        for stage in self._stages().values():
+            flat.update(dataclasses.asdict(stage))
+        return flat
+
+    def _stages(self) -> Mapping[str, Any]:
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "method"}
+
+
+def describe_settings() -> list[tuple[str, str, str, str]]:
+    """Return (name, default, unit, effect) of every setting, in the order of the stages."""
+    return [
+        (s.name, str(s.default), s.metadata["unit"], s.metadata["effect"])
+        for stage in MapConfig()._stages().values()
+        for s in fields(stage)
+    ]
+
+
+def _assign(stages: Mapping[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
+    """Return the stages by name, with `name=value` assignments applied to the stage that has the name."""
+    changes: dict[str, dict[str, float]] = {}
+    owner = {s.name: (stage, s) for stage, config in stages.items() for s in fields(config)}
+    for assignment in assignments:
+        name, equals, text = assignment.partition("=")
+        name = name.strip()
+        if not equals:
+            example, (_, setting) = next(iter(owner.items()))
+            raise SettingError(
+                f"--set {assignment}: expected name=value", hint=f"for example --set {example}={setting.default}"
+            )
+        if name not in owner:
+            near = difflib.get_close_matches(name, owner, n=1)
+            raise SettingError(
+                f"--set {assignment}: there is no setting named {name!r}",
+                hint=f"did you mean {near[0]}?" if near else f"settings are: {', '.join(sorted(owner))}",
+            )
+        stage, setting = owner[name]
+        changes.setdefault(stage, {})[name] = _parse(setting, text.strip())
+    return {stage: dataclasses.replace(config, **changes.get(stage, {})) for stage, config in stages.items()}
+
+
+def _parse(setting: dataclasses.Field[Any], text: str) -> float:
+    number = int if isinstance(setting.default, int) else float
+    try:
+        return number(text)
+    except ValueError:
+        kind = "a whole number" if number is int else "a number"
+        raise SettingError(
+            f"{setting.name}: expected {kind} ({setting.metadata['unit']}), found {text!r}",
+            hint=f"the default is {setting.name}={setting.default}",
+        ) from None
+
+
+def _check_range(setting: dataclasses.Field[Any], value: float) -> None:
+    low, high = setting.metadata["low"], setting.metadata["high"]
+    too_low = value <= low if setting.metadata["open_low"] else value < low
+    if too_low or value > high or not abs(value) < _TOO_LARGE:  # Nor infinite, nor NaN.
+        above = "above" if setting.metadata["open_low"] else "at least"
+        upper = f" and at most {high:g}" if math.isfinite(high) else ""
+        raise SettingError(
+            f"{setting.name}: expected {above} {low:g}{upper} ({setting.metadata['unit']}), found {value}",
+            hint=f"the default is {setting.name}={setting.default}",
+        )
+
+
+@dataclass(frozen=True)
+class SimulationConfig:
+    """A simulated city, its drives, its camera, its detector and all their errors."""
+
+    # The city.
+    streets_north_south: int = _setting(
+        6,
+        unit="streets",
+        low=2,
+        effect="streets that run north to south; with the next, the size of the city",
+    )
+    streets_east_west: int = _setting(6, unit="streets", low=2, effect="streets that run east to west")
+    block_east_m: float = _setting(
+        110.0, unit="m", low=60.0, effect="mean distance between two streets that run north to south"
+    )
+    block_north_m: float = _setting(
+        90.0, unit="m", low=60.0, effect="mean distance between two streets that run east to west"
+    )
+    block_jitter: float = _setting(
+        0.15, unit="1", high=0.3, effect="blocks are longer or shorter by up to this share of the mean"
+    )
+    street_width_m: float = _setting(
+        26.0,
+        unit="m",
+        low=24.0,
+        high=40.0,
+        effect="from house front to house front; wider streets see round corners",
+    )
+    relief_m: float = _setting(2.0, unit="m", effect="standard deviation of the height of the ground; 0 is a flat city")
+    signalised_share: float = _setting(
+        0.3, unit="1", high=1.0, effect="share of the intersections that have lights (at least one has)"
+    )
+    lights: int = _setting(
+        0, unit="lights", effect="exact number of lights; 0 takes as many as the intersections happen to have"
+    )
+    min_lights: int = _setting(3, unit="lights", low=1, effect="fewest lights of an intersection")
+    max_lights: int = _setting(8, unit="lights", low=1, high=24, effect="most lights of an intersection")
+    lights_per_approach: float = _setting(
+        1.8, unit="lights", low=1.0, high=8.0, effect="mean number of lights that face the same approach"
+    )
+    pair_share: float = _setting(
+        0.25,
+        unit="1",
+        high=1.0,
+        effect="share of poles and mast arms that carry two lights, 0.5 to 0.9 m apart",
+    )
+    light_width_m: float = _setting(0.35, unit="m", open_low=True, effect="width of a light")
+    light_height_m: float = _setting(1.0, unit="m", open_low=True, effect="height of a light")
+
+    # The drives.
+    passes_per_street: int = _setting(
+        2,
+        unit="passes",
+        effect="every street is driven this often in each direction, before any drives at random",
+    )
+    images: int = _setting(
+        0,
+        unit="images",
+        effect="exact number of images: drives at random follow until it is reached; 0 for no such drives",
+    )
+    pass_length_m: float = _setting(
+        3000.0,
+        unit="m",
+        low=200.0,
+        effect="length of a pass; errors of the pose and of the car are of one pass",
+    )
+    turn_share: float = _setting(
+        0.35,
+        unit="1",
+        high=1.0,
+        effect="share of intersections at which a drive at random turns (half left, half right)",
+    )
+    main_street_pull: float = _setting(
+        0.0,
+        unit="1",
+        high=3.0,
+        effect="how much some streets are preferred: by drives at random, and by the lights of an intersection",
+    )
+    red_light_share: float = _setting(
+        0.35, unit="1", high=1.0, effect="share of approaches at which the car has to wait"
+    )
+    red_light_s: float = _setting(20.0, unit="s", effect="mean time it waits; waits are 0.5 to 1.5 times that")
+    speed_mps: float = _setting(
+        8.0, unit="m/s", open_low=True, effect="speed while moving; only timestamps depend on it"
+    )
+    frame_spacing_m: float = _setting(
+        2.0,
+        unit="m",
+        low=0.1,
+        high=20.0,
+        effect="distance between two images of a moving car; smaller takes more images",
+    )
+    standing_interval_s: float = _setting(
+        0.5,
+        unit="s",
+        low=0.02,
+        effect="time between two images of a standing car; smaller takes more alike images",
+    )
+    keep_before_signal_m: float = _setting(
+        100.0,
+        unit="m",
+        low=20.0,
+        effect="images farther than this along the street from the next lights ahead are dropped; "
+        "larger keeps more images without a detection",
+    )
+    detections: int = _setting(
+        0,
+        unit="detections",
+        effect="aimed number of detections, met by taking keep_before_signal_m between 0.7 and 1.5 times "
+        "its value; 0 takes it as it is",
+    )
+
+    # The camera.
+    image_width_px: int = _setting(640, unit="px", low=16, effect="width of the pictures")
+    image_height_px: int = _setting(480, unit="px", low=16, effect="height of the pictures")
+    focal_px: float = _setting(
+        500.0, unit="px", open_low=True, effect="focal length; larger sees farther and less wide"
+    )
+    camera_height_m: float = _setting(1.6, unit="m", effect="height of the camera above the street")
+    camera_pitch_deg: float = _setting(
+        3.0, unit="deg", low=-30.0, high=30.0, effect="how far the camera looks up from the street"
+    )
+
+    # What can be seen.
+    max_sight_m: float = _setting(
+        120.0, unit="m", open_low=True, effect="a light farther than this (on the ground) is not seen"
+    )
+    min_box_height_px: float = _setting(5.0, unit="px", effect="a light lower than this in the picture is not seen")
+    max_facing_deg: float = _setting(
+        65.0,
+        unit="deg",
+        high=90.0,
+        effect="a light that faces away from the camera by more than this is not seen",
+    )
+    occluded_share: float = _setting(
+        0.05,
+        unit="1",
+        high=0.9,
+        effect="share of views of a light that traffic hides, in runs of successive images",
+    )
+    occlusion_s: float = _setting(4.0, unit="s", effect="mean time after which traffic hides a light or not anew")
+
+    # The detector.
+    recall_mean: float = _setting(
+        0.85,
+        unit="1",
+        open_low=True,
+        high=1.0,
+        effect="share of the lights in view that are detected, mean of the passes",
+    )
+    recall_sd: float = _setting(
+        0.06,
+        unit="1",
+        high=0.45,
+        effect="standard deviation of that share between passes (weather, time of day)",
+    )
+    half_recall_height_px: float = _setting(
+        3.0,
+        unit="px",
+        effect="box height at which the recall is half; at twice the height 94 % of it; 0 switches off",
+    )
+    pixel_noise_px: float = _setting(1.2, unit="px", effect="standard deviation of a small box's centre, each axis")
+    pixel_noise_share: float = _setting(
+        0.06,
+        unit="1",
+        high=0.5,
+        effect="part of that standard deviation that grows with the box, as share of its height",
+    )
+    size_noise: float = _setting(
+        0.15, unit="1", high=1.0, effect="standard deviation of the logarithm of a box's width and height"
+    )
+    score_true: float = _setting(0.75, unit="1", high=1.0, effect="mean score of a light in a large box")
+    score_false: float = _setting(0.5, unit="1", high=1.0, effect="mean score of false boxes and of tiny ones")
+    score_noise: float = _setting(0.12, unit="1", high=1.0, effect="standard deviation of scores (cut to 0 and 1)")
+
+    # Detections of other things.
+    clutter_per_image: float = _setting(
+        0.05, unit="boxes", effect="mean number of random false boxes an image, each in one image only"
+    )
+    reflections_per_1000_images: float = _setting(
+        0.6,
+        unit="1",
+        effect="false objects fixed to the car, at one place of the picture for a stretch of a pass",
+    )
+    reflection_images: float = _setting(
+        25.0, unit="images", low=1.0, effect="mean number of images in which such a reflection stays"
+    )
+    temporary_per_1000_images: float = _setting(
+        0.1, unit="1", effect="false objects in the world that only one pass meets, such as a van's lamp"
+    )
+    temporary_recall: float = _setting(
+        0.6,
+        unit="1",
+        high=1.0,
+        effect="how often a temporary object is detected, as share of the recall of lights",
+    )
+    lookalikes_per_light: float = _setting(
+        0.02,
+        unit="1",
+        effect="false objects that stay, look like lights and are met by every pass; 0 for none",
+    )
+    lookalike_recall: float = _setting(
+        0.4, unit="1", high=1.0, effect="how often a lookalike is detected, as share of the recall of lights"
+    )
+
+    # The errors of the poses.
+    position_white_m: float = _setting(
+        0.072,
+        unit="m",
+        effect="standard deviation of a camera position, each axis: part of each image of its own",
+    )
+    position_drift_m: float = _setting(
+        0.096,
+        unit="m",
+        effect="standard deviation of a camera position, each axis: part that drifts along a pass",
+    )
+    rotation_white_deg: float = _setting(
+        0.09, unit="deg", effect="standard deviation of a rotation, each axis: part of each image of its own"
+    )
+    rotation_drift_deg: float = _setting(
+        0.12, unit="deg", effect="standard deviation of a rotation, each axis: part that drifts along a pass"
+    )
+    drift_length_m: float = _setting(
+        100.0, unit="m", open_low=True, effect="distance over which drifting errors forget 63 % of themselves"
+    )
+    write_pose_sigmas: int = _setting(
+        0, unit="0 or 1", high=1, effect="1 writes the standard deviations of the poses into images.parquet"
+    )
+
+    def __post_init__(self) -> None:
+        for setting in fields(self):
+            _check_range(setting, getattr(self, setting.name))
+        if self.images == 0 and self.passes_per_street == 0:
+            raise SettingError(
+                "images and passes_per_street are both 0, so nobody drives",
+                hint="--set passes_per_street=2 drives every street; --set images=1000 drives at random",
+            )
+        if self.min_lights > self.max_lights:
+            raise SettingError(
+                f"min_lights ({self.min_lights}) must be at most max_lights ({self.max_lights})",
+                hint="set both, e.g. --set min_lights=3 --set max_lights=8",
+            )
+        if self.recall_sd > 0.0 and self.recall_sd**2 >= self.recall_mean * (1.0 - self.recall_mean):
+            raise SettingError(
+                f"recall_sd ({self.recall_sd}) is too large for recall_mean ({self.recall_mean})",
+                hint="a share between 0 and 1 cannot vary so much: take a smaller recall_sd, or 0",
+            )
+
+    def with_settings(self, assignments: Iterable[str]) -> Self:
+        """Return a copy with `name=value` assignments applied; raises as `MapConfig.with_settings`."""
+        changed: Self = _assign({"simulation": self}, assignments)["simulation"]
+        return changed

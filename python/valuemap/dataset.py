@@ -1,0 +1,303 @@
+"""A dataset: the folder of tables that every reader writes and every stage reads.
+
+This is the door: whatever passes `read_dataset` is consistent, and no stage checks it again.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from valuemap.errors import InputError
+from valuemap.folders import new_folder
+from valuemap.tables import (
+    Bools,
+    Cameras,
+    Detections,
+    Floats,
+    Images,
+    Ints,
+    Table,
+    Truth,
+    TruthDetections,
+    read_table,
+    write_table,
+)
+
+FORMAT_VERSION = 1
+MARKER = "dataset.json"
+_QUATERNION_TOLERANCE = 1e-3
+_ROUNDING = 1e-12
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The world of a dataset: right-handed, metric.
+
+    Either geo-referenced (`anchor` = WGS84 latitude and longitude in degrees and ellipsoidal height in metres
+    of the origin; x east, y north, z up) or a frame of its own, of which only `up` (a unit vector) is known.
+    """
+
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    anchor: tuple[float, float, float] | None = None
+
+    @property
+    def is_georeferenced(self) -> bool:
+        """Whether positions can be given as longitude, latitude and height."""
+        return self.anchor is not None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the `frame` object of dataset.json and run.json."""
+        if self.anchor is not None:
+            lat, lon, height = self.anchor
+            return {"anchor": {"lat": lat, "lon": lon, "height": height}}
+        return {"local": True, "up": list(self.up)}
+
+    @staticmethod
+    def from_json(frame: Any, *, source: str) -> Frame:
+        """Read the `frame` object; `source` names the file in errors."""
+        try:
+            if "anchor" in frame:
+                anchor = tuple(float(frame["anchor"][key]) for key in ("lat", "lon", "height"))
+                if abs(anchor[0]) <= 90.0 and abs(anchor[1]) <= 360.0 and math.isfinite(anchor[2]):
+                    return Frame(anchor=anchor)  # type: ignore[arg-type]
+            elif frame.get("local"):
+                x, y, z = (float(c) for c in frame["up"])
+                norm = math.hypot(x, y, z)
+                if math.isfinite(norm) and norm > 0.0:
+                    return Frame(up=(x / norm, y / norm, z / norm))
+        except (TypeError, ValueError, KeyError, AttributeError):
+            pass
+        raise InputError(
+            f'{source}: frame: expected {{"anchor": {{"lat", "lon", "height"}}}} or '
+            f'{{"local": true, "up": [x, y, z]}}, found {json.dumps(frame)}',
+            hint="lat and lon are WGS84 degrees; up is the direction of the sky",
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Posed images with detections, and the truth where it is known."""
+
+    name: str
+    frame: Frame
+    cameras: Cameras
+    images: Images
+    detections: Detections
+    truth: Truth | None = None
+    truth_detections: TruthDetections | None = None
+
+
+def read_dataset(path: str | Path) -> Dataset:
+    """Read and check a dataset folder.
+
+    Raises
+    ------
+    InputError
+        A table is missing, damaged or inconsistent; the message names file, row and what to do.
+    """
+    folder = Path(path)
+    head = _read_head(folder)
+    optional = {
+        name: read_table(kind, folder / f"{name}.parquet") if (folder / f"{name}.parquet").is_file() else None
+        for name, kind in (("truth", Truth), ("truth_detections", TruthDetections))
+    }
+    return check_dataset(
+        Dataset(
+            name=str(head.get("name", folder.name)),
+            frame=Frame.from_json(head.get("frame"), source=str(folder / MARKER)),
+            cameras=read_table(Cameras, folder / "cameras.parquet"),
+            images=read_table(Images, folder / "images.parquet"),
+            detections=read_table(Detections, folder / "detections.parquet"),
+            **optional,  # type: ignore[arg-type]
+        ),
+        source=str(folder),
+    )
+
+
+def write_dataset(dataset: Dataset, path: str | Path) -> None:
+    """Check a dataset and write it as a folder; an older dataset there is replaced, never half."""
+    dataset = check_dataset(dataset, source=dataset.name)
+    with new_folder(Path(path), marker=MARKER) as folder:
+        head = {"format_version": FORMAT_VERSION, "name": dataset.name, "frame": dataset.frame.to_json()}
+        (folder / MARKER).write_text(json.dumps(head, indent=2) + "\n", encoding="utf-8")
+        tables: dict[str, Table | None] = {
+            "cameras": dataset.cameras,
+            "images": dataset.images,
+            "detections": dataset.detections,
+            "truth": dataset.truth,
+            "truth_detections": dataset.truth_detections,
+        }
+        for name, table in tables.items():
+            if table is not None:
+                write_table(table, folder / f"{name}.parquet")
+
+
+def check_dataset(dataset: Dataset, *, source: str) -> Dataset:
+    """Check what only holds between tables, and return the dataset with quaternions normalised.
+
+    Raises
+    ------
+    InputError
+        An unknown camera model or id, a quaternion that is not of unit length, a detection of an unknown
+        image, outside its picture by more than a box, or with a size that cannot be.
+    """
+    _check_cameras(dataset.cameras, source)
+    images = _check_images(dataset.images, dataset.cameras, source)
+    _check_detections(dataset, source)
+    if dataset.truth_detections is not None:
+        pairs = dataset.truth_detections
+        if dataset.truth is None:
+            raise InputError(
+                f"{source}: truth_detections.parquet without truth.parquet",
+                hint="add truth.parquet, or remove truth_detections.parquet",
+            )
+        _check_known(
+            pairs.object_id,
+            dataset.truth.object_id,
+            pairs.detection_id,
+            source,
+            "truth_detections",
+            "object_id",
+            "truth",
+        )
+        _check_known(
+            pairs.detection_id,
+            dataset.detections.detection_id,
+            pairs.detection_id,
+            source,
+            "truth_detections",
+            "detection_id",
+            "detections",
+        )
+    return Dataset(**{**vars(dataset), "images": images})
+
+
+def rows_of(ids: Ints, keys: Ints) -> Ints:
+    """Return the row in sorted unique `keys` of each of `ids`, all of which must be there."""
+    return np.searchsorted(keys, ids).astype(np.int64)
+
+
+def _read_head(folder: Path) -> dict[str, Any]:
+    path = folder / MARKER
+    if not path.is_file():
+        raise InputError(
+            f"{folder}: is not a dataset: there is no {MARKER} in it",
+            hint="make one with valuemap import or valuemap simulate",
+        )
+    try:
+        head = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise InputError(f"{path}: cannot be read as JSON: {error}", hint="repair it or import again") from error
+    if not isinstance(head, dict) or head.get("format_version") != FORMAT_VERSION:
+        found = head.get("format_version") if isinstance(head, dict) else head
+        raise InputError(
+            f"{path}: format_version: expected {FORMAT_VERSION}, found {found}",
+            hint="import the data again with this version of valuemap",
+        )
+    return head
+
+
+def _check_cameras(cameras: Cameras, source: str) -> None:
+    for row in range(len(cameras)):
+        where = f"{source}/cameras.parquet, row with camera_id {cameras.camera_id[row]}"
+        model = cameras.model.names[cameras.model.codes[row]]
+        if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
+            known = ", ".join(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
+            raise InputError(f"{where}: model: found {model!r}", hint=f"use one of COLMAP's camera models: {known}")
+        width, height, params = int(cameras.width_px[row]), int(cameras.height_px[row]), cameras.params[row]
+        if width <= 0 or height <= 0:
+            raise InputError(
+                f"{where}: width and height: expected pixels above 0, found {width} x {height}",
+                hint="give the size of the pictures that the detections were made on",
+            )
+        expected = pycolmap.Camera(model=model, width=width, height=height).params_info
+        names = [name.strip() for name in expected.split(",")]
+        if len(params) != len(names) or not np.all(np.isfinite(params)):
+            raise InputError(
+                f"{where}: params: {model} expects {len(names)} finite numbers ({expected}), found {params.tolist()}",
+                hint="give the parameters in COLMAP's order, in pixels",
+            )
+
+
+def _check_images(images: Images, cameras: Cameras, source: str) -> Images:
+    _check_known(images.camera_id, cameras.camera_id, images.image_id, source, "images", "camera_id", "cameras")
+    norm = np.linalg.norm(images.cam_from_world_quat, axis=1)
+    wrong = np.flatnonzero(np.abs(norm - 1.0) > _QUATERNION_TOLERANCE)
+    if len(wrong):
+        row = wrong[0]
+        raise InputError(
+            f"{source}/images.parquet, row with image_id {images.image_id[row]}: qw qx qy qz: expected a quaternion of "
+            f"length 1, found length {norm[row]:.6g} ({len(wrong)} rows)",
+            hint="quaternions are w, x, y, z and rotate the world into the camera",
+        )
+    for name in ("position_sigma_m", "rotation_sigma_rad"):
+        _check_positive(getattr(images, name), images.image_id, source, "images", "image_id", name)
+    # Those of unit length to rounding stay as they are, so that writing and reading again changes no bit.
+    scale = np.where(np.abs(norm - 1.0) > _ROUNDING, norm, 1.0)
+    return images.replace(cam_from_world_quat=images.cam_from_world_quat / scale[:, None])
+
+
+def _check_detections(dataset: Dataset, source: str) -> None:
+    detections, images, cameras = dataset.detections, dataset.images, dataset.cameras
+    ids = detections.detection_id
+    _check_known(detections.image_id, images.image_id, ids, source, "detections", "image_id", "images")
+    where = (source, "detections", "detection_id")
+    for i, name in enumerate(("width", "height")):
+        _refuse(detections.size_px[:, i] < 0.0, detections.size_px[:, i], ids, *where, name, "expected at least 0 px")
+    for name in ("range_m", "range_sigma_m"):
+        _check_positive(getattr(detections, name), ids, *where, name)
+    camera_row = rows_of(images.camera_id, cameras.camera_id)[rows_of(detections.image_id, images.image_id)]
+    for i, (axis, extent) in enumerate((("x", cameras.width_px), ("y", cameras.height_px))):
+        center, size, limit = detections.center_px[:, i], detections.size_px[:, i], extent[camera_row]
+        outside: Bools = (center < -size) | (center > limit + size)
+        _refuse(
+            outside,
+            center,
+            ids,
+            *where,
+            axis,
+            "expected a centre inside its picture or within a box of it",
+            hint="are the boxes in pixels of the size in cameras.parquet, and x, y their centres?",
+        )
+
+
+def _check_known(ids: Ints, known: Ints, keys: Ints, source: str, table: str, column: str, other: str) -> None:
+    unknown = ~np.isin(ids, known)
+    key = "detection_id" if table != "images" else "image_id"
+    expected = f"expected an id that is in {other}.parquet"
+    hint = f"add it to {other}.parquet, or remove these rows from {table}.parquet"
+    _refuse(unknown, ids, keys, source, table, key, column, expected, hint=hint)
+
+
+def _check_positive(values: Floats | None, keys: Ints, source: str, table: str, key: str, column: str) -> None:
+    if values is not None:
+        _refuse(values <= 0.0, values, keys, source, table, key, column, "expected above 0, or no value")
+
+
+def _refuse(
+    wrong: Bools,
+    values: Floats | Ints,
+    keys: Ints,
+    source: str,
+    table: str,
+    key: str,
+    column: str,
+    expected: str,
+    *,
+    hint: str = "repair or remove these rows",
+) -> None:
+    """Raise one error for all wrong rows, showing the first."""
+    rows = np.flatnonzero(wrong)
+    if len(rows):
+        raise InputError(
+            f"{source}/{table}.parquet, row with {key} {keys[rows[0]]}: {column}: {expected}, "
+            f"found {values[rows[0]]} ({len(rows)} rows)",
+            hint=hint,
+        )

@@ -1,0 +1,36 @@
+"""The one tree of exceptions that users may meet.
+
+Everything a user can cause (bad files, impossible settings, places that cannot be written) is a
+`ValuemapError`. It says in one line what is wrong, and in `hint` what to do about it. Anything else
+that escapes is a bug in valuemap.
+"""
+
+from __future__ import annotations
+
+
+class ValuemapError(Exception):
+    """Base of everything valuemap raises on purpose.
+
+    Parameters
+    ----------
+    message
+        One line: what is wrong and where (file, row), what was expected, what was found.
+    hint
+        One line: what the user can do about it.
+    """
+
+    def __init__(self, message: str, *, hint: str) -> None:
+        super().__init__(message)
+        self.hint = hint
+
+
+class InputError(ValuemapError):
+    """A file or table that cannot be used as it is."""
+
+
+class SettingError(ValuemapError):
+    """A setting that does not exist or has an impossible value."""
+
+
+class OutputError(ValuemapError):
+    """A place that cannot be written to."""

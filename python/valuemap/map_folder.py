@@ -1,0 +1,86 @@
+"""A map: the folder of labels, votes and the record of the run that `valuemap map` writes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from valuemap.dataset import Frame
+from valuemap.errors import InputError
+from valuemap.folders import new_folder
+from valuemap.tables import Labels, Votes, read_table, table_to_arrow, write_table
+
+if TYPE_CHECKING:
+    import geopandas
+
+MARKER = "run.json"
+
+
+@dataclass(frozen=True, eq=False)
+class Map:
+    """Labels with their evidence, in the frame of the dataset they come from.
+
+    `run` is what run.json holds: version, dataset, settings, counts of everything found and rejected, and
+    seconds and peak memory a stage.
+    """
+
+    frame: Frame
+    labels: Labels
+    votes: Votes
+    run: dict[str, Any]
+
+
+def write_map(result: Map, path: str | Path) -> None:
+    """Write a map as a folder; an older map there is replaced, never half."""
+    with new_folder(Path(path), marker=MARKER) as folder:
+        run = {**result.run, "frame": result.frame.to_json()}
+        (folder / MARKER).write_text(json.dumps(run, indent=2) + "\n", encoding="utf-8")
+        write_labels(result, folder / "labels.parquet")
+        write_table(result.votes, folder / "votes.parquet")
+
+
+def read_map(path: str | Path) -> Map:
+    """Read and check a map folder.
+
+    Raises
+    ------
+    InputError
+        The folder is not a map, or a file in it is damaged.
+    """
+    folder = Path(path)
+    head = folder / MARKER
+    if not head.is_file():
+        raise InputError(f"{folder}: is not a map: there is no {MARKER} in it", hint="make one with valuemap map")
+    try:
+        run = json.loads(head.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise InputError(f"{head}: cannot be read as JSON: {error}", hint="make the map again") from error
+    if not isinstance(run, dict):
+        raise InputError(f"{head}: expected a JSON object, found {type(run).__name__}", hint="make the map again")
+    return Map(
+        frame=Frame.from_json(run.pop("frame", None), source=str(head)),
+        labels=read_table(Labels, folder / "labels.parquet"),
+        votes=read_table(Votes, folder / "votes.parquet"),
+        run=run,
+    )
+
+
+def write_labels(result: Map, path: Path) -> None:
+    """Write the labels as Parquet; as GeoParquet (points lon, lat, height) where geo-referenced."""
+    if result.labels.lon_lat_height is None:
+        write_table(result.labels, path)
+        return
+    geographic_labels(result.labels).to_parquet(path, compression="zstd")
+
+
+def geographic_labels(labels: Labels) -> geopandas.GeoDataFrame:
+    """Return geo-referenced labels as a data frame with their columns on disk and points lon, lat, height."""
+    import geopandas  # Slow to import, and only geo-referenced maps need it.
+
+    assert labels.lon_lat_height is not None
+    points = geopandas.points_from_xy(*labels.lon_lat_height.T)
+    frame = table_to_arrow(labels).to_pandas()
+    frame = frame.astype({"class": "string"})  # No labels have no classes, and categories of none have no type.
+    return geopandas.GeoDataFrame(frame, geometry=points, crs="EPSG:4979")

@@ -1,0 +1,445 @@
+"""The typed tables that all stages share, and the one way to read, check and write them.
+
+Each table is a frozen dataclass of arrays of one length. Each field says which columns of the file on
+disk it stands for, so that reading, validation and writing are one mechanism for all tables. Tables are
+held in ascending order of their key, so that nothing depends on the order of rows in a file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, ClassVar, Self, TypeVar
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from valuemap.arrow import numbers_from_arrow, numbers_to_arrow, texts_to_arrow
+from valuemap.errors import InputError
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Categories:
+    """A column of few distinct texts: `names[codes[i]]` is the text of row i; names are sorted."""
+
+    codes: NDArray[np.int32]
+    names: tuple[str, ...]
+
+    @classmethod
+    def from_texts(cls, texts: Sequence[str] | pa.Array | pa.ChunkedArray) -> Self:
+        """Encode texts (N) so that equal columns get equal codes whatever the order of rows."""
+        column = texts if isinstance(texts, pa.ChunkedArray | pa.Array) else texts_to_arrow(texts)
+        if isinstance(column, pa.ChunkedArray):
+            column = column.combine_chunks()
+        if not pa.types.is_dictionary(column.type):
+            column = column.dictionary_encode()
+        found = column.dictionary.to_pylist()
+        names = tuple(sorted(set(found)))
+        rank = {name: i for i, name in enumerate(names)}
+        recode = np.array([rank[name] for name in found], dtype=np.int32)
+        codes = numbers_from_arrow(column.indices)
+        return cls(recode[codes] if len(codes) else np.empty(0, np.int32), names)
+
+    def __len__(self) -> int:
+        return len(self.codes)
+
+    def take(self, rows: NDArray[Any]) -> Categories:
+        """Return the rows given by indices or by a mask."""
+        return Categories(self.codes[rows], self.names)
+
+    def texts(self) -> list[str]:
+        """Return the text of every row."""
+        return [self.names[code] for code in self.codes]
+
+    def code_of(self, name: str) -> int:
+        """Return the code of a text, or -1 where no row can have it."""
+        return self.names.index(name) if name in self.names else -1
+
+    def to_arrow(self) -> pa.Array:
+        """Return a dictionary array."""
+        return pa.DictionaryArray.from_arrays(numbers_to_arrow(self.codes), texts_to_arrow(self.names))
+
+
+def _column(kind: str, names: tuple[str, ...], *, optional: bool = False, nullable: bool = False) -> Any:
+    """Declare which columns on disk a field stands for.
+
+    kind: "int", "float", "text", "category" or "floats" (a list of numbers a row).
+    optional: the whole column may be missing; the field is then None.
+    nullable: single values may be missing; they are NaN in memory.
+    """
+    metadata = {"kind": kind, "names": names, "optional": optional, "nullable": nullable}
+    return field(default=None, metadata=metadata) if optional else field(metadata=metadata)
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Base of the tables: arrays of one length, sorted by the key column."""
+
+    KEY: ClassVar[str | None] = None
+    MAY_BE_EMPTY: ClassVar[bool] = False
+
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))
+
+    def take(self, rows: NDArray[Any]) -> Self:
+        """Return the rows given by indices or by a mask, as the same type of table."""
+        return type(self)(**{f.name: _take(getattr(self, f.name), rows) for f in fields(self)})
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields replaced."""
+        return dataclasses.replace(self, **changes)
+
+
+@dataclass(frozen=True, eq=False)
+class Cameras(Table):
+    """Intrinsics. `model` is a COLMAP model name, `params` in COLMAP's order (pixels, centre of pixel 0 at 0.5)."""
+
+    KEY: ClassVar[str | None] = "camera_id"
+
+    camera_id: Ints = _column("int", ("camera_id",))
+    model: Categories = _column("category", ("model",))
+    width_px: Ints = _column("int", ("width",))
+    height_px: Ints = _column("int", ("height",))
+    params: list[Floats] = _column("floats", ("params",))
+
+
+@dataclass(frozen=True, eq=False)
+class Images(Table):
+    """Exposures: camera, pose, pass and time.
+
+    `cam_from_world_quat` (N, 4) is a unit quaternion w, x, y, z and `cam_from_world_m` (N, 3) a translation:
+    point_in_cam = R point_in_world + t, camera axes x right, y down, z forward. Timestamps are seconds.
+    """
+
+    KEY: ClassVar[str | None] = "image_id"
+
+    image_id: Ints = _column("int", ("image_id",))
+    name: pa.Array = _column("text", ("name",))
+    camera_id: Ints = _column("int", ("camera_id",))
+    cam_from_world_quat: Floats = _column("float", ("qw", "qx", "qy", "qz"))
+    cam_from_world_m: Floats = _column("float", ("tx", "ty", "tz"))
+    pass_id: Categories = _column("category", ("pass_id",))
+    timestamp_s: Floats | None = _column("float", ("timestamp",), optional=True, nullable=True)
+    position_sigma_m: Floats | None = _column("float", ("position_sigma_m",), optional=True, nullable=True)
+    rotation_sigma_rad: Floats | None = _column("float", ("rotation_sigma_rad",), optional=True, nullable=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Detections(Table):
+    """2D boxes: centre and size (N, 2) in pixels, class and score; optionally a measured range in metres."""
+
+    KEY: ClassVar[str | None] = "detection_id"
+
+    detection_id: Ints = _column("int", ("detection_id",))
+    image_id: Ints = _column("int", ("image_id",))
+    class_name: Categories = _column("category", ("class",))
+    center_px: Floats = _column("float", ("x", "y"))
+    size_px: Floats = _column("float", ("width", "height"))
+    score: Floats = _column("float", ("score",))
+    range_m: Floats | None = _column("float", ("range_m",), optional=True, nullable=True)
+    range_sigma_m: Floats | None = _column("float", ("range_sigma_m",), optional=True, nullable=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth(Table):
+    """Known objects, for evaluation only; positions (N, 3) in metres in the frame of the dataset."""
+
+    KEY: ClassVar[str | None] = "object_id"
+
+    object_id: Ints = _column("int", ("object_id",))
+    class_name: Categories = _column("category", ("class",))
+    position_in_world_m: Floats = _column("float", ("x", "y", "z"))
+
+
+@dataclass(frozen=True, eq=False)
+class TruthPoints(Table):
+    """Known objects in a file of the user's own: positions (N, 3) in the frame of the map, the rest if known."""
+
+    position_in_world_m: Floats = _column("float", ("x", "y", "z"))
+    class_name: Categories | None = _column("category", ("class",), optional=True)
+    object_id: Ints | None = _column("int", ("object_id",), optional=True)
+
+
+@dataclass(frozen=True, eq=False)
+class GeographicTruth(Table):
+    """Known objects in a file of the user's own: WGS84 longitude and latitude (N, 2) in degrees, the rest if known."""
+
+    lon_lat: Floats = _column("float", ("lon", "lat"))
+    height_m: Floats | None = _column("float", ("height",), optional=True)
+    class_name: Categories | None = _column("category", ("class",), optional=True)
+    object_id: Ints | None = _column("int", ("object_id",), optional=True)
+
+
+@dataclass(frozen=True, eq=False)
+class TruthDetections(Table):
+    """Which object a detection really shows; detections of nothing are not listed."""
+
+    KEY: ClassVar[str | None] = "detection_id"
+    MAY_BE_EMPTY: ClassVar[bool] = True
+
+    detection_id: Ints = _column("int", ("detection_id",))
+    object_id: Ints = _column("int", ("object_id",))
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Points with the rays that support them: what voting finds and merging makes into labels.
+
+    `position_in_world_m` (N, 3); the voters of candidate i are the rows `voters[voter_offsets[i] :
+    voter_offsets[i + 1]]` of the detections, ascending; `cluster` (N) is where it was found.
+    """
+
+    position_in_world_m: Floats
+    voter_offsets: Ints
+    voters: NDArray[np.uint32]
+    cluster: NDArray[np.uint32]
+
+    def __len__(self) -> int:
+        return len(self.cluster)
+
+    def row_of_voter(self) -> Ints:
+        """Return the candidate (row) that each of the voters supports."""
+        return np.repeat(np.arange(len(self)), np.diff(self.voter_offsets))
+
+
+@dataclass(frozen=True, eq=False)
+class Labels(Table):
+    """Accepted objects.
+
+    Positions (N, 3) in metres in the frame of the dataset; covariance (N, 6) in m² as xx, xy, xz, yy, yz, zz;
+    `votes` counts images, `passes` the passes they come from; `reprojection_rms_px` over the voters;
+    `max_parallax_rad` the largest angle between two voters' directions to the object; `first_seen_s` and
+    `last_seen_s` the voters' first and last timestamps (NaN where there are none); width and height from the
+    voters' boxes at their depths; lon, lat in degrees and height in metres on WGS84 where geo-referenced.
+    """
+
+    KEY: ClassVar[str | None] = "label_id"
+    MAY_BE_EMPTY: ClassVar[bool] = True
+
+    label_id: Ints = _column("int", ("label_id",))
+    class_name: Categories = _column("category", ("class",))
+    position_in_world_m: Floats = _column("float", ("x", "y", "z"))
+    covariance_m2: Floats = _column(
+        "float",
+        (
+            "covariance_xx",
+            "covariance_xy",
+            "covariance_xz",
+            "covariance_yy",
+            "covariance_yz",
+            "covariance_zz",
+        ),
+    )
+    votes: Ints = _column("int", ("votes",))
+    passes: Ints = _column("int", ("passes",))
+    object_width_m: Floats = _column("float", ("object_width_m",))
+    object_height_m: Floats = _column("float", ("object_height_m",))
+    reprojection_rms_px: Floats = _column("float", ("reprojection_rms_px",))
+    max_parallax_rad: Floats = _column("float", ("max_parallax_rad",))
+    first_seen_s: Floats = _column("float", ("first_seen",), nullable=True)
+    last_seen_s: Floats = _column("float", ("last_seen",), nullable=True)
+    lon_lat_height: Floats | None = _column("float", ("lon", "lat", "height"), optional=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Votes(Table):
+    """Which detection supports which label, and how closely: sorted by label, then image."""
+
+    MAY_BE_EMPTY: ClassVar[bool] = True
+
+    label_id: Ints = _column("int", ("label_id",))
+    detection_id: Ints = _column("int", ("detection_id",))
+    image_id: Ints = _column("int", ("image_id",))
+    residual_px: Floats = _column("float", ("residual_px",))
+    residual_sigmas: Floats = _column("float", ("residual_sigmas",))
+
+
+T = TypeVar("T", bound=Table)
+
+
+def read_table(kind: type[T], path: Path) -> T:
+    """Read and check one Parquet file as a table, rows sorted by its key.
+
+    Raises
+    ------
+    InputError
+        The file is missing, not Parquet or truncated, empty, lacks a column, or holds a wrong type, a
+        missing or non-finite value, or a duplicate key; the message names file, row and column.
+    """
+    return table_from_arrow(kind, read_arrow(path), source=str(path))
+
+
+def read_arrow(path: Path) -> pa.Table:
+    """Read one Parquet file as it is; raises `InputError` where it is missing, damaged or cut short."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file", hint="give the folder that an import or simulate command wrote")
+    try:
+        # Not pq.read_table, which imports pandas before it reads.
+        table = pq.ParquetFile(path).read()
+        table.validate(full=True)  # Finds texts that are not UTF-8, which nothing else would before they are used.
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(
+            f"{path}: cannot be read as Parquet: {reason}", hint="the file is damaged or cut short: write it again"
+        ) from error
+    return table
+
+
+def table_from_arrow(kind: type[T], table: pa.Table, *, source: str) -> T:
+    """Check an Arrow table and turn it into a typed one, rows sorted by its key; raises as `read_table`."""
+    if table.num_rows == 0 and not kind.MAY_BE_EMPTY:
+        raise InputError(f"{source}: the table is empty", hint="at least one row is needed: check what wrote the file")
+    values = {f.name: _read_field(f.metadata, table, source) for f in fields(kind)}
+    result = kind(**values)
+    if kind.KEY is None:
+        return result
+    key: Ints = getattr(result, kind.KEY)
+    if np.all(key[1:] > key[:-1]):
+        return result
+    order = np.argsort(key, kind="stable")
+    repeated = np.flatnonzero(np.diff(key[order]) == 0)
+    if len(repeated):
+        row = int(order[repeated[0] + 1])
+        raise InputError(
+            f"{source} row {row}: {kind.KEY}: expected unique ids, found {key[row]} again ({len(repeated)} repeated)",
+            hint="give every row an id of its own",
+        )
+    return result.take(order)
+
+
+def table_to_arrow(table: Table) -> pa.Table:
+    """Return the columns as on disk; optional fields that are None are left out."""
+    columns: dict[str, pa.Array] = {}
+    for f in fields(table):
+        value = getattr(table, f.name)
+        if value is None:
+            continue
+        names = f.metadata["names"]
+        if f.metadata["kind"] == "float":
+            for i, name in enumerate(names):
+                part = value if value.ndim == 1 else value[:, i]
+                columns[name] = numbers_to_arrow(np.asarray(part, np.float64), nullable=f.metadata["nullable"])
+        else:
+            columns[names[0]] = _to_arrow(value, f.metadata["kind"])
+    return pa.table(columns)
+
+
+def write_table(table: Table, path: Path) -> None:
+    """Write a table as Parquet (zstd); the same table gives the same bytes."""
+    pq.write_table(table_to_arrow(table), path, compression="zstd")
+
+
+def _take(value: Any, rows: NDArray[Any]) -> Any:
+    if value is None:
+        return None
+    if isinstance(value, Categories):
+        return value.take(rows)
+    if isinstance(value, pa.Array):
+        indices = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
+        return value.take(numbers_to_arrow(indices.astype(np.int64)))
+    if isinstance(value, list):
+        return [value[i] for i in (np.flatnonzero(rows) if rows.dtype == np.bool_ else rows)]
+    return value[rows]
+
+
+def _to_arrow(value: Any, kind: str) -> pa.Array:
+    if kind == "category":
+        return value.to_arrow()
+    if kind == "floats":
+        offsets = np.cumsum([0, *map(len, value)], dtype=np.int32)
+        items = numbers_to_arrow(np.concatenate([*value, np.empty(0)]))
+        return pa.ListArray.from_arrays(numbers_to_arrow(offsets), items)
+    return value if isinstance(value, pa.Array) else numbers_to_arrow(np.asarray(value, np.int64))
+
+
+_EXPECTED = {
+    "int": "whole numbers",
+    "float": "numbers",
+    "text": "texts",
+    "category": "texts",
+    "floats": "a list of numbers a row",
+}
+
+
+def _read_field(column: Any, table: pa.Table, source: str) -> Any:
+    names, kind = column["names"], column["kind"]
+    missing = [name for name in names if name not in table.column_names]
+    if missing:
+        if column["optional"] and len(missing) == len(names):
+            return None
+        raise InputError(
+            f"{source}: column {missing[0]!r} is missing; found {', '.join(table.column_names)}",
+            hint=f"add the column {missing[0]!r} ({_EXPECTED[kind]})",
+        )
+    twice = [name for name in names if table.column_names.count(name) > 1]
+    if twice:
+        raise InputError(f"{source}: column {twice[0]!r} is there twice", hint="keep one of them")
+    parts = [_read_column(table.column(name), name, column, source) for name in names]
+    return parts[0] if len(parts) == 1 else np.stack(parts, axis=1)
+
+
+def _read_column(column: pa.ChunkedArray, name: str, spec: Any, source: str) -> Any:
+    kind, nullable = spec["kind"], spec["nullable"]
+    if not _is_of_kind(column.type, kind):
+        raise InputError(
+            f"{source}: column {name!r}: expected {_EXPECTED[kind]}, found {column.type}",
+            hint=f"write {name!r} with another type",
+        )
+    if pa.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)  # Unused and missing texts in the dictionary do not count.
+    if column.null_count and not nullable:
+        row = int(np.flatnonzero(column.is_null().to_numpy())[0])
+        raise InputError(
+            f"{source} row {row}: {name}: expected a value, found none ({column.null_count} rows)",
+            hint="fill the value in, or remove the row",
+        )
+    if kind == "category":
+        return Categories.from_texts(column)
+    if kind == "text":
+        return pc.cast(column, pa.string()).combine_chunks()
+    if kind == "floats":
+        return [np.asarray(row, dtype=np.float64) for row in column.to_pylist()]
+    if kind == "int":
+        return _numbers(column, pa.int64(), name, source)
+    values: Floats = _numbers(column, pa.float64(), name, source)
+    bad = np.flatnonzero(np.isinf(values) if nullable else ~np.isfinite(values))
+    if len(bad):
+        row = int(bad[0])
+        raise InputError(
+            f"{source} row {row}: {name}: expected a finite number, found {values[row]} ({len(bad)} rows)",
+            hint="repair or remove the row",
+        )
+    return values
+
+
+def _numbers(column: pa.ChunkedArray, as_type: pa.DataType, name: str, source: str) -> NDArray[Any]:
+    try:
+        return numbers_from_arrow(column.cast(as_type))
+    except pa.ArrowInvalid as error:
+        raise InputError(
+            f"{source}: column {name!r}: expected numbers that {as_type} can hold: {error}",
+            hint="are these ids below 2^63, timestamps in seconds?",
+        ) from error
+
+
+def _is_of_kind(kind_found: pa.DataType, kind: str) -> bool:
+    types = pa.types
+    if types.is_dictionary(kind_found):
+        return kind in ("text", "category") and _is_of_kind(kind_found.value_type, kind)
+    if kind == "int":
+        return bool(types.is_integer(kind_found))
+    if kind == "float":
+        return bool(types.is_integer(kind_found) or types.is_floating(kind_found) or types.is_null(kind_found))
+    if kind == "floats":
+        is_list = types.is_list(kind_found) or types.is_large_list(kind_found) or types.is_fixed_size_list(kind_found)
+        return bool(is_list and _is_of_kind(kind_found.value_type, "float"))
+    return bool(types.is_string(kind_found) or types.is_large_string(kind_found))

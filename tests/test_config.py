@@ -1,0 +1,120 @@
+"""Settings: every default in range, every misuse refused with a hint, and the record complete."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+
+import pytest
+
+from valuemap.config import (
+    MapConfig,
+    MergeConfig,
+    PartitionConfig,
+    SimulationConfig,
+    VoteConfig,
+    describe_settings,
+)
+from valuemap.errors import SettingError
+
+NAMES = [name for name, *_ in describe_settings()]
+
+
+def test_the_settings_of_the_paper_have_its_values() -> None:
+    assert PartitionConfig().cluster_radius_m == 50.0
+    assert MergeConfig().merge_radius_m == 1.0
+
+
+def test_settings_go_to_the_stage_that_has_them() -> None:
+    config = MapConfig().with_settings(["max_range_m=80", " min_votes = 4 ", "merge_radius_m=0"])
+    assert (config.vote.max_range_m, config.vote.min_votes, config.merge.merge_radius_m) == (80.0, 4, 0.0)
+    assert config.partition == PartitionConfig()
+    assert MapConfig().vote == VoteConfig()
+
+
+def test_the_last_of_two_assignments_counts() -> None:
+    assert MapConfig().with_settings(["min_votes=4", "min_votes=5"]).vote.min_votes == 5
+
+
+def test_two_settings_that_only_fit_together_can_be_set_together() -> None:
+    config = MapConfig().with_settings(["min_range_m=200", "max_range_m=300"])
+    assert config.vote.min_range_m == 200.0
+
+
+def test_as_dict_holds_every_setting_once() -> None:
+    record = MapConfig().with_settings(["min_parallax_deg=3"]).as_dict()
+    assert sorted(record) == sorted(["method", *NAMES])
+    assert len(set(NAMES)) == len(NAMES)
+    assert record["method"] == "paper"
+    assert record["min_parallax_deg"] == 3.0
+
+
+def test_every_setting_is_described() -> None:
+    for name, default, unit, effect in describe_settings():
+        assert unit
+        assert len(effect) > 20
+        assert float(default) == MapConfig().as_dict()[name]
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message", "hint"),
+    [
+        ("max_rnage_m=80", "there is no setting named 'max_rnage_m'", "did you mean max_range_m?"),
+        ("alpha=1", "there is no setting named 'alpha'", "settings are: cluster_radius_m, "),
+        ("method=robust", "there is no setting named 'method'", "settings are: "),
+        ("=3", "there is no setting named ''", "settings are: "),
+        ("max_range_m", "--set max_range_m: expected name=value", "for example --set "),
+        (
+            "max_range_m=far",
+            r"max_range_m: expected a number \(m\), found 'far'",
+            "the default is max_range_m=60",
+        ),
+        ("max_range_m=", r"max_range_m: expected a number \(m\), found ''", "the default is max_range_m=60"),
+        (
+            "min_votes=3.5",
+            r"min_votes: expected a whole number \(images\), found '3.5'",
+            "the default is min_votes=3",
+        ),
+        ("min_votes=1", r"min_votes: expected at least 2 \(images\), found 1", "the default is min_votes=3"),
+        ("cluster_radius_m=0", r"cluster_radius_m: expected above 0 \(m\), found 0", "cluster_radius_m=50"),
+        ("merge_radius_m=-1", r"merge_radius_m: expected at least 0 \(m\), found -1", "merge_radius_m=1"),
+        ("max_range_m=inf", r"max_range_m: expected above 0 \(m\), found inf", "max_range_m=60"),
+        ("max_range_m=nan", r"max_range_m: expected above 0 \(m\), found nan", "max_range_m=60"),
+        (
+            "min_parallax_deg=91",
+            r"min_parallax_deg: expected at least 0 and at most 90 \(deg\), found 91",
+            "=2",
+        ),
+        ("min_range_m=60", r"min_range_m \(60.0\) must be less than max_range_m \(60.0\)", "set both"),
+    ],
+)
+def test_a_wrong_assignment_is_refused(assignment: str, message: str, hint: str) -> None:
+    with pytest.raises(SettingError, match=message) as refusal:
+        MapConfig().with_settings([assignment])
+    assert hint in refusal.value.hint
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_number_that_nothing_can_hold_is_refused() -> None:
+    with pytest.raises(SettingError, match="min_votes: expected "):
+        MapConfig().with_settings(["min_votes=1" + "0" * 400])
+
+
+def test_an_unknown_method_is_refused() -> None:
+    with pytest.raises(SettingError, match="method: expected one of paper, found 'magic'"):
+        MapConfig(method="magic")  # type: ignore[arg-type]
+
+
+def test_wrong_settings_are_refused_wherever_they_come_from() -> None:
+    with pytest.raises(SettingError, match="max_reprojection_error_px: expected above 0"):
+        MapConfig(vote=VoteConfig(max_reprojection_error_px=0.0))
+
+
+@pytest.mark.parametrize("name", [f.name for f in fields(SimulationConfig)])
+def test_the_simulation_has_a_range_for_every_setting(name: str) -> None:
+    for wrong in ("nan", "-1000000"):
+        with pytest.raises(SettingError, match=f"{name}: expected "):
+            SimulationConfig().with_settings([f"{name}={wrong}"])
+    default = getattr(SimulationConfig(), name)
+    assert SimulationConfig().with_settings([f"{name}={default}"]) == SimulationConfig()
+    assert math.isfinite(default)

@@ -1,0 +1,95 @@
+"""The local frame and WGS84: against PROJ's own steps, against known geometry, and there and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from pyproj import Transformer
+
+from valuemap.errors import InputError
+from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
+from valuemap.tables import Floats
+
+ANCHORS = [
+    (51.5, -0.14, 35.0),
+    (37.7749, -122.4194, 16.0),
+    (-33.87, 151.21, 0.0),
+    (0.0, 0.0, 0.0),
+    (64.1, -21.9, 1500.0),
+    (-16.5, 179.9999, 10.0),
+    (89.9, 45.0, 0.0),
+]
+EQUATOR_RADIUS_M = 6378137.0
+
+
+def random_positions(count: int = 200, extent_m: float = 20_000.0) -> Floats:
+    random = np.random.default_rng(5)
+    return random.uniform(-1.0, 1.0, (count, 3)) * [extent_m, extent_m, 300.0]
+
+
+def enu_by_hand(lon_lat_height: Floats, anchor: tuple[float, float, float]) -> Floats:
+    """Earth-centred coordinates by pyproj, turned and shifted by the textbook's matrix."""
+    to_earth_centred = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    points = np.stack(to_earth_centred.transform(*lon_lat_height.T), axis=1)
+    lat, lon, height = anchor
+    origin = np.array(to_earth_centred.transform(lon, lat, height))
+    phi, lam = np.radians(lat), np.radians(lon)
+    enu_from_earth = np.array(
+        [
+            [-np.sin(lam), np.cos(lam), 0.0],
+            [-np.sin(phi) * np.cos(lam), -np.sin(phi) * np.sin(lam), np.cos(phi)],
+            [np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)],
+        ]
+    )
+    return np.asarray((points - origin) @ enu_from_earth.T)
+
+
+@pytest.mark.parametrize("anchor", ANCHORS)
+def test_positions_survive_the_way_there_and_back(anchor: tuple[float, float, float]) -> None:
+    positions = random_positions()
+    back = enu_from_lon_lat_height(lon_lat_height_from_enu(positions, anchor), anchor)
+    assert_allclose(back, positions, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("anchor", ANCHORS)
+def test_the_local_frame_is_that_of_the_textbook(anchor: tuple[float, float, float]) -> None:
+    places = lon_lat_height_from_enu(random_positions(), anchor)
+    assert_allclose(enu_from_lon_lat_height(places, anchor), enu_by_hand(places, anchor), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("anchor", ANCHORS)
+def test_the_anchor_is_the_origin(anchor: tuple[float, float, float]) -> None:
+    lat, lon, height = anchor
+    assert_allclose(lon_lat_height_from_enu(np.zeros((1, 3)), anchor), [[lon, lat, height]], rtol=0, atol=1e-7)
+    assert_allclose(enu_from_lon_lat_height(np.array([[lon, lat, height]]), anchor), 0.0, atol=1e-8)
+
+
+def test_x_is_east_y_is_north_z_is_up() -> None:
+    """At the equator one metre east is 1/a radians of longitude; north and up have their own signs."""
+    east, north, up = lon_lat_height_from_enu(np.eye(3), (0.0, 0.0, 0.0))
+    assert_allclose(east, [np.degrees(1.0 / EQUATOR_RADIUS_M), 0.0, 0.0], rtol=1e-6, atol=1e-6)
+    assert east[0] > 8.9e-6
+    assert north[1] > 8.9e-6
+    assert abs(north[0]) < 1e-12
+    assert_allclose(up, [0.0, 0.0, 1.0], rtol=0, atol=1e-8)
+
+
+def test_a_map_may_cross_the_date_line() -> None:
+    place = lon_lat_height_from_enu(np.array([[100.0, 0.0, 0.0]]), (-16.5, 179.9999, 10.0))
+    assert -180.0 <= place[0, 0] < -179.9
+
+
+def test_no_positions_are_no_places() -> None:
+    assert lon_lat_height_from_enu(np.empty((0, 3)), ANCHORS[0]).shape == (0, 3)
+
+
+def test_an_anchor_may_be_of_numpy_numbers() -> None:
+    anchor = tuple(np.array(ANCHORS[0]))
+    assert_allclose(lon_lat_height_from_enu(np.zeros((1, 3)), anchor), [[-0.14, 51.5, 35.0]], rtol=0, atol=1e-8)
+
+
+def test_a_place_that_is_none_is_refused() -> None:
+    with pytest.raises(InputError, match="has no place on the ellipsoid") as refusal:
+        enu_from_lon_lat_height(np.array([[0.0, 95.0, 0.0]]), ANCHORS[0])
+    assert "x east, y north, z up" in refusal.value.hint
