@@ -1,0 +1,227 @@
+"""Detections in COCO's format: annotations (an object) or results (a list)."""
+
+from __future__ import annotations
+
+import json
+import reprlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from valuemap.dataset import rows_of
+from valuemap.errors import InputError
+from valuemap.readers.assemble import number_detections
+from valuemap.readers.names import match_images
+from valuemap.tables import Cameras, Detections, Images, Ints
+
+_FORMAT_HINT = "COCO's format is described at https://cocodataset.org/#format-data"
+_HUGE = 1e300
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """What a value must be, as a test and in words."""
+
+    accepts: Callable[[Any], bool]
+    expected: str
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) < _HUGE  # False for NaN too.
+
+
+def _is_box(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 4 and all(map(_is_number, value)) and min(value[2:]) >= 0
+
+
+_ID = _Kind(lambda value: type(value) in (int, str), "a whole number or a text")
+_TEXT = _Kind(lambda value: isinstance(value, str) and value != "", "a text")
+_MAYBE_TEXT = _Kind(lambda value: isinstance(value, str), "a text")
+_NUMBER = _Kind(_is_number, "a finite number")
+_BOX = _Kind(_is_box, "x, y, width, height as finite numbers, sizes not negative")
+
+
+@dataclass(frozen=True)
+class _Entries:
+    """A list of JSON objects and where it stands, for errors."""
+
+    where: str
+    entries: list[dict[str, Any]]
+
+    def __post_init__(self) -> None:
+        wrong = next((row for row, entry in enumerate(self.entries) if not isinstance(entry, dict)), None)
+        if wrong is not None:
+            raise InputError(
+                f"{self.where}[{wrong}]: expected an object, found {reprlib.repr(self.entries[wrong])}",
+                hint=_FORMAT_HINT,
+            )
+
+    def column(self, key: str, kind: _Kind, default: Any = None) -> list[Any]:
+        """Return one value an entry; `default` stands for a missing key."""
+        values = [entry.get(key, default) for entry in self.entries]
+        wrong = next((row for row, value in enumerate(values) if not kind.accepts(value)), None)
+        if wrong is not None:
+            found = reprlib.repr(values[wrong])
+            raise InputError(
+                f"{self.where}[{wrong}]: {key}: expected {kind.expected}, found {found}",
+                hint=_FORMAT_HINT,
+            )
+        return values
+
+
+def read_coco(path: Path, images: Images, cameras: Cameras) -> Detections:
+    """Read boxes and find their images by file name, as `match_images` does.
+
+    An object has `images` (id, file_name), `annotations` (image_id, category_id, bbox, maybe score and id)
+    and maybe `categories` (id, name). A list has results (category_id, bbox, score) that name their image in
+    `file_name`, or in an `image_id` that is a text. A bbox is x, y, width, height of continuous edges, so its
+    centre needs no further half pixel. Without `categories` the class of id 9 is `class-9`; without `score`
+    the score is 1. Where every annotation has a whole number of its own as `id`, that is its detection_id.
+
+    Raises
+    ------
+    InputError
+        The file is no COCO file or has no boxes, a box is on an image that `images` does not have or that has
+        another size there, or a value is missing or impossible.
+    """
+    content = _load(path)
+    is_results = isinstance(content, list)
+    boxes = _Entries(f"{path}: {'results' if is_results else 'annotations'}", _boxes_in(content, path))
+    listed = _Entries(f"{path}: images", [] if is_results else _list_in(content, "images", path))
+    names = _names_of_results(boxes) if is_results else _names_of_annotations(boxes, listed)
+    known = images.name.to_pylist()
+    row_of = match_images({*names, *(listed.column("file_name", _TEXT))}, known)
+    _refuse_unknown(boxes.where, names, row_of, known)
+    _refuse_other_sizes(listed, set(names), row_of, images, cameras)
+    bbox_px = np.array(boxes.column("bbox", _BOX), dtype=np.float64)
+    return number_detections(
+        image_id=images.image_id[[row_of[name] for name in names]],
+        class_names=_class_names(boxes, content, path),
+        center_px=bbox_px[:, :2] + bbox_px[:, 2:] / 2.0,
+        size_px=bbox_px[:, 2:],
+        score=np.array(boxes.column("score", _NUMBER, default=1.0), dtype=np.float64),
+        detection_id=None if is_results else _own_ids(boxes),
+    )
+
+
+def _load(path: Path) -> Any:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file", hint="give a JSON file with detections in COCO's format")
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError, RecursionError) as error:
+        raise InputError(f"{path}: cannot be read as JSON: {error}", hint="is it whole? Write it again") from error
+
+
+def _boxes_in(content: Any, path: Path) -> list[Any]:
+    boxes: list[Any] = content if isinstance(content, list) else _list_in(content, "annotations", path)
+    if not boxes:
+        raise InputError(f"{path}: there are no detections in it", hint="did the detector find anything?")
+    return boxes
+
+
+def _list_in(content: Any, key: str, path: Path) -> list[Any]:
+    found = content.get(key) if isinstance(content, dict) else None
+    if not isinstance(found, list):
+        raise InputError(
+            f"{path}: expected a list of results, or an object with lists named images and annotations; "
+            f"there is no list named {key}",
+            hint="is it a COCO file?",
+        )
+    return found
+
+
+def _names_of_annotations(boxes: _Entries, listed: _Entries) -> list[str]:
+    image_ids = boxes.column("image_id", _ID)
+    ids, names = listed.column("id", _ID), listed.column("file_name", _TEXT)
+    name_of = _without_repeats(ids, names, listed.where)
+    unlisted = [row for row, image_id in enumerate(image_ids) if image_id not in name_of]
+    if unlisted:
+        raise InputError(
+            f"{boxes.where}[{unlisted[0]}]: image_id {image_ids[unlisted[0]]!r} is not in images "
+            f"({len(unlisted)} entries)",
+            hint="add the image with its file_name to images, or remove these entries",
+        )
+    return [name_of[image_id] for image_id in image_ids]
+
+
+def _names_of_results(boxes: _Entries) -> list[str]:
+    """Return the file name of each result: a bare number might be the id of another image elsewhere."""
+    image_ids = boxes.column("image_id", _ID, default="")
+    names: list[str] = [
+        name or (image_id if isinstance(image_id, str) else "")
+        for name, image_id in zip(boxes.column("file_name", _MAYBE_TEXT, default=""), image_ids, strict=True)
+    ]
+    unnamed = [row for row, name in enumerate(names) if not name]
+    if unnamed:
+        raise InputError(
+            f"{boxes.where}[{unnamed[0]}]: image_id {image_ids[unnamed[0]]!r} does not say which file it is "
+            f"({len(unnamed)} entries)",
+            hint="add file_name to every result, or put the results as annotations into an object, beside "
+            "the list named images that the detector ran on",
+        )
+    return names
+
+
+def _without_repeats(ids: list[Any], texts: list[str], where: str) -> dict[Any, str]:
+    found = dict(zip(ids, texts, strict=True))
+    if len(found) < len(ids):
+        row = next(row for row, key in enumerate(ids) if key in ids[:row])
+        raise InputError(f"{where}[{row}]: id {ids[row]!r} is there twice", hint="give every entry an id of its own")
+    return found
+
+
+def _refuse_unknown(where: str, names: list[str], row_of: dict[str, int], known: list[str]) -> None:
+    unknown = {name for name in names if name not in row_of}
+    if unknown:
+        row = next(row for row, name in enumerate(names) if name in unknown)
+        raise InputError(
+            f"{where}[{row}]: image {names[row]!r} is not among the images with a pose ({len(unknown)} of "
+            f"{len(set(names))} images with detections are not)",
+            hint=f"images are matched by file name, as in {known[0]!r}: correct the names, or remove the "
+            "detections of images that have no pose",
+        )
+
+
+def _refuse_other_sizes(
+    listed: _Entries, used: set[str], row_of: dict[str, int], images: Images, cameras: Cameras
+) -> None:
+    """Refuse boxes that were made on pictures of another size than the model's, resized or undistorted."""
+    camera_row = rows_of(images.camera_id, cameras.camera_id)
+    for row, entry in enumerate(listed.entries):
+        name, size = entry["file_name"], (entry.get("width"), entry.get("height"))
+        if name not in used or None in size:
+            continue
+        camera = camera_row[row_of[name]]
+        expected = (int(cameras.width_px[camera]), int(cameras.height_px[camera]))
+        if size != expected:
+            raise InputError(
+                f"{listed.where}[{row}]: {name!r}: expected {expected[0]} x {expected[1]} px as in the "
+                f"model, found {size[0]} x {size[1]}",
+                hint="run the detector on the pictures that the model was made of, or scale boxes and sizes",
+            )
+
+
+def _class_names(boxes: _Entries, content: Any, path: Path) -> list[str]:
+    category_ids = boxes.column("category_id", _ID)
+    if isinstance(content, list) or not content.get("categories"):
+        return [key if isinstance(key, str) else f"class-{key}" for key in category_ids]
+    categories = _Entries(f"{path}: categories", _list_in(content, "categories", path))
+    name_of = _without_repeats(categories.column("id", _ID), categories.column("name", _TEXT), categories.where)
+    unnamed = [row for row, category_id in enumerate(category_ids) if category_id not in name_of]
+    if unnamed:
+        raise InputError(
+            f"{boxes.where}[{unnamed[0]}]: category_id {category_ids[unnamed[0]]!r} is not in categories "
+            f"({len(unnamed)} entries)",
+            hint="add it to categories, or remove these entries",
+        )
+    return [name_of[category_id] for category_id in category_ids]
+
+
+def _own_ids(boxes: _Entries) -> Ints | None:
+    ids = [entry.get("id") for entry in boxes.entries]
+    is_whole = all(type(value) is int and 0 <= value < 2**63 for value in ids)
+    return np.array(ids, dtype=np.int64) if is_whole and len(set(ids)) == len(ids) else None

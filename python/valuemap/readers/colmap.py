@@ -1,0 +1,171 @@
+"""COLMAP models (text and binary, with or without rigs) with detections in COCO's format."""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import pyarrow as pa
+import pycolmap
+
+from valuemap.dataset import Dataset
+from valuemap.errors import InputError
+from valuemap.progress import Progress, silent
+from valuemap.readers.assemble import ONE_PASS, assemble
+from valuemap.readers.coco import read_coco
+from valuemap.readers.colmap_files import find_model
+from valuemap.readers.csv_file import read_csv
+from valuemap.readers.names import match_images
+from valuemap.tables import Cameras, Categories, Images
+
+
+def read_colmap(
+    model_dir: Path,
+    *,
+    detections: Path,
+    pass_from: str = "folder",
+    up: tuple[float, float, float] | None = None,
+    anchor: tuple[float, float, float] | None = None,
+    progress: Progress = silent,
+) -> Dataset:
+    """Read a COLMAP model and the detections in its images.
+
+    Camera, image and pose conventions of valuemap are COLMAP's own, so numbers and ids are taken as they are.
+    Images without a pose are left out, as COLMAP's own exports do.
+
+    Parameters
+    ----------
+    model_dir
+        Folder with cameras, images and, where both exist, rigs and frames, as .bin (preferred) or .txt.
+    detections
+        COCO annotations or results, see `read_coco`.
+    pass_from
+        "folder" (the folder part of the image name is its pass), "none" (all images are one pass), or the
+        path of a CSV file with columns image and pass.
+    up, anchor
+        As in `assemble`.
+
+    Raises
+    ------
+    InputError
+        A file is missing, damaged or inconsistent with the others.
+    SettingError
+        `up` or `anchor` is impossible.
+    """
+    progress("reading the COLMAP model", 0, 2)
+    cameras, images = _read_model(model_dir, pass_from)
+    progress("reading the detections", 1, 2)
+    found = read_coco(detections, images, cameras)
+    dataset = assemble(
+        name=model_dir.resolve().name,
+        cameras=cameras,
+        images=images,
+        detections=found,
+        up=up,
+        anchor=anchor,
+        source=str(model_dir),
+    )
+    progress("reading the detections", 2, 2)
+    return dataset
+
+
+def _read_model(model_dir: Path, pass_from: str) -> tuple[Cameras, Images]:
+    model = _load(find_model(model_dir), model_dir)
+    cameras = [model.cameras[camera_id] for camera_id in sorted(model.cameras)]
+    images = [model.images[image_id] for image_id in sorted(model.images) if model.images[image_id].has_pose]
+    if not images:
+        raise InputError(
+            f"{model_dir}: the model has no image with a pose",
+            hint="is this the folder of a finished reconstruction?",
+        )
+    names = [image.name for image in images]
+    return (
+        Cameras(
+            camera_id=np.array([camera.camera_id for camera in cameras], dtype=np.int64),
+            model=Categories.from_texts([camera.model.name for camera in cameras]),
+            width_px=np.array([camera.width for camera in cameras], dtype=np.int64),
+            height_px=np.array([camera.height for camera in cameras], dtype=np.int64),
+            params=[np.array(camera.params, dtype=np.float64) for camera in cameras],
+        ),
+        _with_poses(images, names, Categories.from_texts(_passes(names, pass_from)), model_dir),
+    )
+
+
+def _load(files: list[Path], model_dir: Path) -> pycolmap.Reconstruction:
+    """Read the files through a folder of links that has no points: they are not needed, and may be many."""
+    suffix = files[0].suffix
+    with tempfile.TemporaryDirectory() as folder:
+        for path in files:
+            (Path(folder) / path.name).symlink_to(path.resolve())
+        (Path(folder) / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
+        try:
+            model = pycolmap.Reconstruction(folder)
+            for image in model.images.values():
+                _ = image.name  # Fails where it is not UTF-8.
+        except Exception as error:  # pybind11 gives what C++ throws many types.
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise InputError(
+                f"{model_dir}: pycolmap cannot read {', '.join(path.name for path in files)}: {reason}",
+                hint="does COLMAP's own model_analyzer read it? If not, export it again",
+            ) from error
+    return model
+
+
+def _with_poses(images: list[pycolmap.Image], names: list[str], pass_id: Categories, model_dir: Path) -> Images:
+    poses = [image.cam_from_world() for image in images]
+    quaternion = np.array([pose.rotation.quat for pose in poses])[:, [3, 0, 1, 2]]  # pycolmap: x, y, z, w.
+    translation_m = np.array([pose.translation for pose in poses])
+    wrong = np.flatnonzero(~np.isfinite(np.hstack([quaternion, translation_m])).all(axis=1))
+    if len(wrong):
+        row = wrong[0]
+        raise InputError(
+            f"{model_dir}: image {names[row]!r}: pose: expected finite numbers, "
+            f"found {quaternion[row].tolist()} {translation_m[row].tolist()} ({len(wrong)} images)",
+            hint="repair the poses of these images, or remove the images",
+        )
+    repeated = [name for name, count in Counter(names).items() if count > 1]
+    if repeated:
+        raise InputError(
+            f"{model_dir}: {len(repeated)} image names occur more than once, the first is {min(repeated)!r}",
+            hint="detections are matched by file name: give every image a name of its own",
+        )
+    return Images(
+        image_id=np.array([image.image_id for image in images], dtype=np.int64),
+        name=pa.array(names, pa.string()),
+        camera_id=np.array([image.camera_id for image in images], dtype=np.int64),
+        cam_from_world_quat=quaternion,
+        cam_from_world_m=translation_m,
+        pass_id=pass_id,
+    )
+
+
+def _passes(names: list[str], pass_from: str) -> list[str]:
+    if pass_from == "none":
+        return [ONE_PASS] * len(names)
+    if pass_from == "folder":
+        return [folder if (folder := str(PurePosixPath(name).parent)) != "." else ONE_PASS for name in names]
+    path = Path(pass_from)
+    if not path.is_file():
+        raise InputError(
+            f"pass-from: expected folder, none or a CSV file, found {pass_from!r}: no such file",
+            hint="a CSV file has the columns image and pass",
+        )
+    table = read_csv(path, {"image": pa.string(), "pass": pa.string()}, {})
+    pass_of: dict[str, str] = {}
+    for image, name in zip(table["image"].to_pylist(), table["pass"].to_pylist(), strict=True):
+        if pass_of.setdefault(image, name) != name:
+            raise InputError(
+                f"{path}: image {image!r} is in two passes, {pass_of[image]!r} and {name!r}",
+                hint="give every image one line",
+            )
+    listed = list(pass_of)
+    found = match_images(names, listed)
+    missing = [name for name in names if name not in found]
+    if missing:
+        raise InputError(
+            f"{path}: image {missing[0]!r} of the model is not in it ({len(missing)} of {len(names)} images)",
+            hint="list every image of the model with its pass",
+        )
+    return [pass_of[listed[found[name]]] for name in names]

@@ -1,0 +1,148 @@
+"""Finding the files of a COLMAP model, and refusing what pycolmap would read in part without a word.
+
+pycolmap reads past the end of a cut binary file (whatever was in memory, or for ever), stops at the last
+whole image of a cut images.txt, and takes an image for the points of the one before where a second line is
+missing.
+"""
+
+from __future__ import annotations
+
+import mmap
+import re
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import pycolmap
+
+from valuemap.errors import InputError
+
+_NEEDED = ("cameras", "images")
+_OPTIONAL = ("rigs", "frames")
+_POSE_BYTES = 7 * 8
+
+
+def find_model(model_dir: Path) -> list[Path]:
+    """Return the files of a model to read: cameras, images, and rigs and frames where both exist.
+
+    Binary files are preferred to text where both are whole sets, as in COLMAP. Points are not needed.
+
+    Raises
+    ------
+    InputError
+        There is no model, or one of its files is cut short or lacks lines.
+    """
+    if not model_dir.is_dir():
+        raise InputError(f"{model_dir}: no such folder", hint="give the folder with cameras.bin and images.bin or .txt")
+    for suffix, check in ((".bin", _check_binary), (".txt", _check_text)):
+        needed = [model_dir / f"{name}{suffix}" for name in _NEEDED]
+        if all(path.is_file() for path in needed):
+            rig_files = [model_dir / f"{name}{suffix}" for name in _OPTIONAL]
+            files = needed + (rig_files if all(path.is_file() for path in rig_files) else [])
+            for path in files:
+                check(path)
+            return files
+    found = sorted(path.name for path in model_dir.iterdir() if path.stem in _NEEDED + _OPTIONAL)
+    raise InputError(
+        f"{model_dir}: not a COLMAP model: expected cameras.bin and images.bin, or both as .txt, "
+        f"found {' and '.join(found) or 'none of them'}",
+        hint="give the folder that COLMAP wrote the model to, often sparse/0",
+    )
+
+
+def _check_binary(path: Path) -> None:
+    record_end = _RECORD_ENDS[path.stem]
+    size = path.stat().st_size
+    end, records = -1, 0
+    if size >= 8:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            (records,) = struct.unpack_from("<Q", data)
+            end = 8
+            try:
+                for _ in range(records):
+                    end = record_end(data, end)
+            except (struct.error, ValueError, OverflowError):  # Past the end, or not a camera model.
+                end = -1
+    if end != size:
+        raise InputError(
+            f"{path}: damaged or cut short: it announces {records} {path.stem}, which do not make its {size} bytes",
+            hint="copy or export the model again",
+        )
+
+
+def _camera_end(data: mmap.mmap, start: int) -> int:
+    (model,) = struct.unpack_from("<i", data, start + 4)
+    names = pycolmap.Camera(model=pycolmap.CameraModelId(model), width=1, height=1).params_info
+    return start + 24 + 8 * len(names.split(","))
+
+
+def _image_end(data: mmap.mmap, start: int) -> int:
+    name_end = data.find(b"\0", start + 8 + _POSE_BYTES)
+    if name_end < 0:
+        raise ValueError
+    (points,) = struct.unpack_from("<Q", data, name_end + 1)
+    return int(name_end + 9 + 24 * points)
+
+
+def _rig_end(data: mmap.mmap, start: int) -> int:
+    (sensors,) = struct.unpack_from("<I", data, start + 4)
+    end = start + 8 + (8 if sensors else 0)
+    for _ in range(sensors - 1):
+        (has_pose,) = struct.unpack_from("<B", data, end + 8)
+        end += 9 + (_POSE_BYTES if has_pose else 0)
+    return end
+
+
+def _frame_end(data: mmap.mmap, start: int) -> int:
+    (images,) = struct.unpack_from("<I", data, start + 8 + _POSE_BYTES)
+    return int(start + 12 + _POSE_BYTES + 16 * images)
+
+
+_RECORD_ENDS: dict[str, Callable[[mmap.mmap, int], int]] = {
+    "cameras": _camera_end,
+    "images": _image_end,
+    "rigs": _rig_end,
+    "frames": _frame_end,
+}
+
+
+def _check_text(path: Path) -> None:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text: {error}", hint="export the model again") from error
+    records = _count_images(path, lines) if path.stem == "images" else sum(map(_is_data, lines))
+    announced = re.search(r"^# Number of \w+: (\d+)", "\n".join(lines[:10]), re.MULTILINE)
+    if announced and records < int(announced[1]):
+        raise InputError(
+            f"{path}: cut short: it announces {announced[1]} {path.stem} and holds {records}",
+            hint="copy or export the model again, or correct the comment in its first lines",
+        )
+
+
+def _is_data(line: str) -> bool:
+    return bool(line.strip()) and not line.lstrip().startswith("#")
+
+
+def _count_images(path: Path, lines: list[str]) -> int:
+    """Return the number of images: each has a line for its pose and one, maybe empty, for its points."""
+    count, row = 0, 0
+    while row < len(lines):
+        if not _is_data(lines[row]):
+            row += 1
+            continue
+        fields = lines[row].split()
+        if len(fields) != 10:
+            raise InputError(
+                f"{path} line {row + 1}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, "
+                f"found {len(fields)} fields",
+                hint="image names with spaces are only possible in a binary model (COLMAP's model_converter)",
+            )
+        if row + 1 == len(lines) or len(lines[row + 1].split()) % 3:
+            raise InputError(
+                f"{path} line {row + 2}: expected an empty line, or the points of image {fields[9]!r} "
+                "(X Y POINT3D_ID ...)",
+                hint="every image takes two lines; the second may be empty, but it must be there",
+            )
+        count, row = count + 1, row + 2
+    return count

@@ -1,0 +1,49 @@
+"""Reading a CSV file with known columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import pyarrow as pa
+from pyarrow import csv
+
+from valuemap.errors import InputError
+
+_NAMES = {pa.int64(): "whole numbers", pa.float64(): "numbers", pa.string(): "texts"}
+
+
+def read_csv(path: Path, required: Mapping[str, pa.DataType], optional: Mapping[str, pa.DataType]) -> pa.Table:
+    """Return the named columns of a comma-separated file with a header line, in the types given.
+
+    Optional columns that are absent are left out, as are columns that nobody asked for. There are no missing
+    values: an empty field is an empty text, and no number.
+
+    Raises
+    ------
+    InputError
+        The file is missing, empty or no CSV, lacks a column, or a value is not of its type.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file", hint="check the path")
+    expected = ", ".join(f"{name} ({_NAMES[kind]})" for name, kind in required.items())
+    try:
+        table = csv.read_csv(
+            path,
+            read_options=csv.ReadOptions(use_threads=False),  # Else errors do not say the row.
+            convert_options=csv.ConvertOptions(column_types={**required, **optional}, null_values=[]),
+        )
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{path}: {reason}", hint=f"expected a CSV file with columns {expected}") from error
+    columns = [name for name in (*required, *optional) if name in required or name in table.column_names]
+    for name in columns:
+        if table.column_names.count(name) != 1:
+            found = ", ".join(table.column_names)
+            raise InputError(
+                f"{path}: expected one column {name!r} in the first line, found {found}",
+                hint=f"expected a CSV file with columns {expected}",
+            )
+    if table.num_rows == 0:
+        raise InputError(f"{path}: no rows after the first line", hint="check what wrote the file")
+    return table.select(columns)
