@@ -1,0 +1,92 @@
+"""What the cameras can see: which targets stand in which pictures, and where exactly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from valuemap.config import SimulationConfig
+from valuemap.progress import Progress
+from valuemap.simulate.city import Targets
+from valuemap.simulate.drives import Frames
+from valuemap.simulate.rows import join_rows
+from valuemap.simulate.streets import Streets
+from valuemap.tables import Floats, Ints, Table
+
+_CHUNK_FRAMES = 50_000
+_NEAREST_M = 1.0
+_NARROWEST = 0.3
+"""A light seen from the side still looks this wide, as share of its width: it has visors."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings(Table):
+    """Targets in view, sorted by frame, then target: rows (N) of both, true centre and size (N, 2) in pixels."""
+
+    frame_row: Ints
+    target_row: Ints
+    center_px: Floats
+    size_px: Floats
+
+
+def see(
+    targets: Targets,
+    frames: Frames,
+    streets: Streets,
+    config: SimulationConfig,
+    *,
+    progress: Progress,
+    what: str,
+) -> Sightings:
+    """Return all views of targets: near enough, inside the picture, facing the camera, no house between."""
+    chunks = []
+    for start in range(0, len(frames), _CHUNK_FRAMES):
+        rows = np.arange(start, min(start + _CHUNK_FRAMES, len(frames)))
+        seen = _see_in_chunk(targets, frames.take(rows), streets, config)
+        chunks.append(seen.replace(frame_row=seen.frame_row + start))
+        progress(what, int(rows[-1]) + 1, len(frames))
+    return join_rows(chunks)
+
+
+def _see_in_chunk(targets: Targets, frames: Frames, streets: Streets, config: SimulationConfig) -> Sightings:
+    frame_row, target_row = _pairs_within(frames, targets, config.max_sight_m)
+    center, position = frames.center_in_world_m[frame_row], targets.position_in_world_m[target_row]
+    to_target = position - center
+    cos_facing = _cos_facing(to_target, targets.facing_rad[target_row])
+    in_cam = np.einsum("nij,nj->ni", frames.cam_from_world()[frame_row], to_target)
+    depth_m = np.maximum(in_cam[:, 2:], _NEAREST_M)
+    picture_px = np.array([config.image_width_px, config.image_height_px])
+    from_middle_px = config.focal_px * in_cam[:, :2] / depth_m
+    size_px = config.focal_px * targets.size_m[target_row] / depth_m
+    size_px[:, 0] *= np.maximum(cos_facing, _NARROWEST)
+    only_pass = targets.pass_row[target_row]
+    seen = (
+        ((only_pass < 0) | (only_pass == frames.pass_row[frame_row]))
+        & (in_cam[:, 2] > _NEAREST_M)
+        & (cos_facing >= np.cos(np.radians(config.max_facing_deg)))
+        & (size_px[:, 1] >= config.min_box_height_px)
+        & np.all(np.abs(from_middle_px) <= (picture_px - size_px) / 2.0, axis=1)
+    )
+    rows = np.flatnonzero(seen)
+    rows = rows[~streets.is_hidden_by_houses(center[rows, :2], position[rows, :2])]
+    rows = rows[np.lexsort((target_row[rows], frame_row[rows]))]
+    center_px = picture_px / 2.0 + from_middle_px[rows]
+    return Sightings(frame_row[rows], target_row[rows], center_px, size_px[rows])
+
+
+def _cos_facing(to_target: Floats, facing_rad: Floats) -> Floats:
+    """Return the cosine (N), on the ground, between where targets face and where the camera is from them."""
+    along = to_target[:, 0] * np.cos(facing_rad) + to_target[:, 1] * np.sin(facing_rad)
+    cosine: Floats = -along / np.maximum(np.hypot(to_target[:, 0], to_target[:, 1]), 1e-9)
+    return cosine
+
+
+def _pairs_within(frames: Frames, targets: Targets, radius_m: float) -> tuple[Ints, Ints]:
+    """Return the rows (frame, target) of all pairs closer than a radius on the ground."""
+    if len(targets) == 0:
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    trees = [cKDTree(points[:, :2]) for points in (frames.center_in_world_m, targets.position_in_world_m)]
+    pairs = trees[0].sparse_distance_matrix(trees[1], radius_m, output_type="ndarray")
+    return pairs["i"].astype(np.int64), pairs["j"].astype(np.int64)
