@@ -1,0 +1,593 @@
+"""Evaluation: matching against a search of all matchings, recoverable objects against all pairs, and the figures."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.optimize import linear_sum_assignment
+
+from small_dataset import ANCHOR, map_of, small_dataset
+from valuemap.dataset import Dataset, Frame, write_dataset
+from valuemap.errors import InputError, SettingError
+from valuemap.evaluate import Evaluation, TrueObjects, evaluate_map, match_labels, recoverable_objects
+from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
+from valuemap.map_folder import Map, write_map
+from valuemap.tables import Categories, Floats, Truth, TruthDetections, write_table
+
+JSON_NAMES = [
+    "true_positives",
+    "duplicates",
+    "false_positives",
+    "false_negatives",
+    "recall",
+    "precision",
+    "position_rmse_m",
+    "position_median_m",
+    "horizontal_rmse_m",
+    "vertical_rmse_m",
+    "mean_reprojection_error_px",
+]
+
+
+def truth_of(positions: Any, classes: list[str] | None = None) -> Truth:
+    position = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
+    names = classes if classes is not None else ["light"] * len(position)
+    return Truth(np.arange(len(position)), Categories.from_texts(names), position)
+
+
+def objects_of(positions: Floats, classes: list[str] | None = None) -> TrueObjects:
+    return TrueObjects(
+        np.arange(len(positions)), positions, None if classes is None else Categories.from_texts(classes)
+    )
+
+
+def counts(evaluation: Evaluation) -> tuple[int, int, int, int]:
+    return (
+        evaluation.true_positives,
+        evaluation.duplicates,
+        evaluation.false_positives,
+        evaluation.false_negatives,
+    )
+
+
+# Exact cases.
+
+
+def test_a_map_worked_out_by_hand() -> None:
+    """Four labels: 0.3 m east and 0.4 m above its object, a duplicate of it, a false one, 1 m south of its object."""
+    truth = truth_of([[0.0, 0.0, 5.0], [20.0, 0.0, 5.0], [40.0, 0.0, 5.0]])
+    result = map_of(
+        [[0.3, 0.0, 5.4], [0.0, 1.5, 5.0], [60.0, 0.0, 5.0], [20.0, -1.0, 5.0]], residual_px=[1.0, 2.0, 6.0]
+    )
+    evaluation = evaluate_map(result, truth)
+    assert counts(evaluation) == (2, 1, 1, 1)
+    assert (evaluation.labels, evaluation.objects, evaluation.recoverable_objects) == (4, 3, 3)
+    assert evaluation.precision == 0.5
+    assert evaluation.recall == pytest.approx(2 / 3)
+    assert evaluation.position_rmse_m == pytest.approx(math.sqrt((0.25 + 1.0) / 2))
+    assert evaluation.position_median_m == pytest.approx(0.75)
+    assert evaluation.horizontal_rmse_m == pytest.approx(math.sqrt((0.09 + 1.0) / 2))
+    assert evaluation.vertical_rmse_m == pytest.approx(math.sqrt(0.16 / 2))
+    assert evaluation.mean_reprojection_error_px == pytest.approx(3.0)
+    matches = evaluation.matches
+    assert matches.label_outcome.texts() == ["true", "duplicate", "false", "true"]
+    assert matches.object_outcome.texts() == ["found", "found", "missed"]
+    assert_array_equal(matches.object_of_label, [0, -1, -1, 1])
+    assert_array_equal(matches.label_of_object, [0, 3, -1])
+
+
+def test_most_matches_come_before_the_nearest() -> None:
+    """The label at 1 is nearest to the object at 1.2, but only that label reaches the object at -0.9."""
+    matches = match_labels(
+        map_of([[1.0, 0, 0], [3.1, 0, 0]]).labels, objects_of(np.array([[-0.9, 0, 0], [1.2, 0, 0]])), Frame()
+    )
+    assert_array_equal(matches.object_of_label, [0, 1])
+
+
+def test_of_equally_many_matches_the_shortest_count() -> None:
+    matches = match_labels(
+        map_of([[0.0, 0, 0], [1.0, 0, 0]]).labels, objects_of(np.array([[0.9, 0, 0], [0.2, 0, 0]])), Frame()
+    )
+    assert_array_equal(matches.object_of_label, [1, 0])
+
+
+def test_the_radius_itself_is_within() -> None:
+    for radius_m, expected in ((2.0, (1, 0, 0, 0)), (1.999, (0, 0, 1, 1))):
+        assert counts(evaluate_map(map_of([[2.0, 0, 0]]), truth_of([[0, 0, 0]]), radius_m=radius_m)) == expected
+
+
+def test_a_label_on_the_spot_is_a_match() -> None:
+    evaluation = evaluate_map(map_of([[1.0, 2, 3], [1.0, 2, 3]]), truth_of([[1, 2, 3]]))
+    assert counts(evaluation) == (1, 1, 0, 0)
+    assert evaluation.position_rmse_m == 0.0
+
+
+def test_classes_do_not_mix() -> None:
+    result = map_of([[0.0, 0, 0], [10.0, 0, 0]], ["light", "sign"])
+    evaluation = evaluate_map(result, truth_of([[0, 0, 0], [10, 0, 0]], ["sign", "sign"]))
+    assert counts(evaluation) == (1, 0, 1, 1)
+    assert evaluation.matches.label_outcome.texts() == ["false", "true"]
+
+
+def test_a_class_that_the_truth_does_not_know_is_false() -> None:
+    assert counts(evaluate_map(map_of([[0.0, 0, 0]], ["tree"]), truth_of([[0, 0, 0]]))) == (0, 0, 1, 1)
+
+
+def test_a_map_without_labels() -> None:
+    evaluation = evaluate_map(map_of([]), truth_of([[0, 0, 0]]))
+    assert counts(evaluation) == (0, 0, 0, 1)
+    assert evaluation.recall == 0.0
+    assert evaluation.to_json()["precision"] is None
+
+
+def test_up_says_what_is_vertical() -> None:
+    """With up = -y, an offset of 3 along y and 4 along z is 3 high and 4 far."""
+    result = map_of([[0.0, 0.3, 0.4]], frame=Frame(up=(0.0, -1.0, 0.0)))
+    evaluation = evaluate_map(result, truth_of([[0, 0, 0]]))
+    assert evaluation.vertical_rmse_m == pytest.approx(0.3)
+    assert evaluation.horizontal_rmse_m == pytest.approx(0.4)
+    assert evaluation.position_rmse_m == pytest.approx(0.5)
+
+
+# What is printed.
+
+
+def test_json_has_exactly_the_documented_names() -> None:
+    values = evaluate_map(map_of([[0.0, 0, 0]], residual_px=[1.5]), truth_of([[0, 0, 0]])).to_json()
+    assert list(values) == JSON_NAMES
+    assert values["mean_reprojection_error_px"] == 1.5
+
+
+def test_json_of_nothing_is_null_and_not_nan() -> None:
+    evaluation = evaluate_map(map_of([[9.0, 0, 0]]), truth_of([[0, 0, 0]]))
+    parsed = json.loads(json.dumps(evaluation.to_json(), allow_nan=False))
+    assert parsed["position_rmse_m"] is None
+    assert parsed["mean_reprojection_error_px"] is None
+    assert parsed["recall"] == 0.0
+
+
+def test_the_documentation_names_what_json_prints() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "evaluation.md").read_text(encoding="utf-8")
+    for name in JSON_NAMES:
+        assert f"`{name}`" in text
+
+
+def test_the_output_says_when_every_object_counts() -> None:
+    dataset = small_dataset()
+    result = map_of([[4.0, 25.0, 5.0]])
+    assert evaluate_map(result, dataset).notes == ()
+    (note,) = evaluate_map(result, Dataset(**{**vars(dataset), "truth_detections": None})).notes
+    assert note.startswith("every true object counts as recoverable")
+
+
+# The matching against slower ways.
+
+
+def best_of_all_matchings(distance: Floats, radius_m: float) -> tuple[int, float]:
+    """Try every one-to-one matching (labels x objects): most matches, then smallest sum."""
+    labels, objects = distance.shape
+    best = (0, 0.0)
+    for size in range(1, min(labels, objects) + 1):
+        for some_labels in itertools.combinations(range(labels), size):
+            for some_objects in itertools.permutations(range(objects), size):
+                parts = distance[list(some_labels), list(some_objects)]
+                if np.all(parts <= radius_m) and (size > best[0] or parts.sum() < best[1]):
+                    best = (size, float(parts.sum()))
+    return best
+
+
+points = st.lists(st.tuples(st.integers(0, 12), st.integers(0, 3)), max_size=4)
+
+
+@settings(max_examples=150, deadline=None)
+@given(points, points, st.sampled_from([0.5, 2.0, 3.0]))
+def test_the_matching_is_the_best_of_all(
+    labels: list[tuple[int, int]], objects: list[tuple[int, int]], radius_m: float
+) -> None:
+    label_points = np.array([(x / 2, y / 2, 0.0) for x, y in labels]).reshape(-1, 3)
+    object_points = np.array([(x / 2, y / 2, 0.0) for x, y in objects]).reshape(-1, 3)
+    matches = match_labels(map_of(label_points).labels, objects_of(object_points), Frame(), radius_m=radius_m)
+    distance = np.linalg.norm(label_points[:, None] - object_points[None], axis=2)
+    found = np.flatnonzero(matches.object_of_label >= 0)
+    chosen = distance[found, matches.object_of_label[found]]
+    assert len(set(matches.object_of_label[found])) == len(found)
+    assert np.all(chosen <= radius_m)
+    count, total = best_of_all_matchings(distance, radius_m)
+    assert len(found) == count
+    assert chosen.sum() == pytest.approx(total, abs=1e-9)
+
+
+@pytest.mark.parametrize("radius_m", [1.0, 2.0, 8.0])
+def test_a_large_matching_is_that_of_the_dense_algorithm(radius_m: float) -> None:
+    """Crowded enough that most labels have several objects to choose from."""
+    random = np.random.default_rng(8)
+    objects = random.uniform(0.0, 25.0, (300, 3)) * [1.0, 1.0, 0.1]
+    labels = np.concatenate([objects[:250], objects[:60]]) + random.normal(0.0, 0.6, (310, 3))
+    matches = match_labels(map_of(labels).labels, objects_of(objects), Frame(), radius_m=radius_m)
+    distance = np.linalg.norm(labels[:, None] - objects[None], axis=2)
+    cost = np.where(distance <= radius_m, distance - 1e4, 0.0)
+    rows, columns = linear_sum_assignment(cost)
+    is_match = cost[rows, columns] < 0.0
+    found = np.flatnonzero(matches.object_of_label >= 0)
+    assert len(found) == is_match.sum()
+    total = distance[rows, columns][is_match].sum()
+    assert distance[found, matches.object_of_label[found]].sum() == pytest.approx(total, abs=1e-6)
+    near = (distance <= radius_m).any(axis=1)
+    expected = np.where(matches.object_of_label >= 0, "true", np.where(near, "duplicate", "false"))
+    assert matches.label_outcome.texts() == expected.tolist()
+
+
+def test_every_label_and_every_object_has_one_outcome() -> None:
+    random = np.random.default_rng(4)
+    objects = random.uniform(0.0, 60.0, (200, 3)) * [1, 1, 0.05]
+    labels = np.concatenate([objects[:120] + random.normal(0.0, 0.7, (120, 3)), random.uniform(0.0, 60.0, (60, 3))])
+    evaluation = evaluate_map(map_of(labels), truth_of(objects))
+    assert evaluation.true_positives + evaluation.duplicates + evaluation.false_positives == 180
+    assert evaluation.true_positives + evaluation.false_negatives == 200
+    matches = evaluation.matches
+    found = matches.object_of_label >= 0
+    assert_array_equal(matches.label_of_object[matches.object_of_label[found]], np.flatnonzero(found))
+
+
+# Recoverable objects.
+
+
+def scene_of_views(centers: list[Floats], positions: Floats, *, same_image_twice: bool = False) -> Dataset:
+    """Return a dataset in which object i is detected from centers[i] (n, 3), each view an image of its own."""
+    base = small_dataset()
+    center = np.concatenate(centers)
+    ids = np.arange(len(center))
+    identity = np.tile([1.0, 0.0, 0.0, 0.0], (len(center), 1))
+    object_id = np.repeat(np.arange(len(positions)), [len(c) for c in centers])
+    images = type(base.images)(
+        ids,
+        pa.array([str(i) for i in ids]),
+        np.ones_like(ids),
+        identity,
+        -center,
+        Categories.from_texts(["p"] * len(ids)),
+    )
+    detections = type(base.detections)(
+        ids,
+        ids,
+        Categories.from_texts(["light"] * len(ids)),
+        np.full((len(ids), 2), 100.0),
+        np.ones((len(ids), 2)),
+        np.ones(len(ids)),
+    )
+    pairs = TruthDetections(ids, object_id)
+    if same_image_twice:
+        detections = detections.replace(image_id=np.zeros_like(ids))
+    return Dataset("views", Frame(), base.cameras, images, detections, truth_of(positions), pairs)
+
+
+def widest_angle(centers: Floats, position: Floats) -> float:
+    """Try every pair of views."""
+    direction = (position - centers) / np.linalg.norm(position - centers, axis=1, keepdims=True)
+    angles = [
+        math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b)) for a, b in itertools.combinations(direction, 2)
+    ]
+    return max(angles, default=-1.0)
+
+
+def test_recoverable_objects_are_those_of_all_pairs() -> None:
+    """Objects seen 0 to 40 times from places whose spread straddles the limit in every way."""
+    random = np.random.default_rng(11)
+    positions = random.uniform(-50.0, 50.0, (200, 3))
+    centers = [
+        position
+        + [0.0, -40.0, 0.0]
+        + random.normal(0.0, random.choice([0.02, 0.3, 0.6, 3.0]), (random.integers(0, 40), 3))
+        for position in positions
+    ]
+    min_parallax = math.radians(2.0)
+    expected = [
+        widest_angle(c, p) >= min_parallax if len(c) > 1 else False for c, p in zip(centers, positions, strict=True)
+    ]
+    found = recoverable_objects(scene_of_views(centers, positions), min_parallax)
+    assert found is not None
+    assert 50 < np.sum(expected) < 150
+    assert_array_equal(found, expected)
+
+
+def test_the_widest_pair_need_not_include_the_first_view() -> None:
+    """Views at -0.6, 0, and 0.6 degrees, the middle one first: 1.2 degrees between the outer ones."""
+    angles = np.radians([0.0, -0.6, 0.6])
+    centers = -30.0 * np.stack([np.sin(angles), np.cos(angles), np.zeros(3)], axis=1)
+    dataset = scene_of_views([centers], np.zeros((1, 3)))
+    for limit, expected in ((1.19, True), (1.21, False)):
+        assert_array_equal(recoverable_objects(dataset, math.radians(limit)), [expected])
+
+
+def test_an_object_with_thousands_of_views_is_measured_exactly() -> None:
+    """A ring of 3001 views, 1.5 degrees across: no pair reaches more, opposite ones just do."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 3001)
+    radius = 40.0 * math.tan(math.radians(0.75))
+    centers = np.stack([radius * np.cos(turn), np.full(3001, -40.0), radius * np.sin(turn)], axis=1)
+    centers = np.concatenate([[[0.0, -40.0, 0.0]], centers])
+    dataset = scene_of_views([centers], np.zeros((1, 3)))
+    for limit, expected in ((1.4999, True), (1.5001, False)):
+        assert_array_equal(recoverable_objects(dataset, math.radians(limit)), [expected])
+
+
+def test_two_detections_in_one_image_are_one_view() -> None:
+    centers = [np.array([[0.0, -40.0, 0.0], [40.0, 0.0, 0.0]])]
+    positions = np.zeros((1, 3))
+    assert_array_equal(recoverable_objects(scene_of_views(centers, positions), 0.0), [True])
+    assert_array_equal(recoverable_objects(scene_of_views(centers, positions, same_image_twice=True), 0.0), [False])
+
+
+def test_objects_that_are_not_recoverable_do_not_count_in_the_recall() -> None:
+    """Of three objects one is seen once: its label is still true, its absence no miss."""
+    wide = np.array([[0.0, -20.0, 0.0], [8.0, -20.0, 0.0]])
+    positions = np.array([[0.0, 0.0, 0.0], [30.0, 0.0, 0.0], [60.0, 0.0, 0.0]])
+    dataset = scene_of_views([wide, wide + [30.0, 0.0, 0.0], wide[:1]], positions)
+    missing = evaluate_map(map_of([[0.0, 0.1, 0.0]]), dataset)
+    assert (missing.recoverable_objects, missing.false_negatives, missing.recall) == (2, 1, 0.5)
+    assert missing.matches.object_outcome.texts() == ["found", "missed", "not recoverable"]
+    lucky = evaluate_map(map_of([[0.0, 0.1, 0.0], [60.0, 0.0, 0.0]]), dataset)
+    assert (lucky.true_positives, lucky.precision, lucky.recall) == (2, 1.0, 0.5)
+    assert lucky.matches.object_outcome.texts() == ["found", "missed", "found"]
+
+
+def test_the_parallax_is_that_of_the_map_unless_given() -> None:
+    """Two views 5 degrees apart."""
+    centers = [np.array([[0.0, -20.0, 0.0], [20.0 * math.tan(math.radians(5.0)), -20.0, 0.0]])]
+    dataset = scene_of_views(centers, np.zeros((1, 3)))
+    strict = map_of([], run={"settings": {"min_parallax_deg": 6.0}})
+    assert evaluate_map(strict, dataset).recoverable_objects == 0
+    assert evaluate_map(strict, dataset, min_parallax_rad=math.radians(4.0)).recoverable_objects == 1
+    assert evaluate_map(map_of([], run={}), dataset).recoverable_objects == 1  # The default is 2 degrees.
+    assert math.isnan(evaluate_map(strict, dataset).recall)
+
+
+# Truth from files.
+
+
+def geographic_map() -> Map:
+    """Return a geo-referenced map with labels 0.3 m east of truth_positions()."""
+    position = truth_positions() + [0.3, 0.0, 0.0]
+    return map_of(position, frame=Frame(anchor=ANCHOR), lon_lat_height=lon_lat_height_from_enu(position, ANCHOR))
+
+
+def truth_positions() -> Floats:
+    return np.array([[100.0, 2000.0, 8.0], [-3000.0, 50.0, -4.0], [500.0, 600.0, 5.0]])
+
+
+def truth_places() -> Floats:
+    return lon_lat_height_from_enu(truth_positions(), ANCHOR)
+
+
+def write_csv(path: Path, columns: dict[str, Any]) -> Path:
+    rows = zip(*columns.values(), strict=True)
+    lines = [",".join(columns), *(",".join("" if v is None else str(v) for v in row) for row in rows)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def xyz(positions: Floats) -> dict[str, Any]:
+    return dict(zip("xyz", positions.T.tolist(), strict=True))
+
+
+def lon_lat(places: Floats, *names: str) -> dict[str, Any]:
+    return dict(zip(names or ("lon", "lat", "height"), places.T.tolist(), strict=False))
+
+
+def assert_found_at(evaluation: Evaluation, distance_m: float) -> None:
+    assert counts(evaluation) == (3, 0, 0, 0)
+    assert evaluation.horizontal_rmse_m == pytest.approx(distance_m, abs=2e-3)
+
+
+def test_truth_from_csv_and_parquet(tmp_path: Path) -> None:
+    result = map_of(truth_positions() + [0.3, 0.0, 0.0])
+    columns = {**xyz(truth_positions()), "class": ["light"] * 3, "object_id": [5, 6, 7], "note": ["a"] * 3}
+    pq.write_table(pa.table(columns), tmp_path / "truth.parquet")
+    for path in (write_csv(tmp_path / "truth.csv", columns), tmp_path / "truth.parquet"):
+        evaluation = evaluate_map(result, path)
+        assert_found_at(evaluation, 0.3)
+        assert sorted(evaluation.matches.objects.object_id) == [5, 6, 7]
+        assert len(evaluation.notes) == 1
+
+
+def test_truth_without_classes_matches_any(tmp_path: Path) -> None:
+    result = map_of(truth_positions(), ["light", "sign", "tree"])
+    evaluation = evaluate_map(result, write_csv(tmp_path / "truth.csv", xyz(truth_positions())))
+    assert_found_at(evaluation, 0.0)
+    assert any("any class" in note for note in evaluation.notes)
+
+
+def test_classes_that_look_like_numbers_are_texts(tmp_path: Path) -> None:
+    path = write_csv(tmp_path / "truth.csv", {**xyz(truth_positions()), "class": [1, 2, 2]})
+    assert_found_at(evaluate_map(map_of(truth_positions(), ["1", "2", "2"]), path), 0.0)
+
+
+def test_truth_in_longitude_and_latitude(tmp_path: Path) -> None:
+    columns = lon_lat(truth_places())
+    pq.write_table(pa.table(columns), tmp_path / "truth.parquet")
+    for path in (write_csv(tmp_path / "truth.csv", columns), tmp_path / "truth.parquet"):
+        evaluation = evaluate_map(geographic_map(), path)
+        assert_found_at(evaluation, 0.3)
+        assert evaluation.vertical_rmse_m == pytest.approx(0.0, abs=1e-6)
+
+
+def test_truth_without_heights_is_matched_horizontally(tmp_path: Path) -> None:
+    path = write_csv(tmp_path / "truth.csv", lon_lat(truth_places(), "lon", "lat"))
+    evaluation = evaluate_map(geographic_map(), path)
+    assert_found_at(evaluation, 0.3)
+    values = evaluation.to_json()
+    assert values["vertical_rmse_m"] is values["position_rmse_m"] is values["position_median_m"] is None
+    assert any("no heights" in note for note in evaluation.notes)
+
+
+def test_heights_far_from_the_anchor_do_not_shift_truth_without_heights(tmp_path: Path) -> None:
+    """In a city 1600 m above its anchor, the height of the labels is taken: else it would be 0.5 m off."""
+    high = truth_positions() + [0.0, 0.0, 1600.0]
+    places = lon_lat_height_from_enu(high, ANCHOR)
+    result = map_of(high, frame=Frame(anchor=ANCHOR), lon_lat_height=places)
+    path = write_csv(tmp_path / "truth.csv", lon_lat(places, "lon", "lat"))
+    assert evaluate_map(result, path).horizontal_rmse_m < 0.02
+
+
+@pytest.mark.parametrize("suffix", [".geojson", ".gpkg", ".fgb"])
+@pytest.mark.parametrize("has_height", [True, False])
+def test_truth_from_files_of_points(suffix: str, has_height: bool, tmp_path: Path) -> None:
+    import geopandas
+
+    lon, lat, height = truth_places().T
+    points = geopandas.points_from_xy(lon, lat, height if has_height else None)
+    frame = geopandas.GeoDataFrame({"class": ["light"] * 3}, geometry=points, crs="EPSG:4326")
+    frame.to_file(tmp_path / f"truth{suffix}")
+    evaluation = evaluate_map(geographic_map(), tmp_path / f"truth{suffix}")
+    assert_found_at(evaluation, 0.3)
+    assert math.isnan(evaluation.vertical_rmse_m) != has_height
+
+
+def test_geographic_positions_come_first_where_they_are_complete(tmp_path: Path) -> None:
+    """x, y, z may belong to another anchor; an exported map has both."""
+    wrong = xyz(truth_positions() + 1000.0)
+    both = write_csv(tmp_path / "both.csv", {**wrong, **lon_lat(truth_places())})
+    assert_found_at(evaluate_map(geographic_map(), both), 0.3)
+    flat = write_csv(tmp_path / "flat.csv", {**xyz(truth_positions()), **lon_lat(truth_places() + 1.0, "lon", "lat")})
+    assert_found_at(evaluate_map(geographic_map(), flat), 0.3)
+
+
+def test_the_order_of_rows_in_a_file_does_not_matter(tmp_path: Path) -> None:
+    random = np.random.default_rng(9)
+    positions = random.uniform(0.0, 100.0, (50, 3))
+    result = map_of(positions + random.normal(0.0, 0.3, (50, 3)))
+    shuffled = positions[random.permutation(50)]
+    first = evaluate_map(result, write_csv(tmp_path / "a.csv", xyz(positions)))
+    second = evaluate_map(result, write_csv(tmp_path / "b.csv", xyz(shuffled)))
+    assert first == second
+
+
+def test_a_dataset_folder_and_a_map_folder(tmp_path: Path) -> None:
+    dataset, result = small_dataset(), map_of([[4.0, 25.1, 5.0]], residual_px=[1.0])
+    write_dataset(dataset, tmp_path / "city")
+    write_map(result, tmp_path / "map")
+    evaluation = evaluate_map(tmp_path / "map", str(tmp_path / "city"))
+    assert evaluation == evaluate_map(result, dataset)
+    assert counts(evaluation) == (1, 0, 0, 1)
+
+
+def test_a_dataset_with_another_anchor() -> None:
+    other = (51.501, -0.139, 30.0)
+    position = enu_from_lon_lat_height(
+        lon_lat_height_from_enu(np.array([[4.0, 25.0, 5.0], [12.0, 20.0, 2.0]]), ANCHOR), other
+    )
+    result = map_of(position, ["light", "sign"], frame=Frame(anchor=other))
+    evaluation = evaluate_map(result, small_dataset(Frame(anchor=ANCHOR)))
+    assert counts(evaluation) == (2, 0, 0, 0)
+    assert evaluation.position_rmse_m < 1e-6
+
+
+# Refusals.
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message", "hint"),
+    [
+        ("t.txt", "x,y,z\n1,2,3\n", r"t\.txt: truth of an unknown kind: \.txt$", ".csv, .parquet, .geojson"),
+        ("t.csv", "", r"t\.csv: cannot be read as CSV: Empty CSV file", "commas"),
+        ("t.csv", "x,y,z\n", r"t\.csv: the table is empty$", "at least one row"),
+        ("t.csv", "x,y\n1,2\n", r"t\.csv: column 'z' is missing; found x, y$", "add the column 'z'"),
+        ("t.csv", "x,y,z\n1,2,3\n1,a,3\n", r"t\.csv: cannot be read as CSV: .*[Rr]ow #3.* 'a'", "commas"),
+        (
+            "t.csv",
+            "x,y,z\n1,2,3\n1,,3\n",
+            r"t\.csv row 1: y: expected a value, found none",
+            "fill the value in",
+        ),
+        ("t.csv", "x,y,z\n1,2,inf\n", r"t\.csv row 0: z: expected a finite number, found inf", "repair"),
+        (
+            "t.csv",
+            "x,y,z,class\n1,2,3,a\n1,2,3,\n",
+            r"t\.csv row 1: class: expected a value, found none",
+            "fill",
+        ),
+        (
+            "t.csv",
+            "lon,lat,height\n1,2,3\n",
+            r"has longitude and latitude, but the map is not geo-referenced",
+            "x, y, z",
+        ),
+        ("t.parquet", "PAR1", r"t\.parquet: cannot be read as Parquet", "damaged"),
+        ("t.geojson", "{", r"t\.geojson: cannot be read", "QGIS"),
+        (
+            "t.geojson",
+            '{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {}, "geometry": '
+            '{"type": "LineString", "coordinates": [[0, 0], [1, 1]]}}]}',
+            r"t\.geojson row 0: expected a point, found LineString \(1 rows\)$",
+            "one point",
+        ),
+    ],
+)
+def test_wrong_truth_is_refused(name: str, text: str, message: str, hint: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=message) as refusal:
+        evaluate_map(map_of([[0.0, 0, 0]]), tmp_path / name)
+    assert hint in refusal.value.hint
+
+
+def test_a_table_without_geometries_is_refused(tmp_path: Path) -> None:
+    import pandas as pd
+    import pyogrio
+
+    pyogrio.write_dataframe(pd.DataFrame({"class": ["light"]}), tmp_path / "t.gpkg")
+    with pytest.raises(InputError, match=r"t\.gpkg: has no geometries in a coordinate system"):
+        evaluate_map(geographic_map(), tmp_path / "t.gpkg")
+
+
+def test_truth_that_is_nowhere_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file or folder"):
+        evaluate_map(map_of([]), tmp_path / "absent.csv")
+    with pytest.raises(InputError, match="is not a dataset"):
+        evaluate_map(map_of([]), tmp_path)
+    with pytest.raises(InputError, match="no place on the ellipsoid"):
+        evaluate_map(geographic_map(), write_csv(tmp_path / "t.csv", {"lon": [0.0], "lat": [95.0], "height": [0.0]}))
+
+
+def test_a_dataset_without_truth_is_refused() -> None:
+    dataset = Dataset(**{**vars(small_dataset()), "truth": None, "truth_detections": None})
+    with pytest.raises(InputError, match="small: the dataset has no truth") as refusal:
+        evaluate_map(map_of([]), dataset)
+    assert "truth.parquet" in refusal.value.hint
+
+
+@pytest.mark.parametrize(
+    "frame", [Frame(anchor=ANCHOR), Frame(up=(0.0, -1.0, 0.0))], ids=["geo-referenced", "another up"]
+)
+def test_truth_in_another_frame_is_refused(frame: Frame) -> None:
+    with pytest.raises(InputError, match="the truth is in frame .* the map in "):
+        evaluate_map(map_of([], frame=frame), small_dataset())
+
+
+@pytest.mark.parametrize("radius_m", [0.0, -1.0, math.nan, math.inf])
+def test_an_impossible_radius_is_refused(radius_m: float) -> None:
+    with pytest.raises(SettingError, match="radius: expected above 0 m, found "):
+        evaluate_map(map_of([]), truth_of([[0, 0, 0]]), radius_m=radius_m)
+
+
+def test_an_impossible_parallax_is_refused() -> None:
+    with pytest.raises(SettingError, match="min_parallax: expected 0 to 180 degrees, found -"):
+        evaluate_map(map_of([]), small_dataset(), min_parallax_rad=-0.1)
+
+
+def test_a_truth_table_of_the_dataset_is_truth_too(tmp_path: Path) -> None:
+    truth = truth_of(truth_positions())
+    write_table(truth, tmp_path / "truth.parquet")
+    result = map_of(truth_positions() + [0.0, 0.0, 0.5])
+    from_file, from_table = evaluate_map(result, tmp_path / "truth.parquet"), evaluate_map(result, truth)
+    assert from_file == from_table
+    assert_allclose(from_file.vertical_rmse_m, 0.5)

@@ -1,0 +1,156 @@
+"""Exports: read back by other software with the same numbers, whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import geopandas
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from small_dataset import ANCHOR, map_of
+from valuemap.dataset import Frame
+from valuemap.errors import InputError, OutputError
+from valuemap.geodesy import lon_lat_height_from_enu
+from valuemap.map_folder import Map
+from valuemap.tables import Labels, read_table, table_to_arrow
+from valuemap.writers import WRITERS, export_map
+
+POSITIONS = np.array([[1.0 / 3.0, -2.0, 5.25], [100.123456789012, 0.1, 4.0]])
+CLASSES = ["traffic light", 'sign "30", round']
+COLUMNS = ["label_id", "class", "x", "y", "z", "votes", "passes"]
+
+
+def local_map() -> Map:
+    return map_of(POSITIONS, CLASSES)
+
+
+def geographic_map() -> Map:
+    places = lon_lat_height_from_enu(POSITIONS, ANCHOR)
+    return map_of(POSITIONS, CLASSES, frame=Frame(anchor=ANCHOR), lon_lat_height=places)
+
+
+def empty_geographic_map() -> Map:
+    return map_of([], frame=Frame(anchor=ANCHOR), lon_lat_height=np.empty((0, 3)))
+
+
+def rows_of_csv(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_csv_holds_every_number_with_all_its_digits(tmp_path: Path) -> None:
+    export_map(local_map(), tmp_path / "map.csv")
+    rows = rows_of_csv(tmp_path / "map.csv")
+    assert {*COLUMNS} <= {*rows[0]}
+    assert "lon" not in rows[0]
+    assert [row["class"] for row in rows] == CLASSES
+    assert_array_equal([[float(row[name]) for name in "xyz"] for row in rows], POSITIONS)
+    assert [row["votes"] for row in rows] == ["5", "5"]
+    assert float(rows[0]["covariance_xx"]) == 0.04
+
+
+def test_csv_leaves_unknown_values_empty(tmp_path: Path) -> None:
+    export_map(local_map(), tmp_path / "map.csv")
+    assert [row["first_seen"] for row in rows_of_csv(tmp_path / "map.csv")] == ["", ""]
+
+
+def test_csv_has_longitude_latitude_and_height_where_there_are_any(tmp_path: Path) -> None:
+    export_map(geographic_map(), tmp_path / "map.csv")
+    found = [[float(row[name]) for name in ("lon", "lat", "height")] for row in rows_of_csv(tmp_path / "map.csv")]
+    assert_array_equal(found, lon_lat_height_from_enu(POSITIONS, ANCHOR))
+
+
+def test_geojson_is_longitude_latitude_height_in_that_order(tmp_path: Path) -> None:
+    export_map(geographic_map(), tmp_path / "map.geojson")
+    collection = json.loads((tmp_path / "map.geojson").read_text(encoding="utf-8"))
+    assert collection["type"] == "FeatureCollection"
+    assert "crs" not in collection  # RFC 7946, section 4: always WGS84.
+    first, second = collection["features"]
+    assert first["geometry"]["type"] == "Point"
+    lon, lat, height = first["geometry"]["coordinates"]
+    assert (round(lon, 2), round(lat, 2), round(height, 2)) == (-0.14, 51.5, 40.25)
+    places = [first["geometry"]["coordinates"], second["geometry"]["coordinates"]]
+    assert_allclose(places, lon_lat_height_from_enu(POSITIONS, ANCHOR), rtol=0, atol=6e-10)
+    assert {*COLUMNS} <= {*first["properties"]}
+    assert second["properties"]["class"] == CLASSES[1]
+    assert first["properties"]["first_seen"] is None
+    assert first["properties"]["x"] == POSITIONS[0, 0]
+
+
+def test_geojson_opens_with_gdal(tmp_path: Path) -> None:
+    export_map(geographic_map(), tmp_path / "map.geojson")
+    frame = geopandas.read_file(tmp_path / "map.geojson")
+    assert frame.geometry.has_z.all()
+    assert frame["label_id"].tolist() == [0, 1]
+
+
+def test_geojson_needs_a_geo_reference(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="the map is not geo-referenced") as refusal:
+        export_map(local_map(), tmp_path / "map.geojson")
+    assert ".csv or .parquet" in refusal.value.hint
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_parquet_is_the_table_of_labels(tmp_path: Path) -> None:
+    export_map(local_map(), tmp_path / "map.parquet")
+    assert pq.read_table(tmp_path / "map.parquet").equals(table_to_arrow(local_map().labels))
+
+
+def test_parquet_is_geoparquet_where_geo_referenced(tmp_path: Path) -> None:
+    export_map(geographic_map(), tmp_path / "map.parquet")
+    frame = geopandas.read_parquet(tmp_path / "map.parquet")
+    assert frame.crs == "EPSG:4979"
+    places = np.column_stack([frame.geometry.x, frame.geometry.y, frame.geometry.z])
+    assert_array_equal(places, lon_lat_height_from_enu(POSITIONS, ANCHOR))
+    again = read_table(Labels, tmp_path / "map.parquet")
+    assert table_to_arrow(again).equals(table_to_arrow(geographic_map().labels))
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_a_map_without_labels_is_a_file_without_rows(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"map{suffix}"
+    export_map(empty_geographic_map(), path)
+    if suffix == ".csv":
+        assert rows_of_csv(path) == []
+    elif suffix == ".geojson":
+        assert json.loads(path.read_text(encoding="utf-8"))["features"] == []
+    else:
+        assert len(read_table(Labels, path)) == 0
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_the_same_map_gives_the_same_bytes(suffix: str, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        export_map(geographic_map(), tmp_path / name / f"map{suffix}")
+    assert (tmp_path / "a" / f"map{suffix}").read_bytes() == (tmp_path / "b" / f"map{suffix}").read_bytes()
+
+
+def test_the_suffix_may_be_in_capitals_and_a_file_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "MAP.CSV").write_text("old")
+    export_map(local_map(), tmp_path / "MAP.CSV")
+    assert len(rows_of_csv(tmp_path / "MAP.CSV")) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "found"), [("map.shp", r"\.shp"), ("map", "without a suffix"), ("map.csv.gz", r"\.gz")]
+)
+def test_an_unknown_format_is_refused(name: str, found: str, tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=found) as refusal:
+        export_map(local_map(), tmp_path / name)
+    assert refusal.value.hint == "name a file that ends in .csv, .geojson, .parquet"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_a_place_that_cannot_be_written_is_refused(suffix: str, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(OutputError, match="cannot be written"):
+        export_map(geographic_map(), tmp_path / "file" / f"map{suffix}")
+    (tmp_path / f"map{suffix}").mkdir()
+    with pytest.raises(OutputError, match="is a folder, a file is to be written there"):
+        export_map(geographic_map(), tmp_path / f"map{suffix}")
