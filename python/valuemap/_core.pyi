@@ -1,0 +1,46 @@
+"""The numeric core (Rust): arrays in, arrays out; float64, C order, world frame, metres, radians and pixels."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+_Floats = NDArray[np.float64]
+_Offsets = NDArray[np.int64]
+_Indices = NDArray[np.uint32]
+
+class Rays:
+    def __init__(
+        self,
+        residual_from_world: _Floats,
+        center_in_world_m: _Floats,
+        direction_in_world: _Floats,
+        image: _Indices,
+        class_: _Indices,
+        /,
+    ) -> None: ...
+    def __len__(self) -> int: ...
+
+def partition(center_in_world_m: _Floats, cluster_radius_m: float) -> _Indices: ...
+def vote(
+    rays: Rays,
+    cluster: _Indices,
+    *,
+    max_reprojection_error_px: float,
+    min_parallax_rad: float,
+    min_range_m: float,
+    max_range_m: float,
+    min_vote_ratio: float,
+    min_votes: int,
+    threads: int,
+    progress: Callable[[int, int], None],
+) -> tuple[_Floats, tuple[_Offsets, _Indices], _Indices, dict[str, int]]: ...
+def merge(
+    rays: Rays,
+    point_in_world_m: _Floats,
+    voter_offsets: _Offsets,
+    voters: _Indices,
+    cluster: _Indices,
+    merge_radius_m: float,
+) -> tuple[_Floats, tuple[_Offsets, _Indices]]: ...
+def unit_covariance(rays: Rays, point_in_world_m: _Floats, voter_offsets: _Offsets, voters: _Indices) -> _Floats: ...

@@ -1,0 +1,105 @@
+"""Stage 4: what the evidence says about each label: covariance, passes, residuals, parallax, size, time."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+import valuemap._core as _core
+from valuemap.cameras import Rays
+from valuemap.config import RefineConfig
+from valuemap.dataset import Dataset
+from valuemap.geodesy import lon_lat_height_from_enu
+from valuemap.tables import Candidates, Floats, Ints, Labels, Votes
+
+_UPPER_TRIANGLE = (0, 1, 2, 4, 5, 8)
+_MAX_DIRECTIONS = 64
+
+
+def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config: RefineConfig) -> tuple[Labels, Votes]:
+    """Return the labels (ids from 1, in the order of the candidates) and their votes.
+
+    The covariance is `detection_sigma_px²` times the inverse of the normal equations of Eq. (1) of the paper at the
+    label; width and height are the medians over voters of box size times depth over focal length.
+    """
+    images, detections = dataset.images, dataset.detections
+    voters = candidates.voters.astype(np.int64)
+    starts = candidates.voter_offsets[:-1]
+    label = candidates.row_of_voter()
+    count = np.diff(candidates.voter_offsets)
+    residual_px, size_m = _seen_from_voters(rays, voters, candidates.position_in_world_m[label], detections.size_px)
+    image_row = rays.image_row[voters]
+    time = np.full(len(voters), np.nan) if images.timestamp_s is None else images.timestamp_s[image_row]
+    covariance = config.detection_sigma_px**2 * _core.unit_covariance(
+        rays.core, candidates.position_in_world_m, candidates.voter_offsets, candidates.voters
+    )
+    position = candidates.position_in_world_m
+    anchor = dataset.frame.anchor
+    labels = Labels(
+        label_id=np.arange(1, len(candidates) + 1),
+        class_name=detections.class_name.take(voters[starts]),
+        position_in_world_m=position,
+        covariance_m2=covariance[:, _UPPER_TRIANGLE],
+        votes=count,
+        passes=_count_distinct(label, images.pass_id.codes[image_row], len(candidates)),
+        object_width_m=_median_in_groups(size_m[:, 0], label, candidates.voter_offsets),
+        object_height_m=_median_in_groups(size_m[:, 1], label, candidates.voter_offsets),
+        reprojection_rms_px=np.sqrt(_reduce(np.add, residual_px**2, starts) / count),
+        max_parallax_rad=max_angles(rays, candidates),
+        first_seen_s=_reduce(np.fmin, time, starts),
+        last_seen_s=_reduce(np.fmax, time, starts),
+        lon_lat_height=None if anchor is None else lon_lat_height_from_enu(position, anchor),
+    )
+    votes = Votes(
+        label_id=labels.label_id[label],
+        detection_id=detections.detection_id[voters],
+        image_id=detections.image_id[voters],
+        residual_px=residual_px,
+        residual_sigmas=residual_px / config.detection_sigma_px,
+    )
+    return labels, votes
+
+
+def max_angles(rays: Rays, candidates: Candidates) -> Floats:
+    """Return for each candidate (N) the largest angle in radians at which two of its voters' cameras see it.
+
+    Exact up to 64 voters; beyond, among the 64 directions that are farthest from the mean direction.
+    """
+    angles = np.zeros(len(candidates))
+    for row in range(len(candidates)):
+        members = candidates.voters[candidates.voter_offsets[row] : candidates.voter_offsets[row + 1]]
+        direction = candidates.position_in_world_m[row] - rays.center_in_world_m[members]
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        if len(direction) > _MAX_DIRECTIONS:
+            spread = np.linalg.norm(direction - direction.mean(axis=0), axis=1)
+            direction = direction[np.argsort(-spread, kind="stable")[:_MAX_DIRECTIONS]]
+        chord = np.linalg.norm(direction[:, None] - direction[None], axis=2).max()
+        angles[row] = 2.0 * np.arcsin(min(1.0, chord / 2.0))
+    return angles
+
+
+def _seen_from_voters(rays: Rays, voters: Ints, position: Floats, size_px: Floats) -> tuple[Floats, Floats]:
+    """Return the reprojection error in pixels (N) and the size in metres (N, 2) that each voter sees."""
+    matrix = rays.residual_from_world[voters]
+    projected = np.einsum("nij,nj->ni", matrix, position - rays.center_in_world_m[voters])
+    depth = projected[:, 2:]
+    pixels_per_unit = np.linalg.norm(
+        matrix[:, :2] - (matrix[:, :2] @ matrix[:, 2, :, None]) * matrix[:, 2, None], axis=2
+    )
+    return np.linalg.norm(projected[:, :2] / depth, axis=1), size_px[voters] * depth / pixels_per_unit
+
+
+def _reduce(operation: np.ufunc, values: Floats, starts: Ints) -> Floats:
+    return np.asarray(operation.reduceat(values, starts)) if len(starts) else np.empty(0)
+
+
+def _count_distinct(group: Ints, code: NDArray[np.int32], groups: int) -> Ints:
+    pairs = np.unique(np.stack([group, code], axis=1), axis=0)
+    return np.bincount(pairs[:, 0], minlength=groups).astype(np.int64)
+
+
+def _median_in_groups(values: Floats, group: Ints, offsets: Ints) -> Floats:
+    ordered = values[np.lexsort((values, group))]
+    count = np.diff(offsets)
+    low, high = offsets[:-1] + (count - 1) // 2, offsets[:-1] + count // 2
+    return np.asarray((ordered[low] + ordered[high]) / 2.0)

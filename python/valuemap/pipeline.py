@@ -1,0 +1,101 @@
+"""The method on one screen: a dataset in, a map out."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from valuemap.cameras import cast_rays
+from valuemap.config import MapConfig
+from valuemap.dataset import Dataset
+from valuemap.describe import describe_labels
+from valuemap.map_folder import Map
+from valuemap.merge import merge_clusters
+from valuemap.partition import partition_images
+from valuemap.progress import Progress, silent
+from valuemap.vote import vote_in_clusters
+
+
+def build_map(
+    dataset: Dataset, config: MapConfig | None = None, *, threads: int = 0, progress: Progress = silent
+) -> Map:
+    """Find the objects that the detections of a dataset show.
+
+    Algorithm 1 of Dabisias et al., "VALUE", ICRA 2018, in clusters, with merging.
+
+    Parameters
+    ----------
+    dataset
+        Posed images and detections.
+    config
+        Settings; the defaults where not given.
+    threads
+        Threads to work on, 0 for one a core. The result does not depend on it.
+    progress
+        Called as progress(what, done, total).
+
+    Returns
+    -------
+    Map
+        Labels ordered by their first detection, votes, and the record of the run.
+    """
+    config = config or MapConfig()
+    stages = _Stages()
+    with stages.measured("rays"):
+        rays = cast_rays(dataset)
+    with stages.measured("partition"):
+        cluster_of_image = partition_images(dataset.images, config.partition)
+    with stages.measured("vote"):
+        found, pair_counts = vote_in_clusters(rays, cluster_of_image, config.vote, threads=threads, progress=progress)
+    with stages.measured("merge"):
+        merged = merge_clusters(rays, found, config.merge)
+    with stages.measured("describe"):
+        labels, votes = describe_labels(dataset, rays, merged, config.refine)
+    counts = {
+        "images": len(dataset.images),
+        "detections": len(dataset.detections),
+        "detections_without_ray": int(np.isnan(rays.direction_in_world[:, 0]).sum()),
+        "detections_without_label": len(dataset.detections) - len(votes),
+        "clusters": int(cluster_of_image.max()) + 1,
+        **pair_counts,
+        "labels_before_merge": len(found),
+        "labels": len(labels),
+    }
+    return Map(dataset.frame, labels, votes, _record(dataset, config, counts, stages))
+
+
+class _Stages:
+    """Seconds and peak memory of each stage, in the order they ran."""
+
+    def __init__(self) -> None:
+        self.records: list[dict[str, Any]] = []
+
+    @contextmanager
+    def measured(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        seconds = time.perf_counter() - start
+        self.records.append({"stage": stage, "seconds": round(seconds, 3), "peak_memory_mb": _peak_memory_mb()})
+
+
+def _peak_memory_mb() -> int:
+    """Peak memory of the process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak // (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def _record(dataset: Dataset, config: MapConfig, counts: dict[str, int], stages: _Stages) -> dict[str, Any]:
+    return {
+        "valuemap": version("valuemap"),
+        "dataset": dataset.name,
+        "settings": config.as_dict(),
+        "counts": counts,
+        "stages": stages.records,
+    }

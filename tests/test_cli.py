@@ -1,0 +1,228 @@
+"""The command line as users meet it: the verbs end to end, and one clear line for every mistake."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pycolmap
+import pytest
+
+import valuemap
+from scenes import as_dataset, random_scene
+from valuemap.config import describe_settings
+
+COMMAND = [sys.executable, "-c", "from valuemap.cli import main; main()"]
+
+
+def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=120, check=False)
+
+
+def works(*arguments: str | Path) -> str:
+    done = run(*arguments)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def complains(*arguments: str | Path) -> str:
+    """Run a command that must fail with one line and a hint; return the line."""
+    done = run(*arguments)
+    assert done.returncode == 1
+    assert done.stdout == ""
+    lines = done.stderr.strip().splitlines()
+    assert len(lines) == 2, done.stderr
+    assert lines[0].startswith("error: ")
+    assert lines[1].startswith("hint: ")
+    return done.stderr
+
+
+@pytest.fixture
+def street(tmp_path: Path) -> Path:
+    folder = tmp_path / "street"
+    valuemap.write_dataset(as_dataset(random_scene(7, images=60, objects=8, clutter=60)), folder)
+    return folder
+
+
+def spoil(folder: Path, table: str, column: str, value: object) -> None:
+    """Overwrite the first value of a column."""
+    path = folder / f"{table}.parquet"
+    content = pq.read_table(path)
+    values = content.column(column).to_pylist()
+    values[0] = value
+    index = content.column_names.index(column)
+    pq.write_table(content.set_column(index, column, pa.array(values)), path)
+
+
+def test_from_simulation_to_export(tmp_path: Path) -> None:
+    data, result = tmp_path / "data", tmp_path / "map"
+    works("simulate", "--preset", "small", "--seed", "3", "--out", data)
+    assert "traffic_light" in works("info", data)
+    works("map", data, "--out", result, "--method", "paper", "--threads", "2", "--set", "min_votes=4")
+    run_record = json.loads((result / "run.json").read_text())
+    assert run_record["settings"]["min_votes"] == 4
+    assert run_record["counts"]["labels"] == len(valuemap.read_map(result).labels)
+    assert {stage["stage"] for stage in run_record["stages"]} >= {"partition", "vote", "merge"}
+    figures = json.loads(works("evaluate", result, "--truth", data, "--json"))
+    assert figures["recall"] > 0.9
+    assert set(figures) == {
+        "true_positives",
+        "duplicates",
+        "false_positives",
+        "false_negatives",
+        "recall",
+        "precision",
+        "position_rmse_m",
+        "position_median_m",
+        "horizontal_rmse_m",
+        "vertical_rmse_m",
+        "mean_reprojection_error_px",
+    }
+    assert "recoverable objects" in works("evaluate", result, "--truth", data, "--radius", "1.0")
+    works("export", result, tmp_path / "labels.csv")
+    header = (tmp_path / "labels.csv").read_text().splitlines()[0].split(",")
+    assert {"label_id", "class", "x", "y", "z", "votes", "passes"} <= set(header)
+    assert json.loads(works("info", result, "--json"))["labels"] == run_record["counts"]["labels"]
+
+
+def test_the_demo_leaves_everything_on_disk(tmp_path: Path) -> None:
+    told = works("demo", "--out", tmp_path / "demo")
+    assert "recall" in told
+    assert len(valuemap.read_map(tmp_path / "demo" / "map").labels) > 0
+    assert (tmp_path / "demo" / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_json_of_a_map_is_its_record(street: Path, tmp_path: Path) -> None:
+    printed = json.loads(works("map", street, "--out", tmp_path / "map", "--json"))
+    assert printed["counts"]["images"] == 60
+
+
+def test_settings_are_listed_with_their_effects() -> None:
+    told = works("settings")
+    assert all(name in told for name, *_ in describe_settings())
+
+
+def test_a_map_replaces_an_older_one_and_nothing_else(street: Path, tmp_path: Path) -> None:
+    works("map", street, "--out", tmp_path / "map")
+    works("map", street, "--out", tmp_path / "map", "--set", "min_votes=5")
+    assert valuemap.read_map(tmp_path / "map").run["settings"]["min_votes"] == 5
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("years of work")
+    assert "not ours to replace" in complains("map", street, "--out", tmp_path / "mine")
+    assert (tmp_path / "mine" / "thesis.txt").read_text() == "years of work"
+
+
+def test_bad_input_is_one_line_and_no_map(street: Path, tmp_path: Path) -> None:
+    """Truncated Parquet, empty detections, a pose with NaN, a missing dataset."""
+
+    def told(spoiled: Path) -> str:
+        line = complains("map", spoiled, "--out", tmp_path / "map")
+        assert not (tmp_path / "map").exists()
+        assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
+        return line
+
+    def copy(name: str) -> Path:
+        return Path(shutil.copytree(street, tmp_path / name))
+
+    truncated = copy("truncated")
+    content = (truncated / "images.parquet").read_bytes()
+    (truncated / "images.parquet").write_bytes(content[: len(content) // 2])
+    assert "images.parquet" in told(truncated)
+
+    empty = copy("empty")
+    pq.write_table(pq.read_table(empty / "detections.parquet").slice(0, 0), empty / "detections.parquet")
+    assert "detections.parquet: the table is empty" in told(empty)
+
+    nan = copy("nan")
+    spoil(nan, "images", "tx", float("nan"))
+    assert "images.parquet row 0: tx: expected a finite number, found nan" in told(nan)
+
+    unknown = copy("unknown")
+    spoil(unknown, "detections", "image_id", 987654)
+    assert "found 987654" in told(unknown)
+
+    assert "is not a dataset" in told(tmp_path / "nowhere")
+
+
+def test_misspelt_settings_are_refused_with_a_suggestion(street: Path, tmp_path: Path) -> None:
+    line = complains("map", street, "--out", tmp_path / "map", "--set", "min_vote=4")
+    assert "did you mean min_votes?" in line
+    assert "expected a whole number" in complains("map", street, "--out", tmp_path / "map", "--set", "min_votes=many")
+    assert "expected above 0" in complains("map", street, "--out", tmp_path / "map", "--set", "cluster_radius_m=-1")
+    assert "expected one of" in complains("map", street, "--out", tmp_path / "map", "--method", "magic")
+
+
+def test_an_unwritable_output_is_found_before_the_work(street: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    assert "cannot be written" in complains("map", street, "--out", tmp_path / "file" / "map")
+    assert "is a file" in complains("map", street, "--out", tmp_path / "file")
+
+
+def test_a_colmap_folder_without_cameras_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "model").mkdir()
+    (tmp_path / "coco.json").write_text("[]")
+    line = complains(
+        "import", "colmap", tmp_path / "model", "--detections", tmp_path / "coco.json", "--out", tmp_path / "out"
+    )
+    assert "cameras" in line
+
+
+def colmap_model(folder: Path) -> None:
+    """Write a model of three images on a line."""
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="PINHOLE", width=640, height=480, params=[500, 500, 320, 240])
+    )
+    for i in range(3):
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-float(i), 0.0, 0.0]))
+        image = pycolmap.Image(name=f"a/{i}.jpg", camera_id=1, image_id=i + 1)
+        model.add_image_with_trivial_frame(image, pose)
+    folder.mkdir()
+    model.write_text(folder)
+
+
+def test_a_coco_file_naming_an_unknown_image_is_refused(tmp_path: Path) -> None:
+    colmap_model(tmp_path / "model")
+    coco: dict[str, list[dict[str, object]]] = {
+        "images": [{"id": 5, "file_name": "a/0.jpg"}, {"id": 6, "file_name": "b/99.jpg"}],
+        "categories": [{"id": 1, "name": "light"}],
+        "annotations": [
+            {"id": 1, "image_id": 5, "category_id": 1, "bbox": [310, 230, 20, 20]},
+            {"id": 2, "image_id": 6, "category_id": 1, "bbox": [310, 230, 20, 20]},
+        ],
+    }
+    (tmp_path / "coco.json").write_text(json.dumps(coco))
+    command: list[str | Path] = ["import", "colmap", tmp_path / "model", "--detections", tmp_path / "coco.json"]
+    command += ["--out", tmp_path / "out"]
+    assert "b/99.jpg" in complains(*command)
+    assert not (tmp_path / "out").exists()
+    coco["annotations"].pop()
+    (tmp_path / "coco.json").write_text(json.dumps(coco))
+    works(*command)
+    dataset = valuemap.read_dataset(tmp_path / "out")
+    assert dataset.images.pass_id.names == ("a",)
+    np.testing.assert_allclose(dataset.detections.center_px, [[320.0, 240.0]])
+
+
+def test_ctrl_c_leaves_nothing_behind(tmp_path: Path) -> None:
+    # One cluster of thousands of detections: minutes of work.
+    scene = random_scene(5, images=200, objects=12, clutter=12000)
+    valuemap.write_dataset(as_dataset(scene), tmp_path / "dense")
+    command = [*COMMAND, "map", str(tmp_path / "dense"), "--out", str(tmp_path / "map"), "--threads", "1"]
+    wide = ["--set", "max_reprojection_error_px=60", "--set", "min_parallax_deg=0.01", "--set", "cluster_radius_m=1000"]
+    with subprocess.Popen([*command, *wide], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        time.sleep(3.0)
+        assert process.poll() is None, "the work was too short to be interrupted"
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert told.splitlines()[0] == "interrupted: nothing was written"
+    assert [path.name for path in tmp_path.iterdir()] == ["dense"]

@@ -1,0 +1,160 @@
+"""Laws of the whole method: moved worlds, permuted rows, renamed passes, other thread counts give the same map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import valuemap
+from scenes import as_dataset, random_scene
+from valuemap.dataset import Dataset, Frame
+from valuemap.map_folder import Map
+from valuemap.tables import Labels, Votes, table_to_arrow, write_table
+
+
+def street(seed: int = 7) -> Dataset:
+    """A drive of several clusters, with clutter and two passes."""
+    scene = random_scene(seed, images=60, objects=8, clutter=60)
+    return as_dataset(scene, passes=[f"pass-{i % 2}" for i in range(60)])
+
+
+def small_clusters() -> valuemap.MapConfig:
+    return valuemap.MapConfig().with_settings(["cluster_radius_m=12"])
+
+
+def same_tables(a: Map, b: Map) -> bool:
+    pairs = ((a.labels, b.labels), (a.votes, b.votes))
+    return all(bool(table_to_arrow(x).equals(table_to_arrow(y))) for x, y in pairs)
+
+
+def moved(dataset: Dataset, turn: Rotation, shift: np.ndarray) -> Dataset:
+    """The same dataset in a world where X' = turn X + shift."""
+    rotation = Rotation.from_quat(dataset.images.cam_from_world_quat, scalar_first=True) * turn.inv()
+    return Dataset(
+        **{
+            **vars(dataset),
+            "frame": Frame(up=tuple(turn.apply([0.0, 0.0, 1.0]))),
+            "images": dataset.images.replace(
+                cam_from_world_quat=rotation.as_quat(scalar_first=True),
+                cam_from_world_m=dataset.images.cam_from_world_m - rotation.apply(shift),
+            ),
+        }
+    )
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    angles=st.tuples(*[st.floats(-180.0, 180.0)] * 3),
+    shift=st.tuples(*[st.floats(-1e5, 1e5)] * 3),
+)
+def test_a_moved_world_gives_the_moved_map(angles: tuple[float, ...], shift: tuple[float, ...]) -> None:
+    turn = Rotation.from_euler("zyx", angles, degrees=True)
+    still = valuemap.build_map(street(), small_clusters())
+    other = valuemap.build_map(moved(street(), turn, np.array(shift)), small_clusters())
+    assert len(still.labels) > 3
+    assert np.array_equal(still.votes.detection_id, other.votes.detection_id)
+    assert np.array_equal(still.votes.label_id, other.votes.label_id)
+    expected = turn.apply(still.labels.position_in_world_m) + np.array(shift)
+    np.testing.assert_allclose(other.labels.position_in_world_m, expected, atol=1e-6)
+    np.testing.assert_allclose(other.labels.reprojection_rms_px, still.labels.reprojection_rms_px, atol=1e-6)
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_order_of_rows_does_not_matter(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+    folder = tmp_path_factory.mktemp("dataset") / "street"
+    dataset = street()
+    random = np.random.default_rng(seed)
+    shuffled = Dataset(
+        **{
+            **vars(dataset),
+            "images": dataset.images.take(random.permutation(len(dataset.images))),
+            "detections": dataset.detections.take(random.permutation(len(dataset.detections))),
+        }
+    )
+    # Only the door sorts rows, so the shuffled tables go through files.
+    valuemap.write_dataset(dataset, folder)
+    write_table(shuffled.images, folder / "images.parquet")
+    write_table(shuffled.detections, folder / "detections.parquet")
+    again = valuemap.build_map(valuemap.read_dataset(folder), small_clusters())
+    assert same_tables(again, valuemap.build_map(dataset, small_clusters()))
+
+
+def test_the_names_of_passes_do_not_matter() -> None:
+    dataset = street()
+    names = {"pass-0": "z", "pass-1": "a"}
+    renamed = dataset.images.pass_id.from_texts([names[name] for name in dataset.images.pass_id.texts()])
+    other = Dataset(**{**vars(dataset), "images": dataset.images.replace(pass_id=renamed)})
+    assert same_tables(valuemap.build_map(dataset), valuemap.build_map(other))
+
+
+def test_the_number_of_threads_does_not_matter(tmp_path: Path) -> None:
+    one = valuemap.build_map(street(), small_clusters(), threads=1)
+    assert len(one.labels) > 3
+    valuemap.write_map(one, tmp_path / "one")
+    for threads in (2, 3, 0):
+        valuemap.write_map(valuemap.build_map(street(), small_clusters(), threads=threads), tmp_path / "other")
+        for name in ("labels.parquet", "votes.parquet"):
+            assert (tmp_path / "other" / name).read_bytes() == (tmp_path / "one" / name).read_bytes()
+
+
+def test_votes_and_labels_tell_one_story() -> None:
+    dataset = street()
+    result = valuemap.build_map(dataset, small_clusters())
+    labels, votes = result.labels, result.votes
+    rows = votes.label_id - 1
+    assert np.array_equal(np.bincount(rows), labels.votes)
+    assert len(np.unique(votes.detection_id)) == len(votes)
+    assert len(np.unique(np.stack([votes.label_id, votes.image_id]), axis=1).T) == len(votes)
+    rms = np.sqrt(np.bincount(rows, votes.residual_px**2) / labels.votes)
+    np.testing.assert_allclose(labels.reprojection_rms_px, rms)
+    assert set(labels.passes) <= {1, 2}
+    counts = result.run["counts"]
+    assert counts["labels"] == len(labels)
+    assert counts["detections_without_label"] == len(dataset.detections) - len(votes)
+
+
+def test_a_map_survives_its_folder(tmp_path: Path) -> None:
+    result = valuemap.build_map(street())
+    valuemap.write_map(result, tmp_path / "map")
+    again = valuemap.read_map(tmp_path / "map")
+    assert same_tables(result, again)
+    assert again.frame == result.frame
+    assert again.run["settings"] == valuemap.MapConfig().as_dict()
+
+
+def test_no_support_gives_an_empty_map_with_all_columns(tmp_path: Path) -> None:
+    scene = random_scene(3, images=5, objects=0, clutter=5)
+    result = valuemap.build_map(as_dataset(scene))
+    assert len(result.labels) == 0
+    assert len(result.votes) == 0
+    valuemap.write_map(result, tmp_path / "map")
+    assert isinstance(valuemap.read_map(tmp_path / "map").labels, Labels)
+    assert isinstance(valuemap.read_map(tmp_path / "map").votes, Votes)
+
+
+def test_covariance_is_that_of_the_scatter() -> None:
+    """Over many noise draws positions scatter as the mean covariance says (6 numbers, 400 draws)."""
+    sigma = 1.5
+    config = valuemap.MapConfig().with_settings([f"detection_sigma_px={sigma}", "max_reprojection_error_px=20"])
+    base = as_dataset(random_scene(1, images=20, objects=1, clutter=0, noise_px=0.0, recall=1.0))
+    random = np.random.default_rng(0)
+    points, covariances = [], []
+    for _ in range(400):
+        noisy = base.detections.center_px + random.normal(0.0, sigma, base.detections.center_px.shape)
+        result = valuemap.build_map(
+            Dataset(**{**vars(base), "detections": base.detections.replace(center_px=noisy)}), config
+        )
+        assert len(result.labels) == 1
+        points.append(result.labels.position_in_world_m[0])
+        covariances.append(result.labels.covariance_m2[0])
+    xx, xy, xz, yy, yz, zz = np.mean(covariances, axis=0)
+    expected = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    whitened = np.linalg.inv(np.linalg.cholesky(expected)) @ np.cov(np.array(points).T)
+    whitened = whitened @ np.linalg.inv(np.linalg.cholesky(expected)).T
+    np.testing.assert_allclose(np.linalg.eigvalsh(whitened), 1.0, atol=0.35)
