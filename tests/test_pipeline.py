@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -23,8 +24,12 @@ def street(seed: int = 7) -> Dataset:
     return as_dataset(scene, passes=[f"pass-{i % 2}" for i in range(60)])
 
 
-def small_clusters() -> valuemap.MapConfig:
-    return valuemap.MapConfig().with_settings(["cluster_radius_m=12"])
+def paper() -> valuemap.MapConfig:
+    """Algorithm 1 in clusters that are small, so that there are several."""
+    return valuemap.MapConfig(method="paper").with_settings(["cluster_radius_m=12"])
+
+
+both_methods = pytest.mark.parametrize("config", [valuemap.MapConfig(), paper()], ids=["robust", "paper"])
 
 
 def same_tables(a: Map, b: Map) -> bool:
@@ -47,26 +52,32 @@ def moved(dataset: Dataset, turn: Rotation, shift: np.ndarray) -> Dataset:
     )
 
 
+@both_methods
 @settings(max_examples=15, deadline=None)
 @given(
     angles=st.tuples(*[st.floats(-180.0, 180.0)] * 3),
     shift=st.tuples(*[st.floats(-1e5, 1e5)] * 3),
 )
-def test_a_moved_world_gives_the_moved_map(angles: tuple[float, ...], shift: tuple[float, ...]) -> None:
+def test_a_moved_world_gives_the_moved_map(
+    config: valuemap.MapConfig, angles: tuple[float, ...], shift: tuple[float, ...]
+) -> None:
     turn = Rotation.from_euler("zyx", angles, degrees=True)
-    still = valuemap.build_map(street(), small_clusters())
-    other = valuemap.build_map(moved(street(), turn, np.array(shift)), small_clusters())
+    still = valuemap.build_map(street(), config)
+    other = valuemap.build_map(moved(street(), turn, np.array(shift)), config)
     assert len(still.labels) > 3
     assert np.array_equal(still.votes.detection_id, other.votes.detection_id)
     assert np.array_equal(still.votes.label_id, other.votes.label_id)
     expected = turn.apply(still.labels.position_in_world_m) + np.array(shift)
-    np.testing.assert_allclose(other.labels.position_in_world_m, expected, atol=1e-6)
-    np.testing.assert_allclose(other.labels.reprojection_rms_px, still.labels.reprojection_rms_px, atol=1e-6)
+    np.testing.assert_allclose(other.labels.position_in_world_m, expected, atol=2e-6)
+    np.testing.assert_allclose(other.labels.reprojection_rms_px, still.labels.reprojection_rms_px, atol=2e-5)
 
 
+@both_methods
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_the_order_of_rows_does_not_matter(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+def test_the_order_of_rows_does_not_matter(
+    tmp_path_factory: pytest.TempPathFactory, config: valuemap.MapConfig, seed: int
+) -> None:
     folder = tmp_path_factory.mktemp("dataset") / "street"
     dataset = street()
     random = np.random.default_rng(seed)
@@ -81,31 +92,34 @@ def test_the_order_of_rows_does_not_matter(tmp_path_factory: pytest.TempPathFact
     valuemap.write_dataset(dataset, folder)
     write_table(shuffled.images, folder / "images.parquet")
     write_table(shuffled.detections, folder / "detections.parquet")
-    again = valuemap.build_map(valuemap.read_dataset(folder), small_clusters())
-    assert same_tables(again, valuemap.build_map(dataset, small_clusters()))
+    again = valuemap.build_map(valuemap.read_dataset(folder), config)
+    assert same_tables(again, valuemap.build_map(dataset, config))
 
 
-def test_the_names_of_passes_do_not_matter() -> None:
+@both_methods
+def test_the_names_of_passes_do_not_matter(config: valuemap.MapConfig) -> None:
     dataset = street()
     names = {"pass-0": "z", "pass-1": "a"}
     renamed = dataset.images.pass_id.from_texts([names[name] for name in dataset.images.pass_id.texts()])
     other = Dataset(**{**vars(dataset), "images": dataset.images.replace(pass_id=renamed)})
-    assert same_tables(valuemap.build_map(dataset), valuemap.build_map(other))
+    assert same_tables(valuemap.build_map(dataset, config), valuemap.build_map(other, config))
 
 
-def test_the_number_of_threads_does_not_matter(tmp_path: Path) -> None:
-    one = valuemap.build_map(street(), small_clusters(), threads=1)
+@both_methods
+def test_the_number_of_threads_does_not_matter(config: valuemap.MapConfig, tmp_path: Path) -> None:
+    one = valuemap.build_map(street(), config, threads=1)
     assert len(one.labels) > 3
     valuemap.write_map(one, tmp_path / "one")
     for threads in (2, 3, 0):
-        valuemap.write_map(valuemap.build_map(street(), small_clusters(), threads=threads), tmp_path / "other")
+        valuemap.write_map(valuemap.build_map(street(), config, threads=threads), tmp_path / "other")
         for name in ("labels.parquet", "votes.parquet"):
             assert (tmp_path / "other" / name).read_bytes() == (tmp_path / "one" / name).read_bytes()
 
 
-def test_votes_and_labels_tell_one_story() -> None:
+@both_methods
+def test_votes_and_labels_tell_one_story(config: valuemap.MapConfig) -> None:
     dataset = street()
-    result = valuemap.build_map(dataset, small_clusters())
+    result = valuemap.build_map(dataset, config)
     labels, votes = result.labels, result.votes
     rows = votes.label_id - 1
     assert np.array_equal(np.bincount(rows), labels.votes)
@@ -128,9 +142,10 @@ def test_a_map_survives_its_folder(tmp_path: Path) -> None:
     assert again.run["settings"] == valuemap.MapConfig().as_dict()
 
 
-def test_no_support_gives_an_empty_map_with_all_columns(tmp_path: Path) -> None:
+@both_methods
+def test_no_support_gives_an_empty_map_with_all_columns(config: valuemap.MapConfig, tmp_path: Path) -> None:
     scene = random_scene(3, images=5, objects=0, clutter=5)
-    result = valuemap.build_map(as_dataset(scene))
+    result = valuemap.build_map(as_dataset(scene), config)
     assert len(result.labels) == 0
     assert len(result.votes) == 0
     valuemap.write_map(result, tmp_path / "map")
@@ -138,10 +153,12 @@ def test_no_support_gives_an_empty_map_with_all_columns(tmp_path: Path) -> None:
     assert isinstance(valuemap.read_map(tmp_path / "map").votes, Votes)
 
 
-def test_covariance_is_that_of_the_scatter() -> None:
+@pytest.mark.parametrize("method", ["robust", "paper"])
+def test_covariance_is_that_of_the_scatter(method: Literal["robust", "paper"]) -> None:
     """Over many noise draws positions scatter as the mean covariance says (6 numbers, 400 draws)."""
     sigma = 1.5
-    config = valuemap.MapConfig().with_settings([f"detection_sigma_px={sigma}", "max_reprojection_error_px=20"])
+    known = [f"detection_sigma_px={sigma}", "position_sigma_m=0", "rotation_sigma_deg=0", "gate_sigmas=6"]
+    config = valuemap.MapConfig(method=method).with_settings([*known, "max_reprojection_error_px=20"])
     base = as_dataset(random_scene(1, images=20, objects=1, clutter=0, noise_px=0.0, recall=1.0))
     random = np.random.default_rng(0)
     points, covariances = [], []

@@ -104,6 +104,7 @@ def test_clusters_do_not_see_each_other() -> None:
     rays = cast_rays(as_dataset(scene))
     halves = (np.arange(12) % 2).astype(np.uint32)
     found, _ = vote_in_clusters(rays, halves, VoteConfig())
+    assert found.cluster is not None
     assert sorted(found.cluster) == [0, 1]
     for row in range(2):
         members = found.voters[found.voter_offsets[row] : found.voter_offsets[row + 1]]

@@ -44,3 +44,37 @@ def merge(
     merge_radius_m: float,
 ) -> tuple[_Floats, tuple[_Offsets, _Indices]]: ...
 def unit_covariance(rays: Rays, point_in_world_m: _Floats, voter_offsets: _Offsets, voters: _Indices) -> _Floats: ...
+
+class Scene:
+    def __init__(
+        self,
+        rays: Rays,
+        *,
+        box_px: _Floats,
+        range_m: _Floats,
+        range_sigma_m: _Floats,
+        center_in_world_m: _Floats,
+        cam_from_world: _Floats,
+        camera: _Indices,
+        pass_code: _Indices,
+        position_sigma_m: _Floats,
+        rotation_sigma_rad: _Floats,
+        frustum_normals: _Floats,
+        solid_angle_sr: _Floats,
+        viewpoint_step_m: float,
+    ) -> None: ...
+
+_Noise = tuple[float, float, float, float, float, float]
+_Settings = tuple[float, float, float, float, int, float]
+
+def calibrate_noise(
+    scene: Scene,
+    guess: _Noise,
+    known: list[bool],
+    settings: _Settings,
+    threads: int,
+    progress: Callable[[int, int], None],
+) -> _Noise: ...
+def find_labels(
+    scene: Scene, noise: _Noise, settings: _Settings, threads: int, progress: Callable[[int, int], None]
+) -> tuple[_Floats, tuple[_Offsets, _Indices], _Floats, _Floats, _Offsets, dict[str, float]]: ...

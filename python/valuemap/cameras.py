@@ -23,6 +23,8 @@ import valuemap._core as _core
 from valuemap.dataset import Dataset, rows_of
 from valuemap.tables import Cameras, Floats, Images, Ints
 
+_LEAST_FORWARD = 0.1
+"""Corners of a picture less forward than this (cosine to the axis) bound no pyramid."""
 _JACOBIAN_STEP = 1e-5
 """Half the step, in units of the virtual image plane, of the central differences."""
 _RAY_TOLERANCE_PX = 0.1
@@ -111,6 +113,30 @@ def cast_rays(dataset: Dataset) -> Rays:
         camera_row=camera_row,
         class_code=detections.class_name.codes,
     )
+
+
+def picture_bounds(cameras: Cameras) -> tuple[Floats, Floats]:
+    """Return what each camera pictures: normals (N, 4, 3) of planes through its centre, and solid angles (N) in sr.
+
+    A point in camera axes is in the picture if its product with all four normals is not negative. Cameras that see
+    beyond a half space have NaN normals: they are taken to picture everything around them.
+    """
+    normals, solid_angle = np.full((len(cameras), 4, 3), np.nan), np.full(len(cameras), 4.0 * np.pi)
+    for row in range(len(cameras)):
+        camera = colmap_camera(cameras, row)
+        width, height = camera.width, camera.height
+        corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
+        ray = np.asarray(camera.cam_ray_from_img(corners))
+        if camera.is_spherical() or not np.all(ray[:, 2] > _LEAST_FORWARD):
+            continue
+        normals[row] = np.cross(ray, np.roll(ray, -1, axis=0))
+        # Two spherical triangles, by the formula of Van Oosterom and Strackee (1983).
+        solid_angle[row] = sum(_triangle_sr(ray[0], ray[i], ray[i + 1]) for i in (1, 2))
+    return normals, solid_angle
+
+
+def _triangle_sr(a: Floats, b: Floats, c: Floats) -> float:
+    return float(2.0 * np.arctan2(abs(a @ np.cross(b, c)), 1.0 + a @ b + b @ c + c @ a))
 
 
 def _local_pinholes(camera: pycolmap.Camera, center_px: Floats) -> tuple[Floats, Floats]:

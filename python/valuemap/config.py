@@ -14,16 +14,22 @@ from typing import Any, Literal, Self, get_args
 
 from valuemap.errors import SettingError
 
-Method = Literal["paper"]
+Method = Literal["robust", "paper"]
 
 _TOO_LARGE = 2**63
 """Whole numbers from here on fit no integer of the core."""
 
 
 def _setting(
-    default: float, *, unit: str, effect: str, low: float = 0.0, high: float = math.inf, open_low: bool = False
+    default: float | None,
+    *,
+    unit: str,
+    effect: str,
+    low: float = 0.0,
+    high: float = math.inf,
+    open_low: bool = False,
 ) -> Any:
-    """Declare one setting: default, unit, effect and the range of values that make sense."""
+    """Declare one setting: default (None: estimated from the data), unit, effect and the range that makes sense."""
     return field(
         default=default,
         metadata={"unit": unit, "effect": effect, "low": low, "high": high, "open_low": open_low},
@@ -80,14 +86,39 @@ class VoteConfig:
 
 
 @dataclass(frozen=True)
-class RefineConfig:
-    """What one detection is worth when positions and covariances are estimated."""
+class NoiseConfig:
+    """How far a detection may be from where its object projects; what is not set is estimated from the data."""
 
-    detection_sigma_px: float = _setting(
-        2.0,
+    gate_sigmas: float = _setting(
+        3.5,
+        unit="sigmas",
+        open_low=True,
+        effect="a detection votes for a point that projects closer than this many standard deviations (robust)",
+    )
+    detection_sigma_px: float | None = _setting(
+        None,
         unit="px",
         open_low=True,
-        effect="standard deviation of a detection's centre, each axis; scales the covariance of the labels",
+        effect="standard deviation of a detection's centre, each axis",
+    )
+    position_sigma_m: float | None = _setting(
+        None,
+        unit="m",
+        effect="standard deviation of a camera position, each axis (robust)",
+    )
+    rotation_sigma_deg: float | None = _setting(
+        None,
+        unit="deg",
+        effect="standard deviation of a camera rotation, each axis (robust)",
+    )
+
+
+@dataclass(frozen=True)
+class ExistenceConfig:
+    """Which labels are kept."""
+
+    min_existence: float = _setting(
+        0.5, unit="1", high=1.0, effect="labels that exist with a smaller probability are dropped (robust)"
     )
 
 
@@ -102,10 +133,11 @@ class MergeConfig:
 class MapConfig:
     """All settings of one `map` run, by stage."""
 
-    method: Method = "paper"
+    method: Method = "robust"
     partition: PartitionConfig = PartitionConfig()
     vote: VoteConfig = VoteConfig()
-    refine: RefineConfig = RefineConfig()
+    noise: NoiseConfig = NoiseConfig()
+    existence: ExistenceConfig = ExistenceConfig()
     merge: MergeConfig = MergeConfig()
 
     def __post_init__(self) -> None:
@@ -133,9 +165,9 @@ class MapConfig:
         """
         return dataclasses.replace(self, **_assign(self._stages(), assignments))
 
-    def as_dict(self) -> dict[str, float | str]:
+    def as_dict(self) -> dict[str, float | str | None]:
         """Return all settings, flat, as `run.json` holds them."""
-        flat: dict[str, float | str] = {"method": self.method}
+        flat: dict[str, float | str | None] = {"method": self.method}
         for stage in self._stages().values():
             flat.update(dataclasses.asdict(stage))
         return flat
@@ -147,7 +179,7 @@ class MapConfig:
 def describe_settings() -> list[tuple[str, str, str, str]]:
     """Return (name, default, unit, effect) of every setting, in the order of the stages."""
     return [
-        (s.name, str(s.default), s.metadata["unit"], s.metadata["effect"])
+        (s.name, _shown(s.default), s.metadata["unit"], s.metadata["effect"])
         for stage in MapConfig()._stages().values()
         for s in fields(stage)
     ]
@@ -184,11 +216,17 @@ def _parse(setting: dataclasses.Field[Any], text: str) -> float:
         kind = "a whole number" if number is int else "a number"
         raise SettingError(
             f"{setting.name}: expected {kind} ({setting.metadata['unit']}), found {text!r}",
-            hint=f"the default is {setting.name}={setting.default}",
+            hint=f"the default is {setting.name}={_shown(setting.default)}",
         ) from None
 
 
-def _check_range(setting: dataclasses.Field[Any], value: float) -> None:
+def _shown(value: Any) -> str:
+    return "estimated" if value is None else str(value)
+
+
+def _check_range(setting: dataclasses.Field[Any], value: float | None) -> None:
+    if value is None:
+        return
     low, high = setting.metadata["low"], setting.metadata["high"]
     too_low = value <= low if setting.metadata["open_low"] else value < low
     if too_low or value > high or not abs(value) < _TOO_LARGE:  # Nor infinite, nor NaN.
@@ -196,7 +234,7 @@ def _check_range(setting: dataclasses.Field[Any], value: float) -> None:
         upper = f" and at most {high:g}" if math.isfinite(high) else ""
         raise SettingError(
             f"{setting.name}: expected {above} {low:g}{upper} ({setting.metadata['unit']}), found {value}",
-            hint=f"the default is {setting.name}={setting.default}",
+            hint=f"the default is {setting.name}={_shown(setting.default)}",
         )
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 import valuemap._core as _core
 from valuemap.cameras import Rays
-from valuemap.config import RefineConfig
+from valuemap.config import NoiseConfig
 from valuemap.dataset import Dataset
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.tables import Candidates, Floats, Ints, Labels, Votes
@@ -16,11 +16,13 @@ _UPPER_TRIANGLE = (0, 1, 2, 4, 5, 8)
 _MAX_DIRECTIONS = 64
 
 
-def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config: RefineConfig) -> tuple[Labels, Votes]:
+def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config: NoiseConfig) -> tuple[Labels, Votes]:
     """Return the labels (ids from 1, in the order of the candidates) and their votes.
 
-    The covariance is `detection_sigma_px²` times the inverse of the normal equations of Eq. (1) of the paper at the
-    label; width and height are the medians over voters of box size times depth over focal length.
+    Where the candidates have no covariance of their own it is the squared standard deviation of the detections times
+    the inverse of the normal equations of Eq. (1) of the paper at the label. That deviation is the setting
+    `detection_sigma_px`, else that of the residuals. Width and height are the medians over voters of box size times
+    depth over focal length.
     """
     images, detections = dataset.images, dataset.detections
     voters = candidates.voters.astype(np.int64)
@@ -30,16 +32,19 @@ def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config
     residual_px, size_m = _seen_from_voters(rays, voters, candidates.position_in_world_m[label], detections.size_px)
     image_row = rays.image_row[voters]
     time = np.full(len(voters), np.nan) if images.timestamp_s is None else images.timestamp_s[image_row]
-    covariance = config.detection_sigma_px**2 * _core.unit_covariance(
-        rays.core, candidates.position_in_world_m, candidates.voter_offsets, candidates.voters
-    )
+    sigma_px = config.detection_sigma_px or _residual_sigma_px(residual_px, len(candidates))
+    covariance = candidates.covariance_m2
+    if covariance is None:
+        covariance = sigma_px**2 * _core.unit_covariance(
+            rays.core, candidates.position_in_world_m, candidates.voter_offsets, candidates.voters
+        )
     position = candidates.position_in_world_m
     anchor = dataset.frame.anchor
     labels = Labels(
         label_id=np.arange(1, len(candidates) + 1),
         class_name=detections.class_name.take(voters[starts]),
         position_in_world_m=position,
-        covariance_m2=covariance[:, _UPPER_TRIANGLE],
+        covariance_m2=covariance.reshape(-1, 9)[:, _UPPER_TRIANGLE],
         votes=count,
         passes=_count_distinct(label, images.pass_id.codes[image_row], len(candidates)),
         object_width_m=_median_in_groups(size_m[:, 0], label, candidates.voter_offsets),
@@ -48,6 +53,8 @@ def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config
         max_parallax_rad=max_angles(rays, candidates),
         first_seen_s=_reduce(np.fmin, time, starts),
         last_seen_s=_reduce(np.fmax, time, starts),
+        expected=candidates.expected,
+        existence=candidates.existence,
         lon_lat_height=None if anchor is None else lon_lat_height_from_enu(position, anchor),
     )
     votes = Votes(
@@ -55,7 +62,7 @@ def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config
         detection_id=detections.detection_id[voters],
         image_id=detections.image_id[voters],
         residual_px=residual_px,
-        residual_sigmas=residual_px / config.detection_sigma_px,
+        residual_sigmas=residual_px / sigma_px,
     )
     return labels, votes
 
@@ -87,6 +94,12 @@ def _seen_from_voters(rays: Rays, voters: Ints, position: Floats, size_px: Float
         matrix[:, :2] - (matrix[:, :2] @ matrix[:, 2, :, None]) * matrix[:, 2, None], axis=2
     )
     return np.linalg.norm(projected[:, :2] / depth, axis=1), size_px[voters] * depth / pixels_per_unit
+
+
+def _residual_sigma_px(residual_px: Floats, labels: int) -> float:
+    """Return the standard deviation of residuals, each axis: two numbers a vote, three spent on each position."""
+    freedom = 2 * len(residual_px) - 3 * labels
+    return float(np.sqrt(np.sum(residual_px**2) / freedom)) if freedom > 0 else 1.0
 
 
 def _reduce(operation: np.ufunc, values: Floats, starts: Ints) -> Floats:

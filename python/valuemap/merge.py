@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 import valuemap._core as _core
 from valuemap.cameras import Rays
 from valuemap.config import MergeConfig
@@ -14,8 +12,9 @@ def merge_clusters(rays: Rays, candidates: Candidates, config: MergeConfig) -> C
     """Merge candidates of one class and of different clusters closer than `merge_radius_m`, the closest pair first.
 
     Positions are refined over the union of the voters. Candidates of one cluster were told apart there and stay
-    apart. The result is ordered by first voter, and its `cluster` is 0 everywhere: clusters have had their day.
+    apart. The result is ordered by first voter and no longer of clusters.
     """
+    assert candidates.cluster is not None
     position, (offsets, voters) = _core.merge(
         rays.core,
         candidates.position_in_world_m,
@@ -24,4 +23,4 @@ def merge_clusters(rays: Rays, candidates: Candidates, config: MergeConfig) -> C
         candidates.cluster,
         config.merge_radius_m,
     )
-    return Candidates(position, offsets, voters, np.zeros(len(position), np.uint32))
+    return Candidates(position, offsets, voters)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import resource
 import sys
 import time
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from valuemap.cameras import cast_rays
+from valuemap.cameras import Rays, cast_rays
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
 from valuemap.describe import describe_labels
@@ -20,6 +21,8 @@ from valuemap.map_folder import Map
 from valuemap.merge import merge_clusters
 from valuemap.partition import partition_images
 from valuemap.progress import Progress, silent
+from valuemap.robust import Scene, calibrate_noise, find_labels
+from valuemap.tables import Candidates
 from valuemap.vote import vote_in_clusters
 
 
@@ -27,8 +30,6 @@ def build_map(
     dataset: Dataset, config: MapConfig | None = None, *, threads: int = 0, progress: Progress = silent
 ) -> Map:
     """Find the objects that the detections of a dataset show.
-
-    Algorithm 1 of Dabisias et al., "VALUE", ICRA 2018, in clusters, with merging.
 
     Parameters
     ----------
@@ -50,25 +51,45 @@ def build_map(
     stages = _Stages()
     with stages.measured("rays"):
         rays = cast_rays(dataset)
-    with stages.measured("partition"):
-        cluster_of_image = partition_images(dataset.images, config.partition)
-    with stages.measured("vote"):
-        found, pair_counts = vote_in_clusters(rays, cluster_of_image, config.vote, threads=threads, progress=progress)
-    with stages.measured("merge"):
-        merged = merge_clusters(rays, found, config.merge)
+    method = _paper if config.method == "paper" else _robust
+    found, counts = method(dataset, rays, config, stages, threads, progress)
     with stages.measured("describe"):
-        labels, votes = describe_labels(dataset, rays, merged, config.refine)
+        labels, votes = describe_labels(dataset, rays, found, config.noise)
     counts = {
         "images": len(dataset.images),
         "detections": len(dataset.detections),
         "detections_without_ray": int(np.isnan(rays.direction_in_world[:, 0]).sum()),
         "detections_without_label": len(dataset.detections) - len(votes),
-        "clusters": int(cluster_of_image.max()) + 1,
-        **pair_counts,
-        "labels_before_merge": len(found),
+        **counts,
         "labels": len(labels),
     }
     return Map(dataset.frame, labels, votes, _record(dataset, config, counts, stages))
+
+
+def _paper(
+    dataset: Dataset, rays: Rays, config: MapConfig, stages: _Stages, threads: int, progress: Progress
+) -> tuple[Candidates, dict[str, Any]]:
+    """Algorithm 1 of Dabisias et al., "VALUE", ICRA 2018, in clusters, with merging."""
+    with stages.measured("partition"):
+        cluster_of_image = partition_images(dataset.images, config.partition)
+    with stages.measured("vote"):
+        found, counts = vote_in_clusters(rays, cluster_of_image, config.vote, threads=threads, progress=progress)
+    with stages.measured("merge"):
+        merged = merge_clusters(rays, found, config.merge)
+    clusters = int(cluster_of_image.max()) + 1
+    return merged, {"clusters": clusters, **counts, "labels_before_merge": len(found)}
+
+
+def _robust(
+    dataset: Dataset, rays: Rays, config: MapConfig, stages: _Stages, threads: int, progress: Progress
+) -> tuple[Candidates, dict[str, Any]]:
+    """Bounded candidates, a pose-aware gate calibrated on the data, and existence; docs/method.md."""
+    scene = Scene(dataset, rays)
+    with stages.measured("calibrate"):
+        noise = calibrate_noise(scene, config, threads=threads, progress=progress)
+    with stages.measured("find"):
+        found, counts = find_labels(scene, noise, config, threads=threads, progress=progress)
+    return found, {**counts, "noise": dataclasses.asdict(noise)}
 
 
 class _Stages:

@@ -195,16 +195,21 @@ class Candidates:
     """Points with the rays that support them: what voting finds and merging makes into labels.
 
     `position_in_world_m` (N, 3); the voters of candidate i are the rows `voters[voter_offsets[i] :
-    voter_offsets[i + 1]]` of the detections, ascending; `cluster` (N) is where it was found.
+    voter_offsets[i + 1]]` of the detections, ascending. `cluster` (N) is where it was found (paper); `covariance_m2`
+    (N, 3, 3), the probability of `existence` (N) and the number of images `expected` to see it (N) are what the
+    robust method adds.
     """
 
     position_in_world_m: Floats
     voter_offsets: Ints
     voters: NDArray[np.uint32]
-    cluster: NDArray[np.uint32]
+    cluster: NDArray[np.uint32] | None = None
+    covariance_m2: Floats | None = None
+    existence: Floats | None = None
+    expected: Ints | None = None
 
     def __len__(self) -> int:
-        return len(self.cluster)
+        return len(self.position_in_world_m)
 
     def row_of_voter(self) -> Ints:
         """Return the candidate (row) that each of the voters supports."""
@@ -219,7 +224,8 @@ class Labels(Table):
     `votes` counts images, `passes` the passes they come from; `reprojection_rms_px` over the voters;
     `max_parallax_rad` the largest angle between two voters' directions to the object; `first_seen_s` and
     `last_seen_s` the voters' first and last timestamps (NaN where there are none); width and height from the
-    voters' boxes at their depths; lon, lat in degrees and height in metres on WGS84 where geo-referenced.
+    voters' boxes at their depths; `expected` counts the images that should have seen it and `existence` is the
+    probability that it exists (robust method); lon, lat in degrees and height in metres on WGS84 where geo-referenced.
     """
 
     KEY: ClassVar[str | None] = "label_id"
@@ -248,6 +254,8 @@ class Labels(Table):
     first_seen_s: Floats = _column("float", ("first_seen",), nullable=True)
     last_seen_s: Floats = _column("float", ("last_seen",), nullable=True)
     lon_lat_height: Floats | None = _column("float", ("lon", "lat", "height"), optional=True)
+    expected: Ints | None = _column("int", ("expected",), optional=True)
+    existence: Floats | None = _column("float", ("existence",), optional=True)
 
 
 @dataclass(frozen=True, eq=False)

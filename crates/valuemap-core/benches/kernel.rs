@@ -4,7 +4,7 @@ use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use nalgebra::{Matrix3, Rotation3, Vector3};
-use valuemap_core::kernel::{Gates, instruction_sets};
+use valuemap_core::kernel::{Gate, Gates, instruction_sets};
 use valuemap_core::ray::Ray;
 
 const RAYS: usize = 192;
@@ -32,8 +32,8 @@ fn scene() -> (Vec<Ray>, Vec<Vector3<f64>>) {
 
 fn bench(criterion: &mut Criterion) {
     let (rays, points) = scene();
-    let lanes: Vec<u32> = (0..RAYS as u32).collect();
-    let gates = Gates::new(&rays, &lanes, 6.0);
+    let gate = Gate { radius_px: 6.0, floor_m2: 0.0 };
+    let gates = Gates::new((0..).zip(&rays).map(|(lane, ray)| (lane, ray, gate)));
     let mut maybe = vec![0; POINTS * gates.words()];
     let mut sure = maybe.clone();
     let mut group = criterion.benchmark_group("kernel");

@@ -6,7 +6,7 @@
 
 use nalgebra::Vector3;
 
-use crate::kernel::{Gates, LANES};
+use crate::kernel::{Gate, Gates, LANES};
 use crate::progress::{Halt, Progress};
 use crate::ray::Ray;
 
@@ -46,7 +46,8 @@ impl Ballot {
     ) -> Result<Self, Halt> {
         const BATCH: usize = 256;
         let layout = Layout::new(image);
-        let gates = Gates::new(rays, &layout.bit_of_ray, gate_px);
+        let gate = Gate { radius_px: gate_px, floor_m2: 0.0 };
+        let gates = Gates::new(rays.iter().zip(&layout.bit_of_ray).map(|(ray, &bit)| (bit, ray, gate)));
         let words = gates.words();
         if points.len().saturating_mul(words * size_of::<u64>()) > MAX_BYTES {
             return Err(Halt::TooLarge { rays: rays.len(), hypotheses: points.len() });
@@ -61,7 +62,7 @@ impl Ballot {
                 for (first, (maybe, sure)) in (0..).step_by(LANES).zip(row.iter_mut().zip(sure)) {
                     for bit in ones(*maybe & !*sure) {
                         let ray = &rays[layout.ray_of_bit[first + bit as usize] as usize];
-                        if !(ray.squared_error(point) < gate_px * gate_px) {
+                        if !gate.holds(&ray.project(point)) {
                             *maybe &= !(1 << bit);
                         }
                     }
@@ -163,7 +164,8 @@ impl Layout {
     }
 }
 
-fn ones(mut bits: u64) -> impl Iterator<Item = u32> {
+/// The set bits of a word, ascending.
+pub fn ones(mut bits: u64) -> impl Iterator<Item = u32> {
     std::iter::from_fn(move || {
         (bits != 0).then(|| {
             let bit = bits.trailing_zeros();

@@ -1,7 +1,7 @@
 //! The voting kernel: does a point project into a ray's gate? `f32`, vectorised, dispatched at run time.
 //!
 //! For each ray a 3x4 matrix gives `(a, b, c) = A [X; 1]`; the point is inside where
-//! `a² + b² < c²` and `c > 0` (the gate is divided into A), which needs no division. In `f32` this is uncertain
+//! `a² + b² < c² + floor` and `c > 0` (the gate is divided into A), which needs no division. In `f32` this is uncertain
 //! within a margin that is known, so the kernel answers twice: `maybe` (no point that is inside is missing) and `sure`
 //! (every point in it is inside). The caller tests the few points between the two in `f64`, which makes the result
 //! independent of the instruction set.
@@ -14,13 +14,34 @@ use crate::ray::Ray;
 
 /// Rays that are tested together: one bit each in the answer.
 pub const LANES: usize = 64;
-const COEFFICIENTS: usize = 12;
+const COEFFICIENTS: usize = 13;
+const FLOOR: usize = 12;
 /// Points that are tested against a block while it is in the nearest cache.
 const TILE: usize = 64;
 /// Relative width of the band between `sure` and `maybe`.
 const BAND: f32 = 0.01;
 /// Bound on the relative `f32` error of a 4-term dot product of rounded inputs (a count of roundings, doubled).
 const ROUNDING: f64 = 16.0 * (f32::EPSILON as f64);
+
+/// How near a point must project: `|(a, b)|² < radius_px² (c² + floor_m2)`, a radius that grows at small depths c.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Gate {
+    /// Radius for distant points, px.
+    pub radius_px: f64,
+    /// Squared depth at which the radius is `sqrt(2)` times as large, m².
+    pub floor_m2: f64,
+}
+
+impl Gate {
+    /// Whether a point with this `(a, b, c)` is inside.
+    #[inline]
+    #[must_use]
+    pub fn holds(&self, projected: &Vector3<f64>) -> bool {
+        let error2 = projected.x * projected.x + projected.y * projected.y;
+        let depth = projected.z;
+        depth > 0.0 && error2 < self.radius_px * self.radius_px * (depth * depth + self.floor_m2)
+    }
+}
 
 /// The matrices of up to 64 rays, one coefficient after the other, so that lanes are contiguous.
 #[derive(Clone)]
@@ -30,13 +51,14 @@ impl Block {
     /// Lanes without a ray have `c = -1` everywhere: never inside.
     fn empty() -> Self {
         let mut block = Self([[0.0; LANES]; COEFFICIENTS]);
-        block.0[COEFFICIENTS - 1] = [-1.0; LANES];
+        block.0[FLOOR - 1] = [-1.0; LANES];
         block
     }
 
-    fn set(&mut self, lane: usize, ray: &Ray, gate: f64) {
+    fn set(&mut self, lane: usize, ray: &Ray, gate: Gate) {
+        self.0[FLOOR][lane] = gate.floor_m2 as f32;
         for row in 0..3 {
-            let scale = if row < 2 { 1.0 / gate } else { 1.0 };
+            let scale = if row < 2 { 1.0 / gate.radius_px } else { 1.0 };
             let m = ray.residual_from_world.row(row) * scale;
             for column in 0..3 {
                 self.0[row * 4 + column][lane] = m[column] as f32;
@@ -63,17 +85,20 @@ struct Margins {
 }
 
 impl Gates {
-    /// Place rays on lanes: `lanes[i]` is the lane of `rays[i]`; a gate is a radius in pixels.
+    /// Place rays with their gates on lanes.
     ///
     /// Centres should lie near the origin: `f32` has 24 bits.
     #[must_use]
-    pub fn new(rays: &[Ray], lanes: &[u32], gate_px: f64) -> Self {
-        let count = lanes.iter().max().map_or(0, |&last| last as usize / LANES + 1);
-        let mut gates = Self { blocks: vec![Block::empty(); count], largest_row: 1.0, largest_center_m: 0.0 };
-        for (ray, &lane) in rays.iter().zip(lanes) {
-            gates.blocks[lane as usize / LANES].set(lane as usize % LANES, ray, gate_px);
+    pub fn new<'a>(rays: impl Iterator<Item = (u32, &'a Ray, Gate)>) -> Self {
+        let mut gates = Self { blocks: Vec::new(), largest_row: 1.0, largest_center_m: 0.0 };
+        for (lane, ray, gate) in rays {
+            let block = lane as usize / LANES;
+            while gates.blocks.len() <= block {
+                gates.blocks.push(Block::empty());
+            }
+            gates.blocks[block].set(lane as usize % LANES, ray, gate);
             let m = &ray.residual_from_world;
-            gates.largest_row = gates.largest_row.max(m.row(0).norm().max(m.row(1).norm()) / gate_px);
+            gates.largest_row = gates.largest_row.max(m.row(0).norm().max(m.row(1).norm()) / gate.radius_px);
             gates.largest_center_m = gates.largest_center_m.max(ray.center.norm());
         }
         gates
@@ -184,7 +209,7 @@ fn test_block<const FUSED: bool>(block: &Block, x: [f32; 3], margins: Margins) -
         };
         let (a, b, c) = (dot(0), dot(1), dot(2));
         let error2 = multiply_add::<FUSED>(a, a, b * b);
-        let c2 = c * c;
+        let c2 = multiply_add::<FUSED>(c, c, m[FLOOR][lane]);
         maybe[lane] =
             u8::from(error2 < multiply_add::<FUSED>(c2, 1.0 + BAND, margins.maybe)) & u8::from(c > -margins.depth);
         sure[lane] =

@@ -23,9 +23,16 @@ pub mod merge;
 pub mod partition;
 pub mod progress;
 pub mod ray;
+pub mod robust;
 pub mod select;
 pub mod triangulate;
 pub mod two_view;
 pub mod vote;
 
 pub use nalgebra::Vector3;
+
+/// A 3x3 matrix of its numbers row by row.
+#[must_use]
+pub fn matrix_from_rows(rows: &[f64; 9]) -> nalgebra::Matrix3<f64> {
+    nalgebra::Matrix3::from_row_slice(rows)
+}

@@ -66,4 +66,20 @@ impl Ray {
     pub fn relative_to(&self, origin: &Vector3<f64>) -> Self {
         Self { center: self.center - origin, ..*self }
     }
+
+    /// Squared pixels that a unit of the virtual image plane spans, the mean of both axes.
+    #[must_use]
+    pub fn pixels_per_unit2(&self) -> f64 {
+        // The first two rows are J (V_12 - p_0 V_3) with V orthonormal: without their part along V_3 they are J V_12.
+        let depth = self.residual_from_world.row(2);
+        let across =
+            [0, 1].map(|i| self.residual_from_world.row(i) - depth * self.residual_from_world.row(i).dot(&depth));
+        0.5 * (across[0].norm_squared() + across[1].norm_squared())
+    }
+
+    /// Whether the camera model has a ray for this detection: all numbers are finite.
+    #[must_use]
+    pub fn is_usable(&self) -> bool {
+        self.residual_from_world.iter().chain(&self.center).all(|number| number.is_finite())
+    }
 }

@@ -6,7 +6,7 @@ use proptest::collection::vec;
 use proptest::prelude::*;
 use valuemap_core::ballot::Ballot;
 use valuemap_core::hypothesis::{Viability, propose};
-use valuemap_core::kernel::{Gates, LANES, instruction_sets};
+use valuemap_core::kernel::{Gate, Gates, LANES, instruction_sets};
 use valuemap_core::merge::merge;
 use valuemap_core::progress::Progress;
 use valuemap_core::ray::{Ray, Rays};
@@ -83,10 +83,12 @@ proptest! {
 
     #[test]
     fn the_kernel_is_right_wherever_it_is_sure(
-        rays in vec(ray(), 1..150), points in vec(point(), 1..40), gate in prop_oneof![Just(0.5), Just(6.0), Just(400.0)]
+        rays in vec(ray(), 1..150), points in vec(point(), 1..40), radius_px in prop_oneof![Just(0.5), Just(6.0), Just(400.0)],
+        floor_m2 in prop_oneof![Just(0.0), Just(0.04), Just(25.0)]
     ) {
         let lanes: Vec<u32> = (0..rays.len() as u32).map(|i| i + i / 10).collect();
-        let gates = Gates::new(&rays, &lanes, gate);
+        let gate = Gate { radius_px, floor_m2 };
+        let gates = Gates::new(rays.iter().zip(&lanes).map(|(ray, &lane)| (lane, ray, gate)));
         for (name, arch) in instruction_sets() {
             let mut maybe = vec![u64::MAX; points.len() * gates.words()];
             let mut sure = maybe.clone();
@@ -94,7 +96,7 @@ proptest! {
             for (p, point) in points.iter().enumerate() {
                 let bit = |rows: &[u64], lane: usize| rows[p * gates.words() + lane / LANES] >> (lane % LANES) & 1 == 1;
                 for (ray, &lane) in rays.iter().zip(&lanes) {
-                    let inside = ray.squared_error(point) < gate * gate;
+                    let inside = gate.holds(&ray.project(point));
                     prop_assert!(!inside || bit(&maybe, lane as usize), "{name}");
                     prop_assert!(inside || !bit(&sure, lane as usize), "{name}");
                 }

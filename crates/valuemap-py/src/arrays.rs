@@ -22,7 +22,7 @@ pub fn rays_from(matrices: &[[f64; 9]], centers: &[[f64; 3]], directions: &[[f64
         .iter()
         .zip(centers.iter().zip(directions))
         .map(|(m, (&center, &direction))| Ray {
-            residual_from_world: [[m[0], m[3], m[6]], [m[1], m[4], m[7]], [m[2], m[5], m[8]]].into(),
+            residual_from_world: valuemap_core::matrix_from_rows(m),
             center: center.into(),
             direction: direction.into(),
         })

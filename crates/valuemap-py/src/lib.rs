@@ -2,6 +2,7 @@
 #![allow(clippy::needless_pass_by_value)] // Python hands its arguments over by value.
 
 mod arrays;
+mod robust;
 mod run;
 
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
@@ -18,7 +19,13 @@ use crate::run::with_progress;
 
 /// Viewing rays, one a detection, copied once and used by every stage.
 #[pyclass(frozen, module = "valuemap._core")]
-struct Rays(valuemap_core::ray::Rays);
+pub struct Rays(valuemap_core::ray::Rays);
+
+impl Rays {
+    fn core(&self) -> &valuemap_core::ray::Rays {
+        &self.0
+    }
+}
 
 #[pymethods]
 impl Rays {
@@ -148,6 +155,9 @@ fn unit_covariance<'py>(
 
 #[pymodule]
 mod _core {
+    #[pymodule_export]
+    #[pymodule_export]
+    use super::robust::{Scene, calibrate_noise, find_labels};
     #[pymodule_export]
     use super::{Rays, merge_labels, partition_images, unit_covariance, vote_in_clusters};
 }

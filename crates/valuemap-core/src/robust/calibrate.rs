@@ -1,0 +1,231 @@
+//! Self-calibration: the noise is estimated from the residuals of the labels themselves.
+//!
+//! The size of the errors by restricted maximum likelihood: the parameters that make the residuals of a sample of well
+//! supported labels most likely, positions marginalised. Depth tells errors of position from those in pixels, and box
+//! size the part that grows with it; what is rotation and what is detection, residuals of one focal length do not tell,
+//! so each gets half. How much of the pose error a pass shares shows only where passes meet: it is what makes the
+//! positions that the passes of a label would give it alone differ as much as they do.
+
+use nalgebra::{Matrix3, Vector3};
+use rayon::prelude::*;
+
+use super::estimate::{by_pass, pass_terms};
+use super::label::Label;
+use super::noise::Noise;
+use super::scene::Scene;
+
+/// Labels with fewer voters do not serve.
+const MIN_VOTES: usize = 6;
+/// A pass with fewer voters does not say where it would put a label alone.
+const MIN_VOTES_OF_PASS: usize = 4;
+/// The part of the labels that serves, those that fit best.
+const FIT_SHARE: f64 = 0.9;
+/// Voters that are used, about.
+const SAMPLE_VOTES: usize = 6000;
+/// The parameters are searched between these factors of a step, from coarse to fine.
+const STEPS: [f64; 5] = [2.0, 1.5, 1.25, 1.12, 1.06];
+/// The guess is trusted to about this factor (standard deviation of the logarithm): what the data do not tell stays near it.
+const TRUST_LOG_SD: f64 = 1.0;
+/// The part of the variance of distant objects' residuals that is taken for rotation.
+const ROTATION_PART: f64 = 0.5;
+/// Where fewer labels are seen by several passes, the shared part is taken to be as large as the own part.
+const MIN_SHARED_LABELS: usize = 5;
+/// One label says no more than this about the disagreement of passes, as a multiple of what is expected.
+const MOST_DISAGREEMENT: f64 = 5.0;
+
+/// What is searched for, and where: least and most.
+const DETECTION_PX: (f64, f64) = (0.05, 30.0);
+const BOX_SHARE: (f64, f64) = (1e-3, 0.5);
+const POSITION_M: (f64, f64) = (1e-4, 5.0);
+/// Shared errors over own errors of a pose.
+const DRIFT_RATIO: (f64, f64) = (0.3, 2.0);
+
+/// Which parts of the noise the user knows; they stay as they are.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Known {
+    /// The detections' part.
+    pub detection: bool,
+    /// The positions' part.
+    pub position: bool,
+    /// The rotations' part.
+    pub rotation: bool,
+}
+
+/// Estimate the noise, starting from a guess.
+///
+/// The guess is returned where there are too few labels to tell.
+#[must_use]
+pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Label], known: Known) -> Noise {
+    let sample = sample(scene, guess, labels);
+    if sample.len() < 3 {
+        return *guess;
+    }
+    let sum = |of: &(dyn Fn(&Label) -> f64 + Sync)| -> f64 {
+        // Summed in the order of the labels, so that threads do not change the result.
+        sample.par_iter().map(|label| of(label)).collect::<Vec<f64>>().iter().sum()
+    };
+    // All errors as if each image had them for itself, rotation as if it were the detections'.
+    let fixed = [known.detection && known.rotation, known.detection, known.position];
+    let total = |p: &[f64; 3]| Noise {
+        detection_px: p[0],
+        box_share: p[1],
+        position_m: p[2],
+        rotation_rad: 0.0,
+        position_drift_m: 0.0,
+        rotation_drift_rad: 0.0,
+    };
+    let scale2 = sample.iter().flat_map(|label| &label.voters).map(|&ray| scene.scale2[ray as usize]);
+    let scale2 = scale2.sum::<f64>() / sample.iter().map(|label| label.voters.len()).sum::<usize>() as f64;
+    let rotation = guess.rotation_rad.hypot(guess.rotation_drift_rad);
+    let start = [
+        (guess.detection_px.powi(2) + scale2 * rotation * rotation).sqrt(),
+        guess.box_share,
+        guess.position_m.hypot(guess.position_drift_m),
+    ];
+    let found = search(start, [DETECTION_PX, BOX_SHARE, POSITION_M], fixed, &|p| {
+        let noise = total(p);
+        sum(&|label| minus_log_likelihood(scene, &noise, &label.voters, &label.estimate.point))
+    });
+    let far2 = found[0] * found[0];
+    let rotation2 = if known.rotation { rotation * rotation } else { ROTATION_PART * far2 / scale2 };
+    let with_drift = |ratio: f64| {
+        // The size of all errors together stays: it is what the gate follows.
+        let own = (1.0 + ratio * ratio).sqrt().recip();
+        let (position, rotation) = (found[2] * own, rotation2.sqrt() * own);
+        Noise {
+            detection_px: if known.detection { guess.detection_px } else { ((1.0 - ROTATION_PART) * far2).sqrt() },
+            box_share: found[1],
+            position_m: position,
+            rotation_rad: rotation,
+            position_drift_m: position * ratio,
+            rotation_drift_rad: rotation * ratio,
+        }
+    };
+    with_drift(agreeing_ratio(scene, &sample, &with_drift))
+}
+
+/// The ratio of shared to own pose errors at which the passes of labels disagree as much as expected: by bisection, since
+/// the larger the shared errors are taken for, the less remains unexplained.
+fn agreeing_ratio(scene: &Scene, labels: &[&Label], noise_of: &(dyn Fn(f64) -> Noise + Sync)) -> f64 {
+    let excess = |ratio: f64| mean_disagreement(scene, &noise_of(ratio), labels).map(|mean| mean - 1.0);
+    let (mut low, mut high) = (DRIFT_RATIO.0.ln(), DRIFT_RATIO.1.ln());
+    for _ in 0..12 {
+        let middle = 0.5 * (low + high);
+        match excess(middle.exp()) {
+            None => return 1.0,
+            Some(excess) if excess > 0.0 => low = middle,
+            Some(_) => high = middle,
+        }
+    }
+    (0.5 * (low + high)).exp()
+}
+
+/// How much larger than they are said to be the errors are that labels of several passes show: the mean disagreement of
+/// their passes, at least 1. The variance of positions is to be multiplied by it.
+#[must_use]
+pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[&Label]) -> f64 {
+    mean_disagreement(scene, noise, labels).unwrap_or(1.0).max(1.0)
+}
+
+fn mean_disagreement(scene: &Scene, noise: &Noise, labels: &[&Label]) -> Option<f64> {
+    let of_labels: Vec<Option<f64>> = labels.par_iter().map(|label| disagreement(scene, noise, label)).collect();
+    let known: Vec<f64> = of_labels.into_iter().flatten().map(|d| d.min(MOST_DISAGREEMENT)).collect();
+    (known.len() >= MIN_SHARED_LABELS).then(|| known.iter().sum::<f64>() / known.len() as f64)
+}
+
+/// How far the positions that the passes of a label give it alone lie from their mean: squared, in sigmas, a degree of
+/// freedom. Nothing for labels of a single pass.
+fn disagreement(scene: &Scene, noise: &Noise, label: &Label) -> Option<f64> {
+    let (mut information, mut gradient, mut alone, mut passes) = (Matrix3::zeros(), Vector3::zeros(), 0.0, 0);
+    for pass in by_pass(scene, &label.voters).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS) {
+        let terms = pass_terms(scene, noise, pass, &vec![1.0; pass.len()], &label.estimate.point)?;
+        alone += terms.gradient.dot(&terms.information.cholesky()?.solve(&terms.gradient));
+        information += terms.information;
+        gradient += terms.gradient;
+        passes += 1;
+    }
+    let together = gradient.dot(&information.cholesky()?.solve(&gradient));
+    (passes >= 2).then(|| (alone - together) / (3.0 * f64::from(passes - 1)))
+}
+
+/// Minimise a cost over positive parameters by a pattern search in their logarithms, with a prior around the start.
+fn search<const N: usize>(
+    start: [f64; N],
+    bounds: [(f64, f64); N],
+    fixed: [bool; N],
+    cost: &dyn Fn(&[f64; N]) -> f64,
+) -> [f64; N] {
+    let mut best = start;
+    for i in (0..N).filter(|&i| !fixed[i]) {
+        best[i] = best[i].clamp(bounds[i].0, bounds[i].1);
+    }
+    let center = best;
+    let penalised = |parameters: &[f64; N]| {
+        let away = (0..N).filter(|&i| !fixed[i]).map(|i| (parameters[i] / center[i]).ln() / TRUST_LOG_SD);
+        cost(parameters) + away.map(|away| away * away).sum::<f64>()
+    };
+    let mut least = penalised(&best);
+    for step in STEPS {
+        for i in (0..N).chain(0..N).filter(|&i| !fixed[i]) {
+            for factor in [step, 1.0 / step] {
+                loop {
+                    let mut trial = best;
+                    trial[i] = (best[i] * factor).clamp(bounds[i].0, bounds[i].1);
+                    if trial[i].to_bits() == best[i].to_bits() {
+                        break;
+                    }
+                    let value = penalised(&trial);
+                    if !(value < least) {
+                        break;
+                    }
+                    (best, least) = (trial, value);
+                }
+            }
+        }
+    }
+    best
+}
+
+/// Well supported labels, evenly over the map, together about as many voters as needed. Those whose residuals fit the
+/// guess worst are left out: wrong associations would be taken for noise.
+fn sample<'a>(scene: &Scene, guess: &Noise, labels: &'a [Label]) -> Vec<&'a Label> {
+    let mut good: Vec<(f64, &Label)> = labels
+        .iter()
+        .filter(|label| label.voters.len() >= MIN_VOTES)
+        .map(|label| (misfit(scene, guess, label), label))
+        .collect();
+    let mut misfits: Vec<f64> = good.iter().map(|(misfit, _)| *misfit).collect();
+    misfits.sort_by(f64::total_cmp);
+    if let Some(&limit) = misfits.get((misfits.len() as f64 * FIT_SHARE) as usize) {
+        good.retain(|(misfit, _)| *misfit <= limit);
+    }
+    let good: Vec<&Label> = good.into_iter().map(|(_, label)| label).collect();
+    let votes: usize = good.iter().map(|label| label.voters.len()).sum();
+    let stride = (votes / SAMPLE_VOTES).max(1);
+    good.into_iter().step_by(stride).collect()
+}
+
+/// Squared residuals of a label in sigmas, shared errors taken out, a residual.
+fn misfit(scene: &Scene, noise: &Noise, label: &Label) -> f64 {
+    let passes = by_pass(scene, &label.voters);
+    let ones = vec![1.0; label.voters.len()];
+    let squares = passes.filter_map(|pass| pass_terms(scene, noise, pass, &ones[..pass.len()], &label.estimate.point));
+    squares.map(|terms| terms.square).sum::<f64>() / label.voters.len() as f64
+}
+
+/// Minus twice the logarithm of the restricted likelihood of voters' residuals (ordered by pass) around a point, up to a
+/// constant.
+fn minus_log_likelihood(scene: &Scene, noise: &Noise, voters: &[u32], point: &Vector3<f64>) -> f64 {
+    let (mut information, mut gradient) = (Matrix3::zeros(), Vector3::zeros());
+    let mut value = 0.0;
+    let ones = vec![1.0; voters.len()];
+    for pass in by_pass(scene, voters) {
+        let Some(terms) = pass_terms(scene, noise, pass, &ones[..pass.len()], point) else { return 0.0 };
+        information += terms.information;
+        gradient += terms.gradient;
+        value += terms.square + terms.log_determinant;
+    }
+    let Some(cholesky) = information.cholesky() else { return 0.0 };
+    value += 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
+    value - gradient.dot(&cholesky.solve(&gradient))
+}

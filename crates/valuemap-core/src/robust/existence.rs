@@ -1,0 +1,183 @@
+//! Does a label exist? Hits and misses among the looks that should have seen it.
+//!
+//! A look is a viewpoint (all images of a pass at one place) with at least one image that has the label in its picture,
+//! within the range and the sector from which it was seen. A real object is detected in a share of the looks, which
+//! varies from pass to pass (beta-binomial); where there is nothing, a look has a detection in the gate only by chance.
+
+use std::f64::consts::PI;
+
+use nalgebra::Vector3;
+use rayon::prelude::*;
+use rstar::RTree;
+use rstar::primitives::GeomWithData;
+
+use super::label::Label;
+use super::noise::Spread;
+use super::scene::Scene;
+
+/// Half of the sector around the mean viewing direction that a label is expected to be seen from, at least, rad.
+const MIN_HALF_SECTOR_RAD: f64 = 0.35;
+/// How much farther than its farthest voter a label is still expected to be seen.
+const RANGE_SLACK: f64 = 1.0;
+/// Nearer than this nothing is expected to be seen, m.
+const NEAREST_M: f64 = 4.0;
+
+/// Share of looks in which detections of other objects happen to lie in the gate of nothing.
+const COINCIDENCE: f64 = 0.05;
+/// How little that share varies between passes, see [`Rates::concentration`].
+const COINCIDENCE_CONCENTRATION: f64 = 15.0;
+/// Of the points that gathered enough votes to be judged, so many are nothing for each that is something. The point was chosen
+/// as the best of many, so plain odds would flatter it.
+const PRIOR_ODDS_AGAINST: f64 = 3.0;
+
+/// Looks of one pass at a label.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Looks {
+    /// The pass.
+    pub pass: u32,
+    /// Viewpoints that should have seen it.
+    pub expected: u32,
+    /// Viewpoints that did.
+    pub hits: u32,
+}
+
+/// How often objects and nothing are detected, learnt from the labels themselves.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rates {
+    /// Mean share of looks with a detection, of real objects.
+    pub recall: f64,
+    /// How much that share varies between passes: as if this many looks had been seen before (beta prior).
+    pub concentration: f64,
+}
+
+/// All images by place, to find the looks at labels.
+pub struct Lookout<'a> {
+    scene: &'a Scene,
+    tree: RTree<GeomWithData<[f64; 3], u32>>,
+}
+
+impl<'a> Lookout<'a> {
+    /// Index all images of a scene.
+    #[must_use]
+    pub fn new(scene: &'a Scene) -> Self {
+        let places = (0..).zip(&scene.views).map(|(i, view)| GeomWithData::new(view.center.into(), i)).collect();
+        Self { scene, tree: RTree::bulk_load(places) }
+    }
+
+    /// The looks at a label, by pass, and the images that should have seen it.
+    #[must_use]
+    pub fn looks(&self, label: &Label) -> (Vec<Looks>, u32) {
+        let scene = self.scene;
+        let point = label.estimate.point;
+        let toward: Vec<Vector3<f64>> =
+            label.voters.iter().map(|&ray| (scene.ray(ray).center - point).normalize()).collect();
+        let farthest = label.voters.iter().map(|&ray| (scene.ray(ray).center - point).norm()).fold(0.0, f64::max);
+        let mean = toward.iter().sum::<Vector3<f64>>().normalize();
+        let widest = toward.iter().map(|d| d.dot(&mean).clamp(-1.0, 1.0).acos()).fold(MIN_HALF_SECTOR_RAD, f64::max);
+        let least_cosine = widest.min(PI).cos();
+        let mut voted: Vec<u32> = label.voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
+        voted.sort_unstable();
+        let mut looks: Vec<(u32, u32, bool)> = Vec::new();
+        let mut expected = 0;
+        let range = farthest * RANGE_SLACK;
+        for near in self.tree.locate_within_distance(point.into(), range * range * (1.0 + 1e-9)) {
+            let image = near.data;
+            let view = &scene.views[image as usize];
+            let hit = voted.binary_search(&image).is_ok();
+            let away = view.center - point;
+            let should = away.norm() >= NEAREST_M
+                && away.normalize().dot(&mean) >= least_cosine
+                && scene.is_in_picture(view, &point);
+            expected += u32::from(hit || should);
+            if (hit || should) && label.undecided.binary_search(&image).is_err() {
+                looks.push((view.pass, view.viewpoint, hit));
+            }
+        }
+        looks.sort_unstable();
+        (count_looks(&looks), expected)
+    }
+}
+
+/// Join images of one viewpoint, then viewpoints of one pass.
+fn count_looks(sorted: &[(u32, u32, bool)]) -> Vec<Looks> {
+    sorted
+        .chunk_by(|a, b| a.0 == b.0)
+        .map(|pass| {
+            let viewpoints = pass.chunk_by(|a, b| a.1 == b.1);
+            let hits = viewpoints.clone().filter(|images| images.iter().any(|image| image.2)).count();
+            Looks { pass: pass[0].0, expected: viewpoints.count() as u32, hits: hits as u32 }
+        })
+        .collect()
+}
+
+impl Rates {
+    /// Learn the recall and its spread over passes from the looks at labels that nobody doubts.
+    #[must_use]
+    pub fn learn(looks: &[Vec<Looks>]) -> Self {
+        let sure: Vec<&Looks> = looks
+            .iter()
+            .filter(|passes| passes.iter().map(|p| p.hits).sum::<u32>() >= 8)
+            .flatten()
+            .filter(|pass| pass.expected >= 3)
+            .collect();
+        let (hits, expected) =
+            sure.iter().fold((0.0_f64, 0.0_f64), |(h, n), p| (h + f64::from(p.hits), n + f64::from(p.expected)));
+        if expected < 30.0 {
+            return Self { recall: 0.7, concentration: 3.0 };
+        }
+        let recall = (hits / expected).clamp(0.05, 0.98);
+        // Method of moments: the variance of a pass's share is p (1 - p) (1 + (n - 1) / (1 + s)) / n.
+        let mut excess = (0.0, 0.0);
+        for pass in &sure {
+            let n = f64::from(pass.expected);
+            let share = f64::from(pass.hits) / n - recall;
+            excess.0 += n * share * share - recall * (1.0 - recall);
+            excess.1 += (n - 1.0) * recall * (1.0 - recall);
+        }
+        let correlation = (excess.0 / excess.1).clamp(0.01, 0.5);
+        Self { recall, concentration: 1.0 / correlation - 1.0 }
+    }
+
+    /// Logarithm of the likelihood of the hits of one pass at a real object: beta-binomial.
+    #[must_use]
+    pub fn log_likelihood(&self, looks: &Looks) -> f64 {
+        let (a, b) = (self.recall * self.concentration, (1.0 - self.recall) * self.concentration);
+        log_rising(a, looks.hits) + log_rising(b, looks.expected - looks.hits) - log_rising(a + b, looks.expected)
+    }
+}
+
+/// `log(x (x + 1) ... (x + n - 1))`.
+fn log_rising(x: f64, n: u32) -> f64 {
+    (0..n).map(|k| (x + f64::from(k)).ln()).sum()
+}
+
+/// The probability that each label exists.
+///
+/// Against it speaks that nothing is there, and the hits come from detections of other things: a small share of the looks,
+/// again different from pass to pass. `chance` is the share that stray detections alone give.
+#[must_use]
+pub fn probabilities(looks: &[Vec<Looks>], rates: &Rates, chance: &[f64]) -> Vec<f64> {
+    looks
+        .par_iter()
+        .zip(chance)
+        .map(|(passes, &chance)| {
+            let nothing = Rates { recall: chance + COINCIDENCE, concentration: COINCIDENCE_CONCENTRATION };
+            let log_odds: f64 =
+                passes.iter().map(|pass| rates.log_likelihood(pass) - nothing.log_likelihood(pass)).sum();
+            1.0 / (1.0 + PRIOR_ODDS_AGAINST * (-log_odds).exp())
+        })
+        .collect()
+}
+
+/// The chance of a look having a detection in the gate of nothing: stray detections a steradian, times the solid angle of
+/// the gate, the mean over the voters.
+#[must_use]
+pub fn chance_of(label: &Label, scene: &Scene, spreads: &[Spread], gate_sigmas: f64, strays_per_sr: f64) -> f64 {
+    let areas = label.voters.iter().map(|&ray| {
+        let depth = scene.ray(ray).project(&label.estimate.point).z;
+        let variance = spreads[ray as usize].variance(depth) / scene.scale2[ray as usize];
+        PI * gate_sigmas * gate_sigmas * variance
+    });
+    let mean = areas.sum::<f64>() / label.voters.len() as f64;
+    (strays_per_sr * mean).clamp(1e-4, 0.5)
+}

@@ -1,0 +1,138 @@
+//! Which rays see a point: all rays, grouped by the place they were taken from, ready for the kernel.
+
+use nalgebra::Vector3;
+use rstar::RTree;
+use rstar::primitives::GeomWithData;
+use rustc_hash::FxHashMap;
+
+use super::noise::Spread;
+use super::scene::Scene;
+use crate::ballot::ones;
+use crate::kernel::{Gates, LANES};
+
+/// Side of the cubes that rays are grouped by, m: one or two blocks of the kernel a pass.
+const PLACE_M: f64 = 20.0;
+
+/// A ray that a point projects onto.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Hit {
+    /// The ray.
+    pub ray: u32,
+    /// Its image.
+    pub image: u32,
+    /// Squared residual over its variance.
+    pub chi2: f64,
+}
+
+/// Rays by place.
+pub struct RayIndex<'a> {
+    scene: &'a Scene,
+    spreads: &'a [Spread],
+    gate_sigmas: f64,
+    places: Vec<Place>,
+    tree: RTree<GeomWithData<[f64; 3], usize>>,
+    /// How far a ray's camera may be from the origin of its place, m.
+    reach_m: f64,
+}
+
+struct Place {
+    origin: Vector3<f64>,
+    rays: Vec<u32>,
+    gates: Gates,
+}
+
+impl<'a> RayIndex<'a> {
+    /// Index the given rays (ascending); `spreads` are those of all rays of the scene.
+    #[must_use]
+    pub fn new(scene: &'a Scene, spreads: &'a [Spread], gate_sigmas: f64, rays: impl Iterator<Item = u32>) -> Self {
+        let mut members: FxHashMap<[i64; 3], Vec<u32>> = FxHashMap::default();
+        for ray in rays.filter(|&ray| scene.ray(ray).is_usable()) {
+            let center = scene.ray(ray).center;
+            let cell = [0, 1, 2].map(|axis| (center[axis] / PLACE_M).floor() as i64);
+            members.entry(cell).or_default().push(ray);
+        }
+        let mut places: Vec<Place> =
+            members.into_values().map(|rays| Place::new(scene, spreads, gate_sigmas, rays)).collect();
+        places.sort_by_key(|place| place.rays[0]);
+        let tree = RTree::bulk_load(
+            places.iter().enumerate().map(|(i, place)| GeomWithData::new(place.origin.into(), i)).collect(),
+        );
+        Self { scene, spreads, gate_sigmas, places, tree, reach_m: PLACE_M * 3.0_f64.sqrt() }
+    }
+
+    /// The gate, in sigmas.
+    #[must_use]
+    pub fn gate_sigmas(&self) -> f64 {
+        self.gate_sigmas
+    }
+
+    /// The scene whose rays are indexed.
+    #[must_use]
+    pub fn scene(&self) -> &'a Scene {
+        self.scene
+    }
+
+    /// The rays of one class within `range_m` that a point projects onto within their gates and that `keep` admits,
+    /// the closest of each image; ordered by image.
+    #[must_use]
+    pub fn hits(&self, point: &Vector3<f64>, class: u32, range_m: f64, keep: &dyn Fn(u32) -> bool) -> Vec<Hit> {
+        let mut hits = self.all_hits(point, class, range_m);
+        hits.retain(|hit| keep(hit.ray));
+        hits.sort_by(|a, b| (a.image.cmp(&b.image)).then(a.chi2.total_cmp(&b.chi2)).then(a.ray.cmp(&b.ray)));
+        hits.dedup_by_key(|hit| hit.image);
+        hits
+    }
+
+    /// All rays of one class within `range_m` that a point projects onto within their gates, in no order.
+    #[must_use]
+    pub fn all_hits(&self, point: &Vector3<f64>, class: u32, range_m: f64) -> Vec<Hit> {
+        let mut hits = Vec::new();
+        let (mut maybe, mut sure) = (Vec::new(), Vec::new());
+        let reach = range_m + self.reach_m;
+        for near in self.tree.locate_within_distance((*point).into(), reach * reach) {
+            let place = &self.places[near.data];
+            maybe.resize(place.gates.words(), 0);
+            sure.resize(place.gates.words(), 0);
+            place.gates.test(&[point - place.origin], &mut maybe, &mut sure);
+            for (word, &bits) in maybe.iter().enumerate() {
+                let candidates = ones(bits).map(|bit| place.rays[word * LANES + bit as usize]);
+                let of_class = candidates.filter(|&ray| self.scene.rays.class[ray as usize] == class);
+                hits.extend(of_class.filter_map(|ray| self.hit(ray, point, range_m)));
+            }
+        }
+        hits
+    }
+
+    fn hit(&self, ray: u32, point: &Vector3<f64>, range_m: f64) -> Option<Hit> {
+        let seen = self.scene.ray(ray);
+        let projected = seen.project(point);
+        let chi2 = chi2(&projected, &self.spreads[ray as usize]);
+        let near = (point - seen.center).norm_squared() <= range_m * range_m;
+        (near && projected.z > 0.0 && chi2 < self.gate_sigmas * self.gate_sigmas).then(|| Hit {
+            ray,
+            image: self.scene.rays.image[ray as usize],
+            chi2,
+        })
+    }
+}
+
+impl Place {
+    fn new(scene: &Scene, spreads: &[Spread], gate_sigmas: f64, rays: Vec<u32>) -> Self {
+        let origin = scene.ray(rays[0]).center;
+        let local: Vec<_> = rays.iter().map(|&ray| scene.ray(ray).relative_to(&origin)).collect();
+        let gates = Gates::new(
+            (0..)
+                .zip(rays.iter().zip(&local))
+                .map(|(lane, (&r, ray))| (lane, ray, spreads[r as usize].gate(gate_sigmas))),
+        );
+        Self { origin, rays, gates }
+    }
+}
+
+/// Squared residual over the variance at the point's depth, of `(a, b, c)` in front of the camera.
+#[inline]
+#[must_use]
+pub fn chi2(projected: &Vector3<f64>, spread: &Spread) -> f64 {
+    let depth2 = projected.z * projected.z;
+    (projected.x * projected.x + projected.y * projected.y) / (spread.far_px2 * depth2 + spread.near_px2)
+}

@@ -1,0 +1,123 @@
+//! A label in the making: polished until its voters agree with it.
+
+use nalgebra::Vector3;
+
+use super::estimate::{Estimate, estimate, own_chi2};
+use super::index::{Hit, RayIndex};
+use super::noise::Noise;
+use super::scene::Scene;
+
+/// Rounds of estimating and gathering voters again, at most.
+const MAX_ROUNDS: usize = 5;
+/// Good enough while voters are still being gathered, m.
+pub const ROUGH_M: f64 = 5e-3;
+/// Good enough for good, m.
+pub const EXACT_M: f64 = 1e-7;
+/// Rounds of leaving out voters, at most.
+const MAX_TRIMS: usize = 10;
+
+/// Voters whose directions have a mean at least this long are all on one side of the label.
+const ONE_SIDED: f64 = 0.6;
+/// What is seen from one side is not seen from directions farther than this from their mean (cosine of 80 degrees).
+const SIDE_COSINE: f64 = 0.17;
+
+/// A point with its covariance and voters.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Label {
+    /// Where it is.
+    pub estimate: Estimate,
+    /// Mean of the unit directions from it to its voters' cameras: short if it is seen from all around.
+    pub side: Vector3<f64>,
+    /// The class of its voters.
+    pub class: u32,
+    /// The rays that support it, one an image, ordered by pass, then by number.
+    pub voters: Vec<u32>,
+    /// Images (ascending) that say nothing for or against it: a stronger label that has no detection of its own there
+    /// explains its voter as well, or another label took what it might have had.
+    pub undecided: Vec<u32>,
+}
+
+/// Estimate from voters in any order, without those that disagree with the others of their pass.
+///
+/// The gate that gathered them allows for all errors of a pose; but images of one pass are wrong together, so what is
+/// left of a residual when the shared error is taken out must fit the image's own errors alone.
+#[must_use]
+pub fn from_voters(
+    scene: &Scene,
+    noise: &Noise,
+    gate_sigmas: f64,
+    mut voters: Vec<u32>,
+    start: Vector3<f64>,
+    tolerance_m: f64,
+) -> Option<Label> {
+    voters.sort_unstable_by_key(|&ray| (scene.view(ray).pass, ray));
+    let class = scene.rays.class[*voters.first()? as usize];
+    let mut found = estimate(scene, noise, &voters, start, tolerance_m)?;
+    for _ in 0..MAX_TRIMS {
+        let own = own_chi2(scene, noise, &voters, &vec![1.0; voters.len()], &found.point)?;
+        let limit = gate_sigmas * gate_sigmas;
+        if own.iter().all(|&chi2| chi2 < limit) {
+            break;
+        }
+        // The worst first: one bad voter makes good ones look bad.
+        let worst = own.iter().copied().fold(0.0, f64::max);
+        let keep = |chi2: f64| chi2 < limit.max(0.5 * worst);
+        voters = voters.iter().zip(&own).filter(|&(_, &chi2)| keep(chi2)).map(|(&ray, _)| ray).collect();
+        if voters.len() < 2 {
+            return None;
+        }
+        found = estimate(scene, noise, &voters, found.point, tolerance_m)?;
+    }
+    let side =
+        voters.iter().map(|&ray| direction_to(scene, ray, &found.point)).sum::<Vector3<f64>>() / voters.len() as f64;
+    Some(Label { estimate: found, side, class, voters, undecided: Vec::new() })
+}
+
+/// Unit direction from a point to the camera of a ray.
+#[must_use]
+pub fn direction_to(scene: &Scene, ray: u32, point: &Vector3<f64>) -> Vector3<f64> {
+    (scene.ray(ray).center - point).normalize()
+}
+
+impl Label {
+    /// Whether a ray's camera is on the side that the label is seen from.
+    #[must_use]
+    pub fn faces(&self, scene: &Scene, ray: u32) -> bool {
+        let length = self.side.norm();
+        let cosine = direction_to(scene, ray, &self.estimate.point).dot(&self.side) / length;
+        length < ONE_SIDED || cosine > SIDE_COSINE
+    }
+}
+
+/// Estimate a point on its voters and gather voters from the estimate, until they stay the same.
+///
+/// Nothing if fewer than `min_votes` remain.
+#[must_use]
+pub fn polish(
+    noise: &Noise,
+    index: &RayIndex<'_>,
+    start: Vector3<f64>,
+    class: u32,
+    range_m: f64,
+    min_votes: usize,
+    keep: &dyn Fn(u32) -> bool,
+) -> Option<Label> {
+    let scene = index.scene();
+    let rays = |hits: Vec<Hit>| hits.iter().map(|hit| hit.ray).collect::<Vec<u32>>();
+    let mut gathered = rays(index.hits(&start, class, range_m, keep));
+    let mut point = start;
+    for _ in 0..MAX_ROUNDS {
+        if gathered.len() < min_votes {
+            return None;
+        }
+        let label = from_voters(scene, noise, index.gate_sigmas(), gathered.clone(), point, ROUGH_M)?;
+        let again = rays(index.hits(&label.estimate.point, class, range_m, keep));
+        if again == gathered {
+            return (label.voters.len() >= min_votes).then_some(label);
+        }
+        point = label.estimate.point;
+        gathered = again;
+    }
+    let label = from_voters(scene, noise, index.gate_sigmas(), gathered, point, ROUGH_M)?;
+    (label.voters.len() >= min_votes).then_some(label)
+}

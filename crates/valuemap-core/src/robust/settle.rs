@@ -1,0 +1,230 @@
+//! Settling: all labels compete for all detections; those that stand for one object become one.
+
+use nalgebra::Vector3;
+use rayon::prelude::*;
+use rstar::RTree;
+use rstar::primitives::GeomWithData;
+
+use super::calibrate::variance_factor;
+use super::index::RayIndex;
+use super::label::{EXACT_M, Label, direction_to, from_voters};
+use super::noise::Noise;
+use super::scene::Scene;
+
+/// Squared Mahalanobis distance up to which two positions agree: the 99.7 % quantile of chi² with 3 degrees of freedom.
+const AGREEMENT_CHI2: f64 = 14.0;
+/// Squared Mahalanobis distance from which on they disagree: far beyond chance.
+const DISAGREEMENT_CHI2: f64 = 30.0;
+/// Two sides are at least 60 degrees apart (cosine).
+const SIDES_COSINE: f64 = 0.5;
+/// Labels farther apart than this are never compared, m.
+const NEIGHBOR_M: f64 = 6.0;
+/// Two labels may share this part of the images of the smaller one and still be one object: clutter beside it.
+const SHARED_IMAGES: f64 = 0.15;
+
+/// Give every detection to the label that it fits best, one detection an image and label, and estimate again.
+///
+/// Labels that keep fewer than `min_votes` are dropped.
+#[must_use]
+pub fn reassign(
+    scene: &Scene,
+    noise: &Noise,
+    index: &RayIndex<'_>,
+    labels: &[Label],
+    range_m: f64,
+    min_votes: usize,
+) -> Vec<Label> {
+    let claims: Vec<Vec<Claim>> = labels
+        .par_iter()
+        .enumerate()
+        .map(|(number, label)| {
+            index
+                .all_hits(&label.estimate.point, label.class, range_m)
+                .into_iter()
+                .filter(|hit| label.faces(scene, hit.ray))
+                .map(|hit| Claim { image: hit.image, chi2: hit.chi2, label: number as u32, ray: hit.ray })
+                .collect()
+        })
+        .collect();
+    let mut claims: Vec<Claim> = claims.into_iter().flatten().collect();
+    claims.par_sort_unstable_by(|a, b| {
+        a.image.cmp(&b.image).then(a.chi2.total_cmp(&b.chi2)).then((a.label, a.ray).cmp(&(b.label, b.ray)))
+    });
+    let mut voters: Vec<Vec<u32>> = vec![Vec::new(); labels.len()];
+    let mut undecided: Vec<Vec<u32>> = vec![Vec::new(); labels.len()];
+    let stronger = |a: &Claim, b: &Claim| {
+        let strength = |claim: &Claim| (labels[claim.label as usize].voters.len(), std::cmp::Reverse(claim.label));
+        strength(a) > strength(b)
+    };
+    for in_image in claims.chunk_by(|a, b| a.image == b.image) {
+        let mut granted: Vec<&Claim> = Vec::new();
+        for claim in in_image {
+            if !granted.iter().any(|o| o.ray == claim.ray || o.label == claim.label) {
+                granted.push(claim);
+            }
+        }
+        let idle = |claim: &&Claim| !granted.iter().any(|o| o.label == claim.label);
+        for winner in &granted {
+            voters[winner.label as usize].push(winner.ray);
+            if in_image.iter().filter(idle).any(|other| other.ray == winner.ray && stronger(other, winner)) {
+                undecided[winner.label as usize].push(winner.image);
+            }
+        }
+        for loser in in_image.iter().filter(idle) {
+            undecided[loser.label as usize].push(loser.image);
+        }
+    }
+    labels
+        .par_iter()
+        .zip(voters.into_par_iter().zip(undecided))
+        .filter(|(_, (voters, _))| voters.len() >= min_votes)
+        .filter_map(|(label, (voters, undecided))| {
+            let found = from_voters(scene, noise, index.gate_sigmas(), voters, label.estimate.point, EXACT_M)?;
+            Some(Label { undecided, ..found })
+        })
+        .filter(|label| label.voters.len() >= min_votes)
+        .collect()
+}
+
+struct Claim {
+    image: u32,
+    chi2: f64,
+    label: u32,
+    ray: u32,
+}
+
+/// Make one of any two labels of a class whose positions agree within their covariances, unless their images say that
+/// they are two: images in which both have a detection of their own. The nearest pair first.
+#[must_use]
+pub fn fuse(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) -> Vec<Label> {
+    let mut labels = labels;
+    let factor = variance_factor(scene, noise, &labels.iter().collect::<Vec<_>>());
+    loop {
+        let mut pairs = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor);
+        if pairs.is_empty() {
+            return labels;
+        }
+        pairs.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
+        let mut taken = vec![false; labels.len()];
+        let mut fused = Vec::new();
+        for (_, a, b) in pairs {
+            if !taken[a] && !taken[b] {
+                taken[a] = true;
+                taken[b] = true;
+                fused.push(union(scene, noise, gate_sigmas, &labels[a], &labels[b]));
+            }
+        }
+        let kept = labels.into_iter().zip(&taken).filter(|(_, taken)| !**taken).map(|(label, _)| label);
+        labels = kept.chain(fused).collect();
+        labels.sort_by_key(first_voter);
+    }
+}
+
+/// Make two of any label whose voters on two sides of it put it to places that do not agree: two lights back to back, say,
+/// which no image shows together.
+#[must_use]
+pub fn split(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>, min_votes: usize) -> Vec<Label> {
+    let factor = variance_factor(scene, noise, &labels.iter().collect::<Vec<_>>());
+    let parts = |label: Label| -> Vec<Label> {
+        let sides = two_sides(scene, &label);
+        if sides.iter().any(|side| side.len() < min_votes) {
+            return vec![label];
+        }
+        let start = label.estimate.point;
+        let apart = sides.map(|side| from_voters(scene, noise, gate_sigmas, side, start, EXACT_M));
+        match apart {
+            [Some(a), Some(b)]
+                if a.voters.len().min(b.voters.len()) >= min_votes
+                    && distance2(&a, &b).is_some_and(|distance2| distance2 > DISAGREEMENT_CHI2 * factor) =>
+            {
+                vec![a, b]
+            }
+            _ => vec![label],
+        }
+    };
+    let mut labels: Vec<Label> = labels.into_par_iter().flat_map_iter(parts).collect();
+    labels.sort_by_key(first_voter);
+    labels
+}
+
+/// Voters by the nearer of two opposite directions: two means of the directions to their cameras.
+fn two_sides(scene: &Scene, label: &Label) -> [Vec<u32>; 2] {
+    let directions: Vec<Vector3<f64>> =
+        label.voters.iter().map(|&ray| direction_to(scene, ray, &label.estimate.point)).collect();
+    let farthest = |from: &Vector3<f64>| {
+        directions.iter().copied().min_by(|a, b| a.dot(from).total_cmp(&b.dot(from))).unwrap_or(*from)
+    };
+    let first = farthest(&label.side);
+    let mut means = [first, farthest(&first)];
+    for _ in 0..4 {
+        let nearer = |d: &Vector3<f64>| usize::from(d.dot(&means[1]) > d.dot(&means[0]));
+        let mut sums = [Vector3::zeros(); 2];
+        for direction in &directions {
+            sums[nearer(direction)] += direction;
+        }
+        means = [0, 1].map(|i| if sums[i].norm() > 0.0 { sums[i].normalize() } else { means[i] });
+    }
+    let mut sides = [Vec::new(), Vec::new()];
+    if means[0].dot(&means[1]) < SIDES_COSINE {
+        for (&ray, direction) in label.voters.iter().zip(&directions) {
+            sides[usize::from(direction.dot(&means[1]) > direction.dot(&means[0]))].push(ray);
+        }
+    }
+    sides
+}
+
+/// The lowest ray of a label: what labels are ordered by.
+#[must_use]
+pub fn first_voter(label: &Label) -> u32 {
+    label.voters.iter().copied().min().unwrap_or(u32::MAX)
+}
+
+fn agreeing_pairs(scene: &Scene, labels: &[Label], most: f64) -> Vec<(f64, usize, usize)> {
+    let places = labels.iter().enumerate().map(|(i, l)| GeomWithData::new(l.estimate.point.into(), i)).collect();
+    let tree: RTree<GeomWithData<[f64; 3], usize>> = RTree::bulk_load(places);
+    labels
+        .par_iter()
+        .enumerate()
+        .flat_map_iter(|(a, label)| {
+            let near = tree.locate_within_distance(label.estimate.point.into(), NEIGHBOR_M * NEIGHBOR_M);
+            near.map(|near| near.data)
+                .filter(move |&b| b > a)
+                .filter_map(|b| distance2(label, &labels[b]).map(|distance2| (distance2, a, b)))
+                .filter(|&(distance2, a, b)| distance2 < most && !told_apart(scene, &labels[a], &labels[b]))
+                .collect::<Vec<_>>()
+        })
+        .collect()
+}
+
+/// Squared Mahalanobis distance of two labels of one class.
+fn distance2(a: &Label, b: &Label) -> Option<f64> {
+    if a.class != b.class {
+        return None;
+    }
+    let apart: Vector3<f64> = a.estimate.point - b.estimate.point;
+    let together = (a.estimate.covariance + b.estimate.covariance).cholesky()?;
+    Some(apart.dot(&together.solve(&apart)))
+}
+
+/// Whether images show both labels as detections of their own, more often than clutter would.
+fn told_apart(scene: &Scene, a: &Label, b: &Label) -> bool {
+    let images = |label: &Label| {
+        let mut images: Vec<u32> = label.voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
+        images.sort_unstable();
+        images
+    };
+    let (of_a, of_b) = (images(a), images(b));
+    let shared = of_a.iter().filter(|image| of_b.binary_search(image).is_ok()).count();
+    shared as f64 > 1.0 + SHARED_IMAGES * of_a.len().min(of_b.len()) as f64
+}
+
+/// Of images that both have, the larger label's detection stays.
+fn union(scene: &Scene, noise: &Noise, gate_sigmas: f64, a: &Label, b: &Label) -> Label {
+    let (large, small) = if b.voters.len() > a.voters.len() { (b, a) } else { (a, b) };
+    let mut images: Vec<u32> = large.voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
+    images.sort_unstable();
+    let mut voters = large.voters.clone();
+    let new = |ray: &&u32| images.binary_search(&scene.rays.image[**ray as usize]).is_err();
+    voters.extend(small.voters.iter().filter(new));
+    from_voters(scene, noise, gate_sigmas, voters, large.estimate.point, EXACT_M).unwrap_or_else(|| large.clone())
+}

@@ -1,0 +1,139 @@
+"""The robust method: noise estimated from the data, then labels with covariances and probabilities of existence."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+import valuemap._core as _core
+from valuemap.cameras import Rays, camera_centers, picture_bounds, rotation_matrices
+from valuemap.config import MapConfig, NoiseConfig
+from valuemap.dataset import Dataset
+from valuemap.progress import Progress, silent
+from valuemap.tables import Candidates, Floats
+
+VIEWPOINT_STEP_M = 1.0
+"""Images of a pass closer than this to where a viewpoint began are one look, e.g. those before a red light."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of what moves a detection off its object; see the core's `noise.rs`.
+
+    Each axis; position and rotation have a part that each image has for itself, and a part that drifts and is shared
+    by the images of a pass that see one object.
+    """
+
+    detection_px: float = 2.0
+    box_share: float = 0.04
+    position_m: float = 0.1
+    rotation_rad: float = math.radians(0.1)
+    position_drift_m: float = 0.1
+    rotation_drift_rad: float = math.radians(0.1)
+
+    def as_tuple(self) -> tuple[float, float, float, float, float, float]:
+        """Return the six numbers in the order of the fields."""
+        return (
+            self.detection_px,
+            self.box_share,
+            self.position_m,
+            self.rotation_rad,
+            self.position_drift_m,
+            self.rotation_drift_rad,
+        )
+
+
+class Scene:
+    """A dataset as the core's robust method holds it."""
+
+    def __init__(self, dataset: Dataset, rays: Rays) -> None:
+        self._dataset = dataset
+        self._rays = rays
+
+    @cached_property
+    def core(self) -> _core.Scene:
+        """Everything that was seen, copied once."""
+        images, detections = self._dataset.images, self._dataset.detections
+        normals, solid_angle_sr = picture_bounds(self._dataset.cameras)
+        return _core.Scene(
+            self._rays.core,
+            box_px=np.sqrt(detections.size_px[:, 0] * detections.size_px[:, 1]),
+            range_m=_or_nan(detections.range_m, len(detections)),
+            range_sigma_m=_or_nan(detections.range_sigma_m, len(detections)),
+            center_in_world_m=np.ascontiguousarray(camera_centers(images)),
+            cam_from_world=rotation_matrices(images),
+            camera=np.searchsorted(self._dataset.cameras.camera_id, images.camera_id).astype(np.uint32),
+            pass_code=images.pass_id.codes.astype(np.uint32),
+            position_sigma_m=_or_nan(images.position_sigma_m, len(images)),
+            rotation_sigma_rad=_or_nan(images.rotation_sigma_rad, len(images)),
+            frustum_normals=normals,
+            solid_angle_sr=solid_angle_sr,
+            viewpoint_step_m=VIEWPOINT_STEP_M,
+        )
+
+
+def calibrate_noise(scene: Scene, config: MapConfig, *, threads: int = 0, progress: Progress = silent) -> Noise:
+    """Estimate the noise from the residuals of labels in a sample of places; what the config sets stays as it is."""
+    guess, known = _guess(config.noise)
+    if all(known):
+        return guess
+    estimated = _core.calibrate_noise(
+        scene.core,
+        guess.as_tuple(),
+        known,
+        _settings(config),
+        threads,
+        lambda done, total: progress("estimating the noise", done, total),
+    )
+    return Noise(*estimated)
+
+
+def find_labels(
+    scene: Scene, noise: Noise, config: MapConfig, *, threads: int = 0, progress: Progress = silent
+) -> tuple[Candidates, dict[str, Any]]:
+    """Return the labels, ordered by first detection, and counts of what was found and rejected."""
+    position, (offsets, voters), covariance, existence, expected, counts = _core.find_labels(
+        scene.core,
+        noise.as_tuple(),
+        _settings(config),
+        threads,
+        lambda done, total: progress("finding labels", min(done, total), total),
+    )
+    covariance = covariance.reshape(-1, 3, 3)
+    return Candidates(position, offsets, voters, None, covariance, existence, expected), counts
+
+
+def _guess(config: NoiseConfig) -> tuple[Noise, list[bool]]:
+    """Return where the estimation starts, and whether detection, position and rotation are set by the user."""
+    noise = Noise()
+    if config.detection_sigma_px is not None:
+        noise = replace(noise, detection_px=config.detection_sigma_px, box_share=0.0)
+    # A known total says nothing about its parts: half of the variance each.
+    if config.position_sigma_m is not None:
+        part = config.position_sigma_m / math.sqrt(2.0)
+        noise = replace(noise, position_m=part, position_drift_m=part)
+    if config.rotation_sigma_deg is not None:
+        part = math.radians(config.rotation_sigma_deg) / math.sqrt(2.0)
+        noise = replace(noise, rotation_rad=part, rotation_drift_rad=part)
+    known = [config.detection_sigma_px, config.position_sigma_m, config.rotation_sigma_deg]
+    return noise, [value is not None for value in known]
+
+
+def _settings(config: MapConfig) -> tuple[float, float, float, float, int, float]:
+    vote = config.vote
+    return (
+        math.radians(vote.min_parallax_deg),
+        vote.min_range_m,
+        vote.max_range_m,
+        config.noise.gate_sigmas,
+        vote.min_votes,
+        config.existence.min_existence,
+    )
+
+
+def _or_nan(values: Floats | None, count: int) -> Floats:
+    return np.full(count, np.nan) if values is None else np.ascontiguousarray(values)

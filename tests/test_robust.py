@@ -1,0 +1,154 @@
+"""The robust method on small scenes of known truth."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import valuemap
+from literal import Floats, Pinhole, Sighting
+from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
+from valuemap.config import MapConfig
+from valuemap.dataset import Dataset
+from valuemap.simulate import PRESETS, simulate
+from valuemap.tables import Categories
+
+INTRINSICS = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+ALONG_X = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+def drive(
+    objects: Floats, *, passes: int = 2, seed: int = 0, noise_px: float = 0.5, offset_m: float = 0.0, stop: int = 0
+) -> Dataset:
+    """Passes along x past objects, each pass shifted by its own error; the first stands still for `stop` frames."""
+    random = np.random.default_rng(seed)
+    cameras: list[Pinhole] = []
+    sightings: list[Sighting] = []
+    names: list[str] = []
+    for number in range(passes):
+        error = random.normal(0.0, offset_m, 3)
+        places = [*np.arange(0.0, 36.0, 2.0), *([10.0] * stop if number == 0 else [])]
+        for x in sorted(places):
+            center = np.array([x, -1.5 + 3.0 * number / passes, 1.6])
+            true, recorded = (Pinhole(INTRINSICS, ALONG_X, -ALONG_X @ c) for c in (center, center + error))
+            for place in objects:
+                pixel, depth = true.project(place)
+                if depth > 3.0 and 0 <= pixel[0] < WIDTH and 0 <= pixel[1] < HEIGHT and random.random() < 0.9:
+                    sightings.append(Sighting(len(cameras), "light", pixel + random.normal(0.0, noise_px, 2)))
+            cameras.append(recorded)
+            names.append(f"pass-{number}")
+    return as_dataset(Scene(cameras, sightings, objects), passes=names)
+
+
+def nearest_m(result: valuemap.Map, objects: Floats) -> Floats:
+    apart = np.linalg.norm(result.labels.position_in_world_m[:, None] - objects[None], axis=2)
+    return np.asarray(apart.min(axis=0))
+
+
+def test_twin_heads_stay_two() -> None:
+    twins = np.array([[45.0, 4.0, 5.0], [45.0, 4.6, 5.0]])
+    result = valuemap.build_map(drive(twins))
+    assert len(result.labels) == 2
+    assert nearest_m(result, twins).max() < 0.1
+
+
+def test_one_light_of_passes_that_disagree_stays_one() -> None:
+    light = np.array([[45.0, 4.0, 5.0], [50.0, -6.0, 4.0], [38.0, 7.0, 4.5]])
+    for seed in range(4):
+        result = valuemap.build_map(drive(light, passes=4, seed=seed, offset_m=0.25))
+        assert len(result.labels) == 3
+        assert result.labels.passes.min() >= 3
+
+
+def test_standing_still_does_not_make_sure() -> None:
+    """A hundred frames from one place tell hardly more of the position than one does."""
+    light = np.array([[45.0, 4.0, 5.0], [50.0, -6.0, 4.0]])
+    config = MapConfig().with_settings(["detection_sigma_px=0.5", "position_sigma_m=0.1", "rotation_sigma_deg=0.1"])
+    moving = valuemap.build_map(drive(light), config).labels
+    standing = valuemap.build_map(drive(light, stop=100), config).labels
+    assert standing.votes.sum() > moving.votes.sum() + 100
+    ratio = standing.covariance_m2[:, [0, 3, 5]] / moving.covariance_m2[:, [0, 3, 5]]
+    assert ratio.min() > 0.5
+
+
+def test_known_sigmas_of_images_are_used() -> None:
+    light = np.array([[45.0, 4.0, 5.0]])
+    dataset = drive(light)
+    count = len(dataset.images)
+    labels = {}
+    for sigma in (0.02, 0.5):
+        images = dataset.images.replace(position_sigma_m=np.full(count, sigma), rotation_sigma_rad=np.full(count, 1e-4))
+        labels[sigma] = valuemap.build_map(dataclasses.replace(dataset, images=images)).labels
+    assert labels[0.5].covariance_m2[0, 0] > 10.0 * labels[0.02].covariance_m2[0, 0]
+
+
+def test_measured_ranges_pull_softly() -> None:
+    """Exact ranges tighten the position along the view; wild ones with honest sigmas change little."""
+    light = np.array([[45.0, 4.0, 5.0]])
+    dataset = drive(light, passes=1, noise_px=1.0)
+    plain = valuemap.build_map(dataset).labels
+    rows = np.searchsorted(dataset.images.image_id, dataset.detections.image_id)
+    true_range = np.linalg.norm(light[0] - camera_centers(dataset.images)[rows], axis=1)
+    exact = dataset.detections.replace(range_m=true_range, range_sigma_m=np.full(len(rows), 0.05))
+    tightened = valuemap.build_map(dataclasses.replace(dataset, detections=exact)).labels
+    assert tightened.covariance_m2[0, 0] < 0.5 * plain.covariance_m2[0, 0]
+    wild = dataset.detections.replace(range_m=true_range + 20.0, range_sigma_m=np.full(len(rows), 20.0))
+    pulled = valuemap.build_map(dataclasses.replace(dataset, detections=wild)).labels
+    moved = np.linalg.norm(pulled.position_in_world_m[0] - plain.position_in_world_m[0])
+    assert moved < 3.0 * np.sqrt(plain.covariance_m2[0, [0, 3, 5]].sum())
+
+
+def test_classes_do_not_mix() -> None:
+    light = np.array([[45.0, 4.0, 5.0]])
+    dataset = drive(light)
+    half = ["light" if i % 2 else "sign" for i in range(len(dataset.detections))]
+    mixed = dataclasses.replace(dataset, detections=dataset.detections.replace(class_name=Categories.from_texts(half)))
+    result = valuemap.build_map(mixed)
+    assert sorted(result.labels.class_name.texts()) == ["light", "sign"]
+
+
+@pytest.fixture(scope="module")
+def small_city() -> tuple[Dataset, valuemap.Map]:
+    config = dataclasses.replace(PRESETS["small"], lookalikes_per_light=0.0)
+    dataset = simulate(config, seed=5, name="small")
+    return dataset, valuemap.build_map(dataset)
+
+
+def test_it_beats_the_paper_on_a_city_with_pose_noise(small_city: tuple[Dataset, valuemap.Map]) -> None:
+    dataset, robust = small_city
+    ours = valuemap.evaluate_map(robust, dataset)
+    paper = valuemap.evaluate_map(valuemap.build_map(dataset, MapConfig(method="paper")), dataset)
+    assert ours.recall >= 0.95
+    assert ours.precision >= 0.9 > paper.precision
+    assert ours.duplicates <= 1 < paper.duplicates
+
+
+def test_the_noise_is_estimated(small_city: tuple[Dataset, valuemap.Map]) -> None:
+    _, result = small_city
+    noise = result.run["counts"]["noise"]
+    config = PRESETS["small"]
+    true_position = np.hypot(config.position_white_m, config.position_drift_m)
+    true_rotation = np.radians(np.hypot(config.rotation_white_deg, config.rotation_drift_deg))
+    true_far_px = np.hypot(config.pixel_noise_px, config.focal_px * true_rotation)
+    rotation = np.hypot(noise["rotation_rad"], noise["rotation_drift_rad"])
+    far_px = np.hypot(noise["detection_px"], config.focal_px * rotation)
+    assert 0.5 < np.hypot(noise["position_m"], noise["position_drift_m"]) / true_position < 2.0
+    assert 0.5 < far_px / true_far_px < 2.0
+
+
+def test_existence_and_expected_views_are_told(small_city: tuple[Dataset, valuemap.Map]) -> None:
+    _, result = small_city
+    labels = result.labels
+    assert labels.existence is not None
+    assert labels.expected is not None
+    assert np.all((labels.existence >= MapConfig().existence.min_existence) & (labels.existence <= 1.0))
+    assert np.all(labels.expected >= labels.votes)
+
+
+def test_a_stricter_existence_keeps_fewer() -> None:
+    dataset = simulate(PRESETS["small"], seed=3, name="small")
+    configs = [MapConfig().with_settings([f"min_existence={least}"]) for least in (0.0, 0.5, 0.999)]
+    kept = [len(valuemap.build_map(dataset, config).labels) for config in configs]
+    assert kept[0] > kept[1] >= kept[2] > 0
