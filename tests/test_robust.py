@@ -10,6 +10,7 @@ import pytest
 import valuemap
 from literal import Floats, Pinhole, Sighting
 from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
+from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
 from valuemap.simulate import PRESETS, simulate
