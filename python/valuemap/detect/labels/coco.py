@@ -15,8 +15,8 @@ _HINT = "COCO's format is described at https://cocodataset.org/#format-data"
 def read_coco(path: Path) -> LabelledPictures:
     """Read `images` (id, file_name), `annotations` (image_id, category_id, bbox) and `categories` (id, name).
 
-    A bbox is x, y, width, height of continuous edges. Crowd regions are no objects and left out. Pictures are
-    looked for beside the file, and in a folder `images` beside it.
+    A bbox is x, y, width, height of continuous edges. An annotation with `iscrowd` is a place to ignore.
+    Pictures are looked for beside the file, and in a folder `images` beside it.
 
     Raises
     ------
@@ -31,10 +31,10 @@ def read_coco(path: Path) -> LabelledPictures:
     for row, entry in enumerate(content["annotations"]):
         where = f"{path}: annotations[{row}]"
         try:
-            if entry.get("iscrowd"):
-                continue
             x, y, width, height = map(float, entry["bbox"])
-            boxes[entry["image_id"]].add(names[entry["category_id"]], (x, y, x + width, y + height), where)
+            edges_px = (x, y, x + width, y + height)
+            is_crowd = bool(entry.get("iscrowd"))
+            boxes[entry["image_id"]].add(names[entry["category_id"]], edges_px, where, ignored=is_crowd)
         except (AttributeError, KeyError, TypeError, ValueError):
             skipped.append(f"{where}: expected bbox, and image_id and category_id that are listed, found {entry!r}")
     pictures = tuple(boxes[image].picture(_find(path.parent, name)) for image, name in files.items())

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from valuemap.detect.labels.pictures import SPLITS, BoxList, LabelledPicture, LabelledPictures
+from valuemap.detect.pictures import list_pictures
 from valuemap.errors import InputError
 
-PICTURE_ENDINGS = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 _TRANSPOSED = frozenset({5, 6, 7, 8})
 """EXIF orientations that swap width and height."""
 
@@ -30,7 +30,7 @@ def read_yolo(folder: Path) -> LabelledPictures:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder", hint="give the folder that holds pictures and YOLO text files")
     names = _class_names(folder)
-    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in PICTURE_ENDINGS)
+    paths = list_pictures(folder)
     texts = [_text_of(path, folder) for path in paths]
     if not any(text.is_file() for text in texts):
         raise InputError(
