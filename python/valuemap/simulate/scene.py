@@ -109,7 +109,9 @@ def look(world: World, row: int) -> Scene:
     lights = recording.city.lights.position_in_world_m
     vehicles = vehicles_around(frames, row, view, streets, lights, shown, hidden, seed=recording.seed)
     ground = vehicles.ground_in_world_m[:, :2]
-    vehicles = vehicles.take(~streets.is_hidden_by_houses(np.broadcast_to(own, ground.shape), ground))
+    round_corner = streets.is_hidden_by_houses(np.broadcast_to(own, ground.shape), ground)
+    # What stands before a light in view is in view, even if its middle is not.
+    vehicles = vehicles.take((vehicles.kind != CAR) | ~round_corner)
     depth_m = view.in_cam_m(vehicles.corners_m())[..., 2].min(axis=1)
     faces = _faces(vehicles, view)
     outlines = view.outlines_px(faces.corner_in_world_m)

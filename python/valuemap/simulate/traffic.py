@@ -136,6 +136,15 @@ def _lead(own: Floats, heading: float, pass_row: int, direction: int, streets: S
     return np.array([[place[0], place[1], 0.0, float(direction), np.floor(chance * 1e4)]])
 
 
+def _farthest_that_hides(own: Floats, to_light: Floats, along_m: float, ahead: Floats, streets: Streets) -> float:
+    """Return how far ahead a truck may be for its rear to reach above the line of sight to a light."""
+    near_m = np.linspace(min(30.0, 0.7 * along_m), 2.5, 24)
+    line_m = own[2] + (to_light[2] + 0.75) * near_m / max(along_m, 1.0)
+    roof_m = streets.hills.height_m(own[:2] + near_m[:, None] * ahead) + SIZES_M[TRUCK, 2]
+    high_enough = np.append(roof_m[:-1] > line_m[:-1] + 0.1, True)  # If none is, the nearest.
+    return float(near_m[np.argmax(high_enough)])
+
+
 def _before_hidden(
     frames: Frames,
     row: int,
@@ -151,17 +160,13 @@ def _before_hidden(
     ahead = DIRECTIONS[direction]
     left = np.array([-ahead[1], ahead[0]])
     own = view.center_in_world_m
-    _, width_m, height_m = SIZES_M[TRUCK]
+    width_m = SIZES_M[TRUCK, 1]
     axis_m = (streets.x_m, streets.y_m)[1 - direction % 2]
     trucks: list[Floats] = []
     to_light = lights[shown.target_row] - own
     along_m, aside_m = to_light[:, :2] @ ahead, to_light[:, :2] @ left
     for one in np.flatnonzero(hidden):
-        # As near as it must be for its rear to reach above the light, seen from here, but not nearer.
-        street_m = float(streets.hills.height_m(own[None, :2])[0])
-        rise = (to_light[one, 2] + 0.75) / max(along_m[one], 1.0)
-        near_m = min(0.7 * along_m[one], 0.88 * (height_m + street_m - own[2]) / max(rise, 1e-3))
-        near_m = float(np.clip(near_m, 2.5, 30.0))
+        near_m = _farthest_that_hides(own, to_light[one], float(along_m[one]), ahead, streets)
         at_rear = aside_m * near_m / np.maximum(along_m, 1.0)
         margin_m = 0.45 * near_m / max(along_m[one], 1.0) + 0.1
         choices = at_rear[one] + np.array([0.0, width_m / 2.0 - margin_m, margin_m - width_m / 2.0])
