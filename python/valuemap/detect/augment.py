@@ -57,9 +57,7 @@ class Window:
         return np.asarray(drawn, np.uint8)
 
 
-def choose_window(
-    size_px: tuple[int, int], boxes_px: Floats, config: TrainConfig, rng: np.random.Generator
-) -> Window:
+def choose_window(size_px: tuple[int, int], boxes_px: Floats, config: TrainConfig, rng: np.random.Generator) -> Window:
     """Choose a cut-out of a picture (width, height), mostly one with an object where there are any."""
     spread = math.log(config.max_enlargement)
     scale = math.exp(rng.uniform(-spread, spread))

@@ -7,6 +7,7 @@ import logging
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
@@ -65,9 +66,9 @@ def export_onnx(
         temporary.write_bytes(model.SerializeToString(deterministic=True))
 
 
-def _forget_the_source(model: object) -> None:
+def _forget_the_source(model: Any) -> None:
     """Remove what the exporter notes about the lines of source: paths of this machine, and half of the file."""
-    graph = model.graph  # type: ignore[attr-defined]
+    graph = model.graph
     for part in (model, graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
-        del part.metadata_props[:]  # type: ignore[attr-defined]
+        del part.metadata_props[:]
     del graph.value_info[:]

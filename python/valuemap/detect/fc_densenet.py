@@ -105,7 +105,7 @@ class FCDenseNet(nn.Module):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
         # Objects are rare: begin with the probability that says so, or the background swamps the first steps.
         nn.init.normal_(self.last.weight, std=0.01)
-        nn.init.constant_(self.last.bias, -math.log(99.0))  # type: ignore[arg-type]
+        nn.init.constant_(self.last.bias, -math.log(99.0))
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Return the logits."""

@@ -140,9 +140,7 @@ def whole(data: TrainingData, row: int, config: TrainConfig) -> tuple[Sample, Fi
     return Sample(image, target.astype(np.float32), weight), fit
 
 
-def batches(
-    data: TrainingData, config: TrainConfig, *, seed: int, epoch: int
-) -> Iterator[tuple[Array, Array, Array]]:
+def batches(data: TrainingData, config: TrainConfig, *, seed: int, epoch: int) -> Iterator[tuple[Array, Array, Array]]:
     """Yield images, targets and weights of one epoch; the same for the same seed and epoch, and made ahead."""
     order = np.random.default_rng([seed, epoch]).permutation(len(data.training) * config.cutouts)
     groups = [order[start : start + config.batch] for start in range(0, len(order), config.batch)]
@@ -179,9 +177,7 @@ def edges_of(boxes_px: Floats) -> Floats:
     return np.hstack([boxes_px[:, :2] - half, boxes_px[:, :2] + half])
 
 
-def _without_broken(
-    pictures: list[LabelledPicture], skipped: list[str], progress: Progress
-) -> list[LabelledPicture]:
+def _without_broken(pictures: list[LabelledPicture], skipped: list[str], progress: Progress) -> list[LabelledPicture]:
     """Decode every picture once, so that training never meets a broken one."""
 
     def reason(picture: LabelledPicture) -> str | None:
@@ -215,7 +211,7 @@ def _part(
     names = [str(picture.path.parent) for picture in free]
     if len(set(names)) < _MIN_FOLDERS:
         names = [str(row) for row in range(len(free))]
-    order = sorted(set(names), key=lambda name: (names.index(name)))
+    order = sorted(set(names), key=lambda name: names.index(name))
     shuffled = np.random.default_rng([seed, len(order)]).permutation(len(order))
     wanted, chosen = config.validation_share * len(free), set[str]()
     for place in shuffled[:-1]:  # Something is left for training, whatever the share.

@@ -123,7 +123,7 @@ class Training:
         seconds = round(time.perf_counter() - start, 1)
         self.history.append(Epoch(epoch, training_loss, validation_loss, threshold, recall, precision, seconds))
         if self.best.epoch == epoch:
-            self.best_weights = {name: value.detach().cpu().clone() for name, value in self.network.state_dict().items()}
+            self.best_weights = {name: value.cpu().clone() for name, value in self.network.state_dict().items()}
 
     def save(self, path: Path) -> None:
         """Write the checkpoint, whole or not at all."""
@@ -205,7 +205,7 @@ class Training:
             self.scaler.update()
             losses.append(loss.item())
             progress(f"epoch {epoch} of {self.config.epochs}: train", step + 1, steps)
-        return sum(losses) / len(losses)
+        return float(sum(losses) / len(losses))
 
     @torch.no_grad()
     def _validate(self, epoch: int, progress: Progress) -> tuple[float, ThresholdSearch]:
@@ -220,9 +220,7 @@ class Training:
             sums += loss_sums(logits, target, weight, self.config.focal_power)
             width, height = fit.resized
             probability = torch.sigmoid(logits.float())[0, :, :height, :width].cpu().numpy()
-            search.add(
-                probability, edges_of(picture.boxes_px), self.data.codes(picture), edges_of(picture.ignored_px)
-            )
+            search.add(probability, edges_of(picture.boxes_px), self.data.codes(picture), edges_of(picture.ignored_px))
             progress(f"epoch {epoch} of {self.config.epochs}: validate", row + 1, len(self.data.validation))
         return loss_of(sums).item(), search
 

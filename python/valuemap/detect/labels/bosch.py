@@ -38,7 +38,7 @@ def _load(path: Path) -> list[Any]:
     # The loader in C is ten times as fast; wheels for some machines come without it.
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        content = yaml.load(path.read_bytes(), Loader=loader)  # noqa: S506 (both are safe loaders)
+        content = yaml.load(path.read_bytes(), Loader=loader)  # Both are safe.
     except FileNotFoundError:
         raise InputError(f"{path}: no such file", hint="give the YAML file of the labels") from None
     except (OSError, yaml.YAMLError, ValueError) as error:

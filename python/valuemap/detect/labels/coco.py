@@ -10,6 +10,7 @@ from valuemap.detect.labels.pictures import BoxList, LabelledPictures
 from valuemap.errors import InputError
 
 _HINT = "COCO's format is described at https://cocodataset.org/#format-data"
+_LISTS = ("images", "annotations", "categories")
 
 
 def read_coco(path: Path) -> LabelledPictures:
@@ -43,15 +44,15 @@ def read_coco(path: Path) -> LabelledPictures:
 
 def _load(path: Path) -> dict[str, list[Any]]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content: Any = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file", hint="give a JSON file with labels in COCO's format") from None
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read as JSON: {error}", hint="is it whole? Write it again") from error
-    for key in ("images", "annotations", "categories"):
+    for key in _LISTS:
         if not isinstance(content, dict) or not isinstance(content.get(key), list):
             raise InputError(f"{path}: expected an object with a list named {key}", hint=_HINT)
-    return content
+    return {key: content[key] for key in _LISTS}
 
 
 def _by_id(entries: list[Any], key: str, where: str, skipped: list[str]) -> dict[Any, str]:

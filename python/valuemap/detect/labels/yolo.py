@@ -80,9 +80,7 @@ def _split_of(path: Path, folder: Path) -> str:
     return next((SPLITS[part] for part in reversed(parts) if part in SPLITS), "")
 
 
-def _picture(
-    path: Path, text: Path, names: dict[int, str], split: str, skipped: list[str]
-) -> LabelledPicture | None:
+def _picture(path: Path, text: Path, names: dict[int, str], split: str, skipped: list[str]) -> LabelledPicture | None:
     size_px = _size_px(path)
     if size_px is None:
         skipped.append(f"{path}: cannot be read as a picture")
