@@ -22,7 +22,7 @@ from valuemap.simulate.canvas import (
 )
 from valuemap.simulate.housings import LIT, lamp_px, paint_housing, paint_lookalike
 from valuemap.simulate.scene import Scene, World
-from valuemap.simulate.scenery import Bars, Fronts, Signs
+from valuemap.simulate.scenery import Bars, Fronts, Signs, Trees
 from valuemap.simulate.streams import hash01, random_stream
 from valuemap.simulate.vehicle_shapes import GLASS, HEAD_LAMP, PAINT, TAIL_LAMP, TRIM, TYRE
 from valuemap.simulate.weather import Light, light_of_pass
@@ -33,7 +33,7 @@ _MARKS_M = 75.0
 _THINGS_M = 110.0
 _WINDOWS_M = 120.0
 _FAR = 10**6
-_BAR, _SIGN, _HOUSING = range(3)
+_BAR, _SIGN, _TREE, _HOUSING, _VEHICLE = range(5)
 _MATERIALS = {
     GLASS: (46, 54, 62),
     TYRE: (22, 22, 23),
@@ -41,6 +41,10 @@ _MATERIALS = {
     TAIL_LAMP: (120, 16, 16),
     HEAD_LAMP: (222, 222, 214),
 }
+_FRAMES_M = 70.0
+_BOARDS = np.array([[120, 40, 40], [40, 70, 60], [50, 56, 78], [150, 120, 70], [70, 66, 62], [170, 165, 155]])
+_LEAVES = np.array([[92, 124, 66], [108, 130, 58], [78, 112, 72], [128, 122, 58]])
+_LEAF_CORNERS = 18
 _WINDOW_LIT = np.array([[255, 214, 140], [255, 232, 186], [236, 196, 120]])
 
 
@@ -55,6 +59,7 @@ class Painter:
         self._ground = cKDTree(scenery.ground.corner_in_world_m[:, :, :2].mean(axis=1))
         self._fronts = cKDTree((scenery.fronts.from_m + scenery.fronts.to_m) / 2.0)
         self._bars = cKDTree((scenery.bars.from_in_world_m[:, :2] + scenery.bars.to_in_world_m[:, :2]) / 2.0)
+        self._trees = cKDTree(scenery.trees.foot_in_world_m[:, :2])
         self._signs = cKDTree(scenery.signs.center_in_world_m[:, :2])
         self._air = Air(self.world.recording.config, self.world.recording.seed)
 
@@ -111,7 +116,10 @@ class Painter:
         outlines = view.outlines_px(corners)
         is_seen = np.array([outline is not None for outline in outlines], dtype=np.bool_)
         band_of, bands = _bands(fronts, view, is_seen)
+        frame = light.through_haze(np.clip(fronts.color * 1.22 + 16.0, 0.0, 250.0) * lit, distance_m)
+        board = light.through_haze(_BOARDS[fronts.number % len(_BOARDS)] * lit, distance_m)
         window_of, number, windows = _windows(fronts, view, is_seen & (distance_m < _WINDOWS_M))
+        frames = _grown(windows)
         is_lit = hash01(number + 1000 * fronts.number[window_of], seed, 7) < light.weather.lit_windows
         band_at = np.searchsorted(band_of, np.arange(len(fronts) + 1))
         window_at = np.searchsorted(window_of, np.arange(len(fronts) + 1))
@@ -119,8 +127,12 @@ class Painter:
             outline = outlines[row]
             assert outline is not None
             fill(canvas, outline, wall[row].tolist())
-            fill_all(canvas, bands[band_at[row] : band_at[row + 1]], trim[row].tolist())
+            own = slice(band_at[row], band_at[row + 1])
+            fill_all(canvas, bands[own][:2], trim[row].tolist())
+            fill_all(canvas, bands[own][2:], board[row].tolist())
             own = slice(window_at[row], window_at[row + 1])
+            if distance_m[row] < _FRAMES_M:
+                fill_all(canvas, frames[own], frame[row].tolist())
             fill_all(canvas, windows[own][~is_lit[own]], glass[row].tolist())
             fill_all(canvas, windows[own][is_lit[own]], shine[row].tolist())
 
@@ -129,13 +141,19 @@ class Painter:
         view, housings = scene.view, scene.housings
         bars, bar_px, bar_depth_m = self._bars_in(view)
         signs, sign_px, sign_depth_m = self._signs_in(view)
-        depth_m = [bar_depth_m, sign_depth_m, housings.depth_m, scene.vehicle_depth_m]
-        kind = np.repeat(np.arange(4), [len(d) for d in depth_m])
+        trees, tree_px, tree_depth_m = self._trees_in(view)
+        depth_m = [bar_depth_m, sign_depth_m, tree_depth_m, housings.depth_m, scene.vehicle_depth_m]
+        kind = np.repeat(np.arange(_VEHICLE + 1), [len(d) for d in depth_m])
         index = np.concatenate([np.arange(len(d)) for d in depth_m])
         all_depth_m = np.concatenate(depth_m)
         metal = light.through_haze(bars.color * light.on_ground * 0.9, bar_depth_m).tolist()
         plate = light.through_haze(signs.color * light.on_walls(signs.normal), sign_depth_m).tolist()
         back = light.through_haze(np.full((len(signs), 3), 110.0) * light.on_ground, sign_depth_m).tolist()
+        greens = _LEAVES[trees.number % len(_LEAVES)] * light.on_ground
+        leaves = [
+            light.through_haze(np.outer([0.62, 0.82, 1.05], green), np.full(3, far_m)).tolist()
+            for green, far_m in zip(greens, tree_depth_m, strict=True)
+        ]
         shows_front = ((view.center_in_world_m[:2] - signs.center_in_world_m[:, :2]) * signs.normal).sum(axis=1) > 0.0
         lamps = self.world.signals.lamps(
             self.world.recording.frames, scene.row, self.world.approach[housings.light_row]
@@ -153,6 +171,9 @@ class Painter:
                     _disc(glow, head, radius_px, 1.0 / COARSE, (255, 206, 140))
             elif kind[job] == _SIGN:
                 fill(canvas, sign_px[i], plate[i] if shows_front[i] else back[i])
+            elif kind[job] == _TREE:
+                for blob, shade in zip(tree_px[i], leaves[i], strict=True):
+                    fill(canvas, blob, shade)
             elif kind[job] == _HOUSING:
                 self._paint_light(canvas, glow, scene, i, int(lamps[i]), light)
             else:
@@ -205,6 +226,23 @@ class Painter:
             outlines.append(middle + radius * circle)
         return signs, outlines, in_cam[:, 2]
 
+    def _trees_in(self, view: View) -> tuple[Trees, Floats, Floats]:
+        """Return trees in the picture, the outlines (N, 3, K, 2) of three layers of leaves and depths (N)."""
+        trees = self.world.scenery.trees.take(self._around(self._trees, view, _THINGS_M))
+        crown = trees.foot_in_world_m + trees.crown_m[:, None] * [0.0, 0.0, 1.0]
+        in_cam = view.in_cam_m(crown)
+        seen = (in_cam[:, 2] > 2.0) & ~self._is_round_corner(view, crown[:, :2])
+        trees, in_cam = trees.take(seen), in_cam[seen]
+        angle = np.arange(_LEAF_CORNERS) * (2.0 * np.pi / _LEAF_CORNERS)
+        circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        corner = np.arange(3 * _LEAF_CORNERS) + 100.0 * trees.number[:, None]
+        bumpy = 0.72 + 0.45 * hash01(corner, self.world.recording.seed, 11).reshape(-1, 3, _LEAF_CORNERS)
+        layer = np.array([[0.0, 0.0, 1.0], [-0.12, -0.16, 0.72], [-0.2, -0.34, 0.42]])
+        unit = layer[:, None, :2] + layer[:, 2, None, None] * circle
+        radius_px = view.focal_px * trees.radius_m / in_cam[:, 2]
+        outline = view.project_px(in_cam)[:, None, None] + radius_px[:, None, None, None] * bumpy[..., None] * unit
+        return trees, outline, in_cam[:, 2]
+
     def _is_round_corner(self, view: View, ground_m: Floats) -> Bools:
         own = np.broadcast_to(view.center_in_world_m[:2], ground_m.shape)
         return self.world.recording.city.streets.is_hidden_by_houses(own, ground_m)
@@ -246,12 +284,22 @@ def _upright(start: Floats, stop: Floats, low: Floats, high: Floats) -> Floats:
 
 
 def _bands(fronts: Fronts, view: View, is_seen: Bools) -> tuple[Ints, Floats]:
-    """Return cornices and plinths: of which front (N), and outlines (N, 4, 2)."""
-    rows = np.repeat(np.flatnonzero(is_seen & (fronts.windows[:, 1] > 0)), 2)
-    is_plinth = np.arange(len(rows)) % 2 == 1
-    low = np.where(is_plinth, fronts.base_m[rows], fronts.top_m[rows] - 0.55)
-    high = np.where(is_plinth, fronts.base_m[rows] + 0.9, fronts.top_m[rows])
-    return _in_picture(rows, _upright(fronts.from_m[rows], fronts.to_m[rows], low, high), view)[::2]
+    """Return plinth, cornice and board over the shops of each front: of which (3 N), and outlines (3 N, 4, 2)."""
+    rows = np.flatnonzero(is_seen & (fronts.windows[:, 1] > 0))
+    base, top = fronts.base_m[rows, None], fronts.top_m[rows, None]
+    low = np.concatenate([base, top - 0.55, base + 3.15], axis=1).reshape(-1)
+    high = np.concatenate([base + 0.9, top, base + 3.7], axis=1).reshape(-1)
+    of = np.repeat(rows, 3)
+    in_cam = view.in_cam_m(_upright(fronts.from_m[of], fronts.to_m[of], low, high))
+    whole = np.all(in_cam[:, :, 2] > NEAR_M, axis=1).reshape(-1, 3).all(axis=1).repeat(3)
+    return of[whole], view.project_px(in_cam[whole])
+
+
+def _grown(outlines_px: Floats) -> Floats:
+    """Return outlines (N, 4, 2) a little larger: the frames around windows."""
+    middle = outlines_px.mean(axis=1, keepdims=True)
+    grown: Floats = middle + (outlines_px - middle) * 1.16
+    return grown
 
 
 def _windows(fronts: Fronts, view: View, is_seen: Bools) -> tuple[Ints, Ints, Floats]:
@@ -272,15 +320,9 @@ def _windows(fronts: Fronts, view: View, is_seen: Bools) -> tuple[Ints, Ints, Fl
     low = fronts.base_m[of_front] + 0.3 + 3.3 * storey + np.where(is_shop, 0.6, 1.1)
     high = low + np.where(is_shop, 2.1, 1.6)
     corners = _upright(start + along[:, :1] * (stop - start), start + along[:, 1:] * (stop - start), low, high)
-    return _in_picture(of_front, corners, view, number)
-
-
-def _in_picture(of: Ints, corners: Floats, view: View, number: Ints | None = None) -> tuple[Ints, Ints, Floats]:
-    """Return those of the rectangles (N, 4, 3) that are before the camera, with their outlines (N, 4, 2)."""
     in_cam = view.in_cam_m(corners)
     before = np.all(in_cam[..., 2] > NEAR_M, axis=1)
-    number = np.zeros(len(of), dtype=np.int64) if number is None else number
-    return of[before], number[before], view.project_px(in_cam[before])
+    return of_front[before], number[before], view.project_px(in_cam[before])
 
 
 def _disc(canvas: Picture, middle_px: Floats, radius_px: float, scale: float, color: tuple[float, ...]) -> None:

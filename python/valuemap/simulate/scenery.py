@@ -34,6 +34,7 @@ _WALLS = np.array(
 )
 _SIGNS = np.array([[190, 30, 35], [30, 80, 165], [235, 200, 40], [235, 235, 235], [25, 115, 70]])
 _GABLE_M = 11.0
+_TREE_SHARE = 0.5
 _Lay = Callable[[int, bool, Floats, Floats], None]
 _ARM_BELOW_M = 7.0
 """Lights nearer than this to the axis of their street hang on a mast arm."""
@@ -88,6 +89,16 @@ class Signs(Table):
 
 
 @dataclass(frozen=True, eq=False)
+class Trees(Table):
+    """Trees: feet (N, 3), heights of the middle of the crown above the foot and radii (N), numbers (N)."""
+
+    foot_in_world_m: Floats
+    crown_m: Floats
+    radius_m: Floats
+    number: Ints
+
+
+@dataclass(frozen=True, eq=False)
 class Scenery:
     """All that stands still and is no light."""
 
@@ -95,11 +106,12 @@ class Scenery:
     fronts: Fronts
     bars: Bars
     signs: Signs
+    trees: Trees
 
 
 def build_scenery(city: City, *, seed: int) -> Scenery:
     """Furnish a city."""
-    street_bars, signs = _furnish(city.streets, seed)
+    street_bars, signs, trees = _furnish(city.streets, seed)
     return Scenery(
         ground=_pave(city.streets, seed),
         fronts=_build_fronts(city.streets, seed),
@@ -111,6 +123,7 @@ def build_scenery(city: City, *, seed: int) -> Scenery:
             ]
         ),
         signs=signs,
+        trees=trees,
     )
 
 
@@ -315,16 +328,20 @@ def _carry_lights(lights: Targets, streets: Streets, *, share_poles: bool) -> Ba
     return join_rows([poles, arms])
 
 
-def _furnish(streets: Streets, seed: int) -> tuple[Bars, Signs]:
-    """Put street lamps and signs along the pavements."""
+def _furnish(streets: Streets, seed: int) -> tuple[Bars, Signs, Trees]:
+    """Put street lamps, signs and trees along the pavements.
+
+    Trees stand so near the houses that they hide no light from those who drive toward it.
+    """
     random = random_stream(seed, "furniture")
     lamps: list[Floats] = []
     signs: list[Floats] = []
+    trees: list[Floats] = []
     for along_x in (True, False):
         axes, crossings = (streets.y_m, streets.x_m) if along_x else (streets.x_m, streets.y_m)
         for axis in axes:
             for side in (-1.0, 1.0):
-                for spacing_m, aside_m, found in ((30.0, 12.2, lamps), (42.0, 8.6, signs)):
+                for spacing_m, aside_m, found in ((30.0, 11.2, lamps), (42.0, 8.6, signs), (14.0, 12.2, trees)):
                     start_m = crossings[0] - _BEYOND_M + random.uniform(0.0, spacing_m)
                     at = np.arange(start_m, crossings[-1] + _BEYOND_M, spacing_m)
                     at = at + random.uniform(-4.0, 4.0, len(at))
@@ -334,7 +351,7 @@ def _furnish(streets: Streets, seed: int) -> tuple[Bars, Signs]:
                     toward = np.full(len(at), side if along_x else -side)
                     flat = np.zeros(len(at))
                     found.append(np.column_stack([at, across, toward, flat] if along_x else [across, at, flat, toward]))
-    lamp, sign = np.concatenate(lamps), np.concatenate(signs)
+    lamp, sign, tree = np.concatenate(lamps), np.concatenate(signs), np.concatenate(trees)
     lamp_m, sign_m = streets.hills.height_m(lamp[:, :2]), streets.hills.height_m(sign[:, :2])
     poles = _bars(_at(lamp[:, :2], lamp_m), _at(lamp[:, :2], lamp_m + 7.5), 0.14, 58.0, is_street_lamp=1)
     posts = _bars(_at(sign[:, :2], sign_m), _at(sign[:, :2], sign_m + 2.7), 0.07, 120.0)
@@ -347,7 +364,13 @@ def _furnish(streets: Streets, seed: int) -> tuple[Bars, Signs]:
         color=_SIGNS[kind].astype(np.float64),
         corners=np.array([8, 24, 4, 4, 4])[kind],
     )
-    return join_rows([poles, posts]), plates
+    tree = tree[random.random(len(tree)) < _TREE_SHARE]
+    foot = _at(tree[:, :2], streets.hills.height_m(tree[:, :2]))
+    radius_m = random.uniform(1.3, 1.9, len(tree))
+    crown_m = 2.4 + radius_m + random.uniform(0.0, 0.8, len(tree))
+    trunks = _bars(foot, foot + crown_m[:, None] * [0.0, 0.0, 1.0], 0.22, 66.0)
+    crowns = Trees(foot, crown_m, radius_m, np.arange(len(tree)))
+    return join_rows([poles, posts, trunks]), plates, crowns
 
 
 def _bars(start: Floats, end: Floats, thickness_m: float, grey: float, *, is_street_lamp: int = 0) -> Bars:
