@@ -57,9 +57,9 @@ def paint_housing(
 ) -> None:
     """Paint one housing that fills exactly the box (left, top, right, bottom).
 
-    It is painted enlarged on a patch of its own, which is then shrunk onto the canvas, so that edges and lamps
-    lie where they belong to a small fraction of a pixel. `turn` is the cosine between its front and the camera,
-    `lamp` the lit one, `haze` the share of its colour that is left.
+    It is painted enlarged on a patch of its own, which is then shrunk onto the canvas, so that lamps lie where
+    they belong to a small fraction of a pixel; its edges are exact. `turn` is the cosine between its front and
+    the camera, `lamp` the lit one, `haze` the share of its colour that is left.
     """
     box = box_px * ENLARGED
     low = np.maximum(np.floor(box[:2]).astype(int) - 1, 0)
@@ -69,13 +69,10 @@ def paint_housing(
     finer = int(np.clip(round(_PATCH_PX / (box[3] - box[1])), 1, 16))
     width, height = (high - low) * finer
     color = np.zeros((height, width, 3), np.uint8)
-    cover = np.zeros((height, width), np.uint8)
     left, top, right, bottom = ((box - np.tile(low, 2)) * finer).tolist()
-    rows, columns = _span(top, bottom, height), _span(left, right, width)
-    cover[rows, columns] = 255
     ambient = np.asarray(light.weather.skylight) + 0.3 * np.asarray(light.weather.sunlight)
     body_color = ambient * _BODIES[body % len(_BODIES)] * (0.8 if turn > 0.0 else 0.65)
-    color[rows, columns] = body_color.astype(np.uint8)
+    color[:] = body_color.astype(np.uint8)
     if turn > 0.0:
         _paint_lamps(color, (left, top, right, bottom), turn, lamp, body_color, ambient)
     else:
@@ -84,10 +81,10 @@ def paint_housing(
     if turn > 0.0:
         _paint_lit(hazed, (left, top, right, bottom), turn, lamp)
     patch_px = (int(high[0] - low[0]), int(high[1] - low[1]))
-    share = cv2.resize(cover, patch_px, interpolation=cv2.INTER_AREA)[:, :, None] / 255.0
-    smooth = cv2.resize(hazed * (cover[:, :, None] > 0), patch_px, interpolation=cv2.INTER_AREA)
+    share = np.outer(_covered(box[1], box[3], low[1], high[1]), _covered(box[0], box[2], low[0], high[0]))[:, :, None]
+    smooth = cv2.resize(hazed, patch_px, interpolation=cv2.INTER_AREA)
     place = canvas[low[1] : high[1], low[0] : high[0]]
-    place[:] = np.clip(place * (1.0 - share) + smooth, 0.0, 255.0).astype(np.uint8)
+    place[:] = np.rint(np.clip(place * (1.0 - share) + smooth * share, 0.0, 255.0)).astype(np.uint8)
 
 
 def paint_lookalike(canvas: Picture, box_px: Floats, light: Light, haze: float) -> None:
@@ -110,8 +107,11 @@ def lamp_px(box_px: Floats, lamp: int) -> tuple[Floats, float]:
     return center, _LAMP_RADIUS * 0.35 * float(bottom - top)
 
 
-def _span(start: float, stop: float, limit: int) -> slice:
-    return slice(max(0, round(start)), max(0, min(limit, round(stop))))
+def _covered(start: float, stop: float, first: int, last: int) -> Floats:
+    """Return which shares of the pixels first to last (N) are between start and stop."""
+    pixel = np.arange(first, last)
+    covered: Floats = np.clip(np.minimum(pixel + 1, stop) - np.maximum(pixel, start), 0.0, 1.0)
+    return covered
 
 
 def _ellipse(
