@@ -114,7 +114,8 @@ def evaluate_boxes(
 ) -> DetectionEvaluation:
     """Compare boxes with labels, picture by picture.
 
-    Only pictures on both sides count; a picture in which nothing was found is in `found` without boxes. Classes must agree if any name occurs on both sides; else they are not compared.
+    Only pictures on both sides count; a picture in which nothing was found is in `found` without boxes. Classes must
+    agree if any name occurs on both sides; else they are not compared.
     """
     pictures = [picture for picture in labels.pictures if picture.path in found]
     names = {name for picture in pictures for name in picture.classes}

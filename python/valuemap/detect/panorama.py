@@ -22,8 +22,9 @@ from valuemap.tables import Floats
 
 MODEL = "EQUIRECTANGULAR"
 
-_POINTS_A_SIDE = 9
-"""Points on each side of a box that are followed into the panorama, where its sides are bent."""
+_SIDES = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
+"""The middles of the sides of a box. Its corners are no good: off the middle of a view upright things lean, so that the
+corners lie outside of them, and farther outside in the panorama."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +61,8 @@ class PanoramaViews:
         return np.asarray(drawn, np.uint8)
 
     def to_panorama(self, boxes: Boxes, view: int) -> Boxes:
-        """Return boxes of a view as boxes of the panorama: the centre is the same ray, the size of the bent box."""
-        along = np.linspace(-0.5, 0.5, _POINTS_A_SIDE)
-        ends = np.full(_POINTS_A_SIDE, 0.5)
-        outline = np.concatenate(
-            [np.stack(pair, axis=1) for pair in ((along, ends), (along, -ends), (ends, along), (-ends, along))]
-        )
-        points = boxes.center_px[:, None] + outline[None] * boxes.size_px[:, None]
+        """Return boxes of a view as boxes of the panorama: centres on the same rays, sizes between the sides."""
+        points = boxes.center_px[:, None] + _SIDES[None] * boxes.size_px[:, None]
         center = self._panorama_from_view(boxes.center_px)
         around = self._panorama_from_view(points.reshape(-1, 2)).reshape(points.shape) - center[:, None]
         width = self.panorama[0]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, UnidentifiedImageError
 
 from valuemap.detect.boxes import Boxes
 from valuemap.detect.letterbox import Pixels, Size
@@ -64,6 +64,8 @@ def read_picture(path: Path, *, upright: bool = True) -> Picture:
             pixels = _as_rgb(ImageOps.exif_transpose(image) if orientation > 1 else image)
     except FileNotFoundError:
         raise UnusablePicture("no such file") from None
+    except UnidentifiedImageError:
+        raise UnusablePicture("is no picture") from None
     except Exception as error:  # On damaged files Pillow's decoders raise nearly anything.
         raise UnusablePicture(f"cannot be decoded: {str(error).splitlines()[0] if str(error) else error!r}") from error
     return Picture(pixels, orientation, stored)

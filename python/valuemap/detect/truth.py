@@ -12,7 +12,8 @@ from valuemap.dataset import rows_of
 from valuemap.tables import Bools, Cameras, Detections, Floats, Images, Ints, Truth, TruthDetections
 
 _MAX_RANGE_M = 200.0
-_SLACK_PX = 2.0
+_SLACK_PX = 4.0
+"""For boxes that are smaller than the errors of the poses."""
 _IMAGES_AT_ONCE = 2000
 """Bounds memory, changes no result."""
 
