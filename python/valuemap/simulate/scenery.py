@@ -230,7 +230,9 @@ def _build_fronts(streets: Streets, seed: int) -> Fronts:
     from_m, to_m = rows[:, :2], rows[:, 2:4]
     count = len(rows)
     base = np.minimum(streets.hills.height_m(from_m), streets.hills.height_m(to_m)) - 0.3
-    storeys = random.integers(2, 8, count)
+    top = base + 1.5 + 3.3 * random.integers(2, 8, count) + random.uniform(0.0, 0.8, count)
+    top = _even_at_corners(top, from_m, to_m)
+    storeys = np.floor((top - base - 1.5) / 3.3).astype(np.int64)
     width_m = np.linalg.norm(to_m - from_m, axis=1)
     color = _WALLS[random.integers(0, len(_WALLS), count)] * random.uniform(0.8, 1.1, (count, 1))
     fronts = Fronts(
@@ -238,7 +240,7 @@ def _build_fronts(streets: Streets, seed: int) -> Fronts:
         to_m=to_m,
         normal=rows[:, 4:],
         base_m=base,
-        top_m=base + 1.5 + 3.3 * storeys + random.uniform(0.0, 0.8, count),
+        top_m=top,
         color=color,
         windows=np.stack([np.maximum(1, np.round(width_m / random.uniform(2.2, 3.6, count))), storeys], 1).astype(
             np.int64
@@ -248,12 +250,25 @@ def _build_fronts(streets: Streets, seed: int) -> Fronts:
     return join_rows([fronts, _gables(fronts)])
 
 
+def _even_at_corners(top_m: Floats, from_m: Floats, to_m: Floats) -> Floats:
+    """Return heights (N) of roofs such that the two fronts of a house at a corner have the same."""
+    ends = np.round(np.concatenate([from_m, to_m]), 6)
+    place = np.unique(ends, axis=0, return_inverse=True)[1].reshape(-1)
+    runs_along_x = np.tile(np.equal(from_m[:, 1], to_m[:, 1]), 2)
+    met = np.zeros((place.max() + 1, 2), dtype=np.int64)
+    np.add.at(met, (place, runs_along_x.astype(np.int64)), 1)
+    is_corner = (met.min(axis=1) > 0)[place]
+    highest_m = np.full(len(met), -np.inf)
+    front = np.tile(np.arange(len(top_m)), 2)[is_corner]
+    np.maximum.at(highest_m, place[is_corner], top_m[front])
+    even_m = top_m.copy()
+    np.maximum.at(even_m, front, highest_m[place[is_corner]])
+    return even_m
+
+
 def _gables(fronts: Fronts) -> Fronts:
     """Return the walls, without windows, by which houses rise above their neighbours."""
-    lowest, highest = (
-        np.minimum(fronts.from_m, fronts.to_m),
-        np.maximum(fronts.from_m, fronts.to_m),
-    )
+    lowest, highest = np.minimum(fronts.from_m, fronts.to_m), np.maximum(fronts.from_m, fronts.to_m)
     inward = -fronts.normal * _GABLE_M
     along = np.abs(fronts.normal[:, ::-1])
     parts = []
