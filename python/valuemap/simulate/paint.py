@@ -17,12 +17,12 @@ from valuemap.simulate.canvas import (
     bar_outlines_px,
     far_to_near,
     fill,
-    fill_all,
     on_canvas,
 )
+from valuemap.simulate.furniture import Bars, Signs, Trees
 from valuemap.simulate.housings import LIT, lamp_px, paint_housing, paint_lookalike
+from valuemap.simulate.paint_houses import paint_fronts
 from valuemap.simulate.scene import Scene, World
-from valuemap.simulate.scenery import Bars, Fronts, Signs, Trees
 from valuemap.simulate.streams import hash01, random_stream
 from valuemap.simulate.vehicle_shapes import GLASS, HEAD_LAMP, PAINT, TAIL_LAMP, TRIM, TYRE
 from valuemap.simulate.weather import Light, light_of_pass
@@ -30,8 +30,8 @@ from valuemap.tables import Bools, Floats, Ints
 
 _SIGHT_M = 150.0
 _MARKS_M = 75.0
+_FRONTS_M = 195.0
 _THINGS_M = 110.0
-_WINDOWS_M = 120.0
 _FAR = 10**6
 _BAR, _SIGN, _TREE, _HOUSING, _VEHICLE = range(5)
 _MATERIALS = {
@@ -41,11 +41,8 @@ _MATERIALS = {
     TAIL_LAMP: (120, 16, 16),
     HEAD_LAMP: (222, 222, 214),
 }
-_FRAMES_M = 70.0
-_BOARDS = np.array([[120, 40, 40], [40, 70, 60], [50, 56, 78], [150, 120, 70], [70, 66, 62], [170, 165, 155]])
 _LEAVES = np.array([[92, 124, 66], [108, 130, 58], [78, 112, 72], [128, 122, 58]])
 _LEAF_CORNERS = 18
-_WINDOW_LIT = np.array([[255, 214, 140], [255, 232, 186], [236, 196, 120]])
 
 
 @dataclass(eq=False)
@@ -70,7 +67,8 @@ class Painter:
         canvas = self._air.sky_behind(view, light)
         glow = np.zeros((-(-view.height_px // COARSE), -(-view.width_px // COARSE), 3), np.uint8)
         self._paint_ground(canvas, view, light)
-        self._paint_fronts(canvas, view, light)
+        fronts = self.world.scenery.fronts.take(self._around(self._fronts, view, _FRONTS_M))
+        paint_fronts(canvas, fronts, view, light, seed=self.world.recording.seed)
         self._paint_things(canvas, glow, scene, light)
         picture = cv2.resize(canvas, (view.width_px, view.height_px), interpolation=cv2.INTER_AREA)
         random = random_stream(self.world.recording.seed, "picture", scene.row)
@@ -96,45 +94,6 @@ class Painter:
         for outline, shade in zip(view.outlines_px(corners), color, strict=True):
             if outline is not None:
                 fill(canvas, outline, shade)
-
-    def _paint_fronts(self, canvas: Picture, view: View, light: Light) -> None:
-        fronts = self.world.scenery.fronts.take(self._around(self._fronts, view, _SIGHT_M * 1.3))
-        toward = view.center_in_world_m[:2] - fronts.from_m
-        fronts = fronts.take((toward * fronts.normal).sum(axis=1) > 0.0)
-        middle = (fronts.from_m + fronts.to_m) / 2.0
-        distance_m = np.linalg.norm(middle - view.center_in_world_m[:2], axis=1)
-        order = far_to_near(distance_m)
-        fronts, distance_m = fronts.take(order), distance_m[order]
-        corners = _upright(fronts.from_m, fronts.to_m, fronts.base_m, fronts.top_m)
-        lit = light.on_walls(fronts.normal)
-        wall = light.through_haze(fronts.color * lit, distance_m)
-        trim = light.through_haze(fronts.color * lit * 0.72, distance_m)
-        glass = np.asarray(light.weather.sky_low) * 0.3 * np.minimum(1.0, lit + 0.25) + [12.0, 15.0, 18.0]
-        glass = light.through_haze(glass, distance_m)
-        shine = light.through_haze(_WINDOW_LIT[fronts.number % len(_WINDOW_LIT)].astype(np.float64), 0.6 * distance_m)
-        seed = self.world.recording.seed
-        outlines = view.outlines_px(corners)
-        is_seen = np.array([outline is not None for outline in outlines], dtype=np.bool_)
-        band_of, bands = _bands(fronts, view, is_seen)
-        frame = light.through_haze(np.clip(fronts.color * 1.22 + 16.0, 0.0, 250.0) * lit, distance_m)
-        board = light.through_haze(_BOARDS[fronts.number % len(_BOARDS)] * lit, distance_m)
-        window_of, number, windows = _windows(fronts, view, is_seen & (distance_m < _WINDOWS_M))
-        frames = _grown(windows)
-        is_lit = hash01(number + 1000 * fronts.number[window_of], seed, 7) < light.weather.lit_windows
-        band_at = np.searchsorted(band_of, np.arange(len(fronts) + 1))
-        window_at = np.searchsorted(window_of, np.arange(len(fronts) + 1))
-        for row in np.flatnonzero(is_seen):
-            outline = outlines[row]
-            assert outline is not None
-            fill(canvas, outline, wall[row].tolist())
-            own = slice(band_at[row], band_at[row + 1])
-            fill_all(canvas, bands[own][:2], trim[row].tolist())
-            fill_all(canvas, bands[own][2:], board[row].tolist())
-            own = slice(window_at[row], window_at[row + 1])
-            if distance_m[row] < _FRAMES_M:
-                fill_all(canvas, frames[own], frame[row].tolist())
-            fill_all(canvas, windows[own][~is_lit[own]], glass[row].tolist())
-            fill_all(canvas, windows[own][is_lit[own]], shine[row].tolist())
 
     def _paint_things(self, canvas: Picture, glow: Picture, scene: Scene, light: Light) -> None:
         """Paint poles, signs, lights and vehicles, the farthest first."""
@@ -206,7 +165,7 @@ class Painter:
         bars, start, end = bars.take(seen), start[seen], end[seen]
         width_px = view.focal_px * bars.thickness_m[:, None] / np.stack([start[:, 2], end[:, 2]], axis=1)
         outline = bar_outlines_px(view.project_px(start), view.project_px(end), width_px)
-        # Lights hang before their poles: half a metre settles what is before what.
+        # Lights hang before their poles: what is in doubt is behind.
         return bars, outline, (start[:, 2] + end[:, 2]) / 2.0 + 0.15
 
     def _signs_in(self, view: View) -> tuple[Signs, list[Floats], Floats]:
@@ -274,55 +233,6 @@ class Painter:
             _disc(glow, outline.mean(axis=0), radius_px, 1.0 / COARSE, color)
         elif material == PAINT:
             cv2.fillConvexPoly(glow, on_canvas(outline, 1.0 / COARSE), (0, 0, 0), cv2.LINE_8, 4)
-
-
-def _upright(start: Floats, stop: Floats, low: Floats, high: Floats) -> Floats:
-    """Return upright rectangles (N, 4, 3) from points to points (N, 2) of the ground, between heights (N)."""
-    feet = np.stack([start, stop, stop, start], axis=1)
-    height = np.stack([low, low, high, high], axis=1)
-    return np.concatenate([feet, height[:, :, None]], axis=2)
-
-
-def _bands(fronts: Fronts, view: View, is_seen: Bools) -> tuple[Ints, Floats]:
-    """Return plinth, cornice and board over the shops of each front: of which (3 N), and outlines (3 N, 4, 2)."""
-    rows = np.flatnonzero(is_seen & (fronts.windows[:, 1] > 0))
-    base, top = fronts.base_m[rows, None], fronts.top_m[rows, None]
-    low = np.concatenate([base, top - 0.55, base + 3.15], axis=1).reshape(-1)
-    high = np.concatenate([base + 0.9, top, base + 3.7], axis=1).reshape(-1)
-    of = np.repeat(rows, 3)
-    in_cam = view.in_cam_m(_upright(fronts.from_m[of], fronts.to_m[of], low, high))
-    whole = np.all(in_cam[:, :, 2] > NEAR_M, axis=1).reshape(-1, 3).all(axis=1).repeat(3)
-    return of[whole], view.project_px(in_cam[whole])
-
-
-def _grown(outlines_px: Floats) -> Floats:
-    """Return outlines (N, 4, 2) a little larger: the frames around windows."""
-    middle = outlines_px.mean(axis=1, keepdims=True)
-    grown: Floats = middle + (outlines_px - middle) * 1.16
-    return grown
-
-
-def _windows(fronts: Fronts, view: View, is_seen: Bools) -> tuple[Ints, Ints, Floats]:
-    """Return windows: of which front (N), the number there, and outlines (N, 4, 2)."""
-    rows = np.flatnonzero(is_seen)
-    columns, storeys = fronts.windows[rows].T
-    counts = columns * storeys
-    of = np.repeat(np.arange(len(rows)), counts)
-    number = np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts, counts)
-    column, storey = number % columns[of], number // columns[of]
-    # Shop windows below, and houses of different habits above.
-    is_shop = storey == 0
-    wide = 0.42 + 0.3 * hash01(fronts.number[rows], 3)
-    half = np.where(is_shop, 0.41, wide[of] / 2.0)
-    along = np.stack([(column + 0.5 - half), (column + 0.5 + half)], axis=1) / columns[of][:, None]
-    of_front = rows[of]
-    start, stop = fronts.from_m[of_front], fronts.to_m[of_front]
-    low = fronts.base_m[of_front] + 0.3 + 3.3 * storey + np.where(is_shop, 0.6, 1.1)
-    high = low + np.where(is_shop, 2.1, 1.6)
-    corners = _upright(start + along[:, :1] * (stop - start), start + along[:, 1:] * (stop - start), low, high)
-    in_cam = view.in_cam_m(corners)
-    before = np.all(in_cam[..., 2] > NEAR_M, axis=1)
-    return of_front[before], number[before], view.project_px(in_cam[before])
 
 
 def _disc(canvas: Picture, middle_px: Floats, radius_px: float, scale: float, color: tuple[float, ...]) -> None:

@@ -10,9 +10,10 @@ from scipy.spatial import cKDTree
 
 from valuemap.simulate.canvas import View
 from valuemap.simulate.city import Targets
+from valuemap.simulate.furniture import approach_of
 from valuemap.simulate.housings import Housings, place_housings
 from valuemap.simulate.rows import join_rows
-from valuemap.simulate.scenery import Scenery, approach_of, build_scenery
+from valuemap.simulate.scenery import Scenery, build_scenery
 from valuemap.simulate.sightings import Sightings
 from valuemap.simulate.signals import Signals, time_signals
 from valuemap.simulate.simulation import Recording
