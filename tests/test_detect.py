@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from small_dataset import small_dataset
+from test_cli import colmap_model
 from tiny_models import red_finder, says
-from valuemap import read_dataset, write_dataset
+from valuemap import build_map, read_dataset, write_dataset
 from valuemap.config import DetectConfig
 from valuemap.dataset import Dataset
 from valuemap.detect import infer
@@ -34,7 +35,9 @@ from valuemap.detect.run import RECORD, RESULTS, detect_dataset, detect_folder, 
 from valuemap.detect.tiles import are_cut, merge_views, plan_tiles
 from valuemap.detect.truth import find_truth_detections
 from valuemap.errors import InputError, SettingError
+from valuemap.readers.colmap import read_colmap
 from valuemap.simulate import PRESETS, simulate
+from valuemap.summary import summarize_dataset
 from valuemap.tables import Cameras, Categories
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "detector"
@@ -99,6 +102,19 @@ def test_detections_of_a_dataset_are_replaced(dataset: Path, finder: Path) -> No
     }
     assert told[-1] == ("pictures", 4, 4)
     assert not list(dataset.glob(".*"))
+
+
+def test_images_may_come_without_detections(tmp_path: Path, finder: Path) -> None:
+    colmap_model(tmp_path / "model")
+    write_dataset(read_colmap(tmp_path / "model"), tmp_path / "data")
+    with pytest.raises(InputError, match="there are no detections") as error:
+        build_map(read_dataset(tmp_path / "data"))
+    assert "valuemap detect" in error.value.hint
+    assert summarize_dataset(read_dataset(tmp_path / "data"))["detections"] == 0
+    for i in range(3):
+        save(tmp_path / "pictures" / "a" / f"{i}.jpg", painted((640, 480), [(300, 200, 310, 230)]), format="PNG")
+    detect_dataset(tmp_path / "data", finder, pictures=tmp_path / "pictures")
+    assert read_dataset(tmp_path / "data").detections.image_id.tolist() == [1, 2, 3]
 
 
 def test_unusable_pictures_are_listed_and_counted(dataset: Path, finder: Path) -> None:

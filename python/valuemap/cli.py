@@ -90,8 +90,10 @@ def main() -> None:
 @import_app.command("colmap")
 def import_colmap(
     model_dir: Annotated[Path, typer.Argument(help="Folder of a COLMAP model, .bin or .txt.")],
-    detections: Annotated[Path, typer.Option(help="COCO results or annotations (JSON).")],
     out: DatasetOut,
+    detections: Annotated[
+        Path | None, typer.Option(help="COCO results or annotations (JSON); without, run valuemap detect afterwards.")
+    ] = None,
     pass_from: Annotated[
         str, typer.Option(help="What a pass is: folder (of the image name), none, or a CSV file: image,pass.")
     ] = "folder",
