@@ -3,13 +3,15 @@
     python benchmarks/detector_speed.py MODEL.onnx PICTURES [--size SIZE] [--count N] [--batch N] [--json FILE]
 
 PICTURES is a folder, for example `images` of a dataset that `valuemap simulate --images` made; its pictures are taken
-again and again until there are N. Memory is that of the process: first after a tenth of the pictures, then at the end.
+again and again until there are N. Memory is that of the process after each tenth. The load says how many other
+processes wanted the processor in the minute before: above 0.5 or so the speed is that of a shared machine.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import resource
 import sys
 import time
@@ -64,6 +66,7 @@ def measure(model: Path, pictures: Path, count: int, config: DetectConfig) -> di
     list(detector.run([Task(path) for path in paths[:5]]))  # The first pictures wait for memory and caches.
     done = boxes = 0
     memory_mb: list[int] = []
+    load = os.getloadavg()[0]
     start, cpu = time.perf_counter(), time.process_time()
     for group in detector.run([Task(path) for path in islice(cycle(paths), count)]):
         done += len(group)
@@ -78,6 +81,7 @@ def measure(model: Path, pictures: Path, count: int, config: DetectConfig) -> di
         "pictures": done,
         "boxes": boxes,
         "pictures_a_second": round(done / seconds, 1),
+        "load_of_the_machine_before": round(load, 2),
         "cores_busy": round((time.process_time() - cpu) / seconds, 2),
         "memory_mb_after_each_tenth": memory_mb,
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+import signal
 import subprocess
 import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from PIL import Image
 
 from small_dataset import small_dataset
-from test_cli import complains, works
+from test_cli import COMMAND, complains, works
 from test_detect import painted, save
 from tiny_models import red_finder
 from valuemap import read_dataset, write_dataset
@@ -211,6 +215,33 @@ def test_mistakes_are_one_line_and_a_hint(tmp_path: Path) -> None:
     assert "dataset.json" in complains("evaluate-detections", pictures, "--labels", "coco:x.json")
     (pictures / "1.png").write_bytes(b"")
     assert "none of 1 pictures" in complains("detect", pictures, "--model", finder)
+
+
+def test_ctrl_c_keeps_what_is_done(tmp_path: Path) -> None:
+    count = 20000
+    data, base = tmp_path / "data", small_dataset()
+    images = base.images.take(np.zeros(count, np.int64)).replace(
+        image_id=np.arange(count), name=pa.array([f"{i % 7}.png" for i in range(count)])
+    )
+    first = base.detections.take(np.array([0])).replace(image_id=np.array([0]))
+    write_dataset(replace(base, images=images, detections=first, truth=None, truth_detections=None), data)
+    for i in range(7):
+        save(data / "images" / f"{i}.png", painted((640, 480), [(9 * i, 9, 9 * i + 5, 30)]))
+    before = (data / "detections.parquet").read_bytes()
+    command = [*COMMAND, "detect", str(data), "--model", str(red_finder(tmp_path / "finder.onnx"))]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        journal = data / ".detect.journal"
+        while process.poll() is None and not (journal.is_file() and journal.stat().st_size > 5000):
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=60)
+    assert process.returncode == 130, told
+    assert told.splitlines() == [
+        "interrupted: the detections are as before",
+        "hint: run the same command again to go on from here",
+    ]
+    assert (data / "detections.parquet").read_bytes() == before
+    assert journal.stat().st_size > 5000
 
 
 def test_simulated_pictures_are_drawn_on_request(tmp_path: Path) -> None:

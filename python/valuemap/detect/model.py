@@ -172,19 +172,27 @@ def load_model(path: Path, config: DetectConfig) -> Model:
 
 
 def _open(path: Path, content: bytes, provider: str) -> Any:
-    if _PROVIDERS[provider] not in onnxruntime.get_available_providers():
-        raise SettingError(
-            f"--provider {provider}: this ONNX Runtime cannot do that",
-            hint="install onnxruntime-gpu in place of onnxruntime, or use --provider cpu",
-        )
+    wanted = _PROVIDERS[provider]
+    if wanted not in onnxruntime.get_available_providers():
+        raise _no_provider(provider)
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3  # Errors come as exceptions; warnings are about the export.
     try:
-        return onnxruntime.InferenceSession(content, options, providers=[_PROVIDERS[provider]])
+        session = onnxruntime.InferenceSession(content, options, providers=[wanted])
     except Exception as error:  # ONNX Runtime's errors have no base of their own.
         raise InputError(
             f"{path}: cannot be read as an ONNX model: {_first_line(error)}", hint="is it whole? Export it again"
         ) from error
+    if wanted not in session.get_providers():  # Without a driver it would go on with the CPU and say nothing.
+        raise _no_provider(provider)
+    return session
+
+
+def _no_provider(provider: str) -> SettingError:
+    return SettingError(
+        f"--provider {provider}: this ONNX Runtime cannot do that here",
+        hint="install onnxruntime-gpu in place of onnxruntime, with CUDA and a driver, or use --provider cpu",
+    )
 
 
 def _with_free_size(content: bytes) -> bytes:
