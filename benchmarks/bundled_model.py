@@ -47,7 +47,9 @@ from valuemap.tables import Floats
 
 CLASS = "traffic_light"
 MODEL = Path(__file__).parents[1] / "python" / "valuemap" / "detect" / "models" / "traffic_lights.onnx"
-SETTINGS = TrainConfig(epochs=12, batch=8, crop_px=256, object_share=0.6)
+SETTINGS = TrainConfig(
+    first_channels=12, growth_channels=8, layers=3, dropout=0.0, epochs=10, learning_rate=0.004, object_share=0.6
+)
 
 CITY = replace(PRESETS["small"], passes_per_street=3)
 CITIES = {
@@ -79,7 +81,7 @@ def main() -> None:
     start = time.perf_counter()
     config = SETTINGS.with_settings(arguments.settings)
     with ProgressBar(disable=not sys.stderr.isatty()) as bar:
-        progress = _progress(bar)
+        progress = show_progress(bar)
         korean = read_tl_kr(arguments.tl_kr)
         rendered = render_cities(arguments.work / "rendered", progress)
         held_out = render_city(arguments.work / "held_out", CITY, HELD_OUT_SEED, HELD_OUT_PICTURES, "val", progress)
@@ -212,13 +214,8 @@ def measure_lamps(pictures: list[LabelledPicture]) -> dict[str, Any]:
     }
 
 
-def _contains(edges_px: Floats, point_px: Floats) -> Any:
-    low = point_px[None] >= edges_px[:, None, :2]
-    high = point_px[None] <= edges_px[:, None, 2:]
-    return (low & high).all(axis=2)
-
-
-def _progress(bar: ProgressBar) -> Progress:
+def show_progress(bar: ProgressBar) -> Progress:
+    """Return a callback that shows every kind of work as a bar of its own."""
     tasks: dict[str, Any] = {}
 
     def progress(what: str, done: int, total: int) -> None:
@@ -227,6 +224,12 @@ def _progress(bar: ProgressBar) -> Progress:
         bar.update(tasks[what], completed=done, total=total)
 
     return progress
+
+
+def _contains(edges_px: Floats, point_px: Floats) -> Any:
+    low = point_px[None] >= edges_px[:, None, :2]
+    high = point_px[None] <= edges_px[:, None, 2:]
+    return (low & high).all(axis=2)
 
 
 if __name__ == "__main__":
