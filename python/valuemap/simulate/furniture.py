@@ -13,7 +13,7 @@ from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import DIRECTIONS, Streets
 from valuemap.tables import Floats, Ints, Table
 
-_SIGNS = np.array([[190, 30, 35], [30, 80, 165], [235, 200, 40], [235, 235, 235], [25, 115, 70]])
+_SIGNS = np.array([[190, 30, 35], [30, 80, 165], [235, 200, 40], [235, 235, 235], [112, 72, 44]])
 _ARM_BELOW_M = 7.0
 """Lights nearer than this to the axis of their street hang on a mast arm."""
 _TREE_SHARE = 0.5
