@@ -179,7 +179,7 @@ def simulate_command(
 @app.command("detect", epilog="Settings for --set: tile_overlap_px, max_iou, decoders, panorama_view_deg and more.")
 def detect_command(
     place: Annotated[Path, typer.Argument(metavar="DATASET|FOLDER", help="A dataset, or any folder of pictures.")],
-    model: Annotated[Path, typer.Option(help="ONNX file.")],
+    model: Annotated[Path, typer.Option(help="ONNX file; or bundled, a small model for traffic lights.")],
     classes: Annotated[
         str, typer.Option(help='Wanted classes, "traffic light,stop sign"; numbers too, and new names: "9=light".')
     ] = DetectConfig.classes,
@@ -201,8 +201,11 @@ def detect_command(
     as_json: AsJson = False,
 ) -> None:
     """Find objects in pictures with an ONNX model; started again, an interrupted run goes on."""
+    from valuemap.detect import BUNDLED_MODEL
     from valuemap.detect.run import RECORD, detect_dataset, detect_folder  # ONNX Runtime and OpenCV.
 
+    if str(model) == "bundled":
+        model = BUNDLED_MODEL
     config = DetectConfig(
         kind=kind,  # type: ignore[arg-type]
         classes=classes,

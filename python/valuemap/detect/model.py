@@ -177,6 +177,8 @@ def _open(path: Path, content: bytes, provider: str) -> Any:
         raise _no_provider(provider)
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3  # Errors come as exceptions; warnings are about the export.
+    # Threads that wait for work would otherwise spin, on the cores that decode the next pictures.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         session = onnxruntime.InferenceSession(content, options, providers=[wanted])
     except Exception as error:  # ONNX Runtime's errors have no base of their own.
