@@ -34,7 +34,7 @@ from valuemap.detect.pictures import read_picture
 from valuemap.detect.run import RECORD, RESULTS, detect_dataset, detect_folder, detect_pictures
 from valuemap.detect.tiles import are_cut, merge_views, plan_tiles
 from valuemap.detect.truth import find_truth_detections
-from valuemap.errors import InputError, SettingError
+from valuemap.errors import InputError, OutputError, SettingError
 from valuemap.readers.colmap import read_colmap
 from valuemap.simulate import PRESETS, simulate
 from valuemap.summary import summarize_dataset
@@ -405,6 +405,15 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path: Path, finder: Pa
     assert record["pictures_of_an_interrupted_run"] == 12
     assert record["counts"] == expected["counts"]
     assert record["unusable"] == expected["unusable"]
+
+
+def test_a_full_disk_is_one_clear_line(dataset: Path, finder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def write(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Journal, "write", write)
+    with pytest.raises(OutputError, match="cannot be written: No space left on device"):
+        detect_dataset(dataset, finder)
 
 
 def test_a_run_with_other_settings_begins_anew(dataset: Path, finder: Path) -> None:

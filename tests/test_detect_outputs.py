@@ -193,6 +193,23 @@ def test_boxes_suppressed_in_the_graph(tmp_path: Path, batch: tuple[int, ...]) -
     assert decode(model, model.run([np.zeros((64, 64, 3), np.uint8)]), fit, classes="3").class_code.tolist() == [3]
 
 
+def test_boxes_without_a_batch_go_one_picture_at_a_time(tmp_path: Path) -> None:
+    """Four boxes, with masks beside them, so that scores and boxes look alike."""
+    outputs = {
+        "scores": np.array([0.9, 0.8, 0.7, 0.6], np.float32),
+        "places": np.array([[i, i, i + 9, i + 9] for i in range(0, 40, 10)], np.float32),
+        "masks": np.zeros((4, 1, 8, 8), np.float32),
+        "labels": np.array([1, 1, 2, 2]),
+    }
+    dims = {"masks": (4, 1, 8, 8)}
+    model = load_model(
+        says(tmp_path / "m.onnx", outputs, picture=("batch", 3, 64, 64), dims=dims), DetectConfig(kind="boxes")
+    )
+    found = decode(model, model.run([np.zeros((64, 64, 3), np.uint8)]), model.fit((64, 64), None))
+    assert found.score.tolist() == pytest.approx([0.9, 0.8, 0.7, 0.6])
+    assert model.fixed_batch == 1
+
+
 def test_boxes_in_one_output_of_six_columns(tmp_path: Path) -> None:
     rows = np.array([[[1, 2, 11, 22, 0.9, 1], [0, 0, 0, 0, 0, 0]]], np.float32)
     model = load_model(says(tmp_path / "m.onnx", {"output0": rows}), DetectConfig())

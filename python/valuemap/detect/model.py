@@ -150,6 +150,8 @@ def load_model(path: Path, config: DetectConfig) -> Model:
     if fixed is not None and (config.size == "picture" or (size is not None and size != fixed)):
         session = _open(path, _with_free_size(content), config.provider)
         fixed = None
+    if kind == "boxes" and all(len(output.shape) != 3 for output in outputs):
+        batch = 1  # Its boxes have no batch: they would be those of the first picture.
     count = _class_count(kind, outputs)
     names = _class_names(path, metadata, count)
     return Model(
@@ -218,8 +220,8 @@ def _recognise(path: Path, outputs: Sequence[Any], metadata: Mapping[str, str]) 
     names = [output.name.lower() for output in outputs]
     if len(outputs) >= 2 and any("logits" in name for name in names) and any("boxes" in name for name in names):
         return "detr"
-    if len(outputs) == 3 and any("int" in output.type for output in outputs):
-        return "boxes"
+    if len(outputs) >= 3 and any("int" in output.type for output in outputs):
+        return "boxes"  # Others, as torchvision's masks, are left alone.
     if len(outputs) == 1 and len(shapes[0]) == 4:
         return "segmentation"
     if len(outputs) == 1 and len(shapes[0]) == 3:

@@ -127,15 +127,16 @@ def _from_boxes(model: Model, outputs: list[Array], row: int, _: Fit, wanted: Wa
 
 
 def _edges_score_number(model: Model, outputs: list[Array], row: int) -> tuple[Array, Array, Array]:
-    """Tell three outputs apart by rank and dtype; some exports have a batch, torchvision's have none."""
-    floats = sorted((output for output in outputs if output.dtype.kind == "f"), key=lambda output: output.ndim)
-    whole = [output for output in outputs if output.dtype.kind in "iu"]
-    if len(floats) != 2 or len(whole) != 1:
-        raise _unexpected(model, outputs, "boxes [N, 4], labels [N] and scores [N]")
-    score, edges_px = floats
-    has_batch = edges_px.ndim == 3
-    parts = [output[row] if has_batch else output for output in (edges_px, score, whole[0])]
-    return parts[0], parts[1], parts[2]
+    """Tell outputs apart by rank and dtype; some exports have a batch, torchvision's have none."""
+    places = [output for output in outputs if output.ndim in (2, 3) and output.shape[-1] == 4]
+    if places:
+        edges_px = max(places, key=lambda output: output.ndim)  # Four scores have less dimensions than boxes.
+        flat = [output for output in outputs if output.ndim == edges_px.ndim - 1]
+        score = next((output for output in flat if output.dtype.kind == "f"), None)
+        number = next((output for output in flat if output.dtype.kind in "iu"), None)
+        if score is not None and number is not None:
+            return (edges_px[row], score[row], number[row]) if edges_px.ndim == 3 else (edges_px, score, number)
+    raise _unexpected(model, outputs, "boxes [N, 4], labels [N] and scores [N]")
 
 
 _DECODERS: Mapping[str, Callable[[Model, list[Array], int, Fit, WantedClasses], Boxes]] = {

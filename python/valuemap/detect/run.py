@@ -185,8 +185,13 @@ class _Run:
     def __enter__(self) -> _Run:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, _: object, error: object, __: object) -> None:
         self.journal.close()
+        if isinstance(error, OSError):
+            raise OutputError(
+                f"{self.folder}: cannot be written: {error.strerror or error}",
+                hint="check the folder's permissions and free space; the same command then goes on from here",
+            ) from error
 
     def finish(self, progress: Progress) -> None:
         """Run the pictures that the journal does not have yet.
