@@ -261,7 +261,7 @@ def train_command(
     assignments: Settings = None,
     as_json: AsJson = False,
 ) -> None:
-    """Train a network on labelled pictures; needs the extra valuemap[train]."""
+    """Train a network on labelled pictures; needs the extra named train."""
     from valuemap.detect.labels import read_labels
     from valuemap.detect.train import train
 
