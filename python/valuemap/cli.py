@@ -404,13 +404,16 @@ def demo_command(
     out: Annotated[Path, typer.Option("--out", help="Folder for dataset, map and picture.")] = Path("demo"),
     seed: Annotated[int, typer.Option(help="Another seed, another city.")] = 0,
 ) -> None:
-    """Simulate a small city, map it, evaluate the map and draw it."""
+    """Simulate a city, draw its pictures, detect lights in them, map these, evaluate and draw the map."""
     from valuemap.demo import run_demo
 
+    check_place(out / "dataset", marker=dataset_folder.MARKER)
+    check_place(out / "map", marker=map_folder.MARKER)
     with _progress_bars() as progress:
         outcome = run_demo(out, seed=seed, progress=progress)
-    _show(summarize_dataset(outcome.dataset), title="A simulated city")
-    _show(summarize_map(outcome.result), title="The map of it")
+    _show(summarize_dataset(outcome.dataset), title="A simulated city, its lights detected in pictures")
+    _show(_detection_rows(outcome.detection), title="The detections against the true boxes")
+    _show(summarize_map(outcome.result), title="The map of them")
     _show(_evaluation_rows(outcome.evaluation), title="The map against the simulated truth")
     for what, path in outcome.files.items():
         _out.print(f"{what:8} {path}", highlight=False, soft_wrap=True)
@@ -444,6 +447,18 @@ def _show_accuracies(evaluation: DetectionEvaluation) -> None:
             shown = ("-" if math.isnan(figure) else f"{figure:.3f}" for figure in figures)
             table.add_row(heights, f"{iou:g}", str(accuracy.labels), *shown)
     _out.print(table)
+
+
+def _detection_rows(evaluation: DetectionEvaluation) -> dict[str, Any]:
+    """Return how good detections are in pictures, at the lowest IoU."""
+    iou, accuracy = next(iter(evaluation.overall.items()))
+    return {
+        "pictures": evaluation.pictures,
+        "true boxes": accuracy.labels,
+        f"recall at IoU {iou:g}": accuracy.recall,
+        f"precision at IoU {iou:g}": accuracy.precision,
+        "mean IoU": accuracy.mean_iou,
+    }
 
 
 def _evaluation_rows(evaluation: Evaluation) -> dict[str, Any]:
