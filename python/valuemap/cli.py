@@ -411,8 +411,8 @@ def demo_command(
     check_place(out / "map", marker=map_folder.MARKER)
     with _progress_bars() as progress:
         outcome = run_demo(out, seed=seed, progress=progress)
-    _show(summarize_dataset(outcome.dataset), title="A simulated city, its lights detected in pictures")
-    _show(_detection_rows(outcome.detection), title="The detections against the true boxes")
+    _show(summarize_dataset(outcome.dataset), title="A simulated city and what was detected in its pictures")
+    _show(_detection_rows(outcome.detection), title="The detections")
     _show(summarize_map(outcome.result), title="The map of them")
     _show(_evaluation_rows(outcome.evaluation), title="The map against the simulated truth")
     for what, path in outcome.files.items():
