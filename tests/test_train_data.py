@@ -273,7 +273,8 @@ def test_the_threshold_is_where_most_objects_and_least_else_is_found() -> None:
     assert search.best() == (0.5, 1.0, 1.0)
     search.add(np.full((1, 20, 60), 0.99), edges(), np.empty(0, int), edges())
     _, recall, precision = search.best()
-    assert (recall, precision) == (1.0, pytest.approx(2 / 3))
+    assert recall == 1.0
+    assert precision == pytest.approx(2 / 3)
 
 
 def test_a_network_that_finds_nothing_has_a_threshold_all_the_same() -> None:
