@@ -30,7 +30,7 @@ from valuemap.errors import ValuemapError
 from valuemap.folders import new_file
 from yolox_dtld import as_found
 
-SETTINGS = TrainConfig(epochs=8, cutouts=2, validation_share=0.1, dropout=0.0)
+SETTINGS = TrainConfig(epochs=6, cutouts=2, validation_share=0.1, dropout=0.0)
 HEIGHTS_PX = (0.0, 12.0, 24.0)
 MIN_IOU = 0.3
 
