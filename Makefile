@@ -1,16 +1,19 @@
 # `make demo` and `make test` do all their own set-up: they need Python 3.11+, a C compiler and cargo, nothing else.
-.PHONY: demo test lint bench rust-test setup clean
+# `make test EXTRAS=train` installs PyTorch (5 GB) and tests training too; without it those tests are skipped.
+.PHONY: demo test lint bench model rust-test setup clean
 
 UV_VERSION := 0.13.8
 PYTHON ?= python3
 UV := .tools/bin/uv
 RUN := $(UV) run --frozen
+EXTRAS ?=
+DETECTOR_DATA ?= ../shared/data/detector
 
 demo: setup
 	$(RUN) valuemap demo
 
 test: setup
-	$(RUN) pytest
+	EXTRAS="$(EXTRAS)" $(RUN) pytest
 
 rust-test:
 	cargo test --locked --package valuemap-core
@@ -27,8 +30,14 @@ bench: setup
 	cargo bench --locked --package valuemap-core
 	$(RUN) python benchmarks/speed.py
 
+# The bundled model of traffic lights, from rendered and real pictures: see docs/model_card.md.
+model: EXTRAS := train
+model: setup
+	$(RUN) python benchmarks/bundled_model.py $(DETECTOR_DATA)/tl_kr --work target/model \
+		--dtld $(DETECTOR_DATA)/dtld --json benchmarks/results/bundled_model.json
+
 setup: $(UV)
-	@$(UV) sync --frozen --quiet
+	@$(UV) sync --frozen --quiet $(EXTRAS:%=--extra %)
 
 # uv comes from the package index into a private environment, so that nothing on the machine changes.
 $(UV):

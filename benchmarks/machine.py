@@ -15,7 +15,7 @@ def describe_machine() -> dict[str, Any]:
         "machine": {"platform": platform.platform(), "cpu": _cpu_model(), "cores": os.cpu_count()},
         "versions": {
             "python": platform.python_version(),
-            **{name: version(name) for name in ("valuemap", "numpy", "scipy", "pyarrow", "pycolmap")},
+            **{name: version(name) for name in ("valuemap", "numpy", "scipy", "pyarrow", "pycolmap", "onnxruntime")},
         },
     }
 

@@ -195,9 +195,9 @@ PINHOLE_PARAMS = [[500.0, 500.0, 320.0, 240.0], [600.0, 600.0, 400.0, 300.0, 0.0
             "repair",
         ),
         (
-            "detections",
+            "images",
             lambda t: t.slice(0, 0),
-            r"detections\.parquet: the table is empty$",
+            r"images\.parquet: the table is empty$",
             "at least one row",
         ),
         (

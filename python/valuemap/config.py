@@ -188,7 +188,7 @@ def describe_settings() -> list[tuple[str, str, str, str]]:
 def _assign(stages: Mapping[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
     """Return the stages by name, with `name=value` assignments applied to the stage that has the name."""
     changes: dict[str, dict[str, float]] = {}
-    owner = {s.name: (stage, s) for stage, config in stages.items() for s in fields(config)}
+    owner = {s.name: (stage, s) for stage, config in stages.items() for s in fields(config) if s.metadata}
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
         name = name.strip()
@@ -236,6 +236,85 @@ def _check_range(setting: dataclasses.Field[Any], value: float | None) -> None:
             f"{setting.name}: expected {above} {low:g}{upper} ({setting.metadata['unit']}), found {value}",
             hint=f"the default is {setting.name}={_shown(setting.default)}",
         )
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How a segmentation network is built and trained."""
+
+    # The network. Its size on disk and its speed depend on these alone.
+    first_stride: int = _setting(
+        2, unit="px", low=1, high=2, effect="2 works on the picture at half size: four times as fast, coarser boxes"
+    )
+    first_channels: int = _setting(16, unit="channels", low=1, effect="channels of the first convolution")
+    growth_channels: int = _setting(10, unit="channels", low=1, effect="new channels a layer of a dense block")
+    first_layers: int = _setting(
+        2, unit="layers", low=1, effect="layers of the first and last dense block, at the full size; the dearest"
+    )
+    layers: int = _setting(4, unit="layers", low=1, effect="layers of each other dense block")
+    levels: int = _setting(
+        4, unit="halvings", low=1, high=4, effect="how often a picture is halved and enlarged again; more sees wider"
+    )
+    compression: float = _setting(
+        0.6, unit="1", open_low=True, high=1.0, effect="share of the channels that a transition down keeps"
+    )
+    dropout: float = _setting(0.05, unit="1", high=0.9, effect="share of channels left out at random in training")
+
+    # The optimisation.
+    epochs: int = _setting(40, unit="epochs", low=1, effect="how often the network sees every picture")
+    cutouts: int = _setting(
+        1, unit="cut-outs", low=1, effect="cut-outs of each picture an epoch; more validates and saves less often"
+    )
+    batch: int = _setting(8, unit="pictures", low=1, effect="cut-outs a step; more needs more memory")
+    learning_rate: float = _setting(
+        0.003, unit="1", open_low=True, high=1.0, effect="largest step; rises over the first 5 % and falls to nothing"
+    )
+    weight_decay: float = _setting(0.0005, unit="1", effect="pull of the weights towards 0")
+    focal_power: float = _setting(
+        2.0, unit="1", high=5.0, effect="how little pixels count that are right already; 0 counts all alike"
+    )
+    small_object_px: float = _setting(
+        64.0, unit="px", effect="pixels of an object smaller than this count more, so that it counts like one as large"
+    )
+    validation_share: float = _setting(
+        0.2,
+        unit="1",
+        open_low=True,
+        high=0.9,
+        effect="share of the pictures kept for validation where the labels do not say which",
+    )
+    minimum_component_px: int = _setting(
+        4, unit="px", low=1, effect="connected pixels fewer than this are no detection"
+    )
+
+    # The augmentation.
+    crop_px: int = _setting(
+        256, unit="px", low=32, high=4096, effect="side of the square cut-outs, a multiple of 32; larger costs more"
+    )
+    object_share: float = _setting(
+        0.7, unit="1", high=1.0, effect="share of cut-outs that hold an object, where the picture has one"
+    )
+    flip_share: float = _setting(0.5, unit="1", high=1.0, effect="share of cut-outs with left and right exchanged")
+    max_enlargement: float = _setting(
+        1.6, unit="1", low=1.0, high=8.0, effect="pictures are enlarged or shrunk by at most this, at random"
+    )
+    brightness: float = _setting(
+        0.3, unit="1", high=0.9, effect="brightness, contrast and the balance of colours vary by about this share"
+    )
+    blur_sigma_px: float = _setting(1.0, unit="px", effect="a third of the cut-outs are blurred by up to this")
+
+    def __post_init__(self) -> None:
+        for setting in fields(self):
+            _check_range(setting, getattr(self, setting.name))
+        if self.crop_px % 32:
+            raise SettingError(
+                f"crop_px: expected a multiple of 32, found {self.crop_px}", hint="take 256, 320 or 384, say"
+            )
+
+    def with_settings(self, assignments: Iterable[str]) -> Self:
+        """Return a copy with `name=value` assignments applied; raises as `MapConfig.with_settings`."""
+        changed: Self = _assign({"train": self}, assignments)["train"]
+        return changed
 
 
 @dataclass(frozen=True)
@@ -489,4 +568,95 @@ class SimulationConfig:
     def with_settings(self, assignments: Iterable[str]) -> Self:
         """Return a copy with `name=value` assignments applied; raises as `MapConfig.with_settings`."""
         changed: Self = _assign({"simulation": self}, assignments)["simulation"]
+        return changed
+
+
+ModelKind = Literal["segmentation", "yolox", "ultralytics", "detr", "boxes"]
+Provider = Literal["cpu", "cuda"]
+
+
+@dataclass(frozen=True)
+class DetectConfig:
+    """How pictures are put through a detector, and which of its boxes count."""
+
+    kind: ModelKind | None = None
+    """What the outputs of the model mean; None finds out."""
+    classes: str = ""
+    """Names or numbers of the wanted classes, each perhaps =NEW_NAME, with commas between; none is all."""
+    size: str = "model"
+    """What the network sees: "model" is its own size, else the picture's; "picture"; N or WIDTHxHEIGHT in px."""
+    provider: Provider = "cpu"
+    min_score: float | None = None
+    """A box with a lower score is dropped; None takes `default_min_score`, or a segmentation's own threshold."""
+    default_min_score: float = _setting(
+        0.3, unit="1", high=1.0, effect="a box with a lower score is dropped, if --min-score does not say otherwise"
+    )
+    max_iou: float = _setting(
+        0.5, unit="1", high=1.0, effect="of two boxes of one class that overlap more than this, the lesser is dropped"
+    )
+    tile_px: int = _setting(
+        0,
+        unit="px",
+        effect="larger pictures are cut into overlapping tiles of this size, to find smaller things; 0 cuts nothing",
+    )
+    tile_overlap_px: int = _setting(
+        96,
+        unit="px",
+        effect="least overlap of two tiles: things larger than this may be seen only in parts, then joined",
+    )
+    batch: int = _setting(
+        1, unit="pictures", low=1, high=1024, effect="pictures of one size that go through the network together"
+    )
+    decoders: int = _setting(
+        0, unit="threads", high=256, effect="threads that decode pictures ahead of the network; 0 for one a core"
+    )
+    panorama_view_deg: float = _setting(
+        90.0,
+        unit="deg",
+        low=30.0,
+        high=120.0,
+        effect="field of view of the perspective views, all the way round, that a panorama is cut into",
+    )
+    panorama_overlap_deg: float = _setting(
+        20.0, unit="deg", high=25.0, effect="least overlap of two neighbouring views of a panorama"
+    )
+    panorama_pitch_deg: float = _setting(
+        10.0, unit="deg", low=-60.0, high=60.0, effect="how far the views of a panorama look up"
+    )
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("kind", (None, *get_args(ModelKind))), ("provider", get_args(Provider))):
+            if getattr(self, name) not in allowed:
+                raise SettingError(
+                    f"--{name}: expected one of {', '.join(filter(None, allowed))}, found {getattr(self, name)!r}",
+                    hint="leave it away for the default",
+                )
+        for setting in fields(self):
+            if setting.metadata:
+                _check_range(setting, getattr(self, setting.name))
+        if self.min_score is not None and not 0.0 <= self.min_score <= 1.0:
+            raise SettingError(f"--min-score: expected 0 to 1, found {self.min_score}", hint="for example 0.3")
+        if self.tile_px and self.tile_overlap_px >= self.tile_px / 2:
+            raise SettingError(
+                f"--tile {self.tile_px}: expected more than twice tile_overlap_px ({self.tile_overlap_px})",
+                hint="take larger tiles, or --set tile_overlap_px=32",
+            )
+        _ = self.size_px
+
+    @property
+    def size_px(self) -> tuple[int, int] | None:
+        """The width and height that the user asked for; None for the model's or the picture's own."""
+        if self.size in ("model", "picture"):
+            return None
+        sides = self.size.lower().split("x")
+        if len(sides) > 2 or not all(side.isdecimal() and 0 < int(side) < 2**15 for side in sides):
+            raise SettingError(
+                f"--size: expected N or WIDTHxHEIGHT in px, or picture, found {self.size!r}",
+                hint="for example --size 1024x448",
+            )
+        return int(sides[0]), int(sides[-1])
+
+    def with_settings(self, assignments: Iterable[str]) -> Self:
+        """Return a copy with `name=value` assignments applied; raises as `MapConfig.with_settings`."""
+        changed: Self = _assign({"detect": self}, assignments)["detect"]
         return changed

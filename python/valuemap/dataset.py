@@ -121,6 +121,21 @@ def read_dataset(path: str | Path) -> Dataset:
     )
 
 
+def read_images(path: str | Path) -> tuple[Cameras, Images]:
+    """Read and check the cameras and images of a dataset folder, whose detections are still to be made.
+
+    Raises
+    ------
+    InputError
+        As `read_dataset`.
+    """
+    folder = Path(path)
+    _read_head(folder)
+    cameras, images = read_table(Cameras, folder / "cameras.parquet"), read_table(Images, folder / "images.parquet")
+    _check_cameras(cameras, str(folder))
+    return cameras, _check_images(images, cameras, str(folder))
+
+
 def write_dataset(dataset: Dataset, path: str | Path) -> None:
     """Check a dataset and write it as a folder; an older dataset there is replaced, never half."""
     dataset = check_dataset(dataset, source=dataset.name)

@@ -17,6 +17,7 @@ from valuemap.cameras import Rays, cast_rays
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
 from valuemap.describe import describe_labels
+from valuemap.errors import InputError
 from valuemap.map_folder import Map
 from valuemap.merge import merge_clusters
 from valuemap.partition import partition_images
@@ -42,12 +43,22 @@ def build_map(
     progress
         Called as progress(what, done, total).
 
+    Raises
+    ------
+    InputError
+        The dataset has no detections.
+
     Returns
     -------
     Map
         Labels ordered by their first detection, votes, and the record of the run.
     """
     config = config or MapConfig()
+    if not len(dataset.detections):
+        raise InputError(
+            f"{dataset.name}: there are no detections in it",
+            hint="find some with valuemap detect, or import them with the images",
+        )
     stages = _Stages()
     with stages.measured("rays"):
         rays = cast_rays(dataset)

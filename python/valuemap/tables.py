@@ -135,9 +135,13 @@ class Images(Table):
 
 @dataclass(frozen=True, eq=False)
 class Detections(Table):
-    """2D boxes: centre and size (N, 2) in pixels, class and score; optionally a measured range in metres."""
+    """2D boxes: centre and size (N, 2) in pixels, class and score; optionally a measured range in metres.
+
+    There are none before `valuemap detect` has looked for them.
+    """
 
     KEY: ClassVar[str | None] = "detection_id"
+    MAY_BE_EMPTY: ClassVar[bool] = True
 
     detection_id: Ints = _column("int", ("detection_id",))
     image_id: Ints = _column("int", ("image_id",))

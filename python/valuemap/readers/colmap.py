@@ -13,18 +13,18 @@ import pycolmap
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import ONE_PASS, assemble
+from valuemap.readers.assemble import ONE_PASS, assemble, number_detections
 from valuemap.readers.coco import read_coco
 from valuemap.readers.colmap_files import find_model
 from valuemap.readers.csv_file import read_csv
 from valuemap.readers.names import match_images
-from valuemap.tables import Cameras, Categories, Images
+from valuemap.tables import Cameras, Categories, Detections, Images
 
 
 def read_colmap(
     model_dir: Path,
     *,
-    detections: Path,
+    detections: Path | None = None,
     pass_from: str = "folder",
     up: tuple[float, float, float] | None = None,
     anchor: tuple[float, float, float] | None = None,
@@ -40,7 +40,7 @@ def read_colmap(
     model_dir
         Folder with cameras, images and, where both exist, rigs and frames, as .bin (preferred) or .txt.
     detections
-        COCO annotations or results, see `read_coco`.
+        COCO annotations or results, see `read_coco`; None where they are still to be found in the pictures.
     pass_from
         "folder" (the folder part of the image name is its pass), "none" (all images are one pass), or the
         path of a CSV file with columns image and pass.
@@ -57,7 +57,7 @@ def read_colmap(
     progress("reading the COLMAP model", 0, 2)
     cameras, images = _read_model(model_dir, pass_from)
     progress("reading the detections", 1, 2)
-    found = read_coco(detections, images, cameras)
+    found = _no_detections() if detections is None else read_coco(detections, images, cameras)
     dataset = assemble(
         name=model_dir.resolve().name,
         cameras=cameras,
@@ -69,6 +69,11 @@ def read_colmap(
     )
     progress("reading the detections", 2, 2)
     return dataset
+
+
+def _no_detections() -> Detections:
+    nothing = np.empty(0)
+    return number_detections(nothing.astype(np.int64), [], np.empty((0, 2)), np.empty((0, 2)), nothing)
 
 
 def _read_model(model_dir: Path, pass_from: str) -> tuple[Cameras, Images]:

@@ -2,6 +2,6 @@
 
 from valuemap.simulate.city import build_city
 from valuemap.simulate.presets import PRESETS
-from valuemap.simulate.simulation import simulate
+from valuemap.simulate.simulation import Recording, record_city, simulate
 
-__all__ = ["PRESETS", "build_city", "simulate"]
+__all__ = ["PRESETS", "Recording", "build_city", "record_city", "simulate"]

@@ -61,7 +61,7 @@ def detect(
     recall = pass_recall[frames.pass_row[sightings.frame_row]] * quality
     recall *= targets.recall_share[sightings.target_row]
     is_found = random_stream(seed, kind, "detect").random(count) < recall
-    is_found &= ~_hidden_by_traffic(sightings, frames, config, random_stream(seed, kind, "traffic"))
+    is_found &= ~hidden_by_traffic(sightings, frames, config, seed=seed, kind=kind)
 
     sigma_px = np.hypot(config.pixel_noise_px, config.pixel_noise_share * height_px)
     shift_px = random_stream(seed, kind, "center").standard_normal((count, 2)) * sigma_px[:, None]
@@ -89,17 +89,15 @@ def noisy_score(mean: Floats, config: SimulationConfig, random: np.random.Genera
     return noisy
 
 
-def _hidden_by_traffic(
-    sightings: Sightings, frames: Frames, config: SimulationConfig, random: np.random.Generator
-) -> Bools:
-    """Return which views (N) traffic hides.
+def hidden_by_traffic(sightings: Sightings, frames: Frames, config: SimulationConfig, *, seed: int, kind: str) -> Bools:
+    """Return which views (N) of one kind of target traffic hides.
 
     From one view of a target to its next in the same pass, dt later, the state is drawn anew with probability
     1 - exp(-dt / occlusion_s), and else stays as it is.
     """
     pass_row, time_s = frames.pass_row[sightings.frame_row], frames.time_s[sightings.frame_row]
     order = np.lexsort((sightings.frame_row, sightings.target_row, pass_row))
-    redraw, state = random.random((len(order), 2)).T
+    redraw, state = random_stream(seed, kind, "traffic").random((len(order), 2)).T
     is_next = (np.diff(pass_row[order]) == 0) & (np.diff(sightings.target_row[order]) == 0)
     with np.errstate(divide="ignore", invalid="ignore"):  # A time of 0 s draws anew for every view.
         stays = np.exp(-np.abs(np.diff(time_s[order])) / config.occlusion_s)

@@ -17,7 +17,7 @@ from valuemap.tables import Floats, Ints, Table
 
 _CHUNK_FRAMES = 50_000
 _NEAREST_M = 1.0
-_NARROWEST = 0.3
+NARROWEST = 0.3
 """A light seen from the side still looks this wide, as share of its width: it has visors."""
 
 
@@ -54,18 +54,18 @@ def _see_in_chunk(targets: Targets, frames: Frames, streets: Streets, config: Si
     frame_row, target_row = _pairs_within(frames, targets, config.max_sight_m)
     center, position = frames.center_in_world_m[frame_row], targets.position_in_world_m[target_row]
     to_target = position - center
-    cos_facing = _cos_facing(to_target, targets.facing_rad[target_row])
+    turn = cos_facing(to_target, targets.facing_rad[target_row])
     in_cam = np.einsum("nij,nj->ni", frames.cam_from_world()[frame_row], to_target)
     depth_m = np.maximum(in_cam[:, 2:], _NEAREST_M)
     picture_px = np.array([config.image_width_px, config.image_height_px])
     from_middle_px = config.focal_px * in_cam[:, :2] / depth_m
     size_px = config.focal_px * targets.size_m[target_row] / depth_m
-    size_px[:, 0] *= np.maximum(cos_facing, _NARROWEST)
+    size_px[:, 0] *= np.maximum(turn, NARROWEST)
     only_pass = targets.pass_row[target_row]
     seen = (
         ((only_pass < 0) | (only_pass == frames.pass_row[frame_row]))
         & (in_cam[:, 2] > _NEAREST_M)
-        & (cos_facing >= np.cos(np.radians(config.max_facing_deg)))
+        & (turn >= np.cos(np.radians(config.max_facing_deg)))
         & (size_px[:, 1] >= config.min_box_height_px)
         & np.all(np.abs(from_middle_px) <= (picture_px - size_px) / 2.0, axis=1)
     )
@@ -76,7 +76,7 @@ def _see_in_chunk(targets: Targets, frames: Frames, streets: Streets, config: Si
     return Sightings(frame_row[rows], target_row[rows], center_px, size_px[rows])
 
 
-def _cos_facing(to_target: Floats, facing_rad: Floats) -> Floats:
+def cos_facing(to_target: Floats, facing_rad: Floats) -> Floats:
     """Return the cosine (N), on the ground, between where targets face and where the camera is from them."""
     along = to_target[:, 0] * np.cos(facing_rad) + to_target[:, 1] * np.sin(facing_rad)
     cosine: Floats = -along / np.maximum(np.hypot(to_target[:, 0], to_target[:, 1]), 1e-9)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pyarrow as pa
 from scipy.spatial.transform import Rotation
@@ -11,20 +13,44 @@ from valuemap.dataset import Dataset, Frame
 from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
 from valuemap.simulate.city import City, build_city
-from valuemap.simulate.detector import NO_LIGHT, Boxes, detect, recall_of_passes
+from valuemap.simulate.detector import NO_LIGHT, Boxes, detect, hidden_by_traffic, recall_of_passes
 from valuemap.simulate.drives import KEEP_RANGE, Frames, drive
 from valuemap.simulate.false_objects import clutter, place_temporary, reflect
 from valuemap.simulate.pose_errors import pose_errors
 from valuemap.simulate.rows import join_rows
-from valuemap.simulate.sightings import see
-from valuemap.tables import Cameras, Categories, Detections, Floats, Images, Ints, Truth, TruthDetections
+from valuemap.simulate.sightings import Sightings, see
+from valuemap.tables import Bools, Cameras, Categories, Detections, Floats, Images, Ints, Truth, TruthDetections
 
 _CLASS = "traffic_light"
 _CAMERA_ID = 0
 _KEEP_STEP_M = 0.5
 
 
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What was recorded, and what it was recorded of.
+
+    Row i of `frames`, the true exposures, is row i of `dataset.images`, which holds their poses with errors.
+    `sightings` are the true views of lights, of which traffic hides those in `is_hidden` (N).
+    """
+
+    config: SimulationConfig
+    seed: int
+    city: City
+    frames: Frames
+    sightings: Sightings
+    is_hidden: Bools
+    dataset: Dataset
+
+
 def simulate(config: SimulationConfig, *, seed: int, name: str = "simulated", progress: Progress = silent) -> Dataset:
+    """Return the dataset of `record_city`, which has the parameters and the errors."""
+    return record_city(config, seed=seed, name=name, progress=progress).dataset
+
+
+def record_city(
+    config: SimulationConfig, *, seed: int, name: str = "simulated", progress: Progress = silent
+) -> Recording:
     """Simulate a city and a fleet's recordings of it, with truth.
 
     Parameters
@@ -41,9 +67,9 @@ def simulate(config: SimulationConfig, *, seed: int, name: str = "simulated", pr
 
     Returns
     -------
-    Dataset
-        In a local frame, x east, y north, z up, in metres. Poses are as recorded, with their errors; truth is
-        without. Detections that show no light are not in `truth_detections`.
+    Recording
+        Its dataset is in a local frame, x east, y north, z up, in metres. Poses are as recorded, with their
+        errors; truth is without. Detections that show no light are not in `truth_detections`.
 
     Raises
     ------
@@ -54,18 +80,44 @@ def simulate(config: SimulationConfig, *, seed: int, name: str = "simulated", pr
         raise SettingError(f"seed: expected at least 0, found {seed}", hint="for example --seed 1")
     city = build_city(config, seed=seed)
     frames = drive(city, config, seed=seed, progress=progress)
-    boxes = _detect_everything(city, frames, config, seed=seed, progress=progress)
+    sightings = see(city.lights, frames, city.streets, config, progress=progress, what="seeing lights")
+    boxes = _detect_everything(city, sightings, frames, config, seed=seed, progress=progress)
     position_error_m, rotation_error_rad = pose_errors(frames, config, seed=seed)
     kept = _kept_frames(frames, boxes, config)
-    boxes = _only_in(kept, boxes)
+    boxes = boxes.replace(frame_row=_row_among(kept, boxes.frame_row))
+    boxes = boxes.take(boxes.frame_row >= 0)
     if len(boxes) == 0:
         raise SettingError("nothing at all is detected in this city", hint="raise recall_mean, or drive more")
+    is_hidden = hidden_by_traffic(sightings, frames, config, seed=seed, kind="lights")
+    sighted_in = _row_among(kept, sightings.frame_row)
+    frames = frames.take(kept)
+    dataset = _dataset(name, city, frames, boxes, position_error_m[kept], rotation_error_rad[kept], config)
+    return Recording(
+        config=config,
+        seed=seed,
+        city=city,
+        frames=frames,
+        sightings=sightings.replace(frame_row=sighted_in).take(sighted_in >= 0),
+        is_hidden=is_hidden[sighted_in >= 0],
+        dataset=dataset,
+    )
+
+
+def _dataset(
+    name: str,
+    city: City,
+    frames: Frames,
+    boxes: Boxes,
+    position_error_m: Floats,
+    rotation_error_rad: Floats,
+    config: SimulationConfig,
+) -> Dataset:
     shows_light = boxes.light_row != NO_LIGHT
     return Dataset(
         name=name,
         frame=Frame(),
         cameras=_cameras(config),
-        images=_images(frames.take(kept), position_error_m[kept], rotation_error_rad[kept], config),
+        images=_images(frames, position_error_m, rotation_error_rad, config),
         detections=Detections(
             detection_id=np.arange(len(boxes)),
             image_id=boxes.frame_row,
@@ -85,19 +137,23 @@ def simulate(config: SimulationConfig, *, seed: int, name: str = "simulated", pr
     )
 
 
-def _detect_everything(city: City, frames: Frames, config: SimulationConfig, *, seed: int, progress: Progress) -> Boxes:
+def _detect_everything(
+    city: City, of_lights: Sightings, frames: Frames, config: SimulationConfig, *, seed: int, progress: Progress
+) -> Boxes:
     """Return all boxes, by frame and in it from left to right, so that their order tells nothing."""
     recall = recall_of_passes(int(frames.pass_row[-1]) + 1, config, seed=seed)
     kinds = {
-        "lights": city.lights,
         "lookalikes": city.lookalikes,
         "temporary": place_temporary(frames, city.streets, config, seed=seed),
     }
-    parts = [reflect(frames, config, seed=seed), clutter(frames, config, seed=seed)]
+    parts = [
+        reflect(frames, config, seed=seed),
+        clutter(frames, config, seed=seed),
+        detect(of_lights, city.lights, frames, recall, config, seed=seed, kind="lights", are_lights=True),
+    ]
     for kind, targets in kinds.items():
         seen = see(targets, frames, city.streets, config, progress=progress, what=f"seeing {kind}")
-        are_lights = kind == "lights"
-        parts.append(detect(seen, targets, frames, recall, config, seed=seed, kind=kind, are_lights=are_lights))
+        parts.append(detect(seen, targets, frames, recall, config, seed=seed, kind=kind, are_lights=False))
     boxes = join_rows(parts)
     return boxes.take(np.lexsort((boxes.center_px[:, 1], boxes.center_px[:, 0], boxes.frame_row)))
 
@@ -124,11 +180,10 @@ def _kept_frames(frames: Frames, boxes: Boxes, config: SimulationConfig) -> Ints
     return choices[best]
 
 
-def _only_in(kept: Ints, boxes: Boxes) -> Boxes:
-    """Return the boxes in the kept frames, with rows numbered among these."""
-    row = np.minimum(np.searchsorted(kept, boxes.frame_row), len(kept) - 1)
-    stays = kept[row] == boxes.frame_row
-    return boxes.replace(frame_row=row).take(stays)
+def _row_among(kept: Ints, frame_row: Ints) -> Ints:
+    """Return rows (N) numbered among the kept ones, -1 for those that are not kept."""
+    row = np.minimum(np.searchsorted(kept, frame_row), len(kept) - 1)
+    return np.where(kept[row] == frame_row, row, -1)
 
 
 def _cameras(config: SimulationConfig) -> Cameras:

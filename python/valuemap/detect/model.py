@@ -1,0 +1,294 @@
+"""An ONNX model: what it takes, what its outputs mean and what its classes are called, found out once at the door."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from valuemap.config import DetectConfig, ModelKind
+from valuemap.detect.coco_names import COCO_80, COCO_91
+from valuemap.detect.letterbox import Fit, Fitting, Pixels, Size, fit_around, fit_into
+from valuemap.errors import InputError, SettingError
+
+Array = NDArray[Any]
+
+_KIND_HINT = f"say what it is with --kind: one of {', '.join(get_args(ModelKind))}"
+_PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
+_DTYPES: Mapping[str, type[np.floating[Any]]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+_IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """How pixels become numbers: (pixel / 255 - mean) / std in the order of `color`, and where the picture goes."""
+
+    color: str = "RGB"
+    mean: tuple[float, ...] = (0.0, 0.0, 0.0)
+    std: tuple[float, ...] = (1.0, 1.0, 1.0)
+    fitting: Fitting = "corner"
+
+
+_PREPARATIONS: Mapping[str, Preparation] = {
+    "segmentation": Preparation(),
+    "yolox": Preparation(color="BGR", std=(1 / 255, 1 / 255, 1 / 255)),  # Takes 0 to 255.
+    "ultralytics": Preparation(fitting="center"),
+    "detr": Preparation(mean=_IMAGENET_MEAN, std=_IMAGENET_STD, fitting="stretch"),
+    "boxes": Preparation(),
+}
+"""What each kind expects where the file does not say it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A model ready to run.
+
+    `class_count` is None where the outputs do not tell; `fixed` is the width and height that it insists on, None if it
+    takes any multiple of `stride`; `fixed_batch` likewise. `threshold` and `minimum_component_px` are of
+    segmentations; `is_softmax` of DETRs, whose last class is then "nothing".
+    """
+
+    path: Path
+    sha256: str
+    session: Any
+    kind: str
+    class_names: tuple[str, ...]
+    class_count: int | None
+    fixed: Size | None
+    fixed_batch: int | None
+    has_batch: bool
+    stride: int
+    preparation: Preparation
+    threshold: float
+    minimum_component_px: int
+    is_softmax: bool
+
+    def fit(self, picture: Size, size: Size | None) -> Fit:
+        """Return how a picture of a size is brought to what the network takes; `size` is what the user asked for."""
+        canvas = size or self.fixed
+        if canvas is None:
+            return fit_around(picture, self.stride)
+        return fit_into(picture, canvas, self.preparation.fitting)
+
+    def run(self, canvases: Sequence[Pixels]) -> list[Array]:
+        """Run canvases (height, width, 3), RGB, of one size, and return the outputs.
+
+        Raises
+        ------
+        InputError
+            The network cannot be run on this size or number of pictures.
+        """
+        entry = self.session.get_inputs()[0]
+        batch = np.empty((self.fixed_batch or len(canvases), 3, *canvases[0].shape[:2]), np.float32)
+        batch[len(canvases) :] = 0.0
+        for row, canvas in enumerate(canvases):
+            self._prepare(canvas, batch[row])
+        tensor = batch.astype(_DTYPES[entry.type], copy=False)
+        try:
+            outputs: list[Array] = self.session.run(None, {entry.name: tensor if self.has_batch else tensor[0]})
+        except Exception as error:  # ONNX Runtime's errors have no base of their own.
+            width, height = canvases[0].shape[1::-1]
+            raise InputError(
+                f"{self.path}: cannot be run on {len(batch)} pictures of {width} x {height} px: {_first_line(error)}",
+                hint="choose what the network takes with --size and --batch",
+            ) from error
+        return outputs
+
+    def _prepare(self, canvas: Pixels, out: NDArray[np.float32]) -> None:
+        """Write (pixel / 255 - mean) / std of a canvas into `out` (3, height, width)."""
+        how = self.preparation
+        channels = (0, 1, 2) if how.color == "RGB" else (2, 1, 0)
+        for i, channel in enumerate(channels):
+            gain = np.float32(1.0 / (255.0 * how.std[i]))
+            np.multiply(canvas[:, :, channel], gain, out=out[i], casting="unsafe")
+            if how.mean[i]:
+                out[i] -= np.float32(how.mean[i] / how.std[i])
+
+
+def load_model(path: Path, config: DetectConfig) -> Model:
+    """Open an ONNX file and find out what it is.
+
+    Raises
+    ------
+    InputError
+        No such file, no ONNX file, or a model of a shape that cannot be used.
+    SettingError
+        The provider is not installed.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file", hint="give an ONNX file")
+    content = path.read_bytes()
+    session = _open(path, content, config.provider)
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    metadata = session.get_modelmeta().custom_metadata_map
+    if len(inputs) != 1 or inputs[0].type not in _DTYPES or len(inputs[0].shape) not in (3, 4):
+        found = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
+        raise InputError(
+            f"{path}: expected one input of pictures, float [batch, 3, height, width], found {found}",
+            hint="export the network alone, without what comes before or after it",
+        )
+    has_batch = len(inputs[0].shape) == 4
+    batch, channels, height, width = inputs[0].shape if has_batch else (1, *inputs[0].shape)
+    if isinstance(channels, int) and channels != 3:
+        raise InputError(
+            f"{path}: expected an input of 3 channels [batch, 3, height, width], found {inputs[0].shape}",
+            hint="export it for colour pictures, channels first",
+        )
+    kind = config.kind or metadata.get("valuemap.kind") or _recognise(path, outputs, metadata)
+    if kind not in get_args(ModelKind):
+        raise InputError(f"{path}: kind {kind!r} is not known", hint=_KIND_HINT)
+    fixed = (width, height) if isinstance(width, int) and isinstance(height, int) else None
+    size = config.size_px
+    if fixed is not None and (config.size == "picture" or (size is not None and size != fixed)):
+        session = _open(path, _with_free_size(content), config.provider)
+        fixed = None
+    if kind == "boxes" and all(len(output.shape) != 3 for output in outputs):
+        batch = 1  # Its boxes have no batch: they would be those of the first picture.
+    count = _class_count(kind, outputs)
+    names = _class_names(path, metadata, count)
+    return Model(
+        path=path,
+        sha256=hashlib.sha256(content).hexdigest(),
+        session=session,
+        kind=kind,
+        class_names=names,
+        class_count=count,
+        fixed=fixed,
+        fixed_batch=batch if isinstance(batch, int) else None,
+        has_batch=has_batch,
+        stride=int(_number(path, metadata, "stride", 32)),
+        preparation=_preparation(path, kind, metadata),
+        threshold=_number(path, metadata, "valuemap.threshold", 0.5),
+        minimum_component_px=int(_number(path, metadata, "valuemap.minimum_component_px", 1)),
+        # A last class for "nothing" is one more than there are names, or than COCO's numbers.
+        is_softmax=count is not None and count == (len(names) or 91) + 1,
+    )
+
+
+def _open(path: Path, content: bytes, provider: str) -> Any:
+    wanted = _PROVIDERS[provider]
+    if wanted not in onnxruntime.get_available_providers():
+        raise _no_provider(provider)
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3  # Errors come as exceptions; warnings are about the export.
+    # Threads that wait for work would otherwise spin, on the cores that decode the next pictures.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        session = onnxruntime.InferenceSession(content, options, providers=[wanted])
+    except Exception as error:  # ONNX Runtime's errors have no base of their own.
+        raise InputError(
+            f"{path}: cannot be read as an ONNX model: {_first_line(error)}", hint="is it whole? Export it again"
+        ) from error
+    if wanted not in session.get_providers():  # Without a driver it would go on with the CPU and say nothing.
+        raise _no_provider(provider)
+    return session
+
+
+def _no_provider(provider: str) -> SettingError:
+    return SettingError(
+        f"--provider {provider}: this ONNX Runtime cannot do that here",
+        hint="install onnxruntime-gpu in place of onnxruntime, with CUDA and a driver, or use --provider cpu",
+    )
+
+
+def _with_free_size(content: bytes) -> bytes:
+    """Return the model with height and width left open, as a fully convolutional one can be run."""
+    import onnx  # Only models of a fixed size need it.
+
+    model = onnx.load_from_string(content)
+    del model.graph.value_info[:]  # They hold the sizes of everything in between.
+    rows = model.graph.input[0].type.tensor_type.shape.dim[-2:]
+    for axis, name in zip(rows, ("height", "width"), strict=True):
+        axis.dim_param = name
+    for output in model.graph.output:
+        output.type.tensor_type.ClearField("shape")
+    rewritten: bytes = model.SerializeToString()
+    return rewritten
+
+
+def _recognise(path: Path, outputs: Sequence[Any], metadata: Mapping[str, str]) -> str:
+    """Tell the kind from the number, names and shapes of the outputs."""
+    shapes = [output.shape for output in outputs]
+    names = [output.name.lower() for output in outputs]
+    if len(outputs) >= 2 and any("logits" in name for name in names) and any("boxes" in name for name in names):
+        return "detr"
+    if len(outputs) >= 3 and any("int" in output.type for output in outputs):
+        return "boxes"  # Others, as torchvision's masks, are left alone.
+    if len(outputs) == 1 and len(shapes[0]) == 4:
+        return "segmentation"
+    if len(outputs) == 1 and len(shapes[0]) == 3:
+        rows, columns = shapes[0][1:]
+        if columns == 6:
+            return "boxes"
+        if "names" in metadata or (isinstance(rows, int) and (not isinstance(columns, int) or rows < columns)):
+            return "ultralytics"
+        if isinstance(columns, int):
+            return "yolox"
+    found = ", ".join(f"{output.name} {output.shape}" for output in outputs)
+    raise InputError(f"{path}: cannot tell what the outputs mean: {found}", hint=_KIND_HINT)
+
+
+def _class_count(kind: str, outputs: Sequence[Any]) -> int | None:
+    """Return how many classes the outputs have room for, with DETR's "nothing"; None if they do not say."""
+    axis, other = {"segmentation": (1, 0), "yolox": (2, 5), "ultralytics": (1, 4), "detr": (2, 0), "boxes": (0, 0)}[
+        kind
+    ]
+    if kind == "boxes":
+        return None
+    output = next((o for o in outputs if "logits" in o.name.lower()), outputs[0])
+    entries = output.shape[axis] if len(output.shape) > axis else None
+    return entries - other if isinstance(entries, int) else None
+
+
+def _class_names(path: Path, metadata: Mapping[str, str], count: int | None) -> tuple[str, ...]:
+    """Return the names that the file says, else COCO's if the number fits, else none."""
+    try:
+        if "valuemap.classes" in metadata:
+            return tuple(str(name) for name in json.loads(metadata["valuemap.classes"]))
+        if "names" in metadata:  # Ultralytics writes a Python dict.
+            named = {int(i): str(name) for i, name in dict(ast.literal_eval(metadata["names"])).items()}
+            return tuple(named.get(i, f"class-{i}") for i in range(max(named) + 1))
+    except (ValueError, TypeError, SyntaxError) as error:
+        raise InputError(
+            f"{path}: the names of the classes in its metadata cannot be read: {error}", hint="export it again"
+        ) from error
+    return {80: COCO_80, 91: COCO_91, 92: COCO_91}.get(count or 0, ())
+
+
+def _preparation(path: Path, kind: str, metadata: Mapping[str, str]) -> Preparation:
+    default = _PREPARATIONS[kind]
+    try:
+        mean, std = (
+            tuple(float(c) for c in json.loads(metadata[f"valuemap.{name}"])) if f"valuemap.{name}" in metadata else own
+            for name, own in (("mean", default.mean), ("std", default.std))
+        )
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{path}: metadata valuemap.mean, valuemap.std: {error}", hint="export it again") from error
+    color = metadata.get("valuemap.color", default.color)
+    if color not in ("RGB", "BGR") or len(mean) != 3 or len(std) != 3 or not all(std):
+        raise InputError(
+            f"{path}: metadata: expected valuemap.color RGB or BGR, and 3 numbers in valuemap.mean and valuemap.std",
+            hint="export it again",
+        )
+    return Preparation(color, mean, std, default.fitting)
+
+
+def _number(path: Path, metadata: Mapping[str, str], name: str, default: float) -> float:
+    try:
+        return float(metadata.get(name, default))
+    except ValueError:
+        raise InputError(
+            f"{path}: metadata {name}: expected a number, found {metadata[name]!r}", hint="export it again"
+        ) from None
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else repr(error)

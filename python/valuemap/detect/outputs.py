@@ -1,0 +1,167 @@
+"""What each kind of network says, as boxes of the picture: one function a kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from valuemap.detect.boxes import Boxes, suppress
+from valuemap.detect.classes import WantedClasses
+from valuemap.detect.components import boxes_of_components
+from valuemap.detect.letterbox import Fit
+from valuemap.detect.model import Model
+from valuemap.errors import InputError
+from valuemap.tables import Floats, Ints
+
+Array = NDArray[Any]
+
+_YOLOX_STRIDES = ((8, 16, 32), (8, 16, 32, 64))
+_MAX_CANDIDATES = 3000
+"""Boxes of one canvas that go into the suppression, best first: bounds the cost where every score is accepted."""
+
+
+def find_boxes(
+    model: Model, outputs: list[Array], row: int, fit: Fit, wanted: WantedClasses, *, min_score: float, max_iou: float
+) -> Boxes:
+    """Return the boxes of one row of a batch, in pixels of the picture that was on the canvas.
+
+    Raises
+    ------
+    InputError
+        The outputs are not what the kind of model has.
+    """
+    boxes = _DECODERS[model.kind](model, outputs, row, fit, wanted)
+    boxes = boxes.take(boxes.score >= min_score)
+    boxes = boxes.take(np.argsort(-boxes.score, kind="stable")[:_MAX_CANDIDATES])
+    boxes = Boxes(boxes.center_px, boxes.size_px, boxes.score, wanted.one_a_name(boxes.class_code))
+    if model.kind in ("yolox", "ultralytics"):
+        boxes = boxes.take(suppress(boxes, max_iou))
+    return fit.to_picture(boxes).clipped(*fit.picture)
+
+
+def _from_segmentation(model: Model, outputs: list[Array], row: int, fit: Fit, wanted: WantedClasses) -> Boxes:
+    """Make connected pixels (8 neighbours) of at least the threshold one object; its score is their mean."""
+    if outputs[0].ndim != 4:
+        raise _unexpected(model, outputs, "[batch, classes, height, width]")
+    maps = np.asarray(outputs[0][row], np.float32)
+    # A map may be coarser than the canvas; and of the padding nothing is wanted.
+    cell_px = np.array(fit.canvas, np.float64) / maps.shape[:0:-1]
+    low = np.floor(np.array(fit.offset) / cell_px).astype(int)
+    high = np.ceil((np.array(fit.offset) + fit.resized) / cell_px).astype(int)
+    parts = []
+    for number in wanted.columns(len(maps)):
+        probability = maps[number, low[1] : high[1], low[0] : high[0]]
+        found = boxes_of_components(probability, model.threshold, model.minimum_component_px)
+        center_px = (found.center_px + low) * cell_px
+        parts.append(Boxes(center_px, found.size_px * cell_px, found.score, np.full(len(found), number)))
+    return Boxes.together(parts)
+
+
+def _from_yolox(model: Model, outputs: list[Array], row: int, fit: Fit, wanted: WantedClasses) -> Boxes:
+    """Ge et al., "YOLOX", 2021: xy = (o + grid) stride, wh = exp(o) stride, score = objectness times class."""
+    if outputs[0].ndim != 3 or outputs[0].shape[2] <= 5:
+        raise _unexpected(model, outputs, "[batch, anchors, 5 + classes]")
+    raw = np.asarray(outputs[0][row], np.float64)
+    cell, stride_px = _yolox_grid(model, outputs, fit)
+    score, number = _best_class(raw[:, 5:], wanted)
+    with np.errstate(over="ignore"):  # Boxes of infinite size are dropped.
+        size_px = np.exp(raw[:, 2:4]) * stride_px
+    return _from_centers((raw[:, :2] + cell) * stride_px, size_px, raw[:, 4] * score, number)
+
+
+def _yolox_grid(model: Model, outputs: list[Array], fit: Fit) -> tuple[Floats, Floats]:
+    """Return column and row (N, 2) of the cell of each anchor, and its stride (N, 1)."""
+    width, height = fit.canvas
+    for strides in _YOLOX_STRIDES:
+        shapes = [(height // stride, width // stride) for stride in strides]
+        counts = [rows * columns for rows, columns in shapes]
+        if sum(counts) == outputs[0].shape[1]:
+            cells = [np.moveaxis(np.indices(shape)[::-1], 0, -1).reshape(-1, 2) for shape in shapes]
+            return np.concatenate(cells).astype(np.float64), np.repeat(strides, counts)[:, None].astype(np.float64)
+    raise _unexpected(model, outputs, f"an anchor for each cell of strides 8, 16, 32 of {width} x {height} px")
+
+
+def _from_ultralytics(model: Model, outputs: list[Array], row: int, _: Fit, wanted: WantedClasses) -> Boxes:
+    """Centre x, y, width, height in pixels of the canvas, then a score a class; one column an anchor."""
+    if outputs[0].ndim != 3 or outputs[0].shape[1] <= 4:
+        raise _unexpected(model, outputs, "[batch, 4 + classes, anchors]")
+    raw = np.asarray(outputs[0][row], np.float64).T
+    score, number = _best_class(raw[:, 4:], wanted)
+    return _from_centers(raw[:, :2], raw[:, 2:4], score, number)
+
+
+def _from_detr(model: Model, outputs: list[Array], row: int, fit: Fit, wanted: WantedClasses) -> Boxes:
+    """Carion et al., "DETR", 2020: a softmax with a last class for nothing; its successors: a sigmoid a class."""
+    named = {entry.name.lower(): output for entry, output in zip(model.session.get_outputs(), outputs, strict=True)}
+    logits = next((output for name, output in named.items() if "logits" in name), None)
+    places = next((output for name, output in named.items() if "boxes" in name), None)
+    if logits is None or places is None or logits.ndim != 3 or places.shape[-1] != 4:
+        raise _unexpected(model, outputs, "logits [batch, queries, classes] and boxes [batch, queries, 4]")
+    value = np.asarray(logits[row], np.float64)
+    if model.is_softmax:
+        odds = np.exp(value - value.max(axis=1, keepdims=True))
+        probability = (odds / odds.sum(axis=1, keepdims=True))[:, :-1]
+    else:
+        probability = 1.0 / (1.0 + np.exp(np.clip(-value, -60.0, 60.0)))
+    score, number = _best_class(probability, wanted)
+    place_px = np.asarray(places[row], np.float64) * np.tile(fit.canvas, 2)  # Centre and size, as shares of the whole.
+    return _from_centers(place_px[:, :2], place_px[:, 2:], score, number)
+
+
+def _from_boxes(model: Model, outputs: list[Array], row: int, _: Fit, wanted: WantedClasses) -> Boxes:
+    """Edges, class and score, suppressed in the graph: three outputs as of torchvision, or one [batch, N, 6]."""
+    if len(outputs) == 1:
+        if outputs[0].ndim != 3 or outputs[0].shape[2] != 6:
+            raise _unexpected(model, outputs, "left, top, right, bottom, score, class [batch, N, 6]")
+        edges_px, score, number = outputs[0][row][:, :4], outputs[0][row][:, 4], outputs[0][row][:, 5]
+    else:
+        edges_px, score, number = _edges_score_number(model, outputs, row)
+    number = np.round(number).astype(np.int64)
+    if edges_px.shape != (len(score), 4) or len(number) != len(score):
+        raise _unexpected(model, outputs, "boxes [N, 4], labels [N] and scores [N]")
+    is_wanted = wanted.are_wanted(number)
+    return Boxes.from_edges(edges_px[is_wanted], score[is_wanted], number[is_wanted])
+
+
+def _edges_score_number(model: Model, outputs: list[Array], row: int) -> tuple[Array, Array, Array]:
+    """Tell outputs apart by rank and dtype; some exports have a batch, torchvision's have none."""
+    places = [output for output in outputs if output.ndim in (2, 3) and output.shape[-1] == 4]
+    if places:
+        edges_px = max(places, key=lambda output: output.ndim)  # Four scores have less dimensions than boxes.
+        flat = [output for output in outputs if output.ndim == edges_px.ndim - 1]
+        score = next((output for output in flat if output.dtype.kind == "f"), None)
+        number = next((output for output in flat if output.dtype.kind in "iu"), None)
+        if score is not None and number is not None:
+            return (edges_px[row], score[row], number[row]) if edges_px.ndim == 3 else (edges_px, score, number)
+    raise _unexpected(model, outputs, "boxes [N, 4], labels [N] and scores [N]")
+
+
+_DECODERS: Mapping[str, Callable[[Model, list[Array], int, Fit, WantedClasses], Boxes]] = {
+    "segmentation": _from_segmentation,
+    "yolox": _from_yolox,
+    "ultralytics": _from_ultralytics,
+    "detr": _from_detr,
+    "boxes": _from_boxes,
+}
+
+
+def _best_class(score: Floats, wanted: WantedClasses) -> tuple[Floats, Ints]:
+    """Return the best score (N) among the wanted classes, and which class that is (N)."""
+    columns = wanted.columns(score.shape[1])
+    best = np.argmax(score[:, columns], axis=1)
+    return score[np.arange(len(score)), columns[best]], columns[best]
+
+
+def _from_centers(center_px: Floats, size_px: Floats, score: Floats, number: Ints) -> Boxes:
+    return Boxes.from_edges(np.concatenate([center_px - size_px / 2, center_px + size_px / 2], axis=1), score, number)
+
+
+def _unexpected(model: Model, outputs: list[Array], expected: str) -> InputError:
+    found = ", ".join(str(list(output.shape)) for output in outputs)
+    return InputError(
+        f"{model.path}: a model of kind {model.kind} gives {expected}, found {found}",
+        hint="say what the model is with --kind, or what it takes with --size",
+    )

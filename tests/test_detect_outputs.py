@@ -1,0 +1,348 @@
+"""What each kind of network says becomes the right boxes, to a hundredth of a pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from tiny_models import red_finder, says
+from valuemap.config import DetectConfig
+from valuemap.detect.boxes import Boxes, overlaps, suppress
+from valuemap.detect.classes import choose_classes
+from valuemap.detect.coco_names import COCO_80, COCO_91
+from valuemap.detect.letterbox import Fit, fit_around, fit_into
+from valuemap.detect.model import Model, load_model
+from valuemap.detect.outputs import find_boxes
+from valuemap.errors import InputError, SettingError
+
+Array = NDArray[Any]
+
+
+def boxes_of(edges: Any, score: Any = 0.9, number: Any = 0) -> Boxes:
+    table = np.array(edges, dtype=np.float64).reshape(-1, 4)
+    return Boxes.from_edges(table, np.broadcast_to(score, len(table)), np.broadcast_to(number, len(table)))
+
+
+def yolox_raw(boxes: Boxes, canvas: tuple[int, int], classes: int) -> Array:
+    """Return what YOLOX says about boxes: each in the cell of stride 8, 16 or 32 that its centre lies in."""
+    width, height = canvas
+    grids = [(height // s, width // s) for s in (8, 16, 32)]
+    raw = np.zeros((sum(rows * columns for rows, columns in grids), 5 + classes), np.float32)
+    for i in range(len(boxes)):
+        level = i % 3
+        stride = (8, 16, 32)[level]
+        rows, columns = grids[level]
+        cell = np.minimum(boxes.center_px[i] // stride, [columns - 1, rows - 1])
+        anchor = sum(r * c for r, c in grids[:level]) + int(cell[1] * columns + cell[0])
+        raw[anchor, :2] = boxes.center_px[i] / stride - cell
+        raw[anchor, 2:4] = np.log(boxes.size_px[i] / stride)
+        raw[anchor, 4] = 1.0
+        raw[anchor, 5 + boxes.class_code[i]] = boxes.score[i]
+    return raw
+
+
+def ultralytics_raw(boxes: Boxes, canvas: tuple[int, int], classes: int) -> Array:
+    raw = np.zeros((4 + classes, max(len(boxes), 20)), np.float32)
+    raw[:4, : len(boxes)] = np.concatenate([boxes.center_px, boxes.size_px], axis=1).T
+    raw[4 + boxes.class_code, np.arange(len(boxes))] = boxes.score
+    return raw
+
+
+def model_of(path: Path, kind: str, count: int = 3) -> Model:
+    """Return a model whose kind is said, to decode outputs that the test makes up."""
+    outputs = {"output": np.zeros((1, 20, 5 + count), np.float32)}
+    if kind == "detr":
+        outputs = {"logits": np.zeros((1, 5, count), np.float32), "pred_boxes": np.zeros((1, 5, 4), np.float32)}
+    file = says(path / f"{kind}.onnx", outputs, picture=("batch", 3, "height", "width"))
+    return load_model(file, DetectConfig(kind=kind))  # type: ignore[arg-type]
+
+
+def decode(model: Model, outputs: list[Array], fit: Fit, *, classes: str = "", min_score: float = 0.25) -> Boxes:
+    wanted = choose_classes(classes, model.class_names)
+    return find_boxes(model, outputs, 0, fit, wanted, min_score=min_score, max_iou=0.5)
+
+
+@pytest.fixture(scope="module")
+def decoders(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Model]:
+    folder = tmp_path_factory.mktemp("models")
+    return {kind: model_of(folder, kind) for kind in ("yolox", "ultralytics", "detr")}
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    picture=st.tuples(st.integers(40, 4000), st.integers(40, 3000)),
+    canvas=st.sampled_from([None, (416, 416), (1024, 448), (640, 640), (96, 1280)]),
+    how=st.sampled_from(["corner", "center", "stretch"]),
+    kind=st.sampled_from(["yolox", "ultralytics", "detr"]),
+    place=st.tuples(st.floats(0.05, 0.95), st.floats(0.05, 0.95)),
+    share=st.tuples(st.floats(0.01, 0.09), st.floats(0.01, 0.09)),
+)
+def test_centres_survive_the_way_to_the_network_and_back(
+    decoders: Mapping[str, Model],
+    picture: tuple[int, int],
+    canvas: tuple[int, int] | None,
+    how: Any,
+    kind: str,
+    place: tuple[float, float],
+    share: tuple[float, float],
+) -> None:
+    fit = fit_around(picture, 32) if canvas is None else fit_into(picture, canvas, how)
+    boxes = Boxes(
+        np.array([place]) * picture, np.array([share]) * picture, np.array([0.75]), np.array([1], dtype=np.int64)
+    )
+    seen = fit.to_canvas(boxes)
+    if kind == "detr":
+        shares = np.concatenate([seen.center_px, seen.size_px], axis=1) / np.tile(fit.canvas, 2)
+        logits = np.array([[-9.0, np.log(0.75 / 0.25), -9.0]])
+        outputs = [logits[None].astype(np.float32), shares[None].astype(np.float32)]
+    else:
+        raw = (yolox_raw if kind == "yolox" else ultralytics_raw)(seen, fit.canvas, 3)
+        outputs = [raw[None]]
+    found = decode(decoders[kind], outputs, fit)
+    assert len(found) == 1
+    np.testing.assert_allclose(found.center_px, boxes.center_px, atol=0.01)
+    np.testing.assert_allclose(found.size_px, boxes.size_px, atol=0.01)
+    assert found.score[0] == pytest.approx(0.75, abs=1e-6)
+    assert found.class_code[0] == 1
+
+
+@pytest.mark.parametrize("canvas", [(320, 320), (480, 256), (700, 640)])
+@pytest.mark.parametrize("how", ["corner", "center", "stretch"])
+def test_resized_pixels_lie_where_the_boxes_do(canvas: tuple[int, int], how: Any) -> None:
+    """A soft spot drawn on the canvas has its centre where the fit says, so there is no half pixel too much."""
+    picture, center = (611, 407), np.array([233.37, 171.81])
+    x, y = np.meshgrid(np.arange(picture[0]) + 0.5, np.arange(picture[1]) + 0.5)
+    spot = 255.0 * np.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / (2 * 12.0**2))
+    fit = fit_into(picture, canvas, how)
+    drawn = fit.draw(np.repeat(spot[:, :, None], 3, axis=2).round().astype(np.uint8))[:, :, 1].astype(float)
+    assert drawn.shape == canvas[::-1]
+    left, top = fit.offset
+    drawn = drawn[top : top + fit.resized[1], left : left + fit.resized[0]]
+    x, y = np.meshgrid(np.arange(drawn.shape[1]) + left + 0.5, np.arange(drawn.shape[0]) + top + 0.5)
+    seen = np.array([[(x * drawn).sum(), (y * drawn).sum()]]) / drawn.sum()
+    back = fit.to_picture(Boxes(seen, np.ones((1, 2)), np.ones(1), np.zeros(1, np.int64)))
+    np.testing.assert_allclose(back.center_px[0], center, atol=0.02)
+
+
+def test_a_letterbox_is_grey_and_keeps_the_shape() -> None:
+    fit = fit_into((1280, 713), (416, 416), "corner")
+    assert (fit.resized, fit.offset) == ((416, 231), (0, 0))
+    assert (fit.draw(np.zeros((713, 1280, 3), np.uint8))[231:] == 114).all()
+    assert fit_into((100, 50), (64, 64), "center").offset == (0, 16)
+    assert fit_around((1024, 440), 32).canvas == (1024, 448)
+
+
+def test_yolox_multiplies_objectness_and_class_and_suppresses(decoders: Mapping[str, Model]) -> None:
+    raw = np.zeros((20 * 20 + 10 * 10 + 5 * 5, 8), np.float32)
+    raw[0, :] = [0.5, 0.5, np.log(2), np.log(3), 0.8, 0.0, 0.5, 0.9]  # Cell (0, 0) of stride 8.
+    raw[21, :] = [-0.5, -0.5, np.log(2), np.log(3), 0.6, 0.0, 0.0, 0.9]  # The same box from cell (1, 1).
+    raw[400, :] = [2.0, 2.0, 0.0, 0.0, 0.5, 0.9, 0.0, 0.0]  # Cell (0, 0) of stride 16.
+    found = decode(decoders["yolox"], [raw[None]], fit_around((160, 160), 32))
+    np.testing.assert_allclose(found.score, [0.72, 0.45], atol=1e-6)
+    assert found.class_code.tolist() == [2, 0]
+    np.testing.assert_allclose(found.edges_px[0], [0, 0, 12, 16], atol=1e-4)  # Clipped at the left and the top.
+    np.testing.assert_allclose(found.edges_px[1], [24, 24, 40, 40], atol=1e-4)
+    only = decode(decoders["yolox"], [raw[None]], fit_around((160, 160), 32), classes="1")
+    assert only.class_code.tolist() == [1]
+    assert only.score[0] == pytest.approx(0.4)
+
+
+def test_yolox_of_another_grid_is_refused(decoders: Mapping[str, Model]) -> None:
+    with pytest.raises(InputError, match="anchor for each cell"):
+        decode(decoders["yolox"], [np.zeros((1, 77, 8), np.float32)], fit_around((160, 160), 32))
+
+
+def test_a_detr_with_a_class_for_nothing_is_a_softmax(tmp_path: Path) -> None:
+    logits = np.array([[[2.0, 0.0, 1.0], [0.0, 0.0, 5.0]]], np.float32)
+    places = np.array([[[0.5, 0.25, 0.5, 0.5], [0.5, 0.5, 1.0, 1.0]]], np.float32)
+    file = says(
+        tmp_path / "detr.onnx",
+        {"logits": logits, "pred_boxes": places},
+        picture=(1, 3, 200, 100),
+        metadata={"valuemap.classes": ["light", "sign"]},
+    )
+    model = load_model(file, DetectConfig())
+    assert (model.kind, model.is_softmax, model.fixed) == ("detr", True, (100, 200))
+    fit = model.fit((50, 100), None)
+    found = decode(model, model.run([fit.draw(np.zeros((100, 50, 3), np.uint8))]), fit)
+    np.testing.assert_allclose(found.edges_px, [[12.5, 0, 37.5, 50]], atol=1e-4)
+    assert found.score[0] == pytest.approx(np.exp(2) / (np.exp(2) + 1 + np.exp(1)))
+
+
+@pytest.mark.parametrize("batch", [(), (1,)])
+def test_boxes_suppressed_in_the_graph(tmp_path: Path, batch: tuple[int, ...]) -> None:
+    """Torchvision's three outputs, in any order, with or without a batch."""
+    outputs = {
+        "scores": np.array([0.9, 0.4, 0.1], np.float32).reshape(*batch, 3),
+        "found": np.array([[1, 2, 11, 22], [30, 30, 40, 50], [0, 0, 5, 5]], np.float32).reshape(*batch, 3, 4),
+        "labels": np.array([10, 3, 10]).reshape(*batch, 3),
+    }
+    model = load_model(says(tmp_path / "m.onnx", outputs, picture=(*batch, 3, "height", "width")), DetectConfig())
+    assert model.kind == "boxes"
+    fit = model.fit((64, 64), None)
+    found = decode(model, model.run([np.zeros((64, 64, 3), np.uint8)]), fit)
+    np.testing.assert_allclose(found.edges_px, [[1, 2, 11, 22], [30, 30, 40, 50]])
+    assert found.class_code.tolist() == [10, 3]
+    assert decode(model, model.run([np.zeros((64, 64, 3), np.uint8)]), fit, classes="3").class_code.tolist() == [3]
+
+
+def test_boxes_without_a_batch_go_one_picture_at_a_time(tmp_path: Path) -> None:
+    """Four boxes, with masks beside them, so that scores and boxes look alike."""
+    outputs = {
+        "scores": np.array([0.9, 0.8, 0.7, 0.6], np.float32),
+        "places": np.array([[i, i, i + 9, i + 9] for i in range(0, 40, 10)], np.float32),
+        "masks": np.zeros((4, 1, 8, 8), np.float32),
+        "labels": np.array([1, 1, 2, 2]),
+    }
+    dims = {"masks": (4, 1, 8, 8)}
+    model = load_model(
+        says(tmp_path / "m.onnx", outputs, picture=("batch", 3, 64, 64), dims=dims), DetectConfig(kind="boxes")
+    )
+    found = decode(model, model.run([np.zeros((64, 64, 3), np.uint8)]), model.fit((64, 64), None))
+    assert found.score.tolist() == pytest.approx([0.9, 0.8, 0.7, 0.6])
+    assert model.fixed_batch == 1
+
+
+def test_boxes_in_one_output_of_six_columns(tmp_path: Path) -> None:
+    rows = np.array([[[1, 2, 11, 22, 0.9, 1], [0, 0, 0, 0, 0, 0]]], np.float32)
+    model = load_model(says(tmp_path / "m.onnx", {"output0": rows}), DetectConfig())
+    assert model.kind == "boxes"
+    found = decode(model, [rows], model.fit((64, 64), None))
+    np.testing.assert_allclose(found.edges_px, [[1, 2, 11, 22]])
+
+
+def test_components_of_a_coarser_map_without_the_padding(tmp_path: Path) -> None:
+    model = load_model(
+        red_finder(tmp_path / "m.onnx", {"valuemap.threshold": "0.6", "valuemap.minimum_component_px": "2"}),
+        DetectConfig(),
+    )
+    probability = np.zeros((1, 1, 16, 32), np.float32)
+    probability[0, 0, 2:5, 3:5] = [[0.7, 0.9]] * 3
+    probability[0, 0, 5, 5] = 0.8  # Touches by a corner.
+    probability[0, 0, 10, 20] = 0.9  # Too small.
+    probability[0, 0, 13:16, 2:9] = 0.9  # Padding, from row 13 on.
+    found = decode(model, [probability], fit_around((128, 52), 64))
+    np.testing.assert_allclose(found.edges_px, [[12, 8, 24, 24]])
+    assert found.score[0] == pytest.approx((3 * 0.7 + 3 * 0.9 + 0.8) / 7)
+
+
+RECOGNISED: list[tuple[str, dict[str, Array], dict[str, Any], dict[str, Any]]] = [
+    ("segmentation", {"output": np.zeros((1, 2, 64, 64), np.float32)}, {}, {}),
+    ("yolox", {"output": np.zeros((1, 84, 13), np.float32)}, {}, {}),
+    ("yolox", {"output": np.zeros((1, 84, 13), np.float32)}, {"output": ("batch", "anchors", 13)}, {}),
+    ("ultralytics", {"output": np.zeros((1, 13, 84), np.float32)}, {}, {}),
+    ("ultralytics", {"output": np.zeros((1, 13, 84), np.float32)}, {"output": ("batch", 13, "anchors")}, {}),
+    ("ultralytics", {"output": np.zeros((1, 84, 13), np.float32)}, {}, {"names": "{0: 'light', 1: 'sign'}"}),
+    ("boxes", {"output": np.zeros((1, 300, 6), np.float32)}, {}, {}),
+    ("detr", {"logits": np.zeros((1, 9, 3), np.float32), "pred_boxes": np.zeros((1, 9, 4), np.float32)}, {}, {}),
+]
+
+
+@pytest.mark.parametrize(("kind", "outputs", "dims", "metadata"), RECOGNISED)
+def test_kinds_are_recognised(
+    tmp_path: Path, kind: str, outputs: dict[str, Array], dims: dict[str, Any], metadata: dict[str, Any]
+) -> None:
+    file = says(tmp_path / "m.onnx", outputs, dims=dims, metadata=metadata)
+    assert load_model(file, DetectConfig()).kind == kind
+    assert load_model(file, DetectConfig(kind="boxes")).kind == "boxes"
+
+
+def test_the_file_says_how_it_wants_pictures(tmp_path: Path) -> None:
+    file = red_finder(
+        tmp_path / "m.onnx",
+        {"valuemap.mean": [0.5, 0.25, 0.0], "valuemap.std": [0.5, 0.5, 2.0], "valuemap.color": "RGB"},
+    )
+    model = load_model(file, DetectConfig())
+    canvas = np.tile(np.array([255, 51, 0], np.uint8), (32, 32, 1))
+    output = model.run([canvas, canvas])[0]
+    assert output.shape == (2, 1, 32, 32)
+    np.testing.assert_allclose(output, (1.0 - 0.5) / 0.5 - (0.2 - 0.25) / 0.5, atol=1e-5)
+    assert model.class_names == ("traffic_light",)
+
+
+def test_names_come_from_the_file_else_from_coco(tmp_path: Path) -> None:
+    assert COCO_80[9] == "traffic light"
+    assert COCO_80[11] == COCO_91[13] == "stop sign"
+    assert (len(COCO_80), len(COCO_91), COCO_91[90]) == (80, 91, "toothbrush")
+    for columns, names in ((85, COCO_80), (8, ())):
+        file = says(tmp_path / f"{columns}.onnx", {"output": np.zeros((1, 84, columns), np.float32)})
+        assert load_model(file, DetectConfig(kind="yolox")).class_names == names
+    named = {"output": np.zeros((1, 6, 84), np.float32)}
+    file = says(tmp_path / "u.onnx", named, metadata={"names": "{0: 'light', 1: 'sign'}"})
+    assert load_model(file, DetectConfig()).class_names == ("light", "sign")
+
+
+def test_wanted_classes_by_name_number_and_new_name() -> None:
+    wanted = choose_classes("Stop Sign, traffic light=light, 0=light", COCO_80)
+    assert wanted.columns(80).tolist() == [0, 9, 11]
+    assert [wanted.name_of(i) for i in (0, 9, 11, 99)] == ["light", "light", "stop sign", "class-99"]
+    assert wanted.one_a_name(np.array([9, 11, 0, 12])).tolist() == [0, 11, 0, 12]
+    with pytest.raises(SettingError, match="no class 'trafic light'") as error:
+        choose_classes("trafic light", COCO_80)
+    assert "traffic light" in error.value.hint
+    with pytest.raises(SettingError, match="does not say"):
+        choose_classes("light", ())
+    with pytest.raises(SettingError, match="no class 80"):
+        choose_classes("80", COCO_80).columns(80)
+
+
+def test_models_that_cannot_be_used(tmp_path: Path) -> None:
+    (tmp_path / "text.onnx").write_text("no model")
+    odd = says(tmp_path / "odd.onnx", {"a": np.zeros((1, 7), np.float32)})
+    grey = says(tmp_path / "grey.onnx", {"a": np.zeros((1, 9, 9), np.float32)}, picture=(1, 1, 8, 8))
+    two = says(tmp_path / "two.onnx", {name: np.zeros((1, 9, 9), np.float32) for name in "ab"})
+    for file, message in (
+        (tmp_path / "none.onnx", "no such file"),
+        (tmp_path / "text.onnx", "cannot be read as an ONNX model"),
+        (odd, "cannot tell what the outputs mean"),
+        (grey, "3 channels"),
+        (two, "cannot tell what the outputs mean"),
+    ):
+        with pytest.raises(InputError, match=message) as error:
+            load_model(file, DetectConfig())
+        assert "\n" not in str(error.value)
+    with pytest.raises(SettingError, match="--provider cuda"):
+        load_model(two, DetectConfig(provider="cuda"))
+
+
+def literal_suppression(boxes: Boxes, max_iou: float) -> set[int]:
+    left = sorted(range(len(boxes)), key=lambda i: -boxes.score[i])
+    kept: list[int] = []
+    for i in left:
+        for j in kept:
+            a, b = boxes.edges_px[i], boxes.edges_px[j]
+            width = max(0.0, min(a[2], b[2]) - max(a[0], b[0]))
+            height = max(0.0, min(a[3], b[3]) - max(a[1], b[1]))
+            union = (a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - width * height
+            if boxes.class_code[i] == boxes.class_code[j] and width * height / union > max_iou:
+                break
+        else:
+            kept.append(i)
+    return set(kept)
+
+
+def test_suppression_agrees_with_the_literal_one() -> None:
+    random = np.random.default_rng(1)
+    for _ in range(50):
+        low = random.uniform(0, 60, (40, 2))
+        edges = np.concatenate([low, low + random.uniform(3, 30, (40, 2))], axis=1)
+        boxes = boxes_of(edges, random.permutation(40) / 40.0, random.integers(0, 2, 40))
+        assert set(suppress(boxes, 0.4).tolist()) == literal_suppression(boxes, 0.4)
+
+
+def test_boxes_meet_across_the_seam_of_a_panorama() -> None:
+    left, right = boxes_of([[-5.0, 10, 5, 20]]), boxes_of([[995.0, 10, 1005, 20]])
+    assert overlaps(left, right)[0] == 0.0
+    assert overlaps(left, right, period_px=1000.0)[0] == pytest.approx(1.0)
+
+
+def test_boxes_that_are_no_numbers_are_dropped() -> None:
+    assert len(boxes_of([[0, 0, np.inf, 5], [0, 0, 5, 5], [np.nan, 0, 1, 1]])) == 1
+    assert len(boxes_of([[0, 0, 5, 5], [20, 20, 30, 30]]).clipped(10, 10)) == 1
