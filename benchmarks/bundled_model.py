@@ -164,7 +164,7 @@ def read_tl_kr(folder: Path) -> list[LabelledPicture]:
 def is_upright(path: Path) -> bool:
     """Return whether the top third is brighter than the bottom third, as under a sky by day.
 
-    Of the 302 pictures this takes 84 for upside down, all of them training copies; by eye it is right for each.
+    Of the 302 pictures this takes 84 for upside down, all of them training copies; a sample looked right by eye.
     The black corners of turned copies do not count.
     """
     grey = read_picture(path).pixels.mean(axis=2)

@@ -34,15 +34,14 @@ MIN_DETECTIONS = 3
 
 def city(passes: int, **changes: float) -> SimulationConfig:
     """Return the city of the benchmark with a number of passes through every street."""
-    return dataclasses.replace(
-        SimulationConfig(),
-        streets_north_south=4,
-        streets_east_west=4,
-        signalised_share=1.0,
-        passes_per_street=passes,
-        lookalikes_per_light=0.0,
-        **changes,  # type: ignore[arg-type]
-    )
+    settings: dict[str, float] = {
+        "streets_north_south": 4,
+        "streets_east_west": 4,
+        "signalised_share": 1.0,
+        "passes_per_street": passes,
+        "lookalikes_per_light": 0.0,
+    }
+    return dataclasses.replace(SimulationConfig(), **{**settings, **changes})  # type: ignore[arg-type]
 
 
 def main() -> None:

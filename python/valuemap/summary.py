@@ -43,7 +43,7 @@ def summarize_map(result: Map) -> dict[str, Any]:
         "frame": _frame(result.frame),
         "labels": len(labels),
         "classes": _classes(labels.class_name),
-        **{name.replace("_", " "): counts[name] for name in counts if name != "labels"},
+        **{name.replace("_", " "): _short(counts[name]) for name in counts if name != "labels"},
         "seconds": float(sum(stage["seconds"] for stage in result.run.get("stages", []))),
     }
     if len(labels):
@@ -54,6 +54,11 @@ def summarize_map(result: Map) -> dict[str, Any]:
             "median reprojection rms in px": float(np.median(labels.reprojection_rms_px)),
         }
     return facts
+
+
+def _short(count: Any) -> Any:
+    """Return what a record holds by name as one line."""
+    return ", ".join(f"{name} {value:.2g}" for name, value in count.items()) if isinstance(count, dict) else count
 
 
 def _frame(frame: Frame) -> str:

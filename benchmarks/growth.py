@@ -1,0 +1,57 @@
+"""How the time grows with the passes: the same simulated streets driven 5 and 50 times, in one run.
+
+Time of `build_map` with the default method; ten times the passes should cost about ten times as much.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import valuemap
+from machine import describe_machine
+from robust import city
+from valuemap.simulate import simulate
+
+
+def main() -> None:
+    """Run the benchmark and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--passes", type=int, nargs=2, default=[5, 50])
+    parser.add_argument("--streets", type=int, default=3, help="streets in each direction")
+    parser.add_argument("--json", type=Path, help="file to write the figures to")
+    options = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    for passes in options.passes:
+        size = {"streets_north_south": options.streets, "streets_east_west": options.streets}
+        dataset = simulate(city(passes, **size), seed=0, name="growth")
+        start = time.perf_counter()
+        result = valuemap.build_map(dataset)
+        seconds = time.perf_counter() - start
+        evaluation = valuemap.evaluate_map(result, dataset)
+        rows.append(
+            {
+                "passes": passes,
+                "images": len(dataset.images),
+                "detections": len(dataset.detections),
+                "seconds": round(seconds, 2),
+                "recall": round(evaluation.recall, 4),
+                "precision": round(evaluation.precision, 4),
+                "position_rmse_m": round(evaluation.position_rmse_m, 4),
+            }
+        )
+        print(rows[-1], flush=True)
+    ratio = rows[1]["seconds"] / rows[0]["seconds"]
+    print(f"{rows[1]['detections'] / rows[0]['detections']:.1f} times the detections: {ratio:.1f} times the time")
+    if options.json:
+        command = ("python benchmarks/growth.py " + " ".join(sys.argv[1:])).strip()
+        record = {"command": command, "data": "simulated", **describe_machine(), "results": rows, "time_ratio": ratio}
+        options.json.write_text(json.dumps(record, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
