@@ -138,7 +138,7 @@ fn mean_disagreement(scene: &Scene, noise: &Noise, labels: &[&Label]) -> Option<
 fn disagreement(scene: &Scene, noise: &Noise, label: &Label) -> Option<f64> {
     let (mut information, mut gradient, mut alone, mut passes) = (Matrix3::zeros(), Vector3::zeros(), 0.0, 0);
     for pass in by_pass(scene, &label.voters).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS) {
-        let terms = pass_terms(scene, noise, pass, &vec![1.0; pass.len()], &label.estimate.point)?;
+        let terms = pass_terms(scene, noise, pass, &label.estimate.point)?;
         alone += terms.gradient.dot(&terms.information.cholesky()?.solve(&terms.gradient));
         information += terms.information;
         gradient += terms.gradient;
@@ -208,8 +208,7 @@ fn sample<'a>(scene: &Scene, guess: &Noise, labels: &'a [Label]) -> Vec<&'a Labe
 /// Squared residuals of a label in sigmas, shared errors taken out, a residual.
 fn misfit(scene: &Scene, noise: &Noise, label: &Label) -> f64 {
     let passes = by_pass(scene, &label.voters);
-    let ones = vec![1.0; label.voters.len()];
-    let squares = passes.filter_map(|pass| pass_terms(scene, noise, pass, &ones[..pass.len()], &label.estimate.point));
+    let squares = passes.filter_map(|pass| pass_terms(scene, noise, pass, &label.estimate.point));
     squares.map(|terms| terms.square).sum::<f64>() / label.voters.len() as f64
 }
 
@@ -218,9 +217,8 @@ fn misfit(scene: &Scene, noise: &Noise, label: &Label) -> f64 {
 fn minus_log_likelihood(scene: &Scene, noise: &Noise, voters: &[u32], point: &Vector3<f64>) -> f64 {
     let (mut information, mut gradient) = (Matrix3::zeros(), Vector3::zeros());
     let mut value = 0.0;
-    let ones = vec![1.0; voters.len()];
     for pass in by_pass(scene, voters) {
-        let Some(terms) = pass_terms(scene, noise, pass, &ones[..pass.len()], point) else { return 0.0 };
+        let Some(terms) = pass_terms(scene, noise, pass, point) else { return 0.0 };
         information += terms.information;
         gradient += terms.gradient;
         value += terms.square + terms.log_determinant;

@@ -57,17 +57,19 @@ pub fn estimate(
 ) -> Option<Estimate> {
     let mut point = start;
     let mut weights = vec![1.0; voters.len()];
+    let mut information = Matrix3::zeros();
     for _ in 0..MAX_ITERATIONS {
-        let (information, gradient) = normal_equations(scene, noise, voters, &weights, &point)?;
-        let step = -information.cholesky()?.solve(&gradient);
+        let here = Evaluation::at(scene, noise, voters, &weights, &point)?;
+        let step = -here.information.cholesky()?.solve(&here.gradient);
         point += step * (LONGEST_STEP_M / step.norm()).min(1.0);
-        let own = own_chi2(scene, noise, voters, &weights, &point)?;
-        weights = own.iter().map(|chi2| (HUBER_SIGMAS / chi2.sqrt()).min(1.0)).collect();
+        weights = here.own.iter().map(|chi2| (HUBER_SIGMAS / chi2.sqrt()).min(1.0)).collect();
+        information = here.information;
         if step.norm() < tolerance_m {
             break;
         }
     }
-    let (information, _) = normal_equations(scene, noise, voters, &weights, &point)?;
+    // The last step may have gone behind a voter.
+    voters.iter().all(|&ray| scene.ray(ray).project(&point).z > 0.0).then_some(())?;
     Some(Estimate { point, covariance: information.cholesky()?.inverse() })
 }
 
@@ -76,53 +78,52 @@ pub fn estimate(
 ///
 /// `voters` must be ordered by pass. Nothing if the point is behind one of them.
 #[must_use]
-pub fn own_chi2(
-    scene: &Scene,
-    noise: &Noise,
-    voters: &[u32],
-    weights: &[f64],
-    point: &Vector3<f64>,
-) -> Option<Vec<f64>> {
-    let mut residuals = Vec::with_capacity(voters.len());
-    let mut information = Matrix3::zeros();
-    let mut done = 0;
-    for pass in by_pass(scene, voters) {
-        let sums = PassSums::of(scene, noise, pass, &weights[done..done + pass.len()], point)?;
-        done += pass.len();
-        information += sums.information;
-        let shared = -sums.of_shared.cholesky()?.solve(&sums.shared_gradient);
-        for &ray in pass {
-            let look = Look::of(scene, noise, ray, point)?;
-            let left = [0, 1].map(|i| look.residual[i] + look.by_shared[i].dot(&shared));
-            residuals.push((Vector2::from(left), look));
-        }
-    }
-    let covariance = information.cholesky()?.inverse();
-    let of_voter = |((left, look), weight): ((Vector2<f64>, Look), &f64)| {
-        let pull = |i: usize, k: usize| weight * look.by_point[i].dot(&(covariance * look.by_point[k]));
-        let pulled = Matrix2::new(pull(0, 0), pull(0, 1), pull(1, 0), pull(1, 1));
-        let expected = Matrix2::from_diagonal_element(look.variance * (1.0 + LEAST_FREEDOM)) - pulled;
-        expected.cholesky().map_or(f64::INFINITY, |cholesky| left.dot(&cholesky.solve(&left)))
-    };
-    Some(residuals.into_iter().zip(weights).map(of_voter).collect())
+pub fn own_chi2(scene: &Scene, noise: &Noise, voters: &[u32], point: &Vector3<f64>) -> Option<Vec<f64>> {
+    Some(Evaluation::at(scene, noise, voters, &vec![1.0; voters.len()], point)?.own)
 }
 
-fn normal_equations(
-    scene: &Scene,
-    noise: &Noise,
-    voters: &[u32],
-    weights: &[f64],
-    point: &Vector3<f64>,
-) -> Option<(Matrix3<f64>, Vector3<f64>)> {
-    let mut sum = (Matrix3::zeros(), Vector3::zeros());
-    let mut done = 0;
-    for pass in by_pass(scene, voters) {
-        let terms = pass_terms(scene, noise, pass, &weights[done..done + pass.len()], point)?;
-        done += pass.len();
-        sum.0 += terms.information;
-        sum.1 += terms.gradient;
+/// The normal equations of all voters at a point, and how well each fits.
+struct Evaluation {
+    information: Matrix3<f64>,
+    gradient: Vector3<f64>,
+    /// See [`own_chi2`].
+    own: Vec<f64>,
+}
+
+impl Evaluation {
+    fn at(scene: &Scene, noise: &Noise, voters: &[u32], weights: &[f64], point: &Vector3<f64>) -> Option<Self> {
+        let looks = looks_at(scene, noise, voters, point)?;
+        let (mut information, mut gradient) = (Matrix3::zeros(), Vector3::zeros());
+        let mut alone = Matrix3::zeros();
+        let mut left: Vec<Vector2<f64>> = Vec::with_capacity(voters.len());
+        for pass in by_pass(scene, voters) {
+            let range = left.len()..left.len() + pass.len();
+            let sums = PassSums::of(&looks[range.clone()], &weights[range.clone()]);
+            let terms = sums.terms()?;
+            information += terms.information;
+            gradient += terms.gradient;
+            alone += sums.information;
+            let shared = -sums.of_shared.cholesky()?.solve(&sums.shared_gradient);
+            let of_look =
+                |look: &Look| Vector2::from([0, 1].map(|i| look.residual[i] + look.by_shared[i].dot(&shared)));
+            left.extend(looks[range].iter().map(of_look));
+        }
+        let covariance = alone.cholesky()?.inverse();
+        let own = looks.iter().zip(weights).zip(&left).map(|((look, weight), left)| {
+            let pull = |i: usize, k: usize| weight * look.by_point[i].dot(&(covariance * look.by_point[k]));
+            let pulled = Matrix2::new(pull(0, 0), pull(0, 1), pull(1, 0), pull(1, 1));
+            let expected = Matrix2::from_diagonal_element(look.variance * (1.0 + LEAST_FREEDOM)) - pulled;
+            expected.cholesky().map_or(f64::INFINITY, |cholesky| left.dot(&cholesky.solve(left)))
+        });
+        let own = own.collect();
+        let (by_range, by_range_gradient) = range_terms(scene, voters, point);
+        Some(Self { information: information + by_range, gradient: gradient + by_range_gradient, own })
     }
-    // A measured range is one more observation of its voter, along the viewing direction.
+}
+
+/// Information and gradient of measured ranges: each is one more observation of its voter, along the viewing direction.
+fn range_terms(scene: &Scene, voters: &[u32], point: &Vector3<f64>) -> (Matrix3<f64>, Vector3<f64>) {
+    let mut sum = (Matrix3::zeros(), Vector3::zeros());
     for &ray in voters {
         let (range, sigma) = (scene.range_m[ray as usize], scene.range_sigma_m[ray as usize]);
         if range.is_finite() && sigma.is_finite() {
@@ -134,7 +135,7 @@ fn normal_equations(
             sum.1 += direction * (weight * residual);
         }
     }
-    Some(sum)
+    sum
 }
 
 /// Voters in runs of one pass.
@@ -144,23 +145,12 @@ pub fn by_pass<'a>(scene: &'a Scene, voters: &'a [u32]) -> impl Iterator<Item = 
 
 /// The terms of the voters of one pass at a point; nothing if it is behind one of them.
 #[must_use]
-pub fn pass_terms(
-    scene: &Scene,
-    noise: &Noise,
-    voters: &[u32],
-    weights: &[f64],
-    point: &Vector3<f64>,
-) -> Option<PassTerms> {
-    let sums = PassSums::of(scene, noise, voters, weights, point)?;
-    let cholesky = sums.of_shared.cholesky()?;
-    let solved = cholesky.solve(&sums.shared_gradient);
-    let shared_log_determinant = 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
-    Some(PassTerms {
-        information: sums.information - sums.cross * cholesky.solve(&sums.cross.transpose()),
-        gradient: sums.gradient - sums.cross * solved,
-        square: sums.square - sums.shared_gradient.dot(&solved),
-        log_determinant: sums.log_determinant + shared_log_determinant,
-    })
+pub fn pass_terms(scene: &Scene, noise: &Noise, voters: &[u32], point: &Vector3<f64>) -> Option<PassTerms> {
+    PassSums::of(&looks_at(scene, noise, voters, point)?, &vec![1.0; voters.len()]).terms()
+}
+
+fn looks_at(scene: &Scene, noise: &Noise, voters: &[u32], point: &Vector3<f64>) -> Option<Vec<Look>> {
+    voters.iter().map(|&ray| Look::of(scene, noise, ray, point)).collect()
 }
 
 /// One voter's residual at a point, with its derivatives.
@@ -201,7 +191,7 @@ struct PassSums {
 }
 
 impl PassSums {
-    fn of(scene: &Scene, noise: &Noise, voters: &[u32], weights: &[f64], point: &Vector3<f64>) -> Option<Self> {
+    fn of(looks: &[Look], weights: &[f64]) -> Self {
         let mut sums = Self {
             information: Matrix3::zeros(),
             gradient: Vector3::zeros(),
@@ -211,8 +201,7 @@ impl PassSums {
             square: 0.0,
             log_determinant: 0.0,
         };
-        for (&ray, robust_weight) in voters.iter().zip(weights) {
-            let look = Look::of(scene, noise, ray, point)?;
+        for (look, robust_weight) in looks.iter().zip(weights) {
             let weight = robust_weight / look.variance;
             sums.log_determinant += 2.0 * look.variance.ln();
             for i in 0..2 {
@@ -225,6 +214,19 @@ impl PassSums {
                 sums.square += r * r * weight;
             }
         }
-        Some(sums)
+        sums
+    }
+
+    /// What is left about the point when the shared errors are marginalised: Schur complement.
+    fn terms(&self) -> Option<PassTerms> {
+        let cholesky = self.of_shared.cholesky()?;
+        let solved = cholesky.solve(&self.shared_gradient);
+        let shared_log_determinant = 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
+        Some(PassTerms {
+            information: self.information - self.cross * cholesky.solve(&self.cross.transpose()),
+            gradient: self.gradient - self.cross * solved,
+            square: self.square - self.shared_gradient.dot(&solved),
+            log_determinant: self.log_determinant + shared_log_determinant,
+        })
     }
 }

@@ -54,7 +54,7 @@ pub fn from_voters(
     let class = scene.rays.class[*voters.first()? as usize];
     let mut found = estimate(scene, noise, &voters, start, tolerance_m)?;
     for _ in 0..MAX_TRIMS {
-        let own = own_chi2(scene, noise, &voters, &vec![1.0; voters.len()], &found.point)?;
+        let own = own_chi2(scene, noise, &voters, &found.point)?;
         let limit = gate_sigmas * gate_sigmas;
         if own.iter().all(|&chi2| chi2 < limit) {
             break;

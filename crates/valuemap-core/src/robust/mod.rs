@@ -63,6 +63,9 @@ const ROUNDS: usize = 3;
 /// Labels are dropped below these multiples of the probability that is asked for, one after the other.
 const DOUBTS: [f64; 4] = [1e-5, 1e-2, 0.3, 1.0];
 
+/// Rounds of dropping and giving back at each of them, at most.
+const MAX_DOUBT_ROUNDS: usize = 6;
+
 /// A label with what speaks for it.
 #[derive(Debug, Clone)]
 pub struct Finding {
@@ -194,11 +197,12 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
     let lookout = Lookout::new(scene);
     let min_votes = settings.min_votes as usize;
     let (mut fused, mut outvoted, mut doubted) = (0, 0, 0);
-    let mut compete = |labels: Vec<Label>| {
+    let mut compete = |labels: Vec<Label>, may_split: bool| {
         let before = labels.len();
         let labels = settle::reassign(scene, noise, &index, &labels, range_m, min_votes);
         let left = labels.len();
-        let labels = settle::split(scene, noise, settings.gate_sigmas, labels, min_votes);
+        let labels =
+            if may_split { settle::split(scene, noise, settings.gate_sigmas, labels, min_votes) } else { labels };
         let labels = settle::fuse(scene, noise, settings.gate_sigmas, labels);
         outvoted += (before - left) as u64;
         fused += left.saturating_sub(labels.len()) as u64;
@@ -206,11 +210,11 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
     };
     for _ in 0..3 {
         progress.check()?;
-        labels = compete(labels);
+        labels = compete(labels, true);
     }
     // The least probable first: what they give back may be just what a doubtful one lacks.
     for doubt in DOUBTS.map(|doubt| doubt * settings.min_existence) {
-        loop {
+        for _ in 0..MAX_DOUBT_ROUNDS {
             progress.check()?;
             let (judged, ..) = judge(scene, &spreads, &lookout, &labels, settings);
             let before = labels.len();
@@ -220,7 +224,7 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
             if labels.len() == before {
                 break;
             }
-            labels = compete(labels);
+            labels = compete(labels, false);
         }
     }
     let (judged, rates, strays_per_image) = judge(scene, &spreads, &lookout, &labels, settings);
