@@ -168,8 +168,11 @@ def test_covariance_is_that_of_the_scatter(method: Literal["robust", "paper"]) -
             Dataset(**{**vars(base), "detections": base.detections.replace(center_px=noisy)}), config
         )
         assert len(result.labels) == 1
+        if result.labels.votes[0] < len(base.detections):
+            continue  # The robust method left a voter out: another estimator, with another scatter.
         points.append(result.labels.position_in_world_m[0])
         covariances.append(result.labels.covariance_m2[0])
+    assert len(points) > 380
     xx, xy, xz, yy, yz, zz = np.mean(covariances, axis=0)
     expected = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     whitened = np.linalg.inv(np.linalg.cholesky(expected)) @ np.cov(np.array(points).T)
