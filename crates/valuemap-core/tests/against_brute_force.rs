@@ -4,6 +4,7 @@
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;
+use proptest::test_runner::RngSeed;
 use valuemap_core::ballot::Ballot;
 use valuemap_core::hypothesis::{Viability, propose};
 use valuemap_core::kernel::{Gate, Gates, LANES, instruction_sets};
@@ -69,8 +70,13 @@ fn rays_of_images(count: std::ops::Range<usize>) -> impl Strategy<Value = (Vec<R
     })
 }
 
+/// The same cases in every run.
+fn config() -> ProptestConfig {
+    ProptestConfig { cases: 64, failure_persistence: None, rng_seed: RngSeed::Fixed(1), ..ProptestConfig::default() }
+}
+
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
+    #![proptest_config(config())]
 
     #[test]
     fn rays_pass_through_their_targets(target in point(), center in point(), tilt in -0.5..0.5, turn in -0.5..0.5) {
@@ -149,8 +155,13 @@ proptest! {
                 if cosine >= viability.min_parallax_rad.cos() {
                     continue;
                 }
-                let start = midpoint(&rays[a], &rays[b]).unwrap();
-                let Some(point) = refine(&[&rays[a], &rays[b]].into_iter(), start) else { continue };
+                // The middle may lie behind a camera though the best point does not: several starts, the best counts.
+                let along = [2.0, 10.0, 30.0, 60.0].map(|depth| rays[a].center + rays[a].direction * depth);
+                let starts = midpoint(&rays[a], &rays[b]).into_iter().chain(along);
+                let pair = [&rays[a], &rays[b]];
+                let cost = |point: &Vector3<f64>| pair.iter().map(|ray| ray.squared_error(point)).sum::<f64>();
+                let ends = starts.filter_map(|start| refine(&pair.into_iter(), start));
+                let Some(point) = ends.min_by(|p, q| cost(p).total_cmp(&cost(q))) else { continue };
                 let errors = [a, b].map(|r| rays[r].squared_error(&point));
                 let ranges = [a, b].map(|r| (point - rays[r].center).norm());
                 if errors.iter().all(|&e| e < error * error) && ranges.iter().all(|r| (1.0..=60.0).contains(r)) {
