@@ -12,7 +12,7 @@ import numpy as np
 import valuemap._core as _core
 from valuemap.cameras import Rays, camera_centers, picture_bounds, rotation_matrices
 from valuemap.config import MapConfig, NoiseConfig
-from valuemap.dataset import Dataset
+from valuemap.dataset import Dataset, rows_of
 from valuemap.progress import Progress, silent
 from valuemap.tables import Candidates, Floats
 
@@ -66,7 +66,7 @@ class Scene:
             range_sigma_m=_or_nan(detections.range_sigma_m, len(detections)),
             center_in_world_m=np.ascontiguousarray(camera_centers(images)),
             cam_from_world=rotation_matrices(images),
-            camera=np.searchsorted(self._dataset.cameras.camera_id, images.camera_id).astype(np.uint32),
+            camera=rows_of(images.camera_id, self._dataset.cameras.camera_id).astype(np.uint32),
             pass_code=images.pass_id.codes.astype(np.uint32),
             position_sigma_m=_or_nan(images.position_sigma_m, len(images)),
             rotation_sigma_rad=_or_nan(images.rotation_sigma_rad, len(images)),

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from valuemap.cameras import camera_centers
-from valuemap.dataset import Dataset, Frame
+from valuemap.dataset import Dataset, Frame, rows_of
 from valuemap.map_folder import Map
 from valuemap.tables import Categories, Floats, Ints
 
@@ -15,7 +15,7 @@ from valuemap.tables import Categories, Floats, Ints
 def summarize_dataset(dataset: Dataset) -> dict[str, Any]:
     """Return the facts of a dataset by name, ready for JSON."""
     images, detections = dataset.images, dataset.detections
-    detections_of_image = np.bincount(np.searchsorted(images.image_id, detections.image_id), minlength=len(images))
+    detections_of_image = np.bincount(rows_of(detections.image_id, images.image_id), minlength=len(images))
     facts: dict[str, Any] = {
         "dataset": dataset.name,
         "frame": _frame(dataset.frame),

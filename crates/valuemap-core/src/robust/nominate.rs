@@ -109,15 +109,15 @@ impl<'a> Booth<'a> {
         let words = self.gates.words();
         let (mut maybe, mut sure) = (vec![0; points.len() * words], vec![0; points.len() * words]);
         self.gates.test(&points, &mut maybe, &mut sure);
-        let mut best: Option<(f64, u32, usize)> = None;
+        let mut best: Option<(f64, usize)> = None;
         for (i, point) in points.iter().enumerate() {
             let row = i * words..(i + 1) * words;
             let (votes, support) = self.support(ray, point, &maybe[row]);
-            if votes >= 2 && best.is_none_or(|(most, ..)| support > most) {
-                best = Some((support, votes, i));
+            if votes >= 2 && best.is_none_or(|(most, _)| support > most) {
+                best = Some((support, i));
             }
         }
-        best.map(|(support, _, i)| Nomination {
+        best.map(|(support, i)| Nomination {
             point: points[i] + self.origin,
             rays: [ray, self.partners[meetings[i].1]],
             support,
