@@ -1,14 +1,11 @@
-//! A label in the making: polished until its voters agree with it.
+//! A label in the making: a point, the rays that support it, and the side it is seen from.
 
 use nalgebra::Vector3;
 
 use super::estimate::{Estimate, estimate, own_chi2};
-use super::index::{Hit, RayIndex};
 use super::noise::Noise;
 use super::scene::Scene;
 
-/// Rounds of estimating and gathering voters again, at most.
-const MAX_ROUNDS: usize = 5;
 /// Good enough while voters are still being gathered, m.
 pub const ROUGH_M: f64 = 5e-3;
 /// Good enough for good, m.
@@ -87,37 +84,4 @@ impl Label {
         let cosine = direction_to(scene, ray, &self.estimate.point).dot(&self.side) / length;
         length < ONE_SIDED || cosine > SIDE_COSINE
     }
-}
-
-/// Estimate a point on its voters and gather voters from the estimate, until they stay the same.
-///
-/// Nothing if fewer than `min_votes` remain.
-#[must_use]
-pub fn polish(
-    noise: &Noise,
-    index: &RayIndex<'_>,
-    start: Vector3<f64>,
-    class: u32,
-    range_m: f64,
-    min_votes: usize,
-    keep: &dyn Fn(u32) -> bool,
-) -> Option<Label> {
-    let scene = index.scene();
-    let rays = |hits: Vec<Hit>| hits.iter().map(|hit| hit.ray).collect::<Vec<u32>>();
-    let mut gathered = rays(index.hits(&start, class, range_m, keep));
-    let mut point = start;
-    for _ in 0..MAX_ROUNDS {
-        if gathered.len() < min_votes {
-            return None;
-        }
-        let label = from_voters(scene, noise, index.gate_sigmas(), gathered.clone(), point, ROUGH_M)?;
-        let again = rays(index.hits(&label.estimate.point, class, range_m, keep));
-        if again == gathered {
-            return (label.voters.len() >= min_votes).then_some(label);
-        }
-        point = label.estimate.point;
-        gathered = again;
-    }
-    let label = from_voters(scene, noise, index.gate_sigmas(), gathered, point, ROUGH_M)?;
-    (label.voters.len() >= min_votes).then_some(label)
 }

@@ -2,8 +2,8 @@
 //!
 //! 1. [`noise`]: a pose-aware gate in sigmas instead of a radius in pixels.
 //! 2. [`nominate`](mod@nominate): each ray meets few partners ([`sample`]) and nominates the point that a sample of images supports best.
-//! 3. [`label`]: the best supported nomination is polished, on its voters and from its estimate, until the voters stay
-//!    the same; its voters leave; and so on. Rays that are left over get further rounds among themselves.
+//! 3. [`gather`](mod@gather): the best supported nomination is polished to a [`label`], on its voters and from its estimate,
+//!    until the voters stay the same; its voters leave; and so on. Rays left over get further rounds among themselves.
 //! 4. [`settle`]: all labels compete for all detections; labels that agree within their covariances and are never
 //!    seen side by side become one.
 //! 5. [`existence`]: hits and misses among the looks that should have seen it say how probable a label is.
@@ -13,6 +13,7 @@
 pub mod calibrate;
 pub mod estimate;
 pub mod existence;
+pub mod gather;
 pub mod index;
 pub mod label;
 pub mod noise;
@@ -28,10 +29,10 @@ use crate::progress::{Halt, Progress};
 
 use calibrate::Known;
 use existence::{Lookout, Looks, Rates};
+use gather::{VOTE_RANGE, gather};
 use index::RayIndex;
-use label::{Label, polish};
+use label::Label;
 use noise::{Noise, Spread};
-use nominate::Nomination;
 use scene::Scene;
 
 /// Settings of the robust method.
@@ -47,18 +48,12 @@ pub struct Settings {
     pub min_existence: f64,
 }
 
-/// Detections this many times farther than the farthest proposed point still vote.
-const VOTE_RANGE: f64 = 2.5;
 /// Rays of the places that the noise is estimated from, about.
 const CALIBRATION_RAYS: usize = 20_000;
 /// How much wider the gate is while the noise is estimated: what a gate cuts off is missing in the estimate.
 const CALIBRATION_GATE: f64 = 1.4;
 /// Times that the noise is estimated anew, from labels found with the last estimate.
 const CALIBRATION_ROUNDS: usize = 3;
-/// Nominations that are polished side by side.
-const BATCH: usize = 64;
-/// Rounds of nominations, each among the rays that the rounds before left over.
-const ROUNDS: usize = 3;
 
 /// Labels are dropped below these multiples of the probability that is asked for, one after the other.
 const DOUBTS: [f64; 4] = [1e-5, 1e-2, 0.3, 1.0];
@@ -120,68 +115,6 @@ pub fn self_calibrate(
         noise = calibrate::calibrate(scene, &noise, &labels, known);
     }
     Ok(noise)
-}
-
-/// Find labels among some rays (ascending) with a given noise, round after round, and count nominations and labels.
-///
-/// # Errors
-/// [`Halt::Cancelled`] when `progress` says so.
-pub fn gather(
-    scene: &Scene,
-    noise: &Noise,
-    settings: &Settings,
-    rays: &[u32],
-    progress: &Progress,
-) -> Result<(Vec<Label>, [u64; 2]), Halt> {
-    let spreads = spreads_of(scene, noise);
-    let range_m = settings.viability.max_range_m * VOTE_RANGE;
-    let min_votes = settings.min_votes as usize;
-    let mut labels: Vec<Label> = Vec::new();
-    let mut claimed = vec![false; scene.rays.rays.len()];
-    let mut counts = [0_u64; 2];
-    for _ in 0..ROUNDS {
-        let free: Vec<u32> = rays.iter().copied().filter(|&ray| !claimed[ray as usize]).collect();
-        let mut nominations =
-            nominate::nominate(scene, &spreads, settings.gate_sigmas, &settings.viability, &free, progress)?;
-        nominations.sort_by(|a, b| b.support.total_cmp(&a.support).then(a.rays.cmp(&b.rays)));
-        counts[0] += nominations.len() as u64;
-        let index = RayIndex::new(scene, &spreads, settings.gate_sigmas, free.into_iter());
-        let before = labels.len();
-        // The best nominations of all places are polished side by side; where two claim the same ray, the better one
-        // has it, and the other is polished again on what is left.
-        for batch in nominations.chunks(BATCH) {
-            progress.check()?;
-            let polish_one = |nomination: &Nomination, claimed: &[bool]| {
-                if nomination.rays.iter().any(|&ray| claimed[ray as usize]) {
-                    return None;
-                }
-                let class = scene.rays.class[nomination.rays[0] as usize];
-                let keep = |ray: u32| !claimed[ray as usize];
-                polish(noise, &index, nomination.point, class, range_m, min_votes, &keep)
-            };
-            let polished: Vec<Option<Label>> =
-                batch.par_iter().map(|nomination| polish_one(nomination, &claimed)).collect();
-            for (nomination, label) in batch.iter().zip(polished) {
-                let is_free = |label: &Label| label.voters.iter().all(|&ray| !claimed[ray as usize]);
-                let settled = match label {
-                    Some(label) if !is_free(&label) => polish_one(nomination, &claimed),
-                    label => label,
-                };
-                if let Some(label) = settled {
-                    for &ray in &label.voters {
-                        claimed[ray as usize] = true;
-                    }
-                    labels.push(label);
-                }
-            }
-        }
-        if labels.len() == before {
-            break;
-        }
-    }
-    counts[1] = labels.len() as u64;
-    labels.sort_by_key(settle::first_voter);
-    Ok((labels, counts))
 }
 
 /// Find the labels of a scene with a known noise.

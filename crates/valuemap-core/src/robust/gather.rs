@@ -1,0 +1,118 @@
+//! Gathering: the best supported nomination is polished, on its voters and from its estimate, until the voters stay the
+//! same; its voters leave; and so on. Rays that are left over get further rounds among themselves.
+
+use nalgebra::Vector3;
+use rayon::prelude::*;
+
+use super::index::{Hit, RayIndex};
+use super::label::{Label, ROUGH_M, from_voters};
+use super::noise::Noise;
+use super::nominate::{self, Nomination};
+use super::scene::Scene;
+use super::settle;
+use super::{Settings, spreads_of};
+use crate::progress::{Halt, Progress};
+
+/// Detections this many times farther than the farthest proposed point still vote.
+pub const VOTE_RANGE: f64 = 2.5;
+/// Nominations that are polished side by side.
+const BATCH: usize = 64;
+/// Rounds of nominations, each among the rays that the rounds before left over.
+const ROUNDS: usize = 3;
+/// Rounds of estimating and gathering voters again, at most.
+const MAX_ROUNDS: usize = 5;
+
+/// Find labels among some rays (ascending) with a given noise, round after round, and count nominations and labels.
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn gather(
+    scene: &Scene,
+    noise: &Noise,
+    settings: &Settings,
+    rays: &[u32],
+    progress: &Progress,
+) -> Result<(Vec<Label>, [u64; 2]), Halt> {
+    let spreads = spreads_of(scene, noise);
+    let range_m = settings.viability.max_range_m * VOTE_RANGE;
+    let min_votes = settings.min_votes as usize;
+    let mut labels: Vec<Label> = Vec::new();
+    let mut claimed = vec![false; scene.rays.rays.len()];
+    let mut counts = [0_u64; 2];
+    for _ in 0..ROUNDS {
+        let free: Vec<u32> = rays.iter().copied().filter(|&ray| !claimed[ray as usize]).collect();
+        let mut nominations =
+            nominate::nominate(scene, &spreads, settings.gate_sigmas, &settings.viability, &free, progress)?;
+        nominations.sort_by(|a, b| b.support.total_cmp(&a.support).then(a.rays.cmp(&b.rays)));
+        counts[0] += nominations.len() as u64;
+        let index = RayIndex::new(scene, &spreads, settings.gate_sigmas, free.into_iter());
+        let before = labels.len();
+        // The best nominations of all places are polished side by side; where two claim the same ray, the better one
+        // has it, and the other is polished again on what is left.
+        for batch in nominations.chunks(BATCH) {
+            progress.check()?;
+            let polish_one = |nomination: &Nomination, claimed: &[bool]| {
+                if nomination.rays.iter().any(|&ray| claimed[ray as usize]) {
+                    return None;
+                }
+                let class = scene.rays.class[nomination.rays[0] as usize];
+                let keep = |ray: u32| !claimed[ray as usize];
+                polish(noise, &index, nomination.point, class, range_m, min_votes, &keep)
+            };
+            let polished: Vec<Option<Label>> =
+                batch.par_iter().map(|nomination| polish_one(nomination, &claimed)).collect();
+            for (nomination, label) in batch.iter().zip(polished) {
+                let is_free = |label: &Label| label.voters.iter().all(|&ray| !claimed[ray as usize]);
+                let settled = match label {
+                    Some(label) if !is_free(&label) => polish_one(nomination, &claimed),
+                    label => label,
+                };
+                if let Some(label) = settled {
+                    for &ray in &label.voters {
+                        claimed[ray as usize] = true;
+                    }
+                    labels.push(label);
+                }
+            }
+        }
+        if labels.len() == before {
+            break;
+        }
+    }
+    counts[1] = labels.len() as u64;
+    labels.sort_by_key(settle::first_voter);
+    Ok((labels, counts))
+}
+
+/// Estimate a point on its voters and gather voters from the estimate, until they stay the same.
+///
+/// Nothing if fewer than `min_votes` remain.
+#[must_use]
+fn polish(
+    noise: &Noise,
+    index: &RayIndex<'_>,
+    start: Vector3<f64>,
+    class: u32,
+    range_m: f64,
+    min_votes: usize,
+    keep: &dyn Fn(u32) -> bool,
+) -> Option<Label> {
+    let scene = index.scene();
+    let rays = |hits: Vec<Hit>| hits.iter().map(|hit| hit.ray).collect::<Vec<u32>>();
+    let mut gathered = rays(index.hits(&start, class, range_m, keep));
+    let mut point = start;
+    for _ in 0..MAX_ROUNDS {
+        if gathered.len() < min_votes {
+            return None;
+        }
+        let label = from_voters(scene, noise, index.gate_sigmas(), gathered.clone(), point, ROUGH_M)?;
+        let again = rays(index.hits(&label.estimate.point, class, range_m, keep));
+        if again == gathered {
+            return (label.voters.len() >= min_votes).then_some(label);
+        }
+        point = label.estimate.point;
+        gathered = again;
+    }
+    let label = from_voters(scene, noise, index.gate_sigmas(), gathered, point, ROUGH_M)?;
+    (label.voters.len() >= min_votes).then_some(label)
+}
