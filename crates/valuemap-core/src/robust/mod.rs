@@ -10,14 +10,18 @@
 //! 6. [`estimate`](mod@estimate): position and covariance, with pose errors that a pass shares.
 //! 7. [`calibrate`](mod@calibrate): the noise itself is estimated from the labels' residuals.
 
+pub mod associate;
 pub mod calibrate;
+pub mod drift;
 pub mod estimate;
+pub mod exchange;
 pub mod existence;
 pub mod gather;
 pub mod index;
 pub mod label;
 pub mod noise;
 pub mod nominate;
+pub mod poses;
 pub mod sample;
 pub mod scene;
 pub mod settle;
@@ -132,6 +136,7 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
     let (mut fused, mut outvoted, mut doubted) = (0, 0, 0);
     let mut compete = |labels: Vec<Label>, may_split: bool| {
         let before = labels.len();
+        let labels = exchange::exchange(scene, noise, settings.gate_sigmas, labels);
         let labels = settle::reassign(scene, noise, &index, &labels, range_m, min_votes);
         let left = labels.len();
         let labels =
@@ -141,7 +146,7 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
         fused += left.saturating_sub(labels.len()) as u64;
         labels
     };
-    for _ in 0..3 {
+    for _ in 0..4 {
         progress.check()?;
         labels = compete(labels, true);
     }

@@ -3,7 +3,7 @@
 //! `sigma² = sigma_px² + (f sigma_position / depth)² + (f sigma_rotation)²`: a pose error of 0.1 m is 1 px at 40 m and
 //! 8 px at 5 m, so no single radius in pixels fits.
 
-use super::scene::Scene;
+use super::scene::{Scene, View};
 use crate::kernel::Gate;
 
 /// Standard deviations of everything that moves a detection off its object.
@@ -55,7 +55,7 @@ impl Noise {
     #[must_use]
     pub fn total(&self, scene: &Scene, ray: u32) -> Spread {
         let own = self.own(scene, ray);
-        let (position, rotation) = self.shared(scene, ray);
+        let (position, rotation) = self.shared(scene.view(ray));
         let scale2 = scene.scale2[ray as usize];
         Spread {
             far_px2: own.far_px2 + scale2 * rotation * rotation,
@@ -66,21 +66,33 @@ impl Noise {
     /// The spread of the errors that a ray does not share with others of its pass.
     #[must_use]
     pub fn own(&self, scene: &Scene, ray: u32) -> Spread {
-        let view = scene.view(ray);
+        let (position, rotation) = self.of_image(scene.view(ray));
         let scale2 = scene.scale2[ray as usize];
-        let of_box = self.box_share * scene.box_px[ray as usize];
-        let position = known_share(view.position_sigma_m, self.position_m, self.position_drift_m);
-        let rotation = known_share(view.rotation_sigma_rad, self.rotation_rad, self.rotation_drift_rad);
         Spread {
-            far_px2: self.detection_px * self.detection_px + of_box * of_box + scale2 * rotation * rotation,
+            far_px2: self.detection_px2(scene, ray) + scale2 * rotation * rotation,
             near_px2: scale2 * position * position,
         }
     }
 
-    /// Standard deviations of position (m) and rotation (rad) that a ray shares with its pass.
+    /// Variance of a detection alone, each axis, px².
     #[must_use]
-    pub fn shared(&self, scene: &Scene, ray: u32) -> (f64, f64) {
-        let view = scene.view(ray);
+    pub fn detection_px2(&self, scene: &Scene, ray: u32) -> f64 {
+        let of_box = self.box_share * scene.box_px[ray as usize];
+        self.detection_px * self.detection_px + of_box * of_box
+    }
+
+    /// Standard deviations of position (m) and rotation (rad) that an image has for itself.
+    #[must_use]
+    pub fn of_image(&self, view: &View) -> (f64, f64) {
+        (
+            known_share(view.position_sigma_m, self.position_m, self.position_drift_m),
+            known_share(view.rotation_sigma_rad, self.rotation_rad, self.rotation_drift_rad),
+        )
+    }
+
+    /// Standard deviations of position (m) and rotation (rad) that an image shares with its pass.
+    #[must_use]
+    pub fn shared(&self, view: &View) -> (f64, f64) {
         (
             known_share(view.position_sigma_m, self.position_drift_m, self.position_m),
             known_share(view.rotation_sigma_rad, self.rotation_drift_rad, self.rotation_rad),

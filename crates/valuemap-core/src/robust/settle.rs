@@ -5,6 +5,7 @@ use rayon::prelude::*;
 use rstar::RTree;
 use rstar::primitives::GeomWithData;
 
+use super::associate::{Verdict, associate};
 use super::calibrate::variance_factor;
 use super::index::RayIndex;
 use super::label::{EXACT_M, Label, direction_to, from_voters};
@@ -34,63 +35,17 @@ pub fn reassign(
     range_m: f64,
     min_votes: usize,
 ) -> Vec<Label> {
-    let claims: Vec<Vec<Claim>> = labels
-        .par_iter()
-        .enumerate()
-        .map(|(number, label)| {
-            index
-                .all_hits(&label.estimate.point, label.class, range_m)
-                .into_iter()
-                .filter(|hit| label.faces(scene, hit.ray))
-                .map(|hit| Claim { image: hit.image, chi2: hit.chi2, label: number as u32, ray: hit.ray })
-                .collect()
-        })
-        .collect();
-    let mut claims: Vec<Claim> = claims.into_iter().flatten().collect();
-    claims.par_sort_unstable_by(|a, b| {
-        a.image.cmp(&b.image).then(a.chi2.total_cmp(&b.chi2)).then((a.label, a.ray).cmp(&(b.label, b.ray)))
-    });
-    let mut voters: Vec<Vec<u32>> = vec![Vec::new(); labels.len()];
-    let mut undecided: Vec<Vec<u32>> = vec![Vec::new(); labels.len()];
-    let stronger = |a: &Claim, b: &Claim| {
-        let strength = |claim: &Claim| (labels[claim.label as usize].voters.len(), std::cmp::Reverse(claim.label));
-        strength(a) > strength(b)
-    };
-    for in_image in claims.chunk_by(|a, b| a.image == b.image) {
-        let mut granted: Vec<&Claim> = Vec::new();
-        for claim in in_image {
-            if !granted.iter().any(|o| o.ray == claim.ray || o.label == claim.label) {
-                granted.push(claim);
-            }
-        }
-        let idle = |claim: &&Claim| !granted.iter().any(|o| o.label == claim.label);
-        for winner in &granted {
-            voters[winner.label as usize].push(winner.ray);
-            if in_image.iter().filter(idle).any(|other| other.ray == winner.ray && stronger(other, winner)) {
-                undecided[winner.label as usize].push(winner.image);
-            }
-        }
-        for loser in in_image.iter().filter(idle) {
-            undecided[loser.label as usize].push(loser.image);
-        }
-    }
+    let verdicts = associate(scene, noise, index, labels, range_m);
     labels
         .par_iter()
-        .zip(voters.into_par_iter().zip(undecided))
-        .filter(|(_, (voters, _))| voters.len() >= min_votes)
-        .filter_map(|(label, (voters, undecided))| {
+        .zip(verdicts)
+        .filter(|(_, verdict)| verdict.voters.len() >= min_votes)
+        .filter_map(|(label, Verdict { voters, undecided })| {
             let found = from_voters(scene, noise, index.gate_sigmas(), voters, label.estimate.point, EXACT_M)?;
             Some(Label { undecided, ..found })
         })
         .filter(|label| label.voters.len() >= min_votes)
         .collect()
-}
-
-struct Claim {
-    image: u32,
-    chi2: f64,
-    label: u32,
-    ray: u32,
 }
 
 /// Make one of any two labels of a class whose positions agree within their covariances, unless their images say that

@@ -1,0 +1,265 @@
+//! Which detection shows which label: all labels compete for all detections, image by image.
+//!
+//! The labels in an image are off by its pose error together, so that error is estimated first, from the votes along
+//! the drive ([`poses`](super::poses)) and from the image's other detections; what is left of a residual tells two heads
+//! on one pole apart where the pose error is as large as their distance. Where several labels and detections could
+//! go together, the assignment with the least sum of costs wins (joint compatibility; the costs are those of maximum
+//! likelihood).
+
+use nalgebra::{Matrix2, SMatrix};
+use pathfinding::prelude::{Matrix, kuhn_munkres_min};
+use rayon::prelude::*;
+use rustc_hash::FxHashMap;
+
+use super::drift::Look;
+use super::estimate::{Estimate, by_pass, pass_terms};
+use super::index::RayIndex;
+use super::label::Label;
+use super::noise::Noise;
+use super::poses::{Belief, PoseError, legs, smooth};
+use super::scene::Scene;
+
+/// Times that the assignment of an image is made anew, with the pose error from the last one.
+const ROUNDS: usize = 3;
+/// Costs are whole numbers of this part, so that sums do not depend on their order.
+const COST_UNIT: f64 = 1e-6;
+/// Squared residuals beyond this many squared sigmas count less in the drift, in proportion to their root.
+const HUBER_CHI2: f64 = 4.0;
+
+/// How much of what the votes of a pass say about a label is left out when their pass is judged.
+const OTHERS_SHARE: f64 = 0.95;
+/// Farther than this the linear step to where the other passes put a label is not trusted, m.
+const LONGEST_STEP_M: f64 = 3.0;
+
+/// What an association says of one label.
+#[derive(Debug, Clone, Default)]
+pub struct Verdict {
+    /// Its rays.
+    pub voters: Vec<u32>,
+    /// Images that say nothing for or against it, see [`Label::undecided`].
+    pub undecided: Vec<u32>,
+}
+
+/// A detection that a label may have.
+struct Claim {
+    pass: u32,
+    image: u32,
+    label: u32,
+    ray: u32,
+    /// Squared residual over its variance, pose error and all.
+    chi2: f64,
+    is_vote: bool,
+}
+
+/// A claim as seen from its label: residual with derivatives, and the covariance of all but the pose error, px².
+struct Case<'a> {
+    claim: &'a Claim,
+    look: Look,
+    own: Matrix2<f64>,
+    /// What the label's own uncertainty adds to the variance, each axis, px².
+    label_px2: f64,
+}
+
+/// Give detections to labels, at most one an image and label.
+#[must_use]
+pub fn associate(scene: &Scene, noise: &Noise, index: &RayIndex<'_>, labels: &[Label], range_m: f64) -> Vec<Verdict> {
+    let of_labels: Vec<Vec<Claim>> = labels
+        .par_iter()
+        .enumerate()
+        .map(|(number, label)| claims_of(scene, index, number as u32, label, range_m))
+        .collect();
+    let mut claims: Vec<Claim> = of_labels.into_iter().flatten().collect();
+    claims.par_sort_unstable_by_key(|claim| (claim.pass, claim.image, claim.label, claim.ray));
+    let passes: Vec<&[Claim]> = claims.chunk_by(|a, b| a.pass == b.pass).collect();
+    let decided: Vec<Vec<Decision>> =
+        passes.par_iter().map(|pass| decide(scene, noise, labels, index.gate_sigmas().powi(2), pass)).collect();
+    let mut verdicts = vec![Verdict::default(); labels.len()];
+    for decision in decided.into_iter().flatten() {
+        match decision {
+            Decision::Vote { label, ray } => verdicts[label as usize].voters.push(ray),
+            Decision::Undecided { label, image } => verdicts[label as usize].undecided.push(image),
+        }
+    }
+    for verdict in &mut verdicts {
+        verdict.undecided.sort_unstable();
+    }
+    verdicts
+}
+
+fn claims_of(scene: &Scene, index: &RayIndex<'_>, number: u32, label: &Label, range_m: f64) -> Vec<Claim> {
+    let mut voters = label.voters.clone();
+    voters.sort_unstable();
+    let hits = index.all_hits(&label.estimate.point, label.class, range_m);
+    hits.into_iter()
+        .filter(|hit| label.faces(scene, hit.ray))
+        .map(|hit| Claim {
+            pass: scene.views[hit.image as usize].pass,
+            image: hit.image,
+            label: number,
+            ray: hit.ray,
+            chi2: hit.chi2,
+            is_vote: voters.binary_search(&hit.ray).is_ok(),
+        })
+        .collect()
+}
+
+enum Decision {
+    Vote { label: u32, ray: u32 },
+    Undecided { label: u32, image: u32 },
+}
+
+/// Decide the claims of one pass, ordered by image.
+fn decide(scene: &Scene, noise: &Noise, labels: &[Label], limit: f64, claims: &[Claim]) -> Vec<Decision> {
+    let pass = claims[0].pass;
+    let mut elsewhere: FxHashMap<u32, Estimate> = FxHashMap::default();
+    for claim in claims {
+        let label = &labels[claim.label as usize];
+        elsewhere.entry(claim.label).or_insert_with(|| estimate_elsewhere(scene, noise, label, pass));
+    }
+    let cases: Vec<Case<'_>> =
+        claims.iter().filter_map(|claim| Case::of(scene, noise, &elsewhere[&claim.label], claim)).collect();
+    let images: Vec<&[Case<'_>]> = cases.chunk_by(|a, b| a.claim.image == b.claim.image).collect();
+    let centers: Vec<_> = images.iter().map(|cases| cases[0].look.center).collect();
+    let leg_of = legs(&centers);
+    let starts: Vec<_> =
+        (0..images.len()).filter(|&i| i == 0 || leg_of[i] != leg_of[i - 1]).map(|i| centers[i]).collect();
+    let votes: Vec<Belief> = images.iter().map(|cases| belief_of_votes(cases)).collect();
+    let mut of_legs = vec![Belief::nothing(); starts.len()];
+    for (vote, &leg) in votes.iter().zip(&leg_of) {
+        of_legs[leg] = of_legs[leg].and(vote);
+    }
+    let smoothed = smooth(&starts, &of_legs);
+    let mut decisions = Vec::new();
+    for ((cases, vote), &leg) in images.iter().zip(&votes).zip(&leg_of) {
+        let view = &scene.views[cases[0].claim.image as usize];
+        // Its own votes are what is in question.
+        let pose = smoothed[leg].without(vote).pose_error(noise.shared(view), noise.of_image(view));
+        decide_image(cases, labels, limit, &pose, &mut decisions);
+    }
+    decisions
+}
+
+/// Where the other passes put a label: votes of this pass that went to the wrong one of two labels must not confirm
+/// themselves. They keep a small weight, for where the other passes tell little.
+fn estimate_elsewhere(scene: &Scene, noise: &Noise, label: &Label, pass: u32) -> Estimate {
+    let voters = by_pass(scene, &label.voters).find(|voters| scene.view(voters[0]).pass == pass);
+    let rest = label.voters.len() - voters.map_or(0, <[u32]>::len);
+    let of_pass =
+        voters.filter(|_| rest >= 2).and_then(|voters| pass_terms(scene, noise, voters, &label.estimate.point));
+    let moved = of_pass.and_then(|terms| {
+        let all = label.estimate.covariance.try_inverse()?;
+        let covariance = (all - terms.information * OTHERS_SHARE).cholesky()?.inverse();
+        let step = covariance * terms.gradient * OTHERS_SHARE;
+        (step.norm() < LONGEST_STEP_M).then_some(Estimate { point: label.estimate.point + step, covariance })
+    });
+    moved.unwrap_or(label.estimate)
+}
+
+impl<'a> Case<'a> {
+    fn of(scene: &Scene, noise: &Noise, estimate: &Estimate, claim: &'a Claim) -> Option<Self> {
+        let look = Look::of(scene, noise, claim.ray, &estimate.point)?;
+        let by_point = SMatrix::<f64, 2, 3>::from_rows(&[look.by_point[0].transpose(), look.by_point[1].transpose()]);
+        let of_label = by_point * estimate.covariance * by_point.transpose();
+        let own = Matrix2::identity() * noise.detection_px2(scene, claim.ray) + of_label;
+        Some(Self { claim, look, own, label_px2: 0.5 * of_label.trace() })
+    }
+
+    /// Squared residual in sigmas where the pose error is about as said, and twice the logarithm of the likelihood's scale.
+    fn fit(&self, pose: &PoseError) -> (f64, f64) {
+        let (residual, covariance) = pose.expected(&self.look, &self.own);
+        let chi2 = covariance.try_inverse().map_or(f64::INFINITY, |inverse| residual.dot(&(inverse * residual)));
+        (chi2, covariance.determinant().ln())
+    }
+}
+
+/// What the votes of one image say about the drift of its pass.
+fn belief_of_votes(cases: &[Case<'_>]) -> Belief {
+    cases.iter().filter(|case| case.claim.is_vote).fold(Belief::nothing(), |sum, case| {
+        let robust = (HUBER_CHI2 / case.claim.chi2).sqrt().min(1.0);
+        sum.and(&Belief::of_vote(&case.look, (case.look.variance + case.label_px2) / robust))
+    })
+}
+
+/// Decide the claims of one image, whose pose error is about known.
+fn decide_image(cases: &[Case<'_>], labels: &[Label], limit: f64, pose: &PoseError, decisions: &mut Vec<Decision>) {
+    let mut fits: Vec<(f64, f64)> = cases.iter().map(|case| case.fit(pose)).collect();
+    let mut granted = assign(cases, &fits, limit);
+    for _ in 1..ROUNDS {
+        for (i, case) in cases.iter().enumerate().filter(|(i, case)| is_contested(cases, *i, case)) {
+            let others = granted.iter().map(|&j| &cases[j]);
+            let independent = others.filter(|o| o.claim.label != case.claim.label && o.claim.ray != case.claim.ray);
+            let known = independent.fold(*pose, |pose, other| pose.after(&other.look, &other.own));
+            fits[i] = case.fit(&known);
+        }
+        let again = assign(cases, &fits, limit);
+        if again == granted {
+            break;
+        }
+        granted = again;
+    }
+    let strength = |label: u32| (labels[label as usize].voters.len(), std::cmp::Reverse(label));
+    let idle: Vec<&Case<'_>> = cases
+        .iter()
+        .zip(&fits)
+        .filter(|(case, fit)| fit.0 < limit && !granted.iter().any(|&i| cases[i].claim.label == case.claim.label))
+        .map(|(case, _)| case)
+        .collect();
+    for &i in &granted {
+        let Claim { image, label, ray, .. } = *cases[i].claim;
+        decisions.push(Decision::Vote { label, ray });
+        if idle.iter().any(|other| other.claim.ray == ray && strength(other.claim.label) > strength(label)) {
+            decisions.push(Decision::Undecided { label, image });
+        }
+    }
+    for loser in idle.chunk_by(|a, b| a.claim.label == b.claim.label) {
+        decisions.push(Decision::Undecided { label: loser[0].claim.label, image: loser[0].claim.image });
+    }
+}
+
+/// Whether another claim of the image is for the same label or the same detection.
+fn is_contested(cases: &[Case<'_>], i: usize, case: &Case<'_>) -> bool {
+    let mut others = cases.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, other)| other.claim);
+    others.any(|other| other.label == case.claim.label || other.ray == case.claim.ray)
+}
+
+/// The claims to grant, ascending: the assignment with the least sum of costs, where a detection without a label costs as
+/// much as one at the gate.
+fn assign(cases: &[Case<'_>], fits: &[(f64, f64)], limit: f64) -> Vec<usize> {
+    let open: Vec<usize> = (0..cases.len()).filter(|&i| fits[i].0 < limit).collect();
+    if open.iter().all(|&i| !open.iter().any(|&j| j != i && shares(cases, i, j))) {
+        return open;
+    }
+    let mut rays: Vec<u32> = open.iter().map(|&i| cases[i].claim.ray).collect();
+    rays.sort_unstable();
+    rays.dedup();
+    let mut labels: Vec<u32> = open.iter().map(|&i| cases[i].claim.label).collect();
+    labels.sort_unstable();
+    labels.dedup();
+    // Narrow likelihoods are high: a label of which little is known must not win because it forbids nothing.
+    let scale = open.iter().map(|&i| fits[i].1).fold(f64::INFINITY, f64::min);
+    let cost = |fit: (f64, f64)| ((fit.0 + fit.1 - scale) / COST_UNIT) as i64;
+    let none = (limit / COST_UNIT) as i64;
+    // One more column for each detection: it shows no label.
+    let mut costs = Matrix::new(rays.len(), labels.len() + rays.len(), 2 * none);
+    for row in 0..rays.len() {
+        for column in labels.len()..labels.len() + rays.len() {
+            costs[(row, column)] = none;
+        }
+    }
+    for &i in &open {
+        let at = (rays.binary_search(&cases[i].claim.ray), labels.binary_search(&cases[i].claim.label));
+        if let (Ok(row), Ok(column)) = at {
+            costs[(row, column)] = cost(fits[i]).min(2 * none);
+        }
+    }
+    let (_, columns) = kuhn_munkres_min(&costs);
+    let is_granted = |i: &usize| {
+        let at = (rays.binary_search(&cases[*i].claim.ray), labels.binary_search(&cases[*i].claim.label));
+        matches!(at, (Ok(row), Ok(column)) if columns[row] == column)
+    };
+    open.into_iter().filter(is_granted).collect()
+}
+
+fn shares(cases: &[Case<'_>], i: usize, j: usize) -> bool {
+    cases[i].claim.label == cases[j].claim.label || cases[i].claim.ray == cases[j].claim.ray
+}

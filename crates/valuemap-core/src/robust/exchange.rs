@@ -1,0 +1,191 @@
+//! Exchange: two labels side by side may have each other's votes from some directions, and have moved so that these votes
+//! fit; then no single vote changes sides.
+//!
+//! Where an image shows both, the difference of their detections does not depend on the pose's error, and says how the
+//! one lies from the other, up to which is which. The difference of the positions that explains most images is
+//! sought among those that pairs of images propose; it says in which images the two must be swapped.
+
+use nalgebra::{Matrix2x3, Matrix3, Vector2, Vector3};
+use rayon::prelude::*;
+use rstar::RTree;
+use rstar::primitives::GeomWithData;
+use rustc_hash::FxHashMap;
+
+use super::label::{EXACT_M, Label, from_voters};
+use super::noise::Noise;
+use super::scene::Scene;
+use super::settle::first_voter;
+
+/// Labels farther apart than this do not have each other's votes, m.
+const PAIR_M: f64 = 2.5;
+/// So many images must show both.
+const MIN_IMAGES: usize = 6;
+/// Images whose pairs propose how the labels lie to each other, at most.
+const PROPOSERS: usize = 16;
+/// Images that proposals are tried on, about.
+const SAMPLE_IMAGES: usize = 64;
+/// Times that the best proposal is fitted to all images that agree with it.
+const REFINEMENTS: usize = 3;
+/// No image speaks stronger against a proposal.
+const CUT_CHI2: f64 = 16.0;
+/// An exchange must lower the sum of squared residuals by so much.
+const LEAST_GAIN: f64 = 30.0;
+
+/// Let neighbours exchange votes where their images say so; what only one of them has in an image is given anew. The nearest pairs first, each label in one pair.
+#[must_use]
+pub fn exchange(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) -> Vec<Label> {
+    let pairs = nearest_pairs(&labels);
+    let exchanged: Vec<Option<[Label; 2]>> =
+        pairs.par_iter().map(|&(a, b)| exchange_pair(scene, noise, gate_sigmas, &labels[a], &labels[b])).collect();
+    let mut labels = labels;
+    for (&(a, b), new) in pairs.iter().zip(exchanged) {
+        if let Some([new_a, new_b]) = new {
+            (labels[a], labels[b]) = (new_a, new_b);
+        }
+    }
+    labels.sort_by_key(first_voter);
+    labels
+}
+
+/// Disjoint pairs of neighbours of one class, the nearest first.
+fn nearest_pairs(labels: &[Label]) -> Vec<(usize, usize)> {
+    let places = labels.iter().enumerate().map(|(i, l)| GeomWithData::new(l.estimate.point.into(), i)).collect();
+    let tree: RTree<GeomWithData<[f64; 3], usize>> = RTree::bulk_load(places);
+    let mut near: Vec<(f64, usize, usize)> = Vec::new();
+    for (a, label) in labels.iter().enumerate() {
+        for other in tree.locate_within_distance(label.estimate.point.into(), PAIR_M * PAIR_M) {
+            let b = other.data;
+            if b > a && labels[b].class == label.class {
+                near.push(((labels[b].estimate.point - label.estimate.point).norm(), a, b));
+            }
+        }
+    }
+    near.sort_by(|x, y| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2))));
+    let mut taken = vec![false; labels.len()];
+    let mut pairs = Vec::new();
+    for (_, a, b) in near {
+        if !taken[a] && !taken[b] {
+            (taken[a], taken[b]) = (true, true);
+            pairs.push((a, b));
+        }
+    }
+    pairs
+}
+
+/// Both labels' detections in an image that shows both, and what their difference says.
+struct Both {
+    rays: [u32; 2],
+    /// Difference of the residuals at a common point, px: that of the positions, seen from the image, if each ray is its
+    /// label's.
+    difference: Vector2<f64>,
+    /// By the difference of the positions, px/m.
+    by_point: Matrix2x3<f64>,
+    /// Variance of the difference, each axis, px².
+    variance: f64,
+}
+
+impl Both {
+    /// Squared residual in sigmas if the labels are this far apart, as the rays are and swapped.
+    fn chi2(&self, apart: &Vector3<f64>) -> [f64; 2] {
+        let expected = self.by_point * apart;
+        [1.0, -1.0].map(|sign| (self.difference * sign - expected).norm_squared() / self.variance)
+    }
+}
+
+/// The two labels after an exchange; nothing if they are best as they are.
+fn exchange_pair(scene: &Scene, noise: &Noise, gate_sigmas: f64, a: &Label, b: &Label) -> Option<[Label; 2]> {
+    let images = images_of_both(scene, noise, a, b)?;
+    if images.len() < MIN_IMAGES {
+        return None;
+    }
+    let now = a.estimate.point - b.estimate.point;
+    let unswapped: f64 = images.iter().map(|both| both.chi2(&now)[0].min(CUT_CHI2)).sum();
+    let mut best = (cost(&images, 1, &now), now);
+    let stride = images.len().div_ceil(SAMPLE_IMAGES);
+    for apart in proposals(&images) {
+        let value = cost(&images, stride, &apart) * stride as f64;
+        if value < best.0 {
+            best = (value, apart);
+        }
+    }
+    for _ in 0..REFINEMENTS {
+        best.1 = refined(&images, &best.1)?;
+    }
+    let least = cost(&images, 1, &best.1);
+    if !(least < unswapped - LEAST_GAIN) {
+        return None;
+    }
+    let swapped: Vec<bool> = images.iter().map(|both| both.chi2(&best.1)).map(|[as_is, swap]| swap < as_is).collect();
+    // Which is which is free to choose: so that fewer votes change sides.
+    let mirrored = 2 * swapped.iter().filter(|&&swap| swap).count() > swapped.len();
+    if swapped.iter().all(|&swap| swap == mirrored) {
+        return None;
+    }
+    let of = |side: usize, old: &Label| {
+        let ray = |(both, &swap): (&Both, &bool)| both.rays[side ^ usize::from(swap != mirrored)];
+        let voters = images.iter().zip(&swapped).map(ray).collect();
+        from_voters(scene, noise, gate_sigmas, voters, old.estimate.point, EXACT_M)
+    };
+    Some([of(0, a)?, of(1, b)?])
+}
+
+/// The images in which both labels have a detection, by pass.
+fn images_of_both(scene: &Scene, noise: &Noise, a: &Label, b: &Label) -> Option<Vec<Both>> {
+    let middle = (a.estimate.point + b.estimate.point) * 0.5;
+    let image = |ray: u32| scene.rays.image[ray as usize];
+    let of_b: FxHashMap<u32, u32> = b.voters.iter().map(|&ray| (image(ray), ray)).collect();
+    let shown = a.voters.iter().filter_map(|&ray| of_b.get(&image(ray)).map(|&other| [ray, other]));
+    shown
+        .map(|rays| {
+            let (residual_a, rows) = scene.ray(rays[0]).linearize(&middle)?;
+            let (residual_b, _) = scene.ray(rays[1]).linearize(&middle)?;
+            Some(Both {
+                rays,
+                difference: Vector2::from(residual_b) - Vector2::from(residual_a),
+                by_point: Matrix2x3::from_rows(&rows),
+                variance: noise.detection_px2(scene, rays[0]) + noise.detection_px2(scene, rays[1]),
+            })
+        })
+        .collect()
+}
+
+/// Differences of the positions that pairs of images would have.
+fn proposals(images: &[Both]) -> Vec<Vector3<f64>> {
+    let sample: Vec<&Both> = images.iter().step_by(images.len().div_ceil(PROPOSERS)).collect();
+    let mut proposals = Vec::new();
+    for (i, first) in sample.iter().enumerate() {
+        for second in &sample[i + 1..] {
+            proposals
+                .extend([1.0, -1.0].iter().filter_map(|&sign| solve([(*first, 1.0), (*second, sign)].into_iter())));
+        }
+    }
+    proposals
+}
+
+/// The difference of the positions that fits best if the images are swapped as it says.
+fn refined(images: &[Both], apart: &Vector3<f64>) -> Option<Vector3<f64>> {
+    let fitting = images.iter().filter_map(|both| {
+        let [as_is, swap] = both.chi2(apart);
+        (as_is.min(swap) < CUT_CHI2).then_some((both, if swap < as_is { -1.0 } else { 1.0 }))
+    });
+    solve(fitting)
+}
+
+/// Least squares, with a weak prior for what the images do not tell.
+fn solve<'a>(images: impl Iterator<Item = (&'a Both, f64)>) -> Option<Vector3<f64>> {
+    let mut information = Matrix3::identity() / (PAIR_M * PAIR_M);
+    let mut sum = Vector3::zeros();
+    for (both, sign) in images {
+        information += both.by_point.transpose() * both.by_point / both.variance;
+        sum += both.by_point.transpose() * both.difference * (sign / both.variance);
+    }
+    Some(information.cholesky()?.solve(&sum))
+}
+
+fn cost(images: &[Both], stride: usize, apart: &Vector3<f64>) -> f64 {
+    let of_image = |both: &Both| {
+        let [as_is, swap] = both.chi2(apart);
+        as_is.min(swap).min(CUT_CHI2)
+    };
+    images.iter().step_by(stride).map(of_image).sum()
+}

@@ -1,0 +1,151 @@
+//! Where the images of a pass really were, as far as the labels tell: the drift of the pass, smoothed along the drive.
+//!
+//! Every vote for a label measures the pose error of its image. The drift is the Markov process of
+//! [`drift`](super::drift): what the looks of each leg say of it is passed on to the legs after and before it (two-filter
+//! smoother).
+
+use nalgebra::{Matrix2, SMatrix, Vector2, Vector3};
+
+use super::drift::{DRIFT_LENGTH_M, LEG_M, Look, Matrix6, Vector6};
+
+/// What is known of the drift of a leg, in sigmas of the drift: information and gradient.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Belief {
+    information: Matrix6,
+    gradient: Vector6,
+}
+
+/// A pose error: position, m, and rotation, rad, both in the world.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PoseError {
+    /// The most probable error.
+    pub mean: Vector6,
+    /// Its covariance.
+    pub covariance: Matrix6,
+}
+
+impl Belief {
+    /// No knowledge at all.
+    #[must_use]
+    pub fn nothing() -> Self {
+        Self { information: Matrix6::zeros(), gradient: Vector6::zeros() }
+    }
+
+    /// Before anything is seen: drifts are counted in their own sigmas.
+    #[must_use]
+    pub fn prior() -> Self {
+        Self { information: Matrix6::identity(), gradient: Vector6::zeros() }
+    }
+
+    /// Both beliefs, which must not rest on the same looks.
+    #[must_use]
+    pub fn and(&self, other: &Self) -> Self {
+        Self { information: self.information + other.information, gradient: self.gradient + other.gradient }
+    }
+
+    /// What it was before another belief, which is part of it, was added.
+    #[must_use]
+    pub fn without(&self, other: &Self) -> Self {
+        Self { information: self.information - other.information, gradient: self.gradient - other.gradient }
+    }
+
+    /// What a vote says; `variance` is that of its residual, px², each axis.
+    #[must_use]
+    pub fn of_vote(look: &Look, variance: f64) -> Self {
+        let mut belief = Self::nothing();
+        for i in 0..2 {
+            let shared = look.by_pose[i].component_mul(&look.drift_sigma);
+            belief.information += shared * shared.transpose() / variance;
+            belief.gradient += shared * (look.residual[i] / variance);
+        }
+        belief
+    }
+
+    /// What it says of the drift `distance_m` farther along the drive; `is_prior` if it holds the prior already.
+    fn carried(&self, distance_m: f64, is_prior: bool) -> Self {
+        let keep = (-distance_m / DRIFT_LENGTH_M).exp();
+        let stiffness = 1.0 / (1.0 - keep * keep);
+        let tie = keep * stiffness;
+        // The new drift is `keep` times the old one and something new of variance 1 - keep².
+        let (own, of_new) = if is_prior { (keep * tie, stiffness) } else { (stiffness, keep * tie) };
+        let Some(tied) = (self.information + Matrix6::identity() * own).cholesky() else { return Self::nothing() };
+        Self {
+            information: Matrix6::identity() * of_new - tied.inverse() * (tie * tie),
+            gradient: tied.solve(&self.gradient) * tie,
+        }
+    }
+
+    /// The drift of an image, and the error that it has for itself; both with their standard deviations of position, m, and
+    /// rotation, rad.
+    #[must_use]
+    pub fn pose_error(&self, drift: (f64, f64), own: (f64, f64)) -> PoseError {
+        let diagonal = |(p, r): (f64, f64)| Vector6::new(p, p, p, r, r, r);
+        let (drift, own) = (diagonal(drift), diagonal(own));
+        let covariance = self.information.cholesky().map_or_else(Matrix6::identity, |cholesky| cholesky.inverse());
+        let mean = -(covariance * self.gradient);
+        let scale = Matrix6::from_diagonal(&drift);
+        PoseError {
+            mean: mean.component_mul(&drift),
+            covariance: scale * covariance * scale + Matrix6::from_diagonal(&own.component_mul(&own)),
+        }
+    }
+}
+
+impl PoseError {
+    /// Residual of a look, px, with this error taken out, and its covariance; `own` is the covariance of all that is not the
+    /// pose's, px².
+    #[must_use]
+    pub fn expected(&self, look: &Look, own: &Matrix2<f64>) -> (Vector2<f64>, Matrix2<f64>) {
+        let by_pose = rows_of(look);
+        let residual = Vector2::from(look.residual) + by_pose * self.mean;
+        (residual, own + by_pose * self.covariance * by_pose.transpose())
+    }
+
+    /// The error after a look at a label was found to be right (Kalman).
+    #[must_use]
+    pub fn after(&self, look: &Look, own: &Matrix2<f64>) -> Self {
+        let (residual, covariance) = self.expected(look, own);
+        let Some(inverse) = covariance.try_inverse() else { return *self };
+        let by_pose = rows_of(look);
+        let gain = self.covariance * by_pose.transpose() * inverse;
+        Self { mean: self.mean - gain * residual, covariance: self.covariance - gain * by_pose * self.covariance }
+    }
+}
+
+fn rows_of(look: &Look) -> SMatrix<f64, 2, 6> {
+    SMatrix::<f64, 2, 6>::from_rows(&[look.by_pose[0].transpose(), look.by_pose[1].transpose()])
+}
+
+/// Cut places along a drive into legs of one drift: the number of each place's leg, ascending from 0.
+#[must_use]
+pub fn legs(centers: &[Vector3<f64>]) -> Vec<usize> {
+    let mut leg = 0;
+    let mut start = centers.first().copied().unwrap_or_default();
+    let of_place = |center: &Vector3<f64>| {
+        if (center - start).norm() > LEG_M {
+            (leg, start) = (leg + 1, *center);
+        }
+        leg
+    };
+    centers.iter().map(of_place).collect()
+}
+
+/// What is known of the drift of each leg, from its own looks and those of all other legs of the pass; `starts` is where the
+/// legs begin.
+#[must_use]
+pub fn smooth(starts: &[Vector3<f64>], looks: &[Belief]) -> Vec<Belief> {
+    let distance = |leg: usize| (starts[leg + 1] - starts[leg]).norm();
+    let mut before = vec![Belief::prior(); looks.len()];
+    for leg in 1..looks.len() {
+        before[leg] = before[leg - 1].and(&looks[leg - 1]).carried(distance(leg - 1), true);
+    }
+    let mut after = Belief::nothing();
+    let mut smoothed = before;
+    for leg in (0..looks.len()).rev() {
+        smoothed[leg] = smoothed[leg].and(&looks[leg]).and(&after);
+        if leg > 0 {
+            after = after.and(&looks[leg]).carried(distance(leg - 1), false);
+        }
+    }
+    smoothed
+}
