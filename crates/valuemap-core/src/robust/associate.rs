@@ -6,14 +6,14 @@
 //! go together, the assignment with the least sum of costs wins (joint compatibility; the costs are those of maximum
 //! likelihood).
 
-use nalgebra::{Matrix2, SMatrix};
+use nalgebra::{Matrix2, SMatrix, Vector3};
 use pathfinding::prelude::{Matrix, kuhn_munkres_min};
 use rayon::prelude::*;
-use rustc_hash::FxHashMap;
+use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::drift::Look;
 use super::estimate::{Estimate, by_pass, pass_terms};
-use super::index::RayIndex;
+use super::index::{Hit, RayIndex};
 use super::label::Label;
 use super::noise::Noise;
 use super::poses::{Belief, PoseError, legs, smooth};
@@ -30,6 +30,15 @@ const HUBER_CHI2: f64 = 4.0;
 const OTHERS_SHARE: f64 = 0.95;
 /// Farther than this the linear step to where the other passes put a label is not trusted, m.
 const LONGEST_STEP_M: f64 = 3.0;
+
+/// Images of a pass that show one of two labels, which may be either, before it is concluded that there is but one.
+const LEAST_RIVALRY: u32 = 8;
+/// For each of them, images that show both, at most: what clutter and double detections do.
+const MOST_BOTH: f64 = 0.1;
+/// Detections are looked for as far from a label as this many of its standard deviations, in steps of one.
+const REACH_SIGMAS: i32 = 2;
+/// Where a label's place is known this well, its uncertainty widens no gate, m.
+const CERTAIN_M: f64 = 0.1;
 
 /// What an association says of one label.
 #[derive(Debug, Clone, Default)]
@@ -56,8 +65,8 @@ struct Case<'a> {
     claim: &'a Claim,
     look: Look,
     own: Matrix2<f64>,
-    /// What the label's own uncertainty adds to the variance, each axis, px².
-    label_px2: f64,
+    /// Variance of the detection, each axis, px².
+    detection_px2: f64,
 }
 
 /// Give detections to labels, at most one an image and label.
@@ -89,7 +98,10 @@ pub fn associate(scene: &Scene, noise: &Noise, index: &RayIndex<'_>, labels: &[L
 fn claims_of(scene: &Scene, index: &RayIndex<'_>, number: u32, label: &Label, range_m: f64) -> Vec<Claim> {
     let mut voters = label.voters.clone();
     voters.sort_unstable();
-    let hits = index.all_hits(&label.estimate.point, label.class, range_m);
+    let mut hits: Vec<Hit> =
+        places_of(&label.estimate).iter().flat_map(|place| index.all_hits(place, label.class, range_m)).collect();
+    hits.sort_by(|a, b| a.ray.cmp(&b.ray).then(a.chi2.total_cmp(&b.chi2)));
+    hits.dedup_by_key(|hit| hit.ray);
     hits.into_iter()
         .filter(|hit| label.faces(scene, hit.ray))
         .map(|hit| Claim {
@@ -101,6 +113,18 @@ fn claims_of(scene: &Scene, index: &RayIndex<'_>, number: u32, label: &Label, ra
             is_vote: voters.binary_search(&hit.ray).is_ok(),
         })
         .collect()
+}
+
+/// Where a label may be: along the direction that it is least known in.
+fn places_of(estimate: &Estimate) -> Vec<Vector3<f64>> {
+    let axes = estimate.covariance.symmetric_eigen();
+    let longest = axes.eigenvalues.imax();
+    let sigma = axes.eigenvalues[longest].max(0.0).sqrt();
+    if sigma < CERTAIN_M {
+        return vec![estimate.point];
+    }
+    let axis = axes.eigenvectors.column(longest) * sigma;
+    (-REACH_SIGMAS..=REACH_SIGMAS).map(|step| estimate.point + axis * f64::from(step)).collect()
 }
 
 enum Decision {
@@ -129,12 +153,18 @@ fn decide(scene: &Scene, noise: &Noise, labels: &[Label], limit: f64, claims: &[
         of_legs[leg] = of_legs[leg].and(vote);
     }
     let smoothed = smooth(&starts, &of_legs);
-    let mut decisions = Vec::new();
-    for ((cases, vote), &leg) in images.iter().zip(&votes).zip(&leg_of) {
+    let judge = |((cases, vote), &leg): ((&&[Case<'_>], &Belief), &usize)| {
         let view = &scene.views[cases[0].claim.image as usize];
         // Its own votes are what is in question.
         let pose = smoothed[leg].without(vote).pose_error(noise.shared(view), noise.of_image(view));
-        decide_image(cases, labels, limit, &pose, &mut decisions);
+        grant(cases, limit, &pose)
+    };
+    let mut fits: Vec<Vec<Fit>> = images.iter().zip(&votes).zip(&leg_of).map(judge).collect();
+    let overruled = overruled(&images, &fits, limit);
+    let mut decisions = Vec::new();
+    for (cases, fits) in images.iter().zip(&mut fits) {
+        overrule(cases, fits, &overruled, limit);
+        report(cases, fits, labels, limit, &mut decisions);
     }
     decisions
 }
@@ -160,59 +190,131 @@ impl<'a> Case<'a> {
         let look = Look::of(scene, noise, claim.ray, &estimate.point)?;
         let by_point = SMatrix::<f64, 2, 3>::from_rows(&[look.by_point[0].transpose(), look.by_point[1].transpose()]);
         let of_label = by_point * estimate.covariance * by_point.transpose();
-        let own = Matrix2::identity() * noise.detection_px2(scene, claim.ray) + of_label;
-        Some(Self { claim, look, own, label_px2: 0.5 * of_label.trace() })
+        let detection_px2 = noise.detection_px2(scene, claim.ray);
+        Some(Self { claim, look, own: Matrix2::identity() * detection_px2 + of_label, detection_px2 })
     }
 
-    /// Squared residual in sigmas where the pose error is about as said, and twice the logarithm of the likelihood's scale.
-    fn fit(&self, pose: &PoseError) -> (f64, f64) {
+    /// How well it fits where the pose error is about as said.
+    fn cost(&self, pose: &PoseError) -> f64 {
         let (residual, covariance) = pose.expected(&self.look, &self.own);
         let chi2 = covariance.try_inverse().map_or(f64::INFINITY, |inverse| residual.dot(&(inverse * residual)));
-        (chi2, covariance.determinant().ln())
+        // Narrow likelihoods are high: a label of which little is known must not win because it forbids nothing.
+        let widening = (covariance - self.own + Matrix2::identity() * self.detection_px2).determinant();
+        chi2 + (covariance.determinant() / widening).ln()
     }
 }
 
 /// What the votes of one image say about the drift of its pass.
 fn belief_of_votes(cases: &[Case<'_>]) -> Belief {
     cases.iter().filter(|case| case.claim.is_vote).fold(Belief::nothing(), |sum, case| {
+        let of_label_px2 = 0.5 * case.own.trace() - case.detection_px2;
         let robust = (HUBER_CHI2 / case.claim.chi2).sqrt().min(1.0);
-        sum.and(&Belief::of_vote(&case.look, (case.look.variance + case.label_px2) / robust))
+        sum.and(&Belief::of_vote(&case.look, (case.look.variance + of_label_px2) / robust))
     })
 }
 
-/// Decide the claims of one image, whose pose error is about known.
-fn decide_image(cases: &[Case<'_>], labels: &[Label], limit: f64, pose: &PoseError, decisions: &mut Vec<Decision>) {
-    let mut fits: Vec<(f64, f64)> = cases.iter().map(|case| case.fit(pose)).collect();
-    let mut granted = assign(cases, &fits, limit);
+/// What became of a claim.
+#[derive(Debug, Clone, Copy)]
+struct Fit {
+    /// Squared residual, and how much wider its distribution is than that of a label known exactly.
+    cost: f64,
+    granted: bool,
+}
+
+/// Judge the claims of one image, whose pose error is about known.
+fn grant(cases: &[Case<'_>], limit: f64, pose: &PoseError) -> Vec<Fit> {
+    let mut costs: Vec<f64> = cases.iter().map(|case| case.cost(pose)).collect();
+    let mut granted = assign(cases, &costs, limit);
     for _ in 1..ROUNDS {
         for (i, case) in cases.iter().enumerate().filter(|(i, case)| is_contested(cases, *i, case)) {
             let others = granted.iter().map(|&j| &cases[j]);
             let independent = others.filter(|o| o.claim.label != case.claim.label && o.claim.ray != case.claim.ray);
             let known = independent.fold(*pose, |pose, other| pose.after(&other.look, &other.own));
-            fits[i] = case.fit(&known);
+            costs[i] = case.cost(&known);
         }
-        let again = assign(cases, &fits, limit);
+        let again = assign(cases, &costs, limit);
         if again == granted {
             break;
         }
         granted = again;
     }
+    (0..).zip(costs).map(|(i, cost)| Fit { cost, granted: granted.binary_search(&i).is_ok() }).collect()
+}
+
+/// What one pass shows of two labels that claim the same detections.
+#[derive(Default)]
+struct Rivalry {
+    /// Images that show both.
+    both: u32,
+    /// Images that show one of them, which may be either.
+    one: u32,
+    /// How well these fit the first, less how well the second.
+    cost: f64,
+}
+
+/// Pairs of labels (the better one, the other) of which a pass shows only one, where it might be either: there is one
+/// object, and the other label is not to be seen from there.
+fn overruled(images: &[&[Case<'_>]], fits: &[Vec<Fit>], limit: f64) -> FxHashSet<(u32, u32)> {
+    let mut rivalries: FxHashMap<(u32, u32), Rivalry> = FxHashMap::default();
+    for (cases, fits) in images.iter().zip(fits) {
+        let open: Vec<usize> = (0..cases.len()).filter(|&i| fits[i].cost < limit).collect();
+        let is_shown = |label: u32| open.iter().any(|&i| fits[i].granted && cases[i].claim.label == label);
+        for (k, &i) in open.iter().enumerate() {
+            for &j in open[k + 1..].iter().filter(|&&j| cases[j].claim.ray == cases[i].claim.ray) {
+                let pair = (cases[i].claim.label, cases[j].claim.label);
+                let rivalry = rivalries.entry(pair).or_default();
+                match (is_shown(pair.0), is_shown(pair.1)) {
+                    (true, true) => rivalry.both += 1,
+                    (false, false) => {}
+                    _ => {
+                        rivalry.one += 1;
+                        rivalry.cost += fits[i].cost - fits[j].cost;
+                    }
+                }
+            }
+        }
+    }
+    let is_one = |r: &Rivalry| r.one >= LEAST_RIVALRY && f64::from(r.both) < MOST_BOTH * f64::from(r.one);
+    let of_pair = |((a, b), r): ((u32, u32), Rivalry)| if r.cost <= 0.0 { (a, b) } else { (b, a) };
+    rivalries.into_iter().filter(|(_, r)| is_one(r)).map(of_pair).collect()
+}
+
+/// Take the detections that a better label claims as well from labels that are overruled.
+fn overrule(cases: &[Case<'_>], fits: &mut [Fit], overruled: &FxHashSet<(u32, u32)>, limit: f64) {
+    let is_overruled = |j: usize, fits: &[Fit]| {
+        let claim = cases[j].claim;
+        let mut rivals = (0..cases.len()).filter(|&i| fits[i].cost < limit && cases[i].claim.ray == claim.ray);
+        rivals.any(|i| overruled.contains(&(cases[i].claim.label, claim.label)))
+    };
+    let out: Vec<usize> = (0..cases.len()).filter(|&j| fits[j].cost < limit && is_overruled(j, fits)).collect();
+    if out.is_empty() {
+        return;
+    }
+    let mut costs: Vec<f64> = fits.iter().map(|fit| fit.cost).collect();
+    for &j in &out {
+        costs[j] = f64::INFINITY;
+    }
+    let granted = assign(cases, &costs, limit);
+    for (i, fit) in fits.iter_mut().enumerate() {
+        fit.granted = granted.binary_search(&i).is_ok();
+    }
+}
+
+/// Say which claims of one image are granted, and which labels it says nothing about.
+fn report(cases: &[Case<'_>], fits: &[Fit], labels: &[Label], limit: f64, decisions: &mut Vec<Decision>) {
     let strength = |label: u32| (labels[label as usize].voters.len(), std::cmp::Reverse(label));
-    let idle: Vec<&Case<'_>> = cases
-        .iter()
-        .zip(&fits)
-        .filter(|(case, fit)| fit.0 < limit && !granted.iter().any(|&i| cases[i].claim.label == case.claim.label))
-        .map(|(case, _)| case)
-        .collect();
-    for &i in &granted {
-        let Claim { image, label, ray, .. } = *cases[i].claim;
+    let granted = || cases.iter().zip(fits).filter(|(_, fit)| fit.granted).map(|(case, _)| case.claim);
+    let is_idle = |label: u32| !granted().any(|claim| claim.label == label);
+    let open = cases.iter().zip(fits).filter(|(_, fit)| fit.cost < limit).map(|(case, _)| case.claim);
+    let idle: Vec<&Claim> = open.filter(|claim| is_idle(claim.label)).collect();
+    for &Claim { image, label, ray, .. } in granted() {
         decisions.push(Decision::Vote { label, ray });
-        if idle.iter().any(|other| other.claim.ray == ray && strength(other.claim.label) > strength(label)) {
+        if idle.iter().any(|other| other.ray == ray && strength(other.label) > strength(label)) {
             decisions.push(Decision::Undecided { label, image });
         }
     }
-    for loser in idle.chunk_by(|a, b| a.claim.label == b.claim.label) {
-        decisions.push(Decision::Undecided { label: loser[0].claim.label, image: loser[0].claim.image });
+    for loser in idle.chunk_by(|a, b| a.label == b.label) {
+        decisions.push(Decision::Undecided { label: loser[0].label, image: loser[0].image });
     }
 }
 
@@ -224,8 +326,8 @@ fn is_contested(cases: &[Case<'_>], i: usize, case: &Case<'_>) -> bool {
 
 /// The claims to grant, ascending: the assignment with the least sum of costs, where a detection without a label costs as
 /// much as one at the gate.
-fn assign(cases: &[Case<'_>], fits: &[(f64, f64)], limit: f64) -> Vec<usize> {
-    let open: Vec<usize> = (0..cases.len()).filter(|&i| fits[i].0 < limit).collect();
+fn assign(cases: &[Case<'_>], costs: &[f64], limit: f64) -> Vec<usize> {
+    let open: Vec<usize> = (0..cases.len()).filter(|&i| costs[i] < limit).collect();
     if open.iter().all(|&i| !open.iter().any(|&j| j != i && shares(cases, i, j))) {
         return open;
     }
@@ -235,24 +337,21 @@ fn assign(cases: &[Case<'_>], fits: &[(f64, f64)], limit: f64) -> Vec<usize> {
     let mut labels: Vec<u32> = open.iter().map(|&i| cases[i].claim.label).collect();
     labels.sort_unstable();
     labels.dedup();
-    // Narrow likelihoods are high: a label of which little is known must not win because it forbids nothing.
-    let scale = open.iter().map(|&i| fits[i].1).fold(f64::INFINITY, f64::min);
-    let cost = |fit: (f64, f64)| ((fit.0 + fit.1 - scale) / COST_UNIT) as i64;
     let none = (limit / COST_UNIT) as i64;
     // One more column for each detection: it shows no label.
-    let mut costs = Matrix::new(rays.len(), labels.len() + rays.len(), 2 * none);
+    let mut table = Matrix::new(rays.len(), labels.len() + rays.len(), 2 * none);
     for row in 0..rays.len() {
         for column in labels.len()..labels.len() + rays.len() {
-            costs[(row, column)] = none;
+            table[(row, column)] = none;
         }
     }
     for &i in &open {
         let at = (rays.binary_search(&cases[i].claim.ray), labels.binary_search(&cases[i].claim.label));
         if let (Ok(row), Ok(column)) = at {
-            costs[(row, column)] = cost(fits[i]).min(2 * none);
+            table[(row, column)] = (costs[i] / COST_UNIT) as i64;
         }
     }
-    let (_, columns) = kuhn_munkres_min(&costs);
+    let (_, columns) = kuhn_munkres_min(&table);
     let is_granted = |i: &usize| {
         let at = (rays.binary_search(&cases[*i].claim.ray), labels.binary_search(&cases[*i].claim.label));
         matches!(at, (Ok(row), Ok(column)) if columns[row] == column)
