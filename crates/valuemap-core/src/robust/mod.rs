@@ -59,6 +59,9 @@ const CALIBRATION_GATE: f64 = 1.4;
 /// Times that the noise is estimated anew, from labels found with the last estimate.
 const CALIBRATION_ROUNDS: usize = 3;
 
+/// Times that labels compete before any is doubted.
+const SETTLING_ROUNDS: usize = 4;
+
 /// Labels are dropped below these multiples of the probability that is asked for, one after the other.
 const DOUBTS: [f64; 4] = [1e-5, 1e-2, 0.3, 1.0];
 
@@ -114,8 +117,16 @@ pub fn self_calibrate(
     let rays = sample::places(scene, CALIBRATION_RAYS, settings.viability.max_range_m);
     let settings = Settings { gate_sigmas: settings.gate_sigmas * CALIBRATION_GATE, ..*settings };
     let mut noise = *guess;
-    for _ in 0..CALIBRATION_ROUNDS {
-        let (labels, _) = gather(scene, &noise, &settings, &rays, progress)?;
+    for round in 1..=CALIBRATION_ROUNDS {
+        let (mut labels, _) = gather(scene, &noise, &settings, &rays, progress)?;
+        if round == CALIBRATION_ROUNDS {
+            let spreads = spreads_of(scene, &noise);
+            let court = Court::new(scene, &noise, &spreads, &settings, rays.iter().copied());
+            for _ in 0..SETTLING_ROUNDS {
+                progress.check()?;
+                labels = court.settle(labels, true).0;
+            }
+        }
         noise = calibrate::calibrate(scene, &noise, &labels, known);
     }
     Ok(noise)
@@ -129,24 +140,16 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
     let all: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
     let (mut labels, [nominations, accepted]) = gather(scene, noise, settings, &all, progress)?;
     let spreads = spreads_of(scene, noise);
-    let range_m = settings.viability.max_range_m * VOTE_RANGE;
-    let index = RayIndex::new(scene, &spreads, settings.gate_sigmas, all.into_iter());
+    let court = Court::new(scene, noise, &spreads, settings, all.into_iter());
     let lookout = Lookout::new(scene);
-    let min_votes = settings.min_votes as usize;
     let (mut fused, mut outvoted, mut doubted) = (0, 0, 0);
     let mut compete = |labels: Vec<Label>, may_split: bool| {
-        let before = labels.len();
-        let labels = exchange::exchange(scene, noise, settings.gate_sigmas, labels);
-        let labels = settle::reassign(scene, noise, &index, &labels, range_m, min_votes);
-        let left = labels.len();
-        let labels =
-            if may_split { settle::split(scene, noise, settings.gate_sigmas, labels, min_votes) } else { labels };
-        let labels = settle::fuse(scene, noise, settings.gate_sigmas, labels);
-        outvoted += (before - left) as u64;
-        fused += left.saturating_sub(labels.len()) as u64;
+        let (labels, [lost, joined]) = court.settle(labels, may_split);
+        outvoted += lost;
+        fused += joined;
         labels
     };
-    for _ in 0..4 {
+    for _ in 0..SETTLING_ROUNDS {
         progress.check()?;
         labels = compete(labels, true);
     }
@@ -182,6 +185,43 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
         strays_per_image,
         variance_factor,
     })
+}
+
+/// Where labels compete for the rays.
+struct Court<'a> {
+    scene: &'a Scene,
+    noise: &'a Noise,
+    settings: &'a Settings,
+    index: RayIndex<'a>,
+}
+
+impl<'a> Court<'a> {
+    fn new(
+        scene: &'a Scene,
+        noise: &'a Noise,
+        spreads: &'a [Spread],
+        settings: &'a Settings,
+        rays: impl Iterator<Item = u32>,
+    ) -> Self {
+        Self { scene, noise, settings, index: RayIndex::new(scene, spreads, settings.gate_sigmas, rays) }
+    }
+
+    /// One round: neighbors exchange votes, all labels compete for all rays, those that are two are split and those that are
+    /// one are fused. Also how many lost their votes, and how many became part of another one.
+    fn settle(&self, labels: Vec<Label>, may_split: bool) -> (Vec<Label>, [u64; 2]) {
+        let &Self { scene, noise, settings, ref index } = self;
+        let gate = settings.gate_sigmas;
+        let min_votes = settings.min_votes as usize;
+        let range_m = settings.viability.max_range_m * VOTE_RANGE;
+        let before = labels.len();
+        let labels = exchange::exchange(scene, noise, gate, labels);
+        let labels = settle::reassign(scene, noise, index, &labels, range_m, min_votes);
+        let left = labels.len();
+        let labels = if may_split { settle::split(scene, noise, gate, labels, min_votes) } else { labels };
+        let labels = settle::fuse(scene, noise, gate, labels);
+        let joined = left.saturating_sub(labels.len());
+        (labels, [(before - left) as u64, joined as u64])
+    }
 }
 
 /// The probability of existence of each label and the number of images that should have seen it.
