@@ -90,7 +90,7 @@ class NoiseConfig:
     """How far a detection may be from where its object projects; what is not set is estimated from the data."""
 
     gate_sigmas: float = _setting(
-        3.5,
+        4.0,
         unit="sigmas",
         open_low=True,
         effect="a detection votes for a point that projects closer than this many standard deviations (robust)",

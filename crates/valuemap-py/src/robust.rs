@@ -175,11 +175,11 @@ pub fn find_labels<'py>(
 
 fn counts_of<'py>(py: Python<'py>, found: &Findings) -> PyResult<Bound<'py, PyDict>> {
     let dict = PyDict::new(py);
-    dict.set_item("nominations", found.nominations)?;
-    dict.set_item("labels_before_settling", found.accepted)?;
-    dict.set_item("labels_fused", found.fused)?;
-    dict.set_item("labels_rejected_outvoted", found.outvoted)?;
-    dict.set_item("labels_rejected_existence", found.doubted)?;
+    dict.set_item("nominations", found.tally.nominations)?;
+    dict.set_item("labels_before_settling", found.tally.accepted)?;
+    dict.set_item("labels_fused", found.tally.fused)?;
+    dict.set_item("labels_rejected_outvoted", found.tally.outvoted)?;
+    dict.set_item("labels_rejected_existence", found.tally.doubted)?;
     dict.set_item("recall", found.rates.recall)?;
     dict.set_item("recall_concentration", found.rates.concentration)?;
     dict.set_item("strays_per_image", found.strays_per_image)?;

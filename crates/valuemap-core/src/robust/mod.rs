@@ -59,6 +59,9 @@ const CALIBRATION_GATE: f64 = 1.4;
 /// Times that the noise is estimated anew, from labels found with the last estimate.
 const CALIBRATION_ROUNDS: usize = 3;
 
+/// Times that the rays of no label are gathered, at most.
+const SESSIONS: usize = 3;
+
 /// Times that labels compete before any is doubted.
 const SETTLING_ROUNDS: usize = 4;
 
@@ -79,11 +82,9 @@ pub struct Finding {
     pub expected: u32,
 }
 
-/// The labels of a scene, and what became of the rest.
-#[derive(Debug, Clone)]
-pub struct Findings {
-    /// Labels, ordered by their lowest voter.
-    pub findings: Vec<Finding>,
+/// What became of everything that was proposed.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Tally {
     /// Points nominated by rays.
     pub nominations: u64,
     /// Nominations that were polished to labels.
@@ -94,6 +95,15 @@ pub struct Findings {
     pub outvoted: u64,
     /// Labels that probably do not exist.
     pub doubted: u64,
+}
+
+/// The labels of a scene, and what became of the rest.
+#[derive(Debug, Clone)]
+pub struct Findings {
+    /// Labels, ordered by their lowest voter.
+    pub findings: Vec<Finding>,
+    /// How it came to them.
+    pub tally: Tally,
     /// What was learnt about detection rates.
     pub rates: Rates,
     /// Detections an image that no label has.
@@ -124,7 +134,7 @@ pub fn self_calibrate(
             let court = Court::new(scene, &noise, &spreads, &settings, rays.iter().copied());
             for _ in 0..SETTLING_ROUNDS {
                 progress.check()?;
-                labels = court.settle(labels, true).0;
+                labels = court.settle(labels, true, &mut Tally::default());
             }
         }
         noise = calibrate::calibrate(scene, &noise, &labels, known);
@@ -137,35 +147,32 @@ pub fn self_calibrate(
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
 pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progress) -> Result<Findings, Halt> {
-    let all: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
-    let (mut labels, [nominations, accepted]) = gather(scene, noise, settings, &all, progress)?;
+    let all = 0..scene.rays.rays.len() as u32;
     let spreads = spreads_of(scene, noise);
-    let court = Court::new(scene, noise, &spreads, settings, all.into_iter());
+    let court = Court::new(scene, noise, &spreads, settings, all.clone());
     let lookout = Lookout::new(scene);
-    let (mut fused, mut outvoted, mut doubted) = (0, 0, 0);
-    let mut compete = |labels: Vec<Label>, may_split: bool| {
-        let (labels, [lost, joined]) = court.settle(labels, may_split);
-        outvoted += lost;
-        fused += joined;
-        labels
-    };
-    for _ in 0..SETTLING_ROUNDS {
-        progress.check()?;
-        labels = compete(labels, true);
-    }
-    // The least probable first: what they give back may be just what a doubtful one lacks.
-    for doubt in DOUBTS.map(|doubt| doubt * settings.min_existence) {
-        for _ in 0..MAX_DOUBT_ROUNDS {
+    let mut tally = Tally::default();
+    let mut labels: Vec<Label> = Vec::new();
+    // What a doubted label gives back, and what settled labels leave, may be seen more clearly now.
+    for _ in 0..SESSIONS {
+        let mut claimed = vec![false; all.len()];
+        for &ray in labels.iter().flat_map(|label| &label.voters) {
+            claimed[ray as usize] = true;
+        }
+        let free: Vec<u32> = all.clone().filter(|&ray| !claimed[ray as usize]).collect();
+        let before: Vec<u32> = labels.iter().map(settle::first_voter).collect();
+        let (more, [nominations, accepted]) = gather(scene, noise, settings, &free, progress)?;
+        tally.nominations += nominations;
+        tally.accepted += accepted;
+        labels.extend(more);
+        labels.sort_by_key(settle::first_voter);
+        for _ in 0..SETTLING_ROUNDS {
             progress.check()?;
-            let (judged, ..) = judge(scene, &spreads, &lookout, &labels, settings);
-            let before = labels.len();
-            let existing = labels.into_iter().zip(judged).filter(|(_, (existence, _))| *existence >= doubt);
-            labels = existing.map(|(label, _)| label).collect();
-            doubted += (before - labels.len()) as u64;
-            if labels.len() == before {
-                break;
-            }
-            labels = compete(labels, false);
+            labels = court.settle(labels, true, &mut tally);
+        }
+        labels = court.doubt(&lookout, labels, &mut tally, progress)?;
+        if labels.iter().map(settle::first_voter).eq(before) {
+            break;
         }
     }
     let (judged, rates, strays_per_image) = judge(scene, &spreads, &lookout, &labels, settings);
@@ -174,23 +181,14 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
         label.estimate.covariance *= variance_factor;
         Finding { label, existence, expected }
     });
-    Ok(Findings {
-        findings: findings.collect(),
-        nominations,
-        accepted,
-        fused,
-        outvoted,
-        doubted,
-        rates,
-        strays_per_image,
-        variance_factor,
-    })
+    Ok(Findings { findings: findings.collect(), tally, rates, strays_per_image, variance_factor })
 }
 
 /// Where labels compete for the rays.
 struct Court<'a> {
     scene: &'a Scene,
     noise: &'a Noise,
+    spreads: &'a [Spread],
     settings: &'a Settings,
     index: RayIndex<'a>,
 }
@@ -203,13 +201,13 @@ impl<'a> Court<'a> {
         settings: &'a Settings,
         rays: impl Iterator<Item = u32>,
     ) -> Self {
-        Self { scene, noise, settings, index: RayIndex::new(scene, spreads, settings.gate_sigmas, rays) }
+        Self { scene, noise, spreads, settings, index: RayIndex::new(scene, spreads, settings.gate_sigmas, rays) }
     }
 
     /// One round: neighbors exchange votes, all labels compete for all rays, those that are two are split and those that are
-    /// one are fused. Also how many lost their votes, and how many became part of another one.
-    fn settle(&self, labels: Vec<Label>, may_split: bool) -> (Vec<Label>, [u64; 2]) {
-        let &Self { scene, noise, settings, ref index } = self;
+    /// one are fused.
+    fn settle(&self, labels: Vec<Label>, may_split: bool, tally: &mut Tally) -> Vec<Label> {
+        let &Self { scene, noise, settings, ref index, .. } = self;
         let gate = settings.gate_sigmas;
         let min_votes = settings.min_votes as usize;
         let range_m = settings.viability.max_range_m * VOTE_RANGE;
@@ -219,8 +217,35 @@ impl<'a> Court<'a> {
         let left = labels.len();
         let labels = if may_split { settle::split(scene, noise, gate, labels, min_votes) } else { labels };
         let labels = settle::fuse(scene, noise, gate, labels);
-        let joined = left.saturating_sub(labels.len());
-        (labels, [(before - left) as u64, joined as u64])
+        tally.outvoted += (before - left) as u64;
+        tally.fused += left.saturating_sub(labels.len()) as u64;
+        labels
+    }
+
+    /// Drop the labels that probably do not exist, the least probable first: what they give back may be just what a doubtful
+    /// one lacks.
+    fn doubt(
+        &self,
+        lookout: &Lookout<'_>,
+        mut labels: Vec<Label>,
+        tally: &mut Tally,
+        progress: &Progress,
+    ) -> Result<Vec<Label>, Halt> {
+        for doubt in DOUBTS.map(|doubt| doubt * self.settings.min_existence) {
+            for _ in 0..MAX_DOUBT_ROUNDS {
+                progress.check()?;
+                let (judged, ..) = judge(self.scene, self.spreads, lookout, &labels, self.settings);
+                let before = labels.len();
+                let existing = labels.into_iter().zip(judged).filter(|(_, (existence, _))| *existence >= doubt);
+                labels = existing.map(|(label, _)| label).collect();
+                tally.doubted += (before - labels.len()) as u64;
+                if labels.len() == before {
+                    break;
+                }
+                labels = self.settle(labels, false, tally);
+            }
+        }
+        Ok(labels)
     }
 }
 
