@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import valuemap
+from cities import city
 from machine import describe_machine
-from robust import city
 from valuemap.simulate import simulate
 
 
