@@ -147,10 +147,10 @@ def add_up(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "precision": ratio(int(is_real.sum()), len(is_real)),
         "false_positives_per_label": ratio(sum(o.false_positives for o in outcomes), len(is_real)),
         "duplicates_per_label": ratio(sum(o.duplicates for o in outcomes), len(is_real)),
-        "position_rmse_m": round(float(np.sqrt(error.mean())), 4),
-        "rmse_over_bound": round(float(np.sqrt(error.sum() / bound.sum())), 3),
-        "mean_normalised_error": round(float(normalised.mean()), 2),
-        "median_normalised_error": round(float(np.median(normalised)), 2),
+        "position_rmse_m": ratio(float(error.sum()), len(error)) ** 0.5,
+        "rmse_over_bound": ratio(float(error.sum()), float(bound.sum())) ** 0.5,
+        "mean_normalised_error": ratio(float(normalised.sum()), len(normalised)),
+        "median_normalised_error": float(np.median(normalised)) if len(normalised) else 0.0,
     }
     for name in PASSING_KINDS:
         things, labelled = np.sum([o.passing[name] for o in outcomes], axis=0).tolist()
@@ -158,7 +158,8 @@ def add_up(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     existence = [o.existence for o in outcomes if o.existence is not None]
     if len(existence) == len(outcomes):
         figures["reliability"] = reliability(np.concatenate(existence), is_real)
-    return {**figures, "seconds": round(sum(o.seconds for o in outcomes), 2)}
+    figures["seconds"] = sum(o.seconds for o in outcomes)
+    return {name: round(value, 4) if isinstance(value, float) else value for name, value in figures.items()}
 
 
 def reliability(existence: Floats, is_real: Bools) -> list[dict[str, float]]:
@@ -175,9 +176,9 @@ def reliability(existence: Floats, is_real: Bools) -> list[dict[str, float]]:
     return rows
 
 
-def ratio(part: int, whole: int) -> float:
-    """Return a share, NaN of nothing."""
-    return round(part / whole, 4) if whole else float("nan")
+def ratio(part: float, whole: float) -> float:
+    """Return a share; 0 of nothing."""
+    return part / whole if whole else 0.0
 
 
 def line(name: str, figures: dict[str, Any]) -> str:
