@@ -2,63 +2,93 @@
 
 from __future__ import annotations
 
-import math
+import itertools
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 
-from valuemap.cameras import cast_rays
 from valuemap.config import SimulationConfig
-from valuemap.dataset import Dataset, rows_of
+from valuemap.dataset import rows_of
+from valuemap.simulate import Recording
+from valuemap.tables import Floats, Ints, Table
 
-Floats = NDArray[np.float64]
 
+@dataclass(frozen=True, eq=False)
+class Views(Table):
+    """Which detection shows which object, and how a residual in pixels moves: sorted by object, pass and distance.
 
-def cramer_rao_covariances(dataset: Dataset, noise: SimulationConfig) -> Floats:
-    """Return the bound (objects, 3, 3) in m², from the true associations and the simulator's own noise.
-
-    A view's residual is J dX + own error + J b + J [X - C]_x w, where b and w are the drifts of position and rotation
-    of its pass, which are taken as constant over the views of one object; the information of each pass about X is
-    that left after b and w are marginalised with their priors. Objects without views get infinite variances.
+    `of_point` (N, 2, 3) is its derivative by the object's position in m, which is also that by the camera's but for
+    the sign; `of_turn` (N, 2, 3) that by a rotation vector in rad in camera axes; `pixel_sigma` (N) the deviation of
+    the box's centre, each axis; `distance_m` (N) driven since the start of the pass.
     """
-    assert dataset.truth is not None
-    assert dataset.truth_detections is not None
-    rays = cast_rays(dataset)
-    object_row = rows_of(dataset.truth_detections.object_id, dataset.truth.object_id)
-    ray = rows_of(dataset.truth_detections.detection_id, dataset.detections.detection_id)
-    point = dataset.truth.position_in_world_m[object_row]
-    matrix, center = rays.residual_from_world[ray], rays.center_in_world_m[ray]
-    projected = np.einsum("nij,nj->ni", matrix, point - center)
-    depth = projected[:, 2, None, None]
-    jacobian = (matrix[:, :2] - (projected[:, :2] / projected[:, 2:])[:, :, None] * matrix[:, 2:]) / depth
-    turned = np.cross((point - center)[:, None], jacobian)
-    scale2 = np.mean(np.sum(jacobian**2, axis=2), axis=1) * projected[:, 2] ** 2
-    height_px = dataset.detections.size_px[ray, 1]
-    variance = (
-        noise.pixel_noise_px**2
-        + (noise.pixel_noise_share * height_px) ** 2
-        + scale2 * (noise.position_white_m / projected[:, 2]) ** 2
-        + scale2 * math.radians(noise.rotation_white_deg) ** 2
-    )
-    shared = np.concatenate(
-        [jacobian * noise.position_drift_m, turned * math.radians(noise.rotation_drift_deg)], axis=2
-    )
-    weighted = jacobian / variance[:, None, None]
-    passes = dataset.images.pass_id.codes[rays.image_row[ray]]
-    group, inverse = np.unique(np.stack([object_row, passes], axis=1), axis=0, return_inverse=True)
 
-    def summed(products: Floats) -> Floats:
-        sums = np.zeros((len(group), *products.shape[1:]))
-        np.add.at(sums, inverse.ravel(), products)
-        return sums
+    object_row: Ints
+    pass_row: Ints
+    distance_m: Floats
+    of_point: Floats
+    of_turn: Floats
+    pixel_sigma: Floats
 
-    of_point = summed(np.einsum("nki,nkj->nij", weighted, jacobian))
-    cross = summed(np.einsum("nki,nkj->nij", weighted, shared))
-    of_shared = np.eye(6) + summed(np.einsum("nki,nkj->nij", shared / variance[:, None, None], shared))
-    information = np.zeros((len(dataset.truth), 3, 3))
-    left = of_point - cross @ np.linalg.solve(of_shared, cross.transpose(0, 2, 1))
-    np.add.at(information, group[:, 0], left)
+
+def cramer_rao_covariances(views: Views, config: SimulationConfig, objects: int) -> Floats:
+    """Return the bound (objects, 3, 3) in m² of an unbiased estimate from these views under the simulator's noise.
+
+    With the covariance S of the residuals of all views of an object in a pass and their derivatives J by its position,
+    the pass tells J^T S^-1 J of that, and passes add up. Objects without views get infinite variances.
+    """
+    information = np.zeros((objects, 3, 3))
+    is_new = (np.diff(views.object_row) != 0) | (np.diff(views.pass_row) != 0)
+    for start, end in itertools.pairwise([0, *(np.flatnonzero(is_new) + 1).tolist(), len(views)]):
+        of_one = views.take(np.arange(start, end))
+        of_point = of_one.of_point.reshape(-1, 3)
+        factor = cho_factor(residual_covariance(of_one, config))
+        information[of_one.object_row[0]] += of_point.T @ cho_solve(factor, of_point)
     bound = np.full_like(information, np.inf)
     seen = np.linalg.det(information) > 0.0
     bound[seen] = np.linalg.inv(information[seen])
     return bound
+
+
+def true_views(recording: Recording) -> Views:
+    """Return the detections that show objects, with true poses, boxes and derivatives."""
+    dataset, config, lights = recording.dataset, recording.config, recording.city.lights
+    assert dataset.truth is not None
+    assert dataset.truth_detections is not None
+    object_row = rows_of(dataset.truth_detections.object_id, dataset.truth.object_id)
+    detection = rows_of(dataset.truth_detections.detection_id, dataset.detections.detection_id)
+    frames = recording.frames.take(rows_of(dataset.detections.image_id[detection], dataset.images.image_id))
+    cam_from_world = frames.cam_from_world()
+    in_cam = np.einsum("nij,nj->ni", cam_from_world, lights.position_in_world_m[object_row] - frames.center_in_world_m)
+    x, y, depth = in_cam.T
+    of_cam = np.zeros((len(depth), 2, 3))
+    of_cam[:, 0, 0] = of_cam[:, 1, 1] = config.focal_px / depth
+    of_cam[:, 0, 2], of_cam[:, 1, 2] = -config.focal_px * x / depth**2, -config.focal_px * y / depth**2
+    height_px = config.focal_px * lights.size_m[object_row, 1] / depth
+    views = Views(
+        object_row=object_row,
+        pass_row=frames.pass_row,
+        distance_m=frames.distance_m,
+        of_point=of_cam @ cam_from_world,
+        of_turn=np.cross(in_cam[:, None], of_cam),
+        pixel_sigma=np.hypot(config.pixel_noise_px, config.pixel_noise_share * height_px),
+    )
+    return views.take(np.lexsort((views.distance_m, views.pass_row, views.object_row)))
+
+
+def residual_covariance(views: Views, config: SimulationConfig) -> Floats:
+    """Return the covariance (2N, 2N) in px² of the residuals, x and y in turn, of views (N) of one pass.
+
+    A pose error has a part of each image of its own and an Ornstein-Uhlenbeck process over the distance driven, whose
+    values d apart correlate with exp(-d / drift_length_m); see simulate/pose_errors.py.
+    """
+    apart_m = np.abs(views.distance_m[:, None] - views.distance_m)
+    drift, own = np.exp(-apart_m / config.drift_length_m), np.eye(len(views))
+    white_rad, drift_rad = np.radians([config.rotation_white_deg, config.rotation_drift_deg])
+    position = config.position_white_m**2 * own + config.position_drift_m**2 * drift
+    rotation = white_rad**2 * own + drift_rad**2 * drift
+    covariance = np.diag(np.repeat(views.pixel_sigma**2, 2))
+    for derivative, between_images in ((views.of_point, position), (views.of_turn, rotation)):
+        rows = derivative.reshape(-1, 3)
+        covariance += rows @ rows.T * between_images.repeat(2, axis=0).repeat(2, axis=1)
+    return np.asarray(covariance)

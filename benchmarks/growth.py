@@ -6,15 +6,13 @@ Time of `build_map` with the default method; ten times the passes should cost ab
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import valuemap
-from machine import describe_machine
-from robust import city
+from cities import city
+from machine import write_record
 from valuemap.simulate import simulate
 
 
@@ -47,10 +45,7 @@ def main() -> None:
         print(rows[-1], flush=True)
     ratio = rows[1]["seconds"] / rows[0]["seconds"]
     print(f"{rows[1]['detections'] / rows[0]['detections']:.1f} times the detections: {ratio:.1f} times the time")
-    if options.json:
-        command = ("python benchmarks/growth.py " + " ".join(sys.argv[1:])).strip()
-        record = {"command": command, "data": "simulated", **describe_machine(), "results": rows, "time_ratio": ratio}
-        options.json.write_text(json.dumps(record, indent=2) + "\n")
+    write_record(options.json, rows, time_ratio=ratio)
 
 
 if __name__ == "__main__":

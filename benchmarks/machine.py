@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
+import sys
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+
+def write_record(path: Path | None, results: Any, **more: Any) -> None:
+    """Write the figures of a benchmark on simulated data with its command, machine and versions, if a file is named."""
+    if path is not None:
+        arguments = ("PATH" if Path(argument).is_absolute() else argument for argument in sys.argv[1:])
+        command = " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *arguments])
+        record = {"command": command, "data": "simulated", **describe_machine(), **more, "results": results}
+        path.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
 
 
 def describe_machine() -> dict[str, Any]:

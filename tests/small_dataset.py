@@ -100,6 +100,8 @@ def map_of(
         max_parallax_rad=np.full(count, 0.4),
         first_seen_s=np.full(count, np.nan),
         last_seen_s=np.full(count, 12.5),
+        facing_azimuth_rad=np.full(count, 4.7),
+        facing_concentration=np.full(count, 0.9),
         lon_lat_height=lon_lat_height,
     )
     votes = Votes(

@@ -12,10 +12,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import valuemap
-from scenes import as_dataset, random_scene
+from literal import Pinhole, Sighting
+from scenes import Scene, as_dataset, random_scene
+from valuemap.cameras import cast_rays
+from valuemap.config import NoiseConfig
 from valuemap.dataset import Dataset, Frame
+from valuemap.describe import describe_labels
 from valuemap.map_folder import Map
-from valuemap.tables import Labels, Votes, table_to_arrow, write_table
+from valuemap.tables import Candidates, Labels, Votes, table_to_arrow, write_table
 
 
 def street(seed: int = 7) -> Dataset:
@@ -70,6 +74,37 @@ def test_a_moved_world_gives_the_moved_map(
     expected = turn.apply(still.labels.position_in_world_m) + np.array(shift)
     np.testing.assert_allclose(other.labels.position_in_world_m, expected, atol=2e-6)
     np.testing.assert_allclose(other.labels.reprojection_rms_px, still.labels.reprojection_rms_px, atol=2e-5)
+    np.testing.assert_allclose(other.labels.facing_concentration, still.labels.facing_concentration, atol=1e-6)
+    np.testing.assert_allclose(facing(other), turn.apply(facing(still)), atol=1e-6)
+
+
+def facing(result: valuemap.Map) -> np.ndarray:
+    """Where labels face, as unit vectors in the world."""
+    azimuth = result.labels.facing_azimuth_rad
+    return np.asarray(np.stack([np.sin(azimuth), np.cos(azimuth)], axis=1) @ result.frame.east_north())
+
+
+def test_azimuths_are_clockwise_from_north() -> None:
+    """A light seen from the west by a car that waits and from the south by one that does not faces south-west."""
+    light = np.array([3.0, 4.0, 5.0])
+    intrinsics = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    looking_east = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    looking_north = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    places = [(looking_east, light - [20.0, 0.0, 3.0])] * 9 + [(looking_north, light - [0.0, 30.0, 3.0])]
+    cameras = [Pinhole(intrinsics, rotation, -rotation @ center) for rotation, center in places]
+    sightings = [Sighting(i, "light", camera.project(light)[0]) for i, camera in enumerate(cameras)]
+    dataset = as_dataset(Scene(cameras, sightings, light[None]), passes=["waits"] * 9 + ["passes by"])
+    found = Candidates(light[None], np.array([0, 10]), np.arange(10, dtype=np.uint32))
+    labels, _ = describe_labels(dataset, cast_rays(dataset), found, NoiseConfig())
+    np.testing.assert_allclose(labels.facing_azimuth_rad, [np.radians(225.0)])
+    np.testing.assert_allclose(labels.facing_concentration, [np.sqrt(0.5)])
+
+
+def test_a_frame_of_its_own_has_a_north() -> None:
+    np.testing.assert_allclose(Frame().east_north(), [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], atol=1e-15)
+    np.testing.assert_allclose(Frame(up=(0.0, -1.0, 0.0)).east_north(), [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], atol=1e-15)
+    tilted = Frame(up=(0.0, 0.6, 0.8)).east_north()
+    np.testing.assert_allclose(tilted, [[1.0, 0.0, 0.0], [0.0, 0.8, -0.6]], atol=1e-15)
 
 
 @both_methods

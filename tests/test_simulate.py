@@ -18,7 +18,8 @@ from valuemap.config import SimulationConfig
 from valuemap.dataset import Dataset, check_dataset, read_dataset, write_dataset
 from valuemap.errors import SettingError
 from valuemap.progress import silent
-from valuemap.simulate import PRESETS, build_city, simulate
+from valuemap.simulate import PRESETS, build_city, record_city, simulate
+from valuemap.simulate.detector import KINDS
 from valuemap.simulate.drives import Frames, drive
 from valuemap.simulate.paths import lay_path
 from valuemap.simulate.pose_errors import _drift_along_passes
@@ -656,6 +657,32 @@ def test_reflections_stay_where_they_are_in_the_picture() -> None:
         assert len(np.unique(dataset.images.pass_id.codes[dataset.detections.image_id[rows]])) == 1
         assert np.all(np.ptp(dataset.detections.center_px[rows], axis=0) < 8.0)
         assert np.ptp(dataset.detections.image_id[rows]) < 60
+
+
+def test_a_recording_tells_what_every_detection_shows() -> None:
+    rates = {"clutter_per_image": 0.2, "temporary_per_1000_images": 5.0, "reflections_per_1000_images": 5.0}
+    recording = record_city(changed(SMALL, lookalikes_per_light=1.0, **rates), seed=0)
+    dataset, boxes = recording.dataset, recording.boxes
+    assert dataset.truth_detections is not None
+    assert np.array_equal(boxes.center_px, dataset.detections.center_px)
+    assert np.array_equal(boxes.frame_row, dataset.detections.image_id)
+    is_of = {kind: boxes.kind == code for code, kind in enumerate(KINDS)}
+    assert np.array_equal(np.flatnonzero(is_of["lights"]), dataset.truth_detections.detection_id)
+    passes = recording.frames.pass_row[boxes.frame_row]
+    most_passes = {}
+    for kind, rows in is_of.items():
+        met = np.unique(np.stack([boxes.thing_row[rows], passes[rows]], axis=1), axis=0)[:, 0]
+        most_passes[kind] = np.bincount(met).max()
+    assert (most_passes["clutter"], most_passes["reflections"], most_passes["temporary"]) == (1, 1, 1)
+    assert min(most_passes["lights"], most_passes["lookalikes"]) > 2
+    assert np.bincount(boxes.thing_row[is_of["clutter"]]).max() == 1
+    reflection = boxes.take(is_of["reflections"])
+    first = np.unique(reflection.thing_row, return_index=True)[1]
+    assert np.array_equal(reflection.size_px, reflection.size_px[first][_number(reflection.thing_row)])
+
+
+def _number(values: Ints) -> Ints:
+    return np.unique(values, return_inverse=True)[1]
 
 
 def test_clutter_comes_as_often_as_asked_and_everywhere() -> None:

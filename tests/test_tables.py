@@ -156,6 +156,7 @@ def test_some_tables_may_be_empty(kind: Any, tmp_path: Path) -> None:
             **dict.fromkeys(("x", "y", "z", "object_width_m", "object_height_m"), pa.float64()),
             **{f"covariance_{axes}": pa.float64() for axes in ("xx", "xy", "xz", "yy", "yz", "zz")},
             **dict.fromkeys(("reprojection_rms_px", "max_parallax_rad", "first_seen", "last_seen"), pa.float64()),
+            **dict.fromkeys(("facing_azimuth_rad", "facing_concentration"), pa.float64()),
         },
         Votes: {
             **dict.fromkeys(("label_id", "detection_id", "image_id"), pa.int64()),

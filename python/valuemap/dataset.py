@@ -52,6 +52,18 @@ class Frame:
         """Whether positions can be given as longitude, latitude and height."""
         return self.anchor is not None
 
+    def east_north(self) -> Floats:
+        """Return two unit vectors (2, 3) across up: azimuths count from the second to the first.
+
+        In a frame of its own north is the horizontal part of the axis y, or where y is within 45 degrees of the
+        vertical that of z, and east is to the right of it.
+        """
+        up = np.array(self.up)
+        north = np.array([0.0, 1.0, 0.0]) if abs(up[1]) <= math.sqrt(0.5) else np.array([0.0, 0.0, 1.0])
+        north -= (north @ up) * up
+        north /= np.linalg.norm(north)
+        return np.stack([np.cross(north, up), north])
+
     def to_json(self) -> dict[str, Any]:
         """Return the `frame` object of dataset.json and run.json."""
         if self.anchor is not None:

@@ -22,7 +22,9 @@ def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config
     Where the candidates have no covariance of their own it is the squared standard deviation of the detections times
     the inverse of the normal equations of Eq. (1) of the paper at the label. That deviation is the setting
     `detection_sigma_px`, else that of the residuals. Width and height are the medians over voters of box size times
-    depth over focal length.
+    depth over focal length. A label faces the mean horizontal direction to its voters' cameras, in which every pass
+    weighs the same, so that a car that waits before it does not decide; the length of that mean of unit vectors is the
+    concentration.
     """
     images, detections = dataset.images, dataset.detections
     voters = candidates.voters.astype(np.int64)
@@ -40,19 +42,24 @@ def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config
         )
     position = candidates.position_in_world_m
     anchor = dataset.frame.anchor
+    label_of_pass, pass_of_voter = _passes_of_labels(label, images.pass_id.codes[image_row])
+    toward_camera = (rays.center_in_world_m[voters] - position[label]) @ dataset.frame.east_north().T
+    facing = _mean_in_groups(_mean_in_groups(_unit_vectors(toward_camera), pass_of_voter), label_of_pass)
     labels = Labels(
         label_id=np.arange(1, len(candidates) + 1),
         class_name=detections.class_name.take(voters[starts]),
         position_in_world_m=position,
         covariance_m2=covariance.reshape(-1, 9)[:, _UPPER_TRIANGLE],
         votes=count,
-        passes=_count_distinct(label, images.pass_id.codes[image_row], len(candidates)),
+        passes=np.bincount(label_of_pass, minlength=len(candidates)),
         object_width_m=_median_in_groups(size_m[:, 0], label, candidates.voter_offsets),
         object_height_m=_median_in_groups(size_m[:, 1], label, candidates.voter_offsets),
         reprojection_rms_px=np.sqrt(_reduce(np.add, residual_px**2, starts) / count),
         max_parallax_rad=max_angles(rays, candidates),
         first_seen_s=_reduce(np.fmin, time, starts),
         last_seen_s=_reduce(np.fmax, time, starts),
+        facing_azimuth_rad=np.arctan2(facing[:, 0], facing[:, 1]) % (2.0 * np.pi),
+        facing_concentration=np.minimum(np.linalg.norm(facing, axis=1), 1.0),
         expected=candidates.expected,
         existence=candidates.existence,
         lon_lat_height=None if anchor is None else lon_lat_height_from_enu(position, anchor),
@@ -106,9 +113,23 @@ def _reduce(operation: np.ufunc, values: Floats, starts: Ints) -> Floats:
     return np.asarray(operation.reduceat(values, starts)) if len(starts) else np.empty(0)
 
 
-def _count_distinct(group: Ints, code: NDArray[np.int32], groups: int) -> Ints:
-    pairs = np.unique(np.stack([group, code], axis=1), axis=0)
-    return np.bincount(pairs[:, 0], minlength=groups).astype(np.int64)
+def _passes_of_labels(label: Ints, pass_code: NDArray[np.int32]) -> tuple[Ints, Ints]:
+    """Return the label of every pass that voted for one (N, by label), and which of these each voter is of."""
+    codes = int(pass_code.max(initial=0)) + 1
+    pairs, pass_of_voter = np.unique(label * codes + pass_code, return_inverse=True)
+    return pairs // codes, pass_of_voter
+
+
+def _unit_vectors(vectors: Floats) -> Floats:
+    """Return vectors (N, K) with length 1; those without a direction stay 0."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.where(length > 0.0, length, 1.0))
+
+
+def _mean_in_groups(values: Floats, group: Ints) -> Floats:
+    """Return the mean (groups, K) of values (N, K); groups are numbered from 0, none is empty."""
+    sums = [np.bincount(group, weights=column) for column in values.T]
+    return np.asarray(np.stack(sums, axis=1) / np.bincount(group)[:, None])
 
 
 def _median_in_groups(values: Floats, group: Ints, offsets: Ints) -> Floats:

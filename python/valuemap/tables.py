@@ -228,7 +228,9 @@ class Labels(Table):
     `votes` counts images, `passes` the passes they come from; `reprojection_rms_px` over the voters;
     `max_parallax_rad` the largest angle between two voters' directions to the object; `first_seen_s` and
     `last_seen_s` the voters' first and last timestamps (NaN where there are none); width and height from the
-    voters' boxes at their depths; `expected` counts the images that should have seen it and `existence` is the
+    voters' boxes at their depths; `facing_azimuth_rad` (0 to 2 pi, clockwise from north seen from above) where the
+    voters' cameras are from it, and `facing_concentration` (0 to 1) how much they are on one side of it;
+    `expected` counts the images that should have seen it and `existence` is the
     probability that it exists (robust method); lon, lat in degrees and height in metres on WGS84 where geo-referenced.
     """
 
@@ -257,6 +259,8 @@ class Labels(Table):
     max_parallax_rad: Floats = _column("float", ("max_parallax_rad",))
     first_seen_s: Floats = _column("float", ("first_seen",), nullable=True)
     last_seen_s: Floats = _column("float", ("last_seen",), nullable=True)
+    facing_azimuth_rad: Floats = _column("float", ("facing_azimuth_rad",))
+    facing_concentration: Floats = _column("float", ("facing_concentration",))
     lon_lat_height: Floats | None = _column("float", ("lon", "lat", "height"), optional=True)
     expected: Ints | None = _column("int", ("expected",), optional=True)
     existence: Floats | None = _column("float", ("existence",), optional=True)

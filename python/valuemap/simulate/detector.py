@@ -13,18 +13,21 @@ from valuemap.simulate.sightings import Sightings
 from valuemap.simulate.streams import random_stream
 from valuemap.tables import Bools, Floats, Ints, Table
 
-NO_LIGHT = -1
+KINDS = ("lights", "lookalikes", "temporary", "reflections", "clutter")
+"""What a box may show, only the first rightly; also the names of their random numbers."""
 
 
 @dataclass(frozen=True, eq=False)
 class Boxes(Table):
     """Detected boxes: centres and sizes (N, 2) in pixels, scores (N).
 
-    `light_row` (N) is the row of the light that a box shows, or NO_LIGHT.
+    `kind` (N) is what a box shows, as index of KINDS; `thing_row` (N) numbers the things of a kind from 0, so that
+    boxes of one thing have one number.
     """
 
     frame_row: Ints
-    light_row: Ints
+    kind: Ints
+    thing_row: Ints
     center_px: Floats
     size_px: Floats
     score: Floats
@@ -48,9 +51,8 @@ def detect(
     *,
     seed: int,
     kind: str,
-    are_lights: bool,
 ) -> Boxes:
-    """Return what is detected of the targets in view; `kind` names their random numbers.
+    """Return what is detected of the targets in view, all of one of KINDS.
 
     The numbers are drawn for every view, detected or not, so that no setting reshuffles those of another.
     """
@@ -66,11 +68,12 @@ def detect(
     sigma_px = np.hypot(config.pixel_noise_px, config.pixel_noise_share * height_px)
     shift_px = random_stream(seed, kind, "center").standard_normal((count, 2)) * sigma_px[:, None]
     stretch = np.exp(config.size_noise * random_stream(seed, kind, "size").standard_normal((count, 2)))
-    best = config.score_true if are_lights else (config.score_true + config.score_false) / 2.0
+    best = config.score_true if kind == "lights" else (config.score_true + config.score_false) / 2.0
     score = config.score_false + (best - config.score_false) * quality
     boxes = Boxes(
         frame_row=sightings.frame_row,
-        light_row=sightings.target_row if are_lights else np.full(count, NO_LIGHT),
+        kind=np.full(count, KINDS.index(kind)),
+        thing_row=sightings.target_row,
         center_px=inside_picture(sightings.center_px + shift_px, config),
         size_px=sightings.size_px * stretch,
         score=noisy_score(score, config, random_stream(seed, kind, "score")),

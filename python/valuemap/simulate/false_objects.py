@@ -9,7 +9,7 @@ import numpy as np
 
 from valuemap.config import SimulationConfig
 from valuemap.simulate.city import Targets
-from valuemap.simulate.detector import NO_LIGHT, Boxes, inside_picture, noisy_score
+from valuemap.simulate.detector import KINDS, Boxes, inside_picture, noisy_score
 from valuemap.simulate.drives import Frames
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import Streets
@@ -32,7 +32,8 @@ def clutter(frames: Frames, config: SimulationConfig, *, seed: int) -> Boxes:
     score = np.full(len(frame_row), config.score_false)
     return Boxes(
         frame_row=frame_row,
-        light_row=np.full(len(frame_row), NO_LIGHT),
+        kind=np.full(len(frame_row), KINDS.index("clutter")),
+        thing_row=np.arange(len(frame_row)),
         center_px=center_px,
         size_px=size_px,
         score=noisy_score(score, config, random_stream(seed, "clutter", "score")),
@@ -56,7 +57,8 @@ def reflect(frames: Frames, config: SimulationConfig, *, seed: int) -> Boxes:
     score = np.full(count, config.score_false)
     boxes = Boxes(
         frame_row=frame_row,
-        light_row=np.full(count, NO_LIGHT),
+        kind=np.full(count, KINDS.index("reflections")),
+        thing_row=of_box,
         center_px=inside_picture(center_px[of_box] + jitter_px, config),
         size_px=size_px[of_box],
         score=noisy_score(score, config, random_stream(seed, "reflections", "score")),

@@ -13,7 +13,7 @@ from valuemap.dataset import Dataset, Frame
 from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
 from valuemap.simulate.city import City, build_city
-from valuemap.simulate.detector import NO_LIGHT, Boxes, detect, hidden_by_traffic, recall_of_passes
+from valuemap.simulate.detector import KINDS, Boxes, detect, hidden_by_traffic, recall_of_passes
 from valuemap.simulate.drives import KEEP_RANGE, Frames, drive
 from valuemap.simulate.false_objects import clutter, place_temporary, reflect
 from valuemap.simulate.pose_errors import pose_errors
@@ -31,7 +31,8 @@ class Recording:
     """What was recorded, and what it was recorded of.
 
     Row i of `frames`, the true exposures, is row i of `dataset.images`, which holds their poses with errors.
-    `sightings` are the true views of lights, of which traffic hides those in `is_hidden` (N).
+    `sightings` are the true views of lights, of which traffic hides those in `is_hidden` (N). Row i of `boxes` says
+    what row i of `dataset.detections` shows.
     """
 
     config: SimulationConfig
@@ -40,6 +41,7 @@ class Recording:
     frames: Frames
     sightings: Sightings
     is_hidden: Bools
+    boxes: Boxes
     dataset: Dataset
 
 
@@ -99,6 +101,7 @@ def record_city(
         frames=frames,
         sightings=sightings.replace(frame_row=sighted_in).take(sighted_in >= 0),
         is_hidden=is_hidden[sighted_in >= 0],
+        boxes=boxes,
         dataset=dataset,
     )
 
@@ -112,7 +115,7 @@ def _dataset(
     rotation_error_rad: Floats,
     config: SimulationConfig,
 ) -> Dataset:
-    shows_light = boxes.light_row != NO_LIGHT
+    shows_light = boxes.kind == KINDS.index("lights")
     return Dataset(
         name=name,
         frame=Frame(),
@@ -132,7 +135,7 @@ def _dataset(
             position_in_world_m=city.lights.position_in_world_m,
         ),
         truth_detections=TruthDetections(
-            detection_id=np.flatnonzero(shows_light), object_id=boxes.light_row[shows_light]
+            detection_id=np.flatnonzero(shows_light), object_id=boxes.thing_row[shows_light]
         ),
     )
 
@@ -149,11 +152,11 @@ def _detect_everything(
     parts = [
         reflect(frames, config, seed=seed),
         clutter(frames, config, seed=seed),
-        detect(of_lights, city.lights, frames, recall, config, seed=seed, kind="lights", are_lights=True),
+        detect(of_lights, city.lights, frames, recall, config, seed=seed, kind="lights"),
     ]
     for kind, targets in kinds.items():
         seen = see(targets, frames, city.streets, config, progress=progress, what=f"seeing {kind}")
-        parts.append(detect(seen, targets, frames, recall, config, seed=seed, kind=kind, are_lights=False))
+        parts.append(detect(seen, targets, frames, recall, config, seed=seed, kind=kind))
     boxes = join_rows(parts)
     return boxes.take(np.lexsort((boxes.center_px[:, 1], boxes.center_px[:, 0], boxes.frame_row)))
 

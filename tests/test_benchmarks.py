@@ -1,0 +1,209 @@
+"""What the benchmarks compute besides the method: bounds and counts, on small cases of known answers."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bound import Views, cramer_rao_covariances, residual_covariance, true_views
+from cities import PASSING_KINDS, passing_things, reliability
+from literal import Pinhole, Sighting
+from more_data import part_of, reprojection_errors_px, tour_of_images
+from scenes import Scene, as_dataset
+from small_dataset import map_of
+from valuemap.config import SimulationConfig
+from valuemap.simulate import PRESETS, Recording, record_city
+from valuemap.simulate.detector import KINDS
+from valuemap.simulate.pose_errors import pose_errors
+from valuemap.tables import Categories, Floats, Ints, Truth, TruthDetections, Votes
+
+
+@pytest.fixture(scope="module")
+def small_city() -> Recording:
+    return record_city(PRESETS["small"], seed=0)
+
+
+# The Cramer-Rao bound.
+
+
+def information(views: Views, config: SimulationConfig, *, is_shared: bool) -> Floats:
+    """What views of one object tell of it, with drift as six unknowns of each pass, or as more noise of each image."""
+    white = config.position_white_m, np.radians(config.rotation_white_deg)
+    drift = config.position_drift_m, np.radians(config.rotation_drift_deg)
+    passes, number = np.unique(views.pass_row, return_inverse=True)
+    normal = np.diag([0.0] * 3 + [1.0] * (6 * len(passes)))
+    for i in range(len(views)):
+        derivatives = views.of_point[i], views.of_turn[i]
+        covariance = views.pixel_sigma[i] ** 2 * np.eye(2)
+        for derivative, own, along in zip(derivatives, white, drift, strict=True):
+            covariance += (own**2 + (0.0 if is_shared else along**2)) * derivative @ derivative.T
+        row = np.zeros((2, len(normal)))
+        row[:, :3] = views.of_point[i]
+        if is_shared:
+            row[:, 3 + 6 * number[i] :][:, :6] = np.hstack([derivatives[0] * drift[0], derivatives[1] * drift[1]])
+        normal += row.T @ np.linalg.inv(covariance) @ row
+    return np.asarray(np.linalg.inv(np.linalg.inv(normal)[:3, :3]))
+
+
+@pytest.mark.parametrize(("length_m", "is_shared"), [(1e12, True), (1e-12, False)])
+def test_the_bound_has_the_right_limits(small_city: Recording, length_m: float, is_shared: bool) -> None:
+    """Drift that never changes in a pass is six more unknowns of it; drift that is forgotten at once is white."""
+    config = dataclasses.replace(small_city.config, drift_length_m=length_m)
+    views = true_views(small_city)
+    views = views.take(np.diff(views.distance_m, append=np.inf) != 0.0)  # Where the car stands, drift stands as well.
+    bound = cramer_rao_covariances(views, config, len(small_city.city.lights))
+    for light in np.unique(views.object_row)[:5]:
+        of_light = views.take(views.object_row == light)
+        assert len(np.unique(of_light.pass_row)) > 1
+        expected = information(of_light, config, is_shared=is_shared)
+        np.testing.assert_allclose(bound[light], np.linalg.inv(expected), rtol=1e-6)
+
+
+def test_residuals_scatter_as_the_bound_takes_them_to(small_city: Recording) -> None:
+    """Over 500 draws of the simulator's own errors the residuals of one light in one pass have that covariance."""
+    config, frames, lights = small_city.config, small_city.frames, small_city.city.lights
+    views = true_views(small_city)
+    views = views.take((views.object_row == views.object_row[0]) & (views.pass_row == views.pass_row[0]))
+    views = views.take(np.arange(0, len(views), 3))
+    rows = [
+        int(np.flatnonzero((frames.pass_row == p) & (frames.distance_m == d))[0])
+        for p, d in zip(views.pass_row, views.distance_m, strict=True)
+    ]
+    to_light = lights.position_in_world_m[views.object_row] - frames.center_in_world_m[rows]
+    cam_from_world = frames.cam_from_world()[rows]
+    random = np.random.default_rng(0)
+    residuals = []
+    for seed in range(500):
+        shift, turn = pose_errors(frames, config, seed=seed)
+        in_cam = np.einsum("nij,nj->ni", cam_from_world, to_light - shift[rows])
+        turned = Rotation.from_rotvec(turn[rows]).apply(in_cam)
+        exact = np.einsum("nij,nj->ni", cam_from_world, to_light)
+        moved = config.focal_px * (turned[:, :2] / turned[:, 2:] - exact[:, :2] / exact[:, 2:])
+        residuals.append((moved + random.normal(size=moved.shape) * views.pixel_sigma[:, None]).ravel())
+    lower = np.linalg.cholesky(residual_covariance(views, config))
+    scatter = np.cov(np.linalg.solve(lower, np.transpose(residuals)))
+    assert len(scatter) >= 16
+    np.testing.assert_allclose(scatter, np.eye(len(scatter)), atol=0.3)
+
+
+def test_without_views_nothing_is_known(small_city: Recording) -> None:
+    views = true_views(small_city)
+    bound = cramer_rao_covariances(views.take(views.object_row != 0), small_city.config, len(small_city.city.lights))
+    assert np.all(np.isinf(bound[0]))
+    assert np.all(np.isfinite(bound[views.object_row[-1]]))
+
+
+# What became of labels and objects.
+
+
+def test_things_that_pass_by_have_a_label_if_most_of_its_voters_show_them() -> None:
+    rates = {"temporary_per_1000_images": 5.0, "reflections_per_1000_images": 5.0}
+    recording = record_city(dataclasses.replace(PRESETS["small"], **rates), seed=0)  # type: ignore[arg-type]
+    kind, thing = recording.boxes.kind, recording.boxes.thing_row
+
+    def rows(name: str, number: int) -> Ints:
+        return np.flatnonzero((kind == KINDS.index(name)) & (thing == number))
+
+    often = [int(np.argmax(np.bincount(thing[kind == KINDS.index(name)]))) for name in PASSING_KINDS]
+    temporary, reflection = (rows(name, number) for name, number in zip(PASSING_KINDS, often, strict=True))
+    light = np.flatnonzero(kind == KINDS.index("lights"))
+    assert min(len(temporary), len(reflection)) >= 3
+
+    def passing(*voters: Ints) -> dict[str, tuple[int, int]]:
+        result = map_of(np.zeros((len(voters), 3)))
+        every = np.concatenate(voters)
+        votes = Votes(
+            label_id=np.repeat(result.labels.label_id, [len(v) for v in voters]),
+            detection_id=recording.dataset.detections.detection_id[every],
+            image_id=recording.dataset.detections.image_id[every],
+            residual_px=np.zeros(len(every)),
+            residual_sigmas=np.zeros(len(every)),
+        )
+        labels = result.labels.replace(votes=np.array([len(v) for v in voters]))
+        return passing_things(recording, dataclasses.replace(result, labels=labels, votes=votes))
+
+    half = len(temporary)
+    none = passing(light[:4])
+    assert all(things > 1 and labelled == 0 for things, labelled in none.values())
+    assert passing(temporary)["temporary"] == (none["temporary"][0], 1)
+    assert passing(temporary, temporary)["temporary"] == (none["temporary"][0], 1)
+    assert passing(temporary, reflection)["reflections"] == (none["reflections"][0], 1)
+    assert passing(np.concatenate([temporary, light[:half]])) == none
+    assert passing(np.concatenate([temporary, light[: half - 1]]))["temporary"][1] == 1
+
+
+def test_reliability_counts_labels_by_their_existence() -> None:
+    rows = reliability(np.array([0.5, 0.55, 0.95, 0.99, 1.0, 1.0]), np.array([True, False, False, True, True, True]))
+    assert rows == [
+        {"from": 0.5, "to": 0.6, "labels": 2, "real": 0.5},
+        {"from": 0.9, "to": 0.99, "labels": 1, "real": 0.0},
+        {"from": 0.99, "to": 1.0, "labels": 3, "real": 1.0},
+        {"from": 0.9, "to": 1.0, "labels": 4, "real": 0.75},
+    ]
+
+
+# More data.
+
+
+def test_the_first_tour_is_the_city_driven_once() -> None:
+    twice = record_city(dataclasses.replace(PRESETS["small"], passes_per_street=2), seed=0)
+    once = record_city(dataclasses.replace(PRESETS["small"], passes_per_street=1), seed=0).dataset
+    first = part_of(twice.dataset, tour_of_images(twice) == 0)
+    assert once.truth_detections is not None
+    assert first.truth_detections is not None
+    assert len(first.images) < len(twice.dataset.images)
+    assert first.images.name.to_pylist() == once.images.name.to_pylist()
+    assert np.array_equal(first.images.cam_from_world_m, once.images.cam_from_world_m)
+    assert np.array_equal(first.detections.center_px, once.detections.center_px)
+    assert np.array_equal(first.truth_detections.object_id, once.truth_detections.object_id)
+
+
+def test_reprojection_errors_are_those_of_the_pinhole() -> None:
+    """Labels 0.2 m too far right at 20 m and 0.1 m too low at 10 m, with a focal length of 500 px: both 5 px."""
+    intrinsics = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
+    objects = np.array([[1.0, 2.0, 20.0], [-1.0, 1.0, 10.0], [0.0, 0.0, 15.0]])
+    camera = Pinhole(intrinsics, np.eye(3), np.zeros(3))
+    sightings = [Sighting(0, "light", camera.project(place)[0]) for place in objects]
+    dataset = dataclasses.replace(
+        as_dataset(Scene([camera], sightings, objects)),
+        truth=Truth(np.arange(3), Categories.from_texts(["light"] * 3), objects),
+        truth_detections=TruthDetections(np.array([0, 10, 20]), np.arange(3)),
+    )
+    labels = objects + [[0.2, 0.0, 0.0], [0.0, 0.1, 0.0], [9.0, 9.0, 9.0]]
+    errors_px = reprojection_errors_px(dataset, labels, np.array([True, True, False]))
+    np.testing.assert_allclose(errors_px, [5.0, 5.0])
+
+
+# The scripts run.
+
+
+@pytest.mark.parametrize(
+    ("script", "arguments", "rows"),
+    [
+        ("robust", "--seeds 0 --passes 1", 1),
+        ("robust", "--seeds 0 --passes 1 --method paper", 1),
+        ("more_data", "--seeds 0 --tours 1 2", 2),
+        ("ablation", "--seeds 0 --passes 1 --without nothing", 1),
+    ],
+)
+def test_a_benchmark_writes_what_it_found(
+    script: str,
+    arguments: str,
+    rows: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / "figures.json"
+    monkeypatch.setattr("sys.argv", [f"benchmarks/{script}.py", *arguments.split(), "--json", str(path)])
+    importlib.import_module(script).main()
+    record = json.loads(path.read_text(encoding="utf-8"))
+    assert record["command"].startswith(f"python benchmarks/{script}.py {arguments}")
+    assert [0.0 < row["recall"] <= 1.0 for row in record["results"]] == [True] * rows
+    assert str(record["results"][-1]["recall"]) in capsys.readouterr().out
