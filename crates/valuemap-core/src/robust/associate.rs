@@ -36,7 +36,7 @@ const LEAST_RIVALRY: u32 = 8;
 /// For each of them, images that show both, at most: what clutter and double detections do.
 const MOST_BOTH: f64 = 0.1;
 /// Detections are looked for as far from a label as this many of its standard deviations, in steps of one.
-const REACH_SIGMAS: i32 = 2;
+const REACH_SIGMAS: i32 = 4;
 /// Where a label's place is known this well, its uncertainty widens no gate, m.
 const CERTAIN_M: f64 = 0.1;
 
@@ -260,16 +260,19 @@ fn overruled(images: &[&[Case<'_>]], fits: &[Vec<Fit>], limit: f64) -> FxHashSet
         let open: Vec<usize> = (0..cases.len()).filter(|&i| fits[i].cost < limit).collect();
         let is_shown = |label: u32| open.iter().any(|&i| fits[i].granted && cases[i].claim.label == label);
         for (k, &i) in open.iter().enumerate() {
-            for &j in open[k + 1..].iter().filter(|&&j| cases[j].claim.ray == cases[i].claim.ray) {
-                let pair = (cases[i].claim.label, cases[j].claim.label);
-                let rivalry = rivalries.entry(pair).or_default();
-                match (is_shown(pair.0), is_shown(pair.1)) {
-                    (true, true) => rivalry.both += 1,
-                    (false, false) => {}
-                    _ => {
+            for &j in &open[k + 1..] {
+                let (a, b) = (cases[i].claim, cases[j].claim);
+                let pair = (a.label, b.label);
+                match (is_shown(a.label), is_shown(b.label)) {
+                    (true, true) if fits[i].granted && fits[j].granted => {
+                        rivalries.entry(pair).or_default().both += 1;
+                    }
+                    (true, false) | (false, true) if a.ray == b.ray => {
+                        let rivalry = rivalries.entry(pair).or_default();
                         rivalry.one += 1;
                         rivalry.cost += fits[i].cost - fits[j].cost;
                     }
+                    _ => {}
                 }
             }
         }

@@ -124,7 +124,8 @@ fn exchange_pair(scene: &Scene, noise: &Noise, gate_sigmas: f64, a: &Label, b: &
     let of = |side: usize, old: &Label| {
         let ray = |(both, &swap): (&Both, &bool)| both.rays[side ^ usize::from(swap != mirrored)];
         let voters = images.iter().zip(&swapped).map(ray).collect();
-        from_voters(scene, noise, gate_sigmas, voters, old.estimate.point, EXACT_M)
+        let found = from_voters(scene, noise, gate_sigmas, voters, old.estimate.point, EXACT_M)?;
+        Some(Label { unseen_from: old.unseen_from.clone(), ..found })
     };
     Some([of(0, a)?, of(1, b)?])
 }

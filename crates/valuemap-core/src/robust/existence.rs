@@ -1,8 +1,11 @@
 //! Does a label exist? Hits and misses among the looks that should have seen it.
 //!
 //! A look is a viewpoint (all images of a pass at one place) with at least one image that has the label in its picture,
-//! within the range and the sector from which it was seen. A real object is detected in a share of the looks, which
+//! from a direction and distance from which it was seen. A real object is detected in a share of the looks, which
 //! varies from pass to pass (beta-binomial); where there is nothing, a look has a detection in the gate only by chance.
+//!
+//! A direction from which a label is looked at many times and hit a few is not one that it is seen from: its few votes
+//! are other things'.
 
 use std::f64::consts::PI;
 
@@ -11,14 +14,12 @@ use rayon::prelude::*;
 use rstar::RTree;
 use rstar::primitives::GeomWithData;
 
-use super::label::Label;
+use super::label::{Label, SECTOR_COSINE, direction_to};
 use super::noise::Spread;
 use super::scene::Scene;
 
-/// Half of the sector around the mean viewing direction that a label is expected to be seen from, at least, rad.
-const MIN_HALF_SECTOR_RAD: f64 = 0.35;
-/// How much farther than its farthest voter a label is still expected to be seen.
-const RANGE_SLACK: f64 = 1.0;
+/// So many times more probable must be that the hits in a sector are not the label's, before its votes are taken away (logarithm).
+const STRAY_LOG_ODDS: f64 = 6.0;
 /// Nearer than this nothing is expected to be seen, m.
 const NEAREST_M: f64 = 4.0;
 
@@ -29,6 +30,17 @@ const COINCIDENCE_CONCENTRATION: f64 = 15.0;
 /// Of the points that gathered enough votes to be judged, so many are nothing for each that is something. The point was chosen
 /// as the best of many, so plain odds would flatter it.
 const PRIOR_ODDS_AGAINST: f64 = 3.0;
+
+/// Directions that a label is looked at from: around those of some of its votes.
+#[derive(Debug, Clone)]
+pub struct Sector {
+    /// The middle, from the label.
+    pub direction: Vector3<f64>,
+    /// Its looks, by pass, ascending.
+    pub looks: Vec<Looks>,
+    /// Images that should have seen the label.
+    pub expected: u32,
+}
 
 /// Looks of one pass at a label.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -64,38 +76,79 @@ impl<'a> Lookout<'a> {
         Self { scene, tree: RTree::bulk_load(places) }
     }
 
-    /// The looks at a label, by pass, and the images that should have seen it.
+    /// The sectors that a label was seen from at least once.
     #[must_use]
-    pub fn looks(&self, label: &Label) -> (Vec<Looks>, u32) {
+    pub fn sectors(&self, label: &Label) -> Vec<Sector> {
         let scene = self.scene;
         let point = label.estimate.point;
-        let toward: Vec<Vector3<f64>> =
-            label.voters.iter().map(|&ray| (scene.ray(ray).center - point).normalize()).collect();
-        let farthest = label.voters.iter().map(|&ray| (scene.ray(ray).center - point).norm()).fold(0.0, f64::max);
-        let mean = toward.iter().sum::<Vector3<f64>>().normalize();
-        let widest = toward.iter().map(|d| d.dot(&mean).clamp(-1.0, 1.0).acos()).fold(MIN_HALF_SECTOR_RAD, f64::max);
-        let least_cosine = widest.min(PI).cos();
-        let mut voted: Vec<u32> = label.voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
+        let mut voters = label.voters.clone();
+        voters.sort_unstable();
+        let (middles, farthest) = middles_of(scene, &point, &voters);
+        let range = farthest.iter().copied().fold(0.0, f64::max);
+        let mut voted: Vec<u32> = voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
         voted.sort_unstable();
-        let mut looks: Vec<(u32, u32, bool)> = Vec::new();
-        let mut expected = 0;
-        let range = farthest * RANGE_SLACK;
+        let mut looks: Vec<Vec<(u32, u32, bool)>> = vec![Vec::new(); middles.len()];
+        let mut expected = vec![0; middles.len()];
         for near in self.tree.locate_within_distance(point.into(), range * range * (1.0 + 1e-9)) {
             let image = near.data;
             let view = &scene.views[image as usize];
             let hit = voted.binary_search(&image).is_ok();
             let away = view.center - point;
-            let should = away.norm() >= NEAREST_M
-                && away.normalize().dot(&mean) >= least_cosine
+            let distance = away.norm();
+            let (cosine, sector) = nearest(&middles, &(away / distance));
+            let should = distance >= NEAREST_M
+                && distance <= farthest[sector] * (1.0 + 1e-9)
+                && cosine >= SECTOR_COSINE
                 && scene.is_in_picture(view, &point);
-            expected += u32::from(hit || should);
+            expected[sector] += u32::from(hit || should);
             if (hit || should) && label.undecided.binary_search(&image).is_err() {
-                looks.push((view.pass, view.viewpoint, hit));
+                looks[sector].push((view.pass, view.viewpoint, hit));
             }
         }
-        looks.sort_unstable();
-        (count_looks(&looks), expected)
+        let sectors = middles.into_iter().zip(looks).zip(expected);
+        sectors
+            .map(|((direction, mut looks), expected)| {
+                looks.sort_unstable();
+                Sector { direction, looks: count_looks(&looks), expected }
+            })
+            .collect()
     }
+}
+
+/// The middles of the sectors that some voters look from, and the farthest voter of each, m.
+fn middles_of(scene: &Scene, point: &Vector3<f64>, voters: &[u32]) -> (Vec<Vector3<f64>>, Vec<f64>) {
+    let mut middles: Vec<Vector3<f64>> = Vec::new();
+    for &ray in voters {
+        let direction = direction_to(scene, ray, point);
+        if middles.iter().all(|middle| middle.dot(&direction) < SECTOR_COSINE) {
+            middles.push(direction);
+        }
+    }
+    let mut farthest = vec![0.0_f64; middles.len()];
+    for &ray in voters {
+        let (_, sector) = nearest(&middles, &direction_to(scene, ray, point));
+        farthest[sector] = farthest[sector].max((scene.ray(ray).center - point).norm());
+    }
+    (middles, farthest)
+}
+
+/// The nearest middle of a sector to a direction: cosine and place in the list.
+fn nearest(middles: &[Vector3<f64>], direction: &Vector3<f64>) -> (f64, usize) {
+    let cosines = middles.iter().map(|middle| middle.dot(direction));
+    cosines.zip(0..).fold((f64::NEG_INFINITY, 0), |best, this| if this.0 > best.0 { this } else { best })
+}
+
+/// All looks of some sectors, by pass.
+#[must_use]
+pub fn looks_of<'s>(sectors: impl Iterator<Item = &'s Sector>) -> Vec<Looks> {
+    let mut looks: Vec<Looks> = sectors.flat_map(|sector| sector.looks.iter().copied()).collect();
+    looks.sort_unstable_by_key(|looks| (looks.pass, looks.expected, looks.hits));
+    let sum = |pass: &[Looks]| Looks {
+        pass: pass[0].pass,
+        expected: pass.iter().map(|looks| looks.expected).sum(),
+        hits: pass.iter().map(|looks| looks.hits).sum(),
+    };
+    looks.chunk_by(|a, b| a.pass == b.pass).map(sum).collect()
 }
 
 /// Join images of one viewpoint, then viewpoints of one pass.
@@ -151,6 +204,22 @@ fn log_rising(x: f64, n: u32) -> f64 {
     (0..n).map(|k| (x + f64::from(k)).ln()).sum()
 }
 
+impl Sector {
+    /// Whether its hits are more likely those of other things.
+    #[must_use]
+    pub fn is_stray(&self, rates: &Rates) -> bool {
+        let nothing = nothing(COINCIDENCE);
+        let log_odds: f64 =
+            self.looks.iter().map(|pass| nothing.log_likelihood(pass) - rates.log_likelihood(pass)).sum();
+        log_odds > STRAY_LOG_ODDS
+    }
+}
+
+/// How often nothing is hit.
+fn nothing(share: f64) -> Rates {
+    Rates { recall: share, concentration: COINCIDENCE_CONCENTRATION }
+}
+
 /// The probability that each label exists.
 ///
 /// Against it speaks that nothing is there, and the hits come from detections of other things: a small share of the looks,
@@ -161,7 +230,7 @@ pub fn probabilities(looks: &[Vec<Looks>], rates: &Rates, chance: &[f64]) -> Vec
         .par_iter()
         .zip(chance)
         .map(|(passes, &chance)| {
-            let nothing = Rates { recall: chance + COINCIDENCE, concentration: COINCIDENCE_CONCENTRATION };
+            let nothing = nothing(chance + COINCIDENCE);
             let log_odds: f64 =
                 passes.iter().map(|pass| rates.log_likelihood(pass) - nothing.log_likelihood(pass)).sum();
             1.0 / (1.0 + PRIOR_ODDS_AGAINST * (-log_odds).exp())

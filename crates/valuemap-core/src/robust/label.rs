@@ -15,6 +15,8 @@ const MAX_TRIMS: usize = 10;
 
 /// Voters whose directions have a mean at least this long are all on one side of the label.
 const ONE_SIDED: f64 = 0.6;
+/// Half of the angle of a sector, and the least between the middles of two (cosine of 15 degrees).
+pub const SECTOR_COSINE: f64 = 0.966;
 /// What is seen from one side is not seen from directions farther than this from their mean (cosine of 80 degrees).
 const SIDE_COSINE: f64 = 0.17;
 
@@ -32,6 +34,8 @@ pub struct Label {
     /// Images (ascending) that say nothing for or against it: a stronger label that has no detection of its own there
     /// explains its voter as well, or another label took what it might have had.
     pub undecided: Vec<u32>,
+    /// Directions, with 15 degrees around, from which images look at it in vain: what they have in its gate are other things.
+    pub unseen_from: Vec<Vector3<f64>>,
 }
 
 /// Estimate from voters in any order, without those that disagree with the others of their pass.
@@ -67,7 +71,7 @@ pub fn from_voters(
     }
     let side =
         voters.iter().map(|&ray| direction_to(scene, ray, &found.point)).sum::<Vector3<f64>>() / voters.len() as f64;
-    Some(Label { estimate: found, side, class, voters, undecided: Vec::new() })
+    Some(Label { estimate: found, side, class, voters, undecided: Vec::new(), unseen_from: Vec::new() })
 }
 
 /// Unit direction from a point to the camera of a ray.
@@ -81,7 +85,8 @@ impl Label {
     #[must_use]
     pub fn faces(&self, scene: &Scene, ray: u32) -> bool {
         let length = self.side.norm();
-        let cosine = direction_to(scene, ray, &self.estimate.point).dot(&self.side) / length;
-        length < ONE_SIDED || cosine > SIDE_COSINE
+        let direction = direction_to(scene, ray, &self.estimate.point);
+        let is_in_vain = self.unseen_from.iter().any(|unseen| unseen.dot(&direction) > SECTOR_COSINE);
+        !is_in_vain && (length < ONE_SIDED || direction.dot(&self.side) / length > SIDE_COSINE)
     }
 }

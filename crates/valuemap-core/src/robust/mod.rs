@@ -26,16 +26,17 @@ pub mod sample;
 pub mod scene;
 pub mod settle;
 
+use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use crate::hypothesis::Viability;
 use crate::progress::{Halt, Progress};
 
 use calibrate::Known;
-use existence::{Lookout, Looks, Rates};
+use existence::{Lookout, Looks, Rates, Sector};
 use gather::{VOTE_RANGE, gather};
 use index::RayIndex;
-use label::Label;
+use label::{EXACT_M, Label};
 use noise::{Noise, Spread};
 use scene::Scene;
 
@@ -175,9 +176,9 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
             break;
         }
     }
-    let (judged, rates, strays_per_image) = judge(scene, &spreads, &lookout, &labels, settings);
+    let Judgement { of_labels, rates, strays_per_image } = judge(scene, &spreads, &lookout, &labels, settings);
     let variance_factor = calibrate::variance_factor(scene, noise, &labels.iter().collect::<Vec<_>>());
-    let findings = labels.into_iter().zip(judged).map(|(mut label, (existence, expected))| {
+    let findings = labels.into_iter().zip(of_labels).map(|(mut label, (existence, expected))| {
         label.estimate.covariance *= variance_factor;
         Finding { label, existence, expected }
     });
@@ -222,6 +223,30 @@ impl<'a> Court<'a> {
         labels
     }
 
+    /// Take votes away from labels that look as if they were not to be seen from there.
+    fn look_around(&self, lookout: &Lookout<'_>, labels: Vec<Label>, tally: &mut Tally) -> Vec<Label> {
+        let before = labels.len();
+        let sectors: Vec<Vec<Sector>> = labels.par_iter().map(|label| lookout.sectors(label)).collect();
+        let rates = Rates::learn(&sectors.iter().flatten().map(|sector| sector.looks.clone()).collect::<Vec<_>>());
+        let of_label = |(label, sectors): (Label, Vec<Sector>)| {
+            let stray: Vec<Vector3<f64>> =
+                sectors.iter().filter(|sector| sector.is_stray(&rates)).map(|sector| sector.direction).collect();
+            if stray.is_empty() {
+                return Some(label);
+            }
+            let unseen_from = [label.unseen_from.as_slice(), &stray].concat();
+            let label = Label { unseen_from: unseen_from.clone(), ..label };
+            let seen = label.voters.iter().copied().filter(|&ray| label.faces(self.scene, ray)).collect();
+            let start = label.estimate.point;
+            let found = label::from_voters(self.scene, self.noise, self.settings.gate_sigmas, seen, start, EXACT_M)?;
+            let enough = found.voters.len() >= self.settings.min_votes as usize;
+            enough.then_some(Label { undecided: label.undecided, unseen_from, ..found })
+        };
+        let labels: Vec<Label> = labels.into_par_iter().zip(sectors).filter_map(of_label).collect();
+        tally.doubted += (before - labels.len()) as u64;
+        labels
+    }
+
     /// Drop the labels that probably do not exist, the least probable first: what they give back may be just what a doubtful
     /// one lacks.
     fn doubt(
@@ -234,9 +259,11 @@ impl<'a> Court<'a> {
         for doubt in DOUBTS.map(|doubt| doubt * self.settings.min_existence) {
             for _ in 0..MAX_DOUBT_ROUNDS {
                 progress.check()?;
-                let (judged, ..) = judge(self.scene, self.spreads, lookout, &labels, self.settings);
+                labels = self.look_around(lookout, labels, tally);
+                let judgement = judge(self.scene, self.spreads, lookout, &labels, self.settings);
                 let before = labels.len();
-                let existing = labels.into_iter().zip(judged).filter(|(_, (existence, _))| *existence >= doubt);
+                let existing =
+                    labels.into_iter().zip(judgement.of_labels).filter(|(_, (existence, _))| *existence >= doubt);
                 labels = existing.map(|(label, _)| label).collect();
                 tally.doubted += (before - labels.len()) as u64;
                 if labels.len() == before {
@@ -249,28 +276,35 @@ impl<'a> Court<'a> {
     }
 }
 
-/// The probability of existence of each label and the number of images that should have seen it.
-fn judge(
-    scene: &Scene,
-    spreads: &[Spread],
-    lookout: &Lookout<'_>,
-    labels: &[Label],
-    settings: &Settings,
-) -> (Vec<(f64, u32)>, Rates, f64) {
-    let seen: Vec<(Vec<Looks>, u32)> = labels.par_iter().map(|label| lookout.looks(label)).collect();
+/// How probable it is that labels exist, and what that rests on.
+struct Judgement {
+    /// Probability of existence of each label, and the images that should have seen it.
+    of_labels: Vec<(f64, u32)>,
+    rates: Rates,
+    strays_per_image: f64,
+}
+
+fn judge(scene: &Scene, spreads: &[Spread], lookout: &Lookout<'_>, labels: &[Label], settings: &Settings) -> Judgement {
+    let seen: Vec<(Vec<Looks>, u32)> = labels
+        .par_iter()
+        .map(|label| {
+            let sectors = lookout.sectors(label);
+            (existence::looks_of(sectors.iter()), sectors.iter().map(|sector| sector.expected).sum())
+        })
+        .collect();
     let (looks, expected): (Vec<Vec<Looks>>, Vec<u32>) = seen.into_iter().unzip();
     let rates = Rates::learn(&looks);
     let claimed: usize = labels.iter().map(|label| label.voters.len()).sum();
-    let strays = (scene.rays.rays.len() - claimed) as f64 / scene.views.len() as f64;
+    let strays_per_image = (scene.rays.rays.len() - claimed) as f64 / scene.views.len() as f64;
     let solid_angle =
         scene.frusta.iter().map(|frustum| frustum.solid_angle_sr).sum::<f64>() / scene.frusta.len() as f64;
-    let strays_per_sr = strays / solid_angle;
+    let strays_per_sr = strays_per_image / solid_angle;
     let chance: Vec<f64> = labels
         .iter()
         .map(|label| existence::chance_of(label, scene, spreads, settings.gate_sigmas, strays_per_sr))
         .collect();
     let existence = existence::probabilities(&looks, &rates, &chance);
-    (existence.into_iter().zip(expected).collect(), rates, strays)
+    Judgement { of_labels: existence.into_iter().zip(expected).collect(), rates, strays_per_image }
 }
 
 /// The spread of every ray.

@@ -42,7 +42,7 @@ pub fn reassign(
         .filter(|(_, verdict)| verdict.voters.len() >= min_votes)
         .filter_map(|(label, Verdict { voters, undecided })| {
             let found = from_voters(scene, noise, index.gate_sigmas(), voters, label.estimate.point, EXACT_M)?;
-            Some(Label { undecided, ..found })
+            Some(Label { undecided, unseen_from: label.unseen_from.clone(), ..found })
         })
         .filter(|label| label.voters.len() >= min_votes)
         .collect()
