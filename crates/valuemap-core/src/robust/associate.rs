@@ -160,7 +160,7 @@ fn decide(scene: &Scene, noise: &Noise, labels: &[Label], limit: f64, claims: &[
         grant(cases, limit, &pose)
     };
     let mut fits: Vec<Vec<Fit>> = images.iter().zip(&votes).zip(&leg_of).map(judge).collect();
-    let overruled = overruled(&images, &fits, limit);
+    let overruled = overruled(scene, noise, &elsewhere, &images, &fits, limit);
     let mut decisions = Vec::new();
     for (cases, fits) in images.iter().zip(&mut fits) {
         overrule(cases, fits, &overruled, limit);
@@ -248,13 +248,20 @@ struct Rivalry {
     both: u32,
     /// Images that show one of them, which may be either.
     one: u32,
-    /// How well these fit the first, less how well the second.
-    cost: f64,
+    /// What they show.
+    rays: Vec<u32>,
 }
 
 /// Pairs of labels (the better one, the other) of which a pass shows only one, where it might be either: there is one
 /// object, and the other label is not to be seen from there.
-fn overruled(images: &[&[Case<'_>]], fits: &[Vec<Fit>], limit: f64) -> FxHashSet<(u32, u32)> {
+fn overruled(
+    scene: &Scene,
+    noise: &Noise,
+    elsewhere: &FxHashMap<u32, Estimate>,
+    images: &[&[Case<'_>]],
+    fits: &[Vec<Fit>],
+    limit: f64,
+) -> FxHashSet<(u32, u32)> {
     let mut rivalries: FxHashMap<(u32, u32), Rivalry> = FxHashMap::default();
     for (cases, fits) in images.iter().zip(fits) {
         let open: Vec<usize> = (0..cases.len()).filter(|&i| fits[i].cost < limit).collect();
@@ -270,7 +277,7 @@ fn overruled(images: &[&[Case<'_>]], fits: &[Vec<Fit>], limit: f64) -> FxHashSet
                     (true, false) | (false, true) if a.ray == b.ray => {
                         let rivalry = rivalries.entry(pair).or_default();
                         rivalry.one += 1;
-                        rivalry.cost += fits[i].cost - fits[j].cost;
+                        rivalry.rays.push(a.ray);
                     }
                     _ => {}
                 }
@@ -278,8 +285,25 @@ fn overruled(images: &[&[Case<'_>]], fits: &[Vec<Fit>], limit: f64) -> FxHashSet
         }
     }
     let is_one = |r: &Rivalry| r.one >= LEAST_RIVALRY && f64::from(r.both) < MOST_BOTH * f64::from(r.one);
-    let of_pair = |((a, b), r): ((u32, u32), Rivalry)| if r.cost <= 0.0 { (a, b) } else { (b, a) };
+    let of_pair = |((a, b), mut rivalry): ((u32, u32), Rivalry)| {
+        rivalry.rays.sort_unstable();
+        let [of_a, of_b] = [a, b].map(|label| surprise(scene, noise, &rivalry.rays, &elsewhere[&label]));
+        if of_a <= of_b { (a, b) } else { (b, a) }
+    };
     rivalries.into_iter().filter(|(_, r)| is_one(r)).map(of_pair).collect()
+}
+
+/// Minus twice the logarithm of the likelihood that rays of one pass show a label of which an estimate is known, up to what
+/// is the same for all labels: together they may move the estimate once.
+fn surprise(scene: &Scene, noise: &Noise, rays: &[u32], estimate: &Estimate) -> f64 {
+    let joint = || {
+        let terms = pass_terms(scene, noise, rays, &estimate.point)?;
+        let known = estimate.covariance.try_inverse()?;
+        let after = (terms.information + known).cholesky()?;
+        let widening = (after.determinant() * estimate.covariance.determinant()).ln();
+        Some(terms.square - terms.gradient.dot(&after.solve(&terms.gradient)) + widening)
+    };
+    joint().unwrap_or(f64::INFINITY)
 }
 
 /// Take the detections that a better label claims as well from labels that are overruled.

@@ -19,7 +19,9 @@ use super::noise::Spread;
 use super::scene::Scene;
 
 /// So many times more probable must be that the hits in a sector are not the label's, before its votes are taken away (logarithm).
-const STRAY_LOG_ODDS: f64 = 6.0;
+const STRAY_LOG_ODDS: f64 = 1e9;
+/// More hits in a sector than this are no accident.
+const MOST_STRAYS: u32 = 2;
 /// Nearer than this nothing is expected to be seen, m.
 const NEAREST_M: f64 = 4.0;
 
@@ -205,13 +207,13 @@ fn log_rising(x: f64, n: u32) -> f64 {
 }
 
 impl Sector {
-    /// Whether its hits are more likely those of other things.
+    /// Whether its hits are more likely those of other things. At the edge of what can be seen, or behind a corner, any share
+    /// of the looks may be hits.
     #[must_use]
-    pub fn is_stray(&self, rates: &Rates) -> bool {
-        let nothing = nothing(COINCIDENCE);
-        let log_odds: f64 =
-            self.looks.iter().map(|pass| nothing.log_likelihood(pass) - rates.log_likelihood(pass)).sum();
-        log_odds > STRAY_LOG_ODDS
+    pub fn is_stray(&self) -> bool {
+        let (nothing, any) = (nothing(COINCIDENCE), Rates { recall: 0.5, concentration: 2.0 });
+        let log_odds: f64 = self.looks.iter().map(|pass| nothing.log_likelihood(pass) - any.log_likelihood(pass)).sum();
+        self.looks.iter().map(|pass| pass.hits).sum::<u32>() <= MOST_STRAYS && log_odds > STRAY_LOG_ODDS
     }
 }
 

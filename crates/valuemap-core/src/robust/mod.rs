@@ -227,10 +227,9 @@ impl<'a> Court<'a> {
     fn look_around(&self, lookout: &Lookout<'_>, labels: Vec<Label>, tally: &mut Tally) -> Vec<Label> {
         let before = labels.len();
         let sectors: Vec<Vec<Sector>> = labels.par_iter().map(|label| lookout.sectors(label)).collect();
-        let rates = Rates::learn(&sectors.iter().flatten().map(|sector| sector.looks.clone()).collect::<Vec<_>>());
         let of_label = |(label, sectors): (Label, Vec<Sector>)| {
             let stray: Vec<Vector3<f64>> =
-                sectors.iter().filter(|sector| sector.is_stray(&rates)).map(|sector| sector.direction).collect();
+                sectors.iter().filter(|sector| sector.is_stray()).map(|sector| sector.direction).collect();
             if stray.is_empty() {
                 return Some(label);
             }
