@@ -21,7 +21,7 @@ const MEETINGS: usize = 12;
 const MIN_BASELINE_M: f64 = 0.5;
 
 /// So many images within the range of an image are enough to nominate what they see.
-const NOMINATING_IMAGES: usize = 160;
+const NOMINATING_IMAGES: usize = 80;
 
 /// Which images nominate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
