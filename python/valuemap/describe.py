@@ -13,7 +13,6 @@ from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.tables import Candidates, Floats, Ints, Labels, Votes
 
 _UPPER_TRIANGLE = (0, 1, 2, 4, 5, 8)
-_MAX_DIRECTIONS = 64
 
 
 def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config: NoiseConfig) -> tuple[Labels, Votes]:
@@ -22,16 +21,20 @@ def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config
     Where the candidates have no covariance of their own it is the squared standard deviation of the detections times
     the inverse of the normal equations of Eq. (1) of the paper at the label. That deviation is the setting
     `detection_sigma_px`, else that of the residuals. Width and height are the medians over voters of box size times
-    depth over focal length. A label faces the mean horizontal direction to its voters' cameras, in which every pass
-    weighs the same, so that a car that waits before it does not decide; the length of that mean of unit vectors is the
-    concentration.
+    depth over focal length. The largest parallax is exact up to 64 voters; beyond, it is that among the 64 directions
+    that are farthest from their mean. A label faces the mean horizontal direction to its voters' cameras, in which every
+    pass weighs the same, so that a car that waits before it does not decide; the length of that mean of unit vectors is
+    the concentration.
     """
     images, detections = dataset.images, dataset.detections
     voters = candidates.voters.astype(np.int64)
     starts = candidates.voter_offsets[:-1]
     label = candidates.row_of_voter()
     count = np.diff(candidates.voter_offsets)
-    residual_px, size_m = _seen_from_voters(rays, voters, candidates.position_in_world_m[label], detections.size_px)
+    residual_px, metres_per_px, max_parallax_rad = _core.see(
+        rays.core, candidates.position_in_world_m, candidates.voter_offsets, candidates.voters
+    )
+    size_m = detections.size_px[voters] * metres_per_px
     image_row = rays.image_row[voters]
     time = np.full(len(voters), np.nan) if images.timestamp_s is None else images.timestamp_s[image_row]
     sigma_px = config.detection_sigma_px or _residual_sigma_px(residual_px, len(candidates))
@@ -52,10 +55,10 @@ def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config
         covariance_m2=covariance.reshape(-1, 9)[:, _UPPER_TRIANGLE],
         votes=count,
         passes=np.bincount(label_of_pass, minlength=len(candidates)),
-        object_width_m=_median_in_groups(size_m[:, 0], label, candidates.voter_offsets),
-        object_height_m=_median_in_groups(size_m[:, 1], label, candidates.voter_offsets),
+        object_width_m=_core.medians(size_m[:, 0].copy(), candidates.voter_offsets),
+        object_height_m=_core.medians(size_m[:, 1].copy(), candidates.voter_offsets),
         reprojection_rms_px=np.sqrt(_reduce(np.add, residual_px**2, starts) / count),
-        max_parallax_rad=max_angles(rays, candidates),
+        max_parallax_rad=max_parallax_rad,
         first_seen_s=_reduce(np.fmin, time, starts),
         last_seen_s=_reduce(np.fmax, time, starts),
         facing_azimuth_rad=np.arctan2(facing[:, 0], facing[:, 1]) % (2.0 * np.pi),
@@ -72,35 +75,6 @@ def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config
         residual_sigmas=residual_px / sigma_px,
     )
     return labels, votes
-
-
-def max_angles(rays: Rays, candidates: Candidates) -> Floats:
-    """Return for each candidate (N) the largest angle in radians at which two of its voters' cameras see it.
-
-    Exact up to 64 voters; beyond, among the 64 directions that are farthest from the mean direction.
-    """
-    angles = np.zeros(len(candidates))
-    for row in range(len(candidates)):
-        members = candidates.voters[candidates.voter_offsets[row] : candidates.voter_offsets[row + 1]]
-        direction = candidates.position_in_world_m[row] - rays.center_in_world_m[members]
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        if len(direction) > _MAX_DIRECTIONS:
-            spread = np.linalg.norm(direction - direction.mean(axis=0), axis=1)
-            direction = direction[np.argsort(-spread, kind="stable")[:_MAX_DIRECTIONS]]
-        chord = np.linalg.norm(direction[:, None] - direction[None], axis=2).max()
-        angles[row] = 2.0 * np.arcsin(min(1.0, chord / 2.0))
-    return angles
-
-
-def _seen_from_voters(rays: Rays, voters: Ints, position: Floats, size_px: Floats) -> tuple[Floats, Floats]:
-    """Return the reprojection error in pixels (N) and the size in metres (N, 2) that each voter sees."""
-    matrix = rays.residual_from_world[voters]
-    projected = np.einsum("nij,nj->ni", matrix, position - rays.center_in_world_m[voters])
-    depth = projected[:, 2:]
-    pixels_per_unit = np.linalg.norm(
-        matrix[:, :2] - (matrix[:, :2] @ matrix[:, 2, :, None]) * matrix[:, 2, None], axis=2
-    )
-    return np.linalg.norm(projected[:, :2] / depth, axis=1), size_px[voters] * depth / pixels_per_unit
 
 
 def _residual_sigma_px(residual_px: Floats, labels: int) -> float:
@@ -130,10 +104,3 @@ def _mean_in_groups(values: Floats, group: Ints) -> Floats:
     """Return the mean (groups, K) of values (N, K); groups are numbered from 0, none is empty."""
     sums = [np.bincount(group, weights=column) for column in values.T]
     return np.asarray(np.stack(sums, axis=1) / np.bincount(group)[:, None])
-
-
-def _median_in_groups(values: Floats, group: Ints, offsets: Ints) -> Floats:
-    ordered = values[np.lexsort((values, group))]
-    count = np.diff(offsets)
-    low, high = offsets[:-1] + (count - 1) // 2, offsets[:-1] + count // 2
-    return np.asarray((ordered[low] + ordered[high]) / 2.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from pyproj import Transformer
 
 from valuemap.errors import InputError
 from valuemap.tables import Floats
@@ -23,6 +22,8 @@ def enu_from_lon_lat_height(lon_lat_height: Floats, anchor: tuple[float, float, 
 
 
 def _transform(points: Floats, anchor: tuple[float, float, float], *, inverse: bool) -> Floats:
+    from pyproj import Transformer  # Slow to import, and only geo-referenced data needs it.
+
     lat, lon, height = (float(part) for part in anchor)
     enu_from_geographic = Transformer.from_pipeline(
         "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "

@@ -17,6 +17,7 @@
 //! The result does not depend on the number of threads.
 
 pub mod ballot;
+pub mod evidence;
 pub mod hypothesis;
 pub mod kernel;
 pub mod merge;

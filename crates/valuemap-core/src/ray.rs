@@ -70,11 +70,17 @@ impl Ray {
     /// Squared pixels that a unit of the virtual image plane spans, the mean of both axes.
     #[must_use]
     pub fn pixels_per_unit2(&self) -> f64 {
+        let [x, y] = self.pixels_per_unit2_of_axes();
+        0.5 * (x + y)
+    }
+
+    /// Squared pixels that a unit of the virtual image plane spans, horizontally and vertically in the picture.
+    #[must_use]
+    pub fn pixels_per_unit2_of_axes(&self) -> [f64; 2] {
         // The first two rows are J (V_12 - p_0 V_3) with V orthonormal: without their part along V_3 they are J V_12.
         let depth = self.residual_from_world.row(2);
-        let across =
-            [0, 1].map(|i| self.residual_from_world.row(i) - depth * self.residual_from_world.row(i).dot(&depth));
-        0.5 * (across[0].norm_squared() + across[1].norm_squared())
+        let rows = [0, 1].map(|i| self.residual_from_world.row(i));
+        rows.map(|row| (row - depth * row.dot(&depth)).norm_squared())
     }
 
     /// Whether the camera model has a ray for this detection: all numbers are finite.

@@ -30,7 +30,7 @@ pub fn rays_from(matrices: &[[f64; 9]], centers: &[[f64; 3]], directions: &[[f64
 }
 
 /// The members of each group.
-pub fn split<'a>(count: usize, offsets: &[i64], members: &'a [u32]) -> PyResult<Vec<&'a [u32]>> {
+pub fn split<'a, T>(count: usize, offsets: &[i64], members: &'a [T]) -> PyResult<Vec<&'a [T]>> {
     let bad = || PyValueError::new_err("groups: offsets must rise from 0 to the number of members");
     if offsets.len() != count + 1 {
         return Err(bad());

@@ -5,14 +5,14 @@ mod arrays;
 mod robust;
 mod run;
 
-use numpy::{IntoPyArray, PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
+use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use valuemap_core::hypothesis::{PairCounts, Viability};
 use valuemap_core::select::Stop;
 use valuemap_core::vote::Candidate;
-use valuemap_core::{merge, partition, triangulate, vote};
+use valuemap_core::{evidence, merge, partition, triangulate, vote};
 
 use crate::arrays::{Groups, candidates_from, groups_of, points_of, rows_of};
 use crate::run::with_progress;
@@ -153,11 +153,55 @@ fn unit_covariance<'py>(
     arrays::matrix(py, &rows, 9)
 }
 
+/// Reprojection errors (M) in px and metres a pixel (M, 2) of the voters, and the largest angle (N) between them,
+/// `valuemap_core::evidence`.
+type Seen<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>, Bound<'py, PyArray1<f64>>);
+
+/// What the voters of points see.
+#[pyfunction]
+fn see<'py>(
+    py: Python<'py>,
+    rays: &Rays,
+    point_in_world_m: PyReadonlyArray2<'py, f64>,
+    voter_offsets: PyReadonlyArray1<'py, i64>,
+    voters: PyReadonlyArray1<'py, u32>,
+) -> PyResult<Seen<'py>> {
+    let points = rows_of(&point_in_world_m)?;
+    let voters = voters.as_slice()?;
+    let groups = arrays::split(points.len(), voter_offsets.as_slice()?, voters)?;
+    let ray = |number: u32| &rays.0.rays[number as usize];
+    let mut residual_px = Vec::with_capacity(voters.len());
+    let mut metres_per_px = Vec::with_capacity(2 * voters.len());
+    let mut angles = Vec::with_capacity(points.len());
+    for (&point, voters) in points.iter().zip(groups) {
+        let point = point.into();
+        for sight in voters.iter().map(|&voter| evidence::sight(ray(voter), &point)) {
+            residual_px.push(sight.residual_px);
+            metres_per_px.extend(sight.metres_per_px);
+        }
+        angles.push(evidence::max_angle(voters.iter().map(|&voter| ray(voter)), &point));
+    }
+    let metres_per_px = metres_per_px.into_pyarray(py).reshape([residual_px.len(), 2])?;
+    Ok((residual_px.into_pyarray(py), metres_per_px, angles.into_pyarray(py)))
+}
+
+/// The median of each group of values, `valuemap_core::evidence::median`.
+#[pyfunction]
+fn medians<'py>(
+    py: Python<'py>,
+    values: PyReadonlyArray1<'py, f64>,
+    offsets: PyReadonlyArray1<'py, i64>,
+) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    let offsets = offsets.as_slice()?;
+    let groups = arrays::split(offsets.len().saturating_sub(1), offsets, values.as_slice()?)?;
+    let medians: Vec<f64> = groups.into_iter().map(|group| evidence::median(&mut group.to_vec())).collect();
+    Ok(medians.into_pyarray(py))
+}
+
 #[pymodule]
 mod _core {
     #[pymodule_export]
-    #[pymodule_export]
     use super::robust::{Scene, calibrate_noise, find_labels};
     #[pymodule_export]
-    use super::{Rays, merge_labels, partition_images, unit_covariance, vote_in_clusters};
+    use super::{Rays, medians, merge_labels, partition_images, see, unit_covariance, vote_in_clusters};
 }

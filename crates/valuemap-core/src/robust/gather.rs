@@ -1,13 +1,15 @@
 //! Gathering: the best supported nomination is polished, on its voters and from its estimate, until the voters stay the
-//! same; its voters leave; and so on. Rays that are left over get further rounds among themselves.
+//! same; its voters leave; and so on. Where there are many images the rays of a few of them nominate first; all
+//! rays that are left over get further rounds among themselves.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use super::index::{Hit, RayIndex};
+use super::index::RayIndex;
 use super::label::{Label, ROUGH_M, from_voters};
 use super::noise::Noise;
-use super::nominate::{self, Nomination};
+use super::nominate::{self, Nomination, Who};
+use super::quick::quick_estimate;
 use super::scene::Scene;
 use super::settle;
 use super::{Settings, spreads_of};
@@ -17,10 +19,10 @@ use crate::progress::{Halt, Progress};
 pub const VOTE_RANGE: f64 = 2.5;
 /// Nominations that are polished side by side.
 const BATCH: usize = 64;
-/// Rounds of nominations, each among the rays that the rounds before left over.
-const ROUNDS: usize = 3;
+/// Who nominates, round after round, each time with the rays that are left over.
+const ROUNDS: [Who; 4] = [Who::Part, Who::All, Who::All, Who::All];
 /// Rounds of estimating and gathering voters again, at most.
-const MAX_ROUNDS: usize = 5;
+const MAX_ROUNDS: usize = 8;
 
 /// Find labels among some rays (ascending) with a given noise, round after round, and count nominations and labels.
 ///
@@ -39,10 +41,10 @@ pub fn gather(
     let mut labels: Vec<Label> = Vec::new();
     let mut claimed = vec![false; scene.rays.rays.len()];
     let mut counts = [0_u64; 2];
-    for _ in 0..ROUNDS {
+    for who in ROUNDS {
         let free: Vec<u32> = rays.iter().copied().filter(|&ray| !claimed[ray as usize]).collect();
         let mut nominations =
-            nominate::nominate(scene, &spreads, settings.gate_sigmas, &settings.viability, &free, progress)?;
+            nominate::nominate(scene, &spreads, settings.gate_sigmas, &settings.viability, &free, who, progress)?;
         nominations.sort_by(|a, b| b.support.total_cmp(&a.support).then(a.rays.cmp(&b.rays)));
         counts[0] += nominations.len() as u64;
         let index = RayIndex::new(scene, &spreads, settings.gate_sigmas, free.into_iter());
@@ -75,7 +77,7 @@ pub fn gather(
                 }
             }
         }
-        if labels.len() == before {
+        if who == Who::All && labels.len() == before {
             break;
         }
     }
@@ -84,7 +86,8 @@ pub fn gather(
     Ok((labels, counts))
 }
 
-/// Estimate a point on its voters and gather voters from the estimate, until they stay the same.
+/// Estimate a point on its voters and gather voters from the estimate, quickly, until they stay the same; then once with
+/// the estimate that settling uses, without the voters that disagree.
 ///
 /// Nothing if fewer than `min_votes` remain.
 #[must_use]
@@ -98,20 +101,24 @@ fn polish(
     keep: &dyn Fn(u32) -> bool,
 ) -> Option<Label> {
     let scene = index.scene();
-    let rays = |hits: Vec<Hit>| hits.iter().map(|hit| hit.ray).collect::<Vec<u32>>();
-    let mut gathered = rays(index.hits(&start, class, range_m, keep));
+    let voters_at = |point: &Vector3<f64>| -> Vec<u32> {
+        index.hits(point, class, range_m, keep).iter().map(|hit| hit.ray).collect()
+    };
+    let mut gathered = voters_at(&start);
     let mut point = start;
     for _ in 0..MAX_ROUNDS {
         if gathered.len() < min_votes {
             return None;
         }
-        let label = from_voters(scene, noise, index.gate_sigmas(), gathered.clone(), point, ROUGH_M)?;
-        let again = rays(index.hits(&label.estimate.point, class, range_m, keep));
+        point = quick_estimate(scene, index.spreads(), &gathered, point)?;
+        let again = voters_at(&point);
         if again == gathered {
-            return (label.voters.len() >= min_votes).then_some(label);
+            break;
         }
-        point = label.estimate.point;
         gathered = again;
+    }
+    if gathered.len() < min_votes {
+        return None;
     }
     let label = from_voters(scene, noise, index.gate_sigmas(), gathered, point, ROUGH_M)?;
     (label.voters.len() >= min_votes).then_some(label)

@@ -66,6 +66,12 @@ impl<'a> RayIndex<'a> {
         self.gate_sigmas
     }
 
+    /// The spreads of all rays of the scene.
+    #[must_use]
+    pub fn spreads(&self) -> &'a [Spread] {
+        self.spreads
+    }
+
     /// The scene whose rays are indexed.
     #[must_use]
     pub fn scene(&self) -> &'a Scene {

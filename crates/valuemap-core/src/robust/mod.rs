@@ -3,7 +3,8 @@
 //! 1. [`noise`]: a pose-aware gate in sigmas instead of a radius in pixels.
 //! 2. [`nominate`](mod@nominate): each ray meets few partners ([`sample`]) and nominates the point that a sample of images supports best.
 //! 3. [`gather`](mod@gather): the best supported nomination is polished to a [`label`], on its voters and from its estimate,
-//!    until the voters stay the same; its voters leave; and so on. Rays left over get further rounds among themselves.
+//!    until the voters stay the same ([`quick`]); its voters leave; and so on. Rays left over get further rounds among
+//!    themselves.
 //! 4. [`settle`]: all labels compete for all detections; labels that agree within their covariances and are never
 //!    seen side by side become one.
 //! 5. [`existence`]: hits and misses among the looks that should have seen it say how probable a label is.
@@ -22,6 +23,7 @@ pub mod label;
 pub mod noise;
 pub mod nominate;
 pub mod poses;
+pub mod quick;
 pub mod sample;
 pub mod scene;
 pub mod settle;

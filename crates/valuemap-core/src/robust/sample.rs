@@ -4,62 +4,88 @@
 //! evenly; the sparsest level that still has enough images around serves. The choice depends on distances and image
 //! numbers alone, not on the frame.
 
+use std::cmp::Reverse;
+
 use nalgebra::Vector3;
 use rustc_hash::FxHashMap;
 
 use super::scene::Scene;
 
 const MAX_LEVEL: u32 = 12;
+/// Images around which it is counted how many there are.
+const DENSITY_IMAGES: usize = 255;
 
-/// Images by level and place.
+/// Images by place, the highest level first.
 pub struct Sampler<'a> {
     centers: &'a [Vector3<f64>],
     radius_m: f64,
-    levels: Vec<FxHashMap<[i64; 3], Vec<u32>>>,
+    places: FxHashMap<[i64; 3], Vec<u32>>,
 }
 
 impl<'a> Sampler<'a> {
     /// Prepare to sample among some images; `centers` are those of all images, m.
     #[must_use]
     pub fn new(centers: &'a [Vector3<f64>], images: &[u32], radius_m: f64) -> Self {
-        let mut levels: Vec<FxHashMap<[i64; 3], Vec<u32>>> = vec![FxHashMap::default(); MAX_LEVEL as usize + 1];
+        let mut places: FxHashMap<[i64; 3], Vec<u32>> = FxHashMap::default();
         for &image in images {
-            let cell = cell_of(&centers[image as usize], radius_m);
-            let highest = scramble(u64::from(image)).leading_zeros().min(MAX_LEVEL);
-            for level in &mut levels[..=highest as usize] {
-                level.entry(cell).or_default().push(image);
-            }
+            places.entry(cell_of(&centers[image as usize], radius_m)).or_default().push(image);
         }
-        Self { centers, radius_m, levels }
+        for images in places.values_mut() {
+            images.sort_unstable_by_key(|&image| (Reverse(level_of(image)), image));
+        }
+        Self { centers, radius_m, places }
     }
 
     /// At most `most` images within the radius of `image` and farther from it than `min_baseline_m`, in random order.
     #[must_use]
     pub fn around(&self, image: u32, min_baseline_m: f64, most: usize) -> Vec<u32> {
-        let center = &self.centers[image as usize];
-        let [x, y, z] = cell_of(center, self.radius_m);
-        let mut found: Vec<u32> = Vec::new();
-        for level in self.levels.iter().rev() {
-            found.clear();
-            for dx in -1..=1 {
-                for dy in -1..=1 {
-                    for dz in -1..=1 {
-                        let Some(images) = level.get(&[x + dx, y + dy, z + dz]) else { continue };
-                        found.extend(images.iter().copied().filter(|&other| {
-                            let distance = (self.centers[other as usize] - center).norm();
-                            distance <= self.radius_m && distance > min_baseline_m
-                        }));
-                    }
-                }
-            }
-            if found.len() >= most {
-                break;
-            }
-        }
+        let (mut found, _) = self.thinned(image, min_baseline_m, most);
         found.sort_by_cached_key(|&other| scramble(u64::from(image) << 32 | u64::from(other)));
         found.truncate(most);
         found
     }
+
+    /// The highest level that still has `enough` images around an image: the median of a sample of the images.
+    #[must_use]
+    pub fn level_with(&self, enough: usize) -> u32 {
+        let mut images: Vec<u32> = self.places.values().flatten().copied().collect();
+        images.sort_unstable_by_key(|&image| (Reverse(level_of(image)), image));
+        images.truncate(DENSITY_IMAGES);
+        let mut levels: Vec<u32> = images.iter().map(|&image| self.thinned(image, 0.0, enough).1).collect();
+        levels.sort_unstable();
+        levels.get(levels.len() / 2).copied().unwrap_or(0)
+    }
+
+    /// The images around an image on the highest level that has enough of them, else on the lowest; and that level.
+    fn thinned(&self, image: u32, min_baseline_m: f64, enough: usize) -> (Vec<u32>, u32) {
+        let center = &self.centers[image as usize];
+        let [x, y, z] = cell_of(center, self.radius_m);
+        let near = |step: i64| [x + step / 9 - 1, y + step / 3 % 3 - 1, z + step % 3 - 1];
+        let mut places: Vec<&[u32]> =
+            (0..27).filter_map(|step| self.places.get(&near(step)).map(Vec::as_slice)).collect();
+        let mut found: Vec<u32> = Vec::new();
+        for level in (0..=MAX_LEVEL).rev() {
+            for place in &mut places {
+                let of_level = place.iter().take_while(|&&other| level_of(other) >= level).count();
+                let (of_level, below) = place.split_at(of_level);
+                found.extend(of_level.iter().copied().filter(|&other| {
+                    let distance = (self.centers[other as usize] - center).norm();
+                    distance <= self.radius_m && distance > min_baseline_m
+                }));
+                *place = below;
+            }
+            if found.len() >= enough {
+                return (found, level);
+            }
+        }
+        (found, 0)
+    }
+}
+
+/// The highest level that an image is on.
+#[must_use]
+pub fn level_of(image: u32) -> u32 {
+    scramble(u64::from(image)).leading_zeros().min(MAX_LEVEL)
 }
 
 /// Rays (ascending) of whole places, chosen at random, together about as many as asked for.

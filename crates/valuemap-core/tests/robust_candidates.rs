@@ -1,0 +1,209 @@
+//! How the robust method finds candidates, against the same thing done the slow way, on random streets.
+#![allow(clippy::unwrap_used, clippy::expect_used, missing_docs)]
+
+use std::collections::BTreeSet;
+
+use nalgebra::{Matrix3, Rotation3, Vector3};
+use proptest::collection::vec;
+use proptest::prelude::*;
+use proptest::test_runner::RngSeed;
+use valuemap_core::hypothesis::Viability;
+use valuemap_core::progress::Progress;
+use valuemap_core::ray::{Ray, Rays};
+use valuemap_core::robust::estimate::estimate;
+use valuemap_core::robust::index::{RayIndex, chi2};
+use valuemap_core::robust::noise::Noise;
+use valuemap_core::robust::nominate::{Who, nominate};
+use valuemap_core::robust::quick::quick_estimate;
+use valuemap_core::robust::sample::{Sampler, level_of};
+use valuemap_core::robust::scene::{Frustum, Scene, View};
+use valuemap_core::robust::spreads_of;
+
+const FOCAL_PX: f64 = 600.0;
+const GATE_SIGMAS: f64 = 3.5;
+const VIABILITY: Viability =
+    Viability { max_reprojection_error_px: f64::NAN, min_parallax_rad: 0.035, min_range_m: 2.0, max_range_m: 60.0 };
+
+/// Without errors that a pass shares, which the quick estimate knows nothing of.
+const NOISE: Noise = Noise {
+    detection_px: 1.0,
+    box_share: 0.0,
+    position_m: 0.03,
+    rotation_rad: 5e-4,
+    position_drift_m: 0.0,
+    rotation_drift_rad: 0.0,
+};
+
+/// A drive along x that sees all of the objects within 50 m ahead, each a little off.
+fn street(images: usize, spacing_m: f64, objects: &[Vector3<f64>], errors_px: &[[f64; 2]]) -> Scene {
+    let cam_from_world = Matrix3::new(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0, 0.0);
+    let centers: Vec<Vector3<f64>> = (0..images).map(|i| Vector3::x() * (spacing_m * i as f64)).collect();
+    let mut rays = Rays::default();
+    let mut errors = errors_px.iter().cycle();
+    for (image, &center) in centers.iter().enumerate() {
+        for object in objects {
+            let in_cam = cam_from_world * (object - center);
+            if in_cam.z > 3.0 && in_cam.norm() < 50.0 {
+                let error = errors.next().unwrap();
+                let [u, v] = [in_cam.x / in_cam.z + error[0] / FOCAL_PX, in_cam.y / in_cam.z + error[1] / FOCAL_PX];
+                let pixels = Matrix3::new(FOCAL_PX, 0.0, -FOCAL_PX * u, 0.0, FOCAL_PX, -FOCAL_PX * v, 0.0, 0.0, 1.0);
+                rays.rays.push(Ray {
+                    residual_from_world: pixels * cam_from_world,
+                    center,
+                    direction: (cam_from_world.transpose() * Vector3::new(u, v, 1.0)).normalize(),
+                });
+                rays.image.push(image as u32);
+                rays.class.push(0);
+            }
+        }
+    }
+    let count = rays.rays.len();
+    let view = |&center: &Vector3<f64>| View {
+        center,
+        cam_from_world,
+        camera: 0,
+        pass: 0,
+        viewpoint: 0,
+        position_sigma_m: f64::NAN,
+        rotation_sigma_rad: f64::NAN,
+    };
+    Scene {
+        scale2: vec![FOCAL_PX * FOCAL_PX; count],
+        box_px: vec![20.0; count],
+        range_m: vec![f64::NAN; count],
+        range_sigma_m: vec![f64::NAN; count],
+        views: centers.iter().map(view).collect(),
+        frusta: vec![Frustum { normals: Vec::new(), solid_angle_sr: 12.0 }],
+        rays,
+    }
+}
+
+fn object() -> impl Strategy<Value = Vector3<f64>> {
+    (20.0..140.0, 2.0..9.0, prop_oneof![Just(-1.0), Just(1.0)], 1.0..6.0)
+        .prop_map(|(x, aside, side, z)| Vector3::new(x, aside * side, z))
+}
+
+fn errors_px() -> impl Strategy<Value = Vec<[f64; 2]>> {
+    vec([-1.0..1.0, -1.0..1.0], 97)
+}
+
+/// The same cases in every run.
+fn config() -> ProptestConfig {
+    ProptestConfig { cases: 48, failure_persistence: None, rng_seed: RngSeed::Fixed(1), ..ProptestConfig::default() }
+}
+
+proptest! {
+    #![proptest_config(config())]
+
+    #[test]
+    fn the_index_finds_the_rays_that_a_look_at_all_of_them_finds(
+        objects in vec(object(), 1..12), errors in errors_px(), points in vec(object(), 1..20), range_m in 10.0..80.0_f64
+    ) {
+        let mut scene = street(60, 2.0, &objects, &errors);
+        let count = scene.rays.rays.len() as u32;
+        for ray in 0..count {
+            scene.rays.class[ray as usize] = ray % 3 / 2;
+        }
+        let spreads = spreads_of(&scene, &NOISE);
+        let index = RayIndex::new(&scene, &spreads, GATE_SIGMAS, 0..count);
+        for point in points.iter().chain(&objects) {
+            let fit = |ray: u32| {
+                let projected = scene.ray(ray).project(point);
+                let near = (point - scene.ray(ray).center).norm() <= range_m;
+                let chi2 = chi2(&projected, &spreads[ray as usize]);
+                (near && projected.z > 0.0 && chi2 < GATE_SIGMAS * GATE_SIGMAS).then_some(chi2)
+            };
+            for class in [0, 1] {
+                let seen = (0..count).filter(|&ray| scene.rays.class[ray as usize] == class && fit(ray).is_some());
+                let mut found: Vec<u32> = index.all_hits(point, class, range_m).iter().map(|hit| hit.ray).collect();
+                found.sort_unstable();
+                prop_assert_eq!(found, seen.clone().collect::<Vec<_>>());
+                let keep = |ray: u32| !ray.is_multiple_of(5);
+                let mut closest: Vec<u32> = Vec::new();
+                for ray in seen.filter(|&ray| keep(ray)) {
+                    match closest.last_mut() {
+                        Some(last) if scene.rays.image[*last as usize] == scene.rays.image[ray as usize] => {
+                            if fit(ray) < fit(*last) {
+                                *last = ray;
+                            }
+                        }
+                        _ => closest.push(ray),
+                    }
+                }
+                let hits = index.hits(point, class, range_m, &keep);
+                prop_assert_eq!(hits.iter().map(|hit| hit.ray).collect::<Vec<_>>(), closest);
+            }
+        }
+    }
+
+    #[test]
+    fn every_image_nominates_where_its_object_is(object in object(), errors in errors_px()) {
+        let scene = street(70, 2.0, &[object], &errors);
+        let spreads = spreads_of(&scene, &NOISE);
+        let free: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
+        let of = |who| nominate(&scene, &spreads, GATE_SIGMAS, &VIABILITY, &free, who, &Progress::default()).unwrap();
+        let all = of(Who::All);
+        prop_assert!(all.len() as f64 > 0.9 * free.len() as f64, "{} of {}", all.len(), free.len());
+        for nomination in &all {
+            let [a, b] = nomination.rays.map(|ray| scene.ray(ray));
+            prop_assert!(a.center != b.center);
+            prop_assert!((nomination.point - object).norm() < 0.15 * (nomination.point - a.center).norm());
+            prop_assert!(nomination.support > 1.0);
+        }
+        let best = *all.iter().max_by(|a, b| a.support.total_cmp(&b.support)).unwrap();
+        prop_assert!((best.point - object).norm() < 0.5, "{}", (best.point - object).norm());
+        // So few images all nominate.
+        prop_assert_eq!(of(Who::Part), all);
+    }
+
+    #[test]
+    fn where_there_are_many_images_a_part_of_them_nominates(object in object(), errors in errors_px()) {
+        let scene = street(3000, 0.05, &[object], &errors);
+        let spreads = spreads_of(&scene, &NOISE);
+        let free: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
+        let of = |who| nominate(&scene, &spreads, GATE_SIGMAS, &VIABILITY, &free, who, &Progress::default()).unwrap();
+        let (all, part) = (of(Who::All), of(Who::Part));
+        prop_assert!(part.len() < all.len() && part.len() >= 20, "{} of {}", part.len(), all.len());
+        let level = part.iter().map(|one| level_of(scene.rays.image[one.rays[0] as usize])).min().unwrap();
+        prop_assert!(level >= 1);
+        let of_images = all.into_iter().filter(|one| level_of(scene.rays.image[one.rays[0] as usize]) >= level);
+        prop_assert_eq!(part, of_images.collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn a_quick_estimate_is_nearly_the_exact_one(object in object(), errors in errors_px(), x in -1.0..1.0, y in -0.3..0.3) {
+        let scene = street(70, 2.0, &[object], &errors);
+        let spreads = spreads_of(&scene, &NOISE);
+        let voters: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
+        let start = object + Vector3::new(x, y, 0.2);
+        let quick = quick_estimate(&scene, &spreads, &voters, start).unwrap();
+        let exact = estimate(&scene, &NOISE, &voters, start, 1e-7).unwrap();
+        let apart = quick - exact.point;
+        let sigmas2 = apart.dot(&exact.covariance.cholesky().unwrap().solve(&apart));
+        prop_assert!(sigmas2 < 0.3_f64.powi(2), "{} m, {} sigmas", apart.norm(), sigmas2.sqrt());
+    }
+
+    #[test]
+    fn a_sample_is_bounded_and_the_same_in_any_frame(
+        places in vec([-100.0..100.0, -100.0..100.0, -3.0..3.0], 2..400), most in 1..60_usize,
+        turn in -3.0..3.0_f64, shift in [-1e3..1e3, -1e3..1e3, -10.0..10.0]
+    ) {
+        const RADIUS_M: f64 = 60.0;
+        const BASELINE_M: f64 = 0.5;
+        let centers: Vec<Vector3<f64>> = places.into_iter().map(Vector3::from).collect();
+        let turn = Rotation3::from_euler_angles(0.1, 0.2, turn);
+        let moved: Vec<Vector3<f64>> = centers.iter().map(|center| turn * center + Vector3::from(shift)).collect();
+        let images: Vec<u32> = (0..centers.len() as u32).filter(|image| image % 7 != 3).collect();
+        let (here, there) = (Sampler::new(&centers, &images, RADIUS_M), Sampler::new(&moved, &images, RADIUS_M));
+        for &image in &images {
+            let distance = |other: u32| (centers[other as usize] - centers[image as usize]).norm();
+            let near = images.iter().filter(|&&other| distance(other) <= RADIUS_M && distance(other) > BASELINE_M);
+            let sample = here.around(image, BASELINE_M, most);
+            prop_assert_eq!(&sample, &there.around(image, BASELINE_M, most));
+            let found: BTreeSet<u32> = sample.iter().copied().collect();
+            prop_assert_eq!(sample.len(), found.len());
+            prop_assert_eq!(sample.len(), near.clone().count().min(most));
+            prop_assert!(found.is_subset(&near.copied().collect()));
+        }
+    }
+}
