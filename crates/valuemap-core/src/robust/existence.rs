@@ -19,7 +19,7 @@ use super::noise::Spread;
 use super::scene::Scene;
 
 /// So many times more probable must be that the hits in a sector are not the label's, before its votes are taken away (logarithm).
-const STRAY_LOG_ODDS: f64 = 1e9;
+const STRAY_LOG_ODDS: f64 = 5.0;
 /// More hits in a sector than this are no accident.
 const MOST_STRAYS: u32 = 2;
 /// Nearer than this nothing is expected to be seen, m.
@@ -31,7 +31,7 @@ const COINCIDENCE: f64 = 0.05;
 const COINCIDENCE_CONCENTRATION: f64 = 15.0;
 /// Of the points that gathered enough votes to be judged, so many are nothing for each that is something. The point was chosen
 /// as the best of many, so plain odds would flatter it.
-const PRIOR_ODDS_AGAINST: f64 = 3.0;
+const PRIOR_ODDS_AGAINST: f64 = 10.0;
 
 /// Directions that a label is looked at from: around those of some of its votes.
 #[derive(Debug, Clone)]
