@@ -64,6 +64,7 @@ fn street(images: usize, spacing_m: f64, objects: &[Vector3<f64>], errors_px: &[
         camera: 0,
         pass: 0,
         viewpoint: 0,
+        driven_m: 0.0,
         position_sigma_m: f64::NAN,
         rotation_sigma_rad: f64::NAN,
     };

@@ -56,7 +56,8 @@ impl Scene {
                 cam_from_world: valuemap_core::matrix_from_rows(&rotations[i]),
                 camera: camera[i],
                 pass: pass[i],
-                viewpoint: viewpoints[i],
+                viewpoint: viewpoints[i].0,
+                driven_m: viewpoints[i].1,
                 position_sigma_m: positions[i],
                 rotation_sigma_rad: turns[i],
             })

@@ -12,12 +12,12 @@ use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::drift::Look;
-use super::estimate::{Estimate, by_pass, pass_terms};
+use super::estimate::{Estimate, by_pass, is_one_visit, pass_terms};
 use super::index::{Hit, RayIndex};
 use super::label::Label;
 use super::noise::Noise;
 use super::poses::{Belief, PoseError, legs, smooth};
-use super::scene::Scene;
+use super::scene::{Scene, View};
 
 /// Times that the assignment of an image is made anew, with the pose error from the last one.
 const ROUNDS: usize = 3;
@@ -79,7 +79,8 @@ pub fn associate(scene: &Scene, noise: &Noise, index: &RayIndex<'_>, labels: &[L
         .collect();
     let mut claims: Vec<Claim> = of_labels.into_iter().flatten().collect();
     claims.par_sort_unstable_by_key(|claim| (claim.pass, claim.image, claim.label, claim.ray));
-    let passes: Vec<&[Claim]> = claims.chunk_by(|a, b| a.pass == b.pass).collect();
+    let view = |claim: &Claim| &scene.views[claim.image as usize];
+    let passes: Vec<&[Claim]> = claims.chunk_by(|a, b| is_one_visit(view(a), view(b))).collect();
     let decided: Vec<Vec<Decision>> =
         passes.par_iter().map(|pass| decide(scene, noise, labels, index.gate_sigmas().powi(2), pass)).collect();
     let mut verdicts = vec![Verdict::default(); labels.len()];
@@ -134,19 +135,19 @@ enum Decision {
 
 /// Decide the claims of one pass, ordered by image.
 fn decide(scene: &Scene, noise: &Noise, labels: &[Label], limit: f64, claims: &[Claim]) -> Vec<Decision> {
-    let pass = claims[0].pass;
+    let [first, last] = [&claims[0], &claims[claims.len() - 1]].map(|claim| &scene.views[claim.image as usize]);
     let mut elsewhere: FxHashMap<u32, Estimate> = FxHashMap::default();
     for claim in claims {
         let label = &labels[claim.label as usize];
-        elsewhere.entry(claim.label).or_insert_with(|| estimate_elsewhere(scene, noise, label, pass));
+        elsewhere.entry(claim.label).or_insert_with(|| estimate_elsewhere(scene, noise, label, first, last));
     }
     let cases: Vec<Case<'_>> =
         claims.iter().filter_map(|claim| Case::of(scene, noise, &elsewhere[&claim.label], claim)).collect();
     let images: Vec<&[Case<'_>]> = cases.chunk_by(|a, b| a.claim.image == b.claim.image).collect();
-    let centers: Vec<_> = images.iter().map(|cases| cases[0].look.center).collect();
-    let leg_of = legs(&centers);
+    let driven_m: Vec<f64> = images.iter().map(|cases| cases[0].look.driven_m).collect();
+    let leg_of = legs(&driven_m);
     let starts: Vec<_> =
-        (0..images.len()).filter(|&i| i == 0 || leg_of[i] != leg_of[i - 1]).map(|i| centers[i]).collect();
+        (0..images.len()).filter(|&i| i == 0 || leg_of[i] != leg_of[i - 1]).map(|i| driven_m[i]).collect();
     let votes: Vec<Belief> = images.iter().map(|cases| belief_of_votes(cases)).collect();
     let mut of_legs = vec![Belief::nothing(); starts.len()];
     for (vote, &leg) in votes.iter().zip(&leg_of) {
@@ -171,8 +172,10 @@ fn decide(scene: &Scene, noise: &Noise, labels: &[Label], limit: f64, claims: &[
 
 /// Where the other passes put a label: votes of this pass that went to the wrong one of two labels must not confirm
 /// themselves. They keep a small weight, for where the other passes tell little.
-fn estimate_elsewhere(scene: &Scene, noise: &Noise, label: &Label, pass: u32) -> Estimate {
-    let voters = by_pass(scene, &label.voters).find(|voters| scene.view(voters[0]).pass == pass);
+fn estimate_elsewhere(scene: &Scene, noise: &Noise, label: &Label, first: &View, last: &View) -> Estimate {
+    let is_here =
+        |view: &View| view.pass == first.pass && view.driven_m >= first.driven_m && view.driven_m <= last.driven_m;
+    let voters = by_pass(scene, &label.voters).find(|voters| voters.iter().any(|&ray| is_here(scene.view(ray))));
     let rest = label.voters.len() - voters.map_or(0, <[u32]>::len);
     let of_pass =
         voters.filter(|_| rest >= 2).and_then(|voters| pass_terms(scene, noise, voters, &label.estimate.point));

@@ -45,8 +45,8 @@ pub struct Look {
     pub drift_sigma: Vector6,
     /// Variance of its own error, px².
     pub variance: f64,
-    /// Where it was taken from, m.
-    pub center: Vector3<f64>,
+    /// How far its pass had driven, m.
+    pub driven_m: f64,
 }
 
 impl Look {
@@ -64,7 +64,7 @@ impl Look {
         });
         let variance = noise.own(scene, ray).variance(seen.project(point).z);
         let drift_sigma = Vector6::new(p, p, p, r, r, r);
-        Some(Self { residual, by_point, by_pose, drift_sigma, variance, center: seen.center })
+        Some(Self { residual, by_point, by_pose, drift_sigma, variance, driven_m: scene.view(ray).driven_m })
     }
 }
 
@@ -116,7 +116,8 @@ impl<'a> Drive<'a> {
                 }
             }
             // The next leg's drift is `keep` times this one's, and something new of variance `1 - keep²`.
-            let keep = next.first().map_or(0.0, |next| (-(next.center - here[0].center).norm() / DRIFT_LENGTH_M).exp());
+            let keep =
+                next.first().map_or(0.0, |next| (-(next.driven_m - here[0].driven_m).abs() / DRIFT_LENGTH_M).exp());
             let stiffness = 1.0 / (1.0 - keep * keep);
             let tie = keep * stiffness;
             let tied = (of_drift + Matrix6::identity() * (keep * tie)).cholesky()?;
@@ -157,6 +158,6 @@ impl<'a> Drive<'a> {
 
 /// How many looks, from the first one on, share one drift.
 fn leg_length(looks: &[Look]) -> usize {
-    let is_far = |look: &Look| (look.center - looks[0].center).norm_squared() > LEG_M * LEG_M;
+    let is_far = |look: &Look| (look.driven_m - looks[0].driven_m).abs() > LEG_M;
     looks.iter().position(is_far).unwrap_or(looks.len())
 }

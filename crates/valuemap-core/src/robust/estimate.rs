@@ -7,9 +7,11 @@ use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 
 use super::drift::{Drive, Look, PassTerms};
 use super::noise::Noise;
-use super::scene::Scene;
+use super::scene::{Scene, View};
 
 const MAX_ITERATIONS: usize = 20;
+/// A pass that comes back after so long a drive has another drift, m.
+const FORGOTTEN_M: f64 = 250.0;
 /// Freedom left to a residual that the point follows altogether, as a share of its variance.
 const LEAST_FREEDOM: f64 = 1e-3;
 const LONGEST_STEP_M: f64 = 5.0;
@@ -116,9 +118,15 @@ fn range_terms(scene: &Scene, voters: &[u32], point: &Vector3<f64>) -> (Matrix3<
     sum
 }
 
-/// Voters in runs of one pass.
+/// Whether two views, successive among those of something, are of one visit: of a pass that has not forgotten its drift.
+#[must_use]
+pub fn is_one_visit(a: &View, b: &View) -> bool {
+    a.pass == b.pass && (b.driven_m - a.driven_m).abs() < FORGOTTEN_M
+}
+
+/// Voters in runs of one visit.
 pub fn by_pass<'a>(scene: &'a Scene, voters: &'a [u32]) -> impl Iterator<Item = &'a [u32]> {
-    voters.chunk_by(|&a, &b| scene.view(a).pass == scene.view(b).pass)
+    voters.chunk_by(|&a, &b| is_one_visit(scene.view(a), scene.view(b)))
 }
 
 /// The terms of the voters of one pass at a point; nothing if it is behind one of them.

@@ -4,7 +4,7 @@
 //! [`drift`](super::drift): what the looks of each leg say of it is passed on to the legs after and before it (two-filter
 //! smoother).
 
-use nalgebra::{Matrix2, SMatrix, Vector2, Vector3};
+use nalgebra::{Matrix2, SMatrix, Vector2};
 
 use super::drift::{DRIFT_LENGTH_M, LEG_M, Look, Matrix6, Vector6};
 
@@ -116,25 +116,26 @@ fn rows_of(look: &Look) -> SMatrix<f64, 2, 6> {
     SMatrix::<f64, 2, 6>::from_rows(&[look.by_pose[0].transpose(), look.by_pose[1].transpose()])
 }
 
-/// Cut places along a drive into legs of one drift: the number of each place's leg, ascending from 0.
+/// Cut places along a drive, by how far the pass had driven there (m), into legs of one drift: the number of each place's
+/// leg, ascending from 0.
 #[must_use]
-pub fn legs(centers: &[Vector3<f64>]) -> Vec<usize> {
+pub fn legs(driven_m: &[f64]) -> Vec<usize> {
     let mut leg = 0;
-    let mut start = centers.first().copied().unwrap_or_default();
-    let of_place = |center: &Vector3<f64>| {
-        if (center - start).norm() > LEG_M {
-            (leg, start) = (leg + 1, *center);
+    let mut start = driven_m.first().copied().unwrap_or_default();
+    let of_place = |&driven: &f64| {
+        if (driven - start).abs() > LEG_M {
+            (leg, start) = (leg + 1, driven);
         }
         leg
     };
-    centers.iter().map(of_place).collect()
+    driven_m.iter().map(of_place).collect()
 }
 
-/// What is known of the drift of each leg, from its own looks and those of all other legs of the pass; `starts` is where the
-/// legs begin.
+/// What is known of the drift of each leg, from its own looks and those of all other legs of the pass; `starts_m` is where
+/// the legs begin.
 #[must_use]
-pub fn smooth(starts: &[Vector3<f64>], looks: &[Belief]) -> Vec<Belief> {
-    let distance = |leg: usize| (starts[leg + 1] - starts[leg]).norm();
+pub fn smooth(starts_m: &[f64], looks: &[Belief]) -> Vec<Belief> {
+    let distance = |leg: usize| (starts_m[leg + 1] - starts_m[leg]).abs();
     let mut before = vec![Belief::prior(); looks.len()];
     for leg in 1..looks.len() {
         before[leg] = before[leg - 1].and(&looks[leg - 1]).carried(distance(leg - 1), true);

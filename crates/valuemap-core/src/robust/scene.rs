@@ -36,6 +36,8 @@ pub struct View {
     pub pass: u32,
     /// The place of the pass where it was taken: images of one viewpoint see the same, e.g. before a red light.
     pub viewpoint: u32,
+    /// How far the pass had driven there, m.
+    pub driven_m: f64,
     /// Known standard deviation of the position, m; NaN where it is to be estimated.
     pub position_sigma_m: f64,
     /// Known standard deviation of the rotation, rad; NaN where it is to be estimated.
@@ -76,23 +78,26 @@ impl Scene {
 }
 
 /// Number the viewpoints: within a pass, in the order of the images, a new one begins where the camera has moved
-/// by more than `step_m` since the last one began.
+/// by more than `step_m` since the last one began. Also how far the pass had driven there, m: from one to the next.
 #[must_use]
-pub fn number_viewpoints(centers: &[[f64; 3]], pass: &[u32], step_m: f64) -> Vec<u32> {
+pub fn number_viewpoints(centers: &[[f64; 3]], pass: &[u32], step_m: f64) -> Vec<(u32, f64)> {
     let passes = pass.iter().max().map_or(0, |&last| last as usize + 1);
-    let mut current: Vec<Option<(Vector3<f64>, u32)>> = vec![None; passes];
+    let mut current: Vec<Option<(Vector3<f64>, u32, f64)>> = vec![None; passes];
     let mut next = 0;
     centers
         .iter()
         .zip(pass)
         .map(|(center, &pass)| {
             let center = Vector3::from(*center);
-            match current[pass as usize] {
-                Some((start, viewpoint)) if (center - start).norm() <= step_m => viewpoint,
+            let last = current[pass as usize];
+            let step = last.map_or(0.0, |(start, ..)| (center - start).norm());
+            match last {
+                Some((_, viewpoint, driven)) if step <= step_m => (viewpoint, driven),
                 _ => {
-                    current[pass as usize] = Some((center, next));
+                    let driven = last.map_or(0.0, |(_, _, driven)| driven + step);
+                    current[pass as usize] = Some((center, next, driven));
                     next += 1;
-                    next - 1
+                    (next - 1, driven)
                 }
             }
         })
