@@ -29,9 +29,12 @@ const NEAREST_M: f64 = 4.0;
 const COINCIDENCE: f64 = 0.05;
 /// How little that share varies between passes, see [`Rates::concentration`].
 const COINCIDENCE_CONCENTRATION: f64 = 15.0;
-/// Of the points that gathered enough votes to be judged, so many are nothing for each that is something. The point was chosen
-/// as the best of many, so plain odds would flatter it.
-const PRIOR_ODDS_AGAINST: f64 = 10.0;
+/// Odds that a point which gathered enough votes to be judged is nothing, where hardly any was found to be: it was chosen as
+/// the best of many, so plain odds would flatter it.
+const ODDS_AGAINST: f64 = 10.0;
+/// How much they grow with the number of those, for each label, that were found to be nothing: what is left is the best of
+/// so many more.
+const ODDS_PER_DOUBTED: f64 = 3.0;
 
 /// Directions that a label is looked at from: around those of some of its votes.
 #[derive(Debug, Clone)]
@@ -226,8 +229,10 @@ fn nothing(share: f64) -> Rates {
 ///
 /// Against it speaks that nothing is there, and the hits come from detections of other things: a small share of the looks,
 /// again different from pass to pass. `chance` is the share that stray detections alone give.
+/// `doubted` is how many others were found not to exist.
 #[must_use]
-pub fn probabilities(looks: &[Vec<Looks>], rates: &Rates, chance: &[f64]) -> Vec<f64> {
+pub fn probabilities(looks: &[Vec<Looks>], rates: &Rates, chance: &[f64], doubted: u64) -> Vec<f64> {
+    let odds_against = ODDS_AGAINST * (1.0 + ODDS_PER_DOUBTED * doubted as f64 / looks.len().max(1) as f64);
     looks
         .par_iter()
         .zip(chance)
@@ -235,7 +240,7 @@ pub fn probabilities(looks: &[Vec<Looks>], rates: &Rates, chance: &[f64]) -> Vec
             let nothing = nothing(chance + COINCIDENCE);
             let log_odds: f64 =
                 passes.iter().map(|pass| rates.log_likelihood(pass) - nothing.log_likelihood(pass)).sum();
-            1.0 / (1.0 + PRIOR_ODDS_AGAINST * (-log_odds).exp())
+            1.0 / (1.0 + odds_against * (-log_odds).exp())
         })
         .collect()
 }

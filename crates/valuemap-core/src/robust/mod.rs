@@ -178,7 +178,8 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
             break;
         }
     }
-    let Judgement { of_labels, rates, strays_per_image } = judge(scene, &spreads, &lookout, &labels, settings);
+    let Judgement { of_labels, rates, strays_per_image } =
+        judge(scene, &spreads, &lookout, &labels, settings, tally.doubted);
     let variance_factor = calibrate::variance_factor(scene, noise, &labels.iter().collect::<Vec<_>>());
     let findings = labels.into_iter().zip(of_labels).map(|(mut label, (existence, expected))| {
         label.estimate.covariance *= variance_factor;
@@ -261,7 +262,7 @@ impl<'a> Court<'a> {
             for _ in 0..MAX_DOUBT_ROUNDS {
                 progress.check()?;
                 labels = self.look_around(lookout, labels, tally);
-                let judgement = judge(self.scene, self.spreads, lookout, &labels, self.settings);
+                let judgement = judge(self.scene, self.spreads, lookout, &labels, self.settings, tally.doubted);
                 let before = labels.len();
                 let existing =
                     labels.into_iter().zip(judgement.of_labels).filter(|(_, (existence, _))| *existence >= doubt);
@@ -285,7 +286,14 @@ struct Judgement {
     strays_per_image: f64,
 }
 
-fn judge(scene: &Scene, spreads: &[Spread], lookout: &Lookout<'_>, labels: &[Label], settings: &Settings) -> Judgement {
+fn judge(
+    scene: &Scene,
+    spreads: &[Spread],
+    lookout: &Lookout<'_>,
+    labels: &[Label],
+    settings: &Settings,
+    doubted: u64,
+) -> Judgement {
     let seen: Vec<(Vec<Looks>, u32)> = labels
         .par_iter()
         .map(|label| {
@@ -304,7 +312,7 @@ fn judge(scene: &Scene, spreads: &[Spread], lookout: &Lookout<'_>, labels: &[Lab
         .iter()
         .map(|label| existence::chance_of(label, scene, spreads, settings.gate_sigmas, strays_per_sr))
         .collect();
-    let existence = existence::probabilities(&looks, &rates, &chance);
+    let existence = existence::probabilities(&looks, &rates, &chance, doubted);
     Judgement { of_labels: existence.into_iter().zip(expected).collect(), rates, strays_per_image }
 }
 
