@@ -508,6 +508,16 @@ def test_a_folder_of_pictures_gives_annotations_that_can_be_compared(tmp_path: P
         detect_folder(tmp_path / "out", finder)
 
 
+def test_annotations_of_others_are_not_replaced(tmp_path: Path, finder: Path) -> None:
+    save(tmp_path / "1.png", painted((64, 64), []))
+    (tmp_path / RESULTS).write_text("made by hand")
+    with pytest.raises(OutputError, match="not ours to replace"):
+        detect_folder(tmp_path, finder)
+    assert (tmp_path / RESULTS).read_text() == "made by hand"
+    for _ in range(2):  # Our own are.
+        detect_folder(tmp_path, finder, out=tmp_path / "out")
+
+
 def test_yolox_nano_finds_the_known_boxes() -> None:
     if not DATA.is_dir():
         pytest.skip(f"there is no {DATA}")

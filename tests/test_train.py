@@ -172,7 +172,7 @@ def test_a_run_is_only_gone_on_with_if_that_is_said_and_nothing_changed(tmp_path
     assert not run.exists()
     train([pictures], run, config)
     before = (run / "model.onnx").read_bytes()
-    with pytest.raises(OutputError, match="holds a training run already") as refusal:
+    with pytest.raises(OutputError, match="holds a training run or a model already") as refusal:
         train([pictures], run, config)
     assert "--resume" in refusal.value.hint
     with pytest.raises(SettingError, match="is of a run with another epochs: 1, now 2"):

@@ -120,6 +120,11 @@ def detect_folder(
     -------
     Path
         The file of annotations.
+
+    Raises
+    ------
+    OutputError
+        `out` holds a `detections.json` that no such run wrote, or cannot be written.
     """
     folder, config = Path(pictures), config or DetectConfig()
     target = Path(out) if out is not None else folder
@@ -128,6 +133,11 @@ def detect_folder(
     paths = list_pictures(folder)
     if not paths:
         raise InputError(f"{folder}: there are no pictures in it", hint="give a dataset or a folder of pictures")
+    if (target / RESULTS).exists() and not any((target / name).exists() for name in (RECORD, _JOURNAL)):
+        raise OutputError(
+            f"{target / RESULTS}: is there without {RECORD}, so it is not ours to replace",
+            hint="choose another --out, or remove the file first",
+        )
     detector = Detector(Path(model), config)
     names = [path.relative_to(folder).as_posix() for path in paths]
     try:

@@ -94,7 +94,7 @@ def train(
     SettingError
         The run to resume had other settings, pictures or another seed.
     OutputError
-        `run` holds a run already and `resume` is not said, or cannot be written.
+        `run` holds a run or a model already and `resume` is not said, or cannot be written.
     """
     if importlib.util.find_spec("torch") is None or importlib.util.find_spec("onnxscript") is None:
         raise ValuemapError(
@@ -105,8 +105,10 @@ def train(
 
     config = config or TrainConfig()
     checkpoint = run / CHECKPOINT
-    if checkpoint.exists() and not resume:
-        raise OutputError(f"{run}: holds a training run already", hint="go on with --resume, or choose another --out")
+    if not resume and any((run / name).exists() for name in (CHECKPOINT, MODEL)):
+        raise OutputError(
+            f"{run}: holds a training run or a model already", hint="go on with --resume, or choose another --out"
+        )
     if resume and not checkpoint.exists() and not (run / RECORD).exists():
         raise InputError(f"{run}: there is no training run to go on with", hint="check --out, or leave --resume away")
     data = prepare_data(labels, config, one_class=one_class, seed=seed, progress=progress)
