@@ -48,7 +48,7 @@ from valuemap.tables import Floats
 CLASS = "traffic_light"
 MODEL = Path(__file__).parents[1] / "python" / "valuemap" / "detect" / "models" / "traffic_lights.onnx"
 SETTINGS = TrainConfig(
-    first_channels=12, growth_channels=8, layers=3, dropout=0.0, epochs=10, learning_rate=0.004, object_share=0.6
+    first_channels=12, growth_channels=8, layers=3, dropout=0.0, epochs=20, learning_rate=0.004, object_share=0.6
 )
 
 CITY = replace(PRESETS["small"], passes_per_street=3)
