@@ -2,8 +2,9 @@
 
     python benchmarks/demo.py --work DIR [--seeds 0 2 3] [--json FILE]
 
-Nothing was chosen on the cities of the seeds 2 and 3. The load says how many other processes wanted the processor in
-the minute before: above 0.5 or so the seconds are those of a shared machine.
+The seeds 2 and 3 are cities that neither the training nor the least score of the boxes was chosen on. The load says
+how many other processes wanted the processor in the minute before: above 0.5 or so the seconds are those of a shared
+machine.
 """
 
 from __future__ import annotations
