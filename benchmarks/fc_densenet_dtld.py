@@ -58,7 +58,7 @@ def main() -> None:
             one_class="traffic_light",
             progress=show_progress(bar),
         )
-    run = json.loads((options.work / "run.json").read_text(encoding="utf-8"))
+    run = json.loads((options.work / "train.json").read_text(encoding="utf-8"))
     yolox = DetectConfig(classes="traffic light", size="1024x448", min_score=0.01)
     results = {
         "fc_densenet": {

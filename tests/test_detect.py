@@ -23,7 +23,7 @@ from tiny_models import red_finder, says
 from valuemap import build_map, read_dataset, write_dataset
 from valuemap.config import DetectConfig
 from valuemap.dataset import Dataset
-from valuemap.detect import infer
+from valuemap.detect import BUNDLED_MODEL, infer
 from valuemap.detect.boxes import Boxes
 from valuemap.detect.found import match_pictures, read_found
 from valuemap.detect.infer import Detector, Task
@@ -129,7 +129,7 @@ def test_unusable_pictures_are_listed_and_counted(dataset: Path, finder: Path) -
     record = json.loads((dataset / RECORD).read_text())
     assert record["counts"]["unusable_pictures"] == 3
     problems = {entry["image"]: entry["problem"] for entry in record["unusable"]}
-    assert "truncated" in problems["a/1.jpg"]
+    assert problems["a/1.jpg"].startswith("cannot be decoded: image file is truncated")
     assert problems["a/2.jpg"] == "is no picture"
     assert problems["b/1.jpg"] == "no such file"
 
@@ -407,6 +407,16 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path: Path, finder: Pa
     assert record["unusable"] == expected["unusable"]
 
 
+def test_a_model_that_cannot_be_run_is_one_clear_line_and_leaves_nothing_behind(
+    dataset: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(InputError, match="cannot be run on a batch of 1, 100 x 50 px") as refusal:
+        detect_dataset(dataset, BUNDLED_MODEL, DetectConfig(size="100x50"))
+    assert "multiples of 32" in refusal.value.hint
+    assert capfd.readouterr().err == ""  # ONNX Runtime would print the same at length.
+    assert not list(dataset.glob(".*"))
+
+
 def test_a_full_disk_is_one_clear_line(dataset: Path, finder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def write(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -496,6 +506,16 @@ def test_a_folder_of_pictures_gives_annotations_that_can_be_compared(tmp_path: P
     assert set(match_pictures(read_found(tmp_path / "out"), labels)) == {picture.path for picture in labels.pictures}
     with pytest.raises(InputError, match="no pictures in it"):
         detect_folder(tmp_path / "out", finder)
+
+
+def test_annotations_of_others_are_not_replaced(tmp_path: Path, finder: Path) -> None:
+    save(tmp_path / "1.png", painted((64, 64), []))
+    (tmp_path / RESULTS).write_text("made by hand")
+    with pytest.raises(OutputError, match="not ours to replace"):
+        detect_folder(tmp_path, finder)
+    assert (tmp_path / RESULTS).read_text() == "made by hand"
+    for _ in range(2):  # Our own are.
+        detect_folder(tmp_path, finder, out=tmp_path / "out")
 
 
 def test_yolox_nano_finds_the_known_boxes() -> None:

@@ -25,7 +25,7 @@ from valuemap import read_dataset, write_dataset
 from valuemap.detect.accuracy import FoundBoxes, evaluate_boxes
 from valuemap.detect.found import match_pictures
 from valuemap.detect.labels import LabelledPicture, LabelledPictures
-from valuemap.errors import InputError
+from valuemap.errors import InputError, SettingError
 
 HERE = Path("a.png")
 
@@ -89,6 +89,12 @@ def test_ignored_places_count_for_nothing() -> None:
     boxes = found([[50, 50, 10, 30], [145, 50, 30, 40], [155, 50, 30, 40]], [0.9, 0.8, 0.7])
     accuracy = evaluate_boxes({HERE: boxes}, labels).overall[0.5]
     assert (accuracy.labels, accuracy.right, accuracy.false) == (1, 1, 0)
+
+
+def test_impossible_limits_are_refused() -> None:
+    for limits, message in (({"min_score": math.nan}, "--min-score"), ({"min_height_px": -3.0}, "--min-height")):
+        with pytest.raises(SettingError, match=message):
+            evaluate_boxes({}, LabelledPictures("test", (), ()), **limits)
 
 
 def test_classes_are_compared_where_they_are_the_same_on_both_sides() -> None:

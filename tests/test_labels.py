@@ -218,7 +218,7 @@ def test_a_coco_image_without_a_name_is_named(tmp_path: Path) -> None:
     ("spec", "content", "message"),
     [
         ("pascal:{0}", "", "expected a format and a place, the format one of bosch, coco, yolo"),
-        ("coco", "", "expected a format and a place"),
+        ("coco", "", "^labels 'coco': expected a format and a place"),
         ("coco:", "", "expected a format and a place"),
         ("bosch:{0}", None, "no such file"),
         ("bosch:{0}", "a: {b", "cannot be read as YAML"),
@@ -245,6 +245,21 @@ def test_yolo_pictures_without_any_text_file_are_refused(tmp_path: Path) -> None
     write_picture(tmp_path / "a.jpg")
     with pytest.raises(InputError, match="1 pictures, but none has a text file"):
         read_labels(f"yolo:{tmp_path}")
+
+
+def test_a_folder_without_pictures_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there are no pictures in it"):
+        read_labels(f"yolo:{tmp_path}")
+
+
+def test_yolo_names_that_are_no_text_are_refused(tmp_path: Path) -> None:
+    write_picture(tmp_path / "a.jpg")
+    write_text(tmp_path / "a.txt", "0 0.5 0.5 0.1 0.1")
+    (tmp_path / "classes.txt").write_bytes(b"\xff\xfe")
+    with pytest.raises(InputError, match=r"classes.txt: cannot be read"):
+        read_labels(f"yolo:{tmp_path}")
+    (tmp_path / "classes.txt").write_bytes(b"light\r\nsign\r\n")
+    assert read_labels(f"yolo:{tmp_path}").class_names == ("light",)
 
 
 def test_yolo_names_that_are_none_are_refused(tmp_path: Path) -> None:

@@ -17,8 +17,10 @@ from PIL import Image
 from extras import require_extra
 from valuemap.config import TrainConfig
 from valuemap.detect.labels import LabelledPicture, LabelledPictures
-from valuemap.detect.train import TrainResult, train
+from valuemap.detect.samples import prepare_data
+from valuemap.detect.train import RECORD, TrainResult, train
 from valuemap.errors import InputError, OutputError, SettingError
+from valuemap.progress import silent
 
 require_extra("train", "torch", "onnxscript")
 
@@ -26,7 +28,7 @@ import torch  # noqa: E402 (only where it is installed)
 
 from valuemap.detect.export_onnx import export_onnx  # noqa: E402
 from valuemap.detect.fc_densenet import FCDenseNet  # noqa: E402
-from valuemap.detect.training import loss_of, loss_sums  # noqa: E402
+from valuemap.detect.training import Training, loss_of, loss_sums  # noqa: E402
 
 torch.set_num_threads(1)  # Tiny networks only get slower with more, above all on a busy machine.
 
@@ -106,7 +108,7 @@ def test_it_learns_to_find_squares(tmp_path: Path) -> None:
     assert result.recall >= 0.8
     assert result.precision >= 0.8
     assert (tmp_path / "run" / "curve.png").read_bytes().startswith(b"\x89PNG")
-    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    record = json.loads((tmp_path / "run" / RECORD).read_text())
     assert record["counts"] == result.counts
     assert record["counts"]["training_pictures"] == 18
     assert record["counts"]["skipped"] == 1
@@ -165,9 +167,12 @@ def test_another_seed_is_another_run(tmp_path: Path) -> None:
 def test_a_run_is_only_gone_on_with_if_that_is_said_and_nothing_changed(tmp_path: Path) -> None:
     pictures, run = squares(tmp_path / "pictures", 8), tmp_path / "run"
     config = replace(TINY, epochs=1)
-    train([pictures], run, config, resume=True)  # Nothing is there to go on with: from the start.
+    with pytest.raises(InputError, match="there is no training run to go on with"):
+        train([pictures], run, config, resume=True)
+    assert not run.exists()
+    train([pictures], run, config)
     before = (run / "model.onnx").read_bytes()
-    with pytest.raises(OutputError, match="holds a training run already") as refusal:
+    with pytest.raises(OutputError, match="holds a training run or a model already") as refusal:
         train([pictures], run, config)
     assert "--resume" in refusal.value.hint
     with pytest.raises(SettingError, match="is of a run with another epochs: 1, now 2"):
@@ -181,6 +186,52 @@ def test_a_run_is_only_gone_on_with_if_that_is_said_and_nothing_changed(tmp_path
     with pytest.raises(InputError, match="cannot be read as a checkpoint"):
         train([pictures], run, config, resume=True)
     assert (run / "model.onnx").read_bytes() == before
+
+
+def test_a_run_stopped_in_its_first_epoch_goes_on_from_the_start(tmp_path: Path) -> None:
+    pictures, config = squares(tmp_path / "pictures", 8), replace(TINY, epochs=1)
+
+    def stop(what: str, _: int, __: int) -> None:
+        if what.startswith("epoch 1"):
+            raise _Stop
+
+    with pytest.raises(_Stop):
+        train([pictures], tmp_path / "run", config, progress=stop)
+    train([pictures], tmp_path / "run", config, resume=True)
+    assert len(metrics(tmp_path / "run")) == 1
+
+
+def half_precision(pictures: LabelledPictures) -> Training:
+    """A training as on a GPU: autocast and a scale of the loss, which PyTorch has for the CPU too."""
+    data = prepare_data([pictures], TINY, one_class=None, seed=0, progress=silent)
+    training = Training(data, TINY, seed=0, threads=0)
+    training.is_mixed, training.scaler = True, torch.amp.GradScaler("cpu", growth_interval=2)
+    return training
+
+
+def test_half_precision_keeps_its_scale_of_the_loss(tmp_path: Path) -> None:
+    pictures = squares(tmp_path / "pictures", 8)
+    first = half_precision(pictures)
+    first.run_epoch(silent)
+    first.save(tmp_path / "checkpoint.pt")
+    scale = first.scaler.get_scale()
+    assert scale > torch.amp.GradScaler("cpu").get_scale()  # Two steps without an overflow double it.
+    second = half_precision(pictures)
+    second.load(tmp_path / "checkpoint.pt")
+    assert second.scaler.get_scale() == scale
+    for training in (first, second):
+        training.run_epoch(silent)
+    assert replace(first.history[1], seconds=0.0) == replace(second.history[1], seconds=0.0)
+    assert np.isfinite(first.history[1].training_loss)
+
+
+def test_a_run_begun_without_half_precision_goes_on_with_it(tmp_path: Path) -> None:
+    pictures = squares(tmp_path / "pictures", 8)
+    train([pictures], tmp_path / "run", replace(TINY, epochs=3))
+    training = half_precision(pictures)
+    training.load(tmp_path / "run" / "checkpoint.pt")
+    training.run_epoch(silent)
+    assert len(training.history) == 4
 
 
 @pytest.fixture(scope="module")

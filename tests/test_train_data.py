@@ -218,6 +218,8 @@ def test_too_few_pictures_or_boxes_are_refused(tmp_path: Path) -> None:
     path = write_picture(tmp_path / "a.png")
     with pytest.raises(InputError, match="test: 1 usable pictures for training, 0 for validation"):
         prepare_data([source(labelled(path, (9, 9, 4, 4)))], TrainConfig(), one_class=None, seed=0, progress=silent)
+    with pytest.raises(InputError, match=r"no usable pictures \(1 entries skipped, .*none.png: no such file"):
+        prepare_data([source(labelled(tmp_path / "none.png"))], TrainConfig(), one_class=None, seed=0, progress=silent)
     with pytest.raises(InputError, match="no picture for training has a box"):
         prepare_data([source(*[labelled(path)] * 9)], TrainConfig(), one_class=None, seed=0, progress=silent)
 

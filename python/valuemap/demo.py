@@ -24,7 +24,7 @@ CITY = replace(PRESETS["small"], frame_spacing_m=4.0, standing_interval_s=8.0, k
 """The city of the preset `small` with fewer images: enough for a map, in less time."""
 
 DETECTION = DetectConfig(min_score=0.7)
-"""Chosen among 0.6 to 0.72 by the maps of seeds 0 and 1, so the figures of these cities flatter it a little."""
+"""Chosen among 0.6 to 0.72 by the maps of seeds 0 and 1 with an earlier model, so these flatter it a little."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.csv as pa_csv
 
 from valuemap.cameras import camera_centers
 from valuemap.config import VoteConfig
@@ -39,6 +38,7 @@ from valuemap.tables import (
     TruthDetections,
     TruthPoints,
     read_arrow,
+    read_csv_arrow,
     table_from_arrow,
 )
 
@@ -395,19 +395,8 @@ def _sorted_objects(
 def _read_csv(path: Path) -> pa.Table:
     numbers = dict.fromkeys(("x", "y", "z", "lon", "lat", "height"), pa.float64())
     types = {**numbers, "class": pa.string(), "object_id": pa.int64()}
-    try:
-        table = pa_csv.read_csv(
-            path,
-            read_options=pa_csv.ReadOptions(use_threads=False),  # Else errors do not say the row.
-            convert_options=pa_csv.ConvertOptions(column_types=types, strings_can_be_null=True),
-        )
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(
-            f"{path}: cannot be read as CSV: {reason}",
-            hint="separate columns by commas, their names in the first line",
-        ) from error
-    return table.rename_columns([name.strip() for name in table.column_names])
+    hint = "separate columns by commas, their names in the first line"
+    return read_csv_arrow(path, types, has_missing=True, hint=hint)
 
 
 def _read_points(path: Path) -> pa.Table:

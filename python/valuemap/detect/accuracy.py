@@ -19,6 +19,7 @@ import numpy as np
 
 from valuemap.detect.boxes import Boxes, overlaps
 from valuemap.detect.labels import LabelledPictures
+from valuemap.errors import SettingError
 from valuemap.tables import Bools, Floats, Ints
 
 IOU_THRESHOLDS = (0.3, 0.5)
@@ -116,7 +117,16 @@ def evaluate_boxes(
 
     Only pictures on both sides count; a picture in which nothing was found is in `found` without boxes. Classes must
     agree if any name occurs on both sides; else they are not compared.
+
+    Raises
+    ------
+    SettingError
+        `min_score` or `min_height_px` is impossible.
     """
+    if not math.isfinite(min_score):
+        raise SettingError(f"--min-score: expected a number, found {min_score}", hint="for example 0.3")
+    if not 0.0 <= min_height_px < math.inf:
+        raise SettingError(f"--min-height: expected 0 px or more, found {min_height_px}", hint="for example 24")
     pictures = [picture for picture in labels.pictures if picture.path in found]
     names = {name for picture in pictures for name in picture.classes}
     found_names = {name for boxes in found.values() for name in boxes.classes}

@@ -14,9 +14,6 @@ from torch.nn import functional
 
 from valuemap.config import TrainConfig
 
-MULTIPLE_PX = 32
-"""Width and height of a picture must be multiples of this: how often the default network halves it."""
-
 
 class DenseLayer(nn.Module):
     """Batch norm, ReLU, 3x3 convolution, dropout: `growth` new channels from all channels so far."""
@@ -66,8 +63,9 @@ class TransitionDown(nn.Module):
 class FCDenseNet(nn.Module):
     """Pictures (batch, 3, height, width), normalised, to logits (batch, classes, height, width).
 
-    Height and width are multiples of `MULTIPLE_PX`. The first convolution halves the picture already where
-    `first_stride` is 2; the logits are then enlarged again, which costs little and keeps small objects.
+    Height and width are multiples of 32: the default network halves them five times. The first convolution halves
+    the picture already where `first_stride` is 2; the logits are then enlarged again, which costs little and keeps
+    small objects.
     """
 
     def __init__(self, classes: int, config: TrainConfig) -> None:

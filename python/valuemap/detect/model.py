@@ -97,8 +97,8 @@ class Model:
         except Exception as error:  # ONNX Runtime's errors have no base of their own.
             width, height = canvases[0].shape[1::-1]
             raise InputError(
-                f"{self.path}: cannot be run on {len(batch)} pictures of {width} x {height} px: {_first_line(error)}",
-                hint="choose what the network takes with --size and --batch",
+                f"{self.path}: cannot be run on a batch of {len(batch)}, {width} x {height} px: {_first_line(error)}",
+                hint="choose what the network takes with --size and --batch; many take multiples of 32 px only",
             ) from error
         return outputs
 
@@ -124,7 +124,7 @@ def load_model(path: Path, config: DetectConfig) -> Model:
         The provider is not installed.
     """
     if not path.is_file():
-        raise InputError(f"{path}: no such file", hint="give an ONNX file")
+        raise InputError(f"{path}: no such file", hint="give an ONNX file, or bundled")
     content = path.read_bytes()
     session = _open(path, content, config.provider)
     inputs, outputs = session.get_inputs(), session.get_outputs()
@@ -178,7 +178,7 @@ def _open(path: Path, content: bytes, provider: str) -> Any:
     if wanted not in onnxruntime.get_available_providers():
         raise _no_provider(provider)
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3  # Errors come as exceptions; warnings are about the export.
+    options.log_severity_level = 4  # Errors come as exceptions; warnings are about the export.
     # Threads that wait for work would otherwise spin, on the cores that decode the next pictures.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:

@@ -67,7 +67,8 @@ def read_picture(path: Path, *, upright: bool = True) -> Picture:
     except UnidentifiedImageError:
         raise UnusablePicture("is no picture") from None
     except Exception as error:  # On damaged files Pillow's decoders raise nearly anything.
-        raise UnusablePicture(f"cannot be decoded: {str(error).splitlines()[0] if str(error) else error!r}") from error
+        reason = str(error).splitlines()[0] if str(error) else repr(error)
+        raise UnusablePicture(f"cannot be decoded: {reason}") from error
     return Picture(pixels, orientation, stored)
 
 

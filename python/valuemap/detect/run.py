@@ -120,6 +120,11 @@ def detect_folder(
     -------
     Path
         The file of annotations.
+
+    Raises
+    ------
+    OutputError
+        `out` holds a `detections.json` that no such run wrote, or cannot be written.
     """
     folder, config = Path(pictures), config or DetectConfig()
     target = Path(out) if out is not None else folder
@@ -128,6 +133,11 @@ def detect_folder(
     paths = list_pictures(folder)
     if not paths:
         raise InputError(f"{folder}: there are no pictures in it", hint="give a dataset or a folder of pictures")
+    if (target / RESULTS).exists() and not any((target / name).exists() for name in (RECORD, _JOURNAL)):
+        raise OutputError(
+            f"{target / RESULTS}: is there without {RECORD}, so it is not ours to replace",
+            hint="choose another --out, or remove the file first",
+        )
     detector = Detector(Path(model), config)
     names = [path.relative_to(folder).as_posix() for path in paths]
     try:
@@ -180,13 +190,16 @@ class _Run:
             raise OutputError(
                 f"{folder}: cannot be written: {error.strerror}", hint="check the folder's permissions, or use --out"
             ) from error
-        self.resumed_after = self.journal.done
+        self.done = self.resumed_after = self.journal.done
 
     def __enter__(self) -> _Run:
         return self
 
     def __exit__(self, _: object, error: object, __: object) -> None:
-        self.journal.close()
+        if self.done:
+            self.journal.close()
+        else:
+            self.journal.remove()  # A model that cannot be run, say: there is nothing to go on from.
         if isinstance(error, OSError):
             raise OutputError(
                 f"{self.folder}: cannot be written: {error.strerror or error}",
@@ -201,19 +214,19 @@ class _Run:
         InputError
             Not one of the pictures can be used.
         """
-        start, done, total = time.perf_counter(), self.resumed_after, len(self.tasks)
-        progress("pictures", done, total)
-        for group in self.detector.run(self.tasks[done:]):
+        start, total = time.perf_counter(), len(self.tasks)
+        progress("pictures", self.done, total)
+        for group in self.detector.run(self.tasks[self.done :]):
             self.journal.write(group)
-            done += len(group)
-            progress("pictures", done, total)
+            self.done += len(group)
+            progress("pictures", self.done, total)
         self.seconds = time.perf_counter() - start
         problems = [outcome.problem for outcome in self.journal.read()]
         if all(problems):
             self.journal.remove()
             raise InputError(
                 f"{self.tasks[0].path}: {problems[0]} (none of {total} pictures can be used)",
-                hint="are these the pictures of the dataset? Say where they are with --images",
+                hint="are these the right pictures? Of a dataset, --images says where they are",
             )
 
     def write_record(self) -> None:

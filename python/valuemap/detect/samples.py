@@ -85,15 +85,17 @@ def prepare_data(
     usable = _without_broken([p for p in pictures if p.split != "test"], skipped, progress)
     training, validation = _part(usable, config, seed)
     where = ", ".join(source.source for source in sources)
+    left_out = f" ({len(skipped)} entries skipped, the first: {skipped[0]})" if skipped else ""
+    if not usable:
+        raise InputError(f"{where}: no usable pictures{left_out}", hint="are the pictures where the labels say?")
     if not training or not validation:
         raise InputError(
-            f"{where}: {len(training)} usable pictures for training, {len(validation)} for validation "
-            f"({len(skipped)} entries skipped{': ' + skipped[0] if skipped else ''})",
+            f"{where}: {len(training)} usable pictures for training, {len(validation)} for validation{left_out}",
             hint="at least one is needed for each: add pictures, or raise validation_share",
         )
     classes = tuple(sorted({name for picture in training for name in picture.classes}))
     if not classes:
-        raise InputError(f"{where}: no picture for training has a box", hint="label some objects")
+        raise InputError(f"{where}: no picture for training has a box{left_out}", hint="label some objects")
     unknown = {name for picture in validation for name in picture.classes} - set(classes)
     if unknown:
         raise InputError(

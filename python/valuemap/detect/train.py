@@ -1,7 +1,7 @@
 """Training a segmentation network on labelled pictures: what goes in, and the folder that comes out.
 
 The folder of a run holds `checkpoint.pt` (the last epoch, to resume from), `metrics.csv` (a row an epoch),
-`curve.png`, `run.json` (settings, counts, what was left out) and, at the end, `model.onnx`. PyTorch is imported
+`curve.png`, `train.json` (settings, counts, what was left out) and, at the end, `model.onnx`. PyTorch is imported
 only when training begins.
 """
 
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from valuemap.config import TrainConfig
 from valuemap.detect.labels import LabelledPictures
 from valuemap.detect.samples import TrainingData, prepare_data
-from valuemap.errors import OutputError, ValuemapError
+from valuemap.errors import InputError, OutputError, ValuemapError
 from valuemap.folders import new_file
 from valuemap.progress import Progress, silent
 
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 CHECKPOINT = "checkpoint.pt"
 MODEL = "model.onnx"
+RECORD = "train.json"
+"""The record of a run. It is not called run.json, as that file makes a folder a map."""
 _CURVES = (("loss", ("training_loss", "validation_loss")), ("share at IoU 0.3", ("recall", "precision")))
 
 
@@ -71,7 +73,8 @@ def train(
     config
         Settings; the defaults where not given.
     resume
-        Go on after the last finished epoch of `run`. The losses are those of a run without interruption.
+        Go on after the last finished epoch of `run`, from the start if it has none. The losses are those of a run
+        without interruption.
     one_class
         Take every label as this class; otherwise every class of the labels has an output of its own.
     seed
@@ -87,11 +90,11 @@ def train(
     ValuemapError
         PyTorch is not installed.
     InputError
-        There are too few usable pictures, or the checkpoint to resume from is damaged.
+        There are too few usable pictures, or no run to resume, or its checkpoint is damaged.
     SettingError
         The run to resume had other settings, pictures or another seed.
     OutputError
-        `run` holds a run already and `resume` is not said, or cannot be written.
+        `run` holds a run or a model already and `resume` is not said, or cannot be written.
     """
     if importlib.util.find_spec("torch") is None or importlib.util.find_spec("onnxscript") is None:
         raise ValuemapError(
@@ -102,8 +105,12 @@ def train(
 
     config = config or TrainConfig()
     checkpoint = run / CHECKPOINT
-    if checkpoint.exists() and not resume:
-        raise OutputError(f"{run}: holds a training run already", hint="go on with --resume, or choose another --out")
+    if not resume and any((run / name).exists() for name in (CHECKPOINT, MODEL)):
+        raise OutputError(
+            f"{run}: holds a training run or a model already", hint="go on with --resume, or choose another --out"
+        )
+    if resume and not checkpoint.exists() and not (run / RECORD).exists():
+        raise InputError(f"{run}: there is no training run to go on with", hint="check --out, or leave --resume away")
     data = prepare_data(labels, config, one_class=one_class, seed=seed, progress=progress)
     training = Training(data, config, seed=seed, threads=threads)
     if resume and checkpoint.exists():
@@ -151,7 +158,7 @@ def _write_record(run: Path, data: TrainingData, config: TrainConfig, seed: int,
         "epochs": len(history),
         "seconds": round(sum(epoch.seconds for epoch in history), 1),
     }
-    with new_file(run / "run.json") as temporary:
+    with new_file(run / RECORD) as temporary:
         temporary.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
 
 

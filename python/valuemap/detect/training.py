@@ -149,7 +149,7 @@ class Training:
             It is of other settings, pictures, or another seed.
         """
         try:
-            state = torch.load(path, map_location=self.device, weights_only=True)
+            state = torch.load(path, map_location="cpu", weights_only=True)
             identity = state["identity"]
         except Exception as error:  # What a damaged file raises depends on where the damage is.
             reason = str(error).splitlines()[0] if str(error) else repr(error)
@@ -167,7 +167,8 @@ class Training:
         self.network.load_state_dict(state["network"])
         self.best_weights = state["best"]
         self.optimiser.load_state_dict(state["optimiser"])
-        self.scaler.load_state_dict(state["scaler"])
+        if state["scaler"]:  # Empty, if the run was begun without half precision.
+            self.scaler.load_state_dict(state["scaler"])
 
     def export(self, path: Path) -> None:
         """Write the network of the best epoch as ONNX."""

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pyarrow as pa
-from pyarrow import csv
 
 from valuemap.errors import InputError
+from valuemap.tables import read_csv_arrow
 
 _NAMES = {pa.int64(): "whole numbers", pa.float64(): "numbers", pa.string(): "texts"}
 
@@ -27,22 +27,15 @@ def read_csv(path: Path, required: Mapping[str, pa.DataType], optional: Mapping[
     if not path.is_file():
         raise InputError(f"{path}: no such file", hint="check the path")
     expected = ", ".join(f"{name} ({_NAMES[kind]})" for name, kind in required.items())
-    try:
-        table = csv.read_csv(
-            path,
-            read_options=csv.ReadOptions(use_threads=False),  # Else errors do not say the row.
-            convert_options=csv.ConvertOptions(column_types={**required, **optional}, null_values=[]),
-        )
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path}: {reason}", hint=f"expected a CSV file with columns {expected}") from error
+    hint = f"expected a CSV file with columns {expected}"
+    table = read_csv_arrow(path, {**required, **optional}, has_missing=False, hint=hint)
     columns = [name for name in (*required, *optional) if name in required or name in table.column_names]
     for name in columns:
         if table.column_names.count(name) != 1:
             found = ", ".join(table.column_names)
             raise InputError(
                 f"{path}: expected one column {name!r} in the first line, found {found}",
-                hint=f"expected a CSV file with columns {expected}",
+                hint=hint,
             )
     if table.num_rows == 0:
         raise InputError(f"{path}: no rows after the first line", hint="check what wrote the file")

@@ -30,7 +30,7 @@ def read_labels(spec: str) -> LabelledPictures:
     name, colon, place = spec.partition(":")
     if not colon or name not in LOADERS or not place:
         raise InputError(
-            f"--data {spec}: expected a format and a place, the format one of {', '.join(sorted(LOADERS))}",
+            f"labels {spec!r}: expected a format and a place, the format one of {', '.join(sorted(LOADERS))}",
             hint="for example bosch:train.yaml, yolo:pictures or coco:annotations.json",
         )
     labels = LOADERS[name](Path(place))

@@ -25,12 +25,14 @@ def read_yolo(folder: Path) -> LabelledPictures:
     Raises
     ------
     InputError
-        The folder is not there, or holds no text files for its pictures, or `data.yaml` cannot be read.
+        The folder is not there, or holds no pictures or no text files for them, or the names cannot be read.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder", hint="give the folder that holds pictures and YOLO text files")
     names = _class_names(folder)
     paths = list_pictures(folder)
+    if not paths:
+        raise InputError(f"{folder}: there are no pictures in it", hint="pictures and text files belong together")
     texts = [_text_of(path, folder) for path in paths]
     if not any(text.is_file() for text in texts):
         raise InputError(
@@ -61,7 +63,10 @@ def _class_names(folder: Path) -> dict[int, str]:
                 f"{config}: expected names of the classes: {reason}", hint="write names: [traffic light] into it"
             ) from error
     if lines.is_file():
-        return dict(enumerate(lines.read_text(encoding="utf-8").split("\n")))
+        try:
+            return dict(enumerate(map(str.strip, lines.read_text(encoding="utf-8").splitlines())))
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{lines}: cannot be read: {error}", hint="write one name a line, as UTF-8") from error
     return {}
 
 
