@@ -15,6 +15,7 @@ import kitti_signs
 import valuemap
 from cities import add_up, city, line, measure, prepare
 from machine import write_record
+from valuemap import robust
 from valuemap.robust import Noise
 
 _GUESS = Noise()
@@ -27,12 +28,14 @@ WITHOUT: dict[str, list[str]] = {
         f"position_sigma_m={math.hypot(_GUESS.position_m, _GUESS.position_drift_m)}",
         f"rotation_sigma_deg={math.degrees(math.hypot(_GUESS.rotation_rad, _GUESS.rotation_drift_rad))}",
     ],
-    "polish": ["without=polish"],
+    "polish": [],
     "existence": ["min_existence=0"],
-    "merge by evidence": ["without=merge"],
-    "shared noise": ["without=shared_noise"],
+    "merge by evidence": [],
+    "shared noise": [],
 }
 """What is left out, and the settings that leave it out."""
+LEFT_OUT = {"polish": "polish", "merge by evidence": "merge", "shared noise": "shared_noise"}
+"""Parts that no setting leaves out, by their names in `valuemap.robust`."""
 KITTI_FIGURES = ("signs_found_2m", "signs_found_1m", "precision", "track_recall")
 
 
@@ -49,6 +52,7 @@ def main() -> None:
     cases = [prepare(city(options.passes), seed) for seed in options.seeds]
     results: list[dict[str, Any]] = []
     for part, config in configs.items():
+        robust.LEFT_OUT = {LEFT_OUT[part]} if part in LEFT_OUT else set()
         figures = add_up([measure(case, config) for case in cases])
         results.append({"without": part, "settings": WITHOUT[part], **figures})
         print(line(f"without {part}", figures), flush=True)

@@ -69,7 +69,7 @@ class Scene:
     ) -> None: ...
 
 _Noise = tuple[float, float, float, float, float, float]
-_Settings = tuple[float, float, float, float, int, float]
+_Settings = tuple[float, float, float, float, int, float, bool, bool]
 
 def calibrate_noise(
     scene: Scene,

@@ -118,7 +118,7 @@ class ExistenceConfig:
     """Which labels are kept."""
 
     min_existence: float = _setting(
-        0.6, unit="1", high=1.0, effect="labels that exist with a smaller probability are dropped (robust)"
+        0.55, unit="1", high=1.0, effect="labels that exist with a smaller probability are dropped (robust)"
     )
 
 

@@ -211,6 +211,14 @@ def rows_of(ids: Ints, keys: Ints) -> Ints:
     return np.searchsorted(keys, ids).astype(np.int64)
 
 
+def number_passes(images: Images) -> Ints:
+    """Return the number (N) of each image's pass, in the order of their first images: the names do not matter."""
+    _, first, inverse = np.unique(images.pass_id.codes, return_index=True, return_inverse=True)
+    number = np.empty(len(first), dtype=np.int64)
+    number[np.argsort(first)] = np.arange(len(first))
+    return number[inverse]
+
+
 def _read_head(folder: Path) -> dict[str, Any]:
     path = folder / MARKER
     if not path.is_file():

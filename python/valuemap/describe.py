@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 import valuemap._core as _core
 from valuemap.cameras import Rays
 from valuemap.config import NoiseConfig
-from valuemap.dataset import Dataset
+from valuemap.dataset import Dataset, number_passes
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.tables import Candidates, Floats, Ints, Labels, Votes
 
@@ -45,7 +44,7 @@ def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config
         )
     position = candidates.position_in_world_m
     anchor = dataset.frame.anchor
-    label_of_pass, pass_of_voter = _passes_of_labels(label, images.pass_id.codes[image_row])
+    label_of_pass, pass_of_voter = _passes_of_labels(label, number_passes(images)[image_row])
     toward_camera = (rays.center_in_world_m[voters] - position[label]) @ dataset.frame.east_north().T
     facing = _mean_in_groups(_mean_in_groups(_unit_vectors(toward_camera), pass_of_voter), label_of_pass)
     labels = Labels(
@@ -87,7 +86,7 @@ def _reduce(operation: np.ufunc, values: Floats, starts: Ints) -> Floats:
     return np.asarray(operation.reduceat(values, starts)) if len(starts) else np.empty(0)
 
 
-def _passes_of_labels(label: Ints, pass_code: NDArray[np.int32]) -> tuple[Ints, Ints]:
+def _passes_of_labels(label: Ints, pass_code: Ints) -> tuple[Ints, Ints]:
     """Return the label of every pass that voted for one (N, by label), and which of these each voter is of."""
     codes = int(pass_code.max(initial=0)) + 1
     pairs, pass_of_voter = np.unique(label * codes + pass_code, return_inverse=True)

@@ -12,9 +12,12 @@ import numpy as np
 import valuemap._core as _core
 from valuemap.cameras import Rays, camera_centers, picture_bounds, rotation_matrices
 from valuemap.config import MapConfig, NoiseConfig
-from valuemap.dataset import Dataset, rows_of
+from valuemap.dataset import Dataset, number_passes, rows_of
 from valuemap.progress import Progress, silent
 from valuemap.tables import Candidates, Floats
+
+LEFT_OUT: set[str] = set()
+"""Parts of the method to leave out: polish, merge, shared_noise. For the ablation benchmark; not a setting."""
 
 VIEWPOINT_STEP_M = 1.0
 """Images of a pass closer than this to where a viewpoint began are one look, e.g. those before a red light."""
@@ -67,7 +70,7 @@ class Scene:
             center_in_world_m=np.ascontiguousarray(camera_centers(images)),
             cam_from_world=rotation_matrices(images),
             camera=rows_of(images.camera_id, self._dataset.cameras.camera_id).astype(np.uint32),
-            pass_code=images.pass_id.codes.astype(np.uint32),
+            pass_code=number_passes(images).astype(np.uint32),
             position_sigma_m=_or_nan(images.position_sigma_m, len(images)),
             rotation_sigma_rad=_or_nan(images.rotation_sigma_rad, len(images)),
             frustum_normals=normals,
@@ -89,7 +92,8 @@ def calibrate_noise(scene: Scene, config: MapConfig, *, threads: int = 0, progre
         threads,
         lambda done, total: progress("estimating the noise", done, total),
     )
-    return Noise(*estimated)
+    noise = Noise(*estimated)
+    return _all_own(noise) if "shared_noise" in LEFT_OUT else noise
 
 
 def find_labels(
@@ -105,6 +109,17 @@ def find_labels(
     )
     covariance = covariance.reshape(-1, 3, 3)
     return Candidates(position, offsets, voters, None, covariance, existence, expected), counts
+
+
+def _all_own(noise: Noise) -> Noise:
+    """Return noise of the same size of which images share nothing."""
+    return replace(
+        noise,
+        position_m=math.hypot(noise.position_m, noise.position_drift_m),
+        rotation_rad=math.hypot(noise.rotation_rad, noise.rotation_drift_rad),
+        position_drift_m=0.0,
+        rotation_drift_rad=0.0,
+    )
 
 
 def _guess(config: NoiseConfig) -> tuple[Noise, list[bool]]:
@@ -123,7 +138,7 @@ def _guess(config: NoiseConfig) -> tuple[Noise, list[bool]]:
     return noise, [value is not None for value in known]
 
 
-def _settings(config: MapConfig) -> tuple[float, float, float, float, int, float]:
+def _settings(config: MapConfig) -> tuple[float, float, float, float, int, float, bool, bool]:
     vote = config.vote
     return (
         math.radians(vote.min_parallax_deg),
@@ -132,6 +147,8 @@ def _settings(config: MapConfig) -> tuple[float, float, float, float, int, float
         config.noise.gate_sigmas,
         vote.min_votes,
         config.existence.min_existence,
+        "polish" in LEFT_OUT,
+        "merge" in LEFT_OUT,
     )
 
 

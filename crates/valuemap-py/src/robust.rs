@@ -8,7 +8,7 @@ use valuemap_core::hypothesis::Viability;
 use valuemap_core::robust::calibrate::Known;
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::scene::{Frustum, Scene as CoreScene, View, number_viewpoints};
-use valuemap_core::robust::{Findings, Settings, find, self_calibrate};
+use valuemap_core::robust::{Findings, Settings, Without, find, self_calibrate};
 
 use crate::Rays;
 use crate::arrays::{Groups, matrix, rows_of};
@@ -91,14 +91,14 @@ fn noise_of(
     Noise { detection_px, box_share, position_m, rotation_rad, position_drift_m, rotation_drift_rad }
 }
 
-/// Least parallax (rad), least and largest range (m), gate (sigmas), least votes, least existence.
-type SettingValues = (f64, f64, f64, f64, u32, f64);
+/// Least parallax (rad), least and largest range (m), gate (sigmas), least votes, least existence; without polish, merge.
+type SettingValues = (f64, f64, f64, f64, u32, f64, bool, bool);
 
 fn settings_of(
-    (min_parallax_rad, min_range_m, max_range_m, gate_sigmas, min_votes, min_existence): SettingValues,
+    (min_parallax_rad, min_range_m, max_range_m, gate_sigmas, min_votes, min_existence, polish, merge): SettingValues,
 ) -> Settings {
     let viability = Viability { max_reprojection_error_px: f64::NAN, min_parallax_rad, min_range_m, max_range_m };
-    Settings { viability, gate_sigmas, min_votes, min_existence }
+    Settings { viability, gate_sigmas, min_votes, min_existence, without: Without { polish, merge } }
 }
 
 /// Estimate the noise from the data, `valuemap_core::robust::self_calibrate`.

@@ -18,6 +18,7 @@ use super::label::Label;
 use super::noise::Noise;
 use super::poses::{Belief, PoseError, legs, smooth};
 use super::scene::{Scene, View};
+use crate::progress::{Halt, Progress};
 
 /// Times that the assignment of an image is made anew, with the pose error from the last one.
 const ROUNDS: usize = 3;
@@ -70,8 +71,17 @@ struct Case<'a> {
 }
 
 /// Give detections to labels, at most one an image and label.
-#[must_use]
-pub fn associate(scene: &Scene, noise: &Noise, index: &RayIndex<'_>, labels: &[Label], range_m: f64) -> Vec<Verdict> {
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn associate(
+    scene: &Scene,
+    noise: &Noise,
+    index: &RayIndex<'_>,
+    labels: &[Label],
+    range_m: f64,
+    progress: &Progress,
+) -> Result<Vec<Verdict>, Halt> {
     let of_labels: Vec<Vec<Claim>> = labels
         .par_iter()
         .enumerate()
@@ -81,8 +91,9 @@ pub fn associate(scene: &Scene, noise: &Noise, index: &RayIndex<'_>, labels: &[L
     claims.par_sort_unstable_by_key(|claim| (claim.pass, claim.image, claim.label, claim.ray));
     let view = |claim: &Claim| &scene.views[claim.image as usize];
     let passes: Vec<&[Claim]> = claims.chunk_by(|a, b| is_one_visit(view(a), view(b))).collect();
-    let decided: Vec<Vec<Decision>> =
-        passes.par_iter().map(|pass| decide(scene, noise, labels, index.gate_sigmas().powi(2), pass)).collect();
+    let limit = index.gate_sigmas().powi(2);
+    let decide_pass = |pass: &&[Claim]| decide(scene, noise, labels, limit, pass, progress);
+    let decided: Vec<Vec<Decision>> = passes.par_iter().map(decide_pass).collect::<Result<_, Halt>>()?;
     let mut verdicts = vec![Verdict::default(); labels.len()];
     for decision in decided.into_iter().flatten() {
         match decision {
@@ -93,7 +104,7 @@ pub fn associate(scene: &Scene, noise: &Noise, index: &RayIndex<'_>, labels: &[L
     for verdict in &mut verdicts {
         verdict.undecided.sort_unstable();
     }
-    verdicts
+    Ok(verdicts)
 }
 
 fn claims_of(scene: &Scene, index: &RayIndex<'_>, number: u32, label: &Label, range_m: f64) -> Vec<Claim> {
@@ -134,7 +145,14 @@ enum Decision {
 }
 
 /// Decide the claims of one pass, ordered by image.
-fn decide(scene: &Scene, noise: &Noise, labels: &[Label], limit: f64, claims: &[Claim]) -> Vec<Decision> {
+fn decide(
+    scene: &Scene,
+    noise: &Noise,
+    labels: &[Label],
+    limit: f64,
+    claims: &[Claim],
+    progress: &Progress,
+) -> Result<Vec<Decision>, Halt> {
     let [first, last] = [&claims[0], &claims[claims.len() - 1]].map(|claim| &scene.views[claim.image as usize]);
     let mut elsewhere: FxHashMap<u32, Estimate> = FxHashMap::default();
     for claim in claims {
@@ -158,16 +176,17 @@ fn decide(scene: &Scene, noise: &Noise, labels: &[Label], limit: f64, claims: &[
         let view = &scene.views[cases[0].claim.image as usize];
         // Its own votes are what is in question.
         let pose = smoothed[leg].without(vote).pose_error(noise.shared(view), noise.of_image(view));
-        grant(cases, limit, &pose)
+        progress.check()?;
+        Ok(grant(cases, limit, &pose))
     };
-    let mut fits: Vec<Vec<Fit>> = images.iter().zip(&votes).zip(&leg_of).map(judge).collect();
+    let mut fits: Vec<Vec<Fit>> = images.iter().zip(&votes).zip(&leg_of).map(judge).collect::<Result<_, Halt>>()?;
     let overruled = overruled(scene, noise, &elsewhere, &images, &fits, limit);
     let mut decisions = Vec::new();
     for (cases, fits) in images.iter().zip(&mut fits) {
         overrule(cases, fits, &overruled, limit);
         report(cases, fits, labels, limit, &mut decisions);
     }
-    decisions
+    Ok(decisions)
 }
 
 /// Where the other passes put a label: votes of this pass that went to the wrong one of two labels must not confirm
@@ -267,22 +286,25 @@ fn overruled(
 ) -> FxHashSet<(u32, u32)> {
     let mut rivalries: FxHashMap<(u32, u32), Rivalry> = FxHashMap::default();
     for (cases, fits) in images.iter().zip(fits) {
-        let open: Vec<usize> = (0..cases.len()).filter(|&i| fits[i].cost < limit).collect();
-        let is_shown = |label: u32| open.iter().any(|&i| fits[i].granted && cases[i].claim.label == label);
-        for (k, &i) in open.iter().enumerate() {
-            for &j in &open[k + 1..] {
-                let (a, b) = (cases[i].claim, cases[j].claim);
-                let pair = (a.label, b.label);
-                match (is_shown(a.label), is_shown(b.label)) {
-                    (true, true) if fits[i].granted && fits[j].granted => {
-                        rivalries.entry(pair).or_default().both += 1;
-                    }
-                    (true, false) | (false, true) if a.ray == b.ray => {
-                        let rivalry = rivalries.entry(pair).or_default();
+        let granted: Vec<u32> =
+            cases.iter().zip(fits).filter(|(_, fit)| fit.granted).map(|(case, _)| case.claim.label).collect();
+        let shown: FxHashSet<u32> = granted.iter().copied().collect();
+        for (k, &a) in granted.iter().enumerate() {
+            for &b in &granted[k + 1..] {
+                rivalries.entry((a, b)).or_default().both += 1;
+            }
+        }
+        let mut open: Vec<&Claim> =
+            cases.iter().zip(fits).filter(|(_, fit)| fit.cost < limit).map(|(case, _)| case.claim).collect();
+        open.sort_unstable_by_key(|claim| (claim.ray, claim.label));
+        for of_ray in open.chunk_by(|a, b| a.ray == b.ray) {
+            for (k, a) in of_ray.iter().enumerate() {
+                for b in &of_ray[k + 1..] {
+                    if shown.contains(&a.label) != shown.contains(&b.label) {
+                        let rivalry = rivalries.entry((a.label, b.label)).or_default();
                         rivalry.one += 1;
                         rivalry.rays.push(a.ray);
                     }
-                    _ => {}
                 }
             }
         }

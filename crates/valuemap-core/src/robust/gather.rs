@@ -59,7 +59,7 @@ pub fn gather(
                 }
                 let class = scene.rays.class[nomination.rays[0] as usize];
                 let keep = |ray: u32| !claimed[ray as usize];
-                polish(noise, &index, nomination.point, class, range_m, min_votes, &keep)
+                polish(noise, &index, nomination.point, class, range_m, settings, &keep)
             };
             let polished: Vec<Option<Label>> =
                 batch.par_iter().map(|nomination| polish_one(nomination, &claimed)).collect();
@@ -97,16 +97,18 @@ fn polish(
     start: Vector3<f64>,
     class: u32,
     range_m: f64,
-    min_votes: usize,
+    settings: &Settings,
     keep: &dyn Fn(u32) -> bool,
 ) -> Option<Label> {
     let scene = index.scene();
+    let min_votes = settings.min_votes as usize;
+    let rounds = if settings.without.polish { 0 } else { MAX_ROUNDS };
     let voters_at = |point: &Vector3<f64>| -> Vec<u32> {
         index.hits(point, class, range_m, keep).iter().map(|hit| hit.ray).collect()
     };
     let mut gathered = voters_at(&start);
     let mut point = start;
-    for _ in 0..MAX_ROUNDS {
+    for _ in 0..rounds {
         if gathered.len() < min_votes {
             return None;
         }

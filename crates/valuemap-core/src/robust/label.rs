@@ -36,6 +36,8 @@ pub struct Label {
     pub undecided: Vec<u32>,
     /// Directions, with 15 degrees around, from which images look at it in vain: what they have in its gate are other things.
     pub unseen_from: Vec<Vector3<f64>>,
+    /// Whether the estimate is as exact as it gets.
+    pub is_exact: bool,
 }
 
 /// Estimate from voters in any order, without those that disagree with the others of their pass.
@@ -71,7 +73,15 @@ pub fn from_voters(
     }
     let side =
         voters.iter().map(|&ray| direction_to(scene, ray, &found.point)).sum::<Vector3<f64>>() / voters.len() as f64;
-    Some(Label { estimate: found, side, class, voters, undecided: Vec::new(), unseen_from: Vec::new() })
+    Some(Label {
+        estimate: found,
+        side,
+        class,
+        voters,
+        undecided: Vec::new(),
+        unseen_from: Vec::new(),
+        is_exact: tolerance_m <= EXACT_M,
+    })
 }
 
 /// Unit direction from a point to the camera of a ray.

@@ -53,6 +53,17 @@ pub struct Settings {
     pub min_votes: u32,
     /// Labels that exist with a smaller probability are dropped.
     pub min_existence: f64,
+    /// Parts that are left out, to see what they are worth.
+    pub without: Without,
+}
+
+/// Parts of the method that can be left out.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Without {
+    /// Nominations get the voters of the point where they were made.
+    pub polish: bool,
+    /// Labels of one object stay several.
+    pub merge: bool,
 }
 
 /// Rays of the places that the noise is estimated from, about.
@@ -137,7 +148,7 @@ pub fn self_calibrate(
             let court = Court::new(scene, &noise, &spreads, &settings, rays.iter().copied());
             for _ in 0..SETTLING_ROUNDS {
                 progress.check()?;
-                labels = court.settle(labels, true, &mut Tally::default());
+                labels = court.settle(labels, true, &mut Tally::default(), progress)?;
             }
         }
         noise = calibrate::calibrate(scene, &noise, &labels, known);
@@ -171,7 +182,7 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
         labels.sort_by_key(settle::first_voter);
         for _ in 0..SETTLING_ROUNDS {
             progress.check()?;
-            labels = court.settle(labels, true, &mut tally);
+            labels = court.settle(labels, true, &mut tally, progress)?;
         }
         labels = court.doubt(&lookout, labels, &mut tally, progress)?;
         if labels.iter().map(settle::first_voter).eq(before) {
@@ -210,20 +221,26 @@ impl<'a> Court<'a> {
 
     /// One round: neighbors exchange votes, all labels compete for all rays, those that are two are split and those that are
     /// one are fused.
-    fn settle(&self, labels: Vec<Label>, may_split: bool, tally: &mut Tally) -> Vec<Label> {
+    fn settle(
+        &self,
+        labels: Vec<Label>,
+        may_split: bool,
+        tally: &mut Tally,
+        progress: &Progress,
+    ) -> Result<Vec<Label>, Halt> {
         let &Self { scene, noise, settings, ref index, .. } = self;
         let gate = settings.gate_sigmas;
         let min_votes = settings.min_votes as usize;
         let range_m = settings.viability.max_range_m * VOTE_RANGE;
         let before = labels.len();
         let labels = exchange::exchange(scene, noise, gate, labels);
-        let labels = settle::reassign(scene, noise, index, &labels, range_m, min_votes);
+        let labels = settle::reassign(scene, noise, index, &labels, range_m, min_votes, progress)?;
         let left = labels.len();
         let labels = if may_split { settle::split(scene, noise, gate, labels, min_votes) } else { labels };
-        let labels = settle::fuse(scene, noise, gate, labels);
+        let labels = if settings.without.merge { labels } else { settle::fuse(scene, noise, gate, labels) };
         tally.outvoted += (before - left) as u64;
         tally.fused += left.saturating_sub(labels.len()) as u64;
-        labels
+        Ok(labels)
     }
 
     /// Take votes away from labels that look as if they were not to be seen from there.
@@ -271,7 +288,7 @@ impl<'a> Court<'a> {
                 if labels.len() == before {
                     break;
                 }
-                labels = self.settle(labels, false, tally);
+                labels = self.settle(labels, false, tally, progress)?;
             }
         }
         Ok(labels)

@@ -11,6 +11,7 @@ use super::index::RayIndex;
 use super::label::{EXACT_M, Label, direction_to, from_voters};
 use super::noise::Noise;
 use super::scene::Scene;
+use crate::progress::{Halt, Progress};
 
 /// Squared Mahalanobis distance up to which two positions agree: the 99.7 % quantile of chi² with 3 degrees of freedom.
 const AGREEMENT_CHI2: f64 = 14.0;
@@ -26,7 +27,9 @@ const SHARED_IMAGES: f64 = 0.15;
 /// Give every detection to the label that it fits best, one detection an image and label, and estimate again.
 ///
 /// Labels that keep fewer than `min_votes` are dropped.
-#[must_use]
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
 pub fn reassign(
     scene: &Scene,
     noise: &Noise,
@@ -34,18 +37,24 @@ pub fn reassign(
     labels: &[Label],
     range_m: f64,
     min_votes: usize,
-) -> Vec<Label> {
-    let verdicts = associate(scene, noise, index, labels, range_m);
-    labels
+    progress: &Progress,
+) -> Result<Vec<Label>, Halt> {
+    let verdicts = associate(scene, noise, index, labels, range_m, progress)?;
+    let kept = labels
         .par_iter()
         .zip(verdicts)
         .filter(|(_, verdict)| verdict.voters.len() >= min_votes)
-        .filter_map(|(label, Verdict { voters, undecided })| {
+        .filter_map(|(label, Verdict { mut voters, undecided })| {
+            voters.sort_unstable_by_key(|&ray| (scene.view(ray).pass, ray));
+            if label.is_exact && voters == label.voters {
+                return Some(Label { undecided, ..label.clone() });
+            }
             let found = from_voters(scene, noise, index.gate_sigmas(), voters, label.estimate.point, EXACT_M)?;
             Some(Label { undecided, unseen_from: label.unseen_from.clone(), ..found })
         })
         .filter(|label| label.voters.len() >= min_votes)
-        .collect()
+        .collect();
+    Ok(kept)
 }
 
 /// Make one of any two labels of a class whose positions agree within their covariances, unless their images say that
