@@ -21,9 +21,9 @@ def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config
     the inverse of the normal equations of Eq. (1) of the paper at the label. That deviation is the setting
     `detection_sigma_px`, else that of the residuals. Width and height are the medians over voters of box size times
     depth over focal length. The largest parallax is exact up to 64 voters; beyond, it is that among the 64 directions
-    that are farthest from their mean. A label faces the mean horizontal direction to its voters' cameras, in which every
-    pass weighs the same, so that a car that waits before it does not decide; the length of that mean of unit vectors is
-    the concentration.
+    that are farthest from their mean. A label faces the mean horizontal direction to its voters' cameras, in which
+    every pass weighs the same, so that a car that waits before it does not decide; the length of that mean of unit
+    vectors is the concentration.
     """
     images, detections = dataset.images, dataset.detections
     voters = candidates.voters.astype(np.int64)

@@ -85,8 +85,11 @@ pub fn associate(
     let of_labels: Vec<Vec<Claim>> = labels
         .par_iter()
         .enumerate()
-        .map(|(number, label)| claims_of(scene, index, number as u32, label, range_m))
-        .collect();
+        .map(|(number, label)| {
+            progress.check()?;
+            Ok(claims_of(scene, index, number as u32, label, range_m))
+        })
+        .collect::<Result<_, Halt>>()?;
     let mut claims: Vec<Claim> = of_labels.into_iter().flatten().collect();
     claims.par_sort_unstable_by_key(|claim| (claim.pass, claim.image, claim.label, claim.ray));
     let view = |claim: &Claim| &scene.views[claim.image as usize];
@@ -180,7 +183,7 @@ fn decide(
         Ok(grant(cases, limit, &pose))
     };
     let mut fits: Vec<Vec<Fit>> = images.iter().zip(&votes).zip(&leg_of).map(judge).collect::<Result<_, Halt>>()?;
-    let overruled = overruled(scene, noise, &elsewhere, &images, &fits, limit);
+    let overruled = overruled(scene, noise, &elsewhere, &images, &fits, limit, progress)?;
     let mut decisions = Vec::new();
     for (cases, fits) in images.iter().zip(&mut fits) {
         overrule(cases, fits, &overruled, limit);
@@ -283,9 +286,11 @@ fn overruled(
     images: &[&[Case<'_>]],
     fits: &[Vec<Fit>],
     limit: f64,
-) -> FxHashSet<(u32, u32)> {
+    progress: &Progress,
+) -> Result<FxHashSet<(u32, u32)>, Halt> {
     let mut rivalries: FxHashMap<(u32, u32), Rivalry> = FxHashMap::default();
     for (cases, fits) in images.iter().zip(fits) {
+        progress.check()?;
         let granted: Vec<u32> =
             cases.iter().zip(fits).filter(|(_, fit)| fit.granted).map(|(case, _)| case.claim.label).collect();
         let shown: FxHashSet<u32> = granted.iter().copied().collect();
@@ -315,7 +320,7 @@ fn overruled(
         let [of_a, of_b] = [a, b].map(|label| surprise(scene, noise, &rivalry.rays, &elsewhere[&label]));
         if of_a <= of_b { (a, b) } else { (b, a) }
     };
-    rivalries.into_iter().filter(|(_, r)| is_one(r)).map(of_pair).collect()
+    Ok(rivalries.into_iter().filter(|(_, r)| is_one(r)).map(of_pair).collect())
 }
 
 /// Minus twice the logarithm of the likelihood that rays of one pass show a label of which an estimate is known, up to what

@@ -34,6 +34,7 @@ pub struct PassTerms {
 }
 
 /// One voter's residual at a point, with its derivatives.
+#[derive(Debug, Clone)]
 pub struct Look {
     /// Residual, px.
     pub residual: [f64; 2],

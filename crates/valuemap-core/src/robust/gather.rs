@@ -37,7 +37,6 @@ pub fn gather(
 ) -> Result<(Vec<Label>, [u64; 2]), Halt> {
     let spreads = spreads_of(scene, noise);
     let range_m = settings.viability.max_range_m * VOTE_RANGE;
-    let min_votes = settings.min_votes as usize;
     let mut labels: Vec<Label> = Vec::new();
     let mut claimed = vec![false; scene.rays.rays.len()];
     let mut counts = [0_u64; 2];

@@ -45,6 +45,7 @@ pub fn reassign(
         .zip(verdicts)
         .filter(|(_, verdict)| verdict.voters.len() >= min_votes)
         .filter_map(|(label, Verdict { mut voters, undecided })| {
+            progress.check().ok()?;
             voters.sort_unstable_by_key(|&ray| (scene.view(ray).pass, ray));
             if label.is_exact && voters == label.voters {
                 return Some(Label { undecided, ..label.clone() });
@@ -54,6 +55,7 @@ pub fn reassign(
         })
         .filter(|label| label.voters.len() >= min_votes)
         .collect();
+    progress.check()?;
     Ok(kept)
 }
 
