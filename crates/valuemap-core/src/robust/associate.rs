@@ -251,7 +251,7 @@ fn grant(cases: &[Case<'_>], limit: f64, pose: &PoseError) -> Vec<Fit> {
     let mut costs: Vec<f64> = cases.iter().map(|case| case.cost(pose)).collect();
     let mut granted = assign(cases, &costs, limit);
     for _ in 1..ROUNDS {
-        for (i, case) in cases.iter().enumerate().filter(|(i, case)| is_contested(cases, *i, case)) {
+        for (i, case) in cases.iter().enumerate().filter(|(i, _)| (0..cases.len()).any(|j| shares(cases, *i, j))) {
             let others = granted.iter().map(|&j| &cases[j]);
             let independent = others.filter(|o| o.claim.label != case.claim.label && o.claim.ray != case.claim.ray);
             let known = independent.fold(*pose, |pose, other| pose.after(&other.look, &other.own));
@@ -375,17 +375,11 @@ fn report(cases: &[Case<'_>], fits: &[Fit], labels: &[Label], limit: f64, decisi
     }
 }
 
-/// Whether another claim of the image is for the same label or the same detection.
-fn is_contested(cases: &[Case<'_>], i: usize, case: &Case<'_>) -> bool {
-    let mut others = cases.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, other)| other.claim);
-    others.any(|other| other.label == case.claim.label || other.ray == case.claim.ray)
-}
-
 /// The claims to grant, ascending: the assignment with the least sum of costs, where a detection without a label costs as
 /// much as one at the gate.
 fn assign(cases: &[Case<'_>], costs: &[f64], limit: f64) -> Vec<usize> {
     let open: Vec<usize> = (0..cases.len()).filter(|&i| costs[i] < limit).collect();
-    if open.iter().all(|&i| !open.iter().any(|&j| j != i && shares(cases, i, j))) {
+    if !open.iter().any(|&i| open.iter().any(|&j| shares(cases, i, j))) {
         return open;
     }
     let mut rays: Vec<u32> = open.iter().map(|&i| cases[i].claim.ray).collect();
@@ -416,6 +410,7 @@ fn assign(cases: &[Case<'_>], costs: &[f64], limit: f64) -> Vec<usize> {
     open.into_iter().filter(is_granted).collect()
 }
 
+/// Whether two claims are for the same label or the same detection.
 fn shares(cases: &[Case<'_>], i: usize, j: usize) -> bool {
-    cases[i].claim.label == cases[j].claim.label || cases[i].claim.ray == cases[j].claim.ray
+    i != j && (cases[i].claim.label == cases[j].claim.label || cases[i].claim.ray == cases[j].claim.ray)
 }

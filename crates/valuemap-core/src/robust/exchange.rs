@@ -7,11 +7,9 @@
 
 use nalgebra::{Matrix2x3, Matrix3, Vector2, Vector3};
 use rayon::prelude::*;
-use rstar::RTree;
-use rstar::primitives::GeomWithData;
 use rustc_hash::FxHashMap;
 
-use super::label::{EXACT_M, Label, from_voters};
+use super::label::{EXACT_M, Label, by_place, from_voters};
 use super::noise::Noise;
 use super::scene::Scene;
 use super::settle::first_voter;
@@ -49,8 +47,7 @@ pub fn exchange(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Labe
 
 /// Disjoint pairs of neighbours of one class, the nearest first.
 fn nearest_pairs(labels: &[Label]) -> Vec<(usize, usize)> {
-    let places = labels.iter().enumerate().map(|(i, l)| GeomWithData::new(l.estimate.point.into(), i)).collect();
-    let tree: RTree<GeomWithData<[f64; 3], usize>> = RTree::bulk_load(places);
+    let tree = by_place(labels);
     let mut near: Vec<(f64, usize, usize)> = Vec::new();
     for (a, label) in labels.iter().enumerate() {
         for other in tree.locate_within_distance(label.estimate.point.into(), PAIR_M * PAIR_M) {

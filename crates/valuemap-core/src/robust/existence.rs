@@ -90,8 +90,7 @@ impl<'a> Lookout<'a> {
         voters.sort_unstable();
         let (middles, farthest) = middles_of(scene, &point, &voters);
         let range = farthest.iter().copied().fold(0.0, f64::max);
-        let mut voted: Vec<u32> = voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
-        voted.sort_unstable();
+        let voted = label.images(scene);
         let mut looks: Vec<Vec<(u32, u32, bool)>> = vec![Vec::new(); middles.len()];
         let mut expected = vec![0; middles.len()];
         for near in self.tree.locate_within_distance(point.into(), range * range * (1.0 + 1e-9)) {

@@ -1,6 +1,8 @@
 //! A label in the making: a point, the rays that support it, and the side it is seen from.
 
 use nalgebra::Vector3;
+use rstar::RTree;
+use rstar::primitives::GeomWithData;
 
 use super::estimate::{Estimate, estimate, own_chi2};
 use super::noise::Noise;
@@ -53,7 +55,7 @@ pub fn from_voters(
     start: Vector3<f64>,
     tolerance_m: f64,
 ) -> Option<Label> {
-    voters.sort_unstable_by_key(|&ray| (scene.view(ray).pass, ray));
+    scene.sort_by_pass(&mut voters);
     let class = scene.rays.class[*voters.first()? as usize];
     let mut found = estimate(scene, noise, &voters, start, tolerance_m)?;
     for _ in 0..MAX_TRIMS {
@@ -90,7 +92,21 @@ pub fn direction_to(scene: &Scene, ray: u32, point: &Vector3<f64>) -> Vector3<f6
     (scene.ray(ray).center - point).normalize()
 }
 
+/// Labels by place.
+#[must_use]
+pub fn by_place(labels: &[Label]) -> RTree<GeomWithData<[f64; 3], usize>> {
+    RTree::bulk_load(labels.iter().enumerate().map(|(i, l)| GeomWithData::new(l.estimate.point.into(), i)).collect())
+}
+
 impl Label {
+    /// The images of its voters, ascending.
+    #[must_use]
+    pub fn images(&self, scene: &Scene) -> Vec<u32> {
+        let mut images: Vec<u32> = self.voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
+        images.sort_unstable();
+        images
+    }
+
     /// Whether a ray's camera is on the side that the label is seen from.
     #[must_use]
     pub fn faces(&self, scene: &Scene, ray: u32) -> bool {

@@ -5,10 +5,11 @@
 //! 3. [`gather`](mod@gather): the best supported nomination is polished to a [`label`], on its voters and from its estimate,
 //!    until the voters stay the same ([`quick`]); its voters leave; and so on. Rays left over get further rounds among
 //!    themselves.
-//! 4. [`settle`]: all labels compete for all detections; labels that agree within their covariances and are never
-//!    seen side by side become one.
+//! 4. [`settle`]: all labels compete for all detections ([`associate`](mod@associate)), the pose errors of the images taken out
+//!    ([`poses`]), neighbors first untangled ([`exchange`](mod@exchange)); labels that agree within their covariances and
+//!    are never seen side by side become one.
 //! 5. [`existence`]: hits and misses among the looks that should have seen it say how probable a label is.
-//! 6. [`estimate`](mod@estimate): position and covariance, with pose errors that a pass shares.
+//! 6. [`estimate`](mod@estimate): position and covariance, with pose errors that a pass shares ([`drift`]).
 //! 7. [`calibrate`](mod@calibrate): the noise itself is estimated from the labels' residuals.
 
 pub mod associate;
@@ -190,7 +191,7 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
         }
     }
     let Judgement { of_labels, rates, strays_per_image } =
-        judge(scene, &spreads, &lookout, &labels, settings, tally.doubted);
+        judge(scene, &spreads, &sectors_of(&lookout, &labels), &labels, settings, tally.doubted);
     let variance_factor = calibrate::variance_factor(scene, noise, &labels.iter().collect::<Vec<_>>());
     let findings = labels.into_iter().zip(of_labels).map(|(mut label, (existence, expected))| {
         label.estimate.covariance *= variance_factor;
@@ -243,15 +244,20 @@ impl<'a> Court<'a> {
         Ok(labels)
     }
 
-    /// Take votes away from labels that look as if they were not to be seen from there.
-    fn look_around(&self, lookout: &Lookout<'_>, labels: Vec<Label>, tally: &mut Tally) -> Vec<Label> {
+    /// Take votes away from labels that look as if they were not to be seen from there. Also the sectors of those left.
+    fn look_around(
+        &self,
+        lookout: &Lookout<'_>,
+        labels: Vec<Label>,
+        tally: &mut Tally,
+    ) -> (Vec<Label>, Vec<Vec<Sector>>) {
         let before = labels.len();
-        let sectors: Vec<Vec<Sector>> = labels.par_iter().map(|label| lookout.sectors(label)).collect();
+        let sectors = sectors_of(lookout, &labels);
         let of_label = |(label, sectors): (Label, Vec<Sector>)| {
             let stray: Vec<Vector3<f64>> =
                 sectors.iter().filter(|sector| sector.is_stray()).map(|sector| sector.direction).collect();
             if stray.is_empty() {
-                return Some(label);
+                return Some((label, sectors));
             }
             let unseen_from = [label.unseen_from.as_slice(), &stray].concat();
             let label = Label { unseen_from: unseen_from.clone(), ..label };
@@ -259,11 +265,14 @@ impl<'a> Court<'a> {
             let start = label.estimate.point;
             let found = label::from_voters(self.scene, self.noise, self.settings.gate_sigmas, seen, start, EXACT_M)?;
             let enough = found.voters.len() >= self.settings.min_votes as usize;
-            enough.then_some(Label { undecided: label.undecided, unseen_from, ..found })
+            let left = enough.then_some(Label { undecided: label.undecided, unseen_from, ..found })?;
+            let sectors = lookout.sectors(&left);
+            Some((left, sectors))
         };
-        let labels: Vec<Label> = labels.into_par_iter().zip(sectors).filter_map(of_label).collect();
+        let (labels, sectors): (Vec<Label>, Vec<_>) =
+            labels.into_par_iter().zip(sectors).filter_map(of_label).collect::<Vec<_>>().into_iter().unzip();
         tally.doubted += (before - labels.len()) as u64;
-        labels
+        (labels, sectors)
     }
 
     /// Drop the labels that probably do not exist, the least probable first: what they give back may be just what a doubtful
@@ -278,8 +287,9 @@ impl<'a> Court<'a> {
         for doubt in DOUBTS.map(|doubt| doubt * self.settings.min_existence) {
             for _ in 0..MAX_DOUBT_ROUNDS {
                 progress.check()?;
-                labels = self.look_around(lookout, labels, tally);
-                let judgement = judge(self.scene, self.spreads, lookout, &labels, self.settings, tally.doubted);
+                let (left, sectors) = self.look_around(lookout, labels, tally);
+                labels = left;
+                let judgement = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.doubted);
                 let before = labels.len();
                 let existing =
                     labels.into_iter().zip(judgement.of_labels).filter(|(_, (existence, _))| *existence >= doubt);
@@ -303,22 +313,20 @@ struct Judgement {
     strays_per_image: f64,
 }
 
+fn sectors_of(lookout: &Lookout<'_>, labels: &[Label]) -> Vec<Vec<Sector>> {
+    labels.par_iter().map(|label| lookout.sectors(label)).collect()
+}
+
 fn judge(
     scene: &Scene,
     spreads: &[Spread],
-    lookout: &Lookout<'_>,
+    sectors: &[Vec<Sector>],
     labels: &[Label],
     settings: &Settings,
     doubted: u64,
 ) -> Judgement {
-    let seen: Vec<(Vec<Looks>, u32)> = labels
-        .par_iter()
-        .map(|label| {
-            let sectors = lookout.sectors(label);
-            (existence::looks_of(sectors.iter()), sectors.iter().map(|sector| sector.expected).sum())
-        })
-        .collect();
-    let (looks, expected): (Vec<Vec<Looks>>, Vec<u32>) = seen.into_iter().unzip();
+    let looks: Vec<Vec<Looks>> = sectors.par_iter().map(|sectors| existence::looks_of(sectors.iter())).collect();
+    let expected = sectors.iter().map(|sectors| sectors.iter().map(|sector| sector.expected).sum());
     let rates = Rates::learn(&looks);
     let claimed: usize = labels.iter().map(|label| label.voters.len()).sum();
     let strays_per_image = (scene.rays.rays.len() - claimed) as f64 / scene.views.len() as f64;

@@ -62,6 +62,11 @@ impl Scene {
         &self.views[self.rays.image[ray as usize] as usize]
     }
 
+    /// Order rays by pass, then by number.
+    pub fn sort_by_pass(&self, rays: &mut [u32]) {
+        rays.sort_unstable_by_key(|&ray| (self.view(ray).pass, ray));
+    }
+
     /// A ray.
     #[inline]
     #[must_use]

@@ -2,13 +2,11 @@
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
-use rstar::RTree;
-use rstar::primitives::GeomWithData;
 
 use super::associate::{Verdict, associate};
 use super::calibrate::variance_factor;
 use super::index::RayIndex;
-use super::label::{EXACT_M, Label, direction_to, from_voters};
+use super::label::{EXACT_M, Label, by_place, direction_to, from_voters};
 use super::noise::Noise;
 use super::scene::Scene;
 use crate::progress::{Halt, Progress};
@@ -46,7 +44,7 @@ pub fn reassign(
         .filter(|(_, verdict)| verdict.voters.len() >= min_votes)
         .filter_map(|(label, Verdict { mut voters, undecided })| {
             progress.check().ok()?;
-            voters.sort_unstable_by_key(|&ray| (scene.view(ray).pass, ray));
+            scene.sort_by_pass(&mut voters);
             if label.is_exact && voters == label.voters {
                 return Some(Label { undecided, ..label.clone() });
             }
@@ -146,8 +144,7 @@ pub fn first_voter(label: &Label) -> u32 {
 }
 
 fn agreeing_pairs(scene: &Scene, labels: &[Label], most: f64) -> Vec<(f64, usize, usize)> {
-    let places = labels.iter().enumerate().map(|(i, l)| GeomWithData::new(l.estimate.point.into(), i)).collect();
-    let tree: RTree<GeomWithData<[f64; 3], usize>> = RTree::bulk_load(places);
+    let tree = by_place(labels);
     labels
         .par_iter()
         .enumerate()
@@ -174,12 +171,7 @@ fn distance2(a: &Label, b: &Label) -> Option<f64> {
 
 /// Whether images show both labels as detections of their own, more often than clutter would.
 fn told_apart(scene: &Scene, a: &Label, b: &Label) -> bool {
-    let images = |label: &Label| {
-        let mut images: Vec<u32> = label.voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
-        images.sort_unstable();
-        images
-    };
-    let (of_a, of_b) = (images(a), images(b));
+    let (of_a, of_b) = (a.images(scene), b.images(scene));
     let shared = of_a.iter().filter(|image| of_b.binary_search(image).is_ok()).count();
     shared as f64 > 1.0 + SHARED_IMAGES * of_a.len().min(of_b.len()) as f64
 }
@@ -187,8 +179,7 @@ fn told_apart(scene: &Scene, a: &Label, b: &Label) -> bool {
 /// Of images that both have, the larger label's detection stays.
 fn union(scene: &Scene, noise: &Noise, gate_sigmas: f64, a: &Label, b: &Label) -> Label {
     let (large, small) = if b.voters.len() > a.voters.len() { (b, a) } else { (a, b) };
-    let mut images: Vec<u32> = large.voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
-    images.sort_unstable();
+    let images = large.images(scene);
     let mut voters = large.voters.clone();
     let new = |ray: &&u32| images.binary_search(&scene.rays.image[**ray as usize]).is_err();
     voters.extend(small.voters.iter().filter(new));
