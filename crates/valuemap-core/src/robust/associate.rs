@@ -6,18 +6,20 @@
 //! go together, the assignment with the least sum of costs wins (joint compatibility; the costs are those of maximum
 //! likelihood).
 
+use std::sync::{Arc, OnceLock};
+
 use nalgebra::{Matrix2, SMatrix, Vector3};
 use pathfinding::prelude::{Matrix, kuhn_munkres_min};
 use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
-use super::drift::Look;
-use super::estimate::{Estimate, by_pass, is_one_visit, pass_terms};
+use super::drift::{Drive, Look};
+use super::estimate::Estimate;
 use super::index::{Hit, RayIndex};
 use super::label::Label;
 use super::noise::Noise;
-use super::poses::{Belief, PoseError, legs, smooth};
-use super::scene::{Scene, View};
+use super::poses::{Belief, Legs, PoseError, smooth};
+use super::scene::Scene;
 use crate::progress::{Halt, Progress};
 
 /// Times that the assignment of an image is made anew, with the pose error from the last one.
@@ -27,33 +29,22 @@ const COST_UNIT: f64 = 1e-6;
 /// Squared residuals beyond this many squared sigmas count less in the drift, in proportion to their root.
 const HUBER_CHI2: f64 = 4.0;
 
-/// How much of what the votes of a pass say about a label is left out when their pass is judged.
-const OTHERS_SHARE: f64 = 0.95;
-/// Farther than this the linear step to where the other passes put a label is not trusted, m.
-const LONGEST_STEP_M: f64 = 3.0;
-
 /// Images of a pass that show one of two labels, which may be either, before it is concluded that there is but one.
 const LEAST_RIVALRY: u32 = 8;
 /// For each of them, images that show both, at most: what clutter and double detections do.
 const MOST_BOTH: f64 = 0.1;
+/// Legs before and after those in question that say something about their drift.
+const LEGS_AROUND: usize = 20;
 /// Detections are looked for as far from a label as this many of its standard deviations, in steps of one.
 const REACH_SIGMAS: i32 = 4;
 /// Where a label's place is known this well, its uncertainty widens no gate, m.
 const CERTAIN_M: f64 = 0.1;
 
-/// What an association says of one label.
-#[derive(Debug, Clone, Default)]
-pub struct Verdict {
-    /// Its rays.
-    pub voters: Vec<u32>,
-    /// Images that say nothing for or against it, see [`Label::undecided`].
-    pub undecided: Vec<u32>,
-}
-
 /// A detection that a label may have.
-struct Claim {
-    pass: u32,
+#[derive(Debug, Clone, Copy)]
+pub struct Claim {
     image: u32,
+    /// The label's number.
     label: u32,
     ray: u32,
     /// Squared residual over its variance, pose error and all.
@@ -70,64 +61,176 @@ struct Case<'a> {
     detection_px2: f64,
 }
 
-/// Give detections to labels, at most one an image and label.
+/// Gives detections to labels, at most one an image and label.
 ///
-/// # Errors
-/// [`Halt::Cancelled`] when `progress` says so.
-pub fn associate(
-    scene: &Scene,
-    noise: &Noise,
-    index: &RayIndex<'_>,
-    labels: &[Label],
+/// It remembers what it decided last, and decides only those legs anew that a label claims which changed.
+pub struct Association<'a> {
+    scene: &'a Scene,
+    noise: &'a Noise,
+    index: RayIndex<'a>,
+    /// Detections farther from a label are not its own, m.
     range_m: f64,
-    progress: &Progress,
-) -> Result<Vec<Verdict>, Halt> {
-    let of_labels: Vec<Vec<Claim>> = labels
-        .par_iter()
-        .enumerate()
-        .map(|(number, label)| {
-            progress.check()?;
-            Ok(claims_of(scene, index, number as u32, label, range_m))
-        })
-        .collect::<Result<_, Halt>>()?;
-    let mut claims: Vec<Claim> = of_labels.into_iter().flatten().collect();
-    claims.par_sort_unstable_by_key(|claim| (claim.pass, claim.image, claim.label, claim.ray));
-    let view = |claim: &Claim| &scene.views[claim.image as usize];
-    let passes: Vec<&[Claim]> = claims.chunk_by(|a, b| is_one_visit(view(a), view(b))).collect();
-    let limit = index.gate_sigmas().powi(2);
-    let decide_pass = |pass: &&[Claim]| decide(scene, noise, labels, limit, pass, progress);
-    let decided: Vec<Vec<Decision>> = passes.par_iter().map(decide_pass).collect::<Result<_, Halt>>()?;
-    let mut verdicts = vec![Verdict::default(); labels.len()];
-    for decision in decided.into_iter().flatten() {
-        match decision {
-            Decision::Vote { label, ray } => verdicts[label as usize].voters.push(ray),
-            Decision::Undecided { label, image } => verdicts[label as usize].undecided.push(image),
-        }
-    }
-    for verdict in &mut verdicts {
-        verdict.undecided.sort_unstable();
-    }
-    Ok(verdicts)
+    legs: Legs,
+    /// What the votes of each leg say of its drift.
+    of_legs: Vec<Belief>,
+    /// The claims of the labels, by what these were.
+    last: FxHashMap<u64, Arc<[Claim]>>,
+    overruled: FxHashSet<Overruled>,
 }
 
-fn claims_of(scene: &Scene, index: &RayIndex<'_>, number: u32, label: &Label, range_m: f64) -> Vec<Claim> {
+/// Of two labels, as they were, the first overrules the second in a pass.
+type Overruled = (u64, u64, u32);
+
+/// What was decided on some legs.
+struct Decided {
+    decisions: Vec<Decision>,
+    /// The legs from this one on, and what their votes say.
+    of_legs: (usize, Vec<Belief>),
+    overruled: Vec<Overruled>,
+}
+
+impl<'a> Association<'a> {
+    /// Begin, with nothing decided.
+    #[must_use]
+    pub fn new(scene: &'a Scene, noise: &'a Noise, index: RayIndex<'a>, range_m: f64) -> Self {
+        let legs = Legs::new(&scene.views);
+        let of_legs = vec![Belief::nothing(); legs.pass.len()];
+        let (last, overruled) = (FxHashMap::default(), FxHashSet::default());
+        Self { scene, noise, index, range_m, legs, of_legs, last, overruled }
+    }
+
+    /// Give detections to labels: those that they had where nothing changed, else those that fit best.
+    ///
+    /// # Errors
+    /// [`Halt::Cancelled`] when `progress` says so.
+    pub fn associate(&mut self, labels: Vec<Label>, progress: &Progress) -> Result<Vec<Label>, Halt> {
+        let claims_of = |label: &Label| {
+            progress.check()?;
+            let known =
+                label.known.claims.get_or_init(|| claims_of(self.scene, &self.index, label, self.range_m).into());
+            Ok((label.identity(), Arc::clone(known)))
+        };
+        let claims: Vec<(u64, Arc<[Claim]>)> = labels.par_iter().map(claims_of).collect::<Result<_, Halt>>()?;
+        let is_open = self.open_legs(&claims);
+        let leg_of = |image: u32| self.legs.of_view[image as usize] as usize;
+        let is_open_image = |image: u32| is_open[leg_of(image)];
+        let of_label = |(number, (_, claims)): (usize, &(u64, Arc<[Claim]>))| {
+            let open = claims.iter().filter(|claim| is_open_image(claim.image));
+            open.map(|claim| Claim { label: number as u32, ..*claim }).collect::<Vec<_>>()
+        };
+        let mut open: Vec<Claim> = claims.par_iter().enumerate().flat_map_iter(of_label).collect();
+        open.par_sort_unstable_by_key(|claim| (leg_of(claim.image), claim.image, claim.label, claim.ray));
+        let is_one_run = |a: &Claim, b: &Claim| {
+            let [a, b] = [a, b].map(|claim| leg_of(claim.image));
+            self.legs.pass[a] == self.legs.pass[b] && b - a <= LEGS_AROUND
+        };
+        let identities: Vec<u64> = claims.iter().map(|(identity, _)| *identity).collect();
+        let runs: Vec<&[Claim]> = open.chunk_by(is_one_run).collect();
+        let decided: Vec<Decided> =
+            runs.par_iter().map(|run| self.decide(&labels, &identities, run, progress)).collect::<Result<_, Halt>>()?;
+        let mut voters: Vec<Vec<u32>> = Vec::with_capacity(labels.len());
+        let mut undecided: Vec<Vec<u32>> = Vec::with_capacity(labels.len());
+        for label in &labels {
+            let stays = |ray: &&u32| !is_open_image(self.scene.rays.image[**ray as usize]);
+            voters.push(label.voters.iter().filter(stays).copied().collect());
+            undecided.push(label.undecided.iter().filter(|image| !is_open_image(**image)).copied().collect());
+        }
+        let current: FxHashSet<u64> = identities.iter().copied().collect();
+        self.overruled.retain(|(a, b, _)| current.contains(a) && current.contains(b));
+        for Decided { decisions, of_legs: (first, beliefs), overruled } in decided {
+            self.of_legs[first..first + beliefs.len()].copy_from_slice(&beliefs);
+            self.overruled.extend(overruled);
+            for decision in decisions {
+                match decision {
+                    Decision::Vote { label, ray } => voters[label as usize].push(ray),
+                    Decision::Undecided { label, image } => undecided[label as usize].push(image),
+                }
+            }
+        }
+        self.last = claims.into_iter().collect();
+        let given = labels.into_iter().zip(voters).zip(undecided);
+        Ok(given.map(|((label, voters), undecided)| given_to(self.scene, label, voters, undecided)).collect())
+    }
+
+    /// Legs that a label claims which was not there before, or is there no longer.
+    fn open_legs(&self, claims: &[(u64, Arc<[Claim]>)]) -> Vec<bool> {
+        let mut is_open = vec![false; self.legs.pass.len()];
+        let current: FxHashSet<u64> = claims.iter().map(|(identity, _)| *identity).collect();
+        let new = claims.iter().filter(|(identity, _)| !self.last.contains_key(identity)).map(|(_, claims)| claims);
+        let gone = self.last.iter().filter(|(identity, _)| !current.contains(*identity)).map(|(_, claims)| claims);
+        for claim in new.chain(gone).flat_map(|claims| claims.iter()) {
+            is_open[self.legs.of_view[claim.image as usize] as usize] = true;
+        }
+        is_open
+    }
+
+    /// Decide the claims of some legs of one pass, ordered by leg and image.
+    fn decide(
+        &self,
+        labels: &[Label],
+        identities: &[u64],
+        claims: &[Claim],
+        progress: &Progress,
+    ) -> Result<Decided, Halt> {
+        let (scene, noise, limit) = (self.scene, self.noise, self.index.gate_sigmas().powi(2));
+        let cases: Vec<Case<'_>> =
+            claims.iter().filter_map(|claim| Case::of(scene, noise, &labels[claim.label as usize], claim)).collect();
+        let run = Run::new(self, labels, identities, &cases);
+        let smoothed = smooth(&run.starts_m, &run.of_legs);
+        let judge = |(i, cases): (usize, &&[Case<'_>])| {
+            let view = &scene.views[cases[0].claim.image as usize];
+            // Its own votes are what is in question.
+            let belief = smoothed[run.leg_of[i]].without(&run.votes[i]);
+            progress.check()?;
+            Ok(grant(cases, limit, &belief.pose_error(noise.shared(view), noise.of_image(view))))
+        };
+        let mut fits: Vec<Vec<Fit>> = run.images.iter().enumerate().map(judge).collect::<Result<_, Halt>>()?;
+        let overruled = run.overruled(&fits, progress)?;
+        let mut decisions = Vec::new();
+        for (cases, fits) in run.images.iter().zip(&mut fits) {
+            overrule(cases, fits, &overruled, limit);
+            report(cases, fits, labels, limit, &mut decisions);
+        }
+        let (first, end) = run.own_legs;
+        let of_legs = run.of_legs[first - run.first_leg..end - run.first_leg].to_vec();
+        let named = |(a, b): (u32, u32)| (identities[a as usize], identities[b as usize], run.pass);
+        let overruled = overruled.into_iter().map(named).collect();
+        Ok(Decided { decisions, of_legs: (first, of_legs), overruled })
+    }
+}
+
+/// A label with the votes that it was given, in any order, and the images that are undecided.
+fn given_to(scene: &Scene, label: Label, mut voters: Vec<u32>, mut undecided: Vec<u32>) -> Label {
+    scene.sort_by_pass(&mut voters);
+    undecided.sort_unstable();
+    let mut label = label;
+    if undecided != label.undecided {
+        label.undecided = undecided;
+        label.known.sectors = OnceLock::new();
+    }
+    let fitting = || voters.iter().copied().filter(|ray| !label.refused.contains(ray));
+    if !fitting().eq(label.voters.iter().copied()) {
+        label.refused.clear();
+        label.voters = voters;
+    }
+    label
+}
+
+fn claims_of(scene: &Scene, index: &RayIndex<'_>, label: &Label, range_m: f64) -> Vec<Claim> {
     let mut voters = label.voters.clone();
     voters.sort_unstable();
     let mut hits: Vec<Hit> =
         places_of(&label.estimate).iter().flat_map(|place| index.all_hits(place, label.class, range_m)).collect();
     hits.sort_by(|a, b| a.ray.cmp(&b.ray).then(a.chi2.total_cmp(&b.chi2)));
     hits.dedup_by_key(|hit| hit.ray);
-    hits.into_iter()
-        .filter(|hit| label.faces(scene, hit.ray))
-        .map(|hit| Claim {
-            pass: scene.views[hit.image as usize].pass,
-            image: hit.image,
-            label: number,
-            ray: hit.ray,
-            chi2: hit.chi2,
-            is_vote: voters.binary_search(&hit.ray).is_ok(),
-        })
-        .collect()
+    let of_hit = |hit: Hit| Claim {
+        image: hit.image,
+        label: u32::MAX,
+        ray: hit.ray,
+        chi2: hit.chi2,
+        is_vote: voters.binary_search(&hit.ray).is_ok(),
+    };
+    hits.into_iter().filter(|hit| label.faces(scene, hit.ray)).map(of_hit).collect()
 }
 
 /// Where a label may be: along the direction that it is least known in.
@@ -147,72 +250,29 @@ enum Decision {
     Undecided { label: u32, image: u32 },
 }
 
-/// Decide the claims of one pass, ordered by image.
-fn decide(
-    scene: &Scene,
-    noise: &Noise,
-    labels: &[Label],
-    limit: f64,
-    claims: &[Claim],
-    progress: &Progress,
-) -> Result<Vec<Decision>, Halt> {
-    let [first, last] = [&claims[0], &claims[claims.len() - 1]].map(|claim| &scene.views[claim.image as usize]);
-    let mut elsewhere: FxHashMap<u32, Estimate> = FxHashMap::default();
-    for claim in claims {
-        let label = &labels[claim.label as usize];
-        elsewhere.entry(claim.label).or_insert_with(|| estimate_elsewhere(scene, noise, label, first, last));
-    }
-    let cases: Vec<Case<'_>> =
-        claims.iter().filter_map(|claim| Case::of(scene, noise, &elsewhere[&claim.label], claim)).collect();
-    let images: Vec<&[Case<'_>]> = cases.chunk_by(|a, b| a.claim.image == b.claim.image).collect();
-    let driven_m: Vec<f64> = images.iter().map(|cases| cases[0].look.driven_m).collect();
-    let leg_of = legs(&driven_m);
-    let starts: Vec<_> =
-        (0..images.len()).filter(|&i| i == 0 || leg_of[i] != leg_of[i - 1]).map(|i| driven_m[i]).collect();
-    let votes: Vec<Belief> = images.iter().map(|cases| belief_of_votes(cases)).collect();
-    let mut of_legs = vec![Belief::nothing(); starts.len()];
-    for (vote, &leg) in votes.iter().zip(&leg_of) {
-        of_legs[leg] = of_legs[leg].and(vote);
-    }
-    let smoothed = smooth(&starts, &of_legs);
-    let judge = |((cases, vote), &leg): ((&&[Case<'_>], &Belief), &usize)| {
-        let view = &scene.views[cases[0].claim.image as usize];
-        // Its own votes are what is in question.
-        let pose = smoothed[leg].without(vote).pose_error(noise.shared(view), noise.of_image(view));
-        progress.check()?;
-        Ok(grant(cases, limit, &pose))
-    };
-    let mut fits: Vec<Vec<Fit>> = images.iter().zip(&votes).zip(&leg_of).map(judge).collect::<Result<_, Halt>>()?;
-    let overruled = overruled(scene, noise, &elsewhere, &images, &fits, limit, progress)?;
-    let mut decisions = Vec::new();
-    for (cases, fits) in images.iter().zip(&mut fits) {
-        overrule(cases, fits, &overruled, limit);
-        report(cases, fits, labels, limit, &mut decisions);
-    }
-    Ok(decisions)
-}
-
-/// Where the other passes put a label: votes of this pass that went to the wrong one of two labels must not confirm
-/// themselves. They keep a small weight, for where the other passes tell little.
-fn estimate_elsewhere(scene: &Scene, noise: &Noise, label: &Label, first: &View, last: &View) -> Estimate {
-    let is_here =
-        |view: &View| view.pass == first.pass && view.driven_m >= first.driven_m && view.driven_m <= last.driven_m;
-    let voters = by_pass(scene, &label.voters).find(|voters| voters.iter().any(|&ray| is_here(scene.view(ray))));
-    let rest = label.voters.len() - voters.map_or(0, <[u32]>::len);
-    let of_pass =
-        voters.filter(|_| rest >= 2).and_then(|voters| pass_terms(scene, noise, voters, &label.estimate.point));
-    let moved = of_pass.and_then(|terms| {
-        let all = label.estimate.covariance.try_inverse()?;
-        let covariance = (all - terms.information * OTHERS_SHARE).cholesky()?.inverse();
-        let step = covariance * terms.gradient * OTHERS_SHARE;
-        (step.norm() < LONGEST_STEP_M).then_some(Estimate { point: label.estimate.point + step, covariance })
-    });
-    moved.unwrap_or(label.estimate)
+/// What is claimed on some legs of one pass: the cases, image by image, and what the votes say about the drift.
+struct Run<'a> {
+    of: &'a Association<'a>,
+    labels: &'a [Label],
+    identities: &'a [u64],
+    pass: u32,
+    images: Vec<&'a [Case<'a>]>,
+    /// What the votes of each image say.
+    votes: Vec<Belief>,
+    /// The leg of each image, counted from the first leg around.
+    leg_of: Vec<usize>,
+    first_leg: usize,
+    /// The first and the end of the legs with images, counted from the first of all.
+    own_legs: (usize, usize),
+    /// Where the legs around begin, m driven, and what their votes say.
+    starts_m: Vec<f64>,
+    of_legs: Vec<Belief>,
 }
 
 impl<'a> Case<'a> {
-    fn of(scene: &Scene, noise: &Noise, estimate: &Estimate, claim: &'a Claim) -> Option<Self> {
-        let look = Look::of(scene, noise, claim.ray, &estimate.point)?;
+    fn of(scene: &Scene, noise: &Noise, label: &Label, claim: &'a Claim) -> Option<Self> {
+        let estimate = label.elsewhere(scene.view(claim.ray));
+        let look = Look::of(scene, noise, claim.ray, claim.label as usize, &estimate.point)?;
         let by_point = SMatrix::<f64, 2, 3>::from_rows(&[look.by_point[0].transpose(), look.by_point[1].transpose()]);
         let of_label = by_point * estimate.covariance * by_point.transpose();
         let detection_px2 = noise.detection_px2(scene, claim.ray);
@@ -230,8 +290,8 @@ impl<'a> Case<'a> {
 }
 
 /// What the votes of one image say about the drift of its pass.
-fn belief_of_votes(cases: &[Case<'_>]) -> Belief {
-    cases.iter().filter(|case| case.claim.is_vote).fold(Belief::nothing(), |sum, case| {
+fn belief_of_votes<'c>(cases: impl Iterator<Item = &'c Case<'c>>) -> Belief {
+    cases.filter(|case| case.claim.is_vote).fold(Belief::nothing(), |sum, case| {
         let of_label_px2 = 0.5 * case.own.trace() - case.detection_px2;
         let robust = (HUBER_CHI2 / case.claim.chi2).sqrt().min(1.0);
         sum.and(&Belief::of_vote(&case.look, (case.look.variance + of_label_px2) / robust))
@@ -273,67 +333,121 @@ struct Rivalry {
     both: u32,
     /// Images that show one of them, which may be either.
     one: u32,
-    /// What they show.
-    rays: Vec<u32>,
+    /// These images, as numbered in the pass, and what they show.
+    rays: Vec<(usize, u32)>,
 }
 
-/// Pairs of labels (the better one, the other) of which a pass shows only one, where it might be either: there is one
-/// object, and the other label is not to be seen from there.
-fn overruled(
-    scene: &Scene,
-    noise: &Noise,
-    elsewhere: &FxHashMap<u32, Estimate>,
-    images: &[&[Case<'_>]],
-    fits: &[Vec<Fit>],
-    limit: f64,
-    progress: &Progress,
-) -> Result<FxHashSet<(u32, u32)>, Halt> {
-    let mut rivalries: FxHashMap<(u32, u32), Rivalry> = FxHashMap::default();
-    for (cases, fits) in images.iter().zip(fits) {
-        progress.check()?;
-        let granted: Vec<u32> =
-            cases.iter().zip(fits).filter(|(_, fit)| fit.granted).map(|(case, _)| case.claim.label).collect();
-        let shown: FxHashSet<u32> = granted.iter().copied().collect();
-        for (k, &a) in granted.iter().enumerate() {
-            for &b in &granted[k + 1..] {
-                rivalries.entry((a, b)).or_default().both += 1;
-            }
+impl<'a> Run<'a> {
+    fn new(of: &'a Association<'a>, labels: &'a [Label], identities: &'a [u64], cases: &'a [Case<'a>]) -> Self {
+        let legs = &of.legs;
+        let images: Vec<&[Case<'_>]> = cases.chunk_by(|a, b| a.claim.image == b.claim.image).collect();
+        let leg_of = |cases: &&[Case<'_>]| legs.of_view[cases[0].claim.image as usize] as usize;
+        let own_legs = (images.first().map_or(0, leg_of), images.last().map_or(0, |image| leg_of(image) + 1));
+        let pass = legs.pass[own_legs.0];
+        let is_of_pass = |leg: &usize| legs.pass[*leg] == pass;
+        let before = (0..own_legs.0).rev().take(LEGS_AROUND).take_while(is_of_pass).count();
+        let after = (own_legs.1..legs.pass.len()).take(LEGS_AROUND).take_while(is_of_pass).count();
+        let around = own_legs.0 - before..own_legs.1 + after;
+        let leg_of: Vec<usize> = images.iter().map(|image| leg_of(image) - around.start).collect();
+        let votes: Vec<Belief> = images.iter().map(|cases| belief_of_votes(cases.iter())).collect();
+        let mut of_legs = of.of_legs[around.clone()].to_vec();
+        for &leg in &leg_of {
+            of_legs[leg] = Belief::nothing();
         }
-        let mut open: Vec<&Claim> =
-            cases.iter().zip(fits).filter(|(_, fit)| fit.cost < limit).map(|(case, _)| case.claim).collect();
-        open.sort_unstable_by_key(|claim| (claim.ray, claim.label));
-        for of_ray in open.chunk_by(|a, b| a.ray == b.ray) {
-            for (k, a) in of_ray.iter().enumerate() {
-                for b in &of_ray[k + 1..] {
-                    if shown.contains(&a.label) != shown.contains(&b.label) {
-                        let rivalry = rivalries.entry((a.label, b.label)).or_default();
-                        rivalry.one += 1;
-                        rivalry.rays.push(a.ray);
+        for (vote, &leg) in votes.iter().zip(&leg_of) {
+            of_legs[leg] = of_legs[leg].and(vote);
+        }
+        let starts_m = legs.start_m[around.clone()].to_vec();
+        let first_leg = around.start;
+        Self { of, labels, identities, pass, images, votes, leg_of, first_leg, own_legs, starts_m, of_legs }
+    }
+
+    /// Pairs of labels (the better one, the other) of which a pass shows only one, where it might be either: there is one
+    /// object, and the other label is not to be seen from there.
+    fn overruled(&self, fits: &[Vec<Fit>], progress: &Progress) -> Result<FxHashSet<(u32, u32)>, Halt> {
+        let limit = self.of.index.gate_sigmas().powi(2);
+        let mut rivalries: FxHashMap<(u32, u32), Rivalry> = FxHashMap::default();
+        for (i, (cases, fits)) in self.images.iter().zip(fits).enumerate() {
+            progress.check()?;
+            let granted: Vec<u32> =
+                cases.iter().zip(fits).filter(|(_, fit)| fit.granted).map(|(case, _)| case.claim.label).collect();
+            let shown: FxHashSet<u32> = granted.iter().copied().collect();
+            for (k, &a) in granted.iter().enumerate() {
+                for &b in &granted[k + 1..] {
+                    rivalries.entry((a, b)).or_default().both += 1;
+                }
+            }
+            let mut open: Vec<&Claim> =
+                cases.iter().zip(fits).filter(|(_, fit)| fit.cost < limit).map(|(case, _)| case.claim).collect();
+            open.sort_unstable_by_key(|claim| (claim.ray, claim.label));
+            for of_ray in open.chunk_by(|a, b| a.ray == b.ray) {
+                for (k, a) in of_ray.iter().enumerate() {
+                    for b in &of_ray[k + 1..] {
+                        if shown.contains(&a.label) != shown.contains(&b.label) {
+                            let rivalry = rivalries.entry((a.label, b.label)).or_default();
+                            rivalry.one += 1;
+                            rivalry.rays.push((i, a.ray));
+                        }
                     }
                 }
             }
         }
+        let is_one = |r: &Rivalry| r.one >= LEAST_RIVALRY && f64::from(r.both) < MOST_BOTH * f64::from(r.one);
+        // What does not change is not seen whole here.
+        let identity = |label: u32| self.identities[label as usize];
+        let was = |a: u32, b: u32| self.of.overruled.contains(&(identity(a), identity(b), self.pass));
+        let is_old = |label: u32| self.of.last.contains_key(&identity(label));
+        let of_pair = |((a, b), rivalry): ((u32, u32), Rivalry)| {
+            let poses = self.drift_without(&[a, b], &rivalry.rays);
+            let [of_a, of_b] = [a, b].map(|label| self.surprise(label, &rivalry.rays, &poses));
+            if of_a <= of_b { (a, b) } else { (b, a) }
+        };
+        let decide = |((a, b), rivalry): ((u32, u32), Rivalry)| {
+            if is_old(a) && is_old(b) {
+                return [(a, b), (b, a)].into_iter().find(|&(a, b)| was(a, b));
+            }
+            is_one(&rivalry).then(|| of_pair(((a, b), rivalry)))
+        };
+        Ok(rivalries.into_iter().filter_map(decide).collect())
     }
-    let is_one = |r: &Rivalry| r.one >= LEAST_RIVALRY && f64::from(r.both) < MOST_BOTH * f64::from(r.one);
-    let of_pair = |((a, b), mut rivalry): ((u32, u32), Rivalry)| {
-        rivalry.rays.sort_unstable();
-        let [of_a, of_b] = [a, b].map(|label| surprise(scene, noise, &rivalry.rays, &elsewhere[&label]));
-        if of_a <= of_b { (a, b) } else { (b, a) }
-    };
-    Ok(rivalries.into_iter().filter(|(_, r)| is_one(r)).map(of_pair).collect())
-}
 
-/// Minus twice the logarithm of the likelihood that rays of one pass show a label of which an estimate is known, up to what
-/// is the same for all labels: together they may move the estimate once.
-fn surprise(scene: &Scene, noise: &Noise, rays: &[u32], estimate: &Estimate) -> f64 {
-    let joint = || {
-        let terms = pass_terms(scene, noise, rays, &estimate.point)?;
-        let known = estimate.covariance.try_inverse()?;
-        let after = (terms.information + known).cholesky()?;
-        let widening = (after.determinant() * estimate.covariance.determinant()).ln();
-        Some(terms.square - terms.gradient.dot(&after.solve(&terms.gradient)) + widening)
-    };
-    joint().unwrap_or(f64::INFINITY)
+    /// The drift in the images of some rays, as far as the votes for all but some labels tell.
+    fn drift_without(&self, labels: &[u32], rays: &[(usize, u32)]) -> Vec<PoseError> {
+        let legs = rays.iter().map(|(i, _)| self.leg_of[*i]);
+        let first = legs.clone().min().unwrap_or(0).saturating_sub(LEGS_AROUND);
+        let end = (legs.max().unwrap_or(0) + LEGS_AROUND + 1).min(self.starts_m.len());
+        let mut of_legs = self.of_legs[first..end].to_vec();
+        let from = self.leg_of.partition_point(|&leg| leg < first);
+        let to = self.leg_of.partition_point(|&leg| leg < end);
+        for (cases, leg) in self.images[from..to].iter().zip(&self.leg_of[from..to]) {
+            let theirs = cases.iter().filter(|case| labels.contains(&case.claim.label));
+            of_legs[leg - first] = of_legs[leg - first].without(&belief_of_votes(theirs));
+        }
+        let smoothed = smooth(&self.starts_m[first..end], &of_legs);
+        let of_ray = |&(i, ray): &(usize, u32)| {
+            smoothed[self.leg_of[i] - first].pose_error(self.of.noise.shared(self.of.scene.view(ray)), (0.0, 0.0))
+        };
+        rays.iter().map(of_ray).collect()
+    }
+
+    /// Minus twice the logarithm of the likelihood that rays, the drift in whose images is about known, show a label, up to
+    /// what is the same for all labels: together they may move the drift and the label once.
+    fn surprise(&self, label: u32, rays: &[(usize, u32)], drift: &[PoseError]) -> f64 {
+        let estimate = self.labels[label as usize].elsewhere(self.of.scene.view(rays[0].1));
+        let look = |(&(_, ray), drift): (&(usize, u32), &PoseError)| {
+            let look = Look::of(self.of.scene, self.of.noise, ray, 0, &estimate.point)?;
+            Some(look.by_itself().with_drift(&drift.mean, &drift.covariance.diagonal().map(f64::sqrt)))
+        };
+        let joint = || {
+            let looks: Vec<Look> = rays.iter().zip(drift).map(look).collect::<Option<_>>()?;
+            let normals = Drive::along(&looks, &vec![1.0; looks.len()], 1)?.normals;
+            let (information, gradient) = normals.of_one();
+            let after = (information + estimate.covariance.try_inverse()?).cholesky()?;
+            let widening = (after.determinant() * estimate.covariance.determinant()).ln();
+            Some(normals.square - gradient.dot(&after.solve(&gradient)) + widening)
+        };
+        joint().unwrap_or(f64::INFINITY)
+    }
 }
 
 /// Take the detections that a better label claims as well from labels that are overruled.

@@ -123,12 +123,17 @@ fn agreeing_ratio(scene: &Scene, labels: &[&Label], noise_of: &(dyn Fn(f64) -> N
 /// How much larger than they are said to be the errors are that labels of several passes show: the mean disagreement of
 /// their passes, at least 1. The variance of positions is to be multiplied by it.
 #[must_use]
-pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[&Label]) -> f64 {
-    mean_disagreement(scene, noise, labels).unwrap_or(1.0).max(1.0)
+pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Label]) -> f64 {
+    let of_label = |label: &Label| *label.known.disagreement.get_or_init(|| disagreement(scene, noise, label));
+    mean(labels.par_iter().map(of_label).collect()).unwrap_or(1.0).max(1.0)
 }
 
 fn mean_disagreement(scene: &Scene, noise: &Noise, labels: &[&Label]) -> Option<f64> {
-    let of_labels: Vec<Option<f64>> = labels.par_iter().map(|label| disagreement(scene, noise, label)).collect();
+    mean(labels.par_iter().map(|label| disagreement(scene, noise, label)).collect())
+}
+
+/// The mean of those that are known, without letting one say too much.
+fn mean(of_labels: Vec<Option<f64>>) -> Option<f64> {
     let known: Vec<f64> = of_labels.into_iter().flatten().map(|d| d.min(MOST_DISAGREEMENT)).collect();
     (known.len() >= MIN_SHARED_LABELS).then(|| known.iter().sum::<f64>() / known.len() as f64)
 }
@@ -139,9 +144,10 @@ fn disagreement(scene: &Scene, noise: &Noise, label: &Label) -> Option<f64> {
     let (mut information, mut gradient, mut alone, mut passes) = (Matrix3::zeros(), Vector3::zeros(), 0.0, 0);
     for pass in by_pass(scene, &label.voters).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS) {
         let terms = pass_terms(scene, noise, pass, &label.estimate.point)?;
-        alone += terms.gradient.dot(&terms.information.cholesky()?.solve(&terms.gradient));
-        information += terms.information;
-        gradient += terms.gradient;
+        let (of_pass, by_pass) = terms.of_one();
+        alone += by_pass.dot(&of_pass.cholesky()?.solve(&by_pass));
+        information += of_pass;
+        gradient += by_pass;
         passes += 1;
     }
     let together = gradient.dot(&information.cholesky()?.solve(&gradient));
@@ -219,8 +225,9 @@ fn minus_log_likelihood(scene: &Scene, noise: &Noise, voters: &[u32], point: &Ve
     let mut value = 0.0;
     for pass in by_pass(scene, voters) {
         let Some(terms) = pass_terms(scene, noise, pass, point) else { return 0.0 };
-        information += terms.information;
-        gradient += terms.gradient;
+        let (of_pass, by_pass) = terms.of_one();
+        information += of_pass;
+        gradient += by_pass;
         value += terms.square + terms.log_determinant;
     }
     let Some(cholesky) = information.cholesky() else { return 0.0 };

@@ -1,12 +1,15 @@
 //! Errors that the images of a pass share: they drift along the drive.
 //!
-//! A voter's residual is `r = J (X - X_0) + J b + J [X - C]_x w + e`: e is its own error (detection, and the part of the pose
-//! error that each image has for itself); b and w are errors of position and rotation that change slowly along the drive,
-//! an Ornstein-Uhlenbeck process: two that are d apart have the correlation `exp(-d / DRIFT_LENGTH_M)`. A drive is cut
-//! into short legs of one b and w each, and these are marginalised leg after leg (Schur complement), so that a hundred
-//! images before a red light count as one look from there, not as a hundred.
+//! A vote's residual is `r = J (X - X_0) + J b + J [X - C]_x w + e`: e is the detection's error; b and w are errors of position
+//! and rotation. A part of them each image has for itself, but for all labels that it shows; another part changes slowly
+//! along the drive, an Ornstein-Uhlenbeck process: two that are d apart have the correlation `exp(-d / DRIFT_LENGTH_M)`. A
+//! drive is cut into short legs of one drift each. The image's own error is marginalised first, then the drift leg after
+//! leg (Schur complements), so that a hundred images before a red light count as one look from there, not as a
+//! hundred, and what an image gets wrong for one label, it gets wrong for its neighbors.
 
-use nalgebra::{Cholesky, Const, Matrix3, SMatrix, SVector, Vector2, Vector3};
+use std::ops::Range;
+
+use nalgebra::{Cholesky, Const, DMatrix, DVector, Matrix2, Matrix3, SMatrix, SVector, Vector2, Vector3};
 
 use super::noise::Noise;
 use super::scene::Scene;
@@ -17,144 +20,311 @@ type Matrix3x6 = SMatrix<f64, 3, 6>;
 
 /// Distance over which drifting errors forget 63 % of themselves, m.
 pub const DRIFT_LENGTH_M: f64 = 100.0;
+/// Freedom left to a residual that the point follows altogether, as a share of its variance.
+const LEAST_FREEDOM: f64 = 1e-3;
 /// Drifting errors are one within this distance, m.
 pub const LEG_M: f64 = 10.0;
 
-/// What the voters of one pass say about a point: information, gradient, and the terms of their likelihood.
-#[derive(Debug, Clone, Copy)]
-pub struct PassTerms {
-    /// Information about the point, 1/m².
-    pub information: Matrix3<f64>,
-    /// Gradient of half the squared residuals, 1/m.
-    pub gradient: Vector3<f64>,
-    /// Squared residuals in sigmas, shared errors taken out.
-    pub square: f64,
-    /// Logarithm of the determinant of the residuals' covariance.
-    pub log_determinant: f64,
-}
-
-/// One voter's residual at a point, with its derivatives.
+/// One vote's residual at the position of its label, with its derivatives.
 #[derive(Debug, Clone)]
 pub struct Look {
+    /// Which of the labels it is a look at.
+    pub label: usize,
+    /// The image.
+    pub image: u32,
     /// Residual, px.
     pub residual: [f64; 2],
-    /// By the point.
+    /// By the position.
     pub by_point: [Vector3<f64>; 2],
-    /// By the errors of the position (m) and the rotation (rad, in the world) that the pass shares.
+    /// By the errors of the image's position (m) and rotation (rad, in the world).
     pub by_pose: [Vector6; 2],
-    /// Standard deviations of these errors.
+    /// Standard deviations of the part of these errors that drifts.
     pub drift_sigma: Vector6,
-    /// Variance of its own error, px².
+    /// Of the part that the image has for itself.
+    pub own_sigma: Vector6,
+    /// Variance of the detection, each axis, px².
+    pub detection_px2: f64,
+    /// Variance of all but the drift, each axis, px².
     pub variance: f64,
     /// How far its pass had driven, m.
     pub driven_m: f64,
 }
 
 impl Look {
-    /// The look of a ray at a point; nothing if the point is behind it.
+    /// The look of a ray at one of some labels, which is at `point`; nothing if that is behind it.
     #[must_use]
-    pub fn of(scene: &Scene, noise: &Noise, ray: u32, point: &Vector3<f64>) -> Option<Self> {
-        let seen = scene.ray(ray);
+    pub fn of(scene: &Scene, noise: &Noise, ray: u32, label: usize, point: &Vector3<f64>) -> Option<Self> {
+        let (seen, view) = (scene.ray(ray), scene.view(ray));
         let (residual, rows) = seen.linearize(point)?;
-        let (p, r) = noise.shared(scene.view(ray));
         let away = point - seen.center;
         let by_point = rows.map(|row| row.transpose());
         let by_pose = by_point.map(|column| {
             let turned = away.cross(&column);
             Vector6::new(column.x, column.y, column.z, turned.x, turned.y, turned.z)
         });
-        let variance = noise.own(scene, ray).variance(seen.project(point).z);
-        let drift_sigma = Vector6::new(p, p, p, r, r, r);
-        Some(Self { residual, by_point, by_pose, drift_sigma, variance, driven_m: scene.view(ray).driven_m })
+        let sigmas = |(p, r): (f64, f64)| Vector6::new(p, p, p, r, r, r);
+        Some(Self {
+            label,
+            image: scene.rays.image[ray as usize],
+            residual,
+            by_point,
+            by_pose,
+            drift_sigma: sigmas(noise.shared(view)),
+            own_sigma: sigmas(noise.of_image(view)),
+            detection_px2: noise.detection_px2(scene, ray),
+            variance: noise.own(scene, ray).variance(seen.project(point).z),
+            driven_m: view.driven_m,
+        })
+    }
+
+    /// The look as if its image had its own error for this label alone: less than what is known, and much quicker.
+    #[must_use]
+    pub fn by_itself(mut self) -> Self {
+        self.detection_px2 = self.variance;
+        self.own_sigma = Vector6::zeros();
+        self
+    }
+
+    /// The look with a drift, which is about known, taken out: mean and standard deviations of what is known of it.
+    #[must_use]
+    pub fn with_drift(mut self, mean: &Vector6, sigma: &Vector6) -> Self {
+        for (residual, by_pose) in self.residual.iter_mut().zip(&self.by_pose) {
+            *residual += by_pose.dot(mean);
+        }
+        self.drift_sigma = *sigma;
+        self
+    }
+
+    /// Squared residual in sigmas, studentised: a vote that pulls the point towards itself has a small residual, and is expected
+    /// to. `left` is the residual without the drift, px; `covariance` that of the point if the drift were known, m².
+    #[must_use]
+    pub fn studentised(&self, left: &Vector2<f64>, covariance: &Matrix3<f64>, weight: f64) -> f64 {
+        let pull = |i: usize, k: usize| weight * self.by_point[i].dot(&(covariance * self.by_point[k]));
+        let pulled = Matrix2::new(pull(0, 0), pull(0, 1), pull(1, 0), pull(1, 1));
+        let expected = Matrix2::from_diagonal_element(self.variance * (1.0 + LEAST_FREEDOM)) - pulled;
+        expected.cholesky().map_or(f64::INFINITY, |cholesky| left.dot(&cholesky.solve(left)))
     }
 }
 
-/// What the looks of one pass at a point say, their drift taken out.
-pub struct Drive<'a> {
-    /// The normal equations of the point.
-    pub terms: PassTerms,
-    /// Information about the point if the drift were known, 1/m².
-    pub alone: Matrix3<f64>,
-    legs: Vec<Leg<'a>>,
+/// Normal equations of the positions of some labels, three rows each, and the terms of their likelihood.
+#[derive(Debug, Clone)]
+pub struct Normals {
+    /// Information about the positions, 1/m².
+    pub information: DMatrix<f64>,
+    /// Gradient of half the squared residuals, 1/m.
+    pub gradient: DVector<f64>,
+    /// Squared residuals in sigmas, pose errors taken out.
+    pub square: f64,
+    /// Logarithm of the determinant of the residuals' covariance.
+    pub log_determinant: f64,
 }
 
-/// Looks that share one drift.
-struct Leg<'a> {
+impl Normals {
+    /// Those of no looks at some labels.
+    #[must_use]
+    pub fn nothing(labels: usize) -> Self {
+        let size = 3 * labels;
+        Self {
+            information: DMatrix::zeros(size, size),
+            gradient: DVector::zeros(size),
+            square: 0.0,
+            log_determinant: 0.0,
+        }
+    }
+
+    /// Add information about two labels, or one.
+    pub fn add(&mut self, a: usize, b: usize, block: &Matrix3<f64>) {
+        let mut view = self.information.fixed_view_mut::<3, 3>(3 * a, 3 * b);
+        view += block;
+    }
+
+    /// Add to the gradient of a label.
+    pub fn add_gradient(&mut self, a: usize, rows: &Vector3<f64>) {
+        let mut view = self.gradient.fixed_rows_mut::<3>(3 * a);
+        view += rows;
+    }
+
+    /// What was said of the only label.
+    #[must_use]
+    pub fn of_one(&self) -> (Matrix3<f64>, Vector3<f64>) {
+        (self.information.fixed_view::<3, 3>(0, 0).into_owned(), self.gradient.fixed_rows::<3>(0).into_owned())
+    }
+}
+
+/// What the looks of one visit of a pass at some labels say, all pose errors taken out.
+pub struct Drive<'a> {
+    /// The normal equations of the positions.
+    pub normals: Normals,
     looks: &'a [Look],
-    /// Information about its drift from its looks, those before, and its tie to the next leg.
-    of_drift: Cholesky<f64, Const<6>>,
+    legs: Vec<Solved>,
+}
+
+/// What the looks of a leg, those before, and its tie to the next leg say about its drift, in sigmas.
+struct Leg {
+    information: Matrix6,
+    gradient: Vector6,
+    /// How it depends on the positions of the labels seen so far.
+    cross: Vec<(usize, Matrix3x6)>,
+}
+
+/// A leg whose drift is taken out.
+struct Solved {
+    looks: Range<usize>,
+    information: Cholesky<f64, Const<6>>,
     gradient: Vector6,
     /// How much a unit of the next leg's drift pulls at this one's.
     tie: f64,
 }
 
 impl<'a> Drive<'a> {
-    /// Go along the looks of a pass, in their order; nothing if their numbers overflow.
+    /// Go along the looks of a visit, in their order; nothing if their numbers overflow.
     #[must_use]
-    pub fn along(looks: &'a [Look], weights: &[f64]) -> Option<Self> {
-        let mut terms =
-            PassTerms { information: Matrix3::zeros(), gradient: Vector3::zeros(), square: 0.0, log_determinant: 0.0 };
-        let mut alone = Matrix3::zeros();
+    pub fn along(looks: &'a [Look], weights: &[f64], labels: usize) -> Option<Self> {
+        let mut normals = Normals::nothing(labels);
         // The prior of the first leg: drifts are counted in their own sigmas.
-        let (mut of_drift, mut gradient, mut cross) = (Matrix6::identity(), Vector6::zeros(), Matrix3x6::zeros());
-        let mut legs: Vec<Leg<'a>> = Vec::new();
-        let mut rest = looks;
-        while !rest.is_empty() {
-            let (here, next) = rest.split_at(leg_length(rest));
-            let done = looks.len() - rest.len();
-            for (look, robust_weight) in here.iter().zip(&weights[done..]) {
-                let weight = robust_weight / look.variance;
-                terms.log_determinant += 2.0 * look.variance.ln();
-                for i in 0..2 {
-                    let (r, column) = (look.residual[i], look.by_point[i]);
-                    let shared = look.by_pose[i].component_mul(&look.drift_sigma);
-                    alone += column * column.transpose() * weight;
-                    terms.gradient += column * (r * weight);
-                    of_drift += shared * shared.transpose() * weight;
-                    gradient += shared * (r * weight);
-                    cross += column * shared.transpose() * weight;
-                    terms.square += r * r * weight;
+        let mut leg = Leg { information: Matrix6::identity(), gradient: Vector6::zeros(), cross: Vec::new() };
+        let mut legs = Vec::new();
+        let mut start = 0;
+        while start < looks.len() {
+            let end = start + leg_length(&looks[start..]);
+            let mut at = start;
+            for image in looks[start..end].chunk_by(|a, b| a.image == b.image) {
+                let weights = &weights[at..at + image.len()];
+                if image[0].own_sigma == Vector6::zeros() {
+                    image.iter().zip(weights).for_each(|(look, &weight)| leg.add(look, weight, &mut normals));
+                } else {
+                    leg.add_image(image, weights, &mut normals);
                 }
+                at += image.len();
             }
             // The next leg's drift is `keep` times this one's, and something new of variance `1 - keep²`.
-            let keep =
-                next.first().map_or(0.0, |next| (-(next.driven_m - here[0].driven_m).abs() / DRIFT_LENGTH_M).exp());
-            let stiffness = 1.0 / (1.0 - keep * keep);
-            let tie = keep * stiffness;
-            let tied = (of_drift + Matrix6::identity() * (keep * tie)).cholesky()?;
-            let by_gradient = tied.solve(&gradient);
-            let by_cross = tied.solve(&cross.transpose()).transpose();
-            terms.information -= cross * by_cross.transpose();
-            terms.gradient -= cross * by_gradient;
-            terms.square -= gradient.dot(&by_gradient);
-            terms.log_determinant +=
-                2.0 * tied.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>() - 6.0 * stiffness.ln();
-            of_drift = Matrix6::identity() * stiffness - tied.inverse() * (tie * tie);
-            legs.push(Leg { looks: here, of_drift: tied, gradient, tie });
-            (gradient, cross) = (by_gradient * tie, by_cross * tie);
-            rest = next;
+            let distance = looks.get(end).map_or(f64::INFINITY, |next| (next.driven_m - looks[start].driven_m).abs());
+            let keep = (-distance / DRIFT_LENGTH_M).exp();
+            let (solved, next) = leg.take_out(keep, start..end, &mut normals)?;
+            legs.push(solved);
+            leg = next;
+            start = end;
         }
-        terms.information += alone;
-        Some(Self { terms, alone, legs })
+        Some(Self { normals, looks, legs })
     }
 
     /// Residuals, px, after the most probable drift is taken out, in the order of the looks.
     #[must_use]
     pub fn left(&self) -> Vec<Vector2<f64>> {
-        let mut left = Vec::new();
+        let mut left = vec![Vector2::zeros(); self.looks.len()];
         let mut drift_of_next = Vector6::zeros();
         for leg in self.legs.iter().rev() {
-            let drift = leg.of_drift.solve(&(drift_of_next * leg.tie - leg.gradient));
-            let of_look = |look: &Look| {
+            let drift = leg.information.solve(&(drift_of_next * leg.tie - leg.gradient));
+            for i in leg.looks.clone() {
+                let look = &self.looks[i];
                 let pose = drift.component_mul(&look.drift_sigma);
-                Vector2::from([0, 1].map(|i| look.residual[i] + look.by_pose[i].dot(&pose)))
-            };
-            left.extend(leg.looks.iter().rev().map(of_look));
+                left[i] = Vector2::from([0, 1].map(|axis| look.residual[axis] + look.by_pose[axis].dot(&pose)));
+            }
             drift_of_next = drift;
         }
-        left.reverse();
         left
     }
+}
+
+impl Leg {
+    /// Add a look whose image has no error that it shares with others.
+    fn add(&mut self, look: &Look, robust_weight: f64, normals: &mut Normals) {
+        let weight = robust_weight / look.detection_px2;
+        let (mut of_label, mut by_label) = (Matrix3::zeros(), Vector3::zeros());
+        let mut cross = Matrix3x6::zeros();
+        for axis in 0..2 {
+            let (r, column) = (look.residual[axis], look.by_point[axis]);
+            let shared = look.by_pose[axis].component_mul(&look.drift_sigma);
+            let (weighted, weighted_shared) = (column * weight, shared * weight);
+            of_label += column * weighted.transpose();
+            by_label += weighted * r;
+            self.information += shared * weighted_shared.transpose();
+            self.gradient += weighted_shared * r;
+            cross += column * weighted_shared.transpose();
+            normals.square += r * r * weight;
+        }
+        normals.log_determinant += 2.0 * look.detection_px2.ln();
+        normals.add(look.label, look.label, &of_label);
+        normals.add_gradient(look.label, &by_label);
+        self.add_cross(look.label, &cross);
+    }
+
+    /// Add the looks of one image, its own error taken out.
+    fn add_image(&mut self, looks: &[Look], weights: &[f64], normals: &mut Normals) {
+        let (mut of_pose, mut gradient) = (Matrix6::zeros(), Vector6::zeros());
+        let mut crosses: Vec<(usize, Matrix3x6)> = Vec::with_capacity(looks.len());
+        for (look, robust_weight) in looks.iter().zip(weights) {
+            let weight = robust_weight / look.detection_px2;
+            let mut cross = Matrix3x6::zeros();
+            for axis in 0..2 {
+                let (r, column, pose) = (look.residual[axis], look.by_point[axis], look.by_pose[axis]);
+                normals.add(look.label, look.label, &(column * column.transpose() * weight));
+                normals.add_gradient(look.label, &(column * (r * weight)));
+                normals.square += r * r * weight;
+                of_pose += pose * pose.transpose() * weight;
+                gradient += pose * (r * weight);
+                cross += column * pose.transpose() * weight;
+            }
+            normals.log_determinant += 2.0 * look.detection_px2.ln();
+            crosses.push((look.label, cross));
+        }
+        let own = Matrix6::from_diagonal(&looks[0].own_sigma);
+        let Some(known) = (Matrix6::identity() + own * of_pose * own).cholesky() else { return };
+        // The covariance of the image's own error, once its looks are known.
+        let error = own * known.inverse() * own;
+        normals.square -= gradient.dot(&(error * gradient));
+        normals.log_determinant += log_determinant(&known);
+        let kept = Matrix6::identity() - error * of_pose;
+        let drift = Matrix6::from_diagonal(&looks[0].drift_sigma);
+        for (a, of_a) in &crosses {
+            let by_error = of_a * error;
+            normals.add_gradient(*a, &-(by_error * gradient));
+            for (b, of_b) in &crosses {
+                normals.add(*a, *b, &-(by_error * of_b.transpose()));
+            }
+            self.add_cross(*a, &(of_a * kept * drift));
+        }
+        self.information += drift * of_pose * kept * drift;
+        self.gradient += drift * kept.transpose() * gradient;
+    }
+
+    fn add_cross(&mut self, label: usize, cross: &Matrix3x6) {
+        match self.cross.iter_mut().find(|(other, _)| *other == label) {
+            Some((_, sum)) => *sum += cross,
+            None => self.cross.push((label, *cross)),
+        }
+    }
+
+    /// Take the drift of this leg out; what remains is known of the next one's, which is `keep` times this one's.
+    fn take_out(self, keep: f64, looks: Range<usize>, normals: &mut Normals) -> Option<(Solved, Self)> {
+        let stiffness = 1.0 / (1.0 - keep * keep);
+        let tie = keep * stiffness;
+        let tied = (self.information + Matrix6::identity() * (keep * tie)).cholesky()?;
+        let inverse = tied.inverse();
+        let by_gradient = inverse * self.gradient;
+        let by_cross: Vec<(usize, Matrix3x6)> = self.cross.iter().map(|(a, cross)| (*a, cross * inverse)).collect();
+        for (i, (a, of_a)) in by_cross.iter().enumerate() {
+            normals.add_gradient(*a, &-(of_a * self.gradient));
+            for (b, of_b) in &self.cross[..i] {
+                let both = -(of_a * of_b.transpose());
+                normals.add(*a, *b, &both);
+                normals.add(*b, *a, &both.transpose());
+            }
+            normals.add(*a, *a, &-(of_a * self.cross[i].1.transpose()));
+        }
+        normals.square -= self.gradient.dot(&by_gradient);
+        normals.log_determinant += log_determinant(&tied) - 6.0 * stiffness.ln();
+        let next = Self {
+            information: Matrix6::identity() * stiffness - inverse * (tie * tie),
+            gradient: by_gradient * tie,
+            cross: by_cross.into_iter().map(|(a, cross)| (a, cross * tie)).collect(),
+        };
+        Some((Solved { looks, information: tied, gradient: self.gradient, tie }, next))
+    }
+}
+
+fn log_determinant(cholesky: &Cholesky<f64, Const<6>>) -> f64 {
+    2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>()
 }
 
 /// How many looks, from the first one on, share one drift.

@@ -1,22 +1,29 @@
-//! Where an object is, and how sure that is: least squares over its voters, with pose errors that a pass shares.
+//! Where objects are, and how sure that is: least squares over their votes, with the errors of the poses.
 //!
-//! Each pass gives its normal equations with its drift taken out ([`drift`](super::drift)); they add up, and the inverse of
-//! their sum is the covariance.
+//! Each visit of a pass gives its normal equations with its pose errors taken out ([`drift`](super::drift)); they add up, and the
+//! inverse of their sum is the covariance. Labels that are estimated together share what their images get wrong: a
+//! label alone cannot tell an error of its pass from one of its own, its neighbors in the same images can (a bundle
+//! adjustment with priors on the poses).
 
-use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
+use nalgebra::{DMatrix, Matrix3, Vector2, Vector3};
 
-use super::drift::{Drive, Look, PassTerms};
+use super::drift::{Drive, Look, Normals};
+use super::label::EXACT_M;
 use super::noise::Noise;
 use super::scene::{Scene, View};
 
 const MAX_ITERATIONS: usize = 20;
+/// Where the votes may still change.
+const ROUGH_ITERATIONS: usize = 5;
 /// A pass that comes back after so long a drive has another drift, m.
 const FORGOTTEN_M: f64 = 250.0;
-/// Freedom left to a residual that the point follows altogether, as a share of its variance.
-const LEAST_FREEDOM: f64 = 1e-3;
 const LONGEST_STEP_M: f64 = 5.0;
 /// Residuals beyond this many sigmas count less, in proportion (Huber).
 const HUBER_SIGMAS: f64 = 2.0;
+/// How much of what a visit says is left out when it is judged: a little stays, for where the others tell nothing.
+const OTHERS_SHARE: f64 = 0.95;
+/// Farther than this the linear step to where the other visits put a label is not trusted, m.
+const LONGEST_MOVE_M: f64 = 3.0;
 
 /// A position with its covariance, m².
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -27,8 +34,194 @@ pub struct Estimate {
     pub covariance: Matrix3<f64>,
 }
 
-/// Estimate a position from its voters, starting nearby, until a step is shorter than the tolerance; `voters` must be
-/// ordered by pass.
+/// Where all visits but one put a label.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Elsewhere {
+    /// The pass of that one.
+    pub pass: u32,
+    /// From where to where it voted, m driven.
+    pub driven_m: [f64; 2],
+    /// What the others say.
+    pub estimate: Estimate,
+}
+
+impl Elsewhere {
+    /// Whether a view is of the visit that is left out.
+    #[must_use]
+    pub fn leaves_out(&self, view: &View) -> bool {
+        let [first, last] = self.driven_m;
+        view.pass == self.pass && view.driven_m > first - FORGOTTEN_M && view.driven_m < last + FORGOTTEN_M
+    }
+}
+
+/// Labels that are estimated together.
+pub struct Joint<'a> {
+    scene: &'a Scene,
+    noise: &'a Noise,
+    /// Label and ray of each vote, by visit and image.
+    votes: Vec<(usize, u32)>,
+    weights: Vec<f64>,
+    points: Vec<Vector3<f64>>,
+    tolerance_m: f64,
+}
+
+/// Labels estimated together.
+pub struct Solution<'a> {
+    joint: Joint<'a>,
+    here: Evaluation,
+    /// The positions with their covariances.
+    pub estimates: Vec<Estimate>,
+}
+
+impl<'a> Joint<'a> {
+    /// Begin with the voters of each label and a point near it; estimates are final when a step is shorter than the tolerance.
+    #[must_use]
+    pub fn new<'v>(
+        scene: &'a Scene,
+        noise: &'a Noise,
+        labels: impl Iterator<Item = (&'v [u32], Vector3<f64>)>,
+        tolerance_m: f64,
+    ) -> Self {
+        let (mut votes, mut points) = (Vec::new(), Vec::new());
+        for (label, (voters, start)) in labels.enumerate() {
+            votes.extend(voters.iter().map(|&ray| (label, ray)));
+            points.push(start);
+        }
+        votes.sort_unstable_by_key(|&(label, ray)| (scene.view(ray).pass, ray, label));
+        Self { scene, noise, weights: vec![1.0; votes.len()], votes, points, tolerance_m }
+    }
+
+    /// Estimate the positions.
+    ///
+    /// Nothing if one ends up behind a voter, or the votes do not fix them.
+    #[must_use]
+    pub fn solve(mut self) -> Option<Solution<'a>> {
+        let mut here = self.evaluate()?;
+        let rounds = if self.tolerance_m > EXACT_M { ROUGH_ITERATIONS } else { MAX_ITERATIONS };
+        for round in 1..=rounds {
+            let longest = self.step(&here)?;
+            self.weights = here.own.iter().map(|chi2| (HUBER_SIGMAS / chi2.sqrt()).min(1.0)).collect();
+            if longest < self.tolerance_m || round == rounds {
+                break;
+            }
+            here = self.evaluate()?;
+        }
+        // The last step may have gone behind a voter.
+        let is_in_front = |&(label, ray): &(usize, u32)| self.scene.ray(ray).project(&self.points[label]).z > 0.0;
+        self.votes.iter().all(is_in_front).then_some(())?;
+        let estimates = self.estimates(&here.normals.information.clone().cholesky()?.inverse());
+        Some(Solution { joint: self, here, estimates })
+    }
+
+    /// Move the points to where the normal equations put them; the longest step, m.
+    fn step(&mut self, here: &Evaluation) -> Option<f64> {
+        let step = -here.normals.information.clone().cholesky()?.solve(&here.normals.gradient);
+        let mut longest = 0.0_f64;
+        for (k, point) in self.points.iter_mut().enumerate() {
+            let step = step.fixed_rows::<3>(3 * k);
+            let length = step.norm();
+            *point += step * (LONGEST_STEP_M / length).min(1.0);
+            longest = longest.max(length);
+        }
+        Some(longest)
+    }
+
+    fn estimates(&self, covariance: &DMatrix<f64>) -> Vec<Estimate> {
+        let block = |k: usize| covariance.fixed_view::<3, 3>(3 * k, 3 * k).into_owned();
+        self.points.iter().enumerate().map(|(k, &point)| Estimate { point, covariance: block(k) }).collect()
+    }
+
+    fn visits(&self) -> impl Iterator<Item = &[(usize, u32)]> {
+        self.votes.chunk_by(|a, b| is_one_visit(self.scene.view(a.1), self.scene.view(b.1)))
+    }
+
+    fn evaluate(&self) -> Option<Evaluation> {
+        let of_vote = |&(label, ray): &(usize, u32)| {
+            let look = Look::of(self.scene, self.noise, ray, label, &self.points[label])?;
+            Some(if self.tolerance_m > EXACT_M || self.points.len() == 1 { look.by_itself() } else { look })
+        };
+        let looks: Vec<Look> = self.votes.iter().map(of_vote).collect::<Option<_>>()?;
+        let mut normals = Normals::nothing(self.points.len());
+        let mut of_visits = Vec::new();
+        let mut left: Vec<Vector2<f64>> = Vec::with_capacity(looks.len());
+        for votes in self.visits() {
+            let range = left.len()..left.len() + votes.len();
+            let drive = Drive::along(&looks[range.clone()], &self.weights[range], self.points.len())?;
+            normals.information += &drive.normals.information;
+            normals.gradient += &drive.normals.gradient;
+            left.extend(drive.left());
+            of_visits.push(drive.normals);
+        }
+        let mut alone = vec![Matrix3::zeros(); self.points.len()];
+        for (look, weight) in looks.iter().zip(&self.weights) {
+            for column in &look.by_point {
+                alone[look.label] += column * column.transpose() * (weight / look.variance);
+            }
+        }
+        let alone: Vec<Matrix3<f64>> =
+            alone.into_iter().map(|alone| Some(alone.cholesky()?.inverse())).collect::<Option<_>>()?;
+        let own = looks.iter().zip(&self.weights).zip(&left);
+        let own = own.map(|((look, weight), left)| look.studentised(left, &alone[look.label], *weight)).collect();
+        for &(label, ray) in &self.votes {
+            if let Some((information, gradient)) = range_terms(self.scene, ray, &self.points[label]) {
+                normals.add(label, label, &information);
+                normals.add_gradient(label, &gradient);
+            }
+        }
+        Some(Evaluation { normals, of_visits, own })
+    }
+}
+
+impl Solution<'_> {
+    /// Label and ray of each vote with its squared residual in its own sigmas, after the drift of its visit is taken out,
+    /// studentised: a vote that pulls the point towards itself has a small residual, and is expected to.
+    #[must_use]
+    pub fn own_chi2(&self) -> Vec<((usize, u32), f64)> {
+        self.joint.votes.iter().copied().zip(self.here.own.iter().copied()).collect()
+    }
+
+    /// For each label, where all visits but one put it, for each that votes for it: votes of a visit that went to the wrong one of
+    /// two labels must not confirm themselves.
+    #[must_use]
+    pub fn elsewhere(&self) -> Vec<Vec<Elsewhere>> {
+        let Self { joint, here, .. } = self;
+        let mut found = vec![Vec::new(); joint.points.len()];
+        let mut voters = vec![0_usize; joint.points.len()];
+        for &(label, _) in &joint.votes {
+            voters[label] += 1;
+        }
+        for (votes, of_visit) in joint.visits().zip(&here.of_visits) {
+            let rest = &here.normals.information - &of_visit.information * OTHERS_SHARE;
+            let Some(rest) = rest.cholesky() else { continue };
+            let step = rest.solve(&(&of_visit.gradient * OTHERS_SHARE - &here.normals.gradient));
+            let others = joint.estimates(&rest.inverse());
+            let mut of_visit = vec![0_usize; joint.points.len()];
+            for &(label, _) in votes {
+                of_visit[label] += 1;
+            }
+            let view = |vote: &(usize, u32)| joint.scene.view(vote.1);
+            let driven_m = [view(&votes[0]), view(&votes[votes.len() - 1])].map(|view| view.driven_m);
+            for (label, mut estimate) in others.into_iter().enumerate() {
+                let step = step.fixed_rows::<3>(3 * label);
+                if of_visit[label] > 0 && voters[label] >= of_visit[label] + 2 && step.norm() < LONGEST_MOVE_M {
+                    estimate.point += step;
+                    found[label].push(Elsewhere { pass: view(&votes[0]).pass, driven_m, estimate });
+                }
+            }
+        }
+        found
+    }
+}
+
+/// The normal equations of all votes, and how well each fits.
+struct Evaluation {
+    normals: Normals,
+    of_visits: Vec<Normals>,
+    /// See [`Joint::own_chi2`].
+    own: Vec<f64>,
+}
+
+/// Estimate the position of one label from its voters, starting nearby, until a step is shorter than the tolerance.
 ///
 /// Nothing if the point ends up behind a voter, or the voters do not fix it.
 #[must_use]
@@ -39,83 +232,19 @@ pub fn estimate(
     start: Vector3<f64>,
     tolerance_m: f64,
 ) -> Option<Estimate> {
-    let mut point = start;
-    let mut weights = vec![1.0; voters.len()];
-    let mut information = Matrix3::zeros();
-    for _ in 0..MAX_ITERATIONS {
-        let here = Evaluation::at(scene, noise, voters, &weights, &point)?;
-        let step = -here.information.cholesky()?.solve(&here.gradient);
-        point += step * (LONGEST_STEP_M / step.norm()).min(1.0);
-        weights = here.own.iter().map(|chi2| (HUBER_SIGMAS / chi2.sqrt()).min(1.0)).collect();
-        information = here.information;
-        if step.norm() < tolerance_m {
-            break;
-        }
-    }
-    // The last step may have gone behind a voter.
-    voters.iter().all(|&ray| scene.ray(ray).project(&point).z > 0.0).then_some(())?;
-    Some(Estimate { point, covariance: information.cholesky()?.inverse() })
+    Joint::new(scene, noise, std::iter::once((voters, start)), tolerance_m).solve()?.estimates.pop()
 }
 
-/// Squared residuals of the voters at a point in their own sigmas, after the error that their pass shares is taken out,
-/// studentised: a voter that pulls the point towards itself has a small residual, and is expected to.
-///
-/// `voters` must be ordered by pass. Nothing if the point is behind one of them.
-#[must_use]
-pub fn own_chi2(scene: &Scene, noise: &Noise, voters: &[u32], point: &Vector3<f64>) -> Option<Vec<f64>> {
-    Some(Evaluation::at(scene, noise, voters, &vec![1.0; voters.len()], point)?.own)
-}
-
-/// The normal equations of all voters at a point, and how well each fits.
-struct Evaluation {
-    information: Matrix3<f64>,
-    gradient: Vector3<f64>,
-    /// See [`own_chi2`].
-    own: Vec<f64>,
-}
-
-impl Evaluation {
-    fn at(scene: &Scene, noise: &Noise, voters: &[u32], weights: &[f64], point: &Vector3<f64>) -> Option<Self> {
-        let looks = looks_at(scene, noise, voters, point)?;
-        let (mut information, mut gradient) = (Matrix3::zeros(), Vector3::zeros());
-        let mut alone = Matrix3::zeros();
-        let mut left: Vec<Vector2<f64>> = Vec::with_capacity(voters.len());
-        for pass in by_pass(scene, voters) {
-            let range = left.len()..left.len() + pass.len();
-            let drive = Drive::along(&looks[range.clone()], &weights[range])?;
-            information += drive.terms.information;
-            gradient += drive.terms.gradient;
-            alone += drive.alone;
-            left.extend(drive.left());
-        }
-        let covariance = alone.cholesky()?.inverse();
-        let own = looks.iter().zip(weights).zip(&left).map(|((look, weight), left)| {
-            let pull = |i: usize, k: usize| weight * look.by_point[i].dot(&(covariance * look.by_point[k]));
-            let pulled = Matrix2::new(pull(0, 0), pull(0, 1), pull(1, 0), pull(1, 1));
-            let expected = Matrix2::from_diagonal_element(look.variance * (1.0 + LEAST_FREEDOM)) - pulled;
-            expected.cholesky().map_or(f64::INFINITY, |cholesky| left.dot(&cholesky.solve(left)))
-        });
-        let own = own.collect();
-        let (by_range, by_range_gradient) = range_terms(scene, voters, point);
-        Some(Self { information: information + by_range, gradient: gradient + by_range_gradient, own })
-    }
-}
-
-/// Information and gradient of measured ranges: each is one more observation of its voter, along the viewing direction.
-fn range_terms(scene: &Scene, voters: &[u32], point: &Vector3<f64>) -> (Matrix3<f64>, Vector3<f64>) {
-    let mut sum = (Matrix3::zeros(), Vector3::zeros());
-    for &ray in voters {
-        let (range, sigma) = (scene.range_m[ray as usize], scene.range_sigma_m[ray as usize]);
-        if range.is_finite() && sigma.is_finite() {
-            let away = point - scene.ray(ray).center;
-            let direction = away.normalize();
-            let residual = (away.norm() - range) / sigma;
-            let weight = (HUBER_SIGMAS / residual.abs()).min(1.0) / sigma;
-            sum.0 += direction * direction.transpose() * (weight / sigma);
-            sum.1 += direction * (weight * residual);
-        }
-    }
-    sum
+/// Information and gradient of a measured range: one more observation of its voter, along the viewing direction.
+fn range_terms(scene: &Scene, ray: u32, point: &Vector3<f64>) -> Option<(Matrix3<f64>, Vector3<f64>)> {
+    let (range, sigma) = (scene.range_m[ray as usize], scene.range_sigma_m[ray as usize]);
+    (range.is_finite() && sigma.is_finite()).then(|| {
+        let away = point - scene.ray(ray).center;
+        let direction = away.normalize();
+        let residual = (away.norm() - range) / sigma;
+        let weight = (HUBER_SIGMAS / residual.abs()).min(1.0) / sigma;
+        (direction * direction.transpose() * (weight / sigma), direction * (weight * residual))
+    })
 }
 
 /// Whether two views, successive among those of something, are of one visit: of a pass that has not forgotten its drift.
@@ -129,12 +258,10 @@ pub fn by_pass<'a>(scene: &'a Scene, voters: &'a [u32]) -> impl Iterator<Item = 
     voters.chunk_by(|&a, &b| is_one_visit(scene.view(a), scene.view(b)))
 }
 
-/// The terms of the voters of one pass at a point; nothing if it is behind one of them.
+/// What the voters of one visit say of a point; nothing if it is behind one of them.
 #[must_use]
-pub fn pass_terms(scene: &Scene, noise: &Noise, voters: &[u32], point: &Vector3<f64>) -> Option<PassTerms> {
-    Some(Drive::along(&looks_at(scene, noise, voters, point)?, &vec![1.0; voters.len()])?.terms)
-}
-
-fn looks_at(scene: &Scene, noise: &Noise, voters: &[u32], point: &Vector3<f64>) -> Option<Vec<Look>> {
-    voters.iter().map(|&ray| Look::of(scene, noise, ray, point)).collect()
+pub fn pass_terms(scene: &Scene, noise: &Noise, voters: &[u32], point: &Vector3<f64>) -> Option<Normals> {
+    let of_voter = |&ray: &u32| Some(Look::of(scene, noise, ray, 0, point)?.by_itself());
+    let looks: Vec<Look> = voters.iter().map(of_voter).collect::<Option<_>>()?;
+    Some(Drive::along(&looks, &vec![1.0; voters.len()], 1)?.normals)
 }

@@ -9,7 +9,7 @@ use nalgebra::{Matrix2x3, Matrix3, Vector2, Vector3};
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use super::label::{EXACT_M, Label, by_place, from_voters};
+use super::label::{Label, SECTOR_COSINE, by_place, direction_to, from_voters};
 use super::noise::Noise;
 use super::scene::Scene;
 use super::settle::first_voter;
@@ -27,14 +27,26 @@ const REFINEMENTS: usize = 3;
 /// No image speaks stronger against a proposal.
 const CUT_CHI2: f64 = 16.0;
 /// An exchange must lower the sum of squared residuals by so much.
-const LEAST_GAIN: f64 = 30.0;
+const LEAST_GAIN: f64 = 8.0;
 
 /// Let neighbours exchange votes where their images say so; what only one of them has in an image is given anew. The nearest pairs first, each label in one pair.
 #[must_use]
 pub fn exchange(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) -> Vec<Label> {
     let pairs = nearest_pairs(&labels);
-    let exchanged: Vec<Option<[Label; 2]>> =
-        pairs.par_iter().map(|&(a, b)| exchange_pair(scene, noise, gate_sigmas, &labels[a], &labels[b])).collect();
+    let of_pair = |&(a, b): &(usize, usize)| {
+        let (a, b) = (&labels[a], &labels[b]);
+        let neighbor = b.identity();
+        if a.known.untangled.get() == Some(&neighbor) {
+            return None;
+        }
+        let exchanged = exchange_pair(scene, noise, gate_sigmas, a, b);
+        if exchanged.is_none() {
+            // Only the first neighbor is remembered.
+            a.known.untangled.get_or_init(|| neighbor);
+        }
+        exchanged
+    };
+    let exchanged: Vec<Option<[Label; 2]>> = pairs.par_iter().map(of_pair).collect();
     let mut labels = labels;
     for (&(a, b), new) in pairs.iter().zip(exchanged) {
         if let Some([new_a, new_b]) = new {
@@ -72,6 +84,8 @@ fn nearest_pairs(labels: &[Label]) -> Vec<(usize, usize)> {
 /// Both labels' detections in an image that shows both, and what their difference says.
 struct Both {
     rays: [u32; 2],
+    /// Unit direction from the labels to the camera.
+    direction: Vector3<f64>,
     /// Difference of the residuals at a common point, px: that of the positions, seen from the image, if each ray is its
     /// label's.
     difference: Vector2<f64>,
@@ -97,22 +111,15 @@ fn exchange_pair(scene: &Scene, noise: &Noise, gate_sigmas: f64, a: &Label, b: &
     }
     let now = a.estimate.point - b.estimate.point;
     let unswapped: f64 = images.iter().map(|both| both.chi2(&now)[0].min(CUT_CHI2)).sum();
-    let mut best = (cost(&images, 1, &now), now);
-    let stride = images.len().div_ceil(SAMPLE_IMAGES);
-    for apart in proposals(&images) {
-        let value = cost(&images, stride, &apart) * stride as f64;
-        if value < best.0 {
-            best = (value, apart);
-        }
-    }
-    for _ in 0..REFINEMENTS {
-        best.1 = refined(&images, &best.1)?;
-    }
-    let least = cost(&images, 1, &best.1);
+    let mut starts = flipped(&images);
+    starts.push(proposed(&images, &now));
+    let refined =
+        starts.iter().filter_map(|start| (0..REFINEMENTS).try_fold(*start, |apart, _| refined(&images, &apart)));
+    let (least, apart) = refined.map(|apart| (cost(&images, 1, &apart), apart)).min_by(|a, b| a.0.total_cmp(&b.0))?;
     if !(least < unswapped - LEAST_GAIN) {
         return None;
     }
-    let swapped: Vec<bool> = images.iter().map(|both| both.chi2(&best.1)).map(|[as_is, swap]| swap < as_is).collect();
+    let swapped: Vec<bool> = images.iter().map(|both| both.chi2(&apart)).map(|[as_is, swap]| swap < as_is).collect();
     // Which is which is free to choose: so that fewer votes change sides.
     let mirrored = 2 * swapped.iter().filter(|&&swap| swap).count() > swapped.len();
     if swapped.iter().all(|&swap| swap == mirrored) {
@@ -121,7 +128,7 @@ fn exchange_pair(scene: &Scene, noise: &Noise, gate_sigmas: f64, a: &Label, b: &
     let of = |side: usize, old: &Label| {
         let ray = |(both, &swap): (&Both, &bool)| both.rays[side ^ usize::from(swap != mirrored)];
         let voters = images.iter().zip(&swapped).map(ray).collect();
-        let found = from_voters(scene, noise, gate_sigmas, voters, old.estimate.point, EXACT_M)?;
+        let found = from_voters(scene, noise, gate_sigmas, voters, old.estimate.point)?;
         Some(Label { unseen_from: old.unseen_from.clone(), ..found })
     };
     Some([of(0, a)?, of(1, b)?])
@@ -139,12 +146,35 @@ fn images_of_both(scene: &Scene, noise: &Noise, a: &Label, b: &Label) -> Option<
             let (residual_b, _) = scene.ray(rays[1]).linearize(&middle)?;
             Some(Both {
                 rays,
+                direction: direction_to(scene, rays[0], &middle),
                 difference: Vector2::from(residual_b) - Vector2::from(residual_a),
                 by_point: Matrix2x3::from_rows(&rows),
                 variance: noise.detection_px2(scene, rays[0]) + noise.detection_px2(scene, rays[1]),
             })
         })
         .collect()
+}
+
+/// The differences of the positions if the votes of all images that look from about one direction are swapped.
+fn flipped(images: &[Both]) -> Vec<Vector3<f64>> {
+    let mut sectors: Vec<Vector3<f64>> = Vec::new();
+    for both in images {
+        if sectors.iter().all(|middle| middle.dot(&both.direction) < SECTOR_COSINE) {
+            sectors.push(both.direction);
+        }
+    }
+    let flip = |middle: &Vector3<f64>| {
+        let sign = |both: &Both| if middle.dot(&both.direction) < SECTOR_COSINE { 1.0 } else { -1.0 };
+        solve(images.iter().map(|both| (both, sign(both))))
+    };
+    sectors.iter().filter_map(flip).collect()
+}
+
+/// The difference of the positions that fits a sample of the images best, of those that pairs of images would have.
+fn proposed(images: &[Both], now: &Vector3<f64>) -> Vector3<f64> {
+    let stride = images.len().div_ceil(SAMPLE_IMAGES);
+    let all = std::iter::once(*now).chain(proposals(images)).map(|apart| (cost(images, stride, &apart), apart));
+    all.min_by(|a, b| a.0.total_cmp(&b.0)).map_or(*now, |(_, apart)| apart)
 }
 
 /// Differences of the positions that pairs of images would have.

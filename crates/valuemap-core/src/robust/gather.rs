@@ -6,7 +6,7 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use super::index::RayIndex;
-use super::label::{Label, ROUGH_M, from_voters};
+use super::label::{Label, from_voters};
 use super::noise::Noise;
 use super::nominate::{self, Nomination, Who};
 use super::quick::quick_estimate;
@@ -121,6 +121,6 @@ fn polish(
     if gathered.len() < min_votes {
         return None;
     }
-    let label = from_voters(scene, noise, index.gate_sigmas(), gathered, point, ROUGH_M)?;
+    let label = from_voters(scene, noise, index.gate_sigmas(), gathered, point)?;
     (label.voters.len() >= min_votes).then_some(label)
 }

@@ -1,17 +1,25 @@
 //! A label in the making: a point, the rays that support it, and the side it is seen from.
 
+use std::hash::{Hash, Hasher};
+use std::sync::{Arc, OnceLock};
+
 use nalgebra::Vector3;
 use rstar::RTree;
 use rstar::primitives::GeomWithData;
+use rustc_hash::FxHasher;
 
-use super::estimate::{Estimate, estimate, own_chi2};
+use super::associate::Claim;
+use super::estimate::{Elsewhere, Estimate, Joint};
+use super::existence::Sector;
 use super::noise::Noise;
-use super::scene::Scene;
+use super::scene::{Scene, View};
 
 /// Good enough while voters are still being gathered, m.
-pub const ROUGH_M: f64 = 5e-3;
+pub const ROUGH_M: f64 = 1e-2;
 /// Good enough for good, m.
 pub const EXACT_M: f64 = 1e-7;
+/// A label that moved by less, squared and in sigmas, is what it was.
+const SMALL_MOVE_CHI2: f64 = 0.01;
 /// Rounds of leaving out voters, at most.
 const MAX_TRIMS: usize = 10;
 
@@ -23,7 +31,7 @@ pub const SECTOR_COSINE: f64 = 0.966;
 const SIDE_COSINE: f64 = 0.17;
 
 /// A point with its covariance and voters.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct Label {
     /// Where it is.
     pub estimate: Estimate,
@@ -38,8 +46,40 @@ pub struct Label {
     pub undecided: Vec<u32>,
     /// Directions, with 15 degrees around, from which images look at it in vain: what they have in its gate are other things.
     pub unseen_from: Vec<Vector3<f64>>,
-    /// Whether the estimate is as exact as it gets.
-    pub is_exact: bool,
+    /// For each visit that votes for it: where all others put it.
+    pub elsewhere: Vec<Elsewhere>,
+    /// Votes that it was given, and that do not fit once its place is estimated together.
+    pub refused: Vec<u32>,
+    /// What it was when it last changed.
+    pub revision: Revision,
+    /// What follows from that.
+    pub known: Known,
+}
+
+/// What a label was when it last changed: small moves are no change.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Revision {
+    /// Fingerprint of its voters.
+    pub voters: u64,
+    /// Where it was.
+    pub point: Vector3<f64>,
+    /// Fingerprint of the votes of all labels that it was last estimated with.
+    pub place: u64,
+}
+
+/// What was found out about a label as it is; forgotten when it changes.
+#[derive(Debug, Clone, Default)]
+pub struct Known {
+    /// Detections that it may have.
+    pub claims: OnceLock<Arc<[Claim]>>,
+    /// The directions that it is looked at from.
+    pub sectors: OnceLock<Arc<[Sector]>>,
+    /// How far its visits disagree, see [`variance_factor`](super::calibrate::variance_factor).
+    pub disagreement: OnceLock<Option<f64>>,
+    /// Whether it was found not to be two.
+    pub is_one: bool,
+    /// The neighbor, as it was, that it was found to have no votes to exchange with.
+    pub untangled: OnceLock<u64>,
 }
 
 /// Estimate from voters in any order, without those that disagree with the others of their pass.
@@ -53,37 +93,63 @@ pub fn from_voters(
     gate_sigmas: f64,
     mut voters: Vec<u32>,
     start: Vector3<f64>,
-    tolerance_m: f64,
 ) -> Option<Label> {
     scene.sort_by_pass(&mut voters);
     let class = scene.rays.class[*voters.first()? as usize];
-    let mut found = estimate(scene, noise, &voters, start, tolerance_m)?;
+    let mut point = start;
     for _ in 0..MAX_TRIMS {
-        let own = own_chi2(scene, noise, &voters, &found.point)?;
-        let limit = gate_sigmas * gate_sigmas;
-        if own.iter().all(|&chi2| chi2 < limit) {
-            break;
+        let start = std::iter::once((voters.as_slice(), point));
+        let solution = Joint::new(scene, noise, start, ROUGH_M).solve()?;
+        let estimate = solution.estimates[0];
+        let left = fitting(&solution.own_chi2(), gate_sigmas);
+        if left.len() == voters.len() {
+            let side = side_of(scene, &voters, &estimate.point);
+            return Some(Label {
+                estimate,
+                side,
+                class,
+                voters,
+                undecided: Vec::new(),
+                unseen_from: Vec::new(),
+                elsewhere: Vec::new(),
+                refused: Vec::new(),
+                revision: Revision::default(),
+                known: Known::default(),
+            });
         }
-        // The worst first: one bad voter makes good ones look bad.
-        let worst = own.iter().copied().fold(0.0, f64::max);
-        let keep = |chi2: f64| chi2 < limit.max(0.5 * worst);
-        voters = voters.iter().zip(&own).filter(|&(_, &chi2)| keep(chi2)).map(|(&ray, _)| ray).collect();
+        (point, voters) = (estimate.point, left.into_iter().map(|(_, ray)| ray).collect());
         if voters.len() < 2 {
             return None;
         }
-        found = estimate(scene, noise, &voters, found.point, tolerance_m)?;
     }
-    let side =
-        voters.iter().map(|&ray| direction_to(scene, ray, &found.point)).sum::<Vector3<f64>>() / voters.len() as f64;
-    Some(Label {
-        estimate: found,
-        side,
-        class,
-        voters,
-        undecided: Vec::new(),
-        unseen_from: Vec::new(),
-        is_exact: tolerance_m <= EXACT_M,
-    })
+    None
+}
+
+/// The votes that fit the gate; of a label with others the worst leave first, since one bad vote makes good ones look bad.
+#[must_use]
+pub fn fitting(votes: &[((usize, u32), f64)], gate_sigmas: f64) -> Vec<(usize, u32)> {
+    let labels = votes.iter().map(|((label, _), _)| label + 1).max().unwrap_or(0);
+    let mut worst = vec![0.0_f64; labels];
+    for ((label, _), chi2) in votes {
+        worst[*label] = worst[*label].max(*chi2);
+    }
+    let limit = gate_sigmas * gate_sigmas;
+    let fits = |((label, _), chi2): &&((usize, u32), f64)| *chi2 < limit || *chi2 < 0.5 * worst[*label];
+    votes.iter().filter(fits).map(|(vote, _)| *vote).collect()
+}
+
+/// Mean of the unit directions from a point to the cameras of its voters.
+#[must_use]
+pub fn side_of(scene: &Scene, voters: &[u32], point: &Vector3<f64>) -> Vector3<f64> {
+    voters.iter().map(|&ray| direction_to(scene, ray, point)).sum::<Vector3<f64>>() / voters.len() as f64
+}
+
+/// A number that tells sets of rays, in one order, from others.
+#[must_use]
+pub fn fingerprint(rays: &[u32]) -> u64 {
+    let mut hasher = FxHasher::default();
+    rays.hash(&mut hasher);
+    hasher.finish()
 }
 
 /// Unit direction from a point to the camera of a ray.
@@ -105,6 +171,33 @@ impl Label {
         let mut images: Vec<u32> = self.voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
         images.sort_unstable();
         images
+    }
+
+    /// A fingerprint of what it was when it last changed.
+    #[must_use]
+    pub fn identity(&self) -> u64 {
+        let mut hasher = FxHasher::default();
+        let point = if self.revision == Revision::default() { self.estimate.point } else { self.revision.point };
+        (fingerprint(&self.voters), self.unseen_from.len(), self.class).hash(&mut hasher);
+        point.iter().for_each(|number| number.to_bits().hash(&mut hasher));
+        hasher.finish()
+    }
+
+    /// Note where it was estimated to be; it is what it was if it has the same voters and moved but little.
+    pub fn revise(&mut self) {
+        let voters = fingerprint(&self.voters);
+        let step = self.estimate.point - self.revision.point;
+        let moved = self.estimate.covariance.cholesky().map(|cholesky| step.dot(&cholesky.solve(&step)));
+        if voters != self.revision.voters || !moved.is_some_and(|chi2| chi2 < SMALL_MOVE_CHI2) {
+            self.revision = Revision { voters, point: self.estimate.point, place: self.revision.place };
+            self.known = Known::default();
+        }
+    }
+
+    /// Where it is, as far as visits other than a view's tell.
+    #[must_use]
+    pub fn elsewhere(&self, view: &View) -> Estimate {
+        self.elsewhere.iter().find(|other| other.leaves_out(view)).map_or(self.estimate, |other| other.estimate)
     }
 
     /// Whether a ray's camera is on the side that the label is seen from.

@@ -12,6 +12,7 @@
 //! 6. [`estimate`](mod@estimate): position and covariance, with pose errors that a pass shares ([`drift`]).
 //! 7. [`calibrate`](mod@calibrate): the noise itself is estimated from the labels' residuals.
 
+pub mod adjust;
 pub mod associate;
 pub mod calibrate;
 pub mod drift;
@@ -29,17 +30,21 @@ pub mod sample;
 pub mod scene;
 pub mod settle;
 
+use std::sync::Arc;
+
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use crate::hypothesis::Viability;
 use crate::progress::{Halt, Progress};
 
+use adjust::adjust;
+use associate::Association;
 use calibrate::Known;
 use existence::{Lookout, Looks, Rates, Sector};
 use gather::{VOTE_RANGE, gather};
 use index::RayIndex;
-use label::{EXACT_M, Label};
+use label::{EXACT_M, Label, ROUGH_M};
 use noise::{Noise, Spread};
 use scene::Scene;
 
@@ -146,7 +151,7 @@ pub fn self_calibrate(
         let (mut labels, _) = gather(scene, &noise, &settings, &rays, progress)?;
         if round == CALIBRATION_ROUNDS {
             let spreads = spreads_of(scene, &noise);
-            let court = Court::new(scene, &noise, &spreads, &settings, rays.iter().copied());
+            let mut court = Court::new(scene, &noise, &spreads, &settings, rays.iter().copied());
             for _ in 0..SETTLING_ROUNDS {
                 progress.check()?;
                 labels = court.settle(labels, true, &mut Tally::default(), progress)?;
@@ -164,7 +169,7 @@ pub fn self_calibrate(
 pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progress) -> Result<Findings, Halt> {
     let all = 0..scene.rays.rays.len() as u32;
     let spreads = spreads_of(scene, noise);
-    let court = Court::new(scene, noise, &spreads, settings, all.clone());
+    let mut court = Court::new(scene, noise, &spreads, settings, all.clone());
     let lookout = Lookout::new(scene);
     let mut tally = Tally::default();
     let mut labels: Vec<Label> = Vec::new();
@@ -175,24 +180,25 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
             claimed[ray as usize] = true;
         }
         let free: Vec<u32> = all.clone().filter(|&ray| !claimed[ray as usize]).collect();
-        let before: Vec<u32> = labels.iter().map(settle::first_voter).collect();
+        let before = labels.len();
         let (more, [nominations, accepted]) = gather(scene, noise, settings, &free, progress)?;
         tally.nominations += nominations;
         tally.accepted += accepted;
-        labels.extend(more);
+        labels = court.admit(&lookout, labels, more, &mut tally);
         labels.sort_by_key(settle::first_voter);
         for _ in 0..SETTLING_ROUNDS {
             progress.check()?;
             labels = court.settle(labels, true, &mut tally, progress)?;
         }
         labels = court.doubt(&lookout, labels, &mut tally, progress)?;
-        if labels.iter().map(settle::first_voter).eq(before) {
+        if labels.len() <= before {
             break;
         }
     }
+    let labels = adjust(scene, noise, settings.gate_sigmas, settings.min_votes as usize, &labels, EXACT_M);
     let Judgement { of_labels, rates, strays_per_image } =
         judge(scene, &spreads, &sectors_of(&lookout, &labels), &labels, settings, tally.doubted);
-    let variance_factor = calibrate::variance_factor(scene, noise, &labels.iter().collect::<Vec<_>>());
+    let variance_factor = calibrate::variance_factor(scene, noise, &labels);
     let findings = labels.into_iter().zip(of_labels).map(|(mut label, (existence, expected))| {
         label.estimate.covariance *= variance_factor;
         Finding { label, existence, expected }
@@ -206,7 +212,7 @@ struct Court<'a> {
     noise: &'a Noise,
     spreads: &'a [Spread],
     settings: &'a Settings,
-    index: RayIndex<'a>,
+    association: Association<'a>,
 }
 
 impl<'a> Court<'a> {
@@ -217,25 +223,28 @@ impl<'a> Court<'a> {
         settings: &'a Settings,
         rays: impl Iterator<Item = u32>,
     ) -> Self {
-        Self { scene, noise, spreads, settings, index: RayIndex::new(scene, spreads, settings.gate_sigmas, rays) }
+        let index = RayIndex::new(scene, spreads, settings.gate_sigmas, rays);
+        let range_m = settings.viability.max_range_m * VOTE_RANGE;
+        Self { scene, noise, spreads, settings, association: Association::new(scene, noise, index, range_m) }
     }
 
     /// One round: neighbors exchange votes, all labels compete for all rays, those that are two are split and those that are
     /// one are fused.
     fn settle(
-        &self,
+        &mut self,
         labels: Vec<Label>,
         may_split: bool,
         tally: &mut Tally,
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
-        let &Self { scene, noise, settings, ref index, .. } = self;
+        let &mut Self { scene, noise, settings, .. } = self;
         let gate = settings.gate_sigmas;
         let min_votes = settings.min_votes as usize;
-        let range_m = settings.viability.max_range_m * VOTE_RANGE;
         let before = labels.len();
         let labels = exchange::exchange(scene, noise, gate, labels);
-        let labels = settle::reassign(scene, noise, index, &labels, range_m, min_votes, progress)?;
+        let mut labels = self.association.associate(labels, progress)?;
+        labels.retain(|label| label.voters.len() >= min_votes);
+        let labels = adjust(scene, noise, gate, min_votes, &labels, ROUGH_M);
         let left = labels.len();
         let labels = if may_split { settle::split(scene, noise, gate, labels, min_votes) } else { labels };
         let labels = if settings.without.merge { labels } else { settle::fuse(scene, noise, gate, labels) };
@@ -244,16 +253,31 @@ impl<'a> Court<'a> {
         Ok(labels)
     }
 
+    /// Some labels with those of others that may exist with what they have.
+    fn admit(&self, lookout: &Lookout<'_>, mut labels: Vec<Label>, new: Vec<Label>, tally: &mut Tally) -> Vec<Label> {
+        let old = labels.len();
+        labels.extend(new);
+        let sectors = sectors_of(lookout, &labels);
+        let judgement = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.doubted);
+        let before = labels.len();
+        let limit = if old == 0 { 0.0 } else { DOUBTS[1] * self.settings.min_existence };
+        let admitted = labels.into_iter().zip(judgement.of_labels).enumerate();
+        let admitted = admitted.filter(|(i, (_, (existence, _)))| *i < old || *existence >= limit);
+        let labels: Vec<Label> = admitted.map(|(_, (label, _))| label).collect();
+        tally.doubted += (before - labels.len()) as u64;
+        labels
+    }
+
     /// Take votes away from labels that look as if they were not to be seen from there. Also the sectors of those left.
     fn look_around(
         &self,
         lookout: &Lookout<'_>,
         labels: Vec<Label>,
         tally: &mut Tally,
-    ) -> (Vec<Label>, Vec<Vec<Sector>>) {
+    ) -> (Vec<Label>, Vec<Arc<[Sector]>>) {
         let before = labels.len();
         let sectors = sectors_of(lookout, &labels);
-        let of_label = |(label, sectors): (Label, Vec<Sector>)| {
+        let of_label = |(label, sectors): (Label, Arc<[Sector]>)| {
             let stray: Vec<Vector3<f64>> =
                 sectors.iter().filter(|sector| sector.is_stray()).map(|sector| sector.direction).collect();
             if stray.is_empty() {
@@ -263,10 +287,10 @@ impl<'a> Court<'a> {
             let label = Label { unseen_from: unseen_from.clone(), ..label };
             let seen = label.voters.iter().copied().filter(|&ray| label.faces(self.scene, ray)).collect();
             let start = label.estimate.point;
-            let found = label::from_voters(self.scene, self.noise, self.settings.gate_sigmas, seen, start, EXACT_M)?;
+            let found = label::from_voters(self.scene, self.noise, self.settings.gate_sigmas, seen, start)?;
             let enough = found.voters.len() >= self.settings.min_votes as usize;
             let left = enough.then_some(Label { undecided: label.undecided, unseen_from, ..found })?;
-            let sectors = lookout.sectors(&left);
+            let sectors = sectors_of_label(lookout, &left);
             Some((left, sectors))
         };
         let (labels, sectors): (Vec<Label>, Vec<_>) =
@@ -278,7 +302,7 @@ impl<'a> Court<'a> {
     /// Drop the labels that probably do not exist, the least probable first: what they give back may be just what a doubtful
     /// one lacks.
     fn doubt(
-        &self,
+        &mut self,
         lookout: &Lookout<'_>,
         mut labels: Vec<Label>,
         tally: &mut Tally,
@@ -313,14 +337,18 @@ struct Judgement {
     strays_per_image: f64,
 }
 
-fn sectors_of(lookout: &Lookout<'_>, labels: &[Label]) -> Vec<Vec<Sector>> {
-    labels.par_iter().map(|label| lookout.sectors(label)).collect()
+fn sectors_of(lookout: &Lookout<'_>, labels: &[Label]) -> Vec<Arc<[Sector]>> {
+    labels.par_iter().map(|label| sectors_of_label(lookout, label)).collect()
+}
+
+fn sectors_of_label(lookout: &Lookout<'_>, label: &Label) -> Arc<[Sector]> {
+    Arc::clone(label.known.sectors.get_or_init(|| lookout.sectors(label).into()))
 }
 
 fn judge(
     scene: &Scene,
     spreads: &[Spread],
-    sectors: &[Vec<Sector>],
+    sectors: &[Arc<[Sector]>],
     labels: &[Label],
     settings: &Settings,
     doubted: u64,

@@ -7,6 +7,7 @@
 use nalgebra::{Matrix2, SMatrix, Vector2};
 
 use super::drift::{DRIFT_LENGTH_M, LEG_M, Look, Matrix6, Vector6};
+use super::scene::View;
 
 /// What is known of the drift of a leg, in sigmas of the drift: information and gradient.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -116,19 +117,28 @@ fn rows_of(look: &Look) -> SMatrix<f64, 2, 6> {
     SMatrix::<f64, 2, 6>::from_rows(&[look.by_pose[0].transpose(), look.by_pose[1].transpose()])
 }
 
-/// Cut places along a drive, by how far the pass had driven there (m), into legs of one drift: the number of each place's
-/// leg, ascending from 0.
-#[must_use]
-pub fn legs(driven_m: &[f64]) -> Vec<usize> {
-    let mut leg = 0;
-    let mut start = driven_m.first().copied().unwrap_or_default();
-    let of_place = |&driven: &f64| {
-        if (driven - start).abs() > LEG_M {
-            (leg, start) = (leg + 1, driven);
-        }
-        leg
-    };
-    driven_m.iter().map(of_place).collect()
+/// The drives of a scene, cut into legs of one drift each.
+pub struct Legs {
+    /// The leg of each view.
+    pub of_view: Vec<u32>,
+    /// The pass of each leg, ascending.
+    pub pass: Vec<u32>,
+    /// Where each leg begins, m driven.
+    pub start_m: Vec<f64>,
+}
+
+impl Legs {
+    /// Cut the drives of all passes.
+    #[must_use]
+    pub fn new(views: &[View]) -> Self {
+        let step_of = |view: &View| (view.pass, (view.driven_m / LEG_M).floor() as i64);
+        let mut steps: Vec<(u32, i64)> = views.iter().map(step_of).collect();
+        steps.sort_unstable();
+        steps.dedup();
+        let of_view = views.iter().map(|view| steps.partition_point(|step| *step < step_of(view)) as u32).collect();
+        let start_m = steps.iter().map(|(_, step)| *step as f64 * LEG_M).collect();
+        Self { of_view, pass: steps.into_iter().map(|(pass, _)| pass).collect(), start_m }
+    }
 }
 
 /// What is known of the drift of each leg, from its own looks and those of all other legs of the pass; `starts_m` is where

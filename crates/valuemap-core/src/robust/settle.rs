@@ -3,13 +3,10 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use super::associate::{Verdict, associate};
 use super::calibrate::variance_factor;
-use super::index::RayIndex;
-use super::label::{EXACT_M, Label, by_place, direction_to, from_voters};
+use super::label::{Label, by_place, direction_to, from_voters};
 use super::noise::Noise;
 use super::scene::Scene;
-use crate::progress::{Halt, Progress};
 
 /// Squared Mahalanobis distance up to which two positions agree: the 99.7 % quantile of chi² with 3 degrees of freedom.
 const AGREEMENT_CHI2: f64 = 14.0;
@@ -22,47 +19,12 @@ const NEIGHBOR_M: f64 = 6.0;
 /// Two labels may share this part of the images of the smaller one and still be one object: clutter beside it.
 const SHARED_IMAGES: f64 = 0.15;
 
-/// Give every detection to the label that it fits best, one detection an image and label, and estimate again.
-///
-/// Labels that keep fewer than `min_votes` are dropped.
-///
-/// # Errors
-/// [`Halt::Cancelled`] when `progress` says so.
-pub fn reassign(
-    scene: &Scene,
-    noise: &Noise,
-    index: &RayIndex<'_>,
-    labels: &[Label],
-    range_m: f64,
-    min_votes: usize,
-    progress: &Progress,
-) -> Result<Vec<Label>, Halt> {
-    let verdicts = associate(scene, noise, index, labels, range_m, progress)?;
-    let kept = labels
-        .par_iter()
-        .zip(verdicts)
-        .filter(|(_, verdict)| verdict.voters.len() >= min_votes)
-        .filter_map(|(label, Verdict { mut voters, undecided })| {
-            progress.check().ok()?;
-            scene.sort_by_pass(&mut voters);
-            if label.is_exact && voters == label.voters {
-                return Some(Label { undecided, ..label.clone() });
-            }
-            let found = from_voters(scene, noise, index.gate_sigmas(), voters, label.estimate.point, EXACT_M)?;
-            Some(Label { undecided, unseen_from: label.unseen_from.clone(), ..found })
-        })
-        .filter(|label| label.voters.len() >= min_votes)
-        .collect();
-    progress.check()?;
-    Ok(kept)
-}
-
 /// Make one of any two labels of a class whose positions agree within their covariances, unless their images say that
 /// they are two: images in which both have a detection of their own. The nearest pair first.
 #[must_use]
 pub fn fuse(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) -> Vec<Label> {
     let mut labels = labels;
-    let factor = variance_factor(scene, noise, &labels.iter().collect::<Vec<_>>());
+    let factor = variance_factor(scene, noise, &labels);
     loop {
         let mut pairs = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor);
         if pairs.is_empty() {
@@ -88,14 +50,18 @@ pub fn fuse(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) 
 /// which no image shows together.
 #[must_use]
 pub fn split(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>, min_votes: usize) -> Vec<Label> {
-    let factor = variance_factor(scene, noise, &labels.iter().collect::<Vec<_>>());
-    let parts = |label: Label| -> Vec<Label> {
+    let factor = variance_factor(scene, noise, &labels);
+    let parts = |mut label: Label| -> Vec<Label> {
+        if label.known.is_one {
+            return vec![label];
+        }
+        label.known.is_one = true;
         let sides = two_sides(scene, &label);
         if sides.iter().any(|side| side.len() < min_votes) {
             return vec![label];
         }
         let start = label.estimate.point;
-        let apart = sides.map(|side| from_voters(scene, noise, gate_sigmas, side, start, EXACT_M));
+        let apart = sides.map(|side| from_voters(scene, noise, gate_sigmas, side, start));
         match apart {
             [Some(a), Some(b)]
                 if a.voters.len().min(b.voters.len()) >= min_votes
@@ -183,5 +149,5 @@ fn union(scene: &Scene, noise: &Noise, gate_sigmas: f64, a: &Label, b: &Label) -
     let mut voters = large.voters.clone();
     let new = |ray: &&u32| images.binary_search(&scene.rays.image[**ray as usize]).is_err();
     voters.extend(small.voters.iter().filter(new));
-    from_voters(scene, noise, gate_sigmas, voters, large.estimate.point, EXACT_M).unwrap_or_else(|| large.clone())
+    from_voters(scene, noise, gate_sigmas, voters, large.estimate.point).unwrap_or_else(|| large.clone())
 }
