@@ -6,7 +6,7 @@
 //! go together, the assignment with the least sum of costs wins (joint compatibility; the costs are those of maximum
 //! likelihood).
 
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 
 use nalgebra::{Matrix2, SMatrix, Vector3};
 use pathfinding::prelude::{Matrix, kuhn_munkres_min};
@@ -106,9 +106,9 @@ impl<'a> Association<'a> {
     pub fn associate(&mut self, labels: Vec<Label>, progress: &Progress) -> Result<Vec<Label>, Halt> {
         let claims_of = |label: &Label| {
             progress.check()?;
-            let known =
-                label.known.claims.get_or_init(|| claims_of(self.scene, &self.index, label, self.range_m).into());
-            Ok((label.identity(), Arc::clone(known)))
+            let identity = label.identity();
+            let found = || claims_of(self.scene, &self.index, label, self.range_m).into();
+            Ok((identity, self.last.get(&identity).map_or_else(found, Arc::clone)))
         };
         let claims: Vec<(u64, Arc<[Claim]>)> = labels.par_iter().map(claims_of).collect::<Result<_, Halt>>()?;
         let is_open = self.open_legs(&claims);
@@ -203,11 +203,7 @@ impl<'a> Association<'a> {
 fn given_to(scene: &Scene, label: Label, mut voters: Vec<u32>, mut undecided: Vec<u32>) -> Label {
     scene.sort_by_pass(&mut voters);
     undecided.sort_unstable();
-    let mut label = label;
-    if undecided != label.undecided {
-        label.undecided = undecided;
-        label.known.sectors = OnceLock::new();
-    }
+    let mut label = Label { undecided, ..label };
     let fitting = || voters.iter().copied().filter(|ray| !label.refused.contains(ray));
     if !fitting().eq(label.voters.iter().copied()) {
         label.refused.clear();

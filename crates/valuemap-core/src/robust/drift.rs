@@ -9,10 +9,11 @@
 
 use std::ops::Range;
 
-use nalgebra::{Cholesky, Const, DMatrix, DVector, Matrix2, Matrix3, SMatrix, SVector, Vector2, Vector3};
+use nalgebra::{Cholesky, Const, DMatrix, DVector, Matrix2, Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
 
 use super::noise::Noise;
 use super::scene::Scene;
+use crate::ray::Ray;
 
 pub(super) type Matrix6 = SMatrix<f64, 6, 6>;
 pub(super) type Vector6 = SVector<f64, 6>;
@@ -54,7 +55,39 @@ impl Look {
     /// The look of a ray at one of some labels, which is at `point`; nothing if that is behind it.
     #[must_use]
     pub fn of(scene: &Scene, noise: &Noise, ray: u32, label: usize, point: &Vector3<f64>) -> Option<Self> {
-        let (seen, view) = (scene.ray(ray), scene.view(ray));
+        Self::of_ray(scene, noise, scene.ray(ray), ray, label, point)
+    }
+
+    /// The same with its derivatives where its image probably was, whose pose error is about `error`, m and rad.
+    ///
+    /// Derivatives at the measured poses are wrong in the same way as the residuals are: what both have in common
+    /// moves a label away from the cameras, however many look at it.
+    #[must_use]
+    pub fn where_it_was(
+        scene: &Scene,
+        noise: &Noise,
+        ray: u32,
+        label: usize,
+        point: &Vector3<f64>,
+        error: &Vector6,
+    ) -> Option<Self> {
+        let (shift, turn) = (error.fixed_rows::<3>(0), error.fixed_rows::<3>(3));
+        let measured = scene.ray(ray);
+        let turn = Rotation3::from_scaled_axis(turn.into_owned());
+        let probable = Ray {
+            residual_from_world: measured.residual_from_world * turn.inverse(),
+            center: measured.center + shift,
+            direction: turn * measured.direction,
+        };
+        let mut look = Self::of_ray(scene, noise, &probable, ray, label, point)?;
+        for (residual, by_pose) in look.residual.iter_mut().zip(&look.by_pose) {
+            *residual += by_pose.dot(error);
+        }
+        Some(look)
+    }
+
+    fn of_ray(scene: &Scene, noise: &Noise, seen: &Ray, ray: u32, label: usize, point: &Vector3<f64>) -> Option<Self> {
+        let view = scene.view(ray);
         let (residual, rows) = seen.linearize(point)?;
         let away = point - seen.center;
         let by_point = rows.map(|row| row.transpose());
@@ -93,6 +126,11 @@ impl Look {
         }
         self.drift_sigma = *sigma;
         self
+    }
+
+    /// The residual, px, without what a pose error, m and rad, makes of it.
+    fn without(&self, error: &Vector6) -> Vector2<f64> {
+        Vector2::from([0, 1].map(|axis| self.residual[axis] - self.by_pose[axis].dot(error)))
     }
 
     /// Squared residual in sigmas, studentised: a vote that pulls the point towards itself has a small residual, and is expected
@@ -211,18 +249,46 @@ impl<'a> Drive<'a> {
     /// Residuals, px, after the most probable drift is taken out, in the order of the looks.
     #[must_use]
     pub fn left(&self) -> Vec<Vector2<f64>> {
-        let mut left = vec![Vector2::zeros(); self.looks.len()];
+        self.looks.iter().zip(self.drifts()).map(|(look, drift)| look.without(&drift)).collect()
+    }
+
+    /// The most probable drift at each look, m and rad.
+    fn drifts(&self) -> Vec<Vector6> {
+        let mut drifts = vec![Vector6::zeros(); self.looks.len()];
         let mut drift_of_next = Vector6::zeros();
         for leg in self.legs.iter().rev() {
-            let drift = leg.information.solve(&(drift_of_next * leg.tie - leg.gradient));
+            let drift = leg.information.solve(&(drift_of_next * leg.tie + leg.gradient));
             for i in leg.looks.clone() {
-                let look = &self.looks[i];
-                let pose = drift.component_mul(&look.drift_sigma);
-                left[i] = Vector2::from([0, 1].map(|axis| look.residual[axis] + look.by_pose[axis].dot(&pose)));
+                drifts[i] = drift.component_mul(&self.looks[i].drift_sigma);
             }
             drift_of_next = drift;
         }
-        left
+        drifts
+    }
+
+    /// The most probable pose error of the image of each look, drift and its own, m and rad.
+    #[must_use]
+    pub fn pose_errors(&self, weights: &[f64]) -> Vec<Vector6> {
+        let mut errors = self.drifts();
+        let mut at = 0;
+        for image in self.looks.chunk_by(|a, b| a.image == b.image) {
+            let own = Matrix6::from_diagonal(&image[0].own_sigma);
+            let (mut of_pose, mut gradient) = (Matrix6::zeros(), Vector6::zeros());
+            for (i, look) in image.iter().enumerate() {
+                let left = look.without(&errors[at + i]);
+                for (pose, r) in look.by_pose.iter().zip(left.iter()) {
+                    let weighted = pose * (weights[at + i] / look.detection_px2);
+                    of_pose += pose * weighted.transpose();
+                    gradient += weighted * *r;
+                }
+            }
+            if let Some(known) = (Matrix6::identity() + own * of_pose * own).cholesky() {
+                let of_image = own * known.solve(&(own * gradient));
+                errors[at..at + image.len()].iter_mut().for_each(|error| *error += of_image);
+            }
+            at += image.len();
+        }
+        errors
     }
 }
 

@@ -7,7 +7,7 @@
 
 use nalgebra::{DMatrix, Matrix3, Vector2, Vector3};
 
-use super::drift::{Drive, Look, Normals};
+use super::drift::{Drive, Look, Normals, Vector6};
 use super::label::EXACT_M;
 use super::noise::Noise;
 use super::scene::{Scene, View};
@@ -61,6 +61,8 @@ pub struct Joint<'a> {
     /// Label and ray of each vote, by visit and image.
     votes: Vec<(usize, u32)>,
     weights: Vec<f64>,
+    /// The most probable pose error of the image of each vote, m and rad.
+    pose_errors: Vec<Vector6>,
     points: Vec<Vector3<f64>>,
     tolerance_m: f64,
 }
@@ -88,7 +90,9 @@ impl<'a> Joint<'a> {
             points.push(start);
         }
         votes.sort_unstable_by_key(|&(label, ray)| (scene.view(ray).pass, ray, label));
-        Self { scene, noise, weights: vec![1.0; votes.len()], votes, points, tolerance_m }
+        let count = votes.len();
+        let (weights, pose_errors) = (vec![1.0; count], vec![Vector6::zeros(); count]);
+        Self { scene, noise, votes, weights, pose_errors, points, tolerance_m }
     }
 
     /// Estimate the positions.
@@ -103,6 +107,9 @@ impl<'a> Joint<'a> {
             self.weights = here.own.iter().map(|chi2| (HUBER_SIGMAS / chi2.sqrt()).min(1.0)).collect();
             if longest < self.tolerance_m || round == rounds {
                 break;
+            }
+            if self.tolerance_m <= EXACT_M {
+                self.pose_errors.clone_from(&here.pose_errors);
             }
             here = self.evaluate()?;
         }
@@ -136,20 +143,29 @@ impl<'a> Joint<'a> {
     }
 
     fn evaluate(&self) -> Option<Evaluation> {
-        let of_vote = |&(label, ray): &(usize, u32)| {
-            let look = Look::of(self.scene, self.noise, ray, label, &self.points[label])?;
-            Some(if self.tolerance_m > EXACT_M || self.points.len() == 1 { look.by_itself() } else { look })
+        let is_rough = self.tolerance_m > EXACT_M;
+        let of_vote = |(&(label, ray), error): (&(usize, u32), &Vector6)| {
+            let (scene, noise, point) = (self.scene, self.noise, &self.points[label]);
+            if is_rough {
+                Some(Look::of(scene, noise, ray, label, point)?.by_itself())
+            } else {
+                Look::where_it_was(scene, noise, ray, label, point, error)
+            }
         };
-        let looks: Vec<Look> = self.votes.iter().map(of_vote).collect::<Option<_>>()?;
+        let looks: Vec<Look> = self.votes.iter().zip(&self.pose_errors).map(of_vote).collect::<Option<_>>()?;
         let mut normals = Normals::nothing(self.points.len());
         let mut of_visits = Vec::new();
+        let mut pose_errors = Vec::new();
         let mut left: Vec<Vector2<f64>> = Vec::with_capacity(looks.len());
         for votes in self.visits() {
             let range = left.len()..left.len() + votes.len();
-            let drive = Drive::along(&looks[range.clone()], &self.weights[range], self.points.len())?;
+            let drive = Drive::along(&looks[range.clone()], &self.weights[range.clone()], self.points.len())?;
             normals.information += &drive.normals.information;
             normals.gradient += &drive.normals.gradient;
             left.extend(drive.left());
+            if !is_rough {
+                pose_errors.extend(drive.pose_errors(&self.weights[range]));
+            }
             of_visits.push(drive.normals);
         }
         let mut alone = vec![Matrix3::zeros(); self.points.len()];
@@ -168,7 +184,7 @@ impl<'a> Joint<'a> {
                 normals.add_gradient(label, &gradient);
             }
         }
-        Some(Evaluation { normals, of_visits, own })
+        Some(Evaluation { normals, of_visits, own, pose_errors })
     }
 }
 
@@ -217,8 +233,10 @@ impl Solution<'_> {
 struct Evaluation {
     normals: Normals,
     of_visits: Vec<Normals>,
-    /// See [`Joint::own_chi2`].
+    /// See [`Solution::own_chi2`].
     own: Vec<f64>,
+    /// The most probable pose error of the image of each vote; none while estimates are rough.
+    pose_errors: Vec<Vector6>,
 }
 
 /// Estimate the position of one label from its voters, starting nearby, until a step is shorter than the tolerance.

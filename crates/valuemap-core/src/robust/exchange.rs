@@ -29,42 +29,35 @@ const CUT_CHI2: f64 = 16.0;
 /// An exchange must lower the sum of squared residuals by so much.
 const LEAST_GAIN: f64 = 8.0;
 
-/// Let neighbours exchange votes where their images say so; what only one of them has in an image is given anew. The nearest pairs first, each label in one pair.
+/// Let neighbours exchange votes where their images say so; what only one of them has in an image is given anew. The
+/// nearest pairs first, each label in one pair.
 #[must_use]
 pub fn exchange(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) -> Vec<Label> {
     let pairs = nearest_pairs(&labels);
-    let of_pair = |&(a, b): &(usize, usize)| {
-        let (a, b) = (&labels[a], &labels[b]);
-        let neighbor = b.identity();
-        if a.known.untangled.get() == Some(&neighbor) {
-            return None;
-        }
-        let exchanged = exchange_pair(scene, noise, gate_sigmas, a, b);
-        if exchanged.is_none() {
-            // Only the first neighbor is remembered.
-            a.known.untangled.get_or_init(|| neighbor);
-        }
-        exchanged
-    };
+    let of_pair = |&(a, b): &(usize, usize)| exchange_pair(scene, noise, gate_sigmas, &labels[a], &labels[b]);
     let exchanged: Vec<Option<[Label; 2]>> = pairs.par_iter().map(of_pair).collect();
     let mut labels = labels;
     for (&(a, b), new) in pairs.iter().zip(exchanged) {
-        if let Some([new_a, new_b]) = new {
-            (labels[a], labels[b]) = (new_a, new_b);
+        if let Some(new) = new {
+            [labels[a], labels[b]] = new;
+        } else {
+            let neighbor = labels[b].identity();
+            labels[a].known.untangled.push(neighbor);
         }
     }
     labels.sort_by_key(first_voter);
     labels
 }
 
-/// Disjoint pairs of neighbours of one class, the nearest first.
+/// Disjoint pairs of neighbours of one class that may have votes to exchange, the nearest first.
 fn nearest_pairs(labels: &[Label]) -> Vec<(usize, usize)> {
     let tree = by_place(labels);
     let mut near: Vec<(f64, usize, usize)> = Vec::new();
     for (a, label) in labels.iter().enumerate() {
         for other in tree.locate_within_distance(label.estimate.point.into(), PAIR_M * PAIR_M) {
             let b = other.data;
-            if b > a && labels[b].class == label.class {
+            let is_open = || !label.known.untangled.contains(&labels[b].identity());
+            if b > a && labels[b].class == label.class && is_open() {
                 near.push(((labels[b].estimate.point - label.estimate.point).norm(), a, b));
             }
         }

@@ -1,23 +1,21 @@
 //! A label in the making: a point, the rays that support it, and the side it is seen from.
 
 use std::hash::{Hash, Hasher};
-use std::sync::{Arc, OnceLock};
+use std::sync::OnceLock;
 
 use nalgebra::Vector3;
 use rstar::RTree;
 use rstar::primitives::GeomWithData;
 use rustc_hash::FxHasher;
 
-use super::associate::Claim;
 use super::estimate::{Elsewhere, Estimate, Joint};
-use super::existence::Sector;
 use super::noise::Noise;
 use super::scene::{Scene, View};
 
 /// Good enough while voters are still being gathered, m.
 pub const ROUGH_M: f64 = 1e-2;
 /// Good enough for good, m.
-pub const EXACT_M: f64 = 1e-7;
+pub const EXACT_M: f64 = 1e-5;
 /// A label that moved by less, squared and in sigmas, is what it was.
 const SMALL_MOVE_CHI2: f64 = 0.01;
 /// Rounds of leaving out voters, at most.
@@ -70,16 +68,12 @@ pub struct Revision {
 /// What was found out about a label as it is; forgotten when it changes.
 #[derive(Debug, Clone, Default)]
 pub struct Known {
-    /// Detections that it may have.
-    pub claims: OnceLock<Arc<[Claim]>>,
-    /// The directions that it is looked at from.
-    pub sectors: OnceLock<Arc<[Sector]>>,
     /// How far its visits disagree, see [`variance_factor`](super::calibrate::variance_factor).
     pub disagreement: OnceLock<Option<f64>>,
     /// Whether it was found not to be two.
     pub is_one: bool,
-    /// The neighbor, as it was, that it was found to have no votes to exchange with.
-    pub untangled: OnceLock<u64>,
+    /// Neighbors, as they were, that it was found to have no votes to exchange with.
+    pub untangled: Vec<u64>,
 }
 
 /// Estimate from voters in any order, without those that disagree with the others of their pass.

@@ -5,11 +5,12 @@
 //! 3. [`gather`](mod@gather): the best supported nomination is polished to a [`label`], on its voters and from its estimate,
 //!    until the voters stay the same ([`quick`]); its voters leave; and so on. Rays left over get further rounds among
 //!    themselves.
-//! 4. [`settle`]: all labels compete for all detections ([`associate`](mod@associate)), the pose errors of the images taken out
-//!    ([`poses`]), neighbors first untangled ([`exchange`](mod@exchange)); labels that agree within their covariances and
-//!    are never seen side by side become one.
+//! 4. [`associate`](mod@associate): all labels compete for all detections, the pose errors of the images taken out
+//!    ([`poses`]), neighbors first untangled ([`exchange`](mod@exchange)); then the labels of each place are estimated together
+//!    ([`adjust`](mod@adjust)), and those that agree within their covariances and are never seen side by side become one
+//!    ([`settle`]). Again and again, but only where labels changed.
 //! 5. [`existence`]: hits and misses among the looks that should have seen it say how probable a label is.
-//! 6. [`estimate`](mod@estimate): position and covariance, with pose errors that a pass shares ([`drift`]).
+//! 6. [`estimate`](mod@estimate): positions and covariances, with the pose errors of images and passes ([`drift`]).
 //! 7. [`calibrate`](mod@calibrate): the noise itself is estimated from the labels' residuals.
 
 pub mod adjust;
@@ -34,6 +35,7 @@ use std::sync::Arc;
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
+use rustc_hash::FxHashMap;
 
 use crate::hypothesis::Viability;
 use crate::progress::{Halt, Progress};
@@ -44,7 +46,7 @@ use calibrate::Known;
 use existence::{Lookout, Looks, Rates, Sector};
 use gather::{VOTE_RANGE, gather};
 use index::RayIndex;
-use label::{EXACT_M, Label, ROUGH_M};
+use label::{EXACT_M, Label, ROUGH_M, fingerprint};
 use noise::{Noise, Spread};
 use scene::Scene;
 
@@ -197,7 +199,7 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
     }
     let labels = adjust(scene, noise, settings.gate_sigmas, settings.min_votes as usize, &labels, EXACT_M);
     let Judgement { of_labels, rates, strays_per_image } =
-        judge(scene, &spreads, &sectors_of(&lookout, &labels), &labels, settings, tally.doubted);
+        judge(scene, &spreads, &court.sectors(&lookout, &labels), &labels, settings, tally.doubted);
     let variance_factor = calibrate::variance_factor(scene, noise, &labels);
     let findings = labels.into_iter().zip(of_labels).map(|(mut label, (existence, expected))| {
         label.estimate.covariance *= variance_factor;
@@ -213,6 +215,8 @@ struct Court<'a> {
     spreads: &'a [Spread],
     settings: &'a Settings,
     association: Association<'a>,
+    /// The sectors of the labels as they last were.
+    seen_from: FxHashMap<(u64, u64), Arc<[Sector]>>,
 }
 
 impl<'a> Court<'a> {
@@ -225,7 +229,14 @@ impl<'a> Court<'a> {
     ) -> Self {
         let index = RayIndex::new(scene, spreads, settings.gate_sigmas, rays);
         let range_m = settings.viability.max_range_m * VOTE_RANGE;
-        Self { scene, noise, spreads, settings, association: Association::new(scene, noise, index, range_m) }
+        Self {
+            scene,
+            noise,
+            spreads,
+            settings,
+            association: Association::new(scene, noise, index, range_m),
+            seen_from: FxHashMap::default(),
+        }
     }
 
     /// One round: neighbors exchange votes, all labels compete for all rays, those that are two are split and those that are
@@ -253,11 +264,28 @@ impl<'a> Court<'a> {
         Ok(labels)
     }
 
+    /// The sectors that each label is seen from.
+    fn sectors(&mut self, lookout: &Lookout<'_>, labels: &[Label]) -> Vec<Arc<[Sector]>> {
+        let key_of = |label: &Label| (label.identity(), fingerprint(&label.undecided));
+        let of_label = |label: &Label| {
+            self.seen_from.get(&key_of(label)).map_or_else(|| lookout.sectors(label).into(), Arc::clone)
+        };
+        let found: Vec<Arc<[Sector]>> = labels.par_iter().map(of_label).collect();
+        self.seen_from = labels.iter().map(key_of).zip(found.iter().cloned()).collect();
+        found
+    }
+
     /// Some labels with those of others that may exist with what they have.
-    fn admit(&self, lookout: &Lookout<'_>, mut labels: Vec<Label>, new: Vec<Label>, tally: &mut Tally) -> Vec<Label> {
+    fn admit(
+        &mut self,
+        lookout: &Lookout<'_>,
+        mut labels: Vec<Label>,
+        new: Vec<Label>,
+        tally: &mut Tally,
+    ) -> Vec<Label> {
         let old = labels.len();
         labels.extend(new);
-        let sectors = sectors_of(lookout, &labels);
+        let sectors = self.sectors(lookout, &labels);
         let judgement = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.doubted);
         let before = labels.len();
         let limit = if old == 0 { 0.0 } else { DOUBTS[1] * self.settings.min_existence };
@@ -270,13 +298,13 @@ impl<'a> Court<'a> {
 
     /// Take votes away from labels that look as if they were not to be seen from there. Also the sectors of those left.
     fn look_around(
-        &self,
+        &mut self,
         lookout: &Lookout<'_>,
         labels: Vec<Label>,
         tally: &mut Tally,
     ) -> (Vec<Label>, Vec<Arc<[Sector]>>) {
         let before = labels.len();
-        let sectors = sectors_of(lookout, &labels);
+        let sectors = self.sectors(lookout, &labels);
         let of_label = |(label, sectors): (Label, Arc<[Sector]>)| {
             let stray: Vec<Vector3<f64>> =
                 sectors.iter().filter(|sector| sector.is_stray()).map(|sector| sector.direction).collect();
@@ -290,7 +318,7 @@ impl<'a> Court<'a> {
             let found = label::from_voters(self.scene, self.noise, self.settings.gate_sigmas, seen, start)?;
             let enough = found.voters.len() >= self.settings.min_votes as usize;
             let left = enough.then_some(Label { undecided: label.undecided, unseen_from, ..found })?;
-            let sectors = sectors_of_label(lookout, &left);
+            let sectors = lookout.sectors(&left).into();
             Some((left, sectors))
         };
         let (labels, sectors): (Vec<Label>, Vec<_>) =
@@ -335,14 +363,6 @@ struct Judgement {
     of_labels: Vec<(f64, u32)>,
     rates: Rates,
     strays_per_image: f64,
-}
-
-fn sectors_of(lookout: &Lookout<'_>, labels: &[Label]) -> Vec<Arc<[Sector]>> {
-    labels.par_iter().map(|label| sectors_of_label(lookout, label)).collect()
-}
-
-fn sectors_of_label(lookout: &Lookout<'_>, label: &Label) -> Arc<[Sector]> {
-    Arc::clone(label.known.sectors.get_or_init(|| lookout.sectors(label).into()))
 }
 
 fn judge(
