@@ -101,13 +101,16 @@ def test_measured_ranges_pull_softly() -> None:
     assert moved < 3.0 * np.sqrt(plain.covariance_m2[0, [0, 3, 5]].sum())
 
 
-def test_classes_do_not_mix() -> None:
+def test_the_class_with_most_votes_has_the_place_and_others_do_not_vote() -> None:
     light = np.array([[45.0, 4.0, 5.0]])
     dataset = drive(light)
-    half = ["light" if i % 2 else "sign" for i in range(len(dataset.detections))]
-    mixed = dataclasses.replace(dataset, detections=dataset.detections.replace(class_name=Categories.from_texts(half)))
-    result = valuemap.build_map(mixed)
-    assert sorted(result.labels.class_name.texts()) == ["light", "sign"]
+    mixed = ["sign" if i % 3 == 0 else "light" for i in range(len(dataset.detections))]
+    detections = dataset.detections.replace(class_name=Categories.from_texts(mixed))
+    result = valuemap.build_map(dataclasses.replace(dataset, detections=detections))
+    assert result.labels.class_name.texts() == ["light"]
+    lights = detections.detection_id[np.array(mixed) == "light"]
+    assert np.isin(result.votes.detection_id, lights).all()
+    assert result.labels.votes[0] > 0.9 * len(lights)
 
 
 @pytest.fixture(scope="module")

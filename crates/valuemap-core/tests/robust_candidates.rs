@@ -10,14 +10,18 @@ use proptest::test_runner::RngSeed;
 use valuemap_core::hypothesis::Viability;
 use valuemap_core::progress::Progress;
 use valuemap_core::ray::{Ray, Rays};
+use valuemap_core::robust::adjust::adjust;
+use valuemap_core::robust::associate::Association;
 use valuemap_core::robust::estimate::estimate;
+use valuemap_core::robust::gather::gather;
 use valuemap_core::robust::index::{RayIndex, chi2};
+use valuemap_core::robust::label::{Label, ROUGH_M};
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::nominate::{Who, nominate};
 use valuemap_core::robust::quick::quick_estimate;
 use valuemap_core::robust::sample::{Sampler, level_of};
 use valuemap_core::robust::scene::{Frustum, Scene, View};
-use valuemap_core::robust::spreads_of;
+use valuemap_core::robust::{Settings, Without, spreads_of};
 
 const FOCAL_PX: f64 = 600.0;
 const GATE_SIGMAS: f64 = 3.5;
@@ -206,5 +210,52 @@ proptest! {
             prop_assert_eq!(sample.len(), near.clone().count().min(most));
             prop_assert!(found.is_subset(&near.copied().collect()));
         }
+    }
+}
+
+/// The voters of labels, each in one order.
+fn voters(labels: &[Label]) -> BTreeSet<Vec<u32>> {
+    labels.iter().map(|label| label.voters.iter().copied().collect::<BTreeSet<_>>().into_iter().collect()).collect()
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 12, ..config() })]
+
+    #[test]
+    fn what_is_decided_only_where_labels_changed_is_what_is_decided_anew(
+        objects in vec(object(), 2..7), errors in errors_px()
+    ) {
+        // Each object has a twin, so that there is something to decide.
+        let twins = objects.iter().map(|object| object + Vector3::y() * 0.5);
+        let objects: Vec<Vector3<f64>> = objects.iter().copied().chain(twins).collect();
+        let mut scene = street(70, 2.0, &objects, &errors);
+        for view in &mut scene.views {
+            view.driven_m = view.center.x;
+        }
+        let noise = Noise { position_drift_m: 0.03, rotation_drift_rad: 5e-4, ..NOISE };
+        let settings = Settings {
+            viability: VIABILITY,
+            gate_sigmas: GATE_SIGMAS,
+            min_votes: 3,
+            min_existence: 0.5,
+            without: Without::default(),
+        };
+        let progress = Progress::default();
+        let all = 0..scene.rays.rays.len() as u32;
+        let spreads = spreads_of(&scene, &noise);
+        let begin = || {
+            let index = RayIndex::new(&scene, &spreads, GATE_SIGMAS, all.clone());
+            Association::new(&scene, &noise, index, 150.0)
+        };
+        let rays: Vec<u32> = all.clone().collect();
+        let (mut labels, _) = gather(&scene, &noise, &settings, &rays, &progress).unwrap();
+        let mut with_memory = begin();
+        for _ in 0..6 {
+            let given = with_memory.associate(labels.clone(), &progress).unwrap();
+            prop_assert_eq!(voters(&given), voters(&begin().associate(labels, &progress).unwrap()));
+            let enough: Vec<Label> = given.into_iter().filter(|label| label.voters.len() >= 3).collect();
+            labels = adjust(&scene, &noise, GATE_SIGMAS, 3, &enough, ROUGH_M);
+        }
+        prop_assert!(!labels.is_empty());
     }
 }

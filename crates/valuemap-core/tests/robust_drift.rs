@@ -100,6 +100,26 @@ proptest! {
     }
 
     #[test]
+    fn pose_errors_are_the_dense_posterior(looks in looks()) {
+        let (covariance, _, residual) = dense(&looks);
+        let cholesky = covariance.cholesky().ok_or(TestCaseError::fail("not positive definite"))?;
+        let weighed = cholesky.solve(&residual);
+        let ones = vec![1.0; looks.len()];
+        let drive = Drive::along(&looks, &ones, LABELS).ok_or(TestCaseError::fail("no solution"))?;
+        for (look, found) in looks.iter().zip(drive.pose_errors(&ones)) {
+            // Covariance of the image's pose error with all residuals, times what they weigh.
+            let of_residual = |k: usize| {
+                let (other, by_pose) = (&looks[k / 2], looks[k / 2].by_pose[k % 2]);
+                let drift2 = look.drift_sigma.component_mul(&look.drift_sigma) * kernel(look, other);
+                let own2 = look.own_sigma.component_mul(&look.own_sigma) * f64::from(look.image == other.image);
+                (drift2 + own2).component_mul(&by_pose) * weighed[k]
+            };
+            let expected: Vector6 = (0..2 * looks.len()).map(of_residual).sum();
+            prop_assert!((found - expected).norm() < 1e-8);
+        }
+    }
+
+    #[test]
     fn the_smoother_is_the_dense_posterior(looks in looks()) {
         let looks: Vec<Look> = looks.into_iter().map(Look::by_itself).collect();
         let mut starts: Vec<f64> = looks.iter().map(|look| look.driven_m).collect();

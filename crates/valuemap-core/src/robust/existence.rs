@@ -34,7 +34,7 @@ const COINCIDENCE_CONCENTRATION: f64 = 15.0;
 const ODDS_AGAINST: f64 = 10.0;
 /// How much they grow with the number of those, for each label, that were found to be nothing: what is left is the best of
 /// so many more.
-const ODDS_PER_DOUBTED: f64 = 1.5;
+const ODDS_PER_DOUBTED: f64 = 4.0;
 
 /// Directions that a label is looked at from: around those of some of its votes.
 #[derive(Debug, Clone)]

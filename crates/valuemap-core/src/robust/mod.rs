@@ -198,6 +198,9 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
         }
     }
     let labels = adjust(scene, noise, settings.gate_sigmas, settings.min_votes as usize, &labels, EXACT_M);
+    let before = labels.len();
+    let labels = settle::outclass(scene, noise, labels);
+    tally.outvoted += (before - labels.len()) as u64;
     let Judgement { of_labels, rates, strays_per_image } =
         judge(scene, &spreads, &court.sectors(&lookout, &labels), &labels, settings, tally.doubted);
     let variance_factor = calibrate::variance_factor(scene, noise, &labels);

@@ -26,7 +26,7 @@ pub fn fuse(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) 
     let mut labels = labels;
     let factor = variance_factor(scene, noise, &labels);
     loop {
-        let mut pairs = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor);
+        let mut pairs = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor, |a, b| a.class == b.class);
         if pairs.is_empty() {
             return labels;
         }
@@ -44,6 +44,20 @@ pub fn fuse(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) 
         labels = kept.chain(fused).collect();
         labels.sort_by_key(first_voter);
     }
+}
+
+/// Of two labels of different classes that agree, and that no images show side by side, keep the one with more votes: a
+/// detector takes one object for another now and then.
+#[must_use]
+pub fn outclass(scene: &Scene, noise: &Noise, labels: Vec<Label>) -> Vec<Label> {
+    let factor = variance_factor(scene, noise, &labels);
+    let pairs = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor, |a, b| a.class != b.class);
+    let mut is_outclassed = vec![false; labels.len()];
+    for (_, a, b) in pairs {
+        let strength = |i: usize| (labels[i].voters.len(), std::cmp::Reverse(i));
+        is_outclassed[if strength(a) < strength(b) { a } else { b }] = true;
+    }
+    labels.into_iter().zip(is_outclassed).filter(|(_, out)| !out).map(|(label, _)| label).collect()
 }
 
 /// Make two of any label whose voters on two sides of it put it to places that do not agree: two lights back to back, say,
@@ -109,7 +123,13 @@ pub fn first_voter(label: &Label) -> u32 {
     label.voters.iter().copied().min().unwrap_or(u32::MAX)
 }
 
-fn agreeing_pairs(scene: &Scene, labels: &[Label], most: f64) -> Vec<(f64, usize, usize)> {
+/// Squared Mahalanobis distance and numbers of labels that may be paired, agree, and are not told apart.
+fn agreeing_pairs(
+    scene: &Scene,
+    labels: &[Label],
+    most: f64,
+    may_pair: impl Fn(&Label, &Label) -> bool + Sync,
+) -> Vec<(f64, usize, usize)> {
     let tree = by_place(labels);
     labels
         .par_iter()
@@ -117,7 +137,7 @@ fn agreeing_pairs(scene: &Scene, labels: &[Label], most: f64) -> Vec<(f64, usize
         .flat_map_iter(|(a, label)| {
             let near = tree.locate_within_distance(label.estimate.point.into(), NEIGHBOR_M * NEIGHBOR_M);
             near.map(|near| near.data)
-                .filter(move |&b| b > a)
+                .filter(|&b| b > a && may_pair(label, &labels[b]))
                 .filter_map(|b| distance2(label, &labels[b]).map(|distance2| (distance2, a, b)))
                 .filter(|&(distance2, a, b)| distance2 < most && !told_apart(scene, &labels[a], &labels[b]))
                 .collect::<Vec<_>>()
@@ -125,11 +145,8 @@ fn agreeing_pairs(scene: &Scene, labels: &[Label], most: f64) -> Vec<(f64, usize
         .collect()
 }
 
-/// Squared Mahalanobis distance of two labels of one class.
+/// Squared Mahalanobis distance of two labels.
 fn distance2(a: &Label, b: &Label) -> Option<f64> {
-    if a.class != b.class {
-        return None;
-    }
     let apart: Vector3<f64> = a.estimate.point - b.estimate.point;
     let together = (a.estimate.covariance + b.estimate.covariance).cholesky()?;
     Some(apart.dot(&together.solve(&apart)))
