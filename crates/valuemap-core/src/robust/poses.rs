@@ -9,6 +9,9 @@ use nalgebra::{Matrix2, SMatrix, Vector2};
 use super::drift::{DRIFT_LENGTH_M, LEG_M, Look, Matrix6, Vector6};
 use super::scene::View;
 
+/// Legs before and after those in question that say something about their drift.
+pub(super) const LEGS_AROUND: usize = 20;
+
 /// What is known of the drift of a leg, in sigmas of the drift: information and gradient.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Belief {

@@ -1,0 +1,186 @@
+//! One image: which of its detections shows which of the labels that claim it.
+//!
+//! The labels in an image are off by its pose error together; what is left of a residual, that error taken out, tells two heads on
+//! one pole apart where the error is as large as their distance. Where several labels and detections could go
+//! together, the assignment with the least sum of costs wins (joint compatibility; the costs are those of maximum
+//! likelihood).
+
+use nalgebra::{Matrix2, SMatrix};
+use pathfinding::prelude::{Matrix, kuhn_munkres_min};
+use rustc_hash::FxHashSet;
+
+use super::drift::Look;
+use super::label::Label;
+use super::noise::Noise;
+use super::poses::{Belief, PoseError};
+use super::scene::Scene;
+
+/// Times that the assignment of an image is made anew, with the pose error from the last one.
+const ROUNDS: usize = 3;
+/// Costs are whole numbers of this part, so that sums do not depend on their order.
+const COST_UNIT: f64 = 1e-6;
+/// Squared residuals beyond this many squared sigmas count less in the drift, in proportion to their root.
+const HUBER_CHI2: f64 = 4.0;
+
+/// A detection that a label may have.
+#[derive(Debug, Clone, Copy)]
+pub struct Claim {
+    pub(super) image: u32,
+    /// The label's number.
+    pub(super) label: u32,
+    pub(super) ray: u32,
+    /// Squared residual over its variance, pose error and all.
+    pub(super) chi2: f64,
+    pub(super) is_vote: bool,
+}
+
+/// A claim as seen from its label: residual with derivatives, and the covariance of all but the pose error, px².
+pub(super) struct Case<'a> {
+    pub(super) claim: &'a Claim,
+    pub(super) look: Look,
+    own: Matrix2<f64>,
+    /// Variance of the detection, each axis, px².
+    detection_px2: f64,
+}
+
+/// What is decided of a label.
+pub(super) enum Decision {
+    Vote { label: u32, ray: u32 },
+    Undecided { label: u32, image: u32 },
+}
+
+impl<'a> Case<'a> {
+    pub(super) fn of(scene: &Scene, noise: &Noise, label: &Label, claim: &'a Claim) -> Option<Self> {
+        let estimate = label.elsewhere(scene.view(claim.ray));
+        let look = Look::of(scene, noise, claim.ray, claim.label as usize, &estimate.point)?;
+        let by_point = SMatrix::<f64, 2, 3>::from_rows(&[look.by_point[0].transpose(), look.by_point[1].transpose()]);
+        let of_label = by_point * estimate.covariance * by_point.transpose();
+        let detection_px2 = noise.detection_px2(scene, claim.ray);
+        Some(Self { claim, look, own: Matrix2::identity() * detection_px2 + of_label, detection_px2 })
+    }
+
+    /// How well it fits where the pose error is about as said.
+    fn cost(&self, pose: &PoseError) -> f64 {
+        let (residual, covariance) = pose.expected(&self.look, &self.own);
+        let chi2 = covariance.try_inverse().map_or(f64::INFINITY, |inverse| residual.dot(&(inverse * residual)));
+        // Narrow likelihoods are high: a label of which little is known must not win because it forbids nothing.
+        let widening = (covariance - self.own + Matrix2::identity() * self.detection_px2).determinant();
+        chi2 + (covariance.determinant() / widening).ln()
+    }
+}
+
+/// What the votes of one image say about the drift of its pass.
+pub(super) fn belief_of_votes<'c>(cases: impl Iterator<Item = &'c Case<'c>>) -> Belief {
+    cases.filter(|case| case.claim.is_vote).fold(Belief::nothing(), |sum, case| {
+        let of_label_px2 = 0.5 * case.own.trace() - case.detection_px2;
+        let robust = (HUBER_CHI2 / case.claim.chi2).sqrt().min(1.0);
+        sum.and(&Belief::of_vote(&case.look, (case.look.variance + of_label_px2) / robust))
+    })
+}
+
+/// What became of a claim.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Fit {
+    /// Squared residual, and how much wider its distribution is than that of a label known exactly.
+    pub(super) cost: f64,
+    pub(super) granted: bool,
+}
+
+/// Judge the claims of one image, whose pose error is about known.
+pub(super) fn grant(cases: &[Case<'_>], limit: f64, pose: &PoseError) -> Vec<Fit> {
+    let mut costs: Vec<f64> = cases.iter().map(|case| case.cost(pose)).collect();
+    let mut granted = assign(cases, &costs, limit);
+    for _ in 1..ROUNDS {
+        for (i, case) in cases.iter().enumerate().filter(|(i, _)| (0..cases.len()).any(|j| shares(cases, *i, j))) {
+            let others = granted.iter().map(|&j| &cases[j]);
+            let independent = others.filter(|o| o.claim.label != case.claim.label && o.claim.ray != case.claim.ray);
+            let known = independent.fold(*pose, |pose, other| pose.after(&other.look, &other.own));
+            costs[i] = case.cost(&known);
+        }
+        let again = assign(cases, &costs, limit);
+        if again == granted {
+            break;
+        }
+        granted = again;
+    }
+    (0..).zip(costs).map(|(i, cost)| Fit { cost, granted: granted.binary_search(&i).is_ok() }).collect()
+}
+
+/// Take the detections that a better label claims as well from labels that are overruled.
+pub(super) fn overrule(cases: &[Case<'_>], fits: &mut [Fit], overruled: &FxHashSet<(u32, u32)>, limit: f64) {
+    let is_overruled = |j: usize, fits: &[Fit]| {
+        let claim = cases[j].claim;
+        let mut rivals = (0..cases.len()).filter(|&i| fits[i].cost < limit && cases[i].claim.ray == claim.ray);
+        rivals.any(|i| overruled.contains(&(cases[i].claim.label, claim.label)))
+    };
+    let out: Vec<usize> = (0..cases.len()).filter(|&j| fits[j].cost < limit && is_overruled(j, fits)).collect();
+    if out.is_empty() {
+        return;
+    }
+    let mut costs: Vec<f64> = fits.iter().map(|fit| fit.cost).collect();
+    for &j in &out {
+        costs[j] = f64::INFINITY;
+    }
+    let granted = assign(cases, &costs, limit);
+    for (i, fit) in fits.iter_mut().enumerate() {
+        fit.granted = granted.binary_search(&i).is_ok();
+    }
+}
+
+/// Say which claims of one image are granted, and which labels it says nothing about.
+pub(super) fn report(cases: &[Case<'_>], fits: &[Fit], labels: &[Label], limit: f64, decisions: &mut Vec<Decision>) {
+    let strength = |label: u32| (labels[label as usize].voters.len(), std::cmp::Reverse(label));
+    let granted = || cases.iter().zip(fits).filter(|(_, fit)| fit.granted).map(|(case, _)| case.claim);
+    let is_idle = |label: u32| !granted().any(|claim| claim.label == label);
+    let open = cases.iter().zip(fits).filter(|(_, fit)| fit.cost < limit).map(|(case, _)| case.claim);
+    let idle: Vec<&Claim> = open.filter(|claim| is_idle(claim.label)).collect();
+    for &Claim { image, label, ray, .. } in granted() {
+        decisions.push(Decision::Vote { label, ray });
+        if idle.iter().any(|other| other.ray == ray && strength(other.label) > strength(label)) {
+            decisions.push(Decision::Undecided { label, image });
+        }
+    }
+    for loser in idle.chunk_by(|a, b| a.label == b.label) {
+        decisions.push(Decision::Undecided { label: loser[0].label, image: loser[0].image });
+    }
+}
+
+/// The claims to grant, ascending: the assignment with the least sum of costs, where a detection without a label costs as
+/// much as one at the gate.
+fn assign(cases: &[Case<'_>], costs: &[f64], limit: f64) -> Vec<usize> {
+    let open: Vec<usize> = (0..cases.len()).filter(|&i| costs[i] < limit).collect();
+    if !open.iter().any(|&i| open.iter().any(|&j| shares(cases, i, j))) {
+        return open;
+    }
+    let mut rays: Vec<u32> = open.iter().map(|&i| cases[i].claim.ray).collect();
+    rays.sort_unstable();
+    rays.dedup();
+    let mut labels: Vec<u32> = open.iter().map(|&i| cases[i].claim.label).collect();
+    labels.sort_unstable();
+    labels.dedup();
+    let none = (limit / COST_UNIT) as i64;
+    // One more column for each detection: it shows no label.
+    let mut table = Matrix::new(rays.len(), labels.len() + rays.len(), 2 * none);
+    for row in 0..rays.len() {
+        for column in labels.len()..labels.len() + rays.len() {
+            table[(row, column)] = none;
+        }
+    }
+    for &i in &open {
+        let at = (rays.binary_search(&cases[i].claim.ray), labels.binary_search(&cases[i].claim.label));
+        if let (Ok(row), Ok(column)) = at {
+            table[(row, column)] = (costs[i] / COST_UNIT) as i64;
+        }
+    }
+    let (_, columns) = kuhn_munkres_min(&table);
+    let is_granted = |i: &usize| {
+        let at = (rays.binary_search(&cases[*i].claim.ray), labels.binary_search(&cases[*i].claim.label));
+        matches!(at, (Ok(row), Ok(column)) if columns[row] == column)
+    };
+    open.into_iter().filter(is_granted).collect()
+}
+
+/// Whether two claims are for the same label or the same detection.
+fn shares(cases: &[Case<'_>], i: usize, j: usize) -> bool {
+    i != j && (cases[i].claim.label == cases[j].claim.label || cases[i].claim.ray == cases[j].claim.ray)
+}

@@ -1,0 +1,116 @@
+//! Rivals: two labels of which a pass shows only one, where it might be either.
+//!
+//! There is one object, and one of the labels is not to be seen from there. All that the pass shows of it together is
+//! weighed, with the drift of the pass as its other labels tell it.
+
+use rustc_hash::{FxHashMap, FxHashSet};
+
+use super::associate::Run;
+use super::drift::{Drive, Look};
+use super::grant::{Claim, Fit, belief_of_votes};
+use super::poses::{LEGS_AROUND, PoseError, smooth};
+use crate::progress::{Halt, Progress};
+
+/// Images of a pass that show one of two labels, which may be either, before it is concluded that there is but one.
+const LEAST_RIVALRY: u32 = 8;
+/// For each of them, images that show both, at most: what clutter and double detections do.
+const MOST_BOTH: f64 = 0.1;
+/// What one pass shows of two labels that claim the same detections.
+#[derive(Default)]
+struct Rivalry {
+    /// Images that show both.
+    both: u32,
+    /// Images that show one of them, which may be either.
+    one: u32,
+    /// These images, as numbered in the pass, and what they show.
+    rays: Vec<(usize, u32)>,
+}
+
+impl Run<'_> {
+    /// Pairs of labels (the better one, the other) of which a pass shows only one, where it might be either: there is one
+    /// object, and the other label is not to be seen from there.
+    pub(super) fn overruled(&self, fits: &[Vec<Fit>], progress: &Progress) -> Result<FxHashSet<(u32, u32)>, Halt> {
+        let limit = self.of.index.gate_sigmas().powi(2);
+        let mut rivalries: FxHashMap<(u32, u32), Rivalry> = FxHashMap::default();
+        for (i, (cases, fits)) in self.images.iter().zip(fits).enumerate() {
+            progress.check()?;
+            let granted: Vec<u32> =
+                cases.iter().zip(fits).filter(|(_, fit)| fit.granted).map(|(case, _)| case.claim.label).collect();
+            let shown: FxHashSet<u32> = granted.iter().copied().collect();
+            for (k, &a) in granted.iter().enumerate() {
+                for &b in &granted[k + 1..] {
+                    rivalries.entry((a, b)).or_default().both += 1;
+                }
+            }
+            let mut open: Vec<&Claim> =
+                cases.iter().zip(fits).filter(|(_, fit)| fit.cost < limit).map(|(case, _)| case.claim).collect();
+            open.sort_unstable_by_key(|claim| (claim.ray, claim.label));
+            for of_ray in open.chunk_by(|a, b| a.ray == b.ray) {
+                for (k, a) in of_ray.iter().enumerate() {
+                    for b in &of_ray[k + 1..] {
+                        if shown.contains(&a.label) != shown.contains(&b.label) {
+                            let rivalry = rivalries.entry((a.label, b.label)).or_default();
+                            rivalry.one += 1;
+                            rivalry.rays.push((i, a.ray));
+                        }
+                    }
+                }
+            }
+        }
+        let is_one = |r: &Rivalry| r.one >= LEAST_RIVALRY && f64::from(r.both) < MOST_BOTH * f64::from(r.one);
+        // What does not change is not seen whole here.
+        let identity = |label: u32| self.identities[label as usize];
+        let was = |a: u32, b: u32| self.of.overruled.contains(&(identity(a), identity(b), self.pass));
+        let is_old = |label: u32| self.of.last.contains_key(&identity(label));
+        let of_pair = |((a, b), rivalry): ((u32, u32), Rivalry)| {
+            let poses = self.drift_without(&[a, b], &rivalry.rays);
+            let [of_a, of_b] = [a, b].map(|label| self.surprise(label, &rivalry.rays, &poses));
+            if of_a <= of_b { (a, b) } else { (b, a) }
+        };
+        let decide = |((a, b), rivalry): ((u32, u32), Rivalry)| {
+            if is_old(a) && is_old(b) {
+                return [(a, b), (b, a)].into_iter().find(|&(a, b)| was(a, b));
+            }
+            is_one(&rivalry).then(|| of_pair(((a, b), rivalry)))
+        };
+        Ok(rivalries.into_iter().filter_map(decide).collect())
+    }
+
+    /// The drift in the images of some rays, as far as the votes for all but some labels tell.
+    fn drift_without(&self, labels: &[u32], rays: &[(usize, u32)]) -> Vec<PoseError> {
+        let legs = rays.iter().map(|(i, _)| self.leg_of[*i]);
+        let first = legs.clone().min().unwrap_or(0).saturating_sub(LEGS_AROUND);
+        let end = (legs.max().unwrap_or(0) + LEGS_AROUND + 1).min(self.starts_m.len());
+        let mut of_legs = self.of_legs[first..end].to_vec();
+        let from = self.leg_of.partition_point(|&leg| leg < first);
+        let to = self.leg_of.partition_point(|&leg| leg < end);
+        for (cases, leg) in self.images[from..to].iter().zip(&self.leg_of[from..to]) {
+            let theirs = cases.iter().filter(|case| labels.contains(&case.claim.label));
+            of_legs[leg - first] = of_legs[leg - first].without(&belief_of_votes(theirs));
+        }
+        let smoothed = smooth(&self.starts_m[first..end], &of_legs);
+        let of_ray = |&(i, ray): &(usize, u32)| {
+            smoothed[self.leg_of[i] - first].pose_error(self.of.noise.shared(self.of.scene.view(ray)), (0.0, 0.0))
+        };
+        rays.iter().map(of_ray).collect()
+    }
+
+    /// Minus twice the logarithm of the likelihood that rays, the drift in whose images is about known, show a label, up to
+    /// what is the same for all labels: together they may move the drift and the label once.
+    fn surprise(&self, label: u32, rays: &[(usize, u32)], drift: &[PoseError]) -> f64 {
+        let estimate = self.labels[label as usize].elsewhere(self.of.scene.view(rays[0].1));
+        let look = |(&(_, ray), drift): (&(usize, u32), &PoseError)| {
+            let look = Look::of(self.of.scene, self.of.noise, ray, 0, &estimate.point)?;
+            Some(look.by_itself().with_drift(&drift.mean, &drift.covariance.diagonal().map(f64::sqrt)))
+        };
+        let joint = || {
+            let looks: Vec<Look> = rays.iter().zip(drift).map(look).collect::<Option<_>>()?;
+            let normals = Drive::along(&looks, &vec![1.0; looks.len()], 1)?.normals;
+            let (information, gradient) = normals.of_one();
+            let after = (information + estimate.covariance.try_inverse()?).cholesky()?;
+            let widening = (after.determinant() * estimate.covariance.determinant()).ln();
+            Some(normals.square - gradient.dot(&after.solve(&gradient)) + widening)
+        };
+        joint().unwrap_or(f64::INFINITY)
+    }
+}
