@@ -13,10 +13,9 @@ import sys
 import time
 from pathlib import Path
 
-from machine import describe_machine
+from machine import describe_machine, keep_record
 from valuemap.detect.labels import read_labels
 from valuemap.errors import ValuemapError
-from valuemap.folders import new_file
 
 RUNS = 5
 
@@ -50,9 +49,7 @@ def main() -> int:
         },
     }
     print(json.dumps(record, indent=2))
-    if options.json is not None:
-        with new_file(options.json) as path:
-            path.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    keep_record(options.json, record)
     return 0
 
 

@@ -31,7 +31,7 @@ import cv2
 import numpy as np
 from rich.progress import Progress as ProgressBar
 
-from machine import describe_machine
+from machine import describe_machine, keep_record
 from valuemap.config import DetectConfig, SimulationConfig, TrainConfig
 from valuemap.detect.accuracy import FoundBoxes, evaluate_boxes
 from valuemap.detect.labels import LabelledPicture, LabelledPictures, read_labels
@@ -115,11 +115,8 @@ def main() -> None:
         labels = read_labels(f"yolo:{arguments.dtld}")
         german = [picture for picture in labels.pictures if picture.split == "val"]
         figures["dtld"] = {**measure_boxes(german), "centres": measure_centres(german)}
-    text = json.dumps(figures, indent=2)
-    sys.stdout.write(text + "\n")
-    if arguments.json is not None:
-        with new_file(arguments.json) as temporary:
-            temporary.write_text(text + "\n", encoding="utf-8")
+    sys.stdout.write(json.dumps(figures, indent=2) + "\n")
+    keep_record(arguments.json, figures)
 
 
 def render_cities(folder: Path, progress: Progress) -> list[LabelledPicture]:

@@ -17,10 +17,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from machine import describe_machine
+from machine import describe_machine, keep_record
 from valuemap.demo import DETECTION, run_demo
 from valuemap.errors import ValuemapError
-from valuemap.folders import new_file
 
 
 def main() -> int:
@@ -43,9 +42,7 @@ def main() -> int:
         "results_of_seed": results,
     }
     print(json.dumps(record, indent=2))
-    if options.json is not None:
-        with new_file(options.json) as path:
-            path.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    keep_record(options.json, record)
     return 0
 
 

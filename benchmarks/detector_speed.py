@@ -19,12 +19,11 @@ from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
-from machine import describe_machine
+from machine import describe_machine, keep_record
 from valuemap.config import DetectConfig
 from valuemap.detect.infer import Detector, Task
 from valuemap.detect.pictures import list_pictures, read_picture
 from valuemap.errors import ValuemapError
-from valuemap.folders import new_file
 
 
 def main() -> int:
@@ -53,8 +52,7 @@ def main() -> int:
             **describe_machine(),
             "results": results,
         }
-        with new_file(options.json) as path:
-            path.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        keep_record(options.json, record)
     return 0
 
 

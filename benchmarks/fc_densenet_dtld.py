@@ -20,14 +20,13 @@ from typing import Any
 from rich.progress import Progress as ProgressBar
 
 from bundled_model import show_progress
-from machine import describe_machine
+from machine import describe_machine, keep_record
 from valuemap.config import DetectConfig, TrainConfig
 from valuemap.detect.accuracy import evaluate_boxes
 from valuemap.detect.labels import LabelledPictures, read_labels
 from valuemap.detect.run import detect_pictures
 from valuemap.detect.train import train
 from valuemap.errors import ValuemapError
-from valuemap.folders import new_file
 from yolox_dtld import as_found
 
 SETTINGS = TrainConfig(epochs=6, cutouts=2, validation_share=0.1, dropout=0.0)
@@ -79,8 +78,7 @@ def main() -> None:
             "settings": dataclasses.asdict(config),
             "results": results,
         }
-        with new_file(options.json) as path:
-            path.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        keep_record(options.json, record)
 
 
 def measure(model: Path, config: DetectConfig, labels: LabelledPictures) -> dict[str, Any]:

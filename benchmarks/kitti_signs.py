@@ -34,11 +34,10 @@ from pyarrow import csv
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from machine import describe_machine
+from machine import describe_machine, keep_record
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, write_dataset
 from valuemap.errors import InputError, ValuemapError
-from valuemap.folders import new_file
 from valuemap.map_folder import write_map
 from valuemap.pipeline import build_map
 from valuemap.readers.kitti import read_kitti
@@ -104,10 +103,7 @@ def main() -> int:
         scores = {sequence: run_sequence(options.data_dir, sequence, config, options.out) for sequence in SEQUENCES}
         results = {name: score.to_json() for name, score in {**scores, "total": add_up(scores)}.items()}
         print(_table(results))
-        if options.json is not None:
-            with new_file(options.json) as path:
-                record = json.dumps(_record(options, config, results), indent=2)
-                path.write_text(record + "\n", encoding="utf-8")
+        keep_record(options.json, _record(options, config, results))
     except ValuemapError as error:
         print(f"error: {error}\nhint: {error.hint}", file=sys.stderr)
         return 1

@@ -10,6 +10,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from valuemap.folders import new_file
+
 
 def write_record(path: Path | None, results: Any, **more: Any) -> None:
     """Write the figures of a benchmark on simulated data with its command, machine and versions, if a file is named."""
@@ -17,7 +19,14 @@ def write_record(path: Path | None, results: Any, **more: Any) -> None:
         arguments = ("PATH" if Path(argument).is_absolute() else argument for argument in sys.argv[1:])
         command = " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *arguments])
         record = {"command": command, "data": "simulated", **describe_machine(), **more, "results": results}
-        path.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        keep_record(path, record)
+
+
+def keep_record(path: Path | None, record: dict[str, Any]) -> None:
+    """Write a record whole or not at all, if a file is named."""
+    if path is not None:
+        with new_file(path) as temporary:
+            temporary.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
 
 
 def describe_machine() -> dict[str, Any]:

@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from machine import describe_machine
+from machine import describe_machine, keep_record
 from valuemap.dataset import write_dataset
 from valuemap.simulate import PRESETS, record_city
 from valuemap.simulate.render import render_images
@@ -50,9 +50,8 @@ def main() -> None:
         "pictures_a_second": round(count / seconds, 1),
     }
     print(f"{count} pictures in {seconds:.1f} s: {count / seconds:.1f} a second, {len(boxes)} boxes")
-    if options.json:
-        command = " ".join(["python", "benchmarks/renders.py", *sys.argv[1:]])
-        options.json.write_text(json.dumps({"command": command, **describe_machine(), **result}, indent=2) + "\n")
+    command = " ".join(["python", "benchmarks/renders.py", *sys.argv[1:]])
+    keep_record(options.json, {"command": command, **describe_machine(), **result})
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ is written beside them. Run `python benchmarks/speed.py --json FILE` to keep the
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import statistics
 import subprocess
@@ -18,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import valuemap
-from machine import describe_machine
+from machine import describe_machine, keep_record
 
 
 def main() -> None:
@@ -43,8 +42,7 @@ def main() -> None:
                 f"recall {result['accuracy']['recall']:.3f} precision {result['accuracy']['precision']:.3f}",
                 flush=True,
             )
-    if options.json:
-        options.json.write_text(json.dumps(record, indent=2) + "\n")
+    keep_record(options.json, record)
 
 
 def _measure(folder: Path, preset: str, options: argparse.Namespace) -> dict[str, Any]:

@@ -16,13 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from machine import describe_machine
+from machine import describe_machine, keep_record
 from valuemap.config import DetectConfig
 from valuemap.detect.accuracy import FoundBoxes, evaluate_boxes
 from valuemap.detect.labels import LabelledPictures, read_labels
 from valuemap.detect.run import PictureBoxes, detect_pictures
 from valuemap.errors import ValuemapError
-from valuemap.folders import new_file
 
 MIN_SCORE = 0.01
 """For the average precision the whole curve is needed."""
@@ -49,9 +48,7 @@ def main() -> int:
         "results": results,
     }
     print(json.dumps(results, indent=2))
-    if options.json is not None:
-        with new_file(options.json) as path:
-            path.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    keep_record(options.json, record)
     return 0
 
 

@@ -12,10 +12,10 @@ use valuemap_core::progress::Progress;
 use valuemap_core::ray::{Ray, Rays};
 use valuemap_core::robust::adjust::adjust;
 use valuemap_core::robust::associate::Association;
-use valuemap_core::robust::estimate::estimate;
+use valuemap_core::robust::estimate::{Care, estimate};
 use valuemap_core::robust::gather::gather;
 use valuemap_core::robust::index::{RayIndex, chi2};
-use valuemap_core::robust::label::{Label, ROUGH_M};
+use valuemap_core::robust::label::Label;
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::nominate::{Who, nominate};
 use valuemap_core::robust::quick::quick_estimate;
@@ -182,7 +182,7 @@ proptest! {
         let voters: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
         let start = object + Vector3::new(x, y, 0.2);
         let quick = quick_estimate(&scene, &spreads, &voters, start).unwrap();
-        let exact = estimate(&scene, &NOISE, &voters, start, 1e-7).unwrap();
+        let exact = estimate(&scene, &NOISE, &voters, start, Care::Exact).unwrap();
         let apart = quick - exact.point;
         let sigmas2 = apart.dot(&exact.covariance.cholesky().unwrap().solve(&apart));
         prop_assert!(sigmas2 < 0.3_f64.powi(2), "{} m, {} sigmas", apart.norm(), sigmas2.sqrt());
@@ -254,7 +254,7 @@ proptest! {
             let given = with_memory.associate(labels.clone(), &progress).unwrap();
             prop_assert_eq!(voters(&given), voters(&begin().associate(labels, &progress).unwrap()));
             let enough: Vec<Label> = given.into_iter().filter(|label| label.voters.len() >= 3).collect();
-            labels = adjust(&scene, &noise, GATE_SIGMAS, 3, &enough, ROUGH_M);
+            labels = adjust(&scene, &noise, GATE_SIGMAS, 3, &enough, Care::Rough);
         }
         prop_assert!(!labels.is_empty());
     }

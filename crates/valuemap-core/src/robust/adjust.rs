@@ -5,8 +5,8 @@ use std::hash::{Hash, Hasher};
 use rayon::prelude::*;
 use rustc_hash::FxHasher;
 
-use super::estimate::Joint;
-use super::label::{EXACT_M, Label, by_place, fingerprint, fitting, side_of};
+use super::estimate::{Care, Joint};
+use super::label::{Label, by_place, fingerprint, fitting, side_of};
 use super::noise::Noise;
 use super::scene::Scene;
 use super::settle::first_voter;
@@ -18,7 +18,7 @@ const MOST_LABELS: usize = 12;
 /// Rounds of leaving out votes, at most.
 const MAX_TRIMS: usize = 4;
 
-/// Estimate all labels anew, place by place, to a tolerance; those that keep fewer than `min_votes` are dropped.
+/// Estimate all labels anew, place by place; those that keep fewer than `min_votes` are dropped.
 #[must_use]
 pub fn adjust(
     scene: &Scene,
@@ -26,15 +26,15 @@ pub fn adjust(
     gate_sigmas: f64,
     min_votes: usize,
     labels: &[Label],
-    tolerance_m: f64,
+    care: Care,
 ) -> Vec<Label> {
     let of_place = |place: &Vec<usize>| {
         let place: Vec<Label> = place.iter().map(|&i| labels[i].clone()).collect();
         let votes = votes_of(&place);
-        if tolerance_m > EXACT_M && place.iter().all(|label| label.revision.place == votes) {
+        if care == Care::Rough && place.iter().all(|label| label.revision.place == votes) {
             return place;
         }
-        adjust_place(scene, noise, gate_sigmas, min_votes, place, tolerance_m)
+        adjust_place(scene, noise, gate_sigmas, min_votes, place, care)
     };
     let mut labels: Vec<Label> = places(labels).par_iter().flat_map_iter(of_place).collect();
     labels.sort_by_key(first_voter);
@@ -71,14 +71,14 @@ fn adjust_place(
     gate_sigmas: f64,
     min_votes: usize,
     place: Vec<Label>,
-    tolerance_m: f64,
+    care: Care,
 ) -> Vec<Label> {
     let mut together = place.clone();
     for _ in 0..MAX_TRIMS {
-        match adjusted(scene, noise, gate_sigmas, &mut together, tolerance_m) {
+        match adjusted(scene, noise, gate_sigmas, &mut together, care) {
             None if place.len() == 1 => return Vec::new(),
             None => {
-                let alone = |label| adjust_place(scene, noise, gate_sigmas, min_votes, vec![label], tolerance_m);
+                let alone = |label| adjust_place(scene, noise, gate_sigmas, min_votes, vec![label], care);
                 return place.into_iter().flat_map(alone).collect();
             }
             Some(is_done) => {
@@ -107,12 +107,11 @@ fn votes_of(labels: &[Label]) -> u64 {
 }
 
 /// Estimate labels together and leave votes out that do not fit; whether there were none.
-fn adjusted(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: &mut [Label], tolerance_m: f64) -> Option<bool> {
+fn adjusted(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: &mut [Label], care: Care) -> Option<bool> {
     let starts = labels.iter().map(|label| (label.voters.as_slice(), label.estimate.point));
-    let solution = Joint::new(scene, noise, starts, tolerance_m).solve()?;
-    let votes = solution.own_chi2();
-    let left = fitting(&votes, gate_sigmas);
-    let is_done = left.len() == votes.len();
+    let solution = Joint::new(scene, noise, starts, care).solve()?;
+    let (left, refused) = fitting(&solution.own_chi2(), gate_sigmas);
+    let is_done = refused.is_empty();
     let elsewhere = if is_done { solution.elsewhere() } else { vec![Vec::new(); labels.len()] };
     let mut voters = vec![Vec::new(); labels.len()];
     for (label, ray) in left {
@@ -121,8 +120,10 @@ fn adjusted(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: &mut [Label]
     for (((label, estimate), elsewhere), voters) in labels.iter_mut().zip(solution.estimates).zip(elsewhere).zip(voters)
     {
         label.side = side_of(scene, &voters, &estimate.point);
-        label.refused.extend(label.voters.iter().filter(|ray| !voters.contains(ray)));
         (label.estimate, label.elsewhere, label.voters) = (estimate, elsewhere, voters);
+    }
+    for (label, ray) in refused {
+        labels[label].refused.push(ray);
     }
     Some(is_done)
 }

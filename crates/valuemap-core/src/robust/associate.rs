@@ -73,7 +73,9 @@ impl<'a> Association<'a> {
             Ok((identity, self.last.get(&identity).map_or_else(found, Arc::clone)))
         };
         let claims: Vec<(u64, Arc<[Claim]>)> = labels.par_iter().map(claims_of).collect::<Result<_, Halt>>()?;
-        let is_open = self.open_legs(&claims);
+        let identities: Vec<u64> = claims.iter().map(|(identity, _)| *identity).collect();
+        let current: FxHashSet<u64> = identities.iter().copied().collect();
+        let is_open = self.open_legs(&claims, &current);
         let leg_of = |image: u32| self.legs.of_view[image as usize] as usize;
         let is_open_image = |image: u32| is_open[leg_of(image)];
         let of_label = |(number, (_, claims)): (usize, &(u64, Arc<[Claim]>))| {
@@ -86,7 +88,6 @@ impl<'a> Association<'a> {
             let [a, b] = [a, b].map(|claim| leg_of(claim.image));
             self.legs.pass[a] == self.legs.pass[b] && b - a <= LEGS_AROUND
         };
-        let identities: Vec<u64> = claims.iter().map(|(identity, _)| *identity).collect();
         let runs: Vec<&[Claim]> = open.chunk_by(is_one_run).collect();
         let decided: Vec<Decided> =
             runs.par_iter().map(|run| self.decide(&labels, &identities, run, progress)).collect::<Result<_, Halt>>()?;
@@ -97,7 +98,6 @@ impl<'a> Association<'a> {
             voters.push(label.voters.iter().filter(stays).copied().collect());
             undecided.push(label.undecided.iter().filter(|image| !is_open_image(**image)).copied().collect());
         }
-        let current: FxHashSet<u64> = identities.iter().copied().collect();
         self.overruled.retain(|(a, b, _)| current.contains(a) && current.contains(b));
         for Decided { decisions, of_legs: (first, beliefs), overruled } in decided {
             self.of_legs[first..first + beliefs.len()].copy_from_slice(&beliefs);
@@ -115,9 +115,8 @@ impl<'a> Association<'a> {
     }
 
     /// Legs that a label claims which was not there before, or is there no longer.
-    fn open_legs(&self, claims: &[(u64, Arc<[Claim]>)]) -> Vec<bool> {
+    fn open_legs(&self, claims: &[(u64, Arc<[Claim]>)], current: &FxHashSet<u64>) -> Vec<bool> {
         let mut is_open = vec![false; self.legs.pass.len()];
-        let current: FxHashSet<u64> = claims.iter().map(|(identity, _)| *identity).collect();
         let new = claims.iter().filter(|(identity, _)| !self.last.contains_key(identity)).map(|(_, claims)| claims);
         let gone = self.last.iter().filter(|(identity, _)| !current.contains(*identity)).map(|(_, claims)| claims);
         for claim in new.chain(gone).flat_map(|claims| claims.iter()) {

@@ -1,20 +1,18 @@
 //! Where objects are, and how sure that is: least squares over their votes, with the errors of the poses.
 //!
-//! Each visit of a pass gives its normal equations with its pose errors taken out ([`drift`](super::drift)); they add up, and the
-//! inverse of their sum is the covariance. Labels that are estimated together share what their images get wrong: a
+//! Each visit of a pass gives its normal equations with its pose errors taken out ([`drift`](super::drift)); they add
+//! up, and the inverse of their sum is the covariance. Labels that are estimated together share what their images get wrong: a
 //! label alone cannot tell an error of its pass from one of its own, its neighbors in the same images can (a bundle
 //! adjustment with priors on the poses).
 
-use nalgebra::{DMatrix, Matrix3, Vector2, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix3, Vector2, Vector3};
 
 use super::drift::{Drive, Look, Normals, Vector6};
-use super::label::EXACT_M;
 use super::noise::Noise;
 use super::scene::{Scene, View};
 
-const MAX_ITERATIONS: usize = 20;
-/// Where the votes may still change.
-const ROUGH_ITERATIONS: usize = 5;
+/// Good enough while votes may still change, m.
+pub const ROUGH_M: f64 = 1e-2;
 /// A pass that comes back after so long a drive has another drift, m.
 const FORGOTTEN_M: f64 = 250.0;
 const LONGEST_STEP_M: f64 = 5.0;
@@ -24,6 +22,33 @@ const HUBER_SIGMAS: f64 = 2.0;
 const OTHERS_SHARE: f64 = 0.95;
 /// Farther than this the linear step to where the other visits put a label is not trusted, m.
 const LONGEST_MOVE_M: f64 = 3.0;
+
+/// How much care an estimate takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Care {
+    /// Good enough while votes may still change: each label has an image's own error for itself, at the measured poses.
+    Rough,
+    /// Good for good: labels share what their images get wrong, and all is linearised where the images probably were.
+    Exact,
+}
+
+impl Care {
+    /// Estimates are done when a step is shorter than this, m.
+    #[must_use]
+    pub fn tolerance_m(self) -> f64 {
+        match self {
+            Self::Rough => ROUGH_M,
+            Self::Exact => 1e-5,
+        }
+    }
+
+    fn max_iterations(self) -> usize {
+        match self {
+            Self::Rough => 5,
+            Self::Exact => 20,
+        }
+    }
+}
 
 /// A position with its covariance, m².
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -64,7 +89,7 @@ pub struct Joint<'a> {
     /// The most probable pose error of the image of each vote, m and rad.
     pose_errors: Vec<Vector6>,
     points: Vec<Vector3<f64>>,
-    tolerance_m: f64,
+    care: Care,
 }
 
 /// Labels estimated together.
@@ -76,13 +101,13 @@ pub struct Solution<'a> {
 }
 
 impl<'a> Joint<'a> {
-    /// Begin with the voters of each label and a point near it; estimates are final when a step is shorter than the tolerance.
+    /// Begin with the voters of each label and a point near it.
     #[must_use]
     pub fn new<'v>(
         scene: &'a Scene,
         noise: &'a Noise,
         labels: impl Iterator<Item = (&'v [u32], Vector3<f64>)>,
-        tolerance_m: f64,
+        care: Care,
     ) -> Self {
         let (mut votes, mut points) = (Vec::new(), Vec::new());
         for (label, (voters, start)) in labels.enumerate() {
@@ -92,7 +117,7 @@ impl<'a> Joint<'a> {
         votes.sort_unstable_by_key(|&(label, ray)| (scene.view(ray).pass, ray, label));
         let count = votes.len();
         let (weights, pose_errors) = (vec![1.0; count], vec![Vector6::zeros(); count]);
-        Self { scene, noise, votes, weights, pose_errors, points, tolerance_m }
+        Self { scene, noise, votes, weights, pose_errors, points, care }
     }
 
     /// Estimate the positions.
@@ -101,28 +126,29 @@ impl<'a> Joint<'a> {
     #[must_use]
     pub fn solve(mut self) -> Option<Solution<'a>> {
         let mut here = self.evaluate()?;
-        let rounds = if self.tolerance_m > EXACT_M { ROUGH_ITERATIONS } else { MAX_ITERATIONS };
-        for round in 1..=rounds {
-            let longest = self.step(&here)?;
+        let mut rounds = 1;
+        let information = loop {
+            let information = here.normals.information.clone().cholesky()?;
+            let longest = self.step(&-information.solve(&here.normals.gradient));
             self.weights = here.own.iter().map(|chi2| (HUBER_SIGMAS / chi2.sqrt()).min(1.0)).collect();
-            if longest < self.tolerance_m || round == rounds {
-                break;
+            if longest < self.care.tolerance_m() || rounds == self.care.max_iterations() {
+                break information;
             }
-            if self.tolerance_m <= EXACT_M {
+            if self.care == Care::Exact {
                 self.pose_errors.clone_from(&here.pose_errors);
             }
             here = self.evaluate()?;
-        }
+            rounds += 1;
+        };
         // The last step may have gone behind a voter.
         let is_in_front = |&(label, ray): &(usize, u32)| self.scene.ray(ray).project(&self.points[label]).z > 0.0;
         self.votes.iter().all(is_in_front).then_some(())?;
-        let estimates = self.estimates(&here.normals.information.clone().cholesky()?.inverse());
+        let estimates = self.estimates(&information.inverse());
         Some(Solution { joint: self, here, estimates })
     }
 
-    /// Move the points to where the normal equations put them; the longest step, m.
-    fn step(&mut self, here: &Evaluation) -> Option<f64> {
-        let step = -here.normals.information.clone().cholesky()?.solve(&here.normals.gradient);
+    /// Move the points, each not too far; the longest step asked for, m.
+    fn step(&mut self, step: &DVector<f64>) -> f64 {
         let mut longest = 0.0_f64;
         for (k, point) in self.points.iter_mut().enumerate() {
             let step = step.fixed_rows::<3>(3 * k);
@@ -130,7 +156,7 @@ impl<'a> Joint<'a> {
             *point += step * (LONGEST_STEP_M / length).min(1.0);
             longest = longest.max(length);
         }
-        Some(longest)
+        longest
     }
 
     fn estimates(&self, covariance: &DMatrix<f64>) -> Vec<Estimate> {
@@ -143,13 +169,11 @@ impl<'a> Joint<'a> {
     }
 
     fn evaluate(&self) -> Option<Evaluation> {
-        let is_rough = self.tolerance_m > EXACT_M;
         let of_vote = |(&(label, ray), error): (&(usize, u32), &Vector6)| {
             let (scene, noise, point) = (self.scene, self.noise, &self.points[label]);
-            if is_rough {
-                Some(Look::of(scene, noise, ray, label, point)?.by_itself())
-            } else {
-                Look::where_it_was(scene, noise, ray, label, point, error)
+            match self.care {
+                Care::Rough => Some(Look::of(scene, noise, ray, label, point)?.by_itself()),
+                Care::Exact => Look::where_it_was(scene, noise, ray, label, point, error),
             }
         };
         let looks: Vec<Look> = self.votes.iter().zip(&self.pose_errors).map(of_vote).collect::<Option<_>>()?;
@@ -163,7 +187,7 @@ impl<'a> Joint<'a> {
             normals.information += &drive.normals.information;
             normals.gradient += &drive.normals.gradient;
             left.extend(drive.left());
-            if !is_rough {
+            if self.care == Care::Exact {
                 pose_errors.extend(drive.pose_errors(&self.weights[range]));
             }
             of_visits.push(drive.normals);
@@ -239,18 +263,12 @@ struct Evaluation {
     pose_errors: Vec<Vector6>,
 }
 
-/// Estimate the position of one label from its voters, starting nearby, until a step is shorter than the tolerance.
+/// Estimate the position of one label from its voters, starting nearby.
 ///
 /// Nothing if the point ends up behind a voter, or the voters do not fix it.
 #[must_use]
-pub fn estimate(
-    scene: &Scene,
-    noise: &Noise,
-    voters: &[u32],
-    start: Vector3<f64>,
-    tolerance_m: f64,
-) -> Option<Estimate> {
-    Joint::new(scene, noise, std::iter::once((voters, start)), tolerance_m).solve()?.estimates.pop()
+pub fn estimate(scene: &Scene, noise: &Noise, voters: &[u32], start: Vector3<f64>, care: Care) -> Option<Estimate> {
+    Joint::new(scene, noise, std::iter::once((voters, start)), care).solve()?.estimates.pop()
 }
 
 /// Information and gradient of a measured range: one more observation of its voter, along the viewing direction.

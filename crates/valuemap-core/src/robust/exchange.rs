@@ -9,7 +9,7 @@ use nalgebra::{Matrix2x3, Matrix3, Vector2, Vector3};
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use super::label::{Label, SECTOR_COSINE, by_place, direction_to, from_voters};
+use super::label::{Label, SECTOR_COSINE, by_place, direction_to, from_voters, sector_middles};
 use super::noise::Noise;
 use super::scene::Scene;
 use super::settle::first_voter;
@@ -150,12 +150,7 @@ fn images_of_both(scene: &Scene, noise: &Noise, a: &Label, b: &Label) -> Option<
 
 /// The differences of the positions if the votes of all images that look from about one direction are swapped.
 fn flipped(images: &[Both]) -> Vec<Vector3<f64>> {
-    let mut sectors: Vec<Vector3<f64>> = Vec::new();
-    for both in images {
-        if sectors.iter().all(|middle| middle.dot(&both.direction) < SECTOR_COSINE) {
-            sectors.push(both.direction);
-        }
-    }
+    let sectors = sector_middles(images.iter().map(|both| both.direction));
     let flip = |middle: &Vector3<f64>| {
         let sign = |both: &Both| if middle.dot(&both.direction) < SECTOR_COSINE { 1.0 } else { -1.0 };
         solve(images.iter().map(|both| (both, sign(both))))

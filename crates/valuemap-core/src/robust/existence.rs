@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use rstar::RTree;
 use rstar::primitives::GeomWithData;
 
-use super::label::{Label, SECTOR_COSINE, direction_to};
+use super::label::{Label, SECTOR_COSINE, direction_to, sector_middles};
 use super::noise::Spread;
 use super::scene::Scene;
 
@@ -121,13 +121,7 @@ impl<'a> Lookout<'a> {
 
 /// The middles of the sectors that some voters look from, and the farthest voter of each, m.
 fn middles_of(scene: &Scene, point: &Vector3<f64>, voters: &[u32]) -> (Vec<Vector3<f64>>, Vec<f64>) {
-    let mut middles: Vec<Vector3<f64>> = Vec::new();
-    for &ray in voters {
-        let direction = direction_to(scene, ray, point);
-        if middles.iter().all(|middle| middle.dot(&direction) < SECTOR_COSINE) {
-            middles.push(direction);
-        }
-    }
+    let middles = sector_middles(voters.iter().map(|&ray| direction_to(scene, ray, point)));
     let mut farthest = vec![0.0_f64; middles.len()];
     for &ray in voters {
         let (_, sector) = nearest(&middles, &direction_to(scene, ray, point));

@@ -8,14 +8,10 @@ use rstar::RTree;
 use rstar::primitives::GeomWithData;
 use rustc_hash::FxHasher;
 
-use super::estimate::{Elsewhere, Estimate, Joint};
+use super::estimate::{Care, Elsewhere, Estimate, Joint};
 use super::noise::Noise;
 use super::scene::{Scene, View};
 
-/// Good enough while voters are still being gathered, m.
-pub const ROUGH_M: f64 = 1e-2;
-/// Good enough for good, m.
-pub const EXACT_M: f64 = 1e-5;
 /// A label that moved by less, squared and in sigmas, is what it was.
 const SMALL_MOVE_CHI2: f64 = 0.01;
 /// Rounds of leaving out voters, at most.
@@ -93,10 +89,10 @@ pub fn from_voters(
     let mut point = start;
     for _ in 0..MAX_TRIMS {
         let start = std::iter::once((voters.as_slice(), point));
-        let solution = Joint::new(scene, noise, start, ROUGH_M).solve()?;
+        let solution = Joint::new(scene, noise, start, Care::Rough).solve()?;
         let estimate = solution.estimates[0];
-        let left = fitting(&solution.own_chi2(), gate_sigmas);
-        if left.len() == voters.len() {
+        let (left, refused) = fitting(&solution.own_chi2(), gate_sigmas);
+        if refused.is_empty() {
             let side = side_of(scene, &voters, &estimate.point);
             return Some(Label {
                 estimate,
@@ -119,17 +115,23 @@ pub fn from_voters(
     None
 }
 
-/// The votes that fit the gate; of a label with others the worst leave first, since one bad vote makes good ones look bad.
+/// Labels and rays of votes.
+type Votes = Vec<(usize, u32)>;
+
+/// The votes that fit the gate, and those that must leave: of each label the worst first, since one bad vote makes good
+/// ones look bad.
 #[must_use]
-pub fn fitting(votes: &[((usize, u32), f64)], gate_sigmas: f64) -> Vec<(usize, u32)> {
+pub fn fitting(votes: &[((usize, u32), f64)], gate_sigmas: f64) -> (Votes, Votes) {
     let labels = votes.iter().map(|((label, _), _)| label + 1).max().unwrap_or(0);
     let mut worst = vec![0.0_f64; labels];
     for ((label, _), chi2) in votes {
         worst[*label] = worst[*label].max(*chi2);
     }
     let limit = gate_sigmas * gate_sigmas;
-    let fits = |((label, _), chi2): &&((usize, u32), f64)| *chi2 < limit || *chi2 < 0.5 * worst[*label];
-    votes.iter().filter(fits).map(|(vote, _)| *vote).collect()
+    let stays = |((label, _), chi2): &((usize, u32), f64)| *chi2 < limit || *chi2 < 0.5 * worst[*label];
+    let (stay, leave): (Vec<_>, Vec<_>) = votes.iter().partition(|vote| stays(vote));
+    let votes_of = |of: Vec<&((usize, u32), f64)>| of.into_iter().map(|(vote, _)| *vote).collect();
+    (votes_of(stay), votes_of(leave))
 }
 
 /// Mean of the unit directions from a point to the cameras of its voters.
@@ -150,6 +152,18 @@ pub fn fingerprint(rays: &[u32]) -> u64 {
 #[must_use]
 pub fn direction_to(scene: &Scene, ray: u32, point: &Vector3<f64>) -> Vector3<f64> {
     (scene.ray(ray).center - point).normalize()
+}
+
+/// Directions of which each has one in its sector: the first ones that no earlier one has.
+#[must_use]
+pub fn sector_middles(directions: impl Iterator<Item = Vector3<f64>>) -> Vec<Vector3<f64>> {
+    let mut middles: Vec<Vector3<f64>> = Vec::new();
+    for direction in directions {
+        if middles.iter().all(|middle| middle.dot(&direction) < SECTOR_COSINE) {
+            middles.push(direction);
+        }
+    }
+    middles
 }
 
 /// Labels by place.

@@ -45,10 +45,11 @@ use crate::progress::{Halt, Progress};
 use adjust::adjust;
 use associate::Association;
 use calibrate::Known;
+use estimate::Care;
 use existence::{Lookout, Looks, Rates, Sector};
 use gather::{VOTE_RANGE, gather};
 use index::RayIndex;
-use label::{EXACT_M, Label, ROUGH_M, fingerprint};
+use label::{Label, fingerprint};
 use noise::{Noise, Spread};
 use scene::Scene;
 
@@ -188,7 +189,7 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
         let (more, [nominations, accepted]) = gather(scene, noise, settings, &free, progress)?;
         tally.nominations += nominations;
         tally.accepted += accepted;
-        labels = court.admit(&lookout, labels, more, &mut tally);
+        labels = if labels.is_empty() { more } else { court.admit(&lookout, labels, more, &mut tally) };
         labels.sort_by_key(settle::first_voter);
         for _ in 0..SETTLING_ROUNDS {
             progress.check()?;
@@ -199,7 +200,7 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
             break;
         }
     }
-    let labels = adjust(scene, noise, settings.gate_sigmas, settings.min_votes as usize, &labels, EXACT_M);
+    let labels = adjust(scene, noise, settings.gate_sigmas, settings.min_votes as usize, &labels, Care::Exact);
     let before = labels.len();
     let labels = settle::outclass(scene, noise, labels);
     tally.outvoted += (before - labels.len()) as u64;
@@ -260,7 +261,7 @@ impl<'a> Court<'a> {
         let labels = exchange::exchange(scene, noise, gate, labels);
         let mut labels = self.association.associate(labels, progress)?;
         labels.retain(|label| label.voters.len() >= min_votes);
-        let labels = adjust(scene, noise, gate, min_votes, &labels, ROUGH_M);
+        let labels = adjust(scene, noise, gate, min_votes, &labels, Care::Rough);
         let left = labels.len();
         let labels = if may_split { settle::split(scene, noise, gate, labels, min_votes) } else { labels };
         let labels = if settings.without.merge { labels } else { settle::fuse(scene, noise, gate, labels) };
@@ -293,7 +294,7 @@ impl<'a> Court<'a> {
         let sectors = self.sectors(lookout, &labels);
         let judgement = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.doubted);
         let before = labels.len();
-        let limit = if old == 0 { 0.0 } else { DOUBTS[1] * self.settings.min_existence };
+        let limit = DOUBTS[1] * self.settings.min_existence;
         let admitted = labels.into_iter().zip(judgement.of_labels).enumerate();
         let admitted = admitted.filter(|(i, (_, (existence, _)))| *i < old || *existence >= limit);
         let labels: Vec<Label> = admitted.map(|(_, (label, _))| label).collect();

@@ -22,7 +22,7 @@ pub struct Belief {
 /// A pose error: position, m, and rotation, rad, both in the world.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PoseError {
-    /// The most probable error.
+    /// The most probable error with its sign turned: what is to be added to residuals.
     pub mean: Vector6,
     /// Its covariance.
     pub covariance: Matrix6,

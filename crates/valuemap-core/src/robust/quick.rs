@@ -5,8 +5,8 @@
 
 use nalgebra::{Matrix3, Vector3};
 
+use super::estimate::ROUGH_M;
 use super::index::chi2;
-use super::label::ROUGH_M;
 use super::noise::Spread;
 use super::scene::Scene;
 

@@ -1,4 +1,4 @@
-//! Settling: all labels compete for all detections; those that stand for one object become one.
+//! Settling: labels that stand for two objects become two, those that stand for one object become one.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
