@@ -5,8 +5,9 @@ use std::hash::{Hash, Hasher};
 use rayon::prelude::*;
 use rustc_hash::FxHasher;
 
-use super::estimate::{Care, Joint};
-use super::label::{Label, by_place, fingerprint, fitting, side_of};
+use super::contest::{Contest, widened};
+use super::estimate::{Care, Joint, Solution, Start};
+use super::label::{Label, by_place, fingerprint, side_of, unfit};
 use super::noise::Noise;
 use super::scene::Scene;
 use super::settle::first_voter;
@@ -18,7 +19,8 @@ const MOST_LABELS: usize = 12;
 /// Rounds of leaving out votes, at most.
 const MAX_TRIMS: usize = 4;
 
-/// Estimate all labels anew, place by place; those that keep fewer than `min_votes` are dropped.
+/// Estimate all labels anew, place by place; those that keep fewer than `min_votes` are dropped. With all care, covariances
+/// say also what contested votes may have done ([`contest`](super::contest)).
 #[must_use]
 pub fn adjust(
     scene: &Scene,
@@ -28,15 +30,11 @@ pub fn adjust(
     labels: &[Label],
     care: Care,
 ) -> Vec<Label> {
-    let of_place = |place: &Vec<usize>| {
-        let place: Vec<Label> = place.iter().map(|&i| labels[i].clone()).collect();
-        let votes = votes_of(&place);
-        if care == Care::Rough && place.iter().all(|label| label.revision.place == votes) {
-            return place;
-        }
-        adjust_place(scene, noise, gate_sigmas, min_votes, place, care)
-    };
-    let mut labels: Vec<Label> = places(labels).par_iter().flat_map_iter(of_place).collect();
+    let contest = (care == Care::Exact).then(|| Contest::new(scene, noise, gate_sigmas, labels));
+    let adjustment = Adjustment { scene, noise, gate_sigmas, min_votes, contest };
+    let of_place = |place: &Vec<usize>| adjustment.of_place(place.iter().map(|&i| labels[i].clone()).collect());
+    // One at a time: the first ones are the largest.
+    let mut labels: Vec<Label> = places(labels).par_iter().with_max_len(1).flat_map_iter(of_place).collect();
     labels.sort_by_key(first_voter);
     labels
 }
@@ -64,37 +62,109 @@ fn places(labels: &[Label]) -> Vec<Vec<usize>> {
     places
 }
 
-/// Labels that cannot be estimated together are estimated one by one.
-fn adjust_place(
-    scene: &Scene,
-    noise: &Noise,
+/// How labels are estimated.
+struct Adjustment<'a> {
+    scene: &'a Scene,
+    noise: &'a Noise,
     gate_sigmas: f64,
     min_votes: usize,
-    place: Vec<Label>,
-    care: Care,
-) -> Vec<Label> {
-    let mut together = place.clone();
-    for _ in 0..MAX_TRIMS {
-        match adjusted(scene, noise, gate_sigmas, &mut together, care) {
-            None if place.len() == 1 => return Vec::new(),
-            None => {
-                let alone = |label| adjust_place(scene, noise, gate_sigmas, min_votes, vec![label], care);
-                return place.into_iter().flat_map(alone).collect();
+    /// Only for estimates with all care.
+    contest: Option<Contest<'a>>,
+}
+
+impl Adjustment<'_> {
+    fn care(&self) -> Care {
+        if self.contest.is_some() { Care::Exact } else { Care::Rough }
+    }
+
+    fn of_place(&self, place: Vec<Label>) -> Vec<Label> {
+        let votes = votes_of(&place);
+        if self.care() == Care::Rough && place.iter().all(|label| label.revision.place == votes) {
+            return place;
+        }
+        let mut together = self.together(place);
+        let votes = votes_of(&together);
+        for label in &mut together {
+            label.revise();
+            label.revision.place = votes;
+        }
+        together
+    }
+
+    /// Labels that cannot be estimated together are estimated one by one.
+    fn together(&self, place: Vec<Label>) -> Vec<Label> {
+        let mut together = place.clone();
+        for _ in 0..MAX_TRIMS {
+            match self.estimate(&mut together) {
+                None if place.len() == 1 => return Vec::new(),
+                None => return place.into_iter().flat_map(|label| self.together(vec![label])).collect(),
+                Some(is_done) => {
+                    together.retain(|label| label.voters.len() >= self.min_votes);
+                    if is_done || together.is_empty() {
+                        break;
+                    }
+                }
             }
-            Some(is_done) => {
-                together.retain(|label| label.voters.len() >= min_votes);
-                if is_done || together.is_empty() {
-                    break;
+        }
+        together
+    }
+
+    /// Estimate labels together and leave votes out that do not fit; whether there were none.
+    fn estimate(&self, labels: &mut [Label]) -> Option<bool> {
+        let starts = labels.iter().map(|label| Start {
+            voters: &label.voters,
+            weights: &label.weights,
+            point: label.estimate.point,
+        });
+        let solution = Joint::new(self.scene, self.noise, starts, self.care()).solve()?;
+        let votes = solution.own_chi2();
+        let leaves = unfit(&votes, self.gate_sigmas);
+        if leaves.contains(&true) {
+            for (label, estimate) in labels.iter_mut().zip(&solution.estimates) {
+                (label.estimate, label.elsewhere) = (*estimate, Vec::new());
+            }
+        } else {
+            self.take(labels, &solution);
+        }
+        for label in &mut *labels {
+            label.voters.clear();
+            label.weights.clear();
+        }
+        for ((&((label, ray), _), &weight), &leaves) in votes.iter().zip(solution.weights()).zip(&leaves) {
+            let label = &mut labels[label];
+            if leaves {
+                label.refused.push(ray);
+            } else {
+                label.voters.push(ray);
+                label.weights.push(weight);
+            }
+        }
+        for label in labels {
+            label.side = side_of(self.scene, &label.voters, &label.estimate.point);
+        }
+        Some(!leaves.contains(&true))
+    }
+
+    /// Take over estimates that all votes fit.
+    fn take(&self, labels: &mut [Label], solution: &Solution<'_>) {
+        match &self.contest {
+            None => {
+                for ((label, estimate), elsewhere) in
+                    labels.iter_mut().zip(&solution.estimates).zip(solution.elsewhere())
+                {
+                    (label.estimate, label.elsewhere) = (*estimate, elsewhere);
+                }
+            }
+            Some(contest) => {
+                let contested = contest.contested(solution);
+                let sure = contested.contains(&true).then(|| solution.without(&contested)).flatten();
+                let sure = sure.as_ref().unwrap_or(&solution.estimates);
+                for ((label, estimate), sure) in labels.iter_mut().zip(&solution.estimates).zip(sure) {
+                    label.estimate = widened(estimate, sure);
                 }
             }
         }
     }
-    let votes = votes_of(&together);
-    for label in &mut together {
-        label.revise();
-        label.revision.place = votes;
-    }
-    together
 }
 
 /// A fingerprint of the votes of some labels.
@@ -104,26 +174,4 @@ fn votes_of(labels: &[Label]) -> u64 {
         fingerprint(&label.voters).hash(&mut hasher);
     }
     hasher.finish()
-}
-
-/// Estimate labels together and leave votes out that do not fit; whether there were none.
-fn adjusted(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: &mut [Label], care: Care) -> Option<bool> {
-    let starts = labels.iter().map(|label| (label.voters.as_slice(), label.estimate.point));
-    let solution = Joint::new(scene, noise, starts, care).solve()?;
-    let (left, refused) = fitting(&solution.own_chi2(), gate_sigmas);
-    let is_done = refused.is_empty();
-    let elsewhere = if is_done { solution.elsewhere() } else { vec![Vec::new(); labels.len()] };
-    let mut voters = vec![Vec::new(); labels.len()];
-    for (label, ray) in left {
-        voters[label].push(ray);
-    }
-    for (((label, estimate), elsewhere), voters) in labels.iter_mut().zip(solution.estimates).zip(elsewhere).zip(voters)
-    {
-        label.side = side_of(scene, &voters, &estimate.point);
-        (label.estimate, label.elsewhere, label.voters) = (estimate, elsewhere, voters);
-    }
-    for (label, ray) in refused {
-        labels[label].refused.push(ray);
-    }
-    Some(is_done)
 }

@@ -12,7 +12,7 @@ use rustc_hash::{FxHashMap, FxHashSet};
 use super::estimate::Estimate;
 use super::grant::{Case, Claim, Decision, Fit, belief_of_votes, grant, overrule, report};
 use super::index::{Hit, RayIndex};
-use super::label::Label;
+use super::label::{Label, fingerprint};
 use super::noise::Noise;
 use super::poses::{Belief, LEGS_AROUND, Legs, smooth};
 use super::scene::Scene;
@@ -35,12 +35,19 @@ pub struct Association<'a> {
     legs: Legs,
     /// What the votes of each leg say of its drift.
     of_legs: Vec<Belief>,
-    /// The claims of the labels, by what these were.
-    pub(super) last: FxHashMap<u64, Arc<[Claim]>>,
+    /// The claims of the labels, by where these stood.
+    pub(super) last: FxHashMap<u64, Arc<Claimed>>,
     pub(super) overruled: FxHashSet<Overruled>,
 }
 
-/// Of two labels, as they were, the first overrules the second in a pass.
+/// What a label claims, with the votes that it had.
+pub(super) struct Claimed {
+    /// Fingerprint of its voters.
+    voters: u64,
+    claims: Vec<Claim>,
+}
+
+/// Of two labels, where they stood, the first overrules the second in a pass.
 type Overruled = (u64, u64, u32);
 
 /// What was decided on some legs.
@@ -66,20 +73,19 @@ impl<'a> Association<'a> {
     /// # Errors
     /// [`Halt::Cancelled`] when `progress` says so.
     pub fn associate(&mut self, labels: Vec<Label>, progress: &Progress) -> Result<Vec<Label>, Halt> {
-        let claims_of = |label: &Label| {
+        let claimed_by = |label: &Label| {
             progress.check()?;
-            let identity = label.identity();
-            let found = || claims_of(self.scene, &self.index, label, self.range_m).into();
-            Ok((identity, self.last.get(&identity).map_or_else(found, Arc::clone)))
+            let stand = label.stand();
+            Ok((stand, self.claimed_by(label, stand)))
         };
-        let claims: Vec<(u64, Arc<[Claim]>)> = labels.par_iter().map(claims_of).collect::<Result<_, Halt>>()?;
-        let identities: Vec<u64> = claims.iter().map(|(identity, _)| *identity).collect();
-        let current: FxHashSet<u64> = identities.iter().copied().collect();
+        let claims: Vec<(u64, Arc<Claimed>)> = labels.par_iter().map(claimed_by).collect::<Result<_, Halt>>()?;
+        let stands: Vec<u64> = claims.iter().map(|(stand, _)| *stand).collect();
+        let current: FxHashSet<u64> = stands.iter().copied().collect();
         let is_open = self.open_legs(&claims, &current);
         let leg_of = |image: u32| self.legs.of_view[image as usize] as usize;
         let is_open_image = |image: u32| is_open[leg_of(image)];
-        let of_label = |(number, (_, claims)): (usize, &(u64, Arc<[Claim]>))| {
-            let open = claims.iter().filter(|claim| is_open_image(claim.image));
+        let of_label = |(number, (_, claimed)): (usize, &(u64, Arc<Claimed>))| {
+            let open = claimed.claims.iter().filter(|claim| is_open_image(claim.image));
             open.map(|claim| Claim { label: number as u32, ..*claim }).collect::<Vec<_>>()
         };
         let mut open: Vec<Claim> = claims.par_iter().enumerate().flat_map_iter(of_label).collect();
@@ -90,7 +96,7 @@ impl<'a> Association<'a> {
         };
         let runs: Vec<&[Claim]> = open.chunk_by(is_one_run).collect();
         let decided: Vec<Decided> =
-            runs.par_iter().map(|run| self.decide(&labels, &identities, run, progress)).collect::<Result<_, Halt>>()?;
+            runs.par_iter().map(|run| self.decide(&labels, &stands, run, progress)).collect::<Result<_, Halt>>()?;
         let mut voters: Vec<Vec<u32>> = Vec::with_capacity(labels.len());
         let mut undecided: Vec<Vec<u32>> = Vec::with_capacity(labels.len());
         for label in &labels {
@@ -114,29 +120,51 @@ impl<'a> Association<'a> {
         Ok(given.map(|((label, voters), undecided)| given_to(self.scene, label, voters, undecided)).collect())
     }
 
-    /// Legs that a label claims which was not there before, or is there no longer.
-    fn open_legs(&self, claims: &[(u64, Arc<[Claim]>)], current: &FxHashSet<u64>) -> Vec<bool> {
-        let mut is_open = vec![false; self.legs.pass.len()];
-        let new = claims.iter().filter(|(identity, _)| !self.last.contains_key(identity)).map(|(_, claims)| claims);
-        let gone = self.last.iter().filter(|(identity, _)| !current.contains(*identity)).map(|(_, claims)| claims);
-        for claim in new.chain(gone).flat_map(|claims| claims.iter()) {
-            is_open[self.legs.of_view[claim.image as usize] as usize] = true;
+    /// The images in which a label might have rays that `is_asked` is true for.
+    #[must_use]
+    pub fn images_at(&self, label: &Label, is_asked: impl Fn(u32) -> bool) -> Vec<u32> {
+        let hits = self.index.all_hits(&label.estimate.point, label.class, self.range_m);
+        hits.into_iter().filter(|hit| is_asked(hit.ray)).map(|hit| hit.image).collect()
+    }
+
+    /// The claims of a label: those that it had if it is where it was.
+    fn claimed_by(&self, label: &Label, stand: u64) -> Arc<Claimed> {
+        let voters = fingerprint(&label.voters);
+        match self.last.get(&stand) {
+            Some(last) if last.voters == voters => Arc::clone(last),
+            Some(last) => Arc::new(Claimed { voters, claims: with_votes_of(label, last.claims.clone()) }),
+            None => {
+                let claims = claims_of(self.scene, &self.index, label, self.range_m);
+                Arc::new(Claimed { voters, claims: with_votes_of(label, claims) })
+            }
         }
+    }
+
+    /// Legs that a label claims which was not there before, or is there no longer, or where its votes changed.
+    fn open_legs(&self, claims: &[(u64, Arc<Claimed>)], current: &FxHashSet<u64>) -> Vec<bool> {
+        let mut is_open = vec![false; self.legs.pass.len()];
+        let mut open = |claim: &Claim| is_open[self.legs.of_view[claim.image as usize] as usize] = true;
+        for (stand, now) in claims {
+            match self.last.get(stand) {
+                None => now.claims.iter().for_each(&mut open),
+                Some(last) if last.voters != now.voters => {
+                    let both = now.claims.iter().zip(&last.claims);
+                    both.filter(|(now, last)| now.is_vote != last.is_vote).for_each(|(now, _)| open(now));
+                }
+                Some(_) => {}
+            }
+        }
+        let gone = self.last.iter().filter(|(stand, _)| !current.contains(*stand));
+        gone.flat_map(|(_, last)| &last.claims).for_each(&mut open);
         is_open
     }
 
     /// Decide the claims of some legs of one pass, ordered by leg and image.
-    fn decide(
-        &self,
-        labels: &[Label],
-        identities: &[u64],
-        claims: &[Claim],
-        progress: &Progress,
-    ) -> Result<Decided, Halt> {
+    fn decide(&self, labels: &[Label], stands: &[u64], claims: &[Claim], progress: &Progress) -> Result<Decided, Halt> {
         let (scene, noise, limit) = (self.scene, self.noise, self.index.gate_sigmas().powi(2));
         let cases: Vec<Case<'_>> =
             claims.iter().filter_map(|claim| Case::of(scene, noise, &labels[claim.label as usize], claim)).collect();
-        let run = Run::new(self, labels, identities, &cases);
+        let run = Run::new(self, labels, stands, &cases);
         let smoothed = smooth(&run.starts_m, &run.of_legs);
         let judge = |(i, cases): (usize, &&[Case<'_>])| {
             let view = &scene.views[cases[0].claim.image as usize];
@@ -154,7 +182,7 @@ impl<'a> Association<'a> {
         }
         let (first, end) = run.own_legs;
         let of_legs = run.of_legs[first - run.first_leg..end - run.first_leg].to_vec();
-        let named = |(a, b): (u32, u32)| (identities[a as usize], identities[b as usize], run.pass);
+        let named = |(a, b): (u32, u32)| (stands[a as usize], stands[b as usize], run.pass);
         let overruled = overruled.into_iter().map(named).collect();
         Ok(Decided { decisions, of_legs: (first, of_legs), overruled })
     }
@@ -167,6 +195,9 @@ fn given_to(scene: &Scene, label: Label, mut voters: Vec<u32>, mut undecided: Ve
     let mut label = Label { undecided, ..label };
     let fitting = || voters.iter().copied().filter(|ray| !label.refused.contains(ray));
     if !fitting().eq(label.voters.iter().copied()) {
+        let key = |ray: u32| (scene.view(ray).pass, ray);
+        let last = |&ray: &u32| label.voters.binary_search_by_key(&key(ray), |&old| key(old)).map(|i| label.weights[i]);
+        label.weights = voters.iter().map(|ray| last(ray).unwrap_or(1.0)).collect();
         label.refused.clear();
         label.voters = voters;
     }
@@ -174,20 +205,22 @@ fn given_to(scene: &Scene, label: Label, mut voters: Vec<u32>, mut undecided: Ve
 }
 
 fn claims_of(scene: &Scene, index: &RayIndex<'_>, label: &Label, range_m: f64) -> Vec<Claim> {
-    let mut voters = label.voters.clone();
-    voters.sort_unstable();
     let mut hits: Vec<Hit> =
         places_of(&label.estimate).iter().flat_map(|place| index.all_hits(place, label.class, range_m)).collect();
     hits.sort_by(|a, b| a.ray.cmp(&b.ray).then(a.chi2.total_cmp(&b.chi2)));
     hits.dedup_by_key(|hit| hit.ray);
-    let of_hit = |hit: Hit| Claim {
-        image: hit.image,
-        label: u32::MAX,
-        ray: hit.ray,
-        chi2: hit.chi2,
-        is_vote: voters.binary_search(&hit.ray).is_ok(),
-    };
+    let of_hit = |hit: Hit| Claim { image: hit.image, label: u32::MAX, ray: hit.ray, chi2: hit.chi2, is_vote: false };
     hits.into_iter().filter(|hit| label.faces(scene, hit.ray)).map(of_hit).collect()
+}
+
+/// Claims (any order) with those marked that are votes.
+fn with_votes_of(label: &Label, mut claims: Vec<Claim>) -> Vec<Claim> {
+    let mut voters = label.voters.clone();
+    voters.sort_unstable();
+    for claim in &mut claims {
+        claim.is_vote = voters.binary_search(&claim.ray).is_ok();
+    }
+    claims
 }
 
 /// Where a label may be: along the direction that it is least known in.
@@ -206,7 +239,7 @@ fn places_of(estimate: &Estimate) -> Vec<Vector3<f64>> {
 pub(super) struct Run<'a> {
     pub(super) of: &'a Association<'a>,
     pub(super) labels: &'a [Label],
-    pub(super) identities: &'a [u64],
+    pub(super) stands: &'a [u64],
     pub(super) pass: u32,
     pub(super) images: Vec<&'a [Case<'a>]>,
     /// What the votes of each image say.
@@ -222,7 +255,7 @@ pub(super) struct Run<'a> {
 }
 
 impl<'a> Run<'a> {
-    fn new(of: &'a Association<'a>, labels: &'a [Label], identities: &'a [u64], cases: &'a [Case<'a>]) -> Self {
+    fn new(of: &'a Association<'a>, labels: &'a [Label], stands: &'a [u64], cases: &'a [Case<'a>]) -> Self {
         let legs = &of.legs;
         let images: Vec<&[Case<'_>]> = cases.chunk_by(|a, b| a.claim.image == b.claim.image).collect();
         let leg_of = |cases: &&[Case<'_>]| legs.of_view[cases[0].claim.image as usize] as usize;
@@ -243,6 +276,6 @@ impl<'a> Run<'a> {
         }
         let starts_m = legs.start_m[around.clone()].to_vec();
         let first_leg = around.start;
-        Self { of, labels, identities, pass, images, votes, leg_of, first_leg, own_legs, starts_m, of_legs }
+        Self { of, labels, stands, pass, images, votes, leg_of, first_leg, own_legs, starts_m, of_legs }
     }
 }

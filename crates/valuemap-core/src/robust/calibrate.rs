@@ -9,7 +9,8 @@
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 
-use super::estimate::{by_pass, pass_terms};
+use super::drift::Drive;
+use super::estimate::{by_pass, looks_at};
 use super::label::Label;
 use super::noise::Noise;
 use super::scene::Scene;
@@ -143,8 +144,8 @@ fn mean(of_labels: Vec<Option<f64>>) -> Option<f64> {
 fn disagreement(scene: &Scene, noise: &Noise, label: &Label) -> Option<f64> {
     let (mut information, mut gradient, mut alone, mut passes) = (Matrix3::zeros(), Vector3::zeros(), 0.0, 0);
     for pass in by_pass(scene, &label.voters).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS) {
-        let terms = pass_terms(scene, noise, pass, &label.estimate.point)?;
-        let (of_pass, by_pass) = terms.of_one();
+        let looks = looks_at(scene, noise, pass, &label.estimate.point)?;
+        let (of_pass, by_pass) = Drive::at_one(&looks)?.normals.of_one();
         alone += by_pass.dot(&of_pass.cholesky()?.solve(&by_pass));
         information += of_pass;
         gradient += by_pass;
@@ -214,8 +215,8 @@ fn sample<'a>(scene: &Scene, guess: &Noise, labels: &'a [Label]) -> Vec<&'a Labe
 /// Squared residuals of a label in sigmas, shared errors taken out, a residual.
 fn misfit(scene: &Scene, noise: &Noise, label: &Label) -> f64 {
     let passes = by_pass(scene, &label.voters);
-    let squares = passes.filter_map(|pass| pass_terms(scene, noise, pass, &label.estimate.point));
-    squares.map(|terms| terms.square).sum::<f64>() / label.voters.len() as f64
+    let of_pass = |pass| Some(Drive::at_one(&looks_at(scene, noise, pass, &label.estimate.point)?)?.normals.square);
+    passes.filter_map(of_pass).sum::<f64>() / label.voters.len() as f64
 }
 
 /// Minus twice the logarithm of the restricted likelihood of voters' residuals (ordered by pass) around a point, up to a
@@ -224,11 +225,12 @@ fn minus_log_likelihood(scene: &Scene, noise: &Noise, voters: &[u32], point: &Ve
     let (mut information, mut gradient) = (Matrix3::zeros(), Vector3::zeros());
     let mut value = 0.0;
     for pass in by_pass(scene, voters) {
-        let Some(terms) = pass_terms(scene, noise, pass, point) else { return 0.0 };
-        let (of_pass, by_pass) = terms.of_one();
+        let Some(looks) = looks_at(scene, noise, pass, point) else { return 0.0 };
+        let Some(drive) = Drive::at_one(&looks) else { return 0.0 };
+        let (of_pass, by_pass) = drive.normals.of_one();
         information += of_pass;
         gradient += by_pass;
-        value += terms.square + terms.log_determinant;
+        value += drive.normals.square + drive.log_determinant();
     }
     let Some(cholesky) = information.cholesky() else { return 0.0 };
     value += 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();

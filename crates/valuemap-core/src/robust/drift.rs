@@ -9,13 +9,13 @@
 
 use std::ops::Range;
 
-use nalgebra::{Cholesky, Const, DMatrix, DVector, Matrix2, Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
 
 use super::noise::Noise;
 use super::scene::Scene;
+use super::spd::{Inverse, Matrix6};
 use crate::ray::Ray;
 
-pub(super) type Matrix6 = SMatrix<f64, 6, 6>;
 pub(super) type Vector6 = SVector<f64, 6>;
 type Matrix3x6 = SMatrix<f64, 3, 6>;
 
@@ -153,8 +153,6 @@ pub struct Normals {
     pub gradient: DVector<f64>,
     /// Squared residuals in sigmas, pose errors taken out.
     pub square: f64,
-    /// Logarithm of the determinant of the residuals' covariance.
-    pub log_determinant: f64,
 }
 
 impl Normals {
@@ -162,12 +160,7 @@ impl Normals {
     #[must_use]
     pub fn nothing(labels: usize) -> Self {
         let size = 3 * labels;
-        Self {
-            information: DMatrix::zeros(size, size),
-            gradient: DVector::zeros(size),
-            square: 0.0,
-            log_determinant: 0.0,
-        }
+        Self { information: DMatrix::zeros(size, size), gradient: DVector::zeros(size), square: 0.0 }
     }
 
     /// Add information about two labels, or one.
@@ -208,13 +201,21 @@ struct Leg {
 /// A leg whose drift is taken out.
 struct Solved {
     looks: Range<usize>,
-    information: Cholesky<f64, Const<6>>,
+    information: Inverse,
     gradient: Vector6,
     /// How much a unit of the next leg's drift pulls at this one's.
     tie: f64,
+    /// How stiff this pull is.
+    stiffness: f64,
 }
 
 impl<'a> Drive<'a> {
+    /// Go along the looks of a visit at one label, which all count alike; nothing if their numbers overflow.
+    #[must_use]
+    pub fn at_one(looks: &'a [Look]) -> Option<Self> {
+        Self::along(looks, &vec![1.0; looks.len()], 1)
+    }
+
     /// Go along the looks of a visit, in their order; nothing if their numbers overflow.
     #[must_use]
     pub fn along(looks: &'a [Look], weights: &[f64], labels: usize) -> Option<Self> {
@@ -246,6 +247,14 @@ impl<'a> Drive<'a> {
         Some(Self { normals, looks, legs })
     }
 
+    /// Logarithm of the determinant of the covariance of the residuals, px⁴ a look; of looks by themselves.
+    #[must_use]
+    pub fn log_determinant(&self) -> f64 {
+        let of_looks: f64 = self.looks.iter().map(|look| 2.0 * look.detection_px2.ln()).sum();
+        let of_leg = |leg: &Solved| leg.information.determinant.ln() - 6.0 * leg.stiffness.ln();
+        of_looks + self.legs.iter().map(of_leg).sum::<f64>()
+    }
+
     /// Residuals, px, after the most probable drift is taken out, in the order of the looks.
     #[must_use]
     pub fn left(&self) -> Vec<Vector2<f64>> {
@@ -257,7 +266,7 @@ impl<'a> Drive<'a> {
         let mut drifts = vec![Vector6::zeros(); self.looks.len()];
         let mut drift_of_next = Vector6::zeros();
         for leg in self.legs.iter().rev() {
-            let drift = leg.information.solve(&(drift_of_next * leg.tie + leg.gradient));
+            let drift = leg.information.matrix * (drift_of_next * leg.tie + leg.gradient);
             for i in leg.looks.clone() {
                 drifts[i] = drift.component_mul(&self.looks[i].drift_sigma);
             }
@@ -282,8 +291,8 @@ impl<'a> Drive<'a> {
                     gradient += weighted * *r;
                 }
             }
-            if let Some(known) = (Matrix6::identity() + own * of_pose * own).cholesky() {
-                let of_image = own * known.solve(&(own * gradient));
+            if let Some(known) = Inverse::of(&(Matrix6::identity() + own * of_pose * own)) {
+                let of_image = own * (known.matrix * (own * gradient));
                 errors[at..at + image.len()].iter_mut().for_each(|error| *error += of_image);
             }
             at += image.len();
@@ -309,7 +318,6 @@ impl Leg {
             cross += column * weighted_shared.transpose();
             normals.square += r * r * weight;
         }
-        normals.log_determinant += 2.0 * look.detection_px2.ln();
         normals.add(look.label, look.label, &of_label);
         normals.add_gradient(look.label, &by_label);
         self.add_cross(look.label, &cross);
@@ -331,15 +339,13 @@ impl Leg {
                 gradient += pose * (r * weight);
                 cross += column * pose.transpose() * weight;
             }
-            normals.log_determinant += 2.0 * look.detection_px2.ln();
             crosses.push((look.label, cross));
         }
         let own = Matrix6::from_diagonal(&looks[0].own_sigma);
-        let Some(known) = (Matrix6::identity() + own * of_pose * own).cholesky() else { return };
+        let Some(known) = Inverse::of(&(Matrix6::identity() + own * of_pose * own)) else { return };
         // The covariance of the image's own error, once its looks are known.
-        let error = own * known.inverse() * own;
+        let error = own * known.matrix * own;
         normals.square -= gradient.dot(&(error * gradient));
-        normals.log_determinant += log_determinant(&known);
         let kept = Matrix6::identity() - error * of_pose;
         let drift = Matrix6::from_diagonal(&looks[0].drift_sigma);
         for (a, of_a) in &crosses {
@@ -365,8 +371,8 @@ impl Leg {
     fn take_out(self, keep: f64, looks: Range<usize>, normals: &mut Normals) -> Option<(Solved, Self)> {
         let stiffness = 1.0 / (1.0 - keep * keep);
         let tie = keep * stiffness;
-        let tied = (self.information + Matrix6::identity() * (keep * tie)).cholesky()?;
-        let inverse = tied.inverse();
+        let information = Inverse::of(&(self.information + Matrix6::identity() * (keep * tie)))?;
+        let inverse = information.matrix;
         let by_gradient = inverse * self.gradient;
         let by_cross: Vec<(usize, Matrix3x6)> = self.cross.iter().map(|(a, cross)| (*a, cross * inverse)).collect();
         for (i, (a, of_a)) in by_cross.iter().enumerate() {
@@ -379,18 +385,13 @@ impl Leg {
             normals.add(*a, *a, &-(of_a * self.cross[i].1.transpose()));
         }
         normals.square -= self.gradient.dot(&by_gradient);
-        normals.log_determinant += log_determinant(&tied) - 6.0 * stiffness.ln();
         let next = Self {
             information: Matrix6::identity() * stiffness - inverse * (tie * tie),
             gradient: by_gradient * tie,
             cross: by_cross.into_iter().map(|(a, cross)| (a, cross * tie)).collect(),
         };
-        Some((Solved { looks, information: tied, gradient: self.gradient, tie }, next))
+        Some((Solved { looks, information, gradient: self.gradient, tie, stiffness }, next))
     }
-}
-
-fn log_determinant(cholesky: &Cholesky<f64, Const<6>>) -> f64 {
-    2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>()
 }
 
 /// How many looks, from the first one on, share one drift.

@@ -33,12 +33,11 @@ pub enum Care {
 }
 
 impl Care {
-    /// Estimates are done when a step is shorter than this, m.
-    #[must_use]
-    pub fn tolerance_m(self) -> f64 {
+    /// Estimates are done when a step is shorter than this, in sigmas of all labels together.
+    fn tolerance_sigmas(self) -> f64 {
         match self {
-            Self::Rough => ROUGH_M,
-            Self::Exact => 1e-5,
+            Self::Rough => 0.05,
+            Self::Exact => 0.01,
         }
     }
 
@@ -79,6 +78,16 @@ impl Elsewhere {
     }
 }
 
+/// Where the estimation of a label begins.
+pub struct Start<'v> {
+    /// Its voters.
+    pub voters: &'v [u32],
+    /// How much each of them counted when it was last estimated; none if it was not.
+    pub weights: &'v [f64],
+    /// A point near it.
+    pub point: Vector3<f64>,
+}
+
 /// Labels that are estimated together.
 pub struct Joint<'a> {
     scene: &'a Scene,
@@ -101,22 +110,18 @@ pub struct Solution<'a> {
 }
 
 impl<'a> Joint<'a> {
-    /// Begin with the voters of each label and a point near it.
+    /// Begin with some labels.
     #[must_use]
-    pub fn new<'v>(
-        scene: &'a Scene,
-        noise: &'a Noise,
-        labels: impl Iterator<Item = (&'v [u32], Vector3<f64>)>,
-        care: Care,
-    ) -> Self {
-        let (mut votes, mut points) = (Vec::new(), Vec::new());
-        for (label, (voters, start)) in labels.enumerate() {
-            votes.extend(voters.iter().map(|&ray| (label, ray)));
-            points.push(start);
+    pub fn new<'v>(scene: &'a Scene, noise: &'a Noise, labels: impl Iterator<Item = Start<'v>>, care: Care) -> Self {
+        let (mut counted, mut points) = (Vec::new(), Vec::new());
+        for (label, Start { voters, weights, point }) in labels.enumerate() {
+            let weight = |i: usize| weights.get(i).copied().unwrap_or(1.0);
+            counted.extend(voters.iter().enumerate().map(|(i, &ray)| ((label, ray), weight(i))));
+            points.push(point);
         }
-        votes.sort_unstable_by_key(|&(label, ray)| (scene.view(ray).pass, ray, label));
-        let count = votes.len();
-        let (weights, pose_errors) = (vec![1.0; count], vec![Vector6::zeros(); count]);
+        counted.sort_unstable_by_key(|&((label, ray), _)| (scene.view(ray).pass, ray, label));
+        let pose_errors = vec![Vector6::zeros(); counted.len()];
+        let (votes, weights) = counted.into_iter().unzip();
         Self { scene, noise, votes, weights, pose_errors, points, care }
     }
 
@@ -129,9 +134,11 @@ impl<'a> Joint<'a> {
         let mut rounds = 1;
         let information = loop {
             let information = here.normals.information.clone().cholesky()?;
-            let longest = self.step(&-information.solve(&here.normals.gradient));
+            let step = -information.solve(&here.normals.gradient);
+            let length_sigmas = (-step.dot(&here.normals.gradient)).sqrt();
+            self.step(&step);
             self.weights = here.own.iter().map(|chi2| (HUBER_SIGMAS / chi2.sqrt()).min(1.0)).collect();
-            if longest < self.care.tolerance_m() || rounds == self.care.max_iterations() {
+            if length_sigmas < self.care.tolerance_sigmas() || rounds == self.care.max_iterations() {
                 break information;
             }
             if self.care == Care::Exact {
@@ -147,16 +154,12 @@ impl<'a> Joint<'a> {
         Some(Solution { joint: self, here, estimates })
     }
 
-    /// Move the points, each not too far; the longest step asked for, m.
-    fn step(&mut self, step: &DVector<f64>) -> f64 {
-        let mut longest = 0.0_f64;
+    /// Move the points, each not too far.
+    fn step(&mut self, step: &DVector<f64>) {
         for (k, point) in self.points.iter_mut().enumerate() {
             let step = step.fixed_rows::<3>(3 * k);
-            let length = step.norm();
-            *point += step * (LONGEST_STEP_M / length).min(1.0);
-            longest = longest.max(length);
+            *point += step * (LONGEST_STEP_M / step.norm()).min(1.0);
         }
-        longest
     }
 
     fn estimates(&self, covariance: &DMatrix<f64>) -> Vec<Estimate> {
@@ -169,14 +172,16 @@ impl<'a> Joint<'a> {
     }
 
     fn evaluate(&self) -> Option<Evaluation> {
-        let of_vote = |(&(label, ray), error): (&(usize, u32), &Vector6)| {
-            let (scene, noise, point) = (self.scene, self.noise, &self.points[label]);
-            match self.care {
-                Care::Rough => Some(Look::of(scene, noise, ray, label, point)?.by_itself()),
-                Care::Exact => Look::where_it_was(scene, noise, ray, label, point, error),
-            }
-        };
-        let looks: Vec<Look> = self.votes.iter().zip(&self.pose_errors).map(of_vote).collect::<Option<_>>()?;
+        let (scene, noise) = (self.scene, self.noise);
+        // Not collected: an iterator of options does not say how many there will be.
+        let mut looks = Vec::with_capacity(self.votes.len());
+        for (&(label, ray), error) in self.votes.iter().zip(&self.pose_errors) {
+            let point = &self.points[label];
+            looks.push(match self.care {
+                Care::Rough => Look::of(scene, noise, ray, label, point)?.by_itself(),
+                Care::Exact => Look::where_it_was(scene, noise, ray, label, point, error)?,
+            });
+        }
         let mut normals = Normals::nothing(self.points.len());
         let mut of_visits = Vec::new();
         let mut pose_errors = Vec::new();
@@ -218,6 +223,33 @@ impl Solution<'_> {
     #[must_use]
     pub fn own_chi2(&self) -> Vec<((usize, u32), f64)> {
         self.joint.votes.iter().copied().zip(self.here.own.iter().copied()).collect()
+    }
+
+    /// How much each vote counts that [`own_chi2`](Self::own_chi2) lists.
+    #[must_use]
+    pub fn weights(&self) -> &[f64] {
+        &self.joint.weights
+    }
+
+    /// To first order, the estimates without the votes of which `leaves` says so, in the order of
+    /// [`own_chi2`](Self::own_chi2); nothing if the others do not fix them.
+    #[must_use]
+    pub fn without(&self, leaves: &[bool]) -> Option<Vec<Estimate>> {
+        let Joint { scene, noise, votes, weights, pose_errors, points, care } = &self.joint;
+        let stays: Vec<usize> = (0..votes.len()).filter(|&i| !leaves[i]).collect();
+        let mut rest = Joint {
+            scene,
+            noise,
+            votes: stays.iter().map(|&i| votes[i]).collect(),
+            weights: stays.iter().map(|&i| weights[i]).collect(),
+            pose_errors: stays.iter().map(|&i| pose_errors[i]).collect(),
+            points: points.clone(),
+            care: *care,
+        };
+        let Evaluation { normals, .. } = rest.evaluate()?;
+        let information = normals.information.cholesky()?;
+        rest.step(&-information.solve(&normals.gradient));
+        Some(rest.estimates(&information.inverse()))
     }
 
     /// For each label, where all visits but one put it, for each that votes for it: votes of a visit that went to the wrong one of
@@ -268,7 +300,10 @@ struct Evaluation {
 /// Nothing if the point ends up behind a voter, or the voters do not fix it.
 #[must_use]
 pub fn estimate(scene: &Scene, noise: &Noise, voters: &[u32], start: Vector3<f64>, care: Care) -> Option<Estimate> {
-    Joint::new(scene, noise, std::iter::once((voters, start)), care).solve()?.estimates.pop()
+    Joint::new(scene, noise, std::iter::once(Start { voters, weights: &[], point: start }), care)
+        .solve()?
+        .estimates
+        .pop()
 }
 
 /// Information and gradient of a measured range: one more observation of its voter, along the viewing direction.
@@ -294,10 +329,8 @@ pub fn by_pass<'a>(scene: &'a Scene, voters: &'a [u32]) -> impl Iterator<Item = 
     voters.chunk_by(|&a, &b| is_one_visit(scene.view(a), scene.view(b)))
 }
 
-/// What the voters of one visit say of a point; nothing if it is behind one of them.
+/// The looks of the voters of one visit at a point, each by itself; nothing if it is behind one of them.
 #[must_use]
-pub fn pass_terms(scene: &Scene, noise: &Noise, voters: &[u32], point: &Vector3<f64>) -> Option<Normals> {
-    let of_voter = |&ray: &u32| Some(Look::of(scene, noise, ray, 0, point)?.by_itself());
-    let looks: Vec<Look> = voters.iter().map(of_voter).collect::<Option<_>>()?;
-    Some(Drive::along(&looks, &vec![1.0; voters.len()], 1)?.normals)
+pub fn looks_at(scene: &Scene, noise: &Noise, voters: &[u32], point: &Vector3<f64>) -> Option<Vec<Look>> {
+    voters.iter().map(|&ray| Some(Look::of(scene, noise, ray, 0, point)?.by_itself())).collect()
 }

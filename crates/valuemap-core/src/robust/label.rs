@@ -8,12 +8,14 @@ use rstar::RTree;
 use rstar::primitives::GeomWithData;
 use rustc_hash::FxHasher;
 
-use super::estimate::{Care, Elsewhere, Estimate, Joint};
+use super::estimate::{Care, Elsewhere, Estimate, Joint, Start};
 use super::noise::Noise;
 use super::scene::{Scene, View};
 
 /// A label that moved by less, squared and in sigmas, is what it was.
-const SMALL_MOVE_CHI2: f64 = 0.01;
+const SMALL_MOVE_CHI2: f64 = 0.1;
+/// A label whose mean direction of sight changed by less is seen from where it was.
+const SMALL_TURN: f64 = 0.1;
 /// Rounds of leaving out voters, at most.
 const MAX_TRIMS: usize = 10;
 
@@ -35,6 +37,8 @@ pub struct Label {
     pub class: u32,
     /// The rays that support it, one an image, ordered by pass, then by number.
     pub voters: Vec<u32>,
+    /// How much each of them counted when it was last estimated, 0 to 1.
+    pub weights: Vec<f64>,
     /// Images (ascending) that say nothing for or against it: a stronger label that has no detection of its own there
     /// explains its voter as well, or another label took what it might have had.
     pub undecided: Vec<u32>,
@@ -55,8 +59,10 @@ pub struct Label {
 pub struct Revision {
     /// Fingerprint of its voters.
     pub voters: u64,
-    /// Where it was.
+    /// Where it was when it last moved.
     pub point: Vector3<f64>,
+    /// From where it was seen then, see [`Label::side`].
+    pub side: Vector3<f64>,
     /// Fingerprint of the votes of all labels that it was last estimated with.
     pub place: u64,
 }
@@ -86,19 +92,21 @@ pub fn from_voters(
 ) -> Option<Label> {
     scene.sort_by_pass(&mut voters);
     let class = scene.rays.class[*voters.first()? as usize];
-    let mut point = start;
+    let (mut point, mut weights) = (start, Vec::new());
     for _ in 0..MAX_TRIMS {
-        let start = std::iter::once((voters.as_slice(), point));
-        let solution = Joint::new(scene, noise, start, Care::Rough).solve()?;
+        let start = Start { voters: &voters, weights: &weights, point };
+        let solution = Joint::new(scene, noise, std::iter::once(start), Care::Rough).solve()?;
+        let leaves = unfit(&solution.own_chi2(), gate_sigmas);
         let estimate = solution.estimates[0];
-        let (left, refused) = fitting(&solution.own_chi2(), gate_sigmas);
-        if refused.is_empty() {
+        weights = solution.weights().to_vec();
+        if !leaves.contains(&true) {
             let side = side_of(scene, &voters, &estimate.point);
             return Some(Label {
                 estimate,
                 side,
                 class,
                 voters,
+                weights,
                 undecided: Vec::new(),
                 unseen_from: Vec::new(),
                 elsewhere: Vec::new(),
@@ -107,7 +115,9 @@ pub fn from_voters(
                 known: Known::default(),
             });
         }
-        (point, voters) = (estimate.point, left.into_iter().map(|(_, ray)| ray).collect());
+        point = estimate.point;
+        (voters, weights) =
+            voters.iter().copied().zip(weights).zip(leaves).filter(|(_, leaves)| !leaves).map(|(vote, _)| vote).unzip();
         if voters.len() < 2 {
             return None;
         }
@@ -115,13 +125,10 @@ pub fn from_voters(
     None
 }
 
-/// Labels and rays of votes.
-type Votes = Vec<(usize, u32)>;
-
-/// The votes that fit the gate, and those that must leave: of each label the worst first, since one bad vote makes good
-/// ones look bad.
+/// Which votes do not fit the gate and must leave: of each label the worst first, since one bad vote makes good ones look
+/// bad.
 #[must_use]
-pub fn fitting(votes: &[((usize, u32), f64)], gate_sigmas: f64) -> (Votes, Votes) {
+pub fn unfit(votes: &[((usize, u32), f64)], gate_sigmas: f64) -> Vec<bool> {
     let labels = votes.iter().map(|((label, _), _)| label + 1).max().unwrap_or(0);
     let mut worst = vec![0.0_f64; labels];
     for ((label, _), chi2) in votes {
@@ -129,9 +136,7 @@ pub fn fitting(votes: &[((usize, u32), f64)], gate_sigmas: f64) -> (Votes, Votes
     }
     let limit = gate_sigmas * gate_sigmas;
     let stays = |((label, _), chi2): &((usize, u32), f64)| *chi2 < limit || *chi2 < 0.5 * worst[*label];
-    let (stay, leave): (Vec<_>, Vec<_>) = votes.iter().partition(|vote| stays(vote));
-    let votes_of = |of: Vec<&((usize, u32), f64)>| of.into_iter().map(|(vote, _)| *vote).collect();
-    (votes_of(stay), votes_of(leave))
+    votes.iter().map(|vote| !stays(vote)).collect()
 }
 
 /// Mean of the unit directions from a point to the cameras of its voters.
@@ -181,23 +186,38 @@ impl Label {
         images
     }
 
-    /// A fingerprint of what it was when it last changed.
+    /// A fingerprint of where it is and from where it is seen; small moves change nothing.
     #[must_use]
-    pub fn identity(&self) -> u64 {
+    pub fn stand(&self) -> u64 {
         let mut hasher = FxHasher::default();
-        let point = if self.revision == Revision::default() { self.estimate.point } else { self.revision.point };
-        (fingerprint(&self.voters), self.unseen_from.len(), self.class).hash(&mut hasher);
-        point.iter().for_each(|number| number.to_bits().hash(&mut hasher));
+        let is_new = self.revision == Revision::default();
+        let [point, side] =
+            if is_new { [self.estimate.point, self.side] } else { [self.revision.point, self.revision.side] };
+        (self.unseen_from.len(), self.class).hash(&mut hasher);
+        point.iter().chain(&side).for_each(|number| number.to_bits().hash(&mut hasher));
         hasher.finish()
     }
 
-    /// Note where it was estimated to be; it is what it was if it has the same voters and moved but little.
+    /// A fingerprint of that and its voters.
+    #[must_use]
+    pub fn identity(&self) -> u64 {
+        let mut hasher = FxHasher::default();
+        (self.stand(), fingerprint(&self.voters)).hash(&mut hasher);
+        hasher.finish()
+    }
+
+    /// Note where it was estimated to be, and what it rests on.
     pub fn revise(&mut self) {
         let voters = fingerprint(&self.voters);
         let step = self.estimate.point - self.revision.point;
-        let moved = self.estimate.covariance.cholesky().map(|cholesky| step.dot(&cholesky.solve(&step)));
-        if voters != self.revision.voters || !moved.is_some_and(|chi2| chi2 < SMALL_MOVE_CHI2) {
-            self.revision = Revision { voters, point: self.estimate.point, place: self.revision.place };
+        let chi2 = self.estimate.covariance.cholesky().map(|cholesky| step.dot(&cholesky.solve(&step)));
+        let turn = (self.side - self.revision.side).norm();
+        let stays = chi2.is_some_and(|chi2| chi2 < SMALL_MOVE_CHI2) && turn < SMALL_TURN;
+        if !stays {
+            (self.revision.point, self.revision.side) = (self.estimate.point, self.side);
+        }
+        if !stays || voters != self.revision.voters {
+            self.revision.voters = voters;
             self.known = Known::default();
         }
     }

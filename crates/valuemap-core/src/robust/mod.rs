@@ -16,6 +16,7 @@
 pub mod adjust;
 pub mod associate;
 pub mod calibrate;
+pub mod contest;
 pub mod drift;
 pub mod estimate;
 pub mod exchange;
@@ -23,6 +24,7 @@ pub mod existence;
 pub mod gather;
 pub mod grant;
 pub mod index;
+pub mod keyframes;
 pub mod label;
 pub mod noise;
 pub mod nominate;
@@ -32,8 +34,9 @@ pub mod rivals;
 pub mod sample;
 pub mod scene;
 pub mod settle;
+mod spd;
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -49,6 +52,7 @@ use estimate::Care;
 use existence::{Lookout, Looks, Rates, Sector};
 use gather::{VOTE_RANGE, gather};
 use index::RayIndex;
+use keyframes::Keyframes;
 use label::{Label, fingerprint};
 use noise::{Noise, Spread};
 use scene::Scene;
@@ -86,14 +90,18 @@ const CALIBRATION_ROUNDS: usize = 3;
 
 /// Times that the rays of no label are gathered, at most.
 const SESSIONS: usize = 3;
+/// The same in a large scene, first in its keyframes and then in all images: what is left over gets less and less.
+const SESSIONS_OF_LARGE: usize = 1;
 
 /// Times that labels compete before any is doubted.
 const SETTLING_ROUNDS: usize = 4;
+/// The same for labels that competed in the keyframes.
+const REFINING_ROUNDS: usize = 2;
 
-/// Labels are dropped below these multiples of the probability that is asked for, one after the other.
-const DOUBTS: [f64; 4] = [1e-5, 1e-2, 0.3, 1.0];
+/// Labels are dropped below these multiples of the probability that is asked for, one after the other, and then below that.
+const DOUBTS: [f64; 3] = [1e-5, 1e-2, 0.3];
 
-/// Rounds of dropping and giving back at each of them, at most.
+/// Rounds of dropping and giving back at the end, at most.
 const MAX_DOUBT_ROUNDS: usize = 6;
 
 /// A label with what speaks for it.
@@ -158,7 +166,6 @@ pub fn self_calibrate(
             let spreads = spreads_of(scene, &noise);
             let mut court = Court::new(scene, &noise, &spreads, &settings, rays.iter().copied());
             for _ in 0..SETTLING_ROUNDS {
-                progress.check()?;
                 labels = court.settle(labels, true, &mut Tally::default(), progress)?;
             }
         }
@@ -172,46 +179,44 @@ pub fn self_calibrate(
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
 pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progress) -> Result<Findings, Halt> {
-    let all = 0..scene.rays.rays.len() as u32;
-    let spreads = spreads_of(scene, noise);
-    let mut court = Court::new(scene, noise, &spreads, settings, all.clone());
-    let lookout = Lookout::new(scene);
     let mut tally = Tally::default();
-    let mut labels: Vec<Label> = Vec::new();
-    // What a doubted label gives back, and what settled labels leave, may be seen more clearly now.
-    for _ in 0..SESSIONS {
-        let mut claimed = vec![false; all.len()];
-        for &ray in labels.iter().flat_map(|label| &label.voters) {
-            claimed[ray as usize] = true;
-        }
-        let free: Vec<u32> = all.clone().filter(|&ray| !claimed[ray as usize]).collect();
-        let before = labels.len();
-        let (more, [nominations, accepted]) = gather(scene, noise, settings, &free, progress)?;
-        tally.nominations += nominations;
-        tally.accepted += accepted;
-        labels = if labels.is_empty() { more } else { court.admit(&lookout, labels, more, &mut tally) };
-        labels.sort_by_key(settle::first_voter);
-        for _ in 0..SETTLING_ROUNDS {
-            progress.check()?;
-            labels = court.settle(labels, true, &mut tally, progress)?;
-        }
-        labels = court.doubt(&lookout, labels, &mut tally, progress)?;
-        if labels.len() <= before {
-            break;
-        }
-    }
+    let keyframes = Keyframes::of(scene);
+    let begun = match &keyframes {
+        Some(keyframes) => found_in(keyframes, noise, settings, &mut tally, progress)?,
+        None => Vec::new(),
+    };
+    let (sessions, rounds) =
+        if keyframes.is_some() { (SESSIONS_OF_LARGE, REFINING_ROUNDS) } else { (SESSIONS, SETTLING_ROUNDS) };
+    let spreads = spreads_of(scene, noise);
+    let mut court = Court::new(scene, noise, &spreads, settings, 0..scene.rays.rays.len() as u32);
+    let labels = court.hold(begun, sessions, rounds, &mut tally, progress)?;
     let labels = adjust(scene, noise, settings.gate_sigmas, settings.min_votes as usize, &labels, Care::Exact);
     let before = labels.len();
     let labels = settle::outclass(scene, noise, labels);
     tally.outvoted += (before - labels.len()) as u64;
     let Judgement { of_labels, rates, strays_per_image } =
-        judge(scene, &spreads, &court.sectors(&lookout, &labels), &labels, settings, tally.doubted);
+        judge(scene, &spreads, &court.sectors(&labels), &labels, settings, tally.doubted);
     let variance_factor = calibrate::variance_factor(scene, noise, &labels);
     let findings = labels.into_iter().zip(of_labels).map(|(mut label, (existence, expected))| {
         label.estimate.covariance *= variance_factor;
         Finding { label, existence, expected }
     });
     Ok(Findings { findings: findings.collect(), tally, rates, strays_per_image, variance_factor })
+}
+
+/// The labels that the keyframes of a scene show.
+fn found_in(
+    keyframes: &Keyframes,
+    noise: &Noise,
+    settings: &Settings,
+    tally: &mut Tally,
+    progress: &Progress,
+) -> Result<Vec<Label>, Halt> {
+    let scene = &keyframes.scene;
+    let spreads = spreads_of(scene, noise);
+    let mut court = Court::new(scene, noise, &spreads, settings, 0..scene.rays.rays.len() as u32);
+    let labels = court.hold(Vec::new(), SESSIONS_OF_LARGE, SETTLING_ROUNDS, tally, progress)?;
+    Ok(labels.into_iter().map(|label| keyframes.in_whole(label)).collect())
 }
 
 /// Where labels compete for the rays.
@@ -221,6 +226,7 @@ struct Court<'a> {
     spreads: &'a [Spread],
     settings: &'a Settings,
     association: Association<'a>,
+    lookout: OnceLock<Lookout<'a>>,
     /// The sectors of the labels as they last were.
     seen_from: FxHashMap<(u64, u64), Arc<[Sector]>>,
 }
@@ -241,8 +247,63 @@ impl<'a> Court<'a> {
             spreads,
             settings,
             association: Association::new(scene, noise, index, range_m),
+            lookout: OnceLock::new(),
             seen_from: FxHashMap::default(),
         }
+    }
+
+    /// Find labels among all rays, beginning with those that were found already.
+    fn hold(
+        &mut self,
+        begun: Vec<Label>,
+        sessions: usize,
+        rounds: usize,
+        tally: &mut Tally,
+        progress: &Progress,
+    ) -> Result<Vec<Label>, Halt> {
+        let mut labels = if begun.is_empty() { begun } else { self.settle(begun, true, tally, progress)? };
+        // What a doubted label gives back, and what settled labels leave, may be seen more clearly now.
+        for _ in 0..sessions {
+            let before = labels.len();
+            let new = self.left_over(&labels, tally, progress)?;
+            labels = if labels.is_empty() { new } else { self.admit(labels, new, tally) };
+            labels.sort_by_key(settle::first_voter);
+            for _ in 0..rounds {
+                labels = self.settle(labels, true, tally, progress)?;
+            }
+            labels = self.doubt(labels, tally, progress)?;
+            if labels.len() <= before {
+                break;
+            }
+        }
+        Ok(labels)
+    }
+
+    /// Labels of the rays that no label has; if there are others, these compete among themselves first.
+    fn left_over(&self, labels: &[Label], tally: &mut Tally, progress: &Progress) -> Result<Vec<Label>, Halt> {
+        let &Self { scene, noise, spreads, settings, .. } = self;
+        let mut is_taken = vec![false; scene.rays.rays.len()];
+        for &ray in labels.iter().flat_map(|label| &label.voters) {
+            is_taken[ray as usize] = true;
+        }
+        let free: Vec<u32> = (0..is_taken.len() as u32).filter(|&ray| !is_taken[ray as usize]).collect();
+        let (mut new, [nominations, accepted]) = gather(scene, noise, settings, &free, progress)?;
+        tally.nominations += nominations;
+        tally.accepted += accepted;
+        if !labels.is_empty() {
+            let mut annex = Court::new(scene, noise, spreads, settings, free.into_iter());
+            for _ in 0..SETTLING_ROUNDS {
+                new = annex.settle(new, true, tally, progress)?;
+            }
+            // Where others took what they might have had they were not missed.
+            new.par_iter_mut().for_each(|label| {
+                let taken = self.association.images_at(label, |ray| is_taken[ray as usize]);
+                label.undecided.extend(taken);
+                label.undecided.sort_unstable();
+                label.undecided.dedup();
+            });
+        }
+        Ok(new)
     }
 
     /// One round: neighbors exchange votes, all labels compete for all rays, those that are two are split and those that are
@@ -254,6 +315,7 @@ impl<'a> Court<'a> {
         tally: &mut Tally,
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
+        progress.check()?;
         let &mut Self { scene, noise, settings, .. } = self;
         let gate = settings.gate_sigmas;
         let min_votes = settings.min_votes as usize;
@@ -270,47 +332,39 @@ impl<'a> Court<'a> {
         Ok(labels)
     }
 
+    fn sectors_of(&self, label: &Label) -> Arc<[Sector]> {
+        self.lookout.get_or_init(|| Lookout::new(self.scene)).sectors(label).into()
+    }
+
     /// The sectors that each label is seen from.
-    fn sectors(&mut self, lookout: &Lookout<'_>, labels: &[Label]) -> Vec<Arc<[Sector]>> {
+    fn sectors(&mut self, labels: &[Label]) -> Vec<Arc<[Sector]>> {
         let key_of = |label: &Label| (label.identity(), fingerprint(&label.undecided));
-        let of_label = |label: &Label| {
-            self.seen_from.get(&key_of(label)).map_or_else(|| lookout.sectors(label).into(), Arc::clone)
-        };
+        let of_label =
+            |label: &Label| self.seen_from.get(&key_of(label)).map_or_else(|| self.sectors_of(label), Arc::clone);
         let found: Vec<Arc<[Sector]>> = labels.par_iter().map(of_label).collect();
         self.seen_from = labels.iter().map(key_of).zip(found.iter().cloned()).collect();
         found
     }
 
-    /// Some labels with those of others that may exist with what they have.
-    fn admit(
-        &mut self,
-        lookout: &Lookout<'_>,
-        mut labels: Vec<Label>,
-        new: Vec<Label>,
-        tally: &mut Tally,
-    ) -> Vec<Label> {
+    /// Some labels with those of others that probably exist.
+    fn admit(&mut self, mut labels: Vec<Label>, new: Vec<Label>, tally: &mut Tally) -> Vec<Label> {
         let old = labels.len();
         labels.extend(new);
-        let sectors = self.sectors(lookout, &labels);
+        let sectors = self.sectors(&labels);
         let judgement = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.doubted);
         let before = labels.len();
-        let limit = DOUBTS[1] * self.settings.min_existence;
         let admitted = labels.into_iter().zip(judgement.of_labels).enumerate();
-        let admitted = admitted.filter(|(i, (_, (existence, _)))| *i < old || *existence >= limit);
+        let admitted =
+            admitted.filter(|(i, (_, (existence, _)))| *i < old || *existence >= self.settings.min_existence);
         let labels: Vec<Label> = admitted.map(|(_, (label, _))| label).collect();
         tally.doubted += (before - labels.len()) as u64;
         labels
     }
 
     /// Take votes away from labels that look as if they were not to be seen from there. Also the sectors of those left.
-    fn look_around(
-        &mut self,
-        lookout: &Lookout<'_>,
-        labels: Vec<Label>,
-        tally: &mut Tally,
-    ) -> (Vec<Label>, Vec<Arc<[Sector]>>) {
+    fn look_around(&mut self, labels: Vec<Label>, tally: &mut Tally) -> (Vec<Label>, Vec<Arc<[Sector]>>) {
         let before = labels.len();
-        let sectors = self.sectors(lookout, &labels);
+        let sectors = self.sectors(&labels);
         let of_label = |(label, sectors): (Label, Arc<[Sector]>)| {
             let stray: Vec<Vector3<f64>> =
                 sectors.iter().filter(|sector| sector.is_stray()).map(|sector| sector.direction).collect();
@@ -324,7 +378,7 @@ impl<'a> Court<'a> {
             let found = label::from_voters(self.scene, self.noise, self.settings.gate_sigmas, seen, start)?;
             let enough = found.voters.len() >= self.settings.min_votes as usize;
             let left = enough.then_some(Label { undecided: label.undecided, unseen_from, ..found })?;
-            let sectors = lookout.sectors(&left).into();
+            let sectors = self.sectors_of(&left);
             Some((left, sectors))
         };
         let (labels, sectors): (Vec<Label>, Vec<_>) =
@@ -335,31 +389,36 @@ impl<'a> Court<'a> {
 
     /// Drop the labels that probably do not exist, the least probable first: what they give back may be just what a doubtful
     /// one lacks.
-    fn doubt(
-        &mut self,
-        lookout: &Lookout<'_>,
-        mut labels: Vec<Label>,
-        tally: &mut Tally,
-        progress: &Progress,
-    ) -> Result<Vec<Label>, Halt> {
-        for doubt in DOUBTS.map(|doubt| doubt * self.settings.min_existence) {
-            for _ in 0..MAX_DOUBT_ROUNDS {
-                progress.check()?;
-                let (left, sectors) = self.look_around(lookout, labels, tally);
-                labels = left;
-                let judgement = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.doubted);
-                let before = labels.len();
-                let existing =
-                    labels.into_iter().zip(judgement.of_labels).filter(|(_, (existence, _))| *existence >= doubt);
-                labels = existing.map(|(label, _)| label).collect();
-                tally.doubted += (before - labels.len()) as u64;
-                if labels.len() == before {
-                    break;
-                }
-                labels = self.settle(labels, false, tally, progress)?;
+    fn doubt(&mut self, mut labels: Vec<Label>, tally: &mut Tally, progress: &Progress) -> Result<Vec<Label>, Halt> {
+        for doubt in DOUBTS {
+            labels = self.drop_below(doubt, labels, tally, progress)?;
+        }
+        for _ in 0..MAX_DOUBT_ROUNDS {
+            let dropped = tally.doubted;
+            labels = self.drop_below(1.0, labels, tally, progress)?;
+            if tally.doubted == dropped {
+                break;
             }
         }
         Ok(labels)
+    }
+
+    /// Drop the labels that are less probable than a multiple of what is asked for, and let the others compete for their votes.
+    fn drop_below(
+        &mut self,
+        doubt: f64,
+        labels: Vec<Label>,
+        tally: &mut Tally,
+        progress: &Progress,
+    ) -> Result<Vec<Label>, Halt> {
+        let (labels, sectors) = self.look_around(labels, tally);
+        let judgement = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.doubted);
+        let before = labels.len();
+        let judged = labels.into_iter().zip(judgement.of_labels);
+        let existing = judged.filter(|(_, (existence, _))| *existence >= doubt * self.settings.min_existence);
+        let labels: Vec<Label> = existing.map(|(label, _)| label).collect();
+        tally.doubted += (before - labels.len()) as u64;
+        if labels.len() == before { Ok(labels) } else { self.settle(labels, false, tally, progress) }
     }
 }
 
@@ -388,7 +447,7 @@ fn judge(
         scene.frusta.iter().map(|frustum| frustum.solid_angle_sr).sum::<f64>() / scene.frusta.len() as f64;
     let strays_per_sr = strays_per_image / solid_angle;
     let chance: Vec<f64> = labels
-        .iter()
+        .par_iter()
         .map(|label| existence::chance_of(label, scene, spreads, settings.gate_sigmas, strays_per_sr))
         .collect();
     let existence = existence::probabilities(&looks, &rates, &chance, doubted);
@@ -398,5 +457,5 @@ fn judge(
 /// The spread of every ray.
 #[must_use]
 pub fn spreads_of(scene: &Scene, noise: &Noise) -> Vec<Spread> {
-    (0..scene.rays.rays.len() as u32).map(|ray| noise.total(scene, ray)).collect()
+    (0..scene.rays.rays.len() as u32).into_par_iter().map(|ray| noise.total(scene, ray)).collect()
 }

@@ -6,8 +6,9 @@
 
 use nalgebra::{Matrix2, SMatrix, Vector2};
 
-use super::drift::{DRIFT_LENGTH_M, LEG_M, Look, Matrix6, Vector6};
+use super::drift::{DRIFT_LENGTH_M, LEG_M, Look, Vector6};
 use super::scene::View;
+use super::spd::{Inverse, Matrix6};
 
 /// Legs before and after those in question that say something about their drift.
 pub(super) const LEGS_AROUND: usize = 20;
@@ -72,10 +73,10 @@ impl Belief {
         let tie = keep * stiffness;
         // The new drift is `keep` times the old one and something new of variance 1 - keep².
         let (own, of_new) = if is_prior { (keep * tie, stiffness) } else { (stiffness, keep * tie) };
-        let Some(tied) = (self.information + Matrix6::identity() * own).cholesky() else { return Self::nothing() };
+        let Some(tied) = Inverse::of(&(self.information + Matrix6::identity() * own)) else { return Self::nothing() };
         Self {
-            information: Matrix6::identity() * of_new - tied.inverse() * (tie * tie),
-            gradient: tied.solve(&self.gradient) * tie,
+            information: Matrix6::identity() * of_new - tied.matrix * (tie * tie),
+            gradient: tied.matrix * self.gradient * tie,
         }
     }
 
@@ -85,7 +86,7 @@ impl Belief {
     pub fn pose_error(&self, drift: (f64, f64), own: (f64, f64)) -> PoseError {
         let diagonal = |(p, r): (f64, f64)| Vector6::new(p, p, p, r, r, r);
         let (drift, own) = (diagonal(drift), diagonal(own));
-        let covariance = self.information.cholesky().map_or_else(Matrix6::identity, |cholesky| cholesky.inverse());
+        let covariance = Inverse::of(&self.information).map_or_else(Matrix6::identity, |inverse| inverse.matrix);
         let mean = -(covariance * self.gradient);
         let scale = Matrix6::from_diagonal(&drift);
         PoseError {

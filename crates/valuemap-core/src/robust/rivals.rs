@@ -59,9 +59,9 @@ impl Run<'_> {
         }
         let is_one = |r: &Rivalry| r.one >= LEAST_RIVALRY && f64::from(r.both) < MOST_BOTH * f64::from(r.one);
         // What does not change is not seen whole here.
-        let identity = |label: u32| self.identities[label as usize];
-        let was = |a: u32, b: u32| self.of.overruled.contains(&(identity(a), identity(b), self.pass));
-        let is_old = |label: u32| self.of.last.contains_key(&identity(label));
+        let stand = |label: u32| self.stands[label as usize];
+        let was = |a: u32, b: u32| self.of.overruled.contains(&(stand(a), stand(b), self.pass));
+        let is_old = |label: u32| self.of.last.contains_key(&stand(label));
         let of_pair = |((a, b), rivalry): ((u32, u32), Rivalry)| {
             let poses = self.drift_without(&[a, b], &rivalry.rays);
             let [of_a, of_b] = [a, b].map(|label| self.surprise(label, &rivalry.rays, &poses));
@@ -105,7 +105,7 @@ impl Run<'_> {
         };
         let joint = || {
             let looks: Vec<Look> = rays.iter().zip(drift).map(look).collect::<Option<_>>()?;
-            let normals = Drive::along(&looks, &vec![1.0; looks.len()], 1)?.normals;
+            let normals = Drive::at_one(&looks)?.normals;
             let (information, gradient) = normals.of_one();
             let after = (information + estimate.covariance.try_inverse()?).cholesky()?;
             let widening = (after.determinant() * estimate.covariance.determinant()).ln();

@@ -1,0 +1,102 @@
+//! Contested votes: of two neighbors an image shows only one, and it might be either.
+//!
+//! Which of the two got the vote is decided by residuals that the pose errors hide, and decided alike for all that look from
+//! there: no covariance knows of it. If the position without the contested votes is another one than with them, some of
+//! them are the neighbor's, and how far the two are apart is how little the position is known.
+
+use nalgebra::Vector3;
+use rayon::prelude::*;
+use rstar::RTree;
+use rstar::primitives::GeomWithData;
+use rustc_hash::FxHashSet;
+
+use super::estimate::{Estimate, Solution};
+use super::index::chi2;
+use super::label::{Label, by_place};
+use super::noise::Noise;
+use super::scene::Scene;
+
+/// Labels farther apart do not contest each other's votes, m.
+const NEIGHBOR_M: f64 = 3.0;
+/// Squared distance in sigmas up to which the positions with and without contested votes agree: the 95 % quantile of chi²
+/// with 3 degrees of freedom.
+const AGREEMENT_CHI2: f64 = 7.8;
+/// Where the contested votes tell next to nothing, the difference of the covariances is at least this share of them.
+const LEAST_DIFFERENCE: f64 = 1e-2;
+
+/// Labels that might have each other's votes.
+pub struct Contest<'a> {
+    scene: &'a Scene,
+    noise: &'a Noise,
+    gate_sigmas: f64,
+    labels: &'a [Label],
+    tree: RTree<GeomWithData<[f64; 3], usize>>,
+    /// The images that show each label.
+    shown_in: Vec<FxHashSet<u32>>,
+}
+
+impl<'a> Contest<'a> {
+    /// Begin with all labels of a scene.
+    #[must_use]
+    pub fn new(scene: &'a Scene, noise: &'a Noise, gate_sigmas: f64, labels: &'a [Label]) -> Self {
+        let images = |label: &Label| label.voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
+        let shown_in = labels.par_iter().map(images).collect();
+        Self { scene, noise, gate_sigmas, labels, tree: by_place(labels), shown_in }
+    }
+
+    /// For each vote of a solution whether a neighbor that its image does not show might have it.
+    #[must_use]
+    pub fn contested(&self, solution: &Solution<'_>) -> Vec<bool> {
+        let neighbors = |estimate: &Estimate| -> Vec<usize> {
+            let near = self.tree.locate_within_distance(estimate.point.into(), NEIGHBOR_M * NEIGHBOR_M);
+            near.map(|near| near.data).collect()
+        };
+        let near: Vec<Vec<usize>> = solution.estimates.iter().map(neighbors).collect();
+        let votes = solution.own_chi2();
+        votes.iter().map(|&((label, ray), _)| near[label].iter().any(|&i| self.might_have(i, ray))).collect()
+    }
+
+    /// Never the label that has it: its images are those that show it.
+    fn might_have(&self, neighbor: usize, ray: u32) -> bool {
+        let projected = self.scene.ray(ray).project(&self.labels[neighbor].estimate.point);
+        self.labels[neighbor].class == self.scene.rays.class[ray as usize]
+            && !self.shown_in[neighbor].contains(&self.scene.rays.image[ray as usize])
+            && projected.z > 0.0
+            && chi2(&projected, &self.noise.total(self.scene, ray)) < self.gate_sigmas * self.gate_sigmas
+    }
+}
+
+/// An estimate with what contested votes may have done to it; `sure` rests on the other votes alone.
+///
+/// The difference of two estimates, one of which rests on a part of what the other rests on, has the difference of their
+/// covariances (Hausman, "Specification Tests in Econometrics", Econometrica 46, 1978).
+#[must_use]
+pub fn widened(estimate: &Estimate, sure: &Estimate) -> Estimate {
+    let apart: Vector3<f64> = sure.point - estimate.point;
+    let difference = sure.covariance - estimate.covariance * (1.0 - LEAST_DIFFERENCE);
+    let chi2 = difference.cholesky().map(|cholesky| apart.dot(&cholesky.solve(&apart)));
+    let doubt = if chi2.is_some_and(|chi2| chi2 > AGREEMENT_CHI2) { 1.0 } else { 0.0 };
+    Estimate { covariance: estimate.covariance + apart * apart.transpose() * doubt, ..*estimate }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Matrix3;
+
+    use super::*;
+
+    fn at(x_m: f64, variance_m2: f64) -> Estimate {
+        Estimate { point: Vector3::new(x_m, 0.0, 0.0), covariance: Matrix3::identity() * variance_m2 }
+    }
+
+    #[test]
+    fn votes_that_agree_change_nothing() {
+        assert_eq!(widened(&at(0.0, 0.01), &at(0.2, 0.02)), at(0.0, 0.01));
+    }
+
+    #[test]
+    fn votes_that_disagree_widen_the_covariance_by_how_much() {
+        let found = widened(&at(0.0, 0.01), &at(0.5, 0.02)).covariance;
+        assert!((found - Matrix3::from_diagonal(&Vector3::new(0.26, 0.01, 0.01))).norm() < 1e-12);
+    }
+}

@@ -1,0 +1,65 @@
+//! Inverses of symmetric positive definite matrices of six rows, by closed forms for their blocks of three: what pose errors
+//! need all the time.
+
+use nalgebra::{Matrix3, SMatrix};
+
+pub(super) type Matrix6 = SMatrix<f64, 6, 6>;
+
+/// The inverse of a matrix and its determinant.
+pub(super) struct Inverse {
+    pub(super) matrix: Matrix6,
+    pub(super) determinant: f64,
+}
+
+impl Inverse {
+    /// Nothing if the matrix is not positive definite.
+    pub(super) fn of(matrix: &Matrix6) -> Option<Self> {
+        let [a, b, d] = [(0, 0), (0, 3), (3, 3)].map(|at| matrix.fixed_view::<3, 3>(at.0, at.1).into_owned());
+        let (of_a, a_determinant) = inverse_of_block(&a)?;
+        let across = of_a * b;
+        // The Schur complement of the first block.
+        let (of_rest, rest_determinant) = inverse_of_block(&(d - b.tr_mul(&across)))?;
+        let corner = -across * of_rest;
+        let mut inverse = Matrix6::zeros();
+        inverse.fixed_view_mut::<3, 3>(0, 0).copy_from(&(of_a - corner * across.transpose()));
+        inverse.fixed_view_mut::<3, 3>(0, 3).copy_from(&corner);
+        inverse.fixed_view_mut::<3, 3>(3, 0).copy_from(&corner.transpose());
+        inverse.fixed_view_mut::<3, 3>(3, 3).copy_from(&of_rest);
+        Some(Self { matrix: inverse, determinant: a_determinant * rest_determinant })
+    }
+}
+
+fn inverse_of_block(block: &Matrix3<f64>) -> Option<(Matrix3<f64>, f64)> {
+    let minor = block.m11 * block.m22 - block.m12 * block.m12;
+    let determinant = block.determinant();
+    let is_positive = block.m11 > 0.0 && minor > 0.0 && determinant > 0.0;
+    Some((block.try_inverse()?, determinant)).filter(|_| is_positive)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_inverse_of_a_positive_definite_matrix_is_found_with_its_determinant() {
+        let root = Matrix6::from_fn(|i, j| ((i * 7 + j * 3) % 5) as f64 - 1.5 + if i == j { 3.0 } else { 0.0 });
+        let matrix = root * root.transpose();
+        let found = Inverse::of(&matrix);
+        let expected = matrix.cholesky().map(|cholesky| (cholesky.inverse(), cholesky.determinant()));
+        let apart = found.zip(expected).map(|(found, (inverse, determinant))| {
+            ((found.matrix - inverse).norm() / inverse.norm()).max((found.determinant / determinant - 1.0).abs())
+        });
+        assert!(apart.is_some_and(|apart| apart < 1e-10));
+    }
+
+    #[test]
+    fn other_matrices_have_none() {
+        let mut matrix = Matrix6::identity();
+        for i in 0..6 {
+            matrix[(i, i)] = -1.0;
+            assert!(Inverse::of(&matrix).is_none());
+            matrix[(i, i)] = 1.0;
+        }
+        assert!(Inverse::of(&Matrix6::from_element(1.0)).is_none());
+    }
+}
