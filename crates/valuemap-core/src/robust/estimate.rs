@@ -33,7 +33,7 @@ pub enum Care {
 }
 
 impl Care {
-    /// Estimates are done when a step is shorter than this, in sigmas of all labels together.
+    /// Estimates are done when a step is shorter than this, in sigmas, root mean square of the labels.
     fn tolerance_sigmas(self) -> f64 {
         match self {
             Self::Rough => 0.05,
@@ -135,7 +135,7 @@ impl<'a> Joint<'a> {
         let information = loop {
             let information = here.normals.information.clone().cholesky()?;
             let step = -information.solve(&here.normals.gradient);
-            let length_sigmas = (-step.dot(&here.normals.gradient)).sqrt();
+            let length_sigmas = (-step.dot(&here.normals.gradient) / self.points.len() as f64).sqrt();
             self.step(&step);
             self.weights = here.own.iter().map(|chi2| (HUBER_SIGMAS / chi2.sqrt()).min(1.0)).collect();
             if length_sigmas < self.care.tolerance_sigmas() || rounds == self.care.max_iterations() {

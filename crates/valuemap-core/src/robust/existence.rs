@@ -13,6 +13,7 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use rstar::RTree;
 use rstar::primitives::GeomWithData;
+use rustc_hash::FxHashMap;
 
 use super::label::{Label, SECTOR_COSINE, direction_to, sector_middles};
 use super::noise::Spread;
@@ -22,6 +23,9 @@ use super::scene::Scene;
 const STRAY_LOG_ODDS: f64 = 5.0;
 /// More hits in a sector than this are no accident.
 const MOST_STRAYS: u32 = 2;
+/// Side of the cubes that images are grouped by, m.
+const CUBE_M: f64 = 10.0;
+
 /// Nearer than this nothing is expected to be seen, m.
 const NEAREST_M: f64 = 4.0;
 
@@ -70,15 +74,28 @@ pub struct Rates {
 /// All images by place, to find the looks at labels.
 pub struct Lookout<'a> {
     scene: &'a Scene,
-    tree: RTree<GeomWithData<[f64; 3], u32>>,
+    /// The middles of the cubes with images.
+    cubes: RTree<GeomWithData<[f64; 3], Vec<u32>>>,
 }
 
 impl<'a> Lookout<'a> {
     /// Index all images of a scene.
     #[must_use]
     pub fn new(scene: &'a Scene) -> Self {
-        let places = (0..).zip(&scene.views).map(|(i, view)| GeomWithData::new(view.center.into(), i)).collect();
-        Self { scene, tree: RTree::bulk_load(places) }
+        let mut images: FxHashMap<[i64; 3], Vec<u32>> = FxHashMap::default();
+        for (image, view) in (0..).zip(&scene.views) {
+            let cube = [0, 1, 2].map(|axis| (view.center[axis] / CUBE_M).floor() as i64);
+            images.entry(cube).or_default().push(image);
+        }
+        let middle = |cube: [i64; 3]| cube.map(|index| (index as f64 + 0.5) * CUBE_M);
+        let cubes = images.into_iter().map(|(cube, images)| GeomWithData::new(middle(cube), images));
+        Self { scene, cubes: RTree::bulk_load(cubes.collect()) }
+    }
+
+    /// All images within a distance of a point, and some farther ones, in no order.
+    fn around(&self, point: &Vector3<f64>, distance_m: f64) -> impl Iterator<Item = u32> {
+        let reach = distance_m + 0.5 * CUBE_M * 3.0_f64.sqrt();
+        self.cubes.locate_within_distance((*point).into(), reach * reach).flat_map(|near| near.data.iter().copied())
     }
 
     /// The sectors that a label was seen from at least once.
@@ -93,12 +110,14 @@ impl<'a> Lookout<'a> {
         let voted = label.images(scene);
         let mut looks: Vec<Vec<(u32, u32, bool)>> = vec![Vec::new(); middles.len()];
         let mut expected = vec![0; middles.len()];
-        for near in self.tree.locate_within_distance(point.into(), range * range * (1.0 + 1e-9)) {
-            let image = near.data;
+        for image in self.around(&point, range) {
             let view = &scene.views[image as usize];
-            let hit = voted.binary_search(&image).is_ok();
             let away = view.center - point;
             let distance = away.norm();
+            if distance > range * (1.0 + 1e-9) {
+                continue;
+            }
+            let hit = voted.binary_search(&image).is_ok();
             let (cosine, sector) = nearest(&middles, &(away / distance));
             let should = distance >= NEAREST_M
                 && distance <= farthest[sector] * (1.0 + 1e-9)

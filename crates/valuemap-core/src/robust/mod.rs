@@ -261,17 +261,18 @@ impl<'a> Court<'a> {
         tally: &mut Tally,
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
-        let mut labels = if begun.is_empty() { begun } else { self.settle(begun, true, tally, progress)? };
+        let mut labels = if begun.is_empty() { begun } else { self.settle(begun, false, tally, progress)? };
         // What a doubted label gives back, and what settled labels leave, may be seen more clearly now.
         for _ in 0..sessions {
             let before = labels.len();
             let new = self.left_over(&labels, tally, progress)?;
-            labels = if labels.is_empty() { new } else { self.admit(labels, new, tally) };
+            let is_raw = labels.is_empty();
+            labels = if is_raw { new } else { self.admit(labels, new, tally) };
             labels.sort_by_key(settle::first_voter);
             for _ in 0..rounds {
                 labels = self.settle(labels, true, tally, progress)?;
             }
-            labels = self.doubt(labels, tally, progress)?;
+            labels = self.doubt(labels, is_raw, tally, progress)?;
             if labels.len() <= before {
                 break;
             }
@@ -389,9 +390,11 @@ impl<'a> Court<'a> {
 
     /// Drop the labels that probably do not exist, the least probable first: what they give back may be just what a doubtful
     /// one lacks.
-    fn doubt(&mut self, mut labels: Vec<Label>, tally: &mut Tally, progress: &Progress) -> Result<Vec<Label>, Halt> {
-        for doubt in DOUBTS {
-            labels = self.drop_below(doubt, labels, tally, progress)?;
+    fn doubt(&mut self, mut labels: Vec<Label>, is_raw: bool, tally: &mut Tally, progress: &Progress) -> Result<Vec<Label>, Halt> {
+        if is_raw || std::env::var("GR").is_ok() {
+            for doubt in DOUBTS {
+                labels = self.drop_below(doubt, labels, tally, progress)?;
+            }
         }
         for _ in 0..MAX_DOUBT_ROUNDS {
             let dropped = tally.doubted;
