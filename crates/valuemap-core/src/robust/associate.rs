@@ -116,7 +116,7 @@ impl<'a> Association<'a> {
             }
         }
         self.last = claims.into_iter().collect();
-        let given = labels.into_iter().zip(voters).zip(undecided);
+        let given = labels.into_par_iter().zip(voters).zip(undecided);
         Ok(given.map(|((label, voters), undecided)| given_to(self.scene, label, voters, undecided)).collect())
     }
 

@@ -9,14 +9,13 @@
 
 use std::ops::Range;
 
-use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Rotation3, SMatrix, Vector2, Vector3};
 
 use super::noise::Noise;
 use super::scene::Scene;
-use super::spd::{Inverse, Matrix6};
+use super::spd::{Inverse, Matrix6, Vector6, scaled};
 use crate::ray::Ray;
 
-pub(super) type Vector6 = SVector<f64, 6>;
 type Matrix3x6 = SMatrix<f64, 3, 6>;
 
 /// Distance over which drifting errors forget 63 % of themselves, m.
@@ -281,7 +280,7 @@ impl<'a> Drive<'a> {
         let mut errors = self.drifts();
         let mut at = 0;
         for image in self.looks.chunk_by(|a, b| a.image == b.image) {
-            let own = Matrix6::from_diagonal(&image[0].own_sigma);
+            let own = &image[0].own_sigma;
             let (mut of_pose, mut gradient) = (Matrix6::zeros(), Vector6::zeros());
             for (i, look) in image.iter().enumerate() {
                 let left = look.without(&errors[at + i]);
@@ -291,8 +290,8 @@ impl<'a> Drive<'a> {
                     gradient += weighted * *r;
                 }
             }
-            if let Some(known) = Inverse::of(&(Matrix6::identity() + own * of_pose * own)) {
-                let of_image = own * (known.matrix * (own * gradient));
+            if let Some(known) = Inverse::of(&(Matrix6::identity() + scaled(&of_pose, own))) {
+                let of_image = own.component_mul(&(known.matrix * own.component_mul(&gradient)));
                 errors[at..at + image.len()].iter_mut().for_each(|error| *error += of_image);
             }
             at += image.len();
@@ -341,23 +340,26 @@ impl Leg {
             }
             crosses.push((look.label, cross));
         }
-        let own = Matrix6::from_diagonal(&looks[0].own_sigma);
-        let Some(known) = Inverse::of(&(Matrix6::identity() + own * of_pose * own)) else { return };
+        let (own, drift) = (&looks[0].own_sigma, &looks[0].drift_sigma);
+        let Some(known) = Inverse::of(&(Matrix6::identity() + scaled(&of_pose, own))) else { return };
         // The covariance of the image's own error, once its looks are known.
-        let error = own * known.matrix * own;
+        let error = scaled(&known.matrix, own);
         normals.square -= gradient.dot(&(error * gradient));
         let kept = Matrix6::identity() - error * of_pose;
-        let drift = Matrix6::from_diagonal(&looks[0].drift_sigma);
         for (a, of_a) in &crosses {
             let by_error = of_a * error;
             normals.add_gradient(*a, &-(by_error * gradient));
             for (b, of_b) in &crosses {
                 normals.add(*a, *b, &-(by_error * of_b.transpose()));
             }
-            self.add_cross(*a, &(of_a * kept * drift));
+            let mut cross = of_a * kept;
+            for (mut column, sigma) in cross.column_iter_mut().zip(drift) {
+                column *= *sigma;
+            }
+            self.add_cross(*a, &cross);
         }
-        self.information += drift * of_pose * kept * drift;
-        self.gradient += drift * kept.transpose() * gradient;
+        self.information += scaled(&(of_pose * kept), drift);
+        self.gradient += drift.component_mul(&kept.tr_mul(&gradient));
     }
 
     fn add_cross(&mut self, label: usize, cross: &Matrix3x6) {

@@ -7,9 +7,10 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector2, Vector3};
 
-use super::drift::{Drive, Look, Normals, Vector6};
+use super::drift::{Drive, Look, Normals};
 use super::noise::Noise;
 use super::scene::{Scene, View};
+use super::spd::Vector6;
 
 /// Good enough while votes may still change, m.
 pub const ROUGH_M: f64 = 1e-2;

@@ -44,7 +44,7 @@ pub fn gather(
         let free: Vec<u32> = rays.iter().copied().filter(|&ray| !claimed[ray as usize]).collect();
         let mut nominations =
             nominate::nominate(scene, &spreads, settings.gate_sigmas, &settings.viability, &free, who, progress)?;
-        nominations.sort_by(|a, b| b.support.total_cmp(&a.support).then(a.rays.cmp(&b.rays)));
+        nominations.par_sort_by(|a, b| b.support.total_cmp(&a.support).then(a.rays.cmp(&b.rays)));
         counts[0] += nominations.len() as u64;
         let index = RayIndex::new(scene, &spreads, settings.gate_sigmas, free.into_iter());
         let before = labels.len();

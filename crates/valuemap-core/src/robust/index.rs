@@ -1,6 +1,7 @@
 //! Which rays see a point: all rays, grouped by the place they were taken from, ready for the kernel.
 
 use nalgebra::Vector3;
+use rayon::prelude::*;
 use rstar::RTree;
 use rstar::primitives::GeomWithData;
 use rustc_hash::FxHashMap;
@@ -52,7 +53,7 @@ impl<'a> RayIndex<'a> {
             members.entry(cell).or_default().push(ray);
         }
         let mut places: Vec<Place> =
-            members.into_values().map(|rays| Place::new(scene, spreads, gate_sigmas, rays)).collect();
+            members.into_par_iter().map(|(_, rays)| Place::new(scene, spreads, gate_sigmas, rays)).collect();
         places.sort_by_key(|place| place.rays[0]);
         let tree = RTree::bulk_load(
             places.iter().enumerate().map(|(i, place)| GeomWithData::new(place.origin.into(), i)).collect(),

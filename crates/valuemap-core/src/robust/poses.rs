@@ -6,9 +6,9 @@
 
 use nalgebra::{Matrix2, SMatrix, Vector2};
 
-use super::drift::{DRIFT_LENGTH_M, LEG_M, Look, Vector6};
+use super::drift::{DRIFT_LENGTH_M, LEG_M, Look};
 use super::scene::View;
-use super::spd::{Inverse, Matrix6};
+use super::spd::{Inverse, Matrix6, Vector6, scaled};
 
 /// Legs before and after those in question that say something about their drift.
 pub(super) const LEGS_AROUND: usize = 20;
@@ -88,10 +88,9 @@ impl Belief {
         let (drift, own) = (diagonal(drift), diagonal(own));
         let covariance = Inverse::of(&self.information).map_or_else(Matrix6::identity, |inverse| inverse.matrix);
         let mean = -(covariance * self.gradient);
-        let scale = Matrix6::from_diagonal(&drift);
         PoseError {
             mean: mean.component_mul(&drift),
-            covariance: scale * covariance * scale + Matrix6::from_diagonal(&own.component_mul(&own)),
+            covariance: scaled(&covariance, &drift) + Matrix6::from_diagonal(&own.component_mul(&own)),
         }
     }
 }

@@ -1,9 +1,15 @@
 //! Inverses of symmetric positive definite matrices of six rows, by closed forms for their blocks of three: what pose errors
 //! need all the time.
 
-use nalgebra::{Matrix3, SMatrix};
+use nalgebra::{Matrix3, SMatrix, SVector};
 
 pub(super) type Matrix6 = SMatrix<f64, 6, 6>;
+pub(super) type Vector6 = SVector<f64, 6>;
+
+/// `S M S` for the diagonal matrix S of some scales.
+pub(super) fn scaled(matrix: &Matrix6, scales: &Vector6) -> Matrix6 {
+    matrix.zip_map(&(scales * scales.transpose()), |element, scale| element * scale)
+}
 
 /// The inverse of a matrix and its determinant.
 pub(super) struct Inverse {
