@@ -29,6 +29,8 @@ _JACOBIAN_STEP = 1e-5
 """Half the step, in units of the virtual image plane, of the central differences."""
 _RAY_TOLERANCE_PX = 0.1
 """A ray that projects farther than this from its pixel is not the ray of the pixel."""
+_BLOCK = 8192
+"""Rays that are cast at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,11 @@ class Rays:
 
 def camera_centers(images: Images) -> Floats:
     """Return the camera centres (N, 3) in metres in the world, -R^T t."""
-    centers: Floats = -np.einsum("nji,nj->ni", rotation_matrices(images), images.cam_from_world_m)
+    return _centers(rotation_matrices(images), images)
+
+
+def _centers(cam_from_world: Floats, images: Images) -> Floats:
+    centers: Floats = -np.einsum("nji,nj->ni", cam_from_world, images.cam_from_world_m)
     return centers
 
 
@@ -96,23 +102,29 @@ def cast_rays(dataset: Dataset) -> Rays:
     images, cameras, detections = dataset.images, dataset.cameras, dataset.detections
     image_row = rows_of(detections.image_id, images.image_id)
     camera_row = rows_of(images.camera_id, cameras.camera_id)[image_row]
-    residual_from_cam = np.empty((len(detections), 3, 3))
-    direction_in_cam = np.empty((len(detections), 3))
+    rotation = rotation_matrices(images)
+    residual_from_world = np.empty((len(detections), 3, 3))
+    direction_in_world = np.empty((len(detections), 3))
     for row in range(len(cameras)):
-        members = np.flatnonzero(camera_row == row)
-        if len(members):
-            residual_from_cam[members], direction_in_cam[members] = _local_pinholes(
-                colmap_camera(cameras, row), detections.center_px[members]
-            )
-    world_to_cam = rotation_matrices(images)[image_row]
+        camera = colmap_camera(cameras, row)
+        for members in _blocks(np.flatnonzero(camera_row == row)):
+            residual_from_cam, direction_in_cam = _local_pinholes(camera, detections.center_px[members])
+            world_to_cam = rotation[image_row[members]]
+            residual_from_world[members] = residual_from_cam @ world_to_cam
+            direction_in_world[members] = np.einsum("nji,nj->ni", world_to_cam, direction_in_cam)
     return Rays(
-        residual_from_world=residual_from_cam @ world_to_cam,
-        center_in_world_m=camera_centers(images)[image_row],
-        direction_in_world=np.einsum("nji,nj->ni", world_to_cam, direction_in_cam),
+        residual_from_world=residual_from_world,
+        center_in_world_m=_centers(rotation, images)[image_row],
+        direction_in_world=direction_in_world,
         image_row=image_row,
         camera_row=camera_row,
         class_code=detections.class_name.codes,
     )
+
+
+def _blocks(rows: Ints) -> list[Ints]:
+    """Cut rows into blocks whose intermediate results stay in the cache."""
+    return [rows[start : start + _BLOCK] for start in range(0, len(rows), _BLOCK)]
 
 
 def picture_bounds(cameras: Cameras) -> tuple[Floats, Floats]:
