@@ -110,9 +110,9 @@ impl PoseError {
     pub fn after(&self, look: &Look, own: &Matrix2<f64>) -> Self {
         let (residual, covariance) = self.expected(look, own);
         let Some(inverse) = covariance.try_inverse() else { return *self };
-        let by_pose = rows_of(look);
-        let gain = self.covariance * by_pose.transpose() * inverse;
-        Self { mean: self.mean - gain * residual, covariance: self.covariance - gain * by_pose * self.covariance }
+        let seen = rows_of(look) * self.covariance;
+        let gain = seen.tr_mul(&inverse);
+        Self { mean: self.mean - gain * residual, covariance: self.covariance - gain * seen }
     }
 }
 
