@@ -34,9 +34,10 @@ const MIN_SHARED_LABELS: usize = 5;
 /// One label says no more than this about the disagreement of passes, as a multiple of what is expected.
 const MOST_DISAGREEMENT: f64 = 5.0;
 
-/// What is searched for, and where: least and most.
+/// What is searched for, and where: least and most. Boxes of objects of one size grow as errors of position do, with one over
+/// the distance: a detector that is off by more than a tenth of its boxes is not one, what is more is the position's.
 const DETECTION_PX: (f64, f64) = (0.05, 30.0);
-const BOX_SHARE: (f64, f64) = (1e-3, 0.5);
+const BOX_SHARE: (f64, f64) = (1e-3, 0.1);
 const POSITION_M: (f64, f64) = (1e-4, 5.0);
 /// Shared errors over own errors of a pose.
 const DRIFT_RATIO: (f64, f64) = (0.3, 2.0);

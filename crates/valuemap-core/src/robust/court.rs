@@ -1,0 +1,271 @@
+//! The court: labels compete for the rays, round after round, and those that probably do not exist are dropped.
+
+use std::sync::{Arc, OnceLock};
+
+use nalgebra::Vector3;
+use rayon::prelude::*;
+use rustc_hash::FxHashMap;
+
+use super::adjust::adjust;
+use super::associate::Association;
+use super::estimate::Care;
+use super::existence::{self, Lookout, Looks, Rates, Sector};
+use super::gather::{VOTE_RANGE, gather};
+use super::index::RayIndex;
+use super::label::{self, Label, fingerprint};
+use super::noise::{Noise, Spread};
+use super::scene::Scene;
+use super::{SETTLING_ROUNDS, Settings, Tally, exchange, settle};
+use crate::progress::{Halt, Progress};
+
+/// Labels are dropped below these multiples of the probability that is asked for, one after the other, and then below that.
+const DOUBTS: [f64; 3] = [1e-5, 1e-2, 0.3];
+
+/// Rounds of dropping and giving back at the end, at most.
+const MAX_DOUBT_ROUNDS: usize = 6;
+
+/// Where labels compete for the rays.
+pub(super) struct Court<'a> {
+    scene: &'a Scene,
+    noise: &'a Noise,
+    spreads: &'a [Spread],
+    settings: &'a Settings,
+    association: Association<'a>,
+    lookout: OnceLock<Lookout<'a>>,
+    /// The sectors of the labels as they last were.
+    seen_from: FxHashMap<(u64, u64), Arc<[Sector]>>,
+}
+
+impl<'a> Court<'a> {
+    /// Begin with some rays (ascending) of a scene.
+    pub(super) fn new(
+        scene: &'a Scene,
+        noise: &'a Noise,
+        spreads: &'a [Spread],
+        settings: &'a Settings,
+        rays: impl Iterator<Item = u32>,
+    ) -> Self {
+        let index = RayIndex::new(scene, spreads, settings.gate_sigmas, rays);
+        let range_m = settings.viability.max_range_m * VOTE_RANGE;
+        Self {
+            scene,
+            noise,
+            spreads,
+            settings,
+            association: Association::new(scene, noise, index, range_m),
+            lookout: OnceLock::new(),
+            seen_from: FxHashMap::default(),
+        }
+    }
+
+    /// Find labels among all rays, beginning with those that were found already.
+    pub(super) fn hold(
+        &mut self,
+        begun: Vec<Label>,
+        sessions: usize,
+        rounds: usize,
+        tally: &mut Tally,
+        progress: &Progress,
+    ) -> Result<Vec<Label>, Halt> {
+        let mut labels = if begun.is_empty() { begun } else { self.settle(begun, false, tally, progress)? };
+        // What a doubted label gives back, and what settled labels leave, may be seen more clearly now.
+        for _ in 0..sessions {
+            let before = labels.len();
+            let new = self.left_over(&labels, tally, progress)?;
+            let is_raw = labels.is_empty();
+            labels = if is_raw { new } else { self.admit(labels, new, tally) };
+            labels.sort_by_key(settle::first_voter);
+            for _ in 0..rounds {
+                labels = self.settle(labels, true, tally, progress)?;
+            }
+            labels = self.doubt(labels, is_raw, tally, progress)?;
+            if labels.len() <= before {
+                break;
+            }
+        }
+        Ok(labels)
+    }
+
+    /// Labels of the rays that no label has; if there are others, these compete among themselves first.
+    fn left_over(&self, labels: &[Label], tally: &mut Tally, progress: &Progress) -> Result<Vec<Label>, Halt> {
+        let &Self { scene, noise, spreads, settings, .. } = self;
+        let mut is_taken = vec![false; scene.rays.rays.len()];
+        for &ray in labels.iter().flat_map(|label| &label.voters) {
+            is_taken[ray as usize] = true;
+        }
+        let free: Vec<u32> = (0..is_taken.len() as u32).filter(|&ray| !is_taken[ray as usize]).collect();
+        let (mut new, [nominations, accepted]) = gather(scene, noise, settings, &free, progress)?;
+        tally.nominations += nominations;
+        tally.accepted += accepted;
+        if !labels.is_empty() {
+            let mut annex = Court::new(scene, noise, spreads, settings, free.into_iter());
+            for _ in 0..SETTLING_ROUNDS {
+                new = annex.settle(new, true, tally, progress)?;
+            }
+            // Where others took what they might have had they were not missed.
+            new.par_iter_mut().for_each(|label| {
+                let taken = self.association.images_at(label, |ray| is_taken[ray as usize]);
+                label.undecided.extend(taken);
+                label.undecided.sort_unstable();
+                label.undecided.dedup();
+            });
+        }
+        Ok(new)
+    }
+
+    /// One round: neighbors exchange votes, all labels compete for all rays, those that are two are split and those that are
+    /// one are fused.
+    pub(super) fn settle(
+        &mut self,
+        labels: Vec<Label>,
+        may_split: bool,
+        tally: &mut Tally,
+        progress: &Progress,
+    ) -> Result<Vec<Label>, Halt> {
+        progress.check()?;
+        let &mut Self { scene, noise, settings, .. } = self;
+        let gate = settings.gate_sigmas;
+        let min_votes = settings.min_votes as usize;
+        let before = labels.len();
+        let labels = exchange::exchange(scene, noise, gate, labels);
+        let mut labels = self.association.associate(labels, progress)?;
+        labels.retain(|label| label.voters.len() >= min_votes);
+        let labels = adjust(scene, noise, gate, min_votes, &labels, Care::Rough);
+        let left = labels.len();
+        let labels = if may_split { settle::split(scene, noise, gate, labels, min_votes) } else { labels };
+        let labels = if settings.without.merge { labels } else { settle::fuse(scene, noise, gate, labels) };
+        tally.outvoted += (before - left) as u64;
+        tally.fused += left.saturating_sub(labels.len()) as u64;
+        Ok(labels)
+    }
+
+    fn sectors_of(&self, label: &Label) -> Arc<[Sector]> {
+        self.lookout.get_or_init(|| Lookout::new(self.scene)).sectors(label).into()
+    }
+
+    /// The sectors that each label is seen from.
+    pub(super) fn sectors(&mut self, labels: &[Label]) -> Vec<Arc<[Sector]>> {
+        let key_of = |label: &Label| (label.identity(), fingerprint(&label.undecided));
+        let of_label =
+            |label: &Label| self.seen_from.get(&key_of(label)).map_or_else(|| self.sectors_of(label), Arc::clone);
+        let found: Vec<Arc<[Sector]>> = labels.par_iter().map(of_label).collect();
+        self.seen_from = labels.iter().map(key_of).zip(found.iter().cloned()).collect();
+        found
+    }
+
+    /// Some labels with those of others that probably exist.
+    fn admit(&mut self, mut labels: Vec<Label>, new: Vec<Label>, tally: &mut Tally) -> Vec<Label> {
+        let old = labels.len();
+        labels.extend(new);
+        let sectors = self.sectors(&labels);
+        let judgement = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.doubted);
+        let before = labels.len();
+        let admitted = labels.into_iter().zip(judgement.of_labels).enumerate();
+        let admitted =
+            admitted.filter(|(i, (_, (existence, _)))| *i < old || *existence >= self.settings.min_existence);
+        let labels: Vec<Label> = admitted.map(|(_, (label, _))| label).collect();
+        tally.doubted += (before - labels.len()) as u64;
+        labels
+    }
+
+    /// Take votes away from labels that look as if they were not to be seen from there. Also the sectors of those left.
+    fn look_around(&mut self, labels: Vec<Label>, tally: &mut Tally) -> (Vec<Label>, Vec<Arc<[Sector]>>) {
+        let before = labels.len();
+        let sectors = self.sectors(&labels);
+        let of_label = |(label, sectors): (Label, Arc<[Sector]>)| {
+            let stray: Vec<Vector3<f64>> =
+                sectors.iter().filter(|sector| sector.is_stray()).map(|sector| sector.direction).collect();
+            if stray.is_empty() {
+                return Some((label, sectors));
+            }
+            let unseen_from = [label.unseen_from.as_slice(), &stray].concat();
+            let label = Label { unseen_from: unseen_from.clone(), ..label };
+            let seen = label.voters.iter().copied().filter(|&ray| label.faces(self.scene, ray)).collect();
+            let start = label.estimate.point;
+            let found = label::from_voters(self.scene, self.noise, self.settings.gate_sigmas, seen, start)?;
+            let enough = found.voters.len() >= self.settings.min_votes as usize;
+            let left = enough.then_some(Label { undecided: label.undecided, unseen_from, ..found })?;
+            let sectors = self.sectors_of(&left);
+            Some((left, sectors))
+        };
+        let (labels, sectors): (Vec<Label>, Vec<_>) =
+            labels.into_par_iter().zip(sectors).filter_map(of_label).collect::<Vec<_>>().into_iter().unzip();
+        tally.doubted += (before - labels.len()) as u64;
+        (labels, sectors)
+    }
+
+    /// Drop the labels that probably do not exist, the least probable first: what they give back may be just what a doubtful
+    /// one lacks.
+    fn doubt(
+        &mut self,
+        mut labels: Vec<Label>,
+        is_raw: bool,
+        tally: &mut Tally,
+        progress: &Progress,
+    ) -> Result<Vec<Label>, Halt> {
+        if is_raw || std::env::var("GR").is_ok() {
+            for doubt in DOUBTS {
+                labels = self.drop_below(doubt, labels, tally, progress)?;
+            }
+        }
+        for _ in 0..MAX_DOUBT_ROUNDS {
+            let dropped = tally.doubted;
+            labels = self.drop_below(1.0, labels, tally, progress)?;
+            if tally.doubted == dropped {
+                break;
+            }
+        }
+        Ok(labels)
+    }
+
+    /// Drop the labels that are less probable than a multiple of what is asked for, and let the others compete for their votes.
+    fn drop_below(
+        &mut self,
+        doubt: f64,
+        labels: Vec<Label>,
+        tally: &mut Tally,
+        progress: &Progress,
+    ) -> Result<Vec<Label>, Halt> {
+        let (labels, sectors) = self.look_around(labels, tally);
+        let judgement = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.doubted);
+        let before = labels.len();
+        let judged = labels.into_iter().zip(judgement.of_labels);
+        let existing = judged.filter(|(_, (existence, _))| *existence >= doubt * self.settings.min_existence);
+        let labels: Vec<Label> = existing.map(|(label, _)| label).collect();
+        tally.doubted += (before - labels.len()) as u64;
+        if labels.len() == before { Ok(labels) } else { self.settle(labels, false, tally, progress) }
+    }
+}
+
+/// How probable it is that labels exist, and what that rests on.
+pub(super) struct Judgement {
+    /// Probability of existence of each label, and the images that should have seen it.
+    pub(super) of_labels: Vec<(f64, u32)>,
+    pub(super) rates: Rates,
+    pub(super) strays_per_image: f64,
+}
+
+/// Judge all labels of a scene.
+pub(super) fn judge(
+    scene: &Scene,
+    spreads: &[Spread],
+    sectors: &[Arc<[Sector]>],
+    labels: &[Label],
+    settings: &Settings,
+    doubted: u64,
+) -> Judgement {
+    let looks: Vec<Vec<Looks>> = sectors.par_iter().map(|sectors| existence::looks_of(sectors.iter())).collect();
+    let expected = sectors.iter().map(|sectors| sectors.iter().map(|sector| sector.expected).sum());
+    let rates = Rates::learn(&looks);
+    let claimed: usize = labels.iter().map(|label| label.voters.len()).sum();
+    let strays_per_image = (scene.rays.rays.len() - claimed) as f64 / scene.views.len() as f64;
+    let solid_angle =
+        scene.frusta.iter().map(|frustum| frustum.solid_angle_sr).sum::<f64>() / scene.frusta.len() as f64;
+    let strays_per_sr = strays_per_image / solid_angle;
+    let chance: Vec<f64> = labels
+        .par_iter()
+        .map(|label| existence::chance_of(label, scene, spreads, settings.gate_sigmas, strays_per_sr))
+        .collect();
+    let existence = existence::probabilities(&looks, &rates, &chance, doubted);
+    Judgement { of_labels: existence.into_iter().zip(expected).collect(), rates, strays_per_image }
+}
