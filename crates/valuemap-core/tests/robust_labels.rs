@@ -13,7 +13,8 @@ use valuemap_core::robust::estimate::{Care, Joint, Start};
 use valuemap_core::robust::keyframes::Keyframes;
 use valuemap_core::robust::label::{Label, from_voters};
 use valuemap_core::robust::noise::Noise;
-use valuemap_core::robust::scene::Scene;
+use valuemap_core::robust::scene::{Scene, View};
+use valuemap_core::robust::settle::mend;
 
 use street::{GATE_SIGMAS, NOISE, config, errors_px, object, street};
 
@@ -43,7 +44,7 @@ proptest! {
         }
         prop_assert!(Keyframes::of(&scene).is_none());
         let keyframes = Keyframes::every(&scene, stretch_m);
-        let stretch_of = |view: &valuemap_core::robust::scene::View| {
+        let stretch_of = |view: &View| {
             (view.pass, view.camera, (view.driven_m / stretch_m).floor() as i64)
         };
         let all: BTreeSet<_> = scene.views.iter().map(stretch_of).collect();
@@ -60,6 +61,31 @@ proptest! {
             prop_assert_eq!(scene.ray(of_whole), keyframes.scene.ray(of_part));
             prop_assert_eq!(scene.view(of_whole).center, keyframes.scene.view(of_part).center);
         }
+    }
+
+    #[test]
+    fn one_object_that_is_torn_is_mended_and_two_side_by_side_are_not(
+        object in object(), errors in errors_px(), apart_m in 0.3..0.9_f64
+    ) {
+        let scene = street(70, 2.0, &[object], &errors);
+        let (even, odd): (Vec<u32>, Vec<u32>) =
+            (0..scene.rays.rays.len() as u32).partition(|&ray| scene.rays.image[ray as usize].is_multiple_of(2));
+        prop_assume!(odd.len() >= 10);
+        let torn = vec![label(&scene, even, object), label(&scene, odd, object)];
+        let mended = mend(&scene, &DRIFTING, GATE_SIGMAS, torn);
+        prop_assert_eq!(mended.len(), 1);
+        prop_assert!((mended[0].estimate.point - object).norm() < 1.0);
+
+        let twin = object + Vector3::z() * apart_m;
+        let scene = street(70, 2.0, &[object, twin], &errors);
+        let twins = [object, twin].map(|at| {
+            let nearer = |&ray: &u32| {
+                let of = |object: &Vector3<f64>| scene.ray(ray).squared_error(object);
+                of(&at) <= of(&object).min(of(&twin))
+            };
+            label(&scene, (0..scene.rays.rays.len() as u32).filter(nearer).collect(), at)
+        });
+        prop_assert_eq!(mend(&scene, &DRIFTING, GATE_SIGMAS, twins.to_vec()).len(), 2);
     }
 
     #[test]

@@ -35,9 +35,9 @@ const MIN_SHARED_LABELS: usize = 5;
 const MOST_DISAGREEMENT: f64 = 5.0;
 
 /// What is searched for, and where: least and most. Boxes of objects of one size grow as errors of position do, with one over
-/// the distance: a detector that is off by more than a tenth of its boxes is not one, what is more is the position's.
+/// the distance: a detector that is off by more than this share of its boxes is not one, what is more is the position's.
 const DETECTION_PX: (f64, f64) = (0.05, 30.0);
-const BOX_SHARE: (f64, f64) = (1e-3, 0.1);
+const BOX_SHARE: (f64, f64) = (1e-3, 0.15);
 const POSITION_M: (f64, f64) = (1e-4, 5.0);
 /// Shared errors over own errors of a pose.
 const DRIFT_RATIO: (f64, f64) = (0.3, 2.0);

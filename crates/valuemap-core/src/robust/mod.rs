@@ -183,6 +183,9 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
     let spreads = spreads_of(scene, noise);
     let mut court = Court::new(scene, noise, &spreads, settings, 0..scene.rays.rays.len() as u32);
     let labels = court.hold(begun, sessions, rounds, &mut tally, progress)?;
+    let before = labels.len();
+    let labels = if settings.without.merge { labels } else { settle::mend(scene, noise, settings.gate_sigmas, labels) };
+    tally.fused += (before - labels.len()) as u64;
     let labels = adjust(scene, noise, settings.gate_sigmas, settings.min_votes as usize, &labels, Care::Exact);
     let before = labels.len();
     let labels = settle::outclass(scene, noise, labels);
@@ -190,11 +193,16 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
     let Judgement { of_labels, rates, strays_per_image } =
         judge(scene, &spreads, &court.sectors(&labels), &labels, settings, tally.doubted);
     let variance_factor = calibrate::variance_factor(scene, noise, &labels);
-    let findings = labels.into_iter().zip(of_labels).map(|(mut label, (existence, expected))| {
-        label.estimate.covariance *= variance_factor;
-        Finding { label, existence, expected }
-    });
-    Ok(Findings { findings: findings.collect(), tally, rates, strays_per_image, variance_factor })
+    let before = labels.len();
+    let judged = labels.into_iter().zip(of_labels).filter(|(_, (existence, _))| *existence >= settings.min_existence);
+    let findings: Vec<Finding> = judged
+        .map(|(mut label, (existence, expected))| {
+            label.estimate.covariance *= variance_factor;
+            Finding { label, existence, expected }
+        })
+        .collect();
+    tally.doubted += (before - findings.len()) as u64;
+    Ok(Findings { findings, tally, rates, strays_per_image, variance_factor })
 }
 
 /// The labels that the keyframes of a scene show.

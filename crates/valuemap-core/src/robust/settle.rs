@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use super::calibrate::variance_factor;
-use super::label::{Label, by_place, direction_to, from_voters};
+use super::label::{Label, SECTOR_COSINE, by_place, direction_to, from_voters, sector_middles};
 use super::noise::Noise;
 use super::scene::Scene;
 
@@ -18,6 +18,14 @@ const SIDES_COSINE: f64 = 0.5;
 const NEIGHBOR_M: f64 = 6.0;
 /// Two labels may share this part of the images of the smaller one and still be one object: clutter beside it.
 const SHARED_IMAGES: f64 = 0.15;
+/// Labels this near that are seen from the same directions, but never side by side, are one object wherever they are put, m.
+const TORN_M: f64 = 1.0;
+/// So many images of each must look from these directions.
+const LEAST_TORN: usize = 8;
+/// And this part of those of the smaller one.
+const TORN_SHARE: f64 = 0.5;
+/// For each of them, images that show both, at most: two objects are both detected far more often.
+const MOST_BOTH: f64 = 0.05;
 
 /// Make one of any two labels of a class whose positions agree within their covariances, unless their images say that
 /// they are two: images in which both have a detection of their own. The nearest pair first.
@@ -26,24 +34,69 @@ pub fn fuse(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) 
     let mut labels = labels;
     let factor = variance_factor(scene, noise, &labels);
     loop {
-        let mut pairs = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor, |a, b| a.class == b.class);
+        let pairs = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor, |a, b| a.class == b.class);
         if pairs.is_empty() {
             return labels;
         }
-        pairs.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
-        let mut taken = vec![false; labels.len()];
-        let mut fused = Vec::new();
-        for (_, a, b) in pairs {
-            if !taken[a] && !taken[b] {
-                taken[a] = true;
-                taken[b] = true;
-                fused.push(union(scene, noise, gate_sigmas, &labels[a], &labels[b]));
-            }
-        }
-        let kept = labels.into_iter().zip(&taken).filter(|(_, taken)| !**taken).map(|(label, _)| label);
-        labels = kept.chain(fused).collect();
-        labels.sort_by_key(first_voter);
+        labels = fused_pairs(scene, noise, gate_sigmas, labels, pairs);
     }
+}
+
+/// Labels of which some pairs are fused, the one of least distance first, each label once.
+fn fused_pairs(
+    scene: &Scene,
+    noise: &Noise,
+    gate_sigmas: f64,
+    labels: Vec<Label>,
+    mut pairs: Vec<(f64, usize, usize)>,
+) -> Vec<Label> {
+    pairs.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
+    let mut taken = vec![false; labels.len()];
+    let mut fused = Vec::new();
+    for (_, a, b) in pairs {
+        if !taken[a] && !taken[b] {
+            taken[a] = true;
+            taken[b] = true;
+            fused.push(union(scene, noise, gate_sigmas, &labels[a], &labels[b]));
+        }
+    }
+    let kept = labels.into_iter().zip(&taken).filter(|(_, taken)| !**taken).map(|(label, _)| label);
+    let mut labels: Vec<Label> = kept.chain(fused).collect();
+    labels.sort_by_key(first_voter);
+    labels
+}
+
+/// Make one of two labels of a class, near each other, that are seen from the same directions and never side by side: an
+/// object whose passes went to the one or the other, because their drifts are larger than is thought.
+#[must_use]
+pub fn mend(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) -> Vec<Label> {
+    let tree = by_place(&labels);
+    let mut pairs: Vec<(f64, usize, usize)> = Vec::new();
+    for (a, label) in labels.iter().enumerate() {
+        let near = tree.locate_within_distance(label.estimate.point.into(), TORN_M * TORN_M).map(|near| near.data);
+        for b in near.filter(|&b| b > a && labels[b].class == label.class && are_torn(scene, label, &labels[b])) {
+            pairs.push(((labels[b].estimate.point - label.estimate.point).norm(), a, b));
+        }
+    }
+    fused_pairs(scene, noise, gate_sigmas, labels, pairs)
+}
+
+/// Whether two labels are seen from the same directions, but never side by side.
+fn are_torn(scene: &Scene, a: &Label, b: &Label) -> bool {
+    let seen_like = |label: &Label, other: &Label| {
+        let directions = |of: &Label| -> Vec<Vector3<f64>> {
+            of.voters.iter().map(|&ray| direction_to(scene, ray, &of.estimate.point)).collect()
+        };
+        let middles = sector_middles(directions(other).into_iter());
+        let is_like = |own: &&Vector3<f64>| middles.iter().any(|middle| middle.dot(own) >= SECTOR_COSINE);
+        directions(label).iter().filter(is_like).count()
+    };
+    let like = seen_like(a, b).min(seen_like(b, a));
+    let (of_a, of_b) = (a.images(scene), b.images(scene));
+    let both = of_a.iter().filter(|image| of_b.binary_search(image).is_ok()).count();
+    like >= LEAST_TORN
+        && like as f64 >= TORN_SHARE * of_a.len().min(of_b.len()) as f64
+        && (both as f64) < MOST_BOTH * like as f64
 }
 
 /// Of two labels of different classes that agree, and that no images show side by side, keep the one with more votes: a
