@@ -171,7 +171,7 @@ proptest! {
             Association::new(&scene, &noise, index, 150.0)
         };
         let rays: Vec<u32> = all.clone().collect();
-        let (mut labels, _) = gather(&scene, &noise, &settings, &rays, &progress).unwrap();
+        let (mut labels, _) = gather(&scene, &noise, &spreads, &settings, &rays, &progress).unwrap();
         let mut with_memory = begin();
         for _ in 0..6 {
             let given = with_memory.associate(labels.clone(), &progress).unwrap();

@@ -94,7 +94,7 @@ impl<'a> Court<'a> {
             is_taken[ray as usize] = true;
         }
         let free: Vec<u32> = (0..is_taken.len() as u32).filter(|&ray| !is_taken[ray as usize]).collect();
-        let (mut new, [nominations, accepted]) = gather(scene, noise, settings, &free, progress)?;
+        let (mut new, [nominations, accepted]) = gather(scene, noise, spreads, settings, &free, progress)?;
         tally.nominations += nominations;
         tally.accepted += accepted;
         if !labels.is_empty() {

@@ -9,7 +9,7 @@ use nalgebra::{Matrix2x3, Matrix3, Vector2, Vector3};
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use super::label::{Label, SECTOR_COSINE, by_place, direction_to, from_voters, sector_middles};
+use super::label::{Label, SECTOR_COSINE, direction_to, from_voters, near_pairs, sector_middles};
 use super::noise::Noise;
 use super::scene::Scene;
 use super::settle::first_voter;
@@ -51,17 +51,12 @@ pub fn exchange(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Labe
 
 /// Disjoint pairs of neighbours of one class that may have votes to exchange, the nearest first.
 fn nearest_pairs(labels: &[Label]) -> Vec<(usize, usize)> {
-    let tree = by_place(labels);
-    let mut near: Vec<(f64, usize, usize)> = Vec::new();
-    for (a, label) in labels.iter().enumerate() {
-        for other in tree.locate_within_distance(label.estimate.point.into(), PAIR_M * PAIR_M) {
-            let b = other.data;
-            let is_open = || !label.known.untangled.contains(&labels[b].identity());
-            if b > a && labels[b].class == label.class && is_open() {
-                near.push(((labels[b].estimate.point - label.estimate.point).norm(), a, b));
-            }
-        }
-    }
+    let open = |(a, b): (usize, usize)| {
+        let (first, second) = (&labels[a], &labels[b]);
+        let is_open = first.class == second.class && !first.known.untangled.contains(&second.identity());
+        is_open.then(|| ((second.estimate.point - first.estimate.point).norm(), a, b))
+    };
+    let mut near: Vec<(f64, usize, usize)> = near_pairs(labels, PAIR_M).into_par_iter().filter_map(open).collect();
     near.sort_by(|x, y| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2))));
     let mut taken = vec![false; labels.len()];
     let mut pairs = Vec::new();

@@ -5,14 +5,14 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
+use super::Settings;
 use super::index::RayIndex;
 use super::label::{Label, from_voters};
-use super::noise::Noise;
+use super::noise::{Noise, Spread};
 use super::nominate::{self, Nomination, Who};
 use super::quick::quick_estimate;
 use super::scene::Scene;
 use super::settle;
-use super::{Settings, spreads_of};
 use crate::progress::{Halt, Progress};
 
 /// Detections this many times farther than the farthest proposed point still vote.
@@ -24,18 +24,19 @@ const ROUNDS: [Who; 4] = [Who::Part, Who::All, Who::All, Who::All];
 /// Rounds of estimating and gathering voters again, at most.
 const MAX_ROUNDS: usize = 8;
 
-/// Find labels among some rays (ascending) with a given noise, round after round, and count nominations and labels.
+/// Find labels among some rays (ascending) with a given noise, round after round, and count nominations and labels;
+/// `spreads` are those of all rays of the scene.
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
 pub fn gather(
     scene: &Scene,
     noise: &Noise,
+    spreads: &[Spread],
     settings: &Settings,
     rays: &[u32],
     progress: &Progress,
 ) -> Result<(Vec<Label>, [u64; 2]), Halt> {
-    let spreads = spreads_of(scene, noise);
     let range_m = settings.viability.max_range_m * VOTE_RANGE;
     let mut labels: Vec<Label> = Vec::new();
     let mut claimed = vec![false; scene.rays.rays.len()];
@@ -43,10 +44,10 @@ pub fn gather(
     for who in ROUNDS {
         let free: Vec<u32> = rays.iter().copied().filter(|&ray| !claimed[ray as usize]).collect();
         let mut nominations =
-            nominate::nominate(scene, &spreads, settings.gate_sigmas, &settings.viability, &free, who, progress)?;
+            nominate::nominate(scene, spreads, settings.gate_sigmas, &settings.viability, &free, who, progress)?;
         nominations.par_sort_by(|a, b| b.support.total_cmp(&a.support).then(a.rays.cmp(&b.rays)));
         counts[0] += nominations.len() as u64;
-        let index = RayIndex::new(scene, &spreads, settings.gate_sigmas, free.into_iter());
+        let index = RayIndex::new(scene, spreads, settings.gate_sigmas, free.into_iter());
         let before = labels.len();
         // The best nominations of all places are polished side by side; where two claim the same ray, the better one
         // has it, and the other is polished again on what is left.

@@ -4,6 +4,7 @@ use std::hash::{Hash, Hasher};
 use std::sync::OnceLock;
 
 use nalgebra::Vector3;
+use rayon::prelude::*;
 use rstar::RTree;
 use rstar::primitives::GeomWithData;
 use rustc_hash::FxHasher;
@@ -177,7 +178,25 @@ pub fn by_place(labels: &[Label]) -> RTree<GeomWithData<[f64; 3], usize>> {
     RTree::bulk_load(labels.iter().enumerate().map(|(i, l)| GeomWithData::new(l.estimate.point.into(), i)).collect())
 }
 
+/// Pairs of labels within a distance of each other, the one with the lower number first, in no order.
+#[must_use]
+pub fn near_pairs(labels: &[Label], distance_m: f64) -> Vec<(usize, usize)> {
+    let tree = by_place(labels);
+    let of_label = |(a, label): (usize, &Label)| {
+        let near = tree.locate_within_distance(label.estimate.point.into(), distance_m * distance_m);
+        near.map(|near| near.data).filter(|&b| b > a).map(|b| (a, b)).collect::<Vec<_>>()
+    };
+    labels.par_iter().enumerate().flat_map_iter(of_label).collect()
+}
+
 impl Label {
+    /// How many images show it and another one as detections of their own.
+    #[must_use]
+    pub fn images_shared(&self, other: &Self, scene: &Scene) -> usize {
+        let others = other.images(scene);
+        self.images(scene).iter().filter(|image| others.binary_search(image).is_ok()).count()
+    }
+
     /// The images of its voters, ascending.
     #[must_use]
     pub fn images(&self, scene: &Scene) -> Vec<u32> {

@@ -154,9 +154,9 @@ pub fn self_calibrate(
     let settings = Settings { gate_sigmas: settings.gate_sigmas * CALIBRATION_GATE, ..*settings };
     let mut noise = *guess;
     for round in 1..=CALIBRATION_ROUNDS {
-        let (mut labels, _) = gather(scene, &noise, &settings, &rays, progress)?;
+        let spreads = spreads_of(scene, &noise);
+        let (mut labels, _) = gather(scene, &noise, &spreads, &settings, &rays, progress)?;
         if round == CALIBRATION_ROUNDS {
-            let spreads = spreads_of(scene, &noise);
             let mut court = Court::new(scene, &noise, &spreads, &settings, rays.iter().copied());
             for _ in 0..SETTLING_ROUNDS {
                 labels = court.settle(labels, true, &mut Tally::default(), progress)?;

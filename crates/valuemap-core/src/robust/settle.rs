@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use super::calibrate::variance_factor;
-use super::label::{Label, SECTOR_COSINE, by_place, direction_to, from_voters, sector_middles};
+use super::label::{Label, SECTOR_COSINE, direction_to, from_voters, near_pairs, sector_middles};
 use super::noise::Noise;
 use super::scene::Scene;
 
@@ -70,14 +70,12 @@ fn fused_pairs(
 /// object whose passes went to the one or the other, because their drifts are larger than is thought.
 #[must_use]
 pub fn mend(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) -> Vec<Label> {
-    let tree = by_place(&labels);
-    let mut pairs: Vec<(f64, usize, usize)> = Vec::new();
-    for (a, label) in labels.iter().enumerate() {
-        let near = tree.locate_within_distance(label.estimate.point.into(), TORN_M * TORN_M).map(|near| near.data);
-        for b in near.filter(|&b| b > a && labels[b].class == label.class && are_torn(scene, label, &labels[b])) {
-            pairs.push(((labels[b].estimate.point - label.estimate.point).norm(), a, b));
-        }
-    }
+    let torn = |(a, b): (usize, usize)| {
+        let (first, second) = (&labels[a], &labels[b]);
+        let distance = (second.estimate.point - first.estimate.point).norm();
+        (first.class == second.class && are_torn(scene, first, second)).then_some((distance, a, b))
+    };
+    let pairs = near_pairs(&labels, TORN_M).into_par_iter().filter_map(torn).collect();
     fused_pairs(scene, noise, gate_sigmas, labels, pairs)
 }
 
@@ -92,11 +90,9 @@ fn are_torn(scene: &Scene, a: &Label, b: &Label) -> bool {
         directions(label).iter().filter(is_like).count()
     };
     let like = seen_like(a, b).min(seen_like(b, a));
-    let (of_a, of_b) = (a.images(scene), b.images(scene));
-    let both = of_a.iter().filter(|image| of_b.binary_search(image).is_ok()).count();
     like >= LEAST_TORN
-        && like as f64 >= TORN_SHARE * of_a.len().min(of_b.len()) as f64
-        && (both as f64) < MOST_BOTH * like as f64
+        && like as f64 >= TORN_SHARE * a.voters.len().min(b.voters.len()) as f64
+        && (a.images_shared(b, scene) as f64) < MOST_BOTH * like as f64
 }
 
 /// Of two labels of different classes that agree, and that no images show side by side, keep the one with more votes: a
@@ -183,19 +179,12 @@ fn agreeing_pairs(
     most: f64,
     may_pair: impl Fn(&Label, &Label) -> bool + Sync,
 ) -> Vec<(f64, usize, usize)> {
-    let tree = by_place(labels);
-    labels
-        .par_iter()
-        .enumerate()
-        .flat_map_iter(|(a, label)| {
-            let near = tree.locate_within_distance(label.estimate.point.into(), NEIGHBOR_M * NEIGHBOR_M);
-            near.map(|near| near.data)
-                .filter(|&b| b > a && may_pair(label, &labels[b]))
-                .filter_map(|b| distance2(label, &labels[b]).map(|distance2| (distance2, a, b)))
-                .filter(|&(distance2, a, b)| distance2 < most && !told_apart(scene, &labels[a], &labels[b]))
-                .collect::<Vec<_>>()
-        })
-        .collect()
+    let agreeing = |(a, b): (usize, usize)| {
+        let (first, second) = (&labels[a], &labels[b]);
+        let distance2 = may_pair(first, second).then(|| distance2(first, second)).flatten()?;
+        (distance2 < most && !told_apart(scene, first, second)).then_some((distance2, a, b))
+    };
+    near_pairs(labels, NEIGHBOR_M).into_par_iter().filter_map(agreeing).collect()
 }
 
 /// Squared Mahalanobis distance of two labels.
@@ -207,9 +196,7 @@ fn distance2(a: &Label, b: &Label) -> Option<f64> {
 
 /// Whether images show both labels as detections of their own, more often than clutter would.
 fn told_apart(scene: &Scene, a: &Label, b: &Label) -> bool {
-    let (of_a, of_b) = (a.images(scene), b.images(scene));
-    let shared = of_a.iter().filter(|image| of_b.binary_search(image).is_ok()).count();
-    shared as f64 > 1.0 + SHARED_IMAGES * of_a.len().min(of_b.len()) as f64
+    a.images_shared(b, scene) as f64 > 1.0 + SHARED_IMAGES * a.voters.len().min(b.voters.len()) as f64
 }
 
 /// Of images that both have, the larger label's detection stays.
