@@ -203,7 +203,7 @@ impl<'a> Court<'a> {
         tally: &mut Tally,
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
-        if is_raw || std::env::var("GR").is_ok() {
+        if is_raw {
             for doubt in DOUBTS {
                 labels = self.drop_below(doubt, labels, tally, progress)?;
             }
