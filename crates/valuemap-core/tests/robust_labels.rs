@@ -4,19 +4,24 @@
 mod street;
 
 use std::collections::BTreeSet;
+use std::f64::consts::FRAC_PI_2;
 
-use nalgebra::Vector3;
+use nalgebra::{Isometry3, Point3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;
+use valuemap_core::robust::associate::Association;
 use valuemap_core::robust::contest::Contest;
-use valuemap_core::robust::estimate::{Care, Joint, Start};
+use valuemap_core::robust::estimate::{Care, Joint, Limits, Start};
+use valuemap_core::robust::handover::hand_over;
+use valuemap_core::robust::index::RayIndex;
 use valuemap_core::robust::keyframes::Keyframes;
 use valuemap_core::robust::label::{Label, from_voters};
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::scene::{Scene, View};
 use valuemap_core::robust::settle::mend;
+use valuemap_core::robust::spreads_of;
 
-use street::{GATE_SIGMAS, NOISE, config, errors_px, object, street};
+use street::{GATE_SIGMAS, NOISE, config, errors_px, joined, moved, object, street};
 
 const DRIFTING: Noise = Noise { position_drift_m: 0.05, rotation_drift_rad: 5e-4, ..NOISE };
 
@@ -134,6 +139,74 @@ proptest! {
             let is_alone = !shows_twin.contains(&scene.rays.image[ray as usize]);
             prop_assert_eq!(is_contested, of == 0 && is_alone && fits);
         }
+    }
+}
+
+/// Two objects side by side that drives along x both see, and one of which drives along y see from aside.
+fn crossing(objects: [Vector3<f64>; 2], errors: &[[f64; 2]]) -> Scene {
+    let along = || street(30, 2.0, &objects, errors);
+    let turn = Isometry3::new(Vector3::new(30.0, -25.0, 0.0), Vector3::z() * FRAC_PI_2);
+    let seen = turn.inverse() * Point3::from(objects[0]);
+    let across = || moved(street(12, 1.0, &[seen.coords], &errors[5..]), &turn);
+    joined(vec![along(), along(), across(), across(), across()])
+}
+
+proptest! {
+    #![proptest_config(config())]
+
+    #[test]
+    fn what_the_wrong_one_of_two_has_from_aside_is_handed_over(errors in errors_px(), apart_m in 0.5..0.9_f64) {
+        let first = Vector3::new(60.0, 5.0, 3.0);
+        let second = first + Vector3::y() * apart_m;
+        let scene = crossing([first, second], &errors);
+        let noise = Noise { position_drift_m: 0.12, rotation_drift_rad: 1e-3, ..NOISE };
+        let gate_sigmas = GATE_SIGMAS;
+        let (from_aside, from_front): (Vec<u32>, Vec<u32>) =
+            (0..scene.rays.rays.len() as u32).partition(|&ray| scene.view(ray).pass >= 2);
+        let (of_first, of_second): (Vec<u32>, Vec<u32>) = from_front.into_iter().partition(|ray| ray.is_multiple_of(2));
+        let all_of_first: BTreeSet<u32> = of_first.iter().chain(&from_aside).copied().collect();
+        let mistaken = [of_second.as_slice(), &from_aside].concat();
+        let label = |voters: Vec<u32>, start| from_voters(&scene, &noise, 10.0, voters, start).unwrap();
+        let wrong = vec![label(of_first.clone(), first), label(mistaken, second)];
+        let spreads = spreads_of(&scene, &noise);
+        let index = RayIndex::new(&scene, &spreads, gate_sigmas, 0..scene.rays.rays.len() as u32);
+        let association = Association::new(&scene, &noise, index, 150.0);
+
+        let (right, is_any) = hand_over(&association, 3, wrong);
+        prop_assert!(is_any);
+        let voters = |label: &Label| label.voters.iter().copied().collect::<BTreeSet<u32>>();
+        let of_second: BTreeSet<u32> = of_second.into_iter().collect();
+        prop_assert_eq!(right.iter().map(voters).collect::<Vec<_>>(), vec![all_of_first, of_second]);
+        prop_assert!((right[0].estimate.point - first).norm() < 0.3);
+
+        let (same, is_any) = hand_over(&association, 3, right.clone());
+        prop_assert!(!is_any);
+        prop_assert_eq!(same.iter().map(voters).collect::<Vec<_>>(), right.iter().map(voters).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn votes_that_do_not_fit_leave_and_the_rest_decides(object in object(), errors in errors_px(), off_m in 3.0..6.0_f64) {
+        let scene = street(70, 2.0, &[object, object + Vector3::z() * off_m], &errors);
+        let good = rays_of(&scene, &object);
+        let bad: Vec<u32> = (0..scene.rays.rays.len() as u32).filter(|ray| !good.contains(ray)).collect();
+        prop_assume!(good.len() >= 10 && bad.len() > good.len() / 10);
+        let bad = &bad[..=good.len() / 10];
+        let limits = Limits { gate_sigmas: GATE_SIGMAS, min_votes: 3 };
+        let all: Vec<u32> = good.iter().chain(bad).copied().collect();
+        // Of the second label too few votes are left.
+        let lost = [good[0], good[1], bad[0]];
+        let starts = [&all[..], &lost].map(|voters| Start { voters, weights: &[], point: object });
+        let found = Joint::new(&scene, &DRIFTING, starts.into_iter(), Care::Rough).solve_within(&limits).unwrap();
+        let start = Start { voters: &good, weights: &[], point: object };
+        let expected = Joint::new(&scene, &DRIFTING, std::iter::once(start), Care::Rough).solve_within(&limits).unwrap();
+        prop_assert!(expected.refused.is_empty());
+        prop_assert_eq!(found.votes(), expected.votes());
+        let refused: BTreeSet<(usize, u32)> = found.refused.iter().copied().collect();
+        let left = bad.iter().map(|&ray| (0, ray)).chain(lost.map(|ray| (1, ray)));
+        prop_assert_eq!(refused, left.collect::<BTreeSet<_>>());
+        let apart = found.estimates[0].point - expected.estimates[0].point;
+        let sigmas2 = apart.dot(&expected.estimates[0].covariance.cholesky().unwrap().solve(&apart));
+        prop_assert!(sigmas2 < 0.2_f64.powi(2), "{} sigmas", sigmas2.sqrt());
     }
 }
 

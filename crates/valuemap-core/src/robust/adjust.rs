@@ -6,8 +6,8 @@ use rayon::prelude::*;
 use rustc_hash::FxHasher;
 
 use super::contest::{Contest, widened};
-use super::estimate::{Care, Joint, Solution, Start};
-use super::label::{Label, by_place, fingerprint, side_of, unfit};
+use super::estimate::{Care, Joint, Limits, Solution, Start};
+use super::label::{Label, by_place, fingerprint, side_of};
 use super::noise::Noise;
 use super::scene::Scene;
 use super::settle::first_voter;
@@ -16,8 +16,6 @@ use super::settle::first_voter;
 const PLACE_M: f64 = 25.0;
 /// Labels that are estimated together, at most: the cost grows with the square of their number.
 const MOST_LABELS: usize = 12;
-/// Rounds of leaving out votes, at most.
-const MAX_TRIMS: usize = 4;
 
 /// Estimate all labels anew, place by place; those that keep fewer than `min_votes` are dropped. With all care, covariances
 /// say also what contested votes may have done ([`contest`](super::contest)).
@@ -93,59 +91,43 @@ impl Adjustment<'_> {
 
     /// Labels that cannot be estimated together are estimated one by one.
     fn together(&self, place: Vec<Label>) -> Vec<Label> {
-        let mut together = place.clone();
-        for _ in 0..MAX_TRIMS {
-            match self.estimate(&mut together) {
-                None if place.len() == 1 => return Vec::new(),
-                None => return place.into_iter().flat_map(|label| self.together(vec![label])).collect(),
-                Some(is_done) => {
-                    together.retain(|label| label.voters.len() >= self.min_votes);
-                    if is_done || together.is_empty() {
-                        break;
-                    }
-                }
-            }
+        match self.estimate(&place) {
+            None if place.len() == 1 => Vec::new(),
+            None => place.into_iter().flat_map(|label| self.together(vec![label])).collect(),
+            Some(together) => together,
         }
-        together
     }
 
-    /// Estimate labels together and leave votes out that do not fit; whether there were none.
-    fn estimate(&self, labels: &mut [Label]) -> Option<bool> {
-        let starts = labels.iter().map(|label| Start {
+    /// Estimate labels together and leave votes out that do not fit.
+    fn estimate(&self, place: &[Label]) -> Option<Vec<Label>> {
+        let starts = place.iter().map(|label| Start {
             voters: &label.voters,
             weights: &label.weights,
             point: label.estimate.point,
         });
-        let solution = Joint::new(self.scene, self.noise, starts, self.care()).solve()?;
-        let votes = solution.own_chi2();
-        let leaves = unfit(&votes, self.gate_sigmas);
-        if leaves.contains(&true) {
-            for (label, estimate) in labels.iter_mut().zip(&solution.estimates) {
-                (label.estimate, label.elsewhere) = (*estimate, Vec::new());
-            }
-        } else {
-            self.take(labels, &solution);
-        }
-        for label in &mut *labels {
+        let limits = Limits { gate_sigmas: self.gate_sigmas, min_votes: self.min_votes };
+        let solution = Joint::new(self.scene, self.noise, starts, self.care()).solve_within(&limits)?;
+        let mut labels = place.to_vec();
+        self.take(&mut labels, &solution);
+        for label in &mut labels {
             label.voters.clear();
             label.weights.clear();
         }
-        for ((&((label, ray), _), &weight), &leaves) in votes.iter().zip(solution.weights()).zip(&leaves) {
-            let label = &mut labels[label];
-            if leaves {
-                label.refused.push(ray);
-            } else {
-                label.voters.push(ray);
-                label.weights.push(weight);
-            }
+        for (&(label, ray), &weight) in solution.votes().iter().zip(solution.weights()) {
+            labels[label].voters.push(ray);
+            labels[label].weights.push(weight);
         }
-        for label in labels {
+        for &(label, ray) in &solution.refused {
+            labels[label].refused.push(ray);
+        }
+        labels.retain(|label| label.voters.len() >= self.min_votes);
+        for label in &mut labels {
             label.side = side_of(self.scene, &label.voters, &label.estimate.point);
         }
-        Some(!leaves.contains(&true))
+        Some(labels)
     }
 
-    /// Take over estimates that all votes fit.
+    /// Take over the estimates.
     fn take(&self, labels: &mut [Label], solution: &Solution<'_>) {
         match &self.contest {
             None => {

@@ -11,7 +11,7 @@ use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::estimate::Estimate;
 use super::grant::{Case, Claim, Decision, Fit, belief_of_votes, grant, overrule, report};
-use super::index::{Hit, RayIndex};
+use super::index::{Hit, RayIndex, chi2};
 use super::label::{Label, fingerprint};
 use super::noise::Noise;
 use super::poses::{Belief, LEGS_AROUND, Legs, smooth};
@@ -125,6 +125,20 @@ impl<'a> Association<'a> {
     pub fn images_at(&self, label: &Label, is_asked: impl Fn(u32) -> bool) -> Vec<u32> {
         let hits = self.index.all_hits(&label.estimate.point, label.class, self.range_m);
         hits.into_iter().filter(|hit| is_asked(hit.ray)).map(|hit| hit.image).collect()
+    }
+
+    /// The rays of one class that a point projects onto within their gates, in no order.
+    #[must_use]
+    pub(super) fn hits(&self, point: &Vector3<f64>, class: u32) -> Vec<Hit> {
+        self.index.all_hits(point, class, self.range_m)
+    }
+
+    /// Whether a ray has a label in its gate.
+    #[must_use]
+    pub(super) fn claims(&self, label: &Label, ray: u32) -> bool {
+        let projected = self.scene.ray(ray).project(&label.estimate.point);
+        let gate = self.index.gate_sigmas();
+        projected.z > 0.0 && chi2(&projected, &self.index.spreads()[ray as usize]) < gate * gate
     }
 
     /// The claims of a label: those that it had if it is where it was.

@@ -15,7 +15,7 @@ use super::index::RayIndex;
 use super::label::{self, Label, fingerprint};
 use super::noise::{Noise, Spread};
 use super::scene::Scene;
-use super::{SETTLING_ROUNDS, Settings, Tally, exchange, settle};
+use super::{Schedule, Settings, Tally, WHOLE, exchange, handover, settle};
 use crate::progress::{Halt, Progress};
 
 /// Labels are dropped below these multiples of the probability that is asked for, one after the other, and then below that.
@@ -62,23 +62,28 @@ impl<'a> Court<'a> {
     pub(super) fn hold(
         &mut self,
         begun: Vec<Label>,
-        sessions: usize,
-        rounds: usize,
+        schedule: &Schedule,
         tally: &mut Tally,
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
         let mut labels = if begun.is_empty() { begun } else { self.settle(begun, false, tally, progress)? };
         // What a doubted label gives back, and what settled labels leave, may be seen more clearly now.
-        for _ in 0..sessions {
+        for _ in 0..schedule.sessions {
             let before = labels.len();
             let new = self.left_over(&labels, tally, progress)?;
             let is_raw = labels.is_empty();
             labels = if is_raw { new } else { self.admit(labels, new, tally) };
             labels.sort_by_key(settle::first_voter);
-            for _ in 0..rounds {
+            for _ in 0..schedule.rounds {
                 labels = self.settle(labels, true, tally, progress)?;
             }
+            labels = self.hand_over(labels, schedule.handovers, tally, progress)?.0;
             labels = self.doubt(labels, is_raw, tally, progress)?;
+            let is_any;
+            (labels, is_any) = self.hand_over(labels, schedule.handovers, tally, progress)?;
+            if is_any {
+                labels = self.doubt(labels, false, tally, progress)?;
+            }
             if labels.len() <= before {
                 break;
             }
@@ -99,7 +104,7 @@ impl<'a> Court<'a> {
         tally.accepted += accepted;
         if !labels.is_empty() {
             let mut annex = Court::new(scene, noise, spreads, settings, free.into_iter());
-            for _ in 0..SETTLING_ROUNDS {
+            for _ in 0..WHOLE.rounds {
                 new = annex.settle(new, true, tally, progress)?;
             }
             // Where others took what they might have had they were not missed.
@@ -137,6 +142,25 @@ impl<'a> Court<'a> {
         tally.outvoted += (before - left) as u64;
         tally.fused += left.saturating_sub(labels.len()) as u64;
         Ok(labels)
+    }
+
+    /// Let neighbors hand over what the other one explains better, round after round; whether there was anything.
+    fn hand_over(
+        &mut self,
+        mut labels: Vec<Label>,
+        rounds: usize,
+        tally: &mut Tally,
+        progress: &Progress,
+    ) -> Result<(Vec<Label>, bool), Halt> {
+        for round in 0..rounds {
+            let is_any;
+            (labels, is_any) = handover::hand_over(&self.association, self.settings.min_votes as usize, labels);
+            if !is_any {
+                return Ok((labels, round > 0));
+            }
+            labels = self.settle(labels, true, tally, progress)?;
+        }
+        Ok((labels, rounds > 0))
     }
 
     fn sectors_of(&self, label: &Label) -> Arc<[Sector]> {

@@ -17,6 +17,10 @@ pub const ROUGH_M: f64 = 1e-2;
 /// A pass that comes back after so long a drive has another drift, m.
 const FORGOTTEN_M: f64 = 250.0;
 const LONGEST_STEP_M: f64 = 5.0;
+/// Votes are judged once a step is shorter than this, in sigmas, root mean square of the labels.
+const NEAR_SIGMAS: f64 = 0.3;
+/// Rounds of leaving out votes, at most.
+const MAX_TRIMS: usize = 10;
 /// Residuals beyond this many sigmas count less, in proportion (Huber).
 const HUBER_SIGMAS: f64 = 2.0;
 /// How much of what a visit says is left out when it is judged: a little stays, for where the others tell nothing.
@@ -89,6 +93,15 @@ pub struct Start<'v> {
     pub point: Vector3<f64>,
 }
 
+/// Which votes leave while labels are estimated.
+#[derive(Debug, Clone, Copy)]
+pub struct Limits {
+    /// Those with a larger residual, in their own sigmas, the drift of their visit taken out.
+    pub gate_sigmas: f64,
+    /// All of a label with fewer than so many.
+    pub min_votes: usize,
+}
+
 /// Labels that are estimated together.
 pub struct Joint<'a> {
     scene: &'a Scene,
@@ -106,6 +119,8 @@ pub struct Joint<'a> {
 pub struct Solution<'a> {
     joint: Joint<'a>,
     here: Evaluation,
+    /// Label and ray of the votes that left.
+    pub refused: Vec<(usize, u32)>,
     /// The positions with their covariances.
     pub estimates: Vec<Estimate>,
 }
@@ -126,24 +141,41 @@ impl<'a> Joint<'a> {
         Self { scene, noise, votes, weights, pose_errors, points, care }
     }
 
-    /// Estimate the positions.
+    /// Estimate the positions. Labels without votes stay where they are.
     ///
     /// Nothing if one ends up behind a voter, or the votes do not fix them.
     #[must_use]
-    pub fn solve(mut self) -> Option<Solution<'a>> {
+    pub fn solve(self) -> Option<Solution<'a>> {
+        self.solve_within(&Limits { gate_sigmas: f64::INFINITY, min_votes: 0 })
+    }
+
+    /// Estimate the positions, and leave votes out that do not fit.
+    ///
+    /// Nothing if one ends up behind a voter, or the votes do not fix them.
+    #[must_use]
+    pub fn solve_within(mut self, limits: &Limits) -> Option<Solution<'a>> {
         let mut here = self.evaluate()?;
         let mut rounds = 1;
+        let mut trims = 0;
+        let mut refused = Vec::new();
         let information = loop {
             let information = here.normals.information.clone().cholesky()?;
             let step = -information.solve(&here.normals.gradient);
             let length_sigmas = (-step.dot(&here.normals.gradient) / self.points.len() as f64).sqrt();
             self.step(&step);
             self.weights = here.own.iter().map(|chi2| (HUBER_SIGMAS / chi2.sqrt()).min(1.0)).collect();
-            if length_sigmas < self.care.tolerance_sigmas() || rounds == self.care.max_iterations() {
-                break information;
-            }
             if self.care == Care::Exact {
                 self.pose_errors.clone_from(&here.pose_errors);
+            }
+            let is_last = rounds == self.care.max_iterations();
+            if trims < MAX_TRIMS
+                && (is_last || length_sigmas < NEAR_SIGMAS)
+                && self.trim(&here.own, limits, &mut refused)
+            {
+                trims += 1;
+                rounds = 0;
+            } else if is_last || length_sigmas < self.care.tolerance_sigmas() {
+                break information;
             }
             here = self.evaluate()?;
             rounds += 1;
@@ -152,7 +184,27 @@ impl<'a> Joint<'a> {
         let is_in_front = |&(label, ray): &(usize, u32)| self.scene.ray(ray).project(&self.points[label]).z > 0.0;
         self.votes.iter().all(is_in_front).then_some(())?;
         let estimates = self.estimates(&information.inverse());
-        Some(Solution { joint: self, here, estimates })
+        Some(Solution { joint: self, here, refused, estimates })
+    }
+
+    /// Leave out votes with the residuals `own`, see [`Solution::own_chi2`], that do not fit; whether there were any.
+    fn trim(&mut self, own: &[f64], limits: &Limits, refused: &mut Vec<(usize, u32)>) -> bool {
+        let mut leaves = unfit(&self.votes, own, limits.gate_sigmas);
+        if !leaves.contains(&true) {
+            return false;
+        }
+        let mut left = vec![0; self.points.len()];
+        for ((label, _), leaves) in self.votes.iter().zip(&leaves) {
+            left[*label] += usize::from(!leaves);
+        }
+        for ((label, _), leaves) in self.votes.iter().zip(&mut leaves) {
+            *leaves |= left[*label] < limits.min_votes;
+        }
+        refused.extend(self.votes.iter().zip(&leaves).filter(|(_, leaves)| **leaves).map(|(vote, _)| *vote));
+        retain(&mut self.votes, &leaves);
+        retain(&mut self.weights, &leaves);
+        retain(&mut self.pose_errors, &leaves);
+        true
     }
 
     /// Move the points, each not too far.
@@ -192,6 +244,7 @@ impl<'a> Joint<'a> {
             let drive = Drive::along(&looks[range.clone()], &self.weights[range.clone()], self.points.len())?;
             normals.information += &drive.normals.information;
             normals.gradient += &drive.normals.gradient;
+            normals.square += drive.normals.square;
             left.extend(drive.left());
             if self.care == Care::Exact {
                 pose_errors.extend(drive.pose_errors(&self.weights[range]));
@@ -199,6 +252,14 @@ impl<'a> Joint<'a> {
             of_visits.push(drive.normals);
         }
         let mut alone = vec![Matrix3::zeros(); self.points.len()];
+        let mut is_seen = vec![false; self.points.len()];
+        for &(label, _) in &self.votes {
+            is_seen[label] = true;
+        }
+        for label in (0..self.points.len()).filter(|&label| !is_seen[label]) {
+            normals.add(label, label, &Matrix3::identity());
+            alone[label] = Matrix3::identity();
+        }
         for (look, weight) in looks.iter().zip(&self.weights) {
             for column in &look.by_point {
                 alone[look.label] += column * column.transpose() * (weight / look.variance);
@@ -219,6 +280,18 @@ impl<'a> Joint<'a> {
 }
 
 impl Solution<'_> {
+    /// Squared residuals of all votes in sigmas, pose errors taken out.
+    #[must_use]
+    pub fn square(&self) -> f64 {
+        self.here.normals.square
+    }
+
+    /// Label and ray of each vote.
+    #[must_use]
+    pub fn votes(&self) -> &[(usize, u32)] {
+        &self.joint.votes
+    }
+
     /// Label and ray of each vote with its squared residual in its own sigmas, after the drift of its visit is taken out,
     /// studentised: a vote that pulls the point towards itself has a small residual, and is expected to.
     #[must_use]
@@ -284,6 +357,25 @@ impl Solution<'_> {
         }
         found
     }
+}
+
+/// Which votes with the residuals `own` do not fit the gate and must leave: of each label the worst first, since one bad
+/// vote makes good ones look bad.
+fn unfit(votes: &[(usize, u32)], own: &[f64], gate_sigmas: f64) -> Vec<bool> {
+    let labels = votes.iter().map(|(label, _)| label + 1).max().unwrap_or(0);
+    let mut worst = vec![0.0_f64; labels];
+    for ((label, _), chi2) in votes.iter().zip(own) {
+        worst[*label] = worst[*label].max(*chi2);
+    }
+    let limit = gate_sigmas * gate_sigmas;
+    let stays = |((label, _), chi2): (&(usize, u32), &f64)| *chi2 < limit || *chi2 < 0.5 * worst[*label];
+    votes.iter().zip(own).map(|vote| !stays(vote)).collect()
+}
+
+/// Leave out what is said to leave.
+fn retain<T>(all: &mut Vec<T>, leaves: &[bool]) {
+    let mut leaves = leaves.iter();
+    all.retain(|_| leaves.next() == Some(&false));
 }
 
 /// The normal equations of all votes, and how well each fits.

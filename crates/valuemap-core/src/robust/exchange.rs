@@ -9,7 +9,7 @@ use nalgebra::{Matrix2x3, Matrix3, Vector2, Vector3};
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use super::label::{Label, SECTOR_COSINE, direction_to, from_voters, near_pairs, sector_middles};
+use super::label::{Label, SECTOR_COSINE, direction_to, from_voters, nearest_pairs, sector_middles};
 use super::noise::Noise;
 use super::scene::Scene;
 use super::settle::first_voter;
@@ -33,7 +33,8 @@ const LEAST_GAIN: f64 = 8.0;
 /// nearest pairs first, each label in one pair.
 #[must_use]
 pub fn exchange(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) -> Vec<Label> {
-    let pairs = nearest_pairs(&labels);
+    let is_open = |a: &Label, b: &Label| a.class == b.class && !a.known.untangled.contains(&b.identity());
+    let pairs = nearest_pairs(&labels, PAIR_M, is_open);
     let of_pair = |&(a, b): &(usize, usize)| exchange_pair(scene, noise, gate_sigmas, &labels[a], &labels[b]);
     let exchanged: Vec<Option<[Label; 2]>> = pairs.par_iter().map(of_pair).collect();
     let mut labels = labels;
@@ -47,26 +48,6 @@ pub fn exchange(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Labe
     }
     labels.sort_by_key(first_voter);
     labels
-}
-
-/// Disjoint pairs of neighbours of one class that may have votes to exchange, the nearest first.
-fn nearest_pairs(labels: &[Label]) -> Vec<(usize, usize)> {
-    let open = |(a, b): (usize, usize)| {
-        let (first, second) = (&labels[a], &labels[b]);
-        let is_open = first.class == second.class && !first.known.untangled.contains(&second.identity());
-        is_open.then(|| ((second.estimate.point - first.estimate.point).norm(), a, b))
-    };
-    let mut near: Vec<(f64, usize, usize)> = near_pairs(labels, PAIR_M).into_par_iter().filter_map(open).collect();
-    near.sort_by(|x, y| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2))));
-    let mut taken = vec![false; labels.len()];
-    let mut pairs = Vec::new();
-    for (_, a, b) in near {
-        if !taken[a] && !taken[b] {
-            (taken[a], taken[b]) = (true, true);
-            pairs.push((a, b));
-        }
-    }
-    pairs
 }
 
 /// Both labels' detections in an image that shows both, and what their difference says.

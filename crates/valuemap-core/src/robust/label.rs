@@ -9,7 +9,7 @@ use rstar::RTree;
 use rstar::primitives::GeomWithData;
 use rustc_hash::FxHasher;
 
-use super::estimate::{Care, Elsewhere, Estimate, Joint, Start};
+use super::estimate::{Care, Elsewhere, Estimate, Joint, Limits, Start};
 use super::noise::Noise;
 use super::scene::{Scene, View};
 
@@ -17,8 +17,6 @@ use super::scene::{Scene, View};
 const SMALL_MOVE_CHI2: f64 = 0.1;
 /// A label whose mean direction of sight changed by less is seen from where it was.
 const SMALL_TURN: f64 = 0.1;
-/// Rounds of leaving out voters, at most.
-const MAX_TRIMS: usize = 10;
 
 /// Voters whose directions have a mean at least this long are all on one side of the label.
 const ONE_SIDED: f64 = 0.6;
@@ -77,6 +75,8 @@ pub struct Known {
     pub is_one: bool,
     /// Neighbors, as they were, that it was found to have no votes to exchange with.
     pub untangled: Vec<u64>,
+    /// The same for votes to hand over.
+    pub satisfied: Vec<u64>,
 }
 
 /// Estimate from voters in any order, without those that disagree with the others of their pass.
@@ -93,51 +93,24 @@ pub fn from_voters(
 ) -> Option<Label> {
     scene.sort_by_pass(&mut voters);
     let class = scene.rays.class[*voters.first()? as usize];
-    let (mut point, mut weights) = (start, Vec::new());
-    for _ in 0..MAX_TRIMS {
-        let start = Start { voters: &voters, weights: &weights, point };
-        let solution = Joint::new(scene, noise, std::iter::once(start), Care::Rough).solve()?;
-        let leaves = unfit(&solution.own_chi2(), gate_sigmas);
-        let estimate = solution.estimates[0];
-        weights = solution.weights().to_vec();
-        if !leaves.contains(&true) {
-            let side = side_of(scene, &voters, &estimate.point);
-            return Some(Label {
-                estimate,
-                side,
-                class,
-                voters,
-                weights,
-                undecided: Vec::new(),
-                unseen_from: Vec::new(),
-                elsewhere: Vec::new(),
-                refused: Vec::new(),
-                revision: Revision::default(),
-                known: Known::default(),
-            });
-        }
-        point = estimate.point;
-        (voters, weights) =
-            voters.iter().copied().zip(weights).zip(leaves).filter(|(_, leaves)| !leaves).map(|(vote, _)| vote).unzip();
-        if voters.len() < 2 {
-            return None;
-        }
-    }
-    None
-}
-
-/// Which votes do not fit the gate and must leave: of each label the worst first, since one bad vote makes good ones look
-/// bad.
-#[must_use]
-pub fn unfit(votes: &[((usize, u32), f64)], gate_sigmas: f64) -> Vec<bool> {
-    let labels = votes.iter().map(|((label, _), _)| label + 1).max().unwrap_or(0);
-    let mut worst = vec![0.0_f64; labels];
-    for ((label, _), chi2) in votes {
-        worst[*label] = worst[*label].max(*chi2);
-    }
-    let limit = gate_sigmas * gate_sigmas;
-    let stays = |((label, _), chi2): &((usize, u32), f64)| *chi2 < limit || *chi2 < 0.5 * worst[*label];
-    votes.iter().map(|vote| !stays(vote)).collect()
+    let start = Start { voters: &voters, weights: &[], point: start };
+    let limits = Limits { gate_sigmas, min_votes: 2 };
+    let solution = Joint::new(scene, noise, std::iter::once(start), Care::Rough).solve_within(&limits)?;
+    let estimate = solution.estimates[0];
+    let voters: Vec<u32> = solution.votes().iter().map(|(_, ray)| *ray).collect();
+    (voters.len() >= 2).then(|| Label {
+        estimate,
+        side: side_of(scene, &voters, &estimate.point),
+        class,
+        voters,
+        weights: solution.weights().to_vec(),
+        undecided: Vec::new(),
+        unseen_from: Vec::new(),
+        elsewhere: Vec::new(),
+        refused: Vec::new(),
+        revision: Revision::default(),
+        known: Known::default(),
+    })
 }
 
 /// Mean of the unit directions from a point to the cameras of its voters.
@@ -187,6 +160,30 @@ pub fn near_pairs(labels: &[Label], distance_m: f64) -> Vec<(usize, usize)> {
         near.map(|near| near.data).filter(|&b| b > a).map(|b| (a, b)).collect::<Vec<_>>()
     };
     labels.par_iter().enumerate().flat_map_iter(of_label).collect()
+}
+
+/// Disjoint pairs of labels within a distance of each other that may be paired, the nearest first.
+#[must_use]
+pub fn nearest_pairs(
+    labels: &[Label],
+    distance_m: f64,
+    may_pair: impl Fn(&Label, &Label) -> bool + Sync,
+) -> Vec<(usize, usize)> {
+    let apart = |(a, b): (usize, usize)| {
+        let (first, second) = (&labels[a], &labels[b]);
+        may_pair(first, second).then(|| ((second.estimate.point - first.estimate.point).norm(), a, b))
+    };
+    let mut near: Vec<(f64, usize, usize)> = near_pairs(labels, distance_m).into_par_iter().filter_map(apart).collect();
+    near.sort_by(|x, y| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2))));
+    let mut taken = vec![false; labels.len()];
+    let mut pairs = Vec::new();
+    for (_, a, b) in near {
+        if !taken[a] && !taken[b] {
+            (taken[a], taken[b]) = (true, true);
+            pairs.push((a, b));
+        }
+    }
+    pairs
 }
 
 impl Label {

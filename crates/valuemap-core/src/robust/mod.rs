@@ -27,6 +27,7 @@ pub mod exchange;
 pub mod existence;
 pub mod gather;
 pub mod grant;
+pub mod handover;
 pub mod index;
 pub mod keyframes;
 pub mod label;
@@ -87,15 +88,22 @@ const CALIBRATION_GATE: f64 = 1.4;
 /// Times that the noise is estimated anew, from labels found with the last estimate.
 const CALIBRATION_ROUNDS: usize = 3;
 
-/// Times that the rays of no label are gathered, at most.
-const SESSIONS: usize = 3;
-/// The same in a large scene, first in its keyframes and then in all images: what is left over gets less and less.
-const SESSIONS_OF_LARGE: usize = 1;
+/// How labels are found among the rays of a scene.
+struct Schedule {
+    /// Times that the rays of no label are gathered, at most: what is left over gets less and less.
+    sessions: usize,
+    /// Times that labels compete before any is doubted.
+    rounds: usize,
+    /// Times that neighbors hand over votes before any is doubted, and after, at most.
+    handovers: usize,
+}
 
-/// Times that labels compete before any is doubted.
-const SETTLING_ROUNDS: usize = 4;
-/// The same for labels that competed in the keyframes.
-const REFINING_ROUNDS: usize = 2;
+/// For all images of a scene.
+const WHOLE: Schedule = Schedule { sessions: 3, rounds: 4, handovers: 3 };
+/// For the keyframes of a large one.
+const KEYFRAMES: Schedule = Schedule { sessions: 1, ..WHOLE };
+/// For all its images, when labels competed in the keyframes.
+const REFINING: Schedule = Schedule { sessions: 1, rounds: 2, handovers: 0 };
 
 /// A label with what speaks for it.
 #[derive(Debug, Clone)]
@@ -158,7 +166,7 @@ pub fn self_calibrate(
         let (mut labels, _) = gather(scene, &noise, &spreads, &settings, &rays, progress)?;
         if round == CALIBRATION_ROUNDS {
             let mut court = Court::new(scene, &noise, &spreads, &settings, rays.iter().copied());
-            for _ in 0..SETTLING_ROUNDS {
+            for _ in 0..WHOLE.rounds {
                 labels = court.settle(labels, true, &mut Tally::default(), progress)?;
             }
         }
@@ -178,11 +186,10 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
         Some(keyframes) => found_in(keyframes, noise, settings, &mut tally, progress)?,
         None => Vec::new(),
     };
-    let (sessions, rounds) =
-        if keyframes.is_some() { (SESSIONS_OF_LARGE, REFINING_ROUNDS) } else { (SESSIONS, SETTLING_ROUNDS) };
+    let schedule = if keyframes.is_some() { REFINING } else { WHOLE };
     let spreads = spreads_of(scene, noise);
     let mut court = Court::new(scene, noise, &spreads, settings, 0..scene.rays.rays.len() as u32);
-    let labels = court.hold(begun, sessions, rounds, &mut tally, progress)?;
+    let labels = court.hold(begun, &schedule, &mut tally, progress)?;
     let before = labels.len();
     let labels = if settings.without.merge { labels } else { settle::mend(scene, noise, settings.gate_sigmas, labels) };
     tally.fused += (before - labels.len()) as u64;
@@ -216,7 +223,7 @@ fn found_in(
     let scene = &keyframes.scene;
     let spreads = spreads_of(scene, noise);
     let mut court = Court::new(scene, noise, &spreads, settings, 0..scene.rays.rays.len() as u32);
-    let labels = court.hold(Vec::new(), SESSIONS_OF_LARGE, SETTLING_ROUNDS, tally, progress)?;
+    let labels = court.hold(Vec::new(), &KEYFRAMES, tally, progress)?;
     Ok(labels.into_iter().map(|label| keyframes.in_whole(label)).collect())
 }
 

@@ -1,7 +1,7 @@
 //! Random streets, and what the tests on them share.
 #![allow(dead_code, missing_docs)] // Each test uses a part of it.
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Isometry3, Matrix3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
@@ -68,6 +68,38 @@ pub fn street(images: usize, spacing_m: f64, objects: &[Vector3<f64>], errors_px
         frusta: vec![Frustum { normals: Vec::new(), solid_angle_sr: 12.0 }],
         rays,
     }
+}
+
+/// A scene elsewhere in the world.
+pub fn moved(mut scene: Scene, motion: &Isometry3<f64>) -> Scene {
+    let rotation = motion.rotation.to_rotation_matrix();
+    for ray in &mut scene.rays.rays {
+        ray.residual_from_world *= rotation.matrix().transpose();
+        ray.center = motion.rotation * ray.center + motion.translation.vector;
+        ray.direction = rotation * ray.direction;
+    }
+    for view in &mut scene.views {
+        view.center = motion.rotation * view.center + motion.translation.vector;
+        view.cam_from_world *= rotation.matrix().transpose();
+    }
+    scene
+}
+
+/// Several scenes as one, each a pass of its own.
+pub fn joined(scenes: Vec<Scene>) -> Scene {
+    let mut all = Scene { frusta: scenes[0].frusta.clone(), ..Scene::default() };
+    for (pass, scene) in (0..).zip(scenes) {
+        let images = all.views.len() as u32;
+        all.rays.rays.extend(scene.rays.rays);
+        all.rays.image.extend(scene.rays.image.iter().map(|image| image + images));
+        all.rays.class.extend(scene.rays.class);
+        all.scale2.extend(scene.scale2);
+        all.box_px.extend(scene.box_px);
+        all.range_m.extend(scene.range_m);
+        all.range_sigma_m.extend(scene.range_sigma_m);
+        all.views.extend(scene.views.into_iter().map(|view| View { pass, viewpoint: 0, ..view }));
+    }
+    all
 }
 
 pub fn object() -> impl Strategy<Value = Vector3<f64>> {

@@ -1,0 +1,234 @@
+//! Handover: where images show only one of two neighbors from some direction, the wrong one may have all that looks from there.
+//!
+//! Its position has then moved so that these votes fit, and the detections that it should have do not fit anywhere: no
+//! single vote changes sides. Both are estimated anew as if the other one had these votes, with what then fits of the
+//! detections that nobody has; the explanation that leaves less unexplained stays.
+
+use nalgebra::Vector3;
+use rayon::prelude::*;
+use rustc_hash::FxHashSet;
+
+use super::associate::Association;
+use super::estimate::{Care, Joint, Limits, Start};
+use super::label::{Label, SECTOR_COSINE, by_place, direction_to, from_voters, nearest_pairs, sector_middles};
+use super::settle::first_voter;
+
+/// Labels farther apart than this do not have each other's votes, m.
+const PAIR_M: f64 = 3.0;
+/// So many images must show one of the two alone from about one direction.
+const LEAST_ALONE: usize = 6;
+/// For each of them, images that show both from there, at most.
+const MOST_BOTH: f64 = 0.2;
+/// This part of them must be in the other's gate.
+const CLAIMED_SHARE: f64 = 0.5;
+/// Other labels that are estimated with the two, at most, and how far they may be, m: they tell the drift of the passes.
+const COMPANIONS: usize = 5;
+const AROUND_M: f64 = 25.0;
+/// Times that detections nobody has are gathered, without companions and with them.
+const GATHERINGS: (usize, usize) = (1, 2);
+/// Handovers that explain so much less without companions are not tried with them.
+const PROMISING: f64 = -30.0;
+/// A handover must explain so much more.
+const LEAST_GAIN: f64 = 10.0;
+
+/// Hand over to the other of two neighbors what it explains better; whether there was anything. The nearest pairs first,
+/// each label in one pair.
+#[must_use]
+pub fn hand_over(association: &Association<'_>, min_votes: usize, mut labels: Vec<Label>) -> (Vec<Label>, bool) {
+    let is_open = |a: &Label, b: &Label| a.class == b.class && !a.known.satisfied.contains(&b.identity());
+    let pairs = nearest_pairs(&labels, PAIR_M, is_open);
+    let mut is_taken = vec![false; association.scene.rays.rays.len()];
+    for &ray in labels.iter().flat_map(|label| &label.voters) {
+        is_taken[ray as usize] = true;
+    }
+    let tree = by_place(&labels);
+    let of_pair = |&(a, b): &(usize, usize)| {
+        let near = tree.nearest_neighbor_iter_with_distance_2(labels[a].estimate.point.into());
+        let near = near.take_while(|(_, distance2)| *distance2 <= AROUND_M * AROUND_M).map(|(near, _)| near.data);
+        let companions = near.filter(|&i| i != a && i != b).take(COMPANIONS).map(|i| &labels[i]).collect();
+        Pair { association, min_votes, is_taken: &is_taken, labels: [&labels[a], &labels[b]], companions }.better()
+    };
+    let better: Vec<Option<[Label; 2]>> = pairs.par_iter().with_max_len(1).map(of_pair).collect();
+    let is_any = better.iter().any(Option::is_some);
+    for (&(a, b), new) in pairs.iter().zip(better) {
+        if let Some(new) = new {
+            [labels[a], labels[b]] = new;
+        } else {
+            let neighbor = labels[b].identity();
+            labels[a].known.satisfied.push(neighbor);
+        }
+    }
+    labels.sort_by_key(first_voter);
+    (labels, is_any)
+}
+
+/// Two neighbors.
+struct Pair<'a> {
+    association: &'a Association<'a>,
+    min_votes: usize,
+    /// Of each ray, whether a label has it.
+    is_taken: &'a [bool],
+    labels: [&'a Label; 2],
+    companions: Vec<&'a Label>,
+}
+
+/// Votes (ascending) that one of the two has from about one direction, or all such votes.
+struct Handover {
+    from: usize,
+    rays: Vec<u32>,
+}
+
+/// Who has which votes, and what is gained by that: the squared gate for each of them, less its squared residual in sigmas.
+struct Explanation {
+    voters: [Vec<u32>; 2],
+    points: [Vector3<f64>; 2],
+    gain: f64,
+}
+
+/// A vote from its direction, and whether its image shows the other label as well.
+struct Sighting {
+    ray: u32,
+    direction: Vector3<f64>,
+    shows_both: bool,
+}
+
+impl Pair<'_> {
+    /// The two labels after a handover; nothing if they are best as they are.
+    fn better(&self) -> Option<[Label; 2]> {
+        let handovers = [0, 1].map(|from| self.handovers(from));
+        if handovers.iter().all(Vec::is_empty) {
+            return None;
+        }
+        let alone = self.explain(&[], &[])?;
+        let is_promising = |handover: &&Handover| {
+            let after = self.explain(&[handover], &[]);
+            after.is_some_and(|after| after.gain > alone.gain + PROMISING)
+        };
+        let [of_first, of_second] =
+            [0, 1].map(|from| handovers[from].iter().filter(is_promising).collect::<Vec<&Handover>>());
+        let each = of_first.iter().chain(&of_second).map(|&handover| vec![handover]);
+        let both = of_first.iter().flat_map(|&a| of_second.iter().map(move |&b| vec![a, b]));
+        let tried: Vec<Vec<&Handover>> = each.chain(both).collect();
+        if tried.is_empty() {
+            return None;
+        }
+        let as_is = self.explain(&[], &self.companions)?;
+        let explained = tried.iter().filter_map(|handovers| self.explain(handovers, &self.companions));
+        let best = explained.max_by(|a, b| a.gain.total_cmp(&b.gain))?;
+        if !(best.gain > as_is.gain + LEAST_GAIN) {
+            return None;
+        }
+        let [first, second] = [0, 1].map(|side| self.label(side, &best));
+        Some([first?, second?])
+    }
+
+    /// What one of the two might hand over: what looks from one direction, for each, or all that.
+    fn handovers(&self, from: usize) -> Vec<Handover> {
+        let sightings = self.sightings(from);
+        let alone = || sightings.iter().filter(|sighting| !sighting.shows_both);
+        let mut handovers = Vec::new();
+        for middle in sector_middles(alone().map(|sighting| sighting.direction)) {
+            let is_there = |sighting: &&Sighting| middle.dot(&sighting.direction) >= SECTOR_COSINE;
+            let mut rays: Vec<u32> = alone().filter(is_there).map(|sighting| sighting.ray).collect();
+            let both = sightings.iter().filter(is_there).count() - rays.len();
+            let claimed = rays.iter().filter(|&&ray| self.association.claims(self.labels[1 - from], ray)).count();
+            let share = |count: usize| count as f64 / rays.len() as f64;
+            if rays.len() >= LEAST_ALONE && share(both) <= MOST_BOTH && share(claimed) >= CLAIMED_SHARE {
+                rays.sort_unstable();
+                handovers.push(Handover { from, rays });
+            }
+        }
+        if handovers.len() > 1 {
+            let mut rays: Vec<u32> = handovers.iter().flat_map(|handover| &handover.rays).copied().collect();
+            rays.sort_unstable();
+            rays.dedup();
+            handovers.push(Handover { from, rays });
+        }
+        handovers
+    }
+
+    fn sightings(&self, of: usize) -> Vec<Sighting> {
+        let scene = self.association.scene;
+        let of_other = self.labels[1 - of].images(scene);
+        let middle = (self.labels[0].estimate.point + self.labels[1].estimate.point) * 0.5;
+        let sighting = |&ray: &u32| Sighting {
+            ray,
+            direction: direction_to(scene, ray, &middle),
+            shows_both: of_other.binary_search(&scene.rays.image[ray as usize]).is_ok(),
+        };
+        self.labels[of].voters.iter().map(sighting).collect()
+    }
+
+    /// What is explained after some handovers, with what fits then of what nobody has, some other labels estimated with the
+    /// two.
+    fn explain(&self, handovers: &[&Handover], companions: &[&Label]) -> Option<Explanation> {
+        let &Association { scene, noise, ref index, .. } = self.association;
+        let limits = Limits { gate_sigmas: index.gate_sigmas(), min_votes: self.min_votes };
+        let gatherings = if companions.is_empty() { GATHERINGS.0 } else { GATHERINGS.1 };
+        let mut voters = self.labels.map(|label| label.voters.clone());
+        for Handover { from, rays } in handovers {
+            voters[*from].retain(|ray| rays.binary_search(ray).is_err());
+            voters[1 - from].extend(rays);
+        }
+        let mut points = self.labels.map(|label| label.estimate.point);
+        let mut gathering = 0;
+        loop {
+            let pair = [0, 1].map(|side| Start { voters: &voters[side], weights: &[], point: points[side] });
+            let others = companions.iter().map(|label| Start {
+                voters: &label.voters,
+                weights: &label.weights,
+                point: label.estimate.point,
+            });
+            let solution =
+                Joint::new(scene, noise, pair.into_iter().chain(others), Care::Rough).solve_within(&limits)?;
+            points = [0, 1].map(|side| solution.estimates[side].point);
+            voters = [0, 1].map(|side| {
+                let own = solution.votes().iter().filter(|(label, _)| *label == side);
+                own.map(|(_, ray)| *ray).collect()
+            });
+            if voters.iter().any(|voters| voters.len() < self.min_votes) {
+                return None;
+            }
+            if gathering == gatherings {
+                let gain = limits.gate_sigmas.powi(2) * solution.votes().len() as f64 - solution.square();
+                return Some(Explanation { voters, points, gain });
+            }
+            self.gather(&mut voters, &points);
+            gathering += 1;
+        }
+    }
+
+    /// Give the two what nobody has in their gates, one an image, what is nearest first.
+    fn gather(&self, voters: &mut [Vec<u32>; 2], points: &[Vector3<f64>; 2]) {
+        let own: FxHashSet<u32> = self.labels.iter().flat_map(|label| &label.voters).copied().collect();
+        let mut given: FxHashSet<u32> = voters.iter().flatten().copied().collect();
+        let image = |ray: u32| self.association.scene.rays.image[ray as usize];
+        let mut shown: FxHashSet<(usize, u32)> =
+            (0..).zip(&*voters).flat_map(|(side, voters)| voters.iter().map(move |&ray| (side, image(ray)))).collect();
+        let mut free = Vec::new();
+        for (side, point) in points.iter().enumerate() {
+            let hits = self.association.hits(point, self.labels[side].class).into_iter();
+            let is_free = |ray: u32| !self.is_taken[ray as usize] || own.contains(&ray);
+            free.extend(hits.filter(|hit| is_free(hit.ray)).map(|hit| (hit.chi2, hit.ray, side)));
+        }
+        free.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
+        for (_, ray, side) in free {
+            if !given.contains(&ray) && shown.insert((side, image(ray))) {
+                given.insert(ray);
+                voters[side].push(ray);
+            }
+        }
+    }
+
+    /// One of the two as it is explained; it is to be seen from where it has votes now.
+    fn label(&self, side: usize, explanation: &Explanation) -> Option<Label> {
+        let &Association { scene, noise, ref index, .. } = self.association;
+        let point = explanation.points[side];
+        let found = from_voters(scene, noise, index.gate_sigmas(), explanation.voters[side].clone(), point)?;
+        let is_unseen = |direction: &&Vector3<f64>| {
+            found.voters.iter().all(|&ray| direction.dot(&direction_to(scene, ray, &point)) < SECTOR_COSINE)
+        };
+        let unseen_from = self.labels[side].unseen_from.iter().filter(is_unseen).copied().collect();
+        Some(Label { unseen_from, ..found })
+    }
+}
