@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use proptest::prelude::*;
-use valuemap_core::robust::drift::{DRIFT_LENGTH_M, Drive, LEG_M, Look};
+use valuemap_core::robust::drift::{DRIFT_LENGTH_M, Drive, LEG_M, Look, Sigmas};
 use valuemap_core::robust::poses::{Belief, Legs, smooth};
 use valuemap_core::robust::scene::View;
 
@@ -13,14 +13,14 @@ const LABELS: usize = 3;
 /// Looks from places far enough from each other that each is a leg of its own; some places look at several labels.
 fn looks() -> impl Strategy<Value = Vec<Look>> {
     let look = (
-        prop::array::uniform12(-1.0..1.0_f64),
+        prop::array::uniform6(-1.0..1.0_f64),
         prop::array::uniform8(-1.0..1.0_f64),
         prop::option::of((LEG_M * 1.1)..80.0_f64),
         0.5..4.0_f64,
     );
     prop::collection::vec(look, 2..9).prop_map(|parts| {
         let (mut driven_m, mut image, mut label) = (0.0, 0, 0);
-        let of_part = |(poses, rest, step, detection_px2): ([f64; 12], [f64; 8], Option<f64>, f64)| {
+        let of_part = |(turns, rest, step, detection_px2): ([f64; 6], [f64; 8], Option<f64>, f64)| {
             // Without a step it is the same image, and another label.
             match step.or_else(|| (label + 1 == LABELS).then_some(LEG_M * 2.0)) {
                 Some(step) => (driven_m, image, label) = (driven_m + step, image + 1, image as usize % LABELS),
@@ -31,9 +31,9 @@ fn looks() -> impl Strategy<Value = Vec<Look>> {
                 image,
                 residual: [rest[0] * 3.0, rest[1] * 3.0],
                 by_point: [Vector3::new(rest[2], rest[3], rest[4]), Vector3::new(rest[5], rest[6], rest[7])],
-                by_pose: [Vector6::from_column_slice(&poses[..6]), Vector6::from_column_slice(&poses[6..])],
-                drift_sigma: Vector6::new(0.5, 0.5, 0.5, 0.2, 0.2, 0.2),
-                own_sigma: Vector6::new(0.3, 0.3, 0.3, 0.4, 0.4, 0.4),
+                by_turn: [Vector3::from_column_slice(&turns[..3]), Vector3::from_column_slice(&turns[3..])],
+                drift_sigma: Sigmas { position_m: 0.5, rotation_rad: 0.2 },
+                own_sigma: Sigmas { position_m: 0.3, rotation_rad: 0.4 },
                 detection_px2,
                 variance: detection_px2 + 1.0,
                 driven_m,
@@ -51,7 +51,7 @@ fn kernel(a: &Look, b: &Look) -> f64 {
 fn dense(looks: &[Look]) -> (DMatrix<f64>, DMatrix<f64>, DVector<f64>) {
     let n = 2 * looks.len();
     let row = |k: usize| (&looks[k / 2], k % 2);
-    let scaled = |k: usize, sigma: &Vector6| row(k).0.by_pose[row(k).1].component_mul(sigma);
+    let scaled = |k: usize, sigma: &Sigmas| row(k).0.by_pose(row(k).1).component_mul(&sigma.each());
     let covariance = DMatrix::from_fn(n, n, |i, j| {
         let (a, b) = (row(i).0, row(j).0);
         let detection = if i == j { a.detection_px2 } else { 0.0 };
@@ -92,7 +92,7 @@ proptest! {
         let weighed = cholesky.solve(&residual);
         for (k, found) in drive.left().iter().enumerate() {
             for axis in 0..2 {
-                let scaled = |i: usize, axis: usize| looks[i].by_pose[axis].component_mul(&looks[i].drift_sigma);
+                let scaled = |i: usize, axis: usize| looks[i].by_pose(axis).component_mul(&looks[i].drift_sigma.each());
                 let drift: f64 = (0..2 * looks.len())
                     .map(|j| kernel(&looks[k], &looks[j / 2]) * scaled(k, axis).dot(&scaled(j / 2, j % 2)) * weighed[j])
                     .sum();
@@ -111,9 +111,9 @@ proptest! {
         for (look, found) in looks.iter().zip(drive.pose_errors(&ones)) {
             // Covariance of the image's pose error with all residuals, times what they weigh.
             let of_residual = |k: usize| {
-                let (other, by_pose) = (&looks[k / 2], looks[k / 2].by_pose[k % 2]);
-                let drift2 = look.drift_sigma.component_mul(&look.drift_sigma) * kernel(look, other);
-                let own2 = look.own_sigma.component_mul(&look.own_sigma) * f64::from(look.image == other.image);
+                let (other, by_pose) = (&looks[k / 2], looks[k / 2].by_pose(k % 2));
+                let drift2 = look.drift_sigma.each().map(|sigma| sigma * sigma) * kernel(look, other);
+                let own2 = look.own_sigma.each().map(|sigma| sigma * sigma) * f64::from(look.image == other.image);
                 (drift2 + own2).component_mul(&by_pose) * weighed[k]
             };
             let expected: Vector6 = (0..2 * looks.len()).map(of_residual).sum();
@@ -133,14 +133,14 @@ proptest! {
         }
         let (covariance, _, residual) = dense(&looks);
         let cholesky = covariance.cholesky().ok_or(TestCaseError::fail("not positive definite"))?;
-        let sigma = looks[0].drift_sigma;
+        let sigma = looks[0].drift_sigma.each();
         for (leg, belief) in smooth(&starts, &beliefs).iter().enumerate() {
             let found = belief.pose_error((sigma[0], sigma[3]), (0.0, 0.0));
             // Covariance of this leg's drift with all residuals.
             let cross = DMatrix::from_fn(6, 2 * looks.len(), |i, k| {
                 let look = &looks[k / 2];
                 let keep = (-(starts[leg] - look.driven_m).abs() / DRIFT_LENGTH_M).exp();
-                keep * sigma[i] * look.by_pose[k % 2][i] * look.drift_sigma[i]
+                keep * sigma[i] * look.by_pose(k % 2)[i] * look.drift_sigma.each()[i]
             });
             let mean = -(&cross * cholesky.solve(&residual));
             let prior = DMatrix::from_diagonal(&DVector::from_iterator(6, sigma.iter().map(|s| s * s)));

@@ -221,7 +221,7 @@ fn given_to(scene: &Scene, label: Label, mut voters: Vec<u32>, mut undecided: Ve
 fn claims_of(scene: &Scene, index: &RayIndex<'_>, label: &Label, range_m: f64) -> Vec<Claim> {
     let mut hits: Vec<Hit> =
         places_of(&label.estimate).iter().flat_map(|place| index.all_hits(place, label.class, range_m)).collect();
-    hits.sort_by(|a, b| a.ray.cmp(&b.ray).then(a.chi2.total_cmp(&b.chi2)));
+    hits.sort_unstable_by(|a, b| a.ray.cmp(&b.ray).then(a.chi2.total_cmp(&b.chi2)));
     hits.dedup_by_key(|hit| hit.ray);
     let of_hit = |hit: Hit| Claim { image: hit.image, label: u32::MAX, ray: hit.ray, chi2: hit.chi2, is_vote: false };
     hits.into_iter().filter(|hit| label.faces(scene, hit.ray)).map(of_hit).collect()

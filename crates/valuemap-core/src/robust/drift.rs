@@ -25,6 +25,32 @@ const LEAST_FREEDOM: f64 = 1e-3;
 /// Drifting errors are one within this distance, m.
 pub const LEG_M: f64 = 10.0;
 
+/// Standard deviations of a pose error, each axis.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sigmas {
+    /// Of the position, m.
+    pub position_m: f64,
+    /// Of the rotation, rad.
+    pub rotation_rad: f64,
+}
+
+impl Sigmas {
+    /// Those of no error.
+    pub const NONE: Self = Self { position_m: 0.0, rotation_rad: 0.0 };
+
+    fn of((position_m, rotation_rad): (f64, f64)) -> Self {
+        Self { position_m, rotation_rad }
+    }
+
+    /// All six, position first.
+    #[inline]
+    #[must_use]
+    pub fn each(&self) -> Vector6 {
+        let (p, r) = (self.position_m, self.rotation_rad);
+        Vector6::new(p, p, p, r, r, r)
+    }
+}
+
 /// One vote's residual at the position of its label, with its derivatives.
 #[derive(Debug, Clone)]
 pub struct Look {
@@ -36,12 +62,12 @@ pub struct Look {
     pub residual: [f64; 2],
     /// By the position.
     pub by_point: [Vector3<f64>; 2],
-    /// By the errors of the image's position (m) and rotation (rad, in the world).
-    pub by_pose: [Vector6; 2],
+    /// By the error of the image's rotation (rad, in the world); by that of its position it is as by the label's.
+    pub by_turn: [Vector3<f64>; 2],
     /// Standard deviations of the part of these errors that drifts.
-    pub drift_sigma: Vector6,
+    pub drift_sigma: Sigmas,
     /// Of the part that the image has for itself.
-    pub own_sigma: Vector6,
+    pub own_sigma: Sigmas,
     /// Variance of the detection, each axis, px².
     pub detection_px2: f64,
     /// Variance of all but the drift, each axis, px².
@@ -79,9 +105,7 @@ impl Look {
             direction: turn * measured.direction,
         };
         let mut look = Self::of_ray(scene, noise, &probable, ray, label, point)?;
-        for (residual, by_pose) in look.residual.iter_mut().zip(&look.by_pose) {
-            *residual += by_pose.dot(error);
-        }
+        look.shift(error);
         Some(look)
     }
 
@@ -90,19 +114,14 @@ impl Look {
         let (residual, rows) = seen.linearize(point)?;
         let away = point - seen.center;
         let by_point = rows.map(|row| row.transpose());
-        let by_pose = by_point.map(|column| {
-            let turned = away.cross(&column);
-            Vector6::new(column.x, column.y, column.z, turned.x, turned.y, turned.z)
-        });
-        let sigmas = |(p, r): (f64, f64)| Vector6::new(p, p, p, r, r, r);
         Some(Self {
             label,
             image: scene.rays.image[ray as usize],
             residual,
             by_point,
-            by_pose,
-            drift_sigma: sigmas(noise.shared(view)),
-            own_sigma: sigmas(noise.of_image(view)),
+            by_turn: by_point.map(|column| away.cross(&column)),
+            drift_sigma: Sigmas::of(noise.shared(view)),
+            own_sigma: Sigmas::of(noise.of_image(view)),
             detection_px2: noise.detection_px2(scene, ray),
             variance: noise.own(scene, ray).variance(seen.project(point).z),
             driven_m: view.driven_m,
@@ -113,23 +132,35 @@ impl Look {
     #[must_use]
     pub fn by_itself(mut self) -> Self {
         self.detection_px2 = self.variance;
-        self.own_sigma = Vector6::zeros();
+        self.own_sigma = Sigmas::NONE;
         self
     }
 
-    /// The look with a drift, which is about known, taken out: mean and standard deviations of what is known of it.
+    /// The look with a pose error, m and rad, taken out that is known but for some remainder, which then is the drift.
     #[must_use]
-    pub fn with_drift(mut self, mean: &Vector6, sigma: &Vector6) -> Self {
-        for (residual, by_pose) in self.residual.iter_mut().zip(&self.by_pose) {
-            *residual += by_pose.dot(mean);
-        }
-        self.drift_sigma = *sigma;
+    pub fn with_drift(mut self, error: &Vector6, remainder: Sigmas) -> Self {
+        self.shift(error);
+        self.drift_sigma = remainder;
         self
+    }
+
+    /// One axis of the residual by the errors of the image's position (m) and rotation (rad, in the world).
+    #[inline]
+    #[must_use]
+    pub fn by_pose(&self, axis: usize) -> Vector6 {
+        let (shift, turn) = (&self.by_point[axis], &self.by_turn[axis]);
+        Vector6::new(shift.x, shift.y, shift.z, turn.x, turn.y, turn.z)
+    }
+
+    fn shift(&mut self, error: &Vector6) {
+        for axis in 0..2 {
+            self.residual[axis] += self.by_pose(axis).dot(error);
+        }
     }
 
     /// The residual, px, without what a pose error, m and rad, makes of it.
     fn without(&self, error: &Vector6) -> Vector2<f64> {
-        Vector2::from([0, 1].map(|axis| self.residual[axis] - self.by_pose[axis].dot(error)))
+        Vector2::from([0, 1].map(|axis| self.residual[axis] - self.by_pose(axis).dot(error)))
     }
 
     /// Squared residual in sigmas, studentised: a vote that pulls the point towards itself has a small residual, and is expected
@@ -228,7 +259,7 @@ impl<'a> Drive<'a> {
             let mut at = start;
             for image in looks[start..end].chunk_by(|a, b| a.image == b.image) {
                 let weights = &weights[at..at + image.len()];
-                if image[0].own_sigma == Vector6::zeros() {
+                if image[0].own_sigma == Sigmas::NONE {
                     image.iter().zip(weights).for_each(|(look, &weight)| leg.add(look, weight, &mut normals));
                 } else {
                     leg.add_image(image, weights, &mut normals);
@@ -267,7 +298,7 @@ impl<'a> Drive<'a> {
         for leg in self.legs.iter().rev() {
             let drift = leg.information.matrix * (drift_of_next * leg.tie + leg.gradient);
             for i in leg.looks.clone() {
-                drifts[i] = drift.component_mul(&self.looks[i].drift_sigma);
+                drifts[i] = drift.component_mul(&self.looks[i].drift_sigma.each());
             }
             drift_of_next = drift;
         }
@@ -280,17 +311,18 @@ impl<'a> Drive<'a> {
         let mut errors = self.drifts();
         let mut at = 0;
         for image in self.looks.chunk_by(|a, b| a.image == b.image) {
-            let own = &image[0].own_sigma;
+            let own = image[0].own_sigma.each();
             let (mut of_pose, mut gradient) = (Matrix6::zeros(), Vector6::zeros());
             for (i, look) in image.iter().enumerate() {
                 let left = look.without(&errors[at + i]);
-                for (pose, r) in look.by_pose.iter().zip(left.iter()) {
+                for axis in 0..2 {
+                    let pose = look.by_pose(axis);
                     let weighted = pose * (weights[at + i] / look.detection_px2);
                     of_pose += pose * weighted.transpose();
-                    gradient += weighted * *r;
+                    gradient += weighted * left[axis];
                 }
             }
-            if let Some(known) = Inverse::of(&(Matrix6::identity() + scaled(&of_pose, own))) {
+            if let Some(known) = Inverse::of(&(Matrix6::identity() + scaled(&of_pose, &own))) {
                 let of_image = own.component_mul(&(known.matrix * own.component_mul(&gradient)));
                 errors[at..at + image.len()].iter_mut().for_each(|error| *error += of_image);
             }
@@ -305,10 +337,11 @@ impl Leg {
     fn add(&mut self, look: &Look, robust_weight: f64, normals: &mut Normals) {
         let weight = robust_weight / look.detection_px2;
         let (mut of_label, mut by_label) = (Matrix3::zeros(), Vector3::zeros());
+        let drift = look.drift_sigma.each();
         let mut cross = Matrix3x6::zeros();
         for axis in 0..2 {
             let (r, column) = (look.residual[axis], look.by_point[axis]);
-            let shared = look.by_pose[axis].component_mul(&look.drift_sigma);
+            let shared = look.by_pose(axis).component_mul(&drift);
             let (weighted, weighted_shared) = (column * weight, shared * weight);
             of_label += column * weighted.transpose();
             by_label += weighted * r;
@@ -330,7 +363,7 @@ impl Leg {
             let weight = robust_weight / look.detection_px2;
             let mut cross = Matrix3x6::zeros();
             for axis in 0..2 {
-                let (r, column, pose) = (look.residual[axis], look.by_point[axis], look.by_pose[axis]);
+                let (r, column, pose) = (look.residual[axis], look.by_point[axis], look.by_pose(axis));
                 normals.add(look.label, look.label, &(column * column.transpose() * weight));
                 normals.add_gradient(look.label, &(column * (r * weight)));
                 normals.square += r * r * weight;
@@ -340,10 +373,10 @@ impl Leg {
             }
             crosses.push((look.label, cross));
         }
-        let (own, drift) = (&looks[0].own_sigma, &looks[0].drift_sigma);
-        let Some(known) = Inverse::of(&(Matrix6::identity() + scaled(&of_pose, own))) else { return };
+        let (own, drift) = (looks[0].own_sigma.each(), looks[0].drift_sigma.each());
+        let Some(known) = Inverse::of(&(Matrix6::identity() + scaled(&of_pose, &own))) else { return };
         // The covariance of the image's own error, once its looks are known.
-        let error = scaled(&known.matrix, own);
+        let error = scaled(&known.matrix, &own);
         normals.square -= gradient.dot(&(error * gradient));
         let kept = Matrix6::identity() - error * of_pose;
         for (a, of_a) in &crosses {
@@ -353,12 +386,12 @@ impl Leg {
                 normals.add(*a, *b, &-(by_error * of_b.transpose()));
             }
             let mut cross = of_a * kept;
-            for (mut column, sigma) in cross.column_iter_mut().zip(drift) {
+            for (mut column, sigma) in cross.column_iter_mut().zip(&drift) {
                 column *= *sigma;
             }
             self.add_cross(*a, &cross);
         }
-        self.information += scaled(&(of_pose * kept), drift);
+        self.information += scaled(&(of_pose * kept), &drift);
         self.gradient += drift.component_mul(&kept.tr_mul(&gradient));
     }
 

@@ -425,5 +425,10 @@ pub fn by_pass<'a>(scene: &'a Scene, voters: &'a [u32]) -> impl Iterator<Item = 
 /// The looks of the voters of one visit at a point, each by itself; nothing if it is behind one of them.
 #[must_use]
 pub fn looks_at(scene: &Scene, noise: &Noise, voters: &[u32], point: &Vector3<f64>) -> Option<Vec<Look>> {
-    voters.iter().map(|&ray| Some(Look::of(scene, noise, ray, 0, point)?.by_itself())).collect()
+    // Not collected: an iterator of options does not say how many there will be.
+    let mut looks = Vec::with_capacity(voters.len());
+    for &ray in voters {
+        looks.push(Look::of(scene, noise, ray, 0, point)?.by_itself());
+    }
+    Some(looks)
 }

@@ -25,7 +25,7 @@ const CLAIMED_SHARE: f64 = 0.5;
 const COMPANIONS: usize = 5;
 const AROUND_M: f64 = 25.0;
 /// Times that detections nobody has are gathered, without companions and with them.
-const GATHERINGS: (usize, usize) = (1, 2);
+const GATHERINGS: (usize, usize) = (0, 2);
 /// Handovers that explain so much less without companions are not tried with them.
 const PROMISING: f64 = -30.0;
 /// A handover must explain so much more.

@@ -6,7 +6,7 @@
 
 use nalgebra::{Matrix2, SMatrix, Vector2};
 
-use super::drift::{DRIFT_LENGTH_M, LEG_M, Look};
+use super::drift::{DRIFT_LENGTH_M, LEG_M, Look, Sigmas};
 use super::scene::View;
 use super::spd::{Inverse, Matrix6, Vector6, scaled};
 
@@ -58,8 +58,9 @@ impl Belief {
     #[must_use]
     pub fn of_vote(look: &Look, variance: f64) -> Self {
         let mut belief = Self::nothing();
+        let drift = look.drift_sigma.each();
         for i in 0..2 {
-            let shared = look.by_pose[i].component_mul(&look.drift_sigma);
+            let shared = look.by_pose(i).component_mul(&drift);
             belief.information += shared * shared.transpose() / variance;
             belief.gradient += shared * (look.residual[i] / variance);
         }
@@ -105,6 +106,16 @@ impl PoseError {
         (residual, own + by_pose * self.covariance * by_pose.transpose())
     }
 
+    /// Its standard deviations, root mean squares of the axes.
+    #[must_use]
+    pub fn sigmas(&self) -> Sigmas {
+        let [position_m, rotation_rad] = [0, 3].map(|first| {
+            let variance = self.covariance.diagonal().fixed_rows::<3>(first).mean();
+            variance.sqrt()
+        });
+        Sigmas { position_m, rotation_rad }
+    }
+
     /// The error after a look at a label was found to be right (Kalman).
     #[must_use]
     pub fn after(&self, look: &Look, own: &Matrix2<f64>) -> Self {
@@ -117,7 +128,7 @@ impl PoseError {
 }
 
 fn rows_of(look: &Look) -> SMatrix<f64, 2, 6> {
-    SMatrix::<f64, 2, 6>::from_rows(&[look.by_pose[0].transpose(), look.by_pose[1].transpose()])
+    SMatrix::<f64, 2, 6>::from_rows(&[look.by_pose(0).transpose(), look.by_pose(1).transpose()])
 }
 
 /// The drives of a scene, cut into legs of one drift each.

@@ -101,7 +101,7 @@ impl Run<'_> {
         let estimate = self.labels[label as usize].elsewhere(self.of.scene.view(rays[0].1));
         let look = |(&(_, ray), drift): (&(usize, u32), &PoseError)| {
             let look = Look::of(self.of.scene, self.of.noise, ray, 0, &estimate.point)?;
-            Some(look.by_itself().with_drift(&drift.mean, &drift.covariance.diagonal().map(f64::sqrt)))
+            Some(look.by_itself().with_drift(&drift.mean, drift.sigmas()))
         };
         let joint = || {
             let looks: Vec<Look> = rays.iter().zip(drift).map(look).collect::<Option<_>>()?;
