@@ -4,6 +4,7 @@
 mod street;
 
 use std::collections::BTreeSet;
+use std::sync::Arc;
 
 use nalgebra::{Rotation3, Vector3};
 use proptest::collection::vec;
@@ -33,7 +34,7 @@ proptest! {
         let mut scene = street(60, 2.0, &objects, &errors);
         let count = scene.rays.rays.len() as u32;
         for ray in 0..count {
-            scene.rays.class[ray as usize] = ray % 3 / 2;
+            Arc::make_mut(&mut scene.rays).class[ray as usize] = ray % 3 / 2;
         }
         let spreads = spreads_of(&scene, &NOISE);
         let index = RayIndex::new(&scene, &spreads, GATE_SIGMAS, 0..count);

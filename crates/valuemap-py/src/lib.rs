@@ -5,6 +5,8 @@ mod arrays;
 mod robust;
 mod run;
 
+use std::sync::Arc;
+
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -19,10 +21,10 @@ use crate::run::with_progress;
 
 /// Viewing rays, one a detection, copied once and used by every stage.
 #[pyclass(frozen, module = "valuemap._core")]
-pub struct Rays(valuemap_core::ray::Rays);
+pub struct Rays(Arc<valuemap_core::ray::Rays>);
 
 impl Rays {
-    fn core(&self) -> &valuemap_core::ray::Rays {
+    fn core(&self) -> &Arc<valuemap_core::ray::Rays> {
         &self.0
     }
 }
@@ -45,7 +47,8 @@ impl Rays {
         if lengths.iter().any(|&length| length != matrices.len()) {
             return Err(PyValueError::new_err("rays: all arrays must have one row a ray"));
         }
-        Ok(Self(valuemap_core::ray::Rays { rays: arrays::rays_from(matrices, centers, directions), image, class }))
+        let rays = arrays::rays_from(matrices, centers, directions);
+        Ok(Self(Arc::new(valuemap_core::ray::Rays { rays, image, class })))
     }
 
     fn __len__(&self) -> usize {

@@ -1,5 +1,7 @@
 //! The robust method across the border.
 
+use std::sync::Arc;
+
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -72,7 +74,7 @@ impl Scene {
             .collect();
         Ok(Self(CoreScene {
             scale2: rays.core().rays.iter().map(valuemap_core::ray::Ray::pixels_per_unit2).collect(),
-            rays: rays.core().clone(),
+            rays: Arc::clone(rays.core()),
             box_px: box_px.as_slice()?.to_vec(),
             range_m: range_m.as_slice()?.to_vec(),
             range_sigma_m: range_sigma_m.as_slice()?.to_vec(),

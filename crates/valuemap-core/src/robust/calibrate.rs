@@ -123,10 +123,11 @@ fn agreeing_ratio(scene: &Scene, labels: &[&Label], noise_of: &(dyn Fn(f64) -> N
 }
 
 /// How much larger than they are said to be the errors are that labels of several passes show: the mean disagreement of
-/// their passes, at least 1. The variance of positions is to be multiplied by it.
+/// their passes, at least 1. The variance of positions is to be multiplied by it. About `most` of the labels serve.
 #[must_use]
-pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Label]) -> f64 {
-    let of_label = |label: &Label| *label.known.disagreement.get_or_init(|| disagreement(scene, noise, label));
+pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Label], most: usize) -> f64 {
+    let labels: Vec<&Label> = labels.iter().step_by((labels.len() / most).max(1)).collect();
+    let of_label = |label: &&Label| *label.known.disagreement.get_or_init(|| disagreement(scene, noise, label));
     mean(labels.par_iter().map(of_label).collect()).unwrap_or(1.0).max(1.0)
 }
 

@@ -146,12 +146,36 @@ pub(super) fn report(cases: &[Case<'_>], fits: &[Fit], labels: &[Label], limit: 
 }
 
 /// The claims to grant, ascending: the assignment with the least sum of costs, where a detection without a label costs as
-/// much as one at the gate.
+/// much as one at the gate. Claims that have nothing to do with each other are assigned for themselves.
 fn assign(cases: &[Case<'_>], costs: &[f64], limit: f64) -> Vec<usize> {
-    let open: Vec<usize> = (0..cases.len()).filter(|&i| costs[i] < limit).collect();
-    if !open.iter().any(|&i| open.iter().any(|&j| shares(cases, i, j))) {
-        return open;
+    let mut open: Vec<usize> = (0..cases.len()).filter(|&i| costs[i] < limit).collect();
+    let mut granted = Vec::with_capacity(open.len());
+    while let Some(first) = open.pop() {
+        let mut tied = vec![first];
+        let mut next = 0;
+        while let Some(&tie) = tied.get(next) {
+            open.retain(|&i| {
+                let is_tied = shares(cases, tie, i);
+                if is_tied {
+                    tied.push(i);
+                }
+                !is_tied
+            });
+            next += 1;
+        }
+        let is_one = |of: fn(&Claim) -> u32| tied.iter().all(|&i| of(cases[i].claim) == of(cases[first].claim));
+        if is_one(|claim| claim.label) || is_one(|claim| claim.ray) {
+            granted.extend(tied.into_iter().min_by(|&i, &j| costs[i].total_cmp(&costs[j]).then(i.cmp(&j))));
+        } else {
+            granted.extend(assign_tied(cases, costs, limit, tied));
+        }
     }
+    granted.sort_unstable();
+    granted
+}
+
+/// The assignment of claims of several labels for several detections.
+fn assign_tied(cases: &[Case<'_>], costs: &[f64], limit: f64, open: Vec<usize>) -> Vec<usize> {
     let mut rays: Vec<u32> = open.iter().map(|&i| cases[i].claim.ray).collect();
     rays.sort_unstable();
     rays.dedup();

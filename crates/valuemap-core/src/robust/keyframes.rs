@@ -3,6 +3,8 @@
 //! Images a few metres apart see the same. What they disagree about is found out with one of them as well as with all, in
 //! a fraction of the time.
 
+use std::sync::Arc;
+
 use rustc_hash::FxHashSet;
 
 use super::label::{Known, Label, Revision};
@@ -54,11 +56,11 @@ impl Keyframes {
         let rays: Vec<u32> = (0..scene.rays.rays.len() as u32).filter(|&ray| number_of(ray).is_some()).collect();
         let of_rays = |column: &[f64]| rays.iter().map(|&ray| column[ray as usize]).collect();
         let thinned = Scene {
-            rays: Rays {
+            rays: Arc::new(Rays {
                 rays: rays.iter().map(|&ray| *scene.ray(ray)).collect(),
                 image: rays.iter().filter_map(|&ray| number_of(ray)).collect(),
                 class: rays.iter().map(|&ray| scene.rays.class[ray as usize]).collect(),
-            },
+            }),
             scale2: of_rays(&scene.scale2),
             box_px: of_rays(&scene.box_px),
             range_m: of_rays(&scene.range_m),

@@ -199,7 +199,7 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
     tally.outvoted += (before - labels.len()) as u64;
     let Judgement { of_labels, rates, strays_per_image } =
         judge(scene, &spreads, &court.sectors(&labels), &labels, settings, tally.doubted);
-    let variance_factor = calibrate::variance_factor(scene, noise, &labels);
+    let variance_factor = calibrate::variance_factor(scene, noise, &labels, labels.len().max(1));
     let before = labels.len();
     let judged = labels.into_iter().zip(of_labels).filter(|(_, (existence, _))| *existence >= settings.min_existence);
     let findings: Vec<Finding> = judged

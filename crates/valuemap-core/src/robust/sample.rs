@@ -7,6 +7,7 @@
 use std::cmp::Reverse;
 
 use nalgebra::Vector3;
+use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
 use super::scene::Scene;
@@ -26,10 +27,7 @@ impl<'a> Sampler<'a> {
     /// Prepare to sample among some images; `centers` are those of all images, m.
     #[must_use]
     pub fn new(centers: &'a [Vector3<f64>], images: &[u32], radius_m: f64) -> Self {
-        let mut places: FxHashMap<[i64; 3], Vec<u32>> = FxHashMap::default();
-        for &image in images {
-            places.entry(cell_of(&centers[image as usize], radius_m)).or_default().push(image);
-        }
+        let mut places = by_cell(centers, images.iter().copied(), radius_m);
         for images in places.values_mut() {
             images.sort_unstable_by_key(|&image| (Reverse(level_of(image)), image));
         }
@@ -59,10 +57,8 @@ impl<'a> Sampler<'a> {
     /// The images around an image on the highest level that has enough of them, else on the lowest; and that level.
     fn thinned(&self, image: u32, min_baseline_m: f64, enough: usize) -> (Vec<u32>, u32) {
         let center = &self.centers[image as usize];
-        let [x, y, z] = cell_of(center, self.radius_m);
-        let near = |step: i64| [x + step / 9 - 1, y + step / 3 % 3 - 1, z + step % 3 - 1];
-        let mut places: Vec<&[u32]> =
-            (0..27).filter_map(|step| self.places.get(&near(step)).map(Vec::as_slice)).collect();
+        let near = cells_around(center, self.radius_m);
+        let mut places: Vec<&[u32]> = near.filter_map(|cell| self.places.get(&cell).map(Vec::as_slice)).collect();
         let mut found: Vec<u32> = Vec::new();
         for level in (0..=MAX_LEVEL).rev() {
             for place in &mut places {
@@ -101,23 +97,42 @@ pub fn places(scene: &Scene, rays: usize, radius_m: f64) -> Vec<u32> {
     for &image in &scene.rays.image {
         rays_of[image as usize] += 1;
     }
-    let mut seeds: Vec<u32> = (0..scene.views.len() as u32).collect();
-    seeds.sort_by_cached_key(|&image| scramble(u64::from(image)));
+    let centers: Vec<Vector3<f64>> = scene.views.iter().map(|view| view.center).collect();
+    let images = 0..scene.views.len() as u32;
+    let by_cell = by_cell(&centers, images.clone(), radius_m);
+    let mut seeds: Vec<u32> = images.collect();
+    seeds.par_sort_by_cached_key(|&image| scramble(u64::from(image)));
     let mut taken = vec![false; scene.views.len()];
     let mut found = 0;
     for seed in seeds {
         if found >= rays {
             break;
         }
-        let center = scene.views[seed as usize].center;
-        for (image, view) in scene.views.iter().enumerate() {
-            if !taken[image] && (view.center - center).norm() <= radius_m {
+        let center = &centers[seed as usize];
+        for &image in cells_around(center, radius_m).filter_map(|cell| by_cell.get(&cell)).flatten() {
+            let image = image as usize;
+            if !taken[image] && (centers[image] - center).norm() <= radius_m {
                 taken[image] = true;
                 found += rays_of[image];
             }
         }
     }
     (0..count).filter(|&ray| taken[scene.rays.image[ray as usize] as usize]).collect()
+}
+
+/// Images by the cube that they were taken in.
+fn by_cell(centers: &[Vector3<f64>], images: impl Iterator<Item = u32>, side_m: f64) -> FxHashMap<[i64; 3], Vec<u32>> {
+    let mut cells: FxHashMap<[i64; 3], Vec<u32>> = FxHashMap::default();
+    for image in images {
+        cells.entry(cell_of(&centers[image as usize], side_m)).or_default().push(image);
+    }
+    cells
+}
+
+/// The cubes with everything that is within one side of a point.
+fn cells_around(center: &Vector3<f64>, side_m: f64) -> impl Iterator<Item = [i64; 3]> {
+    let [x, y, z] = cell_of(center, side_m);
+    (0..27).map(move |step| [x + step / 9 - 1, y + step / 3 % 3 - 1, z + step % 3 - 1])
 }
 
 fn cell_of(center: &Vector3<f64>, side_m: f64) -> [i64; 3] {

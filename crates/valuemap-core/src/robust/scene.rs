@@ -1,5 +1,7 @@
 //! What the robust method knows: rays with their boxes, and all images, also those without detections.
 
+use std::sync::Arc;
+
 use nalgebra::{Matrix3, Vector3};
 
 use crate::ray::{Ray, Rays};
@@ -8,7 +10,7 @@ use crate::ray::{Ray, Rays};
 #[derive(Debug, Default, Clone)]
 pub struct Scene {
     /// Viewing rays with image and class.
-    pub rays: Rays,
+    pub rays: Arc<Rays>,
     /// Squared pixels that a unit of each ray's virtual image plane spans, see [`Ray::pixels_per_unit2`].
     pub scale2: Vec<f64>,
     /// Size of each ray's box, px (geometric mean of width and height).

@@ -18,6 +18,8 @@ const SIDES_COSINE: f64 = 0.5;
 const NEIGHBOR_M: f64 = 6.0;
 /// Two labels may share this part of the images of the smaller one and still be one object: clutter beside it.
 const SHARED_IMAGES: f64 = 0.15;
+/// So many labels tell about how far their passes disagree.
+const DISAGREEING: usize = 400;
 /// Labels this near that are seen from the same directions, but never side by side, are one object wherever they are put, m.
 const TORN_M: f64 = 1.0;
 /// So many images of each must look from these directions.
@@ -32,7 +34,7 @@ const MOST_BOTH: f64 = 0.05;
 #[must_use]
 pub fn fuse(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) -> Vec<Label> {
     let mut labels = labels;
-    let factor = variance_factor(scene, noise, &labels);
+    let factor = variance_factor(scene, noise, &labels, DISAGREEING);
     loop {
         let pairs = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor, |a, b| a.class == b.class);
         if pairs.is_empty() {
@@ -99,7 +101,7 @@ fn are_torn(scene: &Scene, a: &Label, b: &Label) -> bool {
 /// detector takes one object for another now and then.
 #[must_use]
 pub fn outclass(scene: &Scene, noise: &Noise, labels: Vec<Label>) -> Vec<Label> {
-    let factor = variance_factor(scene, noise, &labels);
+    let factor = variance_factor(scene, noise, &labels, DISAGREEING);
     let pairs = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor, |a, b| a.class != b.class);
     let mut is_outclassed = vec![false; labels.len()];
     for (_, a, b) in pairs {
@@ -113,7 +115,7 @@ pub fn outclass(scene: &Scene, noise: &Noise, labels: Vec<Label>) -> Vec<Label> 
 /// which no image shows together.
 #[must_use]
 pub fn split(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>, min_votes: usize) -> Vec<Label> {
-    let factor = variance_factor(scene, noise, &labels);
+    let factor = variance_factor(scene, noise, &labels, DISAGREEING);
     let parts = |mut label: Label| -> Vec<Label> {
         if label.known.is_one {
             return vec![label];

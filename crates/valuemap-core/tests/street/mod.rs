@@ -1,6 +1,8 @@
 //! Random streets, and what the tests on them share.
 #![allow(dead_code, missing_docs)] // Each test uses a part of it.
 
+use std::sync::Arc;
+
 use nalgebra::{Isometry3, Matrix3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -66,14 +68,14 @@ pub fn street(images: usize, spacing_m: f64, objects: &[Vector3<f64>], errors_px
         range_sigma_m: vec![f64::NAN; count],
         views: centers.iter().map(view).collect(),
         frusta: vec![Frustum { normals: Vec::new(), solid_angle_sr: 12.0 }],
-        rays,
+        rays: Arc::new(rays),
     }
 }
 
 /// A scene elsewhere in the world.
 pub fn moved(mut scene: Scene, motion: &Isometry3<f64>) -> Scene {
     let rotation = motion.rotation.to_rotation_matrix();
-    for ray in &mut scene.rays.rays {
+    for ray in &mut Arc::make_mut(&mut scene.rays).rays {
         ray.residual_from_world *= rotation.matrix().transpose();
         ray.center = motion.rotation * ray.center + motion.translation.vector;
         ray.direction = rotation * ray.direction;
@@ -88,18 +90,19 @@ pub fn moved(mut scene: Scene, motion: &Isometry3<f64>) -> Scene {
 /// Several scenes as one, each a pass of its own.
 pub fn joined(scenes: Vec<Scene>) -> Scene {
     let mut all = Scene { frusta: scenes[0].frusta.clone(), ..Scene::default() };
+    let mut rays = Rays::default();
     for (pass, scene) in (0..).zip(scenes) {
         let images = all.views.len() as u32;
-        all.rays.rays.extend(scene.rays.rays);
-        all.rays.image.extend(scene.rays.image.iter().map(|image| image + images));
-        all.rays.class.extend(scene.rays.class);
+        rays.rays.extend(&scene.rays.rays);
+        rays.image.extend(scene.rays.image.iter().map(|image| image + images));
+        rays.class.extend(&scene.rays.class);
         all.scale2.extend(scene.scale2);
         all.box_px.extend(scene.box_px);
         all.range_m.extend(scene.range_m);
         all.range_sigma_m.extend(scene.range_sigma_m);
         all.views.extend(scene.views.into_iter().map(|view| View { pass, viewpoint: 0, ..view }));
     }
-    all
+    Scene { rays: Arc::new(rays), ..all }
 }
 
 pub fn object() -> impl Strategy<Value = Vector3<f64>> {
