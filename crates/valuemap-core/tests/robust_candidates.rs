@@ -20,9 +20,9 @@ use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::nominate::{Who, nominate};
 use valuemap_core::robust::quick::quick_estimate;
 use valuemap_core::robust::sample::{Sampler, level_of};
-use valuemap_core::robust::{Settings, Without, spreads_of};
+use valuemap_core::robust::spreads_of;
 
-use street::{GATE_SIGMAS, NOISE, VIABILITY, config, errors_px, object, street};
+use street::{GATE_SIGMAS, NOISE, SETTINGS, VIABILITY, config, errors_px, object, street};
 
 proptest! {
     #![proptest_config(config())]
@@ -157,13 +157,6 @@ proptest! {
         let objects: Vec<Vector3<f64>> = objects.iter().copied().chain(twins).collect();
         let scene = street(70, 2.0, &objects, &errors);
         let noise = Noise { position_drift_m: 0.03, rotation_drift_rad: 5e-4, ..NOISE };
-        let settings = Settings {
-            viability: VIABILITY,
-            gate_sigmas: GATE_SIGMAS,
-            min_votes: 3,
-            min_existence: 0.5,
-            without: Without::default(),
-        };
         let progress = Progress::default();
         let all = 0..scene.rays.rays.len() as u32;
         let spreads = spreads_of(&scene, &noise);
@@ -172,7 +165,7 @@ proptest! {
             Association::new(&scene, &noise, index, 150.0)
         };
         let rays: Vec<u32> = all.clone().collect();
-        let (mut labels, _) = gather(&scene, &noise, &spreads, &settings, &rays, &progress).unwrap();
+        let (mut labels, _) = gather(&scene, &noise, &spreads, &SETTINGS, &rays, &progress).unwrap();
         let mut with_memory = begin();
         for _ in 0..6 {
             let given = with_memory.associate(labels.clone(), &progress).unwrap();

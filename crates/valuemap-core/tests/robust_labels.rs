@@ -18,10 +18,9 @@ use valuemap_core::robust::keyframes::Keyframes;
 use valuemap_core::robust::label::{Label, from_voters};
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::scene::{Scene, View};
-use valuemap_core::robust::settle::mend;
 use valuemap_core::robust::spreads_of;
 
-use street::{GATE_SIGMAS, NOISE, config, errors_px, joined, moved, object, street};
+use street::{GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, joined, moved, object, street};
 
 const DRIFTING: Noise = Noise { position_drift_m: 0.05, rotation_drift_rad: 5e-4, ..NOISE };
 
@@ -33,6 +32,13 @@ fn label(scene: &Scene, voters: Vec<u32>, start: Vector3<f64>) -> Label {
 fn rays_of(scene: &Scene, object: &Vector3<f64>) -> Vec<u32> {
     let shows = |&ray: &u32| scene.ray(ray).squared_error(object) < 4.0_f64.powi(2);
     (0..scene.rays.rays.len() as u32).filter(shows).collect()
+}
+
+/// Labels after one round of handovers.
+fn after_handover(scene: &Scene, noise: &Noise, labels: Vec<Label>) -> (Vec<Label>, bool) {
+    let spreads = spreads_of(scene, noise);
+    let index = RayIndex::new(scene, &spreads, GATE_SIGMAS, 0..scene.rays.rays.len() as u32);
+    hand_over(&Association::new(scene, noise, index, 150.0), &SETTINGS, labels)
 }
 
 proptest! {
@@ -69,7 +75,7 @@ proptest! {
     }
 
     #[test]
-    fn one_object_that_is_torn_is_mended_and_two_side_by_side_are_not(
+    fn one_object_that_is_torn_becomes_one_and_two_side_by_side_do_not(
         object in object(), errors in errors_px(), apart_m in 0.3..0.9_f64
     ) {
         let scene = street(70, 2.0, &[object], &errors);
@@ -77,7 +83,8 @@ proptest! {
             (0..scene.rays.rays.len() as u32).partition(|&ray| scene.rays.image[ray as usize].is_multiple_of(2));
         prop_assume!(odd.len() >= 10);
         let torn = vec![label(&scene, even, object), label(&scene, odd, object)];
-        let mended = mend(&scene, &DRIFTING, GATE_SIGMAS, torn);
+        let (mended, is_any) = after_handover(&scene, &DRIFTING, torn);
+        prop_assert!(is_any);
         prop_assert_eq!(mended.len(), 1);
         prop_assert!((mended[0].estimate.point - object).norm() < 1.0);
 
@@ -90,7 +97,7 @@ proptest! {
             };
             label(&scene, (0..scene.rays.rays.len() as u32).filter(nearer).collect(), at)
         });
-        prop_assert_eq!(mend(&scene, &DRIFTING, GATE_SIGMAS, twins.to_vec()).len(), 2);
+        prop_assert_eq!(after_handover(&scene, &DRIFTING, twins.to_vec()).0.len(), 2);
     }
 
     #[test]
@@ -160,7 +167,6 @@ proptest! {
         let second = first + Vector3::y() * apart_m;
         let scene = crossing([first, second], &errors);
         let noise = Noise { position_drift_m: 0.12, rotation_drift_rad: 1e-3, ..NOISE };
-        let gate_sigmas = GATE_SIGMAS;
         let (from_aside, from_front): (Vec<u32>, Vec<u32>) =
             (0..scene.rays.rays.len() as u32).partition(|&ray| scene.view(ray).pass >= 2);
         let (of_first, of_second): (Vec<u32>, Vec<u32>) = from_front.into_iter().partition(|ray| ray.is_multiple_of(2));
@@ -168,18 +174,14 @@ proptest! {
         let mistaken = [of_second.as_slice(), &from_aside].concat();
         let label = |voters: Vec<u32>, start| from_voters(&scene, &noise, 10.0, voters, start).unwrap();
         let wrong = vec![label(of_first.clone(), first), label(mistaken, second)];
-        let spreads = spreads_of(&scene, &noise);
-        let index = RayIndex::new(&scene, &spreads, gate_sigmas, 0..scene.rays.rays.len() as u32);
-        let association = Association::new(&scene, &noise, index, 150.0);
-
-        let (right, is_any) = hand_over(&association, 3, wrong);
+        let (right, is_any) = after_handover(&scene, &noise, wrong);
         prop_assert!(is_any);
         let voters = |label: &Label| label.voters.iter().copied().collect::<BTreeSet<u32>>();
         let of_second: BTreeSet<u32> = of_second.into_iter().collect();
         prop_assert_eq!(right.iter().map(voters).collect::<Vec<_>>(), vec![all_of_first, of_second]);
         prop_assert!((right[0].estimate.point - first).norm() < 0.3);
 
-        let (same, is_any) = hand_over(&association, 3, right.clone());
+        let (same, is_any) = after_handover(&scene, &noise, right.clone());
         prop_assert!(!is_any);
         prop_assert_eq!(same.iter().map(voters).collect::<Vec<_>>(), right.iter().map(voters).collect::<Vec<_>>());
     }

@@ -15,7 +15,7 @@ use super::index::RayIndex;
 use super::label::{self, Label, fingerprint};
 use super::noise::{Noise, Spread};
 use super::scene::Scene;
-use super::{Schedule, Settings, Tally, WHOLE, exchange, handover, settle};
+use super::{Schedule, Settings, Tally, exchange, handover, settle};
 use crate::progress::{Halt, Progress};
 
 /// Labels are dropped below these multiples of the probability that is asked for, one after the other, and then below that.
@@ -66,11 +66,11 @@ impl<'a> Court<'a> {
         tally: &mut Tally,
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
-        let mut labels = if begun.is_empty() { begun } else { self.settle(begun, false, tally, progress)? };
+        let mut labels = self.associate(begun, tally, progress)?;
         // What a doubted label gives back, and what settled labels leave, may be seen more clearly now.
         for _ in 0..schedule.sessions {
             let before = labels.len();
-            let new = self.left_over(&labels, tally, progress)?;
+            let new = self.left_over(&labels, schedule.rounds, tally, progress)?;
             let is_raw = labels.is_empty();
             labels = if is_raw { new } else { self.admit(labels, new, tally) };
             labels.sort_by_key(settle::first_voter);
@@ -91,8 +91,14 @@ impl<'a> Court<'a> {
         Ok(labels)
     }
 
-    /// Labels of the rays that no label has; if there are others, these compete among themselves first.
-    fn left_over(&self, labels: &[Label], tally: &mut Tally, progress: &Progress) -> Result<Vec<Label>, Halt> {
+    /// Labels of the rays that no label has; if there are others, these compete among themselves first, in some rounds.
+    fn left_over(
+        &self,
+        labels: &[Label],
+        rounds: usize,
+        tally: &mut Tally,
+        progress: &Progress,
+    ) -> Result<Vec<Label>, Halt> {
         let &Self { scene, noise, spreads, settings, .. } = self;
         let mut is_taken = vec![false; scene.rays.rays.len()];
         for &ray in labels.iter().flat_map(|label| &label.voters) {
@@ -104,7 +110,7 @@ impl<'a> Court<'a> {
         tally.accepted += accepted;
         if !labels.is_empty() {
             let mut annex = Court::new(scene, noise, spreads, settings, free.into_iter());
-            for _ in 0..WHOLE.rounds {
+            for _ in 0..rounds {
                 new = annex.settle(new, true, tally, progress)?;
             }
             // Where others took what they might have had they were not missed.
@@ -131,16 +137,24 @@ impl<'a> Court<'a> {
         let &mut Self { scene, noise, settings, .. } = self;
         let gate = settings.gate_sigmas;
         let min_votes = settings.min_votes as usize;
-        let before = labels.len();
         let labels = exchange::exchange(scene, noise, gate, labels);
-        let mut labels = self.association.associate(labels, progress)?;
-        labels.retain(|label| label.voters.len() >= min_votes);
+        let labels = self.associate(labels, tally, progress)?;
+        let associated = labels.len();
         let labels = adjust(scene, noise, gate, min_votes, &labels, Care::Rough);
         let left = labels.len();
         let labels = if may_split { settle::split(scene, noise, gate, labels, min_votes) } else { labels };
         let labels = if settings.without.merge { labels } else { settle::fuse(scene, noise, gate, labels) };
-        tally.outvoted += (before - left) as u64;
+        tally.outvoted += (associated - left) as u64;
         tally.fused += left.saturating_sub(labels.len()) as u64;
+        Ok(labels)
+    }
+
+    /// All labels compete for all rays; those that get too few are dropped.
+    fn associate(&mut self, labels: Vec<Label>, tally: &mut Tally, progress: &Progress) -> Result<Vec<Label>, Halt> {
+        let before = labels.len();
+        let mut labels = self.association.associate(labels, progress)?;
+        labels.retain(|label| label.voters.len() >= self.settings.min_votes as usize);
+        tally.outvoted += (before - labels.len()) as u64;
         Ok(labels)
     }
 
@@ -154,7 +168,7 @@ impl<'a> Court<'a> {
     ) -> Result<(Vec<Label>, bool), Halt> {
         for round in 0..rounds {
             let is_any;
-            (labels, is_any) = handover::hand_over(&self.association, self.settings.min_votes as usize, labels);
+            (labels, is_any) = handover::hand_over(&self.association, self.settings, labels);
             if !is_any {
                 return Ok((labels, round > 0));
             }

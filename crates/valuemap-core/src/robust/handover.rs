@@ -1,13 +1,17 @@
-//! Handover: where images show only one of two neighbors from some direction, the wrong one may have all that looks from there.
+//! Handover: which of two neighbors has the votes of some direction, or whether there is but one.
+//!
+//! Where images show only one of two neighbors from some direction, the wrong one may have all that looks from there.
 //!
 //! Its position has then moved so that these votes fit, and the detections that it should have do not fit anywhere: no
 //! single vote changes sides. Both are estimated anew as if the other one had these votes, with what then fits of the
-//! detections that nobody has; the explanation that leaves less unexplained stays.
+//! detections that nobody has; the explanation that leaves less unexplained stays. And where one label explains nearly all
+//! that both do, and hardly any image shows both, there is one object.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
 use rustc_hash::FxHashSet;
 
+use super::Settings;
 use super::associate::Association;
 use super::estimate::{Care, Joint, Limits, Start};
 use super::label::{Label, SECTOR_COSINE, by_place, direction_to, from_voters, nearest_pairs, sector_middles};
@@ -25,16 +29,22 @@ const CLAIMED_SHARE: f64 = 0.5;
 const COMPANIONS: usize = 5;
 const AROUND_M: f64 = 25.0;
 /// Times that detections nobody has are gathered, without companions and with them.
-const GATHERINGS: (usize, usize) = (0, 2);
+const GATHERINGS: (usize, usize) = (1, 2);
 /// Handovers that explain so much less without companions are not tried with them.
 const PROMISING: f64 = -30.0;
 /// A handover must explain so much more.
 const LEAST_GAIN: f64 = 10.0;
+/// For each image that shows the one with fewer votes, images that show both, at most, for them to be one object.
+const MOST_SHARED: f64 = 0.05;
+/// One object may explain so much less for each vote of the one with fewer votes; how much without companions for it to be
+/// worth a try with them.
+const MOST_LOST: f64 = 0.5;
+const MAYBE_LOST: f64 = 1.5;
 
-/// Hand over to the other of two neighbors what it explains better; whether there was anything. The nearest pairs first,
-/// each label in one pair.
+/// Make one of two neighbors, or hand over to the other what it explains better; whether there was anything. The nearest
+/// pairs first, each label in one pair.
 #[must_use]
-pub fn hand_over(association: &Association<'_>, min_votes: usize, mut labels: Vec<Label>) -> (Vec<Label>, bool) {
+pub fn hand_over(association: &Association<'_>, settings: &Settings, mut labels: Vec<Label>) -> (Vec<Label>, bool) {
     let is_open = |a: &Label, b: &Label| a.class == b.class && !a.known.satisfied.contains(&b.identity());
     let pairs = nearest_pairs(&labels, PAIR_M, is_open);
     let mut is_taken = vec![false; association.scene.rays.rays.len()];
@@ -46,18 +56,23 @@ pub fn hand_over(association: &Association<'_>, min_votes: usize, mut labels: Ve
         let near = tree.nearest_neighbor_iter_with_distance_2(labels[a].estimate.point.into());
         let near = near.take_while(|(_, distance2)| *distance2 <= AROUND_M * AROUND_M).map(|(near, _)| near.data);
         let companions = near.filter(|&i| i != a && i != b).take(COMPANIONS).map(|i| &labels[i]).collect();
-        Pair { association, min_votes, is_taken: &is_taken, labels: [&labels[a], &labels[b]], companions }.better()
+        Pair { association, settings, is_taken: &is_taken, labels: [&labels[a], &labels[b]], companions }.better()
     };
-    let better: Vec<Option<[Label; 2]>> = pairs.par_iter().with_max_len(1).map(of_pair).collect();
+    let better: Vec<Option<Vec<Label>>> = pairs.par_iter().with_max_len(1).map(of_pair).collect();
     let is_any = better.iter().any(Option::is_some);
+    let mut is_replaced = vec![false; labels.len()];
+    let mut replacing = Vec::new();
     for (&(a, b), new) in pairs.iter().zip(better) {
         if let Some(new) = new {
-            [labels[a], labels[b]] = new;
+            (is_replaced[a], is_replaced[b]) = (true, true);
+            replacing.extend(new);
         } else {
             let neighbor = labels[b].identity();
             labels[a].known.satisfied.push(neighbor);
         }
     }
+    let kept = labels.into_iter().zip(is_replaced).filter(|(_, is_replaced)| !is_replaced).map(|(label, _)| label);
+    let mut labels: Vec<Label> = kept.chain(replacing).collect();
     labels.sort_by_key(first_voter);
     (labels, is_any)
 }
@@ -65,7 +80,7 @@ pub fn hand_over(association: &Association<'_>, min_votes: usize, mut labels: Ve
 /// Two neighbors.
 struct Pair<'a> {
     association: &'a Association<'a>,
-    min_votes: usize,
+    settings: &'a Settings,
     /// Of each ray, whether a label has it.
     is_taken: &'a [bool],
     labels: [&'a Label; 2],
@@ -73,6 +88,7 @@ struct Pair<'a> {
 }
 
 /// Votes (ascending) that one of the two has from about one direction, or all such votes.
+#[derive(Clone)]
 struct Handover {
     from: usize,
     rays: Vec<u32>,
@@ -93,33 +109,72 @@ struct Sighting {
 }
 
 impl Pair<'_> {
-    /// The two labels after a handover; nothing if they are best as they are.
-    fn better(&self) -> Option<[Label; 2]> {
-        let handovers = [0, 1].map(|from| self.handovers(from));
-        if handovers.iter().all(Vec::is_empty) {
+    /// What the two are better; nothing if they are best as they are.
+    fn better(&self) -> Option<Vec<Label>> {
+        let [of_first, of_second] = [0, 1].map(|from| self.handovers(from));
+        let as_one = self.as_one();
+        if of_first.is_empty() && of_second.is_empty() && as_one.is_none() {
             return None;
         }
-        let alone = self.explain(&[], &[])?;
-        let is_promising = |handover: &&Handover| {
-            let after = self.explain(&[handover], &[]);
-            after.is_some_and(|after| after.gain > alone.gain + PROMISING)
+        let voters = self.labels.map(|label| label.voters.clone());
+        let alone = self.explain(voters.clone(), &[])?;
+        let gains = |voters: &[Vec<u32>; 2], least: f64| {
+            self.explain(voters.clone(), &[]).is_some_and(|after| after.gain > alone.gain + least)
         };
-        let [of_first, of_second] =
-            [0, 1].map(|from| handovers[from].iter().filter(is_promising).collect::<Vec<&Handover>>());
-        let each = of_first.iter().chain(&of_second).map(|&handover| vec![handover]);
-        let both = of_first.iter().flat_map(|&a| of_second.iter().map(move |&b| vec![a, b]));
-        let tried: Vec<Vec<&Handover>> = each.chain(both).collect();
-        if tried.is_empty() {
+        let promising = |handovers: &[Handover]| -> Vec<Handover> {
+            let gains = |handover: &&Handover| gains(&self.after(&[handover]), PROMISING);
+            handovers.iter().filter(gains).cloned().collect()
+        };
+        let [of_first, of_second] = [promising(&of_first), promising(&of_second)];
+        let each = of_first.iter().chain(&of_second).map(|handover| self.after(&[handover]));
+        let both = of_first.iter().flat_map(|a| of_second.iter().map(|b| self.after(&[a, b])));
+        let tried: Vec<[Vec<u32>; 2]> = each.chain(both).collect();
+        let smaller = voters[0].len().min(voters[1].len()) as f64;
+        let as_one = as_one.filter(|as_one| gains(as_one, -MAYBE_LOST * smaller));
+        if tried.is_empty() && as_one.is_none() {
             return None;
         }
-        let as_is = self.explain(&[], &self.companions)?;
-        let explained = tried.iter().filter_map(|handovers| self.explain(handovers, &self.companions));
+        // Companions that cannot be estimated must not keep these two as they are.
+        let (as_is, companions) = match self.explain(voters, &self.companions) {
+            Some(as_is) => (as_is, self.companions.as_slice()),
+            None => (alone, &[][..]),
+        };
+        let one = as_one.and_then(|voters| self.explain(voters, companions));
+        if let Some(one) = one.filter(|one| one.gain > as_is.gain - MOST_LOST * smaller) {
+            let side = usize::from(one.voters[0].is_empty());
+            return Some(vec![self.label(side, &one)?]);
+        }
+        let explained = tried.into_iter().filter_map(|voters| self.explain(voters, companions));
         let best = explained.max_by(|a, b| a.gain.total_cmp(&b.gain))?;
         if !(best.gain > as_is.gain + LEAST_GAIN) {
             return None;
         }
-        let [first, second] = [0, 1].map(|side| self.label(side, &best));
-        Some([first?, second?])
+        Some(vec![self.label(0, &best)?, self.label(1, &best)?])
+    }
+
+    /// The votes of the two after some handovers.
+    fn after(&self, handovers: &[&Handover]) -> [Vec<u32>; 2] {
+        let mut voters = self.labels.map(|label| label.voters.clone());
+        for Handover { from, rays } in handovers {
+            voters[*from].retain(|ray| rays.binary_search(ray).is_err());
+            voters[1 - from].extend(rays);
+        }
+        voters
+    }
+
+    /// All votes for the one with more, unless too many images show both; of these its own stay.
+    fn as_one(&self) -> Option<[Vec<u32>; 2]> {
+        let scene = self.association.scene;
+        let smaller = usize::from(self.labels[1].voters.len() <= self.labels[0].voters.len());
+        let [few, many] = [smaller, 1 - smaller].map(|side| self.labels[side]);
+        let shown = many.images(scene);
+        let is_new = |ray: &&u32| shown.binary_search(&scene.rays.image[**ray as usize]).is_err();
+        let new: Vec<u32> = few.voters.iter().filter(is_new).copied().collect();
+        let shared = few.voters.len() - new.len();
+        let mut voters = [Vec::new(), Vec::new()];
+        voters[1 - smaller] = [many.voters.as_slice(), &new].concat();
+        let may_be_one = shared as f64 <= MOST_SHARED * few.voters.len() as f64;
+        (may_be_one && !self.settings.without.merge).then_some(voters)
     }
 
     /// What one of the two might hand over: what looks from one direction, for each, or all that.
@@ -159,17 +214,13 @@ impl Pair<'_> {
         self.labels[of].voters.iter().map(sighting).collect()
     }
 
-    /// What is explained after some handovers, with what fits then of what nobody has, some other labels estimated with the
-    /// two.
-    fn explain(&self, handovers: &[&Handover], companions: &[&Label]) -> Option<Explanation> {
+    /// What is explained if the two have some votes, or one of them all, with what fits then of what nobody has, some other
+    /// labels estimated with the two.
+    fn explain(&self, mut voters: [Vec<u32>; 2], companions: &[&Label]) -> Option<Explanation> {
         let &Association { scene, noise, ref index, .. } = self.association;
-        let limits = Limits { gate_sigmas: index.gate_sigmas(), min_votes: self.min_votes };
+        let limits = Limits { gate_sigmas: index.gate_sigmas(), min_votes: self.settings.min_votes as usize };
         let gatherings = if companions.is_empty() { GATHERINGS.0 } else { GATHERINGS.1 };
-        let mut voters = self.labels.map(|label| label.voters.clone());
-        for Handover { from, rays } in handovers {
-            voters[*from].retain(|ray| rays.binary_search(ray).is_err());
-            voters[1 - from].extend(rays);
-        }
+        let is_there = [0, 1].map(|side| !voters[side].is_empty());
         let mut points = self.labels.map(|label| label.estimate.point);
         let mut gathering = 0;
         loop {
@@ -186,7 +237,7 @@ impl Pair<'_> {
                 let own = solution.votes().iter().filter(|(label, _)| *label == side);
                 own.map(|(_, ray)| *ray).collect()
             });
-            if voters.iter().any(|voters| voters.len() < self.min_votes) {
+            if (0..2).any(|side| is_there[side] && voters[side].len() < limits.min_votes) {
                 return None;
             }
             if gathering == gatherings {
@@ -206,7 +257,7 @@ impl Pair<'_> {
         let mut shown: FxHashSet<(usize, u32)> =
             (0..).zip(&*voters).flat_map(|(side, voters)| voters.iter().map(move |&ray| (side, image(ray)))).collect();
         let mut free = Vec::new();
-        for (side, point) in points.iter().enumerate() {
+        for (side, point) in points.iter().enumerate().filter(|(side, _)| !voters[*side].is_empty()) {
             let hits = self.association.hits(point, self.labels[side].class).into_iter();
             let is_free = |ray: u32| !self.is_taken[ray as usize] || own.contains(&ray);
             free.extend(hits.filter(|hit| is_free(hit.ray)).map(|hit| (hit.chi2, hit.ray, side)));

@@ -190,9 +190,6 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
     let spreads = spreads_of(scene, noise);
     let mut court = Court::new(scene, noise, &spreads, settings, 0..scene.rays.rays.len() as u32);
     let labels = court.hold(begun, &schedule, &mut tally, progress)?;
-    let before = labels.len();
-    let labels = if settings.without.merge { labels } else { settle::mend(scene, noise, settings.gate_sigmas, labels) };
-    tally.fused += (before - labels.len()) as u64;
     let labels = adjust(scene, noise, settings.gate_sigmas, settings.min_votes as usize, &labels, Care::Exact);
     let before = labels.len();
     let labels = settle::outclass(scene, noise, labels);

@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use super::calibrate::variance_factor;
-use super::label::{Label, SECTOR_COSINE, direction_to, from_voters, near_pairs, sector_middles};
+use super::label::{Label, direction_to, from_voters, near_pairs};
 use super::noise::Noise;
 use super::scene::Scene;
 
@@ -20,14 +20,6 @@ const NEIGHBOR_M: f64 = 6.0;
 const SHARED_IMAGES: f64 = 0.15;
 /// So many labels tell about how far their passes disagree.
 const DISAGREEING: usize = 400;
-/// Labels this near that are seen from the same directions, but never side by side, are one object wherever they are put, m.
-const TORN_M: f64 = 1.0;
-/// So many images of each must look from these directions.
-const LEAST_TORN: usize = 8;
-/// And this part of those of the smaller one.
-const TORN_SHARE: f64 = 0.5;
-/// For each of them, images that show both, at most: two objects are both detected far more often.
-const MOST_BOTH: f64 = 0.05;
 
 /// Make one of any two labels of a class whose positions agree within their covariances, unless their images say that
 /// they are two: images in which both have a detection of their own. The nearest pair first.
@@ -36,65 +28,24 @@ pub fn fuse(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) 
     let mut labels = labels;
     let factor = variance_factor(scene, noise, &labels, DISAGREEING);
     loop {
-        let pairs = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor, |a, b| a.class == b.class);
+        let mut pairs = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor, |a, b| a.class == b.class);
         if pairs.is_empty() {
             return labels;
         }
-        labels = fused_pairs(scene, noise, gate_sigmas, labels, pairs);
-    }
-}
-
-/// Labels of which some pairs are fused, the one of least distance first, each label once.
-fn fused_pairs(
-    scene: &Scene,
-    noise: &Noise,
-    gate_sigmas: f64,
-    labels: Vec<Label>,
-    mut pairs: Vec<(f64, usize, usize)>,
-) -> Vec<Label> {
-    pairs.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
-    let mut taken = vec![false; labels.len()];
-    let mut fused = Vec::new();
-    for (_, a, b) in pairs {
-        if !taken[a] && !taken[b] {
-            taken[a] = true;
-            taken[b] = true;
-            fused.push(union(scene, noise, gate_sigmas, &labels[a], &labels[b]));
+        pairs.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
+        let mut taken = vec![false; labels.len()];
+        let mut fused = Vec::new();
+        for (_, a, b) in pairs {
+            if !taken[a] && !taken[b] {
+                taken[a] = true;
+                taken[b] = true;
+                fused.push(union(scene, noise, gate_sigmas, &labels[a], &labels[b]));
+            }
         }
+        let kept = labels.into_iter().zip(&taken).filter(|(_, taken)| !**taken).map(|(label, _)| label);
+        labels = kept.chain(fused).collect();
+        labels.sort_by_key(first_voter);
     }
-    let kept = labels.into_iter().zip(&taken).filter(|(_, taken)| !**taken).map(|(label, _)| label);
-    let mut labels: Vec<Label> = kept.chain(fused).collect();
-    labels.sort_by_key(first_voter);
-    labels
-}
-
-/// Make one of two labels of a class, near each other, that are seen from the same directions and never side by side: an
-/// object whose passes went to the one or the other, because their drifts are larger than is thought.
-#[must_use]
-pub fn mend(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) -> Vec<Label> {
-    let torn = |(a, b): (usize, usize)| {
-        let (first, second) = (&labels[a], &labels[b]);
-        let distance = (second.estimate.point - first.estimate.point).norm();
-        (first.class == second.class && are_torn(scene, first, second)).then_some((distance, a, b))
-    };
-    let pairs = near_pairs(&labels, TORN_M).into_par_iter().filter_map(torn).collect();
-    fused_pairs(scene, noise, gate_sigmas, labels, pairs)
-}
-
-/// Whether two labels are seen from the same directions, but never side by side.
-fn are_torn(scene: &Scene, a: &Label, b: &Label) -> bool {
-    let seen_like = |label: &Label, other: &Label| {
-        let directions = |of: &Label| -> Vec<Vector3<f64>> {
-            of.voters.iter().map(|&ray| direction_to(scene, ray, &of.estimate.point)).collect()
-        };
-        let middles = sector_middles(directions(other).into_iter());
-        let is_like = |own: &&Vector3<f64>| middles.iter().any(|middle| middle.dot(own) >= SECTOR_COSINE);
-        directions(label).iter().filter(is_like).count()
-    };
-    let like = seen_like(a, b).min(seen_like(b, a));
-    like >= LEAST_TORN
-        && like as f64 >= TORN_SHARE * a.voters.len().min(b.voters.len()) as f64
-        && (a.images_shared(b, scene) as f64) < MOST_BOTH * like as f64
 }
 
 /// Of two labels of different classes that agree, and that no images show side by side, keep the one with more votes: a

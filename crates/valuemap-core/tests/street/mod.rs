@@ -11,11 +11,20 @@ use valuemap_core::hypothesis::Viability;
 use valuemap_core::ray::{Ray, Rays};
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::scene::{Frustum, Scene, View};
+use valuemap_core::robust::{Settings, Without};
 
 pub const FOCAL_PX: f64 = 600.0;
 pub const GATE_SIGMAS: f64 = 3.5;
 pub const VIABILITY: Viability =
     Viability { max_reprojection_error_px: f64::NAN, min_parallax_rad: 0.035, min_range_m: 2.0, max_range_m: 60.0 };
+
+pub const SETTINGS: Settings = Settings {
+    viability: VIABILITY,
+    gate_sigmas: GATE_SIGMAS,
+    min_votes: 3,
+    min_existence: 0.5,
+    without: Without { polish: false, merge: false },
+};
 
 /// Without errors that a pass shares, which the quick estimate knows nothing of.
 pub const NOISE: Noise = Noise {
