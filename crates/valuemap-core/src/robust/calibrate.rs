@@ -40,7 +40,7 @@ const DETECTION_PX: (f64, f64) = (0.05, 30.0);
 const BOX_SHARE: (f64, f64) = (1e-3, 0.15);
 const POSITION_M: (f64, f64) = (1e-4, 5.0);
 /// Shared errors over own errors of a pose.
-const DRIFT_RATIO: (f64, f64) = (0.3, 2.0);
+const DRIFT_RATIO: (f64, f64) = (0.3, 2.5);
 
 /// Which parts of the noise the user knows; they stay as they are.
 #[derive(Debug, Clone, Copy, Default)]

@@ -42,24 +42,49 @@ const MOST_LOST: f64 = 0.5;
 const MAYBE_LOST: f64 = 1.5;
 
 /// Make one of two neighbors, or hand over to the other what it explains better; whether there was anything. The nearest
-/// pairs first, each label in one pair.
+/// pairs first, each label in one pair; other pairs once these are best as they are.
 #[must_use]
 pub fn hand_over(association: &Association<'_>, settings: &Settings, mut labels: Vec<Label>) -> (Vec<Label>, bool) {
     let is_open = |a: &Label, b: &Label| a.class == b.class && !a.known.satisfied.contains(&b.identity());
-    let pairs = nearest_pairs(&labels, PAIR_M, is_open);
+    loop {
+        let pairs = nearest_pairs(&labels, PAIR_M, is_open);
+        if pairs.is_empty() {
+            return (labels, false);
+        }
+        let better = better_pairs(association, settings, &labels, &pairs);
+        if better.iter().any(Option::is_some) {
+            return (replaced(labels, &pairs, better), true);
+        }
+        for (a, b) in pairs {
+            let neighbor = labels[b].identity();
+            labels[a].known.satisfied.push(neighbor);
+        }
+    }
+}
+
+/// What some disjoint pairs of labels are better; nothing for those that are best as they are.
+fn better_pairs(
+    association: &Association<'_>,
+    settings: &Settings,
+    labels: &[Label],
+    pairs: &[(usize, usize)],
+) -> Vec<Option<Vec<Label>>> {
     let mut is_taken = vec![false; association.scene.rays.rays.len()];
     for &ray in labels.iter().flat_map(|label| &label.voters) {
         is_taken[ray as usize] = true;
     }
-    let tree = by_place(&labels);
+    let tree = by_place(labels);
     let of_pair = |&(a, b): &(usize, usize)| {
         let near = tree.nearest_neighbor_iter_with_distance_2(labels[a].estimate.point.into());
         let near = near.take_while(|(_, distance2)| *distance2 <= AROUND_M * AROUND_M).map(|(near, _)| near.data);
         let companions = near.filter(|&i| i != a && i != b).take(COMPANIONS).map(|i| &labels[i]).collect();
         Pair { association, settings, is_taken: &is_taken, labels: [&labels[a], &labels[b]], companions }.better()
     };
-    let better: Vec<Option<Vec<Label>>> = pairs.par_iter().with_max_len(1).map(of_pair).collect();
-    let is_any = better.iter().any(Option::is_some);
+    pairs.par_iter().with_max_len(1).map(of_pair).collect()
+}
+
+/// All labels, some pairs replaced; the others need not be looked at again.
+fn replaced(mut labels: Vec<Label>, pairs: &[(usize, usize)], better: Vec<Option<Vec<Label>>>) -> Vec<Label> {
     let mut is_replaced = vec![false; labels.len()];
     let mut replacing = Vec::new();
     for (&(a, b), new) in pairs.iter().zip(better) {
@@ -74,7 +99,7 @@ pub fn hand_over(association: &Association<'_>, settings: &Settings, mut labels:
     let kept = labels.into_iter().zip(is_replaced).filter(|(_, is_replaced)| !is_replaced).map(|(label, _)| label);
     let mut labels: Vec<Label> = kept.chain(replacing).collect();
     labels.sort_by_key(first_voter);
-    (labels, is_any)
+    labels
 }
 
 /// Two neighbors.
