@@ -8,7 +8,8 @@
 //! 4. [`associate`](mod@associate): all labels compete for all detections, the pose errors of the images taken out
 //!    ([`poses`]), neighbors first untangled ([`exchange`](mod@exchange)); then the labels of each place are estimated together
 //!    ([`adjust`](mod@adjust)), and those that agree within their covariances and are never seen side by side become one
-//!    ([`settle`]). Again and again, but only where labels changed.
+//!    ([`settle`]). Again and again, but only where labels changed; and neighbors hand over what the other one explains
+//!    better ([`handover`]).
 //! 5. [`existence`]: hits and misses among the looks that should have seen it say how probable a label is.
 //! 6. [`estimate`](mod@estimate): positions and covariances, with the pose errors of images and passes ([`drift`]), and
 //!    with what votes that might be a neighbor's may have done ([`contest`]).
