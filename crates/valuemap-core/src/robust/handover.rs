@@ -52,12 +52,10 @@ pub fn hand_over(association: &Association<'_>, settings: &Settings, mut labels:
             return (labels, false);
         }
         let better = better_pairs(association, settings, &labels, &pairs);
-        if better.iter().any(Option::is_some) {
-            return (replaced(labels, &pairs, better), true);
-        }
-        for (a, b) in pairs {
-            let neighbor = labels[b].identity();
-            labels[a].known.satisfied.push(neighbor);
+        let is_any = better.iter().any(Option::is_some);
+        labels = replaced(labels, &pairs, better);
+        if is_any {
+            return (labels, true);
         }
     }
 }
@@ -83,7 +81,7 @@ fn better_pairs(
     pairs.par_iter().with_max_len(1).map(of_pair).collect()
 }
 
-/// All labels, some pairs replaced; the others need not be looked at again.
+/// All labels, some pairs replaced; the others need not be looked at again as they are.
 fn replaced(mut labels: Vec<Label>, pairs: &[(usize, usize)], better: Vec<Option<Vec<Label>>>) -> Vec<Label> {
     let mut is_replaced = vec![false; labels.len()];
     let mut replacing = Vec::new();
