@@ -2,7 +2,8 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use proptest::prelude::*;
-use valuemap_core::robust::drift::{DRIFT_LENGTH_M, Drive, LEG_M, Look, Sigmas};
+use valuemap_core::robust::drift::{DRIFT_LENGTH_M, Drive, LEG_M, Look};
+use valuemap_core::robust::noise::Sigmas;
 use valuemap_core::robust::poses::{Belief, Legs, smooth};
 use valuemap_core::robust::scene::View;
 
@@ -135,7 +136,7 @@ proptest! {
         let cholesky = covariance.cholesky().ok_or(TestCaseError::fail("not positive definite"))?;
         let sigma = looks[0].drift_sigma.each();
         for (leg, belief) in smooth(&starts, &beliefs).iter().enumerate() {
-            let found = belief.pose_error((sigma[0], sigma[3]), (0.0, 0.0));
+            let found = belief.pose_error(looks[0].drift_sigma, Sigmas::NONE);
             // Covariance of this leg's drift with all residuals.
             let cross = DMatrix::from_fn(6, 2 * looks.len(), |i, k| {
                 let look = &looks[k / 2];

@@ -7,10 +7,9 @@ use rustc_hash::FxHasher;
 
 use super::contest::{Contest, widened};
 use super::estimate::{Care, Joint, Limits, Solution, Start};
-use super::label::{Label, by_place, fingerprint, side_of};
+use super::label::{Label, by_place, fingerprint, first_voter, side_of};
 use super::noise::Noise;
 use super::scene::Scene;
-use super::settle::first_voter;
 
 /// Labels within this distance of the one with the most votes are estimated with it, m.
 const PLACE_M: f64 = 25.0;

@@ -11,7 +11,7 @@ use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::estimate::Estimate;
 use super::grant::{Case, Claim, Decision, Fit, belief_of_votes, grant, overrule, report};
-use super::index::{Hit, RayIndex, chi2};
+use super::index::{Hit, RayIndex, chi2_in_gate};
 use super::label::{Label, fingerprint};
 use super::noise::Noise;
 use super::poses::{Belief, LEGS_AROUND, Legs, smooth};
@@ -123,7 +123,7 @@ impl<'a> Association<'a> {
     /// The images in which a label might have rays that `is_asked` is true for.
     #[must_use]
     pub fn images_at(&self, label: &Label, is_asked: impl Fn(u32) -> bool) -> Vec<u32> {
-        let hits = self.index.all_hits(&label.estimate.point, label.class, self.range_m);
+        let hits = self.hits(&label.estimate.point, label.class);
         hits.into_iter().filter(|hit| is_asked(hit.ray)).map(|hit| hit.image).collect()
     }
 
@@ -136,9 +136,8 @@ impl<'a> Association<'a> {
     /// Whether a ray has a label in its gate.
     #[must_use]
     pub(super) fn claims(&self, label: &Label, ray: u32) -> bool {
-        let projected = self.scene.ray(ray).project(&label.estimate.point);
-        let gate = self.index.gate_sigmas();
-        projected.z > 0.0 && chi2(&projected, &self.index.spreads()[ray as usize]) < gate * gate
+        let spread = &self.index.spreads()[ray as usize];
+        chi2_in_gate(self.scene.ray(ray), &label.estimate.point, spread, self.index.gate_sigmas()).is_some()
     }
 
     /// The claims of a label: those that it had if it is where it was.

@@ -11,7 +11,7 @@ use rstar::primitives::GeomWithData;
 use rustc_hash::FxHashSet;
 
 use super::estimate::{Estimate, Solution};
-use super::index::chi2;
+use super::index::chi2_in_gate;
 use super::label::{Label, by_place};
 use super::noise::Noise;
 use super::scene::Scene;
@@ -58,11 +58,10 @@ impl<'a> Contest<'a> {
 
     /// Never the label that has it: its images are those that show it.
     fn might_have(&self, neighbor: usize, ray: u32) -> bool {
-        let projected = self.scene.ray(ray).project(&self.labels[neighbor].estimate.point);
+        let (seen, spread) = (self.scene.ray(ray), self.noise.total(self.scene, ray));
         self.labels[neighbor].class == self.scene.rays.class[ray as usize]
             && !self.shown_in[neighbor].contains(&self.scene.rays.image[ray as usize])
-            && projected.z > 0.0
-            && chi2(&projected, &self.noise.total(self.scene, ray)) < self.gate_sigmas * self.gate_sigmas
+            && chi2_in_gate(seen, &self.labels[neighbor].estimate.point, &spread, self.gate_sigmas).is_some()
     }
 }
 

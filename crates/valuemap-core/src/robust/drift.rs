@@ -11,7 +11,7 @@ use std::ops::Range;
 
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Rotation3, SMatrix, Vector2, Vector3};
 
-use super::noise::Noise;
+use super::noise::{Noise, Sigmas};
 use super::scene::Scene;
 use super::spd::{Inverse, Matrix6, Vector6, scaled};
 use crate::ray::Ray;
@@ -24,32 +24,6 @@ pub const DRIFT_LENGTH_M: f64 = 100.0;
 const LEAST_FREEDOM: f64 = 1e-3;
 /// Drifting errors are one within this distance, m.
 pub const LEG_M: f64 = 10.0;
-
-/// Standard deviations of a pose error, each axis.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Sigmas {
-    /// Of the position, m.
-    pub position_m: f64,
-    /// Of the rotation, rad.
-    pub rotation_rad: f64,
-}
-
-impl Sigmas {
-    /// Those of no error.
-    pub const NONE: Self = Self { position_m: 0.0, rotation_rad: 0.0 };
-
-    fn of((position_m, rotation_rad): (f64, f64)) -> Self {
-        Self { position_m, rotation_rad }
-    }
-
-    /// All six, position first.
-    #[inline]
-    #[must_use]
-    pub fn each(&self) -> Vector6 {
-        let (p, r) = (self.position_m, self.rotation_rad);
-        Vector6::new(p, p, p, r, r, r)
-    }
-}
 
 /// One vote's residual at the position of its label, with its derivatives.
 #[derive(Debug, Clone)]
@@ -120,8 +94,8 @@ impl Look {
             residual,
             by_point,
             by_turn: by_point.map(|column| away.cross(&column)),
-            drift_sigma: Sigmas::of(noise.shared(view)),
-            own_sigma: Sigmas::of(noise.of_image(view)),
+            drift_sigma: noise.shared(view),
+            own_sigma: noise.of_image(view),
             detection_px2: noise.detection_px2(scene, ray),
             variance: noise.own(scene, ray).variance(seen.project(point).z),
             driven_m: view.driven_m,

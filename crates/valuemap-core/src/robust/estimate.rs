@@ -103,6 +103,7 @@ pub struct Limits {
 }
 
 /// Labels that are estimated together.
+#[derive(Clone)]
 pub struct Joint<'a> {
     scene: &'a Scene,
     noise: &'a Noise,
@@ -201,10 +202,14 @@ impl<'a> Joint<'a> {
             *leaves |= left[*label] < limits.min_votes;
         }
         refused.extend(self.votes.iter().zip(&leaves).filter(|(_, leaves)| **leaves).map(|(vote, _)| *vote));
-        retain(&mut self.votes, &leaves);
-        retain(&mut self.weights, &leaves);
-        retain(&mut self.pose_errors, &leaves);
+        self.leave_out(&leaves);
         true
+    }
+
+    fn leave_out(&mut self, leaves: &[bool]) {
+        retain(&mut self.votes, leaves);
+        retain(&mut self.weights, leaves);
+        retain(&mut self.pose_errors, leaves);
     }
 
     /// Move the points, each not too far.
@@ -252,18 +257,15 @@ impl<'a> Joint<'a> {
             of_visits.push(drive.normals);
         }
         let mut alone = vec![Matrix3::zeros(); self.points.len()];
-        let mut is_seen = vec![false; self.points.len()];
-        for &(label, _) in &self.votes {
-            is_seen[label] = true;
-        }
-        for label in (0..self.points.len()).filter(|&label| !is_seen[label]) {
-            normals.add(label, label, &Matrix3::identity());
-            alone[label] = Matrix3::identity();
-        }
         for (look, weight) in looks.iter().zip(&self.weights) {
             for column in &look.by_point {
                 alone[look.label] += column * column.transpose() * (weight / look.variance);
             }
+        }
+        // Labels without votes stay where they are.
+        for (label, alone) in alone.iter_mut().enumerate().filter(|(_, alone)| **alone == Matrix3::zeros()) {
+            *alone = Matrix3::identity();
+            normals.add(label, label, alone);
         }
         let alone: Vec<Matrix3<f64>> =
             alone.into_iter().map(|alone| Some(alone.cholesky()?.inverse())).collect::<Option<_>>()?;
@@ -309,17 +311,8 @@ impl Solution<'_> {
     /// [`own_chi2`](Self::own_chi2); nothing if the others do not fix them.
     #[must_use]
     pub fn without(&self, leaves: &[bool]) -> Option<Vec<Estimate>> {
-        let Joint { scene, noise, votes, weights, pose_errors, points, care } = &self.joint;
-        let stays: Vec<usize> = (0..votes.len()).filter(|&i| !leaves[i]).collect();
-        let mut rest = Joint {
-            scene,
-            noise,
-            votes: stays.iter().map(|&i| votes[i]).collect(),
-            weights: stays.iter().map(|&i| weights[i]).collect(),
-            pose_errors: stays.iter().map(|&i| pose_errors[i]).collect(),
-            points: points.clone(),
-            care: *care,
-        };
+        let mut rest = self.joint.clone();
+        rest.leave_out(leaves);
         let Evaluation { normals, .. } = rest.evaluate()?;
         let information = normals.information.cholesky()?;
         rest.step(&-information.solve(&normals.gradient));

@@ -9,10 +9,10 @@ use nalgebra::{Matrix2x3, Matrix3, Vector2, Vector3};
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use super::label::{Label, SECTOR_COSINE, direction_to, from_voters, nearest_pairs, sector_middles};
+use super::label::{Label, SECTOR_COSINE, direction_to, from_voters, sector_middles};
 use super::noise::Noise;
+use super::pairs::{nearest_pairs, replaced};
 use super::scene::Scene;
-use super::settle::first_voter;
 
 /// Labels farther apart than this do not have each other's votes, m.
 const PAIR_M: f64 = 2.5;
@@ -36,18 +36,8 @@ pub fn exchange(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Labe
     let is_open = |a: &Label, b: &Label| a.class == b.class && !a.known.untangled.contains(&b.identity());
     let pairs = nearest_pairs(&labels, PAIR_M, is_open);
     let of_pair = |&(a, b): &(usize, usize)| exchange_pair(scene, noise, gate_sigmas, &labels[a], &labels[b]);
-    let exchanged: Vec<Option<[Label; 2]>> = pairs.par_iter().map(of_pair).collect();
-    let mut labels = labels;
-    for (&(a, b), new) in pairs.iter().zip(exchanged) {
-        if let Some(new) = new {
-            [labels[a], labels[b]] = new;
-        } else {
-            let neighbor = labels[b].identity();
-            labels[a].known.untangled.push(neighbor);
-        }
-    }
-    labels.sort_by_key(first_voter);
-    labels
+    let exchanged = pairs.par_iter().map(of_pair).collect();
+    replaced(labels, &pairs, exchanged, |known, neighbor| known.untangled.push(neighbor))
 }
 
 /// Both labels' detections in an image that shows both, and what their difference says.
@@ -73,7 +63,7 @@ impl Both {
 }
 
 /// The two labels after an exchange; nothing if they are best as they are.
-fn exchange_pair(scene: &Scene, noise: &Noise, gate_sigmas: f64, a: &Label, b: &Label) -> Option<[Label; 2]> {
+fn exchange_pair(scene: &Scene, noise: &Noise, gate_sigmas: f64, a: &Label, b: &Label) -> Option<Vec<Label>> {
     let images = images_of_both(scene, noise, a, b)?;
     if images.len() < MIN_IMAGES {
         return None;
@@ -100,7 +90,7 @@ fn exchange_pair(scene: &Scene, noise: &Noise, gate_sigmas: f64, a: &Label, b: &
         let found = from_voters(scene, noise, gate_sigmas, voters, old.estimate.point)?;
         Some(Label { unseen_from: old.unseen_from.clone(), ..found })
     };
-    Some([of(0, a)?, of(1, b)?])
+    Some(vec![of(0, a)?, of(1, b)?])
 }
 
 /// The images in which both labels have a detection, by pass.

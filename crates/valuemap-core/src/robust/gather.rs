@@ -7,12 +7,11 @@ use rayon::prelude::*;
 
 use super::Settings;
 use super::index::RayIndex;
-use super::label::{Label, from_voters};
+use super::label::{Label, first_voter, from_voters};
 use super::noise::{Noise, Spread};
 use super::nominate::{self, Nomination, Who};
 use super::quick::quick_estimate;
 use super::scene::Scene;
-use super::settle;
 use crate::progress::{Halt, Progress};
 
 /// Detections this many times farther than the farthest proposed point still vote.
@@ -82,7 +81,7 @@ pub fn gather(
         }
     }
     counts[1] = labels.len() as u64;
-    labels.sort_by_key(settle::first_voter);
+    labels.sort_by_key(first_voter);
     Ok((labels, counts))
 }
 

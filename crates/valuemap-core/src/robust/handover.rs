@@ -1,8 +1,6 @@
 //! Handover: which of two neighbors has the votes of some direction, or whether there is but one.
 //!
-//! Where images show only one of two neighbors from some direction, the wrong one may have all that looks from there.
-//!
-//! Its position has then moved so that these votes fit, and the detections that it should have do not fit anywhere: no
+//! Where images show only one of two neighbors from some direction, the wrong one may have all that looks from there. Its position has then moved so that these votes fit, and the detections that it should have do not fit anywhere: no
 //! single vote changes sides. Both are estimated anew as if the other one had these votes, with what then fits of the
 //! detections that nobody has; the explanation that leaves less unexplained stays. And where one label explains nearly all
 //! that both do, and hardly any image shows both, there is one object.
@@ -14,8 +12,8 @@ use rustc_hash::FxHashSet;
 use super::Settings;
 use super::associate::Association;
 use super::estimate::{Care, Joint, Limits, Start};
-use super::label::{Label, SECTOR_COSINE, by_place, direction_to, from_voters, nearest_pairs, sector_middles};
-use super::settle::first_voter;
+use super::label::{Label, SECTOR_COSINE, by_place, direction_to, from_voters, sector_middles};
+use super::pairs::{nearest_pairs, replaced};
 
 /// Labels farther apart than this do not have each other's votes, m.
 const PAIR_M: f64 = 3.0;
@@ -53,7 +51,7 @@ pub fn hand_over(association: &Association<'_>, settings: &Settings, mut labels:
         }
         let better = better_pairs(association, settings, &labels, &pairs);
         let is_any = better.iter().any(Option::is_some);
-        labels = replaced(labels, &pairs, better);
+        labels = replaced(labels, &pairs, better, |known, neighbor| known.satisfied.push(neighbor));
         if is_any {
             return (labels, true);
         }
@@ -81,25 +79,6 @@ fn better_pairs(
     pairs.par_iter().with_max_len(1).map(of_pair).collect()
 }
 
-/// All labels, some pairs replaced; the others need not be looked at again as they are.
-fn replaced(mut labels: Vec<Label>, pairs: &[(usize, usize)], better: Vec<Option<Vec<Label>>>) -> Vec<Label> {
-    let mut is_replaced = vec![false; labels.len()];
-    let mut replacing = Vec::new();
-    for (&(a, b), new) in pairs.iter().zip(better) {
-        if let Some(new) = new {
-            (is_replaced[a], is_replaced[b]) = (true, true);
-            replacing.extend(new);
-        } else {
-            let neighbor = labels[b].identity();
-            labels[a].known.satisfied.push(neighbor);
-        }
-    }
-    let kept = labels.into_iter().zip(is_replaced).filter(|(_, is_replaced)| !is_replaced).map(|(label, _)| label);
-    let mut labels: Vec<Label> = kept.chain(replacing).collect();
-    labels.sort_by_key(first_voter);
-    labels
-}
-
 /// Two neighbors.
 struct Pair<'a> {
     association: &'a Association<'a>,
@@ -111,7 +90,6 @@ struct Pair<'a> {
 }
 
 /// Votes (ascending) that one of the two has from about one direction, or all such votes.
-#[derive(Clone)]
 struct Handover {
     from: usize,
     rays: Vec<u32>,
@@ -144,11 +122,10 @@ impl Pair<'_> {
         let gains = |voters: &[Vec<u32>; 2], least: f64| {
             self.explain(voters.clone(), &[]).is_some_and(|after| after.gain > alone.gain + least)
         };
-        let promising = |handovers: &[Handover]| -> Vec<Handover> {
-            let gains = |handover: &&Handover| gains(&self.after(&[handover]), PROMISING);
-            handovers.iter().filter(gains).cloned().collect()
+        let promising = |handovers: Vec<Handover>| -> Vec<Handover> {
+            handovers.into_iter().filter(|handover| gains(&self.after(&[handover]), PROMISING)).collect()
         };
-        let [of_first, of_second] = [promising(&of_first), promising(&of_second)];
+        let [of_first, of_second] = [of_first, of_second].map(promising);
         let each = of_first.iter().chain(&of_second).map(|handover| self.after(&[handover]));
         let both = of_first.iter().flat_map(|a| of_second.iter().map(|b| self.after(&[a, b])));
         let tried: Vec<[Vec<u32>; 2]> = each.chain(both).collect();

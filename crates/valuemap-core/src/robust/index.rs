@@ -10,6 +10,7 @@ use super::noise::Spread;
 use super::scene::Scene;
 use crate::ballot::ones;
 use crate::kernel::{Gates, LANES};
+use crate::ray::Ray;
 
 /// Side of the cubes that rays are grouped by, m: one or two blocks of the kernel a pass.
 const PLACE_M: f64 = 20.0;
@@ -111,15 +112,9 @@ impl<'a> RayIndex<'a> {
     }
 
     fn hit(&self, ray: u32, point: &Vector3<f64>, range_m: f64) -> Option<Hit> {
-        let seen = self.scene.ray(ray);
-        let projected = seen.project(point);
-        let chi2 = chi2(&projected, &self.spreads[ray as usize]);
-        let near = (point - seen.center).norm_squared() <= range_m * range_m;
-        (near && projected.z > 0.0 && chi2 < self.gate_sigmas * self.gate_sigmas).then(|| Hit {
-            ray,
-            image: self.scene.rays.image[ray as usize],
-            chi2,
-        })
+        let chi2 = chi2_in_gate(self.scene.ray(ray), point, &self.spreads[ray as usize], self.gate_sigmas)?;
+        let near = (point - self.scene.ray(ray).center).norm_squared() <= range_m * range_m;
+        near.then(|| Hit { ray, image: self.scene.rays.image[ray as usize], chi2 })
     }
 }
 
@@ -134,6 +129,14 @@ impl Place {
         );
         Self { origin, rays, gates }
     }
+}
+
+/// Squared residual of a point over its variance, if it lies in the gate of a ray.
+#[must_use]
+pub fn chi2_in_gate(ray: &Ray, point: &Vector3<f64>, spread: &Spread, gate_sigmas: f64) -> Option<f64> {
+    let projected = ray.project(point);
+    let chi2 = chi2(&projected, spread);
+    (projected.z > 0.0 && chi2 < gate_sigmas * gate_sigmas).then_some(chi2)
 }
 
 /// Squared residual over the variance at the point's depth, of `(a, b, c)` in front of the camera.

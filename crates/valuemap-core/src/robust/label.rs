@@ -4,7 +4,6 @@ use std::hash::{Hash, Hasher};
 use std::sync::OnceLock;
 
 use nalgebra::Vector3;
-use rayon::prelude::*;
 use rstar::RTree;
 use rstar::primitives::GeomWithData;
 use rustc_hash::FxHasher;
@@ -151,39 +150,10 @@ pub fn by_place(labels: &[Label]) -> RTree<GeomWithData<[f64; 3], usize>> {
     RTree::bulk_load(labels.iter().enumerate().map(|(i, l)| GeomWithData::new(l.estimate.point.into(), i)).collect())
 }
 
-/// Pairs of labels within a distance of each other, the one with the lower number first, in no order.
+/// The lowest ray of a label: what labels are ordered by.
 #[must_use]
-pub fn near_pairs(labels: &[Label], distance_m: f64) -> Vec<(usize, usize)> {
-    let tree = by_place(labels);
-    let of_label = |(a, label): (usize, &Label)| {
-        let near = tree.locate_within_distance(label.estimate.point.into(), distance_m * distance_m);
-        near.map(|near| near.data).filter(|&b| b > a).map(|b| (a, b)).collect::<Vec<_>>()
-    };
-    labels.par_iter().enumerate().flat_map_iter(of_label).collect()
-}
-
-/// Disjoint pairs of labels within a distance of each other that may be paired, the nearest first.
-#[must_use]
-pub fn nearest_pairs(
-    labels: &[Label],
-    distance_m: f64,
-    may_pair: impl Fn(&Label, &Label) -> bool + Sync,
-) -> Vec<(usize, usize)> {
-    let apart = |(a, b): (usize, usize)| {
-        let (first, second) = (&labels[a], &labels[b]);
-        may_pair(first, second).then(|| ((second.estimate.point - first.estimate.point).norm(), a, b))
-    };
-    let mut near: Vec<(f64, usize, usize)> = near_pairs(labels, distance_m).into_par_iter().filter_map(apart).collect();
-    near.sort_by(|x, y| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2))));
-    let mut taken = vec![false; labels.len()];
-    let mut pairs = Vec::new();
-    for (_, a, b) in near {
-        if !taken[a] && !taken[b] {
-            (taken[a], taken[b]) = (true, true);
-            pairs.push((a, b));
-        }
-    }
-    pairs
+pub fn first_voter(label: &Label) -> u32 {
+    label.voters.iter().copied().min().unwrap_or(u32::MAX)
 }
 
 impl Label {

@@ -34,6 +34,7 @@ pub mod keyframes;
 pub mod label;
 pub mod noise;
 pub mod nominate;
+pub mod pairs;
 pub mod poses;
 pub mod quick;
 pub mod rivals;

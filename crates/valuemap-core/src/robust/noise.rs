@@ -4,6 +4,7 @@
 //! 8 px at 5 m, so no single radius in pixels fits.
 
 use super::scene::{Scene, View};
+use super::spd::Vector6;
 use crate::kernel::Gate;
 
 /// Standard deviations of everything that moves a detection off its object.
@@ -24,6 +25,28 @@ pub struct Noise {
     pub position_drift_m: f64,
     /// Of the camera rotation, each axis, shared by a pass, rad.
     pub rotation_drift_rad: f64,
+}
+
+/// Standard deviations of a pose error, each axis.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sigmas {
+    /// Of the position, m.
+    pub position_m: f64,
+    /// Of the rotation, rad.
+    pub rotation_rad: f64,
+}
+
+impl Sigmas {
+    /// Those of no error.
+    pub const NONE: Self = Self { position_m: 0.0, rotation_rad: 0.0 };
+
+    /// All six, position first.
+    #[inline]
+    #[must_use]
+    pub fn each(&self) -> Vector6 {
+        let (p, r) = (self.position_m, self.rotation_rad);
+        Vector6::new(p, p, p, r, r, r)
+    }
 }
 
 /// The variance of one ray's residual, each axis, as a function of depth.
@@ -55,22 +78,22 @@ impl Noise {
     #[must_use]
     pub fn total(&self, scene: &Scene, ray: u32) -> Spread {
         let own = self.own(scene, ray);
-        let (position, rotation) = self.shared(scene.view(ray));
+        let Sigmas { position_m, rotation_rad } = self.shared(scene.view(ray));
         let scale2 = scene.scale2[ray as usize];
         Spread {
-            far_px2: own.far_px2 + scale2 * rotation * rotation,
-            near_px2: own.near_px2 + scale2 * position * position,
+            far_px2: own.far_px2 + scale2 * rotation_rad * rotation_rad,
+            near_px2: own.near_px2 + scale2 * position_m * position_m,
         }
     }
 
     /// The spread of the errors that a ray does not share with others of its pass.
     #[must_use]
     pub fn own(&self, scene: &Scene, ray: u32) -> Spread {
-        let (position, rotation) = self.of_image(scene.view(ray));
+        let Sigmas { position_m, rotation_rad } = self.of_image(scene.view(ray));
         let scale2 = scene.scale2[ray as usize];
         Spread {
-            far_px2: self.detection_px2(scene, ray) + scale2 * rotation * rotation,
-            near_px2: scale2 * position * position,
+            far_px2: self.detection_px2(scene, ray) + scale2 * rotation_rad * rotation_rad,
+            near_px2: scale2 * position_m * position_m,
         }
     }
 
@@ -83,20 +106,20 @@ impl Noise {
 
     /// Standard deviations of position (m) and rotation (rad) that an image has for itself.
     #[must_use]
-    pub fn of_image(&self, view: &View) -> (f64, f64) {
-        (
-            known_share(view.position_sigma_m, self.position_m, self.position_drift_m),
-            known_share(view.rotation_sigma_rad, self.rotation_rad, self.rotation_drift_rad),
-        )
+    pub fn of_image(&self, view: &View) -> Sigmas {
+        Sigmas {
+            position_m: known_share(view.position_sigma_m, self.position_m, self.position_drift_m),
+            rotation_rad: known_share(view.rotation_sigma_rad, self.rotation_rad, self.rotation_drift_rad),
+        }
     }
 
     /// Standard deviations of position (m) and rotation (rad) that an image shares with its pass.
     #[must_use]
-    pub fn shared(&self, view: &View) -> (f64, f64) {
-        (
-            known_share(view.position_sigma_m, self.position_drift_m, self.position_m),
-            known_share(view.rotation_sigma_rad, self.rotation_drift_rad, self.rotation_rad),
-        )
+    pub fn shared(&self, view: &View) -> Sigmas {
+        Sigmas {
+            position_m: known_share(view.position_sigma_m, self.position_drift_m, self.position_m),
+            rotation_rad: known_share(view.rotation_sigma_rad, self.rotation_drift_rad, self.rotation_rad),
+        }
     }
 }
 

@@ -6,7 +6,8 @@
 
 use nalgebra::{Matrix2, SMatrix, Vector2};
 
-use super::drift::{DRIFT_LENGTH_M, LEG_M, Look, Sigmas};
+use super::drift::{DRIFT_LENGTH_M, LEG_M, Look};
+use super::noise::Sigmas;
 use super::scene::View;
 use super::spd::{Inverse, Matrix6, Vector6, scaled};
 
@@ -84,9 +85,8 @@ impl Belief {
     /// The drift of an image, and the error that it has for itself; both with their standard deviations of position, m, and
     /// rotation, rad.
     #[must_use]
-    pub fn pose_error(&self, drift: (f64, f64), own: (f64, f64)) -> PoseError {
-        let diagonal = |(p, r): (f64, f64)| Vector6::new(p, p, p, r, r, r);
-        let (drift, own) = (diagonal(drift), diagonal(own));
+    pub fn pose_error(&self, drift: Sigmas, own: Sigmas) -> PoseError {
+        let (drift, own) = (drift.each(), own.each());
         let covariance = Inverse::of(&self.information).map_or_else(Matrix6::identity, |inverse| inverse.matrix);
         let mean = -(covariance * self.gradient);
         PoseError {

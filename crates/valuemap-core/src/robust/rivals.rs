@@ -8,6 +8,7 @@ use rustc_hash::{FxHashMap, FxHashSet};
 use super::associate::Run;
 use super::drift::{Drive, Look};
 use super::grant::{Claim, Fit, belief_of_votes};
+use super::noise::Sigmas;
 use super::poses::{LEGS_AROUND, PoseError, smooth};
 use crate::progress::{Halt, Progress};
 
@@ -90,7 +91,7 @@ impl Run<'_> {
         }
         let smoothed = smooth(&self.starts_m[first..end], &of_legs);
         let of_ray = |&(i, ray): &(usize, u32)| {
-            smoothed[self.leg_of[i] - first].pose_error(self.of.noise.shared(self.of.scene.view(ray)), (0.0, 0.0))
+            smoothed[self.leg_of[i] - first].pose_error(self.of.noise.shared(self.of.scene.view(ray)), Sigmas::NONE)
         };
         rays.iter().map(of_ray).collect()
     }

@@ -4,8 +4,9 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use super::calibrate::variance_factor;
-use super::label::{Label, direction_to, from_voters, near_pairs};
+use super::label::{Label, direction_to, first_voter, from_voters};
 use super::noise::Noise;
+use super::pairs::{disjoint, near_pairs, replaced};
 use super::scene::Scene;
 
 /// Squared Mahalanobis distance up to which two positions agree: the 99.7 % quantile of chi² with 3 degrees of freedom.
@@ -28,23 +29,14 @@ pub fn fuse(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) 
     let mut labels = labels;
     let factor = variance_factor(scene, noise, &labels, DISAGREEING);
     loop {
-        let mut pairs = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor, |a, b| a.class == b.class);
-        if pairs.is_empty() {
+        let agreeing = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor, |a, b| a.class == b.class);
+        if agreeing.is_empty() {
             return labels;
         }
-        pairs.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
-        let mut taken = vec![false; labels.len()];
-        let mut fused = Vec::new();
-        for (_, a, b) in pairs {
-            if !taken[a] && !taken[b] {
-                taken[a] = true;
-                taken[b] = true;
-                fused.push(union(scene, noise, gate_sigmas, &labels[a], &labels[b]));
-            }
-        }
-        let kept = labels.into_iter().zip(&taken).filter(|(_, taken)| !**taken).map(|(label, _)| label);
-        labels = kept.chain(fused).collect();
-        labels.sort_by_key(first_voter);
+        let pairs = disjoint(agreeing);
+        let fused = pairs.iter().map(|&(a, b)| Some(vec![union(scene, noise, gate_sigmas, &labels[a], &labels[b])]));
+        let fused = fused.collect();
+        labels = replaced(labels, &pairs, fused, |_, _| ());
     }
 }
 
@@ -117,12 +109,6 @@ fn two_sides(scene: &Scene, label: &Label) -> [Vec<u32>; 2] {
         }
     }
     sides
-}
-
-/// The lowest ray of a label: what labels are ordered by.
-#[must_use]
-pub fn first_voter(label: &Label) -> u32 {
-    label.voters.iter().copied().min().unwrap_or(u32::MAX)
 }
 
 /// Squared Mahalanobis distance and numbers of labels that may be paired, agree, and are not told apart.
