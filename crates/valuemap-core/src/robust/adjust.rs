@@ -32,7 +32,7 @@ pub fn adjust(
     let of_place = |place: &Vec<usize>| adjustment.of_place(place.iter().map(|&i| labels[i].clone()).collect());
     // One at a time: the first ones are the largest.
     let mut labels: Vec<Label> = places(labels).par_iter().with_max_len(1).flat_map_iter(of_place).collect();
-    labels.sort_by_key(first_voter);
+    labels.sort_by_cached_key(first_voter);
     labels
 }
 

@@ -218,10 +218,8 @@ fn given_to(scene: &Scene, label: Label, mut voters: Vec<u32>, mut undecided: Ve
 }
 
 fn claims_of(scene: &Scene, index: &RayIndex<'_>, label: &Label, range_m: f64) -> Vec<Claim> {
-    let mut hits: Vec<Hit> =
-        places_of(&label.estimate).iter().flat_map(|place| index.all_hits(place, label.class, range_m)).collect();
-    hits.sort_unstable_by(|a, b| a.ray.cmp(&b.ray).then(a.chi2.total_cmp(&b.chi2)));
-    hits.dedup_by_key(|hit| hit.ray);
+    let mut hits = index.hits_of_any(&places_of(&label.estimate), label.class, range_m);
+    hits.sort_by_key(|hit| hit.ray);
     let of_hit = |hit: Hit| Claim { image: hit.image, label: u32::MAX, ray: hit.ray, chi2: hit.chi2, is_vote: false };
     hits.into_iter().filter(|hit| label.faces(scene, hit.ray)).map(of_hit).collect()
 }
@@ -229,7 +227,7 @@ fn claims_of(scene: &Scene, index: &RayIndex<'_>, label: &Label, range_m: f64) -
 /// Claims (any order) with those marked that are votes.
 fn with_votes_of(label: &Label, mut claims: Vec<Claim>) -> Vec<Claim> {
     let mut voters = label.voters.clone();
-    voters.sort_unstable();
+    voters.sort();
     for claim in &mut claims {
         claim.is_vote = voters.binary_search(&claim.ray).is_ok();
     }

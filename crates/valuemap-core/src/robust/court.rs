@@ -73,7 +73,7 @@ impl<'a> Court<'a> {
             let new = self.left_over(&labels, schedule.rounds, tally, progress)?;
             let is_raw = labels.is_empty();
             labels = if is_raw { new } else { self.admit(labels, new, tally) };
-            labels.sort_by_key(label::first_voter);
+            labels.sort_by_cached_key(label::first_voter);
             for _ in 0..schedule.rounds {
                 labels = self.settle(labels, true, tally, progress)?;
             }

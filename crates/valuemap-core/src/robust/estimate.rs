@@ -136,7 +136,7 @@ impl<'a> Joint<'a> {
             counted.extend(voters.iter().enumerate().map(|(i, &ray)| ((label, ray), weight(i))));
             points.push(point);
         }
-        counted.sort_unstable_by_key(|&((label, ray), _)| (scene.view(ray).pass, ray, label));
+        counted.sort_by_key(|&((label, ray), _)| (scene.view(ray).pass, ray, label));
         let pose_errors = vec![Vector6::zeros(); counted.len()];
         let (votes, weights) = counted.into_iter().unzip();
         Self { scene, noise, votes, weights, pose_errors, points, care }

@@ -81,7 +81,7 @@ pub fn gather(
         }
     }
     counts[1] = labels.len() as u64;
-    labels.sort_by_key(first_voter);
+    labels.sort_by_cached_key(first_voter);
     Ok((labels, counts))
 }
 

@@ -94,18 +94,36 @@ impl<'a> RayIndex<'a> {
     /// All rays of one class within `range_m` that a point projects onto within their gates, in no order.
     #[must_use]
     pub fn all_hits(&self, point: &Vector3<f64>, class: u32, range_m: f64) -> Vec<Hit> {
+        self.hits_of_any(std::slice::from_ref(point), class, range_m)
+    }
+
+    /// The rays that [`all_hits`](Self::all_hits) finds for any of some points, each with its least residual; in no order.
+    #[must_use]
+    pub fn hits_of_any(&self, points: &[Vector3<f64>], class: u32, range_m: f64) -> Vec<Hit> {
+        let Some(&middle) = points.get(points.len() / 2) else { return Vec::new() };
+        let span = points.iter().map(|point| (point - middle).norm()).fold(0.0, f64::max);
+        let reach = range_m + span + self.reach_m;
         let mut hits = Vec::new();
+        let mut around = vec![Vector3::zeros(); points.len()];
         let (mut maybe, mut sure) = (Vec::new(), Vec::new());
-        let reach = range_m + self.reach_m;
-        for near in self.tree.locate_within_distance((*point).into(), reach * reach) {
+        for near in self.tree.locate_within_distance(middle.into(), reach * reach) {
             let place = &self.places[near.data];
-            maybe.resize(place.gates.words(), 0);
-            sure.resize(place.gates.words(), 0);
-            place.gates.test(&[point - place.origin], &mut maybe, &mut sure);
-            for (word, &bits) in maybe.iter().enumerate() {
-                let candidates = ones(bits).map(|bit| place.rays[word * LANES + bit as usize]);
-                let of_class = candidates.filter(|&ray| self.scene.rays.class[ray as usize] == class);
-                hits.extend(of_class.filter_map(|ray| self.hit(ray, point, range_m)));
+            let words = place.gates.words();
+            around.iter_mut().zip(points).for_each(|(around, point)| *around = point - place.origin);
+            maybe.resize(words * points.len(), 0);
+            sure.resize(words * points.len(), 0);
+            place.gates.test(&around, &mut maybe, &mut sure);
+            for word in 0..words {
+                let bits_of = |point: usize| maybe[point * words + word];
+                let any = (0..points.len()).fold(0, |any, point| any | bits_of(point));
+                for bit in ones(any) {
+                    let ray = place.rays[word * LANES + bit as usize];
+                    if self.scene.rays.class[ray as usize] == class {
+                        let of_ray = (0..points.len()).filter(|&point| bits_of(point) >> bit & 1 == 1);
+                        let of_ray = of_ray.filter_map(|point| self.hit(ray, &points[point], range_m));
+                        hits.extend(of_ray.min_by(|a, b| a.chi2.total_cmp(&b.chi2)));
+                    }
+                }
             }
         }
         hits

@@ -66,6 +66,6 @@ pub fn replaced(
     }
     let kept = labels.into_iter().zip(is_replaced).filter(|(_, is_replaced)| !is_replaced).map(|(label, _)| label);
     let mut labels: Vec<Label> = kept.chain(replacing).collect();
-    labels.sort_by_key(first_voter);
+    labels.sort_by_cached_key(first_voter);
     labels
 }

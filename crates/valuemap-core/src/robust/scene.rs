@@ -66,7 +66,7 @@ impl Scene {
 
     /// Order rays by pass, then by number.
     pub fn sort_by_pass(&self, rays: &mut [u32]) {
-        rays.sort_unstable_by_key(|&ray| (self.view(ray).pass, ray));
+        rays.sort_by_key(|&ray| (self.view(ray).pass, ray));
     }
 
     /// A ray.

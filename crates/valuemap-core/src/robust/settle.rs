@@ -81,7 +81,7 @@ pub fn split(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>,
         }
     };
     let mut labels: Vec<Label> = labels.into_par_iter().flat_map_iter(parts).collect();
-    labels.sort_by_key(first_voter);
+    labels.sort_by_cached_key(first_voter);
     labels
 }
 
