@@ -19,6 +19,10 @@ use valuemap_core::{evidence, merge, partition, triangulate, vote};
 use crate::arrays::{Groups, candidates_from, groups_of, points_of, rows_of};
 use crate::run::with_progress;
 
+/// Many threads allocate small matrices and large columns all the time.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
 /// Viewing rays, one a detection, copied once and used by every stage.
 #[pyclass(frozen, module = "valuemap._core")]
 pub struct Rays(Arc<valuemap_core::ray::Rays>);
