@@ -13,7 +13,7 @@ use super::noise::Noise;
 use super::scene::{Scene, View};
 
 /// A label that moved by less, squared and in sigmas, is what it was.
-const SMALL_MOVE_CHI2: f64 = 0.1;
+const SMALL_MOVE_CHI2: f64 = 0.3;
 /// A label whose mean direction of sight changed by less is seen from where it was.
 const SMALL_TURN: f64 = 0.1;
 
