@@ -82,21 +82,18 @@ impl<'a> Association<'a> {
         let stands: Vec<u64> = claims.iter().map(|(stand, _)| *stand).collect();
         let current: FxHashSet<u64> = stands.iter().copied().collect();
         let is_open = self.open_legs(&claims, &current);
-        let leg_of = |image: u32| self.legs.of_view[image as usize] as usize;
-        let is_open_image = |image: u32| is_open[leg_of(image)];
-        let of_label = |(number, (_, claimed)): (usize, &(u64, Arc<Claimed>))| {
-            let open = claimed.claims.iter().filter(|claim| is_open_image(claim.image));
-            open.map(|claim| Claim { label: number as u32, ..*claim }).collect::<Vec<_>>()
-        };
-        let mut open: Vec<Claim> = claims.par_iter().enumerate().flat_map_iter(of_label).collect();
-        open.par_sort_unstable_by_key(|claim| (leg_of(claim.image), claim.image, claim.label, claim.ray));
+        let mut open = by_leg(&claims, &is_open);
         let is_one_run = |a: &Claim, b: &Claim| {
-            let [a, b] = [a, b].map(|claim| leg_of(claim.image));
+            let [a, b] = [a.leg as usize, b.leg as usize];
             self.legs.pass[a] == self.legs.pass[b] && b - a <= LEGS_AROUND
         };
-        let runs: Vec<&[Claim]> = open.chunk_by(is_one_run).collect();
-        let decided: Vec<Decided> =
-            runs.par_iter().map(|run| self.decide(&labels, &stands, run, progress)).collect::<Result<_, Halt>>()?;
+        let runs: Vec<&mut [Claim]> = open.chunk_by_mut(is_one_run).collect();
+        let decide = |run: &mut [Claim]| {
+            run.sort_by_key(|claim| (claim.leg, claim.image));
+            self.decide(&labels, &stands, run, progress)
+        };
+        let decided: Vec<Decided> = runs.into_par_iter().map(decide).collect::<Result<_, Halt>>()?;
+        let is_open_image = |image: u32| is_open[self.legs.of_view[image as usize] as usize];
         let mut voters: Vec<Vec<u32>> = Vec::with_capacity(labels.len());
         let mut undecided: Vec<Vec<u32>> = Vec::with_capacity(labels.len());
         for label in &labels {
@@ -146,17 +143,26 @@ impl<'a> Association<'a> {
         match self.last.get(&stand) {
             Some(last) if last.voters == voters => Arc::clone(last),
             Some(last) => Arc::new(Claimed { voters, claims: with_votes_of(label, last.claims.clone()) }),
-            None => {
-                let claims = claims_of(self.scene, &self.index, label, self.range_m);
-                Arc::new(Claimed { voters, claims: with_votes_of(label, claims) })
-            }
+            None => Arc::new(Claimed { voters, claims: with_votes_of(label, self.claims_of(label)) }),
         }
+    }
+
+    /// All claims of a label, by ray; none is a vote yet.
+    fn claims_of(&self, label: &Label) -> Vec<Claim> {
+        let mut hits = self.index.hits_of_any(&places_of(&label.estimate), label.class, self.range_m);
+        hits.retain(|hit| label.faces(self.scene, hit.ray));
+        hits.sort_by_key(|hit| hit.ray);
+        let of_hit = |Hit { ray, image, chi2 }: Hit| {
+            let leg = self.legs.of_view[image as usize];
+            Claim { leg, image, label: u32::MAX, ray, chi2, is_vote: false }
+        };
+        hits.into_iter().map(of_hit).collect()
     }
 
     /// Legs that a label claims which was not there before, or is there no longer, or where its votes changed.
     fn open_legs(&self, claims: &[(u64, Arc<Claimed>)], current: &FxHashSet<u64>) -> Vec<bool> {
         let mut is_open = vec![false; self.legs.pass.len()];
-        let mut open = |claim: &Claim| is_open[self.legs.of_view[claim.image as usize] as usize] = true;
+        let mut open = |claim: &Claim| is_open[claim.leg as usize] = true;
         for (stand, now) in claims {
             match self.last.get(stand) {
                 None => now.claims.iter().for_each(&mut open),
@@ -217,17 +223,34 @@ fn given_to(scene: &Scene, label: Label, mut voters: Vec<u32>, mut undecided: Ve
     label
 }
 
-fn claims_of(scene: &Scene, index: &RayIndex<'_>, label: &Label, range_m: f64) -> Vec<Claim> {
-    let mut hits = index.hits_of_any(&places_of(&label.estimate), label.class, range_m);
-    hits.sort_by_key(|hit| hit.ray);
-    let of_hit = |hit: Hit| Claim { image: hit.image, label: u32::MAX, ray: hit.ray, chi2: hit.chi2, is_vote: false };
-    hits.into_iter().filter(|hit| label.faces(scene, hit.ray)).map(of_hit).collect()
+/// The claims of all labels on some legs: leg by leg, each label after label and ray after ray.
+fn by_leg(claims: &[(u64, Arc<Claimed>)], is_open: &[bool]) -> Vec<Claim> {
+    let open = || {
+        let all = (0..)
+            .zip(claims)
+            .flat_map(|(label, (_, of_label))| of_label.claims.iter().map(move |claim| Claim { label, ..*claim }));
+        all.filter(|claim| is_open[claim.leg as usize])
+    };
+    let mut next = vec![0; is_open.len() + 1];
+    for claim in open() {
+        next[claim.leg as usize + 1] += 1;
+    }
+    for leg in 0..is_open.len() {
+        next[leg + 1] += next[leg];
+    }
+    let mut sorted = vec![Claim::default(); next[is_open.len()]];
+    for claim in open() {
+        let place = &mut next[claim.leg as usize];
+        sorted[*place] = claim;
+        *place += 1;
+    }
+    sorted
 }
 
 /// Claims (any order) with those marked that are votes.
 fn with_votes_of(label: &Label, mut claims: Vec<Claim>) -> Vec<Claim> {
     let mut voters = label.voters.clone();
-    voters.sort();
+    voters.sort_unstable();
     for claim in &mut claims {
         claim.is_vote = voters.binary_search(&claim.ray).is_ok();
     }

@@ -42,7 +42,7 @@ impl Care {
     fn tolerance_sigmas(self) -> f64 {
         match self {
             Self::Rough => 0.05,
-            Self::Exact => 0.01,
+            Self::Exact => 0.03,
         }
     }
 

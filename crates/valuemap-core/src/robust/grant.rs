@@ -23,8 +23,10 @@ const COST_UNIT: f64 = 1e-6;
 const HUBER_CHI2: f64 = 4.0;
 
 /// A detection that a label may have.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub struct Claim {
+    /// The leg of the drive that the image was taken on.
+    pub(super) leg: u32,
     pub(super) image: u32,
     /// The label's number.
     pub(super) label: u32,
@@ -89,9 +91,14 @@ pub(super) struct Fit {
 /// Judge the claims of one image, whose pose error is about known.
 pub(super) fn grant(cases: &[Case<'_>], limit: f64, pose: &PoseError) -> Vec<Fit> {
     let mut costs: Vec<f64> = cases.iter().map(|case| case.cost(pose)).collect();
+    let contested: Vec<usize> = (0..cases.len()).filter(|&i| (0..cases.len()).any(|j| shares(cases, i, j))).collect();
+    if contested.is_empty() {
+        return costs.into_iter().map(|cost| Fit { cost, granted: cost < limit }).collect();
+    }
     let mut granted = assign(cases, &costs, limit);
     for _ in 1..ROUNDS {
-        for (i, case) in cases.iter().enumerate().filter(|(i, _)| (0..cases.len()).any(|j| shares(cases, *i, j))) {
+        for &i in &contested {
+            let case = &cases[i];
             let others = granted.iter().map(|&j| &cases[j]);
             let independent = others.filter(|o| o.claim.label != case.claim.label && o.claim.ray != case.claim.ray);
             let known = independent.fold(*pose, |pose, other| pose.after(&other.look, &other.own));
