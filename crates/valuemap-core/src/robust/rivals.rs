@@ -7,7 +7,7 @@ use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::associate::Run;
 use super::drift::{Drive, Look};
-use super::grant::{Claim, Fit, belief_of_votes};
+use super::grant::{Case, Fit, belief_of_votes};
 use super::noise::Sigmas;
 use super::poses::{LEGS_AROUND, PoseError, smooth};
 use crate::progress::{Halt, Progress};
@@ -16,6 +16,7 @@ use crate::progress::{Halt, Progress};
 const LEAST_RIVALRY: u32 = 8;
 /// For each of them, images that show both, at most: what clutter and double detections do.
 const MOST_BOTH: f64 = 0.1;
+
 /// What one pass shows of two labels that claim the same detections.
 #[derive(Default)]
 struct Rivalry {
@@ -31,30 +32,15 @@ impl Run<'_> {
     /// Pairs of labels (the better one, the other) of which a pass shows only one, where it might be either: there is one
     /// object, and the other label is not to be seen from there.
     pub(super) fn overruled(&self, fits: &[Vec<Fit>], progress: &Progress) -> Result<FxHashSet<(u32, u32)>, Halt> {
-        let limit = self.of.index.gate_sigmas().powi(2);
-        let mut rivalries: FxHashMap<(u32, u32), Rivalry> = FxHashMap::default();
-        for (i, (cases, fits)) in self.images.iter().zip(fits).enumerate() {
-            progress.check()?;
-            let granted: Vec<u32> =
-                cases.iter().zip(fits).filter(|(_, fit)| fit.granted).map(|(case, _)| case.claim.label).collect();
-            let shown: FxHashSet<u32> = granted.iter().copied().collect();
+        let mut rivalries = self.rivalries(fits, progress)?;
+        if rivalries.is_empty() {
+            return Ok(FxHashSet::default());
+        }
+        for (cases, fits) in self.images.iter().zip(fits) {
+            let granted: Vec<u32> = granted(cases, fits).collect();
             for (k, &a) in granted.iter().enumerate() {
                 for &b in &granted[k + 1..] {
-                    rivalries.entry((a, b)).or_default().both += 1;
-                }
-            }
-            let mut open: Vec<&Claim> =
-                cases.iter().zip(fits).filter(|(_, fit)| fit.cost < limit).map(|(case, _)| case.claim).collect();
-            open.sort_unstable_by_key(|claim| (claim.ray, claim.label));
-            for of_ray in open.chunk_by(|a, b| a.ray == b.ray) {
-                for (k, a) in of_ray.iter().enumerate() {
-                    for b in &of_ray[k + 1..] {
-                        if shown.contains(&a.label) != shown.contains(&b.label) {
-                            let rivalry = rivalries.entry((a.label, b.label)).or_default();
-                            rivalry.one += 1;
-                            rivalry.rays.push((i, a.ray));
-                        }
-                    }
+                    rivalries.entry((a, b)).and_modify(|rivalry| rivalry.both += 1);
                 }
             }
         }
@@ -75,6 +61,27 @@ impl Run<'_> {
             is_one(&rivalry).then(|| of_pair(((a, b), rivalry)))
         };
         Ok(rivalries.into_iter().filter_map(decide).collect())
+    }
+
+    /// Pairs of labels that might have the same detection, and the images that show one of them there.
+    fn rivalries(&self, fits: &[Vec<Fit>], progress: &Progress) -> Result<FxHashMap<(u32, u32), Rivalry>, Halt> {
+        let limit = self.of.index.gate_sigmas().powi(2);
+        let mut rivalries: FxHashMap<(u32, u32), Rivalry> = FxHashMap::default();
+        for (i, (cases, fits)) in self.images.iter().zip(fits).enumerate() {
+            progress.check()?;
+            let is_shown = |label: u32| granted(cases, fits).any(|granted| granted == label);
+            let open = cases.iter().zip(fits).filter(|(_, fit)| fit.cost < limit).map(|(case, _)| case.claim);
+            for (k, a) in open.clone().enumerate() {
+                for b in open.clone().skip(k + 1).filter(|b| b.ray == a.ray) {
+                    let rivalry = rivalries.entry((a.label, b.label)).or_default();
+                    if is_shown(a.label) != is_shown(b.label) {
+                        rivalry.one += 1;
+                        rivalry.rays.push((i, a.ray));
+                    }
+                }
+            }
+        }
+        Ok(rivalries)
     }
 
     /// The drift in the images of some rays, as far as the votes for all but some labels tell.
@@ -114,4 +121,9 @@ impl Run<'_> {
         };
         joint().unwrap_or(f64::INFINITY)
     }
+}
+
+/// The labels that one image shows, ascending.
+fn granted<'f>(cases: &'f [Case<'_>], fits: &'f [Fit]) -> impl Iterator<Item = u32> + 'f {
+    cases.iter().zip(fits).filter(|(_, fit)| fit.granted).map(|(case, _)| case.claim.label)
 }
