@@ -12,14 +12,18 @@ _Indices = NDArray[np.uint32]
 class Rays:
     def __init__(
         self,
-        residual_from_world: _Floats,
-        center_in_world_m: _Floats,
-        direction_in_world: _Floats,
+        residual_from_cam: _Floats,
+        direction_in_cam: _Floats,
         image: _Indices,
         class_: _Indices,
+        cam_from_world: _Floats,
+        center_in_world_m: _Floats,
         /,
     ) -> None: ...
     def __len__(self) -> int: ...
+    def residual_from_world(self) -> _Floats: ...
+    def center_in_world_m(self) -> _Floats: ...
+    def direction_in_world(self) -> _Floats: ...
 
 def partition(center_in_world_m: _Floats, cluster_radius_m: float) -> _Indices: ...
 def vote(

@@ -30,22 +30,18 @@ _JACOBIAN_STEP = 1e-5
 _RAY_TOLERANCE_PX = 0.1
 """A ray that projects farther than this from its pixel is not the ray of the pixel."""
 _BLOCK = 8192
-"""Rays that are cast at once."""
+"""Rows that are worked on at once, so that what is between stays in the cache."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rays:
     """One viewing ray a detection, in the order of the detections.
 
-    `residual_from_world` (N, 3, 3) is M above, `center_in_world_m` (N, 3) the camera centre,
-    `direction_in_world` (N, 3) a unit vector (both NaN where the camera model has no ray for the pixel, so that
-    the detection neither proposes nor votes), `image_row` (N) the row of the detection's image in the
+    `core` are the rays as the numeric core holds them, `image_row` (N) is the row of the detection's image in the
     images table, `camera_row` (N) that of its camera, `class_code` (N) that of its class.
     """
 
-    residual_from_world: Floats
-    center_in_world_m: Floats
-    direction_in_world: Floats
+    core: _core.Rays
     image_row: Ints
     camera_row: Ints
     class_code: NDArray[np.int32]
@@ -54,15 +50,22 @@ class Rays:
         return len(self.image_row)
 
     @cached_property
-    def core(self) -> _core.Rays:
-        """The same rays as the numeric core holds them; copied once."""
-        return _core.Rays(
-            np.ascontiguousarray(self.residual_from_world),
-            np.ascontiguousarray(self.center_in_world_m),
-            np.ascontiguousarray(self.direction_in_world),
-            self.image_row.astype(np.uint32),
-            self.class_code.astype(np.uint32),
-        )
+    def residual_from_world(self) -> Floats:
+        """M above (N, 3, 3); NaN, like the direction, where the camera model has no ray for the pixel.
+
+        Such a detection neither proposes nor votes.
+        """
+        return self.core.residual_from_world()
+
+    @cached_property
+    def center_in_world_m(self) -> Floats:
+        """The camera centres (N, 3)."""
+        return self.core.center_in_world_m()
+
+    @cached_property
+    def direction_in_world(self) -> Floats:
+        """Unit vectors (N, 3)."""
+        return self.core.direction_in_world()
 
 
 def camera_centers(images: Images) -> Floats:
@@ -77,14 +80,22 @@ def _centers(cam_from_world: Floats, images: Images) -> Floats:
 
 def rotation_matrices(images: Images) -> Floats:
     """Return R (N, 3, 3) with point_in_cam = R point_in_world + t."""
+    rotation = np.empty((len(images), 3, 3))
+    for start in range(0, len(images), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        rotation[block] = _rotation_of(images.cam_from_world_quat[block])
+    return rotation
+
+
+def _rotation_of(quat: Floats) -> Floats:
     # Written out, because importing SciPy's rotations takes longer than mapping a small city.
-    w, x, y, z = images.cam_from_world_quat.T
+    w, x, y, z = np.ascontiguousarray(quat.T)
     rows = [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
         [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
         [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
     ]
-    return np.ascontiguousarray(np.array(rows).transpose(2, 0, 1))
+    return np.array(rows).transpose(2, 0, 1)
 
 
 def colmap_camera(cameras: Cameras, row: int) -> pycolmap.Camera:
@@ -102,28 +113,28 @@ def cast_rays(dataset: Dataset) -> Rays:
     images, cameras, detections = dataset.images, dataset.cameras, dataset.detections
     image_row = rows_of(detections.image_id, images.image_id)
     camera_row = rows_of(images.camera_id, cameras.camera_id)[image_row]
-    rotation = rotation_matrices(images)
-    residual_from_world = np.empty((len(detections), 3, 3))
-    direction_in_world = np.empty((len(detections), 3))
+    residual_from_cam = np.empty((len(detections), 3, 3))
+    direction_in_cam = np.empty((len(detections), 3))
     for row in range(len(cameras)):
         camera = colmap_camera(cameras, row)
         for members in _blocks(np.flatnonzero(camera_row == row)):
-            residual_from_cam, direction_in_cam = _local_pinholes(camera, detections.center_px[members])
-            world_to_cam = rotation[image_row[members]]
-            residual_from_world[members] = residual_from_cam @ world_to_cam
-            direction_in_world[members] = np.einsum("nji,nj->ni", world_to_cam, direction_in_cam)
-    return Rays(
-        residual_from_world=residual_from_world,
-        center_in_world_m=_centers(rotation, images)[image_row],
-        direction_in_world=direction_in_world,
-        image_row=image_row,
-        camera_row=camera_row,
-        class_code=detections.class_name.codes,
+            residual_from_cam[members], direction_in_cam[members] = _local_pinholes(
+                camera, detections.center_px[members]
+            )
+    cam_from_world = rotation_matrices(images)
+    core = _core.Rays(
+        residual_from_cam,
+        direction_in_cam,
+        image_row.astype(np.uint32),
+        detections.class_name.codes.astype(np.uint32),
+        cam_from_world,
+        np.ascontiguousarray(_centers(cam_from_world, images)),
     )
+    return Rays(core, image_row, camera_row, detections.class_name.codes)
 
 
 def _blocks(rows: Ints) -> list[Ints]:
-    """Cut rows into blocks whose intermediate results stay in the cache."""
+    """Cut rows into blocks."""
     return [rows[start : start + _BLOCK] for start in range(0, len(rows), _BLOCK)]
 
 
@@ -157,26 +168,30 @@ def _local_pinholes(camera: pycolmap.Camera, center_px: Floats) -> tuple[Floats,
     # Where a model has no ray, e.g. beyond 90 degrees of a fisheye, COLMAP may answer with another one.
     miss_px = np.linalg.norm(_pixels_between(camera, camera.img_from_cam(ray), center_px), axis=1)
     ray[~(miss_px <= _RAY_TOLERANCE_PX)] = np.nan
-    virtual_from_cam = (
-        np.broadcast_to(np.eye(3), (len(ray), 3, 3)) if camera.is_perspective_pinhole() else _rotation_onto(ray)
-    )
-    in_virtual = np.einsum("nij,nj->ni", virtual_from_cam, ray)
+    # A perspective camera has a plane of its own.
+    virtual_from_cam = None if camera.is_perspective_pinhole() else _rotation_onto(ray)
+    in_virtual = ray if virtual_from_cam is None else np.einsum("nij,nj->ni", virtual_from_cam, ray)
     plane = in_virtual[:, :2] / in_virtual[:, 2:]
-    jacobian = np.stack([_pixels_per_step(camera, virtual_from_cam, plane, axis) for axis in (0, 1)], axis=2)
-    offset = virtual_from_cam[:, :2] - plane[:, :, None] * virtual_from_cam[:, 2:]
-    residual_from_cam = np.concatenate([jacobian @ offset, virtual_from_cam[:, 2:]], axis=1)
+    residual_from_cam = np.zeros((len(ray), 3, 3))
+    for axis in (0, 1):
+        residual_from_cam[:, :2, axis] = _pixels_per_step(camera, virtual_from_cam, plane, axis)
+    residual_from_cam[:, :2, 2] = -np.einsum("nij,nj->ni", residual_from_cam[:, :2, :2], plane)
+    residual_from_cam[:, 2, 2] = 1.0
+    if virtual_from_cam is not None:
+        residual_from_cam = residual_from_cam @ virtual_from_cam
     has_no_ray = np.isnan(residual_from_cam).any(axis=(1, 2))
     residual_from_cam[has_no_ray], ray[has_no_ray] = np.nan, np.nan
     return residual_from_cam, ray
 
 
-def _pixels_per_step(camera: pycolmap.Camera, virtual_from_cam: Floats, plane: Floats, axis: int) -> Floats:
+def _pixels_per_step(camera: pycolmap.Camera, virtual_from_cam: Floats | None, plane: Floats, axis: int) -> Floats:
     """Return the column (N, 2) of d pi / d p for one axis of the virtual plane, by central differences."""
     ends = []
     for step in (_JACOBIAN_STEP, -_JACOBIAN_STEP):
         point = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
         point[:, axis] += step
-        ends.append(camera.img_from_cam(np.einsum("nji,nj->ni", virtual_from_cam, point)))
+        in_cam = point if virtual_from_cam is None else np.einsum("nji,nj->ni", virtual_from_cam, point)
+        ends.append(camera.img_from_cam(in_cam))
     return _pixels_between(camera, ends[0], ends[1]) / (2.0 * _JACOBIAN_STEP)
 
 

@@ -28,6 +28,21 @@ pub struct Ray {
 }
 
 impl Ray {
+    /// The ray of a detection of a camera: the matrix and the direction are given in its axes.
+    #[must_use]
+    pub fn of_camera(
+        residual_from_cam: &Matrix3<f64>,
+        direction_in_cam: Vector3<f64>,
+        cam_from_world: &Matrix3<f64>,
+        center: Vector3<f64>,
+    ) -> Self {
+        Self {
+            residual_from_world: residual_from_cam * cam_from_world,
+            center,
+            direction: cam_from_world.tr_mul(&direction_in_cam),
+        }
+    }
+
     /// `(a, b, c)` of a world point.
     #[inline]
     #[must_use]

@@ -1,10 +1,9 @@
 //! `NumPy` arrays to the core's types and back.
 
-use numpy::{IntoPyArray, PyArray1, PyArray2, PyReadonlyArray2};
+use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use valuemap_core::Vector3;
-use valuemap_core::ray::Ray;
 use valuemap_core::vote::Candidate;
 
 /// Groups of rays: offsets (N + 1) into the members, and the members.
@@ -16,17 +15,15 @@ pub fn rows_of<'a>(array: &'a PyReadonlyArray2<'_, f64>) -> PyResult<&'a [[f64; 
     if rest.is_empty() { Ok(rows) } else { Err(PyValueError::new_err("expected an array of shape (N, 3)")) }
 }
 
-/// Rays of row-major matrices, centres and directions.
-pub fn rays_from(matrices: &[[f64; 9]], centers: &[[f64; 3]], directions: &[[f64; 3]]) -> Vec<Ray> {
-    matrices
-        .iter()
-        .zip(centers.iter().zip(directions))
-        .map(|(m, (&center, &direction))| Ray {
-            residual_from_world: valuemap_core::matrix_from_rows(m),
-            center: center.into(),
-            direction: direction.into(),
-        })
-        .collect()
+/// Vectors as the rows of an (N, 3) array.
+pub fn vectors(
+    py: Python<'_>,
+    vectors: impl ExactSizeIterator<Item = Vector3<f64>>,
+) -> PyResult<Bound<'_, PyArray2<f64>>> {
+    let count = vectors.len();
+    let mut rows = Vec::with_capacity(3 * count);
+    vectors.for_each(|vector| rows.extend_from_slice(vector.as_slice()));
+    rows.into_pyarray(py).reshape([count, 3])
 }
 
 /// The members of each group.

@@ -7,11 +7,15 @@ mod run;
 
 use std::sync::Arc;
 
-use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
+use numpy::{
+    IntoPyArray, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
+};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use valuemap_core::hypothesis::{PairCounts, Viability};
+use valuemap_core::matrix_from_rows;
+use valuemap_core::ray::Ray;
 use valuemap_core::select::Stop;
 use valuemap_core::vote::Candidate;
 use valuemap_core::{evidence, merge, partition, triangulate, vote};
@@ -37,22 +41,49 @@ impl Rays {
 impl Rays {
     #[new]
     fn new(
-        residual_from_world: PyReadonlyArray3<'_, f64>,
-        center_in_world_m: PyReadonlyArray2<'_, f64>,
-        direction_in_world: PyReadonlyArray2<'_, f64>,
+        residual_from_cam: PyReadonlyArray3<'_, f64>,
+        direction_in_cam: PyReadonlyArray2<'_, f64>,
         image: PyReadonlyArray1<'_, u32>,
         class: PyReadonlyArray1<'_, u32>,
+        cam_from_world: PyReadonlyArray3<'_, f64>,
+        center_in_world_m: PyReadonlyArray2<'_, f64>,
     ) -> PyResult<Self> {
-        let matrices = residual_from_world.as_slice()?.as_chunks::<9>().0;
+        let matrices = residual_from_cam.as_slice()?.as_chunks::<9>().0;
+        let directions = rows_of(&direction_in_cam)?;
+        let rotations = cam_from_world.as_slice()?.as_chunks::<9>().0;
         let centers = rows_of(&center_in_world_m)?;
-        let directions = rows_of(&direction_in_world)?;
         let (image, class) = (image.as_slice()?.to_vec(), class.as_slice()?.to_vec());
-        let lengths = [centers.len(), directions.len(), image.len(), class.len()];
+        let lengths = [directions.len(), image.len(), class.len()];
         if lengths.iter().any(|&length| length != matrices.len()) {
             return Err(PyValueError::new_err("rays: all arrays must have one row a ray"));
         }
-        let rays = arrays::rays_from(matrices, centers, directions);
+        if rotations.len() != centers.len() || image.iter().any(|&image| image as usize >= centers.len()) {
+            return Err(PyValueError::new_err("rays: every image must have a pose"));
+        }
+        let of_ray = |((matrix, &direction), &image): ((&[f64; 9], &[f64; 3]), &u32)| {
+            let cam_from_world = matrix_from_rows(&rotations[image as usize]);
+            Ray::of_camera(&matrix_from_rows(matrix), direction.into(), &cam_from_world, centers[image as usize].into())
+        };
+        let rays = matrices.iter().zip(directions).zip(&image).map(of_ray).collect();
         Ok(Self(Arc::new(valuemap_core::ray::Rays { rays, image, class })))
+    }
+
+    /// M of every ray in the world, (N, 3, 3).
+    fn residual_from_world<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f64>>> {
+        let mut rows = Vec::with_capacity(9 * self.0.rays.len());
+        // Matrices lie column by column.
+        self.0.rays.iter().for_each(|ray| rows.extend_from_slice(ray.residual_from_world.transpose().as_slice()));
+        rows.into_pyarray(py).reshape([self.0.rays.len(), 3, 3])
+    }
+
+    /// The camera centre of every ray in the world, m, (N, 3).
+    fn center_in_world_m<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        arrays::vectors(py, self.0.rays.iter().map(|ray| ray.center))
+    }
+
+    /// The unit direction of every ray in the world, (N, 3).
+    fn direction_in_world<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        arrays::vectors(py, self.0.rays.iter().map(|ray| ray.direction))
     }
 
     fn __len__(&self) -> usize {
