@@ -376,7 +376,9 @@ def table_to_arrow(table: Table) -> pa.Table:
 
 def write_table(table: Table, path: Path) -> None:
     """Write a table as Parquet (zstd); the same table gives the same bytes."""
-    pq.write_table(table_to_arrow(table), path, compression="zstd")
+    # Other columns repeat themselves little: a dictionary makes them larger and slower to write and to read.
+    texts = [name for f in fields(table) if f.metadata["kind"] == "category" for name in f.metadata["names"]]
+    pq.write_table(table_to_arrow(table), path, compression="zstd", use_dictionary=texts)
 
 
 def _take(value: Any, rows: NDArray[Any]) -> Any:

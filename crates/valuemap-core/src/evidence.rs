@@ -35,7 +35,7 @@ pub fn max_angle<'a>(rays: impl Iterator<Item = &'a Ray>, point: &Vector3<f64>) 
     if directions.len() > MAX_DIRECTIONS {
         let mean = directions.iter().sum::<Vector3<f64>>() / directions.len() as f64;
         let far = |direction: &Vector3<f64>| (direction - mean).norm_squared();
-        directions.sort_by(|a, b| far(b).total_cmp(&far(a)));
+        directions.select_nth_unstable_by(MAX_DIRECTIONS, |a, b| far(b).total_cmp(&far(a)));
         directions.truncate(MAX_DIRECTIONS);
     }
     let mut chord2 = 0.0_f64;
