@@ -103,7 +103,7 @@ struct Schedule {
 /// For all images of a scene.
 const WHOLE: Schedule = Schedule { sessions: 3, rounds: 4, handovers: 3 };
 /// For the keyframes of a large one.
-const KEYFRAMES: Schedule = Schedule { sessions: 1, ..WHOLE };
+const KEYFRAMES: Schedule = Schedule { sessions: 1, handovers: 1, ..WHOLE };
 /// For all its images, when labels competed in the keyframes.
 const REFINING: Schedule = Schedule { sessions: 1, rounds: 2, handovers: 0 };
 
