@@ -62,7 +62,13 @@ impl Ray {
     #[inline]
     #[must_use]
     pub fn linearize(&self, point: &Vector3<f64>) -> Option<([f64; 2], [RowVector3<f64>; 2])> {
-        let p = self.project(point);
+        self.linearize_at(&self.project(point))
+    }
+
+    /// The same of a point with this `(a, b, c)`.
+    #[inline]
+    #[must_use]
+    pub fn linearize_at(&self, p: &Vector3<f64>) -> Option<([f64; 2], [RowVector3<f64>; 2])> {
         if !(p.z > 0.0) {
             return None;
         }

@@ -9,9 +9,9 @@
 
 use std::ops::Range;
 
-use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Rotation3, SMatrix, Vector2, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix3, Rotation3, SMatrix, Vector2, Vector3};
 
-use super::noise::{Noise, Sigmas};
+use super::noise::{Noise, Sigmas, Spread};
 use super::scene::Scene;
 use super::spd::{Inverse, Matrix6, Vector6, scaled};
 use crate::ray::Ray;
@@ -50,11 +50,48 @@ pub struct Look {
     pub driven_m: f64,
 }
 
-impl Look {
-    /// The look of a ray at one of some labels, which is at `point`; nothing if that is behind it.
+/// From where one looks: a ray with all that is known of its image and its detection, side by side in memory.
+#[derive(Debug, Clone)]
+pub struct Vantage {
+    ray: Ray,
+    image: u32,
+    driven_m: f64,
+    drift_sigma: Sigmas,
+    own_sigma: Sigmas,
+    detection_px2: f64,
+    /// Of all errors but the drift.
+    spread: Spread,
+    /// Measured range with its standard deviation, m; NaN where there is none.
+    pub range_m: [f64; 2],
+}
+
+impl Vantage {
+    /// That of a ray.
     #[must_use]
-    pub fn of(scene: &Scene, noise: &Noise, ray: u32, label: usize, point: &Vector3<f64>) -> Option<Self> {
-        Self::of_ray(scene, noise, scene.ray(ray), ray, label, point)
+    pub fn of(scene: &Scene, noise: &Noise, ray: u32) -> Self {
+        let view = scene.view(ray);
+        Self {
+            ray: *scene.ray(ray),
+            image: scene.rays.image[ray as usize],
+            driven_m: view.driven_m,
+            drift_sigma: noise.shared(view),
+            own_sigma: noise.of_image(view),
+            detection_px2: noise.detection_px2(scene, ray),
+            spread: noise.own(scene, ray),
+            range_m: [scene.range_m[ray as usize], scene.range_sigma_m[ray as usize]],
+        }
+    }
+
+    /// The camera centre, m.
+    #[must_use]
+    pub fn center(&self) -> &Vector3<f64> {
+        &self.ray.center
+    }
+
+    /// The look at one of some labels, which is at `point`; nothing if that is behind it.
+    #[must_use]
+    pub fn look(&self, label: usize, point: &Vector3<f64>) -> Option<Look> {
+        self.look_along(&self.ray, label, point)
     }
 
     /// The same with its derivatives where its image probably was, whose pose error is about `error`, m and rad.
@@ -62,44 +99,45 @@ impl Look {
     /// Derivatives at the measured poses are wrong in the same way as the residuals are: what both have in common
     /// moves a label away from the cameras, however many look at it.
     #[must_use]
-    pub fn where_it_was(
-        scene: &Scene,
-        noise: &Noise,
-        ray: u32,
-        label: usize,
-        point: &Vector3<f64>,
-        error: &Vector6,
-    ) -> Option<Self> {
+    pub fn look_where_it_was(&self, label: usize, point: &Vector3<f64>, error: &Vector6) -> Option<Look> {
         let (shift, turn) = (error.fixed_rows::<3>(0), error.fixed_rows::<3>(3));
-        let measured = scene.ray(ray);
         let turn = Rotation3::from_scaled_axis(turn.into_owned());
         let probable = Ray {
-            residual_from_world: measured.residual_from_world * turn.inverse(),
-            center: measured.center + shift,
-            direction: turn * measured.direction,
+            residual_from_world: self.ray.residual_from_world * turn.inverse(),
+            center: self.ray.center + shift,
+            direction: turn * self.ray.direction,
         };
-        let mut look = Self::of_ray(scene, noise, &probable, ray, label, point)?;
+        let mut look = self.look_along(&probable, label, point)?;
         look.shift(error);
         Some(look)
     }
 
-    fn of_ray(scene: &Scene, noise: &Noise, seen: &Ray, ray: u32, label: usize, point: &Vector3<f64>) -> Option<Self> {
-        let view = scene.view(ray);
-        let (residual, rows) = seen.linearize(point)?;
-        let away = point - seen.center;
+    #[inline]
+    fn look_along(&self, ray: &Ray, label: usize, point: &Vector3<f64>) -> Option<Look> {
+        let projected = ray.project(point);
+        let (residual, rows) = ray.linearize_at(&projected)?;
+        let away = point - ray.center;
         let by_point = rows.map(|row| row.transpose());
-        Some(Self {
+        Some(Look {
             label,
-            image: scene.rays.image[ray as usize],
+            image: self.image,
             residual,
             by_point,
             by_turn: by_point.map(|column| away.cross(&column)),
-            drift_sigma: noise.shared(view),
-            own_sigma: noise.of_image(view),
-            detection_px2: noise.detection_px2(scene, ray),
-            variance: noise.own(scene, ray).variance(seen.project(point).z),
-            driven_m: view.driven_m,
+            drift_sigma: self.drift_sigma,
+            own_sigma: self.own_sigma,
+            detection_px2: self.detection_px2,
+            variance: self.spread.variance(projected.z),
+            driven_m: self.driven_m,
         })
+    }
+}
+
+impl Look {
+    /// The look of a ray at one of some labels, which is at `point`; nothing if that is behind it.
+    #[must_use]
+    pub fn of(scene: &Scene, noise: &Noise, ray: u32, label: usize, point: &Vector3<f64>) -> Option<Self> {
+        Vantage::of(scene, noise, ray).look(label, point)
     }
 
     /// The look as if its image had its own error for this label alone: less than what is known, and much quicker.
@@ -141,10 +179,15 @@ impl Look {
     /// to. `left` is the residual without the drift, px; `covariance` that of the point if the drift were known, m².
     #[must_use]
     pub fn studentised(&self, left: &Vector2<f64>, covariance: &Matrix3<f64>, weight: f64) -> f64 {
-        let pull = |i: usize, k: usize| weight * self.by_point[i].dot(&(covariance * self.by_point[k]));
-        let pulled = Matrix2::new(pull(0, 0), pull(0, 1), pull(1, 0), pull(1, 1));
-        let expected = Matrix2::from_diagonal_element(self.variance * (1.0 + LEAST_FREEDOM)) - pulled;
-        expected.cholesky().map_or(f64::INFINITY, |cholesky| left.dot(&cholesky.solve(left)))
+        let moved = self.by_point.map(|column| covariance * column * weight);
+        let pull = |i: usize, k: usize| self.by_point[i].dot(&moved[k]);
+        let free = self.variance * (1.0 + LEAST_FREEDOM);
+        let (x, y, both) = (free - pull(0, 0), free - pull(1, 1), pull(0, 1));
+        let determinant = x * y - both * both;
+        if !(x > 0.0 && determinant > 0.0) {
+            return f64::INFINITY;
+        }
+        (y * left.x * left.x + 2.0 * both * left.x * left.y + x * left.y * left.y) / determinant
     }
 }
 
@@ -262,19 +305,21 @@ impl<'a> Drive<'a> {
     /// Residuals, px, after the most probable drift is taken out, in the order of the looks.
     #[must_use]
     pub fn left(&self) -> Vec<Vector2<f64>> {
-        self.looks.iter().zip(self.drifts()).map(|(look, drift)| look.without(&drift)).collect()
+        let mut left = Vec::with_capacity(self.looks.len());
+        for (leg, drift) in self.legs.iter().zip(self.drifts()) {
+            let looks = &self.looks[leg.looks.clone()];
+            left.extend(looks.iter().map(|look| look.without(&drift.component_mul(&look.drift_sigma.each()))));
+        }
+        left
     }
 
-    /// The most probable drift at each look, m and rad.
+    /// The most probable drift on each leg, in sigmas.
     fn drifts(&self) -> Vec<Vector6> {
-        let mut drifts = vec![Vector6::zeros(); self.looks.len()];
-        let mut drift_of_next = Vector6::zeros();
-        for leg in self.legs.iter().rev() {
-            let drift = leg.information.matrix * (drift_of_next * leg.tie + leg.gradient);
-            for i in leg.looks.clone() {
-                drifts[i] = drift.component_mul(&self.looks[i].drift_sigma.each());
-            }
-            drift_of_next = drift;
+        let mut drifts = vec![Vector6::zeros(); self.legs.len()];
+        let mut of_next = Vector6::zeros();
+        for (leg, drift) in self.legs.iter().zip(&mut drifts).rev() {
+            *drift = leg.information.matrix * (of_next * leg.tie + leg.gradient);
+            of_next = *drift;
         }
         drifts
     }
@@ -282,7 +327,12 @@ impl<'a> Drive<'a> {
     /// The most probable pose error of the image of each look, drift and its own, m and rad.
     #[must_use]
     pub fn pose_errors(&self, weights: &[f64]) -> Vec<Vector6> {
-        let mut errors = self.drifts();
+        let drifts = self.legs.iter().zip(self.drifts());
+        let of_leg = |(leg, drift): (&Solved, Vector6)| {
+            let looks = self.looks[leg.looks.clone()].iter();
+            looks.map(move |look| drift.component_mul(&look.drift_sigma.each()))
+        };
+        let mut errors: Vec<Vector6> = drifts.flat_map(of_leg).collect();
         let mut at = 0;
         for image in self.looks.chunk_by(|a, b| a.image == b.image) {
             let own = image[0].own_sigma.each();

@@ -7,7 +7,7 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector2, Vector3};
 
-use super::drift::{Drive, Look, Normals};
+use super::drift::{Drive, Look, Normals, Vantage};
 use super::noise::Noise;
 use super::scene::{Scene, View};
 use super::spd::Vector6;
@@ -106,9 +106,10 @@ pub struct Limits {
 #[derive(Clone)]
 pub struct Joint<'a> {
     scene: &'a Scene,
-    noise: &'a Noise,
     /// Label and ray of each vote, by visit and image.
     votes: Vec<(usize, u32)>,
+    /// From where each is cast.
+    vantages: Vec<Vantage>,
     weights: Vec<f64>,
     /// The most probable pose error of the image of each vote, m and rad.
     pose_errors: Vec<Vector6>,
@@ -138,8 +139,9 @@ impl<'a> Joint<'a> {
         }
         counted.sort_by_key(|&((label, ray), _)| (scene.view(ray).pass, ray, label));
         let pose_errors = vec![Vector6::zeros(); counted.len()];
+        let vantages = counted.iter().map(|&((_, ray), _)| Vantage::of(scene, noise, ray)).collect();
         let (votes, weights) = counted.into_iter().unzip();
-        Self { scene, noise, votes, weights, pose_errors, points, care }
+        Self { scene, votes, vantages, weights, pose_errors, points, care }
     }
 
     /// Estimate the positions. Labels without votes stay where they are.
@@ -208,6 +210,7 @@ impl<'a> Joint<'a> {
 
     fn leave_out(&mut self, leaves: &[bool]) {
         retain(&mut self.votes, leaves);
+        retain(&mut self.vantages, leaves);
         retain(&mut self.weights, leaves);
         retain(&mut self.pose_errors, leaves);
     }
@@ -230,14 +233,13 @@ impl<'a> Joint<'a> {
     }
 
     fn evaluate(&self) -> Option<Evaluation> {
-        let (scene, noise) = (self.scene, self.noise);
         // Not collected: an iterator of options does not say how many there will be.
         let mut looks = Vec::with_capacity(self.votes.len());
-        for (&(label, ray), error) in self.votes.iter().zip(&self.pose_errors) {
+        for ((&(label, _), vantage), error) in self.votes.iter().zip(&self.vantages).zip(&self.pose_errors) {
             let point = &self.points[label];
             looks.push(match self.care {
-                Care::Rough => Look::of(scene, noise, ray, label, point)?.by_itself(),
-                Care::Exact => Look::where_it_was(scene, noise, ray, label, point, error)?,
+                Care::Rough => vantage.look(label, point)?.by_itself(),
+                Care::Exact => vantage.look_where_it_was(label, point, error)?,
             });
         }
         let mut normals = Normals::nothing(self.points.len());
@@ -271,8 +273,8 @@ impl<'a> Joint<'a> {
             alone.into_iter().map(|alone| Some(alone.cholesky()?.inverse())).collect::<Option<_>>()?;
         let own = looks.iter().zip(&self.weights).zip(&left);
         let own = own.map(|((look, weight), left)| look.studentised(left, &alone[look.label], *weight)).collect();
-        for &(label, ray) in &self.votes {
-            if let Some((information, gradient)) = range_terms(self.scene, ray, &self.points[label]) {
+        for (&(label, _), vantage) in self.votes.iter().zip(&self.vantages) {
+            if let Some((information, gradient)) = range_terms(vantage, &self.points[label]) {
                 normals.add(label, label, &information);
                 normals.add_gradient(label, &gradient);
             }
@@ -393,10 +395,10 @@ pub fn estimate(scene: &Scene, noise: &Noise, voters: &[u32], start: Vector3<f64
 }
 
 /// Information and gradient of a measured range: one more observation of its voter, along the viewing direction.
-fn range_terms(scene: &Scene, ray: u32, point: &Vector3<f64>) -> Option<(Matrix3<f64>, Vector3<f64>)> {
-    let (range, sigma) = (scene.range_m[ray as usize], scene.range_sigma_m[ray as usize]);
+fn range_terms(vantage: &Vantage, point: &Vector3<f64>) -> Option<(Matrix3<f64>, Vector3<f64>)> {
+    let [range, sigma] = vantage.range_m;
     (range.is_finite() && sigma.is_finite()).then(|| {
-        let away = point - scene.ray(ray).center;
+        let away = point - vantage.center();
         let direction = away.normalize();
         let residual = (away.norm() - range) / sigma;
         let weight = (HUBER_SIGMAS / residual.abs()).min(1.0) / sigma;

@@ -27,7 +27,7 @@ pub fn quick_estimate(scene: &Scene, spreads: &[Spread], voters: &[u32], start: 
         for &voter in voters {
             let (ray, spread) = (scene.ray(voter), &spreads[voter as usize]);
             let projected = ray.project(&point);
-            let (residual, rows) = ray.linearize(&point)?;
+            let (residual, rows) = ray.linearize_at(&projected)?;
             let robust = (HUBER_CHI2 / chi2(&projected, spread)).sqrt().min(1.0);
             let weight = robust / spread.variance(projected.z);
             for (r, row) in residual.into_iter().zip(rows) {
