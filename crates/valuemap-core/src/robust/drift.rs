@@ -360,23 +360,35 @@ impl Leg {
     /// Add a look whose image has no error that it shares with others.
     fn add(&mut self, look: &Look, robust_weight: f64, normals: &mut Normals) {
         let weight = robust_weight / look.detection_px2;
-        let (mut of_label, mut by_label) = (Matrix3::zeros(), Vector3::zeros());
-        let drift = look.drift_sigma.each();
-        let mut cross = Matrix3x6::zeros();
+        let Sigmas { position_m, rotation_rad } = look.drift_sigma;
+        // Positions of label and image move a residual alike: three blocks make up all products.
+        let (mut of_shift, mut of_both, mut of_turn) = (Matrix3::zeros(), Matrix3::zeros(), Matrix3::zeros());
+        let (mut by_shift, mut by_turn) = (Vector3::zeros(), Vector3::zeros());
         for axis in 0..2 {
-            let (r, column) = (look.residual[axis], look.by_point[axis]);
-            let shared = look.by_pose(axis).component_mul(&drift);
-            let (weighted, weighted_shared) = (column * weight, shared * weight);
-            of_label += column * weighted.transpose();
-            by_label += weighted * r;
-            self.information += shared * weighted_shared.transpose();
-            self.gradient += weighted_shared * r;
-            cross += column * weighted_shared.transpose();
+            let (r, shift, turn) = (look.residual[axis], look.by_point[axis], look.by_turn[axis]);
+            let (weighted_shift, weighted_turn) = (shift * weight, turn * weight);
+            of_shift += weighted_shift * shift.transpose();
+            of_both += weighted_shift * turn.transpose();
+            of_turn += weighted_turn * turn.transpose();
+            by_shift += weighted_shift * r;
+            by_turn += weighted_turn * r;
             normals.square += r * r * weight;
         }
-        normals.add(look.label, look.label, &of_label);
-        normals.add_gradient(look.label, &by_label);
+        normals.add(look.label, look.label, &of_shift);
+        normals.add_gradient(look.label, &by_shift);
+        let mut cross = Matrix3x6::zeros();
+        cross.fixed_columns_mut::<3>(0).copy_from(&(of_shift * position_m));
+        cross.fixed_columns_mut::<3>(3).copy_from(&(of_both * rotation_rad));
         self.add_cross(look.label, &cross);
+        let both = of_both * (position_m * rotation_rad);
+        let mut information = Matrix6::zeros();
+        information.fixed_view_mut::<3, 3>(0, 0).copy_from(&(of_shift * (position_m * position_m)));
+        information.fixed_view_mut::<3, 3>(0, 3).copy_from(&both);
+        information.fixed_view_mut::<3, 3>(3, 0).copy_from(&both.transpose());
+        information.fixed_view_mut::<3, 3>(3, 3).copy_from(&(of_turn * (rotation_rad * rotation_rad)));
+        self.information += information;
+        let (shift, turn) = (by_shift * position_m, by_turn * rotation_rad);
+        self.gradient += Vector6::new(shift.x, shift.y, shift.z, turn.x, turn.y, turn.z);
     }
 
     /// Add the looks of one image, its own error taken out.

@@ -40,6 +40,8 @@ pub struct RayIndex<'a> {
 struct Place {
     origin: Vector3<f64>,
     rays: Vec<u32>,
+    /// Their classes.
+    classes: Vec<u32>,
     gates: Gates,
 }
 
@@ -117,8 +119,9 @@ impl<'a> RayIndex<'a> {
                 let bits_of = |point: usize| maybe[point * words + word];
                 let any = (0..points.len()).fold(0, |any, point| any | bits_of(point));
                 for bit in ones(any) {
-                    let ray = place.rays[word * LANES + bit as usize];
-                    if self.scene.rays.class[ray as usize] == class {
+                    let lane = word * LANES + bit as usize;
+                    if place.classes[lane] == class {
+                        let ray = place.rays[lane];
                         let of_ray = (0..points.len()).filter(|&point| bits_of(point) >> bit & 1 == 1);
                         let of_ray = of_ray.filter_map(|point| self.hit(ray, &points[point], range_m));
                         hits.extend(of_ray.min_by(|a, b| a.chi2.total_cmp(&b.chi2)));
@@ -145,7 +148,8 @@ impl Place {
                 .zip(rays.iter().zip(&local))
                 .map(|(lane, (&r, ray))| (lane, ray, spreads[r as usize].gate(gate_sigmas))),
         );
-        Self { origin, rays, gates }
+        let classes = rays.iter().map(|&ray| scene.rays.class[ray as usize]).collect();
+        Self { origin, rays, classes, gates }
     }
 }
 
