@@ -148,6 +148,26 @@ impl Look {
         self
     }
 
+    /// The look, which counts with a weight, with the error that its image has for itself added to the detection's: mixed so that
+    /// both residuals are independent, with variance 1. Only for the one look of an image; nothing if numbers overflow.
+    fn whitened(&self, weight: f64) -> Option<Self> {
+        let own = self.own_sigma.each();
+        let scaled = [0, 1].map(|axis| self.by_pose(axis).component_mul(&own));
+        let detection = self.detection_px2 / weight;
+        let first = (detection + scaled[0].norm_squared()).sqrt();
+        let tie = scaled[0].dot(&scaled[1]) / first;
+        let second = (detection + scaled[1].norm_squared() - tie * tie).sqrt();
+        let mut white = self.clone();
+        white.residual[0] /= first;
+        white.by_point[0] /= first;
+        white.by_turn[0] /= first;
+        white.residual[1] = (self.residual[1] - tie * white.residual[0]) / second;
+        white.by_point[1] = (self.by_point[1] - white.by_point[0] * tie) / second;
+        white.by_turn[1] = (self.by_turn[1] - white.by_turn[0] * tie) / second;
+        white.detection_px2 = 1.0;
+        (first * second > 0.0).then_some(white)
+    }
+
     /// The look with a pose error, m and rad, taken out that is known but for some remainder, which then is the drift.
     #[must_use]
     pub fn with_drift(mut self, error: &Vector6, remainder: Sigmas) -> Self {
@@ -393,6 +413,12 @@ impl Leg {
 
     /// Add the looks of one image, its own error taken out.
     fn add_image(&mut self, looks: &[Look], weights: &[f64], normals: &mut Normals) {
+        if let ([look], [weight]) = (looks, weights) {
+            if let Some(look) = look.whitened(*weight) {
+                self.add(&look, 1.0, normals);
+            }
+            return;
+        }
         let (mut of_pose, mut gradient) = (Matrix6::zeros(), Vector6::zeros());
         let mut crosses: Vec<(usize, Matrix3x6)> = Vec::with_capacity(looks.len());
         for (look, robust_weight) in looks.iter().zip(weights) {
