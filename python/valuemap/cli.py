@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import sys
@@ -84,6 +85,7 @@ Settings = Annotated[
 
 def main() -> None:
     """Run the command line."""
+    gc.freeze()  # What was imported stays: looking through it for garbage, at the end too, takes a tenth of a second.
     app()
 
 

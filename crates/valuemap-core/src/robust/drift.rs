@@ -355,25 +355,37 @@ impl<'a> Drive<'a> {
         let mut errors: Vec<Vector6> = drifts.flat_map(of_leg).collect();
         let mut at = 0;
         for image in self.looks.chunk_by(|a, b| a.image == b.image) {
-            let own = image[0].own_sigma.each();
-            let (mut of_pose, mut gradient) = (Matrix6::zeros(), Vector6::zeros());
-            for (i, look) in image.iter().enumerate() {
-                let left = look.without(&errors[at + i]);
-                for axis in 0..2 {
-                    let pose = look.by_pose(axis);
-                    let weighted = pose * (weights[at + i] / look.detection_px2);
-                    of_pose += pose * weighted.transpose();
-                    gradient += weighted * left[axis];
-                }
-            }
-            if let Some(known) = Inverse::of(&(Matrix6::identity() + scaled(&of_pose, &own))) {
-                let of_image = own.component_mul(&(known.matrix * own.component_mul(&gradient)));
-                errors[at..at + image.len()].iter_mut().for_each(|error| *error += of_image);
+            let range = at..at + image.len();
+            if let Some(of_image) = own_error(image, &weights[range.clone()], &errors[at]) {
+                errors[range].iter_mut().for_each(|error| *error += of_image);
             }
             at += image.len();
         }
         errors
     }
+}
+
+/// The most probable error that an image has for itself if its drift is as said, m and rad; nothing if numbers overflow.
+fn own_error(looks: &[Look], weights: &[f64], drift: &Vector6) -> Option<Vector6> {
+    let own = looks[0].own_sigma.each();
+    if let ([look], [weight]) = (looks, weights) {
+        let white = look.whitened(*weight)?;
+        let left = white.without(drift);
+        let gradient = white.by_pose(0) * left.x + white.by_pose(1) * left.y;
+        return Some(own.component_mul(&own.component_mul(&gradient)));
+    }
+    let (mut of_pose, mut gradient) = (Matrix6::zeros(), Vector6::zeros());
+    for (look, weight) in looks.iter().zip(weights) {
+        let left = look.without(drift);
+        for axis in 0..2 {
+            let pose = look.by_pose(axis);
+            let weighted = pose * (weight / look.detection_px2);
+            of_pose += pose * weighted.transpose();
+            gradient += weighted * left[axis];
+        }
+    }
+    let known = Inverse::of(&(Matrix6::identity() + scaled(&of_pose, &own)))?;
+    Some(own.component_mul(&(known.matrix * own.component_mul(&gradient))))
 }
 
 impl Leg {
