@@ -29,7 +29,7 @@ def main() -> None:
     """Run the benchmark and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--method", choices=["robust", "paper"], default="robust")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(10)))
     parser.add_argument("--passes", type=int, nargs="+", default=[2, 6, 20])
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     options = parser.parse_args()

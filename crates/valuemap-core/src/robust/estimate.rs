@@ -41,7 +41,7 @@ impl Care {
     /// Estimates are done when a step is shorter than this, in sigmas, root mean square of the labels.
     fn tolerance_sigmas(self) -> f64 {
         match self {
-            Self::Rough => 0.1,
+            Self::Rough => 0.05,
             Self::Exact => 0.03,
         }
     }
