@@ -9,6 +9,7 @@ use std::f64::consts::FRAC_PI_2;
 use nalgebra::{Isometry3, Point3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;
+use valuemap_core::progress::Progress;
 use valuemap_core::robust::associate::Association;
 use valuemap_core::robust::contest::Contest;
 use valuemap_core::robust::estimate::{Care, Joint, Limits, Start};
@@ -43,6 +44,29 @@ fn after_handover(scene: &Scene, noise: &Noise, labels: Vec<Label>) -> (Vec<Labe
 
 proptest! {
     #![proptest_config(config())]
+
+    /// Neighbors that have just exchanged votes keep few of them.
+    #[test]
+    fn what_a_label_wins_is_not_undecided_for_a_neighbor_that_had_more_votes_before(
+        object in object(), errors in errors_px()
+    ) {
+        let scene = street(60, 1.0, &[object], &errors);
+        let rays = rays_of(&scene, &object);
+        prop_assume!(rays.len() >= 25);
+        let all = label(&scene, rays, object);
+        let with = |voters: std::ops::Range<usize>, point: Vector3<f64>| {
+            let mut label = all.clone();
+            (label.voters, label.weights) = (all.voters[voters.clone()].to_vec(), vec![1.0; voters.len()]);
+            label.estimate.point = point;
+            label
+        };
+        let labels = vec![with(0..4, object), with(4..12, object + Vector3::new(0.0, 0.0, 0.15))];
+        let spreads = spreads_of(&scene, &DRIFTING);
+        let index = RayIndex::new(&scene, &spreads, GATE_SIGMAS, 0..scene.rays.rays.len() as u32);
+        let found = Association::new(&scene, &DRIFTING, index, 150.0).associate(labels, &Progress::default()).unwrap();
+        prop_assume!(found[0].voters.len() >= 15);
+        prop_assert!(2 * found[0].undecided.len() < found[0].voters.len());
+    }
 
     #[test]
     fn keyframes_are_one_image_of_each_stretch_and_camera(

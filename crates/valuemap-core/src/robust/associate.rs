@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::estimate::Estimate;
-use super::grant::{Case, Claim, Decision, Fit, belief_of_votes, grant, overrule, report};
+use super::grant::{Case, Claim, Decision, Fit, belief_of_votes, grant, granted, overrule, report};
 use super::index::{Hit, RayIndex, chi2_in_gate};
 use super::label::{Label, fingerprint};
 use super::noise::Noise;
@@ -195,9 +195,15 @@ impl<'a> Association<'a> {
         let mut fits: Vec<Vec<Fit>> = run.images.iter().enumerate().map(judge).collect::<Result<_, Halt>>()?;
         let overruled = run.overruled(&fits, progress)?;
         let mut decisions = Vec::new();
+        // What neighbors have just exchanged says little of how many votes each will have.
+        let mut votes: FxHashMap<u32, usize> = FxHashMap::default();
         for (cases, fits) in run.images.iter().zip(&mut fits) {
             overrule(cases, fits, &overruled, limit);
-            report(cases, fits, labels, limit, &mut decisions);
+            granted(cases, fits).for_each(|claim| *votes.entry(claim.label).or_default() += 1);
+        }
+        let votes_of = |label: u32| labels[label as usize].voters.len().max(votes.get(&label).copied().unwrap_or(0));
+        for (cases, fits) in run.images.iter().zip(&fits) {
+            report(cases, fits, &votes_of, limit, &mut decisions);
         }
         let (first, end) = run.own_legs;
         let of_legs = run.of_legs[first - run.first_leg..end - run.first_leg].to_vec();

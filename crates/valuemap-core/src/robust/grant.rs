@@ -134,14 +134,25 @@ pub(super) fn overrule(cases: &[Case<'_>], fits: &mut [Fit], overruled: &FxHashS
     }
 }
 
-/// Say which claims of one image are granted, and which labels it says nothing about.
-pub(super) fn report(cases: &[Case<'_>], fits: &[Fit], labels: &[Label], limit: f64, decisions: &mut Vec<Decision>) {
-    let strength = |label: u32| (labels[label as usize].voters.len(), std::cmp::Reverse(label));
-    let granted = || cases.iter().zip(fits).filter(|(_, fit)| fit.granted).map(|(case, _)| case.claim);
-    let is_idle = |label: u32| !granted().any(|claim| claim.label == label);
+/// The claims of one image that are granted, by label.
+pub(super) fn granted<'c>(cases: &'c [Case<'c>], fits: &'c [Fit]) -> impl Iterator<Item = &'c Claim> {
+    cases.iter().zip(fits).filter(|(_, fit)| fit.granted).map(|(case, _)| case.claim)
+}
+
+/// Say which claims of one image are granted, and which labels it says nothing about; `votes_of` is how many votes a label
+/// has, this image and others.
+pub(super) fn report(
+    cases: &[Case<'_>],
+    fits: &[Fit],
+    votes_of: &dyn Fn(u32) -> usize,
+    limit: f64,
+    decisions: &mut Vec<Decision>,
+) {
+    let strength = |label: u32| (votes_of(label), std::cmp::Reverse(label));
+    let is_idle = |label: u32| !granted(cases, fits).any(|claim| claim.label == label);
     let open = cases.iter().zip(fits).filter(|(_, fit)| fit.cost < limit).map(|(case, _)| case.claim);
     let idle: Vec<&Claim> = open.filter(|claim| is_idle(claim.label)).collect();
-    for &Claim { image, label, ray, .. } in granted() {
+    for &Claim { image, label, ray, .. } in granted(cases, fits) {
         decisions.push(Decision::Vote { label, ray });
         if idle.iter().any(|other| other.ray == ray && strength(other.label) > strength(label)) {
             decisions.push(Decision::Undecided { label, image });

@@ -7,7 +7,7 @@ use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::associate::Run;
 use super::drift::{Drive, Look};
-use super::grant::{Case, Fit, belief_of_votes};
+use super::grant::{Fit, belief_of_votes, granted};
 use super::noise::Sigmas;
 use super::poses::{LEGS_AROUND, PoseError, smooth};
 use crate::progress::{Halt, Progress};
@@ -37,7 +37,7 @@ impl Run<'_> {
             return Ok(FxHashSet::default());
         }
         for (cases, fits) in self.images.iter().zip(fits) {
-            let granted: Vec<u32> = granted(cases, fits).collect();
+            let granted: Vec<u32> = granted(cases, fits).map(|claim| claim.label).collect();
             for (k, &a) in granted.iter().enumerate() {
                 for &b in &granted[k + 1..] {
                     rivalries.entry((a, b)).and_modify(|rivalry| rivalry.both += 1);
@@ -69,7 +69,7 @@ impl Run<'_> {
         let mut rivalries: FxHashMap<(u32, u32), Rivalry> = FxHashMap::default();
         for (i, (cases, fits)) in self.images.iter().zip(fits).enumerate() {
             progress.check()?;
-            let is_shown = |label: u32| granted(cases, fits).any(|granted| granted == label);
+            let is_shown = |label: u32| granted(cases, fits).any(|claim| claim.label == label);
             let open = cases.iter().zip(fits).filter(|(_, fit)| fit.cost < limit).map(|(case, _)| case.claim);
             for (k, a) in open.clone().enumerate() {
                 for b in open.clone().skip(k + 1).filter(|b| b.ray == a.ray) {
@@ -121,9 +121,4 @@ impl Run<'_> {
         };
         joint().unwrap_or(f64::INFINITY)
     }
-}
-
-/// The labels that one image shows, ascending.
-fn granted<'f>(cases: &'f [Case<'_>], fits: &'f [Fit]) -> impl Iterator<Item = u32> + 'f {
-    cases.iter().zip(fits).filter(|(_, fit)| fit.granted).map(|(case, _)| case.claim.label)
 }
