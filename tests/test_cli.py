@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,20 @@ def test_from_simulation_to_export(tmp_path: Path) -> None:
     header = (tmp_path / "labels.csv").read_text().splitlines()[0].split(",")
     assert {"label_id", "class", "x", "y", "z", "votes", "passes"} <= set(header)
     assert json.loads(works("info", result, "--json"))["labels"] == run_record["counts"]["labels"]
+
+
+def test_the_version_is_told_by_every_way_to_start() -> None:
+    told = works("--version")
+    assert told == f"valuemap {version('valuemap')}\n"
+    for module in ("valuemap", "valuemap.cli"):
+        command = [sys.executable, "-m", module, "--version"]
+        assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == told
+
+
+def test_commands_are_shown_in_the_order_of_use() -> None:
+    told = works("--help")
+    places = [told.index(f"│ {name} ") for name in ("import", "detect", "map", "evaluate", "export", "demo")]
+    assert places == sorted(places)
 
 
 def test_json_of_a_map_is_its_record(street: Path, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 import valuemap
 from valuemap import demo
-from valuemap.cli import app
+from valuemap.cli.commands import app
 
 
 def test_the_demo_goes_from_pictures_to_a_map(

@@ -1,0 +1,63 @@
+"""The application that every command adds itself to, and how its errors come out."""
+
+from __future__ import annotations
+
+import sys
+from importlib.metadata import version
+from typing import Annotated, Any
+
+import typer
+import typer.core
+
+from valuemap.errors import ValuemapError
+
+INTERRUPTED = 130
+
+
+class _Commands(typer.core.TyperGroup):
+    """Commands in the order of use, whose errors come out as one line and a hint, and a status that is not 0."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        from valuemap.cli.commands import COMMANDS  # It imports this module.
+
+        order = {module.strip("_").replace("_", "-"): place for place, module in enumerate(COMMANDS)}
+        return sorted(super().list_commands(ctx), key=order.__getitem__)
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except ValuemapError as error:
+            complain(f"error: {error}", error.hint)
+            sys.exit(1)
+        except KeyboardInterrupt:
+            complain("interrupted: nothing was written", "run the same command again to start over")
+            sys.exit(INTERRUPTED)
+
+
+def complain(message: str, hint: str) -> None:
+    """Print one line and a hint on stderr."""
+    print(message, file=sys.stderr)
+    print(f"hint: {hint}", file=sys.stderr)
+
+
+app = typer.Typer(
+    cls=_Commands,
+    no_args_is_help=True,
+    add_completion=True,
+    pretty_exceptions_enable=False,
+)
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        print(f"valuemap {version('valuemap')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Many posed street images in, a 3D map of static objects out, with nobody labelling anything."""

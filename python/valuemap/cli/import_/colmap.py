@@ -1,0 +1,41 @@
+"""`valuemap import colmap`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from valuemap import dataset as dataset_folder
+from valuemap.cli.import_.app import finish_dataset, import_app
+from valuemap.cli.options import DatasetOut, Up
+from valuemap.cli.show import progress_bars
+from valuemap.folders import check_place
+
+
+@import_app.command("colmap")
+def import_colmap(
+    model_dir: Annotated[Path, typer.Argument(help="Folder of a COLMAP model, .bin or .txt.")],
+    out: DatasetOut,
+    detections: Annotated[
+        Path | None, typer.Option(help="COCO results or annotations (JSON); without, run valuemap detect afterwards.")
+    ] = None,
+    pass_from: Annotated[
+        str, typer.Option(help="What a pass is: folder (of the image name), none, or a CSV file: image,pass.")
+    ] = "folder",
+    up: Up = None,
+    anchor: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(metavar="LAT LON HEIGHT", help="WGS84 place of the origin of an east-north-up model."),
+    ] = None,
+) -> None:
+    """Import a COLMAP model with detections in COCO format."""
+    from valuemap.readers import READERS
+
+    check_place(out, marker=dataset_folder.MARKER)
+    with progress_bars() as progress:
+        dataset = READERS["colmap"](
+            model_dir, detections=detections, pass_from=pass_from, up=up, anchor=anchor, progress=progress
+        )
+    finish_dataset(dataset, out)

@@ -1,0 +1,40 @@
+"""`valuemap info`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from valuemap import dataset as dataset_folder
+from valuemap import map_folder
+from valuemap.cli.app import app
+from valuemap.cli.options import AsJson
+from valuemap.cli.show import show
+from valuemap.dataset import read_dataset
+from valuemap.errors import InputError
+from valuemap.map_folder import read_map
+from valuemap.summary import summarize_dataset, summarize_map
+
+
+@app.command("info")
+def info_command(
+    folder: Annotated[Path, typer.Argument(metavar="DATASET|MAP", help="Folder of a dataset or a map.")],
+    as_json: AsJson = False,
+) -> None:
+    """Say what a dataset or a map holds."""
+    if (folder / map_folder.MARKER).is_file():
+        facts = summarize_map(read_map(folder))
+    elif (folder / dataset_folder.MARKER).is_file():
+        facts = summarize_dataset(read_dataset(folder))
+    else:
+        raise InputError(
+            f"{folder}: is neither a dataset nor a map",
+            hint=f"a dataset has a {dataset_folder.MARKER}, a map a {map_folder.MARKER}",
+        )
+    if as_json:
+        print(json.dumps(facts, indent=2))
+    else:
+        show(facts)

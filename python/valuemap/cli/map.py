@@ -1,0 +1,42 @@
+"""`valuemap map`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, get_args
+
+import typer
+
+from valuemap import map_folder
+from valuemap.cli.app import app
+from valuemap.cli.options import AsJson, Settings
+from valuemap.cli.show import log, progress_bars, show
+from valuemap.config import MapConfig, Method
+from valuemap.dataset import read_dataset
+from valuemap.folders import check_place
+from valuemap.map_folder import write_map
+from valuemap.pipeline import build_map
+from valuemap.summary import summarize_map
+
+
+@app.command("map", epilog="Settings for --set: see valuemap settings.")
+def map_command(
+    dataset: Annotated[Path, typer.Argument(help="Folder that an import or simulate command wrote.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder to write the map to.")],
+    method: Annotated[str, typer.Option(help=f"One of {', '.join(get_args(Method))}.")] = MapConfig().method,
+    threads: Annotated[int, typer.Option(min=0, help="Threads, 0 for one a core; the map is the same.")] = 0,
+    assignments: Settings = None,
+    as_json: AsJson = False,
+) -> None:
+    """Turn the detections of a dataset into a map of labels."""
+    config = MapConfig(method=method).with_settings(assignments or [])  # type: ignore[arg-type]
+    check_place(out, marker=map_folder.MARKER)
+    with progress_bars() as progress:
+        result = build_map(read_dataset(dataset), config, threads=threads, progress=progress)
+    write_map(result, out)
+    if as_json:
+        print(json.dumps(result.run, indent=2))
+    else:
+        show(summarize_map(result))
+        log.print(f"Wrote {out}", highlight=False)

@@ -1,0 +1,18 @@
+"""Options that several commands have in common."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+DatasetOut = Annotated[Path, typer.Option("--out", help="Folder to write the dataset to.")]
+Up = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option("--up", metavar="X Y Z", help="Direction of the sky; default: the mean of the cameras' own."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON to stdout.")]
+Settings = Annotated[
+    list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a setting; may be repeated.")
+]

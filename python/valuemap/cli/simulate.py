@@ -1,0 +1,48 @@
+"""`valuemap simulate`."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from valuemap import dataset as dataset_folder
+from valuemap.cli.app import INTERRUPTED, app, complain
+from valuemap.cli.import_.app import finish_dataset
+from valuemap.cli.options import DatasetOut, Settings
+from valuemap.cli.show import log, progress_bars
+from valuemap.errors import SettingError
+from valuemap.folders import check_place
+
+
+@app.command("simulate")
+def simulate_command(
+    out: DatasetOut,
+    preset: Annotated[str, typer.Option(help="small, sf or nyc: the sizes of the paper's two data sets.")] = "small",
+    seed: Annotated[int, typer.Option(help="Another seed, another city.")] = 0,
+    images: Annotated[
+        bool, typer.Option("--images", help="Draw the pictures too, with the true boxes in boxes.json.")
+    ] = False,
+    assignments: Settings = None,
+) -> None:
+    """Simulate a city, drives through it and a noisy detector, with truth."""
+    from valuemap.simulate import PRESETS, record_city
+
+    if preset not in PRESETS:
+        raise SettingError(f"--preset {preset}: there is no such preset", hint=f"choose one of {', '.join(PRESETS)}")
+    check_place(out, marker=dataset_folder.MARKER)
+    config = PRESETS[preset].with_settings(assignments or [])
+    with progress_bars() as progress:
+        recording = record_city(config, seed=seed, name=preset, progress=progress)
+    finish_dataset(recording.dataset, out)
+    if images:
+        from valuemap.simulate.render import render_images  # Draws with a library that nothing else here needs.
+
+        try:
+            with progress_bars() as progress:
+                painted = render_images(recording, out, progress=progress)
+        except KeyboardInterrupt:
+            complain("interrupted: the dataset is whole, its pictures are not", "run the same command again")
+            sys.exit(INTERRUPTED)
+        log.print(f"Drew {painted} pictures in {out / 'images'}", highlight=False)
