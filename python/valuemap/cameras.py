@@ -70,24 +70,25 @@ class Rays:
 
 def camera_centers(images: Images) -> Floats:
     """Return the camera centres (N, 3) in metres in the world, -R^T t."""
-    return _centers(rotation_matrices(images), images)
+    return camera_poses(images)[1]
 
 
-def _centers(cam_from_world: Floats, images: Images) -> Floats:
-    centers: Floats = -np.einsum("nji,nj->ni", cam_from_world, images.cam_from_world_m)
-    return centers
+def camera_poses(images: Images) -> tuple[Floats, Floats]:
+    """Return the rotation matrices (N, 3, 3) and the camera centres (N, 3) of images."""
+    cam_from_world = rotation_matrices(images)
+    return cam_from_world, -np.einsum("nji,nj->ni", cam_from_world, images.cam_from_world_m)
 
 
 def rotation_matrices(images: Images) -> Floats:
     """Return R (N, 3, 3) with point_in_cam = R point_in_world + t."""
     rotation = np.empty((len(images), 3, 3))
-    for start in range(0, len(images), _BLOCK):
-        block = slice(start, start + _BLOCK)
-        rotation[block] = _rotation_of(images.cam_from_world_quat[block])
+    for members in _blocks(np.arange(len(images))):
+        rotation[members] = _rotation_of(images.cam_from_world_quat[members])
     return rotation
 
 
 def _rotation_of(quat: Floats) -> Floats:
+    """Return R (N, 3, 3) of quaternions (N, 4)."""
     # Written out, because importing SciPy's rotations takes longer than mapping a small city.
     w, x, y, z = np.ascontiguousarray(quat.T)
     rows = [
@@ -121,14 +122,12 @@ def cast_rays(dataset: Dataset) -> Rays:
             residual_from_cam[members], direction_in_cam[members] = _local_pinholes(
                 camera, detections.center_px[members]
             )
-    cam_from_world = rotation_matrices(images)
     core = _core.Rays(
         residual_from_cam,
         direction_in_cam,
         image_row.astype(np.uint32),
         detections.class_name.codes.astype(np.uint32),
-        cam_from_world,
-        np.ascontiguousarray(_centers(cam_from_world, images)),
+        *camera_poses(images),
     )
     return Rays(core, image_row, camera_row, detections.class_name.codes)
 

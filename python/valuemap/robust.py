@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import valuemap._core as _core
-from valuemap.cameras import Rays, camera_centers, picture_bounds, rotation_matrices
+from valuemap.cameras import Rays, camera_poses, picture_bounds
 from valuemap.config import MapConfig, NoiseConfig
 from valuemap.dataset import Dataset, number_passes, rows_of
 from valuemap.progress import Progress, silent
@@ -62,13 +62,14 @@ class Scene:
         """Everything that was seen, copied once."""
         images, detections = self._dataset.images, self._dataset.detections
         normals, solid_angle_sr = picture_bounds(self._dataset.cameras)
+        cam_from_world, center_in_world_m = camera_poses(images)
         return _core.Scene(
             self._rays.core,
             box_px=np.sqrt(detections.size_px[:, 0] * detections.size_px[:, 1]),
             range_m=_or_nan(detections.range_m, len(detections)),
             range_sigma_m=_or_nan(detections.range_sigma_m, len(detections)),
-            center_in_world_m=np.ascontiguousarray(camera_centers(images)),
-            cam_from_world=rotation_matrices(images),
+            center_in_world_m=center_in_world_m,
+            cam_from_world=cam_from_world,
             camera=rows_of(images.camera_id, self._dataset.cameras.camera_id).astype(np.uint32),
             pass_code=number_passes(images).astype(np.uint32),
             position_sigma_m=_or_nan(images.position_sigma_m, len(images)),

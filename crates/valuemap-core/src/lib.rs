@@ -30,7 +30,7 @@ pub mod triangulate;
 pub mod two_view;
 pub mod vote;
 
-pub use nalgebra::Vector3;
+pub use nalgebra::{SMatrix, Vector3};
 
 /// A 3x3 matrix of its numbers row by row.
 #[must_use]

@@ -3,8 +3,8 @@
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use valuemap_core::Vector3;
 use valuemap_core::vote::Candidate;
+use valuemap_core::{SMatrix, Vector3};
 
 /// Groups of rays: offsets (N + 1) into the members, and the members.
 pub type Groups<'py> = (Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<u32>>);
@@ -15,15 +15,15 @@ pub fn rows_of<'a>(array: &'a PyReadonlyArray2<'_, f64>) -> PyResult<&'a [[f64; 
     if rest.is_empty() { Ok(rows) } else { Err(PyValueError::new_err("expected an array of shape (N, 3)")) }
 }
 
-/// Vectors as the rows of an (N, 3) array.
-pub fn vectors(
+/// Vectors or matrices, column by column, as the rows of an array of shape (N, width).
+pub fn matrix<const ROWS: usize, const COLUMNS: usize>(
     py: Python<'_>,
-    vectors: impl ExactSizeIterator<Item = Vector3<f64>>,
+    matrices: impl ExactSizeIterator<Item = SMatrix<f64, ROWS, COLUMNS>>,
 ) -> PyResult<Bound<'_, PyArray2<f64>>> {
-    let count = vectors.len();
-    let mut rows = Vec::with_capacity(3 * count);
-    vectors.for_each(|vector| rows.extend_from_slice(vector.as_slice()));
-    rows.into_pyarray(py).reshape([count, 3])
+    let (count, width) = (matrices.len(), ROWS * COLUMNS);
+    let mut rows = Vec::with_capacity(count * width);
+    matrices.for_each(|matrix| rows.extend_from_slice(matrix.as_slice()));
+    rows.into_pyarray(py).reshape([count, width])
 }
 
 /// The members of each group.
@@ -60,13 +60,7 @@ pub fn candidates_from(
 
 /// Positions of candidates, (N, 3).
 pub fn points_of<'py>(py: Python<'py>, candidates: &[Candidate]) -> PyResult<Bound<'py, PyArray2<f64>>> {
-    let rows: Vec<Vec<f64>> = candidates.iter().map(|candidate| candidate.point.as_slice().to_vec()).collect();
-    matrix(py, &rows, 3)
-}
-
-/// Rows of equal length as an array of shape (N, width), also where there are none.
-pub fn matrix<'py>(py: Python<'py>, rows: &[Vec<f64>], width: usize) -> PyResult<Bound<'py, PyArray2<f64>>> {
-    if rows.is_empty() { Ok(PyArray2::zeros(py, [0, width], false)) } else { Ok(PyArray2::from_vec2(py, rows)?) }
+    matrix(py, candidates.iter().map(|candidate| candidate.point))
 }
 
 /// Voters of candidates.

@@ -70,20 +70,19 @@ impl Rays {
 
     /// M of every ray in the world, (N, 3, 3).
     fn residual_from_world<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f64>>> {
-        let mut rows = Vec::with_capacity(9 * self.0.rays.len());
-        // Matrices lie column by column.
-        self.0.rays.iter().for_each(|ray| rows.extend_from_slice(ray.residual_from_world.transpose().as_slice()));
-        rows.into_pyarray(py).reshape([self.0.rays.len(), 3, 3])
+        // Column by column.
+        let transposed = self.0.rays.iter().map(|ray| ray.residual_from_world.transpose());
+        arrays::matrix(py, transposed)?.reshape([self.0.rays.len(), 3, 3])
     }
 
     /// The camera centre of every ray in the world, m, (N, 3).
     fn center_in_world_m<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
-        arrays::vectors(py, self.0.rays.iter().map(|ray| ray.center))
+        arrays::matrix(py, self.0.rays.iter().map(|ray| ray.center))
     }
 
     /// The unit direction of every ray in the world, (N, 3).
     fn direction_in_world<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
-        arrays::vectors(py, self.0.rays.iter().map(|ray| ray.direction))
+        arrays::matrix(py, self.0.rays.iter().map(|ray| ray.direction))
     }
 
     fn __len__(&self) -> usize {
@@ -180,15 +179,11 @@ fn unit_covariance<'py>(
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let points = rows_of(&point_in_world_m)?;
     let groups = arrays::split(points.len(), voter_offsets.as_slice()?, voters.as_slice()?)?;
-    let rows: Vec<Vec<f64>> = points
-        .iter()
-        .zip(groups)
-        .map(|(&point, voters)| {
-            let supporters = voters.iter().map(|&ray| &rays.0.rays[ray as usize]);
-            triangulate::unit_covariance(supporters, &point.into()).as_slice().to_vec()
-        })
-        .collect();
-    arrays::matrix(py, &rows, 9)
+    let of_point = |(&point, voters): (&[f64; 3], &[u32])| {
+        let supporters = voters.iter().map(|&ray| &rays.0.rays[ray as usize]);
+        triangulate::unit_covariance(supporters, &point.into())
+    };
+    arrays::matrix(py, points.iter().zip(groups).map(of_point))
 }
 
 /// Reprojection errors (M) in px and metres a pixel (M, 2) of the voters, and the largest angle (N) between them,

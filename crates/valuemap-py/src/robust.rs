@@ -154,8 +154,6 @@ pub fn find_labels<'py>(
         find(&scene.0, &noise_of(noise), &settings, progress)
     })?;
     let labels = || found.findings.iter().map(|finding| &finding.label);
-    let points: Vec<Vec<f64>> = labels().map(|label| label.estimate.point.as_slice().to_vec()).collect();
-    let covariances: Vec<Vec<f64>> = labels().map(|label| label.estimate.covariance.as_slice().to_vec()).collect();
     let mut offsets = vec![0_i64];
     let mut voters: Vec<u32> = Vec::new();
     for label in labels() {
@@ -167,9 +165,9 @@ pub fn find_labels<'py>(
     let existence: Vec<f64> = found.findings.iter().map(|finding| finding.existence).collect();
     let expected: Vec<i64> = found.findings.iter().map(|finding| i64::from(finding.expected)).collect();
     Ok((
-        matrix(py, &points, 3)?,
+        matrix(py, labels().map(|label| label.estimate.point))?,
         (offsets.into_pyarray(py), voters.into_pyarray(py)),
-        matrix(py, &covariances, 9)?,
+        matrix(py, labels().map(|label| label.estimate.covariance))?,
         existence.into_pyarray(py),
         expected.into_pyarray(py),
         counts_of(py, &found)?,

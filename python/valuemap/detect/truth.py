@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from valuemap.cameras import camera_centers, colmap_camera, rotation_matrices
+from valuemap.cameras import camera_poses, colmap_camera
 from valuemap.dataset import rows_of
 from valuemap.tables import Bools, Cameras, Detections, Floats, Images, Ints, Truth, TruthDetections
 
@@ -28,7 +28,7 @@ def find_truth_detections(cameras: Cameras, images: Images, detections: Detectio
     first = np.searchsorted(image_row[order], np.arange(len(images) + 1))
     with_detections = np.flatnonzero(np.diff(first))
     tree = cKDTree(truth.position_in_world_m)
-    rotation, centers = rotation_matrices(images), camera_centers(images)
+    rotation, centers = camera_poses(images)
     same_class = _same_class(detections, truth)
     rows, objects = [], []
     for begin in range(0, len(with_detections), _IMAGES_AT_ONCE):

@@ -134,6 +134,11 @@ pub(super) fn overrule(cases: &[Case<'_>], fits: &mut [Fit], overruled: &FxHashS
     }
 }
 
+/// The claims of one image that fit, by label.
+pub(super) fn open<'c>(cases: &'c [Case<'c>], fits: &'c [Fit], limit: f64) -> impl Iterator<Item = &'c Claim> + Clone {
+    cases.iter().zip(fits).filter(move |(_, fit)| fit.cost < limit).map(|(case, _)| case.claim)
+}
+
 /// The claims of one image that are granted, by label.
 pub(super) fn granted<'c>(cases: &'c [Case<'c>], fits: &'c [Fit]) -> impl Iterator<Item = &'c Claim> {
     cases.iter().zip(fits).filter(|(_, fit)| fit.granted).map(|(case, _)| case.claim)
@@ -150,8 +155,7 @@ pub(super) fn report(
 ) {
     let strength = |label: u32| (votes_of(label), std::cmp::Reverse(label));
     let is_idle = |label: u32| !granted(cases, fits).any(|claim| claim.label == label);
-    let open = cases.iter().zip(fits).filter(|(_, fit)| fit.cost < limit).map(|(case, _)| case.claim);
-    let idle: Vec<&Claim> = open.filter(|claim| is_idle(claim.label)).collect();
+    let idle: Vec<&Claim> = open(cases, fits, limit).filter(|claim| is_idle(claim.label)).collect();
     for &Claim { image, label, ray, .. } in granted(cases, fits) {
         decisions.push(Decision::Vote { label, ray });
         if idle.iter().any(|other| other.ray == ray && strength(other.label) > strength(label)) {

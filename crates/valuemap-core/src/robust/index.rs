@@ -118,15 +118,13 @@ impl<'a> RayIndex<'a> {
             for word in 0..words {
                 let bits_of = |point: usize| maybe[point * words + word];
                 let any = (0..points.len()).fold(0, |any, point| any | bits_of(point));
-                for bit in ones(any) {
-                    let lane = word * LANES + bit as usize;
-                    if place.classes[lane] == class {
-                        let ray = place.rays[lane];
-                        let of_ray = (0..points.len()).filter(|&point| bits_of(point) >> bit & 1 == 1);
-                        let of_ray = of_ray.filter_map(|point| self.hit(ray, &points[point], range_m));
-                        hits.extend(of_ray.min_by(|a, b| a.chi2.total_cmp(&b.chi2)));
-                    }
-                }
+                let lane_of = |bit: u32| word * LANES + bit as usize;
+                let nearest = |bit: u32| {
+                    let near = points.iter().enumerate().filter(|(point, _)| bits_of(*point) >> bit & 1 == 1);
+                    let of_ray = near.filter_map(|(_, point)| self.hit(place.rays[lane_of(bit)], point, range_m));
+                    of_ray.min_by(|a, b| a.chi2.total_cmp(&b.chi2))
+                };
+                hits.extend(ones(any).filter(|&bit| place.classes[lane_of(bit)] == class).filter_map(nearest));
             }
         }
         hits

@@ -7,7 +7,7 @@ use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::associate::Run;
 use super::drift::{Drive, Look};
-use super::grant::{Fit, belief_of_votes, granted};
+use super::grant::{Fit, belief_of_votes, granted, open};
 use super::noise::Sigmas;
 use super::poses::{LEGS_AROUND, PoseError, smooth};
 use crate::progress::{Halt, Progress};
@@ -70,7 +70,7 @@ impl Run<'_> {
         for (i, (cases, fits)) in self.images.iter().zip(fits).enumerate() {
             progress.check()?;
             let is_shown = |label: u32| granted(cases, fits).any(|claim| claim.label == label);
-            let open = cases.iter().zip(fits).filter(|(_, fit)| fit.cost < limit).map(|(case, _)| case.claim);
+            let open = open(cases, fits, limit);
             for (k, a) in open.clone().enumerate() {
                 for b in open.clone().skip(k + 1).filter(|b| b.ray == a.ray) {
                     let rivalry = rivalries.entry((a.label, b.label)).or_default();
