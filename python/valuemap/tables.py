@@ -280,6 +280,42 @@ class Votes(Table):
     residual_sigmas: Floats = _column("float", ("residual_sigmas",))
 
 
+REJECTION_REASONS: Mapping[str, str] = {
+    "votes": "too few images vote for it (min_votes)",
+    "ratio": "it has too few votes for what is usual here (min_vote_ratio)",
+    "outvoted": "another label explains its detections better",
+    "existence": "it probably does not exist: too few of the images that should have seen it did (min_existence)",
+    "merged": "it is one object with another label",
+    "class": "a label of another class has the place",
+    "parallax": "its rays are too parallel to say how far away it is (min_parallax_deg)",
+    "range": "it is too near to its cameras or too far from them (min_range_m, max_range_m)",
+}
+"""Why a hypothesis became no label: the test that it failed, in words."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rejected(Table):
+    """The best hypotheses that became no labels.
+
+    Positions (N, 3) in metres in the frame of the dataset; `votes` counts images, `passes` the passes they come from,
+    `expected` the images that should have seen it; `existence` is NaN where it never came to that test; `reason` is one
+    of `REJECTION_REASONS`; `rival` is the label that has its detections or its place, -1 where there is none.
+    """
+
+    KEY: ClassVar[str | None] = "hypothesis_id"
+    MAY_BE_EMPTY: ClassVar[bool] = True
+
+    hypothesis_id: Ints = _column("int", ("hypothesis_id",))
+    class_name: Categories = _column("category", ("class",))
+    position_in_world_m: Floats = _column("float", ("x", "y", "z"))
+    votes: Ints = _column("int", ("votes",))
+    passes: Ints = _column("int", ("passes",))
+    expected: Ints = _column("int", ("expected",))
+    existence: Floats = _column("float", ("existence",), nullable=True)
+    reason: Categories = _column("category", ("reason",))
+    rival: Ints | None = _column("int", ("rival",), optional=True)
+
+
 T = TypeVar("T", bound=Table)
 
 
