@@ -16,11 +16,14 @@ What is counted
                       sign that it belongs to, or a sign without a track; the other right ones are duplicates
     tracks found      reference tracks with a label within 1 m, and the same matched one to one
     distance          of labels to the tracks they are matched with
+    distance, survey  of labels to the evaluable signs they are matched with within 2 m, over the signs that both this
+                      method and `paper` (with the same other settings) find, so that the two medians compare
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import sys
 import time
@@ -52,7 +55,11 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Score:
-    """Counts of one sequence or of several; `distance_m` (N) of labels to the tracks matched with them."""
+    """Counts of one sequence or of several; `distance_m` (N) of labels to the tracks matched with them.
+
+    `sign_distance_m` (M) of the evaluable signs to the labels matched with them, NaN where there is none, and
+    `paper_sign_distance_m` (M) the same of the paper's method.
+    """
 
     labels: int
     right_labels: int
@@ -64,11 +71,14 @@ class Score:
     tracks_found: int
     tracks_matched: int
     distance_m: Floats
+    sign_distance_m: Floats
+    paper_sign_distance_m: Floats
     seconds: float = 0.0
 
     def to_json(self) -> dict[str, Any]:
         """Return counts, ratios and the median distance by name."""
         radii = [f"{radius:g}m" for radius in SIGN_RADII_M]
+        both = np.isfinite(self.sign_distance_m) & np.isfinite(self.paper_sign_distance_m)
         return {
             "labels": self.labels,
             "right_labels": self.right_labels,
@@ -84,7 +94,10 @@ class Score:
             "tracks_one_to_one": self.tracks_matched,
             "track_recall": _ratio(self.tracks_found, self.tracks),
             "track_recall_one_to_one": _ratio(self.tracks_matched, self.tracks),
-            "median_distance_m": round(float(np.median(self.distance_m)), 3) if len(self.distance_m) else None,
+            "median_distance_m": median(self.distance_m),
+            "signs_of_both": int(both.sum()),
+            "median_distance_survey_m": median(self.sign_distance_m[both]),
+            "median_distance_survey_paper_m": median(self.paper_sign_distance_m[both]),
             "map_seconds": round(self.seconds, 2),
         }
 
@@ -128,6 +141,12 @@ def import_sequence(data_dir: Path, sequence: str) -> Dataset:
     )
 
 
+def run(data_dir: Path, config: MapConfig) -> dict[str, dict[str, Any]]:
+    """Map and score every sequence, and all together."""
+    scores = {sequence: run_sequence(data_dir, sequence, config, None) for sequence in SEQUENCES}
+    return {name: score.to_json() for name, score in {**scores, "total": add_up(scores)}.items()}
+
+
 def run_sequence(data_dir: Path, sequence: str, config: MapConfig, out: Path | None) -> Score:
     """Import, map and evaluate one sequence; keep dataset and map under `out`."""
     dataset = import_sequence(data_dir, sequence)
@@ -139,7 +158,11 @@ def run_sequence(data_dir: Path, sequence: str, config: MapConfig, out: Path | N
         write_map(result, out / sequence / "map")
     signs, is_evaluable = read_signs(data_dir / sequence / "gt.csv")
     tracks = read_points(data_dir / sequence / "reference_tracks.csv")
-    return score_labels(result.labels.position_in_world_m, signs, is_evaluable, tracks, seconds=seconds)
+    score = score_labels(result.labels.position_in_world_m, signs, is_evaluable, tracks, seconds=seconds)
+    if config.method != "paper":
+        by_paper = build_map(dataset, dataclasses.replace(config, method="paper")).labels.position_in_world_m
+        score = dataclasses.replace(score, paper_sign_distance_m=sign_distances(by_paper, signs[is_evaluable]))
+    return score
 
 
 def score_labels(labels: Floats, signs: Floats, is_evaluable: Bools, tracks: Floats, *, seconds: float = 0.0) -> Score:
@@ -155,6 +178,7 @@ def score_labels(labels: Floats, signs: Floats, is_evaluable: Bools, tracks: Flo
     near_object = np.hstack([near_object, np.delete(near_sign, sign_of_track, axis=1)])
 
     track_label, track = match_one_to_one(to_tracks, near_track)
+    sign_distance_m = sign_distances(labels, signs[is_evaluable])
     return Score(
         labels=len(labels),
         right_labels=int((near_sign.any(axis=1) | near_track.any(axis=1)).sum()),
@@ -166,8 +190,19 @@ def score_labels(labels: Floats, signs: Floats, is_evaluable: Bools, tracks: Flo
         tracks_found=int(near_track.any(axis=0).sum()),
         tracks_matched=len(track),
         distance_m=to_tracks[track_label, track],
+        sign_distance_m=sign_distance_m,
+        paper_sign_distance_m=sign_distance_m,
         seconds=seconds,
     )
+
+
+def sign_distances(labels: Floats, signs: Floats) -> Floats:
+    """Return the distance (M) of each sign (M, 3) to the label (N, 3) matched with it, NaN where there is none."""
+    distance_m = cdist(labels, signs)
+    label, sign = match_one_to_one(distance_m, distance_m <= max(SIGN_RADII_M))
+    distance_of_sign_m = np.full(len(signs), np.nan)
+    distance_of_sign_m[sign] = distance_m[label, sign]
+    return distance_of_sign_m
 
 
 def match_one_to_one(distance_m: Floats, is_allowed: Bools) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -192,6 +227,8 @@ def add_up(scores: dict[str, Score]) -> Score:
         tracks_found=sum(s.tracks_found for s in each),
         tracks_matched=sum(s.tracks_matched for s in each),
         distance_m=np.concatenate([s.distance_m for s in each]),
+        sign_distance_m=np.concatenate([s.sign_distance_m for s in each]),
+        paper_sign_distance_m=np.concatenate([s.paper_sign_distance_m for s in each]),
         seconds=sum(s.seconds for s in each),
     )
 
@@ -219,6 +256,11 @@ def _meta(data_dir: Path, sequence: str) -> dict[str, Any]:
         raise InputError(f"{path}: no such file", hint="give the folder described at the top of this script")
     camera: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))[sequence]
     return camera
+
+
+def median(values: Floats) -> float | None:
+    """Return the median with three digits; None of nothing."""
+    return round(float(np.median(values)), 3) if len(values) else None
 
 
 def _ratio(part: int, whole: int) -> float | None:

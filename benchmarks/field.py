@@ -1,0 +1,127 @@
+"""All benchmarks on real data with one command: what the default method does outside our own cities.
+
+    python benchmarks/field.py DATA_ROOT [--only NAME ...] [--json FILE] [--method NAME] [--set name=value ...]
+
+DATA_ROOT has a folder a data set, named as here; what each holds and what is counted stands at the top of the script of
+that name. A data set whose folder is not there is said and left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av2_static
+import bend_ramps
+import kitti_signs
+import kitti_ts
+import london_tl
+from field_data import Figures
+from machine import describe_machine, keep_record
+from valuemap.config import MapConfig
+from valuemap.errors import InputError, ValuemapError
+
+RUNS: dict[str, Callable[[Path, MapConfig], dict[str, Figures]]] = {
+    "kitti_signs": kitti_signs.run,
+    "av2_static": av2_static.run,
+    "london_tl": london_tl.run,
+    "kitti_ts": kitti_ts.run,
+    "bend_ramps": bend_ramps.run,
+}
+
+SHOWN: dict[str, tuple[tuple[str, str, str], ...]] = {
+    "kitti_signs": (
+        ("signs_found_2m", "signs found of 27, 2 m", ">= 26"),
+        ("signs_found_1m", "signs found of 27, 1 m", ">= 25"),
+        ("tracks_one_to_one", "tracks one to one of 80", ">= 77"),
+        ("precision", "precision", ">= 0.94"),
+        ("duplicate_labels", "duplicates", ""),
+        ("median_distance_survey_m", "median to survey, m", "<= paper's"),
+        ("median_distance_survey_paper_m", "the same of paper, m", ""),
+    ),
+    "av2_static": (
+        ("recall", "recall of 18", ">= 0.95"),
+        ("precision_one_to_one", "precision", ">= 0.95"),
+        ("duplicate_labels", "duplicates", ""),
+        ("median_distance_m", "median, m", ""),
+    ),
+    "london_tl": (
+        ("f1_6m", "F1 at 6 m", ">= 0.70"),
+        ("true_6m", "true", ""),
+        ("false_6m", "false", ""),
+        ("missed_6m", "missed", ""),
+        ("f1_3m", "F1 at 3 m", ""),
+    ),
+    "kitti_ts": (
+        ("recall_1m", "R@1 m of 216", ">= 0.45"),
+        ("recall_2m", "R@2 m", ""),
+        ("labels", "labels", ""),
+        ("precision_2m", "precision at 2 m", ""),
+        ("duplicate_labels_2m", "duplicates", ""),
+    ),
+    "bend_ramps": (
+        ("covered", "covered of 5771", ">= 0.709"),
+        ("unmatched", "unmatched", "<= 0.093"),
+        ("median_distance_m", "median, m", "<= 0.461"),
+        ("sigma_per_axis_m", "sigma per axis, m", "<= 0.334"),
+        ("in_95_ellipse_less_bias", "in 95 % ellipse, less bias", ">= 0.67"),
+        ("in_95_ellipse", "in 95 % ellipse", ""),
+        ("labels", "labels", ""),
+    ),
+}
+"""The figures of the compact table: name, words, and what is to be reached."""
+
+
+def run(data_root: Path, config: MapConfig, only: list[str] | None = None) -> dict[str, dict[str, Figures]]:
+    """Run the benchmarks named, or all whose data is there; return figures by data set and part."""
+    names = only or [name for name in RUNS if (data_root / name).is_dir()]
+    if not names:
+        raise InputError(f"{data_root}: none of {', '.join(RUNS)} in it", hint="give the folder that holds the data")
+    for name in RUNS:
+        if name not in names:
+            print(f"left out: {name}", file=sys.stderr)
+    results = {}
+    for name in names:
+        start = time.perf_counter()
+        results[name] = RUNS[name](data_root / name, config)
+        total = list(results[name].values())[-1]
+        print(_lines(name, total, time.perf_counter() - start), flush=True)
+    return results
+
+
+def _lines(name: str, total: dict[str, Any], seconds: float) -> str:
+    lines = [f"{name} (map {total['map_seconds']:.2f} s, whole {seconds:.1f} s)"]
+    for figure, words, goal in SHOWN[name]:
+        value = total[figure]
+        lines.append(f"    {words:28}{'-' if value is None else value:>9}  {goal}")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Run the benchmarks; return the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data_root", type=Path, metavar="DATA_ROOT")
+    parser.add_argument("--only", nargs="+", choices=list(RUNS), metavar="NAME", help=f"of {', '.join(RUNS)}")
+    parser.add_argument("--json", type=Path, help="write all figures, settings and machine there")
+    parser.add_argument("--method", default=MapConfig().method)
+    parser.add_argument("--set", action="append", default=[], metavar="name=value", dest="settings")
+    options = parser.parse_args()
+    try:
+        config = MapConfig(method=options.method).with_settings(options.settings)
+        results = run(options.data_root, config, options.only)
+        settings = "".join(f" --set {assignment}" for assignment in options.settings)
+        command = f"python benchmarks/field.py DATA_ROOT --method {options.method}{settings}"
+        record = {"benchmark": "field", "command": command, **describe_machine(), "settings": config.as_dict()}
+        keep_record(options.json, {**record, "results": results})
+    except ValuemapError as error:
+        print(f"error: {error}\nhint: {error.hint}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
