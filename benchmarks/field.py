@@ -1,9 +1,10 @@
 """All benchmarks on real data with one command: what the default method does outside our own cities.
 
-    python benchmarks/field.py DATA_ROOT [--only NAME ...] [--json FILE] [--method NAME] [--set name=value ...]
+    python benchmarks/field.py DATA_ROOT [--only NAME ...] [--laws] [--json FILE] [--method NAME] [--set name=value ...]
 
 DATA_ROOT has a folder a data set, named as here; what each holds and what is counted stands at the top of the script of
-that name. A data set whose folder is not there is said and left out.
+that name. A data set whose folder is not there is said and left out. With --laws the laws of `laws.py` follow: shuffled
+ids, renamed passes, a world of another size.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import av2_static
 import bend_ramps
 import kitti_signs
 import kitti_ts
+import laws
 import london_tl
 from field_data import Figures
 from machine import describe_machine, keep_record
@@ -90,6 +92,8 @@ def run(data_root: Path, config: MapConfig, only: list[str] | None = None) -> di
         results[name] = RUNS[name](data_root / name, config)
         total = list(results[name].values())[-1]
         print(_lines(name, total, time.perf_counter() - start), flush=True)
+        if name == "av2_static":
+            print(_by_class(results[name]), flush=True)
     return results
 
 
@@ -101,11 +105,21 @@ def _lines(name: str, total: dict[str, Any], seconds: float) -> str:
     return "\n".join(lines)
 
 
+def _by_class(results: dict[str, Figures]) -> str:
+    """Return one line a class: the parts that are no logs and not the total."""
+    classes = {part: figures for part, figures in results.items() if part != "total" and "map_seconds" not in figures}
+    return "\n".join(
+        f"    {part.lower():28}{figures['found']} of {figures['objects']}, {figures['labels']} labels"
+        for part, figures in classes.items()
+    )
+
+
 def main() -> int:
     """Run the benchmarks; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data_root", type=Path, metavar="DATA_ROOT")
     parser.add_argument("--only", nargs="+", choices=list(RUNS), metavar="NAME", help=f"of {', '.join(RUNS)}")
+    parser.add_argument("--laws", action="store_true", help="check laws that no map may break as well; slow")
     parser.add_argument("--json", type=Path, help="write all figures, settings and machine there")
     parser.add_argument("--method", default=MapConfig().method)
     parser.add_argument("--set", action="append", default=[], metavar="name=value", dest="settings")
@@ -113,10 +127,11 @@ def main() -> int:
     try:
         config = MapConfig(method=options.method).with_settings(options.settings)
         results = run(options.data_root, config, options.only)
+        kept = laws.run(options.data_root, config, options.only) if options.laws else {}
         settings = "".join(f" --set {assignment}" for assignment in options.settings)
         command = f"python benchmarks/field.py DATA_ROOT --method {options.method}{settings}"
         record = {"benchmark": "field", "command": command, **describe_machine(), "settings": config.as_dict()}
-        keep_record(options.json, {**record, "results": results})
+        keep_record(options.json, {**record, "results": results, **({"laws": kept} if kept else {})})
     except ValuemapError as error:
         print(f"error: {error}\nhint: {error.hint}", file=sys.stderr)
         return 1
