@@ -23,6 +23,7 @@ from valuemap.tables import (
     Floats,
     Images,
     Ints,
+    Rejected,
     Table,
     Truth,
     TruthDetections,
@@ -95,7 +96,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Posed images with detections, and the truth where it is known."""
+    """Posed images with detections, the truth where it is known, and what the import had to leave out."""
 
     name: str
     frame: Frame
@@ -104,6 +105,7 @@ class Dataset:
     detections: Detections
     truth: Truth | None = None
     truth_detections: TruthDetections | None = None
+    rejected: Rejected | None = None
 
 
 def read_dataset(path: str | Path) -> Dataset:
@@ -118,7 +120,7 @@ def read_dataset(path: str | Path) -> Dataset:
     head = _read_head(folder)
     optional = {
         name: read_table(kind, folder / f"{name}.parquet") if (folder / f"{name}.parquet").is_file() else None
-        for name, kind in (("truth", Truth), ("truth_detections", TruthDetections))
+        for name, kind in (("truth", Truth), ("truth_detections", TruthDetections), ("rejected", Rejected))
     }
     return check_dataset(
         Dataset(
@@ -160,6 +162,7 @@ def write_dataset(dataset: Dataset, path: str | Path) -> None:
             "detections": dataset.detections,
             "truth": dataset.truth,
             "truth_detections": dataset.truth_detections,
+            "rejected": dataset.rejected,
         }
         for name, table in tables.items():
             if table is not None:

@@ -23,6 +23,7 @@ import pyarrow as pa
 
 from valuemap.cameras import camera_centers
 from valuemap.config import VoteConfig
+from valuemap.csv_table import read_csv_arrow
 from valuemap.dataset import Dataset, Frame, read_dataset, rows_of
 from valuemap.errors import InputError, SettingError
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
@@ -38,7 +39,6 @@ from valuemap.tables import (
     TruthDetections,
     TruthPoints,
     read_arrow,
-    read_csv_arrow,
     table_from_arrow,
 )
 

@@ -8,7 +8,7 @@ held in ascending order of their key, so that nothing depends on the order of ro
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar
@@ -16,7 +16,6 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
@@ -196,6 +195,25 @@ class TruthDetections(Table):
 
 
 @dataclass(frozen=True, eq=False)
+class Rejected(Table):
+    """Rows that an import left out, in their order: which table they were for, where they stood, and why.
+
+    `center_px`, `size_px` (N, 2) and `score` (N) are what was found, NaN where it was no number or does not apply.
+    """
+
+    MAY_BE_EMPTY: ClassVar[bool] = True
+
+    table: Categories = _column("category", ("table",))
+    place: pa.Array = _column("text", ("place",))
+    reason: Categories = _column("category", ("reason",))
+    image_name: pa.Array = _column("text", ("image",))
+    class_name: Categories = _column("category", ("class",))
+    center_px: Floats = _column("float", ("x", "y"), nullable=True)
+    size_px: Floats = _column("float", ("width", "height"), nullable=True)
+    score: Floats = _column("float", ("score",), nullable=True)
+
+
+@dataclass(frozen=True, eq=False)
 class Candidates:
     """Points with the rays that support them: what voting finds and merging makes into labels.
 
@@ -345,30 +363,6 @@ def read_arrow(path: Path) -> pa.Table:
             f"{path}: cannot be read as Parquet: {reason}", hint="the file is damaged or cut short: write it again"
         ) from error
     return table
-
-
-def read_csv_arrow(path: Path, types: Mapping[str, pa.DataType], *, has_missing: bool, hint: str) -> pa.Table:
-    """Read a comma-separated file with a header line; the columns named in `types` are of these types.
-
-    With `has_missing` an empty field is a missing value; else it is an empty text, and no number.
-
-    Raises
-    ------
-    InputError
-        The file is empty or no CSV, or a value is not of its type; `hint` says what is expected.
-    """
-    try:
-        table = pa_csv.read_csv(
-            path,
-            read_options=pa_csv.ReadOptions(use_threads=False),  # Else errors do not say the row.
-            convert_options=pa_csv.ConvertOptions(
-                column_types=types, null_values=None if has_missing else [], strings_can_be_null=has_missing
-            ),
-        )
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path}: cannot be read as CSV: {reason}", hint=hint) from error
-    return table.rename_columns([name.strip() for name in table.column_names])
 
 
 def table_from_arrow(kind: type[T], table: pa.Table, *, source: str) -> T:

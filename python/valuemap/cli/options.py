@@ -16,3 +16,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON to stdout.")]
 Settings = Annotated[
     list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a setting; may be repeated.")
 ]
+MaxRejected = Annotated[
+    float,
+    typer.Option("--max-rejected", metavar="SHARE", help="Stop where more of the boxes, or images, cannot be used."),
+]

@@ -1,17 +1,21 @@
-"""What all readers end with: number the detections, settle the frame, and pass the checks at the door."""
+"""What all readers end with: vet what was found, settle the frame, and pass the checks at the door."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.dataset import Dataset, Frame, check_dataset
 from valuemap.errors import InputError, SettingError
-from valuemap.tables import Cameras, Categories, Detections, Floats, Images, Ints
+from valuemap.readers.vet import MAX_REJECTED, FoundBoxes, Rejections, vet_boxes, vet_images
+from valuemap.tables import Cameras, Floats, Images, Truth
+
+__all__ = ["MAX_REJECTED", "ONE_PASS", "FoundBoxes", "assemble"]
 
 ONE_PASS = "all"
 """The pass of images about whose passes nothing is known."""
@@ -22,57 +26,27 @@ _MIN_MEAN_UP = 0.1
 _MAX_TILT_FROM_ENU_RAD = math.radians(60.0)
 
 
-def number_detections(
-    image_id: Ints,
-    class_names: Sequence[str],
-    center_px: Floats,
-    size_px: Floats,
-    score: Floats,
-    detection_id: Ints | None = None,
-) -> Detections:
-    """Return detections of boxes in any order.
-
-    Parameters
-    ----------
-    image_id, class_names, score
-        One a box (N).
-    center_px, size_px
-        Centre and size (N, 2) in pixels, centre of the top-left pixel at (0.5, 0.5).
-    detection_id
-        Distinct ids (N). Without them the boxes are numbered from 0 by image, place, size, class and score,
-        so that the numbers do not depend on the order of the boxes.
-    """
-    classes = Categories.from_texts(class_names)
-    if detection_id is None:
-        order = np.lexsort((score, classes.codes, *size_px.T, *center_px.T, image_id))
-        ids: Ints = np.arange(len(order), dtype=np.int64)
-    else:
-        order = np.argsort(detection_id)
-        ids = detection_id[order]
-    return Detections(
-        detection_id=ids,
-        image_id=image_id[order],
-        class_name=classes.take(order),
-        center_px=center_px[order],
-        size_px=size_px[order],
-        score=score[order],
-    )
-
-
 def assemble(
     *,
     name: str,
     cameras: Cameras,
     images: Images,
-    detections: Detections,
+    detections: FoundBoxes,
     up: tuple[float, float, float] | None,
     anchor: tuple[float, float, float] | None,
     source: str,
+    where_image: Callable[[int], str] | None = None,
+    truth: Truth | None = None,
+    max_rejected: float = MAX_REJECTED,
 ) -> Dataset:
-    """Return the checked dataset of what a reader found.
+    """Return the checked dataset of what a reader found; what cannot be used is left out and listed in it.
 
     Parameters
     ----------
+    images
+        All that were found; those whose pose is no pose are left out, and their boxes with them.
+    detections
+        All that were found.
     up
         The direction up in the frame of the poses, of any length; None for the mean of the cameras' own.
     anchor
@@ -80,15 +54,33 @@ def assemble(
         the ENU frame there already (x east, y north, z up, metres).
     source
         What errors name as the place of the data.
+    where_image
+        Returns the place of an image in the user's files, for its row in `images`.
+    truth
+        Known objects, where there are.
+    max_rejected
+        The share of the boxes, and of the images, that may be left out.
 
     Raises
     ------
     SettingError
-        `up` or `anchor` is impossible, or both are given.
+        `up`, `anchor` or `max_rejected` is impossible, or `up` and `anchor` are both given.
     InputError
-        The tables are inconsistent, the poses cannot be metric, have no mean up, or contradict `anchor`.
+        Too many boxes or images cannot be used; the tables are inconsistent, the poses cannot be metric, have no
+        mean up, or contradict `anchor`.
     """
-    unframed = Dataset(name=name, frame=Frame(), cameras=cameras, images=images, detections=detections)
+    rejections = Rejections(source, max_rejected)
+    posed, usable = vet_images(images, rejections, where_image)
+    boxes = vet_boxes(detections, images, usable, cameras, rejections)
+    unframed = Dataset(
+        name=name,
+        frame=Frame(),
+        cameras=cameras,
+        images=posed,
+        detections=boxes,
+        truth=truth,
+        rejected=rejections.table(),
+    )
     dataset = check_dataset(unframed, source=source)
     _check_steps(dataset.images, source)
     return dataclasses.replace(dataset, frame=_frame(dataset.images, up, anchor, source))
@@ -138,18 +130,25 @@ def _check_anchor(anchor: tuple[float, float, float], mean_up: Floats, length: f
 
 
 def _check_steps(images: Images, source: str) -> None:
-    """Refuse poses that cannot be in metres: all ranges and radii of the method are."""
-    order = np.lexsort((np.array(images.name.to_pylist()), images.pass_id.codes))
-    same_pass = np.diff(images.pass_id.codes[order]) == 0
-    step_m = np.linalg.norm(np.diff(camera_centers(images)[order], axis=0), axis=1)[same_pass]
-    if not len(step_m):
+    """Refuse poses that cannot be in metres: all ranges and radii of the method are.
+
+    A step is the way from an image to the nearest of its pass that is elsewhere, so that no order of them is assumed.
+    """
+    center_m = camera_centers(images)
+    steps = []
+    for code in range(len(images.pass_id.names)):
+        # A car that waits says nothing about scale: its images are one place.
+        places = np.unique((center_m[images.pass_id.codes == code] / _STILL_M).round(), axis=0) * _STILL_M
+        if len(places) > 1:
+            distance_m, _ = cKDTree(places).query(places, k=[2])
+            steps.append(np.ravel(distance_m))
+    if np.bincount(images.pass_id.codes).max() < 2:
         return
-    moving = step_m[step_m > _STILL_M]  # A car that waits says nothing about scale.
-    median = float(np.median(moving)) if len(moving) else 0.0
+    median = float(np.median(np.concatenate(steps))) if steps else 0.0
     low, high = _PLAUSIBLE_STEP_M
     if not low <= median <= high:
         raise InputError(
-            f"{source}: poses: expected metres, with a median step between successive images of a pass from "
+            f"{source}: poses: expected metres, with a median step between neighbouring images of a pass from "
             f"{low:g} to {high:g}, found {median:.3g}",
             hint="scale the model to metres first, e.g. with COLMAP's model_aligner",
         )

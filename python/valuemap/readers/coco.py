@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import reprlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,9 +14,9 @@ import numpy as np
 
 from valuemap.dataset import rows_of
 from valuemap.errors import InputError
-from valuemap.readers.assemble import number_detections
 from valuemap.readers.names import match_images
-from valuemap.tables import Cameras, Detections, Images, Ints
+from valuemap.readers.vet import FoundBoxes
+from valuemap.tables import Cameras, Floats, Images, Ints
 
 _FORMAT_HINT = "COCO's format is described at https://cocodataset.org/#format-data"
 _HUGE = 1e300
@@ -33,15 +34,10 @@ def _is_number(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) < _HUGE  # False for NaN too.
 
 
-def _is_box(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 4 and all(map(_is_number, value)) and min(value[2:]) >= 0
-
-
 _ID = _Kind(lambda value: type(value) in (int, str), "a whole number or a text")
 _TEXT = _Kind(lambda value: isinstance(value, str) and value != "", "a text")
 _MAYBE_TEXT = _Kind(lambda value: isinstance(value, str), "a text")
-_NUMBER = _Kind(_is_number, "a finite number")
-_BOX = _Kind(_is_box, "x, y, width, height as finite numbers, sizes not negative")
+_NO_BOX = [math.nan] * 4
 
 
 @dataclass(frozen=True)
@@ -72,8 +68,8 @@ class _Entries:
         return values
 
 
-def read_coco(path: Path, images: Images, cameras: Cameras) -> Detections:
-    """Read boxes and find their images by file name, as `match_images` does.
+def read_coco(path: Path, images: Images, cameras: Cameras) -> FoundBoxes:
+    """Read boxes and find their images by file name, as `match_images` does; which can be used is not decided here.
 
     An object has `images` (id, file_name), `annotations` (image_id, category_id, bbox, maybe score and id)
     and maybe `categories` (id, name). A list has results (category_id, bbox, score) that name their image in
@@ -84,34 +80,44 @@ def read_coco(path: Path, images: Images, cameras: Cameras) -> Detections:
     Raises
     ------
     InputError
-        The file is no COCO file or has no boxes, a box is on an image that `images` does not have or that has
-        another size there, or a value is missing or impossible.
+        The file is no COCO file or has no boxes, an image has another size there than in `images`, or two entries of
+        a list have the same id.
     """
     content = _load(path)
     is_results = isinstance(content, list)
     boxes = _Entries(f"{path}: {'results' if is_results else 'annotations'}", _boxes_in(content, path))
     listed = _Entries(f"{path}: images", [] if is_results else _list_in(content, "images", path))
     names = _names_of_results(boxes) if is_results else _names_of_annotations(boxes, listed)
-    known = images.name.to_pylist()
-    row_of = match_images({*names, *(listed.column("file_name", _TEXT))}, known)
-    _refuse_unknown(boxes.where, names, row_of, known)
+    row_of = match_images({*names, *(listed.column("file_name", _TEXT))}, images.name.to_pylist())
     _refuse_other_sizes(listed, set(names), row_of, images, cameras)
-    bbox_px = np.array(boxes.column("bbox", _BOX), dtype=np.float64)
-    return number_detections(
-        image_id=images.image_id[[row_of[name] for name in names]],
+    bbox_px = np.array([_box_or_none(entry.get("bbox")) for entry in boxes.entries], dtype=np.float64)
+    return FoundBoxes(
+        image_row=np.array([row_of.get(name, -1) for name in names], dtype=np.int64),
+        image_names=names,
         class_names=_class_names(boxes, content, path),
         center_px=bbox_px[:, :2] + bbox_px[:, 2:] / 2.0,
         size_px=bbox_px[:, 2:],
-        score=np.array(boxes.column("score", _NUMBER, default=1.0), dtype=np.float64),
+        score=_scores(boxes),
         detection_id=None if is_results else _own_ids(boxes),
+        where=lambda row: f"{boxes.where}[{row}]",
     )
+
+
+def _box_or_none(value: Any) -> list[float]:
+    is_box = isinstance(value, list) and len(value) == 4 and all(map(_is_number, value))
+    return value if is_box else _NO_BOX
+
+
+def _scores(boxes: _Entries) -> Floats:
+    scores = (entry.get("score", 1.0) for entry in boxes.entries)
+    return np.array([score if _is_number(score) else math.nan for score in scores], dtype=np.float64)
 
 
 def _load(path: Path) -> Any:
     if not path.is_file():
         raise InputError(f"{path}: no such file", hint="give a JSON file with detections in COCO's format")
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, OSError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read as JSON: {error}", hint="is it whole? Write it again") from error
 
@@ -135,17 +141,13 @@ def _list_in(content: Any, key: str, path: Path) -> list[Any]:
 
 
 def _names_of_annotations(boxes: _Entries, listed: _Entries) -> list[str]:
-    image_ids = boxes.column("image_id", _ID)
+    """Return the file name of each annotation; of an image that is not listed its id, which is no file name."""
     ids, names = listed.column("id", _ID), listed.column("file_name", _TEXT)
     name_of = _without_repeats(ids, names, listed.where)
-    unlisted = [row for row, image_id in enumerate(image_ids) if image_id not in name_of]
-    if unlisted:
-        raise InputError(
-            f"{boxes.where}[{unlisted[0]}]: image_id {image_ids[unlisted[0]]!r} is not in images "
-            f"({len(unlisted)} entries)",
-            hint="add the image with its file_name to images, or remove these entries",
-        )
-    return [name_of[image_id] for image_id in image_ids]
+    image_ids = [entry.get("image_id") for entry in boxes.entries]
+    return [
+        name_of[key] if _ID.accepts(key) and key in name_of else f"image_id {reprlib.repr(key)}" for key in image_ids
+    ]
 
 
 def _names_of_results(boxes: _Entries) -> list[str]:
@@ -174,18 +176,6 @@ def _without_repeats(ids: list[Any], texts: list[str], where: str) -> dict[Any, 
     return found
 
 
-def _refuse_unknown(where: str, names: list[str], row_of: dict[str, int], known: list[str]) -> None:
-    unknown = {name for name in names if name not in row_of}
-    if unknown:
-        row = next(row for row, name in enumerate(names) if name in unknown)
-        raise InputError(
-            f"{where}[{row}]: image {names[row]!r} is not among the images with a pose ({len(unknown)} of "
-            f"{len(set(names))} images with detections are not)",
-            hint=f"images are matched by file name, as in {known[0]!r}: correct the names, or remove the "
-            "detections of images that have no pose",
-        )
-
-
 def _refuse_other_sizes(
     listed: _Entries, used: set[str], row_of: dict[str, int], images: Images, cameras: Cameras
 ) -> None:
@@ -193,7 +183,7 @@ def _refuse_other_sizes(
     camera_row = rows_of(images.camera_id, cameras.camera_id)
     for row, entry in enumerate(listed.entries):
         name, size = entry["file_name"], (entry.get("width"), entry.get("height"))
-        if name not in used or None in size:
+        if name not in used or name not in row_of or None in size:
             continue
         camera = camera_row[row_of[name]]
         expected = (int(cameras.width_px[camera]), int(cameras.height_px[camera]))
@@ -206,19 +196,19 @@ def _refuse_other_sizes(
 
 
 def _class_names(boxes: _Entries, content: Any, path: Path) -> list[str]:
-    category_ids = boxes.column("category_id", _ID)
+    """Return the class of each box; of those that have none, or one that is not listed, an empty text."""
+    category_ids = [entry.get("category_id") for entry in boxes.entries]
     if isinstance(content, list) or not content.get("categories"):
-        return [key if isinstance(key, str) else f"class-{key}" for key in category_ids]
+        return [_class_of_id(key) for key in category_ids]
     categories = _Entries(f"{path}: categories", _list_in(content, "categories", path))
     name_of = _without_repeats(categories.column("id", _ID), categories.column("name", _TEXT), categories.where)
-    unnamed = [row for row, category_id in enumerate(category_ids) if category_id not in name_of]
-    if unnamed:
-        raise InputError(
-            f"{boxes.where}[{unnamed[0]}]: category_id {category_ids[unnamed[0]]!r} is not in categories "
-            f"({len(unnamed)} entries)",
-            hint="add it to categories, or remove these entries",
-        )
-    return [name_of[category_id] for category_id in category_ids]
+    return [name_of.get(key, "") if _ID.accepts(key) else "" for key in category_ids]
+
+
+def _class_of_id(key: Any) -> str:
+    if not _ID.accepts(key):
+        return ""
+    return key if isinstance(key, str) else f"class-{key}"
 
 
 def _own_ids(boxes: _Entries) -> Ints | None:

@@ -13,12 +13,12 @@ import pycolmap
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import ONE_PASS, assemble, number_detections
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, assemble
 from valuemap.readers.coco import read_coco
 from valuemap.readers.colmap_files import find_model
 from valuemap.readers.csv_file import read_csv
 from valuemap.readers.names import match_images
-from valuemap.tables import Cameras, Categories, Detections, Images
+from valuemap.tables import Cameras, Categories, Images
 
 
 def read_colmap(
@@ -28,6 +28,7 @@ def read_colmap(
     pass_from: str = "folder",
     up: tuple[float, float, float] | None = None,
     anchor: tuple[float, float, float] | None = None,
+    max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
 ) -> Dataset:
     """Read a COLMAP model and the detections in its images.
@@ -44,7 +45,7 @@ def read_colmap(
     pass_from
         "folder" (the folder part of the image name is its pass), "none" (all images are one pass), or the
         path of a CSV file with columns image and pass.
-    up, anchor
+    up, anchor, max_rejected
         As in `assemble`.
 
     Raises
@@ -52,12 +53,12 @@ def read_colmap(
     InputError
         A file is missing, damaged or inconsistent with the others.
     SettingError
-        `up` or `anchor` is impossible.
+        `up`, `anchor` or `max_rejected` is impossible.
     """
     progress("reading the COLMAP model", 0, 2)
     cameras, images = _read_model(model_dir, pass_from)
     progress("reading the detections", 1, 2)
-    found = _no_detections() if detections is None else read_coco(detections, images, cameras)
+    found = FoundBoxes.none() if detections is None else read_coco(detections, images, cameras)
     dataset = assemble(
         name=model_dir.resolve().name,
         cameras=cameras,
@@ -66,14 +67,10 @@ def read_colmap(
         up=up,
         anchor=anchor,
         source=str(model_dir),
+        max_rejected=max_rejected,
     )
     progress("reading the detections", 2, 2)
     return dataset
-
-
-def _no_detections() -> Detections:
-    nothing = np.empty(0)
-    return number_detections(nothing.astype(np.int64), [], np.empty((0, 2)), np.empty((0, 2)), nothing)
 
 
 def _read_model(model_dir: Path, pass_from: str) -> tuple[Cameras, Images]:
@@ -122,14 +119,6 @@ def _with_poses(images: list[pycolmap.Image], names: list[str], pass_id: Categor
     poses = [image.cam_from_world() for image in images]
     quaternion = np.array([pose.rotation.quat for pose in poses])[:, [3, 0, 1, 2]]  # pycolmap: x, y, z, w.
     translation_m = np.array([pose.translation for pose in poses])
-    wrong = np.flatnonzero(~np.isfinite(np.hstack([quaternion, translation_m])).all(axis=1))
-    if len(wrong):
-        row = wrong[0]
-        raise InputError(
-            f"{model_dir}: image {names[row]!r}: pose: expected finite numbers, "
-            f"found {quaternion[row].tolist()} {translation_m[row].tolist()} ({len(wrong)} images)",
-            hint="repair the poses of these images, or remove the images",
-        )
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
         raise InputError(

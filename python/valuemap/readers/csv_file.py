@@ -7,28 +7,28 @@ from pathlib import Path
 
 import pyarrow as pa
 
+from valuemap.csv_table import read_csv_arrow
 from valuemap.errors import InputError
-from valuemap.tables import read_csv_arrow
 
 _NAMES = {pa.int64(): "whole numbers", pa.float64(): "numbers", pa.string(): "texts"}
 
 
 def read_csv(path: Path, required: Mapping[str, pa.DataType], optional: Mapping[str, pa.DataType]) -> pa.Table:
-    """Return the named columns of a comma-separated file with a header line, in the types given.
+    """Return the named columns of a CSV file with a header line, in the types given.
 
-    Optional columns that are absent are left out, as are columns that nobody asked for. There are no missing
-    values: an empty field is an empty text, and no number.
+    Optional columns that are absent are left out, as are columns that nobody asked for. What should be a float64 and
+    is no number is NaN, to be vetted; an empty field is an empty text.
 
     Raises
     ------
     InputError
         The file is missing, empty or no CSV, lacks a column, or a value is not of its type.
     """
-    if not path.is_file():
+    if not path.exists():
         raise InputError(f"{path}: no such file", hint="check the path")
     expected = ", ".join(f"{name} ({_NAMES[kind]})" for name, kind in required.items())
     hint = f"expected a CSV file with columns {expected}"
-    table = read_csv_arrow(path, {**required, **optional}, has_missing=False, hint=hint)
+    table = read_csv_arrow(path, {**required, **optional}, has_missing=False, hint=hint, bad_numbers_are_nan=True)
     columns = [name for name in (*required, *optional) if name in required or name in table.column_names]
     for name in columns:
         if table.column_names.count(name) != 1:

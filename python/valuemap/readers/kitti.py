@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import ONE_PASS, assemble, number_detections
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, assemble
 from valuemap.readers.csv_file import read_csv
-from valuemap.tables import Cameras, Categories, Detections, Floats, Images
+from valuemap.tables import Cameras, Categories, Floats, Images
 
 _CORNERS = ("x1", "y1", "x2", "y2")
 _ROTATION_TOLERANCE = 1e-3
@@ -29,6 +29,7 @@ def read_kitti(
     detections: Path,
     class_name: str = "object",
     up: tuple[float, float, float] | None = None,
+    max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
 ) -> Dataset:
     """Read the poses of one drive with one rectified camera, and the detections in its frames.
@@ -48,15 +49,15 @@ def read_kitti(
         CSV file with columns frame (the first is 0), x1, y1, x2, y2 and maybe class and score.
     class_name
         The class of boxes that have none.
-    up
+    up, max_rejected
         As in `assemble`.
 
     Raises
     ------
     InputError
-        A file is missing or no table of such numbers, a pose is no rigid motion, or a box is impossible.
+        A file is missing or no table of such numbers, a pose is no rigid motion, or too many boxes are impossible.
     SettingError
-        `intrinsics`, `image_size` or `up` is impossible.
+        `intrinsics`, `image_size`, `up` or `max_rejected` is impossible.
     """
     fx, fy, cx, cy = intrinsics
     if not (np.isfinite(intrinsics).all() and min(fx, fy) > 0.0 and min(image_size) > 0):
@@ -85,6 +86,7 @@ def read_kitti(
         up=up,
         anchor=None,
         source=str(poses),
+        max_rejected=max_rejected,
     )
 
 
@@ -139,31 +141,21 @@ def _images(world_from_cam: Floats) -> Images:
     )
 
 
-def _read_detections(path: Path, frames: int, class_name: str) -> Detections:
+def _read_detections(path: Path, frames: int, class_name: str) -> FoundBoxes:
     table = read_csv(
         path,
-        {"frame": pa.int64(), **dict.fromkeys(_CORNERS, pa.float64())},
+        dict.fromkeys(("frame", *_CORNERS), pa.float64()),
         {"class": pa.string(), "score": pa.float64()},
     )
     frame = table["frame"].to_numpy()
+    is_frame = (frame >= 0) & (frame < frames) & (frame % 1.0 == 0.0)
     corners_px = np.stack([table[name].to_numpy() for name in _CORNERS], axis=1)
-    score = table["score"].to_numpy() if "score" in table.column_names else np.ones(len(frame))
-    for wrong, expected in (
-        ((frame < 0) | (frame >= frames), f"a frame from 0 to {frames - 1}, as there are {frames} poses"),
-        (~np.isfinite(corners_px).all(axis=1) | ~np.isfinite(score), "finite numbers"),
-        ((corners_px[:, 2:] < corners_px[:, :2]).any(axis=1), "x1 <= x2 and y1 <= y2"),
-    ):
-        rows = np.flatnonzero(wrong)
-        if len(rows):
-            raise InputError(
-                f"{path} line {rows[0] + 2}: expected {expected}, found frame {frame[rows[0]]}, corners "
-                f"{corners_px[rows[0]].tolist()}, score {score[rows[0]]:g} ({len(rows)} rows)",
-                hint="the columns are frame, left, top, right, bottom in pixels; the first frame is 0",
-            )
-    return number_detections(
-        image_id=frame,
+    return FoundBoxes(
+        image_row=np.where(is_frame, frame, -1).astype(np.int64),
+        image_names=[f"frame {number:.17g}" for number in frame],
         class_names=table["class"].to_pylist() if "class" in table.column_names else [class_name] * len(frame),
         center_px=(corners_px[:, :2] + corners_px[:, 2:]) / 2.0 + _PIXEL_CENTER,
         size_px=corners_px[:, 2:] - corners_px[:, :2],
-        score=score,
+        score=table["score"].to_numpy() if "score" in table.column_names else np.ones(len(frame)),
+        where=lambda row: f"{path} line {row + 2}",
     )

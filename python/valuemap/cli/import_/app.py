@@ -2,21 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import typer
 
 from valuemap.cli.app import app
-from valuemap.cli.show import log, show
+from valuemap.cli.show import log, show, show_notes
 from valuemap.dataset import Dataset, write_dataset
+from valuemap.readers.vet import count_reasons
 from valuemap.summary import summarize_dataset
+from valuemap.tables import Rejected
+
+_SHOWN_REJECTED = 10
 
 import_app = typer.Typer(no_args_is_help=True, help="Bring posed images and detections into a dataset.")
 app.add_typer(import_app, name="import")
 
 
 def finish_dataset(dataset: Dataset, out: Path) -> None:
-    """Write the dataset and say on stderr what it holds."""
+    """Write the dataset and say on stderr what it holds, and what was left out."""
     write_dataset(dataset, out)
     show(summarize_dataset(dataset), console=log)
+    if dataset.rejected is not None:
+        show_notes(_rejected_lines(dataset.rejected, out))
     log.print(f"Wrote {out}", highlight=False)
+
+
+def _rejected_lines(rejected: Rejected, out: Path) -> Iterator[str]:
+    """Yield how many rows were left out, by reason, and the first of them."""
+    for table, count in count_reasons(rejected).items():
+        for reason, rows in count.items():
+            yield f"left out of {table}: {rows}, because {reason}"
+    for row in range(min(len(rejected), _SHOWN_REJECTED)):
+        image = rejected.image_name[row].as_py()
+        yield f"  {rejected.place[row].as_py()}: {rejected.reason.names[rejected.reason.codes[row]]} ({image})"
+    yield f"all {len(rejected)} are in {out / 'rejected.parquet'}"

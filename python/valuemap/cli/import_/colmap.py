@@ -9,9 +9,10 @@ import typer
 
 from valuemap import dataset as dataset_folder
 from valuemap.cli.import_.app import finish_dataset, import_app
-from valuemap.cli.options import DatasetOut, Up
+from valuemap.cli.options import DatasetOut, MaxRejected, Up
 from valuemap.cli.show import progress_bars
 from valuemap.folders import check_place
+from valuemap.readers.vet import MAX_REJECTED
 
 
 @import_app.command("colmap")
@@ -29,6 +30,7 @@ def import_colmap(
         tuple[float, float, float] | None,
         typer.Option(metavar="LAT LON HEIGHT", help="WGS84 place of the origin of an east-north-up model."),
     ] = None,
+    max_rejected: MaxRejected = MAX_REJECTED,
 ) -> None:
     """Import a COLMAP model with detections in COCO format."""
     from valuemap.readers import READERS
@@ -36,6 +38,12 @@ def import_colmap(
     check_place(out, marker=dataset_folder.MARKER)
     with progress_bars() as progress:
         dataset = READERS["colmap"](
-            model_dir, detections=detections, pass_from=pass_from, up=up, anchor=anchor, progress=progress
+            model_dir,
+            detections=detections,
+            pass_from=pass_from,
+            up=up,
+            anchor=anchor,
+            max_rejected=max_rejected,
+            progress=progress,
         )
     finish_dataset(dataset, out)

@@ -9,9 +9,10 @@ import typer
 
 from valuemap import dataset as dataset_folder
 from valuemap.cli.import_.app import finish_dataset, import_app
-from valuemap.cli.options import DatasetOut, Up
+from valuemap.cli.options import DatasetOut, MaxRejected, Up
 from valuemap.cli.show import progress_bars
 from valuemap.folders import check_place
+from valuemap.readers.vet import MAX_REJECTED
 
 
 @import_app.command("kitti")
@@ -26,6 +27,7 @@ def import_kitti(
     out: DatasetOut,
     class_name: Annotated[str, typer.Option("--class", help="Class of detections without one.")] = "object",
     up: Up = None,
+    max_rejected: MaxRejected = MAX_REJECTED,
 ) -> None:
     """Import KITTI-odometry-style poses with boxes in a CSV file."""
     from valuemap.readers import READERS
@@ -39,6 +41,7 @@ def import_kitti(
             detections=detections,
             class_name=class_name,
             up=up,
+            max_rejected=max_rejected,
             progress=progress,
         )
     finish_dataset(dataset, out)

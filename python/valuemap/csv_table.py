@@ -1,0 +1,119 @@
+"""CSV files of users, as spreadsheets and programs write them: the one way to read them."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import gzip
+import math
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+
+from valuemap.arrow import numbers_to_arrow
+from valuemap.errors import InputError
+
+
+def read_csv_arrow(
+    path: Path, types: Mapping[str, pa.DataType], *, has_missing: bool, hint: str, bad_numbers_are_nan: bool = False
+) -> pa.Table:
+    """Read a CSV file with a header line; the columns named in `types` are of these types.
+
+    Fields are separated by commas, or by semicolons or tabs where the header line has no comma; numbers then may have
+    decimal commas. Gzip and a byte order mark are read through. A column whose name is that of a type but for the case
+    of its letters is taken as that. With `has_missing` an empty field is a missing value; else it is an empty text,
+    and no number. With `bad_numbers_are_nan`, what should be a float64 and is no number is NaN, not an error.
+
+    Raises
+    ------
+    InputError
+        The file is empty or no CSV, or a value is not of its type; `hint` says what is expected.
+    """
+    try:
+        content = _read_text_bytes(path, hint)
+        separator, names = _header(content)
+        type_of = _types_by_header(names, types)
+        options: dict[str, Any] = {
+            "column_types": type_of,
+            "null_values": None if has_missing else [],
+            "strings_can_be_null": has_missing,
+        }
+        try:
+            table = _parse_csv(content, separator, options)
+        except pa.ArrowInvalid:
+            table = _parse_odd_csv(content, separator, options, bad_numbers_are_nan)
+    except (pa.ArrowException, OSError, EOFError, zlib.error) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{path}: cannot be read as CSV: {reason}", hint=hint) from error
+    exact = {name.strip() for name in table.column_names}
+    same = {name.lower(): name for name in types if name not in exact}
+    return table.rename_columns([same.get(name.strip().lower(), name.strip()) for name in table.column_names])
+
+
+def _read_text_bytes(path: Path, hint: str) -> bytes:
+    """Return the bytes of a text file, unpacked if it is gzip; raises `InputError` where it is something else."""
+    if not path.is_file():  # A pipe would hang.
+        raise InputError(f"{path}: is not a file", hint=hint)
+    content = path.read_bytes()
+    if content.startswith(b"\x1f\x8b"):
+        content = gzip.decompress(content)
+    for start, what in ((b"PK\3\4", "a zip archive or a spreadsheet"), (b"PAR1", "a Parquet file")):
+        if content.startswith(start):
+            raise InputError(f"{path}: is {what}, not CSV", hint=f"save it as CSV in UTF-8; {hint}")
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise InputError(f"{path}: is text in UTF-16, not in UTF-8", hint=f"save it as CSV in UTF-8; {hint}")
+    return content.removeprefix(codecs.BOM_UTF8)
+
+
+def _header(content: bytes) -> tuple[str, list[str]]:
+    """Return what separates the fields of the first line, and the fields."""
+    first = next(iter(content[:100_000].lstrip(b"\r\n").splitlines()), b"").decode("utf-8", "replace")
+    separator = next((mark for mark in (",", ";", "\t") if mark in first), ",")
+    return separator, next(iter(csv.reader([first], delimiter=separator)), [])
+
+
+def _types_by_header(names: Sequence[str], types: Mapping[str, pa.DataType]) -> dict[str, pa.DataType]:
+    """Return the types by the names as the header has them: spaces and the case of letters may be others."""
+    exact = {name.strip() for name in names}
+    same = {name.lower(): name for name in types if name not in exact}
+    found = {name: same.get(name.strip().lower(), name.strip()) for name in names}
+    return {name: types[wanted] for name, wanted in found.items() if wanted in types}
+
+
+def _parse_csv(content: bytes, separator: str, options: Mapping[str, Any]) -> pa.Table:
+    return pa_csv.read_csv(
+        pa.BufferReader(content),
+        read_options=pa_csv.ReadOptions(use_threads=False),  # Else errors do not say the row.
+        parse_options=pa_csv.ParseOptions(delimiter=separator),
+        convert_options=pa_csv.ConvertOptions(**options),
+    )
+
+
+def _parse_odd_csv(content: bytes, separator: str, options: dict[str, Any], bad_numbers_are_nan: bool) -> pa.Table:
+    """Read what cannot be read at once: decimal commas, or fields that should be numbers and are none."""
+    decimal = "." if separator == "," else ","
+    try:
+        return _parse_csv(content, separator, {**options, "decimal_point": decimal})
+    except pa.ArrowInvalid:
+        if not bad_numbers_are_nan:
+            raise
+    type_of: dict[str, pa.DataType] = options["column_types"]
+    as_texts = {name: pa.string() if kind == pa.float64() else kind for name, kind in type_of.items()}
+    table = _parse_csv(content, separator, {**options, "column_types": as_texts})
+    for name, kind in type_of.items():
+        if kind == pa.float64() and table.column_names.count(name) == 1:
+            values = np.array([_number_or_nan(text, decimal) for text in table.column(name).to_pylist()])
+            table = table.set_column(table.column_names.index(name), name, numbers_to_arrow(values))
+    return table
+
+
+def _number_or_nan(text: str | None, decimal: str) -> float:
+    try:
+        return float((text or "nan").replace(decimal, "."))
+    except ValueError:
+        return math.nan

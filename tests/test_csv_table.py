@@ -1,0 +1,83 @@
+"""CSV files as spreadsheets and programs write them."""
+
+from __future__ import annotations
+
+import gzip
+import os
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+from valuemap.csv_table import read_csv_arrow
+from valuemap.errors import InputError
+
+TYPES = {**dict.fromkeys("xyz", pa.float64()), "class": pa.string()}
+PLAIN = b"x,y,z,class\n1,2,3.5,light\n"
+
+
+def read(folder: Path, content: bytes, *, bad_numbers_are_nan: bool = False) -> list[dict[str, object]]:
+    (folder / "points.csv").write_bytes(content)
+    table = read_csv_arrow(
+        folder / "points.csv", TYPES, has_missing=False, hint="a hint", bad_numbers_are_nan=bad_numbers_are_nan
+    )
+    rows: list[dict[str, object]] = table.to_pylist()
+    return rows
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        PLAIN,
+        b"\xef\xbb\xbf" + PLAIN,
+        gzip.compress(PLAIN),
+        PLAIN.replace(b"\n", b"\r\n"),
+        b"X,Y,Z,Class\n1,2,3.5,light\n",
+        b" x, Y ,z,class\n1,2,3.5,light\n",
+        b"x;y;z;class\n1;2;3.5;light\n",
+        b"x;y;z;class\n1;2;3,5;light\n",
+        b"x\ty\tz\tclass\n1\t2\t3.5\tlight\n",
+        b'"x","y","z","class"\n1,2,3.5,"light"\n',
+    ],
+)
+def test_all_these_say_the_same(tmp_path: Path, content: bytes) -> None:
+    assert read(tmp_path, content) == [{"x": 1.0, "y": 2.0, "z": 3.5, "class": "light"}]
+
+
+def test_a_name_in_other_letters_is_taken_only_where_the_exact_one_is_not_there(tmp_path: Path) -> None:
+    assert read(tmp_path, b"x,X\n1,one\n") == [{"x": 1.0, "X": "one"}]
+
+
+def test_what_is_no_number_is_an_error_or_nan(tmp_path: Path) -> None:
+    content = b"x,y,z\n1,two,3\n4,,6\n"
+    with pytest.raises(InputError, match=r"points\.csv: cannot be read as CSV: .*invalid value 'two'"):
+        read(tmp_path, content)
+    rows = read(tmp_path, content, bad_numbers_are_nan=True)
+    assert str(rows) == "[{'x': 1.0, 'y': nan, 'z': 3.0}, {'x': 4.0, 'y': nan, 'z': 6.0}]"
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "cannot be read as CSV: Empty CSV file"),
+        (b"\0\0\0", "cannot be read as CSV"),
+        ("x,y,z\n1,2,3\n".encode("utf-16"), "is text in UTF-16, not in UTF-8"),
+        (b"PK\3\4xl/worksheets", "is a zip archive or a spreadsheet, not CSV"),
+        (b"PAR1....", "is a Parquet file, not CSV"),
+        (gzip.compress(PLAIN)[:-9], "cannot be read as CSV: Compressed file ended"),
+        (b"x,y,z,class\n1,2,3,\xff\n", "invalid UTF8 data"),
+        (b"x,y,z\n1,2\n", "Row #2: Expected 3 columns, got 2"),
+    ],
+)
+def test_what_is_no_csv_is_named(tmp_path: Path, content: bytes, said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, content)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert "a hint" in caught.value.hint
+
+
+def test_a_pipe_does_not_hang(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.csv")
+    with pytest.raises(InputError, match=r"pipe\.csv: is not a file"):
+        read_csv_arrow(tmp_path / "pipe.csv", TYPES, has_missing=False, hint="a hint")
