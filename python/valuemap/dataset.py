@@ -23,7 +23,7 @@ from valuemap.tables import (
     Floats,
     Images,
     Ints,
-    Rejected,
+    RejectedRows,
     Table,
     Truth,
     TruthDetections,
@@ -105,7 +105,7 @@ class Dataset:
     detections: Detections
     truth: Truth | None = None
     truth_detections: TruthDetections | None = None
-    rejected: Rejected | None = None
+    rejected: RejectedRows | None = None
 
 
 def read_dataset(path: str | Path) -> Dataset:
@@ -120,7 +120,7 @@ def read_dataset(path: str | Path) -> Dataset:
     head = _read_head(folder)
     optional = {
         name: read_table(kind, folder / f"{name}.parquet") if (folder / f"{name}.parquet").is_file() else None
-        for name, kind in (("truth", Truth), ("truth_detections", TruthDetections), ("rejected", Rejected))
+        for name, kind in (("truth", Truth), ("truth_detections", TruthDetections), ("rejected", RejectedRows))
     }
     return check_dataset(
         Dataset(

@@ -8,7 +8,7 @@ held in ascending order of their key, so that nothing depends on the order of ro
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar
@@ -195,7 +195,7 @@ class TruthDetections(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class Rejected(Table):
+class RejectedRows(Table):
     """Rows that an import left out, in their order: which table they were for, where they stood, and why.
 
     `center_px`, `size_px` (N, 2) and `score` (N) are what was found, NaN where it was no number or does not apply.

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from valuemap.errors import InputError, SettingError
-from valuemap.tables import Bools, Cameras, Categories, Detections, Floats, Images, Ints, Rejected
+from valuemap.tables import Bools, Cameras, Categories, Detections, Floats, Images, Ints, RejectedRows
 
 MAX_REJECTED = 0.01
 """An import stops where a larger share of the boxes, or of the images, cannot be used."""
@@ -107,7 +107,7 @@ class Rejections:
 
     source: str
     max_share: float = MAX_REJECTED
-    _parts: list[Rejected] = field(default_factory=list)
+    _parts: list[RejectedRows] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.max_share <= 1.0:
@@ -116,7 +116,7 @@ class Rejections:
                 hint="for example 0.05 for one row in twenty",
             )
 
-    def table(self) -> Rejected | None:
+    def table(self) -> RejectedRows | None:
         """Return all of them, or None where there are none."""
         if not any(map(len, self._parts)):
             return None
@@ -124,7 +124,7 @@ class Rejections:
         def together(name: str) -> Categories:
             return Categories.from_texts([text for part in self._parts for text in getattr(part, name).texts()])
 
-        return Rejected(
+        return RejectedRows(
             table=together("table"),
             place=pa.concat_arrays([part.place for part in self._parts]),
             reason=together("reason"),
@@ -150,7 +150,7 @@ class Rejections:
             return
         nothing = np.full(len(rows), np.nan)
         pairs = np.full((len(rows), 2), np.nan)
-        part = Rejected(
+        part = RejectedRows(
             table=Categories.from_texts([table] * len(rows)),
             place=pa.array([_text(where(row)) for row in rows.tolist()], pa.string()),
             reason=Categories.from_texts([why.reasons[code].text for code in why.code[rows].tolist()]),
@@ -163,7 +163,7 @@ class Rejections:
         self._parts.append(part)
         self._refuse_too_many(table, why, part)
 
-    def _refuse_too_many(self, table: str, why: Verdicts, part: Rejected) -> None:
+    def _refuse_too_many(self, table: str, why: Verdicts, part: RejectedRows) -> None:
         what = {"detections": "boxes", "images": "images"}[table]
         # What goes with its image is the image's fault, which was counted.
         counted = np.flatnonzero(why.code[why.code >= 0] != why.code_of(_LEFT_OUT))
@@ -336,7 +336,7 @@ def _finite(values: Floats) -> Floats:
     return np.where(np.isfinite(values), values, np.nan)
 
 
-def _found(part: Rejected, row: int) -> str:
+def _found(part: RejectedRows, row: int) -> str:
     """Return what a box was, where the file said it."""
     if part.table.texts()[row] != "detections":
         return ""
@@ -346,7 +346,7 @@ def _found(part: Rejected, row: int) -> str:
     return f": {image!r}, centre {x:g} {y:g}, size {width:g} x {height:g}, score {part.score[row]:g}"
 
 
-def count_reasons(rejected: Rejected) -> dict[str, dict[str, int]]:
+def count_reasons(rejected: RejectedRows) -> dict[str, dict[str, int]]:
     """Return how many rows were left out, by table and reason, the most frequent reason first."""
     counts: dict[str, dict[str, int]] = {}
     for table, reason in zip(rejected.table.texts(), rejected.reason.texts(), strict=True):

@@ -12,7 +12,7 @@ from valuemap.cli.show import log, show, show_notes
 from valuemap.dataset import Dataset, write_dataset
 from valuemap.readers.vet import count_reasons
 from valuemap.summary import summarize_dataset
-from valuemap.tables import Rejected
+from valuemap.tables import RejectedRows
 
 _SHOWN_REJECTED = 10
 
@@ -29,7 +29,7 @@ def finish_dataset(dataset: Dataset, out: Path) -> None:
     log.print(f"Wrote {out}", highlight=False)
 
 
-def _rejected_lines(rejected: Rejected, out: Path) -> Iterator[str]:
+def _rejected_lines(rejected: RejectedRows, out: Path) -> Iterator[str]:
     """Yield how many rows were left out, by reason, and the first of them."""
     for table, count in count_reasons(rejected).items():
         for reason, rows in count.items():
