@@ -12,10 +12,10 @@ from scipy.spatial import cKDTree
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.dataset import Dataset, Frame, check_dataset
 from valuemap.errors import InputError, SettingError
-from valuemap.readers.vet import MAX_REJECTED, FoundBoxes, Rejections, vet_boxes, vet_images
+from valuemap.readers.vet import MAX_REJECTED, FoundBoxes, Rejections, number_detections, vet_boxes, vet_images
 from valuemap.tables import Cameras, Floats, Images, Truth
 
-__all__ = ["MAX_REJECTED", "ONE_PASS", "FoundBoxes", "assemble"]
+__all__ = ["MAX_REJECTED", "ONE_PASS", "FoundBoxes", "assemble", "number_detections"]
 
 ONE_PASS = "all"
 """The pass of images about whose passes nothing is known."""

@@ -275,28 +275,46 @@ def vet_boxes(boxes: FoundBoxes, images: Images, usable: Bools, cameras: Cameras
         return str(images.name[row[i]].as_py()) if row[i] >= 0 else ""
 
     rejections.add("detections", why, where=boxes.where, image_names=image_name, boxes=boxes)
-    return _number(boxes, classes, images.image_id[row], why.fine)
+    fine = why.fine
+    return number_detections(
+        images.image_id[row[fine]],
+        classes.take(fine),
+        boxes.center_px[fine],
+        boxes.size_px[fine],
+        boxes.score[fine],
+        None if boxes.detection_id is None else boxes.detection_id[fine],
+        None if boxes.range_m is None else boxes.range_m[fine],
+        None if boxes.range_sigma_m is None else boxes.range_sigma_m[fine],
+    )
 
 
-def _number(boxes: FoundBoxes, classes: Categories, image_id: Ints, fine: Bools) -> Detections:
-    """Return the fine boxes as detections, numbered in an order that does not depend on theirs."""
-    rows = np.flatnonzero(fine)
-    if boxes.detection_id is None:
-        keys = (boxes.score, classes.codes, *boxes.size_px.T, *boxes.center_px.T, image_id)
-        rows = rows[np.lexsort([key[rows] for key in keys])]
-        ids: Ints = np.arange(len(rows), dtype=np.int64)
+def number_detections(
+    image_id: Ints,
+    class_names: Sequence[str] | Categories,
+    center_px: Floats,
+    size_px: Floats,
+    score: Floats,
+    detection_id: Ints | None = None,
+    range_m: Floats | None = None,
+    range_sigma_m: Floats | None = None,
+) -> Detections:
+    """Return boxes that can all be used as detections; `image_id` (N) is of `Images`, the rest as in `FoundBoxes`."""
+    classes = class_names if isinstance(class_names, Categories) else Categories.from_texts(class_names)
+    if detection_id is None:
+        order = np.lexsort((score, classes.codes, *size_px.T, *center_px.T, image_id))
+        ids: Ints = np.arange(len(order), dtype=np.int64)
     else:
-        rows = rows[np.argsort(boxes.detection_id[rows])]
-        ids = boxes.detection_id[rows]
+        order = np.argsort(detection_id)
+        ids = detection_id[order]
     return Detections(
         detection_id=ids,
-        image_id=image_id[rows],
-        class_name=classes.take(rows),
-        center_px=boxes.center_px[rows],
-        size_px=boxes.size_px[rows],
-        score=boxes.score[rows],
-        range_m=None if boxes.range_m is None else boxes.range_m[rows],
-        range_sigma_m=None if boxes.range_sigma_m is None else boxes.range_sigma_m[rows],
+        image_id=image_id[order],
+        class_name=classes.take(order),
+        center_px=center_px[order],
+        size_px=size_px[order],
+        score=score[order],
+        range_m=None if range_m is None else range_m[order],
+        range_sigma_m=None if range_sigma_m is None else range_sigma_m[order],
     )
 
 
