@@ -52,19 +52,19 @@ def cramer_rao_covariances(views: Views, config: SimulationConfig, objects: int)
 
 def true_views(recording: Recording) -> Views:
     """Return the detections that show objects, with true poses, boxes and derivatives."""
-    dataset, config, lights = recording.dataset, recording.config, recording.city.lights
+    dataset, config, objects = recording.dataset, recording.config, recording.city.objects
     assert dataset.truth is not None
     assert dataset.truth_detections is not None
     object_row = rows_of(dataset.truth_detections.object_id, dataset.truth.object_id)
     detection = rows_of(dataset.truth_detections.detection_id, dataset.detections.detection_id)
     frames = recording.frames.take(rows_of(dataset.detections.image_id[detection], dataset.images.image_id))
     cam_from_world = frames.cam_from_world()
-    in_cam = np.einsum("nij,nj->ni", cam_from_world, lights.position_in_world_m[object_row] - frames.center_in_world_m)
+    in_cam = np.einsum("nij,nj->ni", cam_from_world, objects.position_in_world_m[object_row] - frames.center_in_world_m)
     x, y, depth = in_cam.T
     of_cam = np.zeros((len(depth), 2, 3))
     of_cam[:, 0, 0] = of_cam[:, 1, 1] = config.focal_px / depth
     of_cam[:, 0, 2], of_cam[:, 1, 2] = -config.focal_px * x / depth**2, -config.focal_px * y / depth**2
-    height_px = config.focal_px * lights.size_m[object_row, 1] / depth
+    height_px = config.focal_px * objects.size_m[object_row, 1] / depth
     views = Views(
         object_row=object_row,
         pass_row=frames.pass_row,

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import dense
 from bound import Views, cramer_rao_covariances, residual_covariance, true_views
 from cities import PASSING_KINDS, passing_things, reliability
 from literal import Pinhole, Sighting
@@ -148,6 +149,35 @@ def test_reliability_counts_labels_by_their_existence() -> None:
     ]
 
 
+# Dense scenes.
+
+
+def test_a_label_is_right_within_3_of_its_sigmas_and_1_to_3_m() -> None:
+    distance_m = np.array([0.9, 0.9, 1.1, 1.1, 2.9, 3.1])
+    sigmas = np.array([2.0, 9.0, 2.9, 3.1, 2.9, 1.0])
+    assert dense.is_right(distance_m, sigmas**2).tolist() == [True, True, True, False, True, False]
+
+
+def test_most_matches_come_first_then_the_least_distance() -> None:
+    distance_m = np.array([[0.1, 0.9, 9.0], [0.2, 9.0, 9.0], [9.0, 0.4, 9.0]])
+    rows, columns = dense.match_one_to_one(distance_m, distance_m < 1.0)
+    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == [(0, 0), (2, 1)]
+    rows, columns = dense.match_one_to_one(distance_m[:2], distance_m[:2] < 1.0)
+    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == [(0, 1), (1, 0)]
+    assert len(dense.match_one_to_one(np.empty((0, 3)), np.empty((0, 3), np.bool_))[0]) == 0
+
+
+def test_the_small_part_of_a_scene_is_whole_in_itself() -> None:
+    recording = dense.record_scene(dense.SCENES["posts-3"], 0, is_small=True)
+    dataset, boxes = recording.dataset, recording.boxes
+    assert dataset.truth_detections is not None
+    assert 50 < len(dataset.images) == len(recording.frames) < 150
+    assert np.array_equal(dataset.images.image_id[boxes.frame_row], dataset.detections.image_id)
+    is_object = boxes.kind == KINDS.index("roadside")
+    assert np.array_equal(dataset.detections.detection_id[is_object], dataset.truth_detections.detection_id)
+    assert dense.objects_that_count(recording, 3).sum() > 20
+
+
 # More data.
 
 
@@ -189,6 +219,7 @@ def test_reprojection_errors_are_those_of_the_pinhole() -> None:
         ("robust", "--seeds 0 --passes 1", 1),
         ("robust", "--seeds 0 --passes 1 --method paper", 1),
         ("more_data", "--seeds 0 --tours 1 2", 2),
+        ("dense", "--seeds 0 --small --only lamps-25", 1),
         ("ablation", "--seeds 0 --passes 1 --without nothing", 1),
     ],
 )

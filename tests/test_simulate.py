@@ -672,7 +672,7 @@ def test_a_recording_tells_what_every_detection_shows() -> None:
     most_passes = {}
     for kind, rows in is_of.items():
         met = np.unique(np.stack([boxes.thing_row[rows], passes[rows]], axis=1), axis=0)[:, 0]
-        most_passes[kind] = np.bincount(met).max()
+        most_passes[kind] = np.bincount(met).max(initial=0)
     assert (most_passes["clutter"], most_passes["reflections"], most_passes["temporary"]) == (1, 1, 1)
     assert min(most_passes["lights"], most_passes["lookalikes"]) > 2
     assert np.bincount(boxes.thing_row[is_of["clutter"]]).max() == 1

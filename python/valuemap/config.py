@@ -365,6 +365,28 @@ class SimulationConfig:
     )
     light_width_m: float = _setting(0.35, unit="m", open_low=True, effect="width of a light")
     light_height_m: float = _setting(1.0, unit="m", open_low=True, effect="height of a light")
+    has_lights: int = _setting(
+        1, unit="0 or 1", high=1, effect="0 builds a city without lights, in which no car waits and all images are kept"
+    )
+
+    # What stands in rows along the streets.
+    sign_row_spacing_m: float = _setting(
+        0.0, unit="m", effect="distance along the right side of a street between two rows of signs; 0 for none"
+    )
+    sign_apart_m: float = _setting(
+        0.9, unit="m", open_low=True, effect="distance between the middles of two signs side by side"
+    )
+    min_row_signs: int = _setting(2, unit="signs", low=1, effect="fewest signs of a row")
+    max_row_signs: int = _setting(6, unit="signs", low=1, high=12, effect="most signs of a row")
+    lamp_spacing_m: float = _setting(
+        0.0, unit="m", effect="distance between two street lamps on each side of a street; 0 for none"
+    )
+    tree_spacing_m: float = _setting(
+        0.0, unit="m", effect="distance between two trees on each side of a street; 0 for none"
+    )
+    post_spacing_m: float = _setting(
+        0.0, unit="m", effect="distance between two posts on each side of a street; 0 for none"
+    )
 
     # The drives.
     passes_per_street: int = _setting(
@@ -559,11 +581,31 @@ class SimulationConfig:
                 f"min_lights ({self.min_lights}) must be at most max_lights ({self.max_lights})",
                 hint="set both, e.g. --set min_lights=3 --set max_lights=8",
             )
+        if self.min_row_signs > self.max_row_signs:
+            raise SettingError(
+                f"min_row_signs ({self.min_row_signs}) must be at most max_row_signs ({self.max_row_signs})",
+                hint="set both, e.g. --set min_row_signs=2 --set max_row_signs=6",
+            )
+        rows = (self.sign_row_spacing_m, self.lamp_spacing_m, self.tree_spacing_m, self.post_spacing_m)
+        if not self.has_lights and not any(rows):
+            raise SettingError(
+                "has_lights and all spacings of signs, lamps, trees and posts are 0, so nothing stands in the city",
+                hint="--set post_spacing_m=10 puts posts along the streets",
+            )
         if self.recall_sd > 0.0 and self.recall_sd**2 >= self.recall_mean * (1.0 - self.recall_mean):
             raise SettingError(
                 f"recall_sd ({self.recall_sd}) is too large for recall_mean ({self.recall_mean})",
                 hint="a share between 0 and 1 cannot vary so much: take a smaller recall_sd, or 0",
             )
+
+    def check_drawable(self) -> None:
+        """Raise `SettingError` where pictures could not show what is simulated."""
+        for name in ("sign_row_spacing_m", "lamp_spacing_m", "tree_spacing_m", "post_spacing_m"):
+            if getattr(self, name):
+                raise SettingError(
+                    f"{name} ({getattr(self, name)}): pictures are drawn of cities with lights only",
+                    hint=f"leave --images away, or --set {name}=0",
+                )
 
     def with_settings(self, assignments: Iterable[str]) -> Self:
         """Return a copy with `name=value` assignments applied; raises as `MapConfig.with_settings`."""

@@ -33,6 +33,8 @@ def simulate_command(
         raise SettingError(f"--preset {preset}: there is no such preset", hint=f"choose one of {', '.join(PRESETS)}")
     check_place(out, marker=dataset_folder.MARKER)
     config = PRESETS[preset].with_settings(assignments or [])
+    if images:
+        config.check_drawable()
     with progress_bars() as progress:
         recording = record_city(config, seed=seed, name=preset, progress=progress)
     finish_dataset(recording.dataset, out)

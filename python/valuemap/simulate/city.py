@@ -1,16 +1,20 @@
-"""What stands in the city: lights at some intersections, and things that look like lights."""
+"""What stands in the city: lights at some intersections, rows along the streets, and things that look like lights."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from valuemap.config import SimulationConfig
 from valuemap.errors import SettingError
+from valuemap.simulate.roadside import place_roadside
+from valuemap.simulate.rows import join_rows
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import DIRECTIONS, Streets, lay_streets
-from valuemap.tables import Bools, Floats, Ints, Table
+from valuemap.simulate.targets import CLASSES, Targets, class_of_false
+from valuemap.tables import Bools, Floats, Ints
 
 _MOUNTS_M: Floats = np.array(
     # Ahead of the intersection's centre, to the left of the street's axis, above the street, as drivers see it.
@@ -33,32 +37,23 @@ _LOOKALIKE_ABOVE_M = (2.5, 6.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Targets(Table):
-    """Things that are detected as lights.
-
-    `position_in_world_m` (N, 3) are their centres; `facing_rad` (N) where they shine to, counter-clockwise from
-    east; `size_m` (N, 2) width and height; `recall_share` (N) how often they are detected compared to a light;
-    `pass_row` (N) the only pass that meets them, or -1 for all.
-    """
-
-    position_in_world_m: Floats
-    facing_rad: Floats
-    size_m: Floats
-    recall_share: Floats
-    pass_row: Ints
-
-
-@dataclass(frozen=True, eq=False)
 class City:
     """Streets and what stands there for good.
 
+    `roadside` are the signs, lamps, trees and posts along the streets.
     `is_signalised[i, j, k]` says whether lights face the traffic that reaches intersection (i, j) in direction k.
     """
 
     streets: Streets
     is_signalised: Bools
     lights: Targets
+    roadside: Targets
     lookalikes: Targets
+
+    @cached_property
+    def objects(self) -> Targets:
+        """All that is in the truth, in its order: the lights, then what stands along the streets."""
+        return join_rows([self.lights, self.roadside])
 
 
 def build_city(config: SimulationConfig, *, seed: int) -> City:
@@ -77,14 +72,15 @@ def build_city(config: SimulationConfig, *, seed: int) -> City:
         streets=streets,
         is_signalised=lights_facing > 0,
         lights=lights,
-        lookalikes=_place_lookalikes(
-            config, count, np.argwhere(lights_facing > 0), streets, random_stream(seed, "lookalikes")
-        ),
+        roadside=place_roadside(config, streets, seed=seed),
+        lookalikes=_place_lookalikes(config, count, np.argwhere(lights_facing > 0), streets, seed),
     )
 
 
 def _lights_per_approach(config: SimulationConfig, streets: Streets, random: np.random.Generator) -> Ints:
     """Return (i, j, k): how many lights face the traffic that reaches intersection (i, j) in direction k."""
+    if not config.has_lights:
+        return np.zeros((*streets.shape, 4), dtype=np.int64)
     can_arrive = np.roll(streets.can_leave(), 2, axis=2)  # Who may leave to the west may arrive going east.
     every = np.argwhere(np.ones(streets.shape))
     count = max(1, round(config.signalised_share * len(every)))
@@ -127,9 +123,10 @@ def _hang_lights(
     config: SimulationConfig, lights_facing: Ints, streets: Streets, random: np.random.Generator
 ) -> Targets:
     approaches = np.argwhere(lights_facing > 0)
-    places = [_choose_mounts(config, lights_facing[i, j, k], random) for i, j, k in approaches]
-    of_light = np.repeat(approaches, [len(p) for p in places], axis=0)
-    return _targets_at(of_light, np.concatenate(places), streets, config, 1.0, random)
+    places = [np.empty((0, 3)), *(_choose_mounts(config, lights_facing[i, j, k], random) for i, j, k in approaches)]
+    of_light = np.repeat(approaches, [len(p) for p in places[1:]], axis=0)
+    class_code = np.full(len(of_light), CLASSES.index("traffic_light"))
+    return _targets_at(of_light, np.concatenate(places), class_code, streets, config, 1.0, random)
 
 
 def _choose_mounts(config: SimulationConfig, count: int, random: np.random.Generator) -> Floats:
@@ -150,10 +147,9 @@ def _choose_mounts(config: SimulationConfig, count: int, random: np.random.Gener
     return places[np.arange(count) % len(places)] + above_m
 
 
-def _place_lookalikes(
-    config: SimulationConfig, count: int, approaches: Ints, streets: Streets, random: np.random.Generator
-) -> Targets:
+def _place_lookalikes(config: SimulationConfig, count: int, approaches: Ints, streets: Streets, seed: int) -> Targets:
     """Put lookalikes beside the streets that lead to lights, where cars look."""
+    random = random_stream(seed, "lookalikes")
     side = random.choice([-1.0, 1.0], count)
     places = np.column_stack(
         [
@@ -162,13 +158,15 @@ def _place_lookalikes(
             random.uniform(*_LOOKALIKE_ABOVE_M, count),
         ]
     )
-    chosen = approaches[random.integers(0, len(approaches), count)]
-    return _targets_at(chosen, places, streets, config, config.lookalike_recall, random)
+    chosen = approaches[random.integers(0, max(len(approaches), 1), count)]
+    class_code = class_of_false(count, config, seed=seed, kind="lookalikes")
+    return _targets_at(chosen, places, class_code, streets, config, config.lookalike_recall, random)
 
 
 def _targets_at(
     approach: Ints,
     place_m: Floats,
+    class_code: Ints,
     streets: Streets,
     config: SimulationConfig,
     recall_share: float,
@@ -186,4 +184,6 @@ def _targets_at(
         size_m=np.broadcast_to([config.light_width_m, config.light_height_m], (count, 2)),
         recall_share=np.full(count, recall_share),
         pass_row=np.full(count, -1, dtype=np.int64),
+        class_code=class_code,
+        is_round=np.zeros(count, dtype=np.bool_),
     )

@@ -7,14 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from valuemap.config import SimulationConfig
-from valuemap.simulate.city import Targets
 from valuemap.simulate.drives import Frames
 from valuemap.simulate.sightings import Sightings
 from valuemap.simulate.streams import random_stream
+from valuemap.simulate.targets import Targets
 from valuemap.tables import Bools, Floats, Ints, Table
 
-KINDS = ("lights", "lookalikes", "temporary", "reflections", "clutter")
-"""What a box may show, only the first rightly; also the names of their random numbers."""
+KINDS = ("lights", "lookalikes", "temporary", "reflections", "clutter", "roadside")
+"""What a box may show; also the names of their random numbers."""
+TRUE_KINDS = ("lights", "roadside")
+"""The kinds that a box shows rightly, in the order of the truth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,12 +24,13 @@ class Boxes(Table):
     """Detected boxes: centres and sizes (N, 2) in pixels, scores (N).
 
     `kind` (N) is what a box shows, as index of KINDS; `thing_row` (N) numbers the things of a kind from 0, so that
-    boxes of one thing have one number.
+    boxes of one thing have one number; `class_code` (N) is what the detector calls it.
     """
 
     frame_row: Ints
     kind: Ints
     thing_row: Ints
+    class_code: Ints
     center_px: Floats
     size_px: Floats
     score: Floats
@@ -68,12 +71,13 @@ def detect(
     sigma_px = np.hypot(config.pixel_noise_px, config.pixel_noise_share * height_px)
     shift_px = random_stream(seed, kind, "center").standard_normal((count, 2)) * sigma_px[:, None]
     stretch = np.exp(config.size_noise * random_stream(seed, kind, "size").standard_normal((count, 2)))
-    best = config.score_true if kind == "lights" else (config.score_true + config.score_false) / 2.0
+    best = config.score_true if kind in TRUE_KINDS else (config.score_true + config.score_false) / 2.0
     score = config.score_false + (best - config.score_false) * quality
     boxes = Boxes(
         frame_row=sightings.frame_row,
         kind=np.full(count, KINDS.index(kind)),
         thing_row=sightings.target_row,
+        class_code=targets.class_code[sightings.target_row],
         center_px=inside_picture(sightings.center_px + shift_px, config),
         size_px=sightings.size_px * stretch,
         score=noisy_score(score, config, random_stream(seed, kind, "score")),

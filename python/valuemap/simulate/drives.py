@@ -31,7 +31,7 @@ class Frames(Table):
     """True exposures, in the order of passes and time.
 
     `pass_row` (N) numbers the passes; `distance_m` (N) is driven since the start of the pass; `signal_ahead_m`
-    (N) the distance along the street to the next intersection with lights that face the car;
+    (N) the distance along the street to the next intersection with lights that face the car, 0 in a city without;
     `center_in_world_m` (N, 3) the camera centre; `heading_rad` (N) where it looks, counter-clockwise from east;
     `pitch_rad` (N) how far up.
     """
@@ -86,6 +86,8 @@ def _drive_route(route: Route, city: City, config: SimulationConfig, seed: int, 
     ahead_m = _distance_to_next(path.middle_at_m[has_lights], distance_m)
     # Lights round a corner are not ahead.
     ahead_m[_distance_to_next(path.middle_at_m[path.turn != 0], distance_m) < ahead_m] = np.inf
+    if not config.has_lights:
+        ahead_m = np.zeros(len(distance_m))
     kept = ahead_m <= config.keep_before_signal_m * (KEEP_RANGE[1] if config.detections else 1.0)
     distance_m, time_s, ahead_m = distance_m[kept], time_s[kept], ahead_m[kept]
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 import numpy as np
 
 from valuemap.config import SimulationConfig
-from valuemap.simulate.city import Targets
 from valuemap.simulate.detector import KINDS, Boxes, inside_picture, noisy_score
 from valuemap.simulate.drives import Frames
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import Streets
+from valuemap.simulate.targets import Targets, class_of_false
 from valuemap.tables import Floats
 
 _BOX_HEIGHT_PX = (6.0, 40.0)
@@ -34,6 +34,7 @@ def clutter(frames: Frames, config: SimulationConfig, *, seed: int) -> Boxes:
         frame_row=frame_row,
         kind=np.full(len(frame_row), KINDS.index("clutter")),
         thing_row=np.arange(len(frame_row)),
+        class_code=class_of_false(len(frame_row), config, seed=seed, kind="clutter"),
         center_px=center_px,
         size_px=size_px,
         score=noisy_score(score, config, random_stream(seed, "clutter", "score")),
@@ -59,6 +60,7 @@ def reflect(frames: Frames, config: SimulationConfig, *, seed: int) -> Boxes:
         frame_row=frame_row,
         kind=np.full(count, KINDS.index("reflections")),
         thing_row=of_box,
+        class_code=class_of_false(len(first), config, seed=seed, kind="reflections")[of_box],
         center_px=inside_picture(center_px[of_box] + jitter_px, config),
         size_px=size_px[of_box],
         score=noisy_score(score, config, random_stream(seed, "reflections", "score")),
@@ -84,6 +86,8 @@ def place_temporary(frames: Frames, streets: Streets, config: SimulationConfig, 
         size_m=np.broadcast_to([config.light_width_m, config.light_height_m], (count, 2)),
         recall_share=np.full(count, config.temporary_recall),
         pass_row=frames.pass_row[near],
+        class_code=class_of_false(count, config, seed=seed, kind="temporary"),
+        is_round=np.zeros(count, dtype=np.bool_),
     )
 
 

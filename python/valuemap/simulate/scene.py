@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from valuemap.simulate.canvas import View
-from valuemap.simulate.city import Targets
 from valuemap.simulate.furniture import approach_of
 from valuemap.simulate.housings import Housings, place_housings
 from valuemap.simulate.rows import join_rows
@@ -17,6 +16,7 @@ from valuemap.simulate.scenery import Scenery, build_scenery
 from valuemap.simulate.sightings import Sightings
 from valuemap.simulate.signals import Signals, time_signals
 from valuemap.simulate.simulation import Recording
+from valuemap.simulate.targets import Targets
 from valuemap.simulate.traffic import CAR, Vehicles, vehicles_around
 from valuemap.simulate.vehicle_shapes import SHAPES
 from valuemap.tables import Bools, Floats, Ints, Table
@@ -83,7 +83,14 @@ class Scene:
 
 
 def build_world(recording: Recording) -> World:
-    """Furnish the city of a recording, and time its signals."""
+    """Furnish the city of a recording, and time its signals.
+
+    Raises
+    ------
+    SettingError
+        Something in the city cannot be drawn.
+    """
+    recording.config.check_drawable()
     city, frames = recording.city, recording.frames
     targets = join_rows([city.lights, city.lookalikes])
     return World(

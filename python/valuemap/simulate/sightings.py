@@ -9,10 +9,10 @@ from scipy.spatial import cKDTree
 
 from valuemap.config import SimulationConfig
 from valuemap.progress import Progress
-from valuemap.simulate.city import Targets
 from valuemap.simulate.drives import Frames
 from valuemap.simulate.rows import join_rows
 from valuemap.simulate.streets import Streets
+from valuemap.simulate.targets import Targets
 from valuemap.tables import Floats, Ints, Table
 
 _CHUNK_FRAMES = 50_000
@@ -54,7 +54,7 @@ def _see_in_chunk(targets: Targets, frames: Frames, streets: Streets, config: Si
     frame_row, target_row = _pairs_within(frames, targets, config.max_sight_m)
     center, position = frames.center_in_world_m[frame_row], targets.position_in_world_m[target_row]
     to_target = position - center
-    turn = cos_facing(to_target, targets.facing_rad[target_row])
+    turn = np.where(targets.is_round[target_row], 1.0, cos_facing(to_target, targets.facing_rad[target_row]))
     in_cam = np.einsum("nij,nj->ni", frames.cam_from_world()[frame_row], to_target)
     depth_m = np.maximum(in_cam[:, 2:], _NEAREST_M)
     picture_px = np.array([config.image_width_px, config.image_height_px])

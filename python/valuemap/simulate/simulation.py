@@ -13,15 +13,15 @@ from valuemap.dataset import Dataset, Frame
 from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
 from valuemap.simulate.city import City, build_city
-from valuemap.simulate.detector import KINDS, Boxes, detect, hidden_by_traffic, recall_of_passes
+from valuemap.simulate.detector import KINDS, TRUE_KINDS, Boxes, detect, hidden_by_traffic, recall_of_passes
 from valuemap.simulate.drives import KEEP_RANGE, Frames, drive
 from valuemap.simulate.false_objects import clutter, place_temporary, reflect
 from valuemap.simulate.pose_errors import pose_errors
 from valuemap.simulate.rows import join_rows
 from valuemap.simulate.sightings import Sightings, see
+from valuemap.simulate.targets import CLASSES, classes_in
 from valuemap.tables import Bools, Cameras, Categories, Detections, Floats, Images, Ints, Truth, TruthDetections
 
-_CLASS = "traffic_light"
 _CAMERA_ID = 0
 _KEEP_STEP_M = 0.5
 
@@ -115,7 +115,9 @@ def _dataset(
     rotation_error_rad: Floats,
     config: SimulationConfig,
 ) -> Dataset:
-    shows_light = boxes.kind == KINDS.index("lights")
+    shows_object = np.isin(boxes.kind, [KINDS.index(kind) for kind in TRUE_KINDS])
+    is_of_roadside = boxes.kind == KINDS.index("roadside")
+    object_row = boxes.thing_row + np.where(is_of_roadside, len(city.lights), 0)
     return Dataset(
         name=name,
         frame=Frame(),
@@ -124,19 +126,17 @@ def _dataset(
         detections=Detections(
             detection_id=np.arange(len(boxes)),
             image_id=boxes.frame_row,
-            class_name=_all_of_class(len(boxes)),
+            class_name=_classes(boxes.class_code, config),
             center_px=boxes.center_px,
             size_px=boxes.size_px,
             score=boxes.score,
         ),
         truth=Truth(
-            object_id=np.arange(len(city.lights)),
-            class_name=_all_of_class(len(city.lights)),
-            position_in_world_m=city.lights.position_in_world_m,
+            object_id=np.arange(len(city.objects)),
+            class_name=_classes(city.objects.class_code, config),
+            position_in_world_m=city.objects.position_in_world_m,
         ),
-        truth_detections=TruthDetections(
-            detection_id=np.flatnonzero(shows_light), object_id=boxes.thing_row[shows_light]
-        ),
+        truth_detections=TruthDetections(detection_id=np.flatnonzero(shows_object), object_id=object_row[shows_object]),
     )
 
 
@@ -146,6 +146,7 @@ def _detect_everything(
     """Return all boxes, by frame and in it from left to right, so that their order tells nothing."""
     recall = recall_of_passes(int(frames.pass_row[-1]) + 1, config, seed=seed)
     kinds = {
+        "roadside": city.roadside,
         "lookalikes": city.lookalikes,
         "temporary": place_temporary(frames, city.streets, config, seed=seed),
     }
@@ -155,6 +156,8 @@ def _detect_everything(
         detect(of_lights, city.lights, frames, recall, config, seed=seed, kind="lights"),
     ]
     for kind, targets in kinds.items():
+        if len(targets) == 0:
+            continue
         seen = see(targets, frames, city.streets, config, progress=progress, what=f"seeing {kind}")
         parts.append(detect(seen, targets, frames, recall, config, seed=seed, kind=kind))
     boxes = join_rows(parts)
@@ -230,5 +233,6 @@ def _pose_sigmas(count: int, config: SimulationConfig) -> dict[str, Floats]:
     return {name: np.full(count, sigma) for name, sigma in sigmas.items() if sigma > 0.0}
 
 
-def _all_of_class(count: int) -> Categories:
-    return Categories(np.zeros(count, dtype=np.int32), (_CLASS,))
+def _classes(class_code: Ints, config: SimulationConfig) -> Categories:
+    classes = classes_in(config)
+    return Categories(np.searchsorted(classes, class_code).astype(np.int32), tuple(CLASSES[code] for code in classes))
