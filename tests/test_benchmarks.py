@@ -175,7 +175,7 @@ def test_the_small_part_of_a_scene_is_whole_in_itself() -> None:
     assert np.array_equal(dataset.images.image_id[boxes.frame_row], dataset.detections.image_id)
     is_object = boxes.kind == KINDS.index("roadside")
     assert np.array_equal(dataset.detections.detection_id[is_object], dataset.truth_detections.detection_id)
-    assert dense.objects_that_count(recording, 3).sum() > 20
+    assert np.logical_and(*dense.objects_that_count(recording, 3)).sum() > 20
 
 
 # More data.

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from valuemap.simulate.canvas import ENLARGED, Picture, View, fill, on_canvas
-from valuemap.simulate.city import Targets
 from valuemap.simulate.sightings import NARROWEST, cos_facing
+from valuemap.simulate.targets import Targets
 from valuemap.simulate.weather import Color, Light
 from valuemap.tables import Floats, Ints, Table
 
