@@ -7,9 +7,9 @@ one fault of the detector, of the poses or of the drives each. All settings of t
 Counted over all seeds of a scene: recall of the objects whose Cramer-Rao bound (`bound.py`; root of the trace) is at
 most 0.5 m and that have enough detections; precision, of all labels; duplicates, labels that only lack an object
 because another label took it; the mean squared normalised error of the right labels (3 if covariances are honest).
-A label is right within 1 m of an object of its class, or within 3 m and three of its own standard deviations; labels and
-objects are matched one to one, most matches first, then least distance. One that is not right, but of whose votes more
-than half show one object with a larger bound, is left out: nobody can tell where that is.
+A label is right within 1 m of an object of its class, or within 3 m and three of its own standard deviations; labels
+and objects are matched one to one, most matches first, then least distance. One that is not right, but of whose votes
+more than half show one object with a larger bound, is left out: nobody can tell where that is.
 
 Time per detection is that of `build_map`; `--nyc` measures that of the `nyc` preset in the same run, for comparison.
 `--small` takes a small part of each scene, for quick looks while working on the method; `--radius` a larger part.
@@ -59,7 +59,7 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What became of one scene of one seed: `labels` are those not left out, `normalised_error` (N) of the right ones."""
+    """What became of one scene of one seed: `labels` are those that count, `normalised_error` (N) of right ones."""
 
     objects: int
     found: int
