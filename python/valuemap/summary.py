@@ -8,6 +8,7 @@ import numpy as np
 
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset, Frame, rows_of
+from valuemap.drives import find_drives, summarize_drives
 from valuemap.map_folder import Map
 from valuemap.tables import Categories, Floats, Ints
 
@@ -23,6 +24,7 @@ def summarize_dataset(dataset: Dataset) -> dict[str, Any]:
         "camera models": ", ".join(sorted(set(dataset.cameras.model.texts()))),
         "images": len(images),
         "passes": len(np.unique(images.pass_id.codes)),
+        **summarize_drives(find_drives(images)),
         "extent in m": _extent(camera_centers(images)),
         "detections": len(detections),
         "classes": _classes(detections.class_name),

@@ -1,0 +1,823 @@
+"""Driving order, told once: which images are one drive, in which order, and from which places they were taken.
+
+All that follows looks only at times, numbers in names, poses and which images share a pass and a camera; never at
+the values of ids, the order of rows or what passes are called. Images are put into an order of their own first (by
+time, then place), and all ties are broken by it.
+
+1. *Streams*: the images of one camera in one pass.
+2. *Rigs*: streams that expose together, each always in the same place seen from the other, are cameras of one
+   vehicle. Their images share exposures.
+3. *Order*: the exposures of a vehicle by time, else by the numbers in their names, else along the chain of nearest
+   poses. An order that makes the way clearly longer than the chain is not believed.
+4. *Drives*: the order is cut where time or place jumps, and where the vehicle comes back to where it was.
+5. *Viewpoints*: a new one begins where the camera has moved more than a step since the last one began.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from valuemap.cameras import camera_centers, rotation_matrices
+from valuemap.tables import Bools, Floats, Images, Ints
+
+_MOST_CAMERAS = 16
+"""More images of one camera and pass with one time than this are no rig: the time is a date, and tells no order."""
+_LEAST_EXPOSURES = 3
+"""Two cameras must expose together this often before their places relative to each other can be said to be constant."""
+_LEAST_SHARE_ON_RIGS = 0.2
+"""A part of the names in which fewer images than this share differ alone names no cameras."""
+_LEAST_NAMESAKES = 8
+"""The same by names: fewer names agree by chance."""
+_SAME_LOOK_COSINE = float(np.cos(np.radians(10.0)))
+"""Two cameras that look less than this apart look the same way."""
+_WINDOW = 16
+"""Exposures in a row that are looked at together: in random order their way is 5.7 times as long as they are wide."""
+_CLEARLY_LONGER = 2.0
+"""An order whose way is longer than the chain of nearest poses by this factor is none."""
+_TRIMMED_SHARE = 0.05
+"""The longest steps of an order say how far apart its parts are, not whether it is one: they are left out."""
+_NEIGHBORS = 8
+"""Nearest poses that a pose may be chained to in one round."""
+_GAP_STEPS = 10.0
+"""A step longer than this many usual ones is a jump, if the time it took does not explain it."""
+_JUMP_SPEEDS = 3.0
+"""Faster than this many usual speeds nobody drives."""
+_PAUSE_STEPS = 100.0
+"""Who was away for longer than this many usual steps take, and comes back elsewhere, drives anew."""
+_STOP_STEPS = 1000.0
+"""Who stood for longer than this many usual steps take drives anew: no light is red for that long."""
+_REVISIT_STEPS = 5.0
+"""Nearer than this many usual steps is the same place: opposite lanes are, parallel streets are not."""
+_AWAY_STEPS = 30.0
+"""Who drove this many usual steps between two visits of a place had left it."""
+_STILL_SHARE = 1.0 / 3.0
+"""A step shorter than this share of a usual one is no way made: poses of a standing car tremble."""
+
+_STEADY_SHARE = 0.5
+"""A place that varies by less than this share of the way from image to image is constant."""
+_ROUNDING = 1e-6
+"""What is constant to this share of the way is constant."""
+
+_SIDE_BY_SIDE = 16
+"""Fewer runs than this are faster one by one."""
+
+TIME, NAME, CHAIN = 0, 1, 2
+_TOLD_BY = ("time", "name", "chain")
+_DIGITS = re.compile("([0-9]+)")
+
+
+@dataclass(frozen=True, eq=False)
+class Drives:
+    """The drives, for each image (N) in the order of the images table.
+
+    `pass_code` numbers the drives from 0 by their first time, then first place; `order` is the place of the image's
+    exposure within its drive, from 0, the same for all images of one exposure of a rig; `driven_m` is how far the
+    drive had come where its viewpoint began; `viewpoint` numbers the viewpoints of all drives, along the drives.
+    `record` says in numbers what was found, for `valuemap info` and `run.json`: `passes` given, `drives` made of
+    them, `cut_at` (why there are more), `images_ordered_by` (how the order was told), `rigs` and `images_on_rigs`.
+    """
+
+    pass_code: Ints
+    order: Ints
+    driven_m: Floats
+    viewpoint: Ints
+    record: dict[str, Any]
+
+    @property
+    def count(self) -> int:
+        """The number of drives."""
+        return int(self.pass_code.max(initial=-1)) + 1
+
+    @property
+    def is_mostly_without_order(self) -> bool:
+        """Whether neither times nor names tell the order of most images."""
+        return bool(2 * self.record["images_ordered_by"].get("chain", 0) > len(self.pass_code))
+
+
+def find_drives(images: Images, *, viewpoint_step_m: float = 1.0) -> Drives:
+    """Tell which images are one drive and in which order they were taken.
+
+    It never fails: images without any order become short drives from one to the nearest next. The result depends
+    on times, poses, numbers in names, and on which images share a pass or a camera, but not on row order, nor on
+    the values of ids, nor on the names of passes.
+
+    Parameters
+    ----------
+    images
+        The images of a dataset.
+    viewpoint_step_m
+        A new viewpoint begins where the camera has moved more than this since the last one began.
+    """
+    shots = _Shots.of(images)
+    vehicle, exposure, rigs = _vehicles(shots)
+    first, exposure_of_shot = np.unique(exposure, return_inverse=True)
+    track = _order_exposures(shots, vehicle[first], first)
+    place_m, group = shots.center_m[first][track.exposure], track.group
+    cut = _cuts(place_m, group, track)
+    drive = np.cumsum(cut.any_of) - 1
+
+    # Numbered by first time, then place, which is what the order of the shots is.
+    starts = np.flatnonzero(cut.any_of)
+    rank = np.empty(len(starts), np.int64)
+    earliest = np.minimum.reduceat(first[track.exposure], starts) if len(starts) else starts
+    rank[np.argsort(earliest, kind="stable")] = np.arange(len(starts))
+    along = np.argsort(rank[drive], kind="stable")
+    drive, place_m, exposure_along = rank[drive][along], place_m[along], track.exposure[along]
+    begins = np.diff(drive, prepend=-1) > 0
+    order = np.arange(len(drive)) - np.maximum.accumulate(np.where(begins, np.arange(len(drive)), 0))
+    opens = _viewpoint_openings(place_m, begins, viewpoint_step_m)
+    driven_m = _driven_m(place_m, begins, opens)
+
+    position = np.empty(len(first), np.int64)
+    position[exposure_along] = np.arange(len(first))
+    of_row = np.empty(len(shots), np.int64)
+    of_row[shots.row] = position[exposure_of_shot]
+    told = np.bincount(track.told_by[np.argsort(track.exposure)][exposure_of_shot], minlength=3)
+    record = {
+        "passes": len(np.unique(images.pass_id.codes)),
+        "drives": len(starts),
+        "cut_at": cut.counts,
+        "images_ordered_by": {name: int(n) for name, n in zip(_TOLD_BY, told, strict=True) if n},
+        "rigs": rigs,
+        "images_on_rigs": int(np.sum(np.bincount(exposure_of_shot)[exposure_of_shot] > 1)),
+    }
+    return Drives(drive[of_row], order[of_row], driven_m[of_row], (np.cumsum(opens) - 1)[of_row], record)
+
+
+# Images in an order of their own.
+
+
+@dataclass(frozen=True, eq=False)
+class _Shots:
+    """The images (N) by time, then place: `row` in the images table, and what tells them apart."""
+
+    images: Images
+    row: Ints
+    center_m: Floats
+    time_s: Floats
+    given: Ints
+    camera: Ints
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    @classmethod
+    def of(cls, images: Images) -> _Shots:
+        center_m = camera_centers(images)
+        time_s = np.full(len(images), np.nan) if images.timestamp_s is None else images.timestamp_s
+        time_s = np.where(_is_a_date(images, time_s), np.nan, time_s)
+        row = np.argsort(time_s, kind="stable")
+        tie = _equal_to_next(time_s[row])
+        for key in (*center_m.T, *images.cam_from_world_quat.T):
+            if not tie.any():
+                break
+            row, tie = _break_ties(row, tie, key)
+        if tie.any():
+            names = np.array(images.name.to_pylist())
+            row, tie = _break_ties(row, tie, names)
+        # Numbered by first appearance: neither names nor ids matter.
+        is_timed = ~np.isnan(time_s[row])
+        given = _by_first(images.pass_id.codes[row].astype(np.int64) * 2 + is_timed)
+        camera = _by_first(images.camera_id[row])
+        return cls(images, row, center_m[row], time_s[row], given, camera)
+
+    def names(self, shots: Ints) -> list[str]:
+        """Return the names of some."""
+        return list(self.images.name.take(self.row[shots]).to_pylist())
+
+    def cam_from_world(self, shots: Ints) -> Floats:
+        """Return the rotations (N, 3, 3) of some."""
+        return rotation_matrices(self.images.take(self.row[shots]))
+
+
+def _is_a_date(images: Images, time_s: Floats) -> Bools:
+    """Return the images (N) of passes that have many images of one camera at one time."""
+    order = np.argsort(time_s, kind="stable")
+    same = np.concatenate([_equal_to_next(time_s[order]), [False]])[: len(order)]
+    if not same.any():
+        return np.zeros(len(images), np.bool_)
+    tied = order[same | np.concatenate([[False], same[:-1]])]
+    pass_code, camera = images.pass_id.codes[tied].astype(np.int64), images.camera_id[tied]
+    at_once = np.stack([pass_code, camera, np.unique(time_s[tied], return_inverse=True)[1]])
+    groups, count = np.unique(at_once, axis=1, return_counts=True)
+    dated = np.zeros(len(images.pass_id.names), np.bool_)
+    dated[groups[0, count > _MOST_CAMERAS]] = True
+    return dated[images.pass_id.codes]
+
+
+def _equal_to_next(values: NDArray[Any]) -> Bools:
+    """Return which of sorted values (N) equal the next one (N - 1); none follows none."""
+    same: Bools = values[1:] == values[:-1]
+    if values.dtype.kind == "f":
+        same |= np.isnan(values[1:]) & np.isnan(values[:-1])
+    return same
+
+
+def _break_ties(row: Ints, tie: Bools, key: NDArray[Any]) -> tuple[Ints, Bools]:
+    """Sort rows that tie with their neighbors by a further key (of all rows), and return what still ties."""
+    group = np.concatenate([[0], np.cumsum(~tie)])
+    place = np.flatnonzero(np.concatenate([tie, [False]]) | np.concatenate([[False], tie]))
+    values = key[row[place]]
+    if values.dtype.kind == "U":
+        values = np.unique(values, return_inverse=True)[1]
+    row = row.copy()
+    row[place] = row[place][np.lexsort((values, group[place]))]
+    tie = tie.copy()
+    tied = np.flatnonzero(tie)
+    tie[tied] = key[row[tied]] == key[row[tied + 1]]
+    return row, tie
+
+
+def _by_first(codes: Ints) -> Ints:
+    """Return codes (N) numbered by their first appearance."""
+    if len(codes) and np.all(codes == codes[0]):
+        return np.zeros(len(codes), np.int64)
+    _, first, inverse = np.unique(codes, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[inverse]
+
+
+# Rigs: cameras of one vehicle.
+
+
+def _vehicles(shots: _Shots) -> tuple[Ints, Ints, int]:
+    """Return the vehicle (N) of each shot, the first shot (N) of its exposure, and the number of rigs."""
+    stream = _streams(shots)
+    clock = shots.time_s.copy()
+    timed = ~np.isnan(clock)
+    pairs = [_rig_pairs(shots, np.flatnonzero(timed), clock, stream, by_name=False)]
+    untimed = np.flatnonzero(~timed)
+    if len(untimed):
+        clock[untimed], part, found = _rigs_by_name(shots, untimed, stream)
+        stream = _by_first(stream * (int(part.max()) + 1) + part)
+        pairs.append(found)
+    i, j = (np.concatenate([pair[side] for pair in pairs]) for side in (0, 1))
+    streams = int(stream.max(initial=-1)) + 1
+    exposure = np.arange(len(shots))
+    rig_id = getattr(shots.images, "rig_id", None)
+    if rig_id is not None:
+        rig = _by_first(rig_id[shots.row])
+        _, first = np.unique(rig, return_index=True)
+        exposure = first[rig]
+        i, j = np.concatenate([i, exposure]), np.concatenate([j, np.arange(len(shots))])
+    given_of_stream = np.empty(streams, np.int64)
+    given_of_stream[stream] = shots.given
+    if not len(i):
+        return shots.given, exposure, 0
+    rig_of_stream = _connected(stream[i], stream[j], streams)
+    exposure = _expose_together(clock, stream, rig_of_stream, exposure)
+    given = _connected(shots.given[i], shots.given[j], int(shots.given.max()) + 1)
+    on_rig = np.bincount(rig_of_stream, minlength=streams)
+    return _by_first(given[shots.given]), exposure, int(np.sum(on_rig > 1))
+
+
+def _streams(shots: _Shots) -> Ints:
+    """Return the stream (N) of each shot: its pass, camera, and which of several at one time it is."""
+    cameras = int(shots.camera.max(initial=0)) + 1
+    stream = _by_first(shots.given * cameras + shots.camera) if cameras > 1 else shots.given
+    if cameras > 1:
+        # A camera for each image, as some reconstructions have it, tells no cameras apart.
+        images = np.bincount(shots.given)
+        _, first = np.unique(stream, return_index=True)
+        streams = np.bincount(shots.given[first], minlength=len(images))
+        alone = (2 * streams > images)[shots.given]
+        stream = _by_first(np.where(alone, shots.given, int(shots.given.max()) + 1 + stream))
+    tie = _equal_to_next(shots.time_s) & ~np.isnan(shots.time_s[1:])
+    if not tie.any():
+        return stream
+    # Several at one time of what looks like one camera: told apart by their names.
+    group = np.concatenate([[0], np.cumsum(~tie)])
+    tied = np.flatnonzero(np.concatenate([tie, [False]]) | np.concatenate([[False], tie]))
+    name = np.unique(np.array(shots.names(tied)), return_inverse=True)[1]
+    tied = tied[np.lexsort((name, stream[tied], group[tied]))]
+    begins = np.concatenate([[True], (np.diff(group[tied]) != 0) | (np.diff(stream[tied]) != 0)])
+    at = np.arange(len(tied))
+    rank = np.zeros(len(shots), np.int64)
+    rank[tied] = at - np.maximum.accumulate(np.where(begins, at, 0))
+    return _by_first(stream * (int(rank.max()) + 1) + rank)
+
+
+def _rig_pairs(
+    shots: _Shots, members: Ints, clock: Floats, stream: Ints, *, by_name: bool, by_number: bool = False
+) -> tuple[Ints, Ints]:
+    """Return pairs of shots that two cameras of one rig took together.
+
+    Two streams are of one rig if, where they expose within half the time between two exposures of each, the place of
+    the one seen from the other is constant, measured by how far the vehicle moves from image to image. Two drives by
+    one camera that looks the same way are no rig where only numbers in their names or their places agree.
+    """
+    members = members[np.argsort(clock[members], kind="stable")]
+    if len(np.unique(stream[members])) < 2:
+        return members[:0], members[:0]
+    time, of = clock[members], stream[members]
+    cadence, step_m = _own_cadence(time, of, shots.center_m[members])
+    found = []
+    for lag in range(1, min(_MOST_CAMERAS, len(members))):
+        near = time[lag:] - time[:-lag] <= 0.5 * np.minimum(cadence[lag:], cadence[:-lag])
+        if by_name:
+            near &= time[lag:] == time[:-lag]
+        if not near.any():
+            break
+        before = np.flatnonzero(near & (of[lag:] != of[:-lag]))
+        found.append(np.stack([before, before + lag]))
+    pair = np.concatenate([*found, np.empty((2, 0), np.int64)], axis=1)
+    swapped = of[pair[0]] > of[pair[1]]
+    pair = np.where(swapped, pair[::-1], pair)
+    count = int(of.max()) + 1
+    _, group, number = np.unique(of[pair[0]] * count + of[pair[1]], return_inverse=True, return_counts=True)
+    often = number[group] >= (_LEAST_NAMESAKES if by_name else _LEAST_EXPOSURES)
+    if by_name:  # Names that tell no order tell no exposures.
+        by_stream = _sort_codes(of)
+        codes = np.unique(of, return_inverse=True)[1]
+        often &= _is_a_way(shots.center_m[members[by_stream]], of[by_stream])[codes[pair[0]]]
+    pair, group = pair[:, often], group[often]
+    if not pair.shape[1]:
+        return members[:0], members[:0]
+    a, b = members[pair[0]], members[pair[1]]
+    rotation_a, rotation_b = shots.cam_from_world(a), shots.cam_from_world(b)
+    offset_m = np.einsum("nij,nj->ni", rotation_a, shots.center_m[b] - shots.center_m[a])
+    cosine = (np.einsum("nij,nij->n", rotation_a, rotation_b) - 1.0) / 2.0
+    group = np.unique(group, return_inverse=True)[1]
+    middle_m = np.stack([_quantiles(axis_m, group, 0.5) for axis_m in offset_m.T], axis=1)
+    spread_m = _quantiles(np.linalg.norm(offset_m - middle_m[group], axis=1), group, 0.5)
+    by_group = _sort_codes(group)
+    starts = _runs(group[by_group])[:-1]
+    place_m = shots.center_m[a[by_group]]
+    width_m = np.linalg.norm(np.maximum.reduceat(place_m, starts) - np.minimum.reduceat(place_m, starts), axis=1)
+    usual_m = _quantiles(step_m[pair[0]], group, 0.5)
+    apart_m = np.linalg.norm(middle_m, axis=1)
+    one, other = a[by_group[starts]], b[by_group[starts]]
+    one_camera = (
+        (shots.camera[one] == shots.camera[other])
+        & (by_number | (shots.given[one] != shots.given[other]))
+        & (_quantiles(cosine, group, 0.5) > _SAME_LOOK_COSINE)
+    )
+    is_rig = (spread_m <= _STEADY_SHARE * usual_m + _ROUNDING * width_m) & (apart_m <= width_m)
+    is_rig &= ~(one_camera & (by_name | (apart_m <= usual_m)))
+    return a[is_rig[group]], b[is_rig[group]]
+
+
+def _own_cadence(time: Floats, stream: Ints, center_m: Floats) -> tuple[Floats, Floats]:
+    """Return for shots (N, by time) the time to the nearer neighbor in their stream, and the distance to the next."""
+    order = np.argsort(stream, kind="stable")
+    same = np.diff(stream[order]) == 0
+    gap = np.where(same, np.diff(time[order]), np.inf)
+    away_m = np.where(same, np.linalg.norm(np.diff(center_m[order], axis=0), axis=1), np.nan)
+    cadence, step_m = np.empty(len(order)), np.empty(len(order))
+    cadence[order] = np.minimum(np.concatenate([[np.inf], gap]), np.concatenate([gap, [np.inf]]))
+    before_m, after_m = np.concatenate([[np.nan], away_m]), np.concatenate([away_m, [np.nan]])
+    step_m[order] = np.where(np.isnan(after_m), before_m, after_m)
+    return cadence, np.nan_to_num(step_m)
+
+
+def _expose_together(clock: Floats, stream: Ints, rig_of_stream: Ints, exposure: Ints) -> Ints:
+    """Return the first shot (N) of each shot's exposure: that of the rig's fullest camera nearest in time."""
+    rig = rig_of_stream[stream]
+    cameras = np.bincount(rig_of_stream)
+    shared = np.flatnonzero(cameras[rig] > 1)
+    shared = shared[np.lexsort((clock[shared], rig[shared]))]
+    exposure = exposure.copy()
+    for members in np.split(shared, np.flatnonzero(np.diff(rig[shared])) + 1):
+        of, images = np.unique(stream[members], return_counts=True)
+        leads = stream[members] == of[np.argmax(images)]
+        lead, follow = members[leads], members[~leads]
+        at = clock[lead]
+        after = np.clip(np.searchsorted(at, clock[follow]), 1, max(len(at) - 1, 1))
+        nearest = after - (clock[follow] - at[after - 1] <= np.abs(at[np.minimum(after, len(at) - 1)] - clock[follow]))
+        gap = np.diff(at)
+        own = np.minimum(np.concatenate([[np.inf], gap]), np.concatenate([gap, [np.inf]]))
+        joins = np.abs(clock[follow] - at[nearest]) <= 0.5 * own[nearest]
+        exposure[follow[joins]] = exposure[lead[nearest[joins]]]
+        # What the fullest camera missed the others may still have taken together.
+        rest = follow[~joins]
+        _, head, at_once = np.unique(clock[rest], return_index=True, return_inverse=True)
+        exposure[rest] = np.minimum(exposure[rest], exposure[rest[head[at_once]]])
+    return exposure
+
+
+def _connected(a: Ints, b: Ints, count: int) -> Ints:
+    """Return the lowest member (count) of the connected group of each of `count` things, of which pairs are one."""
+    lowest = np.arange(count)
+    a, b = np.unique(np.stack([a, b]), axis=1)
+    while True:
+        least = np.minimum(lowest[a], lowest[b])
+        merged = lowest.copy()
+        np.minimum.at(merged, lowest[a], least)
+        np.minimum.at(merged, lowest[b], least)
+        merged = merged[merged]
+        if np.array_equal(merged, lowest):
+            return lowest
+        lowest = merged
+
+
+# Numbers in names.
+
+
+def _rigs_by_name(shots: _Shots, members: Ints, stream: Ints) -> tuple[Floats, Ints, tuple[Ints, Ints]]:
+    """Return what names tell of shots (M): their rank, the part that names the camera (N), and pairs of rigs."""
+    parts = _NameParts(shots.names(members))
+    best: tuple[Floats, Ints, tuple[Ints, Ints]] | None = None
+    for column in parts.columns_that_may_name_cameras():
+        rank = np.zeros(len(shots))
+        rank[members] = parts.rank(without=column)
+        part = np.zeros(len(shots), np.int64)
+        part[members] = parts.codes[column]
+        split = _by_first(stream * (int(part.max()) + 1) + part)
+        found = _rig_pairs(shots, members, rank, split, by_name=True, by_number=column % 2 == 1)
+        if len(found[0]) > (len(best[2][0]) if best else 0):
+            best = rank[members], part, found
+    none = np.empty(0, np.int64)
+    return best or (parts.rank(), np.zeros(len(shots), np.int64), (none, none))
+
+
+class _NameParts:
+    """Names (M) cut into texts and numbers: columns of codes that sort as texts and numbers do."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        parts = [_DIGITS.split(name) for name in names]
+        self._length = np.array([len(part) for part in parts])
+        self.codes: list[Ints] = []
+        self.numbers: list[Floats] = []
+        for column in range(int(self._length.max(initial=0))):
+            cells = [part[column] if column < len(part) else "" for part in parts]
+            values = {cell: (0, cell) for cell in set(cells)}
+            if column % 2:  # Numbers of any length: without leading zeros, the longer one is more.
+                values = {cell: (len(cell.lstrip("0")), cell.lstrip("0")) for cell in values}
+            rank = {value: i for i, value in enumerate(sorted(set(values.values())))}
+            self.codes.append(np.array([rank[values[cell]] for cell in cells], dtype=np.int64))
+            numbers = {cell: float(cell) if column % 2 and cell else np.nan for cell in values}
+            self.numbers.append(np.array([numbers[cell] for cell in cells]))
+
+    def rank(self, *, without: int | None = None) -> Floats:
+        """Return the rank (M) in natural order; names that differ in one column only may have the same."""
+        keys = [codes for column, codes in enumerate(self.codes) if column != without]
+        keys.insert(0, self._length)
+        order = np.lexsort(keys[::-1])
+        differs = np.zeros(len(order), np.bool_)
+        for key in keys:
+            differs[1:] |= key[order][1:] != key[order][:-1]
+        rank = np.empty(len(order))
+        rank[order] = np.cumsum(differs)
+        return rank
+
+    def columns_that_may_name_cameras(self) -> list[int]:
+        """Return the columns without which a good part of the names is the same as some others, but not as many."""
+        columns = []
+        for column, codes in enumerate(self.codes):
+            if codes.any():
+                alike = np.bincount(self.rank(without=column).astype(np.int64))
+                on_rig = alike[(alike > 1) & (alike <= _MOST_CAMERAS)].sum()
+                if on_rig > _LEAST_SHARE_ON_RIGS * len(codes):
+                    columns.append(column)
+        return columns
+
+    def running_number(self) -> Floats | None:
+        """Return the number (M) that alone tells the names apart; none where several do."""
+        varying = [column for column, codes in enumerate(self.codes) if len(codes) and np.ptp(codes) > 0]
+        return self.numbers[varying[-1]] if len(varying) == 1 and varying[0] % 2 == 1 else None
+
+
+# The order of the exposures of a vehicle.
+
+
+@dataclass(frozen=True, eq=False)
+class _Track:
+    """Exposures (E) one after the other, vehicle after vehicle.
+
+    `exposure` indexes what was put in order; `group` numbers the vehicles, ascending; `clock` is a time or a running
+    number, NaN where there is none; `told_by` is how the order was told.
+    """
+
+    exposure: Ints
+    group: Ints
+    clock: Floats
+    told_by: Ints
+
+
+def _order_exposures(shots: _Shots, vehicle: Ints, first: Ints) -> _Track:
+    """Return the exposures (first shots, E) of vehicles (E) in driving order."""
+    by_vehicle = _sort_codes(vehicle)
+    place_m, time_s = shots.center_m[first], shots.time_s[first]
+    runs = _runs(vehicle[by_vehicle])
+    ordered, clock, told_by = by_vehicle.copy(), time_s[by_vehicle], np.zeros(len(first), np.int64)
+    believed = _is_a_way(place_m[by_vehicle], vehicle[by_vehicle]) & ~np.isnan(clock[runs[:-1]])
+    group = vehicle[by_vehicle].astype(np.int64)
+    pieces: list[_Track] = []
+    for number in np.flatnonzero(~believed):
+        place = slice(runs[number], runs[number + 1])
+        members = by_vehicle[place]
+        found = _order_vehicle(shots, members, first, place_m)
+        ordered[place], clock[place], told_by[place] = found.exposure, found.clock, found.told_by
+        pieces.append(found)
+    # A vehicle whose cameras go each their own way is several.
+    extra = np.zeros(len(first), np.int64)
+    for number, found in zip(np.flatnonzero(~believed), pieces, strict=True):
+        extra[runs[number] : runs[number + 1]] = found.group
+    steps = np.concatenate([[0], (np.diff(group) != 0) | (np.diff(extra) != 0)]) if len(group) else group
+    return _Track(ordered, np.cumsum(steps), clock, told_by)
+
+
+def _order_vehicle(shots: _Shots, members: Ints, first: Ints, place_m: Floats) -> _Track:
+    """Return some exposures (of all, E) in driving order, told by time, names or the chain, whichever is plausible."""
+    time_s = shots.time_s[first[members]]
+    none = np.full(len(members), np.nan)
+    zero = np.zeros(len(members), np.int64)
+    chain: Ints | None = None
+
+    def is_believed(order: Ints) -> bool:
+        nonlocal chain
+        way = place_m[members[order]]
+        if _is_a_way(way, zero).all():
+            return True
+        chain = _chain(place_m[members]) if chain is None else chain
+        return _way_m(way) <= _CLEARLY_LONGER * _way_m(place_m[members[chain]])
+
+    if not np.isnan(time_s).any() and is_believed(np.arange(len(members))):
+        return _Track(members, zero, time_s, zero + TIME)
+    camera = shots.camera[first[members]]
+    if len(np.unique(camera)) > 1 and 2 * len(np.unique(camera)) <= len(members):
+        parts = [
+            _order_vehicle(shots, members[camera == code], first, place_m) for code in dict.fromkeys(camera.tolist())
+        ]
+        if not any(np.any(part.told_by == CHAIN) for part in parts):
+            offset = np.cumsum([0, *(int(part.group.max()) + 1 for part in parts)])
+            return _Track(
+                np.concatenate([part.exposure for part in parts]),
+                np.concatenate([part.group + start for part, start in zip(parts, offset, strict=False)]),
+                np.concatenate([part.clock for part in parts]),
+                np.concatenate([part.told_by for part in parts]),
+            )
+    parts_of_names = _NameParts(shots.names(first[members]))
+    by_name = np.argsort(parts_of_names.rank(), kind="stable")
+    if is_believed(by_name):
+        number = parts_of_names.running_number()
+        return _Track(members[by_name], zero, none if number is None else number[by_name], zero + NAME)
+    chain = _chain(place_m[members]) if chain is None else chain
+    return _Track(members[chain], zero, none, zero + CHAIN)
+
+
+def _sort_codes(codes: Ints) -> Ints:
+    """Return a stable order of codes from 0."""
+    # Numbers of 16 bits are sorted by counting.
+    small = codes.astype(np.uint16) if len(codes) and codes.max() < 2**16 else codes
+    return np.argsort(small, kind="stable")
+
+
+def _quantiles(values: Floats, group: Ints, share: float) -> Floats:
+    """Return for each group from 0 the value below which this share of its values (N) lies; NaN values do not count."""
+    order = np.argsort(values)  # NaN last.
+    order = order[_sort_codes(group[order])]
+    groups = int(group.max(initial=-1)) + 1
+    size = np.bincount(group, minlength=groups)
+    number = size - np.bincount(group[np.isnan(values)], minlength=groups)
+    quantile = np.full(groups, np.nan)
+    some = np.flatnonzero(number)
+    quantile[some] = values[order[(np.cumsum(size) - size)[some] + np.int64(share * (number[some] - 1) + 0.5)]]
+    return quantile
+
+
+def _runs(values: Ints) -> Ints:
+    """Return where runs of equal values begin, and the end."""
+    return np.concatenate([np.flatnonzero(np.diff(values, prepend=values[:1] - 1)), [len(values)]]).astype(np.int64)
+
+
+def _is_a_way(place_m: Floats, group: Ints) -> Bools:
+    """Return for each group of places (N, 3) in a row whether they surely are in driving order.
+
+    No order is shorter than its places are wide. So one that, cut into short windows, is little longer than these
+    windows are wide, goes ahead nearly everywhere.
+    """
+    runs = _runs(group)
+    within = np.arange(len(group)) - np.repeat(runs[:-1], np.diff(runs))
+    starts = np.flatnonzero(within % _WINDOW == 0)
+    if not len(starts):
+        return np.empty(0, np.bool_)
+    step_m = np.linalg.norm(np.diff(place_m, axis=0, prepend=place_m[:1]), axis=1)
+    step_m[starts] = 0.0
+    way_m = np.add.reduceat(step_m, starts)
+    width_m = np.linalg.norm(np.maximum.reduceat(place_m, starts) - np.minimum.reduceat(place_m, starts), axis=1)
+    of = np.searchsorted(runs, starts, side="right") - 1
+    groups = len(runs) - 1
+    way_m, width_m = np.bincount(of, way_m, groups), np.bincount(of, width_m, groups)
+    return np.asarray(way_m <= _CLEARLY_LONGER * width_m)
+
+
+def _way_m(place_m: Floats) -> float:
+    """Return the length of a way along places (N, 3) without its longest steps."""
+    step_m = np.sort(np.linalg.norm(np.diff(place_m, axis=0), axis=1))
+    return float(step_m[: len(step_m) - int(np.ceil(_TRIMMED_SHARE * len(step_m)))].sum())
+
+
+def _chain(place_m: Floats) -> Ints:
+    """Return places (N, 3) in the order of a short way through all of them: nearest ends are joined first.
+
+    It begins at the end that is farther from the middle of all places.
+    """
+    from scipy.spatial import cKDTree  # Only where neither times nor names tell.
+
+    count = len(place_m)
+    if count < 3:
+        return np.arange(count)
+    links: list[list[int]] = [[] for _ in range(count)]
+    parent = list(range(count))
+
+    def root(i: int) -> int:
+        while parent[i] != i:
+            parent[i] = parent[parent[i]]
+            i = parent[i]
+        return i
+
+    ends = np.arange(count)
+    chains = count
+    while chains > 1:
+        tree = cKDTree(place_m[ends])
+        neighbors = min(_NEIGHBORS + 1, len(ends))
+        distance_m, near = map(np.asarray, tree.query(place_m[ends], k=neighbors))
+        a = np.repeat(ends, neighbors)
+        b = ends[near.reshape(-1)]
+        low, high = np.minimum(a, b), np.maximum(a, b)
+        order = np.lexsort((high, low, distance_m.reshape(-1)))
+        joined = 0
+        for i, j in zip(low[order].tolist(), high[order].tolist(), strict=True):
+            if i != j and len(links[i]) < 2 and len(links[j]) < 2 and root(i) != root(j):
+                links[i].append(j)
+                links[j].append(i)
+                parent[root(i)] = root(j)
+                joined += 1
+        chains -= joined
+        ends = np.array([i for i in range(count) if len(links[i]) < 2])
+        if not joined:  # All near ends are of one chain: look farther.
+            ends = _one_end_each(ends, [root(i) for i in ends.tolist()])
+    tips = [i for i in range(count) if len(links[i]) == 1]
+    middle_m = place_m.mean(axis=0)
+    last, here = -1, max(tips, key=lambda i: (float(np.linalg.norm(place_m[i] - middle_m)), -i))
+    way = [here]
+    while len(way) < count:
+        last, here = here, next(i for i in links[here] if i != last)
+        way.append(here)
+    return np.array(way)
+
+
+def _one_end_each(ends: Ints, chain: list[int]) -> Ints:
+    """Return one end of each chain, the first by number."""
+    first: dict[int, int] = {}
+    for end, of in zip(ends.tolist(), chain, strict=True):
+        first.setdefault(of, end)
+    return np.array(list(first.values()))
+
+
+# Where one drive ends and the next begins.
+
+
+@dataclass(frozen=True, eq=False)
+class _Cuts:
+    """Where (E) a drive begins, and why: counts by reason."""
+
+    any_of: Bools
+    counts: dict[str, int]
+
+
+def _cuts(place_m: Floats, group: Ints, track: _Track) -> _Cuts:
+    """Return where along the exposures (E) of vehicles drives begin."""
+    begins = np.diff(group, prepend=-1) != 0
+    if len(group) < 2:
+        return _Cuts(begins, {})
+    step_m = np.linalg.norm(np.diff(place_m, axis=0, prepend=place_m[:1]), axis=1)
+    step_m[begins] = np.nan
+    taken = np.diff(track.clock, prepend=np.nan)
+    taken[begins] = np.nan
+    usual_m = _usual(step_m, group)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        speed = step_m / np.where(taken > 0.0, taken, np.nan)
+    usual_speed, usual_taken = _usual(speed, group), _usual(taken, group)
+    timed = track.told_by == TIME
+    with np.errstate(divide="ignore", invalid="ignore"):
+        far = step_m > _GAP_STEPS * usual_m
+        too_fast = ~(step_m <= _JUMP_SPEEDS * usual_speed * taken)  # Also where there is no clock.
+        waited = taken - step_m / np.where(usual_speed > 0.0, usual_speed, np.inf)
+        pause = timed & (waited > _PAUSE_STEPS * usual_taken) & (far | (waited > _STOP_STEPS * usual_taken))
+    jump = far & too_fast & ~pause
+    drive = np.cumsum(begins | jump | pause)
+    revisit = _revisits(place_m, drive, usual_m, track.told_by != CHAIN)
+    reasons = {"pauses": pause, "jumps": jump, "revisits": revisit}
+    counts = {name: int(mask.sum()) for name, mask in reasons.items() if mask.any()}
+    return _Cuts(begins | jump | pause | revisit, counts)
+
+
+def _usual(values: Floats, group: Ints) -> Floats:
+    """Return (E) what is usual in the group of each: the upper quartile, which neither stops nor gaps move.
+
+    It is at least half of what is usual in all groups, so that a drive that mostly stands has the speed of the others.
+    """
+    usual = _quantiles(values, group, 0.75)
+    known = usual[~np.isnan(usual)]
+    floor = 0.5 * np.median(known) if len(known) else np.nan
+    return np.asarray(np.maximum(usual, floor)[group])
+
+
+def _revisits(place_m: Floats, drive: Ints, usual_m: Floats, may: Bools) -> Bools:
+    """Return where (E) a drive comes back to where it has been, having left: what follows is a drive of its own.
+
+    A place is as wide as some usual steps. All is done on the ground (the two axes along which places differ most),
+    in four grids of cells of twice that width, each shifted by half a cell, so that any two near places share a cell.
+    """
+    count = len(drive)
+    near_m = np.where((usual_m > 0.0) & may, _REVISIT_STEPS * usual_m, np.nan)
+    step_m = np.linalg.norm(np.diff(place_m, axis=0, prepend=place_m[:1]), axis=1)
+    way_m = np.cumsum(np.where(step_m > _STILL_SHARE * usual_m, step_m, 0.0))
+    ground = np.sort(np.argsort(-np.ptp(place_m, axis=0), kind="stable")[:2])
+    able = np.flatnonzero(~np.isnan(near_m))
+    result = np.zeros(count, np.bool_)
+    if not len(able):
+        return result
+    back, before = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for shift in ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5)):
+        cell = np.floor(place_m[able][:, ground] / (2.0 * near_m[able, None]) + shift).astype(np.int64)
+        key = (drive[able] * np.int64(1_000_003) + cell[:, 0]) * np.int64(1_000_003) + cell[:, 1]
+        enters = np.concatenate([[True], key[1:] != key[:-1]])
+        leaves = np.concatenate([enters[1:], [True]])
+        kept = np.flatnonzero(enters | leaves)
+        kept = kept[np.argsort(key[kept], kind="stable")]
+        i, j = able[kept[1:]], able[kept[:-1]]
+        again = (key[kept[1:]] == key[kept[:-1]]) & enters[kept[1:]] & leaves[kept[:-1]]
+        again &= way_m[i] - way_m[j] >= _AWAY_STEPS * usual_m[i]
+        back.append(i[again])
+        before.append(j[again])
+    i, j = np.concatenate(back), np.concatenate(before)
+    order = np.lexsort((-j, i))
+    start = 0
+    for here, there in zip(i[order].tolist(), j[order].tolist(), strict=True):
+        if there >= start:
+            result[here] = True
+            start = here
+    return result
+
+
+# Viewpoints.
+
+
+def _viewpoint_openings(place_m: Floats, begins: Bools, step_m: float) -> Bools:
+    """Return where (E) along drives viewpoints begin."""
+    moved_m = np.linalg.norm(np.diff(place_m, axis=0, prepend=place_m[:1]), axis=1)
+    opens = begins | (moved_m > step_m)
+    # Sure whatever the viewpoint's begin: it lies within a step of the exposure before.
+    sure = begins | (moved_m > 2.0 * step_m)
+    # As long as each moves by a step, each begins one; only from the first that does not on, one has to look back.
+    at = np.arange(len(opens))
+    last_sure = np.maximum.accumulate(np.where(sure, at, 0))
+    last_still = np.maximum.accumulate(np.where(opens, -1, at)) if len(at) else at
+    unsure = np.flatnonzero(~sure & (last_still > last_sure))
+    if not len(unsure):
+        return np.asarray(opens)
+    # Runs of them do not depend on each other: all go ahead side by side, the last few long ones by themselves.
+    head = np.flatnonzero(np.diff(unsure, prepend=-2) != 1)
+    here, end = unsure[head], unsure[np.concatenate([head[1:], [len(unsure)]]) - 1] + 1
+    begin = here - 1
+    while len(here) > _SIDE_BY_SIDE:
+        new = np.linalg.norm(place_m[here] - place_m[begin], axis=1) > step_m
+        opens[here] = new
+        begin = np.where(new, here, begin)
+        here = here + 1
+        goes_on = here < end
+        here, end, begin = here[goes_on], end[goes_on], begin[goes_on]
+    for first, last, since in zip(here.tolist(), end.tolist(), begin.tolist(), strict=True):
+        places = place_m[since:last].tolist()
+        start = places[0]
+        for i in range(first, last):
+            opens[i] = new_here = math.dist(places[i - since], start) > step_m
+            if new_here:
+                start = places[i - since]
+    return np.asarray(opens)
+
+
+def _driven_m(place_m: Floats, begins: Bools, opens: Bools) -> Floats:
+    """Return how far (E) drives had come where the viewpoint of each exposure began."""
+    start = np.flatnonzero(opens)
+    way_m = np.linalg.norm(np.diff(place_m[start], axis=0, prepend=place_m[:1]), axis=1)
+    way_m[begins[start]] = 0.0
+    total_m = np.cumsum(way_m)
+    at_begin_m = np.maximum.accumulate(np.where(begins[start], total_m, 0.0))
+    return np.asarray((total_m - at_begin_m)[np.cumsum(opens) - 1])
+
+
+def summarize_drives(drives: Drives) -> dict[str, Any]:
+    """Return what was found as facts of one line each, for people and scripts."""
+    record = drives.record
+    return {
+        "drives": record["drives"],
+        "drives cut at": _listed(record["cut_at"]) or "-",
+        "driving order by": _listed(record["images_ordered_by"]),
+        "images on rigs": record["images_on_rigs"],
+    }
+
+
+def _listed(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items())

@@ -1,0 +1,351 @@
+"""Driving order: told by times, names or places, never by ids, rows or what passes are called."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from scipy.spatial.transform import Rotation
+
+from valuemap.config import SimulationConfig
+from valuemap.drives import Drives, find_drives
+from valuemap.simulate import simulate
+from valuemap.tables import Categories, Floats, Images, Ints
+
+AHEAD, LEFT = 0.0, 90.0
+
+
+def posed(
+    center_m: Floats,
+    *,
+    heading_deg: Any = 0.0,
+    time_s: Any = None,
+    names: Sequence[str] | None = None,
+    passes: Sequence[str] | None = None,
+    camera: Any = 1,
+) -> Images:
+    """Return level cameras at places (N, 2 or 3) that look along x, turned to the left by some degrees."""
+    count = len(center_m)
+    center = np.column_stack([center_m, np.full(count, 1.6)]) if center_m.shape[1] == 2 else center_m
+    level = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    turn = Rotation.from_euler("z", -np.broadcast_to(heading_deg, count)[:, None], degrees=True)
+    rotation = Rotation.from_matrix(level @ turn.as_matrix())
+    return Images(
+        image_id=np.arange(count),
+        name=pa.array(names or [f"{i * 7919 % 1000003:x}.jpg" for i in range(count)], pa.string()),
+        camera_id=np.broadcast_to(camera, count).astype(np.int64),
+        cam_from_world_quat=rotation.as_quat(canonical=True, scalar_first=True),
+        cam_from_world_m=-rotation.apply(center),
+        pass_id=Categories.from_texts(passes or ["all"] * count),
+        timestamp_s=time_s,
+    )
+
+
+def street(count: int, *, step_m: float = 2.0, seed: int = 0, y_m: float = 0.0) -> Floats:
+    random = np.random.default_rng(seed)
+    x = np.cumsum(step_m * random.uniform(0.8, 1.2, count))
+    return np.column_stack([x, y_m + random.normal(0.0, 0.05, count)])
+
+
+def stack(*parts: Images) -> Images:
+    """Return images under each other, numbered anew."""
+    timed = parts[0].timestamp_s is not None
+    return Images(
+        image_id=np.arange(sum(map(len, parts))),
+        name=pa.concat_arrays([p.name for p in parts]),
+        camera_id=np.concatenate([p.camera_id for p in parts]),
+        cam_from_world_quat=np.concatenate([p.cam_from_world_quat for p in parts]),
+        cam_from_world_m=np.concatenate([p.cam_from_world_m for p in parts]),
+        pass_id=Categories.from_texts([text for p in parts for text in p.pass_id.texts()]),
+        timestamp_s=np.concatenate([p.timestamp_s for p in parts]) if timed else None,
+    )
+
+
+def same(a: Drives, b: Drives) -> bool:
+    return (
+        np.array_equal(a.pass_code, b.pass_code)
+        and np.array_equal(a.order, b.order)
+        and np.array_equal(a.driven_m, b.driven_m)
+        and np.array_equal(a.viewpoint, b.viewpoint)
+    )
+
+
+def of_rows(drives: Drives, rows: Ints) -> Drives:
+    return Drives(
+        drives.pass_code[rows], drives.order[rows], drives.driven_m[rows], drives.viewpoint[rows], drives.record
+    )
+
+
+def shuffled(images: Images, seed: int) -> tuple[Images, Ints]:
+    """Return the same images in another order, with other ids of images and cameras and other names of passes."""
+    random = np.random.default_rng(seed)
+    rows = random.permutation(len(images))
+    mixed = images.take(rows)
+    other = [f"{random.integers(10**9)}-{i}" for i in range(len(images.pass_id.names))]
+    cameras = np.unique(images.camera_id)
+    ids = random.permutation(10 * len(cameras))[: len(cameras)]
+    return (
+        mixed.replace(
+            image_id=np.arange(len(images)),
+            pass_id=Categories.from_texts([other[code] for code in mixed.pass_id.codes]),
+            camera_id=ids[np.searchsorted(cameras, mixed.camera_id)],
+        ),
+        rows,
+    )
+
+
+def a_city() -> Images:
+    config = SimulationConfig(images=1500)
+    return simulate(config, seed=5).images
+
+
+def test_times_tell_the_order_and_pauses_and_jumps_end_a_drive() -> None:
+    place = street(60)
+    time = np.arange(60.0)
+    time[20:] += 3600.0  # A break.
+    place[40:] += [0.0, 500.0]  # A jump.
+    found = find_drives(posed(place, time_s=time))
+    assert found.pass_code.tolist() == [0] * 20 + [1] * 20 + [2] * 20
+    assert found.order.tolist() == [*range(20)] * 3
+    assert found.record["cut_at"] == {"pauses": 1, "jumps": 1}
+    assert found.record["images_ordered_by"] == {"time": 60}
+
+
+def test_a_red_light_and_a_stretch_without_images_end_no_drive() -> None:
+    place = street(80)
+    time = np.arange(80.0)
+    time[30:] += 60.0  # Waits.
+    time[50:] += 100.0  # Drives on, for 200 m.
+    place[50:, 0] += 200.0
+    assert find_drives(posed(place, time_s=time)).count == 1
+    # The same without times is a jump.
+    assert find_drives(posed(place, names=[f"{i}.jpg" for i in range(80)])).count == 2
+    # But not where numbers were left out.
+    numbers = np.arange(80) + 100 * (np.arange(80) >= 50)
+    assert find_drives(posed(place, names=[f"{i}.jpg" for i in numbers])).count == 1
+
+
+def test_numbers_in_names_are_numbers() -> None:
+    place = street(120)
+    names = [f"drive 7/frame{i}.jpg" for i in range(120)]  # Not padded: as texts they are out of order.
+    found = find_drives(posed(place, names=names))
+    assert found.order.tolist() == list(range(120))
+    assert found.record["images_ordered_by"] == {"name": 120}
+
+
+def test_times_of_day_in_names_run() -> None:
+    place = street(200)
+    names = [f"2024-05-01T{9 + i // 120:02d}-{i // 2 % 60:02d}-{30 * (i % 2):02d}.jpg" for i in range(200)]
+    assert find_drives(posed(place, names=names)).order.tolist() == list(range(200))
+
+
+def test_numbers_and_times_that_jump_about_are_not_believed() -> None:
+    place = street(100)
+    random = np.random.default_rng(1)
+    mixed = random.permutation(100)
+    for images in (
+        posed(place, names=[f"{i:04d}.jpg" for i in mixed]),
+        posed(place, time_s=mixed.astype(np.float64)),
+    ):
+        found = find_drives(images)
+        assert found.record["images_ordered_by"] == {"chain": 100}
+        assert found.count == 1
+        assert found.order.tolist() in (list(range(100)), list(range(99, -1, -1)))
+    # Where times lie, names are asked before places are.
+    found = find_drives(posed(place, time_s=mixed.astype(np.float64), names=[f"{i}.jpg" for i in range(100)]))
+    assert found.record["images_ordered_by"] == {"name": 100}
+    assert found.order.tolist() == list(range(100))
+
+
+def test_a_car_that_waits_is_still_on_its_way() -> None:
+    random = np.random.default_rng(3)
+    place = np.concatenate([street(30), np.tile(street(30)[-1], (40, 1)), street(30) + street(30)[-1] + [1.0, 0.0]])
+    place += random.normal(0.0, 0.02, place.shape)
+    found = find_drives(posed(place, time_s=0.5 * np.arange(100)))
+    assert found.record["images_ordered_by"] == {"time": 100}
+    assert found.count == 1
+    assert len(np.unique(found.viewpoint[30:70])) == 1
+    assert len(np.unique(found.viewpoint)) == pytest.approx(60, abs=5)
+
+
+def test_a_street_driven_again_is_another_drive() -> None:
+    angle = np.linspace(0.0, 6.0 * np.pi, 600)  # Three laps of 377 m.
+    place = 60.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    found = find_drives(posed(place, time_s=np.arange(600.0)))
+    # Each ends a few steps before it is closed, so that a rest is left.
+    assert found.count == 4
+    assert found.record["cut_at"] == {"revisits": 3}
+    assert np.bincount(found.pass_code).tolist() == pytest.approx([190, 190, 190, 30], abs=15)
+    # There and back in the other lane.
+    there = street(100)
+    back = there[::-1] + [0.0, 4.0]
+    found = find_drives(posed(np.concatenate([there, back]), time_s=np.arange(200.0)))
+    assert found.count == 2
+    assert np.bincount(found.pass_code).tolist() == pytest.approx([100, 100], abs=20)
+
+
+def rig(passes: str, *, times: bool = True, cameras: Sequence[int] = (1, 2), late_s: float = 0.0) -> Images:
+    """Return two cameras of one car that turns, the second 1 m behind and to the left of the first."""
+    heading = np.concatenate([np.zeros(40), np.linspace(0.0, np.pi / 2, 20), np.full(40, np.pi / 2)])
+    ahead = np.column_stack([np.cos(heading), np.sin(heading)])
+    front = np.cumsum(2.0 * ahead, axis=0) + np.random.default_rng(2).normal(0.0, 0.05, (100, 2))
+    side = front - ahead + 0.5 * np.column_stack([-ahead[:, 1], ahead[:, 0]])
+    parts = [
+        posed(
+            place,
+            heading_deg=np.degrees(heading) + look,
+            time_s=0.3 * np.arange(100) + late * late_s if times else None,
+            names=[f"{folder}/{i}.jpg" for i in range(100)],
+            passes=[folder if passes == "folder" else "all"] * 100,
+            camera=number,
+        )
+        for place, look, folder, number, late in zip(
+            (front, side), (AHEAD, LEFT), ("cam0", "cam1"), cameras, (0, 1), strict=True
+        )
+    ]
+    return stack(*parts)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.03])
+@pytest.mark.parametrize("times", [True, False])
+@pytest.mark.parametrize("cameras", [(1, 2), (1, 1)])
+@pytest.mark.parametrize("passes", ["folder", "all"])
+def test_cameras_of_one_car_share_its_drive(passes: str, times: bool, cameras: tuple[int, int], late_s: float) -> None:
+    found = find_drives(rig(passes, times=times, cameras=cameras, late_s=late_s))
+    if passes == "all" and cameras == (1, 1) and late_s and times:
+        # One camera, as far as can be seen: its images are in order.
+        assert found.count == 1
+        return
+    assert found.count == 1
+    assert found.record["images_on_rigs"] == 200
+    assert found.order.tolist() == [*range(100)] * 2
+    assert np.array_equal(found.viewpoint[:100], found.viewpoint[100:])
+    # The way is that of one camera, not from one to the other and back.
+    assert found.driven_m.max() == pytest.approx(198.0, rel=0.03)
+
+
+def test_two_cars_at_one_time_are_no_rig() -> None:
+    one = posed(street(100, seed=1), time_s=np.arange(100.0), passes=["a"] * 100, camera=1)
+    two = posed(street(100, step_m=2.3, seed=2, y_m=4.0), time_s=np.arange(100.0), passes=["b"] * 100, camera=2)
+    assert find_drives(stack(one, two)).record["images_on_rigs"] == 0
+    assert find_drives(stack(one, two)).count == 2
+
+
+def test_two_drives_with_the_same_numbers_are_no_rig() -> None:
+    straight = street(100)
+    parts = [
+        posed(
+            straight + [0.0, 3.0 * i],
+            names=[f"{name}/{k}.jpg" for k in range(100)],
+            passes=[name] * 100,
+        )
+        for i, name in enumerate("ab")
+    ]
+    assert find_drives(stack(*parts)).count == 2
+
+
+def test_rig_id_joins_whatever_the_rest_says() -> None:
+    images = rig("folder", times=False).replace(
+        name=pa.array([f"{i:x}" for i in np.random.default_rng(0).permutation(200) + 10**9])
+    )
+    assert find_drives(images).count == 2
+    if "rig_id" not in Images.__dataclass_fields__:
+        pytest.skip("images have no rig_id")
+    found = find_drives(images.replace(rig_id=np.tile(np.arange(100), 2)))
+    assert found.count == 1
+    assert np.array_equal(found.order[:100], found.order[100:])
+
+
+def test_cars_mixed_in_one_pass_are_told_apart_by_their_cameras() -> None:
+    one = posed(street(100, seed=1), time_s=np.arange(100.0), camera=1)
+    two = posed(street(100, seed=2, y_m=300.0), time_s=np.arange(100.0) + 0.5, camera=2)
+    found = find_drives(stack(one, two))
+    assert found.pass_code.tolist() == [0] * 100 + [1] * 100
+    assert found.record["images_ordered_by"] == {"time": 200}
+
+
+def test_a_collection_without_order_becomes_short_drives() -> None:
+    random = np.random.default_rng(0)
+    far = 2500.0 * random.normal(0.0, 3.0, (12, 2))
+    found = find_drives(posed(far))
+    assert len(np.unique(found.order * 1000 + found.pass_code)) == 12
+    # Panoramas every 10 m along two streets, all of one month, in any order.
+    streets = np.concatenate([street(60, step_m=10.0), street(60, step_m=10.0, seed=1, y_m=400.0)])
+    rows = random.permutation(120)
+    found = find_drives(posed(streets[rows], time_s=np.full(120, 1.7e9)))
+    assert found.record["images_ordered_by"] == {"chain": 120}
+    assert found.count == 2
+    along = np.argsort(found.pass_code * 1000 + found.order)
+    assert np.max(np.sort(np.linalg.norm(np.diff(streets[rows][along], axis=0), axis=1))[:-1]) < 15.0
+
+
+def test_one_image_and_images_all_in_one_place() -> None:
+    assert find_drives(posed(np.zeros((1, 2)))).count == 1
+    found = find_drives(posed(np.zeros((50, 2)), time_s=np.arange(50.0)))
+    assert found.count == 1
+    assert set(found.viewpoint.tolist()) == {0}
+    assert find_drives(posed(np.zeros((50, 2)))).count >= 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", ["city", "city without times", "rig", "rig by names", "one pass"])
+def test_ids_rows_and_names_of_passes_mean_nothing(kind: str, seed: int) -> None:
+    if kind.startswith("rig"):
+        images = rig("folder", times=kind == "rig")
+    else:
+        images = a_city()
+        if kind == "city without times":
+            images = images.replace(timestamp_s=None)
+        if kind == "one pass":
+            images = images.replace(pass_id=Categories.from_texts(["all"] * len(images)))
+    mixed, rows = shuffled(images, seed)
+    assert same(find_drives(mixed), of_rows(find_drives(images), rows))
+
+
+def test_a_city_has_the_passes_that_were_driven() -> None:
+    images = a_city()
+    found = find_drives(images)
+    # Each drive is of one pass, and in its order of time.
+    pairs = np.unique(np.stack([found.pass_code, images.pass_id.codes]), axis=1)
+    assert pairs.shape[1] == found.count
+    along = np.lexsort((found.order, found.pass_code))
+    assert images.timestamp_s is not None
+    time = images.timestamp_s[along]
+    assert np.all(np.diff(time)[np.diff(found.pass_code[along]) == 0] > 0.0)
+    # One pass for all is cut at the same gaps.
+    merged = find_drives(images.replace(pass_id=Categories.from_texts(["all"] * len(images))))
+    pairs = np.unique(np.stack([merged.pass_code, images.pass_id.codes]), axis=1)
+    assert pairs.shape[1] == merged.count
+
+
+def literal_viewpoints(place_m: Floats, step_m: float) -> list[int]:
+    number, start, result = 0, place_m[0], []
+    for place in place_m:
+        if np.linalg.norm(place - start) > step_m:
+            number, start = number + 1, place
+        result.append(number)
+    return result
+
+
+@pytest.mark.parametrize("step_m", [0.3, 1.0, 2.0])
+@pytest.mark.parametrize("drives", [1, 40])
+def test_viewpoints_are_those_of_looking_back_at_each(step_m: float, drives: int) -> None:
+    random = np.random.default_rng(7)
+    places = np.cumsum(random.normal(0.0, 0.5, (drives, 300, 2)) + [0.4, 0.0], axis=1)
+    places[:, :, 1] += 1e4 * np.arange(drives)[:, None]
+    time = (1e6 * np.arange(drives)[:, None] + np.arange(300.0)).reshape(-1)
+    passes = [str(i) for i in range(drives) for _ in range(300)]
+    found = find_drives(posed(places.reshape(-1, 2), time_s=time, passes=passes), viewpoint_step_m=step_m)
+    for drive in range(found.count):
+        rows = np.flatnonzero(found.pass_code == drive)
+        rows = rows[np.argsort(found.order[rows])]
+        place = places.reshape(-1, 2)[rows]
+        expected = literal_viewpoints(place, step_m)
+        assert (found.viewpoint[rows] - found.viewpoint[rows[0]]).tolist() == expected
+        begins = [expected.index(number) for number in range(expected[-1] + 1)]
+        way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(place[begins], axis=0), axis=1))])
+        assert found.driven_m[rows] == pytest.approx(way[expected])
+    assert len(np.unique(found.viewpoint)) == found.viewpoint.max() + 1
