@@ -262,7 +262,7 @@ def _vehicles(shots: _Shots) -> tuple[Ints, Ints, int]:
     i, j = (np.concatenate([pair[side] for pair in pairs]) for side in (0, 1))
     streams = int(stream.max(initial=-1)) + 1
     exposure = np.arange(len(shots))
-    rig_id = getattr(shots.images, "rig_id", None)
+    rig_id = shots.images.rig_id
     if rig_id is not None:
         rig = _by_first(rig_id[shots.row])
         _, first = np.unique(rig, return_index=True)
@@ -382,7 +382,7 @@ def _expose_together(clock: Floats, stream: Ints, rig_of_stream: Ints, exposure:
     """Return the first shot (N) of each shot's exposure: that of the rig's fullest camera nearest in time."""
     rig = rig_of_stream[stream]
     cameras = np.bincount(rig_of_stream)
-    shared = np.flatnonzero(cameras[rig] > 1)
+    shared = np.flatnonzero((cameras[rig] > 1) & (np.bincount(exposure)[exposure] == 1))  # The rest knows already.
     shared = shared[np.lexsort((clock[shared], rig[shared]))]
     exposure = exposure.copy()
     for members in np.split(shared, np.flatnonzero(np.diff(rig[shared])) + 1):

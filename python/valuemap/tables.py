@@ -117,7 +117,8 @@ class Images(Table):
     """Exposures: camera, pose, pass and time.
 
     `cam_from_world_quat` (N, 4) is a unit quaternion w, x, y, z and `cam_from_world_m` (N, 3) a translation:
-    point_in_cam = R point_in_world + t, camera axes x right, y down, z forward. Timestamps are seconds.
+    point_in_cam = R point_in_world + t, camera axes x right, y down, z forward. Timestamps are seconds. Images with the
+    same `rig_id` were taken at one time by the cameras of one car.
     """
 
     KEY: ClassVar[str | None] = "image_id"
@@ -128,6 +129,7 @@ class Images(Table):
     cam_from_world_quat: Floats = _column("float", ("qw", "qx", "qy", "qz"))
     cam_from_world_m: Floats = _column("float", ("tx", "ty", "tz"))
     pass_id: Categories = _column("category", ("pass_id",))
+    rig_id: Ints | None = _column("int", ("rig_id",), optional=True)
     timestamp_s: Floats | None = _column("float", ("timestamp",), optional=True, nullable=True)
     position_sigma_m: Floats | None = _column("float", ("position_sigma_m",), optional=True, nullable=True)
     rotation_sigma_rad: Floats | None = _column("float", ("rotation_sigma_rad",), optional=True, nullable=True)
