@@ -384,6 +384,8 @@ def _expose_together(clock: Floats, stream: Ints, rig_of_stream: Ints, exposure:
     cameras = np.bincount(rig_of_stream)
     shared = np.flatnonzero((cameras[rig] > 1) & (np.bincount(exposure)[exposure] == 1))  # The rest knows already.
     shared = shared[np.lexsort((clock[shared], rig[shared]))]
+    if not len(shared):
+        return exposure
     exposure = exposure.copy()
     for members in np.split(shared, np.flatnonzero(np.diff(rig[shared])) + 1):
         of, images = np.unique(stream[members], return_counts=True)

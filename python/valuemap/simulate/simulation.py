@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -222,7 +223,7 @@ def _images(frames: Frames, position_error_m: Floats, rotation_error_rad: Floats
     )
 
 
-def _pose_sigmas(count: int, config: SimulationConfig) -> dict[str, Floats]:
+def _pose_sigmas(count: int, config: SimulationConfig) -> dict[str, Any]:
     """Return the optional columns; a sigma of 0 cannot be written, a pose without errors has none."""
     if not config.write_pose_sigmas:
         return {}
