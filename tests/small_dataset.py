@@ -82,6 +82,7 @@ def map_of(
     lon_lat_height: np.ndarray[Any, Any] | None = None,
     residual_px: Sequence[float] = (),
     run: dict[str, Any] | None = None,
+    existence: Sequence[float] | None = None,
 ) -> Map:
     """Return a map with labels at positions (N, 3), each with a covariance of diag(0.04, 0.01, 0.09) m²."""
     position = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
@@ -103,6 +104,7 @@ def map_of(
         facing_azimuth_rad=np.full(count, 4.7),
         facing_concentration=np.full(count, 0.9),
         lon_lat_height=lon_lat_height,
+        existence=None if existence is None else np.array(existence, np.float64),
     )
     votes = Votes(
         label_id=np.zeros(len(residual_px), np.int64),

@@ -86,8 +86,15 @@ def test_from_simulation_to_export(tmp_path: Path) -> None:
         "horizontal_rmse_m",
         "vertical_rmse_m",
         "mean_reprojection_error_px",
+        "accuracy",
+        "completeness",
+        "chance",
+        "reliability",
     }
-    assert "recoverable objects" in works("evaluate", result, "--truth", data, "--radius", "1.0")
+    told = works("evaluate", result, "--truth", data, "--radius", "1.0", "--truth-sigma", "0.02")
+    assert "recoverable objects" in told
+    assert "RMSE_H = " in told
+    assert "own sigma 0.02 m an axis" in told
     works("export", result, tmp_path / "labels.csv")
     header = (tmp_path / "labels.csv").read_text().splitlines()[0].split(",")
     assert {"label_id", "class", "x", "y", "z", "votes", "passes"} <= set(header)

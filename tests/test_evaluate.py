@@ -145,7 +145,7 @@ def test_up_says_what_is_vertical() -> None:
 
 def test_json_has_exactly_the_documented_names() -> None:
     values = evaluate_map(map_of([[0.0, 0, 0]], residual_px=[1.5]), truth_of([[0, 0, 0]])).to_json()
-    assert list(values) == JSON_NAMES
+    assert list(values) == [*JSON_NAMES, "accuracy", "completeness", "chance", "reliability"]
     assert values["mean_reprojection_error_px"] == 1.5
 
 
@@ -159,15 +159,18 @@ def test_json_of_nothing_is_null_and_not_nan() -> None:
 
 def test_the_documentation_names_what_json_prints() -> None:
     text = (Path(__file__).parents[1] / "docs" / "evaluation.md").read_text(encoding="utf-8")
-    for name in JSON_NAMES:
+    values = evaluate_map(map_of([[0.0, 0, 0]], existence=[0.9]), truth_of([[0, 0, 0]])).to_json()
+    parts = [values[name] for name in ("accuracy", "completeness", "chance")]
+    for name in [*values, *(name for part in [*parts, *values["reliability"]] for name in part)]:
         assert f"`{name}`" in text
 
 
 def test_the_output_says_when_every_object_counts() -> None:
     dataset = small_dataset()
     result = map_of([[4.0, 25.0, 5.0]])
-    assert evaluate_map(result, dataset).notes == ()
-    (note,) = evaluate_map(result, Dataset(**{**vars(dataset), "truth_detections": None})).notes
+    (few,) = evaluate_map(result, dataset).notes
+    assert few.startswith("1 check point: too few")
+    note, _ = evaluate_map(result, Dataset(**{**vars(dataset), "truth_detections": None})).notes
     assert note.startswith("every true object counts as recoverable")
 
 
@@ -397,7 +400,7 @@ def test_truth_from_csv_and_parquet(tmp_path: Path) -> None:
         evaluation = evaluate_map(result, path)
         assert_found_at(evaluation, 0.3)
         assert sorted(evaluation.matches.objects.object_id) == [5, 6, 7]
-        assert len(evaluation.notes) == 1
+        assert sum("recoverable" in note for note in evaluation.notes) == 1
 
 
 def test_truth_without_classes_matches_any(tmp_path: Path) -> None:

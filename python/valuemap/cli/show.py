@@ -45,7 +45,7 @@ def evaluation_rows(evaluation: Evaluation) -> dict[str, Any]:
         "labels": evaluation.labels,
         "true objects": evaluation.objects,
         "recoverable objects": evaluation.recoverable_objects,
-        **evaluation.to_json(),
+        **evaluation.measures(),
     }
 
 

@@ -1,0 +1,185 @@
+"""One map against the truth: all figures of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from valuemap.dataset import Dataset
+from valuemap.evaluate.accuracy import PositionalAccuracy, measure_accuracy
+from valuemap.evaluate.chance import ChanceFloor, measure_chance
+from valuemap.evaluate.completeness import Completeness, measure_completeness
+from valuemap.evaluate.matching import LABEL_OUTCOMES, Matches, match_labels
+from valuemap.evaluate.reliability import ExistenceRange, measure_reliability
+from valuemap.evaluate.truth import TrueObjects, true_objects
+from valuemap.map_folder import Map, read_map
+from valuemap.tables import Floats, Truth
+
+_MEASURES = (
+    "true_positives",
+    "duplicates",
+    "false_positives",
+    "false_negatives",
+    "recall",
+    "precision",
+    "position_rmse_m",
+    "position_median_m",
+    "horizontal_rmse_m",
+    "vertical_rmse_m",
+    "mean_reprojection_error_px",
+)
+"""The names that `valuemap evaluate --json` prints first, in this order."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Counts and errors of one map against the truth; NaN where there is nothing to measure.
+
+    precision = true_positives / labels, so that duplicates cost; recall = recoverable objects found /
+    recoverable_objects; false_negatives are the recoverable objects not found. Position errors are over the
+    true positives, horizontal and vertical with respect to the up of the map's frame (root mean squares of
+    lengths, so position² = horizontal² + vertical²). The reprojection error is the mean over all votes.
+    """
+
+    true_positives: int
+    duplicates: int
+    false_positives: int
+    false_negatives: int
+    recall: float
+    precision: float
+    position_rmse_m: float
+    position_median_m: float
+    horizontal_rmse_m: float
+    vertical_rmse_m: float
+    mean_reprojection_error_px: float
+    labels: int
+    objects: int
+    recoverable_objects: int
+    radius_m: float
+    notes: tuple[str, ...]
+    """What a reader of the numbers must know, e.g. that every object counts as recoverable."""
+    accuracy: PositionalAccuracy
+    completeness: Completeness
+    chance: ChanceFloor
+    reliability: tuple[ExistenceRange, ...] | None
+    """None where the map has no probability of existence."""
+    matches: Matches = field(repr=False, compare=False)
+
+    def measures(self) -> dict[str, int | float | None]:
+        """Return the measures of this class by name, None where there is nothing to measure."""
+        values = {name: getattr(self, name) for name in _MEASURES}
+        return {name: None if math.isnan(value) else value for name, value in values.items()}
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all figures by name, None where there is nothing to measure."""
+        return {
+            **self.measures(),
+            "accuracy": {"statement": self.accuracy.statement, **self.accuracy.to_json()},
+            "completeness": self.completeness.to_json(),
+            "chance": self.chance.to_json(),
+            "reliability": None if self.reliability is None else [each.to_json() for each in self.reliability],
+        }
+
+
+def evaluate_map(
+    result: Map | str | Path,
+    truth: Dataset | Truth | str | Path,
+    *,
+    radius_m: float = 2.0,
+    min_parallax_rad: float | None = None,
+    truth_sigma_m: float | None = None,
+) -> Evaluation:
+    """Compare a map with known objects.
+
+    Parameters
+    ----------
+    result
+        A map, or the folder of one.
+    truth
+        A dataset with truth or its folder, a table of objects in the frame of the map, or a file of objects
+        (see `read_truth`).
+    radius_m
+        A label and an object farther apart than this are never matched.
+    min_parallax_rad
+        An object is recoverable if two images that detected it see it from directions that differ by at
+        least this angle. Default: the `min_parallax_deg` that the map was made with.
+    truth_sigma_m
+        Standard deviation of the true positions on each axis, where it is known; the accuracy statement adds it.
+
+    Raises
+    ------
+    InputError
+        There is no truth, it cannot be read, or it is in another frame than the map.
+    SettingError
+        The radius, the angle or the standard deviation is impossible.
+    """
+    if isinstance(result, str | Path):
+        result = read_map(result)
+    objects = true_objects(truth, result, min_parallax_rad)
+    matches = match_labels(result.labels, objects, result.frame, radius_m=radius_m)
+    return _measure(result, matches, radius_m, truth_sigma_m)
+
+
+def _measure(result: Map, matches: Matches, radius_m: float, truth_sigma_m: float | None) -> Evaluation:
+    objects = matches.objects
+    found = matches.object_of_label >= 0
+    offset = result.labels.position_in_world_m[found] - objects.position_in_world_m[matches.object_of_label[found]]
+    vertical = offset @ np.array(result.frame.up)
+    horizontal = np.linalg.norm(offset - vertical[:, None] * result.frame.up, axis=1)
+    if not objects.has_height:
+        vertical = np.full(len(vertical), np.nan)
+    distance = np.hypot(horizontal, vertical)
+
+    labels, true_positives = len(found), int(found.sum())
+    recoverable = int(objects.counts_in_recall.sum())
+    missed = int(np.sum(objects.counts_in_recall & (matches.label_of_object < 0)))
+    accuracy = measure_accuracy(result.labels, matches, result.frame, truth_sigma_m=truth_sigma_m)
+    outcomes = np.bincount(matches.label_outcome.codes, minlength=len(LABEL_OUTCOMES))
+    return Evaluation(
+        true_positives=true_positives,
+        duplicates=int(outcomes[LABEL_OUTCOMES.index("duplicate")]),
+        false_positives=int(outcomes[LABEL_OUTCOMES.index("false")]),
+        false_negatives=missed,
+        recall=_ratio(recoverable - missed, recoverable),
+        precision=_ratio(true_positives, labels),
+        position_rmse_m=_root_mean_square(distance),
+        position_median_m=float(np.median(distance)) if true_positives else math.nan,
+        horizontal_rmse_m=_root_mean_square(horizontal),
+        vertical_rmse_m=_root_mean_square(vertical),
+        mean_reprojection_error_px=float(result.votes.residual_px.mean()) if len(result.votes) else math.nan,
+        labels=labels,
+        objects=len(objects),
+        recoverable_objects=recoverable,
+        radius_m=radius_m,
+        notes=(*_notes(objects), *accuracy.notes),
+        accuracy=accuracy,
+        completeness=measure_completeness(matches),
+        chance=measure_chance(result.labels, objects, result.frame, radius_m=radius_m),
+        reliability=measure_reliability(result.labels, matches),
+        matches=matches,
+    )
+
+
+def _notes(objects: TrueObjects) -> tuple[str, ...]:
+    notes = {
+        "every true object counts as recoverable: the truth does not say which detections show it": (
+            objects.is_recoverable is None
+        ),
+        "a label may match an object of any class: the truth has no classes": objects.class_name is None,
+        "labels are matched horizontally, without vertical and 3D errors: the truth has no heights": (
+            not objects.has_height
+        ),
+    }
+    return tuple(note for note, applies in notes.items() if applies)
+
+
+def _ratio(part: int, whole: int) -> float:
+    return part / whole if whole else math.nan
+
+
+def _root_mean_square(values: Floats) -> float:
+    return math.sqrt(np.mean(values**2)) if len(values) else math.nan
