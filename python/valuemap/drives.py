@@ -19,6 +19,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -117,7 +118,8 @@ def find_drives(images: Images, *, viewpoint_step_m: float = 1.0) -> Drives:
     """
     shots = _Shots.of(images)
     vehicle, exposure, rigs = _vehicles(shots)
-    first, exposure_of_shot = np.unique(exposure, return_inverse=True)
+    first = np.flatnonzero(exposure == np.arange(len(exposure)))
+    exposure_of_shot = (np.cumsum(exposure == np.arange(len(exposure))) - 1)[exposure]
     track = _order_exposures(shots, vehicle[first], first)
     place_m, group = shots.center_m[first][track.exposure], track.group
     cut = _cuts(place_m, group, track)
@@ -141,7 +143,7 @@ def find_drives(images: Images, *, viewpoint_step_m: float = 1.0) -> Drives:
     of_row[shots.row] = position[exposure_of_shot]
     told = np.bincount(track.told_by[np.argsort(track.exposure)][exposure_of_shot], minlength=3)
     record = {
-        "passes": len(np.unique(images.pass_id.codes)),
+        "passes": int(np.count_nonzero(np.bincount(images.pass_id.codes))),
         "drives": len(starts),
         "cut_at": cut.counts,
         "images_ordered_by": {name: int(n) for name, n in zip(_TOLD_BY, told, strict=True) if n},
@@ -187,6 +189,17 @@ class _Shots:
         given = _by_first(images.pass_id.codes[row].astype(np.int64) * 2 + is_timed)
         camera = _by_first(images.camera_id[row])
         return cls(images, row, center_m[row], time_s[row], given, camera)
+
+    @cached_property
+    def _parts_of_untimed(self) -> _NameParts:
+        return _NameParts(self.names(np.flatnonzero(np.isnan(self.time_s))))
+
+    def name_parts(self, shots: Ints) -> _NameParts:
+        """Return the names of some, cut into texts and numbers; those of all without a time are cut only once."""
+        timed = ~np.isnan(self.time_s)
+        if timed[shots].any():
+            return _NameParts(self.names(shots))
+        return self._parts_of_untimed.take(shots - np.cumsum(timed)[shots])
 
     def names(self, shots: Ints) -> list[str]:
         """Return the names of some."""
@@ -237,12 +250,17 @@ def _break_ties(row: Ints, tie: Bools, key: NDArray[Any]) -> tuple[Ints, Bools]:
 
 def _by_first(codes: Ints) -> Ints:
     """Return codes (N) numbered by their first appearance."""
-    if len(codes) and np.all(codes == codes[0]):
-        return np.zeros(len(codes), np.int64)
-    _, first, inverse = np.unique(codes, return_index=True, return_inverse=True)
+    if not len(codes):
+        return codes.astype(np.int64)
+    low, high = int(codes.min()), int(codes.max())
+    if high - low > 4 * len(codes):
+        codes = np.unique(codes, return_inverse=True)[1]
+        low, high = 0, int(codes.max())
+    first = np.full(high - low + 1, len(codes))
+    first[codes[::-1] - low] = np.arange(len(codes))[::-1]  # The last assignment stays: that of the first.
     rank = np.empty(len(first), np.int64)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return rank[inverse]
+    rank[np.argsort(first, kind="stable")] = np.arange(len(first))
+    return rank[codes - low]
 
 
 # Rigs: cameras of one vehicle.
@@ -315,7 +333,7 @@ def _rig_pairs(
     one camera that looks the same way are no rig where only numbers in their names or their places agree.
     """
     members = members[np.argsort(clock[members], kind="stable")]
-    if len(np.unique(stream[members])) < 2:
+    if not len(members) or stream[members].min() == stream[members].max():
         return members[:0], members[:0]
     time, of = clock[members], stream[members]
     cadence, step_m = _own_cadence(time, of, shots.center_m[members])
@@ -351,7 +369,7 @@ def _rig_pairs(
     by_group = _sort_codes(group)
     starts = _runs(group[by_group])[:-1]
     place_m = shots.center_m[a[by_group]]
-    width_m = np.linalg.norm(np.maximum.reduceat(place_m, starts) - np.minimum.reduceat(place_m, starts), axis=1)
+    width_m = _lengths(np.maximum.reduceat(place_m, starts) - np.minimum.reduceat(place_m, starts))
     usual_m = _quantiles(step_m[pair[0]], group, 0.5)
     apart_m = np.linalg.norm(middle_m, axis=1)
     one, other = a[by_group[starts]], b[by_group[starts]]
@@ -370,7 +388,7 @@ def _own_cadence(time: Floats, stream: Ints, center_m: Floats) -> tuple[Floats, 
     order = np.argsort(stream, kind="stable")
     same = np.diff(stream[order]) == 0
     gap = np.where(same, np.diff(time[order]), np.inf)
-    away_m = np.where(same, np.linalg.norm(np.diff(center_m[order], axis=0), axis=1), np.nan)
+    away_m = np.where(same, _lengths(np.diff(center_m[order], axis=0)), np.nan)
     cadence, step_m = np.empty(len(order)), np.empty(len(order))
     cadence[order] = np.minimum(np.concatenate([[np.inf], gap]), np.concatenate([gap, [np.inf]]))
     before_m, after_m = np.concatenate([[np.nan], away_m]), np.concatenate([away_m, [np.nan]])
@@ -425,7 +443,7 @@ def _connected(a: Ints, b: Ints, count: int) -> Ints:
 
 def _rigs_by_name(shots: _Shots, members: Ints, stream: Ints) -> tuple[Floats, Ints, tuple[Ints, Ints]]:
     """Return what names tell of shots (M): their rank, the part that names the camera (N), and pairs of rigs."""
-    parts = _NameParts(shots.names(members))
+    parts = shots.name_parts(members)
     best: tuple[Floats, Ints, tuple[Ints, Ints]] | None = None
     for column in parts.columns_that_may_name_cameras():
         rank = np.zeros(len(shots))
@@ -442,6 +460,14 @@ def _rigs_by_name(shots: _Shots, members: Ints, stream: Ints) -> tuple[Floats, I
 
 class _NameParts:
     """Names (M) cut into texts and numbers: columns of codes that sort as texts and numbers do."""
+
+    def take(self, rows: Ints) -> _NameParts:
+        """Return some of them."""
+        part = _NameParts([])
+        part._length = self._length[rows]
+        part.codes = [codes[rows] for codes in self.codes]
+        part.numbers = [numbers[rows] for numbers in self.numbers]
+        return part
 
     def __init__(self, names: Sequence[str]) -> None:
         parts = [_DIGITS.split(name) for name in names]
@@ -481,10 +507,15 @@ class _NameParts:
                     columns.append(column)
         return columns
 
-    def running_number(self) -> Floats | None:
-        """Return the number (M) that alone tells the names apart; none where several do."""
+    def numbers_passed(self, order: Ints) -> Floats:
+        """Return by how much (M) a number grew since the name before in an order, NaN where more than it changed."""
         varying = [column for column, codes in enumerate(self.codes) if len(codes) and np.ptp(codes) > 0]
-        return self.numbers[varying[-1]] if len(varying) == 1 and varying[0] % 2 == 1 else None
+        passed = np.full(len(order), np.nan)
+        if varying and varying[-1] % 2 == 1:
+            passed[1:] = np.diff(self.numbers[varying[-1]][order])
+            for column in varying[:-1]:
+                passed[1:][np.diff(self.codes[column][order]) != 0] = np.nan
+        return passed
 
 
 # The order of the exposures of a vehicle.
@@ -494,13 +525,14 @@ class _NameParts:
 class _Track:
     """Exposures (E) one after the other, vehicle after vehicle.
 
-    `exposure` indexes what was put in order; `group` numbers the vehicles, ascending; `clock` is a time or a running
-    number, NaN where there is none; `told_by` is how the order was told.
+    `exposure` indexes what was put in order; `group` numbers the vehicles, ascending; `taken` is how long it is since
+    the exposure before, in seconds or by a running number, NaN where nothing tells; `told_by` is how the order was
+    told.
     """
 
     exposure: Ints
     group: Ints
-    clock: Floats
+    taken: Floats
     told_by: Ints
 
 
@@ -509,22 +541,23 @@ def _order_exposures(shots: _Shots, vehicle: Ints, first: Ints) -> _Track:
     by_vehicle = _sort_codes(vehicle)
     place_m, time_s = shots.center_m[first], shots.time_s[first]
     runs = _runs(vehicle[by_vehicle])
-    ordered, clock, told_by = by_vehicle.copy(), time_s[by_vehicle], np.zeros(len(first), np.int64)
-    believed = _is_a_way(place_m[by_vehicle], vehicle[by_vehicle]) & ~np.isnan(clock[runs[:-1]])
+    ordered, told_by = by_vehicle.copy(), np.zeros(len(first), np.int64)
+    taken = np.diff(time_s[by_vehicle], prepend=np.nan)
+    believed = _is_a_way(place_m[by_vehicle], vehicle[by_vehicle]) & ~np.isnan(time_s[by_vehicle[runs[:-1]]])
     group = vehicle[by_vehicle].astype(np.int64)
     pieces: list[_Track] = []
     for number in np.flatnonzero(~believed):
         place = slice(runs[number], runs[number + 1])
         members = by_vehicle[place]
         found = _order_vehicle(shots, members, first, place_m)
-        ordered[place], clock[place], told_by[place] = found.exposure, found.clock, found.told_by
+        ordered[place], taken[place], told_by[place] = found.exposure, found.taken, found.told_by
         pieces.append(found)
     # A vehicle whose cameras go each their own way is several.
     extra = np.zeros(len(first), np.int64)
     for number, found in zip(np.flatnonzero(~believed), pieces, strict=True):
         extra[runs[number] : runs[number + 1]] = found.group
     steps = np.concatenate([[0], (np.diff(group) != 0) | (np.diff(extra) != 0)]) if len(group) else group
-    return _Track(ordered, np.cumsum(steps), clock, told_by)
+    return _Track(ordered, np.cumsum(steps), taken, told_by)
 
 
 def _order_vehicle(shots: _Shots, members: Ints, first: Ints, place_m: Floats) -> _Track:
@@ -543,7 +576,7 @@ def _order_vehicle(shots: _Shots, members: Ints, first: Ints, place_m: Floats) -
         return _way_m(way) <= _CLEARLY_LONGER * _way_m(place_m[members[chain]])
 
     if not np.isnan(time_s).any() and is_believed(np.arange(len(members))):
-        return _Track(members, zero, time_s, zero + TIME)
+        return _Track(members, zero, np.diff(time_s, prepend=np.nan), zero + TIME)
     camera = shots.camera[first[members]]
     if len(np.unique(camera)) > 1 and 2 * len(np.unique(camera)) <= len(members):
         parts = [
@@ -554,14 +587,13 @@ def _order_vehicle(shots: _Shots, members: Ints, first: Ints, place_m: Floats) -
             return _Track(
                 np.concatenate([part.exposure for part in parts]),
                 np.concatenate([part.group + start for part, start in zip(parts, offset, strict=False)]),
-                np.concatenate([part.clock for part in parts]),
+                np.concatenate([part.taken for part in parts]),
                 np.concatenate([part.told_by for part in parts]),
             )
-    parts_of_names = _NameParts(shots.names(first[members]))
+    parts_of_names = shots.name_parts(first[members])
     by_name = np.argsort(parts_of_names.rank(), kind="stable")
     if is_believed(by_name):
-        number = parts_of_names.running_number()
-        return _Track(members[by_name], zero, none if number is None else number[by_name], zero + NAME)
+        return _Track(members[by_name], zero, parts_of_names.numbers_passed(by_name), zero + NAME)
     chain = _chain(place_m[members]) if chain is None else chain
     return _Track(members[chain], zero, none, zero + CHAIN)
 
@@ -574,16 +606,42 @@ def _sort_codes(codes: Ints) -> Ints:
 
 
 def _quantiles(values: Floats, group: Ints, share: float) -> Floats:
-    """Return for each group from 0 the value below which this share of its values (N) lies; NaN values do not count."""
-    order = np.argsort(values)  # NaN last.
-    order = order[_sort_codes(group[order])]
+    """Return for each group from 0 the value below which this share of its values (N) lies; NaN values do not count.
+
+    Values are rounded to single precision: then one sort of whole numbers, by group and value, does it.
+    """
+    bits = (values + 0.0).astype(np.float32).view(np.uint32)  # No -0; bits of positive numbers sort as these do.
+    bits = np.where(np.isnan(values), np.uint32(2**32 - 1), bits ^ np.where(bits >> 31, 2**32 - 1, 2**31).astype("u4"))
+    keys = np.sort((group.astype(np.uint64) << np.uint64(32)) | bits)
     groups = int(group.max(initial=-1)) + 1
     size = np.bincount(group, minlength=groups)
     number = size - np.bincount(group[np.isnan(values)], minlength=groups)
-    quantile = np.full(groups, np.nan)
     some = np.flatnonzero(number)
-    quantile[some] = values[order[(np.cumsum(size) - size)[some] + np.int64(share * (number[some] - 1) + 0.5)]]
+    at = (np.cumsum(size) - size)[some] + (share * (number[some] - 1) + 0.5).astype(np.int64)
+    found = keys[at].astype(np.uint32)
+    found ^= np.where(found >> 31, 2**31, 2**32 - 1).astype("u4")
+    quantile = np.full(groups, np.nan)
+    quantile[some] = found.view(np.float32)
     return quantile
+
+
+def _by_key(key: Ints) -> Ints:
+    """Return an order in which equal keys (N) are next to each other, ascending; so may be some others, by chance."""
+    bits = np.uint64(len(key).bit_length())
+    mixed = key.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)  # Spreads over the upper bits: 2^64 / golden ratio.
+    at = np.arange(len(key), dtype=np.uint64)
+    ordered = np.sort((mixed >> bits << bits) | at)  # Much faster than a stable argsort.
+    return (ordered & ((np.uint64(1) << bits) - np.uint64(1))).astype(np.int64)
+
+
+def _lengths(vectors: Floats) -> Floats:
+    """Return the lengths (N) of vectors (N, 3)."""
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)))  # Several times as fast as the norm of NumPy.
+
+
+def _steps_m(place_m: Floats) -> Floats:
+    """Return how far each of some places (N, 3) in a row is from the one before, the first 0."""
+    return _lengths(np.diff(place_m, axis=0, prepend=place_m[:1]))
 
 
 def _runs(values: Ints) -> Ints:
@@ -602,19 +660,19 @@ def _is_a_way(place_m: Floats, group: Ints) -> Bools:
     starts = np.flatnonzero(within % _WINDOW == 0)
     if not len(starts):
         return np.empty(0, np.bool_)
-    step_m = np.linalg.norm(np.diff(place_m, axis=0, prepend=place_m[:1]), axis=1)
+    step_m = _steps_m(place_m)
     step_m[starts] = 0.0
     way_m = np.add.reduceat(step_m, starts)
-    width_m = np.linalg.norm(np.maximum.reduceat(place_m, starts) - np.minimum.reduceat(place_m, starts), axis=1)
+    width_m = _lengths(np.maximum.reduceat(place_m, starts) - np.minimum.reduceat(place_m, starts))
     of = np.searchsorted(runs, starts, side="right") - 1
     groups = len(runs) - 1
-    way_m, width_m = np.bincount(of, way_m, groups), np.bincount(of, width_m, groups)
-    return np.asarray(way_m <= _CLEARLY_LONGER * width_m)
+    ways_m, widths_m = np.bincount(of, way_m, groups), np.bincount(of, width_m, groups)
+    return np.asarray(ways_m <= _CLEARLY_LONGER * widths_m)
 
 
 def _way_m(place_m: Floats) -> float:
     """Return the length of a way along places (N, 3) without its longest steps."""
-    step_m = np.sort(np.linalg.norm(np.diff(place_m, axis=0), axis=1))
+    step_m = np.sort(_lengths(np.diff(place_m, axis=0)))
     return float(step_m[: len(step_m) - int(np.ceil(_TRIMMED_SHARE * len(step_m)))].sum())
 
 
@@ -692,10 +750,9 @@ def _cuts(place_m: Floats, group: Ints, track: _Track) -> _Cuts:
     begins = np.diff(group, prepend=-1) != 0
     if len(group) < 2:
         return _Cuts(begins, {})
-    step_m = np.linalg.norm(np.diff(place_m, axis=0, prepend=place_m[:1]), axis=1)
+    step_m = _steps_m(place_m)
     step_m[begins] = np.nan
-    taken = np.diff(track.clock, prepend=np.nan)
-    taken[begins] = np.nan
+    taken = np.where(begins, np.nan, track.taken)
     usual_m = _usual(step_m, group)
     with np.errstate(divide="ignore", invalid="ignore"):
         speed = step_m / np.where(taken > 0.0, taken, np.nan)
@@ -733,7 +790,7 @@ def _revisits(place_m: Floats, drive: Ints, usual_m: Floats, may: Bools) -> Bool
     """
     count = len(drive)
     near_m = np.where((usual_m > 0.0) & may, _REVISIT_STEPS * usual_m, np.nan)
-    step_m = np.linalg.norm(np.diff(place_m, axis=0, prepend=place_m[:1]), axis=1)
+    step_m = _steps_m(place_m)
     way_m = np.cumsum(np.where(step_m > _STILL_SHARE * usual_m, step_m, 0.0))
     ground = np.sort(np.argsort(-np.ptp(place_m, axis=0), kind="stable")[:2])
     able = np.flatnonzero(~np.isnan(near_m))
@@ -747,10 +804,13 @@ def _revisits(place_m: Floats, drive: Ints, usual_m: Floats, may: Bools) -> Bool
         enters = np.concatenate([[True], key[1:] != key[:-1]])
         leaves = np.concatenate([enters[1:], [True]])
         kept = np.flatnonzero(enters | leaves)
-        kept = kept[np.argsort(key[kept], kind="stable")]
+        kept = kept[_by_key(key[kept])]
         i, j = able[kept[1:]], able[kept[:-1]]
         again = (key[kept[1:]] == key[kept[:-1]]) & enters[kept[1:]] & leaves[kept[:-1]]
         again &= way_m[i] - way_m[j] >= _AWAY_STEPS * usual_m[i]
+        again[again] = (
+            _lengths(place_m[i[again]] - place_m[j[again]]) <= 4.0 * near_m[i[again]]
+        )  # Not by a key's chance.
         back.append(i[again])
         before.append(j[again])
     i, j = np.concatenate(back), np.concatenate(before)
@@ -768,7 +828,7 @@ def _revisits(place_m: Floats, drive: Ints, usual_m: Floats, may: Bools) -> Bool
 
 def _viewpoint_openings(place_m: Floats, begins: Bools, step_m: float) -> Bools:
     """Return where (E) along drives viewpoints begin."""
-    moved_m = np.linalg.norm(np.diff(place_m, axis=0, prepend=place_m[:1]), axis=1)
+    moved_m = _steps_m(place_m)
     opens = begins | (moved_m > step_m)
     # Sure whatever the viewpoint's begin: it lies within a step of the exposure before.
     sure = begins | (moved_m > 2.0 * step_m)
@@ -784,7 +844,7 @@ def _viewpoint_openings(place_m: Floats, begins: Bools, step_m: float) -> Bools:
     here, end = unsure[head], unsure[np.concatenate([head[1:], [len(unsure)]]) - 1] + 1
     begin = here - 1
     while len(here) > _SIDE_BY_SIDE:
-        new = np.linalg.norm(place_m[here] - place_m[begin], axis=1) > step_m
+        new = _lengths(place_m[here] - place_m[begin]) > step_m
         opens[here] = new
         begin = np.where(new, here, begin)
         here = here + 1
