@@ -1,10 +1,17 @@
-"""Between a dataset's local frame (x east, y north, z up at an anchor) and WGS84, through PROJ."""
+"""Between a dataset's local frame (x east, y north, z up at an anchor), WGS84 and map projections, through PROJ.
+
+The local frame is a plane that touches the ellipsoid at the anchor, so it is exact at any distance; what bends is the
+Earth below it. Who knows a heading, or a pose relative to the horizon, at some other place must turn it by
+`enu_axes_at`, and in a map projection by `true_axes_of_crs` too.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from valuemap.errors import InputError
+from valuemap.errors import InputError, SettingError
 from valuemap.tables import Floats
 
 
@@ -19,6 +26,92 @@ def lon_lat_height_from_enu(position_in_world_m: Floats, anchor: tuple[float, fl
 def enu_from_lon_lat_height(lon_lat_height: Floats, anchor: tuple[float, float, float]) -> Floats:
     """Return ENU positions (N, 3) in metres of longitude, latitude (degrees) and height (m), (N, 3)."""
     return _transform(lon_lat_height, anchor, inverse=False)
+
+
+def enu_axes_at(lon_lat_height: Floats, anchor: tuple[float, float, float]) -> Floats:
+    """Return rotations (N, 3, 3) from east, north, up at places (N, 3) into the frame of the anchor.
+
+    Columns are the directions east, north and up there, from longitude and geodetic latitude.
+    """
+    lat, lon, _ = anchor
+    at_anchor = _earth_from_enu(np.array([lon]), np.array([lat]))[0]
+    axes: Floats = at_anchor.T @ _earth_from_enu(lon_lat_height[:, 0], lon_lat_height[:, 1])
+    return axes
+
+
+def lon_lat_height_from_crs(position: Floats, crs: str) -> Floats:
+    """Return longitude, latitude (degrees) and ellipsoidal height (m), (N, 3), of coordinates in a reference system.
+
+    Parameters
+    ----------
+    position
+        Easting (or longitude), northing (or latitude) and height (N, 3), whatever the order of the system's own axes.
+    crs
+        What pyproj knows, such as `EPSG:32610`. Heights of a system without a vertical axis are ellipsoidal.
+
+    Raises
+    ------
+    SettingError
+        There is no such system, or PROJ lacks the grid that its heights need.
+    InputError
+        A place is outside where the system is defined.
+    """
+    lon, lat, height = _to_wgs84(crs).transform(*position.T)
+    found = np.stack([lon, lat, height], axis=1)
+    if not np.all(np.isfinite(found)):
+        row = int(np.flatnonzero(~np.isfinite(found).all(axis=1))[0])
+        raise InputError(
+            f"crs {crs}: {position[row].tolist()} is no place in it", hint="are x and y easting and northing in its unit?"
+        )
+    return found
+
+
+def true_axes_of_crs(position: Floats, crs: str) -> Floats:
+    """Return rotations (N, 3, 3) from the axes of a map's grid into east, north, up at coordinates (N, 3) in it.
+
+    Grid north differs from north by the convergence, 3 degrees at the edge of a UTM zone at 60 degrees of latitude.
+    """
+    transformer = _to_wgs84(crs)
+    step = 1e-5 if transformer.source_crs is not None and transformer.source_crs.is_geographic else 1.0
+    north = np.zeros_like(position)
+    north[:, 1] = step
+    ends = [np.stack(transformer.transform(*(position + sign * north).T), axis=1) for sign in (-1.0, 1.0)]
+    lon_rad, lat_rad = (np.radians(ends[1][:, axis] - ends[0][:, axis]) for axis in (0, 1))
+    middle_rad = np.radians((ends[0][:, 1] + ends[1][:, 1]) / 2.0)
+    # A degree of longitude is shorter than one of latitude by the cosine, and by the shape of the ellipsoid.
+    flatness = 6.69437999014e-3
+    east = np.cos(middle_rad) * lon_rad
+    along = lat_rad * (1.0 - flatness) / (1.0 - flatness * np.sin(middle_rad) ** 2)
+    azimuth_rad = np.arctan2(east, along)
+    sine, cosine, zero, one = np.sin(azimuth_rad), np.cos(azimuth_rad), np.zeros(len(east)), np.ones(len(east))
+    rows = [[cosine, sine, zero], [-sine, cosine, zero], [zero, zero, one]]
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def _to_wgs84(crs: str) -> Any:
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import ProjError
+
+    try:
+        system = CRS.from_user_input(int(crs) if crs.isdecimal() else crs)
+        if len(system.axis_info) < 3:
+            system = system.to_3d()
+        return Transformer.from_crs(system, "EPSG:4979", always_xy=True, only_best=True, allow_ballpark=False)
+    except ProjError as error:
+        reason = " ".join(str(error).split())[:200]
+        raise SettingError(
+            f"crs {crs!r}: cannot be brought to WGS84: {reason}",
+            hint="give a code such as EPSG:32610, or 4979; heights above the sea need a grid that PROJ must have",
+        ) from error
+
+
+def _earth_from_enu(lon_deg: Floats, lat_deg: Floats) -> Floats:
+    lon, lat = np.radians(lon_deg), np.radians(lat_deg)
+    zero = np.zeros(len(lon))
+    east = np.stack([-np.sin(lon), np.cos(lon), zero], axis=1)
+    north = np.stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)], axis=1)
+    up = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
+    return np.stack([east, north, up], axis=2)
 
 
 def _transform(points: Floats, anchor: tuple[float, float, float], *, inverse: bool) -> Floats:

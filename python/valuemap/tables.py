@@ -139,6 +139,8 @@ class Images(Table):
 class Detections(Table):
     """2D boxes: centre and size (N, 2) in pixels, class and score; optionally a measured range in metres.
 
+    A size of 0 was not measured (bearings, key points). `vertical_sigma_px` is the standard deviation of the centre's y
+    where it is not that of its x (NaN: it is); where no elevation was measured y is the horizon and it is large.
     There are none before `valuemap detect` has looked for them.
     """
 
@@ -153,6 +155,7 @@ class Detections(Table):
     score: Floats = _column("float", ("score",))
     range_m: Floats | None = _column("float", ("range_m",), optional=True, nullable=True)
     range_sigma_m: Floats | None = _column("float", ("range_sigma_m",), optional=True, nullable=True)
+    vertical_sigma_px: Floats | None = _column("float", ("vertical_sigma_px",), optional=True, nullable=True)
 
 
 @dataclass(frozen=True, eq=False)

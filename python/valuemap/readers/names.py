@@ -3,30 +3,43 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import PurePosixPath
 
 
 def match_images(names: Collection[str], known: Sequence[str]) -> dict[str, int]:
     """Return the index in `known` of each of `names` that can be told for sure; the others are left out.
 
-    The exact name counts first. Else the base name (without folders), if no other name and no other known
-    image has it: `cam1/7.jpg` must not become `cam0/7.jpg` only because `cam1` is not among the known.
+    The exact name counts first, then the name without its suffix, the base name (without folders), and the base name
+    without its suffix: each only if no other name and no other known image has the same. `cam1/7.jpg` must not become
+    `cam0/7.jpg` only because `cam1` is not among the known, nor `7.png` become `7.jpg` beside another `7.jpg`.
     """
     distinct = set(names)
-    exact = {name: row for row, name in enumerate(known)}
-    known_bases = Counter(map(_base, known))
-    bases = Counter(map(_base, distinct))
-    by_base = {_base(name): row for row, name in enumerate(known)}
-    found = {}
-    for name in distinct:
-        base = _base(name)
-        if name in exact:
-            found[name] = exact[name]
-        elif bases[base] == known_bases[base] == 1:
-            found[name] = by_base[base]
+    found: dict[str, int] = {}
+    for key in _KEYS:
+        missing = distinct - found.keys()
+        if not missing:
+            break
+        count, known_count = Counter(map(key, distinct)), Counter(map(key, known))
+        row_of = {key(name): row for row, name in enumerate(known)}
+        for name in missing:
+            part = key(name)
+            if count[part] == known_count[part] == 1:
+                found[name] = row_of[part]
     return found
+
+
+def _without_suffix(name: str) -> str:
+    return str(PurePosixPath(name).with_suffix("")) if PurePosixPath(name).suffix in _PICTURES else name
 
 
 def _base(name: str) -> str:
     return PurePosixPath(name).name
+
+
+_PICTURES = frozenset(
+    suffix
+    for lower in (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".ppm", ".txt")
+    for suffix in (lower, lower.upper())
+)
+_KEYS: tuple[Callable[[str], str], ...] = (str, _without_suffix, _base, lambda name: _base(_without_suffix(name)))

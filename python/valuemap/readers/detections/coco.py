@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 import reprlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from valuemap.dataset import rows_of
 from valuemap.errors import InputError
-from valuemap.readers.names import match_images
-from valuemap.readers.vet import FoundBoxes
-from valuemap.tables import Cameras, Floats, Images, Ints
+from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes
+from valuemap.readers.files import read_json
+from valuemap.tables import Floats, Ints
 
 _FORMAT_HINT = "COCO's format is described at https://cocodataset.org/#format-data"
 _HUGE = 1e300
+_NO_BOX = [float("nan")] * 4
 
 
 @dataclass(frozen=True)
@@ -37,7 +35,6 @@ def _is_number(value: Any) -> bool:
 _ID = _Kind(lambda value: type(value) in (int, str), "a whole number or a text")
 _TEXT = _Kind(lambda value: isinstance(value, str) and value != "", "a text")
 _MAYBE_TEXT = _Kind(lambda value: isinstance(value, str), "a text")
-_NO_BOX = [math.nan] * 4
 
 
 @dataclass(frozen=True)
@@ -67,9 +64,27 @@ class _Entries:
             )
         return values
 
+    def numbers(self, key: str, default: float) -> Floats:
+        """Return one number an entry (N), NaN where there is something else."""
+        values = (entry.get(key, default) for entry in self.entries)
+        return np.array([value if _is_number(value) else np.nan for value in values], dtype=np.float64)
 
-def read_coco(path: Path, images: Images, cameras: Cameras) -> FoundBoxes:
-    """Read boxes and find their images by file name, as `match_images` does; which can be used is not decided here.
+    def boxes(self) -> Floats:
+        """Return x, y, width, height (N, 4), NaN where these are no four numbers."""
+        found = [entry.get("bbox") for entry in self.entries]
+        if all(box is None for box in found):
+            raise InputError(f"{self.where}[0]: expected bbox: x, y, width, height, found none", hint=_FORMAT_HINT)
+        return np.array(
+            [
+                box if isinstance(box, list) and len(box) == 4 and all(map(_is_number, box)) else _NO_BOX
+                for box in found
+            ],
+            dtype=np.float64,
+        )
+
+
+def read_coco(file: DetectionFile) -> NamedBoxes:
+    """Read boxes; images are known by file name.
 
     An object has `images` (id, file_name), `annotations` (image_id, category_id, bbox, maybe score and id)
     and maybe `categories` (id, name). A list has results (category_id, bbox, score) that name their image in
@@ -80,46 +95,25 @@ def read_coco(path: Path, images: Images, cameras: Cameras) -> FoundBoxes:
     Raises
     ------
     InputError
-        The file is no COCO file or has no boxes, an image has another size there than in `images`, or two entries of
-        a list have the same id.
+        The file is no COCO file or has no boxes, or one does not say its image or class.
     """
-    content = _load(path)
+    path = file.path
+    content = read_json(path, "a JSON file with detections in COCO's format")
     is_results = isinstance(content, list)
     boxes = _Entries(f"{path}: {'results' if is_results else 'annotations'}", _boxes_in(content, path))
     listed = _Entries(f"{path}: images", [] if is_results else _list_in(content, "images", path))
-    names = _names_of_results(boxes) if is_results else _names_of_annotations(boxes, listed)
-    row_of = match_images({*names, *(listed.column("file_name", _TEXT))}, images.name.to_pylist())
-    _refuse_other_sizes(listed, set(names), row_of, images, cameras)
-    bbox_px = np.array([_box_or_none(entry.get("bbox")) for entry in boxes.entries], dtype=np.float64)
-    return FoundBoxes(
-        image_row=np.array([row_of.get(name, -1) for name in names], dtype=np.int64),
-        image_names=names,
+    bbox_px = boxes.boxes()
+    return NamedBoxes(
+        image_names=_names_of_results(boxes) if is_results else _names_of_annotations(boxes, listed),
         class_names=_class_names(boxes, content, path),
-        center_px=bbox_px[:, :2] + bbox_px[:, 2:] / 2.0,
-        size_px=bbox_px[:, 2:],
-        score=_scores(boxes),
-        detection_id=None if is_results else _own_ids(boxes),
+        center=bbox_px[:, :2] + bbox_px[:, 2:] / 2.0,
+        size=bbox_px[:, 2:],
+        score=boxes.numbers("score", 1.0),
         where=lambda row: f"{boxes.where}[{row}]",
+        detection_id=None if is_results else _own_ids(boxes),
+        pictures=_sizes(listed),
+        other_names=listed.column("file_name", _TEXT),
     )
-
-
-def _box_or_none(value: Any) -> list[float]:
-    is_box = isinstance(value, list) and len(value) == 4 and all(map(_is_number, value))
-    return value if is_box else _NO_BOX
-
-
-def _scores(boxes: _Entries) -> Floats:
-    scores = (entry.get("score", 1.0) for entry in boxes.entries)
-    return np.array([score if _is_number(score) else math.nan for score in scores], dtype=np.float64)
-
-
-def _load(path: Path) -> Any:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file", hint="give a JSON file with detections in COCO's format")
-    try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, OSError, RecursionError) as error:
-        raise InputError(f"{path}: cannot be read as JSON: {error}", hint="is it whole? Write it again") from error
 
 
 def _boxes_in(content: Any, path: Path) -> list[Any]:
@@ -140,14 +134,23 @@ def _list_in(content: Any, key: str, path: Path) -> list[Any]:
     return found
 
 
+def _sizes(listed: _Entries) -> dict[str, tuple[int, int]]:
+    sizes = ((entry["file_name"], entry.get("width"), entry.get("height")) for entry in listed.entries)
+    return {name: (width, height) for name, width, height in sizes if width is not None and height is not None}
+
+
 def _names_of_annotations(boxes: _Entries, listed: _Entries) -> list[str]:
-    """Return the file name of each annotation; of an image that is not listed its id, which is no file name."""
+    image_ids = boxes.column("image_id", _ID)
     ids, names = listed.column("id", _ID), listed.column("file_name", _TEXT)
     name_of = _without_repeats(ids, names, listed.where)
-    image_ids = [entry.get("image_id") for entry in boxes.entries]
-    return [
-        name_of[key] if _ID.accepts(key) and key in name_of else f"image_id {reprlib.repr(key)}" for key in image_ids
-    ]
+    unlisted = [row for row, image_id in enumerate(image_ids) if image_id not in name_of]
+    if unlisted:
+        raise InputError(
+            f"{boxes.where}[{unlisted[0]}]: image_id {image_ids[unlisted[0]]!r} is not in images "
+            f"({len(unlisted)} entries)",
+            hint="add the image with its file_name to images, or remove these entries",
+        )
+    return [name_of[image_id] for image_id in image_ids]
 
 
 def _names_of_results(boxes: _Entries) -> list[str]:
@@ -171,44 +174,26 @@ def _names_of_results(boxes: _Entries) -> list[str]:
 def _without_repeats(ids: list[Any], texts: list[str], where: str) -> dict[Any, str]:
     found = dict(zip(ids, texts, strict=True))
     if len(found) < len(ids):
-        row = next(row for row, key in enumerate(ids) if key in ids[:row])
+        seen = set()
+        row = next(row for row, key in enumerate(ids) if key in seen or seen.add(key))  # type: ignore[func-returns-value]
         raise InputError(f"{where}[{row}]: id {ids[row]!r} is there twice", hint="give every entry an id of its own")
     return found
 
 
-def _refuse_other_sizes(
-    listed: _Entries, used: set[str], row_of: dict[str, int], images: Images, cameras: Cameras
-) -> None:
-    """Refuse boxes that were made on pictures of another size than the model's, resized or undistorted."""
-    camera_row = rows_of(images.camera_id, cameras.camera_id)
-    for row, entry in enumerate(listed.entries):
-        name, size = entry["file_name"], (entry.get("width"), entry.get("height"))
-        if name not in used or name not in row_of or None in size:
-            continue
-        camera = camera_row[row_of[name]]
-        expected = (int(cameras.width_px[camera]), int(cameras.height_px[camera]))
-        if size != expected:
-            raise InputError(
-                f"{listed.where}[{row}]: {name!r}: expected {expected[0]} x {expected[1]} px as in the "
-                f"model, found {size[0]} x {size[1]}",
-                hint="run the detector on the pictures that the model was made of, or scale boxes and sizes",
-            )
-
-
 def _class_names(boxes: _Entries, content: Any, path: Path) -> list[str]:
-    """Return the class of each box; of those that have none, or one that is not listed, an empty text."""
-    category_ids = [entry.get("category_id") for entry in boxes.entries]
+    category_ids = boxes.column("category_id", _ID)
     if isinstance(content, list) or not content.get("categories"):
-        return [_class_of_id(key) for key in category_ids]
+        return [key if isinstance(key, str) else f"class-{key}" for key in category_ids]
     categories = _Entries(f"{path}: categories", _list_in(content, "categories", path))
     name_of = _without_repeats(categories.column("id", _ID), categories.column("name", _TEXT), categories.where)
-    return [name_of.get(key, "") if _ID.accepts(key) else "" for key in category_ids]
-
-
-def _class_of_id(key: Any) -> str:
-    if not _ID.accepts(key):
-        return ""
-    return key if isinstance(key, str) else f"class-{key}"
+    unnamed = [row for row, category_id in enumerate(category_ids) if category_id not in name_of]
+    if unnamed:
+        raise InputError(
+            f"{boxes.where}[{unnamed[0]}]: category_id {category_ids[unnamed[0]]!r} is not in categories "
+            f"({len(unnamed)} entries)",
+            hint="add it to categories, or remove these entries",
+        )
+    return [name_of[category_id] for category_id in category_ids]
 
 
 def _own_ids(boxes: _Entries) -> Ints | None:

@@ -1,0 +1,127 @@
+"""Bearings: where the camera was, in which direction an object, and maybe how far; nothing else."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from valuemap.dataset import Dataset
+from valuemap.errors import InputError, SettingError
+from valuemap.progress import Progress, silent
+from valuemap.readers.assemble import ONE_PASS, FoundBoxes, assemble
+from valuemap.readers.cameras_of import parse_camera, make_cameras
+from valuemap.readers.csv_file import CsvFile
+from valuemap.readers.poses import local_from_cam, make_images, place_on_earth
+from valuemap.tables import Floats, Ints
+
+_EXPECTED = "a CSV file with columns lat, lon, bearing (degrees clockwise from north) and maybe depth (metres)"
+_WIDTH_PX, _HEIGHT_PX = 7200, 3600
+"""Of the panorama that a place is taken for: 20 px a degree."""
+VERTICAL_SIGMA_PX = _HEIGHT_PX / math.sqrt(2.0 * math.pi)
+"""A normal density of this deviation is at its peak as high as the even one over the picture: no evidence."""
+
+
+def read_bearings(
+    bearings: Path,
+    *,
+    columns: Mapping[str, str] | None = None,
+    class_name: str = "object",
+    depth_sigma: float = 0.3,
+    camera_height_m: float = 0.0,
+    anchor: tuple[float, float, float] | None = None,
+    max_rejected: float = 0.01,
+    progress: Progress = silent,
+) -> Dataset:
+    """Read a table with one row a detection: `lat, lon` of the camera, `bearing` of the object, maybe `depth` in metres.
+
+    Every distinct place is an image, a panorama that looks north, or every distinct text in the column `image` where
+    there is one. Detections are on the horizon with a `vertical_sigma_px` that says that their elevation was not
+    measured, and have no size. Optional columns are `class`, `score`, `pass` and `height` of the camera.
+
+    Parameters
+    ----------
+    bearings
+        The table.
+    columns
+        Under which name a column stands in it, where it is another one.
+    class_name
+        The class of detections that have none.
+    depth_sigma
+        Standard deviation of a depth as a fraction of it.
+    camera_height_m
+        Height of the cameras where the table has none.
+    anchor
+        Latitude, longitude and height of the origin; by default the place of the first image by name.
+
+    Raises
+    ------
+    InputError
+        The file is no such table, or an image is at two places.
+    SettingError
+        An option is impossible.
+    """
+    if not 0.0 < depth_sigma < math.inf:
+        raise SettingError(f"depth-sigma: expected above 0, found {depth_sigma:g}", hint="0.3 is 30 % of the depth")
+    progress("reading the bearings", 0, 1)
+    table = CsvFile(bearings, _EXPECTED, columns)
+    lat, lon, bearing_deg = (table.numbers(name) for name in ("lat", "lon", "bearing"))
+    height = table.numbers("height") if table.has("height") else np.full(len(table), camera_height_m)
+    place = np.stack([lon, lat, height], axis=1)
+    passes = table.filled_texts("pass") if table.has("pass") else [ONE_PASS] * len(table)
+    names, first, image_of = _images(table, place, passes)
+    placed = place_on_earth(place[first], anchor, source=str(bearings))
+    level = np.zeros(len(first))
+    cameras, camera_id = make_cameras([parse_camera(f"EQUIRECTANGULAR {_WIDTH_PX} {_HEIGHT_PX}")] * len(first), "")
+    images = make_images(
+        names=names,
+        camera_id=camera_id,
+        world_from_cam=placed.world_from_local @ local_from_cam(level, level, level),
+        center_in_world_m=placed.position_in_world_m,
+        passes=[passes[row] for row in first],
+        source=str(bearings),
+    )
+    depth_m = table.numbers("depth", may_miss=True) if table.has("depth") else None
+    x_px = ((bearing_deg / 360.0 + 0.5) % 1.0) * _WIDTH_PX
+    dataset = assemble(
+        name=bearings.stem,
+        cameras=cameras,
+        images=images,
+        detections=FoundBoxes(
+            image_row=image_of,
+            class_names=table.filled_texts("class") if table.has("class") else [class_name] * len(table),
+            center_px=np.stack([x_px, np.full(len(table), _HEIGHT_PX / 2.0)], axis=1),
+            size_px=None,
+            score=table.numbers("score") if table.has("score") else np.ones(len(table)),
+            where=table.line,
+            range_m=depth_m,
+            range_sigma_m=None if depth_m is None else depth_sigma * depth_m,
+            vertical_sigma_px=np.full(len(table), VERTICAL_SIGMA_PX),
+        ),
+        up=None,
+        anchor=placed.anchor,
+        source=str(bearings),
+        max_rejected=max_rejected,
+    )
+    progress("reading the bearings", 1, 1)
+    return dataset
+
+
+def _images(table: CsvFile, place: Floats, passes: list[str]) -> tuple[list[str], Ints, Ints]:
+    """Return the names of the images in their order, the first row of each (M), and the image of each row (N)."""
+    keys = (
+        table.filled_texts("image")
+        if table.has("image")
+        else [f"{lat:.8f}_{lon:.8f}_{height:g}_{name}" for (lon, lat, height), name in zip(place, passes, strict=True)]
+    )
+    names, first, image_of = np.unique(np.array(keys), return_index=True, return_inverse=True)
+    moved = np.flatnonzero((place != place[first[image_of]]).any(axis=1))
+    if len(moved):
+        row = int(moved[0])
+        raise InputError(
+            f"{table.line(row)}: image {keys[row]!r} is at two places ({len(moved)} rows)",
+            hint="give every place an image of its own, or remove the column image",
+        )
+    return [str(name) for name in names], first, image_of

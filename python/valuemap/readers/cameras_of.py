@@ -1,0 +1,86 @@
+"""Cameras as formats give them, made into the cameras table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+
+from valuemap.errors import InputError, SettingError
+from valuemap.tables import Cameras, Categories, Ints
+
+_LARGEST_PX = 1_000_000
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera: COLMAP's name of the model, size in pixels, and parameters in COLMAP's order and pixel convention."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+def make_cameras(cameras: Sequence[Camera], source: str) -> tuple[Cameras, Ints]:
+    """Return the distinct cameras, with ids from 1 in an order of their values, and the id of each given one (N).
+
+    Raises
+    ------
+    InputError
+        A camera has no size, or a focal length that is not above 0.
+    """
+    for camera in cameras:
+        if not (0 < camera.width < _LARGEST_PX and 0 < camera.height < _LARGEST_PX):
+            raise InputError(
+                f"{source}: camera: expected a width and height in pixels, found {camera.width} x {camera.height}",
+                hint="give the size of the pictures that the detections were made on",
+            )
+        if not np.isfinite(camera.params).all() or (camera.model != "EQUIRECTANGULAR" and not camera.params[0] > 0.0):
+            raise InputError(
+                f"{source}: camera: expected a focal length above 0 and finite parameters, found {list(camera.params)}",
+                hint="focal lengths are in pixels",
+            )
+    distinct = sorted(set(cameras), key=lambda camera: (camera.model, camera.width, camera.height, camera.params))
+    id_of = {camera: number for number, camera in enumerate(distinct, start=1)}
+    table = Cameras(
+        camera_id=np.arange(1, len(distinct) + 1, dtype=np.int64),
+        model=Categories.from_texts([camera.model for camera in distinct]),
+        width_px=np.array([camera.width for camera in distinct], dtype=np.int64),
+        height_px=np.array([camera.height for camera in distinct], dtype=np.int64),
+        params=[np.array(camera.params, dtype=np.float64) for camera in distinct],
+    )
+    return table, np.array([id_of[camera] for camera in cameras], dtype=np.int64)
+
+
+def parse_camera(text: str, pixel_center: float = 0.5) -> Camera:
+    """Return the camera of a text such as `PINHOLE 1242 375 721.5 721.5 609.6 172.9`: model, size, parameters.
+
+    `pixel_center` is the coordinate of the centre of the top-left pixel in the parameters. A panorama
+    (`EQUIRECTANGULAR 8192 4096`) has no further parameters.
+
+    Raises
+    ------
+    SettingError
+        There is no such model, or it has another number of parameters.
+    """
+    hint = 'for example "PINHOLE 1242 375 721.5 721.5 609.6 172.9" or "EQUIRECTANGULAR 8192 4096"'
+    name, *rest = text.split() or [""]
+    if name not in pycolmap.CameraModelId.__members__ or name == "INVALID":
+        raise SettingError(f"camera {text!r}: expected one of COLMAP's camera models first", hint=hint)
+    try:
+        width, height = int(rest[0]), int(rest[1])
+        params = [float(value) for value in rest[2:]]
+    except (ValueError, IndexError) as error:
+        raise SettingError(f"camera {text!r}: expected model, width, height and numbers", hint=hint) from error
+    if not (0 < width < _LARGEST_PX and 0 < height < _LARGEST_PX):
+        raise SettingError(f"camera {text!r}: expected a width and height in pixels", hint=hint)
+    if name == "EQUIRECTANGULAR":
+        params = params or [float(width), float(height)]
+    names = [part.strip() for part in pycolmap.Camera(model=name, width=width, height=height).params_info.split(",")]
+    if len(params) != len(names) or not np.isfinite(params).all():
+        raise SettingError(f"camera {text!r}: {name} has the parameters {', '.join(names)}", hint=hint)
+    shifted = [value + 0.5 - pixel_center if key in ("cx", "cy") else value for key, value in zip(names, params, strict=True)]
+    return Camera(name, width, height, tuple(shifted))

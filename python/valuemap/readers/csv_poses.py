@@ -1,0 +1,258 @@
+"""Images and poses in a table of the user's own, with columns that say what they are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from valuemap.dataset import Dataset
+from valuemap.errors import InputError, SettingError
+from valuemap.progress import Progress, silent
+from valuemap.readers.assemble import ONE_PASS, assemble
+from valuemap.readers.cameras_of import Camera, make_cameras, parse_camera
+from valuemap.readers.csv_file import CsvFile
+from valuemap.readers.detections import DetectionFile, read_detections
+from valuemap.readers.poses import (
+    AXES,
+    OnEarth,
+    local_from_cam,
+    make_images,
+    place_in_crs,
+    place_on_earth,
+    rotations_of_quaternions,
+)
+from valuemap.tables import Floats
+
+_EXPECTED = (
+    "a CSV file with columns image; lat, lon or x, y; and heading_deg, yaw_rad or qw, qx, qy, qz"
+)
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_HEADINGS = ("heading_deg", "heading_rad", "yaw_deg", "yaw_rad")
+
+
+@dataclass(frozen=True)
+class _Where:
+    """Positions, and what turns the local axes of each image into the world."""
+
+    position_m: Floats
+    world_from_local: Floats
+    anchor: tuple[float, float, float] | None
+
+
+def read_csv_poses(
+    poses: Path,
+    *,
+    detections: DetectionFile | Path | None = None,
+    camera: str | None = None,
+    columns: Mapping[str, str] | None = None,
+    rotation: str = "cam_from_world",
+    axes: str = "right-down-forward",
+    pixel_center: float = 0.5,
+    camera_height_m: float = 0.0,
+    crs: str | None = None,
+    up: tuple[float, float, float] | None = None,
+    anchor: tuple[float, float, float] | None = None,
+    max_rejected: float = 0.01,
+    progress: Progress = silent,
+) -> Dataset:
+    """Read a table with one row an image.
+
+    Columns: `image` (name); a place, `lat, lon` in degrees or `x, y`, with `height` or `z`; an orientation; and as far
+    as known a camera, `pass`, `timestamp` (seconds, or ISO 8601, in UTC where it says no zone), `rig` (equal for images
+    taken at one time by one car), `position_sigma_m` and `rotation_sigma_deg`.
+
+    An orientation is a quaternion `qw, qx, qy, qz`, or one of `heading_deg`, `heading_rad` (clockwise from north) and
+    `yaw_deg`, `yaw_rad` (counter-clockwise from east) of the middle of the picture, with `pitch_deg` (up) and
+    `roll_deg` (right side down), which are 0 for level cameras. A camera is `model, width, height, params` (numbers
+    with spaces between), or `width, height, fx, cx, cy` and maybe `fy`; else it is `camera` for all.
+
+    Parameters
+    ----------
+    poses
+        The table.
+    detections
+        As in `read_detections`.
+    camera
+        The camera of all images, as in `parse_camera`, where the table has none.
+    columns
+        Under which name a column stands in the table, where it is another one.
+    rotation
+        What a quaternion does, "cam_from_world" or "world_from_cam". The world of a quaternion is the frame of `x, y, z`;
+        with `lat, lon` it is east, north, up at the image.
+    axes
+        The axes of the camera that a quaternion is about, one of `AXES`.
+    pixel_center
+        Coordinates of the centre of the top-left pixel in `cx, cy`: 0.5 or 0.
+    camera_height_m
+        Height of all images where the table has none.
+    crs
+        The reference system of `x, y`, e.g. EPSG:32610: easting, northing. Without, they are metres in a frame of their own.
+    up, anchor
+        As in `assemble`. With `lat, lon` or `crs` the anchor is the origin, by default the place of the first image by name.
+
+    Raises
+    ------
+    InputError
+        A file is missing, damaged or inconsistent.
+    SettingError
+        An option is impossible, or does not go with the columns.
+    """
+    if rotation not in ("cam_from_world", "world_from_cam") or axes not in AXES:
+        raise SettingError(
+            f"rotation {rotation}, axes {axes}: expected cam_from_world or world_from_cam, and one of {', '.join(AXES)}",
+            hint="leave them away for COLMAP's convention",
+        )
+    progress("reading the poses", 0, 2)
+    table = CsvFile(poses, _EXPECTED, columns)
+    names = table.filled_texts("image")
+    where = _place(table, names, crs, anchor, up, camera_height_m)
+    cameras, camera_id = make_cameras(_cameras(table, camera, pixel_center), str(poses))
+    images = make_images(
+        names=names,
+        camera_id=camera_id,
+        world_from_cam=where.world_from_local @ _local_from_cam(table, names, rotation, axes),
+        center_in_world_m=where.position_m,
+        passes=table.filled_texts("pass") if table.has("pass") else [ONE_PASS] * len(table),
+        source=str(poses),
+        timestamp_s=_timestamps(table) if table.has("timestamp") else None,
+        rigs=table.filled_texts("rig") if table.has("rig") else None,
+        position_sigma_m=_optional(table, "position_sigma_m"),
+        rotation_sigma_rad=_radians(_optional(table, "rotation_sigma_deg")),
+    )
+    progress("reading the detections", 1, 2)
+    dataset = assemble(
+        name=poses.stem,
+        cameras=cameras,
+        images=images,
+        detections=read_detections(detections, images, cameras),
+        up=up,
+        anchor=where.anchor,
+        source=str(poses),
+        max_rejected=max_rejected,
+    )
+    progress("reading the detections", 2, 2)
+    return dataset
+
+
+def _place(
+    table: CsvFile,
+    names: list[str],
+    crs: str | None,
+    anchor: tuple[float, float, float] | None,
+    up: tuple[float, float, float] | None,
+    camera_height_m: float,
+) -> _Where:
+    level = np.full(len(table), camera_height_m)
+    first = min(range(len(names)), key=names.__getitem__)
+    source = str(table.path)
+    if table.has("lat", "lon"):
+        if crs is not None or up is not None:
+            raise SettingError("crs and up: do not go with columns lat, lon", hint="leave them away: lat, lon are WGS84")
+        height = table.numbers("height") if table.has("height") else level
+        return _on_earth(
+            place_on_earth(
+                np.stack([table.numbers("lon"), table.numbers("lat"), height], axis=1), anchor, first, source=source
+            )
+        )
+    if not table.has("x", "y"):
+        raise table.missing("lat, lon or x, y")
+    height = next((table.numbers(name) for name in ("z", "height") if table.has(name)), level)
+    position = np.stack([table.numbers("x"), table.numbers("y"), height], axis=1)
+    if crs is not None:
+        if up is not None:
+            raise SettingError("up: does not go with crs", hint="leave it away: heights are along z")
+        return _on_earth(place_in_crs(position, crs, anchor, first, source=source))
+    return _Where(position, np.broadcast_to(np.eye(3), (len(table), 3, 3)), anchor)
+
+
+def _on_earth(placed: OnEarth) -> _Where:
+    return _Where(placed.position_in_world_m, placed.world_from_local, placed.anchor)
+
+
+def _local_from_cam(table: CsvFile, names: list[str], rotation: str, axes: str) -> Floats:
+    """Return rotations (N, 3, 3) from camera axes into the frame of the positions, or east, north, up at the image."""
+    headings = [name for name in _HEADINGS if table.has(name)]
+    if table.has(*_QUATERNION):
+        if headings:
+            raise InputError(
+                f"{table.path}: has both a quaternion and {headings[0]}", hint="remove the columns that do not count"
+            )
+        quaternion = np.stack([table.numbers(name) for name in _QUATERNION], axis=1)
+        matrix = rotations_of_quaternions(quaternion, names, str(table.path))
+        local_from_axes = matrix if rotation == "world_from_cam" else matrix.transpose(0, 2, 1)
+        return local_from_axes @ AXES[axes].T
+    if len(headings) != 1:
+        raise table.missing(f"one of {', '.join(_HEADINGS)}, or {', '.join(_QUATERNION)}")
+    name = headings[0]
+    angle_rad = table.numbers(name) * (math.pi / 180.0 if name.endswith("_deg") else 1.0)
+    if name.endswith("_rad") and np.abs(angle_rad).max() > 4.0 * math.pi:
+        raise InputError(
+            f"{table.path}: {name}: expected radians, found {np.abs(angle_rad).max():g}",
+            hint=f"are these degrees? Then --column {name[:-4]}_deg={name}",
+        )
+    heading_rad = angle_rad if name.startswith("heading") else math.pi / 2.0 - angle_rad
+    pitch, roll = (
+        np.radians(table.numbers(column)) if table.has(column) else np.zeros(len(table))
+        for column in ("pitch_deg", "roll_deg")
+    )
+    return local_from_cam(heading_rad, pitch, roll)
+
+
+def _cameras(table: CsvFile, camera: str | None, pixel_center: float) -> list[Camera]:
+    if table.has("model", "width", "height", "params"):
+        texts = zip(table.texts("model"), table.texts("width"), table.texts("height"), table.texts("params"), strict=True)
+        joined = [" ".join(parts) for parts in texts]
+        parsed: dict[str, Camera] = {}
+        for row, text in enumerate(joined):
+            if text not in parsed:
+                try:
+                    parsed[text] = parse_camera(text, pixel_center)
+                except SettingError as error:
+                    raise InputError(f"{table.line(row)}: {error}", hint=error.hint) from error
+        return [parsed[text] for text in joined]
+    if table.has("width", "height", "fx", "cx", "cy"):
+        shift = 0.5 - pixel_center
+        focal = [table.numbers("fx"), table.numbers("fy") if table.has("fy") else table.numbers("fx")]
+        values = np.stack([*focal, table.numbers("cx") + shift, table.numbers("cy") + shift], axis=1).tolist()
+        sizes = zip(table.whole_numbers("width").tolist(), table.whole_numbers("height").tolist(), strict=True)
+        return [Camera("PINHOLE", w, h, tuple(params)) for (w, h), params in zip(sizes, values, strict=True)]
+    if camera is None:
+        raise table.missing("width, height, fx, cx, cy (or model, width, height, params; or the option camera)")
+    return [parse_camera(camera, pixel_center)] * len(table)
+
+
+def _timestamps(table: CsvFile) -> Floats:
+    """Return seconds (N) since 1970; empty fields are NaN."""
+    return np.array([_seconds(text.strip(), table, row) for row, text in enumerate(table.texts("timestamp"))])
+
+
+def _seconds(text: str, table: CsvFile, row: int) -> float:
+    if not text:
+        return math.nan
+    try:
+        seconds = float(text)
+    except ValueError:
+        try:
+            time = datetime.fromisoformat(text)
+        except ValueError as error:
+            raise InputError(
+                f"{table.line(row)}: timestamp: expected seconds or an ISO 8601 time, found {text[:40]!r}",
+                hint="for example 1700000000.25 or 2023-11-14T22:13:20.25Z",
+            ) from error
+        return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
+    if not math.isfinite(seconds):
+        raise InputError(f"{table.line(row)}: timestamp: expected a finite number", hint="leave it empty where not known")
+    return seconds
+
+
+def _optional(table: CsvFile, name: str) -> Floats | None:
+    return table.numbers(name, may_miss=True) if table.has(name) else None
+
+
+def _radians(degrees: Floats | None) -> Floats | None:
+    return None if degrees is None else np.radians(degrees)

@@ -1,0 +1,58 @@
+"""Detections in a table: one row a box, a key point or a bearing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from valuemap.readers.csv_file import CsvFile
+from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes
+from valuemap.tables import Floats
+
+_EXPECTED = "a CSV file with columns image and x1, y1, x2, y2, or left, top, width, height, or x, y"
+
+
+def read_csv_boxes(file: DetectionFile) -> NamedBoxes:
+    """Read boxes from a table with a column `image` (a name) and one of these sets of columns, in pixels or fractions.
+
+    `x1, y1, x2, y2` are edges, `left, top, width, height` the top-left corner and the size, `x, y` the centre, with
+    `width, height` or, for key points, without. Optional are `class`, `score`, `range_m`, `range_sigma_m` (metres) and
+    `vertical_sigma_px`.
+
+    Raises
+    ------
+    InputError
+        The file is no such table.
+    """
+    table = CsvFile(file.path, _EXPECTED, file.columns)
+    center, size = _boxes(table)
+    optional = {
+        name: table.numbers(name, may_miss=True) if table.has(name) else None
+        for name in ("range_m", "range_sigma_m", "vertical_sigma_px")
+    }
+    return NamedBoxes(
+        image_names=table.filled_texts("image"),
+        class_names=table.filled_texts("class") if table.has("class") else [file.class_name] * len(table),
+        center=center,
+        size=size,
+        score=table.numbers("score") if table.has("score") else np.full(len(table), file.full_score),
+        where=table.line,
+        fractions=file.fractions,
+        **optional,
+    )
+
+
+def _boxes(table: CsvFile) -> tuple[Floats, Floats | None]:
+    """Return centres (N, 2), and sizes (N, 2) where there are any."""
+    if table.has("x1", "y1", "x2", "y2"):
+        first, last = _pair(table, "x1", "y1"), _pair(table, "x2", "y2")
+        return (first + last) / 2.0, last - first
+    if table.has("left", "top", "width", "height"):
+        corner, size = _pair(table, "left", "top"), _pair(table, "width", "height")
+        return corner + size / 2.0, size
+    if table.has("x", "y"):
+        return _pair(table, "x", "y"), _pair(table, "width", "height") if table.has("width", "height") else None
+    raise table.missing("x1, y1, x2, y2, or left, top, width, height, or x, y (the centre) and maybe width, height")
+
+
+def _pair(table: CsvFile, first: str, second: str) -> Floats:
+    return np.stack([table.numbers(first), table.numbers(second)], axis=1)

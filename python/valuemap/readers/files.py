@@ -1,0 +1,169 @@
+"""Reading the files of others: regular ones only, whole, as text, JSON, YAML or XML, and only inside their folder.
+
+Whatever is wrong with a file is one `InputError`. Names that a file gives to other files must not lead out of the
+folder, YAML must have no aliases and XML no document type: an alias or an entity that names itself ten times, ten times
+over, is a few bytes on disk and fills the memory.
+"""
+
+from __future__ import annotations
+
+import json
+import reprlib
+import stat
+import xml.parsers.expat
+from collections.abc import Callable
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+from valuemap.errors import InputError
+
+_MAX_NAME = 1000
+
+
+def check_file(path: Path, expected: str) -> Path:
+    """Return the path of a regular file; `expected` says in words what should be there.
+
+    Raises
+    ------
+    InputError
+        There is nothing, or a folder, a pipe or a device, which would never end.
+    """
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: no such file", hint=f"expected {expected}") from error
+    if not stat.S_ISREG(mode):
+        kind = "a folder" if stat.S_ISDIR(mode) else "no regular file"
+        raise InputError(f"{path}: is {kind}", hint=f"expected {expected}")
+    return path
+
+
+def check_folder(path: Path, expected: str) -> Path:
+    """Return the path of a folder; `expected` says in words what should be there."""
+    if not path.is_dir():
+        found = "is a file" if path.exists() else "no such folder"
+        raise InputError(f"{path}: {found}", hint=f"expected {expected}")
+    return path
+
+
+def file_in(folder: Path, name: str, expected: str) -> Path:
+    """Return the path of a regular file in a folder; neither its name nor a link may lead out of the folder.
+
+    Raises
+    ------
+    InputError
+        The name is absolute or goes up, the file is elsewhere, is missing, or is no regular file.
+    """
+    if not _stays_inside(name):
+        raise InputError(
+            f"{folder}: {_short(name)}: leads out of the folder",
+            hint="file names must be relative, without .. in them",
+        )
+    path = check_file(folder / name, expected)
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise InputError(
+            f"{path}: is a link that leads out of {folder}",
+            hint="put the file itself into the folder",
+        )
+    return path
+
+
+def check_names(names: list[str], source: str) -> None:
+    """Refuse names of images that could mean a file outside the folder of the pictures, or none at all."""
+    for name in names:
+        if not _stays_inside(name):
+            raise InputError(
+                f"{source}: image name {_short(name)}: expected a relative name that stays in the folder of the pictures",
+                hint="names must be texts without .. and not absolute, e.g. monday/cam0/000123.jpg",
+            )
+
+
+def _stays_inside(name: str) -> bool:
+    path = PurePosixPath(name)
+    is_drive = bool(PureWindowsPath(name).drive)
+    printable = name.isprintable() and 0 < len(name) <= _MAX_NAME
+    return printable and not path.is_absolute() and not is_drive and ".." not in path.parts and str(path) != "."
+
+
+def read_text(path: Path, expected: str) -> str:
+    """Return a file as text; `expected` says in words what should be there."""
+    check_file(path, expected)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: cannot be read as text: byte {error.start} is not UTF-8", hint=f"expected {expected}, in UTF-8"
+        ) from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}", hint=f"expected {expected}") from error
+    if not text.strip():
+        raise InputError(f"{path}: is empty", hint=f"expected {expected}")
+    return text
+
+
+def read_json(path: Path, expected: str) -> Any:
+    """Return what a JSON file holds; `expected` says in words what should be there."""
+    text = read_text(path, expected)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"{path}: cannot be read as JSON: {_first_line(error)}", hint="is it whole? Write or download it again"
+        ) from error
+
+
+def read_yaml(path: Path, expected: str) -> Any:
+    """Return what a YAML file holds, which must not have aliases."""
+    import yaml  # Slow to import, and few formats need it.
+
+    text = read_text(path, expected)
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    try:
+        for event in yaml.parse(text, Loader=loader):
+            if isinstance(event, yaml.AliasEvent):
+                raise InputError(
+                    f"{path} line {event.start_mark.line + 1}: has an alias (*{_short(event.anchor or '')})",
+                    hint="write the value out: aliases are not read",
+                )
+        return yaml.load(text, Loader=loader)
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot be read as YAML: {_first_line(error)}", hint="is it whole? Write or download it again"
+        ) from error
+
+
+def read_xml(path: Path, expected: str, on_element: Callable[[str, dict[str, str], int], None]) -> None:
+    """Call `on_element(name, attributes, line)` for every opening tag of an XML file, in their order.
+
+    Parameters
+    ----------
+    path, expected
+        The file, and in words what should be there.
+    on_element
+        Called as `on_element(name, attributes, line)` for an opening tag, and with `/name` for a closing one.
+    """
+    text = read_text(path, expected)
+    parser = xml.parsers.expat.ParserCreate()
+
+    def refuse(*_: Any) -> None:
+        raise InputError(
+            f"{path} line {parser.CurrentLineNumber}: has a document type", hint="remove <!DOCTYPE ...> from the file"
+        )
+
+    parser.StartDoctypeDeclHandler = refuse
+    parser.StartElementHandler = lambda name, attributes: on_element(name, attributes, parser.CurrentLineNumber)
+    parser.EndElementHandler = lambda name: on_element(f"/{name}", {}, parser.CurrentLineNumber)
+    try:
+        parser.Parse(text.encode(), True)
+    except xml.parsers.expat.ExpatError as error:
+        raise InputError(
+            f"{path}: cannot be read as XML: {_first_line(error)}", hint="is it whole? Write or download it again"
+        ) from error
+
+
+def _first_line(error: BaseException) -> str:
+    return (" ".join(str(error).split()) or type(error).__name__)[:200]
+
+
+def _short(text: str) -> str:
+    return reprlib.repr(text)

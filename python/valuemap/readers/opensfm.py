@@ -1,0 +1,163 @@
+"""OpenSfM: reconstruction.json with cameras, shots and the place of the origin."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from valuemap.dataset import Dataset
+from valuemap.errors import InputError, SettingError
+from valuemap.progress import Progress, silent
+from valuemap.readers.assemble import ONE_PASS, assemble
+from valuemap.readers.cameras_of import Camera, make_cameras
+from valuemap.readers.detections import DetectionFile, read_detections
+from valuemap.readers.files import file_in, read_json
+from valuemap.readers.json_values import Json
+from valuemap.readers.poses import make_images
+
+_EXPECTED = "OpenSfM's reconstruction.json: a list of reconstructions with cameras and shots"
+_REFERENCE = "reference_lla.json"
+
+
+def read_opensfm(
+    reconstruction: Path,
+    *,
+    detections: DetectionFile | Path | None = None,
+    up: tuple[float, float, float] | None = None,
+    anchor: tuple[float, float, float] | None = None,
+    max_rejected: float = 0.01,
+    progress: Progress = silent,
+) -> Dataset:
+    """Read all reconstructions of a file, whose origin is `reference_lla` in it or in the file of that name beside it.
+
+    Rotations are axis-angle, world to camera. Lengths are fractions of the larger side of the picture about its middle,
+    and become pixels with the centre of the top-left one at 0.5. A pass is the sequence of a shot (`skey`), else the
+    folder of its name; separate reconstructions share no pass. Rig instances are rigs.
+
+    Parameters
+    ----------
+    reconstruction
+        The file, or the folder with it.
+    detections
+        As in `read_detections`.
+    up, anchor
+        As in `assemble`, for models without a reference.
+
+    Raises
+    ------
+    InputError
+        A file is missing, damaged or of another format, or a camera is of a type that COLMAP's models do not have.
+    SettingError
+        `anchor` or `up` contradicts the reference of the file.
+    """
+    progress("reading the reconstruction", 0, 2)
+    path = reconstruction / "reconstruction.json" if reconstruction.is_dir() else reconstruction
+    content = Json(read_json(path, _EXPECTED), str(path), f"expected {_EXPECTED}")
+    parts = list(content.entries())
+    names, passes, rigs, time, rotation, translation, camera_of = [], [], [], [], [], [], []
+    for number, part in enumerate(parts):
+        cameras_here = {key: _camera(value) for key, value in part["cameras"].items()}
+        rig_of = _rigs(part, number)
+        for name, shot in part["shots"].items():
+            key = shot["camera"].text()
+            if key not in cameras_here:
+                raise shot["camera"].wrong("expected one of cameras")
+            names.append(name)
+            camera_of.append(cameras_here[key])
+            rotation.append(shot["rotation"].numbers(3))
+            translation.append(shot["translation"].numbers(3))
+            time.append(shot["capture_time"].number() if "capture_time" in shot else np.nan)
+            folder = str(PurePosixPath(name).parent)
+            sequence = shot["skey"].text() if "skey" in shot else (folder if folder != "." else ONE_PASS)
+            passes.append(f"{number}/{sequence}" if len(parts) > 1 else sequence)
+            rigs.append(rig_of.get(name, f"{number}/{name}"))
+    reference = _reference(parts, path)
+    if reference is not None and (anchor is not None or up is not None):
+        raise SettingError(
+            f"anchor and up: {path} says where it is: {reference[0]:g} {reference[1]:g} {reference[2]:g}",
+            hint="leave them away",
+        )
+    if not names:
+        raise InputError(f"{path}: there are no shots in it", hint="did the reconstruction succeed?")
+    cameras, camera_id = make_cameras(camera_of, str(path))
+    cam_from_world = Rotation.from_rotvec(np.array(rotation))
+    images = make_images(
+        names=names,
+        camera_id=camera_id,
+        world_from_cam=cam_from_world.inv().as_matrix(),
+        center_in_world_m=-cam_from_world.inv().apply(np.array(translation)),
+        passes=passes,
+        source=str(path),
+        timestamp_s=np.array(time),
+        rigs=rigs,
+    )
+    progress("reading the detections", 1, 2)
+    dataset = assemble(
+        name=path.resolve().parent.name,
+        cameras=cameras,
+        images=images,
+        detections=read_detections(detections, images, cameras),
+        up=up,
+        anchor=reference or anchor,
+        source=str(path),
+        max_rejected=max_rejected,
+    )
+    progress("reading the detections", 2, 2)
+    return dataset
+
+
+def _camera(value: Json) -> Camera:
+    """Return one camera; COLMAP's models are the same functions of other names."""
+    kind = value["projection_type"].text()
+    width, height = value["width"].whole(), value["height"].whole()
+    if kind in ("spherical", "equirectangular"):
+        return Camera("EQUIRECTANGULAR", width, height, (float(width), float(height)))
+    size = max(width, height)
+
+    def of(name: str, default: float | None = None) -> float:
+        return value[name].number() if default is None or name in value else default
+
+    if "focal_x" in value:
+        fx, fy = size * of("focal_x"), size * of("focal_y")
+    else:
+        fx = fy = size * of("focal")
+    cx, cy = width / 2.0 + size * of("c_x", 0.0), height / 2.0 + size * of("c_y", 0.0)
+    k1, k2, k3, k4, p1, p2 = (of(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    params = {
+        "perspective": ("OPENCV", (fx, fy, cx, cy, k1, k2, 0.0, 0.0)),
+        "simple_radial": ("OPENCV", (fx, fy, cx, cy, k1, 0.0, 0.0, 0.0)),
+        "radial": ("OPENCV", (fx, fy, cx, cy, k1, k2, 0.0, 0.0)),
+        "brown": ("FULL_OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)),
+        "fisheye": ("OPENCV_FISHEYE", (fx, fy, cx, cy, k1, k2, 0.0, 0.0)),
+        "fisheye_opencv": ("OPENCV_FISHEYE", (fx, fy, cx, cy, k1, k2, k3, k4)),
+    }
+    if kind not in params:
+        raise value["projection_type"].wrong(f"expected one of {', '.join(params)}, spherical, equirectangular")
+    return Camera(params[kind][0], width, height, params[kind][1])
+
+
+def _rigs(part: Json, number: int) -> dict[str, str]:
+    """Return the rig instance of each shot that is in one."""
+    found = {}
+    if "rig_instances" in part:
+        for key, instance in part["rig_instances"].items():
+            for name, _ in instance["rig_camera_ids"].items():
+                found[name] = f"{number}/instance/{key}"
+    return found
+
+
+def _reference(parts: list[Json], path: Path) -> tuple[float, float, float] | None:
+    """Return latitude, longitude and altitude of the origin, which all reconstructions share."""
+    found = [part["reference_lla"] for part in parts if "reference_lla" in part]
+    if not found and (path.parent / _REFERENCE).is_file():
+        beside = file_in(path.parent, _REFERENCE, "the place of the origin")
+        found = [Json(read_json(beside, "latitude, longitude, altitude"), str(beside))]
+    places = [tuple(place[key].number() for key in ("latitude", "longitude", "altitude")) for place in found]
+    if len(set(places)) > 1:
+        raise InputError(
+            f"{path}: its {len(parts)} reconstructions have different origins (reference_lla)",
+            hint="import them one by one",
+        )
+    return places[0] if places else None  # type: ignore[return-value]

@@ -1,0 +1,250 @@
+"""Images of poses in the conventions of others: camera to world, headings, places on Earth or in a map projection."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from valuemap.errors import InputError
+from valuemap.geodesy import enu_axes_at, enu_from_lon_lat_height, lon_lat_height_from_crs, true_axes_of_crs
+from valuemap.readers.files import check_names
+from valuemap.tables import Categories, Floats, Images, Ints
+
+_ROTATION_TOLERANCE = 1e-3
+_LARGEST_M = 1e8
+
+# Columns are the axes of a level camera that looks north: x east, y down, z north.
+LOOKING_NORTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+AXES = {
+    "right-down-forward": np.eye(3),
+    "right-up-back": np.diag([1.0, -1.0, -1.0]),
+    "forward-left-up": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+}
+"""What takes camera axes (x right, y down, z forward) into the axes that others give to a camera: OpenCV's, OpenGL's
+and those of a vehicle (ROS, Waymo)."""
+
+
+@dataclass(frozen=True, eq=False)
+class OnEarth:
+    """Where images are: positions (N, 3) in the ENU frame of the anchor, and there the local axes of each.
+
+    `world_from_local` (N, 3, 3) takes east, north, up at the image into the frame of the anchor; 20 km away these
+    differ by a fifth of a degree.
+    """
+
+    position_in_world_m: Floats
+    world_from_local: Floats
+    anchor: tuple[float, float, float]
+
+
+def place_on_earth(
+    lon_lat_height: Floats, anchor: tuple[float, float, float] | None, first: int = 0, *, source: str
+) -> OnEarth:
+    """Place images (N, 3) at longitude, latitude (degrees) and ellipsoidal height (m).
+
+    Parameters
+    ----------
+    anchor
+        Latitude, longitude and height of the origin; None for the place of the image in row `first`.
+    source
+        What errors name as the place of the data.
+
+    Raises
+    ------
+    InputError
+        A latitude is beyond 90 degrees: often latitude and longitude are swapped.
+    """
+    wrong = np.flatnonzero((np.abs(lon_lat_height[:, 1]) > 90.0) | (np.abs(lon_lat_height[:, 0]) > 360.0))
+    if len(wrong):
+        lon, lat, _ = lon_lat_height[wrong[0]]
+        raise InputError(
+            f"{source}: expected degrees, found latitude {lat:g} and longitude {lon:g} ({len(wrong)} images)",
+            hint="are latitude and longitude swapped, or are these metres of a map projection (--crs)?",
+        )
+    if anchor is None:
+        lon, lat, height = lon_lat_height[first].tolist()
+        anchor = (lat, lon, height)
+    return OnEarth(
+        enu_from_lon_lat_height(lon_lat_height, anchor), enu_axes_at(lon_lat_height, anchor), anchor
+    )
+
+
+def place_in_crs(
+    position: Floats, crs: str, anchor: tuple[float, float, float] | None, first: int = 0, *, source: str
+) -> OnEarth:
+    """Place images at coordinates (N, 3) of a reference system such as `EPSG:32610`, easting first, height last.
+
+    The local axes are those of the grid: its north is not north, and poses in it are turned by the convergence.
+    """
+    lon_lat_height = lon_lat_height_from_crs(position, crs)
+    placed = place_on_earth(lon_lat_height, anchor, first, source=source)
+    true_from_grid = true_axes_of_crs(position, crs)
+    return OnEarth(placed.position_in_world_m, placed.world_from_local @ true_from_grid, placed.anchor)
+
+
+def local_from_cam(heading_rad: Floats, pitch_rad: Floats, roll_rad: Floats) -> Floats:
+    """Return rotations (N, 3, 3) from camera axes into east, north, up.
+
+    The heading counts clockwise from north as seen from above, the pitch up, and the roll clockwise as seen from
+    behind the camera, so that its right side is down. The heading is applied last.
+    """
+    turn = Rotation.from_euler("ZXY", np.stack([-heading_rad, pitch_rad, roll_rad], axis=1))
+    matrix: Floats = turn.as_matrix() @ LOOKING_NORTH
+    return matrix
+
+
+def rotations_of_quaternions(quaternion_wxyz: Floats, names: Sequence[str], source: str) -> Floats:
+    """Return rotations (N, 3, 3) of quaternions (N, 4) in the order w, x, y, z, which must be of unit length."""
+    length = np.linalg.norm(quaternion_wxyz, axis=1)
+    wrong = np.flatnonzero(~(np.abs(length - 1.0) < _ROTATION_TOLERANCE))
+    if len(wrong):
+        row = wrong[0]
+        raise InputError(
+            f"{source}: image {names[row]!r}: expected a quaternion of length 1, found "
+            f"{quaternion_wxyz[row].tolist()} ({len(wrong)} images)",
+            hint="a quaternion is w, x, y, z of a rotation",
+        )
+    matrix: Floats = Rotation.from_quat(quaternion_wxyz, scalar_first=True).as_matrix()
+    return matrix
+
+
+def make_images(
+    *,
+    names: Sequence[str],
+    camera_id: Ints,
+    world_from_cam: Floats,
+    center_in_world_m: Floats,
+    passes: Sequence[str],
+    source: str,
+    image_id: Ints | None = None,
+    timestamp_s: Floats | None = None,
+    rigs: Sequence[str] | None = None,
+    position_sigma_m: Floats | None = None,
+    rotation_sigma_rad: Floats | None = None,
+) -> Images:
+    """Return images of poses in any order.
+
+    Parameters
+    ----------
+    names, camera_id, passes
+        One an image (N); names are distinct and stay in the folder of the pictures.
+    world_from_cam, center_in_world_m
+        Rotations (N, 3, 3) from camera axes (x right, y down, z forward) into the world, and camera centres (N, 3).
+    source
+        What errors name as the place of the data.
+    image_id
+        Distinct ids (N). Without them images are numbered from 0 in the order of their names.
+    timestamp_s
+        Seconds (N), NaN where not known.
+    rigs
+        Which images were taken at one time by one rig (N): equal texts.
+    position_sigma_m, rotation_sigma_rad
+        Standard deviations of each axis (N), NaN where not known.
+
+    Raises
+    ------
+    InputError
+        There are no images, a name is there twice or leads out of its folder, or a pose is no rigid motion.
+    """
+    if not len(names):
+        raise InputError(f"{source}: there is no image with a pose", hint="is this the whole of it?")
+    check_names(list(names), source)
+    repeated = [name for name, count in Counter(names).items() if count > 1]
+    if repeated:
+        raise InputError(
+            f"{source}: {len(repeated)} image names occur more than once, the first is {min(repeated)!r}",
+            hint="detections are matched by file name: give every image a name of its own",
+        )
+    _check_poses(names, world_from_cam, center_in_world_m, source)
+    if image_id is None:
+        order = np.array(sorted(range(len(names)), key=lambda row: names[row]), dtype=np.int64)
+        ids: Ints = np.arange(len(names), dtype=np.int64)
+    else:
+        order = np.argsort(image_id, kind="stable")
+        ids = image_id[order]
+    cam_from_world = Rotation.from_matrix(world_from_cam[order]).inv()
+    optional = {
+        name: None if values is None or np.isnan(values).all() else values[order]
+        for name, values in (
+            ("timestamp_s", timestamp_s),
+            ("position_sigma_m", position_sigma_m),
+            ("rotation_sigma_rad", rotation_sigma_rad),
+        )
+    }
+    return Images(
+        image_id=ids,
+        name=pa.array([names[row] for row in order], pa.string()),
+        camera_id=np.asarray(camera_id, dtype=np.int64)[order],
+        cam_from_world_quat=cam_from_world.as_quat(canonical=True, scalar_first=True),
+        cam_from_world_m=-cam_from_world.apply(center_in_world_m[order]),
+        pass_id=Categories.from_texts([passes[row] for row in order]),
+        rig_id=None if rigs is None else Categories.from_texts([rigs[row] for row in order]).codes.astype(np.int64),
+        **optional,
+    )
+
+
+def rigs_by_time(cameras: Sequence[str], timestamp_s: Floats, drives: Sequence[str], longest_s: float = 0.06) -> list[str]:
+    """Return which images (N) were taken together: equal texts for images of different cameras of one drive.
+
+    In driving order an image joins the ones before it unless its camera is among them, or the first of them is more
+    than `longest_s` older. Cameras of a car are not fired at the same instant: Argoverse's are within 50 ms.
+    """
+    rigs = [""] * len(cameras)
+    together: set[str] = set()
+    drive, begin_s, number = None, -np.inf, -1
+    for row in sorted(range(len(cameras)), key=lambda row: (drives[row], timestamp_s[row], cameras[row])):
+        if drives[row] != drive or cameras[row] in together or timestamp_s[row] - begin_s > longest_s:
+            drive, begin_s, together, number = drives[row], float(timestamp_s[row]), set(), number + 1
+        together.add(cameras[row])
+        rigs[row] = f"{number:012d}"
+    return rigs
+
+
+def interpolate_poses(
+    time: Ints, known_time: Ints, rotation: Floats, center_m: Floats, longest: int
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Return rotations (N, 3, 3) and centres (N, 3) at times (N) between known poses, and which there are (N).
+
+    Poses turn about one axis and move straight between neighbours. There is none outside the known times, nor in gaps
+    longer than `longest`, in which it may have been anywhere. Known times (M) are in any order, and distinct.
+    """
+    order = np.argsort(known_time, kind="stable")
+    known, rotations, centers = known_time[order], Rotation.from_matrix(rotation[order]), center_m[order]
+    after = np.clip(np.searchsorted(known, time), 1 if len(known) > 1 else 0, len(known) - 1)
+    before = np.maximum(after - 1, 0)
+    gap = known[after] - known[before]
+    share = np.divide(time - known[before], gap, out=np.zeros(len(time)), where=gap > 0)
+    inside = (time >= known[0]) & (time <= known[-1])
+    usable = inside & ((gap <= longest) | (share == 0.0) | (share == 1.0))
+    share = np.clip(share, 0.0, 1.0)
+    step = rotations[before].inv() * rotations[after]
+    turned = rotations[before] * Rotation.from_rotvec(step.as_rotvec() * share[:, None])
+    moved: Floats = centers[before] + (centers[after] - centers[before]) * share[:, None]
+    return turned.as_matrix(), moved, usable
+
+
+def _check_poses(names: Sequence[str], rotation: Floats, center_m: Floats, source: str) -> None:
+    finite = np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(center_m).all(axis=1)
+    error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    right = np.linalg.det(np.where(finite[:, None, None], rotation, 0.0)) > 0.0
+    near = np.abs(center_m).max(axis=1) < _LARGEST_M
+    for fine, expected in (
+        (finite, "finite numbers"),
+        (near, "metres"),
+        ((error <= _ROTATION_TOLERANCE) & right, "a rotation without scale and mirroring"),
+    ):
+        wrong = np.flatnonzero(~fine)
+        if len(wrong):
+            row = wrong[0]
+            found = f"{np.round(rotation[row], 6).tolist()} at {center_m[row].tolist()}"
+            raise InputError(
+                f"{source}: image {names[row]!r}: pose: expected {expected}, found {found} ({len(wrong)} images)",
+                hint="repair these poses, or remove the images",
+            )

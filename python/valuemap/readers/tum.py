@@ -1,0 +1,162 @@
+"""TUM: a trajectory with one line a pose, as SLAM systems and evo write it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from valuemap.dataset import Dataset
+from valuemap.errors import InputError, SettingError
+from valuemap.progress import Progress, silent
+from valuemap.readers.assemble import ONE_PASS, assemble
+from valuemap.readers.cameras_of import make_cameras, parse_camera
+from valuemap.readers.detections import DetectionFile, read_detections
+from valuemap.readers.files import read_text
+from valuemap.readers.poses import AXES, interpolate_poses, make_images, rotations_of_quaternions
+from valuemap.tables import Floats, Ints
+
+_EXPECTED = "a text file with rows: timestamp tx ty tz qx qy qz qw, camera to world"
+_EXPECTED_LIST = "a text file with rows: timestamp filename"
+_NANO = 1_000_000_000
+
+
+def read_tum(
+    trajectory: Path,
+    *,
+    camera: str,
+    image_list: Path | None = None,
+    detections: DetectionFile | Path | None = None,
+    axes: str = "right-down-forward",
+    pixel_center: float = 0.5,
+    longest_gap_s: float = 0.2,
+    up: tuple[float, float, float] | None = None,
+    anchor: tuple[float, float, float] | None = None,
+    max_rejected: float = 0.01,
+    progress: Progress = silent,
+) -> Dataset:
+    """Read a trajectory of `timestamp tx ty tz qx qy qz qw` (x first!), camera to world, in seconds and metres.
+
+    Parameters
+    ----------
+    trajectory
+        Text file; lines that begin with `#` do not count.
+    camera
+        As in `parse_camera`.
+    image_list
+        Text file of `timestamp filename` (`rgb.txt`). The pose of an image is that between the two poses next in
+        time; images outside the trajectory, or in a gap longer than `longest_gap_s`, are left out. Without it there is
+        an image `TIMESTAMP.png`, as written in the file, for every pose.
+    detections
+        As in `read_detections`.
+    axes
+        The axes of what the trajectory is of, one of `AXES`.
+    pixel_center
+        Coordinates of the centre of the top-left pixel in the parameters of the camera.
+    up, anchor
+        As in `assemble`.
+
+    Raises
+    ------
+    InputError
+        A file is missing or no such table, two poses have one time, or no image has a pose.
+    SettingError
+        An option is impossible.
+    """
+    if axes not in AXES:
+        raise SettingError(f"axes {axes}: there are none such", hint=f"one of {', '.join(AXES)}")
+    progress("reading the trajectory", 0, 2)
+    texts, rows = _rows(trajectory)
+    time = _nanoseconds(texts, trajectory)
+    if len(set(time.tolist())) < len(time):
+        raise InputError(f"{trajectory}: two poses have the same timestamp", hint="keep one of them")
+    rotation = rotations_of_quaternions(rows[:, [6, 3, 4, 5]], texts, str(trajectory)) @ AXES[axes].T
+    center = rows[:, :3]
+    names = [f"{text}.png" for text in texts]
+    if image_list is not None:
+        image_time, names = _read_list(image_list)
+        rotation, center, usable = interpolate_poses(
+            image_time, time, rotation, center, int(longest_gap_s * _NANO)
+        )
+        if not usable.any():
+            raise InputError(
+                f"{image_list}: no image is within the time of the trajectory, {texts[0]} to {texts[-1]}",
+                hint="are both in seconds, of one clock?",
+            )
+        rotation, center, time = rotation[usable], center[usable], image_time[usable]
+        names = [name for name, use in zip(names, usable, strict=True) if use]
+    cameras, camera_id = make_cameras([parse_camera(camera, pixel_center)] * len(names), str(trajectory))
+    images = make_images(
+        names=names,
+        camera_id=camera_id,
+        world_from_cam=rotation,
+        center_in_world_m=center,
+        passes=[ONE_PASS] * len(names),
+        source=str(trajectory),
+        timestamp_s=time / _NANO,
+    )
+    progress("reading the detections", 1, 2)
+    dataset = assemble(
+        name=trajectory.stem,
+        cameras=cameras,
+        images=images,
+        detections=read_detections(detections, images, cameras),
+        up=up,
+        anchor=anchor,
+        source=str(trajectory),
+        max_rejected=max_rejected,
+    )
+    progress("reading the detections", 2, 2)
+    return dataset
+
+
+def _rows(path: Path) -> tuple[list[str], Floats]:
+    texts, rows = [], []
+    for number, line in enumerate(read_text(path, _EXPECTED).splitlines(), start=1):
+        fields = line.replace(",", " ").split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        try:
+            values = [float(field) for field in fields[1:]]
+        except ValueError:
+            values = []
+        if len(values) != 7 or not np.isfinite(values).all():
+            raise InputError(f"{path} line {number}: expected 8 finite numbers, found {line[:80]!r}", hint=f"expected {_EXPECTED}")
+        texts.append(fields[0])
+        rows.append(values)
+    if not rows:
+        raise InputError(f"{path}: there are no poses in it", hint=f"expected {_EXPECTED}")
+    return texts, np.array(rows)
+
+
+def _read_list(path: Path) -> tuple[Ints, list[str]]:
+    texts, names = [], []
+    for number, line in enumerate(read_text(path, _EXPECTED_LIST).splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        fields = line.split(maxsplit=1)
+        if len(fields) != 2:
+            raise InputError(f"{path} line {number}: found {line[:80]!r}", hint=f"expected {_EXPECTED_LIST}")
+        texts.append(fields[0])
+        names.append(fields[1].strip())
+    if not names:
+        raise InputError(f"{path}: there are no images in it", hint=f"expected {_EXPECTED_LIST}")
+    return _nanoseconds(texts, path), names
+
+
+def _nanoseconds(texts: list[str], path: Path) -> Ints:
+    """Return seconds in texts as whole nanoseconds (N): in float64 two images at 10 kHz would be one today."""
+    found = []
+    for text in texts:
+        whole, _, part = text.partition(".")
+        if whole.isdecimal() and len(whole) <= 10 and (part.isdecimal() or not part):
+            found.append(int(whole) * _NANO + int(part[:9].ljust(9, "0")))
+        else:
+            try:
+                value = float(text)
+                found.append(round(value * _NANO))
+            except (ValueError, OverflowError) as error:
+                raise InputError(f"{path}: expected a timestamp in seconds, found {text[:40]!r}", hint="is it TUM?") from error
+            if not -(2**62) < found[-1] < 2**62:
+                raise InputError(f"{path}: expected a timestamp in seconds, found {text[:40]!r}", hint="are these nanoseconds?")
+    return np.array(found, dtype=np.int64)
