@@ -93,7 +93,7 @@ def test_ranges_may_be_missing_but_not_nothing_or_endless(column: Any) -> None:
     range_m = np.full(300, 30.0)
     range_m[:3] = [np.nan, 0.0, np.inf]
     dataset = assembled(boxes(300, **{column: range_m}))
-    reason = "its range or the sigma of it is not above 0"
+    reason = "its range or a sigma is not above 0"
     assert reasons(dataset) == [("boxes.json: annotations[1]", reason), ("boxes.json: annotations[2]", reason)]
 
 

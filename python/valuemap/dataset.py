@@ -289,7 +289,7 @@ def _check_detections(dataset: Dataset, source: str) -> None:
     where = (source, "detections", "detection_id")
     for i, name in enumerate(("width", "height")):
         _refuse(detections.size_px[:, i] < 0.0, detections.size_px[:, i], ids, *where, name, "expected at least 0 px")
-    for name in ("range_m", "range_sigma_m"):
+    for name in ("range_m", "range_sigma_m", "vertical_sigma_px"):
         _check_positive(getattr(detections, name), ids, *where, name)
     camera_row = rows_of(images.camera_id, cameras.camera_id)[rows_of(detections.image_id, images.image_id)]
     for i, (axis, extent) in enumerate((("x", cameras.width_px), ("y", cameras.height_px))):

@@ -61,7 +61,8 @@ def lon_lat_height_from_crs(position: Floats, crs: str) -> Floats:
     if not np.all(np.isfinite(found)):
         row = int(np.flatnonzero(~np.isfinite(found).all(axis=1))[0])
         raise InputError(
-            f"crs {crs}: {position[row].tolist()} is no place in it", hint="are x and y easting and northing in its unit?"
+            f"crs {crs}: {position[row].tolist()} is no place in it",
+            hint="are x and y easting and northing in its unit?",
         )
     return found
 

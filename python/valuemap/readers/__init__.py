@@ -5,11 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from valuemap.dataset import Dataset
+from valuemap.readers.argoverse2 import read_argoverse2
+from valuemap.readers.bearings import read_bearings
 from valuemap.readers.colmap import read_colmap
+from valuemap.readers.csv_poses import read_csv_poses
+from valuemap.readers.kapture import read_kapture
 from valuemap.readers.kitti import read_kitti
+from valuemap.readers.nuscenes import read_nuscenes
+from valuemap.readers.opensfm import read_opensfm
+from valuemap.readers.tum import read_tum
 
 READERS: dict[str, Callable[..., Dataset]] = {
+    "argoverse2": read_argoverse2,
+    "bearings": read_bearings,
     "colmap": read_colmap,
+    "csv": read_csv_poses,
+    "kapture": read_kapture,
     "kitti": read_kitti,
+    "nuscenes": read_nuscenes,
+    "opensfm": read_opensfm,
+    "tum": read_tum,
 }
 """What `valuemap import NAME` calls."""

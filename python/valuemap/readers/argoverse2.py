@@ -13,7 +13,7 @@ from valuemap.arrow import numbers_from_arrow
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import assemble
+from valuemap.readers.assemble import MAX_REJECTED, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_folder, file_in
@@ -62,7 +62,7 @@ def read_argoverse2(
     city: str | None = None,
     up: tuple[float, float, float] | None = None,
     anchor: tuple[float, float, float] | None = None,
-    max_rejected: float = 0.01,
+    max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
 ) -> Dataset:
     """Read the cameras of one log, or of all logs of one city in a folder; every image has the pose of its own instant.
@@ -105,13 +105,17 @@ def read_argoverse2(
         read.append(_read_log(folder, "" if single else f"{folder.name}/"))
     found = sorted({log.city or city or "" for log in read})
     if len(found) > 1 and city is None:
-        raise SettingError(f"{logs}: has logs of {', '.join(found)}, whose frames are not one", hint="choose with --city")
+        raise SettingError(
+            f"{logs}: has logs of {', '.join(found)}, whose frames are not one", hint="choose with --city"
+        )
     city = city or found[0] or None
     kept = [(folder, log) for folder, log in zip(folders, read, strict=True) if log.city in (None, city)]
     images = [log for _, log in kept]
     names = [name for log in images for name in log.names]
     if not names:
-        raise InputError(f"{logs}: there are no images in sensors/cameras", hint="the names of the pictures are the times")
+        raise InputError(
+            f"{logs}: there are no images in sensors/cameras", hint="the names of the pictures are the times"
+        )
     passes = [folder.name for folder, log in kept for _ in log.names]
     time_ns = np.concatenate([log.time_ns for log in images])
     rotation = np.concatenate([log.world_from_cam for log in images])
@@ -128,7 +132,9 @@ def read_argoverse2(
         passes=passes,
         source=str(logs),
         timestamp_s=time_ns * _NANO,
-        rigs=rigs_by_time([sensor for log in images for sensor in log.sensors], (time_ns - time_ns.min()) * _NANO, passes),
+        rigs=rigs_by_time(
+            [sensor for log in images for sensor in log.sensors], (time_ns - time_ns.min()) * _NANO, passes
+        ),
     )
     dataset = assemble(
         name=logs.resolve().name,
@@ -211,7 +217,8 @@ def _feather(folder: Path, name: str) -> pa.Table:
 def _column(table: pa.Table, name: str, where: Path) -> pa.ChunkedArray:
     if table.column_names.count(name) != 1:
         raise InputError(
-            f"{where}: expected a column {name!r}, found {', '.join(table.column_names)[:200]}", hint=f"expected {_EXPECTED}"
+            f"{where}: expected a column {name!r}, found {', '.join(table.column_names)[:200]}",
+            hint=f"expected {_EXPECTED}",
         )
     return table.column(name)
 
@@ -222,7 +229,9 @@ def _numbers(table: pa.Table, name: str, where: Path) -> Floats:
     try:
         values: Floats = numbers_from_arrow(column.cast(kind))
     except pa.ArrowException as error:
-        raise InputError(f"{where}: {name}: expected numbers, found {column.type}", hint=f"expected {_EXPECTED}") from error
+        raise InputError(
+            f"{where}: {name}: expected numbers, found {column.type}", hint=f"expected {_EXPECTED}"
+        ) from error
     if not np.isfinite(values).all():
         raise InputError(f"{where}: {name}: expected finite numbers", hint="repair the table")
     return values
@@ -231,9 +240,8 @@ def _numbers(table: pa.Table, name: str, where: Path) -> Floats:
 def _poses(table: pa.Table, where: Path) -> tuple[Floats, Floats]:
     """Return rotations (N, 3, 3) and translations (N, 3)."""
     quaternion = np.stack([_numbers(table, name, where) for name in ("qw", "qx", "qy", "qz")], axis=1)
-    rows = [f"row {row}" for row in range(len(quaternion))]
     translation = np.stack([_numbers(table, name, where) for name in ("tx_m", "ty_m", "tz_m")], axis=1)
-    return rotations_of_quaternions(quaternion, rows, str(where)), translation
+    return rotations_of_quaternions(quaternion), translation
 
 
 def _cameras(table: pa.Table, folder: Path) -> dict[str, Camera]:

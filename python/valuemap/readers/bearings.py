@@ -11,13 +11,15 @@ import numpy as np
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import ONE_PASS, FoundBoxes, assemble
-from valuemap.readers.cameras_of import parse_camera, make_cameras
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, assemble
+from valuemap.readers.cameras_of import make_cameras, parse_camera
 from valuemap.readers.csv_file import CsvFile
 from valuemap.readers.poses import local_from_cam, make_images, place_on_earth
 from valuemap.tables import Floats, Ints
 
 _EXPECTED = "a CSV file with columns lat, lon, bearing (degrees clockwise from north) and maybe depth (metres)"
+_TEXTS = ("image", "class", "pass")
+_NUMBERS = ("lat", "lon", "height", "bearing", "depth", "score")
 _WIDTH_PX, _HEIGHT_PX = 7200, 3600
 """Of the panorama that a place is taken for: 20 px a degree."""
 VERTICAL_SIGMA_PX = _HEIGHT_PX / math.sqrt(2.0 * math.pi)
@@ -32,10 +34,10 @@ def read_bearings(
     depth_sigma: float = 0.3,
     camera_height_m: float = 0.0,
     anchor: tuple[float, float, float] | None = None,
-    max_rejected: float = 0.01,
+    max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
 ) -> Dataset:
-    """Read a table with one row a detection: `lat, lon` of the camera, `bearing` of the object, maybe `depth` in metres.
+    """Read a table with one row a detection: `lat, lon` of the camera, `bearing` and maybe `depth` of the object.
 
     Every distinct place is an image, a panorama that looks north, or every distinct text in the column `image` where
     there is one. Detections are on the horizon with a `vertical_sigma_px` that says that their elevation was not
@@ -66,9 +68,10 @@ def read_bearings(
     if not 0.0 < depth_sigma < math.inf:
         raise SettingError(f"depth-sigma: expected above 0, found {depth_sigma:g}", hint="0.3 is 30 % of the depth")
     progress("reading the bearings", 0, 1)
-    table = CsvFile(bearings, _EXPECTED, columns)
-    lat, lon, bearing_deg = (table.numbers(name) for name in ("lat", "lon", "bearing"))
-    height = table.numbers("height") if table.has("height") else np.full(len(table), camera_height_m)
+    table = CsvFile(bearings, _EXPECTED, texts=_TEXTS, numbers=_NUMBERS, columns=columns)
+    lat, lon = (table.finite_numbers(name) for name in ("lat", "lon"))
+    bearing_deg = table.numbers("bearing")
+    height = table.finite_numbers("height") if table.has("height") else np.full(len(table), camera_height_m)
     place = np.stack([lon, lat, height], axis=1)
     passes = table.filled_texts("pass") if table.has("pass") else [ONE_PASS] * len(table)
     names, first, image_of = _images(table, place, passes)
@@ -83,7 +86,7 @@ def read_bearings(
         passes=[passes[row] for row in first],
         source=str(bearings),
     )
-    depth_m = table.numbers("depth", may_miss=True) if table.has("depth") else None
+    depth_m = table.numbers("depth") if table.has("depth") else None
     x_px = ((bearing_deg / 360.0 + 0.5) % 1.0) * _WIDTH_PX
     dataset = assemble(
         name=bearings.stem,
@@ -91,9 +94,10 @@ def read_bearings(
         images=images,
         detections=FoundBoxes(
             image_row=image_of,
-            class_names=table.filled_texts("class") if table.has("class") else [class_name] * len(table),
+            class_names=table.texts("class") if table.has("class") else [class_name] * len(table),
             center_px=np.stack([x_px, np.full(len(table), _HEIGHT_PX / 2.0)], axis=1),
-            size_px=None,
+            size_px=np.zeros((len(table), 2)),
+            are_points=True,
             score=table.numbers("score") if table.has("score") else np.ones(len(table)),
             where=table.line,
             range_m=depth_m,

@@ -82,5 +82,7 @@ def parse_camera(text: str, pixel_center: float = 0.5) -> Camera:
     names = [part.strip() for part in pycolmap.Camera(model=name, width=width, height=height).params_info.split(",")]
     if len(params) != len(names) or not np.isfinite(params).all():
         raise SettingError(f"camera {text!r}: {name} has the parameters {', '.join(names)}", hint=hint)
-    shifted = [value + 0.5 - pixel_center if key in ("cx", "cy") else value for key, value in zip(names, params, strict=True)]
+    shifted = [
+        value + 0.5 - pixel_center if key in ("cx", "cy") else value for key, value in zip(names, params, strict=True)
+    ]
     return Camera(name, width, height, tuple(shifted))

@@ -1,4 +1,4 @@
-"""COLMAP models (text and binary, with or without rigs) with detections in COCO's format."""
+"""COLMAP models, text and binary, with or without rigs."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import pycolmap
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, assemble
-from valuemap.readers.coco import read_coco
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, assemble
 from valuemap.readers.colmap_files import find_model
 from valuemap.readers.csv_file import read_csv
+from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.names import match_images
 from valuemap.tables import Cameras, Categories, Images
 
@@ -24,7 +24,7 @@ from valuemap.tables import Cameras, Categories, Images
 def read_colmap(
     model_dir: Path,
     *,
-    detections: Path | None = None,
+    detections: DetectionFile | Path | None = None,
     pass_from: str = "folder",
     up: tuple[float, float, float] | None = None,
     anchor: tuple[float, float, float] | None = None,
@@ -41,7 +41,7 @@ def read_colmap(
     model_dir
         Folder with cameras, images and, where both exist, rigs and frames, as .bin (preferred) or .txt.
     detections
-        COCO annotations or results, see `read_coco`; None where they are still to be found in the pictures.
+        As in `read_detections`; None where they are still to be found in the pictures.
     pass_from
         "folder" (the folder part of the image name is its pass), "none" (all images are one pass), or the
         path of a CSV file with columns image and pass.
@@ -58,12 +58,11 @@ def read_colmap(
     progress("reading the COLMAP model", 0, 2)
     cameras, images = _read_model(model_dir, pass_from)
     progress("reading the detections", 1, 2)
-    found = FoundBoxes.none() if detections is None else read_coco(detections, images, cameras)
     dataset = assemble(
         name=model_dir.resolve().name,
         cameras=cameras,
         images=images,
-        detections=found,
+        detections=read_detections(detections, images, cameras),
         up=up,
         anchor=anchor,
         source=str(model_dir),

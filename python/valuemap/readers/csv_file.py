@@ -1,107 +1,155 @@
-"""Reading a table of texts and numbers separated by commas, semicolons or tabs, with names in its first line."""
+"""Tables of the user's own in CSV files, with columns that are found by their names."""
 
 from __future__ import annotations
 
-import csv
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.csv as pa_csv
 
 from valuemap.arrow import numbers_from_arrow
+from valuemap.csv_table import read_csv_arrow
 from valuemap.errors import InputError, SettingError
 from valuemap.readers.files import check_file
-from valuemap.tables import Floats, Ints
+from valuemap.tables import Bools, Floats
 
 _NAMES = {pa.int64(): "whole numbers", pa.float64(): "numbers", pa.string(): "texts"}
-_SEPARATORS = (",", ";", "\t")
-_LARGEST_HEADER = 1_000_000
 
 
-class CsvFile:
-    """The columns of a file by name, as texts until somebody asks for numbers.
+def read_csv(path: Path, required: Mapping[str, pa.DataType], optional: Mapping[str, pa.DataType]) -> pa.Table:
+    """Return the named columns of a CSV file with a header line, in the types given.
 
-    Names are told apart without regard to upper case; `columns` says under which name a column stands in the file,
-    where it is another one.
+    Optional columns that are absent are left out, as are columns that nobody asked for. What should be a float64 and
+    is no number is NaN, to be vetted; an empty field is an empty text.
 
     Raises
     ------
     InputError
-        The file is missing, empty, not UTF-8 or not a table.
+        The file is missing, empty or no CSV, lacks a column, or a value is not of its type.
+    """
+    if not path.exists():
+        raise InputError(f"{path}: no such file", hint="check the path")
+    expected = ", ".join(f"{name} ({_NAMES[kind]})" for name, kind in required.items())
+    hint = f"expected a CSV file with columns {expected}"
+    table = read_csv_arrow(path, {**required, **optional}, has_missing=False, hint=hint, bad_numbers_are_nan=True)
+    columns = [name for name in (*required, *optional) if name in required or name in table.column_names]
+    for name in columns:
+        if table.column_names.count(name) != 1:
+            found = ", ".join(table.column_names)
+            raise InputError(
+                f"{path}: expected one column {name!r} in the first line, found {found}",
+                hint=hint,
+            )
+    if table.num_rows == 0:
+        raise InputError(f"{path}: no rows after the first line", hint="check what wrote the file")
+    return table.select(columns)
+
+
+class CsvFile:
+    """The columns of a CSV file, some of which may be missing or have other names.
+
+    Parameters
+    ----------
+    path
+        The file.
+    expected
+        What it should be, in words, for errors.
+    texts, numbers
+        Names of columns, lower case, that are texts and numbers; others are not looked at.
+    columns
+        Under which name a column stands in the file, where it is another one.
+
+    Raises
+    ------
+    InputError
+        The file is missing, empty or no CSV, or has a column twice.
     SettingError
-        `columns` names a column that the file does not have.
+        `columns` names a column that the file does not have, or one that nobody asks for.
     """
 
-    def __init__(self, path: Path, expected: str, columns: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        expected: str,
+        *,
+        texts: Sequence[str],
+        numbers: Sequence[str],
+        columns: Mapping[str, str] | None = None,
+    ) -> None:
         self.path = path
         self._hint = f"expected {expected}"
-        header, separator = _header(path, expected)
-        self._names = [name.strip() for name in header]
-        self._index: dict[str, int] = {}
-        for index, name in enumerate(self._names):
-            if self._index.setdefault(name.lower(), index) != index:
-                raise InputError(f"{path}: column {name!r} is there twice", hint="keep one of them")
-        for ours, theirs in (columns or {}).items():
-            if theirs.lower() not in self._index:
-                found = ", ".join(self._names)
-                raise SettingError(f"column {ours}={theirs}: {path} has no column {theirs!r}", hint=f"it has {found}")
-        # What was renamed is not found under the name that it had.
-        renamed = {theirs.lower() for theirs in (columns or {}).values()}
-        kept = {name: index for name, index in self._index.items() if name not in renamed}
-        self._index = kept | {ours.lower(): self._index[theirs.lower()] for ours, theirs in (columns or {}).items()}
-        self._table = _read(path, separator, len(header), self._hint)
+        columns = columns or {}
+        unknown = [name for name in columns if name not in (*texts, *numbers)]
+        if unknown:
+            raise SettingError(
+                f"column {unknown[0]}={columns[unknown[0]]}: there is no column {unknown[0]!r}",
+                hint=f"the names before = are among {', '.join((*texts, *numbers))}",
+            )
+        check_file(path, expected)
+        kinds = dict.fromkeys(texts, pa.string()) | dict.fromkeys(numbers, pa.float64())
+        # A column that has another's name does not count as that.
+        renamed = {columns.get(name, name): kind for name, kind in kinds.items()}
+        self._table = read_csv_arrow(path, renamed, has_missing=False, hint=self._hint, bad_numbers_are_nan=True)
         if self._table.num_rows == 0:
             raise InputError(f"{path}: no rows after the first line", hint="check what wrote the file")
+        self._name = {
+            name: columns.get(name, name) for name in kinds if name in columns or name not in columns.values()
+        }
+        for ours, theirs in columns.items():
+            if theirs not in self._table.column_names:
+                found = ", ".join(self._table.column_names)[:300]
+                raise SettingError(f"column {ours}={theirs}: {path} has no column {theirs!r}", hint=f"it has {found}")
+        for theirs in self._name.values():
+            if self._table.column_names.count(theirs) > 1:
+                raise InputError(f"{path}: column {theirs!r} is there twice", hint="keep one of them")
 
     def __len__(self) -> int:
         return int(self._table.num_rows)
 
     def has(self, *names: str) -> bool:
         """Say whether all of these columns are there."""
-        return all(name in self._index for name in names)
+        return all(self._name.get(name) in self._table.column_names for name in names)
 
     def texts(self, name: str) -> list[str]:
-        """Return a column as texts (N); an empty field is an empty text."""
-        texts: list[str] = self._column(name).to_pylist()
-        return texts
+        """Return a column as texts (N) without spaces around them; an empty field is an empty text."""
+        return [text.strip() for text in self._column(name).to_pylist()]
 
     def filled_texts(self, name: str) -> list[str]:
         """Return a column as texts (N) none of which is empty."""
-        texts = [text.strip() for text in self.texts(name)]
+        texts = self.texts(name)
         if "" in texts:
-            raise self._wrong(texts.index(""), name, "a text", "")
+            row = texts.index("")
+            raise InputError(f"{self.line(row)}: {name}: expected a text, found none", hint=self._hint)
         return texts
 
-    def numbers(self, name: str, *, may_miss: bool = False) -> Floats:
-        """Return a column as finite numbers (N); with `may_miss` an empty field is NaN."""
-        column = pc.utf8_trim_whitespace(self._column(name))
-        if may_miss:
-            column = pc.if_else(pc.equal(column, ""), None, column)
-        try:
-            values = numbers_from_arrow(pc.cast(column, pa.float64())).copy()
-        except pa.ArrowInvalid:
-            row = next(row for row, text in enumerate(column.to_pylist()) if text is not None and not _is_number(text))
-            raise self._wrong(row, name, "a number", column[row].as_py()) from None
-        is_bad = ~np.isfinite(values)
-        if may_miss:
-            is_bad &= np.array([text is not None for text in column.to_pylist()])
-        if is_bad.any():
-            row = int(np.flatnonzero(is_bad)[0])
-            raise self._wrong(row, name, "a finite number", str(values[row]))
+    def numbers(self, name: str) -> Floats:
+        """Return a column as numbers (N), NaN where there is none or another text."""
+        values: Floats = numbers_from_arrow(self._column(name)).astype(np.float64)
         return values
 
-    def whole_numbers(self, name: str) -> Ints:
+    def finite_numbers(self, name: str) -> Floats:
+        """Return a column as numbers (N) all of which are finite."""
+        values = self.numbers(name)
+        self.refuse(~np.isfinite(values), name, "a finite number")
+        return values
+
+    def whole_numbers(self, name: str) -> list[int]:
         """Return a column as whole numbers (N)."""
-        column = pc.utf8_trim_whitespace(self._column(name))
-        try:
-            return np.array(numbers_from_arrow(pc.cast(column, pa.int64())), dtype=np.int64)
-        except pa.ArrowInvalid:
-            row = next(row for row, text in enumerate(column.to_pylist()) if not _is_whole(text))
-            raise self._wrong(row, name, "a whole number", column[row].as_py()) from None
+        values = self.numbers(name)
+        self.refuse(~(np.abs(values) < 2**53) | (values % 1.0 != 0.0), name, "a whole number")
+        return [int(value) for value in values.tolist()]
+
+    def refuse(self, wrong: Bools, name: str, expected: str) -> None:
+        """Raise one error for all wrong rows (N), showing the first."""
+        rows = np.flatnonzero(wrong)
+        if len(rows):
+            found = reprlib.repr(self._column(name)[int(rows[0])].as_py())
+            raise InputError(
+                f"{self.line(int(rows[0]))}: {name}: expected {expected}, found {found} ({len(rows)} rows)",
+                hint=self._hint,
+            )
 
     def line(self, row: int) -> str:
         """Return where a row stands, for errors."""
@@ -110,98 +158,22 @@ class CsvFile:
     def missing(self, expected: str) -> InputError:
         """Return the error that says which columns are expected."""
         return InputError(
-            f"{self.path}: expected {expected} in the first line, found {', '.join(self._names)[:300]}",
-            hint=self._hint + "; --column NAME=THEIRS says what a column is called in the file",
+            f"{self.path}: expected {expected} in the first line, found {', '.join(self._table.column_names)[:300]}",
+            hint=f"{self._hint}; an option says what a column is called in the file, NAME=THEIRS",
         )
 
     def _column(self, name: str) -> pa.ChunkedArray:
-        if name not in self._index:
-            raise self.missing(f"one column {name!r}")
-        return self._table.column(self._index[name])
-
-    def _wrong(self, row: int, name: str, expected: str, found: str) -> InputError:
-        return InputError(
-            f"{self.line(row)}: {name}: expected {expected}, found {reprlib.repr(found)}", hint=self._hint
-        )
+        if not self.has(name):
+            raise self.missing(f"a column {name!r}")
+        return self._table.column(self._name[name])
 
 
-def read_csv(path: Path, required: Mapping[str, pa.DataType], optional: Mapping[str, pa.DataType]) -> pa.Table:
-    """Return the named columns of a file, in the types given, which are those of texts, numbers and whole numbers.
-
-    Optional columns that are absent are left out, as are columns that nobody asked for. There are no missing
-    values: an empty field is an empty text, and no number.
-
-    Raises
-    ------
-    InputError
-        The file is missing, empty or no CSV, lacks a column, or a value is not of its type.
-    """
-    expected = ", ".join(f"{name} ({_NAMES[kind]})" for name, kind in required.items())
-    file = CsvFile(path, f"a CSV file with columns {expected}")
-    found = {}
-    for name, kind in {**required, **optional}.items():
-        if name in required or file.has(name):
-            take = {pa.int64(): file.whole_numbers, pa.float64(): file.numbers, pa.string(): file.texts}[kind]
-            found[name] = pa.array(take(name), kind)
-    return pa.table(found)
-
-
-def parse_columns(assignments: list[str]) -> dict[str, str]:
+def parse_columns(assignments: Sequence[str]) -> dict[str, str]:
     """Return which column stands under which name, of texts such as `heading_deg=yaw`."""
     found = {}
     for assignment in assignments:
-        ours, is_pair, theirs = assignment.partition("=")
-        if not (is_pair and ours.strip() and theirs.strip()):
+        ours, is_pair, theirs = (part.strip() for part in assignment.partition("="))
+        if not (is_pair and ours and theirs):
             raise SettingError(f"column {assignment!r}: expected NAME=THEIRS", hint="for example lat=latitude")
-        found[ours.strip()] = theirs.strip()
+        found[ours] = theirs
     return found
-
-
-def _header(path: Path, expected: str) -> tuple[list[str], str]:
-    check_file(path, expected)
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            first = file.readline(_LARGEST_HEADER)
-    except UnicodeDecodeError as error:
-        hint = "unpack it first" if path.read_bytes()[:2] == b"\x1f\x8b" else f"expected {expected}, in UTF-8"
-        raise InputError(f"{path}: cannot be read as CSV: its first line is not UTF-8", hint=hint) from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}", hint=f"expected {expected}") from error
-    if not first.strip():
-        raise InputError(f"{path}: cannot be read as CSV: its first line is empty", hint=f"expected {expected}")
-    separator = max(_SEPARATORS, key=first.count)
-    try:
-        return next(csv.reader([first], delimiter=separator)), separator
-    except (csv.Error, StopIteration) as error:
-        raise InputError(f"{path}: cannot be read as CSV: {error}", hint=f"expected {expected}") from error
-
-
-def _read(path: Path, separator: str, columns: int, hint: str) -> pa.Table:
-    names = [str(number) for number in range(columns)]
-    try:
-        return pa_csv.read_csv(
-            path,
-            # Else errors do not say the row.
-            read_options=pa_csv.ReadOptions(use_threads=False, column_names=names, skip_rows=1),
-            parse_options=pa_csv.ParseOptions(delimiter=separator),
-            convert_options=pa_csv.ConvertOptions(
-                column_types=dict.fromkeys(names, pa.string()), null_values=[], strings_can_be_null=False
-            ),
-        )
-    except (pa.ArrowException, OSError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        if "Empty CSV" in reason:
-            raise InputError(f"{path}: no rows after the first line", hint="check what wrote the file") from error
-        raise InputError(f"{path}: cannot be read as CSV: {reason}", hint=hint) from error
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return "_" not in text
-
-
-def _is_whole(text: str) -> bool:
-    return text.lstrip("+-").isdecimal() and abs(int(text)) < 2**63 and not text.startswith("+")

@@ -13,7 +13,7 @@ import numpy as np
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import ONE_PASS, assemble
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras, parse_camera
 from valuemap.readers.csv_file import CsvFile
 from valuemap.readers.detections import DetectionFile, read_detections
@@ -28,10 +28,14 @@ from valuemap.readers.poses import (
 )
 from valuemap.tables import Floats
 
-_EXPECTED = (
-    "a CSV file with columns image; lat, lon or x, y; and heading_deg, yaw_rad or qw, qx, qy, qz"
-)
+_EXPECTED = "a CSV file with columns image; lat, lon or x, y; and heading_deg, yaw_rad or qw, qx, qy, qz"
 _QUATERNION = ("qw", "qx", "qy", "qz")
+_TEXTS = ("image", "pass", "rig", "timestamp", "model", "params")
+_NUMBERS = (
+    *("lat", "lon", "height", "x", "y", "z", "qw", "qx", "qy", "qz", "pitch_deg", "roll_deg"),
+    *("heading_deg", "heading_rad", "yaw_deg", "yaw_rad", "width_px", "height_px", "fx", "fy", "cx", "cy"),
+    *("position_sigma_m", "rotation_sigma_deg"),
+)
 _HEADINGS = ("heading_deg", "heading_rad", "yaw_deg", "yaw_rad")
 
 
@@ -57,7 +61,7 @@ def read_csv_poses(
     crs: str | None = None,
     up: tuple[float, float, float] | None = None,
     anchor: tuple[float, float, float] | None = None,
-    max_rejected: float = 0.01,
+    max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
 ) -> Dataset:
     """Read a table with one row an image.
@@ -68,8 +72,8 @@ def read_csv_poses(
 
     An orientation is a quaternion `qw, qx, qy, qz`, or one of `heading_deg`, `heading_rad` (clockwise from north) and
     `yaw_deg`, `yaw_rad` (counter-clockwise from east) of the middle of the picture, with `pitch_deg` (up) and
-    `roll_deg` (right side down), which are 0 for level cameras. A camera is `model, width, height, params` (numbers
-    with spaces between), or `width, height, fx, cx, cy` and maybe `fy`; else it is `camera` for all.
+    `roll_deg` (right side down), which are 0 for level cameras. A camera is `width_px, height_px` with `model, params`
+    (numbers with spaces between), or with `fx, cx, cy` and maybe `fy`; else it is `camera` for all.
 
     Parameters
     ----------
@@ -82,8 +86,8 @@ def read_csv_poses(
     columns
         Under which name a column stands in the table, where it is another one.
     rotation
-        What a quaternion does, "cam_from_world" or "world_from_cam". The world of a quaternion is the frame of `x, y, z`;
-        with `lat, lon` it is east, north, up at the image.
+        What a quaternion does, "cam_from_world" or "world_from_cam". The world of a quaternion is the frame of
+        `x, y, z`; with `lat, lon` it is east, north, up at the image.
     axes
         The axes of the camera that a quaternion is about, one of `AXES`.
     pixel_center
@@ -91,9 +95,9 @@ def read_csv_poses(
     camera_height_m
         Height of all images where the table has none.
     crs
-        The reference system of `x, y`, e.g. EPSG:32610: easting, northing. Without, they are metres in a frame of their own.
-    up, anchor
-        As in `assemble`. With `lat, lon` or `crs` the anchor is the origin, by default the place of the first image by name.
+        The reference system of `x, y`, e.g. EPSG:32610: easting, northing. Without, they are metres in their own frame.
+    up, anchor, max_rejected
+        As in `assemble`. With `lat, lon` or `crs` the anchor is the origin, by default the first image by name.
 
     Raises
     ------
@@ -104,18 +108,18 @@ def read_csv_poses(
     """
     if rotation not in ("cam_from_world", "world_from_cam") or axes not in AXES:
         raise SettingError(
-            f"rotation {rotation}, axes {axes}: expected cam_from_world or world_from_cam, and one of {', '.join(AXES)}",
+            f"rotation {rotation}, axes {axes}: expected cam_from_world or world_from_cam, and {' or '.join(AXES)}",
             hint="leave them away for COLMAP's convention",
         )
     progress("reading the poses", 0, 2)
-    table = CsvFile(poses, _EXPECTED, columns)
+    table = CsvFile(poses, _EXPECTED, texts=_TEXTS, numbers=_NUMBERS, columns=columns)
     names = table.filled_texts("image")
     where = _place(table, names, crs, anchor, up, camera_height_m)
     cameras, camera_id = make_cameras(_cameras(table, camera, pixel_center), str(poses))
     images = make_images(
         names=names,
         camera_id=camera_id,
-        world_from_cam=where.world_from_local @ _local_from_cam(table, names, rotation, axes),
+        world_from_cam=where.world_from_local @ _local_from_cam(table, rotation, axes),
         center_in_world_m=where.position_m,
         passes=table.filled_texts("pass") if table.has("pass") else [ONE_PASS] * len(table),
         source=str(poses),
@@ -152,7 +156,9 @@ def _place(
     source = str(table.path)
     if table.has("lat", "lon"):
         if crs is not None or up is not None:
-            raise SettingError("crs and up: do not go with columns lat, lon", hint="leave them away: lat, lon are WGS84")
+            raise SettingError(
+                "crs and up: do not go with columns lat, lon", hint="leave them away: lat, lon are WGS84"
+            )
         height = table.numbers("height") if table.has("height") else level
         return _on_earth(
             place_on_earth(
@@ -174,7 +180,7 @@ def _on_earth(placed: OnEarth) -> _Where:
     return _Where(placed.position_in_world_m, placed.world_from_local, placed.anchor)
 
 
-def _local_from_cam(table: CsvFile, names: list[str], rotation: str, axes: str) -> Floats:
+def _local_from_cam(table: CsvFile, rotation: str, axes: str) -> Floats:
     """Return rotations (N, 3, 3) from camera axes into the frame of the positions, or east, north, up at the image."""
     headings = [name for name in _HEADINGS if table.has(name)]
     if table.has(*_QUATERNION):
@@ -183,16 +189,17 @@ def _local_from_cam(table: CsvFile, names: list[str], rotation: str, axes: str) 
                 f"{table.path}: has both a quaternion and {headings[0]}", hint="remove the columns that do not count"
             )
         quaternion = np.stack([table.numbers(name) for name in _QUATERNION], axis=1)
-        matrix = rotations_of_quaternions(quaternion, names, str(table.path))
+        matrix = rotations_of_quaternions(quaternion)
         local_from_axes = matrix if rotation == "world_from_cam" else matrix.transpose(0, 2, 1)
-        return local_from_axes @ AXES[axes].T
+        turned: Floats = local_from_axes @ AXES[axes]
+        return turned
     if len(headings) != 1:
         raise table.missing(f"one of {', '.join(_HEADINGS)}, or {', '.join(_QUATERNION)}")
     name = headings[0]
     angle_rad = table.numbers(name) * (math.pi / 180.0 if name.endswith("_deg") else 1.0)
-    if name.endswith("_rad") and np.abs(angle_rad).max() > 4.0 * math.pi:
+    if name.endswith("_rad") and np.nanmax(np.abs(angle_rad), initial=0.0) > 4.0 * math.pi:
         raise InputError(
-            f"{table.path}: {name}: expected radians, found {np.abs(angle_rad).max():g}",
+            f"{table.path}: {name}: expected radians, found {np.nanmax(np.abs(angle_rad)):g}",
             hint=f"are these degrees? Then --column {name[:-4]}_deg={name}",
         )
     heading_rad = angle_rad if name.startswith("heading") else math.pi / 2.0 - angle_rad
@@ -204,9 +211,10 @@ def _local_from_cam(table: CsvFile, names: list[str], rotation: str, axes: str) 
 
 
 def _cameras(table: CsvFile, camera: str | None, pixel_center: float) -> list[Camera]:
-    if table.has("model", "width", "height", "params"):
-        texts = zip(table.texts("model"), table.texts("width"), table.texts("height"), table.texts("params"), strict=True)
-        joined = [" ".join(parts) for parts in texts]
+    if table.has("model", "width_px", "height_px", "params"):
+        sizes = zip(table.whole_numbers("width_px"), table.whole_numbers("height_px"), strict=True)
+        parts = zip(table.filled_texts("model"), sizes, table.texts("params"), strict=True)
+        joined = [f"{model} {width} {height} {params}" for model, (width, height), params in parts]
         parsed: dict[str, Camera] = {}
         for row, text in enumerate(joined):
             if text not in parsed:
@@ -215,14 +223,17 @@ def _cameras(table: CsvFile, camera: str | None, pixel_center: float) -> list[Ca
                 except SettingError as error:
                     raise InputError(f"{table.line(row)}: {error}", hint=error.hint) from error
         return [parsed[text] for text in joined]
-    if table.has("width", "height", "fx", "cx", "cy"):
+    if table.has("width_px", "height_px", "fx", "cx", "cy"):
+        fx, cx, cy = (table.finite_numbers(name) for name in ("fx", "cx", "cy"))
+        fy = table.finite_numbers("fy") if table.has("fy") else fx
         shift = 0.5 - pixel_center
-        focal = [table.numbers("fx"), table.numbers("fy") if table.has("fy") else table.numbers("fx")]
-        values = np.stack([*focal, table.numbers("cx") + shift, table.numbers("cy") + shift], axis=1).tolist()
-        sizes = zip(table.whole_numbers("width").tolist(), table.whole_numbers("height").tolist(), strict=True)
-        return [Camera("PINHOLE", w, h, tuple(params)) for (w, h), params in zip(sizes, values, strict=True)]
+        params = np.stack([fx, fy, cx + shift, cy + shift], axis=1).tolist()
+        sizes = zip(table.whole_numbers("width_px"), table.whole_numbers("height_px"), strict=True)
+        return [Camera("PINHOLE", *size, tuple(values)) for size, values in zip(sizes, params, strict=True)]
     if camera is None:
-        raise table.missing("width, height, fx, cx, cy (or model, width, height, params; or the option camera)")
+        raise table.missing(
+            "width_px, height_px and fx, cx, cy or model, params, where no camera is given for all images"
+        )
     return [parse_camera(camera, pixel_center)] * len(table)
 
 
@@ -246,12 +257,14 @@ def _seconds(text: str, table: CsvFile, row: int) -> float:
             ) from error
         return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
     if not math.isfinite(seconds):
-        raise InputError(f"{table.line(row)}: timestamp: expected a finite number", hint="leave it empty where not known")
+        raise InputError(
+            f"{table.line(row)}: timestamp: expected a finite number", hint="leave it empty where not known"
+        )
     return seconds
 
 
 def _optional(table: CsvFile, name: str) -> Floats | None:
-    return table.numbers(name, may_miss=True) if table.has(name) else None
+    return table.numbers(name) if table.has(name) else None
 
 
 def _radians(degrees: Floats | None) -> Floats | None:

@@ -73,7 +73,7 @@ def check_names(names: list[str], source: str) -> None:
     for name in names:
         if not _stays_inside(name):
             raise InputError(
-                f"{source}: image name {_short(name)}: expected a relative name that stays in the folder of the pictures",
+                f"{source}: image name {_short(name)}: expected a relative name that stays in the folder",
                 hint="names must be texts without .. and not absolute, e.g. monday/cam0/000123.jpg",
             )
 
@@ -122,7 +122,7 @@ def read_yaml(path: Path, expected: str) -> Any:
         for event in yaml.parse(text, Loader=loader):
             if isinstance(event, yaml.AliasEvent):
                 raise InputError(
-                    f"{path} line {event.start_mark.line + 1}: has an alias (*{_short(event.anchor or '')})",
+                    f"{path}: has an alias, *{event.anchor}",
                     hint="write the value out: aliases are not read",
                 )
         return yaml.load(text, Loader=loader)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import ONE_PASS, assemble
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras, parse_camera
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_folder, file_in, read_text
@@ -39,7 +39,7 @@ def read_kapture(
     detections: DetectionFile | Path | None = None,
     up: tuple[float, float, float] | None = None,
     anchor: tuple[float, float, float] | None = None,
-    max_rejected: float = 0.01,
+    max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
 ) -> Dataset:
     """Read a kapture folder, version 1.
@@ -55,7 +55,7 @@ def read_kapture(
         The folder that holds `sensors`.
     detections
         As in `read_detections`.
-    up, anchor
+    up, anchor, max_rejected
         As in `assemble`.
 
     Raises

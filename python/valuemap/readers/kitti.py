@@ -10,7 +10,7 @@ import numpy as np
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import ONE_PASS, FoundBoxes, assemble
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.csv_file import CsvFile
 from valuemap.readers.detections import DetectionFile, read_detections
@@ -41,7 +41,7 @@ def read_kitti(
     up: tuple[float, float, float] | None = None,
     anchor: tuple[float, float, float] | None = None,
     heading_deg: float | None = None,
-    max_rejected: float = 0.01,
+    max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
 ) -> Dataset:
     """Read the poses of one drive with one or several rectified cameras, and the detections in its frames.
@@ -69,11 +69,11 @@ def read_kitti(
         KITTI's `times.txt`: seconds of each frame.
     class_name
         The class of boxes that have none.
-    up, anchor
+    up, anchor, max_rejected
         As in `assemble`.
     heading_deg
-        Where camera 0 of the first frame looked, clockwise from north, with y down and level: brings poses of a frame of
-        camera axes into east, north, up at the anchor.
+        Where camera 0 of the first frame looked, clockwise from north, with y down and level: brings poses in its axes
+        into east, north, up at the anchor.
 
     Raises
     ------
@@ -157,7 +157,9 @@ def _projections(
         )
     for camera in cameras:
         if not (found[camera][0, 0] > 0.0 and found[camera][1, 1] > 0.0 and abs(found[camera][2, 2] - 1.0) < 1e-6):
-            raise InputError(f"{calibration}: P{camera} is no rectified camera", hint=f"expected {_EXPECTED_CALIBRATION}")
+            raise InputError(
+                f"{calibration}: P{camera} is no rectified camera", hint=f"expected {_EXPECTED_CALIBRATION}"
+            )
     return {camera: found[camera] for camera in sorted(set(cameras))}
 
 
@@ -177,7 +179,8 @@ def _turned(world_from_cam: Floats, heading_deg: float, anchor: tuple[float, flo
     if anchor is None or not np.isfinite(heading_deg):
         raise SettingError(f"heading {heading_deg:g}: goes with an anchor", hint="give --anchor LAT LON HEIGHT too")
     turn = local_from_cam(np.radians([heading_deg]), np.zeros(1), np.zeros(1))[0]
-    return turn @ world_from_cam
+    turned: Floats = turn @ world_from_cam
+    return turned
 
 
 def _read_poses(path: Path) -> Floats:
@@ -221,7 +224,8 @@ def _read_times(path: Path, frames: int) -> Floats:
         raise InputError(f"{path}: expected a number a row", hint=f"expected {_EXPECTED_TIMES}") from error
     if len(seconds) != frames or not np.isfinite(seconds).all():
         raise InputError(
-            f"{path}: expected {frames} finite numbers, one a pose, found {len(seconds)}", hint=f"expected {_EXPECTED_TIMES}"
+            f"{path}: expected {frames} finite numbers, one a pose, found {len(seconds)}",
+            hint=f"expected {_EXPECTED_TIMES}",
         )
     return seconds
 
@@ -233,33 +237,34 @@ def _detections(
     file = DetectionFile(detections, class_name=class_name) if isinstance(detections, Path) else detections
     if file is None or file.format not in ("auto", "csv") or file.path.suffix.lower() not in (".csv", ".txt"):
         return None
-    table = CsvFile(file.path, _EXPECTED_BOXES, file.columns)
+    table = CsvFile(
+        file.path,
+        _EXPECTED_BOXES,
+        texts=("image", "class"),
+        numbers=(*_CORNERS, "frame", "camera", "score"),
+        columns=file.columns,
+    )
     if table.has("image"):
         return None
-    frame = table.whole_numbers("frame")
+    frame = table.numbers("frame")
     corners_px = np.stack([table.numbers(name) for name in _CORNERS], axis=1)
     numbers = list(projections)
     frames = len(images) // len(numbers)
     if table.has("camera"):
-        row_of = {camera: row for row, camera in enumerate(numbers)}
-        camera = np.array([row_of.get(number, -1) for number in table.whole_numbers("camera").tolist()])
+        row_of = {float(camera): row for row, camera in enumerate(numbers)}
+        camera = np.array([row_of.get(number, -1) for number in table.numbers("camera").tolist()])
     elif len(numbers) == 1:
         camera = np.zeros(len(frame), dtype=np.int64)
     else:
         raise table.missing("a column 'camera', as there are several")
-    known = (camera >= 0) & (frame >= 0) & (frame < frames)
-    if not known.any():
-        raise InputError(
-            f"{table.line(0)}: expected a frame from 0 to {frames - 1}, as there are {frames} poses, found frame "
-            f"{frame[0]} ({len(frame)} rows)",
-            hint="the columns are frame, left, top, right, bottom in pixels; the first frame is 0",
-        )
+    known = (camera >= 0) & (frame >= 0) & (frame < frames) & (frame % 1.0 == 0.0)
     return FoundBoxes(
-        image_row=np.where(known, camera * frames + frame, -1),
-        class_names=table.filled_texts("class") if table.has("class") else [file.class_name] * len(frame),
+        image_row=np.where(known, camera * frames + np.where(known, frame, 0.0), -1.0).astype(np.int64),
+        class_names=table.texts("class") if table.has("class") else [file.class_name] * len(frame),
         center_px=(corners_px[:, :2] + corners_px[:, 2:]) / 2.0 + _PIXEL_CENTER,
         size_px=corners_px[:, 2:] - corners_px[:, :2],
-        score=(table.numbers("score") if table.has("score") else np.full(len(frame), file.full_score)) / file.full_score,
+        score=(table.numbers("score") if table.has("score") else np.full(len(frame), file.full_score))
+        / file.full_score,
         where=table.line,
-        image_names=[f"frame {number}" for number in frame.tolist()],
+        image_names=[f"frame {number:.17g}" for number in frame.tolist()],
     )

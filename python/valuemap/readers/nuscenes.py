@@ -11,7 +11,7 @@ import numpy as np
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import assemble
+from valuemap.readers.assemble import MAX_REJECTED, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_folder, file_in, read_json
@@ -39,7 +39,7 @@ def read_nuscenes(
     sweeps: bool = False,
     up: tuple[float, float, float] | None = None,
     anchor: tuple[float, float, float] | None = None,
-    max_rejected: float = 0.01,
+    max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
 ) -> Dataset:
     """Read the cameras of all scenes of one location; every image has the ego pose of its own instant.
@@ -57,7 +57,7 @@ def read_nuscenes(
         Which map, where there are several, such as `boston-seaport`: their frames have nothing to do with each other.
     sweeps
         Take the images between the key frames too.
-    up, anchor
+    up, anchor, max_rejected
         As in `assemble`; the origins of nuScenes' four maps are known.
 
     Raises
@@ -104,8 +104,8 @@ def read_nuscenes(
     if not names:
         raise InputError(f"{tables}: there is no image of a camera", hint=f"expected {_EXPECTED}")
     quaternion, offset = np.array(quaternions), np.array(offsets)
-    world_from_ego = rotations_of_quaternions(quaternion[:, 0], names, str(tables))
-    ego_from_cam = rotations_of_quaternions(quaternion[:, 1], names, str(tables))
+    world_from_ego = rotations_of_quaternions(quaternion[:, 0])
+    ego_from_cam = rotations_of_quaternions(quaternion[:, 1])
     cameras, camera_id = make_cameras(camera_of, str(tables))
     images = make_images(
         names=names,

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import ONE_PASS, assemble
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import file_in, read_json
@@ -27,7 +27,7 @@ def read_opensfm(
     detections: DetectionFile | Path | None = None,
     up: tuple[float, float, float] | None = None,
     anchor: tuple[float, float, float] | None = None,
-    max_rejected: float = 0.01,
+    max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
 ) -> Dataset:
     """Read all reconstructions of a file, whose origin is `reference_lla` in it or in the file of that name beside it.
@@ -42,7 +42,7 @@ def read_opensfm(
         The file, or the folder with it.
     detections
         As in `read_detections`.
-    up, anchor
+    up, anchor, max_rejected
         As in `assemble`, for models without a reference.
 
     Raises
@@ -143,7 +143,7 @@ def _rigs(part: Json, number: int) -> dict[str, str]:
     found = {}
     if "rig_instances" in part:
         for key, instance in part["rig_instances"].items():
-            for name, _ in instance["rig_camera_ids"].items():
+            for name in instance["rig_camera_ids"].object():
                 found[name] = f"{number}/instance/{key}"
     return found
 

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from valuemap.errors import InputError
 from valuemap.geodesy import enu_axes_at, enu_from_lon_lat_height, lon_lat_height_from_crs, true_axes_of_crs
 from valuemap.readers.files import check_names
-from valuemap.tables import Categories, Floats, Images, Ints
+from valuemap.tables import Bools, Categories, Floats, Images, Ints
 
 _ROTATION_TOLERANCE = 1e-3
 _LARGEST_M = 1e8
@@ -47,7 +46,7 @@ class OnEarth:
 def place_on_earth(
     lon_lat_height: Floats, anchor: tuple[float, float, float] | None, first: int = 0, *, source: str
 ) -> OnEarth:
-    """Place images (N, 3) at longitude, latitude (degrees) and ellipsoidal height (m).
+    """Place images (N, 3) at longitude, latitude (degrees) and ellipsoidal height (m); NaN stays NaN.
 
     Parameters
     ----------
@@ -61,19 +60,24 @@ def place_on_earth(
     InputError
         A latitude is beyond 90 degrees: often latitude and longitude are swapped.
     """
-    wrong = np.flatnonzero((np.abs(lon_lat_height[:, 1]) > 90.0) | (np.abs(lon_lat_height[:, 0]) > 360.0))
+    fine: Bools = np.asarray(np.isfinite(lon_lat_height).all(axis=1))
+    beyond = (np.abs(lon_lat_height[:, 1]) > 90.0) | (np.abs(lon_lat_height[:, 0]) > 360.0)
+    wrong = np.flatnonzero(fine & beyond)
     if len(wrong):
         lon, lat, _ = lon_lat_height[wrong[0]]
         raise InputError(
             f"{source}: expected degrees, found latitude {lat:g} and longitude {lon:g} ({len(wrong)} images)",
             hint="are latitude and longitude swapped, or are these metres of a map projection (--crs)?",
         )
+    if not fine.any():
+        raise InputError(f"{source}: no image has a place", hint="are latitude and longitude numbers in degrees?")
     if anchor is None:
-        lon, lat, height = lon_lat_height[first].tolist()
+        lon, lat, height = lon_lat_height[first if fine[first] else np.argmax(fine)].tolist()
         anchor = (lat, lon, height)
-    return OnEarth(
-        enu_from_lon_lat_height(lon_lat_height, anchor), enu_axes_at(lon_lat_height, anchor), anchor
-    )
+    position, axes = np.full((len(fine), 3), np.nan), np.full((len(fine), 3, 3), np.nan)
+    position[fine] = enu_from_lon_lat_height(lon_lat_height[fine], anchor)
+    axes[fine] = enu_axes_at(lon_lat_height[fine], anchor)
+    return OnEarth(position, axes, anchor)
 
 
 def place_in_crs(
@@ -83,9 +87,11 @@ def place_in_crs(
 
     The local axes are those of the grid: its north is not north, and poses in it are turned by the convergence.
     """
-    lon_lat_height = lon_lat_height_from_crs(position, crs)
+    fine: Bools = np.asarray(np.isfinite(position).all(axis=1))
+    lon_lat_height, true_from_grid = np.full((len(fine), 3), np.nan), np.full((len(fine), 3, 3), np.nan)
+    lon_lat_height[fine] = lon_lat_height_from_crs(position[fine], crs)
+    true_from_grid[fine] = true_axes_of_crs(position[fine], crs)
     placed = place_on_earth(lon_lat_height, anchor, first, source=source)
-    true_from_grid = true_axes_of_crs(position, crs)
     return OnEarth(placed.position_in_world_m, placed.world_from_local @ true_from_grid, placed.anchor)
 
 
@@ -100,18 +106,13 @@ def local_from_cam(heading_rad: Floats, pitch_rad: Floats, roll_rad: Floats) -> 
     return matrix
 
 
-def rotations_of_quaternions(quaternion_wxyz: Floats, names: Sequence[str], source: str) -> Floats:
-    """Return rotations (N, 3, 3) of quaternions (N, 4) in the order w, x, y, z, which must be of unit length."""
+def rotations_of_quaternions(quaternion_wxyz: Floats) -> Floats:
+    """Return rotations (N, 3, 3) of quaternions (N, 4) in the order w, x, y, z; NaN where one is not of unit length."""
     length = np.linalg.norm(quaternion_wxyz, axis=1)
-    wrong = np.flatnonzero(~(np.abs(length - 1.0) < _ROTATION_TOLERANCE))
-    if len(wrong):
-        row = wrong[0]
-        raise InputError(
-            f"{source}: image {names[row]!r}: expected a quaternion of length 1, found "
-            f"{quaternion_wxyz[row].tolist()} ({len(wrong)} images)",
-            hint="a quaternion is w, x, y, z of a rotation",
-        )
-    matrix: Floats = Rotation.from_quat(quaternion_wxyz, scalar_first=True).as_matrix()
+    fine: Bools = np.abs(length - 1.0) < _ROTATION_TOLERANCE
+    matrix = np.full((len(fine), 3, 3), np.nan)
+    if fine.any():
+        matrix[fine] = Rotation.from_quat(quaternion_wxyz[fine], scalar_first=True).as_matrix()
     return matrix
 
 
@@ -129,7 +130,7 @@ def make_images(
     position_sigma_m: Floats | None = None,
     rotation_sigma_rad: Floats | None = None,
 ) -> Images:
-    """Return images of poses in any order.
+    """Return images of poses in any order; a pose that is no rigid motion becomes NaN, to be left out with its reason.
 
     Parameters
     ----------
@@ -151,7 +152,7 @@ def make_images(
     Raises
     ------
     InputError
-        There are no images, a name is there twice or leads out of its folder, or a pose is no rigid motion.
+        There are no images, or a name is there twice or leads out of its folder.
     """
     if not len(names):
         raise InputError(f"{source}: there is no image with a pose", hint="is this the whole of it?")
@@ -162,14 +163,19 @@ def make_images(
             f"{source}: {len(repeated)} image names occur more than once, the first is {min(repeated)!r}",
             hint="detections are matched by file name: give every image a name of its own",
         )
-    _check_poses(names, world_from_cam, center_in_world_m, source)
+    usable = _usable(world_from_cam, center_in_world_m)
     if image_id is None:
         order = np.array(sorted(range(len(names)), key=lambda row: names[row]), dtype=np.int64)
         ids: Ints = np.arange(len(names), dtype=np.int64)
     else:
         order = np.argsort(image_id, kind="stable")
         ids = image_id[order]
-    cam_from_world = Rotation.from_matrix(world_from_cam[order]).inv()
+    quaternion, translation = np.full((len(names), 4), np.nan), np.full((len(names), 3), np.nan)
+    fine = usable[order]
+    if fine.any():
+        cam_from_world = Rotation.from_matrix(world_from_cam[order][fine]).inv()
+        quaternion[fine] = cam_from_world.as_quat(canonical=True, scalar_first=True)
+        translation[fine] = -cam_from_world.apply(center_in_world_m[order][fine])
     optional = {
         name: None if values is None or np.isnan(values).all() else values[order]
         for name, values in (
@@ -182,15 +188,17 @@ def make_images(
         image_id=ids,
         name=pa.array([names[row] for row in order], pa.string()),
         camera_id=np.asarray(camera_id, dtype=np.int64)[order],
-        cam_from_world_quat=cam_from_world.as_quat(canonical=True, scalar_first=True),
-        cam_from_world_m=-cam_from_world.apply(center_in_world_m[order]),
+        cam_from_world_quat=quaternion,
+        cam_from_world_m=translation,
         pass_id=Categories.from_texts([passes[row] for row in order]),
         rig_id=None if rigs is None else Categories.from_texts([rigs[row] for row in order]).codes.astype(np.int64),
         **optional,
     )
 
 
-def rigs_by_time(cameras: Sequence[str], timestamp_s: Floats, drives: Sequence[str], longest_s: float = 0.06) -> list[str]:
+def rigs_by_time(
+    cameras: Sequence[str], timestamp_s: Floats, drives: Sequence[str], longest_s: float = 0.06
+) -> list[str]:
     """Return which images (N) were taken together: equal texts for images of different cameras of one drive.
 
     In driving order an image joins the ones before it unless its camera is among them, or the first of them is more
@@ -209,7 +217,7 @@ def rigs_by_time(cameras: Sequence[str], timestamp_s: Floats, drives: Sequence[s
 
 def interpolate_poses(
     time: Ints, known_time: Ints, rotation: Floats, center_m: Floats, longest: int
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Floats, Bools]:
     """Return rotations (N, 3, 3) and centres (N, 3) at times (N) between known poses, and which there are (N).
 
     Poses turn about one axis and move straight between neighbours. There is none outside the known times, nor in gaps
@@ -222,7 +230,7 @@ def interpolate_poses(
     gap = known[after] - known[before]
     share = np.divide(time - known[before], gap, out=np.zeros(len(time)), where=gap > 0)
     inside = (time >= known[0]) & (time <= known[-1])
-    usable = inside & ((gap <= longest) | (share == 0.0) | (share == 1.0))
+    usable: Bools = inside & ((gap <= longest) | (share == 0.0) | (share == 1.0))
     share = np.clip(share, 0.0, 1.0)
     step = rotations[before].inv() * rotations[after]
     turned = rotations[before] * Rotation.from_rotvec(step.as_rotvec() * share[:, None])
@@ -230,21 +238,12 @@ def interpolate_poses(
     return turned.as_matrix(), moved, usable
 
 
-def _check_poses(names: Sequence[str], rotation: Floats, center_m: Floats, source: str) -> None:
-    finite = np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(center_m).all(axis=1)
-    error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+def _usable(rotation: Floats, center_m: Floats) -> Bools:
+    """Return which poses (N) are rigid motions of sensible lengths; the others are left out when all is assembled."""
+    finite: Bools = np.asarray(np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(center_m).all(axis=1))
+    with np.errstate(invalid="ignore", over="ignore"):
+        error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        near = np.abs(center_m).max(axis=1) < _LARGEST_M
     right = np.linalg.det(np.where(finite[:, None, None], rotation, 0.0)) > 0.0
-    near = np.abs(center_m).max(axis=1) < _LARGEST_M
-    for fine, expected in (
-        (finite, "finite numbers"),
-        (near, "metres"),
-        ((error <= _ROTATION_TOLERANCE) & right, "a rotation without scale and mirroring"),
-    ):
-        wrong = np.flatnonzero(~fine)
-        if len(wrong):
-            row = wrong[0]
-            found = f"{np.round(rotation[row], 6).tolist()} at {center_m[row].tolist()}"
-            raise InputError(
-                f"{source}: image {names[row]!r}: pose: expected {expected}, found {found} ({len(wrong)} images)",
-                hint="repair these poses, or remove the images",
-            )
+    usable: Bools = finite & near & (error <= _ROTATION_TOLERANCE) & right
+    return usable

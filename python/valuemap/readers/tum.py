@@ -9,7 +9,7 @@ import numpy as np
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import ONE_PASS, assemble
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, assemble
 from valuemap.readers.cameras_of import make_cameras, parse_camera
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import read_text
@@ -32,7 +32,7 @@ def read_tum(
     longest_gap_s: float = 0.2,
     up: tuple[float, float, float] | None = None,
     anchor: tuple[float, float, float] | None = None,
-    max_rejected: float = 0.01,
+    max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
 ) -> Dataset:
     """Read a trajectory of `timestamp tx ty tz qx qy qz qw` (x first!), camera to world, in seconds and metres.
@@ -53,7 +53,7 @@ def read_tum(
         The axes of what the trajectory is of, one of `AXES`.
     pixel_center
         Coordinates of the centre of the top-left pixel in the parameters of the camera.
-    up, anchor
+    up, anchor, max_rejected
         As in `assemble`.
 
     Raises
@@ -70,14 +70,12 @@ def read_tum(
     time = _nanoseconds(texts, trajectory)
     if len(set(time.tolist())) < len(time):
         raise InputError(f"{trajectory}: two poses have the same timestamp", hint="keep one of them")
-    rotation = rotations_of_quaternions(rows[:, [6, 3, 4, 5]], texts, str(trajectory)) @ AXES[axes].T
+    rotation = rotations_of_quaternions(rows[:, [6, 3, 4, 5]]) @ AXES[axes]
     center = rows[:, :3]
     names = [f"{text}.png" for text in texts]
     if image_list is not None:
         image_time, names = _read_list(image_list)
-        rotation, center, usable = interpolate_poses(
-            image_time, time, rotation, center, int(longest_gap_s * _NANO)
-        )
+        rotation, center, usable = interpolate_poses(image_time, time, rotation, center, int(longest_gap_s * _NANO))
         if not usable.any():
             raise InputError(
                 f"{image_list}: no image is within the time of the trajectory, {texts[0]} to {texts[-1]}",
@@ -121,7 +119,9 @@ def _rows(path: Path) -> tuple[list[str], Floats]:
         except ValueError:
             values = []
         if len(values) != 7 or not np.isfinite(values).all():
-            raise InputError(f"{path} line {number}: expected 8 finite numbers, found {line[:80]!r}", hint=f"expected {_EXPECTED}")
+            raise InputError(
+                f"{path} line {number}: expected 8 finite numbers, found {line[:80]!r}", hint=f"expected {_EXPECTED}"
+            )
         texts.append(fields[0])
         rows.append(values)
     if not rows:
@@ -156,7 +156,11 @@ def _nanoseconds(texts: list[str], path: Path) -> Ints:
                 value = float(text)
                 found.append(round(value * _NANO))
             except (ValueError, OverflowError) as error:
-                raise InputError(f"{path}: expected a timestamp in seconds, found {text[:40]!r}", hint="is it TUM?") from error
+                raise InputError(
+                    f"{path}: expected a timestamp in seconds, found {text[:40]!r}", hint="is it TUM?"
+                ) from error
             if not -(2**62) < found[-1] < 2**62:
-                raise InputError(f"{path}: expected a timestamp in seconds, found {text[:40]!r}", hint="are these nanoseconds?")
+                raise InputError(
+                    f"{path}: expected a timestamp in seconds, found {text[:40]!r}", hint="are these nanoseconds?"
+                )
     return np.array(found, dtype=np.int64)

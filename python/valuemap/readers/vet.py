@@ -44,7 +44,7 @@ _OUTSIDE = _Reason(
     "are the boxes in pixels of the pictures that the cameras are of, and in the order that the format says?",
 )
 _SCORE = _Reason("its score is not from 0 to 1", "scores are probabilities: divide percentages by 100")
-_RANGE = _Reason("its range or the sigma of it is not above 0", "ranges are metres; leave unknown ones empty")
+_RANGE = _Reason("its range or a sigma is not above 0", "ranges are metres; leave unknown ones empty")
 _TWICE = _Reason("the same box is there already", "was the file put together from parts that overlap?")
 _LEFT_OUT = _Reason("its image was left out", "repair the image first")
 _POSE_NOT_FINITE = _Reason("a number of its pose is missing or not finite", "repair the poses of these images")
@@ -74,6 +74,8 @@ class FoundBoxes:
         so that the numbers do not depend on the order of the boxes.
     range_m, range_sigma_m
         Measured distances (N) in metres, NaN where there is none.
+    vertical_sigma_px
+        Standard deviations (N) of the centre's y, NaN where it is that of its x.
     are_points
         The boxes are directions without a size, so that a size of 0 is right.
     """
@@ -88,6 +90,7 @@ class FoundBoxes:
     detection_id: Ints | None = None
     range_m: Floats | None = None
     range_sigma_m: Floats | None = None
+    vertical_sigma_px: Floats | None = None
     are_points: bool = False
 
     @staticmethod
@@ -262,7 +265,7 @@ def vet_boxes(boxes: FoundBoxes, images: Images, usable: Bools, cameras: Cameras
     why.mark((size > _MAX_SIZE_OF_PICTURE * picture).any(axis=1), _TOO_LARGE)
     why.mark(((center < 0.0) | (center > picture)).any(axis=1), _OUTSIDE)
     why.mark((score < 0.0) | (score > 1.0), _SCORE)
-    for values in (boxes.range_m, boxes.range_sigma_m):
+    for values in (boxes.range_m, boxes.range_sigma_m, boxes.vertical_sigma_px):
         if values is not None:
             why.mark((values <= 0.0) | np.isinf(values), _RANGE)
     classes = Categories.from_texts([_text(name) for name in boxes.class_names])
@@ -285,6 +288,7 @@ def vet_boxes(boxes: FoundBoxes, images: Images, usable: Bools, cameras: Cameras
         None if boxes.detection_id is None else boxes.detection_id[fine],
         None if boxes.range_m is None else boxes.range_m[fine],
         None if boxes.range_sigma_m is None else boxes.range_sigma_m[fine],
+        None if boxes.vertical_sigma_px is None else boxes.vertical_sigma_px[fine],
     )
 
 
@@ -297,6 +301,7 @@ def number_detections(
     detection_id: Ints | None = None,
     range_m: Floats | None = None,
     range_sigma_m: Floats | None = None,
+    vertical_sigma_px: Floats | None = None,
 ) -> Detections:
     """Return boxes that can all be used as detections; `image_id` (N) is of `Images`, the rest as in `FoundBoxes`."""
     classes = class_names if isinstance(class_names, Categories) else Categories.from_texts(class_names)
@@ -315,6 +320,7 @@ def number_detections(
         score=score[order],
         range_m=None if range_m is None else range_m[order],
         range_sigma_m=None if range_sigma_m is None else range_sigma_m[order],
+        vertical_sigma_px=None if vertical_sigma_px is None else vertical_sigma_px[order],
     )
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from importlib import import_module
 
 READERS = (
+    "bearings",
     "colmap",
+    "csv",
     "kitti",
 )
 """Modules of this package; each adds its command to `import_app` when it is imported."""

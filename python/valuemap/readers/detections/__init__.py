@@ -13,6 +13,7 @@ from valuemap.readers.detections.csv import read_csv_boxes
 from valuemap.readers.detections.cvat import read_cvat
 from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes, find_images
 from valuemap.readers.detections.yolo import read_yolo
+from valuemap.readers.files import check_file
 from valuemap.tables import Cameras, Images
 
 __all__ = ["DETECTIONS", "DetectionFile", "read_detections"]
@@ -50,13 +51,15 @@ def _format_of(file: DetectionFile) -> str:
     if file.format != "auto":
         if file.format not in DETECTIONS:
             raise SettingError(
-                f"detections-format {file.format}: there is no such format", hint=f"one of auto, {', '.join(DETECTIONS)}"
+                f"detections-format {file.format}: there is no such format",
+                hint=f"one of auto, {', '.join(DETECTIONS)}",
             )
         return file.format
     if file.path.is_dir():
         return "yolo"
     found = _OF_SUFFIX.get(file.path.suffix.lower())
     if found is None:
+        check_file(file.path, "a file with detections, or a folder of YOLO's")
         raise InputError(
             f"{file.path}: its name does not say the format of the detections",
             hint=f"give --detections-format, one of {', '.join(DETECTIONS)}",

@@ -72,8 +72,6 @@ class _Entries:
     def boxes(self) -> Floats:
         """Return x, y, width, height (N, 4), NaN where these are no four numbers."""
         found = [entry.get("bbox") for entry in self.entries]
-        if all(box is None for box in found):
-            raise InputError(f"{self.where}[0]: expected bbox: x, y, width, height, found none", hint=_FORMAT_HINT)
         return np.array(
             [
                 box if isinstance(box, list) and len(box) == 4 and all(map(_is_number, box)) else _NO_BOX
@@ -140,17 +138,13 @@ def _sizes(listed: _Entries) -> dict[str, tuple[int, int]]:
 
 
 def _names_of_annotations(boxes: _Entries, listed: _Entries) -> list[str]:
-    image_ids = boxes.column("image_id", _ID)
+    """Return the file name of each annotation; of an image that is not listed its id, which is no file name."""
     ids, names = listed.column("id", _ID), listed.column("file_name", _TEXT)
     name_of = _without_repeats(ids, names, listed.where)
-    unlisted = [row for row, image_id in enumerate(image_ids) if image_id not in name_of]
-    if unlisted:
-        raise InputError(
-            f"{boxes.where}[{unlisted[0]}]: image_id {image_ids[unlisted[0]]!r} is not in images "
-            f"({len(unlisted)} entries)",
-            hint="add the image with its file_name to images, or remove these entries",
-        )
-    return [name_of[image_id] for image_id in image_ids]
+    image_ids = [entry.get("image_id") for entry in boxes.entries]
+    return [
+        name_of[key] if _ID.accepts(key) and key in name_of else f"image_id {reprlib.repr(key)}" for key in image_ids
+    ]
 
 
 def _names_of_results(boxes: _Entries) -> list[str]:
@@ -181,19 +175,19 @@ def _without_repeats(ids: list[Any], texts: list[str], where: str) -> dict[Any, 
 
 
 def _class_names(boxes: _Entries, content: Any, path: Path) -> list[str]:
-    category_ids = boxes.column("category_id", _ID)
+    """Return the class of each box; of those that have none, or one that is not listed, an empty text."""
+    category_ids = [entry.get("category_id") for entry in boxes.entries]
     if isinstance(content, list) or not content.get("categories"):
-        return [key if isinstance(key, str) else f"class-{key}" for key in category_ids]
+        return [_class_of_id(key) for key in category_ids]
     categories = _Entries(f"{path}: categories", _list_in(content, "categories", path))
     name_of = _without_repeats(categories.column("id", _ID), categories.column("name", _TEXT), categories.where)
-    unnamed = [row for row, category_id in enumerate(category_ids) if category_id not in name_of]
-    if unnamed:
-        raise InputError(
-            f"{boxes.where}[{unnamed[0]}]: category_id {category_ids[unnamed[0]]!r} is not in categories "
-            f"({len(unnamed)} entries)",
-            hint="add it to categories, or remove these entries",
-        )
-    return [name_of[category_id] for category_id in category_ids]
+    return [name_of.get(key, "") if _ID.accepts(key) else "" for key in category_ids]
+
+
+def _class_of_id(key: Any) -> str:
+    if not _ID.accepts(key):
+        return ""
+    return key if isinstance(key, str) else f"class-{key}"
 
 
 def _own_ids(boxes: _Entries) -> Ints | None:

@@ -11,6 +11,11 @@ from valuemap.tables import Floats
 _EXPECTED = "a CSV file with columns image and x1, y1, x2, y2, or left, top, width, height, or x, y"
 
 
+_TEXTS = ("image", "class")
+_OPTIONAL = ("range_m", "range_sigma_m", "vertical_sigma_px")
+_NUMBERS = ("x1", "y1", "x2", "y2", "left", "top", "x", "y", "width", "height", "score", *_OPTIONAL)
+
+
 def read_csv_boxes(file: DetectionFile) -> NamedBoxes:
     """Read boxes from a table with a column `image` (a name) and one of these sets of columns, in pixels or fractions.
 
@@ -23,21 +28,20 @@ def read_csv_boxes(file: DetectionFile) -> NamedBoxes:
     InputError
         The file is no such table.
     """
-    table = CsvFile(file.path, _EXPECTED, file.columns)
+    table = CsvFile(file.path, _EXPECTED, texts=_TEXTS, numbers=_NUMBERS, columns=file.columns)
     center, size = _boxes(table)
-    optional = {
-        name: table.numbers(name, may_miss=True) if table.has(name) else None
-        for name in ("range_m", "range_sigma_m", "vertical_sigma_px")
-    }
+    optional = {name: table.numbers(name) if table.has(name) else None for name in _OPTIONAL}
     return NamedBoxes(
-        image_names=table.filled_texts("image"),
-        class_names=table.filled_texts("class") if table.has("class") else [file.class_name] * len(table),
+        image_names=table.texts("image"),
+        class_names=table.texts("class") if table.has("class") else [file.class_name] * len(table),
         center=center,
         size=size,
         score=table.numbers("score") if table.has("score") else np.full(len(table), file.full_score),
         where=table.line,
         fractions=file.fractions,
-        **optional,
+        range_m=optional["range_m"],
+        range_sigma_m=optional["range_sigma_m"],
+        vertical_sigma_px=optional["vertical_sigma_px"],
     )
 
 

@@ -76,7 +76,9 @@ def read_cvat(file: DetectionFile) -> NamedBoxes:
 
 def _text(attributes: dict[str, str], key: str, where: str) -> str:
     if not attributes.get(key):
-        raise InputError(f"{where}: expected {key}=..., found {', '.join(attributes) or 'nothing'}", hint=f"expected {_EXPECTED}")
+        raise InputError(
+            f"{where}: expected {key}=..., found {', '.join(attributes) or 'nothing'}", hint=f"expected {_EXPECTED}"
+        )
     return attributes[key]
 
 

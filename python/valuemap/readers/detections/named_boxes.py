@@ -57,8 +57,8 @@ class DetectionFile:
 class NamedBoxes:
     """Boxes (N) of images that are known by name.
 
-    Centres and sizes (N, 2) are in pixels from the picture's corner, or fractions of its width and height; NaN where the
-    file holds no number. Without sizes nothing is known of them. `where(row)` says where a box stands in the file,
+    Centres and sizes (N, 2) are in pixels from the picture's corner, or fractions of its width and height; NaN where
+    the file holds no number. Without sizes nothing is known of them. `where(row)` says where a box stands in the file,
     `pictures` the width and height of pictures as far as the file says.
     """
 
@@ -84,19 +84,13 @@ def find_images(boxes: NamedBoxes, images: Images, cameras: Cameras, file: Detec
     Raises
     ------
     InputError
-        There are no boxes, none of their images is known, or they were made on pictures of another size.
+        There are no boxes, or they were made on pictures of another size.
     """
     if not len(boxes.image_names):
         raise InputError(f"{file.path}: there are no detections in it", hint="did the detector find anything?")
     known = images.name.to_pylist()
     row_of = match_images({*boxes.image_names, *boxes.other_names}, known)
     image_row = np.array([row_of.get(name, -1) for name in boxes.image_names], dtype=np.int64)
-    if np.all(image_row < 0):
-        raise InputError(
-            f"{boxes.where(0)}: image {boxes.image_names[0]!r} is not among the images with a pose, "
-            f"nor is any other of the {len(set(boxes.image_names))} images with detections",
-            hint=f"images are matched by file name, as in {known[0]!r}: correct the names",
-        )
     camera_row = rows_of(images.camera_id, cameras.camera_id)
     _refuse_other_sizes(boxes, row_of, camera_row, cameras, file.path)
     picture_px = np.stack([cameras.width_px, cameras.height_px], axis=1)[camera_row[image_row]].astype(np.float64)
@@ -105,7 +99,8 @@ def find_images(boxes: NamedBoxes, images: Images, cameras: Cameras, file: Detec
         image_row=image_row,
         class_names=boxes.class_names,
         center_px=boxes.center * scale + (0.5 - file.pixel_center),
-        size_px=None if boxes.size is None else boxes.size * scale,
+        size_px=np.zeros((len(image_row), 2)) if boxes.size is None else boxes.size * scale,
+        are_points=boxes.size is None,
         score=boxes.score / file.full_score,
         where=boxes.where,
         image_names=boxes.image_names,

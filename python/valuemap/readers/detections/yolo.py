@@ -95,7 +95,9 @@ def _class_names(folder: Path) -> dict[int, str] | None:
 def _names_in(content: Any, path: Path) -> Any:
     names = content.get("names") if isinstance(content, dict) else None
     is_list = isinstance(names, list) and all(isinstance(name, str) for name in names)
-    is_dict = isinstance(names, dict) and all(type(code) is int and isinstance(name, str) for code, name in names.items())
+    is_dict = isinstance(names, dict) and all(
+        type(code) is int and isinstance(name, str) for code, name in names.items()
+    )
     if not (is_list or is_dict):
         raise InputError(f"{path}: expected names, a list of classes, or numbers and classes", hint="repair the file")
     return names

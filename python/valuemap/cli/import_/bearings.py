@@ -1,0 +1,46 @@
+"""`valuemap import bearings`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from valuemap import dataset as dataset_folder
+from valuemap.cli.import_.app import finish_dataset, import_app
+from valuemap.cli.import_.options import Anchor, CameraHeight, ClassName, Columns
+from valuemap.cli.options import DatasetOut, MaxRejected
+from valuemap.cli.show import progress_bars
+from valuemap.folders import check_place
+from valuemap.readers.csv_file import parse_columns
+from valuemap.readers.vet import MAX_REJECTED
+
+
+@import_app.command("bearings")
+def import_bearings(
+    bearings: Annotated[Path, typer.Argument(help="CSV: lat,lon,bearing and maybe depth, class, score, pass, image.")],
+    out: DatasetOut,
+    columns: Columns = None,
+    class_name: ClassName = "object",
+    depth_sigma: Annotated[float, typer.Option(help="Standard deviation of a depth, as a fraction of it.")] = 0.3,
+    camera_height: CameraHeight = 0.0,
+    anchor: Anchor = None,
+    max_rejected: MaxRejected = MAX_REJECTED,
+) -> None:
+    """Import places with bearings (degrees clockwise from north) of objects, and maybe depths."""
+    from valuemap.readers import READERS
+
+    check_place(out, marker=dataset_folder.MARKER)
+    with progress_bars() as progress:
+        dataset = READERS["bearings"](
+            bearings,
+            columns=parse_columns(columns or []),
+            class_name=class_name,
+            depth_sigma=depth_sigma,
+            camera_height_m=camera_height,
+            anchor=anchor,
+            max_rejected=max_rejected,
+            progress=progress,
+        )
+    finish_dataset(dataset, out)

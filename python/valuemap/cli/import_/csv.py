@@ -1,0 +1,82 @@
+"""`valuemap import csv`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from valuemap import dataset as dataset_folder
+from valuemap.cli.import_.app import finish_dataset, import_app
+from valuemap.cli.import_.options import (
+    Anchor,
+    CameraHeight,
+    CameraText,
+    ClassName,
+    Columns,
+    DetectionColumns,
+    Detections,
+    DetectionsFormat,
+    Fractions,
+    FullScore,
+    PixelCenter,
+    detection_file,
+)
+from valuemap.cli.options import DatasetOut, MaxRejected, Up
+from valuemap.cli.show import progress_bars
+from valuemap.folders import check_place
+from valuemap.readers.csv_file import parse_columns
+from valuemap.readers.vet import MAX_REJECTED
+
+
+@import_app.command("csv")
+def import_csv(
+    poses: Annotated[Path, typer.Argument(help="CSV: image; lat,lon or x,y; heading_deg or a quaternion; ...")],
+    out: DatasetOut,
+    detections: Detections = None,
+    detections_format: DetectionsFormat = "auto",
+    detection_columns: DetectionColumns = None,
+    class_name: ClassName = "object",
+    camera: CameraText = None,
+    columns: Columns = None,
+    rotation: Annotated[str, typer.Option(help="What a quaternion does.")] = "cam_from_world",
+    axes: Annotated[str, typer.Option(help="Of the camera that a quaternion is about.")] = "right-down-forward",
+    pixel_center: PixelCenter = 0.5,
+    fractions: Fractions = False,
+    full_score: FullScore = 1.0,
+    camera_height: CameraHeight = 0.0,
+    crs: Annotated[str | None, typer.Option(help="Reference system of x, y: EPSG:32610.")] = None,
+    up: Up = None,
+    anchor: Anchor = None,
+    max_rejected: MaxRejected = MAX_REJECTED,
+) -> None:
+    """Import a table of images with poses or headings, on the Earth, in a map projection or in a frame of its own."""
+    from valuemap.readers import READERS
+
+    check_place(out, marker=dataset_folder.MARKER)
+    with progress_bars() as progress:
+        dataset = READERS["csv"](
+            poses,
+            detections=detection_file(
+                detections,
+                detections_format,
+                class_name=class_name,
+                columns=detection_columns,
+                pixel_center=pixel_center,
+                full_score=full_score,
+                fractions=fractions,
+            ),
+            camera=camera,
+            columns=parse_columns(columns or []),
+            rotation=rotation,
+            axes=axes,
+            pixel_center=pixel_center,
+            camera_height_m=camera_height,
+            crs=crs,
+            up=up,
+            anchor=anchor,
+            max_rejected=max_rejected,
+            progress=progress,
+        )
+    finish_dataset(dataset, out)

@@ -1,0 +1,357 @@
+"""Tables of the user's own: poses, headings, map projections and bearings, against geometry done by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from pyproj import Transformer
+
+from reading import SPOILS, azimuths_deg, meeting_point, refusal, spoiled, write
+from valuemap.cameras import camera_centers, cast_rays, rotation_matrices
+from valuemap.dataset import Dataset, read_dataset, write_dataset
+from valuemap.readers.bearings import VERTICAL_SIGMA_PX, read_bearings
+from valuemap.readers.csv_poses import read_csv_poses
+from valuemap.readers.detections import DetectionFile
+from valuemap.tables import Floats
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+CAMERA = "PINHOLE 640 480 500 500 320 240"
+# At these places two positions 1e-5 degrees apart are 1.1132 m (east, at the equator) and 1.1057 m (north) apart.
+DEGREE_EAST_M, DEGREE_NORTH_M = 111319.4908, 110574.2758
+
+
+def poses_of(folder: Path, header: str, *rows: str) -> Path:
+    return write(folder / "poses.csv", "\n".join([header, *rows]) + "\n")
+
+
+def boxes_of(folder: Path, *boxes: tuple[str, float, float]) -> Path:
+    lines = [f"{image},{x - 5},{y - 10},{x + 5},{y + 10},light" for image, x, y in boxes]
+    return write(folder / "boxes.csv", "\n".join(["image,x1,y1,x2,y2,class", *lines]) + "\n")
+
+
+def test_a_heading_counts_clockwise_from_north_and_right_of_it_is_more(tmp_path: Path) -> None:
+    """A box one focal length right of the middle is 45 degrees clockwise of the heading."""
+    poses = poses_of(tmp_path, "image,lat,lon,heading_deg", "a.jpg,0,0,90", "b.jpg,0.0001,0,350")
+    boxes = boxes_of(tmp_path, ("a.jpg", 320, 240), ("a.jpg", 620, 240), ("b.jpg", 620, 240))
+    dataset = read_csv_poses(poses, camera=CAMERA, detections=boxes)
+    right = np.degrees(np.arctan2(300.0, 500.0))
+    assert_allclose(azimuths_deg(dataset), [90.0, 90.0 + right, 350.0 + right - 360.0], atol=1e-9)
+    assert_allclose(cast_rays(dataset).direction_in_world[:, 2], 0.0, atol=1e-5)
+    assert dataset.frame.anchor == (0.0, 0.0, 0.0)
+    assert_allclose(camera_centers(dataset.images)[1], [0.0, 1e-4 * DEGREE_NORTH_M, 0.0], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [("heading_deg", 210.0), ("heading_rad", np.radians(210)), ("yaw_deg", -120.0), ("yaw_rad", -np.radians(120))],
+)
+def test_a_heading_may_be_given_in_four_ways(tmp_path: Path, column: str, value: float) -> None:
+    poses = poses_of(tmp_path, f"image,lat,lon,{column}", f"a.jpg,0,0,{float(value)!r}")
+    dataset = read_csv_poses(poses, camera=CAMERA, detections=boxes_of(tmp_path, ("a.jpg", 320, 240)))
+    assert_allclose(azimuths_deg(dataset), 210.0, atol=1e-9)
+
+
+def test_pitch_is_up_and_roll_turns_the_right_side_down(tmp_path: Path) -> None:
+    """The middle of a picture pitched up by 30 degrees; the right of one that is rolled by a quarter turn is below."""
+    poses = poses_of(
+        tmp_path, "image,lat,lon,heading_deg,pitch_deg,roll_deg", "a.jpg,0,0,0,30,0", "b.jpg,0.0001,0,0,0,90"
+    )
+    boxes = boxes_of(tmp_path, ("a.jpg", 320, 240), ("b.jpg", 620, 240))
+    pitched, rolled = cast_rays(read_csv_poses(poses, camera=CAMERA, detections=boxes)).direction_in_world
+    assert_allclose(pitched, [0.0, np.cos(np.pi / 6), np.sin(np.pi / 6)], atol=1e-9)
+    assert_allclose(rolled, np.array([0.0, 500.0, -300.0]) / np.hypot(500.0, 300.0), atol=1e-5)
+
+
+def test_quaternions_of_both_directions_and_of_other_axes(tmp_path: Path) -> None:
+    """A camera that looks along x with z up: x right of it is -y, down is -z. By hand: w x y z = (1, -1, 1, -1) / 2."""
+    boxes = boxes_of(tmp_path, ("a.jpg", 620, 140))
+    expected = np.array([500.0, -300.0, 100.0]) / np.linalg.norm([500.0, 300.0, 100.0])
+    for rotation, quaternion, axes in (
+        ("world_from_cam", (0.5, -0.5, 0.5, -0.5), "right-down-forward"),
+        ("cam_from_world", (0.5, 0.5, -0.5, 0.5), "right-down-forward"),
+        ("world_from_cam", (1, 0, 0, 0), "forward-left-up"),
+        ("world_from_cam", (0.5, 0.5, -0.5, -0.5), "right-up-back"),
+    ):
+        poses = poses_of(tmp_path, "image,x,y,z,qw,qx,qy,qz", f"a.jpg,3,4,5,{','.join(map(str, quaternion))}")
+        dataset = read_csv_poses(poses, camera=CAMERA, detections=boxes, rotation=rotation, axes=axes, up=(0, 0, 1))
+        assert_allclose(cast_rays(dataset).direction_in_world[0], expected, atol=1e-12, err_msg=f"{rotation} {axes}")
+        assert_allclose(camera_centers(dataset.images)[0], [3, 4, 5], atol=1e-12)
+
+
+def test_a_heading_in_a_map_projection_is_that_of_its_grid(tmp_path: Path) -> None:
+    """At 60 N, 3 degrees east of the middle of zone 32, grid north is 3 sin(60) = 2.60 degrees clockwise of north."""
+    to_utm = Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True)
+    east, north = to_utm.transform(12.0, 60.0)
+    poses = poses_of(
+        tmp_path, "image,x,y,heading_deg", f"a.jpg,{east!r},{north!r},0", f"b.jpg,{east!r},{north + 100!r},90"
+    )
+    dataset = read_csv_poses(
+        poses, camera=CAMERA, detections=boxes_of(tmp_path, ("a.jpg", 320, 240), ("b.jpg", 320, 240)), crs="EPSG:32632"
+    )
+    assert dataset.frame.anchor is not None
+    assert_allclose(dataset.frame.anchor[:2], (60.0, 12.0), atol=1e-9)
+    convergence = 3.0 * np.sin(np.radians(60.0))
+    assert_allclose(azimuths_deg(dataset), [convergence, 90.0 + convergence], atol=0.01)
+    step = np.diff(camera_centers(dataset.images), axis=0)[0]
+    assert_allclose(np.degrees(np.arctan2(step[0], step[1])), convergence, atol=0.01)
+    # On the map 3 degrees off the middle is stretched: 0.9996 (1 + (east - 500 km)² / 2 R²) = 0.99994.
+    assert_allclose(np.linalg.norm(step), 100.0 / 0.99994, atol=1e-3)
+
+
+def earth_centred(lon_lat_height: Floats) -> Floats:
+    to_earth = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    return np.stack(to_earth.transform(*lon_lat_height.T), axis=1)
+
+
+def test_far_from_the_anchor_positions_are_exact_and_cameras_stay_level(tmp_path: Path) -> None:
+    """Over 60 km the local frame keeps every distance to a millimetre, and level cameras follow the Earth's bend."""
+    lat_lon = np.array([[52.0 + 0.05 * i, 4.0 + 0.08 * i] for i in range(10)])
+    rows = [f"{i}.jpg,{lat!r},{lon!r},43.0,{36.0 * i},{i}" for i, (lat, lon) in enumerate(lat_lon.tolist())]
+    dataset = read_csv_poses(poses_of(tmp_path, "image,lat,lon,height,heading_deg,pass", *rows), camera=CAMERA)
+    on_earth = earth_centred(np.column_stack([lat_lon[:, 1], lat_lon[:, 0], np.full(10, 43.0)]))
+    centers = camera_centers(dataset.images)
+    extent = np.linalg.norm(on_earth[-1] - on_earth[0])
+    assert extent > 60_000
+    between = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+    assert_allclose(between, np.linalg.norm(on_earth[:, None] - on_earth[None], axis=2), rtol=0, atol=1e-3)
+    up = -rotation_matrices(dataset.images)[:, 1]
+    tilt = np.degrees(np.arccos(np.clip(up @ up[0], -1, 1)))
+    assert_allclose(tilt[-1], np.degrees(extent / 6.375e6), rtol=5e-3)
+    # One metre up from each camera is one metre up on the Earth.
+    lifted = earth_centred(np.column_stack([lat_lon[:, 1], lat_lon[:, 0], np.full(10, 44.0)]))
+    assert_allclose(
+        np.linalg.norm((centers + up)[:, None] - centers[None], axis=2),
+        np.linalg.norm(lifted[:, None] - on_earth[None], axis=2),
+        rtol=0,
+        atol=1e-3,
+    )
+
+
+def test_cameras_passes_times_rigs_and_sigmas_come_from_columns(tmp_path: Path) -> None:
+    header = (
+        "image,lat,lon,heading_deg,width_px,height_px,fx,cx,cy,pass,timestamp,rig,position_sigma_m,rotation_sigma_deg"
+    )
+    poses = poses_of(
+        tmp_path,
+        header,
+        "b.jpg,0,0.0001,0,1242,375,721.5,609.5,172.5,mon,2023-11-14T22:13:20.5Z,1,0.1,2",
+        "a.jpg,0,0,0,1242,375,721.5,609.5,172.5,mon,1700000000.25,1,,",
+        "c.jpg,0,0.0002,0,640,480,500,320,240,tue,,2,0.3,1",
+    )
+    dataset = read_csv_poses(poses, pixel_center=0.0)
+    assert dataset.images.name.to_pylist() == ["a.jpg", "b.jpg", "c.jpg"]
+    assert dataset.images.pass_id.texts() == ["mon", "mon", "tue"]
+    assert dataset.images.timestamp_s is not None
+    assert_allclose(dataset.images.timestamp_s, [1700000000.25, 1700000000.5, np.nan])
+    assert dataset.images.rig_id is not None
+    assert dataset.images.rig_id.tolist() == [0, 0, 1]
+    assert dataset.images.position_sigma_m is not None
+    assert_allclose(dataset.images.position_sigma_m, [np.nan, 0.1, 0.3])
+    assert dataset.images.rotation_sigma_rad is not None
+    assert_allclose(dataset.images.rotation_sigma_rad[1:], np.radians([2.0, 1.0]))
+    assert len(dataset.cameras) == 2
+    assert [params.tolist() for params in dataset.cameras.params] == [
+        [500, 500, 320.5, 240.5],
+        [721.5, 721.5, 610, 173],
+    ]
+    write_dataset(dataset, tmp_path / "dataset")
+    assert read_dataset(tmp_path / "dataset").images.rig_id is not None
+
+
+def test_a_camera_model_may_stand_in_a_row(tmp_path: Path) -> None:
+    poses = poses_of(
+        tmp_path,
+        "image,lat,lon,heading_deg,width_px,height_px,model,params",
+        "a.jpg,0,0,0,800,600,OPENCV_FISHEYE,300 300 400 300 0 0 0 0",
+        "b.jpg,0,0.0001,0,800,400,EQUIRECTANGULAR,",
+    )
+    assert read_csv_poses(poses).cameras.model.texts() == ["EQUIRECTANGULAR", "OPENCV_FISHEYE"]
+    bad = poses_of(tmp_path, "image,lat,lon,heading_deg,width_px,height_px,model,params", "a.jpg,0,0,0,8,6,PINHOLE,1 2")
+    assert "line 2: camera 'PINHOLE 8 6 1 2': PINHOLE has the parameters fx, fy, cx, cy" in refusal(
+        lambda: read_csv_poses(bad)
+    )
+
+
+def test_key_points_as_fractions_of_a_panorama(tmp_path: Path) -> None:
+    """A quarter of the width is 90 degrees; a cell of a 512 x 256 heat map has its middle at 0.5 / 512."""
+    poses = poses_of(tmp_path, "image,lat,lon,heading_deg", "p,0,0,100", "q,0,0.001,0")
+    points = write(tmp_path / "points.csv", "id,u,v,confidence\np,0.25,0.5,1.02\np,0.75,0.25,0.51\n")
+    file = DetectionFile(
+        points,
+        columns={"image": "id", "x": "u", "y": "v", "score": "confidence"},
+        fractions=True,
+        full_score=1.02,
+        class_name="ramp",
+    )
+    dataset = read_csv_poses(poses, camera="EQUIRECTANGULAR 512 256", detections=file)
+    assert_allclose(azimuths_deg(dataset), [190.0, 10.0], atol=1e-9)
+    assert_allclose(cast_rays(dataset).direction_in_world[:, 2], [np.sqrt(0.5), 0.0], atol=1e-9)
+    assert_allclose(dataset.detections.score, [0.5, 1.0])
+    assert not dataset.detections.size_px.any()
+    assert dataset.detections.class_name.texts() == ["ramp", "ramp"]
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "options", "said"),
+    [
+        (
+            "image,lat,lon,heading_deg",
+            "a.jpg,123.4,52.0,0",
+            {},
+            "expected degrees, found latitude 123.4 and longitude 52",
+        ),
+        ("image,lat,lon,yaw_rad", "a.jpg,52,4,123", {}, "yaw_rad: expected radians, found 123"),
+        ("image,lat,lon", "a.jpg,52,4", {}, "expected one of heading_deg"),
+        ("image,heading_deg", "a.jpg,4", {}, "expected lat, lon or x, y"),
+        ("name,lat,lon,heading_deg", "a.jpg,52,4,1", {}, "expected a column 'image'"),
+        ("image,lat,lon,heading_deg", "../a.jpg,52,4,1", {}, "stays in the folder"),
+        ("image,lat,lon,heading_deg", "/etc/passwd,52,4,1", {}, "stays in the folder"),
+        ("image,lat,lon,heading_deg", "a.jpg,52,4,1", {"columns": {"lat": "latitude"}}, "has no column 'latitude'"),
+        ("image,lat,lon,heading_deg", "a.jpg,52,4,1", {"columns": {"latt": "lat"}}, "there is no column 'latt'"),
+        ("image,lat,lon,heading_deg", "a.jpg,52,4,1", {"crs": "EPSG:32632"}, "do not go with columns lat, lon"),
+        (
+            "image,lat,lon,heading_deg",
+            "a.jpg,52,4,1",
+            {"camera": "PINHOL 1 2"},
+            "expected one of COLMAP's camera models",
+        ),
+        ("image,lat,lon,heading_deg", "a.jpg,52,4,1", {"camera": None}, "where no camera is given"),
+        (
+            "image,x,y,heading_deg",
+            "a.jpg,52,4,1",
+            {"crs": "EPSG:123456"},
+            "crs 'EPSG:123456': cannot be brought to WGS84",
+        ),
+        ("image,x,y,heading_deg", "a.jpg,1e9,4,1", {"crs": "EPSG:32632"}, "is no place in it"),
+        ("image,lat,lon,heading_deg,timestamp", "a.jpg,52,4,1,noon", {}, "line 2: timestamp: expected seconds"),
+        ("image,lat,lon,qw,qx,qy,qz", "a.jpg,52,4,1,2,3,4", {}, "a number of its pose is missing"),
+        ("image,lat,lon,heading_deg", "a.jpg,52,4,x", {}, "a number of its pose is missing"),
+        ("image,lat,lon,heading_deg", "a.jpg,52,x,0", {}, "no image has a place"),
+        ("image,lat,lon,heading_deg", "a.jpg,52,4,0\na.jpg,52,4,0", {}, "occur more than once, the first is 'a.jpg'"),
+    ],
+)
+def test_bad_tables(tmp_path: Path, header: str, row: str, options: dict[str, Any], said: str) -> None:
+    poses = poses_of(tmp_path, header, row)
+    assert said in refusal(lambda: read_csv_poses(poses, **{"camera": CAMERA, **options}))
+
+
+@pytest.mark.parametrize("how", SPOILS)
+def test_files_that_are_no_tables(tmp_path: Path, how: str) -> None:
+    poses = poses_of(tmp_path, "image,lat,lon,heading_deg", "a.jpg,52,4,1")
+    boxes = boxes_of(tmp_path, ("a.jpg", 3, 4))
+    assert "boxes.csv" in refusal(lambda: read_csv_poses(poses, camera=CAMERA, detections=spoiled(boxes, how)))
+    assert "poses.csv" in refusal(lambda: read_csv_poses(spoiled(poses, how), camera=CAMERA))
+    bearings = write(tmp_path / "b" / "bearings.csv", "lat,lon,bearing\n1,2,3\n")
+    assert "bearings.csv" in refusal(lambda: read_bearings(spoiled(bearings, how)))
+
+
+# Bearings.
+
+
+def two_bearings(tmp_path: Path) -> Path:
+    """From (0, 0) an object 30 m north and 40 m east; from 60 m east of there the same."""
+    east = 60.0 / DEGREE_EAST_M
+    first, second = np.degrees(np.arctan2(40.0, 30.0)), np.degrees(np.arctan2(-20.0, 30.0))
+    return write(
+        tmp_path / "bearings.csv", f"lat,lon,bearing,depth\n0,0,{float(first)!r},50\n0,{east!r},{float(second)!r},\n"
+    )
+
+
+def test_bearings_meet_where_the_object_is(tmp_path: Path) -> None:
+    dataset = read_bearings(two_bearings(tmp_path), class_name="light")
+    assert_allclose(meeting_point(dataset, within_m=1e-3)[:2], [40.0, 30.0], atol=1e-3)
+    assert dataset.detections.range_m is not None
+    assert_allclose(dataset.detections.range_m, [50.0, np.nan])
+    assert dataset.detections.range_sigma_m is not None
+    assert_allclose(dataset.detections.range_sigma_m, [15.0, np.nan])
+    assert dataset.detections.class_name.texts() == ["light", "light"]
+
+
+def test_the_elevation_and_size_of_a_bearing_were_not_measured(tmp_path: Path) -> None:
+    """At this deviation a normal density is at most as high as the even one over the picture, so it says nothing."""
+    dataset = read_bearings(two_bearings(tmp_path))
+    height = float(dataset.cameras.height_px[0])
+    assert_allclose(dataset.detections.center_px[:, 1], height / 2.0)
+    assert dataset.detections.vertical_sigma_px is not None
+    assert_allclose(dataset.detections.vertical_sigma_px, VERTICAL_SIGMA_PX)
+    assert_allclose(1.0 / (np.sqrt(2.0 * np.pi) * VERTICAL_SIGMA_PX), 1.0 / height, rtol=1e-12)
+    assert not dataset.detections.size_px.any()
+    write_dataset(dataset, tmp_path / "dataset")
+    again = read_dataset(tmp_path / "dataset").detections.vertical_sigma_px
+    assert again is not None
+    assert_allclose(again, VERTICAL_SIGMA_PX)
+
+
+def test_bearings_of_one_place_are_of_one_image_unless_they_say_otherwise(tmp_path: Path) -> None:
+    rows = "1,2,10\n1,2,20\n1,2.0001,30\n"
+    assert len(read_bearings(write(tmp_path / "a.csv", f"lat,lon,bearing\n{rows}")).images) == 2
+    named = "a,1,2,10\nb,1,2,20\nc,1,2.0001,30\n"
+    assert len(read_bearings(write(tmp_path / "b.csv", f"image,lat,lon,bearing\n{named}")).images) == 3
+    moved = write(tmp_path / "c.csv", "image,lat,lon,bearing\na,1,2,10\na,1,2.1,20\n")
+    assert "line 3: image 'a' is at two places" in refusal(lambda: read_bearings(moved))
+
+
+def test_a_bearing_that_is_no_number_is_left_out(tmp_path: Path) -> None:
+    rows = "".join(f"1,2,{bearing}\n" for bearing in (10, "x", *range(20, 320)))
+    dataset = read_bearings(write(tmp_path / "a.csv", f"lat,lon,bearing\n{rows}"))
+    assert len(dataset.detections) == 301
+    assert dataset.rejected is not None
+    assert dataset.rejected.place.to_pylist()[0].endswith("a.csv line 3")
+
+
+# Real data, where it is there.
+
+
+def real(name: str) -> Path:
+    if not (DATA / name).is_dir():
+        pytest.skip(f"{DATA / name} is not here")
+    return DATA / name
+
+
+def test_london_imports_without_a_script() -> None:
+    dataset = read_bearings(real("london_tl") / "detection_input.csv", class_name="traffic light")
+    assert (len(dataset.images), len(dataset.detections), dataset.rejected) == (50, 173, None)
+
+
+def test_bend_imports_without_a_script() -> None:
+    folder = real("bend_ramps")
+    dataset = read_csv_poses(
+        folder / "panoramas.csv",
+        columns={"image": "panorama_id", "pass": "captured"},
+        camera="EQUIRECTANGULAR 512 256",
+        camera_height_m=2.5,
+        detections=DetectionFile(
+            folder / "detections.csv",
+            columns={"image": "panorama_id", "x": "x_normalized", "y": "y_normalized", "score": "confidence"},
+            fractions=True,
+            full_score=1.05,
+            class_name="ramp",
+        ),
+    )
+    assert (len(dataset.images), len(dataset.detections), dataset.rejected) == (9857, 24185, None)
+
+
+def kitti_ts() -> Dataset:
+    folder = real("kitti_ts")
+    return read_csv_poses(
+        folder / "images.csv",
+        columns={
+            "yaw_rad": "yaw_rad_ccw_from_east",
+            "pass": "drive",
+            "width_px": "width",
+            "height_px": "height",
+        },
+        pixel_center=0.0,
+        camera_height_m=1.65,
+        detections=DetectionFile(folder / "detections.csv", pixel_center=0.0),
+    )
+
+
+def test_kitti_ts_imports_without_a_script() -> None:
+    dataset = kitti_ts()
+    assert (len(dataset.images), len(dataset.detections), dataset.rejected) == (1756, 2363, None)
+    assert len(set(dataset.images.pass_id.texts())) == 37

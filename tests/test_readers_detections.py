@@ -1,0 +1,231 @@
+"""Formats of detections: boxes come out where they are in the picture, whatever the poses come from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from numpy.testing import assert_allclose
+
+from reading import refusal, spoiled, write
+from valuemap.dataset import Dataset
+from valuemap.readers.csv_poses import read_csv_poses
+from valuemap.readers.detections import DETECTIONS, DetectionFile
+
+# One box of 40 x 20 px with its top-left corner at (100, 50) in the picture a/1.jpg of 640 x 480 px.
+CENTER, SIZE = (120.0, 60.0), (40.0, 20.0)
+
+COCO = """{"images": [{"id": 7, "file_name": "a/1.jpg", "width": 640, "height": 480}],
+"annotations": [{"image_id": 7, "category_id": 3, "bbox": [100, 50, 40, 20], "score": 0.5}],
+"categories": [{"id": 3, "name": "light"}]}"""
+CVAT = """<?xml version="1.0" encoding="utf-8"?>
+<annotations><version>1.1</version>
+<image id="0" name="a/1.jpg" width="640" height="480">
+<box label="light" occluded="0" xtl="100.0" ytl="50.0" xbr="140.0" ybr="70.0" z_order="0"></box>
+<polygon label="light" points="1,2;3,4;5,6"></polygon></image>
+<image id="1" name="a/2.jpg" width="640" height="480"></image></annotations>
+"""
+BOSCH = """- boxes:
+  - {label: light, occluded: false, x_max: 140.0, x_min: 100.0, y_max: 70.0, y_min: 50.0}
+  path: ./a/1.jpg
+- boxes: []
+  path: ./a/2.jpg
+"""
+YOLO = "0 0.1875 0.125 0.0625 0.0416666666666667 0.5\n"
+CORNERS = "image,x1,y1,x2,y2,class\na/1.jpg,100,50,140,70,light\n"
+
+
+def poses_in(folder: Path) -> Path:
+    return write(folder / "poses.csv", "image,lat,lon,heading_deg\na/1.jpg,52,4,0\na/2.jpg,52,4.0001,0\n")
+
+
+def detections_in(folder: Path, kind: str) -> Path:
+    """Write the one box in a format, where a reader finds it."""
+    if kind == "yolo":
+        write(folder / "data.yaml", "names:\n  0: light\n")
+        write(folder / "labels" / "a" / "1.txt", YOLO)
+        write(folder / "labels" / "a" / "2.txt", "")
+        return folder / "labels"
+    text, name = {
+        "coco": (COCO, "boxes.json"),
+        "cvat": (CVAT, "annotations.xml"),
+        "bosch": (BOSCH, "train.yaml"),
+        "csv": (CORNERS, "boxes.csv"),
+    }[kind]
+    return write(folder / name, text)
+
+
+def read(folder: Path, file: DetectionFile | Path, **options: Any) -> Dataset:
+    return read_csv_poses(poses_in(folder), camera="PINHOLE 640 480 500 500 320 240", detections=file, **options)
+
+
+@pytest.mark.parametrize("kind", DETECTIONS)
+def test_a_box_is_where_it_is_in_the_picture(tmp_path: Path, kind: str) -> None:
+    path = detections_in(tmp_path, kind)
+    for file in (path, DetectionFile(path, format=kind)):
+        dataset = read(tmp_path, file)
+        assert_allclose(dataset.detections.center_px, [CENTER], atol=1e-9)
+        assert_allclose(dataset.detections.size_px, [SIZE], atol=1e-9)
+        assert dataset.detections.class_name.texts() == ["light"]
+        assert dataset.images.name.to_pylist()[int(dataset.detections.image_id[0])] == "a/1.jpg"
+        assert_allclose(dataset.detections.score, [0.5 if kind in ("coco", "yolo") else 1.0])
+
+
+@pytest.mark.parametrize(
+    ("table", "options"),
+    [
+        ("image,left,top,width,height\na/1.jpg,100,50,40,20\n", {}),
+        ("image,x,y,width,height\na/1.jpg,120,60,40,20\n", {}),
+        ("Image;X1;Y1;X2;Y2\na/1.jpg;100;50;140;70\n", {}),
+        ("image,x1,y1,x2,y2\na/1.jpg,99.5,49.5,139.5,69.5\n", {"pixel_center": 0.0}),
+        ("image,x,y,width,height\na/1.jpg,0.1875,0.125,0.0625,0.0416666666666667\n", {"fractions": True}),
+        (
+            "Filename;Annotation tag;Upper left corner X;Upper left corner Y;Lower right corner X;"
+            "Lower right corner Y\n"
+            "a/1.jpg;light;100;50;140;70\n",
+            {
+                "columns": {
+                    "image": "Filename",
+                    "class": "Annotation tag",
+                    "x1": "Upper left corner X",
+                    "y1": "Upper left corner Y",
+                    "x2": "Lower right corner X",
+                    "y2": "Lower right corner Y",
+                }
+            },
+        ),
+    ],
+)
+def test_a_table_may_say_the_same_box_in_many_ways(tmp_path: Path, table: str, options: dict[str, Any]) -> None:
+    path = write(tmp_path / "boxes.csv", table)
+    dataset = read(tmp_path, DetectionFile(path, class_name="light", **options))
+    assert_allclose(dataset.detections.center_px, [CENTER], atol=1e-9)
+    assert_allclose(dataset.detections.size_px, [SIZE], atol=1e-9)
+    assert dataset.detections.class_name.texts() == ["light"]
+
+
+def test_a_range_and_a_vertical_sigma_may_be_given(tmp_path: Path) -> None:
+    path = write(
+        tmp_path / "boxes.csv", "image,x,y,score,range_m,range_sigma_m,vertical_sigma_px\na/1.jpg,9,9,0.3,12,2,44\n"
+    )
+    found = read(tmp_path, path).detections
+    assert found.range_m is not None
+    assert found.range_sigma_m is not None
+    assert found.vertical_sigma_px is not None
+    assert (found.range_m[0], found.range_sigma_m[0], found.vertical_sigma_px[0]) == (12.0, 2.0, 44.0)
+    assert not found.size_px.any()
+
+
+def test_a_polygon_of_yolo_counts_as_its_box(tmp_path: Path) -> None:
+    labels = detections_in(tmp_path, "yolo")
+    write(labels / "a" / "1.txt", "2 0.15625 0.125 0.1875 0.104166666667 0.21875 0.125 0.1875 0.145833333333\n")
+    dataset = read(tmp_path, labels)
+    assert_allclose(dataset.detections.center_px, [CENTER], atol=1e-6)
+    assert_allclose(dataset.detections.size_px, [SIZE], atol=1e-6)
+    assert dataset.detections.class_name.texts() == ["class-2"]
+
+
+@pytest.mark.parametrize("kind", DETECTIONS)
+def test_boxes_of_unknown_images_are_left_out_and_named(tmp_path: Path, kind: str) -> None:
+    path = detections_in(tmp_path, kind)
+    where = path / "a" / "1.txt" if kind == "yolo" else path
+    if kind == "yolo":
+        where.rename(path / "a" / "9.txt")
+    else:
+        where.write_text(where.read_text().replace("a/1.jpg", "a/9.jpg"))
+    assert "its image is not among the images with a pose" in refusal(lambda: read(tmp_path, path))
+
+
+@pytest.mark.parametrize("kind", ["coco", "cvat"])
+def test_boxes_made_on_pictures_of_another_size_are_refused(tmp_path: Path, kind: str) -> None:
+    path = detections_in(tmp_path, kind)
+    path.write_text(path.read_text().replace("640", "1280"))
+    assert "expected 640 x 480 px as in the model, found 1280 x 480" in refusal(lambda: read(tmp_path, path))
+
+
+@pytest.mark.parametrize("how", ["empty", "cut", "binary", "other", "pipe", "folder", "absent"])
+@pytest.mark.parametrize("kind", ["coco", "cvat", "bosch", "csv"])
+def test_files_that_are_of_no_such_format(tmp_path: Path, kind: str, how: str) -> None:
+    path = spoiled(detections_in(tmp_path, kind), how)
+    if (kind, how) != ("csv", "cut"):  # A cut line of a table is a shorter number.
+        assert path.name in refusal(lambda: read(tmp_path, DetectionFile(path, format=kind)))
+
+
+@pytest.mark.parametrize("how", ["binary", "other", "pipe", "link"])
+def test_label_files_that_are_not_yolos(tmp_path: Path, how: str) -> None:
+    folder = detections_in(tmp_path, "yolo")
+    spoiled(folder / "a" / "1.txt", how)
+    assert "1.txt" in refusal(lambda: read(tmp_path, folder))
+
+
+def test_folders_without_labels(tmp_path: Path) -> None:
+    (tmp_path / "labels").mkdir()
+    assert "there are no .txt files in it" in refusal(lambda: read(tmp_path, tmp_path / "labels"))
+    (tmp_path / "labels" / "a.txt").write_text("")
+    assert "there are no detections in it" in refusal(lambda: read(tmp_path, tmp_path / "labels"))
+
+
+@pytest.mark.parametrize(
+    "row",
+    ["0 0.1 0.2 0.3", "light 0.1 0.2 0.3 0.4", "-1 0.1 0.2 0.3 0.4", "0 0.1 0.2 0.3 0.4 0.5 0.6 0.7", "0.5 1 1 1 1"],
+)
+def test_rows_that_are_not_yolos(tmp_path: Path, row: str) -> None:
+    folder = detections_in(tmp_path, "yolo")
+    write(folder / "a" / "1.txt", f"{YOLO}{row}\n")
+    assert "1.txt line 2: expected class cx cy width height" in refusal(lambda: read(tmp_path, folder))
+
+
+def test_an_alias_bomb_is_refused_before_it_goes_off(tmp_path: Path) -> None:
+    levels = "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 12))
+    path = write(tmp_path / "train.yaml", f"a0: &a0 [x, x]\n{levels}")
+    assert "train.yaml: has an alias, *a0" in refusal(lambda: read(tmp_path, path))
+
+
+def test_an_entity_bomb_is_refused_before_it_goes_off(tmp_path: Path) -> None:
+    entities = "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 12))
+    path = write(tmp_path / "a.xml", f'<!DOCTYPE a [<!ENTITY a0 "x">{entities}]><annotations>&a11;</annotations>')
+    assert "a.xml line 1: has a document type" in refusal(lambda: read(tmp_path, path))
+
+
+def test_an_outer_entity_is_not_read(tmp_path: Path) -> None:
+    path = write(
+        tmp_path / "a.xml", '<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/passwd">]><annotations>&x;</annotations>'
+    )
+    assert "has a document type" in refusal(lambda: read(tmp_path, path))
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "said"),
+    [
+        ("cvat", lambda text: text.replace('xtl="100.0"', 'xtl="x"'), "line 4: xtl: expected a number, found 'x'"),
+        ("cvat", lambda text: text.replace(' label="light"', ""), "line 4: expected label=..."),
+        ("cvat", lambda text: text.replace("<image ", "<track ").replace("</image>", "</track>"), "tracks name frames"),
+        (
+            "cvat",
+            lambda text: text.replace("<image ", "<picture ").replace("</image>", "</picture>"),
+            "no images in it",
+        ),
+        ("bosch", lambda text: text.replace("x_max: 140.0", "x_max: wide"), "[0]: boxes[0]: x_max: expected a finite"),
+        ("bosch", lambda text: text.replace("path: ./a/1.jpg", "file: ./a/1.jpg"), "[0]: expected 'path'"),
+        ("bosch", lambda _: "boxes: []\n", "expected a list"),
+        ("csv", lambda text: text.replace("y2", "y3"), "expected x1, y1, x2, y2, or left, top"),
+        ("csv", lambda text: text.replace("image", "picture"), "expected a column 'image'"),
+        ("csv", lambda text: text.replace("140", "x"), "a number is missing or not finite"),
+    ],
+)
+def test_bad_values(tmp_path: Path, kind: str, change: Callable[[str], str], said: str) -> None:
+    path = detections_in(tmp_path, kind)
+    path.write_text(change(path.read_text()))
+    assert said in refusal(lambda: read(tmp_path, path))
+
+
+def test_options_that_cannot_be(tmp_path: Path) -> None:
+    path = detections_in(tmp_path, "csv")
+    assert "there is no such format" in refusal(lambda: read(tmp_path, DetectionFile(path, format="voc")))
+    assert "full-score: expected above 0" in refusal(lambda: DetectionFile(path, full_score=0.0))
+    assert "pixel-center: expected 0 or 0.5" in refusal(lambda: DetectionFile(path, pixel_center=1.0))
+    path.rename(tmp_path / "boxes.dat")
+    assert "does not say the format" in refusal(lambda: read(tmp_path, tmp_path / "boxes.dat"))
+    assert len(read(tmp_path, DetectionFile(tmp_path / "boxes.dat", format="csv")).detections) == 1
