@@ -20,7 +20,9 @@ class Views(Table):
 
     `of_point` (N, 2, 3) is its derivative by the object's position in m, which is also that by the camera's but for
     the sign; `of_turn` (N, 2, 3) that by a rotation vector in rad in camera axes; `pixel_sigma` (N) the deviation of
-    the box's centre, each axis; `distance_m` (N) driven since the start of the pass.
+    the box's centre, each axis; `distance_m` (N) driven since the start of the pass; `exposure_row` (N) is one number
+    for all that the cameras of a car took at one time. The cameras of a car turn together: `of_turn` is by the turn of
+    a camera that looks ahead.
     """
 
     object_row: Ints
@@ -29,6 +31,7 @@ class Views(Table):
     of_point: Floats
     of_turn: Floats
     pixel_sigma: Floats
+    exposure_row: Ints
 
 
 def cramer_rao_covariances(views: Views, config: SimulationConfig, objects: int) -> Floats:
@@ -51,13 +54,17 @@ def cramer_rao_covariances(views: Views, config: SimulationConfig, objects: int)
 
 
 def true_views(recording: Recording) -> Views:
-    """Return the detections that show objects, with true poses, boxes and derivatives."""
+    """Return detections that show whole objects, one of each in an image, with true poses, boxes and derivatives."""
     dataset, config, objects = recording.dataset, recording.config, recording.city.objects
     assert dataset.truth is not None
     assert dataset.truth_detections is not None
     object_row = rows_of(dataset.truth_detections.object_id, dataset.truth.object_id)
     detection = rows_of(dataset.truth_detections.detection_id, dataset.detections.detection_id)
-    frames = recording.frames.take(rows_of(dataset.detections.image_id[detection], dataset.images.image_id))
+    frame_row = rows_of(dataset.detections.image_id[detection], dataset.images.image_id)
+    # A box of a part is around another middle, and a second box of a sighting tells nothing.
+    whole = np.flatnonzero(~recording.boxes.is_cut[detection])
+    once = whole[np.unique(np.stack([object_row[whole], frame_row[whole]]), axis=1, return_index=True)[1]]
+    object_row, frames = object_row[once], recording.frames.take(frame_row[once])
     cam_from_world = frames.cam_from_world()
     in_cam = np.einsum("nij,nj->ni", cam_from_world, objects.position_in_world_m[object_row] - frames.center_in_world_m)
     x, y, depth = in_cam.T
@@ -65,13 +72,19 @@ def true_views(recording: Recording) -> Views:
     of_cam[:, 0, 0] = of_cam[:, 1, 1] = config.focal_px / depth
     of_cam[:, 0, 2], of_cam[:, 1, 2] = -config.focal_px * x / depth**2, -config.focal_px * y / depth**2
     height_px = config.focal_px * objects.size_m[object_row, 1] / depth
+    of_turn = np.cross(in_cam[:, None], of_cam)
+    if config.cameras > 1:
+        aside_rad = np.radians(config.camera_spread_deg) * ((config.cameras - 1) / 2.0 - frames.camera_row)
+        ahead = frames.replace(heading_rad=frames.heading_rad - aside_rad).cam_from_world()
+        of_turn = of_turn @ cam_from_world @ ahead.transpose(0, 2, 1)
     views = Views(
         object_row=object_row,
         pass_row=frames.pass_row,
         distance_m=frames.distance_m,
         of_point=of_cam @ cam_from_world,
-        of_turn=np.cross(in_cam[:, None], of_cam),
+        of_turn=of_turn,
         pixel_sigma=np.hypot(config.pixel_noise_px, config.pixel_noise_share * height_px),
+        exposure_row=frames.exposure_row,
     )
     return views.take(np.lexsort((views.distance_m, views.pass_row, views.object_row)))
 
@@ -80,13 +93,18 @@ def residual_covariance(views: Views, config: SimulationConfig) -> Floats:
     """Return the covariance (2N, 2N) in px² of the residuals, x and y in turn, of views (N) of one pass.
 
     A pose error has a part of each image of its own and an Ornstein-Uhlenbeck process over the distance driven, whose
-    values d apart correlate with exp(-d / drift_length_m); see simulate/pose_errors.py.
+    values d apart correlate with exp(-d / drift_length_m), and another with middle_length_m; see
+    simulate/pose_errors.py. All cameras of an exposure share them.
     """
     apart_m = np.abs(views.distance_m[:, None] - views.distance_m)
-    drift, own = np.exp(-apart_m / config.drift_length_m), np.eye(len(views))
-    white_rad, drift_rad = np.radians([config.rotation_white_deg, config.rotation_drift_deg])
+    own = np.asarray(views.exposure_row[:, None] == views.exposure_row, dtype=np.float64)
+    drift, middle = np.exp(-apart_m / config.drift_length_m), np.exp(-apart_m / config.middle_length_m)
+    white_rad, drift_rad, middle_rad = np.radians(
+        [config.rotation_white_deg, config.rotation_drift_deg, config.rotation_middle_deg]
+    )
     position = config.position_white_m**2 * own + config.position_drift_m**2 * drift
-    rotation = white_rad**2 * own + drift_rad**2 * drift
+    position += config.position_middle_m**2 * middle
+    rotation = white_rad**2 * own + drift_rad**2 * drift + middle_rad**2 * middle
     covariance = np.diag(np.repeat(views.pixel_sigma**2, 2))
     for derivative, between_images in ((views.of_point, position), (views.of_turn, rotation)):
         rows = derivative.reshape(-1, 3)

@@ -38,9 +38,6 @@ from valuemap.dataset import Dataset, rows_of, write_dataset
 from valuemap.simulate import PRESETS, Recording, record_city, simulate
 from valuemap.tables import Bools, Floats, Ints
 
-MAX_BOUND_M = 0.5
-MIN_DETECTIONS = 3
-RIGHT_M = (1.0, 3.0)
 RIGHT_SIGMAS = 3.0
 
 
@@ -48,13 +45,16 @@ RIGHT_SIGMAS = 3.0
 class Scene:
     """What is simulated; for quick looks, only images within `small_radius_m` of the middle of a street, or less city.
 
-    Objects count that have `min_detections` and whose bound is small.
+    Objects count that have `min_detections` and whose bound is at most `max_bound_m`. Labels are right within the first
+    distance of `right_m`, and within the second if their own covariance says so.
     """
 
     config: SimulationConfig
     small_radius_m: float = 0.0
     small_city: SimulationConfig | None = None
-    min_detections: int = MIN_DETECTIONS
+    min_detections: int = 3
+    max_bound_m: float = 0.5
+    right_m: tuple[float, float] = (1.0, 3.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,12 +79,31 @@ def along_streets(passes: int = 6, **changes: float) -> SimulationConfig:
     return dataclasses.replace(SimulationConfig(), **settings)  # type: ignore[arg-type]
 
 
-def with_lights(passes: int = 6, min_detections: int = MIN_DETECTIONS, **changes: float) -> Scene:
-    """Return the city of `robust.py` with a fault; for quick looks a part of it, driven a third as often."""
+def with_lights(passes: int = 6, **changes: float) -> Scene:
+    """Return the city of `robust.py` with a fault; for quick looks a part of it, driven half as often."""
     small = {"streets_north_south": 2, "streets_east_west": 2}
-    small_city = city(max(passes // 3, 3), **{**small, **changes})
-    return Scene(city(passes, **changes), small_city=small_city, min_detections=min_detections)
+    return Scene(city(passes, **changes), small_city=city(max(passes // 2, 3), **{**small, **changes}))
 
+
+GPS: dict[str, Any] = {
+    "position_white_m": 0.2,
+    "position_middle_m": 0.3,
+    "position_drift_m": 1.5,
+    "rotation_white_deg": 0.2,
+    "rotation_drift_deg": 0.5,
+    "write_pose_sigmas": 1,
+}
+"""Poses as of a receiver for satellites and a compass, and said to be."""
+
+MIDDLE: dict[str, Any] = {
+    "position_white_m": 0.04,
+    "position_middle_m": 0.08,
+    "position_drift_m": 0.08,
+    "rotation_white_deg": 0.05,
+    "rotation_middle_deg": 0.1,
+    "rotation_drift_deg": 0.1,
+}
+"""Poses whose errors change over 15 m as well, of the same size as by default in all."""
 
 SCENES: dict[str, Scene] = {
     "signs-0.9": Scene(along_streets(sign_row_spacing_m=30.0, sign_apart_m=0.9), 45.0),
@@ -93,8 +112,21 @@ SCENES: dict[str, Scene] = {
     "trees-10": Scene(along_streets(tree_spacing_m=10.0, max_sight_m=60.0), 40.0),
     "trees-6": Scene(along_streets(tree_spacing_m=6.0, max_sight_m=60.0), 25.0),
     "posts-3": Scene(along_streets(3, post_spacing_m=3.0, max_sight_m=60.0), 16.0),
-    "clutter1": with_lights(20, clutter_per_image=1.0),
-    "poor": with_lights(5, 8, recall_mean=0.3, clutter_per_image=0.5),
+    "clutter1": with_lights(10, clutter_per_image=1.0),
+    "poor": dataclasses.replace(with_lights(5, recall_mean=0.3, clutter_per_image=0.5), min_detections=8),
+    "doubles-8": with_lights(double_share=0.08),
+    "doubles-all": with_lights(double_share=1.0),
+    "edge": with_lights(min_visible_share=0.3, partly_hidden_share=0.1),
+    "tails": with_lights(tail_share=0.05),
+    "shapes": with_lights(size_spread=0.2, side_offset_m=0.15),
+    "middle": with_lights(**MIDDLE),
+    "classes": with_lights(class_confusion=0.1, sign_row_spacing_m=40.0),
+    "two-cameras": with_lights(cameras=2, camera_folders=0),
+    "two-passes": with_lights(cameras=2, camera_folders=1, pass_per_camera=1),
+    "shuffled": with_lights(shuffle_ids=1),
+    "shuffled-names": with_lights(shuffle_ids=1, shuffle_names=1, write_timestamps=0),
+    "revisit": with_lights(1, laps=6),
+    "gps": dataclasses.replace(with_lights(**GPS), max_bound_m=1.5, right_m=(2.0, 5.0)),
 }
 
 
@@ -125,7 +157,7 @@ def main() -> None:
             recording = record_scene(scene, seed, is_small=options.small)
             if options.save is not None:
                 write_dataset(recording.dataset, options.save / f"{name}-{seed}")
-            outcomes.append(measure(recording, config, min_detections=scene.min_detections))
+            outcomes.append(measure(recording, config, scene))
         results.append({"name": name, **add_up(outcomes)})
         print(_line(results[-1]), flush=True)
     write_record(options.json, results)
@@ -159,13 +191,13 @@ def part_of_recording(recording: Recording, rows: Bools) -> Recording:
     )
 
 
-def measure(recording: Recording, config: valuemap.MapConfig, *, min_detections: int) -> Outcome:
+def measure(recording: Recording, config: valuemap.MapConfig, scene: Scene) -> Outcome:
     """Map a recording and compare with the truth."""
     dataset = recording.dataset
     start = time.perf_counter()
     result = valuemap.build_map(dataset, config)
     seconds = time.perf_counter() - start
-    is_bound, is_detected = objects_that_count(recording, min_detections)
+    is_bound, is_detected = objects_that_count(recording, scene)
     counts = is_bound & is_detected
     labels = result.labels
     assert dataset.truth is not None
@@ -173,7 +205,7 @@ def measure(recording: Recording, config: valuemap.MapConfig, *, min_detections:
     class_code = np.array([dataset.truth.class_name.code_of(name) for name in labels.class_name.names], dtype=np.int64)
     error = labels.position_in_world_m[:, None] - dataset.truth.position_in_world_m
     squared = np.einsum("loi,lij,loj->lo", error, np.linalg.inv(covariance), error)
-    is_near = is_right(np.linalg.norm(error, axis=2), squared)
+    is_near = is_right(np.linalg.norm(error, axis=2), squared, scene.right_m)
     is_near &= class_code[labels.class_name.codes][:, None] == dataset.truth.class_name.codes
     label, matched = match_one_to_one(np.linalg.norm(error, axis=2), is_near)
     is_alone = np.ones(len(labels), dtype=np.bool_)
@@ -192,14 +224,14 @@ def measure(recording: Recording, config: valuemap.MapConfig, *, min_detections:
     )
 
 
-def objects_that_count(recording: Recording, min_detections: int) -> tuple[Bools, Bools]:
+def objects_that_count(recording: Recording, scene: Scene) -> tuple[Bools, Bools]:
     """Return which true objects (N) have a small bound, and which have enough detections: those with both count."""
     truth, shown = recording.dataset.truth, recording.dataset.truth_detections
     assert truth is not None
     assert shown is not None
     bound = cramer_rao_covariances(true_views(recording), recording.config, len(truth))
     detections = np.bincount(rows_of(shown.object_id, truth.object_id), minlength=len(truth))
-    return np.trace(bound, axis1=1, axis2=2) <= MAX_BOUND_M**2, detections >= min_detections
+    return np.trace(bound, axis1=1, axis2=2) <= scene.max_bound_m**2, detections >= scene.min_detections
 
 
 def show_mostly(result: valuemap.Map, dataset: Dataset, objects: Bools) -> Bools:
@@ -222,9 +254,9 @@ def covariances(six_m2: Floats) -> Floats:
     return six_m2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
-def is_right(distance_m: Floats, squared_sigmas: Floats) -> Bools:
+def is_right(distance_m: Floats, squared_sigmas: Floats, right_m: tuple[float, float]) -> Bools:
     """Return which labels are right for which objects, from distances and squared Mahalanobis distances (any shape)."""
-    near_m, far_m = RIGHT_M
+    near_m, far_m = right_m
     right: Bools = (distance_m <= near_m) | ((distance_m <= far_m) & (squared_sigmas <= RIGHT_SIGMAS**2))
     return right
 
@@ -232,7 +264,7 @@ def is_right(distance_m: Floats, squared_sigmas: Floats) -> Bools:
 def match_one_to_one(distance_m: Floats, is_near: Bools) -> tuple[Ints, Ints]:
     """Return rows and columns of the pairs of most matches and, of such choices, of the least sum of distances."""
     # One that is no match costs more than all matches together.
-    cost = np.where(is_near, distance_m, RIGHT_M[1] * (min(distance_m.shape) + 1.0))
+    cost = np.where(is_near, distance_m, 1.0 + 2.0 * min(distance_m.shape) * distance_m.max(initial=0.0, where=is_near))
     rows, columns = linear_sum_assignment(cost)
     matched = is_near[rows, columns]
     return rows[matched], columns[matched]

@@ -155,7 +155,7 @@ def test_reliability_counts_labels_by_their_existence() -> None:
 def test_a_label_is_right_within_3_of_its_sigmas_and_1_to_3_m() -> None:
     distance_m = np.array([0.9, 0.9, 1.1, 1.1, 2.9, 3.1])
     sigmas = np.array([2.0, 9.0, 2.9, 3.1, 2.9, 1.0])
-    assert dense.is_right(distance_m, sigmas**2).tolist() == [True, True, True, False, True, False]
+    assert dense.is_right(distance_m, sigmas**2, (1.0, 3.0)).tolist() == [True, True, True, False, True, False]
 
 
 def test_most_matches_come_first_then_the_least_distance() -> None:
@@ -175,7 +175,7 @@ def test_the_small_part_of_a_scene_is_whole_in_itself() -> None:
     assert np.array_equal(dataset.images.image_id[boxes.frame_row], dataset.detections.image_id)
     is_object = boxes.kind == KINDS.index("roadside")
     assert np.array_equal(dataset.detections.detection_id[is_object], dataset.truth_detections.detection_id)
-    assert np.logical_and(*dense.objects_that_count(recording, 3)).sum() > 20
+    assert np.logical_and(*dense.objects_that_count(recording, dense.SCENES["posts-3"])).sum() > 20
 
 
 # More data.

@@ -168,7 +168,7 @@ def test_impossible_rows_are_refused(settings: dict[str, Any], message: str) -> 
 
 
 def test_pictures_of_rows_are_refused() -> None:
-    with pytest.raises(SettingError, match="pictures are drawn of cities with lights only"):
+    with pytest.raises(SettingError, match="pictures are drawn by one camera of whole, flat lights only"):
         next(render_pictures(recorded(post_spacing_m=20.0, keep_before_signal_m=20.0), rows=[0]))
 
 

@@ -387,6 +387,15 @@ class SimulationConfig:
     post_spacing_m: float = _setting(
         0.0, unit="m", effect="distance between two posts on each side of a street; 0 for none"
     )
+    size_spread: float = _setting(
+        0.0, unit="1", high=1.0, effect="standard deviation of the logarithm of the size of objects of one class"
+    )
+    side_offset_m: float = _setting(
+        0.0,
+        unit="m",
+        high=2.0,
+        effect="deviation of the middle of an object's box from its centre, another way from each side",
+    )
 
     # The drives.
     passes_per_street: int = _setting(
@@ -404,6 +413,12 @@ class SimulationConfig:
         unit="m",
         low=200.0,
         effect="length of a pass; errors of the pose and of the car are of one pass",
+    )
+    laps: int = _setting(
+        1,
+        unit="laps",
+        low=1,
+        effect="a pass drives its tour of the streets this often in turn; more than 1 cuts no tours into passes",
     )
     turn_share: float = _setting(
         0.35,
@@ -462,6 +477,13 @@ class SimulationConfig:
         3.0, unit="deg", low=-30.0, high=30.0, effect="how far the camera looks up from the street"
     )
 
+    cameras: int = _setting(
+        1, unit="cameras", low=1, high=8, effect="cameras of each car, each with a camera_id of its own"
+    )
+    camera_spread_deg: float = _setting(
+        60.0, unit="deg", high=180.0, effect="angle between the directions in which two neighbouring cameras look"
+    )
+
     # What can be seen.
     max_sight_m: float = _setting(
         120.0, unit="m", open_low=True, effect="a light farther than this (on the ground) is not seen"
@@ -480,6 +502,19 @@ class SimulationConfig:
         effect="share of views of a light that traffic hides, in runs of successive images",
     )
     occlusion_s: float = _setting(4.0, unit="s", effect="mean time after which traffic hides a light or not anew")
+    min_visible_share: float = _setting(
+        1.0,
+        unit="1",
+        open_low=True,
+        high=1.0,
+        effect="what the picture's edge cuts is seen if this share of its box is left, and has a box of the rest",
+    )
+    partly_hidden_share: float = _setting(
+        0.0,
+        unit="1",
+        high=0.9,
+        effect="share of views of an object that is hidden in part, in runs: its box is that of the rest",
+    )
 
     # The detector.
     recall_mean: float = _setting(
@@ -507,12 +542,26 @@ class SimulationConfig:
         high=0.5,
         effect="part of that standard deviation that grows with the box, as share of its height",
     )
+    tail_share: float = _setting(
+        0.0, unit="1", high=1.0, effect="share of boxes whose centre is far more wrong than that"
+    )
+    tail_factor: float = _setting(
+        5.0, unit="1", low=1.0, effect="how many times the standard deviation of such boxes is that of others"
+    )
     size_noise: float = _setting(
         0.15, unit="1", high=1.0, effect="standard deviation of the logarithm of a box's width and height"
     )
     score_true: float = _setting(0.75, unit="1", high=1.0, effect="mean score of a light in a large box")
     score_false: float = _setting(0.5, unit="1", high=1.0, effect="mean score of false boxes and of tiny ones")
     score_noise: float = _setting(0.12, unit="1", high=1.0, effect="standard deviation of scores (cut to 0 and 1)")
+    double_share: float = _setting(0.0, unit="1", high=1.0, effect="share of boxes that the detector reports twice")
+    double_apart_px: float = _setting(1.5, unit="px", effect="distance between the centres of two such boxes")
+    class_confusion: float = _setting(
+        0.0,
+        unit="1",
+        high=0.9,
+        effect="share of boxes of objects that get another class of those that stand in the city",
+    )
 
     # Detections of other things.
     clutter_per_image: float = _setting(
@@ -564,8 +613,56 @@ class SimulationConfig:
     drift_length_m: float = _setting(
         100.0, unit="m", open_low=True, effect="distance over which drifting errors forget 63 % of themselves"
     )
+    position_middle_m: float = _setting(
+        0.0,
+        unit="m",
+        effect="standard deviation of a camera position, each axis: part that drifts over middle_length_m",
+    )
+    rotation_middle_deg: float = _setting(
+        0.0, unit="deg", effect="standard deviation of a rotation, each axis: part that drifts over middle_length_m"
+    )
+    middle_length_m: float = _setting(
+        15.0, unit="m", open_low=True, effect="distance over which those errors forget 63 % of themselves"
+    )
+    pass_shift_m: float = _setting(
+        0.0, unit="m", effect="each pass is shifted by this much on the ground, in a direction of its own"
+    )
+    pass_yaw_deg: float = _setting(
+        0.0, unit="deg", effect="each pass is turned by this much, left or right, as by a camera mounted askew"
+    )
+    jump_m: float = _setting(
+        0.0, unit="m", effect="poses jump by this much on the ground, and back again later, jumps_per_km times"
+    )
+    jumps_per_km: float = _setting(5.0, unit="1", effect="how often they jump or jump back, in each km of a pass")
+    pose_delay_s: float = _setting(
+        0.0, unit="s", high=10.0, effect="the recorded pose is that of so much time before the image was taken"
+    )
+    focal_error_share: float = _setting(
+        0.0, unit="1", low=-0.5, high=0.5, effect="the recorded focal length is too long by this share of itself"
+    )
+
+    # What is recorded.
     write_pose_sigmas: int = _setting(
         0, unit="0 or 1", high=1, effect="1 writes the standard deviations of the poses into images.parquet"
+    )
+    write_timestamps: int = _setting(1, unit="0 or 1", high=1, effect="0 leaves the time out of images.parquet")
+    write_rigs: int = _setting(
+        0, unit="0 or 1", high=1, effect="1 writes into images.parquet which images a car took at one time (rig_id)"
+    )
+    camera_folders: int = _setting(
+        0,
+        unit="0, 1 or 2",
+        high=2,
+        effect="names with several cameras: 0 is PASS/CAMERA/NUMBER.jpg, 1 CAMERA/PASS/NUMBER.jpg, 2 PASS-CAMERA/...",
+    )
+    pass_per_camera: int = _setting(
+        0, unit="0 or 1", high=1, effect="1 gives the images of each camera a pass_id of their own"
+    )
+    shuffle_ids: int = _setting(
+        0, unit="0 or 1", high=1, effect="1 numbers images and detections at random, not in the order of time"
+    )
+    shuffle_names: int = _setting(
+        0, unit="0 or 1", high=1, effect="1 numbers the files of images at random, not in the order of time"
     )
 
     def __post_init__(self) -> None:
@@ -587,6 +684,11 @@ class SimulationConfig:
                 hint="set both, e.g. --set min_row_signs=2 --set max_row_signs=6",
             )
         rows = (self.sign_row_spacing_m, self.lamp_spacing_m, self.tree_spacing_m, self.post_spacing_m)
+        if self.class_confusion and sum(spacing > 0.0 for spacing in (self.has_lights, *rows)) < 2:
+            raise SettingError(
+                f"class_confusion ({self.class_confusion}): only one class stands in the city",
+                hint="--set sign_row_spacing_m=50 puts signs along the streets as well",
+            )
         if not self.has_lights and not any(rows):
             raise SettingError(
                 "has_lights and all spacings of signs, lamps, trees and posts are 0, so nothing stands in the city",
@@ -600,11 +702,13 @@ class SimulationConfig:
 
     def check_drawable(self) -> None:
         """Raise `SettingError` where pictures could not show what is simulated."""
-        for name in ("sign_row_spacing_m", "lamp_spacing_m", "tree_spacing_m", "post_spacing_m"):
-            if getattr(self, name):
+        rows = ("sign_row_spacing_m", "lamp_spacing_m", "tree_spacing_m", "post_spacing_m")
+        for name in (*rows, "side_offset_m", "partly_hidden_share", "cameras"):
+            default = getattr(SimulationConfig, name)
+            if getattr(self, name) != default:
                 raise SettingError(
-                    f"{name} ({getattr(self, name)}): pictures are drawn of cities with lights only",
-                    hint=f"leave --images away, or --set {name}=0",
+                    f"{name} ({getattr(self, name)}): pictures are drawn by one camera of whole, flat lights only",
+                    hint=f"leave --images away, or --set {name}={default}",
                 )
 
     def with_settings(self, assignments: Iterable[str]) -> Self:

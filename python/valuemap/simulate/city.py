@@ -71,10 +71,21 @@ def build_city(config: SimulationConfig, *, seed: int) -> City:
     return City(
         streets=streets,
         is_signalised=lights_facing > 0,
-        lights=lights,
-        roadside=place_roadside(config, streets, seed=seed),
+        lights=_in_many_shapes(lights, config, seed, "lights"),
+        roadside=_in_many_shapes(place_roadside(config, streets, seed=seed), config, seed, "roadside"),
         lookalikes=_place_lookalikes(config, count, np.argwhere(lights_facing > 0), streets, seed),
     )
+
+
+def _in_many_shapes(targets: Targets, config: SimulationConfig, seed: int, kind: str) -> Targets:
+    """Return the targets larger or smaller than they were, and uneven, each in its own way."""
+    if config.size_spread:
+        log_factor = config.size_spread * random_stream(seed, kind, "size").standard_normal((len(targets), 1))
+        targets = targets.replace(size_m=targets.size_m * np.exp(log_factor))
+    if config.side_offset_m:
+        uneven = random_stream(seed, kind, "uneven").standard_normal((len(targets), 4))
+        targets = targets.replace(uneven_m=config.side_offset_m * uneven)
+    return targets
 
 
 def _lights_per_approach(config: SimulationConfig, streets: Streets, random: np.random.Generator) -> Ints:
@@ -186,4 +197,5 @@ def _targets_at(
         pass_row=np.full(count, -1, dtype=np.int64),
         class_code=class_code,
         is_round=np.zeros(count, dtype=np.bool_),
+        uneven_m=np.zeros((count, 4)),
     )

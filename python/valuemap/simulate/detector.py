@@ -8,9 +8,10 @@ import numpy as np
 
 from valuemap.config import SimulationConfig
 from valuemap.simulate.drives import Frames
-from valuemap.simulate.sightings import Sightings
+from valuemap.simulate.rows import join_rows
+from valuemap.simulate.sightings import Sightings, cut_boxes
 from valuemap.simulate.streams import random_stream
-from valuemap.simulate.targets import Targets
+from valuemap.simulate.targets import Targets, classes_in
 from valuemap.tables import Bools, Floats, Ints, Table
 
 KINDS = ("lights", "lookalikes", "temporary", "reflections", "clutter", "roadside")
@@ -19,12 +20,18 @@ TRUE_KINDS = ("lights", "roadside")
 """The kinds that a box shows rightly, in the order of the truth."""
 
 
+_SCORE_OF_DOUBLE = 0.8
+_HIDDEN_PARTS = (0.15, 0.6)
+"""Least and largest share of a box that is hidden in part."""
+
+
 @dataclass(frozen=True, eq=False)
 class Boxes(Table):
     """Detected boxes: centres and sizes (N, 2) in pixels, scores (N).
 
     `kind` (N) is what a box shows, as index of KINDS; `thing_row` (N) numbers the things of a kind from 0, so that
-    boxes of one thing have one number; `class_code` (N) is what the detector calls it.
+    boxes of one thing have one number; `class_code` (N) is what the detector calls it; `is_cut` (N) says which
+    boxes are of a part only, since the picture's edge or something before it hides the rest.
     """
 
     frame_row: Ints
@@ -34,6 +41,7 @@ class Boxes(Table):
     center_px: Floats
     size_px: Floats
     score: Floats
+    is_cut: Bools
 
 
 def recall_of_passes(count: int, config: SimulationConfig, *, seed: int) -> Floats:
@@ -60,7 +68,12 @@ def detect(
     The numbers are drawn for every view, detected or not, so that no setting reshuffles those of another.
     """
     count = len(sightings)
-    height_px = sightings.size_px[:, 1]
+    true_center_px, true_size_px, is_cut = sightings.center_px, sightings.size_px, sightings.is_cut
+    if config.partly_hidden_share:
+        part = _hidden_part(sightings, frames, config, seed=seed, kind=kind)
+        true_center_px, true_size_px = _without_part(true_center_px, true_size_px, part)
+        is_cut = is_cut | np.any(part > 0.0, axis=1)
+    height_px = true_size_px[:, 1]
     with np.errstate(divide="ignore"):  # Of a height of 0 px on, every box is large.
         quality = 1.0 - np.exp2(-((height_px / config.half_recall_height_px) ** 2))
     recall = pass_recall[frames.pass_row[sightings.frame_row]] * quality
@@ -69,6 +82,9 @@ def detect(
     is_found &= ~hidden_by_traffic(sightings, frames, config, seed=seed, kind=kind)
 
     sigma_px = np.hypot(config.pixel_noise_px, config.pixel_noise_share * height_px)
+    if config.tail_share:
+        is_far_off = random_stream(seed, kind, "tails").random(count) < config.tail_share
+        sigma_px = np.where(is_far_off, config.tail_factor, 1.0) * sigma_px
     shift_px = random_stream(seed, kind, "center").standard_normal((count, 2)) * sigma_px[:, None]
     stretch = np.exp(config.size_noise * random_stream(seed, kind, "size").standard_normal((count, 2)))
     best = config.score_true if kind in TRUE_KINDS else (config.score_true + config.score_false) / 2.0
@@ -77,12 +93,43 @@ def detect(
         frame_row=sightings.frame_row,
         kind=np.full(count, KINDS.index(kind)),
         thing_row=sightings.target_row,
-        class_code=targets.class_code[sightings.target_row],
-        center_px=inside_picture(sightings.center_px + shift_px, config),
-        size_px=sightings.size_px * stretch,
+        class_code=_confuse(targets.class_code[sightings.target_row], config, seed=seed, kind=kind),
+        center_px=inside_picture(true_center_px + shift_px, config),
+        size_px=true_size_px * stretch,
         score=noisy_score(score, config, random_stream(seed, kind, "score")),
+        is_cut=is_cut,
     )
-    return boxes.take(is_found)
+    return report(boxes, is_found, config, random_stream(seed, kind, "double"))
+
+
+def report(boxes: Boxes, is_found: Bools, config: SimulationConfig, random: np.random.Generator) -> Boxes:
+    """Return the boxes that are found, some of them twice; none reaches out of the picture where that cuts boxes."""
+    reported = boxes.take(is_found)
+    if config.double_share:
+        is_double, angle_rad = random.random((2, len(boxes)))
+        angle_rad = 2.0 * np.pi * angle_rad
+        apart_px = config.double_apart_px * np.stack([np.cos(angle_rad), np.sin(angle_rad)], axis=1)
+        again = boxes.replace(
+            center_px=inside_picture(boxes.center_px + apart_px, config), score=_SCORE_OF_DOUBLE * boxes.score
+        )
+        reported = join_rows([reported, again.take(is_found & (is_double < config.double_share))])
+    if config.min_visible_share < 1.0:
+        half_px = np.array([config.image_width_px, config.image_height_px]) / 2.0
+        from_middle_px = reported.center_px - half_px
+        low, high = cut_boxes(from_middle_px - reported.size_px / 2.0, from_middle_px + reported.size_px / 2.0, half_px)
+        reported = reported.replace(center_px=half_px + (low + high) / 2.0, size_px=high - low)
+    return reported
+
+
+def _confuse(class_code: Ints, config: SimulationConfig, *, seed: int, kind: str) -> Ints:
+    """Return what the detector calls objects (N): now and then another class that stands in the city."""
+    if not config.class_confusion or kind not in TRUE_KINDS:
+        return class_code
+    classes = classes_in(config)
+    is_wrong, other = random_stream(seed, kind, "confusion").random((2, len(class_code)))
+    steps = 1 + np.floor(other * (len(classes) - 1)).astype(np.int64)
+    wrong = classes[(np.searchsorted(classes, class_code) + steps) % len(classes)]
+    return np.where(is_wrong < config.class_confusion, wrong, class_code)
 
 
 def inside_picture(center_px: Floats, config: SimulationConfig) -> Floats:
@@ -102,15 +149,39 @@ def hidden_by_traffic(sightings: Sightings, frames: Frames, config: SimulationCo
     From one view of a target to its next in the same pass, dt later, the state is drawn anew with probability
     1 - exp(-dt / occlusion_s), and else stays as it is.
     """
+    return _states(sightings, frames, config, random_stream(seed, kind, "traffic")) < config.occluded_share
+
+
+def _hidden_part(sightings: Sightings, frames: Frames, config: SimulationConfig, *, seed: int, kind: str) -> Floats:
+    """Return which shares (N, 3) of the boxes of views are hidden from the left, from the right and from below.
+
+    At most one of the three is more than 0. As with traffic, it stays for a while.
+    """
+    state = _states(sightings, frames, config, random_stream(seed, kind, "part")) / config.partly_hidden_share
+    side, share = np.divmod(3.0 * state, 1.0)
+    low, high = _HIDDEN_PARTS
+    part: Floats = (low + (high - low) * share)[:, None] * (side[:, None] == np.arange(3))
+    return part
+
+
+def _without_part(center_px: Floats, size_px: Floats, part: Floats) -> tuple[Floats, Floats]:
+    """Return centres and sizes (N, 2) of what is left of boxes without parts (N, 3) on the left, right and below."""
+    left, right, below = part.T
+    shift = np.stack([left - right, -below], axis=1) / 2.0
+    return center_px + shift * size_px, size_px * np.stack([1.0 - left - right, 1.0 - below], axis=1)
+
+
+def _states(sightings: Sightings, frames: Frames, config: SimulationConfig, random: np.random.Generator) -> Floats:
+    """Return a uniform random number (N) for each view, which stays for a while from a target's view to the next."""
     pass_row, time_s = frames.pass_row[sightings.frame_row], frames.time_s[sightings.frame_row]
     order = np.lexsort((sightings.frame_row, sightings.target_row, pass_row))
-    redraw, state = random_stream(seed, kind, "traffic").random((len(order), 2)).T
+    redraw, state = random.random((len(order), 2)).T
     is_next = (np.diff(pass_row[order]) == 0) & (np.diff(sightings.target_row[order]) == 0)
     with np.errstate(divide="ignore", invalid="ignore"):  # A time of 0 s draws anew for every view.
         stays = np.exp(-np.abs(np.diff(time_s[order])) / config.occlusion_s)
     is_anew = np.ones(len(order), dtype=np.bool_)
     is_anew[1:] = ~is_next | (redraw[1:] >= stays)
     drawn_at = np.maximum.accumulate(np.where(is_anew, np.arange(len(order)), 0))
-    is_hidden = np.empty(len(order), dtype=np.bool_)
-    is_hidden[order] = (state < config.occluded_share)[drawn_at]
-    return is_hidden
+    of_view = np.empty(len(order))
+    of_view[order] = state[drawn_at]
+    return of_view

@@ -23,6 +23,8 @@ _LANE_JITTER_M = 0.25
 _STOP_LINE_M = 14.0
 _QUEUE_M = 8.0
 _DAY_S = 86_400.0
+_CAMERA_FROM_MIDDLE_M = 0.2
+"""How far the cameras of a car with several are from the middle of them all."""
 _START_OF_DRIVE_DAYS = (0.3, 0.8)
 
 
@@ -33,7 +35,9 @@ class Frames(Table):
     `pass_row` (N) numbers the passes; `distance_m` (N) is driven since the start of the pass; `signal_ahead_m`
     (N) the distance along the street to the next intersection with lights that face the car, 0 in a city without;
     `center_in_world_m` (N, 3) the camera centre; `heading_rad` (N) where it looks, counter-clockwise from east;
-    `pitch_rad` (N) how far up.
+    `pitch_rad` (N) how far up; `camera_row` (N) which camera of the car it is, `exposure_row` (N) is one number for all
+    that the car's cameras took at one time. `late_m` (N, 3) and `late_rad` (N) say how far the camera moved and turned
+    left since the time of the pose that is recorded.
     """
 
     pass_row: Ints
@@ -43,6 +47,10 @@ class Frames(Table):
     center_in_world_m: Floats
     heading_rad: Floats
     pitch_rad: Floats
+    camera_row: Ints
+    exposure_row: Ints
+    late_m: Floats
+    late_rad: Floats
 
     def cam_from_world(self) -> Floats:
         """Return rotations (N, 3, 3) into camera axes: x right, y down, z forward."""
@@ -71,7 +79,28 @@ def drive(city: City, config: SimulationConfig, *, seed: int, progress: Progress
         passes.append(_drive_route(route, city, config, seed, len(passes)))
         images += int(np.count_nonzero(passes[-1].signal_ahead_m <= sure_m))
         progress("driving at random", min(images, config.images), config.images)
-    return join_rows(passes)
+    frames = join_rows(passes)
+    return frames.replace(exposure_row=np.arange(len(frames)))
+
+
+def mount_cameras(frames: Frames, config: SimulationConfig) -> Frames:
+    """Return the frames of all cameras of the cars, exposure by exposure, from those of cameras that look ahead."""
+    if config.cameras == 1:
+        return frames
+    count = config.cameras
+    mounted = frames.take(np.repeat(np.arange(len(frames)), count))
+    camera_row = np.tile(np.arange(count), len(frames))
+    turn_rad = np.radians(config.camera_spread_deg) * ((count - 1) / 2.0 - camera_row)
+    heading_rad = mounted.heading_rad + turn_rad
+    outward = np.stack([np.cos(heading_rad), np.sin(heading_rad), np.zeros(len(mounted))], axis=1)
+    # What is uphill for one who looks ahead is level for one who looks to the side.
+    level_rad = np.radians(config.camera_pitch_deg)
+    return mounted.replace(
+        center_in_world_m=mounted.center_in_world_m + _CAMERA_FROM_MIDDLE_M * outward,
+        heading_rad=heading_rad,
+        pitch_rad=level_rad + (mounted.pitch_rad - level_rad) * np.cos(turn_rad),
+        camera_row=camera_row,
+    )
 
 
 def _drive_route(route: Route, city: City, config: SimulationConfig, seed: int, pass_row: int) -> Frames:
@@ -82,6 +111,7 @@ def _drive_route(route: Route, city: City, config: SimulationConfig, seed: int, 
     reached = route.intersection[1:]
     has_lights = city.is_signalised[reached[:, 0], reached[:, 1], route.direction]
     distance_m, time_s = _expose(path, *_stops(path, has_lights, config, random), config, random)
+    past_m = np.interp(time_s - config.pose_delay_s, time_s, distance_m) if config.pose_delay_s else distance_m
 
     ahead_m = _distance_to_next(path.middle_at_m[has_lights], distance_m)
     # Lights round a corner are not ahead.
@@ -89,19 +119,30 @@ def _drive_route(route: Route, city: City, config: SimulationConfig, seed: int, 
     if not config.has_lights:
         ahead_m = np.zeros(len(distance_m))
     kept = ahead_m <= config.keep_before_signal_m * (KEEP_RANGE[1] if config.detections else 1.0)
-    distance_m, time_s, ahead_m = distance_m[kept], time_s[kept], ahead_m[kept]
+    distance_m, time_s, ahead_m, past_m = distance_m[kept], time_s[kept], ahead_m[kept], past_m[kept]
 
     ground, heading = path.walk(distance_m)
     hills = city.streets.hills
     rise = (hills.slope(ground) * np.stack([np.cos(heading), np.sin(heading)], axis=1)).sum(axis=1)
+    center = np.column_stack([ground, hills.height_m(ground) + config.camera_height_m])
+    late_m, late_rad = np.zeros_like(center), np.zeros(len(heading))
+    if config.pose_delay_s:
+        past_ground, past_heading = path.walk(past_m)
+        late_m[:, :2] = ground - past_ground
+        late_m[:, 2] = hills.height_m(ground) - hills.height_m(past_ground)
+        late_rad = np.angle(np.exp(1j * (heading - past_heading)))
     return Frames(
         pass_row=np.full(len(distance_m), pass_row, dtype=np.int64),
         distance_m=distance_m,
         time_s=starts_s + time_s,
         signal_ahead_m=ahead_m,
-        center_in_world_m=np.column_stack([ground, hills.height_m(ground) + config.camera_height_m]),
+        center_in_world_m=center,
         heading_rad=heading,
         pitch_rad=np.arctan(rise) + np.radians(config.camera_pitch_deg),
+        camera_row=np.zeros(len(distance_m), dtype=np.int64),
+        exposure_row=np.zeros(len(distance_m), dtype=np.int64),
+        late_m=late_m,
+        late_rad=late_rad,
     )
 
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 import numpy as np
 
 from valuemap.config import SimulationConfig
-from valuemap.simulate.detector import KINDS, Boxes, inside_picture, noisy_score
+from valuemap.simulate.detector import KINDS, Boxes, inside_picture, noisy_score, report
 from valuemap.simulate.drives import Frames
+from valuemap.simulate.rows import join_rows
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import Streets
 from valuemap.simulate.targets import Targets, class_of_false
@@ -30,7 +31,7 @@ def clutter(frames: Frames, config: SimulationConfig, *, seed: int) -> Boxes:
     frame_row = np.repeat(np.arange(len(frames)), counts)
     center_px, size_px = _false_boxes(random_stream(seed, "clutter", "place").random((len(frame_row), 3)), config)
     score = np.full(len(frame_row), config.score_false)
-    return Boxes(
+    boxes = Boxes(
         frame_row=frame_row,
         kind=np.full(len(frame_row), KINDS.index("clutter")),
         thing_row=np.arange(len(frame_row)),
@@ -38,14 +39,29 @@ def clutter(frames: Frames, config: SimulationConfig, *, seed: int) -> Boxes:
         center_px=center_px,
         size_px=size_px,
         score=noisy_score(score, config, random_stream(seed, "clutter", "score")),
+        is_cut=np.zeros(len(frame_row), dtype=np.bool_),
     )
+    return report(boxes, np.ones(len(boxes), dtype=np.bool_), config, random_stream(seed, "clutter", "double"))
 
 
 def reflect(frames: Frames, config: SimulationConfig, *, seed: int) -> Boxes:
-    """Return false boxes fixed to the car: at one place of the picture for a stretch of one pass."""
-    chance = random_stream(seed, "reflections").random(len(frames))
+    """Return false boxes fixed to the car: at one place of the picture of one camera for a stretch of one pass."""
+    parts: list[Boxes] = []
+    for camera in range(config.cameras):
+        rows = np.flatnonzero(frames.camera_row == camera)
+        boxes = _reflect_in_camera(frames.take(rows), config, seed, *([camera] if camera else []))
+        parts.append(boxes.replace(frame_row=rows[boxes.frame_row], thing_row=boxes.thing_row + _things(parts)))
+    return join_rows(parts)
+
+
+def _things(parts: list[Boxes]) -> int:
+    return max((int(part.thing_row.max(initial=-1)) + 1 for part in parts), default=0)
+
+
+def _reflect_in_camera(frames: Frames, config: SimulationConfig, seed: int, *camera: int) -> Boxes:
+    chance = random_stream(seed, "reflections", *camera).random(len(frames))
     first = np.flatnonzero(chance < config.reflections_per_1000_images / 1000.0)
-    draw = random_stream(seed, "reflections", "place").random((len(first), 4))
+    draw = random_stream(seed, "reflections", *camera, "place").random((len(first), 4))
     length = 1 + np.floor(draw[:, 0] * (2.0 * config.reflection_images - 1.0)).astype(np.int64)
     end_of_pass = np.searchsorted(frames.pass_row, frames.pass_row[first], side="right")
     length = np.minimum(length, end_of_pass - first)
@@ -54,18 +70,20 @@ def reflect(frames: Frames, config: SimulationConfig, *, seed: int) -> Boxes:
     of_box = np.repeat(np.arange(len(first)), length)
     count = len(of_box)
     frame_row = first[of_box] + np.arange(count) - np.repeat(np.cumsum(length) - length, length)
-    jitter_px = _REFLECTION_JITTER_PX * random_stream(seed, "reflections", "center").standard_normal((count, 2))
+    normal = random_stream(seed, "reflections", *camera, "center").standard_normal((count, 2))
     score = np.full(count, config.score_false)
     boxes = Boxes(
         frame_row=frame_row,
         kind=np.full(count, KINDS.index("reflections")),
         thing_row=of_box,
         class_code=class_of_false(len(first), config, seed=seed, kind="reflections")[of_box],
-        center_px=inside_picture(center_px[of_box] + jitter_px, config),
+        center_px=inside_picture(center_px[of_box] + _REFLECTION_JITTER_PX * normal, config),
         size_px=size_px[of_box],
-        score=noisy_score(score, config, random_stream(seed, "reflections", "score")),
+        score=noisy_score(score, config, random_stream(seed, "reflections", *camera, "score")),
+        is_cut=np.zeros(count, dtype=np.bool_),
     )
-    return boxes.take(random_stream(seed, "reflections", "detect").random(count) < _REFLECTION_RECALL)
+    is_found = random_stream(seed, "reflections", *camera, "detect").random(count) < _REFLECTION_RECALL
+    return report(boxes, is_found, config, random_stream(seed, "reflections", *camera, "double"))
 
 
 def place_temporary(frames: Frames, streets: Streets, config: SimulationConfig, *, seed: int) -> Targets:
@@ -88,6 +106,7 @@ def place_temporary(frames: Frames, streets: Streets, config: SimulationConfig, 
         pass_row=frames.pass_row[near],
         class_code=class_of_false(count, config, seed=seed, kind="temporary"),
         is_round=np.zeros(count, dtype=np.bool_),
+        uneven_m=np.zeros((count, 4)),
     )
 
 

@@ -119,4 +119,5 @@ def _targets(
         pass_row=np.full(count, -1, dtype=np.int64),
         class_code=np.full(count, CLASSES.index(class_name)),
         is_round=np.full(count, facing_rad is None),
+        uneven_m=np.zeros((count, 4)),
     )

@@ -51,7 +51,8 @@ def routes_over_every_street(
     """Return routes that together drive every street once in each direction, without turning round.
 
     Each arrival at an intersection is given a departure of its own at random, which makes closed loops; loops
-    that meet are joined by swapping departures; the loops are cut into passes of about `pass_length_m`.
+    that meet are joined by swapping departures; the loops are cut into passes of about `pass_length_m`, or are driven
+    `laps` times each.
     """
     random = random_stream(seed, "round", round_number)
     departure = _random_departures(streets.can_leave(), random)
@@ -61,6 +62,10 @@ def routes_over_every_street(
         turned = np.roll(loop, random.integers(0, len(loop)), axis=0)
         intersection, direction = np.concatenate([turned[:, :2], turned[:1, :2]]), turned[:, 2]
         length_m = float(np.abs(np.diff(streets.center_m(intersection), axis=0)).sum())
+        if config.laps > 1:
+            intersection = np.concatenate([np.tile(intersection[:-1], (config.laps, 1)), intersection[-1:]])
+            routes.append(Route(intersection, np.tile(direction, config.laps)))
+            continue
         parts = np.clip(round(length_m / config.pass_length_m), 1, len(direction))
         cuts = np.linspace(0, len(direction), parts + 1).astype(int)
         routes += [Route(intersection[a : b + 1], direction[a:b]) for a, b in pairwise(cuts)]

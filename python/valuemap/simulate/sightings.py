@@ -13,7 +13,7 @@ from valuemap.simulate.drives import Frames
 from valuemap.simulate.rows import join_rows
 from valuemap.simulate.streets import Streets
 from valuemap.simulate.targets import Targets
-from valuemap.tables import Floats, Ints, Table
+from valuemap.tables import Bools, Floats, Ints, Table
 
 _CHUNK_FRAMES = 50_000
 _NEAREST_M = 1.0
@@ -23,12 +23,16 @@ NARROWEST = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Sightings(Table):
-    """Targets in view, sorted by frame, then target: rows (N) of both, true centre and size (N, 2) in pixels."""
+    """Targets in view, sorted by frame, then target: rows (N) of both, true centre and size (N, 2) in pixels.
+
+    Where the picture's edge cuts off a part, `is_cut` (N), they are those of the rest.
+    """
 
     frame_row: Ints
     target_row: Ints
     center_px: Floats
     size_px: Floats
+    is_cut: Bools
 
 
 def see(
@@ -55,6 +59,8 @@ def _see_in_chunk(targets: Targets, frames: Frames, streets: Streets, config: Si
     center, position = frames.center_in_world_m[frame_row], targets.position_in_world_m[target_row]
     to_target = position - center
     turn = np.where(targets.is_round[target_row], 1.0, cos_facing(to_target, targets.facing_rad[target_row]))
+    if config.side_offset_m:
+        to_target = to_target + _offset_of_side(to_target, targets.uneven_m[target_row])
     in_cam = np.einsum("nij,nj->ni", frames.cam_from_world()[frame_row], to_target)
     depth_m = np.maximum(in_cam[:, 2:], _NEAREST_M)
     picture_px = np.array([config.image_width_px, config.image_height_px])
@@ -67,13 +73,41 @@ def _see_in_chunk(targets: Targets, frames: Frames, streets: Streets, config: Si
         & (in_cam[:, 2] > _NEAREST_M)
         & (turn >= np.cos(np.radians(config.max_facing_deg)))
         & (size_px[:, 1] >= config.min_box_height_px)
-        & np.all(np.abs(from_middle_px) <= (picture_px - size_px) / 2.0, axis=1)
     )
+    is_whole = np.all(np.abs(from_middle_px) <= (picture_px - size_px) / 2.0, axis=1)
+    if config.min_visible_share < 1.0:
+        low, high = cut_boxes(from_middle_px - size_px / 2.0, from_middle_px + size_px / 2.0, picture_px / 2.0)
+        is_left = np.prod(high - low, axis=1) >= config.min_visible_share * np.prod(size_px, axis=1)
+        seen &= is_whole | (is_left & ((high - low)[:, 1] >= config.min_box_height_px))
+        from_middle_px = np.where(is_whole[:, None], from_middle_px, (low + high) / 2.0)
+        size_px = np.where(is_whole[:, None], size_px, high - low)
+    else:
+        seen &= is_whole
     rows = np.flatnonzero(seen)
     rows = rows[~streets.is_hidden_by_houses(center[rows, :2], position[rows, :2])]
     rows = rows[np.lexsort((target_row[rows], frame_row[rows]))]
     center_px = picture_px / 2.0 + from_middle_px[rows]
-    return Sightings(frame_row[rows], target_row[rows], center_px, size_px[rows])
+    return Sightings(frame_row[rows], target_row[rows], center_px, size_px[rows], ~is_whole[rows])
+
+
+def _offset_of_side(to_target: Floats, uneven_m: Floats) -> Floats:
+    """Return how far (N, 3) the middle of what a camera sees is off the target's centre: sideways and up.
+
+    An offset that goes once round with the direction from which one looks would only be another centre; sideways it
+    goes twice round.
+    """
+    angle_rad = np.arctan2(to_target[:, 1], to_target[:, 0])
+    to_the_right = np.stack([np.sin(angle_rad), -np.cos(angle_rad), np.zeros(len(angle_rad))], axis=1)
+    aside_m = uneven_m[:, 0] * np.cos(2.0 * angle_rad) + uneven_m[:, 1] * np.sin(2.0 * angle_rad)
+    above_m = uneven_m[:, 2] * np.cos(angle_rad) + uneven_m[:, 3] * np.sin(angle_rad)
+    offset: Floats = aside_m[:, None] * to_the_right
+    offset[:, 2] = above_m
+    return offset
+
+
+def cut_boxes(low_px: Floats, high_px: Floats, half_picture_px: Floats) -> tuple[Floats, Floats]:
+    """Return what of boxes from low to high (N, 2), in px from the middle of the picture, is in it."""
+    return np.clip(low_px, -half_picture_px, half_picture_px), np.clip(high_px, -half_picture_px, half_picture_px)
 
 
 def cos_facing(to_target: Floats, facing_rad: Floats) -> Floats:

@@ -15,15 +15,15 @@ from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
 from valuemap.simulate.city import City, build_city
 from valuemap.simulate.detector import KINDS, TRUE_KINDS, Boxes, detect, hidden_by_traffic, recall_of_passes
-from valuemap.simulate.drives import KEEP_RANGE, Frames, drive
+from valuemap.simulate.drives import KEEP_RANGE, Frames, drive, mount_cameras
 from valuemap.simulate.false_objects import clutter, place_temporary, reflect
 from valuemap.simulate.pose_errors import pose_errors
 from valuemap.simulate.rows import join_rows
 from valuemap.simulate.sightings import Sightings, see
+from valuemap.simulate.streams import random_stream
 from valuemap.simulate.targets import CLASSES, classes_in
 from valuemap.tables import Bools, Cameras, Categories, Detections, Floats, Images, Ints, Truth, TruthDetections
 
-_CAMERA_ID = 0
 _KEEP_STEP_M = 0.5
 
 
@@ -82,26 +82,34 @@ def record_city(
     if seed < 0:
         raise SettingError(f"seed: expected at least 0, found {seed}", hint="for example --seed 1")
     city = build_city(config, seed=seed)
-    frames = drive(city, config, seed=seed, progress=progress)
+    exposures = drive(city, config, seed=seed, progress=progress)
+    errors = pose_errors(exposures, config, seed=seed)
+    frames = mount_cameras(exposures, config)
     sightings = see(city.lights, frames, city.streets, config, progress=progress, what="seeing lights")
     boxes = _detect_everything(city, sightings, frames, config, seed=seed, progress=progress)
-    position_error_m, rotation_error_rad = pose_errors(frames, config, seed=seed)
+    is_hidden = hidden_by_traffic(sightings, frames, config, seed=seed, kind="lights")
     kept = _kept_frames(frames, boxes, config)
-    boxes = boxes.replace(frame_row=_row_among(kept, boxes.frame_row))
+    if config.shuffle_ids:
+        kept = random_stream(seed, "shuffle", "images").permutation(kept)
+        boxes = boxes.take(random_stream(seed, "shuffle", "detections").permutation(len(boxes)))
+    new_row = np.full(len(frames), -1)
+    new_row[kept] = np.arange(len(kept))
+    frames = frames.take(kept)
+    boxes = boxes.replace(frame_row=new_row[boxes.frame_row])
     boxes = boxes.take(boxes.frame_row >= 0)
     if len(boxes) == 0:
         raise SettingError("nothing at all is detected in this city", hint="raise recall_mean, or drive more")
-    is_hidden = hidden_by_traffic(sightings, frames, config, seed=seed, kind="lights")
-    sighted_in = _row_among(kept, sightings.frame_row)
-    frames = frames.take(kept)
-    dataset = _dataset(name, city, frames, boxes, position_error_m[kept], rotation_error_rad[kept], config)
+    sightings = sightings.replace(frame_row=new_row[sightings.frame_row])
+    in_order = np.lexsort((sightings.target_row, sightings.frame_row))
+    in_order = in_order[sightings.frame_row[in_order] >= 0]
+    dataset = _dataset(name, city, frames, boxes, _recorded_poses(frames, *errors, config), config, seed=seed)
     return Recording(
         config=config,
         seed=seed,
         city=city,
         frames=frames,
-        sightings=sightings.replace(frame_row=sighted_in).take(sighted_in >= 0),
-        is_hidden=is_hidden[sighted_in >= 0],
+        sightings=sightings.take(in_order),
+        is_hidden=is_hidden[in_order],
         boxes=boxes,
         dataset=dataset,
     )
@@ -112,9 +120,10 @@ def _dataset(
     city: City,
     frames: Frames,
     boxes: Boxes,
-    position_error_m: Floats,
-    rotation_error_rad: Floats,
+    poses: tuple[Rotation, Floats],
     config: SimulationConfig,
+    *,
+    seed: int,
 ) -> Dataset:
     shows_object = np.isin(boxes.kind, [KINDS.index(kind) for kind in TRUE_KINDS])
     is_of_roadside = boxes.kind == KINDS.index("roadside")
@@ -123,7 +132,7 @@ def _dataset(
         name=name,
         frame=Frame(),
         cameras=_cameras(config),
-        images=_images(frames, position_error_m, rotation_error_rad, config),
+        images=_images(frames, poses, config, seed=seed),
         detections=Detections(
             detection_id=np.arange(len(boxes)),
             image_id=boxes.frame_row,
@@ -187,40 +196,80 @@ def _kept_frames(frames: Frames, boxes: Boxes, config: SimulationConfig) -> Ints
     return choices[best]
 
 
-def _row_among(kept: Ints, frame_row: Ints) -> Ints:
-    """Return rows (N) numbered among the kept ones, -1 for those that are not kept."""
-    row = np.minimum(np.searchsorted(kept, frame_row), len(kept) - 1)
-    return np.where(kept[row] == frame_row, row, -1)
-
-
 def _cameras(config: SimulationConfig) -> Cameras:
     center_px = config.image_width_px / 2.0, config.image_height_px / 2.0
+    focal_px = config.focal_px * (1.0 + config.focal_error_share)
     return Cameras(
-        camera_id=np.array([_CAMERA_ID]),
-        model=Categories.from_texts(["PINHOLE"]),
-        width_px=np.array([config.image_width_px]),
-        height_px=np.array([config.image_height_px]),
-        params=[np.array([config.focal_px, config.focal_px, *center_px])],
+        camera_id=np.arange(config.cameras),
+        model=Categories.from_texts(["PINHOLE"] * config.cameras),
+        width_px=np.full(config.cameras, config.image_width_px),
+        height_px=np.full(config.cameras, config.image_height_px),
+        params=[np.array([focal_px, focal_px, *center_px])] * config.cameras,
     )
 
 
-def _images(frames: Frames, position_error_m: Floats, rotation_error_rad: Floats, config: SimulationConfig) -> Images:
-    rotation = Rotation.from_rotvec(rotation_error_rad) * Rotation.from_matrix(frames.cam_from_world())
-    present, pass_code = np.unique(frames.pass_row, return_inverse=True)
-    digits = max(4, len(str(present[-1])))
-    pass_names = tuple(f"pass-{row:0{digits}d}" for row in present)
-    number = np.arange(len(frames)) - np.searchsorted(pass_code, pass_code)
-    names = [f"{pass_names[code]}/{i:06d}.jpg" for code, i in zip(pass_code, number, strict=True)]
+def _recorded_poses(
+    frames: Frames, position_error_m: Floats, rotation_error_rad: Floats, config: SimulationConfig
+) -> tuple[Rotation, Floats]:
+    """Return the rotations from the world (N) and the centres (N, 3) that are recorded, from the errors of exposures.
+
+    The rotation error is that of a camera that looks ahead; others of the same car are turned with it.
+    """
+    center_m = frames.center_in_world_m + position_error_m[frames.exposure_row]
+    true_rotation = Rotation.from_matrix(frames.cam_from_world())
+    turn_rad = rotation_error_rad[frames.exposure_row]
+    if config.cameras > 1:
+        aside_rad = np.radians(config.camera_spread_deg) * ((config.cameras - 1) / 2.0 - frames.camera_row)
+        ahead = frames.replace(heading_rad=frames.heading_rad - aside_rad).cam_from_world()
+        turn_rad = true_rotation.apply(np.einsum("nji,nj->ni", ahead, turn_rad))
+    if config.pose_delay_s:
+        center_m = center_m - frames.late_m
+        true_rotation = true_rotation * Rotation.from_rotvec(frames.late_rad[:, None] * [0.0, 0.0, 1.0])
+    return Rotation.from_rotvec(turn_rad) * true_rotation, center_m
+
+
+def _images(frames: Frames, poses: tuple[Rotation, Floats], config: SimulationConfig, *, seed: int) -> Images:
+    rotation, center_m = poses
+    names, passes = _names_and_passes(frames, config, seed=seed)
+    optional: dict[str, Any] = {**_pose_sigmas(len(frames), config)}
+    if config.write_timestamps:
+        optional["timestamp_s"] = frames.time_s
+    if config.write_rigs:
+        optional["rig_id"] = np.unique(frames.exposure_row, return_inverse=True)[1]
     return Images(
         image_id=np.arange(len(frames)),
         name=pa.array(names, pa.string()),
-        camera_id=np.full(len(frames), _CAMERA_ID),
+        camera_id=frames.camera_row,
         cam_from_world_quat=rotation.as_quat(canonical=True, scalar_first=True),
-        cam_from_world_m=-rotation.apply(frames.center_in_world_m + position_error_m),
-        pass_id=Categories(pass_code.astype(np.int32), pass_names),
-        timestamp_s=frames.time_s,
-        **_pose_sigmas(len(frames), config),
+        cam_from_world_m=-rotation.apply(center_m),
+        pass_id=passes,
+        **optional,
     )
+
+
+def _names_and_passes(frames: Frames, config: SimulationConfig, *, seed: int) -> tuple[list[str], Categories]:
+    """Return the names of the files (N) and the passes (N)."""
+    present, pass_code = np.unique(frames.pass_row, return_inverse=True)
+    digits = max(4, len(str(present[-1])))
+    pass_names = [f"pass-{row:0{digits}d}" for row in present]
+    # Images are numbered in each pass, those that cameras took at one time alike.
+    exposure = np.unique(frames.exposure_row, return_inverse=True)[1]
+    first = np.full(len(present), len(frames))
+    np.minimum.at(first, pass_code, exposure)
+    number = exposure - first[pass_code]
+    if config.shuffle_names:
+        number = random_stream(seed, "shuffle", "names").permutation(int(exposure.max()) + 1)[exposure]
+    camera_names = [f"cam-{camera}" for camera in range(config.cameras)]
+    folder = "{0}" if config.cameras == 1 else ("{0}/{1}", "{1}/{0}", "{0}-{1}")[config.camera_folders]
+    folders = [[folder.format(p, c) for c in camera_names] for p in pass_names]
+    names = [
+        f"{folders[code][camera]}/{i:06d}.jpg"
+        for code, camera, i in zip(pass_code, frames.camera_row, number, strict=True)
+    ]
+    if config.pass_per_camera:
+        pass_names = [f"{p}-{c}" for p in pass_names for c in camera_names]
+        pass_code = config.cameras * pass_code + frames.camera_row
+    return names, Categories(pass_code.astype(np.int32), tuple(pass_names))
 
 
 def _pose_sigmas(count: int, config: SimulationConfig) -> dict[str, Any]:
@@ -228,8 +277,12 @@ def _pose_sigmas(count: int, config: SimulationConfig) -> dict[str, Any]:
     if not config.write_pose_sigmas:
         return {}
     sigmas = {
-        "position_sigma_m": np.hypot(config.position_white_m, config.position_drift_m),
-        "rotation_sigma_rad": np.radians(np.hypot(config.rotation_white_deg, config.rotation_drift_deg)),
+        "position_sigma_m": np.hypot(
+            np.hypot(config.position_white_m, config.position_drift_m), config.position_middle_m
+        ),
+        "rotation_sigma_rad": np.radians(
+            np.hypot(np.hypot(config.rotation_white_deg, config.rotation_drift_deg), config.rotation_middle_deg)
+        ),
     }
     return {name: np.full(count, sigma) for name, sigma in sigmas.items() if sigma > 0.0}
 

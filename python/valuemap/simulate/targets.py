@@ -21,7 +21,8 @@ class Targets(Table):
     `position_in_world_m` (N, 3) are their centres; `facing_rad` (N) where they face to, counter-clockwise from
     east; `size_m` (N, 2) width and height; `recall_share` (N) how often they are detected compared to a light;
     `pass_row` (N) the only pass that meets them, or -1 for all; `class_code` (N) what they are, or look like;
-    `is_round` (N) whether they look the same from all sides.
+    `is_round` (N) whether they look the same from all sides; `uneven_m` (N, 4) how the middle of their boxes is off
+    their centres from different sides: sideways (cosine and sine of twice the angle) and up (of once).
     """
 
     position_in_world_m: Floats
@@ -31,6 +32,7 @@ class Targets(Table):
     pass_row: Ints
     class_code: Ints
     is_round: Bools
+    uneven_m: Floats
 
 
 def classes_in(config: SimulationConfig) -> Ints:
