@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -10,21 +9,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
+from report_city import city
 from small_dataset import map_of, small_dataset
-from valuemap import build_map
-from valuemap.config import SimulationConfig
 from valuemap.dataset import write_dataset
 from valuemap.errors import InputError
 from valuemap.evidence import Evidence, cut_out, find_dataset, picture_file
-from valuemap.simulate import simulate
-
-
-@cache
-def city() -> Evidence:
-    """Return a small simulated city and its map."""
-    config = SimulationConfig(streets_north_south=3, streets_east_west=2, signalised_share=1.0, lights=20)
-    dataset = simulate(config, seed=3)
-    return Evidence(build_map(dataset), dataset)
 
 
 def test_voters_are_those_of_the_map_and_projections_explain_the_residuals() -> None:

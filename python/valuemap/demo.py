@@ -16,7 +16,7 @@ from valuemap.evaluate import Evaluation, evaluate_map
 from valuemap.map_folder import Map, write_map
 from valuemap.pipeline import build_map
 from valuemap.progress import Progress, silent
-from valuemap.report import draw_map
+from valuemap.report.above import draw_map
 from valuemap.simulate import PRESETS, record_city
 from valuemap.simulate.render import BOXES, render_images
 

@@ -20,10 +20,13 @@ from valuemap.cameras import Rays, camera_centers, cast_rays, colmap_camera, rot
 from valuemap.dataset import MARKER, Dataset, number_passes, rows_of
 from valuemap.errors import InputError
 from valuemap.map_folder import Map
-from valuemap.tables import Bools, Floats, Ints
+from valuemap.tables import Bools, Floats, Ints, Rejected, read_table
 
 PICTURES = "images"
 """The folder of a dataset that holds its pictures, where it has some."""
+
+REJECTED = "rejected.parquet"
+"""The file of a map that holds its rejected hypotheses, where it keeps them."""
 
 NEAREST_M = 4.0
 """Nearer than this no image is expected to see an object."""
@@ -394,6 +397,20 @@ def find_dataset(map_folder: Path, run: dict[str, Any], given: Path | None = Non
     candidates = [Path(os.path.normpath(map_folder.absolute() / named))] if isinstance(named, str) else []
     candidates.append(map_folder.absolute().parent / "dataset")
     return next((folder for folder in candidates if (folder / MARKER).is_file()), None)
+
+
+def read_rejected(map_folder: Path) -> Rejected | None:
+    """Read the rejected hypotheses of a map; None where it keeps none. Raises as `read_table`."""
+    file = map_folder / REJECTED
+    return read_table(Rejected, file) if file.is_file() else None
+
+
+def dataset_reference(dataset_folder: Path, map_folder: Path) -> str:
+    """Return what run.json holds as `dataset_folder`: the way from the map's folder, so that both can be moved."""
+    try:
+        return Path(os.path.relpath(dataset_folder.resolve(), map_folder.resolve())).as_posix()
+    except ValueError:  # Another drive.
+        return dataset_folder.resolve().as_posix()
 
 
 def picture_file(pictures: Path | None, name: str) -> Path | None:

@@ -14,9 +14,13 @@ from valuemap.cli.options import AsJson, Settings
 from valuemap.cli.show import log, progress_bars, show
 from valuemap.config import MapConfig, Method
 from valuemap.dataset import read_dataset
+from valuemap.evaluate import evaluate_map
+from valuemap.evidence import dataset_reference
 from valuemap.folders import check_place
 from valuemap.map_folder import write_map
 from valuemap.pipeline import build_map
+from valuemap.report.above import draw_map
+from valuemap.report.style import check_format
 from valuemap.summary import summarize_map
 
 
@@ -26,15 +30,24 @@ def map_command(
     out: Annotated[Path, typer.Option("--out", help="Folder to write the map to.")],
     method: Annotated[str, typer.Option(help=f"One of {', '.join(get_args(Method))}.")] = MapConfig().method,
     threads: Annotated[int, typer.Option(min=0, help="Threads, 0 for one a core; the map is the same.")] = 0,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw the map from above, as .png or .svg.")
+    ] = None,
     assignments: Settings = None,
     as_json: AsJson = False,
 ) -> None:
     """Turn the detections of a dataset into a map of labels."""
     config = MapConfig(method=method).with_settings(assignments or [])  # type: ignore[arg-type]
     check_place(out, marker=map_folder.MARKER)
+    if picture is not None:
+        check_format(picture)
     with progress_bars() as progress:
-        result = build_map(read_dataset(dataset), config, threads=threads, progress=progress)
+        data = read_dataset(dataset)
+        result = build_map(data, config, threads=threads, progress=progress)
+    result.run["dataset_folder"] = dataset_reference(dataset, out)
     write_map(result, out)
+    if picture is not None:
+        draw_map(result, data, evaluate_map(result, data).matches if data.truth is not None else None, picture)
     if as_json:
         print(json.dumps(result.run, indent=2))
     else:

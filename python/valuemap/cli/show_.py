@@ -1,0 +1,123 @@
+"""`valuemap show`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from valuemap.cli.app import app
+from valuemap.cli.options import AsJson
+from valuemap.cli.show import log, out, show
+from valuemap.dataset import read_dataset
+from valuemap.errors import InputError, SettingError
+from valuemap.evidence import PICTURES, Evidence, find_dataset, read_rejected
+from valuemap.map_folder import read_map
+
+if TYPE_CHECKING:
+    from valuemap.tables import Floats
+
+
+@app.command("show")
+def show_command(
+    map_: Annotated[Path, typer.Argument(metavar="MAP", help="Folder that valuemap map wrote.")],
+    label: Annotated[int | None, typer.Argument(metavar="[LABEL]", help="Id of a label.", show_default=False)] = None,
+    at: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="X Y", help="Say why there is nothing at a place, in the axes of the picture from above."),
+    ] = None,
+    lat: Annotated[float | None, typer.Option(help="The same place in WGS84 degrees, with --lon.")] = None,
+    lon: Annotated[float | None, typer.Option(help="See --lat.")] = None,
+    radius: Annotated[float, typer.Option(min=0.1, help="Metres around the place that count.")] = 2.0,
+    file: Annotated[
+        Path | None, typer.Option("--out", help="Picture to write, .png or .svg; default: label-ID.png or place.png.")
+    ] = None,
+    dataset: Annotated[
+        Path | None, typer.Option(help="What the map was made from; default: where valuemap map found it.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show one label as a picture: its votes, the images that missed it, its rays; or why there is none at a place."""
+    from valuemap.report.label_sheet import plot_label
+    from valuemap.report.place_sheet import explain_place, plot_place
+    from valuemap.report.style import check_format, save_figure
+
+    asked = [label is not None, at is not None, lat is not None or lon is not None]
+    if sum(asked) != 1 or (lat is None) != (lon is None):
+        raise SettingError(
+            "show: expected a label, or a place as --at X Y or as --lat and --lon",
+            hint="for example valuemap show MAP 12, or valuemap show MAP --at 105.2 48.9",
+        )
+    picture = file if file is not None else Path(f"label-{label}.png" if label is not None else "place.png")
+    check_format(picture)
+    result = read_map(map_)
+    folder = find_dataset(map_, result.run, dataset)
+    if folder is None:
+        raise InputError(
+            f"{map_}: cannot tell which dataset the map was made from", hint="give its folder with --dataset"
+        )
+    evidence = Evidence(result, read_dataset(folder))
+    pictures = folder / PICTURES
+    if label is not None:
+        facts = _label_facts(evidence, label)
+        save_figure(plot_label(evidence, label, pictures if pictures.is_dir() else None), picture)
+        if as_json:
+            print(json.dumps(facts, indent=2))
+        else:
+            show(facts)
+    else:
+        point = _place(evidence, at, lat, lon)
+        rejected = read_rejected(map_)
+        answer = explain_place(evidence, point, rejected, radius_m=radius)
+        save_figure(plot_place(evidence, answer, rejected, pictures if pictures.is_dir() else None), picture)
+        if as_json:
+            print(json.dumps(answer.to_json(), indent=2))
+        else:
+            for reason in answer.reasons:
+                out.print(reason, markup=False, highlight=False, soft_wrap=True)
+    log.print(f"Wrote {picture}", highlight=False, markup=False)
+
+
+def _label_facts(evidence: Evidence, label: int) -> dict[str, Any]:
+    labels, row = evidence.result.labels, evidence.label_row(label)
+    voters, misses = evidence.voters(label), evidence.misses(label)
+    x, y, z = (float(c) for c in labels.position_in_world_m[row])
+    sigma = np.sqrt(np.maximum(labels.covariance_m2[row][[0, 3, 5]], 0.0))
+    facts: dict[str, Any] = {
+        "label": label,
+        "class": labels.class_name.names[labels.class_name.codes[row]],
+        "x": x,
+        "y": y,
+        "z": z,
+        "sigma x": float(sigma[0]),
+        "sigma y": float(sigma[1]),
+        "sigma z": float(sigma[2]),
+        "votes": len(voters),
+        "passes": len(np.unique(voters.pass_number)),
+        "images that should have seen it and did not": len(misses),
+        "reprojection rms in px": float(labels.reprojection_rms_px[row]),
+    }
+    if labels.existence is not None:
+        facts["existence"] = float(labels.existence[row])
+    if labels.lon_lat_height is not None:
+        facts |= dict(zip(("lon", "lat", "height"), map(float, labels.lon_lat_height[row]), strict=True))
+    return facts
+
+
+def _place(evidence: Evidence, at: tuple[float, float] | None, lat: float | None, lon: float | None) -> Floats:
+    """Return the place in the world, at the height of the cameras around."""
+    from valuemap.geodesy import enu_from_lon_lat_height
+    from valuemap.report.place_sheet import place_in_world
+
+    if at is None:
+        anchor = evidence.result.frame.anchor
+        if anchor is None:
+            raise InputError(
+                "--lat and --lon: the map is not geo-referenced", hint="give the place in metres with --at X Y"
+            )
+        x, y, _ = enu_from_lon_lat_height(np.array([[lon, lat, anchor[2]]], np.float64), anchor)[0]
+        at = (float(x), float(y))
+    return place_in_world(evidence, *at)

@@ -1,0 +1,153 @@
+"""Tables of a map itself: classes, what the run counted, settings, time and memory, its most doubtful labels."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from valuemap.config import MapConfig
+from valuemap.evaluate import Evaluation
+from valuemap.map_folder import Map
+from valuemap.report.paper import Cell, ReportTable
+from valuemap.tables import Floats, Ints
+
+DOUBTFUL = 12
+"""How many of the most doubtful labels, and of the worst, are listed."""
+
+
+def run_tables(result: Map) -> list[ReportTable]:
+    """Return the tables that need nothing but the map."""
+    return [_classes(result), _stages(result), _counts(result), _settings(result)]
+
+
+def doubtful_rows(result: Map) -> Ints:
+    """Return the rows of the labels that exist with the least probability, else have the fewest votes."""
+    labels = result.labels
+    order = np.lexsort((labels.label_id, labels.votes))
+    if labels.existence is not None:
+        order = np.lexsort((labels.label_id, labels.votes, labels.existence))
+    return np.asarray(order[:DOUBTFUL])
+
+
+def worst_rows(result: Map, evaluation: Evaluation | None) -> Ints:
+    """Return the rows of the worst labels, the worst first.
+
+    With truth: false ones, duplicates, then those farthest from their objects. Without: those with the largest
+    uncertainty.
+    """
+    labels = result.labels
+    if evaluation is None:
+        return np.asarray(np.lexsort((labels.label_id, -spread_m(result)))[:DOUBTFUL])
+    matches = evaluation.matches
+    names = np.array(matches.label_outcome.names)
+    rank = np.array([{"false": 0, "duplicate": 1}.get(name, 2) for name in names])[matches.label_outcome.codes]
+    error = error_m(result, evaluation)
+    return np.asarray(np.lexsort((labels.label_id, -np.nan_to_num(error, nan=-1.0), rank))[:DOUBTFUL])
+
+
+def error_m(result: Map, evaluation: Evaluation) -> Floats:
+    """Return the distance (labels) of every true label from its object, NaN for the others."""
+    matches = evaluation.matches
+    row = matches.object_of_label
+    error = np.full(len(row), np.nan)
+    found = row >= 0
+    apart = result.labels.position_in_world_m[found] - matches.object_in_world_m[row[found]]
+    if not matches.objects.has_height:
+        apart -= np.outer(apart @ np.array(result.frame.up), result.frame.up)
+    error[found] = np.linalg.norm(apart, axis=1)
+    return error
+
+
+def spread_m(result: Map) -> Floats:
+    """Return the standard deviation (labels) of each position, over all directions: the root of the trace."""
+    trace = result.labels.covariance_m2[:, [0, 3, 5]].sum(axis=1)
+    return np.asarray(np.sqrt(np.maximum(trace, 0.0)))
+
+
+def label_table(name: str, title: str, result: Map, rows: Ints, evaluation: Evaluation | None) -> ReportTable:
+    """Return a table of some labels."""
+    labels = result.labels
+    spread = spread_m(result)
+    columns = ["label", "class", "votes", "passes", "existence", "sigma (m)", "reprojection rms (px)"]
+    if evaluation is not None:
+        columns += ["outcome", "error (m)"]
+        outcome, error = evaluation.matches.label_outcome, error_m(result, evaluation)
+    body: list[tuple[Cell, ...]] = []
+    for row in rows:
+        cells: list[Cell] = [
+            int(labels.label_id[row]),
+            labels.class_name.names[labels.class_name.codes[row]],
+            int(labels.votes[row]),
+            int(labels.passes[row]),
+            None if labels.existence is None else float(labels.existence[row]),
+            float(spread[row]),
+            float(labels.reprojection_rms_px[row]),
+        ]
+        if evaluation is not None:
+            cells += [outcome.names[outcome.codes[row]], None if math.isnan(error[row]) else float(error[row])]
+        body.append(tuple(cells))
+    return ReportTable(name, title, tuple(columns), tuple(body))
+
+
+def _classes(result: Map) -> ReportTable:
+    labels = result.labels
+    rows: list[tuple[Cell, ...]] = []
+    for code in np.unique(labels.class_name.codes):
+        of_class = labels.class_name.codes == code
+        existence = None if labels.existence is None else float(np.median(labels.existence[of_class]))
+        rows.append(
+            (
+                labels.class_name.names[code],
+                int(of_class.sum()),
+                float(np.median(labels.votes[of_class])),
+                float(np.median(labels.passes[of_class])),
+                existence,
+                float(np.median(spread_m(result)[of_class])),
+                float(np.median(labels.reprojection_rms_px[of_class])),
+            )
+        )
+    rows.sort(key=lambda row: (-int(row[1] or 0), str(row[0])))
+    columns = ("class", "labels", "votes", "passes", "existence", "sigma (m)", "reprojection rms (px)")
+    return ReportTable("classes", "Labels by class", columns, tuple(rows), ("Medians over the labels of a class.",))
+
+
+def _stages(result: Map) -> ReportTable:
+    stages = [stage for stage in result.run.get("stages", []) if isinstance(stage, dict)]
+    rows: list[tuple[Cell, ...]] = [
+        (str(stage.get("stage", "?")), stage.get("seconds"), stage.get("peak_memory_mb")) for stage in stages
+    ]
+    if rows:
+        seconds = [float(row[1]) for row in rows if isinstance(row[1], int | float)]
+        memory = [int(row[2]) for row in rows if isinstance(row[2], int | float)]
+        rows.append(("all", sum(seconds), max(memory, default=None)))
+    columns = ("stage", "seconds", "peak memory so far (MB)")
+    return ReportTable("stages", "Where time and memory went", columns, tuple(rows))
+
+
+def _counts(result: Map) -> ReportTable:
+    rows = tuple(
+        (name.replace("_", " "), value) for name, value in _flat(result.run.get("counts", {})) if value is not None
+    )
+    return ReportTable("counts", "What the run counted", ("", "value"), rows)
+
+
+def _settings(result: Map) -> ReportTable:
+    defaults = MapConfig().as_dict()
+    rows: tuple[tuple[Cell, ...], ...] = tuple(
+        (name, "estimated" if value is None else value, "" if defaults.get(name, value) == value else "changed")
+        for name, value in _flat(result.run.get("settings", {}))
+    )
+    return ReportTable("settings", "Settings of the run", ("setting", "value", ""), rows)
+
+
+def _flat(record: Any, prefix: str = "") -> list[tuple[str, Cell]]:
+    """Return what a record holds by name, nested names joined."""
+    flat: list[tuple[str, Cell]] = []
+    for name, value in record.items() if isinstance(record, dict) else ():
+        if isinstance(value, dict):
+            flat += _flat(value, f"{prefix}{name} ")
+        else:
+            flat.append((f"{prefix}{name}", value if isinstance(value, int | float | str | None) else str(value)))
+    return flat
