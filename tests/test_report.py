@@ -197,10 +197,11 @@ def test_ellipses_are_drawn_as_large_as_they_are() -> None:
     from matplotlib.collections import EllipseCollection
 
     figure = plot_map(map_of([[20.0, 10.0, 5.0], [20.5, 10.0, 5.0]]), street())
-    drawn_m = [
-        c.get_widths().max() for axes in figure.axes for c in axes.collections if isinstance(c, EllipseCollection)
-        if len(c.get_widths())
-    ]  # fmt: skip
+    drawn_m: list[float] = []
+    for axes in figure.axes:
+        for collection in axes.collections:
+            if isinstance(collection, EllipseCollection):
+                drawn_m += np.ravel(np.asarray(collection.get_widths(), np.float64)).tolist()
     assert drawn_m
     assert_allclose(drawn_m, 2.0 * ELLIPSE_SIGMAS * 0.2, rtol=1e-12)
 
@@ -254,7 +255,8 @@ def line(start: Any, end: Any, count: int = 8) -> Floats:
     ],
 )
 def test_a_gap_is_driven_through_where_the_direction_fits(after: Any, way: Any) -> None:
-    images = images_at(np.concatenate([line([0, 0], [20, 0]), after]))
+    points = np.concatenate([line([0, 0], [20, 0]), after])
+    images = images_at(points, times=np.arange(len(points)))
     joins = drives_of(images, np.eye(3)[:2])[1]
     assert len(joins) == (way is not None)
     if way is not None:

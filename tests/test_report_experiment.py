@@ -14,11 +14,12 @@ from numpy.testing import assert_array_equal
 
 from report_city import city
 from small_dataset import small_dataset
-from valuemap import experiment
+from valuemap import build_map, experiment
 from valuemap.config import MapConfig
-from valuemap.dataset import Dataset
+from valuemap.dataset import Dataset, number_passes
 from valuemap.errors import InputError, OutputError, SettingError
 from valuemap.experiment import MARKER, RESULT, PassesResult, _curve, _ranks, experiment_passes, read_passes
+from valuemap.partition import partition_images
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +51,7 @@ def test_a_finished_experiment_is_read_and_an_interrupted_one_goes_on(
     runs[0].unlink()
     runs[1].write_text("{")  # Cut short by a full disk.
     made = []
-    build = experiment.build_map
+    build = build_map
 
     def counting(*arguments: Any, **settings: Any) -> Any:
         made.append(1)
@@ -114,7 +115,7 @@ def test_each_cluster_ranks_its_own_passes_in_one_order() -> None:
 def test_the_curve_is_of_clusters_that_have_the_passes() -> None:
     """Cluster 0 has 2 passes, cluster 1 has 3, cluster 2 is not counted; nothing was found in cluster 1 once."""
     jobs = [(0, 1), (1, 1), (0, 2), (1, 2)]
-    runs = [
+    runs: list[dict[str, Any]] = [
         {"found": [1, 0, 9], "objects": [2, 4, 9]},
         {"found": [2, 0, 9], "objects": [2, 4, 9]},
         {"found": [2, 1, 9], "objects": [2, 4, 9]},
@@ -134,15 +135,15 @@ def test_the_curve_is_of_clusters_that_have_the_passes() -> None:
 def test_the_pass_left_out_is_never_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Detections of the last pass in the order of a cluster are moved by 50 px: the error says so, the maps do not."""
     dataset = city().dataset
-    cluster = experiment.partition_images(dataset.images, MapConfig().partition).astype(np.int64)
-    passes = experiment.number_passes(dataset.images)
+    cluster = partition_images(dataset.images, MapConfig().partition).astype(np.int64)
+    passes = number_passes(dataset.images)
     rank, last = _ranks(cluster, passes, 0)
     left_out = dataset.images.image_id[rank == last[cluster]]
     moved = np.isin(dataset.detections.image_id, left_out)
     center = dataset.detections.center_px + np.where(moved, 50.0, 0.0)[:, None] * [0.0, 1.0]
     spoiled = replace(dataset, detections=dataset.detections.replace(center_px=center))
     parts: list[Dataset] = []
-    build = experiment.build_map
+    build = build_map
 
     def keeping(part: Dataset, *arguments: Any, **settings: Any) -> Any:
         parts.append(part)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from valuemap.cameras import Rays, camera_centers, cast_rays, colmap_camera, rotation_matrices
 from valuemap.dataset import MARKER, Dataset, number_passes, rows_of
+from valuemap.drives import find_drives
 from valuemap.errors import InputError
 from valuemap.map_folder import Map
 from valuemap.tables import Bools, Floats, Ints, Rejected, read_table
@@ -146,9 +147,10 @@ class Evidence:
     def drive_order(self) -> Ints:
         """The place (images) of every image in the order of passes, and in it of the drive."""
         images = self.dataset.images
-        time = images.image_id if images.timestamp_s is None else images.timestamp_s
+        drives = find_drives(images)
         place = np.empty(len(images), np.int64)
-        place[np.lexsort((images.image_id, time, self.pass_number))] = np.arange(len(images))
+        order = np.lexsort((images.image_id, drives.order, drives.pass_code, self.pass_number))
+        place[order] = np.arange(len(images))
         return place
 
     @cached_property

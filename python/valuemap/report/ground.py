@@ -10,6 +10,7 @@ import numpy as np
 
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset, Frame
+from valuemap.drives import find_drives
 from valuemap.map_folder import Map
 from valuemap.tables import Categories, Floats, Images, Ints
 
@@ -124,13 +125,16 @@ def drives_of(images: Images, axes_in_world: Floats) -> tuple[list[Floats], list
     Images of a pass in order make stretches, cut where the pass jumps. Where it goes on after a gap, straight on or
     around one corner, it probably drove through the gap and took no pictures.
     """
-    order = np.lexsort((images.image_id, _times(images), images.pass_id.codes))
+    found = find_drives(images)
+    order = np.lexsort((found.order, found.pass_code, images.pass_id.codes))
+    exposure = np.stack([found.pass_code, found.order])[:, order]
+    order = order[np.append(True, np.any(np.diff(exposure, axis=1) != 0, axis=0))]  # One image of each rig.
     points = (camera_centers(images) @ axes_in_world.T)[order]
-    pass_code = images.pass_id.codes[order]
+    pass_code, drive_code = images.pass_id.codes[order], found.pass_code[order]
     step = np.linalg.norm(np.diff(points, axis=0), axis=1)
     moving = step[step > 0.0]
     longest_step = max(25.0, 5.0 * float(np.median(moving))) if len(moving) else 0.0
-    cuts = np.flatnonzero((np.diff(pass_code) != 0) | (step > longest_step)) + 1
+    cuts = np.flatnonzero((np.diff(drive_code) != 0) | (np.diff(pass_code) != 0) | (step > longest_step)) + 1
     drives = [np.asarray(drive) for drive in np.split(points, cuts)]
     joins = [
         way
@@ -138,10 +142,6 @@ def drives_of(images: Images, axes_in_world: Floats) -> tuple[list[Floats], list
         if pass_code[cut - 1] == pass_code[cut] and (way := _way_between(before, after)) is not None
     ]
     return drives, joins
-
-
-def _times(images: Images) -> Floats | Ints:
-    return images.image_id if images.timestamp_s is None else images.timestamp_s
 
 
 def _way_between(before: Floats, after: Floats) -> Floats | None:
