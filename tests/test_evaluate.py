@@ -355,6 +355,54 @@ def test_the_parallax_is_that_of_the_map_unless_given() -> None:
     assert math.isnan(evaluate_map(strict, dataset).recall)
 
 
+def test_objects_far_from_all_images_do_not_count(tmp_path: Path) -> None:
+    """The images of the small dataset are at x = 0 to 12 m and y = 0: objects are 24.9 and 25.1 m beside one."""
+    dataset = small_dataset()
+    truth = truth_of([[4.0, 24.9, 90.0], [12.0, -25.1, 0.0], [0.0, 24.9, 0.0]])
+    result = map_of([[4.0, 24.9, 90.0]])
+    evaluation = evaluate_map(result, truth, images=dataset, seen_within_m=25.0)
+    assert (evaluation.objects, evaluation.recoverable_objects, evaluation.recall) == (3, 2, 0.5)
+    assert evaluation.completeness.missing_not_recoverable == 1
+    (note,) = [note for note in evaluation.notes if "farther" in note]
+    assert note == "1 of 3 objects lie farther than 25 m from every image and do not count"
+    write_dataset(dataset, tmp_path / "city")
+    assert evaluate_map(result, truth, images=tmp_path / "city", seen_within_m=25.0) == evaluation
+    assert evaluate_map(result, truth).recoverable_objects == 3
+
+
+def test_far_objects_do_not_count_although_they_were_detected() -> None:
+    """The truth of a dataset says where its images are; what was not detected twice stays out as well."""
+    dataset = scene_of_views(
+        [np.array([[0.0, -20.0, 0.0], [8.0, -20.0, 0.0]]), np.array([[30.0, -20.0, 0.0]])],
+        np.array([[0.0, 0.0, 0.0], [30.0, 0.0, 0.0]]),
+    )
+    for within_m, expected in ((30.0, 1), (20.1, 1), (19.9, 0)):
+        assert evaluate_map(map_of([]), dataset, seen_within_m=within_m).recoverable_objects == expected
+
+
+def test_images_in_another_georeferenced_frame_are_converted() -> None:
+    """The anchor of the map is 111 m north of that of the images."""
+    other = (ANCHOR[0] + 0.001, ANCHOR[1], ANCHOR[2])
+    truth = truth_of([[4.0, 20.0 - 111.3, 0.0], [4.0, 20.0, 0.0]])
+    images = small_dataset(Frame(anchor=ANCHOR))
+    evaluation = evaluate_map(map_of([], frame=Frame(anchor=other)), truth, images=images, seen_within_m=25.0)
+    assert evaluation.recoverable_objects == 1
+    with pytest.raises(InputError, match="the images are in frame .* the map in "):
+        evaluate_map(map_of([]), truth, images=images, seen_within_m=25.0)
+
+
+@pytest.mark.parametrize("distance_m", [0.0, -1.0, math.nan, math.inf])
+def test_an_impossible_distance_is_refused(distance_m: float) -> None:
+    with pytest.raises(SettingError, match="seen_within: expected above 0 m, found "):
+        evaluate_map(map_of([]), small_dataset(), seen_within_m=distance_m)
+
+
+def test_a_distance_needs_images() -> None:
+    with pytest.raises(SettingError, match="does not say where the images are") as refusal:
+        evaluate_map(map_of([]), truth_of([[0, 0, 0]]), seen_within_m=25.0)
+    assert "as images" in refusal.value.hint
+
+
 # Truth from files.
 
 

@@ -25,10 +25,23 @@ def evaluate_command(
         float | None,
         typer.Option(metavar="M", help="Standard deviation of the true positions on each axis, in metres."),
     ] = None,
+    images: Annotated[
+        Path | None, typer.Option(metavar="DATASET", help="The dataset of the map, where the truth is a file.")
+    ] = None,
+    seen_within: Annotated[
+        float | None, typer.Option(metavar="M", help="Objects farther than this from every image do not count.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare a map with known objects: counts, an accuracy statement, completeness, and what chance would give."""
-    evaluation = evaluate_map(read_map(map_), truth, radius_m=radius, truth_sigma_m=truth_sigma)
+    evaluation = evaluate_map(
+        read_map(map_),
+        truth,
+        radius_m=radius,
+        truth_sigma_m=truth_sigma,
+        images=images,
+        seen_within_m=seen_within,
+    )
     if as_json:
         print(json.dumps(evaluation.to_json(), indent=2))
     else:

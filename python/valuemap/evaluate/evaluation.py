@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,13 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from valuemap.dataset import Dataset
+from valuemap.cameras import camera_centers
+from valuemap.dataset import Dataset, Frame, read_dataset
+from valuemap.errors import SettingError
 from valuemap.evaluate.accuracy import PositionalAccuracy, measure_accuracy
 from valuemap.evaluate.chance import ChanceFloor, measure_chance
 from valuemap.evaluate.completeness import Completeness, measure_completeness
 from valuemap.evaluate.matching import LABEL_OUTCOMES, Matches, match_labels
+from valuemap.evaluate.recoverable import near_images
 from valuemap.evaluate.reliability import ExistenceRange, measure_reliability
-from valuemap.evaluate.truth import TrueObjects, true_objects
+from valuemap.evaluate.truth import TrueObjects, positions_in_frame, true_objects
 from valuemap.map_folder import Map, read_map
 from valuemap.tables import Floats, Truth
 
@@ -92,6 +96,8 @@ def evaluate_map(
     radius_m: float = 2.0,
     min_parallax_rad: float | None = None,
     truth_sigma_m: float | None = None,
+    images: Dataset | str | Path | None = None,
+    seen_within_m: float | None = None,
 ) -> Evaluation:
     """Compare a map with known objects.
 
@@ -109,22 +115,54 @@ def evaluate_map(
         least this angle. Default: the `min_parallax_deg` that the map was made with.
     truth_sigma_m
         Standard deviation of the true positions on each axis, where it is known; the accuracy statement adds it.
+    images
+        The dataset that the map was made from, or its folder. Default: the truth, where that is a dataset.
+    seen_within_m
+        Objects farther than this from every image, horizontally, could not be seen and do not count in the recall.
+        Default: distance does not matter.
 
     Raises
     ------
     InputError
-        There is no truth, it cannot be read, or it is in another frame than the map.
+        There is no truth, it cannot be read, or it or the images are in another frame than the map.
     SettingError
-        The radius, the angle or the standard deviation is impossible.
+        The radius, the angle, the standard deviation or the distance is impossible, or there are no images for it.
     """
     if isinstance(result, str | Path):
         result = read_map(result)
     objects = true_objects(truth, result, min_parallax_rad)
+    notes = _notes(objects)
+    if seen_within_m is not None:
+        source = truth if images is None else images
+        objects, note = _only_seen(objects, source, result.frame, seen_within_m)
+        notes = (*notes, note)
     matches = match_labels(result.labels, objects, result.frame, radius_m=radius_m)
-    return _measure(result, matches, radius_m, truth_sigma_m)
+    return _measure(result, matches, radius_m, truth_sigma_m, notes)
 
 
-def _measure(result: Map, matches: Matches, radius_m: float, truth_sigma_m: float | None) -> Evaluation:
+def _only_seen(
+    objects: TrueObjects, source: Dataset | Truth | str | Path, frame: Frame, seen_within_m: float
+) -> tuple[TrueObjects, str]:
+    """Take objects far from all images for ones that nobody can place; return them and what to say of it."""
+    if not (math.isfinite(seen_within_m) and seen_within_m > 0.0):
+        raise SettingError(f"seen_within: expected above 0 m, found {seen_within_m}", hint="for example 25")
+    if isinstance(source, str | Path) and Path(source).is_dir():
+        source = read_dataset(source)
+    if not isinstance(source, Dataset):
+        raise SettingError(
+            "seen_within: the truth does not say where the images are",
+            hint="name the dataset that the map was made from as images (--images)",
+        )
+    center = positions_in_frame(camera_centers(source.images), source, frame, what="the images are")
+    is_near = near_images(objects.position_in_world_m, center, np.array(frame.up), seen_within_m)
+    far = int(np.sum(~is_near))
+    note = f"{far} of {len(objects)} objects lie farther than {seen_within_m:g} m from every image and do not count"
+    return dataclasses.replace(objects, is_recoverable=objects.counts_in_recall & is_near), note
+
+
+def _measure(
+    result: Map, matches: Matches, radius_m: float, truth_sigma_m: float | None, notes: tuple[str, ...]
+) -> Evaluation:
     objects = matches.objects
     found = matches.object_of_label >= 0
     offset = result.labels.position_in_world_m[found] - objects.position_in_world_m[matches.object_of_label[found]]
@@ -155,7 +193,7 @@ def _measure(result: Map, matches: Matches, radius_m: float, truth_sigma_m: floa
         objects=len(objects),
         recoverable_objects=recoverable,
         radius_m=radius_m,
-        notes=(*_notes(objects), *accuracy.notes),
+        notes=(*notes, *accuracy.notes),
         accuracy=accuracy,
         completeness=measure_completeness(matches),
         chance=measure_chance(result.labels, objects, result.frame, radius_m=radius_m),

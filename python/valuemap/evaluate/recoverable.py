@@ -1,4 +1,4 @@
-"""Which true objects a map could hold: those that were detected from sufficiently different directions."""
+"""Which true objects a map could hold: detected from sufficiently different directions, or near an image at least."""
 
 from __future__ import annotations
 
@@ -24,6 +24,18 @@ def recoverable_objects(dataset: Dataset, min_parallax_rad: float) -> Bools | No
         return None
     object_row, direction = _views(dataset.truth, dataset.truth_detections, dataset)
     return _are_spread(object_row, direction, len(dataset.truth), 2.0 * math.sin(min_parallax_rad / 2.0))
+
+
+def near_images(position_in_world_m: Floats, center_in_world_m: Floats, up: Floats, radius_m: float) -> Bools:
+    """Return which positions (N, 3) lie within a radius of a camera centre (M, 3), across up."""
+    from scipy.spatial import KDTree  # Slow to import, and only evaluation needs it.
+
+    if len(position_in_world_m) == 0:
+        return np.empty(0, np.bool_)
+    along_ground = np.eye(3) - np.outer(up, up)
+    distance_m, _ = KDTree(center_in_world_m @ along_ground).query(position_in_world_m @ along_ground)
+    near: Bools = np.asarray(distance_m <= radius_m)
+    return near
 
 
 def _views(truth: Truth, pairs: TruthDetections, dataset: Dataset) -> tuple[Ints, Floats]:

@@ -123,21 +123,33 @@ def _objects_of_dataset(dataset: Dataset, frame: Frame, min_parallax_rad: float)
             f"min_parallax: expected 0 to 180 degrees, found {math.degrees(min_parallax_rad):g}",
             hint="the default is that of the map",
         )
-    position = truth.position_in_world_m
-    if frame.anchor is not None and dataset.frame.anchor is not None:
-        if frame.anchor != dataset.frame.anchor:
-            position = enu_from_lon_lat_height(lon_lat_height_from_enu(position, dataset.frame.anchor), frame.anchor)
-    elif frame.is_georeferenced or dataset.frame.is_georeferenced or not np.allclose(frame.up, dataset.frame.up):
-        raise InputError(
-            f"{dataset.name}: the truth is in frame {dataset.frame.to_json()}, the map in {frame.to_json()}",
-            hint="evaluate with the dataset that the map was made from, or with truth in the same frame",
-        )
+    position = positions_in_frame(truth.position_in_world_m, dataset, frame, what="the truth is")
     return TrueObjects(
         truth.object_id,
         position,
         truth.class_name,
         is_recoverable=recoverable_objects(dataset, min_parallax_rad),
     )
+
+
+def positions_in_frame(position_in_world_m: Floats, dataset: Dataset, frame: Frame, *, what: str) -> Floats:
+    """Return positions (N, 3) of a dataset in the frame of a map; `what` begins the message where that cannot be.
+
+    Raises
+    ------
+    InputError
+        The frames have nothing to do with each other.
+    """
+    if frame.anchor is not None and dataset.frame.anchor is not None:
+        if frame.anchor == dataset.frame.anchor:
+            return position_in_world_m
+        return enu_from_lon_lat_height(lon_lat_height_from_enu(position_in_world_m, dataset.frame.anchor), frame.anchor)
+    if frame.is_georeferenced or dataset.frame.is_georeferenced or not np.allclose(frame.up, dataset.frame.up):
+        raise InputError(
+            f"{dataset.name}: {what} in frame {dataset.frame.to_json()}, the map in {frame.to_json()}",
+            hint="evaluate with the dataset that the map was made from, or with one in the same frame",
+        )
+    return position_in_world_m
 
 
 def _objects_on_earth(truth: GeographicTruth, anchor: tuple[float, float, float], labels: Labels) -> TrueObjects:
