@@ -397,10 +397,14 @@ def test_an_impossible_distance_is_refused(distance_m: float) -> None:
         evaluate_map(map_of([]), small_dataset(), seen_within_m=distance_m)
 
 
-def test_a_distance_needs_images() -> None:
+def test_a_distance_needs_images_and_images_a_distance(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="does not say where the images are") as refusal:
         evaluate_map(map_of([]), truth_of([[0, 0, 0]]), seen_within_m=25.0)
-    assert "as images" in refusal.value.hint
+    assert "--images" in refusal.value.hint
+    with pytest.raises(InputError, match=r"absent: is not a dataset"):
+        evaluate_map(map_of([]), truth_of([[0, 0, 0]]), images=tmp_path / "absent", seen_within_m=25.0)
+    with pytest.raises(SettingError, match="images: mean nothing without seen_within"):
+        evaluate_map(map_of([]), small_dataset(), images=small_dataset())
 
 
 # Truth from files.

@@ -132,27 +132,34 @@ def evaluate_map(
         result = read_map(result)
     objects = true_objects(truth, result, min_parallax_rad)
     notes = _notes(objects)
+    if seen_within_m is None and images is not None:
+        raise SettingError(
+            "images: mean nothing without seen_within", hint="give the distance at which objects can be seen, e.g. 25"
+        )
     if seen_within_m is not None:
-        source = truth if images is None else images
-        objects, note = _only_seen(objects, source, result.frame, seen_within_m)
+        objects, note = _only_seen(objects, _images_of(truth, images), result.frame, seen_within_m)
         notes = (*notes, note)
     matches = match_labels(result.labels, objects, result.frame, radius_m=radius_m)
     return _measure(result, matches, radius_m, truth_sigma_m, notes)
 
 
-def _only_seen(
-    objects: TrueObjects, source: Dataset | Truth | str | Path, frame: Frame, seen_within_m: float
-) -> tuple[TrueObjects, str]:
-    """Take objects far from all images for ones that nobody can place; return them and what to say of it."""
-    if not (math.isfinite(seen_within_m) and seen_within_m > 0.0):
-        raise SettingError(f"seen_within: expected above 0 m, found {seen_within_m}", hint="for example 25")
-    if isinstance(source, str | Path) and Path(source).is_dir():
+def _images_of(truth: Dataset | Truth | str | Path, images: Dataset | str | Path | None) -> Dataset:
+    """Return the dataset that says where the images are: the one given for that, else the truth."""
+    source = truth if images is None else images
+    if isinstance(source, str | Path) and (images is not None or Path(source).is_dir()):
         source = read_dataset(source)
     if not isinstance(source, Dataset):
         raise SettingError(
             "seen_within: the truth does not say where the images are",
             hint="name the dataset that the map was made from as images (--images)",
         )
+    return source
+
+
+def _only_seen(objects: TrueObjects, source: Dataset, frame: Frame, seen_within_m: float) -> tuple[TrueObjects, str]:
+    """Take objects far from all images for ones that nobody can place; return them and what to say of it."""
+    if not (math.isfinite(seen_within_m) and seen_within_m > 0.0):
+        raise SettingError(f"seen_within: expected above 0 m, found {seen_within_m}", hint="for example 25")
     center = positions_in_frame(camera_centers(source.images), source, frame, what="the images are")
     is_near = near_images(objects.position_in_world_m, center, np.array(frame.up), seen_within_m)
     far = int(np.sum(~is_near))
