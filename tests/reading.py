@@ -49,7 +49,7 @@ def meeting_point(dataset: Dataset, *, within_m: float = 1e-6) -> Floats:
     return point
 
 
-def spoiled(path: Path, how: str) -> Path:
+def spoiled(path: Path, how: str, *, outside: Path | None = None) -> Path:
     """Put something else in the place of a file: what every reader must refuse in one line."""
     whole = path.read_bytes()
     path.unlink()
@@ -68,9 +68,9 @@ def spoiled(path: Path, how: str) -> Path:
     elif how == "folder":
         path.mkdir()
     elif how == "link":
-        outside = path.parent.parent / f"outside-{path.name}"
-        outside.write_bytes(whole)
-        path.symlink_to(outside)
+        target = (outside or path.parent.parent) / f"outside-{path.name}"
+        target.write_bytes(whole)
+        path.symlink_to(target)
     else:
         assert how == "absent"
     return path

@@ -241,6 +241,8 @@ def test_poses_in_rigs_are_composed(tmp_path: Path, text: bool) -> None:
     rotation = Rotation.from_quat(dataset.images.cam_from_world_quat, scalar_first=True).as_matrix()
     np.testing.assert_allclose(rotation, np.array(expected)[:, :, :3], atol=1e-12)
     np.testing.assert_allclose(dataset.images.cam_from_world_m, np.array(expected)[:, :, 3], atol=1e-12)
+    assert dataset.images.rig_id is not None
+    assert dataset.images.rig_id.tolist() == [1, 2, 3, 1, 2, 3]
     assert distance_to_rays(dataset).max() < 1e-6
 
 

@@ -11,8 +11,11 @@ from valuemap.readers.colmap import read_colmap
 from valuemap.readers.csv_poses import read_csv_poses
 from valuemap.readers.kapture import read_kapture
 from valuemap.readers.kitti import read_kitti
+from valuemap.readers.kitti360 import read_kitti360
+from valuemap.readers.mapillary import read_mapillary
 from valuemap.readers.nuscenes import read_nuscenes
 from valuemap.readers.opensfm import read_opensfm
+from valuemap.readers.panoramax import read_panoramax
 from valuemap.readers.tum import read_tum
 
 READERS: dict[str, Callable[..., Dataset]] = {
@@ -22,8 +25,11 @@ READERS: dict[str, Callable[..., Dataset]] = {
     "csv": read_csv_poses,
     "kapture": read_kapture,
     "kitti": read_kitti,
+    "kitti360": read_kitti360,
+    "mapillary": read_mapillary,
     "nuscenes": read_nuscenes,
     "opensfm": read_opensfm,
+    "panoramax": read_panoramax,
     "tum": read_tum,
 }
 """What `valuemap import NAME` calls."""

@@ -18,7 +18,7 @@ from valuemap.readers.colmap_files import find_model
 from valuemap.readers.csv_file import read_csv
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.names import match_images
-from valuemap.tables import Cameras, Categories, Images
+from valuemap.tables import Cameras, Categories, Images, Ints
 
 
 def read_colmap(
@@ -131,7 +131,14 @@ def _with_poses(images: list[pycolmap.Image], names: list[str], pass_id: Categor
         cam_from_world_quat=quaternion,
         cam_from_world_m=translation_m,
         pass_id=pass_id,
+        rig_id=_rigs(images),
     )
+
+
+def _rigs(images: list[pycolmap.Image]) -> Ints | None:
+    """Return the frame of each image (N), where a frame has several: they are of one rig at one time."""
+    frame = np.array([image.frame_id for image in images], dtype=np.int64)
+    return frame if len(np.unique(frame)) < len(frame) else None
 
 
 def _passes(names: list[str], pass_from: str) -> list[str]:

@@ -68,7 +68,7 @@ def read_kitti(
     times
         KITTI's `times.txt`: seconds of each frame.
     class_name
-        The class of boxes that have none.
+        The class of boxes that have none, where `detections` is a path.
     up, anchor, max_rejected
         As in `assemble`.
     heading_deg

@@ -5,10 +5,18 @@ from __future__ import annotations
 from importlib import import_module
 
 READERS = (
+    "argoverse2",
     "bearings",
     "colmap",
     "csv",
+    "kapture",
     "kitti",
+    "kitti360",
+    "mapillary",
+    "nuscenes",
+    "opensfm",
+    "panoramax",
+    "tum",
 )
 """Modules of this package; each adds its command to `import_app` when it is imported."""
 

@@ -9,30 +9,28 @@ import typer
 
 from valuemap import dataset as dataset_folder
 from valuemap.cli.import_.app import finish_dataset, import_app
+from valuemap.cli.import_.options import Anchor, with_detections
 from valuemap.cli.options import DatasetOut, MaxRejected, Up
 from valuemap.cli.show import progress_bars
 from valuemap.folders import check_place
+from valuemap.readers.detections import DetectionFile
 from valuemap.readers.vet import MAX_REJECTED
 
 
 @import_app.command("colmap")
+@with_detections
 def import_colmap(
     model_dir: Annotated[Path, typer.Argument(help="Folder of a COLMAP model, .bin or .txt.")],
     out: DatasetOut,
-    detections: Annotated[
-        Path | None, typer.Option(help="COCO results or annotations (JSON); without, run valuemap detect afterwards.")
-    ] = None,
+    detections: DetectionFile | None,
     pass_from: Annotated[
         str, typer.Option(help="What a pass is: folder (of the image name), none, or a CSV file: image,pass.")
     ] = "folder",
     up: Up = None,
-    anchor: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option(metavar="LAT LON HEIGHT", help="WGS84 place of the origin of an east-north-up model."),
-    ] = None,
+    anchor: Anchor = None,
     max_rejected: MaxRejected = MAX_REJECTED,
 ) -> None:
-    """Import a COLMAP model with detections in COCO format."""
+    """Import a COLMAP model."""
     from valuemap.readers import READERS
 
     check_place(out, marker=dataset_folder.MARKER)

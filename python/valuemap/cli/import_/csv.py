@@ -9,42 +9,26 @@ import typer
 
 from valuemap import dataset as dataset_folder
 from valuemap.cli.import_.app import finish_dataset, import_app
-from valuemap.cli.import_.options import (
-    Anchor,
-    CameraHeight,
-    CameraText,
-    ClassName,
-    Columns,
-    DetectionColumns,
-    Detections,
-    DetectionsFormat,
-    Fractions,
-    FullScore,
-    PixelCenter,
-    detection_file,
-)
+from valuemap.cli.import_.options import Anchor, CameraHeight, CameraText, Columns, PixelCenter, with_detections
 from valuemap.cli.options import DatasetOut, MaxRejected, Up
 from valuemap.cli.show import progress_bars
 from valuemap.folders import check_place
 from valuemap.readers.csv_file import parse_columns
+from valuemap.readers.detections import DetectionFile
 from valuemap.readers.vet import MAX_REJECTED
 
 
 @import_app.command("csv")
+@with_detections
 def import_csv(
     poses: Annotated[Path, typer.Argument(help="CSV: image; lat,lon or x,y; heading_deg or a quaternion; ...")],
     out: DatasetOut,
-    detections: Detections = None,
-    detections_format: DetectionsFormat = "auto",
-    detection_columns: DetectionColumns = None,
-    class_name: ClassName = "object",
+    detections: DetectionFile | None,
     camera: CameraText = None,
     columns: Columns = None,
     rotation: Annotated[str, typer.Option(help="What a quaternion does.")] = "cam_from_world",
     axes: Annotated[str, typer.Option(help="Of the camera that a quaternion is about.")] = "right-down-forward",
     pixel_center: PixelCenter = 0.5,
-    fractions: Fractions = False,
-    full_score: FullScore = 1.0,
     camera_height: CameraHeight = 0.0,
     crs: Annotated[str | None, typer.Option(help="Reference system of x, y: EPSG:32610.")] = None,
     up: Up = None,
@@ -58,15 +42,7 @@ def import_csv(
     with progress_bars() as progress:
         dataset = READERS["csv"](
             poses,
-            detections=detection_file(
-                detections,
-                detections_format,
-                class_name=class_name,
-                columns=detection_columns,
-                pixel_center=pixel_center,
-                full_score=full_score,
-                fractions=fractions,
-            ),
+            detections=detections,
             camera=camera,
             columns=parse_columns(columns or []),
             rotation=rotation,

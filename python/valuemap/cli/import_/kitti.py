@@ -9,27 +9,38 @@ import typer
 
 from valuemap import dataset as dataset_folder
 from valuemap.cli.import_.app import finish_dataset, import_app
+from valuemap.cli.import_.options import Anchor, with_detections
 from valuemap.cli.options import DatasetOut, MaxRejected, Up
 from valuemap.cli.show import progress_bars
 from valuemap.folders import check_place
+from valuemap.readers.detections import DetectionFile
 from valuemap.readers.vet import MAX_REJECTED
 
 
 @import_app.command("kitti")
+@with_detections
 def import_kitti(
     poses: Annotated[Path, typer.Option(help="Camera-to-world poses: 12 numbers (3x4) a row and frame.")],
-    intrinsics: Annotated[
-        tuple[float, float, float, float],
-        typer.Option(metavar="FX FY CX CY", help="Pixels; the centre of the top-left pixel is (0, 0) as in KITTI."),
-    ],
     image_size: Annotated[tuple[int, int], typer.Option(metavar="W H", help="Pixels.")],
-    detections: Annotated[Path, typer.Option(help="CSV: frame,x1,y1,x2,y2 and optionally class, score.")],
     out: DatasetOut,
-    class_name: Annotated[str, typer.Option("--class", help="Class of detections without one.")] = "object",
+    detections: DetectionFile | None,
+    intrinsics: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(metavar="FX FY CX CY", help="Pixels; the centre of the top-left pixel is (0, 0) as in KITTI."),
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option("--calib", help="KITTI's calib.txt instead: the poses are of camera 0.")
+    ] = None,
+    cameras: Annotated[list[int] | None, typer.Option("--camera", help="Of calib.txt; repeatable; default: 2.")] = None,
+    times: Annotated[Path | None, typer.Option(help="KITTI's times.txt: seconds of a frame a row.")] = None,
     up: Up = None,
+    anchor: Anchor = None,
+    heading: Annotated[
+        float | None, typer.Option(help="Degrees from north of camera 0 in the first frame, with --anchor.")
+    ] = None,
     max_rejected: MaxRejected = MAX_REJECTED,
 ) -> None:
-    """Import KITTI-odometry-style poses with boxes in a CSV file."""
+    """Import KITTI-odometry-style poses, with boxes in a CSV file that names frames (frame,x1,y1,x2,y2) or others."""
     from valuemap.readers import READERS
 
     check_place(out, marker=dataset_folder.MARKER)
@@ -37,10 +48,14 @@ def import_kitti(
         dataset = READERS["kitti"](
             poses,
             intrinsics=intrinsics,
+            calibration=calibration,
+            cameras=tuple(cameras or (2,)),
             image_size=image_size,
             detections=detections,
-            class_name=class_name,
+            times=times,
             up=up,
+            anchor=anchor,
+            heading_deg=heading,
             max_rejected=max_rejected,
             progress=progress,
         )

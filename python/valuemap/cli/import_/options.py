@@ -2,34 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from valuemap.readers.csv_file import parse_columns
 from valuemap.readers.detections import DETECTIONS, DetectionFile
 
-Detections = Annotated[
-    Path | None,
-    typer.Option("--detections", help="File or folder of boxes; without, run valuemap detect afterwards."),
-]
-DetectionsFormat = Annotated[
-    str, typer.Option("--detections-format", help=f"auto (by its name), {', '.join(DETECTIONS)}.")
-]
-DetectionColumns = Annotated[
-    list[str] | None,
-    typer.Option("--detection-column", metavar="NAME=THEIRS", help="A column of a CSV file of boxes; repeatable."),
-]
-ClassName = Annotated[str, typer.Option("--class", help="Class of detections without one.")]
 PixelCenter = Annotated[
     float,
-    typer.Option(help="Coordinates of the centre of the top-left pixel: 0.5 (COLMAP, COCO) or 0 (OpenCV, KITTI)."),
-]
-FullScore = Annotated[float, typer.Option(help="The score that means certain; scores are divided by it.")]
-Fractions = Annotated[
-    bool, typer.Option("--fractions", help="Boxes of a CSV file are fractions of the picture's width and height.")
+    typer.Option(help="In cx, cy: coordinates of the centre of the top-left pixel, 0.5 (COLMAP) or 0 (OpenCV)."),
 ]
 Columns = Annotated[
     list[str] | None,
@@ -44,27 +30,85 @@ CameraText = Annotated[
     typer.Option("--camera", metavar="TEXT", help='COLMAP\'s model, size and parameters: "PINHOLE W H fx fy cx cy".'),
 ]
 CameraHeight = Annotated[float, typer.Option(help="Height of cameras that have none, metres.")]
+ClassName = Annotated[str, typer.Option("--class", help="Class of detections without one.")]
+
+_DETECTION_OPTIONS: dict[str, tuple[Any, Any]] = {
+    "boxes": (
+        Annotated[
+            Path | None,
+            typer.Option("--detections", help="File or folder of boxes; without, run valuemap detect afterwards."),
+        ],
+        None,
+    ),
+    "boxes_format": (
+        Annotated[str, typer.Option("--detections-format", help=f"auto (as its name says), {', '.join(DETECTIONS)}.")],
+        "auto",
+    ),
+    "boxes_class": (ClassName, "object"),
+    "boxes_columns": (
+        Annotated[
+            list[str] | None,
+            typer.Option("--detection-column", metavar="NAME=THEIRS", help="As --column, of a CSV file of boxes."),
+        ],
+        None,
+    ),
+    "boxes_pixel_center": (
+        Annotated[
+            float,
+            typer.Option("--detection-pixel-center", help="In boxes: the centre of the top-left pixel, 0.5 or 0."),
+        ],
+        0.5,
+    ),
+    "boxes_fractions": (
+        Annotated[bool, typer.Option("--fractions", help="A CSV file of boxes has fractions of width and height.")],
+        False,
+    ),
+    "boxes_full_score": (
+        Annotated[float, typer.Option("--full-score", help="The score that means certain; others are divided by it.")],
+        1.0,
+    ),
+}
 
 
-def detection_file(
-    path: Path | None,
-    format_: str = "auto",
-    *,
-    class_name: str = "object",
-    columns: Sequence[str] | None = None,
-    pixel_center: float = 0.5,
-    full_score: float = 1.0,
-    fractions: bool = False,
+def with_detections(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options that say how to read detections, in the place of its parameter `detections`.
+
+    That parameter is then a `DetectionFile`, or None where no detections are named.
+    """
+    own = [p for p in inspect.signature(command, eval_str=True).parameters.values() if p.name != "detections"]
+    added = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+        for name, (annotation, default) in _DETECTION_OPTIONS.items()
+    ]
+    parameters = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in own] + added
+
+    @functools.wraps(command)
+    def with_file(**values: Any) -> None:
+        boxes = {name: values.pop(name) for name in _DETECTION_OPTIONS}
+        command(**values, detections=_detection_file(**boxes))
+
+    with_file.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    with_file.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return with_file
+
+
+def _detection_file(
+    boxes: Path | None,
+    boxes_format: str,
+    boxes_class: str,
+    boxes_columns: list[str] | None,
+    boxes_pixel_center: float,
+    boxes_fractions: bool,
+    boxes_full_score: float,
 ) -> DetectionFile | None:
-    """Return how to read the detections that the options name; None where they name none."""
-    if path is None:
+    if boxes is None:
         return None
     return DetectionFile(
-        path,
-        format=format_,
-        class_name=class_name,
-        pixel_center=pixel_center,
-        full_score=full_score,
-        columns=parse_columns(columns or []),
-        fractions=fractions,
+        boxes,
+        format=boxes_format,
+        class_name=boxes_class,
+        pixel_center=boxes_pixel_center,
+        full_score=boxes_full_score,
+        columns=parse_columns(boxes_columns or []),
+        fractions=boxes_fractions,
     )

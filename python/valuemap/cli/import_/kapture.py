@@ -1,0 +1,43 @@
+"""`valuemap import kapture`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from valuemap import dataset as dataset_folder
+from valuemap.cli.import_.app import finish_dataset, import_app
+from valuemap.cli.import_.options import Anchor, with_detections
+from valuemap.cli.options import DatasetOut, MaxRejected, Up
+from valuemap.cli.show import progress_bars
+from valuemap.folders import check_place
+from valuemap.readers.detections import DetectionFile
+from valuemap.readers.vet import MAX_REJECTED
+
+
+@import_app.command("kapture")
+@with_detections
+def import_kapture(
+    folder: Annotated[Path, typer.Argument(help="Folder that holds sensors/.")],
+    out: DatasetOut,
+    detections: DetectionFile | None,
+    up: Up = None,
+    anchor: Anchor = None,
+    max_rejected: MaxRejected = MAX_REJECTED,
+) -> None:
+    """Import a kapture folder: sensors, rigs, trajectories and camera records."""
+    from valuemap.readers import READERS
+
+    check_place(out, marker=dataset_folder.MARKER)
+    with progress_bars() as progress:
+        dataset = READERS["kapture"](
+            folder,
+            detections=detections,
+            up=up,
+            anchor=anchor,
+            max_rejected=max_rejected,
+            progress=progress,
+        )
+    finish_dataset(dataset, out)

@@ -1,0 +1,41 @@
+"""`valuemap import mapillary`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from valuemap import dataset as dataset_folder
+from valuemap.cli.import_.app import finish_dataset, import_app
+from valuemap.cli.import_.options import Anchor, with_detections
+from valuemap.cli.options import DatasetOut, MaxRejected
+from valuemap.cli.show import progress_bars
+from valuemap.folders import check_place
+from valuemap.readers.detections import DetectionFile
+from valuemap.readers.vet import MAX_REJECTED
+
+
+@import_app.command("mapillary")
+@with_detections
+def import_mapillary(
+    export: Annotated[Path, typer.Argument(help="JSON file, or a folder of them.")],
+    out: DatasetOut,
+    detections: DetectionFile | None,
+    anchor: Anchor = None,
+    max_rejected: MaxRejected = MAX_REJECTED,
+) -> None:
+    """Import JSON of Mapillary's API v4, with its detections; nothing is fetched."""
+    from valuemap.readers import READERS
+
+    check_place(out, marker=dataset_folder.MARKER)
+    with progress_bars() as progress:
+        dataset = READERS["mapillary"](
+            export,
+            detections=detections,
+            anchor=anchor,
+            max_rejected=max_rejected,
+            progress=progress,
+        )
+    finish_dataset(dataset, out)

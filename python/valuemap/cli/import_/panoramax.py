@@ -1,0 +1,45 @@
+"""`valuemap import panoramax`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from valuemap import dataset as dataset_folder
+from valuemap.cli.import_.app import finish_dataset, import_app
+from valuemap.cli.import_.options import Anchor, CameraHeight, with_detections
+from valuemap.cli.options import DatasetOut, MaxRejected
+from valuemap.cli.show import progress_bars
+from valuemap.folders import check_place
+from valuemap.readers.detections import DetectionFile
+from valuemap.readers.vet import MAX_REJECTED
+
+
+@import_app.command("panoramax")
+@with_detections
+def import_panoramax(
+    export: Annotated[Path, typer.Argument(help="JSON file, or a folder of them.")],
+    out: DatasetOut,
+    detections: DetectionFile | None,
+    class_key: Annotated[str | None, typer.Option(help="The semantic tag whose value is the class.")] = None,
+    camera_height: CameraHeight = 0.0,
+    anchor: Anchor = None,
+    max_rejected: MaxRejected = MAX_REJECTED,
+) -> None:
+    """Import STAC items of Panoramax, with their annotations; nothing is fetched."""
+    from valuemap.readers import READERS
+
+    check_place(out, marker=dataset_folder.MARKER)
+    with progress_bars() as progress:
+        dataset = READERS["panoramax"](
+            export,
+            detections=detections,
+            class_key=class_key,
+            camera_height_m=camera_height,
+            anchor=anchor,
+            max_rejected=max_rejected,
+            progress=progress,
+        )
+    finish_dataset(dataset, out)

@@ -1,0 +1,214 @@
+"""Mapillary: images as its API v4 gives them, as JSON in files, with their detections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from valuemap.dataset import Dataset
+from valuemap.errors import InputError
+from valuemap.progress import Progress, silent
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, assemble
+from valuemap.readers.cameras_of import Camera, make_cameras
+from valuemap.readers.detections import DetectionFile, read_detections
+from valuemap.readers.files import check_file, file_in, read_json
+from valuemap.readers.json_values import Json
+from valuemap.readers.poses import local_from_cam, make_images, place_on_earth
+from valuemap.readers.vector_tile import outline_of_tile
+from valuemap.tables import Floats, Images
+
+_EXPECTED = "JSON of Mapillary's API v4: an image, or data: a list of images, each with id, geometry and camera_type"
+_MILLI = 1e-3
+_HEIGHT_WITHOUT_SFM_M = 2.0
+
+
+@dataclass
+class _Found:
+    """Images and boxes read so far."""
+
+    ids: list[str] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+    cameras: list[Camera] = field(default_factory=list)
+    place: list[list[float]] = field(default_factory=list)
+    rotation: list[Floats] = field(default_factory=list)
+    passes: list[str] = field(default_factory=list)
+    time: list[float] = field(default_factory=list)
+    image_of_box: list[str] = field(default_factory=list)
+    classes: list[str] = field(default_factory=list)
+    edges: list[list[float]] = field(default_factory=list)
+    where: list[str] = field(default_factory=list)
+
+
+def read_mapillary(
+    export: Path,
+    *,
+    detections: DetectionFile | Path | None = None,
+    anchor: tuple[float, float, float] | None = None,
+    max_rejected: float = MAX_REJECTED,
+    progress: Progress = silent,
+) -> Dataset:
+    """Read JSON that the API answered with: the fields asked for, for one image or for many; nothing is fetched.
+
+    Positions are `computed_geometry` and `computed_altitude` where structure from motion has them, else `geometry`.
+    The rotation is `computed_rotation`, axis-angle from east, north, up at the image into the camera, else level with
+    `computed_compass_angle` or `compass_angle`. `camera_parameters` are focal length over the larger side, k1, k2.
+    Passes are sequences, images are named `ID.jpg`, and `captured_at` is in milliseconds.
+
+    Detections are lists of `value` and `geometry` (a vector tile as base64), in `detections` of an image, or in a file
+    `detections.json` beside the export: an object of image ids with such lists, or a list of `data` with `image`.
+
+    Parameters
+    ----------
+    export
+        A JSON file, or a folder of them.
+    detections
+        As in `read_detections`, instead of Mapillary's own; images are named by their ids.
+    anchor
+        Latitude, longitude and height of the origin; by default the place of the first image by name.
+
+    Raises
+    ------
+    InputError
+        A file is missing, damaged or of another format, or an image has no place or camera.
+    """
+    paths = (
+        [file_in(export, path.name, _EXPECTED) for path in sorted(export.glob("*.json")) if path.stem != "detections"]
+        if export.is_dir()
+        else [check_file(export, _EXPECTED)]
+    )
+    if not paths:
+        raise InputError(f"{export}: there are no JSON files in it", hint=f"expected {_EXPECTED}")
+    found = _Found()
+    for number, path in enumerate(paths):
+        progress("reading Mapillary's answers", number, len(paths))
+        for image in _entries(Json(read_json(path, _EXPECTED), str(path), f"expected {_EXPECTED}")):
+            _add_image(image, found)
+    if not found.ids:
+        raise InputError(f"{export}: there are no images in it", hint=f"expected {_EXPECTED}")
+    folder = export if export.is_dir() else export.parent
+    if (folder / "detections.json").exists():
+        _add_detections(file_in(folder, "detections.json", "Mapillary's detections"), found)
+    first = min(range(len(found.ids)), key=found.names.__getitem__)
+    placed = place_on_earth(np.array(found.place), anchor, first, source=str(export))
+    cameras, camera_id = make_cameras(found.cameras, str(export))
+    images = make_images(
+        names=found.names,
+        camera_id=camera_id,
+        world_from_cam=placed.world_from_local @ np.array(found.rotation),
+        center_in_world_m=placed.position_in_world_m,
+        passes=found.passes,
+        source=str(export),
+        timestamp_s=np.array(found.time),
+    )
+    dataset = assemble(
+        name=export.stem,
+        cameras=cameras,
+        images=images,
+        detections=_boxes(found, images) if detections is None else read_detections(detections, images, cameras),
+        up=None,
+        anchor=placed.anchor,
+        source=str(export),
+        max_rejected=max_rejected,
+    )
+    progress("reading Mapillary's answers", len(paths), len(paths))
+    return dataset
+
+
+def _entries(content: Json) -> list[Json]:
+    """Return the images or detections of an answer: one, a list, or a list in `data`."""
+    if isinstance(content.value, dict):
+        if "data" in content:
+            return list(content["data"].entries())
+        return [content]
+    return list(content.entries())
+
+
+def _add_image(image: Json, found: _Found) -> None:
+    key = image["id"].key()
+    width, height = image["width"].whole(), image["height"].whole()
+    has_sfm = "computed_geometry" in image
+    lon, lat = (image["computed_geometry"] if has_sfm else image["geometry"])["coordinates"].numbers(2)
+    altitude = next(
+        (image[name].number() for name in ("computed_altitude", "altitude") if name in image), _HEIGHT_WITHOUT_SFM_M
+    )
+    if "computed_rotation" in image:
+        rotation = Rotation.from_rotvec(image["computed_rotation"].numbers(3)).inv().as_matrix()
+    else:
+        angle = next((image[name] for name in ("computed_compass_angle", "compass_angle") if name in image), None)
+        heading = np.radians([image["compass_angle"].number() if angle is None else angle.number()])
+        rotation = local_from_cam(heading, np.zeros(1), np.zeros(1))[0]
+    found.ids.append(key)
+    found.names.append(f"{key}.jpg")
+    found.cameras.append(_camera(image, width, height))
+    found.place.append([float(lon), float(lat), altitude])
+    found.rotation.append(rotation)
+    sequence = image.get("sequence")
+    found.passes.append(ONE_PASS if sequence is None else _sequence(sequence))
+    found.time.append(image["captured_at"].number() * _MILLI if "captured_at" in image else np.nan)
+    if "detections" in image:
+        for detection in _entries(image["detections"]):
+            _add_box(detection, key, found)
+
+
+def _sequence(value: Json) -> str:
+    return value["id"].key() if isinstance(value.value, dict) else value.key()
+
+
+def _camera(image: Json, width: int, height: int) -> Camera:
+    kind = image["camera_type"].text()
+    if kind in ("spherical", "equirectangular"):
+        return Camera("EQUIRECTANGULAR", width, height, (float(width), float(height)))
+    if kind not in ("perspective", "fisheye", "brown"):
+        raise image["camera_type"].wrong("expected perspective, fisheye, spherical or equirectangular")
+    values = [entry.number() for entry in image["camera_parameters"].entries()]
+    if kind == "brown" or len(values) not in (1, 2, 3):
+        raise image["camera_parameters"].wrong("expected focal length, k1 and k2")
+    focal, k1, k2 = (*values, 0.0, 0.0)[:3]
+    model = "RADIAL" if kind == "perspective" else "RADIAL_FISHEYE"
+    return Camera(model, width, height, (focal * max(width, height), width / 2.0, height / 2.0, k1, k2))
+
+
+def _add_detections(path: Path, found: _Found) -> None:
+    content = Json(read_json(path, "Mapillary's detections"), str(path), "expected image ids with lists of detections")
+    if isinstance(content.value, dict) and "data" not in content:
+        for key, listed in content.items():
+            for detection in _entries(listed):
+                _add_box(detection, key, found)
+        return
+    for detection in _entries(content):
+        image = detection["image"]
+        _add_box(detection, image["id"].key() if isinstance(image.value, dict) else image.key(), found)
+
+
+def _add_box(detection: Json, image: str, found: _Found) -> None:
+    geometry = detection["geometry"]
+    try:
+        points = outline_of_tile(geometry.text())
+    except ValueError as error:
+        raise geometry.wrong(f"expected a vector tile as base64, which {error}") from error
+    found.image_of_box.append(image)
+    found.classes.append(detection["value"].text())
+    found.edges.append([*points.min(axis=0).tolist(), *points.max(axis=0).tolist()])
+    found.where.append(detection.where)
+
+
+def _boxes(found: _Found, images: Images) -> FoundBoxes:
+    if not found.edges:
+        return FoundBoxes.none()
+    camera_of = dict(zip(found.ids, found.cameras, strict=True))
+    row_of = {name.removesuffix(".jpg"): row for row, name in enumerate(images.name.to_pylist())}
+    nowhere = next(iter(found.cameras))
+    size = np.array([[(c := camera_of.get(key, nowhere)).width, c.height] for key in found.image_of_box], np.float64)
+    edges = np.array(found.edges)
+    return FoundBoxes(
+        image_row=np.array([row_of.get(key, -1) for key in found.image_of_box], dtype=np.int64),
+        class_names=found.classes,
+        center_px=(edges[:, :2] + edges[:, 2:]) / 2.0 * size,
+        size_px=(edges[:, 2:] - edges[:, :2]) * size,
+        score=np.ones(len(edges)),
+        where=found.where.__getitem__,
+        image_names=[f"{key}.jpg" for key in found.image_of_box],
+    )

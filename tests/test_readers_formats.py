@@ -1,0 +1,788 @@
+"""Formats of poses: one scene written in the conventions of each, by this file alone, must be the same scene when read.
+
+Three images along a street see one object. Every fixture is written from rotations and centres in the plainest words
+of its format; the boxes are where the object projects by similar triangles. When all rays meet at the object, then
+direction and order of rotations, axes, offsets of sensors and pixel centres are right.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.feather
+import pytest
+from numpy.testing import assert_allclose
+from pyproj import Transformer
+from scipy.spatial.transform import Rotation
+
+from reading import SPOILS, azimuths_deg, meeting_point, refusal, spoiled, write
+from valuemap.cameras import camera_centers, cast_rays, colmap_camera
+from valuemap.dataset import Dataset
+from valuemap.geodesy import enu_from_lon_lat_height
+from valuemap.readers.argoverse2 import read_argoverse2
+from valuemap.readers.kapture import read_kapture
+from valuemap.readers.kitti import read_kitti
+from valuemap.readers.kitti360 import read_kitti360
+from valuemap.readers.mapillary import read_mapillary
+from valuemap.readers.nuscenes import read_nuscenes
+from valuemap.readers.opensfm import read_opensfm
+from valuemap.readers.panoramax import read_panoramax
+from valuemap.readers.tum import read_tum
+from valuemap.tables import Floats
+
+WIDTH, HEIGHT, FX, FY, CX, CY = 640, 480, 500.0, 510.0, 330.0, 230.0
+OBJECT = np.array([4.0, 30.0, 3.0])
+CENTERS = np.array([[0.0, 0.0, 1.5], [0.5, 4.0, 1.6], [0.2, 8.0, 1.4]])
+# Columns: right, down, forward of cameras that look north, a little to the right, and a little down.
+_LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+WORLD_FROM_CAM = np.array([Rotation.from_euler("zx", [-0.05 * i, -0.02 * i]).as_matrix() @ _LEVEL for i in range(3)])
+STAMPS_NS = np.array([1_600_000_000_000_000_000, 1_600_000_000_500_000_000, 1_600_000_001_000_000_000])
+LAT, LON = 52.0, 4.0
+
+
+def pinhole(point_in_cam: Floats) -> Floats:
+    """The pixel by similar triangles; the centre of the top-left pixel is (0.5, 0.5)."""
+    x, y, z = point_in_cam
+    return np.array([FX * x / z + CX, FY * y / z + CY])
+
+
+def boxes(folder: Path, names: list[str], project: Callable[[Floats], Floats] = pinhole, **poses: Any) -> Path:
+    """A box around the object in each image, as CSV."""
+    rotations, centers = poses.get("rotations", WORLD_FROM_CAM), poses.get("centers", CENTERS)
+    lines = []
+    for name, rotation, center in zip(names, rotations, centers, strict=True):
+        x, y = project(rotation.T @ (OBJECT - center))
+        lines.append(f"{name},{x - 5!r},{y - 10!r},{x + 5!r},{y + 10!r}".replace("np.float64(", "").replace(")", ""))
+    return write(folder / "boxes.csv", "\n".join(["image,x1,y1,x2,y2", *lines]) + "\n")
+
+
+def numbers(values: Any) -> str:
+    return " ".join(repr(float(value)) for value in np.ravel(values))
+
+
+def check_scene(dataset: Dataset, *, seconds: bool = True, within_m: float = 1e-6) -> None:
+    """Three images where they are, and three rays that meet at the object."""
+    assert len(dataset.images) == len(dataset.detections) == 3
+    assert_allclose(camera_centers(dataset.images), CENTERS, atol=within_m)
+    assert_allclose(meeting_point(dataset, within_m=within_m), OBJECT, atol=1e-5 + 10 * within_m)
+    if seconds:
+        assert dataset.images.timestamp_s is not None
+        assert_allclose(dataset.images.timestamp_s, STAMPS_NS / 1e9, atol=1e-6)
+
+
+# TUM.
+
+
+def tum_in(folder: Path) -> tuple[Path, Path]:
+    rows = [
+        f"{stamp / 1e9:.9f} {numbers(center)} {numbers(Rotation.from_matrix(rotation).as_quat())}"
+        for stamp, center, rotation in zip(STAMPS_NS, CENTERS, WORLD_FROM_CAM, strict=True)
+    ]
+    return write(folder / "trajectory.txt", "\n".join(["# t tx ty tz qx qy qz qw", *rows]) + "\n"), boxes(
+        folder, [f"{stamp / 1e9:.9f}.png" for stamp in STAMPS_NS]
+    )
+
+
+CAMERA = f"PINHOLE {WIDTH} {HEIGHT} {FX} {FY} {CX} {CY}"
+
+
+def test_tum(tmp_path: Path) -> None:
+    trajectory, csv = tum_in(tmp_path)
+    check_scene(read_tum(trajectory, camera=CAMERA, detections=csv))
+
+
+def test_tum_has_pixels_of_another_convention_where_it_says_so(tmp_path: Path) -> None:
+    trajectory, _ = tum_in(tmp_path)
+    dataset = read_tum(trajectory, camera="PINHOLE 640 480 500 500 319.5 239.5", pixel_center=0.0)
+    assert dataset.cameras.params[0].tolist() == [500, 500, 320, 240]
+
+
+def test_an_image_between_two_poses_of_tum_is_between_them(tmp_path: Path) -> None:
+    """A quarter turn in one second, one metre on: 0.25 s in it is 22.5 degrees and 0.25 m."""
+    half = np.sqrt(0.5)
+    write(tmp_path / "t.txt", f"10 0 0 0 0 0 0 1\n11 1 0 0 0 0 {half} {half}\n")
+    write(tmp_path / "rgb.txt", "# stamps\n10.25 rgb/a.png\n10.0 rgb/b.png\n12.5 rgb/late.png\n9 rgb/early.png\n")
+    options: dict[str, Any] = {
+        "camera": CAMERA,
+        "image_list": tmp_path / "rgb.txt",
+        "longest_gap_s": 2.0,
+        "up": (0.0, 0.0, 1.0),
+    }
+    dataset = read_tum(tmp_path / "t.txt", **options)
+    assert dataset.images.name.to_pylist() == ["rgb/a.png", "rgb/b.png"]
+    assert_allclose(camera_centers(dataset.images), [[0.25, 0.0, 0.0], [0.0, 0.0, 0.0]], atol=1e-12)
+    turned = Rotation.from_quat(dataset.images.cam_from_world_quat[0], scalar_first=True).inv().as_rotvec(degrees=True)
+    assert_allclose(turned, [0, 0, 22.5], atol=1e-9)
+    only_exact = read_tum(tmp_path / "t.txt", **{**options, "longest_gap_s": 0.5})
+    assert only_exact.images.name.to_pylist() == ["rgb/b.png"]
+
+
+# kapture.
+
+
+def kapture_in(folder: Path) -> Path:
+    """The poses are of a rig; the camera is 0.3 m right of it and turned by 10 degrees."""
+    rig_from_cam, camera_in_rig = Rotation.from_euler("y", 10, degrees=True).as_matrix(), np.array([0.3, 0.0, 0.1])
+    poses, records = [], []
+    for stamp, rotation, center in zip(STAMPS_NS, WORLD_FROM_CAM, CENTERS, strict=True):
+        world_from_rig = rotation @ rig_from_cam.T
+        rig_center = center - world_from_rig @ camera_in_rig
+        quaternion = Rotation.from_matrix(world_from_rig.T).as_quat(scalar_first=True)
+        pose = numbers([*quaternion, *(-world_from_rig.T @ rig_center)]).replace(" ", ", ")
+        poses.append(f"{stamp}, rig0, {pose}")
+        records.append(f"{stamp}, cam0, day1/{stamp}.jpg")
+    sensor = Rotation.from_matrix(rig_from_cam.T).as_quat(scalar_first=True)
+    place = numbers([*sensor, *(-rig_from_cam.T @ camera_in_rig)]).replace(" ", ", ")
+    head = "# kapture format: 1.1\n"
+    parameters = f"{WIDTH}, {HEIGHT}, {FX}, {FY}, {CX}, {CY}"
+    write(folder / "sensors" / "sensors.txt", f"{head}cam0, front, camera, PINHOLE, {parameters}\nimu, , imu\n")
+    write(folder / "sensors" / "rigs.txt", f"{head}rig0, cam0, {place}\n")
+    write(
+        folder / "sensors" / "trajectories.txt",
+        head + "\n".join(poses) + f"\n{STAMPS_NS[0] + 7}, rig0, , , , , 1, 2, 3\n",
+    )
+    unposed = f"{STAMPS_NS[0] + 7}, cam0, day1/unposed.jpg"
+    write(folder / "sensors" / "records_camera.txt", head + "\n".join([*records, unposed]) + "\n")
+    return folder
+
+
+def test_kapture(tmp_path: Path) -> None:
+    folder = kapture_in(tmp_path / "k")
+    dataset = read_kapture(folder, detections=boxes(tmp_path, [f"day1/{stamp}.jpg" for stamp in STAMPS_NS]))
+    check_scene(dataset)
+    assert dataset.images.pass_id.texts() == ["day1"] * 3
+    assert dataset.images.rig_id is not None
+    assert len(set(dataset.images.rig_id.tolist())) == 3
+
+
+# OpenSfM.
+
+
+def opensfm_in(folder: Path, camera: dict[str, Any] | None = None) -> Path:
+    shots = {}
+    for i, (rotation, center) in enumerate(zip(WORLD_FROM_CAM, CENTERS, strict=True)):
+        shots[f"{i}.jpg"] = {
+            "camera": "c",
+            "rotation": Rotation.from_matrix(rotation.T).as_rotvec().tolist(),
+            "translation": (-rotation.T @ center).tolist(),
+            "capture_time": float(STAMPS_NS[i]) / 1e9,
+        }
+    # Integer pixel centres: the middle of 640 pixels is 319.5, which is 320 here, so cx - 320 is the offset.
+    brown = {
+        "projection_type": "brown",
+        "width": WIDTH,
+        "height": HEIGHT,
+        "focal_x": FX / WIDTH,
+        "focal_y": FY / WIDTH,
+        "c_x": (CX - 320.0) / WIDTH,
+        "c_y": (CY - 240.0) / WIDTH,
+        **dict.fromkeys(("k1", "k2", "k3", "p1", "p2"), 0.0),
+    }
+    reference = {"latitude": LAT, "longitude": LON, "altitude": 40.0}
+    part = {"cameras": {"c": camera or brown}, "shots": shots, "reference_lla": reference}
+    return write(folder / "reconstruction.json", json.dumps([part]))
+
+
+def test_opensfm(tmp_path: Path) -> None:
+    path = opensfm_in(tmp_path / "o")
+    dataset = read_opensfm(path, detections=boxes(tmp_path, ["0.jpg", "1.jpg", "2.jpg"]))
+    check_scene(dataset)
+    assert dataset.frame.anchor == (LAT, LON, 40.0)
+    assert "says where it is" in refusal(lambda: read_opensfm(path, anchor=(1.0, 2.0, 3.0)))
+
+
+def brown_radial(r: float) -> float:
+    return 1 - 0.1 * r**2 + 0.02 * r**4 + 0.003 * r**6
+
+
+@pytest.mark.parametrize(
+    ("camera", "project"),
+    [
+        (
+            {"projection_type": "perspective", "focal": 0.8, "k1": -0.1, "k2": 0.02},
+            lambda x, y, r: 640 * 0.8 * np.array([x, y]) * (1 - 0.1 * r**2 + 0.02 * r**4) + [320, 240],
+        ),
+        (
+            {"projection_type": "fisheye", "focal": 0.5, "k1": -0.05, "k2": 0.01},
+            lambda x, y, r: 640 * 0.5 * np.array([x, y]) / r * (t := np.arctan(r)) * (1 - 0.05 * t**2 + 0.01 * t**4)
+            + [320, 240],
+        ),
+        (
+            {"projection_type": "spherical"},
+            lambda x, y, _: [
+                320 + 640 * np.arctan2(x, 1.0) / (2 * np.pi),
+                240 + 640 * np.arctan2(y, np.hypot(x, 1.0)) / (2 * np.pi),
+            ],
+        ),
+        (
+            {
+                "projection_type": "brown", "focal_x": 0.8, "focal_y": 0.9, "c_x": 0.01, "c_y": -0.02,
+                "k1": -0.1, "k2": 0.02, "k3": 0.003, "p1": 0.001, "p2": -0.002,
+            },
+            lambda x, y, r: np.array(
+                [
+                    326.4 + 512 * (x * brown_radial(r) + 0.002 * x * y - 0.002 * (r**2 + 2 * x**2)),
+                    227.2 + 576 * (y * brown_radial(r) + 0.001 * (r**2 + 2 * y**2) - 0.004 * x * y),
+                ]
+            ),
+        ),
+    ],
+    ids=["perspective", "fisheye", "spherical", "brown"],
+)  # fmt: skip
+def test_cameras_of_opensfm(tmp_path: Path, camera: dict[str, Any], project: Callable[..., Any]) -> None:
+    """Each by the formula of its documentation; a panorama must be twice as wide as high."""
+    height = 320 if camera["projection_type"] == "spherical" else HEIGHT
+    path = opensfm_in(tmp_path / "o", {**camera, "width": WIDTH, "height": height})
+
+    def pixel(point: Floats) -> Floats:
+        x, y = point[:2] / point[2]
+        found = np.array(project(x, y, np.hypot(x, y)), dtype=np.float64)
+        return found - [0.0, 80.0] if height == 320 else found
+
+    csv = boxes(tmp_path, ["0.jpg", "1.jpg", "2.jpg"], pixel)
+    check_scene(read_opensfm(path, detections=csv), within_m=1e-4)
+
+
+def test_two_reconstructions_of_opensfm_share_no_pass(tmp_path: Path) -> None:
+    path = opensfm_in(tmp_path)
+    part = json.loads(path.read_text())[0]
+    other = {**part, "shots": {f"b{name}": shot for name, shot in part["shots"].items()}}
+    write(path, json.dumps([part, other]))
+    assert sorted(set(read_opensfm(path).images.pass_id.texts())) == ["0/all", "1/all"]
+    other["reference_lla"] = {"latitude": 1.0, "longitude": 2.0, "altitude": 3.0}
+    write(path, json.dumps([part, other]))
+    assert "have different origins" in refusal(lambda: read_opensfm(path))
+
+
+# nuScenes.
+
+
+def nuscenes_in(folder: Path) -> Path:
+    """Each image has an ego pose of its own; the camera is 1.7 m in front of the ego's origin and 1.5 m above it."""
+    ego_from_cam, camera_in_ego = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([1.7, 0.1, 1.5])
+    tables: dict[str, list[dict[str, Any]]] = {
+        "log": [{"token": "l", "location": "boston-seaport"}],
+        "scene": [{"token": "s", "name": "scene-0001", "log_token": "l"}],
+        "sample": [{"token": f"f{i}", "scene_token": "s"} for i in range(3)],
+        "sensor": [
+            {"token": "cam", "channel": "CAM_FRONT", "modality": "camera"},
+            {"token": "top", "channel": "LIDAR_TOP", "modality": "lidar"},
+        ],
+        "calibrated_sensor": [
+            {
+                "token": "k",
+                "sensor_token": "cam",
+                "rotation": Rotation.from_matrix(ego_from_cam).as_quat(scalar_first=True).tolist(),
+                "translation": camera_in_ego.tolist(),
+                # Pixels count from the centre of the top-left one.
+                "camera_intrinsic": [[FX, 0, CX - 0.5], [0, FY, CY - 0.5], [0, 0, 1]],
+            },
+            {"token": "m", "sensor_token": "top", "rotation": [1, 0, 0, 0], "translation": [0, 0, 2]},
+        ],
+        "ego_pose": [],
+        "sample_data": [],
+    }
+    for i, (rotation, center) in enumerate(zip(WORLD_FROM_CAM, CENTERS, strict=True)):
+        world_from_ego = rotation @ ego_from_cam.T
+        quaternion = Rotation.from_matrix(world_from_ego).as_quat(scalar_first=True).tolist()
+        place = (center - world_from_ego @ camera_in_ego).tolist()
+        tables["ego_pose"].append({"token": f"e{i}", "rotation": quaternion, "translation": place})
+        row = {"sample_token": f"f{i}", "ego_pose_token": f"e{i}", "timestamp": int(STAMPS_NS[i] // 1000)}
+        image = {"filename": f"samples/CAM_FRONT/{i}.jpg", "width": WIDTH, "height": HEIGHT, "is_key_frame": True}
+        tables["sample_data"].append({"token": f"d{i}", "calibrated_sensor_token": "k", **row, **image})
+        scan = {"filename": f"samples/LIDAR_TOP/{i}.bin", "width": 0, "height": 0, "is_key_frame": True}
+        tables["sample_data"].append({"token": f"p{i}", "calibrated_sensor_token": "m", **row, **scan})
+    for name, rows in tables.items():
+        write(folder / f"{name}.json", json.dumps(rows))
+    return folder
+
+
+def test_nuscenes(tmp_path: Path) -> None:
+    folder = nuscenes_in(tmp_path / "v1.0-mini")
+    dataset = read_nuscenes(folder, detections=boxes(tmp_path, [f"samples/CAM_FRONT/{i}.jpg" for i in range(3)]))
+    check_scene(dataset)
+    assert dataset.images.pass_id.texts() == ["scene-0001"] * 3
+    assert dataset.frame.anchor == (42.336849169438615, -71.05785369873047, 0.0)
+    assert "location mars: " in refusal(lambda: read_nuscenes(folder, location="mars"))
+
+
+def test_cameras_of_one_sample_of_nuscenes_are_a_rig_and_sweeps_are_not_read_unless_asked_for(tmp_path: Path) -> None:
+    folder = nuscenes_in(tmp_path / "v1.0-mini")
+    rows = json.loads((folder / "sample_data.json").read_text())
+    back = {**rows[0], "token": "back", "filename": "samples/CAM_BACK/0.jpg"}
+    sweep = {**rows[0], "token": "sweep", "filename": "sweeps/CAM_FRONT/0.jpg", "is_key_frame": False}
+    write(folder / "sample_data.json", json.dumps([*rows, back, sweep]))
+    images = read_nuscenes(folder).images
+    assert images.rig_id is not None
+    rig = dict(zip(images.name.to_pylist(), images.rig_id.tolist(), strict=True))
+    assert len(rig) == 4
+    assert rig["samples/CAM_BACK/0.jpg"] == rig["samples/CAM_FRONT/0.jpg"] != rig["samples/CAM_FRONT/1.jpg"]
+    assert len(read_nuscenes(folder, sweeps=True).images) == 5
+
+
+def test_nuscenes_maps_are_not_mixed(tmp_path: Path) -> None:
+    folder = nuscenes_in(tmp_path)
+    other = {"token": "t", "name": "scene-0002", "log_token": "m"}
+    write(folder / "scene.json", json.dumps([*json.loads((folder / "scene.json").read_text()), other]))
+    logs = [*json.loads((folder / "log.json").read_text()), {"token": "m", "location": "singapore-onenorth"}]
+    write(folder / "log.json", json.dumps(logs))
+    assert "boston-seaport, singapore-onenorth, whose frames are not one" in refusal(lambda: read_nuscenes(folder))
+    assert len(read_nuscenes(folder, location="boston-seaport").images) == 3
+
+
+# Argoverse 2.
+
+
+def feather(path: Path, columns: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pyarrow.feather.write_feather(pa.table(columns), path, compression="lz4")
+
+
+def argoverse_in(folder: Path, *, city: str | None = None, offset: Floats | None = None) -> Path:
+    """The ego pose at each instant of an image; the camera sits in front of it."""
+    ego_from_cam, camera_in_ego = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([1.6, -0.1, 1.4])
+    world_from_ego = WORLD_FROM_CAM @ ego_from_cam.T
+    place = CENTERS - world_from_ego @ camera_in_ego + (0.0 if offset is None else offset)
+
+    def pose(rotation: Floats, translation: Floats) -> dict[str, Any]:
+        quaternion = np.atleast_2d(Rotation.from_matrix(rotation).as_quat(scalar_first=True))
+        translation = np.atleast_2d(translation)
+        return {
+            **{name: quaternion[:, i] for i, name in enumerate(("qw", "qx", "qy", "qz"))},
+            **{name: translation[:, i] for i, name in enumerate(("tx_m", "ty_m", "tz_m"))},
+        }
+
+    feather(folder / "city_SE3_egovehicle.feather", {"timestamp_ns": STAMPS_NS, **pose(world_from_ego, place)})
+    calibration = folder / "calibration"
+    sensor = {"sensor_name": ["ring_front_center"], **pose(ego_from_cam, camera_in_ego)}
+    feather(calibration / "egovehicle_SE3_sensor.feather", sensor)
+    intrinsics = {"fx_px": FX, "fy_px": FY, "cx_px": CX - 0.5, "cy_px": CY - 0.5, "k1": -0.3, "k2": 0.1, "k3": 0.0}
+    columns = {name: [value] for name, value in intrinsics.items()}
+    size = {"height_px": [HEIGHT], "width_px": [WIDTH]}
+    feather(calibration / "intrinsics.feather", {"sensor_name": ["ring_front_center"], **columns, **size})
+    for stamp in STAMPS_NS:
+        write(folder / "sensors" / "cameras" / "ring_front_center" / f"{stamp}.jpg", "picture")
+    if city is not None:
+        write(folder / "map" / f"log_map_archive_x____{city}_city_1234.json", "{}")
+    return folder
+
+
+def test_argoverse2(tmp_path: Path) -> None:
+    folder = argoverse_in(tmp_path / "log1")
+    csv = boxes(tmp_path, [f"sensors/cameras/ring_front_center/{stamp}.jpg" for stamp in STAMPS_NS])
+    dataset = read_argoverse2(folder, detections=csv, up=(0.0, 0.0, 1.0))
+    check_scene(dataset)
+    assert dataset.images.pass_id.texts() == ["log1"] * 3
+
+
+def test_argoverse2_on_the_earth(tmp_path: Path) -> None:
+    """Pittsburgh's frame is UTM 17N less its origin: a place 2 km north of that, by pyproj."""
+    offset = np.array([100.0, 2000.0, 300.0])
+    argoverse_in(tmp_path / "logs" / "a", city="PIT", offset=offset)
+    dataset = read_argoverse2(tmp_path / "logs")
+    to_utm = Transformer.from_crs("EPSG:4326", "EPSG:32617", always_xy=True)
+    origin = np.array(to_utm.transform(-80.01294377242584, 40.44177902989321))
+    first = origin + offset[:2] + CENTERS[0, :2]
+    lon, lat = to_utm.transform(first[0], first[1], direction="INVERSE")
+    assert dataset.frame.anchor is not None
+    assert_allclose(dataset.frame.anchor, (lat, lon, offset[2] + CENTERS[0, 2]), atol=1e-9)
+    # Grid north is (lon - 81 W) sin(lat) clockwise of north, here 0.64 degrees; the scale is 0.9996 (1 + x²/2R²).
+    grid_north_rad = np.radians((lon + 81.0) * np.sin(np.radians(lat)))
+    assert abs(grid_north_rad) > 0.01
+    east, north = (CENTERS - CENTERS[0])[:, :2].T / (0.9996 * (1 + ((first[0] - 5e5) / 6.378e6) ** 2 / 2))
+    turned = np.stack([np.cos(grid_north_rad) * east + np.sin(grid_north_rad) * north,
+                       np.cos(grid_north_rad) * north - np.sin(grid_north_rad) * east], axis=1)  # fmt: skip
+    assert_allclose(camera_centers(dataset.images)[:, :2], turned, atol=2e-3)
+
+
+def test_cameras_of_argoverse_that_fire_together_are_a_rig(tmp_path: Path) -> None:
+    folder = argoverse_in(tmp_path / "log1")
+    for path in ("calibration/egovehicle_SE3_sensor.feather", "calibration/intrinsics.feather"):
+        table = pyarrow.feather.read_table(folder / path)
+        left = table.set_column(0, "sensor_name", pa.array(["ring_side_left"]))
+        pyarrow.feather.write_feather(pa.concat_tables([table, left]), folder / path)
+    for stamp in STAMPS_NS[:2] + 20_000_000:
+        write(folder / "sensors" / "cameras" / "ring_side_left" / f"{stamp}.jpg", "picture")
+    images = read_argoverse2(folder, up=(0.0, 0.0, 1.0), max_rejected=0.5).images
+    assert images.rig_id is not None
+    # Between poses half a second apart there is none, but the exact ones stay.
+    assert len(images) == 3
+    table = pyarrow.feather.read_table(folder / "city_SE3_egovehicle.feather").to_pydict()
+    denser = {name: np.repeat(np.array(values), 4)[:-3] for name, values in table.items()}
+    denser["timestamp_ns"] = np.linspace(STAMPS_NS[0], STAMPS_NS[2], 9).astype(np.int64)
+    feather(folder / "city_SE3_egovehicle.feather", denser)
+    images = read_argoverse2(folder, up=(0.0, 0.0, 1.0)).images
+    assert images.rig_id is not None
+    rig = images.rig_id.tolist()
+    assert len(images) == 5
+    assert [rig.count(value) for value in sorted(set(rig))] == [2, 2, 1]
+
+
+# KITTI with several cameras, and on the Earth.
+
+
+def kitti_in(folder: Path) -> dict[str, Any]:
+    """Camera 0 half a metre left of camera 2, in the axes of the first of it: the world's y is down."""
+    world_from_first = WORLD_FROM_CAM[0]
+    rows = []
+    for rotation, center in zip(WORLD_FROM_CAM, CENTERS, strict=True):
+        center0 = center - rotation @ np.array([0.5, 0.0, 0.0])
+        in_first = world_from_first.T @ np.column_stack([rotation, center0 - CENTERS[0]])
+        rows.append(numbers(in_first))
+    calibration = [
+        f"P0: {numbers([[FX, 0, CX - 0.5, 0], [0, FY, CY - 0.5, 0], [0, 0, 1, 0]])}",
+        f"P2: {numbers([[FX, 0, CX - 0.5, -0.5 * FX], [0, FY, CY - 0.5, 0], [0, 0, 1, 0]])}",
+        "Tr: 1 2 3",
+    ]
+    return {
+        "poses": write(folder / "poses.txt", "\n".join(rows) + "\n"),
+        "calibration": write(folder / "calib.txt", "\n".join(calibration) + "\n"),
+        "times": write(folder / "times.txt", "\n".join(f"{stamp / 1e9:.6e}" for stamp in STAMPS_NS - STAMPS_NS[0])),
+        "image_size": (WIDTH, HEIGHT),
+    }
+
+
+def test_kitti_with_several_cameras(tmp_path: Path) -> None:
+    files = kitti_in(tmp_path / "00")
+    lines = ["frame,camera,x1,y1,x2,y2"]
+    for frame, (rotation, center) in enumerate(zip(WORLD_FROM_CAM, CENTERS, strict=True)):
+        for camera, offset in ((2, 0.0), (0, -0.5)):
+            x, y = pinhole(rotation.T @ (OBJECT - center) - [offset, 0, 0]) - 0.5
+            lines.append(f"{frame},{camera},{float(x - 5)},{float(y - 9)},{float(x + 5)},{float(y + 9)}")
+    csv = write(tmp_path / "boxes.csv", "\n".join(lines) + "\n")
+    dataset = read_kitti(**files, cameras=(2, 0), detections=csv)
+    assert dataset.images.name.to_pylist()[::3] == ["image_0/000000.png", "image_2/000000.png"]
+    assert_allclose(meeting_point(dataset), WORLD_FROM_CAM[0].T @ (OBJECT - CENTERS[0]), atol=1e-6)
+    assert dataset.images.rig_id is not None
+    assert dataset.images.rig_id.tolist() == [0, 1, 2, 0, 1, 2]
+    assert dataset.images.timestamp_s is not None
+    assert_allclose(dataset.images.timestamp_s, [0, 0.5, 1, 0, 0.5, 1])
+
+
+def test_kitti_on_the_earth(tmp_path: Path) -> None:
+    """The first camera looks north, level: with that heading the world is east, north, up about it."""
+    files = kitti_in(tmp_path / "00")
+    dataset = read_kitti(**files, cameras=(2,), anchor=(49.0, 8.4, 115.0), heading_deg=0.0)
+    assert_allclose(camera_centers(dataset.images), CENTERS - CENTERS[0], atol=1e-9)
+    assert dataset.frame.anchor == (49.0, 8.4, 115.0)
+    east = read_kitti(**files, cameras=(2,), anchor=(49.0, 8.4, 115.0), heading_deg=90.0)
+    north_m, east_m = (CENTERS - CENTERS[0])[:, 1], (CENTERS - CENTERS[0])[:, 0]
+    assert_allclose(camera_centers(east.images)[:, :2], np.stack([north_m, -east_m], axis=1), atol=1e-9)
+    assert "goes with an anchor" in refusal(lambda: read_kitti(**files, heading_deg=0.0))
+    assert "expected one of them" in refusal(lambda: read_kitti(**{**files, "calibration": None}))
+    assert "expected rows P1" in refusal(lambda: read_kitti(**files, cameras=(1, 2)))
+
+
+# KITTI-360.
+
+
+def kitti360_in(folder: Path) -> Path:
+    car_from_cam, camera_in_car = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([1.5, 0.3, 1.2])
+    rectified = Rotation.from_euler("xyz", [0.02, -0.01, 0.03]).as_matrix()  # Rectified from raw camera axes.
+    raw_in_car = car_from_cam @ rectified
+    rows, raw_rows = [], []
+    for i, (rotation, center) in enumerate(zip(WORLD_FROM_CAM, CENTERS, strict=True)):
+        world_from_car = rotation @ car_from_cam.T
+        rows.append(f"{i + 5} {numbers(np.column_stack([world_from_car, center - world_from_car @ camera_in_car]))}")
+    raw_rows.append(f"image_00: {numbers(np.column_stack([raw_in_car, camera_in_car]))}")
+    raw_rows.append(f"image_02: {numbers(np.column_stack([car_from_cam, camera_in_car]))}")
+    write(folder / "data_poses" / "drive" / "poses.txt", "\n".join(rows) + "\n")
+    write(folder / "calibration" / "calib_cam_to_pose.txt", "\n".join(raw_rows) + "\n")
+    projection = numbers([[FX, 0, CX - 0.5, 0], [0, FY, CY - 0.5, 0], [0, 0, 1, 0]])
+    write(
+        folder / "calibration" / "perspective.txt",
+        f"calib_time: 09-Jan-2012\nS_rect_00: {WIDTH} {HEIGHT}\n"
+        f"R_rect_00: {numbers(rectified)}\nP_rect_00: {projection}\n",
+    )
+    write(
+        folder / "calibration" / "image_02.yaml",
+        "%YAML:1.0\n---\nmodel_type: MEI\ncamera_name: image_02\nimage_width: 1400\nimage_height: 1400\n"
+        "mirror_parameters:\n   xi: 2.2134047507854890e+00\ndistortion_parameters:\n   k1: 1.6798235660113681e-02\n"
+        "   k2: 1.6548773243373522e+00\n   p1: 4.2223943394772046e-04\n   p2: 4.2462134260997584e-04\n"
+        "projection_parameters:\n   gamma1: 1.3363220825849971e+03\n   gamma2: 1.3357883350012958e+03\n"
+        "   u0: 7.1694323510126321e+02\n   v0: 7.0576498308221585e+02\n",
+    )
+    stamps = [f"2020-09-13 12:26:4{i}.000000000" for i in range(8)]
+    write(folder / "data_2d_raw" / "drive" / "image_00" / "timestamps.txt", "\n".join(stamps) + "\n")
+    return folder
+
+
+def test_kitti360(tmp_path: Path) -> None:
+    folder = kitti360_in(tmp_path / "K")
+    names = [f"drive/image_00/data_rect/{i + 5:010d}.png" for i in range(3)]
+    dataset = read_kitti360(folder, sequence="drive", detections=boxes(tmp_path, names))
+    check_scene(dataset, seconds=False)
+    assert dataset.images.timestamp_s is not None
+    assert_allclose(dataset.images.timestamp_s - 1_600_000_000, [5, 6, 7])
+    assert "expected some of 0, 1, 2, 3" in refusal(lambda: read_kitti360(folder, sequence="drive", cameras=(4,)))
+
+
+def test_the_fisheye_of_kitti360_is_that_of_mei(tmp_path: Path) -> None:
+    """By the formula of Mei and Rives: onto the unit sphere, to z + xi, distorted, scaled."""
+    dataset = read_kitti360(kitti360_in(tmp_path), sequence="drive", cameras=(2, 0))
+    assert dataset.cameras.model.texts() == ["OPENCV_FISHEYE", "PINHOLE"]
+    camera = colmap_camera(dataset.cameras, 0)
+    xi, k1, k2, p1, p2 = (
+        2.213404750785489,
+        0.016798235660113681,
+        1.6548773243373522,
+        4.2223943394772046e-4,
+        4.2462134260997584e-4,
+    )
+    for direction in ([0.3, -0.2, 1.0], [-2.0, 1.0, 0.5], [5.0, 3.0, 0.4], [0.0, 0.0, 1.0]):
+        ray = np.array(direction) / np.linalg.norm(direction)
+        x, y = ray[:2] / (ray[2] + xi)
+        r2 = x * x + y * y
+        radial = 1.0 + k1 * r2 + k2 * r2**2
+        u = 1336.3220825849971 * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + 716.94323510126321 + 0.5
+        v = 1335.7883350012958 * (y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)) + 705.76498308221585 + 0.5
+        assert_allclose(np.asarray(camera.img_from_cam(ray[None]))[0], [u, v], atol=0.5)
+    assert dataset.images.rig_id is not None
+    assert dataset.images.rig_id.tolist() == [0, 1, 2, 0, 1, 2]
+
+
+# Mapillary.
+
+
+def varint(value: int) -> bytes:
+    out = b""
+    while value > 127:
+        out, value = out + bytes([value & 127 | 128]), value >> 7
+    return out + bytes([value])
+
+
+def tile(corners: list[tuple[int, int]], extent: int = 4096) -> str:
+    """A vector tile with one polygon, by the specification: tags, lengths, commands, zigzag deltas."""
+    commands, last = [9], (0, 0)  # Move to, once.
+    for i, corner in enumerate(corners):
+        if i == 1:
+            commands.append((len(corners) - 1) << 3 | 2)  # Line to.
+        commands += [(d << 1) ^ (d >> 31) for d in (corner[0] - last[0], corner[1] - last[1])]
+        last = corner
+    geometry = b"".join(map(varint, [*commands, 15]))
+    feature = b"\x18\x03" + b"\x22" + varint(len(geometry)) + geometry
+    layer = b"\x0a\x06mpy-or" + b"\x12" + varint(len(feature)) + feature + b"\x28" + varint(extent) + b"\x78\x02"
+    return base64.b64encode(b"\x1a" + varint(len(layer)) + layer).decode()
+
+
+def mapillary_in(folder: Path) -> Path:
+    """Radial cameras with positions from ENU, rotations about local axes, and outlines in 4096ths of the picture."""
+    data = []
+    for i, (rotation, center) in enumerate(zip(WORLD_FROM_CAM, CENTERS, strict=True)):
+        x, y = (p := rotation.T @ (OBJECT - center))[:2] / p[2]
+        distorted = np.array([x, y]) * (1 - 0.05 * (x * x + y * y))
+        u, v = 640 * 0.8 * distorted + [320, 240]
+        half = 40
+        cx, cy = u / 640 * 4096, v / 480 * 4096
+        box = [(cx - half, cy - half), (cx + half, cy - half), (cx + half, cy + half), (cx - half, cy + half)]
+        corners = [(round(a), round(b)) for a, b in box]
+        to_wgs = Transformer.from_pipeline(
+            f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
+            f"+step +proj=topocentric +ellps=WGS84 +lon_0={LON} +lat_0={LAT} +h_0=0"
+        )
+        lon, lat, height = to_wgs.transform(center[0], center[1], center[2], direction="INVERSE")
+        data.append(
+            {
+                "id": str(1000 + i),
+                "sequence": "seq",
+                "captured_at": int(STAMPS_NS[i] // 1_000_000),
+                "geometry": {"type": "Point", "coordinates": [9.0, 9.0]},
+                "computed_geometry": {"type": "Point", "coordinates": [lon, lat]},
+                "computed_altitude": height,
+                "computed_rotation": Rotation.from_matrix(rotation.T).as_rotvec().tolist(),
+                "camera_type": "perspective",
+                "camera_parameters": [0.8, -0.05, 0.0],
+                "width": WIDTH,
+                "height": HEIGHT,
+                "detections": {"data": [{"id": f"d{i}", "value": "object--traffic-light", "geometry": tile(corners)}]},
+            }
+        )
+    return write(folder / "images.json", json.dumps({"data": data}))
+
+
+def test_mapillary(tmp_path: Path) -> None:
+    """Outlines are rounded to 4096ths, 0.08 px, which is 5 mm at 30 m."""
+    path = mapillary_in(tmp_path / "m")
+    dataset = read_mapillary(path, anchor=(LAT, LON, 0.0))
+    check_scene(dataset, within_m=0.01)
+    assert dataset.detections.class_name.texts() == ["object--traffic-light"] * 3
+    assert_allclose(dataset.detections.size_px, [[80 / 4096 * 640, 80 / 4096 * 480]] * 3)
+    assert dataset.images.pass_id.texts() == ["seq"] * 3
+
+
+def test_mapillary_without_structure_from_motion_is_level_with_its_compass(tmp_path: Path) -> None:
+    image = {
+        "id": 7,
+        "width": 1000,
+        "height": 500,
+        "camera_type": "spherical",
+        "compass_angle": 30.0,
+        "geometry": {"type": "Point", "coordinates": [LON, LAT]},
+        "captured_at": 5000,
+    }
+    outline = tile([(1024, 2048), (1024, 2048), (1024, 2048)])
+    eleventh = {"7": [{"value": "a", "geometry": tile([(3062, 2038), (3082, 2038), (3082, 2058), (3062, 2058)])}]}
+    write(tmp_path / "images.json", json.dumps(image))
+    write(tmp_path / "detections.json", json.dumps(eleventh))
+    dataset = read_mapillary(tmp_path)
+    assert_allclose(azimuths_deg(dataset), 30.0 + 90.0, atol=1e-9)
+    assert_allclose(cast_rays(dataset).direction_in_world[:, 2], 0.0, atol=1e-12)
+    write(tmp_path / "detections.json", json.dumps({"7": [{"value": "a", "geometry": outline}]}))
+    assert "its width or height is not above 0" in refusal(lambda: read_mapillary(tmp_path))
+
+
+@pytest.mark.parametrize("geometry", ["", "?", "AAAA", "GgA=", base64.b64encode(b"\x1a\xff\xff\xff").decode(), 5, None])
+def test_outlines_that_are_no_tiles(tmp_path: Path, geometry: Any) -> None:
+    path = mapillary_in(tmp_path)
+    content = json.loads(path.read_text())
+    content["data"][0]["detections"]["data"][0]["geometry"] = geometry
+    write(path, json.dumps(content))
+    assert "data[0]: detections: data[0]: geometry: expected" in refusal(lambda: read_mapillary(path))
+
+
+# Panoramax.
+
+
+def panoramax_in(folder: Path) -> Path:
+    """A panorama heading east sees something a quarter turn right; a pinhole of 90 degrees its right edge."""
+    ring = [[1499, 499], [1501, 499], [1501, 501], [1499, 501], [1499, 499]]
+    pano = {
+        "datetime": "2023-11-14T22:13:20+00:00",
+        "view:azimuth": 90,
+        "quality:horizontal_accuracy": 1.5,
+        "pers:interior_orientation": {"field_of_view": 360, "sensor_array_dimensions": [2000, 1000]},
+        "annotations": [
+            {
+                "id": "x",
+                "shape": {"type": "Polygon", "coordinates": [ring]},
+                "semantics": [{"key": "osm|traffic_sign", "value": "stop"}],
+            }
+        ],
+    }
+    flat = {
+        **pano,
+        "view:azimuth": 10,
+        "pers:interior_orientation": {"field_of_view": 90, "sensor_array_dimensions": [800, 600]},
+        "annotations": [{"shape": [790, 295, 800, 305], "semantics": [{"key": "osm|traffic_sign", "value": "stop"}]}],
+    }
+    items = [
+        {
+            "type": "Feature",
+            "id": key,
+            "collection": "c",
+            "geometry": {"type": "Point", "coordinates": [LON + i * 1e-4, LAT]},
+            "properties": properties,
+        }
+        for i, (key, properties) in enumerate((("a", pano), ("b", flat)))
+    ]
+    return write(folder / "items.json", json.dumps({"type": "FeatureCollection", "features": items}))
+
+
+def test_panoramax(tmp_path: Path) -> None:
+    dataset = read_panoramax(panoramax_in(tmp_path), camera_height_m=2.0)
+    assert_allclose(azimuths_deg(dataset), [180.0, 10.0 + np.degrees(np.arctan(395.0 / 400.0))], atol=1e-3)
+    assert dataset.detections.class_name.texts() == ["osm|traffic_sign=stop"] * 2
+    assert dataset.images.name.to_pylist() == ["a.jpg", "b.jpg"]
+    assert dataset.images.timestamp_s is not None
+    assert dataset.images.timestamp_s[0] == 1_700_000_000.0
+    assert dataset.images.position_sigma_m is not None
+    assert_allclose(dataset.images.position_sigma_m, 1.5)
+    by_key = read_panoramax(tmp_path, class_key="osm|traffic_sign")
+    assert by_key.detections.class_name.texts() == ["stop"] * 2
+    assert by_key.frame.anchor == (LAT, LON, 0.0)
+    away = enu_from_lon_lat_height(np.array([[LON + 1e-4, LAT, 0.0]]), (LAT, LON, 0.0))
+    assert_allclose(camera_centers(by_key.images)[1], away[0], atol=1e-9)
+
+
+# What all must refuse, each in one line.
+
+
+FORMATS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any], tuple[str, ...]]] = {
+    "tum": (tum_in, lambda p: read_tum(p / "trajectory.txt", camera=CAMERA), ("trajectory.txt",)),
+    "kapture": (
+        kapture_in,
+        read_kapture,
+        tuple(f"sensors/{name}.txt" for name in ("sensors", "trajectories", "records_camera")),
+    ),
+    "opensfm": (opensfm_in, read_opensfm, ("reconstruction.json",)),
+    "nuscenes": (
+        nuscenes_in,
+        read_nuscenes,
+        ("scene.json", "sample_data.json", "ego_pose.json", "calibrated_sensor.json"),
+    ),
+    "argoverse2": (
+        argoverse_in,
+        read_argoverse2,
+        ("city_SE3_egovehicle.feather", "calibration/intrinsics.feather", "calibration/egovehicle_SE3_sensor.feather"),
+    ),
+    "kitti360": (
+        kitti360_in,
+        lambda p: read_kitti360(p, sequence="drive", cameras=(0, 2)),
+        (
+            "data_poses/drive/poses.txt",
+            "calibration/calib_cam_to_pose.txt",
+            "calibration/perspective.txt",
+            "calibration/image_02.yaml",
+        ),
+    ),
+    "kitti": (
+        kitti_in,
+        lambda p: read_kitti(
+            p / "poses.txt", calibration=p / "calib.txt", times=p / "times.txt", image_size=(WIDTH, HEIGHT)
+        ),
+        ("poses.txt", "calib.txt", "times.txt"),
+    ),
+    "mapillary": (mapillary_in, lambda p: read_mapillary(p / "images.json"), ("images.json",)),
+    "panoramax": (panoramax_in, lambda p: read_panoramax(p / "items.json"), ("items.json",)),
+}
+
+
+@pytest.mark.parametrize("how", [*SPOILS, "cut"])
+@pytest.mark.parametrize(("name", "file"), [(name, file) for name, (*_, files) in FORMATS.items() for file in files])
+def test_damaged_files_are_refused_in_one_line(tmp_path: Path, name: str, file: str, how: str) -> None:
+    folder = tmp_path / "data"
+    make, read, _ = FORMATS[name]
+    make(folder)
+    spoiled(folder / file, how)
+    said = refusal(lambda: read(folder))
+    assert Path(file).name in said or "city_SE3_egovehicle.feather" in said
+
+
+@pytest.mark.parametrize("name", ["kapture", "nuscenes", "argoverse2", "kitti360"])
+def test_links_that_lead_out_of_the_folder_are_refused(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "data"
+    make, read, files = FORMATS[name]
+    make(folder)
+    spoiled(folder / files[0], "link", outside=tmp_path)
+    assert "is a link that leads out of" in refusal(lambda: read(folder))
+
+
+@pytest.mark.parametrize("bad", ["../../etc/passwd", "/etc/passwd", "a/../../b.jpg", "C:\\\\a.jpg", ""])
+@pytest.mark.parametrize(
+    ("name", "file", "old"),
+    [
+        ("kapture", "sensors/records_camera.txt", "day1/unposed.jpg"),
+        ("opensfm", "reconstruction.json", "0.jpg"),
+        ("nuscenes", "sample_data.json", "samples/CAM_FRONT/0.jpg"),
+    ],
+)
+def test_names_that_lead_out_of_the_folder_are_refused(
+    tmp_path: Path, name: str, file: str, old: str, bad: str
+) -> None:
+    folder = tmp_path / "data"
+    make, read, _ = FORMATS[name]
+    make(folder)
+    path = folder / file
+    if name == "kapture":
+        old = f"day1/{STAMPS_NS[0]}.jpg"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, bad))
+    said = refusal(lambda: read(folder))
+    assert "stays in the folder" in said or "expected a text" in said
