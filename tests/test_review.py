@@ -1,0 +1,204 @@
+"""Decisions about labels: they survive new maps of the same place, and nothing is decided silently."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from small_dataset import ANCHOR, map_of, small_dataset
+from valuemap.dataset import Frame
+from valuemap.errors import InputError
+from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
+from valuemap.map_folder import Map
+from valuemap.review import apply_review, decide, match_decisions, read_review, state_of, write_review
+from valuemap.tables import Floats, Votes
+
+
+def with_votes(result: Map, votes: int) -> Map:
+    return replace(result, labels=result.labels.replace(votes=np.full(len(result.labels), votes)))
+
+
+def kept(result: Map) -> list[int]:
+    return result.labels.label_id.tolist()
+
+
+def test_what_was_written_is_read_again(tmp_path: Path) -> None:
+    result = map_of([[0, 0, 5], [0.6, 0, 5]], ["light", "light"])
+    first = decide(result, 0, "rejected", note='a "reflection" <b>\n')
+    second = decide(result, 1, "accepted", new_class="sign", new_position_in_world_m=(0.7, 0.1, 5.0))
+    write_review(tmp_path / "review.json", [second, first], result.frame)
+    assert read_review(tmp_path / "review.json", result.frame) == [first, second]
+    assert read_review(tmp_path / "none.json", result.frame) == []
+
+
+def test_rejected_is_dropped_and_corrections_are_applied() -> None:
+    result = map_of([[0, 0, 5], [20, 0, 5], [40, 0, 5]], ["light"] * 3)
+    decisions = [
+        decide(result, 0, "rejected"),
+        decide(result, 1, "accepted", new_class="sign", new_position_in_world_m=(21.0, 0.0, 5.0)),
+    ]
+    reviewed, outcome = apply_review(result, decisions)
+    assert kept(reviewed) == [1, 2]
+    assert reviewed.labels.class_name.texts() == ["sign", "light"]
+    assert reviewed.labels.position_in_world_m[0].tolist() == [21.0, 0.0, 5.0]
+    assert (outcome.accepted, outcome.rejected, outcome.check_again, outcome.without_label) == (1, 1, (), 0)
+
+
+def test_votes_of_rejected_labels_go_with_them() -> None:
+    result = map_of([[0, 0, 5], [20, 0, 5]], residual_px=[1.0, 2.0])
+    assert len(apply_review(result, [decide(result, 1, "rejected")])[0].votes) == 2
+    assert len(apply_review(result, [decide(result, 0, "rejected")])[0].votes) == 0
+
+
+def test_the_right_one_of_two_heads_stays_rejected_when_both_move() -> None:
+    """All passes' offset puts the other head where the rejected one was: the remembered neighbour takes its own."""
+    before = map_of([[0, 0, 5], [0.6, 0, 5]])
+    decisions = [decide(before, 0, "rejected")]
+    after = map_of([[0.45, 0, 5], [1.05, 0, 5]])
+    assert match_decisions(decisions, after).tolist() == [0]
+    forgetful = [replace(decisions[0], neighbors=())]
+    assert match_decisions(forgetful, map_of([[0.6, 0, 5]])).tolist() == [0]
+    assert match_decisions(decisions, map_of([[0.6, 0, 5]])).tolist() == [-1]
+
+
+def test_another_class_or_a_place_far_away_is_another_label() -> None:
+    decisions = [decide(map_of([[0, 0, 5]], ["light"]), 0, "rejected")]
+    assert match_decisions(decisions, map_of([[0.2, 0, 5]], ["sign"])).tolist() == [-1]
+    assert match_decisions(decisions, map_of([[4, 0, 5]], ["light"])).tolist() == [-1]
+    assert match_decisions(decisions, map_of([[0.2, 0, 5]], ["light"])).tolist() == [0]
+    assert match_decisions(decisions, map_of([])).tolist() == [-1]
+
+
+def test_an_uncertain_label_is_known_again_along_its_uncertainty_only() -> None:
+    before = map_of([[0, 0, 5]])
+    spread = before.labels.replace(covariance_m2=np.array([[9.0, 0, 0, 0.01, 0, 0.01]]))
+    decisions = [decide(replace(before, labels=spread), 0, "rejected")]
+    assert match_decisions(decisions, map_of([[8, 0, 5]])).tolist() == [0]
+    assert match_decisions(decisions, map_of([[0, 4, 5]])).tolist() == [-1]
+
+
+def test_the_boxes_that_voted_know_a_label_again_that_moved_and_changed_class() -> None:
+    dataset = small_dataset()
+
+    def map_at(x: float, class_name: str, detections: list[int]) -> Map:
+        result = map_of([[x, 20, 5]], [class_name])
+        row = np.searchsorted(dataset.detections.detection_id, detections)
+        votes = Votes(
+            label_id=np.zeros(len(detections), np.int64),
+            detection_id=np.array(detections),
+            image_id=dataset.detections.image_id[row],
+            residual_px=np.ones(len(detections)),
+            residual_sigmas=np.ones(len(detections)),
+        )
+        return replace(result, votes=votes)
+
+    decisions = [decide(map_at(0, "light", [100, 101]), 0, "rejected", dataset=dataset)]
+    assert [voter[0] for voter in decisions[0].voters] == ["a/1.jpg", "a/2.jpg"]
+    moved = map_at(30, "sign", [101, 102])
+    assert match_decisions(decisions, moved, dataset).tolist() == [0]
+    assert match_decisions(decisions, moved).tolist() == [-1]
+    # Other ids of the same boxes change nothing: names of pictures and places in them count.
+    renumbered = replace(
+        dataset,
+        images=dataset.images.replace(image_id=dataset.images.image_id + 5),
+        detections=dataset.detections.replace(
+            detection_id=dataset.detections.detection_id + 3, image_id=dataset.detections.image_id + 5
+        ),
+    )
+    votes = moved.votes.replace(detection_id=moved.votes.detection_id + 3, image_id=moved.votes.image_id + 5)
+    assert match_decisions(decisions, replace(moved, votes=votes), renumbered).tolist() == [0]
+
+
+def test_twice_the_votes_ask_again_and_stay_out_until_answered() -> None:
+    result = map_of([[0, 0, 5], [20, 0, 5]])
+    decisions = [decide(result, 0, "rejected")]
+    grown, doubled = with_votes(result, 9), with_votes(result, 10)
+    assert state_of(decisions[0], grown.labels, 0) == "rejected"
+    assert state_of(decisions[0], doubled.labels, 0) == "check again"
+    reviewed, outcome = apply_review(doubled, decisions)
+    assert kept(reviewed) == [1]
+    assert outcome.check_again == (0,)
+    assert apply_review(doubled, [decide(doubled, 0, "rejected")])[1].check_again == ()
+
+
+def test_500_rejected_labels_stay_rejected_in_ten_maps() -> None:
+    """New pose errors, other ids and order, missing and additional labels, heads 0.6 m apart."""
+    random = np.random.default_rng(4)
+    poles = np.column_stack([25.0 * (np.arange(600) % 30), 25.0 * (np.arange(600) // 30), random.uniform(3, 6, 600)])
+    twins = poles + [0.6, 0.0, 0.0]
+    true = np.concatenate([poles, twins])
+    before = map_of(true)
+    rejected = random.choice(600, 500, replace=False)
+    decisions = [decide(before, int(row), "rejected") for row in rejected]
+    for _ in range(10):
+        shown = np.flatnonzero(random.random(len(true)) < 0.95)
+        random.shuffle(shown)
+        offset = random.normal(0.0, 0.1, (600, 3))[shown % 600]  # Heads on one pole share the errors of the passes.
+        new = random.uniform([10.0, 10.0, 3.0], [15.0, 15.0, 6.0], (50, 3)) + 25.0 * random.integers(0, 20, (50, 1))
+        here = np.concatenate([true[shown] + offset + random.normal(0.0, 0.05, (len(shown), 3)), new])
+        reviewed, outcome = apply_review(map_of(here), decisions)
+        expected = [row for row in range(len(here)) if row >= len(shown) or shown[row] not in set(rejected.tolist())]
+        assert kept(reviewed) == expected
+        assert outcome.rejected + outcome.without_label == 500
+
+
+def at_anchor(lon_lat_height: Floats, anchor: tuple[float, float, float]) -> Map:
+    frame = Frame(anchor=anchor)
+    return map_of(enu_from_lon_lat_height(lon_lat_height, anchor), frame=frame, lon_lat_height=lon_lat_height)
+
+
+def test_decisions_follow_a_map_to_another_anchor(tmp_path: Path) -> None:
+    place = lon_lat_height_from_enu(np.array([[10.0, 20.0, 5.0], [60.0, 20.0, 5.0]]), ANCHOR)
+    before, after = at_anchor(place, ANCHOR), at_anchor(place, (51.51, -0.12, 0.0))
+    corrected = (11.0, 20.0, 5.0)
+    write_review(
+        tmp_path / "r.json",
+        [decide(before, 0, "accepted", new_position_in_world_m=corrected), decide(before, 1, "rejected")],
+        before.frame,
+    )
+    decisions = read_review(tmp_path / "r.json", after.frame)
+    reviewed, _ = apply_review(after, decisions)
+    assert kept(reviewed) == [0]
+    assert reviewed.labels.lon_lat_height is not None
+    assert np.allclose(
+        reviewed.labels.lon_lat_height, lon_lat_height_from_enu(np.array([corrected]), ANCHOR), atol=1e-8
+    )
+    with pytest.raises(InputError, match="frame of its own"):
+        read_review(tmp_path / "r.json", Frame())
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda content: content.update(format_version=9), "format_version: expected 1, found 9"),
+        (lambda content: content.update(decisions={}), "expected a list"),
+        (lambda content: content["decisions"][0].pop("class"), "decision 1: cannot be used"),
+        (lambda content: content["decisions"][0].update(verdict="maybe"), "decision 1: expected a verdict"),
+        (lambda content: content["decisions"][0].update(position_m=[1, 2]), "decision 1: cannot be used"),
+        (lambda content: content["decisions"][0].update(position_m=[1, 2, float("nan")]), "decision 1: expected"),
+    ],
+)
+def test_damaged_files_are_refused_in_one_line(tmp_path: Path, change: object, told: str) -> None:
+    path = tmp_path / "review.json"
+    result = map_of([[0, 0, 5]])
+    write_review(path, [decide(result, 0, "rejected")], result.frame)
+    content = json.loads(path.read_text())
+    change(content)  # type: ignore[operator]
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=told):
+        read_review(path, result.frame)
+    path.write_text("{")
+    with pytest.raises(InputError, match="cannot be read as JSON"):
+        read_review(path, result.frame)
+
+
+def test_the_order_of_decisions_means_nothing() -> None:
+    result = map_of([[0, 0, 5], [0.6, 0, 5], [9, 0, 5]])
+    decisions = [decide(result, 0, "rejected"), decide(result, 1, "accepted"), decide(result, 2, "rejected")]
+    later = map_of([[0.2, 0.1, 5], [0.9, 0, 5], [9, 0.3, 5]])
+    assert match_decisions(decisions, later).tolist() == [0, 1, 2]
+    assert match_decisions(decisions[::-1], later).tolist() == [2, 1, 0]
