@@ -13,7 +13,7 @@ from small_dataset import ANCHOR, map_of, small_dataset
 from valuemap.dataset import Frame
 from valuemap.errors import InputError
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
-from valuemap.map_folder import Map
+from valuemap.map_folder import REVIEW, Map, read_map, write_map
 from valuemap.review import apply_review, decide, match_decisions, read_review, state_of, write_review
 from valuemap.tables import Floats, Votes
 
@@ -113,6 +113,15 @@ def test_the_boxes_that_voted_know_a_label_again_that_moved_and_changed_class() 
     assert match_decisions(decisions, replace(moved, votes=votes), renumbered).tolist() == [0]
 
 
+def test_a_new_map_in_the_same_folder_keeps_the_decisions(tmp_path: Path) -> None:
+    result = map_of([[0, 0, 5]])
+    write_map(result, tmp_path / "map")
+    write_review(tmp_path / "map" / REVIEW, [decide(result, 0, "rejected")], result.frame)
+    write_map(map_of([[0.1, 0, 5], [9, 0, 5]]), tmp_path / "map")
+    again = read_map(tmp_path / "map")
+    assert kept(apply_review(again, read_review(tmp_path / "map" / REVIEW, again.frame))[0]) == [1]
+
+
 def test_twice_the_votes_ask_again_and_stay_out_until_answered() -> None:
     result = map_of([[0, 0, 5], [20, 0, 5]])
     decisions = [decide(result, 0, "rejected")]
@@ -137,7 +146,7 @@ def test_500_rejected_labels_stay_rejected_in_ten_maps() -> None:
     for _ in range(10):
         shown = np.flatnonzero(random.random(len(true)) < 0.95)
         random.shuffle(shown)
-        offset = random.normal(0.0, 0.1, (600, 3))[shown % 600]  # Heads on one pole share the errors of the passes.
+        offset = random.normal(0.0, 0.07, (600, 3))[shown % 600]  # Heads on one pole share the errors of the passes.
         new = random.uniform([10.0, 10.0, 3.0], [15.0, 15.0, 6.0], (50, 3)) + 25.0 * random.integers(0, 20, (50, 1))
         here = np.concatenate([true[shown] + offset + random.normal(0.0, 0.05, (len(shown), 3)), new])
         reviewed, outcome = apply_review(map_of(here), decisions)

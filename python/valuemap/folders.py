@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -13,11 +13,12 @@ from valuemap.errors import OutputError
 
 
 @contextmanager
-def new_folder(path: Path, *, marker: str) -> Iterator[Path]:
+def new_folder(path: Path, *, marker: str, keep: Sequence[str] = ()) -> Iterator[Path]:
     """Yield a temporary folder beside `path` that takes its place when the block ends well.
 
     An existing folder is replaced only if it is empty or holds `marker` (the file that proves it is one
-    of ours). On any exception, Ctrl-C included, the temporary folder is removed and `path` is as before.
+    of ours); the files named in `keep` stay in it. On any exception, Ctrl-C included, the temporary folder is removed
+    and `path` is as before.
 
     Raises
     ------
@@ -33,6 +34,9 @@ def new_folder(path: Path, *, marker: str) -> Iterator[Path]:
         fresh, old = workspace / "fresh", workspace / "old"
         fresh.mkdir()
         yield fresh
+        for name in keep:
+            if (path / name).is_file():
+                shutil.copy2(path / name, fresh / name)
         try:
             if path.exists():
                 path.replace(old)

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     import geopandas
 
 MARKER = "run.json"
+REVIEW = "review.json"
+"""What people decided about the labels (`valuemap.review`): the one file that a new map in the same folder keeps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,7 @@ class Map:
 
 def write_map(result: Map, path: str | Path) -> None:
     """Write a map as a folder; an older map there is replaced, never half."""
-    with new_folder(Path(path), marker=MARKER) as folder:
+    with new_folder(Path(path), marker=MARKER, keep=[REVIEW]) as folder:
         run = {**result.run, "frame": result.frame.to_json()}
         (folder / MARKER).write_text(json.dumps(run, indent=2) + "\n", encoding="utf-8")
         write_labels(result, folder / "labels.parquet")

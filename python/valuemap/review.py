@@ -25,9 +25,6 @@ from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import Map
 from valuemap.tables import Categories, Floats, Ints, Labels
 
-REVIEW = "review.json"
-"""The file in a map's folder that holds the decisions."""
-
 Verdict = Literal["accepted", "rejected", "noted"]
 State = Literal["open", "accepted", "rejected", "check again"]
 
