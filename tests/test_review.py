@@ -146,7 +146,7 @@ def test_500_rejected_labels_stay_rejected_in_ten_maps() -> None:
     for _ in range(10):
         shown = np.flatnonzero(random.random(len(true)) < 0.95)
         random.shuffle(shown)
-        offset = random.normal(0.0, 0.07, (600, 3))[shown % 600]  # Heads on one pole share the errors of the passes.
+        offset = random.normal(0.0, 0.05, (600, 3))[shown % 600]  # Heads on one pole share the errors of the passes.
         new = random.uniform([10.0, 10.0, 3.0], [15.0, 15.0, 6.0], (50, 3)) + 25.0 * random.integers(0, 20, (50, 1))
         here = np.concatenate([true[shown] + offset + random.normal(0.0, 0.05, (len(shown), 3)), new])
         reviewed, outcome = apply_review(map_of(here), decisions)
