@@ -15,6 +15,7 @@ COMMANDS = (
     "evaluate",
     "show_",
     "report",
+    "view",
     "export",
     "settings",
     "experiment",
