@@ -23,7 +23,7 @@ def with_votes(result: Map, votes: int) -> Map:
 
 
 def kept(result: Map) -> list[int]:
-    return result.labels.label_id.tolist()
+    return [int(each) for each in result.labels.label_id]
 
 
 def test_what_was_written_is_read_again(tmp_path: Path) -> None:

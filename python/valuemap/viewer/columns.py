@@ -20,34 +20,32 @@ _ALIGNMENT = 8
 def pack_columns(columns: Mapping[str, NDArray[Any]]) -> bytes:
     """Return arrays (N) or (N, K) of float32, float64, int32 or uint8 as one body."""
     arrays = {name: np.ascontiguousarray(each, each.dtype.newbyteorder("<")) for name, each in columns.items()}
+    # Offsets are within the header that comes before the columns: room is made that surely holds it.
+    room = _aligned(4 + len(_header(arrays, [10**12] * len(arrays))))
+    offsets = []
+    end = room
+    for each in arrays.values():
+        offsets.append(end)
+        end = _aligned(end + each.nbytes)
+    header = _header(arrays, offsets).ljust(room - 4)
+    body = bytearray(end)
+    body[:room] = len(header).to_bytes(4, "little") + header
+    for offset, each in zip(offsets, arrays.values(), strict=True):
+        body[offset : offset + each.nbytes] = each.tobytes()
+    return bytes(body)
+
+
+def _header(arrays: Mapping[str, NDArray[Any]], offsets: list[int]) -> bytes:
     described = [
         {
             "name": name,
             "type": _TYPES[each.dtype.str[1:]],
             "rows": len(each),
             "width": 1 if each.ndim == 1 else each.shape[1],
-            "offset": 0,
+            "offset": offset,
         }
-        for name, each in arrays.items()
+        for (name, each), offset in zip(arrays.items(), offsets, strict=True)
     ]
-    # Offsets change the length of the header, so they are written with a fixed number of digits.
-    sizes = [each.nbytes for each in arrays.values()]
-    blank = _header([{**each, "offset": 10**12} for each in described])
-    start = _aligned(4 + len(blank))
-    offset = start
-    for each, size in zip(described, sizes, strict=True):
-        each["offset"] = offset
-        offset = _aligned(offset + size)
-    header = _header(described).ljust(len(blank))
-    body = bytearray(offset)
-    body[:4] = len(header).to_bytes(4, "little")
-    body[4 : 4 + len(header)] = header
-    for each, array in zip(described, arrays.values(), strict=True):
-        body[each["offset"] : each["offset"] + array.nbytes] = array.tobytes()
-    return bytes(body)
-
-
-def _header(described: list[dict[str, Any]]) -> bytes:
     return json.dumps(described, separators=(",", ":")).encode()
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.errors import InputError
 from valuemap.evidence import Evidence, Misses, picture_file
 from valuemap.tables import Floats, Ints
 from valuemap.viewer.scene import Scene, number
@@ -45,8 +46,6 @@ def label_details(scene: Scene, label_id: int) -> dict[str, Any]:
     labels, evidence = scene.result.labels, scene.evidence
     row = int(np.searchsorted(labels.label_id, label_id))
     if row == len(labels) or labels.label_id[row] != label_id:
-        from valuemap.errors import InputError
-
         raise InputError(f"there is no label {label_id} in the map", hint="its ids are in labels.parquet")
     position = labels.position_in_world_m[row]
     details: dict[str, Any] = {
@@ -283,8 +282,8 @@ def _answer(details: dict[str, Any]) -> str:
     if details["rejected"]:
         best = details["rejected"][0]
         sentences.append(
-            f"A {best['class']} with {_count(best['votes'], 'vote')} from {_count(best['passes'], 'pass', 'passes')} was "
-            f"considered {best['away_m']:.1f} m from here and rejected: {best['why']}."
+            f"A {best['class']} with {_count(best['votes'], 'vote')} from {_count(best['passes'], 'pass', 'passes')} "
+            f"was considered {best['away_m']:.1f} m from here and rejected: {best['why']}."
         )
         if best["rival"] is not None:
             sentences.append(f"Label {best['rival']} has its detections or its place.")
@@ -297,8 +296,8 @@ def _answer(details: dict[str, Any]) -> str:
             sentences.append("No image pictures this place.")
         elif details["rays"] == 0:
             sentences.append(
-                f"{_count(details['looks'], 'image pictures', 'images picture')} this place, and no detection in any of "
-                f"them points at it."
+                f"{_count(details['looks'], 'image pictures', 'images picture')} this place, and no detection in any "
+                f"of them points at it."
             )
         else:
             taken = details["rays"] - details["free_rays"]

@@ -64,7 +64,7 @@ class Scene:
         self.result = read_map(map_folder)
         self.notes: list[str] = []
         self.evidence = self._find_evidence(dataset_folder)
-        self.pictures = self._find_pictures(dataset_folder, pictures)
+        self.pictures = self._find_pictures(pictures)
         self._truth = truth
         self.rejected = read_table(Rejected, map_folder / REJECTED) if (map_folder / REJECTED).is_file() else None
         self.lock = threading.Lock()
@@ -89,7 +89,7 @@ class Scene:
             self.notes.append(f"The dataset {folder.name} beside this map cannot be used: {error}.")
             return None
 
-    def _find_pictures(self, dataset: Path | None, given: Path | None) -> Path | None:
+    def _find_pictures(self, given: Path | None) -> Path | None:
         if given is not None:
             if not given.is_dir():
                 raise InputError(f"{given}: is not a folder", hint="give the folder that holds the pictures")
