@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import webbrowser
 from pathlib import Path
 from typing import Annotated
@@ -43,6 +44,7 @@ def view_command(
     show_notes(content.scene.notes)
     print(server.address, flush=True)
     log.print("Decisions are saved as you make them. Ctrl-C ends.", highlight=False)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # Ends as quietly as Ctrl-C.
     if not no_open:
         webbrowser.open(server.address)
     try:

@@ -28,8 +28,8 @@ REJECTED = "rejected.parquet"
 OUTCOMES = ("", "true", "duplicate", "false", "found", "missed", "not recoverable")
 """What became of labels and true objects, as numbers for the page."""
 
-_GAP_M = 100.0
-"""Successive images of a pass farther apart than this are not joined by a line."""
+_GAP_STEPS = 6.0
+"""Successive images of a pass farther apart than so many median steps are not joined by a line."""
 
 
 class Scene:
@@ -210,7 +210,9 @@ class Scene:
         forward = rotation_matrices(images)[order][:, 2] @ self.local_from_world.T
         joined = np.zeros(len(order), np.uint8)
         step = np.linalg.norm(np.diff(position, axis=0), axis=1)
-        joined[:-1] = (np.diff(number) == 0) & (step <= _GAP_M)
+        same = np.diff(number) == 0
+        moving = step[same & (step > 0.0)]
+        joined[:-1] = same & (step <= _GAP_STEPS * float(np.median(moving) if len(moving) else 0.0))
         return pack_columns(
             {
                 "position": position.astype(np.float32),

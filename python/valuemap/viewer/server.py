@@ -2,9 +2,9 @@
 
 Another web page that is open in the same browser can send requests to 127.0.0.1, and a name in its control can be made
 to mean 127.0.0.1. So every request must name this server as its Host, come from this server's own page (Origin and
-Sec-Fetch-Site, where a browser sends them) and carry the token of this run, which is in the address that `valuemap view`
-opens. No path of a request ever becomes a path of a file: the files of the page are listed once, and pictures are found
-by the id of their image and only inside the folder of pictures.
+Sec-Fetch-Site, where a browser sends them) and carry the token of this run, which is in the address that
+`valuemap view` opens. No path of a request ever becomes a path of a file: the files of the page are listed once, and
+pictures are found by the id of their image and only inside the folder of pictures.
 """
 
 from __future__ import annotations

@@ -1,0 +1,570 @@
+/** The map: deck.gl draws labels, ellipses, tracks and rays from above, in metres; a basemap may lie beneath. */
+
+import { Deck, type Layer, OrthographicView } from "@deck.gl/core";
+import { LineLayer, ScatterplotLayer } from "@deck.gl/layers";
+import KDBush from "kdbush";
+import type { LabelDetails, PlaceDetails, Shot, State } from "./api";
+import { classColor, type Color, existenceColor, OUTCOMES, passColor, STATES } from "./colors";
+import type { Columns } from "./columns";
+import { EllipseLayer } from "./ellipses";
+import { MAX_ZOOM, MIN_ZOOM, type Settings, type View } from "./state";
+import { flat, Tracks } from "./tracks";
+
+const ELLIPSE_95 = Math.sqrt(5.991464547107979); // Half axis of 95 % of a normal distribution in the plane, in sigmas.
+const PICK_PX = 12;
+const RAYS_FROM_ZOOM = -2;
+
+export interface Labels {
+  count: number;
+  id: Float64Array;
+  position: Float32Array;
+  ellipse: Float32Array;
+  class: Int32Array;
+  votes: Int32Array;
+  passes: Int32Array;
+  existence: Float32Array;
+  rowOf: Map<number, number>;
+}
+
+export function readLabels(columns: Columns): Labels {
+  const id = columns.get<Float64Array>("id");
+  return {
+    count: id.length,
+    id,
+    position: flat(columns.get("position")),
+    ellipse: columns.get("ellipse"),
+    class: columns.get<Int32Array>("class"),
+    votes: columns.get<Int32Array>("votes"),
+    passes: columns.get<Int32Array>("passes"),
+    existence: columns.get("existence"),
+    rowOf: new Map(Array.from(id, (value, row) => [value, row])),
+  };
+}
+
+export interface Truth {
+  position: Float32Array;
+  outcome: Uint8Array;
+  labelOutcome: Uint8Array;
+}
+
+export interface MapEvents {
+  onView(view: View): void;
+  onLabel(id: number): void;
+  onPlace(east: number, north: number): void;
+  onHover(row: number | null, x: number, y: number, east: number, north: number): void;
+  onDrawn(): void;
+}
+
+export class MapView {
+  private readonly deck: Deck<OrthographicView>;
+  private readonly tracks: Tracks;
+  private view: View;
+  private settings: Settings;
+  private states: State[];
+  private shown: Uint32Array = new Uint32Array();
+  private index: KDBush | null = null;
+  private dark = false;
+  private truth: Truth | null = null;
+  private rejected: Float32Array | null = null;
+  private selected: { at: [number, number]; row: number | null } | null = null;
+  private rays: { shots: Shot[]; misses: Shot[]; to: [number, number] } | null = null;
+  private lit: Shot | null = null;
+  private labelLayers: Layer[] = [];
+  private trackLayers: { key: string; layers: Layer[] } = { key: "", layers: [] };
+  private pressed: { x: number; y: number } | null = null;
+
+  constructor(
+    private readonly parent: HTMLElement,
+    private readonly labels: Labels,
+    cameras: Columns,
+    private readonly outcomes: string[],
+    settings: Settings,
+    states: State[],
+    view: View | null,
+    private readonly events: MapEvents,
+  ) {
+    this.tracks = new Tracks(cameras);
+    this.settings = settings;
+    this.states = states;
+    this.view = view ?? this.fitting();
+    this.deck = new Deck({
+      parent: parent as HTMLDivElement,
+      style: { position: "absolute", inset: "0" } as never,
+      views: new OrthographicView({ id: "plan", flipY: false }),
+      viewState: this.deckView(),
+      controller: { doubleClickZoom: false, keyboard: false, scrollZoom: { speed: 0.02, smooth: false }, inertia: false },
+      useDevicePixels: true,
+      onViewStateChange: ({ viewState }) => {
+        const [east, north] = viewState.target as number[];
+        this.setView({ east, north, zoom: viewState.zoom as number });
+      },
+      onAfterRender: () => this.events.onDrawn(),
+      getCursor: ({ isDragging }) => (isDragging ? "grabbing" : "crosshair"),
+      layers: [],
+    });
+    this.listen();
+  }
+
+  // The place
+
+  getView(): View {
+    return this.view;
+  }
+
+  setView(view: View): void {
+    this.view = { ...view, zoom: Math.min(MAX_ZOOM, Math.max(MIN_ZOOM, view.zoom)) };
+    this.deck.setProps({ viewState: this.deckView() });
+    this.draw();
+    this.events.onView(this.view);
+  }
+
+  zoomBy(steps: number): void {
+    this.setView({ ...this.view, zoom: this.view.zoom + steps });
+  }
+
+  panBy(xPx: number, yPx: number): void {
+    const metres = this.metresPerPixel();
+    this.setView({ ...this.view, east: this.view.east + xPx * metres, north: this.view.north - yPx * metres });
+  }
+
+  fit(): void {
+    this.setView(this.fitting());
+  }
+
+  /** Show a place: the view moves only if it is not well inside, and comes nearer if it is far away. */
+  show(east: number, north: number, zoom = 4): void {
+    const [x, y] = this.toScreen(east, north);
+    const { clientWidth, clientHeight: height } = this.parent;
+    const width = clientWidth - this.covered;
+    const inside = x > 0.1 * width && x < 0.9 * width && y > 0.1 * height && y < 0.9 * height;
+    if (inside && this.view.zoom >= 1) return;
+    const nearer = Math.max(this.view.zoom, zoom);
+    this.setView({ east: east + this.covered / 2 / 2 ** nearer, north, zoom: nearer });
+  }
+
+  /** How many pixels on the right something lies over the map. */
+  private covered = 0;
+
+  cover(px: number): void {
+    this.covered = px < this.parent.clientWidth / 2 ? px : 0;
+  }
+
+  metresPerPixel(): number {
+    return 2 ** -this.view.zoom;
+  }
+
+  toScreen(east: number, north: number): [number, number] {
+    const scale = 2 ** this.view.zoom;
+    return [
+      this.parent.clientWidth / 2 + (east - this.view.east) * scale,
+      this.parent.clientHeight / 2 - (north - this.view.north) * scale,
+    ];
+  }
+
+  toGround(x: number, y: number): [number, number] {
+    const metres = this.metresPerPixel();
+    return [
+      this.view.east + (x - this.parent.clientWidth / 2) * metres,
+      this.view.north - (y - this.parent.clientHeight / 2) * metres,
+    ];
+  }
+
+  private deckView() {
+    return {
+      target: [this.view.east, this.view.north, 0] as [number, number, number],
+      zoom: this.view.zoom,
+      minZoom: MIN_ZOOM,
+      maxZoom: MAX_ZOOM,
+    };
+  }
+
+  private fitting(): View {
+    const box = bounds([this.labels.position, this.tracks.levels[this.tracks.levels.length - 1]?.points ?? new Float32Array()]);
+    const width = Math.max(20, box.right - box.left);
+    const height = Math.max(20, box.top - box.bottom);
+    const zoom = Math.log2(Math.min(this.parent.clientWidth / width, this.parent.clientHeight / height) * 0.88);
+    return {
+      east: (box.left + box.right) / 2,
+      north: (box.bottom + box.top) / 2,
+      zoom: Math.min(5, Math.max(MIN_ZOOM, zoom)),
+    };
+  }
+
+  // What is drawn
+
+  setSettings(settings: Settings): void {
+    this.settings = settings;
+    this.rebuild();
+  }
+
+  setStates(states: State[]): void {
+    this.states = states;
+    this.rebuild();
+  }
+
+  setDark(dark: boolean): void {
+    this.dark = dark;
+    this.rebuild();
+  }
+
+  setTruth(truth: Truth): void {
+    this.truth = truth;
+    this.rebuild();
+  }
+
+  setRejected(position: Float32Array): void {
+    this.rejected = flat(position);
+    this.rebuild();
+  }
+
+  select(at: [number, number] | null, row: number | null = null): void {
+    this.selected = at && { at, row };
+    this.rays = null;
+    this.lit = null;
+    this.draw();
+  }
+
+  showRays(details: LabelDetails | PlaceDetails): void {
+    const to: [number, number] = [details.local_m[0], details.local_m[1]];
+    this.rays =
+      "voters" in details
+        ? { shots: details.voters, misses: details.misses, to }
+        : { shots: details.passing ?? [], misses: [], to };
+    this.draw();
+  }
+
+  light(shot: Shot | null): void {
+    this.lit = shot;
+    this.draw();
+  }
+
+  shownRows(): Uint32Array {
+    return this.shown;
+  }
+
+  /** How many labels are inside the picture now. */
+  inView(): number {
+    if (!this.index) return 0;
+    const [left, top] = this.toGround(0, 0);
+    const [right, bottom] = this.toGround(this.parent.clientWidth, this.parent.clientHeight);
+    return this.index.range(left, bottom, right, top).length;
+  }
+
+  labelColor(row: number): Color {
+    const { labels, settings } = this;
+    if (settings.colorBy === "class") return classColor(labels.class[row]);
+    if (settings.colorBy === "state") return STATES[this.states[row]];
+    if (settings.colorBy === "outcome") {
+      return OUTCOMES[this.outcomes[this.truth?.labelOutcome[row] ?? 0]] ?? STATES.open;
+    }
+    return existenceColor(labels.existence[row], this.dark);
+  }
+
+  private isShown(row: number): boolean {
+    const { labels, settings: s } = this;
+    const existence = labels.existence[row];
+    return (
+      labels.votes[row] >= s.minVotes &&
+      labels.passes[row] >= s.minPasses &&
+      !(existence < s.minExistence) &&
+      !(existence > s.maxExistence) &&
+      !s.hiddenStates.has(this.states[row]) &&
+      !this.hiddenCodes.has(labels.class[row])
+    );
+  }
+
+  private hiddenCodes = new Set<number>();
+
+  setHiddenCodes(codes: Set<number>): void {
+    this.hiddenCodes = codes;
+  }
+
+  /** Filter labels anew, and fill the buffers that the GPU reads. */
+  private rebuild(): void {
+    const { labels } = this;
+    const rows: number[] = [];
+    for (let row = 0; row < labels.count; row++) if (this.isShown(row)) rows.push(row);
+    // Doubtful ones are drawn last, so that they are not hidden.
+    if (labels.existence.length) rows.sort((a, b) => (labels.existence[b] || 0) - (labels.existence[a] || 0) || a - b);
+    this.shown = Uint32Array.from(rows);
+    const length = rows.length;
+    const position = new Float32Array(3 * length);
+    const fill = new Uint8Array(4 * length);
+    const line = new Uint8Array(4 * length);
+    const radius = new Float32Array(length);
+    const shape = new Float32Array(3 * length);
+    this.index = length ? new KDBush(length) : null;
+    rows.forEach((row, i) => {
+      const east = labels.position[3 * row];
+      const north = labels.position[3 * row + 1];
+      position[3 * i] = east;
+      position[3 * i + 1] = north;
+      const color = this.labelColor(row);
+      const rejected = this.states[row] === "rejected";
+      fill.set([...color, rejected ? 30 : 255], 4 * i);
+      line.set(rejected ? [...color, 230] : this.states[row] === "check again" ? [...STATES["check again"], 255] : this.dark ? [16, 20, 26, 255] : [255, 255, 255, 255], 4 * i);
+      const major = labels.ellipse[3 * row];
+      radius[i] = ELLIPSE_95 * major;
+      shape[3 * i] = Math.cos(labels.ellipse[3 * row + 2]);
+      shape[3 * i + 1] = Math.sin(labels.ellipse[3 * row + 2]);
+      shape[3 * i + 2] = major > 0 ? labels.ellipse[3 * row + 1] / major : 1;
+      this.index!.add(east, north);
+    });
+    this.index?.finish();
+    const shared = { getPosition: { value: position, size: 3 } };
+    this.labelLayers = [
+      new EllipseLayer({
+        id: "ellipses",
+        visible: this.settings.layers.has("ellipses"),
+        data: {
+          length,
+          attributes: { ...shared, getRadius: { value: radius, size: 1 }, getFillColor: { value: fill, size: 4, normalized: true }, getShape: { value: shape, size: 3 } },
+        } as never,
+        radiusUnits: "common",
+        stroked: false,
+        antialiasing: false,
+      }),
+      new ScatterplotLayer({
+        id: "labels",
+        data: { length, attributes: { ...shared, getFillColor: { value: fill, size: 4, normalized: true }, getLineColor: { value: line, size: 4, normalized: true } } } as never,
+        radiusUnits: "pixels",
+        getRadius: 5,
+        lineWidthUnits: "pixels",
+        getLineWidth: 1.25,
+        stroked: true,
+      }),
+    ];
+    this.trackLayers.key = "";
+    this.draw();
+  }
+
+  private draw(): void {
+    const scale = 2 ** this.view.zoom;
+    // Dots shrink where labels would cover each other; their size changes no buffer.
+    // From near they shrink again, so that ellipses show.
+    const small = scale < 0.15 ? 2.6 : scale < 1 ? 3.6 : scale < 24 ? 5 : 3.5;
+    const layers: (Layer | null)[] = [
+      ...this.trackLayersNow(),
+      this.truthLayer(),
+      this.rejectedLayer(),
+      this.labelLayers[0]?.clone({ visible: this.settings.layers.has("ellipses") && scale > 0.8 }) ?? null,
+      ...this.rayLayers(),
+      this.labelLayers[1]?.clone({ getRadius: small, getLineWidth: small < 3 ? 0.5 : 1.25 } as never) ?? null,
+      this.markLayer(),
+    ];
+    this.deck.setProps({ layers });
+  }
+
+  private trackLayersNow(): Layer[] {
+    const level = this.tracks.at(this.metresPerPixel());
+    const { layers, hiddenPasses } = this.settings;
+    if (!level) return [];
+    const showTracks = layers.has("tracks");
+    const showCameras = layers.has("cameras") && this.view.zoom > 1.5;
+    const key = `${level.spacing} ${this.dark} ${[...hiddenPasses].join()}`;
+    if (this.trackLayers.key !== key) {
+      const rows = level.pass.length;
+      const lines = new Uint8Array(4 * rows);
+      const dots = new Uint8Array(4 * rows);
+      const palette = new Map<number, Color>();
+      for (let i = 0; i < rows; i++) {
+        const number = level.pass[i];
+        if (hiddenPasses.has(number)) continue;
+        let color = palette.get(number);
+        if (!color) palette.set(number, (color = passColor(number, this.dark)));
+        lines[4 * i] = dots[4 * i] = color[0];
+        lines[4 * i + 1] = dots[4 * i + 1] = color[1];
+        lines[4 * i + 2] = dots[4 * i + 2] = color[2];
+        lines[4 * i + 3] = level.joined[i] ? 130 : 0;
+        dots[4 * i + 3] = 200;
+      }
+      this.trackLayers = {
+        key,
+        layers: [
+          new LineLayer({
+            id: `tracks-${level.spacing}`,
+            data: {
+              length: Math.max(0, rows - 1),
+              attributes: {
+                getSourcePosition: { value: level.points, size: 3 },
+                getTargetPosition: { value: level.points, size: 3, offset: 12 },
+                getColor: { value: lines, size: 4, normalized: true },
+              },
+            } as never,
+            widthUnits: "pixels",
+            getWidth: 1.5,
+          }),
+          new ScatterplotLayer({
+            id: `cameras-${level.spacing}`,
+            data: { length: rows, attributes: { getPosition: { value: level.points, size: 3 }, getFillColor: { value: dots, size: 4, normalized: true } } } as never,
+            radiusUnits: "pixels",
+            getRadius: 2,
+            antialiasing: false,
+          }),
+        ],
+      };
+    }
+    const [tracks, cameras] = this.trackLayers.layers;
+    return [tracks.clone({ visible: showTracks }), cameras.clone({ visible: showCameras })];
+  }
+
+  private truthLayer(): Layer | null {
+    if (!this.truth || !this.truth.position.length) return null;
+    const rows = this.truth.outcome.length;
+    const line = new Uint8Array(4 * rows);
+    for (let i = 0; i < rows; i++) {
+      line.set([...(OUTCOMES[this.outcomes[this.truth.outcome[i]]] ?? OUTCOMES.found), 255], 4 * i);
+    }
+    return new ScatterplotLayer({
+      id: "truth",
+      visible: this.settings.layers.has("truth"),
+      data: { length: rows, attributes: { getPosition: { value: this.truth.position, size: 3 }, getLineColor: { value: this.truthLine(line), size: 4, normalized: true } } } as never,
+      radiusUnits: "pixels",
+      getRadius: this.view.zoom < 0 ? 5 : 9,
+      filled: false,
+      stroked: true,
+      lineWidthUnits: "pixels",
+      getLineWidth: 1.75,
+    });
+  }
+
+  private truthColors: Uint8Array | null = null;
+
+  private truthLine(line: Uint8Array): Uint8Array {
+    // The same array again, so that moving the map uploads nothing.
+    return (this.truthColors ??= line);
+  }
+
+  private rejectedLayer(): Layer | null {
+    if (!this.rejected) return null;
+    return new ScatterplotLayer({
+      id: "rejected",
+      visible: this.settings.layers.has("rejected"),
+      data: { length: this.rejected.length / 3, attributes: { getPosition: { value: this.rejected, size: 3 } } } as never,
+      radiusUnits: "pixels",
+      getRadius: this.view.zoom < 0 ? 1.5 : 3,
+      getFillColor: this.dark ? [190, 190, 190, 150] : [90, 90, 90, 150],
+    });
+  }
+
+  private rayLayers(): Layer[] {
+    if (!this.rays) return [];
+    const { shots, misses, to } = this.rays;
+    const visible = this.view.zoom > RAYS_FROM_ZOOM;
+    const seen = shots.filter((shot) => !this.settings.hiddenPasses.has(shot.pass));
+    return [
+      new LineLayer<Shot>({
+        id: "misses",
+        visible,
+        data: misses,
+        getSourcePosition: (shot) => [shot.camera_m[0], shot.camera_m[1], 0],
+        getTargetPosition: () => [...to, 0],
+        getColor: [213, 94, 0, 70],
+        widthUnits: "pixels",
+        getWidth: 1,
+      }),
+      new LineLayer<Shot>({
+        id: "rays",
+        visible,
+        data: seen,
+        getSourcePosition: (shot) => [shot.camera_m[0], shot.camera_m[1], 0],
+        getTargetPosition: () => [...to, 0],
+        getColor: (shot) => [...passColor(shot.pass, this.dark), 120],
+        widthUnits: "pixels",
+        getWidth: 1,
+      }),
+      new ScatterplotLayer<Shot>({
+        id: "voters",
+        visible,
+        data: [...misses, ...seen],
+        getPosition: (shot) => [shot.camera_m[0], shot.camera_m[1], 0],
+        getFillColor: (shot) => (misses.includes(shot) ? [213, 94, 0, 255] : [...passColor(shot.pass, this.dark), 255]),
+        radiusUnits: "pixels",
+        getRadius: 2.6,
+      }),
+      new LineLayer<Shot>({
+        id: "lit",
+        visible,
+        data: this.lit ? [this.lit] : [],
+        getSourcePosition: (shot) => [shot.camera_m[0], shot.camera_m[1], 0],
+        getTargetPosition: () => [...to, 0],
+        getColor: this.dark ? [255, 255, 255, 255] : [20, 20, 20, 255],
+        widthUnits: "pixels",
+        getWidth: 2.5,
+      }),
+    ];
+  }
+
+  private markLayer(): Layer | null {
+    if (!this.selected) return null;
+    return new ScatterplotLayer<{ at: [number, number] }>({
+      id: "selected",
+      data: [this.selected],
+      getPosition: ({ at }) => [...at, 0],
+      filled: false,
+      stroked: true,
+      radiusUnits: "pixels",
+      getRadius: 11,
+      lineWidthUnits: "pixels",
+      getLineWidth: 2.5,
+      getLineColor: this.dark ? [255, 255, 255] : [10, 20, 30],
+    });
+  }
+
+  // What the pointer does. The index on the CPU answers in less than a millisecond, where reading back from the GPU waits.
+
+  /** The row of the label nearest to a pixel, null where there is none close to it. */
+  pick(x: number, y: number): number | null {
+    if (!this.index) return null;
+    const [east, north] = this.toGround(x, y);
+    let best: number | null = null;
+    let bestAway = Infinity;
+    for (const i of this.index.within(east, north, PICK_PX * this.metresPerPixel())) {
+      const row = this.shown[i];
+      const away = Math.hypot(this.labels.position[3 * row] - east, this.labels.position[3 * row + 1] - north);
+      if (away < bestAway) [best, bestAway] = [row, away];
+    }
+    return best;
+  }
+
+  private listen(): void {
+    const at = (event: PointerEvent): [number, number] => {
+      const box = this.parent.getBoundingClientRect();
+      return [event.clientX - box.left, event.clientY - box.top];
+    };
+    this.parent.addEventListener("pointerdown", (event) => {
+      const [x, y] = at(event);
+      this.pressed = event.button === 0 ? { x, y } : null;
+      this.parent.focus({ preventScroll: true });
+    });
+    this.parent.addEventListener("pointerup", (event) => {
+      const [x, y] = at(event);
+      const pressed = this.pressed;
+      this.pressed = null;
+      if (!pressed || Math.hypot(x - pressed.x, y - pressed.y) > 4) return;
+      const row = this.pick(x, y);
+      if (row === null) this.events.onPlace(...this.toGround(x, y));
+      else this.events.onLabel(this.labels.id[row]);
+    });
+    this.parent.addEventListener("pointermove", (event) => {
+      const [x, y] = at(event);
+      const [east, north] = this.toGround(x, y);
+      this.events.onHover(this.pressed ? null : this.pick(x, y), x, y, east, north);
+    });
+    this.parent.addEventListener("pointerleave", () => this.events.onHover(null, 0, 0, NaN, NaN));
+    new ResizeObserver(() => this.draw()).observe(this.parent);
+  }
+}
+
+function bounds(arrays: Float32Array[]) {
+  const box = { left: Infinity, right: -Infinity, bottom: Infinity, top: -Infinity };
+  for (const points of arrays) {
+    for (let i = 0; i < points.length; i += 3) {
+      box.left = Math.min(box.left, points[i]);
+      box.right = Math.max(box.right, points[i]);
+      box.bottom = Math.min(box.bottom, points[i + 1]);
+      box.top = Math.max(box.top, points[i + 1]);
+    }
+  }
+  return box.left <= box.right ? box : { left: -10, right: 10, bottom: -10, top: 10 };
+}
