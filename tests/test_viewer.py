@@ -29,6 +29,7 @@ from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import Map
 from valuemap.tables import Categories, Rejected, write_table
 from valuemap.viewer.columns import pack_columns
+from valuemap.viewer.details import place_details
 from valuemap.viewer.scene import Scene
 from valuemap.viewer.server import PAGE, Basemap, Content, ViewServer
 from viewer_city import HOSTILE, part, street, write_city
@@ -339,12 +340,18 @@ def test_a_label_says_what_it_rests_on(client: Client, city: tuple[Path, Map]) -
 
 def test_an_empty_place_says_what_is_known(client: Client, city: tuple[Path, Map]) -> None:
     head = client.get("/api/map").json()
-    here = np.array([30.0, 25.0]) - head["origin"][:2]
+    labels = city[1].labels
+    beside = labels.position_in_world_m[np.argmax(labels.votes), :2] + [1.5, 0.0]
+    here = beside - head["origin"][:2]
     far = client.get("/api/place?east=5000&north=5000").json()
-    assert "No image pictures this place." in far["answer"]
+    assert "No image pictures this place" in far["answer"]
     details = client.get(f"/api/place?east={here[0]}&north={here[1]}").json()
-    assert "keeps no rejected hypotheses" in details["answer"] or details["kept"]
+    assert "keeps no rejected hypotheses" in details["answer"]
+    assert f"{details['rays']} detections point" in details["answer"]
     assert details["looks"] > 0
+    assert details["rays"] > 0
+    assert details["labels"][0]["away_m"] == 1.5
+    assert "show MAP" not in details["answer"]
     assert details["rays"] == details["free_rays"] + sum(taker["rays"] for taker in details["takers"])
     assert client.ask("/api/place?east=1e30&north=0").status == 400
     assert client.ask("/api/place?north=0").status == 400
@@ -373,13 +380,14 @@ def test_rejected_hypotheses_answer_why_a_place_is_empty(tmp_path: Path) -> None
         assert [each["reason"] for each in details["rejected"]] == ["existence", "votes"]
         assert details["rejected"][0]["existence"] == 0.031
         assert details["rejected"][1]["existence"] is None
-        assert (
-            "A sign with 7 votes from 2 passes was considered 1.0 m from here and rejected: too many images"
-            in (details["answer"])
-        )
+        assert "A hypothesis (sign) 1.00 m away had 7 votes of 2 passes" in details["answer"]
         assert details["position_m"][2] == 4.0
         nowhere = asked.get("/api/place?east=-400&north=-400").json()
-        assert "No hypothesis that was worth keeping" in nowhere["answer"]
+        assert "No rejected hypothesis of this map is near" in nowhere["answer"]
+        alone = Scene(tmp_path / "map")
+        alone.evidence = None
+        told = place_details(alone, east, north)["answer"]
+        assert "A hypothesis (sign) 1.00 m away had 7 votes of 2 passes. It was rejected:" in told
 
 
 def test_decisions_are_saved_at_once(client: Client, city: tuple[Path, Map]) -> None:

@@ -166,7 +166,7 @@ export function renderPlace(panel: HTMLElement, details: PlaceDetails, head: Hea
     details.takers?.length
       ? h("p", {}, "Detections that point here belong to ", ...details.takers.slice(0, 6).flatMap((taker, i) => [i ? ", " : "", labelLink(taker.id), ` (${taker.rays})`]), details.takers.length > 6 ? " and others." : ".")
       : "",
-    details.rejected.length ? h("h3", {}, "Rejected hypotheses ", h("small", {}, "within 5 m")) : "",
+    details.rejected.length ? h("h3", {}, "Rejected hypotheses ", h("small", {}, "within 2 m")) : "",
     details.rejected.length ? h("ul", { class: "hypotheses" }, ...details.rejected.slice(0, 12).map(hypothesis)) : "",
     details.labels.length ? h("h3", {}, "Labels near it") : "",
     details.labels.length ? h("ul", { class: "near" }, ...details.labels.slice(0, 8).map((each) => h("li", {}, labelLink(each.id), ` ${each.class}, ${each.away_m.toFixed(1)} m`))) : "",

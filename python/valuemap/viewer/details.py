@@ -7,32 +7,21 @@ from typing import Any
 import numpy as np
 
 from valuemap.errors import InputError
-from valuemap.evidence import Evidence, Misses, picture_file
-from valuemap.tables import Floats, Ints
+from valuemap.evidence import Evidence, Misses, PassingRays, picture_file
+from valuemap.report.place_sheet import explain_place
+from valuemap.tables import REJECTION_REASONS, Floats, Ints
 from valuemap.viewer.scene import Scene, number
 
-PLACE_RADIUS_M = 5.0
-"""How far around a place its labels and rejected hypotheses are listed."""
-RAY_RADIUS_M = 1.0
-"""A detection whose ray passes a place closer than this points at it."""
+PLACE_RADIUS_M = 2.0
+"""What is at most this far from a place, seen from above, answers why there is nothing."""
+NEAR_LABELS_M = 10.0
+"""How far around a place its labels are listed."""
 
 _CROP_BOXES = 4.0
 """A crop shows this many times the larger side of a box, at least `_CROP_LEAST_PX`."""
 _CROP_LEAST_PX = 48.0
 _MOST_RAYS = 24
 _MOST_LOOKS = 12
-
-REASONS = {
-    "votes": "too few images voted for it (setting min_votes)",
-    "ratio": "it had too few votes compared with the other hypotheses (setting min_vote_ratio)",
-    "outvoted": "its detections belong to a label that explains them better",
-    "existence": "too many images that should have seen it did not (setting min_existence)",
-    "merged": "it is one object with another label",
-    "class": "a label of another class has the place",
-    "parallax": "all its rays come from nearly one direction, which gives no distance (setting min_parallax_deg)",
-    "range": "it is nearer or farther than allowed (settings min_range_m, max_range_m)",
-}
-"""Why a hypothesis became no label, for people."""
 
 
 def label_details(scene: Scene, label_id: int) -> dict[str, Any]:
@@ -78,14 +67,11 @@ def label_details(scene: Scene, label_id: int) -> dict[str, Any]:
 
 
 def place_details(scene: Scene, east_m: float, north_m: float) -> dict[str, Any]:
-    """Return what is known about a place (metres on the page): labels and rejected hypotheses near it, rays past it.
-
-    The height of the place is that of the nearest rejected hypothesis or label, else that of the rays.
-    """
+    """Return what is known about a place (metres on the page): why there is nothing, and the evidence for that."""
     labels, rejected, evidence = scene.result.labels, scene.rejected, scene.evidence
     place = np.array([east_m, north_m])
     label_at = scene.local(labels.position_in_world_m)
-    near_labels, label_m = _nearest(label_at, place)
+    near_labels, label_m = _nearest(label_at, place, NEAR_LABELS_M)
     details: dict[str, Any] = {
         "kept": rejected is not None,
         "rejected": [],
@@ -98,25 +84,25 @@ def place_details(scene: Scene, east_m: float, north_m: float) -> dict[str, Any]
             for row, away in zip(near_labels, label_m, strict=True)
         ],
     }
-    heights = [float(label_at[row, 2]) for row in near_labels[:1]]
+    height = float(label_at[near_labels[0], 2]) if len(near_labels) else 0.0
     if rejected is not None:
         rejected_at = scene.local(rejected.position_in_world_m)
-        rows, away_m = _nearest(rejected_at, place)
-        # The one with the most evidence says the most.
-        order = np.lexsort((away_m, -rejected.votes[rows]))
+        rows, away_m = _nearest(rejected_at, place, PLACE_RADIUS_M)
+        order = np.lexsort((away_m, -rejected.votes[rows]))  # The one with the most evidence says the most.
         details["rejected"] = [_hypothesis(scene, int(rows[i]), float(away_m[i]), rejected_at) for i in order]
-        heights = [float(rejected_at[rows[i], 2]) for i in order[:1]] or heights
+        height = float(rejected_at[rows[order[0]], 2]) if len(order) else height
     if evidence is not None:
         with scene.lock:
-            details |= _seen_at(scene, evidence, place, heights)
-    height = heights[0] if heights else details.get("height_m", 0.0)
+            seen, height = _seen_at(scene, evidence, place)
+        details |= seen
+    else:
+        details["answer"] = _answer_without_dataset(details)
     world = scene.world(np.array([[east_m, north_m, height]]))[0]
-    details |= {
+    return details | {
         "local_m": [number(east_m), number(north_m), number(height)],
         "position_m": [number(c) for c in world],
         "lon_lat_height": scene.lon_lat_height(world),
     }
-    return details | {"answer": _answer(details)}
 
 
 def _voters(scene: Scene, evidence: Evidence, label_id: int) -> list[dict[str, Any]]:
@@ -192,9 +178,9 @@ def _box(center_px: Floats, size_px: Floats) -> list[float | None]:
     return [number(c, 1) for c in (*center_px, *size_px)]
 
 
-def _nearest(local_m: Floats, place: Floats) -> tuple[Ints, Floats]:
+def _nearest(local_m: Floats, place: Floats, radius_m: float) -> tuple[Ints, Floats]:
     away = np.linalg.norm(local_m[:, :2] - place, axis=1)
-    rows = np.flatnonzero(away <= PLACE_RADIUS_M)
+    rows = np.flatnonzero(away <= radius_m)
     rows = rows[np.argsort(away[rows], kind="stable")]
     return rows, away[rows]
 
@@ -214,53 +200,53 @@ def _hypothesis(scene: Scene, row: int, away_m: float, local_m: Floats) -> dict[
         "expected": int(rejected.expected[row]) or None,
         "existence": number(rejected.existence[row]),
         "reason": reason,
-        "why": REASONS.get(reason, reason),
+        "why": REJECTION_REASONS.get(reason, reason),
         "rival": rival if rival >= 0 else None,
     }
 
 
-def _seen_at(scene: Scene, evidence: Evidence, place: Floats, heights: list[float]) -> dict[str, Any]:
-    """Return the rays that pass a place and the images that picture it."""
-    at = scene.world(np.array([[*place, heights[0] if heights else 0.0]]))[0]
-    rays = evidence.rays_past(at, radius_m=RAY_RADIUS_M)
-    points = scene.local(rays.point_in_world_m)
-    if not heights:
-        heights = [float(np.median(points[:, 2]))] if len(points) else [_camera_height(scene, evidence, place)]
-        at = scene.world(np.array([[*place, heights[0]]]))[0]
-    looks = evidence.looks_at(at)
+def _seen_at(scene: Scene, evidence: Evidence, place: Floats) -> tuple[dict[str, Any], float]:
+    """Return why there is nothing at a place, the rays that pass it, the images that picture it, and its height."""
+    centers = scene.local(evidence.center_in_world_m)
+    nearest = int(np.argmin(np.linalg.norm(centers[:, :2] - place, axis=1)))
+    at = scene.world(np.array([[*place, centers[nearest, 2]]]))[0]
+    answer = explain_place(evidence, at, scene.rejected, radius_m=PLACE_RADIUS_M)
+    reasons = " ".join(answer.reasons)
+    for row in answer.labels:  # The page has links instead.
+        reasons = reasons.replace(f" valuemap show MAP {evidence.result.labels.label_id[row]} shows it.", "")
+    rays, looks = answer.passing, answer.looks
     free = rays.label_id < 0
-    detections, classes = evidence.dataset.detections, evidence.dataset.detections.class_name
-    centers = scene.local(evidence.center_in_world_m[rays.image_row])
     shown = np.concatenate([np.flatnonzero(free), np.flatnonzero(~free)])[:_MOST_RAYS]
     takers, counts = np.unique(rays.label_id[~free], return_counts=True)
-    return {
-        "height_m": heights[0],
+    details = {
+        "answer": reasons,
         "looks": len(looks),
         "look_passes": len(np.unique(looks.pass_number)),
         "rays": len(rays),
         "free_rays": int(free.sum()),
-        "free_ray_passes": len(np.unique(rays.pass_number[free])),
         "takers": [
             {"id": int(taker), "rays": int(count)}
             for count, taker in sorted(zip(counts.tolist(), takers.tolist(), strict=True), key=lambda each: -each[0])
         ],
-        "passing": [
-            {
-                **_image(scene, evidence, int(rays.image_row[i]), centers[i]),
-                "box": _box(detections.center_px[rays.detection_row[i]], detections.size_px[rays.detection_row[i]]),
-                "crop": _crop(
-                    detections.center_px[rays.detection_row[i]], _side(detections.size_px[rays.detection_row[i]])
-                ),
-                "projected": None,
-                "class": classes.names[classes.codes[rays.detection_row[i]]],
-                "score": number(detections.score[rays.detection_row[i]], 3),
-                "miss_m": number(rays.miss_m[i], 2),
-                "distance_m": number(rays.distance_m[i], 1),
-                "label": int(rays.label_id[i]) if rays.label_id[i] >= 0 else None,
-            }
-            for i in shown
-        ],
+        "passing": [_passing(scene, evidence, rays, int(i), centers) for i in shown],
         "pictured": _misses(scene, evidence, _some(looks), typical_px=2.0 * _CROP_LEAST_PX),
+    }
+    return details, float(scene.local(answer.point_in_world_m[None])[0, 2])
+
+
+def _passing(scene: Scene, evidence: Evidence, rays: PassingRays, i: int, centers: Floats) -> dict[str, Any]:
+    detections = evidence.dataset.detections
+    row, image_row = int(rays.detection_row[i]), int(rays.image_row[i])
+    return {
+        **_image(scene, evidence, image_row, centers[image_row]),
+        "box": _box(detections.center_px[row], detections.size_px[row]),
+        "crop": _crop(detections.center_px[row], _side(detections.size_px[row])),
+        "projected": None,
+        "class": detections.class_name.names[detections.class_name.codes[row]],
+        "score": number(detections.score[row], 3),
+        "miss_m": number(rays.miss_m[i], 2),
+        "distance_m": number(rays.distance_m[i], 1),
+        "label": int(rays.label_id[i]) if rays.label_id[i] >= 0 else None,
     }
 
 
@@ -270,49 +256,20 @@ def _some(looks: Misses) -> Misses:
     return Misses(**{name: values[rows] for name, values in vars(looks).items()})
 
 
-def _camera_height(scene: Scene, evidence: Evidence, place: Floats) -> float:
-    """Return the height of the nearest camera: where there is nothing else, streets are at least near it."""
-    centers = scene.local(evidence.center_in_world_m)
-    return float(centers[np.argmin(np.linalg.norm(centers[:, :2] - place, axis=1)), 2])
-
-
-def _answer(details: dict[str, Any]) -> str:
-    """Return in a few sentences why there is no label at a place."""
+def _answer_without_dataset(details: dict[str, Any]) -> str:
+    """Return what a map alone can say about a place."""
     sentences = []
     if details["rejected"]:
         best = details["rejected"][0]
         sentences.append(
-            f"A {best['class']} with {_count(best['votes'], 'vote')} from {_count(best['passes'], 'pass', 'passes')} "
-            f"was considered {best['away_m']:.1f} m from here and rejected: {best['why']}."
+            f"A hypothesis ({best['class']}) {best['away_m']:.2f} m away had {_count(best['votes'], 'vote')} of "
+            f"{_count(best['passes'], 'pass', 'passes')}. It was rejected: {best['why']}."
         )
-        if best["rival"] is not None:
-            sentences.append(f"Label {best['rival']} has its detections or its place.")
     elif details["kept"]:
-        sentences.append(f"No hypothesis that was worth keeping is within {PLACE_RADIUS_M:g} m of here.")
+        sentences.append(f"No rejected hypothesis of this map is within {PLACE_RADIUS_M:g} m.")
     else:
-        sentences.append("This map keeps no rejected hypotheses, so only what is around here can be told.")
-    if "looks" in details:
-        if details["looks"] == 0:
-            sentences.append("No image pictures this place.")
-        elif details["rays"] == 0:
-            sentences.append(
-                f"{_count(details['looks'], 'image pictures', 'images picture')} this place, and no detection in any "
-                f"of them points at it."
-            )
-        else:
-            taken = details["rays"] - details["free_rays"]
-            sentences.append(
-                f"{_count(details['looks'], 'image pictures', 'images picture')} this place; "
-                f"{_count(details['rays'], 'detection points', 'detections point')} at it, of which "
-                f"{taken} vote for other labels and {details['free_rays']} for none."
-            )
-            if details["free_rays"] == 1:
-                sentences.append("One free ray gives a direction and no place.")
-            elif details["free_rays"] > 1 and details["free_ray_passes"] == 1:
-                sentences.append("All free ones are of one pass.")
-    if details["labels"]:
-        nearest = details["labels"][0]
-        sentences.append(f"The nearest label is {nearest['id']} ({nearest['class']}), {nearest['away_m']:.1f} m away.")
+        sentences.append("The map keeps no rejected hypotheses.")
+    sentences.append("Without the dataset nobody can tell which images pictured this place.")
     return " ".join(sentences)
 
 

@@ -18,13 +18,12 @@ from valuemap.cameras import rotation_matrices
 from valuemap.dataset import read_dataset
 from valuemap.errors import InputError
 from valuemap.evaluate import Evaluation, evaluate_map
-from valuemap.evidence import PICTURES, Evidence, find_dataset
+from valuemap.evidence import PICTURES, Evidence, find_dataset, read_rejected
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import read_map
-from valuemap.tables import Floats, Rejected, read_table
+from valuemap.tables import Floats
 from valuemap.viewer.columns import pack_columns
 
-REJECTED = "rejected.parquet"
 OUTCOMES = ("", "true", "duplicate", "false", "found", "missed", "not recoverable")
 """What became of labels and true objects, as numbers for the page."""
 
@@ -66,7 +65,7 @@ class Scene:
         self.evidence = self._find_evidence(dataset_folder)
         self.pictures = self._find_pictures(pictures)
         self._truth = truth
-        self.rejected = read_table(Rejected, map_folder / REJECTED) if (map_folder / REJECTED).is_file() else None
+        self.rejected = read_rejected(map_folder)
         self.lock = threading.Lock()
         """Held while something about the evidence is computed, so that nothing is computed twice at once."""
         frame = self.result.frame
