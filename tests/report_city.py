@@ -18,14 +18,14 @@ from valuemap.simulate import simulate
 
 @cache
 def city() -> Evidence:
-    """Return the city: 20 lights, some passes, a map with all its evidence."""
+    """Return the city: 16 lights, some passes, a map with all its evidence."""
     config = SimulationConfig(
-        streets_north_south=3,
+        streets_north_south=2,
         streets_east_west=2,
         signalised_share=1.0,
-        lights=20,
+        lights=16,
         frame_spacing_m=4.0,
-        passes_per_street=4,
+        passes_per_street=3,
     )
     dataset = simulate(config, seed=3)
     return Evidence(build_map(dataset), dataset)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +12,7 @@ from valuemap.evaluate import Evaluation
 from valuemap.evidence import Evidence
 from valuemap.experiment import CURVES, PassesResult
 from valuemap.map_folder import Map
-from valuemap.report.style import BLUE, DPI, FAINT_INK, GREEN, GREY, INK, ORANGE, VERMILION, drawing
+from valuemap.report.style import BLUE, DPI, FAINT_INK, GREEN, GREY, INK, ORANGE, VERMILION, drawing, figure_bytes
 from valuemap.tables import Floats, Ints
 
 if TYPE_CHECKING:
@@ -34,6 +34,13 @@ class ReportFigure:
     title: str
     caption: str
     figure: Figure
+    _drawn: dict[str, bytes] = field(default_factory=dict, repr=False)
+
+    def file(self, suffix: str) -> bytes:
+        """Return the figure as a file, .png or .svg; drawn once."""
+        if suffix not in self._drawn:
+            self._drawn[suffix] = figure_bytes(self.figure, suffix)
+        return self._drawn[suffix]
 
 
 def _figure(panels: int, height_in: float = 3.6, *, width_in: float = _WIDTH_IN) -> tuple[Figure, list[Axes]]:

@@ -24,7 +24,7 @@ from valuemap.report.figures import ReportFigure
 from valuemap.report.ground import ellipses, horizontal_axes, look_down
 from valuemap.report.paper import Cell, ReportTable
 from valuemap.report.run_tables import error_m
-from valuemap.report.style import BLUE, GREY, PURPLE, SKY, YELLOW, figure_bytes
+from valuemap.report.style import BLUE, GREY, PURPLE, SKY, YELLOW
 from valuemap.tables import Floats
 
 _HERE = Path(__file__).parent
@@ -165,7 +165,7 @@ def _table(table: ReportTable) -> str:
 
 def _figure(figure: ReportFigure, *, as_png: bool) -> str:
     if as_png:
-        data = base64.b64encode(figure_bytes(figure.figure, ".png")).decode("ascii")
+        data = base64.b64encode(figure.file(".png")).decode("ascii")
         picture = f'<img alt="{_text(figure.title)}" src="data:image/png;base64,{data}">'
     else:
         picture = _inline_svg(figure)
@@ -177,7 +177,7 @@ def _figure(figure: ReportFigure, *, as_png: bool) -> str:
 
 def _inline_svg(figure: ReportFigure) -> str:
     """Return a figure as an SVG element, with ids that no other figure of the page has."""
-    text = figure_bytes(figure.figure, ".svg").decode("utf-8")
+    text = figure.file(".svg").decode("utf-8")
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     text = re.sub(r'\bid="', f'id="{figure.name}-', text)

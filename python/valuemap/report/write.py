@@ -24,7 +24,7 @@ from valuemap.report.figures import ReportFigure
 from valuemap.report.page import Card, Content, inline_data, page_text
 from valuemap.report.paper import Cell, ReportTable, paper_tables
 from valuemap.report.run_tables import doubtful_rows, error_m, label_table, run_tables, spread_m, worst_rows
-from valuemap.report.style import save_figure
+from valuemap.report.style import FORMATS
 
 FILES_MARKER = "report.json"
 
@@ -149,8 +149,8 @@ def _as_text(cell: Cell) -> Cell:
 
 def _write_files(folder: Path, drawn: Iterable[ReportFigure], tables: Iterable[ReportTable]) -> list[str]:
     for figure in drawn:
-        for suffix in (".png", ".svg"):
-            save_figure(figure.figure, folder / f"{figure.name}{suffix}")
+        for suffix in FORMATS:
+            (folder / f"{figure.name}{suffix}").write_bytes(figure.file(suffix))
     for table in tables:
         write_csv_table(table, folder / f"{table.name}.csv")
     return sorted(path.name for path in folder.iterdir())
