@@ -196,7 +196,7 @@ def test_rejected_hypotheses_are_read_from_the_folder_of_the_map(tmp_path: Path)
 # On the command line.
 
 
-def command(*arguments: str | Path) -> int | str | None:
+def command(*arguments: str | Path | int) -> int | str | None:
     """Run a command in this process; return its status."""
     with pytest.raises(SystemExit) as stopped:
         app(list(map(str, arguments)))
