@@ -16,6 +16,7 @@ from valuemap.readers.mapillary import read_mapillary
 from valuemap.readers.nuscenes import read_nuscenes
 from valuemap.readers.opensfm import read_opensfm
 from valuemap.readers.panoramax import read_panoramax
+from valuemap.readers.ros import read_ros
 from valuemap.readers.tum import read_tum
 
 READERS: dict[str, Callable[..., Dataset]] = {
@@ -30,6 +31,7 @@ READERS: dict[str, Callable[..., Dataset]] = {
     "nuscenes": read_nuscenes,
     "opensfm": read_opensfm,
     "panoramax": read_panoramax,
+    "ros": read_ros,
     "tum": read_tum,
 }
 """What `valuemap import NAME` calls."""

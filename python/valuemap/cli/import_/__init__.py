@@ -16,6 +16,7 @@ READERS = (
     "nuscenes",
     "opensfm",
     "panoramax",
+    "ros",
     "tum",
 )
 """Modules of this package; each adds its command to `import_app` when it is imported."""

@@ -1,0 +1,55 @@
+"""`valuemap import ros`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from valuemap import dataset as dataset_folder
+from valuemap.cli.import_.app import finish_dataset, import_app
+from valuemap.cli.import_.options import Anchor, with_detections
+from valuemap.cli.options import DatasetOut, MaxRejected, Up
+from valuemap.cli.show import progress_bars
+from valuemap.folders import check_place
+from valuemap.readers.detections import DetectionFile
+from valuemap.readers.vet import MAX_REJECTED
+
+
+@import_app.command("ros")
+@with_detections
+def import_ros(
+    bags: Annotated[list[Path], typer.Argument(help="Bags of ROS 1 or 2 that belong together.")],
+    out: DatasetOut,
+    detections: DetectionFile | None,
+    world_frame: Annotated[str | None, typer.Option(help="The fixed frame; default: the top of the tree.")] = None,
+    pose_topic: Annotated[str | None, typer.Option(help="A topic of poses to use beside tf.")] = None,
+    body_frame: Annotated[str | None, typer.Option(help="What these poses are of, such as base_link.")] = None,
+    rectified: Annotated[bool, typer.Option("--rectified", help="Boxes are on rectified pictures.")] = False,
+    box_pixel_center: Annotated[float, typer.Option(help="In boxes of the bags: 0.5 or 0.")] = 0.5,
+    longest_gap: Annotated[float, typer.Option(help="Seconds between poses that are interpolated.")] = 0.2,
+    up: Up = None,
+    anchor: Anchor = None,
+    max_rejected: MaxRejected = MAX_REJECTED,
+) -> None:
+    """Import ROS bags: CameraInfo, tf or poses, and Detection2DArray; without ROS, with the package rosbags."""
+    from valuemap.readers import READERS
+
+    check_place(out, marker=dataset_folder.MARKER)
+    with progress_bars() as progress:
+        dataset = READERS["ros"](
+            bags,
+            detections=detections,
+            world_frame=world_frame,
+            body_frame=body_frame,
+            pose_topic=pose_topic,
+            rectified=rectified,
+            pixel_center=box_pixel_center,
+            longest_gap_s=longest_gap,
+            up=up,
+            anchor=anchor,
+            max_rejected=max_rejected,
+            progress=progress,
+        )
+    finish_dataset(dataset, out)

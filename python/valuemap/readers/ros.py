@@ -1,0 +1,382 @@
+"""ROS bags, of ROS 1 and 2, read without ROS: camera info, poses or tf, and 2D detections of vision_msgs."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from valuemap.dataset import Dataset
+from valuemap.errors import InputError, SettingError
+from valuemap.progress import Progress, silent
+from valuemap.readers.assemble import MAX_REJECTED, FoundBoxes, assemble
+from valuemap.readers.cameras_of import Camera, make_cameras
+from valuemap.readers.detections import DetectionFile, read_detections
+from valuemap.readers.poses import interpolate_poses, make_images, rigs_by_time
+from valuemap.tables import Floats, Images, Ints
+
+_EXPECTED = "a bag of ROS 1 (.bag) or ROS 2 (a folder with metadata.yaml, or .mcap)"
+_NANO = 1e-9
+_CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+_DETECTIONS = "vision_msgs/msg/Detection2DArray"
+_TF = "tf2_msgs/msg/TFMessage"
+_POSES = (
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "nav_msgs/msg/Odometry",
+)
+_LONGEST_CHAIN = 64
+
+# Definitions that ROS 2 bags may leave out: names and types of fields are the interface, as of vision_msgs 4.
+_VISION_MSGS = {
+    "vision_msgs/msg/Point2D": "float64 x\nfloat64 y\n",
+    "vision_msgs/msg/Pose2D": "vision_msgs/Point2D position\nfloat64 theta\n",
+    "vision_msgs/msg/BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y\n",
+    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
+    "vision_msgs/msg/ObjectHypothesisWithPose": (
+        "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n"
+    ),
+    "vision_msgs/msg/Detection2D": (
+        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+        "vision_msgs/BoundingBox2D bbox\nstring id\n"
+    ),
+    "vision_msgs/msg/Detection2DArray": "std_msgs/Header header\nvision_msgs/Detection2D[] detections\n",
+}
+
+
+@dataclass
+class _Edge:
+    """Where a frame is in its parent, at times (ns) or for ever."""
+
+    parent: str
+    is_static: bool
+    time_ns: list[int] = field(default_factory=list)
+    pose: list[tuple[float, ...]] = field(default_factory=list)
+
+    def at(self, time_ns: Ints, longest_ns: int) -> tuple[Floats, Floats]:
+        """Return rotations (N, 3, 3) and translations (N, 3) from the frame into its parent, NaN where not known."""
+        values = np.array(self.pose)
+        rotation = Rotation.from_quat(values[:, 3:]).as_matrix()
+        if self.is_static:
+            return (
+                np.broadcast_to(rotation[-1], (len(time_ns), 3, 3)).copy(),
+                np.broadcast_to(values[-1, :3], (len(time_ns), 3)).copy(),
+            )
+        known, first = np.unique(np.array(self.time_ns, dtype=np.int64), return_index=True)
+        turned, moved, usable = interpolate_poses(time_ns, known, rotation[first], values[first, :3], longest_ns)
+        turned[~usable], moved[~usable] = np.nan, np.nan
+        return turned, moved
+
+
+@dataclass
+class _Bag:
+    """What has been found in the bags."""
+
+    edges: dict[str, _Edge] = field(default_factory=dict)
+    cameras: dict[str, Camera] = field(default_factory=dict)
+    exposures: list[tuple[str, int]] = field(default_factory=list)
+    boxes: dict[tuple[str, int], list[tuple[str, float, float, float, float, float]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )
+
+
+def read_ros(
+    bags: Sequence[Path],
+    *,
+    detections: DetectionFile | Path | None = None,
+    world_frame: str | None = None,
+    body_frame: str | None = None,
+    pose_topic: str | None = None,
+    rectified: bool = False,
+    pixel_center: float = 0.5,
+    longest_gap_s: float = 0.2,
+    up: tuple[float, float, float] | None = None,
+    anchor: tuple[float, float, float] | None = None,
+    max_rejected: float = MAX_REJECTED,
+    progress: Progress = silent,
+) -> Dataset:
+    """Read bags of one drive: `CameraInfo`, `TFMessage` or poses, and `Detection2DArray` messages.
+
+    Every message of detections is an image, named `FRAME/SECONDS.NANOSECONDS.png` by its header; without detections
+    every message of a `CameraInfo`. The pose of its frame is that in the tree of transforms, interpolated in time.
+    Frames are optical ones (x right, y down, z forward), as the convention for `CameraInfo` is.
+
+    Parameters
+    ----------
+    bags
+        Bags that belong together.
+    detections
+        As in `read_detections`, instead of those in the bags.
+    world_frame
+        The fixed frame; by default the top of the tree that the cameras are in.
+    body_frame
+        What the poses of `pose_topic` are of; `Odometry` says it itself.
+    pose_topic
+        A topic of `PoseStamped`, `PoseWithCovarianceStamped` or `Odometry` to use beside the transforms.
+    rectified
+        Boxes are on rectified pictures: the matrix P and no distortion counts.
+    pixel_center
+        Coordinates of the centre of the top-left pixel in the boxes of the bags; in `CameraInfo` it is 0.
+    longest_gap_s
+        Poses this far apart are interpolated.
+    up, anchor, max_rejected
+        As in `assemble`.
+
+    Raises
+    ------
+    InputError
+        A bag is missing or damaged, or lacks what is needed.
+    SettingError
+        There is no such topic or frame, or the package rosbags is not installed.
+    """
+    bag = _Bag()
+    with _open(bags) as reader:
+        _read_messages(reader, bag, pose_topic, body_frame, rectified, progress)
+    if not bag.cameras:
+        raise InputError(f"{bags[0]}: there is no CameraInfo in it", hint="record it beside the pictures")
+    if detections is not None:
+        bag.boxes.clear()
+    images_at = sorted(bag.boxes) or sorted(set(bag.exposures))
+    frame_of = {frame: _camera_frame(frame, bag, bags[0]) for frame in {frame for frame, _ in images_at}}
+    names, rotations, centers, frames, times = [], [], [], [], []
+    for frame in sorted(frame_of):
+        stamps = np.array([stamp for other, stamp in images_at if other == frame], dtype=np.int64)
+        rotation, center = _chain(frame_of[frame], world_frame, bag, stamps, int(longest_gap_s / _NANO), bags[0])
+        rotations.append(rotation)
+        centers.append(center)
+        times.append(stamps)
+        frames += [frame] * len(stamps)
+        names += [_name(frame, stamp) for stamp in stamps.tolist()]
+    stamps = np.concatenate(times)
+    table, camera_id = make_cameras([bag.cameras[frame_of[frame]] for frame in frames], str(bags[0]))
+    passes = [Path(bags[0]).stem] * len(names)
+    images = make_images(
+        names=names,
+        camera_id=camera_id,
+        world_from_cam=np.concatenate(rotations),
+        center_in_world_m=np.concatenate(centers),
+        passes=passes,
+        source=str(bags[0]),
+        timestamp_s=np.asarray(stamps * _NANO, dtype=np.float64),
+        rigs=rigs_by_time(frames, (stamps - stamps.min()) * _NANO, passes),
+    )
+    dataset = assemble(
+        name=Path(bags[0]).stem,
+        cameras=table,
+        images=images,
+        detections=_found_boxes(bag, images, pixel_center)
+        if detections is None
+        else read_detections(detections, images, table),
+        up=up,
+        anchor=anchor,
+        source=str(bags[0]),
+        max_rejected=max_rejected,
+    )
+    progress("reading the bags", 1, 1)
+    return dataset
+
+
+def _name(frame: str, stamp_ns: int) -> str:
+    return f"{frame}/{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}.png"
+
+
+@contextmanager
+def _open(bags: Sequence[Path]) -> Iterator[Any]:
+    """Yield a reader of the bags; whatever it raises on damaged ones is an `InputError`."""
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ModuleNotFoundError as error:
+        raise SettingError("bags need the package rosbags", hint="pip install 'valuemap[ros]'") from error
+    for bag in bags:
+        if not (bag.is_file() or (bag / "metadata.yaml").is_file()):
+            raise InputError(f"{bag}: is no bag", hint=f"expected {_EXPECTED}")
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types: dict[str, Any] = {}
+    for name, text in _VISION_MSGS.items():
+        types |= get_types_from_msg(text, name)
+    store.register(types)
+    try:
+        with AnyReader(list(bags), default_typestore=store) as reader:
+            yield reader
+    except (InputError, SettingError, KeyboardInterrupt):
+        raise
+    except Exception as error:  # Its parsers raise many types on damaged files.
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(
+            f"{bags[0]}: cannot be read as a bag: {reason}", hint=f"expected {_EXPECTED}, whole"
+        ) from error
+
+
+def _read_messages(
+    reader: Any, bag: _Bag, pose_topic: str | None, body_frame: str | None, rectified: bool, progress: Progress
+) -> None:
+    topics = {connection.topic: connection.msgtype for connection in reader.connections}
+    if pose_topic is not None and topics.get(pose_topic) not in _POSES:
+        known = sorted(topic for topic, kind in topics.items() if kind in _POSES)
+        raise SettingError(
+            f"pose-topic {pose_topic}: no topic of poses", hint=f"there are {', '.join(known) or 'none'}: leave it away"
+        )
+    handlers: dict[str, Callable[[Any], None]] = {
+        _CAMERA_INFO: lambda message: _add_camera(message, bag, rectified),
+        _DETECTIONS: lambda message: _add_boxes(message, bag),
+    }
+    wanted = [
+        connection
+        for connection in reader.connections
+        if connection.msgtype in (*handlers, _TF) or connection.topic == pose_topic
+    ]
+    total = sum(connection.msgcount for connection in wanted)
+    for number, (connection, _, data) in enumerate(reader.messages(connections=wanted)):
+        if number % 1000 == 0:
+            progress("reading the bags", number, total)
+        message = reader.deserialize(data, connection.msgtype)
+        if connection.msgtype == _TF:
+            for transform in message.transforms:
+                _add_transform(transform, bag, is_static=connection.topic.rstrip("/").endswith("tf_static"))
+        elif connection.topic == pose_topic:
+            _add_pose(message, bag, body_frame, str(pose_topic))
+        else:
+            handlers[connection.msgtype](message)
+
+
+def _stamp_ns(header: Any) -> int:
+    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def _frame(name: str) -> str:
+    return name.strip("/")
+
+
+def _add_transform(transform: Any, bag: _Bag, *, is_static: bool) -> None:
+    child = _frame(transform.child_frame_id)
+    place, turn = transform.transform.translation, transform.transform.rotation
+    edge = bag.edges.setdefault(child, _Edge(_frame(transform.header.frame_id), is_static))
+    edge.time_ns.append(_stamp_ns(transform.header))
+    edge.pose.append((place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
+
+
+def _add_pose(message: Any, bag: _Bag, body_frame: str | None, topic: str) -> None:
+    pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
+    child = _frame(body_frame or getattr(message, "child_frame_id", "") or "")
+    if not child:
+        raise SettingError(
+            f"pose-topic {topic}: does not say what its poses are of", hint="give --body-frame base_link"
+        )
+    edge = bag.edges.get(child)
+    if edge is None or edge.parent != _frame(message.header.frame_id) or edge.is_static:
+        edge = bag.edges[child] = _Edge(_frame(message.header.frame_id), is_static=False)
+    place, turn = pose.position, pose.orientation
+    edge.time_ns.append(_stamp_ns(message.header))
+    edge.pose.append((place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
+
+
+def _add_camera(message: Any, bag: _Bag, rectified: bool) -> None:
+    """Take the intrinsics of a frame; ROS 1 names its fields in capitals."""
+    frame = _frame(message.header.frame_id)
+    bag.exposures.append((frame, _stamp_ns(message.header)))
+    if frame in bag.cameras:
+        return
+    k, d, r, p = (
+        np.asarray(getattr(message, name, getattr(message, name.upper(), ())), dtype=np.float64) for name in "kdrp"
+    )
+    if len(k) != 9 or len(p) != 12 or not np.isfinite([*k, *d, *p]).all():
+        raise InputError(
+            f"CameraInfo of {frame}: expected 9 and 12 finite numbers in K and P", hint="is it calibrated?"
+        )
+    if rectified and not np.allclose(r.reshape(3, 3), np.eye(3), atol=1e-9):
+        raise InputError(
+            f"CameraInfo of {frame}: its rectification turns the camera, and tf is about the raw one",
+            hint="import boxes on the raw pictures",
+        )
+    matrix = p.reshape(3, 4) if rectified else k.reshape(3, 3)
+    pinhole = (matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5)
+    model, distortion = ("PINHOLE", ()) if rectified else _distortion(message.distortion_model, d, frame)
+    params = tuple(float(value) for value in (*pinhole, *distortion))
+    bag.cameras[frame] = Camera(model, int(message.width), int(message.height), params)
+
+
+def _distortion(model: str, d: Floats, frame: str) -> tuple[str, tuple[float, ...]]:
+    """Return COLMAP's model and its parameters after the pinhole's, of OpenCV's k1, k2, p1, p2, k3 .. k6."""
+    if not d.any():
+        return "PINHOLE", ()
+    if model in ("plumb_bob", "rational_polynomial") and len(d) in (4, 5, 8):
+        k1, k2, p1, p2, k3, k4, k5, k6 = (*d.tolist(), *[0.0] * 4)[:8]
+        return "FULL_OPENCV", (k1, k2, p1, p2, k3, k4, k5, k6)
+    if model in ("equidistant", "fisheye") and len(d) == 4:
+        return "OPENCV_FISHEYE", tuple(d.tolist())
+    raise InputError(
+        f"CameraInfo of {frame}: distortion_model {model!r} with {len(d)} parameters is not known",
+        hint="expected plumb_bob, rational_polynomial or equidistant; or boxes on rectified pictures (--rectified)",
+    )
+
+
+def _add_boxes(message: Any, bag: _Bag) -> None:
+    key = (_frame(message.header.frame_id), _stamp_ns(message.header))
+    found = bag.boxes[key]
+    for detection in message.detections:
+        center = getattr(detection.bbox.center, "position", detection.bbox.center)
+        hypotheses = [getattr(result, "hypothesis", result) for result in detection.results]
+        best = max(hypotheses, key=lambda hypothesis: hypothesis.score, default=None)
+        class_name = "" if best is None else str(getattr(best, "class_id", getattr(best, "id", "")))
+        score = 1.0 if best is None else float(best.score)
+        found.append((class_name, center.x, center.y, detection.bbox.size_x, detection.bbox.size_y, score))
+
+
+def _camera_frame(frame: str, bag: _Bag, source: Path) -> str:
+    """Return the frame of the camera that boxes of a frame are of."""
+    if frame in bag.cameras:
+        return frame
+    if len(bag.cameras) == 1:
+        return next(iter(bag.cameras))
+    raise InputError(
+        f"{source}: detections of frame {frame!r}, but CameraInfo of {', '.join(sorted(bag.cameras))}",
+        hint="detections must have the frame of their camera in the header",
+    )
+
+
+def _chain(
+    frame: str, world_frame: str | None, bag: _Bag, stamps: Ints, longest_ns: int, source: Path
+) -> tuple[Floats, Floats]:
+    """Return rotations (N, 3, 3) from a frame into the world and its origins there (N, 3), NaN where not known."""
+    rotation = np.broadcast_to(np.eye(3), (len(stamps), 3, 3))
+    center = np.zeros((len(stamps), 3))
+    world, above = None if world_frame is None else _frame(world_frame), frame
+    for _ in range(_LONGEST_CHAIN):
+        if above == world or (world is None and above not in bag.edges):
+            break
+        if above not in bag.edges:
+            raise SettingError(f"world-frame {world}: the camera {frame} is not below it", hint=f"it is below {above}")
+        turned, moved = bag.edges[above].at(stamps, longest_ns)
+        rotation, center = turned @ rotation, np.einsum("nij,nj->ni", turned, center) + moved
+        above = bag.edges[above].parent
+    else:
+        raise InputError(f"{source}: the transforms above {frame} go in a circle", hint="repair the tree of frames")
+    if above == frame:
+        raise InputError(
+            f"{source}: there is no transform of the camera's frame {frame!r}",
+            hint="record /tf and /tf_static, or give --pose-topic",
+        )
+    return rotation, center
+
+
+def _found_boxes(bag: _Bag, images: Images, pixel_center: float) -> FoundBoxes:
+    rows = [(_name(*key), number, box) for key, boxes in sorted(bag.boxes.items()) for number, box in enumerate(boxes)]
+    if not rows:
+        return FoundBoxes.none()
+    row_of = {name: row for row, name in enumerate(images.name.to_pylist())}
+    values = np.array([box[1:] for _, _, box in rows], dtype=np.float64)
+    return FoundBoxes(
+        image_row=np.array([row_of[name] for name, _, _ in rows], dtype=np.int64),
+        class_names=[box[0] for _, _, box in rows],
+        center_px=values[:, :2] + 0.5 - pixel_center,
+        size_px=values[:, 2:4],
+        score=values[:, 4],
+        where=lambda row: f"{rows[row][0]}: detections[{rows[row][1]}]",
+    )

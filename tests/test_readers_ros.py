@@ -1,0 +1,201 @@
+"""ROS bags, written here message by message: a car with a camera in front, whose poses are in tf or in odometry."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from reading import meeting_point, refusal, write
+from valuemap.cameras import camera_centers
+from valuemap.readers.ros import read_ros
+
+pytest.importorskip("rosbags", reason="the package rosbags is not installed: pip install 'valuemap[ros]'")
+
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+OBJECT = np.array([30.0, 4.0, 3.0])
+STAMPS_NS = [10**18 + i * 500_000_000 for i in range(4)]
+# The car drives along x and turns; the optical frame looks along the car's x.
+CAR_FROM_CAM = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+CAMERA_IN_CAR = np.array([1.5, 0.2, 1.4])
+CARS = [(np.array([3.0 * i, 0.3 * i, 0.0]), Rotation.from_euler("z", 0.04 * i)) for i in range(4)]
+FX, FY, CX, CY = 500.0, 505.0, 319.5, 239.5
+
+
+def typestore() -> Any:
+    """The messages of vision_msgs as its package defines them, comments left away."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    definitions = {
+        "Point2D": "float64 x\nfloat64 y",
+        "Pose2D": "vision_msgs/Point2D position\nfloat64 theta",
+        "BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y",
+        "ObjectHypothesis": "string class_id\nfloat64 score",
+        "ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose",
+        "Detection2D": "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+        "vision_msgs/BoundingBox2D bbox\nstring id",
+        "Detection2DArray": "std_msgs/Header header\nvision_msgs/Detection2D[] detections",
+    }
+    for name, text in definitions.items():
+        store.register(get_types_from_msg(text + "\n", f"vision_msgs/msg/{name}"))
+    return store
+
+
+class Bag:
+    """Writes messages of one bag."""
+
+    def __init__(self, path: Path) -> None:
+        self.store = typestore()
+        self.writer = Writer(path, version=9)
+        self.writer.open()
+        self.connections: dict[str, Any] = {}
+
+    def make(self, name: str, *values: Any) -> Any:
+        return self.store.types[name](*values)
+
+    def header(self, frame: str, stamp_ns: int) -> Any:
+        stamp = self.make("builtin_interfaces/msg/Time", stamp_ns // 10**9, stamp_ns % 10**9)
+        return self.make("std_msgs/msg/Header", stamp, frame)
+
+    def pose_parts(self, place: Any, turn: Rotation, vector: str) -> tuple[Any, Any]:
+        x, y, z, w = map(float, turn.as_quat())
+        return self.make(f"geometry_msgs/msg/{vector}", *map(float, place)), self.make(
+            "geometry_msgs/msg/Quaternion", x, y, z, w
+        )
+
+    def transform(self, parent: str, child: str, stamp_ns: int, place: Any, turn: Rotation) -> Any:
+        parts = self.pose_parts(place, turn, "Vector3")
+        transform = self.make("geometry_msgs/msg/Transform", *parts)
+        stamped = self.make("geometry_msgs/msg/TransformStamped", self.header(parent, stamp_ns), child, transform)
+        return self.make("tf2_msgs/msg/TFMessage", [stamped])
+
+    def write(self, topic: str, message: Any, stamp_ns: int) -> None:
+        kind = message.__msgtype__
+        if topic not in self.connections:
+            self.connections[topic] = self.writer.add_connection(topic, kind, typestore=self.store)
+        self.writer.write(self.connections[topic], stamp_ns, self.store.serialize_cdr(message, kind))
+
+
+def camera_info(bag: Bag, stamp_ns: int, model: str = "plumb_bob", d: tuple[float, ...] = (0.0,) * 5) -> Any:
+    k = np.array([FX, 0, CX, 0, FY, CY, 0, 0, 1], np.float64)
+    p = np.array([400.0, 0, 300, 0, 0, 400, 200, 0, 0, 0, 1, 0])
+    roi = bag.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+    parts = (np.array(d, np.float64), k, np.eye(3).ravel(), p, 0, 0, roi)
+    return bag.make("sensor_msgs/msg/CameraInfo", bag.header("cam_optical", stamp_ns), 480, 640, model, *parts)
+
+
+def detections(bag: Bag, stamp_ns: int, center_px: Any) -> Any:
+    x, y = map(float, center_px)
+    point = bag.make("vision_msgs/msg/Point2D", x, y)
+    box = bag.make("vision_msgs/msg/BoundingBox2D", bag.make("vision_msgs/msg/Pose2D", point, 0.0), 12.0, 20.0)
+    pose = bag.make(
+        "geometry_msgs/msg/PoseWithCovariance",
+        bag.make("geometry_msgs/msg/Pose", *bag.pose_parts((0, 0, 0), Rotation.identity(), "Point")),
+        np.zeros(36),
+    )
+    results = [
+        bag.make("vision_msgs/msg/ObjectHypothesisWithPose", bag.make("vision_msgs/msg/ObjectHypothesis", *each), pose)
+        for each in (("sign", 0.2), ("light", 0.7))
+    ]
+    header = bag.header("cam_optical", stamp_ns)
+    found = bag.make("vision_msgs/msg/Detection2D", header, results, box, "")
+    return bag.make("vision_msgs/msg/Detection2DArray", header, [found])
+
+
+def write_bag(path: Path, *, poses: str = "tf", model: str = "plumb_bob", d: tuple[float, ...] = (0.0,) * 5) -> Path:
+    """Images between the poses, which are every half second: on a straight way at constant turn these are exact."""
+    bag = Bag(path)
+    optical = Rotation.from_matrix(CAR_FROM_CAM)
+    bag.write("/tf_static", bag.transform("base_link", "cam_optical", 0, CAMERA_IN_CAR, optical), STAMPS_NS[0])
+    for stamp, (place, turn) in zip(STAMPS_NS, CARS, strict=True):
+        if poses == "tf":
+            bag.write("/tf", bag.transform("map", "base_link", stamp, place, turn), stamp)
+        else:
+            zero = bag.make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+            twist = bag.make(
+                "geometry_msgs/msg/TwistWithCovariance", bag.make("geometry_msgs/msg/Twist", zero, zero), np.zeros(36)
+            )
+            pose = bag.make("geometry_msgs/msg/Pose", *bag.pose_parts(place, turn, "Point"))
+            posed = bag.make("geometry_msgs/msg/PoseWithCovariance", pose, np.zeros(36))
+            odometry = bag.make("nav_msgs/msg/Odometry", bag.header("odom", stamp), "base_link", posed, twist)
+            bag.write("/odometry", odometry, stamp)
+    for number in (0, 1, 2):
+        stamp = STAMPS_NS[number] + 100_000_000  # A fifth of the way to the next pose.
+        place = 0.8 * CARS[number][0] + 0.2 * CARS[number + 1][0]
+        turn = Rotation.from_euler("z", 0.04 * (number + 0.2))
+        in_car = turn.inv().apply(OBJECT - place)
+        x, y, z = CAR_FROM_CAM.T @ (in_car - CAMERA_IN_CAR)
+        bag.write("/camera_info", camera_info(bag, stamp, model, d), stamp)
+        # Pixels of CameraInfo count from the middle of the top-left one, boxes from the picture's corner.
+        bag.write("/detections", detections(bag, stamp, (FX * x / z + CX + 0.5, FY * y / z + CY + 0.5)), stamp)
+    bag.writer.close()
+    return path
+
+
+@pytest.mark.parametrize("poses", ["tf", "odometry"])
+def test_boxes_of_a_bag_meet_where_the_object_is(tmp_path: Path, poses: str) -> None:
+    options = {"pose_topic": "/odometry"} if poses == "odometry" else {}
+    dataset = read_ros([write_bag(tmp_path / "bag", poses=poses)], longest_gap_s=1.0, **options)  # type: ignore[arg-type]
+    assert_allclose(meeting_point(dataset), OBJECT, atol=1e-6)
+    assert dataset.detections.class_name.texts() == ["light"] * 3
+    assert_allclose(dataset.detections.score, 0.7)
+    assert_allclose(dataset.detections.size_px, [[12.0, 20.0]] * 3)
+    assert dataset.images.name.to_pylist()[0] == "cam_optical/1000000000.100000000.png"
+    assert dataset.images.timestamp_s is not None
+    assert_allclose(dataset.images.timestamp_s - 1e9, [0.1, 0.6, 1.1], atol=1e-6)
+    first = 0.2 * CARS[1][0] + Rotation.from_euler("z", 0.008).apply(CAMERA_IN_CAR)
+    assert_allclose(camera_centers(dataset.images)[0], first, atol=1e-9)
+
+
+def test_images_in_gaps_of_the_poses_have_none(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag")
+    assert "a number of its pose is missing" in refusal(lambda: read_ros([path], longest_gap_s=0.3))
+
+
+def test_the_distortion_of_a_bag_is_opencvs(tmp_path: Path) -> None:
+    plumb = write_bag(tmp_path / "plumb", d=(-0.2, 0.05, 0.001, -0.002, 0.003))
+    camera = read_ros([plumb], longest_gap_s=1.0).cameras
+    assert camera.model.texts() == ["FULL_OPENCV"]
+    assert camera.params[0].tolist() == [FX, FY, CX + 0.5, CY + 0.5, -0.2, 0.05, 0.001, -0.002, 0.003, 0, 0, 0]
+    fisheye = write_bag(tmp_path / "fisheye", model="equidistant", d=(0.1, 0.2, 0.3, 0.4))
+    assert read_ros([fisheye], longest_gap_s=1.0).cameras.model.texts() == ["OPENCV_FISHEYE"]
+    rectified = read_ros([plumb], longest_gap_s=1.0, rectified=True).cameras
+    assert rectified.params[0].tolist() == [400, 400, 300.5, 200.5]
+    other = write_bag(tmp_path / "other", model="kannala", d=(0.1, 0.2))
+    assert "distortion_model 'kannala' with 2 parameters is not known" in refusal(lambda: read_ros([other]))
+
+
+def test_frames_and_topics_that_are_not_there(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag")
+    assert "is not below it" in refusal(lambda: read_ros([path], world_frame="moon"))
+    assert "no topic of poses" in refusal(lambda: read_ros([path], pose_topic="/odometry"))
+    bag = Bag(tmp_path / "empty")
+    bag.write("/tf", bag.transform("map", "base_link", 5, (0, 0, 0), Rotation.identity()), 5)
+    bag.writer.close()
+    assert "there is no CameraInfo in it" in refusal(lambda: read_ros([tmp_path / "empty"]))
+    bag = Bag(tmp_path / "circle")
+    for parent, child in (("a", "cam_optical"), ("cam_optical", "a")):
+        bag.write("/tf_static", bag.transform(parent, child, 5, (0, 0, 0), Rotation.identity()), 5)
+    bag.write("/camera_info", camera_info(bag, 5), 5)
+    bag.writer.close()
+    assert "go in a circle" in refusal(lambda: read_ros([tmp_path / "circle"]))
+
+
+def test_files_that_are_no_bags(tmp_path: Path) -> None:
+    assert "is no bag" in refusal(lambda: read_ros([tmp_path / "absent.bag"]))
+    assert "cannot be read as a bag" in refusal(lambda: read_ros([write(tmp_path / "x.bag", "hello")]))
+    assert "cannot be read as a bag" in refusal(lambda: read_ros([write(tmp_path / "y.mcap", "hello")]))
+    path = write_bag(tmp_path / "bag")
+    database = next(path.glob("*.db3"))
+    whole = database.read_bytes()
+    database.write_bytes(whole[: len(whole) // 2])
+    assert "cannot be read as a bag" in refusal(lambda: read_ros([path]))
+    database.write_bytes(b"")
+    assert "cannot be read as a bag" in refusal(lambda: read_ros([path]))
+    (path / "metadata.yaml").write_text("{")
+    assert "cannot be read as a bag" in refusal(lambda: read_ros([path]))
