@@ -36,6 +36,17 @@ def city(passes: int, **changes: float) -> SimulationConfig:
     return dataclasses.replace(SimulationConfig(), **{**settings, **changes})  # type: ignore[arg-type]
 
 
+def seeds_from(texts: Sequence[str]) -> list[int]:
+    """Return the seeds that a command line asks for: numbers, and ranges such as 100..109 with both ends."""
+    seeds: list[int] = []
+    for text in texts:
+        first, dots, last = text.partition("..")
+        if not (first.isdecimal() and (last.isdecimal() or not dots)):
+            raise SystemExit(f"--seeds {text}: expected a whole number or a range such as 100..109")
+        seeds += range(int(first), int(last or first) + 1)
+    return seeds
+
+
 @dataclass(frozen=True, eq=False)
 class Case:
     """A recorded city; for each of its objects the Cramer-Rao bound (N, 3, 3) in m² and how many images detected it."""

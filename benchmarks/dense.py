@@ -30,7 +30,7 @@ from scipy.optimize import linear_sum_assignment
 
 import valuemap
 from bound import cramer_rao_covariances, true_views
-from cities import city, ratio
+from cities import city, ratio, seeds_from
 from machine import write_record
 from more_data import part_of
 from valuemap.config import SimulationConfig
@@ -80,9 +80,9 @@ def along_streets(passes: int = 6, **changes: float) -> SimulationConfig:
 
 
 def with_lights(passes: int = 6, **changes: float) -> Scene:
-    """Return the city of `robust.py` with a fault; for quick looks a part of it, driven half as often."""
+    """Return the city of `robust.py` with a fault; for quick looks a part of it, driven less often."""
     small = {"streets_north_south": 2, "streets_east_west": 2}
-    return Scene(city(passes, **changes), small_city=city(max(passes // 2, 3), **{**small, **changes}))
+    return Scene(city(passes, **changes), small_city=city(min(max(passes // 2, 3), 5), **{**small, **changes}))
 
 
 GPS: dict[str, Any] = {
@@ -112,7 +112,7 @@ SCENES: dict[str, Scene] = {
     "trees-10": Scene(along_streets(tree_spacing_m=10.0, max_sight_m=60.0), 40.0),
     "trees-6": Scene(along_streets(tree_spacing_m=6.0, max_sight_m=60.0), 25.0),
     "posts-3": Scene(along_streets(3, post_spacing_m=3.0, max_sight_m=60.0), 16.0),
-    "clutter1": with_lights(10, clutter_per_image=1.0),
+    "clutter1": with_lights(20, clutter_per_image=1.0),
     "poor": dataclasses.replace(with_lights(5, recall_mean=0.3, clutter_per_image=0.5), min_detections=8),
     "doubles-8": with_lights(double_share=0.08),
     "doubles-all": with_lights(double_share=1.0),
@@ -134,7 +134,7 @@ def main() -> None:
     """Run the benchmark and print a line for each scene."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=SCENES, default=list(SCENES), metavar="SCENE")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--seeds", nargs="+", default=["0..4"], metavar="N|FIRST..LAST")
     parser.add_argument("--small", action="store_true", help="a small part of each scene")
     parser.add_argument(
         "--radius", type=float, help="radius in m of the part of a dense scene, instead of that of --small"
@@ -153,7 +153,7 @@ def main() -> None:
         scene, outcomes = SCENES[name], []
         if options.small and options.radius and scene.small_radius_m:
             scene = dataclasses.replace(scene, small_radius_m=options.radius)
-        for seed in options.seeds:
+        for seed in seeds_from(options.seeds):
             recording = record_scene(scene, seed, is_small=options.small)
             if options.save is not None:
                 write_dataset(recording.dataset, options.save / f"{name}-{seed}")

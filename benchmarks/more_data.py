@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 import valuemap
-from cities import city
+from cities import city, seeds_from
 from machine import write_record
 from valuemap.cameras import cast_rays
 from valuemap.dataset import Dataset, rows_of
@@ -54,11 +54,11 @@ class Mapped:
 def main() -> None:
     """Run the benchmark and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--seeds", nargs="+", default=["0..4"], metavar="N|FIRST..LAST")
     parser.add_argument("--tours", type=int, nargs="+", default=[1, 2, 4, 8, 16])
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     options = parser.parse_args()
-    districts = [_measure_district(seed, options.tours) for seed in options.seeds]
+    districts = [_measure_district(seed, options.tours) for seed in seeds_from(options.seeds)]
     results = [{"tours": tours, **_figures(sums)} for tours, *sums in zip(options.tours, *districts, strict=True)]
     for name in results[0]:
         print(f"{name:28}" + "".join(f"{row[name]:>9}" for row in results))

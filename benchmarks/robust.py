@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import valuemap
-from cities import Case, Outcome, add_up, city, line, measure, prepare
+from cities import Case, Outcome, add_up, city, line, measure, prepare, seeds_from
 from machine import write_record
 
 ALPHAS = (1.0, 1.5, 1.75, 2.0, 2.5)
@@ -29,13 +29,13 @@ def main() -> None:
     """Run the benchmark and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--method", choices=["robust", "paper"], default="robust")
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(10)))
+    parser.add_argument("--seeds", nargs="+", default=["0..9"], metavar="N|FIRST..LAST")
     parser.add_argument("--passes", type=int, nargs="+", default=[2, 6, 20])
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     options = parser.parse_args()
     results: list[dict[str, Any]] = []
     for passes in options.passes:
-        cases = [prepare(city(passes), seed) for seed in options.seeds]
+        cases = [prepare(city(passes), seed) for seed in seeds_from(options.seeds)]
         name, told = f"{passes} passes", {}
         if options.method == "paper":
             alpha, f1_of_alpha, outcomes = _at_best_alpha(cases)

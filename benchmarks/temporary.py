@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import valuemap
-from cities import PASSING_KINDS, add_up, city, line, measure, prepare
+from cities import PASSING_KINDS, add_up, city, line, measure, prepare, seeds_from
 from machine import write_record
 
 RATES = {"temporary_per_1000_images": 3.0, "reflections_per_1000_images": 3.0}
@@ -21,13 +21,13 @@ RATES = {"temporary_per_1000_images": 3.0, "reflections_per_1000_images": 3.0}
 def main() -> None:
     """Run the benchmark and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--seeds", nargs="+", default=["0..4"], metavar="N|FIRST..LAST")
     parser.add_argument("--passes", type=int, nargs="+", default=[2, 6])
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     options = parser.parse_args()
     results: list[dict[str, Any]] = []
     for passes in options.passes:
-        cases = [prepare(city(passes, **RATES), seed) for seed in options.seeds]
+        cases = [prepare(city(passes, **RATES), seed) for seed in seeds_from(options.seeds)]
         figures = add_up([measure(case, valuemap.MapConfig()) for case in cases])
         results.append({"passes": passes, **figures})
         print(line(f"{passes} passes", figures))

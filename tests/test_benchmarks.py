@@ -12,8 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import dense
+import fleets
 from bound import Views, cramer_rao_covariances, residual_covariance, true_views
-from cities import PASSING_KINDS, passing_things, reliability
+from cities import PASSING_KINDS, passing_things, reliability, seeds_from
 from literal import Pinhole, Sighting
 from more_data import part_of, reprojection_errors_px, tour_of_images
 from scenes import Scene, as_dataset
@@ -210,6 +211,37 @@ def test_reprojection_errors_are_those_of_the_pinhole() -> None:
     np.testing.assert_allclose(errors_px, [5.0, 5.0])
 
 
+# Fleets.
+
+
+def test_a_shift_of_the_whole_map_costs_nothing_between_neighbours() -> None:
+    place = np.array([[0.0, 0.0, 0.0], [30.0, 0.0, 0.0], [0.0, 40.0, 0.0], [200.0, 0.0, 0.0]])
+
+    def outcome(error_m: Floats) -> fleets.Outcome:
+        found = int(np.isfinite(error_m[:, 0]).sum())
+        return fleets.Outcome(4, found, found, place, error_m, 100, 1.0)
+
+    random = np.random.default_rng(0).standard_normal((4, 3))
+    shifted = fleets.add_up([outcome(random + [3.0, 0.0, 0.0])], [outcome(random)])
+    assert shifted["ratio_to_clean"] == 1.0
+    assert shifted["recall"] == shifted["precision"] == 1.0
+    assert shifted["position_rmse_m"] > 2.0
+    doubled = fleets.add_up([outcome(2.0 * random)], [outcome(random)])
+    assert doubled["ratio_to_clean"] == 2.0
+    # Pairs of (0, 1), (0, 2) and (1, 2) are near; without object 1 only (0, 2).
+    missed = np.array(random)
+    missed[1] = np.nan
+    assert len(fleets.squared_errors_between(outcome(random), outcome(random))) == 3
+    between = fleets.squared_errors_between(outcome(random), outcome(missed))
+    np.testing.assert_allclose(between, [np.sum((random[0] - random[2]) ** 2)])
+
+
+def test_seeds_are_numbers_and_ranges() -> None:
+    assert seeds_from(["3", "100..102"]) == [3, 100, 101, 102]
+    with pytest.raises(SystemExit, match="expected a whole number"):
+        seeds_from(["a..b"])
+
+
 # The scripts run.
 
 
@@ -219,6 +251,7 @@ def test_reprojection_errors_are_those_of_the_pinhole() -> None:
         ("robust", "--seeds 0 --passes 1", 1),
         ("robust", "--seeds 0 --passes 1 --method paper", 1),
         ("more_data", "--seeds 0 --tours 1 2", 2),
+        ("fleets", "--seeds 1 --small --only clean", 1),
         ("dense", "--seeds 0 --small --only lamps-25", 1),
         ("ablation", "--seeds 0 --passes 1 --without nothing", 1),
     ],
