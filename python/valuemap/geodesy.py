@@ -67,6 +67,26 @@ def lon_lat_height_from_crs(position: Floats, crs: str) -> Floats:
     return found
 
 
+def crs_from_lon_lat_height(lon_lat_height: Floats, crs: str) -> Floats:
+    """Return coordinates in a reference system: easting (or longitude), northing (or latitude) and height (N, 3).
+
+    Raises
+    ------
+    SettingError
+        There is no such system, or PROJ lacks the grid that it needs.
+    InputError
+        A place is outside where the system is defined.
+    """
+    found = np.stack(_to_wgs84(crs).transform(*lon_lat_height.T, direction="INVERSE"), axis=1)
+    if not np.all(np.isfinite(found)):
+        row = int(np.flatnonzero(~np.isfinite(found).all(axis=1))[0])
+        raise InputError(
+            f"crs {crs}: longitude, latitude, height {lon_lat_height[row].tolist()} has no place in it",
+            hint="choose a system that is made for this part of the Earth",
+        )
+    return found
+
+
 def true_axes_of_crs(position: Floats, crs: str) -> Floats:
     """Return rotations (N, 3, 3) from the axes of a map's grid into east, north, up at coordinates (N, 3) in it.
 

@@ -9,20 +9,31 @@ import typer
 
 from valuemap.cli.app import app
 from valuemap.cli.show import log, show_notes
-from valuemap.dataset import read_dataset
+from valuemap.dataset import Dataset, read_dataset
 from valuemap.errors import InputError
 from valuemap.evidence import find_dataset
 from valuemap.map_folder import REVIEW, Map, read_map
 from valuemap.review import apply_review, read_review
-from valuemap.writers import WRITERS, export_map
+from valuemap.writers import FOLDER_WRITERS, SUFFIXES, WRITERS, export_map
 
 _SHOWN_IDS = 10
 
 
-@app.command("export", help=f"Write the labels of a map as one file: {', '.join(WRITERS)}.")
+@app.command(
+    "export", help=f"Write the labels of a map as one file ({', '.join(SUFFIXES)}) or into PostGIS (postgresql://...)."
+)
 def export_command(
     map_: Annotated[Path, typer.Argument(metavar="MAP", help="Folder that valuemap map wrote.")],
-    file: Annotated[Path, typer.Argument(help="File to write; its suffix says the format.")],
+    target: Annotated[
+        str, typer.Argument(metavar="FILE|URL", help="File to write, whose suffix says the format, or a database.")
+    ],
+    format_name: Annotated[
+        str | None,
+        typer.Option("--format", help=f"The format, whatever the suffix: {', '.join([*WRITERS, *FOLDER_WRITERS])}."),
+    ] = None,
+    crs: Annotated[
+        str | None, typer.Option(help="Reference system to write in, such as EPSG:25832; default: WGS84.")
+    ] = None,
     reviewed: Annotated[
         bool, typer.Option("--reviewed", help="Without rejected labels, with corrections, as decided in valuemap view.")
     ] = False,
@@ -30,25 +41,33 @@ def export_command(
         Path | None, typer.Option(help="File of the decisions for --reviewed; default: review.json in the map.")
     ] = None,
     dataset: Annotated[
-        Path | None, typer.Option(help="The dataset of the map, for --reviewed; default: found by itself, or not used.")
+        Path | None,
+        typer.Option(help="The dataset of the map, for pictures, cameras and --reviewed; default: found by itself."),
     ] = None,
 ) -> None:
-    """Write the labels of a map as one file."""
+    """Write the labels of a map as one file or into a database."""
     result = read_map(map_)
+    known = _dataset(map_, result, dataset)
     if reviewed or review is not None:
-        result = _reviewed(result, map_, review, dataset)
-    export_map(result, file)
-    log.print(f"Wrote {len(result.labels)} labels to {file}", highlight=False)
+        result = _reviewed(result, map_, review, known)
+    export_map(result, target, format_name=format_name, dataset=known, crs=crs)
+    log.print(f"Wrote {len(result.labels)} labels to {target.partition('?')[0]}", highlight=False)
 
 
-def _reviewed(result: Map, folder: Path, review: Path | None, dataset: Path | None) -> Map:
+def _dataset(map_: Path, result: Map, given: Path | None) -> Dataset | None:
+    """Return the dataset of a map: the given one, else one that is found, if it is the map's by name."""
+    folder = find_dataset(map_, result.run, given)
+    if folder is None:
+        return None
+    dataset = read_dataset(folder)
+    return dataset if given is not None or dataset.name == result.run.get("dataset") else None
+
+
+def _reviewed(result: Map, folder: Path, review: Path | None, dataset: Dataset | None) -> Map:
     path = review or folder / REVIEW
     if not path.is_file():
         raise InputError(f"{path}: no such file", hint="decide about labels with valuemap view, or give --review")
-    found = find_dataset(folder, result.run, dataset)
-    kept, outcome = apply_review(
-        result, read_review(path, result.frame), None if found is None else read_dataset(found)
-    )
+    kept, outcome = apply_review(result, read_review(path, result.frame), dataset)
     notes = [f"{outcome.accepted} labels accepted, {outcome.rejected} rejected and left out"]
     if outcome.check_again:
         ids = ", ".join(map(str, outcome.check_again[:_SHOWN_IDS]))

@@ -1,40 +1,116 @@
-"""Files that other software reads, made from a map: one module a format, one line here."""
+"""Files and databases that other software reads, made from a map: one module a format, one line here."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
 
+from valuemap.dataset import Dataset
 from valuemap.errors import OutputError
 from valuemap.folders import new_file
 from valuemap.map_folder import Map
+from valuemap.writers.attributes import Export
+from valuemap.writers.colmap import write_colmap
 from valuemap.writers.csv import write_csv
+from valuemap.writers.flatgeobuf import write_flatgeobuf
 from valuemap.writers.geojson import write_geojson
+from valuemap.writers.geopackage import write_geopackage
+from valuemap.writers.kml import write_kml
+from valuemap.writers.lanelet2 import write_lanelet2
+from valuemap.writers.maproulette import write_maproulette
+from valuemap.writers.opendrive import write_opendrive
+from valuemap.writers.osm import write_osm
 from valuemap.writers.parquet import write_parquet
+from valuemap.writers.postgis import is_database, write_postgis
 
-WRITERS: dict[str, Callable[[Map, Path], None]] = {
-    ".csv": write_csv,
-    ".geojson": write_geojson,
-    ".parquet": write_parquet,
+WRITERS: dict[str, Callable[[Export, Path], None]] = {
+    "csv": write_csv,
+    "geojson": write_geojson,
+    "parquet": write_parquet,
+    "gpkg": write_geopackage,
+    "fgb": write_flatgeobuf,
+    "kml": write_kml,
+    "osm": write_osm,
+    "maproulette": write_maproulette,
+    "lanelet2": write_lanelet2,
+    "xodr": write_opendrive,
 }
 
+FOLDER_WRITERS: dict[str, Callable[[Export, Path], None]] = {
+    "colmap": write_colmap,
+}
 
-def export_map(result: Map, path: str | Path) -> None:
-    """Write the labels of a map as one file, in the format that its suffix names; never half.
+SUFFIXES: dict[str, str] = {
+    ".csv": "csv",
+    ".geojson": "geojson",
+    ".parquet": "parquet",
+    ".gpkg": "gpkg",
+    ".fgb": "fgb",
+    ".kml": "kml",
+    ".osm": "osm",
+    ".geojsonl": "maproulette",
+    ".lanelet2.osm": "lanelet2",
+    ".xodr": "xodr",
+}
+"""How a file must end to be of a format without being told; of several that fit, the longest."""
+
+
+def export_map(
+    result: Map,
+    target: str | Path,
+    *,
+    format_name: str | None = None,
+    dataset: Dataset | None = None,
+    crs: str | None = None,
+) -> None:
+    """Write the labels of a map as one file, a folder or into a database; never half.
+
+    Parameters
+    ----------
+    target
+        A file, whose suffix says the format, or the URL of a database with PostGIS (`postgresql://...`).
+    format_name
+        The format, one of `WRITERS`, whatever the suffix; or one of `FOLDER_WRITERS`, for which the target is a folder.
+    dataset
+        What the map was made from: then the best pictures of each label are named, and formats that hold cameras do.
+    crs
+        Coordinates in this reference system ("EPSG:25832") instead of WGS84, in formats that hold any.
 
     Raises
     ------
     OutputError
-        There is no format with this suffix, or the place cannot be written.
+        There is no such format, it cannot hold what is asked for, or the place cannot be written.
     InputError
-        The format needs a geo-referenced map and this one is not.
+        The format needs a geo-referenced map and this one is not, or the dataset is not that of the map.
+    SettingError
+        There is no such reference system, or an extra is missing.
     """
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in WRITERS:
-        raise OutputError(
-            f"{path}: cannot export to a file {f'that ends in {suffix}' if suffix else 'without a suffix'}",
-            hint=f"name a file that ends in {', '.join(WRITERS)}",
-        )
+    export = Export(result, dataset, crs)
+    if format_name is None and is_database(str(target)):
+        write_postgis(export, str(target))
+        return
+    path = Path(target)
+    if format_name in FOLDER_WRITERS:
+        FOLDER_WRITERS[format_name](export, path)
+        return
+    writer = WRITERS[_format(path, format_name)]
     with new_file(path) as temporary:
-        WRITERS[suffix](result, temporary)
+        writer(export, temporary)
+
+
+def _format(path: Path, name: str | None) -> str:
+    if name is not None:
+        if name not in WRITERS:
+            raise OutputError(
+                f"--format {name}: there is no such format",
+                hint=f"choose one of {', '.join([*WRITERS, *FOLDER_WRITERS])}",
+            )
+        return name
+    fitting = [suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix.lower())]
+    if not fitting:
+        found = f"that ends in {path.suffix}" if path.suffix else "without a suffix"
+        raise OutputError(
+            f"{path}: cannot export to a file {found}",
+            hint=f"name a file that ends in {', '.join(SUFFIXES)}, or give --format",
+        )
+    return SUFFIXES[max(fitting, key=len)]

@@ -4,10 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from valuemap.map_folder import Map
-from valuemap.tables import table_to_arrow
+from valuemap.writers.attributes import Export
+
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""A text that begins with one of these is a formula to a spreadsheet, which may do what it says."""
 
 
-def write_csv(result: Map, path: Path) -> None:
-    """Write the columns of labels.parquet; an unknown value is an empty field."""
-    table_to_arrow(result.labels).to_pandas().to_csv(path, index=False, lineterminator="\n")
+def write_csv(export: Export, path: Path) -> None:
+    """Write all attributes; an unknown value is an empty field.
+
+    A text that a spreadsheet would take for a formula gets an apostrophe before it, as OWASP advises.
+    """
+    table = export.attributes.copy()
+    texts = [str(column) for column in table.columns if table[column].dtype == "string"]
+    for name in texts:
+        is_formula = table[name].str.startswith(_FORMULA).fillna(value=False).astype(bool)
+        table[name] = table[name].mask(is_formula, "'" + table[name])
+    table.to_csv(path, index=False, lineterminator="\n")

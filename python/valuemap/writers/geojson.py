@@ -5,29 +5,26 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
-from valuemap.errors import InputError
-from valuemap.map_folder import Map, geographic_labels
+from valuemap.writers.attributes import Export, needs_places
 
 _DECIMALS = 9
 """Of a degree: a tenth of a millimetre; and of the height in metres."""
 
 
-def write_geojson(result: Map, path: Path) -> None:
-    """Write one point a label, all columns of labels.parquet as properties.
+def write_geojson(export: Export, path: Path) -> None:
+    """Write one point per label, all attributes as properties.
 
     Raises
     ------
     InputError
         The map is not geo-referenced, so that its labels have no longitude and latitude.
+    OutputError
+        Another reference system is asked for.
     """
-    if result.labels.lon_lat_height is None:
-        raise InputError(
-            "the map is not geo-referenced, and GeoJSON holds longitude and latitude only",
-            hint="export to .csv or .parquet, or import the data with a geo-reference",
-        )
+    needs_places(export, "GeoJSON")
     # Through memory, because GDAL does not tell when a disk is full.
     buffer = io.BytesIO()
-    geographic_labels(result.labels).to_file(
+    export.frame().to_file(
         buffer,
         driver="GeoJSON",
         engine="pyogrio",

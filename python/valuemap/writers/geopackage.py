@@ -1,0 +1,188 @@
+"""GeoPackage: labels, their ellipses, votes and camera positions as layers, drawn by QGIS without any setting up."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from valuemap.cameras import camera_poses
+from valuemap.errors import OutputError
+from valuemap.geodesy import crs_from_lon_lat_height, lon_lat_height_from_enu
+from valuemap.tables import Floats
+from valuemap.writers import qgis_style
+from valuemap.writers.attributes import Export, iso_times
+
+if TYPE_CHECKING:
+    import geopandas
+
+ELLIPSE_SIGMAS = 2.4477
+"""Axes of an ellipse that holds 95 % of the errors on the ground: the root of the quantile of chi-square with 2."""
+
+_CORNERS = 48
+_SAME_DATE = "2000-01-01T00:00:00.000Z"
+"""What the file says about when it was written, so that the same map gives the same bytes."""
+
+
+def write_geopackage(export: Export, path: Path) -> None:
+    """Write the layers `labels`, `ellipses` and `votes`, and `cameras` where the dataset is known.
+
+    Votes are lines from the camera to the label where the dataset is known, else rows without a geometry.
+
+    Raises
+    ------
+    OutputError
+        The disk is full.
+    """
+    import pyogrio
+
+    layers: dict[str, Callable[[Export], geopandas.GeoDataFrame]] = {
+        "labels": Export.frame,
+        "ellipses": _ellipses,
+        "votes": _votes,
+    }
+    if export.dataset is not None:
+        layers["cameras"] = _cameras
+    rows: dict[str, int] = {}
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _SAME_DATE})
+    try:
+        for name, layer in layers.items():
+            frame = layer(export)
+            rows[name] = len(frame)
+            options = {"geometry_type": _GEOMETRIES[name]} if hasattr(frame, "geometry") else {}
+            pyogrio.write_dataframe(frame, path, layer=name, driver="GPKG", append=name != "labels", **options)
+    finally:
+        pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
+    _finish(path, rows, export)
+
+
+_GEOMETRIES = {"labels": "PointZ", "ellipses": "PolygonZ", "votes": "LineStringZ", "cameras": "PointZ"}
+
+
+def ellipse_rings_in_world_m(export: Export) -> Floats:
+    """Return rings (N, corners, 3) around labels on the ground that hold 95 % of the errors, in the map's frame."""
+    labels, ellipse = export.result.labels, export.ellipses
+    east, north = export.result.frame.east_north()
+    azimuth = np.radians(ellipse.azimuth_deg)
+    long_axis = np.outer(np.sin(azimuth), east) + np.outer(np.cos(azimuth), north)
+    short_axis = np.outer(np.cos(azimuth), east) - np.outer(np.sin(azimuth), north)
+    angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS + 1)
+    ring = (
+        np.cos(angle)[None, :, None] * (ellipse.major_m[:, None] * long_axis)[:, None]
+        + np.sin(angle)[None, :, None] * (ellipse.minor_m[:, None] * short_axis)[:, None]
+    )
+    return np.asarray(labels.position_in_world_m[:, None] + ELLIPSE_SIGMAS * ring)
+
+
+def _ellipses(export: Export) -> geopandas.GeoDataFrame:
+    import geopandas
+    import shapely
+
+    rings = ellipse_rings_in_world_m(export)
+    placed = _placed(export, rings.reshape(-1, 3)).reshape(rings.shape)
+    table = export.attributes[["label_id", "class", "ellipse_major_m", "ellipse_minor_m", "ellipse_azimuth_deg"]]
+    return geopandas.GeoDataFrame(table, geometry=shapely.polygons(placed), crs=export.places.crs)
+
+
+def _votes(export: Export) -> geopandas.GeoDataFrame:
+    import geopandas
+    import pandas as pd
+    import shapely
+
+    votes = export.result.votes
+    table = pd.DataFrame(
+        {
+            "label_id": votes.label_id,
+            "detection_id": votes.detection_id,
+            "image_id": votes.image_id,
+            "residual_px": votes.residual_px,
+            "residual_sigmas": votes.residual_sigmas,
+        }
+    )
+    if export.dataset is None:
+        return table
+    image = export.image_row_of_vote
+    images = export.dataset.images
+    table["picture"] = images.name.take(image).to_pandas()
+    table["pass"] = [images.pass_id.names[code] for code in images.pass_id.codes[image]]
+    label = np.searchsorted(export.result.labels.label_id, votes.label_id)
+    starts = _placed(export, camera_poses(images)[1])[image]
+    lines = shapely.linestrings(np.stack([starts, export.places.coordinates[label]], axis=1))
+    return geopandas.GeoDataFrame(table, geometry=lines, crs=export.places.crs)
+
+
+def _cameras(export: Export) -> geopandas.GeoDataFrame:
+    import geopandas
+    import pandas as pd
+
+    assert export.dataset is not None
+    images = export.dataset.images
+    rotation, center_in_world_m = camera_poses(images)
+    ahead = rotation[:, 2] @ export.result.frame.east_north().T
+    table = pd.DataFrame(
+        {
+            "image_id": images.image_id,
+            "picture": images.name.to_pandas(),
+            "camera_id": images.camera_id,
+            "pass": images.pass_id.texts(),
+            "heading_deg": np.degrees(np.arctan2(ahead[:, 0], ahead[:, 1])) % 360.0,
+        }
+    )
+    if images.timestamp_s is not None:
+        table["time"] = pd.array(iso_times(images.timestamp_s), dtype="string")
+    points = geopandas.points_from_xy(*_placed(export, center_in_world_m).T)
+    return geopandas.GeoDataFrame(table, geometry=points, crs=export.places.crs)
+
+
+def _placed(export: Export, position_in_world_m: Floats) -> Floats:
+    """Return positions (N, 3) in the map's frame where the labels are written to."""
+    anchor = export.result.frame.anchor
+    if export.places.crs is None or anchor is None:
+        return position_in_world_m
+    geographic = lon_lat_height_from_enu(position_in_world_m, anchor)
+    return geographic if export.crs is None else crs_from_lon_lat_height(geographic, export.crs)
+
+
+def _finish(path: Path, rows: dict[str, int], export: Export) -> None:
+    """Add the styles, and make sure that all is there: GDAL does not tell when a disk is full."""
+    classes = sorted(set(export.result.labels.class_name.texts()))
+    styles = {
+        "labels": qgis_style.labels_style(classes),
+        "ellipses": qgis_style.ellipses_style(),
+        "votes": qgis_style.votes_style(),
+        "cameras": qgis_style.cameras_style(),
+    }
+    try:
+        with closing(sqlite3.connect(path)) as database:
+            database.execute(
+                "CREATE TABLE layer_styles (id INTEGER PRIMARY KEY, f_table_catalog TEXT, f_table_schema TEXT, "
+                "f_table_name TEXT, f_geometry_column TEXT, styleName TEXT, styleQML TEXT, styleSLD TEXT, "
+                "useAsDefault BOOLEAN, description TEXT, owner TEXT, ui TEXT, update_time DATETIME)"
+            )
+            database.execute(
+                "INSERT INTO gpkg_contents (table_name, data_type, identifier, description, last_change) "
+                "VALUES ('layer_styles', 'attributes', 'layer_styles', 'Styles for QGIS', ?)",
+                (_SAME_DATE,),
+            )
+            spatial = {name for (name,) in database.execute("SELECT table_name FROM gpkg_geometry_columns")}
+            for name in rows:
+                if name in spatial:
+                    database.execute(
+                        "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, "
+                        "styleName, styleQML, styleSLD, useAsDefault, description, owner, update_time) "
+                        "VALUES ('', '', ?, 'geom', ?, ?, '', 1, 'by valuemap', '', ?)",
+                        (name, name, styles[name], _SAME_DATE),
+                    )
+            database.commit()
+            for name, count in rows.items():
+                found = database.execute(f'SELECT count(*) FROM "{name}"').fetchone()[0]
+                if found != count:
+                    raise OutputError(
+                        f"{path}: cannot be written: {found} of {count} {name} are in it", hint="is the disk full?"
+                    )
+    except sqlite3.Error as error:
+        raise OutputError(f"{path}: cannot be written: {error}", hint="is the disk full?") from error

@@ -1,0 +1,176 @@
+"""ASAM OpenDRIVE 1.8: the labels as signals with their places in space, sizes, facing and data quality."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from valuemap.geodesy import crs_from_lon_lat_height
+from valuemap.tables import Floats
+from valuemap.writers.attributes import Export, records
+from valuemap.writers.sign_codes import find_sign, is_traffic_light
+from valuemap.writers.xml import child, write_xml
+
+_LEAST_ROAD_M = 1.0
+_SIGNAL_TRAFFIC_LIGHT = "1000001"
+"""What the signal catalogue of OpenDRIVE calls a traffic light of three colours."""
+
+
+def write_opendrive(export: Export, path: Path) -> None:
+    """Write one signal per label, at its inertial position, with a road that only carries them.
+
+    A map holds no roads, and OpenDRIVE wants signals on one: a straight line from the westernmost to the easternmost
+    label, named so. Who merges the signals into a road network uses `positionInertial` and works out s and t anew.
+    Coordinates are metres: of a transverse Mercator projection at the anchor, which `geoReference` names, or where the
+    map is not geo-referenced in its own frame, z up. `dataQuality` is filled from the covariance: one standard
+    deviation on the ground (root of the sum of squares) and of the height.
+
+    Raises
+    ------
+    OutputError
+        Another reference system is asked for.
+    """
+    points, projection = _coordinates(export)
+    root = ElementTree.Element("OpenDRIVE")
+    low, high = (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(3), np.zeros(3))
+    header = child(
+        root,
+        "header",
+        revMajor="1",
+        revMinor="8",
+        name=export.result.run.get("dataset", "labels"),
+        version="1",
+        vendor="valuemap",
+        west=f"{low[0]:.4f}",
+        east=f"{high[0]:.4f}",
+        south=f"{low[1]:.4f}",
+        north=f"{high[1]:.4f}",
+    )
+    if projection is not None:
+        child(header, "geoReference", projection)
+    start, heading, length_m = _road(points)
+    road = child(
+        root, "road", name="carries signals, is no road", id="0", junction="-1", length=f"{length_m:.4f}", rule="RHT"
+    )
+    line = child(
+        child(road, "planView"),
+        "geometry",
+        s="0",
+        x=f"{start[0]:.4f}",
+        y=f"{start[1]:.4f}",
+        hdg=f"{heading:.10f}",
+        length=f"{length_m:.4f}",
+    )
+    child(line, "line")
+    section = child(child(road, "lanes"), "laneSection", s="0")
+    child(child(section, "center"), "lane", id="0", type="none", level="false")
+    _border(section)
+    signals = child(road, "signals")
+    along = np.array([math.cos(heading), math.sin(heading)])
+    for row, point in zip(records(export), points, strict=True):
+        _signal(
+            signals,
+            row,
+            point,
+            (point[:2] - start) @ np.column_stack([along, [-along[1], along[0]]]),
+            heading,
+            length_m,
+        )
+    write_xml(root, path)
+
+
+def _border(section: ElementTree.Element) -> None:
+    """Add a lane without width: every section must have one."""
+    lane = child(child(section, "right"), "lane", id="-1", type="none", level="false")
+    child(lane, "width", sOffset="0", a="0", b="0", c="0", d="0")
+
+
+def _coordinates(export: Export) -> tuple[Floats, str | None]:
+    """Return x, y, z (N, 3) in metres and the PROJ text of their projection, if there is one."""
+    frame, labels = export.result.frame, export.result.labels
+    if labels.lon_lat_height is None or frame.anchor is None:
+        east, north = frame.east_north()
+        return labels.position_in_world_m @ np.stack([east, north, np.array(frame.up)]).T, None
+    lat, lon, _ = frame.anchor
+    projection = f"+proj=tmerc +lat_0={lat!r} +lon_0={lon!r} +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
+    return crs_from_lon_lat_height(labels.lon_lat_height, f"{projection} +type=crs"), f"{projection} +vunits=m"
+
+
+def _road(points: Floats) -> tuple[Floats, float, float]:
+    """Return start (2), heading (rad from x) and length (m) of a line past all labels."""
+    if not len(points):
+        return np.zeros(2), 0.0, _LEAST_ROAD_M
+    order = np.lexsort((points[:, 1], points[:, 0]))
+    start, end = points[order[0], :2], points[order[-1], :2]
+    length_m = float(np.linalg.norm(end - start))
+    if length_m < _LEAST_ROAD_M:
+        return start, 0.0, _LEAST_ROAD_M
+    return start, math.atan2(end[1] - start[1], end[0] - start[0]), length_m
+
+
+def _signal(
+    signals: ElementTree.Element,
+    row: dict[str, object],
+    point: Floats,
+    s_t: Floats,
+    road_heading: float,
+    length_m: float,
+) -> None:
+    name, height_m = str(row["class"]), float(str(row["object_height_m"]))
+    is_light = is_traffic_light(name)
+    found = find_sign(name)
+    code = None if found is None else found[0].vienna or found[0].mapillary
+    number = None if found is None else found[1]
+    x, y, z = point.tolist()
+    facing = math.pi / 2.0 - math.radians(float(str(row["facing_deg"])))  # From x, counter-clockwise.
+    signal = child(
+        signals,
+        "signal",
+        id=row["label_id"],
+        name=name,
+        s=f"{min(max(float(s_t[0]), 0.0), length_m):.4f}",
+        t=f"{s_t[1]:.4f}",
+        zOffset=f"{z - height_m / 2.0:.4f}",
+        dynamic="yes" if is_light else "no",
+        orientation="none",
+        country="OpenDRIVE",
+        type=_SIGNAL_TRAFFIC_LIGHT if is_light else code or "-1",
+        subtype="-1",
+        value=number,
+        height=f"{height_m:.3f}",
+        width=f"{row['object_width_m']:.3f}",
+        hOffset=f"{_turn(facing - road_heading):.6f}",
+    )
+    child(
+        signal,
+        "positionInertial",
+        x=f"{x:.4f}",
+        y=f"{y:.4f}",
+        z=f"{z - height_m / 2.0:.4f}",
+        hdg=f"{_turn(facing):.6f}",
+        pitch="0",
+        roll="0",
+    )
+    quality = child(signal, "dataQuality")
+    # The error that a label has towards its neighbors is not known apart: it is at most that.
+    ground, up = f"{row['sigma_m']:.4f}", f"{row['sigma_height_m']:.4f}"
+    child(quality, "error", xyAbsolute=ground, zAbsolute=up, xyRelative=ground, zRelative=up)
+    child(
+        quality,
+        "rawData",
+        date=row.get("last_seen_time", "unknown"),
+        source="sensor",
+        postProcessing="fused",
+        postProcessingComment=f"valuemap, {row['votes']} images of {row['passes']} passes",
+    )
+    for key in ("existence", "max_parallax_rad", "reprojection_rms_px"):
+        if key in row:
+            child(signal, "userData", code=key, value=row[key])
+
+
+def _turn(angle: float) -> float:
+    """Return an angle between -pi and pi."""
+    return math.remainder(angle, 2.0 * math.pi)
