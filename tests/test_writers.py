@@ -5,20 +5,22 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from xml.etree import ElementTree
 
 import geopandas
 import numpy as np
 import pyarrow.parquet as pq
+import pyogrio
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from small_dataset import ANCHOR, map_of
+from small_dataset import ANCHOR, map_of, small_dataset
 from valuemap.dataset import Frame
 from valuemap.errors import InputError, OutputError
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import Map
 from valuemap.tables import Labels, read_table, table_to_arrow
-from valuemap.writers import WRITERS, export_map
+from valuemap.writers import SUFFIXES, export_map
 
 POSITIONS = np.array([[1.0 / 3.0, -2.0, 5.25], [100.123456789012, 0.1, 4.0]])
 CLASSES = ["traffic light", 'sign "30", round']
@@ -92,13 +94,15 @@ def test_geojson_opens_with_gdal(tmp_path: Path) -> None:
 def test_geojson_needs_a_geo_reference(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="the map is not geo-referenced") as refusal:
         export_map(local_map(), tmp_path / "map.geojson")
-    assert ".csv or .parquet" in refusal.value.hint
+    assert ".csv, .parquet or .gpkg" in refusal.value.hint
     assert list(tmp_path.iterdir()) == []
 
 
 def test_parquet_is_the_table_of_labels(tmp_path: Path) -> None:
     export_map(local_map(), tmp_path / "map.parquet")
-    assert pq.read_table(tmp_path / "map.parquet").equals(table_to_arrow(local_map().labels))
+    again = read_table(Labels, tmp_path / "map.parquet")
+    assert table_to_arrow(again).equals(table_to_arrow(local_map().labels))
+    assert "geo" not in (pq.read_schema(tmp_path / "map.parquet").metadata or {})
 
 
 def test_parquet_is_geoparquet_where_geo_referenced(tmp_path: Path) -> None:
@@ -111,29 +115,53 @@ def test_parquet_is_geoparquet_where_geo_referenced(tmp_path: Path) -> None:
     assert table_to_arrow(again).equals(table_to_arrow(geographic_map().labels))
 
 
-@pytest.mark.parametrize("suffix", WRITERS)
-def test_a_map_without_labels_is_a_file_without_rows(suffix: str, tmp_path: Path) -> None:
-    path = tmp_path / f"map{suffix}"
-    export_map(empty_geographic_map(), path)
-    if suffix == ".csv":
-        assert rows_of_csv(path) == []
-    elif suffix == ".geojson":
-        assert json.loads(path.read_text(encoding="utf-8"))["features"] == []
-    else:
-        assert len(read_table(Labels, path)) == 0
+EVERY_FILE = [f"map{suffix}" for suffix in SUFFIXES]
 
 
-@pytest.mark.parametrize("suffix", WRITERS)
-def test_the_same_map_gives_the_same_bytes(suffix: str, tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        export_map(geographic_map(), tmp_path / name / f"map{suffix}")
-    assert (tmp_path / "a" / f"map{suffix}").read_bytes() == (tmp_path / "b" / f"map{suffix}").read_bytes()
+def rows_in(path: Path) -> int:
+    if path.suffix == ".csv":
+        return len(rows_of_csv(path))
+    if path.suffix == ".parquet":
+        return len(read_table(Labels, path))
+    if path.suffix in (".osm", ".xodr", ".kml"):
+        tag = {".kml": "{http://www.opengis.net/kml/2.2}Placemark", ".xodr": "signal"}.get(path.suffix, "node")
+        return sum(1 for _ in ElementTree.parse(path).iter(tag))
+    if path.suffix == ".geojsonl":
+        return path.read_text(encoding="utf-8").count("\n")
+    return len(pyogrio.read_dataframe(path, layer="labels"))
+
+
+@pytest.mark.parametrize("name", EVERY_FILE)
+def test_a_map_without_labels_is_a_file_without_rows(name: str, tmp_path: Path) -> None:
+    export_map(empty_geographic_map(), tmp_path / name)
+    assert rows_in(tmp_path / name) == 0
+
+
+@pytest.mark.parametrize("name", EVERY_FILE)
+def test_every_label_is_in_every_format(name: str, tmp_path: Path) -> None:
+    export_map(geographic_map(), tmp_path / name)
+    assert rows_in(tmp_path / name) == (4 if "lanelet2" in name else 2)
+
+
+@pytest.mark.parametrize("name", EVERY_FILE)
+def test_the_same_map_gives_the_same_bytes(name: str, tmp_path: Path) -> None:
+    dataset = small_dataset(Frame(anchor=ANCHOR))
+    for folder in ("a", "b"):
+        export_map(geographic_map(), tmp_path / folder / name, dataset=dataset)
+    assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
 def test_the_suffix_may_be_in_capitals_and_a_file_is_replaced(tmp_path: Path) -> None:
-    (tmp_path / "MAP.CSV").write_text("old")
+    export_map(local_map(), tmp_path / "MAP.CSV")
     export_map(local_map(), tmp_path / "MAP.CSV")
     assert len(rows_of_csv(tmp_path / "MAP.CSV")) == 2
+
+
+def test_a_format_may_be_named(tmp_path: Path) -> None:
+    export_map(geographic_map(), tmp_path / "map.osm", format_name="lanelet2")
+    assert rows_in(tmp_path / "map.osm") == 4
+    with pytest.raises(OutputError, match="there is no such format"):
+        export_map(geographic_map(), tmp_path / "map.osm", format_name="shp")
 
 
 @pytest.mark.parametrize(
@@ -142,15 +170,15 @@ def test_the_suffix_may_be_in_capitals_and_a_file_is_replaced(tmp_path: Path) ->
 def test_an_unknown_format_is_refused(name: str, found: str, tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=found) as refusal:
         export_map(local_map(), tmp_path / name)
-    assert refusal.value.hint == "name a file that ends in .csv, .geojson, .parquet"
+    assert refusal.value.hint.startswith("name a file that ends in .csv, .geojson, .parquet, .gpkg,")
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("suffix", WRITERS)
-def test_a_place_that_cannot_be_written_is_refused(suffix: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", EVERY_FILE)
+def test_a_place_that_cannot_be_written_is_refused(name: str, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     with pytest.raises(OutputError, match="cannot be written"):
-        export_map(geographic_map(), tmp_path / "file" / f"map{suffix}")
-    (tmp_path / f"map{suffix}").mkdir()
+        export_map(geographic_map(), tmp_path / "file" / name)
+    (tmp_path / name).mkdir()
     with pytest.raises(OutputError, match="is a folder, a file is to be written there"):
-        export_map(geographic_map(), tmp_path / f"map{suffix}")
+        export_map(geographic_map(), tmp_path / name)

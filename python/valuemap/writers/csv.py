@@ -6,7 +6,7 @@ from pathlib import Path
 
 from valuemap.writers.attributes import Export
 
-_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+_FORMULA = ("=", "+", "-", "@", "\t", " =", " +", " -", " @")
 """A text that begins with one of these is a formula to a spreadsheet, which may do what it says."""
 
 
@@ -18,6 +18,7 @@ def write_csv(export: Export, path: Path) -> None:
     table = export.attributes.copy()
     texts = [str(column) for column in table.columns if table[column].dtype == "string"]
     for name in texts:
+        table[name] = table[name].str.replace(r"[\r\n]+", " ", regex=True)  # A row is a line.
         is_formula = table[name].str.startswith(_FORMULA).fillna(value=False).astype(bool)
         table[name] = table[name].mask(is_formula, "'" + table[name])
     table.to_csv(path, index=False, lineterminator="\n")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import warnings
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -54,13 +55,15 @@ def write_geopackage(export: Export, path: Path) -> None:
             frame = layer(export)
             rows[name] = len(frame)
             options = {"geometry_type": _GEOMETRIES[name]} if hasattr(frame, "geometry") else {}
-            pyogrio.write_dataframe(frame, path, layer=name, driver="GPKG", append=name != "labels", **options)
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "'crs' was not provided")  # A frame of its own has none.
+                pyogrio.write_dataframe(frame, path, layer=name, driver="GPKG", append=name != "labels", **options)
     finally:
         pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
     _finish(path, rows, export)
 
 
-_GEOMETRIES = {"labels": "PointZ", "ellipses": "PolygonZ", "votes": "LineStringZ", "cameras": "PointZ"}
+_GEOMETRIES = {"labels": "Point Z", "ellipses": "Polygon Z", "votes": "LineString Z", "cameras": "Point Z"}
 
 
 def ellipse_rings_in_world_m(export: Export) -> Floats:

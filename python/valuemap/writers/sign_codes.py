@@ -160,12 +160,6 @@ def _words(text: str) -> str:
     return " ".join(_WORDS.sub(" ", text).split())
 
 
-_BY_WORDS = {
-    words: sign
-    for sign in SIGNS
-    for words in (
-        _words(sign.mapillary),
-        *(_words(name) for name in sign.names),
-        _words(sign.mapillary.split("--", 1)[1]),
-    )
-}
+_BY_WORDS = {_words(name): sign for sign in SIGNS for name in (sign.mapillary, *sign.names)}
+for _each in SIGNS:  # Without its kind too, where that is no other's name.
+    _BY_WORDS.setdefault(_words(_each.mapillary.split("--", 1)[1]), _each)

@@ -1,0 +1,296 @@
+"""Exports for maps of roads, editors and viewers, read back by the software of their field."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import sqlite3
+import subprocess
+from pathlib import Path
+from xml.etree import ElementTree
+
+import geopandas
+import numpy as np
+import pycolmap
+import pyogrio
+import pytest
+from numpy.testing import assert_allclose
+
+from small_dataset import ANCHOR, map_of, small_dataset
+from valuemap.cameras import camera_centers
+from valuemap.dataset import Frame
+from valuemap.errors import InputError
+from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
+from valuemap.map_folder import Map
+from valuemap.tables import Floats, Votes
+from valuemap.writers import export_map
+from valuemap.writers.attributes import Export
+from valuemap.writers.lanelet2 import lower_edges
+
+GEOREFERENCED = Frame(anchor=ANCHOR)
+POSITIONS = np.array([[4.0, 25.0, 5.0], [12.0, 20.0, 2.0], [-30.0, 50.0, 3.0]])
+CLASSES = ["traffic light", "regulatory--stop--g1", 'a <strange> & "new"\x01 class']
+
+
+def a_map(frame: Frame = GEOREFERENCED, *, facing_deg: tuple[float, ...] = (180.0, 90.0, 0.0)) -> Map:
+    """Return three labels; the first two are voted for by the detections of the small dataset."""
+    places = lon_lat_height_from_enu(POSITIONS, ANCHOR) if frame.anchor is not None else None
+    result = map_of(POSITIONS, CLASSES, frame=frame, lon_lat_height=places, run={"dataset": "small & co"})
+    labels = result.labels.replace(
+        facing_azimuth_rad=np.radians(facing_deg),
+        existence=np.array([0.999, 0.8, 0.55]),
+        last_seen_s=np.full(3, 1.7e9),
+        first_seen_s=np.full(3, 1.6e9),
+        facing_concentration=np.array([0.9, 0.9, 0.1]),
+    )
+    votes = Votes(
+        label_id=np.array([0, 0, 0, 1, 1]),
+        detection_id=np.array([100, 101, 102, 103, 104]),
+        image_id=np.array([10, 20, 30, 30, 40]),
+        residual_px=np.array([1.0, 2.0, 0.5, 1.5, 0.25]),
+        residual_sigmas=np.array([0.5, 1.0, 0.25, 0.75, 0.125]),
+    )
+    dataset = small_dataset(frame)
+    image_of = dict(zip(dataset.detections.detection_id.tolist(), dataset.detections.image_id.tolist(), strict=True))
+    votes = votes.replace(image_id=np.array([image_of[i] for i in votes.detection_id.tolist()]))
+    return dataclasses.replace(result, labels=labels, votes=votes)
+
+
+def tags_of(element: ElementTree.Element) -> dict[str, str]:
+    return {tag.attrib["k"]: tag.attrib["v"] for tag in element.iter("tag")}
+
+
+def test_geopackage_has_labels_ellipses_votes_and_cameras(tmp_path: Path) -> None:
+    dataset = small_dataset(GEOREFERENCED)
+    path = tmp_path / "map.gpkg"
+    export_map(a_map(), path, dataset=dataset)
+    assert {name for name, _ in pyogrio.list_layers(path)} == {"labels", "ellipses", "votes", "cameras", "layer_styles"}
+    labels, ellipses, votes, cameras = (
+        geopandas.read_file(path, layer=name) for name in ("labels", "ellipses", "votes", "cameras")
+    )
+    assert labels.crs == ellipses.crs == votes.crs == cameras.crs == "EPSG:4979"
+    assert len(cameras) == 4
+    assert ellipses.geometry.contains(labels.geometry).all()
+    width_m = (ellipses.total_bounds[2:] - ellipses.total_bounds[:2]) * [69_000.0, 111_000.0]
+    assert np.all(width_m < [60.0, 60.0])
+    centers = enu_from_lon_lat_height(
+        np.column_stack([cameras.geometry.x, cameras.geometry.y, cameras.geometry.z]), ANCHOR
+    )
+    assert_allclose(centers, camera_centers(dataset.images), atol=1e-4)
+    assert_allclose(cameras["heading_deg"], 0.0, atol=1e-6)  # They look along y, which is north.
+    first, last = votes.geometry[0].coords[0], votes.geometry[0].coords[-1]
+    assert first[:2] == (cameras.geometry.x[0], cameras.geometry.y[0])
+    assert last[:2] == (labels.geometry.x[0], labels.geometry.y[0])
+    assert votes["picture"].tolist()[0] == "a/1.jpg"
+
+
+def test_geopackage_brings_its_styles(tmp_path: Path) -> None:
+    export_map(a_map(), tmp_path / "map.gpkg", dataset=small_dataset(GEOREFERENCED))
+    with sqlite3.connect(tmp_path / "map.gpkg") as database:
+        styles = dict(database.execute("SELECT f_table_name, styleQML FROM layer_styles WHERE useAsDefault = 1"))
+        columns = dict(database.execute("SELECT table_name, column_name FROM gpkg_geometry_columns"))
+        used = dict(database.execute("SELECT f_table_name, f_geometry_column FROM layer_styles"))
+        problems = database.execute("PRAGMA integrity_check").fetchall()
+    assert set(styles) == {"labels", "ellipses", "votes", "cameras"}
+    assert used == columns
+    assert problems == [("ok",)]
+    for name, text in styles.items():
+        renderer = ElementTree.fromstring(text.partition("\n")[2]).find("renderer-v2")
+        assert renderer is not None, name
+        assert renderer.find("symbols/symbol/layer") is not None, name
+    labels = ElementTree.fromstring(styles["labels"].partition("\n")[2])
+    assert {entry.attrib["value"] for entry in labels.iter("category")} == {c.replace("\x01", "") for c in CLASSES}
+
+
+def test_geopackage_of_a_map_in_a_frame_of_its_own(tmp_path: Path) -> None:
+    export_map(a_map(Frame()), tmp_path / "map.gpkg")
+    labels = pyogrio.read_dataframe(tmp_path / "map.gpkg", layer="labels")
+    assert_allclose(np.column_stack([labels.geometry.x, labels.geometry.y, labels.geometry.z]), POSITIONS)
+    votes = pyogrio.read_dataframe(tmp_path / "map.gpkg", layer="votes", read_geometry=False)
+    assert votes["detection_id"].tolist() == [100, 101, 102, 103, 104]
+
+
+def test_flatgeobuf_holds_the_labels(tmp_path: Path) -> None:
+    export_map(a_map(), tmp_path / "map.fgb")
+    frame = geopandas.read_file(tmp_path / "map.fgb").sort_values("label_id")
+    places = np.column_stack([frame.geometry.x, frame.geometry.y, frame.geometry.z])
+    assert_allclose(places, lon_lat_height_from_enu(POSITIONS, ANCHOR), atol=1e-12)
+    assert len(geopandas.read_file(tmp_path / "map.fgb", bbox=tuple(np.tile(places[0, :2], 2)))) == 1
+
+
+def test_kml_opens_with_gdal(tmp_path: Path) -> None:
+    export_map(a_map(), tmp_path / "map.kml")
+    layers = [name for name, _ in pyogrio.list_layers(tmp_path / "map.kml")]
+    assert sorted(layers) == sorted(c.replace("\x01", "") for c in CLASSES)
+    light = pyogrio.read_dataframe(tmp_path / "map.kml", layer="traffic light")
+    lon, lat, _ = lon_lat_height_from_enu(POSITIONS, ANCHOR)[0]
+    assert (light.geometry.x[0], light.geometry.y[0]) == pytest.approx((lon, lat), abs=1e-9)
+    text = (tmp_path / "map.kml").read_text(encoding="utf-8")
+    assert "<begin>2020-09-13T12:26:40.000Z</begin>" in text
+
+
+def test_osm_suggests_tags_and_forbids_uploading(tmp_path: Path) -> None:
+    export_map(a_map(), tmp_path / "map.osm")
+    root = ElementTree.parse(tmp_path / "map.osm").getroot()
+    assert root.attrib["upload"] == "never"
+    light, stop, strange = root.findall("node")
+    assert [int(node.attrib["id"]) for node in (light, stop, strange)] == [-1, -2, -3]
+    assert tags_of(light)["highway"] == "traffic_signals"
+    assert tags_of(light)["direction"] == "180"
+    assert tags_of(stop) | {"highway": "stop", "traffic_sign": "stop"} == tags_of(stop)
+    assert tags_of(strange)["valuemap:class"] == CLASSES[2].replace("\x01", "")
+    assert "direction" not in tags_of(strange)  # It is seen from all sides.
+    assert tags_of(light)["survey:date"] == "2023-11-14"
+    points = pyogrio.read_dataframe(tmp_path / "map.osm", layer="points")
+    assert len(points) == 3
+
+
+def test_maproulette_has_a_task_a_line(tmp_path: Path) -> None:
+    export_map(a_map(), tmp_path / "tasks.geojsonl")
+    lines = (tmp_path / "tasks.geojsonl").read_bytes().decode().split("\n")[:-1]
+    assert all(line.startswith("\x1e{") for line in lines)
+    tasks = [json.loads(line[1:]) for line in lines]
+    assert [task["type"] for task in tasks] == ["FeatureCollection"] * 3
+    assert [len(task["features"]) for task in tasks] == [1, 1, 1]
+    properties = tasks[0]["features"][0]["properties"]
+    assert properties["id"] == "valuemap-0"
+    assert "highway=traffic_signals" in properties["suggested_tags"].split("\n")
+
+
+@pytest.mark.parametrize(
+    ("facing_deg", "right"),
+    # Who sees a light that faces south looks north: right is east.
+    [(180.0, [1.0, 0.0]), (90.0, [0.0, 1.0]), (0.0, [-1.0, 0.0]), (270.0, [0.0, -1.0])],
+)
+def test_lower_edges_go_from_left_to_right_as_drivers_see_them(facing_deg: float, right: list[float]) -> None:
+    left_end, right_end = lower_edges(Export(a_map(facing_deg=(facing_deg,) * 3)))[0]
+    assert_allclose((right_end - left_end)[:2], 0.3 * np.array(right), atol=1e-12)
+    assert_allclose((left_end + right_end) / 2.0, POSITIONS[0] - [0.0, 0.0, 0.45], atol=1e-12)
+
+
+def test_lanelet2_reads_what_is_written(tmp_path: Path) -> None:
+    lanelet2 = pytest.importorskip("lanelet2", reason="there is no lanelet2 for this system")
+    export_map(a_map(), tmp_path / "map.lanelet2.osm")
+    lat, lon, height = ANCHOR
+    origin = lanelet2.io.Origin(lat, lon, height)
+    read, errors = lanelet2.io.loadRobust(
+        str(tmp_path / "map.lanelet2.osm"), lanelet2.projection.LocalCartesianProjector(origin)
+    )
+    assert list(errors) == []
+    lines = {line.attributes["valuemap:label"]: line for line in read.lineStringLayer}
+    assert sorted(lines) == ["0", "1", "2"]
+    light = lines["0"]
+    assert light.attributes["type"] == "traffic_light"
+    assert light.attributes["subtype"] == "red_yellow_green"
+    assert float(light.attributes["height"]) == pytest.approx(0.9)
+    assert float(light.attributes["existence"]) == pytest.approx(0.999)
+    assert float(light.attributes["sigma_m"]) == pytest.approx(np.hypot(0.2, 0.1), abs=1e-3)
+    assert lines["1"].attributes["type"] == "traffic_sign"
+    ends = np.array([[point.x, point.y, point.z] for point in light])
+    assert_allclose(ends, lower_edges(Export(a_map()))[0], atol=2e-4)
+    nodes = ElementTree.parse(tmp_path / "map.lanelet2.osm").getroot().findall("node")
+    assert [float(tags_of(node)["ele"]) for node in nodes[:2]] == pytest.approx([39.55, 39.55], abs=1e-3)
+
+
+def signals_of(path: Path) -> list[ElementTree.Element]:
+    return ElementTree.parse(path).getroot().findall("road/signals/signal")
+
+
+def test_opendrive_signals_say_where_and_how_exactly(tmp_path: Path) -> None:
+    export_map(a_map(), tmp_path / "map.xodr")
+    light, stop, _ = signals_of(tmp_path / "map.xodr")
+    assert (light.attrib["dynamic"], light.attrib["type"]) == ("yes", "1000001")
+    assert (stop.attrib["dynamic"], stop.attrib["type"]) == ("no", "B,2a")
+    place = light.find("positionInertial")
+    assert place is not None
+    # Near the anchor the projection is the local frame; z is ellipsoidal, to the lower edge.
+    assert [float(place.attrib[axis]) for axis in "xyz"] == pytest.approx([4.0, 25.0, 35.0 + 5.0 - 0.45], abs=1e-3)
+    assert float(place.attrib["hdg"]) == pytest.approx(-np.pi / 2)  # It faces south.
+    error = light.find("dataQuality/error")
+    assert error is not None
+    assert float(error.attrib["xyAbsolute"]) == pytest.approx(np.hypot(0.2, 0.1), abs=1e-4)
+    assert float(error.attrib["zAbsolute"]) == pytest.approx(0.3, abs=1e-4)
+
+
+def test_opendrive_roads_carry_their_signals(tmp_path: Path) -> None:
+    """Whoever only looks at s and t finds them in the same places."""
+    export_map(a_map(), tmp_path / "map.xodr")
+    line = ElementTree.parse(tmp_path / "map.xodr").getroot().find("road/planView/geometry")
+    assert line is not None
+    x, y, heading = (float(line.attrib[name]) for name in ("x", "y", "hdg"))
+    for signal in signals_of(tmp_path / "map.xodr"):
+        s, t = float(signal.attrib["s"]), float(signal.attrib["t"])
+        place = signal.find("positionInertial")
+        assert place is not None
+        assert 0.0 <= s <= float(line.attrib["length"])
+        found = [
+            x + s * np.cos(heading) - t * np.sin(heading),
+            y + s * np.sin(heading) + t * np.cos(heading),
+        ]
+        assert found == pytest.approx([float(place.attrib["x"]), float(place.attrib["y"])], abs=1e-3)
+
+
+@pytest.mark.parametrize("frame", [GEOREFERENCED, Frame(up=(0.0, -1.0, 0.0))])
+def test_opendrive_passes_the_checker_of_asam(frame: Frame, tmp_path: Path) -> None:
+    checker = shutil.which("qc_opendrive")
+    if checker is None:
+        if "qc" in os.environ.get("EXTRAS", "").split():
+            pytest.fail("qc_opendrive is not on the PATH")
+        pytest.skip("qc_opendrive is not on the PATH: pip install asam-qc-opendrive into an environment of its own")
+    export_map(a_map(frame), tmp_path / "map.xodr")
+    (tmp_path / "config.xml").write_text(
+        f'<Config><Param name="InputFile" value="{tmp_path / "map.xodr"}"/>'
+        '<CheckerBundle application="xodrBundle"><Param name="resultFile" value="result.xqar"/></CheckerBundle>'
+        "</Config>"
+    )
+    subprocess.run([checker, "-c", "config.xml"], cwd=tmp_path, check=True, capture_output=True)
+    result = ElementTree.parse(tmp_path / "result.xqar").getroot()
+    checks = list(result.iter("Checker"))
+    assert any(check.attrib["status"] == "completed" for check in checks)
+    issues = [issue.attrib["description"] for issue in result.iter("Issue")]
+    assert issues == []
+
+
+def test_opendrive_of_a_map_in_a_frame_of_its_own_has_z_up(tmp_path: Path) -> None:
+    export_map(a_map(Frame(up=(0.0, -1.0, 0.0))), tmp_path / "map.xodr")
+    place = signals_of(tmp_path / "map.xodr")[0].find("positionInertial")
+    assert place is not None
+    assert float(place.attrib["z"]) == pytest.approx(-25.0 - 0.45)
+
+
+def test_colmap_opens_the_map(tmp_path: Path) -> None:
+    dataset = small_dataset()
+    export_map(a_map(Frame()), tmp_path / "model", format_name="colmap", dataset=dataset)
+    model = pycolmap.Reconstruction(str(tmp_path / "model"))
+    assert model.num_images() == 4
+    assert sorted(model.points3D) == [0, 1, 2]
+    assert_allclose(model.points3D[0].xyz, POSITIONS[0])
+    assert model.points3D[0].error == pytest.approx(1.5)
+    tracks = {
+        (e.image_id, tuple(model.images[e.image_id].points2D[e.point2D_idx].xy))
+        for e in model.points3D[1].track.elements
+    }
+    expected: set[tuple[int, tuple[float, ...]]] = set()
+    for detection in (103, 104):
+        row = dataset.detections.detection_id.tolist().index(detection)
+        center: Floats = dataset.detections.center_px[row]
+        expected.add((int(dataset.detections.image_id[row]), tuple(center.tolist())))
+    assert tracks == expected
+    image = model.images[10]
+    assert_allclose(image.projection_center(), camera_centers(dataset.images)[0], atol=1e-12)
+    assert image.name == "a/1.jpg"
+
+
+def test_colmap_needs_the_dataset(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="the dataset of the map is not known"):
+        export_map(a_map(), tmp_path / "model", format_name="colmap")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["map.kml", "map.osm", "map.geojsonl", "map.lanelet2.osm"])
+def test_formats_of_the_earth_need_a_geo_reference(name: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="the map is not geo-referenced"):
+        export_map(a_map(Frame()), tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
