@@ -30,6 +30,13 @@ def report_command(
         Path | None, typer.Option(help="What valuemap experiment passes wrote: recall and errors by number of passes.")
     ] = None,
     radius: Annotated[float, typer.Option(help="Metres within which a label can be an object.")] = 2.0,
+    truth_sigma: Annotated[
+        float | None,
+        typer.Option(metavar="M", help="Standard deviation of the true positions on each axis, in metres."),
+    ] = None,
+    seen_within: Annotated[
+        float | None, typer.Option(metavar="M", help="Objects farther than this from every image do not count.")
+    ] = None,
 ) -> None:
     """Make one page of everything about a map: labels to click, figures, tables. It needs no network and no server."""
     from valuemap.experiment import read_passes
@@ -41,7 +48,16 @@ def report_command(
     folder = find_dataset(map_, result.run, dataset)
     data = None if folder is None else read_dataset(folder)
     known = truth if truth is not None else data if data is not None and data.truth is not None else None
-    evaluation = None if known is None else evaluate_map(result, known, radius_m=radius)
+    evaluation = None
+    if known is not None:
+        evaluation = evaluate_map(
+            result,
+            known,
+            radius_m=radius,
+            truth_sigma_m=truth_sigma,
+            images=None if seen_within is None else data,
+            seen_within_m=seen_within,
+        )
     curves = None if passes is None else read_passes(passes)
     with progress_bars() as progress:
         write_report(

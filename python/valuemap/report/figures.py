@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from valuemap.evaluate import Evaluation
+from valuemap.evaluate.reliability import LIMITS, ExistenceRange
 from valuemap.evidence import Evidence
 from valuemap.experiment import CURVES, PassesResult
 from valuemap.map_folder import Map
 from valuemap.report.style import BLUE, DPI, FAINT_INK, GREEN, GREY, INK, ORANGE, VERMILION, drawing, figure_bytes
-from valuemap.tables import Floats, Ints
+from valuemap.tables import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,7 +24,6 @@ if TYPE_CHECKING:
 _WIDTH_IN = 10.0
 _LEAST_IN_BIN = 20
 _DEPTH_BINS = 14
-_EXISTENCE_EDGES = (0.0, 0.6, 0.8, 0.9, 0.95, 0.99, 0.999, 1.0)
 _Z95 = 1.959963984540054
 
 
@@ -98,25 +99,26 @@ def existence(result: Map, evaluation: Evaluation | None) -> ReportFigure | None
     labels = result.labels
     if labels.existence is None or len(labels) == 0:
         return None
-    bin_of_label = np.clip(np.searchsorted(_EXISTENCE_EDGES, labels.existence, side="right") - 1, 0, 6)
-    bins = [int(b) for b in np.unique(bin_of_label)]
-    names = [f"{_EXISTENCE_EDGES[b]:g} to {_EXISTENCE_EDGES[b + 1]:g}" for b in bins]
-    count = np.array([np.sum(bin_of_label == b) for b in bins])
+    of_range = np.clip(np.searchsorted(LIMITS, labels.existence, side="right") - 1, 0, len(LIMITS) - 2)
+    bins = [int(b) for b in np.unique(of_range)]
+    names = [f"{LIMITS[b]:g} to {LIMITS[b + 1]:g}" for b in bins]
+    count = np.array([np.sum(of_range == b) for b in bins])
+    ranges = None if evaluation is None else evaluation.reliability
     with drawing():
-        figure, panels = _figure(1 if evaluation is None else 2)
+        figure, panels = _figure(1 if ranges is None else 2)
         panels[0].bar(range(len(bins)), count, color=BLUE, alpha=0.8, width=0.7)
         for i, n in enumerate(count):
             panels[0].text(i, n, f"{n:,}", ha="center", va="bottom", fontsize=9.5)
         panels[0].set_ylabel("labels")
         panels[0].margins(y=0.12)
-        if evaluation is not None:
-            _draw_reliability(panels[1], labels.existence, bin_of_label, bins, evaluation)
+        if ranges is not None:
+            _draw_reliability(panels[1], ranges)
         for axes in panels:
             axes.set_xlabel("probability of existence")
             axes.set_xticks(range(len(bins)), names, fontsize=8.5, rotation=20 if len(bins) > 4 else 0)
             axes.grid(visible=False, axis="x")
     caption = "How many labels have which probability of existence."
-    if evaluation is not None:
+    if ranges is not None:
         caption += (
             " On the right the share of them that are objects, with its 95 % interval, beside what the map claims: "
             "an honest map has its claims within the intervals. Duplicates count as no objects."
@@ -124,27 +126,29 @@ def existence(result: Map, evaluation: Evaluation | None) -> ReportFigure | None
     return ReportFigure("existence", "Reliability of existence", caption, figure)
 
 
-def _draw_reliability(
-    axes: Axes, probability: Floats, bin_of_label: Ints, bins: list[int], evaluation: Evaluation
-) -> None:
-    outcome = evaluation.matches.label_outcome
-    is_true = outcome.codes == outcome.code_of("true")
-    share, low, high, claimed = [], [], [], []
-    for b in bins:
-        rows = bin_of_label == b
-        n, k = int(rows.sum()), int(is_true[rows].sum())
+def _draw_reliability(axes: Axes, ranges: Sequence[ExistenceRange]) -> None:
+    share, low, high = [], [], []
+    for each in ranges:
+        n, k = each.labels, each.true_labels
         # Wilson's interval.
         middle = (k + _Z95**2 / 2) / (n + _Z95**2)
         half = _Z95 / (n + _Z95**2) * math.sqrt(k * (n - k) / n + _Z95**2 / 4)
-        share.append(k / n)
-        low.append(max(0.0, k / n - (middle - half)))
-        high.append(max(0.0, middle + half - k / n))
-        claimed.append(float(probability[rows].mean()))
-    x = np.arange(len(bins))
+        share.append(each.true_share)
+        low.append(max(0.0, each.true_share - (middle - half)))
+        high.append(max(0.0, middle + half - each.true_share))
+    x = np.arange(len(ranges))
     axes.errorbar(x, share, [low, high], fmt="o", color=BLUE, capsize=4, markersize=6, label="objects among them")
-    axes.plot(x, claimed, "_", color=VERMILION, markersize=22, markeredgewidth=2.2, label="claimed, mean")
+    axes.plot(
+        x,
+        [each.mean_existence for each in ranges],
+        "_",
+        color=VERMILION,
+        markersize=22,
+        markeredgewidth=2.2,
+        label="claimed, mean",
+    )
     axes.set_ylim(0.0, 1.05)
-    axes.set_xlim(-0.6, len(bins) - 0.4)
+    axes.set_xlim(-0.6, len(ranges) - 0.4)
     axes.set_ylabel("share of labels")
     axes.legend(loc="lower right")
 

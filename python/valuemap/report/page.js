@@ -99,13 +99,15 @@
     for (i = 0; i < data.object_outcome.length; i++) {
       px = ox + data.object_at[2 * i] * s; py = oy - data.object_at[2 * i + 1] * s;
       if (px < -20 || py < -20 || px > size.width + 20 || py > size.height + 20) continue;
+      var half = Math.min(8, Math.max(2.2, 2 + 4 * s));
       brush.strokeStyle = [style.good, style.bad, style.faint][data.object_outcome[i]];
-      brush.lineWidth = data.object_outcome[i] === 1 ? 2.5 : 1.5;
+      brush.lineWidth = half < 4 ? 1 : data.object_outcome[i] === 1 ? 2.5 : 1.5;
       brush.beginPath();
-      if (data.object_outcome[i] === 0) brush.arc(px, py, 8, 0, 2 * Math.PI); else brush.rect(px - 7, py - 7, 14, 14);
+      if (data.object_outcome[i] === 0) brush.arc(px, py, half, 0, 2 * Math.PI);
+      else brush.rect(px - half, py - half, 2 * half, 2 * half);
       brush.stroke();
     }
-    var radius = Math.min(4.5, Math.max(2, 1.2 + s));
+    var radius = Math.min(4.5, Math.max(1.6, 1.4 + s)), arm = Math.min(6, Math.max(2.5, 2 + 3 * s));
     for (i = 0; i < count; i++) {
       px = ox + data.label_at[3 * i] * s; py = oy - data.label_at[3 * i + 1] * s;
       if (px < -60 || py < -60 || px > size.width + 60 || py > size.height + 60 || !isShown(i)) continue;
@@ -116,9 +118,10 @@
       brush.strokeStyle = style.paper; brush.lineWidth = 0.8; brush.stroke();
       var outcome = data.label_outcome.length ? data.label_outcome[i] : 2;
       if (outcome !== 2) {
-        brush.strokeStyle = outcome === 1 ? style.bad : style.warn; brush.lineWidth = 2.5;
+        brush.strokeStyle = outcome === 1 ? style.bad : style.warn; brush.lineWidth = arm < 4 ? 1.2 : 2.5;
         brush.beginPath();
-        brush.moveTo(px - 6, py - 6); brush.lineTo(px + 6, py + 6); brush.moveTo(px + 6, py - 6); brush.lineTo(px - 6, py + 6);
+        brush.moveTo(px - arm, py - arm); brush.lineTo(px + arm, py + arm);
+        brush.moveTo(px + arm, py - arm); brush.lineTo(px - arm, py + arm);
         brush.stroke();
       }
       if (i === chosen) {

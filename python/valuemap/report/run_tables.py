@@ -22,6 +22,26 @@ def run_tables(result: Map) -> list[ReportTable]:
     return [_classes(result), _stages(result), _counts(result), _settings(result)]
 
 
+def accuracy_tables(evaluation: Evaluation) -> list[ReportTable]:
+    """Return the accuracy statement, completeness and what chance would give, as surveyors ask for them."""
+    figures = evaluation.to_json()
+    tables = []
+    for name, title, notes in (
+        ("accuracy", "Positional accuracy", (f"{_sentence(evaluation.accuracy.statement)}.",)),
+        ("completeness", "Completeness", ()),
+        ("chance", "What chance would give", ("The truth is moved aside, and labels are matched with it again.",)),
+    ):
+        rows = tuple(
+            (what.replace("_", " "), value) for what, value in _flat(figures[name]) if not isinstance(value, str)
+        )
+        tables.append(ReportTable(name, title, ("", "value"), rows, notes))
+    return tables
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}"
+
+
 def doubtful_rows(result: Map) -> Ints:
     """Return the rows of the labels that exist with the least probability, else have the fewest votes."""
     labels = result.labels

@@ -23,7 +23,15 @@ from valuemap.report.crops import chosen_voters, thumbnail, voter_crop
 from valuemap.report.figures import ReportFigure
 from valuemap.report.page import Card, Content, inline_data, page_text
 from valuemap.report.paper import Cell, ReportTable, paper_tables
-from valuemap.report.run_tables import doubtful_rows, error_m, label_table, run_tables, spread_m, worst_rows
+from valuemap.report.run_tables import (
+    accuracy_tables,
+    doubtful_rows,
+    error_m,
+    label_table,
+    run_tables,
+    spread_m,
+    worst_rows,
+)
 from valuemap.report.style import FORMATS
 
 FILES_MARKER = "report.json"
@@ -83,6 +91,7 @@ def write_report(
     progress("drawing the report", 1, steps)
     doubtful, worst = doubtful_rows(result), worst_rows(result, evaluation)
     tables = [] if dataset is None else paper_tables(result, dataset, evaluation)
+    tables += accuracy_tables(evaluation) if evaluation is not None else []
     tables += run_tables(result)
     tables += [_passes_table(passes)] if passes is not None else []
     lists = [
@@ -218,7 +227,8 @@ def _in_short(result: Map, dataset: Dataset | None, evaluation: Evaluation | Non
         yield _percent(evaluation.recall), f"recall of {evaluation.recoverable_objects:,} recoverable objects"
         yield _percent(evaluation.precision), "precision"
         if evaluation.true_positives:
-            yield f"{evaluation.position_median_m:.2f} m", "median position error"
+            flat = "" if evaluation.matches.objects.has_height else "horizontal "
+            yield f"{np.nanmedian(error_m(result, evaluation)):.2f} m", f"median {flat}position error"
     elif len(labels):
         yield f"{np.median(labels.votes):,.0f}", "votes per label, median"
         yield f"{np.median(spread_m(result)):.2f} m", "sigma of a position, median"
@@ -241,7 +251,8 @@ def _cards(
     spread = spread_m(result)
     for row in map(int, rows):
         expected = "" if labels.expected is None else f" of {labels.expected[row]}"
-        lines = [f"{labels.votes[row]}{expected} images, {labels.passes[row]} passes, sigma {spread[row]:.2f} m"]
+        passes = f"{labels.passes[row]} {'pass' if labels.passes[row] == 1 else 'passes'}"
+        lines = [f"{labels.votes[row]}{expected} images, {passes}, sigma {spread[row]:.2f} m"]
         if labels.existence is not None:
             lines.append(f"exists with probability {labels.existence[row]:.3f}")
         if evaluation is not None and error is not None:
