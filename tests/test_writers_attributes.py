@@ -19,7 +19,7 @@ from valuemap.errors import InputError, OutputError, SettingError
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import Map
 from valuemap.tables import Detections, Votes
-from valuemap.writers import export_map
+from valuemap.writers import SUFFIXES, export_map
 from valuemap.writers.attributes import Export, iso_times
 from valuemap.writers.geopackage import ELLIPSE_SIGMAS, ellipse_rings_in_world_m
 from valuemap.writers.sign_codes import SIGNS, find_sign, osm_tags
@@ -209,3 +209,24 @@ def test_sign_codes_are_of_one_meaning_each() -> None:
             found = find_sign(name)
             assert found is not None, name
             assert found[0] is sign, name
+
+
+DOCS = (Path(__file__).parents[1] / "docs" / "formats.md").read_text(encoding="utf-8")
+
+
+def test_the_docs_say_what_every_column_means() -> None:
+    table = Export(geographic_map(), small_dataset(Frame(anchor=ANCHOR)), "EPSG:32630").attributes
+    covariance = {name for name in table.columns if name.startswith("covariance_")}
+    for name in [*table.columns, "expected", "existence"]:
+        if name not in covariance and name != "picture_2":
+            assert f"`{name}`" in DOCS, name
+
+
+def test_the_docs_have_the_table_of_signs_and_all_formats() -> None:
+    for sign in SIGNS:
+        row = next(line for line in DOCS.splitlines() if line.startswith(f"| `{sign.mapillary}` |"))
+        cells = [cell.strip() for cell in row.strip("|").split("|")]
+        assert cells[1] == ", ".join(f"`{key}={value}`" for key, value in sign.osm.items())
+        assert cells[2:4] == [sign.vienna or "", sign.mutcd or ""]
+    for suffix, name in SUFFIXES.items():
+        assert f"| `{suffix}` | `{name}` |" in DOCS

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
+from urllib.parse import parse_qsl, quote, urlencode
 
 import numpy as np
 
@@ -74,7 +74,7 @@ def write_postgis(export: Export, url: str) -> None:
                         sql.SQL("DELETE FROM {} WHERE map = %s").format(sql.Identifier(schema, "cameras")), (name,)
                     )
     except psycopg.Error as error:
-        reason = " ".join(str(error).split())
+        reason = " ".join(str(error).split()).partition(" DETAIL:")[0]
         raise OutputError(
             f"{_without_password(address)}: cannot be written: {reason}",
             hint="is the server running, may this user create tables, is PostGIS installed there?",
@@ -131,7 +131,7 @@ def _tables(export: Export) -> list[tuple[str, dict[str, str], Iterable[Sequence
     kinds = {name: _kind(name, attributes[name].dtype) for name in attributes.columns}
     cells = [[plain(value) for value in attributes[name].tolist()] for name in attributes.columns]
     places = needs_places(export, "PostGIS").tolist()
-    labels = {**kinds, "geom": "geometry(PointZ, 4979)"}
+    labels = {**kinds, "geom": "geometry(PointZ, 4326)"}
     tables: list[tuple[str, dict[str, str], Iterable[Sequence[Any]]]] = [
         ("labels", labels, ([*row, _point(place)] for *row, place in zip(*cells, places, strict=True)))
     ]
@@ -157,7 +157,7 @@ def _cameras(export: Export) -> tuple[str, dict[str, str], Iterable[Sequence[Any
         "picture": "text",
         "pass": "text",
         "time": "timestamptz",
-        "geom": "geometry(PointZ, 4979)",
+        "geom": "geometry(PointZ, 4326)",
     }
     rows = zip(images.image_id.tolist(), images.name.to_pylist(), images.pass_id.texts(), times, places, strict=True)
     return "cameras", columns, ([*row, _point(place)] for *row, place in rows)
@@ -173,7 +173,7 @@ def _kind(name: str, dtype: Any) -> str:
 
 def _point(place: Sequence[float]) -> str:
     lon, lat, height = place
-    return f"SRID=4979;POINT Z ({lon!r} {lat!r} {height!r})"
+    return f"SRID=4326;POINT Z ({lon!r} {lat!r} {height!r})"
 
 
 def _without_null(cell: Any) -> Any:
@@ -183,17 +183,18 @@ def _without_null(cell: Any) -> Any:
 
 def _parts(url: str, default_name: str) -> tuple[str, str, str]:
     """Return the address for libpq, the schema and the name of the map."""
-    parts = urlsplit(url)
-    query = parse_qsl(parts.query, keep_blank_values=True)
-    ours = {key: value for key, value in query if key in ("schema", "map")}
-    rest = urlencode([(key, value) for key, value in query if key not in ours])
+    address, _, query = url.partition("?")
+    pairs = parse_qsl(query, keep_blank_values=True)
+    ours = {key: value for key, value in pairs if key in ("schema", "map")}
+    rest = urlencode([(key, value) for key, value in pairs if key not in ours], quote_via=quote)
     schema, name = ours.get("schema", _SCHEMA), ours.get("map", default_name)
     if not schema or not name or "\0" in schema + name:
         raise SettingError(f"{_without_password(url)}: schema and map must have names", hint="for example ?schema=maps")
-    return urlunsplit(parts._replace(query=rest)), schema, name
+    return f"{address}?{rest}" if rest else address, schema, name
 
 
 def _without_password(url: str) -> str:
-    parts = urlsplit(url)
-    user, at, host = parts.netloc.rpartition("@")
-    return urlunsplit(parts._replace(netloc=f"{user.partition(':')[0]}{at}{host}", query=""))
+    address = url.partition("?")[0]
+    scheme, _, place = address.partition("://")
+    user, at, host = place.rpartition("@")
+    return f"{scheme}://{user.partition(':')[0]}{at}{host}"

@@ -30,6 +30,10 @@ def _sign(value: str) -> dict[str, str]:
     return {"traffic_sign": value}
 
 
+def _hazard(value: str) -> dict[str, str]:
+    return {"traffic_sign": "hazard", "hazard": value}
+
+
 SIGNS = (
     Sign("object--traffic-light", {"highway": "traffic_signals"}, names=("traffic light", "traffic lights", "light")),
     Sign("object--street-light", {"highway": "street_lamp"}, names=("street light", "street lamp", "lamp")),
@@ -46,8 +50,8 @@ SIGNS = (
     Sign("object--vegetation--tree", {"natural": "tree"}, names=("tree",)),
     Sign("object--bollard", {"barrier": "bollard"}, names=("bollard",)),
     Sign("construction--flat--curb-ramp", {"barrier": "kerb", "kerb": "lowered"}, names=("curb ramp", "kerb ramp")),
-    Sign("regulatory--stop", {"highway": "stop", **_sign("stop")}, "B,2a", "R1-1", ("stop", "stop sign")),
-    Sign("regulatory--yield", {"highway": "give_way", **_sign("give_way")}, "B,1", "R1-2", ("yield", "give way")),
+    Sign("regulatory--stop", _sign("stop"), "B,2a", "R1-1", ("stop", "stop sign")),
+    Sign("regulatory--yield", _sign("give_way"), "B,1", "R1-2", ("yield", "give way")),
     Sign("regulatory--priority-road", _sign("priority_road"), "B,3", None, ("priority road",)),
     Sign("regulatory--priority-over-oncoming-vehicles", _sign("priority_over_oncoming"), "B,6"),
     Sign("regulatory--give-way-to-oncoming-traffic", _sign("give_way_to_oncoming"), "B,5"),
@@ -90,38 +94,34 @@ SIGNS = (
     Sign("information--bus-stop", {"highway": "bus_stop"}, "E,15", "R7-107", ("bus stop",)),
     Sign("information--dead-end", _sign("dead_end"), "G,13", "W14-1", ("dead end", "no through road")),
     Sign("information--hospital", _sign("hospital"), "F,1a", "D9-2", ("hospital",)),
-    Sign("warning--curve-left", _sign("hazard;left_curve"), "A,1a", "W1-2L", ("curve left",)),
-    Sign("warning--curve-right", _sign("hazard;right_curve"), "A,1b", "W1-2R", ("curve right",)),
-    Sign("warning--road-narrows", _sign("hazard;road_narrows"), "A,4a", "W5-1", ("road narrows",)),
-    Sign("warning--uneven-road", _sign("hazard;bump"), "A,7a", "W8-8", ("uneven road",)),
+    Sign("warning--curve-left", _hazard("curve"), "A,1a", "W1-2L", ("curve left",)),
+    Sign("warning--curve-right", _hazard("curve"), "A,1b", "W1-2R", ("curve right",)),
+    Sign("warning--road-narrows", _hazard("road_narrows"), "A,4a", "W5-1", ("road narrows",)),
+    Sign("warning--uneven-road", _hazard("bump"), "A,7a", "W8-8", ("uneven road",)),
     Sign(
         "warning--slippery-road-surface",
-        _sign("hazard;slippery"),
+        _hazard("slippery_road"),
         "A,9",
         "W8-5",
         ("slippery road", "slippery road surface"),
     ),
-    Sign("warning--falling-rocks-or-debris-right", _sign("hazard;falling_rocks"), "A,11a", "W8-14", ("falling rocks",)),
-    Sign(
-        "warning--pedestrians-crossing", _sign("hazard;pedestrians"), "A,12", "W11-2", ("pedestrians crossing ahead",)
-    ),
-    Sign("warning--children", _sign("hazard;children"), "A,13", "S1-1", ("children", "school zone")),
-    Sign("warning--bicycles-crossing", _sign("hazard;cyclists"), "A,14", "W11-1", ("bicycles crossing",)),
-    Sign(
-        "warning--wild-animals", _sign("hazard;animal_crossing"), "A,15b", "W11-3", ("wild animals", "animal crossing")
-    ),
-    Sign("warning--roadworks", _sign("hazard;roadworks"), "A,16", "W21-1", ("roadworks", "road works", "construction")),
-    Sign("warning--traffic-signals", _sign("hazard;traffic_signals"), "A,17", "W3-3", ("traffic signals ahead",)),
-    Sign("warning--roundabout", _sign("hazard;roundabout"), "A,22", "W2-6", ("roundabout ahead",)),
-    Sign("warning--two-way-traffic", _sign("hazard;two_way_traffic"), "A,23", "W6-3", ("two way traffic",)),
+    Sign("warning--falling-rocks-or-debris-right", _hazard("falling_rocks"), "A,11a", "W8-14", ("falling rocks",)),
+    Sign("warning--pedestrians-crossing", _hazard("pedestrians"), "A,12", "W11-2", ("pedestrians crossing ahead",)),
+    Sign("warning--children", _hazard("children"), "A,13", "S1-1", ("children", "school zone")),
+    Sign("warning--bicycles-crossing", _hazard("cyclists"), "A,14", "W11-1", ("bicycles crossing",)),
+    Sign("warning--wild-animals", _hazard("animal_crossing"), "A,15b", "W11-3", ("wild animals", "animal crossing")),
+    Sign("warning--roadworks", _hazard("roadworks"), "A,16", "W21-1", ("roadworks", "road works", "construction")),
+    Sign("warning--traffic-signals", _hazard("traffic_signals"), "A,17", "W3-3", ("traffic signals ahead",)),
+    Sign("warning--roundabout", _hazard("roundabout"), "A,22", "W2-6", ("roundabout ahead",)),
+    Sign("warning--two-way-traffic", _hazard("two_way_traffic"), "A,23", "W6-3", ("two way traffic",)),
     Sign(
         "warning--railroad-crossing-with-barriers",
-        _sign("hazard;level_crossing"),
+        _hazard("level_crossing"),
         "A,25",
         "W10-1",
         ("railroad crossing",),
     ),
-    Sign("warning--railroad-crossing-without-barriers", _sign("hazard;level_crossing"), "A,26a", "W10-1"),
+    Sign("warning--railroad-crossing-without-barriers", _hazard("level_crossing"), "A,26a", "W10-1"),
     Sign("warning--other-danger", _sign("hazard"), "A,32", None, ("other danger",)),
 )
 
