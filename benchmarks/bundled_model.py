@@ -97,7 +97,7 @@ def main() -> None:
             progress=progress,
         )
     MODEL.parent.mkdir(exist_ok=True)
-    with new_file(MODEL) as temporary:
+    with new_file(MODEL, force=True, keep_record=False) as temporary:
         shutil.copyfile(result.model, temporary)
     figures = {
         "command": "make model",

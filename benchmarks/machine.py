@@ -25,7 +25,7 @@ def write_record(path: Path | None, results: Any, **more: Any) -> None:
 def keep_record(path: Path | None, record: dict[str, Any]) -> None:
     """Write a record whole or not at all, if a file is named."""
     if path is not None:
-        with new_file(path) as temporary:
+        with new_file(path, force=True, keep_record=False) as temporary:
             temporary.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
 
 

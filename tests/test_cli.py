@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -129,10 +130,18 @@ def test_a_map_replaces_an_older_one_and_nothing_else(street: Path, tmp_path: Pa
     works("map", street, "--out", tmp_path / "map")
     works("map", street, "--out", tmp_path / "map", "--set", "min_votes=5")
     assert valuemap.read_map(tmp_path / "map").run["settings"]["min_votes"] == 5
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "thesis.txt").write_text("years of work")
-    assert "not ours to replace" in complains("map", street, "--out", tmp_path / "mine")
-    assert (tmp_path / "mine" / "thesis.txt").read_text() == "years of work"
+    (tmp_path / "map" / "thesis.txt").write_text("years of work")
+    (tmp_path / "map" / "votes.parquet").write_text("by hand")
+    assert "votes.parquet: is not ours to replace" in complains("map", street, "--out", tmp_path / "map")
+    assert (tmp_path / "map" / "votes.parquet").read_text() == "by hand"
+    works("map", street, "--out", tmp_path / "map", "--force")
+    assert (tmp_path / "map" / "thesis.txt").read_text() == "years of work"
+    works("export", tmp_path / "map", tmp_path / "labels.csv")
+    works("export", tmp_path / "map", tmp_path / "labels.csv")
+    (tmp_path / "labels.csv").write_text("corrected by hand")
+    assert "labels.csv: is not ours to replace" in complains("export", tmp_path / "map", tmp_path / "labels.csv")
+    assert (tmp_path / "labels.csv").read_text() == "corrected by hand"
+    works("export", tmp_path / "map", tmp_path / "labels.csv", "--force")
 
 
 def test_bad_input_is_one_line_and_no_map(street: Path, tmp_path: Path) -> None:
@@ -227,17 +236,99 @@ def test_a_coco_file_naming_an_unknown_image_is_refused(tmp_path: Path) -> None:
     np.testing.assert_allclose(dataset.detections.center_px, [[320.0, 240.0]])
 
 
-def test_ctrl_c_leaves_nothing_behind(tmp_path: Path) -> None:
-    # One cluster of thousands of detections: minutes of work.
+def heard_by_default() -> None:
+    """Undo what a parent does that ignores signals for its children, as nohup and scripts do."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
+def cpu_seconds(process: int) -> float:
+    """Return how long a process has worked, however busy the machine is."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+@pytest.fixture
+def dense(tmp_path: Path) -> list[str]:
+    """A command that works for minutes: one cluster of thousands of detections."""
     scene = random_scene(5, images=200, objects=12, clutter=12000)
     valuemap.write_dataset(as_dataset(scene), tmp_path / "dense")
     command = [*COMMAND, "map", str(tmp_path / "dense"), "--out", str(tmp_path / "map"), "--threads", "1"]
     wide = ["--set", "max_reprojection_error_px=60", "--set", "min_parallax_deg=0.01", "--set", "cluster_radius_m=1000"]
-    with subprocess.Popen([*command, *wide], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        time.sleep(3.0)
+    return [*command, "--method", "paper", *wide]
+
+
+@pytest.mark.parametrize(
+    ("number", "told_first", "code"),
+    [
+        (signal.SIGINT, "interrupted: nothing was written", 130),
+        (signal.SIGTERM, "terminated: nothing was written", 143),
+    ],
+)
+def test_a_signal_to_end_leaves_nothing_behind(
+    number: signal.Signals, told_first: str, code: int, dense: list[str], tmp_path: Path
+) -> None:
+    with subprocess.Popen(
+        dense, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heard_by_default
+    ) as process:
+        while process.poll() is None and cpu_seconds(process.pid) < 2.5:  # Starting takes a second.
+            time.sleep(0.05)
         assert process.poll() is None, "the work was too short to be interrupted"
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         _, told = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert told.splitlines()[0] == "interrupted: nothing was written"
+    assert process.returncode == code
+    assert told.splitlines()[0] == told_first
+    assert len(told.splitlines()) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["dense"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_libraries_are_imported_is_one_line(number: signal.Signals) -> None:
+    """The import of the commands is slowed down until the signal is there."""
+    code = """
+import builtins, os, signal, sys, valuemap.cli
+plain = builtins.__import__
+def slow(name, *rest):
+    if name.startswith("pyarrow"):
+        os.kill(os.getpid(), int(sys.argv[1]))
+    return plain(name, *rest)
+builtins.__import__ = slow
+valuemap.cli.main()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(int(number))],
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=heard_by_default,
+    )
+    what = "interrupted" if number == signal.SIGINT else "terminated"
+    assert done.returncode == 128 + number
+    assert done.stderr.splitlines() == [
+        f"{what}: nothing was written",
+        "hint: run the same command again to start over",
+    ]
+    assert done.stdout == ""
+
+
+def test_signals_that_the_parent_ignores_stay_ignored(street: Path, tmp_path: Path) -> None:
+    code = """
+import os, signal, sys
+for number in (signal.SIGINT, signal.SIGHUP):
+    signal.signal(number, signal.SIG_IGN)
+import valuemap.cli
+valuemap.cli.end_in_order()
+for number in (signal.SIGINT, signal.SIGHUP):
+    os.kill(os.getpid(), number)
+valuemap.cli.main()
+"""
+    done = subprocess.run([sys.executable, "-c", code, "info", str(street)], capture_output=True, check=False)
+    assert done.returncode == 0
+
+
+def test_the_package_offers_what_it_says() -> None:
+    for name in valuemap.__all__:
+        assert getattr(valuemap, name).__name__ == name
+    assert set(valuemap.__all__) <= set(dir(valuemap))
+    with pytest.raises(AttributeError, match="has no attribute 'build_maps'"):
+        _ = valuemap.build_maps

@@ -15,6 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from small_dataset import ANCHOR, rewrite, small_dataset, with_column, with_value
 from valuemap.dataset import Dataset, Frame, read_dataset, rows_of, write_dataset
 from valuemap.errors import InputError, OutputError
+from valuemap.folders import LEDGER, new_file
 from valuemap.tables import Categories, table_to_arrow
 
 TABLES = ("cameras", "images", "detections", "truth", "truth_detections")
@@ -50,7 +51,7 @@ def test_the_order_of_rows_in_the_files_does_not_matter(folder: Path) -> None:
 def test_the_same_dataset_gives_the_same_bytes(folder: Path, tmp_path: Path) -> None:
     write_dataset(small_dataset(), tmp_path / "again")
     files = sorted(path.name for path in folder.iterdir())
-    assert files == sorted(["dataset.json", *(f"{name}.parquet" for name in TABLES)])
+    assert files == sorted([LEDGER, "dataset.json", *(f"{name}.parquet" for name in TABLES)])
     for name in files:
         assert (folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
 
@@ -308,11 +309,23 @@ def test_a_dataset_replaces_a_dataset_and_nothing_else(folder: Path, tmp_path: P
     smaller = Dataset(**{**vars(small_dataset()), "truth": None, "truth_detections": None})
     write_dataset(smaller, folder)
     assert read_dataset(folder).truth is None
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "thesis.txt").write_text("years of work")
-    with pytest.raises(OutputError, match="is not ours to replace"):
-        write_dataset(smaller, tmp_path / "mine")
-    assert (tmp_path / "mine" / "thesis.txt").read_text() == "years of work"
+    (folder / "thesis.txt").write_text("years of work")
+    write_dataset(small_dataset(), folder)
+    assert (folder / "thesis.txt").read_text() == "years of work"
+    rewrite(folder / "truth.parquet", with_value("x", 0, 4.5))
+    with pytest.raises(OutputError, match="truth.parquet: is not ours to replace"):
+        write_dataset(smaller, folder)
+    write_dataset(smaller, folder, force=True)
+    assert read_dataset(folder).truth is None
+
+
+def test_pictures_that_were_drawn_for_a_dataset_go_with_it(folder: Path) -> None:
+    for name in ("drawn.jpg", "pass-1/drawn.jpg"):
+        with new_file(folder / "images" / name) as path:
+            path.write_text("ours")
+        (folder / "images" / name).with_name("mine.jpg").write_text("mine")
+    write_dataset(small_dataset(), folder)
+    assert sorted(p.name for p in (folder / "images").rglob("*.jpg")) == ["mine.jpg", "mine.jpg"]
 
 
 def test_many_texts_are_written_as_codes(folder: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import shutil
 import threading
 from collections.abc import Callable
@@ -17,7 +18,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from small_dataset import small_dataset
+from small_dataset import rewrite, small_dataset, with_value
 from test_cli import colmap_model
 from tiny_models import red_finder, says
 from valuemap import build_map, read_dataset, write_dataset
@@ -35,6 +36,7 @@ from valuemap.detect.run import RECORD, RESULTS, detect_dataset, detect_folder, 
 from valuemap.detect.tiles import are_cut, merge_views, plan_tiles
 from valuemap.detect.truth import find_truth_detections
 from valuemap.errors import InputError, OutputError, SettingError
+from valuemap.folders import LEDGER
 from valuemap.readers.colmap import read_colmap
 from valuemap.simulate import PRESETS, simulate
 from valuemap.summary import summarize_dataset
@@ -101,7 +103,7 @@ def test_detections_of_a_dataset_are_replaced(dataset: Path, finder: Path) -> No
         "detections_of_class": {"traffic_light": 8},
     }
     assert told[-1] == ("pictures", 4, 4)
-    assert not list(dataset.glob(".*"))
+    assert [path.name for path in dataset.glob(".*")] == [LEDGER]
 
 
 def test_images_may_come_without_detections(tmp_path: Path, finder: Path) -> None:
@@ -151,7 +153,7 @@ def test_no_usable_picture_is_an_error_and_changes_nothing(dataset: Path, finder
         detect_dataset(dataset, finder)
     assert (dataset / "detections.parquet").read_bytes() == before
     assert not (dataset / RECORD).exists()
-    assert not list(dataset.glob(".*"))
+    assert [path.name for path in dataset.glob(".*")] == [LEDGER]
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -414,7 +416,7 @@ def test_a_model_that_cannot_be_run_is_one_clear_line_and_leaves_nothing_behind(
         detect_dataset(dataset, BUNDLED_MODEL, DetectConfig(size="100x50"))
     assert "multiples of 32" in refusal.value.hint
     assert capfd.readouterr().err == ""  # ONNX Runtime would print the same at length.
-    assert not list(dataset.glob(".*"))
+    assert [path.name for path in dataset.glob(".*")] == [LEDGER]
 
 
 def test_a_full_disk_is_one_clear_line(dataset: Path, finder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -506,6 +508,35 @@ def test_a_folder_of_pictures_gives_annotations_that_can_be_compared(tmp_path: P
     assert set(match_pictures(read_found(tmp_path / "out"), labels)) == {picture.path for picture in labels.pictures}
     with pytest.raises(InputError, match="no pictures in it"):
         detect_folder(tmp_path / "out", finder)
+
+
+def test_detections_of_others_are_replaced_by_force_only(dataset: Path, finder: Path) -> None:
+    rewrite(dataset / "detections.parquet", with_value("score", 0, 0.5))
+    with pytest.raises(OutputError, match="detections.parquet: is not ours to replace"):
+        detect_dataset(dataset, finder)
+    assert len(detect_dataset(dataset, finder, force=True)) == len(detect_dataset(dataset, finder))
+
+
+@pytest.mark.parametrize("kind", ["link", "dangling link", "pipe", "folder", "notes"])
+def test_what_has_the_name_of_a_journal_is_not_followed_or_truncated(
+    kind: str, dataset: Path, finder: Path, tmp_path: Path
+) -> None:
+    target, journal = tmp_path / "precious", dataset / ".detect.journal"
+    if kind in ("link", "notes"):
+        target.write_text("years of work")
+    if "link" in kind:
+        journal.symlink_to(target)
+    elif kind == "pipe":
+        os.mkfifo(journal)
+    elif kind == "folder":
+        journal.mkdir()
+    else:
+        target.rename(journal)
+    with pytest.raises(OutputError, match="journal: is not ours to replace"):
+        detect_dataset(dataset, finder)
+    if kind in ("link", "notes"):
+        assert (journal if kind == "notes" else target).read_text() == "years of work"
+    assert target.exists() == (kind == "link")
 
 
 def test_annotations_of_others_are_not_replaced(tmp_path: Path, finder: Path) -> None:

@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 
 from small_dataset import small_dataset
-from test_cli import COMMAND, complains, works
+from test_cli import COMMAND, complains, heard_by_default, works
 from test_detect import painted, save
 from tiny_models import red_finder
 from valuemap import read_dataset, write_dataset
@@ -235,7 +235,9 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path) -> None:
         save(data / "images" / f"{i}.png", painted((640, 480), [(9 * i, 9, 9 * i + 5, 30)]))
     before = (data / "detections.parquet").read_bytes()
     command = [*COMMAND, "detect", str(data), "--model", str(red_finder(tmp_path / "finder.onnx"))]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heard_by_default
+    ) as process:
         journal = data / ".detect.journal"
         while process.poll() is None and not (journal.is_file() and journal.stat().st_size > 5000):
             time.sleep(0.02)

@@ -152,7 +152,7 @@ def test_the_same_map_gives_the_same_bytes(name: str, tmp_path: Path) -> None:
 
 
 def test_the_suffix_may_be_in_capitals_and_a_file_is_replaced(tmp_path: Path) -> None:
-    export_map(local_map(), tmp_path / "MAP.CSV")
+    export_map(map_of([[0.0, 0.0, 0.0]]), tmp_path / "MAP.CSV")
     export_map(local_map(), tmp_path / "MAP.CSV")
     assert len(rows_of_csv(tmp_path / "MAP.CSV")) == 2
 
@@ -162,6 +162,15 @@ def test_a_format_may_be_named(tmp_path: Path) -> None:
     assert rows_in(tmp_path / "map.osm") == 4
     with pytest.raises(OutputError, match="there is no such format"):
         export_map(geographic_map(), tmp_path / "map.osm", format_name="shp")
+
+
+def test_a_file_of_somebody_else_is_replaced_by_force_only(tmp_path: Path) -> None:
+    (tmp_path / "map.csv").write_text("mine")
+    with pytest.raises(OutputError, match="is not ours to replace"):
+        export_map(local_map(), tmp_path / "map.csv")
+    assert (tmp_path / "map.csv").read_text() == "mine"
+    export_map(local_map(), tmp_path / "map.csv", force=True)
+    assert len(rows_of_csv(tmp_path / "map.csv")) == 2
 
 
 @pytest.mark.parametrize(

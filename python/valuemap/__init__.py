@@ -4,13 +4,35 @@ The verbs are `read_dataset`, `build_map` and `evaluate_map`; `write_dataset`, `
 are for what lies on disk.
 """
 
-from valuemap.config import MapConfig
-from valuemap.dataset import Dataset, Frame, read_dataset, write_dataset
-from valuemap.errors import ValuemapError
-from valuemap.evaluate import Evaluation, evaluate_map
-from valuemap.map_folder import Map, read_map, write_map
-from valuemap.pipeline import build_map
-from valuemap.writers import export_map
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from valuemap.config import MapConfig
+    from valuemap.dataset import Dataset, Frame, read_dataset, write_dataset
+    from valuemap.errors import ValuemapError
+    from valuemap.evaluate import Evaluation, evaluate_map
+    from valuemap.map_folder import Map, read_map, write_map
+    from valuemap.pipeline import build_map
+    from valuemap.writers import export_map
+
+_MODULE_OF = {
+    "Dataset": "dataset",
+    "Evaluation": "evaluate",
+    "Frame": "dataset",
+    "Map": "map_folder",
+    "MapConfig": "config",
+    "ValuemapError": "errors",
+    "build_map": "pipeline",
+    "evaluate_map": "evaluate",
+    "export_map": "writers",
+    "read_dataset": "dataset",
+    "read_map": "map_folder",
+    "write_dataset": "dataset",
+    "write_map": "map_folder",
+}
 
 __all__ = [
     "Dataset",
@@ -27,3 +49,16 @@ __all__ = [
     "write_dataset",
     "write_map",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name when it is first used: `valuemap.cli` must be there before the half second that all take."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'valuemap' has no attribute {name!r}")
+    value = getattr(import_module(f"valuemap.{_MODULE_OF[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 
 from valuemap.errors import InputError
-from valuemap.folders import new_folder
+from valuemap.folders import new_folder, settle
 from valuemap.tables import (
     Bools,
     Cameras,
@@ -33,6 +33,15 @@ from valuemap.tables import (
 
 FORMAT_VERSION = 1
 MARKER = "dataset.json"
+PARTS = (
+    MARKER,
+    *(f"{name}.parquet" for name in ("cameras", "images", "detections", "truth", "truth_detections", "rejected")),
+    "detect.json",
+    "boxes.json",
+)
+"""All files that a dataset may have: none of an older one may stay beside those of a new one."""
+PART_FOLDERS = ("images",)
+"""Folders of it whose files, as far as valuemap wrote them, are of that dataset alone."""
 _QUATERNION_TOLERANCE = 1e-3
 _ROUNDING = 1e-12
 
@@ -150,10 +159,14 @@ def read_images(path: str | Path) -> tuple[Cameras, Images]:
     return cameras, _check_images(images, cameras, str(folder))
 
 
-def write_dataset(dataset: Dataset, path: str | Path) -> None:
-    """Check a dataset and write it as a folder; an older dataset there is replaced, never half."""
+def write_dataset(dataset: Dataset, path: str | Path, *, force: bool = False) -> None:
+    """Check a dataset and write it as a folder; an older dataset that is there is replaced, never half.
+
+    Other files in the folder stay. Where one that valuemap did not write is in the way, an `OutputError` says so; with
+    `force` it is replaced.
+    """
     dataset = check_dataset(dataset, source=dataset.name)
-    with new_folder(Path(path), marker=MARKER) as folder:
+    with new_folder(Path(path), parts=PARTS, part_folders=PART_FOLDERS, force=force) as folder:
         head = {"format_version": FORMAT_VERSION, "name": dataset.name, "frame": dataset.frame.to_json()}
         (folder / MARKER).write_text(json.dumps(head, indent=2) + "\n", encoding="utf-8")
         tables: dict[str, Table | None] = {
@@ -224,6 +237,7 @@ def number_passes(images: Images) -> Ints:
 
 def _read_head(folder: Path) -> dict[str, Any]:
     path = folder / MARKER
+    settle(folder)
     if not path.is_file():
         raise InputError(
             f"{folder}: is not a dataset: there is no {MARKER} in it",

@@ -152,7 +152,7 @@ def experiment_passes(
         run = _read_run(path)
         if run is None:
             run = _measure(dataset, config, reference, cluster, pass_number, seed, passes, radius_m, threads)
-            _write_json(run, path)
+            _write_json(run, path, force=True)  # One that is damaged is there, and is no use to anybody.
         runs.append(run)
     progress("maps of some passes", len(jobs), len(jobs))
     result = PassesResult(
@@ -401,6 +401,6 @@ def _read_run(path: Path) -> dict[str, Any] | None:
     return content if isinstance(content, dict) else None
 
 
-def _write_json(content: Any, path: Path) -> None:
-    with new_file(path) as temporary:
+def _write_json(content: Any, path: Path, *, force: bool = False) -> None:
+    with new_file(path, force=force) as temporary:
         temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

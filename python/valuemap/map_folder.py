@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from valuemap.dataset import Frame
 from valuemap.errors import InputError
-from valuemap.folders import new_folder
+from valuemap.folders import new_folder, settle
 from valuemap.tables import Labels, Votes, read_table, table_to_arrow, write_table
 
 if TYPE_CHECKING:
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 MARKER = "run.json"
 REVIEW = "review.json"
 """What people decided about the labels (`valuemap.review`): the one file that a new map in the same folder keeps."""
+PARTS = (MARKER, "labels.parquet", "votes.parquet", "rejected.parquet")
+"""All files that a map may have: none of an older one may stay beside those of a new one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +36,13 @@ class Map:
     run: dict[str, Any]
 
 
-def write_map(result: Map, path: str | Path) -> None:
-    """Write a map as a folder; an older map there is replaced, never half."""
-    with new_folder(Path(path), marker=MARKER, keep=[REVIEW]) as folder:
+def write_map(result: Map, path: str | Path, *, force: bool = False) -> None:
+    """Write a map as a folder; an older map that is there is replaced, never half.
+
+    Other files in the folder stay. Where one that valuemap did not write is in the way, an `OutputError` says so; with
+    `force` it is replaced.
+    """
+    with new_folder(Path(path), parts=PARTS, force=force) as folder:
         run = {**result.run, "frame": result.frame.to_json()}
         (folder / MARKER).write_text(json.dumps(run, indent=2) + "\n", encoding="utf-8")
         write_labels(result, folder / "labels.parquet")
@@ -53,6 +59,7 @@ def read_map(path: str | Path) -> Map:
     """
     folder = Path(path)
     head = folder / MARKER
+    settle(folder)
     if not head.is_file():
         raise InputError(f"{folder}: is not a map: there is no {MARKER} in it", hint="make one with valuemap map")
     try:

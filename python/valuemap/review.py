@@ -207,7 +207,7 @@ def write_review(path: str | Path, decisions: Sequence[Decision], frame: Frame) 
         "frame": frame.to_json(),
         "decisions": [_to_json(decision, frame) for decision in ordered],
     }
-    with new_file(Path(path)) as temporary:
+    with new_file(Path(path), force=True) as temporary:  # What is there was read before, and is in it.
         temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from typing import Annotated, Any
 
 import typer
 import typer.core
 
+from valuemap.cli.signals import Terminated, exit_code
 from valuemap.errors import ValuemapError
 
-INTERRUPTED = 130
+_NOTHING_WRITTEN = ("nothing was written", "run the same command again to start over")
 
 
 class _Commands(typer.core.TyperGroup):
@@ -24,20 +28,31 @@ class _Commands(typer.core.TyperGroup):
         return sorted(super().list_commands(ctx), key=order.__getitem__)
 
     def invoke(self, ctx: Any) -> Any:
-        try:
-            return super().invoke(ctx)
-        except ValuemapError as error:
-            complain(f"error: {error}", error.hint)
-            sys.exit(1)
-        except KeyboardInterrupt:
-            complain("interrupted: nothing was written", "run the same command again to start over")
-            sys.exit(INTERRUPTED)
+        with on_interrupt(*_NOTHING_WRITTEN):
+            try:
+                return super().invoke(ctx)
+            except ValuemapError as error:
+                complain(f"error: {error}", error.hint)
+                sys.exit(1)
 
 
 def complain(message: str, hint: str) -> None:
     """Print one line and a hint on stderr."""
     print(message, file=sys.stderr)
     print(f"hint: {hint}", file=sys.stderr)
+
+
+@contextmanager
+def on_interrupt(state: str, hint: str) -> Iterator[None]:
+    """Say in one line what is on disk when the user, or a signal to end, stops the work, and exit as shells expect."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        complain(f"interrupted: {state}", hint)
+        sys.exit(exit_code(signal.SIGINT))
+    except Terminated as end:
+        complain(f"terminated: {state}", hint)
+        sys.exit(exit_code(end.signal))
 
 
 app = typer.Typer(

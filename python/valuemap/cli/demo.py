@@ -27,8 +27,8 @@ def demo_command(
     """Simulate a city, draw its pictures, detect lights in them, map these, evaluate and draw the map."""
     from valuemap.demo import run_demo
 
-    check_place(out / "dataset", marker=dataset_folder.MARKER)
-    check_place(out / "map", marker=map_folder.MARKER)
+    check_place(out / "dataset", parts=dataset_folder.PARTS)
+    check_place(out / "map", parts=map_folder.PARTS)
     with progress_bars() as progress:
         outcome = run_demo(out, seed=seed, progress=progress)
     show(summarize_dataset(outcome.dataset), title="A simulated city and what was detected in its pictures")

@@ -10,8 +10,8 @@ from typing import Annotated, get_args
 import typer
 
 from valuemap import dataset as dataset_folder
-from valuemap.cli.app import INTERRUPTED, app, complain
-from valuemap.cli.options import AsJson, Settings
+from valuemap.cli.app import app, on_interrupt
+from valuemap.cli.options import AsJson, Force, Settings
 from valuemap.cli.show import SHOWN_PROBLEMS, progress_bars, show
 from valuemap.config import DetectConfig, ModelKind, Provider
 from valuemap.errors import SettingError
@@ -39,6 +39,7 @@ def detect_command(
         Path | None, typer.Option(help="Where the results of a folder of pictures go; default: into it.")
     ] = None,
     assignments: Settings = None,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Find objects in pictures with an ONNX model; started again, an interrupted run goes on."""
@@ -62,15 +63,12 @@ def detect_command(
             "--out is for folders of pictures, --images for datasets",
             hint="a dataset gets its detections, a folder of pictures detections.json",
         )
-    try:
-        with progress_bars() as progress:
-            if is_dataset:
-                detect_dataset(place, model, config, pictures=images, progress=progress)
-            else:
-                detect_folder(place, model, config, out=out, progress=progress)
-    except KeyboardInterrupt:
-        complain("interrupted: the detections are as before", "run the same command again to go on from here")
-        sys.exit(INTERRUPTED)
+    state, hint = "the detections are as before", "run the same command again to go on from here"
+    with on_interrupt(state, hint), progress_bars() as progress:
+        if is_dataset:
+            detect_dataset(place, model, config, pictures=images, force=force, progress=progress)
+        else:
+            detect_folder(place, model, config, out=out, force=force, progress=progress)
     record = json.loads(((out or place) / RECORD).read_text(encoding="utf-8"))
     if as_json:
         print(json.dumps(record, indent=2))

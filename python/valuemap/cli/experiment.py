@@ -10,7 +10,7 @@ import typer
 from rich.table import Table
 
 from valuemap.cli import show as shown
-from valuemap.cli.app import INTERRUPTED, app, complain
+from valuemap.cli.app import app, on_interrupt
 from valuemap.cli.options import AsJson, Settings
 from valuemap.cli.show import log, progress_bars
 from valuemap.config import MapConfig, Method
@@ -36,21 +36,18 @@ def passes_command(
     from valuemap.experiment import CURVES, experiment_passes
 
     config = MapConfig(method=method).with_settings(assignments or [])  # type: ignore[arg-type]
-    try:
-        with progress_bars() as progress:
-            result = experiment_passes(
-                read_dataset(dataset),
-                out,
-                config,
-                seeds=seeds,
-                min_passes=min_passes,
-                radius_m=radius,
-                threads=threads,
-                progress=progress,
-            )
-    except KeyboardInterrupt:
-        complain("interrupted: all finished maps are kept", "run the same command again to go on from here")
-        raise SystemExit(INTERRUPTED) from None
+    state, hint = "all finished maps are kept", "run the same command again to go on from here"
+    with on_interrupt(state, hint), progress_bars() as progress:
+        result = experiment_passes(
+            read_dataset(dataset),
+            out,
+            config,
+            seeds=seeds,
+            min_passes=min_passes,
+            radius_m=radius,
+            threads=threads,
+            progress=progress,
+        )
     if as_json:
         print(json.dumps(result.to_json(), indent=2))
         return

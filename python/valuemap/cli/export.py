@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from valuemap.cli.app import app
+from valuemap.cli.options import Force
 from valuemap.cli.show import log, show_notes
 from valuemap.dataset import Dataset, read_dataset
 from valuemap.errors import InputError
@@ -44,13 +45,14 @@ def export_command(
         Path | None,
         typer.Option(help="The dataset of the map, for pictures, cameras and --reviewed; default: found by itself."),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Write the labels of a map as one file or into a database."""
     result = read_map(map_)
     known = _dataset(map_, result, dataset)
     if reviewed or review is not None:
         result = _reviewed(result, map_, review, known)
-    export_map(result, target, format_name=format_name, dataset=known, crs=crs)
+    export_map(result, target, format_name=format_name, dataset=known, crs=crs, force=force)
     log.print(f"Wrote {len(result.labels)} labels to {target.partition('?')[0]}", highlight=False)
 
 

@@ -10,13 +10,13 @@ import typer
 
 from valuemap import map_folder
 from valuemap.cli.app import app
-from valuemap.cli.options import AsJson, Settings
+from valuemap.cli.options import AsJson, Force, Settings
 from valuemap.cli.show import log, progress_bars, show
 from valuemap.config import MapConfig, Method
 from valuemap.dataset import read_dataset
 from valuemap.evaluate import evaluate_map
 from valuemap.evidence import dataset_reference
-from valuemap.folders import check_place
+from valuemap.folders import check_files, check_place
 from valuemap.map_folder import write_map
 from valuemap.pipeline import build_map
 from valuemap.report.above import draw_map
@@ -34,20 +34,23 @@ def map_command(
         Path | None, typer.Option(metavar="FILE", help="Draw the map from above, as .png or .svg.")
     ] = None,
     assignments: Settings = None,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Turn the detections of a dataset into a map of labels."""
     config = MapConfig(method=method).with_settings(assignments or [])  # type: ignore[arg-type]
-    check_place(out, marker=map_folder.MARKER)
+    check_place(out, parts=map_folder.PARTS, force=force)
     if picture is not None:
         check_format(picture)
+        check_files(picture.parent, [picture.name], force=force)
     with progress_bars() as progress:
         data = read_dataset(dataset)
         result = build_map(data, config, threads=threads, progress=progress)
     result.run["dataset_folder"] = dataset_reference(dataset, out)
-    write_map(result, out)
+    write_map(result, out, force=force)
     if picture is not None:
-        draw_map(result, data, evaluate_map(result, data).matches if data.truth is not None else None, picture)
+        matches = evaluate_map(result, data).matches if data.truth is not None else None
+        draw_map(result, data, matches, picture, force=force)
     if as_json:
         print(json.dumps(result.run, indent=2))
     else:

@@ -20,3 +20,4 @@ MaxRejected = Annotated[
     float,
     typer.Option("--max-rejected", metavar="SHARE", help="Stop where more of the boxes, or images, cannot be used."),
 ]
+Force = Annotated[bool, typer.Option("--force", help="Replace files that valuemap did not write, too.")]

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from valuemap.cli.app import app
+from valuemap.cli.options import Force
 from valuemap.cli.show import log, progress_bars
 from valuemap.dataset import read_dataset
 from valuemap.errors import OutputError
@@ -29,6 +30,7 @@ def report_command(
     passes: Annotated[
         Path | None, typer.Option(help="What valuemap experiment passes wrote: recall and errors by number of passes.")
     ] = None,
+    force: Force = False,
     radius: Annotated[float, typer.Option(help="Metres within which a label can be an object.")] = 2.0,
     truth_sigma: Annotated[
         float | None,
@@ -67,6 +69,7 @@ def report_command(
             dataset_folder=folder,
             evaluation=evaluation,
             passes=curves,
+            force=force,
             progress=progress,
         )
     log.print(f"Wrote {out}, its figures and tables to {files_folder(out)}", highlight=False, markup=False)

@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 from valuemap.cli.app import app
-from valuemap.cli.options import AsJson
+from valuemap.cli.options import AsJson, Force
 from valuemap.cli.show import log, out, show
 from valuemap.dataset import read_dataset
 from valuemap.errors import InputError, SettingError
@@ -38,6 +38,7 @@ def show_command(
     dataset: Annotated[
         Path | None, typer.Option(help="What the map was made from; default: where valuemap map found it.")
     ] = None,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Show one label as a picture: its votes, the images that missed it, its rays; or why there is none at a place."""
@@ -60,10 +61,10 @@ def show_command(
             f"{map_}: cannot tell which dataset the map was made from", hint="give its folder with --dataset"
         )
     evidence = Evidence(result, read_dataset(folder))
-    pictures = folder / PICTURES
+    pictures = folder / PICTURES if (folder / PICTURES).is_dir() else None
     if label is not None:
         facts = _label_facts(evidence, label)
-        save_figure(plot_label(evidence, label, pictures if pictures.is_dir() else None), picture)
+        save_figure(plot_label(evidence, label, pictures), picture, force=force)
         if as_json:
             print(json.dumps(facts, indent=2))
         else:
@@ -72,7 +73,7 @@ def show_command(
         point = _place(evidence, at, lat, lon)
         rejected = read_rejected(map_)
         answer = explain_place(evidence, point, rejected, radius_m=radius)
-        save_figure(plot_place(evidence, answer, rejected, pictures if pictures.is_dir() else None), picture)
+        save_figure(plot_place(evidence, answer, rejected, pictures), picture, force=force)
         if as_json:
             print(json.dumps(answer.to_json(), indent=2))
         else:

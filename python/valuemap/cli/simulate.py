@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Annotated
 
 import typer
 
-from valuemap import dataset as dataset_folder
-from valuemap.cli.app import INTERRUPTED, app, complain
-from valuemap.cli.import_.app import finish_dataset
-from valuemap.cli.options import DatasetOut, Settings
+from valuemap.cli.app import app, on_interrupt
+from valuemap.cli.import_.app import check_out, finish_dataset
+from valuemap.cli.options import DatasetOut, Force, Settings
 from valuemap.cli.show import log, progress_bars
 from valuemap.errors import SettingError
-from valuemap.folders import check_place
 
 
 @app.command("simulate")
@@ -25,26 +22,24 @@ def simulate_command(
         bool, typer.Option("--images", help="Draw the pictures too, with the true boxes in boxes.json.")
     ] = False,
     assignments: Settings = None,
+    force: Force = False,
 ) -> None:
     """Simulate a city, drives through it and a noisy detector, with truth."""
     from valuemap.simulate import PRESETS, record_city
 
     if preset not in PRESETS:
         raise SettingError(f"--preset {preset}: there is no such preset", hint=f"choose one of {', '.join(PRESETS)}")
-    check_place(out, marker=dataset_folder.MARKER)
+    check_out(out, force=force)
     config = PRESETS[preset].with_settings(assignments or [])
     if images:
         config.check_drawable()
     with progress_bars() as progress:
         recording = record_city(config, seed=seed, name=preset, progress=progress)
-    finish_dataset(recording.dataset, out)
+    finish_dataset(recording.dataset, out, force=force)
     if images:
         from valuemap.simulate.render import render_images  # Draws with a library that nothing else here needs.
 
-        try:
-            with progress_bars() as progress:
-                painted = render_images(recording, out, progress=progress)
-        except KeyboardInterrupt:
-            complain("interrupted: the dataset is whole, its pictures are not", "run the same command again")
-            sys.exit(INTERRUPTED)
+        state, hint = "the dataset is whole, its pictures are not", "run the same command again"
+        with on_interrupt(state, hint), progress_bars() as progress:
+            painted = render_images(recording, out, progress=progress)
         log.print(f"Drew {painted} pictures in {out / 'images'}", highlight=False)

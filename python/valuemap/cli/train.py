@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from valuemap.cli.app import INTERRUPTED, app, complain
+from valuemap.cli.app import app, on_interrupt
 from valuemap.cli.options import AsJson, Settings
 from valuemap.cli.show import SHOWN_PROBLEMS, progress_bars, show
 from valuemap.config import TrainConfig
@@ -34,22 +34,19 @@ def train_command(
     from valuemap.detect.train import train
 
     config = TrainConfig().with_settings(assignments or [])
-    try:
-        with progress_bars() as progress:
-            labels = [read_labels(source) for source in data]
-            result = train(
-                labels,
-                out,
-                config,
-                resume=resume,
-                one_class=one_class,
-                seed=seed,
-                threads=threads,
-                progress=progress,
-            )
-    except KeyboardInterrupt:
-        complain("interrupted: all finished epochs are kept", "go on with the same command and --resume")
-        sys.exit(INTERRUPTED)
+    state, hint = "all finished epochs are kept", "go on with the same command and --resume"
+    with on_interrupt(state, hint), progress_bars() as progress:
+        labels = [read_labels(source) for source in data]
+        result = train(
+            labels,
+            out,
+            config,
+            resume=resume,
+            one_class=one_class,
+            seed=seed,
+            threads=threads,
+            progress=progress,
+        )
     facts = {**asdict(result), "model": str(result.model)}
     skipped, counts = facts.pop("skipped"), facts.pop("counts")
     if as_json:

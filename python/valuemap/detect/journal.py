@@ -6,17 +6,21 @@ writes numbers so that they read back without a change: nobody can see in the re
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import stat
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from valuemap.detect.boxes import Boxes
 from valuemap.detect.letterbox import Size
+from valuemap.errors import OutputError
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,22 +58,29 @@ class Journal:
     """The file of a run of `run`; it begins anew where that is another run than the file tells of.
 
     Pictures go through the network in groups, so only whole groups of an older run count: `done` pictures.
+
+    Raises
+    ------
+    OutputError
+        What has its name is a link, or no file, or a file that no journal is.
+    OSError
+        The file cannot be written.
     """
 
     def __init__(self, path: Path, run: dict[str, Any], group: int) -> None:
         self.path = path
         self.done = 0
         head = json.dumps(run, sort_keys=True).encode() + b"\n"
-        end = len(head)
-        if path.is_file():
-            with path.open("rb") as file:
-                if file.readline() == head:
-                    self.done, end = _whole_groups(file, end, group)
-        self._file = path.open("r+b" if self.done else "wb")
-        if self.done:
-            self._file.seek(end)
-            self._file.truncate()
-        else:
+        self._file = _open_own(path)
+        first, end = self._file.readline(), len(head)
+        if first == head:
+            self.done, end = _whole_groups(self._file, end, group)
+        elif first and not _is_head(first):
+            self._file.close()
+            raise _foreign(path)
+        self._file.seek(end if self.done else 0)
+        self._file.truncate()
+        if not self.done:
             self._file.write(head)
 
     def write(self, outcomes: Iterable[Outcome]) -> None:
@@ -93,6 +104,35 @@ class Journal:
         self.close()
         with suppress(OSError):
             self.path.unlink()
+
+
+def _open_own(path: Path) -> BinaryIO:
+    """Open a file for reading and writing, or make it; a link is not followed, and a pipe is not waited for."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        descriptor = os.open(path, flags, 0o666)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
+            raise _foreign(path) from error
+        raise
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise _foreign(path)
+    return os.fdopen(descriptor, "r+b")
+
+
+def _is_head(line: bytes) -> bool:
+    try:
+        return "model_sha256" in json.loads(line)
+    except (ValueError, TypeError, RecursionError):
+        return False
+
+
+def _foreign(path: Path) -> OutputError:
+    return OutputError(
+        f"{path}: is not ours to replace: it is no journal of an interrupted run",
+        hint="remove it, or use another --out",
+    )
 
 
 def _whole_groups(file: Iterable[bytes], end: int, group: int) -> tuple[int, int]:

@@ -23,7 +23,7 @@ from valuemap.detect.panorama import MODEL as PANORAMA
 from valuemap.detect.pictures import list_pictures
 from valuemap.detect.truth import find_truth_detections
 from valuemap.errors import InputError, OutputError
-from valuemap.folders import new_file
+from valuemap.folders import check_files, new_file, remove_file
 from valuemap.progress import Progress, silent
 from valuemap.tables import Cameras, Categories, Detections, Images, Truth, read_table, write_table
 
@@ -32,6 +32,7 @@ RECORD = "detect.json"
 RESULTS = "detections.json"
 """What a run over a folder of pictures finds, in COCO's format."""
 _JOURNAL = ".detect.journal"
+_DETECTIONS, _TRUTH_DETECTIONS = "detections.parquet", "truth_detections.parquet"
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +52,7 @@ def detect_dataset(
     config: DetectConfig | None = None,
     *,
     pictures: str | Path | None = None,
+    force: bool = False,
     progress: Progress = silent,
 ) -> Detections:
     """Look for objects in the pictures of a dataset, and make what is found its detections.
@@ -70,6 +72,8 @@ def detect_dataset(
         Settings; the defaults where not given.
     pictures
         Folder in which the names of the images are; default: `images` in the dataset.
+    force
+        Replace detections that valuemap did not write, too.
     progress
         Called as progress("pictures", done, total).
 
@@ -79,9 +83,12 @@ def detect_dataset(
         The dataset or the model cannot be used, or none of the pictures.
     SettingError
         A class that the model does not have, or a provider that is not installed.
+    OutputError
+        The dataset has detections that valuemap did not write, or cannot be written.
     """
     folder, config = Path(dataset), config or DetectConfig()
     cameras, images = read_images(folder)
+    check_files(folder, (_DETECTIONS, _TRUTH_DETECTIONS, RECORD), force=force)
     place = Path(pictures) if pictures is not None else folder / "images"
     if not place.is_dir():
         raise InputError(f"{place}: no such folder of pictures", hint="say where the pictures are with --images")
@@ -91,14 +98,14 @@ def detect_dataset(
         run.finish(progress)
         detections = _as_detections(detector, run.journal, images)
         # The old pairs go first: at no time do they stand beside detections that they are not of.
-        (folder / "truth_detections.parquet").unlink(missing_ok=True)
-        with new_file(folder / "detections.parquet") as path:
+        remove_file(folder / _TRUTH_DETECTIONS, force=force)
+        with new_file(folder / _DETECTIONS, force=force) as path:
             write_table(detections, path)
         if (folder / "truth.parquet").is_file():
             truth = read_table(Truth, folder / "truth.parquet")
-            with new_file(folder / "truth_detections.parquet") as path:
+            with new_file(folder / _TRUTH_DETECTIONS, force=force) as path:
                 write_table(find_truth_detections(cameras, images, detections, truth), path)
-        run.write_record()
+        run.write_record(force=force)
     return detections
 
 
@@ -108,6 +115,7 @@ def detect_folder(
     config: DetectConfig | None = None,
     *,
     out: str | Path | None = None,
+    force: bool = False,
     progress: Progress = silent,
 ) -> Path:
     """Look for objects in all pictures below a folder, and write COCO annotations with scores.
@@ -124,7 +132,7 @@ def detect_folder(
     Raises
     ------
     OutputError
-        `out` holds a `detections.json` that no such run wrote, or cannot be written.
+        `out` holds a `detections.json` that valuemap did not write, or cannot be written.
     """
     folder, config = Path(pictures), config or DetectConfig()
     target = Path(out) if out is not None else folder
@@ -133,11 +141,7 @@ def detect_folder(
     paths = list_pictures(folder)
     if not paths:
         raise InputError(f"{folder}: there are no pictures in it", hint="give a dataset or a folder of pictures")
-    if (target / RESULTS).exists() and not any((target / name).exists() for name in (RECORD, _JOURNAL)):
-        raise OutputError(
-            f"{target / RESULTS}: is there without {RECORD}, so it is not ours to replace",
-            hint="choose another --out, or remove the file first",
-        )
+    check_files(target, (RESULTS, RECORD), force=force)
     detector = Detector(Path(model), config)
     names = [path.relative_to(folder).as_posix() for path in paths]
     try:
@@ -146,9 +150,9 @@ def detect_folder(
         raise OutputError(f"{target}: cannot be written: {error.strerror}", hint="choose another --out") from error
     with _Run(detector, target, [Task(path) for path in paths], names) as run:
         run.finish(progress)
-        with new_file(target / RESULTS) as path:
+        with new_file(target / RESULTS, force=force) as path:
             _write_coco(path, detector, run.journal, names)
-        run.write_record()
+        run.write_record(force=force)
     return target / RESULTS
 
 
@@ -229,7 +233,7 @@ class _Run:
                 hint="are these the right pictures? Of a dataset, --images says where they are",
             )
 
-    def write_record(self) -> None:
+    def write_record(self, *, force: bool) -> None:
         """Write detect.json and forget the journal."""
         unusable, found, turned = [], Counter[str](), 0
         for name, outcome in zip(self.names, self.journal.read(), strict=True):
@@ -253,7 +257,7 @@ class _Run:
             "seconds": round(self.seconds, 3),
             "pictures_a_second": round(ran / self.seconds, 2) if ran and self.seconds else None,
         }
-        with new_file(self.folder / RECORD) as path:
+        with new_file(self.folder / RECORD, force=force) as path:
             path.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
         self.journal.remove()
 

@@ -124,7 +124,9 @@ class _Layout:
     """Upper left corner."""
 
 
-def draw_map(result: Map, dataset: Dataset | None, matches: Outcomes | None, path: str | Path) -> None:
+def draw_map(
+    result: Map, dataset: Dataset | None, matches: Outcomes | None, path: str | Path, *, force: bool = False
+) -> None:
     """Draw a map from above as PNG or SVG, as the suffix says; same input, same bytes.
 
     Parameters
@@ -144,7 +146,7 @@ def draw_map(result: Map, dataset: Dataset | None, matches: Outcomes | None, pat
         The suffix is neither .png nor .svg, or the place cannot be written.
     """
     check_format(Path(path))
-    save_figure(plot_map(result, dataset, matches), Path(path))
+    save_figure(plot_map(result, dataset, matches), Path(path), force=force)
 
 
 def plot_map(result: Map, dataset: Dataset | None = None, matches: Outcomes | None = None) -> Figure:

@@ -76,8 +76,8 @@ def check_format(path: Path) -> None:
         )
 
 
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG or SVG, as the suffix says; never half.
+def save_figure(figure: Figure, path: Path, *, force: bool = False) -> None:
+    """Write a figure as PNG or SVG, as the suffix says; never half; with `force` over a file of somebody else.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def save_figure(figure: Figure, path: Path) -> None:
         The suffix is another one, or the place cannot be written.
     """
     check_format(path)
-    with new_file(path) as temporary:
+    with new_file(path, force=force) as temporary:
         temporary.write_bytes(figure_bytes(figure, path.suffix.lower()))
 
 

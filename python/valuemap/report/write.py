@@ -55,6 +55,7 @@ def write_report(
     dataset_folder: Path | None = None,
     evaluation: Evaluation | None = None,
     passes: PassesResult | None = None,
+    force: bool = False,
     progress: Progress = silent,
 ) -> None:
     """Write the report of a map as `page`, and its figures (PNG, SVG) and tables (CSV) into a folder beside it.
@@ -73,6 +74,8 @@ def write_report(
         The comparison with known objects.
     passes
         The result of `valuemap experiment passes`.
+    force
+        Replace files that valuemap did not write, too.
     progress
         Called as progress(what, done, total).
 
@@ -130,12 +133,12 @@ def write_report(
         notes=tuple(_notes(result, dataset, evidence, evaluation, crops)),
         data=inline_data(result, evidence, evaluation, {row: each for row, each in crops.items() if row not in listed}),
     )
-    with new_folder(files_folder(page), marker=FILES_MARKER) as folder:
+    with new_folder(files_folder(page), parts=(FILES_MARKER,), part_folders=("",), force=force) as folder:
         names = _write_files(folder, [above, *drawn], [*tables, *lists])
         record = {"valuemap": version("valuemap"), "page": page.name, "files": names}
         (folder / FILES_MARKER).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     progress("drawing the report", 4, steps)
-    with new_file(page) as temporary:
+    with new_file(page, force=force) as temporary:
         temporary.write_text(page_text(content), encoding="utf-8")
     progress("drawing the report", steps, steps)
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from valuemap.dataset import Dataset
 from valuemap.errors import OutputError
-from valuemap.folders import new_file
+from valuemap.folders import new_file, new_folder
 from valuemap.map_folder import Map
 from valuemap.writers.attributes import Export
+from valuemap.writers.colmap import FILES as COLMAP_FILES
 from valuemap.writers.colmap import write_colmap
 from valuemap.writers.csv import write_csv
 from valuemap.writers.flatgeobuf import write_flatgeobuf
@@ -36,9 +37,10 @@ WRITERS: dict[str, Callable[[Export, Path], None]] = {
     "xodr": write_opendrive,
 }
 
-FOLDER_WRITERS: dict[str, Callable[[Export, Path], None]] = {
-    "colmap": write_colmap,
+FOLDER_WRITERS: dict[str, tuple[Callable[[Export, Path], None], Collection[str]]] = {
+    "colmap": (write_colmap, COLMAP_FILES),
 }
+"""Each with the names of all files that it writes."""
 
 SUFFIXES: dict[str, str] = {
     ".csv": "csv",
@@ -62,8 +64,11 @@ def export_map(
     format_name: str | None = None,
     dataset: Dataset | None = None,
     crs: str | None = None,
+    force: bool = False,
 ) -> None:
     """Write the labels of a map as one file, a folder or into a database; never half.
+
+    A file that is there is replaced if valuemap wrote it and nobody changed it since, or with `force`.
 
     Parameters
     ----------
@@ -75,11 +80,14 @@ def export_map(
         What the map was made from: then the best pictures of each label are named, and formats that hold cameras do.
     crs
         Coordinates in this reference system ("EPSG:25832") instead of WGS84, in formats that hold any.
+    force
+        Replace a file that valuemap did not write, or that was changed since, too.
 
     Raises
     ------
     OutputError
-        There is no such format, it cannot hold what is asked for, or the place cannot be written.
+        There is no such format, it cannot hold what is asked for, a file of somebody else is there, or the place cannot
+        be written.
     InputError
         The format needs a geo-referenced map and this one is not, or the dataset is not that of the map.
     SettingError
@@ -91,10 +99,12 @@ def export_map(
         return
     path = Path(target)
     if format_name in FOLDER_WRITERS:
-        FOLDER_WRITERS[format_name](export, path)
+        writer, parts = FOLDER_WRITERS[format_name]
+        with new_folder(path, parts=parts, force=force) as folder:
+            writer(export, folder)
         return
     writer = WRITERS[_format(path, format_name)]
-    with new_file(path) as temporary:
+    with new_file(path, force=force) as temporary:
         writer(export, temporary)
 
 

@@ -12,7 +12,6 @@ import pycolmap
 from valuemap.cameras import colmap_camera
 from valuemap.dataset import Dataset, rows_of
 from valuemap.errors import InputError
-from valuemap.folders import new_file
 from valuemap.writers.attributes import Export
 
 _COLORS = ((230, 75, 53), (77, 187, 213), (0, 160, 135), (60, 84, 136), (243, 155, 127), (132, 145, 180))
@@ -23,7 +22,7 @@ FILES = ("cameras.txt", "frames.txt", "images.txt", "points3D.txt", "rigs.txt")
 
 
 def write_colmap(export: Export, folder: Path) -> None:
-    """Write a whole model as text into a folder: cameras, images with their detections as 2D points, and the labels.
+    """Write a whole model as text into a folder that is there: cameras, images with their detections as 2D points, and the labels.
 
     `ERROR` of a point is its reprojection error in pixels, its track the votes.
 
@@ -48,8 +47,7 @@ def write_colmap(export: Export, folder: Path) -> None:
     with tempfile.TemporaryDirectory() as fresh:
         model.write_text(fresh)
         for name in FILES:
-            with new_file(folder / name) as temporary:
-                shutil.copyfile(Path(fresh) / name, temporary)
+            shutil.copyfile(Path(fresh) / name, folder / name)
 
 
 def _add_images(model: pycolmap.Reconstruction, dataset: Dataset) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

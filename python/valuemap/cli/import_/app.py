@@ -9,7 +9,8 @@ import typer
 
 from valuemap.cli.app import app
 from valuemap.cli.show import log, show, show_notes
-from valuemap.dataset import Dataset, write_dataset
+from valuemap.dataset import PARTS, Dataset, write_dataset
+from valuemap.folders import check_place
 from valuemap.readers.vet import count_reasons
 from valuemap.summary import summarize_dataset
 from valuemap.tables import RejectedRows
@@ -20,9 +21,14 @@ import_app = typer.Typer(no_args_is_help=True, help="Bring posed images and dete
 app.add_typer(import_app, name="import")
 
 
-def finish_dataset(dataset: Dataset, out: Path) -> None:
+def check_out(out: Path, *, force: bool) -> None:
+    """Find out before the work whether a dataset can be written."""
+    check_place(out, parts=PARTS, force=force)
+
+
+def finish_dataset(dataset: Dataset, out: Path, *, force: bool) -> None:
     """Write the dataset and say on stderr what it holds, and what was left out."""
-    write_dataset(dataset, out)
+    write_dataset(dataset, out, force=force)
     show(summarize_dataset(dataset), console=log)
     if dataset.rejected is not None:
         show_notes(_rejected_lines(dataset.rejected, out))

@@ -7,12 +7,10 @@ from typing import Annotated
 
 import typer
 
-from valuemap import dataset as dataset_folder
-from valuemap.cli.import_.app import finish_dataset, import_app
+from valuemap.cli.import_.app import check_out, finish_dataset, import_app
 from valuemap.cli.import_.options import Anchor, CameraHeight, ClassName, Columns
-from valuemap.cli.options import DatasetOut, MaxRejected
+from valuemap.cli.options import DatasetOut, Force, MaxRejected
 from valuemap.cli.show import progress_bars
-from valuemap.folders import check_place
 from valuemap.readers.csv_file import parse_columns
 from valuemap.readers.vet import MAX_REJECTED
 
@@ -27,11 +25,12 @@ def import_bearings(
     camera_height: CameraHeight = 0.0,
     anchor: Anchor = None,
     max_rejected: MaxRejected = MAX_REJECTED,
+    force: Force = False,
 ) -> None:
     """Import places with bearings (degrees clockwise from north) of objects, and maybe depths."""
     from valuemap.readers import READERS
 
-    check_place(out, marker=dataset_folder.MARKER)
+    check_out(out, force=force)
     with progress_bars() as progress:
         dataset = READERS["bearings"](
             bearings,
@@ -43,4 +42,4 @@ def import_bearings(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out)
+    finish_dataset(dataset, out, force=force)

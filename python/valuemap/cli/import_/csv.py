@@ -7,12 +7,10 @@ from typing import Annotated
 
 import typer
 
-from valuemap import dataset as dataset_folder
-from valuemap.cli.import_.app import finish_dataset, import_app
+from valuemap.cli.import_.app import check_out, finish_dataset, import_app
 from valuemap.cli.import_.options import Anchor, CameraHeight, CameraText, Columns, PixelCenter, with_detections
-from valuemap.cli.options import DatasetOut, MaxRejected, Up
+from valuemap.cli.options import DatasetOut, Force, MaxRejected, Up
 from valuemap.cli.show import progress_bars
-from valuemap.folders import check_place
 from valuemap.readers.csv_file import parse_columns
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.vet import MAX_REJECTED
@@ -34,11 +32,12 @@ def import_csv(
     up: Up = None,
     anchor: Anchor = None,
     max_rejected: MaxRejected = MAX_REJECTED,
+    force: Force = False,
 ) -> None:
     """Import a table of images with poses or headings, on the Earth, in a map projection or in a frame of its own."""
     from valuemap.readers import READERS
 
-    check_place(out, marker=dataset_folder.MARKER)
+    check_out(out, force=force)
     with progress_bars() as progress:
         dataset = READERS["csv"](
             poses,
@@ -55,4 +54,4 @@ def import_csv(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out)
+    finish_dataset(dataset, out, force=force)

@@ -7,12 +7,10 @@ from typing import Annotated
 
 import typer
 
-from valuemap import dataset as dataset_folder
-from valuemap.cli.import_.app import finish_dataset, import_app
+from valuemap.cli.import_.app import check_out, finish_dataset, import_app
 from valuemap.cli.import_.options import Anchor, with_detections
-from valuemap.cli.options import DatasetOut, MaxRejected, Up
+from valuemap.cli.options import DatasetOut, Force, MaxRejected, Up
 from valuemap.cli.show import progress_bars
-from valuemap.folders import check_place
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.vet import MAX_REJECTED
 
@@ -39,11 +37,12 @@ def import_kitti(
         float | None, typer.Option(help="Degrees from north of camera 0 in the first frame, with --anchor.")
     ] = None,
     max_rejected: MaxRejected = MAX_REJECTED,
+    force: Force = False,
 ) -> None:
     """Import KITTI-odometry-style poses, with boxes in a CSV file that names frames (frame,x1,y1,x2,y2) or others."""
     from valuemap.readers import READERS
 
-    check_place(out, marker=dataset_folder.MARKER)
+    check_out(out, force=force)
     with progress_bars() as progress:
         dataset = READERS["kitti"](
             poses,
@@ -59,4 +58,4 @@ def import_kitti(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out)
+    finish_dataset(dataset, out, force=force)

@@ -7,12 +7,10 @@ from typing import Annotated
 
 import typer
 
-from valuemap import dataset as dataset_folder
-from valuemap.cli.import_.app import finish_dataset, import_app
+from valuemap.cli.import_.app import check_out, finish_dataset, import_app
 from valuemap.cli.import_.options import Anchor, PixelCenter, with_detections
-from valuemap.cli.options import DatasetOut, MaxRejected, Up
+from valuemap.cli.options import DatasetOut, Force, MaxRejected, Up
 from valuemap.cli.show import progress_bars
-from valuemap.folders import check_place
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.vet import MAX_REJECTED
 
@@ -31,11 +29,12 @@ def import_tum(
     up: Up = None,
     anchor: Anchor = None,
     max_rejected: MaxRejected = MAX_REJECTED,
+    force: Force = False,
 ) -> None:
     """Import a trajectory in TUM's format: t tx ty tz qx qy qz qw, camera to world."""
     from valuemap.readers import READERS
 
-    check_place(out, marker=dataset_folder.MARKER)
+    check_out(out, force=force)
     with progress_bars() as progress:
         dataset = READERS["tum"](
             trajectory,
@@ -50,4 +49,4 @@ def import_tum(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out)
+    finish_dataset(dataset, out, force=force)
