@@ -22,7 +22,7 @@ FILES = ("cameras.txt", "frames.txt", "images.txt", "points3D.txt", "rigs.txt")
 
 
 def write_colmap(export: Export, folder: Path) -> None:
-    """Write a whole model as text into a folder that is there: cameras, images with their detections as 2D points, and the labels.
+    """Write a whole model as text into a folder: cameras, images with their detections as 2D points, and the labels.
 
     `ERROR` of a point is its reprojection error in pixels, its track the votes.
 
