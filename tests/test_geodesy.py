@@ -8,7 +8,13 @@ from numpy.testing import assert_allclose
 from pyproj import Transformer
 
 from valuemap.errors import InputError
-from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
+from valuemap.geodesy import (
+    accuracy_note,
+    crs_from_lon_lat_height,
+    enu_from_lon_lat_height,
+    lon_lat_height_from_crs,
+    lon_lat_height_from_enu,
+)
 from valuemap.tables import Floats
 
 ANCHORS = [
@@ -93,3 +99,18 @@ def test_a_place_that_is_none_is_refused() -> None:
     with pytest.raises(InputError, match="has no place on the ellipsoid") as refusal:
         enu_from_lon_lat_height(np.array([[0.0, 95.0, 0.0]]), ANCHORS[0])
     assert "x east, y north, z up" in refusal.value.hint
+
+
+def test_heights_stay_where_a_system_has_none_of_its_own() -> None:
+    """The ellipsoid of Airy, below EPSG:27700, lies some 46 m from that of WGS84 in London."""
+    place = np.array([[-0.14, 51.5, 39.0]])
+    found = crs_from_lon_lat_height(place, "EPSG:27700")
+    assert found[0] == pytest.approx([529_203.0, 179_535.6, 39.0], abs=5.0)
+    assert found[0, 2] == 39.0
+    assert_allclose(lon_lat_height_from_crs(found, "EPSG:27700"), place, atol=1e-7)
+
+
+def test_a_missing_grid_is_told() -> None:
+    note = accuracy_note("EPSG:27700")
+    assert note is None or "EPSG:27700: positions are good to 2 m" in note  # None where somebody installed the grid.
+    assert accuracy_note("EPSG:32630") is None

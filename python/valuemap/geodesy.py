@@ -7,6 +7,7 @@ Earth below it. Who knows a heading, or a pose relative to the horizon, at some 
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -47,7 +48,8 @@ def lon_lat_height_from_crs(position: Floats, crs: str) -> Floats:
     position
         Easting (or longitude), northing (or latitude) and height (N, 3), whatever the order of the system's own axes.
     crs
-        What pyproj knows, such as `EPSG:32610`. Heights of a system without a vertical axis are ellipsoidal.
+        What pyproj knows, such as `EPSG:32610`. Heights of a system without a vertical axis are those above the
+        ellipsoid of WGS84.
 
     Raises
     ------
@@ -87,6 +89,25 @@ def crs_from_lon_lat_height(lon_lat_height: Floats, crs: str) -> Floats:
     return found
 
 
+def accuracy_note(crs: str) -> str | None:
+    """Return what to tell about positions in a reference system that PROJ could reach more exactly with a grid.
+
+    None where there is nothing to tell; raises as `crs_from_lon_lat_height` where there is no such system.
+    """
+    from pyproj.transformer import TransformerGroup
+
+    _to_wgs84(crs)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Best transformation is not available")
+        ways = TransformerGroup(_system(crs), "EPSG:4326", always_xy=True, allow_ballpark=False)
+    if ways.best_available or not ways.transformers:
+        return None
+    return (
+        f"{crs}: positions are good to {ways.transformers[0].accuracy:g} m, as PROJ lacks a grid for it; "
+        "projsync or PROJ_NETWORK=ON gets it"
+    )
+
+
 def true_axes_of_crs(position: Floats, crs: str) -> Floats:
     """Return rotations (N, 3, 3) from the axes of a map's grid into east, north, up at coordinates (N, 3) in it.
 
@@ -110,20 +131,26 @@ def true_axes_of_crs(position: Floats, crs: str) -> Floats:
 
 
 def _to_wgs84(crs: str) -> Any:
-    from pyproj import CRS, Transformer
+    from pyproj import Transformer
     from pyproj.exceptions import ProjError
 
     try:
-        system = CRS.from_user_input(int(crs) if crs.isdecimal() else crs)
-        if len(system.axis_info) < 3:
-            system = system.to_3d()
-        return Transformer.from_crs(system, "EPSG:4979", always_xy=True, only_best=True, allow_ballpark=False)
+        system = _system(crs)
+        # Without a vertical axis heights stay those of WGS84: those of other ellipsoids differ by up to 100 m and more.
+        target = "EPSG:4979" if len(system.axis_info) == 3 else "EPSG:4326"
+        return Transformer.from_crs(system, target, always_xy=True, only_best=True, allow_ballpark=False)
     except ProjError as error:
         reason = " ".join(str(error).split())[:200]
         raise SettingError(
             f"crs {crs!r}: cannot be brought to WGS84: {reason}",
             hint="give a code such as EPSG:32610, or 4979; heights above the sea need a grid that PROJ must have",
         ) from error
+
+
+def _system(crs: str) -> Any:
+    from pyproj import CRS
+
+    return CRS.from_user_input(int(crs) if crs.isdecimal() else crs)
 
 
 def _earth_from_enu(lon_deg: Floats, lat_deg: Floats) -> Floats:
