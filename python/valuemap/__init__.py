@@ -1,7 +1,7 @@
 """valuemap: many posed street images in, a trustworthy 3D map of static objects out.
 
 The verbs are `read_dataset`, `build_map` and `evaluate_map`; `write_dataset`, `write_map`, `read_map` and `export_map`
-are for what lies on disk.
+are for what lies on disk; `plot_map`, `draw_map` and `write_report` are for looking at it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,11 @@ if TYPE_CHECKING:
     from valuemap.evaluate import Evaluation, evaluate_map
     from valuemap.map_folder import Map, read_map, write_map
     from valuemap.pipeline import build_map
+    from valuemap.report.above import draw_map, plot_map
+    from valuemap.report.write import write_report
     from valuemap.writers import export_map
+
+__version__: str
 
 _MODULE_OF = {
     "Dataset": "dataset",
@@ -26,12 +30,15 @@ _MODULE_OF = {
     "MapConfig": "config",
     "ValuemapError": "errors",
     "build_map": "pipeline",
+    "draw_map": "report.above",
     "evaluate_map": "evaluate",
     "export_map": "writers",
+    "plot_map": "report.above",
     "read_dataset": "dataset",
     "read_map": "map_folder",
     "write_dataset": "dataset",
     "write_map": "map_folder",
+    "write_report": "report.write",
 }
 
 __all__ = [
@@ -41,18 +48,26 @@ __all__ = [
     "Map",
     "MapConfig",
     "ValuemapError",
+    "__version__",
     "build_map",
+    "draw_map",
     "evaluate_map",
     "export_map",
+    "plot_map",
     "read_dataset",
     "read_map",
     "write_dataset",
     "write_map",
+    "write_report",
 ]
 
 
 def __getattr__(name: str) -> Any:
     """Import a name when it is first used: `valuemap.cli` must be there before the half second that all take."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("valuemap")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'valuemap' has no attribute {name!r}")
     value = getattr(import_module(f"valuemap.{_MODULE_OF[name]}"), name)
@@ -61,4 +76,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return __all__

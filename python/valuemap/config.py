@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import numbers
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, Self, get_args
@@ -129,9 +130,9 @@ class MergeConfig:
     merge_radius_m: float = _setting(1.0, unit="m", effect="labels of different clusters closer than this become one")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class MapConfig:
-    """All settings of one `map` run, by stage."""
+    """All settings of one `map` run, by stage; single ones by name as well: `MapConfig(max_range_m=80)`."""
 
     method: Method = "robust"
     partition: PartitionConfig = PartitionConfig()
@@ -140,7 +141,27 @@ class MapConfig:
     existence: ExistenceConfig = ExistenceConfig()
     merge: MergeConfig = MergeConfig()
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        method: Method = "robust",
+        partition: PartitionConfig = partition,
+        vote: VoteConfig = vote,
+        noise: NoiseConfig = noise,
+        existence: ExistenceConfig = existence,
+        merge: MergeConfig = merge,
+        **settings: float | None,
+    ) -> None:
+        stages: dict[str, Any] = {
+            "partition": partition, "vote": vote, "noise": noise, "existence": existence, "merge": merge,
+        }  # fmt: skip
+        for name, value in settings.items():
+            stage, _ = _owner_of(name, stages, name)
+            stages[stage] = dataclasses.replace(stages[stage], **{name: value})
+        for name, value in {"method": method, **stages}.items():
+            object.__setattr__(self, name, value)  # As a frozen dataclass does.
+        self._check()
+
+    def _check(self) -> None:
         if self.method not in get_args(Method):
             raise SettingError(
                 f"method: expected one of {', '.join(get_args(Method))}, found {self.method!r}",
@@ -188,24 +209,34 @@ def describe_settings() -> list[tuple[str, str, str, str]]:
 def _assign(stages: Mapping[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
     """Return the stages by name, with `name=value` assignments applied to the stage that has the name."""
     changes: dict[str, dict[str, float]] = {}
-    owner = {s.name: (stage, s) for stage, config in stages.items() for s in fields(config) if s.metadata}
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
         name = name.strip()
         if not equals:
-            example, (_, setting) = next(iter(owner.items()))
+            example, (_, setting) = next(iter(_owners(stages).items()))
             raise SettingError(
                 f"--set {assignment}: expected name=value", hint=f"for example --set {example}={setting.default}"
             )
-        if name not in owner:
-            near = difflib.get_close_matches(name, owner, n=1)
-            raise SettingError(
-                f"--set {assignment}: there is no setting named {name!r}",
-                hint=f"did you mean {near[0]}?" if near else f"settings are: {', '.join(sorted(owner))}",
-            )
-        stage, setting = owner[name]
+        stage, setting = _owner_of(name, stages, f"--set {assignment}")
         changes.setdefault(stage, {})[name] = _parse(setting, text.strip())
     return {stage: dataclasses.replace(config, **changes.get(stage, {})) for stage, config in stages.items()}
+
+
+def _owners(stages: Mapping[str, Any]) -> dict[str, tuple[str, dataclasses.Field[Any]]]:
+    """Return the stage and the declaration of every setting by name."""
+    return {s.name: (stage, s) for stage, config in stages.items() for s in fields(config) if s.metadata}
+
+
+def _owner_of(name: str, stages: Mapping[str, Any], where: str) -> tuple[str, dataclasses.Field[Any]]:
+    """Return the stage and the declaration of one setting; `where` is what errors begin with."""
+    owner = _owners(stages)
+    if name not in owner:
+        near = difflib.get_close_matches(name, owner, n=1)
+        raise SettingError(
+            f"{where}: there is no setting named {name!r}",
+            hint=f"did you mean {near[0]}?" if near else f"settings are: {', '.join(sorted(owner))}",
+        )
+    return owner[name]
 
 
 def _parse(setting: dataclasses.Field[Any], text: str) -> float:
@@ -225,8 +256,15 @@ def _shown(value: Any) -> str:
 
 
 def _check_range(setting: dataclasses.Field[Any], value: float | None) -> None:
-    if value is None:
+    if value is None and setting.default is None:
         return
+    kind = numbers.Integral if isinstance(setting.default, int) else numbers.Real
+    if not isinstance(value, kind) or isinstance(value, bool):
+        expected = "a whole number" if kind is numbers.Integral else "a number"
+        raise SettingError(
+            f"{setting.name}: expected {expected} ({setting.metadata['unit']}), found {value!r}",
+            hint=f"the default is {setting.name}={_shown(setting.default)}",
+        )
     low, high = setting.metadata["low"], setting.metadata["high"]
     too_low = value <= low if setting.metadata["open_low"] else value < low
     if too_low or value > high or not abs(value) < _TOO_LARGE:  # Nor infinite, nor NaN.

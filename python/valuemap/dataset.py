@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 import pycolmap
@@ -27,6 +28,7 @@ from valuemap.tables import (
     Table,
     Truth,
     TruthDetections,
+    check_table,
     read_table,
     write_table,
 )
@@ -103,7 +105,7 @@ class Frame:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Dataset:
     """Posed images with detections, the truth where it is known, and what the import had to leave out."""
 
@@ -115,6 +117,35 @@ class Dataset:
     truth: Truth | None = None
     truth_detections: TruthDetections | None = None
     rejected: RejectedRows | None = None
+
+    def __repr__(self) -> str:
+        passes = len(np.unique(self.images.pass_id.codes))
+        truth = "" if self.truth is None else f", {len(self.truth):,} true objects"
+        return (
+            f"Dataset({self.name!r}: {len(self.images):,} images of {passes:,} passes, "
+            f"{len(self.detections):,} detections{truth})"
+        )
+
+
+_CHECKED: WeakSet[Dataset] = WeakSet()
+"""Data sets that went through `check_dataset`: they need it no more."""
+
+
+def ensure_checked(dataset: Dataset) -> Dataset:
+    """Return a dataset that is checked: one that was made by hand is checked now, table by table.
+
+    Raises
+    ------
+    InputError
+        As `read_dataset`, by the name of the dataset and of the column.
+    """
+    if dataset in _CHECKED:
+        return dataset
+    for f in fields(dataset):
+        table = getattr(dataset, f.name)
+        if isinstance(table, Table):
+            check_table(table, source=f"{dataset.name}: {f.name}")
+    return check_dataset(dataset, source=dataset.name)
 
 
 def read_dataset(path: str | Path) -> Dataset:
@@ -219,7 +250,9 @@ def check_dataset(dataset: Dataset, *, source: str) -> Dataset:
             "detection_id",
             "detections",
         )
-    return Dataset(**{**vars(dataset), "images": images})
+    checked = Dataset(**{**vars(dataset), "images": images})
+    _CHECKED.add(checked)
+    return checked
 
 
 def rows_of(ids: Ints, keys: Ints) -> Ints:

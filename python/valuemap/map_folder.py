@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import base64
+import html
+import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from valuemap.dataset import Frame
+import numpy as np
+
+from valuemap.dataset import Dataset, Frame
 from valuemap.errors import InputError
 from valuemap.folders import new_folder, settle
 from valuemap.tables import Labels, Votes, read_table, table_to_arrow, write_table
 
 if TYPE_CHECKING:
     import geopandas
+    import pandas as pd
+    from matplotlib.figure import Figure
 
 MARKER = "run.json"
 REVIEW = "review.json"
@@ -22,7 +29,7 @@ PARTS = (MARKER, "labels.parquet", "votes.parquet", "rejected.parquet")
 """All files that a map may have: none of an older one may stay beside those of a new one."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Map:
     """Labels with their evidence, in the frame of the dataset they come from.
 
@@ -34,6 +41,47 @@ class Map:
     labels: Labels
     votes: Votes
     run: dict[str, Any]
+
+    def __repr__(self) -> str:
+        classes = len(np.unique(self.labels.class_name.codes))
+        return f"Map({len(self.labels):,} labels of {classes} classes, {len(self.votes):,} votes)"
+
+    def _repr_html_(self) -> str:
+        """Show the map in a notebook: in numbers, and from above."""
+        picture = base64.b64encode(self._picture()).decode("ascii")
+        return (
+            f"<p>{html.escape(repr(self))}</p>"
+            f'<img alt="The map from above" style="max-width:100%" src="data:image/png;base64,{picture}">'
+        )
+
+    def _picture(self) -> bytes:
+        buffer = io.BytesIO()
+        self.plot().savefig(buffer, format="png", dpi=60)
+        return buffer.getvalue()
+
+    def plot(self, dataset: Dataset | None = None) -> Figure:
+        """Return the map from above as a figure of matplotlib; with the dataset also the streets that were driven."""
+        from valuemap import plot_map  # Draws with a library that nothing else of a map needs.
+
+        return plot_map(self, dataset)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the labels as a data frame of pandas, with their columns on disk."""
+        return self.labels.to_pandas()
+
+    def to_geopandas(self) -> geopandas.GeoDataFrame:
+        """Return the labels of a geo-referenced map as points lon, lat, height.
+
+        Raises
+        ------
+        InputError
+            The map is not geo-referenced.
+        """
+        if self.labels.lon_lat_height is None:
+            raise InputError(
+                "the map is not geo-referenced: its labels have no place on the Earth", hint="use to_pandas"
+            )
+        return geographic_labels(self.labels)
 
 
 def write_map(result: Map, path: str | Path, *, force: bool = False) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from valuemap.cameras import Rays, cast_rays
 from valuemap.config import MapConfig
-from valuemap.dataset import Dataset
+from valuemap.dataset import Dataset, ensure_checked
 from valuemap.describe import describe_labels
 from valuemap.errors import InputError
 from valuemap.map_folder import Map
@@ -46,7 +46,7 @@ def build_map(
     Raises
     ------
     InputError
-        The dataset has no detections.
+        The dataset has no detections, or was made by hand and is not what `read_dataset` would accept.
 
     Returns
     -------
@@ -59,6 +59,7 @@ def build_map(
             f"{dataset.name}: there are no detections in it",
             hint="find some with valuemap detect, or import them with the images",
         )
+    dataset = ensure_checked(dataset)
     stages = _Stages()
     with stages.measured("rays"):
         rays = cast_rays(dataset)

@@ -11,7 +11,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, ClassVar, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -22,12 +22,17 @@ from numpy.typing import NDArray
 from valuemap.arrow import numbers_from_arrow, numbers_to_arrow, texts_to_arrow
 from valuemap.errors import InputError
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+_SHOWN_NAMES, _SHOWN_ROWS = 5, 10
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Categories:
     """A column of few distinct texts: `names[codes[i]]` is the text of row i; names are sorted."""
 
@@ -51,6 +56,10 @@ class Categories:
 
     def __len__(self) -> int:
         return len(self.codes)
+
+    def __repr__(self) -> str:
+        shown = ", ".join(map(repr, self.names[:_SHOWN_NAMES]))
+        return f"Categories({len(self):,} rows of {shown}{', ...' if len(self.names) > _SHOWN_NAMES else ''})"
 
     def take(self, rows: NDArray[Any]) -> Categories:
         """Return the rows given by indices or by a mask."""
@@ -80,7 +89,7 @@ def _column(kind: str, names: tuple[str, ...], *, optional: bool = False, nullab
     return field(default=None, metadata=metadata) if optional else field(metadata=metadata)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Table:
     """Base of the tables: arrays of one length, sorted by the key column."""
 
@@ -89,6 +98,32 @@ class Table:
 
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))
+
+    def __getitem__(self, rows: NDArray[Any] | Sequence[int] | Sequence[bool] | slice) -> Self:
+        """Return some rows as the same type of table: by a mask, by indices, or by a slice."""
+        if isinstance(rows, slice):
+            return self.take(np.arange(len(self))[rows])
+        if isinstance(rows, int | np.integer):
+            raise TypeError(f"a table has no single rows: take [{rows}:{rows + 1}] of it")
+        chosen = np.asarray(rows)
+        if chosen.dtype == np.bool_ and len(chosen) != len(self):
+            raise IndexError(f"a mask of {len(chosen)} rows for a table of {len(self)}")
+        return self.take(chosen if len(chosen) else np.empty(0, np.int64))
+
+    def __repr__(self) -> str:
+        columns = [name for f in fields(self) if getattr(self, f.name) is not None for name in f.metadata["names"]]
+        return f"{type(self).__name__}({len(self):,} rows: {', '.join(columns)})"
+
+    def _repr_html_(self) -> str:
+        """Show the first rows in a notebook."""
+        rest = f"<p>{len(self):,} rows</p>" if len(self) > _SHOWN_ROWS else ""
+        html: str = self[:_SHOWN_ROWS].to_pandas().to_html(index=False, border=0)
+        return html + rest
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the columns as on disk as a data frame of pandas."""
+        frame: pd.DataFrame = table_to_arrow(self).to_pandas()
+        return frame
 
     def take(self, rows: NDArray[Any]) -> Self:
         """Return the rows given by indices or by a mask, as the same type of table."""
@@ -99,7 +134,7 @@ class Table:
         return dataclasses.replace(self, **changes)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Cameras(Table):
     """Intrinsics. `model` is a COLMAP model name, `params` in COLMAP's order (pixels, centre of pixel 0 at 0.5)."""
 
@@ -112,7 +147,7 @@ class Cameras(Table):
     params: list[Floats] = _column("floats", ("params",))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Images(Table):
     """Exposures: camera, pose, pass and time.
 
@@ -135,7 +170,7 @@ class Images(Table):
     rotation_sigma_rad: Floats | None = _column("float", ("rotation_sigma_rad",), optional=True, nullable=True)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Detections(Table):
     """2D boxes: centre and size (N, 2) in pixels, class and score; optionally a measured range in metres.
 
@@ -158,7 +193,7 @@ class Detections(Table):
     vertical_sigma_px: Floats | None = _column("float", ("vertical_sigma_px",), optional=True, nullable=True)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Truth(Table):
     """Known objects, for evaluation only; positions (N, 3) in metres in the frame of the dataset."""
 
@@ -169,7 +204,7 @@ class Truth(Table):
     position_in_world_m: Floats = _column("float", ("x", "y", "z"))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TruthPoints(Table):
     """Known objects in a file of the user's own: positions (N, 3) in the frame of the map, the rest if known."""
 
@@ -178,7 +213,7 @@ class TruthPoints(Table):
     object_id: Ints | None = _column("int", ("object_id",), optional=True)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class GeographicTruth(Table):
     """Known objects in a file of the user's own: WGS84 longitude and latitude (N, 2) in degrees, the rest if known."""
 
@@ -188,7 +223,7 @@ class GeographicTruth(Table):
     object_id: Ints | None = _column("int", ("object_id",), optional=True)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TruthDetections(Table):
     """Which object a detection really shows; detections of nothing are not listed."""
 
@@ -199,7 +234,7 @@ class TruthDetections(Table):
     object_id: Ints = _column("int", ("object_id",))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RejectedRows(Table):
     """Rows that an import left out, in their order: which table they were for, where they stood, and why.
 
@@ -244,7 +279,7 @@ class Candidates:
         return np.repeat(np.arange(len(self)), np.diff(self.voter_offsets))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Labels(Table):
     """Accepted objects.
 
@@ -290,7 +325,7 @@ class Labels(Table):
     existence: Floats | None = _column("float", ("existence",), optional=True)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Votes(Table):
     """Which detection supports which label, and how closely: sorted by label, then image."""
 
@@ -316,7 +351,7 @@ REJECTION_REASONS: Mapping[str, str] = {
 """Why a hypothesis became no label: the test that it failed, in words."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Rejected(Table):
     """The best hypotheses that became no labels.
 
@@ -390,6 +425,66 @@ def table_from_arrow(kind: type[T], table: pa.Table, *, source: str) -> T:
             hint="give every row an id of its own",
         )
     return result.take(order)
+
+
+def check_table(table: Table, *, source: str) -> None:
+    """Check a table that was made by hand as `read_table` checks a file; what is read needs it no more.
+
+    Raises
+    ------
+    InputError
+        A column has another length, shape or type than the table needs, or a value is not finite, or the keys are not
+        ascending and unique.
+    """
+    for f in fields(table):
+        value = getattr(table, f.name)
+        if value is not None:
+            _check_column(value, f, len(table), source)
+        elif not f.metadata["optional"]:
+            raise InputError(
+                f"{source}: {f.name}: expected values, found None", hint="only optional columns may be None"
+            )
+    if table.KEY is not None:
+        key: Ints = getattr(table, table.KEY)
+        wrong = np.flatnonzero(np.diff(key) <= 0)
+        if len(wrong):
+            raise InputError(
+                f"{source} row {wrong[0] + 1}: {table.KEY}: expected ascending unique ids, found {key[wrong[0] + 1]} "
+                f"after {key[wrong[0]]} ({len(wrong)} rows)",
+                hint=f"sort the rows by {table.KEY}",
+            )
+
+
+def _check_column(value: Any, column: dataclasses.Field[Any], rows: int, source: str) -> None:
+    names, kind = column.metadata["names"], column.metadata["kind"]
+    expected = {"category": Categories, "text": pa.Array, "floats": list}.get(kind, np.ndarray)
+    if not isinstance(value, expected):
+        raise InputError(
+            f"{source}: {column.name}: expected {expected.__name__}, found {type(value).__name__}",
+            hint="Categories.from_texts makes a column of texts" if kind == "category" else "see the table's docstring",
+        )
+    if len(value) != rows:
+        raise InputError(
+            f"{source}: {column.name}: expected {rows} rows, found {len(value)}",
+            hint="all columns need the same length",
+        )
+    if not isinstance(value, np.ndarray):
+        return
+    shape = (rows,) if len(names) == 1 else (rows, len(names))
+    if value.shape != shape or value.dtype.kind not in ("f" if kind == "float" else "iu"):
+        raise InputError(
+            f"{source}: {column.name}: expected {_EXPECTED[kind]} of shape {shape}, "
+            f"found {value.dtype} of {value.shape}",
+            hint=f"its columns are {', '.join(names)}",
+        )
+    if kind == "float":
+        bad = np.isinf(value) if column.metadata["nullable"] else ~np.isfinite(value)
+        if bad.any():
+            row = int(np.flatnonzero(bad.reshape(rows, -1).any(axis=1))[0])
+            raise InputError(
+                f"{source} row {row}: {column.name}: expected finite numbers, found {value[row]}",
+                hint="repair or remove it",
+            )
 
 
 def table_to_arrow(table: Table) -> pa.Table:

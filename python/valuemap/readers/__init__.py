@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import wraps
+from inspect import signature
+from pathlib import Path
+from typing import Any
 
 from valuemap.dataset import Dataset
 from valuemap.readers.argoverse2 import read_argoverse2
@@ -19,7 +23,24 @@ from valuemap.readers.panoramax import read_panoramax
 from valuemap.readers.ros import read_ros
 from valuemap.readers.tum import read_tum
 
-READERS: dict[str, Callable[..., Dataset]] = {
+
+def _taking_texts(reader: Callable[..., Dataset]) -> Callable[..., Dataset]:
+    """Return a reader that takes texts where it expects paths, as people write them."""
+    parameters = signature(reader)
+    paths = {name for name, parameter in parameters.parameters.items() if "Path" in str(parameter.annotation)}
+
+    @wraps(reader)
+    def read(*arguments: Any, **options: Any) -> Dataset:
+        given = parameters.bind(*arguments, **options)
+        for name in paths & given.arguments.keys():
+            if isinstance(given.arguments[name], str):
+                given.arguments[name] = Path(given.arguments[name])
+        return reader(*given.args, **given.kwargs)
+
+    return read
+
+
+_READERS: dict[str, Callable[..., Dataset]] = {
     "argoverse2": read_argoverse2,
     "bearings": read_bearings,
     "colmap": read_colmap,
@@ -34,4 +55,5 @@ READERS: dict[str, Callable[..., Dataset]] = {
     "ros": read_ros,
     "tum": read_tum,
 }
-"""What `valuemap import NAME` calls."""
+READERS = {name: _taking_texts(reader) for name, reader in _READERS.items()}
+"""What `valuemap import NAME` calls; paths may be given as texts."""
