@@ -22,7 +22,7 @@ from valuemap.errors import InputError, OutputError
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import Map
 from valuemap.tables import Votes
-from valuemap.writers import export_map
+from valuemap.writers import export_map, without_password
 
 psycopg = pytest.importorskip("psycopg", reason="the extra postgis is not installed")
 
@@ -196,3 +196,8 @@ def test_a_server_that_is_not_there_is_one_line_without_the_password() -> None:
 def test_postgis_needs_a_geo_reference() -> None:
     with pytest.raises(InputError, match="the map is not geo-referenced, and PostGIS"):
         export_map(map_of(POSITIONS), "postgresql://localhost/none")
+
+
+def test_a_url_is_shown_without_its_password() -> None:
+    assert without_password("postgresql://me:secret@host:5432/maps?password=x") == "postgresql://me@host:5432/maps"
+    assert without_password("maps/a?b.csv") == "maps/a?b.csv"

@@ -13,9 +13,10 @@ from valuemap.cli.show import log, show_notes
 from valuemap.dataset import Dataset, read_dataset
 from valuemap.errors import InputError
 from valuemap.evidence import find_dataset
+from valuemap.geodesy import accuracy_note
 from valuemap.map_folder import REVIEW, Map, read_map
 from valuemap.review import apply_review, read_review
-from valuemap.writers import FOLDER_WRITERS, SUFFIXES, WRITERS, export_map
+from valuemap.writers import FOLDER_WRITERS, SUFFIXES, WRITERS, export_map, without_password
 
 _SHOWN_IDS = 10
 
@@ -53,7 +54,9 @@ def export_command(
     if reviewed or review is not None:
         result = _reviewed(result, map_, review, known)
     export_map(result, target, format_name=format_name, dataset=known, crs=crs, force=force)
-    log.print(f"Wrote {len(result.labels)} labels to {target.partition('?')[0]}", highlight=False)
+    note = None if crs is None else accuracy_note(crs)
+    show_notes([] if note is None else [note])
+    log.print(f"Wrote {len(result.labels)} labels to {without_password(target)}", highlight=False)
 
 
 def _dataset(map_: Path, result: Map, given: Path | None) -> Dataset | None:

@@ -22,7 +22,9 @@ from valuemap.writers.maproulette import write_maproulette
 from valuemap.writers.opendrive import write_opendrive
 from valuemap.writers.osm import write_osm
 from valuemap.writers.parquet import write_parquet
-from valuemap.writers.postgis import is_database, write_postgis
+from valuemap.writers.postgis import is_database, without_password, write_postgis
+
+__all__ = ["FOLDER_WRITERS", "SUFFIXES", "WRITERS", "export_map", "without_password"]
 
 WRITERS: dict[str, Callable[[Export, Path], None]] = {
     "csv": write_csv,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -44,10 +42,7 @@ def write_colmap(export: Export, folder: Path) -> None:
         model.add_camera_with_trivial_rig(camera)
     first_point = _add_images(model, dataset)
     _add_labels(model, export, dataset, first_point)
-    with tempfile.TemporaryDirectory() as fresh:
-        model.write_text(fresh)
-        for name in FILES:
-            shutil.copyfile(Path(fresh) / name, folder / name)
+    model.write_text(str(folder))
 
 
 def _add_images(model: pycolmap.Reconstruction, dataset: Dataset) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

@@ -76,7 +76,7 @@ def write_postgis(export: Export, url: str) -> None:
     except psycopg.Error as error:
         reason = " ".join(str(error).split()).partition(" DETAIL:")[0]
         raise OutputError(
-            f"{_without_password(address)}: cannot be written: {reason}",
+            f"{without_password(address)}: cannot be written: {reason}",
             hint="is the server running, may this user create tables, is PostGIS installed there?",
         ) from error
     except UnicodeEncodeError as error:
@@ -189,11 +189,14 @@ def _parts(url: str, default_name: str) -> tuple[str, str, str]:
     rest = urlencode([(key, value) for key, value in pairs if key not in ours], quote_via=quote)
     schema, name = ours.get("schema", _SCHEMA), ours.get("map", default_name)
     if not schema or not name or "\0" in schema + name:
-        raise SettingError(f"{_without_password(url)}: schema and map must have names", hint="for example ?schema=maps")
+        raise SettingError(f"{without_password(url)}: schema and map must have names", hint="for example ?schema=maps")
     return f"{address}?{rest}" if rest else address, schema, name
 
 
-def _without_password(url: str) -> str:
+def without_password(url: str) -> str:
+    """Return the URL of a database as it may be shown; a path stays as it is."""
+    if not is_database(url):
+        return url
     address = url.partition("?")[0]
     scheme, _, place = address.partition("://")
     user, at, host = place.rpartition("@")
