@@ -20,6 +20,7 @@ from valuemap.readers.mapillary import read_mapillary
 from valuemap.readers.nuscenes import read_nuscenes
 from valuemap.readers.opensfm import read_opensfm
 from valuemap.readers.panoramax import read_panoramax
+from valuemap.readers.pictures import read_pictures
 from valuemap.readers.ros import read_ros
 from valuemap.readers.tum import read_tum
 
@@ -52,6 +53,7 @@ _READERS: dict[str, Callable[..., Dataset]] = {
     "nuscenes": read_nuscenes,
     "opensfm": read_opensfm,
     "panoramax": read_panoramax,
+    "pictures": read_pictures,
     "ros": read_ros,
     "tum": read_tum,
 }

@@ -16,6 +16,7 @@ READERS = (
     "nuscenes",
     "opensfm",
     "panoramax",
+    "pictures",
     "ros",
     "tum",
 )

@@ -1,0 +1,53 @@
+"""`valuemap import pictures`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from valuemap import dataset as dataset_folder
+from valuemap.cli.import_.app import finish_dataset, import_app
+from valuemap.cli.import_.options import Anchor, CameraText, with_detections
+from valuemap.cli.options import DatasetOut, MaxRejected
+from valuemap.cli.show import progress_bars
+from valuemap.folders import check_place
+from valuemap.readers.detections import DetectionFile
+from valuemap.readers.vet import MAX_REJECTED
+
+
+@import_app.command("pictures")
+@with_detections
+def import_pictures(
+    folder: Annotated[Path, typer.Argument(help="Pictures with GPS positions in their EXIF tags.")],
+    out: DatasetOut,
+    detections: DetectionFile | None,
+    poses: Annotated[str, typer.Option(help="sfm, exif (headings as they are) or auto: exif for panoramas.")] = "auto",
+    workspace: Annotated[
+        Path | None, typer.Option(help="Where structure from motion keeps its work, to go on; default: OUT.sfm.")
+    ] = None,
+    camera: CameraText = None,
+    gps_sigma: Annotated[float, typer.Option(help="Metres, of GPS positions that do not say theirs.")] = 3.0,
+    threads: Annotated[int, typer.Option(min=0, max=1024, help="Of structure from motion, 0 for one a core.")] = 0,
+    anchor: Anchor = None,
+    max_rejected: MaxRejected = MAX_REJECTED,
+) -> None:
+    """Import pictures without poses: from EXIF, and by structure from motion; started again, it goes on."""
+    from valuemap.readers import READERS
+
+    check_place(out, marker=dataset_folder.MARKER)
+    with progress_bars() as progress:
+        dataset = READERS["pictures"](
+            folder,
+            workspace=workspace or out.with_name(f"{out.name}.sfm"),
+            poses=poses,
+            camera=camera,
+            gps_sigma_m=gps_sigma,
+            detections=detections,
+            anchor=anchor,
+            threads=threads,
+            max_rejected=max_rejected,
+            progress=progress,
+        )
+    finish_dataset(dataset, out)

@@ -1,0 +1,166 @@
+"""What a picture says about itself: where, when, which way and how wide, in EXIF and in the XMP of panoramas."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from PIL import Image, UnidentifiedImageError
+from PIL.ExifTags import GPS, IFD, Base
+
+from valuemap.errors import InputError
+
+_FILM_WIDTH_MM = 36.0
+_LARGEST_PX = 200_000_000
+_ROLL_DEG = {3: 180.0, 6: 90.0, 8: -90.0}
+"""Roll of a camera whose picture must be turned by this orientation to stand upright: 6 is a quarter turn clockwise,
+so up is at the left of the picture as stored, and the camera's right side was down."""
+
+
+@dataclass(frozen=True)
+class Exif:
+    """What is known of one picture; None where it does not say.
+
+    `lat_lon` in degrees, `height_m`, `sigma_m` (horizontal), `heading_deg` clockwise from north, `pitch_deg` up and
+    `roll_deg` right side down, `focal_px`, `time_s` since 1970. Pictures of one `camera` have the same intrinsics.
+    """
+
+    width: int
+    height: int
+    is_panorama: bool
+    camera: tuple[Any, ...]
+    lat_lon: tuple[float, float] | None = None
+    height_m: float | None = None
+    sigma_m: float | None = None
+    heading_deg: float | None = None
+    pitch_deg: float = 0.0
+    roll_deg: float = 0.0
+    focal_px: float | None = None
+    time_s: float | None = None
+
+
+def read_exif(path: Path) -> Exif:
+    """Read a picture's size and what it says about itself; values that make no sense are taken for missing.
+
+    Raises
+    ------
+    InputError
+        The file is no picture, or one of more than 200 million pixels.
+    """
+    try:
+        with Image.open(path) as picture:
+            width, height = picture.size
+            tags = picture.getexif()
+            gps, exif = dict(tags.get_ifd(IFD.GPSInfo)), dict(tags.get_ifd(IFD.Exif))
+            xmp = picture.info.get("xmp", b"")
+            main = dict(tags)
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, KeyError, Image.DecompressionBombError) as error:
+        reason = " ".join(str(error).split())[:150]
+        raise InputError(f"{path}: cannot be read as a picture: {reason}", hint="remove or replace it") from error
+    if width * height > _LARGEST_PX:
+        raise InputError(f"{path}: has {width} x {height} pixels", hint="make it smaller")
+    pano = _panorama(xmp.decode("utf-8", "replace") if isinstance(xmp, bytes) else str(xmp))
+    focal_px = _focal_px(exif, width, height)
+    orientation = main.get(Base.Orientation)
+    heading = pano.get("PoseHeadingDegrees", _number(gps.get(GPS.GPSImgDirection)))
+    return Exif(
+        width=width,
+        height=height,
+        is_panorama="equirectangular" in pano,
+        camera=(str(main.get(Base.Make)), str(main.get(Base.Model)), width, height, focal_px),
+        lat_lon=_lat_lon(gps),
+        height_m=_height(gps),
+        sigma_m=_positive(gps.get(GPS.GPSHPositioningError)),
+        heading_deg=None if heading is None else heading % 360.0,
+        pitch_deg=pano.get("PosePitchDegrees", 0.0),
+        roll_deg=pano.get("PoseRollDegrees", _ROLL_DEG.get(orientation, 0.0) if isinstance(orientation, int) else 0.0),
+        focal_px=focal_px,
+        time_s=_time(exif, gps),
+    )
+
+
+def _number(value: Any) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _positive(value: Any) -> float | None:
+    number = _number(value)
+    return number if number is not None and number > 0.0 else None
+
+
+def _degrees(value: Any, reference: Any, negative: str) -> float | None:
+    """Return degrees of degrees, minutes and seconds."""
+    try:
+        parts = [_number(part) for part in value]
+    except TypeError:
+        return None
+    if len(parts) != 3 or any(part is None for part in parts):
+        return None
+    degrees = sum(float(part or 0.0) / 60.0**place for place, part in enumerate(parts))
+    return -degrees if str(reference).strip("\0 ").upper() == negative else degrees
+
+
+def _lat_lon(gps: dict[int, Any]) -> tuple[float, float] | None:
+    lat = _degrees(gps.get(GPS.GPSLatitude), gps.get(GPS.GPSLatitudeRef), "S")
+    lon = _degrees(gps.get(GPS.GPSLongitude), gps.get(GPS.GPSLongitudeRef), "W")
+    if lat is None or lon is None or abs(lat) > 90.0 or abs(lon) > 180.0 or (lat, lon) == (0.0, 0.0):
+        return None
+    return lat, lon
+
+
+def _height(gps: dict[int, Any]) -> float | None:
+    height = _number(gps.get(GPS.GPSAltitude))
+    below = gps.get(GPS.GPSAltitudeRef) in (1, b"\x01")
+    return None if height is None else (-height if below else height)
+
+
+def _focal_px(exif: dict[int, Any], width: int, height: int) -> float | None:
+    film_mm = _positive(exif.get(Base.FocalLengthIn35mmFilm))
+    if film_mm is not None:
+        return film_mm / _FILM_WIDTH_MM * max(width, height)
+    focal_mm = _positive(exif.get(Base.FocalLength))
+    per_unit = _positive(exif.get(Base.FocalPlaneXResolution))
+    unit_mm = {2: 25.4, 3: 10.0}.get(exif.get(Base.FocalPlaneResolutionUnit, 2))
+    stored = _positive(exif.get(Base.ExifImageWidth)) or width
+    if focal_mm is None or per_unit is None or unit_mm is None:
+        return None
+    return focal_mm * per_unit / unit_mm * width / stored
+
+
+def _time(exif: dict[int, Any], gps: dict[int, Any]) -> float | None:
+    """Return the GPS's time, which is UTC, else the camera's, in UTC where it does not say its zone."""
+    day, clock = str(gps.get(GPS.GPSDateStamp, "")), gps.get(GPS.GPSTimeStamp)
+    try:
+        hours, minutes, seconds = (float(part) for part in clock or ())
+        start = datetime.strptime(day.strip("\0 "), "%Y:%m:%d").replace(tzinfo=UTC)
+        return start.timestamp() + hours * 3600.0 + minutes * 60.0 + seconds
+    except (TypeError, ValueError, ZeroDivisionError):
+        pass
+    text = str(exif.get(Base.DateTimeOriginal, "")).strip("\0 ")
+    zone = str(exif.get(Base.OffsetTimeOriginal, "")).strip("\0 ") or "+00:00"
+    part = str(exif.get(Base.SubsecTimeOriginal, "")).strip("\0 ")
+    try:
+        time = datetime.strptime(f"{text} {zone}", "%Y:%m:%d %H:%M:%S %z").timestamp()
+    except ValueError:
+        return None
+    return time + (float(f"0.{part}") if part.isdecimal() else 0.0)
+
+
+def _panorama(xmp: str) -> dict[str, float]:
+    """Return the numbers of the GPano namespace, and a key `equirectangular` where that is the projection."""
+    found = {}
+    for name, first, second in re.findall(r"GPano:(\w+)\s*(?:=\s*[\"']([^\"']*)[\"']|>([^<]*)<)", xmp):
+        text = (first or second).strip()
+        if name == "ProjectionType" and text.lower() == "equirectangular":
+            found["equirectangular"] = 1.0
+        elif (number := _number(text)) is not None:
+            found[name] = number
+    return found

@@ -1,0 +1,250 @@
+"""A folder of pictures without poses: EXIF says where and when, structure from motion or the compass the rest."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Literal, get_args
+
+import numpy as np
+import pycolmap
+
+from valuemap.dataset import Dataset
+from valuemap.errors import InputError, SettingError
+from valuemap.progress import Progress, silent
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, assemble
+from valuemap.readers.cameras_of import Camera, make_cameras, parse_camera
+from valuemap.readers.detections import DetectionFile, read_detections
+from valuemap.readers.exif import Exif, read_exif
+from valuemap.readers.files import check_folder, check_names, file_in
+from valuemap.readers.poses import OnEarth, local_from_cam, make_images, place_on_earth
+from valuemap.readers.structure import Picture, find_poses
+from valuemap.tables import Floats
+
+PosesFrom = Literal["auto", "sfm", "exif"]
+_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+_EXPECTED = f"a folder of pictures: {', '.join(_SUFFIXES)}"
+_FOCAL_GUESS = 1.2
+"""Focal length over the larger side where nothing is known: about 45 degrees."""
+_SHOWN = 3
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Pictures that can be used, in driving order."""
+
+    names: list[str]
+    exif: list[Exif]
+    passes: list[str]
+    placed: OnEarth
+    sigma_m: Floats
+
+
+def read_pictures(
+    folder: Path,
+    *,
+    workspace: Path | None = None,
+    poses: PosesFrom = "auto",
+    camera: str | None = None,
+    gps_sigma_m: float = 3.0,
+    detections: DetectionFile | Path | None = None,
+    anchor: tuple[float, float, float] | None = None,
+    threads: int = 0,
+    max_rejected: float = MAX_REJECTED,
+    progress: Progress = silent,
+) -> Dataset:
+    """Read pictures of a folder and its folders, find their poses, and put them on the Earth.
+
+    Panoramas (equirectangular by their GPano tags, or by `camera`) stand at their GPS position with their heading,
+    pitch and roll. Other pictures get their poses by structure from motion (`find_poses`), or with `poses` "exif" are
+    taken level with the heading that the GPS tags give. A pass is a folder; times are those of the GPS, else of the
+    camera.
+
+    Parameters
+    ----------
+    folder
+        The pictures; links that lead out of it are refused.
+    workspace
+        Where structure from motion keeps what it has found, to go on after an interruption.
+    poses
+        "sfm" and "exif" as above; "auto" is "exif" for panoramas and "sfm" for the others.
+    camera
+        As in `parse_camera`, for all pictures, where their own tags are wrong or say nothing.
+    gps_sigma_m
+        Standard deviation of GPS positions that do not say theirs.
+    detections
+        As in `read_detections`; without, they are still to be found in the pictures.
+    anchor
+        Latitude, longitude and height of the origin; by default the place of the first picture by name.
+    threads
+        Of structure from motion, 0 for one a core.
+
+    Raises
+    ------
+    InputError
+        There are no pictures, none has a GPS position, too many cannot be used, or no poses can be found.
+    SettingError
+        An option is impossible.
+    """
+    if poses not in get_args(PosesFrom) or not 0.0 < gps_sigma_m < math.inf:
+        raise SettingError(
+            f"poses {poses}, gps-sigma {gps_sigma_m:g}: expected {', '.join(get_args(PosesFrom))}, and metres above 0",
+            hint="leave them away",
+        )
+    found = _read_all(folder, gps_sigma_m, anchor, max_rejected, progress)
+    given = None if camera is None else parse_camera(camera)
+    cameras = [given or _guess(exif) for exif in found.exif]
+    by_heading = np.array([poses == "exif" or (poses == "auto" and c.model == "EQUIRECTANGULAR") for c in cameras])
+    rotation, center = _level_poses(found)
+    sigma_m, sigma_rad = found.sigma_m.copy(), np.full(len(found.names), np.nan)
+    part = np.full(len(found.names), -1)
+    rows = np.flatnonzero(~by_heading)
+    if len(rows):
+        if workspace is None:
+            raise SettingError("workspace: structure from motion needs a folder to work in", hint="give --workspace")
+        rotation[rows], center[rows] = np.nan, np.nan
+        distinct = sorted({cameras[row] for row in rows}, key=lambda c: (c.model, c.width, c.height, c.params))
+        known_focal = {cameras[row] for row in rows if given is not None or found.exif[row].focal_px is not None}
+        posed = find_poses(
+            [_picture(folder, found, row, distinct.index(cameras[row])) for row in rows.tolist()],
+            [_as_colmap(each, has_focal=each in known_focal) for each in distinct],
+            workspace,
+            threads=threads or -1,
+            progress=progress,
+        )
+        at = rows[posed.row]
+        rotation[at], center[at], part[at] = posed.world_from_cam, posed.center_in_world_m, posed.part
+        sigma_m[at], sigma_rad[at] = posed.position_sigma_m, posed.rotation_sigma_rad
+        refined = {distinct[number]: _from_colmap(value) for number, value in posed.cameras.items()}
+        cameras = [each if by_heading[row] else refined.get(each, each) for row, each in enumerate(cameras)]
+    kept = np.flatnonzero(np.isfinite(center).all(axis=1) & np.isfinite(rotation).all(axis=(1, 2)))
+    if not len(kept):
+        raise InputError(
+            f"{folder}: no picture has a heading (GPSImgDirection, or PoseHeadingDegrees of a panorama)",
+            hint="--poses sfm finds poses where pictures overlap",
+        )
+    table, camera_id = make_cameras([cameras[row] for row in kept], str(folder))
+    parts = len(set(part[kept].tolist()))
+    images = make_images(
+        names=[found.names[row] for row in kept],
+        camera_id=camera_id,
+        world_from_cam=rotation[kept],
+        center_in_world_m=center[kept],
+        passes=[f"{found.passes[row]}/{part[row]}" if parts > 1 else found.passes[row] for row in kept],
+        source=str(folder),
+        timestamp_s=np.array([math.nan if (t := found.exif[row].time_s) is None else t for row in kept]),
+        position_sigma_m=sigma_m[kept],
+        rotation_sigma_rad=sigma_rad[kept],
+    )
+    return assemble(
+        name=folder.resolve().name,
+        cameras=table,
+        images=images,
+        detections=read_detections(detections, images, table),
+        up=None,
+        anchor=found.placed.anchor,
+        source=str(folder),
+        max_rejected=max_rejected,
+    )
+
+
+def _read_all(
+    folder: Path,
+    gps_sigma_m: float,
+    anchor: tuple[float, float, float] | None,
+    max_rejected: float,
+    progress: Progress,
+) -> _Found:
+    check_folder(folder, _EXPECTED)
+    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _SUFFIXES)
+    if not paths:
+        raise InputError(f"{folder}: there are no pictures in it", hint=f"expected {_EXPECTED}")
+    names, found, unusable = [], [], []
+    for number, path in enumerate(paths):
+        if number % 50 == 0:
+            progress("reading the pictures' tags", number, len(paths))
+        name = path.relative_to(folder).as_posix()
+        try:
+            found.append(read_exif(file_in(folder, name, _EXPECTED)))
+            names.append(name)
+        except InputError as error:
+            unusable.append(str(error))
+    progress("reading the pictures' tags", len(paths), len(paths))
+    if len(unusable) > max_rejected * len(paths):
+        raise InputError(
+            f"{folder}: {len(unusable)} of {len(paths)} pictures cannot be used: {'; '.join(unusable[:_SHOWN])}",
+            hint="remove or replace them; or leave them out with --max-rejected",
+        )
+    check_names(names, str(folder))
+    passes = [str(parent) if str(parent := PurePosixPath(name).parent) != "." else ONE_PASS for name in names]
+    # Driving order: by time where a whole folder has times, else by name.
+    timed = set(passes) - {each for each, exif in zip(passes, found, strict=True) if exif.time_s is None}
+    order = sorted(
+        range(len(names)), key=lambda row: (passes[row], found[row].time_s if passes[row] in timed else 0.0, names[row])
+    )
+    names, found, passes = ([values[row] for row in order] for values in (names, found, passes))  # type: ignore[assignment]
+    height = _heights(found)
+    lon_lat = np.array([(math.nan, math.nan) if e.lat_lon is None else (e.lat_lon[1], e.lat_lon[0]) for e in found])
+    if not np.isfinite(lon_lat).any():
+        raise InputError(
+            f"{folder}: none of {len(names)} pictures has a GPS position in its EXIF tags",
+            hint="were they exported without tags? For poses of your own see import csv and import colmap",
+        )
+    first = min(range(len(names)), key=lambda row: (not np.isfinite(lon_lat[row]).all(), names[row]))
+    placed = place_on_earth(np.column_stack([lon_lat, height]), anchor, first, source=str(folder))
+    sigma = np.array([exif.sigma_m or gps_sigma_m for exif in found])
+    return _Found(list(names), list(found), list(passes), placed, sigma)
+
+
+def _heights(found: Sequence[Exif]) -> Floats:
+    """Return heights (N); pictures without one are at the median of the others, or at 0."""
+    heights = [exif.height_m for exif in found if exif.height_m is not None]
+    median = float(np.median(heights)) if heights else 0.0
+    return np.array([median if exif.height_m is None else exif.height_m for exif in found])
+
+
+def _level_poses(found: _Found) -> tuple[Floats, Floats]:
+    """Return rotations (N, 3, 3) by headings and centres (N, 3), NaN where there is no heading."""
+    heading, pitch, roll = (
+        np.radians([math.nan if (v := getattr(exif, name)) is None else v for exif in found.exif])
+        for name in ("heading_deg", "pitch_deg", "roll_deg")
+    )
+    known = np.isfinite(heading)
+    rotation = np.full((len(heading), 3, 3), np.nan)
+    if known.any():
+        rotation[known] = found.placed.world_from_local[known] @ local_from_cam(
+            heading[known], pitch[known], roll[known]
+        )
+    return rotation, found.placed.position_in_world_m.copy()
+
+
+def _guess(exif: Exif) -> Camera:
+    width, height = exif.width, exif.height
+    if exif.is_panorama:
+        return Camera("EQUIRECTANGULAR", width, height, (float(width), float(height)))
+    focal = exif.focal_px or _FOCAL_GUESS * max(width, height)
+    return Camera("SIMPLE_RADIAL", width, height, (focal, width / 2.0, height / 2.0, 0.0))
+
+
+def _picture(folder: Path, found: _Found, row: int, camera: int) -> Picture:
+    return Picture(
+        name=found.names[row],
+        path=folder / found.names[row],
+        camera=camera,
+        gps_in_world_m=found.placed.position_in_world_m[row],
+        sigma_m=float(found.sigma_m[row]),
+        drive=found.passes[row],
+    )
+
+
+def _as_colmap(camera: Camera, *, has_focal: bool) -> pycolmap.Camera:
+    made = pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=list(camera.params))
+    made.has_prior_focal_length = has_focal
+    return made
+
+
+def _from_colmap(camera: pycolmap.Camera) -> Camera:
+    params = tuple(float(value) for value in camera.params)
+    return Camera(camera.model.name, int(camera.width), int(camera.height), params)

@@ -1,0 +1,301 @@
+"""Pictures without poses: their tags, written here with Pillow, and structure from motion on a street drawn here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from numpy.testing import assert_allclose
+from PIL import Image
+from PIL.ExifTags import GPS, IFD, Base
+from scipy.spatial.transform import Rotation
+
+from reading import refusal, write
+from valuemap.cameras import camera_centers, rotation_matrices
+from valuemap.geodesy import lon_lat_height_from_enu
+from valuemap.readers.exif import read_exif
+from valuemap.readers.pictures import read_pictures
+from valuemap.readers.structure import similarity_onto
+from valuemap.tables import Floats
+
+ANCHOR = (52.0, 4.0, 40.0)
+
+
+def sexagesimal(degrees: float) -> tuple[float, float, float]:
+    whole = int(degrees)
+    minutes = int((degrees - whole) * 60)
+    return float(whole), float(minutes), (degrees - whole - minutes / 60) * 3600
+
+
+def tags(lat: float, lon: float, height: float = 40.0, **more: Any) -> Image.Exif:
+    """EXIF tags with a GPS position, and what else is named as GPS_..., EXIF_... or by its number."""
+    exif = Image.Exif()
+    exif[Base.Software] = "a test"  # Without a tag of its own Pillow writes none.
+    gps: dict[int, Any] = {
+        GPS.GPSLatitudeRef: "N" if lat >= 0 else "S",
+        GPS.GPSLatitude: sexagesimal(abs(lat)),
+        GPS.GPSLongitudeRef: "E" if lon >= 0 else "W",
+        GPS.GPSLongitude: sexagesimal(abs(lon)),
+        GPS.GPSAltitudeRef: b"\x00" if height >= 0 else b"\x01",
+        GPS.GPSAltitude: abs(height),
+    }
+    own: dict[int, Any] = {}
+    for name, value in more.items():
+        if name in GPS.__members__:
+            gps[GPS[name]] = value
+        elif name in ("Make", "Model", "Orientation"):
+            exif[Base[name]] = value
+        else:
+            own[Base[name]] = value
+    exif._ifds[IFD.GPSInfo], exif._ifds[IFD.Exif] = gps, own
+    return exif
+
+
+def picture(path: Path, exif: Image.Exif | None = None, size: tuple[int, int] = (64, 48), **options: Any) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", size).save(path, exif=Image.Exif() if exif is None else exif, **options)
+    return path
+
+
+# Tags.
+
+
+def test_tags_of_a_picture(tmp_path: Path) -> None:
+    exif = tags(
+        -33.5,
+        -70.25,
+        -12.0,
+        GPSImgDirection=271.5,
+        GPSHPositioningError=2.5,
+        GPSDateStamp="2023:11:14",
+        GPSTimeStamp=(22.0, 13.0, 20.5),
+        FocalLengthIn35mmFilm=27,
+        Orientation=6,
+        Model="A",
+    )
+    found = read_exif(picture(tmp_path / "a.jpg", exif, (400, 300)))
+    assert (found.width, found.height) == (400, 300)
+    assert found.lat_lon is not None
+    assert_allclose(np.array(found.lat_lon), [-33.5, -70.25], atol=1e-9)
+    assert (found.height_m, found.sigma_m, found.heading_deg, found.roll_deg) == (-12.0, 2.5, 271.5, 90.0)
+    assert found.time_s == 1_700_000_000.5
+    # A film is 36 mm wide.
+    assert found.focal_px == 300.0
+    assert not found.is_panorama
+
+
+def test_times_of_a_camera_with_a_zone_and_parts_of_a_second(tmp_path: Path) -> None:
+    options: dict[str, Any] = {
+        "DateTimeOriginal": "2023:11:14 23:13:20",
+        "OffsetTimeOriginal": "+01:00",
+        "SubsecTimeOriginal": "25",
+    }
+    assert read_exif(picture(tmp_path / "a.jpg", tags(1, 2, **options))).time_s == 1_700_000_000.25
+    assert read_exif(picture(tmp_path / "b.jpg", tags(1, 2, DateTimeOriginal="yesterday"))).time_s is None
+
+
+def test_tags_that_make_no_sense_are_taken_for_missing(tmp_path: Path) -> None:
+    exif = tags(0.0, 0.0, GPSHPositioningError=0.0, FocalLengthIn35mmFilm=0)
+    found = read_exif(picture(tmp_path / "a.jpg", exif))
+    assert (found.lat_lon, found.heading_deg, found.sigma_m, found.focal_px) == (None, None, None, None)
+
+
+def test_a_panorama_says_so_in_its_xmp(tmp_path: Path) -> None:
+    attributes = 'GPano:ProjectionType="equirectangular" GPano:PoseHeadingDegrees="90.5" GPano:PoseRollDegrees="-2"'
+    elements = (
+        "<GPano:ProjectionType>equirectangular</GPano:ProjectionType><GPano:PosePitchDegrees>3</GPano:PosePitchDegrees>"
+    )
+    for name, body in (("a.jpg", f"<rdf:Description {attributes}/>"), ("b.jpg", elements)):
+        found = read_exif(picture(tmp_path / name, tags(1, 2), (64, 32), xmp=f"<x>{body}</x>".encode()))
+        assert found.is_panorama
+    first = read_exif(tmp_path / "a.jpg")
+    assert (first.heading_deg, first.pitch_deg, first.roll_deg) == (90.5, 0.0, -2.0)
+    assert read_exif(tmp_path / "b.jpg").pitch_deg == 3.0
+
+
+# Headings as they are.
+
+
+def test_pictures_with_a_heading_are_taken_as_they_are(tmp_path: Path) -> None:
+    """Looking east: x right is south, y down is down; turned by EXIF 6 its right side was down."""
+    picture(tmp_path / "a" / "1.jpg", tags(52.0, 4.0, GPSImgDirection=90.0, FocalLengthIn35mmFilm=36))
+    picture(tmp_path / "a" / "2.jpg", tags(52.0001, 4.0, 41.0, GPSImgDirection=90.0, Orientation=6))
+    picture(tmp_path / "a" / "no heading.jpg", tags(52.0002, 4.0))
+    picture(tmp_path / "b" / "no place.jpg")
+    dataset = read_pictures(tmp_path, poses="exif")
+    assert dataset.images.name.to_pylist() == ["a/1.jpg", "a/2.jpg"]
+    assert dataset.images.pass_id.texts() == ["a", "a"]
+    assert dataset.frame.anchor is not None
+    assert_allclose(dataset.frame.anchor, ANCHOR, atol=1e-9)
+    level, rolled = rotation_matrices(dataset.images)
+    assert_allclose(level, [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-9)
+    assert_allclose(rolled[2], [1, 0, 0], atol=1e-4)
+    assert_allclose(rolled[0], [0, 0, -1], atol=1e-4)
+    assert_allclose(camera_centers(dataset.images)[1], [0.0, 11.1273, 1.0], atol=1e-3)
+    focal = {params[0] for params in dataset.cameras.params}
+    assert focal == {64.0, 1.2 * 64}
+    assert dataset.images.position_sigma_m is not None
+    assert_allclose(dataset.images.position_sigma_m, 3.0)
+
+
+def test_panoramas_need_no_structure_from_motion(tmp_path: Path) -> None:
+    xmp = b'<x GPano:ProjectionType="equirectangular" GPano:PoseHeadingDegrees="180"/>'
+    picture(tmp_path / "p.jpg", tags(52.0, 4.0), (64, 32), xmp=xmp)
+    dataset = read_pictures(tmp_path)
+    assert dataset.cameras.model.texts() == ["EQUIRECTANGULAR"]
+    assert_allclose(rotation_matrices(dataset.images)[0][2], [0, -1, 0], atol=1e-9)
+
+
+def test_folders_that_cannot_be_used(tmp_path: Path) -> None:
+    assert "no such folder" in refusal(lambda: read_pictures(tmp_path / "absent"))
+    assert "there are no pictures in it" in refusal(lambda: read_pictures(tmp_path))
+    picture(tmp_path / "a.jpg")
+    assert "none of 1 pictures has a GPS position" in refusal(lambda: read_pictures(tmp_path))
+    picture(tmp_path / "a.jpg", tags(52.0, 4.0))
+    assert "no picture has a heading" in refusal(lambda: read_pictures(tmp_path, poses="exif"))
+    assert "needs a folder to work in" in refusal(lambda: read_pictures(tmp_path))
+    write(tmp_path / "b.jpg", "hello")
+    assert "1 of 2 pictures cannot be used" in refusal(lambda: read_pictures(tmp_path, poses="exif"))
+    (tmp_path / "b.jpg").unlink()
+    outside = picture(tmp_path.parent / f"{tmp_path.name}-outside.jpg", tags(52.0, 4.0))
+    (tmp_path / "b.jpg").symlink_to(outside)
+    assert "is a link that leads out of" in refusal(lambda: read_pictures(tmp_path, poses="exif"))
+    assert "poses compass" in refusal(lambda: read_pictures(tmp_path, poses="compass"))  # type: ignore[arg-type]
+
+
+# Onto the Earth.
+
+
+@pytest.mark.parametrize("straight", [False, True])
+def test_a_model_comes_onto_the_gps_with_its_up_on_the_vertical(straight: bool) -> None:
+    """Along one straight street the positions alone do not say which way is up; one GPS position is 300 m off."""
+    random = np.random.default_rng(0)
+    world = np.cumsum(random.normal([2.0, 1.0, 0.0], [0.1, 0.0 if straight else 1.0, 0.0], (60, 3)), axis=0)
+    world[:, 2] = 0.0
+    if straight:
+        world[:, 1] = world[:, 0] / 2.0
+    turn = Rotation.from_euler("xyz", [1.0, -2.0, 0.5]).as_matrix()
+    model = 0.1 * (world - [5.0, 6.0, 7.0]) @ turn
+    up = np.tile([0.0, 0.0, 1.0], (60, 1)) @ turn
+    gps = world + random.normal(0.0, 0.5, world.shape)
+    gps[7] += [300.0, 0.0, 0.0]
+    gps[9] = np.nan
+    found = similarity_onto(model, up, gps, np.full(60, 0.5))
+    assert found is not None
+    scale, rotation, shift = found
+    assert_allclose(scale, 10.0, rtol=0.01)
+    assert_allclose(rotation @ turn.T @ np.array([0.0, 0.0, 1.0]), [0, 0, 1], atol=0.02)
+    assert np.linalg.norm(scale * model @ rotation.T + shift - world, axis=1).max() < 1.0
+    assert similarity_onto(model[:2], up[:2], gps[:2], np.ones(2)) is None
+    assert similarity_onto(np.zeros((9, 3)), up[:9], gps[10:19], np.ones(9)) is None
+
+
+# Structure from motion.
+
+WIDTH, HEIGHT, FOCAL = 400, 300, 340.0
+
+
+def texture(random: np.random.Generator, width: int, height: int) -> Any:
+    """Spots of many sizes: something for features at every distance."""
+    total = np.zeros((height, width), np.float32)
+    for cell in (4, 8, 16, 32):
+        small = random.random((height // cell + 1, width // cell + 1)).astype(np.float32)
+        total += cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
+    return ((total - total.min()) / np.ptp(total) * 255).astype(np.uint8)
+
+
+def street(random: np.random.Generator) -> list[tuple[Floats, Any]]:
+    """Walls as corners (4, 3) in the world with their textures: left and right in pieces, a far end, and the ground."""
+    walls = []
+    for side in (-7.0, 7.0):
+        for start in range(0, 60, 12):
+            x = side + random.uniform(-1.0, 1.0)
+            corners = [[x, start, 8], [x, start + 10, 8], [x, start + 10, 0], [x, start, 0]]
+            walls.append((np.array(corners, dtype=np.float64), texture(random, 500, 400)))
+    end = [[-12, 62, 10], [12, 62, 10], [12, 62, 0], [-12, 62, 0]]
+    return [(np.array(end, dtype=np.float64), texture(random, 600, 300)), *walls]
+
+
+def draw(walls: list[tuple[Floats, Any]], cam_from_world: Floats, center: Floats) -> Any:
+    """The walls from far to near, each by the homography of its piece in front of the camera."""
+    canvas = np.full((HEIGHT, WIDTH), 200, np.uint8)
+    k = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    for corners, image in sorted(walls, key=lambda wall: -np.linalg.norm(wall[0].mean(axis=0) - center)):
+        height, width = image.shape
+        # From the picture's pixels into the plane of the wall, and on into the view.
+        right, down = (corners[1] - corners[0]) / width, (corners[3] - corners[0]) / height
+        view = k @ cam_from_world @ np.column_stack([right, down, corners[0] - center])
+        depth = (cam_from_world @ (corners - center).T)[2]
+        if depth.max() < 0.5:
+            continue
+        inverse = np.linalg.inv(view)
+        u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+        x, y, w = np.einsum("ij,jhw->ihw", inverse, np.stack([u, v, np.ones_like(u)]))
+        w = np.where(np.abs(w) < 1e-9, 1e-9, w)
+        column, row = x / w, y / w
+        inside = (column > 0) & (column < width) & (row > 0) & (row < height)
+        # In front where the depth of the point, 1 / w up to a factor, is positive.
+        inside &= 1.0 / w > 0.3
+        sampled = cv2.remap(
+            image,
+            (column - 0.5).astype(np.float32),
+            (row - 0.5).astype(np.float32),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REFLECT,
+        )
+        canvas[inside] = sampled[inside]
+    return canvas
+
+
+def drive(folder: Path, count: int = 9) -> tuple[Floats, Floats]:
+    """Draw a drive along the street, with GPS of 0.1 m noise; return centres and rotations, cam from world."""
+    random = np.random.default_rng(1)
+    walls, centers, rotations = street(random), [], []
+    for i in range(count):
+        center = np.array([0.8 * np.sin(0.4 * i), 2.0 * i, 1.6 + 0.1 * np.cos(i)])
+        turn = Rotation.from_euler("zx", [0.08 * np.sin(0.7 * i), 0.02 * np.cos(i)]).as_matrix()
+        rotation = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) @ turn
+        lon, lat, height = lon_lat_height_from_enu((center + random.normal(0.0, 0.1, 3))[None], ANCHOR)[0].tolist()
+        exif = tags(
+            lat, lon, height, FocalLengthIn35mmFilm=31, GPSDateStamp="2023:11:14", GPSTimeStamp=(22.0, 13.0, float(i))
+        )
+        folder.mkdir(exist_ok=True)
+        # Names say nothing of the order.
+        pixels = np.repeat(draw(walls, rotation, center)[:, :, None], 3, axis=2)
+        Image.fromarray(pixels).save(folder / f"{(i * 5) % count:02d} x.jpg", exif=exif, quality=95)
+        centers.append(center)
+        rotations.append(rotation)
+    return np.array(centers), np.array(rotations)
+
+
+def test_structure_from_motion_finds_poses_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    centers, rotations = drive(tmp_path / "pictures")
+    workspace = tmp_path / "work"
+    dataset = read_pictures(tmp_path / "pictures", workspace=workspace, anchor=ANCHOR, gps_sigma_m=0.1, threads=2)
+    assert len(dataset.images) >= 0.9 * len(centers)
+    assert dataset.images.timestamp_s is not None
+    row = (dataset.images.timestamp_s - dataset.images.timestamp_s.min()).round().astype(int)
+    error = camera_centers(dataset.images) - centers[row]
+    relative = np.linalg.norm(error[:, None] - error[None], axis=2)
+    assert relative.max() < 0.3
+    turned = np.einsum("nij,nij->n", rotation_matrices(dataset.images), rotations[row])
+    assert np.degrees(np.arccos(np.clip((turned - 1.0) / 2.0, -1.0, 1.0))).max() < 3.0
+    assert dataset.images.position_sigma_m is not None
+    assert 0.0 < np.median(dataset.images.position_sigma_m) < 0.3
+    assert_allclose(dataset.cameras.params[0][0], FOCAL, rtol=0.03)
+
+    def never(*_: Any, **__: Any) -> None:
+        raise AssertionError("this was done before")
+
+    monkeypatch.setattr(pycolmap, "extract_features", never)
+    monkeypatch.setattr(pycolmap, "incremental_mapping", never)
+    again = read_pictures(tmp_path / "pictures", workspace=workspace, anchor=ANCHOR, gps_sigma_m=0.1, threads=2)
+    assert_allclose(again.images.cam_from_world_m, dataset.images.cam_from_world_m, atol=1e-9)
+    write(tmp_path / "mine" / "notes.txt", "mine")
+    assert "is not empty and not ours" in refusal(
+        lambda: read_pictures(tmp_path / "pictures", workspace=tmp_path / "mine")
+    )
