@@ -7,12 +7,10 @@ from typing import Annotated
 
 import typer
 
-from valuemap import dataset as dataset_folder
-from valuemap.cli.import_.app import finish_dataset, import_app
+from valuemap.cli.import_.app import check_out, finish_dataset, import_app
 from valuemap.cli.import_.options import Anchor, CameraText, with_detections
-from valuemap.cli.options import DatasetOut, MaxRejected
+from valuemap.cli.options import DatasetOut, Force, MaxRejected
 from valuemap.cli.show import progress_bars
-from valuemap.folders import check_place
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.vet import MAX_REJECTED
 
@@ -32,11 +30,12 @@ def import_pictures(
     threads: Annotated[int, typer.Option(min=0, max=1024, help="Of structure from motion, 0 for one a core.")] = 0,
     anchor: Anchor = None,
     max_rejected: MaxRejected = MAX_REJECTED,
+    force: Force = False,
 ) -> None:
     """Import pictures without poses: from EXIF, and by structure from motion; started again, it goes on."""
     from valuemap.readers import READERS
 
-    check_place(out, marker=dataset_folder.MARKER)
+    check_out(out, force=force)
     with progress_bars() as progress:
         dataset = READERS["pictures"](
             folder,
@@ -50,4 +49,4 @@ def import_pictures(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out)
+    finish_dataset(dataset, out, force=force)
