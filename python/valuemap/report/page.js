@@ -354,6 +354,11 @@
 
   // Tools.
 
+  function chooseNamed() {                      // A link to report.html#label=12 opens with that label.
+    var named = /^#label=(\d+)$/.exec(location.hash);
+    for (var i = 0; named && i < count; i++) if (String(data.label_id[i]) === named[1]) { choose(i, true); return; }
+  }
+
   function setUp() {
     readStyle();
     byId("explore").hidden = false;
@@ -392,6 +397,8 @@
     if (window.matchMedia) matchMedia("(prefers-color-scheme: dark)").addEventListener("change", function () { readStyle(); choose(chosen, false); });
     choose(-1, false);
     showAll();
+    chooseNamed();
+    window.addEventListener("hashchange", chooseNamed);
     document.documentElement.setAttribute("data-ready", String(count));
   }
 
