@@ -1,0 +1,732 @@
+"""Put each known fault into good data and see whether `valuemap check` names it, and whether its fix undoes it.
+
+    python benchmarks/check_faults.py [--seeds N] [--kitti-signs DIR] [--kitti-ts DIR] [--only FAULT ...] [--json FILE]
+
+Good data are simulated cities (two cameras, time stamps, a geo-reference, truth), and where their folders are given
+KITTI odometry 00, 05, 07, 09 (see kitti_signs.py; faults go into 00) and KITTI-TS (`images.csv`, `detections.csv`,
+`signs.csv`). Faults are written here, apart from the package: nothing of a fix is used to make the fault that it undoes.
+
+What is counted
+
+    named     the fault is among the findings
+    others    findings of other names beside it, first ones included
+    clean     findings in data without a fault: there should be none
+    recovered the map of the fixed data has as many of the true objects as that of the unharmed data, less 2 %
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from kitti_signs import SEQUENCES, import_sequence, read_points
+from machine import describe_machine, keep_record
+from valuemap.cameras import camera_centers, rotation_matrices
+from valuemap.check.examine import Examination, examine
+from valuemap.dataset import Dataset, Frame, rows_of
+from valuemap.errors import ValuemapError
+from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
+from valuemap.pipeline import build_map
+from valuemap.simulate import PRESETS, simulate
+from valuemap.tables import Cameras, Categories, Detections, Images, Truth
+
+Floats = NDArray[np.float64]
+ANCHOR = (51.5, -0.14, 35.0)
+MATCH_M = 1.5
+
+
+@dataclass(frozen=True)
+class Fault:
+    """How a fault gets into data; None where the data have nothing to put it into."""
+
+    spoil: Callable[[Dataset], Dataset | None]
+    has_fix: bool = True
+
+
+# ---------------------------------------------------------------------------------------------- good data
+
+
+def good_city(seed: int, **changes: float) -> Dataset:
+    """Return a simulated city with two cameras, a geo-reference and sigmas of the poses."""
+    config = replace(PRESETS["small"], write_pose_sigmas=1, **changes)  # type: ignore[arg-type]
+    dataset = simulate(config, seed=seed, name=f"city-{seed}")
+    return with_second_camera(replace(dataset, frame=Frame(anchor=ANCHOR)), scale=0.75)
+
+
+def with_second_camera(dataset: Dataset, *, scale: float) -> Dataset:
+    """Give every second pass a camera with smaller pictures."""
+    cameras = dataset.cameras
+    first = cameras.params[0]
+    both = Cameras(
+        camera_id=np.array([0, 1]),
+        model=Categories.from_texts([cameras.model.names[0]] * 2),
+        width_px=np.array([cameras.width_px[0], int(cameras.width_px[0] * scale)]),
+        height_px=np.array([cameras.height_px[0], int(cameras.height_px[0] * scale)]),
+        params=[first, first * scale],
+    )
+    is_second = dataset.images.pass_id.codes % 2 == 1
+    of_detection = is_second[rows(dataset)]
+    factor = np.where(of_detection, scale, 1.0)[:, None]
+    detections = dataset.detections
+    return replace(
+        dataset,
+        cameras=both,
+        images=dataset.images.replace(camera_id=is_second.astype(np.int64)),
+        detections=detections.replace(center_px=detections.center_px * factor, size_px=detections.size_px * factor),
+    )
+
+
+def good_kitti(data_dir: Path, sequence: str) -> Dataset:
+    """Return a KITTI sequence as a drive of two passes, with time stamps and the reference tracks as truth."""
+    dataset = import_sequence(data_dir, sequence)
+    tracks = read_points(data_dir / sequence / "reference_tracks.csv")
+    count = len(dataset.images)
+    half = np.where(np.arange(count) < _HALF.get(sequence, count), "first", "second")
+    return replace(
+        dataset,
+        images=dataset.images.replace(
+            timestamp_s=0.1 * np.arange(count),
+            pass_id=Categories.from_texts(half.tolist()),
+            rotation_sigma_rad=np.full(count, 0.002),
+        ),
+        truth=Truth(
+            object_id=np.arange(len(tracks)), class_name=Categories.from_texts(["sign"] * len(tracks)), position_in_world_m=tracks
+        ),
+    )
+
+
+_HALF = {"00": 2300}
+"""The image at which sequence 00 comes back to streets that it has been in."""
+
+
+def good_kitti_ts(data_dir: Path) -> Dataset:
+    """Return KITTI-TS: level cameras 1.65 m above the road, at latitudes and longitudes."""
+    images = _rows_of_csv(data_dir / "images.csv")
+    boxes = _rows_of_csv(data_dir / "detections.csv")
+    signs = _rows_of_csv(data_dir / "signs.csv")
+    lat_lon = np.array([[float(row["lat"]), float(row["lon"])] for row in images])
+    anchor = (float(lat_lon[:, 0].mean()), float(lat_lon[:, 1].mean()), 0.0)
+    position = _enu(lat_lon, anchor)
+    position[:, 2] = 1.65
+    yaw = np.array([float(row["yaw_rad_ccw_from_east"]) for row in images])
+    forward = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1)
+    down = np.broadcast_to([0.0, 0.0, -1.0], forward.shape)
+    rotation = np.stack([np.cross(down, forward), down, forward], axis=1)
+    shapes = sorted({(row["fx"], row["cx"], row["cy"], row["width"], row["height"]) for row in images})
+    names = [row["image"] for row in images]
+    corners = np.array([[float(row[key]) for key in ("x1", "y1", "x2", "y2")] for row in boxes])
+    sign_position = _enu(np.array([[float(row["lat"]), float(row["lon"])] for row in signs]), anchor)
+    return Dataset(
+        name="kitti_ts",
+        frame=Frame(anchor=anchor),
+        cameras=Cameras(
+            camera_id=np.arange(len(shapes)),
+            model=Categories.from_texts(["PINHOLE"] * len(shapes)),
+            width_px=np.array([int(shape[3]) for shape in shapes]),
+            height_px=np.array([int(shape[4]) for shape in shapes]),
+            params=[
+                np.array([float(fx), float(fx), float(cx) + 0.5, float(cy) + 0.5]) for fx, cx, cy, _, _ in shapes
+            ],
+        ),
+        images=Images(
+            image_id=np.arange(len(images)),
+            name=pa.array(names),
+            camera_id=np.array(
+                [shapes.index((row["fx"], row["cx"], row["cy"], row["width"], row["height"])) for row in images]
+            ),
+            cam_from_world_quat=Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True),
+            cam_from_world_m=-np.einsum("nij,nj->ni", rotation, position),
+            pass_id=Categories.from_texts([row["drive"] for row in images]),
+            timestamp_s=np.array([0.1 * int(name.rsplit("_", 1)[1]) for name in names]),
+        ),
+        detections=Detections(
+            detection_id=np.arange(len(boxes)),
+            image_id=np.array([names.index(row["image"]) for row in boxes]),
+            class_name=Categories.from_texts([f"sign {row['class']}" for row in boxes]),
+            center_px=(corners[:, :2] + corners[:, 2:]) / 2.0 + 0.5,
+            size_px=corners[:, 2:] - corners[:, :2],
+            score=np.ones(len(boxes)),
+        ),
+        truth=Truth(
+            object_id=np.arange(len(signs)),
+            class_name=Categories.from_texts([f"sign {row['class']}" for row in signs]),
+            position_in_world_m=sign_position,
+        ),
+    )
+
+
+def _rows_of_csv(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def _enu(lat_lon: Floats, anchor: tuple[float, float, float]) -> Floats:
+    return enu_from_lon_lat_height(np.stack([lat_lon[:, 1], lat_lon[:, 0], np.zeros(len(lat_lon))], axis=1), anchor)
+
+
+# ---------------------------------------------------------------------------------------------- faults
+
+
+def rows(dataset: Dataset) -> NDArray[np.int64]:
+    """Return the image row of each detection."""
+    return rows_of(dataset.detections.image_id, dataset.images.image_id)
+
+
+def posed(dataset: Dataset, rotation: Floats, center: Floats) -> Dataset:
+    """Return the dataset with other poses."""
+    quaternion = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
+    return replace(
+        dataset,
+        images=dataset.images.replace(
+            cam_from_world_quat=quaternion, cam_from_world_m=-np.einsum("nij,nj->ni", rotation, center)
+        ),
+    )
+
+
+def _poses(dataset: Dataset) -> tuple[Floats, Floats]:
+    return rotation_matrices(dataset.images), camera_centers(dataset.images)
+
+
+def boxed(dataset: Dataset, center: Floats | None = None, size: Floats | None = None) -> Dataset:
+    """Return the dataset with other boxes."""
+    detections = dataset.detections
+    return replace(
+        dataset,
+        detections=detections.replace(
+            center_px=detections.center_px if center is None else center,
+            size_px=detections.size_px if size is None else size,
+        ),
+    )
+
+
+def inverted_poses(dataset: Dataset) -> Dataset:
+    """world_from_cam in the columns."""
+    rotation, center = _poses(dataset)
+    quaternion = Rotation.from_matrix(rotation.transpose(0, 2, 1)).as_quat(canonical=True, scalar_first=True)
+    return replace(dataset, images=dataset.images.replace(cam_from_world_quat=quaternion, cam_from_world_m=center))
+
+
+def quaternion_order(dataset: Dataset) -> Dataset:
+    """The columns hold x y z w."""
+    quaternion = dataset.images.cam_from_world_quat[:, [1, 2, 3, 0]].copy()
+    return replace(dataset, images=dataset.images.replace(cam_from_world_quat=quaternion))
+
+
+def camera_axes(dataset: Dataset) -> Dataset:
+    """OpenGL: y up, z back."""
+    rotation, center = _poses(dataset)
+    return posed(dataset, np.diag([1.0, -1.0, -1.0]) @ rotation, center)
+
+
+def world_axes(dataset: Dataset) -> Dataset:
+    """Rotations from north, east, down (or another pair of axes where up is not z); positions as they are."""
+    rotation, center = _poses(dataset)
+    ned_from_enu = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    return posed(dataset, rotation @ ned_from_enu.T, center)
+
+
+def center_as_translation(dataset: Dataset) -> Dataset:
+    """The camera centre in tx ty tz."""
+    return replace(dataset, images=dataset.images.replace(cam_from_world_m=camera_centers(dataset.images)))
+
+
+def mirrored_positions(dataset: Dataset) -> Dataset:
+    """A left-handed world for the positions."""
+    rotation, center = _poses(dataset)
+    axis = 0 if abs(dataset.frame.up[1]) > 0.7 else 1
+    flip = np.ones(3)
+    flip[axis] = -1.0
+    return posed(dataset, rotation, center * flip)
+
+
+def lat_lon_swapped(dataset: Dataset) -> Dataset:
+    """Latitude and longitude of the positions exchanged at import, or two axes where there are none."""
+    rotation, center = _poses(dataset)
+    if dataset.frame.anchor is None:
+        return posed(dataset, rotation, center[:, [2, 1, 0]])
+    lat, lon, height = dataset.frame.anchor
+    geographic = lon_lat_height_from_enu(center, dataset.frame.anchor)
+    anchor = (lon, lat, height)
+    swapped = enu_from_lon_lat_height(np.ascontiguousarray(geographic[:, [1, 0, 2]]), anchor)
+    return replace(posed(dataset, rotation, swapped), frame=Frame(anchor=anchor))
+
+
+def _angles(dataset: Dataset) -> tuple[Floats, Floats, Floats]:
+    """Azimuth clockwise from north, pitch and roll, by SciPy's Euler angles."""
+    east, north = dataset.frame.east_north()
+    axes = np.stack([east, north, np.array(dataset.frame.up)])
+    # World (east, north, up) to a body with x right, y forward, z up.
+    body = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]) @ rotation_matrices(dataset.images) @ axes.T
+    angles = Rotation.from_matrix(body.transpose(0, 2, 1)).as_euler("ZXY")
+    return -angles[:, 0], angles[:, 1], angles[:, 2]
+
+
+def _from_angles(dataset: Dataset, azimuth: Floats, pitch: Floats, roll: Floats) -> Dataset:
+    east, north = dataset.frame.east_north()
+    axes = np.stack([east, north, np.array(dataset.frame.up)])
+    body = Rotation.from_euler("ZXY", np.stack([-azimuth, pitch, roll], axis=1)).as_matrix().transpose(0, 2, 1)
+    rotation = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]) @ body @ axes
+    return posed(dataset, rotation, camera_centers(dataset.images))
+
+
+def heading_convention(dataset: Dataset) -> Dataset:
+    """Counter-clockwise from east read as clockwise from north."""
+    azimuth, pitch, roll = _angles(dataset)
+    return _from_angles(dataset, np.pi / 2.0 - azimuth, pitch, roll)
+
+
+def degrees_for_radians(dataset: Dataset) -> Dataset:
+    """Angles in degrees read as radians."""
+    azimuth, pitch, roll = _angles(dataset)
+    return _from_angles(dataset, np.degrees(azimuth), np.degrees(pitch), np.degrees(roll))
+
+
+def pitch_and_roll(dataset: Dataset) -> Dataset:
+    """Pitch and roll of a poor sensor."""
+    azimuth, _, _ = _angles(dataset)
+    noise = np.radians(5.0) * np.random.default_rng(1).standard_normal((2, len(azimuth)))
+    return _from_angles(dataset, azimuth, noise[0], noise[1])
+
+
+def up_direction(dataset: Dataset) -> Dataset | None:
+    """The sky in another direction: positions and rotations in north, east, down where z should be up."""
+    x, y, z = dataset.frame.up
+    if dataset.frame.anchor is None:
+        return replace(dataset, frame=Frame(up=(z, x, y)))
+    rotation, center = _poses(dataset)
+    ned_from_enu = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    return posed(dataset, rotation @ ned_from_enu.T, center @ ned_from_enu.T)
+
+
+def rotation_sigma_in_degrees(dataset: Dataset) -> Dataset:
+    """The column in degrees, of poses good to a degree."""
+    sigma = np.full(len(dataset.images), 1.0)
+    return replace(dataset, images=dataset.images.replace(rotation_sigma_rad=sigma))
+
+
+def _with_params(dataset: Dataset, change: Callable[[Floats], Floats]) -> Dataset:
+    return replace(dataset, cameras=dataset.cameras.replace(params=[change(each.copy()) for each in dataset.cameras.params]))
+
+
+def focal_length(dataset: Dataset) -> Dataset:
+    """A focal length 15 % too long."""
+    return _with_params(dataset, lambda params: params * [1.15, 1.15, 1.0, 1.0])
+
+
+def picture_size(dataset: Dataset) -> Dataset:
+    """The detector saw pictures of half the size."""
+    return boxed(dataset, dataset.detections.center_px / 2.0, dataset.detections.size_px / 2.0)
+
+
+def half_pixel(dataset: Dataset) -> Dataset:
+    """OpenCV's pixels in the cameras where the principal point is in the middle, in the boxes elsewhere."""
+    middle = 2.0 * dataset.cameras.params[0][2] == dataset.cameras.width_px[0]
+    if middle:
+        return _with_params(dataset, lambda params: params - [0.0, 0.0, 0.5, 0.5])
+    return boxed(dataset, dataset.detections.center_px - 0.5)
+
+
+def camera_tilt(dataset: Dataset) -> Dataset:
+    """Cameras mounted 2 degrees lower than is known."""
+    rotation, center = _poses(dataset)
+    return posed(dataset, Rotation.from_euler("x", 2.0, degrees=True).as_matrix() @ rotation, center)
+
+
+def camera_yaw(dataset: Dataset) -> Dataset:
+    """Cameras mounted 3 degrees to a side."""
+    rotation, center = _poses(dataset)
+    return posed(dataset, Rotation.from_euler("y", 3.0, degrees=True).as_matrix() @ rotation, center)
+
+
+def wrong_camera(dataset: Dataset) -> Dataset | None:
+    """All images have the first camera."""
+    if len(dataset.cameras) < 2:
+        dataset = with_second_camera(dataset, scale=0.75)
+    elif np.ptp(dataset.cameras.width_px) < 0.1 * dataset.cameras.width_px[0]:
+        return None
+    return replace(dataset, images=dataset.images.replace(camera_id=np.full(len(dataset.images), dataset.cameras.camera_id[0])))
+
+
+def boxes_as_corners(dataset: Dataset) -> Dataset:
+    """x1 y1 x2 y2."""
+    center, size = dataset.detections.center_px, dataset.detections.size_px
+    return boxed(dataset, center - size / 2.0, center + size / 2.0)
+
+
+def boxes_top_left(dataset: Dataset) -> Dataset:
+    """The top left corner as the centre."""
+    return boxed(dataset, dataset.detections.center_px - dataset.detections.size_px / 2.0)
+
+
+def boxes_normalised(dataset: Dataset) -> Dataset:
+    """From 0 to 1."""
+    row = rows_of(dataset.images.camera_id, dataset.cameras.camera_id)[rows(dataset)]
+    extent = np.stack([dataset.cameras.width_px[row], dataset.cameras.height_px[row]], axis=1)
+    return boxed(dataset, dataset.detections.center_px / extent, dataset.detections.size_px / extent)
+
+
+def boxes_half_size(dataset: Dataset) -> Dataset:
+    """Half widths and heights."""
+    return boxed(dataset, size=dataset.detections.size_px / 2.0)
+
+
+def mirrored_pictures(dataset: Dataset) -> Dataset:
+    """Left and right of the pictures exchanged."""
+    row = rows_of(dataset.images.camera_id, dataset.cameras.camera_id)[rows(dataset)]
+    center = dataset.detections.center_px.copy()
+    center[:, 0] = dataset.cameras.width_px[row] - center[:, 0]
+    return boxed(dataset, center)
+
+
+def scale(dataset: Dataset) -> Dataset:
+    """A model in a unit of its own."""
+    rotation, center = _poses(dataset)
+    return posed(dataset, rotation, 0.07 * center)
+
+
+def _busy_pass(dataset: Dataset) -> int:
+    count = np.bincount(dataset.images.pass_id.codes[rows(dataset)], minlength=len(dataset.images.pass_id.names))
+    return int(np.argsort(-count, kind="stable")[min(1, len(count) - 1)])
+
+
+def _moved_pass(dataset: Dataset, offset: Floats) -> Dataset | None:
+    if len(np.unique(dataset.images.pass_id.codes)) < 2:
+        return None
+    rotation, center = _poses(dataset)
+    is_moved = dataset.images.pass_id.codes == _busy_pass(dataset)
+    return posed(dataset, rotation, center + np.where(is_moved[:, None], offset, 0.0))
+
+
+def pass_offset(dataset: Dataset) -> Dataset | None:
+    """One pass 5 m off."""
+    east, north = dataset.frame.east_north()
+    return _moved_pass(dataset, 4.0 * east + 3.0 * north)
+
+
+def camera_height(dataset: Dataset) -> Dataset | None:
+    """The camera of one pass 1.8 m too low."""
+    return _moved_pass(dataset, -1.8 * np.array(dataset.frame.up))
+
+
+def _later(dataset: Dataset, seconds: float, is_moved: NDArray[np.bool_]) -> Dataset:
+    """Poses as they are so many seconds later."""
+    rotation, center = _poses(dataset)
+    time_s = dataset.images.timestamp_s
+    assert time_s is not None
+    moved = center.copy()
+    for code in np.unique(dataset.images.pass_id.codes):
+        members = np.flatnonzero(dataset.images.pass_id.codes == code)
+        members = members[np.argsort(time_s[members], kind="stable")]
+        for axis in range(3):
+            moved[members, axis] = np.interp(time_s[members] + seconds, time_s[members], center[members, axis])
+    return posed(dataset, rotation, np.where(is_moved[:, None], moved, center))
+
+
+def pass_time_shift(dataset: Dataset) -> Dataset | None:
+    """The clock of one pass 0.5 s off."""
+    if len(np.unique(dataset.images.pass_id.codes)) < 2:
+        return None
+    return _later(dataset, 0.5, dataset.images.pass_id.codes == _busy_pass(dataset))
+
+
+def time_shift(dataset: Dataset) -> Dataset:
+    """The clock of all poses 0.6 s off."""
+    return _later(dataset, 0.6, np.ones(len(dataset.images), dtype=np.bool_))
+
+
+def passes_no_drives(dataset: Dataset) -> Dataset:
+    """Pass ids dealt at random, without times, names or numbers that tell."""
+    random = np.random.default_rng(2)
+    order = random.permutation(len(dataset.images))
+    names = [f"{number:06d}.jpg" for number in order]
+    passes = [f"batch-{number % 5}" for number in order]
+    images = dataset.images.replace(name=pa.array(names), pass_id=Categories.from_texts(passes), timestamp_s=None)
+    return replace(dataset, images=images)
+
+
+def interleaved_passes(dataset: Dataset) -> Dataset | None:
+    """Two passes under one id, their images in turn."""
+    codes = dataset.images.pass_id.codes
+    if len(np.unique(codes)) < 2:
+        return None
+    first, second = (int(code) for code in np.argsort(-np.bincount(codes), kind="stable")[:2])
+    names, when = list(dataset.images.name.to_pylist()), np.arange(len(codes), dtype=np.float64)
+    for code, late in ((first, 0.0), (second, 0.03)):
+        members = np.flatnonzero(codes == code)
+        when[members] = 0.1 * np.arange(len(members)) + late
+        for number, row in enumerate(members):
+            names[row] = f"both/{2 * number + (code == second):06d}.jpg"
+    passes = np.array(dataset.images.pass_id.texts(), dtype=object)
+    passes[(codes == first) | (codes == second)] = "both"
+    images = dataset.images.replace(name=pa.array(names), pass_id=Categories.from_texts(passes.tolist()), timestamp_s=when)
+    return replace(dataset, images=images)
+
+
+def rolling_times(dataset: Dataset) -> Dataset | None:
+    """Seconds within the minute."""
+    time_s = dataset.images.timestamp_s
+    return None if time_s is None else replace(dataset, images=dataset.images.replace(timestamp_s=time_s % 60.0))
+
+
+def time_unit(dataset: Dataset) -> Dataset | None:
+    """Milliseconds."""
+    time_s = dataset.images.timestamp_s
+    return None if time_s is None else replace(dataset, images=dataset.images.replace(timestamp_s=1000.0 * time_s))
+
+
+def detections_shifted(dataset: Dataset) -> Dataset:
+    """Detections listed with the image before their own."""
+    codes = dataset.images.pass_id.codes
+    before = np.maximum(np.arange(len(codes)) - 1, 0)
+    before = np.where(codes[before] == codes, before, np.arange(len(codes)))
+    ids = dataset.images.image_id[before[rows(dataset)]]
+    return replace(dataset, detections=dataset.detections.replace(image_id=ids))
+
+
+def repeated_boxes(dataset: Dataset) -> Dataset:
+    """Every box twice."""
+    detections = dataset.detections
+    twice = np.repeat(np.arange(len(detections)), 2)
+    copies = detections.take(twice).replace(detection_id=np.arange(len(twice)))
+    copies.center_px[1::2] += 0.2
+    return replace(dataset, detections=copies, truth_detections=None)
+
+
+def repeated_images(dataset: Dataset) -> Dataset:
+    """A tenth of the images twice, under other names."""
+    images, detections = dataset.images, dataset.detections
+    again = np.arange(0, len(images), 10)
+    image_rows = np.concatenate([np.arange(len(images)), again])
+    offset = int(images.image_id.max()) + 1
+    ids = np.concatenate([images.image_id, offset + np.arange(len(again))])
+    names = images.name.to_pylist() + [f"copy/{name}" for name in images.name.take(again).to_pylist()]
+    copied = np.isin(rows(dataset), again)
+    new_id = offset + np.searchsorted(again, rows(dataset)[copied])
+    detection_rows = np.concatenate([np.arange(len(detections)), np.flatnonzero(copied)])
+    return replace(
+        dataset,
+        images=images.take(image_rows).replace(image_id=ids, name=pa.array(names)),
+        detections=detections.take(detection_rows).replace(
+            detection_id=np.arange(len(detection_rows)), image_id=np.concatenate([detections.image_id, new_id])
+        ),
+        truth_detections=None,
+    )
+
+
+def far_images(dataset: Dataset) -> Dataset:
+    """One image in a hundred at the other end of the Earth."""
+    rotation, center = _poses(dataset)
+    center = center.copy()
+    center[50::100] += [3.2e6, -1.1e6, 4.0e5]
+    return posed(dataset, rotation, center)
+
+
+def quantised_boxes(dataset: Dataset) -> Dataset:
+    """Centres on the cells of a heat map."""
+    return boxed(dataset, (np.floor(dataset.detections.center_px / 4.0) + 0.5) * 4.0)
+
+
+def class_spelling(dataset: Dataset) -> Dataset:
+    """Every third detection of a class in other letters."""
+    texts = dataset.detections.class_name.texts()
+    spelled = [text.replace("_", " ").title() if i % 3 == 0 else text for i, text in enumerate(texts)]
+    return replace(dataset, detections=dataset.detections.replace(class_name=Categories.from_texts(spelled)))
+
+
+def equal_scores(dataset: Dataset) -> Dataset:
+    """All 0.5."""
+    return replace(dataset, detections=dataset.detections.replace(score=np.full(len(dataset.detections), 0.5)))
+
+
+def truth_elsewhere(dataset: Dataset) -> Dataset | None:
+    """Truth in another frame: moved by some hundred metres."""
+    if dataset.truth is None:
+        return None
+    moved = dataset.truth.position_in_world_m + [250.0, -130.0, 0.0]
+    return replace(dataset, truth=dataset.truth.replace(position_in_world_m=moved))
+
+
+FAULTS: dict[str, Fault] = {
+    "inverted_poses": Fault(inverted_poses),
+    "quaternion_order": Fault(quaternion_order),
+    "camera_axes": Fault(camera_axes),
+    "world_axes": Fault(world_axes),
+    "center_as_translation": Fault(center_as_translation),
+    "mirrored_positions": Fault(mirrored_positions),
+    "lat_lon_swapped": Fault(lat_lon_swapped),
+    "heading_convention": Fault(heading_convention),
+    "degrees_for_radians": Fault(degrees_for_radians),
+    "pitch_and_roll": Fault(pitch_and_roll, has_fix=False),  # What the sensor did not measure does not come back.
+    "up_direction": Fault(up_direction),
+    "rotation_sigma_in_degrees": Fault(rotation_sigma_in_degrees),
+    "focal_length": Fault(focal_length),
+    "picture_size": Fault(picture_size),
+    "half_pixel": Fault(half_pixel),
+    "camera_tilt": Fault(camera_tilt),
+    "camera_yaw": Fault(camera_yaw),
+    "wrong_camera": Fault(wrong_camera),
+    "boxes_as_corners": Fault(boxes_as_corners),
+    "boxes_top_left": Fault(boxes_top_left),
+    "boxes_normalised": Fault(boxes_normalised),
+    "boxes_half_size": Fault(boxes_half_size),
+    "mirrored_pictures": Fault(mirrored_pictures),
+    "scale": Fault(scale, has_fix=False),
+    "pass_offset": Fault(pass_offset),
+    "pass_time_shift": Fault(pass_time_shift),
+    "time_shift": Fault(time_shift),
+    "camera_height": Fault(camera_height),
+    "passes_no_drives": Fault(passes_no_drives),
+    "interleaved_passes": Fault(interleaved_passes),
+    "rolling_times": Fault(rolling_times),
+    "time_unit": Fault(time_unit),
+    "detections_shifted": Fault(detections_shifted),
+    "repeated_boxes": Fault(repeated_boxes),
+    "repeated_images": Fault(repeated_images),
+    "far_images": Fault(far_images),
+    "quantised_boxes": Fault(quantised_boxes, has_fix=False),
+    "class_spelling": Fault(class_spelling),
+    "equal_scores": Fault(equal_scores, has_fix=False),
+    "truth_elsewhere": Fault(truth_elsewhere),
+}
+
+
+# ---------------------------------------------------------------------------------------------- measuring
+
+
+def found_objects(dataset: Dataset, truth: Truth) -> int:
+    """Return how many true objects a map of the dataset has a label for."""
+    labels = build_map(dataset).labels
+    if not len(labels):
+        return 0
+    distance, _ = cKDTree(labels.position_in_world_m).query(truth.position_in_world_m)
+    return int((distance <= MATCH_M).sum())
+
+
+def measure(good: Dataset, name: str, fault: Fault, unharmed: int | None) -> dict[str, Any] | None:
+    """Put one fault in, check, and map what the fix made of it."""
+    spoiled = fault.spoil(good)
+    if spoiled is None:
+        return None
+    start = time.perf_counter()
+    outcome: Examination = examine(spoiled)
+    seconds = time.perf_counter() - start
+    findings = [finding.fault for finding in outcome.findings]
+    result: dict[str, Any] = {
+        "named": name in findings,
+        "others": [finding for finding in findings if finding != name],
+        "seconds": round(seconds, 2),
+    }
+    if fault.has_fix and unharmed is not None and good.truth is not None and name != "truth_elsewhere":
+        result["objects"], result["unharmed"] = found_objects(outcome.fixed, good.truth), unharmed
+        result["recovered"] = result["objects"] >= 0.98 * unharmed - 1.0
+    return result
+
+
+def run(good: Dataset, only: list[str], *, spoils: bool = True, maps: bool = True) -> dict[str, Any]:
+    """Check one good dataset as it is and with every fault."""
+    start = time.perf_counter()
+    clean = examine(good)
+    record: dict[str, Any] = {
+        "clean": [finding.to_json() for finding in clean.findings],
+        "seconds": round(time.perf_counter() - start, 2),
+        "faults": {},
+    }
+    unharmed = found_objects(good, good.truth) if maps and spoils and good.truth is not None else None
+    for name, fault in _chosen(only) if spoils else ():
+        result = measure(good, name, fault, unharmed)
+        if result is not None:
+            record["faults"][name] = result
+            print(f"  {name:28} {_line(result)}", flush=True)
+    return record
+
+
+def _chosen(only: list[str]) -> Iterator[tuple[str, Fault]]:
+    return ((name, fault) for name, fault in FAULTS.items() if not only or name in only)
+
+
+def _line(result: dict[str, Any]) -> str:
+    named = "named" if result["named"] else "MISSED"
+    fixed = "" if "recovered" not in result else f" {result['objects']} of {result['unharmed']} objects"
+    fixed += "" if result.get("recovered", True) else " NOT RECOVERED"
+    return f"{named:7}{fixed} {result['seconds']:.1f} s {' '.join(result['others'])}"
+
+
+def summarise(records: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return the counts over all data."""
+    results = [result for record in records.values() for result in record["faults"].values()]
+    fixes = [result for result in results if "recovered" in result]
+    return {
+        "datasets": len(records),
+        "clean_with_findings": [name for name, record in records.items() if record["clean"]],
+        "kinds": len({name for record in records.values() for name in record["faults"]}),
+        "faults": len(results),
+        "named": sum(result["named"] for result in results),
+        "alone": sum(result["named"] and not result["others"] for result in results),
+        "fixes": len(fixes),
+        "recovered": sum(result["recovered"] for result in fixes),
+        "missed": [
+            f"{data}: {name}" for data, record in records.items() for name, r in record["faults"].items() if not r["named"]
+        ],
+        "not_recovered": [
+            f"{data}: {name}"
+            for data, record in records.items()
+            for name, r in record["faults"].items()
+            if not r.get("recovered", True)
+        ],
+    }
+
+
+def main() -> int:
+    """Run the benchmark; return the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="*", default=list(range(10)))
+    parser.add_argument("--kitti-signs", type=Path, metavar="DIR")
+    parser.add_argument("--kitti-ts", type=Path, metavar="DIR")
+    parser.add_argument("--only", nargs="*", default=[], choices=sorted(FAULTS))
+    parser.add_argument("--clean", action="store_true", help="look at good data only")
+    parser.add_argument("--no-maps", action="store_true", help="do not map what the fixes make")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    records = {}
+    try:
+        for name, good, spoils in _datasets(options):
+            print(name, flush=True)
+            records[name] = run(good, options.only, spoils=spoils and not options.clean, maps=not options.no_maps)
+            for finding in records[name]["clean"]:
+                print(f"  CLEAN DATA: {finding['fault']}: {finding['why']}")
+        totals = summarise(records)
+        for key, value in totals.items():
+            print(f"{key:22} {value}")
+        command = "python benchmarks/check_faults.py --kitti-signs DIR --kitti-ts DIR"
+        record = {"benchmark": "check_faults", "command": command, **describe_machine(), "totals": totals, "results": records}
+        keep_record(options.json, record)
+    except ValuemapError as error:
+        print(f"error: {error}\nhint: {error.hint}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _datasets(options: argparse.Namespace) -> Iterator[tuple[str, Dataset, bool]]:
+    for seed in options.seeds:
+        yield f"city {seed}", good_city(seed), True
+    if options.kitti_signs is not None:
+        for sequence in SEQUENCES:
+            yield f"KITTI {sequence}", good_kitti(options.kitti_signs, sequence), sequence == "00"
+    if options.kitti_ts is not None:
+        yield "KITTI-TS", good_kitti_ts(options.kitti_ts), True
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,144 @@
+"""How well rays agree: the one measure by which a mistake in the conventions of a dataset shows.
+
+Rays of good data meet: many detections of different images vote for one point. Under a wrong convention they meet
+no more often than by chance. The measure asks nothing but that: places are voted on by the core, without any metre
+(ranges are open, so that a model in arbitrary units is measured alike), and every vote counts
+
+    1 - (residual / gate)^2,        and every point found costs COST_OF_A_POINT,
+
+so that few close votes and many distant ones are told apart. A dataset and what it would be under another convention
+are compared place by place on the same detections, so the difference has a scatter of its own and is tested against
+that scatter, not against a constant.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+import valuemap._core as _core
+from valuemap.cameras import Rays, camera_centers, cast_rays, rotation_matrices
+from valuemap.config import VoteConfig
+from valuemap.dataset import Dataset
+from valuemap.errors import SettingError
+from valuemap.tables import Candidates, Floats
+from valuemap.vote import vote_in_clusters
+
+COST_OF_A_POINT = 1.5
+"""A point has three coordinates to please three residuals of its own with: half of them are no evidence."""
+_LEAST_RANGE_M, _GREATEST_RANGE_M = 1e-6, 1e5
+_LEAST_PARALLAX_DEG = 1.0
+_LEAST_PLACES = 4
+_MOST_EXACT = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """What voting on a sample of places came to.
+
+    `gain` (places) is the sum over the votes of a place; `voters` counts all votes, `detections` all detections;
+    `rays` and `found` are what was voted on and the points that were found, relative to `middle_in_world_m` (3).
+    """
+
+    gain: Floats
+    voters: int
+    detections: int
+    rays: Rays
+    found: Candidates
+    middle_in_world_m: Floats
+
+    @property
+    def points_in_world_m(self) -> Floats:
+        """The points (N, 3) where rays meet, in the frame of the dataset."""
+        return self.found.position_in_world_m + self.middle_in_world_m
+
+    @property
+    def share(self) -> float:
+        """The share of detections whose rays meet others."""
+        return self.voters / max(self.detections, 1)
+
+
+def measure_agreement(dataset: Dataset, place_of_image: NDArray[np.uint32], gate_px: float) -> Agreement:
+    """Vote on a sample: `place_of_image` (images) says which images are looked at together, from 0 without gaps."""
+    middle_in_world_m = np.median(camera_centers(dataset.images), axis=0)
+    rays = cast_rays(_around(dataset, middle_in_world_m))
+    places = int(place_of_image.max(initial=0)) + 1
+    config = VoteConfig(
+        max_reprojection_error_px=gate_px,
+        min_parallax_deg=_LEAST_PARALLAX_DEG,
+        min_range_m=_LEAST_RANGE_M,
+        max_range_m=_GREATEST_RANGE_M,
+    )
+    try:
+        found, _ = vote_in_clusters(rays, place_of_image, config)
+    except SettingError:  # So many rays through one point that their votes fill the memory: no convention of the world.
+        found = Candidates(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0, np.uint32), np.empty(0, np.uint32))
+    gain = np.zeros(places)
+    if len(found):
+        residual_px, _, _ = _core.see(rays.core, found.position_in_world_m, found.voter_offsets, found.voters)
+        worth = np.maximum(1.0 - (residual_px / gate_px) ** 2, 0.0)
+        place = place_of_image[rays.image_row[found.voters.astype(np.int64)]]
+        gain += np.bincount(place, weights=worth, minlength=places)
+        first = found.voters[found.voter_offsets[:-1]].astype(np.int64)
+        gain -= COST_OF_A_POINT * np.bincount(place_of_image[rays.image_row[first]], minlength=places)
+    return Agreement(gain, len(found.voters), len(rays), rays, found, middle_in_world_m)
+
+
+def _around(dataset: Dataset, middle_in_world_m: Floats) -> Dataset:
+    """Move the world so that its origin is amid the images: far from it the core's single precision is coarse."""
+    rotation = rotation_matrices(dataset.images)
+    moved = dataset.images.replace(cam_from_world_m=dataset.images.cam_from_world_m + rotation @ middle_in_world_m)
+    return Dataset(**{**vars(dataset), "images": moved})
+
+
+def chance_agreement(dataset: Dataset, place_of_image: NDArray[np.uint32], gate_px: float) -> Agreement:
+    """Measure the same with the detections of each place dealt to other images of it: what is left is chance."""
+    detections = dataset.detections
+    place = place_of_image[np.searchsorted(dataset.images.image_id, detections.image_id)]
+    order = np.argsort(place, kind="stable")
+    dealt = np.arange(len(detections))
+    for rows in np.split(order, np.flatnonzero(np.diff(place[order])) + 1):
+        dealt[rows] = np.roll(rows, len(rows) // 2)
+    moved = detections.replace(center_px=detections.center_px[dealt], size_px=detections.size_px[dealt])
+    return measure_agreement(Dataset(**{**vars(dataset), "detections": moved}), place_of_image, gate_px)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How much better one convention makes rays agree than another: difference of gains, and how likely by chance."""
+
+    difference: float
+    chance: float
+    places: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures by name."""
+        return {"difference": round(self.difference, 2), "chance": float(f"{self.chance:.2g}"), "places": self.places}
+
+
+def compare(better: Floats, worse: Floats) -> Comparison:
+    """Test the paired differences of gains (places) against their scatter, one-sided.
+
+    Student's t has most power where places are alike, Wilcoxon's signed ranks where few of them are much larger; the
+    better of both counts, times two for the choice. Places that neither convention makes anything of do not count.
+    """
+    tells = (better != 0.0) | (worse != 0.0)
+    difference = (better - worse)[tells]
+    count = len(difference)
+    total = float(difference.sum())
+    if count < _LEAST_PLACES or total <= 0.0:
+        return Comparison(total, 1.0, count)
+    scatter = float(difference.std(ddof=1)) / math.sqrt(count)
+    statistic = math.inf if scatter == 0.0 else float(difference.mean()) / scatter
+    by_size = float(stats.t.sf(statistic, count - 1))
+    by_rank = float(stats.wilcoxon(difference, alternative="greater", method=_method(count)).pvalue)
+    return Comparison(total, min(1.0, 2.0 * min(by_size, by_rank)), count)
+
+
+def _method(count: int) -> str:
+    return "exact" if count <= _MOST_EXACT else "approx"

@@ -1,0 +1,286 @@
+"""Faults of boxes: what x, y, width and height mean, and in which picture they were measured."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from scipy import stats
+
+from valuemap.check.fault import LEAST_CHANCE, Convention, Fault, Finding, Fix, Stage, View, with_detections
+from valuemap.dataset import Dataset, rows_of
+from valuemap.tables import Bools, Floats, Ints
+
+_NORMALISED_LIMIT = 2.0
+_STRAYS = 0.02
+"""A gap with more boxes in it than this share of those beside it is none."""
+
+
+def picture_sizes(dataset: Dataset) -> Floats:
+    """Return width and height (N, 2) in pixels of the picture of each detection."""
+    camera_row = rows_of(dataset.images.camera_id, dataset.cameras.camera_id)
+    camera = camera_row[rows_of(dataset.detections.image_id, dataset.images.image_id)]
+    return np.stack([dataset.cameras.width_px[camera], dataset.cameras.height_px[camera]], axis=1).astype(np.float64)
+
+
+class NormalisedBoxes(Fault):
+    """Boxes from 0 to 1."""
+
+    name: ClassVar[str] = "boxes_normalised"
+    stage: ClassVar[Stage] = "tables"
+
+    def find(self, view: View) -> Finding | None:
+        """Look for boxes that all lie in the first pixel."""
+        detections = view.dataset.detections
+        most = float(max(np.abs(detections.center_px).max(), np.abs(detections.size_px).max()))
+        if most > _NORMALISED_LIMIT:
+            return None
+        return Finding(
+            fault=self.name,
+            what="The boxes are from 0 to 1, not in pixels.",
+            why=f"No centre or size of {len(detections)} boxes is above {most:.3g}.",
+            do="Multiply x and width by the picture's width, y and height by its height.",
+            figures={"largest": round(most, 4)},
+            fix=_to_pixels,
+        )
+
+
+class CornersAsCenter(Fault):
+    """x1 y1 x2 y2 where centre and size are expected."""
+
+    name: ClassVar[str] = "boxes_as_corners"
+    stage: ClassVar[Stage] = "tables"
+
+    def find(self, view: View) -> Finding | None:
+        """See whether width and height are always beyond x and y, and still in the picture."""
+        detections = view.dataset.detections
+        center, size = detections.center_px, detections.size_px
+        if len(detections) < 3 or np.median(size) < 2.0:
+            return None
+        beyond = (size >= center).all(axis=1)
+        inside = (size <= picture_sizes(view.dataset) * 1.02 + 1.0).all(axis=1)
+        # Boxes of objects are as often left as right of where width equals x; in good data most are far smaller.
+        share = float((beyond & inside).mean())
+        if share < 0.98:
+            return None
+        return Finding(
+            fault=self.name,
+            what="x, y, width and height hold the corners x1, y1, x2, y2.",
+            why=f"In {share:.1%} of {len(detections)} boxes width exceeds x and height exceeds y, and the median width is "
+            f"{np.median(size[:, 0]):.0f} px.",
+            do="Write centres and sizes: x = (x1 + x2) / 2, width = x2 - x1.",
+            figures={"share": round(share, 4)},
+            fix=_from_corners,
+        )
+
+
+class TopLeftAsCenter(Fault):
+    """The top left corner where the centre is expected."""
+
+    name: ClassVar[str] = "boxes_top_left"
+    stage: ClassVar[Stage] = "tables"
+
+    def find(self, view: View) -> Finding | None:
+        """Compare how boxes end at the left and top of pictures with how they end at the right and bottom."""
+        near, far = _border_ends(view.dataset)
+        for name, shift, first, second in (
+            ("the top left corner", 0.5, near, far),
+            ("the bottom right corner", -0.5, far, near),
+        ):
+            chance = _chance_of_gap(first, second)
+            if chance < LEAST_CHANCE:
+                return Finding(
+                    fault=self.name,
+                    what=f"x and y are {name} of the boxes, not their centres.",
+                    why=f"On one side of the pictures {first.beyond} boxes reach out of the picture by up to "
+                    f"{-first.least:.2g} of their size, on the other none comes closer than {second.least:.2g} of its size, "
+                    f"although {second.within} are within one and a half.",
+                    do="Write centres: x + width / 2, y + height / 2.",
+                    chance=chance,
+                    figures={"beyond": first.beyond, "gap": round(second.least, 3), "near": second.within},
+                    fix=lambda dataset, shift=shift: with_detections(
+                        dataset, center_px=dataset.detections.center_px + shift * dataset.detections.size_px
+                    ),
+                )
+        return None
+
+
+class HalfSizes(Fault):
+    """Half the width and height where the whole is expected."""
+
+    name: ClassVar[str] = "boxes_half_size"
+    stage: ClassVar[Stage] = "results"
+
+    def find(self, view: View) -> Finding | None:
+        """See whether boxes keep half a size from all borders, or objects are half as high as their kind is."""
+        from valuemap.check.sizes import object_heights, plausible_heights
+
+        near, far = _border_ends(view.dataset)
+        chance = max(_chance_of_margin(near), _chance_of_margin(far)) if near.within and far.within else 1.0
+        chance = min(chance, _chance_of_margin(near + far))
+        heights = object_heights(view)
+        figures: dict[str, float] = {"gap": round(min(near.least, far.least), 3)}
+        reasons = []
+        if chance < LEAST_CHANCE:
+            reasons.append(
+                f"no box comes closer to the border of its picture than {figures['gap']:g} of its own size, although "
+                f"{near.within + far.within} are within one and a half sizes"
+            )
+        for name, (height_m, objects) in heights.items():
+            low, high = plausible_heights(name)
+            figures[f"height_m of {name}"] = round(height_m, 3)
+            if low > 0.1 and objects >= 3 and low / 3.0 < height_m < low * 1.35 <= 2.0 * height_m <= high:
+                reasons.append(f"{name} are {height_m:.2g} m high; twice that is usual")
+        if not reasons:
+            return None
+        return Finding(
+            fault=self.name,
+            what="Width and height of the boxes are half of what they should be.",
+            why="; ".join(reasons).capitalize() + ".",
+            do="Write whole widths and heights, not distances from the centre to the sides.",
+            chance=chance if chance < LEAST_CHANCE else LEAST_CHANCE / 10.0,
+            figures=figures,
+            fix=lambda dataset: with_detections(dataset, size_px=2.0 * dataset.detections.size_px),
+        )
+
+
+class PictureSize(Convention):
+    """Boxes measured in pictures of another size than the cameras'."""
+
+    name: ClassVar[str] = "picture_size"
+    what: ClassVar[str] = "The boxes were measured in pictures of another size than cameras.parquet says."
+    do: ClassVar[str] = "Give width, height and parameters of the cameras for the pictures that were looked at."
+
+    def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
+        """Yield boxes of pictures enlarged or shrunk."""
+        for name, factor in (
+            ("4", 4.0), ("3", 3.0), ("2", 2.0), ("1.5", 1.5), ("4/3", 4 / 3), ("3/4", 0.75),
+            ("2/3", 2 / 3), ("1/2", 0.5), ("1/3", 1 / 3), ("1/4", 0.25),
+        ):  # fmt: skip
+            yield f"boxes {name} times as large", _Scaled(factor)
+
+
+class MirroredPictures(Convention):
+    """Boxes measured in pictures that were mirrored or turned."""
+
+    name: ClassVar[str] = "mirrored_pictures"
+    what: ClassVar[str] = "The boxes were measured in pictures that were mirrored or turned."
+    do: ClassVar[str] = "Detect in the pictures as the cameras took them (mind the EXIF orientation)."
+
+    def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
+        """Yield boxes mirrored, turned upside down, and with x and y exchanged."""
+        yield "left and right exchanged", _Flipped(x=True, y=False)
+        yield "top and bottom exchanged", _Flipped(x=False, y=True)
+        yield "turned upside down", _Flipped(x=True, y=True)
+        yield "x and y exchanged (row, column)", _swap_axes
+
+
+@dataclass(frozen=True)
+class _Ends:
+    """How boxes end at some sides of their pictures, in shares of their own size (negative: outside)."""
+
+    ends: Floats
+
+    @property
+    def least(self) -> float:
+        return float(self.ends.min(initial=math.inf))
+
+    @property
+    def beyond(self) -> int:
+        return int((self.ends < -0.02).sum())
+
+    @property
+    def within(self) -> int:
+        return int((self.ends < 1.5).sum())
+
+    def __add__(self, other: _Ends) -> _Ends:
+        return _Ends(np.concatenate([self.ends, other.ends]))
+
+
+def _border_ends(dataset: Dataset) -> tuple[_Ends, _Ends]:
+    """Return how boxes end at left and top, and at right and bottom; sides that nothing comes near are left out."""
+    detections = dataset.detections
+    size = detections.size_px
+    low = (detections.center_px - size / 2.0) / np.maximum(size, 1e-9)
+    high = (picture_sizes(dataset) - detections.center_px - size / 2.0) / np.maximum(size, 1e-9)
+    solid: Bools = size > 1.0
+    keep = [_Ends(np.concatenate([side[:, axis][solid[:, axis]] for axis in (0, 1)])) for side in (low, high)]
+    return keep[0], keep[1]
+
+
+def _chance_of_gap(reaching: _Ends, keeping: _Ends) -> float:
+    """Return how likely one side has boxes half out and the other none that near, if both end alike.
+
+    Pictures cut boxes where the boxes end or where their centres do. If corners stand for centres, boxes on one side
+    reach half a size farther than that, and on the other keep half a size away. Boxes are spread evenly close to a
+    border: those in the unit behind the gap say how many should be in the unit before it.
+    """
+    reach = -0.5 if np.sum(reaching.ends < -0.52) >= 3 else 0.0
+    out = int((reaching.ends < reach - 0.02).sum())
+    if out < 3:
+        return 1.0
+    return _chance_of_empty(keeping.ends, reach + 0.5, 1.0)
+
+
+def _chance_of_margin(ends: _Ends) -> float:
+    """Return how likely no box comes within half its size of a border, if they are spread evenly close to it."""
+    return _chance_of_empty(ends.ends, 0.5, 0.5)
+
+
+def _chance_of_empty(ends: Floats, border: float, width: float) -> float:
+    """Return how likely the range of a width before a border is empty by accident, as many as there are behind it."""
+    missing = int((ends < border - 0.02).sum())
+    beside = int(((ends >= border - 0.02) & (ends < border + width)).sum())
+    if missing > _STRAYS * beside:
+        return 1.0
+    return float(stats.binom.cdf(missing, missing + beside, 0.5))
+
+
+def _to_pixels(dataset: Dataset) -> Dataset:
+    extent = picture_sizes(dataset)
+    detections = dataset.detections
+    return with_detections(dataset, center_px=detections.center_px * extent, size_px=detections.size_px * extent)
+
+
+def _from_corners(dataset: Dataset) -> Dataset:
+    first, second = dataset.detections.center_px, dataset.detections.size_px
+    return with_detections(dataset, center_px=(first + second) / 2.0, size_px=np.maximum(second - first, 0.0))
+
+
+class _Scaled:
+    """Boxes of pictures so many times as large."""
+
+    def __init__(self, factor: float) -> None:
+        self.gate_factor = factor
+
+    def __call__(self, dataset: Dataset) -> Dataset:
+        detections = dataset.detections
+        return with_detections(
+            dataset, center_px=detections.center_px * self.gate_factor, size_px=detections.size_px * self.gate_factor
+        )
+
+
+class _Flipped:
+    """Boxes mirrored."""
+
+    def __init__(self, *, x: bool, y: bool) -> None:
+        self._flips = np.array([x, y])
+
+    def __call__(self, dataset: Dataset) -> Dataset:
+        center = dataset.detections.center_px
+        return with_detections(dataset, center_px=np.where(self._flips, picture_sizes(dataset) - center, center))
+
+
+def _swap_axes(dataset: Dataset) -> Dataset:
+    detections = dataset.detections
+    return with_detections(
+        dataset, center_px=detections.center_px[:, ::-1].copy(), size_px=detections.size_px[:, ::-1].copy()
+    )
+
+
+def rows_in_images(dataset: Dataset) -> Ints:
+    """Return the row (N) of each detection's image."""
+    return rows_of(dataset.detections.image_id, dataset.images.image_id)

@@ -1,0 +1,344 @@
+"""Faults of cameras: focal length, half a pixel, a turn in the mount, the wrong camera of images."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from valuemap.cameras import camera_centers, rotation_matrices
+from valuemap.check.agreement import compare, measure_agreement
+from valuemap.check.fault import LEAST_CHANCE, Fault, Finding, Stage, View, with_detections, with_images, with_poses
+from valuemap.check.fit import Estimate, Parameter, apply, estimate
+from valuemap.check.passes import moved_along
+from valuemap.check.sample import pixels_per_radian
+from valuemap.dataset import Dataset
+from valuemap.tables import Cameras, Floats
+
+_FOCAL_LENGTHS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "OPENCV_FISHEYE": 2,
+                  "FULL_OPENCV": 2, "FOV": 2, "SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 1, "THIN_PRISM_FISHEYE": 2}  # fmt: skip
+"""How many of the first parameters of a model are focal lengths."""
+
+
+def _turn(axis: int) -> Any:
+    def change(dataset: Dataset, angle_rad: float) -> Dataset:
+        vector = np.zeros(3)
+        vector[axis] = angle_rad
+        rotation = Rotation.from_rotvec(vector).as_matrix() @ rotation_matrices(dataset.images)
+        return with_poses(dataset, rotation, camera_centers(dataset.images))
+
+    return change
+
+
+def with_focal(dataset: Dataset, log_factor: float) -> Dataset:
+    """Return a dataset with all focal lengths multiplied by exp(log_factor)."""
+    params = []
+    for row, values in enumerate(dataset.cameras.params):
+        model = dataset.cameras.model.names[dataset.cameras.model.codes[row]]
+        changed = values.copy()
+        changed[: _FOCAL_LENGTHS.get(model, 0)] *= np.exp(log_factor)
+        params.append(changed)
+    cameras: Cameras = dataset.cameras.replace(params=params)
+    return Dataset(**{**vars(dataset), "cameras": cameras})
+
+
+def _shift_along(dataset: Dataset, forward_m: float) -> Dataset:
+    return with_poses(dataset, rotation_matrices(dataset.images), moved_along(dataset, forward_m))
+
+
+PARAMETERS = (
+    Parameter("pitch", _turn(0), 1e-5),
+    Parameter("yaw", _turn(1), 1e-5),
+    Parameter("roll", _turn(2), 1e-5),
+    Parameter("log_focal", with_focal, 1e-5),
+    Parameter("along", _shift_along, 1e-3),
+)
+
+
+def common_errors(view: View) -> Estimate | None:
+    """Return the estimate of what all images may share, worked out once a view."""
+    if "common_errors" not in view.memory:
+        parameters = PARAMETERS if _has_focal(view.dataset) else tuple(p for p in PARAMETERS if p.name != "log_focal")
+        view.memory["common_errors"] = estimate(view.dataset, view.many_places, view.gate_px, parameters)
+    found: Estimate | None = view.memory["common_errors"]
+    return found
+
+
+def _has_focal(dataset: Dataset) -> bool:
+    return all(_FOCAL_LENGTHS.get(dataset.cameras.model.names[code], 0) for code in dataset.cameras.model.codes)
+
+
+class _CommonError(Fault):
+    """Something small that all images share: it must be told from nothing, and its correction must help."""
+
+    stage: ClassVar[Stage] = "fine"
+    parameters: ClassVar[tuple[str, ...]]
+    do: ClassVar[str]
+
+    def find(self, view: View) -> Finding | None:
+        """Test the estimate against its standard error, and the agreement with and without it."""
+        found = common_errors(view)
+        if found is None:
+            return None
+        tests = len(found.names)
+        for name in self.parameters:
+            if name not in found.names:
+                continue
+            value, sigma = found.of(name)
+            freedom = max(found.places - tests, 1)
+            chance = 2.0 * float(stats.t.sf(abs(value) / sigma, freedom)) * tests
+            if chance > LEAST_CHANCE:
+                continue
+            parameter = next(p for p in PARAMETERS if p.name == name)
+            comparison = compare(_gains(view, parameter.change(view.dataset, value)), _gains(view, view.dataset))
+            chance = max(chance, comparison.chance * tests)
+            if chance > LEAST_CHANCE:
+                continue
+            return Finding(
+                fault=self.name,
+                what=self.says(view, name, value),
+                why=f"{self.shows(view, name, value, sigma)} over {found.places} places and {found.points} objects; corrected, "
+                f"the agreement of rays rises by {comparison.difference:.0f} ({comparison.places} places).",
+                do=self.do,
+                chance=chance,
+                figures={"estimates": found.to_json(), "parameter": name, **comparison.to_json()},
+                fix=lambda dataset, parameter=parameter, value=value: parameter.change(dataset, value),
+            )
+        return None
+
+    def says(self, view: View, name: str, value: float) -> str:
+        """Return what is wrong."""
+        raise NotImplementedError
+
+    def shows(self, view: View, name: str, value: float, sigma: float) -> str:
+        """Return the estimate in the unit that people use."""
+        return f"The estimate is {np.degrees(value):.2f} ± {np.degrees(sigma):.2f} degrees"
+
+
+class CameraTilt(_CommonError):
+    """Cameras that look higher or lower, or hang more to a side, than their poses say."""
+
+    name: ClassVar[str] = "camera_tilt"
+    parameters: ClassVar[tuple[str, ...]] = ("pitch", "roll")
+    do: ClassVar[str] = "Correct the rotation between car and camera, or the principal point's y."
+
+    def says(self, view: View, name: str, value: float) -> str:
+        """Return what is wrong."""
+        if name == "pitch":
+            return f"The cameras look {abs(np.degrees(value)):.2f} degrees {'lower' if value > 0 else 'higher'} than their poses say."
+        return f"The cameras are rolled by {abs(np.degrees(value)):.2f} degrees against their poses."
+
+
+class CameraYaw(_CommonError):
+    """Cameras that look more to a side than their poses say."""
+
+    name: ClassVar[str] = "camera_yaw"
+    parameters: ClassVar[tuple[str, ...]] = ("yaw",)
+    do: ClassVar[str] = "Correct the rotation between car and camera, or the principal point's x."
+
+    def says(self, view: View, name: str, value: float) -> str:
+        """Return what is wrong."""
+        side = "right" if value < 0 else "left"
+        return f"The cameras look {abs(np.degrees(value)):.2f} degrees more to the {side} than their poses say."
+
+
+class FocalLength(_CommonError):
+    """A focal length that is wrong."""
+
+    name: ClassVar[str] = "focal_length"
+    parameters: ClassVar[tuple[str, ...]] = ("log_focal",)
+    do: ClassVar[str] = "Calibrate the cameras, or scale their focal lengths: of which picture size are they?"
+
+    def says(self, view: View, name: str, value: float) -> str:
+        """Return what is wrong."""
+        return f"The focal lengths are too {'short' if value > 0 else 'long'}: {np.exp(value):.3f} times them is right."
+
+    def shows(self, view: View, name: str, value: float, sigma: float) -> str:
+        """Return the factor."""
+        return f"The factor is {np.exp(value):.3f} ± {sigma:.3f}"
+
+
+class TimeShift(_CommonError):
+    """Poses that are some time off all pictures."""
+
+    name: ClassVar[str] = "time_shift"
+    parameters: ClassVar[tuple[str, ...]] = ("along",)
+    do: ClassVar[str] = "Correct the clock between cameras and poses (trigger, exposure or network delay)."
+
+    def says(self, view: View, name: str, value: float) -> str:
+        """Return what is wrong."""
+        side = "behind" if value > 0 else "ahead of"
+        return f"All poses are {abs(value):.2f} m along the road ({abs(value) / view.step_m:.1f} images) {side} their pictures."
+
+    def shows(self, view: View, name: str, value: float, sigma: float) -> str:
+        """Return metres."""
+        return f"The shift is {value:.2f} ± {sigma:.2f} m"
+
+
+def _gains(view: View, dataset: Dataset) -> Floats:
+    samples = (view.stretches, view.many_places)
+    return np.concatenate(
+        [measure_agreement(s.of(dataset), s.place_of_image, view.gate_px).gain for s in samples]
+    )
+
+
+class HalfPixel(Fault):
+    """Pixels counted from the middle of the first one on one side, and from its corner on the other."""
+
+    name: ClassVar[str] = "half_pixel"
+    stage: ClassVar[Stage] = "tables"
+
+    def find(self, view: View) -> Finding | None:
+        """Look at where principal points are, and where boxes cut by the border of the picture end."""
+        return _principal_points_at_integers(view) or _boxes_cut_aside(view)
+
+
+def _principal_points_at_integers(view: View) -> Finding | None:
+    cameras = view.dataset.cameras
+    rows, middles = [], 0
+    for row, params in enumerate(cameras.params):
+        count = _FOCAL_LENGTHS.get(cameras.model.names[cameras.model.codes[row]], 0)
+        if not count:
+            continue
+        off = 2.0 * params[count : count + 2] - [cameras.width_px[row], cameras.height_px[row]]
+        if np.all(np.abs(off + 1.0) < 1e-6):
+            rows.append(row)
+        middles += int(np.all(np.abs(off) < 1e-6))
+    if not rows or middles:
+        return None
+    first = cameras.params[rows[0]]
+    count = _FOCAL_LENGTHS[cameras.model.names[cameras.model.codes[rows[0]]]]
+    return Finding(
+        fault=HalfPixel.name,
+        what="The principal points are half a pixel off: they count from the middle of the first pixel.",
+        why=f"{len(rows)} of {len(cameras)} cameras have it at exactly (width - 1) / 2, (height - 1) / 2 "
+        f"({first[count]:g}, {first[count + 1]:g} of {cameras.width_px[rows[0]]} x {cameras.height_px[rows[0]]}), which is the "
+        "middle of a picture where pixel centres are whole numbers, as in OpenCV; here they are at halves.",
+        do="Add 0.5 to cx and cy (and to box centres that were measured so).",
+        figures={"cameras": len(rows)},
+        fix=lambda dataset: _with_principal_points(dataset, rows, 0.5),
+    )
+
+
+def _with_principal_points(dataset: Dataset, rows: list[int], shift_px: float) -> Dataset:
+    params = [values.copy() for values in dataset.cameras.params]
+    for row in rows:
+        count = _FOCAL_LENGTHS[dataset.cameras.model.names[dataset.cameras.model.codes[row]]]
+        params[row][count : count + 2] += shift_px
+    return Dataset(**{**vars(dataset), "cameras": dataset.cameras.replace(params=params)})
+
+
+def _boxes_cut_aside(view: View) -> Finding | None:
+    from valuemap.check.boxes import picture_sizes
+
+    detections = view.dataset.detections
+    low = detections.center_px - detections.size_px / 2.0
+    high = picture_sizes(view.dataset) - detections.center_px - detections.size_px / 2.0
+    for axis in (0, 1):
+        first, last = float(low[:, axis].min()), float(high[:, axis].min())
+        shift = (last - first) / 2.0
+        at_first, at_last = (int((np.abs(side[:, axis] - end) < 1e-3).sum()) for side, end in ((low, first), (high, last)))
+        # A border that boxes are cut at is cut at in both directions of the picture at the same number.
+        at_other = int((np.abs(low[:, 1 - axis] - first) < 1e-3).sum()) if abs(low[:, 1 - axis].min() - first) < 1e-3 else 0
+        if abs(abs(shift) - 0.5) < 1e-3 and min(at_first, at_last) >= 2 and at_first + at_other >= 3:
+            return Finding(
+                fault=HalfPixel.name,
+                what="The boxes are half a pixel off: they count from the middle of the first pixel.",
+                why=f"Boxes cut by the picture end at {first:g} px on one side ({at_first + at_other} boxes) and {last:g} px "
+                f"before the other ({at_last} boxes): the picture they were cut by is {shift:+g} px off.",
+                do=f"Add {shift:g} to x and y of the boxes.",
+                figures={"shift_px": shift, "boxes": at_first + at_other + at_last},
+                fix=lambda dataset, shift=shift: with_detections(dataset, center_px=dataset.detections.center_px + shift),
+            )
+    return None
+
+
+class WrongCamera(Fault):
+    """Images that have another image's camera."""
+
+    name: ClassVar[str] = "wrong_camera"
+    stage: ClassVar[Stage] = "fine"
+
+    def find(self, view: View) -> Finding | None:
+        """Give the images of each pass and camera each other camera and see whether their rays agree better."""
+        chosen = _best_cameras(view)
+        if not chosen:
+            return None
+        worst = max(chosen, key=lambda each: each["difference"])
+        rows = sum(each["images"] for each in chosen)
+        cameras = {(each["pass"], each["camera"]): each["better"] for each in chosen}
+        return Finding(
+            fault=self.name,
+            what="Images have the wrong camera.",
+            why=f"Of {rows} images in {len(chosen)} groups of a pass the rays agree better with another camera of the table: those "
+            f"of pass {worst['pass']} have camera {worst['camera']}, and with camera {worst['better']} their agreement "
+            f"is {worst['with_better']:.0f} instead of {worst['as_given']:.0f}.",
+            do="Give each image the camera that took it.",
+            chance=worst["chance"],
+            figures={"images": rows, "groups": chosen[:10]},
+            fix=lambda dataset: _with_cameras(dataset, cameras),
+        )
+
+
+def _best_cameras(view: View) -> list[dict[str, Any]]:
+    cameras = view.dataset.cameras
+    if not 1 < len(cameras) <= _MOST_CAMERAS:
+        return []
+    sample = view.stretches
+    images = sample.dataset.images
+    place_pass = np.zeros(sample.places, dtype=np.int64)
+    place_camera = np.zeros(sample.places, dtype=np.int64)
+    place_pass[sample.place_of_image] = images.pass_id.codes
+    place_camera[sample.place_of_image] = images.camera_id
+    gains = {}
+    for row, camera in enumerate(cameras.camera_id.tolist()):
+        other = with_images(sample.dataset, camera_id=np.full(len(images), camera))
+        gate_px = view.gate_px * pixels_per_radian_of(view.dataset, row) / pixels_per_radian(view.dataset)
+        gains[camera] = measure_agreement(other, sample.place_of_image, gate_px).gain
+    found = []
+    groups = np.unique(np.stack([place_pass, place_camera], axis=1), axis=0)
+    for code, camera in groups.tolist():
+        of_group = (place_pass == code) & (place_camera == camera)
+        given = gains[camera][of_group]
+        for other in gains:
+            comparison = compare(gains[other][of_group], given)
+            chance = comparison.chance * len(groups) * (len(gains) - 1)
+            if other != camera and chance < LEAST_CHANCE:
+                found.append(
+                    {
+                        "pass": images.pass_id.names[code],
+                        "camera": camera,
+                        "better": other,
+                        "images": int(((images.pass_id.codes == code) & (images.camera_id == camera)).sum()),
+                        "as_given": round(float(given.sum()), 1),
+                        "with_better": round(float(gains[other][of_group].sum()), 1),
+                        "difference": round(comparison.difference, 1),
+                        "chance": chance,
+                    }
+                )
+    best: dict[tuple[str, int], dict[str, Any]] = {}
+    for each in found:
+        key = (each["pass"], each["camera"])
+        if key not in best or each["difference"] > best[key]["difference"]:
+            best[key] = each
+    return list(best.values())
+
+
+_MOST_CAMERAS = 6
+
+
+def pixels_per_radian_of(dataset: Dataset, row: int) -> float:
+    """Return how many pixels a radian has in the middle of the picture of one camera."""
+    return pixels_per_radian(Dataset(**{**vars(dataset), "cameras": dataset.cameras.take(np.array([row]))}))
+
+
+def _with_cameras(dataset: Dataset, cameras: dict[tuple[str, int], int]) -> Dataset:
+    """Give images the cameras found for their pass; passes outside the sample follow those with the same camera."""
+    images = dataset.images
+    camera = images.camera_id.copy()
+    for (name, old), new in cameras.items():
+        rows = (images.camera_id == old) & (images.pass_id.codes == images.pass_id.code_of(name))
+        camera[rows] = new
+    return with_images(dataset, camera_id=camera)

@@ -1,0 +1,117 @@
+"""The check from end to end: what is wrong, stage by stage, each on data in which what was found before is put right."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from valuemap.check.contest import hold_contest
+from valuemap.check.fault import STAGES, Finding, Fix, View
+from valuemap.check.prospects import describe_prospects
+from valuemap.check.registry import CONVENTIONS, FAULTS
+from valuemap.dataset import Dataset
+from valuemap.errors import InputError
+from valuemap.progress import Progress, silent
+
+_MOST_ROUNDS = 4
+"""Of one stage: one fault may hide behind another, but not for ever."""
+
+
+@dataclass(frozen=True, eq=False)
+class Examination:
+    """What a check found, what the data can give, and the dataset with all that can be put right put right."""
+
+    findings: tuple[Finding, ...]
+    prospects: dict[str, Any]
+    fixed: Dataset
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def is_fixable(self) -> bool:
+        """Whether the corrected dataset differs from the given one."""
+        return any(finding.fix is not None for finding in self.findings)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything but the dataset by name."""
+        return {
+            "findings": [finding.to_json() for finding in self.findings],
+            "prospects": self.prospects,
+            "notes": list(self.notes),
+        }
+
+
+def examine(dataset: Dataset, *, progress: Progress = silent) -> Examination:
+    """Look for all known faults in a dataset.
+
+    Parameters
+    ----------
+    dataset
+        Posed images with detections. Nothing is asked of it but that its tables fit together.
+    progress
+        Called as progress(what, done, total).
+
+    Returns
+    -------
+    Examination
+        Findings in the order in which they have to be put right. Same dataset, same findings.
+
+    Raises
+    ------
+    InputError
+        The dataset has no detections.
+    """
+    if not len(dataset.detections):
+        raise InputError(
+            f"{dataset.name}: there are no detections in it",
+            hint="find some with valuemap detect, or import them with the images",
+        )
+    findings: list[Finding] = []
+    notes: list[str] = []
+    gate_share = 1.0
+    for stage in STAGES:
+        for _ in range(_MOST_ROUNDS):
+            view = View(dataset, gate_share=gate_share, known=frozenset(finding.fault for finding in findings))
+            if stage == "conventions":
+                finding, tells = hold_contest(view, CONVENTIONS, progress)
+                if tells is None:
+                    notes.append(
+                        "However the data are read, rays meet no better than by chance: too few detections show one "
+                        "object from several places, or the poses are no poses of these pictures."
+                    )
+                gate_share = tells or gate_share
+                found = [] if finding is None else [finding]
+            else:
+                found = _look(view, stage, progress)
+            findings += found
+            fixes: list[Fix] = [each.fix for each in found if each.fix is not None]
+            for fix in fixes:
+                dataset = fix(dataset)
+            if not fixes:
+                break
+    prospects = describe_prospects(View(dataset, gate_share=gate_share))
+    return Examination(tuple(findings), prospects, dataset, tuple(notes))
+
+
+def _look(view: View, stage: str, progress: Progress) -> list[Finding]:
+    """Return the first fault of a stage that can be put right, and all before it that cannot."""
+    faults = [fault for fault in FAULTS if fault.stage == stage]
+    found = []
+    for number, fault in enumerate(faults):
+        progress(_WORK[stage], number, len(faults))
+        if fault.name in view.known and stage != "fine":
+            continue
+        finding = fault.find(view)
+        if finding is not None and not (finding.fix is None and finding.fault in view.known):
+            found.append(finding)
+            if finding.fix is not None:
+                break
+    progress(_WORK[stage], len(faults), len(faults))
+    return found
+
+
+_WORK = {
+    "tables": "looking at the rows",
+    "positions": "looking at the positions",
+    "fine": "looking for small errors",
+    "results": "looking at what comes out",
+}

@@ -1,0 +1,195 @@
+"""What a fault is: one small class that looks at a dataset and says what it found, with a fix where there is one."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from valuemap.cameras import camera_centers, rotation_matrices
+from valuemap.check.agreement import Agreement, chance_agreement, measure_agreement
+from valuemap.check.sample import MOST_DETECTIONS, Sample, median_step_m, pixels_per_radian, sample_places, sample_stretches
+from valuemap.dataset import Dataset
+from valuemap.tables import Floats
+
+Fix = Callable[[Dataset], Dataset]
+Stage = Literal["tables", "conventions", "positions", "fine", "results"]
+STAGES: tuple[Stage, ...] = ("tables", "conventions", "positions", "fine", "results")
+"""In this order: what is found and can be put right is put right before the next stage looks."""
+
+GATE_RAD = 0.012
+"""Rays that pass closer than this agree: 0.7 degrees, 6 px at a focal length of 500 px."""
+WIDER_GATE = 4.0
+"""Detections of heat maps or panoramas with compass headings may be off by degrees."""
+_MANY_DETECTIONS = 8000
+LEAST_CHANCE = 1e-3
+"""A finding that good data would give with a probability above this, all that was tried counted, is none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """One thing that is wrong.
+
+    `what` is wrong, in one sentence; `why` one knows it, with the figures; what to `do` about it. `chance` is the
+    probability that good data look like this by accident, None where values cannot be right whatever the chance.
+    `fix` makes the corrected dataset; it is None where none is known.
+    """
+
+    fault: str
+    what: str
+    why: str
+    do: str
+    chance: float | None = None
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    fix: Fix | None = None
+
+    @property
+    def sure(self) -> str:
+        """How sure, in words."""
+        if self.chance is None:
+            return "certain"
+        return "almost certain" if self.chance < 1e-6 else "very likely"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the finding by name."""
+        return {
+            "fault": self.fault,
+            "what": self.what,
+            "why": self.why,
+            "do": self.do,
+            "sure": self.sure,
+            "chance": None if self.chance is None else float(f"{self.chance:.2g}"),
+            "figures": dict(self.figures),
+            "has_fix": self.fix is not None,
+        }
+
+
+class View:
+    """A dataset as faults look at it; what several of them need is worked out once."""
+
+    def __init__(self, dataset: Dataset, *, gate_share: float = 1.0, known: frozenset[str] = frozenset()) -> None:
+        self.dataset = dataset
+        self.known = known
+        """Names of what was found before and put right."""
+        self.gate_share = gate_share
+        self.memory: dict[str, Any] = {}
+        """What several faults of one family share."""
+
+    @cached_property
+    def gate_px(self) -> float:
+        """How close rays must pass to agree, at the images' own resolution."""
+        return GATE_RAD * self.gate_share * pixels_per_radian(self.dataset)
+
+    @cached_property
+    def stretches(self) -> Sample:
+        """Stretches of single passes."""
+        return sample_stretches(self.dataset)
+
+    @cached_property
+    def places(self) -> Sample:
+        """Places with all their passes."""
+        return sample_places(self.dataset)
+
+    @cached_property
+    def places_of_passes(self) -> Sample:
+        """Places with all their passes, densely enough that each pass can be looked at alone."""
+        return sample_places(self.dataset, most_detections=4 * MOST_DETECTIONS, thins=False)
+
+    @cached_property
+    def many_places(self) -> Sample:
+        """More places, for what is too small to show at few."""
+        return sample_places(self.dataset, most_detections=_MANY_DETECTIONS)
+
+    @cached_property
+    def agreement(self) -> Agreement:
+        """How well the rays of the stretches agree."""
+        return measure_agreement(self.stretches.dataset, self.stretches.place_of_image, self.gate_px)
+
+    @cached_property
+    def agreement_at_places(self) -> Agreement:
+        """How well the rays of several passes agree."""
+        return measure_agreement(self.places.dataset, self.places.place_of_image, self.gate_px)
+
+    @cached_property
+    def chance(self) -> Agreement:
+        """How well they agree by chance."""
+        return chance_agreement(self.stretches.dataset, self.stretches.place_of_image, self.gate_px)
+
+    @cached_property
+    def step_m(self) -> float:
+        """The median distance between successive images."""
+        return median_step_m(self.dataset.images)
+
+    @cached_property
+    def center_in_world_m(self) -> Floats:
+        """The camera centres (N, 3)."""
+        return camera_centers(self.dataset.images)
+
+    @cached_property
+    def uprightness(self) -> float:
+        """The mean cosine between the cameras' up and the sky."""
+        return uprightness(self.dataset)
+
+
+def uprightness(dataset: Dataset) -> float:
+    """Return the mean cosine between the cameras' up (-y) and the frame's."""
+    return float(np.mean(-rotation_matrices(dataset.images)[:, 1] @ np.array(dataset.frame.up)))
+
+
+class Fault(ABC):
+    """A mistake that data may have; `name` is how reports and tests call it."""
+
+    name: ClassVar[str]
+    stage: ClassVar[Stage]
+
+    @abstractmethod
+    def find(self, view: View) -> Finding | None:
+        """Return what is wrong, or None."""
+
+
+class Convention(ABC):
+    """A mistake that has an inverse: the data are read another way, and the way that makes rays agree best is right."""
+
+    name: ClassVar[str]
+    what: ClassVar[str]
+    do: ClassVar[str]
+
+    @abstractmethod
+    def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
+        """Yield (how the data would be read, the dataset read so) for everything to try."""
+
+
+def with_images(dataset: Dataset, **changes: Any) -> Dataset:
+    """Return a dataset with some columns of its images replaced."""
+    return Dataset(**{**vars(dataset), "images": dataset.images.replace(**changes)})
+
+
+def with_detections(dataset: Dataset, **changes: Any) -> Dataset:
+    """Return a dataset with some columns of its detections replaced."""
+    return Dataset(**{**vars(dataset), "detections": dataset.detections.replace(**changes)})
+
+
+def with_poses(dataset: Dataset, rotation: Floats, center_in_world_m: Floats) -> Dataset:
+    """Return a dataset with other rotations from the world to the camera (N, 3, 3) and camera centres (N, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    quaternion = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
+    translation = -np.einsum("nij,nj->ni", rotation, center_in_world_m)
+    return with_images(dataset, cam_from_world_quat=quaternion, cam_from_world_m=translation)
+
+
+def keep_rows(dataset: Dataset, *, images: Any = None, detections: Any = None) -> Dataset:
+    """Return a dataset with some images (mask) and some detections (mask) only, and nothing that refers to others."""
+    kept_images = dataset.images if images is None else dataset.images.take(images)
+    stays = np.isin(dataset.detections.image_id, kept_images.image_id)
+    if detections is not None:
+        stays &= detections
+    kept = dataset.detections.take(stays)
+    pairs = dataset.truth_detections
+    if pairs is not None:
+        pairs = pairs.take(np.isin(pairs.detection_id, kept.detection_id))
+    return Dataset(**{**vars(dataset), "images": kept_images, "detections": kept, "truth_detections": pairs})

@@ -1,0 +1,167 @@
+"""Small mistakes that all images share, estimated by least squares with honest standard errors.
+
+Points where rays meet are taken from a vote; the residuals of their votes are linearised in the points and in a few
+common parameters (a turn of the cameras in their mounts, the logarithm of the focal length, a shift along the drive),
+the points are eliminated, and the parameters solved for, with weights after Cauchy. Images of one place share their
+errors, so the standard errors come from the scatter between places (the sandwich of Liang and Zeger, 1986), not from the
+number of detections.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from valuemap.cameras import Rays, cast_rays
+from valuemap.check.agreement import measure_agreement
+from valuemap.check.sample import Sample
+from valuemap.dataset import Dataset
+from valuemap.tables import Candidates, Floats, Ints
+
+Change = Callable[[Dataset, float], Dataset]
+"""A dataset with one parameter changed by a value."""
+_ROUNDS = 4
+_LEAST_VOTES = 4
+_LEAST_PLACES = 6
+_CAUCHY = 2.4
+"""Residuals of so many median deviations have half the weight."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One thing to estimate: how it changes a dataset, and the step of the numeric derivative."""
+
+    name: str
+    change: Change
+    step: float
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Values (P) of parameters, their covariance (P, P), and the number of places and points they rest on."""
+
+    names: tuple[str, ...]
+    value: Floats
+    covariance: Floats
+    places: int
+    points: int
+
+    def of(self, name: str) -> tuple[float, float]:
+        """Return the value of a parameter and its standard error."""
+        at = self.names.index(name)
+        return float(self.value[at]), float(np.sqrt(self.covariance[at, at]))
+
+    def to_json(self) -> dict[str, list[float]]:
+        """Return value and standard error by name."""
+        return {name: [float(f"{part:.4g}") for part in self.of(name)] for name in self.names}
+
+
+def estimate(dataset: Dataset, sample: Sample, gate_px: float, parameters: tuple[Parameter, ...]) -> Estimate | None:
+    """Estimate parameters on a sample of a dataset; None where there is too little to go by."""
+    value = np.zeros(len(parameters))
+    result = None
+    for _ in range(_ROUNDS):
+        current = apply(dataset, parameters, value)
+        found = _solve(current, sample, gate_px, parameters)
+        if found is None:
+            return None
+        value = value + found.value
+        result = Estimate(found.names, value.copy(), found.covariance, found.places, found.points)
+        if np.all(np.abs(found.value) < 0.1 * np.sqrt(np.diag(found.covariance))):
+            break
+    return result
+
+
+def apply(dataset: Dataset, parameters: tuple[Parameter, ...], value: Floats | Mapping[str, float]) -> Dataset:
+    """Return the dataset with parameters changed by values."""
+    for number, parameter in enumerate(parameters):
+        change = value.get(parameter.name, 0.0) if isinstance(value, Mapping) else float(value[number])
+        if change != 0.0:
+            dataset = parameter.change(dataset, change)
+    return dataset
+
+
+def _solve(dataset: Dataset, sample: Sample, gate_px: float, parameters: tuple[Parameter, ...]) -> Estimate | None:
+    agreement = measure_agreement(sample.of(dataset), sample.place_of_image, gate_px)
+    found, rays = agreement.found, cast_rays(sample.of(dataset))
+    votes = np.diff(found.voter_offsets)
+    kept = np.flatnonzero(votes >= _LEAST_VOTES)
+    if len(kept) < 3 * len(parameters):
+        return None
+    voters = found.voters.astype(np.int64)
+    rows = np.concatenate([np.arange(found.voter_offsets[k], found.voter_offsets[k + 1]) for k in kept])
+    voter, point_of = voters[rows], np.repeat(np.arange(len(kept)), votes[kept])
+    point = agreement.points_in_world_m[kept]
+    residual = _residuals(rays, voter, point[point_of])
+    slope = np.stack(
+        [
+            (_at(dataset, sample, p, p.step, voter, point[point_of]) - _at(dataset, sample, p, -p.step, voter, point[point_of]))
+            / (2.0 * p.step)
+            for p in parameters
+        ],
+        axis=2,
+    )
+    of_point = _slopes_of_points(rays, voter, point[point_of])
+    size = np.linalg.norm(residual, axis=1)
+    scale = _CAUCHY * max(float(np.median(size)), 1e-9)
+    weight = 1.0 / (1.0 + (size / scale) ** 2)
+    place = sample.place_of_image[rays.image_row[voter]]
+    gradient, curvature = _eliminate(residual, slope, of_point, weight, point_of, place)
+    total = curvature.sum(axis=0)
+    if len(curvature) < _LEAST_PLACES or np.linalg.matrix_rank(total) < len(parameters):
+        return None
+    inverse = np.linalg.inv(total)
+    value = -inverse @ gradient.sum(axis=0)
+    # At the solution: what each place pulls.
+    pull = gradient + np.einsum("kij,j->ki", curvature, value)
+    count = len(pull)
+    meat = pull.T @ pull * count / max(count - len(parameters), 1)
+    return Estimate(tuple(p.name for p in parameters), value, inverse @ meat @ inverse, count, len(kept))
+
+
+def _at(dataset: Dataset, sample: Sample, parameter: Parameter, value: float, voter: Ints, point: Floats) -> Floats:
+    return _residuals(cast_rays(sample.of(parameter.change(dataset, value))), voter, point)
+
+
+def _residuals(rays: Rays, voter: Ints, point: Floats) -> Floats:
+    local = np.einsum("nij,nj->ni", rays.residual_from_world[voter], point - rays.center_in_world_m[voter])
+    return np.asarray(local[:, :2] / local[:, 2:])
+
+
+def _slopes_of_points(rays: Rays, voter: Ints, point: Floats) -> Floats:
+    """Return d residual / d point (N, 2, 3)."""
+    matrix = rays.residual_from_world[voter]
+    local = np.einsum("nij,nj->ni", matrix, point - rays.center_in_world_m[voter])
+    ratio = local[:, :2] / local[:, 2:]
+    return np.asarray((matrix[:, :2] - ratio[:, :, None] * matrix[:, 2:]) / local[:, 2][:, None, None])
+
+
+def _eliminate(
+    residual: Floats, slope: Floats, of_point: Floats, weight: Floats, point_of: Ints, place: Ints
+) -> tuple[Floats, Floats]:
+    """Return gradients (K, P) and curvatures (K, P, P) of each place, the points eliminated."""
+    count = int(point_of.max()) + 1
+    parts = slope.shape[2]
+    a = np.zeros((count, 3, 3))
+    b = np.zeros((count, 3, parts))
+    c = np.zeros((count, 3))
+    g = np.zeros((count, parts))
+    h = np.zeros((count, parts, parts))
+    np.add.at(a, point_of, np.einsum("n,nki,nkj->nij", weight, of_point, of_point))
+    np.add.at(b, point_of, np.einsum("n,nki,nkp->nip", weight, of_point, slope))
+    np.add.at(c, point_of, np.einsum("n,nki,nk->ni", weight, of_point, residual))
+    np.add.at(g, point_of, np.einsum("n,nkp,nk->np", weight, slope, residual))
+    np.add.at(h, point_of, np.einsum("n,nkp,nkq->npq", weight, slope, slope))
+    trace = np.trace(a, axis1=1, axis2=2)
+    inverse = np.linalg.inv(a + (1e-9 * trace[:, None, None]) * np.eye(3))
+    g = g - np.einsum("nip,nij,nj->np", b, inverse, c)
+    h = h - np.einsum("nip,nij,njq->npq", b, inverse, b)
+    first = np.searchsorted(point_of, np.arange(count))
+    _, group = np.unique(place[first], return_inverse=True)
+    groups = int(group.max()) + 1
+    gradient, curvature = np.zeros((groups, parts)), np.zeros((groups, parts, parts))
+    np.add.at(gradient, group, g)
+    np.add.at(curvature, group, h)
+    return gradient, curvature

@@ -1,0 +1,629 @@
+"""Faults of passes and time: what is one drive, in which order, when, and where against the other drives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from valuemap.cameras import Rays, camera_centers, rotation_matrices
+from valuemap.check.agreement import compare, measure_agreement
+from valuemap.check.boxes import rows_in_images
+from valuemap.check.fault import LEAST_CHANCE, Convention, Fault, Finding, Fix, Stage, View, with_detections, with_images, with_poses
+from valuemap.check.headings import driving_azimuths
+from valuemap.check.offsets import densest, pairs_within
+from valuemap.check.sample import driving_order, standing_m
+from valuemap.dataset import Dataset
+from valuemap.tables import Bools, Categories, Floats, Images, Ints
+
+_JUMP_TIMES = 8.0
+"""A step this many times the distance to the nearest image of the pass is none that a car drove."""
+_MOST_JUMPS = 0.25
+_TURNS = 6
+_LAGS = range(1, _TURNS + 1)
+"""At most so many drives take turns under one pass id."""
+_LEAST_IMAGES = 10
+_SAME_WAY = 0.7
+"""Cosine between the axes of cameras that may be of one drive: up to 45 degrees."""
+_TIME_UNITS = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
+_SPEEDS_MPS = (0.2, 70.0)
+_SEARCH_STEPS = 8.0
+"""How far a pass may be off, in median steps between images."""
+_MOST_PASSES = 60
+_MOST_CANDIDATES = 6
+_SEARCHED = 19
+"""Shifts that are looked at around each candidate."""
+_LEAST_PAIRS = 4
+
+
+class ShiftedDetections(Convention):
+    """Detections that belong to the image before or after."""
+
+    name: ClassVar[str] = "detections_shifted"
+    what: ClassVar[str] = "The detections belong to other images than those they are listed with: the next or the last one."
+    do: ClassVar[str] = "Match detections and images by name, not by their place in a list (one counts from 1?)."
+
+    def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
+        """Yield detections moved by one image along each pass."""
+        yield "detections of the next image", _ByImages(1)
+        yield "detections of the image before", _ByImages(-1)
+
+
+class TimeUnit(Fault):
+    """Time stamps that are not seconds."""
+
+    name: ClassVar[str] = "time_unit"
+    stage: ClassVar[Stage] = "positions"
+
+    def find(self, view: View) -> Finding | None:
+        """See whether another unit of time gives a speed that a car has."""
+        speed = median_speed_mps(view)
+        if speed is None or _SPEEDS_MPS[0] <= speed <= _SPEEDS_MPS[1]:
+            return None
+        for unit, seconds in _TIME_UNITS:
+            if _SPEEDS_MPS[0] <= speed / seconds <= _SPEEDS_MPS[1]:
+                return Finding(
+                    fault=self.name,
+                    what=f"The time stamps are {unit}, not seconds.",
+                    why=f"The images would move at {speed:.2g} m/s (median); in {unit} it is {speed / seconds:.3g} m/s.",
+                    do="Write seconds.",
+                    figures={"speed_mps": speed, "unit": unit},
+                    fix=lambda dataset, seconds=seconds: with_images(
+                        dataset, timestamp_s=np.asarray(dataset.images.timestamp_s) * seconds
+                    ),
+                )
+        return None
+
+
+class RollingTimes(Fault):
+    """Time stamps that start over within a drive."""
+
+    name: ClassVar[str] = "rolling_times"
+    stage: ClassVar[Stage] = "positions"
+
+    def find(self, view: View) -> Finding | None:
+        """Follow each pass by the names of its images and look for time that falls back by one and the same amount."""
+        period = _rolling_period(view.dataset)
+        if period is None:
+            return None
+        length, falls = period
+        return Finding(
+            fault=self.name,
+            what="The time stamps start over within drives.",
+            why=f"Along the images of single passes, in the order of their names, time falls back {falls} times, "
+            f"and all time stamps are within {length:.4g} s.",
+            do=f"Add {length:.4g} s at every fall (a counter of seconds within the minute, hour or week?).",
+            figures={"period_s": round(length, 4), "falls": falls},
+            fix=_unrolled,
+        )
+
+
+class InterleavedPasses(Fault):
+    """Several vehicles or cameras under one pass id."""
+
+    name: ClassVar[str] = "interleaved_passes"
+    stage: ClassVar[Stage] = "positions"
+
+    def find(self, view: View) -> Finding | None:
+        """Look for passes that jump to and fro between few drives."""
+        return _find_jumping(view, self.name, is_interleaved=True)
+
+
+class NoDrives(Fault):
+    """Passes that are not drives."""
+
+    name: ClassVar[str] = "passes_no_drives"
+    stage: ClassVar[Stage] = "positions"
+
+    def find(self, view: View) -> Finding | None:
+        """Look for passes whose images are in no order that a car drove."""
+        return _find_jumping(view, self.name, is_interleaved=False)
+
+
+@dataclass(frozen=True, eq=False)
+class PassShift:
+    """How far what one pass sees is from what the others see.
+
+    `offset_m` (3) takes the pass's own objects to those of the others, in the world; of a shift along the drive it is
+    (forward, left, up). `gain` is how well its rays meet the others' points then; `chance` that good data do so.
+    """
+
+    pass_name: str
+    offset_m: Floats
+    is_along: bool
+    gain: float
+    gain_without: float
+    chance: float
+    passes: int
+
+
+class PassOffset(Fault):
+    """A pass that is off by some metres."""
+
+    name: ClassVar[str] = "pass_offset"
+    stage: ClassVar[Stage] = "fine"
+
+    def find(self, view: View) -> Finding | None:
+        """Take the offset of the pass that is farthest from good."""
+        shift = worst_pass(view)
+        if shift is None or shift.is_along or _is_vertical(view, shift.offset_m):
+            return None
+        return _shift_finding(
+            self.name, view, shift, f"Pass {shift.pass_name} is off by {np.linalg.norm(shift.offset_m):.2f} m.",
+            "Align it with the others (another datum, another antenna, no correction data?).",
+        )  # fmt: skip
+
+
+class PassTimeShift(Fault):
+    """A pass whose poses are some time off its pictures."""
+
+    name: ClassVar[str] = "pass_time_shift"
+    stage: ClassVar[Stage] = "fine"
+
+    def find(self, view: View) -> Finding | None:
+        """Take the shift along the drive of the pass that is farthest from good."""
+        shift = worst_pass(view)
+        if shift is None or not shift.is_along:
+            return None
+        images = shift.offset_m[0] / view.step_m
+        return _shift_finding(
+            self.name, view, shift,
+            f"The poses of pass {shift.pass_name} are {abs(shift.offset_m[0]):.2f} m along the road "
+            f"({abs(images):.1f} images) {'behind' if images > 0 else 'ahead of'} its pictures.",
+            "Correct the clock of this pass (leap seconds, exposure or trigger delay).",
+        )  # fmt: skip
+
+
+class CameraHeight(Fault):
+    """A pass whose camera is at the wrong height."""
+
+    name: ClassVar[str] = "camera_height"
+    stage: ClassVar[Stage] = "fine"
+
+    def find(self, view: View) -> Finding | None:
+        """Take the offset of the pass that is farthest from good, if it is up or down."""
+        shift = worst_pass(view)
+        if shift is None or shift.is_along or not _is_vertical(view, shift.offset_m):
+            return None
+        up_m = float(shift.offset_m @ np.array(view.dataset.frame.up))
+        return _shift_finding(
+            self.name, view, shift,
+            f"The camera of pass {shift.pass_name} is {abs(up_m):.2f} m too {'low' if up_m > 0 else 'high'}.",
+            "Correct the height of its camera above the ground, or use one datum of heights for all passes.",
+        )  # fmt: skip
+
+
+def median_speed_mps(view: View) -> float | None:
+    """Return the median speed of images that move, None without time stamps."""
+    images = view.dataset.images
+    if images.timestamp_s is None or not np.all(np.isfinite(images.timestamp_s)):
+        return None
+    order = driving_order(images)
+    step = np.linalg.norm(np.diff(view.center_in_world_m[order], axis=0), axis=1)
+    seconds = np.diff(images.timestamp_s[order])
+    moves = (np.diff(images.pass_id.codes[order]) == 0) & (seconds > 0.0) & (step > 0.3 * view.step_m)
+    return float(np.median(step[moves] / seconds[moves])) if np.any(moves) else None
+
+
+def _rolling_period(dataset: Dataset) -> tuple[float, int] | None:
+    """Return after how many seconds time starts over and how often it does, None where it does not.
+
+    Counters that start over stay within their period, and go forward but for few falls.
+    """
+    images = dataset.images
+    if images.timestamp_s is None or not np.all(np.isfinite(images.timestamp_s)):
+        return None
+    order = driving_order(images, by_time=False)
+    time, codes = images.timestamp_s[order], images.pass_id.codes[order]
+    step = np.diff(time)[np.diff(codes) == 0]
+    falls, forward = -step[step < 0.0], step[step > 0.0]
+    if len(falls) < 1 or len(forward) < 10 or len(falls) > 0.1 * len(step):
+        return None
+    usual = float(np.median(forward))
+    period = _rounded(float(falls.max()) + usual)
+    within = np.ptp(time) <= 1.02 * period and time.min() >= -0.02 * period
+    return (period, len(falls)) if within and falls.max() > 10.0 * usual else None
+
+
+def _unrolled(dataset: Dataset) -> Dataset:
+    found = _rolling_period(dataset)
+    assert found is not None
+    images = dataset.images
+    order = driving_order(images, by_time=False)
+    time = np.asarray(images.timestamp_s)[order]
+    start = np.diff(images.pass_id.codes[order], prepend=-1) != 0
+    falls = np.diff(time, prepend=time[0]) < 0.0
+    falls[start] = False
+    laps = np.cumsum(falls)
+    laps -= np.repeat(laps[start], np.diff(np.append(np.flatnonzero(start), len(order))))
+    unrolled = np.empty(len(order))
+    unrolled[order] = time + laps * found[0]
+    return with_images(dataset, timestamp_s=unrolled)
+
+
+def _rounded(period: float) -> float:
+    """Return the period of a counter: a round number far more often than what a fall and a step add up to."""
+    for unit in (604_800.0, 86_400.0, 3_600.0, 60.0, 10.0, 1.0):
+        whole = round(period / unit) * unit
+        if whole > 0.0 and abs(whole - period) < 0.06 * period:
+            return whole
+    return period
+
+
+def _find_jumping(view: View, name: str, *, is_interleaved: bool) -> Finding | None:
+    if view.known & {"interleaved_passes", "passes_no_drives"}:
+        return None
+    passes = _jumping_passes(view.dataset)
+    passes = [each for each in passes if each["interleaved"] == is_interleaved]
+    if not passes:
+        return None
+    first = passes[0]
+    images = sum(each["images"] for each in passes)
+    what = (
+        f"{len(passes)} passes are several drives in one: their images jump between them."
+        if is_interleaved
+        else f"{len(passes)} passes are no drives: their images follow no road."
+    )
+    return Finding(
+        fault=name,
+        what=what.replace("1 passes are", "One pass is").replace("their", "its" if len(passes) == 1 else "their"),
+        why=f"In pass {first['name']} the median step from image to image is {first['step_m']:.3g} m, although the nearest "
+        f"image is {first['nearest_m']:.3g} m away; {first['jumps']:.0%} of the steps are jumps ({images} images in all such "
+        "passes).",
+        do="Give each drive of each camera a pass id of its own, and time stamps; the fix chains images by place.",
+        figures={"passes": len(passes), "images": images, **{k: v for k, v in first.items() if k != "interleaved"}},
+        fix=_rechained,
+    )
+
+
+def _jumping_passes(dataset: Dataset) -> list[dict[str, Any]]:
+    images = dataset.images
+    center = camera_centers(images)
+    found = []
+    for code, rows in _passes_in_order(images):
+        if len(rows) < _LEAST_IMAGES:
+            continue
+        step = np.linalg.norm(np.diff(center[rows], axis=0), axis=1)
+        moving = rows[np.append(True, step > standing_m(step))]
+        if len(moving) < _LEAST_IMAGES:
+            continue
+        step = np.linalg.norm(np.diff(center[moving], axis=0), axis=1)
+        nearest = _typical_gap(center[moving])
+        if nearest <= 0.0:
+            continue
+        jumps = float((step > _JUMP_TIMES * nearest).mean())
+        if jumps <= _MOST_JUMPS:
+            continue
+        # Of few drives in turn, one of the last images is near; of none, hardly ever.
+        recent = np.min(
+            [np.linalg.norm(center[moving[_TURNS:]] - center[moving[_TURNS - lag : -lag]], axis=1) for lag in _LAGS], axis=0
+        )
+        found.append(
+            {
+                "name": images.pass_id.names[code],
+                "images": len(rows),
+                "step_m": round(float(np.median(step)), 3),
+                "nearest_m": round(nearest, 3),
+                "jumps": round(jumps, 3),
+                "interleaved": bool((recent <= _JUMP_TIMES * nearest).mean() > 0.7),
+            }
+        )
+    return found
+
+
+def _passes_in_order(images: Images) -> Iterator[tuple[int, Ints]]:
+    order = driving_order(images)
+    codes = images.pass_id.codes[order]
+    for rows in np.split(order, np.flatnonzero(np.diff(codes)) + 1):
+        yield int(images.pass_id.codes[rows[0]]), rows
+
+
+def _typical_gap(center: Floats) -> float:
+    """Return the median distance to the nearest image that is elsewhere at all."""
+    distance = cKDTree(center).query(center, k=min(8, len(center)))[0][:, 1:]
+    extent = float(np.linalg.norm(np.ptp(center, axis=0)))
+    elsewhere = np.where(distance > 1e-4 * extent, distance, np.inf).min(axis=1)
+    elsewhere = elsewhere[np.isfinite(elsewhere)]
+    return float(np.median(elsewhere)) if len(elsewhere) else 0.0
+
+
+def _chains(center: Floats, gap_m: float) -> Ints:
+    """Return the chain (N) of images in order: each goes on with the chain whose end is nearest, or starts one."""
+    ends: list[Floats] = []
+    chain = np.empty(len(center), dtype=np.int64)
+    for i, here in enumerate(center):
+        if ends:
+            distance = np.linalg.norm(np.array(ends) - here, axis=1)
+            nearest = int(np.argmin(distance))
+            if distance[nearest] <= _JUMP_TIMES * gap_m:
+                ends[nearest], chain[i] = here, nearest
+                continue
+        if len(ends) >= 500:
+            chain[i] = len(ends) - 1
+            continue
+        chain[i] = len(ends)
+        ends.append(here)
+    return chain
+
+
+def _rechained(dataset: Dataset) -> Dataset:
+    """Give jumping passes new ids: chains in their own order, or where that follows no road, strands of near poses."""
+    images = dataset.images
+    center = camera_centers(images)
+    names = np.array(images.pass_id.texts(), dtype=object)
+    scattered: list[Ints] = []
+    bad = {each["name"]: each["interleaved"] for each in _jumping_passes(dataset)}
+    for code, rows in _passes_in_order(images):
+        name = images.pass_id.names[code]
+        if name not in bad:
+            continue
+        if bad[name]:
+            for row, chain in zip(rows, _chains(center[rows], _typical_gap(center[rows])), strict=True):
+                names[row] = f"{name} part {chain + 1}"
+        else:
+            scattered.append(rows)
+    if scattered:
+        rows = np.sort(np.concatenate(scattered))
+        for row, number in zip(rows, _strands(dataset, rows), strict=True):
+            names[row] = f"strand {number + 1}"
+    return with_images(dataset, pass_id=Categories.from_texts(names.tolist()))
+
+
+def _strands(dataset: Dataset, rows: Ints) -> Ints:
+    """Return which strand each of some images (N) is of: near images that look the same way are linked."""
+    center = camera_centers(dataset.images)[rows]
+    forward = rotation_matrices(dataset.images)[rows, 2]
+    count = min(_TURNS + 1, len(rows))
+    distance, near = cKDTree(center).query(center, k=count)
+    first = np.repeat(np.arange(len(rows)), count)
+    second = near.ravel()
+    linked = (distance.ravel() <= _JUMP_TIMES * _typical_gap(center)) & (
+        np.einsum("nj,nj->n", forward[first], forward[second]) > _SAME_WAY
+    )
+    graph = coo_matrix((np.ones(int(linked.sum())), (first[linked], second[linked])), shape=(len(rows), len(rows)))
+    _, strand = connected_components(graph, directed=False)
+    return np.asarray(strand, dtype=np.int64)
+
+
+class _ByImages:
+    """Detections moved along their passes by a number of images; those of the ends stay."""
+
+    def __init__(self, images: int) -> None:
+        self._images = images
+
+    def __call__(self, dataset: Dataset) -> Dataset:
+        images = dataset.images
+        order = driving_order(images)
+        rank = np.empty(len(order), dtype=np.int64)
+        rank[order] = np.arange(len(order))
+        to = np.clip(np.arange(len(order)) - self._images, 0, len(order) - 1)
+        codes = images.pass_id.codes[order]
+        to = np.where(codes[to] == codes, to, np.arange(len(order)))
+        moved = order[to][rank]
+        return with_detections(dataset, image_id=images.image_id[moved[rows_in_images(dataset)]])
+
+
+def worst_pass(view: View) -> PassShift | None:
+    """Return the shift of the pass that is farthest from good, None where all agree; worked out once a view."""
+    if "worst_pass" not in view.memory:
+        view.memory["worst_pass"] = _worst_pass(view)
+    found: PassShift | None = view.memory["worst_pass"]
+    return found
+
+
+def _worst_pass(view: View) -> PassShift | None:
+    """Vote on each pass alone at each place, and see whether its rays meet the points of the others, moved or not."""
+    sample = view.places_of_passes
+    dataset, pass_code = sample.dataset, sample.dataset.images.pass_id.codes.astype(np.int64)
+    if len(np.unique(pass_code)) < 2:
+        return None
+    group = sample.place_of_image.astype(np.int64) * (int(pass_code.max()) + 1) + pass_code
+    _, group_of_image = np.unique(group, return_inverse=True)
+    agreement = measure_agreement(dataset, group_of_image.astype(np.uint32), view.gate_px)
+    found = agreement.found
+    if len(found) < _LEAST_PAIRS:
+        return None
+    voters = found.voters.astype(np.int64)
+    first = voters[found.voter_offsets[:-1]]
+    first_image = agreement.rays.image_row[first]
+    point, of_pass = found.position_in_world_m, pass_code[first_image]
+    class_code, place = agreement.rays.class_code[first], sample.place_of_image[first_image].astype(np.int64)
+    azimuth, _ = driving_azimuths(view.dataset)
+    heading = _mean_heading(azimuth[sample.image_row][agreement.rays.image_row[voters]], found.voter_offsets)
+    tolerance_m, within_m = view.step_m / 2.0, _SEARCH_STEPS * view.step_m
+    codes, number = np.unique(of_pass, return_counts=True)
+    tried = codes[np.argsort(-number, kind="stable")][:_MOST_PASSES]
+    candidates: list[tuple[int, int, bool, Floats]] = []
+    for code in tried.tolist():
+        own, others = np.flatnonzero(of_pass == code), np.flatnonzero(of_pass != code)
+        i, j = pairs_within(point[own], point[others], within_m=within_m)
+        same = class_code[own[i]] == class_code[others[j]]
+        i, j = own[i[same]], others[j[same]]
+        difference = point[j] - point[i]
+        for is_along, turned in ((False, difference), (True, _along(difference, heading[i], view))):
+            shift = densest(turned, tolerance_m)
+            if shift is None or shift.pairs < _LEAST_PAIRS or np.linalg.norm(shift.offset_m) <= tolerance_m:
+                continue
+            if is_along and abs(shift.offset_m[0]) < 2.0 * float(np.linalg.norm(shift.offset_m[1:])):
+                continue
+            candidates.append((shift.pairs - shift.pairs_at_zero, code, is_along, shift.offset_m))
+    candidates.sort(key=lambda each: (-each[0], each[1], each[2]))
+    meeting = _Meeting(agreement.rays, sample.place_of_image, pass_code, point, of_pass, class_code, place, view.gate_px)
+    return _best_shift(view, meeting, candidates[:_MOST_CANDIDATES], len(tried), tolerance_m)
+
+
+@dataclass(frozen=True, eq=False)
+class _Meeting:
+    """Rays of a sample, and the points that each of its passes finds alone."""
+
+    rays: Rays
+    place_of_image: NDArray[np.uint32]
+    pass_of_image: Ints
+    point: Floats
+    pass_of_point: Ints
+    class_of_point: NDArray[np.int32]
+    place_of_point: Ints
+    gate_px: float
+
+    def gain(self, code: int, offset_m: Floats) -> Floats:
+        """Return how well the rays of a pass, whose images (N, 3) are moved, meet the points of the others (places)."""
+        image = self.rays.image_row
+        own = np.flatnonzero((self.pass_of_image[image] == code) & np.isfinite(self.rays.direction_in_world[:, 0]))
+        others = np.flatnonzero(self.pass_of_point != code)
+        place_of_ray = self.place_of_image[image[own]].astype(np.int64)
+        gain = np.zeros(int(self.place_of_image.max()) + 1)
+        for place in np.unique(place_of_ray).tolist():
+            ray, target = own[place_of_ray == place], others[self.place_of_point[others] == place]
+            if not len(target):
+                continue
+            center = self.rays.center_in_world_m[ray] + offset_m[image[ray]]
+            towards = self.point[target][None] - center[:, None]
+            local = np.einsum("nij,nmj->nmi", self.rays.residual_from_world[ray], towards)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                error2 = (local[..., 0] ** 2 + local[..., 1] ** 2) / local[..., 2] ** 2
+            meets = (local[..., 2] > 0.0) & (self.rays.class_code[ray][:, None] == self.class_of_point[target])
+            worth = np.where(meets, 1.0 - error2 / self.gate_px**2, 0.0).max(axis=1)
+            gain[place] = np.maximum(worth, 0.0).sum()
+        return gain
+
+
+def _best_shift(
+    view: View,
+    meeting: _Meeting,
+    candidates: Sequence[tuple[int, int, bool, Floats]],
+    passes: int,
+    tolerance_m: float,
+) -> PassShift | None:
+    """Move each candidate pass and return the shift that makes its rays meet the points of the others best."""
+    images = view.places_of_passes.image_row
+    still = np.zeros((len(images), 3))
+    best: tuple[float, PassShift] | None = None
+    for _, code, is_along, offset_m in candidates:
+        name = view.dataset.images.pass_id.names[code]
+        given = meeting.gain(code, still)
+
+        def gain_of(offset: Floats, code: int = code, is_along: bool = is_along) -> Floats:
+            moved = (moved_along(view.dataset, offset[0]) - view.center_in_world_m)[images] if is_along else still + offset
+            return meeting.gain(code, moved)
+
+        offset = offset_m * [1.0, 0.0, 0.0] if is_along else offset_m.copy()
+        gain = gain_of(offset)
+        for reach in (1.0, 0.5, 0.25):
+            for axis in (0,) if is_along else (0, 1, 2):
+                for way in (-reach, reach):
+                    other = offset.copy()
+                    other[axis] += way * tolerance_m
+                    gain_there = gain_of(other)
+                    if gain_there.sum() > gain.sum():
+                        offset, gain = other, gain_there
+        comparison = compare(gain, given)
+        chance = min(1.0, comparison.chance * _SEARCHED * len(candidates))
+        total, without = float(gain.sum()), float(given.sum())
+        # Of two ways to say the same, a shift in the world is the simpler one.
+        rise = (total - without) * (1.0 if not is_along else 0.95)
+        if chance < LEAST_CHANCE and np.linalg.norm(offset) > tolerance_m and (best is None or rise > best[0]):
+            best = rise, PassShift(name, offset, is_along, total, without, chance, passes)
+    return None if best is None else best[1]
+
+
+def _mean_heading(azimuth: Floats, offsets: Ints) -> Floats:
+    starts = offsets[:-1]
+    return np.arctan2(np.add.reduceat(np.sin(azimuth), starts), np.add.reduceat(np.cos(azimuth), starts))
+
+
+def _along(difference: Floats, heading: Floats, view: View) -> Floats:
+    """Return differences (N, 3) as forward, left and up of drives along azimuths (N)."""
+    east, north = view.dataset.frame.east_north()
+    up = np.array(view.dataset.frame.up)
+    forward = np.sin(heading)[:, None] * east + np.cos(heading)[:, None] * north
+    left = np.sin(heading - np.pi / 2.0)[:, None] * east + np.cos(heading - np.pi / 2.0)[:, None] * north
+    return np.stack(
+        [np.einsum("nj,nj->n", difference, forward), np.einsum("nj,nj->n", difference, left), difference @ up], axis=1
+    )
+
+
+def _is_vertical(view: View, offset_m: Floats) -> bool:
+    return abs(float(offset_m @ np.array(view.dataset.frame.up))) > 0.9 * float(np.linalg.norm(offset_m))
+
+
+def _shift_finding(fault: str, view: View, shift: PassShift, what: str, do: str) -> Finding:
+    frame = "forward, left, up" if shift.is_along else "x, y, z"
+    numbers = ", ".join(f"{part:.2f}" for part in shift.offset_m)
+    return Finding(
+        fault=fault,
+        what=what,
+        why=f"Moved by {numbers} m ({frame}), what it sees is where other passes see it: the agreement of its rays with "
+        f"the others' points rises from {shift.gain_without:.0f} to {shift.gain:.0f}.",
+        do=do,
+        chance=shift.chance,
+        figures={
+            "pass": shift.pass_name,
+            "shift_m": [round(float(part), 3) for part in shift.offset_m],
+            "frame": frame,
+            "agreement_as_given": round(shift.gain_without, 1),
+            "agreement_if_moved": round(shift.gain, 1),
+            "passes_looked_at": shift.passes,
+        },
+        fix=_Realigned(shift),
+    )
+
+
+class _Realigned:
+    """One pass moved, in the world or along its own drive."""
+
+    def __init__(self, shift: PassShift) -> None:
+        self._shift = shift
+
+    def __call__(self, dataset: Dataset) -> Dataset:
+        center = camera_centers(dataset.images)
+        is_moved: Bools = dataset.images.pass_id.codes == dataset.images.pass_id.code_of(self._shift.pass_name)
+        if self._shift.is_along:
+            moved = moved_along(dataset, self._shift.offset_m[0])
+        else:
+            moved = center + self._shift.offset_m
+        return with_poses(dataset, rotation_matrices(dataset.images), np.where(is_moved[:, None], moved, center))
+
+
+def moved_along(dataset: Dataset, forward_m: float) -> Floats:
+    """Return camera centres (N, 3) moved forward along their passes as far as a shift in time does.
+
+    The shift is that of an image that moves by the median step; slower ones move less, standing ones not at all.
+    """
+    order = driving_order(dataset.images)
+    center = camera_centers(dataset.images)[order]
+    codes = dataset.images.pass_id.codes[order]
+    time = dataset.images.timestamp_s
+    seconds = np.arange(len(order), dtype=np.float64) if time is None or not np.all(np.isfinite(time)) else time[order]
+    step = np.linalg.norm(np.diff(center, axis=0), axis=1)
+    duration = np.diff(seconds)
+    usable = (np.diff(codes) == 0) & (duration > 0.0) & (step > 0.0)
+    usable &= step > 0.3 * np.median(step[usable]) if np.any(usable) else usable
+    if not np.any(usable):
+        return camera_centers(dataset.images)
+    shift_s = forward_m / float(np.median(step[usable] / duration[usable]))
+    moved = np.empty_like(center)
+    for rows in np.split(np.arange(len(order)), np.flatnonzero(np.diff(codes)) + 1):
+        when = seconds[rows]
+        _, keep = np.unique(when, return_index=True)
+        if len(keep) < 2:
+            moved[rows] = center[rows]
+            continue
+        for axis in range(3):
+            moved[rows, axis] = _interpolate(when + shift_s, when[keep], center[rows[keep], axis])
+    result = np.empty_like(moved)
+    result[order] = moved
+    return result
+
+
+def _interpolate(at: Floats, when: Floats, value: Floats) -> Floats:
+    """Interpolate linearly, and beyond the ends go on as at the ends."""
+    inside = np.interp(at, when, value)
+    first = value[0] + (at - when[0]) * (value[1] - value[0]) / (when[1] - when[0])
+    last = value[-1] + (at - when[-1]) * (value[-1] - value[-2]) / (when[-1] - when[-2])
+    return np.asarray(np.where(at < when[0], first, np.where(at > when[-1], last, inside)))

@@ -1,0 +1,366 @@
+"""Faults of the rows themselves: duplicates, strays, coarse values, names, scores, truth."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any, ClassVar
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from valuemap.check.boxes import rows_in_images
+from valuemap.check.fault import Fault, Finding, Stage, View, keep_rows, with_detections
+from valuemap.dataset import Dataset
+from valuemap.tables import Bools, Categories, Floats, Ints
+
+_SAME_SHARE = 0.05
+"""Boxes of one class whose centres and sizes differ by less than this share of their size are one box, twice."""
+_LEAST_DUPLICATES = 0.05
+_FAR_TIMES = 10.0
+_MOST_FAR = 0.05
+_COARSE_PX = 1.5
+
+
+class RepeatedBoxes(Fault):
+    """Every box twice."""
+
+    name: ClassVar[str] = "repeated_boxes"
+    stage: ClassVar[Stage] = "tables"
+
+    def find(self, view: View) -> Finding | None:
+        """Look for boxes of one image and class that cover each other."""
+        repeated = _repeated_boxes(view.dataset)
+        count, total = int(repeated.sum()), len(repeated)
+        if count < max(3, _LEAST_DUPLICATES * total):
+            return None
+        return Finding(
+            fault=self.name,
+            what="Boxes are there twice.",
+            why=f"{count} of {total} boxes lie on another box of their image and class (within {_SAME_SHARE:.0%} of its size).",
+            do="Remove the copies: was a file read twice, or non-maximum suppression left out?",
+            figures={"repeated": count, "boxes": total},
+            fix=lambda dataset: keep_rows(dataset, detections=~_repeated_boxes(dataset)),
+        )
+
+
+class RepeatedImages(Fault):
+    """The same image twice."""
+
+    name: ClassVar[str] = "repeated_images"
+    stage: ClassVar[Stage] = "tables"
+
+    def find(self, view: View) -> Finding | None:
+        """Look for images with the same pose and the same detections."""
+        repeated = _repeated_images(view.dataset)
+        count = int(repeated.sum())
+        if count == 0:
+            return None
+        return Finding(
+            fault=self.name,
+            what="Images are there twice.",
+            why=f"{count} of {len(repeated)} images have the pose and the boxes of another one.",
+            do="Remove the copies: they count as witnesses of their own and make labels look surer than they are.",
+            figures={"repeated": count, "images": len(repeated)},
+            fix=lambda dataset: keep_rows(dataset, images=~_repeated_images(dataset)),
+        )
+
+
+class FarImages(Fault):
+    """Images far from the rest."""
+
+    name: ClassVar[str] = "far_images"
+    stage: ClassVar[Stage] = "tables"
+
+    def find(self, view: View) -> Finding | None:
+        """Look for few images much farther from the middle than all others."""
+        far = _far_images(view.center_in_world_m)
+        count = int(far.sum())
+        if count == 0:
+            return None
+        center = view.center_in_world_m
+        middle = np.median(center, axis=0)
+        nearest = float(np.linalg.norm(center[far] - middle, axis=1).min())
+        extent = float(np.linalg.norm(center[~far] - middle, axis=1).max())
+        names = view.dataset.images.name.take(np.flatnonzero(far)[:3]).to_pylist()
+        return Finding(
+            fault=self.name,
+            what="Some images are far from all others.",
+            why=f"{count} of {len(far)} images are {nearest:.4g} m or more from the middle, the others within {extent:.4g} m: "
+            f"{', '.join(names)}{' and more' if count > 3 else ''}.",
+            do="Remove them, or repair their positions (no GPS fix? 0, 0?).",
+            figures={"far": count, "from_m": round(nearest, 1), "others_within_m": round(extent, 1)},
+            fix=lambda dataset: _without_far(dataset),
+        )
+
+
+class QuantisedBoxes(Fault):
+    """Centres on a coarse grid."""
+
+    name: ClassVar[str] = "quantised_boxes"
+    stage: ClassVar[Stage] = "tables"
+
+    def find(self, view: View) -> Finding | None:
+        """Look for a step of more than a pixel that all centres keep to."""
+        steps = [_grid_step(view.dataset.detections.center_px[:, axis]) for axis in (0, 1)]
+        coarse = max(step or 0.0 for step in steps)
+        if coarse <= _COARSE_PX:
+            return None
+        shown = " and ".join(f"{step:.3g} px in {axis}" for step, axis in zip(steps, "xy", strict=True) if step)
+        return Finding(
+            fault=self.name,
+            what="The centres of the boxes are on a coarse grid.",
+            why=f"All of them are multiples of {shown} (from one another).",
+            do=f"Write the detector's full numbers. If there are none, map with --set detection_sigma_px={max(1.0, coarse / 3.46):.2g} "
+            "or more.",
+            figures={"step_px": [None if step is None else round(step, 4) for step in steps]},
+        )
+
+
+class ClassSpelling(Fault):
+    """Classes that differ only in case, spaces or underscores."""
+
+    name: ClassVar[str] = "class_spelling"
+    stage: ClassVar[Stage] = "tables"
+
+    def find(self, view: View) -> Finding | None:
+        """Compare the names of the classes of detections and truth."""
+        groups = _spellings(view.dataset)
+        if not groups:
+            return None
+        shown = "; ".join(" and ".join(repr(name) for name in sorted(names)) for names in groups)
+        return Finding(
+            fault=self.name,
+            what="Classes differ only in capitals, spaces, hyphens or underscores.",
+            why=f"There are {shown}: detections of them never support each other, and labels match no truth.",
+            do="Spell each class one way.",
+            figures={"classes": [sorted(names) for names in groups]},
+            fix=_with_one_spelling,
+        )
+
+
+class EqualScores(Fault):
+    """All scores equal."""
+
+    name: ClassVar[str] = "equal_scores"
+    stage: ClassVar[Stage] = "tables"
+
+    def find(self, view: View) -> Finding | None:
+        """See whether scores say anything; 1 is what a reader writes where there are none."""
+        score = view.dataset.detections.score
+        if len(score) < 10 or np.ptp(score) > 0.0 or score[0] == 1.0:
+            return None
+        return Finding(
+            fault=self.name,
+            what="All detections have the same score.",
+            why=f"All {len(score)} scores are {score[0]:.4g}.",
+            do="Write the detector's own scores: they say which detections to believe. Without any, leave the column at 1.",
+            figures={"score": float(score[0]), "detections": len(score)},
+        )
+
+
+class TruthElsewhere(Fault):
+    """Truth that is far off, or in another frame."""
+
+    name: ClassVar[str] = "truth_elsewhere"
+    stage: ClassVar[Stage] = "results"
+
+    def find(self, view: View) -> Finding | None:
+        """Look for the shift, after other orders of axes, by which most points where rays meet get an object."""
+        from valuemap.check.offsets import find_shift
+
+        truth = view.dataset.truth
+        if truth is None or len(truth) < 3:
+            return None
+        points, support = _certain_points(view)
+        if len(points) < 3:
+            return None
+        tolerance_m = max(view.step_m / 2.0, 1e-9)
+        objects = truth.position_in_world_m
+        here = _matches(points, objects, tolerance_m)
+        best: tuple[int, str, Floats, Floats] = (here, "as it is", np.eye(3), np.zeros(3))
+        for name, axes in _TRUTH_AXES.items():
+            turned = objects @ np.array(axes, dtype=np.float64).T
+            shift = find_shift(points, turned, tolerance_m, within_m=None)
+            if shift is None:
+                continue
+            there = _matches(points, turned - shift.offset_m, tolerance_m)
+            if there > best[0]:
+                best = (there, name, np.array(axes, dtype=np.float64), -shift.offset_m)
+        from scipy import stats
+
+        matched, how, axes, offset = best
+        distance = float(np.median(cKDTree(objects).query(points)[0]))
+        if here >= len(points) / 4.0 or here + matched == 0:
+            far_off = here < len(points) / 4.0
+            if not far_off:
+                return None
+        # Each point is matched by one or the other: a fair coin, for as many places as there are to shift to.
+        tests = len(points) * len(objects) * len(_TRUTH_AXES)
+        chance = float(stats.binom.sf(matched - 1, matched + here, 0.5)) * tests if matched > here else 1.0
+        knows = chance < LEAST
+        moved = float(np.linalg.norm(offset))
+        return Finding(
+            fault=self.name,
+            what="The truth is not where the rays meet: another frame, or far off.",
+            why=f"Of {len(points)} points where many rays meet {here} have a true object within {tolerance_m:.2g} m; the "
+            f"median distance is {distance:.4g} m."
+            + (f" With {how} and a shift of {moved:.4g} m, {matched} have one." if knows else ""),
+            do="Give the truth in the dataset's frame." + ("" if knows else " No shift or order of axes makes it fit."),
+            chance=None if not knows else min(chance, 1.0),
+            figures={
+                "points": len(points),
+                "matched": here,
+                "median_distance_m": round(distance, 2),
+                "matched_after": matched if knows else here,
+                "shift_m": [round(float(part), 3) for part in offset] if knows else None,
+            },
+            fix=_MovedTruth(axes, offset) if knows else None,
+        )
+
+
+LEAST = 1e-3
+_TRUTH_AXES: dict[str, list[list[float]]] = {
+    "its axes as they are": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "x and y exchanged": [[0, 1, 0], [1, 0, 0], [0, 0, 1]],
+    "x, y, z as east, south, down": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    "north, east, down": [[0, 1, 0], [1, 0, 0], [0, 0, -1]],
+    "y up": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    "y down": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+}
+
+
+class _MovedTruth:
+    """Truth in other axes, then moved."""
+
+    def __init__(self, axes: Floats, offset_m: Floats) -> None:
+        self._axes, self._offset_m = axes, offset_m
+
+    def __call__(self, dataset: Dataset) -> Dataset:
+        assert dataset.truth is not None
+        position = dataset.truth.position_in_world_m @ self._axes.T + self._offset_m
+        return Dataset(**{**vars(dataset), "truth": dataset.truth.replace(position_in_world_m=position)})
+
+
+def _certain_points(view: View) -> tuple[Floats, Ints]:
+    """Return the points (N, 3) where rays of many images meet, and their votes: the half with most votes."""
+    found, point = view.agreement.found, view.agreement.points_in_world_m
+    votes = np.diff(found.voter_offsets)
+    if not len(votes):
+        return np.empty((0, 3)), votes
+    certain = votes >= max(5.0, float(np.median(votes)))
+    return point[certain], votes[certain]
+
+
+def _matches(points: Floats, objects: Floats, within_m: float) -> int:
+    return int((cKDTree(objects).query(points)[0] <= within_m).sum())
+
+
+def _repeated_boxes(dataset: Dataset) -> Bools:
+    """Return which boxes (N) have a better one, or one as good before them, in the same place."""
+    detections = dataset.detections
+    image, code = rows_in_images(dataset), detections.class_name.codes
+    order = np.lexsort((detections.center_px[:, 1], detections.center_px[:, 0], code, image))
+    repeated = np.zeros(len(order), dtype=np.bool_)
+    size = np.maximum(detections.size_px, 1.0)
+    # Copies lie side by side in this order, but for rare boxes in between: three neighbours are looked at.
+    for lag in (1, 2, 3):
+        first, second = order[:-lag], order[lag:]
+        same = (image[first] == image[second]) & (code[first] == code[second])
+        smaller = np.minimum(size[first], size[second])
+        same &= (np.abs(detections.center_px[first] - detections.center_px[second]) <= _SAME_SHARE * smaller).all(axis=1)
+        same &= (np.abs(size[first] - size[second]) <= 2.0 * _SAME_SHARE * smaller).all(axis=1)
+        first, second = first[same], second[same]
+        worse_is_second = (detections.score[second] < detections.score[first]) | (
+            (detections.score[second] == detections.score[first]) & (second > first)
+        )
+        repeated[np.where(worse_is_second, second, first)] = True
+    return repeated
+
+
+def _repeated_images(dataset: Dataset) -> Bools:
+    """Return which images (N) have the camera, pose and boxes of an earlier one; those without boxes do not count."""
+    images, detections = dataset.images, dataset.detections
+    row = rows_in_images(dataset)
+    order = np.lexsort((detections.center_px[:, 1], detections.center_px[:, 0], row))
+    count = np.bincount(row, minlength=len(images))
+    first = np.cumsum(count) - count
+    pose = np.concatenate(
+        [images.cam_from_world_quat, images.cam_from_world_m, images.camera_id[:, None].astype(np.float64)], axis=1
+    )
+    by_pose: dict[Any, list[int]] = defaultdict(list)
+    for image in np.flatnonzero(count):
+        by_pose[pose[image].tobytes()].append(int(image))
+    repeated = np.zeros(len(images), dtype=np.bool_)
+    for alike in by_pose.values():
+        seen = set()
+        for image in alike if len(alike) > 1 else ():
+            rows = order[first[image] : first[image] + count[image]]
+            boxes = detections.center_px[rows].tobytes() + detections.size_px[rows].tobytes()
+            repeated[image] = boxes in seen
+            seen.add(boxes)
+    return repeated
+
+
+def _far_images(center: Floats) -> Bools:
+    """Return which images (N) are ten times farther from the middle than 95 % of all, with nothing in between."""
+    distance = np.linalg.norm(center - np.median(center, axis=0), axis=1)
+    usual = float(np.quantile(distance, 1.0 - _MOST_FAR))
+    far: Bools = distance > _FAR_TIMES * usual
+    if usual == 0.0 or not np.any(far) or len(center) < 10:
+        return np.zeros(len(center), dtype=np.bool_)
+    return far
+
+
+def _without_far(dataset: Dataset) -> Dataset:
+    from valuemap.cameras import camera_centers
+
+    return keep_rows(dataset, images=~_far_images(camera_centers(dataset.images)))
+
+
+def _grid_step(values: Floats) -> float | None:
+    """Return the step of the grid that values (N) are on, None where there is none of more than a thousandth."""
+    distinct = np.unique(np.round(values, 6))
+    # On a grid there are few values for many rows, or all gaps are multiples of the smallest.
+    gaps = np.diff(distinct)
+    if len(distinct) < 5 or len(values) < 20:
+        return None
+    step = float(gaps.min())
+    multiple = gaps / step
+    if step < 1e-3 or np.abs(multiple - np.round(multiple)).max() > 0.01:
+        return None
+    # A handful of values may have a common divisor by accident; hundreds of gaps do not.
+    return step if len(values) > 2 * len(distinct) or len(distinct) > 30 else None
+
+
+def _key(name: str) -> str:
+    return "".join(letter for letter in name.casefold() if letter.isalnum())
+
+
+def _spellings(dataset: Dataset) -> list[set[str]]:
+    groups: dict[str, set[str]] = defaultdict(set)
+    columns = [dataset.detections.class_name] + ([dataset.truth.class_name] if dataset.truth is not None else [])
+    for column in columns:
+        for code in np.unique(column.codes).tolist():
+            groups[_key(column.names[code])].add(column.names[code])
+    return [names for _, names in sorted(groups.items()) if len(names) > 1]
+
+
+def _with_one_spelling(dataset: Dataset) -> Dataset:
+    """Spell every class as most of its detections do."""
+    column = dataset.detections.class_name
+    count = dict(zip(column.names, np.bincount(column.codes, minlength=len(column.names)).tolist(), strict=True))
+    chosen = {
+        name: max(sorted(names), key=lambda name: count.get(name, 0)) for names in _spellings(dataset) for name in names
+    }
+    result = with_detections(dataset, class_name=_renamed(column, chosen))
+    if dataset.truth is None:
+        return result
+    truth = dataset.truth.replace(class_name=_renamed(dataset.truth.class_name, chosen))
+    return Dataset(**{**vars(result), "truth": truth})
+
+
+def _renamed(column: Categories, chosen: dict[str, str]) -> Categories:
+    renamed = [chosen.get(name, name) for name in column.names]
+    names = tuple(sorted(set(renamed)))
+    recode = np.array([names.index(name) for name in renamed], dtype=np.int32)
+    return Categories(recode[column.codes], names)

@@ -1,0 +1,87 @@
+"""All faults that are known, in the order in which they are looked for: a new one is a class and a line here."""
+
+from __future__ import annotations
+
+from valuemap.check.boxes import CornersAsCenter, HalfSizes, MirroredPictures, NormalisedBoxes, PictureSize, TopLeftAsCenter
+from valuemap.check.cameras import CameraTilt, CameraYaw, FocalLength, HalfPixel, TimeShift, WrongCamera
+from valuemap.check.fault import Convention, Fault
+from valuemap.check.frames import (
+    DegreesForRadians,
+    HeadingConvention,
+    HeadingsUseless,
+    LatLonSwapped,
+    MirroredPositions,
+    RotationSigmaUnit,
+    Scale,
+    UpDirection,
+    WorldAxes,
+)
+from valuemap.check.passes import (
+    CameraHeight,
+    InterleavedPasses,
+    NoDrives,
+    PassOffset,
+    PassTimeShift,
+    RollingTimes,
+    ShiftedDetections,
+    TimeUnit,
+)
+from valuemap.check.poses import CameraAxes, CenterAsTranslation, InvertedPoses, PitchAndRoll, QuaternionOrder
+from valuemap.check.quality import (
+    ClassSpelling,
+    EqualScores,
+    FarImages,
+    QuantisedBoxes,
+    RepeatedBoxes,
+    RepeatedImages,
+    TruthElsewhere,
+)
+
+CONVENTIONS: tuple[Convention, ...] = (
+    InvertedPoses(),
+    QuaternionOrder(),
+    CameraAxes(),
+    CenterAsTranslation(),
+    LatLonSwapped(),
+    WorldAxes(),
+    MirroredPositions(),
+    HeadingConvention(),
+    DegreesForRadians(),
+    PictureSize(),
+    MirroredPictures(),
+    ShiftedDetections(),
+    PitchAndRoll(),
+    HeadingsUseless(),
+)
+"""Mistakes that are found by reading the data another way."""
+
+FAULTS: tuple[Fault, ...] = (
+    NormalisedBoxes(),
+    CornersAsCenter(),
+    FarImages(),
+    RepeatedBoxes(),
+    RepeatedImages(),
+    ClassSpelling(),
+    EqualScores(),
+    QuantisedBoxes(),
+    RotationSigmaUnit(),
+    TopLeftAsCenter(),
+    HalfPixel(),
+    UpDirection(),
+    RollingTimes(),
+    InterleavedPasses(),
+    NoDrives(),
+    TimeUnit(),
+    WrongCamera(),
+    PassOffset(),
+    PassTimeShift(),
+    CameraHeight(),
+    FocalLength(),
+    CameraTilt(),
+    CameraYaw(),
+    TimeShift(),
+    HalfSizes(),
+    Scale(),
+    TruthElsewhere(),
+)
+"""All other mistakes; they are looked for stage by stage, in this order in a stage."""

@@ -1,0 +1,48 @@
+"""How large the detected objects are in the world, and how large such things are."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import valuemap._core as _core
+from valuemap.check.fault import View
+
+_LEAST_VOTES = 5
+_ANYTHING = (0.05, 10.0)
+_HEIGHTS_M = (
+    # Housings of two or three lenses of 0.2 or 0.3 m (EN 12368, MUTCD), with or without a back plate.
+    (("traffic_light", "traffic light", "trafficlight", "traffic signal", "traffic_signal"), (0.45, 2.0)),
+    # Discs and triangles of 0.4 to 1.2 m (Vienna, MUTCD), a plate of a street's name up to a board at a junction.
+    (("sign",), (0.2, 2.5)),
+)
+
+
+def plausible_heights(class_name: str) -> tuple[float, float]:
+    """Return between which heights in metres the median of a class must be."""
+    name = class_name.lower()
+    for words, heights in _HEIGHTS_M:
+        if any(word in name for word in words):
+            return heights
+    return _ANYTHING
+
+
+def object_heights(view: View) -> dict[str, tuple[float, int]]:
+    """Return, for each class, the median height in metres of the points where rays meet, and how many these are."""
+    agreement = view.agreement
+    found = agreement.found
+    votes = np.diff(found.voter_offsets)
+    if not len(found):
+        return {}
+    detections = view.stretches.dataset.detections
+    _, metres_per_px, _ = _core.see(agreement.rays.core, found.position_in_world_m, found.voter_offsets, found.voters)
+    height_m = detections.size_px[found.voters.astype(np.int64), 1] * metres_per_px[:, 1]
+    median = _core.medians(height_m.copy(), found.voter_offsets)
+    class_code = detections.class_name.codes[found.voters[found.voter_offsets[:-1]].astype(np.int64)]
+    result = {}
+    for code, name in enumerate(detections.class_name.names):
+        of_class = (class_code == code) & (votes >= _LEAST_VOTES)
+        # Chance makes points of few votes; what most votes are for is what is there.
+        of_class &= votes >= np.median(votes[of_class]) if np.any(of_class) else of_class
+        if np.any(of_class):
+            result[name] = (float(np.median(median[of_class])), int(of_class.sum()))
+    return result
