@@ -4,7 +4,7 @@
 
 Good data are simulated cities (two cameras, time stamps, a geo-reference, truth), and where their folders are given
 KITTI odometry 00, 05, 07, 09 (see kitti_signs.py; faults go into 00) and KITTI-TS (`images.csv`, `detections.csv`,
-`signs.csv`). Faults are written here, apart from the package: nothing of a fix is used to make the fault that it undoes.
+`signs.csv`). Faults are written here, apart from the package: no fix is used to make the fault that it undoes.
 
 What is counted
 
@@ -102,7 +102,9 @@ def good_kitti(data_dir: Path, sequence: str) -> Dataset:
             rotation_sigma_rad=np.full(count, 0.002),
         ),
         truth=Truth(
-            object_id=np.arange(len(tracks)), class_name=Categories.from_texts(["sign"] * len(tracks)), position_in_world_m=tracks
+            object_id=np.arange(len(tracks)),
+            class_name=Categories.from_texts(["sign"] * len(tracks)),
+            position_in_world_m=tracks,
         ),
     )
 
@@ -136,9 +138,7 @@ def good_kitti_ts(data_dir: Path) -> Dataset:
             model=Categories.from_texts(["PINHOLE"] * len(shapes)),
             width_px=np.array([int(shape[3]) for shape in shapes]),
             height_px=np.array([int(shape[4]) for shape in shapes]),
-            params=[
-                np.array([float(fx), float(fx), float(cx) + 0.5, float(cy) + 0.5]) for fx, cx, cy, _, _ in shapes
-            ],
+            params=[np.array([float(fx), float(fx), float(cx) + 0.5, float(cy) + 0.5]) for fx, cx, cy, _, _ in shapes],
         ),
         images=Images(
             image_id=np.arange(len(images)),
@@ -219,7 +219,7 @@ def inverted_poses(dataset: Dataset) -> Dataset:
 
 
 def quaternion_order(dataset: Dataset) -> Dataset:
-    """The columns hold x y z w."""
+    """Put x y z w into the columns."""
     quaternion = dataset.images.cam_from_world_quat[:, [1, 2, 3, 0]].copy()
     return replace(dataset, images=dataset.images.replace(cam_from_world_quat=quaternion))
 
@@ -238,12 +238,12 @@ def world_axes(dataset: Dataset) -> Dataset:
 
 
 def center_as_translation(dataset: Dataset) -> Dataset:
-    """The camera centre in tx ty tz."""
+    """Put the camera centre into tx ty tz."""
     return replace(dataset, images=dataset.images.replace(cam_from_world_m=camera_centers(dataset.images)))
 
 
 def mirrored_positions(dataset: Dataset) -> Dataset:
-    """A left-handed world for the positions."""
+    """Give the positions in a left-handed world."""
     rotation, center = _poses(dataset)
     axis = 0 if abs(dataset.frame.up[1]) > 0.7 else 1
     flip = np.ones(3)
@@ -301,7 +301,7 @@ def pitch_and_roll(dataset: Dataset) -> Dataset:
 
 
 def up_direction(dataset: Dataset) -> Dataset | None:
-    """The sky in another direction: positions and rotations in north, east, down where z should be up."""
+    """Turn the sky: positions and rotations in north, east, down where z should be up."""
     x, y, z = dataset.frame.up
     if dataset.frame.anchor is None:
         return replace(dataset, frame=Frame(up=(z, x, y)))
@@ -311,22 +311,24 @@ def up_direction(dataset: Dataset) -> Dataset | None:
 
 
 def rotation_sigma_in_degrees(dataset: Dataset) -> Dataset:
-    """The column in degrees, of poses good to a degree."""
+    """Give the column in degrees, of poses good to a degree."""
     sigma = np.full(len(dataset.images), 1.0)
     return replace(dataset, images=dataset.images.replace(rotation_sigma_rad=sigma))
 
 
 def _with_params(dataset: Dataset, change: Callable[[Floats], Floats]) -> Dataset:
-    return replace(dataset, cameras=dataset.cameras.replace(params=[change(each.copy()) for each in dataset.cameras.params]))
+    return replace(
+        dataset, cameras=dataset.cameras.replace(params=[change(each.copy()) for each in dataset.cameras.params])
+    )
 
 
 def focal_length(dataset: Dataset) -> Dataset:
-    """A focal length 15 % too long."""
+    """Lengthen the focal length by 15 %."""
     return _with_params(dataset, lambda params: params * [1.15, 1.15, 1.0, 1.0])
 
 
 def picture_size(dataset: Dataset) -> Dataset:
-    """The detector saw pictures of half the size."""
+    """Let the detector see pictures of half the size."""
     return boxed(dataset, dataset.detections.center_px / 2.0, dataset.detections.size_px / 2.0)
 
 
@@ -356,7 +358,9 @@ def wrong_camera(dataset: Dataset) -> Dataset | None:
         dataset = with_second_camera(dataset, scale=0.75)
     elif np.ptp(dataset.cameras.width_px) < 0.1 * dataset.cameras.width_px[0]:
         return None
-    return replace(dataset, images=dataset.images.replace(camera_id=np.full(len(dataset.images), dataset.cameras.camera_id[0])))
+    return replace(
+        dataset, images=dataset.images.replace(camera_id=np.full(len(dataset.images), dataset.cameras.camera_id[0]))
+    )
 
 
 def boxes_as_corners(dataset: Dataset) -> Dataset:
@@ -366,7 +370,7 @@ def boxes_as_corners(dataset: Dataset) -> Dataset:
 
 
 def boxes_top_left(dataset: Dataset) -> Dataset:
-    """The top left corner as the centre."""
+    """Give the top left corner as the centre."""
     return boxed(dataset, dataset.detections.center_px - dataset.detections.size_px / 2.0)
 
 
@@ -391,7 +395,7 @@ def mirrored_pictures(dataset: Dataset) -> Dataset:
 
 
 def scale(dataset: Dataset) -> Dataset:
-    """A model in a unit of its own."""
+    """Give the model in a unit of its own."""
     rotation, center = _poses(dataset)
     return posed(dataset, rotation, 0.07 * center)
 
@@ -416,7 +420,7 @@ def pass_offset(dataset: Dataset) -> Dataset | None:
 
 
 def camera_height(dataset: Dataset) -> Dataset | None:
-    """The camera of one pass 1.8 m too low."""
+    """Put the camera of one pass 1.8 m too low."""
     return _moved_pass(dataset, -1.8 * np.array(dataset.frame.up))
 
 
@@ -435,14 +439,14 @@ def _later(dataset: Dataset, seconds: float, is_moved: NDArray[np.bool_]) -> Dat
 
 
 def pass_time_shift(dataset: Dataset) -> Dataset | None:
-    """The clock of one pass 0.5 s off."""
+    """Set the clock of one pass 0.5 s off."""
     if len(np.unique(dataset.images.pass_id.codes)) < 2:
         return None
     return _later(dataset, 0.5, dataset.images.pass_id.codes == _busy_pass(dataset))
 
 
 def time_shift(dataset: Dataset) -> Dataset:
-    """The clock of all poses 0.6 s off."""
+    """Set the clock of all poses 0.6 s off."""
     return _later(dataset, 0.6, np.ones(len(dataset.images), dtype=np.bool_))
 
 
@@ -470,7 +474,9 @@ def interleaved_passes(dataset: Dataset) -> Dataset | None:
             names[row] = f"both/{2 * number + (code == second):06d}.jpg"
     passes = np.array(dataset.images.pass_id.texts(), dtype=object)
     passes[(codes == first) | (codes == second)] = "both"
-    images = dataset.images.replace(name=pa.array(names), pass_id=Categories.from_texts(passes.tolist()), timestamp_s=when)
+    images = dataset.images.replace(
+        name=pa.array(names), pass_id=Categories.from_texts(passes.tolist()), timestamp_s=when
+    )
     return replace(dataset, images=images)
 
 
@@ -487,7 +493,7 @@ def time_unit(dataset: Dataset) -> Dataset | None:
 
 
 def detections_shifted(dataset: Dataset) -> Dataset:
-    """Detections listed with the image before their own."""
+    """List detections with the image before their own."""
     codes = dataset.images.pass_id.codes
     before = np.maximum(np.arange(len(codes)) - 1, 0)
     before = np.where(codes[before] == codes, before, np.arange(len(codes)))
@@ -505,7 +511,7 @@ def repeated_boxes(dataset: Dataset) -> Dataset:
 
 
 def repeated_images(dataset: Dataset) -> Dataset:
-    """A tenth of the images twice, under other names."""
+    """Give a tenth of the images twice, under other names."""
     images, detections = dataset.images, dataset.detections
     again = np.arange(0, len(images), 10)
     image_rows = np.concatenate([np.arange(len(images)), again])
@@ -611,7 +617,7 @@ def found_objects(dataset: Dataset, truth: Truth) -> int:
     if not len(labels):
         return 0
     distance, _ = cKDTree(labels.position_in_world_m).query(truth.position_in_world_m)
-    return int((distance <= MATCH_M).sum())
+    return int((np.asarray(distance) <= MATCH_M).sum())
 
 
 def measure(good: Dataset, name: str, fault: Fault, unharmed: int | None) -> dict[str, Any] | None:
@@ -677,7 +683,10 @@ def summarise(records: dict[str, dict[str, Any]]) -> dict[str, Any]:
         "fixes": len(fixes),
         "recovered": sum(result["recovered"] for result in fixes),
         "missed": [
-            f"{data}: {name}" for data, record in records.items() for name, r in record["faults"].items() if not r["named"]
+            f"{data}: {name}"
+            for data, record in records.items()
+            for name, r in record["faults"].items()
+            if not r["named"]
         ],
         "not_recovered": [
             f"{data}: {name}"
@@ -710,7 +719,13 @@ def main() -> int:
         for key, value in totals.items():
             print(f"{key:22} {value}")
         command = "python benchmarks/check_faults.py --kitti-signs DIR --kitti-ts DIR"
-        record = {"benchmark": "check_faults", "command": command, **describe_machine(), "totals": totals, "results": records}
+        record = {
+            "benchmark": "check_faults",
+            "command": command,
+            **describe_machine(),
+            "totals": totals,
+            "results": records,
+        }
         keep_record(options.json, record)
     except ValuemapError as error:
         print(f"error: {error}\nhint: {error.hint}", file=sys.stderr)

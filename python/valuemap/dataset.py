@@ -148,8 +148,8 @@ def ensure_checked(dataset: Dataset) -> Dataset:
     return check_dataset(dataset, source=dataset.name)
 
 
-def read_dataset(path: str | Path) -> Dataset:
-    """Read and check a dataset folder.
+def read_dataset(path: str | Path, *, are_boxes_checked: bool = True) -> Dataset:
+    """Read and check a dataset folder; without `are_boxes_checked` boxes may be anywhere, for those who ask why.
 
     Raises
     ------
@@ -172,6 +172,7 @@ def read_dataset(path: str | Path) -> Dataset:
             **optional,  # type: ignore[arg-type]
         ),
         source=str(folder),
+        are_boxes_checked=are_boxes_checked,
     )
 
 
@@ -213,8 +214,10 @@ def write_dataset(dataset: Dataset, path: str | Path, *, force: bool = False) ->
                 write_table(table, folder / f"{name}.parquet")
 
 
-def check_dataset(dataset: Dataset, *, source: str) -> Dataset:
+def check_dataset(dataset: Dataset, *, source: str, are_boxes_checked: bool = True) -> Dataset:
     """Check what only holds between tables, and return the dataset with quaternions normalised.
+
+    Without `are_boxes_checked` nothing is asked of boxes but an image that is known.
 
     Raises
     ------
@@ -224,7 +227,7 @@ def check_dataset(dataset: Dataset, *, source: str) -> Dataset:
     """
     _check_cameras(dataset.cameras, source)
     images = _check_images(dataset.images, dataset.cameras, source)
-    _check_detections(dataset, source)
+    _check_detections(dataset, source, are_boxes_checked=are_boxes_checked)
     if dataset.truth_detections is not None:
         pairs = dataset.truth_detections
         if dataset.truth is None:
@@ -329,10 +332,12 @@ def _check_images(images: Images, cameras: Cameras, source: str) -> Images:
     return images.replace(cam_from_world_quat=images.cam_from_world_quat / scale[:, None])
 
 
-def _check_detections(dataset: Dataset, source: str) -> None:
+def _check_detections(dataset: Dataset, source: str, *, are_boxes_checked: bool) -> None:
     detections, images, cameras = dataset.detections, dataset.images, dataset.cameras
     ids = detections.detection_id
     _check_known(detections.image_id, images.image_id, ids, source, "detections", "image_id", "images")
+    if not are_boxes_checked:
+        return
     where = (source, "detections", "detection_id")
     for i, name in enumerate(("width", "height")):
         _refuse(detections.size_px[:, i] < 0.0, detections.size_px[:, i], ids, *where, name, "expected at least 0 px")

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,9 +136,6 @@ def compare(better: Floats, worse: Floats) -> Comparison:
     scatter = float(difference.std(ddof=1)) / math.sqrt(count)
     statistic = math.inf if scatter == 0.0 else float(difference.mean()) / scatter
     by_size = float(stats.t.sf(statistic, count - 1))
-    by_rank = float(stats.wilcoxon(difference, alternative="greater", method=_method(count)).pvalue)
+    method: Literal["exact", "approx"] = "exact" if count <= _MOST_EXACT else "approx"
+    by_rank = float(stats.wilcoxon(difference, alternative="greater", method=method).pvalue)
     return Comparison(total, min(1.0, 2.0 * min(by_size, by_rank)), count)
-
-
-def _method(count: int) -> str:
-    return "exact" if count <= _MOST_EXACT else "approx"

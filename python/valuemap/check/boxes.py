@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -69,7 +70,7 @@ class CornersAsCenter(Fault):
         return Finding(
             fault=self.name,
             what="x, y, width and height hold the corners x1, y1, x2, y2.",
-            why=f"In {share:.1%} of {len(detections)} boxes width exceeds x and height exceeds y, and the median width is "
+            why=f"In {share:.1%} of {len(detections)} boxes width exceeds x and height exceeds y; the median width is "
             f"{np.median(size[:, 0]):.0f} px.",
             do="Write centres and sizes: x = (x1 + x2) / 2, width = x2 - x1.",
             figures={"share": round(share, 4)},
@@ -96,14 +97,12 @@ class TopLeftAsCenter(Fault):
                     fault=self.name,
                     what=f"x and y are {name} of the boxes, not their centres.",
                     why=f"On one side of the pictures {first.beyond} boxes reach out of the picture by up to "
-                    f"{-first.least:.2g} of their size, on the other none comes closer than {second.least:.2g} of its size, "
+                    f"{-first.least:.2g} of their size, on the other none comes closer than {second.least:.2g} of its, "
                     f"although {second.within} are within one and a half.",
                     do="Write centres: x + width / 2, y + height / 2.",
                     chance=chance,
                     figures={"beyond": first.beyond, "gap": round(second.least, 3), "near": second.within},
-                    fix=lambda dataset, shift=shift: with_detections(
-                        dataset, center_px=dataset.detections.center_px + shift * dataset.detections.size_px
-                    ),
+                    fix=partial(_with_centers_moved, sizes=shift),
                 )
         return None
 
@@ -237,6 +236,10 @@ def _chance_of_empty(ends: Floats, border: float, width: float) -> float:
     if missing > _STRAYS * beside:
         return 1.0
     return float(stats.binom.cdf(missing, missing + beside, 0.5))
+
+
+def _with_centers_moved(dataset: Dataset, *, sizes: float) -> Dataset:
+    return with_detections(dataset, center_px=dataset.detections.center_px + sizes * dataset.detections.size_px)
 
 
 def _to_pixels(dataset: Dataset) -> Dataset:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,14 +12,15 @@ from scipy.spatial.transform import Rotation
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.agreement import compare, measure_agreement
 from valuemap.check.fault import LEAST_CHANCE, Fault, Finding, Stage, View, with_detections, with_images, with_poses
-from valuemap.check.fit import Estimate, Parameter, apply, estimate
+from valuemap.check.fit import Estimate, Parameter, estimate
 from valuemap.check.passes import moved_along
 from valuemap.check.sample import pixels_per_radian
 from valuemap.dataset import Dataset
 from valuemap.tables import Cameras, Floats
 
-_FOCAL_LENGTHS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "OPENCV_FISHEYE": 2,
-                  "FULL_OPENCV": 2, "FOV": 2, "SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 1, "THIN_PRISM_FISHEYE": 2}  # fmt: skip
+_ONE_FOCAL_LENGTH = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+_TWO_FOCAL_LENGTHS = ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE")
+_FOCAL_LENGTHS = dict.fromkeys(_ONE_FOCAL_LENGTH, 1) | dict.fromkeys(_TWO_FOCAL_LENGTHS, 2)
 """How many of the first parameters of a model are focal lengths."""
 
 
@@ -99,12 +101,12 @@ class _CommonError(Fault):
             return Finding(
                 fault=self.name,
                 what=self.says(view, name, value),
-                why=f"{self.shows(view, name, value, sigma)} over {found.places} places and {found.points} objects; corrected, "
-                f"the agreement of rays rises by {comparison.difference:.0f} ({comparison.places} places).",
+                why=f"{self.shows(view, name, value, sigma)} over {found.places} places and {found.points} objects; "
+                f"corrected, the agreement of rays rises by {comparison.difference:.0f} ({comparison.places} places).",
                 do=self.do,
                 chance=chance,
                 figures={"estimates": found.to_json(), "parameter": name, **comparison.to_json()},
-                fix=lambda dataset, parameter=parameter, value=value: parameter.change(dataset, value),
+                fix=partial(_changed, parameter=parameter, value=value),
             )
         return None
 
@@ -127,7 +129,8 @@ class CameraTilt(_CommonError):
     def says(self, view: View, name: str, value: float) -> str:
         """Return what is wrong."""
         if name == "pitch":
-            return f"The cameras look {abs(np.degrees(value)):.2f} degrees {'lower' if value > 0 else 'higher'} than their poses say."
+            way = "lower" if value > 0 else "higher"
+            return f"The cameras look {abs(np.degrees(value)):.2f} degrees {way} than their poses say."
         return f"The cameras are rolled by {abs(np.degrees(value)):.2f} degrees against their poses."
 
 
@@ -170,18 +173,21 @@ class TimeShift(_CommonError):
     def says(self, view: View, name: str, value: float) -> str:
         """Return what is wrong."""
         side = "behind" if value > 0 else "ahead of"
-        return f"All poses are {abs(value):.2f} m along the road ({abs(value) / view.step_m:.1f} images) {side} their pictures."
+        images = abs(value) / view.step_m
+        return f"All poses are {abs(value):.2f} m along the road ({images:.1f} images) {side} their pictures."
 
     def shows(self, view: View, name: str, value: float, sigma: float) -> str:
         """Return metres."""
         return f"The shift is {value:.2f} ± {sigma:.2f} m"
 
 
+def _changed(dataset: Dataset, *, parameter: Parameter, value: float) -> Dataset:
+    return parameter.change(dataset, value)
+
+
 def _gains(view: View, dataset: Dataset) -> Floats:
     samples = (view.stretches, view.many_places)
-    return np.concatenate(
-        [measure_agreement(s.of(dataset), s.place_of_image, view.gate_px).gain for s in samples]
-    )
+    return np.concatenate([measure_agreement(s.of(dataset), s.place_of_image, view.gate_px).gain for s in samples])
 
 
 class HalfPixel(Fault):
@@ -197,7 +203,8 @@ class HalfPixel(Fault):
 
 def _principal_points_at_integers(view: View) -> Finding | None:
     cameras = view.dataset.cameras
-    rows, middles = [], 0
+    rows: list[int] = []
+    middles = 0
     for row, params in enumerate(cameras.params):
         count = _FOCAL_LENGTHS.get(cameras.model.names[cameras.model.codes[row]], 0)
         if not count:
@@ -214,8 +221,8 @@ def _principal_points_at_integers(view: View) -> Finding | None:
         fault=HalfPixel.name,
         what="The principal points are half a pixel off: they count from the middle of the first pixel.",
         why=f"{len(rows)} of {len(cameras)} cameras have it at exactly (width - 1) / 2, (height - 1) / 2 "
-        f"({first[count]:g}, {first[count + 1]:g} of {cameras.width_px[rows[0]]} x {cameras.height_px[rows[0]]}), which is the "
-        "middle of a picture where pixel centres are whole numbers, as in OpenCV; here they are at halves.",
+        f"({first[count]:g}, {first[count + 1]:g} of {cameras.width_px[rows[0]]} x {cameras.height_px[rows[0]]}): "
+        "the middle of a picture where pixel centres are whole numbers, as in OpenCV; here they are at halves.",
         do="Add 0.5 to cx and cy (and to box centres that were measured so).",
         figures={"cameras": len(rows)},
         fix=lambda dataset: _with_principal_points(dataset, rows, 0.5),
@@ -239,20 +246,28 @@ def _boxes_cut_aside(view: View) -> Finding | None:
     for axis in (0, 1):
         first, last = float(low[:, axis].min()), float(high[:, axis].min())
         shift = (last - first) / 2.0
-        at_first, at_last = (int((np.abs(side[:, axis] - end) < 1e-3).sum()) for side, end in ((low, first), (high, last)))
+        at_first, at_last = (
+            int((np.abs(side[:, axis] - end) < 1e-3).sum()) for side, end in ((low, first), (high, last))
+        )
         # A border that boxes are cut at is cut at in both directions of the picture at the same number.
-        at_other = int((np.abs(low[:, 1 - axis] - first) < 1e-3).sum()) if abs(low[:, 1 - axis].min() - first) < 1e-3 else 0
+        at_other = (
+            int((np.abs(low[:, 1 - axis] - first) < 1e-3).sum()) if abs(low[:, 1 - axis].min() - first) < 1e-3 else 0
+        )
         if abs(abs(shift) - 0.5) < 1e-3 and min(at_first, at_last) >= 2 and at_first + at_other >= 3:
             return Finding(
                 fault=HalfPixel.name,
                 what="The boxes are half a pixel off: they count from the middle of the first pixel.",
-                why=f"Boxes cut by the picture end at {first:g} px on one side ({at_first + at_other} boxes) and {last:g} px "
-                f"before the other ({at_last} boxes): the picture they were cut by is {shift:+g} px off.",
+                why=f"Boxes cut by the picture end at {first:g} px on one side ({at_first + at_other} boxes) and "
+                f"{last:g} px before the other ({at_last} boxes): the picture they were cut by is {shift:+g} px off.",
                 do=f"Add {shift:g} to x and y of the boxes.",
                 figures={"shift_px": shift, "boxes": at_first + at_other + at_last},
-                fix=lambda dataset, shift=shift: with_detections(dataset, center_px=dataset.detections.center_px + shift),
+                fix=partial(_with_boxes_moved, shift_px=shift),
             )
     return None
+
+
+def _with_boxes_moved(dataset: Dataset, *, shift_px: float) -> Dataset:
+    return with_detections(dataset, center_px=dataset.detections.center_px + shift_px)
 
 
 class WrongCamera(Fault):
@@ -272,9 +287,9 @@ class WrongCamera(Fault):
         return Finding(
             fault=self.name,
             what="Images have the wrong camera.",
-            why=f"Of {rows} images in {len(chosen)} groups of a pass the rays agree better with another camera of the table: those "
-            f"of pass {worst['pass']} have camera {worst['camera']}, and with camera {worst['better']} their agreement "
-            f"is {worst['with_better']:.0f} instead of {worst['as_given']:.0f}.",
+            why=f"Of {rows} images in {len(chosen)} groups of a pass the rays agree better with another camera of the "
+            f"table: those of pass {worst['pass']} have camera {worst['camera']}, and with camera {worst['better']} "
+            f"their agreement is {worst['with_better']:.0f} instead of {worst['as_given']:.0f}.",
             do="Give each image the camera that took it.",
             chance=worst["chance"],
             figures={"images": rows, "groups": chosen[:10]},

@@ -94,9 +94,9 @@ def _judge(view: View, readings: Sequence[_Reading], top: _Reading) -> Finding |
     return Finding(
         fault=chosen.convention.name,
         what=chosen.convention.what,
-        why=f"Read as {chosen.how}, {chosen.agreement.share:.0%} of {chosen.agreement.detections} detections meet others, "
-        f"with an agreement of {chosen.total:.0f}; as given {given.agreement.share:.0%} and {given.total:.0f}, by chance "
-        f"{view.chance.share:.0%} and {view.chance.gain.sum():.0f} ({comparison.places} places).",
+        why=f"Read as {chosen.how}, {chosen.agreement.share:.0%} of {chosen.agreement.detections} detections meet "
+        f"others, with an agreement of {chosen.total:.0f}; as given {given.agreement.share:.0%} and {given.total:.0f}, "
+        f"by chance {view.chance.share:.0%} and {view.chance.gain.sum():.0f} ({comparison.places} places).",
         do=chosen.convention.do,
         chance=min(comparison.chance * tests, 1.0),
         figures={

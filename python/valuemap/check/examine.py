@@ -1,4 +1,4 @@
-"""The check from end to end: what is wrong, stage by stage, each on data in which what was found before is put right."""
+"""The check from end to end: what is wrong, stage by stage, each on data with all found before put right."""
 
 from __future__ import annotations
 

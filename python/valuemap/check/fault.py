@@ -12,7 +12,14 @@ import numpy as np
 
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.agreement import Agreement, chance_agreement, measure_agreement
-from valuemap.check.sample import MOST_DETECTIONS, Sample, median_step_m, pixels_per_radian, sample_places, sample_stretches
+from valuemap.check.sample import (
+    MOST_DETECTIONS,
+    Sample,
+    median_step_m,
+    pixels_per_radian,
+    sample_places,
+    sample_stretches,
+)
 from valuemap.dataset import Dataset
 from valuemap.tables import Floats
 

@@ -3,8 +3,8 @@
 Points where rays meet are taken from a vote; the residuals of their votes are linearised in the points and in a few
 common parameters (a turn of the cameras in their mounts, the logarithm of the focal length, a shift along the drive),
 the points are eliminated, and the parameters solved for, with weights after Cauchy. Images of one place share their
-errors, so the standard errors come from the scatter between places (the sandwich of Liang and Zeger, 1986), not from the
-number of detections.
+errors, so the standard errors come from the scatter between places (the sandwich of Liang and Zeger, 1986), not from
+the number of detections.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from valuemap.cameras import Rays, cast_rays
 from valuemap.check.agreement import measure_agreement
 from valuemap.check.sample import Sample
 from valuemap.dataset import Dataset
-from valuemap.tables import Candidates, Floats, Ints
+from valuemap.tables import Floats, Ints
 
 Change = Callable[[Dataset, float], Dataset]
 """A dataset with one parameter changed by a value."""
@@ -97,7 +97,10 @@ def _solve(dataset: Dataset, sample: Sample, gate_px: float, parameters: tuple[P
     residual = _residuals(rays, voter, point[point_of])
     slope = np.stack(
         [
-            (_at(dataset, sample, p, p.step, voter, point[point_of]) - _at(dataset, sample, p, -p.step, voter, point[point_of]))
+            (
+                _at(dataset, sample, p, p.step, voter, point[point_of])
+                - _at(dataset, sample, p, -p.step, voter, point[point_of])
+            )
             / (2.0 * p.step)
             for p in parameters
         ],

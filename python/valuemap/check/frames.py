@@ -140,8 +140,8 @@ class UpDirection(Fault):
         return Finding(
             fault=self.name,
             what="The direction of the sky is not where the cameras have it.",
-            why=f"The cameras' own up is {_vector(own)} on average, the frame's {_vector(np.array(view.dataset.frame.up))}: "
-            f"the cosine between them is {view.uprightness:.2f}.",
+            why=f"The cameras' own up is {_vector(own)} on average, the frame's "
+            f"{_vector(np.array(view.dataset.frame.up))}: the cosine between them is {view.uprightness:.2f}.",
             do="Give the direction of the sky with --up." if is_local else "Turn the world into x east, y north, z up.",
             figures={"cosine": round(view.uprightness, 3), "own_up": [round(float(part), 3) for part in own]},
             fix=(lambda dataset: _with_up(dataset, own)) if is_local else (lambda dataset: _stand_up(dataset, own)),
@@ -189,7 +189,9 @@ class Scale(Fault):
             low, high = plausible_heights(name)
             figures[f"height_m of {name}"] = round(height_m, 4)
             if objects >= 3 and not low <= height_m <= high:
-                reasons.append(f"{name} are {height_m:.3g} m high (median of {objects} places; {low:g} to {high:g} m is usual)")
+                reasons.append(
+                    f"{name} are {height_m:.3g} m high (median of {objects} places; {low:g} to {high:g} m is usual)"
+                )
                 factors.append(math.sqrt(low * high) / height_m)
         speed = _median_speed_mps(view)
         if speed is not None:
@@ -204,7 +206,7 @@ class Scale(Fault):
             fault=self.name,
             what="The world is not in metres, or boxes have the wrong size.",
             why="; ".join(reasons).capitalize() + ".",
-            do=f"Scale the poses (about {figures['factor']:g} times): align them with GPS positions or a known distance.",
+            do=f"Scale the poses (about {figures['factor']:g} times): by GPS positions or a known distance.",
             figures=figures,
         )
 
@@ -238,7 +240,7 @@ _ENU_BY_UP: dict[tuple[int, float], list[list[float]]] = {
     (0, 1.0): [[0, 1, 0], [0, 0, 1], [1, 0, 0]],
     (0, -1.0): [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
 }
-"""Takes the world whose up is along an axis to x east, y north, z up: first north, east, down; then y up, as in graphics."""
+"""Takes the world whose up is along an axis to x east, y north, z up: north, east, down; y up, as in graphics; ..."""
 
 
 def _stand_up(dataset: Dataset, own_up: Floats) -> Dataset:

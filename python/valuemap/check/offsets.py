@@ -45,8 +45,8 @@ def pairs_within(points: Floats, others: Floats, *, within_m: float | None) -> t
         return first.ravel(), second.ravel()
     if not len(points) or not len(others):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    near = cKDTree(others).query_ball_point(points, within_m, return_sorted=True)
-    count = np.array([len(rows) for rows in near])
+    near: list[list[int]] = list(cKDTree(others).query_ball_point(points, within_m, return_sorted=True))  # type: ignore[arg-type]
+    count = np.array([len(found) for found in near])
     second = np.concatenate([np.array(rows, dtype=np.int64) for rows in near]) if count.sum() else np.empty(0, np.int64)
     return np.repeat(np.arange(len(points)), count), second
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,7 +16,18 @@ from scipy.spatial import cKDTree
 from valuemap.cameras import Rays, camera_centers, rotation_matrices
 from valuemap.check.agreement import compare, measure_agreement
 from valuemap.check.boxes import rows_in_images
-from valuemap.check.fault import LEAST_CHANCE, Convention, Fault, Finding, Fix, Stage, View, with_detections, with_images, with_poses
+from valuemap.check.fault import (
+    LEAST_CHANCE,
+    Convention,
+    Fault,
+    Finding,
+    Fix,
+    Stage,
+    View,
+    with_detections,
+    with_images,
+    with_poses,
+)
 from valuemap.check.headings import driving_azimuths
 from valuemap.check.offsets import densest, pairs_within
 from valuemap.check.sample import driving_order, standing_m
@@ -46,7 +58,9 @@ class ShiftedDetections(Convention):
     """Detections that belong to the image before or after."""
 
     name: ClassVar[str] = "detections_shifted"
-    what: ClassVar[str] = "The detections belong to other images than those they are listed with: the next or the last one."
+    what: ClassVar[str] = (
+        "The detections belong to other images than those they are listed with: the next or the last one."
+    )
     do: ClassVar[str] = "Match detections and images by name, not by their place in a list (one counts from 1?)."
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
@@ -71,14 +85,16 @@ class TimeUnit(Fault):
                 return Finding(
                     fault=self.name,
                     what=f"The time stamps are {unit}, not seconds.",
-                    why=f"The images would move at {speed:.2g} m/s (median); in {unit} it is {speed / seconds:.3g} m/s.",
+                    why=f"Images would move at {speed:.2g} m/s (median); in {unit} it is {speed / seconds:.3g} m/s.",
                     do="Write seconds.",
                     figures={"speed_mps": speed, "unit": unit},
-                    fix=lambda dataset, seconds=seconds: with_images(
-                        dataset, timestamp_s=np.asarray(dataset.images.timestamp_s) * seconds
-                    ),
+                    fix=partial(_with_times_scaled, factor=seconds),
                 )
         return None
+
+
+def _with_times_scaled(dataset: Dataset, *, factor: float) -> Dataset:
+    return with_images(dataset, timestamp_s=np.asarray(dataset.images.timestamp_s) * factor)
 
 
 class RollingTimes(Fault):
@@ -155,7 +171,7 @@ class PassOffset(Fault):
         if shift is None or shift.is_along or _is_vertical(view, shift.offset_m):
             return None
         return _shift_finding(
-            self.name, view, shift, f"Pass {shift.pass_name} is off by {np.linalg.norm(shift.offset_m):.2f} m.",
+            self.name, shift, f"Pass {shift.pass_name} is off by {np.linalg.norm(shift.offset_m):.2f} m.",
             "Align it with the others (another datum, another antenna, no correction data?).",
         )  # fmt: skip
 
@@ -172,8 +188,7 @@ class PassTimeShift(Fault):
         if shift is None or not shift.is_along:
             return None
         images = shift.offset_m[0] / view.step_m
-        return _shift_finding(
-            self.name, view, shift,
+        return _shift_finding(self.name, shift,
             f"The poses of pass {shift.pass_name} are {abs(shift.offset_m[0]):.2f} m along the road "
             f"({abs(images):.1f} images) {'behind' if images > 0 else 'ahead of'} its pictures.",
             "Correct the clock of this pass (leap seconds, exposure or trigger delay).",
@@ -192,8 +207,7 @@ class CameraHeight(Fault):
         if shift is None or shift.is_along or not _is_vertical(view, shift.offset_m):
             return None
         up_m = float(shift.offset_m @ np.array(view.dataset.frame.up))
-        return _shift_finding(
-            self.name, view, shift,
+        return _shift_finding(self.name, shift,
             f"The camera of pass {shift.pass_name} is {abs(up_m):.2f} m too {'low' if up_m > 0 else 'high'}.",
             "Correct the height of its camera above the ground, or use one datum of heights for all passes.",
         )  # fmt: skip
@@ -241,7 +255,7 @@ def _unrolled(dataset: Dataset) -> Dataset:
     falls = np.diff(time, prepend=time[0]) < 0.0
     falls[start] = False
     laps = np.cumsum(falls)
-    laps -= np.repeat(laps[start], np.diff(np.append(np.flatnonzero(start), len(order))))
+    laps = laps - np.repeat(laps[start], np.diff(np.append(np.flatnonzero(start), len(order))))
     unrolled = np.empty(len(order))
     unrolled[order] = time + laps * found[0]
     return with_images(dataset, timestamp_s=unrolled)
@@ -273,9 +287,9 @@ def _find_jumping(view: View, name: str, *, is_interleaved: bool) -> Finding | N
     return Finding(
         fault=name,
         what=what.replace("1 passes are", "One pass is").replace("their", "its" if len(passes) == 1 else "their"),
-        why=f"In pass {first['name']} the median step from image to image is {first['step_m']:.3g} m, although the nearest "
-        f"image is {first['nearest_m']:.3g} m away; {first['jumps']:.0%} of the steps are jumps ({images} images in all such "
-        "passes).",
+        why=f"In pass {first['name']} the median step from image to image is {first['step_m']:.3g} m, although the "
+        f"nearest image is {first['nearest_m']:.3g} m away; {first['jumps']:.0%} of the steps are jumps ({images} "
+        "images in all such passes).",
         do="Give each drive of each camera a pass id of its own, and time stamps; the fix chains images by place.",
         figures={"passes": len(passes), "images": images, **{k: v for k, v in first.items() if k != "interleaved"}},
         fix=_rechained,
@@ -302,7 +316,8 @@ def _jumping_passes(dataset: Dataset) -> list[dict[str, Any]]:
             continue
         # Of few drives in turn, one of the last images is near; of none, hardly ever.
         recent = np.min(
-            [np.linalg.norm(center[moving[_TURNS:]] - center[moving[_TURNS - lag : -lag]], axis=1) for lag in _LAGS], axis=0
+            [np.linalg.norm(center[moving[_TURNS:]] - center[moving[_TURNS - lag : -lag]], axis=1) for lag in _LAGS],
+            axis=0,
         )
         found.append(
             {
@@ -326,7 +341,7 @@ def _passes_in_order(images: Images) -> Iterator[tuple[int, Ints]]:
 
 def _typical_gap(center: Floats) -> float:
     """Return the median distance to the nearest image that is elsewhere at all."""
-    distance = cKDTree(center).query(center, k=min(8, len(center)))[0][:, 1:]
+    distance = np.asarray(cKDTree(center).query(center, k=min(8, len(center)))[0])[:, 1:]
     extent = float(np.linalg.norm(np.ptp(center, axis=0)))
     elsewhere = np.where(distance > 1e-4 * extent, distance, np.inf).min(axis=1)
     elsewhere = elsewhere[np.isfinite(elsewhere)]
@@ -380,7 +395,7 @@ def _strands(dataset: Dataset, rows: Ints) -> Ints:
     center = camera_centers(dataset.images)[rows]
     forward = rotation_matrices(dataset.images)[rows, 2]
     count = min(_TURNS + 1, len(rows))
-    distance, near = cKDTree(center).query(center, k=count)
+    distance, near = map(np.asarray, cKDTree(center).query(center, k=count))
     first = np.repeat(np.arange(len(rows)), count)
     second = near.ravel()
     linked = (distance.ravel() <= _JUMP_TIMES * _typical_gap(center)) & (
@@ -454,7 +469,9 @@ def _worst_pass(view: View) -> PassShift | None:
                 continue
             candidates.append((shift.pairs - shift.pairs_at_zero, code, is_along, shift.offset_m))
     candidates.sort(key=lambda each: (-each[0], each[1], each[2]))
-    meeting = _Meeting(agreement.rays, sample.place_of_image, pass_code, point, of_pass, class_code, place, view.gate_px)
+    meeting = _Meeting(
+        agreement.rays, sample.place_of_image, pass_code, point, of_pass, class_code, place, view.gate_px
+    )
     return _best_shift(view, meeting, candidates[:_MOST_CANDIDATES], len(tried), tolerance_m)
 
 
@@ -509,7 +526,9 @@ def _best_shift(
         given = meeting.gain(code, still)
 
         def gain_of(offset: Floats, code: int = code, is_along: bool = is_along) -> Floats:
-            moved = (moved_along(view.dataset, offset[0]) - view.center_in_world_m)[images] if is_along else still + offset
+            moved = (
+                (moved_along(view.dataset, offset[0]) - view.center_in_world_m)[images] if is_along else still + offset
+            )
             return meeting.gain(code, moved)
 
         offset = offset_m * [1.0, 0.0, 0.0] if is_along else offset_m.copy()
@@ -552,14 +571,14 @@ def _is_vertical(view: View, offset_m: Floats) -> bool:
     return abs(float(offset_m @ np.array(view.dataset.frame.up))) > 0.9 * float(np.linalg.norm(offset_m))
 
 
-def _shift_finding(fault: str, view: View, shift: PassShift, what: str, do: str) -> Finding:
+def _shift_finding(fault: str, shift: PassShift, what: str, do: str) -> Finding:
     frame = "forward, left, up" if shift.is_along else "x, y, z"
     numbers = ", ".join(f"{part:.2f}" for part in shift.offset_m)
     return Finding(
         fault=fault,
         what=what,
-        why=f"Moved by {numbers} m ({frame}), what it sees is where other passes see it: the agreement of its rays with "
-        f"the others' points rises from {shift.gain_without:.0f} to {shift.gain:.0f}.",
+        why=f"Moved by {numbers} m ({frame}), what it sees is where other passes see it: the agreement of its rays "
+        f"with the others' points rises from {shift.gain_without:.0f} to {shift.gain:.0f}.",
         do=do,
         chance=shift.chance,
         figures={
@@ -583,10 +602,8 @@ class _Realigned:
     def __call__(self, dataset: Dataset) -> Dataset:
         center = camera_centers(dataset.images)
         is_moved: Bools = dataset.images.pass_id.codes == dataset.images.pass_id.code_of(self._shift.pass_name)
-        if self._shift.is_along:
-            moved = moved_along(dataset, self._shift.offset_m[0])
-        else:
-            moved = center + self._shift.offset_m
+        offset_m = self._shift.offset_m
+        moved = moved_along(dataset, offset_m[0]) if self._shift.is_along else center + offset_m
         return with_poses(dataset, rotation_matrices(dataset.images), np.where(is_moved[:, None], moved, center))
 
 

@@ -61,8 +61,7 @@ class QuaternionOrder(Convention):
         for order, columns in (("x y z w", [3, 0, 1, 2]), ("y z w x", [1, 2, 3, 0])):
             yield f"{order}, the translation as it is", _Reordered(columns, keeps_center=False)
             yield f"{order}, the camera centre as it is", _Reordered(columns, keeps_center=True)
-            inverted = _Reordered(columns, keeps_center=False)
-            yield f"{order}, world_from_cam", lambda data, first=inverted: _invert(first(data))
+            yield f"{order}, world_from_cam", _Reordered(columns, keeps_center=False, inverts=True)
 
 
 class CameraAxes(Convention):
@@ -113,12 +112,14 @@ def level(dataset: Dataset) -> Dataset:
 class _Reordered:
     """Takes the parts of the quaternions from other columns."""
 
-    def __init__(self, columns: list[int], *, keeps_center: bool) -> None:
-        self._columns, self._keeps_center = columns, keeps_center
+    def __init__(self, columns: list[int], *, keeps_center: bool, inverts: bool = False) -> None:
+        self._columns, self._keeps_center, self._inverts = columns, keeps_center, inverts
 
     def __call__(self, dataset: Dataset) -> Dataset:
         quaternion = np.ascontiguousarray(dataset.images.cam_from_world_quat[:, self._columns])
         other = with_images(dataset, cam_from_world_quat=quaternion)
+        if self._inverts:
+            return _invert(other)
         if not self._keeps_center:
             return other
         return with_poses(dataset, rotation_matrices(other.images), camera_centers(dataset.images))

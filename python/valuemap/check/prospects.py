@@ -11,7 +11,8 @@ from valuemap.check.fault import View
 from valuemap.check.sample import driving_order
 
 _GAP_TIMES = 10.0
-_LEAST_VOTES = 3
+_LEAST_VOTES = 5
+"""Fewer rays may meet by chance."""
 
 
 def describe_prospects(view: View) -> dict[str, Any]:

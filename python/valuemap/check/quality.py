@@ -6,12 +6,14 @@ from collections import defaultdict
 from typing import Any, ClassVar
 
 import numpy as np
+from scipy import stats
 from scipy.spatial import cKDTree
 
 from valuemap.check.boxes import rows_in_images
-from valuemap.check.fault import Fault, Finding, Stage, View, keep_rows, with_detections
+from valuemap.check.fault import LEAST_CHANCE, Fault, Finding, Stage, View, keep_rows, with_detections
+from valuemap.check.offsets import find_shift
 from valuemap.dataset import Dataset
-from valuemap.tables import Bools, Categories, Floats, Ints
+from valuemap.tables import Bools, Categories, Floats, Truth
 
 _SAME_SHARE = 0.05
 """Boxes of one class whose centres and sizes differ by less than this share of their size are one box, twice."""
@@ -36,7 +38,7 @@ class RepeatedBoxes(Fault):
         return Finding(
             fault=self.name,
             what="Boxes are there twice.",
-            why=f"{count} of {total} boxes lie on another box of their image and class (within {_SAME_SHARE:.0%} of its size).",
+            why=f"{count} of {total} boxes lie on another of their image and class ({_SAME_SHARE:.0%} of its size).",
             do="Remove the copies: was a file read twice, or non-maximum suppression left out?",
             figures={"repeated": count, "boxes": total},
             fix=lambda dataset: keep_rows(dataset, detections=~_repeated_boxes(dataset)),
@@ -85,8 +87,8 @@ class FarImages(Fault):
         return Finding(
             fault=self.name,
             what="Some images are far from all others.",
-            why=f"{count} of {len(far)} images are {nearest:.4g} m or more from the middle, the others within {extent:.4g} m: "
-            f"{', '.join(names)}{' and more' if count > 3 else ''}.",
+            why=f"{count} of {len(far)} images are {nearest:.4g} m or more from the middle, the others within "
+            f"{extent:.4g} m: {', '.join(names)}{' and more' if count > 3 else ''}.",
             do="Remove them, or repair their positions (no GPS fix? 0, 0?).",
             figures={"far": count, "from_m": round(nearest, 1), "others_within_m": round(extent, 1)},
             fix=lambda dataset: _without_far(dataset),
@@ -110,8 +112,8 @@ class QuantisedBoxes(Fault):
             fault=self.name,
             what="The centres of the boxes are on a coarse grid.",
             why=f"All of them are multiples of {shown} (from one another).",
-            do=f"Write the detector's full numbers. If there are none, map with --set detection_sigma_px={max(1.0, coarse / 3.46):.2g} "
-            "or more.",
+            do="Write the detector's full numbers. If there are none, map with --set "
+            f"detection_sigma_px={max(1.0, coarse / 3.46):.2g} or more.",
             figures={"step_px": [None if step is None else round(step, 4) for step in steps]},
         )
 
@@ -153,7 +155,7 @@ class EqualScores(Fault):
             fault=self.name,
             what="All detections have the same score.",
             why=f"All {len(score)} scores are {score[0]:.4g}.",
-            do="Write the detector's own scores: they say which detections to believe. Without any, leave the column at 1.",
+            do="Write the detector's own scores: they say which detections to believe. Without any, write 1.",
             figures={"score": float(score[0]), "detections": len(score)},
         )
 
@@ -166,67 +168,69 @@ class TruthElsewhere(Fault):
 
     def find(self, view: View) -> Finding | None:
         """Look for the shift, after other orders of axes, by which most points where rays meet get an object."""
-        from valuemap.check.offsets import find_shift
-
-        truth = view.dataset.truth
-        if truth is None or len(truth) < 3:
-            return None
-        points, support = _certain_points(view)
-        if len(points) < 3:
+        truth, points = view.dataset.truth, _certain_points(view)
+        if truth is None or len(truth) < _LEAST_TRUTH or len(points) < _LEAST_TRUTH:
             return None
         tolerance_m = max(view.step_m / 2.0, 1e-9)
-        objects = truth.position_in_world_m
+        objects = _flattened(truth.position_in_world_m, truth, view)
+        points = _flattened(points, truth, view)
         here = _matches(points, objects, tolerance_m)
-        best: tuple[int, str, Floats, Floats] = (here, "as it is", np.eye(3), np.zeros(3))
+        if here >= _ENOUGH_TRUTH * min(len(points), len(objects)):
+            return None
+        there, how, fix = here, "", None
         for name, axes in _TRUTH_AXES.items():
             turned = objects @ np.array(axes, dtype=np.float64).T
-            shift = find_shift(points, turned, tolerance_m, within_m=None)
+            shift = find_shift(turned, points, tolerance_m, within_m=None)
             if shift is None:
                 continue
-            there = _matches(points, turned - shift.offset_m, tolerance_m)
-            if there > best[0]:
-                best = (there, name, np.array(axes, dtype=np.float64), -shift.offset_m)
-        from scipy import stats
-
-        matched, how, axes, offset = best
-        distance = float(np.median(cKDTree(objects).query(points)[0]))
-        if here >= len(points) / 4.0 or here + matched == 0:
-            far_off = here < len(points) / 4.0
-            if not far_off:
-                return None
-        # Each point is matched by one or the other: a fair coin, for as many places as there are to shift to.
+            matched = _matches(points, turned + shift.offset_m, tolerance_m)
+            if matched > there:
+                moved_m = float(np.linalg.norm(shift.offset_m))
+                there, how = matched, f" With {name} and a shift of {moved_m:.4g} m, {matched} have one."
+                fix = _MovedTruth(np.array(axes, dtype=np.float64), shift.offset_m)
+        # By a shift to any pair, in any axes, chance matches some: those that are then matched are counted anew.
         tests = len(points) * len(objects) * len(_TRUTH_AXES)
-        chance = float(stats.binom.sf(matched - 1, matched + here, 0.5)) * tests if matched > here else 1.0
-        knows = chance < LEAST
-        moved = float(np.linalg.norm(offset))
+        chance = float(stats.binom.sf(there - 1, there + here, 0.5)) * tests if there > here else 1.0
+        fits = fix is not None and chance < LEAST_CHANCE
+        if not fits and here > 0:
+            return None  # It may well know other objects than are seen here.
+        distance = float(np.median(cKDTree(objects).query(points)[0]))
         return Finding(
             fault=self.name,
             what="The truth is not where the rays meet: another frame, or far off.",
-            why=f"Of {len(points)} points where many rays meet {here} have a true object within {tolerance_m:.2g} m; the "
-            f"median distance is {distance:.4g} m."
-            + (f" With {how} and a shift of {moved:.4g} m, {matched} have one." if knows else ""),
-            do="Give the truth in the dataset's frame." + ("" if knows else " No shift or order of axes makes it fit."),
-            chance=None if not knows else min(chance, 1.0),
+            why=f"Of {len(points)} points where many rays meet {here} have a true object within {tolerance_m:.2g} m; "
+            f"the median distance is {distance:.4g} m.{how if fits else ' No shift or order of axes makes it fit.'}",
+            do="Give the truth in the dataset's frame.",
+            chance=min(chance, 1.0) if fits else None,
             figures={
                 "points": len(points),
                 "matched": here,
+                "matched_if_moved": there if fits else here,
                 "median_distance_m": round(distance, 2),
-                "matched_after": matched if knows else here,
-                "shift_m": [round(float(part), 3) for part in offset] if knows else None,
             },
-            fix=_MovedTruth(axes, offset) if knows else None,
+            fix=fix if fits else None,
         )
 
 
-LEAST = 1e-3
+_LEAST_TRUTH = 3
+_ENOUGH_TRUTH = 0.25
+"""Truth that knows this share of the places where rays meet is in their frame."""
 _TRUTH_AXES: dict[str, list[list[float]]] = {
     "its axes as they are": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
     "x and y exchanged": [[0, 1, 0], [1, 0, 0], [0, 0, 1]],
     "x, y, z as east, south, down": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
-    "north, east, down": [[0, 1, 0], [1, 0, 0], [0, 0, -1]],
+    "x, y, z as north, east, down": [[0, 1, 0], [1, 0, 0], [0, 0, -1]],
     "y up": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
     "y down": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
 }
+
+
+def _flattened(points: Floats, truth: Truth, view: View) -> Floats:
+    """Return points (N, 3) as they are, or where the truth knows no heights (all are equal) on the ground."""
+    up = np.array(view.dataset.frame.up)
+    if float(np.ptp(truth.position_in_world_m @ up)) > 0.0:
+        return points
+    return np.asarray(points - (points @ up)[:, None] * up)
 
 
 class _MovedTruth:
@@ -241,18 +245,18 @@ class _MovedTruth:
         return Dataset(**{**vars(dataset), "truth": dataset.truth.replace(position_in_world_m=position)})
 
 
-def _certain_points(view: View) -> tuple[Floats, Ints]:
-    """Return the points (N, 3) where rays of many images meet, and their votes: the half with most votes."""
+def _certain_points(view: View) -> Floats:
+    """Return the points (N, 3) where rays of many images meet: the half with most votes."""
     found, point = view.agreement.found, view.agreement.points_in_world_m
     votes = np.diff(found.voter_offsets)
     if not len(votes):
-        return np.empty((0, 3)), votes
+        return np.empty((0, 3))
     certain = votes >= max(5.0, float(np.median(votes)))
-    return point[certain], votes[certain]
+    return np.asarray(point[certain])
 
 
 def _matches(points: Floats, objects: Floats, within_m: float) -> int:
-    return int((cKDTree(objects).query(points)[0] <= within_m).sum())
+    return int((np.asarray(cKDTree(objects).query(points)[0]) <= within_m).sum())
 
 
 def _repeated_boxes(dataset: Dataset) -> Bools:
@@ -267,7 +271,9 @@ def _repeated_boxes(dataset: Dataset) -> Bools:
         first, second = order[:-lag], order[lag:]
         same = (image[first] == image[second]) & (code[first] == code[second])
         smaller = np.minimum(size[first], size[second])
-        same &= (np.abs(detections.center_px[first] - detections.center_px[second]) <= _SAME_SHARE * smaller).all(axis=1)
+        same &= (np.abs(detections.center_px[first] - detections.center_px[second]) <= _SAME_SHARE * smaller).all(
+            axis=1
+        )
         same &= (np.abs(size[first] - size[second]) <= 2.0 * _SAME_SHARE * smaller).all(axis=1)
         first, second = first[same], second[same]
         worse_is_second = (detections.score[second] < detections.score[first]) | (
@@ -288,12 +294,14 @@ def _repeated_images(dataset: Dataset) -> Bools:
         [images.cam_from_world_quat, images.cam_from_world_m, images.camera_id[:, None].astype(np.float64)], axis=1
     )
     by_pose: dict[Any, list[int]] = defaultdict(list)
-    for image in np.flatnonzero(count):
-        by_pose[pose[image].tobytes()].append(int(image))
+    for row_with_boxes in np.flatnonzero(count).tolist():
+        by_pose[pose[row_with_boxes].tobytes()].append(row_with_boxes)
     repeated = np.zeros(len(images), dtype=np.bool_)
     for alike in by_pose.values():
-        seen = set()
-        for image in alike if len(alike) > 1 else ():
+        seen: set[bytes] = set()
+        if len(alike) < 2:
+            continue
+        for image in alike:
             rows = order[first[image] : first[image] + count[image]]
             boxes = detections.center_px[rows].tobytes() + detections.size_px[rows].tobytes()
             repeated[image] = boxes in seen

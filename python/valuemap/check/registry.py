@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from valuemap.check.boxes import CornersAsCenter, HalfSizes, MirroredPictures, NormalisedBoxes, PictureSize, TopLeftAsCenter
+from valuemap.check.boxes import (
+    CornersAsCenter,
+    HalfSizes,
+    MirroredPictures,
+    NormalisedBoxes,
+    PictureSize,
+    TopLeftAsCenter,
+)
 from valuemap.check.cameras import CameraTilt, CameraYaw, FocalLength, HalfPixel, TimeShift, WrongCamera
 from valuemap.check.fault import Convention, Fault
 from valuemap.check.frames import (

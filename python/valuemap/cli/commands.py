@@ -10,6 +10,7 @@ COMMANDS = (
     "import_",
     "simulate",
     "info",
+    "check",
     "detect",
     "map",
     "evaluate",

@@ -1,0 +1,78 @@
+"""`valuemap check`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from valuemap import dataset as dataset_folder
+from valuemap.cli.app import app
+from valuemap.cli.options import AsJson
+from valuemap.cli.show import log, progress_bars, show
+from valuemap.dataset import read_dataset, write_dataset
+from valuemap.errors import SettingError
+from valuemap.folders import check_place
+
+_WRONG = 3
+"""Exit code where something is wrong: scripts can tell it from a command that failed (1) and from bad use (2)."""
+
+
+@app.command("check")
+def check_command(
+    dataset: Annotated[Path, typer.Argument(help="Folder that an import or simulate command wrote.")],
+    fix: Annotated[
+        Path | None,
+        typer.Option("--fix", metavar="OUT", help="Write the dataset with what can be put right put right."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say what is wrong with a dataset, how sure that is, and what the data can give."""
+    from valuemap.check import examine
+
+    if fix is not None:
+        if fix.resolve() == dataset.resolve():
+            raise SettingError(
+                f"--fix {fix}: this is the dataset itself", hint="give another folder: what is given stays as it is"
+            )
+        check_place(fix, marker=dataset_folder.MARKER)
+    given = read_dataset(dataset, are_boxes_checked=False)
+    with progress_bars() as progress:
+        outcome = examine(given, progress=progress)
+    if as_json:
+        print(json.dumps({"dataset": given.name, **outcome.to_json()}, indent=2))
+    else:
+        _tell(outcome.to_json())
+    if fix is not None:
+        write_dataset(outcome.fixed, fix)
+        fixed = sum(finding.fix is not None for finding in outcome.findings)
+        log.print(f"Put right {fixed} of {len(outcome.findings)} and wrote {fix}", highlight=False, markup=False)
+    if outcome.findings:
+        raise typer.Exit(_WRONG)
+
+
+def _tell(outcome: dict[str, Any]) -> None:
+    """Print findings as paragraphs, and what the data can give as a table."""
+    findings = outcome["findings"]
+    if findings:
+        print(f"{len(findings)} {'thing is' if len(findings) == 1 else 'things are'} wrong.\n")
+    else:
+        print("Nothing is wrong as far as can be seen.\n")
+    for number, finding in enumerate(findings, 1):
+        print(f"{number}. {finding['what']} ({finding['sure']}; {finding['fault']})")
+        print(f"   Why: {finding['why']}")
+        print(f"   What to do: {finding['do']}")
+        if finding["has_fix"]:
+            print("   --fix does it.")
+        print()
+    for note in outcome["notes"]:
+        print(f"note: {note}\n")
+    facts = {name.replace("_", " "): _shown(value) for name, value in outcome["prospects"].items()}
+    show(facts, title="What the data can give" + (", once put right" if findings else ""))
+
+
+def _shown(value: Any) -> Any:
+    """Return a spread as one text."""
+    return f"{value['median']} ({value['p10']} to {value['p90']})" if isinstance(value, dict) else value
