@@ -10,7 +10,7 @@ import typer
 
 from valuemap import dataset as dataset_folder
 from valuemap.cli.app import app
-from valuemap.cli.options import AsJson
+from valuemap.cli.options import AsJson, Force
 from valuemap.cli.show import log, progress_bars, show
 from valuemap.dataset import read_dataset, write_dataset
 from valuemap.errors import SettingError
@@ -27,6 +27,7 @@ def check_command(
         Path | None,
         typer.Option("--fix", metavar="OUT", help="Write the dataset with what can be put right put right."),
     ] = None,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Say what is wrong with a dataset, how sure that is, and what the data can give."""
@@ -37,7 +38,7 @@ def check_command(
             raise SettingError(
                 f"--fix {fix}: this is the dataset itself", hint="give another folder: what is given stays as it is"
             )
-        check_place(fix, marker=dataset_folder.MARKER)
+        check_place(fix, parts=dataset_folder.PARTS, force=force)
     given = read_dataset(dataset, are_boxes_checked=False)
     with progress_bars() as progress:
         outcome = examine(given, progress=progress)
@@ -46,7 +47,7 @@ def check_command(
     else:
         _tell(outcome.to_json())
     if fix is not None:
-        write_dataset(outcome.fixed, fix)
+        write_dataset(outcome.fixed, fix, force=force)
         fixed = sum(finding.fix is not None for finding in outcome.findings)
         log.print(f"Put right {fixed} of {len(outcome.findings)} and wrote {fix}", highlight=False, markup=False)
     if outcome.findings:
