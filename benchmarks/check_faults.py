@@ -130,6 +130,7 @@ def good_kitti_ts(data_dir: Path) -> Dataset:
     names = [row["image"] for row in images]
     corners = np.array([[float(row[key]) for key in ("x1", "y1", "x2", "y2")] for row in boxes])
     sign_position = _enu(np.array([[float(row["lat"]), float(row["lon"])] for row in signs]), anchor)
+    sign_position[:, 2] = 0.0  # Their heights are not known.
     return Dataset(
         name="kitti_ts",
         frame=Frame(anchor=anchor),

@@ -278,7 +278,7 @@ class WrongCamera(Fault):
 
     def find(self, view: View) -> Finding | None:
         """Give the images of each pass and camera each other camera and see whether their rays agree better."""
-        chosen = _best_cameras(view)
+        chosen, chance = _best_cameras(view)
         if not chosen:
             return None
         worst = max(chosen, key=lambda each: each["difference"])
@@ -291,16 +291,16 @@ class WrongCamera(Fault):
             f"table: those of pass {worst['pass']} have camera {worst['camera']}, and with camera {worst['better']} "
             f"their agreement is {worst['with_better']:.0f} instead of {worst['as_given']:.0f}.",
             do="Give each image the camera that took it.",
-            chance=worst["chance"],
+            chance=chance,
             figures={"images": rows, "groups": chosen[:10]},
             fix=lambda dataset: _with_cameras(dataset, cameras),
         )
 
 
-def _best_cameras(view: View) -> list[dict[str, Any]]:
+def _best_cameras(view: View) -> tuple[list[dict[str, Any]], float]:
     cameras = view.dataset.cameras
     if not 1 < len(cameras) <= _MOST_CAMERAS:
-        return []
+        return [], 1.0
     sample = view.stretches
     images = sample.dataset.images
     place_pass = np.zeros(sample.places, dtype=np.int64)
@@ -312,35 +312,37 @@ def _best_cameras(view: View) -> list[dict[str, Any]]:
         other = with_images(sample.dataset, camera_id=np.full(len(images), camera))
         gate_px = view.gate_px * pixels_per_radian_of(view.dataset, row) / pixels_per_radian(view.dataset)
         gains[camera] = measure_agreement(other, sample.place_of_image, gate_px).gain
-    found = []
+    best: list[dict[str, Any]] = []
+    better, worse = [], []
     groups = np.unique(np.stack([place_pass, place_camera], axis=1), axis=0)
     for code, camera in groups.tolist():
         of_group = (place_pass == code) & (place_camera == camera)
         given = gains[camera][of_group]
-        for other in gains:
-            comparison = compare(gains[other][of_group], given)
-            chance = comparison.chance * len(groups) * (len(gains) - 1)
-            if other != camera and chance < LEAST_CHANCE:
-                found.append(
-                    {
-                        "pass": images.pass_id.names[code],
-                        "camera": camera,
-                        "better": other,
-                        "images": int(((images.pass_id.codes == code) & (images.camera_id == camera)).sum()),
-                        "as_given": round(float(given.sum()), 1),
-                        "with_better": round(float(gains[other][of_group].sum()), 1),
-                        "difference": round(comparison.difference, 1),
-                        "chance": chance,
-                    }
-                )
-    best: dict[tuple[str, int], dict[str, Any]] = {}
-    for each in found:
-        key = (each["pass"], each["camera"])
-        if key not in best or each["difference"] > best[key]["difference"]:
-            best[key] = each
-    return list(best.values())
+        comparisons = {other: compare(gain[of_group], given) for other, gain in gains.items() if other != camera}
+        other = min(comparisons, key=lambda each: (comparisons[each].chance, -comparisons[each].difference))
+        if comparisons[other].chance > _SUSPICIOUS:
+            continue
+        better.append(gains[other][of_group])
+        worse.append(given)
+        best.append(
+            {
+                "pass": images.pass_id.names[code],
+                "camera": camera,
+                "better": other,
+                "images": int(((images.pass_id.codes == code) & (images.camera_id == camera)).sum()),
+                "as_given": round(float(given.sum()), 1),
+                "with_better": round(float(better[-1].sum()), 1),
+                "difference": round(comparisons[other].difference, 1),
+            }
+        )
+    if not best:
+        return [], 1.0
+    # One pass may have too few stretches to be sure of; all that are suspicious together have not.
+    chance = compare(np.concatenate(better), np.concatenate(worse)).chance * len(groups) * (len(gains) - 1)
+    return (best, chance) if chance < LEAST_CHANCE else ([], 1.0)
 
 
+_SUSPICIOUS = 0.01
 _MOST_CAMERAS = 6
 
 

@@ -24,6 +24,9 @@ _CAMERA_AXES: dict[str, list[list[float]]] = {
 """Takes a point in the axes named to x right, y down, z forward."""
 
 
+_STEADY_RAD = 1e-3
+
+
 class InvertedPoses(Convention):
     """world_from_cam where cam_from_world is expected."""
 
@@ -85,7 +88,10 @@ class PitchAndRoll(Convention):
     do: ClassVar[str] = "Take the cameras as level (heading only), or find better poses."
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
-        """Yield level cameras."""
+        """Yield level cameras; a pitch that all images share is no noise but a tilt, and looked for as such."""
+        _, pitch, roll = headings(dataset)
+        if max(float(np.std(pitch)), float(np.std(roll))) < _STEADY_RAD:
+            return
         yield "level cameras", level
 
 

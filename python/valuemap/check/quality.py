@@ -17,6 +17,7 @@ from valuemap.tables import Bools, Categories, Floats, Truth
 
 _SAME_SHARE = 0.05
 """Boxes of one class whose centres and sizes differ by less than this share of their size are one box, twice."""
+_SAME_PX = 0.5
 _LEAST_DUPLICATES = 0.05
 _FAR_TIMES = 10.0
 _MOST_FAR = 0.05
@@ -271,10 +272,9 @@ def _repeated_boxes(dataset: Dataset) -> Bools:
         first, second = order[:-lag], order[lag:]
         same = (image[first] == image[second]) & (code[first] == code[second])
         smaller = np.minimum(size[first], size[second])
-        same &= (np.abs(detections.center_px[first] - detections.center_px[second]) <= _SAME_SHARE * smaller).all(
-            axis=1
-        )
-        same &= (np.abs(size[first] - size[second]) <= 2.0 * _SAME_SHARE * smaller).all(axis=1)
+        apart = np.abs(detections.center_px[first] - detections.center_px[second])
+        same &= (apart <= np.maximum(_SAME_SHARE * smaller, _SAME_PX)).all(axis=1)
+        same &= (np.abs(size[first] - size[second]) <= np.maximum(2.0 * _SAME_SHARE * smaller, _SAME_PX)).all(axis=1)
         first, second = first[same], second[same]
         worse_is_second = (detections.score[second] < detections.score[first]) | (
             (detections.score[second] == detections.score[first]) & (second > first)
