@@ -11,6 +11,7 @@ import numpy as np
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.fault import Convention, Fault, Finding, Fix, Stage, View, with_images, with_poses
 from valuemap.check.headings import driving_azimuths, headings, rotations_of, turned
+from valuemap.check.sample import driving_order
 from valuemap.check.sizes import object_heights, plausible_heights
 from valuemap.dataset import Dataset, Frame
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
@@ -32,6 +33,7 @@ _MIRRORED: dict[str, list[list[float]]] = {
     "z the other way": [[1, 0, 0], [0, 1, 0], [0, 0, -1]],
 }
 _LEAST_UPRIGHT = 0.5
+_MOST_TURN_DEG = 2.5
 _SIGMA_LIMIT_RAD = 0.35
 """A pose whose rotation is not known to 20 degrees is none: such a column is in degrees."""
 _SPEEDS_MPS = (0.2, 70.0)
@@ -212,8 +214,6 @@ class Scale(Fault):
 
 
 def _median_speed_mps(view: View) -> float | None:
-    from valuemap.check.sample import driving_order
-
     images = view.dataset.images
     if images.timestamp_s is None or not np.all(np.isfinite(images.timestamp_s)):
         return None
@@ -333,12 +333,41 @@ class _DegreesReadAsRadians:
         pitch = np.where(turn_over, np.pi - pitch, pitch)
         roll = np.where(turn_over, roll + np.pi, roll)
         along, _ = driving_azimuths(dataset)
-        angle = way * (azimuth - self._zero_rad)
-        wanted = np.degrees(np.arctan2(np.sin(way * (along - self._zero_rad)), np.cos(way * (along - self._zero_rad))))
-        turns = np.round((wanted - angle) / (2.0 * np.pi))
-        right = self._zero_rad + way * np.radians(angle + 2.0 * np.pi * turns)
-        rotation = rotations_of(right, np.radians(_wrap(pitch)), np.radians(_wrap(roll)), dataset.frame)
+        wanted_deg = np.degrees(_wrap(way * (along - self._zero_rad)))
+        right = self._zero_rad + way * np.radians(_unwound(dataset, way * (azimuth - self._zero_rad), wanted_deg))
+        rotation = rotations_of(
+            right, np.radians(_near_its_mean(pitch)), np.radians(_near_its_mean(roll)), dataset.frame
+        )
         return with_poses(dataset, rotation, camera_centers(dataset.images))
+
+
+def _unwound(dataset: Dataset, angle_deg: Floats, wanted_deg: Floats) -> Floats:
+    """Return angles (N), known but for multiples of 2 pi (in degrees!), as near those wanted as whole stretches can be.
+
+    Between images that hardly turn the change of the angle is known; so one multiple is looked for for all of them,
+    and errors of single directions of travel cancel out.
+    """
+    order = driving_order(dataset.images)
+    angle, wanted, codes = angle_deg[order], wanted_deg[order], dataset.images.pass_id.codes[order]
+    change = np.diff(angle, prepend=angle[:1])
+    change -= 2.0 * np.pi * np.round(change / (2.0 * np.pi))
+    wanted_change = np.diff(wanted, prepend=wanted[:1])
+    wanted_change -= 360.0 * np.round(wanted_change / 360.0)
+    breaks = (np.diff(codes, prepend=-1) != 0) | (np.abs(wanted_change - change) > _MOST_TURN_DEG)
+    chain = np.cumsum(np.where(breaks, 0.0, change))
+    result = np.empty(len(order))
+    for rows in np.split(np.arange(len(order)), np.flatnonzero(breaks)[1:]):
+        own = chain[rows] - chain[rows[0]] + angle[rows[0]]
+        off = wanted[rows] - own
+        off = off - 360.0 * np.round((off - off[0]) / 360.0)
+        result[order[rows]] = own + 2.0 * np.pi * np.round(float(np.median(off)) / (2.0 * np.pi))
+    return result
+
+
+def _near_its_mean(angle: Floats) -> Floats:
+    """Return angles (N) without whole turns, such that those that vary around a value stay together."""
+    mean = float(np.arctan2(np.sin(angle).mean(), np.cos(angle).mean()))
+    return np.asarray(mean + _wrap(angle - mean))
 
 
 def _wrap(angle: Floats) -> Floats:

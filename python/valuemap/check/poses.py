@@ -25,6 +25,7 @@ _CAMERA_AXES: dict[str, list[list[float]]] = {
 
 
 _STEADY_RAD = 1e-3
+"""Angles that vary by less than this over all images are given, not measured."""
 
 
 class InvertedPoses(Convention):

@@ -1,0 +1,173 @@
+"""Every known fault is put into a good simulated city and has to be named; good data must raise none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from check_faults import FAULTS as INJECTED
+from check_faults import good_city
+from valuemap.cameras import camera_centers, rotation_matrices
+from valuemap.check import examine
+from valuemap.check.agreement import compare, measure_agreement
+from valuemap.check.cameras import PARAMETERS
+from valuemap.check.contest import hold_contest
+from valuemap.check.fault import View
+from valuemap.check.fit import estimate
+from valuemap.check.headings import headings, rotations_of
+from valuemap.check.offsets import find_shift
+from valuemap.check.registry import CONVENTIONS, FAULTS
+from valuemap.cli.commands import app
+from valuemap.dataset import Dataset, read_dataset, write_dataset
+from valuemap.errors import InputError
+
+_CONVENTIONS = {convention.name for convention in CONVENTIONS}
+_SEEN_AGAIN = {"passes_no_drives"}
+"""Images without any order have none afterwards either: what is put right is which of them share a pass."""
+_RECOVERED = {"degrees_for_radians": 0.6}
+"""Degrees read as radians lose whole turns, which the direction of travel gives back on straight roads only."""
+_FAULT = {fault.name: fault for fault in FAULTS}
+
+
+@pytest.fixture(scope="module")
+def good() -> Dataset:
+    return good_city(1)
+
+
+@pytest.fixture(scope="module")
+def view(good: Dataset) -> View:
+    return View(good)
+
+
+def test_every_fault_of_the_registry_is_injected() -> None:
+    known = _CONVENTIONS | set(_FAULT)
+    assert set(INJECTED) <= known
+    assert known - set(INJECTED) == {"headings_useless"}
+    assert len(known) == len(CONVENTIONS) + len(FAULTS)
+
+
+@pytest.mark.parametrize("name", sorted(set(INJECTED) & _CONVENTIONS))
+def test_a_wrong_convention_is_named_and_undone(name: str, good: Dataset, view: View) -> None:
+    spoiled = INJECTED[name].spoil(good)
+    assert spoiled is not None
+    finding, _ = hold_contest(View(spoiled), CONVENTIONS)
+    assert finding is not None
+    assert finding.fault == name
+    assert finding.chance is not None
+    assert finding.chance < 1e-3
+    assert finding.fix is not None
+    if INJECTED[name].has_fix:
+        sample = view.stretches
+        fixed = measure_agreement(sample.of(finding.fix(spoiled)), sample.place_of_image, view.gate_px)
+        assert fixed.gain.sum() > _RECOVERED.get(name, 0.95) * view.agreement.gain.sum()
+
+
+@pytest.mark.parametrize("name", sorted(set(INJECTED) - _CONVENTIONS))
+def test_a_fault_is_named(name: str, good: Dataset) -> None:
+    spoiled = INJECTED[name].spoil(good)
+    assert spoiled is not None
+    finding = _FAULT[name].find(View(spoiled))
+    assert finding is not None
+    assert finding.fault == name
+    assert (finding.fix is not None) == INJECTED[name].has_fix
+    if finding.fix is not None and name not in _SEEN_AGAIN:
+        assert _FAULT[name].find(View(finding.fix(spoiled))) is None
+
+
+def test_good_data_raise_nothing(good: Dataset) -> None:
+    outcome = examine(good)
+    assert outcome.findings == ()
+    assert outcome.notes == ()
+    assert outcome.prospects["detections_that_meet_others"] > 0.8
+    assert outcome.prospects["passes_per_place"]["median"] >= 2
+
+
+def test_two_faults_are_both_named_and_undone(good: Dataset) -> None:
+    twice = INJECTED["repeated_boxes"].spoil(good)
+    assert twice is not None
+    spoiled = INJECTED["inverted_poses"].spoil(twice)
+    assert spoiled is not None
+    outcome = examine(spoiled)
+    assert [finding.fault for finding in outcome.findings] == ["repeated_boxes", "inverted_poses"]
+    assert len(outcome.fixed.detections) == len(good.detections)
+    np.testing.assert_allclose(camera_centers(outcome.fixed.images), camera_centers(good.images), atol=1e-6)
+
+
+def test_rays_agree_far_better_than_by_chance(view: View) -> None:
+    assert compare(view.agreement.gain, view.chance.gain).chance < 1e-6
+    assert compare(view.chance.gain, view.agreement.gain).chance == 1.0
+
+
+def test_agreement_does_not_depend_on_where_the_world_begins(good: Dataset, view: View) -> None:
+    rotation = rotation_matrices(good.images)
+    far = good.images.replace(cam_from_world_m=good.images.cam_from_world_m - rotation @ np.array([4e6, -5e6, 1e3]))
+    sample = view.stretches
+    moved = measure_agreement(sample.of(Dataset(**{**vars(good), "images": far})), sample.place_of_image, view.gate_px)
+    np.testing.assert_allclose(moved.gain, view.agreement.gain, atol=1e-3)
+
+
+def test_common_errors_are_estimated_in_size_and_direction(good: Dataset, view: View) -> None:
+    pitch, focal = PARAMETERS[0], PARAMETERS[3]
+    spoiled = focal.change(pitch.change(good, np.radians(1.5)), 0.08)
+    before = estimate(good, view.many_places, view.gate_px, PARAMETERS)
+    after = estimate(spoiled, View(spoiled).many_places, view.gate_px, PARAMETERS)
+    assert before is not None
+    assert after is not None
+    assert after.of("pitch")[0] - before.of("pitch")[0] == pytest.approx(-np.radians(1.5), rel=0.15)
+    assert after.of("log_focal")[0] - before.of("log_focal")[0] == pytest.approx(-0.08, rel=0.2)
+
+
+def test_angles_make_the_rotation_they_come_from(good: Dataset) -> None:
+    rotation = rotations_of(*headings(good), good.frame)
+    np.testing.assert_allclose(rotation, rotation_matrices(good.images), atol=1e-9)
+
+
+def test_the_shift_between_point_sets_is_found_among_strangers() -> None:
+    random = np.random.default_rng(0)
+    points = random.uniform(0.0, 100.0, (40, 3))
+    others = np.concatenate([points[:20] + [3.0, -2.0, 1.0], random.uniform(0.0, 100.0, (30, 3))])
+    shift = find_shift(points, others, 0.5, within_m=None)
+    assert shift is not None
+    np.testing.assert_allclose(shift.offset_m, [3.0, -2.0, 1.0], atol=1e-6)
+    assert shift.pairs >= 20
+
+
+def test_a_dataset_without_detections_is_refused(good: Dataset) -> None:
+    nothing = Dataset(**{**vars(good), "detections": good.detections.take(np.arange(0)), "truth_detections": None})
+    with pytest.raises(InputError, match="no detections"):
+        examine(nothing)
+
+
+def test_the_command_says_what_is_wrong_and_writes_the_fixed_dataset(good: Dataset, tmp_path: Path) -> None:
+    spoiled = INJECTED["boxes_normalised"].spoil(good)
+    assert spoiled is not None
+    write_dataset(spoiled, tmp_path / "given")
+    run = CliRunner().invoke(app, ["check", str(tmp_path / "given"), "--fix", str(tmp_path / "fixed")])
+    assert run.exit_code == 3
+    assert "from 0 to 1" in run.stdout
+    assert "What the data can give" in run.stdout
+    fixed = read_dataset(tmp_path / "fixed")
+    np.testing.assert_allclose(fixed.detections.center_px, good.detections.center_px, atol=1e-9)
+    again = CliRunner().invoke(app, ["check", str(tmp_path / "fixed"), "--json"])
+    assert again.exit_code == 0
+    assert json.loads(again.stdout)["findings"] == []
+
+
+def test_the_command_reads_boxes_that_others_refuse_and_spares_what_is_given(good: Dataset, tmp_path: Path) -> None:
+    write_dataset(good, tmp_path / "given")
+    corners = INJECTED["boxes_as_corners"].spoil(good)
+    assert corners is not None
+    from valuemap.tables import write_table
+
+    outside = corners.detections.replace(center_px=3.0 * corners.detections.center_px)
+    write_table(outside, tmp_path / "given" / "detections.parquet")
+    with pytest.raises(InputError):
+        read_dataset(tmp_path / "given")
+    assert len(read_dataset(tmp_path / "given", are_boxes_checked=False).detections) == len(good.detections)
+    run = CliRunner().invoke(app, ["check", str(tmp_path / "given"), "--fix", str(tmp_path / "given")])
+    assert run.exit_code != 0
+    assert (tmp_path / "given" / "detections.parquet").is_file()
