@@ -347,3 +347,68 @@ def test_viewpoints_are_those_of_looking_back_at_each(step_m: float, drives: int
         way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(place[begins], axis=0), axis=1))])
         assert found.driven_m[rows] == pytest.approx(way[expected])
     assert len(np.unique(found.viewpoint)) == found.viewpoint.max() + 1
+
+
+@pytest.mark.parametrize("times", [True, False])
+def test_a_camera_for_each_image_hides_no_rig(times: bool) -> None:
+    images = rig("all", times=times)
+    found = find_drives(images.replace(camera_id=np.arange(200)))
+    assert found.record["images_on_rigs"] == 200
+    assert found.order.tolist() == [*range(100)] * 2
+
+
+def test_a_drive_that_mostly_stands_is_measured_by_the_others() -> None:
+    random = np.random.default_rng(4)
+    parts = []
+    for number in range(5):
+        place = street(60, seed=number, y_m=100.0 * number)
+        if number == 0:
+            place = np.concatenate([place[:30], place[30] + random.normal(0.0, 0.02, (400, 2)), place[30:]])
+        time = 10_000.0 * number + np.arange(len(place))
+        parts.append(posed(place, time_s=time, passes=[str(number)] * len(place)))
+    assert find_drives(stack(*parts)).count == 5
+
+
+def test_numbers_count_within_what_is_before_them_in_the_name() -> None:
+    """Frames of clips, of which some were left out; all in one pass."""
+    numbers = np.concatenate([np.arange(0, 30), np.arange(100, 130)])
+    place = np.column_stack([2.0 * numbers, np.zeros(60)])
+    clips = np.concatenate([place, place[::-1] + [0.0, 5000.0]])
+    names = [f"clip{clip}_{number}.jpg" for clip in (1, 2) for number in numbers]
+    found = find_drives(posed(clips, names=names))
+    assert found.record["images_ordered_by"] == {"name": 120}
+    assert found.pass_code.tolist() == [0] * 60 + [1] * 60
+    # The next clip goes on with the next number, elsewhere.
+    names = [f"clip1_{number}.jpg" for number in numbers] + [f"clip2_{4000 + number}.jpg" for number in numbers]
+    assert find_drives(posed(clips, names=names)).count == 2
+
+
+def test_a_ramp_in_turns_is_a_way_though_it_leads_round_and_round() -> None:
+    angle = np.arange(120) * 2.0 * np.pi / 14.0
+    ramp = np.column_stack([4.5 * np.cos(angle), 4.5 * np.sin(angle), 4.0 * angle / np.pi])
+    assert find_drives(posed(ramp, time_s=np.arange(120.0))).record["images_ordered_by"] == {"time": 120}
+
+
+def test_where_no_order_is_known_nothing_is_driven_again() -> None:
+    angle = np.linspace(0.0, 6.0 * np.pi, 600)
+    place = 60.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    found = find_drives(posed(place[np.random.default_rng(0).permutation(600)]))
+    assert found.record["images_ordered_by"] == {"chain": 600}
+    assert "revisits" not in found.record["cut_at"]
+
+
+def test_what_the_fullest_camera_missed_the_others_took_together() -> None:
+    place = street(100)
+    parts = [
+        posed(place[:, :2] + [0.0, 0.5 * number], heading_deg=90.0 * number, time_s=np.arange(100.0), camera=number)
+        for number in range(3)
+    ]
+    # The first misses the last twenty, the others ten each before.
+    parts = [
+        parts[0].take(np.arange(85)),
+        parts[1].take(np.r_[0:20, 40:100]),
+        parts[2].take(np.r_[0:40, 60:100]),
+    ]
+    found = find_drives(stack(*parts))
+    order = [found.order[start : start + count] for start, count in ((0, 85), (85, 80), (165, 80))]
+    assert order[1][-15:].tolist() == order[2][-15:].tolist() == list(range(85, 100))

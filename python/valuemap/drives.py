@@ -42,8 +42,6 @@ _WINDOW = 16
 """Exposures in a row that are looked at together: in random order their way is 5.7 times as long as they are wide."""
 _CLEARLY_LONGER = 2.0
 """An order whose way is longer than the chain of nearest poses by this factor is none."""
-_TRIMMED_SHARE = 0.05
-"""The longest steps of an order say how far apart its parts are, not whether it is one: they are left out."""
 _NEIGHBORS = 8
 """Nearest poses that a pose may be chained to in one round."""
 _GAP_STEPS = 10.0
@@ -671,9 +669,8 @@ def _is_a_way(place_m: Floats, group: Ints) -> Bools:
 
 
 def _way_m(place_m: Floats) -> float:
-    """Return the length of a way along places (N, 3) without its longest steps."""
-    step_m = np.sort(_lengths(np.diff(place_m, axis=0)))
-    return float(step_m[: len(step_m) - int(np.ceil(_TRIMMED_SHARE * len(step_m)))].sum())
+    """Return the length of a way along places (N, 3)."""
+    return float(_steps_m(place_m).sum())
 
 
 def _chain(place_m: Floats) -> Ints:
