@@ -1,6 +1,6 @@
 # `make demo` and `make test` do all their own set-up: they need Python 3.11+, a C compiler and cargo, nothing else.
 # `make test EXTRAS=train` installs PyTorch (5 GB) and tests training too; without it those tests are skipped.
-.PHONY: demo test lint bench model rust-test setup clean
+.PHONY: demo test lint bench model page rust-test setup clean
 
 UV_VERSION := 0.13.8
 PYTHON ?= python3
@@ -35,6 +35,10 @@ model: EXTRAS := train
 model: setup
 	$(RUN) python benchmarks/bundled_model.py $(DETECTOR_DATA)/tl_kr --work target/model \
 		--dtld $(DETECTOR_DATA)/dtld --json benchmarks/results/bundled_model.json
+
+# The page of valuemap view, from viewer/ into the package: needs Node.js, and only after a change of it.
+page:
+	cd viewer && npm ci --no-audit --no-fund && npm run build
 
 setup: $(UV)
 	@$(UV) sync --frozen --quiet $(EXTRAS:%=--extra %)

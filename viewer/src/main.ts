@@ -52,7 +52,7 @@ class Page {
     this.selection = selection;
     this.dark = localStorage.getItem("theme") ? localStorage.getItem("theme") === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
     document.documentElement.dataset.theme = this.dark ? "dark" : "light";
-    document.title = `${head.name} – valuemap`;
+    document.title = `${head.name} - valuemap`;
     this.renderBar();
     this.filters = new Filters(byId("filters"), head, this.labels, settings, {
       onChange: () => this.settingsChanged(),
@@ -428,7 +428,10 @@ class Page {
     if (act) {
       event.preventDefault();
       act();
-    } else if (event.key === "Enter" && this.gallery && (target === document.body || target.id === "deck")) this.gallery.open();
+    } else if (event.key === "Enter" && this.gallery && !target.closest("button, a, input, textarea, summary")) {
+      event.preventDefault(); // Else the same key closes what it opens: the button to close has the focus then.
+      this.gallery.open();
+    }
   }
 
   private next(label: number | null, by: number): void {

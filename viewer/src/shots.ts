@@ -5,7 +5,7 @@ import { css, passColor } from "./colors";
 import { byId, fixed, h, plural, svg, time } from "./dom";
 
 /** Draw what was detected (box) and what is expected (cross) over a part of a picture, in its own pixels. */
-function overlay(shot: Shot, left: number, top: number, width: number, height: number): SVGSVGElement {
+function overlay(shot: Shot, left: number, top: number, width: number, height: number, arm = width / 14): SVGSVGElement {
   const drawing = svg("svg", {
     viewBox: `${left} ${top} ${width} ${height}`,
     preserveAspectRatio: "none",
@@ -24,7 +24,6 @@ function overlay(shot: Shot, left: number, top: number, width: number, height: n
   }
   const [px, py] = shot.projected ?? [null, null];
   if (px !== null && py !== null) {
-    const arm = width / 14;
     const path = `M${px - arm} ${py}H${px + arm}M${px} ${py - arm}V${py + arm}`;
     drawing.append(svg("path", { class: "cross under", d: path }), svg("path", { class: "cross", d: path }));
   }
@@ -155,7 +154,7 @@ function showWhole(shot: Shot): void {
   picture.style.aspectRatio = `${width} / ${height}`;
   picture.style.maxWidth = `calc(86vh * ${width / height})`;
   if (shot.picture) picture.append(h("img", { src: api.picture(shot), alt: `The picture ${shot.name}` }));
-  picture.append(overlay(shot, 0, 0, width, height));
+  picture.append(overlay(shot, 0, 0, width, height, width / 50));
   const close = h("button", { class: "close", "aria-label": "Close", onclick: () => dialog.close() }, "×");
   const dialog = h("dialog", { id: "whole" }, close, picture, h("p", {}, `${shot.name} · ${width} × ${height} px · ${figures(shot)}`));
   dialog.addEventListener("close", () => dialog.remove());

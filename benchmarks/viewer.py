@@ -1,0 +1,188 @@
+"""How fast the page of `valuemap view` is with a map of New York's size.
+
+50,000 labels and 400,000 images in 100 passes are made up without mapping (positions along a grid of streets, twelve
+votes a label), because the page cares about numbers and places only. The figures are the browser's own (Performance
+API), in Debian's Chromium without a graphics card:
+
+    npm ci --prefix viewer && python benchmarks/viewer.py --json benchmarks/results/viewer.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from scipy.spatial.transform import Rotation
+
+from valuemap.dataset import Dataset, Frame, write_dataset
+from valuemap.map_folder import Map, write_map
+from valuemap.tables import Cameras, Categories, Detections, Images, Labels, Votes
+from valuemap.viewer.scene import Scene
+from valuemap.viewer.server import Content, ViewServer
+
+VIEWER = Path(__file__).parent.parent / "viewer"
+SPACING_M, BLOCK_M, BLOCKS, VOTES = 4.0, 100.0, 100, 12
+WIDTH, HEIGHT, FOCAL = 640, 480, 500.0
+
+
+def made_up_city(labels: int, images: int, passes: int, *, seed: int = 0) -> tuple[Dataset, Map]:
+    """Return a dataset and a map whose votes belong to it; images drive along a grid, labels stand beside them."""
+    random = np.random.default_rng(seed)
+    steps = images // passes
+    center, heading = np.empty((passes, steps, 3)), np.empty((passes, steps))
+    per_block = int(BLOCK_M / SPACING_M)
+    for row in range(passes):
+        turns = random.integers(-1, 2, size=-(-steps // per_block))
+        direction = np.repeat(np.cumsum(turns) % 4, per_block)[:steps] * (np.pi / 2.0)
+        step = SPACING_M * np.column_stack([np.cos(direction), np.sin(direction)])
+        start = BLOCK_M * random.integers(0, BLOCKS, 2)
+        path = start + np.cumsum(step, axis=0)
+        center[row, :, :2] = np.abs((path + BLOCK_M * BLOCKS) % (2 * BLOCK_M * BLOCKS) - BLOCK_M * BLOCKS)
+        center[row, :, 2], heading[row] = 1.6, direction
+    center, heading = center.reshape(-1, 3), heading.reshape(-1)
+    count = len(center)
+    right = np.column_stack([np.sin(heading), -np.cos(heading), np.zeros(count)])
+    forward = np.column_stack([np.cos(heading), np.sin(heading), np.zeros(count)])
+    rotation = np.stack([right, np.broadcast_to([0.0, 0.0, -1.0], (count, 3)), forward], axis=1)
+    dataset_images = Images(
+        image_id=np.arange(count),
+        name=pa.array([f"{i // steps:03d}/{i % steps:05d}.jpg" for i in range(count)]),
+        camera_id=np.ones(count, np.int64),
+        cam_from_world_quat=Rotation.from_matrix(rotation).as_quat(scalar_first=True),
+        cam_from_world_m=-np.einsum("nij,nj->ni", rotation, center),
+        pass_id=Categories.from_texts(np.repeat([f"pass-{i:03d}" for i in range(passes)], steps).tolist()),
+        timestamp_s=1.7e9 + np.arange(count) * 0.4,
+    )
+    last = np.sort(random.choice(np.arange(VOTES, count), labels, replace=False))
+    last = np.maximum(last, last // steps * steps + VOTES)
+    position = center[last] + 6.0 * forward[last] + random.choice([-5.0, 5.0], labels)[:, None] * right[last]
+    position[:, 2] = random.uniform(3.0, 6.0, labels)
+    voter = (last[:, None] - np.arange(VOTES)).ravel()
+    label = np.repeat(np.arange(labels), VOTES)
+    in_cam = np.einsum("nij,nj->ni", rotation[voter], position[label] - center[voter])
+    pixel = FOCAL * in_cam[:, :2] / np.maximum(in_cam[:, 2:], 1.0) + [WIDTH / 2, HEIGHT / 2]
+    pixel = np.clip(pixel + random.normal(0.0, 1.0, pixel.shape), 0.0, [WIDTH, HEIGHT])
+    classes = Categories.from_texts([("traffic_light", "stop", "speed_limit")[i % 3] for i in range(labels)])
+    order = np.lexsort((voter, label))
+    detections = Detections(
+        detection_id=np.arange(len(voter)),
+        image_id=voter[order],
+        class_name=classes.take(label[order]),
+        center_px=pixel[order],
+        size_px=np.tile([12.0, 30.0], (len(voter), 1)),
+        score=random.uniform(0.4, 1.0, len(voter)),
+    )
+    residual = np.abs(random.normal(0.0, 1.2, len(voter)))
+    existence = 1.0 - random.beta(0.3, 8.0, labels)
+    sigma = random.gamma(3.0, 0.03, (labels, 3))
+    zeros = np.zeros(labels)
+    found = Labels(
+        label_id=np.arange(1, labels + 1),
+        class_name=classes,
+        position_in_world_m=position,
+        covariance_m2=np.column_stack(
+            [sigma[:, 0] ** 2, 0.4 * sigma[:, 0] * sigma[:, 1], zeros, sigma[:, 1] ** 2, zeros, sigma[:, 2] ** 2]
+        ),
+        votes=np.full(labels, VOTES),
+        passes=np.ones(labels, np.int64),
+        object_width_m=np.full(labels, 0.3),
+        object_height_m=np.full(labels, 0.9),
+        reprojection_rms_px=np.full(labels, 1.2),
+        max_parallax_rad=np.full(labels, 0.5),
+        first_seen_s=np.full(labels, 1.7e9),
+        last_seen_s=np.full(labels, 1.7e9 + 5.0),
+        facing_azimuth_rad=np.zeros(labels),
+        facing_concentration=np.ones(labels),
+        expected=np.full(labels, VOTES),
+        existence=existence,
+    )
+    votes = Votes(
+        label_id=label[order] + 1,
+        detection_id=detections.detection_id,
+        image_id=detections.image_id,
+        residual_px=residual,
+        residual_sigmas=residual / 1.2,
+    )
+    cameras = Cameras(
+        camera_id=np.array([1]),
+        model=Categories.from_texts(["PINHOLE"]),
+        width_px=np.array([WIDTH]),
+        height_px=np.array([HEIGHT]),
+        params=[np.array([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2])],
+    )
+    dataset = Dataset("made-up city", Frame(), cameras, dataset_images, detections)
+    return dataset, Map(Frame(), found, votes, {"dataset": "made-up city", "settings": {"max_range_m": 60.0}})
+
+
+def measure(folder: Path, labels: int, images: int, passes: int, screenshot: Path, clicks: int) -> dict[str, Any]:
+    """Make the city up, serve it, and let a browser say how fast it is."""
+    dataset, result = made_up_city(labels, images, passes)
+    write_dataset(dataset, folder / "dataset")
+    write_map(result, folder / "map")
+    begun = time.perf_counter()
+    content = Content(lambda: Scene(folder / "map"), None)
+    start_seconds = time.perf_counter() - begun
+    server = ViewServer(content)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    chosen = np.linspace(labels // 20, labels - labels // 20, clicks).astype(int)
+    line = ["node", "e2e/measure.mjs", server.address, str(screenshot.absolute()), *map(str, chosen)]
+    done = subprocess.run(line, cwd=VIEWER, capture_output=True, text=True, check=False, env=os.environ.copy())
+    server.shutdown()
+    if done.returncode != 0:
+        raise SystemExit(done.stderr)
+    seen: dict[str, Any] = json.loads(done.stdout)
+    return {
+        "labels": labels,
+        "images": len(dataset.images),
+        "passes": passes,
+        "votes": len(result.votes),
+        "server_start_s": round(start_seconds, 2),
+        "interactive_ms": round(seen["interactive_ms"]),
+        "labels_drawn": seen["drawn"],
+        "pan": _rounded(seen["pan"]),
+        "zoom": _rounded(seen["zoom"]),
+        "click_median_ms": round(statistics.median(seen["clicks_ms"])),
+        "click_worst_ms": round(max(seen["clicks_ms"])),
+        "answer_median_ms": round(statistics.median(seen["answers_ms"])),
+        "complaints": seen["complaints"],
+    }
+
+
+def _rounded(figures: dict[str, Any]) -> dict[str, int | None]:
+    return {name: None if value is None else round(value) for name, value in figures.items()}
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--labels", type=int, default=50_000)
+    parser.add_argument("--images", type=int, default=400_000)
+    parser.add_argument("--passes", type=int, default=100)
+    parser.add_argument("--clicks", type=int, default=10)
+    parser.add_argument("--screenshot", type=Path, default=Path("viewer-large.png"))
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        figures = measure(Path(folder), given.labels, given.images, given.passes, given.screenshot, given.clicks)
+    figures["machine"] = (
+        f"{platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.0f}, no graphics card"
+    )
+    print(json.dumps(figures, indent=2))
+    if given.json is not None:
+        given.json.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

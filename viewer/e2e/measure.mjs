@@ -1,0 +1,81 @@
+// How fast the page is: node measure.mjs URL SCREENSHOT LABEL..., prints the browser's own figures as JSON.
+import { open, screenOf } from "./browser.mjs";
+
+const [url, screenshot, ...labels] = process.argv.slice(2);
+const { browser, page, noted } = await open(url);
+await page.evaluate(() => {
+  window.longTasks = [];
+  new PerformanceObserver((list) => {
+    for (const entry of list.getEntries()) window.longTasks.push([entry.startTime, entry.duration]);
+  }).observe({ type: "longtask", buffered: true });
+});
+await page.waitForTimeout(3000);
+const measures = (name) =>
+  page.evaluate((wanted) => performance.getEntriesByName(wanted).map((entry) => entry.duration), `valuemap:${name}`);
+const now = () => page.evaluate(() => performance.now());
+const tasksSince = (start) =>
+  page.evaluate((from) => window.longTasks.filter(([at]) => at >= from).map(([, duration]) => duration), start);
+
+const seen = { interactive_ms: (await measures("interactive"))[0], drawn: Number(await page.evaluate(() => document.body.dataset.drawnLabels)) };
+seen.long_tasks_while_loading_ms = await tasksSince(0);
+
+async function frames(action) {
+  await page.evaluate(() => {
+    window.counted = [];
+    const step = (time) => {
+      window.counted.push(time);
+      window.counting = requestAnimationFrame(step);
+    };
+    window.counting = requestAnimationFrame(step);
+  });
+  const start = await now();
+  await action();
+  const between = await page.evaluate(() => {
+    cancelAnimationFrame(window.counting);
+    return window.counted.slice(1).map((time, i) => time - window.counted[i]);
+  });
+  const tasks = await tasksSince(start);
+  return { longest_task_ms: Math.max(0, ...tasks), long_tasks: tasks.length, frames: between.length, median_frame_ms: median(between) };
+}
+const median = (values) => [...values].sort((a, b) => a - b)[Math.floor(values.length / 2)] ?? null;
+
+const [x, y] = [620, 480];
+seen.pan = await frames(async () => {
+  await page.mouse.move(x, y);
+  await page.mouse.down();
+  for (let i = 1; i <= 40; i++) await page.mouse.move(x + 8 * Math.sin(i / 3) * 10, y + 4 * i);
+  await page.mouse.up();
+});
+seen.zoom = await frames(async () => {
+  await page.mouse.move(x, y);
+  for (let i = 0; i < 30; i++) await page.mouse.wheel(0, -120);
+  for (let i = 0; i < 30; i++) await page.mouse.wheel(0, 120);
+  await page.waitForTimeout(300);
+});
+await page.screenshot({ path: screenshot });
+
+const served = [];
+page.on("response", async (response) => {
+  if (response.url().includes("/api/label?")) served.push(response.request().timing().responseEnd);
+});
+for (const label of labels.map(Number)) {
+  await page.evaluate((id) => {
+    const view = window.valuemap.getView();
+    const box = document.getElementById("deck").getBoundingClientRect();
+    const at = window.valuemap.screenOf(id);
+    const scale = 2 ** -view.zoom;
+    const [dx, dy] = [at[0] - box.left - box.width / 2, at[1] - box.top - box.height / 2];
+    window.valuemap.setView({ east: view.east + dx * scale + 120 / 16, north: view.north - dy * scale, zoom: 4 });
+  }, label);
+  await page.waitForTimeout(700);
+  const before = (await measures("click")).length;
+  const at = await screenOf(page, label);
+  await page.mouse.click(...at);
+  await page.waitForFunction((count) => performance.getEntriesByName("valuemap:click").length > count, before);
+}
+seen.clicks_ms = await measures("click");
+seen.answers_ms = served;
+seen.titles = await page.locator("#title").innerText();
+seen.complaints = noted.complaints;
+await browser.close();
+console.log(JSON.stringify(seen));

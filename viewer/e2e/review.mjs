@@ -1,0 +1,83 @@
+// What somebody does with a map: node review.mjs URL STEP LABEL SCREENSHOT, prints what was seen as JSON.
+import { open, screenOf } from "./browser.mjs";
+
+const [url, step, label, screenshot] = process.argv.slice(2);
+const id = Number(label);
+const { browser, page, noted } = await open(url);
+const seen = { noted };
+
+const text = (selector) => page.locator(selector).first().innerText();
+const stateInList = () => page.locator(`#list [data-label="${id}"] .dot`).getAttribute("aria-label");
+const crops = () =>
+  page.$$eval("#details .crop img", (images) => images.filter((image) => image.complete && image.naturalWidth > 0).length);
+
+await page.waitForFunction(() => Number(document.body.dataset.drawnLabels) > 0);
+seen.drawn = Number(await page.evaluate(() => document.body.dataset.drawnLabels));
+seen.title = await page.title();
+seen.texts = await page.locator("#filters .check .text").allInnerTexts();
+
+if (step === "reject") {
+  seen.at = await screenOf(page, id);
+  await page.waitForTimeout(1000);
+  await page.screenshot({ path: screenshot });
+  await page.mouse.click(...seen.at);
+  await page.waitForFunction((title) => document.querySelector("#title")?.textContent === title, `Label ${id}`);
+  await page.waitForFunction(() => [...document.querySelectorAll("#details .large img")].some((image) => image.naturalWidth > 0));
+  seen.thumbs = await page.locator("#details .thumb").count();
+  seen.crops = await crops();
+  seen.sub = await text("#details .sub");
+  seen.first = await text("#details .caption");
+  await page.keyboard.press("ArrowRight");
+  seen.second = await text("#details .caption");
+  await page.keyboard.press("Enter");
+  await page.waitForFunction(() => document.querySelector("#whole img")?.naturalWidth === 640);
+  await page.keyboard.press("Escape");
+  await page.waitForSelector("#whole", { state: "detached" });
+  await page.keyboard.press("r");
+  await page.waitForSelector("#details .state.rejected");
+  await page.waitForFunction((wanted) => document.querySelector(`#list [data-label="${wanted}"] .dot`)?.getAttribute("aria-label") === "rejected", id);
+  seen.pressed = await page.locator("#reject").getAttribute("aria-pressed");
+
+  const saved = page.waitForResponse((response) => response.request().method() === "POST");
+  await page.fill("#note", '"><img src=x onerror="document.title=1">');
+  await page.locator("#note").blur();
+  await saved;
+  await page.keyboard.press("Escape");
+  await page.waitForSelector("#details", { state: "hidden" });
+
+  // An empty place: somewhere on the map with no label near it.
+  await page.mouse.click(seen.at[0] + 40, seen.at[1] + 40);
+  await page.waitForSelector("#answer");
+  seen.answer = await text("#answer");
+  seen.heading = await text("#title");
+
+  // The keyboard alone: the next label in the list, accepted.
+  await page.keyboard.press("Escape");
+  await page.keyboard.press("n");
+  await page.waitForFunction(() => document.querySelector("#title")?.textContent.startsWith("Label "));
+  seen.next = await text("#title");
+  await page.keyboard.press("a");
+  await page.waitForSelector("#details .state.accepted");
+  await page.waitForTimeout(400);
+  seen.address = page.url();
+
+  // The address holds the view: loaded again, it shows the same.
+  await page.reload();
+  await page.waitForFunction((title) => document.querySelector("#title")?.textContent === title, seen.next);
+  seen.sameView = await page.evaluate(() => location.hash);
+} else {
+  seen.state = await stateInList();
+  await page.fill("#search", String(id));
+  await page.keyboard.press("Enter");
+  await page.waitForFunction((title) => document.querySelector("#title")?.textContent === title, `Label ${id}`);
+  seen.review = await text("#details .state");
+  seen.alert = await page.locator("#details .alert").allInnerTexts();
+  seen.note = await page.inputValue("#note");
+  await page.uncheck("#filters label.check:has-text('Rejected') input");
+  await page.waitForSelector(`#list [data-label="${id}"]`, { state: "detached" });
+  seen.hidden = true;
+}
+seen.pwned = await page.evaluate(() => document.title);
+seen.scripts = await page.evaluate(() => document.querySelectorAll("script:not([src]), img[onerror]").length);
+await browser.close();
+console.log(JSON.stringify(seen));
