@@ -8,11 +8,24 @@ import { classColor, type Color, existenceColor, OUTCOMES, passColor, STATES } f
 import type { Columns } from "./columns";
 import { EllipseLayer } from "./ellipses";
 import { MAX_ZOOM, MIN_ZOOM, type Settings, type View } from "./state";
-import { flat, Tracks } from "./tracks";
+import { type Box, flat, Tracks, within } from "./tracks";
 
 const ELLIPSE_95 = Math.sqrt(5.991464547107979); // Half axis of 95 % of a normal distribution in the plane, in sigmas.
 const PICK_PX = 12;
 const RAYS_FROM_ZOOM = -2;
+/** From this many pixels of a metre on ellipses are drawn, and only what is around the view. */
+const NEAR_SCALE = 0.8;
+const EVERYWHERE: Box = { left: -Infinity, bottom: -Infinity, right: Infinity, top: Infinity };
+
+/** What the GPU reads of labels, in the order in which they are drawn. */
+interface Buffers {
+  length: number;
+  position: Float32Array;
+  fill: Uint8Array;
+  line: Uint8Array;
+  radius: Float32Array;
+  shape: Float32Array;
+}
 
 export interface Labels {
   count: number;
@@ -70,7 +83,10 @@ export class MapView {
   private rays: { shots: Shot[]; misses: Shot[]; to: [number, number] } | null = null;
   private lit: Shot | null = null;
   private labelLayers: Layer[] = [];
-  private trackLayers: { key: string; layers: Layer[] } = { key: "", layers: [] };
+  private buffers: Buffers | null = null;
+  /** What the layers of labels hold: all of them, or those in a box around the view. */
+  private held: Box | null = null;
+  private trackLayers: { key: string; box: Box; layers: Layer[] } = { key: "", box: EVERYWHERE, layers: [] };
   private pressed: { x: number; y: number } | null = null;
 
   constructor(
@@ -209,6 +225,11 @@ export class MapView {
 
   setTruth(truth: Truth): void {
     this.truth = truth;
+    const rows = truth.outcome.length;
+    this.truthColors = new Uint8Array(4 * rows);
+    for (let i = 0; i < rows; i++) {
+      this.truthColors.set([...(OUTCOMES[this.outcomes[truth.outcome[i]]] ?? OUTCOMES.found), 255], 4 * i);
+    }
     this.rebuild();
   }
 
@@ -311,35 +332,34 @@ export class MapView {
       this.index!.add(east, north);
     });
     this.index?.finish();
-    const shared = { getPosition: { value: position, size: 3 } };
-    this.labelLayers = [
-      new EllipseLayer({
-        id: "ellipses",
-        visible: this.settings.layers.has("ellipses"),
-        data: {
-          length,
-          attributes: { ...shared, getRadius: { value: radius, size: 1 }, getFillColor: { value: fill, size: 4, normalized: true }, getShape: { value: shape, size: 3 } },
-        } as never,
-        radiusUnits: "common",
-        stroked: false,
-        antialiasing: false,
-      }),
-      new ScatterplotLayer({
-        id: "labels",
-        data: { length, attributes: { ...shared, getFillColor: { value: fill, size: 4, normalized: true }, getLineColor: { value: line, size: 4, normalized: true } } } as never,
-        radiusUnits: "pixels",
-        getRadius: 5,
-        lineWidthUnits: "pixels",
-        getLineWidth: 1.25,
-        stroked: true,
-      }),
-    ];
+    this.buffers = { length, position, fill, line, radius, shape };
+    this.held = null;
     this.trackLayers.key = "";
     this.draw();
   }
 
+  /** The ground that the map shows, widened by a part of its own size on every side. */
+  private ground(margin: number): Box {
+    const [left, top] = this.toGround(0, 0);
+    const [right, bottom] = this.toGround(this.parent.clientWidth, this.parent.clientHeight);
+    const [x, y] = [margin * (right - left), margin * (top - bottom)];
+    return { left: left - x, right: right + x, bottom: bottom - y, top: top + y };
+  }
+
+  /** Hand the GPU what is around the view, anew only when the view leaves that. */
+  private holdLabels(): void {
+    const near = 2 ** this.view.zoom > NEAR_SCALE;
+    const now = near ? this.ground(0) : EVERYWHERE;
+    if (!this.buffers || (this.held && contains(this.held, now) && (near || this.held === EVERYWHERE))) return;
+    this.held = near ? this.ground(1) : EVERYWHERE;
+    const { left, bottom, right, top } = this.held;
+    const rows = near && this.index ? this.index.range(left, bottom, right, top).sort((a, b) => a - b) : null;
+    this.labelLayers = labelLayers(rows ? taken(this.buffers, rows) : this.buffers);
+  }
+
   private draw(): void {
     const scale = 2 ** this.view.zoom;
+    this.holdLabels();
     // Dots shrink where labels would cover each other; their size changes no buffer.
     // From near they shrink again, so that ellipses show.
     const small = scale < 0.15 ? 2.6 : scale < 1 ? 3.6 : scale < 24 ? 5 : 3.5;
@@ -347,7 +367,7 @@ export class MapView {
       ...this.trackLayersNow(),
       this.truthLayer(),
       this.rejectedLayer(),
-      this.labelLayers[0]?.clone({ visible: this.settings.layers.has("ellipses") && scale > 0.8 }) ?? null,
+      this.labelLayers[0]?.clone({ visible: this.settings.layers.has("ellipses") && scale > NEAR_SCALE }) ?? null,
       ...this.rayLayers(),
       this.labelLayers[1]?.clone({ getRadius: small, getLineWidth: small < 3 ? 0.5 : 1.25 } as never) ?? null,
       this.markLayer(),
@@ -356,13 +376,15 @@ export class MapView {
   }
 
   private trackLayersNow(): Layer[] {
-    const level = this.tracks.at(this.metresPerPixel());
+    const whole = this.tracks.at(this.metresPerPixel());
     const { layers, hiddenPasses } = this.settings;
-    if (!level) return [];
+    if (!whole) return [];
     const showTracks = layers.has("tracks");
     const showCameras = layers.has("cameras") && this.view.zoom > 1.5;
-    const key = `${level.spacing} ${this.dark} ${[...hiddenPasses].join()}`;
-    if (this.trackLayers.key !== key) {
+    const key = `${whole.spacing} ${this.dark} ${[...hiddenPasses].join()}`;
+    if (this.trackLayers.key !== key || !contains(this.trackLayers.box, this.ground(0))) {
+      const box = this.ground(1);
+      const level = within(whole, box);
       const rows = level.pass.length;
       const lines = new Uint8Array(4 * rows);
       const dots = new Uint8Array(4 * rows);
@@ -380,6 +402,7 @@ export class MapView {
       }
       this.trackLayers = {
         key,
+        box: level === whole ? EVERYWHERE : box,
         layers: [
           new LineLayer({
             id: `tracks-${level.spacing}`,
@@ -411,14 +434,10 @@ export class MapView {
   private truthLayer(): Layer | null {
     if (!this.truth || !this.truth.position.length) return null;
     const rows = this.truth.outcome.length;
-    const line = new Uint8Array(4 * rows);
-    for (let i = 0; i < rows; i++) {
-      line.set([...(OUTCOMES[this.outcomes[this.truth.outcome[i]]] ?? OUTCOMES.found), 255], 4 * i);
-    }
     return new ScatterplotLayer({
       id: "truth",
       visible: this.settings.layers.has("truth"),
-      data: { length: rows, attributes: { getPosition: { value: this.truth.position, size: 3 }, getLineColor: { value: this.truthLine(line), size: 4, normalized: true } } } as never,
+      data: { length: rows, attributes: { getPosition: { value: this.truth.position, size: 3 }, getLineColor: { value: this.truthColors, size: 4, normalized: true } } } as never,
       radiusUnits: "pixels",
       getRadius: this.view.zoom < 0 ? 5 : 9,
       filled: false,
@@ -428,12 +447,8 @@ export class MapView {
     });
   }
 
-  private truthColors: Uint8Array | null = null;
-
-  private truthLine(line: Uint8Array): Uint8Array {
-    // The same array again, so that moving the map uploads nothing.
-    return (this.truthColors ??= line);
-  }
+  /** Made once: the same array again uploads nothing when the map moves. */
+  private truthColors = new Uint8Array();
 
   private rejectedLayer(): Layer | null {
     if (!this.rejected) return null;
@@ -554,6 +569,54 @@ export class MapView {
     this.parent.addEventListener("pointerleave", () => this.events.onHover(null, 0, 0, NaN, NaN));
     new ResizeObserver(() => this.draw()).observe(this.parent);
   }
+}
+
+function contains(outer: Box, inner: Box): boolean {
+  return outer.left <= inner.left && outer.right >= inner.right && outer.bottom <= inner.bottom && outer.top >= inner.top;
+}
+
+function taken(all: Buffers, rows: number[]): Buffers {
+  const length = rows.length;
+  const part: Buffers = {
+    length,
+    position: new Float32Array(3 * length),
+    fill: new Uint8Array(4 * length),
+    line: new Uint8Array(4 * length),
+    radius: new Float32Array(length),
+    shape: new Float32Array(3 * length),
+  };
+  rows.forEach((row, i) => {
+    part.position.set(all.position.subarray(3 * row, 3 * row + 3), 3 * i);
+    part.fill.set(all.fill.subarray(4 * row, 4 * row + 4), 4 * i);
+    part.line.set(all.line.subarray(4 * row, 4 * row + 4), 4 * i);
+    part.radius[i] = all.radius[row];
+    part.shape.set(all.shape.subarray(3 * row, 3 * row + 3), 3 * i);
+  });
+  return part;
+}
+
+function labelLayers({ length, position, fill, line, radius, shape }: Buffers): Layer[] {
+  const getPosition = { value: position, size: 3 };
+  const getFillColor = { value: fill, size: 4, normalized: true };
+  const getLineColor = { value: line, size: 4, normalized: true };
+  return [
+    new EllipseLayer({
+      id: "ellipses",
+      data: { length, attributes: { getPosition, getFillColor, getRadius: { value: radius, size: 1 }, getShape: { value: shape, size: 3 } } } as never,
+      radiusUnits: "common",
+      stroked: false,
+      antialiasing: false,
+    }),
+    new ScatterplotLayer({
+      id: "labels",
+      data: { length, attributes: { getPosition, getFillColor, getLineColor } } as never,
+      radiusUnits: "pixels",
+      getRadius: 5,
+      lineWidthUnits: "pixels",
+      getLineWidth: 1.25,
+      stroked: true,
+    }),
+  ];
 }
 
 function bounds(arrays: Float32Array[]) {
