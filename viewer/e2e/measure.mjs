@@ -18,6 +18,11 @@ const tasksSince = (start) =>
 
 const seen = { interactive_ms: (await measures("interactive"))[0], drawn: Number(await page.evaluate(() => document.body.dataset.drawnLabels)) };
 seen.long_tasks_while_loading_ms = await tasksSince(0);
+seen.loading = await page.evaluate(() => [
+  ...performance.getEntriesByType("mark").map((entry) => [entry.name, Math.round(entry.startTime)]),
+  ...performance.getEntriesByType("resource").map((entry) => [entry.name.replace(/.*:\d+/, ""), Math.round(entry.startTime), Math.round(entry.duration)]),
+]);
+if (process.env.VERBOSE) console.error(JSON.stringify(seen, null, 1));
 
 async function frames(action) {
   await page.evaluate(() => {

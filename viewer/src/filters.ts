@@ -34,7 +34,7 @@ export class Filters {
   private readonly listTitle = h("h2", {}, "Labels");
   private readonly stateCounts = new Map<State, HTMLElement>();
   private readonly lost = h("div", { id: "lost" });
-  private order: number[] = [];
+  private order = new Uint32Array();
 
   constructor(
     private readonly panel: HTMLElement,
@@ -155,9 +155,12 @@ export class Filters {
     const { labels } = this;
     const doubt = (row: number) => (Number.isFinite(labels.existence[row]) ? labels.existence[row] : labels.votes[row]);
     const urgent = (row: number) => (states[row] === "check again" ? 0 : states[row] === "open" ? 1 : 2);
-    this.order = Array.from(shown).sort((a, b) => urgent(a) - urgent(b) || doubt(a) - doubt(b) || a - b);
+    // One number for each label, so that sorting compares nothing but numbers.
+    const key = new Float64Array(labels.count);
+    for (const row of shown) key[row] = 1e9 * urgent(row) + doubt(row);
+    this.order = shown.slice().sort((a, b) => key[a] - key[b] || a - b);
     this.listTitle.replaceChildren("Labels ", h("small", {}, `${count(shown.length)} of ${count(labels.count)}, doubtful first`));
-    const listed = this.order.slice(0, LISTED);
+    const listed = Array.from(this.order.subarray(0, LISTED));
     this.list.replaceChildren(
       ...listed.map((row) => {
         const id = labels.id[row];
@@ -176,10 +179,9 @@ export class Filters {
       }),
       ...(this.order.length > LISTED ? [h("li", { class: "muted" }, `and ${count(this.order.length - LISTED)} more: filter, or search by id`)] : []),
     );
-    for (const state of ALL_STATES) {
-      const number = this.stateCounts.get(state);
-      if (number) number.textContent = count(states.reduce((sum, each) => sum + (each === state ? 1 : 0), 0));
-    }
+    const perState = new Map<State, number>();
+    for (const state of states) perState.set(state, (perState.get(state) ?? 0) + 1);
+    for (const [state, number] of this.stateCounts) number.textContent = count(perState.get(state) ?? 0);
     this.lost.replaceChildren(
       ...(lost.length
         ? [

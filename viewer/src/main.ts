@@ -500,7 +500,9 @@ declare global {
 async function start(): Promise<void> {
   const begun = api.labels();
   const [head, labels, cameras, reviews] = await Promise.all([api.head(), begun, api.cameras(), api.reviews()]);
+  performance.mark("valuemap:loaded");
   window.valuemap = new Page(head, labels, cameras, reviews);
+  performance.mark("valuemap:built");
 }
 
 start().catch((error: Error) => {

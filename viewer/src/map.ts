@@ -306,8 +306,7 @@ export class MapView {
     const rows: number[] = [];
     for (let row = 0; row < labels.count; row++) if (this.isShown(row)) rows.push(row);
     // Doubtful ones are drawn last, so that they are not hidden.
-    if (labels.existence.length) rows.sort((a, b) => (labels.existence[b] || 0) - (labels.existence[a] || 0) || a - b);
-    this.shown = Uint32Array.from(rows);
+    this.shown = Uint32Array.from(rows).sort((a, b) => (labels.existence[b] || 0) - (labels.existence[a] || 0) || a - b);
     const length = rows.length;
     const position = new Float32Array(3 * length);
     const fill = new Uint8Array(4 * length);
@@ -315,7 +314,7 @@ export class MapView {
     const radius = new Float32Array(length);
     const shape = new Float32Array(3 * length);
     this.index = length ? new KDBush(length) : null;
-    rows.forEach((row, i) => {
+    this.shown.forEach((row, i) => {
       const east = labels.position[3 * row];
       const north = labels.position[3 * row + 1];
       position[3 * i] = east;

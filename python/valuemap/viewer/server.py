@@ -97,6 +97,7 @@ class Content:
         self.scene = read_scene()
         self.opinions = self._read_opinions()
         self._version = self._stamp()
+        _ = self.scene.labels_body, self.scene.cameras_body  # What a page waits for when it opens.
         threading.Thread(target=self.scene.warm_up, daemon=True).start()
 
     def _read_opinions(self) -> Opinions:
