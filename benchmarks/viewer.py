@@ -150,11 +150,13 @@ def measure(folder: Path, labels: int, images: int, passes: int, screenshot: Pat
         "votes": len(result.votes),
         "server_start_s": round(start_seconds, 2),
         "interactive_ms": round(seen["interactive_ms"]),
+        "interactive_cpu_ms": round(seen["loading_cpu_ms"]),
         "labels_drawn": seen["drawn"],
         "pan": _rounded(seen["pan"]),
         "zoom": _rounded(seen["zoom"]),
         "click_median_ms": round(statistics.median(seen["clicks_ms"])),
         "click_worst_ms": round(max(seen["clicks_ms"])),
+        "click_median_cpu_ms": round(statistics.median(seen["clicks_cpu_ms"])),
         "answer_median_ms": round(statistics.median(seen["answers_ms"])),
         "complaints": seen["complaints"],
     }

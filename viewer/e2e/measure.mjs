@@ -3,6 +3,13 @@ import { open, screenOf } from "./browser.mjs";
 
 const [url, screenshot, ...labels] = process.argv.slice(2);
 const { browser, page, noted } = await open(url);
+// The processor time of the page's main thread: what a loaded machine does not change.
+const tools = await page.context().newCDPSession(page);
+await tools.send("Performance.enable", { timeDomain: "threadTicks" });
+const cpu = async () => {
+  const { metrics } = await tools.send("Performance.getMetrics");
+  return 1000 * metrics.find((metric) => metric.name === "ThreadTime").value;
+};
 await page.evaluate(() => {
   window.longTasks = [];
   new PerformanceObserver((list) => {
@@ -17,12 +24,8 @@ const tasksSince = (start) =>
   page.evaluate((from) => window.longTasks.filter(([at]) => at >= from).map(([, duration]) => duration), start);
 
 const seen = { interactive_ms: (await measures("interactive"))[0], drawn: Number(await page.evaluate(() => document.body.dataset.drawnLabels)) };
-seen.long_tasks_while_loading_ms = await tasksSince(0);
-seen.loading = await page.evaluate(() => [
-  ...performance.getEntriesByType("mark").map((entry) => [entry.name, Math.round(entry.startTime)]),
-  ...performance.getEntriesByType("resource").map((entry) => [entry.name.replace(/.*:\d+/, ""), Math.round(entry.startTime), Math.round(entry.duration)]),
-]);
-if (process.env.VERBOSE) console.error(JSON.stringify(seen, null, 1));
+seen.loading_cpu_ms = await cpu();
+
 
 async function frames(action) {
   await page.evaluate(() => {
@@ -34,13 +37,21 @@ async function frames(action) {
     window.counting = requestAnimationFrame(step);
   });
   const start = await now();
+  const before = await cpu();
   await action();
+  const used = (await cpu()) - before;
   const between = await page.evaluate(() => {
     cancelAnimationFrame(window.counting);
     return window.counted.slice(1).map((time, i) => time - window.counted[i]);
   });
   const tasks = await tasksSince(start);
-  return { longest_task_ms: Math.max(0, ...tasks), long_tasks: tasks.length, frames: between.length, median_frame_ms: median(between) };
+  return {
+    longest_task_ms: Math.max(0, ...tasks),
+    long_tasks: tasks.length,
+    frames: between.length,
+    median_frame_ms: median(between),
+    cpu_per_frame_ms: used / Math.max(1, between.length),
+  };
 }
 const median = (values) => [...values].sort((a, b) => a - b)[Math.floor(values.length / 2)] ?? null;
 
@@ -48,18 +59,19 @@ const [x, y] = [620, 480];
 seen.pan = await frames(async () => {
   await page.mouse.move(x, y);
   await page.mouse.down();
-  for (let i = 1; i <= 40; i++) await page.mouse.move(x + 8 * Math.sin(i / 3) * 10, y + 4 * i);
+  for (let i = 1; i <= 20; i++) await page.mouse.move(x + 80 * Math.sin(i / 3), y + 8 * i);
   await page.mouse.up();
 });
 seen.zoom = await frames(async () => {
   await page.mouse.move(x, y);
-  for (let i = 0; i < 30; i++) await page.mouse.wheel(0, -120);
-  for (let i = 0; i < 30; i++) await page.mouse.wheel(0, 120);
+  for (let i = 0; i < 16; i++) await page.mouse.wheel(0, -240);
+  for (let i = 0; i < 16; i++) await page.mouse.wheel(0, 240);
   await page.waitForTimeout(300);
 });
 await page.screenshot({ path: screenshot });
 
 const served = [];
+seen.clicks_cpu_ms = [];
 page.on("response", async (response) => {
   if (response.url().includes("/api/label?")) served.push(response.request().timing().responseEnd);
 });
@@ -75,8 +87,10 @@ for (const label of labels.map(Number)) {
   await page.waitForTimeout(700);
   const before = (await measures("click")).length;
   const at = await screenOf(page, label);
+  const used = await cpu();
   await page.mouse.click(...at);
   await page.waitForFunction((count) => performance.getEntriesByName("valuemap:click").length > count, before);
+  seen.clicks_cpu_ms.push((await cpu()) - used);
 }
 seen.clicks_ms = await measures("click");
 seen.answers_ms = served;
