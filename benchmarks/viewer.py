@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from valuemap.dataset import Dataset, Frame, write_dataset
 from valuemap.map_folder import Map, write_map
-from valuemap.tables import Cameras, Categories, Detections, Images, Labels, Votes
+from valuemap.tables import Cameras, Categories, Detections, Floats, Images, Labels, Votes
 from valuemap.viewer.scene import Scene
 from valuemap.viewer.server import Content, ViewServer
 
@@ -50,8 +50,15 @@ def made_up_city(labels: int, images: int, passes: int, *, seed: int = 0) -> tup
         path = start + np.cumsum(step, axis=0)
         center[row, :, :2] = np.abs((path + BLOCK_M * BLOCKS) % (2 * BLOCK_M * BLOCKS) - BLOCK_M * BLOCKS)
         center[row, :, 2], heading[row] = 1.6, direction
-    center, heading = center.reshape(-1, 3), heading.reshape(-1)
+    return _city_around(center.reshape(-1, 3), heading.reshape(-1), labels, passes, random)
+
+
+def _city_around(
+    center: Floats, heading: Floats, labels: int, passes: int, random: np.random.Generator
+) -> tuple[Dataset, Map]:
+    """Return images at these places (N, 3) with these headings (N), pass after pass, and labels beside them."""
     count = len(center)
+    steps = count // passes
     right = np.column_stack([np.sin(heading), -np.cos(heading), np.zeros(count)])
     forward = np.column_stack([np.cos(heading), np.sin(heading), np.zeros(count)])
     rotation = np.stack([right, np.broadcast_to([0.0, 0.0, -1.0], (count, 3)), forward], axis=1)
@@ -62,7 +69,7 @@ def made_up_city(labels: int, images: int, passes: int, *, seed: int = 0) -> tup
         cam_from_world_quat=Rotation.from_matrix(rotation).as_quat(scalar_first=True),
         cam_from_world_m=-np.einsum("nij,nj->ni", rotation, center),
         pass_id=Categories.from_texts(np.repeat([f"pass-{i:03d}" for i in range(passes)], steps).tolist()),
-        timestamp_s=1.7e9 + np.arange(count) * 0.4,
+        timestamp_s=1.7e9 + 0.4 * np.arange(count, dtype=np.float64),
     )
     last = np.sort(random.choice(np.arange(VOTES, count), labels, replace=False))
     last = np.maximum(last, last // steps * steps + VOTES)

@@ -451,6 +451,17 @@ def test_a_map_that_is_made_again_is_shown_with_its_decisions(tmp_path: Path) ->
         assert np.linalg.norm(after.labels.position_in_world_m[row] - place) < 0.3
 
 
+def test_a_rejected_label_with_twice_the_votes_is_to_be_checked_again(tmp_path: Path) -> None:
+    before = write_city(tmp_path, "two")
+    row = int(np.argmax(before.labels.votes))
+    for asked in serve(lambda: Scene(tmp_path / "map"), tmp_path / "map" / "review.json"):
+        assert asked.decide({"label_id": int(before.labels.label_id[row]), "verdict": "rejected"}).status == 200
+        write_city(tmp_path, "one", "two")
+        asked.get("/api/map")
+        (again,) = asked.get("/api/reviews").json()["decisions"]
+        assert (again["state"], again["votes_then"]) == ("check again", int(before.labels.votes[row]))
+
+
 def test_what_is_missing_is_said(city: tuple[Path, Map], tmp_path: Path) -> None:
     """A map alone: numbers without votes; a dataset without pictures: boxes without pictures."""
     valuemap.write_map(city[1], tmp_path / "alone" / "map")
