@@ -248,6 +248,7 @@ def _scaled_settings(config: MapConfig, scale: float) -> MapConfig:
     """Return the settings with all that are in metres multiplied, but for those that are estimated."""
     value = config.as_dict()
     metres = [name for name, _, unit, _ in describe_settings() if unit == "m" and value.get(name) is not None]
+    metres = [name for name in metres if name not in config.ignored_settings()]
     return config.with_settings(f"{name}={float(value[name] or 0.0) * scale!r}" for name in metres)
 
 

@@ -26,7 +26,7 @@ def test_the_settings_of_the_paper_have_its_values() -> None:
 
 
 def test_settings_go_to_the_stage_that_has_them() -> None:
-    config = MapConfig().with_settings(["max_range_m=80", " min_votes = 4 ", "merge_radius_m=0"])
+    config = MapConfig(method="paper").with_settings(["max_range_m=80", " min_votes = 4 ", "merge_radius_m=0"])
     assert (config.vote.max_range_m, config.vote.min_votes, config.merge.merge_radius_m) == (80.0, 4, 0.0)
     assert config.partition == PartitionConfig()
     assert MapConfig().vote == VoteConfig()

@@ -192,8 +192,9 @@ def test_no_support_gives_an_empty_map_with_all_columns(config: valuemap.MapConf
 def test_covariance_is_that_of_the_scatter(method: Literal["robust", "paper"]) -> None:
     """Over many noise draws positions scatter as the mean covariance says (6 numbers, 400 draws)."""
     sigma = 1.5
-    known = [f"detection_sigma_px={sigma}", "position_sigma_m=0", "rotation_sigma_deg=0", "gate_sigmas=6"]
-    config = valuemap.MapConfig(method=method).with_settings([*known, "max_reprojection_error_px=20"])
+    known = ["position_sigma_m=0", "rotation_sigma_deg=0", "gate_sigmas=6"]
+    own = known if method == "robust" else ["max_reprojection_error_px=20"]
+    config = valuemap.MapConfig(method=method).with_settings([f"detection_sigma_px={sigma}", *own])
     base = as_dataset(random_scene(1, images=20, objects=1, clutter=0, noise_px=0.0, recall=1.0))
     random = np.random.default_rng(0)
     points, covariances = [], []

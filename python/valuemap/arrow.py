@@ -14,6 +14,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from valuemap.errors import InputError
+
 _TYPES = {"f8": pa.float64(), "i8": pa.int64(), "i4": pa.int32()}
 
 
@@ -35,7 +37,18 @@ def numbers_to_arrow(values: NDArray[Any], *, nullable: bool = False) -> pa.Arra
 
 
 def texts_to_arrow(texts: Sequence[str]) -> pa.Array:
-    """Return texts (N) as an Arrow array."""
-    encoded = [text.encode() for text in texts]
+    """Return texts (N) as an Arrow array.
+
+    Raises
+    ------
+    InputError
+        A text cannot be written as UTF-8, as the name of a file in another encoding cannot.
+    """
+    try:
+        encoded = [text.encode() for text in texts]
+    except UnicodeEncodeError as error:
+        raise InputError(
+            f"{error.object!r}: cannot be written as UTF-8", hint="give files and classes names of Unicode characters"
+        ) from error
     offsets = np.cumsum([0, *map(len, encoded)], dtype=np.int32)
     return pa.StringArray.from_buffers(len(encoded), pa.py_buffer(offsets), pa.py_buffer(b"".join(encoded)))

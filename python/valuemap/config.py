@@ -9,6 +9,7 @@ import dataclasses
 import difflib
 import math
 import numbers
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, Self, get_args
@@ -29,12 +30,35 @@ def _setting(
     low: float = 0.0,
     high: float = math.inf,
     open_low: bool = False,
+    method: Method | None = None,
 ) -> Any:
-    """Declare one setting: default (None: estimated from the data), unit, effect and the range that makes sense."""
+    """Declare one setting: default (None: estimated from the data), unit, effect and the range that makes sense.
+
+    `method` is the only one that has it; None for a setting of all methods.
+    """
     return field(
         default=default,
-        metadata={"unit": unit, "effect": effect, "low": low, "high": high, "open_low": open_low},
+        metadata={"unit": unit, "effect": effect, "low": low, "high": high, "open_low": open_low, "method": method},
     )
+
+
+MAX_THREADS = 1024
+"""More are a slip of the keyboard, and take minutes to start."""
+
+
+def bounded_threads(threads: int) -> int:
+    """Return a number of threads to work on (0: one a core), no more than can do anything; results do not depend on it.
+
+    Raises
+    ------
+    SettingError
+        It is no number of threads.
+    """
+    if not 0 <= threads <= MAX_THREADS:
+        raise SettingError(
+            f"threads: expected 0 to {MAX_THREADS}, found {threads}", hint="leave it away for one thread a core"
+        )
+    return min(threads, 4 * (os.cpu_count() or 1))
 
 
 @dataclass(frozen=True)
@@ -47,6 +71,7 @@ class PartitionConfig:
         open_low=True,
         effect="a seed takes all free images closer than this (N_max of the paper); "
         "larger sees objects from more images and costs more",
+        method="paper",
     )
 
 
@@ -59,6 +84,7 @@ class VoteConfig:
         unit="px",
         open_low=True,
         effect="a detection votes for a point that projects closer than this (d_max of the paper)",
+        method="paper",
     )
     min_parallax_deg: float = _setting(
         2.0,
@@ -80,6 +106,7 @@ class VoteConfig:
         unit="1",
         effect="a point is accepted while its votes reach this multiple of the mean votes of the hypotheses "
         "still alive (alpha of the paper); larger is stricter",
+        method="paper",
     )
     min_votes: int = _setting(
         3, unit="images", low=2, effect="a point is accepted only with votes from at least this many images"
@@ -94,7 +121,8 @@ class NoiseConfig:
         4.0,
         unit="sigmas",
         open_low=True,
-        effect="a detection votes for a point that projects closer than this many standard deviations (robust)",
+        effect="a detection votes for a point that projects closer than this many standard deviations",
+        method="robust",
     )
     detection_sigma_px: float | None = _setting(
         None,
@@ -105,12 +133,14 @@ class NoiseConfig:
     position_sigma_m: float | None = _setting(
         None,
         unit="m",
-        effect="standard deviation of a camera position, each axis (robust)",
+        effect="standard deviation of a camera position, each axis",
+        method="robust",
     )
     rotation_sigma_deg: float | None = _setting(
         None,
         unit="deg",
-        effect="standard deviation of a camera rotation, each axis (robust)",
+        effect="standard deviation of a camera rotation, each axis",
+        method="robust",
     )
 
 
@@ -119,7 +149,11 @@ class ExistenceConfig:
     """Which labels are kept."""
 
     min_existence: float = _setting(
-        0.55, unit="1", high=1.0, effect="labels that exist with a smaller probability are dropped (robust)"
+        0.55,
+        unit="1",
+        high=1.0,
+        effect="labels that exist with a smaller probability are dropped",
+        method="robust",
     )
 
 
@@ -127,7 +161,9 @@ class ExistenceConfig:
 class MergeConfig:
     """When labels of different clusters are one object."""
 
-    merge_radius_m: float = _setting(1.0, unit="m", effect="labels of different clusters closer than this become one")
+    merge_radius_m: float = _setting(
+        1.0, unit="m", effect="labels of different clusters closer than this become one", method="paper"
+    )
 
 
 @dataclass(frozen=True, init=False)
@@ -182,9 +218,24 @@ class MapConfig:
         Raises
         ------
         SettingError
-            A name that no stage has, a value that is not a number, or one out of range.
+            A name that no stage has, or that the method ignores; a value that is not a number, or out of range.
         """
-        return dataclasses.replace(self, **_assign(self._stages(), assignments))
+        assignments = list(assignments)
+        changed = dataclasses.replace(self, **_assign(self._stages(), assignments))
+        owner = self.ignored_settings()
+        for name in (assignment.partition("=")[0].strip() for assignment in assignments):
+            if name in owner:  # A user would look for an effect that cannot be.
+                raise SettingError(
+                    f"--set {name}: the method {self.method} has no such setting, only {owner[name]} has it",
+                    hint=f"leave it away, or use --method {owner[name]}",
+                )
+        return changed
+
+    def ignored_settings(self) -> dict[str, Method]:
+        """Return the settings that the method does not have, each with the only method that has it."""
+        settings = [setting for stage in self._stages().values() for setting in fields(stage)]
+        owner = {setting.name: setting.metadata["method"] for setting in settings}
+        return {name: method for name, method in owner.items() if method not in (None, self.method)}
 
     def as_dict(self) -> dict[str, float | str | None]:
         """Return all settings, flat, as `run.json` holds them."""
@@ -200,7 +251,7 @@ class MapConfig:
 def describe_settings() -> list[tuple[str, str, str, str]]:
     """Return (name, default, unit, effect) of every setting, in the order of the stages."""
     return [
-        (s.name, _shown(s.default), s.metadata["unit"], s.metadata["effect"])
+        (s.name, _shown(s.default), s.metadata["unit"], _effect_of(s))
         for stage in MapConfig()._stages().values()
         for s in fields(stage)
     ]
@@ -249,6 +300,12 @@ def _parse(setting: dataclasses.Field[Any], text: str) -> float:
             f"{setting.name}: expected {kind} ({setting.metadata['unit']}), found {text!r}",
             hint=f"the default is {setting.name}={_shown(setting.default)}",
         ) from None
+
+
+def _effect_of(setting: dataclasses.Field[Any]) -> str:
+    """Return the effect of a setting with the only method that has it, if there is one."""
+    method = setting.metadata["method"]
+    return f"{setting.metadata['effect']}{f' ({method})' if method else ''}"
 
 
 def _shown(value: Any) -> str:
@@ -755,6 +812,9 @@ class SimulationConfig:
         return changed
 
 
+MAX_CANVAS_PX = 2**26
+"""What goes through a network at once: its layers take hundreds of bytes a pixel."""
+
 ModelKind = Literal["segmentation", "yolox", "ultralytics", "detr", "boxes"]
 Provider = Literal["cpu", "cuda"]
 
@@ -838,7 +898,13 @@ class DetectConfig:
                 f"--size: expected N or WIDTHxHEIGHT in px, or picture, found {self.size!r}",
                 hint="for example --size 1024x448",
             )
-        return int(sides[0]), int(sides[-1])
+        width, height = int(sides[0]), int(sides[-1])
+        if width * height * self.batch > MAX_CANVAS_PX:
+            raise SettingError(
+                f"--size {self.size}: {width} x {height} px in batches of {self.batch} do not fit into memory",
+                hint=f"take at most {MAX_CANVAS_PX // 10**6} million pixels at once, and --tile for small things",
+            )
+        return width, height
 
     def with_settings(self, assignments: Iterable[str]) -> Self:
         """Return a copy with `name=value` assignments applied; raises as `MapConfig.with_settings`."""

@@ -13,6 +13,7 @@ from typing import Any
 from weakref import WeakSet
 
 import numpy as np
+import pyarrow.compute as pc
 import pycolmap
 
 from valuemap.errors import InputError
@@ -46,6 +47,7 @@ PART_FOLDERS = ("images",)
 """Folders of it whose files, as far as valuemap wrote them, are of that dataset alone."""
 _QUATERNION_TOLERANCE = 1e-3
 _ROUNDING = 1e-12
+_LEADS_OUT = r"^/|(^|/)\.\.(/|$)|\x00"
 
 
 @dataclass(frozen=True)
@@ -281,7 +283,7 @@ def _read_head(folder: Path) -> dict[str, Any]:
         )
     try:
         head = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read as JSON: {error}", hint="repair it or import again") from error
     if not isinstance(head, dict) or head.get("format_version") != FORMAT_VERSION:
         found = head.get("format_version") if isinstance(head, dict) else head
@@ -316,6 +318,7 @@ def _check_cameras(cameras: Cameras, source: str) -> None:
 
 def _check_images(images: Images, cameras: Cameras, source: str) -> Images:
     _check_known(images.camera_id, cameras.camera_id, images.image_id, source, "images", "camera_id", "cameras")
+    _check_names(images, source)
     norm = np.linalg.norm(images.cam_from_world_quat, axis=1)
     wrong = np.flatnonzero(np.abs(norm - 1.0) > _QUATERNION_TOLERANCE)
     if len(wrong):
@@ -330,6 +333,18 @@ def _check_images(images: Images, cameras: Cameras, source: str) -> Images:
     # Those of unit length to rounding stay as they are, so that writing and reading again changes no bit.
     scale = np.where(np.abs(norm - 1.0) > _ROUNDING, norm, 1.0)
     return images.replace(cam_from_world_quat=images.cam_from_world_quat / scale[:, None])
+
+
+def _check_names(images: Images, source: str) -> None:
+    """Refuse names that lead out of the folder of the pictures: they are opened by them."""
+    leads_out = pc.match_substring_regex(images.name, _LEADS_OUT).to_pylist()
+    if True in leads_out:
+        row = leads_out.index(True)
+        raise InputError(
+            f"{source}/images.parquet, row with image_id {images.image_id[row]}: name: expected a path in the folder "
+            f"of the pictures, found {images.name[row].as_py()!r} ({leads_out.count(True)} rows)",
+            hint="name pictures relative to one folder, without ..",
+        )
 
 
 def _check_detections(dataset: Dataset, source: str, *, are_boxes_checked: bool) -> None:

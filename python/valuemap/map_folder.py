@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import json
+import reprlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,14 @@ REVIEW = "review.json"
 """What people decided about the labels (`valuemap.review`): the one file that a new map in the same folder keeps."""
 PARTS = (MARKER, "labels.parquet", "votes.parquet", "rejected.parquet")
 """All files that a map may have: none of an older one may stay beside those of a new one."""
+
+_RECORD: dict[str, tuple[type, str]] = {
+    "dataset": (str, "a text"),
+    "settings": (dict, "an object"),
+    "counts": (dict, "an object"),
+    "stages": (list, "a list"),
+    "notes": (list, "a list"),
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -112,16 +121,32 @@ def read_map(path: str | Path) -> Map:
         raise InputError(f"{folder}: is not a map: there is no {MARKER} in it", hint="make one with valuemap map")
     try:
         run = json.loads(head.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RecursionError) as error:
         raise InputError(f"{head}: cannot be read as JSON: {error}", hint="make the map again") from error
     if not isinstance(run, dict):
         raise InputError(f"{head}: expected a JSON object, found {type(run).__name__}", hint="make the map again")
+    _check_run(run, str(head))
     return Map(
         frame=Frame.from_json(run.pop("frame", None), source=str(head)),
         labels=read_table(Labels, folder / "labels.parquet"),
         votes=read_table(Votes, folder / "votes.parquet"),
         run=run,
     )
+
+
+def _check_run(run: dict[str, Any], source: str) -> None:
+    """Refuse a record whose entries are not what everything that reads it takes them for."""
+    for name, (kind, expected) in _RECORD.items():
+        if not isinstance(run.get(name, kind()), kind):
+            raise InputError(
+                f"{source}: {name}: expected {expected}, found {reprlib.repr(run[name])}", hint="make the map again"
+            )
+    for stage in run.get("stages", []):
+        if not isinstance(stage, dict) or not isinstance(stage.get("seconds"), int | float):
+            raise InputError(
+                f"{source}: stages: expected objects with seconds, found {reprlib.repr(stage)}",
+                hint="make the map again",
+            )
 
 
 def write_labels(result: Map, path: Path) -> None:

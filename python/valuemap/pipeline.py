@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from valuemap.cameras import Rays, cast_rays
-from valuemap.config import MapConfig
+from valuemap.config import MapConfig, bounded_threads
 from valuemap.dataset import Dataset, ensure_checked
 from valuemap.describe import describe_labels
 from valuemap.errors import InputError
@@ -47,13 +47,15 @@ def build_map(
     ------
     InputError
         The dataset has no detections, or was made by hand and is not what `read_dataset` would accept.
+    SettingError
+        `threads` is no number of threads.
 
     Returns
     -------
     Map
         Labels ordered by their first detection, votes, and the record of the run.
     """
-    config = config or MapConfig()
+    config, threads = config or MapConfig(), bounded_threads(threads)
     if not len(dataset.detections):
         raise InputError(
             f"{dataset.name}: there are no detections in it",

@@ -395,7 +395,7 @@ def read_arrow(path: Path) -> pa.Table:
         raise InputError(f"{path}: no such file", hint="give the folder that an import or simulate command wrote")
     try:
         # Not pq.read_table, which imports pandas before it reads.
-        table = pq.ParquetFile(path).read()
+        table = pq.ParquetFile(pa.BufferReader(path.read_bytes())).read()
         table.validate(full=True)  # Finds texts that are not UTF-8, which nothing else would before they are used.
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = str(error).splitlines()[0]
@@ -508,7 +508,8 @@ def write_table(table: Table, path: Path) -> None:
     """Write a table as Parquet (zstd); the same table gives the same bytes."""
     # Dictionaries of all columns made the votes of a large city 10 % larger, and took twice as long to write.
     texts = [name for f in fields(table) if f.metadata["kind"] == "category" for name in f.metadata["names"]]
-    pq.write_table(table_to_arrow(table), path, compression="zstd", use_dictionary=texts)
+    with path.open("wb") as file:  # Arrow takes no path that is not UTF-8.
+        pq.write_table(table_to_arrow(table), file, compression="zstd", use_dictionary=texts)
 
 
 def _take(value: Any, rows: NDArray[Any]) -> Any:

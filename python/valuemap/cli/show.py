@@ -19,8 +19,9 @@ from valuemap.progress import Progress
 SHOWN_PROBLEMS = 5
 """How many problems of one kind are printed before the rest is counted."""
 
-out = Console()
-log = Console(stderr=True)
+# Names of users are no markup: a class may be called [/].
+out = Console(markup=False, emoji=False)
+log = Console(stderr=True, markup=False, emoji=False)
 
 
 def show(facts: dict[str, Any], *, title: str | None = None, console: Console = out) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from valuemap.config import DetectConfig
+from valuemap.config import MAX_CANVAS_PX, DetectConfig
 from valuemap.detect.boxes import Boxes
 from valuemap.detect.classes import WantedClasses, choose_classes
 from valuemap.detect.journal import Outcome
@@ -101,11 +101,13 @@ class Detector:
         try:
             picture = read_picture(task.path, upright=not task.is_panorama)
             in_stored_pixels = _is_of_stored_pixels(picture, task)
+            around = views[picture.stored] if task.is_panorama else None
+            scenes = (
+                [picture.pixels] if around is None else [around.draw(picture.pixels, i) for i in range(around.count)]
+            )
+            return _Prepared(picture, in_stored_pixels, around, [self._cut(pixels) for pixels in scenes])
         except UnusablePicture as problem:
             return Outcome(Boxes.none(), problem=str(problem))
-        around = views[picture.stored] if task.is_panorama else None
-        scenes = [picture.pixels] if around is None else [around.draw(picture.pixels, i) for i in range(around.count)]
-        return _Prepared(picture, in_stored_pixels, around, [self._cut(pixels) for pixels in scenes])
 
     def _cut(self, pixels: Pixels) -> list[_Tile]:
         size = (pixels.shape[1], pixels.shape[0])
@@ -113,6 +115,10 @@ class Detector:
         for window in plan_tiles(size, self.config.tile_px, self.config.tile_overlap_px):
             left, top, right, bottom = window
             fit = self.model.fit((right - left, bottom - top), self.config.size_px)
+            if fit.canvas[0] * fit.canvas[1] > MAX_CANVAS_PX:
+                raise UnusablePicture(
+                    f"is {fit.canvas[0]} x {fit.canvas[1]} px, too much for a network at once: use --tile or --size"
+                )
             tiles.append(_Tile(window, fit, fit.draw(pixels[top:bottom, left:right])))
         return tiles
 

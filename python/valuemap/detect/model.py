@@ -184,12 +184,30 @@ def _open(path: Path, content: bytes, provider: str) -> Any:
     try:
         session = onnxruntime.InferenceSession(content, options, providers=[wanted])
     except Exception as error:  # ONNX Runtime's errors have no base of their own.
+        other = _other_file(content)
+        if other is not None:
+            raise InputError(
+                f"{path}: keeps its weights in another file, {other!r}",
+                hint="put them into one: onnx.save(onnx.load(IN), OUT), or external_data=False in torch.onnx.export",
+            ) from error
         raise InputError(
             f"{path}: cannot be read as an ONNX model: {_first_line(error)}", hint="is it whole? Export it again"
         ) from error
     if wanted not in session.get_providers():  # Without a driver it would go on with the CPU and say nothing.
         raise _no_provider(provider)
     return session
+
+
+def _other_file(content: bytes) -> str | None:
+    """Return the name of the file that a model keeps its weights in, if it is not this one."""
+    import onnx  # Only models that cannot be opened need it.
+
+    try:
+        weights = onnx.load_from_string(content).graph.initializer
+    except Exception:  # Then it is no model at all, which is said elsewhere.
+        return None
+    entries = (entry for each in weights if each.data_location == each.EXTERNAL for entry in each.external_data)
+    return next((str(entry.value) for entry in entries if entry.key == "location"), None)
 
 
 def _no_provider(provider: str) -> SettingError:

@@ -16,7 +16,10 @@ from valuemap.detect.boxes import Boxes
 from valuemap.detect.letterbox import Pixels, Size
 from valuemap.tables import Floats
 
-Image.MAX_IMAGE_PIXELS = 2**29  # Pillow's own limit takes large panoramas for attacks.
+Image.MAX_IMAGE_PIXELS = None  # Pillow's own limit takes large panoramas for attacks; MAX_PIXELS is ours.
+
+MAX_PIXELS = 2**28
+"""Of a picture: several are in memory together, and a header can promise anything."""
 
 SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm"))
 _EXIF_ORIENTATION = 0x0112
@@ -55,21 +58,31 @@ def read_picture(path: Path, *, upright: bool = True) -> Picture:
     UnusablePicture
         There is no such file, it is no picture, or it is damaged or cut short.
     """
+    if not path.is_file():  # A pipe would be waited for.
+        raise UnusablePicture("is no file" if path.exists() else "no such file")
     try:
         with Image.open(path) as image:
             stored = image.size
+            _refuse_too_large(stored)
             orientation = image.getexif().get(_EXIF_ORIENTATION, 1) if upright else 1
             if orientation not in range(2, 9):
                 orientation = 1
             pixels = _as_rgb(ImageOps.exif_transpose(image) if orientation > 1 else image)
-    except FileNotFoundError:
-        raise UnusablePicture("no such file") from None
+    except UnusablePicture:
+        raise
     except UnidentifiedImageError:
         raise UnusablePicture("is no picture") from None
     except Exception as error:  # On damaged files Pillow's decoders raise nearly anything.
         reason = str(error).splitlines()[0] if str(error) else repr(error)
         raise UnusablePicture(f"cannot be decoded: {reason}") from error
     return Picture(pixels, orientation, stored)
+
+
+def _refuse_too_large(stored: Size) -> None:
+    if stored[0] * stored[1] > MAX_PIXELS:
+        raise UnusablePicture(
+            f"is {stored[0]} x {stored[1]} px, more than the {MAX_PIXELS // 10**6} million that are read"
+        )
 
 
 def list_pictures(folder: Path) -> list[Path]:

@@ -17,7 +17,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from valuemap.config import TrainConfig
+from valuemap.config import TrainConfig, bounded_threads
 from valuemap.detect.labels import LabelledPictures
 from valuemap.detect.samples import TrainingData, prepare_data
 from valuemap.errors import InputError, OutputError, ValuemapError
@@ -103,7 +103,7 @@ def train(
         )
     from valuemap.detect.training import Training  # PyTorch is large, slow to import and an extra.
 
-    config = config or TrainConfig()
+    config, threads = config or TrainConfig(), bounded_threads(threads)
     checkpoint = run / CHECKPOINT
     if not resume and any((run / name).exists() for name in (CHECKPOINT, MODEL)):
         raise OutputError(

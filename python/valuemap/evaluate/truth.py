@@ -89,7 +89,7 @@ def read_truth(path: Path, result: Map) -> Dataset | TrueObjects:
             f"{path}: truth of an unknown kind: {path.suffix or 'no suffix'}",
             hint=f"give a dataset folder or one of {', '.join(_TRUTH_READERS)}",
         )
-    table = _TRUTH_READERS[path.suffix.lower()](path)
+    table = _with_numbered_objects(_TRUTH_READERS[path.suffix.lower()](path))
     columns = {*table.column_names}
     has_position, has_place = {"x", "y", "z"} <= columns, {"lon", "lat"} <= columns
     anchor = result.frame.anchor
@@ -103,6 +103,22 @@ def read_truth(path: Path, result: Map) -> Dataset | TrueObjects:
         )
     points = table_from_arrow(TruthPoints, table, source=str(path))
     return _sorted_objects(points, points.position_in_world_m)
+
+
+def _with_numbered_objects(table: pa.Table) -> pa.Table:
+    """Return the table with whole numbers as ids: surveys have texts, such as TL-17a, whose rows are then the ids."""
+    if table.column_names.count("object_id") != 1:
+        return table
+    ids = table["object_id"]
+    if pa.types.is_dictionary(ids.type):
+        ids = ids.cast(ids.type.value_type)
+    if pa.types.is_string(ids.type) or pa.types.is_large_string(ids.type):
+        try:
+            ids = ids.cast(pa.int64())
+        except pa.ArrowInvalid:
+            ids = pa.chunked_array([pa.array(range(table.num_rows), pa.int64())])
+        table = table.set_column(table.column_names.index("object_id"), "object_id", ids)
+    return table
 
 
 def _min_parallax_of(result: Map) -> float:
@@ -183,7 +199,7 @@ def _sorted_objects(
 
 def _read_csv(path: Path) -> pa.Table:
     numbers = dict.fromkeys(("x", "y", "z", "lon", "lat", "height"), pa.float64())
-    types = {**numbers, "class": pa.string(), "object_id": pa.int64()}
+    types = {**numbers, "class": pa.string(), "object_id": pa.string()}
     hint = "separate columns by commas, their names in the first line"
     return read_csv_arrow(path, types, has_missing=True, hint=hint)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from valuemap.detect.labels.pictures import BoxList, LabelledPicture, LabelledPictures
 from valuemap.errors import InputError
+from valuemap.yaml_text import load_yaml
 
 _EDGES = ("x_min", "y_min", "x_max", "y_max")
 
@@ -33,15 +34,11 @@ def read_bosch(path: Path) -> LabelledPictures:
 
 
 def _load(path: Path) -> list[Any]:
-    import yaml  # Only the commands that read such labels need it.
-
-    # The loader in C is ten times as fast; wheels for some machines come without it.
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        content = yaml.load(path.read_bytes(), Loader=loader)  # Both are safe.
+        content = load_yaml(path.read_bytes())
     except FileNotFoundError:
         raise InputError(f"{path}: no such file", hint="give the YAML file of the labels") from None
-    except (OSError, yaml.YAMLError, ValueError) as error:
+    except (OSError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: cannot be read as YAML: {reason}", hint="is it whole? Fetch it again") from error
     if not isinstance(content, list):

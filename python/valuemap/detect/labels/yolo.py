@@ -8,6 +8,7 @@ from typing import Any
 from valuemap.detect.labels.pictures import SPLITS, BoxList, LabelledPicture, LabelledPictures
 from valuemap.detect.pictures import list_pictures
 from valuemap.errors import InputError
+from valuemap.yaml_text import load_yaml
 
 _TRANSPOSED = frozenset({5, 6, 7, 8})
 """EXIF orientations that swap width and height."""
@@ -51,13 +52,11 @@ def read_yolo(folder: Path) -> LabelledPictures:
 def _class_names(folder: Path) -> dict[int, str]:
     config, lines = folder / "data.yaml", folder / "classes.txt"
     if config.is_file():
-        import yaml  # Only such folders need it.
-
         try:
-            names: Any = yaml.safe_load(config.read_bytes())["names"]
+            names: Any = load_yaml(config.read_bytes())["names"]
             items = names.items() if isinstance(names, dict) else enumerate(names)
             return {int(number): str(name) for number, name in items}
-        except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+        except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
             reason = " ".join(str(error).split())
             raise InputError(
                 f"{config}: expected names of the classes: {reason}", hint="write names: [traffic light] into it"
