@@ -20,6 +20,7 @@ from valuemap.describe import describe_labels
 from valuemap.errors import InputError
 from valuemap.map_folder import Map
 from valuemap.merge import merge_clusters
+from valuemap.notes import Findings, find_notes
 from valuemap.partition import partition_images
 from valuemap.progress import Progress, silent
 from valuemap.robust import Scene, calibrate_noise, find_labels
@@ -77,7 +78,8 @@ def build_map(
         **counts,
         "labels": len(labels),
     }
-    return Map(dataset.frame, labels, votes, _record(dataset, config, counts, stages))
+    notes = find_notes(Findings(dataset, config, labels, votes, counts))
+    return Map(dataset.frame, labels, votes, {**_record(dataset, config, counts, stages), "notes": notes})
 
 
 def _paper(

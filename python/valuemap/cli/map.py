@@ -11,7 +11,7 @@ import typer
 from valuemap import map_folder
 from valuemap.cli.app import app
 from valuemap.cli.options import AsJson, Force, Settings
-from valuemap.cli.show import log, progress_bars, show
+from valuemap.cli.show import log, progress_bars, show, show_notes
 from valuemap.config import MapConfig, Method
 from valuemap.dataset import read_dataset
 from valuemap.evaluate import evaluate_map
@@ -51,6 +51,7 @@ def map_command(
     if picture is not None:
         matches = evaluate_map(result, data).matches if data.truth is not None else None
         draw_map(result, data, matches, picture, force=force)
+    show_notes(result.run["notes"])
     if as_json:
         print(json.dumps(result.run, indent=2))
     else:

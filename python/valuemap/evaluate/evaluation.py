@@ -15,6 +15,7 @@ from valuemap.dataset import Dataset, Frame, read_dataset
 from valuemap.errors import SettingError
 from valuemap.evaluate.accuracy import PositionalAccuracy, measure_accuracy
 from valuemap.evaluate.chance import ChanceFloor, measure_chance
+from valuemap.evaluate.class_names import note_classes
 from valuemap.evaluate.completeness import Completeness, measure_completeness
 from valuemap.evaluate.matching import LABEL_OUTCOMES, Matches, match_labels
 from valuemap.evaluate.recoverable import near_images
@@ -131,7 +132,7 @@ def evaluate_map(
     if isinstance(result, str | Path):
         result = read_map(result)
     objects = true_objects(truth, result, min_parallax_rad)
-    notes = _notes(objects)
+    notes = _notes(objects) + note_classes(result.labels, objects)
     if seen_within_m is None and images is not None:
         raise SettingError(
             "images: mean nothing without seen_within", hint="give the distance at which objects can be seen, e.g. 25"

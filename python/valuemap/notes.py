@@ -1,0 +1,156 @@
+"""What a user should know about a map before trusting it: each note is one small function of what was found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from valuemap.config import MapConfig
+from valuemap.dataset import Dataset, number_passes, rows_of
+from valuemap.tables import Floats, Labels, Votes
+
+_UNUSED_SHARE = 0.5
+_PLAUSIBLE_SIZE_M = (0.05, 10.0)
+_TWIN_SIGMAS = 1.0
+_AT_BOUND = 0.99
+_LARGEST_NOISE = {"detection_px": 30.0, "box_share": 0.15, "position_m": 5.0}
+"""Where the estimation of the noise in the core ends."""
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """A map with what it was made from and how; `counts` as run.json holds them."""
+
+    dataset: Dataset
+    config: MapConfig
+    labels: Labels
+    votes: Votes
+    counts: Mapping[str, Any]
+
+
+def find_notes(findings: Findings) -> list[str]:
+    """Return what is odd about a map, one line each; none where nothing is."""
+    return [note for find in NOTES if (note := find(findings)) is not None]
+
+
+def no_labels(findings: Findings) -> str | None:
+    """Say that a map is empty."""
+    if len(findings.labels):
+        return None
+    return "no object was found: are poses, cameras and boxes in the conventions that the formats page names?"
+
+
+def unused_detections(findings: Findings) -> str | None:
+    """Say that most detections show nothing that was found."""
+    unused, count = len(findings.dataset.detections) - len(findings.votes), len(findings.dataset.detections)
+    if unused <= _UNUSED_SHARE * count or not len(findings.labels):
+        return None
+    return (
+        f"{100.0 * unused / count:.0f} % of the detections belong to no label: a noisy detector, things seen "
+        "once, or poses or boxes in another convention than they were taken for"
+    )
+
+
+def noise_at_bound(findings: Findings) -> str | None:
+    """Say that the noise was estimated as large as it can be."""
+    noise = findings.counts.get("noise")
+    if not isinstance(noise, Mapping):
+        return None
+    given = findings.config.noise
+    found = {
+        "detection_px": (noise.get("detection_px", 0.0), given.detection_sigma_px),
+        "box_share": (noise.get("box_share", 0.0), given.detection_sigma_px),
+        "position_m": (
+            math.hypot(noise.get("position_m", 0.0), noise.get("position_drift_m", 0.0)),
+            given.position_sigma_m,
+        ),
+    }
+    largest = [
+        f"{name} {value:.3g}"
+        for name, (value, known) in found.items()
+        if known is None and value >= _AT_BOUND * _LARGEST_NOISE[name]
+    ]
+    if not largest:
+        return None
+    return f"the noise was estimated as large as it can be ({', '.join(largest)}): detections and poses hardly agree"
+
+
+def implausible_size(findings: Findings) -> str | None:
+    """Say that objects are too small or too large, as they are where poses are not in metres."""
+    labels = findings.labels
+    size_m = np.sqrt(labels.object_width_m * labels.object_height_m)
+    if not np.any(size_m > 0.0):
+        return None  # Bearings have no size.
+    median_m = float(np.median(size_m[size_m > 0.0]))
+    low, high = _PLAUSIBLE_SIZE_M
+    if low <= median_m <= high:
+        return None
+    return (
+        f"the median object is {median_m:.2g} m large, expected {low:g} to {high:g} m: the poses may not be in metres, "
+        "or the boxes not in pixels"
+    )
+
+
+def close_twins(findings: Findings) -> str | None:
+    """Say that labels of one class are closer to each other than they are exact."""
+    pairs = _twins(findings.labels)
+    if not pairs:
+        return None
+    (first, second), *others = pairs
+    ids = findings.labels.label_id
+    more = f" and {len(others)} more pairs" if others else ""
+    return f"labels {ids[first]} and {ids[second]}{more} are closer than their sigmas: each may be one object twice"
+
+
+def no_overlap(findings: Findings) -> str | None:
+    """Say that no object was found by two passes, though there are several."""
+    images, votes = findings.dataset.images, findings.votes
+    pass_code = number_passes(images)
+    if pass_code.max(initial=0) == 0 or not len(findings.labels):
+        return None
+    code_of_vote = pass_code[rows_of(votes.image_id, images.image_id)]
+    pairs = np.unique(np.column_stack([votes.label_id, code_of_vote]), axis=0)
+    if len(pairs) > len(np.unique(votes.label_id)):
+        return None
+    return (
+        f"no label has votes of two of the {pass_code.max() + 1} passes: they see different places, or are shifted "
+        "against each other"
+    )
+
+
+NOTES: tuple[Callable[[Findings], str | None], ...] = (
+    no_labels,
+    unused_detections,
+    noise_at_bound,
+    implausible_size,
+    close_twins,
+    no_overlap,
+)
+"""All of them, in the order in which they are told."""
+
+
+def _twins(labels: Labels) -> list[tuple[int, int]]:
+    """Return the rows of labels of one class whose difference is less than its standard deviation in that direction."""
+    covariance = _matrices(labels.covariance_m2)
+    largest_m = float(np.sqrt(np.max(np.trace(covariance, axis1=1, axis2=2), initial=0.0)))
+    if len(labels) < 2 or not largest_m > 0.0:
+        return []
+    reach_m = _TWIN_SIGMAS * math.sqrt(2.0) * largest_m
+    pairs = cKDTree(labels.position_in_world_m).query_pairs(reach_m, output_type="ndarray")
+    pairs = pairs[labels.class_name.codes[pairs[:, 0]] == labels.class_name.codes[pairs[:, 1]]]
+    away_m = labels.position_in_world_m[pairs[:, 0]] - labels.position_in_world_m[pairs[:, 1]]
+    both = covariance[pairs[:, 0]] + covariance[pairs[:, 1]]
+    squared_sigmas = np.einsum("ni,nij,nj->n", away_m, np.linalg.pinv(both), away_m)
+    rows = np.sort(pairs[squared_sigmas < _TWIN_SIGMAS**2], axis=1)
+    return [(int(first), int(second)) for first, second in rows[np.lexsort(rows.T[::-1])]]
+
+
+def _matrices(covariance_m2: Floats) -> Floats:
+    """Return covariances (N, 6) as matrices (N, 3, 3)."""
+    xx, xy, xz, yy, yz, zz = covariance_m2.T
+    return np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
