@@ -65,14 +65,15 @@ class Scene:
         cam_from_world: _Floats,
         camera: _Indices,
         pass_code: _Indices,
+        viewpoint: _Indices,
+        driven_m: _Floats,
         position_sigma_m: _Floats,
         rotation_sigma_rad: _Floats,
         frustum_normals: _Floats,
         solid_angle_sr: _Floats,
-        viewpoint_step_m: float,
     ) -> None: ...
 
-_Noise = tuple[float, float, float, float, float, float]
+_Noise = tuple[float, ...]
 _Settings = tuple[float, float, float, float, int, float, bool, bool]
 
 def calibrate_noise(
@@ -86,3 +87,14 @@ def calibrate_noise(
 def find_labels(
     scene: Scene, noise: _Noise, settings: _Settings, threads: int, progress: Callable[[int, int], None]
 ) -> tuple[_Floats, tuple[_Offsets, _Indices], _Floats, _Floats, _Offsets, dict[str, float]]: ...
+def objects_of(
+    scene: Scene,
+    noise: _Noise,
+    settings: _Settings,
+    point_in_world_m: _Floats,
+    voter_offsets: _Offsets,
+    voters: _Indices,
+    is_searched: bool,
+    threads: int,
+    progress: Callable[[int, int], None],
+) -> tuple[_Floats, tuple[_Offsets, _Indices], _Floats]: ...

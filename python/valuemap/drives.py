@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from valuemap.cameras import camera_centers, rotation_matrices
+from valuemap.dataset import Dataset, rows_of
 from valuemap.tables import Bools, Floats, Images, Ints
 
 _MOST_CAMERAS = 16
@@ -865,6 +866,46 @@ def _driven_m(place_m: Floats, begins: Bools, opens: Bools) -> Floats:
     total_m = np.cumsum(way_m)
     at_begin_m = np.maximum.accumulate(np.where(begins[start], total_m, 0.0))
     return np.asarray((total_m - at_begin_m)[np.cumsum(opens) - 1])
+
+
+@dataclass(frozen=True, eq=False)
+class InOrder:
+    """A dataset in driving order: images and detections are numbered by their rows; the ids (N) are those they had."""
+
+    dataset: Dataset
+    drives: Drives
+    image_id: Ints
+    detection_id: Ints
+
+
+def in_driving_order(dataset: Dataset, *, viewpoint_step_m: float = 1.0) -> InOrder:
+    """Return a dataset with its rows in an order that ids, names and the order of rows do not change.
+
+    Images follow the drives, those of one exposure by place and direction; the detections of an image go from left
+    to right.
+    """
+    images, detections = dataset.images, dataset.detections
+    drives = find_drives(images, viewpoint_step_m=viewpoint_step_m)
+    image_row = rows_of(detections.image_id, images.image_id)
+    order = drives.pass_code * (int(drives.order.max(initial=0)) + 1) + drives.order
+    if np.any(np.diff(order) <= 0):
+        rows = np.lexsort((*images.cam_from_world_m.T, *images.cam_from_world_quat.T, order))
+        images = images.take(rows)
+        columns = {name: getattr(drives, name)[rows] for name in ("pass_code", "order", "driven_m", "viewpoint")}
+        drives = replace(drives, **columns)
+        rank = np.empty(len(rows), dtype=np.int64)
+        rank[rows] = np.arange(len(rows))
+        image_row = rank[image_row]
+    x, y = detections.center_px.T
+    step = np.diff(image_row)
+    if np.any((step < 0) | ((step == 0) & (np.diff(x) <= 0))):
+        width, height = detections.size_px.T
+        rows = np.lexsort((height, width, y, x, image_row))
+        detections, image_row = detections.take(rows), image_row[rows]
+    image_id, detection_id = images.image_id, detections.detection_id
+    images = images.replace(image_id=np.arange(len(images)))
+    detections = detections.replace(detection_id=np.arange(len(detections)), image_id=image_row)
+    return InOrder(replace(dataset, images=images, detections=detections), drives, image_id, detection_id)
 
 
 def summarize_drives(drives: Drives) -> dict[str, Any]:

@@ -227,8 +227,7 @@ class Evidence:
         if len(voted) == 0:
             return self._misses_at(np.empty(0, np.int64), point, class_name=None)
         toward = self.center_in_world_m[self.image_row[votes]] - point
-        # The middles of sectors are taken in the order of the detections, as the method does.
-        toward = toward[np.argsort(self.detection_row[votes], kind="stable")]
+        # The middles of sectors are taken in the order of the votes, as the method does.
         distance = np.linalg.norm(toward, axis=1)
         direction = toward / distance[:, None]
         middles = _sector_middles(direction)

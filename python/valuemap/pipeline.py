@@ -17,6 +17,7 @@ from valuemap.cameras import Rays, cast_rays
 from valuemap.config import MapConfig, bounded_threads
 from valuemap.dataset import Dataset, ensure_checked
 from valuemap.describe import describe_labels
+from valuemap.drives import in_driving_order
 from valuemap.errors import InputError
 from valuemap.map_folder import Map
 from valuemap.merge import merge_clusters
@@ -24,8 +25,11 @@ from valuemap.notes import Findings, find_notes
 from valuemap.partition import partition_images
 from valuemap.progress import Progress, silent
 from valuemap.robust import Scene, calibrate_noise, find_labels
-from valuemap.tables import Candidates
+from valuemap.tables import Labels, Votes
 from valuemap.vote import vote_in_clusters
+
+VIEWPOINT_SHARE = 1.0 / 60.0
+"""Images of a drive closer than this share of the range are one viewpoint: about a degree of parallax at most."""
 
 
 def build_map(
@@ -64,16 +68,11 @@ def build_map(
         )
     dataset = ensure_checked(dataset)
     stages = _Stages()
-    with stages.measured("rays"):
-        rays = cast_rays(dataset)
     method = _paper if config.method == "paper" else _robust
-    found, counts = method(dataset, rays, config, stages, threads, progress)
-    with stages.measured("describe"):
-        labels, votes = describe_labels(dataset, rays, found, config.noise)
+    labels, votes, counts = method(dataset, config, stages, threads, progress)
     counts = {
         "images": len(dataset.images),
         "detections": len(dataset.detections),
-        "detections_without_ray": int(np.isnan(rays.direction_in_world[:, 0]).sum()),
         "detections_without_label": len(dataset.detections) - len(votes),
         **counts,
         "labels": len(labels),
@@ -83,29 +82,48 @@ def build_map(
 
 
 def _paper(
-    dataset: Dataset, rays: Rays, config: MapConfig, stages: _Stages, threads: int, progress: Progress
-) -> tuple[Candidates, dict[str, Any]]:
+    dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, progress: Progress
+) -> tuple[Labels, Votes, dict[str, Any]]:
     """Algorithm 1 of Dabisias et al., "VALUE", ICRA 2018, in clusters, with merging."""
+    with stages.measured("rays"):
+        rays = cast_rays(dataset)
     with stages.measured("partition"):
         cluster_of_image = partition_images(dataset.images, config.partition)
     with stages.measured("vote"):
         found, counts = vote_in_clusters(rays, cluster_of_image, config.vote, threads=threads, progress=progress)
     with stages.measured("merge"):
         merged = merge_clusters(rays, found, config.merge)
+    with stages.measured("describe"):
+        labels, votes = describe_labels(dataset, rays, merged, config.noise)
     clusters = int(cluster_of_image.max()) + 1
-    return merged, {"clusters": clusters, **counts, "labels_before_merge": len(found)}
+    counts = {**_without_ray(rays), "clusters": clusters, **counts, "labels_before_merge": len(found)}
+    return labels, votes, counts
 
 
 def _robust(
-    dataset: Dataset, rays: Rays, config: MapConfig, stages: _Stages, threads: int, progress: Progress
-) -> tuple[Candidates, dict[str, Any]]:
-    """Bounded candidates, a pose-aware gate calibrated on the data, and existence; docs/method.md."""
-    scene = Scene(dataset, rays)
+    dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, progress: Progress
+) -> tuple[Labels, Votes, dict[str, Any]]:
+    """Drives, noise estimated from the data, and the map with the least J that is found; docs/method.md."""
+    with stages.measured("order"):
+        ordered = in_driving_order(dataset, viewpoint_step_m=config.vote.max_range_m * VIEWPOINT_SHARE)
+    with stages.measured("rays"):
+        rays = cast_rays(ordered.dataset)
+    scene = Scene(ordered.dataset, ordered.drives, rays)
     with stages.measured("calibrate"):
         noise = calibrate_noise(scene, config, threads=threads, progress=progress)
     with stages.measured("find"):
         found, counts = find_labels(scene, noise, config, threads=threads, progress=progress)
-    return found, {**counts, "noise": dataclasses.asdict(noise)}
+    with stages.measured("describe"):
+        labels, votes = describe_labels(ordered.dataset, rays, found, config.noise)
+    votes = votes.replace(
+        detection_id=ordered.detection_id[votes.detection_id], image_id=ordered.image_id[votes.image_id]
+    )
+    counts = {**_without_ray(rays), **counts, "drives": ordered.drives.record, "noise": dataclasses.asdict(noise)}
+    return labels, votes, counts
+
+
+def _without_ray(rays: Rays) -> dict[str, int]:
+    return {"detections_without_ray": int(np.isnan(rays.direction_in_world[:, 0]).sum())}
 
 
 class _Stages:
@@ -129,10 +147,12 @@ def _peak_memory_mb() -> int:
 
 
 def _record(dataset: Dataset, config: MapConfig, counts: dict[str, int], stages: _Stages) -> dict[str, Any]:
+    drives = counts.pop("drives", None)
     return {
         "valuemap": version("valuemap"),
         "dataset": dataset.name,
         "settings": config.as_dict(),
+        **({} if drives is None else {"drives": drives}),
         "counts": counts,
         "stages": stages.records,
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -12,15 +12,13 @@ import numpy as np
 import valuemap._core as _core
 from valuemap.cameras import Rays, camera_poses, picture_bounds
 from valuemap.config import MapConfig, NoiseConfig
-from valuemap.dataset import Dataset, number_passes, rows_of
+from valuemap.dataset import Dataset, rows_of
+from valuemap.drives import Drives
 from valuemap.progress import Progress, silent
 from valuemap.tables import Candidates, Floats
 
 LEFT_OUT: set[str] = set()
 """Parts of the method to leave out: polish, merge, shared_noise. For the ablation benchmark; not a setting."""
-
-VIEWPOINT_STEP_M = 1.0
-"""Images of a pass closer than this to where a viewpoint began are one look, e.g. those before a red light."""
 
 
 @dataclass(frozen=True)
@@ -35,26 +33,22 @@ class Noise:
     box_share: float = 0.04
     position_m: float = 0.1
     rotation_rad: float = math.radians(0.1)
+    position_leg_m: float = 0.03
+    rotation_leg_rad: float = math.radians(0.03)
     position_drift_m: float = 0.1
     rotation_drift_rad: float = math.radians(0.1)
 
-    def as_tuple(self) -> tuple[float, float, float, float, float, float]:
-        """Return the six numbers in the order of the fields."""
-        return (
-            self.detection_px,
-            self.box_share,
-            self.position_m,
-            self.rotation_rad,
-            self.position_drift_m,
-            self.rotation_drift_rad,
-        )
+    def as_tuple(self) -> tuple[float, ...]:
+        """Return the eight numbers in the order of the fields."""
+        return astuple(self)
 
 
 class Scene:
     """A dataset as the core's robust method holds it."""
 
-    def __init__(self, dataset: Dataset, rays: Rays) -> None:
+    def __init__(self, dataset: Dataset, drives: Drives, rays: Rays) -> None:
         self._dataset = dataset
+        self._drives = drives
         self._rays = rays
 
     @cached_property
@@ -65,18 +59,19 @@ class Scene:
         cam_from_world, center_in_world_m = camera_poses(images)
         return _core.Scene(
             self._rays.core,
-            box_px=np.sqrt(detections.size_px[:, 0] * detections.size_px[:, 1]),
+            box_px=np.ascontiguousarray(detections.size_px[:, 1]),
             range_m=_or_nan(detections.range_m, len(detections)),
             range_sigma_m=_or_nan(detections.range_sigma_m, len(detections)),
             center_in_world_m=center_in_world_m,
             cam_from_world=cam_from_world,
             camera=rows_of(images.camera_id, self._dataset.cameras.camera_id).astype(np.uint32),
-            pass_code=number_passes(images).astype(np.uint32),
+            pass_code=self._drives.pass_code.astype(np.uint32),
+            viewpoint=self._drives.viewpoint.astype(np.uint32),
+            driven_m=self._drives.driven_m,
             position_sigma_m=_or_nan(images.position_sigma_m, len(images)),
             rotation_sigma_rad=_or_nan(images.rotation_sigma_rad, len(images)),
             frustum_normals=normals,
             solid_angle_sr=solid_angle_sr,
-            viewpoint_step_m=VIEWPOINT_STEP_M,
         )
 
 
@@ -128,13 +123,13 @@ def _guess(config: NoiseConfig) -> tuple[Noise, list[bool]]:
     noise = Noise()
     if config.detection_sigma_px is not None:
         noise = replace(noise, detection_px=config.detection_sigma_px, box_share=0.0)
-    # A known total says nothing about its parts: half of the variance each.
+    # A known total says nothing about its parts: a third of the variance each.
     if config.position_sigma_m is not None:
-        part = config.position_sigma_m / math.sqrt(2.0)
-        noise = replace(noise, position_m=part, position_drift_m=part)
+        part = config.position_sigma_m / math.sqrt(3.0)
+        noise = replace(noise, position_m=part, position_leg_m=part, position_drift_m=part)
     if config.rotation_sigma_deg is not None:
-        part = math.radians(config.rotation_sigma_deg) / math.sqrt(2.0)
-        noise = replace(noise, rotation_rad=part, rotation_drift_rad=part)
+        part = math.radians(config.rotation_sigma_deg) / math.sqrt(3.0)
+        noise = replace(noise, rotation_rad=part, rotation_leg_rad=part, rotation_drift_rad=part)
     known = [config.detection_sigma_px, config.position_sigma_m, config.rotation_sigma_deg]
     return noise, [value is not None for value in known]
 

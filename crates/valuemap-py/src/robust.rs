@@ -9,7 +9,7 @@ use pyo3::types::PyDict;
 use valuemap_core::hypothesis::Viability;
 use valuemap_core::robust::calibrate::Known;
 use valuemap_core::robust::noise::Noise;
-use valuemap_core::robust::scene::{Frustum, Scene as CoreScene, View, number_viewpoints};
+use valuemap_core::robust::scene::{Frustum, Scene as CoreScene, View};
 use valuemap_core::robust::{Findings, Settings, Without, find, self_calibrate};
 
 use crate::Rays;
@@ -24,7 +24,7 @@ pub struct Scene(CoreScene);
 impl Scene {
     #[new]
     #[pyo3(signature = (rays, *, box_px, range_m, range_sigma_m, center_in_world_m, cam_from_world, camera, pass_code,
-        position_sigma_m, rotation_sigma_rad, frustum_normals, solid_angle_sr, viewpoint_step_m))]
+        viewpoint, driven_m, position_sigma_m, rotation_sigma_rad, frustum_normals, solid_angle_sr))]
     #[allow(clippy::too_many_arguments)] // The columns by name, as Python sees them.
     fn new(
         rays: &Rays,
@@ -35,31 +35,33 @@ impl Scene {
         cam_from_world: PyReadonlyArray3<'_, f64>,
         camera: PyReadonlyArray1<'_, u32>,
         pass_code: PyReadonlyArray1<'_, u32>,
+        viewpoint: PyReadonlyArray1<'_, u32>,
+        driven_m: PyReadonlyArray1<'_, f64>,
         position_sigma_m: PyReadonlyArray1<'_, f64>,
         rotation_sigma_rad: PyReadonlyArray1<'_, f64>,
         frustum_normals: PyReadonlyArray3<'_, f64>,
         solid_angle_sr: PyReadonlyArray1<'_, f64>,
-        viewpoint_step_m: f64,
     ) -> PyResult<Self> {
         let centers = rows_of(&center_in_world_m)?;
         let rotations = cam_from_world.as_slice()?.as_chunks::<9>().0;
         let (camera, pass) = (camera.as_slice()?, pass_code.as_slice()?);
+        let (viewpoint, driven_m) = (viewpoint.as_slice()?, driven_m.as_slice()?);
         let (positions, turns) = (position_sigma_m.as_slice()?, rotation_sigma_rad.as_slice()?);
-        let images = [rotations.len(), camera.len(), pass.len(), positions.len(), turns.len()];
+        let images =
+            [rotations.len(), camera.len(), pass.len(), viewpoint.len(), driven_m.len(), positions.len(), turns.len()];
         let solid_angles = solid_angle_sr.as_slice()?;
         let normals = frustum_normals.as_slice()?.as_chunks::<3>().0;
         if images.iter().any(|&length| length != centers.len()) || !normals.len().is_multiple_of(solid_angles.len()) {
             return Err(PyValueError::new_err("scene: one row an image and a camera is needed"));
         }
-        let viewpoints = number_viewpoints(centers, pass, viewpoint_step_m);
         let views = (0..centers.len())
             .map(|i| View {
                 center: centers[i].into(),
                 cam_from_world: valuemap_core::matrix_from_rows(&rotations[i]),
                 camera: camera[i],
                 pass: pass[i],
-                viewpoint: viewpoints[i].0,
-                driven_m: viewpoints[i].1,
+                viewpoint: viewpoint[i],
+                driven_m: driven_m[i],
                 position_sigma_m: positions[i],
                 rotation_sigma_rad: turns[i],
             })
@@ -85,12 +87,30 @@ impl Scene {
 }
 
 /// The fields of the core's `Noise`, in their order.
-type NoiseValues = [f64; 6];
+type NoiseValues = [f64; 8];
 
 fn noise_of(
-    [detection_px, box_share, position_m, rotation_rad, position_drift_m, rotation_drift_rad]: NoiseValues,
+    [
+        detection_px,
+        box_share,
+        position_m,
+        rotation_rad,
+        position_leg_m,
+        rotation_leg_rad,
+        position_drift_m,
+        rotation_drift_rad,
+    ]: NoiseValues,
 ) -> Noise {
-    Noise { detection_px, box_share, position_m, rotation_rad, position_drift_m, rotation_drift_rad }
+    Noise {
+        detection_px,
+        box_share,
+        position_m,
+        rotation_rad,
+        position_leg_m,
+        rotation_leg_rad,
+        position_drift_m,
+        rotation_drift_rad,
+    }
 }
 
 /// Least parallax (rad), least and largest range (m), gate (sigmas), least votes, least existence; without polish, merge.
@@ -124,6 +144,8 @@ pub fn calibrate_noise(
         noise.box_share,
         noise.position_m,
         noise.rotation_rad,
+        noise.position_leg_m,
+        noise.rotation_leg_rad,
         noise.position_drift_m,
         noise.rotation_drift_rad,
     ])
@@ -153,13 +175,11 @@ pub fn find_labels<'py>(
     let found = with_progress(py, threads, scene.0.views.len(), progress, |progress| {
         find(&scene.0, &noise_of(noise), &settings, progress)
     })?;
-    let labels = || found.findings.iter().map(|finding| &finding.label);
+    let labels = || found.findings.iter();
     let mut offsets = vec![0_i64];
     let mut voters: Vec<u32> = Vec::new();
     for label in labels() {
-        let start = voters.len();
-        voters.extend(&label.voters);
-        voters[start..].sort_unstable();
+        voters.extend(&label.votes);
         offsets.push(voters.len() as i64);
     }
     let existence: Vec<f64> = found.findings.iter().map(|finding| finding.existence).collect();
@@ -176,14 +196,53 @@ pub fn find_labels<'py>(
 
 fn counts_of<'py>(py: Python<'py>, found: &Findings) -> PyResult<Bound<'py, PyDict>> {
     let dict = PyDict::new(py);
-    dict.set_item("nominations", found.tally.nominations)?;
-    dict.set_item("labels_before_settling", found.tally.accepted)?;
-    dict.set_item("labels_fused", found.tally.fused)?;
-    dict.set_item("labels_rejected_outvoted", found.tally.outvoted)?;
-    dict.set_item("labels_rejected_existence", found.tally.doubted)?;
+    dict.set_item("hypotheses", found.tally.hypotheses)?;
+    dict.set_item("births", found.tally.births)?;
+    dict.set_item("deaths", found.tally.deaths)?;
+    dict.set_item("energy", found.energy)?;
     dict.set_item("recall", found.rates.recall)?;
     dict.set_item("recall_concentration", found.rates.concentration)?;
-    dict.set_item("strays_per_image", found.strays_per_image)?;
+    dict.set_item("clutter_per_image", found.clutter_per_image)?;
     dict.set_item("variance_factor", found.variance_factor)?;
     Ok(dict)
+}
+
+/// J, votes and positions of objects.
+type FoundObjects<'py> = (Bound<'py, PyArray1<f64>>, Groups<'py>, Bound<'py, PyArray2<f64>>);
+
+/// J of objects, given by groups of rays (ascending) with points nearby, with their votes and positions: as they are, or what a search from them
+/// ends at, `valuemap_core::robust::objects_of`.
+#[pyfunction]
+#[allow(clippy::too_many_arguments)]
+pub fn objects_of<'py>(
+    py: Python<'py>,
+    scene: &Scene,
+    noise: NoiseValues,
+    settings: SettingValues,
+    point_in_world_m: PyReadonlyArray2<'py, f64>,
+    voter_offsets: PyReadonlyArray1<'py, i64>,
+    voters: PyReadonlyArray1<'py, u32>,
+    is_searched: bool,
+    threads: usize,
+    progress: &Bound<'py, PyAny>,
+) -> PyResult<FoundObjects<'py>> {
+    let points = rows_of(&point_in_world_m)?;
+    let groups = crate::arrays::split(points.len(), voter_offsets.as_slice()?, voters.as_slice()?)?;
+    let begun = points.iter().zip(groups).map(|(&point, votes)| (votes.to_vec(), point.into())).collect();
+    let settings = settings_of(settings);
+    let found = with_progress(py, threads, 0, progress, |progress| {
+        valuemap_core::robust::objects_of(&scene.0, &noise_of(noise), &settings, begun, is_searched, progress)
+    })?;
+    let mut offsets = vec![0_i64];
+    let mut voters: Vec<u32> = Vec::new();
+    for object in &found {
+        voters.extend(&object.votes);
+        offsets.push(voters.len() as i64);
+    }
+    let energy: Vec<f64> = found.iter().map(|object| object.energy).collect();
+    Ok((
+        energy.into_pyarray(py),
+        (offsets.into_pyarray(py), voters.into_pyarray(py)),
+        matrix(py, found.iter().map(|object| object.fit.point))?,
+    ))
 }

@@ -11,7 +11,6 @@ use rayon::prelude::*;
 
 use super::drift::Drive;
 use super::estimate::{by_pass, looks_at};
-use super::label::Label;
 use super::noise::Noise;
 use super::scene::Scene;
 
@@ -29,6 +28,9 @@ const STEPS: [f64; 5] = [2.0, 1.5, 1.25, 1.12, 1.06];
 const TRUST_LOG_SD: f64 = 1.0;
 /// The part of the variance of distant objects' residuals that is taken for rotation.
 const ROTATION_PART: f64 = 0.5;
+/// The part of the variance of what the images of a leg share that each of them has for itself all the same: errors that forget 63 % of
+/// themselves along a leg differ by twice this between images that are a tenth of a leg apart, as viewpoints are (Ornstein-Uhlenbeck).
+const ROUGHNESS: f64 = 0.1;
 /// Where fewer labels are seen by several passes, the shared part is taken to be as large as the own part.
 const MIN_SHARED_LABELS: usize = 5;
 /// One label says no more than this about the disagreement of passes, as a multiple of what is expected.
@@ -40,7 +42,10 @@ const DETECTION_PX: (f64, f64) = (0.05, 30.0);
 const BOX_SHARE: (f64, f64) = (1e-3, 0.15);
 const POSITION_M: (f64, f64) = (1e-4, 5.0);
 /// Shared errors over own errors of a pose.
-const DRIFT_RATIO: (f64, f64) = (0.3, 2.5);
+const DRIFT_RATIO: (f64, f64) = (0.1, 1000.0);
+
+/// Votes (ascending) and a position.
+pub type Placed = (Vec<u32>, Vector3<f64>);
 
 /// Which parts of the noise the user knows; they stay as they are.
 #[derive(Debug, Clone, Copy, Default)]
@@ -57,59 +62,64 @@ pub struct Known {
 ///
 /// The guess is returned where there are too few labels to tell.
 #[must_use]
-pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Label], known: Known) -> Noise {
+pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) -> Noise {
     let sample = sample(scene, guess, labels);
     if sample.len() < 3 {
         return *guess;
     }
-    let sum = |of: &(dyn Fn(&Label) -> f64 + Sync)| -> f64 {
+    let sum = |of: &(dyn Fn(&Placed) -> f64 + Sync)| -> f64 {
         // Summed in the order of the labels, so that threads do not change the result.
         sample.par_iter().map(|label| of(label)).collect::<Vec<f64>>().iter().sum()
     };
-    // All errors as if each image had them for itself, rotation as if it were the detections'.
-    let fixed = [known.detection && known.rotation, known.detection, known.position];
-    let total = |p: &[f64; 3]| Noise {
-        detection_px: p[0],
-        box_share: p[1],
-        position_m: p[2],
-        rotation_rad: 0.0,
-        position_drift_m: 0.0,
-        rotation_drift_rad: 0.0,
+    let scale2 = sample.iter().flat_map(|object| &object.0).map(|&ray| scene.scale2[ray as usize]);
+    let scale2 = scale2.sum::<f64>() / sample.iter().map(|object| object.0.len()).sum::<usize>() as f64;
+    // What is rotation of an image alone and what is its detections', residuals of one focal length do not tell.
+    let (known_px2, known_rad2) = (guess.detection_px.powi(2), guess.rotation_rad.powi(2));
+    let far_of = |px2: f64| match (known.detection, known.rotation) {
+        (true, true) => (guess.detection_px, guess.rotation_rad),
+        (true, false) => (guess.detection_px, ((px2 - known_px2).max(0.0) / scale2).sqrt()),
+        (false, true) => ((px2 - scale2 * known_rad2).max(DETECTION_PX.0.powi(2)).sqrt(), guess.rotation_rad),
+        (false, false) => (((1.0 - ROTATION_PART) * px2).sqrt(), (ROTATION_PART * px2 / scale2).sqrt()),
     };
-    let scale2 = sample.iter().flat_map(|label| &label.voters).map(|&ray| scene.scale2[ray as usize]);
-    let scale2 = scale2.sum::<f64>() / sample.iter().map(|label| label.voters.len()).sum::<usize>() as f64;
-    let rotation = guess.rotation_rad.hypot(guess.rotation_drift_rad);
-    let start = [
-        (guess.detection_px.powi(2) + scale2 * rotation * rotation).sqrt(),
-        guess.box_share,
-        guess.position_m.hypot(guess.position_drift_m),
-    ];
-    let found = search(start, [DETECTION_PX, BOX_SHARE, POSITION_M], fixed, &|p| {
-        let noise = total(p);
-        sum(&|label| minus_log_likelihood(scene, &noise, &label.voters, &label.estimate.point))
-    });
-    let far2 = found[0] * found[0];
-    let rotation2 = if known.rotation { rotation * rotation } else { ROTATION_PART * far2 / scale2 };
-    let with_drift = |ratio: f64| {
-        // The size of all errors together stays: it is what the gate follows.
-        let own = (1.0 + ratio * ratio).sqrt().recip();
-        let (position, rotation) = (found[2] * own, rotation2.sqrt() * own);
+    let noise_of = |p: &[f64; 5], ratio: f64| {
+        let [position_leg_m, rotation_leg_rad] = [p[3], p[4]];
+        // What images of a leg share is not quite the same for all of them.
+        let rough = |of_leg: f64| if of_leg > 0.0 { ROUGHNESS * of_leg * of_leg } else { 0.0 };
+        let (detection_px, rotation_rad) = far_of(p[0] * p[0] + scale2 * rough(rotation_leg_rad));
+        // Passes that disagree are shifted: they turn no more than their images and legs do.
+        let rotation_share_rad = rotation_rad.hypot(rotation_leg_rad);
+        let position_m = if known.position { p[2] } else { (p[2] * p[2] + rough(position_leg_m)).sqrt() };
         Noise {
-            detection_px: if known.detection { guess.detection_px } else { ((1.0 - ROTATION_PART) * far2).sqrt() },
-            box_share: found[1],
-            position_m: position,
-            rotation_rad: rotation,
-            position_drift_m: position * ratio,
-            rotation_drift_rad: rotation * ratio,
+            detection_px,
+            box_share: p[1],
+            position_m,
+            rotation_rad,
+            position_leg_m,
+            rotation_leg_rad,
+            position_drift_m: position_m.hypot(position_leg_m) * ratio,
+            rotation_drift_rad: rotation_share_rad,
         }
     };
-    with_drift(agreeing_ratio(scene, &sample, &with_drift))
+    let fixed = [known.detection && known.rotation, known.detection, known.position, known.position, known.rotation];
+    let start = [
+        (known_px2 + scale2 * known_rad2).sqrt(),
+        guess.box_share,
+        guess.position_m,
+        guess.position_leg_m,
+        guess.rotation_leg_rad,
+    ];
+    let rotation_rad = (DETECTION_PX.0 / scale2.sqrt(), DETECTION_PX.1 / scale2.sqrt());
+    let found = search(start, [DETECTION_PX, BOX_SHARE, POSITION_M, POSITION_M, rotation_rad], fixed, &|p| {
+        let noise = noise_of(p, 1.0);
+        sum(&|object| minus_log_likelihood(scene, &noise, &object.0, &object.1))
+    });
+    noise_of(&found, agreeing_ratio(scene, &sample, &|ratio| noise_of(&found, ratio)))
 }
 
-/// The ratio of shared to own pose errors at which the passes of labels disagree as much as expected: by bisection, since
-/// the larger the shared errors are taken for, the less remains unexplained.
-fn agreeing_ratio(scene: &Scene, labels: &[&Label], noise_of: &(dyn Fn(f64) -> Noise + Sync)) -> f64 {
-    let excess = |ratio: f64| mean_disagreement(scene, &noise_of(ratio), labels).map(|mean| mean - 1.0);
+/// The ratio of the drift of positions to the errors of images and legs at which the passes of objects disagree as much as expected: by bisection, since
+/// the larger the drift is taken for, the less remains unexplained.
+fn agreeing_ratio(scene: &Scene, objects: &[&Placed], noise_of: &(dyn Fn(f64) -> Noise + Sync)) -> f64 {
+    let excess = |ratio: f64| mean_disagreement(scene, &noise_of(ratio), objects).map(|mean| mean - 1.0);
     let (mut low, mut high) = (DRIFT_RATIO.0.ln(), DRIFT_RATIO.1.ln());
     for _ in 0..12 {
         let middle = 0.5 * (low + high);
@@ -125,28 +135,29 @@ fn agreeing_ratio(scene: &Scene, labels: &[&Label], noise_of: &(dyn Fn(f64) -> N
 /// How much larger than they are said to be the errors are that labels of several passes show: the mean disagreement of
 /// their passes, at least 1. The variance of positions is to be multiplied by it. About `most` of the labels serve.
 #[must_use]
-pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Label], most: usize) -> f64 {
-    let labels: Vec<&Label> = labels.iter().step_by((labels.len() / most).max(1)).collect();
-    let of_label = |label: &&Label| *label.known.disagreement.get_or_init(|| disagreement(scene, noise, label));
-    mean(labels.par_iter().map(of_label).collect()).unwrap_or(1.0).max(1.0)
+pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Placed], most: usize) -> f64 {
+    let labels: Vec<&Placed> = labels.iter().step_by((labels.len() / most).max(1)).collect();
+    mean_disagreement(scene, noise, &labels).unwrap_or(1.0).max(1.0)
 }
 
-fn mean_disagreement(scene: &Scene, noise: &Noise, labels: &[&Label]) -> Option<f64> {
+fn mean_disagreement(scene: &Scene, noise: &Noise, labels: &[&Placed]) -> Option<f64> {
     mean(labels.par_iter().map(|label| disagreement(scene, noise, label)).collect())
 }
 
 /// The mean of those that are known, without letting one say too much.
-fn mean(of_labels: Vec<Option<f64>>) -> Option<f64> {
+#[must_use]
+pub fn mean(of_labels: Vec<Option<f64>>) -> Option<f64> {
     let known: Vec<f64> = of_labels.into_iter().flatten().map(|d| d.min(MOST_DISAGREEMENT)).collect();
     (known.len() >= MIN_SHARED_LABELS).then(|| known.iter().sum::<f64>() / known.len() as f64)
 }
 
 /// How far the positions that the passes of a label give it alone lie from their mean: squared, in sigmas, a degree of
 /// freedom. Nothing for labels of a single pass.
-fn disagreement(scene: &Scene, noise: &Noise, label: &Label) -> Option<f64> {
+#[must_use]
+pub fn disagreement(scene: &Scene, noise: &Noise, (votes, point): &Placed) -> Option<f64> {
     let (mut information, mut gradient, mut alone, mut passes) = (Matrix3::zeros(), Vector3::zeros(), 0.0, 0);
-    for pass in by_pass(scene, &label.voters).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS) {
-        let looks = looks_at(scene, noise, pass, &label.estimate.point)?;
+    for pass in by_pass(scene, votes).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS) {
+        let looks = looks_at(scene, noise, pass, point)?;
         let (of_pass, by_pass) = Drive::at_one(&looks)?.normals.of_one();
         alone += by_pass.dot(&of_pass.cholesky()?.solve(&by_pass));
         information += of_pass;
@@ -197,10 +208,10 @@ fn search<const N: usize>(
 
 /// Well supported labels, evenly over the map, together about as many voters as needed. Those whose residuals fit the
 /// guess worst are left out: wrong associations would be taken for noise.
-fn sample<'a>(scene: &Scene, guess: &Noise, labels: &'a [Label]) -> Vec<&'a Label> {
-    let mut good: Vec<(f64, &Label)> = labels
+fn sample<'a>(scene: &Scene, guess: &Noise, labels: &'a [Placed]) -> Vec<&'a Placed> {
+    let mut good: Vec<(f64, &Placed)> = labels
         .iter()
-        .filter(|label| label.voters.len() >= MIN_VOTES)
+        .filter(|label| label.0.len() >= MIN_VOTES)
         .map(|label| (misfit(scene, guess, label), label))
         .collect();
     let mut misfits: Vec<f64> = good.iter().map(|(misfit, _)| *misfit).collect();
@@ -208,33 +219,31 @@ fn sample<'a>(scene: &Scene, guess: &Noise, labels: &'a [Label]) -> Vec<&'a Labe
     if let Some(&limit) = misfits.get((misfits.len() as f64 * FIT_SHARE) as usize) {
         good.retain(|(misfit, _)| *misfit <= limit);
     }
-    let good: Vec<&Label> = good.into_iter().map(|(_, label)| label).collect();
-    let votes: usize = good.iter().map(|label| label.voters.len()).sum();
+    let good: Vec<&Placed> = good.into_iter().map(|(_, label)| label).collect();
+    let votes: usize = good.iter().map(|label| label.0.len()).sum();
     let stride = (votes / SAMPLE_VOTES).max(1);
     good.into_iter().step_by(stride).collect()
 }
 
 /// Squared residuals of a label in sigmas, shared errors taken out, a residual.
-fn misfit(scene: &Scene, noise: &Noise, label: &Label) -> f64 {
-    let passes = by_pass(scene, &label.voters);
-    let of_pass = |pass| Some(Drive::at_one(&looks_at(scene, noise, pass, &label.estimate.point)?)?.normals.square);
-    passes.filter_map(of_pass).sum::<f64>() / label.voters.len() as f64
+fn misfit(scene: &Scene, noise: &Noise, label: &Placed) -> f64 {
+    let passes = by_pass(scene, &label.0);
+    let of_pass = |pass| Some(Drive::at_one(&looks_at(scene, noise, pass, &label.1)?)?.normals.square);
+    passes.filter_map(of_pass).sum::<f64>() / label.0.len() as f64
 }
 
-/// Minus twice the logarithm of the restricted likelihood of voters' residuals (ordered by pass) around a point, up to a
-/// constant.
-fn minus_log_likelihood(scene: &Scene, noise: &Noise, voters: &[u32], point: &Vector3<f64>) -> f64 {
-    let (mut information, mut gradient) = (Matrix3::zeros(), Vector3::zeros());
+/// Minus twice the logarithm of the restricted likelihood of votes' residuals (ascending) around a point, up to a constant: each visit may
+/// put the object elsewhere, so that what visits disagree about is not taken for errors within them.
+fn minus_log_likelihood(scene: &Scene, noise: &Noise, votes: &[u32], point: &Vector3<f64>) -> f64 {
     let mut value = 0.0;
-    for pass in by_pass(scene, voters) {
-        let Some(looks) = looks_at(scene, noise, pass, point) else { return 0.0 };
+    for visit in by_pass(scene, votes).filter(|visit| visit.len() >= MIN_VOTES_OF_PASS) {
+        let Some(looks) = looks_at(scene, noise, visit, point) else { return 0.0 };
         let Some(drive) = Drive::at_one(&looks) else { return 0.0 };
-        let (of_pass, by_pass) = drive.normals.of_one();
-        information += of_pass;
-        gradient += by_pass;
+        let (information, gradient) = drive.normals.of_one();
+        let Some(cholesky) = information.cholesky() else { return 0.0 };
         value += drive.normals.square + drive.log_determinant();
+        value += 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
+        value -= gradient.dot(&cholesky.solve(&gradient));
     }
-    let Some(cholesky) = information.cholesky() else { return 0.0 };
-    value += 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
-    value - gradient.dot(&cholesky.solve(&gradient))
+    value
 }

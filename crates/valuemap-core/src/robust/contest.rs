@@ -10,9 +10,9 @@ use rstar::RTree;
 use rstar::primitives::GeomWithData;
 use rustc_hash::FxHashSet;
 
+use super::energy::{Object, by_place};
 use super::estimate::{Estimate, Solution};
 use super::index::chi2_in_gate;
-use super::label::{Label, by_place};
 use super::noise::Noise;
 use super::scene::Scene;
 
@@ -29,7 +29,7 @@ pub struct Contest<'a> {
     scene: &'a Scene,
     noise: &'a Noise,
     gate_sigmas: f64,
-    labels: &'a [Label],
+    labels: &'a [Object],
     tree: RTree<GeomWithData<[f64; 3], usize>>,
     /// The images that show each label.
     shown_in: Vec<FxHashSet<u32>>,
@@ -38,8 +38,8 @@ pub struct Contest<'a> {
 impl<'a> Contest<'a> {
     /// Begin with all labels of a scene.
     #[must_use]
-    pub fn new(scene: &'a Scene, noise: &'a Noise, gate_sigmas: f64, labels: &'a [Label]) -> Self {
-        let images = |label: &Label| label.voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
+    pub fn new(scene: &'a Scene, noise: &'a Noise, gate_sigmas: f64, labels: &'a [Object]) -> Self {
+        let images = |label: &Object| label.votes.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
         let shown_in = labels.par_iter().map(images).collect();
         Self { scene, noise, gate_sigmas, labels, tree: by_place(labels), shown_in }
     }
@@ -61,7 +61,7 @@ impl<'a> Contest<'a> {
         let (seen, spread) = (self.scene.ray(ray), self.noise.total(self.scene, ray));
         self.labels[neighbor].class == self.scene.rays.class[ray as usize]
             && !self.shown_in[neighbor].contains(&self.scene.rays.image[ray as usize])
-            && chi2_in_gate(seen, &self.labels[neighbor].estimate.point, &spread, self.gate_sigmas).is_some()
+            && chi2_in_gate(seen, &self.labels[neighbor].fit.point, &spread, self.gate_sigmas).is_some()
     }
 }
 

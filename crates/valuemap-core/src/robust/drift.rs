@@ -22,6 +22,8 @@ type Matrix3x6 = SMatrix<f64, 3, 6>;
 pub const DRIFT_LENGTH_M: f64 = 100.0;
 /// Freedom left to a residual that the point follows altogether, as a share of its variance.
 const LEAST_FREEDOM: f64 = 1e-3;
+/// A leg's own error is at least this share of the drift: less is no error, and its inverse no number.
+const LEAST_SHARE: f64 = 1e-4;
 /// Drifting errors are one within this distance, m.
 pub const LEG_M: f64 = 10.0;
 
@@ -38,8 +40,10 @@ pub struct Look {
     pub by_point: [Vector3<f64>; 2],
     /// By the error of the image's rotation (rad, in the world); by that of its position it is as by the label's.
     pub by_turn: [Vector3<f64>; 2],
-    /// Standard deviations of the part of these errors that drifts.
+    /// Standard deviations of the part of these errors that drifts along the pass.
     pub drift_sigma: Sigmas,
+    /// Of the part that the images of one leg share, and no others.
+    pub leg_sigma: Sigmas,
     /// Of the part that the image has for itself.
     pub own_sigma: Sigmas,
     /// Variance of the detection, each axis, px².
@@ -57,6 +61,7 @@ pub struct Vantage {
     image: u32,
     driven_m: f64,
     drift_sigma: Sigmas,
+    leg_sigma: Sigmas,
     own_sigma: Sigmas,
     detection_px2: f64,
     /// Of all errors but the drift.
@@ -74,7 +79,8 @@ impl Vantage {
             ray: *scene.ray(ray),
             image: scene.rays.image[ray as usize],
             driven_m: view.driven_m,
-            drift_sigma: noise.shared(view),
+            drift_sigma: noise.of_drift(view),
+            leg_sigma: noise.of_leg(view),
             own_sigma: noise.of_image(view),
             detection_px2: noise.detection_px2(scene, ray),
             spread: noise.own(scene, ray),
@@ -125,6 +131,7 @@ impl Vantage {
             by_point,
             by_turn: by_point.map(|column| away.cross(&column)),
             drift_sigma: self.drift_sigma,
+            leg_sigma: self.leg_sigma,
             own_sigma: self.own_sigma,
             detection_px2: self.detection_px2,
             variance: self.spread.variance(projected.z),
@@ -173,6 +180,7 @@ impl Look {
     pub fn with_drift(mut self, error: &Vector6, remainder: Sigmas) -> Self {
         self.shift(error);
         self.drift_sigma = remainder;
+        self.leg_sigma = Sigmas::NONE;
         self
     }
 
@@ -182,6 +190,15 @@ impl Look {
     pub fn by_pose(&self, axis: usize) -> Vector6 {
         let (shift, turn) = (&self.by_point[axis], &self.by_turn[axis]);
         Vector6::new(shift.x, shift.y, shift.z, turn.x, turn.y, turn.z)
+    }
+
+    /// Standard deviations of all that the image shares with others of its leg.
+    #[must_use]
+    pub fn shared_sigma(&self) -> Sigmas {
+        Sigmas {
+            position_m: self.leg_sigma.position_m.hypot(self.drift_sigma.position_m),
+            rotation_rad: self.leg_sigma.rotation_rad.hypot(self.drift_sigma.rotation_rad),
+        }
     }
 
     fn shift(&mut self, error: &Vector6) {
@@ -257,12 +274,23 @@ pub struct Drive<'a> {
     legs: Vec<Solved>,
 }
 
-/// What the looks of a leg, those before, and its tie to the next leg say about its drift, in sigmas.
+/// What is said about the pose error of a leg, in sigmas of the drift: by the looks of the leg, or about its drift by all before.
 struct Leg {
     information: Matrix6,
     gradient: Vector6,
     /// How it depends on the positions of the labels seen so far.
     cross: Vec<(usize, Matrix3x6)>,
+}
+
+/// The error that a leg has for itself, taken out: what it is once its drift is known.
+struct OwnOfLeg {
+    /// What its looks say of the error of the leg, drift and own, in sigmas of the drift.
+    information: Matrix6,
+    gradient: Vector6,
+    /// Its covariance once its looks are known, in sigmas of the drift.
+    covariance: Matrix6,
+    /// What the marginalisation adds to the logarithm of the determinant.
+    ln_determinant: f64,
 }
 
 /// A leg whose drift is taken out.
@@ -274,6 +302,8 @@ struct Solved {
     tie: f64,
     /// How stiff this pull is.
     stiffness: f64,
+    /// The error that the leg has for itself; nothing if it has none.
+    own: Option<OwnOfLeg>,
 }
 
 impl<'a> Drive<'a> {
@@ -288,12 +318,13 @@ impl<'a> Drive<'a> {
     pub fn along(looks: &'a [Look], weights: &[f64], labels: usize) -> Option<Self> {
         let mut normals = Normals::nothing(labels);
         // The prior of the first leg: drifts are counted in their own sigmas.
-        let mut leg = Leg { information: Matrix6::identity(), gradient: Vector6::zeros(), cross: Vec::new() };
+        let mut carried = Leg { information: Matrix6::identity(), ..Leg::nothing() };
         let mut legs = Vec::new();
         let mut start = 0;
         while start < looks.len() {
             let end = start + leg_length(&looks[start..]);
             let mut at = start;
+            let mut leg = Leg::nothing();
             for image in looks[start..end].chunk_by(|a, b| a.image == b.image) {
                 let weights = &weights[at..at + image.len()];
                 if image[0].own_sigma == Sigmas::NONE {
@@ -306,9 +337,15 @@ impl<'a> Drive<'a> {
             // The next leg's drift is `keep` times this one's, and something new of variance `1 - keep²`.
             let distance = looks.get(end).map_or(f64::INFINITY, |next| (next.driven_m - looks[start].driven_m).abs());
             let keep = (-distance / DRIFT_LENGTH_M).exp();
-            let (solved, next) = leg.take_out(keep, start..end, &mut normals)?;
+            let of_leg = looks[start].leg_sigma;
+            let own = if of_leg == Sigmas::NONE {
+                None
+            } else {
+                Some(leg.take_own_out(of_leg, looks[start].drift_sigma, &mut normals)?)
+            };
+            let (solved, next) = carried.and(&leg).take_out(keep, start..end, own, &mut normals)?;
             legs.push(solved);
-            leg = next;
+            carried = next;
             start = end;
         }
         Some(Self { normals, looks, legs })
@@ -318,11 +355,14 @@ impl<'a> Drive<'a> {
     #[must_use]
     pub fn log_determinant(&self) -> f64 {
         let of_looks: f64 = self.looks.iter().map(|look| 2.0 * look.detection_px2.ln()).sum();
-        let of_leg = |leg: &Solved| leg.information.determinant.ln() - 6.0 * leg.stiffness.ln();
+        let of_leg = |leg: &Solved| {
+            let of_own = leg.own.as_ref().map_or(0.0, |own| own.ln_determinant);
+            leg.information.determinant.ln() - 6.0 * leg.stiffness.ln() + of_own
+        };
         of_looks + self.legs.iter().map(of_leg).sum::<f64>()
     }
 
-    /// Residuals, px, after the most probable drift is taken out, in the order of the looks.
+    /// Residuals, px, after the most probable error of the leg is taken out, in the order of the looks.
     #[must_use]
     pub fn left(&self) -> Vec<Vector2<f64>> {
         let mut left = Vec::with_capacity(self.looks.len());
@@ -333,13 +373,18 @@ impl<'a> Drive<'a> {
         left
     }
 
-    /// The most probable drift on each leg, in sigmas.
+    /// The most probable error of each leg, its drift and its own, in sigmas of the drift.
     fn drifts(&self) -> Vec<Vector6> {
         let mut drifts = vec![Vector6::zeros(); self.legs.len()];
         let mut of_next = Vector6::zeros();
         for (leg, drift) in self.legs.iter().zip(&mut drifts).rev() {
             *drift = leg.information.matrix * (of_next * leg.tie + leg.gradient);
             of_next = *drift;
+        }
+        for (leg, drift) in self.legs.iter().zip(&mut drifts) {
+            if let Some(own) = &leg.own {
+                *drift += own.covariance * (own.gradient - own.information * *drift);
+            }
         }
         drifts
     }
@@ -476,8 +521,58 @@ impl Leg {
         }
     }
 
+    fn nothing() -> Self {
+        Self { information: Matrix6::zeros(), gradient: Vector6::zeros(), cross: Vec::new() }
+    }
+
+    /// Both, which must not rest on the same looks.
+    fn and(mut self, other: &Self) -> Self {
+        self.information += other.information;
+        self.gradient += other.gradient;
+        other.cross.iter().for_each(|(label, cross)| self.add_cross(*label, cross));
+        self
+    }
+
+    /// Take the error out that the leg has for itself; what remains is said of its drift. Nothing if numbers overflow.
+    fn take_own_out(&mut self, own: Sigmas, drift: Sigmas, normals: &mut Normals) -> Option<OwnOfLeg> {
+        let share = own.each().zip_map(&drift.each(), |own, drift| if drift > 0.0 { own / drift } else { 0.0 });
+        let share = share.map(|share| share.max(LEAST_SHARE));
+        let known = Inverse::of(&(Matrix6::identity() + scaled(&self.information, &share)))?;
+        let covariance = scaled(&known.matrix, &share);
+        let of_leg = OwnOfLeg {
+            information: self.information,
+            gradient: self.gradient,
+            covariance,
+            ln_determinant: known.determinant.ln(),
+        };
+        for (i, (a, of_a)) in self.cross.iter().enumerate() {
+            let by_own = of_a * covariance;
+            normals.add_gradient(*a, &-(by_own * self.gradient));
+            for (b, of_b) in &self.cross[..i] {
+                let both = -(by_own * of_b.transpose());
+                normals.add(*a, *b, &both);
+                normals.add(*b, *a, &both.transpose());
+            }
+            normals.add(*a, *a, &-(by_own * of_a.transpose()));
+        }
+        normals.square -= self.gradient.dot(&(covariance * self.gradient));
+        // Without differences of large numbers: with S the share and K the inverse of I + S M S, what is left of M is S⁻¹ (I - K) S⁻¹.
+        let per_share = share.map(f64::recip);
+        let kept = Matrix6::from_diagonal(&share) * known.matrix * Matrix6::from_diagonal(&per_share);
+        self.cross.iter_mut().for_each(|(_, cross)| *cross *= kept);
+        self.gradient = kept.tr_mul(&self.gradient);
+        self.information = scaled(&(Matrix6::identity() - known.matrix), &per_share);
+        Some(of_leg)
+    }
+
     /// Take the drift of this leg out; what remains is known of the next one's, which is `keep` times this one's.
-    fn take_out(self, keep: f64, looks: Range<usize>, normals: &mut Normals) -> Option<(Solved, Self)> {
+    fn take_out(
+        self,
+        keep: f64,
+        looks: Range<usize>,
+        own: Option<OwnOfLeg>,
+        normals: &mut Normals,
+    ) -> Option<(Solved, Self)> {
         let stiffness = 1.0 / (1.0 - keep * keep);
         let tie = keep * stiffness;
         let information = Inverse::of(&(self.information + Matrix6::identity() * (keep * tie)))?;
@@ -499,7 +594,7 @@ impl Leg {
             gradient: by_gradient * tie,
             cross: by_cross.into_iter().map(|(a, cross)| (a, cross * tie)).collect(),
         };
-        Some((Solved { looks, information, gradient: self.gradient, tie, stiffness }, next))
+        Some((Solved { looks, information, gradient: self.gradient, tie, stiffness, own }, next))
     }
 }
 

@@ -124,7 +124,9 @@ impl<'a> RayIndex<'a> {
                     let of_ray = near.filter_map(|(_, point)| self.hit(place.rays[lane_of(bit)], point, range_m));
                     of_ray.min_by(|a, b| a.chi2.total_cmp(&b.chi2))
                 };
-                hits.extend(ones(any).filter(|&bit| place.classes[lane_of(bit)] == class).filter_map(nearest));
+                // Points far away may be in the gate of lanes without a ray, as far as single precision tells.
+                let of_class = |&bit: &u32| place.classes.get(lane_of(bit)) == Some(&class);
+                hits.extend(ones(any).filter(of_class).filter_map(nearest));
             }
         }
         hits

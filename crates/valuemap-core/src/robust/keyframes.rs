@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use rustc_hash::FxHashSet;
 
-use super::label::{Known, Label, Revision};
+use super::initial::label::{Known, Label, Revision};
 use super::scene::Scene;
 use crate::ray::Rays;
 

@@ -1,63 +1,53 @@
-//! The robust method: near perfect where the data allow it, sure of what it says, linear in the data.
+//! The robust method: one energy J, and a search for the map with the least.
 //!
-//! 1. [`noise`]: a pose-aware gate in sigmas instead of a radius in pixels.
-//! 2. [`nominate`](mod@nominate): each ray meets few partners ([`sample`]) and nominates the point that a sample of images supports best.
-//! 3. [`gather`](mod@gather): the best supported nomination is polished to a [`label`], on its voters and from its estimate,
-//!    until the voters stay the same ([`quick`]); its voters leave; and so on. Rays left over get further rounds among
-//!    themselves.
-//! 4. [`associate`](mod@associate): all labels compete for all detections, the pose errors of the images taken out
-//!    ([`poses`]), neighbors first untangled ([`exchange`](mod@exchange)); then the labels of each place are estimated together
-//!    ([`adjust`](mod@adjust)), and those that agree within their covariances and are never seen side by side become one
-//!    ([`settle`]). Again and again, but only where labels changed; and neighbors hand over what the other one explains
-//!    better ([`handover`]).
-//! 5. [`existence`]: hits and misses among the looks that should have seen it say how probable a label is.
-//! 6. [`estimate`](mod@estimate): positions and covariances, with the pose errors of images and passes ([`drift`]), and
-//!    with what votes that might be a neighbor's may have done ([`contest`]).
-//! 7. [`calibrate`](mod@calibrate): the noise itself is estimated from the labels' residuals.
-//!
-//! Large scenes go through this first with a part of their images, the [`keyframes`].
+//! 1. [`scene`], [`noise`], [`model`]: what was seen, its errors, and what is learned about each class.
+//! 2. [`propose`](mod@propose): each ray meets few partners ([`sample`]) and proposes the point that a sample of images supports best.
+//! 3. [`births`](mod@births): the best supported hypothesis takes its votes, and is born if J ([`energy`]) falls.
+//! 4. [`assign`](mod@assign): all objects compete for all detections.
+//! 5. [`finish`](mod@finish): positions and covariances, objects of a place together ([`estimate`](mod@estimate), [`drift`], [`contest`]).
+//! 6. [`calibrate`]: the noise itself is estimated from the residuals; [`learn`](mod@learn): rates, sizes and clutter are.
 
-pub mod adjust;
-pub mod associate;
+pub mod assign;
+pub mod births;
 pub mod calibrate;
 pub mod contest;
-mod court;
 pub mod drift;
+pub mod energy;
 pub mod estimate;
-pub mod exchange;
-pub mod existence;
-pub mod gather;
-pub mod grant;
-pub mod handover;
+pub mod finish;
 pub mod index;
+pub mod initial;
 pub mod keyframes;
-pub mod label;
+pub mod learn;
+pub mod looks;
+pub mod model;
 pub mod noise;
-pub mod nominate;
-pub mod pairs;
+
 pub mod poses;
+pub mod propose;
 pub mod quick;
-pub mod rivals;
+pub mod rearrange;
+pub mod repair;
 pub mod sample;
 pub mod scene;
-pub mod settle;
+pub mod search;
 mod spd;
-
-use rayon::prelude::*;
 
 use crate::hypothesis::Viability;
 use crate::progress::{Halt, Progress};
 
-use adjust::adjust;
 use calibrate::Known;
-use court::{Court, Judgement, judge};
-use estimate::Care;
-use existence::Rates;
-use gather::gather;
-use keyframes::Keyframes;
-use label::Label;
+use energy::{Object, object};
+use estimate::Estimate;
+use finish::finish;
+use index::RayIndex;
+use learn::learn;
+use looks::Lookout;
+use model::{Model, Rates};
 use noise::{Noise, Spread};
+use rayon::prelude::*;
 use scene::Scene;
+use search::{Depth, search};
 
 /// Settings of the robust method.
 #[derive(Debug, Clone, Copy)]
@@ -83,35 +73,24 @@ pub struct Without {
     pub merge: bool,
 }
 
-/// Rays of the places that the noise is estimated from, about.
-const CALIBRATION_RAYS: usize = 20_000;
+/// Rays of the places that the noise is estimated from, about: from each start, and from the best in the end.
+const CALIBRATION_RAYS: (usize, usize) = (4_000, 10_000);
 /// How much wider the gate is while the noise is estimated: what a gate cuts off is missing in the estimate.
 const CALIBRATION_GATE: f64 = 1.4;
 /// Times that the noise is estimated anew, from labels found with the last estimate.
 const CALIBRATION_ROUNDS: usize = 3;
-
-/// How labels are found among the rays of a scene.
-struct Schedule {
-    /// Times that the rays of no label are gathered, at most: what is left over gets less and less.
-    sessions: usize,
-    /// Times that labels compete before any is doubted.
-    rounds: usize,
-    /// Times that neighbors hand over votes before any is doubted, and after, at most.
-    handovers: usize,
-}
-
-/// For all images of a scene.
-const WHOLE: Schedule = Schedule { sessions: 3, rounds: 4, handovers: 3 };
-/// For the keyframes of a large one.
-const KEYFRAMES: Schedule = Schedule { sessions: 1, handovers: 1, ..WHOLE };
-/// For all its images, when labels competed in the keyframes.
-const REFINING: Schedule = Schedule { sessions: 1, rounds: 2, handovers: 0 };
+/// The noise is sought from starts that differ by these factors.
+const STARTS: [f64; 3] = [0.15, 0.5, 1.5];
+/// Scenes with more rays than this are searched less deeply.
+const MOST_RAYS: usize = 100_000;
 
 /// A label with what speaks for it.
 #[derive(Debug, Clone)]
 pub struct Finding {
-    /// Position, covariance, class and voters.
-    pub label: Label,
+    /// Position and covariance.
+    pub estimate: Estimate,
+    /// The rays that vote for it, ascending.
+    pub votes: Vec<u32>,
     /// Probability that it exists.
     pub existence: f64,
     /// Images that should have seen it.
@@ -121,29 +100,27 @@ pub struct Finding {
 /// What became of everything that was proposed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Tally {
-    /// Points nominated by rays.
-    pub nominations: u64,
-    /// Nominations that were polished to labels.
-    pub accepted: u64,
-    /// Labels that became part of another one.
-    pub fused: u64,
-    /// Labels that lost too many votes to others.
-    pub outvoted: u64,
-    /// Labels that probably do not exist.
-    pub doubted: u64,
+    /// Points proposed by rays.
+    pub hypotheses: u64,
+    /// Objects that were born.
+    pub births: u64,
+    /// Objects that were not worth it in the end.
+    pub deaths: u64,
 }
 
 /// The labels of a scene, and what became of the rest.
 #[derive(Debug, Clone)]
 pub struct Findings {
-    /// Labels, ordered by their lowest voter.
+    /// Labels, ordered by their lowest vote.
     pub findings: Vec<Finding>,
     /// How it came to them.
     pub tally: Tally,
-    /// What was learnt about detection rates.
+    /// What was learned about detection rates.
     pub rates: Rates,
-    /// Detections an image that no label has.
-    pub strays_per_image: f64,
+    /// Detections per image that no label has.
+    pub clutter_per_image: f64,
+    /// J of the map.
+    pub energy: f64,
     /// What the covariances were multiplied by, so that the passes agree.
     pub variance_factor: f64,
 }
@@ -160,21 +137,51 @@ pub fn self_calibrate(
     settings: &Settings,
     progress: &Progress,
 ) -> Result<Noise, Halt> {
-    let rays = sample::places(scene, CALIBRATION_RAYS, settings.viability.max_range_m);
     let settings = Settings { gate_sigmas: settings.gate_sigmas * CALIBRATION_GATE, ..*settings };
-    let mut noise = *guess;
-    for round in 1..=CALIBRATION_ROUNDS {
-        let spreads = spreads_of(scene, &noise);
-        let (mut labels, _) = gather(scene, &noise, &spreads, &settings, &rays, progress)?;
-        if round == CALIBRATION_ROUNDS {
-            let mut court = Court::new(scene, &noise, &spreads, &settings, rays.iter().copied());
-            for _ in 0..WHOLE.rounds {
-                labels = court.settle(labels, true, &mut Tally::default(), progress)?;
-            }
+    let mut best: Option<(f64, Noise)> = None;
+    let round = |noise: &Noise, rays: &[u32], best: &mut Option<(f64, Noise)>| {
+        let mut model = Model::new(scene, noise, &settings);
+        let begun = initial::labels_of_few(&model, rays, progress)?;
+        let objects = search(&mut model, rays, begun, Depth::Shallow, &mut Tally::default(), progress)?;
+        let found = likelihood(&model, &objects, rays);
+        let again = calibrate::calibrate(scene, noise, &placed(&objects), known);
+        if best.is_none_or(|(least, _)| found < least) {
+            *best = Some((found, *noise));
         }
-        noise = calibrate::calibrate(scene, &noise, &labels, known);
+        Ok(again)
+    };
+    let few = sample::places(scene, CALIBRATION_RAYS.0, settings.viability.max_range_m);
+    for factor in STARTS {
+        let mut noise = guess.scaled(factor, known);
+        for _ in 0..CALIBRATION_ROUNDS {
+            noise = round(&noise, &few, &mut best)?;
+        }
     }
-    Ok(noise)
+    // What more rays tell is taken if it makes them likelier.
+    let more = sample::places(scene, CALIBRATION_RAYS.1, settings.viability.max_range_m);
+    let mut noise = best.map_or(*guess, |(_, noise)| noise);
+    let mut best = None;
+    for _ in 0..2 {
+        noise = round(&noise, &more, &mut best)?;
+    }
+    Ok(best.map_or(noise, |(_, noise)| noise))
+}
+
+/// Minus twice the logarithm of the likelihood of some rays, clutter and votes, up to a constant: J, and the Poisson process of what is clutter
+/// otherwise, whose density is that of the rays of no object.
+fn likelihood(model: &Model<'_>, objects: &[Object], rays: &[u32]) -> f64 {
+    let scene = model.scene;
+    let of_class = |class: usize| {
+        let of_class = || rays.iter().filter(|&&ray| scene.rays.class[ray as usize] as usize == class);
+        let here = || objects.iter().filter(|object| object.class as usize == class);
+        let votes: usize = here().map(|object| object.votes.len()).sum();
+        let clutter = of_class().count() - votes;
+        let ln_clutter = ((clutter + 1) as f64 / scene.solid_angle_sr()).ln();
+        let change = ln_clutter - model.classes[class].ln_clutter_per_sr;
+        let all: f64 = of_class().map(|&ray| -2.0 * (model.ln_clutter_per_px2(ray) + change)).sum();
+        all + here().map(|object| object.energy + 2.0 * change * object.votes.len() as f64).sum::<f64>()
+    };
+    (0..model.classes.len()).map(of_class).sum()
 }
 
 /// Find the labels of a scene with a known noise.
@@ -182,52 +189,74 @@ pub fn self_calibrate(
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
 pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progress) -> Result<Findings, Halt> {
-    let mut tally = Tally::default();
-    let keyframes = Keyframes::of(scene);
-    let begun = match &keyframes {
-        Some(keyframes) => found_in(keyframes, noise, settings, &mut tally, progress)?,
-        None => Vec::new(),
-    };
-    let schedule = if keyframes.is_some() { REFINING } else { WHOLE };
-    let spreads = spreads_of(scene, noise);
-    let mut court = Court::new(scene, noise, &spreads, settings, 0..scene.rays.rays.len() as u32);
-    let labels = court.hold(begun, &schedule, &mut tally, progress)?;
-    let labels = adjust(scene, noise, settings.gate_sigmas, settings.min_votes as usize, &labels, Care::Exact);
-    let before = labels.len();
-    let labels = settle::outclass(scene, noise, labels);
-    tally.outvoted += (before - labels.len()) as u64;
-    let Judgement { of_labels, rates, strays_per_image } =
-        judge(scene, &spreads, &court.sectors(&labels), &labels, settings, tally.doubted);
-    let variance_factor = calibrate::variance_factor(scene, noise, &labels, labels.len().max(1));
-    let before = labels.len();
-    let judged = labels.into_iter().zip(of_labels).filter(|(_, (existence, _))| *existence >= settings.min_existence);
-    let findings: Vec<Finding> = judged
-        .map(|(mut label, (existence, expected))| {
-            label.estimate.covariance *= variance_factor;
-            Finding { label, existence, expected }
+    let rays: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
+    let mut model = Model::new(scene, noise, settings);
+    let (begun, first) = initial::labels(&model, progress)?;
+    let mut tally =
+        Tally { hypotheses: first.nominations, births: first.accepted, deaths: first.doubted + first.outvoted };
+    let depth = if rays.len() > MOST_RAYS { Depth::Shallow } else { Depth::Deep };
+    let objects = search(&mut model, &rays, begun, depth, &mut tally, progress)?;
+    let estimates = finish(&model, &objects);
+    let variance_factor = calibrate::variance_factor(scene, noise, &placed(&objects), objects.len().max(1));
+    let claimed: usize = objects.iter().map(|object| object.votes.len()).sum();
+    let energy = objects.iter().map(|object| object.energy).sum();
+    let existence = initial::existence(&model, &objects, &estimates, first.doubted);
+    let findings: Vec<Finding> = objects
+        .into_iter()
+        .zip(estimates)
+        .zip(existence)
+        .map(|((object, mut estimate), (existence, expected))| {
+            estimate.covariance *= variance_factor;
+            Finding { estimate, existence, expected, votes: object.votes }
         })
+        .filter(|finding| finding.existence >= settings.min_existence)
         .collect();
-    tally.doubted += (before - findings.len()) as u64;
-    Ok(Findings { findings, tally, rates, strays_per_image, variance_factor })
-}
-
-/// The labels that the keyframes of a scene show.
-fn found_in(
-    keyframes: &Keyframes,
-    noise: &Noise,
-    settings: &Settings,
-    tally: &mut Tally,
-    progress: &Progress,
-) -> Result<Vec<Label>, Halt> {
-    let scene = &keyframes.scene;
-    let spreads = spreads_of(scene, noise);
-    let mut court = Court::new(scene, noise, &spreads, settings, 0..scene.rays.rays.len() as u32);
-    let labels = court.hold(Vec::new(), &KEYFRAMES, tally, progress)?;
-    Ok(labels.into_iter().map(|label| keyframes.in_whole(label)).collect())
+    Ok(Findings {
+        findings,
+        tally,
+        rates: model.classes.first().map_or(Rates::GUESS, |class| class.rates),
+        clutter_per_image: (scene.rays.rays.len() - claimed) as f64 / scene.views.len() as f64,
+        energy,
+        variance_factor,
+    })
 }
 
 /// The spread of every ray.
 #[must_use]
 pub fn spreads_of(scene: &Scene, noise: &Noise) -> Vec<Spread> {
     (0..scene.rays.rays.len() as u32).into_par_iter().map(|ray| noise.total(scene, ray)).collect()
+}
+
+/// Votes and positions of objects.
+fn placed(objects: &[Object]) -> Vec<calibrate::Placed> {
+    objects.iter().map(|object| (object.votes.clone(), object.fit.point)).collect()
+}
+
+/// The objects that votes (ascending) with positions nearby make: as they are, or what a search from them ends at. For tests and diagnoses.
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn objects_of(
+    scene: &Scene,
+    noise: &Noise,
+    settings: &Settings,
+    begun: Vec<calibrate::Placed>,
+    is_searched: bool,
+    progress: &Progress,
+) -> Result<Vec<Object>, Halt> {
+    let rays: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
+    let mut model = Model::new(scene, noise, settings);
+    if is_searched {
+        return search(&mut model, &rays, begun, Depth::Deep, &mut Tally::default(), progress);
+    }
+    let lookout = Lookout::new(scene, settings.viability.max_range_m);
+    let objects: Vec<Object> =
+        begun.into_iter().filter_map(|(votes, point)| object(&model, &lookout, votes, point, Vec::new())).collect();
+    learn(&mut model, &objects);
+    let index = RayIndex::new(scene, &model.spreads, settings.gate_sigmas, rays.into_iter());
+    let claims = assign::claims_of_all(&model, &index, &objects, progress)?;
+    let again = |(o, claims): (Object, Vec<assign::Claim>)| {
+        object(&model, &lookout, o.votes, o.fit.point, assign::images_of(&claims))
+    };
+    Ok(objects.into_iter().zip(claims).filter_map(again).collect())
 }

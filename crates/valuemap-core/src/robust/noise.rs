@@ -3,6 +3,7 @@
 //! `sigma² = sigma_px² + (f sigma_position / depth)² + (f sigma_rotation)²`: a pose error of 0.1 m is 1 px at 40 m and
 //! 8 px at 5 m, so no single radius in pixels fits.
 
+use super::calibrate::Known;
 use super::scene::{Scene, View};
 use super::spd::Vector6;
 use crate::kernel::Gate;
@@ -21,9 +22,13 @@ pub struct Noise {
     pub position_m: f64,
     /// Of the camera rotation, each axis, each image for itself, rad.
     pub rotation_rad: f64,
-    /// Of the camera position, each axis, shared by a pass, m.
+    /// Of the camera position, each axis, shared by the images of a leg, m.
+    pub position_leg_m: f64,
+    /// Of the camera rotation, each axis, shared by the images of a leg, rad.
+    pub rotation_leg_rad: f64,
+    /// Of the camera position, each axis, drifting along a pass, m.
     pub position_drift_m: f64,
-    /// Of the camera rotation, each axis, shared by a pass, rad.
+    /// Of the camera rotation, each axis, drifting along a pass, rad.
     pub rotation_drift_rad: f64,
 }
 
@@ -74,6 +79,22 @@ impl Spread {
 }
 
 impl Noise {
+    /// The same with all parts that are not known larger by a factor.
+    #[must_use]
+    pub fn scaled(&self, factor: f64, known: Known) -> Self {
+        let scale = |value: f64, is_known: bool| if is_known { value } else { value * factor };
+        Self {
+            detection_px: scale(self.detection_px, known.detection),
+            box_share: scale(self.box_share, known.detection),
+            position_m: scale(self.position_m, known.position),
+            rotation_rad: scale(self.rotation_rad, known.rotation),
+            position_leg_m: scale(self.position_leg_m, known.position),
+            rotation_leg_rad: scale(self.rotation_leg_rad, known.rotation),
+            position_drift_m: scale(self.position_drift_m, known.position),
+            rotation_drift_rad: scale(self.rotation_drift_rad, known.rotation),
+        }
+    }
+
     /// The spread of all errors of a ray together.
     #[must_use]
     pub fn total(&self, scene: &Scene, ray: u32) -> Spread {
@@ -107,23 +128,43 @@ impl Noise {
     /// Standard deviations of position (m) and rotation (rad) that an image has for itself.
     #[must_use]
     pub fn of_image(&self, view: &View) -> Sigmas {
+        self.part(view, self.position_m, self.rotation_rad)
+    }
+
+    /// Standard deviations of position (m) and rotation (rad) that the images of a leg share, and no others.
+    #[must_use]
+    pub fn of_leg(&self, view: &View) -> Sigmas {
+        self.part(view, self.position_leg_m, self.rotation_leg_rad)
+    }
+
+    /// Standard deviations of position (m) and rotation (rad) that drift along a pass.
+    #[must_use]
+    pub fn of_drift(&self, view: &View) -> Sigmas {
+        self.part(view, self.position_drift_m, self.rotation_drift_rad)
+    }
+
+    /// Standard deviations of position (m) and rotation (rad) that an image shares with others of its leg: drift and all.
+    #[must_use]
+    pub fn shared(&self, view: &View) -> Sigmas {
+        let (leg, drift) = (self.of_leg(view), self.of_drift(view));
         Sigmas {
-            position_m: known_share(view.position_sigma_m, self.position_m, self.position_drift_m),
-            rotation_rad: known_share(view.rotation_sigma_rad, self.rotation_rad, self.rotation_drift_rad),
+            position_m: leg.position_m.hypot(drift.position_m),
+            rotation_rad: leg.rotation_rad.hypot(drift.rotation_rad),
         }
     }
 
-    /// Standard deviations of position (m) and rotation (rad) that an image shares with its pass.
-    #[must_use]
-    pub fn shared(&self, view: &View) -> Sigmas {
+    /// A part of all errors of a pose; where the total is known, the parts keep the ratio that was estimated.
+    fn part(&self, view: &View, position_m: f64, rotation_rad: f64) -> Sigmas {
+        let position = self.position_m.hypot(self.position_leg_m).hypot(self.position_drift_m);
+        let rotation = self.rotation_rad.hypot(self.rotation_leg_rad).hypot(self.rotation_drift_rad);
         Sigmas {
-            position_m: known_share(view.position_sigma_m, self.position_drift_m, self.position_m),
-            rotation_rad: known_share(view.rotation_sigma_rad, self.rotation_drift_rad, self.rotation_rad),
+            position_m: known_share(view.position_sigma_m, position_m, position),
+            rotation_rad: known_share(view.rotation_sigma_rad, rotation_rad, rotation),
         }
     }
 }
 
-/// One part of a total that may be known: then the parts keep the ratio that was estimated.
-fn known_share(total: f64, part: f64, other: f64) -> f64 {
-    if total.is_nan() || part == 0.0 { part } else { total * part / part.hypot(other) }
+/// A part of a total that may be known.
+fn known_share(known: f64, part: f64, total: f64) -> f64 {
+    if known.is_nan() || part == 0.0 { part } else { known * part / total }
 }

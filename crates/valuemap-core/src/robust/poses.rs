@@ -59,7 +59,7 @@ impl Belief {
     #[must_use]
     pub fn of_vote(look: &Look, variance: f64) -> Self {
         let mut belief = Self::nothing();
-        let drift = look.drift_sigma.each();
+        let drift = look.shared_sigma().each();
         for i in 0..2 {
             let shared = look.by_pose(i).component_mul(&drift);
             belief.information += shared * shared.transpose() / variance;

@@ -64,16 +64,17 @@ impl Scene {
         &self.views[self.rays.image[ray as usize] as usize]
     }
 
-    /// Order rays by pass, then by number.
-    pub fn sort_by_pass(&self, rays: &mut [u32]) {
-        rays.sort_by_key(|&ray| (self.view(ray).pass, ray));
-    }
-
     /// A ray.
     #[inline]
     #[must_use]
     pub fn ray(&self, ray: u32) -> &Ray {
         &self.rays.rays[ray as usize]
+    }
+
+    /// What all images picture together, sr.
+    #[must_use]
+    pub fn solid_angle_sr(&self) -> f64 {
+        self.views.iter().map(|view| self.frusta[view.camera as usize].solid_angle_sr).sum()
     }
 
     /// Whether a point lies in the picture of a view.
@@ -82,31 +83,4 @@ impl Scene {
         let in_camera = view.cam_from_world * (point - view.center);
         self.frusta[view.camera as usize].normals.iter().all(|normal| normal.dot(&in_camera) >= 0.0)
     }
-}
-
-/// Number the viewpoints: within a pass, in the order of the images, a new one begins where the camera has moved
-/// by more than `step_m` since the last one began. Also how far the pass had driven there, m: from one to the next.
-#[must_use]
-pub fn number_viewpoints(centers: &[[f64; 3]], pass: &[u32], step_m: f64) -> Vec<(u32, f64)> {
-    let passes = pass.iter().max().map_or(0, |&last| last as usize + 1);
-    let mut current: Vec<Option<(Vector3<f64>, u32, f64)>> = vec![None; passes];
-    let mut next = 0;
-    centers
-        .iter()
-        .zip(pass)
-        .map(|(center, &pass)| {
-            let center = Vector3::from(*center);
-            let last = current[pass as usize];
-            let step = last.map_or(0.0, |(start, ..)| (center - start).norm());
-            match last {
-                Some((_, viewpoint, driven)) if step <= step_m => (viewpoint, driven),
-                _ => {
-                    let driven = last.map_or(0.0, |(_, _, driven)| driven + step);
-                    current[pass as usize] = Some((center, next, driven));
-                    next += 1;
-                    (next - 1, driven)
-                }
-            }
-        })
-        .collect()
 }

@@ -5,18 +5,18 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use super::Settings;
-use super::index::RayIndex;
 use super::label::{Label, first_voter, from_voters};
-use super::noise::{Noise, Spread};
-use super::nominate::{self, Nomination, Who};
-use super::quick::quick_estimate;
-use super::scene::Scene;
 use crate::progress::{Halt, Progress};
+use crate::robust::Settings;
+use crate::robust::index::RayIndex;
+use crate::robust::model::Model;
+use crate::robust::noise::Noise;
+use crate::robust::propose::{Hypothesis, Who, propose};
+use crate::robust::quick::quick_estimate;
 
 /// Detections this many times farther than the farthest proposed point still vote.
 pub const VOTE_RANGE: f64 = 2.5;
-/// Nominations that are polished side by side.
+/// Hypothesiss that are polished side by side.
 const BATCH: usize = 64;
 /// Who nominates, round after round, each time with the rays that are left over.
 const ROUNDS: [Who; 4] = [Who::Part, Who::All, Who::All, Who::All];
@@ -28,22 +28,15 @@ const MAX_ROUNDS: usize = 8;
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
-pub fn gather(
-    scene: &Scene,
-    noise: &Noise,
-    spreads: &[Spread],
-    settings: &Settings,
-    rays: &[u32],
-    progress: &Progress,
-) -> Result<(Vec<Label>, [u64; 2]), Halt> {
+pub fn gather(model: &Model<'_>, rays: &[u32], progress: &Progress) -> Result<(Vec<Label>, [u64; 2]), Halt> {
+    let Model { scene, noise, ref spreads, settings, .. } = *model;
     let range_m = settings.viability.max_range_m * VOTE_RANGE;
     let mut labels: Vec<Label> = Vec::new();
     let mut claimed = vec![false; scene.rays.rays.len()];
     let mut counts = [0_u64; 2];
     for who in ROUNDS {
         let free: Vec<u32> = rays.iter().copied().filter(|&ray| !claimed[ray as usize]).collect();
-        let mut nominations =
-            nominate::nominate(scene, spreads, settings.gate_sigmas, &settings.viability, &free, who, progress)?;
+        let mut nominations = propose(model, &free, who, progress)?;
         nominations.par_sort_by(|a, b| b.support.total_cmp(&a.support).then(a.rays.cmp(&b.rays)));
         counts[0] += nominations.len() as u64;
         let index = RayIndex::new(scene, spreads, settings.gate_sigmas, free.into_iter());
@@ -52,7 +45,7 @@ pub fn gather(
         // has it, and the other is polished again on what is left.
         for batch in nominations.chunks(BATCH) {
             progress.check()?;
-            let polish_one = |nomination: &Nomination, claimed: &[bool]| {
+            let polish_one = |nomination: &Hypothesis, claimed: &[bool]| {
                 if nomination.rays.iter().any(|&ray| claimed[ray as usize]) {
                     return None;
                 }

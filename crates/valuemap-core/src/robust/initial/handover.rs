@@ -10,11 +10,11 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use rustc_hash::FxHashSet;
 
-use super::Settings;
 use super::associate::Association;
-use super::estimate::{Care, Joint, Limits, Start};
 use super::label::{Label, SECTOR_COSINE, by_place, direction_to, from_voters, sector_middles};
 use super::pairs::{nearest_pairs, replaced};
+use crate::robust::Settings;
+use crate::robust::estimate::{Care, Joint, Limits, Start};
 
 /// Labels farther apart than this do not have each other's votes, m.
 const PAIR_M: f64 = 3.0;

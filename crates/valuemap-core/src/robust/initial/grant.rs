@@ -9,11 +9,11 @@ use nalgebra::{Matrix2, SMatrix};
 use pathfinding::prelude::{Matrix, kuhn_munkres_min};
 use rustc_hash::FxHashSet;
 
-use super::drift::Look;
 use super::label::Label;
-use super::noise::Noise;
-use super::poses::{Belief, PoseError};
-use super::scene::Scene;
+use crate::robust::drift::Look;
+use crate::robust::noise::Noise;
+use crate::robust::poses::{Belief, PoseError};
+use crate::robust::scene::Scene;
 
 /// Times that the assignment of an image is made anew, with the pose error from the last one.
 const ROUNDS: usize = 3;

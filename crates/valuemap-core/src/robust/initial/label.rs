@@ -4,13 +4,16 @@ use std::hash::{Hash, Hasher};
 use std::sync::OnceLock;
 
 use nalgebra::Vector3;
+use rayon::prelude::*;
 use rstar::RTree;
 use rstar::primitives::GeomWithData;
 use rustc_hash::FxHasher;
 
-use super::estimate::{Care, Elsewhere, Estimate, Joint, Limits, Start};
-use super::noise::Noise;
-use super::scene::{Scene, View};
+use crate::robust::calibrate;
+use crate::robust::energy::Object;
+use crate::robust::estimate::{Care, Elsewhere, Estimate, Joint, Limits, Start};
+use crate::robust::noise::Noise;
+use crate::robust::scene::{Scene, View};
 
 /// A label that moved by less, squared and in sigmas, is what it was.
 const SMALL_MOVE_CHI2: f64 = 0.3;
@@ -68,7 +71,7 @@ pub struct Revision {
 /// What was found out about a label as it is; forgotten when it changes.
 #[derive(Debug, Clone, Default)]
 pub struct Known {
-    /// How far its visits disagree, see [`variance_factor`](super::calibrate::variance_factor).
+    /// How far its visits disagree, see [`variance_factor`](crate::robust::calibrate::variance_factor).
     pub disagreement: OnceLock<Option<f64>>,
     /// Whether it was found not to be two.
     pub is_one: bool,
@@ -90,7 +93,7 @@ pub fn from_voters(
     mut voters: Vec<u32>,
     start: Vector3<f64>,
 ) -> Option<Label> {
-    scene.sort_by_pass(&mut voters);
+    voters.sort_unstable();
     let class = scene.rays.class[*voters.first()? as usize];
     let start = Start { voters: &voters, weights: &[], point: start };
     let limits = Limits { gate_sigmas, min_votes: 2 };
@@ -110,6 +113,27 @@ pub fn from_voters(
         revision: Revision::default(),
         known: Known::default(),
     })
+}
+
+/// An object as a label; other detections in its gate explain why it has none there.
+#[must_use]
+pub fn of_object(scene: &Scene, object: &Object, estimate: Estimate) -> Label {
+    let image = |&ray: &u32| scene.rays.image[ray as usize];
+    let voted: Vec<u32> = object.votes.iter().map(image).collect();
+    let undecided = object.others.iter().copied().filter(|image| voted.binary_search(image).is_err()).collect();
+    Label {
+        estimate,
+        side: side_of(scene, &object.votes, &estimate.point),
+        class: object.class,
+        voters: object.votes.clone(),
+        weights: Vec::new(),
+        undecided,
+        unseen_from: Vec::new(),
+        elsewhere: Vec::new(),
+        refused: Vec::new(),
+        revision: Revision::default(),
+        known: Known::default(),
+    }
 }
 
 /// Mean of the unit directions from a point to the cameras of its voters.
@@ -142,6 +166,17 @@ pub fn sector_middles(directions: impl Iterator<Item = Vector3<f64>>) -> Vec<Vec
         }
     }
     middles
+}
+
+/// How much larger than they are said to be the errors are that labels of several passes show, at least 1. About `most` of the labels serve.
+#[must_use]
+pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Label], most: usize) -> f64 {
+    let labels: Vec<&Label> = labels.iter().step_by((labels.len() / most).max(1)).collect();
+    let of_label = |label: &&Label| {
+        let placed = || (label.voters.clone(), label.estimate.point);
+        *label.known.disagreement.get_or_init(|| calibrate::disagreement(scene, noise, &placed()))
+    };
+    calibrate::mean(labels.par_iter().map(of_label).collect()).unwrap_or(1.0).max(1.0)
 }
 
 /// Labels by place.

@@ -3,11 +3,10 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use super::calibrate::variance_factor;
-use super::label::{Label, direction_to, first_voter, from_voters};
-use super::noise::Noise;
+use super::label::{Label, direction_to, first_voter, from_voters, variance_factor};
 use super::pairs::{disjoint, near_pairs, replaced};
-use super::scene::Scene;
+use crate::robust::noise::Noise;
+use crate::robust::scene::Scene;
 
 /// Squared Mahalanobis distance up to which two positions agree: the 99.7 % quantile of chi² with 3 degrees of freedom.
 const AGREEMENT_CHI2: f64 = 14.0;

@@ -5,30 +5,20 @@ use std::hash::{Hash, Hasher};
 use rayon::prelude::*;
 use rustc_hash::FxHasher;
 
-use super::contest::{Contest, widened};
-use super::estimate::{Care, Joint, Limits, Solution, Start};
 use super::label::{Label, by_place, fingerprint, first_voter, side_of};
-use super::noise::Noise;
-use super::scene::Scene;
+use crate::robust::estimate::{Care, Joint, Limits, Start};
+use crate::robust::noise::Noise;
+use crate::robust::scene::Scene;
 
 /// Labels within this distance of the one with the most votes are estimated with it, m.
 const PLACE_M: f64 = 25.0;
 /// Labels that are estimated together, at most: the cost grows with the square of their number.
 const MOST_LABELS: usize = 12;
 
-/// Estimate all labels anew, place by place; those that keep fewer than `min_votes` are dropped. With all care, covariances
-/// say also what contested votes may have done ([`contest`](super::contest)).
+/// Estimate all labels anew, place by place; those that keep fewer than `min_votes` are dropped.
 #[must_use]
-pub fn adjust(
-    scene: &Scene,
-    noise: &Noise,
-    gate_sigmas: f64,
-    min_votes: usize,
-    labels: &[Label],
-    care: Care,
-) -> Vec<Label> {
-    let contest = (care == Care::Exact).then(|| Contest::new(scene, noise, gate_sigmas, labels));
-    let adjustment = Adjustment { scene, noise, gate_sigmas, min_votes, contest };
+pub fn adjust(scene: &Scene, noise: &Noise, gate_sigmas: f64, min_votes: usize, labels: &[Label]) -> Vec<Label> {
+    let adjustment = Adjustment { scene, noise, gate_sigmas, min_votes };
     let of_place = |place: &Vec<usize>| adjustment.of_place(place.iter().map(|&i| labels[i].clone()).collect());
     // One at a time: the first ones are the largest.
     let mut labels: Vec<Label> = places(labels).par_iter().with_max_len(1).flat_map_iter(of_place).collect();
@@ -65,18 +55,12 @@ struct Adjustment<'a> {
     noise: &'a Noise,
     gate_sigmas: f64,
     min_votes: usize,
-    /// Only for estimates with all care.
-    contest: Option<Contest<'a>>,
 }
 
 impl Adjustment<'_> {
-    fn care(&self) -> Care {
-        if self.contest.is_some() { Care::Exact } else { Care::Rough }
-    }
-
     fn of_place(&self, place: Vec<Label>) -> Vec<Label> {
         let votes = votes_of(&place);
-        if self.care() == Care::Rough && place.iter().all(|label| label.revision.place == votes) {
+        if place.iter().all(|label| label.revision.place == votes) {
             return place;
         }
         let mut together = self.together(place);
@@ -105,9 +89,11 @@ impl Adjustment<'_> {
             point: label.estimate.point,
         });
         let limits = Limits { gate_sigmas: self.gate_sigmas, min_votes: self.min_votes };
-        let solution = Joint::new(self.scene, self.noise, starts, self.care()).solve_within(&limits)?;
+        let solution = Joint::new(self.scene, self.noise, starts, Care::Rough).solve_within(&limits)?;
         let mut labels = place.to_vec();
-        self.take(&mut labels, &solution);
+        for ((label, estimate), elsewhere) in labels.iter_mut().zip(&solution.estimates).zip(solution.elsewhere()) {
+            (label.estimate, label.elsewhere) = (*estimate, elsewhere);
+        }
         for label in &mut labels {
             label.voters.clear();
             label.weights.clear();
@@ -124,27 +110,6 @@ impl Adjustment<'_> {
             label.side = side_of(self.scene, &label.voters, &label.estimate.point);
         }
         Some(labels)
-    }
-
-    /// Take over the estimates.
-    fn take(&self, labels: &mut [Label], solution: &Solution<'_>) {
-        match &self.contest {
-            None => {
-                for ((label, estimate), elsewhere) in
-                    labels.iter_mut().zip(&solution.estimates).zip(solution.elsewhere())
-                {
-                    (label.estimate, label.elsewhere) = (*estimate, elsewhere);
-                }
-            }
-            Some(contest) => {
-                let contested = contest.contested(solution);
-                let sure = contested.contains(&true).then(|| solution.without(&contested)).flatten();
-                let sure = sure.as_ref().unwrap_or(&solution.estimates);
-                for ((label, estimate), sure) in labels.iter_mut().zip(&solution.estimates).zip(sure) {
-                    label.estimate = widened(estimate, sure);
-                }
-            }
-        }
     }
 }
 

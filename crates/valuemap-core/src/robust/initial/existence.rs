@@ -16,8 +16,8 @@ use rstar::primitives::GeomWithData;
 use rustc_hash::FxHashMap;
 
 use super::label::{Label, SECTOR_COSINE, direction_to, sector_middles};
-use super::noise::Spread;
-use super::scene::Scene;
+use crate::robust::noise::Spread;
+use crate::robust::scene::Scene;
 
 /// So many times more probable must be that the hits in a sector are not the label's, before its votes are taken away (logarithm).
 const STRAY_LOG_ODDS: f64 = 5.0;

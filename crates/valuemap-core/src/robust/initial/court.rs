@@ -8,15 +8,16 @@ use rustc_hash::FxHashMap;
 
 use super::adjust::adjust;
 use super::associate::Association;
-use super::estimate::Care;
 use super::existence::{self, Lookout, Looks, Rates, Sector};
 use super::gather::{VOTE_RANGE, gather};
-use super::index::RayIndex;
 use super::label::{self, Label, fingerprint};
-use super::noise::{Noise, Spread};
-use super::scene::Scene;
-use super::{Schedule, Settings, Tally, exchange, handover, settle};
+use super::{Schedule, Tally, exchange, handover, settle};
 use crate::progress::{Halt, Progress};
+use crate::robust::Settings;
+use crate::robust::index::RayIndex;
+use crate::robust::model::Model;
+use crate::robust::noise::{Noise, Spread};
+use crate::robust::scene::Scene;
 
 /// Labels are dropped below these multiples of the probability that is asked for, one after the other, and then below that.
 const DOUBTS: [f64; 3] = [1e-5, 1e-2, 0.3];
@@ -30,6 +31,7 @@ pub(super) struct Court<'a> {
     noise: &'a Noise,
     spreads: &'a [Spread],
     settings: &'a Settings,
+    model: &'a Model<'a>,
     association: Association<'a>,
     lookout: OnceLock<Lookout<'a>>,
     /// The sectors of the labels as they last were.
@@ -38,13 +40,8 @@ pub(super) struct Court<'a> {
 
 impl<'a> Court<'a> {
     /// Begin with some rays (ascending) of a scene.
-    pub(super) fn new(
-        scene: &'a Scene,
-        noise: &'a Noise,
-        spreads: &'a [Spread],
-        settings: &'a Settings,
-        rays: impl Iterator<Item = u32>,
-    ) -> Self {
+    pub(super) fn new(model: &'a Model<'a>, rays: impl Iterator<Item = u32>) -> Self {
+        let Model { scene, noise, ref spreads, settings, .. } = *model;
         let index = RayIndex::new(scene, spreads, settings.gate_sigmas, rays);
         let range_m = settings.viability.max_range_m * VOTE_RANGE;
         Self {
@@ -52,6 +49,7 @@ impl<'a> Court<'a> {
             noise,
             spreads,
             settings,
+            model,
             association: Association::new(scene, noise, index, range_m),
             lookout: OnceLock::new(),
             seen_from: FxHashMap::default(),
@@ -99,17 +97,17 @@ impl<'a> Court<'a> {
         tally: &mut Tally,
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
-        let &Self { scene, noise, spreads, settings, .. } = self;
+        let scene = self.scene;
         let mut is_taken = vec![false; scene.rays.rays.len()];
         for &ray in labels.iter().flat_map(|label| &label.voters) {
             is_taken[ray as usize] = true;
         }
         let free: Vec<u32> = (0..is_taken.len() as u32).filter(|&ray| !is_taken[ray as usize]).collect();
-        let (mut new, [nominations, accepted]) = gather(scene, noise, spreads, settings, &free, progress)?;
+        let (mut new, [nominations, accepted]) = gather(self.model, &free, progress)?;
         tally.nominations += nominations;
         tally.accepted += accepted;
         if !labels.is_empty() {
-            let mut annex = Court::new(scene, noise, spreads, settings, free.into_iter());
+            let mut annex = Court::new(self.model, free.into_iter());
             for _ in 0..rounds {
                 new = annex.settle(new, true, tally, progress)?;
             }
@@ -140,7 +138,7 @@ impl<'a> Court<'a> {
         let labels = exchange::exchange(scene, noise, gate, labels);
         let labels = self.associate(labels, tally, progress)?;
         let associated = labels.len();
-        let labels = adjust(scene, noise, gate, min_votes, &labels, Care::Rough);
+        let labels = adjust(scene, noise, gate, min_votes, &labels);
         let left = labels.len();
         let labels = if may_split { settle::split(scene, noise, gate, labels, min_votes) } else { labels };
         let labels = if settings.without.merge { labels } else { settle::fuse(scene, noise, gate, labels) };
@@ -279,8 +277,6 @@ impl<'a> Court<'a> {
 pub(super) struct Judgement {
     /// Probability of existence of each label, and the images that should have seen it.
     pub(super) of_labels: Vec<(f64, u32)>,
-    pub(super) rates: Rates,
-    pub(super) strays_per_image: f64,
 }
 
 /// Judge all labels of a scene.
@@ -305,5 +301,5 @@ pub(super) fn judge(
         .map(|label| existence::chance_of(label, scene, spreads, settings.gate_sigmas, strays_per_sr))
         .collect();
     let existence = existence::probabilities(&looks, &rates, &chance, doubted);
-    Judgement { of_labels: existence.into_iter().zip(expected).collect(), rates, strays_per_image }
+    Judgement { of_labels: existence.into_iter().zip(expected).collect() }
 }

@@ -1,6 +1,6 @@
 //! Which detection shows which label: all labels compete for all detections, image by image.
 //!
-//! The pose error of each image is estimated first, from the votes along the drive ([`poses`](super::poses)); then each image
+//! The pose error of each image is estimated first, from the votes along the drive ([`poses`](crate::robust::poses)); then each image
 //! is decided for itself ([`grant`](mod@super::grant)), and rivals for a whole pass ([`rivals`](super::rivals)).
 
 use std::sync::Arc;
@@ -9,14 +9,14 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
-use super::estimate::Estimate;
 use super::grant::{Case, Claim, Decision, Fit, belief_of_votes, grant, granted, overrule, report};
-use super::index::{Hit, RayIndex, chi2_in_gate};
 use super::label::{Label, fingerprint};
-use super::noise::Noise;
-use super::poses::{Belief, LEGS_AROUND, Legs, smooth};
-use super::scene::Scene;
 use crate::progress::{Halt, Progress};
+use crate::robust::estimate::Estimate;
+use crate::robust::index::{Hit, RayIndex, chi2_in_gate};
+use crate::robust::noise::Noise;
+use crate::robust::poses::{Belief, LEGS_AROUND, Legs, smooth};
+use crate::robust::scene::Scene;
 
 /// Detections are looked for as far from a label as this many of its standard deviations, in steps of one.
 const REACH_SIGMAS: i32 = 4;
@@ -215,7 +215,7 @@ impl<'a> Association<'a> {
 
 /// A label with the votes that it was given, in any order, and the images that are undecided.
 fn given_to(scene: &Scene, label: Label, mut voters: Vec<u32>, mut undecided: Vec<u32>) -> Label {
-    scene.sort_by_pass(&mut voters);
+    voters.sort_unstable();
     undecided.sort_unstable();
     let mut label = Label { undecided, ..label };
     let fitting = || voters.iter().copied().filter(|ray| !label.refused.contains(ray));

@@ -10,9 +10,9 @@ use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
 use super::label::{Label, SECTOR_COSINE, direction_to, from_voters, sector_middles};
-use super::noise::Noise;
 use super::pairs::{nearest_pairs, replaced};
-use super::scene::Scene;
+use crate::robust::noise::Noise;
+use crate::robust::scene::Scene;
 
 /// Labels farther apart than this do not have each other's votes, m.
 const PAIR_M: f64 = 2.5;

@@ -6,11 +6,11 @@
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::associate::Run;
-use super::drift::{Drive, Look};
 use super::grant::{Fit, belief_of_votes, granted, open};
-use super::noise::Sigmas;
-use super::poses::{LEGS_AROUND, PoseError, smooth};
 use crate::progress::{Halt, Progress};
+use crate::robust::drift::{Drive, Look};
+use crate::robust::noise::Sigmas;
+use crate::robust::poses::{LEGS_AROUND, PoseError, smooth};
 
 /// Images of a pass that show one of two labels, which may be either, before it is concluded that there is but one.
 const LEAST_RIVALRY: u32 = 8;

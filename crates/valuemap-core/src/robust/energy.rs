@@ -1,0 +1,247 @@
+//! J: minus twice the logarithm of how much more probable a map is than that all detections are clutter.
+//!
+//! J is a sum over objects, see `docs/method.md`. For one of class c with n votes in visits v:
+//!
+//! ```text
+//! J = sum_v [ r' C^-1 r + ln|C| ] + 2 n ln 2 pi       (1) residuals; C: detections, poses of images, drift of the pass, marginalised
+//!   + ln|information| - 3 ln 2 pi - 2 ln births_c     (2) the position, marginalised, and the price of a birth
+//!   + 2 sum_i ln clutter_c                            (3) what the votes are otherwise
+//!   - 2 sum_i ln ratio(size_i)                        (4) boxes of one object have one physical size
+//!   - 2 ln [ (1 - phi_c) prod_pass usual(hits; looks) + phi_c prod_pass any(hits; looks) ]
+//!                                                     (5) who should have seen it, and did not: beta-binomial
+//! ```
+//!
+//! The second product of (5) is that of a false thing: parked, reflected, or mistaken for an object at times. Its detections meet as
+//! those of an object do, but in any share of the looks, none or all of a pass.
+
+use std::f64::consts::PI;
+
+use nalgebra::{Matrix3, Vector3};
+use rstar::RTree;
+use rstar::primitives::GeomWithData;
+
+use super::drift::{Drive, Look};
+use super::estimate::is_one_visit;
+use super::looks::{Lookout, Seen};
+use super::model::{Model, Sizes};
+use super::scene::Scene;
+
+/// Residuals beyond this many sigmas count less, in proportion (Huber): 95 % efficient where errors are Gaussian at 1.35, more above.
+const HUBER_SIGMAS: f64 = 2.0;
+/// The position is found when a step is shorter than this, in its own sigmas.
+const STEP_SIGMAS: f64 = 0.03;
+const MAX_STEPS: usize = 12;
+/// Times that a step after which the residuals are larger is cut to a quarter.
+const MAX_HALVINGS: usize = 6;
+/// Residuals that are larger by rounding are not larger.
+const LEAST_FALL: f64 = 1e-9;
+
+/// An object: what the map consists of.
+#[derive(Debug, Clone)]
+pub struct Object {
+    /// The class of its votes.
+    pub class: u32,
+    /// The rays that vote for it, at most one per image, ascending.
+    pub votes: Vec<u32>,
+    /// Where it is, given these.
+    pub fit: Fit,
+    /// Logarithm of its physical size, m; not a number if its boxes do not tell.
+    pub ln_size: f64,
+    /// Images, ascending, with a detection in its gate: those that are no votes may hide it.
+    pub others: Vec<u32>,
+    /// The looks at it.
+    pub seen: Seen,
+    /// Probability that it is real rather than false, if it is anything.
+    pub real: f64,
+    /// Its share of J.
+    pub energy: f64,
+}
+
+/// A position that makes some votes most probable.
+#[derive(Debug, Clone)]
+pub struct Fit {
+    /// The position in the world, m.
+    pub point: Vector3<f64>,
+    /// Its covariance, m², the poses of other objects' images unknown.
+    pub covariance: Matrix3<f64>,
+    /// Equation (1) and the first term of (2).
+    pub energy: f64,
+    /// Squared residual of each vote in sigmas, the drift of its visit taken out.
+    pub chi2: Vec<f64>,
+}
+
+/// The terms of one evaluation.
+struct Terms {
+    information: Matrix3<f64>,
+    gradient: Vector3<f64>,
+    energy: f64,
+    chi2: Vec<f64>,
+}
+
+/// The position of an object, by damped Gauss-Newton with Huber's weights from a point nearby. Nothing if it is behind a voter, or if the
+/// votes do not fix it.
+#[must_use]
+pub fn fit(model: &Model<'_>, votes: &[u32], start: Vector3<f64>) -> Option<Fit> {
+    let mut weights = vec![1.0; votes.len()];
+    let mut point = start;
+    weights_of(&terms(model, votes, &weights, &point)?.chi2, &mut weights);
+    let mut here = terms(model, votes, &weights, &point)?;
+    for _ in 0..MAX_STEPS {
+        let mut step = -here.information.cholesky()?.solve(&here.gradient);
+        if -step.dot(&here.gradient) < STEP_SIGMAS * STEP_SIGMAS {
+            break;
+        }
+        let better = (0..MAX_HALVINGS).find_map(|_| {
+            let next =
+                terms(model, votes, &weights, &(point + step)).filter(|next| next.energy <= here.energy + LEAST_FALL);
+            if next.is_none() {
+                step *= 0.25;
+            }
+            next
+        });
+        let Some(next) = better else { break };
+        point += step;
+        here = next;
+        weights_of(&here.chi2, &mut weights);
+    }
+    let here = terms(model, votes, &weights, &point)?;
+    let cholesky = here.information.cholesky()?;
+    let ln_information = 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
+    let finite = point.iter().all(|number| number.is_finite());
+    finite.then(|| Fit { point, covariance: cholesky.inverse(), energy: here.energy + ln_information, chi2: here.chi2 })
+}
+
+/// Huber's weights of some squared residuals.
+fn weights_of(chi2: &[f64], weights: &mut [f64]) {
+    weights.iter_mut().zip(chi2).for_each(|(weight, chi2)| *weight = (HUBER_SIGMAS / chi2.sqrt()).min(1.0));
+}
+
+/// Equation (1) at a point, with what a step needs.
+fn terms(model: &Model<'_>, votes: &[u32], weights: &[f64], point: &Vector3<f64>) -> Option<Terms> {
+    let scene = model.scene;
+    let mut sum = Terms {
+        information: Matrix3::zeros(),
+        gradient: Vector3::zeros(),
+        energy: 0.0,
+        chi2: Vec::with_capacity(votes.len()),
+    };
+    for visit in visits(scene, votes) {
+        let mut looks = Vec::with_capacity(visit.len());
+        for &ray in visit {
+            looks.push(Look::of(scene, model.noise, ray, 0, point)?.by_itself());
+        }
+        let first = sum.chi2.len();
+        let drive = Drive::along(&looks, &weights[first..first + visit.len()], 1)?;
+        let (information, gradient) = drive.normals.of_one();
+        sum.information += information;
+        sum.gradient += gradient;
+        sum.energy += drive.normals.square + drive.log_determinant();
+        for (look, left) in looks.iter().zip(drive.left()) {
+            sum.chi2.push(left.norm_squared() / look.variance);
+        }
+    }
+    for (&chi2, &weight) in sum.chi2.iter().zip(weights) {
+        // Huber's loss is 2 c |r| - c² beyond c, of which the weighted square is c |r|.
+        if weight < 1.0 {
+            sum.energy += (HUBER_SIGMAS * chi2.sqrt() - HUBER_SIGMAS * HUBER_SIGMAS).max(0.0);
+        }
+    }
+    sum.energy.is_finite().then_some(sum)
+}
+
+/// Votes in runs of one visit.
+pub(super) fn visits<'v>(scene: &'v Scene, votes: &'v [u32]) -> impl Iterator<Item = &'v [u32]> {
+    votes.chunk_by(|&a, &b| is_one_visit(scene.view(a), scene.view(b)))
+}
+
+/// Logarithm of the physical size that a ray's box implies at a point, m.
+#[inline]
+#[must_use]
+pub fn implied_size(model: &Model<'_>, ray: u32, point: &Vector3<f64>) -> f64 {
+    model.ln_angle[ray as usize] + model.scene.ray(ray).project(point).z.ln()
+}
+
+/// The size of an object: the median of what its votes imply, drawn to what its class is like where votes are few.
+#[must_use]
+pub fn size_of(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> f64 {
+    let mut sizes: Vec<f64> =
+        votes.iter().map(|&ray| implied_size(model, ray, point)).filter(|s| s.is_finite()).collect();
+    if sizes.is_empty() {
+        return f64::NAN;
+    }
+    let middle = sizes.len() / 2;
+    let median = *sizes.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let Sizes { object: (mean, sd), spread, .. } = model.class_of(votes[0]).sizes;
+    if mean.is_nan() {
+        return median;
+    }
+    let of_votes = sizes.len() as f64 / (spread * spread);
+    let of_class = 1.0 / (sd * sd);
+    (median * of_votes + mean * of_class) / (of_votes + of_class)
+}
+
+/// An object with some votes (ascending), and what it is worth; `others` are images (ascending) with detections in its gate.
+///
+/// Nothing if it has no position.
+#[must_use]
+pub fn object(
+    model: &Model<'_>,
+    lookout: &Lookout,
+    votes: Vec<u32>,
+    start: Vector3<f64>,
+    others: Vec<u32>,
+) -> Option<Object> {
+    let first = *votes.first()?;
+    let class = model.class_of(first);
+    let fit = fit(model, &votes, start)?;
+    let ln_size = size_of(model, &votes, &fit.point);
+    let seen = lookout.looks(model, &fit.point, &votes, &others);
+    let n = votes.len() as f64;
+    let ln_2_pi = (2.0 * PI).ln();
+    let clutter: f64 = votes.iter().map(|&ray| model.ln_clutter_per_px2(ray)).sum();
+    let sizes: f64 = votes
+        .iter()
+        .map(|&ray| {
+            let depth_m = model.scene.ray(ray).project(&fit.point).z;
+            class.sizes.log_ratio(model.ln_angle[ray as usize], depth_m, ln_size)
+        })
+        .sum();
+    let of_size = prior_of_size(&class.sizes, ln_size);
+    let (as_real, as_false) = seen.log_likelihoods(class);
+    let most = as_real.max(as_false);
+    let looks = most + ((as_real - most).exp() + (as_false - most).exp()).ln();
+    let energy = fit.energy + 2.0 * n * ln_2_pi - 3.0 * ln_2_pi - 2.0 * class.ln_births_per_m3
+        + 2.0 * (clutter - sizes - of_size - looks);
+    let real = (as_real - looks).exp();
+    energy.is_finite().then(|| Object {
+        class: model.scene.rays.class[first as usize],
+        votes,
+        fit,
+        ln_size,
+        others,
+        seen,
+        real,
+        energy,
+    })
+}
+
+/// Logarithm of how probable a size is among the objects of a class, beside that of a typical one.
+fn prior_of_size(sizes: &Sizes, ln_size: f64) -> f64 {
+    let (mean, sd) = sizes.object;
+    let away = (ln_size - mean) / sd;
+    if sizes.tell() && away.is_finite() { -0.5 * away * away } else { 0.0 }
+}
+
+/// Objects by place.
+#[must_use]
+pub fn by_place(objects: &[Object]) -> RTree<GeomWithData<[f64; 3], usize>> {
+    RTree::bulk_load(objects.iter().enumerate().map(|(i, o)| GeomWithData::new(o.fit.point.into(), i)).collect())
+}
+
+impl Object {
+    /// Probability that it exists and is real, if its votes are clutter otherwise.
+    #[must_use]
+    pub fn existence(&self) -> f64 {
+        self.real / (1.0 + (0.5 * self.energy).exp())
+    }
+}

@@ -1,0 +1,67 @@
+//! Positions and covariances for good: the objects of one place are estimated together, since they share what their images get wrong.
+
+use rayon::prelude::*;
+
+use super::contest::{Contest, widened};
+use super::energy::{Object, by_place};
+use super::estimate::{Care, Estimate, Joint, Start};
+use super::model::Model;
+
+/// Objects within this share of the range of the one with the most votes are estimated with it.
+const PLACE_SHARE: f64 = 0.4;
+/// Objects that are estimated together, at most: the cost grows with the square of their number.
+const MOST_OBJECTS: usize = 12;
+
+/// The estimate of every object, in their order.
+#[must_use]
+pub fn finish(model: &Model<'_>, objects: &[Object]) -> Vec<Estimate> {
+    let contest = Contest::new(model.scene, model.noise, model.settings.gate_sigmas, objects);
+    let mut estimates: Vec<Estimate> =
+        objects.iter().map(|object| Estimate { point: object.fit.point, covariance: object.fit.covariance }).collect();
+    let places = places(objects, model.settings.viability.max_range_m * PLACE_SHARE);
+    // One at a time: the first ones are the largest.
+    let found: Vec<Vec<(usize, Estimate)>> =
+        places.par_iter().with_max_len(1).map(|place| together(model, objects, place, &contest)).collect();
+    for (i, estimate) in found.into_iter().flatten() {
+        estimates[i] = estimate;
+    }
+    estimates
+}
+
+/// Objects that cannot be estimated together are estimated one by one.
+fn together(model: &Model<'_>, objects: &[Object], place: &[usize], contest: &Contest<'_>) -> Vec<(usize, Estimate)> {
+    let starts = place.iter().map(|&i| Start { voters: &objects[i].votes, weights: &[], point: objects[i].fit.point });
+    let Some(solution) = Joint::new(model.scene, model.noise, starts, Care::Exact).solve() else {
+        if place.len() == 1 {
+            return Vec::new();
+        }
+        return place.iter().flat_map(|&i| together(model, objects, &[i], contest)).collect();
+    };
+    let contested = contest.contested(&solution);
+    let sure = contested.contains(&true).then(|| solution.without(&contested)).flatten();
+    let sure = sure.as_ref().unwrap_or(&solution.estimates);
+    place.iter().zip(&solution.estimates).zip(sure).map(|((&i, found), sure)| (i, widened(found, sure))).collect()
+}
+
+/// The objects around those with the most votes, each object in one place.
+fn places(objects: &[Object], radius_m: f64) -> Vec<Vec<usize>> {
+    let tree = by_place(objects);
+    let mut order: Vec<usize> = (0..objects.len()).collect();
+    order.sort_by_key(|&i| (std::cmp::Reverse(objects[i].votes.len()), i));
+    let mut taken = vec![false; objects.len()];
+    let mut places = Vec::new();
+    for middle in order {
+        if taken[middle] {
+            continue;
+        }
+        let near = tree.nearest_neighbor_iter_with_distance_2(objects[middle].fit.point.into());
+        let near = near.take_while(|(_, distance2)| *distance2 <= radius_m * radius_m).map(|(near, _)| near.data);
+        let mut place: Vec<usize> = near.filter(|&i| !taken[i]).take(MOST_OBJECTS).collect();
+        place.sort_unstable();
+        for &i in &place {
+            taken[i] = true;
+        }
+        places.push(place);
+    }
+    places
+}

@@ -1,0 +1,119 @@
+//! The map that the search begins with: found fast, by rules of thumb.
+
+pub mod adjust;
+pub mod associate;
+mod court;
+pub mod exchange;
+pub mod existence;
+pub mod gather;
+pub mod grant;
+pub mod handover;
+pub mod label;
+pub mod pairs;
+pub mod rivals;
+pub mod settle;
+
+use nalgebra::Vector3;
+
+use rayon::prelude::*;
+
+use super::energy::Object;
+use super::estimate::Estimate;
+use super::keyframes::Keyframes;
+use super::model::Model;
+use crate::progress::{Halt, Progress};
+
+use court::Court;
+use label::Label;
+
+/// How labels are found among the rays of a scene.
+struct Schedule {
+    /// Times that the rays of no label are gathered, at most: what is left over gets less and less.
+    sessions: usize,
+    /// Times that labels compete before any is doubted.
+    rounds: usize,
+    /// Times that neighbors hand over votes before any is doubted, and after, at most.
+    handovers: usize,
+}
+
+/// For all images of a scene.
+const WHOLE: Schedule = Schedule { sessions: 3, rounds: 4, handovers: 3 };
+/// For the keyframes of a large one.
+const KEYFRAMES: Schedule = Schedule { sessions: 1, handovers: 1, ..WHOLE };
+/// For all its images, when labels competed in the keyframes.
+const REFINING: Schedule = Schedule { sessions: 1, rounds: 2, handovers: 0 };
+
+/// What became of everything that was proposed.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Tally {
+    /// Points proposed by rays.
+    pub nominations: u64,
+    /// Nominations that were polished to labels.
+    pub accepted: u64,
+    /// Labels that became part of another one.
+    pub fused: u64,
+    /// Labels that lost too many votes to others.
+    pub outvoted: u64,
+    /// Labels that probably do not exist.
+    pub doubted: u64,
+}
+
+/// Votes (ascending) and a position.
+pub type Begun = (Vec<u32>, Vector3<f64>);
+
+/// Labels of some rays (ascending) alone, quickly.
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn labels_of_few(model: &Model<'_>, rays: &[u32], progress: &Progress) -> Result<Vec<Begun>, Halt> {
+    let (mut labels, _) = gather::gather(model, rays, progress)?;
+    let mut court = Court::new(model, rays.iter().copied());
+    for _ in 0..WHOLE.rounds {
+        labels = court.settle(labels, true, &mut Tally::default(), progress)?;
+    }
+    Ok(begun(labels))
+}
+
+/// The labels of a scene, and how it came to them.
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn labels(model: &Model<'_>, progress: &Progress) -> Result<(Vec<Begun>, Tally), Halt> {
+    let mut tally = Tally::default();
+    let keyframes = Keyframes::of(model.scene);
+    let first = match &keyframes {
+        Some(keyframes) => {
+            let thinned = Model::new(&keyframes.scene, model.noise, model.settings);
+            let mut court = Court::new(&thinned, 0..keyframes.scene.rays.rays.len() as u32);
+            let labels = court.hold(Vec::new(), &KEYFRAMES, &mut tally, progress)?;
+            labels.into_iter().map(|label| keyframes.in_whole(label)).collect()
+        }
+        None => Vec::new(),
+    };
+    let schedule = if keyframes.is_some() { REFINING } else { WHOLE };
+    let mut court = Court::new(model, 0..model.scene.rays.rays.len() as u32);
+    let labels = court.hold(first, &schedule, &mut tally, progress)?;
+    let before = labels.len();
+    let labels = settle::outclass(model.scene, model.noise, labels);
+    tally.outvoted += (before - labels.len()) as u64;
+    Ok((begun(labels), tally))
+}
+
+/// The probability that each object exists, and the images that should have seen it, by the looks at it.
+#[must_use]
+pub fn existence(model: &Model<'_>, objects: &[Object], estimates: &[Estimate], doubted: u64) -> Vec<(f64, u32)> {
+    let lookout = existence::Lookout::new(model.scene);
+    let both = objects.iter().zip(estimates);
+    let labels: Vec<Label> = both.map(|(object, estimate)| label::of_object(model.scene, object, *estimate)).collect();
+    let sectors: Vec<_> = labels.par_iter().map(|label| lookout.sectors(label).into()).collect();
+    court::judge(model.scene, &model.spreads, &sectors, &labels, model.settings, doubted).of_labels
+}
+
+fn begun(labels: Vec<Label>) -> Vec<Begun> {
+    let votes = |label: Label| {
+        let mut votes = label.voters;
+        votes.sort_unstable();
+        (votes, label.estimate.point)
+    };
+    labels.into_iter().map(votes).collect()
+}

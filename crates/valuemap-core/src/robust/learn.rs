@@ -1,0 +1,105 @@
+//! What a map tells about each class: how often its objects are detected, how large they are, how much clutter there is.
+
+use super::energy::{Object, implied_size};
+use super::looks::Looks;
+use super::model::{ClassModel, FALSE_SHARE, Model, ODD_PASSES, Rates};
+
+/// Objects with fewer votes do not serve.
+const MIN_VOTES: usize = 6;
+/// The part of the votes that is nearer than what counts as seen from everywhere.
+const NEAR_VOTES: f64 = 0.05;
+/// Fewer of these tell nothing, and what was thought before stays.
+const MIN_OBJECTS: usize = 5;
+/// The median absolute deviation of a normal distribution, in standard deviations.
+const MAD_OF_NORMAL: f64 = 0.6745;
+/// A spread of sizes is no smaller: boxes are whole pixels, and edges are not the same all around.
+const LEAST_SPREAD: f64 = 0.03;
+
+/// Learn the classes of a model from the objects of its map.
+pub fn learn(model: &mut Model<'_>, objects: &[Object]) {
+    let solid_angle_sr = model.scene.solid_angle_sr();
+    for class in 0..model.classes.len() as u32 {
+        let of_class: Vec<&Object> = objects.iter().filter(|object| object.class == class).collect();
+        let rays = model.scene.rays.class.iter().filter(|&&other| other == class).count();
+        let votes: usize = of_class.iter().map(|object| object.votes.len()).sum();
+        let is_sure = |object: &&Object| object.votes.len() >= MIN_VOTES && object.real > 0.5;
+        let sure: Vec<&Object> = of_class.iter().copied().filter(is_sure).collect();
+        let before = model.classes[class as usize];
+        // One detection more than is seen: no clutter at all is never known for sure.
+        let ln_clutter_per_sr = ((rays - votes + 1) as f64 / solid_angle_sr).ln();
+        let mut learned = ClassModel { ln_clutter_per_sr, ..before };
+        if sure.len() >= MIN_OBJECTS {
+            (learned.rates, learned.odd_passes) = rates(&sure, &before);
+            let false_share = of_class.iter().map(|object| 1.0 - object.real).sum::<f64>() / of_class.len() as f64;
+            learned.false_share = false_share.clamp(FALSE_SHARE.0, FALSE_SHARE.2);
+            learned.nearest_m = nearest_m(model, &sure);
+            let (spread, object) = sizes(model, &sure);
+            learned.sizes.spread = spread.max(LEAST_SPREAD);
+            learned.sizes.object = (object.0, object.1.max(learned.sizes.spread));
+        }
+        model.classes[class as usize] = learned;
+    }
+}
+
+/// The distance from which on all but a few votes are cast, m.
+fn nearest_m(model: &Model<'_>, objects: &[&Object]) -> f64 {
+    let distances = |object: &&Object| -> Vec<f64> {
+        object.votes.iter().map(|&ray| (model.scene.ray(ray).center - object.fit.point).norm()).collect()
+    };
+    let mut distances: Vec<f64> = objects.iter().flat_map(distances).collect();
+    let place = (distances.len() as f64 * NEAR_VOTES) as usize;
+    *distances.select_nth_unstable_by(place, f64::total_cmp).1
+}
+
+/// The spread of the sizes of one object, and mean and standard deviation of those of all.
+fn sizes(model: &Model<'_>, objects: &[&Object]) -> (f64, (f64, f64)) {
+    let (mut away, mut medians) = (Vec::new(), Vec::new());
+    for object in objects {
+        let sizes = object.votes.iter().map(|&ray| implied_size(model, ray, &object.fit.point));
+        let mut sizes: Vec<f64> = sizes.filter(|size| size.is_finite()).collect();
+        if let Some(median) = median(&mut sizes) {
+            away.extend(sizes.iter().map(|size| (size - median).abs()));
+            medians.push(median);
+        }
+    }
+    let spread = median(&mut away).unwrap_or(f64::NAN) / MAD_OF_NORMAL;
+    let middle = median(&mut medians).unwrap_or(f64::NAN);
+    for size in &mut medians {
+        *size = (*size - middle).abs();
+    }
+    (spread, (middle, median(&mut medians).unwrap_or(f64::NAN) / MAD_OF_NORMAL))
+}
+
+fn median(values: &mut [f64]) -> Option<f64> {
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+/// How often objects are detected in the usual pass, how much that differs between them, and the share of odd passes: one step of expectation and
+/// maximisation.
+fn rates(objects: &[&Object], before: &ClassModel) -> (Rates, f64) {
+    let mut passes: Vec<(Looks, f64)> = objects.iter().flat_map(|object| object.seen.usual(before)).collect();
+    passes.retain(|(pass, _)| pass.expected >= 3.0);
+    let (mut hits, mut expected, mut shares, mut count) = (0.0, 0.0, 0.0, 0.0_f64);
+    for (pass, share) in &passes {
+        hits += share * pass.hits;
+        expected += share * pass.expected;
+        shares += share;
+        count += 1.0;
+    }
+    if expected < 30.0 {
+        return (before.rates, before.odd_passes);
+    }
+    let recall = f64::clamp(hits / expected, 0.05, 0.98);
+    // Method of moments: the variance of a pass's share is p (1 - p) (1 + (n - 1) / (1 + s)) / n.
+    let mut excess = (0.0, 0.0);
+    for (pass, share) in &passes {
+        let n = pass.expected;
+        let away = pass.hits / n - recall;
+        excess.0 += share * (n * away * away - recall * (1.0 - recall));
+        excess.1 += share * (n - 1.0) * recall * (1.0 - recall);
+    }
+    let correlation = f64::clamp(excess.0 / excess.1, 0.01, 0.5);
+    let odd = (1.0 - shares / count).clamp(ODD_PASSES.0, ODD_PASSES.2);
+    (Rates { recall, concentration: 1.0 / correlation - 1.0 }, odd)
+}

@@ -1,0 +1,242 @@
+//! What the terms of J are made of: the scene, its noise, and what is learned about each class.
+//!
+//! All rates are densities, so that nothing here has a scale: clutter in detections per image and steradian, births in
+//! objects per cubic metre of the space that votes span.
+
+use std::f64::consts::PI;
+use std::sync::Arc;
+
+use super::noise::{Noise, Spread};
+use super::scene::Scene;
+use super::{Settings, spreads_of};
+
+/// What is learned about the objects and the clutter of one class.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ClassModel {
+    /// How often objects are detected.
+    pub rates: Rates,
+    /// Objects are detected from this distance on, m; infinite before anything is learned.
+    pub nearest_m: f64,
+    /// The share of the passes in which an object is seen in any share of the looks, or none: hidden, or from where it is not detected.
+    pub odd_passes: f64,
+    /// The share of what is born that is false.
+    pub false_share: f64,
+    /// Logarithm of the clutter: detections per image and steradian that show no object.
+    pub ln_clutter_per_sr: f64,
+    /// Logarithm of the density of objects, 1/m³.
+    pub ln_births_per_m3: f64,
+    /// How large detections are.
+    pub sizes: Sizes,
+}
+
+/// How often an object is detected: a share of the looks that differs from pass to pass, a beta distribution.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rates {
+    /// Its mean.
+    pub recall: f64,
+    /// How little it differs between passes: the sum of both parameters of the beta distribution, in looks.
+    pub concentration: f64,
+}
+
+/// Logarithms of box sizes as angles, and of physical sizes in metres: angle times depth.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sizes {
+    /// Mean and standard deviation of the angles of all boxes, ln rad.
+    pub angle: (f64, f64),
+    /// Mean and standard deviation of the physical sizes of objects, ln m.
+    pub object: (f64, f64),
+    /// Standard deviation of the size that one detection implies around that of its object.
+    pub spread: f64,
+}
+
+/// A vote's size disagrees with its object's by chance in this share of the votes: half hidden, cut, merged with another. It bounds
+/// what one size can say. 5 % as in robust regression (Huber and Ronchetti, "Robust Statistics", 2009, section 1).
+const ODD_SIZES: f64 = 0.05;
+/// Sizes that say nothing: boxes of one size in all pictures, or no boxes.
+const LEAST_ANGLE_SD: f64 = 1e-3;
+
+impl Sizes {
+    /// Before anything is learned: objects of one class differ by a factor of two, and boxes of one object by a third.
+    #[must_use]
+    pub fn guess(angle: (f64, f64)) -> Self {
+        Self { angle, object: (f64::NAN, 0.7), spread: 0.3 }
+    }
+
+    /// Whether sizes tell anything at all.
+    #[must_use]
+    pub fn tell(&self) -> bool {
+        self.angle.1 > LEAST_ANGLE_SD && self.spread < self.angle.1
+    }
+
+    /// How much more probable, in logarithms, a box is at an object of a size than as clutter; `angle` and `size` are logarithms.
+    #[inline]
+    #[must_use]
+    pub fn log_ratio(&self, angle: f64, depth_m: f64, size: f64) -> f64 {
+        if !self.tell() || !angle.is_finite() || !size.is_finite() {
+            return 0.0;
+        }
+        let at_object = (angle + depth_m.ln() - size) / self.spread;
+        let as_clutter = (angle - self.angle.0) / self.angle.1;
+        let ratio =
+            self.angle.1 / self.spread * (0.5 * (as_clutter * as_clutter - at_object * at_object)).min(30.0).exp();
+        ((1.0 - ODD_SIZES) * ratio + ODD_SIZES).ln()
+    }
+
+    /// Whether two implied sizes may be of one object.
+    #[inline]
+    #[must_use]
+    pub fn agree(&self, a: f64, b: f64, gate_sigmas: f64) -> bool {
+        !self.tell() || !((a - b).abs() > gate_sigmas * self.spread * std::f64::consts::SQRT_2)
+    }
+}
+
+/// A scene with everything that a term of J needs.
+pub struct Model<'a> {
+    /// What was seen.
+    pub scene: &'a Scene,
+    /// Errors of poses and detections.
+    pub noise: &'a Noise,
+    /// All errors of each ray together.
+    pub spreads: Arc<Vec<Spread>>,
+    /// Logarithm of the angle that each ray's box spans, rad; not finite where it has no box.
+    pub ln_angle: Vec<f64>,
+    /// What is learned, by class.
+    pub classes: Vec<ClassModel>,
+    /// Settings of the run.
+    pub settings: &'a Settings,
+}
+
+impl<'a> Model<'a> {
+    /// A model of which nothing is learned yet: all detections may be clutter.
+    #[must_use]
+    pub fn new(scene: &'a Scene, noise: &'a Noise, settings: &'a Settings) -> Self {
+        let rays = scene.rays.rays.len();
+        let spreads = spreads_of(scene, noise);
+        let ln_angle: Vec<f64> =
+            scene.box_px.iter().zip(&scene.scale2).map(|(&size, &scale2)| (size / scale2.sqrt()).ln()).collect();
+        let count = scene.rays.class.iter().max().map_or(0, |&last| last as usize + 1);
+        let solid_angle_sr = scene.solid_angle_sr();
+        let classes = (0..count as u32)
+            .map(|class| {
+                let of_class = || (0..rays).filter(|&ray| scene.rays.class[ray] == class);
+                let angles: Vec<f64> = of_class().map(|ray| ln_angle[ray]).filter(|angle| angle.is_finite()).collect();
+                ClassModel {
+                    rates: Rates::GUESS,
+                    nearest_m: f64::INFINITY,
+                    odd_passes: ODD_PASSES.1,
+                    false_share: FALSE_SHARE.1,
+                    ln_clutter_per_sr: (of_class().count().max(1) as f64 / solid_angle_sr).ln(),
+                    ln_births_per_m3: -3.0 * settings.viability.max_range_m.ln(),
+                    sizes: Sizes::guess(mean_and_sd(&angles)),
+                }
+            })
+            .collect();
+        Self { scene, noise, spreads: Arc::new(spreads), ln_angle, classes, settings }
+    }
+
+    /// What is learned about the class of a ray.
+    #[inline]
+    #[must_use]
+    pub fn class_of(&self, ray: u32) -> &ClassModel {
+        &self.classes[self.scene.rays.class[ray as usize] as usize]
+    }
+
+    /// Logarithm of the clutter around a ray, per squared pixel.
+    #[inline]
+    #[must_use]
+    pub fn ln_clutter_per_px2(&self, ray: u32) -> f64 {
+        self.class_of(ray).ln_clutter_per_sr - self.scene.scale2[ray as usize].ln()
+    }
+
+    /// How much more probable, in logarithms, a detection is as a vote than as clutter, if its object, of size `ln_size`, is where the
+    /// residual has a squared length of `chi2` sigmas with a covariance of determinant `px4`.
+    #[inline]
+    #[must_use]
+    pub fn vote_gain(&self, ray: u32, chi2: f64, px4: f64, depth_m: f64, ln_size: f64) -> f64 {
+        let class = self.class_of(ray);
+        -0.5 * (chi2 + px4.ln()) - (2.0 * PI).ln() - self.ln_clutter_per_px2(ray)
+            + class.sizes.log_ratio(self.ln_angle[ray as usize], depth_m, ln_size)
+            + class.rates.log_odds()
+    }
+}
+
+/// The share of false things among what is born: at least, before anything is learned, at most. Rule of succession: of a hundred objects one
+/// may be false though none is known.
+pub const FALSE_SHARE: (f64, f64, f64) = (0.01, 0.1, 0.5);
+
+/// The share of odd passes: at least, before anything is learned, at most.
+pub const ODD_PASSES: (f64, f64, f64) = (0.05, 0.2, 0.5);
+
+impl Rates {
+    /// Of things of which nothing is known (Jeffreys).
+    pub const ANY: Self = Self { recall: 0.5, concentration: 1.0 };
+    /// Before anything is learned.
+    pub const GUESS: Self = Self { recall: 0.7, concentration: 3.0 };
+
+    /// What one more hit instead of a miss is worth, about.
+    #[must_use]
+    pub fn log_odds(&self) -> f64 {
+        (self.recall / (1.0 - self.recall)).ln()
+    }
+
+    /// What a miss costs, about.
+    #[must_use]
+    pub fn log_miss(&self) -> f64 {
+        (1.0 - self.recall).ln()
+    }
+
+    /// Logarithm of the likelihood of `hits` among some looks of a pass, in one order: beta-binomial.
+    #[must_use]
+    pub fn log_likelihood(&self, hits: f64, looks: f64) -> f64 {
+        let (a, b) = (self.recall * self.concentration, (1.0 - self.recall) * self.concentration);
+        log_rising(a, hits) + log_rising(b, looks - hits) - log_rising(a + b, looks)
+    }
+}
+
+/// `ln(Gamma(x + n) / Gamma(x))`: `log(x (x + 1) ... (x + n - 1))` for whole n.
+fn log_rising(x: f64, n: f64) -> f64 {
+    if n <= 0.0 { 0.0 } else { ln_gamma(x + n) - ln_gamma(x) }
+}
+
+/// Logarithm of the gamma function of a positive number: Stirling's series (Abramowitz and Stegun, 6.1.41) beyond 8.
+fn ln_gamma(mut x: f64) -> f64 {
+    let mut product = 1.0;
+    while x < 8.0 {
+        product *= x;
+        x += 1.0;
+    }
+    let inverse = 1.0 / x;
+    let square = inverse * inverse;
+    let series = inverse * (1.0 / 12.0 - square * (1.0 / 360.0 - square * (1.0 / 1260.0)));
+    (x - 0.5) * x.ln() - x + 0.5 * (2.0 * PI).ln() + series - product.ln()
+}
+
+/// Mean and standard deviation; 0 of nothing.
+#[must_use]
+pub fn mean_and_sd(values: &[f64]) -> (f64, f64) {
+    let count = values.len().max(1) as f64;
+    let mean = values.iter().sum::<f64>() / count;
+    let variance = values.iter().map(|value| (value - mean) * (value - mean)).sum::<f64>() / count;
+    (mean, variance.sqrt())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_beta_binomial_is_that_of_whole_numbers() {
+        let rates = Rates { recall: 0.6, concentration: 4.0 };
+        // B(2.4 + 2, 1.6 + 1) / B(2.4, 1.6) = (2.4 * 3.4 * 1.6) / (4 * 5 * 6).
+        let expected = (2.4_f64 * 3.4 * 1.6 / (4.0 * 5.0 * 6.0)).ln();
+        assert!((rates.log_likelihood(2.0, 3.0) - expected).abs() < 1e-9);
+        assert!(rates.log_likelihood(0.0, 0.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_size_that_disagrees_says_no_more_than_that_sizes_are_odd_at_times() {
+        let sizes = Sizes { angle: (-3.0, 0.8), object: (0.0, 0.5), spread: 0.1 };
+        assert!(sizes.log_ratio(-3.0, 3.0_f64.exp(), 0.0) > 1.5);
+        assert!((sizes.log_ratio(-3.0, 5.0_f64.exp(), 0.0) - ODD_SIZES.ln()).abs() < 1e-6);
+    }
+}

@@ -1,0 +1,260 @@
+//! Moves of two objects: they become one, or exchange what they have from one direction or on one visit.
+//!
+//! Where two objects are seen from two directions, rays meet in four places: which belong together only J of all four can tell.
+
+use rayon::prelude::*;
+use rustc_hash::{FxHashMap, FxHashSet};
+
+use super::assign::{Claim, claims_of_all, gain_alone, images_of};
+use super::energy::{Object, by_place, object, visits};
+use super::index::RayIndex;
+use super::looks::Lookout;
+use super::model::Model;
+use super::sample::scramble;
+use crate::progress::{Halt, Progress};
+
+/// Objects have to do with each other if one of them may have this share of the other's votes.
+const LEAST_SHARE: f64 = 0.1;
+/// So do objects nearer to each other than this share of the range: rays from two directions meet crosswise not far from where they should.
+const NEAR_SHARE: f64 = 0.05;
+/// What looks from directions within this angle of each other looks from one side (cosine of 25 degrees).
+const SIDE_COSINE: f64 = 0.906;
+/// Two objects of a class are no nearer to each other than this share of their size: things are solid, and boxes show their middle to
+/// within a fraction of their size.
+const EXCLUSIVE_SHARE: f64 = 0.25;
+/// J that falls by less stays as it is.
+const LEAST_FALL: f64 = 1e-6;
+
+/// Pairs that were tried in vain, by their votes.
+#[derive(Default)]
+pub struct TriedPairs(FxHashSet<(u64, u64)>);
+
+/// Merge and exchange as long as J falls; whether it did.
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn rearrange_pairs(
+    model: &Model<'_>,
+    lookout: &Lookout,
+    index: &RayIndex<'_>,
+    mut objects: Vec<Object>,
+    tried: &mut TriedPairs,
+    progress: &Progress,
+) -> Result<(Vec<Object>, bool), Halt> {
+    let mut any = false;
+    loop {
+        let claims = claims_of_all(model, index, &objects, progress)?;
+        let prints: Vec<u64> = objects.iter().map(fingerprint).collect();
+        let mut pairs = pairs(model, &objects, &claims);
+        pairs.retain(|&(a, b)| !tried.0.contains(&(prints[a], prints[b])));
+        let try_one = |&(a, b): &(usize, usize)| {
+            progress.check()?;
+            Ok(Pair { model, lookout, of: [&objects[a], &objects[b]], claims: [&claims[a], &claims[b]] }.best())
+        };
+        let found: Vec<Option<(f64, Vec<Object>)>> =
+            pairs.par_iter().with_max_len(1).map(try_one).collect::<Result<_, Halt>>()?;
+        let mut better: Vec<(f64, usize, usize, Vec<Object>)> = Vec::new();
+        for (&(a, b), found) in pairs.iter().zip(found) {
+            match found {
+                Some((change, objects)) => better.push((change, a, b, objects)),
+                None => {
+                    tried.0.insert((prints[a], prints[b]));
+                }
+            }
+        }
+        if better.is_empty() {
+            return Ok((objects, any));
+        }
+        any = true;
+        better.sort_by(|x, y| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2))));
+        let mut kept: Vec<Option<Object>> = objects.into_iter().map(Some).collect();
+        for (_, a, b, new) in better {
+            if a.max(b) < prints.len() && kept[a].is_some() && kept[b].is_some() {
+                (kept[a], kept[b]) = (None, None);
+                kept.extend(new.into_iter().map(Some));
+            }
+        }
+        objects = kept.into_iter().flatten().collect();
+        objects.sort_by_key(|object| object.votes[0]);
+    }
+}
+
+/// Make one of objects that are nearer to each other than solid things can be: a detector that shows one thing twice, or whose boxes have their
+/// middle elsewhere from another side, makes no second one.
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn exclude(
+    model: &Model<'_>,
+    lookout: &Lookout,
+    index: &RayIndex<'_>,
+    mut objects: Vec<Object>,
+    progress: &Progress,
+) -> Result<Vec<Object>, Halt> {
+    loop {
+        progress.check()?;
+        let tree = by_place(&objects);
+        let mut near: Vec<(f64, usize, usize)> = Vec::new();
+        for (i, object) in objects.iter().enumerate().filter(|(_, object)| object.ln_size.is_finite()) {
+            let reach = EXCLUSIVE_SHARE * object.ln_size.exp();
+            let others = tree.locate_within_distance(object.fit.point.into(), reach * reach);
+            near.extend(others.filter(|other| other.data != i).map(|other| {
+                ((objects[other.data].fit.point - object.fit.point).norm(), i.min(other.data), i.max(other.data))
+            }));
+        }
+        near.sort_by(|x, y| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2))));
+        let mut kept: Vec<Option<Object>> = objects.iter().cloned().map(Some).collect();
+        for (_, a, b) in near {
+            let (Some(first), Some(second)) = (&kept[a], &kept[b]) else { continue };
+            let claims = claims_of_all(model, index, &[first.clone(), second.clone()], progress)?;
+            let pair = Pair { model, lookout, of: [first, second], claims: [&claims[0], &claims[1]] };
+            let weaker = if first.votes.len() < second.votes.len() { a } else { b };
+            // A detector takes one thing for another now and then: the class with more votes has the place.
+            let merged = if first.class == second.class { pair.merged() } else { None };
+            kept[weaker] = None;
+            if let Some(merged) = merged {
+                (kept[a], kept[b]) = (None, None);
+                kept.push(Some(merged));
+            }
+        }
+        let left: Vec<Object> = kept.into_iter().flatten().collect();
+        if left.len() == objects.len() {
+            return Ok(left);
+        }
+        objects = left;
+        objects.sort_by_key(|object| object.votes[0]);
+    }
+}
+
+/// Pairs of objects of which one may have some of what the other has.
+fn pairs(model: &Model<'_>, objects: &[Object], claims: &[Vec<Claim>]) -> Vec<(usize, usize)> {
+    let mut owner = vec![u32::MAX; model.scene.rays.rays.len()];
+    for (i, object) in objects.iter().enumerate() {
+        object.votes.iter().for_each(|&ray| owner[ray as usize] = i as u32);
+    }
+    let mut shared: FxHashMap<(usize, usize), usize> = FxHashMap::default();
+    for (i, claims) in claims.iter().enumerate() {
+        for claim in claims {
+            let other = owner[claim.ray as usize];
+            if other != u32::MAX && other as usize != i {
+                *shared.entry((i, other as usize)).or_default() += 1;
+            }
+        }
+    }
+    let enough =
+        |&((_, of), count): &(&(usize, usize), &usize)| *count as f64 >= LEAST_SHARE * objects[*of].votes.len() as f64;
+    let mut pairs: Vec<(usize, usize)> =
+        shared.iter().filter(enough).map(|(&(a, b), _)| (a.min(b), a.max(b))).collect();
+    // Where rays of two objects from two directions meet crosswise, neither is in the other's gate.
+    let reach_m = NEAR_SHARE * model.settings.viability.max_range_m;
+    let tree = by_place(objects);
+    for (i, object) in objects.iter().enumerate() {
+        let near = tree.locate_within_distance(object.fit.point.into(), reach_m * reach_m).map(|near| near.data);
+        pairs.extend(near.filter(|&other| other > i && objects[other].class == object.class).map(|other| (i, other)));
+    }
+    pairs.sort_unstable();
+    pairs.dedup();
+    pairs
+}
+
+/// Two objects and what they may have.
+struct Pair<'a> {
+    model: &'a Model<'a>,
+    lookout: &'a Lookout,
+    of: [&'a Object; 2],
+    claims: [&'a [Claim]; 2],
+}
+
+impl Pair<'_> {
+    /// What lowers J most, and by how much.
+    fn best(&self) -> Option<(f64, Vec<Object>)> {
+        let before: f64 = self.of.iter().map(|object| object.energy).sum();
+        let mut best: Option<(f64, Vec<Object>)> = None;
+        let mut consider = |found: Option<Vec<Object>>| {
+            if let Some(found) = found {
+                let change = found.iter().map(|object| object.energy).sum::<f64>() - before;
+                if change < best.as_ref().map_or(-LEAST_FALL, |best| best.0) {
+                    best = Some((change, found));
+                }
+            }
+        };
+        consider(self.merged().map(|object| vec![object]));
+        for part in self.parts() {
+            consider(self.exchanged(&part));
+        }
+        best
+    }
+
+    /// Both as one.
+    fn merged(&self) -> Option<Object> {
+        let larger = if self.of[0].votes.len() >= self.of[1].votes.len() { self.of[0] } else { self.of[1] };
+        let mut votes: Vec<(u32, f64, u32)> = self
+            .of
+            .iter()
+            .flat_map(|object| &object.votes)
+            .map(|&ray| (self.model.scene.rays.image[ray as usize], gain_alone(self.model, larger, ray), ray))
+            .collect();
+        votes.sort_by(|x, y| x.0.cmp(&y.0).then(y.1.total_cmp(&x.1)).then(x.2.cmp(&y.2)));
+        votes.dedup_by_key(|vote| vote.0);
+        let mut votes: Vec<u32> = votes.into_iter().map(|vote| vote.2).collect();
+        votes.sort_unstable();
+        let mut others: Vec<u32> = self.claims.iter().flat_map(|claims| images_of(claims)).collect();
+        others.sort_unstable();
+        others.dedup();
+        object(self.model, self.lookout, votes, larger.fit.point, others)
+    }
+
+    /// Images, ascending, whose votes may be exchanged together: those of a visit, and those that look from one side.
+    fn parts(&self) -> Vec<Vec<u32>> {
+        let scene = self.model.scene;
+        let mut votes: Vec<u32> = self.of.iter().flat_map(|object| object.votes.iter().copied()).collect();
+        votes.sort_unstable();
+        let middle = 0.5 * (self.of[0].fit.point + self.of[1].fit.point);
+        let images = |votes: &[u32]| {
+            let mut images: Vec<u32> = votes.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
+            images.dedup();
+            images
+        };
+        let mut parts: Vec<Vec<u32>> = visits(scene, &votes).map(images).collect();
+        let mut sides: Vec<(nalgebra::Vector3<f64>, Vec<u32>)> = Vec::new();
+        for &ray in &votes {
+            let direction = (scene.ray(ray).center - middle).normalize();
+            match sides.iter_mut().find(|(side, _)| side.dot(&direction) >= SIDE_COSINE) {
+                Some((_, of_side)) => of_side.push(ray),
+                None => sides.push((direction, vec![ray])),
+            }
+        }
+        parts.extend(sides.iter().map(|(_, votes)| images(votes)));
+        parts.sort_unstable();
+        parts.dedup();
+        parts
+    }
+
+    /// Both after an exchange of what they have in some images; nothing if one has nothing left, or too little may be exchanged.
+    fn exchanged(&self, images: &[u32]) -> Option<Vec<Object>> {
+        let scene = self.model.scene;
+        let is_in = |ray: &u32| images.binary_search(&scene.rays.image[*ray as usize]).is_ok();
+        let [a, b] = self.of.map(|object| object.votes.iter().copied().partition::<Vec<u32>, _>(is_in));
+        if a.0.len() + b.0.len() == 0 {
+            return None;
+        }
+        let min_votes = self.model.settings.min_votes as usize;
+        let mut found = Vec::with_capacity(2);
+        for (i, (kept, taken)) in [(&a.1, &b.0), (&b.1, &a.0)].into_iter().enumerate() {
+            let mut votes: Vec<u32> = kept.iter().chain(taken).copied().collect();
+            if votes.len() < min_votes {
+                return None;
+            }
+            votes.sort_unstable();
+            let old = self.of[i];
+            found.push(object(self.model, self.lookout, votes, old.fit.point, images_of(self.claims[i]))?);
+        }
+        let limit = self.model.settings.gate_sigmas.powi(2);
+        let fits = found.iter().all(|object| object.energy < 0.0 && object.fit.chi2.iter().all(|chi2| *chi2 <= limit));
+        fits.then_some(found)
+    }
+}
+
+fn fingerprint(object: &Object) -> u64 {
+    object.votes.iter().fold(0, |sum, &ray| scramble(sum ^ u64::from(ray)))
+}

@@ -1,0 +1,87 @@
+//! The search: from a map that is there to begin with, moves that are committed only if J falls.
+//!
+//! In each round all objects compete for all detections, pairs merge and exchange, neighborhoods are destroyed and repaired, and what
+//! is left over gives birth; until nothing lowers J. What is learned about the classes is learned anew in each round.
+
+use std::sync::Arc;
+
+use rayon::prelude::*;
+
+use super::Tally;
+use super::assign::assign;
+use super::births::births;
+use super::calibrate::Placed;
+use super::energy::{Object, object};
+use super::index::RayIndex;
+use super::learn::learn;
+use super::looks::Lookout;
+use super::model::Model;
+use super::propose::Who;
+use super::rearrange::{TriedPairs, exclude, rearrange_pairs};
+use super::repair::{Tried, repair};
+use crate::progress::{Halt, Progress};
+
+/// Rounds, at most.
+const ROUNDS: usize = 6;
+
+/// How far the search goes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Depth {
+    /// What is there competes, and dies if J falls.
+    Shallow,
+    /// All moves, until none lowers J.
+    Deep,
+}
+
+/// The map of some rays with the least J that is found from what is there to begin with.
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn search(
+    model: &mut Model<'_>,
+    rays: &[u32],
+    begun: Vec<Placed>,
+    depth: Depth,
+    tally: &mut Tally,
+    progress: &Progress,
+) -> Result<Vec<Object>, Halt> {
+    let lookout = Lookout::new(model.scene, model.settings.viability.max_range_m);
+    let mut is_taken = vec![false; model.scene.rays.rays.len()];
+    let spreads = Arc::clone(&model.spreads);
+    let index = RayIndex::new(model.scene, &spreads, model.settings.gate_sigmas, rays.iter().copied());
+    let begin = |(votes, point): Placed| object(model, &lookout, votes, point, Vec::new());
+    let mut objects: Vec<Object> = begun.into_par_iter().filter_map(begin).collect();
+    let (mut tried, mut tried_pairs) = (Tried::default(), TriedPairs::default());
+    let rounds = if depth == Depth::Deep { ROUNDS } else { 1 };
+    for round in 0..rounds {
+        learn(model, &objects);
+        let model: &Model<'_> = model;
+        let again = |o: Object| object(model, &lookout, o.votes, o.fit.point, o.others);
+        objects = objects.into_par_iter().filter_map(again).filter(|object| object.energy < 0.0).collect();
+        let before = objects.len();
+        let (assigned, mut any) = assign(model, &lookout, &index, objects, progress)?;
+        objects = assigned;
+        tally.deaths += (before - objects.len()) as u64;
+        if depth == Depth::Deep {
+            let (rearranged, better) = rearrange_pairs(model, &lookout, &index, objects, &mut tried_pairs, progress)?;
+            any |= better;
+            let (repaired, better) = repair(model, &lookout, &index, rearranged, &mut tried, round as u64, progress)?;
+            any |= better;
+            objects = repaired;
+            is_taken.fill(false);
+            objects.iter().flat_map(|o| &o.votes).for_each(|&ray| is_taken[ray as usize] = true);
+            let (born, hypotheses) = births(model, &lookout, rays, &mut is_taken, &[Who::All], progress)?;
+            tally.hypotheses += hypotheses;
+            tally.births += born.len() as u64;
+            any |= !born.is_empty();
+            objects.extend(born);
+        }
+        if !any {
+            break;
+        }
+    }
+    let mut objects = exclude(model, &lookout, &index, objects, progress)?;
+    objects.retain(|object| object.energy < 0.0);
+    objects.sort_by_key(|object| object.votes[0]);
+    Ok(objects)
+}
