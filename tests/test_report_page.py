@@ -122,7 +122,7 @@ def test_without_scripts_tables_figures_and_lists_are_there(report: Path) -> Non
     page = Page(report.read_text(encoding="utf-8"))
     tags = [tag for tag, _ in page.tags]
     assert tags.count("svg") == 5
-    assert tags.count("table") == 8
+    assert tags.count("table") == 11
     for text in (
         "Table 1. Detections and clusters",
         "Table 2. Passes per cluster",

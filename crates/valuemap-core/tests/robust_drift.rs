@@ -11,21 +11,38 @@ type Vector6 = nalgebra::SVector<f64, 6>;
 
 const LABELS: usize = 3;
 
-/// Looks from places far enough from each other that each is a leg of its own; some places look at several labels.
+/// Errors of legs.
+fn legs() -> impl Strategy<Value = Sigmas> {
+    prop_oneof![Just(Sigmas::NONE), Just(Sigmas { position_m: 0.8, rotation_rad: 0.1 })]
+}
+
+/// What comes before a look: another label of the same image, another image of the same place, or a place so far on that it is a leg of its own.
+#[derive(Debug, Clone, Copy)]
+enum Step {
+    Label,
+    Image,
+    Leg(f64),
+}
+
+fn step() -> impl Strategy<Value = Step> {
+    prop_oneof![
+        Just(Step::Label),
+        Just(Step::Image),
+        ((LEG_M * 1.1)..80.0_f64).prop_map(Step::Leg),
+        ((LEG_M * 1.1)..80.0_f64).prop_map(Step::Leg),
+    ]
+}
+
+/// Looks from several places, each a leg of its own; some images look at several labels.
 fn looks() -> impl Strategy<Value = Vec<Look>> {
-    let look = (
-        prop::array::uniform6(-1.0..1.0_f64),
-        prop::array::uniform8(-1.0..1.0_f64),
-        prop::option::of((LEG_M * 1.1)..80.0_f64),
-        0.5..4.0_f64,
-    );
-    prop::collection::vec(look, 2..9).prop_map(|parts| {
+    let look = (prop::array::uniform6(-1.0..1.0_f64), prop::array::uniform8(-1.0..1.0_f64), step(), 0.5..4.0_f64);
+    (prop::collection::vec(look, 2..9), legs()).prop_map(|(parts, leg_sigma)| {
         let (mut driven_m, mut image, mut label) = (0.0, 0, 0);
-        let of_part = |(turns, rest, step, detection_px2): ([f64; 6], [f64; 8], Option<f64>, f64)| {
-            // Without a step it is the same image, and another label.
-            match step.or_else(|| (label + 1 == LABELS).then_some(LEG_M * 2.0)) {
-                Some(step) => (driven_m, image, label) = (driven_m + step, image + 1, image as usize % LABELS),
-                None => label += 1,
+        let of_part = |(turns, rest, step, detection_px2): ([f64; 6], [f64; 8], Step, f64)| {
+            match step {
+                Step::Label if label + 1 < LABELS => label += 1,
+                Step::Label | Step::Image => (image, label) = (image + 1, image as usize % LABELS),
+                Step::Leg(step) => (driven_m, image, label) = (driven_m + step, image + 1, image as usize % LABELS),
             }
             Look {
                 label,
@@ -34,6 +51,7 @@ fn looks() -> impl Strategy<Value = Vec<Look>> {
                 by_point: [Vector3::new(rest[2], rest[3], rest[4]), Vector3::new(rest[5], rest[6], rest[7])],
                 by_turn: [Vector3::from_column_slice(&turns[..3]), Vector3::from_column_slice(&turns[3..])],
                 drift_sigma: Sigmas { position_m: 0.5, rotation_rad: 0.2 },
+                leg_sigma,
                 own_sigma: Sigmas { position_m: 0.3, rotation_rad: 0.4 },
                 detection_px2,
                 variance: detection_px2 + 1.0,
@@ -48,6 +66,15 @@ fn kernel(a: &Look, b: &Look) -> f64 {
     (-(a.driven_m - b.driven_m).abs() / DRIFT_LENGTH_M).exp()
 }
 
+/// Covariance of what two looks' poses have in common along the drive, drift and error of the leg, as it shows in an axis of each.
+fn shared((a, i): (&Look, usize), (b, j): (&Look, usize)) -> f64 {
+    let both = |a_sigma: &Sigmas, b_sigma: &Sigmas| {
+        a.by_pose(i).component_mul(&a_sigma.each()).dot(&b.by_pose(j).component_mul(&b_sigma.each()))
+    };
+    let of_leg = if a.driven_m.to_bits() == b.driven_m.to_bits() { both(&a.leg_sigma, &b.leg_sigma) } else { 0.0 };
+    of_leg + kernel(a, b) * both(&a.drift_sigma, &b.drift_sigma)
+}
+
 /// Covariance of all residuals, and their derivatives by the positions.
 fn dense(looks: &[Look]) -> (DMatrix<f64>, DMatrix<f64>, DVector<f64>) {
     let n = 2 * looks.len();
@@ -57,7 +84,7 @@ fn dense(looks: &[Look]) -> (DMatrix<f64>, DMatrix<f64>, DVector<f64>) {
         let (a, b) = (row(i).0, row(j).0);
         let detection = if i == j { a.detection_px2 } else { 0.0 };
         let own = if a.image == b.image { scaled(i, &a.own_sigma).dot(&scaled(j, &b.own_sigma)) } else { 0.0 };
-        detection + own + kernel(a, b) * scaled(i, &a.drift_sigma).dot(&scaled(j, &b.drift_sigma))
+        detection + own + shared((a, i % 2), (b, j % 2))
     });
     let by_point =
         DMatrix::from_fn(
@@ -89,13 +116,12 @@ proptest! {
             let log_determinant = covariance.determinant().ln();
             prop_assert!((drive.log_determinant() - log_determinant).abs() < 1e-8 * log_determinant.abs().max(1.0));
         }
-        // What is left is what the drift, given all residuals, does not explain.
+        // What is left is what drift and legs, given all residuals, does not explain.
         let weighed = cholesky.solve(&residual);
         for (k, found) in drive.left().iter().enumerate() {
             for axis in 0..2 {
-                let scaled = |i: usize, axis: usize| looks[i].by_pose(axis).component_mul(&looks[i].drift_sigma.each());
                 let drift: f64 = (0..2 * looks.len())
-                    .map(|j| kernel(&looks[k], &looks[j / 2]) * scaled(k, axis).dot(&scaled(j / 2, j % 2)) * weighed[j])
+                    .map(|j| shared((&looks[k], axis), (&looks[j / 2], j % 2)) * weighed[j])
                     .sum();
                 prop_assert!((found[axis] - (looks[k].residual[axis] - drift)).abs() < 1e-8);
             }
@@ -115,21 +141,26 @@ proptest! {
                 let (other, by_pose) = (&looks[k / 2], looks[k / 2].by_pose(k % 2));
                 let drift2 = look.drift_sigma.each().map(|sigma| sigma * sigma) * kernel(look, other);
                 let own2 = look.own_sigma.each().map(|sigma| sigma * sigma) * f64::from(look.image == other.image);
-                (drift2 + own2).component_mul(&by_pose) * weighed[k]
+                let is_one_leg = look.driven_m.to_bits() == other.driven_m.to_bits();
+                let leg2 = look.leg_sigma.each().map(|sigma| sigma * sigma) * f64::from(is_one_leg);
+                (drift2 + leg2 + own2).component_mul(&by_pose) * weighed[k]
             };
             let expected: Vector6 = (0..2 * looks.len()).map(of_residual).sum();
             prop_assert!((found - expected).norm() < 1e-8);
         }
     }
 
+    /// The smoother takes what a leg has for itself for drift as well.
     #[test]
     fn the_smoother_is_the_dense_posterior(looks in looks()) {
-        let looks: Vec<Look> = looks.into_iter().map(Look::by_itself).collect();
+        let votes: Vec<Look> = looks.into_iter().map(Look::by_itself).collect();
+        let all_is_drift = |look: &Look| Look { drift_sigma: look.shared_sigma(), leg_sigma: Sigmas::NONE, ..look.clone() };
+        let looks: Vec<Look> = votes.iter().map(all_is_drift).collect();
         let mut starts: Vec<f64> = looks.iter().map(|look| look.driven_m).collect();
         starts.dedup();
         let leg_of = |look: &Look| starts.partition_point(|&start| start < look.driven_m);
         let mut beliefs = vec![Belief::nothing(); starts.len()];
-        for look in &looks {
+        for look in &votes {
             beliefs[leg_of(look)] = beliefs[leg_of(look)].and(&Belief::of_vote(look, look.variance));
         }
         let (covariance, _, residual) = dense(&looks);

@@ -10,13 +10,16 @@ use nalgebra::{Isometry3, Point3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use valuemap_core::progress::Progress;
-use valuemap_core::robust::associate::Association;
 use valuemap_core::robust::contest::Contest;
+use valuemap_core::robust::energy::object as object_of;
 use valuemap_core::robust::estimate::{Care, Joint, Limits, Start};
-use valuemap_core::robust::handover::hand_over;
 use valuemap_core::robust::index::RayIndex;
+use valuemap_core::robust::initial::associate::Association;
+use valuemap_core::robust::initial::handover::hand_over;
+use valuemap_core::robust::initial::label::{Label, from_voters};
 use valuemap_core::robust::keyframes::Keyframes;
-use valuemap_core::robust::label::{Label, from_voters};
+use valuemap_core::robust::looks::Lookout;
+use valuemap_core::robust::model::Model;
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::scene::{Scene, View};
 use valuemap_core::robust::spreads_of;
@@ -156,17 +159,19 @@ proptest! {
         prop_assume!(of_object.len() >= 8);
         // The twin is seen in the later half of the images alone.
         let of_twin = of_twin[of_twin.len() / 2..].to_vec();
-        let labels = [label(&scene, of_object, object), label(&scene, of_twin, twin)];
-        let starts =
-            labels.iter().map(|label| Start { voters: &label.voters, weights: &[], point: label.estimate.point });
+        let model = Model::new(&scene, &DRIFTING, &SETTINGS);
+        let lookout = Lookout::new(&scene, 60.0);
+        let labels = [(of_object, object), (of_twin, twin)]
+            .map(|(votes, point)| object_of(&model, &lookout, votes, point, Vec::new()).unwrap());
+        let starts = labels.iter().map(|label| Start { voters: &label.votes, weights: &[], point: label.fit.point });
         let solution = Joint::new(&scene, &DRIFTING, starts, Care::Exact).solve().unwrap();
         let contested = Contest::new(&scene, &DRIFTING, GATE_SIGMAS, &labels).contested(&solution);
-        let shows_twin: BTreeSet<u32> = labels[1].voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
+        let shows_twin: BTreeSet<u32> = labels[1].votes.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
         for (((of, ray), _), is_contested) in solution.own_chi2().into_iter().zip(contested) {
             let seen = scene.ray(ray);
-            let projected = seen.project(&labels[1].estimate.point);
+            let projected = seen.project(&labels[1].fit.point);
             let variance = DRIFTING.total(&scene, ray).variance(projected.z);
-            let fits = seen.squared_error(&labels[1].estimate.point) / variance < GATE_SIGMAS * GATE_SIGMAS;
+            let fits = seen.squared_error(&labels[1].fit.point) / variance < GATE_SIGMAS * GATE_SIGMAS;
             let is_alone = !shows_twin.contains(&scene.rays.image[ray as usize]);
             prop_assert_eq!(is_contested, of == 0 && is_alone && fits);
         }

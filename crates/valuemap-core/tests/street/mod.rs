@@ -32,6 +32,8 @@ pub const NOISE: Noise = Noise {
     box_share: 0.0,
     position_m: 0.03,
     rotation_rad: 5e-4,
+    position_leg_m: 0.0,
+    rotation_leg_rad: 0.0,
     position_drift_m: 0.0,
     rotation_drift_rad: 0.0,
 };
@@ -60,12 +62,12 @@ pub fn street(images: usize, spacing_m: f64, objects: &[Vector3<f64>], errors_px
         }
     }
     let count = rays.rays.len();
-    let view = |&center: &Vector3<f64>| View {
+    let view = |(viewpoint, &center): (u32, &Vector3<f64>)| View {
         center,
         cam_from_world,
         camera: 0,
         pass: 0,
-        viewpoint: 0,
+        viewpoint,
         driven_m: center.x,
         position_sigma_m: f64::NAN,
         rotation_sigma_rad: f64::NAN,
@@ -75,7 +77,7 @@ pub fn street(images: usize, spacing_m: f64, objects: &[Vector3<f64>], errors_px
         box_px: vec![20.0; count],
         range_m: vec![f64::NAN; count],
         range_sigma_m: vec![f64::NAN; count],
-        views: centers.iter().map(view).collect(),
+        views: (0..).zip(&centers).map(view).collect(),
         frusta: vec![Frustum { normals: Vec::new(), solid_angle_sr: 12.0 }],
         rays: Arc::new(rays),
     }
@@ -109,7 +111,7 @@ pub fn joined(scenes: Vec<Scene>) -> Scene {
         all.box_px.extend(scene.box_px);
         all.range_m.extend(scene.range_m);
         all.range_sigma_m.extend(scene.range_sigma_m);
-        all.views.extend(scene.views.into_iter().map(|view| View { pass, viewpoint: 0, ..view }));
+        all.views.extend(scene.views.into_iter().map(|view| View { pass, ..view }));
     }
     Scene { rays: Arc::new(rays), ..all }
 }
