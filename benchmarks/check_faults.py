@@ -1,10 +1,12 @@
 """Put each known fault into good data and see whether `valuemap check` names it, and whether its fix undoes it.
 
-    python benchmarks/check_faults.py [--seeds N] [--kitti-signs DIR] [--kitti-ts DIR] [--only FAULT ...] [--json FILE]
+    python benchmarks/check_faults.py [--seeds N ...] [--spoiled N ...] [--kitti-signs DIR] [--kitti-ts DIR]
+                                      [--only FAULT ...] [--json FILE]
 
-Good data are simulated cities (two cameras, time stamps, a geo-reference, truth), and where their folders are given
-KITTI odometry 00, 05, 07, 09 (see kitti_signs.py; faults go into 00) and KITTI-TS (`images.csv`, `detections.csv`,
-`signs.csv`). Faults are written here, apart from the package: no fix is used to make the fault that it undoes.
+Good data are simulated cities (two cameras, time stamps, a geo-reference, truth; faults go into the first), and where
+their folders are given KITTI odometry 00, 05, 07, 09 (see kitti_signs.py; faults go into 00) and KITTI-TS
+(`images.csv`, `detections.csv`, `signs.csv`). Faults are written here, apart from the package: no fix is used to make
+the fault that it undoes.
 
 What is counted
 
@@ -540,6 +542,57 @@ def far_images(dataset: Dataset) -> Dataset:
     return posed(dataset, rotation, center)
 
 
+def focal_unit(dataset: Dataset) -> Dataset:
+    """Focal lengths in millimetres of film 36 mm wide."""
+    factors = [
+        36.0 / float(max(w, h)) for w, h in zip(dataset.cameras.width_px, dataset.cameras.height_px, strict=True)
+    ]
+    params = [each * [factor, factor, 1.0, 1.0] for each, factor in zip(dataset.cameras.params, factors, strict=True)]
+    return replace(dataset, cameras=dataset.cameras.replace(params=params))
+
+
+def principal_point(dataset: Dataset) -> Dataset:
+    """Exchange cx and cy."""
+    return _with_params(dataset, lambda params: params[[0, 1, 3, 2]])
+
+
+def lens_model(dataset: Dataset) -> Dataset:
+    """Give the parameters of the lens for pictures that were undistorted."""
+    cameras = dataset.cameras
+    return replace(
+        dataset,
+        cameras=cameras.replace(
+            model=Categories.from_texts(["OPENCV"] * len(cameras)),
+            params=[np.concatenate([each, [-0.4, 0.1, 0.0, 0.0]]) for each in cameras.params],
+        ),
+    )
+
+
+def held_positions(dataset: Dataset) -> Dataset:
+    """Four images in a row have the position of the first."""
+    rotation, center = _poses(dataset)
+    held = center.copy()
+    for code in np.unique(dataset.images.pass_id.codes):
+        members = np.flatnonzero(dataset.images.pass_id.codes == code)
+        held[members] = center[members[np.arange(len(members)) // 4 * 4]]
+    return posed(dataset, rotation, held)
+
+
+def rounded_positions(dataset: Dataset) -> Dataset:
+    """Five decimals of a degree, or whole metres."""
+    rotation, center = _poses(dataset)
+    if dataset.frame.anchor is None:
+        return posed(dataset, rotation, np.round(center))
+    geographic = lon_lat_height_from_enu(center, dataset.frame.anchor)
+    geographic[:, :2] = np.round(geographic[:, :2], 5)
+    return posed(dataset, rotation, enu_from_lon_lat_height(geographic, dataset.frame.anchor))
+
+
+def height_zero(dataset: Dataset) -> Dataset | None:
+    """One pass above the ellipsoid, the others above the sea."""
+    return _moved_pass(dataset, 47.0 * np.array(dataset.frame.up))
+
+
 def quantised_boxes(dataset: Dataset) -> Dataset:
     """Centres on the cells of a heat map."""
     return boxed(dataset, (np.floor(dataset.detections.center_px / 4.0) + 0.5) * 4.0)
@@ -602,6 +655,12 @@ FAULTS: dict[str, Fault] = {
     "repeated_boxes": Fault(repeated_boxes),
     "repeated_images": Fault(repeated_images),
     "far_images": Fault(far_images),
+    "focal_unit": Fault(focal_unit),
+    "principal_point": Fault(principal_point),
+    "lens_model": Fault(lens_model),
+    "held_positions": Fault(held_positions, has_fix=False),  # Between the fixes the way is guessed.
+    "rounded_positions": Fault(rounded_positions, has_fix=False),
+    "height_zero": Fault(height_zero),
     "quantised_boxes": Fault(quantised_boxes, has_fix=False),
     "class_spelling": Fault(class_spelling),
     "equal_scores": Fault(equal_scores, has_fix=False),
@@ -705,6 +764,7 @@ def main() -> int:
     parser.add_argument("--kitti-signs", type=Path, metavar="DIR")
     parser.add_argument("--kitti-ts", type=Path, metavar="DIR")
     parser.add_argument("--only", nargs="*", default=[], choices=sorted(FAULTS))
+    parser.add_argument("--spoiled", type=int, nargs="*", default=[0], help="seeds of the cities that faults go into")
     parser.add_argument("--clean", action="store_true", help="look at good data only")
     parser.add_argument("--no-maps", action="store_true", help="do not map what the fixes make")
     parser.add_argument("--json", type=Path)
@@ -736,7 +796,7 @@ def main() -> int:
 
 def _datasets(options: argparse.Namespace) -> Iterator[tuple[str, Dataset, bool]]:
     for seed in options.seeds:
-        yield f"city {seed}", good_city(seed), True
+        yield f"city {seed}", good_city(seed), seed in options.spoiled
     if options.kitti_signs is not None:
         for sequence in SEQUENCES:
             yield f"KITTI {sequence}", good_kitti(options.kitti_signs, sequence), sequence == "00"

@@ -26,9 +26,8 @@ from valuemap.dataset import Dataset, read_dataset, write_dataset
 from valuemap.errors import InputError
 
 _CONVENTIONS = {convention.name for convention in CONVENTIONS}
-_SEEN_AGAIN = {"passes_no_drives", "time_shift"}
-"""Images without any order have none afterwards either: what is put right is which of them share a pass. A shift along
-the road is found to within two images only, and what is left of it is named again."""
+_SEEN_AGAIN = {"passes_no_drives"}
+"""Images without any order have none afterwards either: what is put right is which of them share a pass."""
 _RECOVERED = {"degrees_for_radians": 0.6}
 """Degrees read as radians lose whole turns, which the direction of travel gives back on straight roads only."""
 _FAULT = {fault.name: fault for fault in FAULTS}

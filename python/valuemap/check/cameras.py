@@ -11,17 +11,23 @@ from scipy.spatial.transform import Rotation
 
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.agreement import compare, measure_agreement
-from valuemap.check.fault import LEAST_CHANCE, Fault, Finding, Stage, View, with_detections, with_images, with_poses
+from valuemap.check.fault import (
+    LEAST_CHANCE,
+    Fault,
+    Finding,
+    Stage,
+    View,
+    gains_of_all,
+    with_detections,
+    with_images,
+    with_poses,
+)
 from valuemap.check.fit import Estimate, Parameter, estimate
+from valuemap.check.lenses import FOCAL_LENGTHS
 from valuemap.check.passes import moved_along
 from valuemap.check.sample import pixels_per_radian
 from valuemap.dataset import Dataset
 from valuemap.tables import Cameras, Floats
-
-_ONE_FOCAL_LENGTH = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-_TWO_FOCAL_LENGTHS = ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE")
-_FOCAL_LENGTHS = dict.fromkeys(_ONE_FOCAL_LENGTH, 1) | dict.fromkeys(_TWO_FOCAL_LENGTHS, 2)
-"""How many of the first parameters of a model are focal lengths."""
 
 
 def _turn(axis: int) -> Any:
@@ -40,7 +46,7 @@ def with_focal(dataset: Dataset, log_factor: float) -> Dataset:
     for row, values in enumerate(dataset.cameras.params):
         model = dataset.cameras.model.names[dataset.cameras.model.codes[row]]
         changed = values.copy()
-        changed[: _FOCAL_LENGTHS.get(model, 0)] *= np.exp(log_factor)
+        changed[: FOCAL_LENGTHS.get(model, 0)] *= np.exp(log_factor)
         params.append(changed)
     cameras: Cameras = dataset.cameras.replace(params=params)
     return Dataset(**{**vars(dataset), "cameras": cameras})
@@ -62,14 +68,28 @@ PARAMETERS = (
 def common_errors(view: View) -> Estimate | None:
     """Return the estimate of what all images may share, worked out once a view."""
     if "common_errors" not in view.memory:
-        parameters = PARAMETERS if _has_focal(view.dataset) else tuple(p for p in PARAMETERS if p.name != "log_focal")
-        view.memory["common_errors"] = estimate(view.dataset, view.many_places, view.gate_px, parameters)
+        view.memory["common_errors"] = estimate(view.dataset, view.many_places, view.gate_px, _parameters(view))
     found: Estimate | None = view.memory["common_errors"]
     return found
 
 
+def settled_errors(view: View) -> Estimate:
+    """Return the same followed to its end: of an error that is there, its full size."""
+    if "settled_errors" not in view.memory:
+        start = common_errors(view)
+        assert start is not None
+        settled = estimate(view.dataset, view.many_places, view.gate_px, _parameters(view), start=start)
+        view.memory["settled_errors"] = settled
+    found: Estimate = view.memory["settled_errors"]
+    return found
+
+
+def _parameters(view: View) -> tuple[Parameter, ...]:
+    return PARAMETERS if _has_focal(view.dataset) else tuple(p for p in PARAMETERS if p.name != "log_focal")
+
+
 def _has_focal(dataset: Dataset) -> bool:
-    return all(_FOCAL_LENGTHS.get(dataset.cameras.model.names[code], 0) for code in dataset.cameras.model.codes)
+    return all(FOCAL_LENGTHS.get(dataset.cameras.model.names[code], 0) for code in dataset.cameras.model.codes)
 
 
 class _CommonError(Fault):
@@ -94,7 +114,8 @@ class _CommonError(Fault):
             if chance > LEAST_CHANCE:
                 continue
             parameter = next(p for p in PARAMETERS if p.name == name)
-            comparison = compare(_gains(view, parameter.change(view.dataset, value)), _gains(view, view.dataset))
+            value, sigma, gains = _better(view, parameter, value, sigma)
+            comparison = compare(gains, gains_of_all(view, view.dataset))
             chance = max(chance, comparison.chance * tests)
             if chance > LEAST_CHANCE:
                 continue
@@ -181,13 +202,15 @@ class TimeShift(_CommonError):
         return f"The shift is {value:.2f} ± {sigma:.2f} m"
 
 
+def _better(view: View, parameter: Parameter, value: float, sigma: float) -> tuple[float, float, Floats]:
+    """Return value, standard error and gains of the first estimate or the settled one, whichever rays agree with."""
+    settled, settled_sigma = settled_errors(view).of(parameter.name)
+    gains, settled_gains = (gains_of_all(view, parameter.change(view.dataset, each)) for each in (value, settled))
+    return (settled, settled_sigma, settled_gains) if settled_gains.sum() > gains.sum() else (value, sigma, gains)
+
+
 def _changed(dataset: Dataset, *, parameter: Parameter, value: float) -> Dataset:
     return parameter.change(dataset, value)
-
-
-def _gains(view: View, dataset: Dataset) -> Floats:
-    samples = (view.stretches, view.many_places)
-    return np.concatenate([measure_agreement(s.of(dataset), s.place_of_image, view.gate_px).gain for s in samples])
 
 
 class HalfPixel(Fault):
@@ -206,7 +229,7 @@ def _principal_points_at_integers(view: View) -> Finding | None:
     rows: list[int] = []
     middles = 0
     for row, params in enumerate(cameras.params):
-        count = _FOCAL_LENGTHS.get(cameras.model.names[cameras.model.codes[row]], 0)
+        count = FOCAL_LENGTHS.get(cameras.model.names[cameras.model.codes[row]], 0)
         if not count:
             continue
         off = 2.0 * params[count : count + 2] - [cameras.width_px[row], cameras.height_px[row]]
@@ -216,7 +239,7 @@ def _principal_points_at_integers(view: View) -> Finding | None:
     if not rows or middles:
         return None
     first = cameras.params[rows[0]]
-    count = _FOCAL_LENGTHS[cameras.model.names[cameras.model.codes[rows[0]]]]
+    count = FOCAL_LENGTHS[cameras.model.names[cameras.model.codes[rows[0]]]]
     return Finding(
         fault=HalfPixel.name,
         what="The principal points are half a pixel off: they count from the middle of the first pixel.",
@@ -232,7 +255,7 @@ def _principal_points_at_integers(view: View) -> Finding | None:
 def _with_principal_points(dataset: Dataset, rows: list[int], shift_px: float) -> Dataset:
     params = [values.copy() for values in dataset.cameras.params]
     for row in rows:
-        count = _FOCAL_LENGTHS[dataset.cameras.model.names[dataset.cameras.model.codes[row]]]
+        count = FOCAL_LENGTHS[dataset.cameras.model.names[dataset.cameras.model.codes[row]]]
         params[row][count : count + 2] += shift_px
     return Dataset(**{**vars(dataset), "cameras": dataset.cameras.replace(params=params)})
 

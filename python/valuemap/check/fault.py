@@ -147,6 +147,12 @@ def uprightness(dataset: Dataset) -> float:
     return float(np.mean(-rotation_matrices(dataset.images)[:, 1] @ np.array(dataset.frame.up)))
 
 
+def gains_of_all(view: View, dataset: Dataset) -> Floats:
+    """Return the gains of a version of the whole dataset on all that a check looks at: stretches and places."""
+    samples = (view.stretches, view.many_places)
+    return np.concatenate([measure_agreement(s.of(dataset), s.place_of_image, view.gate_px).gain for s in samples])
+
+
 class Fault(ABC):
     """A mistake that data may have; `name` is how reports and tests call it."""
 

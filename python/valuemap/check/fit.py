@@ -23,6 +23,10 @@ from valuemap.tables import Floats, Ints
 Change = Callable[[Dataset, float], Dataset]
 """A dataset with one parameter changed by a value."""
 _ROUNDS = 4
+_MOST_ROUNDS = 40
+"""Of an error that is there: each vote is at a place that the last round left, so the way to it is many short steps."""
+_SETTLED = 0.1
+"""Of a standard error: steps below it change nothing."""
 _LEAST_VOTES = 4
 _LEAST_PLACES = 6
 _CAUCHY = 2.4
@@ -58,18 +62,28 @@ class Estimate:
         return {name: [float(f"{part:.4g}") for part in self.of(name)] for name in self.names}
 
 
-def estimate(dataset: Dataset, sample: Sample, gate_px: float, parameters: tuple[Parameter, ...]) -> Estimate | None:
-    """Estimate parameters on a sample of a dataset; None where there is too little to go by."""
-    value = np.zeros(len(parameters))
-    result = None
-    for _ in range(_ROUNDS):
+def estimate(
+    dataset: Dataset,
+    sample: Sample,
+    gate_px: float,
+    parameters: tuple[Parameter, ...],
+    *,
+    start: Estimate | None = None,
+) -> Estimate | None:
+    """Estimate parameters on a sample of a dataset; None where there is too little to go by.
+
+    A few rounds tell whether there is an error at all. From a `start` that says so it goes on until it stays.
+    """
+    value = np.zeros(len(parameters)) if start is None else start.value
+    result = start
+    for _ in range(_ROUNDS if start is None else _MOST_ROUNDS):
         current = apply(dataset, parameters, value)
         found = _solve(current, sample, gate_px, parameters)
         if found is None:
-            return None
+            return start
         value = value + found.value
         result = Estimate(found.names, value.copy(), found.covariance, found.places, found.points)
-        if np.all(np.abs(found.value) < 0.1 * np.sqrt(np.diag(found.covariance))):
+        if np.all(np.abs(found.value) < _SETTLED * np.sqrt(np.diag(found.covariance))):
             break
     return result
 

@@ -432,8 +432,16 @@ def worst_pass(view: View) -> PassShift | None:
     return found
 
 
-def _worst_pass(view: View) -> PassShift | None:
-    """Vote on each pass alone at each place, and see whether its rays meet the points of the others, moved or not."""
+@dataclass(frozen=True, eq=False)
+class _PassPoints:
+    """What each pass of a sample finds alone: rays to meet them with, and the drive's mean azimuth at each point."""
+
+    meeting: Meeting
+    heading: Floats
+
+
+def _pass_points(view: View) -> _PassPoints | None:
+    """Vote on each pass alone at each place; None where there is nothing to compare."""
     sample = view.places_of_passes
     dataset, pass_code = sample.dataset, sample.dataset.images.pass_id.codes.astype(np.int64)
     if len(np.unique(pass_code)) < 2:
@@ -447,10 +455,34 @@ def _worst_pass(view: View) -> PassShift | None:
     voters = found.voters.astype(np.int64)
     first = voters[found.voter_offsets[:-1]]
     first_image = agreement.rays.image_row[first]
-    point, of_pass = found.position_in_world_m, pass_code[first_image]
-    class_code, place = agreement.rays.class_code[first], sample.place_of_image[first_image].astype(np.int64)
     azimuth, _ = driving_azimuths(view.dataset)
     heading = _mean_heading(azimuth[sample.image_row][agreement.rays.image_row[voters]], found.voter_offsets)
+    meeting = Meeting(
+        rays=agreement.rays,
+        place_of_image=sample.place_of_image,
+        pass_of_image=pass_code,
+        point=found.position_in_world_m,
+        pass_of_point=pass_code[first_image],
+        class_of_point=agreement.rays.class_code[first],
+        place_of_point=sample.place_of_image[first_image].astype(np.int64),
+        gate_px=view.gate_px,
+    )
+    return _PassPoints(meeting, heading)
+
+
+def meeting_of_passes(view: View) -> Meeting | None:
+    """Return the points that each pass finds alone and the rays to meet them with; None where there are none."""
+    points = _pass_points(view)
+    return None if points is None else points.meeting
+
+
+def _worst_pass(view: View) -> PassShift | None:
+    """See for each pass whether its rays meet the points of the others, moved or not."""
+    points = _pass_points(view)
+    if points is None:
+        return None
+    meeting, heading = points.meeting, points.heading
+    point, of_pass, class_code = meeting.point, meeting.pass_of_point, meeting.class_of_point
     tolerance_m, within_m = view.step_m / 2.0, _SEARCH_STEPS * view.step_m
     codes, number = np.unique(of_pass, return_counts=True)
     tried = codes[np.argsort(-number, kind="stable")][:_MOST_PASSES]
@@ -469,14 +501,11 @@ def _worst_pass(view: View) -> PassShift | None:
                 continue
             candidates.append((shift.pairs - shift.pairs_at_zero, code, is_along, shift.offset_m))
     candidates.sort(key=lambda each: (-each[0], each[1], each[2]))
-    meeting = _Meeting(
-        agreement.rays, sample.place_of_image, pass_code, point, of_pass, class_code, place, view.gate_px
-    )
     return _best_shift(view, meeting, candidates[:_MOST_CANDIDATES], len(tried), tolerance_m)
 
 
 @dataclass(frozen=True, eq=False)
-class _Meeting:
+class Meeting:
     """Rays of a sample, and the points that each of its passes finds alone."""
 
     rays: Rays
@@ -512,7 +541,7 @@ class _Meeting:
 
 def _best_shift(
     view: View,
-    meeting: _Meeting,
+    meeting: Meeting,
     candidates: Sequence[tuple[int, int, bool, Floats]],
     passes: int,
     tolerance_m: float,

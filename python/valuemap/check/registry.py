@@ -23,6 +23,7 @@ from valuemap.check.frames import (
     UpDirection,
     WorldAxes,
 )
+from valuemap.check.lenses import FocalUnit, LensModel, PrincipalPoint
 from valuemap.check.passes import (
     CameraHeight,
     InterleavedPasses,
@@ -34,6 +35,7 @@ from valuemap.check.passes import (
     TimeUnit,
 )
 from valuemap.check.poses import CameraAxes, CenterAsTranslation, InvertedPoses, PitchAndRoll, QuaternionOrder
+from valuemap.check.positions import HeightZero, HeldPositions, RoundedPositions
 from valuemap.check.quality import (
     ClassSpelling,
     EqualScores,
@@ -57,6 +59,9 @@ CONVENTIONS: tuple[Convention, ...] = (
     PictureSize(),
     MirroredPictures(),
     ShiftedDetections(),
+    FocalUnit(),
+    PrincipalPoint(),
+    HeldPositions(),
     PitchAndRoll(),
     HeadingsUseless(),
 )
@@ -72,6 +77,7 @@ FAULTS: tuple[Fault, ...] = (
     EqualScores(),
     QuantisedBoxes(),
     RotationSigmaUnit(),
+    RoundedPositions(),
     TopLeftAsCenter(),
     HalfPixel(),
     UpDirection(),
@@ -79,10 +85,12 @@ FAULTS: tuple[Fault, ...] = (
     InterleavedPasses(),
     NoDrives(),
     TimeUnit(),
+    HeightZero(),
     WrongCamera(),
     PassOffset(),
     PassTimeShift(),
     CameraHeight(),
+    LensModel(),
     FocalLength(),
     CameraTilt(),
     CameraYaw(),
