@@ -92,8 +92,9 @@ class Page(HTMLParser):
 
     @property
     def data(self) -> dict[str, Any]:
-        loaded: dict[str, Any] = json.loads(self.scripts[0])
-        return loaded
+        """What the map needs and what a click needs, as one."""
+        first, later = (json.loads(script) for script in self.scripts[:2])
+        return {**first, **later, "arrays": {**first["arrays"], **later["arrays"]}}
 
 
 def arrays_of(data: dict[str, Any]) -> dict[str, Any]:
@@ -212,7 +213,7 @@ def test_names_are_shown_as_text_everywhere(tmp_path: Path, monkeypatch: pytest.
     write_report(result, tmp_path / "r.html", dataset=dataset, dataset_folder=tmp_path)
     text = (tmp_path / "r.html").read_text(encoding="utf-8")
     page = Page(text)
-    assert len(page.scripts) == 2
+    assert len(page.scripts) == 3
     assert "<script>alert" not in text
     assert "</title><b>" not in text
     for name in HOSTILE:
@@ -329,7 +330,9 @@ def test_formulas_are_marked_as_text(tmp_path: Path) -> None:
 
 
 def test_inline_data_of_a_map_alone_has_no_rays() -> None:
-    arrays = arrays_of(inline_data(map_of([[1.0, 2.0, 3.0]]), None, None, {}))
+    data, details = inline_data(map_of([[1.0, 2.0, 3.0]]), None, None, {})
+    assert set(data["detail_arrays"]) == set(details["arrays"])
+    arrays = arrays_of(details)
     assert len(arrays["vote_image"]) == 0
     assert_array_equal(arrays["vote_start"], [0, 0])
     assert isinstance(city(), Evidence)

@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
-import pytest
 from PIL import Image
 
+from browser import in_browser, require_browser
 from test_viewer import Client, serve
 from valuemap.viewer.scene import Scene
 from viewer_city import HOSTILE, write_city
 
-VIEWER = Path(__file__).parent.parent / "viewer"
-CHROMIUM = os.environ.get("CHROMIUM", "/usr/bin/chromium")
-
 
 def test_what_is_rejected_stays_rejected(tmp_path: Path) -> None:
-    _require_browser()
+    require_browser()
     before = write_city(tmp_path, "one")
     row = int(np.argmax(before.labels.votes))
     label_id, place = int(before.labels.label_id[row]), before.labels.position_in_world_m[row]
     for client in serve(lambda: Scene(tmp_path / "map"), tmp_path / "map" / "review.json"):
-        first = _in_browser("reject", client, label_id, tmp_path / "shot.png")
+        first = in_browser("review.mjs", client.server.address, "reject", label_id, tmp_path / "shot.png")
         assert first["drawn"] == len(before.labels)
         _check_drawn(tmp_path / "shot.png", first["at"])
         assert first["thumbs"] >= before.labels.votes[row]
@@ -48,7 +41,7 @@ def test_what_is_rejected_stays_rejected(tmp_path: Path) -> None:
         moved = np.linalg.norm(after.labels.position_in_world_m - place, axis=1)
         again_id = int(after.labels.label_id[np.argmin(moved)])
         assert after.labels.votes[np.argmin(moved)] > before.labels.votes[row]
-        again = _in_browser("again", client, again_id, tmp_path / "again.png")
+        again = in_browser("review.mjs", client.server.address, "again", again_id, tmp_path / "again.png")
         assert (again["state"], again["review"]) == ("rejected", "rejected")
         assert again["alert"] == []
         assert again["hidden"]
@@ -72,30 +65,3 @@ def _check_drawn(screenshot: Path, at: list[float]) -> None:
     x, y = (round(c) for c in at)
     around = pixels[y - 3 : y + 4, x - 3 : x + 4].reshape(-1, 3)
     assert np.max(np.ptp(around, axis=1)) > 90, "there is no colour where the label should be"
-
-
-def _in_browser(step: str, client: Client, label_id: int, screenshot: Path) -> dict[str, Any]:
-    line = ["node", "e2e/review.mjs", client.server.address, step, str(label_id), str(screenshot)]
-    variables = {**os.environ, "CHROMIUM": CHROMIUM}
-    done = subprocess.run(line, cwd=VIEWER, capture_output=True, text=True, timeout=560, check=False, env=variables)
-    assert done.returncode == 0, done.stderr
-    seen: dict[str, Any] = json.loads(done.stdout)
-    return seen
-
-
-def _require_browser() -> None:
-    missing = [
-        what
-        for what, is_there in (
-            ("node", shutil.which("node") is not None),
-            (CHROMIUM, Path(CHROMIUM).is_file()),
-            ("viewer/node_modules (npm ci in viewer/)", (VIEWER / "node_modules" / "playwright-core").is_dir()),
-        )
-        if not is_there
-    ]
-    if not missing:
-        return
-    why = f"the page is not tested in a browser: there is no {', no '.join(missing)}"
-    if os.environ.get("BROWSER_TESTS") == "required":
-        pytest.fail(why)
-    pytest.skip(why)

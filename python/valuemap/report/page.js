@@ -5,13 +5,38 @@
   var kinds = { f4: Float32Array, f8: Float64Array, i2: Int16Array, u1: Uint8Array, u2: Uint16Array, u4: Uint32Array };
 
   function decode(packed) {
+    if (Uint8Array.fromBase64) return new kinds[packed.type](Uint8Array.fromBase64(packed.data).buffer);
     var text = atob(packed.data), bytes = new Uint8Array(text.length);
     for (var i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
     return new kinds[packed.type](bytes.buffer);
   }
 
-  var data = {};
+  var data = {}, parsed = null;
   Object.keys(head.arrays).forEach(function (name) { data[name] = decode(head.arrays[name]); });
+
+  // What a click shows is most of a large page: read at the first click, or before it when there is nothing else to do.
+  function details() {
+    if (!parsed) parsed = JSON.parse(document.getElementById("details").textContent);
+    return parsed;
+  }
+  head.detail_arrays.forEach(function (name) {
+    Object.defineProperty(data, name, {
+      configurable: true,
+      get: function () {
+        var value = decode(details().arrays[name]);
+        delete details().arrays[name];
+        Object.defineProperty(data, name, { value: value });
+        return value;
+      }
+    });
+  });
+  function readAhead(names) {
+    var soon = window.requestIdleCallback || function (work) { return setTimeout(work, 200); };
+    soon(function () {
+      if (!parsed) details(); else data[names.shift()];
+      if (names.length) readAhead(names);
+    });
+  }
   var count = data.label_id.length;
   var byId = function (id) { return document.getElementById(id); };
   var map = byId("map"), panel = byId("panel"), brush = map.getContext("2d");
@@ -267,10 +292,10 @@
   function showCrops(i) {
     var listed = document.querySelector('.crops[data-label="' + i + '"]');
     if (listed) { panel.appendChild(listed.cloneNode(true)); return; }
-    if (!head.crops[i]) return;
+    if (!details().crops[i]) return;
     var crops = element("div", undefined, panel);
     crops.className = "crops";
-    head.crops[i].forEach(function (crop) {
+    details().crops[i].forEach(function (crop) {
       var figure = element("figure", undefined, crops), picture = element("img", undefined, figure);
       picture.src = "data:image/jpeg;base64," + crop[0];
       picture.alt = crop[1];
@@ -341,8 +366,8 @@
     for (var v = begin; v < most; v++) {
       row = element("tr", undefined, body);
       var image = data.vote_image[v];
-      element("td", head.image_names.length ? head.image_names[image] : "row " + data.camera_row[image], row);
-      element("td", head.passes[data.camera_pass[image]], row).style.color = passColor(data.camera_pass[image]);
+      element("td", details().image_names.length ? details().image_names[image] : "row " + data.camera_row[image], row);
+      element("td", details().passes[data.camera_pass[image]], row).style.color = passColor(data.camera_pass[image]);
       var away = Math.hypot(data.camera_at[3 * image] - data.label_at[3 * i],
         data.camera_at[3 * image + 1] - data.label_at[3 * i + 1], data.camera_at[3 * image + 2] - data.label_at[3 * i + 2]);
       element("td", away.toFixed(1), row);
@@ -400,6 +425,8 @@
     chooseNamed();
     window.addEventListener("hashchange", chooseNamed);
     document.documentElement.setAttribute("data-ready", String(count));
+    if (window.performance && performance.mark) performance.mark("valuemap:ready");
+    readAhead(head.detail_arrays.slice());
   }
 
   setUp();

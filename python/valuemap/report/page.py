@@ -59,6 +59,9 @@ class Content:
     """Title, explanation and labels of each list."""
     notes: tuple[str, ...]
     data: dict[str, Any] = field(default_factory=dict)
+    """What the map on the page needs when it opens."""
+    details: dict[str, Any] = field(default_factory=dict)
+    """What a click needs: read when the page has nothing else to do, because it is nearly all of a large map."""
 
 
 def page_text(content: Content) -> str:
@@ -122,6 +125,7 @@ def page_text(content: Content) -> str:
 <section id="notes"><h2>Notes</h2><ul>{notes}</ul></section>
 </main>
 <script id="data" type="application/json">{_json(content.data)}</script>
+<script id="details" type="application/json">{_json(content.details)}</script>
 <script>{script}</script>
 </body>
 </html>
@@ -217,10 +221,11 @@ def inline_data(
     evidence: Evidence | None,
     evaluation: Evaluation | None,
     crops: dict[int, list[tuple[str, str]]],
-) -> dict[str, Any]:
-    """Return what the interactive part shows, positions relative to an origin along right, top and up of the picture.
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what the interactive part shows: for the map (`Content.data`), and for a click (`Content.details`).
 
-    Each vote holds its row in the table of cameras that voted, its direction (parts of 32,767) and its residuals.
+    Positions are relative to an origin along right, top and up of the picture. Each vote holds its row in the table of
+    cameras that voted, its direction (parts of 32,767) and its residuals.
     """
     labels = result.labels
     basis, axis_names = horizontal_axes(result.frame)
@@ -263,8 +268,9 @@ def inline_data(
     assert evaluation is None or evaluation.matches.label_outcome.names == LABEL_OUTCOMES
     assert evaluation is None or evaluation.matches.object_outcome.names == OBJECT_OUTCOMES
     votes, names, passes = _votes(result, evidence, basis, origin)
-    return {
-        "arrays": {**arrays, **votes},
+    data = {
+        "arrays": arrays,
+        "detail_arrays": list(votes),
         "origin": origin.tolist(),
         "extent": [*(low - origin[:2]).tolist(), *(high - origin[:2]).tolist()],
         "drives": len(ground.drives),
@@ -273,11 +279,15 @@ def inline_data(
         "class_rank": rank.tolist(),
         "class_colors": list(_CLASS_COLORS),
         "outcomes": list(LABEL_OUTCOMES),
+        "invitation": _INVITATION,
+    }
+    details = {
+        "arrays": votes,
         "passes": passes,
         "image_names": names,
         "crops": {str(row): each for row, each in crops.items()},
-        "invitation": _INVITATION,
     }
+    return data, details
 
 
 def _votes(

@@ -107,6 +107,9 @@ def write_report(
     progress("drawing the report", 3, steps)
     others = [row for row in doubtful if row not in worst]  # Each is listed once.
     listed = {int(row) for row in [*worst, *doubtful]}
+    data, details = inline_data(
+        result, evidence, evaluation, {row: each for row, each in crops.items() if row not in listed}
+    )
     content = Content(
         title=_name(result, dataset),
         summary=_summary(result, dataset),
@@ -131,7 +134,8 @@ def write_report(
             ),
         ),
         notes=tuple(_notes(result, dataset, evidence, evaluation, crops)),
-        data=inline_data(result, evidence, evaluation, {row: each for row, each in crops.items() if row not in listed}),
+        data=data,
+        details=details,
     )
     with new_folder(files_folder(page), parts=(FILES_MARKER,), part_folders=("",), force=force) as folder:
         names = _write_files(folder, [above, *drawn], [*tables, *lists])
