@@ -7,17 +7,17 @@ listed there and was not changed since. All others stay, and where one would hav
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import os
 import shutil
 import stat
 import tempfile
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 
 from valuemap.errors import OutputError
+from valuemap.system import OWN_FILE, folder_lock, sync_file
 
 LEDGER = ".valuemap-files"
 """In each folder: which files valuemap wrote there, and their SHA-256."""
@@ -210,13 +210,10 @@ def _locked(workspace: Path, *, is_new: bool = False) -> Iterator[None]:
 
     One that is new nobody else can have: where a file system knows no locks, that is as good.
     """
-    descriptor = os.open(workspace, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    try:
+    with ExitStack() as held:
         with suppress(OSError) if is_new else nullcontext():
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            held.enter_context(folder_lock(workspace))
         yield
-    finally:
-        os.close(descriptor)
 
 
 def _decide(
@@ -231,12 +228,12 @@ def _decide(
     """Let the fresh files take the places of the older ones; from the first rename on there is no way back."""
     for name in files:
         _note(workspace / _FRESH / name, path / name)
-        _synced(workspace / _FRESH / name)
+        sync_file(workspace / _FRESH / name)
     stale = [name for name in parts if name not in files and os.path.lexists(path / name)]
     for folder in part_folders:
         stale += [name for name in _own_files_below(path, folder) if name not in files]
     (workspace / _STALE).write_bytes(b"".join(os.fsencode(name) + b"\0" for name in stale))
-    _synced(workspace / _STALE)
+    sync_file(workspace / _STALE)
     (workspace / _FRESH).rename(workspace / _DECIDED)
     _take_places(workspace, path, force=force)
 
@@ -256,7 +253,7 @@ def _take_places(workspace: Path, path: Path, *, force: bool = False) -> None:
 def _files_below(folder: Path) -> list[str]:
     """Return the names of the files in a folder and the folders in it, relative to it, in an order of their own."""
     files = (path for path in folder.rglob("*") if path.name != LEDGER and stat.S_ISREG(path.lstat().st_mode))
-    return sorted(str(path.relative_to(folder)) for path in files)
+    return sorted(path.relative_to(folder).as_posix() for path in files)
 
 
 def _is_inside(name: str) -> bool:
@@ -278,14 +275,14 @@ def _own_files_below(path: Path, folder: str) -> list[str]:
         return []  # It leads out.
     places = (Path(place) for place, _, _ in os.walk(path / folder))  # Follows no link.
     files = (place / os.fsdecode(name) for place in places for name in _ledger(place))
-    return sorted(str(file.relative_to(path)) for file in files if _is_ours(file))
+    return sorted(file.relative_to(path).as_posix() for file in files if _is_ours(file))
 
 
 def _ledger(folder: Path) -> dict[bytes, set[bytes]]:
     """Return the names that a ledger lists, each with all its hashes: the last may not be in place yet."""
     found: dict[bytes, set[bytes]] = {}
     try:
-        descriptor = os.open(folder / LEDGER, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        descriptor = os.open(folder / LEDGER, os.O_RDONLY | OWN_FILE)
     except OSError:
         return found
     with os.fdopen(descriptor, "rb") as file:
@@ -304,7 +301,7 @@ def _note(content: Path, place: Path) -> None:
     if b"\n" in name:
         raise OutputError(f"{place!r}: a line break in a name cannot be kept on record", hint="choose another name")
     place.parent.mkdir(parents=True, exist_ok=True)
-    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK
+    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | OWN_FILE
     descriptor = os.open(place.parent / LEDGER, flags, 0o666)
     try:
         os.write(descriptor, _sha256(content) + b"  " + name + b"\n")
@@ -315,15 +312,6 @@ def _note(content: Path, place: Path) -> None:
 def _sha256(path: Path) -> bytes:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest().encode()
-
-
-def _synced(path: Path) -> None:
-    """Wait until a file is on disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _cannot_write(path: Path, error: OSError) -> OutputError:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import resource
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,6 +23,7 @@ from valuemap.notes import Findings, find_notes
 from valuemap.partition import partition_images
 from valuemap.progress import Progress, silent
 from valuemap.robust import Scene, calibrate_noise, find_labels
+from valuemap.system import peak_memory_mb
 from valuemap.tables import Labels, Votes
 from valuemap.vote import vote_in_clusters
 
@@ -137,13 +136,7 @@ class _Stages:
         start = time.perf_counter()
         yield
         seconds = time.perf_counter() - start
-        self.records.append({"stage": stage, "seconds": round(seconds, 3), "peak_memory_mb": _peak_memory_mb()})
-
-
-def _peak_memory_mb() -> int:
-    """Peak memory of the process so far."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak // (2**20 if sys.platform == "darwin" else 2**10)
+        self.records.append({"stage": stage, "seconds": round(seconds, 3), "peak_memory_mb": peak_memory_mb()})
 
 
 def _record(dataset: Dataset, config: MapConfig, counts: dict[str, int], stages: _Stages) -> dict[str, Any]:

@@ -32,6 +32,9 @@ def end_at_once() -> Iterator[None]:
     SIGTERM waits until the block ends, as glog, which pycolmap brings along, takes it over and prints a stack trace.
     """
     _handle(_end_at_once)
+    if not hasattr(signal, "pthread_sigmask"):  # Windows, where none of these signals comes from outside.
+        yield
+        return
     blocked = {number for number in _ENDING if number != signal.SIGINT}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, blocked)
     try:

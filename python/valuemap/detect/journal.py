@@ -21,6 +21,7 @@ import numpy as np
 from valuemap.detect.boxes import Boxes
 from valuemap.detect.letterbox import Size
 from valuemap.errors import OutputError
+from valuemap.system import OWN_FILE
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +109,7 @@ class Journal:
 
 def _open_own(path: Path) -> BinaryIO:
     """Open a file for reading and writing, or make it; a link is not followed, and a pipe is not waited for."""
-    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    flags = os.O_RDWR | os.O_CREAT | OWN_FILE
     try:
         descriptor = os.open(path, flags, 0o666)
     except OSError as error:
