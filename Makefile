@@ -1,6 +1,6 @@
 # `make demo` and `make test` do all their own set-up: they need Python 3.11+, a C compiler and cargo, nothing else.
 # `make test EXTRAS=train` installs PyTorch (5 GB) and tests training too; without it those tests are skipped.
-.PHONY: demo test lint bench model page rust-test setup clean
+.PHONY: demo test lint bench model page rust-test wheel sdist setup clean
 
 UV_VERSION := 0.13.8
 PYTHON ?= python3
@@ -39,6 +39,15 @@ model: setup
 # The page of valuemap view, from viewer/ into the package: needs Node.js, and only after a change of it.
 page:
 	cd viewer && npm ci --no-audit --no-fund && npm run build
+
+# An abi3 wheel for every Python from 3.11 on, in dist/. On Linux zig links it for glibc 2.28, as old as what the
+# wheels that it depends on need, wherever it is built. .ci/try_wheel.py tries it without a compiler.
+MATURIN := $(UV) tool run --with ziglang==0.17.0 maturin@1.16.0
+wheel: $(UV)
+	$(MATURIN) build --release --locked --out dist $(if $(filter Linux,$(shell uname -s)),--zig --compatibility manylinux_2_28)
+
+sdist: $(UV)
+	$(MATURIN) sdist --out dist
 
 setup: $(UV)
 	@$(UV) sync --frozen --quiet $(EXTRAS:%=--extra %)
