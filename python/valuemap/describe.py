@@ -36,7 +36,7 @@ def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config
     size_m = detections.size_px[voters] * metres_per_px
     image_row = rays.image_row[voters]
     time = np.full(len(voters), np.nan) if images.timestamp_s is None else images.timestamp_s[image_row]
-    sigma_px = config.detection_sigma_px or _residual_sigma_px(residual_px, len(candidates))
+    sigma_px = config.detection_sigma_px or residual_sigma_px(residual_px, len(candidates))
     covariance = candidates.covariance_m2
     if covariance is None:
         covariance = sigma_px**2 * _core.unit_covariance(
@@ -76,7 +76,7 @@ def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config
     return labels, votes
 
 
-def _residual_sigma_px(residual_px: Floats, labels: int) -> float:
+def residual_sigma_px(residual_px: Floats, labels: int) -> float:
     """Return the standard deviation of residuals, each axis: two numbers a vote, three spent on each position."""
     freedom = 2 * len(residual_px) - 3 * labels
     return float(np.sqrt(np.sum(residual_px**2) / freedom)) if freedom > 0 else 1.0

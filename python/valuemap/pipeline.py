@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,20 +14,20 @@ from valuemap.cameras import Rays, cast_rays
 from valuemap.config import MapConfig, bounded_threads
 from valuemap.dataset import Dataset, ensure_checked
 from valuemap.describe import describe_labels
-from valuemap.drives import in_driving_order
+from valuemap.engine.threads import ThreadEngine
 from valuemap.errors import InputError
 from valuemap.map_folder import Map
 from valuemap.merge import merge_clusters
 from valuemap.notes import Findings, find_notes
 from valuemap.partition import partition_images
 from valuemap.progress import Progress, silent
-from valuemap.robust import Scene, calibrate_noise, find_labels
+from valuemap.robust import Scene, calibrate_noise, calibration_to_json
 from valuemap.system import peak_memory_mb
 from valuemap.tables import Labels, Votes
+from valuemap.tiles.mapping import solve_cells
+from valuemap.tiles.seams import join_cells
+from valuemap.tiles.source import InMemory
 from valuemap.vote import vote_in_clusters
-
-VIEWPOINT_SHARE = 1.0 / 60.0
-"""Images of a drive closer than this share of the range are one viewpoint: about a degree of parallax at most."""
 
 
 def build_map(
@@ -102,23 +101,19 @@ def _paper(
 def _robust(
     dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, progress: Progress
 ) -> tuple[Labels, Votes, dict[str, Any]]:
-    """Drives, noise estimated from the data, and the map with the least J that is found; docs/method.md."""
+    """Drives, noise estimated from a sample, and in each cell the map with the least J found; docs/method.md."""
     with stages.measured("order"):
-        ordered = in_driving_order(dataset, viewpoint_step_m=config.vote.max_range_m * VIEWPOINT_SHARE)
-    with stages.measured("rays"):
-        rays = cast_rays(ordered.dataset)
-    scene = Scene(ordered.dataset, ordered.drives, rays)
+        source = InMemory(dataset, config)
     with stages.measured("calibrate"):
-        noise = calibrate_noise(scene, config, threads=threads, progress=progress)
+        sample = source.sample()
+        scene = Scene(sample.dataset, sample.drives, cast_rays(sample.dataset))
+        calibration = calibrate_noise(scene, config, threads=threads, progress=progress)
+        del sample, scene
     with stages.measured("find"):
-        found, counts = find_labels(scene, noise, config, threads=threads, progress=progress)
-    with stages.measured("describe"):
-        labels, votes = describe_labels(ordered.dataset, rays, found, config.noise)
-    votes = votes.replace(
-        detection_id=ordered.detection_id[votes.detection_id], image_id=ordered.image_id[votes.image_id]
-    )
-    counts = {**_without_ray(rays), **counts, "drives": ordered.drives.record, "noise": dataclasses.asdict(noise)}
-    return labels, votes, counts
+        solved = solve_cells(source, calibration, config, ThreadEngine(threads), progress)
+    with stages.measured("join"):
+        labels, votes, counts = join_cells(solved, source.grid, config)
+    return labels, votes, {**counts, "drives": source.drives_record, "noise": calibration_to_json(calibration)}
 
 
 def _without_ray(rays: Rays) -> dict[str, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -14,6 +14,7 @@ from valuemap.cameras import Rays, camera_poses, picture_bounds
 from valuemap.config import MapConfig, NoiseConfig
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives
+from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
 from valuemap.tables import Candidates, Floats
 
@@ -41,6 +42,23 @@ class Noise:
     def as_tuple(self) -> tuple[float, ...]:
         """Return the eight numbers in the order of the fields."""
         return astuple(self)
+
+
+Calibration = Noise
+"""All that is estimated once of a dataset, before any part of it is mapped: plain numbers, for JSON."""
+
+
+def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
+    """Return a calibration as an object of JSON."""
+    return asdict(calibration)
+
+
+def calibration_from_json(value: Any, *, source: str) -> Calibration:
+    """Read what `calibration_to_json` returned; raises `InputError` naming the `source` where it is something else."""
+    try:
+        return Calibration(**{name: float(number) for name, number in value.items()})
+    except (TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{source}: is no calibration: {error}", hint="make the map again") from error
 
 
 class Scene:
@@ -75,7 +93,7 @@ class Scene:
         )
 
 
-def calibrate_noise(scene: Scene, config: MapConfig, *, threads: int = 0, progress: Progress = silent) -> Noise:
+def calibrate_noise(scene: Scene, config: MapConfig, *, threads: int = 0, progress: Progress = silent) -> Calibration:
     """Estimate the noise from the residuals of labels in a sample of places; what the config sets stays as it is."""
     guess, known = _guess(config.noise)
     if all(known):
@@ -93,7 +111,7 @@ def calibrate_noise(scene: Scene, config: MapConfig, *, threads: int = 0, progre
 
 
 def find_labels(
-    scene: Scene, noise: Noise, config: MapConfig, *, threads: int = 0, progress: Progress = silent
+    scene: Scene, noise: Calibration, config: MapConfig, *, threads: int = 0, progress: Progress = silent
 ) -> tuple[Candidates, dict[str, Any]]:
     """Return the labels, ordered by first detection, and counts of what was found and rejected."""
     position, (offsets, voters), covariance, existence, expected, counts = _core.find_labels(

@@ -274,6 +274,16 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.position_in_world_m)
 
+    def take(self, rows: Ints) -> Candidates:
+        """Return the candidates given by indices, with their voters."""
+        first, count = self.voter_offsets[rows], np.diff(self.voter_offsets)[rows]
+        offsets = np.concatenate([[0], np.cumsum(count)])
+        voters = self.voters[np.repeat(first - offsets[:-1], count) + np.arange(offsets[-1])]
+        columns = {
+            name: _take(getattr(self, name), rows) for name in ("cluster", "covariance_m2", "existence", "expected")
+        }
+        return Candidates(self.position_in_world_m[rows], offsets, voters, **columns)
+
     def row_of_voter(self) -> Ints:
         """Return the candidate (row) that each of the voters supports."""
         return np.repeat(np.arange(len(self)), np.diff(self.voter_offsets))

@@ -1,0 +1,30 @@
+"""The interface of all engines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Protocol, TypeVar
+
+from valuemap.progress import Progress
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+Work = Callable[[T, Progress], R]
+"""What is done with a task. It calls the progress now and then, which raises where the task is to end."""
+
+
+class Engine(Protocol):
+    """Runs tasks that do not depend on each other, a bounded number at a time."""
+
+    def threads_of_task(self, tasks: int) -> int:
+        """Return how many threads each of so many tasks may work on."""
+        ...
+
+    def run(self, work: Work[T, R], tasks: Sequence[T]) -> Iterator[tuple[int, R]]:
+        """Yield the number of a task and what the work makes of it, as they get done, in any order.
+
+        An exception of a task ends the others, and is raised. A task may be done again where a machine is lost, so it
+        must come to the same then.
+        """
+        ...

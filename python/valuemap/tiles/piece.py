@@ -1,0 +1,52 @@
+"""What a cell is solved with: its images and those around it, in driving order, as a dataset of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from valuemap.drives import Drives, InOrder
+from valuemap.tables import Floats, Ints
+from valuemap.tiles.grid import WHOLE, Cell, Grid
+
+
+def cut_piece(ordered: InOrder, place_m: Floats, grid: Grid, cell: Cell) -> InOrder:
+    """Return the piece of a cell; `place_m` (images, 2) is where the images are on the ground."""
+    if cell == WHOLE:
+        return ordered
+    return piece_of_rows(ordered, np.flatnonzero(grid.is_within(cell, place_m, grid.halo_m)))
+
+
+def piece_of_rows(ordered: InOrder, rows: Ints) -> InOrder:
+    """Return some images (rows, ascending) with their detections.
+
+    Drives and viewpoints are numbered anew, in their order: what else is in the data must not matter.
+    """
+    images, detections = ordered.dataset.images, ordered.dataset.detections
+    # The detections are in the order of their images, whose ids are their rows.
+    first, end = (np.searchsorted(detections.image_id, rows, side=side) for side in ("left", "right"))
+    count = end - first
+    detection_rows = np.repeat(first - (np.cumsum(count) - count), count) + np.arange(int(count.sum()))
+    drives = ordered.drives
+    return InOrder(
+        replace(
+            ordered.dataset,
+            images=images.take(rows).replace(image_id=np.arange(len(rows))),
+            detections=detections.take(detection_rows).replace(
+                detection_id=np.arange(len(detection_rows)), image_id=np.repeat(np.arange(len(rows)), count)
+            ),
+            truth=None,
+            truth_detections=None,
+            rejected=None,
+        ),
+        Drives(
+            pass_code=np.unique(drives.pass_code[rows], return_inverse=True)[1],
+            order=drives.order[rows],
+            driven_m=drives.driven_m[rows],
+            viewpoint=np.unique(drives.viewpoint[rows], return_inverse=True)[1],
+            record={},
+        ),
+        ordered.image_id[rows],
+        ordered.detection_id[detection_rows],
+    )

@@ -1,0 +1,57 @@
+"""Where the pieces of cells come from: a dataset in memory here, one on disk in `partition`."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from valuemap.config import MapConfig
+from valuemap.dataset import Dataset
+from valuemap.drives import InOrder, in_driving_order
+from valuemap.tiles.grid import WHOLE, Cell, Census, Grid
+from valuemap.tiles.piece import cut_piece, piece_of_rows
+from valuemap.tiles.sample import is_sampled
+
+VIEWPOINT_SHARE = 1.0 / 60.0
+"""Images of a drive closer than this share of the range are one viewpoint: about a degree of parallax at most."""
+
+
+class Source(Protocol):
+    """A dataset in driving order, as pieces."""
+
+    grid: Grid
+    cells: list[Cell]
+    drives_record: dict[str, Any]
+
+    def piece(self, cell: Cell) -> InOrder:
+        """Return what a cell is solved with; it may have no detections, or not even images."""
+        ...
+
+    def sample(self) -> InOrder:
+        """Return what is calibrated on."""
+        ...
+
+
+class InMemory:
+    """The pieces of a dataset that is in memory whole."""
+
+    def __init__(self, dataset: Dataset, config: MapConfig) -> None:
+        max_range_m = config.vote.max_range_m
+        self.grid = Grid.of(dataset.frame, max_range_m)
+        self._ordered = in_driving_order(dataset, viewpoint_step_m=max_range_m * VIEWPOINT_SHARE)
+        self.drives_record = self._ordered.drives.record
+        images, detections = self._ordered.dataset.images, self._ordered.dataset.detections
+        self._place_m = self.grid.images_on_ground(images)
+        self._census = Census.of(self.grid, self._place_m, np.bincount(detections.image_id, minlength=len(images)))
+        self.cells = self._census.cells(self.grid)
+
+    def piece(self, cell: Cell) -> InOrder:
+        """Return what a cell is solved with."""
+        return cut_piece(self._ordered, self._place_m, self.grid, cell)
+
+    def sample(self) -> InOrder:
+        """Return what is calibrated on: all of what is one cell."""
+        if self.cells == [WHOLE]:
+            return self._ordered
+        return piece_of_rows(self._ordered, np.flatnonzero(is_sampled(self.grid, self._census, self._place_m)))
