@@ -1,0 +1,291 @@
+"""Cells of a fixed grid: what is where, what each is solved with, and one map of all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import valuemap
+from scenes import as_dataset, random_scene
+from valuemap.config import MapConfig
+from valuemap.dataset import Dataset, Frame
+from valuemap.map_folder import Map
+from valuemap.tables import Categories, Floats, Labels, Votes, table_to_arrow
+from valuemap.tiles import grid as grid_module
+from valuemap.tiles.grid import LEVELS, WHOLE, Cell, Census, Grid
+from valuemap.tiles.sample import is_sampled, sampled_squares
+from valuemap.tiles.seams import join_cells
+from valuemap.tiles.solve import Solved
+from valuemap.tiles.source import InMemory
+
+GRID = Grid.of(Frame(), 60.0)
+# With all noise known nothing is calibrated.
+KNOWN = MapConfig(detection_sigma_px=1.5, position_sigma_m=0.05, rotation_sigma_deg=0.05)
+
+
+# The grid.
+
+
+def census(place_m: Floats, grid: Grid = GRID) -> Census:
+    return Census.of(grid, place_m, np.ones(len(place_m), np.int64))
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**32 - 1), most=st.sampled_from([20, 100, 10**6]))
+def test_every_place_is_in_one_cell(seed: int, most: int) -> None:
+    random = np.random.default_rng(seed)
+    place_m = np.concatenate([random.uniform(-2000.0, 2000.0, (200, 2)), random.normal(0.0, 50.0, (200, 2))])
+    grid = replace(GRID, most_detections=most)
+    cells = census(place_m, grid).cells(grid)
+    inside = np.stack([grid.is_within(cell, place_m) for cell in cells])
+    assert np.all(inside.sum(axis=0) == 1)
+    assert np.array_equal(grid.find(place_m, cells), np.argmax(inside, axis=0))
+    assert (max(cell.level for cell in cells) > 0) == (most < 10**6)
+
+
+def test_borders_belong_to_one_side() -> None:
+    steps = np.arange(-4, 5) * GRID.side_m / 2**LEVELS - 0.5 * GRID.side_m
+    place_m = np.array([[x, y] for x in steps for y in steps])
+    cells = [Cell((x, y)) for x in range(-3, 3) for y in range(-3, 3)]
+    parts = [Cell(c.base, LEVELS, (i, j)) for c in cells for i in range(2**LEVELS) for j in range(2**LEVELS)]
+    for some in (cells, parts):
+        assert np.all(np.sum([GRID.is_within(cell, place_m) for cell in some], axis=0) == 1)
+
+
+def test_what_is_no_wider_than_a_cell_is_one_wherever_it_is() -> None:
+    place_m = np.array([[470.0, 470.0], [1400.0, 1420.0]])
+    assert census(place_m).cells(GRID) == [WHOLE]
+    assert len(census(place_m + [[0.0, 0.0], [100.0, 0.0]]).cells(GRID)) > 1
+
+
+def test_objects_in_a_cell_without_images_have_a_cell_too() -> None:
+    place_m = np.array([[470.0, 0.0], [-2000.0, 0.0]])
+    cells = census(place_m).cells(GRID)
+    assert Cell((1, 0)) in cells  # 10 m away from the image.
+    assert Cell((-3, 0)) not in cells
+
+
+def test_dense_places_are_split_until_it_helps_no_more() -> None:
+    grid = replace(GRID, most_detections=1000)
+    random = np.random.default_rng(0)
+    spread = np.concatenate([random.uniform(-480.0, 480.0, (3000, 2)), [[3000.0, 0.0]]])
+    levels = {cell.level for cell in census(spread, grid).cells(grid) if cell.base == (0, 0)}
+    assert max(levels) in (1, 2)
+    crossing = np.concatenate([np.zeros((4000, 2)), [[3000.0, 0.0]]])
+    parts = [cell for cell in census(crossing, grid).cells(grid) if cell.base == (0, 0)]
+    assert {cell.level for cell in parts if grid.is_within(cell, np.zeros((1, 2)), grid.halo_m).any()} == {LEVELS}
+
+
+def test_counts_in_parts_add_up() -> None:
+    random = np.random.default_rng(1)
+    place_m = random.uniform(-3000.0, 3000.0, (500, 2))
+    whole, parts = census(place_m), census(place_m[:200]) + census(place_m[200:])
+    for name in ("square", "images", "detections", "extent_m"):
+        assert np.array_equal(getattr(whole, name), getattr(parts, name))
+
+
+def test_the_sample_does_not_depend_on_what_is_elsewhere() -> None:
+    random = np.random.default_rng(2)
+    place_m = random.uniform(-3000.0, 3000.0, (5000, 2))
+    few = sampled_squares(census(place_m), detections=500)
+    chosen = {tuple(square) for square in few.tolist()}
+    assert 0 < len(chosen) < len(census(place_m).square)
+    assert np.array_equal(few, sampled_squares(census(random.permutation(place_m)), detections=500))
+    # Data far away adds places to choose from, and takes no others in.
+    with_more = np.concatenate([place_m, random.uniform(9000.0, 9500.0, (100, 2))])
+    again = {tuple(square) for square in sampled_squares(census(with_more), detections=500).tolist()}
+    assert {square for square in again if square[0] < 60} <= chosen
+    assert is_sampled(GRID, census(place_m), place_m).all()  # Few enough to take all.
+
+
+# Seams, by hand: cell 0 is left of x = 480 m, cell 1 right of it.
+
+LEFT, RIGHT = Cell((0, 0)), Cell((1, 0))
+
+
+def solved(cell: Cell, *labels: tuple[float, list[int]]) -> Solved:
+    """Labels of a cell: x and detections of each."""
+    count = len(labels)
+    position = np.array([[x, 0.0, 5.0] for x, _ in labels]).reshape(count, 3)
+    votes = np.array([len(detections) for _, detections in labels], np.int64)
+    detection = np.array([d for _, detections in labels for d in detections], np.int64)
+    ones = np.ones(count)
+    table = Labels(
+        label_id=np.arange(1, count + 1),
+        class_name=Categories(np.zeros(count, np.int32), ("light",)),
+        position_in_world_m=position,
+        covariance_m2=np.zeros((count, 6)),
+        votes=votes,
+        passes=np.ones(count, np.int64),
+        object_width_m=ones,
+        object_height_m=ones,
+        reprojection_rms_px=ones,
+        max_parallax_rad=ones,
+        first_seen_s=ones,
+        last_seen_s=ones,
+        facing_azimuth_rad=ones,
+        facing_concentration=ones,
+        expected=votes,
+        existence=ones,
+    )
+    label = np.repeat(np.arange(1, count + 1), votes)
+    residual = 1.0 + detection
+    return Solved(
+        cell=cell,
+        labels=table,
+        is_own=GRID.is_within(cell, GRID.on_ground(position)),
+        votes=Votes(label, detection, detection, residual, residual),
+        vote_pass=detection % 3,
+        counts={"images": 1},
+    )
+
+
+def joined(*cells: Solved) -> list[tuple[float, list[int]]]:
+    labels, votes, _ = join_cells(cells, GRID, MapConfig())
+    assert labels.label_id.tolist() == list(range(1, len(labels) + 1))
+    assert np.bincount(votes.label_id, minlength=len(labels) + 1)[1:].tolist() == labels.votes.tolist()
+    return [
+        (x, votes.detection_id[votes.label_id == label].tolist())
+        for x, label in zip(labels.position_in_world_m[:, 0].tolist(), labels.label_id.tolist(), strict=True)
+    ]
+
+
+def test_a_label_belongs_to_the_cell_it_lies_in() -> None:
+    at_home, guest = (479.0, [1, 2, 3, 4]), (479.2, [1, 2, 3, 4, 5])
+    assert joined(solved(LEFT, at_home), solved(RIGHT, guest)) == [at_home]
+
+
+def test_of_an_object_in_two_cells_the_one_with_more_votes_is_kept() -> None:
+    left, right = (479.9, [1, 2, 3, 4]), (480.1, [2, 3, 4, 5, 6])
+    assert joined(solved(LEFT, left), solved(RIGHT, right)) == [right]
+    assert joined(solved(LEFT, (479.9, [1, 2, 3])), solved(RIGHT, (480.1, [2, 3, 4]))) == [(479.9, [1, 2, 3])]
+
+
+def test_an_object_that_each_cell_places_in_the_other_is_not_lost() -> None:
+    from_left, from_right = (480.1, [1, 2, 3, 4]), (479.9, [1, 2, 3, 4, 5])
+    assert joined(solved(LEFT, from_left), solved(RIGHT, from_right)) == [from_right]
+
+
+def test_a_guest_that_its_home_does_not_know_is_not_kept() -> None:
+    assert joined(solved(LEFT, (481.0, [1, 2, 3, 4])), solved(RIGHT, (500.0, [7, 8, 9]))) == [(500.0, [7, 8, 9])]
+    # Nor if two others say so.
+    corner = solved(Cell((0, 1)), (481.0, [1, 2, 3]))
+    assert joined(solved(LEFT, (481.0, [1, 2, 3, 4])), corner, solved(RIGHT, (500.0, [7, 8, 9]))) == [
+        (500.0, [7, 8, 9])
+    ]
+
+
+def test_each_detection_votes_once_and_what_is_counted_follows() -> None:
+    left, right = solved(LEFT, (470.0, [0, 1, 2, 3, 4, 5])), solved(RIGHT, (490.0, [5, 6, 9, 12]))
+    assert joined(left, right) == [(470.0, [0, 1, 2, 3, 4, 5]), (490.0, [6, 9, 12])]
+    labels, _, counts = join_cells([left, right], GRID, MapConfig())
+    assert labels.passes.tolist() == [1, 1]  # Detections 6, 9 and 12 are of one pass.
+    assert labels.reprojection_rms_px[1] == pytest.approx(np.sqrt(np.mean(np.array([7.0, 10.0, 13.0]) ** 2)))
+    assert counts["votes_of_two_labels"] == 1
+    # Too few are left.
+    assert joined(left, solved(RIGHT, (490.0, [4, 6, 9]), (495.0, [20, 21, 22]))) == [
+        (470.0, [0, 1, 2, 3, 4, 5]),
+        (495.0, [20, 21, 22]),
+    ]
+
+
+# Whole maps.
+
+
+def streets(*places_m: float, seed: int = 7) -> Dataset:
+    """Drives of 40 m past the same objects, at several places along x."""
+    scene = random_scene(seed, images=60, objects=8, clutter=30)
+    parts = [
+        shifted(as_dataset(scene, passes=[f"pass-{k}-{i % 2}" for i in range(60)]), x, 10_000 * k)
+        for k, x in enumerate(places_m)
+    ]
+    return joined_datasets(parts)
+
+
+def shifted(dataset: Dataset, x_m: float, ids: int) -> Dataset:
+    from valuemap.cameras import rotation_matrices
+
+    images, detections = dataset.images, dataset.detections
+    moved = images.cam_from_world_m - rotation_matrices(images) @ np.array([x_m, 0.0, 0.0])
+    return replace(
+        dataset,
+        images=images.replace(image_id=images.image_id + ids, cam_from_world_m=moved),
+        detections=detections.replace(detection_id=detections.detection_id + ids, image_id=detections.image_id + ids),
+    )
+
+
+def joined_datasets(parts: list[Dataset]) -> Dataset:
+    import pyarrow as pa
+
+    from valuemap.tables import Detections, Images, table_from_arrow
+
+    images = pa.concat_tables([table_to_arrow(part.images).cast(plain(part.images)) for part in parts])
+    detections = pa.concat_tables([table_to_arrow(part.detections).cast(plain(part.detections)) for part in parts])
+    return replace(
+        parts[0],
+        images=table_from_arrow(Images, images, source="images"),
+        detections=table_from_arrow(Detections, detections, source="detections"),
+    )
+
+
+def plain(table: object) -> object:
+    import pyarrow as pa
+
+    schema = table_to_arrow(table).schema  # type: ignore[arg-type]
+    return pa.schema([pa.field(f.name, pa.string() if pa.types.is_dictionary(f.type) else f.type) for f in schema])
+
+
+def rows(result: Map, *, low: float = -np.inf, high: float = np.inf, shift: float = 0.0, ids: int = 0) -> list[object]:
+    """What a map says about some part of the world, as if it were elsewhere."""
+    labels, votes = result.labels, result.votes
+    found = []
+    for row in np.flatnonzero((labels.position_in_world_m[:, 0] >= low) & (labels.position_in_world_m[:, 0] < high)):
+        members = votes.label_id == labels.label_id[row]
+        position = labels.position_in_world_m[row] - [shift, 0.0, 0.0]
+        found.append((*np.round(position, 4).tolist(), *(votes.detection_id[members] - ids).tolist()))
+    return sorted(found)
+
+
+def test_what_is_in_other_cells_changes_nothing() -> None:
+    alone = valuemap.build_map(streets(0.0), KNOWN)
+    assert len(alone.labels) >= 6
+    together = valuemap.build_map(streets(0.0, 1000.0, 2100.0), KNOWN)
+    assert together.run["counts"]["cells"] == 3
+    for k, x in enumerate((0.0, 1000.0, 2100.0)):
+        assert rows(together, low=x - 200.0, high=x + 200.0, shift=x, ids=10_000 * k) == rows(alone)
+    unmoved = [row for row in table_to_arrow(together.labels).to_pylist() if abs(row["x"]) < 200.0]
+    assert [{**row, "label_id": 0} for row in unmoved] == [
+        {**row, "label_id": 0} for row in table_to_arrow(alone.labels).to_pylist()
+    ]
+
+
+def test_objects_at_a_border_are_found_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The border at x = 480 m goes through the objects of the street.
+    dataset = streets(445.0, 3000.0)
+    result = valuemap.build_map(dataset, KNOWN)
+    assert result.run["counts"]["cells"] > 2
+    sides = result.labels.position_in_world_m[:, 0]
+    assert min(np.sum((sides > 300.0) & (sides < 480.0)), np.sum((sides >= 480.0) & (sides < 700.0))) >= 2
+    alone = valuemap.build_map(streets(0.0), KNOWN)
+    assert len(rows(result, high=1000.0)) == len(alone.labels)
+    assert len(np.unique(result.votes.detection_id)) == len(result.votes)
+    # Without what is around them, cells see their objects worse.
+    monkeypatch.setattr(grid_module, "HALO_RANGES", 0.0)
+    assert len(valuemap.build_map(dataset, KNOWN).votes) < len(result.votes)
+
+
+def test_pieces_have_all_that_sees_their_objects() -> None:
+    dataset = streets(445.0, 3000.0)
+    source = InMemory(dataset, KNOWN)
+    place_m = source.grid.images_on_ground(dataset.images)
+    for cell in source.cells:
+        piece = source.piece(cell)
+        near = source.grid.is_within(cell, place_m, source.grid.halo_m)
+        assert sorted(piece.image_id.tolist()) == dataset.images.image_id[near].tolist()
+        own = dataset.images.image_id[near]
+        of_own = np.isin(dataset.detections.image_id, own)
+        assert sorted(piece.detection_id.tolist()) == dataset.detections.detection_id[of_own].tolist()
