@@ -133,7 +133,7 @@ def solved(cell: Cell, *labels: tuple[float, list[int]]) -> Solved:
         existence=ones,
     )
     label = np.repeat(np.arange(1, count + 1), votes)
-    residual = 1.0 + detection
+    residual: Floats = detection.astype(np.float64) + 1.0
     return Solved(
         cell=cell,
         labels=table,
@@ -239,7 +239,7 @@ def plain(table: object) -> object:
     return pa.schema([pa.field(f.name, pa.string() if pa.types.is_dictionary(f.type) else f.type) for f in schema])
 
 
-def rows(result: Map, *, low: float = -np.inf, high: float = np.inf, shift: float = 0.0, ids: int = 0) -> list[object]:
+def rows(result: Map, *, low: float = -np.inf, high: float = np.inf, shift: float = 0.0, ids: int = 0) -> list[tuple[float, ...]]:
     """What a map says about some part of the world, as if it were elsewhere."""
     labels, votes = result.labels, result.votes
     found = []

@@ -75,7 +75,7 @@ class Grid:
     @property
     def halo_squares(self) -> int:
         """How many of the smallest squares the halo is wide."""
-        return math.ceil(self.halo_m / (self.side_m / 2**LEVELS))
+        return math.ceil(self.halo_m * 2.0**LEVELS / self.side_m)
 
     def on_ground(self, point_in_world_m: Floats) -> Floats:
         """Return the places (N, 2) of points (N, 3) on the ground."""
