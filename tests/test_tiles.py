@@ -239,7 +239,9 @@ def plain(table: object) -> object:
     return pa.schema([pa.field(f.name, pa.string() if pa.types.is_dictionary(f.type) else f.type) for f in schema])
 
 
-def rows(result: Map, *, low: float = -np.inf, high: float = np.inf, shift: float = 0.0, ids: int = 0) -> list[tuple[float, ...]]:
+def rows(
+    result: Map, *, low: float = -np.inf, high: float = np.inf, shift: float = 0.0, ids: int = 0
+) -> list[tuple[float, ...]]:
     """What a map says about some part of the world, as if it were elsewhere."""
     labels, votes = result.labels, result.votes
     found = []

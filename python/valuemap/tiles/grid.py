@@ -75,7 +75,8 @@ class Grid:
     @property
     def halo_squares(self) -> int:
         """How many of the smallest squares the halo is wide."""
-        return math.ceil(self.halo_m * 2.0**LEVELS / self.side_m)
+        squares: float = self.halo_m * 2.0**LEVELS / self.side_m
+        return math.ceil(squares)
 
     def on_ground(self, point_in_world_m: Floats) -> Floats:
         """Return the places (N, 2) of points (N, 3) on the ground."""
