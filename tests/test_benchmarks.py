@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import dense
 import fleets
+from block import block
 from bound import Views, cramer_rao_covariances, residual_covariance, true_views
 from cities import PASSING_KINDS, passing_things, reliability, seeds_from
 from literal import Pinhole, Sighting
@@ -245,6 +246,11 @@ def test_seeds_are_numbers_and_ranges() -> None:
 # The scripts run.
 
 
+def block_driven(passes: int) -> SimulationConfig:
+    """Stands for the city of the benchmarks."""
+    return block(passes_per_street=passes, lookalikes_per_light=0.0)
+
+
 @pytest.mark.parametrize(
     ("script", "arguments", "rows"),
     [
@@ -252,7 +258,7 @@ def test_seeds_are_numbers_and_ranges() -> None:
         ("robust", "--seeds 0 --passes 1 --method paper", 1),
         ("more_data", "--seeds 0 --tours 1 2", 2),
         ("fleets", "--seeds 1 --small --only clean", 1),
-        ("dense", "--seeds 0 --small --only lamps-25", 1),
+        ("dense", "--seeds 0 --small --radius 30 --only lamps-25", 1),
         ("ablation", "--seeds 0 --passes 1 --without nothing", 1),
     ],
 )
@@ -264,9 +270,14 @@ def test_a_benchmark_writes_what_it_found(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
+    """On one block instead of the city."""
     path = tmp_path / "figures.json"
+    module = importlib.import_module(script)
+    for name, small in {"city": block_driven, "SMALL": {"passes_per_street": 2}}.items():
+        if hasattr(module, name):
+            monkeypatch.setattr(module, name, small)
     monkeypatch.setattr("sys.argv", [f"benchmarks/{script}.py", *arguments.split(), "--json", str(path)])
-    importlib.import_module(script).main()
+    module.main()
     record = json.loads(path.read_text(encoding="utf-8"))
     assert record["command"].startswith(f"python benchmarks/{script}.py {arguments}")
     assert [0.0 < row["recall"] <= 1.0 for row in record["results"]] == [True] * rows

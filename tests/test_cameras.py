@@ -9,12 +9,13 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
+from block import block
 from small_dataset import small_dataset
 from valuemap.cameras import Rays, camera_centers, cast_rays, colmap_camera, rotation_matrices
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, Frame
 from valuemap.pipeline import build_map
-from valuemap.simulate import PRESETS, record_city
+from valuemap.simulate import simulate
 from valuemap.tables import Cameras, Categories, Detections, Floats, Images
 
 WIDTH, HEIGHT = 800, 600
@@ -300,8 +301,11 @@ def seen_through(dataset: Dataset, model: str, size: tuple[int, int], params: li
 
 
 def test_a_city_is_mapped_as_completely_through_any_camera() -> None:
-    """The same rays, so the same angular noise: as many objects, and as many labels, whatever pixels they are in."""
-    city = record_city(PRESETS["small"], seed=5, name="small").dataset
+    """The same rays, so the same angular noise: as many objects, and as many labels, whatever pixels they are in.
+
+    With the distortion of the second camera left out, three of the twelve objects are off by more than 0.5 m.
+    """
+    city = simulate(block(), seed=5, name="block")
     focal, middle = float(city.cameras.params[0][0]), city.cameras.params[0][2:].tolist()
     assert city.truth is not None
     truth = city.truth.position_in_world_m
@@ -315,7 +319,7 @@ def test_a_city_is_mapped_as_completely_through_any_camera() -> None:
     ):
         labels = build_map(seen_through(city, model, size, params), MapConfig()).labels
         away = np.linalg.norm(labels.position_in_world_m[:, None] - truth[None], axis=2)
-        found[model] = (int((away.min(axis=0) < 1.0).sum()), len(labels))
+        found[model] = (int((away.min(axis=0) < 0.5).sum()), len(labels))
     objects, count = found["PINHOLE"]
     assert objects >= 0.9 * len(truth)
     assert all(abs(other - objects) <= 1 for other, _ in found.values()), found
