@@ -11,7 +11,7 @@ import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,9 @@ from valuemap.drives import find_drives
 from valuemap.errors import InputError
 from valuemap.map_folder import Map
 from valuemap.tables import Bools, Floats, Ints, Rejected, read_table
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 PICTURES = "images"
 """The folder of a dataset that holds its pictures, where it has some."""
@@ -261,7 +264,8 @@ class Evidence:
         """Return the detections whose rays pass the vertical line through a point closer than `radius_m`."""
         up = np.array(self.dataset.frame.up)
         around = self.images_around(point_in_world_m, self.max_range_m, horizontally=True)
-        rows = np.flatnonzero(np.isin(self.rays.image_row, around))
+        of_image = [self.detections_of_image(int(row)) for row in around]
+        rows = np.sort(np.concatenate(of_image)) if of_image else np.empty(0, np.int64)
         image_row = self.rays.image_row[rows]
         center = self.center_in_world_m[image_row]
         direction = self.rays.direction_in_world[rows]
@@ -293,9 +297,23 @@ class Evidence:
 
     def images_around(self, point_in_world_m: Floats, radius_m: float, *, horizontally: bool = False) -> Ints:
         """Return the rows of the images taken within a distance of a point, ascending."""
-        away = self.center_in_world_m - point_in_world_m
+        place = self.dataset.frame.east_north() @ point_in_world_m
+        # What is near is near from above: looking there first costs nothing in a map of a whole city.
+        rows = np.array(sorted(self._plan.query_ball_point(place, radius_m * _ROUNDING)), dtype=np.int64)
+        away = self.center_in_world_m[rows] - point_in_world_m
         distance = self._horizontal_m(away) if horizontally else np.linalg.norm(away, axis=1)
-        return np.flatnonzero(distance <= radius_m)
+        return rows[distance <= radius_m]
+
+    def nearest_image(self, point_in_world_m: Floats) -> int:
+        """Return the row of the image that was taken nearest to a point, seen from above."""
+        return int(self._plan.query(self.dataset.frame.east_north() @ point_in_world_m)[1])
+
+    @cached_property
+    def _plan(self) -> cKDTree:
+        """An index of the images by where they were taken, seen from above."""
+        from scipy.spatial import cKDTree  # Slow to import, and only clicks need it.
+
+        return cKDTree(self.center_in_world_m @ self.dataset.frame.east_north().T)
 
     def project(self, image_row: Ints, point_in_world_m: Floats) -> Floats:
         """Return where points, one (3) or one per image (N, 3), are in images, px (N, 2); NaN behind the camera."""

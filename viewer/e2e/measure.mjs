@@ -70,11 +70,8 @@ seen.zoom = await frames(async () => {
 });
 await page.screenshot({ path: screenshot });
 
-const served = [];
 seen.clicks_cpu_ms = [];
-page.on("response", async (response) => {
-  if (response.url().includes("/api/label?")) served.push(response.request().timing().responseEnd);
-});
+await page.evaluate(() => performance.setResourceTimingBufferSize(10000));
 for (const label of labels.map(Number)) {
   await page.evaluate((id) => {
     const view = window.valuemap.getView();
@@ -93,7 +90,12 @@ for (const label of labels.map(Number)) {
   seen.clicks_cpu_ms.push((await cpu()) - used);
 }
 seen.clicks_ms = await measures("click");
-seen.answers_ms = served;
+seen.answers_ms = await page.evaluate(() =>
+  performance
+    .getEntriesByType("resource")
+    .filter((entry) => entry.name.includes("/api/label?"))
+    .map((entry) => entry.duration),
+);
 seen.titles = await page.locator("#title").innerText();
 seen.complaints = noted.complaints;
 await browser.close();

@@ -23,6 +23,7 @@ if (step === "reject") {
   await page.mouse.click(...seen.at);
   await page.waitForFunction((title) => document.querySelector("#title")?.textContent === title, `Label ${id}`);
   await page.waitForFunction(() => [...document.querySelectorAll("#details .large img")].some((image) => image.naturalWidth > 0));
+  await page.waitForSelector("#details .gallery[data-complete]");
   seen.thumbs = await page.locator("#details .thumb").count();
   seen.crops = await crops();
   seen.sub = await text("#details .sub");

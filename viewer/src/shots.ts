@@ -52,6 +52,9 @@ function taker(shot: Shot): string {
   return label === null || label === undefined ? "" : ` (label ${label} has it)`;
 }
 
+/** Small pictures that are there at once: more than a panel shows. */
+const FIRST = 20;
+
 export interface Gallery {
   element: HTMLElement;
   /** Go to another picture: 1 is the next, -1 the one before. */
@@ -73,6 +76,7 @@ export function gallery(
 
   function select(index: number, scroll: boolean): void {
     if (!shots.length) return;
+    fill(index + 1);
     current = Math.min(shots.length - 1, Math.max(0, index));
     const shot = shots[current];
     buttons.forEach((button, i) => button.setAttribute("aria-current", i === current ? "true" : "false"));
@@ -97,7 +101,7 @@ export function gallery(
   }
 
   const element = h("div", { class: "gallery" }, large);
-  let index = 0;
+  const strips: { strip: HTMLElement; shots: Shot[]; missing: boolean }[] = [];
   for (const group of groups) {
     if (!group.shots.length) continue;
     element.append(h("h3", {}, `${group.title} `, h("small", {}, group.hint)));
@@ -108,25 +112,47 @@ export function gallery(
         element.append(h("h4", {}, dot, head.passes[part.pass]?.name ?? `pass ${part.pass}`, h("small", {}, ` ${plural(part.shots.length, "image")}${rms(part.shots)}`)));
       }
       const strip = h("div", { class: "strip" });
-      for (const shot of part.shots) {
-        const at = index++;
-        const button = h(
-          "button",
-          {
-            class: group.missing ? "thumb missing" : "thumb",
-            title: `${shot.name}: ${figures(shot)}`,
-            "aria-label": `${shot.name}, ${figures(shot)}, ${fixed(shot.distance_m, 0, " metres")} away`,
-            onclick: () => select(at, false),
-          },
-          crop(shot, shot.crop[2]),
-          h("span", { class: (shot.residual_sigmas ?? 0) > 3 ? "tag bad" : "tag" }, shot.residual_px !== undefined ? fixed(shot.residual_sigmas, 1, " σ") : fixed(shot.distance_m, 0, " m")),
-        );
-        buttons.push(button);
-        strip.append(button);
-      }
+      strips.push({ strip, shots: part.shots, missing: group.missing });
       element.append(strip);
     }
   }
+
+  function thumb(shot: Shot, at: number, missing: boolean): HTMLButtonElement {
+    return h(
+      "button",
+      {
+        class: missing ? "thumb missing" : "thumb",
+        title: `${shot.name}: ${figures(shot)}`,
+        "aria-label": `${shot.name}, ${figures(shot)}, ${fixed(shot.distance_m, 0, " metres")} away`,
+        onclick: () => select(at, false),
+      },
+      crop(shot, shot.crop[2]),
+      h("span", { class: (shot.residual_sigmas ?? 0) > 3 ? "tag bad" : "tag" }, shot.residual_px !== undefined ? fixed(shot.residual_sigmas, 1, " σ") : fixed(shot.distance_m, 0, " m")),
+    );
+  }
+
+  let strip = 0;
+  let inStrip = 0;
+  /** Make at least so many of the small pictures: hundreds at once would make a click wait. */
+  function fill(wanted: number): void {
+    while (buttons.length < Math.min(wanted, shots.length)) {
+      const { strip: parent, shots: part, missing } = strips[strip];
+      const button = thumb(part[inStrip], buttons.length, missing);
+      buttons.push(button);
+      parent.append(button);
+      if (++inStrip === part.length) [strip, inStrip] = [strip + 1, 0];
+    }
+    if (buttons.length === shots.length) element.dataset.complete = "true";
+  }
+  function fillOn(deadline: IdleDeadline): void {
+    if (!element.isConnected) return;
+    do fill(buttons.length + 4);
+    while (buttons.length < shots.length && deadline.timeRemaining() > 4);
+    if (buttons.length < shots.length) requestIdleCallback(fillOn, { timeout: 300 });
+  }
+  fill(FIRST);
+  if (shots.length > buttons.length) requestIdleCallback(fillOn, { timeout: 300 });
+
   if (shots.length) select(0, false);
   else large.remove();
   return { element, step: (by) => select(current + by, by !== 0), open };

@@ -107,32 +107,31 @@ def place_details(scene: Scene, east_m: float, north_m: float) -> dict[str, Any]
 
 def _voters(scene: Scene, evidence: Evidence, label_id: int) -> list[dict[str, Any]]:
     voters = evidence.voters(label_id)
-    centers = scene.local(evidence.center_in_world_m[voters.image_row])
+    side = _side(voters.size_px)
     return [
         {
-            **_image(scene, evidence, int(voters.image_row[i]), centers[i]),
+            **image,
             "box": _box(voters.box_px[i], voters.size_px[i]),
             "projected": [number(c, 1) for c in voters.projected_px[i]],
-            "crop": _crop(voters.box_px[i], _side(voters.size_px[i])),
+            "crop": _crop(voters.box_px[i], side[i]),
             "residual_px": number(voters.residual_px[i], 2),
             "residual_sigmas": number(voters.residual_sigmas[i], 2),
             "score": number(voters.score[i], 3),
             "distance_m": number(voters.distance_m[i], 1),
         }
-        for i in range(len(voters))
+        for i, image in enumerate(_images(scene, evidence, voters.image_row))
     ]
 
 
 def _misses(scene: Scene, evidence: Evidence, misses: Misses, *, typical_px: float) -> list[dict[str, Any]]:
-    centers = scene.local(evidence.center_in_world_m[misses.image_row])
     detections = evidence.dataset.detections
     found = []
-    for i in range(len(misses)):
+    for i, image in enumerate(_images(scene, evidence, misses.image_row)):
         nearest = int(misses.nearest_row[i])
         is_near = nearest >= 0 and misses.nearest_px[i] <= _CROP_LEAST_PX + typical_px
         found.append(
             {
-                **_image(scene, evidence, int(misses.image_row[i]), centers[i]),
+                **image,
                 "projected": [number(c, 1) for c in misses.projected_px[i]],
                 "crop": _crop(misses.projected_px[i], typical_px),
                 "distance_m": number(misses.distance_m[i], 1),
@@ -144,30 +143,40 @@ def _misses(scene: Scene, evidence: Evidence, misses: Misses, *, typical_px: flo
     return found
 
 
-def _image(scene: Scene, evidence: Evidence, row: int, center: Floats) -> dict[str, Any]:
+def _images(scene: Scene, evidence: Evidence, rows: Ints) -> list[dict[str, Any]]:
+    """Return what the page says about images, whatever they show."""
     images = evidence.dataset.images
-    name = evidence.image_name(row)
-    width, height = evidence.picture_size_px(np.array([row]))[0]
-    return {
-        "image": int(images.image_id[row]),
-        "name": name,
-        "pass": int(evidence.pass_number[row]),
-        "picture": picture_file(scene.pictures, name) is not None,
-        "size": [int(width), int(height)],
-        "camera_m": [number(c, 3) for c in center],
-        "time_s": None if images.timestamp_s is None else number(images.timestamp_s[row], 2),
-    }
+    centers = scene.local(evidence.center_in_world_m[rows])
+    return [
+        {
+            "image": image_id,
+            "name": name,
+            "pass": number_of_pass,
+            "picture": picture_file(scene.pictures, name) is not None,
+            "size": size,
+            "camera_m": [number(c, 3) for c in center],
+            "time_s": None if images.timestamp_s is None else number(images.timestamp_s[row], 2),
+        }
+        for row, image_id, name, number_of_pass, size, center in zip(
+            rows,
+            images.image_id[rows].tolist(),
+            images.name.take(rows).to_pylist(),
+            evidence.pass_number[rows].tolist(),
+            evidence.picture_size_px(rows).tolist(),
+            centers,
+            strict=True,
+        )
+    ]
 
 
-def _side(size_px: Floats) -> float:
-    """Return the side of the crop around a box; boxes may have no size."""
-    longest = float(np.nanmax([*size_px, 0.0]))
-    return max(_CROP_LEAST_PX, _CROP_BOXES * longest)
+def _side(size_px: Floats) -> Floats:
+    """Return the sides (N) of the crops around boxes (N, 2); boxes may have no size."""
+    return np.maximum(_CROP_LEAST_PX, _CROP_BOXES * np.fmax(np.fmax(size_px[:, 0], size_px[:, 1]), 0.0))
 
 
 def _typical_side(evidence: Evidence, label_id: int) -> float:
-    sizes = evidence.voters(label_id).size_px
-    return float(np.median([_side(size) for size in sizes])) if len(sizes) else _CROP_LEAST_PX
+    size_px = evidence.dataset.detections.size_px[evidence.detection_row[evidence.vote_rows(label_id)]]
+    return float(np.median(_side(size_px))) if len(size_px) else _CROP_LEAST_PX
 
 
 def _crop(center_px: Floats, side_px: float) -> list[float | None]:
@@ -207,9 +216,9 @@ def _hypothesis(scene: Scene, row: int, away_m: float, local_m: Floats) -> dict[
 
 def _seen_at(scene: Scene, evidence: Evidence, place: Floats) -> tuple[dict[str, Any], float]:
     """Return why there is nothing at a place, the rays that pass it, the images that picture it, and its height."""
-    centers = scene.local(evidence.center_in_world_m)
-    nearest = int(np.argmin(np.linalg.norm(centers[:, :2] - place, axis=1)))
-    at = scene.world(np.array([[*place, centers[nearest, 2]]]))[0]
+    ground = scene.world(np.array([[*place, 0.0]]))[0]
+    camera = scene.local(evidence.center_in_world_m[[evidence.nearest_image(ground)]])[0]
+    at = scene.world(np.array([[*place, camera[2]]]))[0]
     answer = explain_place(evidence, at, scene.rejected, radius_m=PLACE_RADIUS_M)
     reasons = " ".join(answer.reasons)
     for row in answer.labels:  # The page has links instead.
@@ -228,26 +237,32 @@ def _seen_at(scene: Scene, evidence: Evidence, place: Floats) -> tuple[dict[str,
             {"id": int(taker), "rays": int(count)}
             for count, taker in sorted(zip(counts.tolist(), takers.tolist(), strict=True), key=lambda each: -each[0])
         ],
-        "passing": [_passing(scene, evidence, rays, int(i), centers) for i in shown],
+        "passing": _passing(scene, evidence, rays, shown),
         "pictured": _misses(scene, evidence, _some(looks), typical_px=2.0 * _CROP_LEAST_PX),
     }
     return details, float(scene.local(answer.point_in_world_m[None])[0, 2])
 
 
-def _passing(scene: Scene, evidence: Evidence, rays: PassingRays, i: int, centers: Floats) -> dict[str, Any]:
+def _passing(scene: Scene, evidence: Evidence, rays: PassingRays, shown: Ints) -> list[dict[str, Any]]:
     detections = evidence.dataset.detections
-    row, image_row = int(rays.detection_row[i]), int(rays.image_row[i])
-    return {
-        **_image(scene, evidence, image_row, centers[image_row]),
-        "box": _box(detections.center_px[row], detections.size_px[row]),
-        "crop": _crop(detections.center_px[row], _side(detections.size_px[row])),
-        "projected": None,
-        "class": detections.class_name.names[detections.class_name.codes[row]],
-        "score": number(detections.score[row], 3),
-        "miss_m": number(rays.miss_m[i], 2),
-        "distance_m": number(rays.distance_m[i], 1),
-        "label": int(rays.label_id[i]) if rays.label_id[i] >= 0 else None,
-    }
+    rows = rays.detection_row[shown]
+    side = _side(detections.size_px[rows])
+    return [
+        {
+            **image,
+            "box": _box(detections.center_px[row], detections.size_px[row]),
+            "crop": _crop(detections.center_px[row], side[k]),
+            "projected": None,
+            "class": detections.class_name.names[detections.class_name.codes[row]],
+            "score": number(detections.score[row], 3),
+            "miss_m": number(rays.miss_m[i], 2),
+            "distance_m": number(rays.distance_m[i], 1),
+            "label": int(rays.label_id[i]) if rays.label_id[i] >= 0 else None,
+        }
+        for k, (i, row, image) in enumerate(
+            zip(shown, rows, _images(scene, evidence, rays.image_row[shown]), strict=True)
+        )
+    ]
 
 
 def _some(looks: Misses) -> Misses:

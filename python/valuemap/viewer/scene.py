@@ -260,20 +260,6 @@ class Scene:
             return None
         return evaluate_map(self.result, self.evidence.dataset)
 
-    def warm_up(self) -> None:
-        """Compute what the first click would otherwise wait for."""
-        evidence = self.evidence
-        if evidence is None or not len(self.result.labels):
-            return
-        with self.lock:
-            _ = (
-                evidence.drive_order,
-                evidence.center_in_world_m,
-                evidence.label_of_detection,
-                evidence.rays.center_in_world_m,
-            )
-            evidence.misses(int(self.result.labels.label_id[0]))
-
 
 def _matrices(covariance_m2: Floats) -> Floats:
     """Return covariances (N, 6) as matrices (N, 3, 3)."""

@@ -98,7 +98,7 @@ class Content:
         self.opinions = self._read_opinions()
         self._version = self._stamp()
         _ = self.scene.labels_body, self.scene.cameras_body  # What a page waits for when it opens.
-        threading.Thread(target=self.scene.warm_up, daemon=True).start()
+        threading.Thread(target=_warm_up, args=(self.scene,), daemon=True).start()
 
     def _read_opinions(self) -> Opinions:
         return Opinions(self.scene, self._review or self.scene.folder / REVIEW)
@@ -119,6 +119,15 @@ class Content:
             self.scene = self._read_scene()
             self.opinions = self._read_opinions()
             self._version = version
+
+
+def _warm_up(scene: Scene) -> None:
+    """Answer a click that nobody made: what all clicks need is computed then, and the first one need not wait."""
+    labels = scene.result.labels
+    if len(labels):
+        label_details(scene, int(labels.label_id[0]))
+        east, north, _ = scene.local(labels.position_in_world_m[:1])[0]
+        place_details(scene, float(east), float(north))
 
 
 @dataclass(frozen=True)
