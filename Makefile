@@ -13,7 +13,7 @@ demo: setup
 	$(RUN) valuemap demo
 
 test: setup
-	EXTRAS="$(EXTRAS)" $(RUN) pytest
+	EXTRAS="$(EXTRAS)" $(RUN) pytest --numprocesses auto --dist loadfile
 
 rust-test:
 	cargo test --locked --package valuemap-core
