@@ -29,14 +29,21 @@ from valuemap.tables import Labels, Votes
 
 
 def findings(result: Map, *, config: MapConfig | None = None, counts: dict[str, Any] | None = None) -> Findings:
-    return Findings(small_dataset(), config or MapConfig(), result.labels, result.votes, counts or {})
+    total = len(small_dataset().detections)
+    counts = {"detections": total, "detections_without_label": total - len(result.votes), **(counts or {})}
+    return Findings(2, config or MapConfig(), result.labels, result.votes, counts)
 
 
 def with_votes(image_id: list[int], label_id: list[int]) -> Map:
     """Return a map of two labels with such votes."""
     plain = map_of([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]], residual_px=[0.0] * len(image_id))
     votes: Votes = plain.votes.replace(image_id=np.array(image_id), label_id=np.array(label_id))
-    return replace(plain, votes=votes)
+    images = small_dataset().images
+    passes = [
+        len(np.unique(images.pass_id.codes[np.isin(images.image_id, votes.image_id[votes.label_id == label])]))
+        for label in (0, 1)
+    ]
+    return replace(plain, votes=votes, labels=plain.labels.replace(passes=np.array(passes)))
 
 
 def sized(size_m: float) -> Map:
@@ -128,9 +135,7 @@ def test_passes_without_overlap(image_id: list[int], label_id: list[int], told: 
 
 def test_a_single_pass_overlaps_with_nothing() -> None:
     result = with_votes([10, 20], [0, 1])
-    dataset = small_dataset()
-    of_one = replace(dataset, images=dataset.images.take(np.array([0, 1])))
-    assert no_overlap(Findings(of_one, MapConfig(), result.labels, result.votes, {})) is None
+    assert no_overlap(replace(findings(result), passes=1)) is None
 
 
 @pytest.mark.parametrize(

@@ -3,24 +3,37 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
 import valuemap
 from scenes import as_dataset, random_scene
+from valuemap import portions
+from valuemap.cli.commands import app
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, Frame
+from valuemap.engine.threads import ThreadEngine
+from valuemap.errors import OutputError
 from valuemap.map_folder import Map
+from valuemap.progress import silent
+from valuemap.robust import Noise
 from valuemap.tables import Categories, Floats, Labels, Votes, table_to_arrow
 from valuemap.tiles import grid as grid_module
+from valuemap.tiles import mapping
 from valuemap.tiles.grid import LEVELS, WHOLE, Cell, Census, Grid
+from valuemap.tiles.mapping import solve_cells
+from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.sample import is_sampled, sampled_squares
 from valuemap.tiles.seams import join_cells
 from valuemap.tiles.solve import Solved
 from valuemap.tiles.source import InMemory
+from valuemap.tiles.store import hash_piece
+from valuemap.tiles.work import open_work, written
 
 GRID = Grid.of(Frame(), 60.0)
 # With all noise known nothing is calibrated.
@@ -291,3 +304,121 @@ def test_pieces_have_all_that_sees_their_objects() -> None:
         own = dataset.images.image_id[near]
         of_own = np.isin(dataset.detections.image_id, own)
         assert sorted(piece.detection_id.tolist()) == dataset.detections.detection_id[of_own].tolist()
+
+
+# On disk, interrupted, twice.
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """What a map says, with the parts that an update starts from; not how long it took."""
+    names = ("labels.parquet", "votes.parquet", "calibration.json")
+    found = {name: (folder / name).read_bytes() for name in names}
+    return found | {path.name: path.read_bytes() for path in sorted((folder / "cells").glob("*.parquet"))}
+
+
+def mapped(dataset: Path, out: Path, *options: str) -> dict[str, bytes]:
+    settings = [f"--set={name}={value}" for name, value in SET.items()]
+    result = CliRunner().invoke(app, ["map", str(dataset), "--out", str(out), *settings, *options])
+    assert result.exit_code == 0, result.output
+    return files(out)
+
+
+SET = {"detection_sigma_px": 1.5, "position_sigma_m": 0.05, "rotation_sigma_deg": 0.05}
+
+
+@pytest.fixture(scope="module")
+def long_street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("long") / "street"
+    valuemap.write_dataset(streets(0.0, 445.0, 3000.0), folder)
+    return folder
+
+
+def test_tiles_of_any_size_on_disk_or_in_memory_give_the_same_map(
+    long_street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    in_memory = mapped(long_street, tmp_path / "memory")
+    assert len(in_memory) > 5  # Several cells.
+    monkeypatch.setattr(portions, "ROWS", 50)
+    for size in (200.0, 2000.0, 1e6):
+        assert mapped(long_street, tmp_path / f"tiles-{size:.0f}", "--tile-size", str(size)) == in_memory
+    assert mapped(long_street, tmp_path / "one-thread", "--tile-size", "500", "--threads", "1") == in_memory
+    assert sorted(path.name for path in tmp_path.iterdir() if "work" in path.name) == []
+
+
+def test_pieces_on_disk_are_those_in_memory(long_street: Path, tmp_path: Path) -> None:
+    with open_work(tmp_path / "work", resume=False) as work:
+        on_disk = partition_dataset(long_street, work, KNOWN, tile_size_m=1500.0)
+    in_memory = InMemory(valuemap.read_dataset(long_street), KNOWN)
+    assert on_disk.cells == in_memory.cells
+    assert on_disk.drives_record == in_memory.drives_record
+    for cell in [*on_disk.cells, WHOLE]:
+        hashes = {hash_piece(source.piece(cell), cell, GRID, None, KNOWN) for source in (on_disk, in_memory)}
+        assert len(hashes) == 1 or cell == WHOLE
+    assert np.array_equal(on_disk.sample().detection_id, in_memory.sample().detection_id)
+
+
+def test_a_run_that_was_killed_goes_on_and_ends_with_the_same_map(
+    long_street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = mapped(long_street, tmp_path / "whole")
+    solve = mapping.solve_cell
+    solved: list[Cell] = []
+
+    def dies(piece: object, cell: Cell, *args: object, **kwargs: object) -> Solved:
+        if len(solved) == 2:
+            raise MemoryError
+        solved.append(cell)
+        return solve(piece, cell, *args, **kwargs)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(mapping, "solve_cell", dies)
+    with pytest.raises(MemoryError):
+        mapped_or_raises(long_street, tmp_path / "killed", "--threads", "1")
+    assert not (tmp_path / "killed").exists()
+    monkeypatch.setattr(mapping, "solve_cell", lambda piece, cell, *a, **k: solved.append(cell) or solve(piece, cell, *a, **k))  # fmt: skip # noqa: E501
+    assert mapped(long_street, tmp_path / "killed", "--resume") == whole
+    assert len(solved) == len(set(solved)) == len(whole) - 3  # None was solved twice.
+    assert not (tmp_path / "killed.work").exists()
+
+
+def mapped_or_raises(dataset: Path, out: Path, *options: str) -> None:
+    settings = [f"--set={name}={value}" for name, value in SET.items()]
+    CliRunner().invoke(app, ["map", str(dataset), "--out", str(out), *settings, *options], catch_exceptions=False)
+
+
+def test_what_was_made_with_other_settings_is_not_taken(long_street: Path, tmp_path: Path) -> None:
+    with open_work(tmp_path / "work", resume=False) as work:
+        source = InMemory(valuemap.read_dataset(long_street), KNOWN)
+        first = solve_cells(source, Noise(), KNOWN, ThreadEngine(1), silent, store=work / "cells")
+        again = solve_cells(source, Noise(), KNOWN, ThreadEngine(2), silent, store=work / "cells")
+        other = solve_cells(source, Noise(detection_px=3.0), KNOWN, ThreadEngine(2), silent, store=work / "cells")
+    assert first == again
+    assert not set(map(str, first)) & set(map(str, other))
+
+
+def test_a_second_run_into_the_same_folder_is_refused(long_street: Path, tmp_path: Path) -> None:
+    with open_work(tmp_path / "map.work", resume=False):
+        result = CliRunner().invoke(app, ["map", str(long_street), "--out", str(tmp_path / "map"), "--resume"])
+    assert result.exit_code == 1
+    assert "another run is at work here" in result.output
+
+
+def test_foreign_folders_are_no_place_for_parts(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    with pytest.raises(OutputError, match="is not ours"), open_work(tmp_path / "mine", resume=False):
+        pass
+    assert (tmp_path / "mine" / "letter.txt").read_text() == "dear"
+
+
+def test_parts_are_whole_or_not_there(tmp_path: Path) -> None:
+    with open_work(tmp_path / "work", resume=False) as work:
+        with pytest.raises(OSError, match="full"), written(work / "cells" / "a") as path:
+            path.write_text("half")
+            raise OSError(28, "full")
+        assert list((work / "cells").iterdir()) == []
+        (work / "cells" / ".tmp-left").mkdir()
+    with open_work(tmp_path / "work", resume=True) as work:
+        assert list((work / "cells").iterdir()) == []
+    full = pytest.raises(OutputError, match=r"cannot be written: full")
+    with full, open_work(tmp_path / "work", resume=True):
+        raise OSError(28, "full")

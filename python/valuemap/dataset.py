@@ -159,7 +159,7 @@ def read_dataset(path: str | Path, *, are_boxes_checked: bool = True) -> Dataset
         A table is missing, damaged or inconsistent; the message names file, row and what to do.
     """
     folder = Path(path)
-    head = _read_head(folder)
+    head = read_head(folder)
     optional = {
         name: read_table(kind, folder / f"{name}.parquet") if (folder / f"{name}.parquet").is_file() else None
         for name, kind in (("truth", Truth), ("truth_detections", TruthDetections), ("rejected", RejectedRows))
@@ -187,10 +187,10 @@ def read_images(path: str | Path) -> tuple[Cameras, Images]:
         As `read_dataset`.
     """
     folder = Path(path)
-    _read_head(folder)
+    read_head(folder)
     cameras, images = read_table(Cameras, folder / "cameras.parquet"), read_table(Images, folder / "images.parquet")
-    _check_cameras(cameras, str(folder))
-    return cameras, _check_images(images, cameras, str(folder))
+    check_cameras(cameras, str(folder))
+    return cameras, check_images(images, cameras, str(folder))
 
 
 def write_dataset(dataset: Dataset, path: str | Path, *, force: bool = False) -> None:
@@ -227,9 +227,9 @@ def check_dataset(dataset: Dataset, *, source: str, are_boxes_checked: bool = Tr
         An unknown camera model or id, a quaternion that is not of unit length, a detection of an unknown
         image, outside its picture by more than a box, or with a size that cannot be.
     """
-    _check_cameras(dataset.cameras, source)
-    images = _check_images(dataset.images, dataset.cameras, source)
-    _check_detections(dataset, source, are_boxes_checked=are_boxes_checked)
+    check_cameras(dataset.cameras, source)
+    images = check_images(dataset.images, dataset.cameras, source)
+    check_detections(dataset, source, are_boxes_checked=are_boxes_checked)
     if dataset.truth_detections is not None:
         pairs = dataset.truth_detections
         if dataset.truth is None:
@@ -273,7 +273,8 @@ def number_passes(images: Images) -> Ints:
     return number[inverse]
 
 
-def _read_head(folder: Path) -> dict[str, Any]:
+def read_head(folder: Path) -> dict[str, Any]:
+    """Return what dataset.json holds; raises `InputError` where the folder is no dataset."""
     path = folder / MARKER
     settle(folder)
     if not path.is_file():
@@ -294,7 +295,8 @@ def _read_head(folder: Path) -> dict[str, Any]:
     return head
 
 
-def _check_cameras(cameras: Cameras, source: str) -> None:
+def check_cameras(cameras: Cameras, source: str) -> None:
+    """Refuse cameras that cannot be; raises as `read_dataset`."""
     for row in range(len(cameras)):
         where = f"{source}/cameras.parquet, row with camera_id {cameras.camera_id[row]}"
         model = cameras.model.names[cameras.model.codes[row]]
@@ -316,7 +318,8 @@ def _check_cameras(cameras: Cameras, source: str) -> None:
             )
 
 
-def _check_images(images: Images, cameras: Cameras, source: str) -> Images:
+def check_images(images: Images, cameras: Cameras, source: str) -> Images:
+    """Return images with quaternions normalised; raises as `read_dataset`."""
     _check_known(images.camera_id, cameras.camera_id, images.image_id, source, "images", "camera_id", "cameras")
     _check_names(images, source)
     norm = np.linalg.norm(images.cam_from_world_quat, axis=1)
@@ -347,7 +350,8 @@ def _check_names(images: Images, source: str) -> None:
         )
 
 
-def _check_detections(dataset: Dataset, source: str, *, are_boxes_checked: bool) -> None:
+def check_detections(dataset: Dataset, source: str, *, are_boxes_checked: bool = True) -> None:
+    """Refuse detections that the images of a dataset cannot have; raises as `read_dataset`."""
     detections, images, cameras = dataset.detections, dataset.images, dataset.cameras
     ids = detections.detection_id
     _check_known(detections.image_id, images.image_id, ids, source, "detections", "image_id", "images")

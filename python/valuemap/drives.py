@@ -878,6 +878,14 @@ class InOrder:
     detection_id: Ints
 
 
+def driving_order(images: Images, drives: Drives) -> Ints:
+    """Return the rows of images (N) along their drives, those of one exposure by place and direction."""
+    order = drives.pass_code * (int(drives.order.max(initial=0)) + 1) + drives.order
+    if not np.any(np.diff(order) <= 0):
+        return np.arange(len(order))
+    return np.lexsort((*images.cam_from_world_m.T, *images.cam_from_world_quat.T, order))
+
+
 def in_driving_order(dataset: Dataset, *, viewpoint_step_m: float = 1.0) -> InOrder:
     """Return a dataset with its rows in an order that ids, names and the order of rows do not change.
 
@@ -887,9 +895,8 @@ def in_driving_order(dataset: Dataset, *, viewpoint_step_m: float = 1.0) -> InOr
     images, detections = dataset.images, dataset.detections
     drives = find_drives(images, viewpoint_step_m=viewpoint_step_m)
     image_row = rows_of(detections.image_id, images.image_id)
-    order = drives.pass_code * (int(drives.order.max(initial=0)) + 1) + drives.order
-    if np.any(np.diff(order) <= 0):
-        rows = np.lexsort((*images.cam_from_world_m.T, *images.cam_from_world_quat.T, order))
+    rows = driving_order(images, drives)
+    if np.any(np.diff(rows) <= 0):
         images = images.take(rows)
         columns = {name: getattr(drives, name)[rows] for name in ("pass_code", "order", "driven_m", "viewpoint")}
         drives = replace(drives, **columns)

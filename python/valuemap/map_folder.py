@@ -7,6 +7,8 @@ import html
 import io
 import json
 import reprlib
+import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,7 +28,11 @@ if TYPE_CHECKING:
 MARKER = "run.json"
 REVIEW = "review.json"
 """What people decided about the labels (`valuemap.review`): the one file that a new map in the same folder keeps."""
-PARTS = (MARKER, "labels.parquet", "votes.parquet", "rejected.parquet")
+CALIBRATION = "calibration.json"
+"""What was estimated of the dataset before any part of it was mapped."""
+CELLS = "cells"
+"""The folder of what was found in each cell, which an update of the map starts from."""
+PARTS = (MARKER, "labels.parquet", "votes.parquet", "rejected.parquet", CALIBRATION)
 """All files that a map may have: none of an older one may stay beside those of a new one."""
 
 _RECORD: dict[str, tuple[type, str]] = {
@@ -93,14 +99,20 @@ class Map:
         return geographic_labels(self.labels)
 
 
-def write_map(result: Map, path: str | Path, *, force: bool = False) -> None:
+def write_map(result: Map, path: str | Path, *, cells: Sequence[Path] = (), force: bool = False) -> None:
     """Write a map as a folder; an older map that is there is replaced, never half.
 
     Other files in the folder stay. Where one that valuemap did not write is in the way, an `OutputError` says so; with
-    `force` it is replaced.
+    `force` it is replaced. `cells` are the files of its cells, which are copied.
     """
-    with new_folder(Path(path), parts=PARTS, force=force) as folder:
+    with new_folder(Path(path), parts=PARTS, part_folders=(CELLS,), force=force) as folder:
         run = {**result.run, "frame": result.frame.to_json()}
+        calibration = run.pop("calibration", None)
+        if calibration is not None:
+            (folder / CALIBRATION).write_text(json.dumps(calibration, indent=2) + "\n", encoding="utf-8")
+        for cell in cells:
+            (folder / CELLS).mkdir(exist_ok=True)
+            shutil.copyfile(cell, folder / CELLS / cell.name)
         (folder / MARKER).write_text(json.dumps(run, indent=2) + "\n", encoding="utf-8")
         write_labels(result, folder / "labels.parquet")
         write_table(result.votes, folder / "votes.parquet")
@@ -119,19 +131,27 @@ def read_map(path: str | Path) -> Map:
     settle(folder)
     if not head.is_file():
         raise InputError(f"{folder}: is not a map: there is no {MARKER} in it", hint="make one with valuemap map")
-    try:
-        run = json.loads(head.read_text(encoding="utf-8"))
-    except (ValueError, OSError, RecursionError) as error:
-        raise InputError(f"{head}: cannot be read as JSON: {error}", hint="make the map again") from error
-    if not isinstance(run, dict):
-        raise InputError(f"{head}: expected a JSON object, found {type(run).__name__}", hint="make the map again")
+    run = read_json(head)
     _check_run(run, str(head))
+    if (folder / CALIBRATION).is_file():
+        run["calibration"] = read_json(folder / CALIBRATION)
     return Map(
         frame=Frame.from_json(run.pop("frame", None), source=str(head)),
         labels=read_table(Labels, folder / "labels.parquet"),
         votes=read_table(Votes, folder / "votes.parquet"),
         run=run,
     )
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read an object from a file of a map; raises `InputError` where it holds something else."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError, RecursionError) as error:
+        raise InputError(f"{path}: cannot be read as JSON: {error}", hint="make the map again") from error
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: expected a JSON object, found {type(value).__name__}", hint="make the map again")
+    return value
 
 
 def _check_run(run: dict[str, Any], source: str) -> None:

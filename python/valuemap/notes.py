@@ -11,7 +11,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from valuemap.config import MapConfig
-from valuemap.dataset import Dataset, number_passes, rows_of
 from valuemap.tables import Floats, Labels, Votes
 
 _UNUSED_SHARE = 0.5
@@ -24,9 +23,9 @@ _LARGEST_NOISE = {"detection_px": 30.0, "box_share": 0.15, "position_m": 5.0}
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """A map with what it was made from and how; `counts` as run.json holds them."""
+    """A map with how many `passes` it was made from, and how; `counts` as run.json holds them."""
 
-    dataset: Dataset
+    passes: int
     config: MapConfig
     labels: Labels
     votes: Votes
@@ -47,7 +46,7 @@ def no_labels(findings: Findings) -> str | None:
 
 def unused_detections(findings: Findings) -> str | None:
     """Say that most detections show nothing that was found."""
-    unused, count = len(findings.dataset.detections) - len(findings.votes), len(findings.dataset.detections)
+    unused, count = findings.counts["detections_without_label"], findings.counts["detections"]
     if unused <= _UNUSED_SHARE * count or not len(findings.labels):
         return None
     return (
@@ -109,16 +108,11 @@ def close_twins(findings: Findings) -> str | None:
 
 def no_overlap(findings: Findings) -> str | None:
     """Say that no object was found by two passes, though there are several."""
-    images, votes = findings.dataset.images, findings.votes
-    pass_code = number_passes(images)
-    if pass_code.max(initial=0) == 0 or not len(findings.labels):
-        return None
-    code_of_vote = pass_code[rows_of(votes.image_id, images.image_id)]
-    pairs = np.unique(np.column_stack([votes.label_id, code_of_vote]), axis=0)
-    if len(pairs) > len(np.unique(votes.label_id)):
+    labels = findings.labels
+    if findings.passes <= 1 or not len(labels) or np.any(labels.passes > 1):
         return None
     return (
-        f"no label has votes of two of the {pass_code.max() + 1} passes: they see different places, or are shifted "
+        f"no label has votes of two of the {findings.passes} passes: they see different places, or are shifted "
         "against each other"
     )
 

@@ -5,29 +5,39 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from valuemap.cameras import Rays, cast_rays
 from valuemap.config import MapConfig, bounded_threads
-from valuemap.dataset import Dataset, ensure_checked
+from valuemap.dataset import Dataset, Frame, ensure_checked, read_dataset
 from valuemap.describe import describe_labels
+from valuemap.engine.engine import Engine
 from valuemap.engine.threads import ThreadEngine
 from valuemap.errors import InputError
 from valuemap.map_folder import Map
 from valuemap.merge import merge_clusters
 from valuemap.notes import Findings, find_notes
 from valuemap.partition import partition_images
+from valuemap.portions import rows_on_disk
 from valuemap.progress import Progress, silent
-from valuemap.robust import Scene, calibrate_noise, calibration_to_json
+from valuemap.robust import Calibration, calibration_to_json
 from valuemap.system import peak_memory_mb
 from valuemap.tables import Labels, Votes
-from valuemap.tiles.mapping import solve_cells
+from valuemap.tiles.calibration import calibrate
+from valuemap.tiles.mapping import loaded, solve_cells
+from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.seams import join_cells
-from valuemap.tiles.source import InMemory
+from valuemap.tiles.source import InMemory, Source
+from valuemap.tiles.work import CELLS
 from valuemap.vote import vote_in_clusters
+
+LARGEST_IN_MEMORY = 2_000_000
+"""Datasets with more images and detections are cut into pieces on disk: about 2 GB."""
 
 
 def build_map(
@@ -59,24 +69,109 @@ def build_map(
         Labels ordered by their first detection, votes, and the record of the run.
     """
     config, threads = config or MapConfig(), bounded_threads(threads)
-    if not len(dataset.detections):
-        raise InputError(
-            f"{dataset.name}: there are no detections in it",
-            hint="find some with valuemap detect, or import them with the images",
-        )
+    _check_detections(dataset.name, len(dataset.detections))
     dataset = ensure_checked(dataset)
     stages = _Stages()
-    method = _paper if config.method == "paper" else _robust
-    labels, votes, counts = method(dataset, config, stages, threads, progress)
-    counts = {
-        "images": len(dataset.images),
-        "detections": len(dataset.detections),
-        "detections_without_label": len(dataset.detections) - len(votes),
-        **counts,
-        "labels": len(labels),
-    }
-    notes = find_notes(Findings(dataset, config, labels, votes, counts))
-    return Map(dataset.frame, labels, votes, {**_record(dataset, config, counts, stages), "notes": notes})
+    if config.method == "paper":
+        labels, votes, counts = _paper(dataset, config, stages, threads, progress)
+    else:
+        with stages.measured("order"):
+            source = InMemory(dataset, config)
+        labels, votes, counts, _ = _robust(source, config, stages, ThreadEngine(threads), progress)
+    size = {"images": len(dataset.images), "detections": len(dataset.detections)}
+    passes = len(np.unique(dataset.images.pass_id.codes))
+    return _as_map(dataset.name, dataset.frame, size, passes, config, labels, votes, counts, stages)
+
+
+@dataclass(frozen=True)
+class Run:
+    """How a map of a dataset folder is made: where its parts are kept until it is written, and where they are made.
+
+    `tile_size_m` is how large the units are that the dataset is cut into on disk: None for what is usual, where it is
+    larger than memory; it changes no label. `calibration` is that of another map to use, None to estimate it. `known`
+    is where the cells of an older map are, which are not solved again where nothing changed.
+    """
+
+    work: Path
+    engine: Engine
+    tile_size_m: float | None = None
+    calibration: Calibration | None = None
+    known: Path | None = None
+
+
+def build_map_of_folder(
+    folder: Path, config: MapConfig, run: Run, *, progress: Progress = silent
+) -> tuple[Map, list[Path]]:
+    """Find the objects that a dataset folder shows, which may be larger than memory.
+
+    Parameters
+    ----------
+    folder
+        A dataset.
+    config
+        Settings.
+    run
+        Where and how it is made.
+    progress
+        Called as progress(what, done, total).
+
+    Raises
+    ------
+    InputError, OutputError, SettingError
+        As `read_dataset`; the folder of work cannot be written; `tile_size_m` is no size.
+
+    Returns
+    -------
+    Map
+        The map that `build_map` makes of the dataset.
+    list[Path]
+        The files of its cells; none of a dataset that is no wider than one.
+    """
+    images, detections = rows_on_disk(folder)
+    stages = _Stages()
+    is_large = run.tile_size_m is not None or run.engine.needs_paths or images + detections > LARGEST_IN_MEMORY
+    if config.method == "paper" or not is_large:
+        dataset = ensure_checked(read_dataset(folder))
+        if config.method == "paper":
+            return build_map(dataset, config, threads=run.engine.threads_of_task(1), progress=progress), []
+        _check_detections(dataset.name, len(dataset.detections))
+        with stages.measured("order"):
+            source: Source = InMemory(dataset, config)
+        size = {"images": len(dataset.images), "detections": len(dataset.detections)}
+        name, frame = dataset.name, dataset.frame
+    else:
+        with stages.measured("partition"):
+            on_disk = partition_dataset(folder, run.work, config, tile_size_m=run.tile_size_m, progress=progress)
+        source, name, frame, size = on_disk, on_disk.name, on_disk.frame, on_disk.counts
+        _check_detections(name, size["detections"])
+    labels, votes, counts, cells = _robust(source, config, stages, run.engine, progress, run)
+    passes = source.drives_record["passes"]
+    return _as_map(name, frame, size, passes, config, labels, votes, counts, stages), cells
+
+
+def _check_detections(name: str, detections: int) -> None:
+    if not detections:
+        raise InputError(
+            f"{name}: there are no detections in it",
+            hint="find some with valuemap detect, or import them with the images",
+        )
+
+
+def _as_map(
+    name: str,
+    frame: Frame,
+    size: dict[str, int],
+    passes: int,
+    config: MapConfig,
+    labels: Labels,
+    votes: Votes,
+    counts: dict[str, Any],
+    stages: _Stages,
+) -> Map:
+    without = size["detections"] - len(votes)
+    counts = {**size, "detections_without_label": without, **counts, "labels": len(labels)}
+    notes = find_notes(Findings(passes, config, labels, votes, counts))
+    return Map(frame, labels, votes, {**_record(name, config, counts, stages), "notes": notes})
 
 
 def _paper(
@@ -99,21 +194,26 @@ def _paper(
 
 
 def _robust(
-    dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, progress: Progress
-) -> tuple[Labels, Votes, dict[str, Any]]:
-    """Drives, noise estimated from a sample, and in each cell the map with the least J found; docs/method.md."""
-    with stages.measured("order"):
-        source = InMemory(dataset, config)
+    source: Source,
+    config: MapConfig,
+    stages: _Stages,
+    engine: Engine,
+    progress: Progress,
+    run: Run | None = None,
+) -> tuple[Labels, Votes, dict[str, Any], list[Path]]:
+    """Noise estimated from a sample, and in each cell the map with the least J that is found; docs/method.md."""
     with stages.measured("calibrate"):
-        sample = source.sample()
-        scene = Scene(sample.dataset, sample.drives, cast_rays(sample.dataset))
-        calibration = calibrate_noise(scene, config, threads=threads, progress=progress)
-        del sample, scene
+        given = None if run is None else run.calibration
+        calibration = calibrate(source, config, given, None if run is None else run.work, engine, progress)
     with stages.measured("find"):
-        solved = solve_cells(source, calibration, config, ThreadEngine(threads), progress)
+        store = run.work / CELLS if run is not None and len(source.cells) > 1 else None
+        known = None if run is None else run.known
+        solved = solve_cells(source, calibration, config, engine, progress, store=store, known=known)
     with stages.measured("join"):
-        labels, votes, counts = join_cells(solved, source.grid, config)
-    return labels, votes, {**counts, "drives": source.drives_record, "noise": calibration_to_json(calibration)}
+        labels, votes, counts = join_cells(loaded(solved), source.grid, config)
+    estimated = calibration_to_json(calibration)
+    counts = {**counts, "drives": source.drives_record, "noise": estimated, "calibration": estimated}
+    return labels, votes, counts, [result for result in solved if isinstance(result, Path)]
 
 
 def _without_ray(rays: Rays) -> dict[str, int]:
@@ -134,13 +234,14 @@ class _Stages:
         self.records.append({"stage": stage, "seconds": round(seconds, 3), "peak_memory_mb": peak_memory_mb()})
 
 
-def _record(dataset: Dataset, config: MapConfig, counts: dict[str, int], stages: _Stages) -> dict[str, Any]:
-    drives = counts.pop("drives", None)
+def _record(name: str, config: MapConfig, counts: dict[str, Any], stages: _Stages) -> dict[str, Any]:
+    drives, calibration = counts.pop("drives", None), counts.pop("calibration", None)
     return {
         "valuemap": version("valuemap"),
-        "dataset": dataset.name,
+        "dataset": name,
         "settings": config.as_dict(),
         **({} if drives is None else {"drives": drives}),
+        **({} if calibration is None else {"calibration": calibration}),
         "counts": counts,
         "stages": stages.records,
     }

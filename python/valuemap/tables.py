@@ -387,6 +387,34 @@ class Rejected(Table):
 T = TypeVar("T", bound=Table)
 
 
+def join_tables(tables: Sequence[T]) -> T:
+    """Return tables of one kind, at least one, as one, in their order; an optional column stays if all have it."""
+    if len(tables) == 1:
+        return tables[0]
+    columns: dict[str, Any] = {}
+    for f in fields(tables[0]):
+        values = [getattr(table, f.name) for table in tables]
+        if any(value is None for value in values):
+            columns[f.name] = None
+        elif isinstance(values[0], Categories):
+            columns[f.name] = _join_categories(values)
+        elif isinstance(values[0], pa.Array):
+            columns[f.name] = pa.concat_arrays(values)
+        elif isinstance(values[0], list):
+            columns[f.name] = [item for value in values for item in value]
+        else:
+            columns[f.name] = np.concatenate(values)
+    return type(tables[0])(**columns)
+
+
+def _join_categories(columns: Sequence[Categories]) -> Categories:
+    names = tuple(sorted({name for column in columns for name in column.names}))
+    rank = {name: code for code, name in enumerate(names)}
+    recode = [np.array([rank[name] for name in column.names], np.int32) for column in columns]
+    codes = [new[column.codes] if len(column) else column.codes for new, column in zip(recode, columns, strict=True)]
+    return Categories(np.concatenate(codes), names)
+
+
 def read_table(kind: type[T], path: Path) -> T:
     """Read and check one Parquet file as a table, rows sorted by its key.
 

@@ -10,18 +10,21 @@ import typer
 
 from valuemap import map_folder
 from valuemap.cli.app import app
-from valuemap.cli.options import AsJson, Force, Settings
+from valuemap.cli.options import AsJson, Force, Resume, Settings, TileSize, Work
 from valuemap.cli.show import log, progress_bars, show, show_notes
+from valuemap.cli.working import working
 from valuemap.config import MapConfig, Method
 from valuemap.dataset import read_dataset
+from valuemap.engine.threads import ThreadEngine
 from valuemap.evaluate import evaluate_map
 from valuemap.evidence import dataset_reference
 from valuemap.folders import check_files, check_place
 from valuemap.map_folder import write_map
-from valuemap.pipeline import build_map
+from valuemap.pipeline import Run, build_map_of_folder
 from valuemap.report.above import draw_map
 from valuemap.report.style import check_format
 from valuemap.summary import summarize_map
+from valuemap.tiles.calibration import read_calibration
 
 
 @app.command("map", epilog="Settings for --set: see valuemap settings.")
@@ -33,6 +36,12 @@ def map_command(
     picture: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw the map from above, as .png or .svg.")
     ] = None,
+    tile_size: TileSize = None,
+    work: Work = None,
+    resume: Resume = False,
+    calibration: Annotated[
+        Path | None, typer.Option(metavar="MAP", help="Take noise and rates from this map instead of estimating them.")
+    ] = None,
     assignments: Settings = None,
     force: Force = False,
     as_json: AsJson = False,
@@ -43,12 +52,14 @@ def map_command(
     if picture is not None:
         check_format(picture)
         check_files(picture.parent, [picture.name], force=force)
-    with progress_bars() as progress:
-        data = read_dataset(dataset)
-        result = build_map(data, config, threads=threads, progress=progress)
-    result.run["dataset_folder"] = dataset_reference(dataset, out)
-    write_map(result, out, force=force)
+    given = None if calibration is None else read_calibration(calibration)
+    with working(work, out, resume=resume) as folder, progress_bars() as progress:
+        run = Run(folder, ThreadEngine(threads), tile_size_m=tile_size, calibration=given)
+        result, cells = build_map_of_folder(dataset, config, run, progress=progress)
+        result.run["dataset_folder"] = dataset_reference(dataset, out)
+        write_map(result, out, cells=cells, force=force)
     if picture is not None:
+        data = read_dataset(dataset)
         matches = evaluate_map(result, data).matches if data.truth is not None else None
         draw_map(result, data, matches, picture, force=force)
     show_notes(result.run["notes"])

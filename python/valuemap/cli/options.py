@@ -21,3 +21,17 @@ MaxRejected = Annotated[
     typer.Option("--max-rejected", metavar="SHARE", help="Stop where more of the boxes, or images, cannot be used."),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace files that valuemap did not write, too.")]
+TileSize = Annotated[
+    float | None,
+    typer.Option(
+        "--tile-size",
+        metavar="METRES",
+        help="Cut the dataset on disk into tiles of about this size; the map is the same. "
+        "Default: only where it is larger than memory, as small as can be.",
+    ),
+]
+Work = Annotated[
+    Path | None,
+    typer.Option("--work", metavar="FOLDER", help="Folder for unfinished parts. Default: beside --out, named .work."),
+]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with what an interrupted run has left.")]

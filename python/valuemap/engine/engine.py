@@ -17,6 +17,9 @@ Work = Callable[[T, Progress], R]
 class Engine(Protocol):
     """Runs tasks that do not depend on each other, a bounded number at a time."""
 
+    needs_paths: bool
+    """Whether tasks may be done in other processes, to which paths go, not arrays."""
+
     def threads_of_task(self, tasks: int) -> int:
         """Return how many threads each of so many tasks may work on."""
         ...

@@ -23,6 +23,8 @@ class _Stopped(Exception):
 class ThreadEngine:
     """As many tasks at a time as there are threads (0: one a core); fewer tasks work on several threads each."""
 
+    needs_paths = False
+
     def __init__(self, threads: int = 0) -> None:
         self.threads = bounded_threads(threads) or os.cpu_count() or 1
 

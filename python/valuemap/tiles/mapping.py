@@ -1,6 +1,9 @@
-"""All cells of a source through an engine."""
+"""All cells of a source through an engine, those that are done already left out."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
 
 from valuemap.config import MapConfig
 from valuemap.engine.engine import Engine
@@ -9,26 +12,71 @@ from valuemap.robust import Calibration
 from valuemap.tiles.grid import Cell
 from valuemap.tiles.solve import Solved, solve_cell
 from valuemap.tiles.source import Source
+from valuemap.tiles.store import cell_file, hash_piece, load_cell, save_cell
+
+
+@dataclass(frozen=True)
+class CellTask:
+    """What is done with a cell: all that is needed travels with it, the data as a source that reads it."""
+
+    source: Source
+    calibration: Calibration
+    config: MapConfig
+    threads: int
+    store: Path | None = None
+    known: Path | None = None
+
+    def __call__(self, cell: Cell, progress: Progress) -> Solved | Path | None:
+        """Return the labels of a cell, or where they are; nothing where there are no images."""
+        piece = self.source.piece(cell)
+        if not len(piece.image_id):
+            return None
+        grid, file = self.source.grid, None
+        if self.store is not None:
+            key = hash_piece(piece, cell, grid, self.calibration, self.config)
+            file = cell_file(self.store, cell, key)
+            if file.is_file():
+                return file
+            if self.known is not None and (again := cell_file(self.known, cell, key)).is_file():
+                return again
+        solved = solve_cell(piece, cell, grid, self.calibration, self.config, threads=self.threads, progress=progress)
+        if file is None:
+            return solved
+        save_cell(solved, file)
+        return file
 
 
 def solve_cells(
-    source: Source, calibration: Calibration, config: MapConfig, engine: Engine, progress: Progress
-) -> list[Solved]:
-    """Return the labels of all cells, ascending, that have images in or around them."""
+    source: Source,
+    calibration: Calibration,
+    config: MapConfig,
+    engine: Engine,
+    progress: Progress,
+    *,
+    store: Path | None = None,
+    known: Path | None = None,
+) -> list[Solved | Path]:
+    """Return the labels of all cells, ascending, that have images in or around them, or where they are.
+
+    Parameters
+    ----------
+    store
+        Where the labels of each cell are kept; what is there is not made again.
+    known
+        Where those of an older map are, which are not made again either.
+    """
     cells = source.cells
-    solved: list[Solved | None] = [None] * len(cells)
-    threads = engine.threads_of_task(len(cells))
-    one = len(cells) == 1
-
-    def solve(cell: Cell, go_on: Progress) -> Solved | None:
-        piece = source.piece(cell)
-        if not len(piece.image_id):
-            return None
-        report = progress if one else go_on
-        return solve_cell(piece, cell, source.grid, calibration, config, threads=threads, progress=report)
-
-    for done, (number, result) in enumerate(engine.run(solve, cells), start=1):
+    task = CellTask(source, calibration, config, engine.threads_of_task(len(cells)), store, known)
+    if len(cells) == 1:  # It tells how far it is.
+        result = task(cells[0], progress)
+        return [] if result is None else [result]
+    solved: list[Solved | Path | None] = [None] * len(cells)
+    for done, (number, result) in enumerate(engine.run(task, cells), start=1):
         solved[number] = result
-        if not one:
-            progress("cells", done, len(cells))
+        progress("cells", done, len(cells))
     return [result for result in solved if result is not None]
+
+
+def loaded(solved: list[Solved | Path]) -> list[Solved]:
+    """Return the labels of cells, read where they are on disk."""
+    return [load_cell(result) if isinstance(result, Path) else result for result in solved]

@@ -15,18 +15,16 @@ Ties go to the lower cell, then to the order of labels in it, so that all this d
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from valuemap.config import MapConfig
 from valuemap.describe import residual_sigma_px
-from valuemap.tables import Bools, Categories, Ints, Labels, Table, Votes
+from valuemap.tables import Bools, Ints, Labels, Votes, join_tables
 from valuemap.tiles.grid import Grid
 from valuemap.tiles.solve import Solved
-
-T = TypeVar("T", bound=Table)
 
 _SAME_SHARE = 0.5
 
@@ -51,8 +49,8 @@ def join_cells(solved: Sequence[Solved], grid: Grid, config: MapConfig) -> tuple
     """Return the map of cells, ascending, its votes, and counts; labels are numbered from 1, cell by cell."""
     sizes = np.array([len(cell.labels) for cell in solved])
     before = np.cumsum(sizes) - sizes
-    labels = _stack(Labels, [cell.labels for cell in solved])
-    votes = _stack(Votes, [cell.votes for cell in solved])
+    labels = join_tables([cell.labels for cell in solved])
+    votes = join_tables([cell.votes for cell in solved])
     cells = np.repeat(np.arange(len(solved)), sizes)
     home = np.where(np.concatenate([cell.is_own for cell in solved]), cells, -1)
     guests = np.flatnonzero(home < 0)
@@ -161,19 +159,3 @@ def _totals(solved: Sequence[Solved]) -> dict[str, Any]:
         else:
             totals[name] = float(np.average(values, weights=images))
     return totals
-
-
-def _stack(kind: type[T], tables: Sequence[T]) -> T:
-    """Return tables of one kind as one; their categories have the same names."""
-    if len(tables) == 1:
-        return tables[0]
-    columns: dict[str, Any] = {}
-    for column in fields(kind):
-        values = [getattr(table, column.name) for table in tables]
-        if any(value is None for value in values):
-            columns[column.name] = None
-        elif isinstance(values[0], Categories):
-            columns[column.name] = Categories(np.concatenate([value.codes for value in values]), values[0].names)
-        else:
-            columns[column.name] = np.concatenate(values)
-    return kind(**columns)

@@ -9,6 +9,7 @@ import numpy as np
 
 from valuemap.cameras import cast_rays
 from valuemap.config import MapConfig
+from valuemap.dataset import number_passes
 from valuemap.describe import describe_labels
 from valuemap.drives import InOrder
 from valuemap.progress import Progress, silent
@@ -64,6 +65,6 @@ def solve_cell(
             detection_id=piece.detection_id[votes.detection_id],
             image_id=piece.image_id[votes.image_id],
         ),
-        vote_pass=piece.dataset.images.pass_id.codes[votes.image_id].astype(np.int64),
+        vote_pass=number_passes(piece.dataset.images)[votes.image_id],
         counts=counts,
     )

@@ -20,9 +20,20 @@ VIEWPOINT_SHARE = 1.0 / 60.0
 class Source(Protocol):
     """A dataset in driving order, as pieces."""
 
-    grid: Grid
-    cells: list[Cell]
-    drives_record: dict[str, Any]
+    @property
+    def grid(self) -> Grid:
+        """The grid of the cells."""
+        ...
+
+    @property
+    def cells(self) -> list[Cell]:
+        """The cells, ascending."""
+        ...
+
+    @property
+    def drives_record(self) -> dict[str, Any]:
+        """What was found about drives."""
+        ...
 
     def piece(self, cell: Cell) -> InOrder:
         """Return what a cell is solved with; it may have no detections, or not even images."""
@@ -38,13 +49,13 @@ class InMemory:
 
     def __init__(self, dataset: Dataset, config: MapConfig) -> None:
         max_range_m = config.vote.max_range_m
-        self.grid = Grid.of(dataset.frame, max_range_m)
+        self.grid: Grid = Grid.of(dataset.frame, max_range_m)
         self._ordered = in_driving_order(dataset, viewpoint_step_m=max_range_m * VIEWPOINT_SHARE)
-        self.drives_record = self._ordered.drives.record
+        self.drives_record: dict[str, Any] = self._ordered.drives.record
         images, detections = self._ordered.dataset.images, self._ordered.dataset.detections
         self._place_m = self.grid.images_on_ground(images)
         self._census = Census.of(self.grid, self._place_m, np.bincount(detections.image_id, minlength=len(images)))
-        self.cells = self._census.cells(self.grid)
+        self.cells: list[Cell] = self._census.cells(self.grid)
 
     def piece(self, cell: Cell) -> InOrder:
         """Return what a cell is solved with."""

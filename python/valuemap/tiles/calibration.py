@@ -1,0 +1,57 @@
+"""What is estimated once of a dataset, before any cell is solved; kept in the folder of work."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from valuemap.cameras import cast_rays
+from valuemap.config import MapConfig
+from valuemap.drives import InOrder
+from valuemap.engine.engine import Engine
+from valuemap.errors import InputError
+from valuemap.map_folder import CALIBRATION, read_json
+from valuemap.progress import Progress
+from valuemap.robust import Calibration, Scene, calibrate_noise, calibration_from_json, calibration_to_json
+from valuemap.tiles.grid import WHOLE
+from valuemap.tiles.source import Source
+from valuemap.tiles.store import hash_piece
+from valuemap.tiles.work import written
+
+
+def calibrate(
+    source: Source,
+    config: MapConfig,
+    given: Calibration | None,
+    work: Path | None,
+    engine: Engine,
+    progress: Progress,
+) -> Calibration:
+    """Return the calibration that is given, or kept in the folder of work, or else estimated on the sample."""
+    if given is not None:
+        return given
+    sample = source.sample()
+    if work is None:
+        return _estimated(sample, config, engine, progress)
+    file = work / f"calibration.{hash_piece(sample, WHOLE, source.grid, None, config)}.json"
+    if not file.is_file():
+        calibration = _estimated(sample, config, engine, progress)
+        with written(file) as temporary:
+            temporary.write_text(json.dumps(calibration_to_json(calibration)), encoding="utf-8")
+    return calibration_from_json(json.loads(file.read_text(encoding="utf-8")), source=str(file))
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Read what was estimated of the dataset of a map; raises `InputError` where there is nothing."""
+    file = path / CALIBRATION
+    if not file.is_file():
+        raise InputError(
+            f"{path}: there is no {CALIBRATION} in it",
+            hint="give a map that this version of valuemap made by the method robust",
+        )
+    return calibration_from_json(read_json(file), source=str(file))
+
+
+def _estimated(sample: InOrder, config: MapConfig, engine: Engine, progress: Progress) -> Calibration:
+    scene = Scene(sample.dataset, sample.drives, cast_rays(sample.dataset))
+    return calibrate_noise(scene, config, threads=engine.threads_of_task(1), progress=progress)

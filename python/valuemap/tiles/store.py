@@ -1,0 +1,131 @@
+"""The labels of cells as files: one a cell, named after the hash of all that they were made from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import fields
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from valuemap.arrow import numbers_from_arrow, numbers_to_arrow
+from valuemap.config import MapConfig
+from valuemap.drives import InOrder
+from valuemap.errors import InputError
+from valuemap.robust import Calibration, calibration_to_json
+from valuemap.tables import Categories, Ints, Labels, Table, Votes, table_from_arrow, table_to_arrow
+from valuemap.tiles.grid import Cell, Grid
+from valuemap.tiles.solve import Solved
+from valuemap.tiles.work import written
+
+_VOTE_COLUMNS = ("detection_id", "image_id", "residual_px", "residual_sigmas")
+
+
+def cell_file(folder: Path, cell: Cell, key: str) -> Path:
+    """Return where the labels of a cell are, made from what has this hash."""
+    return folder / f"{cell.name}.{key}.parquet"
+
+
+def hash_piece(piece: InOrder, cell: Cell, grid: Grid, calibration: Calibration | None, config: MapConfig) -> str:
+    """Return the hash of all that the labels of a cell depend on."""
+    digest = hashlib.sha256()
+    head = {
+        "valuemap": version("valuemap"),
+        "cell": [cell.base, cell.level, cell.place],
+        "grid": vars(grid),
+        "settings": config.as_dict(),
+        "calibration": None if calibration is None else calibration_to_json(calibration),
+        "frame": piece.dataset.frame.to_json(),
+    }
+    digest.update(json.dumps(head, sort_keys=True).encode())
+    # What the labels do not depend on: names, and what passes are called.
+    for table, without in (
+        (piece.dataset.cameras, ()),
+        (piece.dataset.images, ("name", "pass_id")),
+        (piece.dataset.detections, ()),
+    ):
+        _add_table(digest, table, without)
+    passes = np.unique(piece.dataset.images.pass_id.codes, return_inverse=True)[1]
+    drives = piece.drives
+    for column in (
+        passes,
+        drives.pass_code,
+        drives.order,
+        drives.driven_m,
+        drives.viewpoint,
+        piece.image_id,
+        piece.detection_id,
+    ):
+        digest.update(np.ascontiguousarray(column).tobytes())
+    return digest.hexdigest()[:32]
+
+
+def _add_table(digest: Any, table: Table, without: tuple[str, ...]) -> None:
+    for field in fields(table):
+        value = getattr(table, field.name)
+        digest.update(f"{field.name} {value is None};".encode())
+        if value is None or field.name in without:
+            continue
+        if isinstance(value, Categories):
+            digest.update(json.dumps(value.names).encode())
+            value = value.codes
+        for array in value if isinstance(value, list) else [value]:
+            digest.update(np.ascontiguousarray(array).tobytes())
+    digest.update(str(len(table)).encode())
+
+
+def save_cell(solved: Solved, path: Path) -> None:
+    """Write the labels of a cell with their votes: a row a label."""
+    table = table_to_arrow(solved.labels)
+    votes = table_to_arrow(solved.votes)
+    offsets = numbers_to_arrow(
+        np.searchsorted(solved.votes.label_id, np.arange(1, len(solved.labels) + 2)).astype("i4")
+    )
+    for name in _VOTE_COLUMNS:
+        table = table.append_column(f"vote.{name}", _listed(votes.column(name), offsets))
+    table = table.append_column("vote.pass", _listed(numbers_to_arrow(solved.vote_pass), offsets))
+    table = table.append_column("is_own", numbers_to_arrow(solved.is_own.astype(np.int32)))
+    cell = {"base": solved.cell.base, "level": solved.cell.level, "place": solved.cell.place}
+    head = {"cell": cell, "counts": solved.counts, "classes": solved.labels.class_name.names}
+    table = table.replace_schema_metadata({"valuemap": json.dumps(head)})
+    with written(path) as temporary, temporary.open("wb") as file:
+        pq.write_table(table, file, compression="zstd")
+
+
+def load_cell(path: Path) -> Solved:
+    """Read what `save_cell` wrote; raises `InputError` where the file is damaged."""
+    try:
+        with path.open("rb") as file:
+            table = pq.ParquetFile(file).read()
+        head = json.loads(table.schema.metadata[b"valuemap"])
+        cell = Cell(tuple(head["cell"]["base"]), head["cell"]["level"], tuple(head["cell"]["place"]))
+    except (pa.ArrowException, OSError, KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: cannot be read: {error}", hint="remove it, and make the map again") from error
+    labels = table_from_arrow(Labels, table, source=str(path))
+    classes = tuple(head["classes"])
+    code = np.array([classes.index(name) for name in labels.class_name.names], np.int32)
+    codes = code[labels.class_name.codes] if len(labels) else labels.class_name.codes
+    votes = {name: _flat(table.column(f"vote.{name}")) for name in (*_VOTE_COLUMNS, "pass")}
+    return Solved(
+        cell=cell,
+        labels=labels.replace(class_name=Categories(codes, classes)),
+        is_own=numbers_from_arrow(table.column("is_own")) > 0,
+        votes=Votes(np.repeat(labels.label_id, labels.votes), **{name: votes[name] for name in _VOTE_COLUMNS}),
+        vote_pass=votes["pass"],
+        counts=head["counts"],
+    )
+
+
+def _listed(column: pa.Array | pa.ChunkedArray, offsets: pa.Array) -> pa.Array:
+    values = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    return pa.ListArray.from_arrays(offsets, values)
+
+
+def _flat(column: pa.ChunkedArray) -> Any:
+    values: Ints = numbers_from_arrow(pa.chunked_array([chunk.flatten() for chunk in column.chunks], column.type.value_type))  # fmt: skip # noqa: E501
+    return values

@@ -1,0 +1,135 @@
+"""The folder of a run that is going on: what is done stays there until the map is written, so that a run can go on.
+
+Everything in it is written beside, synced and renamed, under a name that says what it was made from: what is there is
+whole, and a task that is done twice comes to the same file.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from valuemap.errors import OutputError
+from valuemap.system import folder_lock
+
+MARKER = "valuemap-work.json"
+CELLS = "cells"
+_TEMPORARY = ".tmp-"
+
+
+@contextmanager
+def open_work(path: Path, *, resume: bool) -> Iterator[Path]:
+    """Yield a folder for the parts of a run, which nobody else has until the block ends; it stays.
+
+    What an earlier run left there is used if it is to be resumed, and removed if not.
+
+    Raises
+    ------
+    OutputError
+        Another run has it, it holds something else, or it cannot be written.
+    """
+    path = path.absolute()
+    try:
+        _claim(path)
+        with _lock_of(path):
+            if not resume:
+                _empty(path)
+            for stale in [*path.glob(f"{_TEMPORARY}*"), *path.glob(f"*/{_TEMPORARY}*")]:
+                _remove(stale)
+            (path / CELLS).mkdir(exist_ok=True)
+            yield path
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot be written: {error.strerror or error}",
+            hint="make room, or check the folder's permissions; the same command with --resume then goes on from here",
+        ) from error
+
+
+def has_parts(path: Path) -> bool:
+    """Return whether a run has left anything to go on from."""
+    return any(path.glob(f"{CELLS}/*.parquet")) or any(path.glob("partition-*"))
+
+
+def remove_work(path: Path) -> None:
+    """Remove the folder of a run that is over."""
+    with suppress(OSError):
+        shutil.rmtree(path)
+
+
+@contextmanager
+def written(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`, of a file or a folder, that is synced and renamed when the block ends well.
+
+    Where another has done the same meanwhile, theirs stays: it is the same.
+    """
+    temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY, dir=path.parent))
+    try:
+        yield temporary / path.name
+        for file in [temporary / path.name, *(temporary / path.name).rglob("*")]:
+            _sync(file)
+        try:
+            (temporary / path.name).replace(path)
+        except OSError:
+            if not path.is_dir():
+                raise
+        _sync(path.parent)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _claim(path: Path) -> None:
+    """Make the folder, if it is not there; refuse one that is somebody else's."""
+    if path.exists() and not path.is_dir():
+        raise OutputError(f"{path}: is a file, a folder for the parts is needed", hint="choose another --work")
+    path.mkdir(parents=True, exist_ok=True)
+    if not (path / MARKER).is_file():
+        if any(entry.name[: len(_TEMPORARY)] != _TEMPORARY for entry in path.iterdir()):
+            raise OutputError(
+                f"{path}: is not ours: there are files in it, and no {MARKER}", hint="choose another --work"
+            )
+        with written(path / MARKER) as file:
+            file.write_text(json.dumps({"what": "parts of an unfinished map of valuemap"}) + "\n", encoding="utf-8")
+
+
+@contextmanager
+def _lock_of(path: Path) -> Iterator[None]:
+    lock = folder_lock(path)
+    try:
+        lock.__enter__()
+    except OSError as error:
+        raise OutputError(
+            f"{path}: another run is at work here", hint="wait for it to end, or choose another --out or --work"
+        ) from error
+    try:
+        yield
+    finally:
+        lock.__exit__(None, None, None)
+
+
+def _empty(path: Path) -> None:
+    for entry in path.iterdir():
+        if entry.name != MARKER:
+            _remove(entry)
+
+
+def _remove(entry: Path) -> None:
+    if entry.is_dir() and not entry.is_symlink():
+        shutil.rmtree(entry)
+    else:
+        entry.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on disk; folders as far as the system can."""
+    if path.is_dir() and os.name == "nt":
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
