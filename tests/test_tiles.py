@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from valuemap import portions
 from valuemap.cli.commands import app
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, Frame
+from valuemap.drives import InOrder
 from valuemap.engine.threads import ThreadEngine
 from valuemap.errors import OutputError
 from valuemap.map_folder import Map
@@ -24,13 +26,12 @@ from valuemap.progress import silent
 from valuemap.robust import Noise
 from valuemap.tables import Categories, Floats, Labels, Votes, table_to_arrow
 from valuemap.tiles import grid as grid_module
-from valuemap.tiles import mapping
 from valuemap.tiles.grid import LEVELS, WHOLE, Cell, Census, Grid
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.sample import is_sampled, sampled_squares
 from valuemap.tiles.seams import join_cells
-from valuemap.tiles.solve import Solved
+from valuemap.tiles.solve import Solved, solve_cell
 from valuemap.tiles.source import InMemory
 from valuemap.tiles.store import hash_piece
 from valuemap.tiles.work import open_work, written
@@ -361,20 +362,20 @@ def test_a_run_that_was_killed_goes_on_and_ends_with_the_same_map(
     long_street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = mapped(long_street, tmp_path / "whole")
-    solve = mapping.solve_cell
     solved: list[Cell] = []
+    most = 2
 
-    def dies(piece: object, cell: Cell, *args: object, **kwargs: object) -> Solved:
-        if len(solved) == 2:
+    def dies(piece: InOrder, cell: Cell, *args: Any, **kwargs: Any) -> Solved:
+        if len(solved) == most:
             raise MemoryError
         solved.append(cell)
-        return solve(piece, cell, *args, **kwargs)  # type: ignore[arg-type]
+        return solve_cell(piece, cell, *args, **kwargs)
 
-    monkeypatch.setattr(mapping, "solve_cell", dies)
+    monkeypatch.setattr("valuemap.tiles.mapping.solve_cell", dies)
     with pytest.raises(MemoryError):
         mapped_or_raises(long_street, tmp_path / "killed", "--threads", "1")
     assert not (tmp_path / "killed").exists()
-    monkeypatch.setattr(mapping, "solve_cell", lambda piece, cell, *a, **k: solved.append(cell) or solve(piece, cell, *a, **k))  # fmt: skip # noqa: E501
+    most = 100
     assert mapped(long_street, tmp_path / "killed", "--resume") == whole
     assert len(solved) == len(set(solved)) == len(whole) - 3  # None was solved twice.
     assert not (tmp_path / "killed.work").exists()
