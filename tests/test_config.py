@@ -76,11 +76,23 @@ def test_every_setting_is_described() -> None:
             r"min_votes: expected a whole number \(images\), found '3.5'",
             "the default is min_votes=3",
         ),
-        ("min_votes=1", r"min_votes: expected at least 2 \(images\), found 1", "the default is min_votes=3"),
-        ("cluster_radius_m=0", r"cluster_radius_m: expected above 0 \(m\), found 0", "cluster_radius_m=50"),
-        ("merge_radius_m=-1", r"merge_radius_m: expected at least 0 \(m\), found -1", "merge_radius_m=1"),
-        ("max_range_m=inf", r"max_range_m: expected above 0 \(m\), found inf", "max_range_m=60"),
-        ("max_range_m=nan", r"max_range_m: expected above 0 \(m\), found nan", "max_range_m=60"),
+        (
+            "min_votes=1",
+            r"min_votes: expected at least 2 and at most 1e\+06 \(images\), found 1",
+            "the default is min_votes=3",
+        ),
+        (
+            "cluster_radius_m=0",
+            r"cluster_radius_m: expected above 0 and at most 100000 \(m\), found 0",
+            "cluster_radius_m=50",
+        ),
+        (
+            "merge_radius_m=-1",
+            r"merge_radius_m: expected at least 0 and at most 100000 \(m\), found -1",
+            "merge_radius_m=1",
+        ),
+        ("max_range_m=inf", r"max_range_m: expected above 0 and at most 100000 \(m\), found inf", "max_range_m=60"),
+        ("max_range_m=nan", r"max_range_m: expected above 0 and at most 100000 \(m\), found nan", "max_range_m=60"),
         (
             "min_parallax_deg=91",
             r"min_parallax_deg: expected at least 0 and at most 90 \(deg\), found 91",

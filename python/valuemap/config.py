@@ -18,6 +18,10 @@ from valuemap.errors import SettingError
 
 Method = Literal["robust", "paper"]
 
+_LONGEST_M = 1e5
+"""Nothing in the world of one map is farther apart; beyond it squares of metres swallow the metres."""
+_WIDEST_PX = 1e5
+"""Wider than any picture."""
 _TOO_LARGE = 2**63
 """Whole numbers from here on fit no integer of the core."""
 
@@ -69,6 +73,7 @@ class PartitionConfig:
         50.0,
         unit="m",
         open_low=True,
+        high=_LONGEST_M,
         effect="a seed takes all free images closer than this (N_max of the paper); "
         "larger sees objects from more images and costs more",
         method="paper",
@@ -83,6 +88,7 @@ class VoteConfig:
         6.0,
         unit="px",
         open_low=True,
+        high=_WIDEST_PX,
         effect="a detection votes for a point that projects closer than this (d_max of the paper)",
         method="paper",
     )
@@ -93,23 +99,25 @@ class VoteConfig:
         effect="two rays closer than this in angle propose no point (theta_min of the paper)",
     )
     min_range_m: float = _setting(
-        2.0, unit="m", effect="a proposed point nearer than this to either of its cameras is dropped"
+        2.0, unit="m", high=_LONGEST_M, effect="a proposed point nearer than this to either of its cameras is dropped"
     )
     max_range_m: float = _setting(
         60.0,
         unit="m",
         open_low=True,
+        high=_LONGEST_M,
         effect="a proposed point farther than this from either of its cameras is dropped (r_max of the paper)",
     )
     min_vote_ratio: float = _setting(
         1.0,
         unit="1",
+        high=1e3,
         effect="a point is accepted while its votes reach this multiple of the mean votes of the hypotheses "
         "still alive (alpha of the paper); larger is stricter",
         method="paper",
     )
     min_votes: int = _setting(
-        3, unit="images", low=2, effect="a point is accepted only with votes from at least this many images"
+        3, unit="images", low=2, high=10**6, effect="a point is accepted only with votes from at least this many images"
     )
 
 
@@ -121,6 +129,7 @@ class NoiseConfig:
         4.0,
         unit="sigmas",
         open_low=True,
+        high=100.0,
         effect="a detection votes for a point that projects closer than this many standard deviations",
         method="robust",
     )
@@ -128,17 +137,20 @@ class NoiseConfig:
         None,
         unit="px",
         open_low=True,
+        high=1e3,
         effect="standard deviation of a detection's centre, each axis",
     )
     position_sigma_m: float | None = _setting(
         None,
         unit="m",
+        high=100.0,
         effect="standard deviation of a camera position, each axis",
         method="robust",
     )
     rotation_sigma_deg: float | None = _setting(
         None,
         unit="deg",
+        high=45.0,
         effect="standard deviation of a camera rotation, each axis",
         method="robust",
     )
@@ -162,7 +174,11 @@ class MergeConfig:
     """When labels of different clusters are one object."""
 
     merge_radius_m: float = _setting(
-        1.0, unit="m", effect="labels of different clusters closer than this become one", method="paper"
+        1.0,
+        unit="m",
+        high=_LONGEST_M,
+        effect="labels of different clusters closer than this become one",
+        method="paper",
     )
 
 

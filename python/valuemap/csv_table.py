@@ -47,7 +47,7 @@ def read_csv_arrow(
             table = _parse_csv(content, separator, options)
         except pa.ArrowInvalid:
             table = _parse_odd_csv(content, separator, options, bad_numbers_are_nan)
-    except (pa.ArrowException, OSError, EOFError, zlib.error) as error:
+    except (pa.ArrowException, OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"{path}: cannot be read as CSV: {reason}", hint=hint) from error
     exact = {name.strip() for name in table.column_names}

@@ -20,8 +20,15 @@ class ValuemapError(Exception):
     """
 
     def __init__(self, message: str, *, hint: str) -> None:
-        super().__init__(message)
-        self.hint = hint
+        super().__init__(_on_one_line(message))
+        self.hint = _on_one_line(hint)
+
+
+def _on_one_line(text: str) -> str:
+    """Return a text with what is not printed written out, line breaks too: names may hold anything."""
+    if text.isprintable():
+        return text
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
 
 
 class InputError(ValuemapError):

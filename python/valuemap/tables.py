@@ -506,6 +506,18 @@ def _check_column(value: Any, column: dataclasses.Field[Any], rows: int, source:
             f"{source}: {column.name}: expected {rows} rows, found {len(value)}",
             hint="all columns need the same length",
         )
+    if isinstance(value, Categories):
+        _check_codes(value, column.name, source)
+    if isinstance(value, list) and not all(_is_row_of_numbers(row) for row in value):
+        raise InputError(
+            f"{source}: {column.name}: expected an array of numbers in each row",
+            hint="np.array([fx, fy, cx, cy], dtype=np.float64), for example",
+        )
+    if isinstance(value, pa.Array) and (value.null_count or not _is_of_kind(value.type, "text")):
+        raise InputError(
+            f"{source}: {column.name}: expected texts, found {value.type} with {value.null_count} missing",
+            hint="pyarrow.array(texts) makes such a column",
+        )
     if not isinstance(value, np.ndarray):
         return
     shape = (rows,) if len(names) == 1 else (rows, len(names))
@@ -523,6 +535,20 @@ def _check_column(value: Any, column: dataclasses.Field[Any], rows: int, source:
                 f"{source} row {row}: {column.name}: expected finite numbers, found {value[row]}",
                 hint="repair or remove it",
             )
+
+
+def _check_codes(column: Categories, name: str, source: str) -> None:
+    codes = column.codes
+    is_code = isinstance(codes, np.ndarray) and codes.ndim == 1 and codes.dtype.kind in "iu"
+    if not is_code or np.any((codes < 0) | (codes >= len(column.names))):
+        raise InputError(
+            f"{source}: {name}: expected codes from 0 to {len(column.names) - 1}, one a row",
+            hint="Categories.from_texts makes a column of texts",
+        )
+
+
+def _is_row_of_numbers(row: Any) -> bool:
+    return isinstance(row, np.ndarray) and row.ndim == 1 and row.dtype.kind == "f"
 
 
 def table_to_arrow(table: Table) -> pa.Table:

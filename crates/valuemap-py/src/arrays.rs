@@ -1,6 +1,8 @@
 //! `NumPy` arrays to the core's types and back.
 
-use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2};
+use numpy::{
+    IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods,
+};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use valuemap_core::vote::Candidate;
@@ -11,8 +13,10 @@ pub type Groups<'py> = (Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<u32>>);
 
 /// Rows of an (N, 3) array, without a copy.
 pub fn rows_of<'a>(array: &'a PyReadonlyArray2<'_, f64>) -> PyResult<&'a [[f64; 3]]> {
-    let (rows, rest) = array.as_slice()?.as_chunks::<3>();
-    if rest.is_empty() { Ok(rows) } else { Err(PyValueError::new_err("expected an array of shape (N, 3)")) }
+    if array.shape()[1] != 3 {
+        return Err(PyValueError::new_err("expected an array of shape (N, 3)"));
+    }
+    Ok(array.as_slice()?.as_chunks::<3>().0)
 }
 
 /// Vectors or matrices, column by column, as the rows of an array of shape (N, width).
@@ -26,24 +30,74 @@ pub fn matrix<const ROWS: usize, const COLUMNS: usize>(
     rows.into_pyarray(py).reshape([count, width])
 }
 
+/// The first and the last offset, and all between, must be as `split` needs them.
+fn are_offsets(count: usize, offsets: &[i64], members: usize) -> bool {
+    offsets.len() == count + 1
+        && offsets.first() == Some(&0)
+        && offsets.last().is_some_and(|&last| usize::try_from(last) == Ok(members))
+        && offsets.is_sorted()
+}
+
 /// The members of each group.
 pub fn split<'a, T>(count: usize, offsets: &[i64], members: &'a [T]) -> PyResult<Vec<&'a [T]>> {
     let bad = || PyValueError::new_err("groups: offsets must rise from 0 to the number of members");
-    if offsets.len() != count + 1 {
+    if !are_offsets(count, offsets, members.len()) {
         return Err(bad());
     }
     let bounds = |i: usize| usize::try_from(offsets[i]).ok();
     (0..count).map(|i| members.get(bounds(i)?..bounds(i + 1)?)).collect::<Option<Vec<_>>>().ok_or_else(bad)
 }
 
+/// Members of groups of rays: each must be a ray.
+pub fn rays_in<'a>(rays: usize, count: usize, offsets: &[i64], members: &'a [u32]) -> PyResult<Vec<&'a [u32]>> {
+    if members.iter().any(|&ray| ray as usize >= rays) {
+        return Err(PyValueError::new_err(format!("voters: expected rows of {rays} rays")));
+    }
+    split(count, offsets, members)
+}
+
+/// The column must have a value for each of `count` rows.
+pub fn check_length(name: &str, found: usize, count: usize) -> PyResult<()> {
+    if found == count {
+        return Ok(());
+    }
+    Err(PyValueError::new_err(format!("{name}: expected {count} values, found {found}")))
+}
+
+/// All values must be finite numbers.
+pub fn check_finite(name: &str, values: &[f64]) -> PyResult<()> {
+    if values.iter().all(|value| value.is_finite()) {
+        return Ok(());
+    }
+    Err(PyValueError::new_err(format!("{name}: expected finite numbers")))
+}
+
+/// All values must be finite numbers, or NaN, which stands for none.
+pub fn check_not_infinite(name: &str, values: &[f64]) -> PyResult<()> {
+    if values.iter().all(|value| !value.is_infinite()) {
+        return Ok(());
+    }
+    Err(PyValueError::new_err(format!("{name}: expected finite numbers, or NaN for none")))
+}
+
+/// Matrices of an (N, 3, 3) array, without a copy.
+pub fn matrices_of<'a>(name: &str, array: &'a PyReadonlyArray3<'_, f64>) -> PyResult<&'a [[f64; 9]]> {
+    if array.shape()[1..] != [3, 3] {
+        return Err(PyValueError::new_err(format!("{name}: expected an array of shape (N, 3, 3)")));
+    }
+    Ok(array.as_slice()?.as_chunks::<9>().0)
+}
+
 /// Candidates of points with groups of voters, each from one cluster.
 pub fn candidates_from(
+    rays: usize,
     points: &[[f64; 3]],
     offsets: &[i64],
     members: &[u32],
     cluster: &[u32],
 ) -> PyResult<Vec<Candidate>> {
-    let groups = split(points.len(), offsets, members)?;
+    let groups = rays_in(rays, points.len(), offsets, members)?;
+    check_finite("points", points.as_flattened())?;
     if cluster.len() != points.len() || groups.iter().any(|group| group.is_empty()) {
         return Err(PyValueError::new_err("candidates: one cluster and at least one voter a point are needed"));
     }

@@ -20,7 +20,9 @@ use valuemap_core::select::Stop;
 use valuemap_core::vote::Candidate;
 use valuemap_core::{evidence, merge, partition, triangulate, vote};
 
-use crate::arrays::{Groups, candidates_from, groups_of, points_of, rows_of};
+use crate::arrays::{
+    Groups, candidates_from, check_finite, check_not_infinite, groups_of, matrices_of, points_of, rays_in, rows_of,
+};
 use crate::run::with_progress;
 
 /// Many threads allocate small matrices and large columns all the time.
@@ -48,10 +50,15 @@ impl Rays {
         cam_from_world: PyReadonlyArray3<'_, f64>,
         center_in_world_m: PyReadonlyArray2<'_, f64>,
     ) -> PyResult<Self> {
-        let matrices = residual_from_cam.as_slice()?.as_chunks::<9>().0;
+        let matrices = matrices_of("residual_from_cam", &residual_from_cam)?;
         let directions = rows_of(&direction_in_cam)?;
-        let rotations = cam_from_world.as_slice()?.as_chunks::<9>().0;
+        let rotations = matrices_of("cam_from_world", &cam_from_world)?;
         let centers = rows_of(&center_in_world_m)?;
+        // Where a camera has no ray for a pixel, matrix and direction are NaN.
+        check_not_infinite("residual_from_cam", matrices.as_flattened())?;
+        check_not_infinite("direction_in_cam", directions.as_flattened())?;
+        check_finite("cam_from_world", rotations.as_flattened())?;
+        check_finite("center_in_world_m", centers.as_flattened())?;
         let (image, class) = (image.as_slice()?.to_vec(), class.as_slice()?.to_vec());
         let lengths = [directions.len(), image.len(), class.len()];
         if lengths.iter().any(|&length| length != matrices.len()) {
@@ -98,6 +105,8 @@ fn partition_images<'py>(
     cluster_radius_m: f64,
 ) -> PyResult<Bound<'py, PyArray1<u32>>> {
     let centers = rows_of(&center_in_world_m)?;
+    check_finite("center_in_world_m", centers.as_flattened())?;
+    check_finite("cluster_radius_m", &[cluster_radius_m])?;
     Ok(py.detach(|| partition::partition(centers, cluster_radius_m)).into_pyarray(py))
 }
 
@@ -126,6 +135,7 @@ fn vote_in_clusters<'py>(
     if cluster.len() != rays.0.rays.len() {
         return Err(PyValueError::new_err("vote: one cluster a ray is needed"));
     }
+    check_finite("settings", &[max_reprojection_error_px, min_parallax_rad, min_range_m, max_range_m, min_vote_ratio])?;
     let viability = Viability { max_reprojection_error_px, min_parallax_rad, min_range_m, max_range_m };
     let stop = Stop { min_vote_ratio, min_votes };
     let total = vote::count_units(&rays.0, cluster);
@@ -158,7 +168,9 @@ fn merge_labels<'py>(
     cluster: PyReadonlyArray1<'py, u32>,
     merge_radius_m: f64,
 ) -> PyResult<(Bound<'py, PyArray2<f64>>, Groups<'py>)> {
+    check_finite("merge_radius_m", &[merge_radius_m])?;
     let candidates: Vec<Candidate> = candidates_from(
+        rays.0.rays.len(),
         rows_of(&point_in_world_m)?,
         voter_offsets.as_slice()?,
         voters.as_slice()?,
@@ -178,7 +190,7 @@ fn unit_covariance<'py>(
     voters: PyReadonlyArray1<'py, u32>,
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let points = rows_of(&point_in_world_m)?;
-    let groups = arrays::split(points.len(), voter_offsets.as_slice()?, voters.as_slice()?)?;
+    let groups = rays_in(rays.0.rays.len(), points.len(), voter_offsets.as_slice()?, voters.as_slice()?)?;
     let of_point = |(&point, voters): (&[f64; 3], &[u32])| {
         let supporters = voters.iter().map(|&ray| &rays.0.rays[ray as usize]);
         triangulate::unit_covariance(supporters, &point.into())
@@ -201,7 +213,7 @@ fn see<'py>(
 ) -> PyResult<Seen<'py>> {
     let points = rows_of(&point_in_world_m)?;
     let voters = voters.as_slice()?;
-    let groups = arrays::split(points.len(), voter_offsets.as_slice()?, voters)?;
+    let groups = rays_in(rays.0.rays.len(), points.len(), voter_offsets.as_slice()?, voters)?;
     let ray = |number: u32| &rays.0.rays[number as usize];
     let mut residual_px = Vec::with_capacity(voters.len());
     let mut metres_per_px = Vec::with_capacity(2 * voters.len());

@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
-use numpy::{IntoPyArray, PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
+use numpy::{
+    IntoPyArray, PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods,
+};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -13,7 +15,7 @@ use valuemap_core::robust::scene::{Frustum, Scene as CoreScene, View};
 use valuemap_core::robust::{Findings, Settings, Without, find, self_calibrate};
 
 use crate::Rays;
-use crate::arrays::{Groups, matrix, rows_of};
+use crate::arrays::{Groups, check_finite, check_length, check_not_infinite, matrices_of, matrix, rays_in, rows_of};
 use crate::run::with_progress;
 
 /// Rays with their boxes, and all images: what the robust method works on.
@@ -43,17 +45,45 @@ impl Scene {
         solid_angle_sr: PyReadonlyArray1<'_, f64>,
     ) -> PyResult<Self> {
         let centers = rows_of(&center_in_world_m)?;
-        let rotations = cam_from_world.as_slice()?.as_chunks::<9>().0;
+        let rotations = matrices_of("cam_from_world", &cam_from_world)?;
         let (camera, pass) = (camera.as_slice()?, pass_code.as_slice()?);
         let (viewpoint, driven_m) = (viewpoint.as_slice()?, driven_m.as_slice()?);
         let (positions, turns) = (position_sigma_m.as_slice()?, rotation_sigma_rad.as_slice()?);
-        let images =
-            [rotations.len(), camera.len(), pass.len(), viewpoint.len(), driven_m.len(), positions.len(), turns.len()];
+        let images = centers.len();
+        check_length("cam_from_world", rotations.len(), images)?;
+        check_length("camera", camera.len(), images)?;
+        check_length("pass_code", pass.len(), images)?;
+        check_length("viewpoint", viewpoint.len(), images)?;
+        check_length("driven_m", driven_m.len(), images)?;
+        check_length("position_sigma_m", positions.len(), images)?;
+        check_length("rotation_sigma_rad", turns.len(), images)?;
+        check_finite("center_in_world_m", centers.as_flattened())?;
+        check_finite("cam_from_world", rotations.as_flattened())?;
+        check_finite("driven_m", driven_m)?;
+        check_not_infinite("position_sigma_m", positions)?;
+        check_not_infinite("rotation_sigma_rad", turns)?;
         let solid_angles = solid_angle_sr.as_slice()?;
+        check_finite("solid_angle_sr", solid_angles)?;
+        let planes = match *frustum_normals.shape() {
+            [cameras, planes, 3] if cameras == solid_angles.len() && planes > 0 => planes,
+            _ => return Err(PyValueError::new_err("frustum_normals: expected shape (cameras, planes, 3)")),
+        };
         let normals = frustum_normals.as_slice()?.as_chunks::<3>().0;
-        if images.iter().any(|&length| length != centers.len()) || !normals.len().is_multiple_of(solid_angles.len()) {
-            return Err(PyValueError::new_err("scene: one row an image and a camera is needed"));
+        check_not_infinite("frustum_normals", normals.as_flattened())?;
+        if camera.iter().any(|&camera| camera as usize >= solid_angles.len()) {
+            return Err(PyValueError::new_err(format!("camera: expected rows of {} cameras", solid_angles.len())));
         }
+        let core = rays.core();
+        if core.image.iter().any(|&image| image as usize >= images) {
+            return Err(PyValueError::new_err(format!("rays: expected rays of {images} images")));
+        }
+        let (box_px, range_m, range_sigma_m) = (box_px.as_slice()?, range_m.as_slice()?, range_sigma_m.as_slice()?);
+        check_length("box_px", box_px.len(), core.rays.len())?;
+        check_length("range_m", range_m.len(), core.rays.len())?;
+        check_length("range_sigma_m", range_sigma_m.len(), core.rays.len())?;
+        check_finite("box_px", box_px)?;
+        check_not_infinite("range_m", range_m)?;
+        check_not_infinite("range_sigma_m", range_sigma_m)?;
         let views = (0..centers.len())
             .map(|i| View {
                 center: centers[i].into(),
@@ -67,7 +97,7 @@ impl Scene {
             })
             .collect();
         let frusta = normals
-            .chunks(normals.len() / solid_angles.len())
+            .chunks(planes)
             .zip(solid_angles)
             .map(|(normals, &solid_angle_sr)| Frustum {
                 normals: normals.iter().filter(|n| n[0].is_finite()).map(|&n| n.into()).collect(),
@@ -77,9 +107,9 @@ impl Scene {
         Ok(Self(CoreScene {
             scale2: rays.core().rays.iter().map(valuemap_core::ray::Ray::pixels_per_unit2).collect(),
             rays: Arc::clone(rays.core()),
-            box_px: box_px.as_slice()?.to_vec(),
-            range_m: range_m.as_slice()?.to_vec(),
-            range_sigma_m: range_sigma_m.as_slice()?.to_vec(),
+            box_px: box_px.to_vec(),
+            range_m: range_m.to_vec(),
+            range_sigma_m: range_sigma_m.to_vec(),
             views,
             frusta,
         }))
@@ -89,28 +119,31 @@ impl Scene {
 /// The fields of the core's `Noise`, in their order.
 type NoiseValues = [f64; 8];
 
-fn noise_of(
-    [
-        detection_px,
-        box_share,
-        position_m,
-        rotation_rad,
-        position_leg_m,
-        rotation_leg_rad,
-        position_drift_m,
-        rotation_drift_rad,
-    ]: NoiseValues,
-) -> Noise {
-    Noise {
-        detection_px,
-        box_share,
-        position_m,
-        rotation_rad,
-        position_leg_m,
-        rotation_leg_rad,
-        position_drift_m,
-        rotation_drift_rad,
+fn noise_of(values: NoiseValues) -> PyResult<Noise> {
+    check_finite("noise", &values)?;
+    if values.iter().any(|&value| value < 0.0) || values[0] == 0.0 {
+        return Err(PyValueError::new_err("noise: expected standard deviations, that of a detection above 0"));
     }
+    let [
+        detection_px,
+        box_share,
+        position_m,
+        rotation_rad,
+        position_leg_m,
+        rotation_leg_rad,
+        position_drift_m,
+        rotation_drift_rad,
+    ] = values;
+    Ok(Noise {
+        detection_px,
+        box_share,
+        position_m,
+        rotation_rad,
+        position_leg_m,
+        rotation_leg_rad,
+        position_drift_m,
+        rotation_drift_rad,
+    })
 }
 
 /// Least parallax (rad), least and largest range (m), gate (sigmas), least votes, least existence; without polish, merge.
@@ -118,9 +151,15 @@ type SettingValues = (f64, f64, f64, f64, u32, f64, bool, bool);
 
 fn settings_of(
     (min_parallax_rad, min_range_m, max_range_m, gate_sigmas, min_votes, min_existence, polish, merge): SettingValues,
-) -> Settings {
+) -> PyResult<Settings> {
+    check_finite("settings", &[min_parallax_rad, min_range_m, max_range_m, gate_sigmas, min_existence])?;
+    if gate_sigmas <= 0.0 || min_range_m < 0.0 || max_range_m <= min_range_m {
+        return Err(PyValueError::new_err(
+            "settings: expected gate_sigmas above 0, and 0 <= min_range_m < max_range_m",
+        ));
+    }
     let viability = Viability { max_reprojection_error_px: f64::NAN, min_parallax_rad, min_range_m, max_range_m };
-    Settings { viability, gate_sigmas, min_votes, min_existence, without: Without { polish, merge } }
+    Ok(Settings { viability, gate_sigmas, min_votes, min_existence, without: Without { polish, merge } })
 }
 
 /// Estimate the noise from the data, `valuemap_core::robust::self_calibrate`.
@@ -134,10 +173,11 @@ pub fn calibrate_noise(
     threads: usize,
     progress: &Bound<'_, PyAny>,
 ) -> PyResult<NoiseValues> {
-    let settings = settings_of(settings);
+    let settings = settings_of(settings)?;
+    let guess = noise_of(guess)?;
     let known = Known { detection: known[0], position: known[1], rotation: known[2] };
     let noise = with_progress(py, threads, 0, progress, |progress| {
-        self_calibrate(&scene.0, &noise_of(guess), known, &settings, progress)
+        self_calibrate(&scene.0, &guess, known, &settings, progress)
     })?;
     Ok([
         noise.detection_px,
@@ -171,9 +211,10 @@ pub fn find_labels<'py>(
     threads: usize,
     progress: &Bound<'py, PyAny>,
 ) -> PyResult<Found<'py>> {
-    let settings = settings_of(settings);
+    let settings = settings_of(settings)?;
+    let noise = noise_of(noise)?;
     let found = with_progress(py, threads, scene.0.views.len(), progress, |progress| {
-        find(&scene.0, &noise_of(noise), &settings, progress)
+        find(&scene.0, &noise, &settings, progress)
     })?;
     let labels = || found.findings.iter();
     let mut offsets = vec![0_i64];
@@ -227,11 +268,16 @@ pub fn objects_of<'py>(
     progress: &Bound<'py, PyAny>,
 ) -> PyResult<FoundObjects<'py>> {
     let points = rows_of(&point_in_world_m)?;
-    let groups = crate::arrays::split(points.len(), voter_offsets.as_slice()?, voters.as_slice()?)?;
+    check_finite("point_in_world_m", points.as_flattened())?;
+    let rays = scene.0.rays.rays.len();
+    let groups = rays_in(rays, points.len(), voter_offsets.as_slice()?, voters.as_slice()?)?;
+    if groups.iter().any(|group| group.is_empty() || !group.is_sorted_by(|a, b| a < b)) {
+        return Err(PyValueError::new_err("voters: expected at least one ray a point, in ascending order"));
+    }
     let begun = points.iter().zip(groups).map(|(&point, votes)| (votes.to_vec(), point.into())).collect();
-    let settings = settings_of(settings);
+    let (noise, settings) = (noise_of(noise)?, settings_of(settings)?);
     let found = with_progress(py, threads, 0, progress, |progress| {
-        valuemap_core::robust::objects_of(&scene.0, &noise_of(noise), &settings, begun, is_searched, progress)
+        valuemap_core::robust::objects_of(&scene.0, &noise, &settings, begun, is_searched, progress)
     })?;
     let mut offsets = vec![0_i64];
     let mut voters: Vec<u32> = Vec::new();

@@ -1,5 +1,7 @@
 //! Long work on its own threads, while Python's thread reports progress and listens for Ctrl-C.
 
+use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::Duration;
 
@@ -28,15 +30,17 @@ pub fn with_progress<T: Send>(
     let result = std::thread::scope(|scope| {
         let progress = &progress;
         scope.spawn(move || {
+            let done = catch_unwind(AssertUnwindSafe(|| pool.install(|| job(progress))));
             // The receiver only goes away after this thread has sent.
-            let _ = sender.send(pool.install(|| job(progress)));
+            let _ = sender.send(done.map_err(|panic| said_by(panic.as_ref())));
         });
         let mut raised = None;
         loop {
             let waited;
             (waited, receiver) = py.detach(move || (receiver.recv_timeout(POLL), receiver));
             match waited {
-                Ok(result) => break raised.map_or(Ok(result), Err),
+                Ok(Ok(result)) => break raised.map_or(Ok(result), Err),
+                Ok(Err(said)) => break Err(PyRuntimeError::new_err(format!("a fault in the numeric core: {said}"))),
                 Err(RecvTimeoutError::Timeout) => {
                     let heard = py.check_signals().and_then(|()| report.call1((progress.done(), total)).map(drop));
                     if let Err(error) = heard {
@@ -54,4 +58,10 @@ pub fn with_progress<T: Send>(
         Halt::Cancelled => PyKeyboardInterrupt::new_err(()),
         Halt::TooLarge { rays, hypotheses } => PyMemoryError::new_err((rays, hypotheses)),
     })
+}
+
+/// What a panic said.
+fn said_by(panic: &(dyn Any + Send)) -> String {
+    let text = panic.downcast_ref::<&str>().map(|said| (*said).to_owned());
+    text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "unknown".to_owned())
 }

@@ -32,7 +32,7 @@ class FocalUnit(Convention):
     do: ClassVar[str] = "Give fx and fy in pixels: for a picture w wide, w / 2 / tan(half the field of view)."
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
-        """Yield focal lengths in millimetres of film, in shares of the picture, as angles, and twice or half them."""
+        """Yield focal lengths in millimetres of film, in shares of the picture, and as angles."""
         cameras = dataset.cameras
         longer = np.maximum(cameras.width_px, cameras.height_px).astype(np.float64)
         focal = np.array(
@@ -45,8 +45,6 @@ class FocalUnit(Convention):
             yield "focal lengths in millimetres of film 36 mm wide", _Focal(longer / _FILM_MM)
             half = np.radians(np.clip(focal, 1.0, 179.0)) / 2.0
             yield "fields of view in degrees for focal lengths", _Focal(cameras.width_px / 2.0 / np.tan(half) / focal)
-        yield "focal lengths twice as long", _Focal(np.full(len(cameras), 2.0))
-        yield "focal lengths half as long", _Focal(np.full(len(cameras), 0.5))
 
 
 class PrincipalPoint(Convention):

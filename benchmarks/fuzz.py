@@ -1,0 +1,139 @@
+"""Fuzz the readers, the tables, the settings and the border of the core with structured input.
+
+    python benchmarks/fuzz.py [--cases N] [--seconds S] [--seed N] [--only TARGET ...] [--json FILE]
+
+Every case makes whole input, spoils a value, a row, a column, a key, bytes or an array of it, and reads or maps it. It
+must end in a result, or in an error of one line with a hint: any other exception, a panic of the core, and a case of
+more than 20 seconds are faults. Case k of a target has the seed "SEED/TARGET/k", so that one case can be run again:
+
+    python benchmarks/fuzz.py --only TARGET --case K
+
+The targets are those of `tests/test_fuzz.py` (see `tests/fuzzing.py`), where hypothesis draws the cases.
+"""
+
+from __future__ import annotations
+
+import argparse
+import faulthandler
+import logging
+import resource
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from pathlib import Path
+from random import Random
+from types import FrameType
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from fuzzing import Fuzz, Target
+from machine import describe_machine, keep_record
+
+LONGEST_S = 20
+MOST_MEMORY = 6 * 2**30
+"""Of addresses: what asks for more fails at once instead of filling the machine."""
+MOST_SHOWN = 3
+
+
+class Hang(BaseException):
+    """A case takes too long."""
+
+
+def _alarm(_number: int, _frame: FrameType | None) -> None:
+    raise Hang
+
+
+def run_case(target: Target, seed: str) -> BaseException | None:
+    """Run one case; return what it must not raise."""
+    signal.alarm(LONGEST_S)
+    try:
+        target.run(Random(seed))
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # A panic of the core is no Exception.
+        return error
+    finally:
+        signal.alarm(0)
+    return None
+
+
+def place_of(error: BaseException) -> str:
+    """Return what went wrong where: faults that have this in common are one."""
+    frames = [
+        f for f in traceback.extract_tb(error.__traceback__) if "valuemap" in f.filename or "fuzzing" in f.filename
+    ]
+    at = f"{Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else "?"
+    said = str(error).splitlines()[0][:120] if str(error) else ""
+    return f"{type(error).__name__} at {at}: {said}"
+
+
+def main() -> int:
+    """Run the benchmark; return the exit code: 1 where there are faults."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", type=int, default=1_000_000)
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after so long")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", nargs="*", default=[])
+    parser.add_argument("--case", type=int, help="one case, with its traceback")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    faulthandler.enable()
+    logging.disable(logging.CRITICAL)
+    signal.signal(signal.SIGALRM, _alarm)
+    resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, MOST_MEMORY))
+    memory = Path("/dev/shm")
+    with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder:
+        targets = [t for t in Fuzz(Path(folder)).targets if not options.only or t.name in options.only]
+        if options.case is not None:
+            error = run_case(targets[0], f"{options.seed}/{targets[0].name}/{options.case}")
+            if error is not None:
+                traceback.print_exception(error)
+            return int(error is not None)
+        start = time.perf_counter()
+        last = Path(tempfile.gettempdir()) / "valuemap-fuzz-last"
+        done: Counter[str] = Counter()
+        seconds: Counter[str] = Counter()
+        faults: dict[str, dict[str, Any]] = {}
+        while done.total() < options.cases and time.perf_counter() - start < options.seconds:
+            target = min(targets, key=lambda each: seconds[each.name])  # All get the same time.
+            before = time.perf_counter()
+            for _ in range(min(20, options.cases - done.total())):
+                number = done[target.name]
+                done[target.name] += 1
+                last.write_text(f"{target.name}, case {number}")  # For what ends the whole process.
+                error = run_case(target, f"{options.seed}/{target.name}/{number}")
+                if error is None:
+                    continue
+                key = f"{target.name}: {place_of(error)}"
+                known = faults.setdefault(key, {"count": 0, "cases": []})
+                known["count"] += 1
+                if len(known["cases"]) < MOST_SHOWN:
+                    known["cases"].append(number)
+                if known["count"] == 1:
+                    print(f"FAULT {key} (case {number})", flush=True)
+            seconds[target.name] += time.perf_counter() - before
+        elapsed = time.perf_counter() - start
+    for name, count in sorted(done.items()):
+        print(f"{name:24} {count:8} cases {1e3 * seconds[name] / count:7.2f} ms each")
+    print(f"{done.total()} cases in {elapsed:.0f} s, {len(faults)} faults")
+    keep_record(
+        options.json,
+        {
+            "benchmark": "fuzz",
+            "command": f"python benchmarks/fuzz.py --cases {done.total()} --seed {options.seed}",
+            **describe_machine(),
+            "cases": done.total(),
+            "seconds": round(elapsed, 1),
+            "cases_by_target": dict(sorted(done.items())),
+            "faults": faults,
+        },
+    )
+    return int(bool(faults))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,61 @@
+"""Input spoiled where its structure is: every case ends in a result or in one line, never in a traceback or a panic."""
+
+from __future__ import annotations
+
+from random import Random
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fuzzing import Fuzz, core_border, hostile_arrays, must_end_well, settings_texts, spoil_bytes, spoil_lines
+from valuemap.errors import InputError
+from valuemap.readers import READERS
+from valuemap.readers.detections import DETECTIONS
+
+
+@pytest.fixture(scope="module")
+def fuzz(tmp_path_factory: pytest.TempPathFactory) -> Fuzz:
+    return Fuzz(tmp_path_factory.mktemp("fuzz"))
+
+
+def test_every_reader_is_fuzzed(fuzz: Fuzz) -> None:
+    names = {target.name for target in fuzz.targets}
+    others = {"pictures", "ros"}  # Of files of cameras and recorders, which their own libraries take apart.
+    assert {name for name in READERS if not any(target.startswith(name) for target in names)} == others
+    assert {f"boxes {kind}" for kind in DETECTIONS} <= names
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@given(random=st.randoms(use_true_random=False))
+def test_files_never_end_in_a_traceback(fuzz: Fuzz, random: Random) -> None:
+    random.choice(fuzz.targets).run(random)
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow])
+@given(random=st.randoms(use_true_random=False))
+def test_arrays_never_end_in_a_traceback(random: Random) -> None:
+    hostile_arrays(random)
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow])
+@given(random=st.randoms(use_true_random=False))
+def test_settings_never_end_in_a_traceback(random: Random) -> None:
+    settings_texts(random)
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow])
+@given(random=st.randoms(use_true_random=False))
+def test_the_core_never_panics(random: Random) -> None:
+    core_border(random)
+
+
+def test_what_the_fuzzer_lets_pass_and_what_not() -> None:
+    def refuse() -> None:
+        raise InputError("a\nb", hint="c")
+
+    assert must_end_well(refuse) is None  # An error writes line breaks out.
+    with pytest.raises(ZeroDivisionError):
+        must_end_well(lambda: 1 // 0)
+    assert len({spoil_lines(Random(seed), "a,b\n1,2\n3,4") for seed in range(50)}) > 20
+    assert len({spoil_bytes(Random(seed), bytes(40)) for seed in range(50)}) > 20
