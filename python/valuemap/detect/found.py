@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
+from valuemap.coco import read_labelled
 from valuemap.dataset import MARKER, read_images, rows_of
 from valuemap.detect.accuracy import FoundBoxes
 from valuemap.detect.labels import LabelledPictures
@@ -85,25 +85,16 @@ def _of_dataset(folder: Path) -> dict[str, FoundBoxes]:
 
 
 def _of_results(file: Path) -> dict[str, FoundBoxes]:
-    try:
-        content: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-        names = {image["id"]: str(image["file_name"]) for image in content["images"]}
-        classes = {category["id"]: str(category["name"]) for category in content["categories"]}
-        rows: dict[Any, list[tuple[list[float], float, str]]] = {image_id: [] for image_id in names}
-        for entry in content["annotations"]:
-            x, y, width, height = (float(number) for number in entry["bbox"])
-            box = [x + width / 2.0, y + height / 2.0, width, height]
-            rows[entry["image_id"]].append((box, float(entry.get("score", 1.0)), classes[entry["category_id"]]))
-    except (ValueError, KeyError, TypeError, OSError) as error:
+    content = read_labelled(file)
+    if content.skipped:
         raise InputError(
-            f"{file}: is no COCO file of images, annotations and categories: {error!r}",
-            hint="make it with valuemap detect",
-        ) from error
-    return {
-        names[image_id]: FoundBoxes(
-            np.array([box for box, _, _ in entries], dtype=np.float64).reshape(-1, 4),
-            np.array([score for _, score, _ in entries], dtype=np.float64),
-            [name for _, _, name in entries],
+            f"{content.skipped[0]} ({len(content.skipped)} entries)", hint="make the file with valuemap detect"
         )
-        for image_id, entries in rows.items()
+    boxes = np.concatenate([content.box_px[:, :2] + content.box_px[:, 2:] / 2.0, content.box_px[:, 2:]], axis=1)
+    rows: dict[Any, list[int]] = {image: [] for image in content.files}
+    for row, image in enumerate(content.image):
+        rows[image].append(row)
+    return {
+        content.files[image]: FoundBoxes(boxes[own], content.score[own], [content.class_name[row] for row in own])
+        for image, own in rows.items()
     }

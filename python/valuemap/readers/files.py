@@ -7,35 +7,18 @@ over, is a few bytes on disk and fills the memory.
 
 from __future__ import annotations
 
-import json
 import reprlib
-import stat
 import xml.parsers.expat
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from valuemap.errors import InputError
+from valuemap.text_files import check_file, first_line, read_json, read_text
+
+__all__ = ["check_file", "check_folder", "check_names", "file_in", "read_json", "read_text", "read_xml", "read_yaml"]
 
 _MAX_NAME = 1000
-
-
-def check_file(path: Path, expected: str) -> Path:
-    """Return the path of a regular file; `expected` says in words what should be there.
-
-    Raises
-    ------
-    InputError
-        There is nothing, or a folder, a pipe or a device, which would never end.
-    """
-    try:
-        mode = path.stat().st_mode
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: no such file", hint=f"expected {expected}") from error
-    if not stat.S_ISREG(mode):
-        kind = "a folder" if stat.S_ISDIR(mode) else "no regular file"
-        raise InputError(f"{path}: is {kind}", hint=f"expected {expected}")
-    return path
 
 
 def check_folder(path: Path, expected: str) -> Path:
@@ -85,33 +68,6 @@ def _stays_inside(name: str) -> bool:
     return printable and not path.is_absolute() and not is_drive and ".." not in path.parts and str(path) != "."
 
 
-def read_text(path: Path, expected: str) -> str:
-    """Return a file as text; `expected` says in words what should be there."""
-    check_file(path, expected)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: cannot be read as text: byte {error.start} is not UTF-8", hint=f"expected {expected}, in UTF-8"
-        ) from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}", hint=f"expected {expected}") from error
-    if not text.strip():
-        raise InputError(f"{path}: is empty", hint=f"expected {expected}")
-    return text
-
-
-def read_json(path: Path, expected: str) -> Any:
-    """Return what a JSON file holds; `expected` says in words what should be there."""
-    text = read_text(path, expected)
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"{path}: cannot be read as JSON: {_first_line(error)}", hint="is it whole? Write or download it again"
-        ) from error
-
-
 def read_yaml(path: Path, expected: str) -> Any:
     """Return what a YAML file holds, which must not have aliases."""
     import yaml  # Slow to import, and few formats need it.
@@ -128,7 +84,7 @@ def read_yaml(path: Path, expected: str) -> Any:
         return yaml.load(text, Loader=loader)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise InputError(
-            f"{path}: cannot be read as YAML: {_first_line(error)}", hint="is it whole? Write or download it again"
+            f"{path}: cannot be read as YAML: {first_line(error)}", hint="is it whole? Write or download it again"
         ) from error
 
 
@@ -157,12 +113,8 @@ def read_xml(path: Path, expected: str, on_element: Callable[[str, dict[str, str
         parser.Parse(text.encode(), True)
     except xml.parsers.expat.ExpatError as error:
         raise InputError(
-            f"{path}: cannot be read as XML: {_first_line(error)}", hint="is it whole? Write or download it again"
+            f"{path}: cannot be read as XML: {first_line(error)}", hint="is it whole? Write or download it again"
         ) from error
-
-
-def _first_line(error: BaseException) -> str:
-    return (" ".join(str(error).split()) or type(error).__name__)[:200]
 
 
 def _short(text: str) -> str:
