@@ -14,7 +14,7 @@ from valuemap.dataset import Dataset
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, assemble
-from valuemap.readers.colmap_files import find_model
+from valuemap.readers.colmap_files import copy_without_points, find_model
 from valuemap.readers.csv_file import read_csv
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.names import match_images
@@ -95,11 +95,14 @@ def _read_model(model_dir: Path, pass_from: str) -> tuple[Cameras, Images]:
 
 
 def _load(files: list[Path], model_dir: Path) -> pycolmap.Reconstruction:
-    """Read the files through a folder of links that has no points: they are not needed, and may be many."""
+    """Read the files through a folder that has no points: they are not needed, and may be many."""
     suffix = files[0].suffix
     with tempfile.TemporaryDirectory() as folder:
         for path in files:
-            (Path(folder) / path.name).symlink_to(path.resolve())
+            if path.name == "images.bin":
+                copy_without_points(path, Path(folder) / path.name)
+            else:
+                (Path(folder) / path.name).symlink_to(path.resolve())
         (Path(folder) / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
         try:
             model = pycolmap.Reconstruction(folder)

@@ -50,6 +50,19 @@ def find_model(model_dir: Path) -> list[Path]:
     )
 
 
+def copy_without_points(path: Path, to: Path) -> None:
+    """Copy a whole images.bin without the observations of points: they are most of it, and not needed."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data, to.open("wb") as copy:
+        (images,) = struct.unpack_from("<Q", data)
+        copy.write(data[:8])
+        start = 8
+        for _ in range(images):
+            name_end = _name_end(data, start)
+            copy.write(data[start : name_end + 1])
+            copy.write(bytes(8))
+            start = _image_end(data, start)
+
+
 def _check_binary(path: Path) -> None:
     record_end = _RECORD_ENDS[path.stem]
     size = path.stat().st_size
@@ -76,10 +89,15 @@ def _camera_end(data: mmap.mmap, start: int) -> int:
     return start + 24 + 8 * len(names.split(","))
 
 
-def _image_end(data: mmap.mmap, start: int) -> int:
-    name_end = data.find(b"\0", start + 8 + _POSE_BYTES)
-    if name_end < 0:
+def _name_end(data: mmap.mmap, start: int) -> int:
+    end = data.find(b"\0", start + 8 + _POSE_BYTES)
+    if end < 0:
         raise ValueError
+    return end
+
+
+def _image_end(data: mmap.mmap, start: int) -> int:
+    name_end = _name_end(data, start)
     (points,) = struct.unpack_from("<Q", data, name_end + 1)
     return int(name_end + 9 + 24 * points)
 
