@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from pyproj import Transformer
+from pyproj.datadir import get_user_data_dir
 
-from valuemap.errors import InputError
+from valuemap.errors import InputError, SettingError
 from valuemap.geodesy import (
     accuracy_note,
     crs_from_lon_lat_height,
     enu_from_lon_lat_height,
     lon_lat_height_from_crs,
     lon_lat_height_from_enu,
+    with_heights,
 )
 from valuemap.tables import Floats
 
@@ -114,3 +118,44 @@ def test_a_missing_grid_is_told() -> None:
     note = accuracy_note("EPSG:27700")
     assert note is None or "EPSG:27700: positions are good to 2 m" in note  # None where somebody installed the grid.
     assert accuracy_note("EPSG:32630") is None
+
+
+# Heights above the sea.
+
+PROJ_DATA = Path(get_user_data_dir())
+
+
+def test_heights_count_from_a_zero_given_in_metres() -> None:
+    assert with_heights("EPSG:25832", None) == ("EPSG:25832", 0.0)
+    assert with_heights(None, "47.25") == ("EPSG:4326", 47.25)
+
+
+@pytest.mark.parametrize(
+    ("crs", "vertical", "said"),
+    [
+        (None, "5773", "expected at most 150 m, or a system such as EPSG:5773"),
+        (None, "nan", "expected at most 150 m"),
+        (None, "EPSG:25832", "is no vertical system"),
+        (None, "EPSG:1", "there is no such system"),
+        ("EPSG:4979", "40", "EPSG:4979 has heights of its own"),
+        ("EPSG:nothing", "40", "there is no such system"),
+    ],
+)
+def test_what_heights_cannot_count_from(crs: str | None, vertical: str, said: str) -> None:
+    with pytest.raises(SettingError, match=said) as refusal:
+        with_heights(crs, vertical)
+    assert refusal.value.hint
+
+
+def test_heights_of_a_vertical_system_need_its_grid() -> None:
+    """In London the geoid EGM96 lies 46 m above the ellipsoid; where PROJ lacks the grid, that is one line."""
+    system, zero_m = with_heights("EPSG:32630", "EPSG:5773")
+    assert system is not None
+    assert zero_m == 0.0
+    place = np.array([[-0.14, 51.5, 100.0]])
+    if PROJ_DATA.is_absolute() and any(PROJ_DATA.rglob("us_nga_egm96_15.tif")):
+        assert crs_from_lon_lat_height(place, system)[0, 2] == pytest.approx(100.0 - 46.0, abs=1.5)
+        return
+    with pytest.raises(SettingError) as refusal:
+        crs_from_lon_lat_height(place, system)
+    assert "--vertical with the metres" in refusal.value.hint

@@ -131,6 +131,31 @@ def test_far_from_the_anchor_positions_are_exact_and_cameras_stay_level(tmp_path
     )
 
 
+@pytest.mark.parametrize(
+    ("header", "rows", "crs"),
+    [
+        ("image,lat,lon,height,heading_deg", ("a.jpg,52,4,10,0", "b.jpg,52.0001,4,11,0"), None),
+        ("image,x,y,z,heading_deg", ("a.jpg,600000,5760000,10,0", "b.jpg,600000,5760010,11,0"), "EPSG:32631"),
+    ],
+)
+def test_heights_above_the_sea_are_brought_to_the_ellipsoid(
+    tmp_path: Path, header: str, rows: tuple[str, ...], crs: str | None
+) -> None:
+    poses = poses_of(tmp_path, header, *rows)
+    above_sea = read_csv_poses(poses, camera=CAMERA, crs=crs, vertical="43.5")
+    plain = read_csv_poses(poses, camera=CAMERA, crs=crs)
+    assert above_sea.frame.anchor is not None
+    assert plain.frame.anchor is not None
+    assert above_sea.frame.anchor[2] == pytest.approx(plain.frame.anchor[2] + 43.5, abs=1e-6)
+    assert_allclose(camera_centers(above_sea.images), camera_centers(plain.images), atol=1e-4)
+
+
+def test_heights_in_a_frame_of_its_own_have_no_zero(tmp_path: Path) -> None:
+    poses = poses_of(tmp_path, "image,x,y,z,heading_deg", "a.jpg,0,0,0,0", "b.jpg,0,1,0,0")
+    said = refusal(lambda: read_csv_poses(poses, camera=CAMERA, vertical="43.5"))
+    assert "does not go with x, y in a frame of their own" in said
+
+
 def test_cameras_passes_times_rigs_and_sigmas_come_from_columns(tmp_path: Path) -> None:
     header = (
         "image,lat,lon,heading_deg,width_px,height_px,fx,cx,cy,pass,timestamp,rig,position_sigma_m,rotation_sigma_deg"

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import geopandas
 import numpy as np
+import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 from numpy.testing import assert_allclose
@@ -158,6 +159,19 @@ def test_formats_that_are_always_wgs84_refuse_others(name: str, tmp_path: Path) 
     with pytest.raises(OutputError, match="longitude and latitude only, not EPSG:32630"):
         export_map(geographic_map(), tmp_path / name, crs="EPSG:32630")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_heights_above_a_zero_given_in_metres(tmp_path: Path) -> None:
+    result = voted_map([(0, 100)], frame=Frame(anchor=ANCHOR))
+    export_map(result, tmp_path / "plain.csv", crs="EPSG:32630")
+    export_map(result, tmp_path / "sea.csv", crs="EPSG:32630", vertical="46.5")
+    export_map(result, tmp_path / "degrees.csv", vertical="46.5")
+    plain, sea, degrees = (pd.read_csv(tmp_path / f"{name}.csv") for name in ("plain", "sea", "degrees"))
+    assert_allclose(plain["crs_z"] - sea["crs_z"], 46.5, atol=1e-6)
+    assert_allclose(sea["crs_z"], degrees["crs_z"], atol=1e-6)
+    assert_allclose(degrees["crs_x"], ANCHOR[1], atol=1e-3)
+    with pytest.raises(OutputError, match="holds WGS84 longitude and latitude only"):
+        export_map(result, tmp_path / "a.kml", vertical="46.5")
 
 
 def test_a_reference_system_must_exist_and_the_map_have_a_place_in_it(tmp_path: Path) -> None:

@@ -89,6 +89,73 @@ def crs_from_lon_lat_height(lon_lat_height: Floats, crs: str) -> Floats:
     return found
 
 
+def with_heights(crs: str | None, vertical: str | None) -> tuple[str | None, float]:
+    """Return a reference system with the heights of a vertical one, and how far their zero is above its own.
+
+    Parameters
+    ----------
+    crs
+        The horizontal system; None for longitude and latitude in WGS84.
+    vertical
+        A vertical system that pyproj knows, such as `EPSG:5773` (EGM96), or in metres how far the zero of the heights
+        (the sea level) lies above the ellipsoid; None for the heights of `crs`.
+
+    Raises
+    ------
+    SettingError
+        There is no such vertical system, or `crs` has heights of its own.
+    """
+    if vertical is None:
+        return crs, 0.0
+    from pyproj.crs import CompoundCRS
+    from pyproj.exceptions import ProjError
+
+    try:
+        zero_m = float(vertical)
+    except ValueError:
+        zero_m = 0.0
+    else:
+        # EPSG codes are no heights of the sea above the ellipsoid, which are between -110 and 90 m.
+        if not abs(zero_m) <= _GREATEST_UNDULATION_M:
+            raise SettingError(
+                f"vertical {vertical}: expected at most {_GREATEST_UNDULATION_M:g} m, or a system such as EPSG:5773",
+                hint="metres say how far the zero of the heights lies above the ellipsoid of WGS84",
+            )
+        _refuse_own_heights(crs, vertical)
+        return crs or "EPSG:4326", zero_m
+    _refuse_own_heights(crs, vertical)
+    try:
+        below, above = _system(crs or "EPSG:4326"), _system(vertical)
+        if not above.is_vertical:
+            raise SettingError(
+                f"vertical {vertical}: {above.name} is no vertical system", hint="for example EPSG:5773, which is EGM96"
+            )
+        return CompoundCRS(f"{below.name} + {above.name}", [below, above]).to_string(), 0.0
+    except ProjError as error:
+        reason = " ".join(str(error).split())[:200]
+        raise SettingError(
+            f"vertical {vertical}: there is no such system: {reason}", hint="for example EPSG:5773, or metres: 47.2"
+        ) from error
+
+
+_GREATEST_UNDULATION_M = 150.0
+
+
+def _refuse_own_heights(crs: str | None, vertical: str) -> None:
+    if crs is not None and len(_known_system(crs).axis_info) == 3:
+        raise SettingError(f"vertical {vertical}: {crs} has heights of its own", hint="leave --vertical away")
+
+
+def _known_system(crs: str) -> Any:
+    from pyproj.exceptions import ProjError
+
+    try:
+        return _system(crs)
+    except ProjError as error:
+        reason = " ".join(str(error).split())[:200]
+        raise SettingError(f"crs {crs!r}: there is no such system: {reason}", hint="for example EPSG:32610") from error
+
+
 def accuracy_note(crs: str) -> str | None:
     """Return what to tell about positions in a reference system that PROJ could reach more exactly with a grid.
 
@@ -143,7 +210,8 @@ def _to_wgs84(crs: str) -> Any:
         reason = " ".join(str(error).split())[:200]
         raise SettingError(
             f"crs {crs!r}: cannot be brought to WGS84: {reason}",
-            hint="give a code such as EPSG:32610, or 4979; heights above the sea need a grid that PROJ must have",
+            hint="give a code such as EPSG:32610, or 4979; heights above the sea need a grid that PROJ must have "
+            "(projsync gets it), or --vertical with the metres of the sea level above the ellipsoid",
         ) from error
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from valuemap.cli.app import app
-from valuemap.cli.options import Force
+from valuemap.cli.options import Force, Vertical
 from valuemap.cli.show import log, show_notes
 from valuemap.dataset import Dataset, read_dataset
 from valuemap.errors import InputError
@@ -36,6 +36,7 @@ def export_command(
     crs: Annotated[
         str | None, typer.Option(help="Reference system to write in, such as EPSG:25832; default: WGS84.")
     ] = None,
+    vertical: Vertical = None,
     reviewed: Annotated[
         bool, typer.Option("--reviewed", help="Without rejected labels, with corrections, as decided in valuemap view.")
     ] = False,
@@ -53,7 +54,7 @@ def export_command(
     known = _dataset(map_, result, dataset)
     if reviewed or review is not None:
         result = _reviewed(result, map_, review, known)
-    export_map(result, target, format_name=format_name, dataset=known, crs=crs, force=force)
+    export_map(result, target, format_name=format_name, dataset=known, crs=crs, vertical=vertical, force=force)
     note = None if crs is None else accuracy_note(crs)
     show_notes([] if note is None else [note])
     log.print(f"Wrote {len(result.labels)} labels to {without_password(target)}", highlight=False)

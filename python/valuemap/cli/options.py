@@ -35,3 +35,11 @@ Work = Annotated[
     typer.Option("--work", metavar="FOLDER", help="Folder for unfinished parts. Default: beside --out, named .work."),
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with what an interrupted run has left.")]
+Vertical = Annotated[
+    str | None,
+    typer.Option(
+        "--vertical",
+        metavar="EPSG|METRES",
+        help="What heights count from: a system, EPSG:5773, or how many metres above the ellipsoid its zero is.",
+    ),
+]

@@ -59,6 +59,7 @@ def read_csv_poses(
     pixel_center: float = 0.5,
     camera_height_m: float = 0.0,
     crs: str | None = None,
+    vertical: str | None = None,
     up: tuple[float, float, float] | None = None,
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
@@ -96,6 +97,8 @@ def read_csv_poses(
         Height of all images where the table has none.
     crs
         The reference system of `x, y`, e.g. EPSG:32610: easting, northing. Without, they are metres in their own frame.
+    vertical
+        What the heights of `lat, lon` or `crs` count from, as in `with_heights`; without, the ellipsoid.
     up, anchor, max_rejected
         As in `assemble`. With `lat, lon` or `crs` the anchor is the origin, by default the first image by name.
 
@@ -114,7 +117,7 @@ def read_csv_poses(
     progress("reading the poses", 0, 2)
     table = CsvFile(poses, _EXPECTED, texts=_TEXTS, numbers=_NUMBERS, columns=columns)
     names = table.filled_texts("image")
-    where = _place(table, names, crs, anchor, up, camera_height_m)
+    where = _place(table, names, crs, vertical, anchor, up, camera_height_m)
     cameras, camera_id = make_cameras(_cameras(table, camera, pixel_center), str(poses))
     images = make_images(
         names=names,
@@ -147,6 +150,7 @@ def _place(
     table: CsvFile,
     names: list[str],
     crs: str | None,
+    vertical: str | None,
     anchor: tuple[float, float, float] | None,
     up: tuple[float, float, float] | None,
     camera_height_m: float,
@@ -160,11 +164,10 @@ def _place(
                 "crs and up: do not go with columns lat, lon", hint="leave them away: lat, lon are WGS84"
             )
         height = table.numbers("height") if table.has("height") else level
-        return _on_earth(
-            place_on_earth(
-                np.stack([table.numbers("lon"), table.numbers("lat"), height], axis=1), anchor, first, source=source
-            )
-        )
+        place = np.stack([table.numbers("lon"), table.numbers("lat"), height], axis=1)
+        if vertical is None:
+            return _on_earth(place_on_earth(place, anchor, first, source=source))
+        return _on_earth(place_in_crs(place, "EPSG:4326", anchor, first, vertical=vertical, source=source))
     if not table.has("x", "y"):
         raise table.missing("lat, lon or x, y")
     height = next((table.numbers(name) for name in ("z", "height") if table.has(name)), level)
@@ -172,7 +175,11 @@ def _place(
     if crs is not None:
         if up is not None:
             raise SettingError("up: does not go with crs", hint="leave it away: heights are along z")
-        return _on_earth(place_in_crs(position, crs, anchor, first, source=source))
+        return _on_earth(place_in_crs(position, crs, anchor, first, vertical=vertical, source=source))
+    if vertical is not None:
+        raise SettingError(
+            f"vertical {vertical}: does not go with x, y in a frame of their own", hint="give --crs, or leave it away"
+        )
     return _Where(position, np.broadcast_to(np.eye(3), (len(table), 3, 3)), anchor)
 
 

@@ -11,7 +11,13 @@ import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
 from valuemap.errors import InputError
-from valuemap.geodesy import enu_axes_at, enu_from_lon_lat_height, lon_lat_height_from_crs, true_axes_of_crs
+from valuemap.geodesy import (
+    enu_axes_at,
+    enu_from_lon_lat_height,
+    lon_lat_height_from_crs,
+    true_axes_of_crs,
+    with_heights,
+)
 from valuemap.readers.files import check_names
 from valuemap.tables import Bools, Categories, Floats, Images, Ints
 
@@ -81,15 +87,25 @@ def place_on_earth(
 
 
 def place_in_crs(
-    position: Floats, crs: str, anchor: tuple[float, float, float] | None, first: int = 0, *, source: str
+    position: Floats,
+    crs: str,
+    anchor: tuple[float, float, float] | None,
+    first: int = 0,
+    *,
+    vertical: str | None = None,
+    source: str,
 ) -> OnEarth:
     """Place images at coordinates (N, 3) of a reference system such as `EPSG:32610`, easting first, height last.
 
     The local axes are those of the grid: its north is not north, and poses in it are turned by the convergence.
+    Heights are those of the vertical system, as in `with_heights`.
     """
+    system, zero_m = with_heights(crs, vertical)
+    assert system is not None
+    position = position + [0.0, 0.0, zero_m]
     fine: Bools = np.asarray(np.isfinite(position).all(axis=1))
     lon_lat_height, true_from_grid = np.full((len(fine), 3), np.nan), np.full((len(fine), 3, 3), np.nan)
-    lon_lat_height[fine] = lon_lat_height_from_crs(position[fine], crs)
+    lon_lat_height[fine] = lon_lat_height_from_crs(position[fine], system)
     true_from_grid[fine] = true_axes_of_crs(position[fine], crs)
     placed = place_on_earth(lon_lat_height, anchor, first, source=source)
     return OnEarth(placed.position_in_world_m, placed.world_from_local @ true_from_grid, placed.anchor)

@@ -8,6 +8,7 @@ from pathlib import Path
 from valuemap.dataset import Dataset
 from valuemap.errors import OutputError
 from valuemap.folders import new_file, new_folder
+from valuemap.geodesy import with_heights
 from valuemap.map_folder import Map
 from valuemap.writers.attributes import Export
 from valuemap.writers.colmap import FILES as COLMAP_FILES
@@ -66,6 +67,7 @@ def export_map(
     format_name: str | None = None,
     dataset: Dataset | None = None,
     crs: str | None = None,
+    vertical: str | None = None,
     force: bool = False,
 ) -> None:
     """Write the labels of a map as one file, a folder or into a database; never half.
@@ -82,6 +84,8 @@ def export_map(
         What the map was made from: then the best pictures of each label are named, and formats that hold cameras do.
     crs
         Coordinates in this reference system ("EPSG:25832") instead of WGS84, in formats that hold any.
+    vertical
+        The zero of the heights, as in `with_heights`.
     force
         Replace a file that valuemap did not write, or that was changed since, too.
 
@@ -95,7 +99,7 @@ def export_map(
     SettingError
         There is no such reference system, or an extra is missing.
     """
-    export = Export(result, dataset, crs)
+    export = Export(result, dataset, *with_heights(crs, vertical))
     if format_name is None and is_database(str(target)):
         write_postgis(export, str(target))
         return

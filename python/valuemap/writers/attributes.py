@@ -41,12 +41,14 @@ class Places:
 class Export:
     """A map that is to be written: with the dataset it was made from, if that is known, for pictures and cameras.
 
-    `crs` is the coordinate reference system to write in, as PROJ knows it ("EPSG:25832"); None for WGS84.
+    `crs` is the coordinate reference system to write in, as PROJ knows it ("EPSG:25832"); None for WGS84. Heights are
+    written above a zero that is `zero_height_m` above its own.
     """
 
     result: Map
     dataset: Dataset | None = None
     crs: str | None = None
+    zero_height_m: float = 0.0
 
     @cached_property
     def attributes(self) -> pd.DataFrame:
@@ -88,7 +90,13 @@ class Export:
             return Places(labels.position_in_world_m, None)
         if self.crs is None:
             return Places(labels.lon_lat_height, WGS84)
-        return Places(crs_from_lon_lat_height(labels.lon_lat_height, self.crs), self.crs)
+        return Places(self.placed(labels.lon_lat_height), self.crs)
+
+    def placed(self, lon_lat_height: Floats) -> Floats:
+        """Return places (N, 3) of WGS84 in `crs`."""
+        if self.crs is None:
+            return lon_lat_height
+        return crs_from_lon_lat_height(lon_lat_height, self.crs) - [0.0, 0.0, self.zero_height_m]
 
     @cached_property
     def ellipses(self) -> Ellipses:

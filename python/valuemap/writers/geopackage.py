@@ -13,7 +13,7 @@ import numpy as np
 
 from valuemap.cameras import camera_poses
 from valuemap.errors import OutputError
-from valuemap.geodesy import crs_from_lon_lat_height, lon_lat_height_from_enu
+from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.tables import Floats
 from valuemap.writers import qgis_style
 from valuemap.writers.attributes import Export, iso_times
@@ -147,7 +147,7 @@ def _placed(export: Export, position_in_world_m: Floats) -> Floats:
     if export.places.crs is None or anchor is None:
         return position_in_world_m
     geographic = lon_lat_height_from_enu(position_in_world_m, anchor)
-    return geographic if export.crs is None else crs_from_lon_lat_height(geographic, export.crs)
+    return export.placed(geographic)
 
 
 def _finish(path: Path, rows: dict[str, int], export: Export) -> None:

@@ -9,7 +9,7 @@ import typer
 
 from valuemap.cli.import_.app import check_out, finish_dataset, import_app
 from valuemap.cli.import_.options import Anchor, CameraHeight, CameraText, Columns, PixelCenter, with_detections
-from valuemap.cli.options import DatasetOut, Force, MaxRejected, Up
+from valuemap.cli.options import DatasetOut, Force, MaxRejected, Up, Vertical
 from valuemap.cli.show import progress_bars
 from valuemap.readers.csv_file import parse_columns
 from valuemap.readers.detections import DetectionFile
@@ -29,6 +29,7 @@ def import_csv(
     pixel_center: PixelCenter = 0.5,
     camera_height: CameraHeight = 0.0,
     crs: Annotated[str | None, typer.Option(help="Reference system of x, y: EPSG:32610.")] = None,
+    vertical: Vertical = None,
     up: Up = None,
     anchor: Anchor = None,
     max_rejected: MaxRejected = MAX_REJECTED,
@@ -49,6 +50,7 @@ def import_csv(
             pixel_center=pixel_center,
             camera_height_m=camera_height,
             crs=crs,
+            vertical=vertical,
             up=up,
             anchor=anchor,
             max_rejected=max_rejected,
