@@ -96,7 +96,7 @@ def main() -> int:
         start = time.perf_counter()
         last = Path(tempfile.gettempdir()) / "valuemap-fuzz-last"
         done: Counter[str] = Counter()
-        seconds: Counter[str] = Counter()
+        seconds = dict.fromkeys((target.name for target in targets), 0.0)
         faults: dict[str, dict[str, Any]] = {}
         while done.total() < options.cases and time.perf_counter() - start < options.seconds:
             target = min(targets, key=lambda each: seconds[each.name])  # All get the same time.

@@ -13,6 +13,7 @@ import struct
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -221,27 +222,25 @@ def readers(folder: Path) -> list[Target]:
     for name, (make, read, _) in poses_of.FORMATS.items():
         here = folder / name
         make(here)
-        made[name] = Files.of(here, lambda read=read, here=here: read(here))
+        made[name] = Files.of(here, partial(read, here))
     for kind in DETECTIONS:
         here = folder / f"boxes-{kind}"
         file = boxes_of.detections_in(here, kind)
-        made[f"boxes {kind}"] = Files.of(here, lambda here=here, file=file: boxes_of.read(here, file))
+        made[f"boxes {kind}"] = Files.of(here, partial(boxes_of.read, here, file))
     for text in (False, True):
         here = folder / f"colmap-{text}"
         model = write_model(model_of("OPENCV", names=("a/0.jpg", "a/1.jpg")), here / "model", text=text)
         file = here / "boxes.csv"
         file.write_text("image,x,y,width,height,score\na/0.jpg,300,200,10,20,0.5\na/1.jpg,310,200,10,20,0.5\n")
-        made["colmap text" if text else "colmap binary"] = Files.of(
-            here, lambda model=model, file=file: read_colmap(model, detections=file)
-        )
+        made["colmap text" if text else "colmap binary"] = Files.of(here, partial(read_colmap, model, detections=file))
     here = folder / "bearings"
     here.mkdir(parents=True)
     (here / "bearings.csv").write_text("lat,lon,bearing,depth,class\n52,4,10,20,light\n52.0001,4,20,,light\n")
-    made["bearings"] = Files.of(here, lambda here=here: read_bearings(here / "bearings.csv"))
+    made["bearings"] = Files.of(here, partial(read_bearings, here / "bearings.csv"))
     here = folder / "kitti-boxes"
     here.mkdir()
     options = write_kitti(here)
-    made["kitti boxes"] = Files.of(here, lambda options=options: read_kitti(**options))
+    made["kitti boxes"] = Files.of(here, partial(read_kitti, **options))
     here = folder / "csv"
     here.mkdir()
     (here / "poses.csv").write_text(
@@ -249,7 +248,7 @@ def readers(folder: Path) -> list[Target]:
         "b.jpg,1,0,1,0.6,0.8,0,0,p,2,0.1\n"
     )
     made["csv"] = Files.of(
-        here, lambda here=here: read_csv_poses(here / "poses.csv", camera="OPENCV 640 480 500 500 320 240 0.1 0 0 0")
+        here, partial(read_csv_poses, here / "poses.csv", camera="OPENCV 640 480 500 500 320 240 0.1 0 0 0")
     )
     return [Target(name, files.run) for name, files in made.items()]
 
@@ -326,7 +325,7 @@ def hostile_arrays(random: Random) -> None:
         table = getattr(dataset, name)
         column = random.choice([f.name for f in fields(table)])
         value = _spoiled_column(random, getattr(table, column))
-        changed = must_end_well(lambda table=table, column=column, value=value: replace(table, **{column: value}))
+        changed = must_end_well(partial(replace, table, **{column: value}))
         if changed is None:
             return
         dataset = replace(dataset, **{name: changed})

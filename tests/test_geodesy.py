@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from pyproj import Transformer
-from pyproj.datadir import get_user_data_dir
+from pyproj.datadir import get_user_data_dir  # type: ignore[attr-defined]
 
 from valuemap.errors import InputError, SettingError
 from valuemap.geodesy import (
