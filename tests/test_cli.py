@@ -26,7 +26,7 @@ COMMAND = [sys.executable, "-c", "from valuemap.cli import main; main()"]
 
 
 def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run([*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=600, check=False)
 
 
 def works(*arguments: str | Path) -> str:
@@ -114,6 +114,18 @@ def test_commands_are_shown_in_the_order_of_use() -> None:
     told = works("--help")
     places = [told.index(f"│ {name} ") for name in ("import", "detect", "map", "evaluate", "export", "demo")]
     assert places == sorted(places)
+
+
+def test_only_the_command_that_is_asked_for_is_imported() -> None:
+    code = """
+import sys
+from valuemap.cli.load import COMMANDS, load_commands
+load_commands(sys.argv[1:])
+print(*(name for name in COMMANDS if f"valuemap.cli.{name}" in sys.modules))
+"""
+    for words, imported in ((["info", "map"], "info"), (["evaluate-detections"], "evaluate_detections")):
+        done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
+        assert done.stdout == f"{imported}\n"
 
 
 def test_json_of_a_map_is_its_record(street: Path, tmp_path: Path) -> None:

@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 
+import valuemap
+from block import block
 from test_cli import works
+from valuemap.simulate import PRESETS, simulate
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
@@ -17,7 +20,8 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
 
 
-def test_the_python_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_python_example_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setitem(PRESETS, "small", block())
     (example,) = blocks("python")
     exec(compile(example, "README.md", "exec"), {})
     assert "labels," in capsys.readouterr().out
@@ -26,7 +30,7 @@ def test_the_python_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
 def test_the_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All but the import, which needs data of the reader's own: a simulated city stands in for it."""
     monkeypatch.chdir(tmp_path)
-    works("simulate", "--out", "my-data")
+    valuemap.write_dataset(simulate(block(), seed=0), Path("my-data"))
     (tmp_path / "survey.csv").write_text("x,y,z\n0,0,0\n")
     lines = [line.split("#")[0] for block in blocks("sh") for line in block.splitlines()]
     commands = [shlex.split(line)[1:] for line in lines if line.startswith("valuemap ")]

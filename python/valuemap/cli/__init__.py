@@ -11,8 +11,10 @@ def main() -> None:
         import gc
         import sys
 
-        from valuemap.cli.commands import app
+        from valuemap.cli.app import app
+        from valuemap.cli.load import load_commands
 
+        load_commands(sys.argv[1:])
         for stream in (sys.stdout, sys.stderr):  # Names of files need not be UTF-8.
             stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
         gc.freeze()  # What was imported stays: looking through it for garbage, at the end too, takes 0.1 s.

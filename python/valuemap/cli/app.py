@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 import typer.core
 
+from valuemap.cli.load import COMMANDS, name_of
 from valuemap.cli.signals import Terminated, exit_code
 from valuemap.errors import ValuemapError
 
@@ -22,9 +23,7 @@ class _Commands(typer.core.TyperGroup):
     """Commands in the order of use, whose errors come out as one line and a hint, and a status that is not 0."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        from valuemap.cli.commands import COMMANDS  # It imports this module.
-
-        order = {module.strip("_").replace("_", "-"): place for place, module in enumerate(COMMANDS)}
+        order = {name_of(module): place for place, module in enumerate(COMMANDS)}
         return sorted(super().list_commands(ctx), key=order.__getitem__)
 
     def invoke(self, ctx: Any) -> Any:
