@@ -11,9 +11,9 @@ use std::ops::Range;
 
 use nalgebra::{DMatrix, DVector, Matrix3, Rotation3, SMatrix, Vector2, Vector3};
 
-use super::noise::{Noise, Sigmas, Spread};
+use super::noise::{Noise, Sigmas, Spread, norm};
 use super::scene::Scene;
-use super::spd::{Inverse, Matrix6, Vector6, scaled};
+use super::spd::{Inverse, Matrix6, Vector6, product, product_transposed, scaled};
 use crate::ray::Ray;
 
 type Matrix3x6 = SMatrix<f64, 3, 6>;
@@ -196,8 +196,8 @@ impl Look {
     #[must_use]
     pub fn shared_sigma(&self) -> Sigmas {
         Sigmas {
-            position_m: self.leg_sigma.position_m.hypot(self.drift_sigma.position_m),
-            rotation_rad: self.leg_sigma.rotation_rad.hypot(self.drift_sigma.rotation_rad),
+            position_m: norm(self.leg_sigma.position_m, self.drift_sigma.position_m),
+            rotation_rad: norm(self.leg_sigma.rotation_rad, self.drift_sigma.rotation_rad),
         }
     }
 
@@ -378,12 +378,12 @@ impl<'a> Drive<'a> {
         let mut drifts = vec![Vector6::zeros(); self.legs.len()];
         let mut of_next = Vector6::zeros();
         for (leg, drift) in self.legs.iter().zip(&mut drifts).rev() {
-            *drift = leg.information.matrix * (of_next * leg.tie + leg.gradient);
+            *drift = product(&leg.information.matrix, &(of_next * leg.tie + leg.gradient));
             of_next = *drift;
         }
         for (leg, drift) in self.legs.iter().zip(&mut drifts) {
             if let Some(own) = &leg.own {
-                *drift += own.covariance * (own.gradient - own.information * *drift);
+                *drift += product(&own.covariance, &(own.gradient - product(&own.information, drift)));
             }
         }
         drifts
@@ -430,7 +430,7 @@ fn own_error(looks: &[Look], weights: &[f64], drift: &Vector6) -> Option<Vector6
         }
     }
     let known = Inverse::of(&(Matrix6::identity() + scaled(&of_pose, &own)))?;
-    Some(own.component_mul(&(known.matrix * own.component_mul(&gradient))))
+    Some(own.component_mul(&product(&known.matrix, &own.component_mul(&gradient))))
 }
 
 impl Leg {
@@ -496,22 +496,22 @@ impl Leg {
         let Some(known) = Inverse::of(&(Matrix6::identity() + scaled(&of_pose, &own))) else { return };
         // The covariance of the image's own error, once its looks are known.
         let error = scaled(&known.matrix, &own);
-        normals.square -= gradient.dot(&(error * gradient));
-        let kept = Matrix6::identity() - error * of_pose;
+        normals.square -= gradient.dot(&product(&error, &gradient));
+        let kept = Matrix6::identity() - product(&error, &of_pose);
         for (a, of_a) in &crosses {
-            let by_error = of_a * error;
-            normals.add_gradient(*a, &-(by_error * gradient));
+            let by_error = product(of_a, &error);
+            normals.add_gradient(*a, &-product(&by_error, &gradient));
             for (b, of_b) in &crosses {
-                normals.add(*a, *b, &-(by_error * of_b.transpose()));
+                normals.add(*a, *b, &-product_transposed(&by_error, of_b));
             }
-            let mut cross = of_a * kept;
+            let mut cross = product(of_a, &kept);
             for (mut column, sigma) in cross.column_iter_mut().zip(&drift) {
                 column *= *sigma;
             }
             self.add_cross(*a, &cross);
         }
-        self.information += scaled(&(of_pose * kept), &drift);
-        self.gradient += drift.component_mul(&kept.tr_mul(&gradient));
+        self.information += scaled(&product(&of_pose, &kept), &drift);
+        self.gradient += drift.component_mul(&product(&kept.transpose(), &gradient));
     }
 
     fn add_cross(&mut self, label: usize, cross: &Matrix3x6) {
@@ -546,21 +546,21 @@ impl Leg {
             ln_determinant: known.determinant.ln(),
         };
         for (i, (a, of_a)) in self.cross.iter().enumerate() {
-            let by_own = of_a * covariance;
-            normals.add_gradient(*a, &-(by_own * self.gradient));
+            let by_own = product(of_a, &covariance);
+            normals.add_gradient(*a, &-product(&by_own, &self.gradient));
             for (b, of_b) in &self.cross[..i] {
-                let both = -(by_own * of_b.transpose());
+                let both = -product_transposed(&by_own, of_b);
                 normals.add(*a, *b, &both);
                 normals.add(*b, *a, &both.transpose());
             }
-            normals.add(*a, *a, &-(by_own * of_a.transpose()));
+            normals.add(*a, *a, &-product_transposed(&by_own, of_a));
         }
-        normals.square -= self.gradient.dot(&(covariance * self.gradient));
+        normals.square -= self.gradient.dot(&product(&covariance, &self.gradient));
         // Without differences of large numbers: with S the share and K the inverse of I + S M S, what is left of M is S⁻¹ (I - K) S⁻¹.
         let per_share = share.map(f64::recip);
-        let kept = Matrix6::from_diagonal(&share) * known.matrix * Matrix6::from_diagonal(&per_share);
-        self.cross.iter_mut().for_each(|(_, cross)| *cross *= kept);
-        self.gradient = kept.tr_mul(&self.gradient);
+        let kept = Matrix6::from_fn(|row, column| share[row] * known.matrix[(row, column)] * per_share[column]);
+        self.cross.iter_mut().for_each(|(_, cross)| *cross = product(cross, &kept));
+        self.gradient = product(&kept.transpose(), &self.gradient);
         self.information = scaled(&(Matrix6::identity() - known.matrix), &per_share);
         Some(of_leg)
     }
@@ -577,16 +577,16 @@ impl Leg {
         let tie = keep * stiffness;
         let information = Inverse::of(&(self.information + Matrix6::identity() * (keep * tie)))?;
         let inverse = information.matrix;
-        let by_gradient = inverse * self.gradient;
-        let by_cross: Vec<(usize, Matrix3x6)> = self.cross.iter().map(|(a, cross)| (*a, cross * inverse)).collect();
+        let by_gradient = product(&inverse, &self.gradient);
+        let by_cross: Vec<(usize, Matrix3x6)> = self.cross.iter().map(|(a, cross)| (*a, product(cross, &inverse))).collect();
         for (i, (a, of_a)) in by_cross.iter().enumerate() {
-            normals.add_gradient(*a, &-(of_a * self.gradient));
+            normals.add_gradient(*a, &-product(of_a, &self.gradient));
             for (b, of_b) in &self.cross[..i] {
-                let both = -(of_a * of_b.transpose());
+                let both = -product_transposed(of_a, of_b);
                 normals.add(*a, *b, &both);
                 normals.add(*b, *a, &both.transpose());
             }
-            normals.add(*a, *a, &-(of_a * self.cross[i].1.transpose()));
+            normals.add(*a, *a, &-product_transposed(of_a, &self.cross[i].1));
         }
         normals.square -= self.gradient.dot(&by_gradient);
         let next = Self {

@@ -148,15 +148,15 @@ impl Noise {
     pub fn shared(&self, view: &View) -> Sigmas {
         let (leg, drift) = (self.of_leg(view), self.of_drift(view));
         Sigmas {
-            position_m: leg.position_m.hypot(drift.position_m),
-            rotation_rad: leg.rotation_rad.hypot(drift.rotation_rad),
+            position_m: norm(leg.position_m, drift.position_m),
+            rotation_rad: norm(leg.rotation_rad, drift.rotation_rad),
         }
     }
 
     /// A part of all errors of a pose; where the total is known, the parts keep the ratio that was estimated.
     fn part(&self, view: &View, position_m: f64, rotation_rad: f64) -> Sigmas {
-        let position = self.position_m.hypot(self.position_leg_m).hypot(self.position_drift_m);
-        let rotation = self.rotation_rad.hypot(self.rotation_leg_rad).hypot(self.rotation_drift_rad);
+        let position = || norm(norm(self.position_m, self.position_leg_m), self.position_drift_m);
+        let rotation = || norm(norm(self.rotation_rad, self.rotation_leg_rad), self.rotation_drift_rad);
         Sigmas {
             position_m: known_share(view.position_sigma_m, position_m, position),
             rotation_rad: known_share(view.rotation_sigma_rad, rotation_rad, rotation),
@@ -165,6 +165,12 @@ impl Noise {
 }
 
 /// A part of a total that may be known.
-fn known_share(known: f64, part: f64, total: f64) -> f64 {
-    if known.is_nan() || part == 0.0 { part } else { known * part / total }
+fn known_share(known: f64, part: f64, total: impl Fn() -> f64) -> f64 {
+    if known.is_nan() || part == 0.0 { part } else { known * part / total() }
+}
+
+/// The standard deviation of the sum of two errors.
+#[inline]
+pub(super) fn norm(a: f64, b: f64) -> f64 {
+    (a * a + b * b).sqrt()
 }

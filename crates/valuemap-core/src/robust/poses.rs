@@ -9,7 +9,7 @@ use nalgebra::{Matrix2, SMatrix, Vector2};
 use super::drift::{DRIFT_LENGTH_M, LEG_M, Look};
 use super::noise::Sigmas;
 use super::scene::View;
-use super::spd::{Inverse, Matrix6, Vector6, scaled};
+use super::spd::{Inverse, Matrix6, Vector6, product, product_transposed, scaled};
 
 /// Legs before and after those in question that say something about their drift.
 pub(super) const LEGS_AROUND: usize = 20;
@@ -78,7 +78,7 @@ impl Belief {
         let Some(tied) = Inverse::of(&(self.information + Matrix6::identity() * own)) else { return Self::nothing() };
         Self {
             information: Matrix6::identity() * of_new - tied.matrix * (tie * tie),
-            gradient: tied.matrix * self.gradient * tie,
+            gradient: product(&tied.matrix, &self.gradient) * tie,
         }
     }
 
@@ -88,7 +88,7 @@ impl Belief {
     pub fn pose_error(&self, drift: Sigmas, own: Sigmas) -> PoseError {
         let (drift, own) = (drift.each(), own.each());
         let covariance = Inverse::of(&self.information).map_or_else(Matrix6::identity, |inverse| inverse.matrix);
-        let mean = -(covariance * self.gradient);
+        let mean = -product(&covariance, &self.gradient);
         PoseError {
             mean: mean.component_mul(&drift),
             covariance: scaled(&covariance, &drift) + Matrix6::from_diagonal(&own.component_mul(&own)),
@@ -102,8 +102,8 @@ impl PoseError {
     #[must_use]
     pub fn expected(&self, look: &Look, own: &Matrix2<f64>) -> (Vector2<f64>, Matrix2<f64>) {
         let by_pose = rows_of(look);
-        let residual = Vector2::from(look.residual) + by_pose * self.mean;
-        (residual, own + by_pose * self.covariance * by_pose.transpose())
+        let residual = Vector2::from(look.residual) + product(&by_pose, &self.mean);
+        (residual, own + product_transposed(&product(&by_pose, &self.covariance), &by_pose))
     }
 
     /// Its standard deviations, root mean squares of the axes.
@@ -121,7 +121,7 @@ impl PoseError {
     pub fn after(&self, look: &Look, own: &Matrix2<f64>) -> Self {
         let (residual, covariance) = self.expected(look, own);
         let Some(inverse) = covariance.try_inverse() else { return *self };
-        let seen = rows_of(look) * self.covariance;
+        let seen = product(&rows_of(look), &self.covariance);
         let gain = seen.tr_mul(&inverse);
         Self { mean: self.mean - gain * residual, covariance: self.covariance - gain * seen }
     }
