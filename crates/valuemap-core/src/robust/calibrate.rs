@@ -14,10 +14,16 @@ use super::estimate::{by_pass, looks_at};
 use super::noise::Noise;
 use super::scene::Scene;
 
-/// Labels with fewer voters do not serve.
+/// Labels with fewer voters do not serve where there are better ones: chance meetings have few.
 const MIN_VOTES: usize = 6;
+/// If labels with so many voters have fewer than this together, those with at least `LEAST_VOTES` serve: a standard deviation is known to a
+/// tenth from fifty squares, each of the five that are sought.
+const ENOUGH_VOTES: usize = 250;
+const LEAST_VOTES: usize = 3;
 /// A pass with fewer voters does not say where it would put a label alone.
 const MIN_VOTES_OF_PASS: usize = 4;
+/// A visit with fewer voters has no residuals.
+const MIN_VOTES_OF_VISIT: usize = 2;
 /// The part of the labels that serves, those that fit best.
 const FIT_SHARE: f64 = 0.9;
 /// Voters that are used, about.
@@ -81,6 +87,9 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
         (false, true) => ((px2 - scale2 * known_rad2).max(DETECTION_PX.0.powi(2)).sqrt(), guess.rotation_rad),
         (false, false) => (((1.0 - ROTATION_PART) * px2).sqrt(), (ROTATION_PART * px2 / scale2).sqrt()),
     };
+    // Where poses state their errors, what images and legs do not have for themselves drifts.
+    let stated = [scene.usual(|view| view.position_sigma_m), scene.usual(|view| view.rotation_sigma_rad)];
+    let rest = |total: f64, part: f64| (total * total - part * part).max((DRIFT_RATIO.0 * part).powi(2)).sqrt();
     let noise_of = |p: &[f64; 5], ratio: f64| {
         let [position_leg_m, rotation_leg_rad] = [p[3], p[4]];
         // What images of a leg share is not quite the same for all of them.
@@ -89,6 +98,7 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
         // Passes that disagree are shifted: they turn no more than their images and legs do.
         let rotation_share_rad = rotation_rad.hypot(rotation_leg_rad);
         let position_m = if known.position { p[2] } else { (p[2] * p[2] + rough(position_leg_m)).sqrt() };
+        let (of_position, of_rotation) = (position_m.hypot(position_leg_m), rotation_share_rad);
         Noise {
             detection_px,
             box_share: p[1],
@@ -96,8 +106,8 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
             rotation_rad,
             position_leg_m,
             rotation_leg_rad,
-            position_drift_m: position_m.hypot(position_leg_m) * ratio,
-            rotation_drift_rad: rotation_share_rad,
+            position_drift_m: stated[0].map_or(of_position * ratio, |total_m| rest(total_m, of_position)),
+            rotation_drift_rad: stated[1].map_or(of_rotation, |total_rad| rest(total_rad, of_rotation)),
         }
     };
     let fixed = [known.detection && known.rotation, known.detection, known.position, known.position, known.rotation];
@@ -113,6 +123,9 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
         let noise = noise_of(p, 1.0);
         sum(&|object| minus_log_likelihood(scene, &noise, &object.0, &object.1))
     });
+    if stated[0].is_some() {
+        return noise_of(&found, 1.0);
+    }
     noise_of(&found, agreeing_ratio(scene, &sample, &|ratio| noise_of(&found, ratio)))
 }
 
@@ -209,9 +222,11 @@ fn search<const N: usize>(
 /// Well supported labels, evenly over the map, together about as many voters as needed. Those whose residuals fit the
 /// guess worst are left out: wrong associations would be taken for noise.
 fn sample<'a>(scene: &Scene, guess: &Noise, labels: &'a [Placed]) -> Vec<&'a Placed> {
+    let votes: usize = labels.iter().map(|label| label.0.len()).filter(|&votes| votes >= MIN_VOTES).sum();
+    let least = if votes < ENOUGH_VOTES { LEAST_VOTES } else { MIN_VOTES };
     let mut good: Vec<(f64, &Placed)> = labels
         .iter()
-        .filter(|label| label.0.len() >= MIN_VOTES)
+        .filter(|label| label.0.len() >= least)
         .map(|label| (misfit(scene, guess, label), label))
         .collect();
     let mut misfits: Vec<f64> = good.iter().map(|(misfit, _)| *misfit).collect();
@@ -236,7 +251,7 @@ fn misfit(scene: &Scene, noise: &Noise, label: &Placed) -> f64 {
 /// put the object elsewhere, so that what visits disagree about is not taken for errors within them.
 fn minus_log_likelihood(scene: &Scene, noise: &Noise, votes: &[u32], point: &Vector3<f64>) -> f64 {
     let mut value = 0.0;
-    for visit in by_pass(scene, votes).filter(|visit| visit.len() >= MIN_VOTES_OF_PASS) {
+    for visit in by_pass(scene, votes).filter(|visit| visit.len() >= MIN_VOTES_OF_VISIT) {
         let Some(looks) = looks_at(scene, noise, visit, point) else { return 0.0 };
         let Some(drive) = Drive::at_one(&looks) else { return 0.0 };
         let (information, gradient) = drive.normals.of_one();

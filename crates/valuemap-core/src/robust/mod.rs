@@ -78,9 +78,9 @@ const CALIBRATION_RAYS: (usize, usize) = (4_000, 10_000);
 /// How much wider the gate is while the noise is estimated: what a gate cuts off is missing in the estimate.
 const CALIBRATION_GATE: f64 = 1.4;
 /// Times that the noise is estimated anew, from labels found with the last estimate.
-const CALIBRATION_ROUNDS: usize = 3;
+const CALIBRATION_ROUNDS: usize = 2;
 /// The noise is sought from starts that differ by these factors.
-const STARTS: [f64; 3] = [0.15, 0.5, 1.5];
+const STARTS: [f64; 5] = [0.15, 0.5, 1.5, 5.0, 15.0];
 /// Scenes with more rays than this are searched less deeply.
 const MOST_RAYS: usize = 100_000;
 
@@ -138,33 +138,61 @@ pub fn self_calibrate(
     progress: &Progress,
 ) -> Result<Noise, Halt> {
     let settings = Settings { gate_sigmas: settings.gate_sigmas * CALIBRATION_GATE, ..*settings };
-    let mut best: Option<(f64, Noise)> = None;
-    let round = |noise: &Noise, rays: &[u32], best: &mut Option<(f64, Noise)>| {
+    let round = |noise: &Noise, rays: &[u32]| {
         let mut model = Model::new(scene, noise, &settings);
         let begun = initial::labels_of_few(&model, rays, progress)?;
         let objects = search(&mut model, rays, begun, Depth::Shallow, &mut Tally::default(), progress)?;
-        let found = likelihood(&model, &objects, rays);
         let again = calibrate::calibrate(scene, noise, &placed(&objects), known);
-        if best.is_none_or(|(least, _)| found < least) {
-            *best = Some((found, *noise));
-        }
-        Ok(again)
+        let l = likelihood(&model, &objects, rays); if std::env::var("VM_DBG").is_ok() { eprintln!("L {l:.1} objects {} votes {} rays {} of {noise:?}", objects.len(), objects.iter().map(|o| o.votes.len()).sum::<usize>(), rays.len()); }
+        Ok((l, again))
     };
+    // From each start one step; from the likeliest the others.
     let few = sample::places(scene, CALIBRATION_RAYS.0, settings.viability.max_range_m);
+    let mut likeliest = Likeliest::default();
+    let mut noise = *guess;
     for factor in STARTS {
-        let mut noise = guess.scaled(factor, known);
-        for _ in 0..CALIBRATION_ROUNDS {
-            noise = round(&noise, &few, &mut best)?;
+        let start = guess.scaled(factor, known);
+        let (value, again) = round(&start, &few)?;
+        if likeliest.offer(value, start) {
+            noise = again;
         }
+    }
+    for _ in 0..CALIBRATION_ROUNDS {
+        let (value, again) = round(&noise, &few)?;
+        likeliest.offer(value, noise);
+        noise = again;
     }
     // What more rays tell is taken if it makes them likelier.
     let more = sample::places(scene, CALIBRATION_RAYS.1, settings.viability.max_range_m);
-    let mut noise = best.map_or(*guess, |(_, noise)| noise);
-    let mut best = None;
-    for _ in 0..2 {
-        noise = round(&noise, &more, &mut best)?;
+    let mut noise = likeliest.noise.unwrap_or(*guess);
+    if more.len() == few.len() {
+        return Ok(noise);
     }
-    Ok(best.map_or(noise, |(_, noise)| noise))
+    let mut likeliest = Likeliest::default();
+    for _ in 0..2 {
+        let (value, again) = round(&noise, &more)?;
+        likeliest.offer(value, noise);
+        noise = again;
+    }
+    Ok(likeliest.noise.unwrap_or(noise))
+}
+
+/// The noise that makes the same rays likeliest so far.
+#[derive(Default)]
+struct Likeliest {
+    noise: Option<Noise>,
+    value: f64,
+}
+
+impl Likeliest {
+    /// Keep a noise if it is likelier, `value` minus twice the logarithm; whether it is.
+    fn offer(&mut self, value: f64, noise: Noise) -> bool {
+        let is_better = self.noise.is_none() || value < self.value;
+        if is_better {
+            (self.noise, self.value) = (Some(noise), value);
+        }
+        is_better
+    }
 }
 
 /// Minus twice the logarithm of the likelihood of some rays, clutter and votes, up to a constant: J, and the Poisson process of what is clutter

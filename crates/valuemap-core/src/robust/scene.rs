@@ -57,6 +57,14 @@ pub struct Frustum {
 }
 
 impl Scene {
+    /// The median of a number that views state, if most of them do.
+    #[must_use]
+    pub fn usual(&self, of_view: impl Fn(&View) -> f64) -> Option<f64> {
+        let mut stated: Vec<f64> = self.views.iter().map(of_view).filter(|value| value.is_finite()).collect();
+        let middle = stated.len() / 2;
+        (2 * stated.len() > self.views.len()).then(|| *stated.select_nth_unstable_by(middle, f64::total_cmp).1)
+    }
+
     /// The image of a ray.
     #[inline]
     #[must_use]
