@@ -109,8 +109,8 @@ def colmap_camera(cameras: Cameras, row: int) -> pycolmap.Camera:
     )
 
 
-def cast_rays(dataset: Dataset) -> Rays:
-    """Return the viewing ray of every detection of a dataset."""
+def cast_rays(dataset: Dataset, *, is_left_out: NDArray[np.bool_] | None = None) -> Rays:
+    """Return the viewing ray of every detection of a dataset; those that are left out (N) have none."""
     images, cameras, detections = dataset.images, dataset.cameras, dataset.detections
     image_row = rows_of(detections.image_id, images.image_id)
     camera_row = rows_of(images.camera_id, cameras.camera_id)[image_row]
@@ -122,6 +122,8 @@ def cast_rays(dataset: Dataset) -> Rays:
             residual_from_cam[members], direction_in_cam[members] = _local_pinholes(
                 camera, detections.center_px[members]
             )
+    if is_left_out is not None:
+        residual_from_cam[is_left_out], direction_in_cam[is_left_out] = np.nan, np.nan
     core = _core.Rays(
         residual_from_cam,
         direction_in_cam,

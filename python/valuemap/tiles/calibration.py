@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from valuemap.cameras import cast_rays
 from valuemap.config import MapConfig
 from valuemap.drives import InOrder
 from valuemap.engine.engine import Engine
@@ -53,5 +52,5 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def _estimated(sample: InOrder, config: MapConfig, engine: Engine, progress: Progress) -> Calibration:
-    scene = Scene(sample.dataset, sample.drives, cast_rays(sample.dataset))
+    scene = Scene(sample.dataset, sample.drives, cast_sightings(sample.dataset)[0])
     return calibrate_noise(scene, config, threads=engine.threads_of_task(1), progress=progress)

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from valuemap.cameras import cast_rays
 from valuemap.config import MapConfig
 from valuemap.dataset import number_passes
 from valuemap.describe import describe_labels
 from valuemap.drives import InOrder
 from valuemap.progress import Progress, silent
 from valuemap.robust import Calibration, Scene, find_labels
+from valuemap.sightings import cast_sightings
 from valuemap.tables import Bools, Ints, Labels, Votes
 from valuemap.tiles.grid import Cell, Grid
 
@@ -45,7 +45,7 @@ def solve_cell(
     progress: Progress = silent,
 ) -> Solved:
     """Find the labels of a cell in its piece; the piece has at least one image."""
-    rays = cast_rays(piece.dataset)
+    rays, is_double = cast_sightings(piece.dataset)
     scene = Scene(piece.dataset, piece.drives, rays)
     found, counts = find_labels(scene, calibration, config, threads=threads, progress=progress)
     ground_m = grid.on_ground(found.position_in_world_m)
@@ -53,7 +53,8 @@ def solve_cell(
     labels, votes = describe_labels(piece.dataset, rays, found, config.noise)
     counts = {
         "images": len(piece.image_id),
-        "detections_without_ray": int(np.isnan(rays.direction_in_world[:, 0]).sum()),
+        "detections_double": int(is_double.sum()),
+        "detections_without_ray": int((np.isnan(rays.direction_in_world[:, 0]) & ~is_double).sum()),
         **counts,
     }
     return Solved(

@@ -20,13 +20,12 @@ pub fn learn(model: &mut Model<'_>, objects: &[Object]) {
     let solid_angle_sr = model.scene.solid_angle_sr();
     for class in 0..model.classes.len() as u32 {
         let of_class: Vec<&Object> = objects.iter().filter(|object| object.class == class).collect();
-        let rays = model.scene.rays.class.iter().filter(|&&other| other == class).count();
         let votes: usize = of_class.iter().map(|object| object.votes.len()).sum();
         let is_sure = |object: &&Object| object.votes.len() >= MIN_VOTES && object.real > 0.5;
         let sure: Vec<&Object> = of_class.iter().copied().filter(is_sure).collect();
         let before = model.classes[class as usize];
         // One detection more than is seen: no clutter at all is never known for sure.
-        let ln_clutter_per_sr = ((rays - votes + 1) as f64 / solid_angle_sr).ln();
+        let ln_clutter_per_sr = ((before.detections - votes + 1) as f64 / solid_angle_sr).ln();
         let mut learned = ClassModel { ln_clutter_per_sr, ..before };
         if sure.len() >= MIN_OBJECTS {
             (learned.rates, learned.odd_passes) = rates(&sure, &before);

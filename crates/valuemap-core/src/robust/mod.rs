@@ -217,7 +217,7 @@ fn likelihood(model: &Model<'_>, objects: &[Object], rays: &[u32]) -> f64 {
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
 pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progress) -> Result<Findings, Halt> {
-    let rays: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
+    let rays = scene.usable_rays();
     let mut model = Model::new(scene, noise, settings);
     let (begun, first) = initial::labels(&model, progress)?;
     let mut tally =
@@ -243,7 +243,7 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
         findings,
         tally,
         rates: model.classes.first().map_or(Rates::GUESS, |class| class.rates),
-        clutter_per_image: (scene.rays.rays.len() - claimed) as f64 / scene.views.len() as f64,
+        clutter_per_image: (rays.len() - claimed) as f64 / scene.views.len() as f64,
         energy,
         variance_factor,
     })
@@ -272,7 +272,7 @@ pub fn objects_of(
     is_searched: bool,
     progress: &Progress,
 ) -> Result<Vec<Object>, Halt> {
-    let rays: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
+    let rays = scene.usable_rays();
     let mut model = Model::new(scene, noise, settings);
     if is_searched {
         return search(&mut model, &rays, begun, Depth::Deep, &mut Tally::default(), progress);

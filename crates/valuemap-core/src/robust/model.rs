@@ -13,6 +13,8 @@ use super::{Settings, spreads_of};
 /// What is learned about the objects and the clutter of one class.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ClassModel {
+    /// How many detections there are that may vote.
+    pub detections: usize,
     /// How often objects are detected.
     pub rates: Rates,
     /// Objects are detected from this distance on, m; infinite before anything is learned.
@@ -110,7 +112,7 @@ impl<'a> Model<'a> {
     /// A model of which nothing is learned yet: all detections may be clutter.
     #[must_use]
     pub fn new(scene: &'a Scene, noise: &'a Noise, settings: &'a Settings) -> Self {
-        let rays = scene.rays.rays.len();
+        let usable = scene.usable_rays();
         let spreads = spreads_of(scene, noise);
         let ln_angle: Vec<f64> =
             scene.box_px.iter().zip(&scene.scale2).map(|(&size, &scale2)| (size / scale2.sqrt()).ln()).collect();
@@ -118,9 +120,10 @@ impl<'a> Model<'a> {
         let solid_angle_sr = scene.solid_angle_sr();
         let classes = (0..count as u32)
             .map(|class| {
-                let of_class = || (0..rays).filter(|&ray| scene.rays.class[ray] == class);
+                let of_class = || usable.iter().map(|&ray| ray as usize).filter(|&ray| scene.rays.class[ray] == class);
                 let angles: Vec<f64> = of_class().map(|ray| ln_angle[ray]).filter(|angle| angle.is_finite()).collect();
                 ClassModel {
+                    detections: of_class().count(),
                     rates: Rates::GUESS,
                     nearest_m: f64::INFINITY,
                     odd_passes: ODD_PASSES.1,

@@ -89,13 +89,14 @@ pub fn level_of(image: u32) -> u32 {
 /// A place is everything within `radius_m` of an image; all rays where the scene is small.
 #[must_use]
 pub fn places(scene: &Scene, rays: usize, radius_m: f64) -> Vec<u32> {
-    let count = scene.rays.rays.len() as u32;
-    if count as usize <= rays {
-        return (0..count).collect();
+    let usable = scene.usable_rays();
+    if usable.len() <= rays {
+        return usable;
     }
+    let image_of = |ray: u32| scene.rays.image[ray as usize] as usize;
     let mut rays_of = vec![0_usize; scene.views.len()];
-    for &image in &scene.rays.image {
-        rays_of[image as usize] += 1;
+    for &ray in &usable {
+        rays_of[image_of(ray)] += 1;
     }
     let centers: Vec<Vector3<f64>> = scene.views.iter().map(|view| view.center).collect();
     let images = 0..scene.views.len() as u32;
@@ -117,7 +118,7 @@ pub fn places(scene: &Scene, rays: usize, radius_m: f64) -> Vec<u32> {
             }
         }
     }
-    (0..count).filter(|&ray| taken[scene.rays.image[ray as usize] as usize]).collect()
+    usable.into_iter().filter(|&ray| taken[image_of(ray)]).collect()
 }
 
 /// Images by the cube that they were taken in.

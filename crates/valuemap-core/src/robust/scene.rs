@@ -65,6 +65,12 @@ impl Scene {
         (2 * stated.len() > self.views.len()).then(|| *stated.select_nth_unstable_by(middle, f64::total_cmp).1)
     }
 
+    /// The rays, ascending, that propose and vote: detections whose camera has a ray for them, and that are no other's double.
+    #[must_use]
+    pub fn usable_rays(&self) -> Vec<u32> {
+        (0..self.rays.rays.len() as u32).filter(|&ray| self.ray(ray).is_usable()).collect()
+    }
+
     /// The image of a ray.
     #[inline]
     #[must_use]
