@@ -25,6 +25,7 @@ use super::estimate::is_one_visit;
 use super::looks::{Lookout, Seen};
 use super::model::{Model, Sizes};
 use super::scene::Scene;
+use super::sizes::size_terms;
 
 /// Residuals beyond this many sigmas count less, in proportion (Huber): 95 % efficient where errors are Gaussian at 1.35, more above.
 const HUBER_SIGMAS: f64 = 2.0;
@@ -75,7 +76,16 @@ struct Terms {
     information: Matrix3<f64>,
     gradient: Vector3<f64>,
     energy: f64,
+    /// Squares that the sizes of boxes add: they are judged by equation (4).
+    of_sizes: f64,
     chi2: Vec<f64>,
+}
+
+impl Terms {
+    /// What a step must not raise.
+    fn cost(&self) -> f64 {
+        self.energy + self.of_sizes
+    }
 }
 
 /// The position of an object, by damped Gauss-Newton with Huber's weights from a point nearby. Nothing if it is behind a voter, or if the
@@ -93,7 +103,7 @@ pub fn fit(model: &Model<'_>, votes: &[u32], start: Vector3<f64>) -> Option<Fit>
         }
         let better = (0..MAX_HALVINGS).find_map(|_| {
             let next =
-                terms(model, votes, &weights, &(point + step)).filter(|next| next.energy <= here.energy + LEAST_FALL);
+                terms(model, votes, &weights, &(point + step)).filter(|next| next.cost() <= here.cost() + LEAST_FALL);
             if next.is_none() {
                 step *= 0.25;
             }
@@ -123,6 +133,7 @@ fn terms(model: &Model<'_>, votes: &[u32], weights: &[f64], point: &Vector3<f64>
         information: Matrix3::zeros(),
         gradient: Vector3::zeros(),
         energy: 0.0,
+        of_sizes: 0.0,
         chi2: Vec::with_capacity(votes.len()),
     };
     for visit in visits(scene, votes) {
@@ -146,7 +157,12 @@ fn terms(model: &Model<'_>, votes: &[u32], weights: &[f64], point: &Vector3<f64>
             sum.energy += (HUBER_SIGMAS * chi2.sqrt() - HUBER_SIGMAS * HUBER_SIGMAS).max(0.0);
         }
     }
-    sum.energy.is_finite().then_some(sum)
+    if let Some(sizes) = size_terms(model, votes, point) {
+        sum.information += sizes.information;
+        sum.gradient += sizes.gradient;
+        sum.of_sizes = sizes.square;
+    }
+    sum.cost().is_finite().then_some(sum)
 }
 
 /// Votes in runs of one visit.

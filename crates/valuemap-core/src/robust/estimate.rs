@@ -8,8 +8,10 @@
 use nalgebra::{DMatrix, DVector, Matrix3, Vector2, Vector3};
 
 use super::drift::{Drive, Look, Normals, Vantage};
+use super::model::Model;
 use super::noise::Noise;
 use super::scene::{Scene, View};
+use super::sizes::size_terms;
 use super::spd::Vector6;
 
 /// Good enough while votes may still change, m.
@@ -115,6 +117,8 @@ pub struct Joint<'a> {
     pose_errors: Vec<Vector6>,
     points: Vec<Vector3<f64>>,
     care: Care,
+    /// What is learned about sizes, if boxes serve.
+    sizes: Option<&'a Model<'a>>,
 }
 
 /// Labels estimated together.
@@ -141,7 +145,13 @@ impl<'a> Joint<'a> {
         let pose_errors = vec![Vector6::zeros(); counted.len()];
         let vantages = counted.iter().map(|&((_, ray), _)| Vantage::of(scene, noise, ray)).collect();
         let (votes, weights) = counted.into_iter().unzip();
-        Self { scene, votes, vantages, weights, pose_errors, points, care }
+        Self { scene, votes, vantages, weights, pose_errors, points, care, sizes: None }
+    }
+
+    /// Let the sizes of boxes tell where labels are, too.
+    #[must_use]
+    pub fn with_sizes(self, model: &'a Model<'a>) -> Self {
+        Self { sizes: Some(model), ..self }
     }
 
     /// Estimate the positions. Labels without votes stay where they are.
@@ -279,7 +289,24 @@ impl<'a> Joint<'a> {
                 normals.add_gradient(label, &gradient);
             }
         }
+        self.add_sizes(&mut normals);
         Some(Evaluation { normals, of_visits, own, pose_errors })
+    }
+}
+
+impl Joint<'_> {
+    fn add_sizes(&self, normals: &mut Normals) {
+        let Some(model) = self.sizes else { return };
+        let mut votes: Vec<Vec<u32>> = vec![Vec::new(); self.points.len()];
+        for &(label, ray) in &self.votes {
+            votes[label].push(ray);
+        }
+        for (label, (votes, point)) in votes.iter().zip(&self.points).enumerate() {
+            if let Some(terms) = size_terms(model, votes, point) {
+                normals.add(label, label, &terms.information);
+                normals.add_gradient(label, &terms.gradient);
+            }
+        }
     }
 }
 

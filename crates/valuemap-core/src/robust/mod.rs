@@ -30,6 +30,7 @@ pub mod rearrange;
 pub mod repair;
 pub mod sample;
 pub mod scene;
+pub mod sizes;
 pub mod search;
 mod spd;
 

@@ -1,0 +1,63 @@
+//! What boxes say of depth: the boxes of one object have one physical size, so that each is as much larger as it is nearer.
+//!
+//! With the logarithms a of a box's angle, d of its depth and s of the object's size, `a + d - s` is an error of standard deviation
+//! `spread`, and s is one of those that the class has, of mean and standard deviation `object`. The size is marginalised: what is left tells
+//! where the object is by how large its boxes are. What the boxes of a visit get wrong they get wrong alike: they count as one.
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::energy::{size_of, visits};
+use super::model::Model;
+
+/// Sizes that disagree by more than this many standard deviations count less, in proportion (Huber): boxes are cut and hidden in part.
+const HUBER_SIGMAS: f64 = 2.0;
+
+/// Normal equations of a position by the sizes of its votes' boxes.
+#[derive(Debug, Clone, Copy)]
+pub struct SizeTerms {
+    /// Information, 1/m².
+    pub information: Matrix3<f64>,
+    /// Gradient of half the squares, 1/m.
+    pub gradient: Vector3<f64>,
+    /// Squared errors of the logarithms, in standard deviations.
+    pub square: f64,
+}
+
+/// What the boxes of votes of one object say about its position, linearised at a point; nothing where boxes tell nothing.
+#[must_use]
+pub fn size_terms(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> Option<SizeTerms> {
+    let sizes = model.class_of(*votes.first()?).sizes;
+    // Before sizes are learned, they prune and no more.
+    if !sizes.tell() || sizes.object.0.is_nan() {
+        return None;
+    }
+    let usual = size_of(model, votes, point);
+    let per_square = 1.0 / (sizes.spread * sizes.spread);
+    let (mean, of_prior) = (sizes.object.0, 1.0 / (sizes.object.1 * sizes.object.1));
+    let mut boxes: Vec<(f64, f64, Vector3<f64>)> = Vec::with_capacity(votes.len());
+    let looks = visits(model.scene, votes).flat_map(|visit| visit.iter().map(|&ray| (ray, visit.len() as f64)));
+    for (ray, together) in looks {
+        let cast = model.scene.ray(ray);
+        let depth_m = cast.project(point).z;
+        let size = model.ln_angle[ray as usize] + depth_m.ln();
+        if size.is_finite() {
+            let weight = (HUBER_SIGMAS * sizes.spread / (size - usual).abs()).min(1.0) * per_square / together;
+            boxes.push((weight, size, cast.residual_from_world.row(2).transpose() / depth_m));
+        }
+    }
+    let all = of_prior + boxes.iter().map(|(weight, ..)| weight).sum::<f64>();
+    let size = (mean * of_prior + boxes.iter().map(|(weight, size, _)| weight * size).sum::<f64>()) / all;
+    let away = size - mean;
+    let mut terms =
+        SizeTerms { information: Matrix3::zeros(), gradient: Vector3::zeros(), square: away * away * of_prior };
+    let mut pull = Vector3::zeros();
+    for (weight, of_box, by_point) in boxes {
+        let error = of_box - size;
+        terms.square += weight * error * error;
+        terms.gradient += by_point * (weight * error);
+        terms.information += by_point * by_point.transpose() * weight;
+        pull += by_point * weight;
+    }
+    terms.information -= pull * pull.transpose() / all;
+    Some(terms)
+}
