@@ -22,6 +22,7 @@ use rstar::primitives::GeomWithData;
 
 use super::drift::{Drive, Look};
 use super::estimate::is_one_visit;
+use super::heights::height_m;
 use super::looks::{Lookout, Seen};
 use super::model::{Model, Sizes};
 use super::scene::Scene;
@@ -76,15 +77,15 @@ struct Terms {
     information: Matrix3<f64>,
     gradient: Vector3<f64>,
     energy: f64,
-    /// Squares that the sizes of boxes add: they are judged by equation (4).
-    of_sizes: f64,
+    /// What sizes and heights add: they are judged by equations (2) and (4).
+    of_priors: f64,
     chi2: Vec<f64>,
 }
 
 impl Terms {
     /// What a step must not raise.
     fn cost(&self) -> f64 {
-        self.energy + self.of_sizes
+        self.energy + self.of_priors
     }
 }
 
@@ -133,7 +134,7 @@ fn terms(model: &Model<'_>, votes: &[u32], weights: &[f64], point: &Vector3<f64>
         information: Matrix3::zeros(),
         gradient: Vector3::zeros(),
         energy: 0.0,
-        of_sizes: 0.0,
+        of_priors: 0.0,
         chi2: Vec::with_capacity(votes.len()),
     };
     for visit in visits(scene, votes) {
@@ -160,9 +161,41 @@ fn terms(model: &Model<'_>, votes: &[u32], weights: &[f64], point: &Vector3<f64>
     if let Some(sizes) = size_terms(model, votes, point) {
         sum.information += sizes.information;
         sum.gradient += sizes.gradient;
-        sum.of_sizes = sizes.square;
+        sum.of_priors += sizes.square;
+    }
+    if let Some((ln_density, (information, gradient))) = height_terms(model, votes, point) {
+        sum.information += information;
+        sum.gradient += gradient;
+        sum.of_priors -= 2.0 * ln_density;
     }
     sum.cost().is_finite().then_some(sum)
+}
+
+/// Logarithm of the density of heights at a point, with information and gradient of its position; nothing before heights are learned.
+pub(super) fn height_terms(
+    model: &Model<'_>,
+    votes: &[u32],
+    point: &Vector3<f64>,
+) -> Option<(f64, (Matrix3<f64>, Vector3<f64>))> {
+    let heights = model.class_of(*votes.first()?).heights?;
+    let up = model.up?;
+    let height_m = height_m(model.scene, model.up, votes, point)?;
+    let (part, share) = heights.part_at(height_m)?;
+    let weight = share / (part.sigma_m * part.sigma_m + camera_m2(model, votes));
+    let (information, gradient) = (up * up.transpose() * weight, up * (weight * (height_m - part.mean_m)));
+    Some((heights.ln_density(height_m), (information, gradient)))
+}
+
+/// Variance of the mean position of the cameras of some votes, each axis, m²: heights are above where the cameras are said to be.
+fn camera_m2(model: &Model<'_>, votes: &[u32]) -> f64 {
+    let (mut sum, mut visits_count) = (0.0, 0.0_f64);
+    for visit in visits(model.scene, votes) {
+        let view = model.scene.view(visit[0]);
+        let (own, shared) = (model.noise.of_image(view).position_m, model.noise.shared(view).position_m);
+        sum += shared * shared + own * own / visit.len() as f64;
+        visits_count += 1.0;
+    }
+    sum / (visits_count * visits_count)
 }
 
 /// Votes in runs of one visit.
@@ -226,7 +259,7 @@ pub fn object(
     let (as_real, as_false) = seen.log_likelihoods(class);
     let most = as_real.max(as_false);
     let looks = most + ((as_real - most).exp() + (as_false - most).exp()).ln();
-    let energy = fit.energy + 2.0 * n * ln_2_pi - 3.0 * ln_2_pi - 2.0 * class.ln_births_per_m3
+    let energy = fit.energy + 2.0 * n * ln_2_pi - 3.0 * ln_2_pi - 2.0 * class.ln_births(height_m(model.scene, model.up, &votes, &fit.point))
         + 2.0 * (clutter - sizes - of_size - looks);
     let real = (as_real - looks).exp();
     energy.is_finite().then(|| Object {

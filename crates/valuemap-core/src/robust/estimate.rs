@@ -7,6 +7,7 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector2, Vector3};
 
+use super::energy::height_terms;
 use super::drift::{Drive, Look, Normals, Vantage};
 use super::model::Model;
 use super::noise::Noise;
@@ -117,8 +118,8 @@ pub struct Joint<'a> {
     pose_errors: Vec<Vector6>,
     points: Vec<Vector3<f64>>,
     care: Care,
-    /// What is learned about sizes, if boxes serve.
-    sizes: Option<&'a Model<'a>>,
+    /// What is learned about sizes and heights, if they serve.
+    model: Option<&'a Model<'a>>,
 }
 
 /// Labels estimated together.
@@ -145,13 +146,13 @@ impl<'a> Joint<'a> {
         let pose_errors = vec![Vector6::zeros(); counted.len()];
         let vantages = counted.iter().map(|&((_, ray), _)| Vantage::of(scene, noise, ray)).collect();
         let (votes, weights) = counted.into_iter().unzip();
-        Self { scene, votes, vantages, weights, pose_errors, points, care, sizes: None }
+        Self { scene, votes, vantages, weights, pose_errors, points, care, model: None }
     }
 
-    /// Let the sizes of boxes tell where labels are, too.
+    /// Let sizes and heights tell where labels are, too.
     #[must_use]
-    pub fn with_sizes(self, model: &'a Model<'a>) -> Self {
-        Self { sizes: Some(model), ..self }
+    pub fn with_priors(self, model: &'a Model<'a>) -> Self {
+        Self { model: Some(model), ..self }
     }
 
     /// Estimate the positions. Labels without votes stay where they are.
@@ -289,14 +290,14 @@ impl<'a> Joint<'a> {
                 normals.add_gradient(label, &gradient);
             }
         }
-        self.add_sizes(&mut normals);
+        self.add_priors(&mut normals);
         Some(Evaluation { normals, of_visits, own, pose_errors })
     }
 }
 
 impl Joint<'_> {
-    fn add_sizes(&self, normals: &mut Normals) {
-        let Some(model) = self.sizes else { return };
+    fn add_priors(&self, normals: &mut Normals) {
+        let Some(model) = self.model else { return };
         let mut votes: Vec<Vec<u32>> = vec![Vec::new(); self.points.len()];
         for &(label, ray) in &self.votes {
             votes[label].push(ray);
@@ -305,6 +306,10 @@ impl Joint<'_> {
             if let Some(terms) = size_terms(model, votes, point) {
                 normals.add(label, label, &terms.information);
                 normals.add_gradient(label, &terms.gradient);
+            }
+            if let Some((_, (information, gradient))) = height_terms(model, votes, point) {
+                normals.add(label, label, &information);
+                normals.add_gradient(label, &gradient);
             }
         }
     }

@@ -31,7 +31,7 @@ pub fn finish(model: &Model<'_>, objects: &[Object]) -> Vec<Estimate> {
 /// Objects that cannot be estimated together are estimated one by one.
 fn together(model: &Model<'_>, objects: &[Object], place: &[usize], contest: &Contest<'_>) -> Vec<(usize, Estimate)> {
     let starts = place.iter().map(|&i| Start { voters: &objects[i].votes, weights: &[], point: objects[i].fit.point });
-    let Some(solution) = Joint::new(model.scene, model.noise, starts, Care::Exact).with_sizes(model).solve() else {
+    let Some(solution) = Joint::new(model.scene, model.noise, starts, Care::Exact).with_priors(model).solve() else {
         if place.len() == 1 {
             return Vec::new();
         }

@@ -1,6 +1,7 @@
 //! What a map tells about each class: how often its objects are detected, how large they are, how much clutter there is.
 
 use super::energy::{Object, implied_size};
+use super::heights::{Heights, ground_m2 as ground_m2_within, height_m};
 use super::looks::Looks;
 use super::model::{ClassModel, FALSE_SHARE, Model, ODD_PASSES, Rates};
 
@@ -18,6 +19,7 @@ const LEAST_SPREAD: f64 = 0.03;
 /// Learn the classes of a model from the objects of its map.
 pub fn learn(model: &mut Model<'_>, objects: &[Object]) {
     let solid_angle_sr = model.scene.solid_angle_sr();
+    let ground_m2 = ground_m2(model, objects);
     for class in 0..model.classes.len() as u32 {
         let of_class: Vec<&Object> = objects.iter().filter(|object| object.class == class).collect();
         let votes: usize = of_class.iter().map(|object| object.votes.len()).sum();
@@ -35,19 +37,50 @@ pub fn learn(model: &mut Model<'_>, objects: &[Object]) {
             let (spread, object) = sizes(model, &sure);
             learned.sizes.spread = spread.max(LEAST_SPREAD);
             learned.sizes.object = (object.0, object.1.max(learned.sizes.spread));
+            learned.heights = heights(model, &sure);
+            learned.ln_births_per_m2 = (of_class.len() as f64 / ground_m2).ln();
         }
         model.classes[class as usize] = learned;
     }
 }
 
+/// The ground from which objects are seen, m²: as far from the cameras as all but few votes are; nothing where nobody knows what is up.
+fn ground_m2(model: &Model<'_>, objects: &[Object]) -> f64 {
+    let sure: Vec<&Object> = objects.iter().filter(|object| object.votes.len() >= MIN_VOTES).collect();
+    let mut distances = distances_m(model, &sure);
+    let place = (distances.len() as f64 * (1.0 - NEAR_VOTES)) as usize;
+    match model.up {
+        Some(up) if place < distances.len() => {
+            ground_m2_within(model.scene, &up, *distances.select_nth_unstable_by(place, f64::total_cmp).1)
+        }
+        _ => f64::NAN,
+    }
+}
+
+/// How high objects are above the cameras.
+fn heights(model: &Model<'_>, objects: &[&Object]) -> Option<Heights> {
+    let up = model.up?;
+    let of_object = |object: &&Object| {
+        let height_m = height_m(model.scene, model.up, &object.votes, &object.fit.point)?;
+        Some((height_m, up.dot(&(object.fit.covariance * up)).sqrt()))
+    };
+    let (heights_m, sigmas_m): (Vec<f64>, Vec<f64>) = objects.iter().filter_map(of_object).unzip();
+    Heights::learn(&heights_m, &sigmas_m, model.settings.viability.max_range_m)
+}
+
 /// The distance from which on all but a few votes are cast, m.
 fn nearest_m(model: &Model<'_>, objects: &[&Object]) -> f64 {
-    let distances = |object: &&Object| -> Vec<f64> {
-        object.votes.iter().map(|&ray| (model.scene.ray(ray).center - object.fit.point).norm()).collect()
-    };
-    let mut distances: Vec<f64> = objects.iter().flat_map(distances).collect();
+    let mut distances = distances_m(model, objects);
     let place = (distances.len() as f64 * NEAR_VOTES) as usize;
     *distances.select_nth_unstable_by(place, f64::total_cmp).1
+}
+
+/// How far all votes are from their objects, m.
+fn distances_m(model: &Model<'_>, objects: &[&Object]) -> Vec<f64> {
+    let of_object = |object: &&Object| -> Vec<f64> {
+        object.votes.iter().map(|&ray| (model.scene.ray(ray).center - object.fit.point).norm()).collect()
+    };
+    objects.iter().flat_map(of_object).collect()
 }
 
 /// The spread of the sizes of one object, and mean and standard deviation of those of all.

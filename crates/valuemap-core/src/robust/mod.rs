@@ -15,6 +15,7 @@ pub mod drift;
 pub mod energy;
 pub mod estimate;
 pub mod finish;
+pub mod heights;
 pub mod index;
 pub mod initial;
 pub mod keyframes;

@@ -6,6 +6,9 @@
 use std::f64::consts::PI;
 use std::sync::Arc;
 
+use nalgebra::Vector3;
+
+use super::heights::{Heights, up_of};
 use super::noise::{Noise, Spread};
 use super::scene::Scene;
 use super::{Settings, spreads_of};
@@ -27,8 +30,23 @@ pub struct ClassModel {
     pub ln_clutter_per_sr: f64,
     /// Logarithm of the density of objects, 1/m³.
     pub ln_births_per_m3: f64,
+    /// Logarithm of the density of objects on the ground, 1/m², where heights are known.
+    pub ln_births_per_m2: f64,
+    /// How high objects are; nothing before anything is learned.
+    pub heights: Option<Heights>,
     /// How large detections are.
     pub sizes: Sizes,
+}
+
+impl ClassModel {
+    /// Logarithm of the density of objects at a height above the cameras, m, 1/m³.
+    #[must_use]
+    pub fn ln_births(&self, height_m: Option<f64>) -> f64 {
+        match (&self.heights, height_m) {
+            (Some(heights), Some(height_m)) => self.ln_births_per_m2 + heights.ln_density(height_m),
+            _ => self.ln_births_per_m3,
+        }
+    }
 }
 
 /// How often an object is detected: a share of the looks that differs from pass to pass, a beta distribution.
@@ -98,6 +116,8 @@ pub struct Model<'a> {
     pub scene: &'a Scene,
     /// Errors of poses and detections.
     pub noise: &'a Noise,
+    /// What is up in the world, if the cameras tell.
+    pub up: Option<Vector3<f64>>,
     /// All errors of each ray together.
     pub spreads: Arc<Vec<Spread>>,
     /// Logarithm of the angle that each ray's box spans, rad; not finite where it has no box.
@@ -130,11 +150,13 @@ impl<'a> Model<'a> {
                     false_share: FALSE_SHARE.1,
                     ln_clutter_per_sr: (of_class().count().max(1) as f64 / solid_angle_sr).ln(),
                     ln_births_per_m3: -3.0 * settings.viability.max_range_m.ln(),
+                    ln_births_per_m2: f64::NAN,
+                    heights: None,
                     sizes: Sizes::guess(mean_and_sd(&angles)),
                 }
             })
             .collect();
-        Self { scene, noise, spreads: Arc::new(spreads), ln_angle, classes, settings }
+        Self { scene, noise, up: up_of(scene), spreads: Arc::new(spreads), ln_angle, classes, settings }
     }
 
     /// What is learned about the class of a ray.

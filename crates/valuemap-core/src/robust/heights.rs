@@ -1,0 +1,185 @@
+//! How high objects of a class are above the cameras: what narrows down where one is that was hardly seen.
+//!
+//! Lights hang on masts and stand on poles: a mixture of few normal distributions, learned from the objects that many images fix, as many
+//! as the Bayesian information criterion (Schwarz, 1978) asks for; and a share of objects that are anywhere.
+
+use std::f64::consts::PI;
+
+use nalgebra::{Rotation3, Vector3};
+use rustc_hash::FxHashSet;
+
+use super::scene::Scene;
+use crate::robust::sample::cell_of;
+
+/// Normal distributions that are tried, at most.
+const MOST_PARTS: usize = 3;
+/// Rounds of expectation and maximisation, at most.
+const ROUNDS: usize = 50;
+/// The share of objects that are anywhere: on bridges, on hills. As of sizes that are odd by chance (model.rs).
+const ELSEWHERE: f64 = 0.05;
+
+/// A normal distribution among others.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Part {
+    /// Its share of the objects.
+    pub share: f64,
+    /// Its mean, m.
+    pub mean_m: f64,
+    /// Its standard deviation, m.
+    pub sigma_m: f64,
+}
+
+/// The heights of the objects of a class above the cameras that see them.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Heights {
+    /// The distributions; their shares add up to 1, those of the last may be 0.
+    pub parts: [Part; MOST_PARTS],
+    /// Logarithm of the density of what is anywhere, 1/m.
+    ln_elsewhere: f64,
+}
+
+impl Heights {
+    /// Those of some objects, m, each known with a standard deviation, m; what is anywhere is within `range_m` of the cameras. Nothing of no objects.
+    #[must_use]
+    pub fn learn(heights_m: &[f64], sigmas_m: &[f64], range_m: f64) -> Option<Self> {
+        let floor_m = median(sigmas_m)?;
+        let ln_elsewhere = ELSEWHERE.ln() - (2.0 * range_m).ln();
+        let of_parts = (1..=MOST_PARTS).map(|count| {
+            let heights = Self { parts: parts(heights_m, count, floor_m), ln_elsewhere };
+            let likelihood: f64 = heights_m.iter().map(|&height| heights.ln_density(height)).sum();
+            let parameters = (3 * count - 1) as f64;
+            (parameters * (heights_m.len() as f64).ln() - 2.0 * likelihood, heights)
+        });
+        of_parts.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, heights)| heights)
+    }
+
+    /// Logarithm of the density at a height, 1/m.
+    #[must_use]
+    pub fn ln_density(&self, height_m: f64) -> f64 {
+        let of_parts: f64 = self.parts.iter().map(|part| part.share * part.density(height_m)).sum();
+        ((1.0 - ELSEWHERE) * of_parts + self.ln_elsewhere.exp()).ln()
+    }
+
+    /// The distribution that a height is most probably of, and how probably it is of any.
+    #[must_use]
+    pub fn part_at(&self, height_m: f64) -> Option<(Part, f64)> {
+        let weighted = |part: &Part| part.share * part.density(height_m);
+        let part = self.parts.iter().max_by(|a, b| weighted(a).total_cmp(&weighted(b)))?;
+        let of_part = (1.0 - ELSEWHERE) * weighted(part);
+        Some((*part, of_part / self.ln_density(height_m).exp()))
+    }
+}
+
+impl Part {
+    fn density(&self, height_m: f64) -> f64 {
+        let away = (height_m - self.mean_m) / self.sigma_m;
+        (-0.5 * away * away).exp() / (self.sigma_m * (2.0 * PI).sqrt())
+    }
+}
+
+/// The mixture of `count` distributions that makes some heights most likely, begun at their quantiles.
+fn parts(heights_m: &[f64], count: usize, floor_m: f64) -> [Part; MOST_PARTS] {
+    let mut sorted = heights_m.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let quantile = |q: f64| sorted[((sorted.len() as f64 * q) as usize).min(sorted.len() - 1)];
+    let width = (quantile(0.9) - quantile(0.1)).max(floor_m) / count as f64;
+    let mut parts = [Part { share: 0.0, mean_m: quantile(0.5), sigma_m: width.max(floor_m) }; MOST_PARTS];
+    for (i, part) in parts.iter_mut().enumerate().take(count) {
+        (part.share, part.mean_m) = (1.0 / count as f64, quantile((i as f64 + 0.5) / count as f64));
+    }
+    for _ in 0..ROUNDS {
+        let before = parts;
+        let total: Vec<f64> = heights_m
+            .iter()
+            .map(|&height| before.iter().map(|part| part.share * part.density(height)).sum::<f64>() + f64::MIN_POSITIVE)
+            .collect();
+        for (part, old) in parts.iter_mut().zip(&before).take(count) {
+            let weights: Vec<f64> =
+                heights_m.iter().zip(&total).map(|(&height, total)| old.share * old.density(height) / total).collect();
+            let sum = weights.iter().sum::<f64>().max(f64::MIN_POSITIVE);
+            let mean_m = heights_m.iter().zip(&weights).map(|(height, weight)| height * weight).sum::<f64>() / sum;
+            let of_square = |(height, weight): (&f64, &f64)| weight * (height - mean_m).powi(2);
+            let variance = heights_m.iter().zip(&weights).map(of_square).sum::<f64>() / sum;
+            *part = Part { share: sum / heights_m.len() as f64, mean_m, sigma_m: variance.sqrt().max(floor_m) };
+        }
+        if parts.iter().zip(&before).all(|(new, old)| (new.mean_m - old.mean_m).abs() < 1e-3 * floor_m) {
+            break;
+        }
+    }
+    parts
+}
+
+/// How high a point is above the cameras of some rays, m: the nearest count most, roads go up and down. Nothing where nobody knows what is up.
+#[must_use]
+pub fn height_m(scene: &Scene, up: Option<Vector3<f64>>, votes: &[u32], point: &Vector3<f64>) -> Option<f64> {
+    let up = up?;
+    let (mut sum, mut all) = (0.0, 0.0);
+    for &ray in votes {
+        let away = point - scene.ray(ray).center;
+        let weight = 1.0 / away.norm_squared();
+        sum += weight * away.dot(&up);
+        all += weight;
+    }
+    Some(sum / all).filter(|height| height.is_finite())
+}
+
+/// What is up: against where the pictures' columns point, on average, if they agree.
+#[must_use]
+pub fn up_of(scene: &Scene) -> Option<Vector3<f64>> {
+    /// Cosine of 25 degrees, about: cameras that are held askew by more say nothing.
+    const AGREEING: f64 = 0.9;
+    let sum: Vector3<f64> = scene.views.iter().map(|view| -view.cam_from_world.row(1).transpose()).sum();
+    let mean = sum / scene.views.len().max(1) as f64;
+    (mean.norm() > AGREEING).then(|| mean.normalize())
+}
+
+/// The ground within a distance of any camera, m², in cells of a quarter of the distance.
+#[must_use]
+pub fn ground_m2(scene: &Scene, up: &Vector3<f64>, distance_m: f64) -> f64 {
+    const CELLS: i64 = 4;
+    let side_m = distance_m / CELLS as f64;
+    let level = Rotation3::rotation_between(up, &Vector3::z()).unwrap_or_else(Rotation3::identity);
+    let places: FxHashSet<[i64; 2]> = scene
+        .views
+        .iter()
+        .map(|view| {
+            let [x, y, _] = cell_of(&(level * view.center), side_m);
+            [x, y]
+        })
+        .collect();
+    let around: Vec<[i64; 2]> = (-CELLS..=CELLS)
+        .flat_map(|x| (-CELLS..=CELLS).map(move |y| [x, y]))
+        .filter(|[x, y]| x * x + y * y <= CELLS * CELLS)
+        .collect();
+    let cells: FxHashSet<[i64; 2]> =
+        places.iter().flat_map(|[x, y]| around.iter().map(move |[dx, dy]| [x + dx, y + dy])).collect();
+    cells.len() as f64 * side_m * side_m
+}
+
+fn median(values: &[f64]) -> Option<f64> {
+    let mut values: Vec<f64> = values.iter().copied().filter(|value| value.is_finite()).collect();
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn masts_and_poles_are_told_apart() {
+        let heights: Vec<f64> =
+            (0..60).map(|i| if i % 3 == 0 { 5.0 } else { 2.0 } + f64::from(i % 7) * 0.1 - 0.3).collect();
+        let learned = Heights::learn(&heights, &[0.05; 60], 50.0);
+        let means: Vec<f64> = learned
+            .iter()
+            .flat_map(|learned| learned.parts)
+            .filter(|part| part.share > 0.0)
+            .map(|part| part.mean_m)
+            .collect();
+        assert_eq!(means.len(), 2);
+        assert!((means[0].min(means[1]) - 2.0).abs() < 0.2 && (means[0].max(means[1]) - 5.0).abs() < 0.2);
+        let density = |height: f64| learned.as_ref().map_or(0.0, |learned| learned.ln_density(height));
+        assert!(density(2.0) > density(3.5) + 3.0 && density(3.5) > density(30.0) - 1e-9);
+    }
+}
