@@ -59,6 +59,7 @@ class Scene:
         rays: Rays,
         *,
         box_px: _Floats,
+        score: _Floats,
         range_m: _Floats,
         range_sigma_m: _Floats,
         center_in_world_m: _Floats,

@@ -78,6 +78,7 @@ class Scene:
         return _core.Scene(
             self._rays.core,
             box_px=np.ascontiguousarray(detections.size_px[:, 1]),
+            score=_or_nan(detections.score, len(detections)),
             range_m=_or_nan(detections.range_m, len(detections)),
             range_sigma_m=_or_nan(detections.range_sigma_m, len(detections)),
             center_in_world_m=center_in_world_m,

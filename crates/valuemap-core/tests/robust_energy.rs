@@ -309,6 +309,7 @@ fn only(scene: &Scene, kept: &[u32]) -> Scene {
     rays.class = kept.iter().map(|&ray| scene.rays.class[ray as usize]).collect();
     part.scale2 = of(&scene.scale2);
     part.box_px = of(&scene.box_px);
+    part.score = of(&scene.score);
     part.range_m = of(&scene.range_m);
     part.range_sigma_m = of(&scene.range_sigma_m);
     part

@@ -25,12 +25,13 @@ pub struct Scene(CoreScene);
 #[pymethods]
 impl Scene {
     #[new]
-    #[pyo3(signature = (rays, *, box_px, range_m, range_sigma_m, center_in_world_m, cam_from_world, camera, pass_code,
+    #[pyo3(signature = (rays, *, box_px, score, range_m, range_sigma_m, center_in_world_m, cam_from_world, camera, pass_code,
         viewpoint, driven_m, position_sigma_m, rotation_sigma_rad, frustum_normals, solid_angle_sr))]
     #[allow(clippy::too_many_arguments)] // The columns by name, as Python sees them.
     fn new(
         rays: &Rays,
         box_px: PyReadonlyArray1<'_, f64>,
+        score: PyReadonlyArray1<'_, f64>,
         range_m: PyReadonlyArray1<'_, f64>,
         range_sigma_m: PyReadonlyArray1<'_, f64>,
         center_in_world_m: PyReadonlyArray2<'_, f64>,
@@ -81,6 +82,7 @@ impl Scene {
         check_length("box_px", box_px.len(), core.rays.len())?;
         check_length("range_m", range_m.len(), core.rays.len())?;
         check_length("range_sigma_m", range_sigma_m.len(), core.rays.len())?;
+        check_length("score", score.as_slice()?.len(), core.rays.len())?;
         check_finite("box_px", box_px)?;
         check_not_infinite("range_m", range_m)?;
         check_not_infinite("range_sigma_m", range_sigma_m)?;
@@ -108,6 +110,7 @@ impl Scene {
             scale2: rays.core().rays.iter().map(valuemap_core::ray::Ray::pixels_per_unit2).collect(),
             rays: Arc::clone(rays.core()),
             box_px: box_px.to_vec(),
+            score: score.as_slice()?.to_vec(),
             range_m: range_m.to_vec(),
             range_sigma_m: range_sigma_m.to_vec(),
             views,

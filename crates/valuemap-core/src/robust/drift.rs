@@ -578,7 +578,8 @@ impl Leg {
         let information = Inverse::of(&(self.information + Matrix6::identity() * (keep * tie)))?;
         let inverse = information.matrix;
         let by_gradient = product(&inverse, &self.gradient);
-        let by_cross: Vec<(usize, Matrix3x6)> = self.cross.iter().map(|(a, cross)| (*a, product(cross, &inverse))).collect();
+        let by_cross: Vec<(usize, Matrix3x6)> =
+            self.cross.iter().map(|(a, cross)| (*a, product(cross, &inverse))).collect();
         for (i, (a, of_a)) in by_cross.iter().enumerate() {
             normals.add_gradient(*a, &-product(of_a, &self.gradient));
             for (b, of_b) in &self.cross[..i] {

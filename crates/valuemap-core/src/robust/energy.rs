@@ -252,14 +252,16 @@ pub fn object(
         .iter()
         .map(|&ray| {
             let depth_m = model.scene.ray(ray).project(&fit.point).z;
-            class.sizes.log_ratio(model.ln_angle[ray as usize], depth_m, ln_size)
+            class.sizes.log_ratio(model.ln_angle[ray as usize], depth_m, ln_size) + model.ln_score_ratio(ray)
         })
         .sum();
     let of_size = prior_of_size(&class.sizes, ln_size);
     let (as_real, as_false) = seen.log_likelihoods(class);
     let most = as_real.max(as_false);
     let looks = most + ((as_real - most).exp() + (as_false - most).exp()).ln();
-    let energy = fit.energy + 2.0 * n * ln_2_pi - 3.0 * ln_2_pi - 2.0 * class.ln_births(height_m(model.scene, model.up, &votes, &fit.point))
+    let energy = fit.energy + 2.0 * n * ln_2_pi
+        - 3.0 * ln_2_pi
+        - 2.0 * class.ln_births(height_m(model.scene, model.up, &votes, &fit.point))
         + 2.0 * (clutter - sizes - of_size - looks);
     let real = (as_real - looks).exp();
     energy.is_finite().then(|| Object {

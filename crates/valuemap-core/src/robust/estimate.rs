@@ -7,8 +7,8 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector2, Vector3};
 
-use super::energy::height_terms;
 use super::drift::{Drive, Look, Normals, Vantage};
+use super::energy::height_terms;
 use super::model::Model;
 use super::noise::Noise;
 use super::scene::{Scene, View};

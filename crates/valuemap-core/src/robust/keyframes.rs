@@ -63,6 +63,7 @@ impl Keyframes {
             }),
             scale2: of_rays(&scene.scale2),
             box_px: of_rays(&scene.box_px),
+            score: of_rays(&scene.score),
             range_m: of_rays(&scene.range_m),
             range_sigma_m: of_rays(&scene.range_sigma_m),
             views: images.iter().map(|&image| scene.views[image as usize]).collect(),

@@ -1,5 +1,6 @@
 //! What a map tells about each class: how often its objects are detected, how large they are, how much clutter there is.
 
+use super::clutter::{elevation_factor, score_ratio};
 use super::energy::{Object, implied_size};
 use super::heights::{Heights, ground_m2 as ground_m2_within, height_m};
 use super::looks::Looks;
@@ -16,19 +17,29 @@ const MAD_OF_NORMAL: f64 = 0.6745;
 /// A spread of sizes is no smaller: boxes are whole pixels, and edges are not the same all around.
 const LEAST_SPREAD: f64 = 0.03;
 
-/// Learn the classes of a model from the objects of its map.
-pub fn learn(model: &mut Model<'_>, objects: &[Object]) {
-    let solid_angle_sr = model.scene.solid_angle_sr();
+/// Learn the classes of a model from the objects that some rays make.
+pub fn learn(model: &mut Model<'_>, rays: &[u32], objects: &[Object]) {
+    let solid_angle_sr = model.solid_angle_sr(rays.len());
     let ground_m2 = ground_m2(model, objects);
+    let mut is_vote = vec![false; model.scene.rays.rays.len()];
+    objects.iter().flat_map(|object| &object.votes).for_each(|&ray| is_vote[ray as usize] = true);
+    let looked_at = span(&model.sin_elevation);
     for class in 0..model.classes.len() as u32 {
         let of_class: Vec<&Object> = objects.iter().filter(|object| object.class == class).collect();
-        let votes: usize = of_class.iter().map(|object| object.votes.len()).sum();
         let is_sure = |object: &&Object| object.votes.len() >= MIN_VOTES && object.real > 0.5;
         let sure: Vec<&Object> = of_class.iter().copied().filter(is_sure).collect();
         let before = model.classes[class as usize];
         // One detection more than is seen: no clutter at all is never known for sure.
-        let ln_clutter_per_sr = ((before.detections - votes + 1) as f64 / solid_angle_sr).ln();
+        let (in_class, clutter): (Vec<u32>, Vec<u32>) = rays
+            .iter()
+            .copied()
+            .filter(|&ray| model.scene.rays.class[ray as usize] == class)
+            .partition(|&ray| is_vote[ray as usize]);
+        let ln_clutter_per_sr = ((clutter.len() + 1) as f64 / solid_angle_sr).ln();
         let mut learned = ClassModel { ln_clutter_per_sr, ..before };
+        let of = |column: &[f64], rays: &[u32]| rays.iter().map(|&ray| column[ray as usize]).collect::<Vec<f64>>();
+        learned.score_ratio = score_ratio(&of(&model.scene.score, &in_class), &of(&model.scene.score, &clutter));
+        learned.clutter_by_elevation = elevation_factor(&of(&model.sin_elevation, &clutter), looked_at);
         if sure.len() >= MIN_OBJECTS {
             (learned.rates, learned.odd_passes) = rates(&sure, &before);
             let false_share = of_class.iter().map(|object| 1.0 - object.real).sum::<f64>() / of_class.len() as f64;
@@ -66,6 +77,13 @@ fn heights(model: &Model<'_>, objects: &[&Object]) -> Option<Heights> {
     };
     let (heights_m, sigmas_m): (Vec<f64>, Vec<f64>) = objects.iter().filter_map(of_object).unzip();
     Heights::learn(&heights_m, &sigmas_m, model.settings.viability.max_range_m)
+}
+
+/// The least and the greatest of some numbers, those that are not numbers aside.
+fn span(numbers: &[f64]) -> (f64, f64) {
+    numbers
+        .iter()
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(least, most), &number| (least.min(number), most.max(number)))
 }
 
 /// The distance from which on all but a few votes are cast, m.

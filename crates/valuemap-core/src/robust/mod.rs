@@ -10,6 +10,7 @@
 pub mod assign;
 pub mod births;
 pub mod calibrate;
+pub mod clutter;
 pub mod contest;
 pub mod drift;
 pub mod energy;
@@ -31,8 +32,8 @@ pub mod rearrange;
 pub mod repair;
 pub mod sample;
 pub mod scene;
-pub mod sizes;
 pub mod search;
+pub mod sizes;
 mod spd;
 
 use crate::hypothesis::Viability;
@@ -145,8 +146,7 @@ pub fn self_calibrate(
         let begun = initial::labels_of_few(&model, rays, progress)?;
         let objects = search(&mut model, rays, begun, Depth::Shallow, &mut Tally::default(), progress)?;
         let again = calibrate::calibrate(scene, noise, &placed(&objects), known);
-        let l = likelihood(&model, &objects, rays); if std::env::var("VM_DBG").is_ok() { eprintln!("L {l:.1} objects {} votes {} rays {} of {noise:?}", objects.len(), objects.iter().map(|o| o.votes.len()).sum::<usize>(), rays.len()); }
-        Ok((l, again))
+        Ok((likelihood(&model, &objects, rays), again))
     };
     // From each start one step; from the likeliest the others.
     let few = sample::places(scene, CALIBRATION_RAYS.0, settings.viability.max_range_m);
@@ -206,7 +206,7 @@ fn likelihood(model: &Model<'_>, objects: &[Object], rays: &[u32]) -> f64 {
         let here = || objects.iter().filter(|object| object.class as usize == class);
         let votes: usize = here().map(|object| object.votes.len()).sum();
         let clutter = of_class().count() - votes;
-        let ln_clutter = ((clutter + 1) as f64 / scene.solid_angle_sr()).ln();
+        let ln_clutter = ((clutter + 1) as f64 / model.solid_angle_sr(rays.len())).ln();
         let change = ln_clutter - model.classes[class].ln_clutter_per_sr;
         let all: f64 = of_class().map(|&ray| -2.0 * (model.ln_clutter_per_px2(ray) + change)).sum();
         all + here().map(|object| object.energy + 2.0 * change * object.votes.len() as f64).sum::<f64>()
@@ -282,7 +282,7 @@ pub fn objects_of(
     let lookout = Lookout::new(scene, settings.viability.max_range_m);
     let objects: Vec<Object> =
         begun.into_iter().filter_map(|(votes, point)| object(&model, &lookout, votes, point, Vec::new())).collect();
-    learn(&mut model, &objects);
+    learn(&mut model, &rays, &objects);
     let index = RayIndex::new(scene, &model.spreads, settings.gate_sigmas, rays.into_iter());
     let claims = assign::claims_of_all(&model, &index, &objects, progress)?;
     let again = |(o, claims): (Object, Vec<assign::Claim>)| {

@@ -8,10 +8,12 @@ use std::sync::Arc;
 
 use nalgebra::Vector3;
 
+use super::clutter::Steps;
 use super::heights::{Heights, up_of};
 use super::noise::{Noise, Spread};
 use super::scene::Scene;
 use super::{Settings, spreads_of};
+use crate::ray::Ray;
 
 /// What is learned about the objects and the clutter of one class.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -34,6 +36,10 @@ pub struct ClassModel {
     pub ln_births_per_m2: f64,
     /// How high objects are; nothing before anything is learned.
     pub heights: Option<Heights>,
+    /// How much denser clutter is at some sines of elevation, in logarithms.
+    pub clutter_by_elevation: Steps,
+    /// How much more probable votes have a score than clutter has, in logarithms.
+    pub score_ratio: Steps,
     /// How large detections are.
     pub sizes: Sizes,
 }
@@ -122,6 +128,8 @@ pub struct Model<'a> {
     pub spreads: Arc<Vec<Spread>>,
     /// Logarithm of the angle that each ray's box spans, rad; not finite where it has no box.
     pub ln_angle: Vec<f64>,
+    /// Sine of each ray's elevation; not a number where nobody knows what is up.
+    pub sin_elevation: Vec<f64>,
     /// What is learned, by class.
     pub classes: Vec<ClassModel>,
     /// Settings of the run.
@@ -151,12 +159,24 @@ impl<'a> Model<'a> {
                     ln_clutter_per_sr: (of_class().count().max(1) as f64 / solid_angle_sr).ln(),
                     ln_births_per_m3: -3.0 * settings.viability.max_range_m.ln(),
                     ln_births_per_m2: f64::NAN,
+                    clutter_by_elevation: Steps::NONE,
+                    score_ratio: Steps::NONE,
                     heights: None,
                     sizes: Sizes::guess(mean_and_sd(&angles)),
                 }
             })
             .collect();
-        Self { scene, noise, up: up_of(scene), spreads: Arc::new(spreads), ln_angle, classes, settings }
+        let up = up_of(scene);
+        let sin_elevation = |ray: &Ray| up.map_or(f64::NAN, |up| up.dot(&ray.direction));
+        let sin_elevation = scene.rays.rays.iter().map(sin_elevation).collect();
+        Self { scene, noise, up, spreads: Arc::new(spreads), ln_angle, sin_elevation, classes, settings }
+    }
+
+    /// What the cameras look at where some of the rays were found, sr: as large a part of all.
+    #[must_use]
+    pub fn solid_angle_sr(&self, rays: usize) -> f64 {
+        let all: usize = self.classes.iter().map(|class| class.detections).sum();
+        self.scene.solid_angle_sr() * rays as f64 / all.max(1) as f64
     }
 
     /// What is learned about the class of a ray.
@@ -173,6 +193,13 @@ impl<'a> Model<'a> {
         self.class_of(ray).ln_clutter_per_sr - self.scene.scale2[ray as usize].ln()
     }
 
+    /// How much more probable, in logarithms, a vote has the score of a ray than clutter has.
+    #[inline]
+    #[must_use]
+    pub fn ln_score_ratio(&self, ray: u32) -> f64 {
+        self.class_of(ray).score_ratio.at(self.scene.score[ray as usize])
+    }
+
     /// How much more probable, in logarithms, a detection is as a vote than as clutter, if its object, of size `ln_size`, is where the
     /// residual has a squared length of `chi2` sigmas with a covariance of determinant `px4`.
     #[inline]
@@ -181,6 +208,7 @@ impl<'a> Model<'a> {
         let class = self.class_of(ray);
         -0.5 * (chi2 + px4.ln()) - (2.0 * PI).ln() - self.ln_clutter_per_px2(ray)
             + class.sizes.log_ratio(self.ln_angle[ray as usize], depth_m, ln_size)
+            + self.ln_score_ratio(ray)
             + class.rates.log_odds()
     }
 }

@@ -15,6 +15,8 @@ pub struct Scene {
     pub scale2: Vec<f64>,
     /// Size of each ray's box, px (geometric mean of width and height).
     pub box_px: Vec<f64>,
+    /// Score of each ray's detection; NaN where there is none.
+    pub score: Vec<f64>,
     /// Measured range of each ray, m; NaN where there is none.
     pub range_m: Vec<f64>,
     /// Standard deviation of that range, m.

@@ -54,7 +54,7 @@ pub fn search(
     let (mut tried, mut tried_pairs) = (Tried::default(), TriedPairs::default());
     let rounds = if depth == Depth::Deep { ROUNDS } else { 1 };
     for round in 0..rounds {
-        learn(model, &objects);
+        learn(model, rays, &objects);
         let model: &Model<'_> = model;
         let again = |o: Object| object(model, &lookout, o.votes, o.fit.point, o.others);
         objects = objects.into_par_iter().filter_map(again).filter(|object| object.energy < 0.0).collect();

@@ -75,6 +75,7 @@ pub fn street(images: usize, spacing_m: f64, objects: &[Vector3<f64>], errors_px
     Scene {
         scale2: vec![FOCAL_PX * FOCAL_PX; count],
         box_px: vec![20.0; count],
+        score: vec![f64::NAN; count],
         range_m: vec![f64::NAN; count],
         range_sigma_m: vec![f64::NAN; count],
         views: (0..).zip(&centers).map(view).collect(),
@@ -109,6 +110,7 @@ pub fn joined(scenes: Vec<Scene>) -> Scene {
         rays.class.extend(&scene.rays.class);
         all.scale2.extend(scene.scale2);
         all.box_px.extend(scene.box_px);
+        all.score.extend(scene.score);
         all.range_m.extend(scene.range_m);
         all.range_sigma_m.extend(scene.range_sigma_m);
         all.views.extend(scene.views.into_iter().map(|view| View { pass, ..view }));

@@ -1,0 +1,128 @@
+//! What tells votes from clutter in one picture alone: the score of a detection, and how high it is in the picture.
+//!
+//! Both are learned from the map: the scores of votes against those of detections of no object, monotone (isotonic regression); the elevations of
+//! the latter against all that cameras look at.
+
+/// Values are sorted into so many bins of about as many detections each.
+pub const BINS: usize = 12;
+/// Votes and clutter of fewer detections than this tell nothing: two or three of each in a bin.
+const LEAST_DETECTIONS: usize = 30;
+
+/// A function that is constant between some edges.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Steps {
+    /// Ascending; infinite where there are fewer.
+    edges: [f64; BINS - 1],
+    values: [f64; BINS],
+}
+
+impl Steps {
+    /// 0 everywhere.
+    pub const NONE: Self = Self { edges: [f64::INFINITY; BINS - 1], values: [0.0; BINS] };
+
+    /// The value there; 0 for what is not a number.
+    #[inline]
+    #[must_use]
+    pub fn at(&self, x: f64) -> f64 {
+        if x.is_nan() { 0.0 } else { self.values[self.bin(x)] }
+    }
+
+    #[inline]
+    fn bin(&self, x: f64) -> usize {
+        self.edges.partition_point(|edge| *edge <= x)
+    }
+
+    /// Edges so that about as many of some numbers are in each bin; `values` are 0.
+    fn of_quantiles(numbers: impl Iterator<Item = f64>) -> Self {
+        let mut sorted: Vec<f64> = numbers.filter(|number| number.is_finite()).collect();
+        sorted.sort_by(f64::total_cmp);
+        let mut steps = Self::NONE;
+        let mut edges: Vec<f64> = (1..BINS).filter_map(|i| sorted.get(sorted.len() * i / BINS).copied()).collect();
+        edges.dedup();
+        // Nothing is below the least.
+        edges.retain(|edge| sorted.first().is_some_and(|least| edge > least));
+        steps.edges.iter_mut().zip(edges).for_each(|(edge, value)| *edge = value);
+        steps
+    }
+
+    fn counts(&self, numbers: &[f64]) -> [f64; BINS] {
+        let mut counts = [0.0; BINS];
+        numbers.iter().filter(|number| number.is_finite()).for_each(|&number| counts[self.bin(number)] += 1.0);
+        counts
+    }
+}
+
+/// How much more probable, in logarithms, votes have a score than clutter has; it does not fall with the score.
+#[must_use]
+pub fn score_ratio(votes: &[f64], clutter: &[f64]) -> Steps {
+    let finite = |scores: &[f64]| scores.iter().filter(|score| score.is_finite()).count();
+    if finite(votes).min(finite(clutter)) < LEAST_DETECTIONS {
+        return Steps::NONE;
+    }
+    let mut steps = Steps::of_quantiles(votes.iter().chain(clutter).copied());
+    let used = steps.edges.iter().filter(|edge| edge.is_finite()).count() + 1;
+    let (of_votes, of_clutter) = (steps.counts(votes), steps.counts(clutter));
+    // Pooled where the share of votes falls (pool adjacent violators), one more of each kind in all.
+    let mut pools: Vec<(f64, f64, usize)> = Vec::with_capacity(used);
+    for bin in 0..used {
+        pools.push((of_votes[bin], of_clutter[bin], 1));
+        while let [.., (v0, c0, n0), (v1, c1, n1)] = pools[..] {
+            if v1 * (c0 + 1.0) >= v0 * (c1 + 1.0) {
+                break;
+            }
+            pools.truncate(pools.len() - 2);
+            pools.push((v0 + v1, c0 + c1, n0 + n1));
+        }
+    }
+    let (all_votes, all_clutter) = (of_votes.iter().sum::<f64>(), of_clutter.iter().sum::<f64>());
+    let mut bin = 0;
+    for (votes, clutter, bins) in pools {
+        let ratio = ((votes + 1.0) / (all_votes + used as f64)) / ((clutter + 1.0) / (all_clutter + used as f64));
+        steps.values[bin..bin + bins].fill(ratio.ln());
+        bin += bins;
+    }
+    steps
+}
+
+/// How much denser, in logarithms, clutter is at some sines of elevation than it would be if all heights that are `looked_at` had as much.
+#[must_use]
+pub fn elevation_factor(clutter: &[f64], looked_at: (f64, f64)) -> Steps {
+    if clutter.len() < LEAST_DETECTIONS || looked_at.1 <= looked_at.0 {
+        return Steps::NONE;
+    }
+    let mut steps = Steps::of_quantiles(clutter.iter().copied());
+    let used = steps.edges.iter().filter(|edge| edge.is_finite()).count() + 1;
+    let counts = steps.counts(clutter);
+    for bin in 0..used {
+        let from = if bin == 0 { looked_at.0 } else { steps.edges[bin - 1] };
+        let to = if bin + 1 == used { looked_at.1 } else { steps.edges[bin] };
+        let share = (counts[bin] + 1.0) / (clutter.len() + used) as f64;
+        let width = ((to - from) / (looked_at.1 - looked_at.0)).max(f64::MIN_POSITIVE);
+        steps.values[bin] = (share / width).ln();
+    }
+    steps
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn votes_have_higher_scores() {
+        let votes: Vec<f64> = (0..200).map(|i| 0.5 + f64::from(i % 50) / 100.0).collect();
+        let clutter: Vec<f64> = (0..200).map(|i| f64::from(i % 60) / 100.0).collect();
+        let ratio = score_ratio(&votes, &clutter);
+        assert!(ratio.at(0.95) > 1.0 && ratio.at(0.1) < -1.0);
+        let scores: Vec<f64> = (0..100).map(|i| ratio.at(f64::from(i) / 100.0)).collect();
+        assert!(scores.is_sorted());
+        assert!(ratio.at(f64::NAN).abs() < 1e-12 && score_ratio(&votes, &[0.5; 3]) == Steps::NONE);
+    }
+
+    #[test]
+    fn clutter_is_dense_where_it_is() {
+        let clutter: Vec<f64> = (0..300).map(|i| 0.1 + f64::from(i) / 3000.0).collect();
+        let factor = elevation_factor(&clutter, (-1.0, 1.0));
+        assert!((factor.at(0.15) - 20.0_f64.ln()).abs() < 0.2);
+        assert!(factor.at(-0.5) < 0.0 && factor.at(0.9) < 0.0);
+    }
+}
