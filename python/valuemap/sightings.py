@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from valuemap.cameras import Rays, cast_rays
 from valuemap.dataset import Dataset
 from valuemap.tables import Bools, Floats, Ints
 
 DOUBLE_OVERLAP = 0.5
-"""Boxes whose intersection is at least this share of their union are of one thing: what detectors' own non-maximum suppression and the PASCAL
-VOC challenge (Everingham et al., IJCV 2010, section 4.2) take for the same object."""
+"""Boxes whose intersection is at least this share of their union are of one thing: what the non-maximum suppression of
+detectors and the PASCAL VOC challenge (Everingham et al., IJCV 2010, section 4.2) take for the same object."""
 DOUBLE_APART_PX = 2.0
-"""So are boxes whose centres are no farther apart: small boxes overlap less when whole pixels are all that is known of their edges, two on each
-side."""
+"""So are boxes whose centres are no farther apart: edges are known to about a pixel, and small boxes overlap less."""
 
 
 def cast_sightings(dataset: Dataset) -> tuple[Rays, Bools]:
@@ -25,11 +25,13 @@ def cast_sightings(dataset: Dataset) -> tuple[Rays, Bools]:
 def find_doubles(dataset: Dataset) -> Bools:
     """Return which detections (N) are another sight of what a better one of the same image and class shows.
 
-    The better one has the higher score, then the larger box, then stands farther left and up; what overlaps with a double alone is none
-    (greedy non-maximum suppression).
+    The better one has the higher score, then the larger box, then stands farther left and up; what overlaps with a
+    double alone is none (greedy non-maximum suppression).
     """
     detections = dataset.detections
-    first, second = _overlapping(detections.image_id, detections.class_name.codes, detections.center_px, detections.size_px)
+    first, second = _overlapping(
+        detections.image_id, detections.class_name.codes, detections.center_px, detections.size_px
+    )
     score = np.zeros(len(detections)) if detections.score is None else np.nan_to_num(detections.score)
     area_px2 = detections.size_px.prod(axis=1)
     order = np.lexsort((*detections.center_px.T, -area_px2, -score))
@@ -49,7 +51,9 @@ def find_doubles(dataset: Dataset) -> Bools:
     return is_double
 
 
-def _overlapping(image_id: Ints, class_code: Ints, center_px: Floats, size_px: Floats) -> tuple[Ints, Ints]:
+def _overlapping(
+    image_id: Ints, class_code: NDArray[np.int32], center_px: Floats, size_px: Floats
+) -> tuple[Ints, Ints]:
     """Return the rows of all pairs of boxes of one image and class that show one thing."""
     order = np.lexsort((center_px[:, 0], class_code, image_id))
     image, code = np.asarray(image_id)[order], np.asarray(class_code)[order]
@@ -67,7 +71,8 @@ def _overlapping(image_id: Ints, class_code: Ints, center_px: Floats, size_px: F
         rows, other = rows[is_near], other[is_near]
         is_one = _are_one(center[rows], size[rows], center[other], size[other])
         pairs.append((order[rows[is_one]], order[other[is_one]]))
-    return np.concatenate([first for first, _ in pairs] or [rows]), np.concatenate([other for _, other in pairs] or [rows])
+    none = [np.empty(0, np.int64)]
+    return np.concatenate(none + [row for row, _ in pairs]), np.concatenate(none + [other for _, other in pairs])
 
 
 def _are_one(center_px: Floats, size_px: Floats, other_center_px: Floats, other_size_px: Floats) -> Bools:
@@ -78,4 +83,5 @@ def _are_one(center_px: Floats, size_px: Floats, other_center_px: Floats, other_
     )
     common_px2 = common_px.prod(axis=1)
     union_px2 = size_px.prod(axis=1) + other_size_px.prod(axis=1) - common_px2
-    return (common_px2 >= DOUBLE_OVERLAP * union_px2) | (np.linalg.norm(apart_px, axis=1) <= DOUBLE_APART_PX)
+    is_one: Bools = (common_px2 >= DOUBLE_OVERLAP * union_px2) | (np.linalg.norm(apart_px, axis=1) <= DOUBLE_APART_PX)
+    return is_one

@@ -92,7 +92,7 @@ impl<'a> World<'a> {
             begun.iter().filter_map(one).collect()
         };
         let objects = of(&model, begun);
-        learn(&mut model, &objects);
+        learn(&mut model, &scene.usable_rays(), &objects);
         let objects = of(&model, begun);
         Self { model, lookout, objects }
     }
@@ -135,7 +135,7 @@ proptest! {
         let found = searched(&scene, Vec::new());
         prop_assert!(!found.is_empty());
         let mut model = Model::new(&scene, &DRIFTING, &SETTINGS);
-        learn(&mut model, &found);
+        learn(&mut model, &scene.usable_rays(), &found);
         let lookout = Lookout::new(&scene, SETTINGS.viability.max_range_m);
         for one in found {
             let again = object_of(&model, &lookout, one.votes, one.fit.point, one.others).unwrap();

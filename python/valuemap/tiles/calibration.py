@@ -12,6 +12,7 @@ from valuemap.errors import InputError
 from valuemap.map_folder import CALIBRATION, read_json
 from valuemap.progress import Progress
 from valuemap.robust import Calibration, Scene, calibrate_noise, calibration_from_json, calibration_to_json
+from valuemap.sightings import cast_sightings
 from valuemap.tiles.grid import WHOLE
 from valuemap.tiles.source import Source
 from valuemap.tiles.store import hash_piece

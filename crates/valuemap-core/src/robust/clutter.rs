@@ -62,12 +62,12 @@ pub fn score_ratio(votes: &[f64], clutter: &[f64]) -> Steps {
     let mut steps = Steps::of_quantiles(votes.iter().chain(clutter).copied());
     let used = steps.edges.iter().filter(|edge| edge.is_finite()).count() + 1;
     let (of_votes, of_clutter) = (steps.counts(votes), steps.counts(clutter));
-    // Pooled where the share of votes falls (pool adjacent violators), one more of each kind in all.
+    // Pooled where the share of votes falls (pool adjacent violators), with one more of each kind in each pool.
     let mut pools: Vec<(f64, f64, usize)> = Vec::with_capacity(used);
     for bin in 0..used {
         pools.push((of_votes[bin], of_clutter[bin], 1));
         while let [.., (v0, c0, n0), (v1, c1, n1)] = pools[..] {
-            if v1 * (c0 + 1.0) >= v0 * (c1 + 1.0) {
+            if (v1 + 1.0) * (c0 + 1.0) >= (v0 + 1.0) * (c1 + 1.0) {
                 break;
             }
             pools.truncate(pools.len() - 2);
