@@ -93,10 +93,10 @@ pub fn elevation_factor(clutter: &[f64], looked_at: (f64, f64)) -> Steps {
     let mut steps = Steps::of_quantiles(clutter.iter().copied());
     let used = steps.edges.iter().filter(|edge| edge.is_finite()).count() + 1;
     let counts = steps.counts(clutter);
-    for bin in 0..used {
+    for (bin, count) in counts.into_iter().enumerate().take(used) {
         let from = if bin == 0 { looked_at.0 } else { steps.edges[bin - 1] };
         let to = if bin + 1 == used { looked_at.1 } else { steps.edges[bin] };
-        let share = (counts[bin] + 1.0) / (clutter.len() + used) as f64;
+        let share = (count + 1.0) / (clutter.len() + used) as f64;
         let width = ((to - from) / (looked_at.1 - looked_at.0)).max(f64::MIN_POSITIVE);
         steps.values[bin] = (share / width).ln();
     }

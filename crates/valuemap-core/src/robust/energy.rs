@@ -163,7 +163,7 @@ fn terms(model: &Model<'_>, votes: &[u32], weights: &[f64], point: &Vector3<f64>
         sum.gradient += sizes.gradient;
         sum.of_priors += sizes.square;
     }
-    if let Some((ln_density, (information, gradient))) = height_terms(model, votes, point) {
+    if let Some(HeightTerms { ln_density, information, gradient }) = height_terms(model, votes, point) {
         sum.information += information;
         sum.gradient += gradient;
         sum.of_priors -= 2.0 * ln_density;
@@ -171,19 +171,22 @@ fn terms(model: &Model<'_>, votes: &[u32], weights: &[f64], point: &Vector3<f64>
     sum.cost().is_finite().then_some(sum)
 }
 
+/// What heights say about a position: the logarithm of their density, 1/m, and the normal equations.
+pub(super) struct HeightTerms {
+    pub(super) ln_density: f64,
+    pub(super) information: Matrix3<f64>,
+    pub(super) gradient: Vector3<f64>,
+}
+
 /// Logarithm of the density of heights at a point, with information and gradient of its position; nothing before heights are learned.
-pub(super) fn height_terms(
-    model: &Model<'_>,
-    votes: &[u32],
-    point: &Vector3<f64>,
-) -> Option<(f64, (Matrix3<f64>, Vector3<f64>))> {
+pub(super) fn height_terms(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> Option<HeightTerms> {
     let heights = model.class_of(*votes.first()?).heights?;
     let up = model.up?;
     let height_m = height_m(model.scene, model.up, votes, point)?;
     let (part, share) = heights.part_at(height_m)?;
     let weight = share / (part.sigma_m * part.sigma_m + camera_m2(model, votes));
     let (information, gradient) = (up * up.transpose() * weight, up * (weight * (height_m - part.mean_m)));
-    Some((heights.ln_density(height_m), (information, gradient)))
+    Some(HeightTerms { ln_density: heights.ln_density(height_m), information, gradient })
 }
 
 /// Variance of the mean position of the cameras of some votes, each axis, m²: heights are above where the cameras are said to be.

@@ -307,9 +307,9 @@ impl Joint<'_> {
                 normals.add(label, label, &terms.information);
                 normals.add_gradient(label, &terms.gradient);
             }
-            if let Some((_, (information, gradient))) = height_terms(model, votes, point) {
-                normals.add(label, label, &information);
-                normals.add_gradient(label, &gradient);
+            if let Some(terms) = height_terms(model, votes, point) {
+                normals.add(label, label, &terms.information);
+                normals.add_gradient(label, &terms.gradient);
             }
         }
     }
