@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from valuemap.cameras import Rays, camera_centers, cast_rays, colmap_camera, rotation_matrices
 from valuemap.dataset import MARKER, Dataset, number_passes, rows_of

@@ -8,9 +8,10 @@ import io
 import json
 import reprlib
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,7 +33,11 @@ CALIBRATION = "calibration.json"
 """What was estimated of the dataset before any part of it was mapped."""
 CELLS = "cells"
 """The folder of what was found in each cell, which an update of the map starts from."""
-PARTS = (MARKER, "labels.parquet", "votes.parquet", "rejected.parquet", CALIBRATION)
+CHANGES, BRIDGE = "changes.parquet", "bridge.parquet"
+"""What an update of a map says: what became of each label, and which ids it had."""
+DATASET = "dataset"
+"""The folder of an updated map that holds the dataset with the passes that were added."""
+PARTS = (MARKER, "labels.parquet", "votes.parquet", "rejected.parquet", CALIBRATION, CHANGES, BRIDGE)
 """All files that a map may have: none of an older one may stay beside those of a new one."""
 
 _RECORD: dict[str, tuple[type, str]] = {
@@ -99,20 +104,28 @@ class Map:
         return geographic_labels(self.labels)
 
 
-def write_map(result: Map, path: str | Path, *, cells: Sequence[Path] = (), force: bool = False) -> None:
+def write_map(
+    result: Map,
+    path: str | Path,
+    *,
+    cells: Sequence[Path] = (),
+    files: Mapping[str, Path] = MappingProxyType({}),
+    force: bool = False,
+) -> None:
     """Write a map as a folder; an older map that is there is replaced, never half.
 
     Other files in the folder stay. Where one that valuemap did not write is in the way, an `OutputError` says so; with
-    `force` it is replaced. `cells` are the files of its cells, which are copied.
+    `force` it is replaced. `cells` are the files of its cells, `files` others by their names in the folder;
+    all are copied.
     """
-    with new_folder(Path(path), parts=PARTS, part_folders=(CELLS,), force=force) as folder:
+    with new_folder(Path(path), parts=PARTS, part_folders=(CELLS, DATASET), force=force) as folder:
         run = {**result.run, "frame": result.frame.to_json()}
         calibration = run.pop("calibration", None)
         if calibration is not None:
             (folder / CALIBRATION).write_text(json.dumps(calibration, indent=2) + "\n", encoding="utf-8")
-        for cell in cells:
-            (folder / CELLS).mkdir(exist_ok=True)
-            shutil.copyfile(cell, folder / CELLS / cell.name)
+        for name, file in {**{f"{CELLS}/{cell.name}": cell for cell in cells}, **files}.items():
+            (folder / name).parent.mkdir(exist_ok=True)
+            shutil.copyfile(file, folder / name)
         (folder / MARKER).write_text(json.dumps(run, indent=2) + "\n", encoding="utf-8")
         write_labels(result, folder / "labels.parquet")
         write_table(result.votes, folder / "votes.parquet")

@@ -300,7 +300,8 @@ class Labels(Table):
     voters' boxes at their depths; `facing_azimuth_rad` (0 to 2 pi, clockwise from north seen from above) where the
     voters' cameras are from it, and `facing_concentration` (0 to 1) how much they are on one side of it;
     `expected` counts the images that should have seen it and `existence` is the
-    probability that it exists (robust method); lon, lat in degrees and height in metres on WGS84 where geo-referenced.
+    probability that it exists (robust method); lon, lat in degrees and height in metres on WGS84 where geo-referenced;
+    `state` is what `valuemap update` says about it.
     """
 
     KEY: ClassVar[str | None] = "label_id"
@@ -333,6 +334,7 @@ class Labels(Table):
     lon_lat_height: Floats | None = _column("float", ("lon", "lat", "height"), optional=True)
     expected: Ints | None = _column("int", ("expected",), optional=True)
     existence: Floats | None = _column("float", ("existence",), optional=True)
+    state: Categories | None = _column("category", ("state",), optional=True)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -346,6 +348,43 @@ class Votes(Table):
     image_id: Ints = _column("int", ("image_id",))
     residual_px: Floats = _column("float", ("residual_px",))
     residual_sigmas: Floats = _column("float", ("residual_sigmas",))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Changes(Table):
+    """What became of each label when passes were added to a map, by label id.
+
+    `change` is added, changed, moved, removed or unchanged, `state` that of the label. Positions (N, 3) in metres in
+    the frame of the dataset: now, and before (NaN where there was none). The rest is the evidence: in how many `looks`
+    the added passes should have seen it, in how many of these they did (`hits`) and did not (`misses`), by how much
+    they speak for it (`log_odds`, natural logarithm of the likelihood ratio), and the times of the first and last look.
+    """
+
+    MAY_BE_EMPTY: ClassVar[bool] = True
+
+    label_id: Ints = _column("int", ("label_id",))
+    change: Categories = _column("category", ("change",))
+    state: Categories = _column("category", ("state",))
+    class_name: Categories = _column("category", ("class",))
+    position_in_world_m: Floats = _column("float", ("x", "y", "z"))
+    from_m: Floats = _column("float", ("from_x", "from_y", "from_z"), nullable=True)
+    looks: Ints = _column("int", ("looks",))
+    hits: Ints = _column("int", ("hits",))
+    misses: Ints = _column("int", ("misses",))
+    log_odds: Floats = _column("float", ("log_odds",))
+    first_look_s: Floats = _column("float", ("first_look",), nullable=True)
+    last_look_s: Floats = _column("float", ("last_look",), nullable=True)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class IdBridge(Table):
+    """Which label of an older map is which of a newer one, and how many votes they have in common."""
+
+    MAY_BE_EMPTY: ClassVar[bool] = True
+
+    old_label_id: Ints = _column("int", ("old_label_id",))
+    label_id: Ints = _column("int", ("label_id",))
+    common_votes: Ints = _column("int", ("common_votes",))
 
 
 REJECTION_REASONS: Mapping[str, str] = {

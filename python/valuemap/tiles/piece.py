@@ -28,10 +28,11 @@ def piece_of_rows(ordered: InOrder, rows: Ints) -> InOrder:
     first, end = (np.searchsorted(detections.image_id, rows, side=side) for side in ("left", "right"))
     count = end - first
     detection_rows = np.repeat(first - (np.cumsum(count) - count), count) + np.arange(int(count.sum()))
-    drives = ordered.drives
+    drives, cameras = ordered.drives, ordered.dataset.cameras
     return InOrder(
         replace(
             ordered.dataset,
+            cameras=cameras.take(np.isin(cameras.camera_id, images.camera_id[rows])),
             images=images.take(rows).replace(image_id=np.arange(len(rows))),
             detections=detections.take(detection_rows).replace(
                 detection_id=np.arange(len(detection_rows)), image_id=np.repeat(np.arange(len(rows)), count)

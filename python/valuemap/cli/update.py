@@ -1,0 +1,52 @@
+"""`valuemap update`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from valuemap import map_folder
+from valuemap.cli.app import app
+from valuemap.cli.options import AsJson, Force, Resume, TileSize, Work
+from valuemap.cli.show import log, progress_bars, show, show_notes
+from valuemap.cli.working import working
+from valuemap.engine.threads import ThreadEngine
+from valuemap.folders import check_place
+from valuemap.map_folder import write_map
+from valuemap.pipeline import Run
+from valuemap.summary import summarize_map
+from valuemap.update import update_map
+
+
+@app.command("update", epilog="What the states mean: docs/update.md.")
+def update_command(
+    old: Annotated[Path, typer.Argument(metavar="MAP", help="Folder of the map to bring up to date.")],
+    added: Annotated[Path, typer.Option("--add", metavar="DATASET", help="Dataset with the new passes.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder to write the new map to.")],
+    dataset: Annotated[
+        Path | None, typer.Option(help="Dataset of the map. Default: where the map says that it is.")
+    ] = None,
+    threads: Annotated[int, typer.Option(min=0, help="Threads, 0 for one a core; the map is the same.")] = 0,
+    tile_size: TileSize = None,
+    work: Work = None,
+    resume: Resume = False,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Add new passes to a map: only what they touch is solved again, ids stay, and changes are told."""
+    check_place(out, parts=map_folder.PARTS, force=force)
+    with working(work, out, resume=resume) as folder, progress_bars() as progress:
+        run = Run(folder, ThreadEngine(threads), tile_size_m=tile_size)
+        result, cells, files = update_map(old, added, run, dataset=dataset, progress=progress)
+        result.run["dataset_folder"] = map_folder.DATASET
+        write_map(result, out, cells=cells, files=files, force=force)
+    show_notes(result.run["notes"])
+    if as_json:
+        print(json.dumps(result.run, indent=2))
+    else:
+        told = result.run["update"]
+        show(summarize_map(result) | {f"labels {state}": count for state, count in told["labels"].items()})
+        log.print(f"Wrote {out}", highlight=False)

@@ -1,0 +1,188 @@
+"""What became of each label of a map when passes were added: by looks of both epochs, and by shared votes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from valuemap.tables import Bools, Categories, Changes, Floats, IdBridge, Ints, Labels, Votes
+from valuemap.update.looks import Looks
+
+SAME_SHARE = 0.5
+"""Labels that share this part of the votes of one of them are one object."""
+MOVED_WITHIN_M = 5.0
+"""What is gone here and new there, no farther away, is one object that was moved."""
+CHANGED_CHI2 = 16.27
+"""Squared sigmas (chi-square, 3 axes, 99.9 %) from which on a label is elsewhere than before."""
+
+STATES = ("confirmed", "gone", "moved", "new", "uncertain")
+KINDS = ("added", "changed", "moved", "removed", "unchanged")
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """What became of the labels (N) of the new map, and then of those of the old one that it does not have.
+
+    `before` (N) is the row of the old label that each is, -1 where there is none; `state` (N) is one of `STATES`;
+    `moved_from` (N) the row of the new map that a moved one was before, -1 for all others.
+    """
+
+    before: Ints
+    state: list[str]
+    moved_from: Ints
+
+
+def match_labels(old: Labels, old_votes: Votes, new: Labels, new_votes: Votes) -> tuple[Ints, Ints]:
+    """Return the row of the old label (N) that each new one is, -1 for none, and how many votes they share (N).
+
+    Pairs with more common votes go first, then lower ids; each label is of one pair.
+    """
+    before, common = np.full(len(new), -1), np.zeros(len(new), np.int64)
+    label_of = dict(zip(old_votes.detection_id.tolist(), old_votes.label_id.tolist(), strict=True))
+    pairs: dict[tuple[int, int], int] = {}
+    for detection, label in zip(new_votes.detection_id.tolist(), new_votes.label_id.tolist(), strict=True):
+        if (other := label_of.get(detection)) is not None:
+            pairs[other, label] = pairs.get((other, label), 0) + 1
+    old_row = {label: row for row, label in enumerate(old.label_id.tolist())}
+    new_row = {label: row for row, label in enumerate(new.label_id.tolist())}
+    taken: set[int] = set()
+    for (first, second), count in sorted(pairs.items(), key=lambda item: (-item[1], item[0])):
+        i, j = old_row[first], new_row[second]
+        if i not in taken and before[j] < 0 and count >= SAME_SHARE * min(old.votes[i], new.votes[j]):
+            before[j], common[j] = i, count
+            taken.add(i)
+    return before, common
+
+
+def judge(
+    new: Labels,
+    before: Ints,
+    state_before: list[str],
+    is_touched: Bools,
+    looks_at: Callable[[int], tuple[Looks, Looks]],
+) -> tuple[Verdicts, Mapping[int, tuple[Looks, Looks]]]:
+    """Return what became of each label, and the looks at those that the added passes could have seen.
+
+    A label without a look of the added passes stays what it was.
+    """
+    looks = {row: looks_at(int(new.label_id[row])) for row in np.flatnonzero(is_touched | (before < 0)).tolist()}
+    state = []
+    for row in range(len(new)):
+        was = state_before[before[row]] if before[row] >= 0 else "new"
+        first, second = looks.get(row, (None, None))
+        if second is None or first is None or second.looks == 0:
+            state.append(was)
+        elif before[row] >= 0:
+            state.append("confirmed" if second.say_there else "gone" if second.say_gone else _undecided(was, second))
+        else:
+            state.append("confirmed" if first.say_there else "new")
+    moved_from = np.full(len(new), -1)
+    position, code = new.position_in_world_m, new.class_name.codes.tolist()
+    gone = [row for row in looks if before[row] >= 0 and state[row] == "gone" and state_before[before[row]] != "gone"]
+    fresh = [row for row in looks if before[row] < 0 and state[row] == "new" and looks[row][1].say_there]
+    for row, source in _pairs(position, code, fresh, gone):
+        if looks[row][0].log_odds <= 0.0:  # Nobody saw it there before.
+            moved_from[row], state[row] = source, "moved"
+    return Verdicts(before, state, moved_from), looks
+
+
+def _undecided(was: str, looks: Looks) -> str:
+    """Return the state of a label whose looks say neither: what it was, unless they missed more than they saw."""
+    return was if looks.log_odds >= 0.0 else "uncertain"
+
+
+def _pairs(position_m: Floats, code: list[int], fresh: list[int], gone: list[int]) -> list[tuple[int, int]]:
+    """Return pairs of new and gone labels of one class that are near each other, the nearest first."""
+    if not fresh or not gone:
+        return []
+    tree = cKDTree(position_m[gone])
+    near = [tree.query_ball_point(position_m[row], MOVED_WITHIN_M) for row in fresh]
+    found = [
+        (float(np.linalg.norm(position_m[row] - position_m[gone[i]])), row, gone[i])
+        for row, others in zip(fresh, near, strict=True)
+        for i in others
+        if code[row] == code[gone[i]]
+    ]
+    pairs: list[tuple[int, int]] = []
+    for _, row, source in sorted(found):
+        if all(row != r and source != s for r, s in pairs):
+            pairs.append((row, source))
+    return pairs
+
+
+def number(old: Labels, verdicts: Verdicts) -> Ints:
+    """Return the ids (N) of the labels of the new map: those they had, else beyond all that were."""
+    ids = np.zeros(len(verdicts.before), np.int64)
+    known = verdicts.before >= 0
+    ids[known] = old.label_id[verdicts.before[known]]
+    moved = np.flatnonzero(verdicts.moved_from >= 0)
+    ids[moved] = ids[verdicts.moved_from[moved]]
+    fresh = np.flatnonzero(ids == 0)
+    ids[fresh] = np.arange(len(fresh)) + int(old.label_id.max(initial=0)) + 1
+    return ids
+
+
+def tell(
+    old: Labels,
+    new: Labels,
+    verdicts: Verdicts,
+    ids: Ints,
+    looks: Mapping[int, tuple[Looks, Looks]],
+    common: Ints,
+) -> tuple[Changes, IdBridge]:
+    """Return what changed, a row a label of either map, by id, and which labels of both maps are the same.
+
+    `common` (N) are the votes that a label shares with what it was, 0 of those that the new map does not have.
+    """
+    covered = set(verdicts.moved_from.tolist())
+    rows = np.array([row for row in range(len(new)) if row not in covered], np.int64)
+    sources = np.where(verdicts.moved_from[rows] >= 0, verdicts.moved_from[rows], rows)
+    before = verdicts.before[sources]
+    kinds = []
+    for row, source, was in zip(rows.tolist(), sources.tolist(), before.tolist(), strict=True):
+        if source != row:
+            kinds.append("moved")
+        elif was < 0:
+            kinds.append("added")
+        elif verdicts.state[row] == "gone" or common[row] == 0:
+            kinds.append("removed")
+        else:
+            kinds.append("changed" if _differs(old, was, new, row) else "unchanged")
+    found = [looks.get(source, (_NONE, _NONE))[1] for source in sources.tolist()]
+    changes = Changes(
+        label_id=ids[rows],
+        change=Categories.from_texts(kinds),
+        state=Categories.from_texts([verdicts.state[row] for row in rows.tolist()]),
+        class_name=new.class_name.take(rows),
+        position_in_world_m=new.position_in_world_m[rows],
+        from_m=np.where(before[:, None] >= 0, old.position_in_world_m[before], np.nan),
+        looks=np.array([each.looks for each in found], np.int64),
+        hits=np.array([each.hits for each in found], np.int64),
+        misses=np.array([each.misses for each in found], np.int64),
+        log_odds=np.array([each.log_odds for each in found], np.float64),
+        first_look_s=np.array([each.first_s for each in found], np.float64),
+        last_look_s=np.array([each.last_s for each in found], np.float64),
+    )
+    known = rows[(before >= 0) & ((common[rows] > 0) | (sources != rows))]
+    of = np.where(verdicts.moved_from[known] >= 0, verdicts.moved_from[known], known)
+    bridge = IdBridge(old.label_id[verdicts.before[of]], ids[known], common[known])
+    return (
+        changes.take(np.argsort(changes.label_id, kind="stable")),
+        bridge.take(np.argsort(bridge.old_label_id, kind="stable")),
+    )
+
+
+_NONE = Looks(0, 0, 0.0, float("nan"), float("nan"))
+
+
+def _differs(old: Labels, before: int, new: Labels, row: int) -> bool:
+    """Return whether a label is of another class, or elsewhere than its covariances explain."""
+    if old.class_name.names[old.class_name.codes[before]] != new.class_name.names[new.class_name.codes[row]]:
+        return True
+    away = new.position_in_world_m[row] - old.position_in_world_m[before]
+    both = old.covariance_m2[before] + new.covariance_m2[row]
+    xx, xy, xz, yy, yz, zz = both
+    return bool(away @ np.linalg.pinv([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ away > CHANGED_CHI2)

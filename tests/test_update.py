@@ -1,0 +1,206 @@
+"""Maps brought up to date: only what new passes touch is solved, ids stay, and what changed is told with evidence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import valuemap
+from literal import Pinhole, Sighting
+from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
+from valuemap.cli.commands import app
+from valuemap.dataset import Dataset
+from valuemap.errors import InputError
+from valuemap.map_folder import Map
+from valuemap.tables import Changes, Floats, IdBridge, read_table, table_to_arrow
+from valuemap.update.changes import match_labels
+from valuemap.update.join import join_datasets
+
+SET = ("detection_sigma_px=1.5", "position_sigma_m=0.05", "rotation_sigma_deg=0.05")
+LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+# Objects beside a street along x, at x = 0 and again 1200 m further, where nobody drives in the second year.
+STAYS = [[40.0, 6.0, 4.0], [46.0, -7.0, 5.0], [55.0, 5.0, 4.5], [60.0, -6.0, 4.0], [66.0, 8.0, 5.5]]
+REMOVED, ADDED = [50.0, 9.0, 5.0], [52.0, -9.0, 4.2]
+MOVED_FROM, MOVED_TO = [58.0, 10.0, 5.0], [61.0, 10.0, 5.0]
+FAR_M = 1200.0
+
+
+def drives(objects: list[list[float]], seed: int, *, starts_m: tuple[float, ...], passes: int, year: int) -> Dataset:
+    """Drive past objects, seeing nine of ten, with some clutter; times are seconds of a year."""
+    random = np.random.default_rng(seed)
+    intrinsics = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    cameras: list[Pinhole] = []
+    sightings: list[Sighting] = []
+    names: list[str] = []
+    times: list[float] = []
+    world = [np.array(each) + [start, 0.0, 0.0] for start in starts_m for each in objects]
+    for number in range(passes):
+        for start in starts_m:
+            side_m = random.normal(0.0, 1.0)
+            for step in range(24):
+                center = np.array([start + 2.0 * step + 0.3, side_m, 1.6])
+                camera = Pinhole(intrinsics, LEVEL, -LEVEL @ center)
+                for place in world:
+                    pixel, depth = camera.project(place)
+                    inside = 4.0 < depth < 55.0 and 0 <= pixel[0] < WIDTH and 0 <= pixel[1] < HEIGHT
+                    if inside and random.random() < 0.9:
+                        sightings.append(Sighting(len(cameras), "light", pixel + random.normal(0.0, 1.0, 2)))
+                if random.random() < 0.2:
+                    sightings.append(Sighting(len(cameras), "light", random.uniform([0, 0], [WIDTH, HEIGHT])))
+                cameras.append(camera)
+                names.append(f"pass-{number}-{start:.0f}")
+                times.append(1e7 * year + 1e5 * number + 100.0 * start + 0.2 * step)
+    dataset = as_dataset(Scene(cameras, sightings, np.array(world)), passes=names)
+    return Dataset(**{**vars(dataset), "images": dataset.images.replace(timestamp_s=np.array(times))})
+
+
+@pytest.fixture(scope="module")
+def years(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of the first year, the passes of the second, and the map with both."""
+    folder = tmp_path_factory.mktemp("years")
+    first = drives([*STAYS, REMOVED, MOVED_FROM], 1, starts_m=(0.0, FAR_M), passes=3, year=1)
+    second = drives([*STAYS, ADDED, MOVED_TO], 2, starts_m=(0.0,), passes=2, year=2)
+    valuemap.write_dataset(first, folder / "first")
+    valuemap.write_dataset(second, folder / "second")
+    run("map", folder / "first", "--out", folder / "map", *(f"--set={each}" for each in SET))
+    run("update", folder / "map", "--add", folder / "second", "--out", folder / "map2")
+    return folder
+
+
+def run(*arguments: object) -> str:
+    result = CliRunner().invoke(app, [str(each) for each in arguments])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def state_at(result: Map, place: list[float], *, start_m: float = 0.0) -> tuple[str, int] | None:
+    """State and id of the label within half a metre of a place."""
+    labels = result.labels
+    distance: Floats = np.linalg.norm(labels.position_in_world_m - place - [start_m, 0.0, 0.0], axis=1)
+    row = int(np.argmin(distance))
+    assert labels.state is not None
+    return (labels.state.texts()[row], int(labels.label_id[row])) if distance[row] < 0.5 else None
+
+
+def id_at(result: Map, place: list[float], *, start_m: float = 0.0) -> int:
+    distance = np.linalg.norm(result.labels.position_in_world_m - place - [start_m, 0.0, 0.0], axis=1)
+    assert distance.min() < 0.5
+    return int(result.labels.label_id[np.argmin(distance)])
+
+
+def test_states_say_what_became_of_each_object(years: Path) -> None:
+    old, new = valuemap.read_map(years / "map"), valuemap.read_map(years / "map2")
+    for place in STAYS:
+        assert state_at(new, place) == ("confirmed", id_at(old, place))
+        assert state_at(new, place, start_m=FAR_M) == ("confirmed", id_at(old, place, start_m=FAR_M))
+    gone = state_at(new, REMOVED)
+    assert gone is None or gone == ("gone", id_at(old, REMOVED))
+    fresh = state_at(new, ADDED)
+    assert fresh is not None
+    assert fresh[0] == "new"
+    assert fresh[1] > old.labels.label_id.max()
+    assert state_at(new, MOVED_TO) == ("moved", id_at(old, MOVED_FROM))
+    assert state_at(new, MOVED_FROM) is None
+    # Nobody looked: nothing is known to have changed there.
+    for place in (REMOVED, MOVED_FROM):
+        assert state_at(new, place, start_m=FAR_M) == ("confirmed", id_at(old, place, start_m=FAR_M))
+
+
+def test_changes_come_with_opportunities_and_dates(years: Path) -> None:
+    old = valuemap.read_map(years / "map")
+    changes = read_table(Changes, years / "map2" / "changes.parquet")
+    row = {label: i for i, label in enumerate(changes.label_id.tolist())}
+    kinds = changes.change.texts()
+    removed = row[id_at(old, REMOVED)]
+    assert kinds[removed] == "removed"
+    assert changes.state.texts()[removed] == "gone"
+    assert changes.misses[removed] >= 6
+    assert changes.looks[removed] == changes.hits[removed] + changes.misses[removed]
+    assert 2e7 <= changes.first_look_s[removed] <= changes.last_look_s[removed] < 3e7
+    moved = row[id_at(old, MOVED_FROM)]
+    assert kinds[moved] == "moved"
+    np.testing.assert_allclose(changes.from_m[moved], MOVED_FROM, atol=0.3)
+    np.testing.assert_allclose(changes.position_in_world_m[moved], MOVED_TO, atol=0.3)
+    assert kinds[row[id_at(old, STAYS[0])]] == "unchanged"
+    far = row[id_at(old, STAYS[0], start_m=FAR_M)]
+    assert (kinds[far], changes.looks[far]) == ("unchanged", 0)
+    assert kinds.count("added") == 1
+    bridge = read_table(IdBridge, years / "map2" / "bridge.parquet")
+    assert np.array_equal(bridge.old_label_id, bridge.label_id)
+    assert len(bridge) >= len(old.labels) - 1
+
+
+def test_an_update_is_a_map_of_all_the_data_but_for_the_ids(years: Path, tmp_path: Path) -> None:
+    run("map", years / "map2" / "dataset", "--out", tmp_path / "all", "--calibration", years / "map",
+        *(f"--set={each}" for each in SET))  # fmt: skip
+    rebuilt, updated = valuemap.read_map(tmp_path / "all"), valuemap.read_map(years / "map2")
+
+    def contents(result: Map) -> set[tuple[object, ...]]:
+        without = ("label_id", "state")
+        return {
+            (*(value for name, value in row.items() if name not in without), *votes_of(result, row["label_id"]))
+            for row in table_to_arrow(result.labels).to_pylist()
+        }
+
+    missing = contents(rebuilt) - contents(updated)
+    assert contents(updated) <= contents(rebuilt)
+    assert len(missing) <= 1  # Where the moved one was.
+    cells = [{path.name for path in (folder / "cells").glob("*.parquet")} for folder in (tmp_path / "all", years / "map2")]  # fmt: skip # noqa: E501
+    assert cells[0] == cells[1]
+
+
+def votes_of(result: Map, label_id: int) -> list[int]:
+    return list(result.votes.detection_id[result.votes.label_id == label_id].tolist())
+
+
+def test_cells_that_nobody_drove_through_are_not_solved_again(years: Path) -> None:
+    before, after = ({p.name for p in (years / name / "cells").glob("*.parquet")} for name in ("map", "map2"))
+    assert before & after
+    assert after - before
+    assert all(name.startswith("1_") for name in before & after)
+
+
+def test_an_update_of_an_update_goes_on(years: Path, tmp_path: Path) -> None:
+    third = drives([*STAYS, ADDED, MOVED_TO], 3, starts_m=(0.0,), passes=1, year=3)
+    valuemap.write_dataset(third, tmp_path / "third")
+    run("update", years / "map2", "--add", tmp_path / "third", "--out", tmp_path / "map3")
+    second, new = valuemap.read_map(years / "map2"), valuemap.read_map(tmp_path / "map3")
+    assert state_at(new, ADDED) == ("confirmed", id_at(second, ADDED))
+    assert state_at(new, MOVED_TO) == ("confirmed", id_at(second, MOVED_TO))
+    assert state_at(new, STAYS[1]) == ("confirmed", id_at(second, STAYS[1]))
+
+
+def test_datasets_become_one(years: Path) -> None:
+    first, second = valuemap.read_dataset(years / "first"), valuemap.read_dataset(years / "second")
+    both = join_datasets(first, second)
+    assert len(both.images) == len(first.images) + len(second.images)
+    assert np.array_equal(both.detections.detection_id[: len(first.detections)], first.detections.detection_id)
+    assert len(set(both.images.pass_id.texts())) == 8  # Six of the first year, and two that are named alike.
+    untimed = Dataset(**{**vars(second), "images": second.images.replace(timestamp_s=None)})
+    times = join_datasets(first, untimed).images.timestamp_s
+    assert times is not None
+    assert np.isnan(times).sum() == len(second.images)
+    with pytest.raises(InputError, match="expected the frame of"):
+        join_datasets(first, Dataset(**{**vars(second), "frame": valuemap.Frame(up=(0.0, -1.0, 0.0))}))
+
+
+def test_labels_are_matched_by_votes_one_to_one(years: Path) -> None:
+    old = valuemap.read_map(years / "map")
+    matched, common = match_labels(old.labels, old.votes, old.labels, old.votes)
+    assert np.array_equal(matched, np.arange(len(old.labels)))
+    assert np.array_equal(common, old.labels.votes)
+    half = old.votes.take(np.flatnonzero(old.votes.detection_id % 20 == 0))
+    none = old.votes.replace(detection_id=old.votes.detection_id + 10_000_000)
+    assert (match_labels(old.labels, none, old.labels, old.votes)[0] == -1).all()
+    assert (match_labels(old.labels, half, old.labels, old.votes)[1] <= common).all()
+
+
+def test_what_cannot_be_updated_says_so(years: Path, tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["update", str(years / "first"), "--add", str(years / "second"), "--out", str(tmp_path / "x")])  # fmt: skip # noqa: E501
+    assert result.exit_code == 1
+    assert "is not a map" in result.output
+    assert not (tmp_path / "x").exists()
