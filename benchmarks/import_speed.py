@@ -4,13 +4,15 @@
 
 Writes a model (cameras, images with observations of points, rigs and frames, as COLMAP 4 does) and a COCO file into a
 temporary folder, runs `valuemap import colmap` on them as a process of its own, and reports its seconds, processor
-seconds and peak memory. The dataset that comes out is read back and counted.
+seconds and peak memory, and how many processes wanted the processors meanwhile. The dataset that comes out is read back
+and counted.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import resource
 import struct
 import subprocess
@@ -89,6 +91,7 @@ def run_import(folder: Path) -> dict[str, Any]:
         "seconds": round(seconds, 1),
         "processor_seconds": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
         "peak_memory_mb": after.ru_maxrss // 1024,
+        "load_average": round(os.getloadavg()[0], 1),
     }
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +11,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from pyproj import Transformer
+from typer.testing import CliRunner
 
 from reading import SPOILS, azimuths_deg, meeting_point, refusal, spoiled, write
 from valuemap.cameras import camera_centers, cast_rays, rotation_matrices
+from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, read_dataset, write_dataset
 from valuemap.readers.bearings import VERTICAL_SIGMA_PX, read_bearings
 from valuemap.readers.csv_poses import read_csv_poses
@@ -335,6 +339,33 @@ def real(name: str) -> Path:
     if not (DATA / name).is_dir():
         pytest.skip(f"{DATA / name} is not here")
     return DATA / name
+
+
+def commands_in_the_docs() -> dict[str, list[str]]:
+    """The commands that docs/formats.md gives for published data, by the folder that they read."""
+    text = (Path(__file__).parents[1] / "docs" / "formats.md").read_text(encoding="utf-8")
+    section = text.partition("## Published data as they are")[2].partition("\n## ")[0]
+    blocks = re.findall(r"(?:^    .+\n)+", section, re.MULTILINE)
+    commands = [shlex.split(" ".join(block.split("\n"))) for block in blocks]
+    return {command[3].partition("/")[0]: command for command in commands}
+
+
+@pytest.mark.parametrize(
+    ("name", "images", "detections"),
+    [("london_tl", 50, 173), ("bend_ramps", 9857, 24185), ("kitti_ts", 1756, 2363)],
+)
+def test_the_commands_of_the_docs_import_published_data(
+    name: str, images: int, detections: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = commands_in_the_docs()[name]
+    assert command[0] == "valuemap"
+    real(name)
+    monkeypatch.chdir(DATA)
+    command[command.index("--out") + 1] = str(tmp_path / "out")
+    done = CliRunner().invoke(app, command[1:])
+    assert done.exit_code == 0, done.output
+    dataset = read_dataset(tmp_path / "out")
+    assert (len(dataset.images), len(dataset.detections), dataset.rejected) == (images, detections, None)
 
 
 def test_london_imports_without_a_script() -> None:

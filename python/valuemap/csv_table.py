@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import csv
 import gzip
+import io
 import math
 import zlib
 from collections.abc import Mapping, Sequence
@@ -61,13 +62,30 @@ def _read_text_bytes(path: Path, hint: str) -> bytes:
         raise InputError(f"{path}: is not a file", hint=hint)
     content = path.read_bytes()
     if content.startswith(b"\x1f\x8b"):
-        content = gzip.decompress(content)
+        content = _unpacked(content, path, hint)
     for start, what in ((b"PK\3\4", "a zip archive or a spreadsheet"), (b"PAR1", "a Parquet file")):
         if content.startswith(start):
             raise InputError(f"{path}: is {what}, not CSV", hint=f"save it as CSV in UTF-8; {hint}")
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise InputError(f"{path}: is text in UTF-16, not in UTF-8", hint=f"save it as CSV in UTF-8; {hint}")
     return content.removeprefix(codecs.BOM_UTF8)
+
+
+def _unpacked(content: bytes, path: Path, hint: str) -> bytes:
+    """Return what gzip holds; refuse what is a few bytes on disk and fills the memory."""
+    most = max(_MOST_UNPACKED_TIMES * len(content), _ALWAYS_UNPACKED)
+    with gzip.open(io.BytesIO(content)) as file:
+        unpacked = file.read(most + 1)
+    if len(unpacked) > most:
+        raise InputError(
+            f"{path}: unpacks to more than {most / 1e6:.0f} MB, {_MOST_UNPACKED_TIMES} times itself", hint=hint
+        )
+    return unpacked
+
+
+_MOST_UNPACKED_TIMES = 100
+"""Tables of texts and numbers shrink to a third or a twentieth."""
+_ALWAYS_UNPACKED = 64 * 2**20
 
 
 def _header(content: bytes) -> tuple[str, list[str]]:

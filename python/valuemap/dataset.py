@@ -47,7 +47,7 @@ PART_FOLDERS = ("images",)
 """Folders of it whose files, as far as valuemap wrote them, are of that dataset alone."""
 _QUATERNION_TOLERANCE = 1e-3
 _ROUNDING = 1e-12
-_LEADS_OUT = r"^/|(^|/)\.\.(/|$)|\x00"
+_LEADS_OUT = r"^/|^[A-Za-z]:|^\\\\|(^|[/\\])\.\.([/\\]|$)|\x00"
 
 
 @dataclass(frozen=True)
