@@ -12,6 +12,7 @@ COMMANDS = (
     "check",
     "detect",
     "map",
+    "update",
     "evaluate",
     "show_",
     "report",
