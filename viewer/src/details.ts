@@ -80,7 +80,7 @@ export function renderLabel(
       h("kbd", {}, key),
     );
   const expected = details.expected !== null ? `${details.votes} of ${details.votes + details.misses.length || details.expected} images` : plural(details.votes, "image");
-  const side = sideView(details, sigmas.up, dark);
+  const side = sideView(details, sigmas.up, head.origin[2], dark);
   const shots = gallery(
     head,
     dark,

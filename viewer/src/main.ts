@@ -99,6 +99,7 @@ class Page {
         byId("attribution").hidden = !text;
       });
       this.basemap.follow(this.map.getView());
+      this.map.setStreets(false);
     } else if (head.basemap) say("The map has no geo-reference, so there is no basemap under it.");
   }
 

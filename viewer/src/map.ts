@@ -8,9 +8,10 @@ import { classColor, type Color, existenceColor, OUTCOMES, passColor, STATES } f
 import type { Columns } from "./columns";
 import { EllipseLayer } from "./ellipses";
 import { MAX_ZOOM, MIN_ZOOM, type Settings, type View } from "./state";
-import { type Box, flat, Tracks, within } from "./tracks";
+import { type Box, flat, type Level, Tracks, within } from "./tracks";
 
 const ELLIPSE_95 = Math.sqrt(5.991464547107979); // Half axis of 95 % of a normal distribution in the plane, in sigmas.
+const STREET_M = 9;
 const PICK_PX = 12;
 const RAYS_FROM_ZOOM = -2;
 /** From this many pixels of a metre on ellipses are drawn, and only what is around the view. */
@@ -380,7 +381,7 @@ export class MapView {
     if (!whole) return [];
     const showTracks = layers.has("tracks");
     const showCameras = layers.has("cameras") && this.view.zoom > 1.5;
-    const key = `${whole.spacing} ${this.dark} ${[...hiddenPasses].join()}`;
+    const key = `${whole.spacing} ${this.dark} ${this.showStreets} ${[...hiddenPasses].join()}`;
     if (this.trackLayers.key !== key || !contains(this.trackLayers.box, this.ground(0))) {
       const box = this.ground(1);
       const level = within(whole, box);
@@ -403,6 +404,7 @@ export class MapView {
         key,
         box: level === whole ? EVERYWHERE : box,
         layers: [
+          ...(this.showStreets ? this.streetLayers(within(this.tracks.streets(whole), box)) : []),
           new LineLayer({
             id: `tracks-${level.spacing}`,
             data: {
@@ -426,8 +428,52 @@ export class MapView {
         ],
       };
     }
-    const [tracks, cameras] = this.trackLayers.layers;
-    return [tracks.clone({ visible: showTracks }), cameras.clone({ visible: showCameras })];
+    return this.trackLayers.layers.map((layer) => layer.clone({ visible: layer.id.startsWith("cameras") ? showCameras : showTracks }));
+  }
+
+  private showStreets = true;
+
+  /** Whether the ground that was driven is drawn as streets: not over a basemap, which has its own. */
+  setStreets(shown: boolean): void {
+    this.showStreets = shown;
+    this.draw();
+  }
+
+  /** Wide, pale lines beneath the tracks, with round ends: what was driven looks like a street. */
+  private streetLayers(level: Level): Layer[] {
+    const rows = level.pass.length;
+    const color = this.dark ? [34, 42, 51] : [255, 255, 255];
+    const lines = new Uint8Array(4 * rows);
+    const ends = new Uint8Array(4 * rows);
+    for (let i = 0; i < rows; i++) {
+      if (this.settings.hiddenPasses.has(level.pass[i])) continue;
+      lines.set([...color, level.joined[i] ? 255 : 0], 4 * i);
+      ends.set([...color, 255], 4 * i);
+    }
+    return [
+      new LineLayer({
+        id: `tracks-streets-${level.spacing}`,
+        data: {
+          length: Math.max(0, rows - 1),
+          attributes: {
+            getSourcePosition: { value: level.points, size: 3 },
+            getTargetPosition: { value: level.points, size: 3, offset: 12 },
+            getColor: { value: lines, size: 4, normalized: true },
+          },
+        } as never,
+        widthUnits: "common",
+        getWidth: STREET_M,
+        widthMinPixels: 3,
+      }),
+      new ScatterplotLayer({
+        id: `tracks-corners-${level.spacing}`,
+        data: { length: rows, attributes: { getPosition: { value: level.points, size: 3 }, getFillColor: { value: ends, size: 4, normalized: true } } } as never,
+        radiusUnits: "common",
+        getRadius: STREET_M / 2,
+        radiusMinPixels: 1.5,
+        antialiasing: false,
+      }),
+    ];
   }
 
   private truthLayer(): Layer | null {

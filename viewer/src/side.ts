@@ -9,7 +9,7 @@ const HEIGHT = 118;
 const LEFT = 34;
 const BOTTOM = 22;
 
-export function sideView(details: LabelDetails, sigmaUp: number, dark: boolean): SVGSVGElement | null {
+export function sideView(details: LabelDetails, sigmaUp: number, originUp: number, dark: boolean): SVGSVGElement | null {
   const { voters, local_m: at } = details;
   if (!voters.length) return null;
   const rays = voters.map((shot) => ({
@@ -34,10 +34,11 @@ export function sideView(details: LabelDetails, sigmaUp: number, dark: boolean):
       svg("text", { x: x(metres), y: HEIGHT - 7, "text-anchor": "middle" }, metres === 0 ? "0 m" : String(metres)),
     );
   }
-  for (const metres of ticks(low, high, 4)) {
+  for (const metres of ticks(low + originUp, high + originUp, 4)) {
+    const at = y(metres - originUp);
     drawing.append(
-      svg("line", { class: "grid", x1: LEFT, x2: WIDTH - 8, y1: y(metres), y2: y(metres) }),
-      svg("text", { x: LEFT - 4, y: y(metres) + 3, "text-anchor": "end" }, fixed(metres, Number.isInteger(metres) ? 0 : 1)),
+      svg("line", { class: "grid", x1: LEFT, x2: WIDTH - 8, y1: at, y2: at }),
+      svg("text", { x: LEFT - 4, y: at + 3, "text-anchor": "end" }, fixed(metres, Number.isInteger(metres) ? 0 : 1)),
     );
   }
   for (const ray of rays) {

@@ -45,10 +45,12 @@ export function defaults(head: Head): Settings {
 export function toHash(settings: Settings, view: View, selection: Selection, head: Head): string {
   const plain = defaults(head);
   const hash = new URLSearchParams();
-  hash.set("at", `${view.east.toFixed(2)},${view.north.toFixed(2)}`);
+  // In the world's metres: the page's own origin is another one when the map is made again.
+  const [x, y] = head.origin;
+  hash.set("at", `${(view.east + x).toFixed(2)},${(view.north + y).toFixed(2)}`);
   hash.set("z", view.zoom.toFixed(2));
   if (selection?.kind === "label") hash.set("label", String(selection.id));
-  if (selection?.kind === "place") hash.set("place", `${selection.east.toFixed(2)},${selection.north.toFixed(2)}`);
+  if (selection?.kind === "place") hash.set("place", `${(selection.east + x).toFixed(2)},${(selection.north + y).toFixed(2)}`);
   if (settings.colorBy !== plain.colorBy) hash.set("by", settings.colorBy);
   const layers = [...settings.layers].sort().join(",");
   if (layers !== [...plain.layers].sort().join(",")) hash.set("layers", layers);
@@ -87,8 +89,8 @@ export function fromHash(text: string, head: Head): { settings: Settings; view: 
   const label = Number(hash.get("label") ?? NaN);
   let selection: Selection = null;
   if (Number.isInteger(label)) selection = { kind: "label", id: label };
-  else if (place.length === 2) selection = { kind: "place", east: place[0], north: place[1] };
-  const view = at.length === 2 && Number.isFinite(zoom) ? { east: at[0], north: at[1], zoom } : null;
+  else if (place.length === 2) selection = { kind: "place", east: place[0] - head.origin[0], north: place[1] - head.origin[1] };
+  const view = at.length === 2 && Number.isFinite(zoom) ? { east: at[0] - head.origin[0], north: at[1] - head.origin[1], zoom } : null;
   return { settings, view, selection };
 }
 

@@ -52,6 +52,11 @@ export class Tracks {
     for (const level of this.levels) if (!best || level.spacing <= 4 * metresPerPixel) best = level;
     return best;
   }
+
+  /** The level for streets, which are wider than tracks: never the finest, where there is another. */
+  streets(tracks: Level): Level {
+    return tracks === this.levels[0] ? (this.levels[1] ?? tracks) : tracks;
+  }
 }
 
 export function flat(position: Float32Array): Float32Array {
