@@ -29,7 +29,7 @@ from valuemap.map_folder import Map
 from valuemap.report.figures import normalized_errors
 from valuemap.report.page import inline_data, shown
 from valuemap.report.paper import ReportTable, paper_tables
-from valuemap.report.run_tables import doubtful_rows, worst_rows
+from valuemap.report.run_tables import accuracy_tables, doubtful_rows, run_tables, worst_rows
 from valuemap.report.write import files_folder, write_csv_table, write_report
 from valuemap.tables import Categories
 
@@ -322,6 +322,14 @@ def test_honest_covariances_are_called_honest() -> None:
 )
 def test_cells_are_readable(cell: Any, text: str) -> None:
     assert shown(cell) == text
+
+
+def test_names_of_figures_are_readable_and_say_their_units() -> None:
+    tables = {table.name: cells(table) for table in [*accuracy_tables(evaluation_of()), *run_tables(city().result)]}
+    assert tables["accuracy"]["RMSE, horizontal (m)"][0] == evaluation_of().accuracy.rmse_h_m
+    assert "noise position (m)" in tables["counts"]
+    names = [name for name in (*tables["accuracy"], *tables["counts"]) if "_" in name or name.endswith(" m")]
+    assert names == []
 
 
 def test_formulas_are_marked_as_text(tmp_path: Path) -> None:

@@ -113,6 +113,37 @@ def test_the_boxes_that_voted_know_a_label_again_that_moved_and_changed_class() 
     assert match_decisions(decisions, replace(moved, votes=votes), renumbered).tolist() == [0]
 
 
+def test_of_two_heads_the_one_with_the_same_voters_is_known_again_and_missing_images_say_nothing() -> None:
+    """One label between two heads was rejected; the next map, of half the images, has both heads."""
+    dataset = small_dataset()
+    ids = dataset.detections.detection_id
+    image_of = dict(zip(ids.tolist(), dataset.detections.image_id.tolist(), strict=True))
+
+    def map_with(places: list[float], voters: list[list[int]]) -> Map:
+        result = map_of([[x, 20, 5] for x in places], ["light"] * len(places))
+        flat = [each for some in voters for each in some]
+        votes = Votes(
+            label_id=np.repeat(np.arange(len(places)), [len(some) for some in voters]),
+            detection_id=np.array(flat),
+            image_id=np.array([image_of[each] for each in flat]),
+            residual_px=np.ones(len(flat)),
+            residual_sigmas=np.ones(len(flat)),
+        )
+        return replace(result, votes=votes)
+
+    decision = decide(map_with([0.1], [[100, 101, 102]]), 0, "rejected", dataset=dataset)
+    after = map_with([0.0, 0.6], [[103], [100, 101, 102]])
+    assert match_decisions([decision], after, dataset).tolist() == [1]
+    assert match_decisions([replace(decision, voters=())], after, dataset).tolist() == [0]
+    # Most of the voters are in images that are not there: the others decide, wherever the label is.
+    gone = tuple((f"elsewhere/{i}.jpg", 1.0, 1.0) for i in range(20))
+    moved = map_with([30.0], [[100, 101, 102]])
+    assert match_decisions([replace(decision, voters=decision.voters + gone)], moved, dataset).tolist() == [0]
+    # A voter or two of many say nothing.
+    few = replace(decision, voters=decision.voters[:2] + gone)
+    assert match_decisions([few], map_with([30.0], [[100, 101]]), dataset).tolist() == [-1]
+
+
 def test_a_new_map_in_the_same_folder_keeps_the_decisions(tmp_path: Path) -> None:
     result = map_of([[0, 0, 5]])
     write_map(result, tmp_path / "map")

@@ -115,7 +115,7 @@ def test_parquet_is_geoparquet_where_geo_referenced(tmp_path: Path) -> None:
     assert table_to_arrow(again).equals(table_to_arrow(geographic_map().labels))
 
 
-EVERY_FILE = [f"map{suffix}" for suffix in SUFFIXES]
+EVERY_FILE = [f"map{suffix}" for suffix in SUFFIXES if suffix != ".rrd"]  # Tested by itself: it needs an extra.
 
 
 def rows_in(path: Path) -> int:

@@ -35,7 +35,12 @@ pose errors."""
 _GATE = 16.27
 """Squared distance in sigmas up to which a label can be the one that was decided on: chi-square, 3 axes, 99.9 %."""
 _SAME_VOTERS = 0.5
-"""A label with this share of the voters that were decided on is the same one, wherever it is and whatever its class."""
+"""A label with this share of the voters that were decided on, as far as their images are still there, is the same one,
+wherever it is and whatever its class."""
+_LEAST_VOTERS = 3
+"""Fewer of the boxes that voted then say nothing, unless there were no more."""
+_VOTERS_PRICE = 9.0
+"""What it costs, in squared sigmas, to be taken for a label whose voters all vote for another one now."""
 _KEPT_VOTERS = 24
 _NEIGHBOR_M = 6.0
 _CHECK_AGAIN = 2.0
@@ -129,7 +134,8 @@ def match_decisions(decisions: Sequence[Decision], result: Map, dataset: Dataset
     """Return the row of the label (decisions) that each decision is about, -1 where the map has none.
 
     A label can be the one if it has the same class and is where that one was, given the covariances of both, or if most
-    of the boxes that voted then vote for it now. Of all ways to give labels to decisions and to the neighbours that
+    of the boxes that voted then, and whose images are there, vote for it now; of two labels at the place it is more
+    probably the one that has these boxes. Of all ways to give labels to decisions and to the neighbours that
     they remember, each at most once, the one with the smallest sum of squared distances in sigmas counts. Nothing
     depends on the order of the decisions or on the ids of the labels.
     """
@@ -137,10 +143,16 @@ def match_decisions(decisions: Sequence[Decision], result: Map, dataset: Dataset
     row_of_decision = np.full(len(decisions), -1)
     if not decisions or not len(labels):
         return row_of_decision
-    claims = [*_claims_of_places(decisions, labels), *_claims_of_voters(decisions, result, dataset)]
+    shares = _shares_of_voters(decisions, result, dataset)
     cost: dict[tuple[int, int], float] = {}
-    for claimant, row, price in claims:
-        cost[claimant, row] = min(price, cost.get((claimant, row), math.inf))
+    for claimant, row, price in _claims_of_places(decisions, labels):
+        share = shares[claimant] if claimant < len(decisions) else {}
+        # Beside the label that its voters vote for now, another one is the less likely the fewer of them it has.
+        cost[claimant, row] = price + _VOTERS_PRICE * (max(share.values(), default=0.0) - share.get(row, 0.0))
+    for claimant, share in enumerate(shares):
+        for row, part in share.items():
+            if part >= _SAME_VOTERS:
+                cost[claimant, row] = min(_GATE * (1.0 - part), cost.get((claimant, row), math.inf))
     for claimant, row in _assign(cost):
         if claimant < len(decisions):
             row_of_decision[claimant] = row
@@ -375,17 +387,16 @@ def _claims_of_places(decisions: Sequence[Decision], labels: Labels) -> list[tup
 _ANY_CLASS = -2
 
 
-def _claims_of_voters(
-    decisions: Sequence[Decision], result: Map, dataset: Dataset | None
-) -> list[tuple[int, int, float]]:
-    """Return who may have which label because most of the boxes that voted then vote for it now."""
-    if dataset is None:
-        return []
-    wanted = {voter for each in decisions for voter in each.voters}
-    if not wanted:
-        return []
+def _shares_of_voters(decisions: Sequence[Decision], result: Map, dataset: Dataset | None) -> list[dict[int, float]]:
+    """Return which part of the boxes that voted then votes for which label now, by its row, for each decision.
+
+    Boxes in images that the dataset of the new map does not have say nothing.
+    """
+    shares: list[dict[int, float]] = [{} for _ in decisions]
+    names = {name for each in decisions for name, _, _ in each.voters}
+    if dataset is None or not names:
+        return shares
     images, detections, votes, labels = dataset.images, dataset.detections, result.votes, result.labels
-    names = {name for name, _, _ in wanted}
     image_names = images.name.to_pylist()
     image_row = rows_of(votes.image_id, images.image_id)
     is_named = np.array([name in names for name in image_names], dtype=np.bool_)
@@ -395,14 +406,14 @@ def _claims_of_voters(
         label_of_voter[_voter(image_names[image_row[vote]], center)] = int(
             np.searchsorted(labels.label_id, votes.label_id[vote])
         )
-    claims = []
-    for claimant, each in enumerate(decisions):
-        found = [label_of_voter[voter] for voter in each.voters if voter in label_of_voter]
-        for row in sorted(set(found)):
-            share = found.count(row) / len(each.voters)
-            if share >= _SAME_VOTERS:
-                claims.append((claimant, row, _GATE * (1.0 - share)))
-    return claims
+    there = names.intersection(image_names)
+    for share, each in zip(shares, decisions, strict=True):
+        present = [voter for voter in each.voters if voter[0] in there]
+        if len(present) < min(_LEAST_VOTERS, len(each.voters)):
+            continue
+        found = [label_of_voter[voter] for voter in present if voter in label_of_voter]
+        share.update({row: found.count(row) / len(present) for row in sorted(set(found))})
+    return shares
 
 
 def _assign(cost: dict[tuple[int, int], float]) -> list[tuple[int, int]]:

@@ -75,9 +75,38 @@ if (step === "reject") {
   seen.alert = await page.locator("#details .alert").allInnerTexts();
   seen.note = await page.inputValue("#note");
   await page.uncheck("#filters label.check:has-text('Rejected') input");
+  await page.uncheck("#filters label.check:has-text('Check again') input");
   await page.waitForSelector(`#list [data-label="${id}"]`, { state: "detached" });
   seen.hidden = true;
+  // Each filter at its end shows nothing, with the keyboard alone; at its beginning everything again.
+  const listed = () => page.locator("#list [data-label]").count();
+  seen.filtered = {};
+  for (const [name, end, start] of [["votes ≥", "End", "Home"], ["existence ≤", "Home", "End"], ["passes ≥", "End", "Home"]]) {
+    const slider = page.locator(`#filters input[type=range][aria-label="${name}"]`);
+    await slider.focus();
+    await page.keyboard.press(end);
+    const most = await slider.inputValue();
+    seen.filtered[name.split(" ")[0]] = await listed();
+    seen[`${name} at`] = most;
+    await page.keyboard.press(start);
+  }
+  const classes = page.locator("#filters fieldset:has(legend:text-is('Class')) input");
+  for (const box of await classes.all()) await box.uncheck();
+  seen.filtered.class = await listed();
+  for (const box of await classes.all()) await box.check();
+  seen.filtered.all = await listed();
 }
+// What a screen reader would say: everything that can be used has a name.
+seen.unnamed = await page.evaluate(() =>
+  [...document.querySelectorAll("button, input, textarea, select, a[href], [role], canvas")]
+    .filter((each) => each.getAttribute("aria-hidden") !== "true" && !["presentation", "none"].includes(each.getAttribute("role")))
+    .filter((each) => !each.closest("#deck") || each.id === "deck")
+    .filter((each) => {
+      const named = each.getAttribute("aria-label") || each.getAttribute("title") || each.textContent.trim();
+      return !(named || each.labels?.length || each.id === "status");
+    })
+    .map((each) => each.outerHTML.slice(0, 120)),
+);
 seen.pwned = await page.evaluate(() => document.title);
 seen.scripts = await page.evaluate(() => document.querySelectorAll("script:not([src]), img[onerror]").length);
 await browser.close();

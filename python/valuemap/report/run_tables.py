@@ -31,11 +31,32 @@ def accuracy_tables(evaluation: Evaluation) -> list[ReportTable]:
         ("completeness", "Completeness", ()),
         ("chance", "What chance would give", ("The truth is moved aside, and labels are matched with it again.",)),
     ):
-        rows = tuple(
-            (what.replace("_", " "), value) for what, value in _flat(figures[name]) if not isinstance(value, str)
-        )
+        rows = tuple((_readable(what), value) for what, value in _flat(figures[name]) if not isinstance(value, str))
         tables.append(ReportTable(name, title, ("", "value"), rows, notes))
     return tables
+
+
+_UNITS = {"_m": "m", "_rad": "rad", "_px": "px", "_deg": "°"}
+_SPELLINGS = {
+    "rmse h": "RMSE, horizontal",
+    "rmse v": "RMSE, vertical",
+    "rmse 3d": "RMSE in space",
+    "nssda horizontal 95": "NSSDA, horizontal, 95 %",
+    "nssda vertical 95": "NSSDA, vertical, 95 %",
+    "in 95 ellipse": "share in the 95 % ellipse",
+    "in 95 ellipse less bias": "share in the 95 % ellipse, without the bias",
+    "in 95 height": "share in the 95 % interval of the height",
+    "in 95 height less bias": "share in the 95 % interval of the height, without the bias",
+    "stated sigma factor": "true sigma over stated sigma",
+}
+
+
+def _readable(name: str) -> str:
+    """Return the name of a figure for people: `rmse_h_m` is RMSE, horizontal (m)."""
+    unit = next((suffix for suffix in _UNITS if name.endswith(suffix)), "")
+    words = name.removesuffix(unit).replace("_", " ")
+    words = _SPELLINGS.get(words, words.replace("rmse", "RMSE"))
+    return f"{words} ({_UNITS[unit]})" if unit else words
 
 
 def _sentence(text: str) -> str:
@@ -147,9 +168,7 @@ def _stages(result: Map) -> ReportTable:
 
 
 def _counts(result: Map) -> ReportTable:
-    rows = tuple(
-        (name.replace("_", " "), value) for name, value in _flat(result.run.get("counts", {})) if value is not None
-    )
+    rows = tuple((_readable(name), value) for name, value in _flat(result.run.get("counts", {})) if value is not None)
     return ReportTable("counts", "What the run counted", ("", "value"), rows)
 
 

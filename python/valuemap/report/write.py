@@ -243,7 +243,13 @@ def _in_short(result: Map, dataset: Dataset | None, evaluation: Evaluation | Non
         yield f"{result.votes.residual_px.mean():.2f} px", "mean reprojection error"
     seconds = [stage.get("seconds") for stage in result.run.get("stages", []) if isinstance(stage, dict)]
     if seconds:
-        yield f"{sum(float(s) for s in seconds if s is not None):,.2g} s", "for the map, on the machine that made it"
+        yield _seconds(sum(float(s) for s in seconds if s is not None)), "for the map, on the machine that made it"
+
+
+def _seconds(seconds: float) -> str:
+    if seconds >= 600.0:
+        return f"{seconds / 60.0:,.0f} min"
+    return f"{seconds:.0f} s" if seconds >= 10.0 else f"{seconds:.2g} s"
 
 
 def _percent(share: float) -> str:

@@ -24,6 +24,7 @@ from valuemap.writers.opendrive import write_opendrive
 from valuemap.writers.osm import write_osm
 from valuemap.writers.parquet import write_parquet
 from valuemap.writers.postgis import is_database, without_password, write_postgis
+from valuemap.writers.rerun import write_rerun
 
 __all__ = ["FOLDER_WRITERS", "SUFFIXES", "WRITERS", "export_map", "without_password"]
 
@@ -38,6 +39,7 @@ WRITERS: dict[str, Callable[[Export, Path], None]] = {
     "maproulette": write_maproulette,
     "lanelet2": write_lanelet2,
     "xodr": write_opendrive,
+    "rerun": write_rerun,
 }
 
 FOLDER_WRITERS: dict[str, tuple[Callable[[Export, Path], None], Collection[str]]] = {
@@ -56,6 +58,7 @@ SUFFIXES: dict[str, str] = {
     ".geojsonl": "maproulette",
     ".lanelet2.osm": "lanelet2",
     ".xodr": "xodr",
+    ".rrd": "rerun",
 }
 """How a file must end to be of a format without being told; of several that fit, the longest."""
 
