@@ -21,7 +21,7 @@ from valuemap.report.crops import chosen_voters, voter_crop
 from valuemap.report.label_sheet import plot_label
 from valuemap.report.place_sheet import explain_place, place_in_world, plot_place
 from valuemap.report.style import save_figure
-from valuemap.tables import REJECTION_REASONS, Categories, Rejected, Votes, read_table, write_table
+from valuemap.tables import REJECTION_REASONS, Categories, Floats, Rejected, Votes, read_table, write_table
 
 
 def rejected_at(point: np.ndarray[tuple[int], np.dtype[np.float64]], *reasons: str) -> Rejected:
@@ -172,6 +172,25 @@ def test_rejected_hypotheses_say_which_test_they_failed() -> None:
     assert not any("keeps no rejected" in reason for reason in answer.reasons)
     assert explain_place(evidence, point + [500.0, 0.0, 0.0], rejected).reasons[0].startswith("No rejected hypothesis")
     plot_place(evidence, answer, rejected)
+
+
+def test_the_legend_of_a_place_explains_what_is_there_and_nothing_else() -> None:
+    evidence = city()
+    labels = evidence.result.labels
+
+    def legend(point: Floats, rejected: Rejected | None = None) -> set[str]:
+        figure = plot_place(evidence, explain_place(evidence, point, rejected), rejected)
+        found = figure.axes[0].get_legend()
+        assert found is not None
+        return {text.get_text() for text in found.get_texts()}
+
+    assert legend(np.array([5000.0, 0.0, 0.0])) == {"the place"}
+    at_label = legend(labels.position_in_world_m[int(np.argmax(labels.votes))])
+    assert {"labels", "rays that vote for labels", "the place"} <= at_label
+    assert "rejected hypotheses" not in at_label
+    point = place_in_world(evidence, 30.0, 12.0)
+    assert "rejected hypotheses" in legend(point, rejected_at(point, "votes"))
+    assert "rejected hypotheses" not in legend(point, rejected_at(point + [900.0, 0.0, 0.0], "votes"))
 
 
 def test_a_place_is_at_the_height_of_what_was_rejected_there() -> None:

@@ -77,7 +77,7 @@ def test_the_page_of_the_demo(tmp_path: Path) -> None:
     place = before.labels.position_in_world_m
     apart = np.linalg.norm(place[:, None] - place, axis=2) + 1e9 * np.eye(len(place))
     row = int(np.argmax(apart.min(axis=1)))
-    line = [sys.executable, "-m", "valuemap", "view", tmp_path / "map", "--images", pictures, "--no-open"]
+    line = [sys.executable, "-m", "valuemap", "view", str(tmp_path / "map"), "--images", str(pictures), "--no-open"]
     running = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert running.stdout is not None

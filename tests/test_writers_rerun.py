@@ -61,7 +61,7 @@ def log(monkeypatch: pytest.MonkeyPatch) -> Log:
         LineStrips3D=archetype,
         ViewCoordinates=SimpleNamespace(**directions),
     )
-    monkeypatch.setitem(sys.modules, "rerun", stand_in)  # type: ignore[arg-type]
+    monkeypatch.setitem(sys.modules, "rerun", stand_in)
     return told
 
 

@@ -117,7 +117,7 @@ export function renderLabel(
       ["reprojection", fixed(details.rms_px, 2, " px rms")],
       ["σ across", `${fixed(sigmas.major, 3)} × ${fixed(sigmas.minor, 3)} m, height ${fixed(sigmas.up, 3, " m")}`],
       ["parallax", fixed(details.max_parallax_deg, 1, "°")],
-      ["size", `${fixed(details.size_m[0], 2)} × ${fixed(details.size_m[1], 2, " m")}`],
+      ...(details.size_m[0] || details.size_m[1] ? ([["size", `${fixed(details.size_m[0], 2)} × ${fixed(details.size_m[1], 2, " m")}`]] as [string, string][]) : []),
       ["faces", `${fixed(details.facing_deg, 0, "°")} (concentration ${fixed(details.facing_concentration, 2)})`],
       ...place(details),
       ...seen,

@@ -15,7 +15,7 @@ function overlay(shot: Shot, left: number, top: number, width: number, height: n
   if (!shot.picture) drawing.append(svg("rect", { class: "frame", x: 0, y: 0, width: shot.size[0], height: shot.size[1] }));
   const [x, y, w, tall] = shot.box ?? [null, null, null, null];
   if (x !== null && y !== null) {
-    if (w !== null && tall !== null) {
+    if (w && tall) {
       const place = { x: x - w / 2, y: y - tall / 2, width: w, height: tall };
       drawing.append(svg("rect", { class: "box under", ...place }), svg("rect", { class: "box", ...place }));
     } else {

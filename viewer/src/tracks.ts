@@ -23,7 +23,7 @@ export interface Box {
 
 const CHUNK = 128;
 
-const SPACINGS = [0, 10, 40, 160];
+const SPACINGS = [0, 4, 12, 40, 160];
 
 export class Tracks {
   readonly levels: Level[];

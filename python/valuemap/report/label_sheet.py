@@ -255,7 +255,7 @@ def _draw_seen_from(
     others = labels.position_in_world_m @ axes_in_world.T - point
     axes.plot(others[:, 0], others[:, 1], "o", color="white", markeredgecolor=INK, markersize=5, zorder=4)
     axes.plot(0.0, 0.0, "o", color=BLUE, markeredgecolor="white", markersize=9, zorder=5)
-    axes.set_title("Seen from: dots voted, crosses did not; circles are other labels", pad=7)
+    axes.set_title("Seen from: dots voted, crosses did not", pad=7)
     axes.set_xlabel("from the label (m)")
 
 

@@ -326,7 +326,7 @@ def _draw_look(axes: Axes, evidence: Evidence, answer: PlaceAnswer, pictures: Pa
         0.0, -0.035, name if len(name) <= 26 else f"…{name[-25:]}", transform=axes.transAxes, fontsize=8.5, va="top",
         color=FAINT_INK,
     )  # fmt: skip
-    what = "points here" if len(here) else "no detection points here"
+    what = "points here" if len(here) else "no box here"
     axes.text(0.0, -0.135, f"{what}, {looks.distance_m[look]:.0f} m", transform=axes.transAxes, fontsize=8.8, va="top")
 
 
@@ -342,6 +342,8 @@ def _draw_place(
 
     point = answer.point_in_world_m @ basis.T
     reach = max(12.0, 5.0 * answer.radius_m)
+    if len(answer.passing) == 0 and len(answer.looks):  # Nothing points here: what looks here is what there is to see.
+        reach = max(reach, 1.1 * float(np.median(answer.looks.distance_m)))
     axes.set_facecolor(GROUND)
     axes.grid(visible=False)
     for spine in axes.spines.values():
@@ -358,20 +360,25 @@ def _draw_place(
             [center[i, 0], end[0]], [center[i, 1], end[1]], color=color, linewidth=1.1 if is_free else 0.6,
             alpha=0.8 if is_free else 0.35, zorder=2,
         )  # fmt: skip
+    free = passing.label_id < 0
+    if np.any(free):
+        color = pass_color(int(passing.pass_number[free][0]))
+        axes.plot([], [], color=color, linewidth=1.4, label="rays that vote for nothing")
+    if not np.all(free):
+        axes.plot([], [], color=GREY, linewidth=1.4, label="rays that vote for labels")
+
+    def draw(points: Floats, marker: str, text: str, **style: Any) -> None:
+        inside = points[np.all(np.abs(points - point) <= reach, axis=1)]
+        if len(inside):  # The legend explains what is there.
+            axes.plot(inside[:, 0], inside[:, 1], marker, label=text, zorder=4, **style)
+
     cameras = evidence.center_in_world_m[answer.looks.image_row] @ basis.T
-    axes.plot(
-        cameras[:, 0], cameras[:, 1], ".", color=FAINT_INK, markersize=3.5, zorder=3, label="cameras that picture it"
-    )
+    draw(cameras, ".", "cameras that picture it", color=FAINT_INK, markersize=4.5)
     labels = evidence.result.labels.position_in_world_m @ basis.T
-    axes.plot(
-        labels[:, 0], labels[:, 1], "o", color=BLUE, markeredgecolor="white", markersize=8, zorder=4, label="labels"
-    )
-    if rejected is not None and len(rejected):
+    draw(labels, "o", "labels", color=BLUE, markeredgecolor="white", markersize=8)
+    if rejected is not None:
         position = rejected.position_in_world_m @ basis.T
-        axes.plot(
-            position[:, 0], position[:, 1], "X", color=VERMILION, markeredgecolor="white", markersize=8, zorder=4,
-            label="rejected hypotheses",
-        )  # fmt: skip
+        draw(position, "X", "rejected hypotheses", color=VERMILION, markeredgecolor="white", markersize=8)
     axes.add_patch(Circle((point[0], point[1]), answer.radius_m, fill=False, edgecolor=INK, linestyle="--", zorder=5))
     axes.plot(*point, "+", color=ORANGE, markersize=16, markeredgewidth=2.4, zorder=6, label="the place")
     axes.set_xlim(point[0] - reach, point[0] + reach)
@@ -380,7 +387,7 @@ def _draw_place(
     axes.set_xlabel(names[0])
     axes.set_ylabel(names[1])
     axes.tick_params(labelsize=9.5)
-    axes.set_title("From above: coloured rays vote for nothing, grey ones for labels", pad=7)
+    axes.set_title("From above", pad=7)
     axes.legend(loc="lower left", fontsize=9.5, frameon=True, facecolor="white", framealpha=0.85, edgecolor="none")
 
 

@@ -265,12 +265,12 @@ def _cards(
     for row in map(int, rows):
         expected = "" if labels.expected is None else f" of {labels.expected[row]}"
         passes = f"{labels.passes[row]} {'pass' if labels.passes[row] == 1 else 'passes'}"
-        lines = [f"{labels.votes[row]}{expected} images, {passes}, sigma {spread[row]:.2f} m"]
+        lines = [f"{labels.votes[row]}{expected} images, {passes}, sigma {spread[row]:.2f}\u00a0m"]
         if labels.existence is not None:
             lines.append(f"exists with probability {labels.existence[row]:.3f}")
         if evaluation is not None and error is not None:
             outcome = evaluation.matches.label_outcome
-            off = f", {error[row]:.2f} m off" if np.isfinite(error[row]) else ""
+            off = f", {error[row]:.2f}\u00a0m off" if np.isfinite(error[row]) else ""
             lines.append(f"against the truth: {outcome.names[outcome.codes[row]]}{off}")
         name = labels.class_name.names[labels.class_name.codes[row]]
         yield Card(row, f"Label {labels.label_id[row]}: {name}", tuple(lines), tuple(crops.get(row, ())))
