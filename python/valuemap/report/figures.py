@@ -182,8 +182,10 @@ def covariance(result: Map, evaluation: Evaluation | None) -> ReportFigure | Non
         axes.set_aspect("equal")
         # On the side where the curve is not.
         is_below = float(np.mean(share - claimed)) < 0.0
-        x, y, side = (0.03, 0.7, "left") if is_below else (0.97, 0.05, "right")
-        axes.text(x, y, "overconfident below,\ntoo careful above the line", ha=side, fontsize=9, color=FAINT_INK)
+        left, bottom, side = (0.03, 0.7, "left") if is_below else (0.97, 0.05, "right")
+        axes.text(
+            left, bottom, "overconfident below,\ntoo careful above the line", ha=side, fontsize=9, color=FAINT_INK
+        )
         axes.legend(loc="upper left")
         top = max(3.0 * dimensions, float(np.quantile(squared, 0.98)))
         edges = np.linspace(0.0, top, 25).tolist()
