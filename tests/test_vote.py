@@ -53,16 +53,16 @@ def assert_same_as_literal(scene: Scene, config: VoteConfig) -> int:
     return len(expected)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_core_equals_the_literal_algorithm(seed: int) -> None:
     assert assert_same_as_literal(random_scene(seed), VoteConfig()) > 0
 
 
-@pytest.mark.parametrize("alpha", [0.5, 1.25, 2.0])
-def test_core_equals_the_literal_algorithm_at_other_ratios(alpha: float) -> None:
-    scene = random_scene(100, images=12, objects=4, clutter=10)
+@pytest.mark.parametrize(("alpha", "labels"), [(0.5, 4), (1.25, 3), (2.0, 0)])
+def test_core_equals_the_literal_algorithm_at_other_ratios(alpha: float, labels: int) -> None:
+    scene = random_scene(105, images=9, objects=4, clutter=8)
     config = VoteConfig(min_vote_ratio=alpha, min_votes=2, min_parallax_deg=1.0, max_reprojection_error_px=9.0)
-    assert_same_as_literal(scene, config)
+    assert assert_same_as_literal(scene, config) == labels
 
 
 def test_core_equals_the_literal_algorithm_with_several_classes() -> None:
@@ -71,7 +71,7 @@ def test_core_equals_the_literal_algorithm_with_several_classes() -> None:
 
 
 def test_core_equals_the_literal_algorithm_under_clutter_alone() -> None:
-    assert_same_as_literal(random_scene(300, objects=0, clutter=50), VoteConfig(min_votes=2))
+    assert assert_same_as_literal(random_scene(300, objects=0, clutter=35), VoteConfig(min_votes=2)) > 0
 
 
 def test_one_object_seen_by_all_gives_one_label_at_its_place() -> None:
