@@ -98,6 +98,7 @@ def test_detections_of_a_dataset_are_replaced(dataset: Path, finder: Path) -> No
     assert record["counts"] == {
         "pictures": 4,
         "unusable_pictures": 0,
+        "pictures_of_noise_or_one_color": 0,
         "turned_by_exif": 0,
         "detections": 8,
         "detections_of_class": {"traffic_light": 8},

@@ -276,6 +276,7 @@ def test_the_file_names_its_dimensions_and_itself_and_no_place_of_this_machine(e
         "valuemap.std": "[0.229, 0.224, 0.225]",
         "valuemap.color": "RGB",
         "valuemap.minimum_component_px": "7",
+        "valuemap.min_coarse_share": "0.04",
     }
     assert b"fc_densenet.py" not in path.read_bytes()
     assert str(Path.home()).encode() not in path.read_bytes()

@@ -14,6 +14,7 @@ from torch import nn
 
 from valuemap.detect.fc_densenet import FCDenseNet
 from valuemap.detect.samples import MEAN, MULTIPLE_PX, STD
+from valuemap.detect.structure import MIN_COARSE_SHARE
 from valuemap.folders import new_file
 
 _SIDES = ("height", "width")
@@ -59,6 +60,7 @@ def export_onnx(
         "valuemap.std": json.dumps(STD),
         "valuemap.color": "RGB",
         "valuemap.minimum_component_px": str(minimum_component_px),
+        "valuemap.min_coarse_share": repr(MIN_COARSE_SHARE),
     }
     for key, text in metadata.items():
         model.metadata_props.add(key=key, value=text)

@@ -21,6 +21,7 @@ from valuemap.detect.model import Model, load_model
 from valuemap.detect.outputs import find_boxes
 from valuemap.detect.panorama import PanoramaViews, plan_views
 from valuemap.detect.pictures import Picture, UnusablePicture, read_picture
+from valuemap.detect.structure import coarse_share
 from valuemap.detect.tiles import Window, are_cut, inner_borders, merge_views, plan_tiles
 
 _ALL_INNER = (True, True, True, True)
@@ -101,6 +102,8 @@ class Detector:
         try:
             picture = read_picture(task.path, upright=not task.is_panorama)
             in_stored_pixels = _is_of_stored_pixels(picture, task)
+            if not self._has_structure(picture):
+                return Outcome(Boxes.none(), picture.stored, was_turned=picture.orientation != 1, has_structure=False)
             around = views[picture.stored] if task.is_panorama else None
             scenes = (
                 [picture.pixels] if around is None else [around.draw(picture.pixels, i) for i in range(around.count)]
@@ -108,6 +111,10 @@ class Detector:
             return _Prepared(picture, in_stored_pixels, around, [self._cut(pixels) for pixels in scenes])
         except UnusablePicture as problem:
             return Outcome(Boxes.none(), problem=str(problem))
+
+    def _has_structure(self, picture: Picture) -> bool:
+        least = self.model.min_coarse_share
+        return least <= 0.0 or coarse_share(picture.pixels) >= least
 
     def _cut(self, pixels: Pixels) -> list[_Tile]:
         size = (pixels.shape[1], pixels.shape[0])

@@ -28,13 +28,15 @@ from valuemap.system import OWN_FILE
 class Outcome:
     """What became of one picture: boxes in its stored pixels, or why there are none; turned by its EXIF data or not.
 
-    `stored` is its width and height as stored.
+    `stored` is its width and height as stored. A picture without structure is of one colour or noise: there is nothing
+    in it, and the network did not see it.
     """
 
     boxes: Boxes
     stored: Size = (0, 0)
     problem: str | None = None
     was_turned: bool = False
+    has_structure: bool = True
 
     def to_json(self) -> dict[str, Any]:
         """Return the object that `from_json` reads back without a change."""
@@ -44,6 +46,7 @@ class Outcome:
             "stored": list(self.stored),
             "problem": self.problem,
             "was_turned": self.was_turned,
+            "has_structure": self.has_structure,
         }
 
     @staticmethod
@@ -52,7 +55,7 @@ class Outcome:
         table = np.array(entry["boxes"], dtype=np.float64).reshape(-1, 6)
         boxes = Boxes(table[:, :2], table[:, 2:4], table[:, 4], table[:, 5].astype(np.int64))
         width, height = entry["stored"]
-        return Outcome(boxes, (width, height), entry["problem"], entry["was_turned"])
+        return Outcome(boxes, (width, height), entry["problem"], entry["was_turned"], entry["has_structure"])
 
 
 class Journal:

@@ -235,9 +235,10 @@ class _Run:
 
     def write_record(self, *, force: bool) -> None:
         """Write detect.json and forget the journal."""
-        unusable, found, turned = [], Counter[str](), 0
+        unusable, found, turned, bare = [], Counter[str](), 0, 0
         for name, outcome in zip(self.names, self.journal.read(), strict=True):
             turned += outcome.was_turned
+            bare += not outcome.has_structure
             found.update(map(self.detector.wanted.name_of, outcome.boxes.class_code.tolist()))
             if outcome.problem is not None:
                 unusable.append({"image": name, "problem": outcome.problem})
@@ -248,6 +249,7 @@ class _Run:
             "counts": {
                 "pictures": len(self.tasks),
                 "unusable_pictures": len(unusable),
+                "pictures_of_noise_or_one_color": bare,
                 "turned_by_exif": turned,
                 "detections": found.total(),
                 "detections_of_class": dict(sorted(found.items())),
