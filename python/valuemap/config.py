@@ -273,6 +273,15 @@ def describe_settings() -> list[tuple[str, str, str, str]]:
     ]
 
 
+def list_settings() -> list[dict[str, Any]]:
+    """Return every setting as an object of JSON: name, default (null: estimated), unit, effect, method (null: all)."""
+    return [
+        {"name": s.name, "default": s.default, **{key: s.metadata[key] for key in ("unit", "effect", "method")}}
+        for stage in MapConfig()._stages().values()
+        for s in fields(stage)
+    ]
+
+
 def _assign(stages: Mapping[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
     """Return the stages by name, with `name=value` assignments applied to the stage that has the name."""
     changes: dict[str, dict[str, float]] = {}
@@ -633,7 +642,7 @@ class SimulationConfig:
         unit="1",
         open_low=True,
         high=1.0,
-        effect="share of the lights in view that are detected, mean of the passes",
+        effect="detection rate: share of the lights in view that are detected, mean of the passes",
     )
     recall_sd: float = _setting(
         0.06,
@@ -644,7 +653,7 @@ class SimulationConfig:
     half_recall_height_px: float = _setting(
         3.0,
         unit="px",
-        effect="box height at which the recall is half; at twice the height 94 % of it; 0 switches off",
+        effect="box height at which the detection rate is half; at twice the height 94 % of it; 0 switches off",
     )
     pixel_noise_px: float = _setting(1.2, unit="px", effect="standard deviation of a small box's centre, each axis")
     pixel_noise_share: float = _setting(
@@ -693,7 +702,7 @@ class SimulationConfig:
         0.6,
         unit="1",
         high=1.0,
-        effect="how often a temporary object is detected, as share of the recall of lights",
+        effect="how often a temporary object is detected, as share of the detection rate of lights",
     )
     lookalikes_per_light: float = _setting(
         0.02,
@@ -701,7 +710,7 @@ class SimulationConfig:
         effect="false objects that stay, look like lights and are met by every pass; 0 for none",
     )
     lookalike_recall: float = _setting(
-        0.4, unit="1", high=1.0, effect="how often a lookalike is detected, as share of the recall of lights"
+        0.4, unit="1", high=1.0, effect="how often a lookalike is detected, as share of the detection rate of lights"
     )
 
     # The errors of the poses.

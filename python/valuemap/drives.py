@@ -913,18 +913,3 @@ def in_driving_order(dataset: Dataset, *, viewpoint_step_m: float = 1.0) -> InOr
     images = images.replace(image_id=np.arange(len(images)))
     detections = detections.replace(detection_id=np.arange(len(detections)), image_id=image_row)
     return InOrder(replace(dataset, images=images, detections=detections), drives, image_id, detection_id)
-
-
-def summarize_drives(drives: Drives) -> dict[str, Any]:
-    """Return what was found as facts of one line each, for people and scripts."""
-    record = drives.record
-    return {
-        "drives": record["drives"],
-        "drives cut at": _listed(record["cut_at"]) or "-",
-        "driving order by": _listed(record["images_ordered_by"]),
-        "images on rigs": record["images_on_rigs"],
-    }
-
-
-def _listed(counts: dict[str, int]) -> str:
-    return ", ".join(f"{name} {count}" for name, count in counts.items())

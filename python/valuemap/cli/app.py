@@ -16,7 +16,24 @@ from valuemap.cli.load import COMMANDS, name_of
 from valuemap.cli.signals import Terminated, exit_code
 from valuemap.errors import ValuemapError
 
+_WrongUse: Any = typer.BadParameter.__bases__[0]
+"""Options and arguments that cannot be; Typer gives the class no name of its own."""
+
 _NOTHING_WRITTEN = ("nothing was written", "run the same command again to start over")
+
+
+@contextmanager
+def _wrong_use_in_one_line() -> Iterator[None]:
+    """Say in one line which option or argument cannot be, as with all other errors, and exit with 2."""
+    try:
+        yield
+    except _WrongUse as error:
+        if type(error).__name__ == "NoArgsIsHelpError":  # Its message is the help.
+            raise
+        message = " ".join(error.format_message().replace("Value error, ", "").split())
+        command = "valuemap" if error.ctx is None else error.ctx.command_path
+        complain(f"error: {message}", f"{command} --help says what it takes")
+        sys.exit(error.exit_code)
 
 
 class _Commands(typer.core.TyperGroup):
@@ -26,8 +43,12 @@ class _Commands(typer.core.TyperGroup):
         order = {name_of(module): place for place, module in enumerate(COMMANDS)}
         return sorted(super().list_commands(ctx), key=order.__getitem__)
 
+    def make_context(self, *arguments: Any, **named: Any) -> Any:
+        with _wrong_use_in_one_line():
+            return super().make_context(*arguments, **named)
+
     def invoke(self, ctx: Any) -> Any:
-        with on_interrupt(*_NOTHING_WRITTEN):
+        with on_interrupt(*_NOTHING_WRITTEN), _wrong_use_in_one_line():
             try:
                 return super().invoke(ctx)
             except ValuemapError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated
 
 import typer
 
@@ -30,8 +30,8 @@ def detect_command(
     ] = DetectConfig.size,
     tile: Annotated[int, typer.Option(help="Cut larger pictures into overlapping tiles, px; 0 for none.")] = 0,
     batch: Annotated[int, typer.Option(help="Pictures that go through the network together.")] = 1,
-    provider: Annotated[str, typer.Option(help=f"One of {', '.join(get_args(Provider))}.")] = DetectConfig.provider,
-    kind: Annotated[str | None, typer.Option(help=f"What the outputs mean: {', '.join(get_args(ModelKind))}.")] = None,
+    provider: Annotated[Provider, typer.Option(help="What the network runs on.")] = DetectConfig.provider,
+    kind: Annotated[ModelKind | None, typer.Option(help="What the outputs mean; default: found out.")] = None,
     images: Annotated[
         Path | None, typer.Option(help="Folder of the pictures of a dataset; default: images in it.")
     ] = None,
@@ -49,10 +49,10 @@ def detect_command(
     if str(model) == "bundled":
         model = BUNDLED_MODEL
     config = DetectConfig(
-        kind=kind,  # type: ignore[arg-type]
+        kind=kind,
         classes=classes,
         size=size,
-        provider=provider,  # type: ignore[arg-type]
+        provider=provider,
         min_score=min_score,
         tile_px=tile,
         batch=batch,

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated
 
 import typer
 from rich.table import Table
 
 from valuemap.cli import show as shown
 from valuemap.cli.app import app, on_interrupt
-from valuemap.cli.options import AsJson, Settings
+from valuemap.cli.options import DEFAULT_METHOD, AsJson, MethodName, Settings
 from valuemap.cli.show import log, progress_bars
-from valuemap.config import MapConfig, Method
+from valuemap.config import MapConfig
 from valuemap.dataset import read_dataset
 
 experiment_app = typer.Typer(no_args_is_help=True, help="Measure on your own data what the paper measures on its.")
@@ -27,7 +27,7 @@ def passes_command(
     seeds: Annotated[int, typer.Option(min=1, help="Random orders of the passes.")] = 5,
     min_passes: Annotated[int, typer.Option(min=2, help="Clusters with fewer passes do not count.")] = 5,
     radius: Annotated[float, typer.Option(help="Metres within which a label can be an object.")] = 2.0,
-    method: Annotated[str, typer.Option(help=f"One of {', '.join(get_args(Method))}.")] = MapConfig().method,
+    method: MethodName = DEFAULT_METHOD,
     threads: Annotated[int, typer.Option(min=0, help="Threads, 0 for one a core; the result is the same.")] = 0,
     assignments: Settings = None,
     as_json: AsJson = False,
@@ -35,7 +35,7 @@ def passes_command(
     """Measure recall, reprojection error and position error against the number of passes, as in the paper's Fig. 4."""
     from valuemap.experiment import CURVES, experiment_passes
 
-    config = MapConfig(method=method).with_settings(assignments or [])  # type: ignore[arg-type]
+    config = MapConfig(method=method).with_settings(assignments or [])
     state, hint = "all finished maps are kept", "run the same command again to go on from here"
     with on_interrupt(state, hint), progress_bars() as progress:
         result = experiment_passes(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -16,7 +16,9 @@ from valuemap.evidence import find_dataset
 from valuemap.geodesy import accuracy_note
 from valuemap.map_folder import REVIEW, Map, read_map
 from valuemap.review import apply_review, read_review
-from valuemap.writers import FOLDER_WRITERS, SUFFIXES, WRITERS, export_map, without_password
+from valuemap.writers import SUFFIXES, export_map, without_password
+
+Format = Literal["csv", "geojson", "parquet", "gpkg", "fgb", "kml", "osm", "maproulette", "lanelet2", "xodr", "colmap"]
 
 _SHOWN_IDS = 10
 
@@ -29,10 +31,7 @@ def export_command(
     target: Annotated[
         str, typer.Argument(metavar="FILE|URL", help="File to write, whose suffix says the format, or a database.")
     ],
-    format_name: Annotated[
-        str | None,
-        typer.Option("--format", help=f"The format, whatever the suffix: {', '.join([*WRITERS, *FOLDER_WRITERS])}."),
-    ] = None,
+    format_name: Annotated[Format | None, typer.Option("--format", help="The format, whatever the suffix.")] = None,
     crs: Annotated[
         str | None, typer.Option(help="Reference system to write in, such as EPSG:25832; default: WGS84.")
     ] = None,

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated
 
 import typer
 
 from valuemap import map_folder
 from valuemap.cli.app import app
-from valuemap.cli.options import AsJson, Force, Resume, Settings, TileSize, Work
+from valuemap.cli.options import DEFAULT_METHOD, AsJson, Force, MethodName, Resume, Settings, TileSize, Work
 from valuemap.cli.show import log, progress_bars, show, show_notes
 from valuemap.cli.working import working
-from valuemap.config import MapConfig, Method
+from valuemap.config import MapConfig
 from valuemap.dataset import read_dataset
 from valuemap.engine.threads import ThreadEngine
 from valuemap.evaluate import evaluate_map
@@ -31,7 +31,7 @@ from valuemap.tiles.calibration import read_calibration
 def map_command(
     dataset: Annotated[Path, typer.Argument(help="Folder that an import or simulate command wrote.")],
     out: Annotated[Path, typer.Option("--out", help="Folder to write the map to.")],
-    method: Annotated[str, typer.Option(help=f"One of {', '.join(get_args(Method))}.")] = MapConfig().method,
+    method: MethodName = DEFAULT_METHOD,
     threads: Annotated[int, typer.Option(min=0, help="Threads, 0 for one a core; the map is the same.")] = 0,
     picture: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw the map from above, as .png or .svg.")
@@ -47,7 +47,7 @@ def map_command(
     as_json: AsJson = False,
 ) -> None:
     """Turn the detections of a dataset into a map of labels."""
-    config = MapConfig(method=method).with_settings(assignments or [])  # type: ignore[arg-type]
+    config = MapConfig(method=method).with_settings(assignments or [])
     check_place(out, parts=map_folder.PARTS, force=force)
     if picture is not None:
         check_format(picture)

@@ -7,12 +7,16 @@ from typing import Annotated
 
 import typer
 
+from valuemap.config import MapConfig, Method
+
 DatasetOut = Annotated[Path, typer.Option("--out", help="Folder to write the dataset to.")]
 Up = Annotated[
     tuple[float, float, float] | None,
     typer.Option("--up", metavar="X Y Z", help="Direction of the sky; default: the mean of the cameras' own."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON to stdout.")]
+MethodName = Annotated[Method, typer.Option(help="The published method, or the one that goes beyond it.")]
+DEFAULT_METHOD = MapConfig().method
 Settings = Annotated[
     list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a setting; may be repeated.")
 ]

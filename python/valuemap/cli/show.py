@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -19,19 +19,51 @@ from valuemap.progress import Progress
 SHOWN_PROBLEMS = 5
 """How many problems of one kind are printed before the rest is counted."""
 
+_TOLD_AS = {
+    "extent_m": "extent in m",
+    "images_by_detections": "images with 0, 1, 2, ... detections",
+    "median_reprojection_rms_px": "median reprojection rms in px",
+}
+
 # Names of users are no markup: a class may be called [/].
 out = Console(markup=False, emoji=False)
 log = Console(stderr=True, markup=False, emoji=False)
 
 
-def show(facts: dict[str, Any], *, title: str | None = None, console: Console = out) -> None:
-    """Print facts as two columns; nested ones as name.key."""
+def show(facts: Mapping[str, Any], *, title: str | None = None) -> None:
+    """Print facts as two columns on stdout, in words: `images_on_rigs` is told as "images on rigs"."""
     table = Table(show_header=False, box=None, title=title, title_justify="left", title_style="bold")
     table.add_column(no_wrap=True)
     table.add_column(justify="right")
     for name, value in facts.items():
-        table.add_row(name, f"{value:.3f}" if isinstance(value, float) else str(value))
-    console.print(table)
+        table.add_row(_TOLD_AS.get(name, name.replace("_", " ")), worded(name, value))
+    out.print(table)
+
+
+def worded(name: str, value: Any) -> str:
+    """Return the value of a fact as a person reads it."""
+    if name == "frame":
+        return _frame(value)
+    if name == "extent_m":
+        return " x ".join(f"{side:.0f}" for side in value)
+    if isinstance(value, float):
+        return f"{value:.3f}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_short(each)}" for key, each in value.items()) or "-"
+    if isinstance(value, list | tuple):
+        return (" " if all(isinstance(each, int) for each in value) else ", ").join(map(_short, value)) or "-"
+    return "-" if value is None else str(value)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.2g}" if isinstance(value, float) else str(value)
+
+
+def _frame(frame: Mapping[str, Any]) -> str:
+    if "anchor" not in frame:
+        return f"local, up {' '.join(f'{c:.3g}' for c in frame['up'])}"
+    anchor = frame["anchor"]
+    return f"east, north, up at lat {anchor['lat']:.7f} lon {anchor['lon']:.7f} height {anchor['height']:.2f} m"
 
 
 def show_notes(notes: Iterable[str]) -> None:
@@ -72,7 +104,9 @@ def progress_bars() -> Iterator[Progress]:
 
         def progress(what: str, done: int, total: int) -> None:
             if what not in tasks:
-                tasks[what] = bars.add_task(what)
+                for earlier in bars.tasks:  # What comes next begins when what was before has ended.
+                    bars.update(earlier.id, completed=earlier.total)
+                tasks[what] = bars.add_task(what, total=total)
             bars.update(tasks[what], completed=done, total=total)
 
         yield progress

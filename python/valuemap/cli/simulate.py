@@ -2,40 +2,40 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from valuemap.cli.app import app, on_interrupt
 from valuemap.cli.import_.app import check_out, finish_dataset
-from valuemap.cli.options import DatasetOut, Force, Settings
+from valuemap.cli.options import AsJson, DatasetOut, Force, Settings
 from valuemap.cli.show import log, progress_bars
-from valuemap.errors import SettingError
+
+Preset = Literal["small", "sf", "nyc"]
 
 
 @app.command("simulate")
 def simulate_command(
     out: DatasetOut,
-    preset: Annotated[str, typer.Option(help="small, sf or nyc: the sizes of the paper's two data sets.")] = "small",
+    preset: Annotated[Preset, typer.Option(help="sf and nyc have the sizes of the paper's two data sets.")] = "small",
     seed: Annotated[int, typer.Option(help="Another seed, another city.")] = 0,
     images: Annotated[
         bool, typer.Option("--images", help="Draw the pictures too, with the true boxes in boxes.json.")
     ] = False,
     assignments: Settings = None,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Simulate a city, drives through it and a noisy detector, with truth."""
     from valuemap.simulate import PRESETS, record_city
 
-    if preset not in PRESETS:
-        raise SettingError(f"--preset {preset}: there is no such preset", hint=f"choose one of {', '.join(PRESETS)}")
     check_out(out, force=force)
     config = PRESETS[preset].with_settings(assignments or [])
     if images:
         config.check_drawable()
     with progress_bars() as progress:
         recording = record_city(config, seed=seed, name=preset, progress=progress)
-    finish_dataset(recording.dataset, out, force=force)
+    finish_dataset(recording.dataset, out, force=force, as_json=as_json)
     if images:
         from valuemap.simulate.render import render_images  # Draws with a library that nothing else here needs.
 

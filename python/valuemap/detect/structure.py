@@ -22,8 +22,8 @@ def coarse_share(pixels: Pixels) -> float:
     sky, road and shadow leave a good part of it in the blocks. Of noise whose grain is g blocks wide about g**2 is
     left, and of one colour nothing. The root of the brightness is taken: at night a lamp must not be all that counts.
 
-    Measured: at least 0.10 in 180 pictures of streets, real ones of two countries and rendered; at most 0.005 in
-    noise with a grain of up to 8 px, and 0.03 at 16 px, in 640 x 480.
+    Measured: at least 0.09 in 939 pictures of streets in two countries, 0.05 in 1,088 rendered ones; at most 0.005 in
+    noise with grains up to 8 px, 0.03 at 16 px (640 x 480).
 
     Parameters
     ----------

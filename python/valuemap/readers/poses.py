@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -27,7 +28,12 @@ _LARGEST_M = 1e8
 # Columns are the axes of a level camera that looks north: x east, y down, z north.
 LOOKING_NORTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
-AXES = {
+RotationName = Literal["cam_from_world", "world_from_cam"]
+"""What a rotation does."""
+
+Axes = Literal["right-down-forward", "right-up-back", "forward-left-up"]
+
+AXES: dict[Axes, Floats] = {
     "right-down-forward": np.eye(3),
     "right-up-back": np.diag([1.0, -1.0, -1.0]),
     "forward-left-up": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,10 +27,15 @@ def check_out(out: Path, *, force: bool) -> None:
     check_place(out, parts=PARTS, force=force)
 
 
-def finish_dataset(dataset: Dataset, out: Path, *, force: bool) -> None:
-    """Write the dataset and say on stderr what it holds, and what was left out."""
+def finish_dataset(dataset: Dataset, out: Path, *, force: bool, as_json: bool) -> None:
+    """Write the dataset, say on stdout what it holds, and on stderr what was left out."""
     write_dataset(dataset, out, force=force)
-    show(summarize_dataset(dataset), console=log)
+    facts = summarize_dataset(dataset)
+    if as_json:
+        left_out = {} if dataset.rejected is None else count_reasons(dataset.rejected)
+        print(json.dumps({**facts, "left_out": left_out}, indent=2))
+    else:
+        show(facts)
     if dataset.rejected is not None:
         show_notes(_rejected_lines(dataset.rejected, out))
     log.print(f"Wrote {out}", highlight=False)

@@ -9,7 +9,7 @@ import typer
 
 from valuemap.cli.import_.app import check_out, finish_dataset, import_app
 from valuemap.cli.import_.options import Anchor, with_detections
-from valuemap.cli.options import DatasetOut, Force, MaxRejected, Up
+from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected, Up
 from valuemap.cli.show import progress_bars
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.vet import MAX_REJECTED
@@ -26,6 +26,7 @@ def import_argoverse2(
     anchor: Anchor = None,
     max_rejected: MaxRejected = MAX_REJECTED,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Import Argoverse 2 sensor logs: one log, or all logs of one city in a folder."""
     from valuemap.readers import READERS
@@ -41,4 +42,4 @@ def import_argoverse2(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out, force=force)
+    finish_dataset(dataset, out, force=force, as_json=as_json)

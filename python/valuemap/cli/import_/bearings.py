@@ -9,7 +9,7 @@ import typer
 
 from valuemap.cli.import_.app import check_out, finish_dataset, import_app
 from valuemap.cli.import_.options import Anchor, CameraHeight, ClassName, Columns
-from valuemap.cli.options import DatasetOut, Force, MaxRejected
+from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected
 from valuemap.cli.show import progress_bars
 from valuemap.readers.csv_file import parse_columns
 from valuemap.readers.vet import MAX_REJECTED
@@ -26,6 +26,7 @@ def import_bearings(
     anchor: Anchor = None,
     max_rejected: MaxRejected = MAX_REJECTED,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Import places with bearings (degrees clockwise from north) of objects, and maybe depths."""
     from valuemap.readers import READERS
@@ -42,4 +43,4 @@ def import_bearings(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out, force=force)
+    finish_dataset(dataset, out, force=force, as_json=as_json)

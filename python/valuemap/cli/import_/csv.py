@@ -9,10 +9,11 @@ import typer
 
 from valuemap.cli.import_.app import check_out, finish_dataset, import_app
 from valuemap.cli.import_.options import Anchor, CameraHeight, CameraText, Columns, PixelCenter, with_detections
-from valuemap.cli.options import DatasetOut, Force, MaxRejected, Up, Vertical
+from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected, Up, Vertical
 from valuemap.cli.show import progress_bars
 from valuemap.readers.csv_file import parse_columns
 from valuemap.readers.detections import DetectionFile
+from valuemap.readers.poses import Axes, RotationName
 from valuemap.readers.vet import MAX_REJECTED
 
 
@@ -24,8 +25,8 @@ def import_csv(
     detections: DetectionFile | None,
     camera: CameraText = None,
     columns: Columns = None,
-    rotation: Annotated[str, typer.Option(help="What a quaternion does.")] = "cam_from_world",
-    axes: Annotated[str, typer.Option(help="Of the camera that a quaternion is about.")] = "right-down-forward",
+    rotation: Annotated[RotationName, typer.Option(help="What a quaternion does.")] = "cam_from_world",
+    axes: Annotated[Axes, typer.Option(help="Of the camera that a quaternion is about.")] = "right-down-forward",
     pixel_center: PixelCenter = 0.5,
     camera_height: CameraHeight = 0.0,
     crs: Annotated[str | None, typer.Option(help="Reference system of x, y: EPSG:32610.")] = None,
@@ -34,6 +35,7 @@ def import_csv(
     anchor: Anchor = None,
     max_rejected: MaxRejected = MAX_REJECTED,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Import a table of images with poses or headings, on the Earth, in a map projection or in a frame of its own."""
     from valuemap.readers import READERS
@@ -56,4 +58,4 @@ def import_csv(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out, force=force)
+    finish_dataset(dataset, out, force=force, as_json=as_json)

@@ -9,7 +9,7 @@ import typer
 
 from valuemap.cli.import_.app import check_out, finish_dataset, import_app
 from valuemap.cli.import_.options import Anchor, with_detections
-from valuemap.cli.options import DatasetOut, Force, MaxRejected, Up
+from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected, Up
 from valuemap.cli.show import progress_bars
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.vet import MAX_REJECTED
@@ -38,6 +38,7 @@ def import_kitti(
     ] = None,
     max_rejected: MaxRejected = MAX_REJECTED,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Import KITTI-odometry-style poses, with boxes in a CSV file that names frames (frame,x1,y1,x2,y2) or others."""
     from valuemap.readers import READERS
@@ -58,4 +59,4 @@ def import_kitti(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out, force=force)
+    finish_dataset(dataset, out, force=force, as_json=as_json)

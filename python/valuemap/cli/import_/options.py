@@ -6,12 +6,12 @@ import functools
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from valuemap.readers.csv_file import parse_columns
-from valuemap.readers.detections import DETECTIONS, DetectionFile
+from valuemap.readers.detections import DetectionFile
 
 PixelCenter = Annotated[
     float,
@@ -32,6 +32,8 @@ CameraText = Annotated[
 CameraHeight = Annotated[float, typer.Option(help="Height of cameras that have none, metres.")]
 ClassName = Annotated[str, typer.Option("--class", help="Class of detections without one.")]
 
+DetectionFormat = Literal["auto", "coco", "yolo", "cvat", "bosch", "csv"]
+
 _DETECTION_OPTIONS: dict[str, tuple[Any, Any]] = {
     "boxes": (
         Annotated[
@@ -41,7 +43,7 @@ _DETECTION_OPTIONS: dict[str, tuple[Any, Any]] = {
         None,
     ),
     "boxes_format": (
-        Annotated[str, typer.Option("--detections-format", help=f"auto (as its name says), {', '.join(DETECTIONS)}.")],
+        Annotated[DetectionFormat, typer.Option("--detections-format", help="auto is as the name of the file says.")],
         "auto",
     ),
     "boxes_class": (ClassName, "object"),
@@ -94,7 +96,7 @@ def with_detections(command: Callable[..., None]) -> Callable[..., None]:
 
 def _detection_file(
     boxes: Path | None,
-    boxes_format: str,
+    boxes_format: DetectionFormat,
     boxes_class: str,
     boxes_columns: list[str] | None,
     boxes_pixel_center: float,

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from valuemap.cli.import_.app import check_out, finish_dataset, import_app
 from valuemap.cli.import_.options import Anchor, CameraText, with_detections
-from valuemap.cli.options import DatasetOut, Force, MaxRejected
+from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected
 from valuemap.cli.show import progress_bars
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.vet import MAX_REJECTED
@@ -21,7 +21,9 @@ def import_pictures(
     folder: Annotated[Path, typer.Argument(help="Pictures with GPS positions in their EXIF tags.")],
     out: DatasetOut,
     detections: DetectionFile | None,
-    poses: Annotated[str, typer.Option(help="sfm, exif (headings as they are) or auto: exif for panoramas.")] = "auto",
+    poses: Annotated[
+        Literal["auto", "sfm", "exif"], typer.Option(help="exif takes headings as they are; auto: exif for panoramas.")
+    ] = "auto",
     workspace: Annotated[
         Path | None, typer.Option(help="Where structure from motion keeps its work, to go on; default: OUT.sfm.")
     ] = None,
@@ -31,6 +33,7 @@ def import_pictures(
     anchor: Anchor = None,
     max_rejected: MaxRejected = MAX_REJECTED,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Import pictures without poses: from EXIF, and by structure from motion; started again, it goes on."""
     from valuemap.readers import READERS
@@ -49,4 +52,4 @@ def import_pictures(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out, force=force)
+    finish_dataset(dataset, out, force=force, as_json=as_json)

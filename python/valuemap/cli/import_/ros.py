@@ -9,7 +9,7 @@ import typer
 
 from valuemap.cli.import_.app import check_out, finish_dataset, import_app
 from valuemap.cli.import_.options import Anchor, with_detections
-from valuemap.cli.options import DatasetOut, Force, MaxRejected, Up
+from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected, Up
 from valuemap.cli.show import progress_bars
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.vet import MAX_REJECTED
@@ -31,6 +31,7 @@ def import_ros(
     anchor: Anchor = None,
     max_rejected: MaxRejected = MAX_REJECTED,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Import ROS bags: CameraInfo, tf or poses, and Detection2DArray; without ROS, with the package rosbags."""
     from valuemap.readers import READERS
@@ -51,4 +52,4 @@ def import_ros(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out, force=force)
+    finish_dataset(dataset, out, force=force, as_json=as_json)

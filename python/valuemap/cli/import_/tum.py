@@ -9,9 +9,10 @@ import typer
 
 from valuemap.cli.import_.app import check_out, finish_dataset, import_app
 from valuemap.cli.import_.options import Anchor, PixelCenter, with_detections
-from valuemap.cli.options import DatasetOut, Force, MaxRejected, Up
+from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected, Up
 from valuemap.cli.show import progress_bars
 from valuemap.readers.detections import DetectionFile
+from valuemap.readers.poses import Axes
 from valuemap.readers.vet import MAX_REJECTED
 
 
@@ -23,13 +24,14 @@ def import_tum(
     out: DatasetOut,
     detections: DetectionFile | None,
     image_list: Annotated[Path | None, typer.Option("--images", help="rgb.txt: timestamp, file name.")] = None,
-    axes: Annotated[str, typer.Option(help="Of what the trajectory is of.")] = "right-down-forward",
+    axes: Annotated[Axes, typer.Option(help="Of what the trajectory is of.")] = "right-down-forward",
     longest_gap: Annotated[float, typer.Option(help="Seconds between poses that are interpolated.")] = 0.2,
     pixel_center: PixelCenter = 0.5,
     up: Up = None,
     anchor: Anchor = None,
     max_rejected: MaxRejected = MAX_REJECTED,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Import a trajectory in TUM's format: t tx ty tz qx qy qz qw, camera to world."""
     from valuemap.readers import READERS
@@ -49,4 +51,4 @@ def import_tum(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out, force=force)
+    finish_dataset(dataset, out, force=force, as_json=as_json)
