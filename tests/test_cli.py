@@ -112,7 +112,7 @@ def test_the_version_is_told_by_every_way_to_start() -> None:
 
 def test_commands_are_shown_in_the_order_of_use() -> None:
     told = works("--help")
-    places = [told.index(f"│ {name} ") for name in ("import", "detect", "map", "evaluate", "export", "demo")]
+    places = [told.index(f"│ {name} ") for name in ("demo", "import", "detect", "map", "evaluate", "export")]
     assert places == sorted(places)
 
 

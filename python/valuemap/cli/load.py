@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 COMMANDS = (
+    "demo",
     "import_",
     "simulate",
     "info",
@@ -22,7 +23,6 @@ COMMANDS = (
     "experiment",
     "train",
     "evaluate_detections",
-    "demo",
 )
 """Modules of this package, in the order of use; each adds its command to `app` when it is imported."""
 
