@@ -9,6 +9,7 @@ from typing import Any, get_args
 
 import pytest
 from rich.console import Console
+from rich.progress import Progress
 from typer.testing import CliRunner
 
 from small_dataset import map_of, small_dataset
@@ -102,7 +103,7 @@ class Terminal:
         monkeypatch.setattr(shown, "log", Console(file=io.StringIO(), force_terminal=True))
         terminal = self
 
-        class Bars(shown.ProgressBars):
+        class Bars(Progress):
             def __init__(self, *columns: Any, **options: Any) -> None:
                 super().__init__(*columns, **options)
                 terminal.bars.append(self)

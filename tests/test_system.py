@@ -16,9 +16,12 @@ from valuemap import system
 from valuemap.dataset import read_dataset, write_dataset
 
 WITHOUT_UNIX = """
-import os, signal, sys
+import os, signal, sys, types
 for name in ("fcntl", "resource", "pwd", "grp", "termios", "tty", "pty", "syslog"):
     sys.modules[name] = None
+windows = types.ModuleType("msvcrt")
+windows.LK_NBLCK, windows.locking = 2, lambda descriptor, mode, length: None
+sys.modules["msvcrt"] = windows
 for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_DIRECTORY"):
     delattr(os, name)
 for name in ("pthread_sigmask", "SIGHUP"):

@@ -856,7 +856,7 @@ class DetectConfig:
     """What the network sees: "model" is its own size, else the picture's; "picture"; N or WIDTHxHEIGHT in px."""
     provider: Provider = "cpu"
     min_score: float | None = None
-    """A box with a lower score is dropped; None takes `default_min_score`, or a segmentation's own threshold."""
+    """A box with a lower score is dropped; None takes the model's own, or `default_min_score`."""
     default_min_score: float = _setting(
         0.3, unit="1", high=1.0, effect="a box with a lower score is dropped, if --min-score does not say otherwise"
     )

@@ -72,8 +72,7 @@ class Detector:
         self.wanted: WantedClasses = choose_classes(config.classes, self.model.class_names)
         if self.model.class_count is not None:
             self.wanted.columns(self.model.class_count)  # Complains now, not after the first picture.
-        own = 0.0 if self.model.kind == "segmentation" else config.default_min_score
-        self.min_score = own if config.min_score is None else config.min_score
+        self.min_score = self.model.min_score if config.min_score is None else config.min_score
 
     def run(self, tasks: Sequence[Task]) -> Iterator[list[Outcome]]:
         """Yield what became of the pictures, group by group, in their order.

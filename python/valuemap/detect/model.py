@@ -53,7 +53,8 @@ class Model:
 
     `class_count` is None where the outputs do not tell; `fixed` is the width and height that it insists on, None if it
     takes any multiple of `stride`; `fixed_batch` likewise. `threshold` and `minimum_component_px` are of
-    segmentations; pictures with a smaller `coarse_share` than `min_coarse_share` are not looked at; `is_softmax` is of
+    segmentations; boxes with a lower score than `min_score` are dropped where the user does not say otherwise;
+    pictures with a smaller `coarse_share` than `min_coarse_share` are not looked at; `is_softmax` is of
     DETRs, whose last class is then "nothing".
     """
 
@@ -71,6 +72,7 @@ class Model:
     threshold: float
     minimum_component_px: int
     min_coarse_share: float
+    min_score: float
     is_softmax: bool
 
     def fit(self, picture: Size, size: Size | None) -> Fit:
@@ -171,6 +173,9 @@ def load_model(path: Path, config: DetectConfig) -> Model:
         threshold=_number(path, metadata, "valuemap.threshold", 0.5),
         minimum_component_px=int(_number(path, metadata, "valuemap.minimum_component_px", 1)),
         min_coarse_share=_number(path, metadata, "valuemap.min_coarse_share", 0.0),
+        min_score=_number(
+            path, metadata, "valuemap.min_score", 0.0 if kind == "segmentation" else config.default_min_score
+        ),
         # A last class for "nothing" is one more than there are names, or than COCO's numbers.
         is_softmax=count is not None and count == (len(names) or 91) + 1,
     )

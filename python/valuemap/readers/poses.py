@@ -33,7 +33,7 @@ RotationName = Literal["cam_from_world", "world_from_cam"]
 
 Axes = Literal["right-down-forward", "right-up-back", "forward-left-up"]
 
-AXES: dict[Axes, Floats] = {
+AXES: dict[str, Floats] = {
     "right-down-forward": np.eye(3),
     "right-up-back": np.diag([1.0, -1.0, -1.0]),
     "forward-left-up": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
