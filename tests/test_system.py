@@ -16,7 +16,7 @@ from valuemap import system
 from valuemap.dataset import read_dataset, write_dataset
 
 WITHOUT_UNIX = """
-import os, signal, sys, types
+import os, signal, subprocess, sys, types
 for name in ("fcntl", "resource", "pwd", "grp", "termios", "tty", "pty", "syslog"):
     sys.modules[name] = None
 windows = types.ModuleType("msvcrt")
