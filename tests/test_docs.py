@@ -137,6 +137,8 @@ def test_every_column_of_every_table_is_explained() -> None:
         "labels.parquet": tables.Labels,
         "votes.parquet": tables.Votes,
         "rejected.parquet of a map": tables.Rejected,
+        "changes.parquet": tables.Changes,
+        "bridge.parquet": tables.IdBridge,
     }.items():
         told = set(re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`[^|]*) \|", sections[name], flags=re.MULTILINE))))
         assert told == {column for field in fields(kind) for column in field.metadata["names"]}, name
