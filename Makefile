@@ -1,6 +1,6 @@
 # `make demo` and `make test` do all their own set-up: they need Python 3.11+, a C compiler and cargo, nothing else.
 # `make test EXTRAS=train` installs PyTorch (5 GB) and tests training too; without it those tests are skipped.
-.PHONY: demo test lint bench model page rust-test wheel sdist setup clean
+.PHONY: demo test lint bench model page rust-test wheel sdist docs setup clean
 
 UV_VERSION := 0.13.8
 PYTHON ?= python3
@@ -45,6 +45,10 @@ page:
 MATURIN := $(UV) tool run --with ziglang==0.17.0 maturin@1.16.0
 wheel: $(UV)
 	$(MATURIN) build --release --locked --out dist $(if $(filter Linux,$(shell uname -s)),--zig --compatibility manylinux_2_28)
+
+# The pages of docs/ as a site in build/site that needs no network; a link that leads nowhere is an error.
+docs: $(UV)
+	$(UV) run --frozen --isolated --only-group docs env NO_MKDOCS_2_WARNING=1 mkdocs build --strict --quiet
 
 sdist: $(UV)
 	$(MATURIN) sdist --out dist

@@ -24,7 +24,7 @@ _BLOCK = re.compile(r"(<!-- figures: [^\n]*-->\n)(.*?)(<!-- end of figures -->)"
 
 OTHERS = {
     # Dabisias et al., "VALUE", ICRA 2018, Table III: true positives, false positives, false negatives, duplicates.
-    "paper": "recall 0.93 and 0.90, false per label 2.3 and 4.9 %, duplicates 8.0 and 3.3 % (paper, its own cities)",
+    "paper": "recall 0.93 and 0.90, false per label 2.3 and 4.9%, duplicates 8.0 and 3.3% (paper, its own cities)",
     # Ibid., section V: 19 minutes for the clusters of New York City and 3.1 for the triangulation.
     "paper seconds": "22.1 min (paper, its own machines)",
     # Krylov, Kenny, Dahyot, "Automatic Discovery and Geotagging of Objects from Street View Imagery", 2018.
@@ -129,11 +129,11 @@ def _figures(figures: dict[str, Any], keys: tuple[str, ...]) -> str:
 
 def _city(figures: dict[str, Any]) -> str:
     false, twice = figures["false_positives_per_label"], figures["duplicates_per_label"]
-    return f"{figures['recall']:.3f}, {100 * false:.1f} %, {100 * twice:.1f} %"
+    return f"{figures['recall']:.3f}, {100 * false:.1f}%, {100 * twice:.1f}%"
 
 
 def _speed(figures: dict[str, Any]) -> str:
-    return f"{figures['seconds_median']:.1f} s, {figures['peak_memory_mb'] / 1024:.2f} GB"
+    return f"{figures['seconds_median']:.1f}&nbsp;s, {figures['peak_memory_mb'] / 1024:.2f}&nbsp;GB"
 
 
 if __name__ == "__main__":
