@@ -16,6 +16,8 @@ from valuemap.evaluate import evaluate_map
 from valuemap.map_folder import Map
 from valuemap.notes import (
     Findings,
+    cameras_not_upright,
+    classes_spelled_alike,
     close_twins,
     find_notes,
     implausible_size,
@@ -153,3 +155,22 @@ def test_classes_of_truth_and_map_that_differ(in_map: str, in_truth: str, told: 
     notes = [note for note in evaluation.notes if "class" in note and "any class" not in note]
     assert [told in note for note in notes] == [True] if told else notes == []
     assert evaluation.true_positives == int(told is None)
+
+
+def test_classes_that_are_spelled_alike_are_told() -> None:
+    plain = map_of([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]], ["traffic_light", "Traffic Light"])
+    said = classes_spelled_alike(findings(plain))
+    assert said is not None
+    assert "'Traffic Light' and 'traffic_light'" in said
+    assert classes_spelled_alike(findings(map_of([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]], ["light", "sign"]))) is None
+    assert classes_spelled_alike(findings(map_of([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]], ["-", "+"]))) is None
+
+
+def test_quaternions_in_another_order_are_told() -> None:
+    assert cameras_not_upright(np.array([1.0, 0.9, -0.2])) is None
+    scene = random_scene(3, images=40, objects=6, clutter=10)
+    dataset = as_dataset(scene, passes=["one", "two"] * 20)
+    assert not any("on their side" in note for note in build_map(dataset).run["notes"])
+    quaternion = np.ascontiguousarray(dataset.images.cam_from_world_quat[:, [1, 2, 3, 0]])
+    spoiled = replace(dataset, images=dataset.images.replace(cam_from_world_quat=quaternion))
+    assert any("cameras lie on their side" in note for note in build_map(spoiled).run["notes"])

@@ -15,6 +15,7 @@ from valuemap.tables import Floats, Labels, Votes
 
 _UNUSED_SHARE = 0.5
 _PLAUSIBLE_SIZE_M = (0.05, 10.0)
+_UPRIGHT = 0.5
 _TWIN_SIGMAS = 1.0
 _AT_BOUND = 0.99
 _LARGEST_NOISE = {"detection_px": 30.0, "box_share": 0.15, "position_m": 5.0}
@@ -41,7 +42,10 @@ def no_labels(findings: Findings) -> str | None:
     """Say that a map is empty."""
     if len(findings.labels):
         return None
-    return "no object was found: are poses, cameras and boxes in the conventions that the formats page names?"
+    return (
+        "no object was found: are poses, cameras and boxes in the conventions that the formats page names? "
+        "valuemap check finds out"
+    )
 
 
 def unused_detections(findings: Findings) -> str | None:
@@ -51,7 +55,7 @@ def unused_detections(findings: Findings) -> str | None:
         return None
     return (
         f"{100.0 * unused / count:.0f} % of the detections belong to no label: a noisy detector, things seen "
-        "once, or poses or boxes in another convention than they were taken for"
+        "once, or poses or boxes in another convention than they were taken for (valuemap check finds out)"
     )
 
 
@@ -117,6 +121,29 @@ def no_overlap(findings: Findings) -> str | None:
     )
 
 
+def classes_spelled_alike(findings: Findings) -> str | None:
+    """Say that classes differ in capitals, spaces, hyphens or underscores only: their detections never meet."""
+    groups: dict[str, list[str]] = {}
+    for name in findings.labels.class_name.names:
+        groups.setdefault("".join(letter for letter in name.casefold() if letter.isalnum()) or name, []).append(name)
+    alike = [names for names in groups.values() if len(names) > 1]
+    if not alike:
+        return None
+    shown = " and ".join(repr(name) for name in alike[0])
+    return f"the classes {shown} differ in spelling only: detections of one never support labels of the other"
+
+
+def cameras_not_upright(cosine_to_sky: Floats) -> str | None:
+    """Say that most cameras (N cosines between their own up and the frame's) lie on their side or upside down."""
+    lying = int(np.sum(cosine_to_sky < _UPRIGHT))
+    if 2 * lying <= len(cosine_to_sky):
+        return None
+    return (
+        f"{lying} of {len(cosine_to_sky)} cameras lie on their side or upside down: the order of the quaternions, the "
+        "axes or the direction up may be another; valuemap check finds out"
+    )
+
+
 NOTES: tuple[Callable[[Findings], str | None], ...] = (
     no_labels,
     unused_detections,
@@ -124,6 +151,7 @@ NOTES: tuple[Callable[[Findings], str | None], ...] = (
     implausible_size,
     close_twins,
     no_overlap,
+    classes_spelled_alike,
 )
 """All of them, in the order in which they are told."""
 

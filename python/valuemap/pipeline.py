@@ -5,14 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from valuemap.cameras import Rays, cast_rays
+from valuemap.cameras import Rays, cast_rays, rotation_matrices
 from valuemap.config import MapConfig, bounded_threads
 from valuemap.dataset import Dataset, Frame, ensure_checked, read_dataset
 from valuemap.describe import describe_labels
@@ -21,7 +21,7 @@ from valuemap.engine.threads import ThreadEngine
 from valuemap.errors import InputError
 from valuemap.map_folder import Map
 from valuemap.merge import merge_clusters
-from valuemap.notes import Findings, find_notes
+from valuemap.notes import Findings, cameras_not_upright, find_notes
 from valuemap.partition import partition_images
 from valuemap.portions import rows_on_disk
 from valuemap.progress import Progress, silent
@@ -80,7 +80,8 @@ def build_map(
         labels, votes, counts, _ = _robust(source, config, stages, ThreadEngine(threads), progress)
     size = {"images": len(dataset.images), "detections": len(dataset.detections)}
     passes = len(np.unique(dataset.images.pass_id.codes))
-    return _as_map(dataset.name, dataset.frame, size, passes, config, labels, votes, counts, stages)
+    result = _as_map(dataset.name, dataset.frame, size, passes, config, labels, votes, counts, stages)
+    return _with_note(result, _note_on_poses(dataset))
 
 
 @dataclass(frozen=True)
@@ -138,15 +139,24 @@ def build_map_of_folder(
         with stages.measured("order"):
             source: Source = InMemory(dataset, config)
         size = {"images": len(dataset.images), "detections": len(dataset.detections)}
-        name, frame = dataset.name, dataset.frame
+        name, frame, note = dataset.name, dataset.frame, _note_on_poses(dataset)
     else:
         with stages.measured("partition"):
             on_disk = partition_dataset(folder, run.work, config, tile_size_m=run.tile_size_m, progress=progress)
-        source, name, frame, size = on_disk, on_disk.name, on_disk.frame, on_disk.counts
+        source, name, frame, size, note = on_disk, on_disk.name, on_disk.frame, on_disk.counts, None
         _check_detections(name, size["detections"])
     labels, votes, counts, cells = _robust(source, config, stages, run.engine, progress, run)
     passes = source.drives_record["passes"]
-    return _as_map(name, frame, size, passes, config, labels, votes, counts, stages), cells
+    result = _as_map(name, frame, size, passes, config, labels, votes, counts, stages)
+    return _with_note(result, note), cells
+
+
+def _note_on_poses(dataset: Dataset) -> str | None:
+    return cameras_not_upright(-rotation_matrices(dataset.images)[:, 1] @ np.array(dataset.frame.up))
+
+
+def _with_note(result: Map, note: str | None) -> Map:
+    return result if note is None else replace(result, run={**result.run, "notes": [note, *result.run["notes"]]})
 
 
 def _check_detections(name: str, detections: int) -> None:

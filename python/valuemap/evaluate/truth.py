@@ -84,12 +84,13 @@ def read_truth(path: Path, result: Map) -> Dataset | TrueObjects:
         return read_dataset(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file or folder", hint="give a dataset folder or a file of objects")
-    if path.suffix.lower() not in _TRUTH_READERS:
+    suffix = Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
+    if suffix not in _TRUTH_READERS or (suffix != ".csv" and path.suffix.lower() == ".gz"):
         raise InputError(
             f"{path}: truth of an unknown kind: {path.suffix or 'no suffix'}",
             hint=f"give a dataset folder or one of {', '.join(_TRUTH_READERS)}",
         )
-    table = _with_numbered_objects(_TRUTH_READERS[path.suffix.lower()](path))
+    table = _with_numbered_objects(_TRUTH_READERS[suffix](path))
     columns = {*table.column_names}
     has_position, has_place = {"x", "y", "z"} <= columns, {"lon", "lat"} <= columns
     anchor = result.frame.anchor
