@@ -29,7 +29,7 @@ from valuemap.detect.model import load_model
 from valuemap.detect.pictures import UnusablePicture, read_picture
 from valuemap.errors import InputError, SettingError
 from valuemap.evaluate import evaluate_map
-from valuemap.evaluate.truth import read_truth
+from valuemap.evaluate.truth import TrueObjects, read_truth
 from valuemap.map_folder import read_map, write_map
 from valuemap.pipeline import build_map
 from valuemap.summary import summarize_map
@@ -283,7 +283,9 @@ def test_a_column_of_texts_from_parquet_is_read_too(tmp_path: Path) -> None:
 def test_truth_may_be_packed(tmp_path: Path) -> None:
     write_map(map_of([[1.0, 2.0, 3.0]]), tmp_path / "map")
     (tmp_path / "truth.csv.gz").write_bytes(gzip.compress(b"object_id,class,x,y,z\n1,light,1,2,3\n"))
-    assert len(read_truth(tmp_path / "truth.csv.gz", read_map(tmp_path / "map"))) == 1
+    found = read_truth(tmp_path / "truth.csv.gz", read_map(tmp_path / "map"))
+    assert isinstance(found, TrueObjects)
+    assert len(found) == 1
     (tmp_path / "truth.gpkg.gz").write_bytes(gzip.compress(b"x"))
     with pytest.raises(InputError, match="truth of an unknown kind: .gz"):
         read_truth(tmp_path / "truth.gpkg.gz", read_map(tmp_path / "map"))
