@@ -95,11 +95,6 @@ class Drives:
         """The number of drives."""
         return int(self.pass_code.max(initial=-1)) + 1
 
-    @property
-    def is_mostly_without_order(self) -> bool:
-        """Whether neither times nor names tell the order of most images."""
-        return bool(2 * self.record["images_ordered_by"].get("chain", 0) > len(self.pass_code))
-
 
 def find_drives(images: Images, *, viewpoint_step_m: float = 1.0) -> Drives:
     """Tell which images are one drive and in which order they were taken.

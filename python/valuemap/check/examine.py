@@ -26,11 +26,6 @@ class Examination:
     fixed: Dataset
     notes: tuple[str, ...] = field(default=())
 
-    @property
-    def is_fixable(self) -> bool:
-        """Whether the corrected dataset differs from the given one."""
-        return any(finding.fix is not None for finding in self.findings)
-
     def to_json(self) -> dict[str, Any]:
         """Return everything but the dataset by name."""
         return {

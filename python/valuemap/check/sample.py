@@ -194,8 +194,3 @@ def pixels_per_radian(dataset: Dataset) -> float:
         if np.isfinite(angle) and angle > 0.0:
             scales.append(1.0 / angle)
     return float(np.median(scales)) if scales else 500.0
-
-
-def median_box_px(dataset: Dataset) -> Floats:
-    """Return the median width and height (2) of the boxes."""
-    return np.asarray(np.median(dataset.detections.size_px, axis=0))
