@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import pycolmap
 import pytest
 from numpy.testing import assert_allclose
 from PIL import Image
@@ -16,11 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from reading import refusal, write
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.readers.exif import read_exif
 from valuemap.readers.pictures import read_pictures
 from valuemap.readers.structure import similarity_onto
-from valuemap.tables import Floats
 
 ANCHOR = (52.0, 4.0, 40.0)
 
@@ -164,6 +160,13 @@ def test_folders_that_cannot_be_used(tmp_path: Path) -> None:
     outside = picture(tmp_path.parent / f"{tmp_path.name}-outside.jpg", tags(52.0, 4.0))
     (tmp_path / "b.jpg").symlink_to(outside)
     assert "is a link that leads out of" in refusal(lambda: read_pictures(tmp_path, poses="exif"))
+    (tmp_path / "b.jpg").unlink()
+    whole = picture(tmp_path / "b.jpg", tags(52.0, 4.0), (640, 480)).read_bytes()
+    (tmp_path / "b.jpg").write_bytes(whole[: len(whole) // 2])
+    assert "b.jpg: is cut off or damaged" in refusal(lambda: read_pictures(tmp_path, poses="exif"))
+    # A header that promises 30,000 x 30,000 pixels.
+    (tmp_path / "b.jpg").write_bytes(whole.replace(b"\x01\xe0\x02\x80", b"\x75\x30\x75\x30"))
+    assert "b.jpg: " in refusal(lambda: read_pictures(tmp_path, poses="exif"))
     assert "poses compass" in refusal(lambda: read_pictures(tmp_path, poses="compass"))  # type: ignore[arg-type]
 
 
@@ -192,110 +195,3 @@ def test_a_model_comes_onto_the_gps_with_its_up_on_the_vertical(straight: bool) 
     assert np.linalg.norm(scale * model @ rotation.T + shift - world, axis=1).max() < 1.0
     assert similarity_onto(model[:2], up[:2], gps[:2], np.ones(2)) is None
     assert similarity_onto(np.zeros((9, 3)), up[:9], gps[10:19], np.ones(9)) is None
-
-
-# Structure from motion.
-
-WIDTH, HEIGHT, FOCAL = 400, 300, 340.0
-
-
-def texture(random: np.random.Generator, width: int, height: int) -> Any:
-    """Spots of many sizes: something for features at every distance."""
-    total = np.zeros((height, width), np.float32)
-    for cell in (4, 8, 16, 32):
-        small = random.random((height // cell + 1, width // cell + 1)).astype(np.float32)
-        total += cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
-    return ((total - total.min()) / np.ptp(total) * 255).astype(np.uint8)
-
-
-def street(random: np.random.Generator) -> list[tuple[Floats, Any]]:
-    """Walls as corners (4, 3) in the world with their textures: left and right in pieces, a far end, and the ground."""
-    walls = []
-    for side in (-7.0, 7.0):
-        for start in range(0, 60, 12):
-            x = side + random.uniform(-1.0, 1.0)
-            corners = [[x, start, 8], [x, start + 10, 8], [x, start + 10, 0], [x, start, 0]]
-            walls.append((np.array(corners, dtype=np.float64), texture(random, 500, 400)))
-    end = [[-12, 62, 10], [12, 62, 10], [12, 62, 0], [-12, 62, 0]]
-    return [(np.array(end, dtype=np.float64), texture(random, 600, 300)), *walls]
-
-
-def draw(walls: list[tuple[Floats, Any]], cam_from_world: Floats, center: Floats) -> Any:
-    """The walls from far to near, each by the homography of its piece in front of the camera."""
-    canvas = np.full((HEIGHT, WIDTH), 200, np.uint8)
-    k = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    for corners, image in sorted(walls, key=lambda wall: -np.linalg.norm(wall[0].mean(axis=0) - center)):
-        height, width = image.shape
-        # From the picture's pixels into the plane of the wall, and on into the view.
-        right, down = (corners[1] - corners[0]) / width, (corners[3] - corners[0]) / height
-        view = k @ cam_from_world @ np.column_stack([right, down, corners[0] - center])
-        depth = (cam_from_world @ (corners - center).T)[2]
-        if depth.max() < 0.5:
-            continue
-        inverse = np.linalg.inv(view)
-        u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-        x, y, w = np.einsum("ij,jhw->ihw", inverse, np.stack([u, v, np.ones_like(u)]))
-        w = np.where(np.abs(w) < 1e-9, 1e-9, w)
-        column, row = x / w, y / w
-        inside = (column > 0) & (column < width) & (row > 0) & (row < height)
-        # In front where the depth of the point, 1 / w up to a factor, is positive.
-        inside &= 1.0 / w > 0.3
-        sampled = cv2.remap(
-            image,
-            (column - 0.5).astype(np.float32),
-            (row - 0.5).astype(np.float32),
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REFLECT,
-        )
-        canvas[inside] = sampled[inside]
-    return canvas
-
-
-def drive(folder: Path, count: int = 9) -> tuple[Floats, Floats]:
-    """Draw a drive along the street, with GPS of 0.1 m noise; return centres and rotations, cam from world."""
-    random = np.random.default_rng(1)
-    walls, centers, rotations = street(random), [], []
-    for i in range(count):
-        center = np.array([0.8 * np.sin(0.4 * i), 2.0 * i, 1.6 + 0.1 * np.cos(i)])
-        turn = Rotation.from_euler("zx", [0.08 * np.sin(0.7 * i), 0.02 * np.cos(i)]).as_matrix()
-        rotation = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) @ turn
-        lon, lat, height = lon_lat_height_from_enu((center + random.normal(0.0, 0.1, 3))[None], ANCHOR)[0].tolist()
-        exif = tags(
-            lat, lon, height, FocalLengthIn35mmFilm=31, GPSDateStamp="2023:11:14", GPSTimeStamp=(22.0, 13.0, float(i))
-        )
-        folder.mkdir(exist_ok=True)
-        # Names say nothing of the order.
-        pixels = np.repeat(draw(walls, rotation, center)[:, :, None], 3, axis=2)
-        Image.fromarray(pixels).save(folder / f"{(i * 5) % count:02d} x.jpg", exif=exif, quality=95)
-        centers.append(center)
-        rotations.append(rotation)
-    return np.array(centers), np.array(rotations)
-
-
-def test_structure_from_motion_finds_poses_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    centers, rotations = drive(tmp_path / "pictures")
-    workspace = tmp_path / "work"
-    dataset = read_pictures(tmp_path / "pictures", workspace=workspace, anchor=ANCHOR, gps_sigma_m=0.1, threads=2)
-    assert len(dataset.images) >= 0.9 * len(centers)
-    assert dataset.images.timestamp_s is not None
-    row = (dataset.images.timestamp_s - dataset.images.timestamp_s.min()).round().astype(int)
-    error = camera_centers(dataset.images) - centers[row]
-    relative = np.linalg.norm(error[:, None] - error[None], axis=2)
-    assert relative.max() < 0.3
-    turned = np.einsum("nij,nij->n", rotation_matrices(dataset.images), rotations[row])
-    assert np.degrees(np.arccos(np.clip((turned - 1.0) / 2.0, -1.0, 1.0))).max() < 3.0
-    assert dataset.images.position_sigma_m is not None
-    assert 0.0 < np.median(dataset.images.position_sigma_m) < 0.3
-    assert_allclose(dataset.cameras.params[0][0], FOCAL, rtol=0.03)
-
-    def never(*_: Any, **__: Any) -> None:
-        raise AssertionError("this was done before")
-
-    monkeypatch.setattr(pycolmap, "extract_features", never)
-    monkeypatch.setattr(pycolmap, "incremental_mapping", never)
-    again = read_pictures(tmp_path / "pictures", workspace=workspace, anchor=ANCHOR, gps_sigma_m=0.1, threads=2)
-    assert_allclose(again.images.cam_from_world_m, dataset.images.cam_from_world_m, atol=1e-9)
-    write(tmp_path / "mine" / "notes.txt", "mine")
-    assert "is not empty and not ours" in refusal(
-        lambda: read_pictures(tmp_path / "pictures", workspace=tmp_path / "mine")
-    )

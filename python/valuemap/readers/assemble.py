@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -38,6 +38,8 @@ def assemble(
     where_image: Callable[[int], str] | None = None,
     truth: Truth | None = None,
     max_rejected: float = MAX_REJECTED,
+    unposed: Mapping[int, str] | None = None,
+    unreadable: Mapping[str, str] | None = None,
 ) -> Dataset:
     """Return the checked dataset of what a reader found; what cannot be used is left out and listed in it.
 
@@ -60,6 +62,10 @@ def assemble(
         Known objects, where there are.
     max_rejected
         The share of the boxes, and of the images, that may be left out.
+    unposed
+        Why images have no pose, by row, where poses were to be found: they do not count toward that share.
+    unreadable
+        Why pictures are not even in `images`, by name; they are listed.
 
     Raises
     ------
@@ -70,7 +76,8 @@ def assemble(
         mean up, or contradict `anchor`.
     """
     rejections = Rejections(source, max_rejected)
-    posed, usable = vet_images(images, rejections, where_image)
+    rejections.add_unreadable(unreadable or {})
+    posed, usable = vet_images(images, rejections, where_image, unposed)
     boxes = vet_boxes(detections, images, usable, cameras, rejections)
     unframed = Dataset(
         name=name,

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal, get_args
 
 import numpy as np
-import pycolmap
 
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
@@ -17,10 +16,10 @@ from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras, parse_camera
 from valuemap.readers.detections import DetectionFile, read_detections
-from valuemap.readers.exif import Exif, read_exif
+from valuemap.readers.exif import Exif, check_whole, read_exif
 from valuemap.readers.files import check_folder, check_names, file_in
 from valuemap.readers.poses import OnEarth, local_from_cam, make_images, place_on_earth
-from valuemap.readers.structure import Picture, find_poses
+from valuemap.readers.structure import Picture, Posed, find_poses
 from valuemap.tables import Floats
 
 PosesFrom = Literal["auto", "sfm", "exif"]
@@ -29,6 +28,8 @@ _EXPECTED = f"a folder of pictures: {', '.join(_SUFFIXES)}"
 _FOCAL_GUESS = 1.2
 """Focal length over the larger side where nothing is known: about 45 degrees."""
 _SHOWN = 3
+_NO_PLACE = "it has no GPS position"
+_NO_HEADING = "it has no heading (GPSImgDirection, or PoseHeadingDegrees of a panorama)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +41,7 @@ class _Found:
     passes: list[str]
     placed: OnEarth
     sigma_m: Floats
+    unreadable: dict[str, str]
 
 
 def read_pictures(
@@ -54,6 +56,7 @@ def read_pictures(
     threads: int = 0,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
+    tell: Callable[[str], None] | None = None,
 ) -> Dataset:
     """Read pictures of a folder and its folders, find their poses, and put them on the Earth.
 
@@ -80,6 +83,8 @@ def read_pictures(
         Latitude, longitude and height of the origin; by default the place of the first picture by name.
     threads
         Of structure from motion, 0 for one a core.
+    tell
+        Called with each line that is worth knowing about the poses.
 
     Raises
     ------
@@ -100,6 +105,7 @@ def read_pictures(
     rotation, center = _level_poses(found)
     sigma_m, sigma_rad = found.sigma_m.copy(), np.full(len(found.names), np.nan)
     part = np.full(len(found.names), -1)
+    why_not: dict[int, str] = {}
     rows = np.flatnonzero(~by_heading)
     if len(rows):
         if workspace is None:
@@ -109,35 +115,43 @@ def read_pictures(
         known_focal = {cameras[row] for row in rows if given is not None or found.exif[row].focal_px is not None}
         posed = find_poses(
             [_picture(folder, found, row, distinct.index(cameras[row])) for row in rows.tolist()],
-            [_as_colmap(each, has_focal=each in known_focal) for each in distinct],
+            distinct,
+            [each in known_focal for each in distinct],
             workspace,
-            threads=threads or -1,
+            threads=threads,
             progress=progress,
         )
         at = rows[posed.row]
         rotation[at], center[at], part[at] = posed.world_from_cam, posed.center_in_world_m, posed.part
         sigma_m[at], sigma_rad[at] = posed.position_sigma_m, posed.rotation_sigma_rad
-        refined = {distinct[number]: _from_colmap(value) for number, value in posed.cameras.items()}
+        if tell is not None:
+            for line in _told(posed, len(rows)):
+                tell(line)
+        why_not |= {int(rows[row]): reason for row, reason in posed.why_not.items()}
+        refined = {distinct[number]: value for number, value in posed.cameras.items()}
         cameras = [each if by_heading[row] else refined.get(each, each) for row, each in enumerate(cameras)]
-    kept = np.flatnonzero(np.isfinite(center).all(axis=1) & np.isfinite(rotation).all(axis=(1, 2)))
-    if not len(kept):
+    has_pose = np.isfinite(center).all(axis=1) & np.isfinite(rotation).all(axis=(1, 2))
+    if not has_pose.any():
         raise InputError(
             f"{folder}: no picture has a heading (GPSImgDirection, or PoseHeadingDegrees of a panorama)",
             hint="--poses sfm finds poses where pictures overlap",
         )
-    table, camera_id = make_cameras([cameras[row] for row in kept], str(folder))
-    parts = len(set(part[kept].tolist()))
+    for row in np.flatnonzero(~has_pose & by_heading).tolist():
+        why_not[row] = _NO_PLACE if found.exif[row].lat_lon is None else _NO_HEADING
+    table, camera_id = make_cameras(cameras, str(folder))
+    parts = len(set(part[has_pose].tolist()))
     images = make_images(
-        names=[found.names[row] for row in kept],
+        names=found.names,
         camera_id=camera_id,
-        world_from_cam=rotation[kept],
-        center_in_world_m=center[kept],
-        passes=[f"{found.passes[row]}/{part[row]}" if parts > 1 else found.passes[row] for row in kept],
+        world_from_cam=rotation,
+        center_in_world_m=center,
+        passes=[f"{name}/{part[row]}" if parts > 1 else name for row, name in enumerate(found.passes)],
         source=str(folder),
-        timestamp_s=np.array([math.nan if (t := found.exif[row].time_s) is None else t for row in kept]),
-        position_sigma_m=sigma_m[kept],
-        rotation_sigma_rad=sigma_rad[kept],
+        timestamp_s=np.array([math.nan if exif.time_s is None else exif.time_s for exif in found.exif]),
+        position_sigma_m=sigma_m,
+        rotation_sigma_rad=sigma_rad,
     )
+    row_of = {name: row for row, name in enumerate(images.name.to_pylist())}
     return assemble(
         name=folder.resolve().name,
         cameras=table,
@@ -147,6 +161,8 @@ def read_pictures(
         anchor=found.placed.anchor,
         source=str(folder),
         max_rejected=max_rejected,
+        unposed={row_of[found.names[row]]: reason for row, reason in why_not.items()},
+        unreadable=found.unreadable,
     )
 
 
@@ -161,20 +177,25 @@ def _read_all(
     paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _SUFFIXES)
     if not paths:
         raise InputError(f"{folder}: there are no pictures in it", hint=f"expected {_EXPECTED}")
-    names, found, unusable = [], [], []
+    names, found = [], []
+    unreadable: dict[str, str] = {}
     for number, path in enumerate(paths):
         if number % 50 == 0:
             progress("reading the pictures' tags", number, len(paths))
         name = path.relative_to(folder).as_posix()
         try:
-            found.append(read_exif(file_in(folder, name, _EXPECTED)))
-            names.append(name)
+            exif = read_exif(file_in(folder, name, _EXPECTED))
+            check_whole(path)
         except InputError as error:
-            unusable.append(str(error))
+            unreadable[name] = str(error)
+        else:
+            found.append(exif)
+            names.append(name)
     progress("reading the pictures' tags", len(paths), len(paths))
-    if len(unusable) > max_rejected * len(paths):
+    if len(unreadable) > max_rejected * len(paths):
+        shown = "; ".join(list(unreadable.values())[:_SHOWN])
         raise InputError(
-            f"{folder}: {len(unusable)} of {len(paths)} pictures cannot be used: {'; '.join(unusable[:_SHOWN])}",
+            f"{folder}: {len(unreadable)} of {len(paths)} pictures cannot be used: {shown}",
             hint="remove or replace them; or leave them out with --max-rejected",
         )
     check_names(names, str(folder))
@@ -195,7 +216,7 @@ def _read_all(
     first = min(range(len(names)), key=lambda row: (not np.isfinite(lon_lat[row]).all(), names[row]))
     placed = place_on_earth(np.column_stack([lon_lat, height]), anchor, first, source=str(folder))
     sigma = np.array([exif.sigma_m or gps_sigma_m for exif in found])
-    return _Found(list(names), list(found), list(passes), placed, sigma)
+    return _Found(list(names), list(found), list(passes), placed, sigma, unreadable)
 
 
 def _heights(found: Sequence[Exif]) -> Floats:
@@ -228,6 +249,22 @@ def _guess(exif: Exif) -> Camera:
     return Camera("SIMPLE_RADIAL", width, height, (focal, width / 2.0, height / 2.0, 0.0))
 
 
+def _told(posed: Posed, total: int) -> Iterator[str]:
+    """Yield what is worth knowing about poses that were found."""
+    yield f"structure from motion found the poses of {len(posed.row)} of {total} pictures"
+    parts = len(set(posed.part.tolist()))
+    if parts > 1:
+        yield (
+            f"they are in {parts} parts that only the GPS holds together, each a pass of its own; "
+            "their sigmas are those on the Earth"
+        )
+    else:
+        yield (
+            f"together they stand on the Earth to {posed.on_earth_m:.2f} m on each axis, "
+            "which position_sigma_m leaves out"
+        )
+
+
 def _picture(folder: Path, found: _Found, row: int, camera: int) -> Picture:
     return Picture(
         name=found.names[row],
@@ -237,14 +274,3 @@ def _picture(folder: Path, found: _Found, row: int, camera: int) -> Picture:
         sigma_m=float(found.sigma_m[row]),
         drive=found.passes[row],
     )
-
-
-def _as_colmap(camera: Camera, *, has_focal: bool) -> pycolmap.Camera:
-    made = pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=list(camera.params))
-    made.has_prior_focal_length = has_focal
-    return made
-
-
-def _from_colmap(camera: pycolmap.Camera) -> Camera:
-    params = tuple(float(value) for value in camera.params)
-    return Camera(camera.model.name, int(camera.width), int(camera.height), params)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,10 +21,14 @@ _SHOWN_REASONS = 3
 
 @dataclass(frozen=True)
 class _Reason:
-    """Why a row cannot be used, and what the user can do if many are of this kind."""
+    """Why a row cannot be used, and what the user can do if many are of this kind.
+
+    Where it is no fault of the row it does not count toward the share at which an import stops.
+    """
 
     text: str
     hint: str
+    counts: bool = True
 
 
 _NO_CLASS = _Reason(
@@ -46,7 +50,8 @@ _OUTSIDE = _Reason(
 _SCORE = _Reason("its score is not from 0 to 1", "scores are probabilities: divide percentages by 100")
 _RANGE = _Reason("its range or a sigma is not above 0", "ranges are metres; leave unknown ones empty")
 _TWICE = _Reason("the same box is there already", "was the file put together from parts that overlap?")
-_LEFT_OUT = _Reason("its image was left out", "repair the image first")
+# What goes with its image is the image's fault, which was counted.
+_LEFT_OUT = _Reason("its image was left out", "repair the image first", counts=False)
 _POSE_NOT_FINITE = _Reason("a number of its pose is missing or not finite", "repair the poses of these images")
 _NO_ROTATION = _Reason(
     "its quaternion is not of length 1", "quaternions are w, x, y, z and rotate the world into the camera"
@@ -166,10 +171,27 @@ class Rejections:
         self._parts.append(part)
         self._refuse_too_many(table, why, part)
 
+    def add_unreadable(self, reason_of: Mapping[str, str]) -> None:
+        """Take pictures that cannot be read at all, by name."""
+        count = len(reason_of)
+        if count:
+            nothing = Categories.from_texts([""] * count)
+            self._parts.append(
+                RejectedRows(
+                    table=Categories.from_texts(["images"] * count),
+                    place=pa.array([_text(f"{self.source}/{name}") for name in reason_of], pa.string()),
+                    reason=Categories.from_texts([_text(reason) for reason in reason_of.values()]),
+                    image_name=pa.array([_text(name) for name in reason_of], pa.string()),
+                    class_name=nothing,
+                    center_px=np.full((count, 2), np.nan),
+                    size_px=np.full((count, 2), np.nan),
+                    score=np.full(count, np.nan),
+                )
+            )
+
     def _refuse_too_many(self, table: str, why: Verdicts, part: RejectedRows) -> None:
         what = {"detections": "boxes", "images": "images"}[table]
-        # What goes with its image is the image's fault, which was counted.
-        counted = np.flatnonzero(why.code[why.code >= 0] != why.code_of(_LEFT_OUT))
+        counted = [code for code in why.code.tolist() if code >= 0 and why.reasons[code].counts]
         share = len(counted) / len(why.code)
         if len(part) < len(why.code) and share <= self.max_share:
             return
@@ -203,10 +225,6 @@ class Verdicts:
         self.reasons.append(reason)
         self.code[wrong & (self.code < 0)] = len(self.reasons) - 1
 
-    def code_of(self, reason: _Reason) -> int:
-        """Return the code of a reason, or -2 where it was never looked for."""
-        return self.reasons.index(reason) if reason in self.reasons else -2
-
     @property
     def fine(self) -> Bools:
         """The rows without a reason against them."""
@@ -214,10 +232,20 @@ class Verdicts:
 
 
 def vet_images(
-    images: Images, rejections: Rejections, where: Callable[[int], str] | None = None
+    images: Images,
+    rejections: Rejections,
+    where: Callable[[int], str] | None = None,
+    unposed: Mapping[int, str] | None = None,
 ) -> tuple[Images, Bools]:
-    """Return the images that can be used and which rows (N) they are; the others go to the rejections."""
+    """Return the images that can be used and which rows (N) they are; the others go to the rejections.
+
+    `unposed` says why rows have no pose where poses were to be found: they do not count toward the share of those
+    rejected.
+    """
     why = Verdicts(len(images))
+    for reason in sorted(set((unposed or {}).values())):
+        rows = [row for row, text in (unposed or {}).items() if text == reason]
+        why.mark(np.isin(np.arange(len(images)), rows), _Reason(reason, "see docs/formats.md, pictures", counts=False))
     pose = np.hstack([images.cam_from_world_quat, images.cam_from_world_m])
     why.mark(~np.isfinite(pose).all(axis=1), _POSE_NOT_FINITE)
     with np.errstate(invalid="ignore", over="ignore"):

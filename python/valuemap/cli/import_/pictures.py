@@ -10,7 +10,7 @@ import typer
 from valuemap.cli.import_.app import check_out, finish_dataset, import_app
 from valuemap.cli.import_.options import Anchor, CameraText, with_detections
 from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected
-from valuemap.cli.show import progress_bars
+from valuemap.cli.show import progress_bars, show_notes
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.vet import MAX_REJECTED
 
@@ -39,6 +39,7 @@ def import_pictures(
     from valuemap.readers import READERS
 
     check_out(out, force=force)
+    notes: list[str] = []
     with progress_bars() as progress:
         dataset = READERS["pictures"](
             folder,
@@ -51,5 +52,7 @@ def import_pictures(
             threads=threads,
             max_rejected=max_rejected,
             progress=progress,
+            tell=notes.append,
         )
     finish_dataset(dataset, out, force=force, as_json=as_json)
+    show_notes(notes)

@@ -1,0 +1,348 @@
+"""Models that pycolmap grows from matches, united on the Earth.
+
+Cameras stay as they are while models grow: a car drives forward, and a few such pictures fit any focal length, with
+which the model then falls apart. `adjust` refines them in the end. Where a drive cannot be held together, at a corner
+that no picture shows well, pycolmap begins another model. Pictures that a model puts where their GPS cannot be are
+taken out of it, and what is left over grows again. Then all models are put into one by their GPS, points are made anew,
+across models too, and pictures that no model had are sought in the whole.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from valuemap.errors import InputError
+from valuemap.progress import Progress
+from valuemap.readers.cameras_of import Camera
+from valuemap.readers.structure.adjust import Adjusted, Sights, adjust
+from valuemap.readers.structure.features import image_ids
+from valuemap.readers.structure.job import DATABASE, LINKS, MODELS, Job, Posed
+from valuemap.readers.structure.onto_earth import similarity_onto
+from valuemap.tables import Bools, Floats, Ints
+
+LEAST_IMAGES = 3
+_LEAST_INLIERS = 20
+_GPS_SIGMAS = 7.0
+_LEAST_POINTS, _SHARED_POINTS = 10, 8
+_ROUNDS = 2
+
+NO_FILE = "its features cannot be found: the file is damaged"
+NO_MATCH = "too little of it is seen in other pictures"
+NO_GPS = "it hangs together with fewer than three pictures that have a GPS position"
+NOT_THERE = "structure from motion puts it where its GPS position cannot be"
+
+
+@dataclass(eq=False)
+class _Whole:
+    """What all models together know: poses by row (cam_from_world, centre), and cameras by id."""
+
+    poses: dict[int, tuple[Floats, Floats]] = field(default_factory=dict)
+    cameras: dict[int, pycolmap.Camera] = field(default_factory=dict)
+
+
+def find_models(job: Job, workspace: Path, *, threads: int, progress: Progress) -> Posed:
+    """Return the poses of all pictures that can be posed, and the reasons for the others.
+
+    Raises
+    ------
+    InputError
+        No three pictures with GPS hang together.
+    """
+    ids = image_ids(job, workspace)
+    why_not = {row: NO_FILE for row in range(len(job.pictures)) if row not in ids}
+    whole = _Whole(cameras=_cameras(job, workspace))
+    if len(ids) >= LEAST_IMAGES:
+        _take(_grow(job, workspace, "first", list(ids), threads, progress), job, ids, whole)
+        left = [row for row in ids if row not in whole.poses]
+        if whole.poses and len(left) >= LEAST_IMAGES:
+            _take(_grow(job, workspace, "second", left, threads, progress), job, ids, whole)
+    if not whole.poses:
+        raise InputError(
+            f"{workspace}: structure from motion finds no {LEAST_IMAGES} pictures with GPS that hang together",
+            hint="do neighbouring pictures overlap, and do they have GPS? --poses exif takes headings as they are",
+        )
+    found, row, part = _unite(job, workspace, ids, whole, why_not, threads, progress)
+    for each in ids:
+        if each not in set(row.tolist()):
+            why_not.setdefault(each, NO_MATCH)
+    # Several parts are apart by what each is wrong on the Earth; of one, nobody sees that but who compares with others.
+    sigma = found.sigma if part.max() else found.sigma_in_part
+    return Posed(
+        row=row,
+        world_from_cam=np.swapaxes(found.cam_from_world, 1, 2),
+        center_in_world_m=found.center_in_world_m,
+        position_sigma_m=sigma[:, 0],
+        rotation_sigma_rad=sigma[:, 1],
+        part=part,
+        on_earth_m=np.sqrt((found.sigma[:, 0] ** 2).mean()),
+        cameras={camera_id - 1: _camera(camera) for camera_id, camera in found.cameras.items()},
+        why_not=why_not,
+    )
+
+
+def _grow(
+    job: Job, workspace: Path, name: str, rows: list[int], threads: int, progress: Progress
+) -> list[pycolmap.Reconstruction]:
+    """Return models of the pictures, the largest first; those of an earlier run that came to its end are read."""
+    folder = workspace / MODELS / name
+    finished = folder / "finished"
+    if not finished.is_file():
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        options = _options(job, threads)
+        options.image_names = [job.alias(row) for row in sorted(rows)]
+        _run(workspace, folder, options, len(rows), progress)
+        finished.touch()
+    models = [pycolmap.Reconstruction(path) for path in sorted(folder.glob("[0-9]*"))]
+    return sorted(models, key=lambda model: (-model.num_reg_images(), min(model.reg_image_ids(), default=0)))
+
+
+def _options(job: Job, threads: int) -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = threads, 0
+    options.use_prior_position = bool(np.isfinite(job.gps_in_world_m()).all(axis=1).sum() >= LEAST_IMAGES)
+    # Outliers of the GPS are few beside features; what loses weight lets a wrong start stay wrong.
+    options.use_robust_loss_on_prior_position = False
+    options.extract_colors = False
+    options.min_model_size = LEAST_IMAGES
+    options.constant_cameras = {number + 1 for number in range(len(job.cameras))}
+    options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    options.mapper.abs_pose_min_num_inliers = _LEAST_INLIERS
+    return options
+
+
+def _run(
+    workspace: Path, folder: Path, options: Any, total: int, progress: Progress, start: Path | None = None
+) -> dict[int, pycolmap.Reconstruction]:
+    posed = 0
+
+    def count() -> None:
+        nonlocal posed
+        posed = min(posed + 1, total)
+        progress("finding poses", posed, total)
+
+    progress("finding poses", 0, total)
+    found: dict[int, pycolmap.Reconstruction] = pycolmap.incremental_mapping(
+        workspace / DATABASE,
+        workspace / LINKS,
+        folder,
+        options=options,
+        input_path=start or "",
+        next_image_callback=count,
+    )
+    for number, model in found.items():
+        (folder / str(number)).mkdir(exist_ok=True)
+        model.write_binary(folder / str(number))
+    progress("finding poses", total, total)
+    return found
+
+
+def _cameras(job: Job, workspace: Path) -> dict[int, pycolmap.Camera]:
+    """Return the cameras by id; focal lengths that nobody knows are estimated from all pairs of pictures together."""
+    calibrated = workspace / MODELS / "calibrated"
+    if not all(job.has_focal) and not calibrated.is_file():
+        calibrated.parent.mkdir(exist_ok=True)
+        options = pycolmap.ViewGraphCalibrationOptions()
+        options.random_seed = 0
+        pycolmap.calibrate_view_graph(workspace / DATABASE, options)
+        calibrated.touch()
+    with pycolmap.Database.open(workspace / DATABASE) as database:
+        return {int(camera.camera_id): camera for camera in database.read_all_cameras()}
+
+
+def _take(models: list[pycolmap.Reconstruction], job: Job, ids: dict[int, int], whole: _Whole) -> None:
+    """Take in what of the models agrees with its GPS."""
+    row_of = {image_id: row for row, image_id in ids.items()}
+    for model in models:
+        images = [image for _, image in sorted(model.images.items()) if image.has_pose]
+        row = np.array([row_of[image.image_id] for image in images])
+        rotation = np.array([image.cam_from_world().rotation.matrix() for image in images]).reshape(-1, 3, 3)
+        center = np.array([image.projection_center() for image in images]).reshape(-1, 3)
+        gps, sigma = job.gps_in_world_m()[row], job.sigma_m()[row]
+        moved = similarity_onto(center, -rotation[:, 1], gps, sigma)
+        if moved is None:
+            continue
+        scale, turn, shift = moved
+        center, rotation = scale * center @ turn.T + shift, rotation @ turn.T
+        fine = ~contradicts_gps(center, gps, sigma)
+        for i in np.flatnonzero(fine).tolist():
+            whole.poses.setdefault(int(row[i]), (rotation[i], center[i]))
+
+
+def contradicts_gps(center_m: Floats, gps_m: Floats, sigma_m: Floats) -> Bools:
+    """Return which positions (N, 3) are too far from those of the GPS, whose sigmas may be too small for them all."""
+    away = np.linalg.norm(center_m - gps_m, axis=1) / sigma_m
+    known = np.isfinite(away)
+    # Three axes, the third twice as wrong: a median of about 1.9.
+    usual = max(1.0, float(np.median(away[known])) / 1.9) if known.any() else 1.0
+    far: Bools = known & (np.nan_to_num(away) > _GPS_SIGMAS * usual)
+    return far
+
+
+def _unite(
+    job: Job,
+    workspace: Path,
+    ids: dict[int, int],
+    whole: _Whole,
+    why_not: dict[int, str],
+    threads: int,
+    progress: Progress,
+) -> tuple[Adjusted, Ints, Ints]:
+    """Return the final poses of rows (N), and which part each is of: parts are held together by the GPS alone."""
+    steps = _ROUNDS + 1
+    for step in range(_ROUNDS):
+        progress("adjusting poses", step, steps)
+        model = _triangulated(job, workspace, ids, whole, threads)
+        if step == 0:
+            _settle(job, model, ids, whole, {})
+            model = _triangulated(job, workspace, ids, whole, threads)
+            model = _with_the_rest(job, workspace, model, ids, threads, progress)
+        found, row, part = _settle(job, model, ids, whole, why_not)
+    progress("adjusting poses", steps, steps)
+    return found, row, part
+
+
+def _triangulated(
+    job: Job, workspace: Path, ids: dict[int, int], whole: _Whole, threads: int
+) -> pycolmap.Reconstruction:
+    """Return one model of all poses, with points made from the matches."""
+    with pycolmap.Database.open(workspace / DATABASE) as database:
+        cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
+    model = pycolmap.Reconstruction()
+    model.load(cache)
+    for camera_id, camera in whole.cameras.items():
+        model.cameras[camera_id].params = list(camera.params)
+    for row, (rotation, center) in sorted(whole.poses.items()):
+        if not model.exists_image(ids[row]):  # It has no match at all.
+            continue
+        image = model.image(ids[row])
+        frame = model.frame(image.frame_id)
+        frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ center))
+        model.register_frame(image.frame_id)
+    folder = workspace / MODELS / "united"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    options = _options(job, threads)
+    options.use_prior_position = False  # It would turn the whole anew, about a straight street by any angle.
+    made: pycolmap.Reconstruction = pycolmap.triangulate_points(
+        model, workspace / DATABASE, workspace / LINKS, folder, clear_points=True, options=options
+    )
+    return made
+
+
+def _with_the_rest(
+    job: Job, workspace: Path, model: pycolmap.Reconstruction, ids: dict[int, int], threads: int, progress: Progress
+) -> pycolmap.Reconstruction:
+    """Return the model with pictures that no model had and that fit into the whole."""
+    missing = len(ids) - model.num_reg_images()
+    if not missing:
+        return model
+    folder = workspace / MODELS / "united"
+    model.write_binary(folder)
+    options = _options(job, threads)
+    options.use_prior_position = options.multiple_models = False
+    options.fix_existing_frames = options.mapper.fix_existing_frames = True
+    found = _run(workspace, folder, options, missing, progress, start=folder)
+    return max([model, *found.values()], key=lambda each: each.num_reg_images())
+
+
+def _settle(
+    job: Job, model: pycolmap.Reconstruction, ids: dict[int, int], whole: _Whole, why_not: dict[int, str]
+) -> tuple[Adjusted, Ints, Ints]:
+    """Adjust the model, without the pictures that do not belong to it, until all that are left do."""
+    row_of = {image_id: row for row, image_id in ids.items()}
+    out: set[int] = set()
+    while True:
+        sights = _sights(job, model, row_of, out)
+        part = _parts(sights)
+        bad = {}
+        known = np.isfinite(sights.gps_in_world_m).all(axis=1)
+        seen = np.bincount(sights.image, minlength=len(sights.row))
+        with_gps = np.bincount(part[known], minlength=part.max(initial=-1) + 1)
+        for i, row in enumerate(sights.row.tolist()):
+            if seen[i] < _LEAST_POINTS:
+                bad[row] = NO_MATCH
+            elif with_gps[part[i]] < LEAST_IMAGES:
+                bad[row] = NO_GPS
+        found = None
+        if not bad:
+            found = adjust(sights, part)
+            wrong = contradicts_gps(found.center_in_world_m, sights.gps_in_world_m, sights.sigma_m)
+            bad = dict.fromkeys(sights.row[wrong].tolist(), NOT_THERE)
+        if found is not None and not bad:
+            break
+        why_not.update(bad)
+        out |= set(bad)
+        if len(out) == model.num_reg_images():
+            raise InputError(
+                f"{job.pictures[0].path.parent}: structure from motion finds no pictures that agree with their GPS",
+                hint="is --gps-sigma right? --poses exif takes headings as they are",
+            )
+    whole.poses = {
+        row: (found.cam_from_world[i], found.center_in_world_m[i]) for i, row in enumerate(sights.row.tolist())
+    }
+    whole.cameras = found.cameras
+    for row in sights.row.tolist():
+        why_not.pop(row, None)
+    return found, sights.row, part
+
+
+def _sights(job: Job, model: pycolmap.Reconstruction, row_of: dict[int, int], out: set[int]) -> Sights:
+    """Return what the pictures of a model see, without those that are out."""
+    images = sorted((row_of[each], each) for each in model.reg_image_ids() if row_of[each] not in out)
+    number_of: dict[int, int] = {}
+    image, point, pixel = [], [], []
+    for i, (_, image_id) in enumerate(images):
+        for feature in model.image(image_id).points2D:
+            if feature.has_point3D():
+                image.append(i)
+                point.append(number_of.setdefault(feature.point3D_id, len(number_of)))
+                pixel.append(feature.xy)
+    of_image, of_point = np.array(image, dtype=np.int64), np.array(point, dtype=np.int64)
+    # A point that one picture alone sees, when others are out, says nothing.
+    fine = (np.bincount(of_point, minlength=len(number_of)) > 1)[of_point]
+    rows = np.array([row for row, _ in images], dtype=np.int64)
+    poses = [model.image(image_id) for _, image_id in images]
+    rotation = np.array([each.cam_from_world().rotation.matrix() for each in poses]).reshape(-1, 3, 3)
+    kept, of_point = np.unique(of_point[fine], return_inverse=True)
+    xyz = np.array([model.point3D(point_id).xyz for point_id in number_of]).reshape(-1, 3)
+    return Sights(
+        row=rows,
+        cam_from_world=rotation,
+        center_in_world_m=np.array([each.projection_center() for each in poses]).reshape(-1, 3),
+        camera_id=np.array([each.camera_id for each in poses], dtype=np.int64),
+        cameras=dict(sorted(model.cameras.items())),
+        has_focal={number + 1: known for number, known in enumerate(job.has_focal)},
+        gps_in_world_m=job.gps_in_world_m()[rows],
+        sigma_m=job.sigma_m()[rows],
+        drive=np.unique([job.pictures[row].drive for row in rows], return_inverse=True)[1].reshape(-1),
+        image=of_image[fine],
+        point=of_point,
+        pixel=np.array(pixel, dtype=np.float64).reshape(-1, 2)[fine],
+        point_in_world_m=xyz[kept],
+    )
+
+
+def _parts(sights: Sights) -> Ints:
+    """Return which pictures (N) hang together by points that pairs of them share."""
+    shape = (len(sights.row), len(sights.point_in_world_m))
+    seen = csr_matrix((np.ones(len(sights.image)), (sights.image, sights.point)), shape=shape)
+    shared = seen @ seen.T
+    shared.data[shared.data < _SHARED_POINTS] = 0.0
+    shared.eliminate_zeros()
+    part: Ints = connected_components(shared, directed=False)[1].astype(np.int64)
+    return part
+
+
+def _camera(camera: pycolmap.Camera) -> Camera:
+    params = tuple(float(value) for value in camera.params)
+    return Camera(camera.model.name, int(camera.width), int(camera.height), params)
