@@ -1,6 +1,6 @@
 # `make demo` and `make test` do all their own set-up: they need Python 3.11+, a C compiler and cargo, nothing else.
 # `make test EXTRAS=train` installs PyTorch (5 GB) and tests training too; without it those tests are skipped.
-.PHONY: demo test lint bench model page rust-test wheel sdist docs setup clean
+.PHONY: demo test lint bench bench-field model page rust-test wheel sdist docs setup clean
 
 UV_VERSION := 0.13.8
 PYTHON ?= python3
@@ -8,6 +8,7 @@ UV := .tools/bin/uv
 RUN := $(UV) run --frozen
 EXTRAS ?=
 DETECTOR_DATA ?= ../shared/data/detector
+FIELD_DATA ?= ../shared/data
 
 demo: setup
 	$(RUN) valuemap demo
@@ -25,6 +26,10 @@ lint: setup
 	$(RUN) lint-imports
 	cargo fmt --check
 	cargo clippy --locked --all-targets -- --deny warnings
+
+# valuemap and other methods on the same real data: see benchmarks/README.md.
+bench-field: setup
+	$(RUN) python benchmarks/field.py $(FIELD_DATA) --peers benchmarks/results/field.md
 
 bench: setup
 	cargo bench --locked --package valuemap-core

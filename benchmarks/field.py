@@ -13,6 +13,8 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +24,12 @@ import kitti_signs
 import kitti_ts
 import laws
 import london_tl
+import peers
 from field_data import Figures
 from machine import describe_machine, keep_record
 from valuemap.config import MapConfig
 from valuemap.errors import InputError, ValuemapError
+from valuemap.system import peak_memory_mb
 
 RUNS: dict[str, Callable[[Path, MapConfig], dict[str, Figures]]] = {
     "kitti_signs": kitti_signs.run,
@@ -114,17 +118,77 @@ def _by_class(results: dict[str, Figures]) -> str:
     )
 
 
+PEERS_HEAD = """
+# valuemap and its peers on the same real detections
+
+Made by `make bench-field FIELD_DATA=FOLDER`. Krylov's Markov random field is our own writing from the paper; "given"
+means that the association was read from the truth, which no method knows: bounds, not methods. What the peers are:
+`benchmarks/peers.py`. What the figures are: the scripts named as the data sets.
+"""
+
+
+TABLE: dict[str, tuple[str, ...]] = {
+    "london_tl": ("f1_6m", "true_6m", "false_6m", "missed_6m", "f1_3m"),
+    "london_tl bearings": ("f1_6m", "true_6m", "false_6m", "missed_6m", "f1_3m"),
+    "bend_ramps": ("covered", "unmatched", "median_distance_m", "sigma_per_axis_m", "labels"),
+    "kitti_ts": ("recall_1m", "recall_2m", "precision_2m", "median_distance_m", "labels"),
+    "av2_static": ("recall", "precision", "duplicate_labels", "median_distance_m", "labels"),
+}
+"""The figures of the table that compares methods."""
+
+
+def compare(data_root: Path, only: list[str] | None = None) -> str:
+    """Run valuemap, its method `paper` and the peers, each in a process of its own; return a table in Markdown."""
+    lines: list[str] = []
+    for part, figures in TABLE.items():
+        name = part.split()[0]
+        if not (data_root / name).is_dir() or (only and name not in only):
+            continue
+        lines += [f"### {part}", "", f"| method | {' | '.join(figures)} | seconds | peak MB |"]
+        lines.append(f"|---|{'---:|' * (len(figures) + 2)}")
+        for method in ("valuemap", "paper", *peers.PEERS[part]):
+            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+                found, seconds, peak_mb = pool.submit(_measure, data_root / name, part, method).result()
+            shown = ["-" if found[figure] is None else str(found[figure]) for figure in figures]
+            lines.append(f"| {method} | {' | '.join(shown)} | {seconds:.1f} | {peak_mb} |")
+            print(lines[-1], file=sys.stderr, flush=True)
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _measure(data_dir: Path, part: str, method: str) -> tuple[Figures, float, int]:
+    """Return what one method finds in a data set, its seconds with reading and scoring, and its peak memory."""
+    start = time.perf_counter()
+    if method in ("valuemap", "paper"):
+        config = MapConfig(method="robust" if method == "valuemap" else "paper")
+        if part == "london_tl":
+            results = london_tl.run(data_dir, config, with_range=True)
+        else:
+            results = RUNS[part.split()[0]](data_dir, config)
+        found = list(results.values())[-1]
+    else:
+        found = peers.PEERS[part][method](data_dir, part)
+    return found, time.perf_counter() - start, peak_memory_mb() or 0
+
+
 def main() -> int:
     """Run the benchmarks; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data_root", type=Path, metavar="DATA_ROOT")
     parser.add_argument("--only", nargs="+", choices=list(RUNS), metavar="NAME", help=f"of {', '.join(RUNS)}")
     parser.add_argument("--laws", action="store_true", help="check laws that no map may break as well; slow")
+    parser.add_argument("--peers", type=Path, metavar="FILE", help="compare with other methods; a table in Markdown")
     parser.add_argument("--json", type=Path, help="write all figures, settings and machine there")
     parser.add_argument("--method", default=MapConfig().method)
     parser.add_argument("--set", action="append", default=[], metavar="name=value", dest="settings")
     options = parser.parse_args()
     try:
+        if options.peers is not None:
+            table = compare(options.data_root, options.only)
+            machine = ", ".join(f"{name} {value}" for name, value in describe_machine().items())
+            options.peers.write_text(f"{PEERS_HEAD.strip()}\n\nOn {machine}.\n\n{table}", encoding="utf-8")
+            print(table)
+            return 0
         config = MapConfig(method=options.method).with_settings(options.settings)
         results = run(options.data_root, config, options.only)
         kept = laws.run(options.data_root, config, options.only) if options.laws else {}

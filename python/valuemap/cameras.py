@@ -83,11 +83,11 @@ def rotation_matrices(images: Images) -> Floats:
     """Return R (N, 3, 3) with point_in_cam = R point_in_world + t."""
     rotation = np.empty((len(images), 3, 3))
     for members in _blocks(np.arange(len(images))):
-        rotation[members] = _rotation_of(images.cam_from_world_quat[members])
+        rotation[members] = rotation_of(images.cam_from_world_quat[members])
     return rotation
 
 
-def _rotation_of(quat: Floats) -> Floats:
+def rotation_of(quat: Floats) -> Floats:
     """Return R (N, 3, 3) of quaternions (N, 4)."""
     # Written out, because importing SciPy's rotations takes longer than mapping a small city.
     w, x, y, z = np.ascontiguousarray(quat.T)

@@ -46,6 +46,8 @@ _RECORD: dict[str, tuple[type, str]] = {
     "counts": (dict, "an object"),
     "stages": (list, "a list"),
     "notes": (list, "a list"),
+    "poses": (dict, "an object"),
+    "control": (dict, "an object"),
 }
 
 
@@ -54,13 +56,15 @@ class Map:
     """Labels with their evidence, in the frame of the dataset they come from.
 
     `run` is what run.json holds: version, dataset, settings, counts of everything found and rejected, and
-    seconds and peak memory a stage.
+    seconds and peak memory a stage. `corrected` is the dataset with the poses and cameras that the labels were
+    found with, where those that were given had faults and it was just mapped; None else.
     """
 
     frame: Frame
     labels: Labels
     votes: Votes
     run: dict[str, Any]
+    corrected: Dataset | None = None
 
     def __repr__(self) -> str:
         classes = len(np.unique(self.labels.class_name.codes))

@@ -14,7 +14,7 @@ import numpy as np
 
 from valuemap.cameras import Rays, cast_rays, rotation_matrices
 from valuemap.config import MapConfig, bounded_threads
-from valuemap.dataset import Dataset, Frame, ensure_checked, read_dataset
+from valuemap.dataset import Dataset, Frame, ensure_checked, read_dataset, write_dataset
 from valuemap.describe import describe_labels
 from valuemap.engine.engine import Engine
 from valuemap.engine.threads import ThreadEngine
@@ -25,6 +25,7 @@ from valuemap.notes import Findings, cameras_not_upright, find_notes
 from valuemap.partition import partition_images
 from valuemap.portions import rows_on_disk
 from valuemap.progress import Progress, silent
+from valuemap.refine import Refined, refine_poses
 from valuemap.robust import Calibration, calibration_to_json
 from valuemap.system import peak_memory_mb
 from valuemap.tables import Labels, Votes
@@ -38,6 +39,8 @@ from valuemap.vote import vote_in_clusters
 
 LARGEST_IN_MEMORY = 2_000_000
 """Datasets with more images and detections are cut into pieces on disk: about 2 GB."""
+CORRECTED = "corrected"
+"""Where in the folder of work a dataset is kept whose poses were corrected."""
 
 
 def build_map(
@@ -72,15 +75,17 @@ def build_map(
     _check_detections(dataset.name, len(dataset.detections))
     dataset = ensure_checked(dataset)
     stages = _Stages()
+    refined = None
     if config.method == "paper":
         labels, votes, counts = _paper(dataset, config, stages, threads, progress)
     else:
+        refined = _refined(dataset, config, stages, threads, progress)
         with stages.measured("order"):
-            source = InMemory(dataset, config)
+            source = InMemory(refined.dataset, config)
         labels, votes, counts, _ = _robust(source, config, stages, ThreadEngine(threads), progress)
     size = {"images": len(dataset.images), "detections": len(dataset.detections)}
     passes = len(np.unique(dataset.images.pass_id.codes))
-    result = _as_map(dataset.name, dataset.frame, size, passes, config, labels, votes, counts, stages)
+    result = _as_map(dataset.name, dataset.frame, size, passes, config, labels, votes, counts, stages, refined)
     return _with_note(result, _note_on_poses(dataset))
 
 
@@ -130,25 +135,39 @@ def build_map_of_folder(
     """
     images, detections = rows_on_disk(folder)
     stages = _Stages()
+    refined = None
+    threads = run.engine.threads_of_task(1)
     is_large = run.tile_size_m is not None or run.engine.needs_paths or images + detections > LARGEST_IN_MEMORY
     if config.method == "paper" or not is_large:
         dataset = ensure_checked(read_dataset(folder))
         if config.method == "paper":
-            return build_map(dataset, config, threads=run.engine.threads_of_task(1), progress=progress), []
+            return build_map(dataset, config, threads=threads, progress=progress), []
         _check_detections(dataset.name, len(dataset.detections))
+        refined = _refined(dataset, config, stages, threads, progress)
         with stages.measured("order"):
-            source: Source = InMemory(dataset, config)
+            source: Source = InMemory(refined.dataset, config)
         size = {"images": len(dataset.images), "detections": len(dataset.detections)}
         name, frame, note = dataset.name, dataset.frame, _note_on_poses(dataset)
     else:
+        if images + detections <= LARGEST_IN_MEMORY and detections:
+            refined = _refined(ensure_checked(read_dataset(folder)), config, stages, threads, progress)
+            if refined.is_corrected:
+                folder = run.work / CORRECTED
+                write_dataset(refined.dataset, folder)
         with stages.measured("partition"):
             on_disk = partition_dataset(folder, run.work, config, tile_size_m=run.tile_size_m, progress=progress)
         source, name, frame, size, note = on_disk, on_disk.name, on_disk.frame, on_disk.counts, None
         _check_detections(name, size["detections"])
     labels, votes, counts, cells = _robust(source, config, stages, run.engine, progress, run)
     passes = source.drives_record["passes"]
-    result = _as_map(name, frame, size, passes, config, labels, votes, counts, stages)
+    result = _as_map(name, frame, size, passes, config, labels, votes, counts, stages, refined)
     return _with_note(result, note), cells
+
+
+def _refined(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, progress: Progress) -> Refined:
+    """Correct what whole drives' poses are proven wrong by."""
+    with stages.measured("poses"):
+        return refine_poses(dataset, config, threads=threads, progress=progress)
 
 
 def _note_on_poses(dataset: Dataset) -> str | None:
@@ -177,11 +196,16 @@ def _as_map(
     votes: Votes,
     counts: dict[str, Any],
     stages: _Stages,
+    refined: Refined | None,
 ) -> Map:
     without = size["detections"] - len(votes)
     counts = {**size, "detections_without_label": without, **counts, "labels": len(labels)}
     notes = find_notes(Findings(passes, config, labels, votes, counts))
-    return Map(frame, labels, votes, {**_record(name, config, counts, stages), "notes": notes})
+    record = {**_record(name, config, counts, stages), "notes": notes}
+    if refined is None:
+        return Map(frame, labels, votes, record)
+    corrected = refined.dataset if refined.is_corrected else None
+    return Map(frame, labels, votes, {**record, "poses": refined.record}, corrected)
 
 
 def _paper(

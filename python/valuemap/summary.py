@@ -53,6 +53,8 @@ def summarize_map(result: Map) -> dict[str, Any]:
         "labels": len(labels),
         "classes": _classes(labels.class_name),
         **{name: counts[name] for name in counts if name != "labels"},
+        **_poses(result.run.get("poses")),
+        **_control(result.run.get("control")),
         "seconds": float(sum(stage["seconds"] for stage in result.run.get("stages", []))),
     }
     if len(labels):
@@ -63,6 +65,30 @@ def summarize_map(result: Map) -> dict[str, Any]:
             "median_reprojection_rms_px": float(np.median(labels.reprojection_rms_px)),
         }
     return facts
+
+
+def _poses(record: Any) -> dict[str, Any]:
+    """Return how many cameras and drives were corrected, nothing where nothing was looked for."""
+    if not isinstance(record, dict):
+        return {}
+    return {"corrected_poses": {name: len(record.get(name, ())) for name in ("cameras", "drives")}}
+
+
+def _control(record: Any) -> dict[str, Any]:
+    """Return by how much control points moved the map, and what points left out say; nothing where there were none."""
+    if not isinstance(record, dict):
+        return {}
+    names = ("matched", "shift_east_north_up_m", "shift_sigma_m", "turn_deg")
+    left_out = record.get("left_out", {})
+    proof = {
+        name: left_out[key]
+        for name, key in (
+            ("left_out_rmse_as_mapped_m", "rmse_horizontal_as_mapped_m"),
+            ("left_out_rmse_moved_m", "rmse_horizontal_m"),
+        )
+        if key in left_out
+    }
+    return {"control": {**{name: record[name] for name in names if name in record}, **proof}}
 
 
 def _extent(points: Floats) -> list[float]:

@@ -211,6 +211,7 @@ class TruthPoints(Table):
     position_in_world_m: Floats = _column("float", ("x", "y", "z"))
     class_name: Categories | None = _column("category", ("class",), optional=True)
     object_id: Ints | None = _column("int", ("object_id",), optional=True)
+    sigma_m: Floats | None = _column("float", ("sigma",), optional=True, nullable=True)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -221,6 +222,7 @@ class GeographicTruth(Table):
     height_m: Floats | None = _column("float", ("height",), optional=True)
     class_name: Categories | None = _column("category", ("class",), optional=True)
     object_id: Ints | None = _column("int", ("object_id",), optional=True)
+    sigma_m: Floats | None = _column("float", ("sigma",), optional=True, nullable=True)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -300,8 +302,9 @@ class Labels(Table):
     voters' boxes at their depths; `facing_azimuth_rad` (0 to 2 pi, clockwise from north seen from above) where the
     voters' cameras are from it, and `facing_concentration` (0 to 1) how much they are on one side of it;
     `expected` counts the images that should have seen it and `existence` is the
-    probability that it exists (robust method); lon, lat in degrees and height in metres on WGS84 where geo-referenced;
-    `state` is what `valuemap update` says about it.
+    probability that it exists (robust method); `absolute_covariance_m2` (N, 6) is there where control points told how
+    well the whole map is placed, `covariance_m2` is against the labels around; lon, lat in degrees and height in metres
+    on WGS84 where geo-referenced; `state` is what `valuemap update` says about it.
     """
 
     KEY: ClassVar[str | None] = "label_id"
@@ -331,6 +334,18 @@ class Labels(Table):
     last_seen_s: Floats = _column("float", ("last_seen",), nullable=True)
     facing_azimuth_rad: Floats = _column("float", ("facing_azimuth_rad",))
     facing_concentration: Floats = _column("float", ("facing_concentration",))
+    absolute_covariance_m2: Floats | None = _column(
+        "float",
+        (
+            "absolute_covariance_xx",
+            "absolute_covariance_xy",
+            "absolute_covariance_xz",
+            "absolute_covariance_yy",
+            "absolute_covariance_yz",
+            "absolute_covariance_zz",
+        ),
+        optional=True,
+    )
     lon_lat_height: Floats | None = _column("float", ("lon", "lat", "height"), optional=True)
     expected: Ints | None = _column("int", ("expected",), optional=True)
     existence: Floats | None = _column("float", ("existence",), optional=True)

@@ -14,17 +14,21 @@ from valuemap.cli.options import DEFAULT_METHOD, AsJson, Force, MethodName, Resu
 from valuemap.cli.show import log, progress_bars, show, show_notes
 from valuemap.cli.working import working
 from valuemap.config import MapConfig
-from valuemap.dataset import read_dataset
+from valuemap.control import apply_control
+from valuemap.dataset import Dataset, read_dataset
 from valuemap.engine.threads import ThreadEngine
+from valuemap.errors import InputError
 from valuemap.evaluate import evaluate_map
+from valuemap.evaluate.truth import read_truth
 from valuemap.evidence import dataset_reference
 from valuemap.folders import check_files, check_place
-from valuemap.map_folder import write_map
+from valuemap.map_folder import Map, write_map
 from valuemap.pipeline import Run, build_map_of_folder
 from valuemap.report.above import draw_map
 from valuemap.report.style import check_format
 from valuemap.summary import summarize_map
 from valuemap.tiles.calibration import read_calibration
+from valuemap.writers.poses import check_poses_place, write_poses
 
 
 @app.command("map", epilog="Settings for --set: see valuemap settings.")
@@ -35,6 +39,21 @@ def map_command(
     threads: Annotated[int, typer.Option(min=0, help="Threads, 0 for one a core; the map is the same.")] = 0,
     picture: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw the map from above, as .png or .svg.")
+    ] = None,
+    write_poses_to: Annotated[
+        Path | None,
+        typer.Option(
+            "--write-poses",
+            metavar="OUT",
+            help="Write the poses that the labels were found with, as a dataset and as a COLMAP model in OUT/colmap.",
+        ),
+    ] = None,
+    control: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="POINTS",
+            help="Table of surveyed objects (x, y, z or lat, lon; height, sigma, class if known) to move the map to.",
+        ),
     ] = None,
     tile_size: TileSize = None,
     work: Work = None,
@@ -52,14 +71,24 @@ def map_command(
     if picture is not None:
         check_format(picture)
         check_files(picture.parent, [picture.name], force=force)
+    if write_poses_to is not None:
+        check_poses_place(write_poses_to, force=force)
+    if control is not None and not control.is_file():
+        raise InputError(f"{control}: no such file", hint="give a table of surveyed objects, such as a .csv")
     given = None if calibration is None else read_calibration(calibration)
     with working(work, out, resume=resume) as folder, progress_bars() as progress:
         run = Run(folder, ThreadEngine(threads), tile_size_m=tile_size, calibration=given)
         result, cells = build_map_of_folder(dataset, config, run, progress=progress)
-        result.run["dataset_folder"] = dataset_reference(dataset, out)
+        if control is not None or write_poses_to is not None:
+            data = result.corrected or read_dataset(dataset)
+            if control is not None:
+                result, data = _controlled(result, data, control)
+            if write_poses_to is not None:
+                write_poses(result, data, write_poses_to, force=force)
+        result.run["dataset_folder"] = dataset_reference(write_poses_to or dataset, out)
         write_map(result, out, cells=cells, force=force)
     if picture is not None:
-        data = read_dataset(dataset)
+        data = read_dataset(write_poses_to or dataset)
         matches = evaluate_map(result, data).matches if data.truth is not None else None
         draw_map(result, data, matches, picture, force=force)
     show_notes(result.run["notes"])
@@ -68,3 +97,13 @@ def map_command(
     else:
         show(summarize_map(result))
         log.print(f"Wrote {out}", highlight=False)
+
+
+def _controlled(result: Map, data: Dataset, control: Path) -> tuple[Map, Dataset]:
+    """Return the map and its dataset moved to control points."""
+    points = read_truth(control, result)
+    if isinstance(points, Dataset):
+        raise InputError(f"{control}: is a dataset", hint="give a table of surveyed objects, such as a .csv")
+    result, moved = apply_control(result, points, data)
+    assert moved is not None
+    return result, moved

@@ -38,6 +38,7 @@ class TrueObjects:
     `position_in_world_m` is (N, 3). `class_name` is None where the truth has no classes: then any class
     matches. `is_recoverable` (N) is None where nobody recorded which images detected the objects: then all
     count. Without `has_height` the vertical part of the positions means nothing and matching is horizontal.
+    `sigma_m` (N) is the standard deviation of the positions on each axis, NaN where it is not known.
     """
 
     object_id: Ints
@@ -45,6 +46,7 @@ class TrueObjects:
     class_name: Categories | None = None
     is_recoverable: Bools | None = None
     has_height: bool = True
+    sigma_m: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.object_id)
@@ -195,11 +197,12 @@ def _sorted_objects(
         position_in_world_m=position_in_world_m[order],
         class_name=None if truth.class_name is None else truth.class_name.take(order),
         has_height=has_height,
+        sigma_m=None if truth.sigma_m is None else truth.sigma_m[order],
     )
 
 
 def _read_csv(path: Path) -> pa.Table:
-    numbers = dict.fromkeys(("x", "y", "z", "lon", "lat", "height"), pa.float64())
+    numbers = dict.fromkeys(("x", "y", "z", "lon", "lat", "height", "sigma"), pa.float64())
     types = {**numbers, "class": pa.string(), "object_id": pa.string()}
     hint = "separate columns by commas, their names in the first line"
     return read_csv_arrow(path, types, has_missing=True, hint=hint)

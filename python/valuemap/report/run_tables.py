@@ -19,7 +19,7 @@ DOUBTFUL = 12
 
 def run_tables(result: Map) -> list[ReportTable]:
     """Return the tables that need nothing but the map."""
-    return [_classes(result), _stages(result), _counts(result), _settings(result)]
+    return [_classes(result), *_poses(result), _stages(result), _counts(result), _settings(result)]
 
 
 def accuracy_tables(evaluation: Evaluation) -> list[ReportTable]:
@@ -152,6 +152,42 @@ def _classes(result: Map) -> ReportTable:
     rows.sort(key=lambda row: (-int(row[1] or 0), str(row[0])))
     columns = ("class", "labels", "votes", "passes", "existence", "sigma (m)", "reprojection rms (px)")
     return ReportTable("classes", "Labels by class", columns, tuple(rows), ("Medians over the labels of a class.",))
+
+
+def _poses(result: Map) -> list[ReportTable]:
+    """Return what was found wrong with the poses of drives and with cameras, a row for each part of a drive."""
+    record = result.run.get("poses")
+    if not isinstance(record, dict) or record.get("found") != "faults":
+        return []
+    rows: list[tuple[Cell, ...]] = [
+        (f"camera {camera['camera_id']}", "", None, *_turn_delay(camera), camera.get("focal_length_factor"))
+        for camera in record.get("cameras", [])
+    ]
+    for drive in record.get("drives", []):
+        whose = (f"drive {drive['drive']}", str(drive["pass"]))
+        if "turned_deg" in drive or "delay_s" in drive:
+            rows.append((*whose, None, *_turn_delay(drive), None))
+        rows += [
+            (*whose, _numbers(leg["moved_m"]), None, None, None) for leg in drive.get("legs", []) if "moved_m" in leg
+        ]
+    columns = (
+        "",
+        "pass",
+        "moved east, north, up (m)",
+        "turned right, down, forward (deg)",
+        "delay (s)",
+        "focal length x",
+    )
+    notes = ("What was wrong with poses and cameras, found from the objects that drives share, and put right.",)
+    return [ReportTable("poses", "Corrections of poses", columns, tuple(rows), notes)]
+
+
+def _turn_delay(found: dict[str, Any]) -> tuple[Cell, Cell]:
+    return _numbers(found["turned_deg"]) if "turned_deg" in found else None, found.get("delay_s")
+
+
+def _numbers(values: list[float]) -> str:
+    return "  ".join(f"{value:.2f}" for value in values)
 
 
 def _stages(result: Map) -> ReportTable:

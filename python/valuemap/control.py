@@ -1,0 +1,362 @@
+"""Control points: surveyed objects tell by how much the whole map is shifted and turned, and how sure that is.
+
+A point's label is not known. The shift on which most points and labels agree, small ones first, matches them one to
+one; then shift, and rotation about the vertical where the points tell it, are weighted least squares with Huber's
+weights. What labels and points disagree by beyond their own errors - what a survey calls the middle of an object, and
+errors that neighbours do not share - is estimated along with them and is part of the uncertainty. Points that are left
+out at random, with the rest of the estimation done anew, prove it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from valuemap.cameras import camera_poses
+from valuemap.dataset import Dataset
+from valuemap.errors import InputError
+from valuemap.evaluate.truth import TrueObjects
+from valuemap.geodesy import lon_lat_height_from_enu
+from valuemap.map_folder import Map
+from valuemap.tables import Floats, Ints, Labels
+
+REACH_M = 10.0
+"""Shifts up to this are looked for."""
+_USUAL_M = 3.0
+"""Deviation of the shift that is expected: of several that explain the points, a small one is likelier."""
+_FIRST_SPREAD_M = 0.5
+"""What labels and points disagree by, each axis, before anything is known."""
+_CLUTTER = 0.02
+_GATE = 3.5
+_HUBER = 2.0
+_LEAST_POINTS = 3
+_LEAST_FOR_ROTATION = 6
+_TURN_PRICE = 10.0
+"""What a rotation must explain, in squared sigmas."""
+_SPLITS, _LEFT_OUT = 50, 0.3
+_UPPER = (0, 1, 2, 4, 5, 8)
+
+
+@dataclass(frozen=True, eq=False)
+class Georeference:
+    """What takes a map to its control points: `turn_rad` about up at `pivot_m`, then `shift_m`; east, north, up.
+
+    `covariance` (4, 4) is of shift and turn. `label_of_point` (points) is the row of the label, -1 for none;
+    `spread_m` is what labels and points disagree by beyond their own errors, each axis on the ground.
+    """
+
+    shift_m: Floats
+    turn_rad: float
+    pivot_m: Floats
+    covariance: Floats
+    label_of_point: Ints
+    spread_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Points that had no part in the estimation: horizontal and vertical RMSE as mapped and as corrected, m."""
+
+    points: int
+    splits: int
+    before_m: tuple[float, float]
+    after_m: tuple[float, float]
+    shift_deviation_m: float
+    """Root mean square distance on the ground between the shift of the rest and that of all."""
+
+
+def find_georeference(result: Map, points: TrueObjects) -> Georeference:
+    """Return what takes the labels of a map to its control points.
+
+    Raises
+    ------
+    InputError
+        Fewer than three points have a label nearby.
+    """
+    labels, here = _Labels.of(result), _Points.of(result, points)
+    return _find(labels, here, np.arange(len(here.place_m)))
+
+
+def leave_out(result: Map, points: TrueObjects, found: Georeference) -> LeftOut | None:
+    """Estimate without some of the points, chosen at random again and again, and see how far those are then off.
+
+    None where there are too few to leave any out.
+    """
+    labels, here = _Labels.of(result), _Points.of(result, points)
+    matched = np.flatnonzero(found.label_of_point >= 0)
+    count = max(1, round(_LEFT_OUT * len(matched)))
+    if len(matched) - count < _LEAST_POINTS:
+        return None
+    random = np.random.default_rng(0)
+    before, after, shifts = [], [], []
+    for _ in range(_SPLITS):
+        out = random.permutation(matched)[:count]
+        rest = np.setdiff1d(matched, out)
+        try:
+            without = _find(labels, here, rest)
+        except InputError:
+            continue
+        error = here.place_m[out] - labels.place_m[found.label_of_point[out]]
+        before.append(error)
+        after.append(here.place_m[out] - _moved(labels.place_m[found.label_of_point[out]], without))
+        middle = found.pivot_m[None]
+        shifts.append(_moved(middle, without)[0, :2] - _moved(middle, found)[0, :2])
+    if not before:
+        return None
+    return LeftOut(
+        points=count,
+        splits=len(before),
+        before_m=_rmse(np.concatenate(before), here.has_height),
+        after_m=_rmse(np.concatenate(after), here.has_height),
+        shift_deviation_m=float(np.sqrt(np.mean(np.sum(np.square(shifts), axis=1)))),
+    )
+
+
+def apply_control(result: Map, points: TrueObjects, dataset: Dataset | None = None) -> tuple[Map, Dataset | None]:
+    """Return a map that is moved to its control points, and its dataset likewise.
+
+    Labels get a covariance in two parts: that against the labels around stays, and `absolute_covariance_m2` adds
+    what is not known of the shift. `run["control"]` says what was found.
+
+    Raises
+    ------
+    InputError
+        As `find_georeference`.
+    """
+    found = find_georeference(result, points)
+    proof = leave_out(result, points, found)
+    axes = _axes(result)
+    labels = result.labels
+    place = labels.position_in_world_m @ axes.T
+    moved = _moved(place, found) @ axes
+    anchor = result.frame.anchor
+    labels = labels.replace(
+        position_in_world_m=moved,
+        absolute_covariance_m2=_absolute(labels, place, found, axes),
+        facing_azimuth_rad=(labels.facing_azimuth_rad - found.turn_rad) % (2.0 * np.pi),
+        lon_lat_height=None if anchor is None else lon_lat_height_from_enu(moved, anchor),
+    )
+    run = {**result.run, "control": _describe(found, proof, len(points), result)}
+    if dataset is not None:
+        dataset = _moved_dataset(dataset, found, axes)
+    return replace(result, labels=labels, run=run), dataset
+
+
+@dataclass(frozen=True, eq=False)
+class _Labels:
+    """Places (N, 3) and covariances (N, 3, 3) of labels, east, north, up, and their classes."""
+
+    place_m: Floats
+    covariance_m2: Floats
+    class_names: list[str]
+
+    @classmethod
+    def of(cls, result: Map) -> _Labels:
+        axes, labels = _axes(result), result.labels
+        full = labels.covariance_m2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        return cls(labels.position_in_world_m @ axes.T, axes @ full @ axes.T, labels.class_name.texts())
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Places (N, 3) of control points, east, north, up, their deviations (N), and their classes, None for any."""
+
+    place_m: Floats
+    sigma_m: Floats
+    class_names: list[str] | None
+    has_height: bool
+
+    @classmethod
+    def of(cls, result: Map, points: TrueObjects) -> _Points:
+        sigma = np.zeros(len(points)) if points.sigma_m is None else np.nan_to_num(points.sigma_m)
+        names = None if points.class_name is None else points.class_name.texts()
+        return cls(points.position_in_world_m @ _axes(result).T, sigma, names, points.has_height)
+
+
+def _axes(result: Map) -> Floats:
+    return np.vstack([result.frame.east_north(), result.frame.up])
+
+
+def _find(labels: _Labels, points: _Points, rows: Ints) -> Georeference:
+    """Estimate with some of the points."""
+    used = 3 if points.has_height else 2
+    point, label = _candidates(labels, points, rows, used)
+    if len(np.unique(point)) < _LEAST_POINTS:
+        raise InputError(
+            f"control: {len(np.unique(point))} of {len(rows)} points have a label of their class within "
+            f"{REACH_M:g} m, expected at least {_LEAST_POINTS}",
+            hint="are they in the frame of the map, or geographic, and are their classes those of the labels?",
+        )
+    shift = _first_shift(labels, points, point, label, used)
+    pivot = points.place_m[rows].mean(axis=0)
+    found = Georeference(shift, 0.0, pivot, np.zeros((4, 4)), np.full(len(points.place_m), -1), _FIRST_SPREAD_M)
+    for _ in range(8):
+        match = _match(labels, points, point, label, found, used)
+        if int((match >= 0).sum()) < _LEAST_POINTS:
+            raise InputError(
+                f"control: {int((match >= 0).sum())} of {len(rows)} points agree with labels about one shift, "
+                f"expected at least {_LEAST_POINTS}",
+                hint="are these the objects that were mapped?",
+            )
+        found = _adjust(labels, points, match, found, used)
+    return found
+
+
+def _candidates(labels: _Labels, points: _Points, rows: Ints, used: int) -> tuple[Ints, Ints]:
+    """Return pairs of point and label of one class within reach."""
+    if not len(labels.place_m):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    tree = cKDTree(labels.place_m[:, :used])
+    near: list[list[int]] = list(tree.query_ball_point(points.place_m[rows, :used], REACH_M, return_sorted=True))  # type: ignore[arg-type]
+    pairs = [
+        (row, other)
+        for row, others in zip(rows.tolist(), near, strict=True)
+        for other in others
+        if points.class_names is None or points.class_names[row] == labels.class_names[other]
+    ]
+    both = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    return both[:, 0], both[:, 1]
+
+
+def _first_shift(labels: _Labels, points: _Points, point: Ints, label: Ints, used: int) -> Floats:
+    """Return the shift (3) on which most points agree: the best of all differences of pairs, and none."""
+    difference = (points.place_m[point] - labels.place_m[label])[:, :used]
+    variance = np.trace(labels.covariance_m2[label][:, :used, :used], axis1=1, axis2=2) / used
+    variance = variance + points.sigma_m[point] ** 2 + _FIRST_SPREAD_M**2
+    trial = np.unique(np.vstack([np.zeros((1, used)), difference]), axis=0)
+    best, least = np.zeros(used), math.inf
+    for shift in trial:
+        agreement = np.exp(-0.5 * np.sum((difference - shift) ** 2, axis=1) / variance)
+        each = np.zeros(len(points.place_m))
+        np.maximum.at(each, point, agreement)
+        cost = -2.0 * float(np.sum(np.log(_CLUTTER + each))) + float(shift @ shift) / _USUAL_M**2
+        if cost < least:
+            best, least = shift, cost
+    return np.append(best, np.zeros(3 - used))
+
+
+def _moved(place_m: Floats, found: Georeference) -> Floats:
+    """Return places (N, 3), east, north, up, turned about the pivot and shifted."""
+    cos, sin = math.cos(found.turn_rad), math.sin(found.turn_rad)
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray((place_m - found.pivot_m) @ turn.T + found.pivot_m + found.shift_m)
+
+
+def _match(labels: _Labels, points: _Points, point: Ints, label: Ints, found: Georeference, used: int) -> Ints:
+    """Return the label (points) of each point, one to one, the closest in sigmas; -1 where none is within the gate."""
+    apart = (points.place_m[point] - _moved(labels.place_m[label], found))[:, :used]
+    total = labels.covariance_m2[label][:, :used, :used].copy()
+    total += (points.sigma_m[point] ** 2 + max(found.spread_m, 0.05) ** 2)[:, None, None] * np.eye(used)
+    square = np.einsum("ni,ni->n", apart, np.linalg.solve(total, apart[:, :, None])[:, :, 0])
+    match = np.full(len(points.place_m), -1)
+    fits = square < _GATE**2
+    if not fits.any():
+        return match
+    ours, i = np.unique(point[fits], return_inverse=True)
+    theirs, j = np.unique(label[fits], return_inverse=True)
+    cost = np.full((len(ours), len(theirs) + len(ours)), 1e6)
+    cost[i, j] = square[fits]
+    cost[np.arange(len(ours)), len(theirs) + np.arange(len(ours))] = _GATE**2
+    for a, b in zip(*linear_sum_assignment(cost), strict=True):
+        if b < len(theirs):
+            match[ours[a]] = theirs[b]
+    return match
+
+
+def _adjust(labels: _Labels, points: _Points, match: Ints, found: Georeference, used: int) -> Georeference:
+    """Estimate shift, spread, and a turn where it explains more than its price."""
+    rows = np.flatnonzero(match >= 0)
+    source, target = labels.place_m[match[rows]], points.place_m[rows]
+    own = labels.covariance_m2[match[rows]][:, :used, :used]
+    own = own + (points.sigma_m[rows] ** 2)[:, None, None] * np.eye(used)
+    pivot = target.mean(axis=0)
+    spread2 = found.spread_m**2
+    with_turn = len(rows) >= _LEAST_FOR_ROTATION
+    design = np.zeros((len(rows), used, used + 1))
+    design[:, np.arange(used), np.arange(used)] = 1.0
+    arm = source - pivot
+    design[:, 0, used], design[:, 1, used] = -arm[:, 1], arm[:, 0]
+    difference = (target - source)[:, :used]
+    solution, covariance = np.zeros(used + 1), np.zeros((used + 1, used + 1))
+    for columns in ([*range(used + 1)], [*range(used)]) if with_turn else ([*range(used)],):
+        part = design[:, :, columns]
+        weight_of = np.ones(len(rows))
+        for _ in range(20):
+            weight = np.linalg.inv(own + spread2 * np.eye(used)) * weight_of[:, None, None]
+            normal = np.einsum("nki,nkl,nlj->ij", part, weight, part)
+            covariance_part = np.linalg.inv(normal)
+            values = covariance_part @ np.einsum("nki,nkl,nl->i", part, weight, difference)
+            left = difference - part @ values
+            square = np.einsum("ni,nij,nj->n", left, np.linalg.inv(own + spread2 * np.eye(used)), left)
+            weight_of = np.minimum(1.0, _HUBER / np.sqrt(np.maximum(square, 1e-12)))
+            # The spread at which what is left is as large as it should be, a step at a time.
+            freedom = max(used * len(rows) - len(columns), 1)
+            excess = float(np.sum(weight_of * square)) / freedom
+            spread2 = min(max(spread2 * excess, 1e-6), REACH_M**2)
+        solution, covariance = np.zeros(used + 1), np.zeros((used + 1, used + 1))
+        solution[columns], covariance[np.ix_(columns, columns)] = values, covariance_part
+        if with_turn and len(columns) == used + 1 and values[used] ** 2 > _TURN_PRICE * covariance_part[used, used]:
+            break
+    full = np.zeros((4, 4))
+    places = [*range(used), 3]
+    full[np.ix_(places, places)] = covariance
+    shift = np.append(solution[:used], np.zeros(3 - used))
+    return Georeference(shift, float(solution[used]), pivot, full, match, math.sqrt(spread2))
+
+
+def _absolute(labels: Labels, place_m: Floats, found: Georeference, axes: Floats) -> Floats:
+    """Return the covariances (N, 6) of labels with what is not known of shift and turn."""
+    arm = place_m - found.pivot_m
+    design = np.zeros((len(place_m), 3, 4))
+    design[:, np.arange(3), np.arange(3)] = 1.0
+    design[:, 0, 3], design[:, 1, 3] = -arm[:, 1], arm[:, 0]
+    common = axes.T @ (design @ found.covariance @ design.transpose(0, 2, 1)) @ axes
+    return np.asarray(labels.covariance_m2 + common.reshape(-1, 9)[:, _UPPER])
+
+
+def _moved_dataset(dataset: Dataset, found: Georeference, axes: Floats) -> Dataset:
+    """Return the dataset with its images moved as the labels are."""
+    rotation, center = camera_poses(dataset.images)
+    moved = _moved(center @ axes.T, found) @ axes
+    turn = axes.T @ Rotation.from_rotvec([0.0, 0.0, found.turn_rad]).as_matrix() @ axes
+    turned = Rotation.from_matrix(rotation @ turn.T)
+    images = dataset.images.replace(
+        cam_from_world_quat=turned.as_quat(canonical=True, scalar_first=True), cam_from_world_m=-turned.apply(moved)
+    )
+    return replace(dataset, images=images)
+
+
+def _rmse(error_m: Floats, has_height: bool) -> tuple[float, float]:
+    horizontal = float(np.sqrt(np.mean(np.sum(error_m[:, :2] ** 2, axis=1))))
+    return horizontal, float(np.sqrt(np.mean(error_m[:, 2] ** 2))) if has_height else math.nan
+
+
+def _describe(found: Georeference, proof: LeftOut | None, points: int, result: Map) -> dict[str, Any]:
+    """Return what run.json says of the control."""
+    sigma = np.sqrt(np.diag(found.covariance))
+    record: dict[str, Any] = {
+        "points": points,
+        "matched": int((found.label_of_point >= 0).sum()),
+        "shift_east_north_up_m": [round(float(v), 4) for v in found.shift_m],
+        "shift_sigma_m": [round(float(v), 4) for v in sigma[:3]],
+        "turn_deg": round(math.degrees(found.turn_rad), 6),
+        "turn_sigma_deg": round(math.degrees(float(sigma[3])), 6),
+        "pivot_m": [round(float(v), 4) for v in found.pivot_m @ _axes(result)],
+        "spread_m": round(found.spread_m, 4),
+    }
+    if proof is not None:
+        names = ("horizontal", "vertical")
+        record["left_out"] = {
+            "points": proof.points,
+            "splits": proof.splits,
+            **{f"rmse_{n}_as_mapped_m": round(v, 4) for n, v in zip(names, proof.before_m, strict=True) if v == v},
+            **{f"rmse_{n}_m": round(v, 4) for n, v in zip(names, proof.after_m, strict=True) if v == v},
+            "shift_deviation_m": round(proof.shift_deviation_m, 4),
+        }
+    return record

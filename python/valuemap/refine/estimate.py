@@ -1,0 +1,368 @@
+"""From landmarks of single drives to objects, legs and everything that the poses of drives may be wrong by."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+import valuemap._core as _core
+from valuemap.config import MapConfig
+from valuemap.refine.adjust import (
+    WIDTH,
+    Adjustment,
+    Observations,
+    Scales,
+    State,
+    adjust,
+    by_object,
+    marginal_residuals,
+    triangulate,
+    weights,
+)
+from valuemap.refine.footage import DRIFT_LENGTH_M, Footage, Sigmas
+from valuemap.refine.jumps import Legs
+from valuemap.refine.landmarks import Landmarks
+from valuemap.refine.register import Registration, register
+from valuemap.refine.tracks import associate, merge_objects
+from valuemap.tables import Bools, Floats, Ints
+
+WIDE = Scales(
+    0.2, math.radians(0.2), 0.1, math.radians(0.1), (3.0, math.radians(2.0), 0.2, 0.05, math.radians(2.0), 0.2)
+)
+"""What errors are thought to be before anything is known: drift; offset, mounting, delay, focal length."""
+DRIFT_FACTOR = 1.5
+"""Drift is thought to be so many times as large as what is found of it: data pull it towards zero."""
+_FIRST_PX, _FIRST_SHARE, _FIRST_M = 2.0, 0.05, 0.1
+_LANDMARK_PX, _LANDMARK_M = 3.0, 0.2
+_NEW_LEG_M = 1.0
+"""Registered shifts that differ by more than this are of two legs."""
+_JUMP_PRICE, _SEEN_PRICE = 30.0, 8.0
+"""Minus twice the log odds of a jump where the trajectory shows none, and one: what a new leg has to explain."""
+_LEAST_VOTES, _LEAST_OF_LEG = 4, 8
+_RANGES = 1.5
+_COARSE, _FINE = (6.0, 6.0, 4.0, 4.0, 3.0, 2.0, 2.0), (2.0, 1.5, 1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """What else moves a detection: px, a share of its box, and errors of single images, m."""
+
+    px: float = _FIRST_PX
+    share: float = _FIRST_SHARE
+    image_m: float = _FIRST_M
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Objects with their classes and sizes, which detections show them, legs, the state, and the noise that is left."""
+
+    detection: Ints
+    thing: Ints
+    class_code: Ints
+    size_m: Floats
+    legs: Legs
+    state: State
+    noise: Noise
+    sigma_px: Sigmas
+    scales: Scales
+    landmarks: int
+
+
+def estimate(
+    footage: Footage,
+    landmarks: Landmarks,
+    config: MapConfig,
+    *,
+    seen_cuts: Legs,
+    known: tuple[Legs, Floats] | None = None,
+    laid: Footage | None = None,
+) -> Estimate | None:
+    """Estimate everything that drives may be wrong by, None where there is too little that drives share.
+
+    `seen_cuts` are where the trajectory itself jumps. Where legs and their offsets (L, 3) are `known` about, the
+    landmarks are those of the footage `laid` that way.
+    """
+    marks = _usable(landmarks, laid or footage)
+    if marks is None:
+        return None
+    landmarks, covariance = marks
+    registration = register(landmarks, covariance)
+    legs, offset = _first_legs(footage, landmarks, registration, seen_cuts)
+    if known is not None:
+        legs, offset = _added(legs, offset, *known)
+    thing_of_mark, class_code, size_m, points = _objects(landmarks, registration)
+    detection, thing = landmarks.voters, thing_of_mark[landmarks.landmark_of_voter()]
+    counts = (len(legs), footage.drives.count, footage.drives.count) + (footage.cameras,) * 3
+    state = State.zero(points, len(footage.chain.drive), len(footage.row), counts)
+    state.constants[0][:] = offset
+    noise = Noise()
+    sigma_px = _sigmas(footage, noise)
+    leg = legs.of(footage.drives.pass_code, footage.drives.order)
+    range_m = _RANGES * config.vote.max_range_m
+    scales = WIDE
+    tolerances: tuple[float, ...] = _COARSE
+    for round_number in range(4):
+        seen = footage.observe(detection, thing, leg, sigma_px)
+        problem = Adjustment(seen, footage.chain, scales, everything(footage, legs), len(class_code))
+        state = adjust(problem, state, tolerances=tolerances)
+        noise = fit_noise(seen, state, noise)
+        sigma_px = _sigmas(footage, noise)
+        scales = _grown(own_scales(footage, noise, scales), state)
+        if round_number < 3:
+            legs, leg, state = _cut(footage, seen, state, legs, seen_cuts)
+            seen = footage.observe(detection, thing, leg, sigma_px)
+        detection, thing, class_code, size_m, state = _anew(
+            footage, state, class_code, size_m, leg, sigma_px, range_m, detection, thing
+        )
+        if not len(thing):
+            return None
+        tolerances = _FINE
+    return Estimate(detection, thing, class_code, size_m, legs, state, noise, sigma_px, scales, len(landmarks))
+
+
+def everything(footage: Footage, legs: Legs) -> tuple[Bools, ...]:
+    """Return that all constants are free; focal lengths and delays where there are any."""
+    cameras, drives = footage.cameras, footage.drives.count
+    has_focal: Bools = np.zeros(cameras, np.bool_)
+    has_focal[np.unique(footage.rays.camera_row[np.any(footage.from_middle_px != 0.0, axis=1)])] = True
+    of_camera = np.ones(cameras, np.bool_)
+    of_legs, of_drives = np.ones(len(legs), np.bool_), np.ones(drives, np.bool_)
+    kinds = (of_legs, of_drives, of_drives, has_focal, of_camera, of_camera)
+    return tuple(np.repeat(flags[:, None], width, axis=1) for flags, width in zip(kinds, WIDTH, strict=True))
+
+
+def _usable(landmarks: Landmarks, footage: Footage) -> tuple[Landmarks, Floats] | None:
+    """Return the landmarks whose covariances (N, 3, 3) are known, None where they are too few."""
+    if len(landmarks) < 4:
+        return None
+    unit = _core.unit_covariance(
+        footage.rays.core, landmarks.point_in_world_m, landmarks.offsets, landmarks.voters.astype(np.uint32)
+    ).reshape(-1, 3, 3)
+    covariance = _LANDMARK_PX**2 * unit + _LANDMARK_M**2 * np.eye(3)
+    good: Bools = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
+    good[good] &= np.linalg.cond(covariance[good]) < 1e8
+    good[good] &= np.trace(covariance[good], axis1=1, axis2=2) < 100.0**2
+    if good.sum() < 4:
+        return None
+    counts = np.diff(landmarks.offsets)
+    return (
+        Landmarks(
+            point_in_world_m=landmarks.point_in_world_m[good],
+            class_code=landmarks.class_code[good],
+            size_m=landmarks.size_m[good],
+            drive=landmarks.drive[good],
+            leg=landmarks.leg[good],
+            driven_m=landmarks.driven_m[good],
+            offsets=np.concatenate([[0], np.cumsum(counts[good])]),
+            voters=landmarks.voters[np.repeat(good, counts)],
+        ),
+        covariance[good],
+    )
+
+
+def _first_legs(
+    footage: Footage, landmarks: Landmarks, registration: Registration, seen_cuts: Legs
+) -> tuple[Legs, Floats]:
+    """Return the legs and offsets (L, 3) that jumps and the registered shifts of landmarks along the drives suggest."""
+    drives = footage.drives
+    cuts = [*zip(seen_cuts.drive.tolist(), seen_cuts.begins.tolist(), strict=True)]
+    for drive in range(drives.count):
+        rows = np.flatnonzero(landmarks.drive == drive)
+        rows = rows[np.argsort(landmarks.driven_m[rows], kind="stable")]
+        same_leg = np.diff(landmarks.leg[rows]) == 0
+        moves = np.linalg.norm(np.diff(registration.shift_m[rows], axis=0), axis=1) > _NEW_LEG_M
+        images = np.flatnonzero(drives.pass_code == drive)
+        for cut in (np.flatnonzero(moves & same_leg) + 1).tolist():
+            at_m = 0.5 * (landmarks.driven_m[rows[cut - 1]] + landmarks.driven_m[rows[cut]])
+            after = images[drives.driven_m[images] >= at_m]
+            if len(after):
+                cuts.append((drive, int(drives.order[after].min())))
+    both = np.unique(np.array(cuts, dtype=np.int64), axis=0)
+    legs = Legs(both[:, 0], both[:, 1])
+    # A landmark is in the leg of most of its voters.
+    image = footage.rays.image_row[landmarks.voters]
+    leg = legs.of(drives.pass_code[image], drives.order[image])
+    of_mark = np.array([np.median(part) for part in np.split(leg, landmarks.offsets[1:-1])]).round().astype(np.int64)
+    offset = np.zeros((len(legs), 3))
+    for number in range(len(legs)):
+        marks = registration.shift_m[of_mark == number]
+        if len(marks):
+            offset[number] = np.median(marks, axis=0)
+    return legs, offset
+
+
+def _added(legs: Legs, offset: Floats, known: Legs, known_offset: Floats) -> tuple[Legs, Floats]:
+    """Return the legs that both have cut, with both offsets (L, 3) added."""
+    both = np.unique(np.stack([np.append(legs.drive, known.drive), np.append(legs.begins, known.begins)]), axis=1)
+    drive, begins = both[0], both[1]
+    total = offset[legs.of(drive, begins)] + known_offset[known.of(drive, begins)]
+    return Legs(drive, begins), total
+
+
+def _objects(landmarks: Landmarks, registration: Registration) -> tuple[Ints, Ints, Floats, Floats]:
+    """Return the object of each landmark, and class, size and position of each object."""
+    kinds, first, thing = np.unique(registration.object_of_landmark, return_index=True, return_inverse=True)
+    count = np.bincount(thing)
+    place = landmarks.point_in_world_m + registration.shift_m
+    points = np.stack([np.bincount(thing, weights=axis) / count for axis in place.T], axis=1)
+    size = np.array([np.median(landmarks.size_m[thing == k]) for k in range(len(kinds))])
+    return thing, landmarks.class_code[first], size, points
+
+
+def _sigmas(footage: Footage, noise: Noise) -> Sigmas:
+    """Return what detections are off by; a metre of the camera is as many pixels as the box of a thing of a metre."""
+    box = np.maximum(footage.dataset.detections.size_px[:, 1], 0.0)
+    square = noise.px**2 + (noise.share * box) ** 2
+    # What is rotation of an image and what is its detections', residuals do not tell: half of each.
+    own = 0.5 * noise.px**2 + (noise.share * box) ** 2
+    return Sigmas(np.sqrt(square + (noise.image_m * box) ** 2), np.sqrt(own))
+
+
+def _grown(scales: Scales, state: State) -> Scales:
+    """Return scales with more drift where more is found than was thought possible."""
+    found = np.sqrt(np.mean(state.drift**2, axis=0))
+    drift_m, drift_rad = (DRIFT_FACTOR * float(np.sqrt(np.mean(part**2))) for part in (found[:3], found[3:]))
+    return replace(scales, drift_m=max(scales.drift_m, drift_m), drift_rad=max(scales.drift_rad, drift_rad))
+
+
+def own_scales(footage: Footage, noise: Noise, scales: Scales) -> Scales:
+    """Return scales with the noise's own errors of images."""
+    per_rad = float(np.median(footage.pixels_per_rad()))
+    return replace(scales, own_m=max(noise.image_m, 1e-6), own_rad=math.sqrt(0.5) * noise.px / per_rad)
+
+
+def fit_noise(seen: Observations, state: State, noise: Noise) -> Noise:
+    """Scale the noise so that half of the residuals are as small as they should be."""
+    residual, depth = marginal_residuals(seen, state)
+    square = np.sum(residual**2, axis=1) / seen.sigma_px**2
+    square = square[(depth > 0.0) & np.isfinite(square)]
+    if len(square) < 20:
+        return noise
+    factor = math.sqrt(float(np.median(square)) / (2.0 * math.log(2.0)))
+    factor = min(max(factor, 0.5), 3.0)
+    px = min(max(noise.px * factor, 0.2), 30.0)
+    return Noise(px, min(noise.share * factor, 0.3), min(noise.image_m * factor, 0.5))
+
+
+def _cut(footage: Footage, seen: Observations, state: State, legs: Legs, seen_cuts: Legs) -> tuple[Legs, Ints, State]:
+    """Cut drives anew where their poses jump, given the objects: exact segmentation of each drive's images."""
+    shift, information, image_of = _apparent_shift(footage, seen, state)
+    drives = footage.drives
+    leg_drive: list[int] = []
+    begins: list[int] = []
+    offsets: list[Floats] = []
+    leg_now = legs.of(drives.pass_code, drives.order)
+    for drive in range(drives.count):
+        rows = np.flatnonzero(drives.pass_code[image_of] == drive)
+        rows = rows[np.argsort(drives.order[image_of[rows]], kind="stable")]
+        if not len(rows):
+            old = np.flatnonzero(legs.drive == drive)[:1]
+            leg_drive.append(drive)
+            begins.append(0)
+            offsets.append(state.constants[0][old[0]] if len(old) else np.zeros(3))
+            continue
+        value = shift[rows, :2]
+        precision = np.linalg.inv(np.linalg.inv(information[rows])[:, :2, :2])
+        cut_at = seen_cuts.of(drives.pass_code[image_of[rows]], drives.order[image_of[rows]])
+        starts = segment(value, precision, np.where(np.diff(cut_at, prepend=cut_at[0]) != 0, _SEEN_PRICE, _JUMP_PRICE))
+        for number, start in enumerate(starts):
+            end = starts[number + 1] if number + 1 < len(starts) else len(rows)
+            total = precision[start:end].sum(axis=0) + np.eye(2) / WIDE.constant[0] ** 2
+            middle = np.linalg.solve(total, np.einsum("nij,nj->i", precision[start:end], value[start:end]))
+            vertical = state.constants[0][leg_now[image_of[rows[start:end]]], 2]
+            leg_drive.append(drive)
+            begins.append(0 if number == 0 else int(drives.order[image_of[rows[start]]]))
+            offsets.append(np.append(middle, np.median(vertical)))
+    new = Legs(np.array(leg_drive), np.array(begins))
+    constants = (np.array(offsets), *state.constants[1:])
+    drift = state.drift.copy()
+    drift[:, :3] = 0.0
+    return new, new.of(drives.pass_code, drives.order), replace(state, constants=constants, drift=drift)
+
+
+def _apparent_shift(footage: Footage, seen: Observations, state: State) -> tuple[Floats, Floats, Ints]:
+    """Return where each image (M) that sees objects puts its drive: offset and drift (M, 3) and its information."""
+    residual, depth, by_point = by_object(seen, state)
+    weight = weights(seen, residual, depth, 2.0)
+    image = seen.image
+    kinds, place = np.unique(image, return_inverse=True)
+    information, right = np.zeros((len(kinds), 3, 3)), np.zeros((len(kinds), 3))
+    weighted = by_point * weight[:, None, None]
+    np.add.at(information, place, np.einsum("nki,nkj->nij", weighted, by_point))
+    now = state.constants[0][seen.leg] + state.drift[seen.node, :3]
+    # The residual falls by `by_point` times the shift: r(o + e) = r - J e.
+    np.add.at(right, place, np.einsum("nki,nk->ni", weighted, residual + np.einsum("nki,ni->nk", by_point, now)))
+    shift = np.linalg.solve(information + 0.1 * np.eye(3), right[:, :, None])[:, :, 0]
+    # What drifts along the way is no jump: so many images share one value of the process.
+    per_length = max(1.0, DRIFT_LENGTH_M * len(kinds) / max(1.0, _length_m(footage)))
+    spread = np.linalg.inv(information + 0.1 * np.eye(3)) + per_length * (0.5 * WIDE.drift_m) ** 2 * np.eye(3)
+    return np.asarray(shift), np.asarray(np.linalg.inv(spread)), kinds
+
+
+def _length_m(footage: Footage) -> float:
+    return float(sum(footage.drives.driven_m[footage.drives.pass_code == d].max() for d in range(footage.drives.count)))
+
+
+def segment(value: Floats, precision: Floats, price: Floats) -> list[int]:
+    """Return where the pieces of a piecewise constant signal (N, 2) with information (N, 2, 2) begin.
+
+    The segmentation with the least sum of weighted squares and prices, by dynamic programming over the last cut
+    (Jackson et al. 2005). `price` (N) is that of a piece that begins there.
+    """
+    count = len(value)
+    moment = np.einsum("nij,nj->ni", precision, value)
+    square = np.einsum("ni,ni->n", value, moment)
+    a = np.concatenate([np.zeros((1, 3)), np.cumsum(precision[:, [0, 0, 1], [0, 1, 1]], axis=0)])
+    b = np.concatenate([np.zeros((1, 2)), np.cumsum(moment, axis=0)])
+    c = np.concatenate([[0.0], np.cumsum(square)])
+    best = np.full(count + 1, np.inf)
+    best[0] = -price[0]
+    last = np.zeros(count + 1, np.int64)
+    for end in range(1, count + 1):
+        p, q = a[end] - a[:end], b[end] - b[:end]
+        determinant = p[:, 0] * p[:, 2] - p[:, 1] ** 2
+        fit = (p[:, 2] * q[:, 0] ** 2 - 2.0 * p[:, 1] * q[:, 0] * q[:, 1] + p[:, 0] * q[:, 1] ** 2) / np.maximum(
+            determinant, 1e-12
+        )
+        total = best[:end] + (c[end] - c[:end] - fit) + price[:end]
+        last[end] = int(np.argmin(total))
+        best[end] = total[last[end]]
+    starts = []
+    end = count
+    while end > 0:
+        starts.append(int(last[end]))
+        end = int(last[end])
+    return starts[::-1]
+
+
+def _anew(
+    footage: Footage,
+    state: State,
+    class_code: Ints,
+    size_m: Floats,
+    leg: Ints,
+    sigma_px: Sigmas,
+    range_m: float,
+    detection: Ints,
+    thing: Ints,
+) -> tuple[Ints, Ints, Ints, Floats, State]:
+    """Merge objects that are one, give all detections their objects anew, and drop what too few see."""
+    count = len(state.point_in_world_m)
+    seen = footage.observe(detection, thing, leg, sigma_px)
+    state = triangulate(seen, state, count, rounds=3)
+    number = merge_objects(seen, state, seen.image, class_code)
+    seen = replace(seen, thing=number[seen.thing])
+    state = triangulate(seen, state, count, rounds=4)
+    alive = np.bincount(seen.thing, minlength=count) >= _LEAST_VOTES
+    state, class_code, size_m = _kept(state, alive), class_code[alive], size_m[alive]
+    detection, thing = associate(footage, state, class_code, size_m, leg, sigma_px, range_m)
+    alive = np.bincount(thing, minlength=len(class_code)) >= _LEAST_VOTES
+    new = np.cumsum(alive) - 1
+    stays = alive[thing]
+    return detection[stays], new[thing[stays]], class_code[alive], size_m[alive], _kept(state, alive)
+
+
+def _kept(state: State, alive: Bools) -> State:
+    return replace(state, point_in_world_m=state.point_in_world_m[alive])

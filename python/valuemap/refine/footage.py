@@ -1,0 +1,241 @@
+"""The images and detections that the refinement works on, as arrays: one image of each camera and viewpoint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from valuemap.cameras import Rays, camera_poses, cast_rays, colmap_camera, rotation_of
+from valuemap.dataset import Dataset, rows_of
+from valuemap.drives import Drives
+from valuemap.refine.adjust import Chain, Observations
+from valuemap.refine.landmarks import keyframes
+from valuemap.tables import Bools, Floats, Ints
+
+NODE_M = 10.0
+"""Drift is the same within so much of a drive."""
+DRIFT_LENGTH_M = 100.0
+"""The way over which drift forgets 63 % of itself."""
+_MOST_STEPS = 4.0
+"""Images farther apart in time than so many usual steps say nothing of the velocity between them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sigmas:
+    """Standard deviations (detections), px: of all that is not in the model, and of the detection alone."""
+
+    total_px: Floats
+    detection_px: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Footage:
+    """A dataset in driving order, its keyframes, and what is computed once from them.
+
+    `row` are the rows of the keyframes in the dataset; all arrays of images are of keyframes, all of detections of
+    those in them, `detection_row` their rows in the dataset.
+    """
+
+    dataset: Dataset
+    drives: Drives
+    whole: Dataset
+    whole_drives: Drives
+    row: Ints
+    detection_row: Ints
+    rays: Rays
+    cam_from_world: Floats
+    center_in_world_m: Floats
+    motion: Motion
+    camera: Ints
+    chain: Chain
+    node: Ints
+    cam_from_node: Floats
+    from_middle_px: Floats
+    residual_from_cam: Floats
+
+    @property
+    def cameras(self) -> int:
+        """The number of cameras."""
+        return len(self.dataset.cameras)
+
+    def pixels_per_rad(self) -> Floats:
+        """Return how far (detections), px, a detection moves when its image turns."""
+        square = np.sum(self.residual_from_cam[:, :2] ** 2, axis=(1, 2))
+        along = np.einsum("nij,nj->ni", self.residual_from_cam[:, :2], self.residual_from_cam[:, 2])
+        return np.asarray(np.sqrt(0.5 * (square - np.sum(along**2, axis=1))))
+
+    def observe(self, detection: Ints, thing: Ints, leg_of_image: Ints, sigma_px: Sigmas) -> Observations:
+        """Return detections (rows) as observations of things, sorted by drive and node."""
+        order = np.lexsort((detection, self.node[self.rays.image_row[detection]]))
+        return self.observe_as_given(detection[order], thing[order], leg_of_image, sigma_px)
+
+    def observe_as_given(self, detection: Ints, thing: Ints, leg_of_image: Ints, sigma_px: Sigmas) -> Observations:
+        """Return detections (rows) as observations of things, in their order."""
+        image = self.rays.image_row[detection]
+        return Observations(
+            residual_from_cam=self.residual_from_cam[detection],
+            cam_from_world=self.cam_from_world[image],
+            center_in_world_m=self.center_in_world_m[image],
+            forward_mps=self.motion.forward_mps[image],
+            backward_mps=self.motion.backward_mps[image],
+            forward_radps=self.motion.forward_radps[image],
+            backward_radps=self.motion.backward_radps[image],
+            from_middle_px=self.from_middle_px[detection],
+            cam_from_node=self.cam_from_node[image],
+            sigma_px=sigma_px.total_px[detection],
+            detection_sigma_px=sigma_px.detection_px[detection],
+            thing=thing,
+            node=self.node[image],
+            drive=self.drives.pass_code[image],
+            leg=leg_of_image[image],
+            camera=self.camera[image],
+            image=image,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How images (N) move, m/s in the world, and turn, rad/s in camera axes, until the next and since the last one.
+
+    Where there are no times, of an image: a second is then an image.
+    """
+
+    forward_mps: Floats
+    backward_mps: Floats
+    forward_radps: Floats
+    backward_radps: Floats
+    is_timed: Bools
+
+
+def in_working_frame(dataset: Dataset, drives: Drives, unit_m: float) -> tuple[Dataset, Drives]:
+    """Return a dataset and its drives in the frame of this package: x east, y north, z up, in units of `unit_m`.
+
+    Every length below is in such units, so that a world of another scale, with a range of that scale, gives the same.
+    """
+    axes = np.vstack([dataset.frame.east_north(), dataset.frame.up])
+    rotation, center = camera_poses(dataset.images)
+    center = (center - np.median(center, axis=0)) @ axes.T / unit_m
+    quat = Rotation.from_matrix(rotation @ axes.T).as_quat(canonical=True, scalar_first=True)
+    turned = rotation_of(quat)
+    sigma = dataset.images.position_sigma_m
+    images = dataset.images.replace(
+        cam_from_world_quat=quat,
+        cam_from_world_m=-np.einsum("nij,nj->ni", turned, center),
+        position_sigma_m=None if sigma is None else sigma / unit_m,
+    )
+    frame = replace(dataset.frame, up=(0.0, 0.0, 1.0), anchor=None)
+    return replace(dataset, images=images, frame=frame), replace(drives, driven_m=drives.driven_m / unit_m)
+
+
+def gather(dataset: Dataset, drives: Drives) -> Footage:
+    """Take the keyframes of a dataset in driving order and in the working frame."""
+    chosen = keyframes(drives, dataset.images.camera_id)
+    row = np.flatnonzero(chosen)
+    images = dataset.images.take(row)
+    image_row = rows_of(dataset.detections.image_id, dataset.images.image_id)
+    detection_row = np.flatnonzero(chosen[image_row])
+    part = replace(dataset, images=images, detections=dataset.detections.take(detection_row), truth_detections=None)
+    names = ("pass_code", "order", "driven_m", "viewpoint")
+    part_drives = replace(drives, **{name: getattr(drives, name)[row] for name in names})
+    rays = cast_rays(part)
+    rotation, center = camera_poses(images)
+    camera = rows_of(images.camera_id, dataset.cameras.camera_id)
+    chain, node, lead = _nodes(part_drives)
+    cam_from_node = np.einsum("nij,nkj->nik", rotation, rotation[lead])
+    # M (N, 3, 3) is in world axes: back into those of the camera.
+    in_cam = np.einsum("nij,nkj->nik", rays.residual_from_world, rotation[rays.image_row])
+    return Footage(
+        dataset=part,
+        drives=part_drives,
+        whole=dataset,
+        whole_drives=drives,
+        row=row,
+        detection_row=detection_row,
+        rays=rays,
+        cam_from_world=rotation,
+        center_in_world_m=center,
+        motion=_take(find_motion(dataset, drives), row),
+        camera=camera,
+        chain=chain,
+        node=node,
+        cam_from_node=cam_from_node,
+        from_middle_px=_from_middle(part, rays),
+        residual_from_cam=in_cam,
+    )
+
+
+def _take(motion: Motion, rows: Ints) -> Motion:
+    return Motion(**{name: value[rows] for name, value in vars(motion).items()})
+
+
+def _nodes(drives: Drives) -> tuple[Chain, Ints, Ints]:
+    """Return the chain of nodes, the node (N) of each image, and the image (N) whose axes the node's drift has."""
+    piece = np.floor(drives.driven_m / NODE_M).astype(np.int64)
+    code = drives.pass_code * (int(piece.max(initial=0)) + 1) + piece
+    kinds, first, node = np.unique(code, return_index=True, return_inverse=True)
+    drive = drives.pass_code[first]
+    middle_m = np.bincount(node, weights=drives.driven_m) / np.bincount(node)
+    keep = np.zeros(len(kinds))
+    keep[1:] = np.exp(-np.diff(middle_m) / DRIFT_LENGTH_M) * (np.diff(drive) == 0)
+    # All cameras of an exposure turn with the first of it.
+    exposure = drives.pass_code * (int(drives.order.max(initial=0)) + 1) + drives.order
+    _, lead, of = np.unique(exposure, return_index=True, return_inverse=True)
+    return Chain(drive, np.maximum(keep, 0.0)), node, lead[of]
+
+
+def _from_middle(dataset: Dataset, rays: Rays) -> Floats:
+    """Return detections (N, 2) relative to the principal point; 0 in cameras without a focal length."""
+    offset = np.zeros((len(rays), 2))
+    for row in range(len(dataset.cameras)):
+        camera = colmap_camera(dataset.cameras, row)
+        if not len(camera.focal_length_idxs()):
+            continue
+        middle = np.array([camera.principal_point_x, camera.principal_point_y])
+        members = rays.camera_row == row
+        offset[members] = dataset.detections.center_px[members] - middle
+    return offset
+
+
+def find_motion(dataset: Dataset, drives: Drives) -> Motion:
+    """Return how all images move, from the images of the same camera before and after them in the drive."""
+    images = dataset.images
+    rotation, center = camera_poses(images)
+    time = np.full(len(images), np.nan) if images.timestamp_s is None else images.timestamp_s
+    is_timed = np.zeros(len(images), np.bool_)
+    forward, backward = np.zeros((len(images), 3)), np.zeros((len(images), 3))
+    turn_on, turn_back = np.zeros((len(images), 3)), np.zeros((len(images), 3))
+    camera = np.unique(images.camera_id, return_inverse=True)[1]
+    stream = drives.pass_code * (int(camera.max(initial=0)) + 1) + camera
+    order = np.lexsort((drives.order, stream))
+    for rows in np.split(order, np.flatnonzero(np.diff(stream[order])) + 1):
+        when = time[rows]
+        timed = bool(np.all(np.isfinite(when)) and np.all(np.diff(when) > 0.0))
+        when = when if timed else np.arange(len(rows), dtype=np.float64)
+        is_timed[rows] = timed
+        step = np.diff(when)
+        if not len(step):
+            continue
+        usable = step <= _MOST_STEPS * np.median(step)
+        seconds = np.where(usable, step, np.inf)[:, None]
+        speed = np.diff(center[rows], axis=0) / seconds
+        rate = _turns(rotation[rows]) / seconds
+        for values, on, back in ((speed, forward, backward), (rate, turn_on, turn_back)):
+            on[rows[:-1]], back[rows[1:]] = values, values
+            # At an end, as on the other side.
+            starts, ends = np.append(True, ~usable), np.append(~usable, True)
+            back[rows[starts]], on[rows[ends]] = on[rows[starts]], back[rows[ends]]
+    return Motion(forward, backward, turn_on, turn_back, is_timed)
+
+
+def _turns(rotation: Floats) -> Floats:
+    """Return the rotation vectors (N - 1, 3) in camera axes from each image to the next: R_next = exp(v) R."""
+    between = np.einsum("nij,nkj->nik", rotation[1:], rotation[:-1])
+    axis = np.stack(
+        [between[:, 2, 1] - between[:, 1, 2], between[:, 0, 2] - between[:, 2, 0], between[:, 1, 0] - between[:, 0, 1]],
+        axis=1,
+    )
+    sine = 0.5 * np.linalg.norm(axis, axis=1)
+    angle = np.arctan2(sine, 0.5 * (np.trace(between, axis1=1, axis2=2) - 1.0))
+    return np.asarray(0.5 * axis * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0)[:, None])

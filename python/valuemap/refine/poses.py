@@ -1,0 +1,258 @@
+"""The stage: what is wrong with the poses of whole drives is found once, for all that comes after."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from valuemap.cameras import camera_poses, colmap_camera, rotation_of
+from valuemap.config import MapConfig
+from valuemap.dataset import Dataset, rows_of
+from valuemap.drives import Drives, in_driving_order
+from valuemap.errors import SettingError
+from valuemap.progress import Progress, silent
+from valuemap.refine.adjust import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
+from valuemap.refine.estimate import Estimate, estimate
+from valuemap.refine.footage import Footage, find_motion, gather, in_working_frame
+from valuemap.refine.jumps import find_jumps
+from valuemap.refine.landmarks import find_landmarks
+from valuemap.refine.select import Selected, select
+from valuemap.tables import Bools
+
+USUAL_RANGE_M = 60.0
+"""Lengths in this package are metres where `max_range_m` is this; they grow with it."""
+_SAMPLE = 4_000
+"""So many detections, where most drives meet, tell whether anything is wrong."""
+_PLACE = 3.0
+"""Places of the sample are so many ranges wide."""
+_LEAST_DETECTIONS = 50
+_LOST_M = 0.5
+"""Where offsets are larger than this, each drive is looked at anew as it lies then."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A dataset with better poses and cameras, or as it was; `record` says in `run.json` what was found."""
+
+    dataset: Dataset
+    record: dict[str, Any]
+    is_corrected: bool = False
+
+
+def refine_poses(dataset: Dataset, config: MapConfig, *, threads: int = 0, progress: Progress = silent) -> Refined:
+    """Estimate what whole drives' poses are wrong by, from the objects that drives share; correct what is proven.
+
+    Parameters
+    ----------
+    dataset
+        Posed images and detections.
+    config
+        Ranges and parallax as in mapping.
+    threads
+        Threads to work on, 0 for one a core. The result does not depend on it.
+    progress
+        Called as progress(what, done, total).
+
+    Returns
+    -------
+    Refined
+        Where nothing is proven, the dataset is the one that was given.
+    """
+    if len(dataset.detections) < _LEAST_DETECTIONS:
+        return Refined(dataset, {"found": "nothing", "because": "few detections"})
+    unit_m = config.vote.max_range_m / USUAL_RANGE_M
+    ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
+    if ordered.drives.count < 2:
+        return Refined(dataset, {"found": "nothing", "because": "one drive"})
+    ranges = replace(config.vote, max_range_m=USUAL_RANGE_M, min_range_m=config.vote.min_range_m / unit_m)
+    config = MapConfig(config.method, config.partition, ranges, config.noise, config.existence, config.merge)
+    moved, drives = in_working_frame(ordered.dataset, ordered.drives, unit_m)
+    progress("comparing drives", 0, 2)
+    sample = _sample(moved, drives)
+    found = None
+    if sample is not None:
+        found = _find(*_part(moved, drives, sample), config, threads)
+        progress("comparing drives", 1, 2)
+    if sample is None or _is_proven(found):
+        found = _find(moved, drives, config, threads)
+    progress("comparing drives", 2, 2)
+    if found is None or found.selected is None:
+        return Refined(dataset, {"found": "nothing", **_looked_at(found)})
+    corrected = _apply(ordered.dataset, ordered.drives, found, found.selected, unit_m)
+    # Back in the order of the given rows.
+    row = np.empty(len(dataset.images), np.int64)
+    row[rows_of(ordered.image_id, dataset.images.image_id)] = np.arange(len(row))
+    images = dataset.images.replace(
+        cam_from_world_quat=corrected.images.cam_from_world_quat[row],
+        cam_from_world_m=corrected.images.cam_from_world_m[row],
+    )
+    record = {**_describe(ordered.dataset, found, found.selected, unit_m), **_looked_at(found)}
+    return Refined(replace(dataset, images=images, cameras=corrected.cameras), record, is_corrected=True)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What was estimated, and what of it is proven."""
+
+    footage: Footage
+    result: Estimate
+    selected: Selected | None
+
+
+def _is_proven(found: _Found | None) -> bool:
+    return found is not None and found.selected is not None
+
+
+def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> _Found | None:
+    """Estimate on a dataset in the working frame; where drives are far off, with landmarks of drives laid right."""
+    footage = gather(dataset, drives)
+    jumps = find_jumps(dataset, drives)
+    leg = jumps.of(footage.drives.pass_code, footage.drives.order)
+    try:
+        landmarks = find_landmarks(footage.dataset, footage.rays, footage.drives, leg, config, threads=threads)
+    except SettingError:  # So many detections in one place that their votes fill the memory.
+        return None
+    result = estimate(footage, landmarks, config, seen_cuts=jumps)
+    if result is None:
+        return None
+    if float(np.abs(result.state.constants[OFFSET]).max(initial=0.0)) > _LOST_M:
+        laid = _shifted(footage, result)
+        leg = laid.drives.pass_code  # Its jumps are mended.
+        landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, leg, config, threads=threads)
+        known = (result.legs, result.state.constants[OFFSET])
+        again = estimate(footage, landmarks, config, seen_cuts=jumps, known=known, laid=laid)
+        if again is not None and len(again.thing) >= len(result.thing):
+            result = again
+    return _Found(footage, result, select(footage, result))
+
+
+def _shifted(footage: Footage, result: Estimate) -> Footage:
+    """Return the footage with the legs of all drives where they seem to belong."""
+    leg = result.legs.of(footage.whole_drives.pass_code, footage.whole_drives.order)
+    images = footage.whole.images
+    offset = result.state.constants[OFFSET][leg]
+    rotation, _ = camera_poses(images)
+    moved = images.replace(cam_from_world_m=images.cam_from_world_m - np.einsum("nij,nj->ni", rotation, offset))
+    return gather(replace(footage.whole, images=moved), footage.whole_drives)
+
+
+def _sample(dataset: Dataset, drives: Drives) -> Bools | None:
+    """Return the images (N) of the places where most drives meet, None where all are few enough."""
+    images = dataset.images
+    image_row = rows_of(dataset.detections.image_id, images.image_id)
+    if len(image_row) <= 2 * _SAMPLE:
+        return None
+    _, center = camera_poses(images)
+    cell = np.floor(center[:, :2] / (_PLACE * USUAL_RANGE_M)).astype(np.int64)
+    _, place = np.unique(cell, axis=0, return_inverse=True)
+    place = place.ravel()
+    pairs = np.unique(np.stack([place, drives.pass_code]), axis=1)
+    met = np.bincount(pairs[0], minlength=int(place.max()) + 1)
+    detections = np.bincount(place[image_row], minlength=len(met))
+    order = np.lexsort((np.arange(len(met)), -detections, -met))
+    enough = int(np.searchsorted(np.cumsum(detections[order]), _SAMPLE)) + 1
+    return np.isin(place, order[:enough])
+
+
+def _part(dataset: Dataset, drives: Drives, chosen: Bools) -> tuple[Dataset, Drives]:
+    """Return some images with their detections, and their drives, numbered anew."""
+    row = np.flatnonzero(chosen)
+    image_row = rows_of(dataset.detections.image_id, dataset.images.image_id)
+    code = np.unique(drives.pass_code[row], return_inverse=True)[1]
+    part = replace(
+        drives, pass_code=code, order=drives.order[row], driven_m=drives.driven_m[row], viewpoint=drives.viewpoint[row]
+    )
+    detections = dataset.detections.take(chosen[image_row])
+    return replace(dataset, images=dataset.images.take(row), detections=detections, truth_detections=None), part
+
+
+def _looked_at(found: _Found | None) -> dict[str, Any]:
+    if found is None:
+        return {"landmarks": 0, "shared_objects": 0}
+    return {"landmarks": found.result.landmarks, "shared_objects": len(found.result.class_code)}
+
+
+def _apply(dataset: Dataset, drives: Drives, found: _Found, selected: Selected, unit_m: float) -> Dataset:
+    """Return the dataset with the poses and cameras corrected."""
+    axes = np.vstack([dataset.frame.east_north(), dataset.frame.up])
+    offset, mount, delay, focal, camera_mount, camera_delay = selected.state.constants
+    images = dataset.images
+    drive, camera = drives.pass_code, rows_of(images.camera_id, dataset.cameras.camera_id)
+    leg = found.result.legs.of(drive, drives.order)
+    rotation, center = camera_poses(images)
+    motion = find_motion(dataset, drives)
+    late_s = (delay[drive, 0] + camera_delay[camera, 0])[:, None]
+    ahead = late_s >= 0.0
+    center = center + np.where(ahead, motion.forward_mps, motion.backward_mps) * late_s + unit_m * offset[leg] @ axes
+    turned = rotations(np.where(ahead, motion.forward_radps, motion.backward_radps) * late_s) @ rotation
+    turned = rotations(mount[drive] + camera_mount[camera]) @ turned
+    quat = Rotation.from_matrix(turned).as_quat(canonical=True, scalar_first=True)
+    moved = images.replace(
+        cam_from_world_quat=quat, cam_from_world_m=-np.einsum("nij,nj->ni", rotation_of(quat), center)
+    )
+    params = []
+    for row, values in enumerate(dataset.cameras.params):
+        values = values.copy()
+        values[list(colmap_camera(dataset.cameras, row).focal_length_idxs())] *= 1.0 + focal[row, 0]
+        params.append(values)
+    return replace(dataset, images=moved, cameras=dataset.cameras.replace(params=params))
+
+
+def _describe(dataset: Dataset, found: _Found, selected: Selected, unit_m: float) -> dict[str, Any]:
+    """Return what was found, by camera and by drive: corrections with their standard deviations."""
+    names, footage, result = dataset.images.pass_id.names, found.footage, found.result
+    drives = footage.whole_drives
+    first = np.unique(drives.pass_code, return_index=True)[1]
+    cameras = [
+        {
+            "camera_id": int(dataset.cameras.camera_id[row]),
+            **_figures(selected, FOCAL, row, "focal_length_factor", 1.0, plus=1.0),
+            **_figures(selected, CAMERA_MOUNT, row, "turned_deg", np.degrees(1.0)),
+            **_figures(selected, CAMERA_DELAY, row, "delay_s", 1.0),
+        }
+        for row in range(len(dataset.cameras))
+    ]
+    of_drives = []
+    for drive, image in enumerate(first.tolist()):
+        legs = np.flatnonzero(result.legs.drive == drive)
+        of_drive = {
+            **_figures(selected, MOUNT, drive, "turned_deg", np.degrees(1.0)),
+            **_figures(selected, DELAY, drive, "delay_s", 1.0),
+        }
+        moved = [
+            {"from_image": _image_at(footage, drive, int(result.legs.begins[leg])), **figures}
+            for leg in legs.tolist()
+            if (figures := _figures(selected, OFFSET, leg, "moved_m", unit_m))
+        ]
+        if of_drive or moved:
+            name = names[dataset.images.pass_id.codes[image]]
+            of_drives.append({"drive": drive, "pass": name, **of_drive, **({"legs": moved} if moved else {})})
+    return {
+        "found": "faults",
+        "cameras": [camera for camera in cameras if len(camera) > 1],
+        "drives": of_drives,
+        "held_out_objects": selected.held_out,
+        "gain_on_held_out": round(selected.gain, 1),
+        "chance_of_that": float(f"{selected.chance:.2g}"),
+    }
+
+
+def _image_at(footage: Footage, drive: int, order: int) -> str:
+    drives = footage.whole_drives
+    row = int(np.flatnonzero((drives.pass_code == drive) & (drives.order >= order))[0])
+    return str(footage.whole.images.name[row].as_py())
+
+
+def _figures(selected: Selected, kind: int, row: int, name: str, factor: float, plus: float = 0.0) -> dict[str, Any]:
+    """Return one correction and its deviation, nothing where it is zero."""
+    if not selected.active[kind][row].any():
+        return {}
+    values = selected.state.constants[kind][row] * factor + plus
+    deviation = selected.deviation[kind][row] * factor
+    shown = [round(float(v), 5) for v in values], [round(float(v), 5) for v in deviation]
+    if len(values) == 1:
+        return {name: shown[0][0], f"{name}_sigma": shown[1][0]}
+    return {name: shown[0], f"{name}_sigma": shown[1]}

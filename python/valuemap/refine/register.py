@@ -1,0 +1,250 @@
+"""How drives lie to each other: constellations of what each sees alone, matched where residuals cannot lock in.
+
+One drive after the other is laid onto what the drives before it saw. Along a drive the shift on the ground is a chain
+of states on a grid: it stays, creeps to a cell beside it, or jumps at a price, and the likeliest chain is found exactly
+(Viterbi 1967). Then every drive is laid anew onto all others. Matches are one to one: no drive sees an object twice in
+one place.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+
+from valuemap.refine.landmarks import Landmarks
+from valuemap.tables import Floats, Ints
+
+_REACH_M, _CELL_M = 6.0, 0.5
+"""Shifts are sought on the ground up to this far, on a grid this fine."""
+_HEIGHT_M = 1.0
+"""Deviation of what is left between heights."""
+_JUMP, _NEW_LEG, _CREEP = 8.0, 1.0, 1.5
+"""Minus the logarithm of how likely a chain jumps where none is seen, where one is, and creeps to the next cell."""
+_CLUTTER = 0.005
+"""How likely a landmark lies where it does though nobody else sees it."""
+_PRIOR_M = 3.0
+_SMOOTH_M = 0.35
+"""What drives disagree by within a cell and a stretch, each axis."""
+_GATE2 = 12.0
+"""Squared distance in sigmas within which a landmark is an object; 0.993 of chi-squared with three degrees."""
+_SAME_SIZE = 1.6
+_ROUNDS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """The shift (N, 3), m, that takes each landmark to the common frame, and its object (N), -1 for none."""
+
+    shift_m: Floats
+    object_of_landmark: Ints
+
+
+def register(landmarks: Landmarks, covariance: Floats) -> Registration:
+    """Lay the landmarks of all drives, with covariances (N, 3, 3) in m², onto each other; up is z."""
+    point = landmarks.point_in_world_m
+    by_drive = [
+        rows[np.argsort(landmarks.driven_m[rows], kind="stable")]
+        for rows in np.split(
+            np.argsort(landmarks.drive, kind="stable"),
+            np.flatnonzero(np.diff(np.sort(landmarks.drive, kind="stable"))) + 1,
+        )
+        if len(rows)
+    ]
+    shift = np.zeros_like(point)
+    thing = np.full(len(point), -1)
+    known = _Objects(landmarks, point, covariance)
+    for drive in _order_of_laying(point, by_drive):
+        _lay(by_drive[drive], point, covariance, shift, thing, known)
+    for _ in range(_ROUNDS):
+        for rows in by_drive:
+            known.forget(thing[rows], rows, shift)
+            thing[rows] = -1
+            _lay(rows, point, covariance, shift, thing, known)
+    return Registration(shift, thing)
+
+
+def _order_of_laying(point: Floats, by_drive: list[Ints]) -> list[int]:
+    """Return the drives, the one with most landmarks first, then always one that meets most of what is known."""
+    if not by_drive:
+        return []
+    tree = [cKDTree(point[rows]) for rows in by_drive]
+    met = np.array([[int(a.count_neighbors(b, _REACH_M)) if a is not b else 0 for b in tree] for a in tree])
+    seen = (met > 0) * np.array([len(rows) for rows in by_drive])[:, None]
+    left = set(range(len(by_drive)))
+    first = max(left, key=lambda i: (len(by_drive[i]), -i))
+    chosen = [first]
+    left.discard(first)
+    score = seen[:, first].astype(np.int64)
+    while left:
+        best = max(left, key=lambda i: (score[i], len(by_drive[i]), -i))
+        chosen.append(best)
+        left.discard(best)
+        score = score + seen[:, best]
+    return chosen
+
+
+class _Objects:
+    """Objects as sums of information of the landmarks that show them."""
+
+    def __init__(self, landmarks: Landmarks, point: Floats, covariance: Floats) -> None:
+        self.landmarks, self.point = landmarks, point
+        self.weight = np.linalg.inv(covariance)
+        self.information = np.zeros((0, 3, 3))
+        self.vector = np.zeros((0, 3))
+        self.class_code = np.zeros(0, np.int64)
+        self.log_size = np.zeros(0)
+        self.count = np.zeros(0, np.int64)
+
+    def add(self, row: int, shift: Floats) -> int:
+        """Make a new object of a landmark."""
+        self.information = np.concatenate([self.information, np.zeros((1, 3, 3))])
+        self.vector = np.concatenate([self.vector, np.zeros((1, 3))])
+        self.class_code = np.append(self.class_code, self.landmarks.class_code[row])
+        size = self.landmarks.size_m[row]
+        self.log_size = np.append(self.log_size, math.log(size) if size > 0.0 else np.nan)
+        self.count = np.append(self.count, 0)
+        self.join(len(self.count) - 1, row, shift)
+        return len(self.count) - 1
+
+    def join(self, thing: int, row: int, shift: Floats) -> None:
+        """Let a landmark support an object."""
+        self.information[thing] += self.weight[row]
+        self.vector[thing] += self.weight[row] @ (self.point[row] + shift)
+        self.count[thing] += 1
+
+    def forget(self, things: Ints, rows: Ints, shift: Floats) -> None:
+        """Take the support of landmarks away again."""
+        for thing, row in zip(things.tolist(), rows.tolist(), strict=True):
+            self.information[thing] -= self.weight[row]
+            self.vector[thing] -= self.weight[row] @ (self.point[row] + shift[row])
+            self.count[thing] -= 1
+
+    def alive(self) -> tuple[Ints, Floats, Floats]:
+        """Return the objects that anything supports, their positions and covariances."""
+        rows = np.flatnonzero(self.count > 0)
+        covariance = np.linalg.inv(self.information[rows])
+        return rows, np.asarray(np.einsum("nij,nj->ni", covariance, self.vector[rows])), np.asarray(covariance)
+
+
+def _lay(rows: Ints, point: Floats, covariance: Floats, shift: Floats, thing: Ints, known: _Objects) -> None:
+    """Find the shifts of one drive's landmarks, by the way driven, and what they show; both are written in place."""
+    objects, place, spread = known.alive()
+    near: list[list[int]]
+    if len(objects):
+        reach = _REACH_M * math.sqrt(2.0) + 2.0
+        near = list(cKDTree(place[:, :2]).query_ball_point(point[rows, :2], reach, return_sorted=True))  # type: ignore[arg-type]
+    else:
+        near = [[] for _ in rows]
+    pairs = _compatible(rows, near, objects, known)
+    if pairs[0].size:
+        price = np.where(np.diff(known.landmarks.leg[rows]) != 0, _NEW_LEG, _JUMP)
+        shift[rows] = _chain(rows, pairs, point, covariance, place, spread, price)
+    _match(rows, pairs, objects, point, covariance, place, spread, shift, thing, known)
+
+
+def _compatible(rows: Ints, near: list[list[int]], objects: Ints, known: _Objects) -> tuple[Ints, Ints]:
+    """Return pairs of landmark (place in `rows`) and object (place in `objects`) of one class and about one size."""
+    first = np.repeat(np.arange(len(rows)), [len(found) for found in near])
+    second = np.array([i for found in near for i in found], dtype=np.int64)
+    if not len(second):
+        return first, second
+    marks = known.landmarks
+    size = np.where(marks.size_m > 0.0, marks.size_m, np.nan)
+    ratio = np.abs(np.log(size[rows[first]]) - known.log_size[objects[second]])
+    fits = (marks.class_code[rows[first]] == known.class_code[objects[second]]) & ~(ratio > math.log(_SAME_SIZE))
+    return first[fits], second[fits]
+
+
+def _chain(
+    rows: Ints,
+    pairs: tuple[Ints, Ints],
+    point: Floats,
+    covariance: Floats,
+    place: Floats,
+    spread: Floats,
+    price: Floats,
+) -> Floats:
+    """Return the likeliest shifts (N, 3) of landmarks by the way driven: Viterbi over a grid of the ground."""
+    steps = np.arange(-round(_REACH_M / _CELL_M), round(_REACH_M / _CELL_M) + 1) * _CELL_M
+    side = len(steps)
+    grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+    mark, target = pairs
+    # What the grid does not move is the height: it is left free up to what passes for it.
+    total = covariance[rows[mark]] + spread[target] + np.diag([_SMOOTH_M**2, _SMOOTH_M**2, _HEIGHT_M**2])
+    apart = place[target] - point[rows[mark]]
+    evidence = np.zeros((len(rows), side * side))
+    weight = np.linalg.inv(total)
+    block = max(1, 2_000_000 // (side * side))
+    for start in range(0, len(mark), block):
+        part = slice(start, start + block)
+        left = np.empty((len(apart[part]), len(grid), 3))
+        left[:, :, :2] = apart[part, None, :2] - grid
+        left[:, :, 2] = apart[part, None, 2]
+        square = np.einsum("kgi,kij,kgj->kg", left, weight[part], left, optimize=True)
+        np.maximum.at(evidence, mark[part], np.exp(-0.5 * square))
+    gain = np.log(_CLUTTER + evidence)
+    value = -np.sum(grid**2, axis=1) / (2.0 * _PRIOR_M**2) + gain[0]
+    came_from = np.empty((len(rows), side * side), np.int64)
+    here = np.arange(side * side)
+    for i in range(1, len(rows)):
+        best, source = value, here
+        cells, index = value.reshape(side, side), here.reshape(side, side)
+        for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
+            moved = np.full((side, side), -np.inf)
+            of = np.zeros((side, side), np.int64)
+            to: list[slice] = [slice(None), slice(None)]
+            fro: list[slice] = [slice(None), slice(None)]
+            to[axis] = slice(1, None) if step > 0 else slice(None, -1)
+            fro[axis] = slice(None, -1) if step > 0 else slice(1, None)
+            moved[tuple(to)] = cells[tuple(fro)] - _CREEP
+            of[tuple(to)] = index[tuple(fro)]
+            better = moved.ravel() > best
+            best, source = np.where(better, moved.ravel(), best), np.where(better, of.ravel(), source)
+        top = int(np.argmax(value))
+        better = value[top] - price[i - 1] > best
+        best, source = np.where(better, value[top] - price[i - 1], best), np.where(better, top, source)
+        came_from[i] = source
+        value = best + gain[i]
+    state = np.empty(len(rows), np.int64)
+    state[-1] = int(np.argmax(value))
+    for i in range(len(rows) - 1, 0, -1):
+        state[i - 1] = came_from[i, state[i]]
+    return np.column_stack([grid[state], np.zeros(len(rows))])
+
+
+def _match(
+    rows: Ints,
+    pairs: tuple[Ints, Ints],
+    objects: Ints,
+    point: Floats,
+    covariance: Floats,
+    place: Floats,
+    spread: Floats,
+    shift: Floats,
+    thing: Ints,
+    known: _Objects,
+) -> None:
+    """Give each landmark of a drive its object, one to one, or make it one of its own."""
+    mark, target = pairs
+    apart = place[target] - point[rows[mark]] - shift[rows[mark]]
+    total = covariance[rows[mark]] + spread[target] + np.diag([_SMOOTH_M**2, _SMOOTH_M**2, _SMOOTH_M**2])
+    square = np.einsum("ki,kij,kj->k", apart, np.linalg.inv(total), apart)
+    fits = square < _GATE2
+    mark, target, square = mark[fits], target[fits], square[fits]
+    if len(mark):
+        ours, i = np.unique(mark, return_inverse=True)
+        theirs, j = np.unique(target, return_inverse=True)
+        cost = np.full((len(ours), len(theirs) + len(ours)), 1e6)
+        cost[i, j] = square
+        cost[np.arange(len(ours)), len(theirs) + np.arange(len(ours))] = _GATE2
+        for a, b in zip(*linear_sum_assignment(cost), strict=True):
+            if b < len(theirs):
+                row = int(rows[ours[a]])
+                thing[row] = int(objects[theirs[b]])
+                known.join(int(thing[row]), row, shift[row])
+    for row in rows[thing[rows] < 0].tolist():
+        thing[row] = known.add(row, shift[row])

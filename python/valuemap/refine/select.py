@@ -1,0 +1,307 @@
+"""Which errors the data prove: each parameter pays for itself, or is exactly zero.
+
+Drift as large as it is found to be takes part in every fit, so that what a drive's poses do anyway is not taken for a
+fault of them. What has a common cause (a camera) is tried before what each drive has for itself. A parameter stays if
+its squared ratio to its deviation exceeds the price of Bayes' information criterion, and of having looked at so many;
+and if it is larger than drift. At the end all that stays is fitted to one half of the objects, and must make the rays
+of the other half meet better.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from valuemap.refine.adjust import (
+    CAMERA_DELAY,
+    CAMERA_MOUNT,
+    DELAY,
+    FOCAL,
+    MOUNT,
+    OFFSET,
+    Adjustment,
+    Chain,
+    Observations,
+    Scales,
+    State,
+    adjust,
+    cost,
+    triangulate,
+)
+from valuemap.refine.estimate import DRIFT_FACTOR, WIDE, Estimate, everything
+from valuemap.refine.footage import Footage
+from valuemap.refine.tracks import unresolved_share
+from valuemap.tables import Bools, Floats, Ints
+
+_LEAST_DRIFT, _LEAST_DRIFT_RAD = 0.02, math.radians(0.02)
+_BEYOND_DRIFT = 2.0
+"""What is no more than so many deviations of drift is drift."""
+_LEAST_FOCAL = 0.003
+_REFIT = (1.5, 1.0, 1.0, 1.0)
+_LEAST_CHANCE = 1e-3
+_LEAST_OBJECTS = 8
+_MOST_UNRESOLVED = 0.25
+"""Where drives disagree about more than this share of what they see, they could not be laid onto each other."""
+_LEAST_OF_DRIVE = 3
+"""A drive that sees an object less often does not share it."""
+_LEAST_OF_PART = 2
+"""A leg, drive or camera that shares fewer objects stays as it is."""
+_PLAUSIBLE = 3.0
+"""What is more than so many deviations of what is thought possible is something else."""
+
+
+@dataclass(frozen=True, eq=False)
+class Selected:
+    """What stays: the state, in which all else is zero; and how much better held-out objects are explained.
+
+    `deviation` (by kind, as the constants) are standard deviations; `chance` is the probability that the gain on
+    `held_out` objects is luck.
+    """
+
+    state: State
+    active: tuple[Bools, ...]
+    deviation: tuple[Floats, ...]
+    gain: float
+    chance: float
+    held_out: int
+
+
+def select(footage: Footage, found: Estimate) -> Selected | None:
+    """Return what pays, None where nothing does."""
+    seen = footage.observe(found.detection, found.thing, footage_legs(footage, found), found.sigma_px)
+    shared = _shared(footage, found)
+    if shared is None or unresolved_share(seen, found.state, found.class_code) > _MOST_UNRESOLVED:
+        return None
+    found = shared
+    seen = footage.observe(found.detection, found.thing, footage_legs(footage, found), found.sigma_px)
+    chain, things = footage.chain, len(found.class_code)
+    free = _told(seen, everything(footage, found.legs))
+    # What each camera has in all drives, and offsets, first; what it has in each drive where that does not do.
+    active = tuple(flags if kind not in (MOUNT, DELAY) else np.zeros_like(flags) for kind, flags in enumerate(free))
+    scales = _scales(footage, found)
+    state = found.state
+    state, common = _prune(seen, chain, scales, active, state, things, ())
+    of_drives = tuple(flags | (free[kind] if kind in (MOUNT, DELAY) else False) for kind, flags in enumerate(common))
+    state, active = _prune(seen, chain, scales, of_drives, state, things, (CAMERA_MOUNT, CAMERA_DELAY))
+    state, active = _prune(seen, chain, scales, active, state, things, ())
+    if not any(flags.any() for flags in active):
+        return None
+    problem = Adjustment(seen, chain, scales, active, things)
+    state = adjust(problem, state, tolerances=_REFIT, with_variance=True)
+    gain, chance, held_out = _held_out(found, seen, chain, scales, active, state)
+    if not chance < _LEAST_CHANCE or gain <= 0.0:
+        return None
+    deviation = []
+    assert state.covariance is not None
+    sigma = np.sqrt(np.diag(state.covariance))
+    for index in problem.column_of:
+        values = np.zeros(index.shape)
+        values[index >= 0] = sigma[index[index >= 0] - 3 * things]
+        deviation.append(values)
+    return Selected(state, active, tuple(deviation), gain, chance, held_out)
+
+
+def _shared(footage: Footage, found: Estimate) -> Estimate | None:
+    """Return what several drives see, None where that is too little: what one drive alone sees explains any fault."""
+    drive = footage.drives.pass_code[footage.rays.image_row[found.detection]]
+    pairs, votes = np.unique(np.stack([found.thing, drive]), axis=1, return_counts=True)
+    drives = np.bincount(pairs[0, votes >= _LEAST_OF_DRIVE], minlength=len(found.class_code))
+    kept = drives >= 2
+    if int(kept.sum()) < _LEAST_OBJECTS:
+        return None
+    number = np.cumsum(kept) - 1
+    stays = kept[found.thing]
+    return replace(
+        found,
+        detection=found.detection[stays],
+        thing=number[found.thing[stays]],
+        class_code=found.class_code[kept],
+        size_m=found.size_m[kept],
+        state=replace(found.state, point_in_world_m=found.state.point_in_world_m[kept]),
+    )
+
+
+def _told(seen: Observations, free: tuple[Bools, ...]) -> tuple[Bools, ...]:
+    """Return which of the constants enough objects tell anything of."""
+    told = []
+    for flags, of in zip(free, (seen.leg, seen.drive, seen.drive, seen.camera, seen.camera, seen.camera), strict=True):
+        objects = np.unique(np.stack([of, seen.thing]), axis=1)[0]
+        told.append(flags & (np.bincount(objects, minlength=len(flags)) >= _LEAST_OF_PART)[:, None])
+    return tuple(told)
+
+
+def footage_legs(footage: Footage, found: Estimate) -> Ints:
+    """Return the leg of each keyframe."""
+    return found.legs.of(footage.drives.pass_code, footage.drives.order)
+
+
+def _scales(footage: Footage, found: Estimate) -> Scales:
+    """Return priors with a drift as large as what is found of it, and offsets as claimed where they are."""
+    drift = np.sqrt(np.mean(found.state.drift**2, axis=0))
+    drift_m = max(DRIFT_FACTOR * float(np.sqrt(np.mean(drift[:3] ** 2))), _LEAST_DRIFT)
+    drift_rad = max(DRIFT_FACTOR * float(np.sqrt(np.mean(drift[3:] ** 2))), _LEAST_DRIFT_RAD)
+    return replace(
+        found.scales,
+        drift_m=drift_m,
+        drift_rad=drift_rad,
+        constant=(_offset_sigma(footage, found), *WIDE.constant[1:]),
+    )
+
+
+def _offset_sigma(footage: Footage, found: Estimate) -> Floats:
+    """Return the deviation (L) of the offset of each leg: wide, and as its images' claims are to each other."""
+    claimed = footage.dataset.images.position_sigma_m
+    sigma = np.full(len(found.legs), float(WIDE.constant[OFFSET]))
+    if claimed is None or not np.isfinite(claimed).any():
+        return sigma
+    leg = footage_legs(footage, found)
+    usual = float(np.nanmedian(claimed))
+    for number in range(len(sigma)):
+        of_leg = claimed[leg == number]
+        if np.isfinite(of_leg).any():
+            sigma[number] *= float(np.nanmedian(of_leg)) / usual
+    return sigma
+
+
+def _prune(
+    seen: Observations,
+    chain: Chain,
+    scales: Scales,
+    active: tuple[Bools, ...],
+    state: State,
+    things: int,
+    fixed: tuple[int, ...],
+) -> tuple[State, tuple[Bools, ...]]:
+    """Drop whole groups of parameters of which none pays, the poorest first; then those that do not pay in the others.
+
+    Kinds that are `fixed` are not judged.
+    """
+    while True:
+        problem = Adjustment(seen, chain, scales, active, things)
+        state = adjust(problem, state, tolerances=_REFIT, with_variance=True)
+        worth = _worth(problem, state, scales)
+        groups = [
+            (kind, columns)
+            for kind, flags in enumerate(active)
+            for columns in _groups(kind)
+            if kind not in fixed and flags[:, columns].any()
+        ]
+        if not groups:
+            return state, active
+        best = [float(np.max(worth[kind][:, columns][active[kind][:, columns]])) for kind, columns in groups]
+        poorest = int(np.argmin(best))
+        changed = [flags.copy() for flags in active]
+        if best[poorest] <= 0.0:
+            kind, columns = groups[poorest]
+            changed[kind][:, columns] = False
+        else:
+            for kind, flags in enumerate(changed):
+                if kind not in fixed:
+                    flags &= worth[kind] > 0.0
+            if all(np.array_equal(a, b) for a, b in zip(changed, active, strict=True)):
+                return state, active
+        active = tuple(changed)
+
+
+def _groups(kind: int) -> list[list[int]]:
+    """Return the columns of a kind that stand or fall together."""
+    if kind == OFFSET:
+        return [[0, 1], [2]]
+    return [[0], [1], [2]] if kind in (MOUNT, CAMERA_MOUNT) else [[0]]
+
+
+def _worth(problem: Adjustment, state: State, scales: Scales) -> list[Floats]:
+    """Return for each parameter by how much its evidence exceeds its price; below 0 where it is too small to matter."""
+    assert state.covariance is not None
+    first = 3 * problem.things
+    price = math.log(max(len(problem.seen), 2))
+    speed = float(np.median(np.linalg.norm(problem.seen.forward_mps, axis=1)))
+    smallest = {
+        OFFSET: _BEYOND_DRIFT * scales.drift_m,
+        MOUNT: _BEYOND_DRIFT * scales.drift_rad,
+        CAMERA_MOUNT: _BEYOND_DRIFT * scales.drift_rad,
+        DELAY: _BEYOND_DRIFT * scales.drift_m / max(speed, 1e-9),
+        CAMERA_DELAY: _BEYOND_DRIFT * scales.drift_m / max(speed, 1e-9),
+        FOCAL: _LEAST_FOCAL,
+    }
+    worth = []
+    for kind, index in enumerate(problem.column_of):
+        value = np.full(index.shape, -np.inf)
+        for columns in _groups(kind):
+            rows = np.flatnonzero(problem.active[kind][:, columns].all(axis=1))
+            if not len(rows):
+                continue
+            at = index[rows][:, columns] - first
+            theta = state.constants[kind][rows][:, columns]
+            blocks = state.covariance[at[:, :, None], at[:, None, :]]
+            shared = {MOUNT: CAMERA_MOUNT, DELAY: CAMERA_DELAY}.get(kind)
+            is_shared = kind == OFFSET or (shared is not None and problem.active[shared][:, columns].any())
+            if is_shared and len(rows) > 1:
+                sigma = np.asarray(scales.constant[kind], np.float64)
+                sigma = np.broadcast_to(sigma, (len(index),))[rows]
+                theta, blocks = _against_the_mean(theta, state.covariance, at, sigma)
+            square = np.einsum("ni,ni->n", theta, np.linalg.solve(blocks, theta[:, :, None])[:, :, 0])
+            evidence = square - len(columns) * price - 2.0 * math.log(len(rows))
+            size = np.linalg.norm(theta, axis=1)
+            is_fault = (size > smallest[kind]) & (size < _PLAUSIBLE * np.max(scales.constant[kind]))
+            value[rows[:, None], columns] = np.where(is_fault, evidence, -1.0)[:, None]
+        worth.append(value)
+    return worth
+
+
+def _against_the_mean(theta: Floats, covariance: Floats, at: Ints, sigma: Floats) -> tuple[Floats, Floats]:
+    """Return values (N, width) and covariances against their weighted mean, which nothing but the priors tells.
+
+    `at` (N, width) are their places in the covariance, `sigma` (N) the deviations of their priors.
+    """
+    share = sigma**-2.0 / np.sum(sigma**-2.0)
+    theta = theta - share @ theta
+    width = at.shape[1]
+    out = np.empty((len(at), width, width))
+    for i in range(width):
+        for j in range(width):
+            part = covariance[np.ix_(at[:, i], at[:, j])]
+            out[:, i, j] = np.diag(part) - part @ share - share @ part + share @ part @ share
+    return theta, out + 1e-12 * np.eye(width)
+
+
+def _held_out(
+    found: Estimate, seen: Observations, chain: Chain, scales: Scales, active: tuple[Bools, ...], state: State
+) -> tuple[float, float, int]:
+    """Return the gain on objects that had no part in the fit, the chance that it is luck, and the number of objects."""
+    things = len(found.class_code)
+    half = _halves(state.point_in_world_m)
+    gains = []
+    for side in (0, 1):
+        fitted = seen.take(half[seen.thing] == side)
+        judged = seen.take(half[seen.thing] != side)
+        start = replace(state, drift=np.zeros_like(state.drift))
+        problem = Adjustment(fitted, chain, scales, active, things)
+        fit = adjust(problem, start, tolerances=_REFIT)
+        fit = replace(fit, drift=np.zeros_like(state.drift), own=np.zeros_like(state.own))
+        given = replace(fit, constants=tuple(np.zeros_like(c) for c in fit.constants))
+        by_thing = []
+        for one in (given, fit):
+            placed = triangulate(judged, replace(one, point_in_world_m=state.point_in_world_m), things, tolerance=3.0)
+            placed = triangulate(judged, placed, things, rounds=4)
+            by_thing.append(np.bincount(judged.thing, weights=cost(judged, placed), minlength=things))
+        is_judged = np.bincount(judged.thing, minlength=things) > 0
+        gains.append((by_thing[0] - by_thing[1])[is_judged])
+    gain = np.concatenate(gains)
+    if len(gain) < _LEAST_OBJECTS:
+        return float(gain.sum()), 1.0, len(gain)
+    scatter = float(gain.std(ddof=1)) / math.sqrt(len(gain))
+    chance = float(stats.t.sf(float(gain.mean()) / scatter, len(gain) - 1)) if scatter > 0.0 else 0.0
+    by_rank = float(stats.wilcoxon(gain, alternative="greater").pvalue)
+    return float(gain.sum()), min(1.0, 2.0 * min(chance, by_rank)), len(gain)
+
+
+def _halves(point: Floats) -> Ints:
+    """Deal objects into two halves by turns along their places, so that drives see some of both everywhere."""
+    order = np.lexsort((point[:, 2], point[:, 1], np.round(point[:, 0] / 10.0)))
+    half = np.empty(len(point), np.int64)
+    half[order] = np.arange(len(point)) % 2
+    return half

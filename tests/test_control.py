@@ -1,0 +1,147 @@
+"""Control points: shifts and turns found, proven by points left out, and said in the covariance."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from small_dataset import ANCHOR, map_of
+from valuemap.config import SimulationConfig
+from valuemap.control import apply_control, find_georeference
+from valuemap.dataset import Frame, read_dataset, write_dataset
+from valuemap.errors import InputError
+from valuemap.evaluate.truth import TrueObjects, read_truth
+from valuemap.geodesy import lon_lat_height_from_enu
+from valuemap.map_folder import read_map
+from valuemap.simulate import simulate
+from valuemap.tables import Categories, Floats
+
+SHIFT = np.array([-0.4, 0.25, 0.1])
+
+
+def surveyed(places: Floats, classes: list[str] | None = None, **changes: object) -> TrueObjects:
+    names = None if classes is None else Categories.from_texts(classes)
+    return TrueObjects(np.arange(len(places)), places, names, **changes)  # type: ignore[arg-type]
+
+
+def labels_around(seed: int, count: int = 60) -> Floats:
+    random = np.random.default_rng(seed)
+    return random.uniform(0.0, 300.0, (count, 3)) * [1.0, 1.0, 0.02]
+
+
+def map_in(folder: Path, *options: str | Path) -> subprocess.CompletedProcess[str]:
+    """Map the dataset of a folder, quickly."""
+    command = [sys.executable, "-m", "valuemap", "map", folder / "data", "--out", folder / "map", "--method", "paper"]
+    return subprocess.run([*map(str, command), *map(str, options)], capture_output=True, text=True, check=False)
+
+
+def test_a_shift_is_found_with_its_deviation() -> None:
+    for seed in range(5):
+        random = np.random.default_rng(seed)
+        truth = labels_around(seed)
+        result = map_of(truth - SHIFT + random.normal(0.0, 1.0, (60, 3)) * [0.2, 0.1, 0.3])
+        found = find_georeference(result, surveyed(truth[:30]))
+        sigma = np.sqrt(np.diag(found.covariance)[:3])
+        assert np.all(np.abs(found.shift_m - SHIFT) < 4.0 * sigma)
+        assert np.all(sigma < 0.1)
+        assert found.turn_rad == 0.0
+        assert np.array_equal(found.label_of_point, np.arange(30))
+
+
+def test_a_turn_is_found_only_where_the_points_tell_it() -> None:
+    truth = labels_around(3)
+    turn, middle = math.radians(0.5), truth[:40].mean(axis=0)
+    rotation = np.array([[math.cos(turn), math.sin(turn), 0], [-math.sin(turn), math.cos(turn), 0], [0, 0, 1]])
+    noise = np.random.default_rng(3).normal(0.0, 0.1, (60, 3))
+    result = map_of((truth - middle) @ rotation.T + middle + noise)
+    found = find_georeference(result, surveyed(truth[:40]))
+    assert found.turn_rad == pytest.approx(turn, abs=math.radians(0.05))
+    moved, _ = apply_control(result, surveyed(truth[:40]))
+    assert np.abs(moved.labels.position_in_world_m[40:] - truth[40:]).max() < 0.5
+
+
+def test_wrong_points_and_other_classes_do_not_move_a_map() -> None:
+    truth = labels_around(4)
+    classes = ["light", "sign"] * 30
+    places = truth[:20].copy()
+    places[:4] += [3.0, -2.0, 0.0]
+    result = map_of(truth - SHIFT, classes)
+    found = find_georeference(result, surveyed(places, classes[:20]))
+    assert np.abs(found.shift_m - SHIFT).max() < 0.15
+    with pytest.raises(InputError, match="label of their class"):
+        find_georeference(result, surveyed(places, ["post"] * 20))
+
+
+def test_points_left_out_prove_it_and_covariances_have_two_parts() -> None:
+    random = np.random.default_rng(5)
+    truth = labels_around(5)
+    result = map_of(truth - SHIFT + random.normal(0.0, 0.1, (60, 3)))
+    moved, _ = apply_control(result, surveyed(truth[:25], sigma_m=np.full(25, 0.02)))
+    proof = moved.run["control"]["left_out"]
+    assert proof["rmse_horizontal_as_mapped_m"] > 0.4
+    assert proof["rmse_horizontal_m"] < 0.25
+    assert proof["shift_deviation_m"] < 0.05
+    labels = moved.labels
+    assert labels.absolute_covariance_m2 is not None
+    assert np.array_equal(labels.covariance_m2, result.labels.covariance_m2)
+    added = labels.absolute_covariance_m2 - labels.covariance_m2
+    assert np.all(added[:, [0, 3, 5]] > 1e-5)
+    sigma = moved.run["control"]["shift_sigma_m"]
+    assert added[0, 0] == pytest.approx(sigma[0] ** 2, rel=0.05)
+
+
+def test_points_without_heights_leave_the_heights() -> None:
+    truth = labels_around(6)
+    result = map_of(truth - SHIFT)
+    moved, _ = apply_control(result, surveyed(truth[:20], has_height=False))
+    assert moved.labels.position_in_world_m[:, 2] == pytest.approx(result.labels.position_in_world_m[:, 2], abs=1e-9)
+    assert moved.labels.position_in_world_m[:, :2] == pytest.approx(truth[:, :2], abs=0.05)
+
+
+def test_a_file_of_points_has_geographic_places_and_deviations(tmp_path: Path) -> None:
+    places = lon_lat_height_from_enu(labels_around(7, 5), ANCHOR)
+    lines = [f"{lat:.9f},{lon:.9f},{height:.3f},{0.02 if i else ''}" for i, (lon, lat, height) in enumerate(places)]
+    file = tmp_path / "points.csv"
+    file.write_text("\n".join(["lat,lon,height,sigma", *lines]) + "\n")
+    result = map_of(labels_around(7, 5) - SHIFT, frame=Frame(anchor=ANCHOR), lon_lat_height=places)
+    points = read_truth(file, result)
+    assert isinstance(points, TrueObjects)
+    assert points.sigma_m is not None
+    assert np.isnan(points.sigma_m).sum() == 1
+    moved, _ = apply_control(result, points)
+    assert moved.labels.lon_lat_height is not None
+    assert moved.labels.lon_lat_height[:, :2] == pytest.approx(places[:, :2], abs=1e-6)
+
+
+def test_the_command_moves_map_and_written_poses_alike(tmp_path: Path) -> None:
+    config = SimulationConfig(streets_north_south=2, streets_east_west=2, lookalikes_per_light=0.0)
+    dataset = simulate(config, seed=1)
+    assert dataset.truth is not None
+    write_dataset(dataset, tmp_path / "data")
+    places = dataset.truth.position_in_world_m + SHIFT
+    rows = [",".join(f"{v:.4f}" for v in place) for place in places]
+    (tmp_path / "points.csv").write_text("\n".join(["x,y,z", *rows]) + "\n")
+    done = map_in(tmp_path, "--write-poses", tmp_path / "better", "--control", tmp_path / "points.csv")
+    assert done.returncode == 0, done.stderr
+    result, better = read_map(tmp_path / "map"), read_dataset(tmp_path / "better")
+    shift = np.array(result.run["control"]["shift_east_north_up_m"])
+    assert np.abs(shift - SHIFT)[:2].max() < 0.25
+    assert result.labels.absolute_covariance_m2 is not None
+    assert result.run["dataset_folder"] == "../better"
+    assert (tmp_path / "better" / "colmap" / "points3D.txt").is_file()
+    moved = better.images.cam_from_world_m - dataset.images.cam_from_world_m
+    assert np.linalg.norm(moved, axis=1) == pytest.approx(np.linalg.norm(shift), abs=0.02)
+
+
+def test_control_that_is_no_file_is_one_line(tmp_path: Path) -> None:
+    write_dataset(simulate(SimulationConfig(streets_north_south=2, streets_east_west=2), seed=1), tmp_path / "data")
+    done = map_in(tmp_path, "--control", tmp_path / "no.csv")
+    assert done.returncode != 0
+    assert "no.csv: no such file" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "map").exists()
