@@ -450,6 +450,8 @@ def test_a_map_that_is_made_again_is_shown_with_its_decisions(tmp_path: Path) ->
         place = before.labels.position_in_world_m[np.argmax(before.labels.votes)]
         assert asked.decide({"label_id": rejected, "verdict": "rejected"}).status == 200
         after = write_city(tmp_path, "one", "two")
+        asked.get("/")  # A page that is loaded again asks for labels before it knows anything.
+        assert unpack(asked.get("/api/labels").body)["votes"].tolist() == after.labels.votes.tolist()
         assert asked.get("/api/map").json()["counts"]["images"] == 120
         (again,) = asked.get("/api/reviews").json()["decisions"]
         assert again["state"] == "rejected"

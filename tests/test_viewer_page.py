@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -70,7 +71,8 @@ def test_the_page_of_the_demo(tmp_path: Path) -> None:
     demo = os.environ.get("DEMO_FOLDER", "")
     if not demo:
         pytest.skip("the page of the demo is not tried: make demo, and give its folder as DEMO_FOLDER")
-    whole = valuemap.read_dataset(Path(demo) / "dataset")
+    # What the detector found is judged elsewhere: the truth of detections is not that of a part of them.
+    whole = dataclasses.replace(valuemap.read_dataset(Path(demo) / "dataset"), truth_detections=None)
     passes = sorted(set(whole.images.pass_id.texts()))
     pictures = Path(demo) / "dataset" / "images"
     before = _map_by_command(part(whole, *passes[: len(passes) // 2]), tmp_path)

@@ -312,6 +312,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _get(self, path: str, query: dict[str, str]) -> _Answer:
         content = self.server.content
         if path == "/":
+            content.refresh()  # Before the page asks for anything: what it asks for at once must be of one map.
             return self._page()
         if path in self.server.pages:
             return _file(self.server.pages[path])
