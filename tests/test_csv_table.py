@@ -30,7 +30,7 @@ def read(folder: Path, content: bytes, *, bad_numbers_are_nan: bool = False) -> 
     [
         PLAIN,
         b"\xef\xbb\xbf" + PLAIN,
-        gzip.compress(PLAIN),
+        gzip.compress(PLAIN, mtime=0),
         PLAIN.replace(b"\n", b"\r\n"),
         b"X,Y,Z,Class\n1,2,3.5,light\n",
         b" x, Y ,z,class\n1,2,3.5,light\n",
@@ -64,7 +64,7 @@ def test_what_is_no_number_is_an_error_or_nan(tmp_path: Path) -> None:
         ("x,y,z\n1,2,3\n".encode("utf-16"), "is text in UTF-16, not in UTF-8"),
         (b"PK\3\4xl/worksheets", "is a zip archive or a spreadsheet, not CSV"),
         (b"PAR1....", "is a Parquet file, not CSV"),
-        (gzip.compress(PLAIN)[:-9], "cannot be read as CSV: Compressed file ended"),
+        (gzip.compress(PLAIN, mtime=0)[:-9], "cannot be read as CSV: Compressed file ended"),
         (b"x,y,z,class\n1,2,3,\xff\n", "invalid UTF8 data"),
         (b"x,y,z\n1,2\n", "Row #2: Expected 3 columns, got 2"),
     ],

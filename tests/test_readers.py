@@ -17,9 +17,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from reading import refusal
 from valuemap.cameras import camera_centers, cast_rays
 from valuemap.dataset import Dataset, read_dataset, write_dataset
-from valuemap.errors import InputError, SettingError, ValuemapError
+from valuemap.errors import InputError, SettingError
 from valuemap.readers import READERS
 from valuemap.readers.colmap import read_colmap
 from valuemap.readers.kitti import read_kitti
@@ -138,16 +139,6 @@ def same(a: Dataset, b: Dataset) -> bool:
     tables = ("cameras", "images", "detections")
     equal = all(table_to_arrow(getattr(a, name)).equals(table_to_arrow(getattr(b, name))) for name in tables)
     return equal and a.frame == b.frame
-
-
-def refusal(read: Callable[[], Any]) -> str:
-    """The message and hint of the error that reading must end with, each of one line."""
-    with pytest.raises(ValuemapError) as caught:
-        read()
-    assert "\n" not in str(caught.value)
-    assert "\n" not in caught.value.hint
-    assert caught.value.hint
-    return f"{caught.value} | {caught.value.hint}"
 
 
 # COLMAP: geometry.

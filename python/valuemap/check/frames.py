@@ -11,6 +11,7 @@ import numpy as np
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.fault import Convention, Fault, Finding, Fix, Stage, View, with_images, with_poses
 from valuemap.check.headings import driving_azimuths, headings, rotations_of, turned
+from valuemap.check.passes import median_speed_mps
 from valuemap.check.sample import driving_order
 from valuemap.check.sizes import object_heights, plausible_heights
 from valuemap.dataset import Dataset, Frame
@@ -195,7 +196,7 @@ class Scale(Fault):
                     f"{name} are {height_m:.3g} m high (median of {objects} places; {low:g} to {high:g} m is usual)"
                 )
                 factors.append(math.sqrt(low * high) / height_m)
-        speed = _median_speed_mps(view)
+        speed = median_speed_mps(view)
         if speed is not None:
             figures["speed_mps"] = round(speed, 4)
             low, high = _SPEEDS_MPS
@@ -211,17 +212,6 @@ class Scale(Fault):
             do=f"Scale the poses (about {figures['factor']:g} times): by GPS positions or a known distance.",
             figures=figures,
         )
-
-
-def _median_speed_mps(view: View) -> float | None:
-    images = view.dataset.images
-    if images.timestamp_s is None or not np.all(np.isfinite(images.timestamp_s)):
-        return None
-    order = driving_order(images)
-    step = np.linalg.norm(np.diff(view.center_in_world_m[order], axis=0), axis=1)
-    seconds = np.diff(images.timestamp_s[order])
-    moves = (np.diff(images.pass_id.codes[order]) == 0) & (seconds > 0.0) & (step > 0.3 * view.step_m)
-    return float(np.median(step[moves] / seconds[moves])) if np.any(moves) else None
 
 
 def _vector(parts: Floats) -> str:
