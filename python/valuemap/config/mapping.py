@@ -1,0 +1,238 @@
+"""Settings of `valuemap map`, a stage a class, and all of them together."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Self, get_args
+
+from valuemap.config.setting import (
+    LONGEST_M,
+    WIDEST_PX,
+    Method,
+    assign,
+    check_range,
+    declare,
+    effect_of,
+    owner_of,
+    shown,
+)
+from valuemap.errors import SettingError
+
+
+@dataclass(frozen=True)
+class PartitionConfig:
+    """How images are split into independent clusters."""
+
+    cluster_radius_m: float = declare(
+        50.0,
+        unit="m",
+        open_low=True,
+        high=LONGEST_M,
+        effect="a seed takes all free images closer than this (N_max of the paper); "
+        "larger sees objects from more images and costs more",
+        method="paper",
+    )
+
+
+@dataclass(frozen=True)
+class VoteConfig:
+    """Which hypotheses are viable, who votes, and when the greedy selection stops."""
+
+    max_reprojection_error_px: float = declare(
+        6.0,
+        unit="px",
+        open_low=True,
+        high=WIDEST_PX,
+        effect="a detection votes for a point that projects closer than this (d_max of the paper)",
+        method="paper",
+    )
+    min_parallax_deg: float = declare(
+        2.0,
+        unit="deg",
+        high=90.0,
+        effect="two rays closer than this in angle propose no point (theta_min of the paper)",
+    )
+    min_range_m: float = declare(
+        2.0, unit="m", high=LONGEST_M, effect="a proposed point nearer than this to either of its cameras is dropped"
+    )
+    max_range_m: float = declare(
+        60.0,
+        unit="m",
+        open_low=True,
+        high=LONGEST_M,
+        effect="a proposed point farther than this from either of its cameras is dropped (r_max of the paper)",
+    )
+    min_vote_ratio: float = declare(
+        1.0,
+        unit="1",
+        high=1e3,
+        effect="a point is accepted while its votes reach this multiple of the mean votes of the hypotheses "
+        "still alive (alpha of the paper); larger is stricter",
+        method="paper",
+    )
+    min_votes: int = declare(
+        3, unit="images", low=2, high=10**6, effect="a point is accepted only with votes from at least this many images"
+    )
+
+
+@dataclass(frozen=True)
+class NoiseConfig:
+    """How far a detection may be from where its object projects; what is not set is estimated from the data."""
+
+    gate_sigmas: float = declare(
+        4.0,
+        unit="sigmas",
+        open_low=True,
+        high=100.0,
+        effect="a detection votes for a point that projects closer than this many standard deviations",
+        method="robust",
+    )
+    detection_sigma_px: float | None = declare(
+        None,
+        unit="px",
+        open_low=True,
+        high=1e3,
+        effect="standard deviation of a detection's centre, each axis",
+    )
+    position_sigma_m: float | None = declare(
+        None,
+        unit="m",
+        high=100.0,
+        effect="standard deviation of a camera position, each axis",
+        method="robust",
+    )
+    rotation_sigma_deg: float | None = declare(
+        None,
+        unit="deg",
+        high=45.0,
+        effect="standard deviation of a camera rotation, each axis",
+        method="robust",
+    )
+
+
+@dataclass(frozen=True)
+class ExistenceConfig:
+    """Which labels are kept."""
+
+    min_existence: float = declare(
+        0.55,
+        unit="1",
+        high=1.0,
+        effect="labels that exist with a smaller probability are dropped",
+        method="robust",
+    )
+
+
+@dataclass(frozen=True)
+class MergeConfig:
+    """When labels of different clusters are one object."""
+
+    merge_radius_m: float = declare(
+        1.0,
+        unit="m",
+        high=LONGEST_M,
+        effect="labels of different clusters closer than this become one",
+        method="paper",
+    )
+
+
+@dataclass(frozen=True, init=False)
+class MapConfig:
+    """All settings of one `map` run, by stage; single ones by name as well: `MapConfig(max_range_m=80)`."""
+
+    method: Method = "robust"
+    partition: PartitionConfig = PartitionConfig()
+    vote: VoteConfig = VoteConfig()
+    noise: NoiseConfig = NoiseConfig()
+    existence: ExistenceConfig = ExistenceConfig()
+    merge: MergeConfig = MergeConfig()
+
+    def __init__(
+        self,
+        method: Method = "robust",
+        partition: PartitionConfig = partition,
+        vote: VoteConfig = vote,
+        noise: NoiseConfig = noise,
+        existence: ExistenceConfig = existence,
+        merge: MergeConfig = merge,
+        **settings: float | None,
+    ) -> None:
+        stages: dict[str, Any] = {
+            "partition": partition, "vote": vote, "noise": noise, "existence": existence, "merge": merge,
+        }  # fmt: skip
+        for name, value in settings.items():
+            stage, _ = owner_of(name, stages, name)
+            stages[stage] = dataclasses.replace(stages[stage], **{name: value})
+        for name, value in {"method": method, **stages}.items():
+            object.__setattr__(self, name, value)  # As a frozen dataclass does.
+        self._check()
+
+    def _check(self) -> None:
+        if self.method not in get_args(Method):
+            raise SettingError(
+                f"method: expected one of {', '.join(get_args(Method))}, found {self.method!r}",
+                hint="leave --method away for the default",
+            )
+        for stage in self._stages().values():
+            for setting in fields(stage):
+                check_range(setting, getattr(stage, setting.name))
+        if self.vote.min_range_m >= self.vote.max_range_m:
+            raise SettingError(
+                f"min_range_m ({self.vote.min_range_m}) must be less than max_range_m ({self.vote.max_range_m})",
+                hint="set both, e.g. --set min_range_m=2 --set max_range_m=60",
+            )
+
+    def with_settings(self, assignments: Iterable[str]) -> Self:
+        """Return a copy with `name=value` assignments applied, as given to `--set`.
+
+        Raises
+        ------
+        SettingError
+            A name that no stage has, or that the method ignores; a value that is not a number, or out of range.
+        """
+        assignments = list(assignments)
+        changed = dataclasses.replace(self, **assign(self._stages(), assignments))
+        owner = self.ignored_settings()
+        for name in (assignment.partition("=")[0].strip() for assignment in assignments):
+            if name in owner:  # A user would look for an effect that cannot be.
+                raise SettingError(
+                    f"--set {name}: the method {self.method} has no such setting, only {owner[name]} has it",
+                    hint=f"leave it away, or use --method {owner[name]}",
+                )
+        return changed
+
+    def ignored_settings(self) -> dict[str, Method]:
+        """Return the settings that the method does not have, each with the only method that has it."""
+        settings = [setting for stage in self._stages().values() for setting in fields(stage)]
+        owner = {setting.name: setting.metadata["method"] for setting in settings}
+        return {name: method for name, method in owner.items() if method not in (None, self.method)}
+
+    def as_dict(self) -> dict[str, float | str | None]:
+        """Return all settings, flat, as `run.json` holds them."""
+        flat: dict[str, float | str | None] = {"method": self.method}
+        for stage in self._stages().values():
+            flat.update(dataclasses.asdict(stage))
+        return flat
+
+    def _stages(self) -> Mapping[str, Any]:
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "method"}
+
+
+def describe_settings() -> list[tuple[str, str, str, str]]:
+    """Return (name, default, unit, effect) of every setting, in the order of the stages."""
+    return [
+        (s.name, shown(s.default), s.metadata["unit"], effect_of(s))
+        for stage in MapConfig()._stages().values()
+        for s in fields(stage)
+    ]
+
+
+def list_settings() -> list[dict[str, Any]]:
+    """Return every setting as an object of JSON: name, default (null: estimated), unit, effect, method (null: all)."""
+    return [
+        {"name": s.name, "default": s.default, **{key: s.metadata[key] for key in ("unit", "effect", "method")}}
+        for stage in MapConfig()._stages().values()
+        for s in fields(stage)
+    ]
