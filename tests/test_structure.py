@@ -48,7 +48,7 @@ def test_the_bundled_model_finds_nothing_where_nothing_can_be(tmp_path: Path) ->
     for name, pixels in pictures.items():
         cv2.imwrite(str(tmp_path / f"{name}.png"), pixels)
         cv2.imwrite(str(tmp_path / f"{name}.jpg"), pixels)
-    detect_folder(tmp_path, BUNDLED_MODEL, DetectConfig(), out=tmp_path / "out")
+    detect_folder(tmp_path, BUNDLED_MODEL, DetectConfig(min_score=0.0), out=tmp_path / "out")
     counts = json.loads((tmp_path / "out" / RECORD).read_text())["counts"]
     assert counts["detections"] == 0
     assert counts["pictures_of_noise_or_one_color"] == counts["pictures"] == 2 * len(pictures)
@@ -56,7 +56,7 @@ def test_the_bundled_model_finds_nothing_where_nothing_can_be(tmp_path: Path) ->
 
 def test_it_would_find_lights_in_noise_if_it_were_asked(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "noise.png"), noise(4))
-    detector = Detector(BUNDLED_MODEL, DetectConfig())
+    detector = Detector(BUNDLED_MODEL, DetectConfig(min_score=0.0))
     (seen,) = next(iter(detector.run([Task(tmp_path / "noise.png")])))
     detector.model = replace(detector.model, min_coarse_share=0.0)
     (asked,) = next(iter(detector.run([Task(tmp_path / "noise.png")])))
@@ -70,6 +70,11 @@ def test_pictures_of_streets_have_far_more_structure_than_is_asked_for() -> None
     for picture in render_pictures(recording, rows=[0, len(recording.dataset.images) // 2]):
         assert coarse_share(picture.image) > 2.0 * MIN_COARSE_SHARE
         assert coarse_share(picture.image // 16) > 2.0 * MIN_COARSE_SHARE  # At night.
+
+
+def test_by_default_only_boxes_count_that_are_mostly_right_in_real_pictures() -> None:
+    assert Detector(BUNDLED_MODEL, DetectConfig()).min_score == 0.8
+    assert Detector(BUNDLED_MODEL, DetectConfig(min_score=0.3)).min_score == 0.3
 
 
 def test_models_that_do_not_ask_for_structure_look_at_everything(tmp_path: Path) -> None:
