@@ -1,6 +1,6 @@
 # `make demo` and `make test` do all their own set-up: they need Python 3.11+, a C compiler and cargo, nothing else.
 # `make test EXTRAS=train` installs PyTorch (5 GB) and tests training too; without it those tests are skipped.
-.PHONY: demo test lint bench bench-field model page rust-test wheel sdist docs setup clean
+.PHONY: demo test lint bench bench-field bench-scale model page rust-test wheel sdist docs setup clean
 
 UV_VERSION := 0.13.8
 PYTHON ?= python3
@@ -34,6 +34,13 @@ bench-field: setup
 bench: setup
 	cargo bench --locked --package valuemap-core
 	$(RUN) python benchmarks/speed.py
+
+# Tiles of any size, runs that are killed, changes between years.
+bench-scale: setup
+	$(RUN) python benchmarks/scale.py cells --preset block --json benchmarks/results/scale.json
+	$(RUN) python benchmarks/scale.py kills --preset block --json benchmarks/results/scale.json
+	$(RUN) python benchmarks/scale.py change --json benchmarks/results/scale.json
+	$(RUN) python benchmarks/scale.py cells --preset nyc --json benchmarks/results/scale.json
 
 # The bundled model of traffic lights, from rendered and real pictures: see docs/model_card.md.
 model: EXTRAS := train

@@ -41,3 +41,7 @@ class SettingError(ValuemapError):
 
 class OutputError(ValuemapError):
     """A place that cannot be written to."""
+
+
+class ClusterError(ValuemapError):
+    """A cluster that cannot be reached, or cannot do what is asked of it."""

@@ -10,13 +10,24 @@ import typer
 
 from valuemap import map_folder
 from valuemap.cli.app import app
-from valuemap.cli.options import DEFAULT_METHOD, AsJson, Force, MethodName, Resume, Settings, TileSize, Work
+from valuemap.cli.options import (
+    DEFAULT_METHOD,
+    AsJson,
+    EngineName,
+    Force,
+    MethodName,
+    RayAddress,
+    Resume,
+    Settings,
+    TileSize,
+    Work,
+)
 from valuemap.cli.show import log, progress_bars, show, show_notes
 from valuemap.cli.working import working
 from valuemap.config import MapConfig
 from valuemap.control import apply_control
 from valuemap.dataset import Dataset, read_dataset
-from valuemap.engine.threads import ThreadEngine
+from valuemap.engine.choose import engine_named
 from valuemap.errors import InputError
 from valuemap.evaluate import evaluate_map
 from valuemap.evaluate.truth import read_truth
@@ -56,6 +67,8 @@ def map_command(
         ),
     ] = None,
     tile_size: TileSize = None,
+    engine: EngineName = "threads",
+    ray_address: RayAddress = None,
     work: Work = None,
     resume: Resume = False,
     calibration: Annotated[
@@ -77,7 +90,12 @@ def map_command(
         raise InputError(f"{control}: no such file", hint="give a table of surveyed objects, such as a .csv")
     given = None if calibration is None else read_calibration(calibration)
     with working(work, out, resume=resume) as folder, progress_bars() as progress:
-        run = Run(folder, ThreadEngine(threads), tile_size_m=tile_size, calibration=given)
+        run = Run(
+            folder,
+            engine_named(engine, threads=threads, ray_address=ray_address),
+            tile_size_m=tile_size,
+            calibration=given,
+        )
         result, cells = build_map_of_folder(dataset, config, run, progress=progress)
         if control is not None or write_poses_to is not None:
             data = result.corrected or read_dataset(dataset)

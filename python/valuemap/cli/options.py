@@ -47,3 +47,10 @@ Vertical = Annotated[
         help="What heights count from: a system, EPSG:5773, or how many metres above the ellipsoid its zero is.",
     ),
 ]
+EngineName = Annotated[
+    str, typer.Option("--engine", help="threads: on this machine; ray: on a cluster, see docs/cluster.md.")
+]
+RayAddress = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="Cluster for --engine ray, as host:port. Default: one on this machine."),
+]

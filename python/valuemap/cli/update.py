@@ -10,10 +10,10 @@ import typer
 
 from valuemap import map_folder
 from valuemap.cli.app import app
-from valuemap.cli.options import AsJson, Force, Resume, TileSize, Work
+from valuemap.cli.options import AsJson, EngineName, Force, RayAddress, Resume, TileSize, Work
 from valuemap.cli.show import log, progress_bars, show, show_notes
 from valuemap.cli.working import working
-from valuemap.engine.threads import ThreadEngine
+from valuemap.engine.choose import engine_named
 from valuemap.folders import check_place
 from valuemap.map_folder import write_map
 from valuemap.pipeline import Run
@@ -31,6 +31,8 @@ def update_command(
     ] = None,
     threads: Annotated[int, typer.Option(min=0, help="Threads, 0 for one a core; the map is the same.")] = 0,
     tile_size: TileSize = None,
+    engine: EngineName = "threads",
+    ray_address: RayAddress = None,
     work: Work = None,
     resume: Resume = False,
     force: Force = False,
@@ -39,7 +41,8 @@ def update_command(
     """Add new passes to a map: only what they touch is solved again, ids stay, and changes are told."""
     check_place(out, parts=map_folder.PARTS, force=force)
     with working(work, out, resume=resume) as folder, progress_bars() as progress:
-        run = Run(folder, ThreadEngine(threads), tile_size_m=tile_size)
+        where = engine_named(engine, threads=threads, ray_address=ray_address)
+        run = Run(folder, where, tile_size_m=tile_size)
         result, cells, files = update_map(old, added, run, dataset=dataset, progress=progress)
         result.run["dataset_folder"] = map_folder.DATASET
         write_map(result, out, cells=cells, files=files, force=force)

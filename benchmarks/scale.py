@@ -1,0 +1,250 @@
+"""Scale: tiles of any size, runs that are killed, and changes between years; see docs/scale.md.
+
+    python benchmarks/scale.py cells|kills|change [--preset nyc] [--json benchmarks/results/scale.json]
+
+Times are those of the processor (user and system, all threads): they do not depend on what else the machine does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import hashlib
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import valuemap
+from machine import describe_machine
+from valuemap.cameras import rotation_matrices
+from valuemap.config import MapConfig
+from valuemap.dataset import Dataset, rows_of
+from valuemap.engine.threads import ThreadEngine
+from valuemap.pipeline import Run, build_map_of_folder
+from valuemap.simulate import PRESETS, simulate
+from valuemap.tables import Ints
+from valuemap.tiles.work import open_work
+from valuemap.update import compare
+from valuemap.update.join import join_datasets
+
+CELL_SIZES = (200.0, 500.0, 2000.0, 1e6)
+CHANGED = 20
+MOVED = 10
+MOVED_BY_M = 3.0
+KILLS = 10
+
+
+def main() -> None:
+    """Run one part."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=sorted(PARTS))
+    parser.add_argument("--preset", default="small", help="a preset of valuemap simulate, or block for a part of nyc")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    result = {
+        "command": " ".join(["python", *sys.argv]),
+        **describe_machine(),
+        "load_average": os.getloadavg(),
+        "valuemap": valuemap.__version__,
+        **PARTS[arguments.what](arguments),
+    }
+    print(json.dumps(result, indent=2))
+    if arguments.json:
+        known = json.loads(arguments.json.read_text()) if arguments.json.is_file() else {}
+        known[f"{arguments.what} {arguments.preset}"] = result
+        arguments.json.write_text(json.dumps(known, indent=2) + "\n")
+
+
+def city(preset: str, seed: int = 0) -> Dataset:
+    """Return a simulated city."""
+    if preset == "block":
+        nyc = PRESETS["nyc"]
+        small = {"streets_north_south": 9, "streets_east_west": 8, "lights": 60, "images": 8_000, "detections": 0}
+        return simulate(dataclasses.replace(nyc, **small), seed=seed, name="block")
+    return simulate(PRESETS[preset], seed=seed, name=preset)
+
+
+def measured(folder: Path, out: Path, *options: str) -> dict[str, Any]:
+    """Map a dataset in a process of its own, and return what it took."""
+    start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    command = [sys.executable, "-m", "valuemap.cli", "map", str(folder), "--out", str(out), "--json", *options]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    run = json.loads(done.stdout)
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {
+        "options": options,
+        "seconds": round(time.perf_counter() - start, 1),
+        "cpu_seconds": round(cpu_s, 1),
+        "peak_memory_mb": max(stage["peak_memory_mb"] for stage in run["stages"]),
+        "stages": run["stages"],
+        "counts": {name: value for name, value in run["counts"].items() if name != "noise"},
+        "map": digest(out),
+    }
+
+
+def digest(folder: Path) -> str:
+    """Return a hash of what a map says."""
+    names = ("labels.parquet", "votes.parquet", "calibration.json")
+    return hashlib.sha256(b"".join((folder / name).read_bytes() for name in names)).hexdigest()[:16]
+
+
+def cells(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Map by tiles of all sizes, and in memory."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        valuemap.write_dataset(city(arguments.preset), folder / "city")
+        runs = [measured(folder / "city", folder / "memory")]
+        runs += [measured(folder / "city", folder / f"{m:.0f}", "--tile-size", str(m)) for m in CELL_SIZES]
+    return {"identical": len({run["map"] for run in runs}) == 1, "runs": runs}
+
+
+def kills(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Kill runs with SIGKILL at random moments, and let them go on."""
+    chosen = random.Random(0)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        valuemap.write_dataset(city(arguments.preset), folder / "city")
+        whole = measured(folder / "city", folder / "whole", "--tile-size", "1000")
+        identical, killed_at = 0, []
+        for number in range(KILLS):
+            out = folder / f"map-{number}"
+            command = [sys.executable, "-m", "valuemap.cli", "map", str(folder / "city"), "--out", str(out)]
+            command += ["--tile-size", "1000", "--resume"]
+            after_s = chosen.uniform(0.05, 0.95) * whole["seconds"]
+            process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            time.sleep(after_s)
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+            work = out.with_name(f"{out.name}.work")
+            killed_at.append([round(after_s, 1), len(list(work.glob("cells/*.parquet")))])
+            subprocess.run(command, check=True, capture_output=True)
+            identical += digest(out) == whole["map"]
+            assert not work.exists()
+            shutil.rmtree(out)
+    return {"kills": KILLS, "identical": identical, "seconds_and_cells_when_killed": killed_at, "whole": whole}
+
+
+def change(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Two years of one city: lights removed, added and moved between them."""
+    runs = [change_of(arguments.preset, seed) for seed in range(arguments.seeds)]
+    return {"removed": CHANGED, "added": CHANGED, "moved": MOVED, "moved_by_m": MOVED_BY_M, "runs": runs}
+
+
+def change_of(preset: str, seed: int) -> dict[str, Any]:
+    """Change one city, and count which states are right."""
+    config = dataclasses.replace(
+        PRESETS["small"], streets_north_south=6, streets_east_west=6, lights=110, passes_per_street=6
+    )
+    config = config if preset == "small" else PRESETS[preset]
+    dataset = simulate(config, seed=seed, name="years")
+    assert dataset.truth is not None
+    assert dataset.truth_detections is not None
+    seen = np.bincount(dataset.truth_detections.object_id, minlength=len(dataset.truth))
+    objects = np.random.default_rng(seed).permutation(np.flatnonzero(seen >= 40))
+    removed, added, moved = np.split(objects[: 2 * CHANGED + MOVED], [CHANGED, 2 * CHANGED])
+    first, second = years(dataset, removed, added, moved)
+    with tempfile.TemporaryDirectory() as name:
+        folder, progress = Path(name), lambda *_: None
+        valuemap.write_dataset(first, folder / "first")
+        before = valuemap.build_map(first)
+        both = join_datasets(first, second)
+        valuemap.write_dataset(both, folder / "both")
+        with open_work(folder / "work", resume=False) as work:
+            from valuemap.robust import calibration_from_json
+
+            known = calibration_from_json(before.run["calibration"], source="before")
+            rebuilt, _ = build_map_of_folder(
+                folder / "both", MapConfig(), Run(work, ThreadEngine(0), calibration=known), progress=progress
+            )
+        result, changes, _ = compare(before, rebuilt, both, first.images.image_id)
+    place = dataset.truth.position_in_world_m
+    states = result.labels.state.texts() if result.labels.state is not None else []
+    labels = result.labels.position_in_world_m
+    kinds, where, was = changes.change.texts(), changes.position_in_world_m, changes.from_m
+
+    def near(points: np.ndarray[Any, Any], target: np.ndarray[Any, Any]) -> list[int]:
+        return np.flatnonzero(np.linalg.norm(points - target, axis=1) < 1.0).tolist() if len(points) else []
+
+    right = {
+        "removed": sum(any(kinds[i] == "removed" for i in near(where, place[o])) for o in removed),
+        "added": sum(any(states[i] == "new" for i in near(labels, place[o])) for o in added),
+        "moved": sum(any(states[i] == "moved" for i in near(labels, place[o] + [MOVED_BY_M, 0.0, 0.0])) for o in moved),
+    }
+    others = np.setdiff1d(np.arange(len(place)), objects[: 2 * CHANGED + MOVED])
+    touched = {i for o in [*removed, *added, *moved] for i in near(where, place[o])}
+    touched |= {i for o in moved for i in near(where, place[o] + [MOVED_BY_M, 0.0, 0.0])}
+    wrong = [kind for i, kind in enumerate(kinds) if i not in touched and kind in ("removed", "added", "moved")]
+    told = [changes.state.texts()[i] for o in [*removed, *added, *moved] for i in near(where, place[o])]
+    return {
+        "seed": seed,
+        "right": right,
+        "others": len(others),
+        "others_that_change": len(wrong),
+        "what_they_change_to": sorted(wrong),
+        "labels_before": len(before.labels),
+        "in_map_before": {
+            "removed": sum(bool(near(before.labels.position_in_world_m, place[o])) for o in removed),
+            "moved": sum(bool(near(before.labels.position_in_world_m, place[o])) for o in moved),
+        },
+        "states_of_changed": {state: told.count(state) for state in sorted(set(told))},
+        "moved_from_right": sum(bool(near(was[[k == "moved" for k in kinds]], place[o])) for o in moved),
+    }
+
+
+def years(dataset: Dataset, removed: Ints, added: Ints, moved: Ints) -> tuple[Dataset, Dataset]:
+    """Return every other pass as the first year and as the second, with what each shows."""
+    images, detections = dataset.images, dataset.detections
+    assert dataset.truth_detections is not None
+    assert dataset.truth is not None
+    object_of = np.full(len(detections), -1)
+    object_of[rows_of(dataset.truth_detections.detection_id, detections.detection_id)] = (
+        dataset.truth_detections.object_id
+    )
+    late = images.pass_id.codes % 2 == 1
+    image_row = rows_of(detections.image_id, images.image_id)
+    is_late = late[image_row]
+    is_seen = np.where(is_late, ~np.isin(object_of, removed), ~np.isin(object_of, added))
+    center = detections.center_px.copy()
+    shifted = np.flatnonzero(is_late & np.isin(object_of, moved))
+    rotation = rotation_matrices(images)[image_row[shifted]]
+    place = dataset.truth.position_in_world_m[object_of[shifted]]
+    pixel = []
+    for target in (place, place + [MOVED_BY_M, 0.0, 0.0]):
+        x, y, z = (np.einsum("nij,nj->ni", rotation, target) + images.cam_from_world_m[image_row[shifted]]).T
+        focal = dataset.cameras.params[0]
+        pixel.append(np.stack([focal[0] * x / z, focal[1] * y / z], axis=1))
+        is_seen[shifted[z < 4.0]] = False
+    center[shifted] += pixel[1] - pixel[0]
+    size = np.array([dataset.cameras.width_px[0], dataset.cameras.height_px[0]])
+    is_seen &= np.all((center >= 0.0) & (center <= size), axis=1)
+    detections = detections.replace(center_px=center)
+
+    def year(of: bool) -> Dataset:
+        return dataclasses.replace(
+            dataset,
+            images=images.take(np.flatnonzero(late == of)),
+            detections=detections.take(np.flatnonzero(is_seen & (is_late == of))),
+            truth=None,
+            truth_detections=None,
+        )
+
+    return year(False), year(True)
+
+
+PARTS = {"cells": cells, "kills": kills, "change": change}
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""Two Ray nodes on the loopback of this machine, with token authentication: maps on them are those of threads.
+
+Run by `test_ray.py` in a process of its own, as Ray leaves threads and warnings behind: python ray_cluster.py FOLDER.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "a" * 64}
+
+import ray
+from ray.cluster_utils import Cluster
+
+from valuemap.config import MapConfig
+from valuemap.engine.engine import Engine
+from valuemap.engine.ray import RayEngine
+from valuemap.engine.threads import ThreadEngine
+from valuemap.errors import ClusterError, InputError, ValuemapError
+from valuemap.map_folder import write_map
+from valuemap.pipeline import Run, build_map_of_folder
+from valuemap.progress import Progress
+from valuemap.tiles.work import open_work
+
+KNOWN = MapConfig(detection_sigma_px=1.5, position_sigma_m=0.05, rotation_sigma_deg=0.05)
+
+
+def mapped(folder: Path, engine: Engine, name: str, progress: Progress) -> dict[str, bytes]:
+    with open_work(folder / f"{name}.work", resume=False) as work:
+        result, cells = build_map_of_folder(folder / "street", KNOWN, Run(work, engine), progress=progress)
+        write_map(result, folder / name, cells=cells)
+    names = ["labels.parquet", "votes.parquet", "calibration.json"]
+    names += sorted(f"cells/{path.name}" for path in cells)
+    return {each: (folder / name / each).read_bytes() for each in names}
+
+
+def fails(number: int, _progress: Progress) -> int:
+    if number == 3:
+        raise InputError("the fourth cannot be", hint="leave it away")
+    return number
+
+
+def dies(path: str, _progress: Progress) -> int:
+    """End the worker with SIGKILL the first time."""
+    mark = Path(path)
+    if not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return 1
+
+
+def always_dies(_number: int, _progress: Progress) -> int:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return 0
+
+
+def main(folder: Path) -> None:
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "node_ip_address": "127.0.0.2"})
+    second = cluster.add_node(num_cpus=1, node_ip_address="127.0.0.3")
+    cluster.wait_for_nodes()
+    engine = RayEngine(cluster.address)
+    nodes = ray.nodes()  # type: ignore[no-untyped-call]
+    assert sum(node["Alive"] for node in nodes) == 2
+
+    expected = mapped(folder, ThreadEngine(2), "threads", lambda *_: None)
+    assert mapped(folder, engine, "ray", lambda *_: None) == expected
+    print("identical")
+
+    assert sorted(engine.run(dies, [str(folder / f"dead-{i}") for i in range(3)])) == [(0, 1), (1, 1), (2, 1)]
+    print("workers killed")
+    told = ""
+    try:
+        list(engine.run(fails, range(6)))
+    except ValuemapError as error:
+        told = str(error)
+    assert told == "the fourth cannot be", told
+    try:
+        list(engine.run(always_dies, range(1)))
+    except ClusterError as error:
+        told = str(error)
+    assert told.startswith("task 0 was lost 4 times"), told
+    print("failures told")
+
+    killed: list[Any] = []
+
+    def kill_a_node(what: str, done: int, _total: int) -> None:
+        if what == "cells" and done == 1 and not killed:
+            killed.append(second)
+            cluster.remove_node(second, allow_graceful=False)
+
+    assert mapped(folder, engine, "node-killed", kill_a_node) == expected
+    assert killed
+    print("node killed")
+    ray.shutdown()
+    cluster.shutdown()  # type: ignore[no-untyped-call]
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
