@@ -68,6 +68,11 @@ def test_shifts_of_passes_of_three_metres_are_found_to_three_decimetres() -> Non
     assert errors(faulty, clean)[0] > 2.0
     assert errors(refined.dataset, clean)[0] < 0.3
     assert len(refined.record["drives"]) >= 5
+    # The place of all stays: as many images are moved as far to one side as to the other, drive by drive.
+    drive = find_drives(faulty.images).pass_code
+    moved = camera_poses(refined.dataset.images)[1] - camera_poses(faulty.images)[1]
+    mean = np.stack([np.bincount(drive, weights=axis) / np.bincount(drive) for axis in moved.T], axis=1)
+    assert np.abs(mean.mean(axis=0)).max() < 0.3
 
 
 def test_cameras_mounted_askew_are_turned_back() -> None:

@@ -48,7 +48,7 @@ _MOST_UNRESOLVED = 0.25
 _LEAST_OF_DRIVE = 3
 """A drive that sees an object less often does not share it."""
 _LEAST_OF_PART = 2
-"""A leg, drive or camera that shares fewer objects stays as it is."""
+"""A drive or camera that shares fewer objects is turned, delayed and focused as given; one tells where a leg is."""
 _PLAUSIBLE = 3.0
 """What is more than so many deviations of what is thought possible is something else."""
 
@@ -101,7 +101,30 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
         values = np.zeros(index.shape)
         values[index >= 0] = sigma[index[index >= 0] - 3 * things]
         deviation.append(values)
-    return Selected(state, active, tuple(deviation), gain, chance, held_out)
+    constants = (_about_the_mean(footage, found, state.constants[OFFSET], active[OFFSET]), *state.constants[1:])
+    return Selected(replace(state, constants=constants), active, tuple(deviation), gain, chance, held_out)
+
+
+def _about_the_mean(footage: Footage, found: Estimate, offset: Floats, active: Bools) -> Floats:
+    """Return the offsets (L, 3) against their mean over all drives, weighted by what they claim.
+
+    Legs that stay as they are would else be taken for the truth, however little they tell of the place of the others:
+    the absolute position is the mean of all drives.
+    """
+    if not active.any():
+        return offset
+    leg = footage_legs(footage, found)
+    drive = footage.drives.pass_code
+    mean = np.stack([np.bincount(drive, weights=offset[leg, i]) / np.bincount(drive) for i in range(3)], axis=1)
+    sigma = np.full(len(mean), np.nan)
+    claimed = footage.dataset.images.position_sigma_m
+    if claimed is not None:
+        for number in range(len(mean)):
+            of_drive = claimed[(drive == number) & np.isfinite(claimed)]
+            sigma[number] = np.median(of_drive) if len(of_drive) else np.nan
+    usual = float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else 1.0
+    weight = np.nan_to_num(sigma, nan=usual) ** -2.0
+    return np.asarray(offset - weight @ mean / weight.sum())
 
 
 def _shared(footage: Footage, found: Estimate) -> Estimate | None:
@@ -127,9 +150,10 @@ def _shared(footage: Footage, found: Estimate) -> Estimate | None:
 def _told(seen: Observations, free: tuple[Bools, ...]) -> tuple[Bools, ...]:
     """Return which of the constants enough objects tell anything of."""
     told = []
-    for flags, of in zip(free, (seen.leg, seen.drive, seen.drive, seen.camera, seen.camera, seen.camera), strict=True):
-        objects = np.unique(np.stack([of, seen.thing]), axis=1)[0]
-        told.append(flags & (np.bincount(objects, minlength=len(flags)) >= _LEAST_OF_PART)[:, None])
+    parts = (seen.leg, seen.drive, seen.drive, seen.camera, seen.camera, seen.camera)
+    for kind, (flags, of) in enumerate(zip(free, parts, strict=True)):
+        objects = np.bincount(np.unique(np.stack([of, seen.thing]), axis=1)[0], minlength=len(flags))
+        told.append(flags & (objects >= (1 if kind == OFFSET else _LEAST_OF_PART))[:, None])
     return tuple(told)
 
 
