@@ -185,8 +185,9 @@ def main() -> int:
     try:
         if options.peers is not None:
             table = compare(options.data_root, options.only)
-            machine = ", ".join(f"{name} {value}" for name, value in describe_machine().items())
-            options.peers.write_text(f"{PEERS_HEAD.strip()}\n\nOn {machine}.\n\n{table}", encoding="utf-8")
+            machine = describe_machine()["machine"]
+            where = f"On {machine['cores']} cores of {machine['cpu']}."
+            options.peers.write_text(f"{PEERS_HEAD.strip()}\n\n{where}\n\n{table}", encoding="utf-8")
             print(table)
             return 0
         config = MapConfig(method=options.method).with_settings(options.settings)
