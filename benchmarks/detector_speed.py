@@ -1,4 +1,4 @@
-"""How many pictures a second a detector gets through, from the files on disk to boxes, and whether memory stays flat.
+"""How many pictures per second a detector gets through, from the files on disk to boxes, and whether memory stays flat.
 
     python benchmarks/detector_speed.py MODEL.onnx PICTURES [--size SIZE] [--count N] [--batch N] [--json FILE]
 

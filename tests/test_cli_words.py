@@ -21,6 +21,7 @@ from valuemap.cli.simulate import Preset
 from valuemap.config import list_settings
 from valuemap.dataset import write_dataset
 from valuemap.map_folder import write_map
+from valuemap.pipeline import build_map
 from valuemap.readers.detections import DETECTIONS
 from valuemap.readers.poses import AXES, Axes
 from valuemap.simulate import PRESETS
@@ -93,6 +94,12 @@ def test_json_has_numbers_as_numbers(tmp_path: Path) -> None:
     settings = json.loads(run("settings", "--json").stdout)
     assert settings == list_settings()
     assert {"name": "min_votes", "default": 3}.items() <= next(s for s in settings if s["name"] == "min_votes").items()
+
+
+def test_recall_is_what_a_map_has_and_a_detector_has_a_rate() -> None:
+    counts = build_map(small_dataset()).run["counts"]
+    assert 0.0 < counts["detection_rate"] < 1.0
+    assert [name for name in counts if "recall" in name] == []
 
 
 class Terminal:

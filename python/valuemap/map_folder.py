@@ -56,7 +56,7 @@ class Map:
     """Labels with their evidence, in the frame of the dataset they come from.
 
     `run` is what run.json holds: version, dataset, settings, counts of everything found and rejected, and
-    seconds and peak memory a stage. `corrected` is the dataset with the poses and cameras that the labels were
+    seconds and peak memory per stage. `corrected` is the dataset with the poses and cameras that the labels were
     found with, where those that were given had faults and it was just mapped; None else.
     """
 

@@ -111,6 +111,10 @@ def calibrate_noise(scene: Scene, config: MapConfig, *, threads: int = 0, progre
     return _all_own(noise) if "shared_noise" in LEFT_OUT else noise
 
 
+_COUNTED_AS = {"recall": "detection_rate", "recall_concentration": "detection_rate_concentration"}
+"""The share of the looks in which a detector sees what is there is no recall: that is a map's, against truth."""
+
+
 def find_labels(
     scene: Scene, noise: Calibration, config: MapConfig, *, threads: int = 0, progress: Progress = silent
 ) -> tuple[Candidates, dict[str, Any]]:
@@ -123,6 +127,7 @@ def find_labels(
         lambda done, total: progress("finding labels", min(done, total), total),
     )
     covariance = covariance.reshape(-1, 3, 3)
+    counts = {_COUNTED_AS.get(name, name): value for name, value in counts.items()}
     return Candidates(position, offsets, voters, None, covariance, existence, expected), counts
 
 

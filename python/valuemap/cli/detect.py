@@ -78,7 +78,7 @@ def detect_command(
         {
             **{name.replace("_", " "): value for name, value in counts.items()},
             "classes": ", ".join(f"{name} {number}" for name, number in found.items()),
-            "pictures a second": record["pictures_a_second"] or "-",
+            "pictures per second": record["pictures_a_second"] or "-",
         }
     )
     for unusable in record["unusable"][:SHOWN_PROBLEMS]:

@@ -18,7 +18,9 @@ from valuemap.map_folder import REVIEW, Map, read_map
 from valuemap.review import apply_review, read_review
 from valuemap.writers import SUFFIXES, export_map, without_password
 
-Format = Literal["csv", "geojson", "parquet", "gpkg", "fgb", "kml", "osm", "maproulette", "lanelet2", "xodr", "colmap"]
+Format = Literal[
+    "csv", "geojson", "parquet", "gpkg", "fgb", "kml", "osm", "maproulette", "lanelet2", "xodr", "rerun", "colmap"
+]
 
 _SHOWN_IDS = 10
 

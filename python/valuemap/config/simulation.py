@@ -256,7 +256,7 @@ class SimulationConfig:
 
     # Detections of other things.
     clutter_per_image: float = declare(
-        0.05, unit="boxes", effect="mean number of random false boxes an image, each in one image only"
+        0.05, unit="boxes", effect="mean number of random false boxes per image, each in one image only"
     )
     reflections_per_1000_images: float = declare(
         0.6,

@@ -42,7 +42,7 @@ class Fit:
 
     @property
     def scale(self) -> Floats:
-        """Canvas pixels a picture pixel, x and y."""
+        """Canvas pixels per picture pixel, x and y."""
         return np.array(self.resized, np.float64) / np.array(self.picture, np.float64)
 
     def to_canvas(self, boxes: Boxes) -> Boxes:

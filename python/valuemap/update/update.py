@@ -98,9 +98,9 @@ def compare(
     evidence = Evidence(replace(rebuilt, labels=all_labels, votes=all_votes), joined)
     drives = find_drives(joined.images, viewpoint_step_m=evidence.max_range_m * VIEWPOINT_SHARE)
     is_new = ~np.isin(joined.images.image_id, images_before)
-    recall = rebuilt.run["counts"].get("recall", 0.5)
+    detection_rate = rebuilt.run["counts"].get("detection_rate", 0.5)
     near = cKDTree(evidence.center_in_world_m[is_new]).query(all_labels.position_in_world_m)[0]
-    lookout = Lookout(evidence, drives, is_new, recall)
+    lookout = Lookout(evidence, drives, is_new, detection_rate)
     done = 0
 
     def looks_at(label_id: int) -> tuple[Looks, Looks]:
