@@ -71,7 +71,7 @@ def city(preset: str, seed: int = 0) -> Dataset:
     """Return a simulated city."""
     if preset == "block":
         nyc = PRESETS["nyc"]
-        small = {"streets_north_south": 9, "streets_east_west": 8, "lights": 60, "images": 8_000, "detections": 0}
+        small = {"streets_north_south": 8, "streets_east_west": 7, "lights": 40, "images": 4_000, "detections": 0}
         return simulate(dataclasses.replace(nyc, **small), seed=seed, name="block")
     return simulate(PRESETS[preset], seed=seed, name=preset)
 
