@@ -413,6 +413,11 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path: Path, finder: Pa
 def test_a_model_that_cannot_be_run_is_one_clear_line_and_leaves_nothing_behind(
     dataset: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
+    # Half of another colour: the model looks for nothing in plain pictures.
+    for path in (dataset / "images").rglob("*.jpg"):
+        with Image.open(path) as picture:
+            width, height = picture.size
+        save(path, painted((width, height), [(0, 0, width, height // 2)]), format="PNG")
     with pytest.raises(InputError, match="cannot be run on a batch of 1, 100 x 50 px") as refusal:
         detect_dataset(dataset, BUNDLED_MODEL, DetectConfig(size="100x50"))
     assert "multiples of 32" in refusal.value.hint
