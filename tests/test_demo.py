@@ -19,8 +19,8 @@ def test_the_demo_goes_from_pictures_to_a_map(
     monkeypatch.setattr(demo, "run_demo", partial(demo.run_demo, config=few))
     app(["demo", "--out", str(tmp_path / "demo")], standalone_mode=False)
     told = capsys.readouterr().out
-    assert "recall at IoU 0.3" in told
-    assert "position_rmse_m" in told
+    assert "detection rate at IoU 0.3" in told
+    assert "position rmse m" in told
     dataset = valuemap.read_dataset(tmp_path / "demo" / "dataset")
     assert len(list((tmp_path / "demo" / "dataset" / "images").rglob("*.jpg"))) == len(dataset.images) == 60
     assert len(dataset.detections) > 20

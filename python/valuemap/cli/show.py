@@ -27,7 +27,7 @@ _TOLD_AS = {
 
 # Names of users are no markup: a class may be called [/].
 out = Console(markup=False, emoji=False)
-log = Console(stderr=True, markup=False, emoji=False)
+log = Console(stderr=True, markup=False, emoji=False, soft_wrap=True)
 
 
 def show(facts: Mapping[str, Any], *, title: str | None = None) -> None:
