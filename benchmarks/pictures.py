@@ -12,6 +12,7 @@ with the true poses and with those found.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import subprocess
 import sys
 import tempfile
@@ -105,13 +106,24 @@ def run(work: Path, seed: int, pass_row: int, count: int, gps_sigma_m: float) ->
         **compare_poses(true, read_dataset(found)),
         "import_seconds": round(seconds, 1),
     }
+    valuemap("detect", str(truth), "--images", str(photos), "--model", "bundled")
+    write_dataset(with_detections(read_dataset(found), read_dataset(truth)), found, force=True)
     for dataset in (truth, found):
-        valuemap("detect", str(dataset), "--images", str(photos), "--model", "bundled")
         valuemap("map", str(dataset), "--out", str(dataset.with_name(f"{dataset.name}-map")), "--force")
     lights = recording.city.lights.position_in_world_m
     judged = {dataset.name: judge(dataset, lights) for dataset in (truth, found)}
     ratio = judged["found"]["recall"] / max(judged["truth"]["recall"], 1e-9)
     return {**result, "map": judged, "recall_over_that_of_true_poses": round(ratio, 3)}
+
+
+def with_detections(found: Dataset, detected: Dataset) -> Dataset:
+    """Return a dataset with what was detected in the same pictures of another: a detector knows nothing of poses."""
+    id_of = dict(zip(found.images.name.to_pylist(), found.images.image_id.tolist(), strict=True))
+    named = zip(detected.images.image_id.tolist(), detected.images.name.to_pylist(), strict=True)
+    new_id = {image_id: id_of[name] for image_id, name in named if name in id_of}
+    boxes = detected.detections.take(np.isin(detected.detections.image_id, list(new_id)))
+    ids = np.array([new_id[image_id] for image_id in boxes.image_id.tolist()], dtype=np.int64)
+    return dataclasses.replace(found, detections=boxes.replace(image_id=ids))
 
 
 def valuemap(*arguments: str) -> None:

@@ -27,6 +27,7 @@ _WHOLE_STEPS = 5
 _DAMPING = (1e-6, 1e-12, 1e3)
 """At first, at least and at most."""
 _LEAST_SIGMA_PX = 0.2
+_NEAREST_M = 0.3
 _CAUCHY, _BEHIND = 2.5, 30.0
 _HEIGHT_SHARE = 2.0
 _FOCAL_SHARE, _GUESSED_FOCAL_SHARE, _DISTORTION_SIGMA = 0.05, 0.5, 0.2
@@ -154,11 +155,11 @@ def _in_camera(sights: Sights) -> Floats:
 
 
 def _project(sights: Sights, in_cam: Floats) -> Floats:
-    """Return pixels (M, 2); NaN behind the camera."""
+    """Return pixels (M, 2); NaN behind the camera, or so near before it that no street has anything there."""
     pixel = np.full((len(in_cam), 2), np.nan)
     of = sights.camera_id[sights.image]
     for camera_id, camera in sights.cameras.items():
-        rows = np.flatnonzero((of == camera_id) & (in_cam[:, 2] > 0.0))
+        rows = np.flatnonzero((of == camera_id) & (in_cam[:, 2] > _NEAREST_M))
         if len(rows):
             pixel[rows] = camera.img_from_cam(in_cam[rows])
     return pixel

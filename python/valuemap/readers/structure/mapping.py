@@ -30,6 +30,8 @@ from valuemap.tables import Bools, Floats, Ints
 
 LEAST_IMAGES = 3
 _LEAST_INLIERS = 20
+_LEAST_MATCHES = 30
+"""Of a pair. Two pictures of different houses with windows alike may agree in 25 features."""
 _GPS_SIGMAS = 7.0
 _LEAST_POINTS, _SHARED_POINTS = 10, 8
 _ROUNDS = 2
@@ -113,6 +115,7 @@ def _options(job: Job, threads: int) -> Any:
     options.use_robust_loss_on_prior_position = False
     options.extract_colors = False
     options.min_model_size = LEAST_IMAGES
+    options.min_num_matches = _LEAST_MATCHES
     options.constant_cameras = {number + 1 for number in range(len(job.cameras))}
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
@@ -216,7 +219,9 @@ def _triangulated(
 ) -> pycolmap.Reconstruction:
     """Return one model of all poses, with points made from the matches."""
     with pycolmap.Database.open(workspace / DATABASE) as database:
-        cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
+        which = pycolmap.DatabaseCacheOptions()
+        which.min_num_matches = _LEAST_MATCHES
+        cache = pycolmap.DatabaseCache.create(database, which)
     model = pycolmap.Reconstruction()
     model.load(cache)
     for camera_id, camera in whole.cameras.items():
