@@ -391,6 +391,13 @@ def test_garbage_never_ends_in_anything_but_an_input_error(model_dir: Path, coco
     assert path.name in refusal(lambda: read_colmap(model_dir, detections=coco))
 
 
+def test_a_camera_of_impossible_size_is_refused(model_dir: Path, coco: Path) -> None:
+    path = model_dir / "cameras.bin"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:16] + struct.pack("<Q", 2**64 - 1) + whole[24:])
+    assert "is no size of a picture" in refusal(lambda: read_colmap(model_dir, detections=coco))
+
+
 def test_folders_that_are_no_model(tmp_path: Path, model_dir: Path, coco: Path) -> None:
     assert "no such folder" in refusal(lambda: read_colmap(tmp_path / "absent", detections=coco))
     assert "no such folder" in refusal(lambda: read_colmap(coco, detections=coco))

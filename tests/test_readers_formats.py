@@ -33,6 +33,7 @@ from valuemap.readers.mapillary import read_mapillary
 from valuemap.readers.nuscenes import read_nuscenes
 from valuemap.readers.opensfm import read_opensfm
 from valuemap.readers.panoramax import read_panoramax
+from valuemap.readers.poses import interpolate_poses
 from valuemap.readers.tum import read_tum
 from valuemap.tables import Floats
 
@@ -698,6 +699,17 @@ def test_panoramax(tmp_path: Path) -> None:
     assert by_key.frame.anchor == (LAT, LON, 0.0)
     away = enu_from_lon_lat_height(np.array([[LON + 1e-4, LAT, 0.0]]), (LAT, LON, 0.0))
     assert_allclose(camera_centers(by_key.images)[1], away[0], atol=1e-9)
+
+
+def test_poses_without_numbers_are_not_interpolated() -> None:
+    rotation = np.array([np.eye(3), np.full((3, 3), np.nan), np.eye(3)])
+    times, center = np.array([0, 10, 20]), np.array([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]])
+    _, between, usable = interpolate_poses(np.array([5, 15]), times, rotation, center, 100)
+    assert usable.all()
+    assert_allclose(between[:, 0], [0.5, 1.5])
+    _, nowhere, usable = interpolate_poses(np.array([5]), times[1:2], rotation[1:2], center[1:2], 100)
+    assert not usable.any()
+    assert np.isnan(nowhere).all()
 
 
 # What all must refuse, each in one line.

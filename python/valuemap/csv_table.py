@@ -48,12 +48,12 @@ def read_csv_arrow(
             table = _parse_csv(content, separator, options)
         except pa.ArrowInvalid:
             table = _parse_odd_csv(content, separator, options, bad_numbers_are_nan)
+        exact = {name.strip() for name in table.column_names}
+        same = {name.lower(): name for name in types if name not in exact}
+        return table.rename_columns([same.get(name.strip().lower(), name.strip()) for name in table.column_names])
     except (pa.ArrowException, OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"{path}: cannot be read as CSV: {reason}", hint=hint) from error
-    exact = {name.strip() for name in table.column_names}
-    same = {name.lower(): name for name in types if name not in exact}
-    return table.rename_columns([same.get(name.strip().lower(), name.strip()) for name in table.column_names])
 
 
 def _read_text_bytes(path: Path, hint: str) -> bytes:

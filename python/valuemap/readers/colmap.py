@@ -20,6 +20,8 @@ from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.names import match_images
 from valuemap.tables import Cameras, Categories, Images, Ints
 
+_LARGEST_PX = 2**31
+
 
 def read_colmap(
     model_dir: Path,
@@ -82,6 +84,12 @@ def _read_model(model_dir: Path, pass_from: str) -> tuple[Cameras, Images]:
             hint="is this the folder of a finished reconstruction?",
         )
     names = [image.name for image in images]
+    for camera in cameras:
+        if not 0 < max(camera.width, camera.height) < _LARGEST_PX:
+            raise InputError(
+                f"{model_dir}: camera {camera.camera_id}: {camera.width} x {camera.height} px is no size of a picture",
+                hint="is the file whole? Export the model again",
+            )
     return (
         Cameras(
             camera_id=np.array([camera.camera_id for camera in cameras], dtype=np.int64),

@@ -243,8 +243,14 @@ def interpolate_poses(
     """Return rotations (N, 3, 3) and centres (N, 3) at times (N) between known poses, and which there are (N).
 
     Poses turn about one axis and move straight between neighbours. There is none outside the known times, nor in gaps
-    longer than `longest`, in which it may have been anywhere. Known times (M) are in any order, and distinct.
+    longer than `longest`, in which it may have been anywhere. Known times (M) are in any order, and distinct; poses
+    that hold no numbers are not known.
     """
+    fine: Bools = np.asarray(np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(center_m).all(axis=1))
+    if not fine.any():
+        count = len(time)
+        return np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan), np.zeros(count, dtype=np.bool_)
+    known_time, rotation, center_m = known_time[fine], rotation[fine], center_m[fine]
     order = np.argsort(known_time, kind="stable")
     known, rotations, centers = known_time[order], Rotation.from_matrix(rotation[order]), center_m[order]
     after = np.clip(np.searchsorted(known, time), 1 if len(known) > 1 else 0, len(known) - 1)
