@@ -81,7 +81,7 @@ const CALIBRATION_RAYS: (usize, usize) = (4_000, 10_000);
 /// How much wider the gate is while the noise is estimated: what a gate cuts off is missing in the estimate.
 const CALIBRATION_GATE: f64 = 1.4;
 /// Times that the noise is estimated anew, from labels found with the last estimate.
-const CALIBRATION_ROUNDS: usize = 2;
+const CALIBRATION_ROUNDS: usize = 3;
 /// The noise is sought from starts that differ by these factors.
 const STARTS: [f64; 5] = [0.15, 0.5, 1.5, 5.0, 15.0];
 /// Scenes with more rays than this are searched less deeply.
@@ -148,21 +148,16 @@ pub fn self_calibrate(
         let again = calibrate::calibrate(scene, noise, &placed(&objects), known);
         Ok((likelihood(&model, &objects, rays), again))
     };
-    // From each start one step; from the likeliest the others.
+    // From each start some steps: it takes one to learn what passes disagree about, and another to see what that explains.
     let few = sample::places(scene, CALIBRATION_RAYS.0, settings.viability.max_range_m);
     let mut likeliest = Likeliest::default();
-    let mut noise = *guess;
     for factor in STARTS {
-        let start = guess.scaled(factor, known);
-        let (value, again) = round(&start, &few)?;
-        if likeliest.offer(value, start) {
+        let mut noise = guess.scaled(factor, known);
+        for _ in 0..CALIBRATION_ROUNDS {
+            let (value, again) = round(&noise, &few)?;
+            likeliest.offer(value, noise);
             noise = again;
         }
-    }
-    for _ in 0..CALIBRATION_ROUNDS {
-        let (value, again) = round(&noise, &few)?;
-        likeliest.offer(value, noise);
-        noise = again;
     }
     // What more rays tell is taken if it makes them likelier.
     let more = sample::places(scene, CALIBRATION_RAYS.1, settings.viability.max_range_m);
@@ -187,13 +182,11 @@ struct Likeliest {
 }
 
 impl Likeliest {
-    /// Keep a noise if it is likelier, `value` minus twice the logarithm; whether it is.
-    fn offer(&mut self, value: f64, noise: Noise) -> bool {
-        let is_better = self.noise.is_none() || value < self.value;
-        if is_better {
+    /// Keep a noise if it is likelier, `value` minus twice the logarithm.
+    fn offer(&mut self, value: f64, noise: Noise) {
+        if self.noise.is_none() || value < self.value {
             (self.noise, self.value) = (Some(noise), value);
         }
-        is_better
     }
 }
 
