@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,13 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from block import block
 from valuemap.cameras import camera_centers, colmap_camera, rotation_matrices
 from valuemap.config import SimulationConfig
-from valuemap.dataset import Dataset, check_dataset, read_dataset, write_dataset
+from valuemap.dataset import Dataset, check_dataset, read_dataset, rows_of, write_dataset, write_dataset_in_pieces
 from valuemap.errors import SettingError
 from valuemap.progress import silent
-from valuemap.simulate import PRESETS, build_city, record_city, simulate
+from valuemap.simulate import PRESETS, build_city, record_city, simulate, simulate_districts
 from valuemap.simulate.detector import KINDS
 from valuemap.simulate.drives import Frames, drive
 from valuemap.simulate.paths import lay_path
@@ -737,3 +738,41 @@ def test_the_docs_list_every_setting_as_it_is() -> None:
         for s in fields(SimulationConfig)
     ]
     assert [row for row in rows if row not in docs] == []
+
+
+def test_districts_are_cities_side_by_side_one_after_the_other(tmp_path: Path) -> None:
+    config = replace(block(), districts=3)
+    alone = simulate(block(), seed=5)
+    write_dataset_in_pieces(simulate_districts(config, seed=5), tmp_path / "city")
+    city = read_dataset(tmp_path / "city")  # Ids are unique, and what they refer to is there.
+    assert city.truth is not None
+    assert city.truth_detections is not None
+    assert alone.truth is not None
+    for part, whole in ((alone.images, city.images), (alone.detections, city.detections), (alone.truth, city.truth)):
+        first = (
+            table_to_arrow(whole)
+            .slice(0, len(part))
+            .drop_columns([n for n in ("name", "pass_id", "class") if n in table_to_arrow(whole).column_names])
+        )
+        assert first.equals(table_to_arrow(part).select(first.column_names))
+    assert len(set(city.images.name.to_pylist())) == len(city.images)
+    # Objects are seen where they are, in all districts.
+    image = rows_of(city.detections.image_id, city.images.image_id)
+    image = image[rows_of(city.truth_detections.detection_id, city.detections.detection_id)]
+    place = city.truth.position_in_world_m[city.truth_detections.object_id]
+    x, y, z = (
+        np.einsum("nij,nj->ni", rotation_matrices(city.images)[image], place) + city.images.cam_from_world_m[image]
+    ).T
+    f, _, cx, cy = city.cameras.params[0]
+    pixel = np.stack([f * x / z + cx, f * y / z + cy], axis=1)
+    seen = city.detections.center_px[rows_of(city.truth_detections.detection_id, city.detections.detection_id)]
+    assert np.quantile(np.linalg.norm(pixel - seen, axis=1), 0.9) < 10.0
+    # Each is a city of its own, a block away from the next.
+    east_m, north_m = np.array([2 * config.block_east_m, 2 * config.block_north_m])
+    district = np.array([int(name[len("district-")]) for name in city.images.pass_id.names])[city.images.pass_id.codes]
+    center = [camera_centers(city.images)[district == number] for number in range(3)]
+    assert np.allclose(center[1].mean(axis=0) - center[0].mean(axis=0), [east_m, 0.0, 0.0], atol=20.0)
+    assert np.allclose(center[2].mean(axis=0) - center[0].mean(axis=0), [0.0, north_m, 0.0], atol=20.0)
+    assert len({len(part) for part in center}) > 1
+    with pytest.raises(SettingError, match="only one can be held"):
+        simulate(config, seed=5)

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,7 @@ from valuemap.tables import (
     Ints,
     RejectedRows,
     Table,
+    TableWriter,
     Truth,
     TruthDetections,
     check_table,
@@ -199,21 +202,33 @@ def write_dataset(dataset: Dataset, path: str | Path, *, force: bool = False) ->
     Other files in the folder stay. Where one that valuemap did not write is in the way, an `OutputError` says so; with
     `force` it is replaced.
     """
-    dataset = check_dataset(dataset, source=dataset.name)
-    with new_folder(Path(path), parts=PARTS, part_folders=PART_FOLDERS, force=force) as folder:
-        head = {"format_version": FORMAT_VERSION, "name": dataset.name, "frame": dataset.frame.to_json()}
-        (folder / MARKER).write_text(json.dumps(head, indent=2) + "\n", encoding="utf-8")
-        tables: dict[str, Table | None] = {
-            "cameras": dataset.cameras,
-            "images": dataset.images,
-            "detections": dataset.detections,
-            "truth": dataset.truth,
-            "truth_detections": dataset.truth_detections,
-            "rejected": dataset.rejected,
-        }
-        for name, table in tables.items():
-            if table is not None:
-                write_table(table, folder / f"{name}.parquet")
+    write_dataset_in_pieces([check_dataset(dataset, source=dataset.name)], path, force=force)
+
+
+def write_dataset_in_pieces(pieces: Iterable[Dataset], path: str | Path, *, force: bool = False) -> None:
+    """Write pieces of a dataset, at least one, one after the other as `write_dataset`: only one is held at a time.
+
+    Name, frame and cameras are those of the first piece, which the others must have too. Ids of all tables ascend from
+    piece to piece, and what a piece refers to is in it. All pieces have the same tables and columns.
+    """
+    with new_folder(Path(path), parts=PARTS, part_folders=PART_FOLDERS, force=force) as folder, ExitStack() as opened:
+        writers: dict[str, TableWriter] = {}
+        for number, piece in enumerate(pieces):
+            piece = ensure_checked(piece)
+            if number == 0:
+                head = {"format_version": FORMAT_VERSION, "name": piece.name, "frame": piece.frame.to_json()}
+                (folder / MARKER).write_text(json.dumps(head, indent=2) + "\n", encoding="utf-8")
+                write_table(piece.cameras, folder / "cameras.parquet")
+            for name, table in _tables_of(piece).items():
+                if number == 0:
+                    writers[name] = opened.enter_context(TableWriter(folder / f"{name}.parquet"))
+                writers[name].write(table)
+
+
+def _tables_of(dataset: Dataset) -> dict[str, Table]:
+    """Return the tables of a dataset, but for its cameras, by their names on disk."""
+    names = ("images", "detections", "truth", "truth_detections", "rejected")
+    return {name: table for name in names if (table := getattr(dataset, name)) is not None}
 
 
 def check_dataset(dataset: Dataset, *, source: str, are_boxes_checked: bool = True) -> Dataset:

@@ -624,10 +624,34 @@ def table_to_arrow(table: Table) -> pa.Table:
 
 def write_table(table: Table, path: Path) -> None:
     """Write a table as Parquet (zstd); the same table gives the same bytes."""
-    # Dictionaries of all columns made the votes of a large city 10 % larger, and took twice as long to write.
-    texts = [name for f in fields(table) if f.metadata["kind"] == "category" for name in f.metadata["names"]]
-    with path.open("wb") as file:  # Arrow takes no path that is not UTF-8.
-        pq.write_table(table_to_arrow(table), file, compression="zstd", use_dictionary=texts)
+    with TableWriter(path) as writer:
+        writer.write(table)
+
+
+class TableWriter:
+    """Writes a table as Parquet, parts of it one after the other; the first says which columns there are."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __enter__(self) -> Self:
+        self._writer: pq.ParquetWriter | None = None
+        self._file = self._path.open("wb")  # Arrow takes no path that is not UTF-8.
+        return self
+
+    def write(self, table: Table) -> None:
+        """Write the next rows."""
+        rows = table_to_arrow(table)
+        if self._writer is None:
+            # Dictionaries of all columns made the votes of a large city 10 % larger, and took twice as long to write.
+            texts = [n for f in fields(table) if f.metadata["kind"] == "category" for n in f.metadata["names"]]
+            self._writer = pq.ParquetWriter(self._file, rows.schema, compression="zstd", use_dictionary=texts)
+        self._writer.write_table(rows)
+
+    def __exit__(self, *_: object) -> None:
+        with self._file:
+            if self._writer is not None:
+                self._writer.close()
 
 
 def _take(value: Any, rows: NDArray[Any]) -> Any:

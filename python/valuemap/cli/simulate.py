@@ -7,11 +7,12 @@ from typing import Annotated, Literal
 import typer
 
 from valuemap.cli.app import app, on_interrupt
-from valuemap.cli.import_.app import check_out, finish_dataset
+from valuemap.cli.import_.app import check_out, finish_dataset, finish_dataset_of_pieces
 from valuemap.cli.options import AsJson, DatasetOut, Force, Settings
 from valuemap.cli.show import log, progress_bars
+from valuemap.dataset import write_dataset_in_pieces
 
-Preset = Literal["small", "sf", "nyc"]
+Preset = Literal["small", "sf", "nyc", "10x-nyc"]
 
 
 @app.command("simulate")
@@ -27,12 +28,19 @@ def simulate_command(
     as_json: AsJson = False,
 ) -> None:
     """Simulate a city, drives through it and a noisy detector, with truth."""
-    from valuemap.simulate import PRESETS, record_city
+    from valuemap.simulate import PRESETS, record_city, simulate_districts
 
     check_out(out, force=force)
     config = PRESETS[preset].with_settings(assignments or [])
     if images:
         config.check_drawable()
+    if config.districts > 1:
+        with progress_bars() as progress:
+            write_dataset_in_pieces(
+                simulate_districts(config, seed=seed, name=preset, progress=progress), out, force=force
+            )
+        finish_dataset_of_pieces(out, as_json=as_json)
+        return
     with progress_bars() as progress:
         recording = record_city(config, seed=seed, name=preset, progress=progress)
     finish_dataset(recording.dataset, out, force=force, as_json=as_json)

@@ -90,6 +90,14 @@ class SimulationConfig:
         effect="deviation of the middle of an object's box from its centre, another way from each side",
     )
 
+    districts: int = declare(
+        1,
+        unit="cities",
+        low=1,
+        effect="so many cities side by side, each of its own seed and written before the next, so that any number of "
+        "them takes the memory of one; the other settings are those of each",
+    )
+
     # The drives.
     passes_per_street: int = declare(
         2,
@@ -394,7 +402,7 @@ class SimulationConfig:
     def check_drawable(self) -> None:
         """Raise `SettingError` where pictures could not show what is simulated."""
         rows = ("sign_row_spacing_m", "lamp_spacing_m", "tree_spacing_m", "post_spacing_m")
-        for name in (*rows, "side_offset_m", "partly_hidden_share", "cameras"):
+        for name in (*rows, "side_offset_m", "partly_hidden_share", "cameras", "districts"):
             default = getattr(SimulationConfig, name)
             if getattr(self, name) != default:
                 raise SettingError(

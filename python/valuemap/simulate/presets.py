@@ -1,6 +1,8 @@
-"""Ready-made cities: a small one to try things, and two of the size and kind of the paper's data."""
+"""Ready-made cities: a small one to try things, two of the size and kind of the paper's data, and one beyond them."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 from valuemap.config import SimulationConfig
 
@@ -52,3 +54,4 @@ PRESETS: dict[str, SimulationConfig] = {
     ),
 }
 """Settings by the name that `valuemap simulate --preset` takes."""
+PRESETS["10x-nyc"] = replace(PRESETS["nyc"], districts=10)

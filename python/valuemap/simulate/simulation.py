@@ -81,6 +81,11 @@ def record_city(
     """
     if seed < 0:
         raise SettingError(f"seed: expected at least 0, found {seed}", hint="for example --seed 1")
+    if config.districts > 1:
+        raise SettingError(
+            f"districts ({config.districts}): only one can be held at a time",
+            hint="valuemap simulate, and simulate_districts in Python, make them one after the other",
+        )
     city = build_city(config, seed=seed)
     exposures = drive(city, config, seed=seed, progress=progress)
     errors = pose_errors(exposures, config, seed=seed)

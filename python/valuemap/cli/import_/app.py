@@ -10,8 +10,9 @@ import typer
 
 from valuemap.cli.app import app
 from valuemap.cli.show import log, show, show_notes
-from valuemap.dataset import PARTS, Dataset, write_dataset
+from valuemap.dataset import PARTS, Dataset, read_head, write_dataset
 from valuemap.folders import check_place
+from valuemap.portions import rows_on_disk
 from valuemap.readers.vet import count_reasons
 from valuemap.summary import summarize_dataset
 from valuemap.tables import RejectedRows
@@ -38,6 +39,17 @@ def finish_dataset(dataset: Dataset, out: Path, *, force: bool, as_json: bool) -
         show(facts)
     if dataset.rejected is not None:
         show_notes(_rejected_lines(dataset.rejected, out))
+    log.print(f"Wrote {out}", highlight=False)
+
+
+def finish_dataset_of_pieces(out: Path, *, as_json: bool) -> None:
+    """Say how large a dataset is that was written in pieces, as it may not fit into memory."""
+    images, detections = rows_on_disk(out)
+    facts = {"dataset": read_head(out)["name"], "images": images, "detections": detections}
+    if as_json:
+        print(json.dumps(facts, indent=2))
+    else:
+        show(facts)
     log.print(f"Wrote {out}", highlight=False)
 
 
