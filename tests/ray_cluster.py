@@ -11,20 +11,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
-os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "a" * 64}
-
-import ray
-from ray.cluster_utils import Cluster
-
 from valuemap.config import MapConfig
 from valuemap.engine.engine import Engine
-from valuemap.engine.ray import RayEngine
+from valuemap.engine.ray import RayEngine, import_ray
 from valuemap.engine.threads import ThreadEngine
 from valuemap.errors import ClusterError, InputError, ValuemapError
 from valuemap.map_folder import write_map
 from valuemap.pipeline import Run, build_map_of_folder
 from valuemap.progress import Progress
 from valuemap.tiles.work import open_work
+
+os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "a" * 64}
+ray = import_ray()
 
 KNOWN = MapConfig(detection_sigma_px=1.5, position_sigma_m=0.05, rotation_sigma_deg=0.05)
 
@@ -59,12 +57,13 @@ def always_dies(_number: int, _progress: Progress) -> int:
 
 
 def main(folder: Path) -> None:
+    from ray.cluster_utils import Cluster
+
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "node_ip_address": "127.0.0.2"})
     second = cluster.add_node(num_cpus=1, node_ip_address="127.0.0.3")
     cluster.wait_for_nodes()
     engine = RayEngine(cluster.address)
-    nodes = ray.nodes()  # type: ignore[no-untyped-call]
-    assert sum(node["Alive"] for node in nodes) == 2
+    assert sum(node["Alive"] for node in ray.nodes()) == 2
 
     expected = mapped(folder, ThreadEngine(2), "threads", lambda *_: None)
     assert mapped(folder, engine, "ray", lambda *_: None) == expected

@@ -29,6 +29,7 @@ from valuemap.readers.pictures import read_pictures
 from valuemap.readers.poses import LOOKING_NORTH
 from valuemap.readers.structure import Picture, Posed, find_poses, process
 from valuemap.readers.structure.adjust import Sights, adjust, gps_inflation
+from valuemap.readers.structure.features import find_features, image_ids
 from valuemap.readers.structure.job import Job, prepare, read_answer, read_job, write_answer
 from valuemap.readers.structure.mapping import contradicts_gps
 from valuemap.readers.structure.pairs import pairs_to_match
@@ -128,6 +129,27 @@ def test_gps_errors_that_follow_each_other_count_for_less() -> None:
     assert 3.0 < gps_inflation(walk, one).min() < 6.0
     assert_allclose(gps_inflation(walk[:10], one[:10]), 1.0)
     assert gps_inflation(3.0 * white, one).min() > 2.5
+
+
+# Features.
+
+
+def test_pictures_have_the_same_numbers_whoever_is_done_first(tmp_path: Path) -> None:
+    """Two threads: the first picture is full of features, the others are blank; the third is no picture."""
+    random, rows = np.random.default_rng(0), []
+    for i in range(5):
+        path = tmp_path / "photos" / f"{i}.jpg"
+        path.parent.mkdir(exist_ok=True)
+        pixels = texture(random, 400, 300) if i == 0 else np.zeros((300, 400), np.uint8)
+        path.write_bytes(b"no picture") if i == 2 else Image.fromarray(pixels).save(path)
+        rows.append(Picture(path.name, path, 0, np.array([10.0 * i, 0.0, 0.0]), 1.0, "a"))
+    job = Job(rows, [Camera("SIMPLE_RADIAL", 400, 300, (400.0, 200.0, 150.0, 0.0))], [True])
+    prepare(tmp_path / "work", job)
+    find_features(job, tmp_path / "work", threads=2, progress=lambda *_: None)
+    assert image_ids(job, tmp_path / "work") == {0: 1, 1: 2, 3: 4, 4: 5}
+    with pycolmap.Database.open(tmp_path / "work" / "database.db") as database:
+        assert [(i.image_id, i.name) for i in database.read_all_images()] == [(i + 1, job.alias(i)) for i in range(5)]
+        assert [prior.position[0] for prior in database.read_all_pose_priors()] == [0.0, 10.0, 30.0, 40.0]
 
 
 # What is matched.

@@ -26,6 +26,26 @@ PENDING_PER_CORE = 2
 _ONE_THREAD = {"RAYON_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
+def import_ray() -> Any:
+    """Return Ray, which reads these variables when it is imported; who has set them keeps what was set.
+
+    Under `uv run` Ray would send the working folder to all machines and make an environment from it on each, which
+    may hold pictures, and to which no path on the command line is relative. Here machines have their own.
+
+    Raises
+    ------
+    ClusterError
+        It is not installed.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
+    os.environ.setdefault("RAY_task_oom_retries", str(MEMORY_RETRIES))
+    try:
+        return importlib.import_module("ray")
+    except ImportError as error:
+        raise ClusterError("Ray is not installed", hint="install it with: pip install 'valuemap[ray]'") from error
+
+
 class RayEngine:
     """Tasks on the cluster at an address, or on one that is started here and ends with the process.
 
@@ -38,13 +58,9 @@ class RayEngine:
     needs_paths = True
 
     def __init__(self, address: str | None = None) -> None:
-        # Set before Ray is imported, which reads them then.
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        os.environ.setdefault("RAY_task_oom_retries", str(MEMORY_RETRIES))
-        try:
-            self._ray: Any = importlib.import_module("ray")
-        except ImportError as error:
-            raise ClusterError("Ray is not installed", hint="install it with: pip install 'valuemap[ray]'") from error
+        self._ray = import_ray()
+        told = self._ray.exceptions
+        self._lost = (told.WorkerCrashedError, told.NodeDiedError, told.LocalRayletDiedError, told.ObjectLostError)
         if self._ray.is_initialized():
             return
         own = {"include_dashboard": False} if address is None else {}
@@ -92,10 +108,15 @@ class RayEngine:
                 f"task {number} needs more memory than a machine of the cluster has left, {MEMORY_RETRIES + 1} times",
                 hint="give machines more memory, or start them with fewer cores: ray start --num-cpus",
             ) from error
-        except ray.exceptions.RayError as error:
+        except self._lost as error:
             raise ClusterError(
                 f"task {number} was lost {RETRIES + 1} times: {str(error).splitlines()[0]}",
                 hint="what was done is kept: go on with --resume when the cluster is well",
+            ) from error
+        except ray.exceptions.RayError as error:
+            raise ClusterError(
+                f"the cluster cannot run task {number}: {str(error).splitlines()[0]}",
+                hint="have all machines the same Python, valuemap and Ray? What was done is kept: go on with --resume",
             ) from error
         if isinstance(result, _Failed):
             raise result.kind(result.message, hint=result.hint)

@@ -22,13 +22,8 @@ def find_features(job: Job, workspace: Path, *, threads: int, progress: Progress
     path = workspace / DATABASE
     with pycolmap.Database.open(path) as database:
         if database.num_cameras() == 0:
-            for camera, has_focal in zip(job.cameras, job.has_focal, strict=True):
-                made = pycolmap.Camera(
-                    model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
-                )
-                made.has_prior_focal_length = has_focal
-                database.write_camera(made)
-        known = {image.name for image in database.read_all_images()}
+            _write_cameras_and_images(job, database)
+    known = {job.alias(row) for row in image_ids(job, workspace)}
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads, options.use_gpu, options.max_image_size = threads, False, _LARGEST_PX
     options.sift.max_num_features = _MAX_FEATURES
@@ -54,11 +49,10 @@ def find_features(job: Job, workspace: Path, *, threads: int, progress: Progress
             done += len(chunk)
     progress("finding features", len(job.pictures), len(job.pictures))
     with pycolmap.Database.open(path) as database:
-        images = {image.name: image for image in database.read_all_images()}
         database.clear_pose_priors()
-        for row, picture in enumerate(job.pictures):
-            image = images.get(job.alias(row))
-            if image is not None and np.isfinite(picture.gps_in_world_m).all():
+        for image in database.read_all_images():
+            picture = job.pictures[image.image_id - 1]
+            if database.exists_keypoints(image.image_id) and np.isfinite(picture.gps_in_world_m).all():
                 prior = pycolmap.PosePrior()
                 prior.corr_data_id = image.data_id
                 prior.position = picture.gps_in_world_m
@@ -67,8 +61,27 @@ def find_features(job: Job, workspace: Path, *, threads: int, progress: Progress
                 database.write_pose_prior(prior)
 
 
+def _write_cameras_and_images(job: Job, database: pycolmap.Database) -> None:
+    """Give every picture its id before pycolmap does.
+
+    It would number them in the order in which threads are done with them, and models grow in the order of the ids.
+    """
+    for number, (camera, has_focal) in enumerate(zip(job.cameras, job.has_focal, strict=True), start=1):
+        made = pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=list(camera.params))
+        made.camera_id, made.has_prior_focal_length = number, has_focal
+        database.write_camera(made, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=number)
+        rig.add_ref_sensor(made.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+    for row, picture in enumerate(job.pictures):
+        image = pycolmap.Image(name=job.alias(row), camera_id=picture.camera + 1, image_id=row + 1)
+        database.write_image(image, use_image_id=True)
+        frame = pycolmap.Frame(frame_id=row + 1, rig_id=picture.camera + 1)
+        frame.add_data_id(image.data_id)
+        database.write_frame(frame, use_frame_id=True)
+
+
 def image_ids(job: Job, workspace: Path) -> dict[int, int]:
-    """Return the ids of the images in the database, by row; pictures that could not be read have none."""
+    """Return the ids of the images with features in the database, by row; pictures that cannot be read have none."""
     with pycolmap.Database.open(workspace / DATABASE) as database:
-        by_name = {image.name: int(image.image_id) for image in database.read_all_images()}
-    return {row: by_name[name] for row in range(len(job.pictures)) if (name := job.alias(row)) in by_name}
+        return {row: row + 1 for row in range(len(job.pictures)) if database.exists_keypoints(row + 1)}

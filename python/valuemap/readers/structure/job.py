@@ -18,7 +18,7 @@ from valuemap.tables import Floats, Ints
 
 DATABASE, LINKS, MODELS, LOG = "database.db", "pictures", "models", "log.txt"
 _RECORD, _JOB, _ANSWER = "pictures.json", "job.json", "poses.npz"
-_VERSION = 1
+_VERSION = 2
 """Of all that is kept here: what another version of valuemap left is not understood."""
 _WORK = (DATABASE, f"{DATABASE}-shm", f"{DATABASE}-wal", _ANSWER)
 
