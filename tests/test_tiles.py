@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +13,24 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 import valuemap
+from block import block
 from scenes import as_dataset, random_scene
 from valuemap import portions
 from valuemap.cli.commands import app
-from valuemap.config import MapConfig
+from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import Dataset, Frame
-from valuemap.drives import InOrder
+from valuemap.drives import InOrder, driving_order, find_drives
 from valuemap.engine.threads import ThreadEngine
 from valuemap.errors import OutputError
 from valuemap.map_folder import Map
+from valuemap.portions import DatasetReader
 from valuemap.progress import silent
 from valuemap.robust import Noise
+from valuemap.simulate import simulate
 from valuemap.tables import Categories, Floats, Labels, Votes, table_to_arrow
+from valuemap.tiles import fleet, places
 from valuemap.tiles import grid as grid_module
+from valuemap.tiles.fleet import Fleet
 from valuemap.tiles.grid import LEVELS, WHOLE, Cell, Census, Grid
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.partition import partition_dataset
@@ -346,7 +351,9 @@ def test_tiles_of_any_size_on_disk_or_in_memory_give_the_same_map(
     assert sorted(path.name for path in tmp_path.iterdir() if "work" in path.name) == []
 
 
-def test_pieces_on_disk_are_those_in_memory(long_street: Path, tmp_path: Path) -> None:
+def test_pieces_on_disk_are_those_in_memory(long_street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module, name in ((portions, "ROWS"), (fleet, "BATCH"), (places, "SHARE")):
+        monkeypatch.setattr(module, name, 50)
     with open_work(tmp_path / "work", resume=False) as work:
         on_disk = partition_dataset(long_street, work, KNOWN, tile_size_m=1500.0)
     in_memory = InMemory(valuemap.read_dataset(long_street), KNOWN)
@@ -354,8 +361,53 @@ def test_pieces_on_disk_are_those_in_memory(long_street: Path, tmp_path: Path) -
     assert on_disk.drives_record == in_memory.drives_record
     for cell in [*on_disk.cells, WHOLE]:
         hashes = {hash_piece(source.piece(cell), cell, GRID, None, KNOWN) for source in (on_disk, in_memory)}
-        assert len(hashes) == 1 or cell == WHOLE
+        assert len(hashes) == 1 or cell == WHOLE  # Which they are not: it stands for the sample here.
     assert np.array_equal(on_disk.sample().detection_id, in_memory.sample().detection_id)
+
+
+PLAIN: dict[str, float] = {"block_east_m": 300.0, "shuffle_ids": 1}
+
+
+@pytest.mark.parametrize(
+    ("changes", "batches"),
+    [
+        ({}, 3),
+        ({"cameras": 2, "pass_per_camera": 1}, 3),
+        ({"cameras": 2, "write_rigs": 1}, 3),
+        ({"cameras": 2, "write_rigs": 1, "some untimed": 1}, 1),
+        ({"write_timestamps": 0}, 1),
+        ({"some untimed": 1}, 3),
+        ({"some dated": 1}, 3),
+    ],
+)
+def test_drives_are_the_same_batch_by_batch(
+    changes: dict[str, float], batches: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = {**PLAIN, **{name: value for name, value in changes.items() if " " not in name}}
+    known = {field.name for field in fields(SimulationConfig)}
+    dataset = simulate(block(**{name: value for name, value in settings.items() if name in known}), seed=3)
+    images, time_s = dataset.images, dataset.images.timestamp_s
+    chosen = images.pass_id.codes % 3 == 0
+    if "some untimed" in changes:
+        assert time_s is not None
+        dataset = replace(dataset, images=images.replace(timestamp_s=np.where(chosen, np.nan, time_s)))
+    if "some dated" in changes:
+        assert time_s is not None
+        dataset = replace(dataset, images=images.replace(timestamp_s=np.where(chosen, 7e4, time_s)))
+    valuemap.write_dataset(dataset, tmp_path / "city")
+    monkeypatch.setattr(fleet, "BATCH", 300)
+    found = Fleet(DatasetReader(tmp_path / "city", rows=500), tmp_path / "f", viewpoint_step_m=1.0, progress=silent)
+    expected = find_drives(dataset.images, viewpoint_step_m=1.0)
+    assert found.record == expected.record
+    rows, count = driving_order(dataset.images, expected), 0
+    for batch in found.batches():
+        of = rows[batch.place]
+        assert np.array_equal(batch.images.image_id, dataset.images.image_id[of])
+        assert batch.images.pass_id.texts() == dataset.images.pass_id.take(of).texts()
+        for name in ("pass_code", "order", "driven_m", "viewpoint"):
+            assert np.array_equal(getattr(batch.drives, name), getattr(expected, name)[of]), name
+        count += 1
+    assert count >= batches
 
 
 def test_a_run_that_was_killed_goes_on_and_ends_with_the_same_map(

@@ -244,7 +244,14 @@ def check_dataset(dataset: Dataset, *, source: str, are_boxes_checked: bool = Tr
     """
     check_cameras(dataset.cameras, source)
     images = check_images(dataset.images, dataset.cameras, source)
-    check_detections(dataset, source, are_boxes_checked=are_boxes_checked)
+    check_detections(
+        dataset.detections,
+        images.image_id,
+        images.camera_id,
+        dataset.cameras,
+        source,
+        are_boxes_checked=are_boxes_checked,
+    )
     if dataset.truth_detections is not None:
         pairs = dataset.truth_detections
         if dataset.truth is None:
@@ -365,11 +372,18 @@ def _check_names(images: Images, source: str) -> None:
         )
 
 
-def check_detections(dataset: Dataset, source: str, *, are_boxes_checked: bool = True) -> None:
-    """Refuse detections that the images of a dataset cannot have; raises as `read_dataset`."""
-    detections, images, cameras = dataset.detections, dataset.images, dataset.cameras
+def check_detections(
+    detections: Detections,
+    image_id: Ints,
+    camera_id: Ints,
+    cameras: Cameras,
+    source: str,
+    *,
+    are_boxes_checked: bool = True,
+) -> None:
+    """Refuse detections that images (N, by id) with these cameras cannot have; raises as `read_dataset`."""
     ids = detections.detection_id
-    _check_known(detections.image_id, images.image_id, ids, source, "detections", "image_id", "images")
+    _check_known(detections.image_id, image_id, ids, source, "detections", "image_id", "images")
     if not are_boxes_checked:
         return
     where = (source, "detections", "detection_id")
@@ -377,7 +391,7 @@ def check_detections(dataset: Dataset, source: str, *, are_boxes_checked: bool =
         _refuse(detections.size_px[:, i] < 0.0, detections.size_px[:, i], ids, *where, name, "expected at least 0 px")
     for name in ("range_m", "range_sigma_m", "vertical_sigma_px"):
         _check_positive(getattr(detections, name), ids, *where, name)
-    camera_row = rows_of(images.camera_id, cameras.camera_id)[rows_of(detections.image_id, images.image_id)]
+    camera_row = rows_of(camera_id, cameras.camera_id)[rows_of(detections.image_id, image_id)]
     for i, (axis, extent) in enumerate((("x", cameras.width_px), ("y", cameras.height_px))):
         center, size, limit = detections.center_px[:, i], detections.size_px[:, i], extent[camera_row]
         outside: Bools = (center < -size) | (center > limit + size)

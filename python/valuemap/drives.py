@@ -65,6 +65,9 @@ _STEADY_SHARE = 0.5
 _ROUNDING = 1e-6
 """What is constant to this share of the way is constant."""
 
+_PARTS_OF_A_METRE = 2.0**26
+"""Ways are summed in such parts: sums of a whole fleet, 130,000 km, are exact."""
+
 _SIDE_BY_SIDE = 16
 """Fewer runs than this are faster one by one."""
 
@@ -110,41 +113,100 @@ def find_drives(images: Images, *, viewpoint_step_m: float = 1.0) -> Drives:
     viewpoint_step_m
         A new viewpoint begins where the camera has moved more than this since the last one began.
     """
-    shots = _Shots.of(images)
-    vehicle, exposure, rigs = _vehicles(shots)
-    first = np.flatnonzero(exposure == np.arange(len(exposure)))
-    exposure_of_shot = (np.cumsum(exposure == np.arange(len(exposure))) - 1)[exposure]
-    track = _order_exposures(shots, vehicle[first], first)
-    place_m, group = shots.center_m[first][track.exposure], track.group
-    cut = _cuts(place_m, group, track)
-    drive = np.cumsum(cut.any_of) - 1
+    ways = Ways(images)
+    return ways.drives(ways.usual, viewpoint_step_m=viewpoint_step_m)[0]
 
-    # Numbered by first time, then place, which is what the order of the shots is.
-    starts = np.flatnonzero(cut.any_of)
-    rank = np.empty(len(starts), np.int64)
-    earliest = np.minimum.reduceat(first[track.exposure], starts) if len(starts) else starts
-    rank[np.argsort(earliest, kind="stable")] = np.arange(len(starts))
-    along = np.argsort(rank[drive], kind="stable")
-    drive, place_m, exposure_along = rank[drive][along], place_m[along], track.exposure[along]
-    begins = np.diff(drive, prepend=-1) > 0
-    order = np.arange(len(drive)) - np.maximum.accumulate(np.where(begins, np.arange(len(drive)), 0))
-    opens = _viewpoint_openings(place_m, begins, viewpoint_step_m)
-    driven_m = _driven_m(place_m, begins, opens)
 
-    position = np.empty(len(first), np.int64)
-    position[exposure_along] = np.arange(len(first))
-    of_row = np.empty(len(shots), np.int64)
-    of_row[shots.row] = position[exposure_of_shot]
-    told = np.bincount(track.told_by[np.argsort(track.exposure)][exposure_of_shot], minlength=3)
-    record = {
-        "passes": int(np.count_nonzero(np.bincount(images.pass_id.codes))),
-        "drives": len(starts),
-        "cut_at": cut.counts,
-        "images_ordered_by": {name: int(n) for name, n in zip(_TOLD_BY, told, strict=True) if n},
-        "rigs": rigs,
-        "images_on_rigs": int(np.sum(np.bincount(exposure_of_shot)[exposure_of_shot] > 1)),
-    }
-    return Drives(drive[of_row], order[of_row], driven_m[of_row], (np.cumsum(opens) - 1)[of_row], record)
+@dataclass(frozen=True, eq=False)
+class Usual:
+    """What is usual among some vehicles (V): the upper quartiles of their steps, speeds and times, NaN where unknown.
+
+    `low_m` and `high_m` (3) are between which places they drove.
+    """
+
+    step_m: Floats
+    speed: Floats
+    taken: Floats
+    low_m: Floats
+    high_m: Floats
+
+    def __add__(self, other: Usual) -> Usual:
+        return Usual(
+            step_m=np.concatenate([self.step_m, other.step_m]),
+            speed=np.concatenate([self.speed, other.speed]),
+            taken=np.concatenate([self.taken, other.taken]),
+            low_m=np.minimum(self.low_m, other.low_m),
+            high_m=np.maximum(self.high_m, other.high_m),
+        )
+
+    @property
+    def ground_axes(self) -> Ints:
+        """The two axes along which places differ most."""
+        return np.sort(np.argsort(self.low_m - self.high_m, kind="stable")[:2])
+
+
+class Ways:
+    """The ways of vehicles: their images in driving order, not yet cut into drives.
+
+    Of a dataset larger than memory these are the ways of some vehicles; what is `usual` among all of them then says how
+    they are cut.
+    """
+
+    def __init__(self, images: Images) -> None:
+        self._shots = shots = _Shots.of(images)
+        vehicle, exposure, self._rigs = _vehicles(shots)
+        self._first = first = np.flatnonzero(exposure == np.arange(len(exposure)))
+        self._exposure_of_shot = (np.cumsum(exposure == np.arange(len(exposure))) - 1)[exposure]
+        self._track = track = _order_exposures(shots, vehicle[first], first)
+        self._place_m = shots.center_m[first][track.exposure]
+        self._steps = _Steps.of(self._place_m, track)
+        low_m, high_m = self._place_m.min(axis=0, initial=np.inf), self._place_m.max(axis=0, initial=-np.inf)
+        step_m, speed, taken = (
+            _quantiles(values, track.group, 0.75)
+            for values in (self._steps.step_m, self._steps.speed, self._steps.taken)
+        )
+        self.usual = Usual(step_m, speed, taken, low_m, high_m)
+
+    def drives(self, usual: Usual, *, viewpoint_step_m: float = 1.0) -> tuple[Drives, Ints]:
+        """Cut the ways where something unusual happens; return the drives, and the first image (row) of each."""
+        shots, first, track, place_m = self._shots, self._first, self._track, self._place_m
+        cut = _cuts(place_m, track, self._steps, self.usual, usual)
+        drive = np.cumsum(cut.any_of) - 1
+
+        # Numbered by first time, then place, which is what the order of the shots is.
+        starts = np.flatnonzero(cut.any_of)
+        rank = np.empty(len(starts), np.int64)
+        earliest = np.minimum.reduceat(first[track.exposure], starts) if len(starts) else starts
+        rank[np.argsort(earliest, kind="stable")] = np.arange(len(starts))
+        along = np.argsort(rank[drive], kind="stable")
+        drive, place_m, exposure_along = rank[drive][along], place_m[along], track.exposure[along]
+        begins = np.diff(drive, prepend=-1) > 0
+        order = np.arange(len(drive)) - np.maximum.accumulate(np.where(begins, np.arange(len(drive)), 0))
+        opens = _viewpoint_openings(place_m, begins, viewpoint_step_m)
+        driven_m = _driven_m(place_m, begins, opens)
+
+        position = np.empty(len(first), np.int64)
+        position[exposure_along] = np.arange(len(first))
+        of_row = np.empty(len(shots), np.int64)
+        of_row[shots.row] = position[self._exposure_of_shot]
+        told = np.bincount(track.told_by[np.argsort(track.exposure)][self._exposure_of_shot], minlength=3)
+        record = {
+            "passes": int(np.count_nonzero(np.bincount(shots.images.pass_id.codes))),
+            "drives": len(starts),
+            "cut_at": cut.counts,
+            "images_ordered_by": {name: int(n) for name, n in zip(_TOLD_BY, told, strict=True) if n},
+            "rigs": self._rigs,
+            "images_on_rigs": int(np.sum(np.bincount(self._exposure_of_shot)[self._exposure_of_shot] > 1)),
+        }
+        drives = Drives(drive[of_row], order[of_row], driven_m[of_row], (np.cumsum(opens) - 1)[of_row], record)
+        return drives, shots.row[np.sort(earliest)]
+
+
+def are_dates(images: Images) -> Bools:
+    """Return the images (N) whose timestamps tell no order: of passes that have many images of a camera at one time."""
+    if images.timestamp_s is None:
+        return np.zeros(len(images), np.bool_)
+    return _is_a_date(images, images.timestamp_s)
 
 
 # Images in an order of their own.
@@ -638,6 +700,11 @@ def _steps_m(place_m: Floats) -> Floats:
     return _lengths(np.diff(place_m, axis=0, prepend=place_m[:1]))
 
 
+def _summed_m(step_m: Floats) -> Floats:
+    """Return the way up to each of some steps (N), to 15 nm: then no sum depends on other drives."""
+    return np.asarray(np.cumsum(np.rint(step_m * _PARTS_OF_A_METRE).astype(np.int64)) / _PARTS_OF_A_METRE)
+
+
 def _runs(values: Ints) -> Ints:
     """Return where runs of equal values begin, and the end."""
     return np.concatenate([np.flatnonzero(np.diff(values, prepend=values[:1] - 1)), [len(values)]]).astype(np.int64)
@@ -738,18 +805,37 @@ class _Cuts:
     counts: dict[str, int]
 
 
-def _cuts(place_m: Floats, group: Ints, track: _Track) -> _Cuts:
-    """Return where along the exposures (E) of vehicles drives begin."""
-    begins = np.diff(group, prepend=-1) != 0
-    if len(group) < 2:
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """How far (E) each exposure is from the one before in metres, in time, and both, NaN where a way begins."""
+
+    begins: Bools
+    step_m: Floats
+    taken: Floats
+    speed: Floats
+
+    @classmethod
+    def of(cls, place_m: Floats, track: _Track) -> _Steps:
+        begins = np.diff(track.group, prepend=-1) != 0
+        step_m = _steps_m(place_m)
+        step_m[begins] = np.nan
+        taken = np.where(begins, np.nan, track.taken)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            speed = step_m / np.where(taken > 0.0, taken, np.nan)
+        return cls(begins, step_m, taken, speed)
+
+
+def _cuts(place_m: Floats, track: _Track, steps: _Steps, own: Usual, usual: Usual) -> _Cuts:
+    """Return where along the exposures (E) of vehicles drives begin.
+
+    `own` is what is usual for each of these vehicles, `usual` for all.
+    """
+    begins, step_m, taken = steps.begins, steps.step_m, steps.taken
+    if len(begins) < 2:
         return _Cuts(begins, {})
-    step_m = _steps_m(place_m)
-    step_m[begins] = np.nan
-    taken = np.where(begins, np.nan, track.taken)
-    usual_m = _usual(step_m, group)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        speed = step_m / np.where(taken > 0.0, taken, np.nan)
-    usual_speed, usual_taken = _usual(speed, group), _usual(taken, group)
+    usual_m, usual_speed, usual_taken = (
+        _usual(getattr(own, name), getattr(usual, name))[track.group] for name in ("step_m", "speed", "taken")
+    )
     timed = track.told_by == TIME
     with np.errstate(divide="ignore", invalid="ignore"):
         far = step_m > _GAP_STEPS * usual_m
@@ -758,34 +844,32 @@ def _cuts(place_m: Floats, group: Ints, track: _Track) -> _Cuts:
         pause = timed & (waited > _PAUSE_STEPS * usual_taken) & (far | (waited > _STOP_STEPS * usual_taken))
     jump = far & too_fast & ~pause
     drive = np.cumsum(begins | jump | pause)
-    revisit = _revisits(place_m, drive, usual_m, track.told_by != CHAIN)
+    revisit = _revisits(place_m, drive, usual_m, track.told_by != CHAIN, usual.ground_axes)
     reasons = {"pauses": pause, "jumps": jump, "revisits": revisit}
     counts = {name: int(mask.sum()) for name, mask in reasons.items() if mask.any()}
     return _Cuts(begins | jump | pause | revisit, counts)
 
 
-def _usual(values: Floats, group: Ints) -> Floats:
-    """Return (E) what is usual in the group of each: the upper quartile, which neither stops nor gaps move.
+def _usual(own: Floats, of_all: Floats) -> Floats:
+    """Return what is usual for each of some vehicles: the upper quartile, which neither stops nor gaps move.
 
-    It is at least half of what is usual in all groups, so that a drive that mostly stands has the speed of the others.
+    It is at least half of what is usual among all, so that one that mostly stands has the speed of the others.
     """
-    usual = _quantiles(values, group, 0.75)
-    known = usual[~np.isnan(usual)]
+    known = of_all[~np.isnan(of_all)]
     floor = 0.5 * np.median(known) if len(known) else np.nan
-    return np.asarray(np.maximum(usual, floor)[group])
+    return np.asarray(np.maximum(own, floor))
 
 
-def _revisits(place_m: Floats, drive: Ints, usual_m: Floats, may: Bools) -> Bools:
+def _revisits(place_m: Floats, drive: Ints, usual_m: Floats, may: Bools, ground: Ints) -> Bools:
     """Return where (E) a drive comes back to where it has been, having left: what follows is a drive of its own.
 
-    A place is as wide as some usual steps. All is done on the ground (the two axes along which places differ most),
-    in four grids of cells of twice that width, each shifted by half a cell, so that any two near places share a cell.
+    A place is as wide as some usual steps. All is done on the ground (the axes `ground`), in four grids of cells of
+    twice that width, each shifted by half a cell, so that any two near places share a cell.
     """
     count = len(drive)
     near_m = np.where((usual_m > 0.0) & may, _REVISIT_STEPS * usual_m, np.nan)
     step_m = _steps_m(place_m)
-    way_m = np.cumsum(np.where(step_m > _STILL_SHARE * usual_m, step_m, 0.0))
-    ground = np.sort(np.argsort(-np.ptp(place_m, axis=0), kind="stable")[:2])
+    way_m = _summed_m(np.where(step_m > _STILL_SHARE * usual_m, step_m, 0.0))
     able = np.flatnonzero(~np.isnan(near_m))
     result = np.zeros(count, np.bool_)
     if not len(able):
@@ -858,7 +942,7 @@ def _driven_m(place_m: Floats, begins: Bools, opens: Bools) -> Floats:
     start = np.flatnonzero(opens)
     way_m = np.linalg.norm(np.diff(place_m[start], axis=0, prepend=place_m[:1]), axis=1)
     way_m[begins[start]] = 0.0
-    total_m = np.cumsum(way_m)
+    total_m = _summed_m(way_m)
     at_begin_m = np.maximum.accumulate(np.where(begins[start], total_m, 0.0))
     return np.asarray((total_m - at_begin_m)[np.cumsum(opens) - 1])
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -11,26 +11,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from valuemap.dataset import (
-    MARKER,
-    Dataset,
-    Frame,
-    check_cameras,
-    check_detections,
-    check_images,
-    read_head,
-)
+from valuemap.arrow import numbers_from_arrow
+from valuemap.dataset import MARKER, Frame, check_cameras, check_images, read_head
 from valuemap.errors import InputError
-from valuemap.tables import (
-    Cameras,
-    Detections,
-    Images,
-    Ints,
-    Table,
-    join_tables,
-    read_table,
-    table_from_arrow,
-)
+from valuemap.tables import Cameras, Detections, Images, Ints, Table, read_table, table_from_arrow
 
 ROWS = 500_000
 """Rows that are read at a time."""
@@ -39,42 +23,47 @@ T = TypeVar("T", bound=Table)
 
 
 class DatasetReader:
-    """The head, cameras and images of a dataset folder, and its detections in portions.
+    """The head and cameras of a dataset folder, and its images and detections in portions.
 
-    Of the images all columns are held, but the names only where an image has no timestamp: then they tell the order.
+    Ids are unique in the whole tables, and images have known cameras. Which images detections are of is left to who
+    has them (`valuemap.dataset.check_detections`).
     """
 
-    def __init__(self, folder: Path, *, rows: int = ROWS) -> None:
-        self.folder, self._rows = folder, rows
+    def __init__(self, folder: Path, *, rows: int | None = None) -> None:
+        self.folder, self.rows = folder, rows or ROWS
         head = read_head(folder)
         self.name = str(head.get("name", folder.name))
         self.frame = Frame.from_json(head.get("frame"), source=str(folder / MARKER))
         self.cameras = read_table(Cameras, folder / "cameras.parquet")
         check_cameras(self.cameras, str(folder))
-        self.images = self._read_images()
+        _check_unique(Images, folder / "images.parquet", self.rows)
+        _check_unique(Detections, folder / "detections.parquet", self.rows)
+
+    def images(self) -> Iterator[Images]:
+        """Yield the images in the order of the file, each portion sorted by id."""
+        for portion in read_portions(Images, self.folder / "images.parquet", self.rows):
+            yield check_images(portion, self.cameras, str(self.folder))
 
     def detections(self) -> Iterator[Detections]:
         """Yield the detections in the order of the file, each portion sorted by id."""
-        none = Detections(*(None,) * 9)  # type: ignore[arg-type]
-        dataset = Dataset(self.name, self.frame, self.cameras, self.images, none)
-        for portion in _portions(Detections, self.folder / "detections.parquet", self._rows):
-            check_detections(replace(dataset, detections=portion), str(self.folder))
-            yield portion
-
-    def _read_images(self) -> Images:
-        path = self.folder / "images.parquet"
-        parts = []
-        for portion in _portions(Images, path, self._rows):
-            images = check_images(portion, self.cameras, str(self.folder))
-            if images.timestamp_s is not None and not np.isnan(images.timestamp_s).any():
-                images = images.replace(name=pa.repeat("", len(images)))
-            parts.append(images)
-        return _sorted(join_tables(parts), str(path))
+        return read_portions(Detections, self.folder / "detections.parquet", self.rows)
 
 
 def rows_on_disk(folder: Path) -> tuple[int, int]:
     """Return how many images and detections a dataset folder has, from the ends of its files."""
     return _count(folder / "images.parquet"), _count(folder / "detections.parquet")
+
+
+def read_portions(kind: type[T], path: Path, rows: int) -> Iterator[T]:
+    """Yield a table in portions of so many rows at most, at least one portion; each is checked and sorted by itself.
+
+    Raises
+    ------
+    InputError
+        As `read_table`.
+    """
+    for batch in _batches(path, rows, None):
+        yield table_from_arrow(kind, batch, source=str(path))
 
 
 def _count(path: Path) -> int:
@@ -85,18 +74,18 @@ def _count(path: Path) -> int:
     return rows
 
 
-def _portions(kind: type[T], path: Path, rows: int) -> Iterator[T]:
+def _batches(path: Path, rows: int, columns: list[str] | None) -> Iterator[pa.Table]:
     if not path.is_file():
         raise InputError(f"{path}: no such file", hint="give the folder that an import or simulate command wrote")
     try:
         with path.open("rb") as file:
             source = pq.ParquetFile(file)
             if source.metadata.num_rows == 0:
-                yield table_from_arrow(kind, source.schema_arrow.empty_table(), source=str(path))
-            for batch in source.iter_batches(rows):
+                yield source.read(columns)
+            for batch in source.iter_batches(rows, columns=columns):
                 table = pa.Table.from_batches([batch])
-                table.validate(full=True)
-                yield table_from_arrow(kind, table, source=str(path))
+                table.validate(full=True)  # Finds texts that are not UTF-8.
+                yield table
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(
@@ -104,17 +93,33 @@ def _portions(kind: type[T], path: Path, rows: int) -> Iterator[T]:
         ) from error
 
 
-def _sorted(images: Images, source: str) -> Images:
-    """Return images by id; raises `InputError` where two have the same."""
-    steps: Ints = np.diff(images.image_id)
-    if np.all(steps > 0):
-        return images
-    images = images.take(np.argsort(images.image_id, kind="stable"))
-    repeated = np.flatnonzero(np.diff(images.image_id) == 0)
-    if len(repeated):
-        raise InputError(
-            f"{source}: image_id: expected unique ids, found {images.image_id[repeated[0]]} again "
-            f"({len(repeated)} repeated)",
-            hint="give every row an id of its own",
-        )
-    return images
+def _check_unique(kind: type[Table], path: Path, rows: int) -> None:
+    """Refuse a table in which two rows have one id; a share of all ids is held at a time."""
+    assert kind.KEY is not None
+    total, last, ascend = 0, -(2**63), True
+    for ids in _ids(kind, path, rows):
+        if len(ids):
+            ascend &= bool(np.all(np.diff(ids) > 0)) and (total == 0 or int(ids[0]) > last)
+            last = int(ids[-1])
+        total += len(ids)
+    shares = 0 if ascend else math.ceil(total / rows)
+    for share in range(shares):
+        of_share = np.sort(np.concatenate([ids[ids % shares == share] for ids in _ids(kind, path, rows)]))
+        repeated = np.flatnonzero(np.diff(of_share) == 0)
+        if len(repeated):
+            raise InputError(
+                f"{path}: {kind.KEY}: expected unique ids, found {of_share[repeated[0]]} again "
+                f"({len(repeated)} repeated)",
+                hint="give every row an id of its own",
+            )
+
+
+def _ids(kind: type[Table], path: Path, rows: int) -> Iterator[Ints]:
+    assert kind.KEY is not None
+    if kind.KEY not in pq.ParquetFile(path).schema_arrow.names if path.is_file() and _count(path) else False:
+        return  # Whoever reads the table says what is wrong.
+    for batch in _batches(path, rows, [kind.KEY]):
+        column = batch.column(kind.KEY)
+        if not pa.types.is_integer(column.type) or column.null_count:
+            return
+        yield numbers_from_arrow(column.cast(pa.int64()))

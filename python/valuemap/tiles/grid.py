@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -144,6 +144,12 @@ class Census:
             np.bincount(inverse, detections, len(found)).astype(np.int64),
             extent,
         )
+
+    @classmethod
+    def of_detections(cls, grid: Grid, place_m: Floats) -> Census:
+        """Count detections of images at places (N, 2), which are counted already."""
+        found = cls.of(grid, place_m, np.ones(len(place_m), np.int64))
+        return replace(found, images=np.zeros_like(found.images))
 
     def __add__(self, other: Census) -> Census:
         square, inverse = np.unique(np.concatenate([self.square, other.square]), axis=0, return_inverse=True)

@@ -3,9 +3,8 @@
     partition-<hash>/
         partition.json                                  cells, drives, classes: what a task needs to know
         cameras.parquet
-        images/tile_x=0/tile_y=-1/part-0.parquet        in driving order, with their drives
+        images/tile_x=0/tile_y=-1/part-0.parquet        with their drives, a part for each batch (`fleet`)
         detections/tile_x=0/tile_y=-1/part-0.parquet    a part for each portion that was read
-        images/sample/..., detections/sample/...        what is calibrated on
 
 `place` is the number of an image in the driving order of the whole dataset.
 """
@@ -14,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -28,19 +28,20 @@ import pyarrow.parquet as pq
 from valuemap.arrow import numbers_from_arrow, numbers_to_arrow
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, Frame, rows_of
-from valuemap.drives import Drives, InOrder, driving_order, find_drives
-from valuemap.portions import DatasetReader
+from valuemap.drives import Drives, InOrder
+from valuemap.portions import DatasetReader, rows_on_disk
 from valuemap.progress import Progress, silent
 from valuemap.tables import Cameras, Categories, Detections, Floats, Images, Ints, Table, read_table, write_table
-from valuemap.tiles.grid import WHOLE, Cell, Census, Grid, cells_across_tile
+from valuemap.tiles.fleet import Fleet
+from valuemap.tiles.grid import LEVELS, WHOLE, Cell, Census, Grid, cells_across_tile, smallest_squares
 from valuemap.tiles.piece import piece_of_rows
-from valuemap.tiles.sample import is_sampled
+from valuemap.tiles.places import PlaceIndex
+from valuemap.tiles.sample import sampled_squares
 from valuemap.tiles.source import VIEWPOINT_SHARE
 from valuemap.tiles.work import written
 
-_META, _CAMERAS, _SAMPLE = "partition.json", "cameras.parquet", "sample"
+_META, _CAMERAS = "partition.json", "cameras.parquet"
 _DRIVES = ("pass_code", "order", "driven_m", "viewpoint")
-_HASHED_BYTES = 1 << 20
 
 T = TypeVar("T", bound=Table)
 
@@ -55,13 +56,17 @@ class OnDisk:
         """Return what a cell is solved with."""
         if cell == WHOLE:
             return self.sample()
-        ordered = self._read(_hive(self.grid.tile_of(cell, self._meta["cells_across"])))
+        ordered = self._read([self.grid.tile_of(cell, self._meta["cells_across"])])
         place_m = self.grid.images_on_ground(ordered.dataset.images)
         return piece_of_rows(ordered, np.flatnonzero(self.grid.is_within(cell, place_m, self.grid.halo_m)))
 
     def sample(self) -> InOrder:
         """Return what is calibrated on: all of what is one cell."""
-        return self._read(_SAMPLE)
+        squares = np.array(self._meta["sample"], np.int64).reshape(-1, 2)
+        across = self._meta["cells_across"]
+        tiles = sorted({self.grid.tile_of(Cell((x >> LEVELS, y >> LEVELS)), across) for x, y in squares.tolist()})
+        ordered = self._read(tiles, squares)
+        return ordered if self.cells == [WHOLE] else piece_of_rows(ordered, np.arange(len(ordered.image_id)))
 
     @cached_property
     def cells(self) -> list[Cell]:
@@ -98,11 +103,15 @@ class OnDisk:
         meta: dict[str, Any] = json.loads((self.folder / _META).read_text(encoding="utf-8"))
         return meta
 
-    def _read(self, part: str) -> InOrder:
-        """Return what is in and around a tile, or the sample, in driving order."""
-        images = _read_parts(self.folder / "images" / part, self._meta["columns"]["images"])
+    def _read(self, tiles: list[tuple[int, int]], squares: Ints | None = None) -> InOrder:
+        """Return what is in and around tiles, or of it only what is in some of the smallest squares, in driving order.
+
+        Of several tiles squares must be given: what is around one is in another.
+        """
+        images, found = self._tables(tiles, squares)
         place = numbers_from_arrow(images.column("place"))
-        found = _read_parts(self.folder / "detections" / part, self._meta["columns"]["detections"])
+        along = np.argsort(place)
+        images, place = images.take(numbers_to_arrow(along)), place[along]
         row, center = rows_of(numbers_from_arrow(found.column("place")), place), ("x", "y", "width", "height")
         x, y, width, height = (numbers_from_arrow(found.column(name)) for name in center)
         detection_id = numbers_from_arrow(found.column("detection_id"))
@@ -118,6 +127,30 @@ class OnDisk:
         )
         drives = Drives(**{name: numbers_from_arrow(images.column(name)) for name in _DRIVES}, record={})
         return InOrder(dataset, drives, table.image_id, detection_id[order])
+
+    def _tables(self, tiles: list[tuple[int, int]], squares: Ints | None) -> tuple[pa.Table, pa.Table]:
+        """Return the images and detections of `_read`, in any order."""
+        columns = self._meta["columns"]
+        parts: dict[str, list[pa.Table]] = {"images": [], "detections": []}
+        chosen = None if squares is None else {(x, y) for x, y in squares.tolist()}
+        for tile in tiles:
+            images, found = (_read_parts(self.folder / kind / _hive(tile), columns[kind]) for kind in parts)
+            if chosen is not None:
+                square = smallest_squares(self.grid, self.grid.images_on_ground(_from_columns(Images, images, [""])))
+                across = self._meta["cells_across"] << LEVELS
+                own = np.all(square // across == tile, axis=1)
+                own &= np.array([(x, y) in chosen for x, y in square.tolist()], np.bool_)
+                place = numbers_from_arrow(images.column("place"))[own]
+                of_own = np.isin(numbers_from_arrow(found.column("place")), place)
+                images, found = (
+                    table.take(numbers_to_arrow(np.flatnonzero(rows)))
+                    for table, rows in ((images, own), (found, of_own))
+                )
+            parts["images"].append(images)
+            parts["detections"].append(found)
+        both = (pa.concat_tables(part).combine_chunks() for part in parts.values())
+        images, found = both
+        return images, found
 
 
 def partition_dataset(
@@ -139,7 +172,7 @@ def partition_dataset(
 
 
 class _Writer:
-    """Writes the pieces of a dataset."""
+    """Writes the pieces of a dataset, of which only portions are in memory."""
 
     def __init__(
         self, dataset: Path, folder: Path, config: MapConfig, tile_size_m: float | None, progress: Progress
@@ -149,66 +182,60 @@ class _Writer:
         self.reader = DatasetReader(dataset)
         self.grid = Grid.of(self.reader.frame, self.max_range_m)
         self.cells_across = cells_across_tile(self.grid, tile_size_m)
+        self.columns: dict[str, dict[str, str]] = {"images": {}, "detections": {}}
 
     def write(self) -> None:
-        reader, grid = self.reader, self.grid
-        images = reader.images
-        place_m = grid.images_on_ground(images)
-        count = np.zeros(len(images), np.int64)
-        classes: set[str] = set()
-        for portion in reader.detections():
-            count += np.bincount(rows_of(portion.image_id, images.image_id), minlength=len(images))
-            classes.update(portion.class_name.names)
-        census = Census.of(grid, place_m, count)
-        cells = census.cells(grid)
-        drives = find_drives(images, viewpoint_step_m=self.max_range_m * VIEWPOINT_SHARE)
-        rows = driving_order(images, drives)
-        place = np.empty(len(rows), np.int64)
-        place[rows] = np.arange(len(rows))
-        is_in_sample = np.ones(len(images), np.bool_) if cells == [WHOLE] else is_sampled(grid, census, place_m)
-        columns: dict[str, dict[str, str]] = {"images": {}, "detections": {}}
-        extra = {name: getattr(drives, name) for name in _DRIVES}
-        self._spread("images", 0, _to_columns(images, {"place": place, **extra}), rows, place_m, is_in_sample, columns)
-        done, total = 0, int(count.sum())
-        names = tuple(sorted(classes))
-        for number, portion in enumerate(reader.detections()):
-            row = rows_of(portion.image_id, images.image_id)
-            codes = np.array([names.index(name) for name in portion.class_name.names], np.int32)
-            portion = portion.replace(class_name=Categories(codes[portion.class_name.codes], names))
-            table = _to_columns(portion, {"place": place[row]})
-            every = np.arange(len(portion))
-            self._spread("detections", number, table, every, place_m[row], is_in_sample[row], columns)
+        aside = self.folder / "aside"
+        aside.mkdir()
+        step_m = self.max_range_m * VIEWPOINT_SHARE
+        fleet = Fleet(self.reader, aside / "fleet", viewpoint_step_m=step_m, progress=self.progress)
+        index = PlaceIndex(aside / "places", fleet.count)
+        census = Census.of(self.grid, np.empty((0, 2)), np.empty(0, np.int64))
+        for number, batch in enumerate(fleet.batches()):
+            place_m = self.grid.images_on_ground(batch.images)
+            census += Census.of(self.grid, place_m, np.zeros(len(place_m), np.int64))
+            extra = {name: getattr(batch.drives, name) for name in _DRIVES}
+            self._spread("images", number, _to_columns(batch.images, {"place": batch.place, **extra}), place_m)
+            index.add(batch.images, batch.place, place_m)
+        classes: dict[str, int] = {}
+        done, total = 0, rows_on_disk(self.reader.folder)[1]
+        for number, (portion, place, place_m) in enumerate(index.placed(self.reader)):
+            census += Census.of_detections(self.grid, place_m)
+            names = portion.class_name.names
+            codes = np.array([classes.setdefault(name, len(classes)) for name in names], np.int32)
+            portion = portion.replace(class_name=Categories(codes[portion.class_name.codes], tuple(classes)))
+            self._spread("detections", number, _to_columns(portion, {"place": place}), place_m)
             done += len(portion)
-            self.progress("partition", done, total)
-        write_table(reader.cameras, self.folder / _CAMERAS)
+            self.progress("cutting into tiles", done, total)
+        shutil.rmtree(aside)
+        cells = census.cells(self.grid)
+        squares = census.square if cells == [WHOLE] else sampled_squares(census)
+        write_table(self.reader.cameras, self.folder / _CAMERAS)
         record = {
-            "name": reader.name,
-            "frame": reader.frame.to_json(),
+            "name": self.reader.name,
+            "frame": self.reader.frame.to_json(),
             "max_range_m": self.max_range_m,
             "cells_across": self.cells_across,
             "cells": [[cell.base, cell.level, cell.place] for cell in cells],
-            "classes": names,
-            "columns": columns,
-            "drives": drives.record,
-            "counts": {"images": len(images), "detections": total},
+            "sample": squares.tolist(),
+            "classes": list(classes),
+            "columns": self.columns,
+            "drives": fleet.record,
+            "counts": {"images": fleet.count, "detections": total},
         }
         (self.folder / _META).write_text(json.dumps(record) + "\n", encoding="utf-8")
 
-    def _spread(
-        self,
-        kind: str,
-        number: int,
-        table: pa.Table,
-        rows: Ints,
-        place_m: Floats,
-        is_in_sample: np.ndarray[Any, np.dtype[np.bool_]],
-        columns: dict[str, dict[str, str]],
-    ) -> None:
+    def _spread(self, kind: str, number: int, table: pa.Table, place_m: Floats) -> None:
         """Write rows, in this order, to all tiles that they are in or around."""
-        columns[kind] = {column.name: str(column.type) for column in table.schema}
-        for part, members in self._tiles_of(place_m[rows]):
-            self._write(kind, _hive(part), number, table, rows[members])
-        self._write(kind, _SAMPLE, number, table, rows[is_in_sample[rows]])
+        if table.num_rows:
+            self.columns[kind] = {column.name: str(column.type) for column in table.schema}
+        else:
+            self.columns[kind] = self.columns[kind] or {column.name: str(column.type) for column in table.schema}
+        for tile, rows in self._tiles_of(place_m):
+            folder = self.folder / kind / _hive(tile)
+            folder.mkdir(parents=True, exist_ok=True)
+            with (folder / f"part-{number}.parquet").open("wb") as file:
+                pq.write_table(table.take(numbers_to_arrow(rows)), file, compression="lz4", use_dictionary=False)
 
     def _tiles_of(self, place_m: Floats) -> Iterator[tuple[tuple[int, int], Ints]]:
         """Yield the tiles that places (N, 2) are in or around, and which are there, ascending."""
@@ -229,14 +256,6 @@ class _Writer:
         starts = np.flatnonzero(np.any(np.diff(tile, axis=0, prepend=tile[:1] - 1) != 0, axis=1)).tolist()
         for start, end in zip(starts, [*starts[1:], len(row)], strict=True):
             yield (int(tile[start, 0]), int(tile[start, 1])), row[start:end]
-
-    def _write(self, kind: str, part: str, number: int, table: pa.Table, rows: Ints) -> None:
-        if not len(rows):
-            return
-        folder = self.folder / kind / part
-        folder.mkdir(parents=True, exist_ok=True)
-        with (folder / f"part-{number}.parquet").open("wb") as file:
-            pq.write_table(table.take(numbers_to_arrow(rows)), file, compression="lz4", use_dictionary=False)
 
 
 def _hive(tile: tuple[int, int]) -> str:
@@ -284,8 +303,10 @@ def _from_columns(kind: type[T], table: pa.Table, categories: list[str]) -> T:
             codes = numbers_from_arrow(table.column(names[0]))
             if kind is Images:  # What passes are called does not matter.
                 codes = np.unique(codes, return_inverse=True)[1].astype(np.int32)
-                categories = [str(code) for code in range(int(codes.max(initial=-1)) + 1)]
-            values[field.name] = Categories(codes, tuple(categories))
+                values[field.name] = Categories(codes, tuple(map(str, range(int(codes.max(initial=-1)) + 1))))
+                continue
+            rank = np.argsort(np.argsort(categories)).astype(np.int32)
+            values[field.name] = Categories(rank[codes] if len(codes) else codes, tuple(sorted(categories)))
         else:
             parts = [numbers_from_arrow(table.column(name)) for name in names]
             values[field.name] = parts[0] if len(parts) == 1 else np.stack(parts, axis=1)

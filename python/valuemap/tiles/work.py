@@ -10,7 +10,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -20,6 +20,8 @@ from valuemap.system import folder_lock
 MARKER = "valuemap-work.json"
 CELLS = "cells"
 _TEMPORARY = ".tmp-"
+_MANY = 100
+"""To wait for more files than this one by one takes minutes for what takes seconds together."""
 
 
 @contextmanager
@@ -70,8 +72,7 @@ def written(path: Path) -> Iterator[Path]:
     temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY, dir=path.parent))
     try:
         yield temporary / path.name
-        for file in [temporary / path.name, *(temporary / path.name).rglob("*")]:
-            _sync(file)
+        _sync_all([temporary / path.name, *(temporary / path.name).rglob("*")])
         try:
             (temporary / path.name).replace(path)
         except OSError:
@@ -122,6 +123,15 @@ def _remove(entry: Path) -> None:
         shutil.rmtree(entry)
     else:
         entry.unlink(missing_ok=True)
+
+
+def _sync_all(paths: Sequence[Path]) -> None:
+    """Wait until files and folders are on disk; of very many the system writes out all that it has."""
+    if len(paths) > _MANY and hasattr(os, "sync"):
+        os.sync()
+        return
+    for path in paths:
+        _sync(path)
 
 
 def _sync(path: Path) -> None:
