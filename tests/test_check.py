@@ -6,7 +6,9 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from check_faults import FAULTS as INJECTED
@@ -16,20 +18,23 @@ from valuemap.check import examine
 from valuemap.check.agreement import compare, measure_agreement
 from valuemap.check.cameras import PARAMETERS
 from valuemap.check.contest import hold_contest
-from valuemap.check.fault import View
+from valuemap.check.fault import View, with_poses
 from valuemap.check.fit import estimate
-from valuemap.check.headings import headings, rotations_of
+from valuemap.check.headings import headings, level_rotations, rotations_of
 from valuemap.check.offsets import find_shift
+from valuemap.check.passes import moved_along
 from valuemap.check.registry import CONVENTIONS, FAULTS
+from valuemap.check.seams import worst_seam
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, read_dataset, write_dataset
 from valuemap.errors import InputError
+from valuemap.tables import Categories
 
 _CONVENTIONS = {convention.name for convention in CONVENTIONS}
 _SEEN_AGAIN = {"passes_no_drives"}
 """Images without any order have none afterwards either: what is put right is which of them share a pass."""
 _RECOVERED = {"degrees_for_radians": 0.6}
-"""Degrees read as radians lose whole turns, which the direction of travel gives back on straight roads only."""
+"""Degrees read as radians lose whole turns, which the direction of travel does not always give back."""
 _FAULT = {fault.name: fault for fault in FAULTS}
 
 
@@ -134,6 +139,58 @@ def test_the_shift_between_point_sets_is_found_among_strangers() -> None:
     assert shift is not None
     np.testing.assert_allclose(shift.offset_m, [3.0, -2.0, 1.0], atol=1e-6)
     assert shift.pairs >= 20
+
+
+def one_drive_in_two(good: Dataset) -> Dataset:
+    """Return drives of the city as one long one that is two passes: so long that a jump at the seam is no chance."""
+    count = 3000
+    way = np.linspace(0.0, 1.9 * np.pi, count)
+    center = np.stack([475.0 * np.sin(way), 475.0 - 475.0 * np.cos(way), np.full(count, 1.5)], axis=1)
+    rotation = level_rotations(np.pi / 2.0 - way, good.frame)
+    number = np.arange(count)
+    images = good.images.take(number % len(good.images)).replace(
+        image_id=number,
+        name=pa.array([f"{i:05d}.jpg" for i in number]),
+        camera_id=np.zeros(count, dtype=np.int64),
+        cam_from_world_quat=Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True),
+        cam_from_world_m=-np.einsum("nij,nj->ni", rotation, center),
+        pass_id=Categories.from_texts(["early" if i < 1700 else "late" for i in number]),
+        timestamp_s=0.1 * number,
+    )
+    return Dataset(**{**vars(good), "images": images, "detections": good.detections.take(np.arange(0))})
+
+
+@pytest.mark.parametrize(
+    ("fault", "move"),
+    [("pass_offset", [3.0, 2.0, 0.0]), ("camera_height", [0.0, 0.0, -1.8]), ("pass_time_shift", None)],
+)
+def test_a_pass_that_jumps_where_it_goes_on_from_another_is_named_and_put_back(
+    fault: str, move: list[float] | None, good: Dataset
+) -> None:
+    drive = one_drive_in_two(good)
+    assert worst_seam(drive, camera_centers(drive.images)) is None
+    center, is_late = camera_centers(drive.images), drive.images.pass_id.codes == drive.images.pass_id.code_of("late")
+    there = moved_along(drive, 4.0) if move is None else center + move
+    spoiled = with_poses(drive, rotation_matrices(drive.images), np.where(is_late[:, None], there, center))
+    finding = _FAULT[fault].find(View(spoiled))
+    assert finding is not None
+    assert "By its times pass late goes on where early ends" in finding.why
+    assert all(
+        _FAULT[other].find(View(spoiled)) is None
+        for other in ("pass_offset", "camera_height", "pass_time_shift")
+        if other != fault
+    )
+    assert finding.fix is not None
+    fixed = camera_centers(finding.fix(spoiled).images)
+    assert np.linalg.norm(fixed - center, axis=1)[:-10].max() < 0.1
+
+
+def test_drives_far_apart_that_follow_each_other_by_chance_have_no_seam(good: Dataset) -> None:
+    drive = one_drive_in_two(good)
+    is_late = drive.images.pass_id.codes == drive.images.pass_id.code_of("late")
+    there = camera_centers(drive.images) + np.where(is_late[:, None], [60.0, 0.0, 0.0], 0.0)
+    elsewhere = with_poses(drive, rotation_matrices(drive.images), there)
+    assert worst_seam(elsewhere, camera_centers(elsewhere.images)) is None
 
 
 def test_a_dataset_without_detections_is_refused(good: Dataset) -> None:

@@ -136,6 +136,12 @@ PINHOLE_PARAMS = [[500.0, 500.0, 320.0, 240.0], [600.0, 600.0, 400.0, 300.0, 0.0
         ),
         (
             "images",
+            with_value("tz", 1, 1e200),
+            r"images\.parquet, row with image_id 20: tz: expected at most 1e\+12 m, found 1e\+200",
+            "repair",
+        ),
+        (
+            "images",
             with_value("qw", 1, 2.0),
             r"images\.parquet, row with image_id 20: qw qx qy qz: expected a quaternion of length 1, found length 2",
             "w, x, y, z",

@@ -49,6 +49,8 @@ PARTS = (
 PART_FOLDERS = ("images",)
 """Folders of it whose files, as far as valuemap wrote them, are of that dataset alone."""
 _QUATERNION_TOLERANCE = 1e-3
+_FARTHEST_M = 1e12
+"""From the origin of the world: beyond, squares of distances leave what numbers hold."""
 _ROUNDING = 1e-12
 _LEADS_OUT = r"^/|^[A-Za-z]:|^\\\\|(^|[/\\])\.\.([/\\]|$)|\x00"
 
@@ -353,6 +355,10 @@ def check_images(images: Images, cameras: Cameras, source: str) -> Images:
             f"length 1, found length {norm[row]:.6g} ({len(wrong)} rows)",
             hint="quaternions are w, x, y, z and rotate the world into the camera",
         )
+    for axis, name in enumerate(("tx", "ty", "tz")):
+        value = images.cam_from_world_m[:, axis]
+        where = (source, "images", "image_id", name)
+        _refuse(np.abs(value) > _FARTHEST_M, value, images.image_id, *where, f"expected at most {_FARTHEST_M:g} m")
     for name in ("position_sigma_m", "rotation_sigma_rad"):
         _check_positive(getattr(images, name), images.image_id, source, "images", "image_id", name)
     # Those of unit length to rounding stay as they are, so that writing and reading again changes no bit.

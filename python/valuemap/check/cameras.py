@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
 
@@ -10,7 +11,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check.agreement import compare, measure_agreement
+from valuemap.check.agreement import Comparison, compare, measure_agreement
 from valuemap.check.fault import (
     LEAST_CHANCE,
     Fault,
@@ -96,45 +97,81 @@ def _has_focal(dataset: Dataset) -> bool:
     return all(FOCAL_LENGTHS.get(dataset.cameras.model.names[code], 0) for code in dataset.cameras.model.codes)
 
 
+@dataclass(frozen=True, eq=False)
+class _Correction:
+    """One parameter changed by a value, how sure that is, and how well the rays agree then."""
+
+    parameter: Parameter
+    value: float
+    sigma: float
+    chance: float
+    comparison: Comparison
+
+
+def _best_correction(view: View) -> _Correction | None:
+    """Return the one change that lets rays agree best, None where none is told from nothing; worked out once a view.
+
+    The estimate must be told from its standard error, and the agreement with the correction from that without. One at a
+    time, the best first: of a shift along the drive a little looks like a wrong focal length.
+    """
+    if "correction" not in view.memory:
+        view.memory["correction"] = _find_correction(view)
+    found: _Correction | None = view.memory["correction"]
+    return found
+
+
+def _find_correction(view: View) -> _Correction | None:
+    found = common_errors(view)
+    if found is None:
+        return None
+    tests = len(found.names)
+    freedom = max(found.places - tests, 1)
+    given: Floats | None = None
+    best: _Correction | None = None
+    for name in found.names:
+        value, sigma = found.of(name)
+        chance = 2.0 * float(stats.t.sf(abs(value) / sigma, freedom)) * tests
+        if chance > LEAST_CHANCE:
+            continue
+        given = gains_of_all(view, view.dataset) if given is None else given
+        parameter = next(p for p in PARAMETERS if p.name == name)
+        gains = gains_of_all(view, parameter.change(view.dataset, value))
+        value, sigma, gains = _better(view, parameter, value, sigma, gains)
+        comparison = compare(gains, given)
+        chance = max(chance, comparison.chance * tests * 2)  # Of each parameter two values are tried.
+        if chance > LEAST_CHANCE or comparison.difference < _LEAST_RISE * float(given.sum()):
+            continue
+        if best is None or comparison.difference > best.comparison.difference:
+            best = _Correction(parameter, value, sigma, chance, comparison)
+    return best
+
+
 class _CommonError(Fault):
-    """Something small that all images share: it must be told from nothing, and its correction must help."""
+    """Something small that all images share."""
 
     stage: ClassVar[Stage] = "fine"
     parameters: ClassVar[tuple[str, ...]]
     do: ClassVar[str]
 
     def find(self, view: View) -> Finding | None:
-        """Test the estimate against its standard error, and the agreement with and without it."""
-        found = common_errors(view)
-        if found is None:
+        """Take the correction that lets rays agree best, if it is one of these parameters."""
+        best = _best_correction(view)
+        if best is None or best.parameter.name not in self.parameters:
             return None
-        tests = len(found.names)
-        for name in self.parameters:
-            if name not in found.names:
-                continue
-            value, sigma = found.of(name)
-            freedom = max(found.places - tests, 1)
-            chance = 2.0 * float(stats.t.sf(abs(value) / sigma, freedom)) * tests
-            if chance > LEAST_CHANCE:
-                continue
-            parameter = next(p for p in PARAMETERS if p.name == name)
-            given, first = gains_of_all(view, view.dataset), gains_of_all(view, parameter.change(view.dataset, value))
-            chance = max(chance, compare(first, given).chance * tests)
-            if chance > LEAST_CHANCE:
-                continue
-            value, sigma, gains = _better(view, parameter, value, sigma, first)
-            comparison = compare(gains, given)
-            return Finding(
-                fault=self.name,
-                what=self.says(view, name, value),
-                why=f"{self.shows(view, name, value, sigma)} over {found.places} places and {found.points} objects; "
-                f"corrected, the agreement of rays rises by {comparison.difference:.0f} ({comparison.places} places).",
-                do=self.do,
-                chance=chance,
-                figures={"estimates": found.to_json(), "parameter": name, **comparison.to_json()},
-                fix=partial(_changed, parameter=parameter, value=value),
-            )
-        return None
+        found = common_errors(view)
+        assert found is not None
+        name, value = best.parameter.name, best.value
+        return Finding(
+            fault=self.name,
+            what=self.says(view, name, value),
+            why=f"{self.shows(view, name, value, best.sigma)} over {found.places} places and {found.points} objects; "
+            f"corrected, the agreement of rays rises by {best.comparison.difference:.0f} "
+            f"({best.comparison.places} places).",
+            do=self.do,
+            chance=best.chance,
+            figures={"estimates": found.to_json(), "parameter": name, **best.comparison.to_json()},
+            fix=partial(_changed, parameter=best.parameter, value=value),
+        )
 
     def says(self, view: View, name: str, value: float) -> str:
         """Return what is wrong."""

@@ -326,7 +326,7 @@ class _DegreesReadAsRadians:
         wanted_deg = np.degrees(_wrap(way * (along - self._zero_rad)))
         right = self._zero_rad + way * np.radians(_unwound(dataset, way * (azimuth - self._zero_rad), wanted_deg))
         rotation = rotations_of(
-            right, np.radians(_near_its_mean(pitch)), np.radians(_near_its_mean(roll)), dataset.frame
+            right, np.radians(_unrolled(dataset, pitch)), np.radians(_unrolled(dataset, roll)), dataset.frame
         )
         return with_poses(dataset, rotation, camera_centers(dataset.images))
 
@@ -334,15 +334,15 @@ class _DegreesReadAsRadians:
 def _unwound(dataset: Dataset, angle_deg: Floats, wanted_deg: Floats) -> Floats:
     """Return angles (N), known but for multiples of 2 pi (in degrees!), as near those wanted as whole stretches can be.
 
-    Between images that hardly turn the change of the angle is known; so one multiple is looked for for all of them,
-    and errors of single directions of travel cancel out.
+    From image to image the camera turns as the direction of travel does, to within less than half a multiple; so one
+    multiple is looked for for all images of a stretch, and errors of single directions of travel cancel out.
     """
     order = driving_order(dataset.images)
     angle, wanted, codes = angle_deg[order], wanted_deg[order], dataset.images.pass_id.codes[order]
-    change = np.diff(angle, prepend=angle[:1])
-    change -= 2.0 * np.pi * np.round(change / (2.0 * np.pi))
     wanted_change = np.diff(wanted, prepend=wanted[:1])
     wanted_change -= 360.0 * np.round(wanted_change / 360.0)
+    change = np.diff(angle, prepend=angle[:1])
+    change -= 2.0 * np.pi * np.round((change - wanted_change) / (2.0 * np.pi))
     breaks = (np.diff(codes, prepend=-1) != 0) | (np.abs(wanted_change - change) > _MOST_TURN_DEG)
     chain = np.cumsum(np.where(breaks, 0.0, change))
     result = np.empty(len(order))
@@ -354,10 +354,19 @@ def _unwound(dataset: Dataset, angle_deg: Floats, wanted_deg: Floats) -> Floats:
     return result
 
 
-def _near_its_mean(angle: Floats) -> Floats:
-    """Return angles (N) without whole turns, such that those that vary around a value stay together."""
+def _unrolled(dataset: Dataset, angle_deg: Floats) -> Floats:
+    """Return angles (N), known but for multiples of 2 pi (in degrees!), that change little along a drive and are small.
+
+    The multiple of a whole drive is the one that brings its middle nearest to the mean of all.
+    """
+    order = driving_order(dataset.images)
+    angle, codes = angle_deg[order], dataset.images.pass_id.codes[order]
     mean = float(np.arctan2(np.sin(angle).mean(), np.cos(angle).mean()))
-    return np.asarray(mean + _wrap(angle - mean))
+    result = np.empty(len(order))
+    for rows in np.split(np.arange(len(order)), np.flatnonzero(np.diff(codes)) + 1):
+        own = np.unwrap(angle[rows])
+        result[order[rows]] = own - 2.0 * np.pi * np.round((float(np.median(own)) - mean) / (2.0 * np.pi))
+    return result
 
 
 def _wrap(angle: Floats) -> Floats:

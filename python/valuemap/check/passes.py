@@ -31,6 +31,7 @@ from valuemap.check.fault import (
 from valuemap.check.headings import driving_azimuths
 from valuemap.check.offsets import densest, pairs_within
 from valuemap.check.sample import driving_order, standing_m
+from valuemap.check.seams import Seam, worst_seam
 from valuemap.dataset import Dataset
 from valuemap.tables import Bools, Categories, Floats, Images, Ints
 
@@ -147,7 +148,8 @@ class PassShift:
     """How far what one pass sees is from what the others see.
 
     `offset_m` (3) takes the pass's own objects to those of the others, in the world; of a shift along the drive it is
-    (forward, left, up). `gain` is how well its rays meet the others' points then; `chance` that good data do so.
+    (forward, left, up). `gain` is how well its rays meet the others' points then; `chance` that good data do so. Where
+    it is told from the way the poses jump where the pass goes on from another, that is the `seam`.
     """
 
     pass_name: str
@@ -157,6 +159,7 @@ class PassShift:
     gain_without: float
     chance: float
     passes: int
+    seam: Seam | None = None
 
 
 class PassOffset(Fault):
@@ -477,6 +480,33 @@ def meeting_of_passes(view: View) -> Meeting | None:
 
 
 def _worst_pass(view: View) -> PassShift | None:
+    """See whether a pass's rays meet the points of the others better when it is moved, or its poses jump at an end."""
+    return _apart_from_others(view) or _at_a_seam(view)
+
+
+def _at_a_seam(view: View) -> PassShift | None:
+    """Return the shift that closes the largest jump between passes that are one drive: of the shorter of the two."""
+    seam = worst_seam(view.dataset, view.center_in_world_m)
+    if seam is None or seam.chance > LEAST_CHANCE:
+        return None
+    images = view.dataset.images
+    count = {name: int((images.pass_id.codes == images.pass_id.code_of(name)).sum()) for name in images.pass_id.names}
+    name = seam.after if count[seam.after] <= count[seam.before] else seam.before
+    offset_m = -seam.jump_m if name == seam.after else seam.jump_m
+    forward_m = float(offset_m @ seam.forward)
+    speed_mps = median_speed_mps(view)
+    is_along = speed_mps is not None and abs(forward_m) > _ALONG * float(np.linalg.norm(offset_m))
+    if is_along and speed_mps is not None:
+        # What a shift in time is at the median speed.
+        offset_m = np.array([forward_m / seam.speed_mps * speed_mps, 0.0, 0.0])
+    return PassShift(name, offset_m, is_along, 0.0, 0.0, seam.chance, len(count), seam)
+
+
+_ALONG = 0.97
+"""A jump within 14 degrees of the way the car drives is one in time."""
+
+
+def _apart_from_others(view: View) -> PassShift | None:
     """See for each pass whether its rays meet the points of the others, moved or not."""
     points = _pass_points(view)
     if points is None:
@@ -603,19 +633,34 @@ def _is_vertical(view: View, offset_m: Floats) -> bool:
 def _shift_finding(fault: str, shift: PassShift, what: str, do: str) -> Finding:
     frame = "forward, left, up" if shift.is_along else "x, y, z"
     numbers = ", ".join(f"{part:.2f}" for part in shift.offset_m)
+    if shift.seam is None:
+        why = (
+            f"Moved by {numbers} m ({frame}), what it sees is where other passes see it: the agreement of its rays "
+            f"with the others' points rises from {shift.gain_without:.0f} to {shift.gain:.0f}."
+        )
+        figures: dict[str, Any] = {
+            "agreement_as_given": round(shift.gain_without, 1),
+            "agreement_if_moved": round(shift.gain, 1),
+        }
+    else:
+        jump_m = float(np.linalg.norm(shift.seam.jump_m))
+        why = (
+            f"By its times pass {shift.seam.after} goes on where {shift.seam.before} ends, but the poses jump by "
+            f"{jump_m:.2f} m there; from image to image within passes it is less than {shift.seam.usual_m:.2f} m. "
+            f"Moved by {numbers} m ({frame}) they do not."
+        )
+        figures = {"jump_m": round(jump_m, 3), "usual_jump_m": round(shift.seam.usual_m, 3)}
     return Finding(
         fault=fault,
         what=what,
-        why=f"Moved by {numbers} m ({frame}), what it sees is where other passes see it: the agreement of its rays "
-        f"with the others' points rises from {shift.gain_without:.0f} to {shift.gain:.0f}.",
+        why=why,
         do=do,
         chance=shift.chance,
         figures={
             "pass": shift.pass_name,
             "shift_m": [round(float(part), 3) for part in shift.offset_m],
             "frame": frame,
-            "agreement_as_given": round(shift.gain_without, 1),
-            "agreement_if_moved": round(shift.gain, 1),
+            **figures,
             "passes_looked_at": shift.passes,
         },
         fix=_Realigned(shift),
