@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields
+import pickle
+from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from valuemap.config import (
+    DetectConfig,
     MapConfig,
     MergeConfig,
     PartitionConfig,
     SimulationConfig,
+    TrainConfig,
     VoteConfig,
     describe_settings,
 )
+from valuemap.config.setting import declared
 from valuemap.errors import SettingError
 
 NAMES = [name for name, *_ in describe_settings()]
@@ -123,7 +128,7 @@ def test_wrong_settings_are_refused_wherever_they_come_from() -> None:
         MapConfig(vote=VoteConfig(max_reprojection_error_px=0.0))
 
 
-@pytest.mark.parametrize("name", [f.name for f in fields(SimulationConfig)])
+@pytest.mark.parametrize("name", [f.name for f in declared(SimulationConfig)])
 def test_the_simulation_has_a_range_for_every_setting(name: str) -> None:
     for wrong in ("nan", "-1000000"):
         with pytest.raises(SettingError, match=f"{name}: expected "):
@@ -131,3 +136,41 @@ def test_the_simulation_has_a_range_for_every_setting(name: str) -> None:
     default = getattr(SimulationConfig(), name)
     assert SimulationConfig().with_settings([f"{name}={default}"]) == SimulationConfig()
     assert math.isfinite(default)
+
+
+def test_settings_have_the_type_that_they_declare() -> None:
+    for given in (80, 80.0, np.float32(80)):
+        length = VoteConfig(max_range_m=cast("float", given)).max_range_m
+        assert (length, type(length)) == (80.0, float)
+    assert VoteConfig(min_votes=cast("int", np.int64(4))).min_votes == 4
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "line"),
+    [
+        (VoteConfig, {"max_range_m": "80"}, r"max_range_m: expected a number \(m\), found '80'"),
+        (VoteConfig, {"max_range_m": None}, r"max_range_m: expected a number \(m\), found None"),
+        (VoteConfig, {"min_votes": 3.5}, r"min_votes: expected a whole number \(images\), found 3.5"),
+        (VoteConfig, {"min_votes": True}, r"min_votes: expected a whole number \(images\), found True"),
+        (MapConfig, {"max_range_m": "80"}, r"max_range_m: expected a number \(m\), found '80'"),
+        (VoteConfig, {"max_rnage_m": 80}, "VoteConfig: there is no setting named 'max_rnage_m'"),
+        (MapConfig, {"vote": 80}, "vote: expected VoteConfig, found 80"),
+        (DetectConfig, {"kind": "magic"}, "--kind: expected one of segmentation, yolox, .*, found 'magic'"),
+        (DetectConfig, {"provider": "tpu"}, "--provider: expected one of cpu, cuda, found 'tpu'"),
+        (DetectConfig, {"size": 640}, "--size: .* string, found 640"),
+    ],
+)
+def test_a_wrong_value_from_python_is_refused_in_one_line(kind: Any, given: dict[str, Any], line: str) -> None:
+    with pytest.raises(SettingError, match=f"^{line}$") as refusal:
+        kind(**given)
+    assert refusal.value.hint
+
+
+def test_a_wrong_value_without_its_name_is_refused_by_name() -> None:
+    with pytest.raises(SettingError, match="^max_reprojection_error_px: expected above 0 "):
+        VoteConfig(0.0)
+
+
+@pytest.mark.parametrize("settings", [MapConfig(max_range_m=80), DetectConfig(size="640"), TrainConfig(epochs=3)])
+def test_settings_travel_to_other_processes(settings: object) -> None:
+    assert pickle.loads(pickle.dumps(settings)) == settings

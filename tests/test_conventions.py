@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ import pytest
 
 from small_dataset import small_dataset, with_column
 from valuemap.config import SimulationConfig, describe_settings
+from valuemap.config.setting import declared
 from valuemap.tables import Images, table_from_arrow, table_to_arrow
 
 ROOT = Path(__file__).parents[1]
@@ -36,7 +36,7 @@ SUFFIXES = {"m": "_m", "px": "_px", "deg": "_deg", "s": "_s", "m/s": "_mps"}
     ("name", "unit"),
     [
         *((name, unit) for name, _, unit, _ in describe_settings()),
-        *((setting.name, setting.metadata["unit"]) for setting in fields(SimulationConfig)),
+        *((setting.name, setting.unit) for setting in declared(SimulationConfig)),
     ],
 )
 def test_settings_carry_their_units_in_their_names(name: str, unit: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from block import block
 from valuemap.cameras import camera_centers, colmap_camera, rotation_matrices
 from valuemap.config import SimulationConfig
+from valuemap.config.setting import declared
 from valuemap.dataset import Dataset, check_dataset, read_dataset, rows_of, write_dataset, write_dataset_in_pieces
 from valuemap.errors import SettingError
 from valuemap.progress import silent
@@ -733,10 +734,7 @@ def test_progress_reaches_its_end() -> None:
 
 def test_the_docs_list_every_setting_as_it_is() -> None:
     docs = (Path(__file__).parents[1] / "docs" / "simulator.md").read_text(encoding="utf-8")
-    rows = [
-        f"| `{s.name}` | {s.default} | {s.metadata['unit']} | {s.metadata['effect']} |"
-        for s in fields(SimulationConfig)
-    ]
+    rows = [f"| `{s.name}` | {s.default} | {s.unit} | {s.effect} |" for s in declared(SimulationConfig)]
     assert [row for row in rows if row not in docs] == []
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
-from typing import Literal, Self, get_args
+from typing import Literal
 
-from valuemap.config.setting import assign, check_range, declare
+from pydantic.dataclasses import dataclass
+
+from valuemap.config.setting import CHECKED, Settings, declare
 from valuemap.errors import SettingError
 
 MAX_CANVAS_PX = 2**26
@@ -16,8 +16,8 @@ ModelKind = Literal["segmentation", "yolox", "ultralytics", "detr", "boxes"]
 Provider = Literal["cpu", "cuda"]
 
 
-@dataclass(frozen=True)
-class DetectConfig:
+@dataclass(frozen=True, config=CHECKED)
+class DetectConfig(Settings):
     """How pictures are put through a detector, and which of its boxes count."""
 
     kind: ModelKind | None = None
@@ -66,15 +66,6 @@ class DetectConfig:
     )
 
     def __post_init__(self) -> None:
-        for name, allowed in (("kind", (None, *get_args(ModelKind))), ("provider", get_args(Provider))):
-            if getattr(self, name) not in allowed:
-                raise SettingError(
-                    f"--{name}: expected one of {', '.join(filter(None, allowed))}, found {getattr(self, name)!r}",
-                    hint="leave it away for the default",
-                )
-        for setting in fields(self):
-            if setting.metadata:
-                check_range(setting, getattr(self, setting.name))
         if self.min_score is not None and not 0.0 <= self.min_score <= 1.0:
             raise SettingError(f"--min-score: expected 0 to 1, found {self.min_score}", hint="for example 0.3")
         if self.tile_px and self.tile_overlap_px >= self.tile_px / 2:
@@ -102,8 +93,3 @@ class DetectConfig:
                 hint=f"take at most {MAX_CANVAS_PX // 10**6} million pixels at once, and --tile for small things",
             )
         return width, height
-
-    def with_settings(self, assignments: Iterable[str]) -> Self:
-        """Return a copy with `name=value` assignments applied; raises as `MapConfig.with_settings`."""
-        changed: Self = assign({"detect": self}, assignments)["detect"]
-        return changed

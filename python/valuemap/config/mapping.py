@@ -4,25 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
 from typing import Any, Self, get_args
 
+from pydantic.dataclasses import dataclass
+
 from valuemap.config.setting import (
+    CHECKED,
     LONGEST_M,
     WIDEST_PX,
     Method,
+    Setting,
+    Settings,
     assign,
-    check_range,
     declare,
-    effect_of,
+    declared,
     owner_of,
-    shown,
 )
 from valuemap.errors import SettingError
 
 
-@dataclass(frozen=True)
-class PartitionConfig:
+@dataclass(frozen=True, config=CHECKED)
+class PartitionConfig(Settings):
     """How images are split into independent clusters."""
 
     cluster_radius_m: float = declare(
@@ -36,8 +38,8 @@ class PartitionConfig:
     )
 
 
-@dataclass(frozen=True)
-class VoteConfig:
+@dataclass(frozen=True, config=CHECKED)
+class VoteConfig(Settings):
     """Which hypotheses are viable, who votes, and when the greedy selection stops."""
 
     max_reprojection_error_px: float = declare(
@@ -77,8 +79,8 @@ class VoteConfig:
     )
 
 
-@dataclass(frozen=True)
-class NoiseConfig:
+@dataclass(frozen=True, config=CHECKED)
+class NoiseConfig(Settings):
     """How far a detection may be from where its object projects; what is not set is estimated from the data."""
 
     gate_sigmas: float = declare(
@@ -112,8 +114,8 @@ class NoiseConfig:
     )
 
 
-@dataclass(frozen=True)
-class ExistenceConfig:
+@dataclass(frozen=True, config=CHECKED)
+class ExistenceConfig(Settings):
     """Which labels are kept."""
 
     min_existence: float = declare(
@@ -125,8 +127,8 @@ class ExistenceConfig:
     )
 
 
-@dataclass(frozen=True)
-class MergeConfig:
+@dataclass(frozen=True, config=CHECKED)
+class MergeConfig(Settings):
     """When labels of different clusters are one object."""
 
     merge_radius_m: float = declare(
@@ -138,7 +140,7 @@ class MergeConfig:
     )
 
 
-@dataclass(frozen=True, init=False)
+@dataclasses.dataclass(frozen=True, init=False)
 class MapConfig:
     """All settings of one `map` run, by stage; single ones by name as well: `MapConfig(max_range_m=80)`."""
 
@@ -163,7 +165,7 @@ class MapConfig:
             "partition": partition, "vote": vote, "noise": noise, "existence": existence, "merge": merge,
         }  # fmt: skip
         for name, value in settings.items():
-            stage, _ = owner_of(name, stages, name)
+            stage = owner_of(name, stages, name)
             stages[stage] = dataclasses.replace(stages[stage], **{name: value})
         for name, value in {"method": method, **stages}.items():
             object.__setattr__(self, name, value)  # As a frozen dataclass does.
@@ -175,9 +177,12 @@ class MapConfig:
                 f"method: expected one of {', '.join(get_args(Method))}, found {self.method!r}",
                 hint="leave --method away for the default",
             )
-        for stage in self._stages().values():
-            for setting in fields(stage):
-                check_range(setting, getattr(stage, setting.name))
+        for name, stage in self._stages().items():
+            if not isinstance(stage, type(getattr(MapConfig, name))):
+                raise SettingError(
+                    f"{name}: expected {type(getattr(MapConfig, name)).__name__}, found {stage!r}",
+                    hint="single settings go by their names: MapConfig(max_range_m=80)",
+                )
         if self.vote.min_range_m >= self.vote.max_range_m:
             raise SettingError(
                 f"min_range_m ({self.vote.min_range_m}) must be less than max_range_m ({self.vote.max_range_m})",
@@ -205,9 +210,7 @@ class MapConfig:
 
     def ignored_settings(self) -> dict[str, Method]:
         """Return the settings that the method does not have, each with the only method that has it."""
-        settings = [setting for stage in self._stages().values() for setting in fields(stage)]
-        owner = {setting.name: setting.metadata["method"] for setting in settings}
-        return {name: method for name, method in owner.items() if method not in (None, self.method)}
+        return {s.name: s.method for s in _all_settings() if s.method is not None and s.method != self.method}
 
     def as_dict(self) -> dict[str, float | str | None]:
         """Return all settings, flat, as `run.json` holds them."""
@@ -217,22 +220,18 @@ class MapConfig:
         return flat
 
     def _stages(self) -> Mapping[str, Any]:
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "method"}
+        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "method"}
+
+
+def _all_settings() -> list[Setting]:
+    return [setting for stage in MapConfig()._stages().values() for setting in declared(stage)]
 
 
 def describe_settings() -> list[tuple[str, str, str, str]]:
     """Return (name, default, unit, effect) of every setting, in the order of the stages."""
-    return [
-        (s.name, shown(s.default), s.metadata["unit"], effect_of(s))
-        for stage in MapConfig()._stages().values()
-        for s in fields(stage)
-    ]
+    return [(s.name, s.shown_default, s.unit, s.shown_effect) for s in _all_settings()]
 
 
 def list_settings() -> list[dict[str, Any]]:
     """Return every setting as an object of JSON: name, default (null: estimated), unit, effect, method (null: all)."""
-    return [
-        {"name": s.name, "default": s.default, **{key: s.metadata[key] for key in ("unit", "effect", "method")}}
-        for stage in MapConfig()._stages().values()
-        for s in fields(stage)
-    ]
+    return [{key: getattr(s, key) for key in ("name", "default", "unit", "effect", "method")} for s in _all_settings()]

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
-from typing import Self
+from pydantic.dataclasses import dataclass
 
-from valuemap.config.setting import assign, check_range, declare
+from valuemap.config.setting import CHECKED, Settings, declare
 from valuemap.errors import SettingError
 
 
-@dataclass(frozen=True)
-class SimulationConfig:
+@dataclass(frozen=True, config=CHECKED)
+class SimulationConfig(Settings):
     """A simulated city, its drives, its camera, its detector and all their errors."""
 
     # The city.
@@ -365,8 +363,6 @@ class SimulationConfig:
     )
 
     def __post_init__(self) -> None:
-        for setting in fields(self):
-            check_range(setting, getattr(self, setting.name))
         if self.images == 0 and self.passes_per_street == 0:
             raise SettingError(
                 "images and passes_per_street are both 0, so nobody drives",
@@ -403,14 +399,9 @@ class SimulationConfig:
         """Raise `SettingError` where pictures could not show what is simulated."""
         rows = ("sign_row_spacing_m", "lamp_spacing_m", "tree_spacing_m", "post_spacing_m")
         for name in (*rows, "side_offset_m", "partly_hidden_share", "cameras", "districts"):
-            default = getattr(SimulationConfig, name)
+            default = getattr(SimulationConfig(), name)
             if getattr(self, name) != default:
                 raise SettingError(
                     f"{name} ({getattr(self, name)}): pictures are drawn by one camera of whole, flat lights only",
                     hint=f"leave --images away, or --set {name}={default}",
                 )
-
-    def with_settings(self, assignments: Iterable[str]) -> Self:
-        """Return a copy with `name=value` assignments applied; raises as `MapConfig.with_settings`."""
-        changed: Self = assign({"simulation": self}, assignments)["simulation"]
-        return changed

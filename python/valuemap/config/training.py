@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
-from typing import Self
+from pydantic.dataclasses import dataclass
 
-from valuemap.config.setting import assign, check_range, declare
+from valuemap.config.setting import CHECKED, Settings, declare
 from valuemap.errors import SettingError
 
 
-@dataclass(frozen=True)
-class TrainConfig:
+@dataclass(frozen=True, config=CHECKED)
+class TrainConfig(Settings):
     """How a segmentation network is built and trained."""
 
     # The network. Its size on disk and its speed depend on these alone.
@@ -74,14 +72,7 @@ class TrainConfig:
     blur_sigma_px: float = declare(1.0, unit="px", effect="a third of the cut-outs are blurred by up to this")
 
     def __post_init__(self) -> None:
-        for setting in fields(self):
-            check_range(setting, getattr(self, setting.name))
         if self.crop_px % 32:
             raise SettingError(
                 f"crop_px: expected a multiple of 32, found {self.crop_px}", hint="take 256, 320 or 384, say"
             )
-
-    def with_settings(self, assignments: Iterable[str]) -> Self:
-        """Return a copy with `name=value` assignments applied; raises as `MapConfig.with_settings`."""
-        changed: Self = assign({"train": self}, assignments)["train"]
-        return changed
