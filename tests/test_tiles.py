@@ -19,17 +19,18 @@ from valuemap import portions
 from valuemap.cli.commands import app
 from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import Dataset, Frame
-from valuemap.drives import InOrder, driving_order, find_drives
+from valuemap.drives import InOrder, driving_order, find_drives, in_driving_order
 from valuemap.engine.threads import ThreadEngine
 from valuemap.errors import OutputError
 from valuemap.map_folder import Map
 from valuemap.portions import DatasetReader
 from valuemap.progress import silent
-from valuemap.robust import Noise
+from valuemap.robust import Noise, find_labels
 from valuemap.simulate import simulate
-from valuemap.tables import Categories, Floats, Labels, Votes, table_to_arrow
+from valuemap.tables import Candidates, Categories, Floats, Labels, Votes, table_to_arrow
 from valuemap.tiles import fleet, places
 from valuemap.tiles import grid as grid_module
+from valuemap.tiles.dense import groups_of_drives, join_groups
 from valuemap.tiles.fleet import Fleet
 from valuemap.tiles.grid import LEVELS, WHOLE, Cell, Census, Grid
 from valuemap.tiles.mapping import solve_cells
@@ -78,6 +79,7 @@ def test_borders_belong_to_one_side() -> None:
 def test_what_is_no_wider_than_a_cell_is_one_wherever_it_is() -> None:
     place_m = np.array([[470.0, 470.0], [1400.0, 1420.0]])
     assert census(place_m).cells(GRID) == [WHOLE]
+    assert len(census(place_m).cells(replace(GRID, most_detections=1))) > 1  # But not if it is too dense.
     assert len(census(place_m + [[0.0, 0.0], [100.0, 0.0]]).cells(GRID)) > 1
 
 
@@ -310,6 +312,87 @@ def test_pieces_have_all_that_sees_their_objects() -> None:
         own = dataset.images.image_id[near]
         of_own = np.isin(dataset.detections.image_id, own)
         assert sorted(piece.detection_id.tolist()) == dataset.detections.detection_id[of_own].tolist()
+
+
+# Dense places.
+
+
+def crossing(passes: int) -> InOrder:
+    """Many drives past the same objects."""
+    scene = random_scene(3, images=30 * passes, objects=6, clutter=10 * passes)
+    dataset = as_dataset(scene, passes=[f"pass-{i % passes}" for i in range(30 * passes)])
+    time_s = np.arange(30.0 * passes)
+    dataset = replace(dataset, images=dataset.images.replace(timestamp_s=1e5 * (time_s % passes) + time_s // passes))
+    return in_driving_order(dataset)
+
+
+def test_a_dense_place_is_solved_some_drives_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    piece = crossing(12)
+    most = len(piece.detection_id) // 4 + 1
+    sizes = []
+
+    def counted(scene: Any, *args: Any, **kwargs: Any) -> Any:
+        sizes.append(len(scene._dataset.detections))
+        return find_labels(scene, *args, **kwargs)
+
+    whole = solve_cell(piece, WHOLE, GRID, Noise(), KNOWN)
+    monkeypatch.setattr("valuemap.tiles.solve.find_labels", counted)
+    split = solve_cell(piece, WHOLE, replace(GRID, most_detections=most), Noise(), KNOWN)
+    assert len(sizes) >= 4
+    assert max(sizes) <= most
+    assert sum(sizes) == len(piece.detection_id)
+    assert split.counts["dense_groups"] == len(sizes)
+    assert len(split.labels) == len(whole.labels) >= 5
+    for place, votes in zip(whole.labels.position_in_world_m, whole.labels.votes.tolist(), strict=True):
+        away = np.linalg.norm(split.labels.position_in_world_m - place, axis=1)
+        assert away.min() < 0.1
+        assert split.labels.votes[np.argmin(away)] > 0.9 * votes
+    assert (split.labels.passes == 12).all()
+    assert len(np.unique(split.votes.detection_id)) == len(split.votes)
+    # All the drives together know the place as well as they do at once.
+    trace = [np.sqrt(labels.covariance_m2[:, [0, 3, 5]].sum(axis=1)).mean() for labels in (split.labels, whole.labels)]
+    assert trace[0] == pytest.approx(trace[1], rel=0.5)
+
+
+def test_no_group_of_drives_is_too_large() -> None:
+    piece = crossing(7)
+    for most in (200, 37, 10**6):
+        groups = groups_of_drives(piece, most)
+        assert np.array_equal(np.sort(np.concatenate(groups)), np.arange(len(piece.image_id)))
+        sizes = [int(np.isin(piece.dataset.detections.image_id, rows).sum()) for rows in groups]
+        assert max(sizes) <= most
+        assert len(groups) <= 2 * np.ceil(sum(sizes) / most)  # And none is solved for a few detections.
+
+
+def test_what_few_groups_find_is_left_out() -> None:
+    def found(*labels: tuple[float, list[int]]) -> Candidates:
+        count = len(labels)
+        return Candidates(
+            np.array([[x, 0.0, 5.0] for x, _ in labels]).reshape(-1, 3),
+            np.cumsum([0, *(len(voters) for _, voters in labels)]),
+            np.array([row for _, voters in labels for row in voters], np.uint32),
+            covariance_m2=np.tile(0.01 * np.eye(3), (count, 1, 1)),
+            existence=np.full(count, 0.9),
+            expected=np.full(count, 4),
+        )
+
+    classes = Categories(np.array([0] * 20 + [1] * 20, np.int32), ("light", "sign"))
+    groups = [
+        found((0.0, [8, 9]), (5.0, [2, 3])),
+        found((0.1, [4, 5]), (0.15, [24, 25])),  # The second is of another class.
+        found((-0.1, [6, 7]), (0.1, [26, 27]), (0.6, [10, 11])),  # The third is another one.
+        found((0.2, [0])),
+    ]
+    joined, left_out = join_groups(groups, classes)
+    assert joined.position_in_world_m[:, 0] == pytest.approx([0.05, 0.125])
+    assert joined.voters.tolist() == [0, 4, 5, 6, 7, 8, 9, 24, 25, 26, 27]
+    assert joined.voter_offsets.tolist() == [0, 7, 11]
+    assert joined.expected is not None
+    assert joined.expected.tolist() == [16, 8]
+    assert joined.covariance_m2 is not None
+    assert joined.covariance_m2[0] == pytest.approx(0.0025 * np.eye(3))
+    assert left_out == 2
+    assert len(join_groups([found(), found()], classes)[0]) == 0
 
 
 # On disk, interrupted, twice.

@@ -2,7 +2,7 @@
 
 The squares are anchored at the origin of the world, which is the middle of one of them. One in which, with what is
 around it, there are more detections than can be held at a time is four squares, and so on. A dataset that is no wider
-than a square is one cell whole. Tiles group cells into units of work: their size changes no label.
+than a square, and has no more, is one cell whole. Tiles group cells into units of work: their size changes no label.
 """
 
 from __future__ import annotations
@@ -162,7 +162,8 @@ class Census:
 
     def cells(self, grid: Grid) -> list[Cell]:
         """Return the cells, ascending, that may have images in or around them."""
-        if not len(self.square) or max(np.subtract(self.extent_m[2:], self.extent_m[:2])) <= grid.side_m:
+        is_narrow = not len(self.square) or max(np.subtract(self.extent_m[2:], self.extent_m[:2])) <= grid.side_m
+        if is_narrow and self.detections.sum() <= grid.most_detections:
             return [WHOLE]
         reach = grid.halo_squares
         around = np.concatenate([self.square + step for step in np.ndindex(2 * reach + 1, 2 * reach + 1)]) - reach

@@ -24,7 +24,7 @@ from valuemap.config import MapConfig
 from valuemap.describe import residual_sigma_px
 from valuemap.tables import Bools, Ints, Labels, Votes, join_tables
 from valuemap.tiles.grid import Grid
-from valuemap.tiles.solve import Solved
+from valuemap.tiles.solve import Solved, summed
 
 _SAME_SHARE = 0.5
 
@@ -148,14 +148,5 @@ def _totals(solved: Sequence[Solved]) -> dict[str, Any]:
     """Return counts of all cells: sums of whole numbers and of the energy, means of the rest by number of images."""
     if len(solved) == 1:
         return {name: value for name, value in solved[0].counts.items() if name != "images"}
-    images = np.array([cell.counts["images"] for cell in solved], np.float64)
-    totals: dict[str, Any] = {"cells": len(solved)}
-    for name in solved[0].counts:
-        values = [cell.counts[name] for cell in solved]
-        if name == "images":
-            totals["images_in_cells"] = sum(values)
-        elif name == "energy" or all(isinstance(value, int) for value in values):
-            totals[name] = sum(values)
-        else:
-            totals[name] = float(np.average(values, weights=images))
-    return totals
+    images = sum(cell.counts["images"] for cell in solved)
+    return {"cells": len(solved), "images_in_cells": images, **summed([cell.counts for cell in solved])}

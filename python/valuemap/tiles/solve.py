@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,8 +15,10 @@ from valuemap.drives import InOrder
 from valuemap.progress import Progress, silent
 from valuemap.robust import Calibration, Scene, find_labels
 from valuemap.sightings import cast_sightings
-from valuemap.tables import Bools, Ints, Labels, Votes
+from valuemap.tables import Bools, Candidates, Ints, Labels, Votes
+from valuemap.tiles.dense import groups_of_drives, join_groups
 from valuemap.tiles.grid import Cell, Grid
+from valuemap.tiles.piece import piece_of_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +49,12 @@ def solve_cell(
 ) -> Solved:
     """Find the labels of a cell in its piece; the piece has at least one image."""
     rays, is_double = cast_sightings(piece.dataset)
-    scene = Scene(piece.dataset, piece.drives, rays)
-    found, counts = find_labels(scene, calibration, config, threads=threads, progress=progress)
+    groups = groups_of_drives(piece, grid.most_detections)
+    if len(groups) == 1:
+        scene = Scene(piece.dataset, piece.drives, rays)
+        found, counts = find_labels(scene, calibration, config, threads=threads, progress=progress)
+    else:
+        found, counts = _by_groups(piece, groups, calibration, config, threads, progress)
     ground_m = grid.on_ground(found.position_in_world_m)
     found = found.take(np.flatnonzero(grid.is_within(cell, ground_m, grid.margin_m)))
     labels, votes = describe_labels(piece.dataset, rays, found, config.noise)
@@ -69,3 +76,40 @@ def solve_cell(
         vote_pass=number_passes(piece.dataset.images)[votes.image_id],
         counts=counts,
     )
+
+
+def _by_groups(
+    piece: InOrder,
+    groups: list[Ints],
+    calibration: Calibration,
+    config: MapConfig,
+    threads: int,
+    progress: Progress,
+) -> tuple[Candidates, dict[str, Any]]:
+    """Find the labels of a piece that is too dense to be solved at once, some drives at a time."""
+    found, counts = [], []
+    for rows in groups:
+        part = piece_of_rows(piece, rows)
+        detection_row = np.flatnonzero(np.isin(piece.dataset.detections.image_id, rows))
+        scene = Scene(part.dataset, part.drives, cast_sightings(part.dataset)[0])
+        of_group, counted = find_labels(scene, calibration, config, threads=threads, progress=progress)
+        found.append(replace(of_group, voters=detection_row[of_group.voters].astype(np.uint32)))
+        counts.append({"images": len(rows), **counted})
+    joined, left_out = join_groups(found, piece.dataset.detections.class_name)
+    return joined, {**summed(counts), "dense_groups": len(groups), "labels_of_few_groups": left_out}
+
+
+def summed(counts: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return counts of parts as one: sums of whole numbers and of the energy, means of the rest by their images.
+
+    What only some parts counted is 0 in the others.
+    """
+    images = np.array([part["images"] for part in counts], np.float64)
+    totals: dict[str, Any] = {}
+    for name in dict.fromkeys(name for part in counts for name in part if name != "images"):
+        values = [part.get(name, 0) for part in counts]
+        if name == "energy" or all(isinstance(value, int) for value in values):
+            totals[name] = sum(values)
+        else:
+            totals[name] = float(np.average(values, weights=images))
+    return totals
