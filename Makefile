@@ -13,8 +13,9 @@ FIELD_DATA ?= ../shared/data
 demo: setup
 	$(RUN) valuemap demo
 
+# A file is tried in one process, for what its tests share; in the order of the names, long and short ones mixed.
 test: setup
-	EXTRAS="$(EXTRAS)" $(RUN) pytest --numprocesses auto --dist loadfile
+	EXTRAS="$(EXTRAS)" $(RUN) pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 
 rust-test:
 	cargo test --locked --package valuemap-core
