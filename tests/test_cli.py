@@ -17,34 +17,38 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pycolmap
 import pytest
+from typer.testing import CliRunner
 
 import valuemap
 from scenes import as_dataset, random_scene
+from valuemap.cli.commands import app
 from valuemap.config import describe_settings
 
 COMMAND = [sys.executable, "-c", "from valuemap.cli import main; main()"]
 
 
-def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=600, check=False)
-
-
 def works(*arguments: str | Path) -> str:
-    done = run(*arguments)
-    assert done.returncode == 0, done.stderr
+    """Run a command in this process, as starting one takes longer than the work; return what it prints."""
+    done = CliRunner().invoke(app, [*map(str, arguments)])
+    assert done.exit_code == 0, done.output
     return done.stdout
 
 
 def complains(*arguments: str | Path) -> str:
     """Run a command that must fail with one line and a hint; return the line."""
-    done = run(*arguments)
-    assert done.returncode == 1
-    assert done.stdout == ""
-    lines = done.stderr.strip().splitlines()
-    assert len(lines) == 2, done.stderr
+    done = CliRunner().invoke(app, [*map(str, arguments)])
+    assert isinstance(done.exception, SystemExit), done.exception  # Nothing else gets out: no traceback.
+    return one_line_and_a_hint(done.exit_code, done.stdout, done.stderr)
+
+
+def one_line_and_a_hint(code: int, stdout: str, stderr: str) -> str:
+    assert code == 1
+    assert stdout == ""
+    lines = stderr.strip().splitlines()
+    assert len(lines) == 2, stderr
     assert lines[0].startswith("error: ")
     assert lines[1].startswith("hint: ")
-    return done.stderr
+    return stderr
 
 
 @pytest.fixture
@@ -102,12 +106,22 @@ def test_from_simulation_to_export(tmp_path: Path) -> None:
     assert json.loads(works("info", result, "--json"))["labels"] == run_record["counts"]["labels"]
 
 
-def test_the_version_is_told_by_every_way_to_start() -> None:
-    told = works("--version")
-    assert told == f"valuemap {version('valuemap')}\n"
-    for module in ("valuemap", "valuemap.cli"):
-        command = [sys.executable, "-m", module, "--version"]
-        assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == told
+@pytest.mark.parametrize("start", [COMMAND, *([sys.executable, "-m", name] for name in ("valuemap", "valuemap.cli"))])
+def test_every_way_to_start_tells_the_version(start: list[str]) -> None:
+    done = subprocess.run([*start, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"valuemap {version('valuemap')}\n"
+    assert done.stderr == ""
+
+
+def test_a_process_says_and_ends_as_its_command_does(street: Path, tmp_path: Path) -> None:
+    def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+        return subprocess.run([*COMMAND, *map(str, arguments)], capture_output=True, text=True, check=False)
+
+    done = run("map", street, "--out", tmp_path / "map", "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["counts"]["images"] == 60
+    failed = run("map", tmp_path / "nowhere", "--out", tmp_path / "map")
+    assert "is not a dataset" in one_line_and_a_hint(failed.returncode, failed.stdout, failed.stderr)
 
 
 def test_commands_are_shown_in_the_order_of_use() -> None:
