@@ -36,6 +36,7 @@ from valuemap.simulate import PRESETS, simulate
 from valuemap.tables import Ints
 from valuemap.tiles.work import open_work
 from valuemap.update import compare
+from valuemap.update.changes import MOVED_WITHIN_M
 from valuemap.update.join import join_datasets
 
 CELL_SIZES = (200.0, 500.0, 2000.0, 1e6)
@@ -139,8 +140,14 @@ def kills(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def change(arguments: argparse.Namespace) -> dict[str, Any]:
     """Two years of one city: lights removed, added and moved between them."""
-    runs = [change_of(arguments.preset, seed) for seed in range(arguments.seeds)]
-    return {"removed": CHANGED, "added": CHANGED, "moved": MOVED, "moved_by_m": MOVED_BY_M, "runs": runs}
+    runs = []
+    for seed in range(arguments.seeds):
+        runs.append(change_of(arguments.preset, seed))
+        print(json.dumps(runs[-1]), flush=True)
+    right = sum(sum(run["right"].values()) for run in runs)
+    changed = sum(sum(run["changed"].values()) for run in runs)
+    others = sum(run["others_that_change"] for run in runs)
+    return {"moved_by_m": MOVED_BY_M, "right_share": right / changed, "others_that_change": others, "runs": runs}
 
 
 def change_of(preset: str, seed: int) -> dict[str, Any]:
@@ -153,8 +160,8 @@ def change_of(preset: str, seed: int) -> dict[str, Any]:
     assert dataset.truth is not None
     assert dataset.truth_detections is not None
     seen = np.bincount(dataset.truth_detections.object_id, minlength=len(dataset.truth))
-    objects = np.random.default_rng(seed).permutation(np.flatnonzero(seen >= 40))
-    removed, added, moved = np.split(objects[: 2 * CHANGED + MOVED], [CHANGED, 2 * CHANGED])
+    place = dataset.truth.position_in_world_m
+    removed, added, moved = choose_changed(place, np.random.default_rng(seed).permutation(np.flatnonzero(seen >= 40)))
     first, second = years(dataset, removed, added, moved)
     with tempfile.TemporaryDirectory() as name:
         folder, progress = Path(name), lambda *_: None
@@ -169,8 +176,10 @@ def change_of(preset: str, seed: int) -> dict[str, Any]:
             rebuilt, _ = build_map_of_folder(
                 folder / "both", MapConfig(), Run(work, ThreadEngine(0), calibration=known), progress=progress
             )
-        result, changes, _ = compare(before, rebuilt, both, first.images.image_id)
-    place = dataset.truth.position_in_world_m
+            valuemap.write_dataset(second, folder / "second")
+            run = Run(work, ThreadEngine(0), calibration=known)
+            alone, _ = build_map_of_folder(folder / "second", MapConfig(), run, progress=progress)
+        result, changes, _ = compare(before, rebuilt, alone, both, first.images.image_id)
     states = result.labels.state.texts() if result.labels.state is not None else []
     labels = result.labels.position_in_world_m
     kinds, where, was = changes.change.texts(), changes.position_in_world_m, changes.from_m
@@ -183,13 +192,14 @@ def change_of(preset: str, seed: int) -> dict[str, Any]:
         "added": sum(any(states[i] == "new" for i in near(labels, place[o])) for o in added),
         "moved": sum(any(states[i] == "moved" for i in near(labels, place[o] + [MOVED_BY_M, 0.0, 0.0])) for o in moved),
     }
-    others = np.setdiff1d(np.arange(len(place)), objects[: 2 * CHANGED + MOVED])
+    others = np.setdiff1d(np.arange(len(place)), [*removed, *added, *moved])
     touched = {i for o in [*removed, *added, *moved] for i in near(where, place[o])}
     touched |= {i for o in moved for i in near(where, place[o] + [MOVED_BY_M, 0.0, 0.0])}
     wrong = [kind for i, kind in enumerate(kinds) if i not in touched and kind in ("removed", "added", "moved")]
     told = [changes.state.texts()[i] for o in [*removed, *added, *moved] for i in near(where, place[o])]
     return {
         "seed": seed,
+        "changed": {"removed": len(removed), "added": len(added), "moved": len(moved)},
         "right": right,
         "others": len(others),
         "others_that_change": len(wrong),
@@ -202,6 +212,29 @@ def change_of(preset: str, seed: int) -> dict[str, Any]:
         "states_of_changed": {state: told.count(state) for state in sorted(set(told))},
         "moved_from_right": sum(bool(near(was[[k == "moved" for k in kinds]], place[o])) for o in moved),
     }
+
+
+def choose_changed(place_m: np.ndarray[Any, Any], objects: Ints) -> tuple[Ints, Ints, Ints]:
+    """Return which objects are removed, added and moved, in this order of preference.
+
+    One removed and one added side by side are one moved, for all that anybody can see. So objects that change in
+    different ways are farther apart than what is told as moved, and none is moved to where another one is.
+    """
+    chosen: tuple[list[int], list[int], list[int]] = ([], [], [])
+    places = [np.empty((0, 3))] * 3
+    for item in objects.tolist():
+        now = place_m[item] + [MOVED_BY_M, 0.0, 0.0]
+        for kind, most in enumerate((CHANGED, CHANGED, MOVED)):
+            own = place_m[item][None] if kind < 2 else np.stack([place_m[item], now])
+            others = np.concatenate([places[other] for other in range(3) if other != kind or kind == 2])
+            apart = np.linalg.norm(own[:, None] - others, axis=2).min(initial=np.inf)
+            in_place = kind == 2 and np.linalg.norm(place_m - now, axis=1).min() < 1.0
+            if len(chosen[kind]) < most and apart > MOVED_WITHIN_M and not in_place:
+                chosen[kind].append(item)
+                places[kind] = np.concatenate([places[kind], own])
+                break
+    removed, added, moved = (np.array(sorted(items), np.int64) for items in chosen)
+    return removed, added, moved
 
 
 def years(dataset: Dataset, removed: Ints, added: Ints, moved: Ints) -> tuple[Dataset, Dataset]:

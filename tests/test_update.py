@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,9 @@ from valuemap.cli.commands import app
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError
 from valuemap.map_folder import Map
-from valuemap.tables import Changes, Floats, IdBridge, read_table, table_to_arrow
-from valuemap.update.changes import match_labels
+from valuemap.tables import Categories, Changes, Floats, IdBridge, join_tables, read_table, table_to_arrow
+from valuemap.update import compare
+from valuemap.update.changes import match_labels, match_places
 from valuemap.update.join import join_datasets
 
 SET = ("detection_sigma_px=1.5", "position_sigma_m=0.05", "rotation_sigma_deg=0.05")
@@ -108,6 +110,57 @@ def test_states_say_what_became_of_each_object(years: Path) -> None:
     # Nobody looked: nothing is known to have changed there.
     for place in (REMOVED, MOVED_FROM):
         assert state_at(new, place, start_m=FAR_M) == ("confirmed", id_at(old, place, start_m=FAR_M))
+
+
+def test_what_moved_is_told_where_all_the_data_have_one_label_for_both_places(years: Path) -> None:
+    old, both = valuemap.read_map(years / "map"), valuemap.read_dataset(years / "map2" / "dataset")
+    is_new = ~np.isin(both.images.image_id, valuemap.read_dataset(years / "first").images.image_id)
+    of_new = np.isin(both.detections.image_id, both.images.image_id[is_new])
+    added = replace(both, images=both.images.take(is_new), detections=both.detections.take(of_new))
+    alone = valuemap.build_map(added, valuemap.MapConfig().with_settings(SET))
+    # What a map makes of it that takes it for standing still: the old label with the votes of both.
+    told = valuemap.read_map(years / "map2")
+    moved, gone = id_at(told, MOVED_TO), id_at(old, MOVED_FROM)
+    of_gone = old.votes.take(old.votes.label_id == gone)
+    labels = [
+        told.labels.take(told.labels.label_id != moved).replace(state=None),
+        old.labels.take(old.labels.label_id == gone).replace(label_id=np.array([9000])),
+    ]
+    votes = join_tables(
+        [
+            told.votes.replace(label_id=np.where(told.votes.label_id == moved, 9000, told.votes.label_id)),
+            of_gone.replace(label_id=np.full(len(of_gone), 9000)),
+        ]
+    )
+    in_order = votes.take(np.argsort(votes.label_id, kind="stable"))
+    blind = replace(told, labels=join_tables(labels), votes=in_order)
+    result, changes, _ = compare(old, blind, alone, both, both.images.image_id[~is_new])
+    assert state_at(result, MOVED_TO) == ("moved", gone)
+    assert state_at(result, MOVED_FROM) is None
+    for place in STAYS:
+        assert state_at(result, place) == ("confirmed", id_at(old, place))
+    kinds = changes.change.texts()
+    assert (kinds.count("moved"), kinds.count("removed"), kinds.count("added")) == (1, 1, 1)
+    assert np.all(np.bincount(np.unique(result.votes.detection_id, return_inverse=True)[1]) == 1)
+    assert np.bincount(result.votes.label_id)[result.labels.label_id].tolist() == result.labels.votes.tolist()
+
+
+def test_labels_of_two_epochs_are_one_where_their_covariances_say_so(years: Path) -> None:
+    labels = valuemap.read_map(years / "map").labels
+    assert np.array_equal(match_places(labels, labels), np.arange(len(labels)))
+    sigma_m = np.sqrt(labels.covariance_m2[:, 0])
+    for sigmas, expected in ((4.0, np.arange(len(labels))), (9.0, np.full(len(labels), -1))):
+        away = np.zeros((len(labels), 3))
+        away[:, 0] = sigmas * sigma_m
+        only_x = labels.covariance_m2 * [1.0, 0.0, 0.0, 1.0, 0.0, 1.0]
+        still = labels.replace(covariance_m2=only_x)
+        elsewhere = still.replace(position_in_world_m=labels.position_in_world_m + away)
+        assert np.array_equal(match_places(still, elsewhere), expected)
+    signs = labels.replace(class_name=Categories(labels.class_name.codes, ("sign",)))
+    assert (match_places(labels, signs) == -1).all()
+    # Of two at one place each is one of the old ones.
+    twice = join_tables([labels, labels.replace(label_id=labels.label_id + 1000)])
+    assert sorted(match_places(labels, twice).tolist()) == sorted([*range(len(labels)), *[-1] * len(labels)])
 
 
 def test_changes_come_with_opportunities_and_dates(years: Path) -> None:

@@ -1,4 +1,4 @@
-"""What became of each label of a map when passes were added: by looks of both epochs, and by shared votes."""
+"""What became of each label of a map when passes were added: by what each epoch alone has where, and by its looks."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ SAME_SHARE = 0.5
 """Labels that share this part of the votes of one of them are one object."""
 MOVED_WITHIN_M = 5.0
 """What is gone here and new there, no farther away, is one object that was moved."""
+SAME_PLACE_CHI2 = 30.0
+"""Squared sigmas up to which labels of two epochs may be one object. Of objects that stand still one in a thousand is
+beyond 16.3 if covariances are right, and beyond this if deviations are 1.35 times what they say."""
 CHANGED_CHI2 = 16.27
 """Squared sigmas (chi-square, 3 axes, 99.9 %) from which on a label is elsewhere than before."""
 
@@ -57,23 +60,54 @@ def match_labels(old: Labels, old_votes: Votes, new: Labels, new_votes: Votes) -
     return before, common
 
 
+def match_places(old: Labels, new: Labels) -> Ints:
+    """Return the row of the old label (N) that stands where each new one does, -1 for none.
+
+    Both are of one class, and no farther apart than their covariances explain; the pairs that agree best go first, and
+    each label is of one pair.
+    """
+    before = np.full(len(new), -1)
+    if not len(old) or not len(new):
+        return before
+    codes = {name: code for code, name in enumerate(old.class_name.names)}
+    code = np.array([codes.get(name, -1) for name in new.class_name.names])[new.class_name.codes]
+    tree = cKDTree(old.position_in_world_m)
+    near = [tree.query_ball_point(place, MOVED_WITHIN_M) for place in new.position_in_world_m]
+    pairs = [
+        (apart, i, j)
+        for j, others in enumerate(near)
+        for i in others
+        if old.class_name.codes[i] == code[j] and (apart := _apart(old, i, new, j)) <= SAME_PLACE_CHI2
+    ]
+    taken: set[int] = set()
+    for _, i, j in sorted(pairs):
+        if i not in taken and before[j] < 0:
+            before[j] = i
+            taken.add(i)
+    return before
+
+
 def judge(
     new: Labels,
     before: Ints,
     state_before: list[str],
     is_touched: Bools,
+    stands: Bools,
     looks_at: Callable[[int], tuple[Looks, Looks]],
 ) -> tuple[Verdicts, Mapping[int, tuple[Looks, Looks]]]:
     """Return what became of each label, and the looks at those that the added passes could have seen.
 
-    A label without a look of the added passes stays what it was.
+    Those that both epochs alone have in one place, `stands` (N), are confirmed. A label without a look of the added
+    passes stays what it was.
     """
     looks = {row: looks_at(int(new.label_id[row])) for row in np.flatnonzero(is_touched | (before < 0)).tolist()}
     state = []
     for row in range(len(new)):
         was = state_before[before[row]] if before[row] >= 0 else "new"
         first, second = looks.get(row, (None, None))
-        if second is None or first is None or second.looks == 0:
+        if stands[row]:
+            state.append("confirmed")
+        elif second is None or first is None or second.looks == 0:
             state.append(was)
         elif before[row] >= 0:
             state.append("confirmed" if second.say_there else "gone" if second.say_gone else _undecided(was, second))
@@ -132,10 +166,11 @@ def tell(
     ids: Ints,
     looks: Mapping[int, tuple[Looks, Looks]],
     common: Ints,
+    is_lost: Bools,
 ) -> tuple[Changes, IdBridge]:
     """Return what changed, a row a label of either map, by id, and which labels of both maps are the same.
 
-    `common` (N) are the votes that a label shares with what it was, 0 of those that the new map does not have.
+    `common` (N) are the votes that a label shares with what it was; the new map does not have those that are lost (N).
     """
     covered = set(verdicts.moved_from.tolist())
     rows = np.array([row for row in range(len(new)) if row not in covered], np.int64)
@@ -147,7 +182,7 @@ def tell(
             kinds.append("moved")
         elif was < 0:
             kinds.append("added")
-        elif verdicts.state[row] == "gone" or common[row] == 0:
+        elif verdicts.state[row] == "gone" or is_lost[row]:
             kinds.append("removed")
         else:
             kinds.append("changed" if _differs(old, was, new, row) else "unchanged")
@@ -166,7 +201,7 @@ def tell(
         first_look_s=np.array([each.first_s for each in found], np.float64),
         last_look_s=np.array([each.last_s for each in found], np.float64),
     )
-    known = rows[(before >= 0) & ((common[rows] > 0) | (sources != rows))]
+    known = rows[(before >= 0) & (~is_lost[rows] | (sources != rows))]
     of = np.where(verdicts.moved_from[known] >= 0, verdicts.moved_from[known], known)
     bridge = IdBridge(old.label_id[verdicts.before[of]], ids[known], common[known])
     return (
@@ -182,7 +217,11 @@ def _differs(old: Labels, before: int, new: Labels, row: int) -> bool:
     """Return whether a label is of another class, or elsewhere than its covariances explain."""
     if old.class_name.names[old.class_name.codes[before]] != new.class_name.names[new.class_name.codes[row]]:
         return True
-    away = new.position_in_world_m[row] - old.position_in_world_m[before]
-    both = old.covariance_m2[before] + new.covariance_m2[row]
-    xx, xy, xz, yy, yz, zz = both
-    return bool(away @ np.linalg.pinv([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ away > CHANGED_CHI2)
+    return _apart(old, before, new, row) > CHANGED_CHI2
+
+
+def _apart(old: Labels, i: int, new: Labels, j: int) -> float:
+    """Return the distance of two labels in squared sigmas."""
+    away = new.position_in_world_m[j] - old.position_in_world_m[i]
+    xx, xy, xz, yy, yz, zz = old.covariance_m2[i] + new.covariance_m2[j]
+    return float(away @ np.linalg.pinv([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ away)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from valuemap.config import MapConfig
-from valuemap.dataset import MARKER, Dataset, read_dataset, write_dataset
+from valuemap.dataset import MARKER, Dataset, read_dataset, rows_of, write_dataset
 from valuemap.drives import find_drives
 from valuemap.errors import InputError
 from valuemap.evidence import Evidence, find_dataset
@@ -19,10 +20,12 @@ from valuemap.progress import Progress, silent
 from valuemap.tables import Bools, Categories, Changes, IdBridge, Ints, Labels, Votes, join_tables, write_table
 from valuemap.tiles.calibration import read_calibration
 from valuemap.tiles.source import VIEWPOINT_SHARE
-from valuemap.update.changes import STATES, judge, match_labels, number, tell
+from valuemap.update.changes import STATES, Verdicts, judge, match_labels, match_places, number, tell
 from valuemap.update.join import join_datasets
 from valuemap.update.looks import Lookout, Looks
 
+ADDED = "added"
+"""Where in the folder of work the dataset of the added passes is kept."""
 _DATASET_FILES = (MARKER, "cameras.parquet", "images.parquet", "detections.parquet")
 
 
@@ -74,7 +77,8 @@ def update_map(
     write_dataset(joined, run.work / DATASET)
     run = replace(run, calibration=calibration, known=old / CELLS)
     rebuilt, cells = build_map_of_folder(run.work / DATASET, _settings(before), run, progress=progress)
-    result, changes, bridge = compare(before, rebuilt, joined, first.images.image_id, progress=progress)
+    alone = _map_alone(joined, first.images.image_id, before, run, progress)
+    result, changes, bridge = compare(before, rebuilt, alone, joined, first.images.image_id, progress=progress)
     for name, table in ((CHANGES, changes), (BRIDGE, bridge)):
         write_table(table, run.work / name)
     files = {f"{DATASET}/{name}": run.work / DATASET / name for name in _DATASET_FILES}
@@ -82,62 +86,203 @@ def update_map(
 
 
 def compare(
-    before: Map, rebuilt: Map, joined: Dataset, images_before: Ints, *, progress: Progress = silent
+    before: Map, rebuilt: Map, alone: Map, joined: Dataset, images_before: Ints, *, progress: Progress = silent
 ) -> tuple[Map, Changes, IdBridge]:
     """Return a rebuilt map with the ids of the map before it and with states, what changed, and the bridge of ids.
 
-    The images of the joined dataset with the ids `images_before` are those of the map before.
+    What changed is told by two maps that know nothing of each other: that `before`, and that of the added passes
+    `alone`. The images of the joined dataset with the ids `images_before` are those of the map before. Where something
+    moved, the rebuilt map, which takes it for standing still, may have one label for both places; then those of the
+    epochs stand for it.
     """
-    labels, votes = rebuilt.labels.replace(state=None), rebuilt.votes
-    matched, common = match_labels(before.labels, before.votes, labels, votes)
-    lost = np.setdiff1d(np.arange(len(before.labels)), matched)
-    # Those that the new map does not have are looked for at where they were, with the votes that they had.
-    all_labels, all_votes = _with_lost(labels, votes, before, lost)
-    matched = np.concatenate([matched, lost])
-    common = np.concatenate([common, np.zeros(len(lost), np.int64)])
-    evidence = Evidence(replace(rebuilt, labels=all_labels, votes=all_votes), joined)
+    rows = _Rows.of(before, rebuilt, alone)
+    evidence = Evidence(replace(rebuilt, labels=rows.labels, votes=rows.votes), joined)
     drives = find_drives(joined.images, viewpoint_step_m=evidence.max_range_m * VIEWPOINT_SHARE)
     is_new = ~np.isin(joined.images.image_id, images_before)
     detection_rate = rebuilt.run["counts"].get("detection_rate", 0.5)
-    near = cKDTree(evidence.center_in_world_m[is_new]).query(all_labels.position_in_world_m)[0]
-    lookout = Lookout(evidence, drives, is_new, detection_rate)
+    near = cKDTree(evidence.center_in_world_m[is_new]).query(rows.labels.position_in_world_m)[0]
+    # What an epoch alone has elsewhere is no sight of this object.
+    looked = _without_claimed(rows, before, alone, joined, is_new)
+    lookout = Lookout(
+        Evidence(replace(rebuilt, labels=rows.labels, votes=looked), joined), drives, is_new, detection_rate
+    )
     done = 0
 
     def looks_at(label_id: int) -> tuple[Looks, Looks]:
         nonlocal done
         done += 1
-        progress("looking for changes", done, len(all_labels))
+        progress("looking for changes", done, len(rows.labels))
         return lookout.at(label_id)
 
     states = before.labels.state.texts() if before.labels.state is not None else ["confirmed"] * len(before.labels)
-    verdicts, looks = judge(all_labels, matched, states, np.asarray(near <= evidence.max_range_m), looks_at)
+    touched = np.asarray(near <= evidence.max_range_m)
+    verdicts, looks = judge(rows.labels, rows.before, states, touched, rows.stands, looks_at)
+    # What only the added passes have, and all the data do not, is there only if it explains what is gone.
+    unfounded = rows.is_of_alone & (verdicts.moved_from < 0) & ~rows.is_founded
+    if unfounded.any():
+        rows, verdicts, looks = _left_out(rows, verdicts, looks, unfounded)
     ids = number(before.labels, verdicts)
-    changes, bridge = tell(before.labels, all_labels, verdicts, ids, looks, common)
-    is_kept = np.arange(len(all_labels)) < len(labels)
+    changes, bridge = tell(before.labels, rows.labels, verdicts, ids, looks, rows.common, rows.is_lost)
+    is_kept = ~rows.is_lost
     is_kept[verdicts.moved_from[verdicts.moved_from >= 0]] = False
     states_now = Categories.from_texts([verdicts.state[row] for row in np.flatnonzero(is_kept)])
     order = np.argsort(ids[is_kept], kind="stable")
-    kept = labels.take(np.flatnonzero(is_kept[: len(labels)])).replace(label_id=ids[is_kept], state=states_now)
-    id_of = np.where(is_kept, ids, -1)[votes.label_id - 1]
-    votes = votes.replace(label_id=id_of).take(np.flatnonzero(id_of >= 0))
-    votes = votes.take(np.argsort(votes.label_id, kind="stable"))
+    id_of = np.where(is_kept, ids, -1)[rows.votes.label_id - 1]
+    votes = rows.votes.replace(label_id=id_of).take(np.flatnonzero(id_of >= 0))
+    votes, count = _once(votes, ids[is_kept], rows.is_of_alone[is_kept])
+    kept = rows.labels.take(np.flatnonzero(is_kept)).replace(label_id=ids[is_kept], state=states_now, votes=count)
     run = {**rebuilt.run, "update": _counts(verdicts.state, is_kept, changes)}
     return Map(rebuilt.frame, kept.take(order), votes, run), changes, bridge
+
+
+def _map_alone(joined: Dataset, images_before: Ints, before: Map, run: Run, progress: Progress) -> Map:
+    """Return the map of the added passes alone."""
+    images, detections = joined.images, joined.detections
+    is_new = ~np.isin(images.image_id, images_before)
+    of_new = is_new[rows_of(detections.image_id, images.image_id)]
+    added = replace(joined, images=images.take(is_new), detections=detections.take(of_new))
+    write_dataset(added, run.work / ADDED)
+    return build_map_of_folder(run.work / ADDED, _settings(before), replace(run, known=None), progress=progress)[0]
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """All labels (N) that are judged: of the rebuilt map, then of the added passes alone, then of the map before.
+
+    Labels are numbered from 1. `before` (N) is the old label that each is, `common` (N) how many votes they share;
+    `stands` (N) tells what both epochs alone have in one place, `is_founded` (N) what the rebuilt map has too, if only
+    as another object.
+    """
+
+    labels: Labels
+    votes: Votes
+    before: Ints
+    common: Ints
+    stands: Bools
+    is_of_alone: Bools
+    is_founded: Bools
+    is_lost: Bools
+
+    @classmethod
+    def of(cls, before: Map, rebuilt: Map, alone: Map) -> _Rows:
+        labels, votes = rebuilt.labels.replace(state=None), rebuilt.votes
+        old, common = match_labels(before.labels, before.votes, labels, votes)
+        fresh, _ = match_labels(alone.labels, alone.votes, labels, votes)
+        same = match_places(before.labels, alone.labels)
+        partner = np.where(fresh >= 0, same[fresh], -1)
+        # One label of what stood here before and of what stands there now.
+        mixed = (old >= 0) & (fresh >= 0) & (partner < 0) & ~np.isin(old, same)
+        by_place = (old < 0) & (partner >= 0) & ~np.isin(partner, old)
+        old = np.where(by_place, partner, old)
+        stands = np.isin(old, same[same >= 0]) & (old >= 0)
+        extra = np.flatnonzero(
+            (same < 0) & (~np.isin(np.arange(len(same)), fresh) | np.isin(np.arange(len(same)), fresh[mixed]))
+        )
+        founded = np.isin(extra, fresh[mixed])
+        lost = np.setdiff1d(np.arange(len(before.labels)), old)
+        parts = [
+            (
+                labels.take(np.flatnonzero(~mixed)),
+                votes.take(np.flatnonzero(~np.isin(votes.label_id, labels.label_id[mixed]))),
+            ),
+            _taken(alone, extra),
+            _taken(before, np.concatenate([old[mixed], lost])),
+        ]
+        table, all_votes = _numbered(parts)
+        kept = int((~mixed).sum())
+        none = np.full(len(extra), -1)
+        size = (kept, len(extra), int(mixed.sum()), len(lost))
+        zeros = [np.zeros(count, np.bool_) for count in size]
+        return cls(
+            labels=table,
+            votes=all_votes,
+            before=np.concatenate([old[~mixed], none, old[mixed], lost]),
+            common=np.concatenate(
+                [common[~mixed], np.zeros(len(extra), np.int64), common[mixed], np.zeros(len(lost), np.int64)]
+            ),
+            stands=np.concatenate([stands[~mixed], zeros[1], stands[mixed], np.isin(lost, same)]),
+            is_of_alone=np.concatenate([zeros[0], ~zeros[1], zeros[2], zeros[3]]),
+            is_founded=np.concatenate([zeros[0], founded, zeros[2], zeros[3]]),
+            is_lost=np.concatenate([zeros[0], zeros[1], zeros[2], ~zeros[3]]),
+        )
+
+
+def _taken(source: Map, rows: Ints) -> tuple[Labels, Votes]:
+    """Return some labels of a map with their votes."""
+    labels = source.labels.take(rows).replace(state=None)
+    return labels, source.votes.take(np.flatnonzero(np.isin(source.votes.label_id, labels.label_id)))
+
+
+def _numbered(parts: list[tuple[Labels, Votes]]) -> tuple[Labels, Votes]:
+    """Return labels of several maps, and their votes, numbered from 1 in their order."""
+    labels, votes, first = [], [], 1
+    for table, of in parts:
+        ids = np.arange(first, first + len(table))
+        first += len(table)
+        order = np.argsort(table.label_id, kind="stable")
+        row = order[np.searchsorted(table.label_id[order], of.label_id)] if len(of) else np.empty(0, np.int64)
+        by_label = np.argsort(row, kind="stable")
+        labels.append(table.replace(label_id=ids))
+        votes.append(of.replace(label_id=ids[row]).take(by_label))
+    return join_tables(labels), join_tables(votes)
+
+
+def _without_claimed(rows: _Rows, before: Map, alone: Map, joined: Dataset, is_new: Bools) -> Votes:
+    """Return the votes without those by which one epoch alone has an object in another place."""
+    votes, label = rows.votes, rows.votes.label_id - 1
+    of_new = is_new[rows_of(votes.image_id, joined.images.image_id)]
+    in_doubt = ~rows.stands[label] & ~rows.is_of_alone[label]
+    is_old = rows.before[label] >= 0
+    claimed = (of_new & is_old & np.isin(votes.detection_id, alone.votes.detection_id)) | (
+        ~of_new & ~is_old & np.isin(votes.detection_id, before.votes.detection_id)
+    )
+    return votes.take(np.flatnonzero(~(in_doubt & claimed)))
+
+
+def _left_out(
+    rows: _Rows, verdicts: Verdicts, looks: Mapping[int, tuple[Looks, Looks]], is_out: Bools
+) -> tuple[_Rows, Verdicts, dict[int, tuple[Looks, Looks]]]:
+    """Return what was judged without some labels."""
+    kept = np.flatnonzero(~is_out)
+    new_row = np.full(len(is_out), -1)
+    new_row[kept] = np.arange(len(kept))
+    is_vote_kept = ~is_out[rows.votes.label_id - 1]
+    votes = rows.votes.take(np.flatnonzero(is_vote_kept))
+    columns = ("before", "common", "stands", "is_of_alone", "is_founded", "is_lost")
+    moved_from = verdicts.moved_from[kept]
+    return (
+        _Rows(
+            labels=rows.labels.take(kept).replace(label_id=np.arange(1, len(kept) + 1)),
+            votes=votes.replace(label_id=new_row[votes.label_id - 1] + 1),
+            **{name: getattr(rows, name)[kept] for name in columns},
+        ),
+        Verdicts(
+            verdicts.before[kept],
+            [verdicts.state[row] for row in kept.tolist()],
+            np.where(moved_from >= 0, new_row[moved_from], -1),
+        ),
+        {int(new_row[row]): each for row, each in looks.items() if new_row[row] >= 0},
+    )
+
+
+def _once(votes: Votes, ids: Ints, is_of_alone: Bools) -> tuple[Votes, Ints]:
+    """Return votes, by label, of which each detection has one, and how many each label (N) of these ids has.
+
+    Labels of the added passes alone keep theirs: they are there because others had taken their votes wrongly.
+    """
+    yields = ~np.isin(votes.label_id, ids[is_of_alone])
+    order = np.lexsort((votes.label_id, yields, votes.detection_id))
+    again = np.concatenate([[False], np.diff(votes.detection_id[order]) == 0])
+    votes = votes.take(np.sort(order[~again]))
+    votes = votes.take(np.argsort(votes.label_id, kind="stable"))
+    first, end = (np.searchsorted(votes.label_id, ids, side=side) for side in ("left", "right"))
+    return votes, end - first
 
 
 def _settings(before: Map) -> MapConfig:
     settings = dict(before.run.get("settings", {}))
     method = settings.pop("method", "robust")
     return MapConfig(method=method, **settings)
-
-
-def _with_lost(labels: Labels, votes: Votes, before: Map, lost: Ints) -> tuple[Labels, Votes]:
-    rows = before.labels.take(lost).replace(state=None)
-    beyond = np.arange(len(lost)) + len(labels) + 1
-    is_of_lost = np.isin(before.votes.label_id, rows.label_id)
-    old_votes = before.votes.take(np.flatnonzero(is_of_lost))
-    old_votes = old_votes.replace(label_id=beyond[np.searchsorted(rows.label_id, old_votes.label_id)])
-    return join_tables([labels, rows.replace(label_id=beyond)]), join_tables([votes, old_votes])
 
 
 def _counts(states: list[str], is_kept: Bools, changes: Changes) -> dict[str, dict[str, int]]:
