@@ -64,6 +64,9 @@ def test_what_is_no_number_is_an_error_or_nan(tmp_path: Path) -> None:
         ("x,y,z\n1,2,3\n".encode("utf-16"), "is text in UTF-16, not in UTF-8"),
         (b"PK\3\4xl/worksheets", "is a zip archive or a spreadsheet, not CSV"),
         (b"PAR1....", "is a Parquet file, not CSV"),
+        (b"\xef\xbb\xbf\n<!DOCTYPE html><html>404", "is a web page or XML, not CSV"),
+        (b'{"type": "FeatureCollection"}', "is JSON, not CSV"),
+        (b"[\n1]", "is JSON, not CSV"),
         (gzip.compress(PLAIN, mtime=0)[:-9], "cannot be read as CSV: Compressed file ended"),
         (b"x,y,z,class\n1,2,3,\xff\n", "invalid UTF8 data"),
         (b"x,y,z\n1,2\n", "Row #2: Expected 3 columns, got 2"),
@@ -75,6 +78,12 @@ def test_what_is_no_csv_is_named(tmp_path: Path, content: bytes, said: str) -> N
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
     assert "a hint" in caught.value.hint
+
+
+def test_a_header_without_an_end_is_a_table_without_rows(tmp_path: Path) -> None:
+    (tmp_path / "points.csv").write_bytes(b"x,y,class")
+    table = read_csv_arrow(tmp_path / "points.csv", TYPES, has_missing=False, hint="a hint")
+    assert (table.column_names, table.num_rows) == (["x", "y", "class"], 0)
 
 
 def test_a_pipe_does_not_hang(tmp_path: Path) -> None:

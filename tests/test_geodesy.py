@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 from pyproj import Transformer
 from pyproj.datadir import get_user_data_dir  # type: ignore[attr-defined]
 
+from valuemap.dataset import Frame
 from valuemap.errors import InputError, SettingError
 from valuemap.geodesy import (
     accuracy_note,
@@ -103,6 +104,16 @@ def test_a_place_that_is_none_is_refused() -> None:
     with pytest.raises(InputError, match="has no place on the ellipsoid") as refusal:
         enu_from_lon_lat_height(np.array([[0.0, 95.0, 0.0]]), ANCHORS[0])
     assert "x east, y north, z up" in refusal.value.hint
+
+
+@pytest.mark.parametrize(
+    "anchor", [(91.0, 0.0, 0.0), (0.0, 361.0, 0.0), (0.0, 0.0, float("inf")), (float("nan"), 0.0, 0.0)]
+)
+def test_an_anchor_that_is_no_place_is_refused(anchor: tuple[float, float, float]) -> None:
+    for use in (lambda: enu_from_lon_lat_height(np.zeros((1, 3)), anchor), lambda: Frame(anchor=anchor)):
+        with pytest.raises(InputError, match="expected a latitude from -90 to 90") as refusal:
+            use()
+        assert "latitude comes first" in refusal.value.hint
 
 
 def test_heights_stay_where_a_system_has_none_of_its_own() -> None:

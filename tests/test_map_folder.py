@@ -72,6 +72,15 @@ def test_damaged_labels_are_refused(tmp_path: Path) -> None:
         read_map(tmp_path / "map")
 
 
+def test_labels_may_be_removed_from_the_table(tmp_path: Path) -> None:
+    write_map(MAPS[0], tmp_path / "map")
+    rewrite(tmp_path / "map" / "labels.parquet", lambda table: table.slice(1))
+    left = read_map(tmp_path / "map")
+    np.testing.assert_array_equal(left.labels.label_id, MAPS[0].labels.label_id[1:])
+    kept = MAPS[0].votes.label_id != MAPS[0].labels.label_id[0]
+    np.testing.assert_array_equal(left.votes.detection_id, MAPS[0].votes.detection_id[kept])
+
+
 def test_the_frame_is_part_of_the_record(tmp_path: Path) -> None:
     write_map(MAPS[2], tmp_path / "map")
     lat, lon, height = ANCHOR

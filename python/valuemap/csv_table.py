@@ -66,9 +66,17 @@ def _read_text_bytes(path: Path, hint: str) -> bytes:
     for start, what in ((b"PK\3\4", "a zip archive or a spreadsheet"), (b"PAR1", "a Parquet file")):
         if content.startswith(start):
             raise InputError(f"{path}: is {what}, not CSV", hint=f"save it as CSV in UTF-8; {hint}")
+    start = content[:_LOOKED_AT].removeprefix(codecs.BOM_UTF8).lstrip()
+    for mark, what in ((b"<", "a web page or XML"), (b"{", "JSON"), (b"[", "JSON")):
+        if start.startswith(mark):
+            raise InputError(f"{path}: is {what}, not CSV", hint=hint)
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise InputError(f"{path}: is text in UTF-16, not in UTF-8", hint=f"save it as CSV in UTF-8; {hint}")
-    return content.removeprefix(codecs.BOM_UTF8)
+    if b"\0" in content[:_LOOKED_AT]:
+        raise InputError(f"{path}: cannot be read as CSV: it is no text", hint=hint)
+    content = content.removeprefix(codecs.BOM_UTF8)
+    # A header line without an end is a table without rows, too.
+    return content if not content or b"\n" in content or b"\r" in content else content + b"\n"
 
 
 def _unpacked(content: bytes, path: Path, hint: str) -> bytes:
@@ -86,6 +94,8 @@ def _unpacked(content: bytes, path: Path, hint: str) -> bytes:
 _MOST_UNPACKED_TIMES = 100
 """Tables of texts and numbers shrink to a third or a twentieth."""
 _ALWAYS_UNPACKED = 64 * 2**20
+_LOOKED_AT = 1000
+"""Bytes that say what a file is."""
 
 
 def _header(content: bytes) -> tuple[str, list[str]]:

@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow.compute as pc
 import pycolmap
 
+from valuemap.anchor import check_anchor, is_place
 from valuemap.errors import InputError
 from valuemap.folders import new_folder, settle
 from valuemap.tables import (
@@ -66,6 +67,11 @@ class Frame:
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     anchor: tuple[float, float, float] | None = None
 
+    def __post_init__(self) -> None:
+        """Refuse an anchor that is no place on the Earth."""
+        if self.anchor is not None:
+            check_anchor(self.anchor)
+
     @property
     def is_georeferenced(self) -> bool:
         """Whether positions can be given as longitude, latitude and height."""
@@ -95,9 +101,9 @@ class Frame:
         """Read the `frame` object; `source` names the file in errors."""
         try:
             if "anchor" in frame:
-                anchor = tuple(float(frame["anchor"][key]) for key in ("lat", "lon", "height"))
-                if abs(anchor[0]) <= 90.0 and abs(anchor[1]) <= 360.0 and math.isfinite(anchor[2]):
-                    return Frame(anchor=anchor)  # type: ignore[arg-type]
+                lat, lon, height = (float(frame["anchor"][key]) for key in ("lat", "lon", "height"))
+                if is_place(lat, lon, height):
+                    return Frame(anchor=(lat, lon, height))
             elif frame.get("local"):
                 x, y, z = (float(c) for c in frame["up"])
                 norm = math.hypot(x, y, z)

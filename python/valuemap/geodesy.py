@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.anchor import check_anchor
 from valuemap.errors import InputError, SettingError
 from valuemap.tables import Floats
 
@@ -233,6 +234,7 @@ def _earth_from_enu(lon_deg: Floats, lat_deg: Floats) -> Floats:
 def _transform(points: Floats, anchor: tuple[float, float, float], *, inverse: bool) -> Floats:
     from pyproj import Transformer  # Slow to import, and only geo-referenced data needs it.
 
+    check_anchor(anchor)
     lat, lon, height = (float(part) for part in anchor)
     enu_from_geographic = Transformer.from_pipeline(
         "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "

@@ -152,12 +152,10 @@ def read_map(path: str | Path) -> Map:
     _check_run(run, str(head))
     if (folder / CALIBRATION).is_file():
         run["calibration"] = read_json(folder / CALIBRATION)
-    return Map(
-        frame=Frame.from_json(run.pop("frame", None), source=str(head)),
-        labels=read_table(Labels, folder / "labels.parquet"),
-        votes=read_table(Votes, folder / "votes.parquet"),
-        run=run,
-    )
+    labels, votes = read_table(Labels, folder / "labels.parquet"), read_table(Votes, folder / "votes.parquet")
+    # Who removes labels from the table, as a filter in pandas does, need not know of their votes.
+    votes = votes.take(np.isin(votes.label_id, labels.label_id))
+    return Map(frame=Frame.from_json(run.pop("frame", None), source=str(head)), labels=labels, votes=votes, run=run)
 
 
 def read_json(path: Path) -> dict[str, Any]:
