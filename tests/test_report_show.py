@@ -15,8 +15,8 @@ from report_city import city, write_city
 from small_dataset import map_of, small_dataset
 from valuemap.cli.commands import app
 from valuemap.errors import InputError
-from valuemap.evidence import REJECTED, Evidence, read_rejected
-from valuemap.map_folder import write_map
+from valuemap.evidence import Evidence, read_rejected
+from valuemap.map_folder import REJECTED, write_map
 from valuemap.report.crops import chosen_voters, voter_crop
 from valuemap.report.label_sheet import plot_label
 from valuemap.report.place_sheet import explain_place, place_in_world, plot_place

@@ -353,7 +353,7 @@ def test_an_empty_place_says_what_is_known(client: Client, city: tuple[Path, Map
     far = client.get("/api/place?east=5000&north=5000").json()
     assert "No image pictures this place" in far["answer"]
     details = client.get(f"/api/place?east={here[0]}&north={here[1]}").json()
-    assert "keeps no rejected hypotheses" in details["answer"]
+    assert "No rejected hypothesis of this map is near" in details["answer"]
     assert f"{details['rays']} detections point" in details["answer"]
     assert details["looks"] > 0
     assert details["rays"] > 0
@@ -374,7 +374,7 @@ def test_rejected_hypotheses_answer_why_a_place_is_empty(tmp_path: Path) -> None
         passes=np.array([1, 2, 2]),
         expected=np.array([0, 30, 10]),
         existence=np.array([np.nan, 0.031, 0.5]),
-        reason=Categories.from_texts(["votes", "existence", "outvoted"]),
+        reason=Categories.from_texts(["votes", "existence", "merged"]),
         rival=np.array([-1, -1, 1]),
     )
     write_table(rejected, tmp_path / "map" / "rejected.parquet")

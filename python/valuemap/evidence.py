@@ -21,7 +21,7 @@ from valuemap.cameras import Rays, camera_centers, cast_rays, colmap_camera, rot
 from valuemap.dataset import MARKER, Dataset, number_passes, rows_of
 from valuemap.drives import find_drives
 from valuemap.errors import InputError
-from valuemap.map_folder import Map
+from valuemap.map_folder import REJECTED, Map
 from valuemap.tables import Bools, Floats, Ints, Rejected, read_table
 
 if TYPE_CHECKING:
@@ -29,9 +29,6 @@ if TYPE_CHECKING:
 
 PICTURES = "images"
 """The folder of a dataset that holds its pictures, where it has some."""
-
-REJECTED = "rejected.parquet"
-"""The file of a map that holds its rejected hypotheses, where it keeps them."""
 
 NEAREST_M = 4.0
 """Nearer than this no image is expected to see an object."""
@@ -226,11 +223,15 @@ class Evidence:
         """
         row = self.label_row(label_id)
         point = self.result.labels.position_in_world_m[row]
-        votes = self.vote_rows(label_id)
-        voted = np.unique(self.image_row[votes])
-        if len(voted) == 0:
-            return self._misses_at(np.empty(0, np.int64), point, class_name=None)
-        toward = self.center_in_world_m[self.image_row[votes]] - point
+        missed = self.should_have_seen(point, self.image_row[self.vote_rows(label_id)])
+        labels = self.result.labels
+        return self._misses_at(missed, point, class_name=labels.class_name.names[labels.class_name.codes[row]])
+
+    def should_have_seen(self, point_in_world_m: Floats, voter_image_row: Ints) -> Ints:
+        """Return the rows of the images that should have seen a point (3) as its voters did, and did not."""
+        if len(voter_image_row) == 0:
+            return np.empty(0, np.int64)
+        toward = self.center_in_world_m[voter_image_row] - point_in_world_m
         # The middles of sectors are taken in the order of the votes, as the method does.
         distance = np.linalg.norm(toward, axis=1)
         direction = toward / distance[:, None]
@@ -238,8 +239,9 @@ class Evidence:
         farthest = np.zeros(len(middles))
         np.maximum.at(farthest, np.argmax(direction @ middles.T, axis=1), distance)
 
-        near = np.setdiff1d(self.images_around(point, float(farthest.max()) * _ROUNDING), voted)
-        away = self.center_in_world_m[near] - point
+        around = self.images_around(point_in_world_m, float(farthest.max()) * _ROUNDING)
+        near = np.setdiff1d(around, voter_image_row)
+        away = self.center_in_world_m[near] - point_in_world_m
         distance = np.linalg.norm(away, axis=1)
         apart = away / np.maximum(distance, 1e-9)[:, None] @ middles.T
         sector = np.argmax(apart, axis=1)
@@ -249,9 +251,7 @@ class Evidence:
             & (apart[np.arange(len(near)), sector] >= SECTOR_COSINE)
         )
         near = near[should]
-        near = near[self.is_pictured(near, self.project(near, point))]
-        labels = self.result.labels
-        return self._misses_at(near, point, class_name=labels.class_name.names[labels.class_name.codes[row]])
+        return np.asarray(near[self.is_pictured(near, self.project(near, point_in_world_m))])
 
     def looks_at(self, point_in_world_m: Floats) -> Misses:
         """Return all images that picture a place within `max_range_m`; `nearest_*` is over detections of any class."""

@@ -19,7 +19,7 @@ import numpy as np
 from valuemap.dataset import Dataset, Frame
 from valuemap.errors import InputError
 from valuemap.folders import new_folder, settle
-from valuemap.tables import Labels, Votes, read_table, table_to_arrow, write_table
+from valuemap.tables import Labels, Rejected, Votes, read_table, table_to_arrow, write_table
 
 if TYPE_CHECKING:
     import geopandas
@@ -37,7 +37,9 @@ CHANGES, BRIDGE = "changes.parquet", "bridge.parquet"
 """What an update of a map says: what became of each label, and which ids it had."""
 DATASET = "dataset"
 """The folder of an updated map that holds the dataset with the passes that were added."""
-PARTS = (MARKER, "labels.parquet", "votes.parquet", "rejected.parquet", CALIBRATION, CHANGES, BRIDGE)
+REJECTED = "rejected.parquet"
+"""The hypotheses that became no labels, where the map keeps them."""
+PARTS = (MARKER, "labels.parquet", "votes.parquet", REJECTED, CALIBRATION, CHANGES, BRIDGE)
 """All files that a map may have: none of an older one may stay beside those of a new one."""
 
 _RECORD: dict[str, tuple[type, str]] = {
@@ -114,13 +116,14 @@ def write_map(
     *,
     cells: Sequence[Path] = (),
     files: Mapping[str, Path] = MappingProxyType({}),
+    rejected: Rejected | None = None,
     force: bool = False,
 ) -> None:
     """Write a map as a folder; an older map that is there is replaced, never half.
 
     Other files in the folder stay. Where one that valuemap did not write is in the way, an `OutputError` says so; with
     `force` it is replaced. `cells` are the files of its cells, `files` others by their names in the folder;
-    all are copied.
+    all are copied. `rejected` are the hypotheses that became no labels, where they were looked for.
     """
     with new_folder(Path(path), parts=PARTS, part_folders=(CELLS, DATASET), force=force) as folder:
         run = {**result.run, "frame": result.frame.to_json()}
@@ -133,6 +136,8 @@ def write_map(
         (folder / MARKER).write_text(json.dumps(run, indent=2) + "\n", encoding="utf-8")
         write_labels(result, folder / "labels.parquet")
         write_table(result.votes, folder / "votes.parquet")
+        if rejected is not None:
+            write_table(rejected, folder / REJECTED)
 
 
 def read_map(path: str | Path) -> Map:

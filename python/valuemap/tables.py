@@ -405,8 +405,8 @@ class IdBridge(Table):
 REJECTION_REASONS: Mapping[str, str] = {
     "votes": "too few images vote for it (min_votes)",
     "ratio": "it has too few votes for what is usual here (min_vote_ratio)",
-    "outvoted": "another label explains its detections better",
-    "existence": "it probably does not exist: too few of the images that should have seen it did (min_existence)",
+    "existence": "it probably does not exist: what votes for it may meet by chance, and too few of the images that "
+    "should have seen it did (min_existence)",
     "merged": "it is one object with another label",
     "class": "a label of another class has the place",
     "parallax": "its rays are too parallel to say how far away it is (min_parallax_deg)",

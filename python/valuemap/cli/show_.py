@@ -16,6 +16,7 @@ from valuemap.dataset import read_dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.evidence import PICTURES, Evidence, find_dataset, read_rejected
 from valuemap.map_folder import read_map
+from valuemap.rejected import find_rejected
 
 if TYPE_CHECKING:
     from valuemap.tables import Floats
@@ -72,6 +73,8 @@ def show_command(
     else:
         point = _place(evidence, at, lat, lon)
         rejected = read_rejected(map_)
+        if rejected is None:
+            rejected = find_rejected(evidence, point)
         answer = explain_place(evidence, point, rejected, radius_m=radius)
         save_figure(plot_place(evidence, answer, rejected, pictures), picture, force=force)
         if as_json:

@@ -8,8 +8,9 @@ import numpy as np
 
 from valuemap.errors import InputError
 from valuemap.evidence import Evidence, Misses, PassingRays, picture_file
+from valuemap.rejected import find_rejected
 from valuemap.report.place_sheet import explain_place
-from valuemap.tables import REJECTION_REASONS, Floats, Ints
+from valuemap.tables import REJECTION_REASONS, Floats, Ints, Rejected
 from valuemap.viewer.scene import Scene, number
 
 PLACE_RADIUS_M = 2.0
@@ -70,6 +71,9 @@ def place_details(scene: Scene, east_m: float, north_m: float) -> dict[str, Any]
     """Return what is known about a place (metres on the page): why there is nothing, and the evidence for that."""
     labels, rejected, evidence = scene.result.labels, scene.rejected, scene.evidence
     place = np.array([east_m, north_m])
+    if rejected is None and evidence is not None:  # Maps of large datasets keep none.
+        with scene.lock:
+            rejected = find_rejected(evidence, scene.world(np.array([[east_m, north_m, 0.0]]))[0])
     label_at = scene.local(labels.position_in_world_m)
     near_labels, label_m = _nearest(label_at, place, NEAR_LABELS_M)
     details: dict[str, Any] = {
@@ -89,11 +93,11 @@ def place_details(scene: Scene, east_m: float, north_m: float) -> dict[str, Any]
         rejected_at = scene.local(rejected.position_in_world_m)
         rows, away_m = _nearest(rejected_at, place, PLACE_RADIUS_M)
         order = np.lexsort((away_m, -rejected.votes[rows]))  # The one with the most evidence says the most.
-        details["rejected"] = [_hypothesis(scene, int(rows[i]), float(away_m[i]), rejected_at) for i in order]
+        details["rejected"] = [_hypothesis(rejected, int(rows[i]), float(away_m[i]), rejected_at) for i in order]
         height = float(rejected_at[rows[order[0]], 2]) if len(order) else height
     if evidence is not None:
         with scene.lock:
-            seen, height = _seen_at(scene, evidence, place)
+            seen, height = _seen_at(scene, evidence, rejected, place)
         details |= seen
     else:
         details["answer"] = _answer_without_dataset(details)
@@ -194,9 +198,7 @@ def _nearest(local_m: Floats, place: Floats, radius_m: float) -> tuple[Ints, Flo
     return rows, away[rows]
 
 
-def _hypothesis(scene: Scene, row: int, away_m: float, local_m: Floats) -> dict[str, Any]:
-    rejected = scene.rejected
-    assert rejected is not None
+def _hypothesis(rejected: Rejected, row: int, away_m: float, local_m: Floats) -> dict[str, Any]:
     reason = rejected.reason.names[rejected.reason.codes[row]]
     rival = -1 if rejected.rival is None else int(rejected.rival[row])
     return {
@@ -214,12 +216,14 @@ def _hypothesis(scene: Scene, row: int, away_m: float, local_m: Floats) -> dict[
     }
 
 
-def _seen_at(scene: Scene, evidence: Evidence, place: Floats) -> tuple[dict[str, Any], float]:
+def _seen_at(
+    scene: Scene, evidence: Evidence, rejected: Rejected | None, place: Floats
+) -> tuple[dict[str, Any], float]:
     """Return why there is nothing at a place, the rays that pass it, the images that picture it, and its height."""
     ground = scene.world(np.array([[*place, 0.0]]))[0]
     camera = scene.local(evidence.center_in_world_m[[evidence.nearest_image(ground)]])[0]
     at = scene.world(np.array([[*place, camera[2]]]))[0]
-    answer = explain_place(evidence, at, scene.rejected, radius_m=PLACE_RADIUS_M)
+    answer = explain_place(evidence, at, rejected, radius_m=PLACE_RADIUS_M)
     reasons = " ".join(answer.reasons)
     for row in answer.labels:  # The page has links instead.
         reasons = reasons.replace(f" valuemap show MAP {evidence.result.labels.label_id[row]} shows it.", "")
