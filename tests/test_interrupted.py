@@ -1,0 +1,113 @@
+"""Runs that end before they are done, as processes of their own: by a signal, and by a full disk."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import valuemap
+from test_tiles import SET, files, streets
+
+LIMIT_S = 300.0
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of several cells, and the map of it."""
+    folder = tmp_path_factory.mktemp("interrupted")
+    valuemap.write_dataset(streets(0.0, 445.0, 3000.0), folder / "street")
+    assert finish(start(folder, folder / "whole"))[0] == 0
+    return folder
+
+
+def start(folder: Path, out: Path, *options: str) -> subprocess.Popen[str]:
+    settings = [f"--set={name}={value}" for name, value in SET.items()]
+    command = [sys.executable, "-m", "valuemap.cli", "map", str(folder / "street"), "--out", str(out), "--threads=1"]
+    command += [*settings, "--tile-size=500", *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """Return how a process ended, and what it said on stderr."""
+    _, told = process.communicate(timeout=LIMIT_S)
+    return process.returncode, told
+
+
+def parts(work: Path) -> list[Path]:
+    return list(work.glob("cells/*.parquet"))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM that a process can hear")
+def test_a_terminated_run_says_so_in_one_line_and_goes_on(street: Path, tmp_path: Path) -> None:
+    work = tmp_path / "map.work"
+    process = start(street, tmp_path / "map")
+    until = time.monotonic() + LIMIT_S
+    while not parts(work) and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.002)
+    process.send_signal(signal.SIGTERM)
+    code, told = finish(process)
+    assert code == 128 + signal.SIGTERM
+    lines = [line for line in told.splitlines() if not line.startswith("hint: ")]
+    assert len(lines) == 1, told
+    assert str(work) in lines[0]
+    assert 0 < len(parts(work)) < len(files(street / "whole")) - 3
+    # Nothing temporary is left, there or beside it.
+    assert [path.name for path in tmp_path.iterdir()] == ["map.work"]
+    assert [path for path in work.rglob("*") if path.name.startswith(".tmp-")] == []
+    assert finish(start(street, tmp_path / "map", "--resume"))[0] == 0
+    assert files(tmp_path / "map") == files(street / "whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["map"]
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 64 kB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount(place, "-t", "tmpfs", "-o", "size=64k", "tmpfs")
+    yield place
+    subprocess.run(["umount", "-l", str(place)], check=True)
+
+
+def mount(place: Path, *options: str) -> None:
+    try:
+        done = subprocess.run(["mount", *options, str(place)], capture_output=True, text=True)
+    except OSError as error:
+        pytest.skip(f"file systems cannot be mounted here: {error}")
+    if done.returncode:
+        pytest.skip(f"file systems cannot be mounted here: {done.stderr.strip()}")
+
+
+def test_on_a_full_disk_a_run_says_so_and_goes_on_when_there_is_room(
+    street: Path, small_disk: Path, tmp_path: Path
+) -> None:
+    code, told = finish(start(street, tmp_path / "map", f"--work={small_disk / 'work'}"))
+    assert code == 1, told
+    assert told.startswith(f"error: {small_disk / 'work'}: cannot be written: No space left on device"), told
+    assert "--resume" in told
+    assert len(told.splitlines()) == 2, told
+    assert not (tmp_path / "map").exists()
+    assert [path for path in small_disk.rglob("*") if path.name.startswith(".tmp-")] == []
+    mount(small_disk, "-o", "remount,size=100m")
+    assert finish(start(street, tmp_path / "map", f"--work={small_disk / 'work'}", "--resume"))[0] == 0
+    assert files(tmp_path / "map") == files(street / "whole")
+
+
+def test_a_map_that_does_not_fit_leaves_nothing_behind(street: Path, small_disk: Path, tmp_path: Path) -> None:
+    # The parts fit elsewhere, the map does not.
+    (small_disk / "map").mkdir()
+    (small_disk / "letter").write_bytes(b"x" * 50_000)
+    code, told = finish(start(street, small_disk / "map", f"--work={tmp_path / 'work'}"))
+    assert code == 1, told
+    assert "No space left on device" in told
+    assert sorted(path.name for path in small_disk.rglob("*")) == ["letter", "map"]
+    (small_disk / "letter").unlink()
+    mount(small_disk, "-o", "remount,size=100m")
+    assert finish(start(street, small_disk / "map", f"--work={tmp_path / 'work'}", "--resume"))[0] == 0
+    assert files(small_disk / "map") == files(street / "whole")
