@@ -7,9 +7,11 @@ found by the decision about it. Counted over all new maps:
 
     again         rejected objects that the new map has a label of
     rejected      of these, labels that the review leaves out
-    check again   of these, labels that the review leaves out and asks about: they have twice the votes
+    check again   of these, labels that the review leaves out and asks about: they have twice the votes, or could be
+                  what was rejected as well as another label
     reappeared    of these, labels that the review would let through: must be 0
     wrongly out   labels of objects that nobody rejected, left out by a decision about another one
+    asked         labels of objects that nobody rejected, left out and asked about
 """
 
 from __future__ import annotations
@@ -80,9 +82,11 @@ def _object_of_label(result: Map, dataset: Dataset) -> np.ndarray[tuple[int, ...
 def _come_back(some: Dataset, whole: Dataset, decisions: list[Decision], rejected: set[int]) -> dict[str, int]:
     result = build_map(some)
     object_of_label = _object_of_label(result, whole)
-    row_of_decision = match_decisions(decisions, result, some)
+    matches = match_decisions(decisions, result, some)
     state = ["open"] * len(result.labels)
-    for decision, row in zip(decisions, row_of_decision, strict=True):
+    for row in matches.unsure:
+        state[row] = "check again"
+    for decision, row in zip(decisions, matches.row_of_decision, strict=True):
         if row >= 0:
             state[row] = state_of(decision, result.labels, int(row))
     again = [state[row] for row, each in enumerate(object_of_label) if int(each) in rejected]
@@ -92,7 +96,8 @@ def _come_back(some: Dataset, whole: Dataset, decisions: list[Decision], rejecte
         "rejected": again.count("rejected"),
         "check again": again.count("check again"),
         "reappeared": again.count("open"),
-        "wrongly out": len(others) - others.count("open"),
+        "wrongly out": others.count("rejected"),
+        "asked": others.count("check again"),
     }
 
 

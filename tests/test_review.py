@@ -14,7 +14,7 @@ from valuemap.dataset import Frame
 from valuemap.errors import InputError
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import REVIEW, Map, read_map, write_map
-from valuemap.review import apply_review, decide, match_decisions, read_review, state_of, write_review
+from valuemap.review import Matches, apply_review, decide, match_decisions, read_review, state_of, write_review
 from valuemap.tables import Floats, Votes
 
 
@@ -26,6 +26,26 @@ def certain(result: Map) -> Map:
     """Return the map with standard deviations of 2 cm: other passes have larger errors than those."""
     covariance = np.tile(0.0004 * np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0]), (len(result.labels), 1))
     return replace(result, labels=result.labels.replace(covariance_m2=covariance))
+
+
+def rows(matches: Matches) -> list[int]:
+    return [int(row) for row in matches.row_of_decision]
+
+
+def map_with(places: list[float], voters: list[list[int]]) -> Map:
+    """Return labels at these places along x, with these detections of the small dataset as voters."""
+    detections = small_dataset().detections
+    image_of = dict(zip(detections.detection_id.tolist(), detections.image_id.tolist(), strict=True))
+    result = map_of([[x, 20, 5] for x in places], ["light"] * len(places))
+    flat = [each for some in voters for each in some]
+    votes = Votes(
+        label_id=np.repeat(np.arange(len(places)), [len(some) for some in voters]),
+        detection_id=np.array(flat),
+        image_id=np.array([image_of[each] for each in flat]),
+        residual_px=np.ones(len(flat)),
+        residual_sigmas=np.ones(len(flat)),
+    )
+    return replace(result, votes=votes)
 
 
 def kept(result: Map) -> list[int]:
@@ -65,26 +85,26 @@ def test_the_right_one_of_two_heads_stays_rejected_when_both_move() -> None:
     before = map_of([[0, 0, 5], [0.6, 0, 5]])
     decisions = [decide(before, 0, "rejected")]
     after = map_of([[0.45, 0, 5], [1.05, 0, 5]])
-    assert match_decisions(decisions, after).tolist() == [0]
+    assert rows(match_decisions(decisions, after)) == [0]
     forgetful = [replace(decisions[0], neighbors=())]
-    assert match_decisions(forgetful, map_of([[0.6, 0, 5]])).tolist() == [0]
-    assert match_decisions(decisions, map_of([[0.6, 0, 5]])).tolist() == [-1]
+    assert rows(match_decisions(forgetful, map_of([[0.6, 0, 5]]))) == [0]
+    assert rows(match_decisions(decisions, map_of([[0.6, 0, 5]]))) == [-1]
 
 
 def test_another_class_or_a_place_far_away_is_another_label() -> None:
     decisions = [decide(map_of([[0, 0, 5]], ["light"]), 0, "rejected")]
-    assert match_decisions(decisions, map_of([[0.2, 0, 5]], ["sign"])).tolist() == [-1]
-    assert match_decisions(decisions, map_of([[4, 0, 5]], ["light"])).tolist() == [-1]
-    assert match_decisions(decisions, map_of([[0.2, 0, 5]], ["light"])).tolist() == [0]
-    assert match_decisions(decisions, map_of([])).tolist() == [-1]
+    assert rows(match_decisions(decisions, map_of([[0.2, 0, 5]], ["sign"]))) == [-1]
+    assert rows(match_decisions(decisions, map_of([[4, 0, 5]], ["light"]))) == [-1]
+    assert rows(match_decisions(decisions, map_of([[0.2, 0, 5]], ["light"]))) == [0]
+    assert rows(match_decisions(decisions, map_of([]))) == [-1]
 
 
 def test_an_uncertain_label_is_known_again_along_its_uncertainty_only() -> None:
     before = map_of([[0, 0, 5]])
     spread = before.labels.replace(covariance_m2=np.array([[9.0, 0, 0, 0.01, 0, 0.01]]))
     decisions = [decide(replace(before, labels=spread), 0, "rejected")]
-    assert match_decisions(decisions, map_of([[8, 0, 5]])).tolist() == [0]
-    assert match_decisions(decisions, map_of([[0, 4, 5]])).tolist() == [-1]
+    assert rows(match_decisions(decisions, map_of([[8, 0, 5]]))) == [0]
+    assert rows(match_decisions(decisions, map_of([[0, 4, 5]]))) == [-1]
 
 
 def test_the_boxes_that_voted_know_a_label_again_that_moved_and_changed_class() -> None:
@@ -105,8 +125,8 @@ def test_the_boxes_that_voted_know_a_label_again_that_moved_and_changed_class() 
     decisions = [decide(map_at(0, "light", [100, 101]), 0, "rejected", dataset=dataset)]
     assert [voter[0] for voter in decisions[0].voters] == ["a/1.jpg", "a/2.jpg"]
     moved = map_at(30, "sign", [101, 102])
-    assert match_decisions(decisions, moved, dataset).tolist() == [0]
-    assert match_decisions(decisions, moved).tolist() == [-1]
+    assert rows(match_decisions(decisions, moved, dataset)) == [0]
+    assert rows(match_decisions(decisions, moved)) == [-1]
     # Other ids of the same boxes change nothing: names of pictures and places in them count.
     renumbered = replace(
         dataset,
@@ -116,38 +136,23 @@ def test_the_boxes_that_voted_know_a_label_again_that_moved_and_changed_class() 
         ),
     )
     votes = moved.votes.replace(detection_id=moved.votes.detection_id + 3, image_id=moved.votes.image_id + 5)
-    assert match_decisions(decisions, replace(moved, votes=votes), renumbered).tolist() == [0]
+    assert rows(match_decisions(decisions, replace(moved, votes=votes), renumbered)) == [0]
 
 
 def test_of_two_heads_the_one_with_the_same_voters_is_known_again_and_missing_images_say_nothing() -> None:
     """One label between two heads was rejected; the next map, of half the images, has both heads."""
     dataset = small_dataset()
-    ids = dataset.detections.detection_id
-    image_of = dict(zip(ids.tolist(), dataset.detections.image_id.tolist(), strict=True))
-
-    def map_with(places: list[float], voters: list[list[int]]) -> Map:
-        result = map_of([[x, 20, 5] for x in places], ["light"] * len(places))
-        flat = [each for some in voters for each in some]
-        votes = Votes(
-            label_id=np.repeat(np.arange(len(places)), [len(some) for some in voters]),
-            detection_id=np.array(flat),
-            image_id=np.array([image_of[each] for each in flat]),
-            residual_px=np.ones(len(flat)),
-            residual_sigmas=np.ones(len(flat)),
-        )
-        return replace(result, votes=votes)
-
     decision = decide(map_with([0.1], [[100, 101, 102]]), 0, "rejected", dataset=dataset)
     after = map_with([0.0, 0.6], [[103], [100, 101]])
-    assert match_decisions([decision], after, dataset).tolist() == [1]
-    assert match_decisions([replace(decision, voters=())], after, dataset).tolist() == [0]
+    assert rows(match_decisions([decision], after, dataset)) == [1]
+    assert rows(match_decisions([replace(decision, voters=())], after, dataset)) == [0]
     # Most of the voters are in images that are not there: the others decide, wherever the label is.
     gone = tuple((f"elsewhere/{i}.jpg", 1.0, 1.0) for i in range(20))
     moved = map_with([30.0], [[100, 101, 102]])
-    assert match_decisions([replace(decision, voters=decision.voters + gone)], moved, dataset).tolist() == [0]
+    assert rows(match_decisions([replace(decision, voters=decision.voters + gone)], moved, dataset)) == [0]
     # A voter or two of many say nothing.
     few = replace(decision, voters=decision.voters[:2] + gone)
-    assert match_decisions([few], map_with([30.0], [[100, 101]]), dataset).tolist() == [-1]
+    assert rows(match_decisions([few], map_with([30.0], [[100, 101]]), dataset)) == [-1]
 
 
 def test_a_new_map_in_the_same_folder_keeps_the_decisions(tmp_path: Path) -> None:
@@ -169,6 +174,36 @@ def test_twice_the_votes_ask_again_and_stay_out_until_answered() -> None:
     assert kept(reviewed) == [1]
     assert outcome.check_again == (0,)
     assert apply_review(doubled, [decide(doubled, 0, "rejected")])[1].check_again == ()
+
+
+def test_a_second_label_where_one_was_rejected_is_asked_about() -> None:
+    """One head was seen and rejected; with other passes there are two, and the rejection takes either."""
+    alone = certain(map_of([[0, 0, 5], [30, 0, 5]], ["light"] * 2))
+    rejected = decide(alone, 0, "rejected")
+    both = certain(map_of([[0.3, 0, 5], [-0.4, 0, 5], [30, 0, 5], [0.3, 0.2, 5]], ["light"] * 3 + ["sign"]))
+    matches = match_decisions([rejected], both)
+    assert rows(matches) == [0]
+    assert matches.unsure == {1: 0}
+    reviewed, outcome = apply_review(both, [rejected])
+    assert (outcome.rejected, outcome.check_again, kept(reviewed)) == (1, (1,), [2, 3])
+    # What stood there when it was rejected is known, and so is what was decided on; nobody asks about either.
+    before = certain(map_of([[0.3, 0, 5], [-0.4, 0, 5]], ["light"] * 2))
+    assert match_decisions([decide(before, 0, "rejected")], both).unsure == {}
+    told = [rejected, decide(both, 1, "accepted")]
+    assert match_decisions(told, both).unsure == {}
+    assert match_decisions([decide(alone, 0, "accepted")], both).unsure == {}
+
+
+def test_a_label_with_a_part_of_the_rejected_boxes_is_asked_about() -> None:
+    dataset = small_dataset()
+    before = map_with([0.0], [[100, 101, 102, 103]])
+    rejected = decide(before, 0, "rejected", dataset=dataset)
+    assert len(rejected.voters) == 4
+    split = map_with([0.0, 40.0], [[100, 101, 102], [103]])  # Far away: its boxes are what it is known by.
+    assert match_decisions([rejected], split, dataset).unsure == {1: 0}
+    assert match_decisions([rejected], split).unsure == {}
+    assert match_decisions([rejected], before, dataset).unsure == {}
+    assert match_decisions([replace(rejected, verdict="accepted")], split, dataset).unsure == {}
 
 
 def test_500_rejected_labels_stay_rejected_in_ten_maps() -> None:
@@ -246,5 +281,5 @@ def test_the_order_of_decisions_means_nothing() -> None:
     result = map_of([[0, 0, 5], [0.6, 0, 5], [9, 0, 5]])
     decisions = [decide(result, 0, "rejected"), decide(result, 1, "accepted"), decide(result, 2, "rejected")]
     later = map_of([[0.2, 0.1, 5], [0.9, 0, 5], [9, 0.3, 5]])
-    assert match_decisions(decisions, later).tolist() == [0, 1, 2]
-    assert match_decisions(decisions[::-1], later).tolist() == [2, 1, 0]
+    assert rows(match_decisions(decisions, later)) == [0, 1, 2]
+    assert rows(match_decisions(decisions[::-1], later)) == [2, 1, 0]

@@ -26,7 +26,7 @@ from valuemap.dataset import Frame
 from valuemap.errors import InputError, OutputError
 from valuemap.evidence import Evidence
 from valuemap.geodesy import lon_lat_height_from_enu
-from valuemap.map_folder import Map
+from valuemap.map_folder import Map, write_map
 from valuemap.tables import Categories, Rejected, write_table
 from valuemap.viewer.columns import pack_columns
 from valuemap.viewer.details import place_details
@@ -469,6 +469,22 @@ def test_a_rejected_label_with_twice_the_votes_is_to_be_checked_again(tmp_path: 
         asked.get("/api/map")
         (again,) = asked.get("/api/reviews").json()["decisions"]
         assert (again["state"], again["votes_then"]) == ("check again", int(before.labels.votes[row]))
+
+
+def test_a_label_beside_a_rejected_one_is_asked_about_until_somebody_decides(tmp_path: Path) -> None:
+    write_map(map_of([[0, 0, 5], [30, 0, 5]]), tmp_path / "map")
+    for asked in serve(lambda: Scene(tmp_path / "map"), tmp_path / "map" / "review.json"):
+        assert asked.decide({"label_id": 0, "verdict": "rejected"}).status == 200
+        write_map(map_of([[0.3, 0, 5], [-0.4, 0, 5], [30, 0, 5]]), tmp_path / "map")
+        asked.get("/api/map")
+        said = {each["label_id"]: each for each in asked.get("/api/reviews").json()["decisions"]}
+        assert said[0]["state"] == "rejected"
+        assert said[1] == {"label_id": 1, "state": "check again", "beside": 0}
+        assert asked.decide({"label_id": 1, "verdict": "accepted"}).json()["state"] == "accepted"
+        assert asked.decide({"label_id": 1, "verdict": None}).json() == said[1]
+        # Without the rejection there is nothing to ask.
+        asked.decide({"label_id": 0, "verdict": "accepted"})
+        assert [each["label_id"] for each in asked.get("/api/reviews").json()["decisions"]] == [0]
 
 
 def test_what_is_missing_is_said(city: tuple[Path, Map], tmp_path: Path) -> None:

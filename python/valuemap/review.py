@@ -4,7 +4,8 @@ A decision is about a place in the world, not about a row of a table: ids change
 decision remembers the label as it was: id, class, position, covariance, how much evidence it had, which boxes voted
 for it, and which other labels stood around it. `match_decisions` finds the label of a new map that each decision is
 about. A neighbour that stood beside a rejected label takes its own label again, so that of two heads on one pole the
-right one stays rejected.
+right one stays rejected. A label that a rejection could be about as well, and that nothing else accounts for, is asked
+about.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ _GATE = 16.27
 _SAME_VOTERS = 0.5
 """A label with this share of the voters that were decided on, as far as their images are still there, is the same one,
 wherever it is and whatever its class."""
+_PART_OF_VOTERS = 0.25
+"""A label with this share of the boxes that voted for a rejected one is in part what was rejected."""
 _LEAST_VOTERS = 3
 """Fewer of the boxes that voted then say nothing, unless there were no more."""
 _VOTERS_PRICE = 9.0
@@ -71,6 +74,20 @@ class Decision:
     new_class: str | None = None
     new_position_in_world_m: _Point | None = None
     note: str = ""
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Which labels of a map decisions are about.
+
+    `row_of_decision` (decisions) is the row of the label that each is about, -1 where the map has none. `unsure` has
+    the rows of labels that a rejection could be about as well, and that nothing else accounts for (no other decision,
+    and no label that stood there then), or that have a quarter of the boxes that voted for what was rejected. To each
+    belongs the number of that decision.
+    """
+
+    row_of_decision: Ints
+    unsure: dict[int, int]
 
 
 @dataclass(frozen=True)
@@ -130,19 +147,22 @@ def decide(
     )
 
 
-def match_decisions(decisions: Sequence[Decision], result: Map, dataset: Dataset | None = None) -> Ints:
-    """Return the row of the label (decisions) that each decision is about, -1 where the map has none.
+def match_decisions(decisions: Sequence[Decision], result: Map, dataset: Dataset | None = None) -> Matches:
+    """Return the label that each decision is about, and the labels that a rejection could be about as well.
 
     A label can be the one if it has the same class and is where that one was, given the covariances of both, or if most
     of the boxes that voted then, and whose images are there, vote for it now; of two labels at the place it is more
     probably the one that has these boxes. Of all ways to give labels to decisions and to the neighbours that
     they remember, each at most once, the one with the smallest sum of squared distances in sigmas counts. Nothing
     depends on the order of the decisions or on the ids of the labels.
+
+    Where one label was rejected and two stand in its place now, one of them is the rejected one, and what the other is
+    nobody has said: it is to be asked about, not shown as new.
     """
     labels = result.labels
     row_of_decision = np.full(len(decisions), -1)
     if not decisions or not len(labels):
-        return row_of_decision
+        return Matches(row_of_decision, {})
     shares = _shares_of_voters(decisions, result, dataset)
     cost: dict[tuple[int, int], float] = {}
     for claimant, row, price in _claims_of_places(decisions, labels):
@@ -153,10 +173,21 @@ def match_decisions(decisions: Sequence[Decision], result: Map, dataset: Dataset
         for row, part in share.items():
             if part >= _SAME_VOTERS:
                 cost[claimant, row] = min(_GATE * (1.0 - part), cost.get((claimant, row), math.inf))
-    for claimant, row in _assign(cost):
+    assigned = _assign(cost)
+    for claimant, row in assigned:
         if claimant < len(decisions):
             row_of_decision[claimant] = row
-    return row_of_decision
+    taken = {row for _, row in assigned}
+    unsure: dict[int, int] = {}
+    for claimant, row in sorted(cost, key=lambda claim: (cost[claim], claim)):
+        if claimant < len(decisions) and decisions[claimant].verdict == "rejected" and row not in taken:
+            unsure.setdefault(row, claimant)
+    decided = set(row_of_decision.tolist())
+    for claimant, share in enumerate(shares):
+        for row, part in share.items():
+            if part >= _PART_OF_VOTERS and row not in decided and decisions[claimant].verdict == "rejected":
+                unsure.setdefault(row, claimant)
+    return Matches(row_of_decision, unsure)
 
 
 def state_of(decision: Decision, labels: Labels, row: int) -> State:
@@ -172,8 +203,11 @@ def apply_review(result: Map, decisions: Sequence[Decision], dataset: Dataset | 
     A label that is to be looked at again stays out until somebody did.
     """
     labels, votes = result.labels, result.votes
-    rows = match_decisions(decisions, result, dataset)
+    matches = match_decisions(decisions, result, dataset)
+    rows = matches.row_of_decision
     state: list[State] = ["open"] * len(labels)
+    for row in matches.unsure:
+        state[row] = "check again"
     classes, position = labels.class_name.texts(), labels.position_in_world_m.copy()
     for decision, row in zip(decisions, rows, strict=True):
         if row < 0:

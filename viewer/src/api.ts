@@ -104,6 +104,8 @@ export interface Review {
   moved_to?: [number, number] | null;
   note?: string;
   votes_then?: number;
+  /** A label that was rejected, and that this one may be as well; null where the map no longer has it. */
+  beside?: number | null;
 }
 
 export interface Lost {

@@ -102,7 +102,7 @@ export function renderLabel(
       figure(fixed(sigmas.major * 100, sigmas.major < 0.1 ? 1 : 0, " cm"), "σ, worst way"),
     ),
     review.state === "check again"
-      ? h("p", { class: "alert", role: "alert" }, `Rejected with ${plural(review.votes_then ?? 0, "vote")}; now it has ${details.votes}. Please check again.`)
+      ? h("p", { class: "alert", role: "alert" }, `${whyCheck(review, details.votes)} Please check again.`)
       : "",
     h(
       "div",
@@ -126,6 +126,11 @@ export function renderLabel(
     head.has.dataset ? shots.element : h("p", { class: "muted" }, "Without the dataset there are no votes to show: start with --dataset."),
   );
   return { gallery: shots, wish };
+}
+
+function whyCheck(review: Review, votes: number): string {
+  if (review.verdict) return `Rejected with ${plural(review.votes_then ?? 0, "vote")}; now it has ${votes}.`;
+  return `A label was rejected here${review.beside === null ? "" : `, now label ${review.beside}`}; it may have been this one.`;
 }
 
 /** A part that can be folded away, and stays so for the next label. */

@@ -42,17 +42,30 @@ class Opinions:
         return None if self._scene.evidence is None else self._scene.evidence.dataset
 
     def _match(self) -> None:
-        rows = match_decisions(self._decisions, self._map, self._dataset)
-        self._row_of = rows.tolist()
+        matches = match_decisions(self._decisions, self._map, self._dataset)
+        self._row_of: list[int] = matches.row_of_decision.tolist()
+        # Each with the rejection that it is asked about for: without that one it is as any other label.
+        self._unsure = {row: self._decisions[number] for row, number in matches.unsure.items()}
 
     def to_json(self) -> dict[str, Any]:
         """Return all decisions by the ids of this map, and those that are about nothing in it."""
         with self._lock:
             pairs = list(zip(self._decisions, self._row_of, strict=True))
+            asked = self._asked()
         return {
-            "decisions": [self._entry(decision, row) for decision, row in pairs if row >= 0],
+            "decisions": [*(self._entry(decision, row) for decision, row in pairs if row >= 0), *asked],
             "without_label": [self._lost(decision) for decision, row in pairs if row < 0],
         }
+
+    def _asked(self) -> list[dict[str, Any]]:
+        """Return the labels that nobody decided on and that a rejection could be about as well."""
+        ids = self._map.labels.label_id
+        row_of = {id(decision): row for decision, row in zip(self._decisions, self._row_of, strict=True)}
+        return [
+            {"label_id": int(ids[row]), "state": "check again", "beside": int(ids[at]) if at >= 0 else None}
+            for row, decision in sorted(self._unsure.items())
+            if row not in self._row_of and (at := row_of.get(id(decision))) is not None
+        ]
 
     def decide(self, wish: Any) -> dict[str, Any]:
         """Keep a decision that the page asks for, in place of an earlier one about the label; return it as kept.
@@ -93,7 +106,10 @@ class Opinions:
             decisions, rows = [each for each, _ in others], [at for _, at in others]
             write_review(self.path, decisions, self._map.frame)
             self._decisions, self._row_of = decisions, rows
-        return {"label_id": label_id, "state": "open"} if decision is None else self._entry(decision, row)
+            asked = [each for each in self._asked() if each["label_id"] == label_id]
+        if decision is not None:
+            return self._entry(decision, row)
+        return asked[0] if asked else {"label_id": label_id, "state": "open"}
 
     def _entry(self, decision: Decision, row: int) -> dict[str, Any]:
         labels = self._map.labels
