@@ -20,9 +20,6 @@ from valuemap.dataset import Dataset, rows_of
 from valuemap.errors import InputError
 from valuemap.tables import Floats
 
-METRES_PER_DEGREE = 111_320.0
-"""Of latitude, roughly; of longitude on the equator."""
-
 
 def rays_of(dataset: Dataset) -> tuple[Floats, Floats]:
     """Return the centres and directions (N, 3) of the rays of all detections."""

@@ -211,11 +211,3 @@ def cells_across_tile(grid: Grid, tile_size_m: float | None) -> int:
     if not tile_size_m > 0.0:
         raise SettingError(f"--tile-size {tile_size_m}: expected metres above 0", hint="leave it away for the default")
     return max(1, math.ceil(min(tile_size_m / grid.side_m, 2.0**31)))
-
-
-def group_into_tiles(grid: Grid, cells: Sequence[Cell], cells_across: int) -> dict[tuple[int, int], list[Cell]]:
-    """Return the cells of each tile, both ascending."""
-    tiles: dict[tuple[int, int], list[Cell]] = {}
-    for cell in cells:
-        tiles.setdefault(grid.tile_of(cell, cells_across), []).append(cell)
-    return dict(sorted(tiles.items()))
