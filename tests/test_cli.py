@@ -27,6 +27,11 @@ from valuemap.config import describe_settings
 COMMAND = [sys.executable, "-c", "from valuemap.cli import main; main()"]
 
 
+def start(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run a command in a process of its own."""
+    return subprocess.run([*COMMAND, *map(str, arguments)], capture_output=True, text=True, check=False)
+
+
 def works(*arguments: str | Path) -> str:
     """Run a command in this process, as starting one takes longer than the work; return what it prints."""
     done = CliRunner().invoke(app, [*map(str, arguments)])
@@ -106,21 +111,18 @@ def test_from_simulation_to_export(tmp_path: Path) -> None:
     assert json.loads(works("info", result, "--json"))["labels"] == run_record["counts"]["labels"]
 
 
-@pytest.mark.parametrize("start", [COMMAND, *([sys.executable, "-m", name] for name in ("valuemap", "valuemap.cli"))])
-def test_every_way_to_start_tells_the_version(start: list[str]) -> None:
-    done = subprocess.run([*start, "--version"], capture_output=True, text=True, check=True)
+@pytest.mark.parametrize("way", [COMMAND, *([sys.executable, "-m", name] for name in ("valuemap", "valuemap.cli"))])
+def test_every_way_to_start_tells_the_version(way: list[str]) -> None:
+    done = subprocess.run([*way, "--version"], capture_output=True, text=True, check=True)
     assert done.stdout == f"valuemap {version('valuemap')}\n"
     assert done.stderr == ""
 
 
 def test_a_process_says_and_ends_as_its_command_does(street: Path, tmp_path: Path) -> None:
-    def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-        return subprocess.run([*COMMAND, *map(str, arguments)], capture_output=True, text=True, check=False)
-
-    done = run("map", street, "--out", tmp_path / "map", "--json")
+    done = start("map", street, "--out", tmp_path / "map", "--json")
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["counts"]["images"] == 60
-    failed = run("map", tmp_path / "nowhere", "--out", tmp_path / "map")
+    failed = start("map", tmp_path / "nowhere", "--out", tmp_path / "map")
     assert "is not a dataset" in one_line_and_a_hint(failed.returncode, failed.stdout, failed.stderr)
 
 

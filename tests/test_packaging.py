@@ -28,7 +28,7 @@ DISTRIBUTION_OF = {
     "psycopg": "psycopg[binary]",
     "rerun": "rerun-sdk",
 }
-BROUGHT_ALONG = {"pandas": "geopandas", "shapely": "geopandas", "pydantic": "typer"}
+BROUGHT_ALONG = {"pandas": "geopandas", "shapely": "geopandas", "pydantic_core": "pydantic"}
 """Packages that are there because another one, whose data they are, needs them."""
 
 
