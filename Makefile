@@ -36,12 +36,15 @@ bench: setup
 	cargo bench --locked --package valuemap-core
 	$(RUN) python benchmarks/speed.py
 
-# Tiles of any size, runs that are killed, changes between years.
+# Cities larger than memory, tiles of any size, runs that are killed, changes between years.
 bench-scale: setup
+	$(RUN) python benchmarks/scale.py simulate --preset 10x-nyc --json benchmarks/results/scale.json
+	$(RUN) python benchmarks/scale.py partition --preset 10x-nyc --json benchmarks/results/scale.json
 	$(RUN) python benchmarks/scale.py cells --preset block --json benchmarks/results/scale.json
 	$(RUN) python benchmarks/scale.py kills --preset block --json benchmarks/results/scale.json
 	$(RUN) python benchmarks/scale.py change --json benchmarks/results/scale.json
 	$(RUN) python benchmarks/scale.py cells --preset nyc --json benchmarks/results/scale.json
+	$(RUN) python benchmarks/scale.py kills --preset nyc --json benchmarks/results/scale.json
 
 # The bundled model of traffic lights, from rendered and real pictures: see docs/model_card.md.
 model: EXTRAS := train

@@ -1,6 +1,6 @@
 """Scale: tiles of any size, runs that are killed, and changes between years; see docs/scale.md.
 
-    python benchmarks/scale.py cells|kills|change [--preset nyc] [--json benchmarks/results/scale.json]
+    python benchmarks/scale.py simulate|partition|cells|kills|change [--preset nyc] [--dataset FOLDER] [--json FILE]
 
 Times are those of the processor (user and system, all threads): they do not depend on what else the machine does.
 """
@@ -20,6 +20,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +31,13 @@ import valuemap
 from machine import describe_machine
 from valuemap.cameras import rotation_matrices
 from valuemap.config import MapConfig
-from valuemap.dataset import Dataset, rows_of
+from valuemap.dataset import Dataset, rows_of, write_dataset_in_pieces
 from valuemap.engine.threads import ThreadEngine
 from valuemap.pipeline import Run, build_map_of_folder
-from valuemap.simulate import PRESETS, simulate
+from valuemap.portions import rows_on_disk
+from valuemap.simulate import PRESETS, simulate, simulate_districts
 from valuemap.tables import Ints
+from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.work import open_work
 from valuemap.update import compare
 from valuemap.update.changes import MOVED_WITHIN_M
@@ -52,6 +56,7 @@ def main() -> None:
     parser.add_argument("what", choices=sorted(PARTS))
     parser.add_argument("--preset", default="small", help="a preset of valuemap simulate, or block for a part of nyc")
     parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--dataset", type=Path, help="a dataset of the preset that is there already")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     result = {
@@ -100,6 +105,55 @@ def digest(folder: Path) -> str:
     """Return a hash of what a map says."""
     names = ("labels.parquet", "votes.parquet", "calibration.json")
     return hashlib.sha256(b"".join((folder / name).read_bytes() for name in names)).hexdigest()[:16]
+
+
+@contextmanager
+def dataset_of(arguments: argparse.Namespace) -> Iterator[Path]:
+    """Yield the folder of the preset's dataset, simulated if it is not there."""
+    if arguments.dataset is not None:
+        yield arguments.dataset
+        return
+    with tempfile.TemporaryDirectory() as name:
+        write_dataset_in_pieces(simulate_districts(PRESETS[arguments.preset], seed=0), Path(name) / "city")
+        yield Path(name) / "city"
+
+
+def peak_mb() -> int:
+    """Return the peak memory of this process so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+
+
+def cpu_s() -> float:
+    """Return the processor seconds of this process so far."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def simulate_only(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Simulate a city district by district."""
+    with dataset_of(argparse.Namespace(preset=arguments.preset, dataset=None)) as folder:
+        size = rows_on_disk(folder)
+    return {"images_and_detections": size, "cpu_seconds": round(cpu_s(), 1), "peak_memory_mb": peak_mb()}
+
+
+def partition(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Cut a dataset into tiles on disk; give the dataset, or simulating it counts as well."""
+    with dataset_of(arguments) as folder, tempfile.TemporaryDirectory() as name:
+        before, start = cpu_s(), time.perf_counter()
+        with open_work(Path(name) / "work", resume=False) as work:
+            found = partition_dataset(folder, work, MapConfig())
+            seconds = time.perf_counter() - start
+            files = [path for path in found.folder.rglob("*") if path.is_file()]
+            disk = sum(path.stat().st_size for path in files)
+        return {
+            "counts": found.counts,
+            "cells": len(found.cells),
+            "files": len(files),
+            "disk_mb": disk >> 20,
+            "seconds": round(seconds, 1),
+            "cpu_seconds": round(cpu_s() - before, 1),
+            "peak_memory_mb": peak_mb(),
+        }
 
 
 def cells(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -277,7 +331,7 @@ def years(dataset: Dataset, removed: Ints, added: Ints, moved: Ints) -> tuple[Da
     return year(False), year(True)
 
 
-PARTS = {"cells": cells, "kills": kills, "change": change}
+PARTS = {"simulate": simulate_only, "partition": partition, "cells": cells, "kills": kills, "change": change}
 
 if __name__ == "__main__":
     main()
