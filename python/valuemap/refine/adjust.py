@@ -44,7 +44,8 @@ class Observations:
     (N, 3) and `forward_radps`, `backward_radps` (N, 3, camera axes): how the image moves and turns until the next one
     and since the last one; `from_middle_px` (N, 2) from the principal point (0 where the camera has no focal length);
     `cam_from_node` (N, 3, 3) turns drift into camera axes; `sigma_px` (N) is the deviation of all that
-    is not in the model, `detection_sigma_px` (N) that of the detection alone.
+    is not in the model, `detection_sigma_px` (N) that of the detection alone. `leg` (N) and `vehicle` (N) are the rows
+    of the offset and of the mounting and delay; drives that go on as the one before them share its vehicle.
     """
 
     residual_from_cam: Floats
@@ -62,6 +63,7 @@ class Observations:
     node: Ints
     drive: Ints
     leg: Ints
+    vehicle: Ints
     camera: Ints
     image: Ints
 
@@ -90,7 +92,10 @@ class Chain:
 
 @dataclass(frozen=True)
 class Scales:
-    """Standard deviations a priori: of drift and of an image's own error, each axis; of each kind of constant."""
+    """Standard deviations a priori: of drift and of an image's own error, each axis; of each kind of constant.
+
+    Those of constants are one number, or one for each (rows, width).
+    """
 
     drift_m: float
     drift_rad: float
@@ -145,13 +150,13 @@ def skew(vector: Floats) -> Floats:
 def corrected(seen: Observations, state: State) -> tuple[Floats, Floats, Floats, Floats]:
     """Return rotations (N, 3, 3), centres (N, 3), and the velocity (N, 3) and turn rate (N, 3) that a delay acts by."""
     offset, mount, delay, _, camera_mount, camera_delay = state.constants
-    late_s = delay[seen.drive, 0] + camera_delay[seen.camera, 0]
+    late_s = delay[seen.vehicle, 0] + camera_delay[seen.camera, 0]
     ahead = (late_s >= 0.0)[:, None]
     velocity = np.where(ahead, seen.forward_mps, seen.backward_mps)
     rate = np.where(ahead, seen.forward_radps, seen.backward_radps)
     drift, own = state.drift[seen.node], state.own[seen.image]
     center = seen.center_in_world_m + velocity * late_s[:, None] + offset[seen.leg] + drift[:, :3] + own[:, :3]
-    turn = mount[seen.drive] + camera_mount[seen.camera] + own[:, 3:]
+    turn = mount[seen.vehicle] + camera_mount[seen.camera] + own[:, 3:]
     turn = turn + np.einsum("nij,nj->ni", seen.cam_from_node, drift[:, 3:])
     rotation = rotations(turn) @ rotations(rate * late_s[:, None]) @ seen.cam_from_world
     return rotation, center, velocity, rate
@@ -237,7 +242,7 @@ class Adjustment:
             column += int(flags.sum())
             self.column_of.append(index)
         self.columns = column
-        of = (seen.leg, seen.drive, seen.drive, seen.camera, seen.camera, seen.camera)
+        of = (seen.leg, seen.vehicle, seen.vehicle, seen.camera, seen.camera, seen.camera)
         self.constant_columns = np.concatenate([c[rows] for c, rows in zip(self.column_of, of, strict=True)], axis=1)
         bounds = np.flatnonzero(np.diff(seen.drive)) + 1
         self.parts = [rows for rows in np.split(np.arange(len(seen)), bounds) if len(rows)]
@@ -251,7 +256,7 @@ class Adjustment:
         system.add_diagonal(of_things, np.full(len(of_things), _DAMPING), np.zeros(len(of_things)))
         for kind, index in enumerate(self.column_of):
             free = self.active[kind]
-            sigma = np.broadcast_to(np.asarray(self.scales.constant[kind], np.float64).reshape(-1, 1), free.shape)[free]
+            sigma = np.broadcast_to(np.asarray(self.scales.constant[kind], np.float64), free.shape)[free]
             system.add_diagonal(index[free], sigma**-2, -(sigma**-2) * state.constants[kind][free])
         pending = []
         for rows in self.parts:

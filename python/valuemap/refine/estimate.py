@@ -10,6 +10,8 @@ import numpy as np
 import valuemap._core as _core
 from valuemap.config import MapConfig
 from valuemap.refine.adjust import (
+    MOUNT,
+    OFFSET,
     WIDTH,
     Adjustment,
     Observations,
@@ -22,7 +24,7 @@ from valuemap.refine.adjust import (
     weights,
 )
 from valuemap.refine.footage import DRIFT_LENGTH_M, Footage, Sigmas
-from valuemap.refine.jumps import Legs
+from valuemap.refine.jumps import Hints, Legs
 from valuemap.refine.landmarks import Landmarks
 from valuemap.refine.register import Registration, register
 from valuemap.refine.tracks import associate, merge_objects
@@ -39,9 +41,15 @@ _LANDMARK_PX, _LANDMARK_M = 3.0, 0.2
 _NEW_LEG_M = 1.0
 """Registered shifts that differ by more than this are of two legs."""
 _JUMP_PRICE, _SEEN_PRICE = 30.0, 8.0
-"""Minus twice the log odds of a jump where the trajectory shows none, and one: what a new leg has to explain."""
+"""Minus twice the log odds of a jump where the trajectory says nothing, and where it shows one: what a new leg has to
+explain."""
 _LEAST_VOTES, _LEAST_OF_LEG = 4, 8
 _RANGES = 1.5
+_SURE = 4.0
+"""Turns of drives are none of chance if their squares exceed their variances by so many deviations."""
+_TOLD_RAD = math.radians(0.5)
+"""Drives whose turns are less sure than this say nothing of how much drives are turned."""
+_ALONE = (4.0, 3.0, 2.0, 2.0)
 _COARSE, _FINE = (6.0, 6.0, 4.0, 4.0, 3.0, 2.0, 2.0), (2.0, 1.5, 1.0, 1.0, 1.0)
 
 
@@ -76,13 +84,15 @@ def estimate(
     config: MapConfig,
     *,
     seen_cuts: Legs,
+    hints: Hints,
     known: tuple[Legs, Floats] | None = None,
+    turned_rad: Floats | None = None,
     laid: Footage | None = None,
 ) -> Estimate | None:
     """Estimate everything that drives may be wrong by, None where there is too little that drives share.
 
-    `seen_cuts` are where the trajectory itself jumps. Where legs and their offsets (L, 3) are `known` about, the
-    landmarks are those of the footage `laid` that way.
+    `seen_cuts` are where the trajectory itself jumps, `hints` where it may. Where legs and their offsets (L, 3) are
+    `known` about, or how the cameras of drives are turned (D, 3), the landmarks are those of the footage `laid` so.
     """
     marks = _usable(landmarks, laid or footage)
     if marks is None:
@@ -96,7 +106,9 @@ def estimate(
     detection, thing = landmarks.voters, thing_of_mark[landmarks.landmark_of_voter()]
     counts = (len(legs), footage.drives.count, footage.drives.count) + (footage.cameras,) * 3
     state = State.zero(points, len(footage.chain.drive), len(footage.row), counts)
-    state.constants[0][:] = offset
+    state.constants[OFFSET][:] = offset
+    if turned_rad is not None:
+        state.constants[MOUNT][:] = turned_rad
     noise = Noise()
     sigma_px = _sigmas(footage, noise)
     leg = legs.of(footage.drives.pass_code, footage.drives.order)
@@ -111,7 +123,7 @@ def estimate(
         sigma_px = _sigmas(footage, noise)
         scales = _grown(own_scales(footage, noise, scales), state)
         if round_number < 3:
-            legs, leg, state = _cut(footage, seen, state, legs, seen_cuts)
+            legs, leg, state = _cut(footage, seen, state, legs, seen_cuts, hints)
             seen = footage.observe(detection, thing, leg, sigma_px)
         detection, thing, class_code, size_m, state = _anew(
             footage, state, class_code, size_m, leg, sigma_px, range_m, detection, thing
@@ -120,6 +132,39 @@ def estimate(
             return None
         tolerances = _FINE
     return Estimate(detection, thing, class_code, size_m, legs, state, noise, sigma_px, scales, len(landmarks))
+
+
+def mounts_alone(footage: Footage, landmarks: Landmarks) -> Floats:
+    """Return how the camera of each drive (D, 3), rad, is turned about its axes, as the drive alone tells it.
+
+    What a drive passes spreads out from where it drives to: one that looks elsewhere than it says is told without any
+    other drive. How much of it is drift and noise is told by all drives together: where they are turned by no more than
+    that, all is zero; else each is drawn to zero by its share of it. Turns about the axis of view are not told.
+    """
+    drives = footage.drives.count
+    counts = (drives, drives, drives) + (footage.cameras,) * 3
+    turned = np.zeros((drives, 3))
+    marks = _usable(landmarks, footage)
+    if marks is None:
+        return turned
+    landmarks = marks[0]
+    state = State.zero(landmarks.point_in_world_m, len(footage.chain.drive), len(footage.row), counts)
+    leg_of_image = footage.drives.pass_code
+    seen = footage.observe(landmarks.voters, landmarks.landmark_of_voter(), leg_of_image, _sigmas(footage, Noise()))
+    free = tuple(np.full((n, w), kind == MOUNT) for kind, (n, w) in enumerate(zip(counts, WIDTH, strict=True)))
+    problem = Adjustment(seen, footage.chain, WIDE, free, len(landmarks))
+    state = adjust(problem, state, tolerances=_ALONE, with_variance=True)
+    assert state.covariance is not None
+    at = problem.column_of[MOUNT] - 3 * len(landmarks)
+    variance = np.diag(state.covariance)[at]
+    for axis in (0, 1):
+        value, of = state.constants[MOUNT][:, axis], variance[:, axis]
+        told = of < _TOLD_RAD**2
+        excess = float(np.sum(value[told] ** 2 / of[told])) - int(told.sum())
+        if excess > _SURE * math.sqrt(2.0 * max(int(told.sum()), 1)):
+            wide = max(float(np.average(value[told] ** 2 - of[told], weights=1.0 / of[told])), 0.0)
+            turned[:, axis] = value * wide / (wide + of)
+    return turned
 
 
 def everything(footage: Footage, legs: Legs) -> tuple[Bools, ...]:
@@ -246,7 +291,9 @@ def fit_noise(seen: Observations, state: State, noise: Noise) -> Noise:
     return Noise(px, min(noise.share * factor, 0.3), min(noise.image_m * factor, 0.5))
 
 
-def _cut(footage: Footage, seen: Observations, state: State, legs: Legs, seen_cuts: Legs) -> tuple[Legs, Ints, State]:
+def _cut(
+    footage: Footage, seen: Observations, state: State, legs: Legs, seen_cuts: Legs, hints: Hints
+) -> tuple[Legs, Ints, State]:
     """Cut drives anew where their poses jump, given the objects: exact segmentation of each drive's images."""
     shift, information, image_of = _apparent_shift(footage, seen, state)
     drives = footage.drives
@@ -266,7 +313,9 @@ def _cut(footage: Footage, seen: Observations, state: State, legs: Legs, seen_cu
         value = shift[rows, :2]
         precision = np.linalg.inv(np.linalg.inv(information[rows])[:, :2, :2])
         cut_at = seen_cuts.of(drives.pass_code[image_of[rows]], drives.order[image_of[rows]])
-        starts = segment(value, precision, np.where(np.diff(cut_at, prepend=cut_at[0]) != 0, _SEEN_PRICE, _JUMP_PRICE))
+        price = np.maximum(_JUMP_PRICE - hints.between(drive, drives.order[image_of[rows]]), _SEEN_PRICE)
+        price[np.diff(cut_at, prepend=cut_at[0]) != 0] = _SEEN_PRICE
+        starts = segment(value, precision, price)
         for number, start in enumerate(starts):
             end = starts[number + 1] if number + 1 < len(starts) else len(rows)
             total = precision[start:end].sum(axis=0) + np.eye(2) / WIDE.constant[0] ** 2

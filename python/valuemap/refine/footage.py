@@ -90,6 +90,7 @@ class Footage:
             node=self.node[image],
             drive=self.drives.pass_code[image],
             leg=leg_of_image[image],
+            vehicle=self.drives.pass_code[image],
             camera=self.camera[image],
             image=image,
         )

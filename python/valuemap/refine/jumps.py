@@ -1,7 +1,8 @@
-"""Where poses jump: steps that no vehicle makes, told from the trajectory alone."""
+"""Where poses jump: steps that no vehicle makes, or that one hardly makes, told from the trajectory alone."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,30 @@ _SIGMAS = 8.0
 """A step farther than so many usual deviations from what a vehicle can make is a jump."""
 _LEAST_M = 0.3
 _MOST_STEPS = 4.0
+_JUMP_M = 2.0
+"""Deviation of jumps, each axis."""
+_LEAST_SIGMA_M = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Hints:
+    """How much a trajectory speaks for a jump: minus twice the log of the odds (H) before this place of a drive (H).
+
+    Sorted by drive and order; where nothing is known, nothing is said.
+    """
+
+    drive: Ints
+    order: Ints
+    evidence: Floats
+
+    def between(self, drive: int, order: Ints) -> Floats:
+        """Return the most that speaks (N) for a jump after the image before and not after this one, 0 at the first."""
+        low, high = np.searchsorted(self.drive, [drive, drive + 1])
+        at = low + np.searchsorted(self.order[low:high], order, side="right")
+        most = np.zeros(len(order))
+        for i in np.flatnonzero(np.diff(at)) + 1:
+            most[i] = max(0.0, float(self.evidence[at[i - 1] : at[i]].max()))
+        return most
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,10 +66,61 @@ def find_jumps(dataset: Dataset, drives: Drives) -> Legs:
     A vehicle goes on as before, or as after, or stops, or anything between: the step is in the triangle of no step and
     those two. How far usual steps are outside of it is the trembling of the poses.
     """
+    cuts: list[tuple[int, int]] = [(drive, 0) for drive in range(drives.count)]
+    for steps in _steps_of_drives(dataset, drives):
+        ahead = _FASTER * steps.seconds[:, None]
+        outside = _from_triangle(steps.step_m, steps.before_mps * ahead, steps.after_mps * ahead)
+        usual = float(np.median(np.linalg.norm(steps.unexpected_m(), axis=1)))
+        far = outside > max(_SIGMAS * usual / 1.5, _LEAST_M)
+        cuts += [(steps.drive, int(order)) for order in steps.order[far]]
+    both = np.unique(np.array(cuts, dtype=np.int64), axis=0)
+    return Legs(both[:, 0], both[:, 1])
+
+
+def find_hints(dataset: Dataset, drives: Drives) -> Hints:
+    """Return how much each step speaks for a jump: by how much it is likelier with one than without.
+
+    What a step differs by from those before and after it is normal, along the way and across it, with the deviation
+    that it usually has in its drive; and wider by that of jumps where there is one.
+    """
+    parts = []
+    for steps in _steps_of_drives(dataset, drives):
+        unexpected = steps.unexpected_m()
+        way = steps.before_mps + steps.after_mps
+        length = np.linalg.norm(way, axis=1, keepdims=True)
+        way = np.where(length > 0.0, way / np.maximum(length, 1e-9), np.array([1.0, 0.0]))
+        along = np.sum(unexpected * way, axis=1)
+        across = unexpected[:, 1] * way[:, 0] - unexpected[:, 0] * way[:, 1]
+        evidence = np.zeros(len(along))
+        for value in (along, across):
+            variance = max(1.4826 * float(np.median(np.abs(value))), _LEAST_SIGMA_M) ** 2
+            evidence += value**2 / variance - value**2 / (variance + _JUMP_M**2) - np.log1p(_JUMP_M**2 / variance)
+        parts.append(np.column_stack([np.full(len(along), steps.drive), steps.order, evidence]))
+    table = np.concatenate([np.empty((0, 3)), *parts])
+    return Hints(table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2])
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """Steps (N) of one drive that have one before and one after them, on the ground, and the order they lead to."""
+
+    drive: int
+    order: Ints
+    step_m: Floats
+    seconds: Floats
+    before_mps: Floats
+    after_mps: Floats
+
+    def unexpected_m(self) -> Floats:
+        """Return what the steps (N, 2) are other than the mean of those before and after."""
+        return np.asarray(self.step_m - 0.5 * (self.before_mps + self.after_mps) * self.seconds[:, None])
+
+
+def _steps_of_drives(dataset: Dataset, drives: Drives) -> Iterator[_Steps]:
+    """Yield the steps of the camera with most images in each drive; seconds are images where there are no times."""
     center = camera_centers(dataset.images)[:, :2]
     time = dataset.images.timestamp_s
     camera = np.unique(dataset.images.camera_id, return_inverse=True)[1]
-    cuts: list[tuple[int, int]] = [(drive, 0) for drive in range(drives.count)]
     for drive in range(drives.count):
         rows = np.flatnonzero(drives.pass_code == drive)
         rows = rows[camera[rows] == np.argmax(np.bincount(camera[rows]))]
@@ -60,14 +136,9 @@ def find_jumps(dataset: Dataset, drives: Drives) -> Legs:
         inner = np.flatnonzero(near[1:-1] & near[:-2] & near[2:]) + 1
         if len(inner) < 3:
             continue
-        ahead = _FASTER * seconds[inner, None]
-        outside = _from_triangle(step[inner], velocity[inner - 1] * ahead, velocity[inner + 1] * ahead)
-        expected = 0.5 * (velocity[inner - 1] + velocity[inner + 1]) * seconds[inner, None]
-        usual = float(np.median(np.linalg.norm(step[inner] - expected, axis=1)))
-        far = outside > max(_SIGMAS * usual / 1.5, _LEAST_M)
-        cuts += [(drive, int(drives.order[rows[i + 1]])) for i in inner[far]]
-    both = np.unique(np.array(cuts, dtype=np.int64), axis=0)
-    return Legs(both[:, 0], both[:, 1])
+        yield _Steps(
+            drive, drives.order[rows[inner + 1]], step[inner], seconds[inner], velocity[inner - 1], velocity[inner + 1]
+        )
 
 
 def _from_triangle(point: Floats, a: Floats, b: Floats) -> Floats:

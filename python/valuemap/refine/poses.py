@@ -15,12 +15,12 @@ from valuemap.drives import Drives, in_driving_order
 from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
 from valuemap.refine.adjust import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
-from valuemap.refine.estimate import Estimate, estimate
+from valuemap.refine.estimate import Estimate, estimate, mounts_alone
 from valuemap.refine.footage import Footage, find_motion, gather, in_working_frame
-from valuemap.refine.jumps import find_jumps
+from valuemap.refine.jumps import Legs, find_hints, find_jumps
 from valuemap.refine.landmarks import find_landmarks
 from valuemap.refine.select import Selected, select
-from valuemap.tables import Bools
+from valuemap.tables import Bools, Floats
 
 USUAL_RANGE_M = 60.0
 """Lengths in this package are metres where `max_range_m` is this; they grow with it."""
@@ -29,7 +29,8 @@ _SAMPLE = 4_000
 _PLACE = 3.0
 """Places of the sample are so many ranges wide."""
 _LEAST_DETECTIONS = 50
-_LOST_M = 0.5
+_TURNS = 2
+_LOST_M, _FEW_LOST = 0.5, 0.05
 """Where offsets are larger than this, each drive is looked at anew as it lies then."""
 
 
@@ -107,36 +108,64 @@ def _is_proven(found: _Found | None) -> bool:
 
 
 def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> _Found | None:
-    """Estimate on a dataset in the working frame; where drives are far off, with landmarks of drives laid right."""
+    """Estimate on a dataset in the working frame; where drives are far off, with landmarks of drives laid right.
+
+    Cameras askew are turned first, drive by drive, as what drives see is turned about them else and fits nowhere.
+    """
     footage = gather(dataset, drives)
-    jumps = find_jumps(dataset, drives)
+    jumps, hints = find_jumps(dataset, drives), find_hints(dataset, drives)
     leg = jumps.of(footage.drives.pass_code, footage.drives.order)
     try:
+        laid, turned = footage, np.zeros((drives.count, 3))
         landmarks = find_landmarks(footage.dataset, footage.rays, footage.drives, leg, config, threads=threads)
+        for _ in range(_TURNS):
+            more = mounts_alone(laid, landmarks)
+            if not more.any():
+                break
+            turned = turned + more
+            laid = _laid(footage, turned)
+            landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, leg, config, threads=threads)
     except SettingError:  # So many detections in one place that their votes fill the memory.
         return None
-    result = estimate(footage, landmarks, config, seen_cuts=jumps)
+    result = estimate(footage, landmarks, config, seen_cuts=jumps, hints=hints, turned_rad=turned, laid=laid)
     if result is None:
         return None
-    if float(np.abs(result.state.constants[OFFSET]).max(initial=0.0)) > _LOST_M:
-        laid = _shifted(footage, result)
-        leg = laid.drives.pass_code  # Its jumps are mended.
-        landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, leg, config, threads=threads)
+    if _is_lost(footage, result):
         known = (result.legs, result.state.constants[OFFSET])
-        again = estimate(footage, landmarks, config, seen_cuts=jumps, known=known, laid=laid)
+        laid = _laid(footage, turned, known)
+        leg = laid.drives.pass_code  # Its jumps are mended.
+        try:
+            landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, leg, config, threads=threads)
+        except SettingError:
+            return None
+        again = estimate(
+            footage, landmarks, config, seen_cuts=jumps, hints=hints, known=known, turned_rad=turned, laid=laid
+        )
         if again is not None and len(again.thing) >= len(result.thing):
             result = again
     return _Found(footage, result, select(footage, result))
 
 
-def _shifted(footage: Footage, result: Estimate) -> Footage:
-    """Return the footage with the legs of all drives where they seem to belong."""
-    leg = result.legs.of(footage.whole_drives.pass_code, footage.whole_drives.order)
-    images = footage.whole.images
-    offset = result.state.constants[OFFSET][leg]
-    rotation, _ = camera_poses(images)
-    moved = images.replace(cam_from_world_m=images.cam_from_world_m - np.einsum("nij,nj->ni", rotation, offset))
-    return gather(replace(footage.whole, images=moved), footage.whole_drives)
+def _is_lost(footage: Footage, result: Estimate) -> bool:
+    """Return whether more than few of the observations are of legs that are far off."""
+    image = footage.rays.image_row[result.detection]
+    leg = result.legs.of(footage.drives.pass_code[image], footage.drives.order[image])
+    far = np.linalg.norm(result.state.constants[OFFSET][leg], axis=1) > _LOST_M
+    return bool(np.mean(far) > _FEW_LOST)
+
+
+def _laid(footage: Footage, turned_rad: Floats, known: tuple[Legs, Floats] | None = None) -> Footage:
+    """Return the footage with the cameras of drives (D, 3) turned, and legs moved, as they seem to be."""
+    images, drives = footage.whole.images, footage.whole_drives
+    rotation, center = camera_poses(images)
+    rotation = rotations(turned_rad[drives.pass_code]) @ rotation
+    if known is not None:
+        center = center + known[1][known[0].of(drives.pass_code, drives.order)]
+    quat = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
+    moved = images.replace(
+        cam_from_world_quat=quat, cam_from_world_m=-np.einsum("nij,nj->ni", rotation_of(quat), center)
+    )
+    return gather(replace(footage.whole, images=moved), drives)
 
 
 def _sample(dataset: Dataset, drives: Drives) -> Bools | None:

@@ -4,6 +4,14 @@ One drive after the other is laid onto what the drives before it saw. Along a dr
 of states on a grid: it stays, creeps to a cell beside it, or jumps at a price, and the likeliest chain is found exactly
 (Viterbi 1967). Then every drive is laid anew onto all others. Matches are one to one: no drive sees an object twice in
 one place.
+
+That a landmark p shows one of the n objects x_j around it is told by the density of its place given the objects,
+against that of a place where nobody has seen anything:
+
+    L(g) = 1 - q + q V / n sum_j N(x_j - p - g; covariance of both)
+
+so a landmark of unknown depth, or one among many objects, tells little of the shift g. A jump pays for being rare, and
+for the place where it ends: of the many shifts that there are, one always fits two landmarks.
 """
 
 from __future__ import annotations
@@ -20,12 +28,16 @@ from valuemap.tables import Floats, Ints
 
 _REACH_M, _CELL_M = 6.0, 0.5
 """Shifts are sought on the ground up to this far, on a grid this fine."""
+_AROUND_M = _REACH_M * math.sqrt(2.0) + 2.0
+"""Objects this near may be what a landmark shows."""
 _HEIGHT_M = 1.0
 """Deviation of what is left between heights."""
-_JUMP, _NEW_LEG, _CREEP = 8.0, 1.0, 1.5
+_JUMP, _NEW_LEG, _CREEP = 5.0, 0.5, 2.0
 """Minus the logarithm of how likely a chain jumps where none is seen, where one is, and creeps to the next cell."""
-_CLUTTER = 0.005
-"""How likely a landmark lies where it does though nobody else sees it."""
+_SHARED = 0.7
+"""How likely a landmark shows what others have seen."""
+_HIGH_M = 4.0
+"""Objects are spread over so much height."""
 _PRIOR_M = 3.0
 _SMOOTH_M = 0.35
 """What drives disagree by within a cell and a stretch, each axis."""
@@ -135,8 +147,7 @@ def _lay(rows: Ints, point: Floats, covariance: Floats, shift: Floats, thing: In
     objects, place, spread = known.alive()
     near: list[list[int]]
     if len(objects):
-        reach = _REACH_M * math.sqrt(2.0) + 2.0
-        near = list(cKDTree(place[:, :2]).query_ball_point(point[rows, :2], reach, return_sorted=True))  # type: ignore[arg-type]
+        near = list(cKDTree(place[:, :2]).query_ball_point(point[rows, :2], _AROUND_M, return_sorted=True))  # type: ignore[arg-type]
     else:
         near = [[] for _ in rows]
     pairs = _compatible(rows, near, objects, known)
@@ -178,6 +189,9 @@ def _chain(
     apart = place[target] - point[rows[mark]]
     evidence = np.zeros((len(rows), side * side))
     weight = np.linalg.inv(total)
+    around = np.bincount(mark, minlength=len(rows))
+    volume_m3 = math.pi * _AROUND_M**2 * _HIGH_M
+    height = _SHARED * volume_m3 / around[mark] / np.sqrt(np.linalg.det(2.0 * np.pi * total))
     block = max(1, 2_000_000 // (side * side))
     for start in range(0, len(mark), block):
         part = slice(start, start + block)
@@ -185,9 +199,11 @@ def _chain(
         left[:, :, :2] = apart[part, None, :2] - grid
         left[:, :, 2] = apart[part, None, 2]
         square = np.einsum("kgi,kij,kgj->kg", left, weight[part], left, optimize=True)
-        np.maximum.at(evidence, mark[part], np.exp(-0.5 * square))
-    gain = np.log(_CLUTTER + evidence)
-    value = -np.sum(grid**2, axis=1) / (2.0 * _PRIOR_M**2) + gain[0]
+        np.add.at(evidence, mark[part], height[part, None] * np.exp(-0.5 * square))
+    gain = np.log(1.0 - _SHARED + evidence)
+    prior = -np.sum(grid**2, axis=1) / (2.0 * _PRIOR_M**2)
+    prior -= math.log(float(np.exp(prior).sum()))
+    value = prior + gain[0]
     came_from = np.empty((len(rows), side * side), np.int64)
     here = np.arange(side * side)
     for i in range(1, len(rows)):
@@ -205,8 +221,9 @@ def _chain(
             better = moved.ravel() > best
             best, source = np.where(better, moved.ravel(), best), np.where(better, of.ravel(), source)
         top = int(np.argmax(value))
-        better = value[top] - price[i - 1] > best
-        best, source = np.where(better, value[top] - price[i - 1], best), np.where(better, top, source)
+        jumped = value[top] - price[i - 1] + prior
+        better = jumped > best
+        best, source = np.where(better, jumped, best), np.where(better, top, source)
         came_from[i] = source
         value = best + gain[i]
     state = np.empty(len(rows), np.int64)

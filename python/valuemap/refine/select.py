@@ -1,10 +1,11 @@
-"""Which errors the data prove: each parameter pays for itself, or is exactly zero.
+"""Which errors the data prove: each kind of them pays for itself, or is exactly zero.
 
 Drift as large as it is found to be takes part in every fit, so that what a drive's poses do anyway is not taken for a
-fault of them. What has a common cause (a camera) is tried before what each drive has for itself. A parameter stays if
+fault of them. What has a common cause (a camera) is tried before what each drive has for itself. A parameter pays if
 its squared ratio to its deviation exceeds the price of Bayes' information criterion, and of having looked at so many;
-and if it is larger than drift. At the end all that stays is fitted to one half of the objects, and must make the rays
-of the other half meet better.
+and if it is larger than drift. Where a kind of error is proven of some drives, others have it too, but no more of it
+than drift: a spike and a slab, with the spike as wide as drift (George & McCulloch 1993). At the end all that stays is
+fitted to one half of the objects, and must make the rays of the other half meet better.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from valuemap.refine.adjust import (
 )
 from valuemap.refine.estimate import DRIFT_FACTOR, WIDE, Estimate, everything
 from valuemap.refine.footage import Footage
+from valuemap.refine.ties import tie
 from valuemap.refine.tracks import unresolved_share
 from valuemap.tables import Bools, Floats, Ints
 
@@ -47,6 +49,10 @@ _MOST_UNRESOLVED = 0.25
 """Where drives disagree about more than this share of what they see, they could not be laid onto each other."""
 _LEAST_OF_DRIVE = 3
 """A drive that sees an object less often does not share it."""
+_LEAST_OF_LEG = 3
+"""A leg that shares fewer objects is nowhere else than others, or where the drive that it goes on from is."""
+_OF_MANY = (OFFSET, MOUNT, DELAY)
+"""Kinds that each drive has for itself."""
 _LEAST_OF_PART = 2
 """A drive or camera that shares fewer objects is turned, delayed and focused as given; one tells where a leg is."""
 _PLAUSIBLE = 3.0
@@ -77,18 +83,22 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
         return None
     found = shared
     seen = footage.observe(found.detection, found.thing, footage_legs(footage, found), found.sigma_px)
+    ties = tie(footage, found.legs, seen)
+    seen = replace(seen, leg=ties.leg[seen.leg], vehicle=ties.vehicle[seen.vehicle])
     chain, things = footage.chain, len(found.class_code)
     free = _told(seen, everything(footage, found.legs))
     # What each camera has in all drives, and offsets, first; what it has in each drive where that does not do.
     active = tuple(flags if kind not in (MOUNT, DELAY) else np.zeros_like(flags) for kind, flags in enumerate(free))
-    scales = _scales(footage, found)
-    state = found.state
-    state, common = _prune(seen, chain, scales, active, state, things, ())
+    trial = _Trial(seen, chain, _scales(footage, found), things)
+    narrow = tuple(np.zeros_like(flags) for flags in free)
+    narrow[OFFSET][_objects_of(seen.leg, seen.thing, len(found.legs)) < _LEAST_OF_LEG] = True
+    state, common, narrow = trial.prune(active, narrow, found.state, ())
     of_drives = tuple(flags | (free[kind] if kind in (MOUNT, DELAY) else False) for kind, flags in enumerate(common))
-    state, active = _prune(seen, chain, scales, of_drives, state, things, (CAMERA_MOUNT, CAMERA_DELAY))
-    state, active = _prune(seen, chain, scales, active, state, things, ())
+    state, active, narrow = trial.prune(of_drives, narrow, state, (CAMERA_MOUNT, CAMERA_DELAY))
+    state, active, narrow = trial.prune(active, narrow, state, ())
     if not any(flags.any() for flags in active):
         return None
+    scales = trial.narrowed(narrow)
     problem = Adjustment(seen, chain, scales, active, things)
     state = adjust(problem, state, tolerances=_REFIT, with_variance=True)
     gain, chance, held_out = _held_out(found, seen, chain, scales, active, state)
@@ -101,8 +111,9 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
         values = np.zeros(index.shape)
         values[index >= 0] = sigma[index[index >= 0] - 3 * things]
         deviation.append(values)
-    constants = (_about_the_mean(footage, found, state.constants[OFFSET], active[OFFSET]), *state.constants[1:])
-    return Selected(replace(state, constants=constants), active, tuple(deviation), gain, chance, held_out)
+    constants, active, deviations = (ties.spread(values) for values in (state.constants, active, tuple(deviation)))
+    constants = (_about_the_mean(footage, found, constants[OFFSET], active[OFFSET]), *constants[1:])
+    return Selected(replace(state, constants=constants), active, deviations, gain, chance, held_out)
 
 
 def _about_the_mean(footage: Footage, found: Estimate, offset: Floats, active: Bools) -> Floats:
@@ -150,11 +161,16 @@ def _shared(footage: Footage, found: Estimate) -> Estimate | None:
 def _told(seen: Observations, free: tuple[Bools, ...]) -> tuple[Bools, ...]:
     """Return which of the constants enough objects tell anything of."""
     told = []
-    parts = (seen.leg, seen.drive, seen.drive, seen.camera, seen.camera, seen.camera)
+    parts = (seen.leg, seen.vehicle, seen.vehicle, seen.camera, seen.camera, seen.camera)
     for kind, (flags, of) in enumerate(zip(free, parts, strict=True)):
-        objects = np.bincount(np.unique(np.stack([of, seen.thing]), axis=1)[0], minlength=len(flags))
+        objects = _objects_of(of, seen.thing, len(flags))
         told.append(flags & (objects >= (1 if kind == OFFSET else _LEAST_OF_PART))[:, None])
     return tuple(told)
+
+
+def _objects_of(part: Ints, thing: Ints, count: int) -> Ints:
+    """Return how many objects each part sees."""
+    return np.bincount(np.unique(np.stack([part, thing]), axis=1)[0], minlength=count)
 
 
 def footage_legs(footage: Footage, found: Estimate) -> Ints:
@@ -171,7 +187,7 @@ def _scales(footage: Footage, found: Estimate) -> Scales:
         found.scales,
         drift_m=drift_m,
         drift_rad=drift_rad,
-        constant=(_offset_sigma(footage, found), *WIDE.constant[1:]),
+        constant=(_offset_sigma(footage, found)[:, None], *WIDE.constant[1:]),
     )
 
 
@@ -190,44 +206,129 @@ def _offset_sigma(footage: Footage, found: Estimate) -> Floats:
     return sigma
 
 
-def _prune(
-    seen: Observations,
-    chain: Chain,
-    scales: Scales,
-    active: tuple[Bools, ...],
-    state: State,
-    things: int,
-    fixed: tuple[int, ...],
-) -> tuple[State, tuple[Bools, ...]]:
-    """Drop whole groups of parameters of which none pays, the poorest first; then those that do not pay in the others.
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """What parameters are tried on: observations of `things` objects, and what is thought of errors a priori."""
 
-    Kinds that are `fixed` are not judged.
+    seen: Observations
+    chain: Chain
+    scales: Scales
+    things: int
+
+    def smallest(self) -> dict[int, float]:
+        """Return by kind what is no more than drift is."""
+        speed = max(float(np.median(np.linalg.norm(self.seen.forward_mps, axis=1))), 1e-9)
+        of_place, of_turn = self.scales.drift_m, self.scales.drift_rad
+        return {
+            OFFSET: of_place,
+            MOUNT: of_turn,
+            CAMERA_MOUNT: of_turn,
+            DELAY: of_place / speed,
+            CAMERA_DELAY: of_place / speed,
+            FOCAL: _LEAST_FOCAL / _BEYOND_DRIFT,
+        }
+
+    def narrowed(self, narrow: tuple[Bools, ...]) -> Scales:
+        """Return the scales with those of some parameters as narrow as drift."""
+        wide, small = self.scales.constant, self.smallest()
+        sigmas = (np.where(flags, np.minimum(small[k], wide[k]), wide[k]) for k, flags in enumerate(narrow))
+        return replace(self.scales, constant=tuple(sigmas))
+
+    def prune(
+        self, active: tuple[Bools, ...], narrow: tuple[Bools, ...], state: State, fixed: tuple[int, ...]
+    ) -> tuple[State, tuple[Bools, ...], tuple[Bools, ...]]:
+        """Drop whole groups of parameters of which none pays, the poorest first; then narrow those that do not pay.
+
+        What does not pay of a camera is dropped too. Kinds that are `fixed` are not judged.
+        """
+        while True:
+            scales = self.narrowed(narrow)
+            problem = Adjustment(self.seen, self.chain, scales, active, self.things)
+            state = adjust(problem, state, tolerances=_REFIT, with_variance=True)
+            state = _regauged(self.seen, state, active[OFFSET] & ~narrow[OFFSET])
+            worth = self._worth(problem, state, narrow)
+            groups = [
+                (kind, columns)
+                for kind, flags in enumerate(active)
+                for columns in _groups(kind)
+                if kind not in fixed and flags[:, columns].any()
+            ]
+            best = [float(np.max(worth[kind][:, columns][active[kind][:, columns]])) for kind, columns in groups]
+            if not groups:
+                return state, active, narrow
+            poorest = int(np.argmin(best))
+            changed = [flags.copy() for flags in active]
+            thin = [flags.copy() for flags in narrow]
+            if best[poorest] <= 0.0:
+                kind, columns = groups[poorest]
+                changed[kind][:, columns] = False
+            else:
+                for kind in range(len(active)):
+                    if kind in fixed:
+                        continue
+                    if kind in _OF_MANY:
+                        thin[kind] |= active[kind] & (worth[kind] <= 0.0)
+                    else:
+                        changed[kind] &= worth[kind] > 0.0
+                same = all(np.array_equal(a, b) for a, b in zip([*changed, *thin], [*active, *narrow], strict=True))
+                if same:
+                    return state, active, narrow
+            active, narrow = tuple(changed), tuple(thin)
+
+    def _worth(self, problem: Adjustment, state: State, narrow: tuple[Bools, ...]) -> list[Floats]:
+        """Return for each parameter by how much its evidence exceeds its price; below 0 where it is too small."""
+        assert state.covariance is not None
+        first = 3 * problem.things
+        price = math.log(max(len(problem.seen), 2))
+        smallest = self.smallest()
+        worth = []
+        for kind, index in enumerate(problem.column_of):
+            value = np.full(index.shape, -np.inf)
+            for columns in _groups(kind):
+                free = problem.active[kind][:, columns].all(axis=1)
+                value[np.ix_(np.flatnonzero(free), columns)] = -1.0
+                rows = np.flatnonzero(free & ~narrow[kind][:, columns].any(axis=1))
+                if not len(rows):
+                    continue
+                at = index[rows][:, columns] - first
+                theta = state.constants[kind][rows][:, columns]
+                blocks = state.covariance[at[:, :, None], at[:, None, :]]
+                shared = {MOUNT: CAMERA_MOUNT, DELAY: CAMERA_DELAY}.get(kind)
+                is_shared = kind == OFFSET or (shared is not None and problem.active[shared][:, columns].any())
+                if is_shared and len(rows) > 1:
+                    sigma = np.broadcast_to(self.scales.constant[kind], index.shape)[rows, columns[0]]
+                    mean, blocks = _against_the_mean(theta, state.covariance, at, sigma)
+                    # Offsets are against what most drives agree on, where there are any that do not move.
+                    theta = theta if kind == OFFSET and narrow[kind].any() else mean
+                square = np.einsum("ni,ni->n", theta, np.linalg.solve(blocks, theta[:, :, None])[:, :, 0])
+                evidence = square - len(columns) * price - 2.0 * math.log(len(rows))
+                size = np.linalg.norm(theta, axis=1)
+                is_fault = size > _BEYOND_DRIFT * smallest[kind]
+                is_fault &= size < _PLAUSIBLE * np.max(self.scales.constant[kind])
+                value[rows[:, None], columns] = np.where(is_fault, evidence, -1.0)[:, None]
+            worth.append(value)
+        return worth
+
+
+def _regauged(seen: Observations, state: State, active: Bools) -> State:
+    """Return the state with everything moved so that the place on which most drives agree stays.
+
+    It is the median of the offsets that are free, weighted by their observations: drives that are off do not move it.
     """
-    while True:
-        problem = Adjustment(seen, chain, scales, active, things)
-        state = adjust(problem, state, tolerances=_REFIT, with_variance=True)
-        worth = _worth(problem, state, scales)
-        groups = [
-            (kind, columns)
-            for kind, flags in enumerate(active)
-            for columns in _groups(kind)
-            if kind not in fixed and flags[:, columns].any()
-        ]
-        if not groups:
-            return state, active
-        best = [float(np.max(worth[kind][:, columns][active[kind][:, columns]])) for kind, columns in groups]
-        poorest = int(np.argmin(best))
-        changed = [flags.copy() for flags in active]
-        if best[poorest] <= 0.0:
-            kind, columns = groups[poorest]
-            changed[kind][:, columns] = False
-        else:
-            for kind, flags in enumerate(changed):
-                if kind not in fixed:
-                    flags &= worth[kind] > 0.0
-            if all(np.array_equal(a, b) for a, b in zip(changed, active, strict=True)):
-                return state, active
-        active = tuple(changed)
+    weight = np.bincount(seen.leg, minlength=len(active))
+    shift = np.zeros(3)
+    for axis in range(3):
+        rows = np.flatnonzero(active[:, axis])
+        if len(rows) < 3:
+            continue
+        value, of = state.constants[OFFSET][rows, axis], weight[rows]
+        order = np.argsort(value, kind="stable")
+        share = np.cumsum(of[order])
+        shift[axis] = value[order[np.searchsorted(share, 0.5 * share[-1])]]
+    offset = np.where(active.any(axis=0), state.constants[OFFSET] - shift, state.constants[OFFSET])
+    return replace(
+        state, constants=(offset, *state.constants[1:]), point_in_world_m=state.point_in_world_m - shift
+    )
 
 
 def _groups(kind: int) -> list[list[int]]:
@@ -235,45 +336,6 @@ def _groups(kind: int) -> list[list[int]]:
     if kind == OFFSET:
         return [[0, 1], [2]]
     return [[0], [1], [2]] if kind in (MOUNT, CAMERA_MOUNT) else [[0]]
-
-
-def _worth(problem: Adjustment, state: State, scales: Scales) -> list[Floats]:
-    """Return for each parameter by how much its evidence exceeds its price; below 0 where it is too small to matter."""
-    assert state.covariance is not None
-    first = 3 * problem.things
-    price = math.log(max(len(problem.seen), 2))
-    speed = float(np.median(np.linalg.norm(problem.seen.forward_mps, axis=1)))
-    smallest = {
-        OFFSET: _BEYOND_DRIFT * scales.drift_m,
-        MOUNT: _BEYOND_DRIFT * scales.drift_rad,
-        CAMERA_MOUNT: _BEYOND_DRIFT * scales.drift_rad,
-        DELAY: _BEYOND_DRIFT * scales.drift_m / max(speed, 1e-9),
-        CAMERA_DELAY: _BEYOND_DRIFT * scales.drift_m / max(speed, 1e-9),
-        FOCAL: _LEAST_FOCAL,
-    }
-    worth = []
-    for kind, index in enumerate(problem.column_of):
-        value = np.full(index.shape, -np.inf)
-        for columns in _groups(kind):
-            rows = np.flatnonzero(problem.active[kind][:, columns].all(axis=1))
-            if not len(rows):
-                continue
-            at = index[rows][:, columns] - first
-            theta = state.constants[kind][rows][:, columns]
-            blocks = state.covariance[at[:, :, None], at[:, None, :]]
-            shared = {MOUNT: CAMERA_MOUNT, DELAY: CAMERA_DELAY}.get(kind)
-            is_shared = kind == OFFSET or (shared is not None and problem.active[shared][:, columns].any())
-            if is_shared and len(rows) > 1:
-                sigma = np.asarray(scales.constant[kind], np.float64)
-                sigma = np.broadcast_to(sigma, (len(index),))[rows]
-                theta, blocks = _against_the_mean(theta, state.covariance, at, sigma)
-            square = np.einsum("ni,ni->n", theta, np.linalg.solve(blocks, theta[:, :, None])[:, :, 0])
-            evidence = square - len(columns) * price - 2.0 * math.log(len(rows))
-            size = np.linalg.norm(theta, axis=1)
-            is_fault = (size > smallest[kind]) & (size < _PLAUSIBLE * np.max(scales.constant[kind]))
-            value[rows[:, None], columns] = np.where(is_fault, evidence, -1.0)[:, None]
-        worth.append(value)
-    return worth
 
 
 def _against_the_mean(theta: Floats, covariance: Floats, at: Ints, sigma: Floats) -> tuple[Floats, Floats]:
