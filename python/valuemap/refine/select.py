@@ -45,7 +45,7 @@ _LEAST_FOCAL = 0.003
 _REFIT = (1.5, 1.0, 1.0, 1.0)
 _LEAST_CHANCE = 1e-3
 _LEAST_OBJECTS = 8
-_MOST_UNRESOLVED = 0.25
+_MOST_UNRESOLVED = 0.23
 """Where drives disagree about more than this share of what they see, they could not be laid onto each other."""
 _LEAST_OF_DRIVE = 3
 """A drive that sees an object less often does not share it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from valuemap.refine.adjust import Observations, State, by_object, residuals, weights
+from valuemap.refine.adjust import Observations, State, by_object, corrected, residuals, weights
 from valuemap.refine.footage import Footage, Sigmas
 from valuemap.tables import Floats, Ints
 
@@ -14,6 +14,8 @@ _ONE_M = 2.5
 _BESIDE_M = 4.0
 _TOGETHER = 0.1
 """Two objects are one only if fewer than this share of the images that see the one show both."""
+_SAME_SIDE = 0.7
+"""Cosine between mean directions of view: within 45 degrees is the same side."""
 _CLOSE2 = 16.0
 _BLOCK = 2_000_000
 
@@ -101,13 +103,19 @@ def merge_objects(seen: Observations, state: State, image: Ints, class_code: Int
 def unresolved_share(seen: Observations, state: State, class_code: Ints) -> float:
     """Return the share of the observations whose objects stand, as another sees it, beside themselves.
 
-    Two objects of one class nearer to each other than drives can be off, that no image shows together, are one that the
-    drives do not agree about.
+    Two objects of one class nearer to each other than drives can be off, seen from the same side and shown together by
+    no image, are one that the drives do not agree about. What is seen from different sides are two faces.
     """
     count = len(state.point_in_world_m)
     pairs = cKDTree(state.point_in_world_m).query_pairs(_BESIDE_M, output_type="ndarray")
     pairs = pairs[class_code[pairs[:, 0]] == class_code[pairs[:, 1]]]
     shows = [set(seen.image[rows].tolist()) for rows in _rows_of(seen.thing, count)]
+    _, center, _, _ = corrected(seen, state)
+    toward = state.point_in_world_m[seen.thing] - center
+    toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
+    side = np.stack([np.bincount(seen.thing, weights=axis, minlength=count) for axis in toward.T], axis=1)
+    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+    pairs = pairs[np.sum(side[pairs[:, 0]] * side[pairs[:, 1]], axis=1) > _SAME_SIDE]
     doubtful = np.zeros(count, np.bool_)
     for a, b in pairs.tolist():
         if len(shows[a] & shows[b]) <= _TOGETHER * min(len(shows[a]), len(shows[b])):
