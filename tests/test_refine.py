@@ -5,24 +5,28 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import valuemap
+from valuemap import pipeline
 from valuemap.cameras import camera_poses
 from valuemap.config import SimulationConfig
-from valuemap.dataset import Dataset
-from valuemap.drives import find_drives
+from valuemap.dataset import Dataset, write_dataset
+from valuemap.drives import find_drives, in_driving_order
+from valuemap.engine.threads import ThreadEngine
 from valuemap.refine import Refined, refine_poses
-from valuemap.refine.estimate import segment
-from valuemap.refine.footage import find_motion
-from valuemap.refine.jumps import Legs, find_jumps
-from valuemap.refine.landmarks import Landmarks, keyframes
+from valuemap.refine.estimate import mounts_alone, segment
+from valuemap.refine.footage import find_motion, gather, in_working_frame
+from valuemap.refine.jumps import Legs, find_hints, find_jumps
+from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
 from valuemap.refine.register import register
 from valuemap.simulate import simulate
 from valuemap.tables import Floats, Ints
+from valuemap.tiles.work import open_work
 
 CITY = SimulationConfig(
     streets_north_south=2,
@@ -39,10 +43,17 @@ def city(**faults: float) -> Dataset:
 
 
 @functools.cache
-def shifted_city() -> tuple[Dataset, Refined]:
-    """Return a city with every pass shifted by 3 m, and what is made of it."""
+def map_of_shifted_city() -> tuple[Dataset, valuemap.Map]:
+    """Return a city with every pass shifted by 3 m, and its map."""
     faulty = city(pass_shift_m=3.0)
-    return faulty, refine_poses(faulty, valuemap.MapConfig())
+    return faulty, valuemap.build_map(faulty)
+
+
+def shifted_city() -> tuple[Dataset, Refined]:
+    """Return a city with every pass shifted by 3 m, and what is made of its poses when it is mapped."""
+    faulty, result = map_of_shifted_city()
+    assert result.corrected is not None
+    return faulty, Refined(result.corrected, result.run["poses"], is_corrected=True)
 
 
 def errors(dataset: Dataset, clean: Dataset) -> tuple[float, float]:
@@ -73,6 +84,70 @@ def test_shifts_of_passes_of_three_metres_are_found_to_three_decimetres() -> Non
     moved = camera_poses(refined.dataset.images)[1] - camera_poses(faulty.images)[1]
     mean = np.stack([np.bincount(drive, weights=axis) / np.bincount(drive) for axis in moved.T], axis=1)
     assert np.abs(mean.mean(axis=0)).max() < 0.3
+
+
+def test_what_drives_are_off_by_is_found_before_their_objects_are() -> None:
+    faulty, result = map_of_shifted_city()
+    as_it_is = valuemap.build_map(faulty, valuemap.MapConfig(correct_poses=0))
+    assert as_it_is.corrected is None
+    assert as_it_is.run["poses"] == {"found": "nothing", "because": "correct_poses is 0"}
+    with_poses, without = (valuemap.evaluate_map(m, faulty, radius_m=4.0) for m in (result, as_it_is))
+    assert with_poses.precision > 0.95
+    assert without.precision < 0.9
+
+
+def test_short_drives_have_the_offset_of_the_one_they_go_on_from() -> None:
+    clean, (faulty, refined) = city(), shifted_city()
+    drives = find_drives(faulty.images)
+    short = np.bincount(drives.pass_code) < 20
+    assert short.any()
+    off = (camera_poses(refined.dataset.images)[1] - camera_poses(clean.images)[1])[:, :2]
+    off = off - off.mean(axis=0)
+    assert np.linalg.norm(off[short[drives.pass_code]], axis=1).max() < 0.6
+
+
+def test_cells_on_disk_get_the_poses_that_were_corrected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    faulty, result = map_of_shifted_city()
+    write_dataset(faulty, tmp_path / "data")
+    monkeypatch.setattr(pipeline, "refine_poses", lambda *_, **__: shifted_city()[1])
+    (tmp_path / "work").mkdir()
+    run = pipeline.Run(tmp_path / "work", ThreadEngine(1), tile_size_m=150.0)
+    with open_work(tmp_path / "work", resume=False) as work:
+        tiled, _ = pipeline.build_map_of_folder(
+            tmp_path / "data", valuemap.MapConfig(), dataclasses.replace(run, work=work)
+        )
+    assert tiled.run["poses"] == result.run["poses"]
+    assert np.array_equal(tiled.labels.position_in_world_m, result.labels.position_in_world_m)
+
+
+def test_what_is_too_large_to_be_looked_at_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_dataset(simulate(dataclasses.replace(CITY, passes_per_street=1), seed=1), tmp_path / "data")
+    monkeypatch.setattr(pipeline, "LARGEST_IN_MEMORY", 100)
+    with open_work(tmp_path / "work", resume=False) as work:
+        run = pipeline.Run(work, ThreadEngine(1))
+        result, _ = pipeline.build_map_of_folder(tmp_path / "data", valuemap.MapConfig(), run)
+    assert "larger than memory" in result.run["poses"]["because"]
+    assert "poses" in result.run["notes"][0]
+
+
+def test_drives_alone_tell_how_their_cameras_are_turned() -> None:
+    for settings in ({}, {"pass_yaw_deg": 1.0}):
+        clean, faulty = city(), city(**settings)
+        drives = find_drives(faulty.images, viewpoint_step_m=1.0)
+        ordered = in_driving_order(faulty, viewpoint_step_m=1.0)
+        footage = gather(*in_working_frame(ordered.dataset, ordered.drives, 1.0))
+        marks = find_landmarks(
+            footage.dataset, footage.rays, footage.drives, footage.drives.pass_code, valuemap.MapConfig()
+        )
+        turned = np.degrees(mounts_alone(footage, marks))
+        if not settings:
+            assert np.all(turned == 0.0)
+            continue
+        rotations = [camera_poses(d.images)[0] for d in (faulty, clean)]
+        turn = Rotation.from_matrix(np.einsum("nij,nkj->nik", *rotations)).as_rotvec(degrees=True)[:, 1]
+        true = np.array([turn[drives.pass_code == drive].mean() for drive in range(drives.count)])
+        long = np.bincount(drives.pass_code) > 100
+        assert np.abs(turned[long, 1] + true[long]).max() < 0.5
 
 
 def test_cameras_mounted_askew_are_turned_back() -> None:
@@ -111,6 +186,38 @@ def test_constellations_tell_how_drives_lie_to_each_other() -> None:
     total = found.shift_m.reshape(6, 20, 3) + shift[:, None]
     assert np.abs(total - total.mean(axis=(0, 1))).max() < 1.0
     assert len(np.unique(found.object_of_landmark)) == 20
+
+
+def test_two_vague_landmarks_that_another_shift_fits_make_no_jump() -> None:
+    random = np.random.default_rng(4)
+    objects = np.column_stack([np.arange(14) * 20.0, random.uniform(-8.0, 8.0, 14), np.full(14, 5.0)])
+    drive = np.repeat([0, 1], 14)
+    away = np.array([4.0, 4.0, 0.0])
+    for count, sigma_m in ((2, 1.0), (6, 0.3)):
+        points = np.concatenate([objects, objects])
+        points[28 - count :] += away
+        covariance = np.tile(0.3**2 * np.eye(3), (28, 1, 1))
+        covariance[28 - count :] = sigma_m**2 * np.eye(3)
+        shift = register(landmarks(points, drive=drive, driven_m=points[:, 0]), covariance).shift_m
+        expected = np.zeros(3) if count == 2 else -away
+        assert np.abs(shift[28 - count :] - shift[14] - expected).max() <= 0.5
+
+
+def test_a_trajectory_speaks_for_a_jump_where_a_step_is_unlike_the_others() -> None:
+    plain, jumping = city(), city(jump_m=1.0, jumps_per_km=10.0)
+    drives = find_drives(plain.images)
+    hints = find_hints(jumping, find_drives(jumping.images))
+    off = camera_poses(jumping.images)[1] - camera_poses(plain.images)[1]
+    true, false = [], []
+    for drive in range(drives.count):
+        rows = np.flatnonzero(drives.pass_code == drive)
+        rows = rows[np.argsort(drives.order[rows])]
+        jumps = np.append(False, np.linalg.norm(np.diff(off[rows], axis=0), axis=1) > 0.5)
+        speaks = hints.between(drive, drives.order[rows])
+        true += speaks[jumps].tolist()
+        false += speaks[~jumps].tolist()
+    assert np.mean(np.array(true) > 8.0) > 0.6
+    assert np.mean(np.array(false) > 8.0) < 0.05
 
 
 def test_constellations_that_agree_are_not_moved_and_classes_are_kept_apart() -> None:

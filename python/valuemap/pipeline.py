@@ -39,6 +39,11 @@ from valuemap.vote import vote_in_clusters
 
 LARGEST_IN_MEMORY = 2_000_000
 """Datasets with more images and detections are cut into pieces on disk: about 2 GB."""
+_TOO_LARGE = "larger than memory: poses were taken as they are"
+_NOTE_ON_SIZE = (
+    "the dataset is larger than what poses are looked at of: they were taken as they are (map a part of it to learn "
+    "what whole drives are off by; correct_poses=0 says that this is known)"
+)
 CORRECTED = "corrected"
 """Where in the folder of work a dataset is kept whose poses were corrected."""
 
@@ -85,7 +90,10 @@ def build_map(
         labels, votes, counts, _ = _robust(source, config, stages, ThreadEngine(threads), progress)
     size = {"images": len(dataset.images), "detections": len(dataset.detections)}
     passes = len(np.unique(dataset.images.pass_id.codes))
-    result = _as_map(dataset.name, dataset.frame, size, passes, config, labels, votes, counts, stages, refined)
+    poses = None if refined is None else refined.record
+    result = _as_map(dataset.name, dataset.frame, size, passes, config, labels, votes, counts, stages, poses)
+    if refined is not None and refined.is_corrected:
+        result = replace(result, corrected=refined.dataset)
     return _with_note(result, _note_on_poses(dataset))
 
 
@@ -135,7 +143,8 @@ def build_map_of_folder(
     """
     images, detections = rows_on_disk(folder)
     stages = _Stages()
-    refined = None
+    refined: Refined | None = None
+    note: str | None = None
     threads = run.engine.threads_of_task(1)
     is_large = run.tile_size_m is not None or run.engine.needs_paths or images + detections > LARGEST_IN_MEMORY
     if config.method == "paper" or not is_large:
@@ -156,11 +165,16 @@ def build_map_of_folder(
                 write_dataset(refined.dataset, folder)
         with stages.measured("partition"):
             on_disk = partition_dataset(folder, run.work, config, tile_size_m=run.tile_size_m, progress=progress)
-        source, name, frame, size, note = on_disk, on_disk.name, on_disk.frame, on_disk.counts, None
+        source, name, frame, size = on_disk, on_disk.name, on_disk.frame, on_disk.counts
+        is_skipped = refined is None and config.poses.correct_poses
+        note = _NOTE_ON_SIZE if is_skipped else None
         _check_detections(name, size["detections"])
     labels, votes, counts, cells = _robust(source, config, stages, run.engine, progress, run)
     passes = source.drives_record["passes"]
-    result = _as_map(name, frame, size, passes, config, labels, votes, counts, stages, refined)
+    poses = {"found": "nothing", "because": _TOO_LARGE} if refined is None else refined.record
+    result = _as_map(name, frame, size, passes, config, labels, votes, counts, stages, poses)
+    if refined is not None and refined.is_corrected:
+        result = replace(result, corrected=refined.dataset)
     return _with_note(result, note), cells
 
 
@@ -196,16 +210,13 @@ def _as_map(
     votes: Votes,
     counts: dict[str, Any],
     stages: _Stages,
-    refined: Refined | None,
+    poses: dict[str, Any] | None,
 ) -> Map:
     without = size["detections"] - len(votes)
     counts = {**size, "detections_without_label": without, **counts, "labels": len(labels)}
     notes = find_notes(Findings(passes, config, labels, votes, counts))
     record = {**_record(name, config, counts, stages), "notes": notes}
-    if refined is None:
-        return Map(frame, labels, votes, record)
-    corrected = refined.dataset if refined.is_corrected else None
-    return Map(frame, labels, votes, {**record, "poses": refined.record}, corrected)
+    return Map(frame, labels, votes, record if poses is None else {**record, "poses": poses})
 
 
 def _paper(

@@ -115,6 +115,19 @@ class NoiseConfig(Settings):
 
 
 @dataclass(frozen=True, config=CHECKED)
+class PosesConfig(Settings):
+    """Whether poses are corrected before objects are looked for."""
+
+    correct_poses: int = declare(
+        1,
+        unit="0 or 1",
+        high=1,
+        effect="0 takes poses and cameras as they are; 1 corrects what whole drives are proven to be off by",
+        method="robust",
+    )
+
+
+@dataclass(frozen=True, config=CHECKED)
 class ExistenceConfig(Settings):
     """Which labels are kept."""
 
@@ -150,6 +163,7 @@ class MapConfig:
     noise: NoiseConfig = NoiseConfig()
     existence: ExistenceConfig = ExistenceConfig()
     merge: MergeConfig = MergeConfig()
+    poses: PosesConfig = PosesConfig()
 
     def __init__(
         self,
@@ -159,10 +173,12 @@ class MapConfig:
         noise: NoiseConfig = noise,
         existence: ExistenceConfig = existence,
         merge: MergeConfig = merge,
+        poses: PosesConfig = poses,
         **settings: float | None,
     ) -> None:
         stages: dict[str, Any] = {
             "partition": partition, "vote": vote, "noise": noise, "existence": existence, "merge": merge,
+            "poses": poses,
         }  # fmt: skip
         for name, value in settings.items():
             stage = owner_of(name, stages, name)

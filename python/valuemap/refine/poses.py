@@ -62,6 +62,8 @@ def refine_poses(dataset: Dataset, config: MapConfig, *, threads: int = 0, progr
     Refined
         Where nothing is proven, the dataset is the one that was given.
     """
+    if not config.poses.correct_poses:
+        return Refined(dataset, {"found": "nothing", "because": "correct_poses is 0"})
     if len(dataset.detections) < _LEAST_DETECTIONS:
         return Refined(dataset, {"found": "nothing", "because": "few detections"})
     unit_m = config.vote.max_range_m / USUAL_RANGE_M

@@ -326,9 +326,7 @@ def _regauged(seen: Observations, state: State, active: Bools) -> State:
         share = np.cumsum(of[order])
         shift[axis] = value[order[np.searchsorted(share, 0.5 * share[-1])]]
     offset = np.where(active.any(axis=0), state.constants[OFFSET] - shift, state.constants[OFFSET])
-    return replace(
-        state, constants=(offset, *state.constants[1:]), point_in_world_m=state.point_in_world_m - shift
-    )
+    return replace(state, constants=(offset, *state.constants[1:]), point_in_world_m=state.point_in_world_m - shift)
 
 
 def _groups(kind: int) -> list[list[int]]:
