@@ -286,7 +286,7 @@ class _Trial:
             value = np.full(index.shape, -np.inf)
             for columns in _groups(kind):
                 free = problem.active[kind][:, columns].all(axis=1)
-                value[np.ix_(np.flatnonzero(free), columns)] = -1.0
+                value[np.flatnonzero(free)[:, None], columns] = -1.0
                 rows = np.flatnonzero(free & ~narrow[kind][:, columns].any(axis=1))
                 if not len(rows):
                     continue

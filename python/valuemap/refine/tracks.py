@@ -112,9 +112,9 @@ def unresolved_share(seen: Observations, state: State, class_code: Ints) -> floa
     shows = [set(seen.image[rows].tolist()) for rows in _rows_of(seen.thing, count)]
     _, center, _, _ = corrected(seen, state)
     toward = state.point_in_world_m[seen.thing] - center
-    toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
+    toward = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
     side = np.stack([np.bincount(seen.thing, weights=axis, minlength=count) for axis in toward.T], axis=1)
-    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+    side = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
     pairs = pairs[np.sum(side[pairs[:, 0]] * side[pairs[:, 1]], axis=1) > _SAME_SIDE]
     doubtful = np.zeros(count, np.bool_)
     for a, b in pairs.tolist():
