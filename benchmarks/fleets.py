@@ -88,7 +88,7 @@ def main() -> None:
         outcomes = clean if name == CLEAN else [map_city(faulty, seed, config) for seed in seeds]
         results.append({"name": name, **add_up(outcomes, clean)})
         print(_line(results[-1]), flush=True)
-    write_record(options.json, results)
+        write_record(options.json, results)
 
 
 def map_city(simulation: SimulationConfig, seed: int, config: valuemap.MapConfig) -> Outcome:
