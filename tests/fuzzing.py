@@ -430,11 +430,11 @@ def _border_of_scene(
 ) -> None:
     cameras = random.randrange(1, 3)
     scene = call(
-        _core.Scene, made, box_px=floats(count), range_m=floats(count), range_sigma_m=floats(count),
-        center_in_world_m=floats(images, 3), cam_from_world=floats(images, 3, 3), camera=indices(images, cameras),
-        pass_code=indices(images, 2), viewpoint=indices(images, 3), driven_m=floats(images),
-        position_sigma_m=floats(images), rotation_sigma_rad=floats(images), frustum_normals=floats(cameras, 4, 3),
-        solid_angle_sr=floats(cameras),
+        _core.Scene, made, box_px=floats(count), score=floats(count), range_m=floats(count),
+        range_sigma_m=floats(count), center_in_world_m=floats(images, 3), cam_from_world=floats(images, 3, 3),
+        camera=indices(images, cameras), pass_code=indices(images, 2), viewpoint=indices(images, 3),
+        driven_m=floats(images), position_sigma_m=floats(images), rotation_sigma_rad=floats(images),
+        frustum_normals=floats(cameras, 4, 3), solid_angle_sr=floats(cameras),
     )  # fmt: skip
     if scene is None:
         return
@@ -442,13 +442,17 @@ def _border_of_scene(
     settings = (
         random.choice([0.02, 0.0, -1.0, float("nan")]), random.choice([1.0, 0.0, float("nan"), -1e308]),
         random.choice([80.0, 0.0, float("inf"), float("nan")]), random.choice([3.0, 0.0, float("nan"), 1e308]),
-        random.choice([2, 0, 2**31]), random.choice([0.5, float("nan"), 2.0, -1.0]), False, False,
+        random.choice([2, 0, 2**31]), random.choice([1, 0, 2**31]), random.choice([0.5, float("nan"), 2.0, -1.0]),
+        False, False,
     )  # fmt: skip
     which, quiet = random.randrange(3), lambda *_: None
     if which == 0:
-        call(_core.find_labels, scene, noise, settings, 1, quiet)
+        numbers = random.choice([120, 0, 3])
+        row = [float(hostile_number(random)) if random.random() < 0.2 else 0.5 for _ in range(numbers)]
+        classes = [random.choice([None, row, [1.0]]) for _ in range(random.randrange(3))]
+        call(_core.find_labels, scene, (noise, random.random() < 0.5, classes, row), settings, 1, quiet)
     elif which == 1:
-        call(_core.calibrate_noise, scene, noise, [random.random() < 0.5 for _ in range(3)], settings, 1, quiet)
+        call(_core.calibrate, scene, noise, [random.random() < 0.5 for _ in range(3)], settings, 1, quiet)
     else:
         call(_core.objects_of, scene, noise, settings, points, offsets, voters, random.random() < 0.5, 1, quiet)
 

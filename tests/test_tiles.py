@@ -25,7 +25,8 @@ from valuemap.errors import OutputError
 from valuemap.map_folder import Map
 from valuemap.portions import DatasetReader
 from valuemap.progress import silent
-from valuemap.robust import Noise, find_labels
+from valuemap.robust import Noise, Scene, calibrate, find_labels
+from valuemap.sightings import cast_sightings
 from valuemap.simulate import simulate
 from valuemap.tables import Candidates, Categories, Floats, Labels, Votes, table_to_arrow
 from valuemap.tiles import fleet, places
@@ -524,9 +525,12 @@ def mapped_or_raises(dataset: Path, out: Path, *options: str) -> None:
 def test_what_was_made_with_other_settings_is_not_taken(long_street: Path, tmp_path: Path) -> None:
     with open_work(tmp_path / "work", resume=False) as work:
         source = InMemory(valuemap.read_dataset(long_street), KNOWN)
-        first = solve_cells(source, Noise(), KNOWN, ThreadEngine(1), silent, store=work / "cells")
-        again = solve_cells(source, Noise(), KNOWN, ThreadEngine(2), silent, store=work / "cells")
-        other = solve_cells(source, Noise(detection_px=3.0), KNOWN, ThreadEngine(2), silent, store=work / "cells")
+        sample = source.sample()
+        known = calibrate(Scene(sample.dataset, sample.drives, cast_sightings(sample.dataset)[0]), KNOWN)
+        noisy = replace(known, noise=Noise(detection_px=3.0))
+        first = solve_cells(source, known, KNOWN, ThreadEngine(1), silent, store=work / "cells")
+        again = solve_cells(source, known, KNOWN, ThreadEngine(2), silent, store=work / "cells")
+        other = solve_cells(source, noisy, KNOWN, ThreadEngine(2), silent, store=work / "cells")
     assert first == again
     assert not set(map(str, first)) & set(map(str, other))
 

@@ -1,6 +1,6 @@
 """The numeric core (Rust): arrays in, arrays out; float64, C order, world frame, metres, radians and pixels."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,18 +75,20 @@ class Scene:
     ) -> None: ...
 
 _Noise = tuple[float, ...]
-_Settings = tuple[float, float, float, float, int, float, bool, bool]
+_Settings = tuple[float, float, float, float, int, int, float, bool, bool]
 
-def calibrate_noise(
+_Calibration = tuple[_Noise, bool, Sequence[Sequence[float] | None], Sequence[float]]
+
+def calibrate(
     scene: Scene,
     guess: _Noise,
     known: list[bool],
     settings: _Settings,
     threads: int,
     progress: Callable[[int, int], None],
-) -> _Noise: ...
+) -> _Calibration: ...
 def find_labels(
-    scene: Scene, noise: _Noise, settings: _Settings, threads: int, progress: Callable[[int, int], None]
+    scene: Scene, calibration: _Calibration, settings: _Settings, threads: int, progress: Callable[[int, int], None]
 ) -> tuple[_Floats, tuple[_Offsets, _Indices], _Floats, _Floats, _Offsets, dict[str, float]]: ...
 def objects_of(
     scene: Scene,

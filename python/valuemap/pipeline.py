@@ -257,7 +257,7 @@ def _robust(
     with stages.measured("join"):
         labels, votes, counts = join_cells(loaded(solved), source.grid, config)
     estimated = calibration_to_json(calibration)
-    counts = {**counts, "drives": source.drives_record, "noise": estimated, "calibration": estimated}
+    counts = {**counts, "drives": source.drives_record, "noise": estimated["noise"], "calibration": estimated}
     return labels, votes, counts, [result for result in solved if isinstance(result, Path)]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -44,21 +45,48 @@ class Noise:
         return astuple(self)
 
 
-Calibration = Noise
-"""All that is estimated once of a dataset, before any part of it is mapped: plain numbers, for JSON."""
+@dataclass(frozen=True)
+class Calibration:
+    """All that is estimated once of a dataset, before any part of it is mapped."""
+
+    noise: Noise
+    is_deep: bool
+    """Whether all moves of the search pay."""
+    classes: dict[str, tuple[float, ...]]
+    """What is learned of each class of the sample, by its name: the numbers of the core's `ClassModel::to_row`."""
+    pooled: tuple[float, ...]
+    """What is learned of all classes together: what others are like."""
+
+    def as_tuple(self, class_names: Sequence[str]) -> tuple[Any, ...]:
+        """Return it as the core takes it, for classes in this order."""
+        return self.noise.as_tuple(), self.is_deep, [self.classes.get(name) for name in class_names], self.pooled
 
 
 def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
-    """Return a calibration as an object of JSON."""
-    return asdict(calibration)
+    """Return a calibration as an object of JSON; numbers that are not finite are null."""
+    classes = {name: _finite(row) for name, row in calibration.classes.items()}
+    return {**asdict(calibration), "classes": classes, "pooled": _finite(calibration.pooled)}
 
 
 def calibration_from_json(value: Any, *, source: str) -> Calibration:
     """Read what `calibration_to_json` returned; raises `InputError` naming the `source` where it is something else."""
     try:
-        return Calibration(**{name: float(number) for name, number in value.items()})
-    except (TypeError, ValueError, AttributeError) as error:
+        return Calibration(
+            noise=Noise(**{name: float(number) for name, number in value["noise"].items()}),
+            is_deep=bool(value["is_deep"]),
+            classes={name: _numbers(row) for name, row in value["classes"].items()},
+            pooled=_numbers(value["pooled"]),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{source}: is no calibration: {error}", hint="make the map again") from error
+
+
+def _finite(row: Sequence[float]) -> list[float | None]:
+    return [number if math.isfinite(number) else None for number in row]
+
+
+def _numbers(row: Sequence[float | None]) -> tuple[float, ...]:
+    return tuple(math.nan if number is None else float(number) for number in row)
 
 
 class Scene:
@@ -68,6 +96,11 @@ class Scene:
         self._dataset = dataset
         self._drives = drives
         self._rays = rays
+
+    @property
+    def class_names(self) -> Sequence[str]:
+        """The names of the classes, by code."""
+        return self._dataset.detections.class_name.names
 
     @cached_property
     def core(self) -> _core.Scene:
@@ -94,12 +127,13 @@ class Scene:
         )
 
 
-def calibrate_noise(scene: Scene, config: MapConfig, *, threads: int = 0, progress: Progress = silent) -> Calibration:
-    """Estimate the noise from the residuals of labels in a sample of places; what the config sets stays as it is."""
+def calibrate(scene: Scene, config: MapConfig, *, threads: int = 0, progress: Progress = silent) -> Calibration:
+    """Estimate the noise from the residuals of labels in a sample of places, and learn what its classes are like.
+
+    What the config sets of the noise stays as it is.
+    """
     guess, known = _guess(config.noise)
-    if all(known):
-        return guess
-    estimated = _core.calibrate_noise(
+    noise, is_deep, classes, pooled = _core.calibrate(
         scene.core,
         guess.as_tuple(),
         known,
@@ -107,8 +141,13 @@ def calibrate_noise(scene: Scene, config: MapConfig, *, threads: int = 0, progre
         threads,
         lambda done, total: progress("estimating the noise", done, total),
     )
-    noise = Noise(*estimated)
-    return _all_own(noise) if "shared_noise" in LEFT_OUT else noise
+    estimated = Noise(*noise)
+    return Calibration(
+        noise=_all_own(estimated) if "shared_noise" in LEFT_OUT and not all(known) else estimated,
+        is_deep=is_deep,
+        classes={name: tuple(row) for name, row in zip(scene.class_names, classes, strict=False) if row is not None},
+        pooled=tuple(pooled),
+    )
 
 
 _COUNTED_AS = {"recall": "detection_rate", "recall_concentration": "detection_rate_concentration"}
@@ -116,12 +155,12 @@ _COUNTED_AS = {"recall": "detection_rate", "recall_concentration": "detection_ra
 
 
 def find_labels(
-    scene: Scene, noise: Calibration, config: MapConfig, *, threads: int = 0, progress: Progress = silent
+    scene: Scene, calibration: Calibration, config: MapConfig, *, threads: int = 0, progress: Progress = silent
 ) -> tuple[Candidates, dict[str, Any]]:
     """Return the labels, ordered by first detection, and counts of what was found and rejected."""
     position, (offsets, voters), covariance, existence, expected, counts = _core.find_labels(
         scene.core,
-        noise.as_tuple(),
+        calibration.as_tuple(scene.class_names),
         _settings(config),
         threads,
         lambda done, total: progress("finding labels", min(done, total), total),
@@ -158,7 +197,7 @@ def _guess(config: NoiseConfig) -> tuple[Noise, list[bool]]:
     return noise, [value is not None for value in known]
 
 
-def _settings(config: MapConfig) -> tuple[float, float, float, float, int, float, bool, bool]:
+def _settings(config: MapConfig) -> tuple[float, float, float, float, int, int, float, bool, bool]:
     vote = config.vote
     return (
         math.radians(vote.min_parallax_deg),
@@ -166,6 +205,7 @@ def _settings(config: MapConfig) -> tuple[float, float, float, float, int, float
         vote.max_range_m,
         config.noise.gate_sigmas,
         vote.min_votes,
+        config.existence.least_votes,
         config.existence.min_existence,
         "polish" in LEFT_OUT,
         "merge" in LEFT_OUT,

@@ -92,7 +92,7 @@ impl<'a> World<'a> {
             begun.iter().filter_map(one).collect()
         };
         let objects = of(&model, begun);
-        learn(&mut model, &scene.usable_rays(), &objects);
+        learn(&mut model, &lookout, &scene.usable_rays(), &objects);
         let objects = of(&model, begun);
         Self { model, lookout, objects }
     }
@@ -135,8 +135,8 @@ proptest! {
         let found = searched(&scene, Vec::new());
         prop_assert!(!found.is_empty());
         let mut model = Model::new(&scene, &DRIFTING, &SETTINGS);
-        learn(&mut model, &scene.usable_rays(), &found);
         let lookout = Lookout::new(&scene, SETTINGS.viability.max_range_m);
+        learn(&mut model, &lookout, &scene.usable_rays(), &found);
         for one in found {
             let again = object_of(&model, &lookout, one.votes, one.fit.point, one.others).unwrap();
             prop_assert!((again.energy - one.energy).abs() < 1e-6 * one.energy.abs(), "{} {}", again.energy, one.energy);
@@ -233,7 +233,7 @@ proptest! {
             let rays: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
             let begun = vec![(votes.clone(), at)];
             let found =
-                search(&mut model, &rays, begun, depth, &mut Tally::default(), &Progress::default()).unwrap();
+                search(&mut model, &rays, begun, depth, true, &mut Tally::default(), &Progress::default()).unwrap();
             prop_assert!(found.iter().all(|one| (one.fit.point - at).norm() > 1.0), "{depth:?}: {:?}", found.iter().map(|o| (o.energy, o.votes.len(), o.real)).collect::<Vec<_>>());
         }
     }

@@ -10,9 +10,10 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use valuemap_core::hypothesis::Viability;
 use valuemap_core::robust::calibrate::Known;
+use valuemap_core::robust::model::ClassModel;
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::scene::{Frustum, Scene as CoreScene, View};
-use valuemap_core::robust::{Findings, Settings, Without, find, self_calibrate};
+use valuemap_core::robust::{Calibration, Findings, Settings, Without, find, self_calibrate};
 
 use crate::Rays;
 use crate::arrays::{Groups, check_finite, check_length, check_not_infinite, matrices_of, matrix, rays_in, rows_of};
@@ -149,11 +150,11 @@ fn noise_of(values: NoiseValues) -> PyResult<Noise> {
     })
 }
 
-/// Least parallax (rad), least and largest range (m), gate (sigmas), least votes, least existence; without polish, merge.
-type SettingValues = (f64, f64, f64, f64, u32, f64, bool, bool);
+/// Least parallax (rad), least and largest range (m), gate (sigmas), least votes without and with heights, least existence; without polish, merge.
+type SettingValues = (f64, f64, f64, f64, u32, u32, f64, bool, bool);
 
 fn settings_of(
-    (min_parallax_rad, min_range_m, max_range_m, gate_sigmas, min_votes, min_existence, polish, merge): SettingValues,
+    (min_parallax_rad, min_range_m, max_range_m, gate_sigmas, min_votes, least_votes, min_existence, polish, merge): SettingValues,
 ) -> PyResult<Settings> {
     check_finite("settings", &[min_parallax_rad, min_range_m, max_range_m, gate_sigmas, min_existence])?;
     if gate_sigmas <= 0.0 || min_range_m < 0.0 || max_range_m <= min_range_m {
@@ -162,12 +163,29 @@ fn settings_of(
         ));
     }
     let viability = Viability { max_reprojection_error_px: f64::NAN, min_parallax_rad, min_range_m, max_range_m };
-    Ok(Settings { viability, gate_sigmas, min_votes, min_existence, without: Without { polish, merge } })
+    Ok(Settings { viability, gate_sigmas, min_votes, least_votes, min_existence, without: Without { polish, merge } })
 }
 
-/// Estimate the noise from the data, `valuemap_core::robust::self_calibrate`.
+/// A calibration: the noise, whether all moves pay, numbers of each class where anything is known of it, and those of all classes together.
+type CalibrationValues = (NoiseValues, bool, Vec<Option<Vec<f64>>>, Vec<f64>);
+
+fn calibration_of((noise, is_deep, classes, pooled): CalibrationValues) -> PyResult<Calibration> {
+    let of = |row: Vec<f64>| {
+        ClassModel::from_row(&row).ok_or_else(|| {
+            PyValueError::new_err("calibration: expected as many numbers of a class as calibrate returns")
+        })
+    };
+    Ok(Calibration {
+        noise: noise_of(noise)?,
+        is_deep,
+        classes: classes.into_iter().map(|row| row.map(of).transpose()).collect::<PyResult<_>>()?,
+        pooled: of(pooled)?,
+    })
+}
+
+/// Estimate the noise from the data and learn the classes, `valuemap_core::robust::self_calibrate`.
 #[pyfunction]
-pub fn calibrate_noise(
+pub fn calibrate(
     py: Python<'_>,
     scene: &Scene,
     guess: NoiseValues,
@@ -175,14 +193,15 @@ pub fn calibrate_noise(
     settings: SettingValues,
     threads: usize,
     progress: &Bound<'_, PyAny>,
-) -> PyResult<NoiseValues> {
+) -> PyResult<CalibrationValues> {
     let settings = settings_of(settings)?;
     let guess = noise_of(guess)?;
     let known = Known { detection: known[0], position: known[1], rotation: known[2] };
-    let noise = with_progress(py, threads, 0, progress, |progress| {
+    let found = with_progress(py, threads, 0, progress, |progress| {
         self_calibrate(&scene.0, &guess, known, &settings, progress)
     })?;
-    Ok([
+    let noise = &found.noise;
+    let noise = [
         noise.detection_px,
         noise.box_share,
         noise.position_m,
@@ -191,7 +210,9 @@ pub fn calibrate_noise(
         noise.rotation_leg_rad,
         noise.position_drift_m,
         noise.rotation_drift_rad,
-    ])
+    ];
+    let classes = found.classes.iter().map(|class| class.as_ref().map(ClassModel::to_row)).collect();
+    Ok((noise, found.is_deep, classes, found.pooled.to_row()))
 }
 
 /// Positions, voters, covariances (N, 9), existence, expected images, and counts.
@@ -204,20 +225,20 @@ type Found<'py> = (
     Bound<'py, PyDict>,
 );
 
-/// Find labels with a known noise, `valuemap_core::robust::find`.
+/// Find labels with what is estimated once, `valuemap_core::robust::find`.
 #[pyfunction]
 pub fn find_labels<'py>(
     py: Python<'py>,
     scene: &Scene,
-    noise: NoiseValues,
+    calibration: CalibrationValues,
     settings: SettingValues,
     threads: usize,
     progress: &Bound<'py, PyAny>,
 ) -> PyResult<Found<'py>> {
     let settings = settings_of(settings)?;
-    let noise = noise_of(noise)?;
+    let calibration = calibration_of(calibration)?;
     let found = with_progress(py, threads, scene.0.views.len(), progress, |progress| {
-        find(&scene.0, &noise, &settings, progress)
+        find(&scene.0, &calibration, &settings, progress)
     })?;
     let labels = || found.findings.iter();
     let mut offsets = vec![0_i64];

@@ -138,6 +138,15 @@ class ExistenceConfig(Settings):
         effect="labels that exist with a smaller probability are dropped",
         method="robust",
     )
+    least_votes: int = declare(
+        1,
+        unit="images",
+        low=1,
+        high=10**6,
+        effect="where the heights and sizes of a class are known from others of the map, a label needs votes from "
+        "no more than this many images",
+        method="robust",
+    )
 
 
 @dataclass(frozen=True, config=CHECKED)

@@ -11,7 +11,8 @@ from valuemap.engine.engine import Engine
 from valuemap.errors import InputError
 from valuemap.map_folder import CALIBRATION, read_json
 from valuemap.progress import Progress
-from valuemap.robust import Calibration, Scene, calibrate_noise, calibration_from_json, calibration_to_json
+from valuemap.robust import Calibration, Scene, calibration_from_json, calibration_to_json
+from valuemap.robust import calibrate as calibrate_scene
 from valuemap.sightings import cast_sightings
 from valuemap.tiles.grid import WHOLE
 from valuemap.tiles.source import Source
@@ -54,4 +55,4 @@ def read_calibration(path: Path) -> Calibration:
 
 def _estimated(sample: InOrder, config: MapConfig, engine: Engine, progress: Progress) -> Calibration:
     scene = Scene(sample.dataset, sample.drives, cast_sightings(sample.dataset)[0])
-    return calibrate_noise(scene, config, threads=engine.threads_of_task(1), progress=progress)
+    return calibrate_scene(scene, config, threads=engine.threads_of_task(1), progress=progress)

@@ -62,7 +62,7 @@ def join_cells(solved: Sequence[Solved], grid: Grid, config: MapConfig) -> tuple
         label_of_vote=votes.label_id - 1 + np.repeat(before, [len(cell.votes) for cell in solved]),
         detection_id=votes.detection_id,
     )
-    is_kept, has_vote, counts = _decide(rows, config.vote.min_votes)
+    is_kept, has_vote, counts = _decide(rows, min(config.vote.min_votes, config.existence.least_votes))
     vote_pass = np.concatenate([cell.vote_pass for cell in solved])
     has_vote &= is_kept[rows.label_of_vote]
     lost = np.bincount(rows.label_of_vote[~has_vote], minlength=len(labels)) > 0

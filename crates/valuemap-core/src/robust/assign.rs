@@ -234,7 +234,7 @@ pub fn claims_of_all(
 }
 
 /// Where an object may be: along the direction that it is least known in, so densely that gates leave no gap.
-fn places_of(object: &Object) -> Vec<Vector3<f64>> {
+pub(super) fn places_of(object: &Object) -> Vec<Vector3<f64>> {
     let axes = object.fit.covariance.symmetric_eigen();
     let longest = axes.eigenvalues.imax();
     let sigma = axes.eigenvalues[longest].max(0.0).sqrt();

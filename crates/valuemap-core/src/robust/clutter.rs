@@ -20,6 +20,30 @@ impl Steps {
     /// 0 everywhere.
     pub const NONE: Self = Self { edges: [f64::INFINITY; BINS - 1], values: [0.0; BINS] };
 
+    /// 1 everywhere.
+    pub const ONE: Self = Self { edges: [f64::INFINITY; BINS - 1], values: [1.0; BINS] };
+
+    /// Some values, each of as long a part of what is between 0 and `most`.
+    #[must_use]
+    pub fn even(most: f64, values: [f64; BINS]) -> Self {
+        Self { edges: std::array::from_fn(|i| most * (i + 1) as f64 / BINS as f64), values }
+    }
+
+    /// As many numbers.
+    pub const NUMBERS: usize = 2 * BINS - 1;
+
+    /// As numbers, for storage.
+    #[must_use]
+    pub fn to_row(&self) -> [f64; Self::NUMBERS] {
+        std::array::from_fn(|place| self.edges.get(place).copied().unwrap_or_else(|| self.values[place + 1 - BINS]))
+    }
+
+    /// What `to_row` returned.
+    #[must_use]
+    pub fn from_row(row: &[f64; Self::NUMBERS]) -> Self {
+        Self { edges: std::array::from_fn(|i| row[i]), values: std::array::from_fn(|i| row[BINS - 1 + i]) }
+    }
+
     /// The value there; 0 for what is not a number.
     #[inline]
     #[must_use]

@@ -259,14 +259,12 @@ pub fn object(
         })
         .sum();
     let of_size = prior_of_size(&class.sizes, ln_size);
-    let (as_real, as_false) = seen.log_likelihoods(class);
-    let most = as_real.max(as_false);
-    let looks = most + ((as_real - most).exp() + (as_false - most).exp()).ln();
+    let looks = seen.ln_likelihood(class);
     let energy = fit.energy + 2.0 * n * ln_2_pi
         - 3.0 * ln_2_pi
         - 2.0 * class.ln_births(height_m(model.scene, model.up, &votes, &fit.point))
         + 2.0 * (clutter - sizes - of_size - looks);
-    let real = (as_real - looks).exp();
+    let real = seen.real(class);
     energy.is_finite().then(|| Object {
         class: model.scene.rays.class[first as usize],
         votes,

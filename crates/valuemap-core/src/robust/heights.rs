@@ -53,11 +53,38 @@ impl Heights {
         of_parts.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, heights)| heights)
     }
 
+    /// As many numbers.
+    pub const NUMBERS: usize = 3 * MOST_PARTS + 1;
+
+    /// As numbers, for storage.
+    #[must_use]
+    pub fn to_row(&self) -> [f64; Self::NUMBERS] {
+        std::array::from_fn(|place| match self.parts.get(place / 3) {
+            Some(part) => [part.share, part.mean_m, part.sigma_m][place % 3],
+            None => self.ln_elsewhere,
+        })
+    }
+
+    /// What `to_row` returned; nothing if they are not numbers.
+    #[must_use]
+    pub fn from_row(row: &[f64; Self::NUMBERS]) -> Option<Self> {
+        let part = |i: usize| Part { share: row[3 * i], mean_m: row[3 * i + 1], sigma_m: row[3 * i + 2] };
+        row.iter()
+            .all(|number| number.is_finite())
+            .then(|| Self { parts: std::array::from_fn(part), ln_elsewhere: row[Self::NUMBERS - 1] })
+    }
+
     /// Logarithm of the density at a height, 1/m.
     #[must_use]
     pub fn ln_density(&self, height_m: f64) -> f64 {
         let of_parts: f64 = self.parts.iter().map(|part| part.share * part.density(height_m)).sum();
         ((1.0 - ELSEWHERE) * of_parts + self.ln_elsewhere.exp()).ln()
+    }
+
+    /// Their mean, m.
+    #[must_use]
+    pub fn mean_m(&self) -> f64 {
+        self.parts.iter().map(|part| part.share * part.mean_m).sum()
     }
 
     /// The distribution that a height is most probably of, and how probably it is of any.

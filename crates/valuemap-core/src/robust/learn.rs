@@ -1,10 +1,12 @@
 //! What a map tells about each class: how often its objects are detected, how large they are, how much clutter there is.
 
 use super::clutter::{elevation_factor, score_ratio};
+use super::company::company;
 use super::energy::{Object, implied_size};
 use super::heights::{Heights, ground_m2 as ground_m2_within, height_m};
-use super::looks::Looks;
+use super::looks::{Lookout, Looks};
 use super::model::{ClassModel, FALSE_SHARE, Model, ODD_PASSES, Rates};
+use super::reach::reach;
 
 /// Objects with fewer votes do not serve.
 const MIN_VOTES: usize = 6;
@@ -12,46 +14,91 @@ const MIN_VOTES: usize = 6;
 const NEAR_VOTES: f64 = 0.05;
 /// Fewer of these tell nothing, and what was thought before stays.
 const MIN_OBJECTS: usize = 5;
+/// Rates of fewer looks are known worse than to a tenth.
+const LEAST_LOOKS: f64 = 30.0;
 /// The median absolute deviation of a normal distribution, in standard deviations.
 const MAD_OF_NORMAL: f64 = 0.6745;
 /// A spread of sizes is no smaller: boxes are whole pixels, and edges are not the same all around.
 const LEAST_SPREAD: f64 = 0.03;
 
-/// Learn the classes of a model from the objects that some rays make.
-pub fn learn(model: &mut Model<'_>, rays: &[u32], objects: &[Object]) {
-    let solid_angle_sr = model.solid_angle_sr(rays.len());
-    let ground_m2 = ground_m2(model, objects);
-    let mut is_vote = vec![false; model.scene.rays.rays.len()];
-    objects.iter().flat_map(|object| &object.votes).for_each(|&ray| is_vote[ray as usize] = true);
-    let looked_at = span(&model.sin_elevation);
-    for class in 0..model.classes.len() as u32 {
-        let of_class: Vec<&Object> = objects.iter().filter(|object| object.class == class).collect();
-        let is_sure = |object: &&Object| object.votes.len() >= MIN_VOTES && object.real > 0.5;
-        let sure: Vec<&Object> = of_class.iter().copied().filter(is_sure).collect();
-        let before = model.classes[class as usize];
+/// Learn the classes of a model from the objects that some rays make. Classes of few objects are taken to be like all objects together, but for how
+/// many there are and how much clutter.
+pub fn learn(model: &mut Model<'_>, lookout: &Lookout, rays: &[u32], objects: &[Object]) {
+    let evidence = Evidence::new(model, lookout, rays, objects);
+    let all: Vec<&Object> = objects.iter().collect();
+    let pooled = evidence.learned(&all, rays, &model.pooled);
+    let classes: Vec<ClassModel> = (0..)
+        .zip(&model.classes)
+        .map(|(class, before)| {
+            let of_class: Vec<&Object> = all.iter().copied().filter(|object| object.class == class).collect();
+            let rays: Vec<u32> =
+                rays.iter().copied().filter(|&ray| model.scene.rays.class[ray as usize] == class).collect();
+            let learned = evidence.learned(&of_class, &rays, before);
+            if learned.is_learned { learned } else { evidence.like(&pooled, &learned, of_class.len()) }
+        })
+        .collect();
+    (model.pooled, model.classes) = (pooled, classes);
+}
+
+/// What classes are learned from.
+struct Evidence<'a> {
+    model: &'a Model<'a>,
+    lookout: &'a Lookout,
+    objects: &'a [Object],
+    /// Whether each ray is a vote.
+    is_vote: Vec<bool>,
+    solid_angle_sr: f64,
+    ground_m2: f64,
+    looked_at: (f64, f64),
+}
+
+impl<'a> Evidence<'a> {
+    fn new(model: &'a Model<'a>, lookout: &'a Lookout, rays: &[u32], objects: &'a [Object]) -> Self {
+        let mut is_vote = vec![false; model.scene.rays.rays.len()];
+        objects.iter().flat_map(|object| &object.votes).for_each(|&ray| is_vote[ray as usize] = true);
+        Self {
+            model,
+            lookout,
+            objects,
+            is_vote,
+            solid_angle_sr: model.solid_angle_sr(rays.len()),
+            ground_m2: ground_m2(model, objects) * model.share_of(rays.len()),
+            looked_at: span(&model.sin_elevation),
+        }
+    }
+
+    /// What objects and rays of a class tell.
+    fn learned(&self, of_class: &[&Object], rays: &[u32], before: &ClassModel) -> ClassModel {
+        let model = self.model;
+        let (in_class, clutter): (Vec<u32>, Vec<u32>) = rays.iter().partition(|&&ray| self.is_vote[ray as usize]);
         // One detection more than is seen: no clutter at all is never known for sure.
-        let (in_class, clutter): (Vec<u32>, Vec<u32>) = rays
-            .iter()
-            .copied()
-            .filter(|&ray| model.scene.rays.class[ray as usize] == class)
-            .partition(|&ray| is_vote[ray as usize]);
-        let ln_clutter_per_sr = ((clutter.len() + 1) as f64 / solid_angle_sr).ln();
-        let mut learned = ClassModel { ln_clutter_per_sr, ..before };
+        let ln_clutter_per_sr = ((clutter.len() + 1) as f64 / self.solid_angle_sr).ln();
+        let mut learned = ClassModel { ln_clutter_per_sr, ..*before };
         let of = |column: &[f64], rays: &[u32]| rays.iter().map(|&ray| column[ray as usize]).collect::<Vec<f64>>();
         learned.score_ratio = score_ratio(&of(&model.scene.score, &in_class), &of(&model.scene.score, &clutter));
-        learned.clutter_by_elevation = elevation_factor(&of(&model.sin_elevation, &clutter), looked_at);
+        learned.clutter_by_elevation = elevation_factor(&of(&model.sin_elevation, &clutter), self.looked_at);
+        let is_sure = |object: &&Object| object.votes.len() >= MIN_VOTES && object.real > 0.5;
+        let sure: Vec<&Object> = of_class.iter().copied().filter(is_sure).collect();
         if sure.len() >= MIN_OBJECTS {
-            (learned.rates, learned.odd_passes) = rates(&sure, &before);
+            learned.is_learned = true;
+            (learned.rates, learned.odd_passes) = rates(&sure, before);
             let false_share = of_class.iter().map(|object| 1.0 - object.real).sum::<f64>() / of_class.len() as f64;
             learned.false_share = false_share.clamp(FALSE_SHARE.0, FALSE_SHARE.2);
-            learned.nearest_m = nearest_m(model, &sure);
+            (learned.nearest_m, learned.farthest_m) = distances_between_m(model, &sure);
             let (spread, object) = sizes(model, &sure);
             learned.sizes.spread = spread.max(LEAST_SPREAD);
             learned.sizes.object = (object.0, object.1.max(learned.sizes.spread));
             learned.heights = heights(model, &sure);
-            learned.ln_births_per_m2 = (of_class.len() as f64 / ground_m2).ln();
+            learned.ln_births_per_m2 = (of_class.len() as f64 / self.ground_m2).ln();
+            learned.reach = reach(model, self.lookout, &sure, learned.farthest_m);
+            learned.company = company(model, self.objects, &learned, of_class[0].class);
         }
-        model.classes[class as usize] = learned;
+        learned
+    }
+
+    /// A class of few objects, `own`, that are like those of all classes.
+    fn like(&self, pooled: &ClassModel, own: &ClassModel, objects: usize) -> ClassModel {
+        ClassModel { ln_births_per_m2: ((objects + 1) as f64 / self.ground_m2).ln(), ..pooled.with_own(own) }
     }
 }
 
@@ -86,11 +133,12 @@ fn span(numbers: &[f64]) -> (f64, f64) {
         .fold((f64::INFINITY, f64::NEG_INFINITY), |(least, most), &number| (least.min(number), most.max(number)))
 }
 
-/// The distance from which on all but a few votes are cast, m.
-fn nearest_m(model: &Model<'_>, objects: &[&Object]) -> f64 {
+/// The distances between which all but few votes are cast, m: those nearer, and those farther, are as few.
+fn distances_between_m(model: &Model<'_>, objects: &[&Object]) -> (f64, f64) {
     let mut distances = distances_m(model, objects);
-    let place = (distances.len() as f64 * NEAR_VOTES) as usize;
-    *distances.select_nth_unstable_by(place, f64::total_cmp).1
+    distances.sort_by(f64::total_cmp);
+    let few = (distances.len() as f64 * NEAR_VOTES) as usize;
+    (distances[few], distances[distances.len() - 1 - few])
 }
 
 /// How far all votes are from their objects, m.
@@ -130,26 +178,28 @@ fn median(values: &mut [f64]) -> Option<f64> {
 fn rates(objects: &[&Object], before: &ClassModel) -> (Rates, f64) {
     let mut passes: Vec<(Looks, f64)> = objects.iter().flat_map(|object| object.seen.usual(before)).collect();
     passes.retain(|(pass, _)| pass.expected >= 3.0);
-    let (mut hits, mut expected, mut shares, mut count) = (0.0, 0.0, 0.0, 0.0_f64);
-    for (pass, share) in &passes {
-        hits += share * pass.hits;
-        expected += share * pass.expected;
-        shares += share;
-        count += 1.0;
-    }
-    if expected < 30.0 {
-        return (before.rates, before.odd_passes);
+    let odd = 1.0 - passes.iter().map(|pass| pass.1).sum::<f64>() / passes.len() as f64;
+    let odd = odd.clamp(ODD_PASSES.0, ODD_PASSES.2);
+    rates_of(&passes).map_or((before.rates, before.odd_passes), |rates| (rates, odd))
+}
+
+/// A beta distribution of detection rates, by the method of moments, from looks that each count in part. Nothing of few looks.
+#[must_use]
+pub(super) fn rates_of(all: &[(Looks, f64)]) -> Option<Rates> {
+    let expected: f64 = all.iter().map(|(looks, share)| share * looks.expected).sum();
+    let hits: f64 = all.iter().map(|(looks, share)| share * looks.hits).sum();
+    if expected < LEAST_LOOKS {
+        return None;
     }
     let recall = f64::clamp(hits / expected, 0.05, 0.98);
-    // Method of moments: the variance of a pass's share is p (1 - p) (1 + (n - 1) / (1 + s)) / n.
-    let mut excess = (0.0, 0.0);
-    for (pass, share) in &passes {
-        let n = pass.expected;
-        let away = pass.hits / n - recall;
-        excess.0 += share * (n * away * away - recall * (1.0 - recall));
-        excess.1 += share * (n - 1.0) * recall * (1.0 - recall);
+    // The variance of a share of n looks is p (1 - p) (1 + (n - 1) / (1 + s)) / n.
+    let (mut excess, mut most) = (0.0, 0.0);
+    for (looks, share) in all {
+        let n = looks.expected;
+        let away = looks.hits / n - recall;
+        excess += share * (n * away * away - recall * (1.0 - recall));
+        most += share * (n - 1.0) * recall * (1.0 - recall);
     }
-    let correlation = f64::clamp(excess.0 / excess.1, 0.01, 0.5);
-    let odd = (1.0 - shares / count).clamp(ODD_PASSES.0, ODD_PASSES.2);
-    (Rates { recall, concentration: 1.0 / correlation - 1.0 }, odd)
+    let correlation = f64::clamp(excess / most, 0.01, 0.5);
+    Some(Rates { recall, concentration: 1.0 / correlation - 1.0 })
 }

@@ -9,6 +9,7 @@ use rstar::RTree;
 use rstar::primitives::GeomWithData;
 use rustc_hash::FxHashMap;
 
+use super::energy::Object;
 use super::model::{ClassModel, Model, Rates};
 use super::scene::Scene;
 
@@ -85,6 +86,19 @@ impl Seen {
         (real + (-class.false_share).ln_1p(), strange + class.false_share.ln())
     }
 
+    /// Logarithm of how probable the looks are at anything, real or false.
+    #[must_use]
+    pub fn ln_likelihood(&self, class: &ClassModel) -> f64 {
+        let (real, strange) = self.log_likelihoods(class);
+        ln_sum(real, strange)
+    }
+
+    /// Probability that what has these looks is real rather than false.
+    #[must_use]
+    pub fn real(&self, class: &ClassModel) -> f64 {
+        (self.log_likelihoods(class).0 - self.ln_likelihood(class)).exp()
+    }
+
     /// The looks of all passes, and how probable it is that they are from where the object is usually seen.
     #[must_use]
     pub fn usual(&self, class: &ClassModel) -> Vec<(Looks, f64)> {
@@ -132,9 +146,70 @@ impl Lookout {
     /// The looks at a point that some rays (one per image, ascending) vote for; `others` are images (ascending) with a detection in its gate.
     #[must_use]
     pub fn looks(&self, model: &Model<'_>, point: &Vector3<f64>, voters: &[u32], others: &[u32]) -> Seen {
-        let scene = model.scene;
         let nearest_m = voters.first().map_or(f64::INFINITY, |&ray| model.class_of(ray).nearest_m);
-        let sectors = Sectors::of(scene, point, voters, nearest_m);
+        self.looks_within(model, point, voters, others, (nearest_m, 0.0), |_| 1.0)
+    }
+
+    /// The same, with looks from as near and as far as the class is detected: few votes do not tell from where their object is seen.
+    #[must_use]
+    pub fn looks_of_few(&self, model: &Model<'_>, point: &Vector3<f64>, voters: &[u32]) -> Seen {
+        let Some(class) = voters.first().map(|&ray| model.class_of(ray)) else { return Seen::default() };
+        self.looks_within(model, point, voters, &[], (0.0, class.farthest_m), |distance_m| class.reach.at(distance_m))
+    }
+
+    /// Tells of objects whether all images in reach of them have only detections among some rays: their votes are counted in full.
+    pub fn whole<'a>(&'a self, model: &'a Model<'_>, rays: &[u32]) -> impl Fn(&Object) -> bool {
+        let mut is_left_out = vec![false; model.scene.views.len()];
+        let image = |ray: u32| model.scene.rays.image[ray as usize] as usize;
+        for ray in model.scene.usable_rays() {
+            is_left_out[image(ray)] = true;
+        }
+        for &ray in rays {
+            is_left_out[image(ray)] = false;
+        }
+        move |object| {
+            let reach_m = model.classes[object.class as usize].farthest_m;
+            let point = &object.fit.point;
+            let is_near = |&image: &u32| (model.scene.views[image as usize].center - point).norm() <= reach_m;
+            !self.around(point, reach_m).filter(is_near).any(|image| is_left_out[image as usize])
+        }
+    }
+
+    /// How far the images are, m, that look at a point from where some rays vote for it, up to `farthest_m`, and whether they have a vote.
+    #[must_use]
+    pub fn distances_m(
+        &self,
+        model: &Model<'_>,
+        point: &Vector3<f64>,
+        voters: &[u32],
+        farthest_m: f64,
+    ) -> Vec<(f64, bool)> {
+        let scene = model.scene;
+        let sectors = Sectors::of(scene, point, voters, (0.0, farthest_m));
+        let mut hits: Vec<u32> = voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
+        hits.sort_unstable();
+        let distance_m = |image: u32| (scene.views[image as usize].center - point).norm();
+        let is_looking = |&image: &u32| {
+            let view = &scene.views[image as usize];
+            let is_here = || sectors.holding(&(view.center - point)).is_some();
+            distance_m(image) <= farthest_m && is_here() && scene.is_in_picture(view, point)
+        };
+        let looking = self.around(point, farthest_m).filter(is_looking);
+        looking.map(|image| (distance_m(image), hits.binary_search(&image).is_ok())).collect()
+    }
+
+    /// The looks from the distances of the votes, and those given; one without a vote counts as much of a look as `weight` says.
+    fn looks_within(
+        &self,
+        model: &Model<'_>,
+        point: &Vector3<f64>,
+        voters: &[u32],
+        others: &[u32],
+        distances_m: (f64, f64),
+        weight: impl Fn(f64) -> f64,
+    ) -> Seen {
+        let scene = model.scene;
+        let sectors = Sectors::of(scene, point, voters, distances_m);
         let farthest = sectors.0.iter().map(|sector| sector.farthest_m).fold(0.0, f64::max);
         let mut looks: Vec<Look> = Vec::with_capacity(2 * voters.len());
         for &ray in voters {
@@ -148,7 +223,8 @@ impl Lookout {
             let view = &scene.views[image as usize];
             let Some(sector) = sectors.holding(&(view.center - point)) else { continue };
             if hits.binary_search(&image).is_err() && scene.is_in_picture(view, point) {
-                let weight = if others.binary_search(&image).is_ok() { HIDDEN_LOOK } else { 1.0 };
+                let hidden = if others.binary_search(&image).is_ok() { HIDDEN_LOOK } else { 1.0 };
+                let weight = hidden * weight((view.center - point).norm());
                 looks.push(Look { sector, image, weight, is_hit: false });
             }
         }
@@ -191,7 +267,7 @@ struct Sector {
 }
 
 impl Sectors {
-    fn of(scene: &Scene, point: &Vector3<f64>, voters: &[u32], nearest_m: f64) -> Self {
+    fn of(scene: &Scene, point: &Vector3<f64>, voters: &[u32], (nearest_m, farthest_m): (f64, f64)) -> Self {
         let mut sectors: Vec<Sector> = Vec::new();
         for &ray in voters {
             let away = scene.ray(ray).center - point;
@@ -201,7 +277,11 @@ impl Sectors {
                 sector.nearest_m = sector.nearest_m.min(distance);
                 sector.farthest_m = sector.farthest_m.max(distance);
             } else {
-                sectors.push(Sector { direction, nearest_m: nearest_m.min(distance), farthest_m: distance });
+                sectors.push(Sector {
+                    direction,
+                    nearest_m: nearest_m.min(distance),
+                    farthest_m: farthest_m.max(distance),
+                });
             }
         }
         Self(sectors)

@@ -11,10 +11,13 @@ pub mod assign;
 pub mod births;
 pub mod calibrate;
 pub mod clutter;
+pub mod company;
 pub mod contest;
+pub mod counts;
 pub mod drift;
 pub mod energy;
 pub mod estimate;
+pub mod few;
 pub mod finish;
 pub mod heights;
 pub mod index;
@@ -28,6 +31,7 @@ pub mod noise;
 pub mod poses;
 pub mod propose;
 pub mod quick;
+pub mod reach;
 pub mod rearrange;
 pub mod repair;
 pub mod sample;
@@ -46,7 +50,7 @@ use finish::finish;
 use index::RayIndex;
 use learn::learn;
 use looks::Lookout;
-use model::{Model, Rates};
+use model::{ClassModel, Model, Rates};
 use noise::{Noise, Spread};
 use rayon::prelude::*;
 use scene::Scene;
@@ -61,6 +65,8 @@ pub struct Settings {
     pub gate_sigmas: f64,
     /// Labels with fewer voters are dropped.
     pub min_votes: u32,
+    /// Objects of which heights are known need no more than so many.
+    pub least_votes: u32,
     /// Labels that exist with a smaller probability are dropped.
     pub min_existence: f64,
     /// Parts that are left out, to see what they are worth.
@@ -78,6 +84,8 @@ pub struct Without {
 
 /// Rays of the places that the noise is estimated from, about: from each start, and from the best in the end.
 const CALIBRATION_RAYS: (usize, usize) = (4_000, 10_000);
+/// Places that classes are learned from are so many ranges wide: most objects in them are seen by no other images.
+const WIDE: f64 = 3.0;
 /// How much wider the gate is while the noise is estimated: what a gate cuts off is missing in the estimate.
 const CALIBRATION_GATE: f64 = 1.4;
 /// Times that the noise is estimated anew, from labels found with the last estimate.
@@ -86,6 +94,19 @@ const CALIBRATION_ROUNDS: usize = 3;
 const STARTS: [f64; 5] = [0.15, 0.5, 1.5, 5.0, 15.0];
 /// Scenes with more rays than this are searched less deeply.
 const MOST_RAYS: usize = 100_000;
+
+/// What is estimated once of a scene, or of a sample of it, before any part of it is mapped.
+#[derive(Debug, Clone)]
+pub struct Calibration {
+    /// Errors of poses and detections.
+    pub noise: Noise,
+    /// What is learned of each class; nothing of those that are nowhere in the sample.
+    pub classes: Vec<Option<ClassModel>>,
+    /// What is learned of all classes together: what others are like.
+    pub pooled: ClassModel,
+    /// Whether all moves pay.
+    pub is_deep: bool,
+}
 
 /// A label with what speaks for it.
 #[derive(Debug, Clone)]
@@ -129,7 +150,7 @@ pub struct Findings {
 }
 
 /// Estimate the noise from the data, starting from a guess: labels of a sample of places with the noise as it is thought
-/// to be, then the noise that makes their residuals most likely, and again. `known` parts stay as they are.
+/// to be, then the noise that makes their residuals most likely, and again. `known` parts stay as they are. Then learn the classes.
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
@@ -139,12 +160,49 @@ pub fn self_calibrate(
     known: Known,
     settings: &Settings,
     progress: &Progress,
+) -> Result<Calibration, Halt> {
+    let more = sample::places(scene, CALIBRATION_RAYS.1, settings.viability.max_range_m);
+    let noise = if known.detection && known.position && known.rotation {
+        *guess
+    } else {
+        likeliest_noise(scene, guess, known, settings, &more, progress)?
+    };
+    let mut model = Model::new(scene, &noise, settings);
+    let wide = sample::places(scene, CALIBRATION_RAYS.1, WIDE * settings.viability.max_range_m);
+    learn_from(&mut model, &wide, progress)?;
+    let is_deep = scene.usable_rays().len() <= MOST_RAYS;
+    Ok(Calibration { noise, classes: model.classes.iter().copied().map(Some).collect(), pooled: model.pooled, is_deep })
+}
+
+/// Learn the classes of a model from the map of some rays.
+fn learn_from(model: &mut Model<'_>, rays: &[u32], progress: &Progress) -> Result<(), Halt> {
+    let begun = initial::labels_of_few(model, rays, progress)?;
+    let objects = search(model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
+    let lookout = Lookout::new(model.scene, model.settings.viability.max_range_m);
+    learn(model, &lookout, rays, &objects);
+    let few = few::objects_of_few(model, rays, &objects, 1, progress)?;
+    let whole = {
+        let is_whole = lookout.whole(model, rays);
+        [&objects, &few].map(|all| all.iter().filter(|object| is_whole(object)).cloned().collect::<Vec<Object>>())
+    };
+    counts::learn_counts(model, &whole[0], &whole[1]);
+    Ok(())
+}
+
+/// The noise that makes the rays of some places likeliest, `more` and some of them.
+fn likeliest_noise(
+    scene: &Scene,
+    guess: &Noise,
+    known: Known,
+    settings: &Settings,
+    more: &[u32],
+    progress: &Progress,
 ) -> Result<Noise, Halt> {
     let settings = Settings { gate_sigmas: settings.gate_sigmas * CALIBRATION_GATE, ..*settings };
     let round = |noise: &Noise, rays: &[u32]| {
         let mut model = Model::new(scene, noise, &settings);
         let begun = initial::labels_of_few(&model, rays, progress)?;
-        let objects = search(&mut model, rays, begun, Depth::Shallow, &mut Tally::default(), progress)?;
+        let objects = search(&mut model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
         let again = calibrate::calibrate(scene, noise, &placed(&objects), known);
         Ok((likelihood(&model, &objects, rays), again))
     };
@@ -160,14 +218,13 @@ pub fn self_calibrate(
         }
     }
     // What more rays tell is taken if it makes them likelier.
-    let more = sample::places(scene, CALIBRATION_RAYS.1, settings.viability.max_range_m);
     let mut noise = likeliest.noise.unwrap_or(*guess);
     if more.len() == few.len() {
         return Ok(noise);
     }
     let mut likeliest = Likeliest::default();
     for _ in 0..2 {
-        let (value, again) = round(&noise, &more)?;
+        let (value, again) = round(&noise, more)?;
         likeliest.offer(value, noise);
         noise = again;
     }
@@ -207,24 +264,45 @@ fn likelihood(model: &Model<'_>, objects: &[Object], rays: &[u32]) -> f64 {
     (0..model.classes.len()).map(of_class).sum()
 }
 
-/// Find the labels of a scene with a known noise.
+/// Find the labels of a scene with what is estimated of it.
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
-pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progress) -> Result<Findings, Halt> {
+pub fn find(
+    scene: &Scene,
+    calibration: &Calibration,
+    settings: &Settings,
+    progress: &Progress,
+) -> Result<Findings, Halt> {
     let rays = scene.usable_rays();
+    let noise = &calibration.noise;
     let mut model = Model::new(scene, noise, settings);
+    model.know(&calibration.classes, calibration.pooled);
     let (begun, first) = initial::labels(&model, progress)?;
     let mut tally =
         Tally { hypotheses: first.nominations, births: first.accepted, deaths: first.doubted + first.outvoted };
-    let depth = if rays.len() > MOST_RAYS { Depth::Shallow } else { Depth::Deep };
-    let objects = search(&mut model, &rays, begun, depth, &mut tally, progress)?;
+    let depth = if calibration.is_deep { Depth::Deep } else { Depth::Shallow };
+    let objects = search(&mut model, &rays, begun, depth, false, &mut tally, progress)?;
     let estimates = finish(&model, &objects);
     let variance_factor = calibrate::variance_factor(scene, noise, &placed(&objects), objects.len().max(1));
     let claimed: usize = objects.iter().map(|object| object.votes.len()).sum();
     let energy = objects.iter().map(|object| object.energy).sum();
     let existence = initial::existence(&model, &objects, &estimates, first.doubted);
-    let findings: Vec<Finding> = objects
+    let few = if settings.least_votes < settings.min_votes {
+        few::objects_of_few(&model, &rays, &objects, settings.least_votes as usize, progress)?
+    } else {
+        Vec::new()
+    };
+    let of_few: Vec<Estimate> =
+        few.iter().map(|o| Estimate { point: o.fit.point, covariance: o.fit.covariance }).collect();
+    let judged = initial::existence(&model, &few, &of_few, first.doubted);
+    let few = few.into_iter().zip(of_few).zip(judged).map(|((object, estimate), (judged, _))| {
+        // Of few votes nothing is expected of the looks that is not in J.
+        let is_judged = object.votes.len() >= settings.min_votes as usize;
+        let existence = if is_judged { object.existence().min(judged) } else { object.existence() };
+        Finding { estimate, existence, expected: object.seen.images, votes: object.votes }
+    });
+    let mut findings: Vec<Finding> = objects
         .into_iter()
         .zip(estimates)
         .zip(existence)
@@ -232,8 +310,10 @@ pub fn find(scene: &Scene, noise: &Noise, settings: &Settings, progress: &Progre
             estimate.covariance *= variance_factor;
             Finding { estimate, existence, expected, votes: object.votes }
         })
+        .chain(few)
         .filter(|finding| finding.existence >= settings.min_existence)
         .collect();
+    findings.sort_by_key(|finding| finding.votes[0]);
     Ok(Findings {
         findings,
         tally,
@@ -270,12 +350,12 @@ pub fn objects_of(
     let rays = scene.usable_rays();
     let mut model = Model::new(scene, noise, settings);
     if is_searched {
-        return search(&mut model, &rays, begun, Depth::Deep, &mut Tally::default(), progress);
+        return search(&mut model, &rays, begun, Depth::Deep, true, &mut Tally::default(), progress);
     }
     let lookout = Lookout::new(scene, settings.viability.max_range_m);
     let objects: Vec<Object> =
         begun.into_iter().filter_map(|(votes, point)| object(&model, &lookout, votes, point, Vec::new())).collect();
-    learn(&mut model, &rays, &objects);
+    learn(&mut model, &lookout, &rays, &objects);
     let index = RayIndex::new(scene, &model.spreads, settings.gate_sigmas, rays.into_iter());
     let claims = assign::claims_of_all(&model, &index, &objects, progress)?;
     let again = |(o, claims): (Object, Vec<assign::Claim>)| {

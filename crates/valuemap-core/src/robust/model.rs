@@ -9,6 +9,7 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 
 use super::clutter::Steps;
+use super::counts::FEW;
 use super::heights::{Heights, up_of};
 use super::noise::{Noise, Spread};
 use super::scene::Scene;
@@ -18,12 +19,14 @@ use crate::ray::Ray;
 /// What is learned about the objects and the clutter of one class.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ClassModel {
-    /// How many detections there are that may vote.
-    pub detections: usize,
+    /// Whether enough objects told.
+    pub is_learned: bool,
     /// How often objects are detected.
     pub rates: Rates,
     /// Objects are detected from this distance on, m; infinite before anything is learned.
     pub nearest_m: f64,
+    /// Objects are detected up to this distance, m.
+    pub farthest_m: f64,
     /// The share of the passes in which an object is seen in any share of the looks, or none: hidden, or from where it is not detected.
     pub odd_passes: f64,
     /// The share of what is born that is false.
@@ -40,11 +43,130 @@ pub struct ClassModel {
     pub clutter_by_elevation: Steps,
     /// How much more probable votes have a score than clutter has, in logarithms.
     pub score_ratio: Steps,
+    /// The share of the looks from some distance, m, that are hits, of that where it is largest.
+    pub reach: Steps,
+    /// What is added to the logarithm of the odds of objects of one vote, of two, and of more that rays alone do not tell: what the numbers of others allow.
+    pub ln_odds_of_few: [f64; FEW],
+    /// How much denser objects are near others, in logarithms, by minus the distance to the nearest one, m.
+    pub company: Steps,
     /// How large detections are.
     pub sizes: Sizes,
 }
 
 impl ClassModel {
+    /// Before anything is learned: all detections of a class may be clutter; `angle` is mean and standard deviation of the angles of its boxes, ln rad.
+    fn guess(scene: &Scene, settings: &Settings, detections: usize, angle: (f64, f64)) -> Self {
+        Self {
+            is_learned: false,
+            rates: Rates::GUESS,
+            nearest_m: f64::INFINITY,
+            farthest_m: settings.viability.max_range_m,
+            odd_passes: ODD_PASSES.1,
+            false_share: FALSE_SHARE.1,
+            ln_clutter_per_sr: (detections.max(1) as f64 / scene.solid_angle_sr()).ln(),
+            ln_births_per_m3: -3.0 * settings.viability.max_range_m.ln(),
+            ln_births_per_m2: f64::NAN,
+            clutter_by_elevation: Steps::NONE,
+            score_ratio: Steps::NONE,
+            reach: Steps::ONE,
+            ln_odds_of_few: [0.0; FEW],
+            company: Steps::NONE,
+            heights: None,
+            sizes: Sizes::guess(angle),
+        }
+    }
+
+    /// All of it as numbers, for storage.
+    #[must_use]
+    pub fn to_row(&self) -> Vec<f64> {
+        let heights = self.heights.map_or([f64::NAN; Heights::NUMBERS], |heights| heights.to_row());
+        let numbers = [
+            f64::from(u8::from(self.is_learned)),
+            self.rates.recall,
+            self.rates.concentration,
+            self.nearest_m,
+            self.farthest_m,
+            self.odd_passes,
+            self.false_share,
+            self.ln_clutter_per_sr,
+            self.ln_births_per_m3,
+            self.ln_births_per_m2,
+            self.sizes.angle.0,
+            self.sizes.angle.1,
+            self.sizes.object.0,
+            self.sizes.object.1,
+            self.sizes.spread,
+            self.ln_odds_of_few[0],
+            self.ln_odds_of_few[1],
+            self.ln_odds_of_few[2],
+        ];
+        let steps = [self.clutter_by_elevation, self.score_ratio, self.reach, self.company].map(|steps| steps.to_row());
+        numbers.into_iter().chain(heights).chain(steps.into_iter().flatten()).collect()
+    }
+
+    /// What `to_row` returned; nothing of another number of numbers.
+    #[must_use]
+    pub fn from_row(row: &[f64]) -> Option<Self> {
+        let (numbers, rest) = row.split_first_chunk::<18>()?;
+        let (heights, rest) = rest.split_first_chunk::<{ Heights::NUMBERS }>()?;
+        let (clutter, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
+        let (scores, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
+        let (reach, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
+        let company = rest.try_into().ok()?;
+        let &[
+            is_learned,
+            recall,
+            concentration,
+            nearest_m,
+            farthest_m,
+            odd_passes,
+            false_share,
+            ln_clutter_per_sr,
+            ln_births_per_m3,
+            ln_births_per_m2,
+            angle_mean,
+            angle_sd,
+            object_mean,
+            object_sd,
+            spread,
+            ln_odds_of_one,
+            ln_odds_of_two,
+            ln_odds_of_more,
+        ] = numbers;
+        Some(Self {
+            is_learned: is_learned > 0.0,
+            rates: Rates { recall, concentration },
+            nearest_m,
+            farthest_m,
+            odd_passes,
+            false_share,
+            ln_clutter_per_sr,
+            ln_births_per_m3,
+            ln_births_per_m2,
+            heights: Heights::from_row(heights),
+            clutter_by_elevation: Steps::from_row(clutter),
+            score_ratio: Steps::from_row(scores),
+            reach: Steps::from_row(reach),
+            ln_odds_of_few: [ln_odds_of_one, ln_odds_of_two, ln_odds_of_more],
+            company: Steps::from_row(company),
+            sizes: Sizes { angle: (angle_mean, angle_sd), object: (object_mean, object_sd), spread },
+        })
+    }
+
+    /// Like this, but with the clutter of another class and the angles of its boxes; that itself if nothing is learned.
+    #[must_use]
+    pub fn with_own(&self, own: &Self) -> Self {
+        if !self.is_learned {
+            return *own;
+        }
+        Self {
+            ln_clutter_per_sr: own.ln_clutter_per_sr,
+            sizes: Sizes { spread: self.sizes.spread, ..own.sizes },
+            heights: None,
+            ..*self
+        }
+    }
+
     /// Logarithm of the density of objects at a height above the cameras, m, 1/m³.
     #[must_use]
     pub fn ln_births(&self, height_m: Option<f64>) -> f64 {
@@ -130,8 +252,12 @@ pub struct Model<'a> {
     pub ln_angle: Vec<f64>,
     /// Sine of each ray's elevation; not a number where nobody knows what is up.
     pub sin_elevation: Vec<f64>,
+    /// How many rays there are that may vote.
+    usable: usize,
     /// What is learned, by class.
     pub classes: Vec<ClassModel>,
+    /// What is learned of all classes together.
+    pub pooled: ClassModel,
     /// Settings of the run.
     pub settings: &'a Settings,
 }
@@ -145,38 +271,49 @@ impl<'a> Model<'a> {
         let ln_angle: Vec<f64> =
             scene.box_px.iter().zip(&scene.scale2).map(|(&size, &scale2)| (size / scale2.sqrt()).ln()).collect();
         let count = scene.rays.class.iter().max().map_or(0, |&last| last as usize + 1);
-        let solid_angle_sr = scene.solid_angle_sr();
-        let classes = (0..count as u32)
-            .map(|class| {
-                let of_class = || usable.iter().map(|&ray| ray as usize).filter(|&ray| scene.rays.class[ray] == class);
-                let angles: Vec<f64> = of_class().map(|ray| ln_angle[ray]).filter(|angle| angle.is_finite()).collect();
-                ClassModel {
-                    detections: of_class().count(),
-                    rates: Rates::GUESS,
-                    nearest_m: f64::INFINITY,
-                    odd_passes: ODD_PASSES.1,
-                    false_share: FALSE_SHARE.1,
-                    ln_clutter_per_sr: (of_class().count().max(1) as f64 / solid_angle_sr).ln(),
-                    ln_births_per_m3: -3.0 * settings.viability.max_range_m.ln(),
-                    ln_births_per_m2: f64::NAN,
-                    clutter_by_elevation: Steps::NONE,
-                    score_ratio: Steps::NONE,
-                    heights: None,
-                    sizes: Sizes::guess(mean_and_sd(&angles)),
-                }
-            })
-            .collect();
+        let of = |rays: Vec<usize>| {
+            let angles: Vec<f64> = rays.iter().map(|&ray| ln_angle[ray]).filter(|angle| angle.is_finite()).collect();
+            ClassModel::guess(scene, settings, rays.len(), mean_and_sd(&angles))
+        };
+        let all = || usable.iter().map(|&ray| ray as usize);
+        let classes =
+            (0..count as u32).map(|class| of(all().filter(|&ray| scene.rays.class[ray] == class).collect())).collect();
+        let pooled = of(all().collect());
         let up = up_of(scene);
         let sin_elevation = |ray: &Ray| up.map_or(f64::NAN, |up| up.dot(&ray.direction));
         let sin_elevation = scene.rays.rays.iter().map(sin_elevation).collect();
-        Self { scene, noise, up, spreads: Arc::new(spreads), ln_angle, sin_elevation, classes, settings }
+        Self {
+            scene,
+            noise,
+            up,
+            spreads: Arc::new(spreads),
+            ln_angle,
+            sin_elevation,
+            usable: usable.len(),
+            classes,
+            pooled,
+            settings,
+        }
+    }
+
+    /// Take what is known of the classes; those that nothing is known of are like all together, but for their clutter and the angles of their boxes.
+    pub fn know(&mut self, classes: &[Option<ClassModel>], pooled: ClassModel) {
+        self.pooled = pooled;
+        for (class, own) in self.classes.iter_mut().enumerate() {
+            *own = classes.get(class).copied().flatten().unwrap_or_else(|| pooled.with_own(own));
+        }
     }
 
     /// What the cameras look at where some of the rays were found, sr: as large a part of all.
     #[must_use]
     pub fn solid_angle_sr(&self, rays: usize) -> f64 {
-        let all: usize = self.classes.iter().map(|class| class.detections).sum();
-        self.scene.solid_angle_sr() * rays as f64 / all.max(1) as f64
+        self.scene.solid_angle_sr() * self.share_of(rays)
+    }
+
+    /// The share of the usable rays that so many are.
+    #[must_use]
+    pub fn share_of(&self, rays: usize) -> f64 {
+        rays as f64 / self.usable.max(1) as f64
     }
 
     /// What is learned about the class of a ray.
@@ -252,7 +389,7 @@ fn log_rising(x: f64, n: f64) -> f64 {
 }
 
 /// Logarithm of the gamma function of a positive number: Stirling's series (Abramowitz and Stegun, 6.1.41) beyond 8.
-fn ln_gamma(mut x: f64) -> f64 {
+pub(super) fn ln_gamma(mut x: f64) -> f64 {
     let mut product = 1.0;
     while x < 8.0 {
         product *= x;

@@ -1,7 +1,7 @@
 //! The search: from a map that is there to begin with, moves that are committed only if J falls.
 //!
 //! In each round all objects compete for all detections, pairs merge and exchange, neighborhoods are destroyed and repaired, and what
-//! is left over gives birth; until nothing lowers J. What is learned about the classes is learned anew in each round.
+//! is left over gives birth; until nothing lowers J. A search that `learns` learns the classes of its model anew in each round.
 
 use std::sync::Arc;
 
@@ -42,6 +42,7 @@ pub fn search(
     rays: &[u32],
     begun: Vec<Placed>,
     depth: Depth,
+    learns: bool,
     tally: &mut Tally,
     progress: &Progress,
 ) -> Result<Vec<Object>, Halt> {
@@ -54,7 +55,9 @@ pub fn search(
     let (mut tried, mut tried_pairs) = (Tried::default(), TriedPairs::default());
     let rounds = if depth == Depth::Deep { ROUNDS } else { 1 };
     for round in 0..rounds {
-        learn(model, rays, &objects);
+        if learns {
+            learn(model, &lookout, rays, &objects);
+        }
         let model: &Model<'_> = model;
         let again = |o: Object| object(model, &lookout, o.votes, o.fit.point, o.others);
         objects = objects.into_par_iter().filter_map(again).filter(|object| object.energy < 0.0).collect();

@@ -22,6 +22,7 @@ pub const SETTINGS: Settings = Settings {
     viability: VIABILITY,
     gate_sigmas: GATE_SIGMAS,
     min_votes: 3,
+    least_votes: 3,
     min_existence: 0.5,
     without: Without { polish: false, merge: false },
 };

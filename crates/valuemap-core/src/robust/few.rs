@@ -1,0 +1,172 @@
+//! Objects of few looks: one or two detections, and what is known of all objects of their class.
+//!
+//! A ray that no object has is an object's if one stands on it where its class stands: as high, as large, as far. Its position is that of a ray with
+//! heights and sizes as observations, so its covariance is large and honest. Against it counts what is true of every object, equations (1) to (5),
+//! and that clutter is where detectors look for objects: its density is that of the elevations at which it is found.
+
+use nalgebra::Vector3;
+use rayon::prelude::*;
+
+use super::assign::gain_alone;
+use super::company::Sure;
+use super::energy::{Object, by_place, object};
+use super::index::RayIndex;
+use super::looks::Lookout;
+use super::model::{ClassModel, Model};
+use crate::progress::{Halt, Progress};
+
+/// Places along a ray that are compared: so many to a factor of ten in distance are 8 % apart, less than what sizes tell.
+const PLACES_PER_DECADE: f64 = 30.0;
+/// Times that an object gathers votes and is estimated again, at most.
+const ROUNDS: usize = 3;
+
+/// The objects that rays of no other object make, the surest first; those with fewer votes than `least_votes` aside.
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn objects_of_few(
+    model: &Model<'_>,
+    rays: &[u32],
+    objects: &[Object],
+    least_votes: usize,
+    progress: &Progress,
+) -> Result<Vec<Object>, Halt> {
+    let lookout = Lookout::new(model.scene, model.settings.viability.max_range_m);
+    let mut is_taken = vec![false; model.scene.rays.rays.len()];
+    objects.iter().flat_map(|object| &object.votes).for_each(|&ray| is_taken[ray as usize] = true);
+    let is_free = |ray: &u32| !is_taken[*ray as usize] && model.class_of(*ray).heights.is_some();
+    let free: Vec<u32> = rays.iter().copied().filter(is_free).collect();
+    let index = RayIndex::new(model.scene, &model.spreads, model.settings.gate_sigmas, free.iter().copied());
+    let beside = Beside::new(model, objects);
+    let sure: Vec<Sure> = (0..model.classes.len() as u32).map(|class| Sure::of(objects, class)).collect();
+    let nursery = Nursery { model, lookout: &lookout, index: &index, beside: &beside, sure: &sure };
+    let begin = |&ray: &u32| {
+        progress.check()?;
+        Ok(nursery.grown(ray, &|_| true).map(|object| (object, ray)))
+    };
+    let grown: Vec<Option<(Object, u32)>> = free.par_iter().map(begin).collect::<Result<_, Halt>>()?;
+    let mut grown: Vec<(Object, u32)> = grown.into_iter().flatten().collect();
+    grown.sort_by(|a, b| a.0.energy.total_cmp(&b.0.energy).then(a.1.cmp(&b.1)));
+    let mut found: Vec<Object> = Vec::new();
+    for (object, ray) in grown {
+        progress.check()?;
+        if is_taken[ray as usize] {
+            continue;
+        }
+        let is_whole = object.votes.iter().all(|&vote| !is_taken[vote as usize]);
+        let left = if is_whole { Some(object) } else { nursery.grown(ray, &|vote| !is_taken[vote as usize]) };
+        if let Some(object) = left {
+            object.votes.iter().for_each(|&vote| is_taken[vote as usize] = true);
+            found.push(object);
+        }
+    }
+    found.retain(|object| object.votes.len() >= least_votes);
+    for object in &mut found {
+        let ln_odds = model.classes[object.class as usize].ln_odds_of_few;
+        object.energy -= 2.0 * ln_odds[object.votes.len().min(ln_odds.len()) - 1];
+    }
+    Ok(found)
+}
+
+/// The objects that are there.
+struct Beside<'a> {
+    objects: &'a [Object],
+    tree: rstar::RTree<rstar::primitives::GeomWithData<[f64; 3], usize>>,
+    reach_m: f64,
+}
+
+impl<'a> Beside<'a> {
+    fn new(model: &Model<'_>, objects: &'a [Object]) -> Self {
+        Self { objects, tree: by_place(objects), reach_m: model.settings.viability.max_range_m }
+    }
+
+    /// Whether votes at a place may be of an object that is there, and that has no other detection in their images.
+    fn explains(&self, model: &Model<'_>, object: &Object) -> bool {
+        let sigma = object.fit.covariance.trace().sqrt();
+        let reach = (model.settings.gate_sigmas * 2.0 * sigma).min(self.reach_m);
+        let near = self.tree.locate_within_distance(object.fit.point.into(), reach * reach);
+        near.map(|near| &self.objects[near.data]).any(|other| {
+            let apart = other.fit.point - object.fit.point;
+            let covariance = other.fit.covariance + object.fit.covariance;
+            let is_near = covariance
+                .cholesky()
+                .is_none_or(|cholesky| apart.dot(&cholesky.solve(&apart)) <= model.settings.gate_sigmas.powi(2));
+            let image = |ray: &u32| model.scene.rays.image[*ray as usize];
+            let is_seen_beside = || {
+                let images: Vec<u32> = other.votes.iter().map(image).collect();
+                object.votes.iter().any(|ray| images.binary_search(&image(ray)).is_ok())
+            };
+            other.class == object.class && is_near && !is_seen_beside()
+        })
+    }
+}
+
+/// Where objects grow from a ray.
+struct Nursery<'a> {
+    model: &'a Model<'a>,
+    lookout: &'a Lookout,
+    index: &'a RayIndex<'a>,
+    beside: &'a Beside<'a>,
+    sure: &'a [Sure],
+}
+
+impl Nursery<'_> {
+    /// The object of a ray and of the free rays that explain it better; nothing if none stands on it, or one that is there explains it.
+    fn grown(&self, ray: u32, may_vote: &dyn Fn(u32) -> bool) -> Option<Object> {
+        let model = self.model;
+        let class = model.class_of(ray);
+        let start = self.most_probable(ray, class)?;
+        let mut best = object(model, self.lookout, vec![ray], start, Vec::new())?;
+        let range_m = class.farthest_m;
+        for _ in 0..ROUNDS {
+            let hits = self.index.hits_of_any(&super::assign::places_of(&best), best.class, range_m);
+            let mut votes: Vec<(u32, f64, u32)> = hits
+                .into_iter()
+                .filter(|hit| may_vote(hit.ray))
+                .map(|hit| {
+                    (hit.image, if hit.ray == ray { f64::INFINITY } else { gain_alone(model, &best, hit.ray) }, hit.ray)
+                })
+                .filter(|(_, gain, _)| *gain > 0.0)
+                .collect();
+            votes.sort_by(|a, b| a.0.cmp(&b.0).then(b.1.total_cmp(&a.1)).then(a.2.cmp(&b.2)));
+            votes.dedup_by_key(|vote| vote.0);
+            let mut votes: Vec<u32> = votes.into_iter().map(|vote| vote.2).collect();
+            votes.push(ray);
+            votes.sort_unstable();
+            votes.dedup();
+            if votes == best.votes {
+                break;
+            }
+            match object(model, self.lookout, votes, best.fit.point, Vec::new()) {
+                Some(more) if more.energy < best.energy => best = more,
+                _ => break,
+            }
+        }
+        let denser: f64 =
+            best.votes.iter().map(|&vote| class.clutter_by_elevation.at(model.sin_elevation[vote as usize])).sum();
+        best.energy +=
+            2.0 * (denser - class.company.at(self.sure[best.class as usize].nearness(&best.fit.point, None)));
+        (!self.beside.explains(model, &best)).then_some(best)
+    }
+
+    /// Where an object of a class most probably is on a ray: as high and as large as others.
+    fn most_probable(&self, ray: u32, class: &ClassModel) -> Option<Vector3<f64>> {
+        let (heights, up) = (class.heights.as_ref()?, self.model.up?);
+        let cast = self.model.scene.ray(ray);
+        let climb = cast.direction.dot(&up);
+        let ln_angle = self.model.ln_angle[ray as usize];
+        let (mean, sd) = class.sizes.object;
+        let sd = sd.hypot(class.sizes.spread);
+        let ln_density = |distance_m: f64| {
+            let away = (ln_angle + distance_m.ln() - mean) / sd;
+            let of_size = if class.sizes.tell() && away.is_finite() { -0.5 * away * away } else { 0.0 };
+            heights.ln_density(climb * distance_m) + 2.0 * distance_m.ln() + of_size
+        };
+        let nearest_m = self.model.settings.viability.min_range_m.max(class.farthest_m * 1e-3);
+        let steps = ((class.farthest_m / nearest_m).log10() * PLACES_PER_DECADE).ceil().max(1.0);
+        let places = (0..=steps as usize).map(|i| nearest_m * (class.farthest_m / nearest_m).powf(i as f64 / steps));
+        let best = places.map(|distance_m| (ln_density(distance_m), distance_m));
+        let (_, distance_m) = best.max_by(|a, b| a.0.total_cmp(&b.0))?;
+        Some(cast.center + cast.direction * distance_m)
+    }
+}
