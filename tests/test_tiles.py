@@ -25,7 +25,7 @@ from valuemap.errors import OutputError
 from valuemap.map_folder import Map
 from valuemap.portions import DatasetReader
 from valuemap.progress import silent
-from valuemap.robust import Noise, Scene, calibrate, find_labels
+from valuemap.robust import Calibration, Noise, Scene, calibrate, find_labels
 from valuemap.sightings import cast_sightings
 from valuemap.simulate import simulate
 from valuemap.tables import Candidates, Categories, Floats, Labels, Votes, table_to_arrow
@@ -44,7 +44,7 @@ from valuemap.tiles.store import hash_piece
 from valuemap.tiles.work import open_work, written
 
 GRID = Grid.of(Frame(), 60.0)
-# With all noise known nothing is calibrated.
+# With all noise known, only the classes are learned.
 KNOWN = MapConfig(detection_sigma_px=1.5, position_sigma_m=0.05, rotation_sigma_deg=0.05)
 
 
@@ -327,6 +327,10 @@ def crossing(passes: int) -> InOrder:
     return in_driving_order(dataset)
 
 
+def learned(piece: InOrder) -> Calibration:
+    return calibrate(Scene(piece.dataset, piece.drives, cast_sightings(piece.dataset)[0]), KNOWN)
+
+
 def test_a_dense_place_is_solved_some_drives_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     piece = crossing(12)
     most = len(piece.detection_id) // 4 + 1
@@ -336,9 +340,10 @@ def test_a_dense_place_is_solved_some_drives_at_a_time(monkeypatch: pytest.Monke
         sizes.append(len(scene._dataset.detections))
         return find_labels(scene, *args, **kwargs)
 
-    whole = solve_cell(piece, WHOLE, GRID, Noise(), KNOWN)
+    known = learned(piece)
+    whole = solve_cell(piece, WHOLE, GRID, known, KNOWN)
     monkeypatch.setattr("valuemap.tiles.solve.find_labels", counted)
-    split = solve_cell(piece, WHOLE, replace(GRID, most_detections=most), Noise(), KNOWN)
+    split = solve_cell(piece, WHOLE, replace(GRID, most_detections=most), known, KNOWN)
     assert len(sizes) >= 4
     assert max(sizes) <= most
     assert sum(sizes) == len(piece.detection_id)
@@ -525,8 +530,7 @@ def mapped_or_raises(dataset: Path, out: Path, *options: str) -> None:
 def test_what_was_made_with_other_settings_is_not_taken(long_street: Path, tmp_path: Path) -> None:
     with open_work(tmp_path / "work", resume=False) as work:
         source = InMemory(valuemap.read_dataset(long_street), KNOWN)
-        sample = source.sample()
-        known = calibrate(Scene(sample.dataset, sample.drives, cast_sightings(sample.dataset)[0]), KNOWN)
+        known = learned(source.sample())
         noisy = replace(known, noise=Noise(detection_px=3.0))
         first = solve_cells(source, known, KNOWN, ThreadEngine(1), silent, store=work / "cells")
         again = solve_cells(source, known, KNOWN, ThreadEngine(2), silent, store=work / "cells")

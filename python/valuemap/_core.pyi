@@ -87,6 +87,15 @@ def calibrate(
     threads: int,
     progress: Callable[[int, int], None],
 ) -> _Calibration: ...
+def misfit(
+    scene: Scene,
+    guess: _Noise,
+    known: list[bool],
+    settings: _Settings,
+    rays: NDArray[np.uint32] | None,
+    threads: int,
+    progress: Callable[[int, int], None],
+) -> tuple[float, NDArray[np.uint32]]: ...
 def find_labels(
     scene: Scene, calibration: _Calibration, settings: _Settings, threads: int, progress: Callable[[int, int], None]
 ) -> tuple[_Floats, tuple[_Offsets, _Indices], _Floats, _Floats, _Offsets, dict[str, float]]: ...

@@ -30,6 +30,7 @@ from valuemap.robust import Calibration, calibration_to_json
 from valuemap.system import peak_memory_mb
 from valuemap.tables import Labels, Votes
 from valuemap.tiles.calibration import calibrate
+from valuemap.tiles.compare import compare_poses
 from valuemap.tiles.mapping import loaded, solve_cells
 from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.seams import join_cells
@@ -179,9 +180,16 @@ def build_map_of_folder(
 
 
 def _refined(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, progress: Progress) -> Refined:
-    """Correct what whole drives' poses are proven wrong by."""
+    """Correct what whole drives' poses are proven wrong by, if that makes the same detections likelier."""
     with stages.measured("poses"):
-        return refine_poses(dataset, config, threads=threads, progress=progress)
+        refined = refine_poses(dataset, config, threads=threads, progress=progress)
+        if not refined.is_corrected:
+            return refined
+        before, after = compare_poses(dataset, refined.dataset, config, threads=threads, progress=progress)
+        record = {**refined.record, "misfit_before": round(before, 1), "misfit_after": round(after, 1)}
+        if after < before:
+            return replace(refined, record=record)
+        return Refined(dataset, {**record, "found": "nothing", "because": "the poses as given fit better"})
 
 
 def _note_on_poses(dataset: Dataset) -> str | None:

@@ -17,7 +17,7 @@ from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
-from valuemap.tables import Candidates, Floats
+from valuemap.tables import Candidates, Floats, Ints
 
 LEFT_OUT: set[str] = set()
 """Parts of the method to leave out: polish, merge, shared_noise. For the ablation benchmark; not a setting."""
@@ -148,6 +148,26 @@ def calibrate(scene: Scene, config: MapConfig, *, threads: int = 0, progress: Pr
         classes={name: tuple(row) for name, row in zip(scene.class_names, classes, strict=False) if row is not None},
         pooled=tuple(pooled),
     )
+
+
+def misfit(
+    scene: Scene, config: MapConfig, rays: Ints | None = None, *, threads: int = 0, progress: Progress = silent
+) -> tuple[float, Ints]:
+    """Return how badly some detections (rows, N) fit, those of a sample of places where none are given, and which.
+
+    Minus twice the logarithm of their likelihood, up to a constant of theirs. What is true makes them likelier.
+    """
+    guess, known = _guess(config.noise)
+    value, used = _core.misfit(
+        scene.core,
+        guess.as_tuple(),
+        known,
+        _settings(config),
+        None if rays is None else rays.astype(np.uint32),
+        threads,
+        lambda done, total: progress("comparing poses", done, total),
+    )
+    return value, used.astype(np.int64)
 
 
 _COUNTED_AS = {"recall": "detection_rate", "recall_concentration": "detection_rate_concentration"}

@@ -246,7 +246,7 @@ fn medians<'py>(
 #[pymodule]
 mod _core {
     #[pymodule_export]
-    use super::robust::{Scene, calibrate, find_labels, objects_of};
+    use super::robust::{Scene, calibrate, find_labels, misfit, objects_of};
     #[pymodule_export]
     use super::{Rays, medians, merge_labels, partition_images, see, unit_covariance, vote_in_clusters};
 }

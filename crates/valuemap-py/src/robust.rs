@@ -215,6 +215,33 @@ pub fn calibrate(
     Ok((noise, found.is_deep, classes, found.pooled.to_row()))
 }
 
+/// How badly rays fit, and which, `valuemap_core::robust::misfit`.
+#[pyfunction]
+#[allow(clippy::too_many_arguments)]
+pub fn misfit<'py>(
+    py: Python<'py>,
+    scene: &Scene,
+    guess: NoiseValues,
+    known: [bool; 3],
+    settings: SettingValues,
+    rays: Option<PyReadonlyArray1<'py, u32>>,
+    threads: usize,
+    progress: &Bound<'py, PyAny>,
+) -> PyResult<(f64, Bound<'py, PyArray1<u32>>)> {
+    let settings = settings_of(settings)?;
+    let guess = noise_of(guess)?;
+    let known = Known { detection: known[0], position: known[1], rotation: known[2] };
+    let rays = rays.map(|rays| rays.as_slice().map(<[u32]>::to_vec)).transpose()?;
+    let count = scene.0.rays.rays.len();
+    if rays.iter().flatten().any(|&ray| ray as usize >= count) || rays.iter().any(|rays| !rays.is_sorted_by(|a, b| a < b)) {
+        return Err(PyValueError::new_err(format!("rays: expected numbers below {count} in ascending order")));
+    }
+    let (value, rays) = with_progress(py, threads, 0, progress, |progress| {
+        valuemap_core::robust::misfit(&scene.0, &guess, known, &settings, rays, progress)
+    })?;
+    Ok((value, rays.into_pyarray(py)))
+}
+
 /// Positions, voters, covariances (N, 9), existence, expected images, and counts.
 type Found<'py> = (
     Bound<'py, PyArray2<f64>>,

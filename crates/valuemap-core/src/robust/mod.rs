@@ -198,25 +198,8 @@ fn likeliest_noise(
     more: &[u32],
     progress: &Progress,
 ) -> Result<Noise, Halt> {
-    let settings = Settings { gate_sigmas: settings.gate_sigmas * CALIBRATION_GATE, ..*settings };
-    let round = |noise: &Noise, rays: &[u32]| {
-        let mut model = Model::new(scene, noise, &settings);
-        let begun = initial::labels_of_few(&model, rays, progress)?;
-        let objects = search(&mut model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
-        let again = calibrate::calibrate(scene, noise, &placed(&objects), known);
-        Ok((likelihood(&model, &objects, rays), again))
-    };
-    // From each start some steps: it takes one to learn what passes disagree about, and another to see what that explains.
     let few = sample::places(scene, CALIBRATION_RAYS.0, settings.viability.max_range_m);
-    let mut likeliest = Likeliest::default();
-    for factor in STARTS {
-        let mut noise = guess.scaled(factor, known);
-        for _ in 0..CALIBRATION_ROUNDS {
-            let (value, again) = round(&noise, &few)?;
-            likeliest.offer(value, noise);
-            noise = again;
-        }
-    }
+    let likeliest = Likeliest::of_starts(scene, guess, known, settings, &few, progress)?;
     // What more rays tell is taken if it makes them likelier.
     let mut noise = likeliest.noise.unwrap_or(*guess);
     if more.len() == few.len() {
@@ -224,11 +207,47 @@ fn likeliest_noise(
     }
     let mut likeliest = Likeliest::default();
     for _ in 0..2 {
-        let (value, again) = round(&noise, more)?;
+        let (value, again) = round(scene, &noise, known, settings, more, progress)?;
         likeliest.offer(value, noise);
         noise = again;
     }
     Ok(likeliest.noise.unwrap_or(noise))
+}
+
+/// Minus twice the logarithm of how likely some rays are with the noise that makes them likeliest, up to a constant of these rays; of a sample of
+/// places where none are given, and which. It compares poses: what is true makes the same rays likelier.
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn misfit(
+    scene: &Scene,
+    guess: &Noise,
+    known: Known,
+    settings: &Settings,
+    rays: Option<Vec<u32>>,
+    progress: &Progress,
+) -> Result<(f64, Vec<u32>), Halt> {
+    let range_m = settings.viability.max_range_m;
+    let rays = rays.unwrap_or_else(|| sample::places(scene, CALIBRATION_RAYS.0, range_m));
+    let likeliest = Likeliest::of_starts(scene, guess, known, settings, &rays, progress)?;
+    Ok((likeliest.value, rays))
+}
+
+/// One step: how likely some rays are with a noise, and the noise that is estimated from the map that it makes.
+fn round(
+    scene: &Scene,
+    noise: &Noise,
+    known: Known,
+    settings: &Settings,
+    rays: &[u32],
+    progress: &Progress,
+) -> Result<(f64, Noise), Halt> {
+    let settings = Settings { gate_sigmas: settings.gate_sigmas * CALIBRATION_GATE, ..*settings };
+    let mut model = Model::new(scene, noise, &settings);
+    let begun = initial::labels_of_few(&model, rays, progress)?;
+    let objects = search(&mut model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
+    let again = calibrate::calibrate(scene, noise, &placed(&objects), known);
+    Ok((likelihood(&model, &objects, rays), again))
 }
 
 /// The noise that makes the same rays likeliest so far.
@@ -239,6 +258,27 @@ struct Likeliest {
 }
 
 impl Likeliest {
+    /// From each start some steps: it takes one to learn what passes disagree about, and another to see what that explains.
+    fn of_starts(
+        scene: &Scene,
+        guess: &Noise,
+        known: Known,
+        settings: &Settings,
+        rays: &[u32],
+        progress: &Progress,
+    ) -> Result<Self, Halt> {
+        let mut likeliest = Self::default();
+        for factor in STARTS {
+            let mut noise = guess.scaled(factor, known);
+            for _ in 0..CALIBRATION_ROUNDS {
+                let (value, again) = round(scene, &noise, known, settings, rays, progress)?;
+                likeliest.offer(value, noise);
+                noise = again;
+            }
+        }
+        Ok(likeliest)
+    }
+
     /// Keep a noise if it is likelier, `value` minus twice the logarithm.
     fn offer(&mut self, value: f64, noise: Noise) {
         if self.noise.is_none() || value < self.value {

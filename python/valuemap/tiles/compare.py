@@ -1,0 +1,37 @@
+"""Which of two sets of poses explains the same detections better: by the score that maps are made with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from valuemap.config import MapConfig
+from valuemap.dataset import Dataset, rows_of
+from valuemap.drives import InOrder, in_driving_order
+from valuemap.progress import Progress
+from valuemap.robust import Scene, misfit
+from valuemap.sightings import cast_sightings
+from valuemap.tiles.piece import piece_of_rows
+from valuemap.tiles.source import VIEWPOINT_SHARE, InMemory
+
+
+def compare_poses(
+    before: Dataset, after: Dataset, config: MapConfig, *, threads: int, progress: Progress
+) -> tuple[float, float]:
+    """Return how badly the detections of a sample fit the poses of both datasets, each with its likeliest noise.
+
+    Minus twice the logarithm of their likelihood, up to one constant. The datasets have the same images and detections.
+    """
+    old = InMemory(before, config).sample()
+    scene = Scene(old.dataset, old.drives, cast_sightings(old.dataset)[0])
+    of_old, rays = misfit(scene, config, threads=threads, progress=progress)
+    new = _same_images(after, old, config)
+    scene = Scene(new.dataset, new.drives, cast_sightings(new.dataset)[0])
+    same = np.sort(rows_of(old.detection_id[rays], new.detection_id))
+    of_new, _ = misfit(scene, config, same, threads=threads, progress=progress)
+    return of_old, of_new
+
+
+def _same_images(dataset: Dataset, like: InOrder, config: MapConfig) -> InOrder:
+    """Return the images that something holds, in driving order, from another dataset of the same images."""
+    ordered = in_driving_order(dataset, viewpoint_step_m=config.vote.max_range_m * VIEWPOINT_SHARE)
+    return piece_of_rows(ordered, np.flatnonzero(np.isin(ordered.image_id, like.image_id)))
