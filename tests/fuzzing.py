@@ -452,7 +452,16 @@ def _border_of_scene(
         classes = [random.choice([None, row, [1.0]]) for _ in range(random.randrange(3))]
         call(_core.find_labels, scene, (noise, random.random() < 0.5, classes, row), settings, 1, quiet)
     elif which == 1:
-        call(_core.calibrate, scene, noise, [random.random() < 0.5 for _ in range(3)], settings, 1, quiet)
+        call(
+            _core.calibrate,
+            scene,
+            noise,
+            [random.random() < 0.5 for _ in range(3)],
+            settings,
+            random.random() < 0.5,
+            1,
+            quiet,
+        )
     else:
         call(_core.objects_of, scene, noise, settings, points, offsets, voters, random.random() < 0.5, 1, quiet)
 

@@ -84,6 +84,7 @@ def calibrate(
     guess: _Noise,
     known: list[bool],
     settings: _Settings,
+    is_part: bool,
     threads: int,
     progress: Callable[[int, int], None],
 ) -> _Calibration: ...

@@ -127,10 +127,12 @@ class Scene:
         )
 
 
-def calibrate(scene: Scene, config: MapConfig, *, threads: int = 0, progress: Progress = silent) -> Calibration:
+def calibrate(
+    scene: Scene, config: MapConfig, *, is_part: bool = False, threads: int = 0, progress: Progress = silent
+) -> Calibration:
     """Estimate the noise from the residuals of labels in a sample of places, and learn what its classes are like.
 
-    What the config sets of the noise stays as it is.
+    What the config sets of the noise stays as it is. The scene may be a part of what is mapped.
     """
     guess, known = _guess(config.noise)
     noise, is_deep, classes, pooled = _core.calibrate(
@@ -138,6 +140,7 @@ def calibrate(scene: Scene, config: MapConfig, *, threads: int = 0, progress: Pr
         guess.as_tuple(),
         known,
         _settings(config),
+        is_part,
         threads,
         lambda done, total: progress("estimating the noise", done, total),
     )

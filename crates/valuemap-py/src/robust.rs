@@ -185,12 +185,14 @@ fn calibration_of((noise, is_deep, classes, pooled): CalibrationValues) -> PyRes
 
 /// Estimate the noise from the data and learn the classes, `valuemap_core::robust::self_calibrate`.
 #[pyfunction]
+#[allow(clippy::too_many_arguments)]
 pub fn calibrate(
     py: Python<'_>,
     scene: &Scene,
     guess: NoiseValues,
     known: [bool; 3],
     settings: SettingValues,
+    is_part: bool,
     threads: usize,
     progress: &Bound<'_, PyAny>,
 ) -> PyResult<CalibrationValues> {
@@ -198,7 +200,7 @@ pub fn calibrate(
     let guess = noise_of(guess)?;
     let known = Known { detection: known[0], position: known[1], rotation: known[2] };
     let found = with_progress(py, threads, 0, progress, |progress| {
-        self_calibrate(&scene.0, &guess, known, &settings, progress)
+        self_calibrate(&scene.0, &guess, known, &settings, is_part, progress)
     })?;
     let noise = &found.noise;
     let noise = [
@@ -233,7 +235,9 @@ pub fn misfit<'py>(
     let known = Known { detection: known[0], position: known[1], rotation: known[2] };
     let rays = rays.map(|rays| rays.as_slice().map(<[u32]>::to_vec)).transpose()?;
     let count = scene.0.rays.rays.len();
-    if rays.iter().flatten().any(|&ray| ray as usize >= count) || rays.iter().any(|rays| !rays.is_sorted_by(|a, b| a < b)) {
+    if rays.iter().flatten().any(|&ray| ray as usize >= count)
+        || rays.iter().any(|rays| !rays.is_sorted_by(|a, b| a < b))
+    {
         return Err(PyValueError::new_err(format!("rays: expected numbers below {count} in ascending order")));
     }
     let (value, rays) = with_progress(py, threads, 0, progress, |progress| {

@@ -15,6 +15,7 @@ from valuemap.robust import Calibration, Scene, calibration_from_json, calibrati
 from valuemap.robust import calibrate as calibrate_scene
 from valuemap.sightings import cast_sightings
 from valuemap.tiles.grid import WHOLE
+from valuemap.tiles.sample import SAMPLE_DETECTIONS
 from valuemap.tiles.source import Source
 from valuemap.tiles.store import hash_piece
 from valuemap.tiles.work import written
@@ -32,11 +33,12 @@ def calibrate(
     if given is not None:
         return given
     sample = source.sample()
+    is_part = source.cells != [WHOLE] and len(sample.detection_id) >= SAMPLE_DETECTIONS
     if work is None:
-        return _estimated(sample, config, engine, progress)
+        return _estimated(sample, is_part, config, engine, progress)
     file = work / f"calibration.{hash_piece(sample, WHOLE, source.grid, None, config)}.json"
     if not file.is_file():
-        calibration = _estimated(sample, config, engine, progress)
+        calibration = _estimated(sample, is_part, config, engine, progress)
         with written(file) as temporary:
             temporary.write_text(json.dumps(calibration_to_json(calibration)), encoding="utf-8")
     return calibration_from_json(json.loads(file.read_text(encoding="utf-8")), source=str(file))
@@ -53,6 +55,7 @@ def read_calibration(path: Path) -> Calibration:
     return calibration_from_json(read_json(file), source=str(file))
 
 
-def _estimated(sample: InOrder, config: MapConfig, engine: Engine, progress: Progress) -> Calibration:
+def _estimated(sample: InOrder, is_part: bool, config: MapConfig, engine: Engine, progress: Progress) -> Calibration:
     scene = Scene(sample.dataset, sample.drives, cast_sightings(sample.dataset)[0])
-    return calibrate_scene(scene, config, threads=engine.threads_of_task(1), progress=progress)
+    threads = engine.threads_of_task(1)
+    return calibrate_scene(scene, config, is_part=is_part, threads=threads, progress=progress)

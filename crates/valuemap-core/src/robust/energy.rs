@@ -246,24 +246,9 @@ pub fn object(
     let first = *votes.first()?;
     let class = model.class_of(first);
     let fit = fit(model, &votes, start)?;
-    let ln_size = size_of(model, &votes, &fit.point);
+    let (of_votes, ln_size) = energy_of_votes(model, &votes, &fit);
     let seen = lookout.looks(model, &fit.point, &votes, &others);
-    let n = votes.len() as f64;
-    let ln_2_pi = (2.0 * PI).ln();
-    let clutter: f64 = votes.iter().map(|&ray| model.ln_clutter_per_px2(ray)).sum();
-    let sizes: f64 = votes
-        .iter()
-        .map(|&ray| {
-            let depth_m = model.scene.ray(ray).project(&fit.point).z;
-            class.sizes.log_ratio(model.ln_angle[ray as usize], depth_m, ln_size) + model.ln_score_ratio(ray)
-        })
-        .sum();
-    let of_size = prior_of_size(&class.sizes, ln_size);
-    let looks = seen.ln_likelihood(class);
-    let energy = fit.energy + 2.0 * n * ln_2_pi
-        - 3.0 * ln_2_pi
-        - 2.0 * class.ln_births(height_m(model.scene, model.up, &votes, &fit.point))
-        + 2.0 * (clutter - sizes - of_size - looks);
+    let energy = of_votes - 2.0 * seen.ln_likelihood(class);
     let real = seen.real(class);
     energy.is_finite().then(|| Object {
         class: model.scene.rays.class[first as usize],
@@ -275,6 +260,27 @@ pub fn object(
         real,
         energy,
     })
+}
+
+/// J of an object but for the looks at it, equations (1) to (4), of which it is not less; and the logarithm of its size, m.
+#[must_use]
+pub fn energy_of_votes(model: &Model<'_>, votes: &[u32], fit: &Fit) -> (f64, f64) {
+    let class = model.class_of(votes[0]);
+    let ln_size = size_of(model, votes, &fit.point);
+    let n = votes.len() as f64;
+    let ln_2_pi = (2.0 * PI).ln();
+    let clutter: f64 = votes.iter().map(|&ray| model.ln_clutter_per_px2(ray)).sum();
+    let sizes: f64 = votes
+        .iter()
+        .map(|&ray| {
+            let depth_m = model.scene.ray(ray).project(&fit.point).z;
+            class.sizes.log_ratio(model.ln_angle[ray as usize], depth_m, ln_size) + model.ln_score_ratio(ray)
+        })
+        .sum();
+    let of_size = prior_of_size(&class.sizes, ln_size);
+    let births = class.ln_births(height_m(model.scene, model.up, votes, &fit.point));
+    let energy = fit.energy + 2.0 * n * ln_2_pi - 3.0 * ln_2_pi - 2.0 * births + 2.0 * (clutter - sizes - of_size);
+    (energy, ln_size)
 }
 
 /// Logarithm of how probable a size is among the objects of a class, beside that of a typical one.

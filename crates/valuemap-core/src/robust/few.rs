@@ -7,9 +7,9 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use super::assign::gain_alone;
+use super::assign::{gain_alone, places_of};
 use super::company::Sure;
-use super::energy::{Object, by_place, object};
+use super::energy::{Object, by_place, energy_of_votes, fit, object};
 use super::index::RayIndex;
 use super::looks::Lookout;
 use super::model::{ClassModel, Model};
@@ -17,6 +17,8 @@ use crate::progress::{Halt, Progress};
 
 /// Places along a ray that are compared: so many to a factor of ten in distance are 8 % apart, less than what sizes tell.
 const PLACES_PER_DECADE: f64 = 30.0;
+/// What is less probable than one in a hundred is not asked about: even all of it would be few.
+const LEAST_LN_ODDS: f64 = -4.6;
 /// Times that an object gathers votes and is estimated again, at most.
 const ROUNDS: usize = 3;
 
@@ -116,24 +118,12 @@ impl Nursery<'_> {
         let model = self.model;
         let class = model.class_of(ray);
         let start = self.most_probable(ray, class)?;
+        if !self.may_be(ray, class, start) {
+            return None;
+        }
         let mut best = object(model, self.lookout, vec![ray], start, Vec::new())?;
-        let range_m = class.farthest_m;
         for _ in 0..ROUNDS {
-            let hits = self.index.hits_of_any(&super::assign::places_of(&best), best.class, range_m);
-            let mut votes: Vec<(u32, f64, u32)> = hits
-                .into_iter()
-                .filter(|hit| may_vote(hit.ray))
-                .map(|hit| {
-                    (hit.image, if hit.ray == ray { f64::INFINITY } else { gain_alone(model, &best, hit.ray) }, hit.ray)
-                })
-                .filter(|(_, gain, _)| *gain > 0.0)
-                .collect();
-            votes.sort_by(|a, b| a.0.cmp(&b.0).then(b.1.total_cmp(&a.1)).then(a.2.cmp(&b.2)));
-            votes.dedup_by_key(|vote| vote.0);
-            let mut votes: Vec<u32> = votes.into_iter().map(|vote| vote.2).collect();
-            votes.push(ray);
-            votes.sort_unstable();
-            votes.dedup();
+            let votes = self.votes_of(&best, ray, may_vote);
             if votes == best.votes {
                 break;
             }
@@ -142,11 +132,53 @@ impl Nursery<'_> {
                 _ => break,
             }
         }
-        let denser: f64 =
-            best.votes.iter().map(|&vote| class.clutter_by_elevation.at(model.sin_elevation[vote as usize])).sum();
-        best.energy +=
-            2.0 * (denser - class.company.at(self.sure[best.class as usize].nearness(&best.fit.point, None)));
+        let seen = self.lookout.looks_of_few(model, &best.fit.point, &best.votes);
+        best.energy += 2.0 * (best.seen.ln_likelihood(class) - seen.ln_likelihood(class));
+        best.energy -= 2.0 * self.ln_density(class, best.class, &best.votes, &best.fit.point);
+        (best.real, best.seen) = (seen.real(class), seen);
         (!self.beside.explains(model, &best)).then_some(best)
+    }
+
+    /// The ray, and those that an object has from other images, one of each.
+    fn votes_of(&self, object: &Object, ray: u32, may_vote: &dyn Fn(u32) -> bool) -> Vec<u32> {
+        let model = self.model;
+        let hits = self.index.hits_of_any(&places_of(object), object.class, model.class_of(ray).farthest_m);
+        let mut votes: Vec<(u32, f64, u32)> = hits
+            .into_iter()
+            .filter(|hit| may_vote(hit.ray))
+            .map(|hit| {
+                (hit.image, if hit.ray == ray { f64::INFINITY } else { gain_alone(model, object, hit.ray) }, hit.ray)
+            })
+            .filter(|(_, gain, _)| *gain > 0.0)
+            .collect();
+        votes.sort_by(|a, b| a.0.cmp(&b.0).then(b.1.total_cmp(&a.1)).then(a.2.cmp(&b.2)));
+        votes.dedup_by_key(|vote| vote.0);
+        let mut votes: Vec<u32> = votes.into_iter().map(|vote| vote.2).chain([ray]).collect();
+        votes.sort_unstable();
+        votes.dedup();
+        votes
+    }
+
+    /// Whether there can be an object on a ray, before images are asked who sees it: alone, if it had been expected nowhere else, or with others
+    /// where such objects are not ruled out.
+    fn may_be(&self, ray: u32, class: &ClassModel, start: Vector3<f64>) -> bool {
+        let model = self.model;
+        let [of_one, of_others @ ..] = class.ln_odds_of_few;
+        if of_others.iter().any(|&ln_odds| ln_odds > LEAST_LN_ODDS) {
+            return true;
+        }
+        fit(model, &[ray], start).is_some_and(|fit| {
+            let (energy, _) = energy_of_votes(model, &[ray], &fit);
+            let density = self.ln_density(class, model.scene.rays.class[ray as usize], &[ray], &fit.point);
+            of_one + density - 0.5 * energy > LEAST_LN_ODDS
+        })
+    }
+
+    /// How much denser objects are at a place, with the company they have there, than clutter is at the elevations of some rays, in logarithms.
+    fn ln_density(&self, learned: &ClassModel, class: u32, votes: &[u32], place: &Vector3<f64>) -> f64 {
+        let sines = votes.iter().map(|&vote| self.model.sin_elevation[vote as usize]);
+        let clutter: f64 = sines.map(|sine| learned.clutter_by_elevation.at(sine)).sum();
+        learned.company.at(self.sure[class as usize].nearness(place, None)) - clutter
     }
 
     /// Where an object of a class most probably is on a ray: as high and as large as others.

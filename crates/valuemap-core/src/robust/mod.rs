@@ -53,6 +53,7 @@ use looks::Lookout;
 use model::{ClassModel, Model, Rates};
 use noise::{Noise, Spread};
 use rayon::prelude::*;
+use rustc_hash::FxHashMap;
 use scene::Scene;
 use search::{Depth, search};
 
@@ -92,8 +93,10 @@ const CALIBRATION_GATE: f64 = 1.4;
 const CALIBRATION_ROUNDS: usize = 3;
 /// The noise is sought from starts that differ by these factors.
 const STARTS: [f64; 5] = [0.15, 0.5, 1.5, 5.0, 15.0];
-/// Scenes with more rays than this are searched less deeply.
+/// Scenes with more rays than this are searched less deeply, if that changes little.
 const MOST_RAYS: usize = 100_000;
+/// All moves pay if they change more of the objects than this: a sample of some dozen tells no less.
+const LEAST_CHANGE: f64 = 0.05;
 
 /// What is estimated once of a scene, or of a sample of it, before any part of it is mapped.
 #[derive(Debug, Clone)]
@@ -151,6 +154,7 @@ pub struct Findings {
 
 /// Estimate the noise from the data, starting from a guess: labels of a sample of places with the noise as it is thought
 /// to be, then the noise that makes their residuals most likely, and again. `known` parts stay as they are. Then learn the classes.
+/// All moves pay where a scene is small; if it `is_part` of a larger one, where they change the map of a sample.
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
@@ -159,6 +163,7 @@ pub fn self_calibrate(
     guess: &Noise,
     known: Known,
     settings: &Settings,
+    is_part: bool,
     progress: &Progress,
 ) -> Result<Calibration, Halt> {
     let more = sample::places(scene, CALIBRATION_RAYS.1, settings.viability.max_range_m);
@@ -169,13 +174,35 @@ pub fn self_calibrate(
     };
     let mut model = Model::new(scene, &noise, settings);
     let wide = sample::places(scene, CALIBRATION_RAYS.1, WIDE * settings.viability.max_range_m);
-    learn_from(&mut model, &wide, progress)?;
-    let is_deep = scene.usable_rays().len() <= MOST_RAYS;
+    let objects = learn_from(&mut model, &wide, progress)?;
+    let is_small = !is_part && scene.usable_rays().len() <= MOST_RAYS;
+    let is_deep = is_small || {
+        let deeper = search(&mut model, &wide, placed(&objects), Depth::Deep, false, &mut Tally::default(), progress)?;
+        changed_share(&objects, &deeper) > LEAST_CHANGE
+    };
     Ok(Calibration { noise, classes: model.classes.iter().copied().map(Some).collect(), pooled: model.pooled, is_deep })
 }
 
-/// Learn the classes of a model from the map of some rays.
-fn learn_from(model: &mut Model<'_>, rays: &[u32], progress: &Progress) -> Result<(), Halt> {
+/// The share of the objects of two maps of the same rays that are not in both: with half of their votes.
+fn changed_share(some: &[Object], others: &[Object]) -> f64 {
+    let owners = |objects: &[Object]| -> FxHashMap<u32, usize> {
+        objects.iter().enumerate().flat_map(|(i, object)| object.votes.iter().map(move |&ray| (ray, i))).collect()
+    };
+    let lost = |objects: &[Object], owner: &FxHashMap<u32, usize>| {
+        let is_lost = |object: &&Object| {
+            let mut of: Vec<usize> = object.votes.iter().filter_map(|ray| owner.get(ray).copied()).collect();
+            of.sort_unstable();
+            let most = of.chunk_by(|a, b| a == b).map(<[usize]>::len).max().unwrap_or(0);
+            2 * most < object.votes.len()
+        };
+        objects.iter().filter(is_lost).count()
+    };
+    let lost = lost(some, &owners(others)) + lost(others, &owners(some));
+    lost as f64 / (some.len() + others.len()).max(1) as f64
+}
+
+/// Learn the classes of a model from the map of some rays, and return that.
+fn learn_from(model: &mut Model<'_>, rays: &[u32], progress: &Progress) -> Result<Vec<Object>, Halt> {
     let begun = initial::labels_of_few(model, rays, progress)?;
     let objects = search(model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
     let lookout = Lookout::new(model.scene, model.settings.viability.max_range_m);
@@ -186,7 +213,7 @@ fn learn_from(model: &mut Model<'_>, rays: &[u32], progress: &Progress) -> Resul
         [&objects, &few].map(|all| all.iter().filter(|object| is_whole(object)).cloned().collect::<Vec<Object>>())
     };
     counts::learn_counts(model, &whole[0], &whole[1]);
-    Ok(())
+    Ok(objects)
 }
 
 /// The noise that makes the rays of some places likeliest, `more` and some of them.
