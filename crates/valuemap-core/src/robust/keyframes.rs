@@ -13,8 +13,6 @@ use crate::ray::Rays;
 
 /// Of the images of one camera and pass, the first of each stretch of this length is kept, m driven.
 const STRETCH_M: f64 = 4.0;
-/// Scenes with fewer rays take seconds as they are.
-const MIN_RAYS: usize = 100_000;
 /// If more than this share of the rays would stay, it is not worth it.
 const MOST_LEFT: f64 = 0.5;
 
@@ -29,14 +27,11 @@ pub struct Keyframes {
 }
 
 impl Keyframes {
-    /// Choose them; nothing if the scene is small, or if most rays would stay.
+    /// Choose them; nothing if most rays would stay.
     #[must_use]
     pub fn of(scene: &Scene) -> Option<Self> {
-        if scene.rays.rays.len() < MIN_RAYS {
-            return None;
-        }
         let keyframes = Self::every(scene, STRETCH_M);
-        let left = keyframes.rays.len() as f64 / scene.rays.rays.len() as f64;
+        let left = keyframes.rays.len() as f64 / scene.rays.rays.len().max(1) as f64;
         (left <= MOST_LEFT).then_some(keyframes)
     }
 

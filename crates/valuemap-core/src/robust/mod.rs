@@ -107,7 +107,7 @@ pub struct Calibration {
     pub classes: Vec<Option<ClassModel>>,
     /// What is learned of all classes together: what others are like.
     pub pooled: ClassModel,
-    /// Whether all moves pay.
+    /// Whether all moves pay, from all images.
     pub is_deep: bool,
 }
 
@@ -345,7 +345,7 @@ pub fn find(
     let noise = &calibration.noise;
     let mut model = Model::new(scene, noise, settings);
     model.know(&calibration.classes, calibration.pooled);
-    let (begun, first) = initial::labels(&model, progress)?;
+    let (begun, first) = initial::labels(&model, !calibration.is_deep, progress)?;
     let mut tally =
         Tally { hypotheses: first.nominations, births: first.accepted, deaths: first.doubted + first.outvoted };
     let depth = if calibration.is_deep { Depth::Deep } else { Depth::Shallow };

@@ -74,13 +74,13 @@ pub fn labels_of_few(model: &Model<'_>, rays: &[u32], progress: &Progress) -> Re
     Ok(begun(labels))
 }
 
-/// The labels of a scene, and how it came to them.
+/// The labels of a scene, and how it came to them; those of a part of the images decide which there are if it `is_quick`.
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
-pub fn labels(model: &Model<'_>, progress: &Progress) -> Result<(Vec<Begun>, Tally), Halt> {
+pub fn labels(model: &Model<'_>, is_quick: bool, progress: &Progress) -> Result<(Vec<Begun>, Tally), Halt> {
     let mut tally = Tally::default();
-    let keyframes = Keyframes::of(model.scene);
+    let keyframes = is_quick.then(|| Keyframes::of(model.scene)).flatten();
     let first = match &keyframes {
         Some(keyframes) => {
             let thinned = Model::new(&keyframes.scene, model.noise, model.settings);
