@@ -62,7 +62,7 @@ def join_cells(solved: Sequence[Solved], grid: Grid, config: MapConfig) -> tuple
         label_of_vote=votes.label_id - 1 + np.repeat(before, [len(cell.votes) for cell in solved]),
         detection_id=votes.detection_id,
     )
-    is_kept, has_vote, counts = _decide(rows, min(config.vote.min_votes, config.existence.least_votes))
+    is_kept, has_vote, counts = _decide(rows, config.vote.min_votes)
     vote_pass = np.concatenate([cell.vote_pass for cell in solved])
     has_vote &= is_kept[rows.label_of_vote]
     lost = np.bincount(rows.label_of_vote[~has_vote], minlength=len(labels)) > 0
@@ -108,7 +108,7 @@ def _decide(rows: _Rows, min_votes: int) -> tuple[Bools, Bools, dict[str, int]]:
     has_vote[vote[again]] = False
     counts["votes_of_two_labels"] = len(again)
     left = np.bincount(rows.label_of_vote[has_vote], minlength=len(is_kept))
-    outvoted = is_kept & (left < min_votes)
+    outvoted = is_kept & (left < np.minimum(rows.votes, min_votes))
     counts["labels_outvoted_at_seams"] = int(outvoted.sum())
     return is_kept & ~outvoted, has_vote, counts
 

@@ -9,6 +9,7 @@ use rstar::primitives::GeomWithData;
 
 use super::clutter::{Steps, score_ratio};
 use super::energy::Object;
+use super::heights::level_axes;
 use super::model::{ClassModel, Model};
 
 /// Votes that make an object sure.
@@ -47,8 +48,7 @@ pub fn company(model: &Model<'_>, objects: &[Object], learned: &ClassModel, clas
     let sure = Sure::of(objects, class);
     let of_objects: Vec<f64> =
         sure.0.iter().map(|object| sure.nearness(&Vector3::from(*object.geom()), Some(object.data))).collect();
-    let ahead = if up.x.abs() < 0.9 { up.cross(&Vector3::x()) } else { up.cross(&Vector3::y()) }.normalize();
-    let aside = up.cross(&ahead);
+    let [ahead, aside] = level_axes(model.scene, &up);
     let views = &model.scene.views;
     let mut of_ground = Vec::new();
     for view in views.iter().step_by(views.len().div_ceil(MOST_VIEWS).max(1)) {

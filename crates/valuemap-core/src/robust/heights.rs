@@ -5,11 +5,10 @@
 
 use std::f64::consts::PI;
 
-use nalgebra::{Rotation3, Vector3};
+use nalgebra::Vector3;
 use rustc_hash::FxHashSet;
 
 use super::scene::Scene;
-use crate::robust::sample::cell_of;
 
 /// Normal distributions that are tried, at most.
 const MOST_PARTS: usize = 3;
@@ -160,20 +159,26 @@ pub fn up_of(scene: &Scene) -> Option<Vector3<f64>> {
     (mean.norm() > AGREEING).then(|| mean.normalize())
 }
 
+/// Two level directions at right angles, of which the first is where the first camera looks: they move with the world.
+#[must_use]
+pub fn level_axes(scene: &Scene, up: &Vector3<f64>) -> [Vector3<f64>; 2] {
+    let level = |axis: Vector3<f64>| axis - up * axis.dot(up);
+    let axes = scene.views.first().map(|view| [2, 0].map(|row| level(view.cam_from_world.row(row).transpose())));
+    let longest = axes.into_iter().flatten().max_by(|a, b| a.norm_squared().total_cmp(&b.norm_squared()));
+    let ahead = longest.unwrap_or_else(|| level(Vector3::x())).normalize();
+    [ahead, up.cross(&ahead)]
+}
+
 /// The ground within a distance of any camera, m², in cells of a quarter of the distance.
 #[must_use]
 pub fn ground_m2(scene: &Scene, up: &Vector3<f64>, distance_m: f64) -> f64 {
     const CELLS: i64 = 4;
     let side_m = distance_m / CELLS as f64;
-    let level = Rotation3::rotation_between(up, &Vector3::z()).unwrap_or_else(Rotation3::identity);
-    let places: FxHashSet<[i64; 2]> = scene
-        .views
-        .iter()
-        .map(|view| {
-            let [x, y, _] = cell_of(&(level * view.center), side_m);
-            [x, y]
-        })
-        .collect();
+    let axes = level_axes(scene, up);
+    let Some(first) = scene.views.first() else { return 0.0 };
+    let place =
+        |center: &Vector3<f64>| axes.map(|axis| (axis.dot(&(center - first.center)) / side_m + 0.5).floor() as i64);
+    let places: FxHashSet<[i64; 2]> = scene.views.iter().map(|view| place(&view.center)).collect();
     let around: Vec<[i64; 2]> = (-CELLS..=CELLS)
         .flat_map(|x| (-CELLS..=CELLS).map(move |y| [x, y]))
         .filter(|[x, y]| x * x + y * y <= CELLS * CELLS)

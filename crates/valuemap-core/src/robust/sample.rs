@@ -136,7 +136,7 @@ fn cells_around(center: &Vector3<f64>, side_m: f64) -> impl Iterator<Item = [i64
     (0..27).map(move |step| [x + step / 9 - 1, y + step / 3 % 3 - 1, z + step % 3 - 1])
 }
 
-pub(super) fn cell_of(center: &Vector3<f64>, side_m: f64) -> [i64; 3] {
+fn cell_of(center: &Vector3<f64>, side_m: f64) -> [i64; 3] {
     [0, 1, 2].map(|axis| (center[axis] / side_m).floor() as i64)
 }
 
