@@ -122,12 +122,15 @@ def test_cells_on_disk_get_the_poses_that_were_corrected(tmp_path: Path, monkeyp
 
 def test_what_is_too_large_to_be_looked_at_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_dataset(simulate(dataclasses.replace(CITY, passes_per_street=1), seed=1), tmp_path / "data")
-    monkeypatch.setattr(pipeline, "LARGEST_IN_MEMORY", 100)
-    with open_work(tmp_path / "work", resume=False) as work:
-        run = pipeline.Run(work, ThreadEngine(1))
-        result, _ = pipeline.build_map_of_folder(tmp_path / "data", valuemap.MapConfig(), run)
-    assert "larger than memory" in result.run["poses"]["because"]
-    assert "poses" in result.run["notes"][0]
+    monkeypatch.setattr(pipeline, "MOST_CORRECTED", 100)
+    results = [valuemap.build_map(valuemap.read_dataset(tmp_path / "data"), valuemap.MapConfig())]
+    for tile_size_m in (None, 500.0):
+        with open_work(tmp_path / f"work{tile_size_m}", resume=False) as work:
+            run = pipeline.Run(work, ThreadEngine(1), tile_size_m=tile_size_m)
+            results.append(pipeline.build_map_of_folder(tmp_path / "data", valuemap.MapConfig(), run)[0])
+    for result in results:
+        assert "large dataset" in result.run["poses"]["because"]
+        assert "poses" in result.run["notes"][0]
 
 
 def test_drives_alone_tell_how_their_cameras_are_turned() -> None:

@@ -40,7 +40,9 @@ from valuemap.vote import vote_in_clusters
 
 LARGEST_IN_MEMORY = 2_000_000
 """Datasets with more images and detections are cut into pieces on disk: about 2 GB."""
-_TOO_LARGE = "larger than memory: poses were taken as they are"
+MOST_CORRECTED = 300_000
+"""Poses are looked at in datasets of no more images and detections: a minute or two."""
+_TOO_LARGE = "large dataset: poses were taken as they are"
 _NOTE_ON_SIZE = (
     "the dataset is larger than what poses are looked at of: they were taken as they are (map a part of it to learn "
     "what whole drives are off by; correct_poses=0 says that this is known)"
@@ -159,7 +161,7 @@ def build_map_of_folder(
         size = {"images": len(dataset.images), "detections": len(dataset.detections)}
         name, frame, note = dataset.name, dataset.frame, _note_on_poses(dataset)
     else:
-        if images + detections <= LARGEST_IN_MEMORY and detections:
+        if images + detections <= MOST_CORRECTED and detections:
             refined = _refined(ensure_checked(read_dataset(folder)), config, stages, threads, progress)
             if refined.is_corrected:
                 folder = run.work / CORRECTED
@@ -167,12 +169,11 @@ def build_map_of_folder(
         with stages.measured("partition"):
             on_disk = partition_dataset(folder, run.work, config, tile_size_m=run.tile_size_m, progress=progress)
         source, name, frame, size = on_disk, on_disk.name, on_disk.frame, on_disk.counts
-        is_skipped = refined is None and config.poses.correct_poses
-        note = _NOTE_ON_SIZE if is_skipped else None
         _check_detections(name, size["detections"])
     labels, votes, counts, cells = _robust(source, config, stages, run.engine, progress, run)
     passes = source.drives_record["passes"]
-    poses = {"found": "nothing", "because": _TOO_LARGE} if refined is None else refined.record
+    untouched = _TOO_LARGE if config.poses.correct_poses else "correct_poses is 0"
+    poses = {"found": "nothing", "because": untouched} if refined is None else refined.record
     result = _as_map(name, frame, size, passes, config, labels, votes, counts, stages, poses)
     if refined is not None and refined.is_corrected:
         result = replace(result, corrected=refined.dataset)
@@ -181,6 +182,8 @@ def build_map_of_folder(
 
 def _refined(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, progress: Progress) -> Refined:
     """Correct what whole drives' poses are proven wrong by, if that makes the same detections likelier."""
+    if len(dataset.images) + len(dataset.detections) > MOST_CORRECTED and config.poses.correct_poses:
+        return Refined(dataset, {"found": "nothing", "because": _TOO_LARGE})
     with stages.measured("poses"):
         refined = refine_poses(dataset, config, threads=threads, progress=progress)
         if not refined.is_corrected:
@@ -197,7 +200,9 @@ def _note_on_poses(dataset: Dataset) -> str | None:
 
 
 def _with_note(result: Map, note: str | None) -> Map:
-    return result if note is None else replace(result, run={**result.run, "notes": [note, *result.run["notes"]]})
+    is_too_large = result.run.get("poses", {}).get("because") == _TOO_LARGE
+    notes = [text for text in (note, _NOTE_ON_SIZE if is_too_large else None) if text is not None]
+    return replace(result, run={**result.run, "notes": [*notes, *result.run["notes"]]}) if notes else result
 
 
 def _check_detections(name: str, detections: int) -> None:
