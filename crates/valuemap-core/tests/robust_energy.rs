@@ -18,7 +18,7 @@ use valuemap_core::robust::energy::{Object, object as object_of};
 use valuemap_core::robust::index::RayIndex;
 use valuemap_core::robust::learn::learn;
 use valuemap_core::robust::looks::Lookout;
-use valuemap_core::robust::model::Model;
+use valuemap_core::robust::model::{ClassModel, Model};
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::objects_of;
 use valuemap_core::robust::rearrange::{TriedPairs, rearrange_pairs};
@@ -125,6 +125,29 @@ fn crossing(objects: [Vector3<f64>; 2], errors: &[[f64; 2]]) -> Scene {
 
 proptest! {
     #![proptest_config(few(8))]
+
+    /// Pins that what is learned is stored in full, and that a class that nobody knows is like all others but for its clutter.
+    #[test]
+    fn what_is_learned_is_what_is_stored_of_it(objects in vec(object(), 5..7), errors in errors_px()) {
+        let scene = street(50, 2.0, &objects, &errors);
+        let mut model = Model::new(&scene, &DRIFTING, &SETTINGS);
+        let found = searched(&scene, Vec::new());
+        let lookout = Lookout::new(&scene, SETTINGS.viability.max_range_m);
+        learn(&mut model, &lookout, &scene.usable_rays(), &found);
+        let row = model.classes[0].to_row();
+        let again = ClassModel::from_row(&row).map(|class| class.to_row());
+        let bits = |row: &[f64]| row.iter().map(|number| number.to_bits()).collect::<Vec<u64>>();
+        prop_assert_eq!(again.map(|again| bits(&again)), Some(bits(&row)));
+        prop_assert!(ClassModel::from_row(&row[1..]).is_none());
+        let mut other = Model::new(&scene, &DRIFTING, &SETTINGS);
+        let own = other.classes[0];
+        other.know(&[None], model.pooled);
+        prop_assert_eq!(other.classes[0].ln_clutter_per_sr.to_bits(), own.ln_clutter_per_sr.to_bits());
+        if model.pooled.is_learned {
+            prop_assert_eq!(other.classes[0].rates, model.pooled.rates);
+            prop_assert!(other.classes[0].heights.is_none());
+        }
+    }
 
     /// Pins that moves keep account of J: what is committed is what J says anew.
     #[test]

@@ -143,6 +143,14 @@ mod tests {
     }
 
     #[test]
+    fn steps_are_what_is_stored_of_them() {
+        let steps = elevation_factor(&(0..300).map(f64::from).collect::<Vec<_>>(), (-10.0, 400.0));
+        assert_eq!(Steps::from_row(&steps.to_row()), steps);
+        assert_eq!(Steps::from_row(&Steps::ONE.to_row()), Steps::ONE);
+        assert!((Steps::even(120.0, std::array::from_fn(|i| i as f64)).at(65.0) - 6.0).abs() < 1e-12);
+    }
+
+    #[test]
     fn clutter_is_dense_where_it_is() {
         let clutter: Vec<f64> = (0..300).map(|i| 0.1 + f64::from(i) / 3000.0).collect();
         let factor = elevation_factor(&clutter, (-1.0, 1.0));

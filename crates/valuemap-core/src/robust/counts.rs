@@ -95,3 +95,53 @@ fn at_most(bound: f64, value: impl Fn(f64) -> f64) -> f64 {
     }
     low
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Matrix3, Vector3};
+
+    use super::super::energy::Fit;
+    use super::super::looks::Seen;
+    use super::*;
+
+    fn of_votes(votes: usize, energy: f64) -> Object {
+        let fit = Fit { point: Vector3::zeros(), covariance: Matrix3::identity(), energy: 0.0, chi2: vec![1.0; votes] };
+        Object {
+            class: 0,
+            votes: (0..votes as u32).collect(),
+            fit,
+            ln_size: 0.0,
+            others: Vec::new(),
+            seen: Seen::default(),
+            real: 1.0,
+            energy,
+        }
+    }
+
+    fn expected(few: &[Object], ln_odds: f64) -> f64 {
+        few.iter().map(|object| 1.0 / (1.0 + (0.5 * object.energy - ln_odds).exp())).sum()
+    }
+
+    #[test]
+    fn where_objects_have_many_votes_hardly_any_has_one() {
+        let many: Vec<Object> = (0..60).map(|i| of_votes(20 + i % 20, -100.0)).collect();
+        let few: Vec<Object> = (0..40).map(|_| of_votes(1, -6.0)).collect();
+        let [of_one, ..] = ln_odds_of_few(&many.iter().collect::<Vec<_>>(), &few.iter().collect::<Vec<_>>());
+        assert!(expected(&few, 0.0) > 35.0 && expected(&few, of_one) < 0.1);
+    }
+
+    #[test]
+    fn numbers_of_objects_by_votes_are_log_concave() {
+        let many: Vec<Object> = [(3, 40), (4, 60), (5, 60)]
+            .into_iter()
+            .flat_map(|(votes, count)| (0..count).map(move |_| of_votes(votes, -60.0)))
+            .collect();
+        let few: Vec<Object> = (0..80).map(|i| of_votes(1 + i % 2, -6.0)).collect();
+        let odds = ln_odds_of_few(&many.iter().collect::<Vec<_>>(), &few.iter().collect::<Vec<_>>());
+        let of = |votes: usize| few.iter().filter(|object| object.votes.len() == votes).cloned().collect::<Vec<_>>();
+        let (one, two) = (expected(&of(1), odds[0]), expected(&of(2), odds[1]));
+        // The larger of both bounds holds: that of log-concave numbers is the least that there may be.
+        assert!((40.0 * 40.0 / 60.0 - 0.01..32.0).contains(&two), "{two}");
+        assert!((two * two / 40.0 - 0.01..two).contains(&one), "{one}");
+    }
+}

@@ -1,0 +1,51 @@
+"""Poses are corrected only where that makes the same detections likelier."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import valuemap
+from block import block
+from valuemap import pipeline
+from valuemap.dataset import Dataset
+from valuemap.progress import silent
+from valuemap.refine import Refined
+from valuemap.simulate import simulate
+from valuemap.tiles.compare import compare_poses
+
+
+def shifted(dataset: Dataset, shift_m: float) -> Dataset:
+    """Return the dataset with the images of every other pass a step to the right of where they are."""
+    images = dataset.images
+    step = np.where(images.pass_id.codes % 2 == 0, shift_m, 0.0)[:, None] * np.array([-1.0, 0.0, 0.0])
+    return replace(dataset, images=images.replace(cam_from_world_m=images.cam_from_world_m + step))
+
+
+@pytest.fixture(scope="module")
+def city() -> Dataset:
+    return simulate(block(), seed=3, name="city")
+
+
+@pytest.mark.parametrize("shift_m", [1.5, 3.0])
+def test_true_poses_make_detections_likelier(city: Dataset, shift_m: float) -> None:
+    wrong = shifted(city, shift_m)
+    config = valuemap.MapConfig()
+    right_fit, wrong_fit = compare_poses(city, wrong, config, threads=0, progress=silent)
+    assert right_fit < wrong_fit - 100.0
+    # The sample is that of the first: the same detections are compared whichever comes first.
+    again = compare_poses(wrong, city, config, threads=0, progress=silent)
+    assert again == pytest.approx((wrong_fit, right_fit), rel=0.05)
+
+
+def test_a_correction_that_fits_worse_is_not_taken(city: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = valuemap.build_map(city, valuemap.MapConfig(correct_poses=0))
+    wrong = Refined(shifted(city, 1.0), {"found": "faults"}, is_corrected=True)
+    monkeypatch.setattr(pipeline, "refine_poses", lambda *_, **__: wrong)
+    result = valuemap.build_map(city)
+    assert result.run["poses"]["because"] == "the poses as given fit better"
+    assert result.run["poses"]["misfit_after"] > result.run["poses"]["misfit_before"]
+    assert result.corrected is None
+    assert np.array_equal(result.labels.position_in_world_m, alone.labels.position_in_world_m)

@@ -1,0 +1,59 @@
+"""Objects of one or two looks: what is known of all objects of their class tells where they are, and whether."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import valuemap
+from block import block
+from valuemap.dataset import Dataset
+from valuemap.simulate import simulate
+from valuemap.tables import Bools, Floats
+
+NEAR_SIGMAS = 4.0
+
+
+@pytest.fixture(scope="module")
+def sparse() -> tuple[Dataset, Floats]:
+    """Return one picture in ten of a city, and where its lights are."""
+    settings = {"streets_north_south": 4, "streets_east_west": 4, "lights": 80, "lookalikes_per_light": 0.0}
+    whole = simulate(block(**settings), seed=5, name="sparse")
+    assert whole.truth is not None
+    rows = np.flatnonzero(np.random.default_rng(1).random(len(whole.images)) < 1 / 10)
+    images = whole.images.take(rows)
+    detections = whole.detections.take(np.flatnonzero(np.isin(whole.detections.image_id, images.image_id)))
+    part = replace(whole, images=images, detections=detections, truth=None, truth_detections=None)
+    return part, whole.truth.position_in_world_m
+
+
+def is_right(result: valuemap.Map, objects: Floats) -> Bools:
+    """Return which labels (N) have an object within four of their own sigmas."""
+    labels = result.labels
+    xx, xy, xz, yy, yz, zz = labels.covariance_m2.T
+    covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
+    error = labels.position_in_world_m[:, None] - objects
+    squared = np.einsum("nmi,nij,nmj->nm", error, np.linalg.inv(covariance), error)
+    return np.asarray(squared.min(axis=1) < NEAR_SIGMAS**2)
+
+
+def test_objects_of_few_looks_are_where_objects_of_their_class_are(sparse: tuple[Dataset, Floats]) -> None:
+    dataset, objects = sparse
+    known = valuemap.MapConfig().with_settings(["correct_poses=0"])
+    result = valuemap.build_map(dataset, known)
+    without = valuemap.build_map(dataset, known.with_settings(["least_votes=3"]))
+    right = is_right(result, objects)
+    assert right.sum() - is_right(without, objects).sum() >= 3
+    assert len(result.labels) - len(without.labels) <= 4  # Nearly all of these are right.
+    few = result.labels.votes < 3
+    assert few.any()
+    assert right[few].all()
+    assert not (without.labels.votes < 3).any()
+    # One or two looks tell less: the covariance says so, and no label is certain.
+    assert result.labels.covariance_m2 is not None
+    assert result.labels.existence is not None
+    size_m2 = result.labels.covariance_m2[:, [0, 3, 5]].sum(axis=1)
+    assert size_m2[few].min() > 10.0 * np.median(size_m2[~few])
+    assert result.labels.existence[few].max() < 0.99
