@@ -33,11 +33,23 @@ def city() -> Dataset:
 def test_true_poses_make_detections_likelier(city: Dataset, shift_m: float) -> None:
     wrong = shifted(city, shift_m)
     config = valuemap.MapConfig()
-    right_fit, wrong_fit = compare_poses(city, wrong, config, threads=0, progress=silent)
+    right_fit, wrong_fit, count = compare_poses(city, wrong, config, threads=0, progress=silent)
     assert right_fit < wrong_fit - 100.0
     # The sample is that of the first: the same detections are compared whichever comes first.
     again = compare_poses(wrong, city, config, threads=0, progress=silent)
-    assert again == pytest.approx((wrong_fit, right_fit), rel=0.05)
+    assert again[:2] == pytest.approx((wrong_fit, right_fit), rel=0.05)
+    assert again[2] == count > 100
+
+
+def test_a_correction_that_is_not_worth_its_parameters_is_not_taken(
+    city: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right = Refined(city, {"found": "faults", "parameters": 3}, is_corrected=True)
+    monkeypatch.setattr(pipeline, "refine_poses", lambda *_, **__: right)
+    wrong = shifted(city, 3.0)
+    assert valuemap.build_map(wrong).corrected is not None
+    right.record["parameters"] = 10**6
+    assert valuemap.build_map(wrong).corrected is None
 
 
 def test_a_correction_that_fits_worse_is_not_taken(city: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -265,6 +265,7 @@ def _describe(dataset: Dataset, found: _Found, selected: Selected, unit_m: float
         "found": "faults",
         "cameras": [camera for camera in cameras if len(camera) > 1],
         "drives": of_drives,
+        "parameters": int(sum(np.count_nonzero(constants) for constants in selected.state.constants)),
         "held_out_objects": selected.held_out,
         "gain_on_held_out": round(selected.gain, 1),
         "chance_of_that": float(f"{selected.chance:.2g}"),

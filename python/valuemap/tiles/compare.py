@@ -16,10 +16,11 @@ from valuemap.tiles.source import VIEWPOINT_SHARE, InMemory
 
 def compare_poses(
     before: Dataset, after: Dataset, config: MapConfig, *, threads: int, progress: Progress
-) -> tuple[float, float]:
+) -> tuple[float, float, int]:
     """Return how badly the detections of a sample fit the poses of both datasets, each with its likeliest noise.
 
-    Minus twice the logarithm of their likelihood, up to one constant. The datasets have the same images and detections.
+    Minus twice the logarithm of their likelihood, up to one constant; and how many detections. Both datasets have the
+    same images and detections.
     """
     old = InMemory(before, config).sample()
     scene = Scene(old.dataset, old.drives, cast_sightings(old.dataset)[0])
@@ -28,7 +29,7 @@ def compare_poses(
     scene = Scene(new.dataset, new.drives, cast_sightings(new.dataset)[0])
     same = np.sort(rows_of(old.detection_id[rays], new.detection_id))
     of_new, _ = misfit(scene, config, same, threads=threads, progress=progress)
-    return of_old, of_new
+    return of_old, of_new, len(rays)
 
 
 def _same_images(dataset: Dataset, like: InOrder, config: MapConfig) -> InOrder:
