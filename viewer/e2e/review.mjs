@@ -52,10 +52,14 @@ if (step === "reject") {
   seen.answer = await text("#answer");
   seen.heading = await text("#title");
 
-  // The keyboard alone: the next label in the list, accepted.
+  // The keyboard alone: the next label in the list, accepted. The first of the list may be the rejected one.
   await page.keyboard.press("Escape");
   await page.keyboard.press("n");
   await page.waitForFunction(() => document.querySelector("#title")?.textContent.startsWith("Label "));
+  if ((await text("#title")) === `Label ${id}`) {
+    await page.keyboard.press("n");
+    await page.waitForFunction((title) => document.querySelector("#title")?.textContent !== title, `Label ${id}`);
+  }
   seen.next = await text("#title");
   await page.keyboard.press("a");
   await page.waitForSelector("#details .state.accepted");
@@ -74,8 +78,8 @@ if (step === "reject") {
   seen.review = await text("#details .state");
   seen.alert = await page.locator("#details .alert").allInnerTexts();
   seen.note = await page.inputValue("#note");
-  await page.uncheck("#filters label.check:has-text('Rejected') input");
-  await page.uncheck("#filters label.check:has-text('Check again') input");
+  await page.uncheck("#filters label.check:has(.text:text-is('Rejected')) input");
+  await page.uncheck("#filters label.check:has(.text:text-is('Check again')) input");
   await page.waitForSelector(`#list [data-label="${id}"]`, { state: "detached" });
   seen.hidden = true;
   // Each filter at its end shows nothing, with the keyboard alone; at its beginning everything again.
