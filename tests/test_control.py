@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from valuemap.evaluate.truth import TrueObjects, read_truth
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import read_map
 from valuemap.simulate import simulate
-from valuemap.tables import Categories, Floats
+from valuemap.tables import Categories, Floats, Rejected
 
 SHIFT = np.array([-0.4, 0.25, 0.1])
 
@@ -27,6 +28,13 @@ SHIFT = np.array([-0.4, 0.25, 0.1])
 def surveyed(places: Floats, classes: list[str] | None = None, **changes: object) -> TrueObjects:
     names = None if classes is None else Categories.from_texts(classes)
     return TrueObjects(np.arange(len(places)), places, names, **changes)  # type: ignore[arg-type]
+
+
+def rejected_at(*places: Floats) -> Rejected:
+    count = len(places)
+    ones = np.ones(count, np.int64)
+    texts = Categories.from_texts(["votes"] * count)
+    return Rejected(np.arange(1, count + 1), texts, np.array(places), ones, ones, ones, np.full(count, np.nan), texts)
 
 
 def labels_around(seed: int, count: int = 60) -> Floats:
@@ -61,8 +69,12 @@ def test_a_turn_is_found_only_where_the_points_tell_it() -> None:
     result = map_of((truth - middle) @ rotation.T + middle + noise)
     found = find_georeference(result, surveyed(truth[:40]))
     assert found.turn_rad == pytest.approx(turn, abs=math.radians(0.05))
+    places = result.labels.position_in_world_m
+    result = replace(result, rejected=rejected_at(*places))
     moved, _ = apply_control(result, surveyed(truth[:40]))
     assert np.abs(moved.labels.position_in_world_m[40:] - truth[40:]).max() < 0.5
+    assert moved.rejected is not None
+    assert moved.rejected.position_in_world_m == pytest.approx(moved.labels.position_in_world_m)
 
 
 def test_wrong_points_and_other_classes_do_not_move_a_map() -> None:

@@ -164,7 +164,7 @@ def test_the_number_of_threads_does_not_matter(config: valuemap.MapConfig, tmp_p
     valuemap.write_map(one, tmp_path / "one")
     for threads in (2, 3):
         valuemap.write_map(valuemap.build_map(street(), config, threads=threads), tmp_path / "other")
-        for name in ("labels.parquet", "votes.parquet"):
+        for name in ("labels.parquet", "votes.parquet", "rejected.parquet"):
             assert (tmp_path / "other" / name).read_bytes() == (tmp_path / "one" / name).read_bytes()
 
 
@@ -188,6 +188,9 @@ def test_a_map_survives_its_folder(tmp_path: Path) -> None:
     result = map_of_street(valuemap.MapConfig())
     valuemap.write_map(result, tmp_path / "map")
     again = valuemap.read_map(tmp_path / "map")
+    assert result.rejected is not None
+    assert again.rejected is not None
+    assert table_to_arrow(again.rejected).equals(table_to_arrow(result.rejected))
     assert same_tables(result, again)
     assert again.frame == result.frame
     assert again.run["settings"] == valuemap.MapConfig().as_dict()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,9 @@ from report_city import city, write_city
 from valuemap import rejected
 from valuemap.cli.commands import app
 from valuemap.config import MapConfig
-from valuemap.evidence import Evidence, read_rejected
-from valuemap.map_folder import write_map
-from valuemap.rejected import find_rejected, rejected_of_map
+from valuemap.evidence import Evidence
+from valuemap.map_folder import read_map, write_map
+from valuemap.rejected import figures_in_words, find_rejected, rejected_of_map
 from valuemap.tables import REJECTION_REASONS, Categories, Floats, Rejected
 
 
@@ -26,7 +27,8 @@ def without_its_best_label(**settings: Any) -> tuple[Evidence, Floats, int]:
     best = int(np.argmax(labels.votes))
     others = votes.take(votes.label_id != labels.label_id[best])
     run = {**evidence.result.run, "settings": {**MapConfig().as_dict(), **settings}}
-    result = replace(evidence.result, labels=labels.take(np.arange(len(labels)) != best), votes=others, run=run)
+    without = labels.take(np.arange(len(labels)) != best)
+    result = replace(evidence.result, labels=without, votes=others, run=run, rejected=None)
     return Evidence(result, evidence.dataset), labels.position_in_world_m[best], int(labels.votes[best])
 
 
@@ -38,16 +40,19 @@ def at(found: Rejected, point: Floats) -> int:
 
 
 @pytest.mark.parametrize(
-    ("settings", "reason"),
+    ("settings", "reason", "threshold"),
     [
-        ({}, "existence"),
-        ({"method": "paper"}, "ratio"),
-        ({"min_votes": 1000}, "votes"),
-        ({"min_parallax_deg": 89.0}, "parallax"),
-        ({"max_range_m": 8.0}, "range"),
+        ({}, "existence", None),
+        ({"method": "paper"}, "ratio", math.nan),
+        ({"min_votes": 1000}, "votes", 1000.0),
+        ({"min_parallax_deg": 89.0}, "parallax", 89.0),
+        ({"max_range_m": 8.0}, "range", 8.0),
+        ({"min_range_m": 39.0, "max_range_m": 40.0}, "range", 39.0),
     ],
 )
-def test_a_label_that_is_taken_out_is_found_again_with_the_test_it_fails(settings: Any, reason: str) -> None:
+def test_a_label_that_is_taken_out_is_found_again_with_the_test_it_fails(
+    settings: Any, reason: str, threshold: float | None
+) -> None:
     evidence, point, votes = without_its_best_label(**settings)
     found = find_rejected(evidence)
     row = at(found, point)
@@ -56,6 +61,21 @@ def test_a_label_that_is_taken_out_is_found_again_with_the_test_it_fails(setting
     assert found.rival is not None
     assert found.rival[row] == -1
     assert (found.expected[row] >= found.votes[row]) == (reason in ("existence", "ratio"))
+    assert found.value is not None
+    assert found.threshold is not None
+    if threshold is None:
+        labels = evidence.result.labels
+        assert labels.expected is not None
+        threshold = float(np.median(labels.votes / np.maximum(labels.expected, labels.votes)))
+        assert found.value[row] == found.votes[row] / found.expected[row]
+    assert found.threshold[row] == pytest.approx(threshold, nan_ok=True)
+    assert math.isnan(found.value[row]) == math.isnan(threshold)
+    if reason in ("votes", "parallax"):
+        assert found.value[row] < threshold
+    if reason == "range":
+        assert (found.value[row] > threshold) == (threshold == 8.0)
+    said = figures_in_words(found, row)
+    assert f"{threshold:.0%}" in said if reason == "existence" else (f"{threshold:g}" in said) != math.isnan(threshold)
 
 
 @pytest.mark.parametrize(("class_name", "reason"), [(None, "merged"), ("another", "class")])
@@ -71,7 +91,11 @@ def test_a_point_where_a_label_is_names_that_label(class_name: str | None, reaso
     row = at(found, point)
     assert found.reason.texts()[row] == reason
     assert found.rival is not None
+    assert found.value is not None
+    assert found.threshold is not None
     assert found.rival[row] == labels.label_id[0]
+    assert found.value[row] <= found.threshold[row]
+    assert "sigmas" in figures_in_words(found, row)
 
 
 def test_a_place_is_answered_as_the_whole_map_is() -> None:
@@ -102,8 +126,8 @@ def test_a_map_without_detections_left_over_keeps_an_empty_table(tmp_path: Path)
     whole = Evidence(evidence.result, replace(dataset, detections=taken, truth_detections=None))
     found = find_rejected(whole)
     assert len(found) == 0
-    write_map(evidence.result, tmp_path / "map", rejected=found)
-    kept = read_rejected(tmp_path / "map")
+    write_map(replace(evidence.result, rejected=found), tmp_path / "map")
+    kept = read_map(tmp_path / "map").rejected
     assert kept is not None
     assert len(kept) == 0
 

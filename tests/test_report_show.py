@@ -15,8 +15,8 @@ from report_city import city, write_city
 from small_dataset import map_of, small_dataset
 from valuemap.cli.commands import app
 from valuemap.errors import InputError
-from valuemap.evidence import Evidence, read_rejected
-from valuemap.map_folder import REJECTED, write_map
+from valuemap.evidence import Evidence
+from valuemap.map_folder import REJECTED, read_map, write_map
 from valuemap.report.crops import chosen_voters, voter_crop
 from valuemap.report.label_sheet import plot_label
 from valuemap.report.place_sheet import explain_place, place_in_world, plot_place
@@ -201,15 +201,16 @@ def test_a_place_is_at_the_height_of_what_was_rejected_there() -> None:
 
 
 def test_rejected_hypotheses_are_read_from_the_folder_of_the_map(tmp_path: Path) -> None:
-    assert read_rejected(tmp_path) is None
+    write_map(map_of([[1.0, 2.0, 3.0]]), tmp_path)
+    assert read_map(tmp_path).rejected is None
     write_table(rejected_at(np.zeros(3), "votes", "existence"), tmp_path / REJECTED)
-    read = read_rejected(tmp_path)
+    read = read_map(tmp_path).rejected
     assert read is not None
     assert read.reason.texts() == ["votes", "existence"]
     assert len(read_table(Rejected, tmp_path / REJECTED)) == 2
     (tmp_path / REJECTED).write_bytes(b"")
     with pytest.raises(InputError, match="cannot be read as Parquet"):
-        read_rejected(tmp_path)
+        read_map(tmp_path)
 
 
 # On the command line.

@@ -15,7 +15,9 @@ from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError
+from valuemap.evidence import Evidence
 from valuemap.map_folder import Map
+from valuemap.rejected import find_rejected
 from valuemap.tables import Categories, Changes, Floats, IdBridge, join_tables, read_table, table_to_arrow
 from valuemap.update import compare
 from valuemap.update.changes import match_labels, match_places
@@ -215,6 +217,16 @@ def test_cells_that_nobody_drove_through_are_not_solved_again(years: Path) -> No
     assert before & after
     assert after - before
     assert all(name.startswith("1_") for name in before & after)
+
+
+def test_updated_maps_keep_what_was_rejected_of_all_the_data(years: Path) -> None:
+    result = valuemap.read_map(years / "map2")
+    assert result.rejected is not None
+    assert len(result.rejected) > 0
+    found = find_rejected(Evidence(result, valuemap.read_dataset(years / "map2" / "dataset")))
+    assert table_to_arrow(found).equals(table_to_arrow(result.rejected))
+    has_label = result.rejected.rival is not None and np.isin(result.rejected.rival, [-1, *result.labels.label_id])
+    assert np.all(has_label)
 
 
 def test_an_update_of_an_update_goes_on(years: Path, tmp_path: Path) -> None:

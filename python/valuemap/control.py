@@ -142,10 +142,13 @@ def apply_control(result: Map, points: TrueObjects, dataset: Dataset | None = No
         facing_azimuth_rad=(labels.facing_azimuth_rad - found.turn_rad) % (2.0 * np.pi),
         lon_lat_height=None if anchor is None else lon_lat_height_from_enu(moved, anchor),
     )
+    rejected = result.rejected
+    if rejected is not None:
+        rejected = rejected.replace(position_in_world_m=_moved(rejected.position_in_world_m @ axes.T, found) @ axes)
     run = {**result.run, "control": _describe(found, proof, len(points), result)}
     if dataset is not None:
         dataset = _moved_dataset(dataset, found, axes)
-    return replace(result, labels=labels, run=run), dataset
+    return replace(result, labels=labels, run=run, rejected=rejected), dataset
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,6 @@ from valuemap.evaluate import Evaluation, evaluate_map
 from valuemap.map_folder import Map, write_map
 from valuemap.pipeline import build_map
 from valuemap.progress import Progress, silent
-from valuemap.rejected import rejected_of_map
 from valuemap.report.above import draw_map
 from valuemap.simulate import PRESETS, record_city
 from valuemap.simulate.render import BOXES, render_images
@@ -57,7 +56,7 @@ def run_demo(
     detect_dataset(files["dataset"], model, DETECTION, progress=progress)
     dataset = read_dataset(files["dataset"])
     result = build_map(dataset, progress=progress)
-    write_map(result, files["map"], rejected=rejected_of_map(result, lambda: dataset))
+    write_map(result, files["map"])
 
     labels = read_labels(f"coco:{files['dataset'] / BOXES}")
     detection = evaluate_boxes(match_pictures(read_found(files["dataset"]), labels), labels)

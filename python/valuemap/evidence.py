@@ -21,8 +21,8 @@ from valuemap.cameras import Rays, camera_centers, cast_rays, colmap_camera, rot
 from valuemap.dataset import MARKER, Dataset, number_passes, rows_of
 from valuemap.drives import find_drives
 from valuemap.errors import InputError
-from valuemap.map_folder import REJECTED, Map
-from valuemap.tables import Bools, Floats, Ints, Rejected, read_table
+from valuemap.map_folder import Map
+from valuemap.tables import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -417,12 +417,6 @@ def find_dataset(map_folder: Path, run: dict[str, Any], given: Path | None = Non
     candidates = [Path(os.path.normpath(map_folder.absolute() / named))] if isinstance(named, str) else []
     candidates.append(map_folder.absolute().parent / "dataset")
     return next((folder for folder in candidates if (folder / MARKER).is_file()), None)
-
-
-def read_rejected(map_folder: Path) -> Rejected | None:
-    """Read the rejected hypotheses of a map; None where it keeps none. Raises as `read_table`."""
-    file = map_folder / REJECTED
-    return read_table(Rejected, file) if file.is_file() else None
 
 
 def dataset_reference(dataset_folder: Path, map_folder: Path) -> str:

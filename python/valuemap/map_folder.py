@@ -59,7 +59,8 @@ class Map:
 
     `run` is what run.json holds: version, dataset, settings, counts of everything found and rejected, and
     seconds and peak memory per stage. `corrected` is the dataset with the poses and cameras that the labels were
-    found with, where those that were given had faults and it was just mapped; None else.
+    found with, where those that were given had faults and it was just mapped; None else. `rejected` are the best
+    hypotheses that became no labels; None where the map keeps none.
     """
 
     frame: Frame
@@ -67,6 +68,7 @@ class Map:
     votes: Votes
     run: dict[str, Any]
     corrected: Dataset | None = None
+    rejected: Rejected | None = None
 
     def __repr__(self) -> str:
         classes = len(np.unique(self.labels.class_name.codes))
@@ -116,14 +118,13 @@ def write_map(
     *,
     cells: Sequence[Path] = (),
     files: Mapping[str, Path] = MappingProxyType({}),
-    rejected: Rejected | None = None,
     force: bool = False,
 ) -> None:
     """Write a map as a folder; an older map that is there is replaced, never half.
 
     Other files in the folder stay. Where one that valuemap did not write is in the way, an `OutputError` says so; with
     `force` it is replaced. `cells` are the files of its cells, `files` others by their names in the folder;
-    all are copied. `rejected` are the hypotheses that became no labels, where they were looked for.
+    all are copied.
     """
     with new_folder(Path(path), parts=PARTS, part_folders=(CELLS, DATASET), force=force) as folder:
         run = {**result.run, "frame": result.frame.to_json()}
@@ -136,8 +137,8 @@ def write_map(
         (folder / MARKER).write_text(json.dumps(run, indent=2) + "\n", encoding="utf-8")
         write_labels(result, folder / "labels.parquet")
         write_table(result.votes, folder / "votes.parquet")
-        if rejected is not None:
-            write_table(rejected, folder / REJECTED)
+        if result.rejected is not None:
+            write_table(result.rejected, folder / REJECTED)
 
 
 def read_map(path: str | Path) -> Map:
@@ -160,7 +161,9 @@ def read_map(path: str | Path) -> Map:
     labels, votes = read_table(Labels, folder / "labels.parquet"), read_table(Votes, folder / "votes.parquet")
     # Who removes labels from the table, as a filter in pandas does, need not know of their votes.
     votes = votes.take(np.isin(votes.label_id, labels.label_id))
-    return Map(frame=Frame.from_json(run.pop("frame", None), source=str(head)), labels=labels, votes=votes, run=run)
+    rejected = read_table(Rejected, folder / REJECTED) if (folder / REJECTED).is_file() else None
+    frame = Frame.from_json(run.pop("frame", None), source=str(head))
+    return Map(frame=frame, labels=labels, votes=votes, run=run, rejected=rejected)
 
 
 def read_json(path: Path) -> dict[str, Any]:

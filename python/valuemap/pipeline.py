@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -27,6 +27,7 @@ from valuemap.partition import partition_images
 from valuemap.portions import rows_on_disk
 from valuemap.progress import Progress, silent
 from valuemap.refine import Refined, refine_poses
+from valuemap.rejected import rejected_of_map
 from valuemap.robust import Calibration, calibration_to_json
 from valuemap.system import peak_memory_mb
 from valuemap.tables import Labels, Votes
@@ -78,7 +79,7 @@ def build_map(
     Returns
     -------
     Map
-        Labels ordered by their first detection, votes, and the record of the run.
+        Labels ordered by their first detection, votes, rejected hypotheses, and the record of the run.
     """
     config, threads = config or MapConfig(), bounded_threads(threads)
     _check_detections(dataset.name, len(dataset.detections))
@@ -98,6 +99,7 @@ def build_map(
     result = _as_map(dataset.name, dataset.frame, size, passes, config, labels, votes, counts, stages, poses)
     if refined is not None and refined.is_corrected:
         result = replace(result, corrected=refined.dataset)
+    result = _with_rejected(result, lambda: result.corrected or dataset, stages)
     return _with_note(result, _note_on_poses(dataset))
 
 
@@ -178,7 +180,7 @@ def build_map_of_folder(
     result = _as_map(name, frame, size, passes, config, labels, votes, counts, stages, poses)
     if refined is not None and refined.is_corrected:
         result = replace(result, corrected=refined.dataset)
-    return _with_note(result, note), cells
+    return _with_note(_with_rejected(result, lambda: result.corrected or read_dataset(folder), stages), note), cells
 
 
 def _refined(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, progress: Progress) -> Refined:
@@ -197,6 +199,13 @@ def _refined(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int,
         if after + price < before:
             return replace(refined, record=record)
         return Refined(dataset, {**record, "found": "nothing", "because": "the poses as given fit better"})
+
+
+def _with_rejected(result: Map, read: Callable[[], Dataset], stages: _Stages) -> Map:
+    """Add the best hypotheses that became no labels; `read` gives the dataset that the labels were found in."""
+    with stages.measured("rejected"):
+        rejected = rejected_of_map(result, read)
+    return replace(result, rejected=rejected, run={**result.run, "stages": stages.records})
 
 
 def _note_on_poses(dataset: Dataset) -> str | None:

@@ -64,25 +64,51 @@ def find_rejected(evidence: Evidence, around_in_world_m: Floats | None = None) -
     found = _hypotheses(evidence, left)
     most = np.lexsort((np.arange(len(found)), -np.diff(found.voter_offsets)))[:MOST_KEPT]
     found = found.take(most)
-    reason, rival = _judged(evidence, left, found)
+    verdicts = _judged(evidence, left, found)
     voter_images = left.image_row[left.rays.image_row[found.voters.astype(np.int64)]]
     by_point = np.split(voter_images, found.voter_offsets[1:-1]) if len(found) else []
     expected = [
         len(images) + len(evidence.should_have_seen(point, images)) if why in ("existence", "ratio") else 0
-        for point, images, why in zip(found.position_in_world_m, by_point, reason, strict=True)
+        for point, images, why in zip(found.position_in_world_m, by_point, verdicts.reason, strict=True)
     ]
+    votes, usual = np.diff(found.voter_offsets), _usual_share(evidence)
+    is_unlikely = np.array([why == "existence" for why in verdicts.reason], dtype=np.bool_)
     detections = left.dataset.detections
     return Rejected(
         hypothesis_id=np.arange(1, len(found) + 1),
         class_name=detections.class_name.take(found.voters[found.voter_offsets[:-1]].astype(np.int64)),
         position_in_world_m=found.position_in_world_m,
-        votes=np.diff(found.voter_offsets),
+        votes=votes,
         passes=np.array([len(np.unique(evidence.pass_number[images])) for images in by_point], dtype=np.int64),
         expected=np.array(expected, dtype=np.int64),
         existence=np.full(len(found), np.nan),
-        reason=Categories.from_texts(reason),
-        rival=rival,
+        reason=Categories.from_texts(verdicts.reason),
+        rival=verdicts.rival,
+        value=np.where(is_unlikely, votes / np.maximum(expected, 1), verdicts.value),
+        threshold=np.where(is_unlikely, usual, verdicts.threshold),
     )
+
+
+def figures_in_words(rejected: Rejected, row: int) -> str:
+    """Return what the test that a hypothesis failed saw and what it asks for; empty where that is no number."""
+    if rejected.value is None or rejected.threshold is None:
+        return ""
+    value, threshold = float(rejected.value[row]), float(rejected.threshold[row])
+    if not (math.isfinite(value) and math.isfinite(threshold)):
+        return ""
+    reason = rejected.reason.names[rejected.reason.codes[row]]
+    if reason == "range":
+        return f"its votes count from {value:.1f} m, {'at least' if value < threshold else 'at most'} {threshold:g} m"
+    return _FIGURES[reason].format(value=value, threshold=threshold) if reason in _FIGURES else ""
+
+
+_FIGURES = {
+    "votes": "{value:.0f}, of at least {threshold:.0f}",
+    "parallax": "{value:.1f} degrees, of at least {threshold:g}",
+    "merged": "{value:.1f} sigmas apart, up to {threshold:.1f} are one place",
+    "class": "{value:.1f} sigmas apart, up to {threshold:.1f} are one place",
+    "existence": "{value:.0%} of the images that should have seen it vote for it, for a usual label {threshold:.0%}",
+}
 
 
 def rejected_of_map(result: Map, read: Callable[[], Dataset]) -> Rejected | None:
@@ -139,39 +165,80 @@ def _hypotheses(evidence: Evidence, left: _LeftOver) -> Candidates:
     return vote_in_clusters(left.rays, clusters, config, threads=1)[0]
 
 
-def _judged(evidence: Evidence, left: _LeftOver, found: Candidates) -> tuple[list[str], Ints]:
-    """Return the first test that each point fails, and the id of the label that has its place, -1 if none."""
+def _usual_share(evidence: Evidence) -> float:
+    """Return the share of the images that should have seen it which vote for a label, the median; NaN if unknown."""
+    labels = evidence.result.labels
+    if labels.expected is None or not len(labels):
+        return math.nan
+    return float(np.median(labels.votes / np.maximum(labels.expected, labels.votes)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Verdicts:
+    """Of each point (N) the first test that it fails, with its value and threshold, and the label that has its place.
+
+    Both are NaN for the last test; `rival` is -1 where there is no such label.
+    """
+
+    reason: list[str]
+    rival: Ints
+    value: Floats
+    threshold: Floats
+
+
+def _judged(evidence: Evidence, left: _LeftOver, found: Candidates) -> _Verdicts:
     rays, position = left.rays, found.position_in_world_m
     if not len(found):
-        return [], np.empty(0, np.int64)
+        return _Verdicts([], np.empty(0, np.int64), np.empty(0), np.empty(0))
     _, _, parallax_rad = _core.see(rays.core, position, found.voter_offsets, found.voters)
     voters = found.voters.astype(np.int64)
     point = np.repeat(position, np.diff(found.voter_offsets), axis=0)
     distance_m = np.linalg.norm(rays.center_in_world_m[voters] - point, axis=1)
-    in_range = (distance_m >= _setting(evidence, "min_range_m", 2.0)) & (distance_m <= evidence.max_range_m)
-    votes_in_range = np.add.reduceat(in_range.astype(np.int64), found.voter_offsets[:-1])
-    rival, is_same_class = _labels_there(evidence, left, found)
+    rival, is_same_class, sigmas = _labels_there(evidence, left, found)
     settings = evidence.result.run.get("settings")
     last = "ratio" if isinstance(settings, dict) and settings.get("method") == "paper" else "existence"
-    votes, min_votes = np.diff(found.voter_offsets), _setting(evidence, "min_votes", 3)
+    votes, min_votes = np.diff(found.voter_offsets), int(_setting(evidence, "min_votes", 3))
+    parallax_deg, least_deg = np.degrees(parallax_rad), _setting(evidence, "min_parallax_deg", 2.0)
+    by_point = np.split(distance_m, found.voter_offsets[1:-1])
+    decisive = [
+        _decisive(of, _setting(evidence, "min_range_m", 2.0), evidence.max_range_m, min_votes) for of in by_point
+    ]
+    range_m, limit_m = np.array(decisive).T
+    largest = np.full(len(found), math.sqrt(_SAME_PLACE))
     tests = (
-        ("merged", (rival >= 0) & is_same_class),
-        ("class", rival >= 0),
-        ("votes", votes < min_votes),
-        ("parallax", parallax_rad < math.radians(_setting(evidence, "min_parallax_deg", 2.0))),
-        ("range", votes_in_range < min_votes),
+        ("merged", (rival >= 0) & is_same_class, sigmas, largest),
+        ("class", rival >= 0, sigmas, largest),
+        ("votes", votes < min_votes, votes, np.full(len(found), min_votes)),
+        ("parallax", parallax_deg < least_deg, parallax_deg, np.full(len(found), least_deg)),
+        ("range", np.isfinite(limit_m), range_m, limit_m),
+        (last, np.ones(len(found), np.bool_), np.full(len(found), np.nan), np.full(len(found), np.nan)),
     )
-    failed = np.array([fails for _, fails in tests])
-    names = np.array([*(name for name, _ in tests), last])
-    return names[np.where(failed.any(axis=0), failed.argmax(axis=0), len(tests))].tolist(), rival
+    first = np.array([fails for _, fails, _, _ in tests]).argmax(axis=0)
+    value, threshold = (np.array([test[column] for test in tests])[first, np.arange(len(found))] for column in (2, 3))
+    return _Verdicts([tests[test][0] for test in first], rival, value, threshold)
 
 
-def _labels_there(evidence: Evidence, left: _LeftOver, found: Candidates) -> tuple[Ints, Bools]:
-    """Return the id of the label that agrees best with each point, -1 if none does; and whether it has its class."""
+def _decisive(distance_m: Floats, least_m: float, most_m: float, min_votes: int) -> tuple[float, float]:
+    """Return the distance of the vote that makes too few votes of a point lie in the range, and the limit it is beyond.
+
+    The limit is NaN where enough of its votes are in the range.
+    """
+    beyond_m = np.maximum(least_m - distance_m, distance_m - most_m)
+    if len(distance_m) < min_votes:
+        return math.nan, math.nan
+    vote = np.argsort(beyond_m, kind="stable")[min_votes - 1]
+    if beyond_m[vote] <= 0.0:
+        return float(distance_m[vote]), math.nan
+    return float(distance_m[vote]), least_m if distance_m[vote] < least_m else most_m
+
+
+def _labels_there(evidence: Evidence, left: _LeftOver, found: Candidates) -> tuple[Ints, Bools, Floats]:
+    """Return the id of the label that agrees best with each point, -1 if none does; if it has its class; in sigmas."""
     labels, residual_px = evidence.result.labels, evidence.result.votes.residual_px
     rival, is_same = np.full(len(found), _NO_LABEL), np.zeros(len(found), np.bool_)
+    sigmas = np.full(len(found), np.nan)
     if not len(labels):
-        return rival, is_same
+        return rival, is_same, sigmas
     sigma_px = max(1.0, float(np.sqrt(np.mean(residual_px**2) / 2.0)))
     own = sigma_px**2 * _core.unit_covariance(
         left.rays.core, found.position_in_world_m, found.voter_offsets, found.voters
@@ -189,9 +256,9 @@ def _labels_there(evidence: Evidence, left: _LeftOver, found: Candidates) -> tup
         )
         if apart.min() <= _SAME_PLACE:
             best = around[int(np.argmin(apart))]
-            rival[row] = labels.label_id[best]
+            rival[row], sigmas[row] = labels.label_id[best], math.sqrt(max(float(apart.min()), 0.0))
             is_same[row] = labels.class_name.names[labels.class_name.codes[best]] == names.names[names.codes[row]]
-    return rival, is_same
+    return rival, is_same, sigmas
 
 
 def _setting(evidence: Evidence, name: str, otherwise: float) -> float:

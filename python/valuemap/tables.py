@@ -403,7 +403,7 @@ class IdBridge(Table):
 
 
 REJECTION_REASONS: Mapping[str, str] = {
-    "votes": "too few images vote for it (min_votes)",
+    "votes": "too few images vote for it (min_votes), and what is known of its class does not make up for that",
     "ratio": "it has too few votes for what is usual here (min_vote_ratio)",
     "existence": "it probably does not exist: what votes for it may meet by chance, and too few of the images that "
     "should have seen it did (min_existence)",
@@ -422,6 +422,8 @@ class Rejected(Table):
     Positions (N, 3) in metres in the frame of the dataset; `votes` counts images, `passes` the passes they come from,
     `expected` the images that should have seen it; `existence` is NaN where it never came to that test; `reason` is one
     of `REJECTION_REASONS`; `rival` is the label that has its detections or its place, -1 where there is none.
+    `value` is what that test looked at and `threshold` what it asks for: votes, degrees, metres, sigmas or a share,
+    by the reason; NaN where there is no such number.
     """
 
     KEY: ClassVar[str | None] = "hypothesis_id"
@@ -436,6 +438,8 @@ class Rejected(Table):
     existence: Floats = _column("float", ("existence",), nullable=True)
     reason: Categories = _column("category", ("reason",))
     rival: Ints | None = _column("int", ("rival",), optional=True)
+    value: Floats | None = _column("float", ("value",), nullable=True, optional=True)
+    threshold: Floats | None = _column("float", ("threshold",), nullable=True, optional=True)
 
 
 T = TypeVar("T", bound=Table)

@@ -76,6 +76,8 @@ export interface Hypothesis {
   existence: number | null;
   reason: string;
   why: string;
+  /** What the test saw and what it asks for, in words. */
+  figures: string | null;
   rival: number | null;
 }
 

@@ -162,7 +162,7 @@ export function renderPlace(panel: HTMLElement, details: PlaceDetails, head: Hea
       h("button", { class: "link", onclick: () => events.onGo(each.local_m[0], each.local_m[1]) }, `${each.class}, ${each.away_m.toFixed(1)} m away`),
       h("span", { class: "muted" }, ` ${plural(each.votes, "vote")}, ${plural(each.passes, "pass", "passes")}${each.expected ? ` of ${each.expected} expected` : ""}${each.existence === null ? "" : `, existence ${probability(each.existence)}`}`),
       h("br"),
-      `Rejected (${each.reason}): ${each.why}. `,
+      `Rejected (${each.reason}): ${each.why}${each.figures ? ` (${each.figures})` : ""}. `,
       each.rival === null ? "" : h("span", {}, "See ", labelLink(each.rival), "."),
     );
   panel.replaceChildren(

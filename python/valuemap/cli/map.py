@@ -35,7 +35,6 @@ from valuemap.evidence import dataset_reference
 from valuemap.folders import check_files, check_place
 from valuemap.map_folder import Map, write_map
 from valuemap.pipeline import Run, build_map_of_folder
-from valuemap.rejected import rejected_of_map
 from valuemap.report.above import draw_map
 from valuemap.report.style import check_format
 from valuemap.summary import summarize_map
@@ -105,8 +104,7 @@ def map_command(
             if write_poses_to is not None:
                 write_poses(result, data, write_poses_to, force=force)
         result.run["dataset_folder"] = dataset_reference(write_poses_to or dataset, out)
-        rejected = rejected_of_map(result, lambda: result.corrected or read_dataset(dataset))
-        write_map(result, out, cells=cells, rejected=rejected, force=force)
+        write_map(result, out, cells=cells, force=force)
     if picture is not None:
         data = read_dataset(write_poses_to or dataset)
         matches = evaluate_map(result, data).matches if data.truth is not None else None

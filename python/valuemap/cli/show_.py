@@ -14,7 +14,7 @@ from valuemap.cli.options import AsJson, Force
 from valuemap.cli.show import log, out, show
 from valuemap.dataset import read_dataset
 from valuemap.errors import InputError, SettingError
-from valuemap.evidence import PICTURES, Evidence, find_dataset, read_rejected
+from valuemap.evidence import PICTURES, Evidence, find_dataset
 from valuemap.map_folder import read_map
 from valuemap.rejected import find_rejected
 
@@ -72,7 +72,7 @@ def show_command(
             show(facts)
     else:
         point = _place(evidence, at, lat, lon)
-        rejected = read_rejected(map_)
+        rejected = evidence.result.rejected
         if rejected is None:
             rejected = find_rejected(evidence, point)
         answer = explain_place(evidence, point, rejected, radius_m=radius)

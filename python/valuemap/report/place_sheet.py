@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from valuemap.evidence import Evidence, Misses, PassingRays
+from valuemap.rejected import figures_in_words
 from valuemap.report.above import plain_line
 from valuemap.report.crops import crop_at
 from valuemap.report.ground import horizontal_axes
@@ -48,6 +49,8 @@ class PlaceAnswer:
     """Rows of the rejected hypotheses within the radius, those with most votes first."""
     labels: Ints
     """Rows of the labels within the radius, the nearest first."""
+    figures: tuple[dict[str, Any], ...]
+    """Of each of these hypotheses what a script may want to know."""
 
     def to_json(self) -> dict[str, Any]:
         """Return what a script may want to know."""
@@ -59,7 +62,7 @@ class PlaceAnswer:
             "passes_that_picture_it": len(np.unique(self.looks.pass_number)),
             "detections_that_point_here": len(self.passing),
             "of_them_without_a_label": int(free.sum()),
-            "rejected_hypotheses": len(self.hypotheses),
+            "rejected_hypotheses": list(self.figures),
             "labels_here": len(self.labels),
             "reasons": list(self.reasons),
         }
@@ -105,7 +108,24 @@ def explain_place(
     ]
     if rejected is None:
         reasons.append("The map keeps no rejected hypotheses; this is what its detections say.")
-    return PlaceAnswer(point, radius_m, tuple(reasons), looks, passing, hypotheses, labels)
+    figures = () if rejected is None else tuple(_figures(rejected, int(row)) for row in hypotheses)
+    return PlaceAnswer(point, radius_m, tuple(reasons), looks, passing, hypotheses, labels, figures)
+
+
+def _figures(rejected: Rejected, row: int) -> dict[str, Any]:
+    def finite(column: Floats | None) -> float | None:
+        return None if column is None or not math.isfinite(column[row]) else float(column[row])
+
+    return {
+        "hypothesis_id": int(rejected.hypothesis_id[row]),
+        "class": rejected.class_name.names[rejected.class_name.codes[row]],
+        "position_in_world_m": [float(c) for c in rejected.position_in_world_m[row]],
+        "votes": int(rejected.votes[row]),
+        "passes": int(rejected.passes[row]),
+        "reason": rejected.reason.names[rejected.reason.codes[row]],
+        "value": finite(rejected.value),
+        "threshold": finite(rejected.threshold),
+    }
 
 
 def _hypotheses_at(rejected: Rejected | None, evidence: Evidence, point: Floats, radius_m: float) -> Ints:
@@ -167,14 +187,14 @@ def _about_hypotheses(rejected: Rejected | None, evidence: Evidence, point: Floa
         votes = f"{rejected.votes[row]} {'vote' if rejected.votes[row] == 1 else 'votes'}"
         passes = f"{rejected.passes[row]} {'pass' if rejected.passes[row] == 1 else 'passes'}"
         expected = f", where {rejected.expected[row]} images should have seen it" if rejected.expected[row] > 0 else ""
-        existence = rejected.existence[row]
+        existence, figures = rejected.existence[row], figures_in_words(rejected, int(row))
         probability = f" Its probability of existence is {existence:.2f}." if math.isfinite(existence) else ""
         rival = (
             f" That is label {rejected.rival[row]}." if rejected.rival is not None and rejected.rival[row] >= 0 else ""
         )
         reasons.append(
             f"A hypothesis ({name}) {np.linalg.norm(across):.2f} m away had {votes} of {passes}{expected}. It was "
-            f"rejected: {REJECTION_REASONS.get(code, code)}.{rival}{probability}"
+            f"rejected: {REJECTION_REASONS.get(code, code)}{f' ({figures})' if figures else ''}.{rival}{probability}"
         )
     if len(rows) > _SHOWN_HYPOTHESES:
         reasons.append(f"{len(rows) - _SHOWN_HYPOTHESES} more hypotheses with fewer votes were rejected here.")

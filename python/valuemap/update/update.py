@@ -17,6 +17,7 @@ from valuemap.evidence import Evidence, find_dataset
 from valuemap.map_folder import BRIDGE, CELLS, CHANGES, DATASET, Map, read_map
 from valuemap.pipeline import Run, build_map_of_folder
 from valuemap.progress import Progress, silent
+from valuemap.rejected import rejected_of_map
 from valuemap.tables import Bools, Categories, Changes, IdBridge, Ints, Labels, Votes, join_tables, write_table
 from valuemap.tiles.calibration import read_calibration
 from valuemap.tiles.source import VIEWPOINT_SHARE
@@ -79,6 +80,7 @@ def update_map(
     rebuilt, cells = build_map_of_folder(run.work / DATASET, _settings(before), run, progress=progress)
     alone = _map_alone(joined, first.images.image_id, before, run, progress)
     result, changes, bridge = compare(before, rebuilt, alone, joined, first.images.image_id, progress=progress)
+    result = replace(result, rejected=rejected_of_map(result, lambda: joined))
     for name, table in ((CHANGES, changes), (BRIDGE, bridge)):
         write_table(table, run.work / name)
     files = {f"{DATASET}/{name}": run.work / DATASET / name for name in _DATASET_FILES}

@@ -8,7 +8,7 @@ import numpy as np
 
 from valuemap.errors import InputError
 from valuemap.evidence import Evidence, Misses, PassingRays, picture_file
-from valuemap.rejected import find_rejected
+from valuemap.rejected import figures_in_words, find_rejected
 from valuemap.report.place_sheet import explain_place
 from valuemap.tables import REJECTION_REASONS, Floats, Ints, Rejected
 from valuemap.viewer.scene import Scene, number
@@ -212,6 +212,9 @@ def _hypothesis(rejected: Rejected, row: int, away_m: float, local_m: Floats) ->
         "existence": number(rejected.existence[row]),
         "reason": reason,
         "why": REJECTION_REASONS.get(reason, reason),
+        "figures": figures_in_words(rejected, row) or None,
+        "value": None if rejected.value is None else number(rejected.value[row], 3),
+        "threshold": None if rejected.threshold is None else number(rejected.threshold[row], 3),
         "rival": rival if rival >= 0 else None,
     }
 

@@ -18,7 +18,7 @@ from valuemap.cameras import rotation_matrices
 from valuemap.dataset import read_dataset
 from valuemap.errors import InputError
 from valuemap.evaluate import Evaluation, evaluate_map
-from valuemap.evidence import PICTURES, Evidence, find_dataset, read_rejected
+from valuemap.evidence import PICTURES, Evidence, find_dataset
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import read_map
 from valuemap.tables import Floats
@@ -65,7 +65,7 @@ class Scene:
         self.evidence = self._find_evidence(dataset_folder)
         self.pictures = self._find_pictures(pictures)
         self._truth = truth
-        self.rejected = read_rejected(map_folder)
+        self.rejected = self.result.rejected
         self.lock = threading.Lock()
         """Held while something about the evidence is computed, so that nothing is computed twice at once."""
         frame = self.result.frame
