@@ -405,26 +405,8 @@ export class MapView {
         box: level === whole ? EVERYWHERE : box,
         layers: [
           ...(this.showStreets ? this.streetLayers(within(this.tracks.streets(whole), box)) : []),
-          new LineLayer({
-            id: `tracks-${level.spacing}`,
-            data: {
-              length: Math.max(0, rows - 1),
-              attributes: {
-                getSourcePosition: { value: level.points, size: 3 },
-                getTargetPosition: { value: level.points, size: 3, offset: 12 },
-                getColor: { value: lines, size: 4, normalized: true },
-              },
-            } as never,
-            widthUnits: "pixels",
-            getWidth: 1.5,
-          }),
-          new ScatterplotLayer({
-            id: `cameras-${level.spacing}`,
-            data: { length: rows, attributes: { getPosition: { value: level.points, size: 3 }, getFillColor: { value: dots, size: 4, normalized: true } } } as never,
-            radiusUnits: "pixels",
-            getRadius: 2,
-            antialiasing: false,
-          }),
+          wayLines(`tracks-${level.spacing}`, level, lines, { widthUnits: "pixels", getWidth: 1.5 }),
+          wayDots(`cameras-${level.spacing}`, level, dots, { radiusUnits: "pixels", getRadius: 2 }),
         ],
       };
     }
@@ -451,28 +433,8 @@ export class MapView {
       ends.set([...color, 255], 4 * i);
     }
     return [
-      new LineLayer({
-        id: `tracks-streets-${level.spacing}`,
-        data: {
-          length: Math.max(0, rows - 1),
-          attributes: {
-            getSourcePosition: { value: level.points, size: 3 },
-            getTargetPosition: { value: level.points, size: 3, offset: 12 },
-            getColor: { value: lines, size: 4, normalized: true },
-          },
-        } as never,
-        widthUnits: "common",
-        getWidth: STREET_M,
-        widthMinPixels: 3,
-      }),
-      new ScatterplotLayer({
-        id: `tracks-corners-${level.spacing}`,
-        data: { length: rows, attributes: { getPosition: { value: level.points, size: 3 }, getFillColor: { value: ends, size: 4, normalized: true } } } as never,
-        radiusUnits: "common",
-        getRadius: STREET_M / 2,
-        radiusMinPixels: 1.5,
-        antialiasing: false,
-      }),
+      wayLines(`tracks-streets-${level.spacing}`, level, lines, { widthUnits: "common", getWidth: STREET_M, widthMinPixels: 3 }),
+      wayDots(`tracks-corners-${level.spacing}`, level, ends, { radiusUnits: "common", getRadius: STREET_M / 2, radiusMinPixels: 1.5 }),
     ];
   }
 
@@ -512,27 +474,20 @@ export class MapView {
     const { shots, misses, to } = this.rays;
     const visible = this.view.zoom > RAYS_FROM_ZOOM;
     const seen = shots.filter((shot) => !this.settings.hiddenPasses.has(shot.pass));
+    const lines = (id: string, data: Shot[], getColor: (shot: Shot) => [number, number, number, number], getWidth: number) =>
+      new LineLayer<Shot>({
+        id,
+        visible,
+        data,
+        getSourcePosition: (shot) => [shot.camera_m[0], shot.camera_m[1], 0],
+        getTargetPosition: () => [...to, 0],
+        getColor,
+        widthUnits: "pixels",
+        getWidth,
+      });
     return [
-      new LineLayer<Shot>({
-        id: "misses",
-        visible,
-        data: misses,
-        getSourcePosition: (shot) => [shot.camera_m[0], shot.camera_m[1], 0],
-        getTargetPosition: () => [...to, 0],
-        getColor: [213, 94, 0, 70],
-        widthUnits: "pixels",
-        getWidth: 1,
-      }),
-      new LineLayer<Shot>({
-        id: "rays",
-        visible,
-        data: seen,
-        getSourcePosition: (shot) => [shot.camera_m[0], shot.camera_m[1], 0],
-        getTargetPosition: () => [...to, 0],
-        getColor: (shot) => [...passColor(shot.pass, this.dark), 120],
-        widthUnits: "pixels",
-        getWidth: 1,
-      }),
+      lines("misses", misses, () => [213, 94, 0, 70], 1),
+      lines("rays", seen, (shot) => [...passColor(shot.pass, this.dark), 120], 1),
       new ScatterplotLayer<Shot>({
         id: "voters",
         visible,
@@ -542,16 +497,7 @@ export class MapView {
         radiusUnits: "pixels",
         getRadius: 2.6,
       }),
-      new LineLayer<Shot>({
-        id: "lit",
-        visible,
-        data: this.lit ? [this.lit] : [],
-        getSourcePosition: (shot) => [shot.camera_m[0], shot.camera_m[1], 0],
-        getTargetPosition: () => [...to, 0],
-        getColor: this.dark ? [255, 255, 255, 255] : [20, 20, 20, 255],
-        widthUnits: "pixels",
-        getWidth: 2.5,
-      }),
+      lines("lit", this.lit ? [this.lit] : [], () => (this.dark ? [255, 255, 255, 255] : [20, 20, 20, 255]), 2.5),
     ];
   }
 
@@ -662,6 +608,28 @@ function labelLayers({ length, position, fill, line, radius, shape }: Buffers): 
       stroked: true,
     }),
   ];
+}
+
+/** Lines from each image to the next of its pass; `colors` has an opacity of 0 where there is none. */
+function wayLines(id: string, { points, pass }: Level, colors: Uint8Array, width: object): Layer {
+  return new LineLayer({
+    id,
+    data: {
+      length: Math.max(0, pass.length - 1),
+      attributes: {
+        getSourcePosition: { value: points, size: 3 },
+        getTargetPosition: { value: points, size: 3, offset: 12 },
+        getColor: { value: colors, size: 4, normalized: true },
+      },
+    } as never,
+    ...width,
+  });
+}
+
+/** Dots where images are. */
+function wayDots(id: string, { points, pass }: Level, colors: Uint8Array, radius: object): Layer {
+  const attributes = { getPosition: { value: points, size: 3 }, getFillColor: { value: colors, size: 4, normalized: true } };
+  return new ScatterplotLayer({ id, data: { length: pass.length, attributes } as never, antialiasing: false, ...radius });
 }
 
 function bounds(arrays: Float32Array[]) {
