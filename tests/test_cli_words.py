@@ -133,3 +133,7 @@ def test_bars_begin_with_a_total_and_end_with_the_work(monkeypatch: pytest.Monke
         assert (finding.completed, finding.total) == (1, 7)
         progress("finding", 7, 7)
         assert bars.finished
+        progress("finding", 0, 3)  # The same once more, on something else.
+        assert (bars.tasks[1].completed, bars.tasks[1].total) == (0, 3)
+        progress("finding", 3, 3)
+        assert bars.finished

@@ -21,6 +21,7 @@ from PIL import Image
 from small_dataset import rewrite, small_dataset, with_value
 from test_cli import colmap_model
 from tiny_models import red_finder, says
+from told import Told
 from valuemap import build_map, read_dataset, write_dataset
 from valuemap.config import DetectConfig
 from valuemap.dataset import Dataset
@@ -387,7 +388,9 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path: Path, finder: Pa
     before = (folder / "detections.parquet").read_bytes()
     config = DetectConfig(batch=3)
     whole = shutil.copytree(folder, tmp_path / "whole")
-    detect_dataset(whole, finder, config)
+    told = Told()
+    detect_dataset(whole, finder, config, progress=told)
+    told.check("pictures")
 
     def stop_after(count: int) -> Callable[[str, int, int], None]:
         def progress(what: str, done: int, total: int) -> None:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 import valuemap
 from literal import Pinhole, Sighting
 from scenes import Scene, as_dataset, random_scene
+from told import Told
 from valuemap.cameras import cast_rays
 from valuemap.config import NoiseConfig
 from valuemap.dataset import Dataset, Frame
@@ -166,6 +167,13 @@ def test_the_number_of_threads_does_not_matter(config: valuemap.MapConfig, tmp_p
         valuemap.write_map(valuemap.build_map(street(), config, threads=threads), tmp_path / "other")
         for name in ("labels.parquet", "votes.parquet", "rejected.parquet"):
             assert (tmp_path / "other" / name).read_bytes() == (tmp_path / "one" / name).read_bytes()
+
+
+@both_methods
+def test_a_map_tells_how_far_it_is(config: valuemap.MapConfig) -> None:
+    valuemap.build_map(street(), config, progress=(told := Told()))
+    kinds = ["voting"] if config.method == "paper" else ["comparing drives", "estimating the noise", "finding labels"]
+    told.check(*kinds)
 
 
 @both_methods

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from reading import refusal, write
 from test_readers_pictures import ANCHOR, picture, tags
+from told import Told
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.dataset import Dataset
 from valuemap.geodesy import lon_lat_height_from_enu
@@ -382,20 +383,17 @@ def found_street(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Datase
     """A drive of nine pictures and what is found of it: folder, dataset, true centres and rotations, and progress."""
     folder = tmp_path_factory.mktemp("street")
     centers, rotations = drive(folder / "pictures")
-    steps: list[str] = []
-
-    def note(what: str, done: int, total: int) -> None:
-        steps.append(what)
-
+    told = Told()
     dataset = read_pictures(
         folder / "pictures",
         workspace=folder / "work",
         anchor=ANCHOR,
         gps_sigma_m=0.1,
         threads=2,
-        progress=note,
+        progress=told,
     )
-    return folder, dataset, centers, rotations, steps
+    told.check("finding features", "matching pictures", "finding poses", "adjusting poses")
+    return folder, dataset, centers, rotations, [what for what, _, _ in told.calls]
 
 
 Street = tuple[Path, Dataset, Floats, Floats, list[str]]

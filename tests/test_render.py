@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from told import Told
 from valuemap.cameras import colmap_camera, rotation_matrices
 from valuemap.config import SimulationConfig
 from valuemap.dataset import write_dataset
@@ -264,7 +265,9 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recording, Path]:
     few = record_city(changed(passes_per_street=0, images=24, image_width_px=160, image_height_px=120), seed=2)
     folder = tmp_path_factory.mktemp("rendered") / "dataset"
     write_dataset(few.dataset, folder)
-    assert render_images(few, folder) == 24
+    told = Told()
+    assert render_images(few, folder, progress=told) == 24
+    told.check("rendering")
     return few, folder
 
 

@@ -14,6 +14,7 @@ from numpy.testing import assert_array_equal
 
 from report_city import city
 from small_dataset import small_dataset
+from told import Told
 from valuemap import build_map, experiment
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, number_passes
@@ -28,7 +29,9 @@ QUICK = MapConfig(method="paper")
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PassesResult]:
     out = tmp_path_factory.mktemp("experiment") / "out"
-    return out, experiment_passes(city().dataset, out, QUICK, seeds=2, min_passes=3)
+    result = experiment_passes(city().dataset, out, QUICK, seeds=2, min_passes=3, progress=(told := Told()))
+    told.check("voting", "maps of some passes")
+    return out, result
 
 
 def test_more_passes_place_objects_better(measured: tuple[Path, PassesResult]) -> None:

@@ -20,6 +20,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from report_city import city, write_city
 from small_dataset import map_of, small_dataset
+from told import Told
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError
 from valuemap.evaluate import Evaluation, evaluate_map
@@ -60,7 +61,9 @@ def write_again(page: Path, data: Path) -> None:
         dataset_folder=data,
         evaluation=evaluation,
         passes=passes_result(),
+        progress=(told := Told()),
     )
+    told.check("drawing the report")
 
 
 class Page(HTMLParser):

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 import valuemap
 from block import block
 from scenes import as_dataset, random_scene
+from told import Told
 from valuemap import portions
 from valuemap.cli.commands import app
 from valuemap.config import MapConfig, SimulationConfig
@@ -447,7 +448,8 @@ def test_pieces_on_disk_are_those_in_memory(long_street: Path, tmp_path: Path, m
     for module, name in ((portions, "ROWS"), (fleet, "BATCH"), (places, "SHARE")):
         monkeypatch.setattr(module, name, 50)
     with open_work(tmp_path / "work", resume=False) as work:
-        on_disk = partition_dataset(long_street, work, KNOWN, tile_size_m=1500.0)
+        on_disk = partition_dataset(long_street, work, KNOWN, tile_size_m=1500.0, progress=(told := Told()))
+        told.check("reading images", "ordering drives", "cutting into tiles")
     in_memory = InMemory(valuemap.read_dataset(long_street), KNOWN)
     assert on_disk.cells == in_memory.cells
     assert on_disk.drives_record == in_memory.drives_record
@@ -536,7 +538,8 @@ def test_what_was_made_with_other_settings_is_not_taken(long_street: Path, tmp_p
         known = learned(source.sample())
         noisy = replace(known, noise=Noise(detection_px=3.0))
         first = solve_cells(source, known, KNOWN, ThreadEngine(1), silent, store=work / "cells")
-        again = solve_cells(source, known, KNOWN, ThreadEngine(2), silent, store=work / "cells")
+        again = solve_cells(source, known, KNOWN, ThreadEngine(2), (told := Told()), store=work / "cells")
+        told.check("cells")
         other = solve_cells(source, noisy, KNOWN, ThreadEngine(2), silent, store=work / "cells")
     assert first == again
     assert not set(map(str, first)) & set(map(str, other))

@@ -140,7 +140,7 @@ def experiment_passes(
     passes_of_cluster = _passes_of(cluster, pass_number)
     _begin(out, _identity(dataset, config, radius_m))
 
-    everything = build_map(dataset, config, threads=threads)
+    everything = build_map(dataset, config, threads=threads, progress=progress)
     reference = _reference(dataset, everything, cluster)
     counted = _counted(reference, passes_of_cluster, min_passes, dataset.name)
     most = int(passes_of_cluster[counted].max())

@@ -16,7 +16,7 @@ from valuemap.config import MapConfig, NoiseConfig
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives
 from valuemap.errors import InputError
-from valuemap.progress import Progress, silent
+from valuemap.progress import Progress, counted, silent
 from valuemap.tables import Candidates, Floats, Ints
 
 LEFT_OUT: set[str] = set()
@@ -135,15 +135,10 @@ def calibrate(
     What the config sets of the noise stays as it is. The scene may be a part of what is mapped.
     """
     guess, known = _guess(config.noise)
-    noise, is_deep, classes, pooled = _core.calibrate(
-        scene.core,
-        guess.as_tuple(),
-        known,
-        _settings(config),
-        is_part,
-        threads,
-        lambda done, total: progress("estimating the noise", done, total),
-    )
+    with counted(progress, "estimating the noise", 1) as tell:
+        noise, is_deep, classes, pooled = _core.calibrate(
+            scene.core, guess.as_tuple(), known, _settings(config), is_part, threads, lambda _done, _total: tell(0)
+        )
     estimated = Noise(*noise)
     return Calibration(
         noise=_all_own(estimated) if "shared_noise" in LEFT_OUT and not all(known) else estimated,
@@ -161,15 +156,11 @@ def misfit(
     Minus twice the logarithm of their likelihood, up to a constant of theirs. What is true makes them likelier.
     """
     guess, known = _guess(config.noise)
-    value, used = _core.misfit(
-        scene.core,
-        guess.as_tuple(),
-        known,
-        _settings(config),
-        None if rays is None else rays.astype(np.uint32),
-        threads,
-        lambda done, total: progress("comparing poses", done, total),
-    )
+    rows = None if rays is None else rays.astype(np.uint32)
+    with counted(progress, "comparing poses", 1) as tell:
+        value, used = _core.misfit(
+            scene.core, guess.as_tuple(), known, _settings(config), rows, threads, lambda _done, _total: tell(0)
+        )
     return value, used.astype(np.int64)
 
 
@@ -181,13 +172,14 @@ def find_labels(
     scene: Scene, calibration: Calibration, config: MapConfig, *, threads: int = 0, progress: Progress = silent
 ) -> tuple[Candidates, dict[str, Any]]:
     """Return the labels, ordered by first detection, and counts of what was found and rejected."""
-    position, (offsets, voters), covariance, existence, expected, counts = _core.find_labels(
-        scene.core,
-        calibration.as_tuple(scene.class_names),
-        _settings(config),
-        threads,
-        lambda done, total: progress("finding labels", min(done, total), total),
-    )
+    with counted(progress, "finding labels", 1) as tell:
+        position, (offsets, voters), covariance, existence, expected, counts = _core.find_labels(
+            scene.core,
+            calibration.as_tuple(scene.class_names),
+            _settings(config),
+            threads,
+            lambda _done, _total: tell(0),
+        )
     covariance = covariance.reshape(-1, 3, 3)
     counts = {_COUNTED_AS.get(name, name): value for name, value in counts.items()}
     return Candidates(position, offsets, voters, None, covariance, existence, expected), counts

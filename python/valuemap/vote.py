@@ -11,7 +11,7 @@ import valuemap._core as _core
 from valuemap.cameras import Rays
 from valuemap.config import VoteConfig
 from valuemap.errors import SettingError
-from valuemap.progress import Progress, silent
+from valuemap.progress import Progress, counted, silent
 from valuemap.tables import Candidates
 
 
@@ -33,19 +33,22 @@ def vote_in_clusters(
     SettingError
         A cluster is so dense that the votes of its hypotheses, cubic in its detections, do not fit into memory.
     """
+    cluster_of_ray = cluster_of_image[rays.image_row]
+    clusters = max(1, len(np.unique(cluster_of_ray)))
     try:
-        position, (offsets, voters), cluster, counts = _core.vote(
-            rays.core,
-            cluster_of_image[rays.image_row],
-            max_reprojection_error_px=config.max_reprojection_error_px,
-            min_parallax_rad=math.radians(config.min_parallax_deg),
-            min_range_m=config.min_range_m,
-            max_range_m=config.max_range_m,
-            min_vote_ratio=config.min_vote_ratio,
-            min_votes=config.min_votes,
-            threads=threads,
-            progress=lambda done, total: progress("voting", done, total),
-        )
+        with counted(progress, "voting", clusters) as tell:
+            position, (offsets, voters), cluster, counts = _core.vote(
+                rays.core,
+                cluster_of_ray,
+                max_reprojection_error_px=config.max_reprojection_error_px,
+                min_parallax_rad=math.radians(config.min_parallax_deg),
+                min_range_m=config.min_range_m,
+                max_range_m=config.max_range_m,
+                min_vote_ratio=config.min_vote_ratio,
+                min_votes=config.min_votes,
+                threads=threads,
+                progress=lambda done, total: tell(clusters * done // max(total, 1)),
+            )
     except MemoryError as error:
         detections, hypotheses = error.args
         raise SettingError(

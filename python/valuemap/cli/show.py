@@ -8,7 +8,16 @@ from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    ProgressColumn,
+    SpinnerColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.progress import Progress as ProgressBars
 from rich.table import Table
 from rich.text import Text
@@ -93,10 +102,12 @@ class _SpeedColumn(ProgressColumn):
 def progress_bars() -> Iterator[Progress]:
     """Yield a callback that draws one bar for each kind of work on stderr, if that is a terminal."""
     columns = (
+        SpinnerColumn(),  # Some steps are long, and cannot say how far they are.
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         _SpeedColumn(),
+        TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
     with ProgressBars(*columns, console=log, transient=True, disable=not log.is_terminal) as bars:
@@ -107,6 +118,8 @@ def progress_bars() -> Iterator[Progress]:
                 for earlier in bars.tasks:  # What comes next begins when what was before has ended.
                     bars.update(earlier.id, completed=earlier.total)
                 tasks[what] = bars.add_task(what, total=total)
+            elif done == 0 and bars.tasks[tasks[what]].finished:  # The same work once more, on something else.
+                bars.reset(tasks[what], total=total)
             bars.update(tasks[what], completed=done, total=total)
 
         yield progress

@@ -24,7 +24,7 @@ from valuemap.detect.pictures import list_pictures
 from valuemap.detect.truth import find_truth_detections
 from valuemap.errors import InputError, OutputError
 from valuemap.folders import check_files, new_file, remove_file
-from valuemap.progress import Progress, silent
+from valuemap.progress import Progress, counted, silent
 from valuemap.tables import Cameras, Categories, Detections, Images, Truth, read_table, write_table
 
 RECORD = "detect.json"
@@ -172,13 +172,14 @@ def detect_pictures(
     """
     detector = Detector(Path(model), config or DetectConfig())
     found: list[PictureBoxes] = []
-    for group in detector.run([Task(Path(path)) for path in paths]):
-        for outcome in group:
-            codes = outcome.boxes.class_code.tolist()
-            classes = tuple(detector.wanted.name_of(code) for code in codes)
-            path = Path(paths[len(found)])
-            found.append(PictureBoxes(path, outcome.stored, outcome.boxes, classes, outcome.problem))
-        progress("pictures", len(found), len(paths))
+    with counted(progress, "pictures", len(paths)) as tell:
+        for group in detector.run([Task(Path(path)) for path in paths]):
+            for outcome in group:
+                codes = outcome.boxes.class_code.tolist()
+                classes = tuple(detector.wanted.name_of(code) for code in codes)
+                path = Path(paths[len(found)])
+                found.append(PictureBoxes(path, outcome.stored, outcome.boxes, classes, outcome.problem))
+            tell(len(found))
     return found
 
 

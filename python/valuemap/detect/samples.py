@@ -18,7 +18,7 @@ from valuemap.detect.letterbox import Fit, fit_around
 from valuemap.detect.masks import masks_of_boxes
 from valuemap.detect.pictures import UnusablePicture, read_picture
 from valuemap.errors import InputError
-from valuemap.progress import Progress
+from valuemap.progress import Progress, counted
 from valuemap.tables import Floats, Ints
 
 MEAN = (0.485, 0.456, 0.406)
@@ -190,13 +190,14 @@ def _without_broken(pictures: list[LabelledPicture], skipped: list[str], progres
         return None
 
     usable: list[LabelledPicture] = []
-    with ThreadPoolExecutor(_THREADS) as pool:
+    what = "look through the pictures"
+    with ThreadPoolExecutor(_THREADS) as pool, counted(progress, what, len(pictures)) as tell:
         for done, (picture, why) in enumerate(zip(pictures, pool.map(reason, pictures), strict=True), start=1):
             if why is None:
                 usable.append(picture)
             else:
                 skipped.append(why)
-            progress("look through the pictures", done, len(pictures))
+            tell(done)
     return usable
 
 

@@ -190,6 +190,8 @@ class Training:
         torch.manual_seed(self.seed * 1_000_003 + epoch)  # For the dropout.
         steps = math.ceil(len(self.data.training) * self.config.cutouts / self.config.batch)
         losses = []
+        what = f"epoch {epoch} of {self.config.epochs}: train"
+        progress(what, 0, steps)
         for step, arrays in enumerate(batches(self.data, self.config, seed=self.seed, epoch=epoch)):
             rate = self._learning_rate((epoch - 1 + step / steps) / self.config.epochs)
             for group in self.optimiser.param_groups:
@@ -205,7 +207,7 @@ class Training:
             self.scaler.step(self.optimiser)
             self.scaler.update()
             losses.append(loss.item())
-            progress(f"epoch {epoch} of {self.config.epochs}: train", step + 1, steps)
+            progress(what, step + 1, steps)
         return float(sum(losses) / len(losses))
 
     @torch.no_grad()
@@ -213,6 +215,8 @@ class Training:
         self.network.eval()
         search = ThresholdSearch(self.config.minimum_component_px)
         sums = torch.zeros(4, len(self.data.classes), dtype=torch.float64, device=self.device)
+        what = f"epoch {epoch} of {self.config.epochs}: validate"
+        progress(what, 0, len(self.data.validation))
         for row, picture in enumerate(self.data.validation):
             sample, fit = whole(self.data, row, self.config)
             image, target, weight = (self._to_device(a[None]) for a in (sample.image, sample.target, sample.weight))
@@ -222,7 +226,7 @@ class Training:
             width, height = fit.resized
             probability = torch.sigmoid(logits.float())[0, :, :height, :width].cpu().numpy()
             search.add(probability, edges_of(picture.boxes_px), self.data.codes(picture), edges_of(picture.ignored_px))
-            progress(f"epoch {epoch} of {self.config.epochs}: validate", row + 1, len(self.data.validation))
+            progress(what, row + 1, len(self.data.validation))
         return loss_of(sums).item(), search
 
     def _learning_rate(self, done: float) -> float:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from valuemap.config import SimulationConfig
-from valuemap.progress import Progress
+from valuemap.progress import Progress, counted
 from valuemap.simulate.city import City
 from valuemap.simulate.paths import Path, lay_path
 from valuemap.simulate.routes import Route, route_at_random, routes_over_every_street
@@ -67,18 +67,21 @@ def drive(city: City, config: SimulationConfig, *, seed: int, progress: Progress
     Where an aimed number of detections leaves open how far is far, all images that may be needed are returned.
     """
     passes: list[Frames] = []
-    for number in range(config.passes_per_street):
-        routes = routes_over_every_street(city.streets, config, seed=seed, round_number=number)
-        passes += [_drive_route(route, city, config, seed, len(passes) + i) for i, route in enumerate(routes)]
-        progress("driving every street", number + 1, config.passes_per_street)
+    with counted(progress, "driving every street", config.passes_per_street) as tell:
+        for number in range(config.passes_per_street):
+            routes = routes_over_every_street(city.streets, config, seed=seed, round_number=number)
+            passes += [_drive_route(route, city, config, seed, len(passes) + i) for i, route in enumerate(routes)]
+            tell(number + 1)
     # These images stay, however near the aimed number of detections will have them.
     sure_m = config.keep_before_signal_m * (KEEP_RANGE[0] if config.detections else 1.0)
     images = sum(int(np.count_nonzero(p.signal_ahead_m <= sure_m)) for p in passes)
-    while images < config.images:
-        route = route_at_random(city.streets, config, seed=seed, pass_row=len(passes))
-        passes.append(_drive_route(route, city, config, seed, len(passes)))
-        images += int(np.count_nonzero(passes[-1].signal_ahead_m <= sure_m))
-        progress("driving at random", min(images, config.images), config.images)
+    if images < config.images:
+        with counted(progress, "driving at random", config.images) as tell:
+            while images < config.images:
+                route = route_at_random(city.streets, config, seed=seed, pass_row=len(passes))
+                passes.append(_drive_route(route, city, config, seed, len(passes)))
+                images += int(np.count_nonzero(passes[-1].signal_ahead_m <= sure_m))
+                tell(images)
     frames = join_rows(passes)
     return frames.replace(exposure_row=np.arange(len(frames)))
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from valuemap.folders import new_file
-from valuemap.progress import Progress, silent
+from valuemap.progress import Progress, counted, silent
 from valuemap.simulate.canvas import Picture
 from valuemap.simulate.paint import Painter
 from valuemap.simulate.scene import build_world, look, true_boxes
@@ -64,9 +64,10 @@ def render_pictures(
         boxes_px, ignored_px = true_boxes(world, scene)
         return RenderedPicture(row, names[row], painter.paint(scene), boxes_px, ignored_px)
 
-    for done, picture in enumerate(_in_threads(render, wanted, threads)):
-        yield picture
-        progress("rendering", done + 1, len(wanted))
+    with counted(progress, "rendering", len(wanted)) as tell:
+        for done, picture in enumerate(_in_threads(render, wanted, threads)):
+            yield picture
+            tell(done + 1)
 
 
 def render_images(recording: Recording, folder: Path, *, threads: int = 0, progress: Progress = silent) -> int:
@@ -104,10 +105,11 @@ def render_images(recording: Recording, folder: Path, *, threads: int = 0, progr
 
     rows = range(len(recording.frames))
     boxes: list[tuple[Floats, Floats]] = []
-    for should, may, is_new in _in_threads(render, rows, threads):
-        boxes.append((should, may))
-        painted += is_new
-        progress("rendering", len(boxes), len(rows))
+    with counted(progress, "rendering", len(rows)) as tell:
+        for should, may, is_new in _in_threads(render, rows, threads):
+            boxes.append((should, may))
+            painted += is_new
+            tell(len(boxes))
     with new_file(folder / BOXES) as fresh:
         fresh.write_text(json.dumps(_coco(recording, names, boxes)), encoding="utf-8")
     return painted

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from valuemap.config import SimulationConfig
-from valuemap.progress import Progress
+from valuemap.progress import Progress, counted
 from valuemap.simulate.drives import Frames
 from valuemap.simulate.rows import join_rows
 from valuemap.simulate.streets import Streets
@@ -46,11 +46,12 @@ def see(
 ) -> Sightings:
     """Return all views of targets: near enough, inside the picture, facing the camera, no house between."""
     chunks = []
-    for start in range(0, len(frames), _CHUNK_FRAMES):
-        rows = np.arange(start, min(start + _CHUNK_FRAMES, len(frames)))
-        seen = _see_in_chunk(targets, frames.take(rows), streets, config)
-        chunks.append(seen.replace(frame_row=seen.frame_row + start))
-        progress(what, int(rows[-1]) + 1, len(frames))
+    with counted(progress, what, len(frames)) as tell:
+        for start in range(0, len(frames), _CHUNK_FRAMES):
+            rows = np.arange(start, min(start + _CHUNK_FRAMES, len(frames)))
+            seen = _see_in_chunk(targets, frames.take(rows), streets, config)
+            chunks.append(seen.replace(frame_row=seen.frame_row + start))
+            tell(int(rows[-1]) + 1)
     return join_rows(chunks)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import InOrder, in_driving_order
-from valuemap.progress import Progress
+from valuemap.progress import Progress, counted
 from valuemap.robust import Scene, misfit
 from valuemap.sightings import cast_sightings
 from valuemap.tiles.piece import piece_of_rows
@@ -24,11 +24,12 @@ def compare_poses(
     """
     old = InMemory(before, config).sample()
     scene = Scene(old.dataset, old.drives, cast_sightings(old.dataset)[0])
-    of_old, rays = misfit(scene, config, threads=threads, progress=progress)
-    new = _same_images(after, old, config)
-    scene = Scene(new.dataset, new.drives, cast_sightings(new.dataset)[0])
-    same = np.sort(rows_of(old.detection_id[rays], new.detection_id))
-    of_new, _ = misfit(scene, config, same, threads=threads, progress=progress)
+    with counted(progress, "comparing poses", 2) as tell:
+        of_old, rays = misfit(scene, config, threads=threads, progress=lambda *_: tell(0))
+        new = _same_images(after, old, config)
+        scene = Scene(new.dataset, new.drives, cast_sightings(new.dataset)[0])
+        same = np.sort(rows_of(old.detection_id[rays], new.detection_id))
+        of_new, _ = misfit(scene, config, same, threads=threads, progress=lambda *_: tell(1))
     return of_old, of_new, len(rays)
 
 

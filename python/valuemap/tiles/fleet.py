@@ -79,6 +79,7 @@ class Fleet:
         done = 0
         with ExitStack() as opened:
             writers = [opened.enter_context(TableWriter(file)) for file in files]
+            self._progress("reading images", 0, self.count)
             for images in reader.images():
                 of = batch_of_pass[np.array([code_of[name] for name in images.pass_id.names])[images.pass_id.codes]]
                 is_untimed = _is_untimed(images)
@@ -114,6 +115,7 @@ class Fleet:
         usual: Usual | None = None
         ways: Ways | None = None
         total = 2 * len(self._files)
+        self._progress("ordering drives", 0, total)
         for done, file in enumerate(self._files):
             ways = Ways(read_table(Images, file))
             usual = ways.usual if usual is None else usual + ways.usual

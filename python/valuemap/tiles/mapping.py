@@ -7,7 +7,7 @@ from pathlib import Path
 
 from valuemap.config import MapConfig
 from valuemap.engine.engine import Engine
-from valuemap.progress import Progress
+from valuemap.progress import Progress, counted
 from valuemap.robust import Calibration
 from valuemap.tiles.grid import Cell
 from valuemap.tiles.solve import Solved, solve_cell
@@ -71,9 +71,10 @@ def solve_cells(
         result = task(cells[0], progress)
         return [] if result is None else [result]
     solved: list[Solved | Path | None] = [None] * len(cells)
-    for done, (number, result) in enumerate(engine.run(task, cells), start=1):
-        solved[number] = result
-        progress("cells", done, len(cells))
+    with counted(progress, "cells", len(cells)) as tell:
+        for done, (number, result) in enumerate(engine.run(task, cells), start=1):
+            solved[number] = result
+            tell(done)
     return [result for result in solved if result is not None]
 
 

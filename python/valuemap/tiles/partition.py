@@ -199,6 +199,7 @@ class _Writer:
             index.add(batch.images, batch.place, place_m)
         classes: dict[str, int] = {}
         done, total = 0, rows_on_disk(self.reader.folder)[1]
+        self.progress("cutting into tiles", done, total)
         for number, (portion, place, place_m) in enumerate(index.placed(self.reader)):
             census += Census.of_detections(self.grid, place_m)
             names = portion.class_name.names

@@ -12,7 +12,7 @@ from valuemap.config import MapConfig
 from valuemap.dataset import number_passes
 from valuemap.describe import describe_labels
 from valuemap.drives import InOrder
-from valuemap.progress import Progress, silent
+from valuemap.progress import Progress, counted, silent
 from valuemap.robust import Calibration, Scene, find_labels
 from valuemap.sightings import cast_sightings
 from valuemap.tables import Bools, Candidates, Ints, Labels, Votes
@@ -88,13 +88,18 @@ def _by_groups(
 ) -> tuple[Candidates, dict[str, Any]]:
     """Find the labels of a piece that is too dense to be solved at once, some drives at a time."""
     found, counts = [], []
-    for rows in groups:
-        part = piece_of_rows(piece, rows)
-        detection_row = np.flatnonzero(np.isin(piece.dataset.detections.image_id, rows))
-        scene = Scene(part.dataset, part.drives, cast_sightings(part.dataset)[0])
-        of_group, counted = find_labels(scene, calibration, config, threads=threads, progress=progress)
-        found.append(replace(of_group, voters=detection_row[of_group.voters].astype(np.uint32)))
-        counts.append({"images": len(rows), **counted})
+    with counted(progress, "finding labels", len(groups)) as tell:
+        for number, rows in enumerate(groups):
+            part = piece_of_rows(piece, rows)
+            detection_row = np.flatnonzero(np.isin(piece.dataset.detections.image_id, rows))
+            scene = Scene(part.dataset, part.drives, cast_sightings(part.dataset)[0])
+
+            def go_on(_what: str, _done: int, _total: int, number: int = number) -> None:
+                tell(number)
+
+            of_group, of_counts = find_labels(scene, calibration, config, threads=threads, progress=go_on)
+            found.append(replace(of_group, voters=detection_row[of_group.voters].astype(np.uint32)))
+            counts.append({"images": len(rows), **of_counts})
     joined, left_out = join_groups(found, piece.dataset.detections.class_name)
     return joined, {**summed(counts), "dense_groups": len(groups), "labels_of_few_groups": left_out}
 

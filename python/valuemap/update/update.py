@@ -16,7 +16,7 @@ from valuemap.errors import InputError
 from valuemap.evidence import Evidence, find_dataset
 from valuemap.map_folder import BRIDGE, CELLS, CHANGES, DATASET, Map, read_map
 from valuemap.pipeline import Run, build_map_of_folder
-from valuemap.progress import Progress, silent
+from valuemap.progress import Progress, counted, silent
 from valuemap.rejected import rejected_of_map
 from valuemap.tables import Bools, Categories, Changes, IdBridge, Ints, Labels, Votes, join_tables, write_table
 from valuemap.tiles.calibration import read_calibration
@@ -110,15 +110,17 @@ def compare(
     )
     done = 0
 
-    def looks_at(label_id: int) -> tuple[Looks, Looks]:
-        nonlocal done
-        done += 1
-        progress("looking for changes", done, len(rows.labels))
-        return lookout.at(label_id)
-
     states = before.labels.state.texts() if before.labels.state is not None else ["confirmed"] * len(before.labels)
     touched = np.asarray(near <= evidence.max_range_m)
-    verdicts, looks = judge(rows.labels, rows.before, states, touched, rows.stands, looks_at)
+    with counted(progress, "looking for changes", len(rows.labels)) as looked_at:
+
+        def looks_at(label_id: int) -> tuple[Looks, Looks]:
+            nonlocal done
+            done += 1
+            looked_at(done)
+            return lookout.at(label_id)
+
+        verdicts, looks = judge(rows.labels, rows.before, states, touched, rows.stands, looks_at)
     # What only the added passes have, and all the data do not, is there only if it explains what is gone.
     unfounded = rows.is_of_alone & (verdicts.moved_from < 0) & ~rows.is_founded
     if unfounded.any():
