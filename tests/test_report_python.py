@@ -44,6 +44,8 @@ def test_what_is_meant_for_users_is_there_and_no_more() -> None:
 
 def test_rows_of_a_table_are_taken_by_mask_indices_and_slice() -> None:
     labels = map_of(np.arange(12.0).reshape(4, 3), ["a", "b", "a", "c"]).labels
+    assert {"take", "label_id", "to_pandas"} <= set(dir(labels))
+    assert not {"KEY", "MAY_BE_EMPTY"} & set(dir(labels))
     mask = labels.position_in_world_m[:, 0] > 2.0
     assert_array_equal(labels[mask].label_id, [1, 2, 3])
     assert_array_equal(labels[[0, 3]].label_id, [0, 3])
@@ -59,6 +61,7 @@ def test_rows_of_a_table_are_taken_by_mask_indices_and_slice() -> None:
 def test_a_map_is_short_as_text_and_a_picture_in_a_notebook() -> None:
     result = map_of([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], ["<b>", "sign"])
     assert repr(result) == "Map(2 labels of 2 classes, 0 votes)"
+    assert repr(result).replace("2 classes", "1 class") == repr(map_of([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]))
     assert repr(result.labels).startswith("Labels(2 rows: label_id, class, x, y, z, ")
     assert repr(result.labels.class_name) == "Categories(2 rows of '<b>', 'sign')"
     assert "2 true objects" in repr(small_dataset())

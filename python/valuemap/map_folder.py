@@ -72,7 +72,8 @@ class Map:
 
     def __repr__(self) -> str:
         classes = len(np.unique(self.labels.class_name.codes))
-        return f"Map({len(self.labels):,} labels of {classes} classes, {len(self.votes):,} votes)"
+        of = "1 class" if classes == 1 else f"{classes} classes"
+        return f"Map({len(self.labels):,} labels of {of}, {len(self.votes):,} votes)"
 
     def _repr_html_(self) -> str:
         """Show the map in a notebook: in numbers, and from above."""

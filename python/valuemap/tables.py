@@ -110,6 +110,9 @@ class Table:
             raise IndexError(f"a mask of {len(chosen)} rows for a table of {len(self)}")
         return self.take(chosen if len(chosen) else np.empty(0, np.int64))
 
+    def __dir__(self) -> list[str]:
+        return [name for name in super().__dir__() if not name.isupper()]  # Constants are for `read_table`.
+
     def __repr__(self) -> str:
         columns = [name for f in fields(self) if getattr(self, f.name) is not None for name in f.metadata["names"]]
         return f"{type(self).__name__}({len(self):,} rows: {', '.join(columns)})"
