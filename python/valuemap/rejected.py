@@ -103,7 +103,7 @@ def figures_in_words(rejected: Rejected, row: int) -> str:
 
 
 _FIGURES = {
-    "votes": "{value:.0f}, of at least {threshold:.0f}",
+    "votes": "{value:.0f} votes, of at least {threshold:.0f}",
     "parallax": "{value:.1f} degrees, of at least {threshold:g}",
     "merged": "{value:.1f} sigmas apart, up to {threshold:.1f} are one place",
     "class": "{value:.1f} sigmas apart, up to {threshold:.1f} are one place",

@@ -250,7 +250,12 @@ class Page {
       h("br"),
       `existence ${probability(labels.existence[row])} · ${plural(labels.votes[row], "vote")} · ${plural(labels.passes[row], "pass", "passes")}`,
     );
-    tip.style.transform = `translate(${x + 14}px, ${y + 14}px)`;
+    // On the other side of the pointer where it would be cut, by the details for one.
+    const [deck, details] = [byId("deck"), byId("details")];
+    const right = deck.clientWidth - (details.hidden ? 0 : details.offsetWidth);
+    const left = x + 14 + tip.offsetWidth > right ? Math.max(0, x - 14 - tip.offsetWidth) : x + 14;
+    const top = y + 14 + tip.offsetHeight > deck.clientHeight ? y - 14 - tip.offsetHeight : y + 14;
+    tip.style.transform = `translate(${left}px, ${top}px)`;
   }
 
   // Clicks
@@ -267,6 +272,7 @@ class Page {
   private panel(): HTMLElement {
     const panel = byId("details");
     panel.hidden = false;
+    byId("tip").hidden = true; // It says less than the panel, which may cover it.
     this.map.cover(panel.offsetWidth);
     return panel;
   }

@@ -244,7 +244,10 @@ def _missing(evidence: Evidence, passing: PassingRays, free: Ints, images: int) 
     reasons = []
     least = settings.get("min_votes")
     if isinstance(least, int | float) and images < least:
-        reasons.append(f"A label needs votes of {least} images (min_votes).")
+        few = settings.get("least_votes")
+        but = ", or of fewer where others of its class tell height and size (least_votes)"
+        makes_up = but if isinstance(few, int) and few < least else ""
+        reasons.append(f"A label needs votes of {least} images (min_votes){makes_up}.")
     parallax = settings.get("min_parallax_deg")
     direction = evidence.rays.direction_in_world[passing.detection_row[free]]
     direction = direction[np.isfinite(direction[:, 0])]
