@@ -40,6 +40,8 @@ pub mod search;
 pub mod sizes;
 mod spd;
 
+use std::f64::consts::PI;
+
 use crate::hypothesis::Viability;
 use crate::progress::{Halt, Progress};
 
@@ -228,17 +230,17 @@ fn likeliest_noise(
     let few = sample::places(scene, CALIBRATION_RAYS.0, settings.viability.max_range_m);
     let likeliest = Likeliest::of_starts(scene, guess, known, settings, &few, progress)?;
     // What more rays tell is taken if it makes them likelier.
-    let mut noise = likeliest.noise.unwrap_or(*guess);
+    let mut noise = likeliest.noise().unwrap_or(*guess);
     if more.len() == few.len() {
         return Ok(noise);
     }
     let mut likeliest = Likeliest::default();
     for _ in 0..2 {
-        let (value, again) = round(scene, &noise, known, settings, more, progress)?;
-        likeliest.offer(value, noise);
-        noise = again;
+        let found = round(scene, &noise, known, settings, more, progress)?;
+        noise = found.again;
+        likeliest.offer(found);
     }
-    Ok(likeliest.noise.unwrap_or(noise))
+    Ok(likeliest.noise().unwrap_or(noise))
 }
 
 /// Minus twice the logarithm of how likely some rays are with the noise that makes them likeliest, up to a constant of these rays; of a sample of
@@ -257,7 +259,7 @@ pub fn misfit(
     let range_m = settings.viability.max_range_m;
     let rays = rays.unwrap_or_else(|| sample::places(scene, CALIBRATION_RAYS.0, range_m));
     let likeliest = Likeliest::of_starts(scene, guess, known, settings, &rays, progress)?;
-    Ok((likeliest.value, rays))
+    Ok((likeliest.0.map_or(f64::INFINITY, |best| best.value), rays))
 }
 
 /// One step: how likely some rays are with a noise, and the noise that is estimated from the map that it makes.
@@ -268,24 +270,73 @@ fn round(
     settings: &Settings,
     rays: &[u32],
     progress: &Progress,
-) -> Result<(f64, Noise), Halt> {
+) -> Result<Round, Halt> {
     let settings = Settings { gate_sigmas: settings.gate_sigmas * CALIBRATION_GATE, ..*settings };
     let mut model = Model::new(scene, noise, &settings);
     let begun = initial::labels_of_few(&model, rays, progress)?;
     let objects = search(&mut model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
     let again = calibrate::calibrate(scene, noise, &placed(&objects), known);
-    Ok((likelihood(&model, &objects, rays), again))
+    let value = likelihood(&model, &objects, rays);
+    Ok(Round { noise: *noise, value, again, left: Left::of(&model, &objects, rays) })
 }
 
-/// The noise that makes the same rays likeliest so far.
-#[derive(Default)]
-struct Likeliest {
-    noise: Option<Noise>,
+/// What a step of the calibration finds with a noise.
+struct Round {
+    noise: Noise,
+    /// Minus twice the logarithm of how likely the rays are with it.
     value: f64,
+    /// The noise that is estimated from the map that it makes.
+    again: Noise,
+    left: Left,
 }
+
+/// What a larger noise could still explain of some rays.
+struct Left {
+    /// Squared residuals of the votes, in sigmas.
+    chi2: f64,
+    /// Votes, each with the depth of its object, m.
+    votes: Vec<(u32, f64)>,
+    /// The rays of no object, each with minus twice the logarithm of the density of clutter there, 1/px².
+    clutter: Vec<(u32, f64)>,
+}
+
+impl Left {
+    fn of(model: &Model<'_>, objects: &[Object], rays: &[u32]) -> Self {
+        let depth_m = |ray: u32, object: &Object| model.scene.ray(ray).project(&object.fit.point).z;
+        let of_object = |object: &Object| -> Vec<(u32, f64)> {
+            object.votes.iter().map(|&ray| (ray, depth_m(ray, object))).collect()
+        };
+        let mut votes: Vec<(u32, f64)> = objects.iter().flat_map(of_object).collect();
+        votes.sort_unstable_by_key(|vote| vote.0);
+        let is_left = |ray: &&u32| votes.binary_search_by_key(*ray, |vote| vote.0).is_err();
+        let price = |&ray: &u32| (ray, -2.0 * model.ln_clutter_per_px2(ray));
+        let clutter = rays.iter().filter(is_left).map(price).collect();
+        Self { chi2: objects.iter().flat_map(|object| &object.fit.chi2).sum(), votes, clutter }
+    }
+}
+
+impl Round {
+    /// Whether a larger noise may make the rays likelier. If it explained the votes without any residual, and the rays of no object as well,
+    /// each of them would still be as improbable as a residual of 0 is: how much more so than now, grows with the noise.
+    fn may_be_larger(&self, scene: &Scene, noise: &Noise) -> bool {
+        let wider = |&(ray, depth_m): &(u32, f64)| {
+            let [now, then] = [&self.noise, noise].map(|noise| noise.total(scene, ray).variance(depth_m));
+            2.0 * (then / now).ln()
+        };
+        let explained =
+            |&(ray, price): &(u32, f64)| (price - 2.0 * (2.0 * PI * noise.total(scene, ray).far_px2).ln()).max(0.0);
+        let gain = self.left.chi2 + self.left.clutter.iter().map(explained).sum::<f64>();
+        self.left.votes.iter().map(wider).sum::<f64>() <= gain
+    }
+}
+
+/// What makes the same rays likeliest so far.
+#[derive(Default)]
+struct Likeliest(Option<Round>);
 
 impl Likeliest {
-    /// From each start some steps: it takes one to learn what passes disagree about, and another to see what that explains.
+    /// From each start some steps: it takes one to learn what passes disagree about, and another to see what that explains. Larger starts
+    /// than may be likelier are left out.
     fn of_starts(
         scene: &Scene,
         guess: &Noise,
@@ -297,20 +348,27 @@ impl Likeliest {
         let mut likeliest = Self::default();
         for factor in STARTS {
             let mut noise = guess.scaled(factor, known);
+            if likeliest.0.as_ref().is_some_and(|best| !best.may_be_larger(scene, &noise)) {
+                break;
+            }
             for _ in 0..CALIBRATION_ROUNDS {
-                let (value, again) = round(scene, &noise, known, settings, rays, progress)?;
-                likeliest.offer(value, noise);
-                noise = again;
+                let found = round(scene, &noise, known, settings, rays, progress)?;
+                noise = found.again;
+                likeliest.offer(found);
             }
         }
         Ok(likeliest)
     }
 
-    /// Keep a noise if it is likelier, `value` minus twice the logarithm.
-    fn offer(&mut self, value: f64, noise: Noise) {
-        if self.noise.is_none() || value < self.value {
-            (self.noise, self.value) = (Some(noise), value);
+    /// Keep what makes them likelier.
+    fn offer(&mut self, found: Round) {
+        if self.0.as_ref().is_none_or(|best| found.value < best.value) {
+            self.0 = Some(found);
         }
+    }
+
+    fn noise(&self) -> Option<Noise> {
+        self.0.as_ref().map(|best| best.noise)
     }
 }
 

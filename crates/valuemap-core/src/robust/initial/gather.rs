@@ -17,7 +17,7 @@ use crate::robust::quick::quick_estimate;
 /// Detections this many times farther than the farthest proposed point still vote.
 pub const VOTE_RANGE: f64 = 2.5;
 /// Hypothesiss that are polished side by side.
-const BATCH: usize = 64;
+const BATCH: usize = 16;
 /// Who nominates, round after round, each time with the rays that are left over.
 const ROUNDS: [Who; 4] = [Who::Part, Who::All, Who::All, Who::All];
 /// Rounds of estimating and gathering voters again, at most.
