@@ -176,6 +176,7 @@ fn calibration_of((noise, is_deep, classes, pooled): CalibrationValues) -> PyRes
         })
     };
     Ok(Calibration {
+        starts: 0,
         noise: noise_of(noise)?,
         is_deep,
         classes: classes.into_iter().map(|row| row.map(of).transpose()).collect::<PyResult<_>>()?,

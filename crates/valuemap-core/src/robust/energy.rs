@@ -95,8 +95,11 @@ impl Terms {
 pub fn fit(model: &Model<'_>, votes: &[u32], start: Vector3<f64>) -> Option<Fit> {
     let mut weights = vec![1.0; votes.len()];
     let mut point = start;
-    weights_of(&terms(model, votes, &weights, &point)?.chi2, &mut weights);
     let mut here = terms(model, votes, &weights, &point)?;
+    if weights_of(&here.chi2, &mut weights) {
+        here = terms(model, votes, &weights, &point)?;
+    }
+    let mut is_weighted = true;
     for _ in 0..MAX_STEPS {
         let mut step = -here.information.cholesky()?.solve(&here.gradient);
         if -step.dot(&here.gradient) < STEP_SIGMAS * STEP_SIGMAS {
@@ -113,18 +116,26 @@ pub fn fit(model: &Model<'_>, votes: &[u32], start: Vector3<f64>) -> Option<Fit>
         let Some(next) = better else { break };
         point += step;
         here = next;
-        weights_of(&here.chi2, &mut weights);
+        is_weighted = !weights_of(&here.chi2, &mut weights);
     }
-    let here = terms(model, votes, &weights, &point)?;
+    if !is_weighted {
+        here = terms(model, votes, &weights, &point)?;
+    }
     let cholesky = here.information.cholesky()?;
     let ln_information = 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
     let finite = point.iter().all(|number| number.is_finite());
     finite.then(|| Fit { point, covariance: cholesky.inverse(), energy: here.energy + ln_information, chi2: here.chi2 })
 }
 
-/// Huber's weights of some squared residuals.
-fn weights_of(chi2: &[f64], weights: &mut [f64]) {
-    weights.iter_mut().zip(chi2).for_each(|(weight, chi2)| *weight = (HUBER_SIGMAS / chi2.sqrt()).min(1.0));
+/// Set weights to Huber's of some squared residuals; whether any is another one now.
+fn weights_of(chi2: &[f64], weights: &mut [f64]) -> bool {
+    let mut any = false;
+    for (weight, chi2) in weights.iter_mut().zip(chi2) {
+        let new = (HUBER_SIGMAS / chi2.sqrt()).min(1.0);
+        any |= new.to_bits() != weight.to_bits();
+        *weight = new;
+    }
+    any
 }
 
 /// Equation (1) at a point, with what a step needs.

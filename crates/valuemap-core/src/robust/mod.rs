@@ -111,6 +111,8 @@ pub struct Calibration {
     pub pooled: ClassModel,
     /// Whether all moves pay, from all images.
     pub is_deep: bool,
+    /// From how many starts the noise was sought; 0 if it was known.
+    pub starts: usize,
 }
 
 /// A label with what speaks for it.
@@ -169,8 +171,8 @@ pub fn self_calibrate(
     progress: &Progress,
 ) -> Result<Calibration, Halt> {
     let more = sample::places(scene, CALIBRATION_RAYS.1, settings.viability.max_range_m);
-    let noise = if known.detection && known.position && known.rotation {
-        *guess
+    let (noise, starts) = if known.detection && known.position && known.rotation {
+        (*guess, 0)
     } else {
         likeliest_noise(scene, guess, known, settings, &more, progress)?
     };
@@ -182,7 +184,8 @@ pub fn self_calibrate(
         let deeper = search(&mut model, &wide, placed(&objects), Depth::Deep, false, &mut Tally::default(), progress)?;
         changed_share(&objects, &deeper) > LEAST_CHANGE
     };
-    Ok(Calibration { noise, classes: model.classes.iter().copied().map(Some).collect(), pooled: model.pooled, is_deep })
+    let classes = model.classes.iter().copied().map(Some).collect();
+    Ok(Calibration { noise, classes, pooled: model.pooled, is_deep, starts })
 }
 
 /// The share of the objects of two maps of the same rays that are not in both: with half of their votes.
@@ -218,7 +221,7 @@ fn learn_from(model: &mut Model<'_>, rays: &[u32], progress: &Progress) -> Resul
     Ok(objects)
 }
 
-/// The noise that makes the rays of some places likeliest, `more` and some of them.
+/// The noise that makes the rays of some places likeliest, `more` and some of them, and from how many starts it was sought.
 fn likeliest_noise(
     scene: &Scene,
     guess: &Noise,
@@ -226,13 +229,13 @@ fn likeliest_noise(
     settings: &Settings,
     more: &[u32],
     progress: &Progress,
-) -> Result<Noise, Halt> {
+) -> Result<(Noise, usize), Halt> {
     let few = sample::places(scene, CALIBRATION_RAYS.0, settings.viability.max_range_m);
     let likeliest = Likeliest::of_starts(scene, guess, known, settings, &few, progress)?;
     // What more rays tell is taken if it makes them likelier.
-    let mut noise = likeliest.noise().unwrap_or(*guess);
+    let (mut noise, starts) = (likeliest.noise().unwrap_or(*guess), likeliest.starts);
     if more.len() == few.len() {
-        return Ok(noise);
+        return Ok((noise, starts));
     }
     let mut likeliest = Likeliest::default();
     for _ in 0..2 {
@@ -240,7 +243,7 @@ fn likeliest_noise(
         noise = found.again;
         likeliest.offer(found);
     }
-    Ok(likeliest.noise().unwrap_or(noise))
+    Ok((likeliest.noise().unwrap_or(noise), starts))
 }
 
 /// Minus twice the logarithm of how likely some rays are with the noise that makes them likeliest, up to a constant of these rays; of a sample of
@@ -259,7 +262,7 @@ pub fn misfit(
     let range_m = settings.viability.max_range_m;
     let rays = rays.unwrap_or_else(|| sample::places(scene, CALIBRATION_RAYS.0, range_m));
     let likeliest = Likeliest::of_starts(scene, guess, known, settings, &rays, progress)?;
-    Ok((likeliest.0.map_or(f64::INFINITY, |best| best.value), rays))
+    Ok((likeliest.best.map_or(f64::INFINITY, |best| best.value), rays))
 }
 
 /// One step: how likely some rays are with a noise, and the noise that is estimated from the map that it makes.
@@ -332,7 +335,11 @@ impl Round {
 
 /// What makes the same rays likeliest so far.
 #[derive(Default)]
-struct Likeliest(Option<Round>);
+struct Likeliest {
+    best: Option<Round>,
+    /// From how many starts it was sought.
+    starts: usize,
+}
 
 impl Likeliest {
     /// From each start some steps: it takes one to learn what passes disagree about, and another to see what that explains. Larger starts
@@ -348,9 +355,10 @@ impl Likeliest {
         let mut likeliest = Self::default();
         for factor in STARTS {
             let mut noise = guess.scaled(factor, known);
-            if likeliest.0.as_ref().is_some_and(|best| !best.may_be_larger(scene, &noise)) {
+            if likeliest.best.as_ref().is_some_and(|best| !best.may_be_larger(scene, &noise)) {
                 break;
             }
+            likeliest.starts += 1;
             for _ in 0..CALIBRATION_ROUNDS {
                 let found = round(scene, &noise, known, settings, rays, progress)?;
                 noise = found.again;
@@ -362,13 +370,13 @@ impl Likeliest {
 
     /// Keep what makes them likelier.
     fn offer(&mut self, found: Round) {
-        if self.0.as_ref().is_none_or(|best| found.value < best.value) {
-            self.0 = Some(found);
+        if self.best.as_ref().is_none_or(|best| found.value < best.value) {
+            self.best = Some(found);
         }
     }
 
     fn noise(&self) -> Option<Noise> {
-        self.0.as_ref().map(|best| best.noise)
+        self.best.as_ref().map(|best| best.noise)
     }
 }
 
