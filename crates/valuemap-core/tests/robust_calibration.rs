@@ -1,5 +1,7 @@
 //! The noise is sought from starts that differ, but from none so large that it cannot be likelier.
 
+#![allow(clippy::unwrap_used)]
+
 mod street;
 
 use nalgebra::Vector3;
