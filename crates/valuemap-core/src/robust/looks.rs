@@ -93,6 +93,15 @@ impl Seen {
         ln_sum(real, strange)
     }
 
+    /// Passes that see an object, or should have from where others do; and minus the logarithm of how probable it is of those without a hit
+    /// to have none.
+    #[must_use]
+    pub fn missed(&self, class: &ClassModel) -> (usize, f64) {
+        let passes = self.sectors.iter().flatten().filter(|pass| pass.expected > 0.0);
+        let missed = passes.clone().filter(|pass| pass.hits == 0.0);
+        (passes.count(), missed.map(|pass| -OfSector::new(&[*pass], class).usual).sum())
+    }
+
     /// Probability that what has these looks is real rather than false.
     #[must_use]
     pub fn real(&self, class: &ClassModel) -> f64 {

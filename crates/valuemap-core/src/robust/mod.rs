@@ -93,6 +93,9 @@ const WIDE: f64 = 3.0;
 const CALIBRATION_GATE: f64 = 1.4;
 /// Times that the noise is estimated anew, from labels found with the last estimate.
 const CALIBRATION_ROUNDS: usize = 3;
+/// Passes that should have seen objects and did not are expected to cost no more than this, whatever is expected of them: twice the most that
+/// `-p ln p` can be.
+const MOST_UNSEEN: f64 = 2.0 / std::f64::consts::E;
 /// The noise is sought from starts that differ by these factors.
 const STARTS: [f64; 5] = [0.15, 0.5, 1.5, 5.0, 15.0];
 /// Scenes with more rays than this are searched less deeply, if that changes little.
@@ -301,6 +304,8 @@ struct Left {
     votes: Vec<(u32, f64)>,
     /// The rays of no object, each with minus twice the logarithm of the density of clutter there, 1/px².
     clutter: Vec<(u32, f64)>,
+    /// Passes that see objects, or should have; and minus twice the logarithm of how probable it is of those that do not.
+    passes: (usize, f64),
 }
 
 impl Left {
@@ -314,14 +319,21 @@ impl Left {
         let is_left = |ray: &&u32| votes.binary_search_by_key(*ray, |vote| vote.0).is_err();
         let price = |&ray: &u32| (ray, -2.0 * model.ln_clutter_per_px2(ray));
         let clutter = rays.iter().filter(is_left).map(price).collect();
-        Self { chi2: objects.iter().flat_map(|object| &object.fit.chi2).sum(), votes, clutter }
+        let of_passes = objects.iter().map(|object| object.seen.missed(&model.classes[object.class as usize]));
+        let passes = of_passes.fold((0, 0.0), |sum, one| (sum.0 + one.0, sum.1 + 2.0 * one.1));
+        Self { chi2: objects.iter().flat_map(|object| &object.fit.chi2).sum(), votes, clutter, passes }
     }
 }
 
 impl Round {
     /// Whether a larger noise may make the rays likelier. If it explained the votes without any residual, and the rays of no object as well,
-    /// each of them would still be as improbable as a residual of 0 is: how much more so than now, grows with the noise.
+    /// each of them would still be as improbable as a residual of 0 is: how much more so than now, grows with the noise. But passes that
+    /// disagree by more than is thought do not see each other's objects, and that is no residual.
     fn may_be_larger(&self, scene: &Scene, noise: &Noise) -> bool {
+        let (passes, unseen) = self.left.passes;
+        if unseen > MOST_UNSEEN * passes as f64 {
+            return true;
+        }
         let wider = |&(ray, depth_m): &(u32, f64)| {
             let [now, then] = [&self.noise, noise].map(|noise| noise.total(scene, ray).variance(depth_m));
             2.0 * (then / now).ln()
