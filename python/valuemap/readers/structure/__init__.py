@@ -4,8 +4,8 @@ The work is done by a process of its own (`child`), in a folder where all that w
 
 1. `features` finds features in every picture.
 2. `pairs` matches pictures that follow each other in a drive, and those that are near each other by GPS.
-3. `mapping` lets pycolmap grow models, several where the drive cannot be held together, and unites them on the Earth
-   (`onto_earth`).
+3. `pose_graph` finds all poses at once from what pairs of pictures say (`two_views`), on the Earth (`onto_earth`).
+   `mapping` makes points there and finds pictures that pairs do not hold.
 4. `adjust` moves cameras and points to where features, GPS and the vertical agree best, and says how sure that is.
 """
 

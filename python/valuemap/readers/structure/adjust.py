@@ -124,27 +124,36 @@ def adjust(sights: Sights, part: Ints) -> Adjusted:
 
     `part` (N) says which pictures hang together by what they see.
     """
-    here = sights
+    # First the GPS is taken at its word: what is wrong yet would look like errors of it that follow each other.
+    worse = np.ones(len(sights.row))
+    here = _settled(_converged(sights, sights, worse), part, sights, worse)
+    worse = gps_inflation(_gps_off(here), here.drive)
+    here = _settled(_converged(here, sights, worse), part, sights, worse)
+    equations = _equations(here, _weigh(here, worse), sights)
+    variance, in_part = _variances(equations.without_points(0.0)[0], here, part)
+    return Adjusted(here.cam_from_world, here.center_in_world_m, here.cameras, np.sqrt(variance), np.sqrt(in_part))
+
+
+def _converged(here: Sights, first: Sights, worse: Floats) -> Sights:
+    """Return the sights with all moved to where they agree best, the GPS with sigmas `worse` (N) times as large."""
     damping, least, most = _DAMPING
     for _ in range(_MOST_STEPS):
-        weights = _weigh(here)
-        equations = _equations(here, weights, sights)
-        cost = _cost(here, weights, sights)
+        weights = _weigh(here, worse)
+        equations = _equations(here, weights, first)
+        cost = _cost(here, weights, first)
         while damping < most:
             there = _moved(here, *equations.step(damping))
-            if (after := _cost(there, weights, sights)) < cost:
+            if (after := _cost(there, weights, first)) < cost:
                 break
             damping *= 10.0
         else:
             break
-        damping = max(damping / 100.0, least)
         here = there
-        if cost - after < _ENOUGH * cost:
+        # What the GPS alone says is little beside features: much damping holds it up.
+        if cost - after < _ENOUGH * cost and damping <= least:
             break
-    here = _settled(here, part, sights)
-    equations = _equations(here, _weigh(here), sights)
-    variance, in_part = _variances(equations.without_points(0.0)[0], here, part)
-    return Adjusted(here.cam_from_world, here.center_in_world_m, here.cameras, np.sqrt(variance), np.sqrt(in_part))
+        damping = max(damping / 100.0, least)
+    return here
 
 
 def _in_camera(sights: Sights) -> Floats:
@@ -169,24 +178,29 @@ def _residuals(sights: Sights) -> Floats:
     return np.asarray(_project(sights, _in_camera(sights)) - sights.pixel)
 
 
-def _weigh(sights: Sights) -> _Weights:
+def _weigh(sights: Sights, worse: Floats) -> _Weights:
     residual = np.linalg.norm(_residuals(sights), axis=1)
     fine = np.isfinite(residual)
     # The length of two normal errors has a median of 1.18 sigmas.
     sigma_px = max(float(np.median(residual[fine])) / 1.18, _LEAST_SIGMA_PX)
     feature = np.zeros(len(residual))
     feature[fine] = 1.0 / sigma_px / np.sqrt(1.0 + (residual[fine] / (_CAUCHY * sigma_px)) ** 2)
-    off = (sights.center_in_world_m - sights.gps_in_world_m) / [1.0, 1.0, _HEIGHT_SHARE] / sights.sigma_m[:, None]
+    off = _gps_off(sights)
     known = np.isfinite(off).all(axis=1)
     gps = np.zeros_like(off)
     if known.any():
-        worse = gps_inflation(off, sights.drive)
         length = np.linalg.norm(off[known], axis=1) / worse[known]
         sigma = worse[known] * sights.sigma_m[known] * np.sqrt(1.0 + (length / (1.7 * _CAUCHY)) ** 2)
         gps[known] = 1.0 / sigma[:, None] / [1.0, 1.0, _HEIGHT_SHARE]
     count = np.bincount(sights.drive)[sights.drive]
     level = 1.0 / (np.array([_ROLL_SIGMA_RAD, _PITCH_SIGMA_RAD]) * np.sqrt(count)[:, None])
     return _Weights(sigma_px, feature, gps, level)
+
+
+def _gps_off(sights: Sights) -> Floats:
+    """Return how far positions (N, 3) are from those of the GPS, in sigmas, NaN where there is none."""
+    off = (sights.center_in_world_m - sights.gps_in_world_m) / [1.0, 1.0, _HEIGHT_SHARE] / sights.sigma_m[:, None]
+    return np.asarray(off)
 
 
 def gps_inflation(off: Floats, drive: Ints) -> Floats:
@@ -402,7 +416,7 @@ def _variances(matrix: Any, sights: Sights, part: Ints) -> tuple[Floats, Floats]
     return both[0], both[1]
 
 
-def _settled(sights: Sights, part: Ints, first: Sights) -> Sights:
+def _settled(sights: Sights, part: Ints, first: Sights, worse: Floats) -> Sights:
     """Move, turn and scale each part as a whole to where GPS and level cameras want it.
 
     Features say nothing of that, and what the others say of it is so little beside them that steps of everything at
@@ -413,7 +427,7 @@ def _settled(sights: Sights, part: Ints, first: Sights) -> Sights:
     for _ in range(_WHOLE_STEPS):
         size = 6 * len(sights.row)
         matrix, right = _priors(
-            sights, _weigh(sights), first, size + sum(map(len, _intrinsic_columns(sights).values()))
+            sights, _weigh(sights, worse), first, size + sum(map(len, _intrinsic_columns(sights).values()))
         )
         turn, center = sights.cam_from_world.copy(), sights.center_in_world_m.copy()
         points = sights.point_in_world_m.copy()

@@ -1,10 +1,10 @@
-"""Models that pycolmap grows from matches, united on the Earth.
+"""Poses of all pictures from their pairs, sharpened by the points that they see.
 
-Cameras stay as they are while models grow: a car drives forward, and a few such pictures fit any focal length, with
-which the model then falls apart. `adjust` refines them in the end. Where a drive cannot be held together, at a corner
-that no picture shows well, pycolmap begins another model. Pictures that a model puts where their GPS cannot be are
-taken out of it, and what is left over grows again. Then all models are put into one by their GPS, points are made anew,
-across models too, and pictures that no model had are sought in the whole.
+`pose_graph` says about where all cameras are. There points are made from the matches, at first with much tolerance, and
+cameras and points are moved to where they agree best (`adjust`), again and again with less. Pictures that no pair holds
+well are sought in the whole in the end. What shares no points stays in parts that the GPS alone holds together.
+
+Cameras stay as they are until then: a car drives forward, and a few such pictures fit any focal length.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from valuemap.readers.cameras_of import Camera
 from valuemap.readers.structure.adjust import Adjusted, Sights, adjust
 from valuemap.readers.structure.features import image_ids
 from valuemap.readers.structure.job import DATABASE, LINKS, MODELS, Job, Posed
-from valuemap.readers.structure.onto_earth import similarity_onto
+from valuemap.readers.structure.pose_graph import LEAST_IMAGES, start_of
+from valuemap.readers.structure.two_views import LEAST_MATCHES, read_pairs
 from valuemap.tables import Bools, Floats, Ints
 
-LEAST_IMAGES = 3
 _LEAST_INLIERS = 20
-_LEAST_MATCHES = 30
-"""Of a pair. Two pictures of different houses with windows alike may agree in 25 features."""
 _GPS_SIGMAS = 7.0
-_LEAST_POINTS, _SHARED_POINTS = 10, 8
-_ROUNDS = 2
+_LEAST_POINTS, _SHARED_POINTS, _FEW_POINTS = 10, 8, 50
+_TOLERANCES_PX = (12.0, 4.0, 4.0)
+"""Of points, round by round: at first poses are as wrong as pairs say."""
+_SHARP_PX, _ANGLE_DEG = 4.0, 2.0
 
 NO_FILE = "its features cannot be found: the file is damaged"
 NO_MATCH = "too little of it is seen in other pictures"
@@ -62,10 +62,10 @@ def find_models(job: Job, workspace: Path, *, threads: int, progress: Progress) 
     why_not = {row: NO_FILE for row in range(len(job.pictures)) if row not in ids}
     whole = _Whole(cameras=_cameras(job, workspace))
     if len(ids) >= LEAST_IMAGES:
-        _take(_grow(job, workspace, "first", list(ids), threads, progress), job, ids, whole)
-        left = [row for row in ids if row not in whole.poses]
-        if whole.poses and len(left) >= LEAST_IMAGES:
-            _take(_grow(job, workspace, "second", left, threads, progress), job, ids, whole)
+        progress("finding poses", 0, len(ids))
+        pairs = read_pairs(workspace, ids, whole.cameras)
+        whole.poses = start_of(pairs, len(job.pictures), job.gps_in_world_m(), job.sigma_m())
+        progress("finding poses", len(ids), len(ids))
     if not whole.poses:
         raise InputError(
             f"{workspace}: structure from motion finds no {LEAST_IMAGES} pictures with GPS that hang together",
@@ -90,23 +90,6 @@ def find_models(job: Job, workspace: Path, *, threads: int, progress: Progress) 
     )
 
 
-def _grow(
-    job: Job, workspace: Path, name: str, rows: list[int], threads: int, progress: Progress
-) -> list[pycolmap.Reconstruction]:
-    """Return models of the pictures, the largest first; those of an earlier run that came to its end are read."""
-    folder = workspace / MODELS / name
-    finished = folder / "finished"
-    if not finished.is_file():
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        options = _options(job, threads)
-        options.image_names = [job.alias(row) for row in sorted(rows)]
-        _run(workspace, folder, options, len(rows), progress)
-        finished.touch()
-    models = [pycolmap.Reconstruction(path) for path in sorted(folder.glob("[0-9]*"))]
-    return sorted(models, key=lambda model: (-model.num_reg_images(), min(model.reg_image_ids(), default=0)))
-
-
 def _options(job: Job, threads: int) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = threads, 0
@@ -115,7 +98,7 @@ def _options(job: Job, threads: int) -> Any:
     options.use_robust_loss_on_prior_position = False
     options.extract_colors = False
     options.min_model_size = LEAST_IMAGES
-    options.min_num_matches = _LEAST_MATCHES
+    options.min_num_matches = LEAST_MATCHES
     options.constant_cameras = {number + 1 for number in range(len(job.cameras))}
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
@@ -162,25 +145,6 @@ def _cameras(job: Job, workspace: Path) -> dict[int, pycolmap.Camera]:
         return {int(camera.camera_id): camera for camera in database.read_all_cameras()}
 
 
-def _take(models: list[pycolmap.Reconstruction], job: Job, ids: dict[int, int], whole: _Whole) -> None:
-    """Take in what of the models agrees with its GPS."""
-    row_of = {image_id: row for row, image_id in ids.items()}
-    for model in models:
-        images = [image for _, image in sorted(model.images.items()) if image.has_pose]
-        row = np.array([row_of[image.image_id] for image in images])
-        rotation = np.array([image.cam_from_world().rotation.matrix() for image in images]).reshape(-1, 3, 3)
-        center = np.array([image.projection_center() for image in images]).reshape(-1, 3)
-        gps, sigma = job.gps_in_world_m()[row], job.sigma_m()[row]
-        moved = similarity_onto(center, -rotation[:, 1], gps, sigma)
-        if moved is None:
-            continue
-        scale, turn, shift = moved
-        center, rotation = scale * center @ turn.T + shift, rotation @ turn.T
-        fine = ~contradicts_gps(center, gps, sigma)
-        for i in np.flatnonzero(fine).tolist():
-            whole.poses.setdefault(int(row[i]), (rotation[i], center[i]))
-
-
 def contradicts_gps(center_m: Floats, gps_m: Floats, sigma_m: Floats) -> Bools:
     """Return which positions (N, 3) are too far from those of the GPS, whose sigmas may be too small for them all."""
     away = np.linalg.norm(center_m - gps_m, axis=1) / sigma_m
@@ -201,26 +165,24 @@ def _unite(
     progress: Progress,
 ) -> tuple[Adjusted, Ints, Ints]:
     """Return the final poses of rows (N), and which part each is of: parts are held together by the GPS alone."""
-    steps = _ROUNDS + 1
-    for step in range(_ROUNDS):
-        progress("adjusting poses", step, steps)
-        model = _triangulated(job, workspace, ids, whole, threads)
-        if step == 0:
-            _settle(job, model, ids, whole, {})
-            model = _triangulated(job, workspace, ids, whole, threads)
+    last = len(_TOLERANCES_PX) - 1
+    for step, tolerance_px in enumerate(_TOLERANCES_PX):
+        progress("adjusting poses", step, last + 1)
+        model = _triangulated(job, workspace, ids, whole, tolerance_px, threads)
+        if step == last:
             model = _with_the_rest(job, workspace, model, ids, threads, progress)
         found, row, part = _settle(job, model, ids, whole, why_not)
-    progress("adjusting poses", steps, steps)
+    progress("adjusting poses", last + 1, last + 1)
     return found, row, part
 
 
 def _triangulated(
-    job: Job, workspace: Path, ids: dict[int, int], whole: _Whole, threads: int
+    job: Job, workspace: Path, ids: dict[int, int], whole: _Whole, tolerance_px: float, threads: int
 ) -> pycolmap.Reconstruction:
-    """Return one model of all poses, with points made from the matches."""
+    """Return one model of all poses, with points made from the matches that agree to so many pixels."""
     with pycolmap.Database.open(workspace / DATABASE) as database:
         which = pycolmap.DatabaseCacheOptions()
-        which.min_num_matches = _LEAST_MATCHES
+        which.min_num_matches = LEAST_MATCHES
         cache = pycolmap.DatabaseCache.create(database, which)
     model = pycolmap.Reconstruction()
     model.load(cache)
@@ -237,6 +199,10 @@ def _triangulated(
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     options = _options(job, threads)
+    points, looser = options.triangulation, tolerance_px / _SHARP_PX
+    points.merge_max_reproj_error = points.complete_max_reproj_error = tolerance_px
+    options.mapper.filter_max_reproj_error = tolerance_px
+    points.create_max_angle_error = points.continue_max_angle_error = looser * _ANGLE_DEG
     options.use_prior_position = False  # It would turn the whole anew, about a straight street by any angle.
     made: pycolmap.Reconstruction = pycolmap.triangulate_points(
         model, workspace / DATABASE, workspace / LINKS, folder, clear_points=True, options=options
@@ -313,8 +279,7 @@ def _sights(job: Job, model: pycolmap.Reconstruction, row_of: dict[int, int], ou
                 point.append(number_of.setdefault(feature.point3D_id, len(number_of)))
                 pixel.append(feature.xy)
     of_image, of_point = np.array(image, dtype=np.int64), np.array(point, dtype=np.int64)
-    # A point that one picture alone sees, when others are out, says nothing.
-    fine = (np.bincount(of_point, minlength=len(number_of)) > 1)[of_point]
+    fine = _confirmed(of_image, of_point)
     rows = np.array([row for row, _ in images], dtype=np.int64)
     poses = [model.image(image_id) for _, image_id in images]
     rotation = np.array([each.cam_from_world().rotation.matrix() for each in poses]).reshape(-1, 3, 3)
@@ -335,6 +300,19 @@ def _sights(job: Job, model: pycolmap.Reconstruction, row_of: dict[int, int], ou
         pixel=np.array(pixel, dtype=np.float64).reshape(-1, 2)[fine],
         point_in_world_m=xyz[kept],
     )
+
+
+def _confirmed(image: Ints, point: Ints) -> Bools:
+    """Return which sights (M) of points in images to keep.
+
+    A point that one picture alone sees, when others are out, says nothing. One that two see may be two windows alike,
+    and no third tells. It counts only where a picture has few others.
+    """
+    seen = np.bincount(point)[point]
+    others = np.bincount(image, seen > 2, minlength=image.max(initial=-1) + 1)
+    poor = np.bincount(point, others[image] < _FEW_POINTS)[point] > 0
+    fine: Bools = (seen > 2) | ((seen == 2) & poor)
+    return fine
 
 
 def _parts(sights: Sights) -> Ints:

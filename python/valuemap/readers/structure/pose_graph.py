@@ -1,0 +1,367 @@
+"""All pictures at once from their pairs: rotations, then the lengths of ways, then positions.
+
+Nothing grows from a first pair, so nothing bends: every pair has its say, and those that contradict the others lose it
+(L1 norm, then Cauchy's loss; each step is one sparse linear system). How long the way of one pair is beside that of
+another, what both see says: a feature of a picture has one depth, by whichever pair it is measured. The GPS gives the
+scale of what hangs together so, its place, and where north is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix, diags
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
+
+from valuemap.readers.structure.onto_earth import similarity_onto
+from valuemap.readers.structure.two_views import Pair, Way, find_way
+from valuemap.tables import Floats, Ints
+
+LEAST_IMAGES = 3
+_L1_ROUNDS, _CAUCHY_ROUNDS, _CAUCHY = 10, 10, 2.5
+_ROTATION_SIGMA_RAD, _ENOUGH = 0.005, 100
+_LARGEST_TURN_RAD = 0.05
+"""Pairs that are so far off the rotations of all others are not of one place."""
+_LEAST_PARALLAX_RAD, _LEAST_SHARED = 0.01, 8
+_LENGTH_SHARE, _STILL_M = 0.1, 0.02
+_ONE_TURN_RAD = 0.035
+"""What two pairs allow is the same rotation up to here."""
+_RIVAL, _MOST_RIVALS, _MOST_DEPTHS, _SAME_DEPTH = 0.3, 4, 8, 0.02
+_MOST_STATES, _CLEAR = 8, 300.0
+"""So many matches must agree more with one way to go on than with another, which then is given up."""
+_SAME_NORTH_RAD = 0.35
+_HEIGHT_SHARE = 2.0
+_RIDGE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """Differences (M, K) that are wanted of values at `two` from those at `one` (M), with their sigmas (M)."""
+
+    one: Ints
+    two: Ints
+    wanted: Floats
+    sigma: Floats
+
+    def take(self, rows: Ints) -> _Edges:
+        return _Edges(self.one[rows], self.two[rows], self.wanted[rows], self.sigma[rows])
+
+
+def start_of(
+    pairs: Sequence[Pair], count: int, gps_in_world_m: Floats, sigma_m: Floats
+) -> dict[int, tuple[Floats, Floats]]:
+    """Return poses (cam_from_world, centre) by row, of pictures that hang together with three that have a GPS position.
+
+    `gps_in_world_m` (count, 3) is NaN where there is none, `sigma_m` (count) its standard deviation.
+    """
+    rotation = _rotations(pairs, count)
+    pairs = [pair for pair in pairs if np.linalg.norm(_turn_off(pair, rotation)) < _LARGEST_TURN_RAD]
+    ways = [find_way(pair.ray[0] @ rotation[pair.first], pair.ray[1] @ rotation[pair.second]) for pair in pairs]
+    edges, part = _edges(pairs, ways)
+    group = _components(edges.one, edges.two, count)
+    poses: dict[int, tuple[Floats, Floats]] = {}
+    for each in np.unique(group[edges.one[part >= 0]]):
+        mine = np.flatnonzero((group[edges.one] == each) & (part >= 0))
+        placed = _onto_earth(edges.take(mine), part[mine], rotation, gps_in_world_m, sigma_m)
+        if placed is None:
+            continue
+        turn, metric = placed
+        rows = np.unique([metric.one, metric.two])
+        place = np.zeros(count, dtype=np.int64)
+        place[rows] = np.arange(len(rows))
+        local = _Edges(place[metric.one], place[metric.two], metric.wanted, metric.sigma)
+        gps_sigma = sigma_m[rows][:, None] * [1.0, 1.0, _HEIGHT_SHARE]
+        center = _solve(local, len(rows), gps_in_world_m[rows], gps_sigma)
+        poses |= {row: (rotation[row] @ turn.T, center[i]) for i, row in enumerate(rows.tolist())}
+    return poses
+
+
+def _rotations(pairs: Sequence[Pair], count: int) -> Floats:
+    """Return rotations (count, 3, 3), cam from a world of each group of pictures that pairs hold together."""
+    rotation = _grown(pairs, count)
+    one = np.array([pair.first for pair in pairs], dtype=np.int64)
+    two = np.array([pair.second for pair in pairs], dtype=np.int64)
+    sigma = _ROTATION_SIGMA_RAD * np.sqrt(_ENOUGH / np.array([min(len(pair.feature), _ENOUGH) for pair in pairs]))
+    for loss in _losses():
+        # R_two exp(w_two) = turn R_one exp(w_one), in the world's axes.
+        edges = _Edges(one, two, np.array([_turn_off(pair, rotation) for pair in pairs]).reshape(-1, 3), sigma)
+        weight = _weight(np.linalg.norm(edges.wanted, axis=1) / sigma, loss) / sigma**2
+        step = _linear(edges, count, weight, np.zeros((count, 3)), np.zeros((count, 3)))
+        rotation = rotation @ Rotation.from_rotvec(step).as_matrix()
+    return rotation
+
+
+def _grown(pairs: Sequence[Pair], count: int) -> Floats:
+    """Return first rotations (count, 3, 3): picture by picture, such as pairs with those before agree about.
+
+    Each pair has a vote for every rotation that it allows, and for depths: what three pictures see is as far away by
+    one pair as by another. Where that does not say which rotation is right, the next pictures may: several ways to go
+    on are kept until one is clearly ahead.
+    """
+    of: list[list[Pair]] = [[] for _ in range(count)]
+    for pair in pairs:
+        of[pair.first].append(pair)
+        of[pair.second].append(pair)
+    states = [_State(0.0, np.tile(np.eye(3), (count, 1, 1)), [()] * count)]
+    known = np.zeros(count, dtype=np.bool_)
+    matches = np.array([sum(len(pair.feature) for pair in each) for each in of], dtype=np.float64)
+    tied = np.zeros(count)
+    while not known.all():
+        on = (tied[~known] > 0).any()
+        row = int(np.where(known, -1.0, tied if on else matches).argmax())
+        if not on:  # What hangs on nothing known begins a group of its own.
+            states = states[:1]
+        before = [pair for pair in of[row] if known[pair.first + pair.second - row]]
+        if before:
+            states = [after for state in states for after in state.with_row(row, before, alone=len(states) == 1)]
+            states.sort(key=lambda state: -state.score)
+            states = [state for state in states[:_MOST_STATES] if state.score > states[0].score - _CLEAR]
+        known[row] = True
+        for pair in of[row]:
+            tied[pair.first + pair.second - row] += len(pair.feature)
+    return states[0].rotation
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Rotations (count, 3, 3) of the pictures so far, what is known of the depths of each, and how much agrees."""
+
+    score: float
+    rotation: Floats
+    depths: Sequence[tuple[_Depths, ...]]
+
+    def with_row(self, row: int, pairs: Sequence[Pair], *, alone: bool) -> list[_State]:
+        """Return what comes of each rotation that pairs with what is known allow a picture, unless it is clear."""
+        looks = [_look(pair, row, self.rotation) for pair in pairs]
+        rotation = np.concatenate([look.candidates() for look in looks])
+        of = np.repeat(np.arange(len(looks)), [len(look.pair.second_from_first) for look in looks])
+        matches = np.array([min(len(look.pair.feature), _ENOUGH) for look in looks], dtype=np.float64)
+        angle = np.arccos(np.clip((np.einsum("aij,bij->ab", rotation, rotation) - 1.0) / 2.0, -1.0, 1.0))
+        # Rows are candidates, columns pairs.
+        allowed = np.stack([(angle[:, of == each] < _ONE_TURN_RAD).any(axis=1) for each in range(len(looks))], axis=1)
+        score = allowed @ matches
+        rivals: list[int] = []
+        left = score > max(_RIVAL * score.max(), score.max() - _CLEAR)
+        while left.any() and len(rivals) < _MOST_RIVALS:
+            rivals.append(int(np.where(left, score, -1.0).argmax()))
+            left &= angle[rivals[-1]] > _ONE_TURN_RAD
+        clear = alone and len(rivals) == 1
+        agreed = [np.flatnonzero(allowed[each]).tolist() for each in rivals]
+        return [
+            self._after(looks, rotation[each], numbers, float(score[each]), clear=clear)
+            for each, numbers in zip(rivals, agreed, strict=True)
+        ]
+
+    def _after(self, looks: Sequence[_Look], turn: Floats, allowed: list[int], score: float, *, clear: bool) -> _State:
+        rotation, depths = self.rotation.copy(), list(self.depths)
+        rotation[looks[0].row] = turn
+        for number in allowed:
+            look = looks[number]
+            there, here = look.depths(turn)
+            if not clear:
+                score += max((there.agree(known) for known in depths[look.other][-_MOST_DEPTHS:]), default=0.0)
+            depths[look.other] = (*depths[look.other], there)
+            depths[look.row] = (*depths[look.row], here)
+        return _State(self.score + score, rotation, depths)
+
+
+@dataclass(frozen=True, eq=False)
+class _Depths:
+    """Logarithms of the depths (M) of features (M, rising numbers) of a picture in units of some way, and sigmas."""
+
+    feature: Ints
+    log_depth: Floats
+    sigma: Floats
+
+    def agree(self, other: _Depths) -> float:
+        """Return how many features of both have one ratio of depths, each by how near it is to that."""
+        _, mine, its = np.intersect1d(self.feature, other.feature, assume_unique=True, return_indices=True)
+        if len(mine) < _LEAST_SHARED:
+            return 0.0
+        ratio = self.log_depth[mine] - other.log_depth[its]
+        sigma = np.hypot(np.hypot(self.sigma[mine], other.sigma[its]), _SAME_DEPTH)
+        return float(_weight((ratio - np.median(ratio)) / sigma, "cauchy").sum())
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """A pair of a picture whose rotation is known (`other`) and one (`row`) whose rotation is sought."""
+
+    pair: Pair
+    other: int
+    row: int
+    known: Floats
+
+    def candidates(self) -> Floats:
+        """Return the rotations (H, 3, 3) that the pair allows."""
+        turn = self.pair.second_from_first
+        return np.asarray((turn if self.pair.second == self.row else np.swapaxes(turn, 1, 2)) @ self.known)
+
+    def depths(self, rotation: Floats) -> tuple[_Depths, _Depths]:
+        """Return what the known picture and the other say of depths, if the rotation is this."""
+        place = 0 if self.pair.first == self.other else 1
+        way = find_way(self.pair.ray[place] @ self.known, self.pair.ray[1 - place] @ rotation)
+        fine = way.fine & (way.parallax_rad > _LEAST_PARALLAX_RAD)
+        found = []
+        for which, depth in zip((place, 1 - place), way.depth, strict=True):
+            feature, first = np.unique(self.pair.feature[fine, which], return_index=True)
+            found.append(_Depths(feature, np.log(depth[fine][first]), way.sigma[fine][first]))
+        return found[0], found[1]
+
+
+def _look(pair: Pair, row: int, rotation: Floats) -> _Look:
+    other = pair.first + pair.second - row
+    return _Look(pair, other, row, rotation[other])
+
+
+def _turn_off(pair: Pair, rotation: Floats) -> Floats:
+    """Return by what turn (3), rad, a pair is off the rotations of all: the least of those that it allows."""
+    off = rotation[pair.second].T @ pair.second_from_first @ rotation[pair.first]
+    turn = Rotation.from_matrix(off).as_rotvec()
+    return np.asarray(turn[np.linalg.norm(turn, axis=1).argmin()])
+
+
+def _edges(pairs: Sequence[Pair], ways: Sequence[Way]) -> tuple[_Edges, Ints]:
+    """Return the ways of all pairs (M), and of which part each is: those of a part are in one unit, -1 is of none."""
+    of = np.concatenate([np.full(2 * len(pair.feature), i) for i, pair in enumerate(pairs)])
+    row = np.concatenate([np.repeat([pair.first, pair.second], len(pair.feature)) for pair in pairs])
+    feature = np.concatenate([pair.feature.T.reshape(-1) for pair in pairs])
+    log_depth = np.concatenate([np.log(np.maximum(way.depth, 1e-9)).reshape(-1) for way in ways])
+    sigma = np.concatenate([np.tile(way.sigma, 2) for way in ways])
+    parallax = np.concatenate([np.tile(way.parallax_rad, 2) for way in ways])
+    fine = np.concatenate([np.tile(way.fine, 2) for way in ways])
+    node = np.unique(np.stack([row, feature]), axis=1, return_inverse=True)[1].reshape(-1)
+    far = np.flatnonzero(fine & (parallax > _LEAST_PARALLAX_RAD))
+    part = _parts(of[far], node[far], len(pairs))
+    # Each part has its own depths.
+    far = far[part[of[far]] >= 0]
+    own, place = np.unique(np.stack([part[of[far]], node[far]]), axis=1, return_inverse=True)
+    log_length, log_depths = _lengths(of[far], place.reshape(-1), log_depth[far], sigma[far], len(pairs), own.shape[1])
+    length, way_sigma = np.exp(log_length), _LENGTH_SHARE * np.exp(log_length)
+    # How far a pair without parallax can be apart, by what others say of the depths of what it sees.
+    depth_of, part_of = np.full(node.max(initial=-1) + 1, np.nan), np.full(node.max(initial=-1) + 1, -1)
+    depth_of[own[1]], part_of[own[1]] = np.exp(log_depths), own[0]
+    begin = np.searchsorted(of, np.arange(len(pairs) + 1))
+    for i in np.flatnonzero(part < 0).tolist():
+        mine = begin[i] + np.flatnonzero(part_of[node[begin[i] : begin[i + 1]]] >= 0)
+        if len(mine) >= _LEAST_SHARED:
+            part[i] = np.bincount(part_of[node[mine]]).argmax()
+            mine = mine[part_of[node[mine]] == part[i]]
+            length[i], way_sigma[i] = 0.0, np.median(parallax[mine] * depth_of[node[mine]])
+    wanted = length[:, None] * np.array([way.direction for way in ways]).reshape(-1, 3)
+    one, two = (np.array([getattr(pair, end) for pair in pairs], dtype=np.int64) for end in ("first", "second"))
+    return _Edges(one, two, wanted, way_sigma), part
+
+
+def _lengths(pair: Ints, node: Ints, log_depth: Floats, sigma: Floats, pairs: int, nodes: int) -> tuple[Floats, Floats]:
+    """Return logarithms of the lengths of pairs' ways and of the depths of nodes: depth = depth in ways * length."""
+    length, depth = np.zeros(pairs), np.zeros(nodes)
+    weight = 1.0 / sigma**2
+    for loss in ["none", *_losses()]:
+        if loss != "none":
+            weight = _weight(np.abs(log_depth + length[pair] - depth[node]) / sigma, loss) / sigma**2
+        # Without the depths, which are weighted means (Schur's complement).
+        seen = csr_matrix((weight, (pair, node)), shape=(pairs, nodes))
+        of_node = 1.0 / np.maximum(np.bincount(node, weight, nodes), 1e-300)
+        total = np.bincount(pair, weight, pairs)
+        matrix = diags(total + _RIDGE * max(float(np.median(total)), 1e-12)) - seen @ diags(of_node) @ seen.T
+        mean = of_node * np.bincount(node, weight * log_depth, nodes)
+        length = splu(matrix.tocsc()).solve(seen @ mean - np.bincount(pair, weight * log_depth, pairs))
+        depth = mean + of_node * (seen.T @ length)
+    return length, depth
+
+
+def _parts(pair: Ints, node: Ints, count: int) -> Ints:
+    """Return which of pairs (count) are held together by depths of the same features, -1 where a pair has too few."""
+    seen = csr_matrix((np.ones(len(pair)), (pair, node)), shape=(count, node.max(initial=-1) + 1))
+    shared = (seen @ seen.T).tocsr()
+    enough = shared.diagonal() >= _LEAST_SHARED
+    shared.data[shared.data < _LEAST_SHARED] = 0.0
+    shared.eliminate_zeros()
+    part = connected_components(shared, directed=False)[1].astype(np.int64)
+    return np.where(enough, part, -1)
+
+
+def _components(one: Ints, two: Ints, count: int) -> Ints:
+    graph = csr_matrix((np.ones(len(one)), (one, two)), shape=(count, count))
+    found: Ints = connected_components(graph, directed=False)[1].astype(np.int64)
+    return found
+
+
+def _onto_earth(
+    edges: _Edges, part: Ints, rotation: Floats, gps_in_world_m: Floats, sigma_m: Floats
+) -> tuple[Floats, _Edges] | None:
+    """Return the turn (3, 3) from the world of the rotations to that of the GPS, and ways there in metres, or None."""
+    found = []
+    for each in np.unique(part):
+        which = np.flatnonzero(part == each)
+        rows, place = np.unique([edges.one[which], edges.two[which]], return_inverse=True)
+        if len(rows) < LEAST_IMAGES:
+            continue
+        one, two = place.reshape(2, -1)
+        free = np.full((len(rows), 3), np.nan)
+        # What hangs on another piece by nothing would stay where it is.
+        piece = _components(one, two, len(rows))
+        main = piece == np.bincount(piece).argmax()
+        center = _solve(_Edges(one, two, edges.wanted[which], edges.sigma[which]), len(rows), free, free)
+        moved = similarity_onto(center[main], -rotation[rows[main], 1], gps_in_world_m[rows[main]], sigma_m[rows[main]])
+        if moved is not None:
+            found.append((int(main.sum()), which[main[one]], *moved[:2]))
+    if not found:
+        return None
+    found.sort(key=lambda each: -each[0])
+    turn, kept = found[0][3], []
+    for _, which, scale, own in found:
+        if Rotation.from_matrix(own @ turn.T).magnitude() < _SAME_NORTH_RAD:
+            sigma = np.maximum(scale * edges.sigma[which], _STILL_M)
+            kept.append(_Edges(edges.one[which], edges.two[which], scale * edges.wanted[which] @ turn.T, sigma))
+    names = ("one", "two", "wanted", "sigma")
+    return turn, _Edges(*(np.concatenate([getattr(each, name) for each in kept]) for name in names))
+
+
+def _losses() -> Iterator[str]:
+    yield from ["l1"] * _L1_ROUNDS
+    yield from ["cauchy"] * _CAUCHY_ROUNDS
+
+
+def _weight(size: Floats, loss: str) -> Floats:
+    """Return weights of residuals in sigmas."""
+    found: Floats = 1.0 / np.maximum(size, 1.0) if loss == "l1" else 1.0 / (1.0 + (size / _CAUCHY) ** 2)
+    return found
+
+
+def _solve(edges: _Edges, count: int, target: Floats, target_sigma: Floats) -> Floats:
+    """Return values (count, K) whose differences and, where they are known, targets (count, K) are as wanted."""
+    known = np.asarray(np.isfinite(target).all(axis=1))
+    to, root = np.where(known[:, None], target, 0.0), np.where(known[:, None], 1.0 / target_sigma, 0.0)
+    weight, gps = 1.0 / edges.sigma**2, np.ones(count)
+    value = to
+    for loss in ["none", *_losses()]:
+        if loss != "none":
+            off = value[edges.two] - value[edges.one] - edges.wanted
+            weight = _weight(np.linalg.norm(off, axis=1) / edges.sigma, loss) / edges.sigma**2
+            gps = _weight(np.linalg.norm((value - to) * root, axis=1), loss)
+        value = _linear(edges, count, weight, gps[:, None] * root**2, to)
+    return value
+
+
+def _linear(edges: _Edges, count: int, weight: Floats, own: Floats, target: Floats) -> Floats:
+    """Return the values (count, K) of least squares, with weights of differences (M) and of targets (count, K)."""
+    one, two = edges.one, edges.two
+    between = coo_matrix((-weight, (one, two)), shape=(count, count))
+    total = np.bincount(one, weight, count) + np.bincount(two, weight, count)
+    laplacian = (between + between.T).tocsc() + diags(total)
+    pull = weight[:, None] * edges.wanted
+    found = np.empty((count, edges.wanted.shape[1]))
+    ridge = _RIDGE * max(float(np.median(total)), 1e-12)
+    for axis in range(found.shape[1]):
+        given: Floats = own[:, axis] * target[:, axis]
+        right = given + np.bincount(two, pull[:, axis], count) - np.bincount(one, pull[:, axis], count)
+        if axis == 0 or not np.array_equal(own[:, axis], own[:, axis - 1]):
+            factors = splu((laplacian + diags(own[:, axis] + ridge)).tocsc())
+        found[:, axis] = factors.solve(right)
+    return found
