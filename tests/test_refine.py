@@ -16,10 +16,10 @@ from valuemap import pipeline
 from valuemap.cameras import camera_poses
 from valuemap.config import SimulationConfig
 from valuemap.dataset import Dataset, write_dataset
-from valuemap.drives import find_drives, in_driving_order
+from valuemap.drives import Drives, find_drives, in_driving_order
 from valuemap.engine.threads import ThreadEngine
 from valuemap.refine import Refined, refine_poses
-from valuemap.refine.estimate import mounts_alone, segment
+from valuemap.refine.estimate import delay_together, mounts_alone, segment
 from valuemap.refine.footage import find_motion, gather, in_working_frame
 from valuemap.refine.jumps import Legs, find_hints, find_jumps
 from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
@@ -162,7 +162,33 @@ def test_cameras_mounted_askew_are_turned_back() -> None:
 
 def test_a_delay_of_all_poses_is_one_number_of_the_camera() -> None:
     refined = refine_poses(city(pose_delay_s=0.15), valuemap.MapConfig())
-    assert refined.record["cameras"][0]["delay_s"] == pytest.approx(0.15, abs=0.03)
+    assert refined.record["cameras"][0]["delay_s"] == pytest.approx(0.15, abs=0.01)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.1])
+def test_what_drives_see_comes_together_at_the_delay_of_their_poses(delay_s: float) -> None:
+    ordered = in_driving_order(city(pose_delay_s=delay_s), viewpoint_step_m=1.0)
+    footage = gather(*in_working_frame(ordered.dataset, ordered.drives, 1.0))
+    marks = find_landmarks(
+        footage.dataset, footage.rays, footage.drives, footage.drives.pass_code, valuemap.MapConfig()
+    )
+    assert delay_together(footage, marks) == pytest.approx(delay_s, abs=0.05)
+
+
+def test_poses_that_are_moved_on_tremble_as_before() -> None:
+    # Moved towards the next image by two fifths of the way, an image would lose a quarter of its own error.
+    dataset = city(position_drift_m=0.0, position_white_m=0.3)
+    drives = find_drives(dataset.images)
+    motion, center = find_motion(dataset, drives), camera_poses(dataset.images)[1]
+    for late_s, velocity in ((0.1, motion.forward_mps), (-0.1, motion.backward_mps)):
+        assert trembling(center + late_s * velocity, drives) > 0.95 * trembling(center, drives)
+
+
+def trembling(center: Floats, drives: Drives) -> float:
+    """Return the median of what steps differ by from those before them, m."""
+    order = np.lexsort((drives.order, drives.pass_code))
+    unlike = np.linalg.norm(np.diff(center[order], n=2, axis=0), axis=1)
+    return float(np.median(unlike[drives.pass_code[order][2:] == drives.pass_code[order][:-2]]))
 
 
 def test_rows_names_and_ids_change_nothing_of_what_is_found() -> None:

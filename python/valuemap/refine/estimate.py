@@ -10,6 +10,7 @@ import numpy as np
 import valuemap._core as _core
 from valuemap.config import MapConfig
 from valuemap.refine.adjust import (
+    CAMERA_DELAY,
     MOUNT,
     OFFSET,
     WIDTH,
@@ -26,7 +27,7 @@ from valuemap.refine.adjust import (
 from valuemap.refine.footage import DRIFT_LENGTH_M, Footage, Sigmas
 from valuemap.refine.jumps import Hints, Legs
 from valuemap.refine.landmarks import Landmarks
-from valuemap.refine.register import Registration, register
+from valuemap.refine.register import Registration, register, togetherness
 from valuemap.refine.tracks import associate, merge_objects
 from valuemap.tables import Bools, Floats, Ints
 
@@ -50,6 +51,7 @@ _SURE = 4.0
 _TOLD_RAD = math.radians(0.5)
 """Drives whose turns are less sure than this say nothing of how much drives are turned."""
 _ALONE = (4.0, 3.0, 2.0, 2.0)
+_DELAYS_S = 0.02 * np.arange(-15, 16)
 _COARSE, _FINE = (6.0, 6.0, 4.0, 4.0, 3.0, 2.0, 2.0), (2.0, 1.5, 1.0, 1.0, 1.0)
 
 
@@ -87,12 +89,14 @@ def estimate(
     hints: Hints,
     known: tuple[Legs, Floats] | None = None,
     turned_rad: Floats | None = None,
+    late_s: float = 0.0,
     laid: Footage | None = None,
 ) -> Estimate | None:
     """Estimate everything that drives may be wrong by, None where there is too little that drives share.
 
     `seen_cuts` are where the trajectory itself jumps, `hints` where it may. Where legs and their offsets (L, 3) are
-    `known` about, or how the cameras of drives are turned (D, 3), the landmarks are those of the footage `laid` so.
+    `known` about, or how the cameras of drives are turned (D, 3), or how late poses are, the landmarks are those of the
+    footage `laid` so.
     """
     marks = _usable(landmarks, laid or footage)
     if marks is None:
@@ -109,6 +113,7 @@ def estimate(
     state.constants[OFFSET][:] = offset
     if turned_rad is not None:
         state.constants[MOUNT][:] = turned_rad
+    state.constants[CAMERA_DELAY][:] = late_s
     noise = Noise()
     sigma_px = _sigmas(footage, noise)
     leg = legs.of(footage.drives.pass_code, footage.drives.order)
@@ -165,6 +170,27 @@ def mounts_alone(footage: Footage, landmarks: Landmarks) -> Floats:
             wide = max(float(np.average(value[told] ** 2 - of[told], weights=1.0 / of[told])), 0.0)
             turned[:, axis] = value * wide / (wide + of)
     return turned
+
+
+def delay_together(footage: Footage, landmarks: Landmarks) -> float:
+    """Return by how many seconds all poses seem to be late: that by which what drives see best comes together.
+
+    A delay moves what is seen from opposite directions apart, so that later steps would take one thing for two. It is
+    no more than a start for them. Zero where another delay does not explain more than its price: every pair of
+    landmarks counts twice in the sum, so the price of Bayes' information criterion is the logarithm of their number.
+    """
+    marks = _usable(landmarks, footage)
+    if marks is None:
+        return 0.0
+    landmarks, covariance = marks
+    mark, image = landmarks.landmark_of_voter(), footage.rays.image_row[landmarks.voters]
+    velocity = 0.5 * (footage.motion.forward_mps[image] + footage.motion.backward_mps[image])
+    voters = np.diff(landmarks.offsets)
+    mean = np.stack([np.bincount(mark, weights=axis) / voters for axis in velocity.T], axis=1)
+    fits = np.array([togetherness(landmarks, covariance, delay * mean) for delay in _DELAYS_S])
+    best = int(np.argmax(fits))
+    gain = fits[best] - fits[len(_DELAYS_S) // 2]
+    return float(_DELAYS_S[best]) if gain > math.log(len(landmarks)) else 0.0
 
 
 def everything(footage: Footage, legs: Legs) -> tuple[Bools, ...]:

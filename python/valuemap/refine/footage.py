@@ -20,6 +20,8 @@ DRIFT_LENGTH_M = 100.0
 """The way over which drift forgets 63 % of itself."""
 _MOST_STEPS = 4.0
 """Images farther apart in time than so many usual steps say nothing of the velocity between them."""
+_TREMBLES = 4.0
+"""Velocities before and after an image that differ by more than so many times what is usual are not the same."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +102,8 @@ class Footage:
 class Motion:
     """How images (N) move, m/s in the world, and turn, rad/s in camera axes, until the next and since the last one.
 
+    Both are the mean of the two, unless they differ by more than poses tremble: an image moved towards the next one
+    would else be moved towards the mean of both, and whatever the delay, half of the trembling would be gone.
     Where there are no times, of an image: a second is then an image.
     """
 
@@ -227,7 +231,19 @@ def find_motion(dataset: Dataset, drives: Drives) -> Motion:
             # At an end, as on the other side.
             starts, ends = np.append(True, ~usable), np.append(~usable, True)
             back[rows[starts]], on[rows[ends]] = on[rows[starts]], back[rows[ends]]
+            on[rows], back[rows] = _steadied(on[rows], back[rows])
     return Motion(forward, backward, turn_on, turn_back, is_timed)
+
+
+def _steadied(on: Floats, back: Floats) -> tuple[Floats, Floats]:
+    """Return the velocities (N, 3) after and before images of which those that only poses' trembling tells apart agree.
+
+    The mean of both has no part of the error of the image itself.
+    """
+    apart = np.linalg.norm(on - back, axis=1)
+    same = (apart <= _TREMBLES * np.median(apart))[:, None]
+    mean = 0.5 * (on + back)
+    return np.where(same, mean, on), np.where(same, mean, back)
 
 
 def _turns(rotation: Floats) -> Floats:

@@ -15,7 +15,7 @@ from valuemap.drives import Drives, in_driving_order
 from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
 from valuemap.refine.adjust import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
-from valuemap.refine.estimate import Estimate, estimate, mounts_alone
+from valuemap.refine.estimate import Estimate, delay_together, estimate, mounts_alone
 from valuemap.refine.footage import Footage, find_motion, gather, in_working_frame
 from valuemap.refine.jumps import Legs, find_hints, find_jumps
 from valuemap.refine.landmarks import find_landmarks
@@ -112,7 +112,8 @@ def _is_proven(found: _Found | None) -> bool:
 def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> _Found | None:
     """Estimate on a dataset in the working frame; where drives are far off, with landmarks of drives laid right.
 
-    Cameras askew are turned first, drive by drive, as what drives see is turned about them else and fits nowhere.
+    Cameras askew are turned first, drive by drive, as what drives see is turned about them else and fits nowhere; then
+    poses that are late are moved on, as one thing seen from two sides is two else.
     """
     footage = gather(dataset, drives)
     jumps, hints = find_jumps(dataset, drives), find_hints(dataset, drives)
@@ -127,21 +128,35 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
             turned = turned + more
             laid = _laid(footage, turned)
             landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, leg, config, threads=threads)
+        late_s = delay_together(laid, landmarks)
+        if late_s:
+            laid = _laid(footage, turned, late_s)
+            landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, leg, config, threads=threads)
     except SettingError:  # So many detections in one place that their votes fill the memory.
         return None
-    result = estimate(footage, landmarks, config, seen_cuts=jumps, hints=hints, turned_rad=turned, laid=laid)
+    result = estimate(
+        footage, landmarks, config, seen_cuts=jumps, hints=hints, turned_rad=turned, late_s=late_s, laid=laid
+    )
     if result is None:
         return None
     if _is_lost(footage, result):
         known = (result.legs, result.state.constants[OFFSET])
-        laid = _laid(footage, turned, known)
+        laid = _laid(footage, turned, late_s, known)
         leg = laid.drives.pass_code  # Its jumps are mended.
         try:
             landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, leg, config, threads=threads)
         except SettingError:
             return None
         again = estimate(
-            footage, landmarks, config, seen_cuts=jumps, hints=hints, known=known, turned_rad=turned, laid=laid
+            footage,
+            landmarks,
+            config,
+            seen_cuts=jumps,
+            hints=hints,
+            known=known,
+            turned_rad=turned,
+            late_s=late_s,
+            laid=laid,
         )
         if again is not None and len(again.thing) >= len(result.thing):
             result = again
@@ -156,10 +171,17 @@ def _is_lost(footage: Footage, result: Estimate) -> bool:
     return bool(np.mean(far) > _FEW_LOST)
 
 
-def _laid(footage: Footage, turned_rad: Floats, known: tuple[Legs, Floats] | None = None) -> Footage:
-    """Return the footage with the cameras of drives (D, 3) turned, and legs moved, as they seem to be."""
+def _laid(
+    footage: Footage, turned_rad: Floats, late_s: float = 0.0, known: tuple[Legs, Floats] | None = None
+) -> Footage:
+    """Return the footage with the cameras of drives (D, 3) turned, all poses moved on, and legs moved, as they seem."""
     images, drives = footage.whole.images, footage.whole_drives
     rotation, center = camera_poses(images)
+    if late_s:
+        motion = find_motion(footage.whole, drives)
+        ahead = late_s > 0.0
+        center = center + late_s * (motion.forward_mps if ahead else motion.backward_mps)
+        rotation = rotations(late_s * (motion.forward_radps if ahead else motion.backward_radps)) @ rotation
     rotation = rotations(turned_rad[drives.pass_code]) @ rotation
     if known is not None:
         center = center + known[1][known[0].of(drives.pass_code, drives.order)]

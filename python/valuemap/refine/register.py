@@ -79,6 +79,27 @@ def register(landmarks: Landmarks, covariance: Floats) -> Registration:
     return Registration(shift, thing)
 
 
+def togetherness(landmarks: Landmarks, covariance: Floats, shift_m: Floats) -> float:
+    """Return the sum of log L of landmarks moved by shifts (N, 3), m, given those of other drives around them.
+
+    `covariance` (N, 3, 3), m², is that of the landmarks. Which are around is told before they are moved.
+    """
+    point, size = landmarks.point_in_world_m, np.where(landmarks.size_m > 0.0, landmarks.size_m, np.nan)
+    a, b = cKDTree(point[:, :2]).query_pairs(_AROUND_M, output_type="ndarray").T
+    fits = (landmarks.drive[a] != landmarks.drive[b]) & (landmarks.class_code[a] == landmarks.class_code[b])
+    fits &= ~(np.abs(np.log(size[a] / size[b])) > math.log(_SAME_SIZE))
+    a, b = a[fits], b[fits]
+    total = covariance[a] + covariance[b] + np.diag([_SMOOTH_M**2, _SMOOTH_M**2, _HEIGHT_M**2])
+    apart = (point + shift_m)[a] - (point + shift_m)[b]
+    square = np.einsum("ni,ni->n", apart, np.linalg.solve(total, apart[:, :, None])[:, :, 0])
+    density = np.exp(-0.5 * square) / np.sqrt(np.linalg.det(2.0 * np.pi * total))
+    both, count = np.append(a, b), len(point)
+    around = np.bincount(both, minlength=count)
+    found = np.bincount(both, weights=np.tile(density, 2), minlength=count)[around > 0] / around[around > 0]
+    volume_m3 = math.pi * _AROUND_M**2 * _HIGH_M
+    return float(np.sum(np.log(1.0 - _SHARED + _SHARED * volume_m3 * found)))
+
+
 def _order_of_laying(point: Floats, by_drive: list[Ints]) -> list[int]:
     """Return the drives, the one with most landmarks first, then always one that meets most of what is known."""
     if not by_drive:
