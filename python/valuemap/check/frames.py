@@ -12,8 +12,8 @@ from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.fault import Convention, Fault, Finding, Fix, Stage, View, with_images, with_poses
 from valuemap.check.headings import driving_azimuths, headings, rotations_of, turned
 from valuemap.check.passes import median_speed_mps
-from valuemap.check.sample import driving_order
 from valuemap.check.sizes import object_heights, plausible_heights
+from valuemap.check.turns import rotations_from_degrees
 from valuemap.dataset import Dataset, Frame
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.tables import Floats
@@ -34,7 +34,6 @@ _MIRRORED: dict[str, list[list[float]]] = {
     "z the other way": [[1, 0, 0], [0, 1, 0], [0, 0, -1]],
 }
 _LEAST_UPRIGHT = 0.5
-_MOST_TURN_DEG = 2.5
 _SIGMA_LIMIT_RAD = 0.35
 """A pose whose rotation is not known to 20 degrees is none: such a column is in degrees."""
 _SPEEDS_MPS = (0.2, 70.0)
@@ -308,66 +307,11 @@ class _RadiansReadAsDegrees:
 
 
 class _DegreesReadAsRadians:
-    """Angles 57 times too large, of which whole turns are lost: the direction of travel says how many."""
+    """Angles 57 times too large, of which whole turns are lost: the drive says how many."""
 
     def __init__(self, zero_rad: float) -> None:
         self._zero_rad = zero_rad
 
     def __call__(self, dataset: Dataset) -> Dataset:
-        azimuth, pitch, roll = headings(dataset)
-        way = -1.0 if self._zero_rad else 1.0
-        # Pitch and roll of a few degrees become some radians: of the two triples of angles that give the same
-        # rotation, the right one has the smaller roll.
-        turn_over = np.abs(roll) > np.pi / 2.0
-        azimuth = np.where(turn_over, azimuth + np.pi, azimuth)
-        pitch = np.where(turn_over, np.pi - pitch, pitch)
-        roll = np.where(turn_over, roll + np.pi, roll)
-        along, _ = driving_azimuths(dataset)
-        wanted_deg = np.degrees(_wrap(way * (along - self._zero_rad)))
-        right = self._zero_rad + way * np.radians(_unwound(dataset, way * (azimuth - self._zero_rad), wanted_deg))
-        rotation = rotations_of(
-            right, np.radians(_unrolled(dataset, pitch)), np.radians(_unrolled(dataset, roll)), dataset.frame
-        )
+        rotation = rotations_from_degrees(dataset, zero_rad=self._zero_rad, clockwise=not self._zero_rad)
         return with_poses(dataset, rotation, camera_centers(dataset.images))
-
-
-def _unwound(dataset: Dataset, angle_deg: Floats, wanted_deg: Floats) -> Floats:
-    """Return angles (N), known but for multiples of 2 pi (in degrees!), as near those wanted as whole stretches can be.
-
-    From image to image the camera turns as the direction of travel does, to within less than half a multiple; so one
-    multiple is looked for for all images of a stretch, and errors of single directions of travel cancel out.
-    """
-    order = driving_order(dataset.images)
-    angle, wanted, codes = angle_deg[order], wanted_deg[order], dataset.images.pass_id.codes[order]
-    wanted_change = np.diff(wanted, prepend=wanted[:1])
-    wanted_change -= 360.0 * np.round(wanted_change / 360.0)
-    change = np.diff(angle, prepend=angle[:1])
-    change -= 2.0 * np.pi * np.round((change - wanted_change) / (2.0 * np.pi))
-    breaks = (np.diff(codes, prepend=-1) != 0) | (np.abs(wanted_change - change) > _MOST_TURN_DEG)
-    chain = np.cumsum(np.where(breaks, 0.0, change))
-    result = np.empty(len(order))
-    for rows in np.split(np.arange(len(order)), np.flatnonzero(breaks)[1:]):
-        own = chain[rows] - chain[rows[0]] + angle[rows[0]]
-        off = wanted[rows] - own
-        off = off - 360.0 * np.round((off - off[0]) / 360.0)
-        result[order[rows]] = own + 2.0 * np.pi * np.round(float(np.median(off)) / (2.0 * np.pi))
-    return result
-
-
-def _unrolled(dataset: Dataset, angle_deg: Floats) -> Floats:
-    """Return angles (N), known but for multiples of 2 pi (in degrees!), that change little along a drive and are small.
-
-    The multiple of a whole drive is the one that brings its middle nearest to the mean of all.
-    """
-    order = driving_order(dataset.images)
-    angle, codes = angle_deg[order], dataset.images.pass_id.codes[order]
-    mean = float(np.arctan2(np.sin(angle).mean(), np.cos(angle).mean()))
-    result = np.empty(len(order))
-    for rows in np.split(np.arange(len(order)), np.flatnonzero(np.diff(codes)) + 1):
-        own = np.unwrap(angle[rows])
-        result[order[rows]] = own - 2.0 * np.pi * np.round((float(np.median(own)) - mean) / (2.0 * np.pi))
-    return result
-
-
-def _wrap(angle: Floats) -> Floats:
-    return np.arctan2(np.sin(angle), np.cos(angle))

@@ -99,7 +99,7 @@ def read_xml(path: Path, expected: str, on_element: Callable[[str, dict[str, str
         Called as `on_element(name, attributes, line)` for an opening tag, and with `/name` for a closing one.
     """
     text = read_text(path, expected)
-    parser = xml.parsers.expat.ParserCreate()
+    parser = xml.parsers.expat.ParserCreate("utf-8")  # Whatever the file says: it is text by now.
 
     def refuse(*_: Any) -> None:
         raise InputError(

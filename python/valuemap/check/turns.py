@@ -1,0 +1,145 @@
+"""Angles in degrees that were read as radians: known but for multiples of 2 pi, which the drive gives back.
+
+Read as radians, 30 degrees are 4.8 turns: of the angle remains what is left of 2 pi, in degrees. Which multiple of 2 pi
+was lost is sought for the images of a stretch together, in which a camera turns and tilts little from one to the next.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from valuemap.cameras import camera_centers
+from valuemap.check.headings import headings, rotations_of
+from valuemap.check.sample import driving_order, standing_m
+from valuemap.dataset import Dataset
+from valuemap.tables import Bools, Floats, Ints
+
+_TURN = 2.0 * np.pi
+_GAP_STEPS = 5.0
+"""A step so many times the usual one is a gap: nothing is known of how the camera turned in it."""
+_MOST_OFF_DEG = 30.0
+"""Of a direction of travel that is off by more it does not matter how far: there the car did not go where it looked."""
+_ROUNDS = 2
+"""The first headings tell how far the camera moves outwards in bends, which makes the second better."""
+_WEIGHT_OF_CHANGES = 20.0
+"""How much more one degree counts between images than between an image and its direction of travel."""
+
+
+def rotations_from_degrees(dataset: Dataset, *, zero_rad: float, clockwise: bool) -> Floats:
+    """Return the rotations (N, 3, 3) that the degrees meant which were read as radians.
+
+    Parameters
+    ----------
+    dataset
+        Poses as they were read.
+    zero_rad
+        The azimuth, clockwise from north, from which headings count.
+    clockwise
+        Whether they count clockwise.
+    """
+    way = 1.0 if clockwise else -1.0
+    azimuth, pitch, roll = headings(dataset)
+    order = driving_order(dataset.images)
+    travel = _Travel(dataset, order)
+    usual_pitch = None
+    # The longest pass first, with the smallest pitch there can be: the others are mounted as it is.
+    for rows in sorted(travel.passes, key=len, reverse=True):
+        images = order[rows]
+        over = images[_is_turned_over(pitch[images], roll[images])]
+        azimuth[over], pitch[over], roll[over] = azimuth[over] + np.pi, np.pi - pitch[over], roll[over] + np.pi
+        pitch[images] = _steady(pitch[images], usual_pitch or 0.0)
+        roll[images] = _steady(roll[images], 0.0)
+        usual_pitch = float(np.median(pitch[images])) if usual_pitch is None else usual_pitch
+    right = np.empty(len(order))
+    outwards_m = 0.0
+    for _ in range(_ROUNDS):
+        for rows in travel.stretches:
+            images = order[rows]
+            looks_rad = travel.azimuth[rows] - outwards_m * travel.turn_per_m[rows]
+            wanted_deg = np.degrees(_wrap(way * (looks_rad - zero_rad), np.pi))
+            heading_deg = _headings_deg(way * (azimuth[images] - zero_rad), wanted_deg, travel.is_moving[rows])
+            right[images] = zero_rad + way * np.radians(heading_deg)
+        outwards_m = travel.outwards_m(right[order])
+    return rotations_of(right, np.radians(pitch), np.radians(roll), dataset.frame)
+
+
+class _Travel:
+    """Passes of images in driving order, stretches of them without gaps, and how each image (N) moves in its own."""
+
+    def __init__(self, dataset: Dataset, order: Ints) -> None:
+        center = camera_centers(dataset.images)[order]
+        flat = center @ np.stack(list(dataset.frame.east_north()), axis=1)
+        step = np.diff(flat, axis=0)
+        length = np.hypot(*step.T)
+        same = np.diff(dataset.images.pass_id.codes[order]) == 0
+        moving = length[same & (length > standing_m(length[same]))]
+        near = same & (length <= _GAP_STEPS * (np.median(moving) if len(moving) else np.inf))
+        self.passes = np.split(np.arange(len(order)), np.flatnonzero(~same) + 1)
+        self.stretches = np.split(np.arange(len(order)), np.flatnonzero(~near) + 1)
+        sum_of_steps = np.zeros((len(order), 2))
+        sum_of_steps[:-1] += np.where(near[:, None], step, 0.0)
+        sum_of_steps[1:] += np.where(near[:, None], step, 0.0)
+        self.azimuth = np.arctan2(*sum_of_steps.T)
+        length_of_both = np.hypot(*sum_of_steps.T)
+        self.is_moving: Bools = length_of_both > (standing_m(length[same]) if len(moving) else 0.0)
+        turn = np.zeros((2, len(order)))
+        for side, (here, there) in enumerate([(slice(None, -1), slice(1, None)), (slice(1, None), slice(None, -1))]):
+            both = near & self.is_moving[1:] & self.is_moving[:-1]
+            turn[side, here] = np.where(both, _wrap(self.azimuth[there] - self.azimuth[here], np.pi), 0.0)
+        self.turn_per_m = (turn[0] - turn[1]) / np.maximum(length_of_both, 1e-9)
+
+    def outwards_m(self, heading_rad: Floats) -> float:
+        """Return how far a camera is in front of the axle that does not steer: so far it moves outwards in bends."""
+        off = _wrap(self.azimuth - heading_rad, np.pi)
+        known = self.is_moving & (np.abs(off) < np.pi / 6.0)
+        turn = self.turn_per_m[known]
+        return float(turn @ off[known] / max(float(turn @ turn), 1e-12))
+
+
+def _is_turned_over(pitch: Floats, roll: Floats) -> Bools:
+    """Return of which images (K) of a pass the other triple of angles is meant that gives the same rotation.
+
+    It is turned around and over. Meant are those in which the tilts change little from image to image; of the two such
+    rows of triples the one with small rolls, as a camera may well look up, but not lie on its side.
+    """
+
+    def changes(over: bool) -> Floats:
+        before = np.stack([pitch[:-1], roll[:-1]])
+        after = np.stack([np.pi - pitch[1:], roll[1:] + np.pi] if over else [pitch[1:], roll[1:]])
+        return np.asarray((_wrap(after - before, np.pi) ** 2).sum(axis=0))
+
+    is_over = np.cumsum(np.append(False, changes(over=True) < changes(over=False))) % 2 == 1
+    rolled = _steady(roll + np.pi * is_over, 0.0)
+    return np.asarray(is_over if abs(float(np.median(rolled))) <= np.pi / 2.0 else ~is_over)
+
+
+def _steady(angle: Floats, usual: float) -> Floats:
+    """Return angles (K), known but for multiples of 2 pi, that change little, their middle nearest to a usual one."""
+    own = np.unwrap(angle)
+    return np.asarray(own - _TURN * np.round((np.median(own) - usual) / _TURN))
+
+
+def _headings_deg(heading: Floats, wanted_deg: Floats, is_moving: Bools) -> Floats:
+    """Return headings (K) in degrees, -180 to 180, known but for multiples of 2 pi, so that their changes and
+    themselves are as near as can be to the directions of travel: the cheapest path through all multiples.
+    """
+    multiples = np.arange(np.ceil(-180.0 / _TURN), np.floor(180.0 / _TURN) + 2.0)
+    choices = np.mod(heading + 180.0, _TURN)[:, None] - 180.0 + _TURN * (multiples - multiples[0])
+    off = np.minimum(np.abs(_wrap(choices - wanted_deg[:, None], 180.0)), _MOST_OFF_DEG)
+    off = np.where(is_moving[:, None], off, 0.0) + np.where(choices > 180.0, np.inf, 0.0)
+    change = np.where(is_moving[1:] & is_moving[:-1], _wrap(np.diff(wanted_deg), 180.0), 0.0)
+    cost, came_from = off[0], np.zeros(choices.shape, dtype=np.int64)
+    for i in range(1, len(choices)):
+        step = choices[i] - choices[i - 1][:, None] - change[i - 1]
+        total = cost[:, None] + _WEIGHT_OF_CHANGES * np.abs(_wrap(step, 180.0))
+        came_from[i] = total.argmin(axis=0)
+        cost = total.min(axis=0) + off[i]
+    path = np.empty(len(choices), dtype=np.int64)
+    path[-1] = cost.argmin()
+    for i in range(len(choices) - 1, 0, -1):
+        path[i - 1] = came_from[i, path[i]]
+    return np.asarray(choices[np.arange(len(choices)), path])
+
+
+def _wrap(angle: Floats, half_turn: float) -> Floats:
+    return np.asarray(angle - 2.0 * half_turn * np.round(angle / (2.0 * half_turn)))
