@@ -1,6 +1,6 @@
 # `make demo` and `make test` do all their own set-up: they need Python 3.11+, a C compiler and cargo, nothing else.
 # `make test EXTRAS=train` installs PyTorch (5 GB) and tests training too; without it those tests are skipped.
-.PHONY: demo test lint bench bench-field bench-scale model page rust-test wheel sdist docs setup clean
+.PHONY: demo test lint bench bench-field bench-scale model page rust-test fuzz wheel sdist docs setup clean
 
 UV_VERSION := 0.13.8
 PYTHON ?= python3
@@ -19,6 +19,11 @@ test: setup
 
 rust-test:
 	cargo test --locked --package valuemap-core
+
+# Spoiled input through the readers, the tables, the settings and the border of the core; `make rust-test` has some
+# of the core's own. All of it, by the million: see benchmarks/README.md.
+fuzz: setup
+	$(RUN) python benchmarks/fuzz.py --cases 20000
 
 lint: setup
 	$(RUN) ruff check .

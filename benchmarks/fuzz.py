@@ -1,12 +1,15 @@
 """Fuzz the readers, the tables, the settings and the border of the core with structured input.
 
-    python benchmarks/fuzz.py [--cases N] [--seconds S] [--seed N] [--only TARGET ...] [--json FILE]
+    python benchmarks/fuzz.py [--cases N] [--core-cases N] [--seconds S] [--seed N] [--only TARGET ...] [--json FILE]
 
 Every case makes whole input, spoils a value, a row, a column, a key, bytes or an array of it, and reads or maps it. It
 must end in a result, or in an error of one line with a hint: any other exception, a panic of the core, and a case of
 more than 20 seconds are faults. Case k of a target has the seed "SEED/TARGET/k", so that one case can be run again:
 
     python benchmarks/fuzz.py --only TARGET --case K
+
+With `--core-cases` so many cases of `crates/valuemap-core/tests/hostile_input.rs` go through the core without Python
+before, built with its assertions and with overflows as faults: needs cargo.
 
 The targets are those of `tests/test_fuzz.py` (see `tests/fuzzing.py`), where hypothesis draws the cases.
 """
@@ -16,8 +19,10 @@ from __future__ import annotations
 import argparse
 import faulthandler
 import logging
+import os
 import resource
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -39,6 +44,19 @@ MOST_MEMORY = 6 * 2**30
 MOST_SHOWN = 3
 SHARES = {"border of the core": 8.0}
 """All targets get the same time, but this one, behind which there is no Python to catch what goes wrong."""
+
+
+CORE_TESTS = {
+    "partitions_of_hostile_positions": 20,
+    "votes_of_hostile_rays": 25,
+    "evidence_of_hostile_points": 20,
+    "labels_of_hostile_scenes": 18,
+    "noise_of_hostile_scenes": 3,
+    "misfits_of_hostile_scenes": 2,
+    "objects_of_hostile_scenes": 12,
+}
+"""Tests of the core with shares of its cases: those that estimate noise search each case some fifteen times."""
+STRICT = ("lto=false", "codegen-units=16", "debug-assertions=true", "overflow-checks=true")
 
 
 class Hang(BaseException):
@@ -73,16 +91,47 @@ def place_of(error: BaseException) -> str:
     return f"{type(error).__name__} at {at}: {said}"
 
 
+def run_core(cases: int, seed: int) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, Any]]]:
+    """Run the tests of the core, `cases` all together; return cases and seconds of each, and faults."""
+    command = ["cargo", "test", "--quiet", "--locked", "--package", "valuemap-core", "--test", "hostile_input"]
+    command += ["--release", *(part for each in STRICT for part in ("--config", f"profile.release.{each}"))]
+    repository = Path(__file__).parents[1]
+    subprocess.run([*command, "--no-run"], cwd=repository, check=True)
+    done: dict[str, dict[str, float]] = {}
+    faults: dict[str, dict[str, Any]] = {}
+    for name, share in CORE_TESTS.items():
+        own = cases * share // sum(CORE_TESTS.values())
+        environment = os.environ | {
+            "VALUEMAP_FUZZ_CASES": str(own),
+            "VALUEMAP_FUZZ_SEED": str(seed + 1),
+            "RUST_BACKTRACE": "0",
+        }
+        start = time.perf_counter()
+        outcome = subprocess.run(
+            [*command, "--", "--exact", name],
+            cwd=repository, env=environment, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        done[name] = {"cases": own, "seconds": round(time.perf_counter() - start, 1)}
+        print(f"core: {name:34} {own:8} cases {done[name]['seconds']:8.1f} s", flush=True)
+        if outcome.returncode:
+            said = [line for line in outcome.stdout.splitlines() if "Test failed" in line] or ["stopped"]
+            faults[f"core: {name}: {said[0][:200]}"] = {"count": 1, "cases": []}
+            print(f"FAULT core: {name}: {said[0][:200]}", flush=True)
+    return done, faults
+
+
 def main() -> int:
     """Run the benchmark; return the exit code: 1 where there are faults."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=1_000_000)
+    parser.add_argument("--core-cases", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after so long")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", default=[])
     parser.add_argument("--case", type=int, help="one case, with its traceback")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
+    of_core, faults_of_core = run_core(options.core_cases, options.seed) if options.core_cases else ({}, {})
     faulthandler.enable()
     logging.disable(logging.CRITICAL)
     signal.signal(signal.SIGALRM, _alarm)
@@ -99,7 +148,7 @@ def main() -> int:
         last = Path(folder) / "last-case"  # In memory: on a disk this takes longer than many a case.
         done: Counter[str] = Counter()
         seconds = dict.fromkeys((target.name for target in targets), 0.0)
-        faults: dict[str, dict[str, Any]] = {}
+        faults: dict[str, dict[str, Any]] = faults_of_core
         while done.total() < options.cases and time.perf_counter() - start < options.seconds:
             target = min(targets, key=lambda each: seconds[each.name] / SHARES.get(each.name, 1.0))
             before = time.perf_counter()
@@ -126,11 +175,15 @@ def main() -> int:
         options.json,
         {
             "benchmark": "fuzz",
-            "command": f"python benchmarks/fuzz.py --cases {done.total()} --seed {options.seed}",
+            "command": f"python benchmarks/fuzz.py --cases {done.total()} --core-cases {options.core_cases} "
+            f"--seed {options.seed}",
             **describe_machine(),
             "cases": done.total(),
             "seconds": round(elapsed, 1),
             "cases_by_target": dict(sorted(done.items())),
+            "seconds_by_target": {name: round(seconds[name], 1) for name in sorted(done)},
+            "core_cases": sum(int(each["cases"]) for each in of_core.values()),
+            "core_by_test": of_core,
             "faults": faults,
         },
     )

@@ -61,6 +61,49 @@ def tags_of(element: ElementTree.Element) -> dict[str, str]:
     return {tag.attrib["k"]: tag.attrib["v"] for tag in element.iter("tag")}
 
 
+OGRINFO = shutil.which("ogrinfo")
+
+
+@pytest.mark.skipif(OGRINFO is None, reason="GDAL's ogrinfo is not installed")
+@pytest.mark.parametrize(
+    ("name", "driver", "counts"),
+    [
+        ("map.geojson", "GeoJSON", {"labels": 3}),
+        ("map.gpkg", "GPKG", {"labels": 3, "ellipses": 3, "votes": 5, "cameras": 4}),
+        ("map.fgb", "FlatGeobuf", {"labels": 3}),
+        ("map.kml", "KML", {"traffic light": 1, "regulatory--stop--g1": 1}),
+        ("map.osm", "OSM", {"points": 3}),
+        ("map.csv", "CSV", {"map": 3}),
+        ("map.parquet", "Parquet", {"map": 3}),
+        ("map.xodr", "XODR", {}),
+    ],
+)
+def test_ogrinfo_reads_what_is_written(tmp_path: Path, name: str, driver: str, counts: dict[str, int]) -> None:
+    drivers = subprocess.run(["ogrinfo", "--formats"], capture_output=True, text=True, check=True).stdout
+    if f" {driver} -" not in drivers:
+        pytest.skip(f"this GDAL has no driver for {driver}")
+    path = tmp_path / name
+    export_map(a_map(), path, dataset=small_dataset(GEOREFERENCED))
+    # Nodes of no map yet have negative ids.
+    command = ["ogrinfo", "--config", "OSM_USE_CUSTOM_INDEXING", "NO", "-ro", "-al", str(path)]
+    read = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "ERROR" not in read.stderr
+    parts = {part.partition("\n")[0]: part for part in read.stdout.split("\nLayer name: ")[1:]}
+    layers = {layer: part.count("\nOGRFeature(") for layer, part in parts.items()}
+    assert counts.items() <= layers.items(), read.stdout
+    assert name != "map.xodr" or layers
+    if name in {"map.geojson", "map.gpkg", "map.fgb"}:
+        lines = parts["labels"].splitlines()
+        points = [line.split("(")[1].rstrip(")").split() for line in lines if "POINT Z (" in line]
+        places = np.array(points, dtype=np.float64)
+        assert_allclose(
+            places[np.argsort(places[:, 2])],
+            lon_lat_height_from_enu(POSITIONS, ANCHOR)[np.argsort(POSITIONS[:, 2])],
+            rtol=0.0,
+            atol=1e-3,
+        )
+
+
 def test_geopackage_has_labels_ellipses_votes_and_cameras(tmp_path: Path) -> None:
     dataset = small_dataset(GEOREFERENCED)
     path = tmp_path / "map.gpkg"

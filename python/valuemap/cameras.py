@@ -29,6 +29,8 @@ _JACOBIAN_STEP = 1e-5
 """Half the step, in units of the virtual image plane, of the central differences."""
 _RAY_TOLERANCE_PX = 0.1
 """A ray that projects farther than this from its pixel is not the ray of the pixel."""
+_STEEPEST = 1e12
+"""A pixel around which a lens spreads a direction over more pixels has no ray."""
 _BLOCK = 8192
 """Rows that are worked on at once, so that what is between stays in the cache."""
 
@@ -122,8 +124,10 @@ def cast_rays(dataset: Dataset, *, is_left_out: NDArray[np.bool_] | None = None)
             residual_from_cam[members], direction_in_cam[members] = _local_pinholes(
                 camera, detections.center_px[members]
             )
+    has_no_ray = ~(np.abs(residual_from_cam).max(axis=(1, 2)) <= _STEEPEST)
     if is_left_out is not None:
-        residual_from_cam[is_left_out], direction_in_cam[is_left_out] = np.nan, np.nan
+        has_no_ray |= is_left_out
+    residual_from_cam[has_no_ray], direction_in_cam[has_no_ray] = np.nan, np.nan
     core = _core.Rays(
         residual_from_cam,
         direction_in_cam,

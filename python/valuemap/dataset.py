@@ -52,6 +52,8 @@ PART_FOLDERS = ("images",)
 _QUATERNION_TOLERANCE = 1e-3
 _FARTHEST_M = 1e12
 """From the origin of the world: beyond, squares of distances leave what numbers hold."""
+_LARGEST_PX = 1e9
+"""Of a box or a parameter of a camera: no picture has so many."""
 _ROUNDING = 1e-12
 _LEADS_OUT = r"^/|^[A-Za-z]:|^\\\\|(^|[/\\])\.\.([/\\]|$)|\x00"
 
@@ -341,10 +343,10 @@ def check_cameras(cameras: Cameras, source: str) -> None:
             )
         expected = pycolmap.Camera(model=model, width=width, height=height).params_info
         names = [name.strip() for name in expected.split(",")]
-        if len(params) != len(names) or not np.all(np.isfinite(params)):
+        if len(params) != len(names) or not np.all(np.abs(params) <= _LARGEST_PX):
             raise InputError(
                 f"{where}: params: {model} expects {len(names)} finite numbers ({expected}), found {params.tolist()}",
-                hint="give the parameters in COLMAP's order, in pixels",
+                hint=f"give the parameters in COLMAP's order, in pixels, none above {_LARGEST_PX:g}",
             )
 
 
@@ -400,7 +402,9 @@ def check_detections(
         return
     where = (source, "detections", "detection_id")
     for i, name in enumerate(("width", "height")):
-        _refuse(detections.size_px[:, i] < 0.0, detections.size_px[:, i], ids, *where, name, "expected at least 0 px")
+        size = detections.size_px[:, i]
+        _refuse(size < 0.0, size, ids, *where, name, "expected at least 0 px")
+        _refuse(size > _LARGEST_PX, size, ids, *where, name, f"expected at most {_LARGEST_PX:g} px")
     for name in ("range_m", "range_sigma_m", "vertical_sigma_px"):
         _check_positive(getattr(detections, name), ids, *where, name)
     camera_row = rows_of(camera_id, cameras.camera_id)[rows_of(detections.image_id, image_id)]

@@ -80,6 +80,25 @@ pub fn check_not_infinite(name: &str, values: &[f64]) -> PyResult<()> {
     Err(PyValueError::new_err(format!("{name}: expected finite numbers, or NaN for none")))
 }
 
+/// No place is farther from the origin of its world, m: `valuemap.dataset` lets translations of 1e12 pass.
+pub const FARTHEST_M: f64 = 2e12;
+
+/// All values must be numbers of at most so much.
+pub fn check_within(name: &str, values: &[f64], most: f64) -> PyResult<()> {
+    if values.iter().all(|value| value.abs() <= most) {
+        return Ok(());
+    }
+    Err(PyValueError::new_err(format!("{name}: expected numbers from -{most:e} to {most:e}")))
+}
+
+/// All values must be numbers of at most so much, or NaN, which stands for none.
+pub fn check_within_or_none(name: &str, values: &[f64], most: f64) -> PyResult<()> {
+    if values.iter().all(|value| value.is_nan() || value.abs() <= most) {
+        return Ok(());
+    }
+    Err(PyValueError::new_err(format!("{name}: expected numbers from -{most:e} to {most:e}, or NaN for none")))
+}
+
 /// Matrices of an (N, 3, 3) array, without a copy.
 pub fn matrices_of<'a>(name: &str, array: &'a PyReadonlyArray3<'_, f64>) -> PyResult<&'a [[f64; 9]]> {
     if array.shape()[1..] != [3, 3] {

@@ -21,7 +21,8 @@ use valuemap_core::vote::Candidate;
 use valuemap_core::{evidence, merge, partition, triangulate, vote};
 
 use crate::arrays::{
-    Groups, candidates_from, check_finite, check_not_infinite, groups_of, matrices_of, points_of, rays_in, rows_of,
+    FARTHEST_M, Groups, candidates_from, check_finite, check_within, check_within_or_none, groups_of, matrices_of,
+    points_of, rays_in, rows_of,
 };
 use crate::run::with_progress;
 
@@ -55,10 +56,10 @@ impl Rays {
         let rotations = matrices_of("cam_from_world", &cam_from_world)?;
         let centers = rows_of(&center_in_world_m)?;
         // Where a camera has no ray for a pixel, matrix and direction are NaN.
-        check_not_infinite("residual_from_cam", matrices.as_flattened())?;
-        check_not_infinite("direction_in_cam", directions.as_flattened())?;
-        check_finite("cam_from_world", rotations.as_flattened())?;
-        check_finite("center_in_world_m", centers.as_flattened())?;
+        check_within_or_none("residual_from_cam", matrices.as_flattened(), FARTHEST_M)?;
+        check_within_or_none("direction_in_cam", directions.as_flattened(), FARTHEST_M)?;
+        check_within("cam_from_world", rotations.as_flattened(), FARTHEST_M)?;
+        check_within("center_in_world_m", centers.as_flattened(), FARTHEST_M)?;
         let (image, class) = (image.as_slice()?.to_vec(), class.as_slice()?.to_vec());
         let lengths = [directions.len(), image.len(), class.len()];
         if lengths.iter().any(|&length| length != matrices.len()) {
@@ -105,7 +106,7 @@ fn partition_images<'py>(
     cluster_radius_m: f64,
 ) -> PyResult<Bound<'py, PyArray1<u32>>> {
     let centers = rows_of(&center_in_world_m)?;
-    check_finite("center_in_world_m", centers.as_flattened())?;
+    check_within("center_in_world_m", centers.as_flattened(), FARTHEST_M)?;
     check_finite("cluster_radius_m", &[cluster_radius_m])?;
     Ok(py.detach(|| partition::partition(centers, cluster_radius_m)).into_pyarray(py))
 }

@@ -16,7 +16,10 @@ use valuemap_core::robust::scene::{Frustum, Scene as CoreScene, View};
 use valuemap_core::robust::{Calibration, Findings, Settings, Without, find, self_calibrate};
 
 use crate::Rays;
-use crate::arrays::{Groups, check_finite, check_length, check_not_infinite, matrices_of, matrix, rays_in, rows_of};
+use crate::arrays::{
+    FARTHEST_M, Groups, check_finite, check_length, check_not_infinite, check_within, check_within_or_none,
+    matrices_of, matrix, rays_in, rows_of,
+};
 use crate::run::with_progress;
 
 /// Rays with their boxes, and all images: what the robust method works on.
@@ -59,19 +62,19 @@ impl Scene {
         check_length("driven_m", driven_m.len(), images)?;
         check_length("position_sigma_m", positions.len(), images)?;
         check_length("rotation_sigma_rad", turns.len(), images)?;
-        check_finite("center_in_world_m", centers.as_flattened())?;
-        check_finite("cam_from_world", rotations.as_flattened())?;
-        check_finite("driven_m", driven_m)?;
+        check_within("center_in_world_m", centers.as_flattened(), FARTHEST_M)?;
+        check_within("cam_from_world", rotations.as_flattened(), FARTHEST_M)?;
+        check_within("driven_m", driven_m, FARTHEST_M)?;
         check_not_infinite("position_sigma_m", positions)?;
         check_not_infinite("rotation_sigma_rad", turns)?;
         let solid_angles = solid_angle_sr.as_slice()?;
-        check_finite("solid_angle_sr", solid_angles)?;
+        check_within("solid_angle_sr", solid_angles, FARTHEST_M)?;
         let planes = match *frustum_normals.shape() {
             [cameras, planes, 3] if cameras == solid_angles.len() && planes > 0 => planes,
             _ => return Err(PyValueError::new_err("frustum_normals: expected shape (cameras, planes, 3)")),
         };
         let normals = frustum_normals.as_slice()?.as_chunks::<3>().0;
-        check_not_infinite("frustum_normals", normals.as_flattened())?;
+        check_within_or_none("frustum_normals", normals.as_flattened(), FARTHEST_M)?;
         if camera.iter().any(|&camera| camera as usize >= solid_angles.len()) {
             return Err(PyValueError::new_err(format!("camera: expected rows of {} cameras", solid_angles.len())));
         }
@@ -84,7 +87,7 @@ impl Scene {
         check_length("range_m", range_m.len(), core.rays.len())?;
         check_length("range_sigma_m", range_sigma_m.len(), core.rays.len())?;
         check_length("score", score.as_slice()?.len(), core.rays.len())?;
-        check_finite("box_px", box_px)?;
+        check_within("box_px", box_px, FARTHEST_M)?;
         check_not_infinite("range_m", range_m)?;
         check_not_infinite("range_sigma_m", range_sigma_m)?;
         let views = (0..centers.len())
@@ -124,7 +127,7 @@ impl Scene {
 type NoiseValues = [f64; 8];
 
 fn noise_of(values: NoiseValues) -> PyResult<Noise> {
-    check_finite("noise", &values)?;
+    check_within("noise", &values, FARTHEST_M)?;
     if values.iter().any(|&value| value < 0.0) || values[0] == 0.0 {
         return Err(PyValueError::new_err("noise: expected standard deviations, that of a detection above 0"));
     }
@@ -150,6 +153,15 @@ fn noise_of(values: NoiseValues) -> PyResult<Noise> {
     })
 }
 
+/// No gate is wider, sigmas: what it lets in is counted in whole parts of a sigma.
+const WIDEST_GATE: f64 = 1e3;
+/// Nothing that is learned is larger: logarithms, sizes and ranges.
+const LARGEST_LEARNED: f64 = 1e6;
+/// No range is longer, m: the voting kernel counts in single precision.
+const LONGEST_M: f64 = 1e6;
+/// No greatest range is shorter, m: places are looked up in cubes of that size.
+const SHORTEST_M: f64 = 1e-6;
+
 /// Least parallax (rad), least and largest range (m), gate (sigmas), least votes without and with heights, least existence; without polish, merge.
 type SettingValues = (f64, f64, f64, f64, u32, u32, f64, bool, bool);
 
@@ -157,10 +169,13 @@ fn settings_of(
     (min_parallax_rad, min_range_m, max_range_m, gate_sigmas, min_votes, least_votes, min_existence, polish, merge): SettingValues,
 ) -> PyResult<Settings> {
     check_finite("settings", &[min_parallax_rad, min_range_m, max_range_m, gate_sigmas, min_existence])?;
-    if gate_sigmas <= 0.0 || min_range_m < 0.0 || max_range_m <= min_range_m {
-        return Err(PyValueError::new_err(
-            "settings: expected gate_sigmas above 0, and 0 <= min_range_m < max_range_m",
-        ));
+    check_within("settings", &[min_range_m, max_range_m], LONGEST_M)?;
+    let is_gate = gate_sigmas > 0.0 && gate_sigmas <= WIDEST_GATE;
+    if !is_gate || min_range_m < 0.0 || max_range_m <= min_range_m || max_range_m < SHORTEST_M {
+        return Err(PyValueError::new_err(format!(
+            "settings: expected gate_sigmas above 0 and up to {WIDEST_GATE}, 0 <= min_range_m < max_range_m, and \
+             max_range_m of {SHORTEST_M} and more"
+        )));
     }
     let viability = Viability { max_reprojection_error_px: f64::NAN, min_parallax_rad, min_range_m, max_range_m };
     Ok(Settings { viability, gate_sigmas, min_votes, least_votes, min_existence, without: Without { polish, merge } })
@@ -171,6 +186,9 @@ type CalibrationValues = (NoiseValues, bool, Vec<Option<Vec<f64>>>, Vec<f64>);
 
 fn calibration_of((noise, is_deep, classes, pooled): CalibrationValues) -> PyResult<Calibration> {
     let of = |row: Vec<f64>| {
+        // Edges of steps may be infinite.
+        let finite: Vec<f64> = row.iter().copied().filter(|number| !number.is_infinite()).collect();
+        check_within_or_none("calibration", &finite, LARGEST_LEARNED)?;
         ClassModel::from_row(&row).ok_or_else(|| {
             PyValueError::new_err("calibration: expected as many numbers of a class as calibrate returns")
         })
@@ -324,7 +342,7 @@ pub fn objects_of<'py>(
     progress: &Bound<'py, PyAny>,
 ) -> PyResult<FoundObjects<'py>> {
     let points = rows_of(&point_in_world_m)?;
-    check_finite("point_in_world_m", points.as_flattened())?;
+    check_within("point_in_world_m", points.as_flattened(), FARTHEST_M)?;
     let rays = scene.0.rays.rays.len();
     let groups = rays_in(rays, points.len(), voter_offsets.as_slice()?, voters.as_slice()?)?;
     if groups.iter().any(|group| group.is_empty() || !group.is_sorted_by(|a, b| a < b)) {
