@@ -399,7 +399,7 @@ fn labels_of_hostile_scenes() {
     let cases = (columns(12), noise(), any::<bool>(), classes, class_model(), settings());
     run("find", 200, &cases, |(columns, noise, is_deep, classes, pooled, settings)| {
         let scene = columns.scene();
-        let calibration = Calibration { noise, is_deep, classes, pooled };
+        let calibration = Calibration { noise, is_deep, classes, pooled, starts: 0 };
         let found = find(&scene, &calibration, &settings, &Progress::default()).unwrap();
         for finding in &found.findings {
             all_finite("point", finding.estimate.point.iter())?;
