@@ -32,9 +32,9 @@ from valuemap.readers.structure import Picture, Posed, find_poses, process
 from valuemap.readers.structure.adjust import Sights, adjust, gps_inflation
 from valuemap.readers.structure.features import find_features, image_ids
 from valuemap.readers.structure.job import Job, prepare, read_answer, read_job, write_answer
-from valuemap.readers.structure.mapping import contradicts_gps
+from valuemap.readers.structure.mapping import confirmed, contradicts_gps
 from valuemap.readers.structure.pairs import pairs_to_match
-from valuemap.tables import Floats
+from valuemap.tables import Floats, Ints
 
 # How sure the poses are.
 
@@ -118,6 +118,24 @@ def test_an_outlier_of_the_gps_moves_nothing() -> None:
     assert contradicts_gps(found.center_in_world_m, sights.gps_in_world_m, sights.sigma_m).nonzero()[0].tolist() == [11]
 
 
+def test_what_is_wrong_yet_is_not_taken_for_errors_of_the_gps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From half the scale on half the way: how alike residuals are is asked of poses that agree with the GPS."""
+    sights, _, center = drive_with_points(1, gps_sigma_m=0.3)
+    pivot, asked = center[21], []
+    early = np.unique(sights.point[sights.image < 22])
+    sights.point_in_world_m[early] = pivot + 0.5 * (sights.point_in_world_m[early] - pivot)
+    sights.center_in_world_m[:22] = pivot + 0.5 * (sights.center_in_world_m[:22] - pivot)
+
+    def ask(off: Floats, drive: Ints) -> Floats:
+        asked.append(np.abs(off).max())
+        return gps_inflation(off, drive)
+
+    monkeypatch.setattr("valuemap.readers.structure.adjust.gps_inflation", ask)
+    found = adjust(sights, np.zeros(len(sights.row), dtype=np.int64))
+    assert max(asked) < 5.0
+    assert np.linalg.norm(found.center_in_world_m - center, axis=1).max() < 0.6
+
+
 def test_gps_errors_that_follow_each_other_count_for_less() -> None:
     random = np.random.default_rng(0)
     white = random.normal(0.0, 1.0, (400, 3))
@@ -130,6 +148,13 @@ def test_gps_errors_that_follow_each_other_count_for_less() -> None:
     assert 3.0 < gps_inflation(walk, one).min() < 6.0
     assert_allclose(gps_inflation(walk[:10], one[:10]), 1.0)
     assert gps_inflation(3.0 * white, one).min() > 2.5
+
+
+def test_what_only_two_pictures_see_counts_where_they_share_little_else() -> None:
+    """Pictures 0 to 2 share 60 points, and 0 and 1 one of their own; 2 and 3 share ten that no third confirms."""
+    image = np.concatenate([np.tile([0, 1, 2], 60), [0, 1], np.tile([2, 3], 10), [3]])
+    point = np.concatenate([np.repeat(np.arange(60), 3), [60, 60], np.repeat(np.arange(61, 71), 2), [71]])
+    assert confirmed(image, point).tolist() == [True] * 180 + [False] * 2 + [True] * 20 + [False]
 
 
 # Features.

@@ -279,7 +279,7 @@ def _sights(job: Job, model: pycolmap.Reconstruction, row_of: dict[int, int], ou
                 point.append(number_of.setdefault(feature.point3D_id, len(number_of)))
                 pixel.append(feature.xy)
     of_image, of_point = np.array(image, dtype=np.int64), np.array(point, dtype=np.int64)
-    fine = _confirmed(of_image, of_point)
+    fine = confirmed(of_image, of_point)
     rows = np.array([row for row, _ in images], dtype=np.int64)
     poses = [model.image(image_id) for _, image_id in images]
     rotation = np.array([each.cam_from_world().rotation.matrix() for each in poses]).reshape(-1, 3, 3)
@@ -302,16 +302,22 @@ def _sights(job: Job, model: pycolmap.Reconstruction, row_of: dict[int, int], ou
     )
 
 
-def _confirmed(image: Ints, point: Ints) -> Bools:
+def confirmed(image: Ints, point: Ints) -> Bools:
     """Return which sights (M) of points in images to keep.
 
     A point that one picture alone sees, when others are out, says nothing. One that two see may be two windows alike,
-    and no third tells. It counts only where a picture has few others.
+    and no third tells. It counts only where its two pictures share few others.
     """
-    seen = np.bincount(point)[point]
-    others = np.bincount(image, seen > 2, minlength=image.max(initial=-1) + 1)
-    poor = np.bincount(point, others[image] < _FEW_POINTS)[point] > 0
-    fine: Bools = (seen > 2) | ((seen == 2) & poor)
+    count = np.bincount(point)
+    fine: Bools = np.asarray(count[point] > 2)
+    shape = (image.max(initial=-1) + 1, len(count))
+    seen = csr_matrix((np.ones(int(fine.sum())), (image[fine], point[fine])), shape=shape)
+    shared = (seen @ seen.T).tocsr()
+    two = np.flatnonzero(count[point] == 2)
+    two = two[np.argsort(point[two], kind="stable")].reshape(-1, 2)
+    if len(two):
+        poor = np.asarray(shared[image[two[:, 0]], image[two[:, 1]]]).reshape(-1) < _FEW_POINTS
+        fine[two[poor]] = True
     return fine
 
 
