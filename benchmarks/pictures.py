@@ -1,6 +1,6 @@
 """From a folder of rendered street pictures with a GPS position in each, and nothing else, to poses and a map.
 
-    python benchmarks/pictures.py [--seed 1] [--pass-row 1] [--pictures 150] [--gps-sigma 2] [--work DIR] [--json FILE]
+    python benchmarks/pictures.py [--seed 1] [--pass-row 1] [--pictures 208] [--gps-sigma 2] [--work DIR] [--json FILE]
 
 A drive round the blocks of a simulated city by day is rendered. EXIF gets a position with noise of `--gps-sigma` on
 each axis, the time and the focal length. `valuemap import pictures` finds the poses. They are compared with the true
@@ -63,7 +63,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="poses and a map from rendered pictures with GPS positions")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--pass-row", type=int, default=1, help="which drive; the default is by day")
-    parser.add_argument("--pictures", type=int, default=150, help="of its beginning")
+    parser.add_argument("--pictures", type=int, default=208, help="of its beginning; the default is the whole drive")
     parser.add_argument("--gps-sigma", type=float, default=2.0, help="noise of each axis, m")
     parser.add_argument("--work", type=Path, help="folder for everything, to go on after an interruption")
     parser.add_argument("--json", type=Path, help="file to write the figures to")
