@@ -314,10 +314,10 @@ def confirmed(image: Ints, point: Ints) -> Bools:
     seen = csr_matrix((np.ones(int(fine.sum())), (image[fine], point[fine])), shape=shape)
     shared = (seen @ seen.T).tocsr()
     two = np.flatnonzero(count[point] == 2)
-    two = two[np.argsort(point[two], kind="stable")].reshape(-1, 2)
-    if len(two):
-        poor = np.asarray(shared[image[two[:, 0]], image[two[:, 1]]]).reshape(-1) < _FEW_POINTS
-        fine[two[poor]] = True
+    both = two[np.argsort(point[two], kind="stable")].reshape(-1, 2)
+    if len(both):
+        poor = np.asarray(shared[image[both[:, 0]], image[both[:, 1]]]).reshape(-1) < _FEW_POINTS
+        fine[both[poor]] = True
     return fine
 
 
