@@ -176,9 +176,11 @@ fn median(values: &mut [f64]) -> Option<f64> {
 /// How often objects are detected in the usual pass, how much that differs between them, and the share of odd passes: one step of expectation and
 /// maximisation.
 fn rates(objects: &[&Object], before: &ClassModel) -> (Rates, f64) {
-    let mut passes: Vec<(Looks, f64)> = objects.iter().flat_map(|object| object.seen.usual(before)).collect();
-    passes.retain(|(pass, _)| pass.expected >= 3.0);
-    let odd = 1.0 - passes.iter().map(|pass| pass.1).sum::<f64>() / passes.len() as f64;
+    let mut passes: Vec<(Looks, f64, f64)> = objects.iter().flat_map(|object| object.seen.usual(before)).collect();
+    passes.retain(|(pass, ..)| pass.expected >= 3.0);
+    let visible: f64 = passes.iter().map(|pass| pass.1).sum();
+    let odd = 1.0 - passes.iter().map(|pass| pass.2).sum::<f64>() / visible;
+    let passes: Vec<(Looks, f64)> = passes.into_iter().map(|(pass, _, usual)| (pass, usual)).collect();
     let odd = odd.clamp(ODD_PASSES.0, ODD_PASSES.2);
     rates_of(&passes).map_or((before.rates, before.odd_passes), |rates| (rates, odd))
 }
@@ -202,4 +204,60 @@ pub(super) fn rates_of(all: &[(Looks, f64)]) -> Option<Rates> {
     }
     let correlation = f64::clamp(excess / most, 0.01, 0.5);
     Some(Rates { recall, concentration: 1.0 / correlation - 1.0 })
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Matrix3, Vector3};
+
+    use super::super::energy::Fit;
+    use super::super::looks::Seen;
+    use super::super::scene::Scene;
+    use super::super::{Settings, Without};
+    use super::*;
+    use crate::hypothesis::Viability;
+
+    /// An object that all passes see as usual from one side, and hardly any from another.
+    fn seen_from_one_side() -> Object {
+        let pass = |hits: f64| Looks { expected: 20.0, hits };
+        let sectors = [[20.0, 8.0, 16.0, 12.0, 18.0, 10.0], [0.0, 0.0, 1.0, 0.0, 2.0, 0.0]]
+            .map(|hits| hits.into_iter().map(pass).collect())
+            .to_vec();
+        let fit = Fit { point: Vector3::zeros(), covariance: Matrix3::identity(), energy: 0.0, chi2: vec![1.0] };
+        Object {
+            class: 0,
+            votes: vec![0],
+            fit,
+            ln_size: 0.0,
+            others: Vec::new(),
+            seen: Seen { sectors, images: 240 },
+            real: 1.0,
+            energy: -100.0,
+        }
+    }
+
+    #[test]
+    fn passes_are_not_odd_from_where_an_object_is_not_seen() {
+        let objects: Vec<Object> = (0..9).map(|_| seen_from_one_side()).collect();
+        let viability = Viability {
+            max_reprojection_error_px: f64::NAN,
+            min_parallax_rad: 0.0,
+            min_range_m: 2.0,
+            max_range_m: 60.0,
+        };
+        let settings = Settings {
+            viability,
+            gate_sigmas: 3.5,
+            min_votes: 3,
+            least_votes: 1,
+            min_existence: 0.5,
+            without: Without::default(),
+        };
+        let mut class = ClassModel::guess(&Scene::default(), &settings, 0, (f64::NAN, f64::NAN));
+        for _ in 0..5 {
+            (class.rates, class.odd_passes) = rates(&objects.iter().collect::<Vec<_>>(), &class);
+        }
+        assert!((class.rates.recall - 0.7).abs() < 0.05, "{:?}", class.rates);
+        assert!(class.odd_passes < 0.1, "{}", class.odd_passes);
+    }
 }

@@ -108,16 +108,17 @@ impl Seen {
         (self.log_likelihoods(class).0 - self.ln_likelihood(class)).exp()
     }
 
-    /// The looks of all passes, and how probable it is that they are from where the object is usually seen.
+    /// The looks of all passes; how probable it is that they are from where the object is usually seen, and that it is seen as usual on
+    /// this pass as well.
     #[must_use]
-    pub fn usual(&self, class: &ClassModel) -> Vec<(Looks, f64)> {
+    pub fn usual(&self, class: &ClassModel) -> Vec<(Looks, f64, f64)> {
         let of_sector = |passes: &Vec<Looks>| {
             let sector = OfSector::new(passes, class);
             let visible = (sector.usual - ln_sum(sector.usual, sector.any)).exp();
             let of_pass = move |pass: &Looks| {
                 let usual = (1.0 - class.odd_passes) * class.rates.log_likelihood(pass.hits, pass.expected).exp();
                 let any = class.odd_passes * Rates::ANY.log_likelihood(pass.hits, pass.expected).exp();
-                (*pass, visible * usual / (usual + any))
+                (*pass, visible, visible * usual / (usual + any))
             };
             passes.iter().map(of_pass).collect::<Vec<_>>()
         };

@@ -55,7 +55,7 @@ pub struct ClassModel {
 
 impl ClassModel {
     /// Before anything is learned: all detections of a class may be clutter; `angle` is mean and standard deviation of the angles of its boxes, ln rad.
-    fn guess(scene: &Scene, settings: &Settings, detections: usize, angle: (f64, f64)) -> Self {
+    pub(super) fn guess(scene: &Scene, settings: &Settings, detections: usize, angle: (f64, f64)) -> Self {
         Self {
             is_learned: false,
             rates: Rates::GUESS,
