@@ -71,6 +71,8 @@ impl Block {
 /// Rays ready for the kernel; bit `i` of the answers is lane `i`.
 pub struct Gates {
     blocks: Vec<Block>,
+    /// The lanes of each block that have a ray: far from the origin, margins take in the others as well.
+    used: Vec<u64>,
     /// Largest `|row| / gate` of a ray, and largest distance of a camera from the origin, m.
     largest_row: f64,
     largest_center_m: f64,
@@ -90,12 +92,14 @@ impl Gates {
     /// Centres should lie near the origin: `f32` has 24 bits.
     #[must_use]
     pub fn new<'a>(rays: impl Iterator<Item = (u32, &'a Ray, Gate)>) -> Self {
-        let mut gates = Self { blocks: Vec::new(), largest_row: 1.0, largest_center_m: 0.0 };
+        let mut gates = Self { blocks: Vec::new(), used: Vec::new(), largest_row: 1.0, largest_center_m: 0.0 };
         for (lane, ray, gate) in rays {
             let block = lane as usize / LANES;
             while gates.blocks.len() <= block {
                 gates.blocks.push(Block::empty());
+                gates.used.push(0);
             }
+            gates.used[block] |= 1 << (lane as usize % LANES);
             gates.blocks[block].set(lane as usize % LANES, ray, gate);
             let m = &ray.residual_from_world;
             gates.largest_row = gates.largest_row.max(m.row(0).norm().max(m.row(1).norm()) / gate.radius_px);
@@ -183,11 +187,12 @@ impl Pass<'_> {
         let words = self.gates.words();
         let answers = self.maybe.chunks_mut(TILE * words).zip(self.sure.chunks_mut(TILE * words));
         for (points, (maybe, sure)) in self.points.chunks(TILE).zip(answers) {
-            for (word, block) in self.gates.blocks.iter().enumerate() {
+            for (word, (block, used)) in self.gates.blocks.iter().zip(&self.gates.used).enumerate() {
                 for (i, point) in points.iter().enumerate() {
                     let x = [point.x as f32, point.y as f32, point.z as f32];
                     let at = i * words + word;
-                    (maybe[at], sure[at]) = test_block::<FUSED>(block, x, self.margins);
+                    let (may, must) = test_block::<FUSED>(block, x, self.margins);
+                    (maybe[at], sure[at]) = (may & used, must & used);
                 }
             }
         }

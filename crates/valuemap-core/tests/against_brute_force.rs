@@ -262,3 +262,15 @@ fn a_merged_label_may_come_within_reach_of_another() {
 fn nothing_merges_to_nothing() {
     assert!(merge(&Rays::default(), Vec::new(), 1.0).is_empty());
 }
+
+#[test]
+fn lanes_without_a_ray_answer_nothing_however_far_points_are() {
+    let ray = ray_to(Vector3::new(10.0, 0.0, 0.0), Vector3::zeros(), [0.0, 0.0]);
+    let gates = Gates::new([(3, &ray, Gate { radius_px: 6.0, floor_m2: 0.04 })].into_iter());
+    let far = [Vector3::new(3e7, -2e7, 1e7), Vector3::new(1e12, 1e12, 1e12)];
+    for (name, arch) in instruction_sets() {
+        let (mut maybe, mut sure) = (vec![0; 2], vec![0; 2]);
+        gates.test_on(arch, &far, &mut maybe, &mut sure);
+        assert!(maybe.iter().chain(&sure).all(|word| word & !(1 << 3) == 0), "{name}: {maybe:?}");
+    }
+}

@@ -133,7 +133,9 @@ fn by_cell(centers: &[Vector3<f64>], images: impl Iterator<Item = u32>, side_m: 
 /// The cubes with everything that is within one side of a point.
 fn cells_around(center: &Vector3<f64>, side_m: f64) -> impl Iterator<Item = [i64; 3]> {
     let [x, y, z] = cell_of(center, side_m);
-    (0..27).map(move |step| [x + step / 9 - 1, y + step / 3 % 3 - 1, z + step % 3 - 1])
+    (0..27).map(move |step| {
+        [x.saturating_add(step / 9 - 1), y.saturating_add(step / 3 % 3 - 1), z.saturating_add(step % 3 - 1)]
+    })
 }
 
 fn cell_of(center: &Vector3<f64>, side_m: f64) -> [i64; 3] {
