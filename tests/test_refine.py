@@ -18,7 +18,7 @@ from valuemap.config import SimulationConfig
 from valuemap.dataset import Dataset, write_dataset
 from valuemap.drives import Drives, find_drives, in_driving_order
 from valuemap.engine.threads import ThreadEngine
-from valuemap.refine import Refined, refine_poses
+from valuemap.refine import Refined, adjust, refine_poses
 from valuemap.refine.estimate import delay_together, mounts_alone, segment
 from valuemap.refine.footage import find_motion, gather, in_working_frame
 from valuemap.refine.jumps import Legs, find_hints, find_jumps
@@ -333,3 +333,16 @@ def test_jumps_of_poses_are_seen_in_the_trajectory_and_stops_and_turns_are_none(
         right += int((jumps & (np.diff(leg[rows]) != 0)).sum())
     assert true >= 8
     assert right >= 0.5 * true
+
+
+def test_the_normal_equations_of_few_and_of_many_observations_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(0)
+    # Nine columns, and a tenth of what is fixed, which several derivatives of an observation may share.
+    local = np.array([random.permutation(10)[:5] for _ in range(50)])
+    local[::3, 3:] = 9
+    jacobian, residual, weight = random.normal(size=(50, 2, 5)), random.normal(size=(50, 2)), random.random(50)
+    dense = adjust._dense_normals(jacobian, residual, weight, local, 9)
+    monkeypatch.setattr(adjust, "_SMALL", 0)
+    sparse = adjust._dense_normals(jacobian, residual, weight, local, 9)
+    for ours, theirs in zip(dense, sparse, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-12)

@@ -28,6 +28,8 @@ OFFSET, MOUNT, DELAY, FOCAL, CAMERA_MOUNT, CAMERA_DELAY = range(6)
 KINDS = ("offset", "mount", "delay", "focal", "camera_mount", "camera_delay")
 WIDTH = (3, 3, 1, 1, 3, 1)
 _DENSE_LIMIT = 3000
+_SMALL = 200_000
+"""Normal equations of fewer observations times columns are made of dense matrices: sparse ones take longer to build."""
 _DAMPING = 1e-6
 """Added to the information of objects, so that one that nothing tells stays."""
 _LONGEST_M = 20.0
@@ -352,13 +354,20 @@ def _dense_normals(
     jacobian: Floats, residual: Floats, weight: Floats, local: Ints, width: int
 ) -> tuple[Floats, Floats]:
     """Return the normal equations (width, width) and right side of observations with local columns."""
+    if len(local) * width < _SMALL:
+        dense = np.zeros((len(local), 2, width + 1))
+        each = np.arange(len(local))[:, None, None], np.arange(2)[None, :, None]
+        dense[(*each, local[:, None, :])] = jacobian
+        dense *= np.sqrt(weight)[:, None, None]
+        flat = dense.reshape(-1, width + 1)[:, :width]
+        return flat.T @ flat, -(flat.T @ (residual * np.sqrt(weight)[:, None]).ravel())
     rows = np.repeat(np.arange(2 * len(local)), local.shape[1])
     columns = np.repeat(local, 2, axis=0).ravel()
     root = np.sqrt(weight)[:, None]
-    flat = sparse.csr_matrix(
+    matrix = sparse.csr_matrix(
         ((jacobian * root[:, :, None]).ravel(), (rows, columns)), shape=(2 * len(local), width + 1)
     )[:, :width]
-    return (flat.T @ flat).toarray(), -np.asarray(flat.T @ (residual * root).ravel())
+    return (matrix.T @ matrix).toarray(), -np.asarray(matrix.T @ (residual * root).ravel())
 
 
 class _System:
