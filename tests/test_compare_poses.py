@@ -41,6 +41,18 @@ def test_true_poses_make_detections_likelier(city: Dataset, shift_m: float) -> N
     assert again[2] == count > 100
 
 
+def test_ids_at_random_compare_the_same_detections(city: Dataset) -> None:
+    """Ids that ascend along the drive are the exception: the fit of poses is that of the same rays all the same."""
+    ids = np.random.default_rng(0).permutation(len(city.detections)) + 1
+    detections = city.detections.replace(detection_id=ids).take(np.argsort(ids))
+    shuffled = replace(city, detections=detections, truth_detections=None)
+    config = valuemap.MapConfig()
+    expected = compare_poses(city, shifted(city, 1.5), config, threads=0, progress=silent)
+    found = compare_poses(shuffled, shifted(shuffled, 1.5), config, threads=0, progress=silent)
+    assert found[2] == expected[2]
+    assert found[:2] == pytest.approx(expected[:2], rel=0.01)
+
+
 def test_a_correction_that_is_not_worth_its_parameters_is_not_taken(
     city: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:

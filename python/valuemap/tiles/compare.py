@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from valuemap.config import MapConfig
-from valuemap.dataset import Dataset, rows_of
+from valuemap.dataset import Dataset
 from valuemap.drives import InOrder, in_driving_order
 from valuemap.progress import Progress, counted
 from valuemap.robust import Scene, misfit
@@ -28,7 +28,9 @@ def compare_poses(
         of_old, rays = misfit(scene, config, threads=threads, progress=lambda *_: tell(0))
         new = _same_images(after, old, config)
         scene = Scene(new.dataset, new.drives, cast_sightings(new.dataset)[0])
-        same = np.sort(rows_of(old.detection_id[rays], new.detection_id))
+        same = np.flatnonzero(
+            np.isin(new.detection_id, old.detection_id[rays])
+        )  # In another order, where poses tell it.
         of_new, _ = misfit(scene, config, same, threads=threads, progress=lambda *_: tell(1))
     return of_old, of_new, len(rays)
 
