@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -149,18 +149,18 @@ def calibrate(
 
 
 def misfit(
-    scene: Scene, config: MapConfig, rays: Ints | None = None, *, threads: int = 0, progress: Progress = silent
+    scene: Scene, config: MapConfig, rays: Ints | None = None, *, threads: int = 0, going_on: Callable[[], None]
 ) -> tuple[float, Ints]:
     """Return how badly some detections (rows, N) fit, those of a sample of places where none are given, and which.
 
     Minus twice the logarithm of their likelihood, up to a constant of theirs. What is true makes them likelier.
+    `going_on` is called again and again, and stops the work by an exception.
     """
     guess, known = _guess(config.noise)
     rows = None if rays is None else rays.astype(np.uint32)
-    with counted(progress, "comparing poses", 1) as tell:
-        value, used = _core.misfit(
-            scene.core, guess.as_tuple(), known, _settings(config), rows, threads, lambda _done, _total: tell(0)
-        )
+    value, used = _core.misfit(
+        scene.core, guess.as_tuple(), known, _settings(config), rows, threads, lambda _done, _total: going_on()
+    )
     return value, used.astype(np.int64)
 
 

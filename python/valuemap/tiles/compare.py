@@ -25,13 +25,12 @@ def compare_poses(
     old = InMemory(before, config).sample()
     scene = Scene(old.dataset, old.drives, cast_sightings(old.dataset)[0])
     with counted(progress, "comparing poses", 2) as tell:
-        of_old, rays = misfit(scene, config, threads=threads, progress=lambda *_: tell(0))
+        of_old, rays = misfit(scene, config, threads=threads, going_on=lambda: tell(0))
         new = _same_images(after, old, config)
         scene = Scene(new.dataset, new.drives, cast_sightings(new.dataset)[0])
-        same = np.flatnonzero(
-            np.isin(new.detection_id, old.detection_id[rays])
-        )  # In another order, where poses tell it.
-        of_new, _ = misfit(scene, config, same, threads=threads, progress=lambda *_: tell(1))
+        # They are in another order where poses tell the order.
+        same = np.flatnonzero(np.isin(new.detection_id, old.detection_id[rays]))
+        of_new, _ = misfit(scene, config, same, threads=threads, going_on=lambda: tell(1))
     return of_old, of_new, len(rays)
 
 
