@@ -98,24 +98,12 @@ fn at_most(bound: f64, value: impl Fn(f64) -> f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{Matrix3, Vector3};
-
-    use super::super::energy::Fit;
+    use super::super::energy::anywhere;
     use super::super::looks::Seen;
     use super::*;
 
     fn of_votes(votes: usize, energy: f64) -> Object {
-        let fit = Fit { point: Vector3::zeros(), covariance: Matrix3::identity(), energy: 0.0, chi2: vec![1.0; votes] };
-        Object {
-            class: 0,
-            votes: (0..votes as u32).collect(),
-            fit,
-            ln_size: 0.0,
-            others: Vec::new(),
-            seen: Seen::default(),
-            real: 1.0,
-            energy,
-        }
+        anywhere(votes, Seen::default(), energy)
     }
 
     fn expected(few: &[Object], ln_odds: f64) -> f64 {

@@ -314,3 +314,19 @@ impl Object {
         self.real / (1.0 + (0.5 * self.energy).exp())
     }
 }
+
+/// For unit tests of what looks at votes and looks alone: an object somewhere.
+#[cfg(test)]
+pub(super) fn anywhere(votes: usize, seen: Seen, energy: f64) -> Object {
+    let fit = Fit { point: Vector3::zeros(), covariance: Matrix3::identity(), energy: 0.0, chi2: vec![1.0; votes] };
+    Object {
+        class: 0,
+        votes: (0..votes as u32).collect(),
+        fit,
+        ln_size: 0.0,
+        others: Vec::new(),
+        seen,
+        real: 1.0,
+        energy,
+    }
+}

@@ -208,9 +208,7 @@ pub(super) fn rates_of(all: &[(Looks, f64)]) -> Option<Rates> {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{Matrix3, Vector3};
-
-    use super::super::energy::Fit;
+    use super::super::energy::anywhere;
     use super::super::looks::Seen;
     use super::super::scene::Scene;
     use super::super::{Settings, Without};
@@ -223,17 +221,7 @@ mod tests {
         let sectors = [[20.0, 8.0, 16.0, 12.0, 18.0, 10.0], [0.0, 0.0, 1.0, 0.0, 2.0, 0.0]]
             .map(|hits| hits.into_iter().map(pass).collect())
             .to_vec();
-        let fit = Fit { point: Vector3::zeros(), covariance: Matrix3::identity(), energy: 0.0, chi2: vec![1.0] };
-        Object {
-            class: 0,
-            votes: vec![0],
-            fit,
-            ln_size: 0.0,
-            others: Vec::new(),
-            seen: Seen { sectors, images: 240 },
-            real: 1.0,
-            energy: -100.0,
-        }
+        anywhere(1, Seen { sectors, images: 240 }, -100.0)
     }
 
     #[test]
