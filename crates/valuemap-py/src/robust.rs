@@ -236,7 +236,7 @@ pub fn calibrate(
     Ok((noise, found.is_deep, classes, found.pooled.to_row()))
 }
 
-/// How badly rays fit, and which, `valuemap_core::robust::misfit`.
+/// How badly rays fit, and which, `valuemap_core::robust::likeliest::misfit`.
 #[pyfunction]
 #[allow(clippy::too_many_arguments)]
 pub fn misfit<'py>(
@@ -260,7 +260,7 @@ pub fn misfit<'py>(
         return Err(PyValueError::new_err(format!("rays: expected numbers below {count} in ascending order")));
     }
     let (value, rays) = with_progress(py, threads, 0, progress, |progress| {
-        valuemap_core::robust::misfit(&scene.0, &guess, known, &settings, rays, progress)
+        valuemap_core::robust::likeliest::misfit(&scene.0, &guess, known, &settings, rays, progress)
     })?;
     Ok((value, rays.into_pyarray(py)))
 }
