@@ -545,6 +545,15 @@ def test_what_was_made_with_other_settings_is_not_taken(long_street: Path, tmp_p
     assert not set(map(str, first)) & set(map(str, other))
 
 
+@pytest.mark.parametrize("where", [".", "cells"])
+def test_whenever_a_run_is_ended_nothing_temporary_is_left(tmp_path: Path, where: str) -> None:
+    with pytest.raises(KeyboardInterrupt), open_work(tmp_path / "work", resume=False) as work:
+        (work / where / ".tmp-1").mkdir()
+        (work / where / ".tmp-1" / "part.parquet").write_bytes(b"half")
+        raise KeyboardInterrupt
+    assert sorted(path.name for path in (tmp_path / "work").rglob("*")) == ["cells", "valuemap-work.json"]
+
+
 def test_a_second_run_into_the_same_folder_is_refused(long_street: Path, tmp_path: Path) -> None:
     with open_work(tmp_path / "map.work", resume=False):
         result = CliRunner().invoke(app, ["map", str(long_street), "--out", str(tmp_path / "map"), "--resume"])

@@ -41,10 +41,13 @@ def open_work(path: Path, *, resume: bool) -> Iterator[Path]:
         with _lock_of(path):
             if not resume:
                 _empty(path)
-            for stale in [*path.glob(f"{_TEMPORARY}*"), *path.glob(f"*/{_TEMPORARY}*")]:
-                _remove(stale)
+            _remove_temporary(path)
             (path / CELLS).mkdir(exist_ok=True)
-            yield path
+            try:
+                yield path
+            finally:  # A signal may come before `written` has begun to look after what it made, or while it removes it.
+                with suppress(OSError):
+                    _remove_temporary(path)
     except OSError as error:
         raise OutputError(
             f"{path}: cannot be written: {error.strerror or error}",
@@ -116,6 +119,11 @@ def _empty(path: Path) -> None:
     for entry in path.iterdir():
         if entry.name != MARKER:
             _remove(entry)
+
+
+def _remove_temporary(path: Path) -> None:
+    for entry in [*path.glob(f"{_TEMPORARY}*"), *path.glob(f"*/{_TEMPORARY}*")]:
+        _remove(entry)
 
 
 def _remove(entry: Path) -> None:
