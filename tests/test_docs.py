@@ -26,7 +26,10 @@ from tiny_models import red_finder
 from valuemap import tables
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, write_dataset
+from valuemap.readers import READERS
+from valuemap.readers.detections import DETECTIONS
 from valuemap.simulate import PRESETS, simulate
+from valuemap.writers import SUFFIXES
 
 ROOT = Path(__file__).parents[1]
 PAGES = [*sorted((ROOT / "docs").rglob("*.md")), *sorted(ROOT.glob("*.md")), ROOT / "benchmarks" / "README.md"]
@@ -49,6 +52,19 @@ def slug(heading: str) -> str:
 def anchors(page: Path) -> set[str]:
     text = _FENCE.sub("", page.read_text(encoding="utf-8"))
     return {slug(heading) for heading in re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)}
+
+
+def test_every_format_that_is_read_or_written_has_a_page() -> None:
+    folder = ROOT / "docs" / "formats"
+    named = {page.stem: page.read_text(encoding="utf-8") for page in folder.glob("*.md")}
+    for name in READERS:
+        assert f"valuemap import {name} " in named[name], name
+    for name in DETECTIONS:
+        assert f"](detections_{name}.md)" in named["detections"]
+        assert "valuemap import" in named[f"detections_{name}"]
+    written = "".join(named[name] for name in ("gis", "osm", "hd_maps", "viewers"))
+    for name in SUFFIXES.values():
+        assert f"\n## {name}\n" in written, name
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

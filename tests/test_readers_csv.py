@@ -347,10 +347,9 @@ def real(name: str) -> Path:
 
 
 def commands_in_the_docs() -> dict[str, list[str]]:
-    """The commands that docs/formats.md gives for published data, by the folder that they read."""
-    text = (Path(__file__).parents[1] / "docs" / "formats.md").read_text(encoding="utf-8")
-    section = text.partition("## Published data as they are")[2].partition("\n## ")[0]
-    blocks = re.findall(r"(?:^    .+\n)+", section, re.MULTILINE)
+    """The commands that docs/formats/published_data.md gives for published data, by the folder that they read."""
+    text = (Path(__file__).parents[1] / "docs" / "formats" / "published_data.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"(?:^    .+\n)+", text, re.MULTILINE)
     commands = [shlex.split(" ".join(block.split("\n"))) for block in blocks]
     return {command[3].partition("/")[0]: command for command in commands}
 

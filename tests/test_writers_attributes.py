@@ -225,7 +225,8 @@ def test_sign_codes_are_of_one_meaning_each() -> None:
             assert found[0] is sign, name
 
 
-DOCS = (Path(__file__).parents[1] / "docs" / "formats.md").read_text(encoding="utf-8")
+FORMATS = Path(__file__).parents[1] / "docs" / "formats"
+DOCS = "".join((FORMATS / name).read_text(encoding="utf-8") for name in ("export.md", "signs.md"))
 
 
 def test_the_docs_say_what_every_column_means() -> None:

@@ -52,7 +52,7 @@ class Export:
 
     @cached_property
     def attributes(self) -> pd.DataFrame:
-        """A row for each label: the columns of labels.parquet, then those of docs/formats.md for people."""
+        """A row for each label: the columns of labels.parquet, then those of docs/formats/export.md for people."""
         labels = self.result.labels
         table = table_to_arrow(labels).to_pandas()
         table["class"] = table["class"].astype("string")  # No labels have no classes: categories of none have no type.
