@@ -1,87 +1,43 @@
 """Joint least squares over objects and the errors of drives: a bundle adjustment whose poses have few parameters.
 
-A detection of object X in an image with pose (R, C) and local pinhole M (see `cameras.py`) has the residual
+The residuals are those of `residuals.py`. Drift is an Ornstein-Uhlenbeck process over nodes along the drive. It couples
+neighbouring nodes only: each drive's nodes are eliminated by a banded Cholesky factor L; what is left are the objects
+and the constants, whose normal equations lose Y^T Y with L Y = C, where C are the products with the nodes. Steps are
+those of Gauss-Newton with Cauchy's weights, until the next one would hardly lower the cost.
 
-    r = (1 + s) (a/c, b/c) + s (u - u_0),    (a, b, c) = M p,
-    p = exp(m + n + tau w) R (X - C - o - d - tau v)
-
-with s the error of the camera's focal length, m how the camera is mounted (in camera axes), n and d the drift of
-rotation and position, o the offset of the leg, and tau the time from pose to exposure, in which the image moves by v
-and turns by w. Drift is an Ornstein-Uhlenbeck process over nodes along the drive. It couples neighbouring nodes only:
-each drive's nodes are eliminated by a banded Cholesky factor; what is left are the objects and the constants. Steps
-are those of Gauss-Newton with Cauchy's weights.
+Where things stand in the equations depends on who sees what alone: it is found once for all steps. In each step the
+products of the derivatives of an observation are added up over those of one node and object before anything else.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy import sparse
-from scipy.linalg import cho_factor, cho_solve, solveh_banded
+from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpbtrf, dtbtrs
 from scipy.sparse.linalg import splu
 
+from valuemap.refine.residuals import (
+    Linearised,
+    Observations,
+    State,
+    linearised,
+    weights,
+)
 from valuemap.tables import Bools, Floats, Ints
 
-OFFSET, MOUNT, DELAY, FOCAL, CAMERA_MOUNT, CAMERA_DELAY = range(6)
-KINDS = ("offset", "mount", "delay", "focal", "camera_mount", "camera_delay")
-WIDTH = (3, 3, 1, 1, 3, 1)
 _DENSE_LIMIT = 3000
-_SMALL = 200_000
-"""Normal equations of fewer observations times columns are made of dense matrices: sparse ones take longer to build."""
 _DAMPING = 1e-6
 """Added to the information of objects, so that one that nothing tells stays."""
 _LONGEST_M = 20.0
 """A step moves an object by at most this."""
-_CAUCHY = 2.0
-"""Residuals of so many sigmas weigh half."""
-
-
-@dataclass(frozen=True, eq=False)
-class Observations:
-    """Detections (N) of objects, sorted by drive and node, with what their residuals are computed from.
-
-    `residual_from_cam` (N, 3, 3), `cam_from_world` (N, 3, 3), `center_in_world_m` (N, 3); `forward_mps`, `backward_mps`
-    (N, 3) and `forward_radps`, `backward_radps` (N, 3, camera axes): how the image moves and turns until the next one
-    and since the last one; `from_middle_px` (N, 2) from the principal point (0 where the camera has no focal length);
-    `cam_from_node` (N, 3, 3) turns drift into camera axes; `sigma_px` (N) is the deviation of all that
-    is not in the model, `detection_sigma_px` (N) that of the detection alone. `leg` (N) and `vehicle` (N) are the rows
-    of the offset and of the mounting and delay; drives that go on as the one before them share its vehicle.
-    """
-
-    residual_from_cam: Floats
-    cam_from_world: Floats
-    center_in_world_m: Floats
-    forward_mps: Floats
-    backward_mps: Floats
-    forward_radps: Floats
-    backward_radps: Floats
-    from_middle_px: Floats
-    cam_from_node: Floats
-    sigma_px: Floats
-    detection_sigma_px: Floats
-    thing: Ints
-    node: Ints
-    drive: Ints
-    leg: Ints
-    vehicle: Ints
-    camera: Ints
-    image: Ints
-
-    def __len__(self) -> int:
-        return len(self.thing)
-
-    def pixels_per_unit(self) -> Floats:
-        """Return the local focal length (N), px: that of a pinhole along the detection's own ray."""
-        square = np.sum(self.residual_from_cam[:, :2] ** 2, axis=(1, 2)) - np.sum(
-            np.einsum("nij,nj->ni", self.residual_from_cam[:, :2], self.residual_from_cam[:, 2]) ** 2, axis=1
-        )
-        return np.asarray(np.sqrt(0.5 * square))
-
-    def take(self, rows: Any) -> Observations:
-        """Return some of them."""
-        return Observations(**{name: value[rows] for name, value in vars(self).items()})
+_SETTLED = 0.1
+"""Steps end where one lowers the cost, in units of chi-squared, by less than this."""
+_POINT, _TURN, _DELAY_AT, _FOCAL_AT, _NODE_TURN, _RESIDUAL, _BASIS = 0, 3, 6, 7, 8, 11, 12
+"""Columns of what residuals are differentiated by, and of the residual."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,126 +62,56 @@ class Scales:
     constant: tuple[float | Floats, ...]
 
 
+class Groups:
+    """Rows that share a code, to add up over each: `row` are those of the codes (M) in ascending order of the codes."""
+
+    def __init__(self, *codes: Ints) -> None:
+        order = np.lexsort(codes[::-1])
+        in_order = [code[order] for code in codes]
+        starts = np.ones(len(order), np.bool_)
+        starts[1:] = np.any([np.diff(code) != 0 for code in in_order], axis=0)
+        begins = np.flatnonzero(starts)
+        self.row = order[begins]
+        pointers = np.append(begins, len(order))
+        self.members = sparse.csr_array((np.ones(len(order)), order, pointers), shape=(len(begins), len(order)))
+
+    def sum(self, values: Floats) -> Floats:
+        """Return the sums (M, ...) of values (N, ...)."""
+        flat = values.reshape(len(values), -1)
+        return np.asarray(self.members @ flat).reshape(-1, *values.shape[1:])
+
+
+def _selection() -> tuple[Floats, Floats]:
+    """Return what takes the derivatives (12) to those by drift (6), and to those by constants (12)."""
+    drift, constant = np.zeros((_BASIS, 6)), np.zeros((_BASIS, 12))
+    for axis in range(3):
+        drift[_POINT + axis, axis] = constant[_POINT + axis, axis] = -1.0
+        drift[_NODE_TURN + axis, 3 + axis] = 1.0
+        constant[_TURN + axis, 3 + axis] = constant[_TURN + axis, 8 + axis] = 1.0
+    constant[_DELAY_AT, 6] = constant[_DELAY_AT, 11] = constant[_FOCAL_AT, 7] = 1.0
+    return drift, constant
+
+
+_TO_DRIFT, _TO_CONSTANTS = _selection()
+
+
 @dataclass(frozen=True, eq=False)
-class State:
-    """All unknowns: objects (K, 3), drift (n, 6: position in the world, rotation in axes of the node), constants.
+class _Drives:
+    """Drives that see about as many objects, whose nodes are eliminated together.
 
-    `own` (images, 6: position in the world, rotation in camera axes) is what each image is probably off by itself. It
-    is no unknown of the normal equations, which have its variance, but where they are linearised: derivatives at poses
-    that are wrong in the same way as the residuals would move objects away from the cameras, however many look.
+    `nodes` (n) are theirs, one drive after the other. Entry `at` of the products with the nodes, stored column after
+    column, is the sum of those products of observations and constants that are `of_things` or `of_constants` (rows of
+    the sums, which of the 18 and 72 products). `parts` are the places of each drive's nodes and its columns in the
+    normal equations.
     """
 
-    point_in_world_m: Floats
-    drift: Floats
-    own: Floats
-    constants: tuple[Floats, ...]
-    covariance: Floats | None = None
-    """Of the constants that are free (C, C), in the order of `Adjustment.free`, all else marginalised."""
-
-    @staticmethod
-    def zero(points: Floats, nodes: int, images: int, counts: tuple[int, ...]) -> State:
-        """Return poses as they are."""
-        return State(
-            points,
-            np.zeros((nodes, 6)),
-            np.zeros((images, 6)),
-            tuple(np.zeros((n, w)) for n, w in zip(counts, WIDTH, strict=True)),
-        )
-
-
-def rotations(vector_rad: Floats) -> Floats:
-    """Return rotation matrices (N, 3, 3) of rotation vectors (N, 3), Rodrigues' formula."""
-    angle = np.linalg.norm(vector_rad, axis=1)
-    safe = np.where(angle > 1e-12, angle, 1.0)
-    cross = skew(vector_rad / safe[:, None])
-    sin, cos = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    return np.asarray(np.eye(3) + sin * cross + (1.0 - cos) * (cross @ cross))
-
-
-def skew(vector: Floats) -> Floats:
-    """Return the matrices (N, 3, 3) whose product with a vector is the cross product."""
-    x, y, z = vector.T
-    o = np.zeros_like(x)
-    return np.array([[o, -z, y], [z, o, -x], [-y, x, o]]).transpose(2, 0, 1)
-
-
-def corrected(seen: Observations, state: State) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return rotations (N, 3, 3), centres (N, 3), and the velocity (N, 3) and turn rate (N, 3) that a delay acts by."""
-    offset, mount, delay, _, camera_mount, camera_delay = state.constants
-    late_s = delay[seen.vehicle, 0] + camera_delay[seen.camera, 0]
-    ahead = (late_s >= 0.0)[:, None]
-    velocity = np.where(ahead, seen.forward_mps, seen.backward_mps)
-    rate = np.where(ahead, seen.forward_radps, seen.backward_radps)
-    drift, own = state.drift[seen.node], state.own[seen.image]
-    center = seen.center_in_world_m + velocity * late_s[:, None] + offset[seen.leg] + drift[:, :3] + own[:, :3]
-    turn = mount[seen.vehicle] + camera_mount[seen.camera] + own[:, 3:]
-    turn = turn + np.einsum("nij,nj->ni", seen.cam_from_node, drift[:, 3:])
-    rotation = rotations(turn) @ rotations(rate * late_s[:, None]) @ seen.cam_from_world
-    return rotation, center, velocity, rate
-
-
-def residuals(seen: Observations, state: State) -> tuple[Floats, Floats]:
-    """Return the residuals (N, 2) in px and the depths (N) in m."""
-    rotation, center, _, _ = corrected(seen, state)
-    p = np.einsum("nij,nj->ni", rotation, state.point_in_world_m[seen.thing] - center)
-    abc = np.einsum("nij,nj->ni", seen.residual_from_cam, p)
-    stretch = state.constants[FOCAL][seen.camera]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return (1.0 + stretch) * abc[:, :2] / abc[:, 2:] + stretch * seen.from_middle_px, abc[:, 2]
-
-
-def weights(seen: Observations, residual_px: Floats, depth_m: Floats, tolerance: float) -> Floats:
-    """Return Cauchy's weights (N) over variance; what is behind its camera weighs nothing."""
-    square = np.sum(residual_px**2, axis=1) / seen.sigma_px**2
-    with np.errstate(invalid="ignore"):
-        weight = 1.0 / (1.0 + square / (tolerance * _CAUCHY) ** 2) / seen.sigma_px**2
-    return np.where((depth_m > 0.1) & np.isfinite(square), weight, 0.0)
-
-
-def cost(seen: Observations, state: State) -> Floats:
-    """Return Cauchy's cost (N) of each observation: minus twice its log likelihood, up to a constant."""
-    residual_px, depth_m = marginal_residuals(seen, state)
-    square = np.sum(residual_px**2, axis=1) / seen.sigma_px**2
-    width = _CAUCHY**2
-    with np.errstate(invalid="ignore"):
-        value = width * np.log1p(square / width)
-    return np.asarray(np.where((depth_m > 0.1) & np.isfinite(square), value, width * np.log1p(100.0)))
-
-
-def marginal_residuals(seen: Observations, state: State) -> tuple[Floats, Floats]:
-    """Return the residuals (N, 2) in px without the images' own errors, to first order, and the depths (N)."""
-    return _jacobians(seen, state)[:2]
-
-
-def _jacobians(seen: Observations, state: State) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """Return residuals (N, 2), depths, and derivatives by object (N, 2, 3), drift (N, 2, 6), constants, own errors.
-
-    The residuals are those without the images' own errors, to first order around them.
-    """
-    rotation, center, velocity, rate = corrected(seen, state)
-    p = np.einsum("nij,nj->ni", rotation, state.point_in_world_m[seen.thing] - center)
-    abc = np.einsum("nij,nj->ni", seen.residual_from_cam, p)
-    stretch = state.constants[FOCAL][seen.camera]
-    depth = np.where(np.abs(abc[:, 2]) > 1e-6, abc[:, 2], 1e-6)
-    ratio = abc[:, :2] / depth[:, None]
-    at_own = (1.0 + stretch) * ratio + stretch * seen.from_middle_px
-    m = seen.residual_from_cam
-    by_p = (1.0 + stretch)[:, :, None] * (m[:, :2] - ratio[:, :, None] * m[:, 2:]) / depth[:, None, None]
-    by_point = by_p @ rotation
-    by_turn = -by_p @ skew(p)
-    by_drift = np.concatenate([-by_point, by_turn @ seen.cam_from_node], axis=2)
-    by_delay = -np.einsum("nij,nj->ni", by_point, velocity) + np.einsum("nij,nj->ni", by_turn, rate)
-    by_focal = ratio + seen.from_middle_px
-    by_own = np.concatenate([-by_point, by_turn], axis=2)
-    residual = at_own - np.einsum("nki,ni->nk", by_own, state.own[seen.image])
-    parts = [-by_point, by_turn, by_delay[:, :, None], by_focal[:, :, None], by_turn, by_delay[:, :, None]]
-    return residual, abc[:, 2], by_point, by_drift, np.concatenate(parts, axis=2), by_own
-
-
-def by_object(seen: Observations, state: State) -> tuple[Floats, Floats, Floats]:
-    """Return residuals (N, 2), depths (N) and the derivatives (N, 2, 3) of the residuals by their objects."""
-    residual, depth, by_point, _, _, _ = _jacobians(seen, state)
-    return residual, depth, by_point
+    nodes: Ints
+    width: int
+    at_things: Ints
+    rows_of_things: Ints
+    at_constants: Ints
+    rows_of_constants: Ints
+    parts: list[tuple[slice, Ints]]
 
 
 class Adjustment:
@@ -244,41 +130,109 @@ class Adjustment:
             column += int(flags.sum())
             self.column_of.append(index)
         self.columns = column
-        of = (seen.leg, seen.vehicle, seen.vehicle, seen.camera, seen.camera, seen.camera)
-        self.constant_columns = np.concatenate([c[rows] for c, rows in zip(self.column_of, of, strict=True)], axis=1)
-        bounds = np.flatnonzero(np.diff(seen.drive)) + 1
-        self.parts = [rows for rows in np.split(np.arange(len(seen)), bounds) if len(rows)]
+        views = seen.views
+        of = (views.leg, views.vehicle, views.vehicle, views.camera, views.camera, views.camera)
+        of_view = np.concatenate([c[rows] for c, rows in zip(self.column_of, of, strict=True)], axis=1)
+        unknowns, part_of_view = np.unique(
+            np.stack([views.leg, views.vehicle, views.camera]), axis=1, return_inverse=True
+        )
+        part = part_of_view.ravel()[seen.image]
+        self.constants_of_part = np.zeros((unknowns.shape[1], 12), np.int64)
+        self.constants_of_part[part_of_view.ravel()] = of_view
+        # The finest sums, and those that are made of them.
+        node = seen.node
+        self.finest = Groups(node, seen.thing, part)
+        self.node, self.thing, self.part = (code[self.finest.row] for code in (node, seen.thing, part))
+        self.by_node = Groups(self.node)
+        self.by_node_and_part = Groups(self.node, self.part)
+        self.by_thing = Groups(self.thing)
+        self.by_thing_and_part = Groups(self.thing, self.part)
+        self.by_part = Groups(self.part)
+        self.by_image = Groups(seen.image)
+        self.image = seen.image[self.by_image.row]
+        self.drives = list(self._together())
 
-    def step(self, state: State, tolerance: float, *, with_variance: bool = False) -> State:
-        """Return the state after one step of Gauss-Newton with weights of this tolerance."""
-        residual, depth, by_point, by_drift, by_constant, _ = _jacobians(self.seen, state)
-        weight = weights(self.seen, residual, depth, tolerance)
+    def _together(self) -> Iterator[_Drives]:
+        """Yield the drives by how many columns they have: powers of two, so that few of them are empty."""
+        drive = self.chain.drive[self.node]
+        both, of_part = self.by_node_and_part.row, self.constants_of_part[self.part[self.by_node_and_part.row]]
+        # Columns of each drive, in order: those of objects first.
+        keys = [drive[:, None] * self.columns + 3 * self.thing[:, None] + np.arange(3)]
+        keys.append(np.where(of_part >= 0, drive[both][:, None] * self.columns + of_part, -1))
+        kinds, place = np.unique(np.concatenate([key.ravel() for key in keys]), return_inverse=True)
+        column_of_kind, drive_of_kind = kinds % self.columns, kinds // self.columns
+        starts = np.searchsorted(kinds, np.arange(int(self.chain.drive[-1]) + 2) * self.columns)
+        local = place.ravel() - starts[np.maximum(drive_of_kind, 0)][place.ravel()]
+        of_things, of_constants = np.split(local, [keys[0].size])
+        of_things, of_constants = of_things.reshape(-1, 3), of_constants.reshape(-1, 12)
+        is_fixed = of_part < 0
+        widths = np.diff(starts)
+        size = np.ceil(np.log2(np.maximum(widths, 1))).astype(np.int64)
+        for power in np.unique(size[widths > 0]).tolist():
+            members = np.flatnonzero((size == power) & (widths > 0))
+            width = int(widths[members].max())
+            nodes = np.flatnonzero(np.isin(self.chain.drive, members))
+            row_of_node = np.full(len(self.chain.drive), -1)
+            row_of_node[nodes] = np.arange(len(nodes))
+            height = 6 * len(nodes)
+            rows = np.flatnonzero(np.isin(drive, members))
+            six = np.arange(6)[None, :, None]
+            at_things = of_things[rows][:, None, :] * height + 6 * row_of_node[self.node[rows]][:, None, None] + six
+            pairs = np.flatnonzero(np.isin(drive[both], members))
+            column = np.where(is_fixed[pairs], width, of_constants[pairs])
+            at_constants = column[:, None, :] * height + 6 * row_of_node[self.node[both[pairs]]][:, None, None] + six
+            bounds = np.searchsorted(self.chain.drive[nodes], [members, members + 1])
+            yield _Drives(
+                nodes=nodes,
+                width=width,
+                at_things=at_things.ravel(),
+                rows_of_things=rows,
+                at_constants=at_constants.ravel(),
+                rows_of_constants=pairs,
+                parts=[
+                    (slice(6 * int(first), 6 * int(last)), column_of_kind[starts[member] : starts[member + 1]])
+                    for member, first, last in zip(members.tolist(), *bounds, strict=True)
+                ],
+            )
+
+    def step(self, state: State, tolerance: float, *, with_variance: bool = False) -> tuple[State, float]:
+        """Return the state after one step of Gauss-Newton with weights of this tolerance, and what it gains.
+
+        The gain is that of chi-squared if the residuals were linear and the weights stayed.
+        """
+        products = self._products(linearised(self.seen, state), tolerance)
+        things = self.by_thing.sum(products)
+        parts = self.by_part.sum(products)
         system = _System(self.columns, self.things)
-        of_things = np.arange(3 * self.things)
-        system.add_diagonal(of_things, np.full(len(of_things), _DAMPING), np.zeros(len(of_things)))
+        thing = self.thing[self.by_thing.row]
+        of_thing = 3 * thing[:, None] + np.arange(3)
+        of_part = self.constants_of_part[self.part[self.by_part.row]]
+        system.add(of_thing, of_thing, things[:, :3, :3], -things[:, :3, _RESIDUAL])
+        of_constants = _TO_CONSTANTS.T @ parts
+        system.add(of_part, of_part, of_constants @ _TO_CONSTANTS, -of_constants[:, :, _RESIDUAL])
+        pairs = self.by_thing_and_part
+        beside = _TO_CONSTANTS.T @ pairs.sum(products[:, :, :3])
+        system.add_beside(self.constants_of_part[self.part[pairs.row]], 3 * self.thing[pairs.row], beside)
+        system.add_diagonal(np.arange(3 * self.things), np.full(3 * self.things, _DAMPING))
         for kind, index in enumerate(self.column_of):
             free = self.active[kind]
             sigma = np.broadcast_to(np.asarray(self.scales.constant[kind], np.float64), free.shape)[free]
             system.add_diagonal(index[free], sigma**-2, -(sigma**-2) * state.constants[kind][free])
-        pending = []
-        for rows in self.parts:
-            columns_of_thing = 3 * self.seen.thing[rows, None] + np.arange(3)
-            columns = np.concatenate([columns_of_thing, self.constant_columns[rows]], axis=1)
-            used = np.unique(columns[columns >= 0])
-            local = np.where(columns >= 0, np.searchsorted(used, columns), len(used))
-            jacobian = np.concatenate([by_point[rows], by_constant[rows]], axis=2)
-            hessian, gradient = _dense_normals(jacobian, residual[rows], weight[rows], local, len(used))
-            nodes, solved, of_gradient, cross = self._eliminate(
-                rows, state, jacobian, by_drift[rows], residual[rows], weight[rows], local, len(used)
-            )
-            hessian = hessian - cross.T @ solved
-            gradient = gradient - cross.T @ of_gradient
-            pending.append((nodes, used, solved, of_gradient))
-            system.add_block(used, hessian, gradient)
-        step, covariance = system.solve(3 * self.things if with_variance else self.columns)
+        nodes = np.zeros((len(self.chain.drive), _BASIS, _BASIS))
+        nodes[self.node[self.by_node.row]] = self.by_node.sum(products)
+        beside = _TO_DRIFT.T @ self.by_node_and_part.sum(products) @ _TO_CONSTANTS
+        sums = (_TO_DRIFT.T @ products[:, :, :3], beside, _TO_DRIFT.T @ nodes)
+        eliminated = [self._eliminate(drives, sums, state.drift, system) for drives in self.drives]
+        step, covariance = system.solve(3 * self.things if with_variance else None)
+        gain = float(system.right @ step)
         drift = state.drift.copy()
-        for nodes, used, solved, of_gradient in pending:
-            drift[nodes] += (of_gradient - solved @ step[used]).reshape(-1, 6)
+        for drives, (factor, solved) in zip(self.drives, eliminated, strict=True):
+            left = solved[:, -1].copy()
+            gain += float(left @ left)
+            for place, columns in drives.parts:
+                left[place] -= solved[place, : len(columns)] @ step[columns]
+            moved, _ = dtbtrs(factor, left[:, None], uplo=b"L", trans=b"T")
+            drift[drives.nodes] += moved.reshape(-1, 6)
         points = state.point_in_world_m + np.clip(step[: 3 * self.things].reshape(-1, 3), -_LONGEST_M, _LONGEST_M)
         constants = []
         for kind, index in enumerate(self.column_of):
@@ -286,150 +240,183 @@ class Adjustment:
             values = np.where(free, state.constants[kind], 0.0)
             values[free] += step[index[free]]
             constants.append(values)
-        moved = State(points, drift, state.own, tuple(constants), covariance if with_variance else None)
-        return replace(moved, own=self._own_errors(moved, tolerance))
+        after = State(points, drift, state.own, tuple(constants), covariance)
+        return replace(after, own=self._own_errors(after, tolerance)), gain
 
-    def _own_errors(self, state: State, tolerance: float) -> Floats:
-        """Return what each image (N, 6) is probably off by itself, given all else."""
-        residual, depth, _, _, _, by_own = _jacobians(self.seen, state)
-        share = weights(self.seen, residual, depth, tolerance) * self.seen.sigma_px**2 / self.seen.detection_sigma_px**2
-        weighted = by_own * share[:, None, None]
-        count = len(state.own)
-        information, right = np.zeros((count, 6, 6)), np.zeros((count, 6))
-        np.add.at(information, self.seen.image, np.einsum("nki,nkj->nij", weighted, by_own))
-        np.add.at(right, self.seen.image, -np.einsum("nki,nk->ni", weighted, residual))
-        information += np.diag(np.repeat([self.scales.own_m**-2, self.scales.own_rad**-2], 3))
-        return np.asarray(np.linalg.solve(information, right[:, :, None])[:, :, 0])
+    def _products(self, at: Linearised, tolerance: float) -> Floats:
+        """Return the sums (P, 12, 12) of the weighted products of derivatives and residuals, in the finest groups."""
+        weight = weights(self.seen, at.residual_px, at.depth_m, tolerance)
+        basis = np.empty((len(self.seen), 2, _BASIS))
+        basis[:, :, _POINT:_TURN], basis[:, :, _TURN:_DELAY_AT] = at.by_point, at.by_turn
+        basis[:, :, _DELAY_AT], basis[:, :, _FOCAL_AT] = at.by_delay, at.by_focal
+        basis[:, :, _NODE_TURN:_RESIDUAL] = at.by_turn @ self.seen.views.cam_from_node[self.seen.image]
+        basis[:, :, _RESIDUAL] = at.residual_px
+        basis[weight == 0.0] = 0.0  # What is behind its camera may be infinite.
+        basis *= np.sqrt(weight)[:, None, None]
+        return self.finest.sum(basis.transpose(0, 2, 1) @ basis)
 
     def _eliminate(
-        self,
-        rows: Ints,
-        state: State,
-        jacobian: Floats,
-        by_drift: Floats,
-        residual: Floats,
-        weight: Floats,
-        local: Ints,
-        width: int,
-    ) -> tuple[slice, Floats, Floats, Floats]:
-        drive = self.seen.drive[rows[0]]
-        first, last = np.searchsorted(self.chain.drive, [drive, drive + 1])
-        nodes = slice(int(first), int(last))
-        count = int(last - first)
-        node = self.seen.node[rows] - first
+        self, drives: _Drives, sums: tuple[Floats, Floats, Floats], drift: Floats, system: _System
+    ) -> tuple[Floats, Floats]:
+        """Take the nodes of drives out of the system; return their factor L (12, 6n) and Y (6n, width + 1).
+
+        `sums` are the products of the derivatives by drift with those by objects (P, 6, 3), by constants (Q, 6, 12),
+        and with all of each node (n, 6, 12). The last column of Y is that of the right side.
+        """
+        of_things, of_constants, of_nodes = sums
+        count = len(drives.nodes)
+        blocks, gradient, band = self._chain_of(drives, drift)
+        blocks += of_nodes[drives.nodes] @ _TO_DRIFT
+        gradient -= of_nodes[drives.nodes, :, _RESIDUAL]
+        for i in range(6):
+            for j in range(i + 1):
+                band[i - j, j::6] = blocks[:, i, j]
+        cross = np.zeros((drives.width + 1) * 6 * count)
+        np.add.at(cross, drives.at_things, of_things[drives.rows_of_things].ravel())
+        np.add.at(cross, drives.at_constants, of_constants[drives.rows_of_constants].ravel())
+        right = cross.reshape(drives.width + 1, 6 * count).T
+        right[:, -1] = gradient.ravel()
+        factor, failed = dpbtrf(band, lower=1, overwrite_ab=1)
+        if failed:
+            raise np.linalg.LinAlgError("the information of drift is not positive definite")
+        solved, _ = dtbtrs(factor, right, uplo=b"L", overwrite_b=1)
+        for rows, columns in drives.parts:
+            own = solved[rows, : len(columns)]
+            system.take_block(columns, own.T @ own, own.T @ solved[rows, -1])
+        return factor, solved
+
+    def _chain_of(self, drives: _Drives, drift: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return what the process says of nodes: blocks (n, 6, 6), right side (n, 6), a band with those beside them."""
         precision = np.repeat([self.scales.drift_m**-2, self.scales.drift_rad**-2], 3)
-        keep = self.chain.keep[nodes]
+        keep = self.chain.keep[drives.nodes]
         fresh = 1.0 / (1.0 - keep**2 + 1e-9)
         # Precision of the process: each node from the one before it.
         diagonal = fresh.copy()
         diagonal[:-1] += (keep**2 * fresh)[1:]
         beside = -(keep * fresh)[1:]
-        band = np.zeros((12, 6 * count))
-        blocks = np.zeros((count, 6, 6))
-        weighted = by_drift * weight[:, None, None]
-        np.add.at(blocks, node, np.einsum("nki,nkj->nij", weighted, by_drift))
-        for i in range(6):
-            blocks[:, i, i] += diagonal * precision[i]
-        for i in range(6):
-            for j in range(i + 1):
-                band[i - j, j::6] = blocks[:, i, j]
-        if count > 1:
-            band[6, : 6 * (count - 1)] = (beside[:, None] * precision).ravel()
-        drift = state.drift[nodes]
-        pull = diagonal[:, None] * drift
-        pull[1:] += beside[:, None] * drift[:-1]
-        pull[:-1] += beside[:, None] * drift[1:]
-        gradient = -pull * precision
-        np.add.at(gradient, node, -np.einsum("nki,nk->ni", weighted, residual))
-        cross = np.zeros((count, 6, width + 1))
-        product = np.einsum("nki,nkj->nij", weighted, jacobian)
-        np.add.at(cross, (node[:, None, None], np.arange(6)[None, :, None], local[:, None, :]), product)
-        cross_flat = cross.reshape(6 * count, width + 1)[:, :width]
-        right = np.concatenate([cross_flat, gradient.reshape(-1, 1)], axis=1)
-        solved = solveh_banded(band, right, lower=True, overwrite_ab=True, overwrite_b=True, check_finite=False)
-        return nodes, solved[:, :width], solved[:, width], cross_flat
+        of_nodes = drift[drives.nodes]
+        pull = diagonal[:, None] * of_nodes
+        pull[1:] += beside[:, None] * of_nodes[:-1]
+        pull[:-1] += beside[:, None] * of_nodes[1:]
+        count = len(keep)
+        band = np.zeros((12, 6 * count), order="F")
+        band[6, : 6 * (count - 1)] = (beside[:, None] * precision).ravel()
+        return diagonal[:, None, None] * np.diag(precision), -pull * precision, band
 
-
-def _dense_normals(
-    jacobian: Floats, residual: Floats, weight: Floats, local: Ints, width: int
-) -> tuple[Floats, Floats]:
-    """Return the normal equations (width, width) and right side of observations with local columns."""
-    if len(local) * width < _SMALL:
-        dense = np.zeros((len(local), 2, width + 1))
-        each = np.arange(len(local))[:, None, None], np.arange(2)[None, :, None]
-        dense[(*each, local[:, None, :])] = jacobian
-        dense *= np.sqrt(weight)[:, None, None]
-        flat = dense.reshape(-1, width + 1)[:, :width]
-        return flat.T @ flat, -(flat.T @ (residual * np.sqrt(weight)[:, None]).ravel())
-    rows = np.repeat(np.arange(2 * len(local)), local.shape[1])
-    columns = np.repeat(local, 2, axis=0).ravel()
-    root = np.sqrt(weight)[:, None]
-    matrix = sparse.csr_matrix(
-        ((jacobian * root[:, :, None]).ravel(), (rows, columns)), shape=(2 * len(local), width + 1)
-    )[:, :width]
-    return (matrix.T @ matrix).toarray(), -np.asarray(matrix.T @ (residual * root).ravel())
+    def _own_errors(self, state: State, tolerance: float) -> Floats:
+        """Return what each image (I, 6) is probably off by itself, given all else."""
+        at = linearised(self.seen, state)
+        share = weights(self.seen, at.residual_px, at.depth_m, tolerance)
+        share = share * self.seen.sigma_px**2 / self.seen.detection_sigma_px**2
+        basis = np.concatenate([-at.by_point, at.by_turn, at.residual_px[:, :, None]], axis=2)
+        basis[share == 0.0] = 0.0
+        basis *= np.sqrt(share)[:, None, None]
+        products = self.by_image.sum(basis.transpose(0, 2, 1) @ basis)
+        information = products[:, :6, :6] + np.diag(np.repeat([self.scales.own_m**-2, self.scales.own_rad**-2], 3))
+        own = np.zeros_like(state.own)
+        own[self.image] = -np.linalg.solve(information, products[:, :6, 6:])[:, :, 0]
+        return own
 
 
 class _System:
-    """Normal equations of objects and constants, gathered from blocks; dense while small."""
+    """Normal equations of objects and constants, gathered from blocks; dense while small.
+
+    Of the dense matrix only the lower half is right: constants come after objects.
+    """
 
     def __init__(self, columns: int, things: int) -> None:
         self.columns, self.things = columns, things
-        self.is_dense = columns <= _DENSE_LIMIT
-        self.matrix = np.zeros((columns, columns)) if self.is_dense else None
+        # What is not free is added to one more row and column.
+        self.matrix = np.zeros((columns + 1, columns + 1)) if columns <= _DENSE_LIMIT else None
         self.entries: list[tuple[Floats, Ints, Ints]] = []
-        self.right = np.zeros(columns)
+        self._right = np.zeros(columns + 1)
 
-    def add_diagonal(self, columns: Ints, values: Floats, right: Floats) -> None:
+    @property
+    def right(self) -> Floats:
+        """The right side."""
+        return self._right[: self.columns]
+
+    def add(self, rows: Ints, columns: Ints, blocks: Floats, right: Floats) -> None:
+        """Add blocks (B, n, m) at rows (B, n) and columns (B, m), and what belongs to their rows on the right."""
+        self._add(rows[:, :, None], columns[:, None, :], blocks)
+        np.add.at(self._right, rows.ravel(), right.ravel())
+
+    def add_beside(self, rows: Ints, first_column: Ints, blocks: Floats) -> None:
+        """Add blocks (B, n, 3) at rows (B, n) of constants and the columns of objects, and their mirror images."""
+        columns = first_column[:, None] + np.arange(3)
+        self._add(rows[:, :, None], columns[:, None, :], blocks)
+        if self.matrix is None:
+            self._add(columns[:, :, None], rows[:, None, :], blocks.transpose(0, 2, 1))
+
+    def add_diagonal(self, columns: Ints, values: Floats, right: Floats | None = None) -> None:
+        """Add to the diagonal, and on the right."""
+        self._add(columns, columns, values)
+        if right is not None:
+            self._right[columns] += right
+
+    def take_block(self, columns: Ints, block: Floats, right: Floats) -> None:
+        """Take a block (n, n) away, and a right side (n)."""
         if self.matrix is not None:
-            self.matrix[columns, columns] += values
+            self.matrix[np.ix_(columns, columns)] -= block
         else:
-            self.entries.append((values, columns, columns))
-        self.right[columns] += right
+            self._add(columns[:, None], columns[None, :], -block)
+        self._right[columns] -= right
 
-    def add_block(self, columns: Ints, block: Floats, right: Floats) -> None:
+    def _add(self, rows: Ints, columns: Ints, values: Floats) -> None:
         if self.matrix is not None:
-            self.matrix[np.ix_(columns, columns)] += block
-        else:
-            i, j = np.nonzero(block)
-            self.entries.append((block[i, j], columns[i], columns[j]))
-        self.right[columns] += right
+            size = self.columns + 1
+            at = np.broadcast_to((rows % size) * size + columns % size, values.shape)
+            np.add.at(self.matrix.reshape(-1), at.ravel(), np.ascontiguousarray(values).ravel())
+            return
+        used = np.broadcast_to((rows >= 0) & (columns >= 0), values.shape)
+        rows, columns = np.broadcast_to(rows, values.shape)[used], np.broadcast_to(columns, values.shape)[used]
+        self.entries.append((values[used], rows, columns))
 
-    def solve(self, first: int) -> tuple[Floats, Floats]:
-        """Return the solution and the covariance of the columns from `first` on."""
+    def solve(self, first: int | None) -> tuple[Floats, Floats | None]:
+        """Return the solution, and the covariance of the columns from `first` on."""
         if self.matrix is not None:
-            factor = cho_factor(self.matrix, lower=True, overwrite_a=True, check_finite=False)
-            unit = np.eye(self.columns)[:, first:]
-            return cho_solve(factor, self.right), cho_solve(factor, unit)[first:]
+            factor = cho_factor(self.matrix[:-1, :-1], lower=True, overwrite_a=True, check_finite=False)
+            solution = cho_solve(factor, self.right, check_finite=False)
+            if first is None:
+                return solution, None
+            # The factor of what is left once the objects are eliminated is its lower right corner.
+            corner = factor[0][first:, first:]
+            return solution, cho_solve((corner, True), np.eye(len(corner)), check_finite=False)
         values, rows, columns = (np.concatenate(part) for part in zip(*self.entries, strict=True))
-        shape = (self.columns, self.columns)
-        sparse_factor = splu(sparse.csc_matrix((values, (rows, columns)), shape=shape))
+        sparse_factor = splu(sparse.csc_matrix((values, (rows, columns)), shape=(self.columns, self.columns)))
+        solution = np.asarray(sparse_factor.solve(self.right))
+        if first is None:
+            return solution, None
         covariance = np.empty((self.columns - first, self.columns - first))
         for column in range(first, self.columns):
             unit = np.zeros(self.columns)
             unit[column] = 1.0
             covariance[:, column - first] = sparse_factor.solve(unit)[first:]
-        return np.asarray(sparse_factor.solve(self.right)), covariance
+        return solution, covariance
 
 
 def adjust(problem: Adjustment, state: State, *, tolerances: tuple[float, ...], with_variance: bool = False) -> State:
-    """Take one step for each of the tolerances, from wide to narrow."""
-    for number, tolerance in enumerate(tolerances):
-        state = problem.step(state, tolerance, with_variance=with_variance and number == len(tolerances) - 1)
+    """Take a step for each of the tolerances, from wide to narrow, and no more with the last one than it takes."""
+    for tolerance in tolerances:
+        state, gain = problem.step(state, tolerance, with_variance=with_variance)
+        if tolerance == tolerances[-1] and gain < _SETTLED:
+            break
     return state
 
 
-def triangulate(seen: Observations, state: State, things: int, *, rounds: int = 8, tolerance: float = 1.0) -> State:
+def triangulate(seen: Observations, state: State, *, rounds: int = 8, tolerance: float = 1.0) -> State:
     """Return the state with the objects placed anew and all else as it is."""
+    groups = Groups(seen.thing)
+    thing = seen.thing[groups.row]
     for _ in range(rounds):
-        residual, depth, by_point, _, _, _ = _jacobians(seen, state)
-        weight = weights(seen, residual, depth, tolerance)
-        hessian = np.zeros((things, 3, 3))
-        right = np.zeros((things, 3))
-        weighted = by_point * weight[:, None, None]
-        np.add.at(hessian, seen.thing, np.einsum("nki,nkj->nij", weighted, by_point))
-        np.add.at(right, seen.thing, -np.einsum("nki,nk->ni", weighted, residual))
-        hessian += 1e-6 * np.eye(3)
-        step = np.linalg.solve(hessian, right[:, :, None])[:, :, 0]
-        state = replace(state, point_in_world_m=state.point_in_world_m + np.clip(step, -5.0, 5.0))
+        at = linearised(seen, state)
+        weight = weights(seen, at.residual_px, at.depth_m, tolerance)
+        basis = np.concatenate([at.by_point, at.residual_px[:, :, None]], axis=2)
+        basis[weight == 0.0] = 0.0
+        basis *= np.sqrt(weight)[:, None, None]
+        products = groups.sum(basis.transpose(0, 2, 1) @ basis)
+        step = -np.linalg.solve(products[:, :3, :3] + 1e-6 * np.eye(3), products[:, :3, 3:])[:, :, 0]
+        points = state.point_in_world_m.copy()
+        points[thing] += np.clip(step, -5.0, 5.0)
+        state = replace(state, point_in_world_m=points)
     return state

@@ -9,25 +9,12 @@ import numpy as np
 
 import valuemap._core as _core
 from valuemap.config import MapConfig
-from valuemap.refine.adjust import (
-    CAMERA_DELAY,
-    MOUNT,
-    OFFSET,
-    WIDTH,
-    Adjustment,
-    Observations,
-    Scales,
-    State,
-    adjust,
-    by_object,
-    marginal_residuals,
-    triangulate,
-    weights,
-)
+from valuemap.refine.adjust import Adjustment, Groups, Scales, adjust, triangulate
 from valuemap.refine.footage import DRIFT_LENGTH_M, Footage, Sigmas
 from valuemap.refine.jumps import Hints, Legs
 from valuemap.refine.landmarks import Landmarks
 from valuemap.refine.register import Registration, register, togetherness
+from valuemap.refine.residuals import CAMERA_DELAY, MOUNT, OFFSET, WIDTH, Observations, State, linearised, weights
 from valuemap.refine.tracks import associate, merge_objects
 from valuemap.tables import Bools, Floats, Ints
 
@@ -306,9 +293,9 @@ def own_scales(footage: Footage, noise: Noise, scales: Scales) -> Scales:
 
 def fit_noise(seen: Observations, state: State, noise: Noise) -> Noise:
     """Scale the noise so that half of the residuals are as small as they should be."""
-    residual, depth = marginal_residuals(seen, state)
-    square = np.sum(residual**2, axis=1) / seen.sigma_px**2
-    square = square[(depth > 0.0) & np.isfinite(square)]
+    at = linearised(seen, state)
+    square = np.sum(at.residual_px**2, axis=1) / seen.sigma_px**2
+    square = square[(at.depth_m > 0.0) & np.isfinite(square)]
     if len(square) < 20:
         return noise
     factor = math.sqrt(float(np.median(square)) / (2.0 * math.log(2.0)))
@@ -359,16 +346,18 @@ def _cut(
 
 def _apparent_shift(footage: Footage, seen: Observations, state: State) -> tuple[Floats, Floats, Ints]:
     """Return where each image (M) that sees objects puts its drive: offset and drift (M, 3) and its information."""
-    residual, depth, by_point = by_object(seen, state)
-    weight = weights(seen, residual, depth, 2.0)
-    image = seen.image
-    kinds, place = np.unique(image, return_inverse=True)
-    information, right = np.zeros((len(kinds), 3, 3)), np.zeros((len(kinds), 3))
-    weighted = by_point * weight[:, None, None]
-    np.add.at(information, place, np.einsum("nki,nkj->nij", weighted, by_point))
-    now = state.constants[0][seen.leg] + state.drift[seen.node, :3]
+    at = linearised(seen, state)
+    weight = weights(seen, at.residual_px, at.depth_m, 2.0)
+    groups = Groups(seen.image)
+    kinds = seen.image[groups.row]
+    now = state.constants[OFFSET][seen.leg] + state.drift[seen.node, :3]
     # The residual falls by `by_point` times the shift: r(o + e) = r - J e.
-    np.add.at(right, place, np.einsum("nki,nk->ni", weighted, residual + np.einsum("nki,ni->nk", by_point, now)))
+    whole = at.residual_px + np.einsum("nki,ni->nk", at.by_point, now)
+    basis = np.concatenate([at.by_point, whole[:, :, None]], axis=2)
+    basis[weight == 0.0] = 0.0
+    basis *= np.sqrt(weight)[:, None, None]
+    products = groups.sum(basis.transpose(0, 2, 1) @ basis)
+    information, right = products[:, :3, :3], products[:, :3, 3]
     shift = np.linalg.solve(information + 0.1 * np.eye(3), right[:, :, None])[:, :, 0]
     # What drifts along the way is no jump: so many images share one value of the process.
     per_length = max(1.0, DRIFT_LENGTH_M * len(kinds) / max(1.0, _length_m(footage)))
@@ -426,10 +415,10 @@ def _anew(
     """Merge objects that are one, give all detections their objects anew, and drop what too few see."""
     count = len(state.point_in_world_m)
     seen = footage.observe(detection, thing, leg, sigma_px)
-    state = triangulate(seen, state, count, rounds=3)
+    state = triangulate(seen, state, rounds=3)
     number = merge_objects(seen, state, seen.image, class_code)
     seen = replace(seen, thing=number[seen.thing])
-    state = triangulate(seen, state, count, rounds=4)
+    state = triangulate(seen, state, rounds=4)
     alive = np.bincount(seen.thing, minlength=count) >= _LEAST_VOTES
     state, class_code, size_m = _kept(state, alive), class_code[alive], size_m[alive]
     detection, thing = associate(footage, state, class_code, size_m, leg, sigma_px, range_m)

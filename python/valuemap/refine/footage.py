@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 from valuemap.cameras import Rays, camera_poses, cast_rays, colmap_camera, rotation_of
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives
-from valuemap.refine.adjust import Chain, Observations
+from valuemap.refine.adjust import Chain
 from valuemap.refine.landmarks import keyframes
+from valuemap.refine.residuals import Observations, Views
 from valuemap.tables import Bools, Floats, Ints
 
 NODE_M = 10.0
@@ -75,26 +76,28 @@ class Footage:
 
     def observe_as_given(self, detection: Ints, thing: Ints, leg_of_image: Ints, sigma_px: Sigmas) -> Observations:
         """Return detections (rows) as observations of things, in their order."""
-        image = self.rays.image_row[detection]
+        views = Views(
+            cam_from_world=self.cam_from_world,
+            center_in_world_m=self.center_in_world_m,
+            forward_mps=self.motion.forward_mps,
+            backward_mps=self.motion.backward_mps,
+            forward_radps=self.motion.forward_radps,
+            backward_radps=self.motion.backward_radps,
+            cam_from_node=self.cam_from_node,
+            node=self.node,
+            drive=self.drives.pass_code,
+            leg=leg_of_image,
+            vehicle=self.drives.pass_code,
+            camera=self.camera,
+        )
         return Observations(
+            views,
             residual_from_cam=self.residual_from_cam[detection],
-            cam_from_world=self.cam_from_world[image],
-            center_in_world_m=self.center_in_world_m[image],
-            forward_mps=self.motion.forward_mps[image],
-            backward_mps=self.motion.backward_mps[image],
-            forward_radps=self.motion.forward_radps[image],
-            backward_radps=self.motion.backward_radps[image],
             from_middle_px=self.from_middle_px[detection],
-            cam_from_node=self.cam_from_node[image],
             sigma_px=sigma_px.total_px[detection],
             detection_sigma_px=sigma_px.detection_px[detection],
             thing=thing,
-            node=self.node[image],
-            drive=self.drives.pass_code[image],
-            leg=leg_of_image[image],
-            vehicle=self.drives.pass_code[image],
-            camera=self.camera[image],
-            image=image,
+            image=self.rays.image_row[detection],
         )
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_limits
 
 from valuemap.cameras import camera_poses, colmap_camera, rotation_of
 from valuemap.config import MapConfig
@@ -14,11 +15,11 @@ from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives, in_driving_order
 from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
-from valuemap.refine.adjust import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
 from valuemap.refine.estimate import Estimate, delay_together, estimate, mounts_alone
 from valuemap.refine.footage import Footage, find_motion, gather, in_working_frame
 from valuemap.refine.jumps import Legs, find_hints, find_jumps
 from valuemap.refine.landmarks import find_landmarks
+from valuemap.refine.residuals import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
 from valuemap.refine.select import Selected, select
 from valuemap.tables import Bools, Floats
 
@@ -66,6 +67,12 @@ def refine_poses(dataset: Dataset, config: MapConfig, *, threads: int = 0, progr
         return Refined(dataset, {"found": "nothing", "because": "correct_poses is 0"})
     if len(dataset.detections) < _LEAST_DETECTIONS:
         return Refined(dataset, {"found": "nothing", "because": "few detections"})
+    # Small matrices: more threads are slower, and how many there are would show in the last digits.
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _refined(dataset, config, threads, progress)
+
+
+def _refined(dataset: Dataset, config: MapConfig, threads: int, progress: Progress) -> Refined:
     unit_m = config.vote.max_range_m / USUAL_RANGE_M
     ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
     if ordered.drives.count < 2:
@@ -164,10 +171,11 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
 
 
 def _is_lost(footage: Footage, result: Estimate) -> bool:
-    """Return whether more than few of the observations are of legs that are far off."""
+    """Return whether more than few of the observations are of legs that are far from where most are."""
     image = footage.rays.image_row[result.detection]
     leg = result.legs.of(footage.drives.pass_code[image], footage.drives.order[image])
-    far = np.linalg.norm(result.state.constants[OFFSET][leg], axis=1) > _LOST_M
+    offset = result.state.constants[OFFSET][leg]
+    far = np.linalg.norm(offset - np.median(offset, axis=0), axis=1) > _LOST_M
     return bool(np.mean(far) > _FEW_LOST)
 
 

@@ -16,24 +16,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from valuemap.refine.adjust import (
+from valuemap.refine.adjust import Adjustment, Chain, Scales, adjust, triangulate
+from valuemap.refine.estimate import DRIFT_FACTOR, WIDE, Estimate, everything
+from valuemap.refine.footage import Footage
+from valuemap.refine.residuals import (
     CAMERA_DELAY,
     CAMERA_MOUNT,
     DELAY,
     FOCAL,
     MOUNT,
     OFFSET,
-    Adjustment,
-    Chain,
     Observations,
-    Scales,
     State,
-    adjust,
     cost,
-    triangulate,
 )
-from valuemap.refine.estimate import DRIFT_FACTOR, WIDE, Estimate, everything
-from valuemap.refine.footage import Footage
 from valuemap.refine.ties import tie
 from valuemap.refine.tracks import unresolved_share
 from valuemap.tables import Bools, Floats, Ints
@@ -42,7 +38,7 @@ _LEAST_DRIFT, _LEAST_DRIFT_RAD = 0.02, math.radians(0.02)
 _BEYOND_DRIFT = 2.0
 """What is no more than so many deviations of drift is drift."""
 _LEAST_FOCAL = 0.003
-_REFIT = (1.5, 1.0, 1.0, 1.0)
+_REFIT, _ANEW = (1.5, 1.0, 1.0, 1.0), (1.0, 1.0, 1.0)
 _LEAST_CHANCE = 1e-3
 _LEAST_OBJECTS = 8
 _MOST_UNRESOLVED = 0.23
@@ -84,7 +80,8 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
     found = shared
     seen = footage.observe(found.detection, found.thing, footage_legs(footage, found), found.sigma_px)
     ties = tie(footage, found.legs, seen)
-    seen = replace(seen, leg=ties.leg[seen.leg], vehicle=ties.vehicle[seen.vehicle])
+    views = replace(seen.views, leg=ties.leg[seen.views.leg], vehicle=ties.vehicle[seen.views.vehicle])
+    seen = replace(seen, views=views)
     chain, things = footage.chain, len(found.class_code)
     free = _told(seen, everything(footage, found.legs))
     # What each camera has in all drives, and offsets, first; what it has in each drive where that does not do.
@@ -102,7 +99,8 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
     problem = Adjustment(seen, chain, scales, active, things)
     state = adjust(problem, state, tolerances=_REFIT, with_variance=True)
     gain, chance, held_out = _held_out(found, seen, chain, scales, active, state)
-    if not chance < _LEAST_CHANCE or gain <= 0.0:
+    parameters = sum(int(flags.sum()) for flags in active)
+    if not chance < _LEAST_CHANCE or gain <= parameters * math.log(2 * len(seen)):
         return None
     deviation = []
     assert state.covariance is not None
@@ -217,7 +215,7 @@ class _Trial:
 
     def smallest(self) -> dict[int, float]:
         """Return by kind what is no more than drift is."""
-        speed = max(float(np.median(np.linalg.norm(self.seen.forward_mps, axis=1))), 1e-9)
+        speed = max(float(np.median(np.linalg.norm(self.seen.views.forward_mps, axis=1)[self.seen.image])), 1e-9)
         of_place, of_turn = self.scales.drift_m, self.scales.drift_rad
         return {
             OFFSET: of_place,
@@ -239,26 +237,37 @@ class _Trial:
     ) -> tuple[State, tuple[Bools, ...], tuple[Bools, ...]]:
         """Drop whole groups of parameters of which none pays, the poorest first; then narrow those that do not pay.
 
-        What does not pay of a camera is dropped too. Kinds that are `fixed` are not judged.
+        What does not pay of a camera is dropped too. Kinds that are `fixed` are not judged. What the others are without
+        a group is told by the normal equations; what is left then is fitted and judged anew.
         """
+        tolerances: tuple[float, ...] = _REFIT
         while True:
-            scales = self.narrowed(narrow)
-            problem = Adjustment(self.seen, self.chain, scales, active, self.things)
-            state = adjust(problem, state, tolerances=_REFIT, with_variance=True)
-            state = _regauged(self.seen, state, active[OFFSET] & ~narrow[OFFSET])
-            worth = self._worth(problem, state, narrow)
+            problem = Adjustment(self.seen, self.chain, self.narrowed(narrow), active, self.things)
+            state = adjust(problem, state, tolerances=tolerances, with_variance=True)
+            left, thin = self._judged(_Equations.at(problem, state), active, narrow, fixed)
+            if _is_same((*left, *thin), (*active, *narrow)):
+                return self._regauged(state, active[OFFSET] & ~narrow[OFFSET]), active, narrow
+            active, narrow, tolerances = left, thin, _ANEW
+
+    def _judged(
+        self, equations: _Equations, active: tuple[Bools, ...], narrow: tuple[Bools, ...], fixed: tuple[int, ...]
+    ) -> tuple[tuple[Bools, ...], tuple[Bools, ...]]:
+        """Return what stays of parameters, and which of them are narrow, once all that is left pays."""
+        while True:
+            fit = equations.solved(active, self.narrowed(narrow))
+            worth = self._worth(fit, active, narrow)
             groups = [
                 (kind, columns)
                 for kind, flags in enumerate(active)
                 for columns in _groups(kind)
                 if kind not in fixed and flags[:, columns].any()
             ]
-            best = [float(np.max(worth[kind][:, columns][active[kind][:, columns]])) for kind, columns in groups]
             if not groups:
-                return state, active, narrow
+                return active, narrow
+            best = [float(np.max(worth[kind][:, columns][active[kind][:, columns]])) for kind, columns in groups]
             poorest = int(np.argmin(best))
-            changed = [flags.copy() for flags in active]
-            thin = [flags.copy() for flags in narrow]
+            changed = tuple(flags.copy() for flags in active)
+            thin = tuple(flags.copy() for flags in narrow)
             if best[poorest] <= 0.0:
                 kind, columns = groups[poorest]
                 changed[kind][:, columns] = False
@@ -267,37 +276,38 @@ class _Trial:
                     if kind in fixed:
                         continue
                     if kind in _OF_MANY:
-                        thin[kind] |= active[kind] & (worth[kind] <= 0.0)
+                        thin[kind][active[kind] & (worth[kind] <= 0.0)] = True
                     else:
-                        changed[kind] &= worth[kind] > 0.0
-                same = all(np.array_equal(a, b) for a, b in zip([*changed, *thin], [*active, *narrow], strict=True))
-                if same:
-                    return state, active, narrow
-            active, narrow = tuple(changed), tuple(thin)
+                        changed[kind][worth[kind] <= 0.0] = False
+                if _is_same((*changed, *thin), (*active, *narrow)):
+                    return active, narrow
+            active, narrow = changed, thin
 
-    def _worth(self, problem: Adjustment, state: State, narrow: tuple[Bools, ...]) -> list[Floats]:
+    def _worth(self, fit: _Fit, active: tuple[Bools, ...], narrow: tuple[Bools, ...]) -> list[Floats]:
         """Return for each parameter by how much its evidence exceeds its price; below 0 where it is too small."""
-        assert state.covariance is not None
-        first = 3 * problem.things
-        price = math.log(max(len(problem.seen), 2))
+        price = math.log(max(len(self.seen), 2))
         smallest = self.smallest()
+        agreed = self._agreed_shift(fit.constants[OFFSET], active[OFFSET] & ~narrow[OFFSET])
         worth = []
-        for kind, index in enumerate(problem.column_of):
+        for kind, index in enumerate(fit.column_of):
             value = np.full(index.shape, -np.inf)
+            constants = fit.constants[kind]
+            if kind == OFFSET:
+                constants = np.where(active[kind].any(axis=0), constants - agreed, constants)
             for columns in _groups(kind):
-                free = problem.active[kind][:, columns].all(axis=1)
+                free = active[kind][:, columns].all(axis=1)
                 value[np.flatnonzero(free)[:, None], columns] = -1.0
                 rows = np.flatnonzero(free & ~narrow[kind][:, columns].any(axis=1))
                 if not len(rows):
                     continue
-                at = index[rows][:, columns] - first
-                theta = state.constants[kind][rows][:, columns]
-                blocks = state.covariance[at[:, :, None], at[:, None, :]]
+                at = index[rows][:, columns]
+                theta = constants[rows][:, columns]
+                blocks = fit.covariance[at[:, :, None], at[:, None, :]]
                 shared = {MOUNT: CAMERA_MOUNT, DELAY: CAMERA_DELAY}.get(kind)
-                is_shared = kind == OFFSET or (shared is not None and problem.active[shared][:, columns].any())
+                is_shared = kind == OFFSET or (shared is not None and active[shared][:, columns].any())
                 if is_shared and len(rows) > 1:
                     sigma = np.broadcast_to(self.scales.constant[kind], index.shape)[rows, columns[0]]
-                    mean, blocks = _against_the_mean(theta, state.covariance, at, sigma)
+                    mean, blocks = _against_the_mean(theta, fit.covariance, at, sigma)
                     # Offsets are against what most drives agree on, where there are any that do not move.
                     theta = theta if kind == OFFSET and narrow[kind].any() else mean
                 square = np.einsum("ni,ni->n", theta, np.linalg.solve(blocks, theta[:, :, None])[:, :, 0])
@@ -309,24 +319,89 @@ class _Trial:
             worth.append(value)
         return worth
 
+    def _agreed_shift(self, offset: Floats, active: Bools) -> Floats:
+        """Return the place (3) on which most drives agree: drives that are off do not move it.
 
-def _regauged(seen: Observations, state: State, active: Bools) -> State:
-    """Return the state with everything moved so that the place on which most drives agree stays.
+        It is the median of the offsets that are free, weighted by their observations.
+        """
+        weight = np.bincount(self.seen.leg, minlength=len(active))
+        shift = np.zeros(3)
+        for axis in range(3):
+            rows = np.flatnonzero(active[:, axis])
+            if len(rows) < 3:
+                continue
+            value, of = offset[rows, axis], weight[rows]
+            order = np.argsort(value, kind="stable")
+            share = np.cumsum(of[order])
+            shift[axis] = value[order[np.searchsorted(share, 0.5 * share[-1])]]
+        return shift
 
-    It is the median of the offsets that are free, weighted by their observations: drives that are off do not move it.
+    def _regauged(self, state: State, active: Bools) -> State:
+        """Return the state with everything moved so that the place on which most drives agree stays."""
+        shift = self._agreed_shift(state.constants[OFFSET], active)
+        offset = np.where(active.any(axis=0), state.constants[OFFSET] - shift, state.constants[OFFSET])
+        points = state.point_in_world_m - shift
+        return replace(state, constants=(offset, *state.constants[1:]), point_in_world_m=points)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Constants by kind, and the covariance of those that are free; `column_of` (by kind) is where they are in it."""
+
+    constants: tuple[Floats, ...]
+    covariance: Floats
+    column_of: tuple[Ints, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """The normal equations of constants with all else eliminated and without priors, where they are linearised.
+
+    `column_of` (by kind) says which of the columns of `information` (C, C) and of the right side (C) each has.
     """
-    weight = np.bincount(seen.leg, minlength=len(active))
-    shift = np.zeros(3)
-    for axis in range(3):
-        rows = np.flatnonzero(active[:, axis])
-        if len(rows) < 3:
-            continue
-        value, of = state.constants[OFFSET][rows, axis], weight[rows]
-        order = np.argsort(value, kind="stable")
-        share = np.cumsum(of[order])
-        shift[axis] = value[order[np.searchsorted(share, 0.5 * share[-1])]]
-    offset = np.where(active.any(axis=0), state.constants[OFFSET] - shift, state.constants[OFFSET])
-    return replace(state, constants=(offset, *state.constants[1:]), point_in_world_m=state.point_in_world_m - shift)
+
+    column_of: tuple[Ints, ...]
+    information: Floats
+    right: Floats
+
+    @staticmethod
+    def at(problem: Adjustment, state: State) -> _Equations:
+        """Return those of a problem, at its solution."""
+        assert state.covariance is not None
+        first = 3 * problem.things
+        index = tuple(np.where(columns >= 0, columns - first, -1) for columns in problem.column_of)
+        information = np.asarray(np.linalg.inv(state.covariance))
+        values, prior = np.empty((2, len(information)))
+        for kind, columns in enumerate(index):
+            free = columns >= 0
+            values[columns[free]] = state.constants[kind][free]
+            prior[columns[free]] = np.broadcast_to(problem.scales.constant[kind], free.shape)[free] ** -2.0
+        return _Equations(index, information - np.diag(prior), information @ values)
+
+    def solved(self, active: tuple[Bools, ...], scales: Scales) -> _Fit:
+        """Return what some of the constants are, the others zero, with priors."""
+        used = np.concatenate([columns[flags] for columns, flags in zip(self.column_of, active, strict=True)])
+        prior = np.concatenate(
+            [
+                np.broadcast_to(sigma, flags.shape)[flags] ** -2.0
+                for sigma, flags in zip(scales.constant, active, strict=True)
+            ]
+        )
+        covariance = np.linalg.inv(self.information[np.ix_(used, used)] + np.diag(prior))
+        solution = covariance @ self.right[used]
+        constants, column_of, done = [], [], 0
+        for flags in active:
+            count = int(flags.sum())
+            values, at = np.zeros(flags.shape), np.full(flags.shape, -1)
+            values[flags], at[flags] = solution[done : done + count], np.arange(done, done + count)
+            done += count
+            constants.append(values)
+            column_of.append(at)
+        return _Fit(tuple(constants), covariance, tuple(column_of))
+
+
+def _is_same(some: tuple[Bools, ...], others: tuple[Bools, ...]) -> bool:
+    return all(np.array_equal(a, b) for a, b in zip(some, others, strict=True))
 
 
 def _groups(kind: int) -> list[list[int]]:
@@ -369,8 +444,8 @@ def _held_out(
         given = replace(fit, constants=tuple(np.zeros_like(c) for c in fit.constants))
         by_thing = []
         for one in (given, fit):
-            placed = triangulate(judged, replace(one, point_in_world_m=state.point_in_world_m), things, tolerance=3.0)
-            placed = triangulate(judged, placed, things, rounds=4)
+            placed = triangulate(judged, replace(one, point_in_world_m=state.point_in_world_m), tolerance=3.0)
+            placed = triangulate(judged, placed, rounds=4)
             by_thing.append(np.bincount(judged.thing, weights=cost(judged, placed), minlength=things))
         is_judged = np.bincount(judged.thing, minlength=things) > 0
         gains.append((by_thing[0] - by_thing[1])[is_judged])

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from valuemap.refine.adjust import DELAY, MOUNT, OFFSET, Observations
 from valuemap.refine.footage import Footage
 from valuemap.refine.jumps import Legs
+from valuemap.refine.residuals import DELAY, MOUNT, OFFSET, Observations
 from valuemap.tables import Ints
 
 _FEW = 8

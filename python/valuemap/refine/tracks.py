@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from valuemap.refine.adjust import Observations, State, by_object, corrected, residuals, weights
+from valuemap.refine.adjust import Groups
 from valuemap.refine.footage import Footage, Sigmas
+from valuemap.refine.residuals import Observations, State, corrected, linearised, residuals, weights
 from valuemap.tables import Floats, Ints
 
 GATE_SIGMAS = 5.0
@@ -110,8 +111,7 @@ def unresolved_share(seen: Observations, state: State, class_code: Ints) -> floa
     pairs = cKDTree(state.point_in_world_m).query_pairs(_BESIDE_M, output_type="ndarray")
     pairs = pairs[class_code[pairs[:, 0]] == class_code[pairs[:, 1]]]
     shows = [set(seen.image[rows].tolist()) for rows in _rows_of(seen.thing, count)]
-    _, center, _, _ = corrected(seen, state)
-    toward = state.point_in_world_m[seen.thing] - center
+    toward = state.point_in_world_m[seen.thing] - corrected(seen.views, state).center_in_world_m[seen.image]
     toward = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
     side = np.stack([np.bincount(seen.thing, weights=axis, minlength=count) for axis in toward.T], axis=1)
     side = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
@@ -130,8 +130,10 @@ def _rows_of(thing: Ints, count: int) -> list[Ints]:
 
 def _covariances(seen: Observations, state: State, count: int) -> Floats:
     """Return covariances (K, 3, 3) of objects where poses are right, of independent residuals."""
-    residual, depth, by_point = by_object(seen, state)
-    weight = weights(seen, residual, depth, 1.0)
+    at = linearised(seen, state)
+    root = np.sqrt(weights(seen, at.residual_px, at.depth_m, 1.0))
+    by_point = np.where(root[:, None, None] > 0.0, at.by_point * root[:, None, None], 0.0)
     information = np.zeros((count, 3, 3))
-    np.add.at(information, seen.thing, np.einsum("nki,nkj->nij", by_point * weight[:, None, None], by_point))
+    groups = Groups(seen.thing)
+    information[seen.thing[groups.row]] = groups.sum(by_point.transpose(0, 2, 1) @ by_point)
     return np.asarray(np.linalg.inv(information + 1e-4 * np.eye(3)))

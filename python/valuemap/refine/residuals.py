@@ -1,0 +1,249 @@
+"""What moves a detection: the model of residuals that all of this package fits.
+
+A detection of object X in an image with pose (R, C) and local pinhole M (see `cameras.py`) has the residual
+
+    r = (1 + s) (a/c, b/c) + s (u - u_0),    (a, b, c) = M p,
+    p = exp(m + n + tau w) R (X - C - o - d - tau v)
+
+with s the error of the camera's focal length, m how the camera is mounted (in camera axes), n and d the drift of
+rotation and position, o the offset of the leg, and tau the time from pose to exposure, in which the image moves by v
+and turns by w.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from valuemap.tables import Floats, Ints
+
+OFFSET, MOUNT, DELAY, FOCAL, CAMERA_MOUNT, CAMERA_DELAY = range(6)
+WIDTH = (3, 3, 1, 1, 3, 1)
+_CAUCHY = 2.0
+"""Residuals of so many sigmas weigh half."""
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Images (I) with their poses as given, and which unknowns they share.
+
+    `cam_from_world` (I, 3, 3), `center_in_world_m` (I, 3); `forward_mps`, `backward_mps` (I, 3) and `forward_radps`,
+    `backward_radps` (I, 3, camera axes): how the image moves and turns until the next one and since the last one;
+    `cam_from_node` (I, 3, 3) turns drift into camera axes. `leg` (I) and `vehicle` (I) are the rows of the offset and
+    of the mounting and delay; drives that go on as the one before them share its vehicle.
+    """
+
+    cam_from_world: Floats
+    center_in_world_m: Floats
+    forward_mps: Floats
+    backward_mps: Floats
+    forward_radps: Floats
+    backward_radps: Floats
+    cam_from_node: Floats
+    node: Ints
+    drive: Ints
+    leg: Ints
+    vehicle: Ints
+    camera: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Detections (N) of objects in images, with what their residuals are computed from.
+
+    `residual_from_cam` (N, 3, 3); `from_middle_px` (N, 2) from the principal point (0 where the camera has no focal
+    length); `sigma_px` (N) is the deviation of all that is not in the model, `detection_sigma_px` (N) that of the
+    detection alone; `thing` (N) and `image` (N) are rows of the objects and of the views.
+    """
+
+    views: Views
+    residual_from_cam: Floats
+    from_middle_px: Floats
+    sigma_px: Floats
+    detection_sigma_px: Floats
+    thing: Ints
+    image: Ints
+
+    def __len__(self) -> int:
+        return len(self.thing)
+
+    @property
+    def node(self) -> Ints:
+        """The node (N) of the drift of each."""
+        return self.views.node[self.image]
+
+    @property
+    def drive(self) -> Ints:
+        """The drive (N) of each."""
+        return self.views.drive[self.image]
+
+    @property
+    def leg(self) -> Ints:
+        """The leg (N) of each."""
+        return self.views.leg[self.image]
+
+    @property
+    def vehicle(self) -> Ints:
+        """The vehicle (N) of each."""
+        return self.views.vehicle[self.image]
+
+    @property
+    def camera(self) -> Ints:
+        """The camera (N) of each."""
+        return self.views.camera[self.image]
+
+    def pixels_per_unit(self) -> Floats:
+        """Return the local focal length (N), px: that of a pinhole along the detection's own ray."""
+        square = np.sum(self.residual_from_cam[:, :2] ** 2, axis=(1, 2)) - np.sum(
+            np.einsum("nij,nj->ni", self.residual_from_cam[:, :2], self.residual_from_cam[:, 2]) ** 2, axis=1
+        )
+        return np.asarray(np.sqrt(0.5 * square))
+
+    def take(self, rows: Any) -> Observations:
+        """Return some of them."""
+        return Observations(self.views, **{name: value[rows] for name, value in vars(self).items() if name != "views"})
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """All unknowns: objects (K, 3), drift (n, 6: position in the world, rotation in axes of the node), constants.
+
+    `own` (images, 6: position in the world, rotation in camera axes) is what each image is probably off by itself. It
+    is no unknown of the normal equations, which have its variance, but where they are linearised: derivatives at poses
+    that are wrong in the same way as the residuals would move objects away from the cameras, however many look.
+    """
+
+    point_in_world_m: Floats
+    drift: Floats
+    own: Floats
+    constants: tuple[Floats, ...]
+    covariance: Floats | None = None
+    """Of the constants that are free (C, C), in the order of `Adjustment.column_of`, all else marginalised."""
+
+    @staticmethod
+    def zero(points: Floats, nodes: int, images: int, counts: tuple[int, ...]) -> State:
+        """Return poses as they are."""
+        return State(
+            points,
+            np.zeros((nodes, 6)),
+            np.zeros((images, 6)),
+            tuple(np.zeros((n, w)) for n, w in zip(counts, WIDTH, strict=True)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Corrected poses of images: `cam_from_world` (I, 3, 3), `center_in_world_m` (I, 3).
+
+    `velocity_mps` (I, 3) and `rate_radps` (I, 3) are those that a delay acts by.
+    """
+
+    cam_from_world: Floats
+    center_in_world_m: Floats
+    velocity_mps: Floats
+    rate_radps: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Residuals (N, 2), px, without the images' own errors, depths (N), and the derivatives of the residuals.
+
+    Those by the object (N, 2, 3), by a turn in camera axes (N, 2, 3), by the delay (N, 2), and by the error of the
+    focal length (N, 2); that by the position of the camera is minus that by the object.
+    """
+
+    residual_px: Floats
+    depth_m: Floats
+    by_point: Floats
+    by_turn: Floats
+    by_delay: Floats
+    by_focal: Floats
+
+
+def rotations(vector_rad: Floats) -> Floats:
+    """Return rotation matrices (N, 3, 3) of rotation vectors (N, 3), Rodrigues' formula."""
+    angle = np.linalg.norm(vector_rad, axis=1)
+    safe = np.where(angle > 1e-12, angle, 1.0)
+    cross = _skew(vector_rad / safe[:, None])
+    sin, cos = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
+    return np.asarray(np.eye(3) + sin * cross + (1.0 - cos) * (cross @ cross))
+
+
+def _skew(vector: Floats) -> Floats:
+    """Return the matrices (N, 3, 3) whose product with a vector is the cross product."""
+    matrix = np.zeros((len(vector), 3, 3))
+    for axis in range(3):
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        matrix[:, i, j], matrix[:, j, i] = -vector[:, axis], vector[:, axis]
+    return matrix
+
+
+def corrected(views: Views, state: State) -> Poses:
+    """Return the poses of the images as the state has them."""
+    offset, mount, delay, _, camera_mount, camera_delay = state.constants
+    late_s = (delay[views.vehicle, 0] + camera_delay[views.camera, 0])[:, None]
+    velocity = np.where(late_s >= 0.0, views.forward_mps, views.backward_mps)
+    rate = np.where(late_s >= 0.0, views.forward_radps, views.backward_radps)
+    drift = state.drift[views.node]
+    center = views.center_in_world_m + velocity * late_s + offset[views.leg] + drift[:, :3] + state.own[:, :3]
+    turn = mount[views.vehicle] + camera_mount[views.camera] + state.own[:, 3:]
+    turn = turn + np.einsum("nij,nj->ni", views.cam_from_node, drift[:, 3:])
+    moved = rotations(rate * late_s) @ views.cam_from_world if late_s.any() else views.cam_from_world
+    return Poses(rotations(turn) @ moved, center, velocity, rate)
+
+
+def _in_pinhole(seen: Observations, state: State, poses: Poses) -> tuple[Floats, Floats]:
+    """Return the objects in camera axes, p, and in the local pinholes, M p (N, 3)."""
+    apart = state.point_in_world_m[seen.thing] - poses.center_in_world_m[seen.image]
+    p = np.einsum("nij,nj->ni", poses.cam_from_world[seen.image], apart)
+    return p, np.einsum("nij,nj->ni", seen.residual_from_cam, p)
+
+
+def residuals(seen: Observations, state: State) -> tuple[Floats, Floats]:
+    """Return the residuals (N, 2) in px and the depths (N) in m."""
+    _, abc = _in_pinhole(seen, state, corrected(seen.views, state))
+    stretch = state.constants[FOCAL][seen.camera]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (1.0 + stretch) * abc[:, :2] / abc[:, 2:] + stretch * seen.from_middle_px, abc[:, 2]
+
+
+def weights(seen: Observations, residual_px: Floats, depth_m: Floats, tolerance: float) -> Floats:
+    """Return Cauchy's weights (N) over variance; what is behind its camera weighs nothing."""
+    square = np.sum(residual_px**2, axis=1) / seen.sigma_px**2
+    with np.errstate(invalid="ignore"):
+        weight = 1.0 / (1.0 + square / (tolerance * _CAUCHY) ** 2) / seen.sigma_px**2
+    return np.where((depth_m > 0.1) & np.isfinite(square), weight, 0.0)
+
+
+def cost(seen: Observations, state: State) -> Floats:
+    """Return Cauchy's cost (N) of each observation: minus twice its log likelihood, up to a constant."""
+    at = linearised(seen, state)
+    square = np.sum(at.residual_px**2, axis=1) / seen.sigma_px**2
+    width = _CAUCHY**2
+    with np.errstate(invalid="ignore"):
+        value = width * np.log1p(square / width)
+    return np.asarray(np.where((at.depth_m > 0.1) & np.isfinite(square), value, width * np.log1p(100.0)))
+
+
+def linearised(seen: Observations, state: State) -> Linearised:
+    """Return residuals without the images' own errors, to first order around them, and derivatives."""
+    poses = corrected(seen.views, state)
+    p, abc = _in_pinhole(seen, state, poses)
+    stretch = state.constants[FOCAL][seen.camera]
+    depth = np.where(np.abs(abc[:, 2]) > 1e-6, abc[:, 2], 1e-6)
+    ratio = abc[:, :2] / depth[:, None]
+    m = seen.residual_from_cam
+    by_p = (1.0 + stretch)[:, :, None] * (m[:, :2] - ratio[:, :, None] * m[:, 2:]) / depth[:, None, None]
+    by_point = by_p @ poses.cam_from_world[seen.image]
+    by_turn = np.empty_like(by_p)
+    for axis in range(3):  # p x by_p
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        by_turn[:, :, axis] = p[:, i, None] * by_p[:, :, j] - p[:, j, None] * by_p[:, :, i]
+    by_delay = np.einsum("nki,ni->nk", by_turn, poses.rate_radps[seen.image])
+    by_delay -= np.einsum("nki,ni->nk", by_point, poses.velocity_mps[seen.image])
+    own = state.own[seen.image]
+    residual = (1.0 + stretch) * ratio + stretch * seen.from_middle_px
+    residual += np.einsum("nki,ni->nk", by_point, own[:, :3]) - np.einsum("nki,ni->nk", by_turn, own[:, 3:])
+    return Linearised(residual, abc[:, 2], by_point, by_turn, by_delay, ratio + seen.from_middle_px)
