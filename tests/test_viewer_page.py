@@ -62,6 +62,10 @@ def test_what_is_rejected_stays_rejected(tmp_path: Path) -> None:
         }
         assert again["filtered"]["votes"] < len(others)
         assert again["note"].startswith('"><img')
+        # One list of triangles for all labels, one for all tracks; the street that both passes drove is drawn once.
+        for seen, labels in ((first, len(before.labels)), (again, len(others))):
+            mark, track, street = 1, 1, 1
+            assert seen["far"] == {"instances": 0, "corners": 6 * (labels + mark + track + street)}
         _check_texts_and_requests(again, client)
 
 

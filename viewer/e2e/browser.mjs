@@ -7,6 +7,21 @@ export async function open(url, { width = 1440, height = 900, theme = "light" } 
     args: ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
   });
   const context = await browser.newContext({ viewport: { width, height }, colorScheme: theme });
+  // What each frame hands the GPU: shapes drawn one by one, and corners of triangles in lists.
+  await context.addInitScript(() => {
+    const count = (name, of) => {
+      const draw = WebGL2RenderingContext.prototype[name];
+      WebGL2RenderingContext.prototype[name] = function (...given) {
+        const [instances, corners] = of(given);
+        window.given = { instances: (window.given?.instances ?? 0) + instances, corners: (window.given?.corners ?? 0) + corners };
+        return draw.apply(this, given);
+      };
+    };
+    count("drawArraysInstanced", (given) => [given[3], 0]);
+    count("drawElementsInstanced", (given) => [given[4], 0]);
+    count("drawArrays", (given) => [0, given[2]]);
+    count("drawElements", (given) => [0, given[1]]);
+  });
   const page = await context.newPage();
   page.setDefaultTimeout(Number(process.env.PAGE_TIMEOUT_MS ?? 120000));
   const noted = { requests: [], complaints: [] };
@@ -23,3 +38,18 @@ export async function open(url, { width = 1440, height = 900, theme = "light" } 
 
 /** Where a label is on the screen. */
 export const screenOf = (page, id) => page.evaluate((label) => window.valuemap.screenOf(label), id);
+
+/** What one frame hands the GPU, seen from this zoom. */
+export async function frameFrom(page, zoom) {
+  await page.evaluate((wanted) => window.valuemap.setView({ ...window.valuemap.getView(), zoom: wanted }), zoom);
+  await page.waitForTimeout(300);
+  return page.evaluate(async () => {
+    const painted = () => new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(resolve)));
+    window.given = undefined;
+    const view = window.valuemap.getView();
+    window.valuemap.setView({ ...view, east: view.east + 1 });
+    while (!window.given) await painted();
+    window.valuemap.setView(view);
+    return window.given;
+  });
+}

@@ -1,5 +1,5 @@
 // What somebody does with a map: node review.mjs URL STEP LABEL SCREENSHOT, prints what was seen as JSON.
-import { open, screenOf } from "./browser.mjs";
+import { frameFrom, open, screenOf } from "./browser.mjs";
 
 const [url, step, label, screenshot] = process.argv.slice(2);
 const id = Number(label);
@@ -100,6 +100,8 @@ if (step === "reject") {
   for (const box of await classes.all()) await box.check();
   seen.filtered.all = await listed();
 }
+// A city from far away: streets driven twice are drawn once.
+seen.far = await frameFrom(page, -5);
 // What a screen reader would say: everything that can be used has a name.
 seen.unnamed = await page.evaluate(() =>
   [...document.querySelectorAll("button, input, textarea, select, a[href], [role], canvas")]

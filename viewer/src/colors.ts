@@ -75,4 +75,7 @@ function hue(index: number, saturation: number, lightness: number): Color {
   }) as Color;
 }
 
+/** A colour and its opacity (0 to 255) as the four bytes that the GPU reads, for arrays with an element for each colour. */
+export const packed = ([red, green, blue]: Color, opacity: number): number => (red | (green << 8) | (blue << 16) | (opacity << 24)) >>> 0;
+
 export const css = (color: Color): string => `rgb(${color.join(" ")})`;

@@ -288,7 +288,7 @@ class Page {
     const at: [number, number] = [this.labels.position[3 * row], this.labels.position[3 * row + 1]];
     const turn = ++this.asked;
     this.panel();
-    this.map.select(at, row);
+    this.map.select(at);
     if (move) this.map.show(...at);
     this.filters.mark(id);
     try {

@@ -1,32 +1,28 @@
 /** The map: deck.gl draws labels, ellipses, tracks and rays from above, in metres; a basemap may lie beneath. */
 
 import { Deck, type Layer, OrthographicView } from "@deck.gl/core";
-import { LineLayer, ScatterplotLayer } from "@deck.gl/layers";
 import KDBush from "kdbush";
 import type { LabelDetails, PlaceDetails, Shot, State } from "./api";
-import { classColor, type Color, existenceColor, OUTCOMES, passColor, STATES } from "./colors";
+import { classColor, type Color, existenceColor, OUTCOMES, packed, passColor, STATES } from "./colors";
 import type { Columns } from "./columns";
-import { EllipseLayer } from "./ellipses";
+import { DiscLayer, type Discs, LinesLayer } from "./meshes";
 import { MAX_ZOOM, MIN_ZOOM, type Settings, type View } from "./state";
-import { type Box, flat, type Level, Tracks, within } from "./tracks";
+import { type Box, distinct, flat, type Level, Tracks, within } from "./tracks";
 
 const ELLIPSE_95 = Math.sqrt(5.991464547107979); // Half axis of 95 % of a normal distribution in the plane, in sigmas.
 const STREET_M = 9;
 const PICK_PX = 12;
 const RAYS_FROM_ZOOM = -2;
+const CAMERAS_FROM_ZOOM = 1.5;
 /** From this many pixels of a metre on ellipses are drawn, and only what is around the view. */
 const NEAR_SCALE = 0.8;
 const EVERYWHERE: Box = { left: -Infinity, bottom: -Infinity, right: Infinity, top: Infinity };
 
-/** What the GPU reads of labels, in the order in which they are drawn. */
-interface Buffers {
-  length: number;
-  position: Float32Array;
-  fill: Uint8Array;
-  line: Uint8Array;
-  radius: Float32Array;
-  shape: Float32Array;
-}
+/** Streets narrower than that have no round ends, which nobody would see. */
+const ROUND_FROM_PX = 4;
+
+/** Labels as they are drawn, with ellipses in true scale. */
+type Buffers = Discs & { shape: Float32Array };
 
 export interface Labels {
   count: number;
@@ -80,7 +76,7 @@ export class MapView {
   private dark = false;
   private truth: Truth | null = null;
   private rejected: Float32Array | null = null;
-  private selected: { at: [number, number]; row: number | null } | null = null;
+  private selected: [number, number] | null = null;
   private rays: { shots: Shot[]; misses: Shot[]; to: [number, number] } | null = null;
   private lit: Shot | null = null;
   private labelLayers: Layer[] = [];
@@ -89,6 +85,9 @@ export class MapView {
   private held: Box | null = null;
   private trackLayers: { key: string; box: Box; layers: Layer[] } = { key: "", box: EVERYWHERE, layers: [] };
   private pressed: { x: number; y: number } | null = null;
+  /** Of the map in pixels. Asking the element each time would make the browser lay the page out again for every move. */
+  private width = 0;
+  private height = 0;
 
   constructor(
     private readonly parent: HTMLElement,
@@ -101,6 +100,7 @@ export class MapView {
     private readonly events: MapEvents,
   ) {
     this.tracks = new Tracks(cameras);
+    this.measureParent();
     this.settings = settings;
     this.states = states;
     this.view = view ?? this.fitting();
@@ -111,6 +111,9 @@ export class MapView {
       viewState: this.deckView(),
       controller: { doubleClickZoom: false, keyboard: false, scrollZoom: { speed: 0.02, smooth: false }, inertia: false },
       useDevicePixels: true,
+      // The shapes smooth their own edges, and every frame draws all of them: four samples a pixel and a copy of the
+      // picture would double the time of a frame where there is no graphics card.
+      deviceProps: { type: "webgl", webgl: { antialias: false, preserveDrawingBuffer: false } },
       onViewStateChange: ({ viewState }) => {
         const [east, north] = viewState.target as number[];
         this.setView({ east, north, zoom: viewState.zoom as number });
@@ -120,6 +123,11 @@ export class MapView {
       layers: [],
     });
     this.listen();
+  }
+
+  private measureParent(): void {
+    this.width = this.parent.clientWidth;
+    this.height = this.parent.clientHeight;
   }
 
   // The place
@@ -151,8 +159,8 @@ export class MapView {
   /** Show a place: the view moves only if it is not well inside, and comes nearer if it is far away. */
   show(east: number, north: number, zoom = 4): void {
     const [x, y] = this.toScreen(east, north);
-    const { clientWidth, clientHeight: height } = this.parent;
-    const width = clientWidth - this.covered;
+    const height = this.height;
+    const width = this.width - this.covered;
     const inside = x > 0.1 * width && x < 0.9 * width && y > 0.1 * height && y < 0.9 * height;
     if (inside && this.view.zoom >= 1) return;
     const nearer = Math.max(this.view.zoom, zoom);
@@ -163,7 +171,7 @@ export class MapView {
   private covered = 0;
 
   cover(px: number): void {
-    this.covered = px < this.parent.clientWidth / 2 ? px : 0;
+    this.covered = px < this.width / 2 ? px : 0;
   }
 
   metresPerPixel(): number {
@@ -173,16 +181,16 @@ export class MapView {
   toScreen(east: number, north: number): [number, number] {
     const scale = 2 ** this.view.zoom;
     return [
-      this.parent.clientWidth / 2 + (east - this.view.east) * scale,
-      this.parent.clientHeight / 2 - (north - this.view.north) * scale,
+      this.width / 2 + (east - this.view.east) * scale,
+      this.height / 2 - (north - this.view.north) * scale,
     ];
   }
 
   toGround(x: number, y: number): [number, number] {
     const metres = this.metresPerPixel();
     return [
-      this.view.east + (x - this.parent.clientWidth / 2) * metres,
-      this.view.north - (y - this.parent.clientHeight / 2) * metres,
+      this.view.east + (x - this.width / 2) * metres,
+      this.view.north - (y - this.height / 2) * metres,
     ];
   }
 
@@ -199,7 +207,7 @@ export class MapView {
     const box = bounds([this.labels.position, this.tracks.levels[this.tracks.levels.length - 1]?.points ?? new Float32Array()]);
     const width = Math.max(20, box.right - box.left);
     const height = Math.max(20, box.top - box.bottom);
-    const zoom = Math.log2(Math.min(this.parent.clientWidth / width, this.parent.clientHeight / height) * 0.88);
+    const zoom = Math.log2(Math.min(this.width / width, this.height / height) * 0.88);
     return {
       east: (box.left + box.right) / 2,
       north: (box.bottom + box.top) / 2,
@@ -221,28 +229,29 @@ export class MapView {
 
   setDark(dark: boolean): void {
     this.dark = dark;
+    this.makeRejected();
+    this.makeMark();
     this.rebuild();
   }
 
   setTruth(truth: Truth): void {
     this.truth = truth;
-    const rows = truth.outcome.length;
-    this.truthColors = new Uint8Array(4 * rows);
-    for (let i = 0; i < rows; i++) {
-      this.truthColors.set([...(OUTCOMES[this.outcomes[truth.outcome[i]]] ?? OUTCOMES.found), 255], 4 * i);
-    }
+    this.makeTruth();
     this.rebuild();
   }
 
   setRejected(position: Float32Array): void {
     this.rejected = flat(position);
-    this.rebuild();
+    this.makeRejected();
+    this.draw();
   }
 
-  select(at: [number, number] | null, row: number | null = null): void {
-    this.selected = at && { at, row };
+  select(at: [number, number] | null): void {
+    this.selected = at;
     this.rays = null;
     this.lit = null;
+    this.makeMark();
+    this.makeRays();
     this.draw();
   }
 
@@ -252,11 +261,13 @@ export class MapView {
       "voters" in details
         ? { shots: details.voters, misses: details.misses, to }
         : { shots: details.passing ?? [], misses: [], to };
+    this.makeRays();
     this.draw();
   }
 
   light(shot: Shot | null): void {
     this.lit = shot;
+    this.makeRays();
     this.draw();
   }
 
@@ -268,7 +279,7 @@ export class MapView {
   inView(): number {
     if (!this.index) return 0;
     const [left, top] = this.toGround(0, 0);
-    const [right, bottom] = this.toGround(this.parent.clientWidth, this.parent.clientHeight);
+    const [right, bottom] = this.toGround(this.width, this.height);
     return this.index.range(left, bottom, right, top).length;
   }
 
@@ -310,10 +321,11 @@ export class MapView {
     this.shown = Uint32Array.from(rows).sort((a, b) => (labels.existence[b] || 0) - (labels.existence[a] || 0) || a - b);
     const length = rows.length;
     const position = new Float32Array(3 * length);
-    const fill = new Uint8Array(4 * length);
-    const line = new Uint8Array(4 * length);
-    const radius = new Float32Array(length);
-    const shape = new Float32Array(3 * length);
+    const fill = new Uint32Array(length);
+    const line = new Uint32Array(length);
+    const shape = new Float32Array(4 * length);
+    const around = packed(this.dark ? [16, 20, 26] : [255, 255, 255], 255);
+    const again = packed(STATES["check again"], 255);
     this.index = length ? new KDBush(length) : null;
     this.shown.forEach((row, i) => {
       const east = labels.position[3 * row];
@@ -321,27 +333,28 @@ export class MapView {
       position[3 * i] = east;
       position[3 * i + 1] = north;
       const color = this.labelColor(row);
-      const rejected = this.states[row] === "rejected";
-      fill.set([...color, rejected ? 30 : 255], 4 * i);
-      line.set(rejected ? [...color, 230] : this.states[row] === "check again" ? [...STATES["check again"], 255] : this.dark ? [16, 20, 26, 255] : [255, 255, 255, 255], 4 * i);
+      const state = this.states[row];
+      fill[i] = packed(color, state === "rejected" ? 30 : 255);
+      line[i] = state === "rejected" ? packed(color, 230) : state === "check again" ? again : around;
       const major = labels.ellipse[3 * row];
-      radius[i] = ELLIPSE_95 * major;
-      shape[3 * i] = Math.cos(labels.ellipse[3 * row + 2]);
-      shape[3 * i + 1] = Math.sin(labels.ellipse[3 * row + 2]);
-      shape[3 * i + 2] = major > 0 ? labels.ellipse[3 * row + 1] / major : 1;
+      shape[4 * i] = major;
+      shape[4 * i + 1] = Math.cos(labels.ellipse[3 * row + 2]);
+      shape[4 * i + 2] = Math.sin(labels.ellipse[3 * row + 2]);
+      shape[4 * i + 3] = major > 0 ? labels.ellipse[3 * row + 1] / major : 1;
       this.index!.add(east, north);
     });
     this.index?.finish();
-    this.buffers = { length, position, fill, line, radius, shape };
+    this.buffers = { length, position, fill, line, shape };
     this.held = null;
     this.trackLayers.key = "";
+    this.makeRays();
     this.draw();
   }
 
   /** The ground that the map shows, widened by a part of its own size on every side. */
   private ground(margin: number): Box {
     const [left, top] = this.toGround(0, 0);
-    const [right, bottom] = this.toGround(this.parent.clientWidth, this.parent.clientHeight);
+    const [right, bottom] = this.toGround(this.width, this.height);
     const [x, y] = [margin * (right - left), margin * (top - bottom)];
     return { left: left - x, right: right + x, bottom: bottom - y, top: top + y };
   }
@@ -354,7 +367,7 @@ export class MapView {
     this.held = near ? this.ground(1) : EVERYWHERE;
     const { left, bottom, right, top } = this.held;
     const rows = near && this.index ? this.index.range(left, bottom, right, top).sort((a, b) => a - b) : null;
-    this.labelLayers = labelLayers(rows ? taken(this.buffers, rows) : this.buffers);
+    this.labelLayers = labelLayers(rows ? taken(this.buffers, rows) : this.buffers, near);
   }
 
   private draw(): void {
@@ -365,12 +378,12 @@ export class MapView {
     const small = scale < 0.15 ? 2.6 : scale < 1 ? 3.6 : scale < 24 ? 5 : 3.5;
     const layers: (Layer | null)[] = [
       ...this.trackLayersNow(),
-      this.truthLayer(),
-      this.rejectedLayer(),
-      this.labelLayers[0]?.clone({ visible: this.settings.layers.has("ellipses") && scale > NEAR_SCALE }) ?? null,
-      ...this.rayLayers(),
-      this.labelLayers[1]?.clone({ getRadius: small, getLineWidth: small < 3 ? 0.5 : 1.25 } as never) ?? null,
-      this.markLayer(),
+      this.truthLayer?.clone({ visible: this.settings.layers.has("truth"), radius: this.view.zoom < 0 ? 5 : 9 } as never) ?? null,
+      this.rejectedLayer?.clone({ visible: this.settings.layers.has("rejected"), radius: this.view.zoom < 0 ? 1.5 : 3 } as never) ?? null,
+      this.labelLayers[1]?.clone({ visible: this.settings.layers.has("ellipses") }) ?? null,
+      ...this.rayLayers.map((layer) => layer.clone({ visible: this.view.zoom > RAYS_FROM_ZOOM })),
+      this.labelLayers[0]?.clone({ radius: small, lineWidth: small < 3 ? 0.5 : 1.25 } as never) ?? null,
+      this.markLayer,
     ];
     this.deck.setProps({ layers });
   }
@@ -380,37 +393,44 @@ export class MapView {
     const { layers, hiddenPasses } = this.settings;
     if (!whole) return [];
     const showTracks = layers.has("tracks");
-    const showCameras = layers.has("cameras") && this.view.zoom > 1.5;
+    const showCameras = layers.has("cameras") && this.view.zoom > CAMERAS_FROM_ZOOM;
     const key = `${whole.spacing} ${this.dark} ${this.showStreets} ${[...hiddenPasses].join()}`;
     if (this.trackLayers.key !== key || !contains(this.trackLayers.box, this.ground(0))) {
       const box = this.ground(1);
       const level = within(whole, box);
+      const drawn = distinct(level, hiddenPasses, level.spacing / 2);
       const rows = level.pass.length;
-      const lines = new Uint8Array(4 * rows);
-      const dots = new Uint8Array(4 * rows);
+      const lines = new Uint32Array(rows);
+      const dots = new Uint32Array(whole.spacing === 0 ? rows : 0);
       const palette = new Map<number, Color>();
       for (let i = 0; i < rows; i++) {
         const number = level.pass[i];
         if (hiddenPasses.has(number)) continue;
         let color = palette.get(number);
         if (!color) palette.set(number, (color = passColor(number, this.dark)));
-        lines[4 * i] = dots[4 * i] = color[0];
-        lines[4 * i + 1] = dots[4 * i + 1] = color[1];
-        lines[4 * i + 2] = dots[4 * i + 2] = color[2];
-        lines[4 * i + 3] = level.joined[i] ? 130 : 0;
-        dots[4 * i + 3] = 200;
+        if (drawn[i]) lines[i] = packed(color, 130);
+        if (dots.length) dots[i] = packed(color, 200);
       }
+      const images: Discs = { length: dots.length, position: level.points, fill: dots, line: dots };
       this.trackLayers = {
         key,
         box: level === whole ? EVERYWHERE : box,
         layers: [
           ...(this.showStreets ? this.streetLayers(within(this.tracks.streets(whole), box)) : []),
-          wayLines(`tracks-${level.spacing}`, level, lines, { widthUnits: "pixels", getWidth: 1.5 }),
-          wayDots(`cameras-${level.spacing}`, level, dots, { radiusUnits: "pixels", getRadius: 2 }),
+          new LinesLayer({ id: `tracks-${level.spacing}`, lines: { points: level.points, colors: lines }, width: 1.5 }),
+          ...(dots.length ? [new DiscLayer({ id: `cameras-${level.spacing}`, discs: images, radius: 2 })] : []),
         ],
       };
     }
-    return this.trackLayers.layers.map((layer) => layer.clone({ visible: layer.id.startsWith("cameras") ? showCameras : showTracks }));
+    const streetPx = Math.max(3, STREET_M / this.metresPerPixel());
+    return this.trackLayers.layers.map((layer) => {
+      if (layer.id.startsWith("cameras")) return layer.clone({ visible: showCameras });
+      if (layer.id.startsWith("tracks-streets")) return layer.clone({ visible: showTracks, width: streetPx } as never);
+      if (layer.id.startsWith("tracks-corners")) {
+        return layer.clone({ visible: showTracks && streetPx >= ROUND_FROM_PX, radius: streetPx / 2 } as never);
+      }
+      return layer.clone({ visible: showTracks });
+    });
   }
 
   private showStreets = true;
@@ -423,98 +443,68 @@ export class MapView {
 
   /** Wide, pale lines beneath the tracks, with round ends: what was driven looks like a street. */
   private streetLayers(level: Level): Layer[] {
-    const rows = level.pass.length;
-    const color = this.dark ? [34, 42, 51] : [255, 255, 255];
-    const lines = new Uint8Array(4 * rows);
-    const ends = new Uint8Array(4 * rows);
-    for (let i = 0; i < rows; i++) {
-      if (this.settings.hiddenPasses.has(level.pass[i])) continue;
-      lines.set([...color, level.joined[i] ? 255 : 0], 4 * i);
-      ends.set([...color, 255], 4 * i);
-    }
+    const drawn = distinct(level, this.settings.hiddenPasses, Math.max(level.spacing, STREET_M) / 2);
+    const color = packed(this.dark ? [34, 42, 51] : [255, 255, 255], 255);
+    const corners = new Float32Array(level.points.length);
+    let count = 0;
+    const corner = (row: number) => corners.set(level.points.subarray(3 * row, 3 * row + 3), 3 * count++);
+    const round = level.spacing <= (4 * STREET_M) / ROUND_FROM_PX; // Coarser levels are only seen from too far away.
+    drawn.forEach((shown, row) => {
+      if (!shown || !round) return;
+      if (!drawn[row - 1]) corner(row);
+      corner(row + 1);
+    });
+    const colors = new Uint32Array(drawn.length);
+    drawn.forEach((shown, row) => (colors[row] = shown ? color : 0));
+    const fill = new Uint32Array(count).fill(color);
     return [
-      wayLines(`tracks-streets-${level.spacing}`, level, lines, { widthUnits: "common", getWidth: STREET_M, widthMinPixels: 3 }),
-      wayDots(`tracks-corners-${level.spacing}`, level, ends, { radiusUnits: "common", getRadius: STREET_M / 2, radiusMinPixels: 1.5 }),
+      new LinesLayer({ id: `tracks-streets-${level.spacing}`, lines: { points: level.points, colors } }),
+      new DiscLayer({ id: `tracks-corners-${level.spacing}`, discs: { length: count, position: corners.subarray(0, 3 * count), fill, line: fill } }),
     ];
   }
 
-  private truthLayer(): Layer | null {
-    if (!this.truth || !this.truth.position.length) return null;
-    const rows = this.truth.outcome.length;
-    return new ScatterplotLayer({
-      id: "truth",
-      visible: this.settings.layers.has("truth"),
-      data: { length: rows, attributes: { getPosition: { value: this.truth.position, size: 3 }, getLineColor: { value: this.truthColors, size: 4, normalized: true } } } as never,
-      radiusUnits: "pixels",
-      getRadius: this.view.zoom < 0 ? 5 : 9,
-      filled: false,
-      stroked: true,
-      lineWidthUnits: "pixels",
-      getLineWidth: 1.75,
-    });
+  /** Layers that change with what is shown, never with the view. */
+  private truthLayer: Layer | null = null;
+  private rejectedLayer: Layer | null = null;
+  private rayLayers: Layer[] = [];
+  private markLayer: Layer | null = null;
+
+  private makeTruth(): void {
+    if (!this.truth || !this.truth.position.length) return;
+    const { position, outcome } = this.truth;
+    const line = Uint32Array.from(outcome, (number) => packed(OUTCOMES[this.outcomes[number]] ?? OUTCOMES.found, 255));
+    this.truthLayer = new DiscLayer({ id: "truth", discs: ringed({ length: outcome.length, position, fill: line, line }), lineWidth: 1.75 });
   }
 
-  /** Made once: the same array again uploads nothing when the map moves. */
-  private truthColors = new Uint8Array();
-
-  private rejectedLayer(): Layer | null {
-    if (!this.rejected) return null;
-    return new ScatterplotLayer({
-      id: "rejected",
-      visible: this.settings.layers.has("rejected"),
-      data: { length: this.rejected.length / 3, attributes: { getPosition: { value: this.rejected, size: 3 } } } as never,
-      radiusUnits: "pixels",
-      getRadius: this.view.zoom < 0 ? 1.5 : 3,
-      getFillColor: this.dark ? [190, 190, 190, 150] : [90, 90, 90, 150],
-    });
+  private makeRejected(): void {
+    if (!this.rejected) return;
+    const length = this.rejected.length / 3;
+    const fill = new Uint32Array(length).fill(packed(this.dark ? [190, 190, 190] : [90, 90, 90], 150));
+    this.rejectedLayer = new DiscLayer({ id: "rejected", discs: { length, position: this.rejected, fill, line: fill } });
   }
 
-  private rayLayers(): Layer[] {
-    if (!this.rays) return [];
+  private makeRays(): void {
+    this.rayLayers = [];
+    if (!this.rays) return;
     const { shots, misses, to } = this.rays;
-    const visible = this.view.zoom > RAYS_FROM_ZOOM;
     const seen = shots.filter((shot) => !this.settings.hiddenPasses.has(shot.pass));
-    const lines = (id: string, data: Shot[], getColor: (shot: Shot) => [number, number, number, number], getWidth: number) =>
-      new LineLayer<Shot>({
-        id,
-        visible,
-        data,
-        getSourcePosition: (shot) => [shot.camera_m[0], shot.camera_m[1], 0],
-        getTargetPosition: () => [...to, 0],
-        getColor,
-        widthUnits: "pixels",
-        getWidth,
-      });
-    return [
-      lines("misses", misses, () => [213, 94, 0, 70], 1),
-      lines("rays", seen, (shot) => [...passColor(shot.pass, this.dark), 120], 1),
-      new ScatterplotLayer<Shot>({
-        id: "voters",
-        visible,
-        data: [...misses, ...seen],
-        getPosition: (shot) => [shot.camera_m[0], shot.camera_m[1], 0],
-        getFillColor: (shot) => (misses.includes(shot) ? [213, 94, 0, 255] : [...passColor(shot.pass, this.dark), 255]),
-        radiusUnits: "pixels",
-        getRadius: 2.6,
-      }),
-      lines("lit", this.lit ? [this.lit] : [], () => (this.dark ? [255, 255, 255, 255] : [20, 20, 20, 255]), 2.5),
+    const ofPass = (opacity: number) => (shot: Shot) => packed(passColor(shot.pass, this.dark), opacity);
+    const missed = (opacity: number) => () => packed([213, 94, 0], opacity);
+    const lit = () => packed(this.dark ? [255, 255, 255] : [20, 20, 20], 255);
+    this.rayLayers = [
+      rays("misses", misses, to, missed(70), 1),
+      rays("rays", seen, to, ofPass(120), 1),
+      new DiscLayer({ id: "missed", discs: cameras(misses, missed(255)), radius: 2.6 }),
+      new DiscLayer({ id: "voters", discs: cameras(seen, ofPass(255)), radius: 2.6 }),
+      rays("lit", this.lit ? [this.lit] : [], to, lit, 2.5),
     ];
   }
 
-  private markLayer(): Layer | null {
-    if (!this.selected) return null;
-    return new ScatterplotLayer<{ at: [number, number] }>({
-      id: "selected",
-      data: [this.selected],
-      getPosition: ({ at }) => [...at, 0],
-      filled: false,
-      stroked: true,
-      radiusUnits: "pixels",
-      getRadius: 11,
-      lineWidthUnits: "pixels",
-      getLineWidth: 2.5,
-      getLineColor: this.dark ? [255, 255, 255] : [10, 20, 30],
-    });
+  private makeMark(): void {
+    const color = new Uint32Array([packed(this.dark ? [255, 255, 255] : [10, 20, 30], 255)]);
+    const at = this.selected;
+    const mark = at && ringed({ length: 1, position: new Float32Array([...at, 0]), fill: color, line: color });
+    this.markLayer = mark && new DiscLayer({ id: "selected", discs: mark, radius: 11, lineWidth: 2.5 });
   }
 
   // What the pointer does. The index on the CPU answers in less than a millisecond, where reading back from the GPU waits.
@@ -558,7 +548,10 @@ export class MapView {
       this.events.onHover(this.pressed ? null : this.pick(x, y), x, y, east, north);
     });
     this.parent.addEventListener("pointerleave", () => this.events.onHover(null, 0, 0, NaN, NaN));
-    new ResizeObserver(() => this.draw()).observe(this.parent);
+    new ResizeObserver(() => {
+      this.measureParent();
+      this.draw();
+    }).observe(this.parent);
   }
 }
 
@@ -571,65 +564,49 @@ function taken(all: Buffers, rows: number[]): Buffers {
   const part: Buffers = {
     length,
     position: new Float32Array(3 * length),
-    fill: new Uint8Array(4 * length),
-    line: new Uint8Array(4 * length),
-    radius: new Float32Array(length),
-    shape: new Float32Array(3 * length),
+    fill: Uint32Array.from(rows, (row) => all.fill[row]),
+    line: Uint32Array.from(rows, (row) => all.line[row]),
+    shape: new Float32Array(4 * length),
   };
   rows.forEach((row, i) => {
     part.position.set(all.position.subarray(3 * row, 3 * row + 3), 3 * i);
-    part.fill.set(all.fill.subarray(4 * row, 4 * row + 4), 4 * i);
-    part.line.set(all.line.subarray(4 * row, 4 * row + 4), 4 * i);
-    part.radius[i] = all.radius[row];
-    part.shape.set(all.shape.subarray(3 * row, 3 * row + 3), 3 * i);
+    part.shape.set(all.shape.subarray(4 * row, 4 * row + 4), 4 * i);
   });
   return part;
 }
 
-function labelLayers({ length, position, fill, line, radius, shape }: Buffers): Layer[] {
-  const getPosition = { value: position, size: 3 };
-  const getFillColor = { value: fill, size: 4, normalized: true };
-  const getLineColor = { value: line, size: 4, normalized: true };
-  return [
-    new EllipseLayer({
-      id: "ellipses",
-      data: { length, attributes: { getPosition, getFillColor, getRadius: { value: radius, size: 1 }, getShape: { value: shape, size: 3 } } } as never,
-      radiusUnits: "common",
-      stroked: false,
-      antialiasing: false,
-    }),
-    new ScatterplotLayer({
-      id: "labels",
-      data: { length, attributes: { getPosition, getFillColor, getLineColor } } as never,
-      radiusUnits: "pixels",
-      getRadius: 5,
-      lineWidthUnits: "pixels",
-      getLineWidth: 1.25,
-      stroked: true,
-    }),
-  ];
+/** Labels as dots, and from near as ellipses: pale, with an outline in the same colour. */
+function labelLayers({ length, position, fill, line, shape }: Buffers, near: boolean): Layer[] {
+  const dots = new DiscLayer({ id: "labels", discs: { length, position, fill, line } });
+  if (!near) return [dots];
+  const pale = fill.map((color) => faded(color, 0.22));
+  const ellipses = { length, position, fill: pale, line: fill, shape };
+  return [dots, new DiscLayer({ id: "ellipses", discs: ellipses, radius: ELLIPSE_95, lineWidth: 1.5 })];
 }
 
-/** Lines from each image to the next of its pass; `colors` has an opacity of 0 where there is none. */
-function wayLines(id: string, { points, pass }: Level, colors: Uint8Array, width: object): Layer {
-  return new LineLayer({
-    id,
-    data: {
-      length: Math.max(0, pass.length - 1),
-      attributes: {
-        getSourcePosition: { value: points, size: 3 },
-        getTargetPosition: { value: points, size: 3, offset: 12 },
-        getColor: { value: colors, size: 4, normalized: true },
-      },
-    } as never,
-    ...width,
+/** A packed colour with a part of its opacity. */
+const faded = (color: number, part: number): number => ((color & 0xffffff) | (Math.round(part * (color >>> 24)) << 24)) >>> 0;
+
+/** Discs with nothing inside. */
+const ringed = (discs: Discs): Discs => ({ ...discs, fill: discs.fill.map((color) => faded(color, 0)) });
+
+/** Discs where cameras were. */
+function cameras(shots: Shot[], color: (shot: Shot) => number): Discs {
+  const position = new Float32Array(3 * shots.length);
+  shots.forEach(({ camera_m }, i) => position.set([camera_m[0], camera_m[1]], 3 * i));
+  const fill = Uint32Array.from(shots, color);
+  return { length: shots.length, position, fill, line: fill };
+}
+
+/** Lines from cameras to a place; none from there to the next camera. */
+function rays(id: string, shots: Shot[], to: [number, number], color: (shot: Shot) => number, width: number): Layer {
+  const points = new Float32Array(6 * shots.length);
+  const colors = new Uint32Array(2 * shots.length);
+  shots.forEach((shot, i) => {
+    points.set([shot.camera_m[0], shot.camera_m[1], 0, ...to, 0], 6 * i);
+    colors[2 * i] = color(shot);
   });
-}
-
-/** Dots where images are. */
-function wayDots(id: string, { points, pass }: Level, colors: Uint8Array, radius: object): Layer {
-  const attributes = { getPosition: { value: points, size: 3 }, getFillColor: { value: colors, size: 4, normalized: true } };
-  return new ScatterplotLayer({ id, data: { length: pass.length, attributes } as never, antialiasing: false, ...radius });
+  return new LinesLayer({ id, lines: { points, colors }, width });
 }
 
 function bounds(arrays: Float32Array[]) {

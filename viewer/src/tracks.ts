@@ -146,3 +146,54 @@ export function within(level: Level, box: Box): Level {
   }
   return part;
 }
+
+/**
+ * Which lines of a level are to be drawn: not those of hidden passes, and of those that would cover each other, from one
+ * cell of a grid to the same other cell, only the first. `cellM` of 0 keeps them all.
+ */
+export function distinct(level: Level, hidden: ReadonlySet<number>, cellM: number): Uint8Array {
+  const { points, pass, joined } = level;
+  const rows = pass.length;
+  const drawn = new Uint8Array(rows);
+  const seen = new Pairs(cellM > 0 ? rows : 0);
+  const cellOf = (row: number): number =>
+    (Math.imul(Math.round(points[3 * row] / cellM), 0x9e3779b1) ^ Math.imul(Math.round(points[3 * row + 1] / cellM), 0x85ebca77)) >>> 0;
+  for (let row = 0; row + 1 < rows; row++) {
+    if (!joined[row] || (hidden.size && hidden.has(pass[row]))) continue;
+    if (cellM > 0) {
+      // For a line to be lost by chance both its ends must share their number with the ends of another one.
+      const from = cellOf(row);
+      const to = cellOf(row + 1);
+      if (!seen.add(Math.min(from, to), Math.max(from, to))) continue;
+    }
+    drawn[row] = 1;
+  }
+  return drawn;
+}
+
+/** A set of pairs of 32-bit numbers; a Set of anything takes ten times as long, while somebody zooms. */
+class Pairs {
+  private readonly mask: number;
+  private readonly first: Uint32Array;
+  private readonly second: Uint32Array;
+  private readonly taken: Uint8Array;
+
+  constructor(most: number) {
+    const places = 2 ** Math.ceil(Math.log2(2 * most + 2));
+    this.mask = places - 1;
+    this.first = new Uint32Array(places);
+    this.second = new Uint32Array(places);
+    this.taken = new Uint8Array(places);
+  }
+
+  /** Whether the pair is new. */
+  add(first: number, second: number): boolean {
+    const mixed = Math.imul(first ^ Math.imul(second, 0xc2b2ae35), 0x27d4eb2f);
+    let at = (mixed ^ (mixed >>> 15)) & this.mask;
+    for (; this.taken[at]; at = (at + 1) & this.mask) if (this.first[at] === first && this.second[at] === second) return false;
+    this.taken[at] = 1;
+    this.first[at] = first;
+    this.second[at] = second;
+    return true;
+  }
+}
