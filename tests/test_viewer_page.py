@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import subprocess
 import sys
@@ -40,6 +41,7 @@ def test_what_is_rejected_stays_rejected(tmp_path: Path) -> None:
         assert "No rejected hypothesis" in first["answer"] or "It was rejected: " in first["answer"]
         assert first["sameView"] == f"#{urlsplit(first['address']).fragment}"
         assert "token" not in first["address"]
+        _check_moved(first, before, client)
         _check_texts_and_requests(first, client)
         assert first["unnamed"] == [], "a screen reader has nothing to say about them"
         assert first["sub"].startswith(HOSTILE)
@@ -63,9 +65,10 @@ def test_what_is_rejected_stays_rejected(tmp_path: Path) -> None:
         assert again["filtered"]["votes"] < len(others)
         assert again["note"].startswith('"><img')
         # One list of triangles for all labels, one for all tracks; the street that both passes drove is drawn once.
-        for seen, labels in ((first, len(before.labels)), (again, len(others))):
-            mark, track, street = 1, 1, 1
-            assert seen["far"] == {"instances": 0, "corners": 6 * (labels + mark + track + street)}
+        # Around what is selected is a mark; where it was moved to another one, and a line between them.
+        for seen, labels, marks in ((first, len(before.labels), 3), (again, len(others), 1)):
+            track, street = 1, 1
+            assert seen["far"] == {"instances": 0, "corners": 6 * (labels + marks + track + street)}
         _check_texts_and_requests(again, client)
 
 
@@ -130,6 +133,18 @@ def _check_texts_and_requests(seen: dict[str, Any], client: Client) -> None:
     assert HOSTILE in seen["texts"]
     assert _asked(seen) == {f"127.0.0.1:{client.server.port}"}
     assert seen["noted"]["complaints"] == [], "the browser complains, of the policy for example"
+
+
+def _check_moved(seen: dict[str, Any], result: valuemap.Map, client: Client) -> None:
+    """The label that was accepted stands where the click was, at its own height."""
+    decisions = json.loads(client.server.content.opinions.path.read_text())["decisions"]
+    (decision,) = (each for each in decisions if each["label_id"] == seen["nextId"])
+    (row,) = np.flatnonzero(result.labels.label_id == seen["nextId"])
+    places = np.array([decision["new_position_m"], result.labels.position_in_world_m[row]])
+    moved_to, was_at = client.server.content.scene.local(places)
+    pixel_m = seen["movedM"][0] / 6.0
+    np.testing.assert_allclose(moved_to - was_at, [*seen["movedM"], 0.0], atol=pixel_m)
+    assert decision["verdict"] == "accepted"
 
 
 def _asked(seen: dict[str, Any]) -> set[str]:

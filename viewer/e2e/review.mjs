@@ -63,6 +63,17 @@ if (step === "reject") {
   seen.next = await text("#title");
   await page.keyboard.press("a");
   await page.waitForSelector("#details .state.accepted");
+
+  // It is moved by less than the mark of a label is wide, and stays accepted.
+  seen.nextId = Number(seen.next.slice("Label ".length));
+  await page.waitForTimeout(400);
+  const from = await screenOf(page, seen.nextId);
+  await page.keyboard.press("m");
+  await page.waitForSelector("body.moving");
+  await page.mouse.click(from[0] + 6, from[1] - 3);
+  await page.waitForFunction(() => document.querySelector("#move")?.textContent.startsWith("Moved"));
+  await page.waitForSelector("#details .state.accepted");
+  seen.movedM = await page.evaluate(() => [6, 3].map((px) => px / 2 ** window.valuemap.getView().zoom));
   await page.waitForTimeout(400);
   seen.address = page.url();
 

@@ -62,7 +62,8 @@ class Page {
     this.filters.render(this.dark);
     this.map = new MapView(byId("deck"), this.labels, cameras, head.outcomes, settings, this.states, view, {
       onView: () => this.viewChanged(),
-      onLabel: (id) => void this.openLabel(id),
+      // What is moved is often moved by less than its own mark is wide.
+      onLabel: (id, east, north) => void (this.moving === null ? this.openLabel(id) : this.clickedPlace(east, north)),
       onPlace: (east, north) => void this.clickedPlace(east, north),
       onHover: (row, x, y, east, north) => this.hover(row, x, y, east, north),
       onDrawn: () => this.wasDrawn(),
@@ -288,7 +289,7 @@ class Page {
     const at: [number, number] = [this.labels.position[3 * row], this.labels.position[3 * row + 1]];
     const turn = ++this.asked;
     this.panel();
-    this.map.select(at);
+    this.map.select(at, this.reviews.get(id)?.moved_to);
     if (move) this.map.show(...at);
     this.filters.mark(id);
     try {

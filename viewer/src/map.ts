@@ -59,7 +59,7 @@ export interface Truth {
 
 export interface MapEvents {
   onView(view: View): void;
-  onLabel(id: number): void;
+  onLabel(id: number, east: number, north: number): void;
   onPlace(east: number, north: number): void;
   onHover(row: number | null, x: number, y: number, east: number, north: number): void;
   onDrawn(): void;
@@ -76,7 +76,8 @@ export class MapView {
   private dark = false;
   private truth: Truth | null = null;
   private rejected: Float32Array | null = null;
-  private selected: [number, number] | null = null;
+  /** Where the selected is, and where somebody moved it. */
+  private selected: [number, number][] = [];
   private rays: { shots: Shot[]; misses: Shot[]; to: [number, number] } | null = null;
   private lit: Shot | null = null;
   private labelLayers: Layer[] = [];
@@ -230,7 +231,7 @@ export class MapView {
   setDark(dark: boolean): void {
     this.dark = dark;
     this.makeRejected();
-    this.makeMark();
+    this.makeMarks();
     this.rebuild();
   }
 
@@ -246,11 +247,11 @@ export class MapView {
     this.draw();
   }
 
-  select(at: [number, number] | null): void {
-    this.selected = at;
+  select(at: [number, number] | null, movedTo: [number, number] | null = null): void {
+    this.selected = [at, movedTo].filter((place) => place !== null);
     this.rays = null;
     this.lit = null;
-    this.makeMark();
+    this.makeMarks();
     this.makeRays();
     this.draw();
   }
@@ -383,7 +384,7 @@ export class MapView {
       this.labelLayers[1]?.clone({ visible: this.settings.layers.has("ellipses") }) ?? null,
       ...this.rayLayers.map((layer) => layer.clone({ visible: this.view.zoom > RAYS_FROM_ZOOM })),
       this.labelLayers[0]?.clone({ radius: small, lineWidth: small < 3 ? 0.5 : 1.25 } as never) ?? null,
-      this.markLayer,
+      ...this.markLayers,
     ];
     this.deck.setProps({ layers });
   }
@@ -467,7 +468,7 @@ export class MapView {
   private truthLayer: Layer | null = null;
   private rejectedLayer: Layer | null = null;
   private rayLayers: Layer[] = [];
-  private markLayer: Layer | null = null;
+  private markLayers: Layer[] = [];
 
   private makeTruth(): void {
     if (!this.truth || !this.truth.position.length) return;
@@ -500,11 +501,13 @@ export class MapView {
     ];
   }
 
-  private makeMark(): void {
-    const color = new Uint32Array([packed(this.dark ? [255, 255, 255] : [10, 20, 30], 255)]);
-    const at = this.selected;
-    const mark = at && ringed({ length: 1, position: new Float32Array([...at, 0]), fill: color, line: color });
-    this.markLayer = mark && new DiscLayer({ id: "selected", discs: mark, radius: 11, lineWidth: 2.5 });
+  private makeMarks(): void {
+    const position = new Float32Array(this.selected.flatMap((place) => [...place, 0]));
+    const line = new Uint32Array(this.selected.length).fill(packed(this.dark ? [255, 255, 255] : [10, 20, 30], 255));
+    this.markLayers = [
+      new DiscLayer({ id: "selected", discs: ringed({ length: line.length, position, fill: line, line }), radius: 11, lineWidth: 2.5 }),
+      new LinesLayer({ id: "moved", lines: { points: position, colors: line }, width: 1.5 }),
+    ];
   }
 
   // What the pointer does. The index on the CPU answers in less than a millisecond, where reading back from the GPU waits.
@@ -540,7 +543,7 @@ export class MapView {
       if (!pressed || Math.hypot(x - pressed.x, y - pressed.y) > 4) return;
       const row = this.pick(x, y);
       if (row === null) this.events.onPlace(...this.toGround(x, y));
-      else this.events.onLabel(this.labels.id[row]);
+      else this.events.onLabel(this.labels.id[row], ...this.toGround(x, y));
     });
     this.parent.addEventListener("pointermove", (event) => {
       const [x, y] = at(event);
