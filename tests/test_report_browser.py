@@ -41,6 +41,7 @@ def test_from_disk_without_a_network_a_click_shows_what_a_label_rests_on(page: P
     assert seen["labels"] == len(labels)
     assert seen["colors"] > 20, "the map is drawn"
     assert seen["chosen"].startswith(f"Label {labels.label_id[row]}: ")
+    assert len(set(seen["marks"])) == len(seen["marks"]) == 4, "marks are told apart in print, without their colours"
     assert seen["rows"] == min(300, labels.votes[row])
     assert seen["cleared"]
     assert seen["again"] == seen["chosen"]

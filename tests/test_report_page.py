@@ -31,6 +31,7 @@ from valuemap.report.figures import normalized_errors
 from valuemap.report.page import inline_data, shown
 from valuemap.report.paper import ReportTable, paper_tables
 from valuemap.report.run_tables import accuracy_tables, doubtful_rows, run_tables, worst_rows
+from valuemap.report.style import probability
 from valuemap.report.write import files_folder, write_csv_table, write_report
 from valuemap.tables import Categories
 
@@ -325,6 +326,13 @@ def test_honest_covariances_are_called_honest() -> None:
 )
 def test_cells_are_readable(cell: Any, text: str) -> None:
     assert shown(cell) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(1.0, "> 0.999"), (0.9994, "0.999"), (0.5, "0.500"), (1e-5, "< 0.001"), (0.0, "0.000")]
+)
+def test_what_is_nearly_certain_is_not_called_certain(value: float, text: str) -> None:
+    assert probability(value) == text
 
 
 def test_names_of_figures_are_readable_and_say_their_units() -> None:

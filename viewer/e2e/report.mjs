@@ -33,6 +33,7 @@ await page.goto(pathToFileURL(file).href);
 const visible = (selector) => page.locator(selector).filter({ visible: true }).count();
 if (scripts === "on") {
   await page.waitForSelector("html[data-ready]");
+  seen.marks = await page.locator("#legend b").allInnerTexts();
   const timing = () => {
     const [navigation] = performance.getEntriesByType("navigation");
     const [ready] = performance.getEntriesByName("valuemap:ready");

@@ -13,7 +13,7 @@ from valuemap.evidence import Evidence, Misses, Voters
 from valuemap.report.above import plain_line
 from valuemap.report.crops import LEAST_SIDE_PX, Crop, miss_crop, voter_crop
 from valuemap.report.ground import ELLIPSE_SIGMAS, ellipses, horizontal_axes
-from valuemap.report.style import BLUE, DPI, FAINT_INK, GROUND, INK, ORANGE, RULE, drawing
+from valuemap.report.style import BLUE, DPI, FAINT_INK, GROUND, INK, ORANGE, RULE, drawing, probability
 from valuemap.tables import Floats, Ints
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ def _draw_head(figure: Figure, evidence: Evidence, row: int, voters: Voters, mis
         f"{len(voters):,} of {seen:,} images that should have seen it, {passes:,} {'pass' if passes == 1 else 'passes'}"
     ]
     if labels.existence is not None:
-        facts.append(f"exists with probability {labels.existence[row]:.3f}")
+        facts.append(f"exists with probability {probability(labels.existence[row])}")
     facts.append(f"reprojection rms {labels.reprojection_rms_px[row]:.2f} px")
     figure.text(_MARGIN_PX / _WIDTH_PX, 1.0 - 80.0 / height_px, ",  ".join(facts), fontsize=13)
     x, y, z = labels.position_in_world_m[row]

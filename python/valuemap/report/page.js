@@ -145,8 +145,13 @@
       if (outcome !== 2) {
         brush.strokeStyle = outcome === 1 ? style.bad : style.warn; brush.lineWidth = arm < 4 ? 1.2 : 2.5;
         brush.beginPath();
-        brush.moveTo(px - arm, py - arm); brush.lineTo(px + arm, py + arm);
-        brush.moveTo(px + arm, py - arm); brush.lineTo(px - arm, py + arm);
+        if (outcome === 1) {
+          brush.moveTo(px - arm, py - arm); brush.lineTo(px + arm, py + arm);
+          brush.moveTo(px + arm, py - arm); brush.lineTo(px - arm, py + arm);
+        } else {                                 // Another shape too: in print there are no colours.
+          brush.moveTo(px, py - 1.6 * arm); brush.lineTo(px + 1.5 * arm, py + arm); brush.lineTo(px - 1.5 * arm, py + arm);
+          brush.closePath();
+        }
         brush.stroke();
       }
       if (i === chosen) {
@@ -274,7 +279,7 @@
     if (data.lon_lat.length) fact("lon, lat", data.lon_lat[2 * i].toFixed(7) + "  " + data.lon_lat[2 * i + 1].toFixed(7));
     fact("95 % ellipse, half axes", data.half_axes[2 * i].toFixed(3) + " x " + data.half_axes[2 * i + 1].toFixed(3) + " m");
     fact("sigma of the height", data.up_sigma[i].toFixed(3) + " m");
-    if (data.existence.length) fact("existence", data.existence[i].toFixed(4));
+    if (data.existence.length) fact("existence", data.existence[i] > 0.9995 ? "> 0.999" : data.existence[i].toFixed(3));
     var expected = data.expected.length ? " of " + data.expected[i] + " images that should have seen it" : " images";
     fact("votes", data.votes[i] + expected);
     fact("passes", String(data.passes[i]));
@@ -412,7 +417,7 @@
     });
     if (data.label_outcome.length) {
       [["\u25cb", "true object, found", "good"], ["\u25a1", "true object, missed", "bad"], ["\u2715", "false label", "bad"],
-        ["\u2715", "duplicate", "warn"]].forEach(function (mark) {
+        ["\u25b3", "duplicate", "warn"]].forEach(function (mark) {
         var entry = element("span", undefined, byId("legend"));
         element("b", mark[0], entry).className = mark[2];
         entry.appendChild(document.createTextNode(mark[1]));

@@ -100,6 +100,13 @@ def figure_bytes(figure: Figure, suffix: str) -> bytes:
     return buffer.getvalue()
 
 
+def probability(value: float) -> str:
+    """Return a probability in words of three decimals; what is nearly certain is not called certain."""
+    if value > 0.9995:
+        return "> 0.999"
+    return "< 0.001" if 0.0 < value < 0.0005 else f"{value:.3f}"
+
+
 def plain(text: Text) -> Text:
     """Return a text of which nothing is read as a formula."""
     text.set_parse_math(False)

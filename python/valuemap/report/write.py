@@ -32,7 +32,7 @@ from valuemap.report.run_tables import (
     spread_m,
     worst_rows,
 )
-from valuemap.report.style import FORMATS
+from valuemap.report.style import FORMATS, probability
 
 FILES_MARKER = "report.json"
 
@@ -267,7 +267,7 @@ def _cards(
         passes = f"{labels.passes[row]} {'pass' if labels.passes[row] == 1 else 'passes'}"
         lines = [f"{labels.votes[row]}{expected} images, {passes}, sigma {spread[row]:.2f}\u00a0m"]
         if labels.existence is not None:
-            lines.append(f"exists with probability {labels.existence[row]:.3f}")
+            lines.append(f"exists with probability {probability(labels.existence[row])}")
         if evaluation is not None and error is not None:
             outcome = evaluation.matches.label_outcome
             off = f", {error[row]:.2f}\u00a0m off" if np.isfinite(error[row]) else ""
