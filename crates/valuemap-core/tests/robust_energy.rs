@@ -261,6 +261,17 @@ proptest! {
         }
     }
 
+    /// Pins what a bar of progress hears: every kind of move once a round, while it goes on.
+    #[test]
+    fn a_search_counts_its_moves(at in object(), errors in errors_px()) {
+        let scene = street(40, 3.0, &[at], &errors);
+        for (depth, moves) in [(Depth::Shallow, 1), (Depth::Deep, 4)] {
+            let (mut model, progress) = (Model::new(&scene, &DRIFTING, &SETTINGS), Progress::default());
+            search(&mut model, &scene.usable_rays(), Vec::new(), depth, true, &mut Tally::default(), &progress).unwrap();
+            prop_assert!(progress.done() >= moves && progress.done().is_multiple_of(moves), "{}", progress.done());
+        }
+    }
+
     /// Pins exclusion: two boxes of one thing are votes of two objects otherwise.
     #[test]
     fn boxes_that_are_doubled_double_no_object(objects in vec(object(), 1..4), errors in errors_px()) {

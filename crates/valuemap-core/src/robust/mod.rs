@@ -230,6 +230,7 @@ pub fn find(
     let mut model = Model::new(scene, noise, settings);
     model.know(&calibration.classes, calibration.pooled);
     let (begun, first) = initial::labels(&model, !calibration.is_deep, progress)?;
+    progress.advance()?;
     let mut tally =
         Tally { hypotheses: first.nominations, births: first.accepted, deaths: first.doubted + first.outvoted };
     let depth = if calibration.is_deep { Depth::Deep } else { Depth::Shallow };

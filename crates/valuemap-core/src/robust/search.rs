@@ -65,11 +65,14 @@ pub fn search(
         let (assigned, mut any) = assign(model, &lookout, &index, objects, progress)?;
         objects = assigned;
         tally.deaths += (before - objects.len()) as u64;
+        progress.advance()?;
         if depth == Depth::Deep {
             let (rearranged, better) = rearrange_pairs(model, &lookout, &index, objects, &mut tried_pairs, progress)?;
             any |= better;
+            progress.advance()?;
             let (repaired, better) = repair(model, &lookout, &index, rearranged, &mut tried, round as u64, progress)?;
             any |= better;
+            progress.advance()?;
             objects = repaired;
             is_taken.fill(false);
             objects.iter().flat_map(|o| &o.votes).for_each(|&ray| is_taken[ray as usize] = true);
@@ -78,6 +81,7 @@ pub fn search(
             tally.births += born.len() as u64;
             any |= !born.is_empty();
             objects.extend(born);
+            progress.advance()?;
         }
         if !any {
             break;
