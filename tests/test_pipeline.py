@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import valuemap
+import valuemap._core as _core
 from literal import Pinhole, Sighting
 from scenes import Scene, as_dataset, random_scene
 from told import Told
@@ -22,6 +24,7 @@ from valuemap.dataset import Dataset, Frame
 from valuemap.describe import describe_labels
 from valuemap.map_folder import Map
 from valuemap.tables import Candidates, Labels, Votes, table_to_arrow, write_table
+from valuemap.tiles.compare import compare_poses
 
 
 def street(seed: int = 7) -> Dataset:
@@ -174,6 +177,27 @@ def test_a_map_tells_how_far_it_is(config: valuemap.MapConfig) -> None:
     valuemap.build_map(street(), config, progress=(told := Told()))
     kinds = ["voting"] if config.method == "paper" else ["comparing drives", "estimating the noise", "finding labels"]
     told.check(*kinds)
+
+
+def test_what_the_core_counts_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It counts maps and moves, no more than the total; how often it is asked is a matter of time."""
+
+    def counting(work: Callable[..., Any]) -> Callable[..., Any]:
+        def counted(*given: Any) -> Any:
+            given[-1](7, 0)
+            return work(*given)
+
+        return counted
+
+    for name in ("misfit", "calibrate", "find_labels"):
+        monkeypatch.setattr(_core, name, counting(getattr(_core, name)))
+    dataset = street()
+    valuemap.build_map(dataset, progress=(told := Told()))
+    told.check("estimating the noise", "finding labels")
+    compare_poses(dataset, dataset, valuemap.MapConfig(), threads=1, progress=told)
+    told.check("comparing poses")
+    for call in (("estimating the noise", 7, 18), ("finding labels", 7, 25), ("comparing poses", 22, 30)):
+        assert call in told.calls
 
 
 @both_methods

@@ -127,6 +127,14 @@ class Scene:
         )
 
 
+MISFIT_STEPS = 5 * 3
+"""Maps that the core makes to find the likeliest noise, at most: from each start, some."""
+_CALIBRATION_STEPS = MISFIT_STEPS + 2 + 1
+"""Then two of more places, and one for the classes."""
+_SEARCH_STEPS = 6 * 4
+"""Moves of the core's search, at most: rounds, and kinds of moves in each. It ends when nothing helps any more."""
+
+
 def calibrate(
     scene: Scene, config: MapConfig, *, is_part: bool = False, threads: int = 0, progress: Progress = silent
 ) -> Calibration:
@@ -135,9 +143,10 @@ def calibrate(
     What the config sets of the noise stays as it is. The scene may be a part of what is mapped.
     """
     guess, known = _guess(config.noise)
-    with counted(progress, "estimating the noise", 1) as tell:
+    steps = _CALIBRATION_STEPS + (_SEARCH_STEPS if is_part else 0)
+    with counted(progress, "estimating the noise", steps) as tell:
         noise, is_deep, classes, pooled = _core.calibrate(
-            scene.core, guess.as_tuple(), known, _settings(config), is_part, threads, lambda _done, _total: tell(0)
+            scene.core, guess.as_tuple(), known, _settings(config), is_part, threads, lambda done, _total: tell(done)
         )
     estimated = Noise(*noise)
     return Calibration(
@@ -149,19 +158,24 @@ def calibrate(
 
 
 def misfit(
-    scene: Scene, config: MapConfig, rays: Ints | None = None, *, threads: int = 0, going_on: Callable[[], None]
+    scene: Scene, config: MapConfig, rays: Ints | None = None, *, threads: int = 0, tell: Callable[[int], None]
 ) -> tuple[float, Ints]:
     """Return how badly some detections (rows, N) fit, those of a sample of places where none are given, and which.
 
     Minus twice the logarithm of their likelihood, up to a constant of theirs. What is true makes them likelier.
-    `going_on` is called again and again, and stops the work by an exception.
+    `tell` hears again and again how many of `MISFIT_STEPS` are done, and stops the work by an exception.
     """
     guess, known = _guess(config.noise)
     rows = None if rays is None else rays.astype(np.uint32)
     value, used = _core.misfit(
-        scene.core, guess.as_tuple(), known, _settings(config), rows, threads, lambda _done, _total: going_on()
+        scene.core, guess.as_tuple(), known, _settings(config), rows, threads, lambda done, _total: tell(done)
     )
     return value, used.astype(np.int64)
+
+
+def steps_of_labels(calibration: Calibration) -> int:
+    """Return in how many steps labels are found, at most: where they begin, and the moves of the search."""
+    return 1 + (_SEARCH_STEPS if calibration.is_deep else 1)
 
 
 _COUNTED_AS = {"recall": "detection_rate", "recall_concentration": "detection_rate_concentration"}
@@ -172,13 +186,13 @@ def find_labels(
     scene: Scene, calibration: Calibration, config: MapConfig, *, threads: int = 0, progress: Progress = silent
 ) -> tuple[Candidates, dict[str, Any]]:
     """Return the labels, ordered by first detection, and counts of what was found and rejected."""
-    with counted(progress, "finding labels", 1) as tell:
+    with counted(progress, "finding labels", steps_of_labels(calibration)) as tell:
         position, (offsets, voters), covariance, existence, expected, counts = _core.find_labels(
             scene.core,
             calibration.as_tuple(scene.class_names),
             _settings(config),
             threads,
-            lambda _done, _total: tell(0),
+            lambda done, _total: tell(done),
         )
     covariance = covariance.reshape(-1, 3, 3)
     counts = {_COUNTED_AS.get(name, name): value for name, value in counts.items()}

@@ -8,7 +8,7 @@ from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
 from valuemap.drives import InOrder, in_driving_order
 from valuemap.progress import Progress, counted
-from valuemap.robust import Scene, misfit
+from valuemap.robust import MISFIT_STEPS, Scene, misfit
 from valuemap.sightings import cast_sightings
 from valuemap.tiles.piece import piece_of_rows
 from valuemap.tiles.source import VIEWPOINT_SHARE, InMemory
@@ -24,13 +24,13 @@ def compare_poses(
     """
     old = InMemory(before, config).sample()
     scene = Scene(old.dataset, old.drives, cast_sightings(old.dataset)[0])
-    with counted(progress, "comparing poses", 2) as tell:
-        of_old, rays = misfit(scene, config, threads=threads, going_on=lambda: tell(0))
+    with counted(progress, "comparing poses", 2 * MISFIT_STEPS) as tell:
+        of_old, rays = misfit(scene, config, threads=threads, tell=tell)
         new = _same_images(after, old, config)
         scene = Scene(new.dataset, new.drives, cast_sightings(new.dataset)[0])
         # They are in another order where poses tell the order.
         same = np.flatnonzero(np.isin(new.detection_id, old.detection_id[rays]))
-        of_new, _ = misfit(scene, config, same, threads=threads, going_on=lambda: tell(1))
+        of_new, _ = misfit(scene, config, same, threads=threads, tell=lambda done: tell(MISFIT_STEPS + done))
     return of_old, of_new, len(rays)
 
 

@@ -13,7 +13,7 @@ from valuemap.dataset import number_passes
 from valuemap.describe import describe_labels
 from valuemap.drives import InOrder
 from valuemap.progress import Progress, counted, silent
-from valuemap.robust import Calibration, Scene, find_labels
+from valuemap.robust import Calibration, Scene, find_labels, steps_of_labels
 from valuemap.sightings import cast_sightings
 from valuemap.tables import Bools, Candidates, Ints, Labels, Votes
 from valuemap.tiles.dense import groups_of_drives, join_groups
@@ -88,14 +88,15 @@ def _by_groups(
 ) -> tuple[Candidates, dict[str, Any]]:
     """Find the labels of a piece that is too dense to be solved at once, some drives at a time."""
     found, counts = [], []
-    with counted(progress, "finding labels", len(groups)) as tell:
+    steps = steps_of_labels(calibration)
+    with counted(progress, "finding labels", steps * len(groups)) as tell:
         for number, rows in enumerate(groups):
             part = piece_of_rows(piece, rows)
             detection_row = np.flatnonzero(np.isin(piece.dataset.detections.image_id, rows))
             scene = Scene(part.dataset, part.drives, cast_sightings(part.dataset)[0])
 
-            def go_on(_what: str, _done: int, _total: int, number: int = number) -> None:
-                tell(number)
+            def go_on(_what: str, done: int, _total: int, before: int = steps * number) -> None:
+                tell(before + done)
 
             of_group, of_counts = find_labels(scene, calibration, config, threads=threads, progress=go_on)
             found.append(replace(of_group, voters=detection_row[of_group.voters].astype(np.uint32)))
