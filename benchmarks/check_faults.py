@@ -479,10 +479,13 @@ def time_shift(dataset: Dataset) -> Dataset:
     return _later(dataset, 0.6, np.ones(len(dataset.images), dtype=np.bool_))
 
 
+def _dealt(count: int) -> NDArray[np.int64]:
+    return np.random.default_rng(2).permutation(count)
+
+
 def passes_no_drives(dataset: Dataset) -> Dataset:
     """Pass ids dealt at random, without times, names or numbers that tell."""
-    random = np.random.default_rng(2)
-    order = random.permutation(len(dataset.images))
+    order = _dealt(len(dataset.images))
     names = [f"{number:06d}.jpg" for number in order]
     passes = [f"batch-{number % 5}" for number in order]
     images = dataset.images.replace(name=pa.array(names), pass_id=Categories.from_texts(passes), timestamp_s=None)
@@ -490,7 +493,10 @@ def passes_no_drives(dataset: Dataset) -> Dataset:
 
 
 def as_driven(dataset: Dataset) -> Dataset:
-    """Name as one pass what was driven as one, without times: where this file cut a drive in two no poses tell."""
+    """Name as one pass what was driven as one, and nothing else that tells its order: no times, names as dealt.
+
+    Where this file cut a drive in two no poses tell, nor which way it went on where it crosses itself.
+    """
     images = dataset.images
     order = np.lexsort((np.arange(len(images)), np.asarray(images.timestamp_s), images.pass_id.codes))
     codes, center = images.pass_id.codes[order], camera_centers(images)[order]
@@ -498,8 +504,9 @@ def as_driven(dataset: Dataset) -> Dataset:
     goes_on = (np.diff(codes) == 0) | (step < 3.0 * np.median(step))
     passes = np.empty(len(order), dtype=np.int64)
     passes[order] = np.append(0, np.cumsum(~goes_on))
-    names = Categories.from_texts([f"drive-{number}" for number in passes])
-    return replace(dataset, images=images.replace(pass_id=names, timestamp_s=None))
+    drives = Categories.from_texts([f"drive-{number}" for number in passes])
+    names = pa.array([f"{number:06d}.jpg" for number in _dealt(len(images))])
+    return replace(dataset, images=images.replace(name=names, pass_id=drives, timestamp_s=None))
 
 
 def interleaved_passes(dataset: Dataset) -> Dataset | None:

@@ -16,15 +16,16 @@ from check_faults import good_city
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check import examine
 from valuemap.check.agreement import compare, measure_agreement
-from valuemap.check.cameras import PARAMETERS
+from valuemap.check.cameras import PARAMETERS, _Correction, _followed, with_focal
 from valuemap.check.contest import hold_contest
-from valuemap.check.fault import View, with_poses
+from valuemap.check.fault import View, gains_of_all, with_poses
 from valuemap.check.fit import estimate
 from valuemap.check.headings import headings, level_rotations, rotations_of
 from valuemap.check.offsets import find_shift
-from valuemap.check.passes import moved_along
+from valuemap.check.passes import _at_a_seam, _seen_m, moved_along
 from valuemap.check.registry import CONVENTIONS, FAULTS
 from valuemap.check.seams import worst_seam
+from valuemap.check.sizes import object_heights
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, read_dataset, write_dataset
 from valuemap.errors import InputError
@@ -46,6 +47,50 @@ def good() -> Dataset:
 @pytest.fixture(scope="module")
 def view(good: Dataset) -> View:
     return View(good)
+
+
+def test_key_points_have_no_size_that_could_be_wrong(good: Dataset) -> None:
+    points = good.detections.replace(size_px=np.zeros_like(good.detections.size_px))
+    assert object_heights(View(Dataset(**{**vars(good), "detections": points}))) == {}
+
+
+def test_truth_in_metres_is_not_called_misplaced_where_the_world_is_not_in_metres(good: Dataset) -> None:
+    spoiled = INJECTED["scale"].spoil(good)
+    assert spoiled is not None
+    assert [finding.fault for finding in examine(spoiled).findings] == ["scale"]
+
+
+def test_a_seam_that_rays_cannot_see_is_no_fault(good: Dataset, view: View, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen_m = _seen_m(view)
+    assert 0.1 < seen_m < 1.0  # Objects are 10 to 80 m away, the gate is 0.012 rad.
+    drive = one_drive_in_two(good)
+    is_late = drive.images.pass_id.codes == drive.images.pass_id.code_of("late")
+    up = np.where(is_late[:, None], [0.0, 0.0, 0.5 * seen_m], 0.0)
+    jumps = View(with_poses(drive, rotation_matrices(drive.images), camera_centers(drive.images) + up))
+    assert _at_a_seam(jumps) is not None
+    monkeypatch.setattr("valuemap.check.passes._seen_m", lambda _: seen_m)
+    assert _at_a_seam(jumps) is None
+
+
+def test_the_gate_is_one_angle_whatever_the_focal_length(good: Dataset, view: View) -> None:
+    """Pictures said to be wider make errors of poses fewer pixels, which is no agreement."""
+    noisy = camera_centers(good.images) + np.random.default_rng(3).normal(0.0, 1.0, (len(good.images), 3))
+    coarse = View(with_poses(good, rotation_matrices(good.images), noisy))
+    wide = with_focal(coarse.dataset, -2.0)
+    sample = coarse.many_places
+    in_pixels = measure_agreement(sample.of(wide), sample.place_of_image, coarse.gate_px).gain.sum()
+    assert gains_of_all(coarse, wide).sum() < 0.5 * in_pixels
+    assert gains_of_all(coarse, wide).sum() < gains_of_all(coarse, coarse.dataset).sum()
+
+
+def test_a_shift_in_time_is_followed_where_least_squares_stay_behind(good: Dataset, view: View) -> None:
+    shifted = View(with_poses(good, rotation_matrices(good.images), moved_along(good, 5.0)))
+    parameter = next(each for each in PARAMETERS if each.name == "along")
+    given = gains_of_all(shifted, shifted.dataset)
+    start = _Correction(parameter, -1.0, 0.05, 1e-9, compare(given, given))
+    found = _followed(shifted, start, given)
+    assert found.value == pytest.approx(-5.0, abs=0.3)
+    assert found.comparison.difference > 0.0
 
 
 def test_every_fault_of_the_registry_is_injected() -> None:

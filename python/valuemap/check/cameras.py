@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from scipy import stats
+from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from valuemap.cameras import camera_centers, rotation_matrices
@@ -143,7 +144,7 @@ def _find_correction(view: View) -> _Correction | None:
             continue
         if best is None or comparison.difference > best.comparison.difference:
             best = _Correction(parameter, value, sigma, chance, comparison)
-    return best
+    return None if best is None or given is None else _followed(view, best, given)
 
 
 class _CommonError(Fault):
@@ -249,6 +250,43 @@ def _better(view: View, parameter: Parameter, value: float, sigma: float, gains:
     settled, settled_sigma = settled_errors(view).of(parameter.name)
     settled_gains = gains_of_all(view, parameter.change(view.dataset, settled))
     return (settled, settled_sigma, settled_gains) if settled_gains.sum() > gains.sum() else (value, sigma, gains)
+
+
+def _followed(view: View, best: _Correction, given: Floats) -> _Correction:
+    """Return a correction as far as the agreement of rays rises with it.
+
+    Least squares know only the votes that there are. Of an error as large as the way between objects most are wrong,
+    and the estimate stays where these pull; the agreement, which votes anew, rises up to the error.
+    """
+    gains: dict[float, Floats] = {}
+
+    def loss(value: float) -> float:
+        gains[value] = gains_of_all(view, best.parameter.change(view.dataset, value))
+        return -float(gains[value].sum())
+
+    value, least = best.value, loss(best.value)
+    for _ in range(_MOST_DOUBLINGS):
+        farther = loss(2.0 * value)
+        if farther >= least:
+            break
+        value, least = 2.0 * value, farther
+    if value == best.value:
+        return best
+    minimize_scalar(
+        loss,
+        bounds=(min(value / 2.0, 2.0 * value), max(value / 2.0, 2.0 * value)),
+        method="bounded",
+        options={"xatol": best.sigma, "maxiter": _MOST_STEPS},
+    )
+    value = max(gains, key=lambda each: float(gains[each].sum()))
+    comparison = compare(gains[value], given)
+    # The values tried count as tests, as those before did.
+    chance = max(best.chance, comparison.chance * len(gains))
+    return _Correction(best.parameter, value, best.sigma, chance, comparison)
+
+
+_MOST_DOUBLINGS, _MOST_STEPS = 6, 12
+"""Of a search that ends by itself as soon as the agreement falls: of turns it need not."""
 
 
 def _changed(dataset: Dataset, *, parameter: Parameter, value: float) -> Dataset:

@@ -70,8 +70,8 @@ def examine(dataset: Dataset, *, progress: Progress = silent) -> Examination:
                 finding, tells = hold_contest(view, CONVENTIONS, progress)
                 if tells is None:
                     notes.append(
-                        "However the data are read, rays meet no better than by chance: too few detections show one "
-                        "object from several places, or the poses are no poses of these pictures."
+                        "However the data are read, it cannot be told that rays meet better than by chance: too few "
+                        "detections show one object from several places, or the poses are no poses of these pictures."
                     )
                 gate_share = tells or gate_share
                 found = [] if finding is None else [finding]
@@ -90,10 +90,12 @@ def examine(dataset: Dataset, *, progress: Progress = silent) -> Examination:
 def _look(view: View, stage: str, progress: Progress) -> list[Finding]:
     """Return the first fault of a stage that can be put right, and all before it that cannot."""
     faults = [fault for fault in FAULTS if fault.stage == stage]
-    found = []
+    found: list[Finding] = []
     for number, fault in enumerate(faults):
         progress(_WORK[stage], number, len(faults))
         if fault.name in view.known and stage != "fine":
+            continue
+        if fault.explained_by & (view.known | {finding.fault for finding in found}):
             continue
         finding = fault.find(view)
         if finding is not None and not (finding.fix is None and finding.fault in view.known):

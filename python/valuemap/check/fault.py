@@ -148,9 +148,13 @@ def uprightness(dataset: Dataset) -> float:
 
 
 def gains_of_all(view: View, dataset: Dataset) -> Floats:
-    """Return the gains of a version of the whole dataset on all that a check looks at: stretches and places."""
+    """Return the gains of a version of the whole dataset on all that a check looks at: stretches and places.
+
+    The gate is the same angle in every version: of pictures said to be wider, errors of poses are fewer pixels.
+    """
     samples = (view.stretches, view.many_places)
-    return np.concatenate([measure_agreement(s.of(dataset), s.place_of_image, view.gate_px).gain for s in samples])
+    gate_px = view.gate_px * pixels_per_radian(dataset) / pixels_per_radian(view.dataset)
+    return np.concatenate([measure_agreement(s.of(dataset), s.place_of_image, gate_px).gain for s in samples])
 
 
 class Fault(ABC):
@@ -158,6 +162,8 @@ class Fault(ABC):
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
+    explained_by: ClassVar[frozenset[str]] = frozenset()
+    """Faults that look like this one too: where one of them was found, this one is not looked for."""
 
     @abstractmethod
     def find(self, view: View) -> Finding | None:

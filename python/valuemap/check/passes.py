@@ -17,6 +17,7 @@ from valuemap.cameras import Rays, camera_centers, rotation_matrices
 from valuemap.check.agreement import compare, measure_agreement
 from valuemap.check.boxes import rows_in_images
 from valuemap.check.fault import (
+    GATE_RAD,
     LEAST_CHANCE,
     Convention,
     Fault,
@@ -484,10 +485,20 @@ def _worst_pass(view: View) -> PassShift | None:
     return _apart_from_others(view) or _at_a_seam(view)
 
 
+def _seen_m(view: View) -> float:
+    """Return how far poses must be off to be seen at all: the gate of rays at the usual distance of what they show."""
+    if not len(view.dataset.detections) or not len(view.agreement.found):
+        return 0.0
+    found, rays = view.agreement.found, view.agreement.rays
+    point = np.repeat(found.position_in_world_m, np.diff(found.voter_offsets), axis=0)
+    ray_m = point - rays.center_in_world_m[found.voters.astype(np.int64)]
+    return GATE_RAD * view.gate_share * float(np.median(np.linalg.norm(ray_m, axis=1)))
+
+
 def _at_a_seam(view: View) -> PassShift | None:
     """Return the shift that closes the largest jump between passes that are one drive: of the shorter of the two."""
     seam = worst_seam(view.dataset, view.center_in_world_m)
-    if seam is None or seam.chance > LEAST_CHANCE:
+    if seam is None or seam.chance > LEAST_CHANCE or float(np.linalg.norm(seam.jump_m)) < _seen_m(view):
         return None
     images = view.dataset.images
     count = {name: int((images.pass_id.codes == images.pass_id.code_of(name)).sum()) for name in images.pass_id.names}

@@ -166,6 +166,7 @@ class TruthElsewhere(Fault):
 
     name: ClassVar[str] = "truth_elsewhere"
     stage: ClassVar[Stage] = "results"
+    explained_by: ClassVar[frozenset[str]] = frozenset({"scale"})  # Truth in metres is not where such a world's is.
 
     def find(self, view: View) -> Finding | None:
         """Look for the shift, after other orders of axes, by which most points where rays meet get an object."""

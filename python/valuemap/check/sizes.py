@@ -27,7 +27,10 @@ def plausible_heights(class_name: str) -> tuple[float, float]:
 
 
 def object_heights(view: View) -> dict[str, tuple[float, int]]:
-    """Return, for each class, the median height in metres of the points where rays meet, and how many these are."""
+    """Return, for each class, the median height in metres of the points where rays meet, and how many these are.
+
+    Classes whose detections are points without a size are left out.
+    """
     agreement = view.agreement
     found = agreement.found
     votes = np.diff(found.voter_offsets)
@@ -43,6 +46,7 @@ def object_heights(view: View) -> dict[str, tuple[float, int]]:
         of_class = (class_code == code) & (votes >= _LEAST_VOTES)
         # Chance makes points of few votes; what most votes are for is what is there.
         of_class &= votes >= np.median(votes[of_class]) if np.any(of_class) else of_class
+        of_class &= median > 0.0  # Key points have no size.
         if np.any(of_class):
             result[name] = (float(np.median(median[of_class])), int(of_class.sum()))
     return result

@@ -20,9 +20,7 @@ _GAP_STEPS = 5.0
 _MOST_OFF_DEG = 30.0
 """Of a direction of travel that is off by more it does not matter how far: there the car did not go where it looked."""
 _ROUNDS = 2
-"""The first headings tell how far the camera moves outwards in bends, which makes the second better."""
-_WEIGHT_OF_CHANGES = 20.0
-"""How much more one degree counts between images than between an image and its direction of travel."""
+"""The first headings tell how far the camera moves outwards in bends and how far cars look off their way."""
 
 
 def rotations_from_degrees(dataset: Dataset, *, zero_rad: float, clockwise: bool) -> Floats:
@@ -52,14 +50,18 @@ def rotations_from_degrees(dataset: Dataset, *, zero_rad: float, clockwise: bool
         usual_pitch = float(np.median(pitch[images])) if usual_pitch is None else usual_pitch
     right = np.empty(len(order))
     outwards_m = 0.0
+    # Of headings of which nothing is known but a remainder, the nearest is evenly off up to half of 2 pi degrees.
+    off_deg = _TURN / 4.0
     for _ in range(_ROUNDS):
+        looks_rad = travel.azimuth - outwards_m * travel.turn_per_m
+        wanted_deg = np.degrees(_wrap(way * (looks_rad - zero_rad), np.pi))
+        remainder_deg = way * (azimuth[order] - zero_rad)
+        weight = _weight_of_changes(off_deg, _change_deg(remainder_deg, wanted_deg, travel))
         for rows in travel.stretches:
-            images = order[rows]
-            looks_rad = travel.azimuth[rows] - outwards_m * travel.turn_per_m[rows]
-            wanted_deg = np.degrees(_wrap(way * (looks_rad - zero_rad), np.pi))
-            heading_deg = _headings_deg(way * (azimuth[images] - zero_rad), wanted_deg, travel.is_moving[rows])
-            right[images] = zero_rad + way * np.radians(heading_deg)
+            heading_deg = _headings_deg(remainder_deg[rows], wanted_deg[rows], travel.is_moving[rows], weight)
+            right[order[rows]] = zero_rad + way * np.radians(heading_deg)
         outwards_m = travel.outwards_m(right[order])
+        off_deg = travel.off_deg(right[order], outwards_m)
     return rotations_of(right, np.radians(pitch), np.radians(roll), dataset.frame)
 
 
@@ -95,6 +97,46 @@ class _Travel:
         turn = self.turn_per_m[known]
         return float(turn @ off[known] / max(float(turn @ turn), 1e-12))
 
+    def off_deg(self, heading_rad: Floats, outwards_m: float) -> float:
+        """Return how far cameras look off their way: the median of the images that move."""
+        off = np.degrees(np.abs(_wrap(self.azimuth - outwards_m * self.turn_per_m - heading_rad, np.pi)))
+        return float(np.median(off[self.is_moving])) if self.is_moving.any() else 0.0
+
+
+def _weight_of_changes(off_deg: float, change_deg: float) -> float:
+    """Return how much more a degree counts by which a camera turns otherwise than its way than one by which it is off.
+
+    How far a camera looks off its way stays from image to image: it is an autoregression of first order, whose
+    correlation is 1 - (change / off)^2 / 2. Images that are correlated say the same thing about how far it is off, once
+    for 1 / (1 - correlation) of them, while changes are independent.
+
+    Parameters
+    ----------
+    off_deg, change_deg
+        Median sizes of how far it is off, and of how much that changes from image to image.
+    """
+    ratio = off_deg / max(change_deg, _EXACT_DEG)
+    return ratio * max(2.0 * ratio**2, 1.0)
+
+
+_EXACT_DEG = 0.01
+"""Degrees that are written with two decimals change by no less."""
+
+
+def _change_deg(remainder_deg: Floats, wanted_deg: Floats, travel: _Travel) -> float:
+    """Return the median size of how much more than its way a camera turns, as remainders of 2 pi degrees tell it."""
+    found = [
+        np.abs(_wrap(np.diff(remainder_deg[rows]) - _changes(wanted_deg[rows], travel.is_moving[rows]), _TURN / 2.0))
+        for rows in travel.stretches
+    ]
+    every = np.concatenate(found)
+    return float(np.median(every)) if len(every) else 0.0
+
+
+def _changes(wanted_deg: Floats, is_moving: Bools) -> Floats:
+    """Return by how much the way turns from image to image (K - 1), 0 where it is not known."""
+    return np.where(is_moving[1:] & is_moving[:-1], _wrap(np.diff(wanted_deg), 180.0), 0.0)
+
 
 def _is_turned_over(pitch: Floats, roll: Floats) -> Bools:
     """Return of which images (K) of a pass the other triple of angles is meant that gives the same rotation.
@@ -119,7 +161,7 @@ def _steady(angle: Floats, usual: float) -> Floats:
     return np.asarray(own - _TURN * np.round((np.median(own) - usual) / _TURN))
 
 
-def _headings_deg(heading: Floats, wanted_deg: Floats, is_moving: Bools) -> Floats:
+def _headings_deg(heading: Floats, wanted_deg: Floats, is_moving: Bools, weight_of_changes: float) -> Floats:
     """Return headings (K) in degrees, -180 to 180, known but for multiples of 2 pi, so that their changes and
     themselves are as near as can be to the directions of travel: the cheapest path through all multiples.
     """
@@ -127,11 +169,11 @@ def _headings_deg(heading: Floats, wanted_deg: Floats, is_moving: Bools) -> Floa
     choices = np.mod(heading + 180.0, _TURN)[:, None] - 180.0 + _TURN * (multiples - multiples[0])
     off = np.minimum(np.abs(_wrap(choices - wanted_deg[:, None], 180.0)), _MOST_OFF_DEG)
     off = np.where(is_moving[:, None], off, 0.0) + np.where(choices > 180.0, np.inf, 0.0)
-    change = np.where(is_moving[1:] & is_moving[:-1], _wrap(np.diff(wanted_deg), 180.0), 0.0)
+    change = _changes(wanted_deg, is_moving)
     cost, came_from = off[0], np.zeros(choices.shape, dtype=np.int64)
     for i in range(1, len(choices)):
         step = choices[i] - choices[i - 1][:, None] - change[i - 1]
-        total = cost[:, None] + _WEIGHT_OF_CHANGES * np.abs(_wrap(step, 180.0))
+        total = cost[:, None] + weight_of_changes * np.abs(_wrap(step, 180.0))
         came_from[i] = total.argmin(axis=0)
         cost = total.min(axis=0) + off[i]
     path = np.empty(len(choices), dtype=np.int64)
