@@ -20,15 +20,15 @@ from valuemap.drives import Drives, find_drives, in_driving_order
 from valuemap.engine.threads import ThreadEngine
 from valuemap.refine import Refined, adjust, refine_poses
 from valuemap.refine.adjust import Adjustment, Scales
-from valuemap.refine.estimate import delay_together, mounts_alone, segment
+from valuemap.refine.estimate import delay_together, lay, mounts_alone, segment
 from valuemap.refine.footage import Footage, Sigmas, find_motion, gather, in_working_frame
 from valuemap.refine.jumps import Legs, find_hints, find_jumps
 from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
 from valuemap.refine.register import register
-from valuemap.refine.residuals import MOUNT, OFFSET, Observations, State, residuals, weights
+from valuemap.refine.residuals import MOUNT, OFFSET, Observations, State, residuals, rotations, weights
 from valuemap.refine.select import _Equations
 from valuemap.simulate import simulate
-from valuemap.tables import Floats, Ints
+from valuemap.tables import Floats, Images, Ints
 from valuemap.tiles.work import open_work
 
 CITY = SimulationConfig(
@@ -172,9 +172,11 @@ def test_a_delay_of_all_poses_is_one_number_of_the_camera() -> None:
 def test_what_drives_see_comes_together_at_the_delay_of_their_poses(delay_s: float) -> None:
     ordered = in_driving_order(city(pose_delay_s=delay_s), viewpoint_step_m=1.0)
     footage = gather(*in_working_frame(ordered.dataset, ordered.drives, 1.0))
-    marks = find_landmarks(
-        footage.dataset, footage.rays, footage.drives, footage.drives.pass_code, valuemap.MapConfig()
+    drive, hints = footage.drives.pass_code, find_hints(footage.dataset, footage.drives)
+    marks = lay(
+        find_landmarks(footage.dataset, footage.rays, footage.drives, drive, valuemap.MapConfig()), footage, hints
     )
+    assert marks is not None
     assert delay_together(footage, marks) == pytest.approx(delay_s, abs=0.05)
 
 
@@ -462,3 +464,39 @@ def test_poses_that_are_right_cost_few_steps(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(Adjustment, "step", counted)
     refine_poses(city(), valuemap.MapConfig())
     assert 10 < taken < 60
+
+
+@pytest.mark.parametrize("late_s", [0.03, 0.1, -0.03, -0.1])
+def test_a_turn_that_begins_or_ends_between_two_images_is_none_before_or_after(late_s: float) -> None:
+    # One camera, four images a second; it turns at once by 60 degrees a second from 2.07 s to 4.12 s.
+    time_s = 0.25 * np.arange(24)
+
+    def azimuth_rad(at_s: Floats) -> Floats:
+        return np.radians(60.0) * np.clip(at_s - 2.07, 0.0, 4.12 - 2.07)
+
+    def images(at_s: Floats) -> Images:
+        rotation = Rotation.from_euler("y", azimuth_rad(at_s)[:, None])
+        quat = rotation.as_quat(canonical=True, scalar_first=True)
+        center = np.column_stack([5.0 * at_s, np.zeros((len(at_s), 2))])
+        return dataset.images.take(np.arange(len(at_s))).replace(
+            cam_from_world_quat=quat,
+            cam_from_world_m=-np.einsum("nij,nj->ni", rotation.as_matrix(), center),
+            timestamp_s=time_s,
+        )
+
+    dataset = city()
+    recorded, true = (dataclasses.replace(dataset, images=images(at)) for at in (time_s, time_s + late_s))
+    count = len(time_s)
+    drives = dataclasses.replace(
+        find_drives(dataset.images),
+        pass_code=np.zeros(count, np.int64),
+        order=np.arange(count),
+        driven_m=5.0 * time_s,
+        viewpoint=np.arange(count),
+    )
+    for known, worst_deg in ((np.full(count, late_s), 1e-3), (None, 0.5)):
+        motion = find_motion(recorded, drives, late_s=known)
+        rate = motion.forward_radps if late_s > 0.0 else motion.backward_radps
+        turned = rotations(late_s * rate) @ camera_poses(recorded.images)[0]
+        off = Rotation.from_matrix(turned @ camera_poses(true.images)[0].transpose(0, 2, 1)).magnitude()
+        assert (np.degrees(off).max() < worst_deg) == (known is not None)

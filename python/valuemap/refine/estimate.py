@@ -67,9 +67,34 @@ class Estimate:
     landmarks: int
 
 
+@dataclass(frozen=True, eq=False)
+class Marks:
+    """Landmarks with their covariances (N, 3, 3), m², and how those of all drives lie to each other."""
+
+    landmarks: Landmarks
+    covariance: Floats
+    registration: Registration
+
+
+def lay(landmarks: Landmarks, footage: Footage, hints: Hints) -> Marks | None:
+    """Lay the landmarks of a footage onto each other, None where too few of them say where they are."""
+    usable = _usable(landmarks, footage)
+    if usable is None:
+        return None
+    landmarks, covariance = usable
+    order = footage.drives.order[footage.rays.image_row[landmarks.voters]].astype(np.float64)
+    order = _core.medians(order, landmarks.offsets).astype(np.int64)
+    evidence = np.zeros(len(landmarks))
+    for drive in range(footage.drives.count):
+        rows = np.flatnonzero(landmarks.drive == drive)
+        rows = rows[np.argsort(landmarks.driven_m[rows], kind="stable")]
+        evidence[rows] = hints.between(drive, np.maximum.accumulate(order[rows]))
+    return Marks(landmarks, covariance, register(landmarks, covariance, evidence))
+
+
 def estimate(
     footage: Footage,
-    landmarks: Landmarks,
+    marks: Marks,
     config: MapConfig,
     *,
     seen_cuts: Legs,
@@ -77,19 +102,14 @@ def estimate(
     known: tuple[Legs, Floats] | None = None,
     turned_rad: Floats | None = None,
     late_s: float = 0.0,
-    laid: Footage | None = None,
 ) -> Estimate | None:
     """Estimate everything that drives may be wrong by, None where there is too little that drives share.
 
     `seen_cuts` are where the trajectory itself jumps, `hints` where it may. Where legs and their offsets (L, 3) are
     `known` about, or how the cameras of drives are turned (D, 3), or how late poses are, the landmarks are those of the
-    footage `laid` so.
+    footage laid so.
     """
-    marks = _usable(landmarks, laid or footage)
-    if marks is None:
-        return None
-    landmarks, covariance = marks
-    registration = register(landmarks, covariance)
+    landmarks, registration = marks.landmarks, marks.registration
     legs, offset = _first_legs(footage, landmarks, registration, seen_cuts)
     if known is not None:
         legs, offset = _added(legs, offset, *known)
@@ -159,25 +179,32 @@ def mounts_alone(footage: Footage, landmarks: Landmarks) -> Floats:
     return turned
 
 
-def delay_together(footage: Footage, landmarks: Landmarks) -> float:
+def delay_together(footage: Footage, marks: Marks) -> float:
     """Return by how many seconds all poses seem to be late: that by which what drives see best comes together.
 
     A delay moves what is seen from opposite directions apart, so that later steps would take one thing for two. It is
     no more than a start for them. Zero where another delay does not explain more than its price: every pair of
     landmarks counts twice in the sum, so the price of Bayes' information criterion is the logarithm of their number.
+    Where the shifts of the registration explain more than a delay does, each at its price, it is told beside them.
     """
-    marks = _usable(landmarks, footage)
-    if marks is None:
-        return 0.0
-    landmarks, covariance = marks
+    landmarks, covariance = marks.landmarks, marks.covariance
     mark, image = landmarks.landmark_of_voter(), footage.rays.image_row[landmarks.voters]
     velocity = 0.5 * (footage.motion.forward_mps[image] + footage.motion.backward_mps[image])
     voters = np.diff(landmarks.offsets)
     mean = np.stack([np.bincount(mark, weights=axis) / voters for axis in velocity.T], axis=1)
-    fits = np.array([togetherness(landmarks, covariance, delay * mean) for delay in _DELAYS_S])
-    best = int(np.argmax(fits))
-    gain = fits[best] - fits[len(_DELAYS_S) // 2]
-    return float(_DELAYS_S[best]) if gain > math.log(len(landmarks)) else 0.0
+    price, none = math.log(len(landmarks)), len(_DELAYS_S) // 2
+
+    def gains(shift_m: Floats) -> Floats:
+        return np.array([togetherness(landmarks, covariance, shift_m + delay * mean) for delay in _DELAYS_S])
+
+    shift_m = marks.registration.shift_m
+    alone = gains(np.zeros_like(shift_m))
+    pieces = np.unique(np.column_stack([landmarks.leg, shift_m])[shift_m.any(axis=1)], axis=0)
+    of_shifts = togetherness(landmarks, covariance, shift_m) - alone[none] - price * len(pieces)
+    if of_shifts > max(alone.max() - alone[none] - price, 0.0):
+        alone = gains(shift_m)
+    best = int(np.argmax(alone))
+    return float(_DELAYS_S[best]) if alone[best] - alone[none] > price else 0.0
 
 
 def everything(footage: Footage, legs: Legs) -> tuple[Bools, ...]:

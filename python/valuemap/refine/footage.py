@@ -21,6 +21,8 @@ DRIFT_LENGTH_M = 100.0
 """The way over which drift forgets 63 % of itself."""
 _MOST_STEPS = 4.0
 """Images farther apart in time than so many usual steps say nothing of the velocity between them."""
+_SUDDEN = 3.0
+"""A rate that changes over a step by so many times what it does over those beside it changes within the step."""
 _TREMBLES = 4.0
 """Velocities before and after an image that differ by more than so many times what is usual are not the same."""
 
@@ -206,8 +208,12 @@ def _from_middle(dataset: Dataset, rays: Rays) -> Floats:
     return offset
 
 
-def find_motion(dataset: Dataset, drives: Drives) -> Motion:
-    """Return how all images move, from the images of the same camera before and after them in the drive."""
+def find_motion(dataset: Dataset, drives: Drives, *, late_s: Floats | None = None) -> Motion:
+    """Return how all images move, from the images of the same camera before and after them in the drive.
+
+    Where it is known how `late_s` (N) they are, rates are those of so much of the step alone: where a turn begins or
+    ends within it, it turns before or after that only.
+    """
     images = dataset.images
     rotation, center = camera_poses(images)
     time = np.full(len(images), np.nan) if images.timestamp_s is None else images.timestamp_s
@@ -229,24 +235,57 @@ def find_motion(dataset: Dataset, drives: Drives) -> Motion:
         seconds = np.where(usable, step, np.inf)[:, None]
         speed = np.diff(center[rows], axis=0) / seconds
         rate = _turns(rotation[rows]) / seconds
-        for values, on, back in ((speed, forward, backward), (rate, turn_on, turn_back)):
+        ahead = behind = rate
+        if late_s is not None:
+            ahead = _within(rate, step, np.abs(late_s[rows[:-1]]))
+            behind = _within(rate[::-1], step[::-1], np.abs(late_s[rows[:0:-1]]))[::-1]
+        for values, after, before, on, back in (
+            (speed, speed, speed, forward, backward),
+            (rate, ahead, behind, turn_on, turn_back),
+        ):
             on[rows[:-1]], back[rows[1:]] = values, values
             # At an end, as on the other side.
             starts, ends = np.append(True, ~usable), np.append(~usable, True)
             back[rows[starts]], on[rows[ends]] = on[rows[starts]], back[rows[ends]]
-            on[rows], back[rows] = _steadied(on[rows], back[rows])
+            same = _trembles(on[rows], back[rows])
+            mean = 0.5 * (on[rows] + back[rows])
+            # At an end, both are those of the one step that there is.
+            on[rows[:-1]] = np.where(starts[:-1, None] | ends[:-1, None], on[rows[:-1]], after)
+            back[rows[1:]] = np.where(starts[1:, None] | ends[1:, None], back[rows[1:]], before)
+            on[rows], back[rows] = np.where(same, mean, on[rows]), np.where(same, mean, back[rows])
     return Motion(forward, backward, turn_on, turn_back, is_timed)
 
 
-def _steadied(on: Floats, back: Floats) -> tuple[Floats, Floats]:
-    """Return the velocities (N, 3) after and before images of which those that only poses' trembling tells apart agree.
+def _trembles(on: Floats, back: Floats) -> Bools:
+    """Return at which images (N, 1) only poses' trembling tells velocities (N, 3) after and before them apart.
 
     The mean of both has no part of the error of the image itself.
     """
     apart = np.linalg.norm(on - back, axis=1)
-    same = (apart <= _TREMBLES * np.median(apart))[:, None]
-    mean = 0.5 * (on + back)
-    return np.where(same, mean, on), np.where(same, mean, back)
+    return np.asarray((apart <= _TREMBLES * np.median(apart))[:, None])
+
+
+def _within(rate: Floats, step_s: Floats, late_s: Floats) -> Floats:
+    """Return the mean rates (N, 3) of the first `late_s` (N) of each step, from those of whole steps (N, 3).
+
+    Rates are means over steps. Where one is between those beside it, and they differ by far more than each of them from
+    the one beyond it, the rate changes at once within the step, where it explains the mean (the subcell resolution of
+    Harten 1989). Elsewhere it is the mean.
+    """
+    mean = rate.copy()
+    if len(rate) < 5:
+        return mean
+    change = np.linalg.norm(np.diff(rate, axis=0), axis=1)
+    across = rate[1:-3] - rate[3:-1]
+    square = np.sum(across**2, axis=1)
+    is_sudden = np.sqrt(square) > _SUDDEN * np.maximum(change[:-3], change[3:])
+    share = np.sum((rate[2:-2] - rate[3:-1]) * across, axis=1) / np.where(square > 0.0, square, 1.0)
+    is_sudden &= (share > 0.0) & (share < 1.0)
+    until = share * step_s[2:-2]
+    late = late_s[2:-2]
+    before = np.where(late > until, until / np.where(late > 0.0, late, 1.0), 1.0)[:, None]
+    mean[2:-2] = np.where(is_sudden[:, None], before * rate[1:-3] + (1.0 - before) * rate[3:-1], rate[2:-2])
+    return mean
 
 
 def _turns(rotation: Floats) -> Floats:

@@ -15,7 +15,7 @@ from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives, in_driving_order
 from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
-from valuemap.refine.estimate import Estimate, delay_together, estimate, mounts_alone
+from valuemap.refine.estimate import Estimate, delay_together, estimate, lay, mounts_alone
 from valuemap.refine.footage import Footage, find_motion, gather, in_working_frame
 from valuemap.refine.jumps import Legs, find_hints, find_jumps
 from valuemap.refine.landmarks import find_landmarks
@@ -135,15 +135,17 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
             turned = turned + more
             laid = _laid(footage, turned)
             landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, leg, config, threads=threads)
-        late_s = delay_together(laid, landmarks)
+        marks = lay(landmarks, laid, hints)
+        late_s = 0.0 if marks is None else delay_together(laid, marks)
         if late_s:
             laid = _laid(footage, turned, late_s)
             landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, leg, config, threads=threads)
+            marks = lay(landmarks, laid, hints)
     except SettingError:  # So many detections in one place that their votes fill the memory.
         return None
-    result = estimate(
-        footage, landmarks, config, seen_cuts=jumps, hints=hints, turned_rad=turned, late_s=late_s, laid=laid
-    )
+    if marks is None:
+        return None
+    result = estimate(footage, marks, config, seen_cuts=jumps, hints=hints, turned_rad=turned, late_s=late_s)
     if result is None:
         return None
     if _is_lost(footage, result):
@@ -154,17 +156,12 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
             landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, leg, config, threads=threads)
         except SettingError:
             return None
-        again = estimate(
-            footage,
-            landmarks,
-            config,
-            seen_cuts=jumps,
-            hints=hints,
-            known=known,
-            turned_rad=turned,
-            late_s=late_s,
-            laid=laid,
-        )
+        marks = lay(landmarks, laid, hints)
+        again = None
+        if marks is not None:
+            again = estimate(
+                footage, marks, config, seen_cuts=jumps, hints=hints, known=known, turned_rad=turned, late_s=late_s
+            )
         if again is not None and len(again.thing) >= len(result.thing):
             result = again
     return _Found(footage, result, select(footage, result))
@@ -186,7 +183,7 @@ def _laid(
     images, drives = footage.whole.images, footage.whole_drives
     rotation, center = camera_poses(images)
     if late_s:
-        motion = find_motion(footage.whole, drives)
+        motion = find_motion(footage.whole, drives, late_s=np.full(len(center), late_s))
         ahead = late_s > 0.0
         center = center + late_s * (motion.forward_mps if ahead else motion.backward_mps)
         rotation = rotations(late_s * (motion.forward_radps if ahead else motion.backward_radps)) @ rotation
@@ -244,8 +241,8 @@ def _apply(dataset: Dataset, drives: Drives, found: _Found, selected: Selected, 
     drive, camera = drives.pass_code, rows_of(images.camera_id, dataset.cameras.camera_id)
     leg = found.result.legs.of(drive, drives.order)
     rotation, center = camera_poses(images)
-    motion = find_motion(dataset, drives)
     late_s = (delay[drive, 0] + camera_delay[camera, 0])[:, None]
+    motion = find_motion(dataset, drives, late_s=late_s[:, 0])
     ahead = late_s >= 0.0
     center = center + np.where(ahead, motion.forward_mps, motion.backward_mps) * late_s + unit_m * offset[leg] @ axes
     turned = rotations(np.where(ahead, motion.forward_radps, motion.backward_radps) * late_s) @ rotation

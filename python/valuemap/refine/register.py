@@ -55,9 +55,14 @@ class Registration:
     object_of_landmark: Ints
 
 
-def register(landmarks: Landmarks, covariance: Floats) -> Registration:
-    """Lay the landmarks of all drives, with covariances (N, 3, 3) in m², onto each other; up is z."""
+def register(landmarks: Landmarks, covariance: Floats, evidence: Floats | None = None) -> Registration:
+    """Lay the landmarks of all drives, with covariances (N, 3, 3) in m², onto each other; up is z.
+
+    `evidence` (N) is how much the trajectory speaks, as in `Hints`, for a jump between the landmark and the one before
+    it in its drive.
+    """
     point = landmarks.point_in_world_m
+    price = np.full(len(point), _JUMP) if evidence is None else np.maximum(_JUMP - 0.5 * evidence, _NEW_LEG)
     by_drive = [
         rows[np.argsort(landmarks.driven_m[rows], kind="stable")]
         for rows in np.split(
@@ -68,7 +73,7 @@ def register(landmarks: Landmarks, covariance: Floats) -> Registration:
     ]
     shift = np.zeros_like(point)
     thing = np.full(len(point), -1)
-    known = _Objects(landmarks, point, covariance)
+    known = _Objects(landmarks, point, covariance, price)
     for drive in _order_of_laying(point, by_drive):
         _lay(by_drive[drive], point, covariance, shift, thing, known)
     for _ in range(_ROUNDS):
@@ -123,8 +128,8 @@ def _order_of_laying(point: Floats, by_drive: list[Ints]) -> list[int]:
 class _Objects:
     """Objects as sums of information of the landmarks that show them."""
 
-    def __init__(self, landmarks: Landmarks, point: Floats, covariance: Floats) -> None:
-        self.landmarks, self.point = landmarks, point
+    def __init__(self, landmarks: Landmarks, point: Floats, covariance: Floats, price: Floats) -> None:
+        self.landmarks, self.point, self.price = landmarks, point, price
         self.weight = np.linalg.inv(covariance)
         self.information = np.zeros((0, 3, 3))
         self.vector = np.zeros((0, 3))
@@ -173,7 +178,7 @@ def _lay(rows: Ints, point: Floats, covariance: Floats, shift: Floats, thing: In
         near = [[] for _ in rows]
     pairs = _compatible(rows, near, objects, known)
     if pairs[0].size:
-        price = np.where(np.diff(known.landmarks.leg[rows]) != 0, _NEW_LEG, _JUMP)
+        price = np.where(np.diff(known.landmarks.leg[rows]) != 0, _NEW_LEG, known.price[rows[1:]])
         shift[rows] = _chain(rows, pairs, point, covariance, place, spread, price)
     _match(rows, pairs, objects, point, covariance, place, spread, shift, thing, known)
 
