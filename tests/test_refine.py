@@ -469,10 +469,10 @@ def test_poses_that_are_right_cost_few_steps(monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.parametrize("late_s", [0.03, 0.1, -0.03, -0.1])
 def test_a_turn_that_begins_or_ends_between_two_images_is_none_before_or_after(late_s: float) -> None:
     # One camera, four images a second; it turns at once by 60 degrees a second from 2.07 s to 4.12 s.
-    time_s = 0.25 * np.arange(24)
+    time_s: Floats = np.asarray(0.25 * np.arange(24))
 
     def azimuth_rad(at_s: Floats) -> Floats:
-        return np.radians(60.0) * np.clip(at_s - 2.07, 0.0, 4.12 - 2.07)
+        return np.asarray(np.radians(60.0) * np.clip(at_s - 2.07, 0.0, 4.12 - 2.07))
 
     def images(at_s: Floats) -> Images:
         rotation = Rotation.from_euler("y", azimuth_rad(at_s)[:, None])
@@ -485,13 +485,13 @@ def test_a_turn_that_begins_or_ends_between_two_images_is_none_before_or_after(l
         )
 
     dataset = city()
-    recorded, true = (dataclasses.replace(dataset, images=images(at)) for at in (time_s, time_s + late_s))
+    recorded, true = (dataclasses.replace(dataset, images=images(at)) for at in (time_s, np.asarray(time_s + late_s)))
     count = len(time_s)
     drives = dataclasses.replace(
         find_drives(dataset.images),
         pass_code=np.zeros(count, np.int64),
         order=np.arange(count),
-        driven_m=5.0 * time_s,
+        driven_m=np.asarray(5.0 * time_s),
         viewpoint=np.arange(count),
     )
     for known, worst_deg in ((np.full(count, late_s), 1e-3), (None, 0.5)):
