@@ -8,10 +8,16 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from valuemap import pipeline
+from valuemap.cameras import rotation_matrices
 from valuemap.config import MapConfig
+from valuemap.dataset import Dataset
 from valuemap.engine.engine import Engine
 from valuemap.engine.ray import RayEngine, import_ray
 from valuemap.engine.threads import ThreadEngine
@@ -19,6 +25,7 @@ from valuemap.errors import ClusterError, InputError, ValuemapError
 from valuemap.map_folder import write_map
 from valuemap.pipeline import Run, build_map_of_folder
 from valuemap.progress import Progress
+from valuemap.refine import Refined
 from valuemap.tiles.work import open_work
 
 os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "a" * 64}
@@ -34,6 +41,12 @@ def mapped(folder: Path, engine: Engine, name: str, progress: Progress) -> dict[
     names = ["labels.parquet", "votes.parquet", "calibration.json"]
     names += sorted(f"cells/{path.name}" for path in cells)
     return {each: (folder / name / each).read_bytes() for each in names}
+
+
+def moved_by_a_metre(dataset: Dataset, *_: object, **__: object) -> Refined:
+    by_m = -rotation_matrices(dataset.images) @ np.array([0.0, 1.0, 0.0])
+    images = dataset.images.replace(cam_from_world_m=dataset.images.cam_from_world_m + by_m)
+    return Refined(replace(dataset, images=images), {"found": "faults"}, is_corrected=True)
 
 
 def fails(number: int, _progress: Progress) -> int:
@@ -67,6 +80,13 @@ def main(folder: Path) -> None:
 
     expected = mapped(folder, ThreadEngine(2), "threads", lambda *_: None)
     assert mapped(folder, engine, "ray", lambda *_: None) == expected
+    # Poses that were corrected go to the tasks by the dataset that is written with them.
+    setattr(pipeline, "refine_poses", moved_by_a_metre)  # noqa: B010
+    setattr(pipeline, "compare_poses", lambda *_, **__: (2.0, 1.0, 10))  # noqa: B010
+    corrected = mapped(folder, ThreadEngine(2), "threads-moved", lambda *_: None)
+    assert corrected["labels.parquet"] != expected["labels.parquet"]
+    assert mapped(folder, engine, "ray-moved", lambda *_: None) == corrected
+    setattr(pipeline, "refine_poses", lambda dataset, *_, **__: Refined(dataset, {"found": "nothing"}))  # noqa: B010
     print("identical")
 
     assert sorted(engine.run(dies, [str(folder / f"dead-{i}") for i in range(3)])) == [(0, 1), (1, 1), (2, 1)]

@@ -12,11 +12,14 @@ from typer.testing import CliRunner
 import valuemap
 from literal import Pinhole, Sighting
 from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
+from valuemap import pipeline
+from valuemap.cameras import rotation_matrices
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError
 from valuemap.evidence import Evidence
 from valuemap.map_folder import Map
+from valuemap.refine import Refined
 from valuemap.rejected import find_rejected
 from valuemap.tables import Categories, Changes, Floats, IdBridge, join_tables, read_table, table_to_arrow
 from valuemap.update import compare
@@ -269,3 +272,43 @@ def test_what_cannot_be_updated_says_so(years: Path, tmp_path: Path) -> None:
     assert result.exit_code == 1
     assert "is not a map" in result.output
     assert not (tmp_path / "x").exists()
+
+
+def test_an_update_is_one_run_where_poses_are_corrected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = drives(STAYS, 1, starts_m=(0.0,), passes=3, year=1)
+    second = drives(STAYS, 2, starts_m=(0.0,), passes=2, year=2)
+    shift_m = np.random.default_rng(3).normal(0.0, 2.0, (5, 2))
+
+    def moved(dataset: Dataset, way: float, *, keep_mean: bool = False) -> Dataset:
+        """Return the dataset with each pass shifted, one way or back, about the mean of the passes that there are."""
+        images = dataset.images
+        time = images.timestamp_s
+        assert time is not None
+        number = np.array([int(name.split("-")[1]) for name in images.pass_id.texts()]) + np.where(time > 1.5e7, 3, 0)
+        shift = shift_m - (shift_m[np.unique(number)].mean(axis=0) if keep_mean else 0.0)
+        offset = np.column_stack([way * shift[number], np.zeros(len(number))])
+        rotated = np.einsum("nij,nj->ni", rotation_matrices(images), offset)
+        return replace(dataset, images=images.replace(cam_from_world_m=images.cam_from_world_m - rotated))
+
+    def corrected(dataset: Dataset, config: valuemap.MapConfig, **_: object) -> Refined:
+        if not config.poses.correct_poses:
+            return Refined(dataset, {"found": "nothing"})
+        return Refined(moved(dataset, -1.0, keep_mean=True), {"found": "faults", "drives": [{"drive": 0}]}, True)
+
+    monkeypatch.setattr(pipeline, "refine_poses", corrected)
+    monkeypatch.setattr(pipeline, "compare_poses", lambda *_, **__: (2.0, 1.0, 10))
+    valuemap.write_dataset(moved(first, 1.0), tmp_path / "first")
+    valuemap.write_dataset(moved(second, 1.0), tmp_path / "second")
+    run("map", tmp_path / "first", "--out", tmp_path / "map", *(f"--set={each}" for each in SET))
+    run("update", tmp_path / "map", "--add", tmp_path / "second", "--out", tmp_path / "map2")
+    settings = [f"--set={each}" for each in SET]
+    run("map", tmp_path / "map2" / "dataset", "--out", tmp_path / "once", "--calibration", tmp_path / "map", *settings)
+    updated, once = valuemap.read_map(tmp_path / "map2"), valuemap.read_map(tmp_path / "once")
+    assert updated.run["poses"] == once.run["poses"]
+    ours, theirs = (m.labels.position_in_world_m[np.lexsort(m.labels.position_in_world_m.T)] for m in (updated, once))
+    assert np.array_equal(ours, theirs)
+    assert updated.labels.state is not None
+    assert updated.labels.state.texts() == ["confirmed"] * len(STAYS)
+    # What it is compared with is where the corrected poses put it.
+    changes = read_table(Changes, tmp_path / "map2" / "changes.parquet")
+    assert changes.change.texts() == ["unchanged"] * len(STAYS)

@@ -78,9 +78,13 @@ def update_map(
     write_dataset(joined, run.work / DATASET)
     run = replace(run, calibration=calibration, known=old / CELLS)
     rebuilt, cells = build_map_of_folder(run.work / DATASET, _settings(before), run, progress=progress)
-    alone = _map_alone(joined, first.images.image_id, before, run, progress)
-    result, changes, bridge = compare(before, rebuilt, alone, joined, first.images.image_id, progress=progress)
-    result = replace(result, rejected=rejected_of_map(result, lambda: joined))
+    # The poses that the labels were found with, where those of whole drives were corrected.
+    posed = rebuilt.corrected or joined
+    alone = _map_alone(posed, first.images.image_id, before, run, progress)
+    result, changes, bridge = compare(
+        _in_frame_of(rebuilt, before), rebuilt, alone, posed, first.images.image_id, progress=progress
+    )
+    result = replace(result, rejected=rejected_of_map(result, lambda: posed))
     for name, table in ((CHANGES, changes), (BRIDGE, bridge)):
         write_table(table, run.work / name)
     files = {f"{DATASET}/{name}": run.work / DATASET / name for name in _DATASET_FILES}
@@ -139,14 +143,31 @@ def compare(
     return Map(rebuilt.frame, kept.take(order), votes, run), changes, bridge
 
 
+def _in_frame_of(rebuilt: Map, before: Map) -> Map:
+    """Return the map before where the rebuilt one is, if poses were corrected for either.
+
+    Corrected poses are about the mean of all drives, and that of more drives is elsewhere.
+    """
+    was_corrected = before.run.get("poses", {}).get("drives") and before.run["poses"]["found"] != "nothing"
+    if rebuilt.corrected is None and not was_corrected:
+        return before
+    row, _ = match_labels(before.labels, before.votes, rebuilt.labels, rebuilt.votes)
+    moved = rebuilt.labels.position_in_world_m[row >= 0] - before.labels.position_in_world_m[row[row >= 0]]
+    if not len(moved):
+        return before
+    position = before.labels.position_in_world_m + np.median(moved, axis=0)
+    return replace(before, labels=before.labels.replace(position_in_world_m=position))
+
+
 def _map_alone(joined: Dataset, images_before: Ints, before: Map, run: Run, progress: Progress) -> Map:
-    """Return the map of the added passes alone."""
+    """Return the map of the added passes alone, with their poses as they are in the joined dataset."""
     images, detections = joined.images, joined.detections
     is_new = ~np.isin(images.image_id, images_before)
     of_new = is_new[rows_of(detections.image_id, images.image_id)]
     added = replace(joined, images=images.take(is_new), detections=detections.take(of_new))
     write_dataset(added, run.work / ADDED)
-    return build_map_of_folder(run.work / ADDED, _settings(before), replace(run, known=None), progress=progress)[0]
+    config = _settings(before).with_settings(["correct_poses=0"])
+    return build_map_of_folder(run.work / ADDED, config, replace(run, known=None), progress=progress)[0]
 
 
 @dataclass(frozen=True, eq=False)
