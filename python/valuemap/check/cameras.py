@@ -142,9 +142,20 @@ def _find_correction(view: View) -> _Correction | None:
         chance = max(chance, comparison.chance * tests * 2)  # Of each parameter two values are tried.
         if chance > LEAST_CHANCE or comparison.difference < _LEAST_RISE * float(given.sum()):
             continue
+        if name == "log_focal" and _is_wider_gate_only(view, given, parameter.change(view.dataset, value)):
+            continue
         if best is None or comparison.difference > best.comparison.difference:
             best = _Correction(parameter, value, sigma, chance, comparison)
     return None if best is None or given is None else _followed(view, best, given)
+
+
+def _is_wider_gate_only(view: View, given: Floats, dataset: Dataset) -> bool:
+    """Return whether rays agree with other focal lengths only because the gate, in pixels, is a wider angle then.
+
+    Errors of poses are angles: pictures said to be six times as wide make them a sixth of the pixels.
+    """
+    at_one_angle = float(gains_of_all(view, dataset, is_gate_an_angle=True).sum())
+    return at_one_angle < (1.0 - _LEAST_RISE) * float(given.sum())
 
 
 class _CommonError(Fault):

@@ -21,6 +21,8 @@ from valuemap.progress import Progress, silent
 from valuemap.tables import Floats
 
 _LEAST_UPRIGHT = 0.5
+_SUSPICIOUS = 0.05
+"""What good data would give with a probability above this, all that was tried counted, is not even told."""
 _TIE = 1e-3
 """Gains as close as this are the same: readings that differ in the last digits only."""
 
@@ -43,11 +45,11 @@ class _Reading:
 
 def hold_contest(
     view: View, conventions: Sequence[Convention], progress: Progress = silent
-) -> tuple[Finding | None, float | None]:
-    """Return what is wrong with the conventions, if anything, and the share of the gate that tells.
+) -> tuple[Finding | None, float | None, str | None]:
+    """Return what is wrong with the conventions, if anything, the share of the gate that tells, and what is suspected.
 
     The gate is widened where rays, read in any way, meet no better than by chance; None where a wide one tells
-    nothing either.
+    nothing either. A reading that is better than the given one, but by less than so few places can prove, is told.
     """
     for gate_share in (view.gate_share, view.gate_share * WIDER_GATE):
         at_gate = view if gate_share == view.gate_share else View(view.dataset, gate_share=gate_share)
@@ -56,8 +58,9 @@ def hold_contest(
         tests = len(readings)
         if compare(top.agreement.gain, at_gate.chance.gain).chance * tests > LEAST_CHANCE:
             continue
-        return _judge(at_gate, readings, top), gate_share
-    return None, None
+        finding = _judge(at_gate, readings, top)
+        return finding, gate_share, _suspicion(readings[0], top, tests) if finding is None else None
+    return None, None, None
 
 
 def _try_all(view: View, conventions: Sequence[Convention], progress: Progress) -> list[_Reading]:
@@ -107,6 +110,17 @@ def _judge(view: View, readings: Sequence[_Reading], top: _Reading) -> Finding |
             **comparison.to_json(),
         },
         fix=chosen.fix,
+    )
+
+
+def _suspicion(given: _Reading, top: _Reading, tests: int) -> str | None:
+    comparison = compare(top.agreement.gain, given.agreement.gain)
+    if top.convention is None or comparison.chance * tests > _SUSPICIOUS:
+        return None
+    return (
+        f"Read as {top.how}, {top.agreement.share:.0%} of {top.agreement.detections} detections meet others, as given "
+        f"{given.agreement.share:.0%}. The data are too few to be sure ({comparison.places} places), but it may "
+        f"be so: {top.convention.what}"
     )
 
 

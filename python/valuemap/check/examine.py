@@ -67,7 +67,9 @@ def examine(dataset: Dataset, *, progress: Progress = silent) -> Examination:
         for _ in range(_MOST_ROUNDS):
             view = View(dataset, gate_share=gate_share, known=frozenset(finding.fault for finding in findings))
             if stage == "conventions":
-                finding, tells = hold_contest(view, CONVENTIONS, progress)
+                finding, tells, suspicion = hold_contest(view, CONVENTIONS, progress)
+                if suspicion is not None:
+                    notes.append(suspicion)
                 if tells is None:
                     notes.append(
                         "However the data are read, it cannot be told that rays meet better than by chance: too few "

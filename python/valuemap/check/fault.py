@@ -147,13 +147,14 @@ def uprightness(dataset: Dataset) -> float:
     return float(np.mean(-rotation_matrices(dataset.images)[:, 1] @ np.array(dataset.frame.up)))
 
 
-def gains_of_all(view: View, dataset: Dataset) -> Floats:
+def gains_of_all(view: View, dataset: Dataset, *, is_gate_an_angle: bool = False) -> Floats:
     """Return the gains of a version of the whole dataset on all that a check looks at: stretches and places.
 
-    The gate is the same angle in every version: of pictures said to be wider, errors of poses are fewer pixels.
+    The gate is so many pixels, as errors of boxes are; or the same angle in every version, as errors of poses are.
     """
     samples = (view.stretches, view.many_places)
-    gate_px = view.gate_px * pixels_per_radian(dataset) / pixels_per_radian(view.dataset)
+    scale = pixels_per_radian(dataset) / pixels_per_radian(view.dataset) if is_gate_an_angle else 1.0
+    gate_px = view.gate_px * scale
     return np.concatenate([measure_agreement(s.of(dataset), s.place_of_image, gate_px).gain for s in samples])
 
 

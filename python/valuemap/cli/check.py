@@ -60,7 +60,8 @@ def _tell(outcome: dict[str, Any]) -> None:
     if findings:
         print(f"{len(findings)} {'thing is' if len(findings) == 1 else 'things are'} wrong.\n")
     else:
-        print("Nothing is wrong as far as can be seen.\n")
+        certain = "Nothing is wrong as far as can be seen."
+        print("Nothing can be proved to be wrong.\n" if outcome["notes"] else f"{certain}\n")
     for number, finding in enumerate(findings, 1):
         print(f"{number}. {finding['what']} ({finding['sure']}; {finding['fault']})")
         print(f"   Why: {finding['why']}")
