@@ -206,6 +206,21 @@ def test_a_label_with_a_part_of_the_rejected_boxes_is_asked_about() -> None:
     assert match_decisions([replace(rejected, verdict="accepted")], split, dataset).unsure == {}
 
 
+def test_where_boxes_and_places_disagree_about_two_heads_the_other_one_is_asked_about() -> None:
+    """One of two heads was rejected; in the next map each stands where the other one stood, with its own boxes."""
+    dataset = small_dataset()
+    before = map_with([0.0, 0.7], [[100, 101], [102, 103]])
+    rejected = decide(before, 1, "rejected", dataset=dataset)
+    exchanged = match_decisions([rejected], map_with([0.0, 0.7], [[102, 103], [100, 101]]), dataset)
+    assert rows(exchanged) == [0]
+    assert exchanged.unsure == {1: 0}
+    same = match_decisions([rejected], before, dataset)
+    assert (rows(same), same.unsure) == ([1], {})
+    # Nobody is asked about what was decided on as well.
+    told = [rejected, decide(before, 0, "accepted", dataset=dataset)]
+    assert match_decisions(told, map_with([0.0, 0.7], [[102, 103], [100, 101]]), dataset).unsure == {}
+
+
 def test_500_rejected_labels_stay_rejected_in_ten_maps() -> None:
     """New pose errors, other ids and order, missing and additional labels, heads 0.6 m apart."""
     random = np.random.default_rng(4)

@@ -82,8 +82,8 @@ class Matches:
 
     `row_of_decision` (decisions) is the row of the label that each is about, -1 where the map has none. `unsure` has
     the rows of labels that a rejection could be about as well, and that nothing else accounts for (no other decision,
-    and no label that stood there then), or that have a quarter of the boxes that voted for what was rejected. To each
-    belongs the number of that decision.
+    and no label that stood there then, unless boxes and places disagree which of the two it is), or that have a quarter
+    of the boxes that voted for what was rejected. To each belongs the number of that decision.
     """
 
     row_of_decision: Ints
@@ -165,7 +165,9 @@ def match_decisions(decisions: Sequence[Decision], result: Map, dataset: Dataset
         return Matches(row_of_decision, {})
     shares = _shares_of_voters(decisions, result, dataset)
     cost: dict[tuple[int, int], float] = {}
+    price_of_place: dict[tuple[int, int], float] = {}
     for claimant, row, price in _claims_of_places(decisions, labels):
+        price_of_place[claimant, row] = price
         share = shares[claimant] if claimant < len(decisions) else {}
         # Beside the label that its voters vote for now, another one is the less likely the fewer of them it has.
         cost[claimant, row] = price + _VOTERS_PRICE * (max(share.values(), default=0.0) - share.get(row, 0.0))
@@ -177,10 +179,15 @@ def match_decisions(decisions: Sequence[Decision], result: Map, dataset: Dataset
     for claimant, row in assigned:
         if claimant < len(decisions):
             row_of_decision[claimant] = row
-    taken = {row for _, row in assigned}
     unsure: dict[int, int] = {}
+    row_of, holder_of = dict(assigned), {row: claimant for claimant, row in assigned}
     for claimant, row in sorted(cost, key=lambda claim: (cost[claim], claim)):
-        if claimant < len(decisions) and decisions[claimant].verdict == "rejected" and row not in taken:
+        if claimant >= len(decisions) or decisions[claimant].verdict != "rejected" or row_of.get(claimant) == row:
+            continue
+        holder = holder_of.get(row)
+        is_neighbor = holder is not None and holder >= len(decisions)
+        # A neighbour has it because of the boxes; where the two stand says that each has the other's.
+        if holder is None or (is_neighbor and _cost_of_exchange(price_of_place, row_of, claimant, holder) < 0.0):
             unsure.setdefault(row, claimant)
     decided = set(row_of_decision.tolist())
     for claimant, share in enumerate(shares):
@@ -478,6 +485,18 @@ def _assign(cost: dict[tuple[int, int], float]) -> list[tuple[int, int]]:
             if j < len(theirs):
                 assigned.append((mine[i], theirs[j]))
     return assigned
+
+
+def _cost_of_exchange(
+    price: dict[tuple[int, int], float], row_of: dict[int, int], claimant: int, neighbor: int
+) -> float:
+    """Return how much more it costs, in squared sigmas, if two claimants had each other's labels."""
+    mine, other = row_of.get(claimant), row_of[neighbor]
+
+    def of(who: int, row: int | None) -> float:
+        return _GATE if row is None else price.get((who, row), _GATE)
+
+    return of(claimant, other) + of(neighbor, mine) - of(claimant, mine) - of(neighbor, other)
 
 
 def _voters(result: Map, dataset: Dataset, label_id: int) -> tuple[tuple[str, float, float], ...]:
