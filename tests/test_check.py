@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,8 @@ from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check import examine
 from valuemap.check.agreement import compare, measure_agreement
 from valuemap.check.cameras import PARAMETERS, _Correction, _followed, _is_wider_gate_only, with_focal
-from valuemap.check.contest import hold_contest
-from valuemap.check.fault import View, gains_of_all, with_poses
+from valuemap.check.contest import _Reading, _suspicion, hold_contest
+from valuemap.check.fault import LEAST_CHANCE, Convention, View, gains_of_all, with_poses
 from valuemap.check.fit import estimate
 from valuemap.check.headings import headings, level_rotations, rotations_of
 from valuemap.check.offsets import find_shift
@@ -58,6 +59,26 @@ def test_truth_in_metres_is_not_called_misplaced_where_the_world_is_not_in_metre
     spoiled = INJECTED["scale"].spoil(good)
     assert spoiled is not None
     assert [finding.fault for finding in examine(spoiled).findings] == ["scale"]
+
+
+def test_a_reading_that_few_places_cannot_prove_is_suspected_not_found(view: View) -> None:
+    def reading(convention: Convention | None, gain: np.ndarray) -> _Reading:
+        return _Reading(convention, "x y z w", None, replace(view.agreement, gain=gain), is_upright=True)
+
+    worse = np.array([3.0, 4.0, 2.0, 5.0, 4.0, 6.0, 3.0])
+    better = worse + [4.0, 6.0, 3.0, 9.0, 5.0, 8.0, 2.0]
+    quaternions, given = next(each for each in CONVENTIONS if each.name == "quaternion_order"), reading(None, worse)
+    tests = len(CONVENTIONS)
+    chance = compare(better, worse).chance * tests
+    assert LEAST_CHANCE < chance < 0.05
+    told = _suspicion(given, reading(quaternions, better), tests)
+    assert told is not None
+    assert quaternions.what in told
+    assert "x y z w" in told
+    assert (
+        _suspicion(given, reading(quaternions, worse + 0.1 * (better - worse) * [1, -1, 1, 1, -1, 1, 1]), tests) is None
+    )
+    assert _suspicion(given, given, tests) is None
 
 
 def test_a_seam_that_rays_cannot_see_is_no_fault(good: Dataset, view: View, monkeypatch: pytest.MonkeyPatch) -> None:

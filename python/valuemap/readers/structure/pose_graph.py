@@ -22,20 +22,42 @@ from valuemap.readers.structure.two_views import Pair, Way, find_way
 from valuemap.tables import Floats, Ints
 
 LEAST_IMAGES = 3
-_L1_ROUNDS, _CAUCHY_ROUNDS, _CAUCHY = 10, 10, 2.5
+"""Pictures with a GPS position, which a turn, a scale and a place need."""
+_L1_ROUNDS, _CAUCHY_ROUNDS = 10, 10
+"""Of reweighting: of both losses the last ones change nothing that shows."""
+_CAUCHY = 2.5
+"""Sigmas at which Cauchy's loss halves a weight: of normal errors 2.385 loses 5 % of what they say."""
 _ROTATION_SIGMA_RAD, _ENOUGH = 0.005, 100
+"""Rotations of pairs with so many matches are right to 0.3 degrees; of more they are not better, as what bends them
+(the focal length, the lens) is in all matches."""
 _LARGEST_TURN_RAD = 0.05
 """Pairs that are so far off the rotations of all others are not of one place."""
-_LEAST_PARALLAX_RAD, _LEAST_SHARED = 0.01, 8
+_LEAST_PARALLAX_RAD = 0.01
+"""Below it, 5 px at a focal length of 500 px, matches that are right to a pixel say nothing about a depth."""
+_LEAST_SHARED = 8
+"""Features whose depths two pairs share, for these to say how long the ways of both are: a median of fewer is one
+wrong match away from being wrong."""
 _LENGTH_SHARE, _STILL_M = 0.1, 0.02
+"""Standard deviations of a way: a share of its length, and metres of a car that stands."""
 _ONE_TURN_RAD = 0.035
-"""What two pairs allow is the same rotation up to here."""
-_RIVAL, _MOST_RIVALS, _MOST_DEPTHS, _SAME_DEPTH = 0.3, 4, 8, 0.02
-_MOST_STATES, _CLEAR = 8, 300.0
-"""So many matches must agree more with one way to go on than with another, which then is given up."""
+"""What two pairs allow is the same rotation up to here: 2 degrees. Right ones differ by 0.2 to 0.7 degrees, wrong ones
+of a plane by 8 and more (docs/notes/structure_from_motion.md)."""
+_MOST_RIVALS, _MOST_DEPTHS, _MOST_STATES = 4, 8, 8
+"""Rotations of a picture, looks at its depths, and ways to go on that are kept: time grows with each."""
+_RIVAL = 0.3
+"""A rotation that fewer than this share of the best one's matches allow is no rival: the true one of a plane has
+nine tenths of the matches of the wrong one, and those of single wrong pairs a tenth."""
+_SAME_DEPTH = 0.02
+"""Standard deviation of the logarithm of a depth that is one: two per cent, beside what a pixel makes of it."""
+_CLEAR = 300.0
+"""So many matches must agree more with one way to go on than with another, which then is given up: what three full
+pairs (`_ENOUGH`) say, so that no one pair decides."""
 _SAME_NORTH_RAD = 0.35
+"""Parts whose GPS turns them by more than this, 20 degrees, against the largest are too short for their GPS to tell."""
 _HEIGHT_SHARE = 2.0
+"""Heights by GPS are so much worse than positions: satellites are above only."""
 _RIDGE = 1e-9
+"""Share of the usual weight that holds what nothing else holds, so that systems can be solved."""
 
 
 @dataclass(frozen=True, eq=False)
