@@ -229,10 +229,7 @@ def _chain(
     gain = np.log(1.0 - _SHARED + evidence)
     prior = -np.sum(grid**2, axis=1) / (2.0 * _PRIOR_M**2)
     prior -= math.log(float(np.exp(prior).sum()))
-    # Poses are as likely right as anything else.
-    start = prior - math.log(2.0)
-    start[len(grid) // 2] = np.logaddexp(start[len(grid) // 2], -math.log(2.0))
-    value = start + gain[0]
+    value = prior + gain[0]
     came_from = np.empty((len(rows), side * side), np.int64)
     here = np.arange(side * side)
     for i in range(1, len(rows)):
