@@ -53,12 +53,14 @@ def test_ids_at_random_compare_the_same_detections(city: Dataset) -> None:
     assert found[:2] == pytest.approx(expected[:2], rel=0.01)
 
 
-def test_a_correction_that_is_not_worth_its_price_is_not_taken(city: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    right = Refined(city, {"found": "faults", "price": 30.0}, is_corrected=True)
+def test_a_correction_that_is_not_worth_its_parameters_is_not_taken(
+    city: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right = Refined(city, {"found": "faults", "parameters": 3}, is_corrected=True)
     monkeypatch.setattr(pipeline, "refine_poses", lambda *_, **__: right)
     wrong = shifted(city, 3.0)
     assert valuemap.build_map(wrong).corrected is not None
-    right.record["price"] = 1e6
+    right.record["parameters"] = 10**6
     assert valuemap.build_map(wrong).corrected is None
 
 

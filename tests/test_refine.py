@@ -26,7 +26,7 @@ from valuemap.refine.jumps import Legs, find_hints, find_jumps
 from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
 from valuemap.refine.register import register
 from valuemap.refine.residuals import MOUNT, OFFSET, Observations, State, residuals, rotations, weights
-from valuemap.refine.select import _Equations, _occam
+from valuemap.refine.select import _Equations
 from valuemap.simulate import simulate
 from valuemap.tables import Floats, Images, Ints
 from valuemap.tiles.work import open_work
@@ -500,18 +500,3 @@ def test_a_turn_that_begins_or_ends_between_two_images_is_none_before_or_after(l
         turned = rotations(late_s * rate) @ camera_poses(recorded.images)[0]
         off = Rotation.from_matrix(turned @ camera_poses(true.images)[0].transpose(0, 2, 1)).magnitude()
         assert (np.degrees(off).max() < worst_deg) == (known is not None)
-
-
-def test_the_price_of_a_constant_is_what_its_prior_leaves_open() -> None:
-    counts = (2, 1, 1, 1, 1, 1)
-    state = State.zero(np.zeros((1, 3)), 1, 1, counts)
-    active = tuple(np.zeros(c.shape, np.bool_) for c in state.constants)
-    active[OFFSET][1, 0] = active[MOUNT][0, 2] = True
-    state.constants[OFFSET][1, 0], state.constants[MOUNT][0, 2] = 1.5, 0.02
-    narrow = np.array([[3.0, 3.0, 3.0], [0.2, 3.0, 3.0]])
-    state = dataclasses.replace(state, covariance=np.diag([0.1**2, 0.01**2]))
-    for sigma in (3.0, narrow):
-        scales = Scales(0.2, 0.004, 0.1, 0.002, (sigma, 0.03, 0.2, 0.05, 0.03, 0.2))
-        of_offset = 3.0 if isinstance(sigma, float) else 0.2
-        expected = 2.0 * np.log(of_offset / 0.1) + (1.5 / of_offset) ** 2 + 2.0 * np.log(3.0) + (0.02 / 0.03) ** 2
-        assert _occam(state, active, scales) == pytest.approx(expected)
