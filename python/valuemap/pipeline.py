@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -190,9 +191,12 @@ def _refined(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int,
         refined = refine_poses(dataset, config, threads=threads, progress=progress)
         if not refined.is_corrected:
             return refined
-        before, after, _ = compare_poses(dataset, refined.dataset, config, threads=threads, progress=progress)
-        record = {**refined.record, "misfit_before": round(before, 1), "misfit_after": round(after, 1)}
-        if after + refined.record.get("price", 0.0) < before:
+        before, after, compared = compare_poses(dataset, refined.dataset, config, threads=threads, progress=progress)
+        # The Bayesian information criterion (Schwarz, 1978): each detection has two coordinates.
+        price = refined.record.get("parameters", 0) * math.log(2 * compared)
+        figures = {"misfit_before": before, "misfit_after": after, "price": price}
+        record = {**refined.record, **{name: round(figure, 1) for name, figure in figures.items()}}
+        if after + price < before:
             return replace(refined, record=record)
         return Refined(dataset, {**record, "found": "nothing", "because": "the poses as given fit better"})
 

@@ -296,7 +296,6 @@ def _describe(dataset: Dataset, found: _Found, selected: Selected, unit_m: float
         "held_out_objects": selected.held_out,
         "gain_on_held_out": round(selected.gain, 1),
         "chance_of_that": float(f"{selected.chance:.2g}"),
-        "price": round(selected.price, 1),
     }
 
 

@@ -60,8 +60,7 @@ class Selected:
     """What stays: the state, in which all else is zero; and how much better held-out objects are explained.
 
     `deviation` (by kind, as the constants) are standard deviations; `chance` is the probability that the gain on
-    `held_out` objects is luck; `price` is by how much all that stays must make detections likelier, as minus twice the
-    log: its Occam factor (MacKay 1992).
+    `held_out` objects is luck.
     """
 
     state: State
@@ -70,7 +69,6 @@ class Selected:
     gain: float
     chance: float
     held_out: int
-    price: float
 
 
 def select(footage: Footage, found: Estimate) -> Selected | None:
@@ -106,7 +104,6 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
         return None
     deviation = []
     assert state.covariance is not None
-    price = _occam(state, active, scales)
     sigma = np.sqrt(np.diag(state.covariance))
     for index in problem.column_of:
         values = np.zeros(index.shape)
@@ -114,20 +111,7 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
         deviation.append(values)
     constants, active, deviations = (ties.spread(values) for values in (state.constants, active, tuple(deviation)))
     constants = (_about_the_mean(footage, found, constants[OFFSET], active[OFFSET]), *constants[1:])
-    return Selected(replace(state, constants=constants), active, deviations, gain, chance, held_out, price)
-
-
-def _occam(state: State, active: tuple[Bools, ...], scales: Scales) -> float:
-    """Return minus twice the log of what of the prior of constants that are free their posterior takes up."""
-    assert state.covariance is not None
-    value, variance = (
-        np.concatenate(
-            [np.broadcast_to(each, flags.shape)[flags] for each, flags in zip(of_kinds, active, strict=True)]
-        )
-        for of_kinds in (state.constants, [np.square(sigma) for sigma in scales.constant])
-    )
-    information_gain = np.log(variance).sum() - np.linalg.slogdet(state.covariance)[1]
-    return float(information_gain + np.sum(value**2 / variance))
+    return Selected(replace(state, constants=constants), active, deviations, gain, chance, held_out)
 
 
 def _about_the_mean(footage: Footage, found: Estimate, offset: Floats, active: Bools) -> Floats:
