@@ -90,3 +90,9 @@ def test_a_pipe_does_not_hang(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.csv")
     with pytest.raises(InputError, match=r"pipe\.csv: is not a file"):
         read_csv_arrow(tmp_path / "pipe.csv", TYPES, has_missing=False, hint="a hint")
+
+
+def test_a_quotation_mark_that_is_not_closed_in_the_first_line_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "points.csv").write_bytes(b'x,",y,z,class\rx,",y,z,class\r1,2,3,4,5\r')
+    with pytest.raises(InputError, match="first line has a quotation mark that is not closed"):
+        read_csv_arrow(tmp_path / "points.csv", TYPES, has_missing=False, hint="a hint", bad_numbers_are_nan=True)

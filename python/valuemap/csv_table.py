@@ -50,10 +50,14 @@ def read_csv_arrow(
             table = _parse_odd_csv(content, separator, options, bad_numbers_are_nan)
         exact = {name.strip() for name in table.column_names}
         same = {name.lower(): name for name in types if name not in exact}
-        return table.rename_columns([same.get(name.strip().lower(), name.strip()) for name in table.column_names])
+        table = table.rename_columns([same.get(name.strip().lower(), name.strip()) for name in table.column_names])
     except (pa.ArrowException, OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"{path}: cannot be read as CSV: {reason}", hint=hint) from error
+    # Where a quote in the header line is not closed, its columns are not those that the types were given for.
+    if any(field.type != types.get(field.name, field.type) for field in table.schema):
+        raise InputError(f"{path}: the first line has a quotation mark that is not closed", hint=hint)
+    return table
 
 
 def _read_text_bytes(path: Path, hint: str) -> bytes:
