@@ -9,6 +9,10 @@ _Floats = NDArray[np.float64]
 _Offsets = NDArray[np.int64]
 _Indices = NDArray[np.uint32]
 
+CALIBRATION_STEPS: int
+MISFIT_STEPS: int
+SEARCH_STEPS: int
+
 class Rays:
     def __init__(
         self,

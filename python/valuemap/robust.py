@@ -127,12 +127,8 @@ class Scene:
         )
 
 
-MISFIT_STEPS = 5 * 3
-"""Maps that the core makes to find the likeliest noise, at most: from each start, some."""
-_CALIBRATION_STEPS = MISFIT_STEPS + 2 + 1
-"""Then two of more places, and one for the classes."""
-_SEARCH_STEPS = 6 * 4
-"""Moves of the core's search, at most: rounds, and kinds of moves in each. It ends when nothing helps any more."""
+MISFIT_STEPS: int = _core.MISFIT_STEPS
+"""Maps that the core makes to find the likeliest noise, at most."""
 
 
 def calibrate(
@@ -143,7 +139,7 @@ def calibrate(
     What the config sets of the noise stays as it is. The scene may be a part of what is mapped.
     """
     guess, known = _guess(config.noise)
-    steps = _CALIBRATION_STEPS + (_SEARCH_STEPS if is_part else 0)
+    steps = _core.CALIBRATION_STEPS + (_core.SEARCH_STEPS if is_part else 0)
     with counted(progress, "estimating the noise", steps) as tell:
         noise, is_deep, classes, pooled = _core.calibrate(
             scene.core, guess.as_tuple(), known, _settings(config), is_part, threads, lambda done, _total: tell(done)
@@ -175,7 +171,7 @@ def misfit(
 
 def steps_of_labels(calibration: Calibration) -> int:
     """Return in how many steps labels are found, at most: where they begin, and the moves of the search."""
-    return 1 + (_SEARCH_STEPS if calibration.is_deep else 1)
+    return 1 + (_core.SEARCH_STEPS if calibration.is_deep else 1)
 
 
 _COUNTED_AS = {"recall": "detection_rate", "recall_concentration": "detection_rate_concentration"}

@@ -249,5 +249,11 @@ mod _core {
     #[pymodule_export]
     use super::robust::{Scene, calibrate, find_labels, misfit, objects_of};
     #[pymodule_export]
+    const CALIBRATION_STEPS: usize = valuemap_core::robust::CALIBRATION_STEPS;
+    #[pymodule_export]
+    const MISFIT_STEPS: usize = valuemap_core::robust::likeliest::MISFIT_STEPS;
+    #[pymodule_export]
+    const SEARCH_STEPS: usize = valuemap_core::robust::search::SEARCH_STEPS;
+    #[pymodule_export]
     use super::{Rays, medians, merge_labels, partition_images, see, unit_covariance, vote_in_clusters};
 }

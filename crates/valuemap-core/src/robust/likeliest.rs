@@ -15,11 +15,18 @@ use crate::progress::{Halt, Progress};
 const CALIBRATION_GATE: f64 = 1.4;
 /// Times that the noise is estimated anew, from labels found with the last estimate.
 const CALIBRATION_ROUNDS: usize = 3;
+/// Times that it is estimated from more rays than that.
+const MORE_ROUNDS: usize = 2;
 /// Passes that should have seen objects and did not are expected to cost no more than this, whatever is expected of them: twice the most that
 /// `-p ln p` can be.
 const MOST_UNSEEN: f64 = 2.0 / std::f64::consts::E;
 /// The noise is sought from starts that differ by these factors.
 const STARTS: [f64; 5] = [0.15, 0.5, 1.5, 5.0, 15.0];
+
+/// Steps of [`misfit`] at most, as progress counts them.
+pub const MISFIT_STEPS: usize = STARTS.len() * CALIBRATION_ROUNDS;
+/// Steps of the search for the noise at most.
+pub(super) const NOISE_STEPS: usize = MISFIT_STEPS + MORE_ROUNDS;
 
 /// The noise that makes the rays of some places likeliest, `more` and some of them, and from how many starts it was sought.
 pub(super) fn likeliest_noise(
@@ -38,7 +45,7 @@ pub(super) fn likeliest_noise(
         return Ok((noise, starts));
     }
     let mut likeliest = Likeliest::default();
-    for _ in 0..2 {
+    for _ in 0..MORE_ROUNDS {
         let found = round(scene, &noise, known, settings, more, progress)?;
         noise = found.again;
         likeliest.offer(found);

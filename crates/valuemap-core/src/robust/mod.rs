@@ -94,6 +94,9 @@ const MOST_RAYS: usize = 100_000;
 /// All moves pay if they change more of the objects than this: a sample of some dozen tells no less.
 const LEAST_CHANGE: f64 = 0.05;
 
+/// Steps of [`self_calibrate`] at most, as progress counts them, but for the search that tells whether all moves pay: the noise, and the classes.
+pub const CALIBRATION_STEPS: usize = likeliest::NOISE_STEPS + 1;
+
 /// What is estimated once of a scene, or of a sample of it, before any part of it is mapped.
 #[derive(Debug, Clone)]
 pub struct Calibration {

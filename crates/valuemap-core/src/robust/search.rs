@@ -23,6 +23,8 @@ use crate::progress::{Halt, Progress};
 
 /// Rounds, at most.
 const ROUNDS: usize = 6;
+/// Steps of a search with all moves at most, as progress counts them: the four kinds of moves of each round.
+pub const SEARCH_STEPS: usize = 4 * ROUNDS;
 
 /// How far the search goes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
