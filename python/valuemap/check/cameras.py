@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
@@ -34,6 +35,8 @@ from valuemap.tables import Cameras, Floats
 _LEAST_RISE = 0.02
 """Passes have errors of their own, which few passes do not average out: what costs less than one part in fifty of the
 agreement is within them, and changes no map."""
+_MOST_DOUBLINGS, _MOST_STEPS = 6, 12
+"""Of a search that ends by itself as soon as the agreement falls: of turns it need not."""
 
 
 def _turn(axis: int) -> Any:
@@ -185,9 +188,9 @@ class _CommonError(Fault):
             fix=partial(_changed, parameter=best.parameter, value=value),
         )
 
+    @abstractmethod
     def says(self, view: View, name: str, value: float) -> str:
         """Return what is wrong."""
-        raise NotImplementedError
 
     def shows(self, view: View, name: str, value: float, sigma: float) -> str:
         """Return the estimate in the unit that people use."""
@@ -294,10 +297,6 @@ def _followed(view: View, best: _Correction, given: Floats) -> _Correction:
     # The values tried count as tests, as those before did.
     chance = max(best.chance, comparison.chance * len(gains))
     return _Correction(best.parameter, value, best.sigma, chance, comparison)
-
-
-_MOST_DOUBLINGS, _MOST_STEPS = 6, 12
-"""Of a search that ends by itself as soon as the agreement falls: of turns it need not."""
 
 
 def _changed(dataset: Dataset, *, parameter: Parameter, value: float) -> Dataset:
