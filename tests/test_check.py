@@ -20,7 +20,7 @@ from valuemap.check.agreement import compare, measure_agreement
 from valuemap.check.cameras import PARAMETERS, _Correction, _followed, _is_wider_gate_only, with_focal
 from valuemap.check.contest import _Reading, _suspicion, hold_contest
 from valuemap.check.fault import LEAST_CHANCE, Convention, View, gains_of_all, with_poses
-from valuemap.check.fit import estimate
+from valuemap.check.fit import Parameter, estimate
 from valuemap.check.headings import headings, level_rotations, rotations_of
 from valuemap.check.offsets import find_shift
 from valuemap.check.passes import _at_a_seam, _seen_m, moved_along
@@ -30,7 +30,7 @@ from valuemap.check.sizes import object_heights
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, read_dataset, write_dataset
 from valuemap.errors import InputError
-from valuemap.tables import Categories
+from valuemap.tables import Categories, Floats
 
 _CONVENTIONS = {convention.name for convention in CONVENTIONS}
 _SEEN_AGAIN = {"passes_no_drives"}
@@ -114,6 +114,28 @@ def test_a_shift_in_time_is_followed_where_least_squares_stay_behind(good: Datas
     found = _followed(shifted, start, given)
     assert found.value == pytest.approx(-5.0, abs=0.3)
     assert found.comparison.difference > 0.0
+
+
+def test_what_agrees_the_more_the_farther_is_followed_so_far_and_no_farther(
+    good: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rays that agree ever better with a larger value, as no rays do: six doublings, and twelve values beyond."""
+    tried: list[float] = []
+
+    def change(dataset: Dataset, value: float) -> Dataset:
+        tried.append(value)
+        return dataset
+
+    def gains(_view: View, _dataset: Dataset) -> Floats:
+        # Every value has a gain of its own, and its neighbours differ: the search never settles.
+        return np.full(40, np.log(tried[-1])) + np.linspace(0.0, 0.1, 40)
+
+    monkeypatch.setattr("valuemap.check.cameras.gains_of_all", gains)
+    given = np.zeros(40)
+    start = _Correction(Parameter("along", change, 0.1), 1.0, 1e-12, 1e-9, compare(given, given))
+    found = _followed(View(good), start, given)
+    assert 64.0 <= found.value <= 128.0
+    assert len(tried) <= 1 + 6 + 12
 
 
 def test_every_fault_of_the_registry_is_injected() -> None:
