@@ -309,21 +309,40 @@ def test_a_signal_to_end_leaves_nothing_behind(
     assert [path.name for path in tmp_path.iterdir()] == ["dense"]
 
 
+def test_nothing_is_imported_before_a_signal_is_heard() -> None:
+    """Up to its first handler the command takes what the interpreter has, as Ctrl-C until then is a traceback."""
+    code = """
+import os, sys, _signal
+before = set(sys.modules)
+def heard(number, handler):
+    print(*sorted(set(sys.modules) - before), number, flush=True)
+    os._exit(0)
+_signal.signal = heard
+from valuemap.cli import main
+main()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, preexec_fn=heard_by_default
+    )
+    assert done.stdout.split() == ["__future__", "valuemap", "valuemap.cli", "valuemap.cli.signals", "2"]
+
+
+@pytest.mark.parametrize("module", ["gc", "valuemap.cli.app", "pyarrow"])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_while_libraries_are_imported_is_one_line(number: signal.Signals) -> None:
-    """The import of the commands is slowed down until the signal is there."""
+def test_a_signal_while_libraries_are_imported_is_one_line(number: signal.Signals, module: str) -> None:
+    """The import of the commands is slowed down until the signal is there; `gc` is the first of all."""
     code = """
 import builtins, os, signal, sys, valuemap.cli
 plain = builtins.__import__
 def slow(name, *rest):
-    if name.startswith("pyarrow"):
+    if name.startswith(sys.argv[2]):
         os.kill(os.getpid(), int(sys.argv[1]))
     return plain(name, *rest)
 builtins.__import__ = slow
 valuemap.cli.main()
 """
     done = subprocess.run(
-        [sys.executable, "-c", code, str(int(number))],
+        [sys.executable, "-c", code, str(int(number)), module],
         capture_output=True,
         text=True,
         check=False,

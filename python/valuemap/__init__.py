@@ -6,10 +6,10 @@ are for what lies on disk; `plot_map`, `draw_map` and `write_report` are for loo
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
+TYPE_CHECKING = False  # That of `typing`, which takes longer than all that comes before `valuemap.cli` hears Ctrl-C.
 if TYPE_CHECKING:
+    from typing import Any
+
     from valuemap.config import MapConfig
     from valuemap.dataset import Dataset, Frame, read_dataset, write_dataset
     from valuemap.errors import ValuemapError
@@ -70,6 +70,8 @@ def __getattr__(name: str) -> Any:
         return version("valuemap")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'valuemap' has no attribute {name!r}")
+    from importlib import import_module
+
     value = getattr(import_module(f"valuemap.{_MODULE_OF[name]}"), name)
     globals()[name] = value
     return value

@@ -1,15 +1,21 @@
-"""Signals that end a command: one clear line, nothing half-written, and the exit status that shells expect."""
+"""Signals that end a command: one clear line, nothing half-written, and the exit status that shells expect.
+
+Until a handler is there, Ctrl-C prints a traceback. So this imports nothing but what the interpreter has already:
+`signal` and `contextlib` take longer than all the rest up to the handler.
+"""
 
 from __future__ import annotations
 
+import _signal  # type: ignore[import-not-found]  # What `signal` makes enumerations of.
 import os
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
-from types import FrameType
-from typing import NoReturn
 
-_ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    import signal
+    from types import FrameType
+    from typing import NoReturn
+
+_ENDING = tuple(int(getattr(_signal, name)) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(_signal, name))
 
 
 class Terminated(BaseException):
@@ -25,23 +31,22 @@ def exit_code(number: int) -> int:
     return 128 + number
 
 
-@contextmanager
-def end_at_once() -> Iterator[None]:
+class end_at_once:  # noqa: N801  # It is used as a statement.
     """While nothing has begun, end on a signal right away: an exception could come in the middle of an import.
 
     SIGTERM waits until the block ends, as glog, which pycolmap brings along, takes it over and prints a stack trace.
     """
-    _handle(_end_at_once)
-    if not hasattr(signal, "pthread_sigmask"):  # Windows, where none of these signals comes from outside.
-        yield
-        return
-    blocked = {number for number in _ENDING if number != signal.SIGINT}
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, blocked)
-    try:
-        yield
-    finally:
+
+    def __enter__(self) -> None:
         _handle(_end_at_once)
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if hasattr(_signal, "pthread_sigmask"):  # Not on Windows, where none of these comes from outside.
+            waiting = {number for number in _ENDING if number != _signal.SIGINT}
+            self.before = _signal.pthread_sigmask(_signal.SIG_BLOCK, waiting)
+
+    def __exit__(self, *_: object) -> None:
+        _handle(_end_at_once)
+        if hasattr(_signal, "pthread_sigmask"):
+            _signal.pthread_sigmask(_signal.SIG_SETMASK, self.before)
 
 
 def end_in_order() -> None:
@@ -51,17 +56,17 @@ def end_in_order() -> None:
 
 def _handle(handler: signal._HANDLER) -> None:
     for number in _ENDING:
-        if signal.getsignal(number) != signal.SIG_IGN:  # As the parent wants it: nohup, or a script's background.
-            signal.signal(number, handler)
+        if _signal.getsignal(number) != _signal.SIG_IGN:  # As the parent wants it: nohup, or a script's background.
+            _signal.signal(number, handler)
 
 
 def _end_at_once(number: int, _: FrameType | None) -> NoReturn:
-    what = "interrupted" if number == signal.SIGINT else "terminated"
+    what = "interrupted" if number == _signal.SIGINT else "terminated"
     os.write(2, f"{what}: nothing was written\nhint: run the same command again to start over\n".encode())
     os._exit(exit_code(number))
 
 
 def _raise(number: int, _: FrameType | None) -> NoReturn:
-    if number == signal.SIGINT:
+    if number == _signal.SIGINT:
         raise KeyboardInterrupt
     raise Terminated(number)
