@@ -18,7 +18,9 @@ from PIL import Image
 import valuemap
 from browser import in_browser, require_browser
 from test_viewer import Client, command, serve
+from valuemap.map_folder import write_map
 from valuemap.viewer.scene import Scene
+from viewer import made_up_city
 from viewer_city import HOSTILE, part, write_city
 
 
@@ -70,6 +72,27 @@ def test_what_is_rejected_stays_rejected(tmp_path: Path) -> None:
             track, street = 1, 1
             assert seen["far"] == {"instances": 0, "corners": 6 * (labels + marks + track + street)}
         _check_texts_and_requests(again, client)
+
+
+def test_zooming_over_many_images_is_done_in_small_steps(tmp_path: Path) -> None:
+    """No frame hands the GPU more than two parts of each layer, whatever the map, and nothing is handed over twice."""
+    require_browser()
+    dataset, result = made_up_city(500, 80_000, 20)
+    valuemap.write_dataset(dataset, tmp_path / "dataset")
+    write_map(result, tmp_path / "map")
+    # 4,096 shapes a part; a line has 20 bytes at each of four corners, a disc 16. Uniforms and labels are little.
+    most = 2 * 4096 * 4 * (2 * 20 + 2 * 16) + 100_000
+    for client in serve(lambda: Scene(tmp_path / "map"), tmp_path / "map" / "review.json"):
+        seen = in_browser("levels.mjs", client.server.address, -4.5, -3.0, -1.0, 2.0)
+        assert seen["noted"]["complaints"] == []
+        assert max(step["most"] for step in [seen["opened"], *seen["first"], seen["hidden"]]) < most
+        assert max(step["all"] for step in seen["first"]) > most, "the map is too small to tell"
+        for first, again in zip(seen["first"], seen["again"], strict=True):
+            assert again["all"] < 100_000
+            assert again["frame"] == first["frame"]
+        drawn = [step["frame"]["corners"] for step in seen["first"]]
+        assert drawn[-1] < max(drawn), "what is out of view is not drawn"
+        assert 0 < seen["hidden"]["frame"]["corners"] < drawn[0]
 
 
 def test_the_page_of_the_demo(tmp_path: Path) -> None:

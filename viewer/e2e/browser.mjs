@@ -21,6 +21,23 @@ export async function open(url, { width = 1440, height = 900, theme = "light" } 
     count("drawElementsInstanced", (given) => [given[4], 0]);
     count("drawArrays", (given) => [0, given[2]]);
     count("drawElements", (given) => [0, given[1]]);
+    // The bytes that the GPU was handed: in this frame, in the frame with the most, and in all.
+    window.handed = { now: 0, most: 0, all: 0 };
+    for (const [name, at] of [["bufferData", 1], ["bufferSubData", 2]]) {
+      const hand = WebGL2RenderingContext.prototype[name];
+      WebGL2RenderingContext.prototype[name] = function (...given) {
+        const bytes = given[at]?.byteLength ?? 0;
+        window.handed.now += bytes;
+        window.handed.all += bytes;
+        window.handed.most = Math.max(window.handed.most, window.handed.now);
+        return hand.apply(this, given);
+      };
+    }
+    const frame = () => {
+      window.handed.now = 0;
+      requestAnimationFrame(frame);
+    };
+    requestAnimationFrame(frame);
   });
   const page = await context.newPage();
   page.setDefaultTimeout(Number(process.env.PAGE_TIMEOUT_MS ?? 120000));
@@ -39,10 +56,18 @@ export async function open(url, { width = 1440, height = 900, theme = "light" } 
 /** Where a label is on the screen. */
 export const screenOf = (page, id) => page.evaluate((label) => window.valuemap.screenOf(label), id);
 
-/** What one frame hands the GPU, seen from this zoom. */
+/** Look from this zoom, and wait until everything in view is drawn. */
+export async function lookFrom(page, zoom) {
+  await page.evaluate((wanted) => {
+    document.body.dataset.settled = "false"; // Until a frame of the new view says that it is.
+    window.valuemap.setView({ ...window.valuemap.getView(), zoom: wanted });
+  }, zoom);
+  await page.waitForFunction(() => document.body.dataset.settled === "true");
+}
+
+/** What one frame draws, seen from this zoom. */
 export async function frameFrom(page, zoom) {
-  await page.evaluate((wanted) => window.valuemap.setView({ ...window.valuemap.getView(), zoom: wanted }), zoom);
-  await page.waitForTimeout(300);
+  await lookFrom(page, zoom);
   return page.evaluate(async () => {
     const painted = () => new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(resolve)));
     window.given = undefined;

@@ -8,11 +8,10 @@ import { type LabelPanel, renderLabel, renderPlace, renderProblem } from "./deta
 import { byId, count, fixed, h, plural, probability, say } from "./dom";
 import { dot, Filters } from "./filters";
 import { geographic } from "./geodesy";
-import { type Labels, MapView, readLabels } from "./map";
+import { type Labels, MapView, plane, readLabels } from "./map";
 import type { Gallery } from "./shots";
 import { ticks } from "./side";
 import { fromHash, type Selection, type Settings, toHash, type View } from "./state";
-import { flat } from "./tracks";
 
 performance.mark("valuemap:start");
 // The token is in a cookie now; in the address it would end up in bookmarks and histories.
@@ -89,7 +88,7 @@ class Page {
     if (head.has.truth) {
       const truth = await api.truth();
       if (truth.has("outcome")) {
-        this.map.setTruth({ position: flat(truth.get("position")), outcome: truth.get<Uint8Array>("outcome"), labelOutcome: truth.get<Uint8Array>("label_outcome") });
+        this.map.setTruth({ position: plane(truth.get("position")), outcome: truth.get<Uint8Array>("outcome"), labelOutcome: truth.get<Uint8Array>("label_outcome") });
       }
     }
     if (head.has.rejected) this.map.setRejected((await api.rejected()).get("position"));
@@ -227,7 +226,8 @@ class Page {
   private wasDrawn(): void {
     const { dataset } = document.body;
     dataset.drawnLabels = String(this.map.inView());
-    if (!this.drawn && this.map.shownRows().length + this.head.counts.labels >= 0) {
+    dataset.settled = String(this.map.settled());
+    if (!this.drawn && this.map.labelsDrawn()) {
       this.drawn = true;
       performance.measure("valuemap:interactive", { start: 0, end: performance.now() });
       dataset.ready = "true";
@@ -286,7 +286,7 @@ class Page {
       renderProblem(this.panel(), `Label ${id}`, `There is no label ${id} in this map.`, this.panelEvents);
       return;
     }
-    const at: [number, number] = [this.labels.position[3 * row], this.labels.position[3 * row + 1]];
+    const at: [number, number] = [this.labels.position[2 * row], this.labels.position[2 * row + 1]];
     const turn = ++this.asked;
     this.panel();
     this.map.select(at, this.reviews.get(id)?.moved_to);
@@ -451,7 +451,7 @@ class Page {
   screenOf(id: number): [number, number] | null {
     const row = this.labels.rowOf.get(id);
     if (row === undefined) return null;
-    const [x, y] = this.map.toScreen(this.labels.position[3 * row], this.labels.position[3 * row + 1]);
+    const [x, y] = this.map.toScreen(this.labels.position[2 * row], this.labels.position[2 * row + 1]);
     const box = byId("deck").getBoundingClientRect();
     return [x + box.left, y + box.top];
   }

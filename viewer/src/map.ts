@@ -1,25 +1,23 @@
 /** The map: deck.gl draws labels, ellipses, tracks and rays from above, in metres; a basemap may lie beneath. */
 
-import { Deck, type Layer, OrthographicView } from "@deck.gl/core";
+import { Deck, OrthographicView } from "@deck.gl/core";
 import KDBush from "kdbush";
 import type { LabelDetails, PlaceDetails, Shot, State } from "./api";
 import { classColor, type Color, existenceColor, OUTCOMES, packed, passColor, STATES } from "./colors";
 import type { Columns } from "./columns";
-import { DiscLayer, type Discs, LinesLayer } from "./meshes";
+import { Drives } from "./drives";
+import { DiscLayer, type Discs, type Lines, LinesLayer } from "./meshes";
+import type { Box } from "./parts";
 import { MAX_ZOOM, MIN_ZOOM, type Settings, type View } from "./state";
-import { type Box, distinct, flat, type Level, Tracks, within } from "./tracks";
+import { ROUND_FROM_PX, spacingAt, STREET_M, streetSpacing } from "./tracks";
 
 const ELLIPSE_95 = Math.sqrt(5.991464547107979); // Half axis of 95 % of a normal distribution in the plane, in sigmas.
-const STREET_M = 9;
 const PICK_PX = 12;
 const RAYS_FROM_ZOOM = -2;
 const CAMERAS_FROM_ZOOM = 1.5;
 /** From this many pixels of a metre on ellipses are drawn, and only what is around the view. */
 const NEAR_SCALE = 0.8;
-const EVERYWHERE: Box = { left: -Infinity, bottom: -Infinity, right: Infinity, top: Infinity };
-
-/** Streets narrower than that have no round ends, which nobody would see. */
-const ROUND_FROM_PX = 4;
+const STREET_LEAST_PX = 3;
 
 /** Labels as they are drawn, with ellipses in true scale. */
 type Buffers = Discs & { shape: Float32Array };
@@ -41,7 +39,7 @@ export function readLabels(columns: Columns): Labels {
   return {
     count: id.length,
     id,
-    position: flat(columns.get("position")),
+    position: plane(columns.get("position")),
     ellipse: columns.get("ellipse"),
     class: columns.get<Int32Array>("class"),
     votes: columns.get<Int32Array>("votes"),
@@ -67,7 +65,8 @@ export interface MapEvents {
 
 export class MapView {
   private readonly deck: Deck<OrthographicView>;
-  private readonly tracks: Tracks;
+  private readonly drives: Drives;
+  private layers: (DiscLayer | LinesLayer)[] = [];
   private view: View;
   private settings: Settings;
   private states: State[];
@@ -80,11 +79,9 @@ export class MapView {
   private selected: [number, number][] = [];
   private rays: { shots: Shot[]; misses: Shot[]; to: [number, number] } | null = null;
   private lit: Shot | null = null;
-  private labelLayers: Layer[] = [];
   private buffers: Buffers | null = null;
-  /** What the layers of labels hold: all of them, or those in a box around the view. */
-  private held: Box | null = null;
-  private trackLayers: { key: string; box: Box; layers: Layer[] } = { key: "", box: EVERYWHERE, layers: [] };
+  /** The labels in a box around the view, where it is near. */
+  private near: { box: Box; dots: Discs; ellipses: Discs } | null = null;
   private pressed: { x: number; y: number } | null = null;
   /** Of the map in pixels. Asking the element each time would make the browser lay the page out again for every move. */
   private width = 0;
@@ -100,11 +97,13 @@ export class MapView {
     view: View | null,
     private readonly events: MapEvents,
   ) {
-    this.tracks = new Tracks(cameras);
     this.measureParent();
     this.settings = settings;
     this.states = states;
+    this.around = boundsOf([this.labels.position, cameras.rows("position") ? plane(cameras.get("position")) : new Float32Array()]);
     this.view = view ?? this.fitting();
+    this.drives = new Drives(cameras, () => this.draw());
+    this.drives.want(settings.hiddenPasses, spacingAt(this.metresPerPixel()));
     this.deck = new Deck({
       parent: parent as HTMLDivElement,
       style: { position: "absolute", inset: "0" } as never,
@@ -204,8 +203,11 @@ export class MapView {
     };
   }
 
+  /** The bounds of everything there is. */
+  private readonly around: Box;
+
   private fitting(): View {
-    const box = bounds([this.labels.position, this.tracks.levels[this.tracks.levels.length - 1]?.points ?? new Float32Array()]);
+    const box = this.around;
     const width = Math.max(20, box.right - box.left);
     const height = Math.max(20, box.top - box.bottom);
     const zoom = Math.log2(Math.min(this.width / width, this.height / height) * 0.88);
@@ -242,7 +244,7 @@ export class MapView {
   }
 
   setRejected(position: Float32Array): void {
-    this.rejected = flat(position);
+    this.rejected = plane(position);
     this.makeRejected();
     this.draw();
   }
@@ -321,7 +323,7 @@ export class MapView {
     // Doubtful ones are drawn last, so that they are not hidden.
     this.shown = Uint32Array.from(rows).sort((a, b) => (labels.existence[b] || 0) - (labels.existence[a] || 0) || a - b);
     const length = rows.length;
-    const position = new Float32Array(3 * length);
+    const position = new Float32Array(2 * length);
     const fill = new Uint32Array(length);
     const line = new Uint32Array(length);
     const shape = new Float32Array(4 * length);
@@ -329,10 +331,10 @@ export class MapView {
     const again = packed(STATES["check again"], 255);
     this.index = length ? new KDBush(length) : null;
     this.shown.forEach((row, i) => {
-      const east = labels.position[3 * row];
-      const north = labels.position[3 * row + 1];
-      position[3 * i] = east;
-      position[3 * i + 1] = north;
+      const east = labels.position[2 * row];
+      const north = labels.position[2 * row + 1];
+      position[2 * i] = east;
+      position[2 * i + 1] = north;
       const color = this.labelColor(row);
       const state = this.states[row];
       fill[i] = packed(color, state === "rejected" ? 30 : 255);
@@ -346,8 +348,8 @@ export class MapView {
     });
     this.index?.finish();
     this.buffers = { length, position, fill, line, shape };
-    this.held = null;
-    this.trackLayers.key = "";
+    this.near = null;
+    this.drives.want(this.settings.hiddenPasses, spacingAt(this.metresPerPixel()));
     this.makeRays();
     this.draw();
   }
@@ -360,78 +362,67 @@ export class MapView {
     return { left: left - x, right: right + x, bottom: bottom - y, top: top + y };
   }
 
-  /** Hand the GPU what is around the view, anew only when the view leaves that. */
-  private holdLabels(): void {
-    const near = 2 ** this.view.zoom > NEAR_SCALE;
-    const now = near ? this.ground(0) : EVERYWHERE;
-    if (!this.buffers || (this.held && contains(this.held, now) && (near || this.held === EVERYWHERE))) return;
-    this.held = near ? this.ground(1) : EVERYWHERE;
-    const { left, bottom, right, top } = this.held;
-    const rows = near && this.index ? this.index.range(left, bottom, right, top).sort((a, b) => a - b) : null;
-    this.labelLayers = labelLayers(rows ? taken(this.buffers, rows) : this.buffers, near);
+  /** From near only what is around the view is drawn, taken anew when the view leaves that. */
+  private nearLabels(): { dots: Discs; ellipses: Discs } | null {
+    if (!this.buffers || !this.index) return null;
+    if (!this.near || !contains(this.near.box, this.ground(0))) {
+      const box = this.ground(1);
+      const rows = this.index.range(box.left, box.bottom, box.right, box.top).sort((a, b) => a - b);
+      const dots = taken(this.buffers, rows);
+      // Ellipses are pale, with an outline in the same colour.
+      this.near = { box, dots, ellipses: { ...dots, fill: dots.fill.map((color) => faded(color, 0.22)), line: dots.fill } };
+    }
+    return this.near;
   }
 
   private draw(): void {
     const scale = 2 ** this.view.zoom;
-    this.holdLabels();
+    const near = scale > NEAR_SCALE;
+    const around = near ? this.nearLabels() : null;
     // Dots shrink where labels would cover each other; their size changes no buffer.
     // From near they shrink again, so that ellipses show.
-    const small = scale < 0.15 ? 2.6 : scale < 1 ? 3.6 : scale < 24 ? 5 : 3.5;
-    const layers: (Layer | null)[] = [
-      ...this.trackLayersNow(),
-      this.truthLayer?.clone({ visible: this.settings.layers.has("truth"), radius: this.view.zoom < 0 ? 5 : 9 } as never) ?? null,
-      this.rejectedLayer?.clone({ visible: this.settings.layers.has("rejected"), radius: this.view.zoom < 0 ? 1.5 : 3 } as never) ?? null,
-      this.labelLayers[1]?.clone({ visible: this.settings.layers.has("ellipses") }) ?? null,
-      ...this.rayLayers.map((layer) => layer.clone({ visible: this.view.zoom > RAYS_FROM_ZOOM })),
-      this.labelLayers[0]?.clone({ radius: small, lineWidth: small < 3 ? 0.5 : 1.25 } as never) ?? null,
-      ...this.markLayers,
+    const radius = scale < 0.15 ? 2.6 : scale < 1 ? 3.6 : scale < 24 ? 5 : 3.5;
+    const dots = { radius, lineWidth: radius < 3 ? 0.5 : 1.25 };
+    const { layers } = this.settings;
+    this.layers = [
+      ...this.trackLayers(),
+      new DiscLayer({ id: "truth", discs: this.truthDiscs, lineWidth: 1.75, visible: layers.has("truth"), radius: this.view.zoom < 0 ? 5 : 9 }),
+      new DiscLayer({ id: "rejected", discs: this.rejectedDiscs, visible: layers.has("rejected"), radius: this.view.zoom < 0 ? 1.5 : 3 }),
+      new DiscLayer({ id: "ellipses", discs: around && around.ellipses, shaped: true, radius: ELLIPSE_95, lineWidth: 1.5, visible: near && layers.has("ellipses") }),
+      ...this.rayLayers(),
+      new DiscLayer({ id: "labels", discs: this.buffers, ...dots, visible: !near }),
+      new DiscLayer({ id: "labels-near", discs: around && around.dots, ...dots, visible: near }),
+      new DiscLayer({ id: "selected", discs: this.marks.at, radius: 11, lineWidth: 2.5 }),
+      new LinesLayer({ id: "moved", lines: this.marks.moved, width: 1.5 }),
     ];
-    this.deck.setProps({ layers });
+    this.deck.setProps({ layers: this.layers });
   }
 
-  private trackLayersNow(): Layer[] {
-    const whole = this.tracks.at(this.metresPerPixel());
-    const { layers, hiddenPasses } = this.settings;
-    if (!whole) return [];
-    const showTracks = layers.has("tracks");
-    const showCameras = layers.has("cameras") && this.view.zoom > CAMERAS_FROM_ZOOM;
-    const key = `${whole.spacing} ${this.dark} ${this.showStreets} ${[...hiddenPasses].join()}`;
-    if (this.trackLayers.key !== key || !contains(this.trackLayers.box, this.ground(0))) {
-      const box = this.ground(1);
-      const level = within(whole, box);
-      const drawn = distinct(level, hiddenPasses, level.spacing / 2);
-      const rows = level.pass.length;
-      const lines = new Uint32Array(rows);
-      const dots = new Uint32Array(whole.spacing === 0 ? rows : 0);
-      const palette = new Map<number, Color>();
-      for (let i = 0; i < rows; i++) {
-        const number = level.pass[i];
-        if (hiddenPasses.has(number)) continue;
-        let color = palette.get(number);
-        if (!color) palette.set(number, (color = passColor(number, this.dark)));
-        if (drawn[i]) lines[i] = packed(color, 130);
-        if (dots.length) dots[i] = packed(color, 200);
-      }
-      const images: Discs = { length: dots.length, position: level.points, fill: dots, line: dots };
-      this.trackLayers = {
-        key,
-        box: level === whole ? EVERYWHERE : box,
-        layers: [
-          ...(this.showStreets ? this.streetLayers(within(this.tracks.streets(whole), box)) : []),
-          new LinesLayer({ id: `tracks-${level.spacing}`, lines: { points: level.points, colors: lines }, width: 1.5 }),
-          ...(dots.length ? [new DiscLayer({ id: `cameras-${level.spacing}`, discs: images, radius: 2 })] : []),
-        ],
-      };
-    }
-    const streetPx = Math.max(3, STREET_M / this.metresPerPixel());
-    return this.trackLayers.layers.map((layer) => {
-      if (layer.id.startsWith("cameras")) return layer.clone({ visible: showCameras });
-      if (layer.id.startsWith("tracks-streets")) return layer.clone({ visible: showTracks, width: streetPx } as never);
-      if (layer.id.startsWith("tracks-corners")) {
-        return layer.clone({ visible: showTracks && streetPx >= ROUND_FROM_PX, radius: streetPx / 2 } as never);
-      }
-      return layer.clone({ visible: showTracks });
-    });
+  /** Whether all labels in view are drawn. */
+  labelsDrawn(): boolean {
+    return this.layers.every((layer) => !layer.id.startsWith("labels") || !layer.props.visible || layer.complete);
+  }
+
+  /** Whether everything in view is drawn, as finely as it will be. */
+  settled(): boolean {
+    return !this.drives.waiting && this.layers.every((layer) => !layer.props.visible || layer.complete);
+  }
+
+  private trackLayers(): (DiscLayer | LinesLayer)[] {
+    const metres = this.metresPerPixel();
+    const { layers } = this.settings;
+    const level = this.drives.at(spacingAt(metres), this.dark);
+    const streets = level && this.drives.at(streetSpacing(level.spacing), this.dark);
+    const streetPx = Math.max(STREET_LEAST_PX, STREET_M / metres);
+    const visible = layers.has("tracks");
+    const visibleStreets = visible && this.showStreets;
+    const showImages = layers.has("cameras") && this.view.zoom > CAMERAS_FROM_ZOOM;
+    return [
+      new LinesLayer({ id: "streets", lines: streets && streets.streets, width: streetPx, visible: visibleStreets }),
+      new DiscLayer({ id: "corners", discs: streets && streets.corners, radius: streetPx / 2, visible: visibleStreets && streetPx >= ROUND_FROM_PX }),
+      new LinesLayer({ id: "tracks", lines: level && level.tracks, width: 1.5, visible }),
+      new DiscLayer({ id: "cameras", discs: level && level.images, radius: 2, visible: showImages }),
+    ];
   }
 
   private showStreets = true;
@@ -442,72 +433,63 @@ export class MapView {
     this.draw();
   }
 
-  /** Wide, pale lines beneath the tracks, with round ends: what was driven looks like a street. */
-  private streetLayers(level: Level): Layer[] {
-    const drawn = distinct(level, this.settings.hiddenPasses, Math.max(level.spacing, STREET_M) / 2);
-    const color = packed(this.dark ? [34, 42, 51] : [255, 255, 255], 255);
-    const corners = new Float32Array(level.points.length);
-    let count = 0;
-    const corner = (row: number) => corners.set(level.points.subarray(3 * row, 3 * row + 3), 3 * count++);
-    const round = level.spacing <= (4 * STREET_M) / ROUND_FROM_PX; // Coarser levels are only seen from too far away.
-    drawn.forEach((shown, row) => {
-      if (!shown || !round) return;
-      if (!drawn[row - 1]) corner(row);
-      corner(row + 1);
-    });
-    const colors = new Uint32Array(drawn.length);
-    drawn.forEach((shown, row) => (colors[row] = shown ? color : 0));
-    const fill = new Uint32Array(count).fill(color);
-    return [
-      new LinesLayer({ id: `tracks-streets-${level.spacing}`, lines: { points: level.points, colors } }),
-      new DiscLayer({ id: `tracks-corners-${level.spacing}`, discs: { length: count, position: corners.subarray(0, 3 * count), fill, line: fill } }),
-    ];
-  }
-
-  /** Layers that change with what is shown, never with the view. */
-  private truthLayer: Layer | null = null;
-  private rejectedLayer: Layer | null = null;
-  private rayLayers: Layer[] = [];
-  private markLayers: Layer[] = [];
+  /** What changes with what is shown, never with the view. */
+  private truthDiscs: Discs | null = null;
+  private rejectedDiscs: Discs | null = null;
+  private rayMeshes: { missed: Lines; seen: Lines; lit: Lines; misses: Discs; voters: Discs } | null = null;
+  private marks: { at: Discs | null; moved: Lines | null } = { at: null, moved: null };
 
   private makeTruth(): void {
     if (!this.truth || !this.truth.position.length) return;
     const { position, outcome } = this.truth;
     const line = Uint32Array.from(outcome, (number) => packed(OUTCOMES[this.outcomes[number]] ?? OUTCOMES.found, 255));
-    this.truthLayer = new DiscLayer({ id: "truth", discs: ringed({ length: outcome.length, position, fill: line, line }), lineWidth: 1.75 });
+    this.truthDiscs = ringed({ length: outcome.length, position, fill: line, line });
   }
 
   private makeRejected(): void {
     if (!this.rejected) return;
-    const length = this.rejected.length / 3;
+    const length = this.rejected.length / 2;
     const fill = new Uint32Array(length).fill(packed(this.dark ? [190, 190, 190] : [90, 90, 90], 150));
-    this.rejectedLayer = new DiscLayer({ id: "rejected", discs: { length, position: this.rejected, fill, line: fill } });
+    this.rejectedDiscs = { length, position: this.rejected, fill, line: fill };
   }
 
   private makeRays(): void {
-    this.rayLayers = [];
+    this.rayMeshes = null;
     if (!this.rays) return;
     const { shots, misses, to } = this.rays;
     const seen = shots.filter((shot) => !this.settings.hiddenPasses.has(shot.pass));
     const ofPass = (opacity: number) => (shot: Shot) => packed(passColor(shot.pass, this.dark), opacity);
     const missed = (opacity: number) => () => packed([213, 94, 0], opacity);
     const lit = () => packed(this.dark ? [255, 255, 255] : [20, 20, 20], 255);
-    this.rayLayers = [
-      rays("misses", misses, to, missed(70), 1),
-      rays("rays", seen, to, ofPass(120), 1),
-      new DiscLayer({ id: "missed", discs: cameras(misses, missed(255)), radius: 2.6 }),
-      new DiscLayer({ id: "voters", discs: cameras(seen, ofPass(255)), radius: 2.6 }),
-      rays("lit", this.lit ? [this.lit] : [], to, lit, 2.5),
+    this.rayMeshes = {
+      missed: rays(misses, to, missed(70)),
+      seen: rays(seen, to, ofPass(120)),
+      lit: rays(this.lit ? [this.lit] : [], to, lit),
+      misses: cameras(misses, missed(255)),
+      voters: cameras(seen, ofPass(255)),
+    };
+  }
+
+  private rayLayers(): (DiscLayer | LinesLayer)[] {
+    const visible = this.view.zoom > RAYS_FROM_ZOOM;
+    const { rayMeshes: meshes } = this;
+    return [
+      new LinesLayer({ id: "rays-missed", lines: meshes && meshes.missed, width: 1, visible }),
+      new LinesLayer({ id: "rays", lines: meshes && meshes.seen, width: 1, visible }),
+      new DiscLayer({ id: "misses", discs: meshes && meshes.misses, radius: 2.6, visible }),
+      new DiscLayer({ id: "voters", discs: meshes && meshes.voters, radius: 2.6, visible }),
+      new LinesLayer({ id: "lit", lines: meshes && meshes.lit, width: 2.5, visible }),
     ];
   }
 
   private makeMarks(): void {
-    const position = new Float32Array(this.selected.flatMap((place) => [...place, 0]));
-    const line = new Uint32Array(this.selected.length).fill(packed(this.dark ? [255, 255, 255] : [10, 20, 30], 255));
-    this.markLayers = [
-      new DiscLayer({ id: "selected", discs: ringed({ length: line.length, position, fill: line, line }), radius: 11, lineWidth: 2.5 }),
-      new LinesLayer({ id: "moved", lines: { points: position, colors: line }, width: 1.5 }),
-    ];
+    const ends = new Float32Array(this.selected.flat());
+    const length = this.selected.length;
+    const line = new Uint32Array(length).fill(packed(this.dark ? [255, 255, 255] : [10, 20, 30], 255));
+    this.marks = {
+      at: ringed({ length, position: ends, fill: line, line }),
+      moved: length === 2 ? { length: 1, ends, colors: line } : null,
+    };
   }
 
   // What the pointer does. The index on the CPU answers in less than a millisecond, where reading back from the GPU waits.
@@ -520,7 +502,7 @@ export class MapView {
     let bestAway = Infinity;
     for (const i of this.index.within(east, north, PICK_PX * this.metresPerPixel())) {
       const row = this.shown[i];
-      const away = Math.hypot(this.labels.position[3 * row] - east, this.labels.position[3 * row + 1] - north);
+      const away = Math.hypot(this.labels.position[2 * row] - east, this.labels.position[2 * row + 1] - north);
       if (away < bestAway) [best, bestAway] = [row, away];
     }
     return best;
@@ -566,25 +548,16 @@ function taken(all: Buffers, rows: number[]): Buffers {
   const length = rows.length;
   const part: Buffers = {
     length,
-    position: new Float32Array(3 * length),
+    position: new Float32Array(2 * length),
     fill: Uint32Array.from(rows, (row) => all.fill[row]),
     line: Uint32Array.from(rows, (row) => all.line[row]),
     shape: new Float32Array(4 * length),
   };
   rows.forEach((row, i) => {
-    part.position.set(all.position.subarray(3 * row, 3 * row + 3), 3 * i);
+    part.position.set(all.position.subarray(2 * row, 2 * row + 2), 2 * i);
     part.shape.set(all.shape.subarray(4 * row, 4 * row + 4), 4 * i);
   });
   return part;
-}
-
-/** Labels as dots, and from near as ellipses: pale, with an outline in the same colour. */
-function labelLayers({ length, position, fill, line, shape }: Buffers, near: boolean): Layer[] {
-  const dots = new DiscLayer({ id: "labels", discs: { length, position, fill, line } });
-  if (!near) return [dots];
-  const pale = fill.map((color) => faded(color, 0.22));
-  const ellipses = { length, position, fill: pale, line: fill, shape };
-  return [dots, new DiscLayer({ id: "ellipses", discs: ellipses, radius: ELLIPSE_95, lineWidth: 1.5 })];
 }
 
 /** A packed colour with a part of its opacity. */
@@ -595,27 +568,33 @@ const ringed = (discs: Discs): Discs => ({ ...discs, fill: discs.fill.map((color
 
 /** Discs where cameras were. */
 function cameras(shots: Shot[], color: (shot: Shot) => number): Discs {
-  const position = new Float32Array(3 * shots.length);
-  shots.forEach(({ camera_m }, i) => position.set([camera_m[0], camera_m[1]], 3 * i));
   const fill = Uint32Array.from(shots, color);
+  const position = new Float32Array(shots.flatMap(({ camera_m: [east, north] }) => [east, north]));
   return { length: shots.length, position, fill, line: fill };
 }
 
-/** Lines from cameras to a place; none from there to the next camera. */
-function rays(id: string, shots: Shot[], to: [number, number], color: (shot: Shot) => number, width: number): Layer {
-  const points = new Float32Array(6 * shots.length);
-  const colors = new Uint32Array(2 * shots.length);
-  shots.forEach((shot, i) => {
-    points.set([shot.camera_m[0], shot.camera_m[1], 0, ...to, 0], 6 * i);
-    colors[2 * i] = color(shot);
-  });
-  return new LinesLayer({ id, lines: { points, colors }, width });
+/** Lines from cameras to a place. */
+function rays(shots: Shot[], to: [number, number], color: (shot: Shot) => number): Lines {
+  const ends = new Float32Array(shots.flatMap(({ camera_m: [east, north] }) => [east, north, ...to]));
+  return { length: shots.length, ends, colors: Uint32Array.from(shots, color) };
 }
 
-function bounds(arrays: Float32Array[]) {
+/** East and north of points that have a third number. */
+export function plane(position: Float32Array): Float32Array {
+  const rows = position.length / 3;
+  const points = new Float32Array(2 * rows);
+  for (let i = 0; i < rows; i++) {
+    points[2 * i] = position[3 * i];
+    points[2 * i + 1] = position[3 * i + 1];
+  }
+  return points;
+}
+
+/** The bounds of points; a place for none. */
+function boundsOf(arrays: Float32Array[]): Box {
   const box = { left: Infinity, right: -Infinity, bottom: Infinity, top: -Infinity };
   for (const points of arrays) {
-    for (let i = 0; i < points.length; i += 3) {
+    for (let i = 0; i < points.length; i += 2) {
       box.left = Math.min(box.left, points[i]);
       box.right = Math.max(box.right, points[i]);
       box.bottom = Math.min(box.bottom, points[i + 1]);

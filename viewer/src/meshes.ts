@@ -6,36 +6,55 @@
  * in one list, and most of what a frame costs.
  */
 
-import { type DefaultProps, Layer, project32, type UpdateParameters } from "@deck.gl/core";
+import { type DefaultProps, Layer, project32 } from "@deck.gl/core";
+import { Buffer, type VertexArray } from "@luma.gl/core";
 import { Model } from "@luma.gl/engine";
-import { Buffer } from "@luma.gl/core";
+import { PART, partsWithin } from "./parts";
 
 /** Discs in the order in which they are drawn. */
 export interface Discs {
   length: number;
-  /** East, north, 0 of each. */
+  /** East and north of each. */
   position: Float32Array;
   /** The colour of each, packed. */
   fill: Uint32Array;
   line: Uint32Array;
   /** For ellipses in metres: the major half axis, cosine and sine of its angle, minor by major. */
   shape?: Float32Array;
+  /** Of every part (parts.ts), where it is known. */
+  bounds?: Float32Array;
+  family?: object;
 }
 
-/** Lines from each point to the next one; none where the colour is 0. */
+/** Lines in the order in which they are drawn. */
 export interface Lines {
-  points: Float32Array;
-  /** Packed, as many as points. */
+  length: number;
+  /** East and north of one end, then of the other one. */
+  ends: Float32Array;
+  /** Packed. */
   colors: Uint32Array;
+  bounds?: Float32Array;
+  family?: object;
+}
+
+/** What discs and lines have in common. */
+interface Mesh {
+  length: number;
+  bounds?: Float32Array;
+  /** What the GPU holds of a mesh is kept for later while meshes of its family are drawn. */
+  family?: object;
 }
 
 const CORNERS = 4;
 const INDICES = [0, 1, 2, 2, 1, 3];
 
-/** What a list of triangles for `count` rectangles reads. */
-function rectangles(count: number): Uint32Array {
-  const indices = new Uint32Array(INDICES.length * count);
-  for (let i = 0, at = 0; i < count; i++) for (const index of INDICES) indices[at++] = CORNERS * i + index;
+/** So many parts a layer hands the GPU in one frame: more would make the page wait for it. */
+const PARTS_A_FRAME = 2;
+
+/** What a list of triangles for a part reads. */
+function rectangles(): Uint16Array {
+  const indices = new Uint16Array(INDICES.length * PART);
+  for (let i = 0, at = 0; i < PART; i++) for (const index of INDICES) indices[at++] = CORNERS * i + index;
   return indices;
 }
 
@@ -47,15 +66,27 @@ function repeated<T extends Float32Array | Uint32Array>(rows: T, size: number, i
   return into;
 }
 
+const repeatedNumbers = (numbers: Float32Array, size: number) => repeated(numbers, size, new Float32Array(CORNERS * numbers.length));
 const repeatedColors = (colors: Uint32Array) => repeated(colors, 1, new Uint32Array(CORNERS * colors.length));
 
 type Attributes = Record<string, Float32Array | Uint32Array>;
 
+/** A part of a mesh on the GPU. */
+interface Part {
+  buffers: Buffer[];
+  vertices: VertexArray;
+  count: number;
+}
+
 interface MeshState {
   [key: string]: unknown;
-  model?: Model;
-  buffers: Buffer[];
-  count: number;
+  model: Model;
+  indices: Buffer;
+  /** By mesh, those that were in view. */
+  parts: Map<Mesh, Part[]>;
+  /** The mesh of which everything in view was there last. */
+  whole: Mesh | null;
+  complete: boolean;
 }
 
 interface Shaders {
@@ -64,54 +95,104 @@ interface Shaders {
   modules: object[];
 }
 
-/** What both kinds have in common: buffers that are filled once, and drawn as one list of triangles. */
+/**
+ * What both kinds have in common: a mesh in parts, which are handed to the GPU once they are in view, a few in every
+ * frame. Until all of a new mesh are there, the mesh before is drawn.
+ */
 abstract class MeshLayer<Props extends object> extends Layer<Props> {
   static layerName = "MeshLayer";
   declare state: MeshState;
 
-  protected abstract filled(): { count: number; attributes: Attributes };
-  protected abstract mesh(props: Props): unknown;
+  protected abstract mesh(): Mesh | null;
+  /** What the GPU reads of the rows from one to before the other. */
+  protected abstract filled(from: number, to: number): Attributes;
   protected abstract layout(): { name: string; format: "float32x2" | "float32x4" | "unorm8x4" }[];
   protected abstract shaders(): Shaders;
   protected abstract uniforms(): Record<string, Record<string, number>>;
+  /** How many pixels a shape reaches beyond its points. */
+  protected abstract reachPx(): number;
 
   getShaders() {
     return super.getShaders(this.shaders());
   }
 
   initializeState(): void {
-    this.state = { buffers: [], count: 0 };
+    const { device } = this.context;
+    // At once, while the page opens: to compile takes long.
+    const model = new Model(device, { ...this.getShaders(), id: this.props.id, topology: "triangle-list", bufferLayout: this.layout() });
+    const indices = device.createBuffer({ usage: Buffer.INDEX, data: rectangles() });
+    this.state = { model, indices, parts: new Map(), whole: null, complete: false };
   }
 
-  updateState({ props, oldProps }: UpdateParameters<this>): void {
-    if (this.state.model && this.mesh(props as Props) === this.mesh(oldProps as Props)) return;
-    const { device } = this.context;
-    const { count, attributes } = this.filled();
-    const before = this.state.buffers;
-    const indexBuffer = device.createBuffer({ usage: Buffer.INDEX, data: rectangles(count) });
-    const buffers = Object.fromEntries(Object.entries(attributes).map(([name, data]) => [name, device.createBuffer({ data })]));
-    this.state.buffers = [indexBuffer, ...Object.values(buffers)];
-    this.state.count = count;
-    if (this.state.model) {
-      this.state.model.setAttributes(buffers);
-      this.state.model.setIndexBuffer(indexBuffer);
-    } else {
-      this.state.model = new Model(device, { ...this.getShaders(), id: this.props.id, topology: "triangle-list", bufferLayout: this.layout(), attributes: buffers, indexBuffer });
-    }
-    this.state.model.setVertexCount(INDICES.length * count);
-    for (const buffer of before) buffer.destroy();
+  /** Whether everything in view is drawn. */
+  get complete(): boolean {
+    return !this.mesh() || !!this.state?.complete;
   }
 
   draw(): void {
-    const { model, count } = this.state;
-    if (!model || !count) return;
-    model.shaderInputs.setProps(this.uniforms());
-    model.draw(this.context.renderPass);
+    const { state } = this;
+    const mesh = this.mesh();
+    if (!mesh) return;
+    const inView = this.partsInView(mesh);
+    const made = this.partsOf(mesh);
+    const missing = inView.filter((part) => !made[part]);
+    for (const part of missing.slice(0, PARTS_A_FRAME)) made[part] = this.made(part, mesh);
+    state.complete = missing.length <= PARTS_A_FRAME;
+    if (state.complete && state.whole !== mesh) {
+      state.whole = mesh;
+      for (const other of state.parts.keys()) if (other !== mesh && (!mesh.family || other.family !== mesh.family)) this.forget(other);
+    }
+    if (!state.complete) this.setNeedsRedraw();
+    const drawn = state.whole ?? mesh;
+    state.model.shaderInputs.setProps(this.uniforms());
+    for (const number of drawn === mesh ? inView : this.partsInView(drawn)) {
+      const part = this.partsOf(drawn)[number];
+      if (!part) continue;
+      state.model.vertexArray = part.vertices;
+      state.model.setVertexCount(INDICES.length * part.count);
+      state.model.draw(this.context.renderPass);
+    }
   }
 
   finalizeState(context: Layer["context"]): void {
+    for (const mesh of [...this.state.parts.keys()]) this.forget(mesh);
+    this.state.indices.destroy();
     super.finalizeState(context); // It destroys the model.
-    for (const buffer of this.state.buffers) buffer.destroy();
+  }
+
+  private partsOf(mesh: Mesh): Part[] {
+    let parts = this.state.parts.get(mesh);
+    if (!parts) this.state.parts.set(mesh, (parts = []));
+    return parts;
+  }
+
+  private partsInView({ length, bounds }: Mesh): number[] {
+    const { viewport } = this.context;
+    const [left, bottom, right, top] = viewport.getBounds();
+    const reach = (this.reachPx() * (right - left)) / viewport.width;
+    const box = { left: left - reach, bottom: bottom - reach, right: right + reach, top: top + reach };
+    return partsWithin(Math.ceil(length / PART), bounds, box);
+  }
+
+  private made(part: number, mesh: Mesh): Part {
+    const { device } = this.context;
+    const { model, indices } = this.state;
+    const [from, to] = [part * PART, Math.min(mesh.length, (part + 1) * PART)];
+    const buffers = Object.fromEntries(Object.entries(this.filled(from, to)).map(([name, data]) => [name, device.createBuffer({ data })]));
+    const { shaderLayout, bufferLayout } = model.pipeline;
+    model.vertexArray = device.createVertexArray({ shaderLayout, bufferLayout });
+    model.setIndexBuffer(indices);
+    model.setAttributes(buffers);
+    return { buffers: Object.values(buffers), vertices: model.vertexArray, count: to - from };
+  }
+
+  private forget(mesh: Mesh): void {
+    for (const part of this.partsOf(mesh)) {
+      if (!part) continue;
+      part.vertices.destroy();
+      for (const buffer of part.buffers) buffer.destroy();
+    }
+    this.state.parts.delete(mesh);
   }
 }
 
@@ -124,7 +205,9 @@ layout(std140) uniform discUniforms {
 `;
 
 interface DiscProps {
-  discs: Discs;
+  discs: Discs | null;
+  /** Whether the discs are ellipses. */
+  shaped: boolean;
   /** In pixels; for ellipses what the half axes are multiplied with. */
   radius: number;
   /** The width of the outline in pixels. */
@@ -136,14 +219,15 @@ interface DiscProps {
 export class DiscLayer extends MeshLayer<DiscProps> {
   static layerName = "DiscLayer";
   static defaultProps: DefaultProps<DiscProps> = {
-    discs: { type: "object", value: null as never },
+    discs: { type: "object", value: null, optional: true },
+    shaped: false,
     radius: 1,
     lineWidth: 0,
     minRadius: 0.5,
   };
 
   protected shaders() {
-    const shaped = !!this.props.discs.shape;
+    const { shaped } = this.props;
     return {
       vs: `#version 300 es
 #define SHADER_NAME disc-vertex
@@ -200,8 +284,8 @@ void main(void) {
     };
   }
 
-  protected mesh({ discs }: DiscProps): Discs {
-    return discs;
+  protected mesh(): Discs | null {
+    return this.props.discs;
   }
 
   protected layout() {
@@ -209,19 +293,23 @@ void main(void) {
       { name: "centers", format: "float32x2" as const },
       { name: "fillColors", format: "unorm8x4" as const },
       { name: "lineColors", format: "unorm8x4" as const },
-      ...(this.props.discs.shape ? [{ name: "shapes", format: "float32x4" as const }] : []),
+      ...(this.props.shaped ? [{ name: "shapes", format: "float32x4" as const }] : []),
     ];
   }
 
-  protected filled() {
-    const { length, position, fill, line, shape } = this.props.discs;
+  protected filled(from: number, to: number) {
+    const { position, fill, line, shape } = this.props.discs!;
     const attributes: Attributes = {
-      centers: repeated(flattened(position), 2, new Float32Array(2 * CORNERS * length)),
-      fillColors: repeatedColors(fill),
-      lineColors: repeatedColors(line),
+      centers: repeatedNumbers(position.subarray(2 * from, 2 * to), 2),
+      fillColors: repeatedColors(fill.subarray(from, to)),
+      lineColors: repeatedColors(line.subarray(from, to)),
     };
-    if (shape) attributes.shapes = repeated(shape, 4, new Float32Array(shape.length * CORNERS));
-    return { count: length, attributes };
+    if (this.props.shaped && shape) attributes.shapes = repeatedNumbers(shape.subarray(4 * from, 4 * to), 4);
+    return attributes;
+  }
+
+  protected reachPx(): number {
+    return this.props.radius + this.props.lineWidth + 1;
   }
 
   protected uniforms() {
@@ -237,14 +325,14 @@ layout(std140) uniform linesUniforms {
 `;
 
 interface LineProps {
-  lines: Lines;
+  lines: Lines | null;
   /** In pixels. */
   width: number;
 }
 
 export class LinesLayer extends MeshLayer<LineProps> {
   static layerName = "LinesLayer";
-  static defaultProps: DefaultProps<LineProps> = { lines: { type: "object", value: null as never }, width: 1 };
+  static defaultProps: DefaultProps<LineProps> = { lines: { type: "object", value: null, optional: true }, width: 1 };
 
   protected shaders() {
     return {
@@ -283,8 +371,8 @@ void main(void) {
     };
   }
 
-  protected mesh({ lines }: LineProps): Lines {
-    return lines;
+  protected mesh(): Lines | null {
+    return this.props.lines;
   }
 
   protected layout() {
@@ -294,25 +382,13 @@ void main(void) {
     ];
   }
 
-  protected filled() {
-    const { points, colors } = this.props.lines;
-    const rows = points.length / 3;
-    let count = 0;
-    for (let row = 0; row + 1 < rows; row++) if (colors[row]) count++;
-    const ends = new Float32Array(4 * count);
-    const drawn = new Uint32Array(count);
-    for (let row = 0, i = 0; row + 1 < rows; row++) {
-      if (!colors[row]) continue;
-      ends[4 * i] = points[3 * row];
-      ends[4 * i + 1] = points[3 * row + 1];
-      ends[4 * i + 2] = points[3 * row + 3];
-      ends[4 * i + 3] = points[3 * row + 4];
-      drawn[i++] = colors[row];
-    }
-    return {
-      count,
-      attributes: { ends: repeated(ends, 4, new Float32Array(CORNERS * ends.length)), colors: repeatedColors(drawn) },
-    };
+  protected filled(from: number, to: number) {
+    const { ends, colors } = this.props.lines!;
+    return { ends: repeatedNumbers(ends.subarray(4 * from, 4 * to), 4), colors: repeatedColors(colors.subarray(from, to)) };
+  }
+
+  protected reachPx(): number {
+    return this.props.width + 1;
   }
 
   protected uniforms() {
@@ -322,15 +398,4 @@ void main(void) {
 
 function uniformModule(name: string, source: string, uniforms: string[]) {
   return { name, vs: source, fs: source, uniformTypes: Object.fromEntries(uniforms.map((each) => [each, "f32" as const])) };
-}
-
-/** East and north of points that have a third number. */
-function flattened(position: Float32Array): Float32Array {
-  const rows = position.length / 3;
-  const plane = new Float32Array(2 * rows);
-  for (let i = 0; i < rows; i++) {
-    plane[2 * i] = position[3 * i];
-    plane[2 * i + 1] = position[3 * i + 1];
-  }
-  return plane;
 }

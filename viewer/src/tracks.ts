@@ -1,7 +1,13 @@
-/** Where the cameras drove: lines that get coarser as one looks from farther away, so that 400,000 images stay smooth. */
+/**
+ * Where the cameras drove: lines that get coarser as one looks from farther away, so that 400,000 images stay smooth.
+ *
+ * All of it is made in a worker (drives.worker.ts), each level once and in one piece; what is drawn of it in a frame is
+ * the business of parts.ts and meshes.ts.
+ */
 
-import type { Columns } from "./columns";
+import { boundsOfParts, nearby } from "./parts";
 
+/** Images one after the other, as they were driven or fewer of them. */
 export interface Level {
   /** Between points of this level there is at least this distance. */
   spacing: number;
@@ -10,65 +16,60 @@ export interface Level {
   pass: Int32Array;
   /** Whether a line leads from the point to the next. */
   joined: Uint8Array;
-  /** The bounds (left, bottom, right, top) of every `CHUNK` points: successive images are near each other. */
+}
+
+/** Lines, those that are near each other one after the other. */
+export interface Lines {
+  /** East and north of one end, then of the other one. */
+  ends: Float32Array;
+  pass: Int32Array;
   bounds: Float32Array;
 }
 
-export interface Box {
-  left: number;
-  bottom: number;
-  right: number;
-  top: number;
+/** Points, those that are near each other one after the other. */
+export interface Points {
+  /** East and north. */
+  at: Float32Array;
+  pass: Int32Array;
+  bounds: Float32Array;
 }
 
-const CHUNK = 128;
-
-const SPACINGS = [0, 4, 12, 40, 160];
-
-export class Tracks {
-  readonly levels: Level[];
-
-  constructor(cameras: Columns) {
-    const rows = cameras.rows("position");
-    if (!rows) {
-      this.levels = [];
-      return;
-    }
-    const full: Level = {
-      spacing: 0,
-      points: flat(cameras.get("position")),
-      pass: cameras.get<Int32Array>("pass"),
-      joined: cameras.get<Uint8Array>("joined"),
-      bounds: new Float32Array(),
-    };
-    full.bounds = boundsOf(full.points);
-    this.levels = [full];
-    for (const spacing of SPACINGS.slice(1)) this.levels.push(thinned(full, spacing));
-  }
-
-  /** The coarsest level that looks the same at this many metres a pixel. */
-  at(metresPerPixel: number): Level | null {
-    let best: Level | null = null;
-    for (const level of this.levels) if (!best || level.spacing <= 4 * metresPerPixel) best = level;
-    return best;
-  }
-
-  /** The level for streets, which are wider than tracks: never the finest, where there is another. */
-  streets(tracks: Level): Level {
-    return tracks === this.levels[0] ? (this.levels[1] ?? tracks) : tracks;
-  }
+/** What is drawn of a level. */
+export interface Drawn {
+  spacing: number;
+  tracks: Lines;
+  /** Wide, pale lines beneath the tracks. The finest level has none: streets are wider than tracks. */
+  streets: Lines;
+  /** Round ends of streets. */
+  corners: Points;
+  /** Of the finest level only. */
+  images: Points;
 }
 
-export function flat(position: Float32Array): Float32Array {
-  const points = new Float32Array(position.length);
-  for (let i = 0; i < position.length; i += 3) {
-    points[i] = position[i];
-    points[i + 1] = position[i + 1];
-  }
-  return points;
+export const STREET_M = 9;
+
+/** Streets narrower than that have no round ends, which nobody would see. */
+export const ROUND_FROM_PX = 4;
+
+/** The coarsest first, 0 for all images. */
+export const SPACINGS = [160, 40, 12, 4, 0];
+
+/** A level is fine enough where its points are at most this many pixels apart. */
+const APART_PX = 4;
+
+/** The spacing of the coarsest level that looks the same at this many metres a pixel. */
+export function spacingAt(metresPerPixel: number): number {
+  return SPACINGS.find((spacing) => spacing <= APART_PX * metresPerPixel) ?? 0;
 }
 
-function thinned(full: Level, spacing: number): Level {
+/** The spacing of the level for streets: never the finest. */
+export function streetSpacing(spacing: number): number {
+  return spacing || SPACINGS[SPACINGS.length - 2];
+}
+
+/** Images in the order in which they were driven, with fewer points where they are closer than the spacing. */
+export function thinned(full: Level, spacing: number): Level {
+  if (spacing === 0) return full;
   const rows = full.pass.length;
   const keep: number[] = [];
   let last = -1;
@@ -86,7 +87,6 @@ function thinned(full: Level, spacing: number): Level {
     points: new Float32Array(3 * keep.length),
     pass: new Int32Array(keep.length),
     joined: new Uint8Array(keep.length),
-    bounds: new Float32Array(),
   };
   keep.forEach((row, i) => {
     level.points.set(full.points.subarray(3 * row, 3 * row + 3), 3 * i);
@@ -94,57 +94,83 @@ function thinned(full: Level, spacing: number): Level {
     // The end of a stretch is always kept, so what follows a kept point that is no end is of the same stretch.
     level.joined[i] = full.joined[row];
   });
-  level.bounds = boundsOf(level.points);
   return level;
 }
 
-function boundsOf(points: Float32Array): Float32Array {
-  const rows = points.length / 3;
-  const chunks = Math.ceil(rows / CHUNK);
-  const bounds = new Float32Array(4 * chunks);
-  for (let chunk = 0; chunk < chunks; chunk++) {
-    let [left, bottom, right, top] = [Infinity, Infinity, -Infinity, -Infinity];
-    // One point more: the line to the next chunk belongs to this one.
-    for (let i = chunk * CHUNK; i < Math.min(rows, (chunk + 1) * CHUNK + 1); i++) {
-      left = Math.min(left, points[3 * i]);
-      right = Math.max(right, points[3 * i]);
-      bottom = Math.min(bottom, points[3 * i + 1]);
-      top = Math.max(top, points[3 * i + 1]);
-    }
-    bounds.set([left, bottom, right, top], 4 * chunk);
-  }
-  return bounds;
+/** What is drawn of a level without the hidden passes. */
+export function drawnOf(level: Level, hidden: ReadonlySet<number>): Drawn {
+  const { spacing } = level;
+  const tracks = lines(level, distinct(level, hidden, spacing / 2));
+  const finest = spacing === 0;
+  const streets = finest ? new Uint8Array(level.pass.length) : distinct(level, hidden, Math.max(spacing, STREET_M) / 2);
+  // Coarser levels are only seen from too far away for round ends.
+  const round = spacing <= (APART_PX * STREET_M) / ROUND_FROM_PX;
+  const images: number[] = [];
+  if (finest) for (let row = 0; row < level.pass.length; row++) if (!hidden.has(level.pass[row])) images.push(row);
+  return {
+    spacing,
+    tracks,
+    streets: lines(level, streets),
+    corners: points(level, round ? corners(streets) : []),
+    images: points(level, images),
+  };
 }
 
-/** The part of a level that may be inside a box; the level itself where that is most of it. */
-export function within(level: Level, box: Box): Level {
-  const chunks = level.bounds.length / 4;
-  const found: number[] = [];
-  for (let chunk = 0; chunk < chunks; chunk++) {
-    const [left, bottom, right, top] = level.bounds.subarray(4 * chunk, 4 * chunk + 4);
-    if (left <= box.right && right >= box.left && bottom <= box.top && top >= box.bottom) found.push(chunk);
-  }
-  if (found.length > 0.7 * chunks) return level;
-  const rows = level.pass.length;
-  // Every piece takes the first point of the next chunk along, as the end of its last line.
-  const pieces = found.map((chunk) => [chunk * CHUNK, Math.min(rows, (chunk + 1) * CHUNK + 1)]);
-  const count = pieces.reduce((sum, [from, to]) => sum + to - from, 0);
-  const part: Level = {
-    spacing: level.spacing,
-    points: new Float32Array(3 * count),
-    pass: new Int32Array(count),
-    joined: new Uint8Array(count),
-    bounds: new Float32Array(),
-  };
-  let at = 0;
-  for (const [from, to] of pieces) {
-    part.points.set(level.points.subarray(3 * from, 3 * to), 3 * at);
-    part.pass.set(level.pass.subarray(from, to), at);
-    part.joined.set(level.joined.subarray(from, to), at);
-    at += to - from;
-    part.joined[at - 1] = 0;
-  }
-  return part;
+/** The typed arrays of what is drawn, to be handed from a worker to the page without a copy. */
+export function buffersOf(drawn: Drawn): ArrayBuffer[] {
+  return [drawn.tracks, drawn.streets, drawn.corners, drawn.images].flatMap((each) =>
+    Object.values(each).map((array: Float32Array | Int32Array) => array.buffer as ArrayBuffer),
+  );
+}
+
+/** Both ends of all lines that are drawn, those between two lines once. */
+function corners(drawn: Uint8Array): number[] {
+  const rows: number[] = [];
+  drawn.forEach((shown, row) => {
+    if (!shown) return;
+    if (!drawn[row - 1]) rows.push(row);
+    rows.push(row + 1);
+  });
+  return rows;
+}
+
+function lines({ points, pass }: Level, drawn: Uint8Array): Lines {
+  const rows: number[] = [];
+  drawn.forEach((shown, row) => shown && rows.push(row));
+  const east = new Float32Array(rows.length);
+  const north = new Float32Array(rows.length);
+  rows.forEach((row, i) => {
+    east[i] = (points[3 * row] + points[3 * row + 3]) / 2;
+    north[i] = (points[3 * row + 1] + points[3 * row + 4]) / 2;
+  });
+  const ends = new Float32Array(4 * rows.length);
+  const passes = new Int32Array(rows.length);
+  nearby(east, north).forEach((at, i) => {
+    const row = rows[at];
+    ends[4 * i] = points[3 * row];
+    ends[4 * i + 1] = points[3 * row + 1];
+    ends[4 * i + 2] = points[3 * row + 3];
+    ends[4 * i + 3] = points[3 * row + 4];
+    passes[i] = pass[row];
+  });
+  return { ends, pass: passes, bounds: boundsOfParts(ends, 2) };
+}
+
+function points(level: Level, rows: number[]): Points {
+  const east = new Float32Array(rows.length);
+  const north = new Float32Array(rows.length);
+  rows.forEach((row, i) => {
+    east[i] = level.points[3 * row];
+    north[i] = level.points[3 * row + 1];
+  });
+  const at = new Float32Array(2 * rows.length);
+  const pass = new Int32Array(rows.length);
+  nearby(east, north).forEach((from, i) => {
+    at[2 * i] = east[from];
+    at[2 * i + 1] = north[from];
+    pass[i] = level.pass[rows[from]];
+  });
+  return { at, pass, bounds: boundsOfParts(at, 1) };
 }
 
 /**
