@@ -31,6 +31,7 @@ from valuemap.readers.poses import LOOKING_NORTH
 from valuemap.readers.structure import Picture, Posed, find_poses, process
 from valuemap.readers.structure.adjust import Sights, adjust, gps_inflation
 from valuemap.readers.structure.features import find_features, image_ids
+from valuemap.readers.structure.guided import Features, is_turned, match_along_lines
 from valuemap.readers.structure.job import Job, prepare, read_answer, read_job, write_answer
 from valuemap.readers.structure.mapping import confirmed, contradicts_gps
 from valuemap.readers.structure.pairs import pairs_to_match
@@ -40,9 +41,12 @@ from valuemap.tables import Floats, Ints
 
 
 def drive_with_points(
-    seed: int, *, gps_sigma_m: float = 1.0, pixel_sigma: float = 0.5
+    seed: int, *, gps_sigma_m: float = 1.0, pixel_sigma: float = 0.5, lasting: float = 0.0
 ) -> tuple[Sights, Floats, Floats]:
-    """A camera that looks 4 degrees up drives round a corner; true rotations and centres, and what is seen of it."""
+    """A camera that looks 4 degrees up drives round a corner; true rotations and centres, and what is seen of it.
+
+    A share `lasting` of the error of a feature is what it was in the picture before.
+    """
     random = np.random.default_rng(seed)
     count, width, height, focal = 40, 640, 480, 500.0
     corner = np.concatenate([np.zeros(20), np.linspace(0.0, np.pi / 2.0, 8), np.full(12, np.pi / 2.0)])
@@ -53,14 +57,16 @@ def drive_with_points(
     points = np.array([-30.0, -20.0, 0.0]) + random.random((700, 3)) * [100.0, 110.0, 15.0]
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=[focal, 320.0, 240.0, 0.0])
     image, point, pixel = [], [], []
+    error = random.normal(0.0, pixel_sigma, (len(points), 2))
     for i in range(count):
+        error = lasting * error + np.sqrt(1.0 - lasting**2) * random.normal(0.0, pixel_sigma, error.shape)
         in_cam = (points - center[i]) @ rotation[i].T
         px = focal * in_cam[:, :2] / in_cam[:, 2:] + [320.0, 240.0]
         seen = (in_cam[:, 2] > 2.0) & (in_cam[:, 2] < 40.0) & np.all((px > 0) & (px < [640.0, 480.0]), axis=1)
         rows = np.flatnonzero(seen)
         image += [i] * len(rows)
         point += rows.tolist()
-        pixel.append(px[rows] + random.normal(0.0, pixel_sigma, (len(rows), 2)))
+        pixel.append(px[rows] + error[rows])
     of = np.array(point)
     kept = (np.bincount(of, minlength=700) > 1)[of]
     which, of = np.unique(of[kept], return_inverse=True)
@@ -107,6 +113,16 @@ def test_errors_are_as_large_as_their_sigmas_say() -> None:
         assert abs(found.cameras[1].params[0] - 500.0) < 5.0
     for ratio in (world, within, turned):
         assert 0.4 < np.sqrt(np.mean(ratio)) < 1.6
+
+
+def test_errors_of_features_that_last_are_not_taken_for_none() -> None:
+    """Points follow them, so that residuals halve; what points pull poses does not."""
+    sigma = []
+    for lasting in (0.0, 0.95):
+        sights, _, _ = drive_with_points(0, lasting=lasting)
+        found = adjust(sights, np.zeros(len(sights.row), dtype=np.int64))
+        sigma.append(float(np.median(found.sigma_in_part[:, 0])))
+    assert sigma[1] > 0.75 * sigma[0]
 
 
 def test_an_outlier_of_the_gps_moves_nothing() -> None:
@@ -197,6 +213,34 @@ def test_pictures_are_matched_along_the_drive_and_with_others_near(tmp_path: Pat
     assert {(8, 30), (10, 30), (12, 30), (30, 31)} <= set(pairs)
     assert (5, 30) not in pairs
     assert all(a < b for a, b in pairs)
+
+
+# Matches where poses are known.
+
+
+def looks(points: Floats, descriptors: Floats, rotation: Floats, center: Floats) -> Features:
+    ray = (points - center) @ rotation.T
+    return Features(*(each / np.linalg.norm(each, axis=1, keepdims=True) for each in (ray, descriptors)))
+
+
+def test_windows_alike_are_told_apart_by_where_they_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fifty windows and as many that look the same, of two pictures round a corner; the poses are half a degree off."""
+    random = np.random.default_rng(0)
+    points = np.array([-5.0, 10.0, -3.0]) + random.random((100, 3)) * [10.0, 10.0, 8.0]
+    look = np.repeat(random.normal(size=(50, 128)), 2, axis=0)
+    there = look + random.normal(0.0, 0.1, look.shape)
+    first = LOOKING_NORTH.T, np.zeros(3)
+    second = Rotation.from_rotvec([0.0, 0.4, 0.0]).as_matrix() @ first[0], np.array([3.0, 1.0, 0.0])
+    assert is_turned(first[0], second[0])
+    assert not is_turned(first[0], first[0])
+    off = Rotation.from_rotvec([0.005, 0.007, 0.0]).as_matrix() @ second[0], second[1]
+    features = looks(points, look, *first), looks(points, there, *second)
+    found = match_along_lines(*features, first, off)
+    assert len(found) > 50
+    assert np.mean(found[:, 0] == found[:, 1]) > 0.95
+    monkeypatch.setattr("valuemap.readers.structure.guided._BAND_RAD", 4.0)
+    assert len(match_along_lines(*features, first, off)) < 10
+    assert match_along_lines(*features, first, (off[0], first[1])).shape == (0, 2)
 
 
 # The process.
@@ -438,6 +482,32 @@ def test_structure_from_motion_finds_poses(found_street: Street) -> None:
     assert dataset.images.position_sigma_m is not None
     assert 0.0 < np.median(dataset.images.position_sigma_m) < 0.1
     assert_allclose(dataset.cameras.params[0][0], FOCAL, rtol=0.03)
+
+
+def test_turned_pictures_are_matched_again_where_their_poses_are_known(found_street: Street) -> None:
+    """In a copy of the database, and points are made of what is new there."""
+    folder, _, _, _, _ = found_street
+    before, after = (matches_of(folder / "work" / name) for name in ("database.db", "models/guided.db"))
+    fresh = {pair: after[pair] - before.get(pair, set()) for pair in after}
+    assert sum(map(len, fresh.values())) > 30
+    assert all(len(after[pair]) >= len(known) for pair, known in before.items())
+    model = pycolmap.Reconstruction(folder / "work" / "models" / "united")
+    used = 0
+    for point in model.points3D.values():
+        seen = {element.image_id: element.point2D_idx for element in point.track.elements}
+        used += sum((seen[a], seen[b]) in fresh[a, b] for a, b in fresh if a in seen and b in seen)
+    assert used > 10
+
+
+def matches_of(path: Path) -> dict[tuple[int, int], set[tuple[int, int]]]:
+    """Return the matches that were verified, by pairs of images."""
+    found = {}
+    with pycolmap.Database.open(path) as database:
+        for number in database.read_two_view_geometry_num_inliers()[0]:
+            one, two = pycolmap.pair_id_to_image_pair(number)
+            matches = np.asarray(database.read_two_view_geometry(one, two).inlier_matches)
+            found[one, two] = {(int(a), int(b)) for a, b in matches}
+    return found
 
 
 def test_it_goes_on_where_it_was(found_street: Street, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,11 @@
 """The final adjustment: features, GPS positions and the vertical together, and how sure the poses are.
 
-Gauss-Newton with Levenberg's damping over all poses, cameras and points, the points eliminated (Schur's complement);
-the inverse of what is left is the covariance of the poses. Outliers of features and of the GPS lose weight (Cauchy).
+Gauss-Newton with Levenberg's damping over all poses, cameras and points, the points eliminated (Schur's complement).
+Outliers of features and of the GPS lose weight (Cauchy).
+
+Errors of features last: one is off in a picture as it was in the one before, while features of one picture know nothing
+of each other. So the covariance of the poses is that of the scatter between points (the sandwich of Huber, 1967, and of
+Liang and Zeger, 1986): what all sights of a point pull together counts, not how many they are.
 
 Errors of a GPS follow each other: what looks like a hundred positions may be worth ten. How much its residuals along a
 drive are alike says by how much their sigma must grow. The vertical is known from cameras that are held level: their
@@ -106,7 +110,20 @@ class _Equations:
         return step, (inverse @ (self.points_right - self.between.T @ step)).reshape(-1, 3)
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
+class _Linear:
+    """Errors of features (2 M), their derivatives by poses and cameras, and by points (M, 2, 3)."""
+
+    residual: Floats
+    of_rest: csr_matrix
+    by_place: Floats
+
+    def rows(self, width: int) -> Ints:
+        """Return the rows (M, 2, width) of blocks."""
+        return np.repeat(np.arange(len(self.residual)).reshape(-1, 2)[:, :, None], width, 2)
+
+
+@dataclass(frozen=True, eq=False)
 class _Weights:
     """Square roots of the weights of features (M), of GPS positions (N, 3) and of roll and pitch (N, 2).
 
@@ -129,8 +146,14 @@ def adjust(sights: Sights, part: Ints) -> Adjusted:
     here = _settled(_converged(sights, sights, worse), part, sights, worse)
     worse = gps_inflation(_gps_off(here), here.drive)
     here = _settled(_converged(here, sights, worse), part, sights, worse)
-    equations = _equations(here, _weigh(here, worse), sights)
-    variance, in_part = _variances(equations.without_points(0.0)[0], here, part)
+    weights = _weigh(here, worse)
+    scatter = _scatter(_linearised(here, weights), here)
+    meat = scatter + _priors(here, weights, sights, scatter.shape[0])[0]
+    # What weights lose where errors grow is information that their sum counts and that there is not (Huber, 1981).
+    equations = _equations(
+        here, replace(weights, feature=weights.feature * np.sqrt(_slope_share(here, weights))), sights
+    )
+    variance, in_part = _variances(equations.without_points(0.0)[0], meat, here, part)
     return Adjusted(here.cam_from_world, here.center_in_world_m, here.cameras, np.sqrt(variance), np.sqrt(in_part))
 
 
@@ -195,6 +218,14 @@ def _weigh(sights: Sights, worse: Floats) -> _Weights:
     count = np.bincount(sights.drive)[sights.drive]
     level = 1.0 / (np.array([_ROLL_SIGMA_RAD, _PITCH_SIGMA_RAD]) * np.sqrt(count)[:, None])
     return _Weights(sigma_px, feature, gps, level)
+
+
+def _slope_share(sights: Sights, weights: _Weights) -> float:
+    """Return how much what features pull changes with their errors, as a share of their weights."""
+    residual = np.linalg.norm(_residuals(sights), axis=1)
+    fine = np.isfinite(residual)
+    weight = weights.feature[fine] ** 2
+    return float((weight / (1.0 + (residual[fine] / (_CAUCHY * weights.sigma_px)) ** 2)).sum() / weight.sum())
 
 
 def _gps_off(sights: Sights) -> Floats:
@@ -274,6 +305,23 @@ def _equations(sights: Sights, weights: _Weights, first: Sights) -> _Equations:
     The unknowns are for each picture a small rotation w of the camera, R' = exp(w) R, and the shift of its centre; then
     the cameras' parameters.
     """
+    linear = _linearised(sights, weights)
+    of_rest, shape = linear.of_rest, (len(linear.residual), 3 * len(sights.point_in_world_m))
+    of_points = _sparse([(linear.rows(3), _blocks(sights.point, 3, 2), linear.by_place)], shape)
+    more, more_right = _priors(sights, weights, first, of_rest.shape[1])
+    each = np.zeros((len(sights.point_in_world_m), 3, 3))
+    np.add.at(each, sights.point, np.einsum("mki,mkj->mij", linear.by_place, linear.by_place))
+    return _Equations(
+        rest=(of_rest.T @ of_rest).tocsr() + more,
+        points=each,
+        between=(of_rest.T @ of_points).tocsr(),
+        rest_right=more_right - of_rest.T @ linear.residual,
+        points_right=-(of_points.T @ linear.residual),
+    )
+
+
+def _linearised(sights: Sights, weights: _Weights) -> _Linear:
+    """Return what features say, in sigmas."""
     in_cam = _in_camera(sights)
     residual = _project(sights, in_cam) - sights.pixel
     by_point, by_param = _derivatives(sights, in_cam)
@@ -300,22 +348,23 @@ def _equations(sights: Sights, weights: _Weights, first: Sights) -> _Equations:
             values = by_param[camera_id][mine] * weight[mine, None, None]
             place = np.broadcast_to(own, values.shape)
             where.append((np.repeat(rows[mine][:, :, None], len(own), 2), place, values))
-    of_rest = _sparse(where, (2 * count, size))
-    points = len(sights.point_in_world_m)
-    of_points = _sparse(
-        [(np.repeat(rows[:, :, None], 3, 2), _blocks(sights.point, 3, 2), by_place)], (2 * count, 3 * points)
-    )
-    flat = residual.reshape(-1)
-    more, more_right = _priors(sights, weights, first, size)
-    each = np.zeros((points, 3, 3))
-    np.add.at(each, sights.point, np.einsum("mki,mkj->mij", by_place, by_place))
-    return _Equations(
-        rest=(of_rest.T @ of_rest).tocsr() + more,
-        points=each,
-        between=(of_rest.T @ of_points).tocsr(),
-        rest_right=more_right - of_rest.T @ flat,
-        points_right=-(of_points.T @ flat),
-    )
+    return _Linear(residual.reshape(-1), _sparse(where, (2 * count, size)), by_place)
+
+
+def _scatter(linear: _Linear, sights: Sights) -> csr_matrix:
+    """Return the sum of squares of what points pull poses and cameras, each with all its sights.
+
+    What a point can follow by moving itself pulls nothing else.
+    """
+    count, points, residual = len(linear.residual), len(sights.point_in_world_m), linear.residual.reshape(-1, 2)
+    moves, pull_of_point = np.zeros((points, 3, 3)), np.zeros((points, 3))
+    np.add.at(moves, sights.point, np.einsum("mki,mkj->mij", linear.by_place, linear.by_place))
+    np.add.at(pull_of_point, sights.point, np.einsum("mki,mk->mi", linear.by_place, residual))
+    step = np.einsum("pij,pj->pi", np.linalg.pinv(moves, hermitian=True), pull_of_point)
+    left = residual - np.einsum("mki,mi->mk", linear.by_place, step[sights.point])
+    of_point = csr_matrix((left.reshape(-1), (np.repeat(sights.point, 2), np.arange(count))), shape=(points, count))
+    pull = of_point @ linear.of_rest
+    return csr_matrix(pull.T @ pull)
 
 
 def _slopes(sights: Sights) -> Floats:
@@ -386,11 +435,12 @@ def _priors(sights: Sights, weights: _Weights, first: Sights, size: int) -> tupl
     return csr_matrix((up.data, (up.row, up.col)), shape=(size, size)) + diags(diagonal), right
 
 
-def _variances(matrix: Any, sights: Sights, part: Ints) -> tuple[Floats, Floats]:
+def _variances(matrix: Any, meat: Any, sights: Sights, part: Ints) -> tuple[Floats, Floats]:
     """Return variances (N, 2) of positions and rotations in the world, and in their parts.
 
-    With G (D, 7) the ways in which a part moves as a whole and W weights, P = I - G (G'WG)^-1 G'W takes a fitted move
-    of the whole out of an error. The diagonal of P S P', with the covariance S, needs of S its own diagonal and S W G.
+    The covariance S is M^-1 B M^-1, with the matrix M of the equations and the scatter B of what they rest on. With G
+    (D, 7) the ways in which a part moves as a whole and W weights, P = I - G (G'WG)^-1 G'W takes a fitted move of the
+    whole out of an error. The diagonal of P S P' needs of S its own diagonal and S W G.
     """
     factors, images = splu(matrix.tocsc()), len(sights.row)
     count = 6 * images
@@ -399,7 +449,8 @@ def _variances(matrix: Any, sights: Sights, part: Ints) -> tuple[Floats, Floats]
         stop = min(start + _BATCH, count)
         unit = np.zeros((matrix.shape[0], stop - start))
         unit[np.arange(start, stop), np.arange(stop - start)] = 1.0
-        own[start:stop] = factors.solve(unit)[np.arange(start, stop), np.arange(stop - start)]
+        column = factors.solve(unit)
+        own[start:stop] = (column * (meat @ column)).sum(axis=0)
     rest = own.copy()
     weight = np.tile([_RANGE_M**2] * 3 + [1.0] * 3, images)
     for each in np.unique(part):
@@ -408,7 +459,7 @@ def _variances(matrix: Any, sights: Sights, part: Ints) -> tuple[Floats, Floats]
         ways = _moves_of_whole(sights, rows)
         weighted = np.zeros((matrix.shape[0], 7))
         weighted[place] = weight[place, None] * ways
-        spread = factors.solve(weighted)[place]
+        spread = factors.solve(meat @ factors.solve(weighted))[place]
         fitted = ways @ np.linalg.pinv(ways.T @ weighted[place])
         rest[place] += -2.0 * (fitted * spread).sum(axis=1)
         rest[place] += ((fitted @ (weighted[place].T @ spread)) * fitted).sum(axis=1)
