@@ -23,9 +23,10 @@ use rstar::primitives::GeomWithData;
 use super::drift::{Drive, Look};
 use super::estimate::is_one_visit;
 use super::heights::height_m;
-use super::looks::{Lookout, Seen};
+use super::looks::Lookout;
 use super::model::{Model, Sizes};
 use super::scene::Scene;
+use super::seen::Seen;
 use super::sizes::size_terms;
 
 /// Residuals beyond this many sigmas count less, in proportion (Huber): 95 % efficient where errors are Gaussian at 1.35, more above.

@@ -132,10 +132,7 @@ impl Nursery<'_> {
                 _ => break,
             }
         }
-        let seen = self.lookout.looks_of_few(model, &best.fit.point, &best.votes);
-        best.energy += 2.0 * (best.seen.ln_likelihood(class) - seen.ln_likelihood(class));
         best.energy -= 2.0 * self.ln_density(class, best.class, &best.votes, &best.fit.point);
-        (best.real, best.seen) = (seen.real(class), seen);
         (!self.beside.explains(model, &best)).then_some(best)
     }
 
