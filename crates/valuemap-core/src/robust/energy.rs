@@ -7,12 +7,12 @@
 //!   + ln|information| - 3 ln 2 pi - 2 ln births_c     (2) the position, marginalised, and the price of a birth
 //!   + 2 sum_i ln clutter_c                            (3) what the votes are otherwise
 //!   - 2 sum_i ln ratio(size_i)                        (4) boxes of one object have one physical size
-//!   - 2 ln [ (1 - phi_c) prod_pass usual(hits; looks) + phi_c prod_pass any(hits; looks) ]
-//!                                                     (5) who should have seen it, and did not: beta-binomial
+//!   - 2 ln [ (1 - phi) real_c(hits; looks) + phi false_c(hits; looks) ]
+//!                                                     (5) who should have seen it, and did not, by side and pass
 //! ```
 //!
-//! The second product of (5) is that of a false thing: parked, reflected, or mistaken for an object at times. Its detections meet as
-//! those of an object do, but in any share of the looks, none or all of a pass.
+//! The second term of (5) is that of a false thing: parked, reflected, or mistaken for an object at times. Its detections meet as
+//! those of an object do, but on one pass alone or in fewer of the looks (see [`super::seen`]).
 
 use std::f64::consts::PI;
 

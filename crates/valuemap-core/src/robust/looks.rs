@@ -1,8 +1,8 @@
 //! Which images should have seen an object: its looks.
 //!
 //! A look is a viewpoint of a pass with an image that has the point in its picture, from a direction from which the object was voted for and
-//! a distance from which its class is detected. A viewpoint that has a vote is a hit. One from where fewer are detected is as much less of
-//! a look. Where another detection lies in the point's gate, the object may be hidden behind that one, or be one with it in the picture:
+//! a distance from which its class is detected. It is as much of a hit as the share of its images that have a vote. One from where fewer are
+//! detected is as much less of a look. Where another detection lies in the point's gate, the object may be hidden behind that one, or be one with it in the picture:
 //! half a look.
 
 use nalgebra::Vector3;
@@ -138,9 +138,11 @@ impl Lookout {
         let of_pass = |pass: &[Look]| {
             let mut sum = Looks { expected: 0.0, hits: 0.0 };
             for images in pass.chunk_by(|a, b| view(a).viewpoint == view(b).viewpoint) {
-                let hit = images.iter().any(|image| image.is_hit);
-                sum.hits += f64::from(u8::from(hit));
-                sum.expected += if hit { 1.0 } else { images.iter().map(|image| image.weight).fold(0.0, f64::max) };
+                let hits = images.iter().filter(|image| image.is_hit).count() as f64;
+                let all: f64 = images.iter().map(|image| image.weight).sum();
+                let most = images.iter().map(|image| image.weight).fold(0.0, f64::max);
+                sum.hits += if hits > 0.0 { most * hits / all } else { 0.0 };
+                sum.expected += most;
             }
             sum
         };

@@ -364,6 +364,8 @@ impl Rates {
     pub const ANY: Self = Self { recall: 0.5, concentration: 1.0, between: 0.0 };
     /// Before anything is learned.
     pub const GUESS: Self = Self { recall: 0.7, concentration: 3.0, between: 0.0 };
+    /// Of objects of which each is seen in the same share of the looks: as many tell a tenth from none.
+    pub const ALIKE: Self = Self { recall: 0.7, concentration: 100.0, between: 0.0 };
 
     /// How probable it is that a side has a share of hits, but for a factor: the logit is normal.
     #[must_use]

@@ -4,6 +4,7 @@
 //! pass in any share. From some sides it is seen less. What is false is there on one pass alone, any of them, or seen less than a
 //! real one from everywhere: the side with most hits tells.
 
+use std::cmp::Ordering;
 use std::f64::consts::LN_2;
 
 use super::model::{ClassModel, FALSE_SHARE, Rates, ln_gamma};
@@ -122,6 +123,11 @@ impl OfSector {
         Self { usual: with(|share| share.ln_usual), any, falsely, hits, expected }
     }
 
+    /// That from where an object has most votes is the greatest.
+    fn by_hits(&self, other: &Self) -> Ordering {
+        self.hits.total_cmp(&other.hits).then(self.expected.total_cmp(&other.expected))
+    }
+
     /// From as many directions an object is seen as usual as it is not.
     fn either(&self) -> f64 {
         ln_sum(self.usual, self.any) - LN_2
@@ -154,9 +160,8 @@ impl Seen {
     pub fn log_likelihoods(&self, class: &ClassModel) -> (f64, f64) {
         let shares = Shares::of(class);
         let sectors: Vec<OfSector> = self.sectors.iter().map(|passes| OfSector::new(passes, &shares)).collect();
-        let more = |a: &&OfSector, b: &&OfSector| a.hits.total_cmp(&b.hits).then(a.expected.total_cmp(&b.expected));
         let all: f64 = sectors.iter().map(OfSector::either).sum();
-        let (usual, falsely) = sectors.iter().max_by(more).map_or((0.0, 0.0), |main| {
+        let (usual, falsely) = sectors.iter().max_by(|a, b| a.by_hits(b)).map_or((0.0, 0.0), |main| {
             let others = all - main.either();
             (others + main.usual, others + main.falsely)
         });
@@ -170,14 +175,29 @@ impl Seen {
         ln_sum(real, falsely)
     }
 
-    /// Passes that see an object, or should have from where others do; and minus the logarithm of how probable it is of those without a hit
+    /// Passes that see an object from where it has most votes, or should have; and minus the logarithm of how probable it is of those without a hit
     /// to have none.
     #[must_use]
     pub fn missed(&self, class: &ClassModel) -> (usize, f64) {
         let shares = Shares::of(class);
-        let passes = self.sectors.iter().flatten().filter(|pass| pass.expected > 0.0);
-        let missed = passes.clone().filter(|pass| pass.hits == 0.0);
-        (passes.count(), missed.map(|pass| -OfSector::new(&[*pass], &shares).usual).sum())
+        let Some((passes, _)) = self.main(&shares) else { return (0, 0.0) };
+        let looked = passes.iter().filter(|pass| pass.expected > 0.0);
+        let missed = looked.clone().filter(|pass| pass.hits == 0.0);
+        (looked.count(), missed.map(|pass| -OfSector::new(&[*pass], &shares).usual).sum())
+    }
+
+    /// The share of hits from where it has most votes.
+    #[must_use]
+    pub fn main_share(&self) -> Option<f64> {
+        let sum = |passes: &Vec<Looks>| passes.iter().fold((0.0, 0.0), |sum, p| (sum.0 + p.hits, sum.1 + p.expected));
+        let (hits, expected) = self.sectors.iter().map(sum).max_by(|a, b| a.0.total_cmp(&b.0))?;
+        (expected > 0.0).then(|| hits / expected)
+    }
+
+    /// The looks of each pass from where the object has most votes.
+    fn main(&self, shares: &Shares<'_>) -> Option<(&Vec<Looks>, OfSector)> {
+        let sectors = self.sectors.iter().map(|passes| (passes, OfSector::new(passes, shares)));
+        sectors.max_by(|(_, a), (_, b)| a.by_hits(b))
     }
 
     /// Probability that what has these looks is real rather than false.
@@ -187,25 +207,22 @@ impl Seen {
         (real - ln_sum(real, falsely)).exp()
     }
 
-    /// The looks of all passes by sector; how probable it is that they are from where the object is usually seen, and that it is seen as usual on
-    /// this pass as well.
+    /// The looks of all passes from where the object has most votes; how probable it is that it is seen as usual from there, and that it is on this
+    /// pass as well.
     #[must_use]
-    pub fn usual(&self, class: &ClassModel) -> Vec<Vec<(Looks, f64, f64)>> {
+    pub fn usual(&self, class: &ClassModel) -> Vec<(Looks, f64, f64)> {
         let shares = Shares::of(class);
-        let of_sector = |passes: &Vec<Looks>| {
-            let sector = OfSector::new(passes, &shares);
-            let visible = (sector.usual - ln_sum(sector.usual, sector.any)).exp();
-            let of_shares = shares.of_passes(passes);
-            let weights: [f64; SHARES] =
-                std::array::from_fn(|k| (of_shares[k] + shares.each[k].ln_usual - sector.usual).exp());
-            let of_pass = |pass: &Looks| {
-                let (usual, any) = shares.of_pass(pass);
-                let usual = weights.iter().zip(usual).map(|(weight, usual)| weight * usual / (usual + any));
-                (*pass, visible, visible * usual.sum::<f64>())
-            };
-            passes.iter().map(of_pass).collect::<Vec<_>>()
+        let Some((passes, main)) = self.main(&shares) else { return Vec::new() };
+        let real = self.real(class);
+        let of_shares = shares.of_passes(passes);
+        let weights: [f64; SHARES] =
+            std::array::from_fn(|k| (of_shares[k] + shares.each[k].ln_usual - main.usual).exp());
+        let of_pass = |pass: &Looks| {
+            let (usual, any) = shares.of_pass(pass);
+            let usual = weights.iter().zip(usual).map(|(weight, usual)| weight * usual / (usual + any));
+            (*pass, real, real * usual.sum::<f64>())
         };
-        self.sectors.iter().map(of_sector).collect()
+        passes.iter().map(of_pass).collect()
     }
 }
 
@@ -275,6 +292,15 @@ mod tests {
         assert!(since_then.real(&class(0.3)) > 0.5, "{}", since_then.real(&class(0.3)));
         let most = seen(&[&[(14.0, 20.0), (0.0, 20.0), (15.0, 20.0), (16.0, 20.0), (14.0, 20.0)]]);
         assert!(most.real(&class(0.3)) > 0.95, "{}", most.real(&class(0.3)));
+    }
+
+    #[test]
+    fn passes_miss_an_object_where_it_has_most_votes_or_not_at_all() {
+        let side: &[(f64, f64)] = &[(9.0, 10.0), (0.0, 10.0), (8.0, 10.0)];
+        let (alone, beside) = (seen(&[side]), seen(&[&[(0.0, 20.0), (1.0, 20.0), (0.0, 20.0)], side]));
+        let (passes, missed) = alone.missed(&class(0.3));
+        assert!(passes == 3 && missed > 1.0, "{passes} {missed}");
+        assert_eq!(beside.missed(&class(0.3)), (passes, missed));
     }
 
     #[test]
