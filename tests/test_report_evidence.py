@@ -13,7 +13,7 @@ from report_city import city
 from small_dataset import map_of, small_dataset
 from valuemap.dataset import write_dataset
 from valuemap.errors import InputError
-from valuemap.evidence import Evidence, cut_out, find_dataset, picture_file
+from valuemap.evidence import Evidence, cut_out, find_dataset, picture_file, pictures_there
 
 
 def test_voters_are_those_of_the_map_and_projections_explain_the_residuals() -> None:
@@ -132,3 +132,21 @@ def test_the_dataset_of_a_map_is_found(tmp_path: Path) -> None:
     assert find_dataset(tmp_path / "map", {}) == tmp_path / "dataset"
     assert find_dataset(tmp_path / "map", {"dataset_folder": "../elsewhere"}) == tmp_path / "elsewhere"
     assert find_dataset(tmp_path / "map", {}, tmp_path / "given") == tmp_path / "given"
+
+
+def test_pictures_are_there_where_one_of_them_is_found(tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    (folder / "a").mkdir(parents=True)
+    for path in (folder / "a" / "1.jpg", folder / "2.jpg", tmp_path / "secret.jpg"):
+        path.write_bytes(b"")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "3.jpg").write_bytes(b"")
+    (folder / "inside.jpg").symlink_to(folder / "2.jpg")
+    (folder / "outside.jpg").symlink_to(tmp_path / "secret.jpg")
+    (folder / "out").symlink_to(tmp_path / "elsewhere")
+    names = ["a/1.jpg", "2.jpg", "a/../2.jpg", "inside.jpg", "./2.jpg", "outside.jpg", "out/3.jpg", "../secret.jpg"]
+    names += [str(tmp_path / "secret.jpg"), "missing.jpg", "x" * 5000, "a\0b", "no/folder.jpg", "a", "a/..", ""]
+    found = pictures_there(folder, names)
+    assert found == [picture_file(folder, name) is not None for name in names]
+    assert found == [True] * 5 + [False] * (len(names) - 5)
+    assert pictures_there(None, names) == [False] * len(names)

@@ -33,6 +33,8 @@ def test_what_is_rejected_stays_rejected(tmp_path: Path) -> None:
         first = in_browser("review.mjs", client.server.address, "reject", label_id, tmp_path / "shot.png")
         assert first["drawn"] == len(before.labels)
         _check_drawn(tmp_path / "shot.png", first["at"])
+        assert first["hidden"]
+        assert first["asked"] == 1
         assert first["thumbs"] >= before.labels.votes[row]
         assert first["crops"] >= 1
         assert " px · " in first["first"]

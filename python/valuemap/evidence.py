@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import stat
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -364,20 +365,28 @@ class Evidence:
         order, starts = self._detections_of_image
         return order[starts[image_row] : starts[image_row + 1]]
 
+    def _detections_of_images(self, image_row: Ints) -> tuple[Ints, Ints]:
+        """Return which of some images each of their detections is in, 0 for the first, and the detections' rows."""
+        order, starts = self._detections_of_image
+        begin, count = starts[image_row], starts[image_row + 1] - starts[image_row]
+        before = np.cumsum(count) - count
+        place = np.arange(int(count.sum())) + np.repeat(begin - before, count)
+        return np.repeat(np.arange(len(image_row)), count), order[place]
+
     def _misses_at(self, image_row: Ints, point: Floats, *, class_name: str | None) -> Misses:
         detections = self.dataset.detections
         image_row = image_row[np.argsort(self.drive_order[image_row], kind="stable")]
         pixel = self.project(image_row, point)
         nearest, distance_px = np.full(len(image_row), _NO_ROW), np.full(len(image_row), np.inf)
-        code = None if class_name is None else detections.class_name.code_of(class_name)
-        for i, row in enumerate(image_row):
-            found = self.detections_of_image(int(row))
-            if code is not None:
-                found = found[detections.class_name.codes[found] == code]
-            if len(found):
-                apart = np.linalg.norm(detections.center_px[found] - pixel[i], axis=1)
-                best = int(np.argmin(apart))
-                nearest[i], distance_px[i] = found[best], apart[best]
+        of_image, found = self._detections_of_images(image_row)
+        if class_name is not None:
+            alike = detections.class_name.codes[found] == detections.class_name.code_of(class_name)
+            of_image, found = of_image[alike], found[alike]
+        apart = np.linalg.norm(detections.center_px[found] - pixel[of_image], axis=1)
+        by_distance = np.lexsort((apart, of_image))
+        having, first = np.unique(of_image[by_distance], return_index=True)
+        best = by_distance[first]
+        nearest[having], distance_px[having] = found[best], apart[best]
         taken = np.where(nearest >= 0, self.label_of_detection[nearest], _NO_ROW) if len(nearest) else nearest
         return Misses(
             image_row=image_row,
@@ -396,9 +405,9 @@ class Evidence:
 def _sector_middles(direction: Floats) -> Floats:
     """Return those of the unit vectors (N, 3) that are more than 15 degrees from all middles before them (K, 3)."""
     middles: list[Floats] = []
-    for each in direction:
-        if all(float(middle @ each) < SECTOR_COSINE for middle in middles):
-            middles.append(each)
+    while len(direction):
+        middles.append(direction[0])
+        direction = direction[direction @ direction[0] < SECTOR_COSINE]
     return np.array(middles).reshape(-1, 3)
 
 
@@ -438,6 +447,33 @@ def picture_file(pictures: Path | None, name: str) -> Path | None:
         return path if inside and path.is_file() else None
     except (OSError, ValueError):  # Names that no file can have: too long, or with a zero byte.
         return None
+
+
+def pictures_there(pictures: Path | None, names: list[str]) -> list[bool]:
+    """Return for each image whether `picture_file` finds its picture; each folder is looked up once."""
+    if pictures is None:
+        return [False] * len(names)
+    folder = os.path.realpath(pictures)
+    known: dict[str, str | None] = {}
+
+    def is_there(name: str) -> bool:
+        path, base = os.path.split(name)
+        if path not in known:
+            real = os.path.realpath(Path(folder) / path)
+            known[path] = real if os.path.commonpath([folder, real]) == folder else None
+        real_path = known[path]
+        if real_path is None or base in ("", ".", ".."):
+            return False
+        mode = os.lstat(f"{real_path}{os.sep}{base}").st_mode
+        return stat.S_ISREG(mode) or (stat.S_ISLNK(mode) and picture_file(pictures, name) is not None)
+
+    found = []
+    for name in names:
+        try:
+            found.append(is_there(name))
+        except (OSError, ValueError):
+            found.append(False)
+    return found
 
 
 def cut_out(

@@ -20,8 +20,14 @@ if (step === "reject") {
   seen.at = await screenOf(page, id);
   await page.waitForTimeout(1000);
   await page.screenshot({ path: screenshot });
+  // The page asks for what it will show once the pointer rests on a label, and not again when it is clicked.
+  const askedFor = () => noted.requests.filter((asked) => asked.includes(`/api/label?id=${id}`)).length;
+  await page.mouse.move(...seen.at);
+  while (!askedFor()) await page.waitForTimeout(20);
+  seen.hidden = await page.locator("#details").isHidden();
   await page.mouse.click(...seen.at);
   await page.waitForFunction((title) => document.querySelector("#title")?.textContent === title, `Label ${id}`);
+  seen.asked = askedFor();
   await page.waitForFunction(() => [...document.querySelectorAll("#details .large img")].some((image) => image.naturalWidth > 0));
   await page.waitForSelector("#details .gallery[data-complete]");
   seen.thumbs = await page.locator("#details .thumb").count();

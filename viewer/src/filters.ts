@@ -197,11 +197,10 @@ export class Filters {
   }
 
   mark(id: number | null): void {
-    for (const button of this.list.querySelectorAll("button[data-label]")) {
-      const is = button.getAttribute("data-label") === String(id);
-      button.setAttribute("aria-current", is ? "true" : "false");
-      if (is) button.scrollIntoView({ block: "nearest" });
-    }
+    this.list.querySelector("[aria-current=true]")?.setAttribute("aria-current", "false");
+    const marked = id === null ? null : this.list.querySelector(`[data-label="${id}"]`);
+    marked?.setAttribute("aria-current", "true");
+    marked?.scrollIntoView({ block: "nearest" });
   }
 
   /** The label after (1) or before (-1) one in the list. */

@@ -1,7 +1,7 @@
 /** The page of `valuemap view`: loads a map, and keeps map, panels, address and decisions in step. */
 
 import "./style.css";
-import { api, type Head, type Lost, type Review, type State, type Verdict, type Wish } from "./api";
+import { api, type Head, type LabelDetails, type Lost, type Review, type State, type Verdict, type Wish } from "./api";
 import type { Basemap } from "./basemap";
 import { css, existenceScale, OUTCOMES, STATES, classColor } from "./colors";
 import { type LabelPanel, renderLabel, renderPlace, renderProblem } from "./details";
@@ -16,6 +16,9 @@ import { fromHash, type Selection, type Settings, toHash, type View } from "./st
 performance.mark("valuemap:start");
 // The token is in a cookie now; in the address it would end up in bookmarks and histories.
 if (new URLSearchParams(location.search).has("token")) history.replaceState(null, "", `/${location.hash}`);
+
+/** A pointer that stays on a label for so long will probably click it. */
+const REST_MS = 60;
 
 const closed: Review = { label_id: -1, state: "open" };
 
@@ -63,6 +66,7 @@ class Page {
       onView: () => this.viewChanged(),
       // What is moved is often moved by less than its own mark is wide.
       onLabel: (id, east, north) => void (this.moving === null ? this.openLabel(id) : this.clickedPlace(east, north)),
+      onPress: (id) => this.expect(id),
       onPlace: (east, north) => void this.clickedPlace(east, north),
       onHover: (row, x, y, east, north) => this.hover(row, x, y, east, north),
       onDrawn: () => this.wasDrawn(),
@@ -234,6 +238,13 @@ class Page {
     }
   }
 
+  private resting = 0;
+
+  /** The label whose details are open. */
+  private open(): number | null {
+    return this.selection?.kind === "label" ? this.selection.id : null;
+  }
+
   private hover(row: number | null, x: number, y: number, east: number, north: number): void {
     const tip = byId("tip");
     const where = byId("where");
@@ -243,8 +254,10 @@ class Page {
       where.textContent = `${fixed(east + origin[0], 1)}, ${fixed(north + origin[1], 1)} m${geo ? `  ·  ${geo.lat.toFixed(6)}, ${geo.lon.toFixed(6)}` : ""}`;
     }
     tip.hidden = row === null;
+    clearTimeout(this.resting);
     if (row === null) return;
     const { labels } = this;
+    this.resting = window.setTimeout(() => this.expect(labels.id[row]), REST_MS);
     tip.replaceChildren(
       h("b", {}, `Label ${labels.id[row]}`),
       ` ${this.head.classes[labels.class[row]]}`,
@@ -293,20 +306,36 @@ class Page {
     if (move) this.map.show(...at);
     this.filters.mark(id);
     try {
-      const details = await api.label(id);
+      const details = await this.detailsOf(id);
       if (turn !== this.asked) return;
       const panel = this.panel();
       panel.scrollTop = 0;
       this.labelPanel = renderLabel(panel, details, this.sigmas(row), this.reviews.get(id) ?? closed, this.head, this.dark, this.panelEvents);
       this.gallery = this.labelPanel.gallery;
       this.map.showRays(details);
-      this.gallery.step(0);
       say(`Label ${id}, ${details.class}, existence ${probability(details.existence)}, ${plural(details.votes, "vote")}.`);
     } catch (error) {
       if (turn === this.asked) renderProblem(this.panel(), `Label ${id}`, String((error as Error).message), this.panelEvents);
     }
     answered(begun);
     this.viewChanged();
+  }
+
+  private early: { id: number; details: Promise<LabelDetails> } | null = null;
+
+  /** Ask for a label that will be clicked in a moment: the pointer rests on it, or the button is down. */
+  private expect(id: number): void {
+    if (this.early?.id === id || this.open() === id) return;
+    const details = api.label(id);
+    details.catch(() => undefined); // Whoever clicks hears of it.
+    this.early = { id, details };
+  }
+
+  /** What a label rests on, as it was asked for before or else now; a map that was made again is asked again. */
+  private detailsOf(id: number): Promise<LabelDetails> {
+    const { early } = this;
+    this.early = null;
+    return early?.id === id ? early.details : api.label(id);
   }
 
   private sigmas(row: number) {

@@ -58,6 +58,8 @@ export interface Truth {
 export interface MapEvents {
   onView(view: View): void;
   onLabel(id: number, east: number, north: number): void;
+  /** The button is down on a label: it may become a click, or a drag. */
+  onPress(id: number): void;
   onPlace(east: number, north: number): void;
   onHover(row: number | null, x: number, y: number, east: number, north: number): void;
   onDrawn(): void;
@@ -516,6 +518,8 @@ export class MapView {
     this.parent.addEventListener("pointerdown", (event) => {
       const [x, y] = at(event);
       this.pressed = event.button === 0 ? { x, y } : null;
+      const row = this.pressed && this.pick(x, y);
+      if (row !== null) this.events.onPress(this.labels.id[row]);
       this.parent.focus({ preventScroll: true });
     });
     this.parent.addEventListener("pointerup", (event) => {

@@ -53,7 +53,7 @@ function taker(shot: Shot): string {
 }
 
 /** Small pictures that are there at once: more than a panel shows. */
-const FIRST = 20;
+const FIRST = 15;
 
 export interface Gallery {
   element: HTMLElement;
@@ -77,9 +77,10 @@ export function gallery(
   function select(index: number, scroll: boolean): void {
     if (!shots.length) return;
     fill(index + 1);
+    buttons[current]?.setAttribute("aria-current", "false");
     current = Math.min(shots.length - 1, Math.max(0, index));
     const shot = shots[current];
-    buttons.forEach((button, i) => button.setAttribute("aria-current", i === current ? "true" : "false"));
+    buttons[current].setAttribute("aria-current", "true");
     if (scroll) buttons[current].scrollIntoView({ block: "nearest" });
     const wide = h("button", { class: "zoom", title: "The whole picture (Enter)", onclick: open }, crop(shot, shot.crop[2]));
     large.replaceChildren(

@@ -41,11 +41,14 @@ export function sideView(details: LabelDetails, sigmaUp: number, originUp: numbe
       svg("text", { x: LEFT - 4, y: at + 3, "text-anchor": "end" }, fixed(metres, Number.isInteger(metres) ? 0 : 1)),
     );
   }
-  for (const ray of rays) {
-    const color = css(passColor(ray.pass, dark));
+  // Two shapes for each pass, not two for each of hundreds of rays; dots are lines without a length and with round ends.
+  for (const pass of new Set(rays.map((ray) => ray.pass))) {
+    const stroke = css(passColor(pass, dark));
+    const path = (ends: (x: string, y: string) => string) =>
+      rays.flatMap((ray) => (ray.pass === pass ? [ends(x(ray.away).toFixed(1), y(ray.height).toFixed(1))] : [])).join("");
     drawing.append(
-      svg("line", { x1: x(ray.away), y1: y(ray.height), x2: x(0), y2: y(at[2]), stroke: color, "stroke-opacity": 0.45 }),
-      svg("circle", { cx: x(ray.away), cy: y(ray.height), r: 2, fill: color }),
+      svg("path", { class: "ray", stroke, d: path((x0, y0) => `M${x0} ${y0}L${x(0)} ${y(at[2]).toFixed(1)}`) }),
+      svg("path", { class: "from", stroke, d: path((x0, y0) => `M${x0} ${y0}h0`) }),
     );
   }
   drawing.append(

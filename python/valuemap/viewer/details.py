@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from valuemap.errors import InputError
-from valuemap.evidence import Evidence, Misses, PassingRays, picture_file
+from valuemap.evidence import Evidence, Misses, PassingRays, pictures_there
 from valuemap.rejected import figures_in_words, find_rejected
 from valuemap.report.place_sheet import explain_place
 from valuemap.tables import REJECTION_REASONS, Floats, Ints, Rejected
-from valuemap.viewer.scene import Scene, number
+from valuemap.viewer.scene import Scene, number, numbers
 
 PLACE_RADIUS_M = 2.0
 """What is at most this far from a place, seen from above, answers why there is nothing."""
@@ -111,66 +111,66 @@ def place_details(scene: Scene, east_m: float, north_m: float) -> dict[str, Any]
 
 def _voters(scene: Scene, evidence: Evidence, label_id: int) -> list[dict[str, Any]]:
     voters = evidence.voters(label_id)
-    side = _side(voters.size_px)
-    return [
+    return _rows(
         {
-            **image,
-            "box": _box(voters.box_px[i], voters.size_px[i]),
-            "projected": [number(c, 1) for c in voters.projected_px[i]],
-            "crop": _crop(voters.box_px[i], side[i]),
-            "residual_px": number(voters.residual_px[i], 2),
-            "residual_sigmas": number(voters.residual_sigmas[i], 2),
-            "score": number(voters.score[i], 3),
-            "distance_m": number(voters.distance_m[i], 1),
+            **_images(scene, evidence, voters.image_row),
+            "box": _boxes(voters.box_px, voters.size_px),
+            "projected": numbers(voters.projected_px, 1),
+            "crop": _crops(voters.box_px, _side(voters.size_px)),
+            "residual_px": numbers(voters.residual_px, 2),
+            "residual_sigmas": numbers(voters.residual_sigmas, 2),
+            "score": numbers(voters.score, 3),
+            "distance_m": numbers(voters.distance_m, 1),
         }
-        for i, image in enumerate(_images(scene, evidence, voters.image_row))
-    ]
+    )
 
 
 def _misses(scene: Scene, evidence: Evidence, misses: Misses, *, typical_px: float) -> list[dict[str, Any]]:
     detections = evidence.dataset.detections
-    found = []
-    for i, image in enumerate(_images(scene, evidence, misses.image_row)):
-        nearest = int(misses.nearest_row[i])
-        is_near = nearest >= 0 and misses.nearest_px[i] <= _CROP_LEAST_PX + typical_px
-        found.append(
-            {
-                **image,
-                "projected": [number(c, 1) for c in misses.projected_px[i]],
-                "crop": _crop(misses.projected_px[i], typical_px),
-                "distance_m": number(misses.distance_m[i], 1),
-                "box": _box(detections.center_px[nearest], detections.size_px[nearest]) if is_near else None,
-                "nearest_px": number(misses.nearest_px[i], 1),
-                "nearest_label": int(misses.nearest_label[i]) if misses.nearest_label[i] >= 0 else None,
-            }
-        )
-    return found
-
-
-def _images(scene: Scene, evidence: Evidence, rows: Ints) -> list[dict[str, Any]]:
-    """Return what the page says about images, whatever they show."""
-    images = evidence.dataset.images
-    centers = scene.local(evidence.center_in_world_m[rows])
-    return [
+    nearest = misses.nearest_row
+    is_near = (nearest >= 0) & (misses.nearest_px <= _CROP_LEAST_PX + typical_px)
+    box: list[list[float | None] | None] = [None] * len(nearest)
+    for i, found in zip(
+        np.flatnonzero(is_near).tolist(),
+        _boxes(detections.center_px[nearest[is_near]], detections.size_px[nearest[is_near]]),
+        strict=True,
+    ):
+        box[i] = found
+    return _rows(
         {
-            "image": image_id,
-            "name": name,
-            "pass": number_of_pass,
-            "picture": picture_file(scene.pictures, name) is not None,
-            "size": size,
-            "camera_m": [number(c, 3) for c in center],
-            "time_s": None if images.timestamp_s is None else number(images.timestamp_s[row], 2),
+            **_images(scene, evidence, misses.image_row),
+            "projected": numbers(misses.projected_px, 1),
+            "crop": _crops(misses.projected_px, np.full(len(nearest), typical_px)),
+            "distance_m": numbers(misses.distance_m, 1),
+            "box": box,
+            "nearest_px": numbers(misses.nearest_px, 1),
+            "nearest_label": _ids(misses.nearest_label),
         }
-        for row, image_id, name, number_of_pass, size, center in zip(
-            rows,
-            images.image_id[rows].tolist(),
-            images.name.take(rows).to_pylist(),
-            evidence.pass_number[rows].tolist(),
-            evidence.picture_size_px(rows).tolist(),
-            centers,
-            strict=True,
-        )
-    ]
+    )
+
+
+def _images(scene: Scene, evidence: Evidence, rows: Ints) -> dict[str, list[Any]]:
+    """Return what the page says about images, whatever they show, column by column."""
+    images = evidence.dataset.images
+    names = images.name.take(rows).to_pylist()
+    return {
+        "image": images.image_id[rows].tolist(),
+        "name": names,
+        "pass": evidence.pass_number[rows].tolist(),
+        "picture": pictures_there(scene.pictures, names),
+        "size": evidence.picture_size_px(rows).tolist(),
+        "camera_m": numbers(scene.local(evidence.center_in_world_m[rows]), 3),
+        "time_s": [None] * len(rows) if images.timestamp_s is None else numbers(images.timestamp_s[rows], 2),
+    }
+
+
+def _rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
+    """Return columns of the same length row by row."""
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def _ids(label_id: Ints) -> list[int | None]:
+    return [each if each >= 0 else None for each in label_id.tolist()]
 
 
 def _side(size_px: Floats) -> Floats:
@@ -183,12 +183,12 @@ def _typical_side(evidence: Evidence, label_id: int) -> float:
     return float(np.median(_side(size_px))) if len(size_px) else _CROP_LEAST_PX
 
 
-def _crop(center_px: Floats, side_px: float) -> list[float | None]:
-    return [number(center_px[0], 1), number(center_px[1], 1), number(side_px, 1)]
+def _crops(center_px: Floats, side_px: Floats) -> list[list[float | None]]:
+    return numbers(np.column_stack([center_px, side_px]), 1)
 
 
-def _box(center_px: Floats, size_px: Floats) -> list[float | None]:
-    return [number(c, 1) for c in (*center_px, *size_px)]
+def _boxes(center_px: Floats, size_px: Floats) -> list[list[float | None]]:
+    return numbers(np.column_stack([center_px, size_px]), 1)
 
 
 def _nearest(local_m: Floats, place: Floats, radius_m: float) -> tuple[Ints, Floats]:
@@ -253,23 +253,20 @@ def _seen_at(
 def _passing(scene: Scene, evidence: Evidence, rays: PassingRays, shown: Ints) -> list[dict[str, Any]]:
     detections = evidence.dataset.detections
     rows = rays.detection_row[shown]
-    side = _side(detections.size_px[rows])
-    return [
+    classes = detections.class_name
+    return _rows(
         {
-            **image,
-            "box": _box(detections.center_px[row], detections.size_px[row]),
-            "crop": _crop(detections.center_px[row], side[k]),
-            "projected": None,
-            "class": detections.class_name.names[detections.class_name.codes[row]],
-            "score": number(detections.score[row], 3),
-            "miss_m": number(rays.miss_m[i], 2),
-            "distance_m": number(rays.distance_m[i], 1),
-            "label": int(rays.label_id[i]) if rays.label_id[i] >= 0 else None,
+            **_images(scene, evidence, rays.image_row[shown]),
+            "box": _boxes(detections.center_px[rows], detections.size_px[rows]),
+            "crop": _crops(detections.center_px[rows], _side(detections.size_px[rows])),
+            "projected": [None] * len(rows),
+            "class": [classes.names[code] for code in classes.codes[rows]],
+            "score": numbers(detections.score[rows], 3),
+            "miss_m": numbers(rays.miss_m[shown], 2),
+            "distance_m": numbers(rays.distance_m[shown], 1),
+            "label": _ids(rays.label_id[shown]),
         }
-        for k, (i, row, image) in enumerate(
-            zip(shown, rows, _images(scene, evidence, rays.image_row[shown]), strict=True)
-        )
-    ]
+    )
 
 
 def _some(looks: Misses) -> Misses:

@@ -282,3 +282,14 @@ def number(value: Any, digits: int = 4) -> float | None:
     """Return a number for JSON, which has no NaN; rounded, because people read it."""
     value = float(value)
     return round(value, digits) if math.isfinite(value) else None
+
+
+def numbers(values: Floats, digits: int = 4) -> list[Any]:
+    """Return what `number` does of every value of an array, in lists of lists as deep as its axes."""
+    rounded: Any = np.round(values, digits)
+    finite = np.isfinite(rounded)
+    if not finite.all():
+        rounded = rounded.astype(object)
+        rounded[~finite] = None
+    found: list[Any] = rounded.tolist()
+    return found
