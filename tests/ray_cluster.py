@@ -26,6 +26,7 @@ from valuemap.map_folder import write_map
 from valuemap.pipeline import Run, build_map_of_folder
 from valuemap.progress import Progress
 from valuemap.refine import Refined
+from valuemap.tiles.compare import Comparison
 from valuemap.tiles.work import open_work
 
 os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "a" * 64}
@@ -82,7 +83,7 @@ def main(folder: Path) -> None:
     assert mapped(folder, engine, "ray", lambda *_: None) == expected
     # Poses that were corrected go to the tasks by the dataset that is written with them.
     setattr(pipeline, "refine_poses", moved_by_a_metre)  # noqa: B010
-    setattr(pipeline, "compare_poses", lambda *_, **__: (2.0, 1.0, 10))  # noqa: B010
+    setattr(pipeline, "compare_poses", lambda *_, **__: Comparison(2.0, 1.0, 0.0, 10))  # noqa: B010
     corrected = mapped(folder, ThreadEngine(2), "threads-moved", lambda *_: None)
     assert corrected["labels.parquet"] != expected["labels.parquet"]
     assert mapped(folder, engine, "ray-moved", lambda *_: None) == corrected

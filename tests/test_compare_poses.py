@@ -14,7 +14,7 @@ from valuemap.dataset import Dataset
 from valuemap.progress import silent
 from valuemap.refine import Refined
 from valuemap.simulate import simulate
-from valuemap.tiles.compare import compare_poses
+from valuemap.tiles.compare import Comparison, compare_poses
 
 
 def shifted(dataset: Dataset, shift_m: float) -> Dataset:
@@ -29,16 +29,22 @@ def city() -> Dataset:
     return simulate(block(), seed=3, name="city")
 
 
+def compared(before: Dataset, after: Dataset, parameters: int = 1) -> Comparison:
+    """Compare with the default settings."""
+    return compare_poses(before, after, parameters, valuemap.MapConfig(), threads=0, progress=silent)
+
+
 @pytest.mark.parametrize("shift_m", [1.5, 3.0])
 def test_true_poses_make_detections_likelier(city: Dataset, shift_m: float) -> None:
     wrong = shifted(city, shift_m)
-    config = valuemap.MapConfig()
-    right_fit, wrong_fit, count = compare_poses(city, wrong, config, threads=0, progress=silent)
-    assert right_fit < wrong_fit - 100.0
+    worse = compared(city, wrong)
+    assert worse.before < worse.after - 100.0
+    assert not worse.is_better
     # The sample is that of the first: the same detections are compared whichever comes first.
-    again = compare_poses(wrong, city, config, threads=0, progress=silent)
-    assert again[:2] == pytest.approx((wrong_fit, right_fit), rel=0.05)
-    assert again[2] == count > 100
+    again = compared(wrong, city)
+    assert (again.after, again.before) == pytest.approx((worse.before, worse.after), rel=0.05)
+    assert again.detections == worse.detections > 100
+    assert again.is_better
 
 
 def test_ids_at_random_compare_the_same_detections(city: Dataset) -> None:
@@ -46,11 +52,10 @@ def test_ids_at_random_compare_the_same_detections(city: Dataset) -> None:
     ids = np.random.default_rng(0).permutation(len(city.detections)) + 1
     detections = city.detections.replace(detection_id=ids).take(np.argsort(ids))
     shuffled = replace(city, detections=detections, truth_detections=None)
-    config = valuemap.MapConfig()
-    expected = compare_poses(city, shifted(city, 1.5), config, threads=0, progress=silent)
-    found = compare_poses(shuffled, shifted(shuffled, 1.5), config, threads=0, progress=silent)
-    assert found[2] == expected[2]
-    assert found[:2] == pytest.approx(expected[:2], rel=0.01)
+    expected = compared(city, shifted(city, 1.5))
+    found = compared(shuffled, shifted(shuffled, 1.5))
+    assert found.detections == expected.detections
+    assert (found.before, found.after) == pytest.approx((expected.before, expected.after), rel=0.01)
 
 
 def test_a_correction_that_is_not_worth_its_parameters_is_not_taken(

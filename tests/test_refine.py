@@ -18,7 +18,7 @@ from valuemap.config import SimulationConfig
 from valuemap.dataset import Dataset, write_dataset
 from valuemap.drives import Drives, find_drives, in_driving_order
 from valuemap.engine.threads import ThreadEngine
-from valuemap.refine import Refined, adjust, refine_poses
+from valuemap.refine import FITS_NO_BETTER, Refined, adjust, poses, refine_poses
 from valuemap.refine.adjust import Adjustment, Scales
 from valuemap.refine.estimate import delay_together, lay, mounts_alone, segment
 from valuemap.refine.footage import Footage, Sigmas, find_motion, gather, in_working_frame
@@ -87,6 +87,33 @@ def test_shifts_of_passes_of_three_metres_are_found_to_three_decimetres() -> Non
     moved = camera_poses(refined.dataset.images)[1] - camera_poses(faulty.images)[1]
     mean = np.stack([np.bincount(drive, weights=axis) / np.bincount(drive) for axis in moved.T], axis=1)
     assert np.abs(mean.mean(axis=0)).max() < 0.3
+
+
+@pytest.mark.parametrize("fits_better", [False, True])
+def test_what_a_sample_proves_must_explain_it_better(fits_better: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    faulty = city(pass_shift_m=3.0)
+    monkeypatch.setattr(poses, "_SAMPLE", len(faulty.detections) // 3)
+    asked: list[tuple[int, int]] = []
+
+    def judge(before: Dataset, after: Dataset, parameters: int) -> bool:
+        asked.append((len(before.detections), parameters))
+        off = [errors(one, drop_images(city(), one))[0] for one in (before, after)]
+        assert off[1] < 0.2 * off[0]
+        return fits_better
+
+    refined = refine_poses(faulty, valuemap.MapConfig(), fits_better=judge)
+    assert len(asked) == 1
+    assert asked[0][0] < len(faulty.detections)
+    assert asked[0][1] > 2
+    assert refined.is_corrected == fits_better
+    assert refined.record.get("because") == (None if fits_better else FITS_NO_BETTER)
+
+
+def drop_images(dataset: Dataset, like: Dataset) -> Dataset:
+    """Return a dataset with those images alone that another has."""
+    names = set(like.images.name.to_pylist())
+    rows = np.array([name in names for name in dataset.images.name.to_pylist()])
+    return dataclasses.replace(dataset, images=dataset.images.take(np.flatnonzero(rows)))
 
 
 def test_what_drives_are_off_by_is_found_before_their_objects_are() -> None:

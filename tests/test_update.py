@@ -22,6 +22,7 @@ from valuemap.map_folder import Map
 from valuemap.refine import Refined
 from valuemap.rejected import find_rejected
 from valuemap.tables import Categories, Changes, Floats, IdBridge, join_tables, read_table, table_to_arrow
+from valuemap.tiles.compare import Comparison
 from valuemap.update import compare
 from valuemap.update.changes import match_labels, match_places
 from valuemap.update.join import join_datasets
@@ -296,7 +297,7 @@ def test_an_update_is_one_run_where_poses_are_corrected(tmp_path: Path, monkeypa
         return Refined(moved(dataset, -1.0, keep_mean=True), {"found": "faults", "drives": [{"drive": 0}]}, True)
 
     monkeypatch.setattr(pipeline, "refine_poses", corrected)
-    monkeypatch.setattr(pipeline, "compare_poses", lambda *_, **__: (2.0, 1.0, 10))
+    monkeypatch.setattr(pipeline, "compare_poses", lambda *_, **__: Comparison(2.0, 1.0, 0.0, 10))
     valuemap.write_dataset(moved(first, 1.0), tmp_path / "first")
     valuemap.write_dataset(moved(second, 1.0), tmp_path / "second")
     run("map", tmp_path / "first", "--out", tmp_path / "map", *(f"--set={each}" for each in SET))

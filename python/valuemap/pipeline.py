@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -26,13 +25,13 @@ from valuemap.notes import Findings, cameras_not_upright, find_notes
 from valuemap.partition import partition_images
 from valuemap.portions import rows_on_disk
 from valuemap.progress import Progress, silent
-from valuemap.refine import Refined, refine_poses
+from valuemap.refine import FITS_NO_BETTER, Refined, refine_poses
 from valuemap.rejected import rejected_of_map
 from valuemap.robust import Calibration, calibration_to_json
 from valuemap.system import peak_memory_mb
 from valuemap.tables import Labels, Votes
 from valuemap.tiles.calibration import calibrate
-from valuemap.tiles.compare import compare_poses
+from valuemap.tiles.compare import Comparison, compare_poses
 from valuemap.tiles.mapping import loaded, solve_cells
 from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.seams import join_cells
@@ -187,18 +186,21 @@ def _refined(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int,
     """Correct what whole drives' poses are proven wrong by, if that makes the same detections likelier."""
     if len(dataset.images) + len(dataset.detections) > MOST_CORRECTED and config.poses.correct_poses:
         return Refined(dataset, {"found": "nothing", "because": _TOO_LARGE})
+
+    def compared(before: Dataset, after: Dataset, parameters: int) -> Comparison:
+        return compare_poses(before, after, parameters, config, threads=threads, progress=progress)
+
     with stages.measured("poses"):
-        refined = refine_poses(dataset, config, threads=threads, progress=progress)
+        refined = refine_poses(
+            dataset, config, threads=threads, progress=progress, fits_better=lambda *part: compared(*part).is_better
+        )
         if not refined.is_corrected:
             return refined
-        before, after, compared = compare_poses(dataset, refined.dataset, config, threads=threads, progress=progress)
-        # The Bayesian information criterion (Schwarz, 1978): each detection has two coordinates.
-        price = refined.record.get("parameters", 0) * math.log(2 * compared)
-        figures = {"misfit_before": before, "misfit_after": after, "price": price}
-        record = {**refined.record, **{name: round(figure, 1) for name, figure in figures.items()}}
-        if after + price < before:
+        found = compared(dataset, refined.dataset, refined.record.get("parameters", 0))
+        record = {**refined.record, **found.figures()}
+        if found.is_better:
             return replace(refined, record=record)
-        return Refined(dataset, {**record, "found": "nothing", "because": "the poses as given fit better"})
+        return Refined(dataset, {**record, "found": "nothing", "because": FITS_NO_BETTER})
 
 
 def _with_rejected(result: Map, read: Callable[[], Dataset], stages: _Stages) -> Map:

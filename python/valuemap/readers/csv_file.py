@@ -113,8 +113,15 @@ class CsvFile:
         return all(self._name.get(name) in self._table.column_names for name in names)
 
     def texts(self, name: str) -> list[str]:
-        """Return a column as texts (N) without spaces around them; an empty field is an empty text."""
-        return [text.strip() for text in self._column(name).to_pylist()]
+        """Return a column as texts (N) without spaces around them; an empty field is an empty text.
+
+        Equal texts are one object: names of images and classes stand there for many boxes each.
+        """
+        found: list[str] = []
+        for chunk in self._column(name).dictionary_encode().unify_dictionaries().chunks:
+            kinds = np.array([text.strip() for text in chunk.dictionary.to_pylist()], dtype=object)
+            found += kinds[chunk.indices.to_numpy()].tolist()
+        return found
 
     def filled_texts(self, name: str) -> list[str]:
         """Return a column as texts (N) none of which is empty."""

@@ -296,7 +296,8 @@ def vet_boxes(boxes: FoundBoxes, images: Images, usable: Bools, cameras: Cameras
     for values in (boxes.range_m, boxes.range_sigma_m, boxes.vertical_sigma_px):
         if values is not None:
             why.mark((values <= 0.0) | np.isinf(values), _RANGE)
-    classes = Categories.from_texts([_text(name) for name in boxes.class_names])
+    text_of = {name: _text(name) for name in set(boxes.class_names)}
+    classes = Categories.from_texts([text_of[name] for name in boxes.class_names])
     why.mark(classes.codes == classes.code_of(""), _NO_CLASS)
     why.mark(_repeated(boxes, classes, why.fine), _TWICE)
 

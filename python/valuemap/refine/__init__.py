@@ -1,5 +1,5 @@
 """Errors of the poses of whole drives, found from the objects that drives share, once for all that comes after."""
 
-from valuemap.refine.poses import Refined, refine_poses
+from valuemap.refine.poses import FITS_NO_BETTER, Refined, refine_poses
 
-__all__ = ["Refined", "refine_poses"]
+__all__ = ["FITS_NO_BETTER", "Refined", "refine_poses"]

@@ -22,7 +22,11 @@ DRIFT_LENGTH_M = 100.0
 _MOST_STEPS = 4.0
 """Images farther apart in time than so many usual steps say nothing of the velocity between them."""
 _SUDDEN = 3.0
-"""A rate that changes over a step by so many times what it does over those beside it changes within the step."""
+"""A rate that changes from the step before to the step after by so many times what it does beside them changes at once.
+
+It has no unit. Steady acceleration gives 2, a change at once has no limit: 3 is the first whole number that is neither.
+From 1.5 to 12, what comes out is the same (`docs/notes/poses.md`).
+"""
 _TREMBLES = 4.0
 """Velocities before and after an image that differ by more than so many times what is usual are not the same."""
 

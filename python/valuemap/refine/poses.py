@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,6 +36,13 @@ _LOST_M, _FEW_LOST = 0.5, 0.05
 """Where offsets are larger than this, each drive is looked at anew as it lies then."""
 
 
+FITS_NO_BETTER = "the poses as given fit better"
+"""Why nothing is corrected where faults are found that do not make the detections likelier by more than they cost."""
+
+FitsBetter = Callable[[Dataset, Dataset, int], bool]
+"""Says whether the second of two datasets, which so many parameters tell apart, explains its detections better."""
+
+
 @dataclass(frozen=True, eq=False)
 class Refined:
     """A dataset with better poses and cameras, or as it was; `record` says in `run.json` what was found."""
@@ -44,7 +52,14 @@ class Refined:
     is_corrected: bool = False
 
 
-def refine_poses(dataset: Dataset, config: MapConfig, *, threads: int = 0, progress: Progress = silent) -> Refined:
+def refine_poses(
+    dataset: Dataset,
+    config: MapConfig,
+    *,
+    threads: int = 0,
+    progress: Progress = silent,
+    fits_better: FitsBetter | None = None,
+) -> Refined:
     """Estimate what whole drives' poses are wrong by, from the objects that drives share; correct what is proven.
 
     Parameters
@@ -57,6 +72,8 @@ def refine_poses(dataset: Dataset, config: MapConfig, *, threads: int = 0, progr
         Threads to work on, 0 for one a core. The result does not depend on it.
     progress
         Called as progress(what, done, total).
+    fits_better
+        Where it is given, what a sample proves must also explain the sample better, or the rest is not looked at.
 
     Returns
     -------
@@ -69,10 +86,12 @@ def refine_poses(dataset: Dataset, config: MapConfig, *, threads: int = 0, progr
         return Refined(dataset, {"found": "nothing", "because": "few detections"})
     # Small matrices: more threads are slower, and how many there are would show in the last digits.
     with threadpool_limits(limits=1, user_api="blas"):
-        return _refined(dataset, config, threads, progress)
+        return _refined(dataset, config, threads, progress, fits_better)
 
 
-def _refined(dataset: Dataset, config: MapConfig, threads: int, progress: Progress) -> Refined:
+def _refined(
+    dataset: Dataset, config: MapConfig, threads: int, progress: Progress, fits_better: FitsBetter | None
+) -> Refined:
     unit_m = config.vote.max_range_m / USUAL_RANGE_M
     ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
     if ordered.drives.count < 2:
@@ -86,6 +105,11 @@ def _refined(dataset: Dataset, config: MapConfig, threads: int, progress: Progre
     if sample is not None:
         found = _find(*_part(moved, drives, sample), config, threads)
         progress("comparing drives", 1, 2)
+        if found is not None and found.selected is not None and fits_better is not None:
+            given, of_part = _part(ordered.dataset, ordered.drives, sample)
+            there = _apply(given, of_part, found, found.selected, unit_m)
+            if not fits_better(given, there, found.selected.parameters):
+                return Refined(dataset, {"found": "nothing", "because": FITS_NO_BETTER, **_looked_at(found)})
     if sample is None or _is_proven(found):
         found = _find(moved, drives, config, threads)
     progress("comparing drives", 2, 2)
@@ -292,7 +316,7 @@ def _describe(dataset: Dataset, found: _Found, selected: Selected, unit_m: float
         "found": "faults",
         "cameras": [camera for camera in cameras if len(camera) > 1],
         "drives": of_drives,
-        "parameters": int(sum(np.count_nonzero(constants) for constants in selected.state.constants)),
+        "parameters": selected.parameters,
         "held_out_objects": selected.held_out,
         "gain_on_held_out": round(selected.gain, 1),
         "chance_of_that": float(f"{selected.chance:.2g}"),

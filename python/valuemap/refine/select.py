@@ -70,6 +70,11 @@ class Selected:
     chance: float
     held_out: int
 
+    @property
+    def parameters(self) -> int:
+        """How many parameters are not zero."""
+        return sum(int(np.count_nonzero(constants)) for constants in self.state.constants)
+
 
 def select(footage: Footage, found: Estimate) -> Selected | None:
     """Return what pays, None where nothing does."""

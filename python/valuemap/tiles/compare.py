@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 
 from valuemap.config import MapConfig
@@ -14,13 +17,36 @@ from valuemap.tiles.piece import piece_of_rows
 from valuemap.tiles.source import VIEWPOINT_SHARE, InMemory
 
 
-def compare_poses(
-    before: Dataset, after: Dataset, config: MapConfig, *, threads: int, progress: Progress
-) -> tuple[float, float, int]:
-    """Return how badly the detections of a sample fit the poses of both datasets, each with its likeliest noise.
+@dataclass(frozen=True)
+class Comparison:
+    """Minus twice the log likelihood of the same detections with poses before and after, up to one constant.
 
-    Minus twice the logarithm of their likelihood, up to one constant; and how many detections. Both datasets have the
-    same images and detections.
+    Each has the noise that is likeliest for it. `price` is that of the parameters by which poses differ, by the
+    Bayesian information criterion (Schwarz 1978), where each detection has two coordinates.
+    """
+
+    before: float
+    after: float
+    price: float
+    detections: int
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the poses after explain more than they cost."""
+        return self.after + self.price < self.before
+
+    def figures(self) -> dict[str, float]:
+        """Return what `run.json` says of it."""
+        figures = {"misfit_before": self.before, "misfit_after": self.after, "price": self.price}
+        return {name: round(figure, 1) for name, figure in figures.items()}
+
+
+def compare_poses(
+    before: Dataset, after: Dataset, parameters: int, config: MapConfig, *, threads: int, progress: Progress
+) -> Comparison:
+    """Return how badly the detections of a sample fit the poses of two datasets, which `parameters` tell apart.
+
+    Both datasets have the same images and detections.
     """
     old = InMemory(before, config).sample()
     scene = Scene(old.dataset, old.drives, cast_sightings(old.dataset)[0])
@@ -31,7 +57,7 @@ def compare_poses(
         # They are in another order where poses tell the order.
         same = np.flatnonzero(np.isin(new.detection_id, old.detection_id[rays]))
         of_new, _ = misfit(scene, config, same, threads=threads, tell=lambda done: tell(MISFIT_STEPS + done))
-    return of_old, of_new, len(rays)
+    return Comparison(of_old, of_new, parameters * math.log(2 * len(rays)), len(rays))
 
 
 def _same_images(dataset: Dataset, like: InOrder, config: MapConfig) -> InOrder:
