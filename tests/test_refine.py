@@ -195,6 +195,28 @@ def test_a_delay_of_all_poses_is_one_number_of_the_camera() -> None:
     assert refined.record["cameras"][0]["delay_s"] == pytest.approx(0.15, abs=0.01)
 
 
+def test_errors_are_estimated_with_the_rates_of_the_delay_that_poses_start_with(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    late, seen = city(pose_delay_s=0.1), []
+    monkeypatch.setattr(poses, "estimate", lambda footage, *_, late_s, **__: seen.append((footage, late_s)))
+    ordered = in_driving_order(late, viewpoint_step_m=1.0)
+    assert poses._find(ordered.dataset, ordered.drives, valuemap.MapConfig(), 1) is None
+    footage, late_s = seen[0]
+    assert late_s == pytest.approx(0.1, abs=0.03)
+    turned = {}
+    for name, motion in (("mean", find_motion(ordered.dataset, ordered.drives)), ("found", footage.motion)):
+        rate = motion.forward_radps[footage.row] if name == "mean" else motion.forward_radps
+        turned[name] = rotations(0.1 * rate) @ footage.cam_from_world
+    clean = camera_poses(in_driving_order(city(), viewpoint_step_m=1.0).dataset.images)[0][footage.row]
+    off = {
+        name: np.degrees(Rotation.from_matrix(np.einsum("nij,nkj->nik", rotation, clean)).magnitude())
+        for name, rotation in turned.items()
+    }
+    assert (off["mean"] > 1.0).sum() > 5
+    assert (off["found"] > 1.0).sum() < 0.3 * (off["mean"] > 1.0).sum()
+
+
 @pytest.mark.parametrize("delay_s", [0.0, 0.1])
 def test_what_drives_see_comes_together_at_the_delay_of_their_poses(delay_s: float) -> None:
     ordered = in_driving_order(city(pose_delay_s=delay_s), viewpoint_step_m=1.0)

@@ -180,6 +180,12 @@ def gather(dataset: Dataset, drives: Drives) -> Footage:
     )
 
 
+def moving_late(footage: Footage, late_s: float) -> Footage:
+    """Return the footage with the rates of poses that are about so late, as `find_motion` has them."""
+    motion = find_motion(footage.whole, footage.whole_drives, late_s=np.full(len(footage.whole.images), late_s))
+    return replace(footage, motion=_take(motion, footage.row))
+
+
 def _take(motion: Motion, rows: Ints) -> Motion:
     return Motion(**{name: value[rows] for name, value in vars(motion).items()})
 

@@ -17,7 +17,7 @@ from valuemap.drives import Drives, in_driving_order
 from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
 from valuemap.refine.estimate import Estimate, delay_together, estimate, lay, mounts_alone
-from valuemap.refine.footage import Footage, find_motion, gather, in_working_frame
+from valuemap.refine.footage import Footage, find_motion, gather, in_working_frame, moving_late
 from valuemap.refine.jumps import Legs, find_hints, find_jumps
 from valuemap.refine.landmarks import find_landmarks
 from valuemap.refine.residuals import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
@@ -165,6 +165,8 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
             laid = _laid(footage, turned, late_s)
             landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, leg, config, threads=threads)
             marks = lay(landmarks, laid, hints)
+            # Mean rates of steps in which turns begin are none of a delay: focal lengths took what they left.
+            footage = moving_late(footage, late_s)
     except SettingError:  # So many detections in one place that their votes fill the memory.
         return None
     if marks is None:
