@@ -159,7 +159,7 @@ export class Filters {
     const key = new Float64Array(labels.count);
     for (const row of shown) key[row] = 1e9 * urgent(row) + doubt(row);
     this.order = shown.slice().sort((a, b) => key[a] - key[b] || a - b);
-    this.listTitle.replaceChildren("Labels ", h("small", {}, `${count(shown.length)} of ${count(labels.count)}, doubtful first`));
+    this.listTitle.replaceChildren("Labels ", h("small", {}, labels.count ? `${count(shown.length)} of ${count(labels.count)}, doubtful first` : "none"));
     const listed = Array.from(this.order.subarray(0, LISTED));
     this.list.replaceChildren(
       ...listed.map((row) => {
@@ -177,6 +177,7 @@ export class Filters {
           ),
         );
       }),
+      ...(this.order.length ? [] : [h("li", { class: "muted" }, labels.count ? "No label passes the filters." : "This map has no labels. Click a place to read why there is nothing.")]),
       ...(this.order.length > LISTED ? [h("li", { class: "muted" }, `and ${count(this.order.length - LISTED)} more: filter, or search by id`)] : []),
     );
     const perState = new Map<State, number>();
