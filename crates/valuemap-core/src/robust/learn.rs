@@ -180,7 +180,7 @@ fn median(values: &mut [f64]) -> Option<f64> {
 /// much, of which few are false, and objects that are alike.
 fn rates(objects: &[&Object], before: &ClassModel) -> (Rates, f64) {
     let mut shares: Vec<f64> = objects.iter().filter_map(|object| object.seen.main_share()).collect();
-    let alike = median(&mut shares).map_or(Rates::GUESS, |recall| Rates { recall, ..Rates::ALIKE });
+    let alike = median(&mut shares).map_or(Rates::ALIKE, |share| Rates { recall: recall(share), ..Rates::ALIKE });
     let from = |rates: Rates| {
         let class = learned_rates(objects, ClassModel { rates, odd_passes: ODD_PASSES.1, ..*before })?;
         let ln_likelihood: f64 = objects.iter().map(|object| object.seen.ln_likelihood(&class)).sum();
@@ -210,6 +210,11 @@ fn learned_rates(objects: &[&Object], mut class: ClassModel) -> Option<ClassMode
     Some(class)
 }
 
+/// A share of hits as a rate: no detector sees all, and none that serves sees nothing.
+fn recall(share: f64) -> f64 {
+    share.clamp(0.05, 0.98)
+}
+
 /// Detection rates by the method of moments, from looks by side and pass that each count in part. Nothing of few looks.
 #[must_use]
 pub(super) fn rates_of(sides: &[Vec<(Looks, f64)>]) -> Option<Rates> {
@@ -219,7 +224,7 @@ pub(super) fn rates_of(sides: &[Vec<(Looks, f64)>]) -> Option<Rates> {
     if expected < LEAST_LOOKS {
         return None;
     }
-    let recall = f64::clamp(hits / expected, 0.05, 0.98);
+    let recall = recall(hits / expected);
     let variance = recall * (1.0 - recall);
     // The variance of a share of n looks is p (1 - p) (1 + (n - 1) / (1 + s)) / n.
     let (mut excess, mut most) = (0.0, 0.0);
@@ -290,6 +295,17 @@ mod tests {
         let least = all[..60].iter().map(|object| object.seen.real(&class)).fold(1.0, f64::min);
         let most = all[60..].iter().map(|object| object.seen.real(&class)).fold(0.0, f64::max);
         assert!(least > 0.9 && most < 0.5, "{least} {most}");
+    }
+
+    #[test]
+    fn objects_that_all_looks_see_have_rates_as_well() {
+        let passes = || vec![Looks { expected: 12.0, hits: 12.0 }];
+        let objects: Vec<Object> =
+            (0..20).map(|_| anywhere(1, Seen { sectors: vec![passes()], images: 12 }, -100.0)).collect();
+        let (rates, odd_passes) = rates(&objects.iter().collect::<Vec<_>>(), &guess());
+        assert!(rates.recall > 0.9 && rates.concentration > 1.0 && rates.between >= 0.0, "{rates:?}");
+        let class = ClassModel { rates, odd_passes, ..guess() };
+        assert!(objects[0].seen.real(&class) > 0.9);
     }
 
     /// What is thought of a class at first.
