@@ -31,7 +31,6 @@ from valuemap.readers.poses import LOOKING_NORTH
 from valuemap.readers.structure import Picture, Posed, find_poses, process
 from valuemap.readers.structure.adjust import Sights, adjust, gps_inflation
 from valuemap.readers.structure.features import find_features, image_ids
-from valuemap.readers.structure.guided import Features, is_turned, match_along_lines
 from valuemap.readers.structure.job import Job, prepare, read_answer, read_job, write_answer
 from valuemap.readers.structure.mapping import confirmed, contradicts_gps
 from valuemap.readers.structure.pairs import pairs_to_match
@@ -213,34 +212,6 @@ def test_pictures_are_matched_along_the_drive_and_with_others_near(tmp_path: Pat
     assert {(8, 30), (10, 30), (12, 30), (30, 31)} <= set(pairs)
     assert (5, 30) not in pairs
     assert all(a < b for a, b in pairs)
-
-
-# Matches where poses are known.
-
-
-def looks(points: Floats, descriptors: Floats, rotation: Floats, center: Floats) -> Features:
-    ray = (points - center) @ rotation.T
-    return Features(*(each / np.linalg.norm(each, axis=1, keepdims=True) for each in (ray, descriptors)))
-
-
-def test_windows_alike_are_told_apart_by_where_they_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fifty windows and as many that look the same, of two pictures round a corner; the poses are half a degree off."""
-    random = np.random.default_rng(0)
-    points = np.array([-5.0, 10.0, -3.0]) + random.random((100, 3)) * [10.0, 10.0, 8.0]
-    look = np.repeat(random.normal(size=(50, 128)), 2, axis=0)
-    there = look + random.normal(0.0, 0.1, look.shape)
-    first = LOOKING_NORTH.T, np.zeros(3)
-    second = Rotation.from_rotvec([0.0, 0.4, 0.0]).as_matrix() @ first[0], np.array([3.0, 1.0, 0.0])
-    assert is_turned(first[0], second[0])
-    assert not is_turned(first[0], first[0])
-    off = Rotation.from_rotvec([0.005, 0.007, 0.0]).as_matrix() @ second[0], second[1]
-    features = looks(points, look, *first), looks(points, there, *second)
-    found = match_along_lines(*features, first, off)
-    assert len(found) > 50
-    assert np.mean(found[:, 0] == found[:, 1]) > 0.95
-    monkeypatch.setattr("valuemap.readers.structure.guided._BAND_RAD", 4.0)
-    assert len(match_along_lines(*features, first, off)) < 10
-    assert match_along_lines(*features, first, (off[0], first[1])).shape == (0, 2)
 
 
 # The process.
@@ -482,32 +453,6 @@ def test_structure_from_motion_finds_poses(found_street: Street) -> None:
     assert dataset.images.position_sigma_m is not None
     assert 0.0 < np.median(dataset.images.position_sigma_m) < 0.1
     assert_allclose(dataset.cameras.params[0][0], FOCAL, rtol=0.03)
-
-
-def test_turned_pictures_are_matched_again_where_their_poses_are_known(found_street: Street) -> None:
-    """In a copy of the database, and points are made of what is new there."""
-    folder, _, _, _, _ = found_street
-    before, after = (matches_of(folder / "work" / name) for name in ("database.db", "models/guided.db"))
-    fresh = {pair: after[pair] - before.get(pair, set()) for pair in after}
-    assert sum(map(len, fresh.values())) > 30
-    assert all(len(after[pair]) >= len(known) for pair, known in before.items())
-    model = pycolmap.Reconstruction(folder / "work" / "models" / "united")
-    used = 0
-    for point in model.points3D.values():
-        seen = {element.image_id: element.point2D_idx for element in point.track.elements}
-        used += sum((seen[a], seen[b]) in fresh[a, b] for a, b in fresh if a in seen and b in seen)
-    assert used > 10
-
-
-def matches_of(path: Path) -> dict[tuple[int, int], set[tuple[int, int]]]:
-    """Return the matches that were verified, by pairs of images."""
-    found = {}
-    with pycolmap.Database.open(path) as database:
-        for number in database.read_two_view_geometry_num_inliers()[0]:
-            one, two = pycolmap.pair_id_to_image_pair(number)
-            matches = np.asarray(database.read_two_view_geometry(one, two).inlier_matches)
-            found[one, two] = {(int(a), int(b)) for a, b in matches}
-    return found
 
 
 def test_it_goes_on_where_it_was(found_street: Street, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,7 +24,6 @@ from valuemap.progress import Progress
 from valuemap.readers.cameras_of import Camera
 from valuemap.readers.structure.adjust import Adjusted, Sights, adjust
 from valuemap.readers.structure.features import image_ids
-from valuemap.readers.structure.guided import match_turned
 from valuemap.readers.structure.job import DATABASE, LINKS, MODELS, Job, Posed
 from valuemap.readers.structure.pose_graph import LEAST_IMAGES, start_of
 from valuemap.readers.structure.two_views import LEAST_MATCHES, read_pairs
@@ -108,7 +107,7 @@ def _options(job: Job, threads: int) -> Any:
 
 
 def _run(
-    workspace: Path, database: Path, folder: Path, options: Any, total: int, progress: Progress, start: Path
+    workspace: Path, folder: Path, options: Any, total: int, progress: Progress, start: Path
 ) -> dict[int, pycolmap.Reconstruction]:
     posed = 0
 
@@ -119,7 +118,7 @@ def _run(
 
     progress("finding poses", 0, total)
     found: dict[int, pycolmap.Reconstruction] = pycolmap.incremental_mapping(
-        database,
+        workspace / DATABASE,
         workspace / LINKS,
         folder,
         options=options,
@@ -166,33 +165,25 @@ def _unite(
     progress: Progress,
 ) -> tuple[Adjusted, Ints, Ints]:
     """Return the final poses of rows (N), and which part each is of: parts are held together by the GPS alone."""
-    last, database = len(_TOLERANCES_PX) - 1, workspace / DATABASE
+    last = len(_TOLERANCES_PX) - 1
     for step, tolerance_px in enumerate(_TOLERANCES_PX):
         progress("adjusting poses", step, last + 1)
-        if step == 1:  # Now poses are right enough to say where to look for matches.
-            database = match_turned(job, workspace, ids, whole.poses, whole.cameras, workspace / MODELS)
-        model = _triangulated(job, workspace, database, ids, whole, tolerance_px, threads)
+        model = _triangulated(job, workspace, ids, whole, tolerance_px, threads)
         if step == last:
-            model = _with_the_rest(job, workspace, database, model, ids, threads, progress)
+            model = _with_the_rest(job, workspace, model, ids, threads, progress)
         found, row, part = _settle(job, model, ids, whole, why_not)
     progress("adjusting poses", last + 1, last + 1)
     return found, row, part
 
 
 def _triangulated(
-    job: Job,
-    workspace: Path,
-    database: Path,
-    ids: dict[int, int],
-    whole: _Whole,
-    tolerance_px: float,
-    threads: int,
+    job: Job, workspace: Path, ids: dict[int, int], whole: _Whole, tolerance_px: float, threads: int
 ) -> pycolmap.Reconstruction:
     """Return one model of all poses, with points made from the matches that agree to so many pixels."""
-    with pycolmap.Database.open(database) as opened:
+    with pycolmap.Database.open(workspace / DATABASE) as database:
         which = pycolmap.DatabaseCacheOptions()
         which.min_num_matches = LEAST_MATCHES
-        cache = pycolmap.DatabaseCache.create(opened, which)
+        cache = pycolmap.DatabaseCache.create(database, which)
     model = pycolmap.Reconstruction()
     model.load(cache)
     for camera_id, camera in whole.cameras.items():
@@ -214,19 +205,13 @@ def _triangulated(
     points.create_max_angle_error = points.continue_max_angle_error = looser * _ANGLE_DEG
     options.use_prior_position = False  # It would turn the whole anew, about a straight street by any angle.
     made: pycolmap.Reconstruction = pycolmap.triangulate_points(
-        model, database, workspace / LINKS, folder, clear_points=True, options=options
+        model, workspace / DATABASE, workspace / LINKS, folder, clear_points=True, options=options
     )
     return made
 
 
 def _with_the_rest(
-    job: Job,
-    workspace: Path,
-    database: Path,
-    model: pycolmap.Reconstruction,
-    ids: dict[int, int],
-    threads: int,
-    progress: Progress,
+    job: Job, workspace: Path, model: pycolmap.Reconstruction, ids: dict[int, int], threads: int, progress: Progress
 ) -> pycolmap.Reconstruction:
     """Return the model with pictures that no model had and that fit into the whole."""
     missing = len(ids) - model.num_reg_images()
@@ -237,7 +222,7 @@ def _with_the_rest(
     options = _options(job, threads)
     options.use_prior_position = options.multiple_models = False
     options.fix_existing_frames = options.mapper.fix_existing_frames = True
-    found = _run(workspace, database, folder, options, missing, progress, start=folder)
+    found = _run(workspace, folder, options, missing, progress, start=folder)
     return max([model, *found.values()], key=lambda each: each.num_reg_images())
 
 

@@ -58,7 +58,7 @@ def read_pairs(workspace: Path, ids: dict[int, int], cameras: dict[int, pycolmap
             ):
                 continue
             feature = np.asarray(geometry.inlier_matches, dtype=np.int64)
-            ray = np.stack([rays_of(camera_of[each], pixel[each][feature[:, i]]) for i, each in enumerate((one, two))])
+            ray = np.stack([_rays(camera_of[each], pixel[each][feature[:, i]]) for i, each in enumerate((one, two))])
             assert geometry.cam2_from_cam1 is not None
             turn = np.asarray(geometry.cam2_from_cam1.rotation.matrix())
             turns = np.concatenate([turn[None], _turns_by_plane(*ray)])
@@ -81,8 +81,7 @@ def _turns_by_plane(first: Floats, second: Floats) -> Floats:
     return np.unique(np.round(cv2.decomposeHomographyMat(plane, np.eye(3))[1], 9), axis=0)
 
 
-def rays_of(camera: pycolmap.Camera, pixel: Floats) -> Floats:
-    """Return the directions (M, 3), of length 1 and in camera axes, of pixels (M, 2)."""
+def _rays(camera: pycolmap.Camera, pixel: Floats) -> Floats:
     ray = np.column_stack([np.asarray(camera.cam_from_img(pixel)), np.ones(len(pixel))])
     return np.asarray(ray / np.linalg.norm(ray, axis=1)[:, None])
 
