@@ -245,6 +245,8 @@ def test_a_map_alone_gives_a_report(labels: int, tmp_path: Path) -> None:
     assert "The dataset of the map was not given" in page.text
     assert "Nothing was compared with a truth" in page.text
     assert len(arrays_of(page.data)["label_id"]) == labels
+    assert ("The map has no labels" in page.text) == (labels == 0)
+    assert ("Labels whose positions are the least certain" in page.text) == (labels > 0)
 
 
 def test_another_dataset_is_refused_before_anything_is_written(tmp_path: Path) -> None:

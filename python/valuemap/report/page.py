@@ -74,7 +74,7 @@ def page_text(content: Content) -> str:
     )
     figures = "\n".join(_figure(figure, as_png=False) for figure in content.figures)
     tables = "\n".join(_table(table) for table in content.tables)
-    lists = "\n".join(_list(*each) for each in content.lists)
+    lists = "\n".join(_list(*each) for each in content.lists if each[2]) or "<p>The map has no labels.</p>"
     short = "".join(
         f"<li><b>{_text(value)}</b><span>{_text(what)}</span></li>" for value, what in content.figures_in_short
     )
