@@ -23,8 +23,10 @@ export class Drives {
   private readonly colored = new Map<Drawn, Colored>();
   private family = {};
   private dark = false;
-  private hidden = "";
+  private hidden: ReadonlySet<number> = new Set();
   private turn = 0;
+  /** The levels that were asked for, and how many of them are still being made. */
+  private readonly asked = new Set<number>();
   private missing = 0;
 
   /** The columns are handed to the worker: nobody can read them afterwards. */
@@ -42,17 +44,25 @@ export class Drives {
     return this.missing > 0;
   }
 
-  /** Leave passes out, and make the level of a spacing first. What was made before is drawn until then. */
-  want(hiddenPasses: ReadonlySet<number>, spacing: number): void {
-    const hidden = [...hiddenPasses].sort((a, b) => a - b).join();
-    if (!this.worker || (this.turn && hidden === this.hidden)) return;
-    this.hidden = hidden;
-    this.missing = SPACINGS.length;
+  /** Leave passes out; what was made with them is drawn until it is made anew. */
+  hide(passes: ReadonlySet<number>): void {
+    if (passes.size === this.hidden.size && [...passes].every((pass) => this.hidden.has(pass))) return;
+    this.hidden = new Set(passes);
+    this.turn++;
+    this.asked.clear();
+    this.missing = 0;
     this.family = {};
-    const { drives } = this;
-    const wish: Wish = { drives, hidden: new Set(hiddenPasses), first: [spacing, streetSpacing(spacing)], turn: ++this.turn };
-    this.worker.postMessage(wish, drives ? [drives.points.buffer] : []);
+  }
+
+  /** Make the level of a spacing, and that of its streets, where it is not made yet. */
+  need(spacing: number): void {
+    const levels = [...new Set([spacing, streetSpacing(spacing)])].filter((each) => !this.asked.has(each));
+    if (!this.worker || !levels.length) return;
+    for (const each of levels) this.asked.add(each);
+    this.missing += levels.length;
+    const { drives, hidden, turn } = this;
     this.drives = undefined;
+    this.worker.postMessage({ drives, hidden, levels, turn } satisfies Wish, drives ? [drives.points.buffer] : []);
   }
 
   /** The level of a spacing, or what there is instead of it so far: a coarser one rather than a finer one. */

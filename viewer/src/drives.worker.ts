@@ -1,13 +1,14 @@
-/** Makes the levels of the tracks while the page answers: the level that is looked at first, then all others. */
+/** Makes the levels of the tracks that somebody looks at, while the page answers. */
 
-import { buffersOf, drawnOf, type Drawn, type Level, SPACINGS, thinned } from "./tracks";
+import { buffersOf, drawnOf, type Drawn, type Level, thinned } from "./tracks";
 
 /** What the page says: where the cameras were, once, and which passes nobody wants to see. */
 export interface Wish {
   drives?: Level;
   hidden: ReadonlySet<number>;
-  /** Of the levels that are needed first. */
-  first: number[];
+  /** The spacings of the levels that are needed. */
+  levels: number[];
+  /** What was hidden in an earlier turn does not matter any more. */
   turn: number;
 }
 
@@ -17,27 +18,26 @@ export interface Made {
   turn: number;
 }
 
-const levels = new Map<number, Level>();
-let wish: Wish | null = null;
+const thin = new Map<number, Level>();
+const wishes: Wish[] = [];
 
 onmessage = ({ data }: MessageEvent<Wish>) => {
-  if (data.drives) levels.set(0, data.drives);
-  const idle = wish === null;
-  wish = data;
-  if (idle) void work();
+  if (data.drives) thin.set(0, data.drives);
+  wishes.push(data);
+  if (wishes.length === 1) void work();
 };
 
 async function work(): Promise<void> {
-  while (wish) {
-    const { hidden, first, turn } = wish;
-    for (const spacing of new Set([...first, ...SPACINGS])) {
-      const level = levels.get(spacing) ?? thinned(levels.get(0)!, spacing);
-      levels.set(spacing, level);
+  for (; wishes.length; wishes.shift()) {
+    const { hidden, levels, turn } = wishes[0];
+    for (const spacing of levels) {
+      // To hear whether something else is hidden by now.
+      await new Promise((resolve) => setTimeout(resolve));
+      if (wishes[wishes.length - 1].turn !== turn) break;
+      const level = thin.get(spacing) ?? thinned(thin.get(0)!, spacing);
+      thin.set(spacing, level);
       const drawn = drawnOf(level, hidden);
       postMessage({ drawn, turn } satisfies Made, { transfer: buffersOf(drawn) });
-      await new Promise((resolve) => setTimeout(resolve)); // To hear whether something else is wished for by now.
-      if (wish.turn !== turn) break;
     }
-    if (wish.turn === turn) wish = null;
   }
 }

@@ -105,7 +105,7 @@ export class MapView {
     this.around = boundsOf([this.labels.position, cameras.rows("position") ? plane(cameras.get("position")) : new Float32Array()]);
     this.view = view ?? this.fitting();
     this.drives = new Drives(cameras, () => this.draw());
-    this.drives.want(settings.hiddenPasses, spacingAt(this.metresPerPixel()));
+    this.drives.hide(settings.hiddenPasses);
     this.deck = new Deck({
       parent: parent as HTMLDivElement,
       style: { position: "absolute", inset: "0" } as never,
@@ -351,7 +351,7 @@ export class MapView {
     this.index?.finish();
     this.buffers = { length, position, fill, line, shape };
     this.near = null;
-    this.drives.want(this.settings.hiddenPasses, spacingAt(this.metresPerPixel()));
+    this.drives.hide(this.settings.hiddenPasses);
     this.makeRays();
     this.draw();
   }
@@ -392,7 +392,7 @@ export class MapView {
       new DiscLayer({ id: "rejected", discs: this.rejectedDiscs, visible: layers.has("rejected"), radius: this.view.zoom < 0 ? 1.5 : 3 }),
       new DiscLayer({ id: "ellipses", discs: around && around.ellipses, shaped: true, radius: ELLIPSE_95, lineWidth: 1.5, visible: near && layers.has("ellipses") }),
       ...this.rayLayers(),
-      new DiscLayer({ id: "labels", discs: this.buffers, ...dots, visible: !near }),
+      new DiscLayer({ id: "labels", discs: this.buffers, partsAFrame: Infinity, ...dots, visible: !near }),
       new DiscLayer({ id: "labels-near", discs: around && around.dots, ...dots, visible: near }),
       new DiscLayer({ id: "selected", discs: this.marks.at, radius: 11, lineWidth: 2.5 }),
       new LinesLayer({ id: "moved", lines: this.marks.moved, width: 1.5 }),
@@ -413,6 +413,7 @@ export class MapView {
   private trackLayers(): (DiscLayer | LinesLayer)[] {
     const metres = this.metresPerPixel();
     const { layers } = this.settings;
+    this.drives.need(spacingAt(metres));
     const level = this.drives.at(spacingAt(metres), this.dark);
     const streets = level && this.drives.at(streetSpacing(level.spacing), this.dark);
     const streetPx = Math.max(STREET_LEAST_PX, STREET_M / metres);

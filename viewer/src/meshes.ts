@@ -48,7 +48,7 @@ interface Mesh {
 const CORNERS = 4;
 const INDICES = [0, 1, 2, 2, 1, 3];
 
-/** So many parts a layer hands the GPU in one frame: more would make the page wait for it. */
+/** So many parts most layers hand the GPU in one frame: more would make the page wait for it. */
 const PARTS_A_FRAME = 2;
 
 /** What a list of triangles for a part reads. */
@@ -109,6 +109,11 @@ abstract class MeshLayer<Props extends object> extends Layer<Props> {
   protected abstract layout(): { name: string; format: "float32x2" | "float32x4" | "unorm8x4" }[];
   protected abstract shaders(): Shaders;
   protected abstract uniforms(): Record<string, Record<string, number>>;
+  /** How many parts the GPU is handed in one frame. */
+  protected partsAFrame(): number {
+    return PARTS_A_FRAME;
+  }
+
   /** How many pixels a shape reaches beyond its points. */
   protected abstract reachPx(): number;
 
@@ -136,8 +141,9 @@ abstract class MeshLayer<Props extends object> extends Layer<Props> {
     const inView = this.partsInView(mesh);
     const made = this.partsOf(mesh);
     const missing = inView.filter((part) => !made[part]);
-    for (const part of missing.slice(0, PARTS_A_FRAME)) made[part] = this.made(part, mesh);
-    state.complete = missing.length <= PARTS_A_FRAME;
+    const most = this.partsAFrame();
+    for (const part of missing.slice(0, most)) made[part] = this.made(part, mesh);
+    state.complete = missing.length <= most;
     if (state.complete && state.whole !== mesh) {
       state.whole = mesh;
       for (const other of state.parts.keys()) if (other !== mesh && (!mesh.family || other.family !== mesh.family)) this.forget(other);
@@ -214,6 +220,8 @@ interface DiscProps {
   lineWidth: number;
   /** In pixels: ellipses are no smaller than that. */
   minRadius: number;
+  /** What the page is there for is drawn at once, and follows a filter while it is dragged. */
+  partsAFrame: number;
 }
 
 export class DiscLayer extends MeshLayer<DiscProps> {
@@ -224,6 +232,7 @@ export class DiscLayer extends MeshLayer<DiscProps> {
     radius: 1,
     lineWidth: 0,
     minRadius: 0.5,
+    partsAFrame: PARTS_A_FRAME,
   };
 
   protected shaders() {
@@ -310,6 +319,10 @@ void main(void) {
 
   protected reachPx(): number {
     return this.props.radius + this.props.lineWidth + 1;
+  }
+
+  protected partsAFrame(): number {
+    return this.props.partsAFrame;
   }
 
   protected uniforms() {
