@@ -7,12 +7,12 @@
 //!   + ln|information| - 3 ln 2 pi - 2 ln births_c     (2) the position, marginalised, and the price of a birth
 //!   + 2 sum_i ln clutter_c                            (3) what the votes are otherwise
 //!   - 2 sum_i ln ratio(size_i)                        (4) boxes of one object have one physical size
-//!   - 2 ln [ (1 - phi) real_c(hits; looks) + phi false_c(hits; looks) ]
-//!                                                     (5) who should have seen it, and did not, by side and pass
+//!   - 2 ln [ (1 - phi_c) prod_pass usual(hits; looks) + phi_c prod_pass any(hits; looks) ]
+//!                                                     (5) who should have seen it, and did not: beta-binomial
 //! ```
 //!
-//! The second term of (5) is that of a false thing: parked, reflected, or mistaken for an object at times. Its detections meet as
-//! those of an object do, but on one pass alone or in fewer of the looks (see [`super::seen`]).
+//! The second product of (5) is that of a false thing: parked, reflected, or mistaken for an object at times. Its detections meet as
+//! those of an object do, but in any share of the looks, none or all of a pass.
 
 use std::f64::consts::PI;
 
@@ -23,10 +23,9 @@ use rstar::primitives::GeomWithData;
 use super::drift::{Drive, Look};
 use super::estimate::is_one_visit;
 use super::heights::height_m;
-use super::looks::Lookout;
+use super::looks::{Lookout, Seen};
 use super::model::{Model, Sizes};
 use super::scene::Scene;
-use super::seen::Seen;
 use super::sizes::size_terms;
 
 /// Residuals beyond this many sigmas count less, in proportion (Huber): 95 % efficient where errors are Gaussian at 1.35, more above.
@@ -255,16 +254,23 @@ pub fn object(
     start: Vector3<f64>,
     others: Vec<u32>,
 ) -> Option<Object> {
-    unseen(model, votes, start)?.with_looks(model, lookout, others)
-}
-
-/// The same before it is asked who should have seen it: J is not less than its energy.
-#[must_use]
-pub fn unseen(model: &Model<'_>, votes: Vec<u32>, start: Vector3<f64>) -> Option<Object> {
-    let class = model.scene.rays.class[*votes.first()? as usize];
+    let first = *votes.first()?;
+    let class = model.class_of(first);
     let fit = fit(model, &votes, start)?;
-    let (energy, ln_size) = energy_of_votes(model, &votes, &fit);
-    Some(Object { class, votes, fit, ln_size, others: Vec::new(), seen: Seen::default(), real: 1.0, energy })
+    let (of_votes, ln_size) = energy_of_votes(model, &votes, &fit);
+    let seen = lookout.looks(model, &fit.point, &votes, &others);
+    let energy = of_votes - 2.0 * seen.ln_likelihood(class);
+    let real = seen.real(class);
+    energy.is_finite().then(|| Object {
+        class: model.scene.rays.class[first as usize],
+        votes,
+        fit,
+        ln_size,
+        others,
+        seen,
+        real,
+        energy,
+    })
 }
 
 /// J of an object but for the looks at it, equations (1) to (4), of which it is not less; and the logarithm of its size, m.
@@ -302,17 +308,6 @@ pub fn by_place(objects: &[Object]) -> RTree<GeomWithData<[f64; 3], usize>> {
 }
 
 impl Object {
-    /// One that was [`unseen`], with the looks at it; `others` are images (ascending) with detections in its gate.
-    #[must_use]
-    pub fn with_looks(mut self, model: &Model<'_>, lookout: &Lookout, others: Vec<u32>) -> Option<Self> {
-        let class = &model.classes[self.class as usize];
-        self.seen = lookout.looks(model, &self.fit.point, &self.votes, &others);
-        self.energy -= 2.0 * self.seen.ln_likelihood(class);
-        self.real = self.seen.real(class);
-        self.others = others;
-        self.energy.is_finite().then_some(self)
-    }
-
     /// Probability that it exists and is real, if its votes are clutter otherwise.
     #[must_use]
     pub fn existence(&self) -> f64 {

@@ -1,9 +1,8 @@
 //! The noise that makes rays likeliest: sought from several starts, each time from the map that is found with it.
 
 use std::f64::consts::PI;
-use std::rc::Rc;
 
-use super::calibrate::{Known, Placed, calibrate};
+use super::calibrate::{Known, calibrate};
 use super::energy::Object;
 use super::model::Model;
 use super::noise::Noise;
@@ -46,8 +45,11 @@ pub(super) fn likeliest_noise(
         return Ok((noise, starts));
     }
     let mut likeliest = Likeliest::default();
-    likeliest
-        .steps(MORE_ROUNDS, &mut noise, |noise, before| round(scene, noise, known, settings, more, before, progress))?;
+    for _ in 0..MORE_ROUNDS {
+        let found = round(scene, &noise, known, settings, more, progress)?;
+        noise = found.again;
+        likeliest.offer(found);
+    }
     Ok((likeliest.noise().unwrap_or(noise), starts))
 }
 
@@ -65,39 +67,27 @@ pub fn misfit(
     progress: &Progress,
 ) -> Result<(f64, Vec<u32>), Halt> {
     let range_m = settings.viability.max_range_m;
-    let mut rays = rays.unwrap_or_else(|| sample::places(scene, CALIBRATION_RAYS.0, range_m));
-    rays.retain(|&ray| scene.ray(ray).is_usable());
+    let rays = rays.unwrap_or_else(|| sample::places(scene, CALIBRATION_RAYS.0, range_m));
     let likeliest = Likeliest::of_starts(scene, guess, known, settings, &rays, progress)?;
-    Ok((likeliest.best.as_ref().map_or(f64::INFINITY, |best| best.value), rays))
+    Ok((likeliest.best.map_or(f64::INFINITY, |best| best.value), rays))
 }
 
-/// One step: how likely some rays are with a noise, and the noise that is estimated from the map that it makes: of that found anew, and
-/// that which the step `before` ended at, the likelier. So no step forgets what an earlier one found.
+/// One step: how likely some rays are with a noise, and the noise that is estimated from the map that it makes.
 fn round(
     scene: &Scene,
     noise: &Noise,
     known: Known,
     settings: &Settings,
     rays: &[u32],
-    before: Option<&Round>,
     progress: &Progress,
 ) -> Result<Round, Halt> {
     let settings = Settings { gate_sigmas: settings.gate_sigmas * CALIBRATION_GATE, ..*settings };
-    let from = |begun: Vec<Placed>| -> Result<Round, Halt> {
-        let mut model = Model::new(scene, noise, &settings);
-        let objects = search(&mut model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
-        let (value, left) = (likelihood(&model, &objects, rays), Left::of(&model, &objects, rays));
-        Ok(Round { noise: *noise, value, again: *noise, left, objects: placed(&objects) })
-    };
-    let mut best = from(initial::labels_of_few(&Model::new(scene, noise, &settings), rays, progress)?)?;
-    if let Some(before) = before {
-        let again = from(before.objects.clone())?;
-        if again.value < best.value {
-            best = again;
-        }
-    }
-    best.again = calibrate(scene, noise, &best.objects, known);
-    Ok(best)
+    let mut model = Model::new(scene, noise, &settings);
+    let begun = initial::labels_of_few(&model, rays, progress)?;
+    let objects = search(&mut model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
+    let again = calibrate(scene, noise, &placed(&objects), known);
+    let value = likelihood(&model, &objects, rays);
+    Ok(Round { noise: *noise, value, again, left: Left::of(&model, &objects, rays) })
 }
 
 /// What a step of the calibration finds with a noise.
@@ -108,8 +98,6 @@ struct Round {
     /// The noise that is estimated from the map that it makes.
     again: Noise,
     left: Left,
-    /// That map.
-    objects: Vec<Placed>,
 }
 
 /// What a larger noise could still explain of some rays.
@@ -164,7 +152,7 @@ impl Round {
 /// What makes the same rays likeliest so far.
 #[derive(Default)]
 struct Likeliest {
-    best: Option<Rc<Round>>,
+    best: Option<Round>,
     /// From how many starts it was sought.
     starts: usize,
 }
@@ -187,30 +175,20 @@ impl Likeliest {
                 break;
             }
             likeliest.starts += 1;
-            likeliest.steps(CALIBRATION_ROUNDS, &mut noise, |noise, before| {
-                round(scene, noise, known, settings, rays, before, progress)
-            })?;
+            for _ in 0..CALIBRATION_ROUNDS {
+                let found = round(scene, &noise, known, settings, rays, progress)?;
+                noise = found.again;
+                likeliest.offer(found);
+            }
         }
         Ok(likeliest)
     }
 
-    /// Some steps on from a noise. What makes the rays likelier is kept.
-    fn steps(
-        &mut self,
-        count: usize,
-        noise: &mut Noise,
-        step: impl Fn(&Noise, Option<&Round>) -> Result<Round, Halt>,
-    ) -> Result<(), Halt> {
-        let mut before: Option<Rc<Round>> = None;
-        for _ in 0..count {
-            let found = Rc::new(step(noise, before.as_deref())?);
-            *noise = found.again;
-            if self.best.as_ref().is_none_or(|best| found.value < best.value) {
-                self.best = Some(Rc::clone(&found));
-            }
-            before = Some(found);
+    /// Keep what makes them likelier.
+    fn offer(&mut self, found: Round) {
+        if self.best.as_ref().is_none_or(|best| found.value < best.value) {
+            self.best = Some(found);
         }
-        Ok(())
     }
 
     fn noise(&self) -> Option<Noise> {
@@ -233,59 +211,4 @@ fn likelihood(model: &Model<'_>, objects: &[Object], rays: &[u32]) -> f64 {
         all + here().map(|object| object.energy + 2.0 * change * object.votes.len() as f64).sum::<f64>()
     };
     (0..model.classes.len()).map(of_class).sum()
-}
-
-#[cfg(test)]
-mod tests {
-    use nalgebra::Vector3;
-
-    use super::*;
-    use crate::street;
-
-    #[test]
-    fn rays_that_are_none_do_not_count() -> Result<(), Halt> {
-        let objects: Vec<Vector3<f64>> = (0..8).map(|i| Vector3::new(25.0 + 9.0 * f64::from(i), 5.0, 3.0)).collect();
-        let mut scene = street::street(80, 1.0, &objects, &[[0.7, -0.4], [-0.9, 0.8], [0.3, -0.5]]);
-        let all: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
-        std::sync::Arc::make_mut(&mut scene.rays).rays[7].residual_from_world.fill(f64::NAN);
-        let of = |rays: Vec<u32>| {
-            misfit(&scene, &street::NOISE, Known::default(), &street::SETTINGS, Some(rays), &Progress::default())
-        };
-        let (value, used) = of(all)?;
-        assert!(value.is_finite() && used == scene.usable_rays(), "{value}");
-        assert_eq!(value.to_bits(), of(scene.usable_rays())?.0.to_bits());
-        Ok(())
-    }
-
-    /// A step with a noise some times too large on a street of pairs: alone, and after one that ended at the truth.
-    fn steps(apart_m: f64, factor: f64) -> Result<[Round; 2], Halt> {
-        let place = |i: i32| Vector3::new(25.0 + 9.0 * f64::from(i / 2) + apart_m * f64::from(i % 2), 5.0, 3.0);
-        let objects: Vec<Vector3<f64>> = (0..8).map(place).collect();
-        let scene = street::street(50, 1.0, &objects, &[[0.7, -0.4], [-0.9, 0.8], [0.3, -0.5]]);
-        let noise = street::NOISE.scaled(factor, Known::default());
-        let rays = scene.usable_rays();
-        let step = |before: Option<&Round>| {
-            round(&scene, &noise, Known::default(), &street::SETTINGS, &rays, before, &Progress::default())
-        };
-        // In each image the rays are those of the objects that it sees, in their order.
-        let mut votes: Vec<Vec<u32>> = vec![Vec::new(); objects.len()];
-        for in_image in rays.chunk_by(|&a, &b| scene.rays.image[a as usize] == scene.rays.image[b as usize]) {
-            let center = scene.view(in_image[0]).center;
-            let seen =
-                (0..objects.len()).filter(|&i| objects[i].x - center.x > 3.0 && (objects[i] - center).norm() < 50.0);
-            seen.zip(in_image).for_each(|(i, &ray)| votes[i].push(ray));
-        }
-        let alone = step(None)?;
-        let truth = Round { objects: votes.into_iter().zip(objects).collect(), ..step(None)? };
-        Ok([alone, step(Some(&truth))?])
-    }
-
-    #[test]
-    fn a_step_goes_on_from_the_map_of_the_one_before_where_that_is_likelier() -> Result<(), Halt> {
-        let [alone, after] = steps(0.1, 0.3)?;
-        assert!(after.value < alone.value - 10.0, "{} {}", after.value, alone.value);
-        let [alone, after] = steps(0.4, 2.0)?;
-        assert!(after.value <= alone.value, "{} {}", after.value, alone.value);
-        Ok(())
-    }
 }

@@ -38,7 +38,6 @@ pub mod repair;
 pub mod sample;
 pub mod scene;
 pub mod search;
-pub mod seen;
 pub mod sizes;
 mod spd;
 
@@ -243,27 +242,28 @@ pub fn find(
     let variance_factor = calibrate::variance_factor(scene, noise, &placed(&objects), objects.len().max(1));
     let claimed: usize = objects.iter().map(|object| object.votes.len()).sum();
     let energy = objects.iter().map(|object| object.energy).sum();
+    let existence = initial::existence(&model, &objects, &estimates, first.doubted);
     let few = if settings.least_votes < settings.min_votes {
         few::objects_of_few(&model, &rays, &objects, settings.least_votes as usize, progress)?
     } else {
         Vec::new()
     };
-    let finding = |object: Object, estimate: Estimate| Finding {
-        estimate,
-        existence: object.existence(),
-        expected: object.seen.images,
-        votes: object.votes,
-    };
-    let few = few.into_iter().map(|object| {
-        let estimate = Estimate { point: object.fit.point, covariance: object.fit.covariance };
-        finding(object, estimate)
+    let of_few: Vec<Estimate> =
+        few.iter().map(|o| Estimate { point: o.fit.point, covariance: o.fit.covariance }).collect();
+    let judged = initial::existence(&model, &few, &of_few, first.doubted);
+    let few = few.into_iter().zip(of_few).zip(judged).map(|((object, estimate), (judged, _))| {
+        // Of few votes nothing is expected of the looks that is not in J.
+        let is_judged = object.votes.len() >= settings.min_votes as usize;
+        let existence = if is_judged { object.existence().min(judged) } else { object.existence() };
+        Finding { estimate, existence, expected: object.seen.images, votes: object.votes }
     });
     let mut findings: Vec<Finding> = objects
         .into_iter()
         .zip(estimates)
-        .map(|(object, estimate)| {
-            let covariance = estimate.covariance * variance_factor;
-            finding(object, Estimate { covariance, ..estimate })
+        .zip(existence)
+        .map(|((object, mut estimate), (existence, expected))| {
+            estimate.covariance *= variance_factor;
+            Finding { estimate, existence, expected, votes: object.votes }
         })
         .chain(few)
         .filter(|finding| finding.existence >= settings.min_existence)
