@@ -1,6 +1,6 @@
 """Scale: tiles of any size, runs that are killed, and changes between years; see docs/scale.md.
 
-    python benchmarks/scale.py simulate|partition|cells|kills|change [--preset nyc] [--dataset FOLDER] [--json FILE]
+    python benchmarks/scale.py simulate|partition|cells|kills|update|change [--preset nyc] [--dataset FOLDER] [--json FILE]
 
 Times are those of the processor (user and system, all threads): they do not depend on what else the machine does.
 """
@@ -36,7 +36,8 @@ from valuemap.engine.threads import ThreadEngine
 from valuemap.pipeline import Run, build_map_of_folder
 from valuemap.portions import rows_on_disk
 from valuemap.simulate import PRESETS, simulate, simulate_districts
-from valuemap.tables import Ints
+from valuemap.tables import Ints, table_to_arrow
+from valuemap.tiles.grid import Grid
 from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.work import open_work
 from valuemap.update import compare
@@ -48,6 +49,9 @@ CHANGED = 20
 MOVED = 10
 MOVED_BY_M = 3.0
 KILLS = 10
+UPDATED_SHARE = 0.05
+SET = ("--set=correct_poses=0",)
+"""Poses of whole drives are looked at in all data, whatever is added: tiles have no part in that."""
 
 
 def main() -> None:
@@ -84,21 +88,29 @@ def city(preset: str, seed: int = 0) -> Dataset:
 
 def measured(folder: Path, out: Path, *options: str) -> dict[str, Any]:
     """Map a dataset in a process of its own, and return what it took."""
-    start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
-    command = [sys.executable, "-m", "valuemap.cli", "map", str(folder), "--out", str(out), "--json", *options]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    run = json.loads(done.stdout)
-    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    took, run = timed("map", str(folder), "--out", str(out), *options)
     return {
         "options": options,
-        "seconds": round(time.perf_counter() - start, 1),
-        "cpu_seconds": round(cpu_s, 1),
+        **took,
         "peak_memory_mb": max(stage["peak_memory_mb"] for stage in run["stages"]),
         "stages": run["stages"],
         "counts": {name: value for name, value in run["counts"].items() if name != "noise"},
         "map": digest(out),
     }
+
+
+def timed(*command: str) -> tuple[dict[str, float], dict[str, Any]]:
+    """Run a command of valuemap, and return what it took, and what it says."""
+    start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run(program(*command, "--json"), check=True, capture_output=True, text=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {"seconds": round(time.perf_counter() - start, 1), "cpu_seconds": round(cpu_s, 2)}, json.loads(done.stdout)
+
+
+def program(*command: str) -> list[str]:
+    """Return a command of valuemap."""
+    return [sys.executable, "-m", "valuemap.cli", *command]
 
 
 def digest(folder: Path) -> str:
@@ -114,7 +126,10 @@ def dataset_of(arguments: argparse.Namespace) -> Iterator[Path]:
         yield arguments.dataset
         return
     with tempfile.TemporaryDirectory() as name:
-        write_dataset_in_pieces(simulate_districts(PRESETS[arguments.preset], seed=0), Path(name) / "city")
+        if arguments.preset == "block":
+            valuemap.write_dataset(city("block"), Path(name) / "city")
+        else:
+            write_dataset_in_pieces(simulate_districts(PRESETS[arguments.preset], seed=0), Path(name) / "city")
         yield Path(name) / "city"
 
 
@@ -167,29 +182,134 @@ def cells(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def kills(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Kill runs with SIGKILL at random moments, and let them go on."""
-    chosen = random.Random(0)
-    with tempfile.TemporaryDirectory() as name:
+    """Kill maps and updates with SIGKILL at random moments, and let them go on."""
+    with dataset_of(arguments) as dataset, tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        valuemap.write_dataset(city(arguments.preset), folder / "city")
-        whole = measured(folder / "city", folder / "whole", "--tile-size", "1000")
-        identical, killed_at = 0, []
-        for number in range(KILLS):
-            out = folder / f"map-{number}"
-            command = [sys.executable, "-m", "valuemap.cli", "map", str(folder / "city"), "--out", str(out)]
-            command += ["--tile-size", "1000", "--resume"]
-            after_s = chosen.uniform(0.05, 0.95) * whole["seconds"]
-            process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-            time.sleep(after_s)
-            process.send_signal(signal.SIGKILL)
-            process.wait()
-            work = out.with_name(f"{out.name}.work")
-            killed_at.append([round(after_s, 1), len(list(work.glob("cells/*.parquet")))])
-            subprocess.run(command, check=True, capture_output=True)
-            identical += digest(out) == whole["map"]
-            assert not work.exists()
-            shutil.rmtree(out)
-    return {"kills": KILLS, "identical": identical, "seconds_and_cells_when_killed": killed_at, "whole": whole}
+        whole, added, _ = split(dataset, folder)
+        mapping = ("map", str(whole), "--tile-size", "1000", *SET)
+        of_map = killed(mapping, folder / "map")
+        update = ("update", str(folder / "map"), "--add", str(added), "--tile-size", "1000")
+        return {"map": of_map, "update": killed(update, folder / "updated")}
+
+
+def killed(command: tuple[str, ...], out: Path) -> dict[str, Any]:
+    """Kill a command at random moments, and count how often it comes to the same when it goes on."""
+    chosen = random.Random(0)
+    took, _ = timed(*command, "--out", str(out))
+    expected = contents(out)
+    identical, killed_at = 0, []
+    for number in range(KILLS):
+        again = out.with_name(f"{out.name}-{number}")
+        options = (*command, "--out", str(again), "--resume")
+        after_s = chosen.uniform(0.05, 0.95) * took["seconds"]
+        process = subprocess.Popen(program(*options), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(after_s)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        work = again.with_name(f"{again.name}.work")
+        killed_at.append([round(after_s, 1), len(list(work.glob("cells/*.parquet")))])
+        subprocess.run(program(*options), check=True, capture_output=True)
+        identical += contents(again) == expected
+        assert not work.exists()
+        shutil.rmtree(again)
+    return {"kills": KILLS, "identical": identical, "seconds_and_cells_when_killed": killed_at, **took}
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Return the hashes of all files of a map, but for its record, which says how long things took."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name not in ("run.json", ".valuemap-files"))
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def update(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Update a map with new passes through a part of the cells, and compare with a map of all the data."""
+    with dataset_of(arguments) as dataset, tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        before, added, size = split(dataset, folder)
+        of_map, _ = timed("map", str(before), "--out", str(folder / "map"), *SET)
+        of_update, run = timed("update", str(folder / "map"), "--add", str(added), "--out", str(folder / "updated"))
+        both = str(folder / "updated" / "dataset")
+        calibration = ("--calibration", str(folder / "map"))
+        full, _ = timed("map", both, "--out", str(folder / "full"), *SET)
+        again, _ = timed("map", both, "--out", str(folder / "rebuilt"), *SET, *calibration)
+        known = {path.name for path in (folder / "map" / "cells").iterdir()}
+        cells = {path.name for path in (folder / "updated" / "cells").iterdir()}
+        updated, rebuilt = (labels_of(folder / each) for each in ("updated", "rebuilt"))
+    return {
+        **size,
+        "cells_solved": len(cells - known),
+        "cells_of_map": len(cells),
+        "map_before": of_map,
+        "update": {**of_update, "stages": run["stages"]},
+        "map_of_all": full,
+        "map_of_all_with_its_calibration": again,
+        "share_of_cpu_seconds": round(of_update["cpu_seconds"] / full["cpu_seconds"], 3),
+        "share_of_seconds": round(of_update["seconds"] / full["seconds"], 3),
+        "labels": len(updated),
+        "labels_not_in_the_rebuilt_map": len(updated - rebuilt),
+        "labels_only_in_the_rebuilt_map": len(rebuilt - updated),
+        "states": run["update"],
+    }
+
+
+def labels_of(folder: Path) -> set[tuple[Any, ...]]:
+    """Return all that a map says of its labels, with their votes, but for their ids and states."""
+    found = valuemap.read_map(folder)
+    first, end = (np.searchsorted(found.votes.label_id, found.labels.label_id, side=side) for side in ("left", "right"))
+    rows = table_to_arrow(found.labels).drop_columns(["label_id"]).to_pylist()
+    votes = [tuple(found.votes.detection_id[a:b].tolist()) for a, b in zip(first, end, strict=True)]
+    told = [tuple(repr(value) for name, value in row.items() if name != "state") for row in rows]
+    return set(zip(told, votes, strict=True))
+
+
+def split(dataset: Path, folder: Path) -> tuple[Path, Path, dict[str, Any]]:
+    """Write a dataset as what was there before, and passes through a part of the tiles that are added.
+
+    These passes follow each other: each is that which begins nearest to where the last one ended, of those that go
+    through a new tile and not through too many.
+    """
+    whole = valuemap.read_dataset(dataset)
+    images, grid = whole.images, Grid.of(whole.frame, MapConfig().vote.max_range_m)
+    place_m = grid.images_on_ground(images)
+    tile = np.floor((place_m + 0.5 * grid.side_m) / grid.side_m).astype(np.int64)
+    code, time_s = images.pass_id.codes, images.timestamp_s
+    assert time_s is not None
+    rows = [np.flatnonzero(code == number) for number in range(len(images.pass_id.names))]
+    rows = [of[np.argsort(time_s[of], kind="stable")] for of in rows]
+    tiles = [{(x, y) for x, y in tile[of].tolist()} for of in rows]
+    most = max(1, round(UPDATED_SHARE * len(set().union(*tiles))))
+    begins = np.array([place_m[of[0]] for of in rows])
+    chosen = [max((number for number in range(len(rows)) if len(tiles[number]) <= most), key=lambda n: len(tiles[n]))]
+    taken = set(tiles[chosen[0]])
+    while len(taken) < most:
+        away_m = np.linalg.norm(begins - place_m[rows[chosen[-1]][-1]], axis=1)
+        nearest = (
+            n for n in np.argsort(away_m, kind="stable").tolist() if 0 < len(tiles[n] - taken) <= most - len(taken)
+        )
+        following = next(nearest, None)
+        if following is None:
+            break
+        chosen.append(following)
+        taken |= tiles[following]
+    is_added = np.isin(code, chosen)
+    of_added = is_added[rows_of(whole.detections.image_id, images.image_id)]
+    for name, is_part, of_part in (("before", ~is_added, ~of_added), ("added", is_added, of_added)):
+        part = dataclasses.replace(
+            whole,
+            images=images.take(is_part),
+            detections=whole.detections.take(of_part),
+            truth=None,
+            truth_detections=None,
+        )
+        valuemap.write_dataset(part, folder / name)
+    size = {
+        "images": len(images),
+        "images_added": int(is_added.sum()),
+        "passes_added": len(chosen),
+        "tiles": len(set().union(*tiles)),
+        "tiles_driven": len(taken),
+    }
+    return folder / "before", folder / "added", size
 
 
 def change(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -331,7 +451,14 @@ def years(dataset: Dataset, removed: Ints, added: Ints, moved: Ints) -> tuple[Da
     return year(False), year(True)
 
 
-PARTS = {"simulate": simulate_only, "partition": partition, "cells": cells, "kills": kills, "change": change}
+PARTS = {
+    "simulate": simulate_only,
+    "partition": partition,
+    "cells": cells,
+    "kills": kills,
+    "update": update,
+    "change": change,
+}
 
 if __name__ == "__main__":
     main()

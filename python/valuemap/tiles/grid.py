@@ -135,8 +135,10 @@ class Census:
         if not len(place_m):
             return cls(np.empty((0, 2), np.int64), np.empty(0, np.int64), np.empty(0, np.int64))
         square = smallest_squares(grid, place_m)
-        found, inverse = np.unique(square, axis=0, return_inverse=True)
-        inverse = inverse.reshape(-1)
+        low = square.min(axis=0)
+        across = int(square[:, 1].max() - low[1]) + 1
+        keys, inverse = np.unique((square[:, 0] - low[0]) * across + square[:, 1] - low[1], return_inverse=True)
+        found = np.column_stack([keys // across, keys % across]) + low
         extent = (*place_m.min(axis=0).tolist(), *place_m.max(axis=0).tolist())
         return cls(
             found,
@@ -196,6 +198,35 @@ class Census:
     @cached_property
     def _index(self) -> dict[tuple[int, int], int]:
         return {(x, y): row for row, (x, y) in enumerate(self.square.tolist())}
+
+
+class Places:
+    """Places (N, 2) on the ground by the smallest square that they are in: a cell looks only at those near it."""
+
+    def __init__(self, grid: Grid, place_m: Floats) -> None:
+        self._grid, self._place_m = grid, place_m
+        square = smallest_squares(grid, place_m)
+        self._low = square.min(axis=0, initial=2**62)
+        self._across = int((square - self._low).max(axis=0, initial=0)[1]) + 1
+        key = self._key(square)
+        self._order = np.argsort(key, kind="stable")
+        self._keys = key[self._order]
+
+    def around(self, cell: Cell) -> Ints:
+        """Return the places (rows, ascending) in a cell and its halo."""
+        across = 2 ** (LEVELS - cell.level)
+        low = np.array(cell.base) * 2**LEVELS + np.array(cell.place) * across - self._grid.halo_squares
+        high = low + across + 2 * self._grid.halo_squares
+        x = np.arange(low[0], high[0])
+        bounds = np.clip([low[1], high[1]], self._low[1], self._low[1] + self._across)
+        first, end = (np.searchsorted(self._keys, self._key(np.column_stack([x, np.full_like(x, y)]))) for y in bounds)
+        rows = np.concatenate([self._order[a:b] for a, b in zip(first.tolist(), end.tolist(), strict=True)])
+        rows = np.sort(rows)
+        return np.asarray(rows[self._grid.is_within(cell, self._place_m[rows], self._grid.halo_m)])
+
+    def _key(self, square: Ints) -> Ints:
+        """Return numbers (N) that ascend with the first, then the second coordinate of squares (N, 2)."""
+        return np.asarray((square[:, 0] - self._low[0]) * self._across + square[:, 1] - self._low[1])
 
 
 def cells_across_tile(grid: Grid, tile_size_m: float | None) -> int:

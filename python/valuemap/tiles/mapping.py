@@ -12,7 +12,7 @@ from valuemap.robust import Calibration
 from valuemap.tiles.grid import Cell
 from valuemap.tiles.solve import Solved, solve_cell
 from valuemap.tiles.source import Source
-from valuemap.tiles.store import cell_file, hash_piece, load_cell, save_cell
+from valuemap.tiles.store import cell_file, hash_piece, load_cells, save_cell
 
 
 @dataclass(frozen=True)
@@ -80,4 +80,5 @@ def solve_cells(
 
 def loaded(solved: list[Solved | Path]) -> list[Solved]:
     """Return the labels of cells, read where they are on disk."""
-    return [load_cell(result) if isinstance(result, Path) else result for result in solved]
+    read = iter(load_cells([result for result in solved if isinstance(result, Path)]))
+    return [next(read) if isinstance(result, Path) else result for result in solved]

@@ -7,15 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from valuemap.drives import Drives, InOrder
-from valuemap.tables import Floats, Ints
-from valuemap.tiles.grid import WHOLE, Cell, Grid
-
-
-def cut_piece(ordered: InOrder, place_m: Floats, grid: Grid, cell: Cell) -> InOrder:
-    """Return the piece of a cell; `place_m` (images, 2) is where the images are on the ground."""
-    if cell == WHOLE:
-        return ordered
-    return piece_of_rows(ordered, np.flatnonzero(grid.is_within(cell, place_m, grid.halo_m)))
+from valuemap.tables import Ints
 
 
 def piece_of_rows(ordered: InOrder, rows: Ints) -> InOrder:

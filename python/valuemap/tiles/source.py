@@ -9,8 +9,8 @@ import numpy as np
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
 from valuemap.drives import InOrder, in_driving_order
-from valuemap.tiles.grid import WHOLE, Cell, Census, Grid
-from valuemap.tiles.piece import cut_piece, piece_of_rows
+from valuemap.tiles.grid import WHOLE, Cell, Census, Grid, Places
+from valuemap.tiles.piece import piece_of_rows
 from valuemap.tiles.sample import is_sampled
 
 VIEWPOINT_SHARE = 1.0 / 60.0
@@ -56,10 +56,11 @@ class InMemory:
         self._place_m = self.grid.images_on_ground(images)
         self._census = Census.of(self.grid, self._place_m, np.bincount(detections.image_id, minlength=len(images)))
         self.cells: list[Cell] = self._census.cells(self.grid)
+        self._places = Places(self.grid, self._place_m)
 
     def piece(self, cell: Cell) -> InOrder:
         """Return what a cell is solved with."""
-        return cut_piece(self._ordered, self._place_m, self.grid, cell)
+        return self._ordered if cell == WHOLE else piece_of_rows(self._ordered, self._places.around(cell))
 
     def sample(self) -> InOrder:
         """Return what is calibrated on: all of what is one cell."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
@@ -97,28 +98,53 @@ def save_cell(solved: Solved, path: Path) -> None:
         pq.write_table(table, file, compression="zstd")
 
 
-def load_cell(path: Path) -> Solved:
-    """Read what `save_cell` wrote; raises `InputError` where the file is damaged."""
+def load_cells(paths: Sequence[Path]) -> list[Solved]:
+    """Read what `save_cell` wrote of some cells; raises `InputError` where a file is damaged."""
+    if not paths:
+        return []
+    heads, tables = zip(*map(_read, paths), strict=True)
+    # All are checked as one table: of a small one that takes longer than reading it.
+    table = pa.concat_tables(tables)
+    first = np.cumsum([0, *map(len, tables)])
+    number = numbers_to_arrow(np.arange(table.num_rows))
+    label_id = numbers_from_arrow(table.column(Labels.KEY))
+    table = table.set_column(table.column_names.index(Labels.KEY), Labels.KEY, number)
+    labels = table_from_arrow(Labels, table, source=str(paths[0].parent)).replace(label_id=label_id)
+    votes = {name: _flat(table.column(f"vote.{name}")) for name in (*_VOTE_COLUMNS, "pass")}
+    of_label = np.repeat(label_id, labels.votes)
+    first_vote = np.concatenate([[0], np.cumsum(labels.votes)])[first]
+    is_own = numbers_from_arrow(table.column("is_own")) > 0
+    cells = []
+    for k, head in enumerate(heads):
+        rows, cast = slice(first[k], first[k + 1]), slice(first_vote[k], first_vote[k + 1])
+        of_cell = labels[rows]
+        classes = tuple(head["classes"])
+        code = np.array([classes.index(name) if name in classes else -1 for name in labels.class_name.names], np.int32)
+        codes = code[of_cell.class_name.codes] if len(of_cell) else of_cell.class_name.codes
+        cells.append(
+            Solved(
+                cell=head["cell"],
+                labels=of_cell.replace(class_name=Categories(codes, classes)),
+                is_own=is_own[rows],
+                votes=Votes(of_label[cast], **{name: votes[name][cast] for name in _VOTE_COLUMNS}),
+                vote_pass=votes["pass"][cast],
+                counts=head["counts"],
+            )
+        )
+    return cells
+
+
+def _read(path: Path) -> tuple[dict[str, Any], pa.Table]:
+    """Return what a file of a cell says of it, and its rows."""
     try:
         with path.open("rb") as file:
-            table = pq.ParquetFile(file).read()
+            table = pq.ParquetFile(file).read(use_threads=False)
         head = json.loads(table.schema.metadata[b"valuemap"])
-        cell = Cell(tuple(head["cell"]["base"]), head["cell"]["level"], tuple(head["cell"]["place"]))
+        cell = head["cell"]
+        head = {**head, "cell": Cell(tuple(cell["base"]), cell["level"], tuple(cell["place"]))}
     except (pa.ArrowException, OSError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path}: cannot be read: {error}", hint="remove it, and make the map again") from error
-    labels = table_from_arrow(Labels, table, source=str(path))
-    classes = tuple(head["classes"])
-    code = np.array([classes.index(name) for name in labels.class_name.names], np.int32)
-    codes = code[labels.class_name.codes] if len(labels) else labels.class_name.codes
-    votes = {name: _flat(table.column(f"vote.{name}")) for name in (*_VOTE_COLUMNS, "pass")}
-    return Solved(
-        cell=cell,
-        labels=labels.replace(class_name=Categories(codes, classes)),
-        is_own=numbers_from_arrow(table.column("is_own")) > 0,
-        votes=Votes(np.repeat(labels.label_id, labels.votes), **{name: votes[name] for name in _VOTE_COLUMNS}),
-        vote_pass=votes["pass"],
-        counts=head["counts"],
-    )
+    return head, table.replace_schema_metadata(None)
 
 
 def _listed(column: pa.Array | pa.ChunkedArray, offsets: pa.Array) -> pa.Array:

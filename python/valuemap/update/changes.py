@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from valuemap.dataset import rows_of
 from valuemap.tables import Bools, Categories, Changes, Floats, IdBridge, Ints, Labels, Votes
 from valuemap.update.looks import Looks
 
@@ -44,19 +45,20 @@ def match_labels(old: Labels, old_votes: Votes, new: Labels, new_votes: Votes) -
     Pairs with more common votes go first, then lower ids; each label is of one pair.
     """
     before, common = np.full(len(new), -1), np.zeros(len(new), np.int64)
-    label_of = dict(zip(old_votes.detection_id.tolist(), old_votes.label_id.tolist(), strict=True))
-    pairs: dict[tuple[int, int], int] = {}
-    for detection, label in zip(new_votes.detection_id.tolist(), new_votes.label_id.tolist(), strict=True):
-        if (other := label_of.get(detection)) is not None:
-            pairs[other, label] = pairs.get((other, label), 0) + 1
-    old_row = {label: row for row, label in enumerate(old.label_id.tolist())}
-    new_row = {label: row for row, label in enumerate(new.label_id.tolist())}
+    order = np.argsort(old_votes.detection_id, kind="stable")
+    known = old_votes.detection_id[order]
+    at = np.searchsorted(known, new_votes.detection_id)
+    has = np.flatnonzero(known[np.minimum(at, len(known) - 1)] == new_votes.detection_id) if len(known) else at[:0]
+    rows = rows_of(old_votes.label_id[order[at[has]]], old.label_id), rows_of(new_votes.label_id[has], new.label_id)
+    pair, count = np.unique(rows[0] * len(new) + rows[1], return_counts=True)
+    i, j = pair // max(len(new), 1), pair % max(len(new), 1)
+    able = np.flatnonzero(count >= SAME_SHARE * np.minimum(old.votes[i], new.votes[j]))
+    able = able[np.lexsort((j[able], i[able], -count[able]))]
     taken: set[int] = set()
-    for (first, second), count in sorted(pairs.items(), key=lambda item: (-item[1], item[0])):
-        i, j = old_row[first], new_row[second]
-        if i not in taken and before[j] < 0 and count >= SAME_SHARE * min(old.votes[i], new.votes[j]):
-            before[j], common[j] = i, count
-            taken.add(i)
+    for first, second, shared in zip(i[able].tolist(), j[able].tolist(), count[able].tolist(), strict=True):
+        if first not in taken and before[second] < 0:
+            before[second], common[second] = first, shared
+            taken.add(first)
     return before, common
 
 
@@ -72,15 +74,15 @@ def match_places(old: Labels, new: Labels) -> Ints:
     codes = {name: code for code, name in enumerate(old.class_name.names)}
     code = np.array([codes.get(name, -1) for name in new.class_name.names])[new.class_name.codes]
     tree = cKDTree(old.position_in_world_m)
-    near = [tree.query_ball_point(place, MOVED_WITHIN_M) for place in new.position_in_world_m]
-    pairs = [
-        (apart, i, j)
-        for j, others in enumerate(near)
-        for i in others
-        if old.class_name.codes[i] == code[j] and (apart := _apart(old, i, new, j)) <= SAME_PLACE_CHI2
-    ]
+    near = tree.query_ball_point(new.position_in_world_m, MOVED_WITHIN_M)
+    i = np.concatenate([np.array(others, np.int64) for others in near])
+    j = np.repeat(np.arange(len(new)), [len(others) for others in near])
+    same = old.class_name.codes[i] == code[j]
+    i, j = i[same], j[same]
+    apart = _apart(old, i, new, j)
+    pairs = zip(apart.tolist(), i.tolist(), j.tolist(), strict=True)
     taken: set[int] = set()
-    for _, i, j in sorted(pairs):
+    for _, i, j in sorted(pair for pair in pairs if pair[0] <= SAME_PLACE_CHI2):
         if i not in taken and before[j] < 0:
             before[j] = i
             taken.add(i)
@@ -91,16 +93,16 @@ def judge(
     new: Labels,
     before: Ints,
     state_before: list[str],
-    is_touched: Bools,
+    is_asked: Bools,
     stands: Bools,
     looks_at: Callable[[int], tuple[Looks, Looks]],
 ) -> tuple[Verdicts, Mapping[int, tuple[Looks, Looks]]]:
-    """Return what became of each label, and the looks at those that the added passes could have seen.
+    """Return what became of each label, and the looks at those that are asked for: that the added passes may have seen.
 
     Those that both epochs alone have in one place, `stands` (N), are confirmed. A label without a look of the added
     passes stays what it was.
     """
-    looks = {row: looks_at(int(new.label_id[row])) for row in np.flatnonzero(is_touched | (before < 0)).tolist()}
+    looks = {row: looks_at(int(new.label_id[row])) for row in np.flatnonzero(is_asked).tolist()}
     state = []
     for row in range(len(new)):
         was = state_before[before[row]] if before[row] >= 0 else "new"
@@ -176,6 +178,9 @@ def tell(
     rows = np.array([row for row in range(len(new)) if row not in covered], np.int64)
     sources = np.where(verdicts.moved_from[rows] >= 0, verdicts.moved_from[rows], rows)
     before = verdicts.before[sources]
+    differs = np.zeros(len(new), np.bool_)
+    known = rows[verdicts.before[rows] >= 0]
+    differs[known] = _differ(old, verdicts.before[known], new, known)
     kinds = []
     for row, source, was in zip(rows.tolist(), sources.tolist(), before.tolist(), strict=True):
         if source != row:
@@ -185,7 +190,7 @@ def tell(
         elif verdicts.state[row] == "gone" or is_lost[row]:
             kinds.append("removed")
         else:
-            kinds.append("changed" if _differs(old, was, new, row) else "unchanged")
+            kinds.append("changed" if differs[row] else "unchanged")
     found = [looks.get(source, (_NONE, _NONE))[1] for source in sources.tolist()]
     changes = Changes(
         label_id=ids[rows],
@@ -213,15 +218,16 @@ def tell(
 _NONE = Looks(0, 0, 0.0, float("nan"), float("nan"))
 
 
-def _differs(old: Labels, before: int, new: Labels, row: int) -> bool:
-    """Return whether a label is of another class, or elsewhere than its covariances explain."""
-    if old.class_name.names[old.class_name.codes[before]] != new.class_name.names[new.class_name.codes[row]]:
-        return True
-    return _apart(old, before, new, row) > CHANGED_CHI2
+def _differ(old: Labels, before: Ints, new: Labels, rows: Ints) -> Bools:
+    """Return which labels (N) are of another class, or elsewhere than their covariances explain."""
+    code_of = {name: code for code, name in enumerate(new.class_name.names)}
+    code = np.array([code_of.get(name, -1) for name in old.class_name.names], np.int64)
+    is_other = code[old.class_name.codes[before]] != new.class_name.codes[rows]
+    return np.asarray(is_other | (_apart(old, before, new, rows) > CHANGED_CHI2))
 
 
-def _apart(old: Labels, i: int, new: Labels, j: int) -> float:
-    """Return the distance of two labels in squared sigmas."""
+def _apart(old: Labels, i: Ints, new: Labels, j: Ints) -> Floats:
+    """Return the distances (N) of pairs of labels in squared sigmas."""
     away = new.position_in_world_m[j] - old.position_in_world_m[i]
-    xx, xy, xz, yy, yz, zz = old.covariance_m2[i] + new.covariance_m2[j]
-    return float(away @ np.linalg.pinv([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ away)
+    spread = (old.covariance_m2[i] + new.covariance_m2[j])[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    return np.asarray(np.einsum("ni,nij,nj->n", away, np.linalg.pinv(spread), away))

@@ -67,7 +67,8 @@ class Lookout:
     def at(self, label_id: int) -> tuple[Looks, Looks]:
         """Return the looks of the first epoch, and of the second, at a label."""
         hit = self._evidence.image_row[self._evidence.vote_rows(label_id)]
-        missed = self._evidence.misses(label_id).image_row
+        place = self._evidence.result.labels.position_in_world_m[self._evidence.label_row(label_id)]
+        missed = self._evidence.should_have_seen(place, hit)
         image = np.concatenate([hit, missed])
         is_hit = np.arange(len(image)) < len(hit)
         return self._looks(image, is_hit, new=False), self._looks(image, is_hit, new=True)

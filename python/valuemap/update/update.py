@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig
-from valuemap.dataset import MARKER, Dataset, read_dataset, rows_of, write_dataset
+from valuemap.dataset import MARKER, Dataset, ensure_checked, read_dataset, rows_of, write_dataset_in_pieces
 from valuemap.drives import find_drives
 from valuemap.errors import InputError
 from valuemap.evidence import Evidence, find_dataset
@@ -18,7 +19,7 @@ from valuemap.map_folder import BRIDGE, CELLS, CHANGES, DATASET, Map, read_map
 from valuemap.pipeline import Run, build_map_of_folder
 from valuemap.progress import Progress, counted, silent
 from valuemap.rejected import rejected_of_map
-from valuemap.tables import Bools, Categories, Changes, IdBridge, Ints, Labels, Votes, join_tables, write_table
+from valuemap.tables import Bools, Categories, Changes, Floats, IdBridge, Ints, Labels, Votes, join_tables, write_table
 from valuemap.tiles.calibration import read_calibration
 from valuemap.tiles.source import VIEWPOINT_SHARE
 from valuemap.update.changes import STATES, Verdicts, judge, match_labels, match_places, number, tell
@@ -74,8 +75,8 @@ def update_map(
     first, second = read_dataset(place), read_dataset(added)
     if not len(second.detections):
         raise InputError(f"{added}: there are no detections in it", hint="find some with valuemap detect")
-    joined = join_datasets(first, second)
-    write_dataset(joined, run.work / DATASET)
+    joined = ensure_checked(join_datasets(first, second))
+    write_dataset_in_pieces([joined], run.work / DATASET)
     run = replace(run, calibration=calibration, known=old / CELLS)
     rebuilt, cells = build_map_of_folder(run.work / DATASET, _settings(before), run, progress=progress)
     # The poses that the labels were found with, where those of whole drives were corrected.
@@ -102,21 +103,19 @@ def compare(
     epochs stand for it.
     """
     rows = _Rows.of(before, rebuilt, alone)
-    evidence = Evidence(replace(rebuilt, labels=rows.labels, votes=rows.votes), joined)
-    drives = find_drives(joined.images, viewpoint_step_m=evidence.max_range_m * VIEWPOINT_SHARE)
     is_new = ~np.isin(joined.images.image_id, images_before)
-    detection_rate = rebuilt.run["counts"].get("detection_rate", 0.5)
-    near = cKDTree(evidence.center_in_world_m[is_new]).query(rows.labels.position_in_world_m)[0]
+    max_range_m = _settings(before).vote.max_range_m
+    center_m = camera_centers(joined.images)
+    near = cKDTree(center_m[is_new]).query(rows.labels.position_in_world_m)[0]
+    touched = np.asarray(near <= max_range_m)
+    is_asked = touched | (rows.before < 0)
     # What an epoch alone has elsewhere is no sight of this object.
-    looked = _without_claimed(rows, before, alone, joined, is_new)
-    lookout = Lookout(
-        Evidence(replace(rebuilt, labels=rows.labels, votes=looked), joined), drives, is_new, detection_rate
-    )
+    looked = _without_claimed(rows, is_asked, before, alone, joined, is_new)
+    lookout = _lookout(replace(rebuilt, labels=rows.labels, votes=looked), is_asked, joined, center_m, is_new)
     done = 0
 
     states = before.labels.state.texts() if before.labels.state is not None else ["confirmed"] * len(before.labels)
-    touched = np.asarray(near <= evidence.max_range_m)
-    with counted(progress, "looking for changes", len(rows.labels)) as looked_at:
+    with counted(progress, "looking for changes", int(is_asked.sum())) as looked_at:
 
         def looks_at(label_id: int) -> tuple[Looks, Looks]:
             nonlocal done
@@ -124,7 +123,7 @@ def compare(
             looked_at(done)
             return lookout.at(label_id)
 
-        verdicts, looks = judge(rows.labels, rows.before, states, touched, rows.stands, looks_at)
+        verdicts, looks = judge(rows.labels, rows.before, states, is_asked, rows.stands, looks_at)
     # What only the added passes have, and all the data do not, is there only if it explains what is gone.
     unfounded = rows.is_of_alone & (verdicts.moved_from < 0) & ~rows.is_founded
     if unfounded.any():
@@ -164,10 +163,11 @@ def _map_alone(joined: Dataset, images_before: Ints, before: Map, run: Run, prog
     images, detections = joined.images, joined.detections
     is_new = ~np.isin(images.image_id, images_before)
     of_new = is_new[rows_of(detections.image_id, images.image_id)]
-    added = replace(joined, images=images.take(is_new), detections=detections.take(of_new))
-    write_dataset(added, run.work / ADDED)
+    added = ensure_checked(replace(joined, images=images.take(is_new), detections=detections.take(of_new)))
+    write_dataset_in_pieces([added], run.work / ADDED)
     config = _settings(before).with_settings(["correct_poses=0"])
-    return build_map_of_folder(run.work / ADDED, config, replace(run, known=None), progress=progress)[0]
+    run = replace(run, known=None)
+    return build_map_of_folder(run.work / ADDED, config, run, progress=progress)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,9 +252,36 @@ def _numbered(parts: list[tuple[Labels, Votes]]) -> tuple[Labels, Votes]:
     return join_tables(labels), join_tables(votes)
 
 
-def _without_claimed(rows: _Rows, before: Map, alone: Map, joined: Dataset, is_new: Bools) -> Votes:
-    """Return the votes without those by which one epoch alone has an object in another place."""
-    votes, label = rows.votes, rows.votes.label_id - 1
+def _lookout(asked: Map, is_asked: Bools, joined: Dataset, center_m: Floats, is_new: Bools) -> Lookout:
+    """Return what counts looks at some labels of a map; its votes are theirs, and its labels numbered from 1.
+
+    Only images that may have seen one of them are asked: those no farther from it than the farthest of all votes.
+    """
+    images, votes = joined.images, asked.votes
+    place_m = asked.labels.position_in_world_m
+    away_m = center_m[rows_of(votes.image_id, images.image_id)] - place_m[votes.label_id - 1]
+    farthest_m = 1.001 * float(np.linalg.norm(away_m, axis=1).max(initial=0.0))
+    low_m, high_m = place_m[is_asked].min(axis=0, initial=np.inf), place_m[is_asked].max(axis=0, initial=-np.inf)
+    near = np.flatnonzero(np.all((center_m >= low_m - farthest_m) & (center_m <= high_m + farthest_m), axis=1))
+    if len(near):
+        near = near[cKDTree(place_m[is_asked]).query(center_m[near])[0] <= farthest_m]
+    # Whole passes, since an order is told by all of it.
+    of_passes = np.flatnonzero(np.isin(images.pass_id.codes, images.pass_id.codes[near]))
+    max_range_m = _settings(asked).vote.max_range_m
+    drives = find_drives(images.take(of_passes), viewpoint_step_m=max_range_m * VIEWPOINT_SHARE)
+    among = np.searchsorted(of_passes, near)
+    columns = ("pass_code", "order", "driven_m", "viewpoint")
+    voters = np.unique(rows_of(votes.detection_id, joined.detections.detection_id))
+    part = replace(joined, images=images.take(near), detections=joined.detections.take(voters))
+    recall = asked.run["counts"].get("detection_rate", 0.5)
+    drives = replace(drives, **{name: getattr(drives, name)[among] for name in columns})
+    return Lookout(Evidence(asked, part), drives, is_new[near], recall)
+
+
+def _without_claimed(rows: _Rows, is_asked: Bools, before: Map, alone: Map, joined: Dataset, is_new: Bools) -> Votes:
+    """Return the votes for some labels without those by which one epoch alone has an object in another place."""
+    votes = rows.votes.take(np.flatnonzero(is_asked[rows.votes.label_id - 1]))
+    label = votes.label_id - 1
     of_new = is_new[rows_of(votes.image_id, joined.images.image_id)]
     in_doubt = ~rows.stands[label] & ~rows.is_of_alone[label]
     is_old = rows.before[label] >= 0
