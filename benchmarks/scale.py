@@ -1,6 +1,6 @@
 """Scale: tiles of any size, runs that are killed, and changes between years; see docs/scale.md.
 
-    python benchmarks/scale.py simulate|partition|cells|kills|update|change [--preset nyc] [--dataset FOLDER] [--json FILE]
+    python benchmarks/scale.py PART [--preset nyc] [--dataset FOLDER] [--json FILE]
 
 Times are those of the processor (user and system, all threads): they do not depend on what else the machine does.
 """

@@ -16,6 +16,7 @@ from valuemap import pipeline
 from valuemap.cameras import rotation_matrices
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset
+from valuemap.drives import find_drives
 from valuemap.errors import InputError
 from valuemap.evidence import Evidence
 from valuemap.map_folder import Map
@@ -26,6 +27,7 @@ from valuemap.tiles.compare import Comparison
 from valuemap.update import compare
 from valuemap.update.changes import match_labels, match_places
 from valuemap.update.join import join_datasets
+from valuemap.update.looks import HIDDEN_OF, Lookout, Sights
 
 SET = ("detection_sigma_px=1.5", "position_sigma_m=0.05", "rotation_sigma_deg=0.05")
 LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -167,6 +169,29 @@ def test_labels_of_two_epochs_are_one_where_their_covariances_say_so(years: Path
     # Of two at one place each is one of the old ones.
     twice = join_tables([labels, labels.replace(label_id=labels.label_id + 1000)])
     assert sorted(match_places(labels, twice).tolist()) == sorted([*range(len(labels)), *[-1] * len(labels)])
+
+
+def test_one_drive_that_missed_says_gone_only_where_drives_seldom_miss_what_is_there(years: Path) -> None:
+    result, dataset = valuemap.read_map(years / "map"), valuemap.read_dataset(years / "first")
+    is_new = np.zeros(len(dataset.images), np.bool_)
+    lookout = Lookout(Evidence(result, dataset), find_drives(dataset.images), is_new, 0.9)
+
+    def sights(*hits: int) -> Sights:
+        return Sights(np.full(len(hits), 10), np.array(hits), 0.0, 1.0)
+
+    assert lookout.hidden_share([]) == 1.0 / HIDDEN_OF
+    seldom = lookout.hidden_share([sights(9, 8, 9)] * 50)
+    often = lookout.hidden_share([sights(9, 8, 0)] * 50)
+    assert seldom == 1.0 / (150 + HIDDEN_OF)
+    assert often == 51.0 / (150 + HIDDEN_OF)
+    assert lookout.looks(sights(0), seldom).say_gone
+    assert not lookout.looks(sights(0), often).say_gone
+    assert lookout.looks(sights(0, 0, 0), often).say_gone
+    assert lookout.looks(sights(9), often).say_there
+    # Of what is asked in a map: three drives saw each object.
+    first, second = lookout.at(id_at(result, STAYS[0]))
+    assert len(first.looks) == 3
+    assert len(second.looks) == 0
 
 
 def test_changes_come_with_opportunities_and_dates(years: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,7 +74,7 @@ def match_places(old: Labels, new: Labels) -> Ints:
     codes = {name: code for code, name in enumerate(old.class_name.names)}
     code = np.array([codes.get(name, -1) for name in new.class_name.names])[new.class_name.codes]
     tree = cKDTree(old.position_in_world_m)
-    near = tree.query_ball_point(new.position_in_world_m, MOVED_WITHIN_M)
+    near = [tree.query_ball_point(place, MOVED_WITHIN_M) for place in new.position_in_world_m]
     i = np.concatenate([np.array(others, np.int64) for others in near])
     j = np.repeat(np.arange(len(new)), [len(others) for others in near])
     same = old.class_name.codes[i] == code[j]
@@ -93,16 +93,14 @@ def judge(
     new: Labels,
     before: Ints,
     state_before: list[str],
-    is_asked: Bools,
     stands: Bools,
-    looks_at: Callable[[int], tuple[Looks, Looks]],
-) -> tuple[Verdicts, Mapping[int, tuple[Looks, Looks]]]:
-    """Return what became of each label, and the looks at those that are asked for: that the added passes may have seen.
+    looks: Mapping[int, tuple[Looks, Looks]],
+) -> Verdicts:
+    """Return what became of each label; `looks` are those of both epochs at the labels (rows) that are asked for.
 
     Those that both epochs alone have in one place, `stands` (N), are confirmed. A label without a look of the added
     passes stays what it was.
     """
-    looks = {row: looks_at(int(new.label_id[row])) for row in np.flatnonzero(is_asked).tolist()}
     state = []
     for row in range(len(new)):
         was = state_before[before[row]] if before[row] >= 0 else "new"
@@ -122,7 +120,7 @@ def judge(
     for row, source in _pairs(position, code, fresh, gone):
         if looks[row][0].log_odds <= 0.0:  # Nobody saw it there before.
             moved_from[row], state[row] = source, "moved"
-    return Verdicts(before, state, moved_from), looks
+    return Verdicts(before, state, moved_from)
 
 
 def _undecided(was: str, looks: Looks) -> str:

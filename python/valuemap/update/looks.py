@@ -1,13 +1,15 @@
 """The opportunities to see an object: all that was taken from one viewpoint of a drive is one look.
 
 How likely an object that is there is seen in the looks of a drive is the share `recall` of them that the map found, but
-for drives in which it is hidden all the way, or seen from where it is not detected. How likely one that is not there is
-"seen" is the share of looks in which something else is taken for it.
+for drives in which it is hidden all the way, or seen from where it is not detected. How many these are is learned from
+how the drives of the first epoch saw what the map has. How likely one that is not there is "seen" is the share of looks
+in which something else is taken for it.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +18,9 @@ from valuemap.drives import Drives
 from valuemap.evidence import Evidence
 from valuemap.tables import Bools, Floats, Ints
 
-HIDDEN_DRIVES = 0.02
-"""The share of drives in which an object that is there cannot be seen. One drive alone shows that a thing is gone if it
-had three looks or more."""
+HIDDEN_OF = 50
+"""Before anything is learned one in so many drives cannot see an object that is there: as much as so many drives say.
+While it is that few, one drive alone shows that a thing is gone if it had three looks or more."""
 FALSE_LOOKS = 0.02
 """The share of looks in which something else is taken for an object that is not there."""
 RECALL_BOUNDS = (0.3, 0.95)
@@ -57,6 +59,19 @@ class Looks:
         return self.log_odds < -SURE
 
 
+@dataclass(frozen=True, eq=False)
+class Sights:
+    """In how many viewpoints each of some drives (D) looked at an object, and in how many of these it saw it, and when.
+
+    Times are NaN where images have none.
+    """
+
+    looks: Ints
+    hits: Ints
+    first_s: float
+    last_s: float
+
+
 class Lookout:
     """Counts looks at the labels of a map in one of two epochs; `is_new` (images) tells the images of the second."""
 
@@ -64,37 +79,45 @@ class Lookout:
         self._evidence, self._drives, self._is_new = evidence, drives, is_new
         self._recall = min(max(recall, RECALL_BOUNDS[0]), RECALL_BOUNDS[1])
 
-    def at(self, label_id: int) -> tuple[Looks, Looks]:
-        """Return the looks of the first epoch, and of the second, at a label."""
+    def at(self, label_id: int) -> tuple[Sights, Sights]:
+        """Return how the drives of the first epoch, and of the second, saw a label."""
         hit = self._evidence.image_row[self._evidence.vote_rows(label_id)]
         place = self._evidence.result.labels.position_in_world_m[self._evidence.label_row(label_id)]
         missed = self._evidence.should_have_seen(place, hit)
         image = np.concatenate([hit, missed])
         is_hit = np.arange(len(image)) < len(hit)
-        return self._looks(image, is_hit, new=False), self._looks(image, is_hit, new=True)
+        return self._sights(image, is_hit, new=False), self._sights(image, is_hit, new=True)
 
-    def _looks(self, image: Ints, is_hit: Bools, *, new: bool) -> Looks:
+    def hidden_share(self, sights: Sequence[Sights]) -> float:
+        """Return the share of drives that cannot see an object, of how drives saw objects that were there."""
+        none = np.empty(0, np.int64)
+        hits, looks = (np.concatenate([none, *(getattr(each, name) for each in sights)]) for name in ("hits", "looks"))
+        blind = int(np.count_nonzero(self._ratio(hits, looks) < -SURE))
+        telling = int(np.count_nonzero(self._ratio(np.zeros_like(looks), looks) < -SURE))
+        return (blind + 1.0) / (telling + HIDDEN_OF)
+
+    def looks(self, sights: Sights, hidden_share: float) -> Looks:
+        """Return what looks say, where so large a share of drives cannot see an object that is there."""
+        ratio = self._ratio(sights.hits, sights.looks)
+        odds = np.logaddexp(math.log(1.0 - hidden_share) + ratio, math.log(hidden_share))
+        return Looks(int(sights.looks.sum()), int(sights.hits.sum()), float(odds.sum()), sights.first_s, sights.last_s)
+
+    def _sights(self, image: Ints, is_hit: Bools, *, new: bool) -> Sights:
         here = self._is_new[image] == new
         image, is_hit = image[here], is_hit[here]
-        if not len(image):
-            return Looks(0, 0, 0.0, math.nan, math.nan)
         views, view = np.unique(self._drives.viewpoint[image], return_inverse=True)
         was_hit = np.bincount(view, is_hit, len(views)) > 0
         drive = np.empty(len(views), np.int64)
         drive[view] = self._drives.pass_code[image]
         _, of = np.unique(drive, return_inverse=True)
-        hits = np.bincount(of, was_hit).astype(np.int64)
-        looks = np.bincount(of)
-        odds = sum(self._log_odds(int(h), int(n)) for h, n in zip(hits, looks, strict=True))
         time = self._evidence.dataset.images.timestamp_s
         first, last = (math.nan, math.nan) if time is None else _range(time[image])
-        return Looks(len(views), int(was_hit.sum()), odds, first, last)
+        return Sights(np.bincount(of), np.bincount(of, was_hit).astype(np.int64), first, last)
 
-    def _log_odds(self, hits: int, looks: int) -> float:
-        """Return the logarithm of how much likelier the looks of a drive are if the object is there."""
+    def _ratio(self, hits: Ints, looks: Ints) -> Floats:
+        """Return the logarithms of how much likelier the looks of drives (N) are if nothing hides the object."""
         r, c = self._recall, FALSE_LOOKS
-        ratio = hits * math.log(r / c) + (looks - hits) * math.log((1.0 - r) / (1.0 - c))
-        return float(np.logaddexp(math.log(1.0 - HIDDEN_DRIVES) + ratio, math.log(HIDDEN_DRIVES)))
+        return np.asarray(hits * math.log(r / c) + (looks - hits) * math.log((1.0 - r) / (1.0 - c)))
 
 
 def _range(time_s: Floats) -> tuple[float, float]:

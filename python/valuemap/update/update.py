@@ -112,18 +112,18 @@ def compare(
     # What an epoch alone has elsewhere is no sight of this object.
     looked = _without_claimed(rows, is_asked, before, alone, joined, is_new)
     lookout = _lookout(replace(rebuilt, labels=rows.labels, votes=looked), is_asked, joined, center_m, is_new)
-    done = 0
-
     states = before.labels.state.texts() if before.labels.state is not None else ["confirmed"] * len(before.labels)
+    sights = {}
     with counted(progress, "looking for changes", int(is_asked.sum())) as looked_at:
-
-        def looks_at(label_id: int) -> tuple[Looks, Looks]:
-            nonlocal done
-            done += 1
-            looked_at(done)
-            return lookout.at(label_id)
-
-        verdicts, looks = judge(rows.labels, rows.before, states, is_asked, rows.stands, looks_at)
+        for row in np.flatnonzero(is_asked).tolist():
+            sights[row] = lookout.at(int(rows.labels.label_id[row]))
+            looked_at(len(sights))
+    were_there = {row: at for row, at in sights.items() if rows.before[row] >= 0 and states[rows.before[row]] != "gone"}
+    hidden = lookout.hidden_share([first for first, _ in were_there.values()])
+    looks = {
+        row: (lookout.looks(first, hidden), lookout.looks(second, hidden)) for row, (first, second) in sights.items()
+    }
+    verdicts = judge(rows.labels, rows.before, states, rows.stands, looks)
     # What only the added passes have, and all the data do not, is there only if it explains what is gone.
     unfounded = rows.is_of_alone & (verdicts.moved_from < 0) & ~rows.is_founded
     if unfounded.any():
@@ -138,7 +138,8 @@ def compare(
     votes = rows.votes.replace(label_id=id_of).take(np.flatnonzero(id_of >= 0))
     votes, count = _once(votes, ids[is_kept], rows.is_of_alone[is_kept])
     kept = rows.labels.take(np.flatnonzero(is_kept)).replace(label_id=ids[is_kept], state=states_now, votes=count)
-    run = {**rebuilt.run, "update": _counts(verdicts.state, is_kept, changes)}
+    told = {"hidden_share": round(hidden, 4), **_counts(verdicts.state, is_kept, changes)}
+    run = {**rebuilt.run, "update": told}
     return Map(rebuilt.frame, kept.take(order), votes, run), changes, bridge
 
 
