@@ -1,7 +1,7 @@
 """Put each known fault into good data and see whether `valuemap check` names it, and whether its fix undoes it.
 
     python benchmarks/check_faults.py [--seeds N ...] [--spoiled N ...] [--kitti-signs DIR] [--kitti-ts DIR]
-                                      [--only FAULT ...] [--json FILE]
+                                      [--only FAULT ...] [--json FILE] [--go-on]
 
 Good data are simulated cities (two cameras, time stamps, a geo-reference, truth; faults go into the first), and where
 their folders are given KITTI odometry 00, 05, 07, 09 (see kitti_signs.py; faults go into 00) and KITTI-TS
@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import json
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -784,25 +785,30 @@ def measure(good: Dataset, name: str, fault: Fault, unharmed: int | None) -> dic
     return result
 
 
-def run(good: Dataset, only: list[str], *, spoils: bool = True, maps: bool = True) -> dict[str, Any]:
-    """Check one good dataset as it is and with every fault."""
-    start = time.perf_counter()
-    clean = examine(good)
-    record: dict[str, Any] = {
-        "clean": [finding.to_json() for finding in clean.findings],
-        "seconds": round(time.perf_counter() - start, 2),
-        "nowhere": [],
-        "faults": {},
-    }
-    unharmed = found_objects(good, good) if maps and spoils and good.truth is not None else None
-    for name, fault in _chosen(only) if spoils else ():
+def run(
+    good: Dataset, only: list[str], record: dict[str, Any], *, spoils: bool = True, maps: bool = True
+) -> Iterator[None]:
+    """Check one good dataset as it is and with every fault; yield when more of it stands in the record."""
+    if not record:
+        start = time.perf_counter()
+        clean = examine(good)
+        record |= {
+            "clean": [finding.to_json() for finding in clean.findings],
+            "seconds": round(time.perf_counter() - start, 2),
+            "nowhere": [],
+            "faults": {},
+        }
+        yield
+    left = [each for each in _chosen(only) if each[0] not in (*record["faults"], *record["nowhere"])] if spoils else []
+    unharmed = found_objects(good, good) if maps and left and good.truth is not None else None
+    for name, fault in left:
         result = measure(good, name, fault, unharmed)
         if result is None:
             record["nowhere"].append(name)
-            continue
-        record["faults"][name] = result
-        print(f"  {name:28} {_line(result)}", flush=True)
-    return record
+        else:
+            record["faults"][name] = result
+            print(f"  {name:28} {_line(result)}", flush=True)
+        yield
 
 
 def _chosen(only: list[str]) -> Iterator[tuple[str, Fault]]:
@@ -856,15 +862,17 @@ def main() -> int:
     parser.add_argument("--clean", action="store_true", help="look at good data only")
     parser.add_argument("--no-maps", action="store_true", help="do not map what the fixes make")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--go-on", action="store_true", help="keep what the JSON file of an interrupted run has")
     options = parser.parse_args()
-    records = {}
+    records = json.loads(options.json.read_text(encoding="utf-8"))["results"] if options.go_on else {}
     try:
         for name, good, spoils in _datasets(options):
             print(name, flush=True)
-            records[name] = run(good, options.only, spoils=spoils and not options.clean, maps=not options.no_maps)
-            for finding in records[name]["clean"]:
+            record = records.setdefault(name, {})
+            for _ in run(good, options.only, record, spoils=spoils and not options.clean, maps=not options.no_maps):
+                keep_record(options.json, record_of(records))  # It takes long.
+            for finding in record["clean"]:
                 print(f"  CLEAN DATA: {finding['fault']}: {finding['why']}")
-            keep_record(options.json, record_of(records))  # It takes long.
         for key, value in summarise(records).items():
             print(f"{key:22} {value}")
     except ValuemapError as error:

@@ -16,15 +16,16 @@ from check_faults import FAULTS as INJECTED
 from check_faults import good_city
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check import examine
-from valuemap.check.agreement import compare, measure_agreement
+from valuemap.check.agreement import Agreement, compare, gains_of_objects, measure_agreement
 from valuemap.check.cameras import PARAMETERS, _Correction, _followed, _is_wider_gate_only, with_focal
-from valuemap.check.contest import _Reading, _suspicion, hold_contest
-from valuemap.check.fault import LEAST_CHANCE, Convention, View, gains_of_all, with_poses
+from valuemap.check.contest import _compare, _joined, _Reading, _suspicion, hold_contest
+from valuemap.check.fault import LEAST_CHANCE, Convention, View, gains_of_all, keep_rows, with_poses
 from valuemap.check.fit import Parameter, estimate
 from valuemap.check.headings import headings, level_rotations, rotations_of
 from valuemap.check.offsets import find_shift
 from valuemap.check.passes import _at_a_seam, _seen_m, moved_along
 from valuemap.check.registry import CONVENTIONS, FAULTS
+from valuemap.check.sample import driving_order
 from valuemap.check.seams import worst_seam
 from valuemap.check.sizes import object_heights
 from valuemap.cli.commands import app
@@ -63,7 +64,10 @@ def test_truth_in_metres_is_not_called_misplaced_where_the_world_is_not_in_metre
 
 def test_a_reading_that_few_places_cannot_prove_is_suspected_not_found(view: View) -> None:
     def reading(convention: Convention | None, gain: np.ndarray) -> _Reading:
-        return _Reading(convention, "x y z w", None, replace(view.agreement, gain=gain), is_upright=True)
+        points = replace(view.agreement.found, voters=np.arange(len(gain), dtype=np.uint32))
+        points = replace(points, position_in_world_m=np.zeros((len(gain), 3)), voter_offsets=np.arange(len(gain) + 1))
+        agreement = replace(view.agreement, gain=gain, gain_of_point=gain, found=points)
+        return _Reading(convention, "x y z w", None, agreement, uprightness=1.0)
 
     worse = np.array([3.0, 4.0, 2.0, 5.0, 4.0, 6.0, 3.0])
     better = worse + [4.0, 6.0, 3.0, 9.0, 5.0, 8.0, 2.0]
@@ -79,6 +83,89 @@ def test_a_reading_that_few_places_cannot_prove_is_suspected_not_found(view: Vie
         _suspicion(given, reading(quaternions, worse + 0.1 * (better - worse) * [1, -1, 1, 1, -1, 1, 1]), tests) is None
     )
     assert _suspicion(given, given, tests) is None
+
+
+def street(good: Dataset, start: int, length: int) -> Dataset:
+    """Return images that follow each other, and nothing else."""
+    rows = driving_order(good.images)[start : start + length]
+    assert len(np.unique(good.images.pass_id.codes[rows])) == 1
+    return keep_rows(good, images=np.isin(np.arange(len(good.images)), rows))
+
+
+@pytest.mark.parametrize("start", [270, 540, 1260, 1620])
+def test_quaternions_of_a_short_street_are_named(start: int, good: Dataset) -> None:
+    """A hundred images have too few places to compare; single objects and where the cameras' up is say enough."""
+    short = street(good, start, 100)
+    assert examine(short).findings == ()
+    spoiled = INJECTED["quaternion_order"].spoil(short)
+    assert spoiled is not None
+    outcome = examine(spoiled)
+    assert [finding.fault for finding in outcome.findings] == ["quaternion_order"]
+    assert outcome.findings[0].chance is not None
+    assert outcome.findings[0].chance < LEAST_CHANCE
+    np.testing.assert_allclose(camera_centers(outcome.fixed.images), camera_centers(short.images), atol=1e-6)
+
+
+def test_where_rays_cannot_tell_the_sky_is_not_moved_but_what_it_may_be_is_told(good: Dataset) -> None:
+    short = street(good, 450, 20)
+    assert examine(short).findings == ()
+    spoiled = INJECTED["quaternion_order"].spoil(short)
+    assert spoiled is not None
+    outcome = examine(spoiled)
+    assert [finding.fault for finding in outcome.findings] == ["up_direction"]
+    assert outcome.findings[0].fix is None
+    assert any("x y z w" in note and "the rays are too few to tell" in note for note in outcome.notes)
+
+
+def test_points_where_rays_may_meet_by_chance_are_no_objects(good: Dataset) -> None:
+    spoiled = INJECTED["truth_elsewhere"].spoil(good)
+    assert spoiled is not None
+    assert _FAULT["truth_elsewhere"].find(View(spoiled)) is not None
+    assert _FAULT["truth_elsewhere"].find(View(spoiled, meets=False)) is None
+    assert object_heights(View(good)) != {}
+    assert object_heights(View(good, meets=False)) == {}
+
+
+def test_a_guess_is_compared_by_places_however_few_they_are(good: Dataset) -> None:
+    """Level cameras are better or worse for whole stretches, so their objects do not count one by one."""
+    view = View(street(good, 270, 40))
+    few, none = [view.agreement], [replace(view.agreement, gain=0.0 * view.agreement.gain, gain_of_point=np.zeros(0))]
+    none = [replace(none[0], found=view.agreement.found.take(np.array([], dtype=np.int64)))]
+    assert _compare(few, none).of == "objects"
+    assert _compare(few, none).places == len(view.agreement.found)
+    assert _compare(few, none, may_split=False).of == "places"
+    assert {each.name for each in CONVENTIONS if each.is_guess} == {
+        "pitch_and_roll", "headings_useless", "held_positions", "degrees_for_radians"
+    }  # fmt: skip
+
+
+def test_an_object_is_all_that_points_of_either_reading_join(view: View) -> None:
+    def reading(points: list[list[int]], gain: list[float]) -> Agreement:
+        found = replace(
+            view.agreement.found,
+            position_in_world_m=np.zeros((len(points), 3)),
+            voter_offsets=np.cumsum([0, *map(len, points)]),
+            voters=np.concatenate(points).astype(np.uint32),
+        )
+        return replace(view.agreement, detection_id=np.arange(10) + 50, found=found, gain_of_point=np.array(gain))
+
+    one = reading([[0, 1, 2, 3], [6, 7]], [2.5, 0.5])
+    two = reading([[0, 1], [2, 3], [8, 9]], [0.25, 0.5, 1.0])
+    better, worse = gains_of_objects([one], [two])
+    assert sorted(zip(better.tolist(), worse.tolist(), strict=True)) == [(0.0, 1.0), (0.5, 0.0), (2.5, 0.75)]
+    # The same objects on another sample are no others.
+    assert [len(side) for side in gains_of_objects([one, one], [two, two])] == [3, 3]
+
+
+def test_attitudes_speak_where_cameras_lie_askew_only(view: View) -> None:
+    def reading(uprightness: float, *, is_along_axis: bool = False) -> _Reading:
+        return _Reading(None, "", None, view.agreement, uprightness, is_along_axis)
+
+    upright = reading(0.999)
+    assert _joined(0.01, upright, reading(-0.3)) == pytest.approx(5e-6 * (1.0 - np.log(5e-6)))
+    assert _joined(0.01, upright, reading(-0.3, is_along_axis=True)) == 0.01
+    assert _joined(0.01, upright, reading(0.9)) == 0.01
+    assert _joined(0.2, upright, reading(-0.3)) == 0.2
 
 
 def test_a_seam_that_rays_cannot_see_is_no_fault(good: Dataset, view: View, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,7 +236,7 @@ def test_every_fault_of_the_registry_is_injected() -> None:
 def test_a_wrong_convention_is_named_and_undone(name: str, good: Dataset, view: View) -> None:
     spoiled = INJECTED[name].spoil(good)
     assert spoiled is not None
-    finding, _, _ = hold_contest(View(spoiled), CONVENTIONS)
+    finding = hold_contest(View(spoiled), CONVENTIONS).finding
     assert finding is not None
     assert finding.fault == name
     assert finding.chance is not None

@@ -14,19 +14,22 @@ that scatter, not against a constant.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 import valuemap._core as _core
 from valuemap.cameras import Rays, camera_centers, cast_rays, rotation_matrices
 from valuemap.config import VoteConfig
 from valuemap.dataset import Dataset
 from valuemap.errors import SettingError
-from valuemap.tables import Candidates, Floats
+from valuemap.tables import Candidates, Floats, Ints
 from valuemap.vote import vote_in_clusters
 
 COST_OF_A_POINT = 1.5
@@ -41,11 +44,14 @@ _MOST_EXACT = 50
 class Agreement:
     """What voting on a sample of places came to.
 
-    `gain` (places) is the sum over the votes of a place; `voters` counts all votes, `detections` all detections;
-    `rays` and `found` are what was voted on and the points that were found, relative to `middle_in_world_m` (3).
+    `gain` (places) is the sum over the votes of a place, `gain_of_point` (P) that of the points; `voters` counts all
+    votes, `detections` all detections; `rays`, of the detections `detection_id` (N), and `found` are what was voted on
+    and the points that were found, relative to `middle_in_world_m` (3).
     """
 
     gain: Floats
+    gain_of_point: Floats
+    detection_id: Ints
     voters: int
     detections: int
     rays: Rays
@@ -78,15 +84,15 @@ def measure_agreement(dataset: Dataset, place_of_image: NDArray[np.uint32], gate
         found, _ = vote_in_clusters(rays, place_of_image, config)
     except SettingError:  # So many rays through one point that their votes fill the memory: no convention of the world.
         found = Candidates(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0, np.uint32), np.empty(0, np.uint32))
-    gain = np.zeros(places)
+    gain, of_point = np.zeros(places), np.zeros(len(found))
     if len(found):
         residual_px, _, _ = _core.see(rays.core, found.position_in_world_m, found.voter_offsets, found.voters)
         worth = np.maximum(1.0 - (residual_px / gate_px) ** 2, 0.0)
-        place = place_of_image[rays.image_row[found.voters.astype(np.int64)]]
-        gain += np.bincount(place, weights=worth, minlength=places)
+        of_point = np.add.reduceat(worth, found.voter_offsets[:-1]) - COST_OF_A_POINT
         first = found.voters[found.voter_offsets[:-1]].astype(np.int64)
-        gain -= COST_OF_A_POINT * np.bincount(place_of_image[rays.image_row[first]], minlength=places)
-    return Agreement(gain, len(found.voters), len(rays), rays, found, middle_in_world_m)
+        gain += np.bincount(place_of_image[rays.image_row[first]], weights=of_point, minlength=places)
+    detection_id = dataset.detections.detection_id
+    return Agreement(gain, of_point, detection_id, len(found.voters), len(rays), rays, found, middle_in_world_m)
 
 
 def _around(dataset: Dataset, middle_in_world_m: Floats) -> Dataset:
@@ -103,22 +109,53 @@ def chance_agreement(dataset: Dataset, place_of_image: NDArray[np.uint32], gate_
     order = np.argsort(place, kind="stable")
     dealt = np.arange(len(detections))
     for rows in np.split(order, np.flatnonzero(np.diff(place[order])) + 1):
-        dealt[rows] = np.roll(rows, len(rows) // 2)
+        dealt[rows] = np.random.default_rng(len(rows)).permutation(rows)
     moved = detections.replace(center_px=detections.center_px[dealt], size_px=detections.size_px[dealt])
     return measure_agreement(Dataset(**{**vars(dataset), "detections": moved}), place_of_image, gate_px)
 
 
+def gains_of_objects(better: Sequence[Agreement], worse: Sequence[Agreement]) -> tuple[Floats, Floats]:
+    """Return the gains (objects) of two readings by the smallest units that do not depend on each other.
+
+    One unit are all detections that points of either reading join, on whatever sample they were found: what one reading
+    takes for one object may be two by the other.
+    """
+    linked: list[tuple[Ints, Ints, Floats, int]] = []
+    points = 0
+    for which, agreements in enumerate((better, worse)):
+        for each in agreements:
+            voters = each.detection_id[each.found.voters.astype(np.int64)]
+            count = np.diff(each.found.voter_offsets)
+            linked.append((voters, points + np.repeat(np.arange(len(count)), count), each.gain_of_point, which))
+            points += len(count)
+    ids, number = np.unique(np.concatenate([voters for voters, _, _, _ in linked]), return_inverse=True)
+    point = np.concatenate([of for _, of, _, _ in linked])
+    size = points + len(ids)
+    graph = coo_matrix((np.ones(len(point)), (point, points + number)), shape=(size, size))
+    units, unit = connected_components(graph, directed=False)
+    gain = np.concatenate([gain for _, _, gain, _ in linked])
+    of_better = np.concatenate([np.full(len(gain), side == 0) for _, _, gain, side in linked])
+    first, second = (
+        np.bincount(unit[:points][mine], gain[mine], units).astype(np.float64) for mine in (of_better, ~of_better)
+    )
+    return first, second
+
+
 @dataclass(frozen=True)
 class Comparison:
-    """How much better one convention makes rays agree than another: difference of gains, and how likely by chance."""
+    """How much better one convention makes rays agree than another: difference of gains, and how likely by chance.
+
+    `places` counts what was compared: places, or objects where `of` says so.
+    """
 
     difference: float
     chance: float
     places: int
+    of: Literal["places", "objects"] = "places"
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures by name."""
-        return {"difference": round(self.difference, 2), "chance": float(f"{self.chance:.2g}"), "places": self.places}
+        return {"difference": round(self.difference, 2), "chance": float(f"{self.chance:.2g}"), self.of: self.places}
 
 
 def compare(better: Floats, worse: Floats) -> Comparison:

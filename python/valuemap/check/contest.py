@@ -4,25 +4,38 @@ Data as given win unless another reading makes the rays agree better by more tha
 Several readings may be as good as the best on single stretches of road (on a straight drive a mirrored world agrees as
 well); places that several passes meet decide between them, then whether cameras stand upright, then the order of the
 registry.
+
+Places are what readings are compared by, as errors of poses last for a while. A short street has too few of them. There
+single objects are compared, for readings that take the same numbers to mean something else: what they make of one
+object says nothing of what they make of the next. A reading that gives measured values up for guessed ones (level
+cameras, say) is better or worse for whole stretches, and always compared by places.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valuemap.check.agreement import Agreement, compare, measure_agreement
+from valuemap.cameras import rotation_matrices
+from valuemap.check.agreement import Agreement, Comparison, compare, gains_of_objects, measure_agreement
 from valuemap.check.fault import LEAST_CHANCE, WIDER_GATE, Convention, Finding, Fix, View, uprightness
 from valuemap.check.sample import Sample
 from valuemap.dataset import Dataset
 from valuemap.progress import Progress, silent
-from valuemap.tables import Floats
 
 _LEAST_UPRIGHT = 0.5
+_ALONG_AXIS = 0.985
+"""The cosine of 10 degrees, which cars and their cameras lean at most."""
+_ENOUGH_PLACES = 12
+"""What a sample is cut into where there are detections enough."""
+_FROM_RAYS = 0.05
+"""However upright cameras stand under a reading, rays must prefer it beyond this chance."""
 _SUSPICIOUS = 0.05
 """What good data would give with a probability above this, all that was tried counted, is not even told."""
+_LEAST_PRODUCT = 1e-300
 _TIE = 1e-3
 """Gains as close as this are the same: readings that differ in the last digits only."""
 
@@ -35,43 +48,81 @@ class _Reading:
     how: str
     fix: Fix | None
     agreement: Agreement
-    is_upright: bool
+    uprightness: float
+    is_along_axis: bool = False
+
+    @property
+    def is_upright(self) -> bool:
+        """Whether the cameras stand."""
+        return self.uprightness > _LEAST_UPRIGHT
 
     @property
     def total(self) -> float:
         """The gain of all places."""
         return float(self.agreement.gain.sum())
 
+    @property
+    def is_guess(self) -> bool:
+        """Whether it gives up what was measured."""
+        return self.convention is not None and self.convention.is_guess
 
-def hold_contest(
-    view: View, conventions: Sequence[Convention], progress: Progress = silent
-) -> tuple[Finding | None, float | None, str | None]:
-    """Return what is wrong with the conventions, if anything, the share of the gate that tells, and what is suspected.
 
-    The gate is widened where rays, read in any way, meet no better than by chance; None where a wide one tells
-    nothing either. A reading that is better than the given one, but by less than so few places can prove, is told.
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What is wrong with the conventions, if anything, and what may be.
+
+    `gate_share` is the share of the gate at which rays meet better than by chance; None where they cannot be told to,
+    however they are read. `suspicion` is a reading that is better than the given one, but by less than so few places
+    can prove. `rivals` are readings, in words, under which cameras stand that as given lie, where rays cannot tell.
     """
+
+    finding: Finding | None
+    gate_share: float | None
+    suspicion: str | None = None
+    rivals: tuple[str, ...] = ()
+
+
+def hold_contest(view: View, conventions: Sequence[Convention], progress: Progress = silent) -> Verdict:
+    """Compare all readings. The gate is widened where rays, read in any way, meet no better than by chance."""
+    rivals: tuple[str, ...] = ()
     for gate_share in (view.gate_share, view.gate_share * WIDER_GATE):
         at_gate = view if gate_share == view.gate_share else View(view.dataset, gate_share=gate_share)
         readings = _try_all(at_gate, conventions, progress)
-        top = max(readings, key=lambda reading: reading.total)
-        tests = len(readings)
-        if compare(top.agreement.gain, at_gate.chance.gain).chance * tests > LEAST_CHANCE:
+        top, tests = max(readings, key=lambda reading: reading.total), len(readings)
+        rivals = _rivals(readings)
+        by_rays = _compare([top.agreement], [at_gate.chance]).chance
+        if _joined(by_rays, top, readings[0]) * tests > LEAST_CHANCE:
             continue
         finding = _judge(at_gate, readings, top)
-        return finding, gate_share, _suspicion(readings[0], top, tests) if finding is None else None
-    return None, None, None
+        if finding is not None:
+            return Verdict(finding, gate_share)
+        return Verdict(None, gate_share, _suspicion(readings[0], top, tests), rivals)
+    return Verdict(None, None, rivals=rivals)
+
+
+def _rivals(readings: Sequence[_Reading]) -> tuple[str, ...]:
+    """Return readings that stand the cameras up by more than a chance of all that was tried, if rays do not object."""
+    given = readings[0]
+    if given.is_upright:
+        return ()
+    return tuple(
+        reading.how
+        for reading in readings[1:]
+        if not reading.is_guess
+        and _by_attitude(reading) * len(readings) < _SUSPICIOUS
+        and _compare_readings(given, reading).chance * len(readings) > LEAST_CHANCE
+    )
 
 
 def _try_all(view: View, conventions: Sequence[Convention], progress: Progress) -> list[_Reading]:
     sample = view.stretches
     tried = [(convention, how, fix) for convention in conventions for how, fix in convention.readings(sample.dataset)]
-    readings = [_Reading(None, "as given", None, view.agreement, view.uprightness > _LEAST_UPRIGHT)]
+    readings = [_Reading(None, "as given", None, view.agreement, view.uprightness, _is_along_axis(view.dataset))]
     for number, (convention, how, fix) in enumerate(tried):
         progress("trying other conventions", number, len(tried))
         other = fix(sample.dataset)
         agreement = _measure(other, sample, view.gate_px, fix)
-        readings.append(_Reading(convention, how, fix, agreement, uprightness(other) > _LEAST_UPRIGHT))
+        readings.append(_Reading(convention, how, fix, agreement, uprightness(other)))
     progress("trying other conventions", len(tried), len(tried))
     return readings
 
@@ -83,25 +134,30 @@ def _measure(dataset: Dataset, sample: Sample, gate_px: float, fix: Fix | None) 
 
 def _judge(view: View, readings: Sequence[_Reading], top: _Reading) -> Finding | None:
     tests, given = len(readings), readings[0]
-    alike = [r for r in readings if compare(top.agreement.gain, r.agreement.gain).chance * tests > LEAST_CHANCE]
+    alike = [r for r in readings if _chance(top, r, given) * tests > LEAST_CHANCE]
+    everywhere = {id(reading): _everywhere(view, reading) for reading in alike}
+    total = {id(reading): sum(float(each.gain.sum()) for each in everywhere[id(reading)]) for reading in alike}
     if len(alike) > 1:
-        alike = _judge_by_places(view, alike, tests)
+        best = max(alike, key=lambda reading: total[id(reading)])
+        alike = [r for r in alike if _chance(best, r, given, everywhere) * tests > LEAST_CHANCE]
     if given in alike:
         return None
     alike = [reading for reading in alike if reading.is_upright] or alike
-    best = max(float(_gains(view, reading).sum()) for reading in alike)
-    chosen = next(reading for reading in alike if float(_gains(view, reading).sum()) > (1.0 - _TIE) * best)
+    most = max(total[id(reading)] for reading in alike)
+    chosen = next(reading for reading in alike if total[id(reading)] > (1.0 - _TIE) * most)
     assert chosen.convention is not None
-    gain, gain_given = _gains(view, chosen), _gains(view, given)
-    comparison = compare(gain, gain_given)
+    everywhere[id(given)] = _everywhere(view, given)
+    comparison = _compare_readings(chosen, given, everywhere)
+    # What the stretches alone have decided, places that few passes meet do not take back.
+    chance = min(_chance(chosen, given, given), _chance(chosen, given, given, everywhere))
     return Finding(
         fault=chosen.convention.name,
         what=chosen.convention.what,
         why=f"Read as {chosen.how}, {chosen.agreement.share:.0%} of {chosen.agreement.detections} detections meet "
         f"others, with an agreement of {chosen.total:.0f}; as given {given.agreement.share:.0%} and {given.total:.0f}, "
-        f"by chance {view.chance.share:.0%} and {view.chance.gain.sum():.0f} ({comparison.places} places).",
+        f"by chance {view.chance.share:.0%} and {view.chance.gain.sum():.0f} ({comparison.places} {comparison.of}).",
         do=chosen.convention.do,
-        chance=min(comparison.chance * tests, 1.0),
+        chance=min(chance * tests, 1.0),
         figures={
             "reading": chosen.how,
             "agreement_as_given": round(given.total, 1),
@@ -114,26 +170,59 @@ def _judge(view: View, readings: Sequence[_Reading], top: _Reading) -> Finding |
 
 
 def _suspicion(given: _Reading, top: _Reading, tests: int) -> str | None:
-    comparison = compare(top.agreement.gain, given.agreement.gain)
-    if top.convention is None or comparison.chance * tests > _SUSPICIOUS:
+    comparison = _compare_readings(top, given)
+    if top.convention is None or _joined(comparison.chance, top, given) * tests > _SUSPICIOUS:
         return None
     return (
         f"Read as {top.how}, {top.agreement.share:.0%} of {top.agreement.detections} detections meet others, as given "
-        f"{given.agreement.share:.0%}. The data are too few to be sure ({comparison.places} places), but it may "
-        f"be so: {top.convention.what}"
+        f"{given.agreement.share:.0%}. The data are too few to be sure ({comparison.places} {comparison.of}), but it "
+        f"may be so: {top.convention.what}"
     )
 
 
-def _judge_by_places(view: View, alike: Sequence[_Reading], tests: int) -> list[_Reading]:
-    """Return those of readings that no other one beats where several passes meet."""
-    gains = [_gains(view, reading) for reading in alike]
-    best = gains[int(np.argmax([gain.sum() for gain in gains]))]
-    return [r for r, gain in zip(alike, gains, strict=True) if compare(best, gain).chance * tests > LEAST_CHANCE]
+def _chance(
+    better: _Reading, worse: _Reading, given: _Reading, everywhere: Mapping[int, Sequence[Agreement]] | None = None
+) -> float:
+    """Return how likely one reading would be so much better than another, or than the given one, by chance."""
+    by_rays = _compare_readings(better, worse, everywhere).chance
+    return _joined(by_rays, better, given) if worse is given else by_rays
 
 
-def _gains(view: View, reading: _Reading) -> Floats:
-    """Return the gains on the stretches and at the places."""
+def _joined(by_rays: float, reading: _Reading, given: _Reading) -> float:
+    """Join the chance by rays with that of cameras that stand upright, by Fisher's method."""
+    if given.is_upright or given.is_along_axis or not reading.is_upright or by_rays > _FROM_RAYS:
+        return by_rays
+    product = by_rays * _by_attitude(reading)
+    return min(by_rays, product * (1.0 - math.log(max(product, _LEAST_PRODUCT))))
+
+
+def _is_along_axis(dataset: Dataset) -> bool:
+    up = -rotation_matrices(dataset.images)[:, 1].mean(axis=0)
+    return bool(np.abs(up).max() > _ALONG_AXIS)
+
+
+def _by_attitude(reading: _Reading) -> float:
+    """Return the share of cameras, mounted anyhow, that stand as upright."""
+    return (1.0 - min(reading.uprightness, 1.0)) / 2.0
+
+
+def _compare_readings(
+    better: _Reading, worse: _Reading, everywhere: Mapping[int, Sequence[Agreement]] | None = None
+) -> Comparison:
+    both = [[each.agreement] if everywhere is None else everywhere[id(each)] for each in (better, worse)]
+    return _compare(*both, may_split=not (better.is_guess or worse.is_guess))
+
+
+def _compare(better: Sequence[Agreement], worse: Sequence[Agreement], *, may_split: bool = True) -> Comparison:
+    """Compare what two readings come to on the same samples: by places, or where these are few by objects."""
+    by_places = compare(*(np.concatenate([each.gain for each in side]) for side in (better, worse)))
+    if not may_split or by_places.places >= _ENOUGH_PLACES:
+        return by_places
+    return replace(compare(*gains_of_objects(better, worse)), of="objects")
+
+
+def _everywhere(view: View, reading: _Reading) -> list[Agreement]:
+    """Return how well rays agree on the stretches and at the places."""
     # Places have parts of passes: what depends on the image before or after needs the whole.
     dataset = view.places.dataset if reading.fix is None else view.places.of(reading.fix(view.dataset))
-    at_places = _measure(dataset, view.places, view.gate_px, reading.fix)
-    return np.concatenate([reading.agreement.gain, at_places.gain])
+    return [reading.agreement, _measure(dataset, view.places, view.gate_px, reading.fix)]

@@ -15,6 +15,7 @@ from valuemap.progress import Progress, silent
 
 _MOST_ROUNDS = 4
 """Of one stage: one fault may hide behind another, but not for ever."""
+_MOST_TOLD = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,21 +63,34 @@ def examine(dataset: Dataset, *, progress: Progress = silent) -> Examination:
         )
     findings: list[Finding] = []
     notes: list[str] = []
-    gate_share = 1.0
+    gate_share, meets = 1.0, True
+    rivals: tuple[str, ...] = ()
     for stage in STAGES:
         for _ in range(_MOST_ROUNDS):
-            view = View(dataset, gate_share=gate_share, known=frozenset(finding.fault for finding in findings))
+            known = frozenset(finding.fault for finding in findings)
+            view = View(dataset, gate_share=gate_share, known=known, meets=meets, rivals=rivals)
             if stage == "conventions":
-                finding, tells, suspicion = hold_contest(view, CONVENTIONS, progress)
-                if suspicion is not None:
-                    notes.append(suspicion)
-                if tells is None:
+                verdict = hold_contest(view, CONVENTIONS, progress)
+                if verdict.suspicion is not None:
+                    notes.append(verdict.suspicion)
+                meets, rivals = verdict.gate_share is not None, verdict.rivals
+                if not meets:
                     notes.append(
                         "However the data are read, it cannot be told that rays meet better than by chance: too few "
                         "detections show one object from several places, or the poses are no poses of these pictures."
                     )
-                gate_share = tells or gate_share
-                found = [] if finding is None else [finding]
+                if rivals:
+                    told = [
+                        *rivals[:_MOST_TOLD],
+                        *(["otherwise"] if len(rivals) > _MOST_TOLD else []),
+                        "with the sky elsewhere",
+                    ]
+                    notes.append(
+                        f"As given the cameras do not stand upright (cosine {view.uprightness:.2f}). They would if the "
+                        f"data were read as {', or '.join(told)}, and the rays are too few to tell which."
+                    )
+                gate_share = verdict.gate_share or gate_share
+                found = [] if verdict.finding is None else [verdict.finding]
             else:
                 found = _look(view, stage, progress)
             findings += found

@@ -78,8 +78,20 @@ class Finding:
 class View:
     """A dataset as faults look at it; what several of them need is worked out once."""
 
-    def __init__(self, dataset: Dataset, *, gate_share: float = 1.0, known: frozenset[str] = frozenset()) -> None:
+    def __init__(
+        self,
+        dataset: Dataset,
+        *,
+        gate_share: float = 1.0,
+        known: frozenset[str] = frozenset(),
+        meets: bool = True,
+        rivals: tuple[str, ...] = (),
+    ) -> None:
         self.dataset = dataset
+        self.meets = meets
+        """Whether rays can be told to meet better than by chance: else points where they meet are no objects."""
+        self.rivals = rivals
+        """Other readings under which the cameras would stand upright, and that rays cannot exclude."""
         self.known = known
         """Names of what was found before and put right."""
         self.gate_share = gate_share
@@ -177,6 +189,8 @@ class Convention(ABC):
     name: ClassVar[str]
     what: ClassVar[str]
     do: ClassVar[str]
+    is_guess: ClassVar[bool] = False
+    """Whether readings give measured values up for guessed ones."""
 
     @abstractmethod
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:

@@ -103,6 +103,7 @@ class DegreesForRadians(Convention):
     name: ClassVar[str] = "degrees_for_radians"
     what: ClassVar[str] = "The angles of the poses are in the wrong unit: degrees and radians are mixed up."
     do: ClassVar[str] = "Convert the angles (180/pi) and import again."
+    is_guess: ClassVar[bool] = True
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield degrees that were read as radians, and radians read as degrees, as compass or mathematical angles."""
@@ -117,6 +118,7 @@ class HeadingsUseless(Convention):
     name: ClassVar[str] = "headings_useless"
     what: ClassVar[str] = "The headings say nothing: cameras taken to look where they drive agree better."
     do: ClassVar[str] = "Look where the headings come from; the fix takes the direction of travel."
+    is_guess: ClassVar[bool] = True
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield headings from the positions."""
@@ -138,15 +140,21 @@ class UpDirection(Fault):
         if strength < _LEAST_UPRIGHT:
             return None
         own = mean_up / strength
-        is_local = view.dataset.frame.anchor is None
+        fix: Fix | None
+        if view.rivals:  # Were it one of these, a world that is turned would have its north anywhere.
+            do, fix = "See which of the readings in the notes is right, or where the sky is; rays cannot tell.", None
+        elif view.dataset.frame.anchor is None:
+            do, fix = "Give the direction of the sky with --up.", lambda dataset: _with_up(dataset, own)
+        else:
+            do, fix = "Turn the world into x east, y north, z up.", lambda dataset: _stand_up(dataset, own)
         return Finding(
             fault=self.name,
             what="The direction of the sky is not where the cameras have it.",
             why=f"The cameras' own up is {_vector(own)} on average, the frame's "
             f"{_vector(np.array(view.dataset.frame.up))}: the cosine between them is {view.uprightness:.2f}.",
-            do="Give the direction of the sky with --up." if is_local else "Turn the world into x east, y north, z up.",
+            do=do,
             figures={"cosine": round(view.uprightness, 3), "own_up": [round(float(part), 3) for part in own]},
-            fix=(lambda dataset: _with_up(dataset, own)) if is_local else (lambda dataset: _stand_up(dataset, own)),
+            fix=fix,
         )
 
 

@@ -87,6 +87,7 @@ class PitchAndRoll(Convention):
     name: ClassVar[str] = "pitch_and_roll"
     what: ClassVar[str] = "The pitch and roll of the poses are worse than none: level cameras agree better."
     do: ClassVar[str] = "Take the cameras as level (heading only), or find better poses."
+    is_guess: ClassVar[bool] = True
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield level cameras; a pitch that all images share is no noise but a tilt, and looked for as such."""

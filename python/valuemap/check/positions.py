@@ -38,6 +38,7 @@ class HeldPositions(Convention):
     name: ClassVar[str] = "held_positions"
     what: ClassVar[str] = "Several images in a row have one position: positions come more seldom than pictures."
     do: ClassVar[str] = "Interpolate the positions at the times of the pictures; do not take the last one known."
+    is_guess: ClassVar[bool] = True
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield positions between the fixes, where most images that follow a move do not move."""

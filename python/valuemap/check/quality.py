@@ -171,7 +171,7 @@ class TruthElsewhere(Fault):
     def find(self, view: View) -> Finding | None:
         """Look for the shift, after other orders of axes, by which most points where rays meet get an object."""
         truth, points = view.dataset.truth, _certain_points(view)
-        if truth is None or len(truth) < _LEAST_TRUTH or len(points) < _LEAST_TRUTH:
+        if truth is None or len(truth) < _LEAST_TRUTH or len(points) < _LEAST_TRUTH or not view.meets:
             return None
         tolerance_m = max(view.step_m / 2.0, 1e-9)
         objects = _flattened(truth.position_in_world_m, truth, view)

@@ -34,7 +34,7 @@ def object_heights(view: View) -> dict[str, tuple[float, int]]:
     agreement = view.agreement
     found = agreement.found
     votes = np.diff(found.voter_offsets)
-    if not len(found):
+    if not len(found) or not view.meets:
         return {}
     detections = view.stretches.dataset.detections
     _, metres_per_px, _ = _core.see(agreement.rays.core, found.position_in_world_m, found.voter_offsets, found.voters)
