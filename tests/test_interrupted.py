@@ -65,6 +65,44 @@ def test_a_terminated_run_says_so_in_one_line_and_goes_on(street: Path, tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["map"]
 
 
+# What an update has made when it is killed: the data as one, a cell, and what is new alone.
+MOMENTS = ("dataset/detections.parquet", "cells/*.parquet", "added/detections.parquet")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_an_update_that_is_killed_goes_on_to_the_same_map(
+    street: Path, tmp_path_factory: pytest.TempPathFactory, moment: str
+) -> None:
+    folder = street / "updates"
+    if not folder.is_dir():
+        valuemap.write_dataset(streets(0.0, 445.0, seed=11), folder / "added")
+        assert finish(update(street, folder / "whole"))[0] == 0
+    out = tmp_path_factory.mktemp("killed") / "map"
+    process = update(street, out)
+    until = time.monotonic() + LIMIT_S
+    while not any(out.with_name("map.work").glob(moment)) and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.001)
+    process.kill()
+    assert finish(process)[0] == -signal.SIGKILL
+    assert not out.exists()
+    assert finish(update(street, out, "--resume"))[0] == 0
+    assert everything(out) == everything(folder / "whole")
+    assert [path.name for path in out.parent.iterdir()] == ["map"]
+
+
+def update(folder: Path, out: Path, *options: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "valuemap.cli", "update", str(folder / "whole"), "--out", str(out), "--threads=1"]
+    command += ["--add", str(folder / "updates" / "added"), "--tile-size=500", *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def everything(folder: Path) -> dict[str, bytes]:
+    """All files of a map, but for the record of how long it took."""
+    found = (path for path in folder.rglob("*") if path.is_file() and path.name not in ("run.json", ".valuemap-files"))
+    return {str(path.relative_to(folder)): path.read_bytes() for path in found}
+
+
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 64 kB."""

@@ -34,7 +34,7 @@ from valuemap.tiles import fleet, places
 from valuemap.tiles import grid as grid_module
 from valuemap.tiles.dense import groups_of_drives, join_groups
 from valuemap.tiles.fleet import Fleet
-from valuemap.tiles.grid import LEVELS, WHOLE, Cell, Census, Grid
+from valuemap.tiles.grid import LEVELS, WHOLE, Cell, Census, Grid, Places
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.sample import is_sampled, sampled_squares
@@ -101,6 +101,18 @@ def test_dense_places_are_split_until_it_helps_no_more() -> None:
     crossing = np.concatenate([np.zeros((4000, 2)), [[3000.0, 0.0]]])
     parts = [cell for cell in census(crossing, grid).cells(grid) if cell.base == (0, 0)]
     assert {cell.level for cell in parts if grid.is_within(cell, np.zeros((1, 2)), grid.halo_m).any()} == {LEVELS}
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**32 - 1), spread_m=st.sampled_from([10.0, 500.0, 4000.0]))
+def test_the_places_around_a_cell_are_those_in_it_and_its_halo(seed: int, spread_m: float) -> None:
+    random = np.random.default_rng(seed)
+    place_m = random.normal(random.uniform(-5000.0, 5000.0, 2), spread_m, (int(random.integers(0, 300)), 2))
+    places_of = Places(GRID, place_m)
+    bases = [(x, y) for x in range(-9, 9, 2) for y in range(-9, 9)]
+    for cell in [*map(Cell, bases), *(Cell(base, 2, (1, 3)) for base in bases)]:
+        around = np.flatnonzero(GRID.is_within(cell, place_m, GRID.halo_m))
+        assert np.array_equal(places_of.around(cell), around)
 
 
 def test_counts_in_parts_add_up() -> None:
