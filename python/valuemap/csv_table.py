@@ -36,7 +36,9 @@ def read_csv_arrow(
         The file is empty or no CSV, or a value is not of its type; `hint` says what is expected.
     """
     try:
-        content = _read_text_bytes(path, hint)
+        start = _start_of_large(path)
+        content = start or _read_text_bytes(path, hint)
+        source = path if start else content
         separator, names = _header(content)
         type_of = _types_by_header(names, types)
         options: dict[str, Any] = {
@@ -45,9 +47,9 @@ def read_csv_arrow(
             "strings_can_be_null": has_missing,
         }
         try:
-            table = _parse_csv(content, separator, options)
+            table = _parse_csv(source, separator, options)
         except pa.ArrowInvalid:
-            table = _parse_odd_csv(content, separator, options, bad_numbers_are_nan)
+            table = _parse_odd_csv(source, separator, options, bad_numbers_are_nan)
         exact = {name.strip() for name in table.column_names}
         same = {name.lower(): name for name in types if name not in exact}
         table = table.rename_columns([same.get(name.strip().lower(), name.strip()) for name in table.column_names])
@@ -60,6 +62,19 @@ def read_csv_arrow(
     return table
 
 
+def _start_of_large(path: Path) -> bytes | None:
+    """Return how a plain text file begins that is read in blocks; None for a small one, and for what must be unpacked.
+
+    All of it is then never in memory.
+    """
+    if not path.is_file():
+        return None
+    with path.open("rb") as file:
+        start = file.read(_START)
+    is_plain = start[:1].isalpha() and not start.startswith(_NO_TEXT) and b"\0" not in start[:_LOOKED_AT]
+    return start if len(start) == _START and is_plain and b"\n" in start else None
+
+
 def _read_text_bytes(path: Path, hint: str) -> bytes:
     """Return the bytes of a text file, unpacked if it is gzip; raises `InputError` where it is something else."""
     if not path.is_file():  # A pipe would hang.
@@ -67,7 +82,7 @@ def _read_text_bytes(path: Path, hint: str) -> bytes:
     content = path.read_bytes()
     if content.startswith(b"\x1f\x8b"):
         content = _unpacked(content, path, hint)
-    for start, what in ((b"PK\3\4", "a zip archive or a spreadsheet"), (b"PAR1", "a Parquet file")):
+    for start, what in zip(_NO_TEXT, ("a zip archive or a spreadsheet", "a Parquet file"), strict=True):
         if content.startswith(start):
             raise InputError(f"{path}: is {what}, not CSV", hint=f"save it as CSV in UTF-8; {hint}")
     start = content[:_LOOKED_AT].removeprefix(codecs.BOM_UTF8).lstrip()
@@ -98,6 +113,9 @@ def _unpacked(content: bytes, path: Path, hint: str) -> bytes:
 _MOST_UNPACKED_TIMES = 100
 """Tables of texts and numbers shrink to a third or a twentieth."""
 _ALWAYS_UNPACKED = 64 * 2**20
+_START = 2**20
+"""Files of no more bytes are read at once."""
+_NO_TEXT = (b"PK\3\4", b"PAR1")
 _LOOKED_AT = 1000
 """Bytes that say what a file is."""
 
@@ -117,26 +135,29 @@ def _types_by_header(names: Sequence[str], types: Mapping[str, pa.DataType]) -> 
     return {name: types[wanted] for name, wanted in found.items() if wanted in types}
 
 
-def _parse_csv(content: bytes, separator: str, options: Mapping[str, Any]) -> pa.Table:
-    return pa_csv.read_csv(
-        pa.BufferReader(content),
-        read_options=pa_csv.ReadOptions(use_threads=False),  # Else errors do not say the row.
-        parse_options=pa_csv.ParseOptions(delimiter=separator),
-        convert_options=pa_csv.ConvertOptions(**options),
-    )
+def _parse_csv(source: bytes | Path, separator: str, options: Mapping[str, Any]) -> pa.Table:
+    with source.open("rb") if isinstance(source, Path) else pa.BufferReader(source) as file:
+        return pa_csv.read_csv(
+            file,
+            read_options=pa_csv.ReadOptions(use_threads=False),  # Else errors do not say the row.
+            parse_options=pa_csv.ParseOptions(delimiter=separator),
+            convert_options=pa_csv.ConvertOptions(**options),
+        )
 
 
-def _parse_odd_csv(content: bytes, separator: str, options: dict[str, Any], bad_numbers_are_nan: bool) -> pa.Table:
+def _parse_odd_csv(
+    source: bytes | Path, separator: str, options: dict[str, Any], bad_numbers_are_nan: bool
+) -> pa.Table:
     """Read what cannot be read at once: decimal commas, or fields that should be numbers and are none."""
     decimal = "." if separator == "," else ","
     try:
-        return _parse_csv(content, separator, {**options, "decimal_point": decimal})
+        return _parse_csv(source, separator, {**options, "decimal_point": decimal})
     except pa.ArrowInvalid:
         if not bad_numbers_are_nan:
             raise
     type_of: dict[str, pa.DataType] = options["column_types"]
     as_texts = {name: pa.string() if kind == pa.float64() else kind for name, kind in type_of.items()}
-    table = _parse_csv(content, separator, {**options, "column_types": as_texts})
+    table = _parse_csv(source, separator, {**options, "column_types": as_texts})
     for name, kind in type_of.items():
         if kind == pa.float64() and table.column_names.count(name) == 1:
             values = np.array([_number_or_nan(text, decimal) for text in table.column(name).to_pylist()])

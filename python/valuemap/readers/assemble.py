@@ -79,6 +79,7 @@ def assemble(
     rejections.add_unreadable(unreadable or {})
     posed, usable = vet_images(images, rejections, where_image, unposed)
     boxes = vet_boxes(detections, images, usable, cameras, rejections)
+    del detections  # Of many boxes there is no room for both.
     unframed = Dataset(
         name=name,
         frame=Frame(),

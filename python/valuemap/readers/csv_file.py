@@ -13,6 +13,7 @@ from valuemap.arrow import numbers_from_arrow
 from valuemap.csv_table import read_csv_arrow
 from valuemap.errors import InputError, SettingError
 from valuemap.readers.files import check_file
+from valuemap.readers.texts import Texts
 from valuemap.tables import Bools, Floats
 
 _NAMES = {pa.int64(): "whole numbers", pa.float64(): "numbers", pa.string(): "texts"}
@@ -88,7 +89,8 @@ class CsvFile:
                 hint=f"the names before = are among {', '.join((*texts, *numbers))}",
             )
         check_file(path, expected)
-        kinds = dict.fromkeys(texts, pa.string()) | dict.fromkeys(numbers, pa.float64())
+        # Texts that repeat, as the names of images do of boxes, are held once.
+        kinds = dict.fromkeys(texts, pa.dictionary(pa.int32(), pa.string())) | dict.fromkeys(numbers, pa.float64())
         # A column that has another's name does not count as that.
         renamed = {columns.get(name, name): kind for name, kind in kinds.items()}
         self._table = read_csv_arrow(path, renamed, has_missing=False, hint=self._hint, bad_numbers_are_nan=True)
@@ -112,24 +114,23 @@ class CsvFile:
         """Say whether all of these columns are there."""
         return all(self._name.get(name) in self._table.column_names for name in names)
 
-    def texts(self, name: str) -> list[str]:
-        """Return a column as texts (N) without spaces around them; an empty field is an empty text.
-
-        Equal texts are one object: names of images and classes stand there for many boxes each.
-        """
-        found: list[str] = []
-        for chunk in self._column(name).dictionary_encode().unify_dictionaries().chunks:
-            kinds = np.array([text.strip() for text in chunk.dictionary.to_pylist()], dtype=object)
-            found += kinds[chunk.indices.to_numpy()].tolist()
-        return found
+    def texts(self, name: str) -> Texts:
+        """Return a column as texts (N) without spaces around them; an empty field is an empty text."""
+        chunks = self._column(name).chunks
+        number: dict[str, int] = {}
+        codes = [np.empty(0, np.int32)]
+        for chunk in chunks:
+            of = [number.setdefault(text.strip(), len(number)) for text in chunk.dictionary.to_pylist()]
+            codes.append(np.array(of, np.int32)[numbers_from_arrow(chunk.indices)])
+        return Texts(np.concatenate(codes), list(number))
 
     def filled_texts(self, name: str) -> list[str]:
         """Return a column as texts (N) none of which is empty."""
         texts = self.texts(name)
-        if "" in texts:
+        if "" in texts.distinct:
             row = texts.index("")
             raise InputError(f"{self.line(row)}: {name}: expected a text, found none", hint=self._hint)
-        return texts
+        return list(texts)
 
     def numbers(self, name: str) -> Floats:
         """Return a column as numbers (N), NaN where there is none or another text."""
@@ -160,7 +161,7 @@ class CsvFile:
 
     def line(self, row: int) -> str:
         """Return where a row stands, for errors."""
-        return f"{self.path} line {row + 2}"
+        return line_of(self.path, row)
 
     def missing(self, expected: str) -> InputError:
         """Return the error that says which columns are expected."""
@@ -173,6 +174,11 @@ class CsvFile:
         if not self.has(name):
             raise self.missing(f"a column {name!r}")
         return self._table.column(self._name[name])
+
+
+def line_of(path: Path, row: int) -> str:
+    """Return where a row of a CSV file stands, for errors."""
+    return f"{path} line {row + 2}"
 
 
 def parse_columns(assignments: Sequence[str]) -> dict[str, str]:

@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from valuemap.errors import InputError, SettingError
+from valuemap.readers.texts import Texts
 from valuemap.tables import Bools, Cameras, Categories, Detections, Floats, Images, Ints, RejectedRows
 
 MAX_REJECTED = 0.01
@@ -17,6 +18,8 @@ MAX_REJECTED = 0.01
 _QUATERNION_TOLERANCE = 1e-3
 _MAX_SIZE_OF_PICTURE = 2.0
 _SHOWN_REASONS = 3
+_PORTION = 500_000
+"""Boxes that are looked at together."""
 
 
 @dataclass(frozen=True)
@@ -217,13 +220,15 @@ class Verdicts:
     """For each row (N) the first reason that was found against it, as a code, or -1."""
 
     def __init__(self, count: int) -> None:
-        self.code = np.full(count, -1, dtype=np.int64)
+        self.code = np.full(count, -1, dtype=np.int8)
         self.reasons: list[_Reason] = []
 
-    def mark(self, wrong: Bools | np.bool_, reason: _Reason) -> None:
-        """Note a reason against rows that have none yet."""
-        self.reasons.append(reason)
-        self.code[wrong & (self.code < 0)] = len(self.reasons) - 1
+    def mark(self, wrong: Bools | np.bool_, reason: _Reason, part: slice = slice(None)) -> None:
+        """Note a reason against rows, or a part of them, that have none yet."""
+        if reason not in self.reasons:
+            self.reasons.append(reason)
+        code = self.code[part]
+        code[wrong & (code < 0)] = self.reasons.index(reason)
 
     @property
     def fine(self) -> Bools:
@@ -269,36 +274,35 @@ def vet_boxes(boxes: FoundBoxes, images: Images, usable: Bools, cameras: Cameras
 
     `images` are those that `image_row` counts, with all that were left out; `usable` (N) says which were not.
     """
+    classes = Texts.of(boxes.class_names).categories(_text)
     why = Verdicts(len(boxes))
     row = np.asarray(boxes.image_row, np.int64)
-    has_image = row >= 0
-    why.mark(
-        ~has_image,
-        _Reason(
-            "its image is not among the images with a pose",
-            f"images are matched by file name, as in {str(images.name[0].as_py())!r}: correct the names",
-        ),
-    )
-    why.mark(has_image & ~usable[row], _LEFT_OUT)
-    center, size, score = boxes.center_px, boxes.size_px, boxes.score
-    numbers = np.column_stack([center, size, score])
-    why.mark(~np.isfinite(numbers).all(axis=1), _NOT_FINITE)
-    if not boxes.are_points:
-        why.mark(~(size > 0.0).all(axis=1), _NO_SIZE)
     # Ids of cameras that are not there are found by the checks at the door.
     order = np.argsort(cameras.camera_id)
-    place = np.searchsorted(cameras.camera_id[order], images.camera_id[row])
-    camera = order[np.minimum(place, len(order) - 1)]
-    picture = np.column_stack([cameras.width_px, cameras.height_px]).astype(np.float64)[camera]
-    why.mark((size > _MAX_SIZE_OF_PICTURE * picture).any(axis=1), _TOO_LARGE)
-    why.mark(((center < 0.0) | (center > picture)).any(axis=1), _OUTSIDE)
-    why.mark((score < 0.0) | (score > 1.0), _SCORE)
-    for values in (boxes.range_m, boxes.range_sigma_m, boxes.vertical_sigma_px):
-        if values is not None:
-            why.mark((values <= 0.0) | np.isinf(values), _RANGE)
-    text_of = {name: _text(name) for name in set(boxes.class_names)}
-    classes = Categories.from_texts([text_of[name] for name in boxes.class_names])
-    why.mark(classes.codes == classes.code_of(""), _NO_CLASS)
+    place = np.searchsorted(cameras.camera_id[order], images.camera_id)
+    camera_of_image = order[np.minimum(place, len(order) - 1)]
+    picture_px = np.column_stack([cameras.width_px, cameras.height_px]).astype(np.float64)
+    ranges = [values for values in (boxes.range_m, boxes.range_sigma_m, boxes.vertical_sigma_px) if values is not None]
+    no_image = _Reason(
+        "its image is not among the images with a pose",
+        f"images are matched by file name, as in {str(images.name[0].as_py())!r}: correct the names",
+    )
+    # In portions: what is between takes more memory than the boxes.
+    for start in range(0, len(boxes), _PORTION):
+        part = slice(start, start + _PORTION)
+        of, center, size, score = row[part], boxes.center_px[part], boxes.size_px[part], boxes.score[part]
+        why.mark(of < 0, no_image, part)
+        why.mark((of >= 0) & ~usable[of], _LEFT_OUT, part)
+        why.mark(~np.isfinite(np.column_stack([center, size, score])).all(axis=1), _NOT_FINITE, part)
+        if not boxes.are_points:
+            why.mark(~(size > 0.0).all(axis=1), _NO_SIZE, part)
+        picture = picture_px[camera_of_image[of]]
+        why.mark((size > _MAX_SIZE_OF_PICTURE * picture).any(axis=1), _TOO_LARGE, part)
+        why.mark(((center < 0.0) | (center > picture)).any(axis=1), _OUTSIDE, part)
+        why.mark((score < 0.0) | (score > 1.0), _SCORE, part)
+        for values in ranges:
+            why.mark((values[part] <= 0.0) | np.isinf(values[part]), _RANGE, part)
+        why.mark(classes.codes[part] == classes.code_of(""), _NO_CLASS, part)
     why.mark(_repeated(boxes, classes, why.fine), _TWICE)
 
     def image_name(i: int) -> str:
@@ -307,10 +311,10 @@ def vet_boxes(boxes: FoundBoxes, images: Images, usable: Bools, cameras: Cameras
         return str(images.name[row[i]].as_py()) if row[i] >= 0 else ""
 
     rejections.add("detections", why, where=boxes.where, image_names=image_name, boxes=boxes)
-    fine = why.fine
+    fine = slice(None) if why.fine.all() else why.fine  # A slice takes no memory.
     return number_detections(
         images.image_id[row[fine]],
-        classes.take(fine),
+        Categories(classes.codes[fine], classes.names),
         boxes.center_px[fine],
         boxes.size_px[fine],
         boxes.score[fine],
@@ -360,23 +364,24 @@ def _repeated(boxes: FoundBoxes, classes: Categories, fine: Bools) -> Bools:
     """
     result = np.zeros(len(boxes), dtype=np.bool_)
     rows = np.flatnonzero(fine)
-    table = np.column_stack([boxes.center_px, boxes.size_px])[rows] + 0.0  # -0 becomes 0, which it equals.
-    same = [np.asarray(boxes.image_row, np.int64)[rows], classes.codes[rows].astype(np.int64), *table.T]
+    same = (boxes.image_row, classes.codes, *boxes.center_px.T, *boxes.size_px.T)
     # Most boxes have no twin: a hash finds those that may have one, which alone are then sorted by all columns.
-    mixed = np.zeros(len(rows), dtype=np.uint64)
-    for column in same:
-        mixed = (mixed ^ np.ascontiguousarray(column).view(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
-        mixed ^= mixed >> np.uint64(29)
-    by_hash = np.argsort(mixed, kind="stable")
-    twin = np.diff(mixed[by_hash]) == 0
-    maybe = by_hash[np.append(twin, [False]) | np.append([False], twin)] if len(rows) else by_hash
-    tie = maybe if boxes.detection_id is None else boxes.detection_id[rows[maybe]]
-    order = np.lexsort((tie, -boxes.score[rows[maybe]], *(column[maybe] for column in same)))
-    maybe = maybe[order]
+    mixed = np.zeros(len(boxes), dtype=np.uint64)
+    for start in range(0, len(boxes), _PORTION):
+        part = mixed[start : start + _PORTION]
+        for column in same:
+            values = column[start : start + _PORTION] + 0.0  # -0 becomes 0, which it equals.
+            part[:] = (part ^ values.view(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
+            part ^= part >> np.uint64(29)
+    mixed = mixed[rows]
+    ascending = np.sort(mixed)
+    maybe = rows[np.isin(mixed, ascending[1:][ascending[1:] == ascending[:-1]])]
+    tie = maybe if boxes.detection_id is None else boxes.detection_id[maybe]
+    maybe = maybe[np.lexsort((tie, -boxes.score[maybe], *(column[maybe] for column in same)))]
     is_repeat = np.ones(max(len(maybe) - 1, 0), dtype=np.bool_)
     for column in same:
         is_repeat &= column[maybe[1:]] == column[maybe[:-1]]
-    result[rows[maybe[1:][is_repeat]]] = True
+    result[maybe[1:][is_repeat]] = True
     return result
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import pyarrow as pa
+
 from valuemap.errors import InputError, SettingError
 from valuemap.readers.assemble import FoundBoxes
 from valuemap.readers.detections.bosch import read_bosch
@@ -44,7 +46,9 @@ def read_detections(file: DetectionFile | Path | None, images: Images, cameras: 
         return FoundBoxes.none()
     if isinstance(file, Path):
         file = DetectionFile(file)
-    return find_images(DETECTIONS[_format_of(file)](file), images, cameras, file)
+    boxes = DETECTIONS[_format_of(file)](file)
+    pa.default_memory_pool().release_unused()  # Of the file as it was read, which Arrow would keep for what comes next.
+    return find_images(boxes, images, cameras, file)
 
 
 def _format_of(file: DetectionFile) -> str:

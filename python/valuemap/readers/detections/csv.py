@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
-from valuemap.readers.csv_file import CsvFile
+from valuemap.readers.csv_file import CsvFile, line_of
 from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes
+from valuemap.readers.texts import Texts
 from valuemap.tables import Floats
 
 _EXPECTED = "a CSV file with columns image and x1, y1, x2, y2, or left, top, width, height, or x, y"
@@ -33,11 +36,11 @@ def read_csv_boxes(file: DetectionFile) -> NamedBoxes:
     optional = {name: table.numbers(name) if table.has(name) else None for name in _OPTIONAL}
     return NamedBoxes(
         image_names=table.texts("image"),
-        class_names=table.texts("class") if table.has("class") else [file.class_name] * len(table),
+        class_names=table.texts("class") if table.has("class") else Texts.repeated(file.class_name, len(table)),
         center=center,
         size=size,
         score=table.numbers("score") if table.has("score") else np.full(len(table), file.full_score),
-        where=table.line,
+        where=partial(line_of, file.path),  # The table need not be kept for it.
         fractions=file.fractions,
         range_m=optional["range_m"],
         range_sigma_m=optional["range_sigma_m"],

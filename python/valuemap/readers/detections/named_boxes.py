@@ -12,6 +12,7 @@ from valuemap.dataset import rows_of
 from valuemap.errors import InputError, SettingError
 from valuemap.readers.assemble import FoundBoxes
 from valuemap.readers.names import match_images
+from valuemap.readers.texts import Texts
 from valuemap.tables import Cameras, Floats, Images, Ints
 
 
@@ -88,22 +89,25 @@ def find_images(boxes: NamedBoxes, images: Images, cameras: Cameras, file: Detec
     """
     if not len(boxes.image_names):
         raise InputError(f"{file.path}: there are no detections in it", hint="did the detector find anything?")
-    known = images.name.to_pylist()
-    row_of = match_images({*boxes.image_names, *boxes.other_names}, known)
-    image_row = np.array([row_of.get(name, -1) for name in boxes.image_names], dtype=np.int64)
+    names = Texts.of(boxes.image_names)
+    row_of = match_images({*names.distinct, *boxes.other_names}, images.name.to_pylist())
+    row_of_name = np.array([row_of.get(name, -1) for name in names.distinct], dtype=np.int64)
+    image_row = row_of_name[names.codes]
     camera_row = rows_of(images.camera_id, cameras.camera_id)
-    _refuse_other_sizes(boxes, row_of, camera_row, cameras, file.path)
-    picture_px = np.stack([cameras.width_px, cameras.height_px], axis=1)[camera_row[image_row]].astype(np.float64)
-    scale = picture_px if boxes.fractions else np.ones((len(image_row), 2))
+    _refuse_other_sizes(boxes, names.distinct, row_of, camera_row, cameras, file.path)
+    center, size = boxes.center, boxes.size
+    if boxes.fractions:
+        picture_px = np.stack([cameras.width_px, cameras.height_px], axis=1)[camera_row[image_row]].astype(np.float64)
+        center, size = center * picture_px, None if size is None else size * picture_px
     return FoundBoxes(
         image_row=image_row,
         class_names=boxes.class_names,
-        center_px=boxes.center * scale + (0.5 - file.pixel_center),
-        size_px=np.zeros((len(image_row), 2)) if boxes.size is None else boxes.size * scale,
+        center_px=center + (0.5 - file.pixel_center),
+        size_px=np.zeros((len(image_row), 2)) if size is None else size,
         are_points=boxes.size is None,
         score=boxes.score / file.full_score,
         where=boxes.where,
-        image_names=boxes.image_names,
+        image_names=names,
         detection_id=boxes.detection_id,
         range_m=boxes.range_m,
         range_sigma_m=boxes.range_sigma_m,
@@ -112,10 +116,10 @@ def find_images(boxes: NamedBoxes, images: Images, cameras: Cameras, file: Detec
 
 
 def _refuse_other_sizes(
-    boxes: NamedBoxes, row_of: Mapping[str, int], camera_row: Ints, cameras: Cameras, path: Path
+    boxes: NamedBoxes, names: Sequence[str], row_of: Mapping[str, int], camera_row: Ints, cameras: Cameras, path: Path
 ) -> None:
     """Refuse boxes that were made on pictures of another size than the cameras', resized or undistorted."""
-    used = set(boxes.image_names)
+    used = set(names)
     for name, size in boxes.pictures.items():
         if name not in used or name not in row_of:
             continue
