@@ -1,11 +1,12 @@
-"""How long an import takes, and how much memory: a COLMAP binary model of many images and COCO boxes in them.
+"""How long an import takes, and how much memory: COLMAP's model and COCO boxes, and tables of images and boxes.
 
-    python benchmarks/import_speed.py [--images N] [--detections N] [--points N] [--json FILE]
+    python benchmarks/import_speed.py [--images N] [--detections N] [--rows N] [--points N] [--json FILE]
 
 Writes a model (cameras, images with observations of points, rigs and frames, as COLMAP 4 does) and a COCO file into a
-temporary folder, runs `valuemap import colmap` on them as a process of its own, and reports its seconds, processor
-seconds and peak memory, and how many processes wanted the processors meanwhile. The dataset that comes out is read back
-and counted.
+temporary folder, and runs `valuemap import colmap` on them as a process of its own; then the same for
+`valuemap import csv` with two tables, of boxes in any order, one image for ten of them, and with a thirtieth of them,
+so that what a row takes is told apart from what Python takes. It reports seconds, processor seconds and peak memory,
+and how many processes wanted the processors meanwhile. The dataset that comes out is read back and counted.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import struct
 import subprocess
 import sys
@@ -78,21 +78,54 @@ def write_coco(path: Path, images: int, detections: int) -> None:
         file.write("]}\n")
 
 
-def run_import(folder: Path) -> dict[str, Any]:
-    """Import in a process of its own; return what it took."""
-    command = [sys.executable, "-m", "valuemap.cli", "import", "colmap", str(folder / "model")]
-    command += ["--detections", str(folder / "boxes.json"), "--out", str(folder / "dataset")]
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+def write_tables(folder: Path, images: int, detections: int) -> None:
+    """Write a table of images along straight roads, and one of boxes in any order."""
+    folder.mkdir()
+    random = np.random.default_rng(2)
+    with (folder / "images.csv").open("w", encoding="utf-8") as file:
+        file.write("image,x,y,z,heading_deg,pass,timestamp,width_px,height_px,fx,cx,cy\n")
+        for i in range(images):
+            row, number = divmod(i, _IMAGES_OF_A_PASS)
+            place = f"{20.0 * row},{_STEP_M * number},1.5,0,pass{row:04d},{0.2 * i:.1f}"
+            file.write(f"pass{row:04d}/{number:06d}.jpg,{place},1920,1080,1000,960,540\n")
+    image = random.integers(0, images, detections).tolist()
+    box = random.uniform([0.0, 0.0, 8.0, 8.0, 0.1], [1880.0, 1000.0, 40.0, 40.0, 1.0], (detections, 5)).tolist()
+    with (folder / "boxes.csv").open("w", encoding="utf-8") as file:
+        file.write("image,class,left,top,width,height,score\n")
+        for i, (left, top, width, height, score) in zip(image, box, strict=True):
+            row, number = divmod(i, _IMAGES_OF_A_PASS)
+            kind = "light" if left > top else "sign"
+            numbers = f"{left:.3f},{top:.3f},{width:.3f},{height:.3f},{score:.4f}"
+            file.write(f"pass{row:04d}/{number:06d}.jpg,{kind},{numbers}\n")
+
+
+def run_import(folder: Path, *what: str) -> dict[str, Any]:
+    """Import in a process of its own; return what it took, and what came out."""
+    command = [sys.executable, "-c", _RUN, "import", *what, "--out", str(folder / "dataset")]
     start = time.perf_counter()
-    subprocess.run(command, check=True)
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
     seconds = time.perf_counter() - start
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    processor_s, peak_mb = json.loads(done.stderr.splitlines()[-1])
+    dataset = read_dataset(folder / "dataset")
     return {
+        "images": len(dataset.images),
+        "detections": len(dataset.detections),
         "seconds": round(seconds, 1),
-        "processor_seconds": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
-        "peak_memory_mb": after.ru_maxrss // 1024,
+        "processor_seconds": processor_s,
+        "peak_memory_mb": peak_mb,
         "load_average": round(os.getloadavg()[0], 1),
     }
+
+
+_RUN = """
+import atexit, json, resource, sys
+from valuemap.cli import main
+def told():
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    print(json.dumps([round(used.ru_utime + used.ru_stime, 1), used.ru_maxrss >> 10]), file=sys.stderr)
+atexit.register(told)
+main()
+"""
 
 
 def main() -> int:
@@ -101,18 +134,31 @@ def main() -> int:
     parser.add_argument("--images", type=int, default=100_000)
     parser.add_argument("--detections", type=int, default=1_000_000)
     parser.add_argument("--points", type=int, default=200, help="observations of points an image, which are not needed")
+    parser.add_argument("--rows", type=int, default=3_000_000, help="boxes in a table")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
+    results: dict[str, Any] = {}
+    expected: dict[str, tuple[int, int]] = {"colmap": (options.images, options.detections)}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
         write_model(folder / "model", options.images, options.points)
         write_coco(folder / "boxes.json", options.images, options.detections)
         sizes = {path.name: path.stat().st_size for path in (folder / "model" / "images.bin", folder / "boxes.json")}
-        took = run_import(folder)
-        dataset = read_dataset(folder / "dataset")
-    counts = {"images": len(dataset.images), "detections": len(dataset.detections)}
-    result = {**counts, "points_per_image": options.points, "bytes": sizes, **took}
-    print(json.dumps(result))
+        took = run_import(folder, "colmap", str(folder / "model"), "--detections", str(folder / "boxes.json"))
+        results["colmap"] = {"points_per_image": options.points, "bytes": sizes, **took}
+        print(json.dumps(results["colmap"]), flush=True)
+    for rows in (options.rows // 30, options.rows):
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            write_tables(folder / "tables", rows // 10, rows)
+            images, boxes = (folder / "tables" / f"{which}.csv" for which in ("images", "boxes"))
+            size = boxes.stat().st_size
+            took = run_import(folder, "csv", str(images), "--detections", str(boxes))
+            results[f"csv {rows}"], expected[f"csv {rows}"] = {"bytes": size, **took}, (rows // 10, rows)
+            print(json.dumps(results[f"csv {rows}"]), flush=True)
+    few, many = (results[f"csv {rows}"] for rows in (options.rows // 30, options.rows))
+    grown_mb = many["peak_memory_mb"] - few["peak_memory_mb"]
+    results["csv_mb_per_million_rows"] = round(1e6 * grown_mb / (many["detections"] - few["detections"]))
     keep_record(
         options.json,
         {
@@ -120,10 +166,10 @@ def main() -> int:
             "command": "python benchmarks/import_speed.py",
             "data": "simulated",
             **describe_machine(),
-            "results": result,
+            "results": results,
         },
     )
-    return int(counts != {"images": options.images, "detections": options.detections})
+    return int(any((results[key]["images"], results[key]["detections"]) != size for key, size in expected.items()))
 
 
 if __name__ == "__main__":
