@@ -48,6 +48,8 @@ CELL_SIZES = (200.0, 500.0, 2000.0, 1e6)
 CHANGED = 20
 MOVED = 10
 MOVED_BY_M = 3.0
+SEEDS_CHOSEN_ON = 3
+"""What tells changes was looked into on so many seeds."""
 KILLS = 10
 UPDATED_SHARE = 0.05
 SET = ("--set=correct_poses=0",)
@@ -318,10 +320,29 @@ def change(arguments: argparse.Namespace) -> dict[str, Any]:
     for seed in range(arguments.seeds):
         runs.append(change_of(arguments.preset, seed))
         print(json.dumps(runs[-1]), flush=True)
-    right = sum(sum(run["right"].values()) for run in runs)
-    changed = sum(sum(run["changed"].values()) for run in runs)
-    others = sum(run["others_that_change"] for run in runs)
-    return {"moved_by_m": MOVED_BY_M, "right_share": right / changed, "others_that_change": others, "runs": runs}
+    return {
+        "moved_by_m": MOVED_BY_M,
+        **summed(runs),
+        "seeds_not_looked_at_before": summed(runs[SEEDS_CHOSEN_ON:]),
+        "runs": runs,
+    }
+
+
+def summed(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return what the runs say together."""
+    right, changed, had = (
+        sum(sum(run[name].values()) for run in runs) for name in ("right", "changed", "in_map_before")
+    )
+    added = sum(run["changed"]["added"] for run in runs)
+    counts = (
+        *("others_in_map_before", "others_that_change", "false_labels_before", "false_labels_that_change"),
+        *("standing_objects_new_to_the_map", "false_labels_new_to_the_map"),
+    )
+    return {
+        "right_share": round(right / max(changed, 1), 4),
+        "right_share_of_what_the_map_had_and_of_added": round(right / max(had + added, 1), 4),
+        **{name: sum(run[name] for run in runs) for name in counts},
+    }
 
 
 def change_of(preset: str, seed: int) -> dict[str, Any]:
@@ -369,15 +390,25 @@ def change_of(preset: str, seed: int) -> dict[str, Any]:
     others = np.setdiff1d(np.arange(len(place)), [*removed, *added, *moved])
     touched = {i for o in [*removed, *added, *moved] for i in near(where, place[o])}
     touched |= {i for o in moved for i in near(where, place[o] + [MOVED_BY_M, 0.0, 0.0])}
-    wrong = [kind for i, kind in enumerate(kinds) if i not in touched and kind in ("removed", "added", "moved")]
+    # What else the maps say: of objects that stand, and of what is none (temporary things and lookalikes are seen too).
+    had = before.labels.position_in_world_m
+    is_other = np.array([i not in touched for i in range(len(kinds))])
+    is_true = np.array([bool(near(place[others], at)) for at in where])
+    is_told = np.array([kind in ("removed", "moved") for kind in kinds])
+    is_fresh = np.array([kind == "added" and not near(had, at) for kind, at in zip(kinds, where, strict=True)])
+    is_known = is_other & (~np.isnan(was[:, 0]))
     told = [changes.state.texts()[i] for o in [*removed, *added, *moved] for i in near(where, place[o])]
     return {
         "seed": seed,
         "changed": {"removed": len(removed), "added": len(added), "moved": len(moved)},
         "right": right,
-        "others": len(others),
-        "others_that_change": len(wrong),
-        "what_they_change_to": sorted(wrong),
+        "others_in_map_before": int((is_known & is_true).sum()),
+        "others_that_change": int((is_known & is_true & is_told).sum()),
+        "false_labels_before": int((is_known & ~is_true).sum()),
+        "false_labels_that_change": int((is_known & ~is_true & is_told).sum()),
+        "standing_objects_new_to_the_map": int((is_other & is_true & is_fresh).sum()),
+        "false_labels_new_to_the_map": int((is_other & ~is_true & is_fresh).sum()),
+        "hidden_share": result.run["update"]["hidden_share"],
         "labels_before": len(before.labels),
         "in_map_before": {
             "removed": sum(bool(near(before.labels.position_in_world_m, place[o])) for o in removed),

@@ -25,9 +25,9 @@ from valuemap.rejected import find_rejected
 from valuemap.tables import Categories, Changes, Floats, IdBridge, join_tables, read_table, table_to_arrow
 from valuemap.tiles.compare import Comparison
 from valuemap.update import compare
-from valuemap.update.changes import match_labels, match_places
+from valuemap.update.changes import judge, match_labels, match_places
 from valuemap.update.join import join_datasets
-from valuemap.update.looks import HIDDEN_OF, Lookout, Sights
+from valuemap.update.looks import HIDDEN_OF, Lookout, Looks, Sights
 
 SET = ("detection_sigma_px=1.5", "position_sigma_m=0.05", "rotation_sigma_deg=0.05")
 LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -169,6 +169,30 @@ def test_labels_of_two_epochs_are_one_where_their_covariances_say_so(years: Path
     # Of two at one place each is one of the old ones.
     twice = join_tables([labels, labels.replace(label_id=labels.label_id + 1000)])
     assert sorted(match_places(labels, twice).tolist()) == sorted([*range(len(labels)), *[-1] * len(labels)])
+
+
+def test_of_two_heads_side_by_side_neither_takes_the_place_of_the_other(years: Path) -> None:
+    labels = valuemap.read_map(years / "map").labels[:2]
+    sigma_m = np.tile([0.01, 0.0, 0.0, 0.01, 0.0, 0.01], (2, 1))
+    heads = labels.replace(position_in_world_m=np.array([[0.0, 0, 0], [0.6, 0, 0]]), covariance_m2=sigma_m)
+    # The second of the old ones is the nearest to the first of the new ones.
+    again = heads.replace(position_in_world_m=heads.position_in_world_m + [0.35, 0.0, 0.0])
+    assert match_places(heads, again).tolist() == [0, 1]
+    assert match_places(heads, again[1:]).tolist() == [1]
+
+
+def test_what_was_rather_missed_has_moved_where_something_new_stands_beside_it(years: Path) -> None:
+    labels = valuemap.read_map(years / "map").labels[:2]
+    labels = labels.replace(position_in_world_m=np.array([[0.0, 0, 0], [3.0, 0, 0]]))
+
+    def judged(odds: float, *, before: float = -1.0) -> list[str]:
+        looks = {0: (Looks(9, 9, 20.0, 0, 0), Looks(9, 0, odds, 0, 0)), 1: (Looks(9, 0, before, 0, 0), Looks(9, 9, 20.0, 0, 0))}  # fmt: skip # noqa: E501
+        return judge(labels, np.array([0, -1]), ["confirmed"], np.zeros(2, np.bool_), looks).state
+
+    assert judged(-9.0) == ["gone", "moved"]
+    assert judged(-2.0) == ["uncertain", "moved"]
+    assert judged(0.5) == ["confirmed", "new"]
+    assert judged(-2.0, before=1.0) == ["uncertain", "new"]
 
 
 def test_one_drive_that_missed_says_gone_only_where_drives_seldom_miss_what_is_there(years: Path) -> None:

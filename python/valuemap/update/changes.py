@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from valuemap.dataset import rows_of
@@ -65,8 +68,9 @@ def match_labels(old: Labels, old_votes: Votes, new: Labels, new_votes: Votes) -
 def match_places(old: Labels, new: Labels) -> Ints:
     """Return the row of the old label (N) that stands where each new one does, -1 for none.
 
-    Both are of one class, and no farther apart than their covariances explain; the pairs that agree best go first, and
-    each label is of one pair.
+    Both are of one class, and no farther apart than their covariances explain. Of all ways to pair them this is the
+    likeliest: it has the least sum of squared sigmas, where a label alone counts as much as a pair that is just
+    possible. So of two heads side by side neither takes the other's place.
     """
     before = np.full(len(new), -1)
     if not len(old) or not len(new):
@@ -79,13 +83,20 @@ def match_places(old: Labels, new: Labels) -> Ints:
     j = np.repeat(np.arange(len(new)), [len(others) for others in near])
     same = old.class_name.codes[i] == code[j]
     i, j = i[same], j[same]
-    apart = _apart(old, i, new, j)
-    pairs = zip(apart.tolist(), i.tolist(), j.tolist(), strict=True)
-    taken: set[int] = set()
-    for _, i, j in sorted(pair for pair in pairs if pair[0] <= SAME_PLACE_CHI2):
-        if i not in taken and before[j] < 0:
-            before[j] = i
-            taken.add(i)
+    gain = SAME_PLACE_CHI2 - _apart(old, i, new, j)
+    i, j, gain = i[gain >= 0.0], j[gain >= 0.0], gain[gain >= 0.0]
+    # What has nothing to do with each other is paired by itself.
+    graph = coo_array((np.ones(len(i)), (i, len(old) + j)), shape=(len(old) + len(new),) * 2)
+    group = connected_components(graph, directed=False)[1][i]
+    order = np.lexsort((j, i, group))
+    for pairs in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
+        rows, row = np.unique(i[pairs], return_inverse=True)
+        columns, column = np.unique(j[pairs], return_inverse=True)
+        table = np.full((len(rows), len(columns)), -np.inf)
+        table[row, column] = gain[pairs]
+        for first, second in zip(*linear_sum_assignment(np.maximum(table, -1.0), maximize=True), strict=True):
+            if table[first, second] >= 0.0:
+                before[columns[second]] = rows[first]
     return before
 
 
@@ -115,7 +126,9 @@ def judge(
             state.append("confirmed" if first.say_there else "new")
     moved_from = np.full(len(new), -1)
     position, code = new.position_in_world_m, new.class_name.codes.tolist()
-    gone = [row for row in looks if before[row] >= 0 and state[row] == "gone" and state_before[before[row]] != "gone"]
+    # Where something new stands beside it, what was rather missed need not be sure to be gone: one event explains both.
+    missing = ("gone", "uncertain")
+    gone = [row for row in looks if before[row] >= 0 and state[row] in missing and state_before[before[row]] != "gone"]
     fresh = [row for row in looks if before[row] < 0 and state[row] == "new" and looks[row][1].say_there]
     for row, source in _pairs(position, code, fresh, gone):
         if looks[row][0].log_odds <= 0.0:  # Nobody saw it there before.
