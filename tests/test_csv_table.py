@@ -9,7 +9,7 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from valuemap.csv_table import read_csv_arrow
+from valuemap.csv_table import odd_fields, read_csv_arrow
 from valuemap.errors import InputError
 
 TYPES = {**dict.fromkeys("xyz", pa.float64()), "class": pa.string()}
@@ -38,6 +38,8 @@ def read(folder: Path, content: bytes, *, bad_numbers_are_nan: bool = False) -> 
         b"x;y;z;class\n1;2;3,5;light\n",
         b"x\ty\tz\tclass\n1\t2\t3.5\tlight\n",
         b'"x","y","z","class"\n1,2,3.5,"light"\n',
+        PLAIN + b",,,\n\n , , ,\r\n",
+        b"x;y;z;class\n1;2;3,5;light\n;;;\n",
     ],
 )
 def test_all_these_say_the_same(tmp_path: Path, content: bytes) -> None:
@@ -54,6 +56,38 @@ def test_what_is_no_number_is_an_error_or_nan(tmp_path: Path) -> None:
         read(tmp_path, content)
     rows = read(tmp_path, content, bad_numbers_are_nan=True)
     assert str(rows) == "[{'x': 1.0, 'y': nan, 'z': 3.0}, {'x': 4.0, 'y': nan, 'z': 6.0}]"
+
+
+def test_empty_rows_at_the_end_of_a_large_file_are_none(tmp_path: Path) -> None:
+    rows = [f"{number},2,3.5,light" for number in range(100_000)]
+    content = "x,y,z,class\n" + "\n".join(rows) + "\n"
+    assert len(read(tmp_path, content.encode())) == len(rows)
+    assert len(read(tmp_path, (content + ",,,\n,,,\n").encode())) == len(rows)
+
+
+def test_which_fields_are_no_numbers_is_known(tmp_path: Path) -> None:
+    path = tmp_path / "points.csv"
+    path.write_text('x,y,Z\n1,2,3\n1 m,-,6_0\n"1,500",n/a,9\n,,\n', encoding="utf-8")
+    table = read_csv_arrow(path, TYPES, has_missing=False, hint="a hint", bad_numbers_are_nan=True)
+    assert table.num_rows == 3
+    assert [(odd_fields(table, name)[0].tolist(), odd_fields(table, name)[1]) for name in "xyz"] == [
+        ([1, 2], "1 m"), ([], ""), ([1], "6_0")
+    ]  # fmt: skip
+    assert str(table.column("z").to_pylist()) == "[3.0, nan, 9.0]"
+
+
+@pytest.mark.parametrize(
+    ("content", "hint"),
+    [
+        (b"# my points\nx,y,z\n1,2,3\n", "remove the lines that begin with #"),
+        ("x,y,z,class\n1,2,3,Stra\u00dfe\n".encode("latin-1"), "byte 22 is not UTF-8: save it as CSV in UTF-8"),
+    ],
+)
+def test_the_hint_says_what_helps(tmp_path: Path, content: bytes, hint: str) -> None:
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, content)
+    assert caught.value.hint.startswith((hint, "the first line names the columns: " + hint))
+    assert caught.value.hint.endswith("; a hint")
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from valuemap.readers.structure.pose_graph import start_of
+from valuemap.readers.structure.pose_graph import _of_one_place, start_of
 from valuemap.readers.structure.two_views import Pair, _turns_by_plane, find_way
 from valuemap.tables import Bools, Floats
 
@@ -55,7 +55,7 @@ def errors(pairs: list[Pair], rotation: Floats, center: Floats, gps_sigma_m: flo
     """Return how wrong the poses are: positions, m, where all are there, and rotations, degrees, beside each other."""
     random = np.random.default_rng(5)
     gps = center + random.normal(0.0, gps_sigma_m, center.shape)
-    poses = start_of(pairs, len(center), gps, np.full(len(center), gps_sigma_m))
+    poses = start_of(pairs, np.zeros(len(center), np.int64), gps, np.full(len(center), gps_sigma_m))
     assert sorted(poses) == list(range(len(center)))
     off = np.array([poses[row][0].T @ rotation[row] for row in range(len(center))])
     turned = np.degrees(Rotation.from_matrix(off[0].T @ off).magnitude())
@@ -118,6 +118,28 @@ def test_pairs_of_different_places_are_not_believed() -> None:
     assert turned.max() < 1.0
 
 
+def test_houses_alike_in_another_street_do_not_close_a_round() -> None:
+    """The first picture and the last show houses alike, in more features than the pictures at the corner share."""
+    rotation, center = drive()
+    poor = [
+        replace(pair, feature=pair.feature[:35], ray=pair.ray[:, :35])
+        if pair.first <= 15 < pair.second and pair.second == pair.first + 1
+        else pair
+        for pair in pairs_of(rotation, center, 2)
+        if not pair.first <= 15 < pair.second or pair.second == pair.first + 1
+    ]
+    true = next(pair for pair in pairs_of(rotation, center, 4) if pair.first == 0 and pair.second == 1)
+    alike = [replace(true, first=0, second=COUNT - back, feature=true.feature + 6000 * back) for back in (1, 2, 3)]
+    away, turned = errors([*poor, *alike], rotation, center)
+    assert away.max() < 1.0
+    assert turned.max() < 3.0
+    # Where the way around says the same, they are believed.
+    closing = replace(true, first=0, second=COUNT - 1, second_from_first=(rotation[-1] @ rotation[0].T)[None])
+    kept = _of_one_place([*poor, closing, *alike], np.zeros(COUNT, np.int64))
+    assert len(kept) == len(poor) + 1
+    assert kept[-1] is closing
+
+
 def test_pictures_of_a_car_that_stands_are_at_one_place() -> None:
     """Their GPS is not: without parallax a pair says how near its pictures are, as others know the depths."""
     rotation, center = drive()
@@ -125,7 +147,7 @@ def test_pictures_of_a_car_that_stands_are_at_one_place() -> None:
     rotation, center = rotation[where], center[where]
     random = np.random.default_rng(3)
     gps = center + random.normal(0.0, 2.0, center.shape)
-    poses = start_of(pairs_of(rotation, center, 3, 6), len(center), gps, np.full(len(center), 2.0))
+    poses = start_of(pairs_of(rotation, center, 3, 6), np.zeros(len(center), np.int64), gps, np.full(len(center), 2.0))
     standing = np.array([poses[row][1] for row in np.flatnonzero(where == 8).tolist()])
     assert np.linalg.norm(standing - standing.mean(axis=0), axis=1).max() < 0.2
     assert np.linalg.norm(gps[where == 8] - center[where == 8], axis=1).max() > 2.0
@@ -135,9 +157,10 @@ def test_the_scale_is_the_same_along_a_drive() -> None:
     """By the GPS of the first pictures alone, without noise, the last are where they are."""
     rotation, center = drive()
     gps = np.where(np.arange(COUNT)[:, None] < 18, center, np.nan)
-    poses = start_of(pairs_of(rotation, center, 4), COUNT, gps, np.full(COUNT, 0.05))
+    poses = start_of(pairs_of(rotation, center, 4), np.zeros(COUNT, np.int64), gps, np.full(COUNT, 0.05))
     assert np.linalg.norm(poses[COUNT - 1][1] - center[-1]) < 1.0
-    assert start_of(pairs_of(rotation, center, 4), COUNT, np.full((COUNT, 3), np.nan), np.ones(COUNT)) == {}
+    nowhere = np.full((COUNT, 3), np.nan)
+    assert start_of(pairs_of(rotation, center, 4), np.zeros(COUNT, np.int64), nowhere, np.ones(COUNT)) == {}
 
 
 def test_the_way_between_two_cameras_is_where_most_matches_say() -> None:

@@ -17,6 +17,7 @@ from reading import SPOILS, azimuths_deg, meeting_point, refusal, spoiled, write
 from valuemap.cameras import camera_centers, cast_rays, rotation_matrices
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, read_dataset, write_dataset
+from valuemap.errors import InputError
 from valuemap.readers.bearings import VERTICAL_SIGMA_PX, read_bearings
 from valuemap.readers.csv_poses import read_csv_poses
 from valuemap.readers.detections import DetectionFile
@@ -47,6 +48,38 @@ def test_a_heading_counts_clockwise_from_north_and_right_of_it_is_more(tmp_path:
     assert_allclose(cast_rays(dataset).direction_in_world[:, 2], 0.0, atol=1e-5)
     assert dataset.frame.anchor == (0.0, 0.0, 0.0)
     assert_allclose(camera_centers(dataset.images)[1], [0.0, 1e-4 * DEGREE_NORTH_M, 0.0], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "said", "hint"),
+    [
+        ("lat,lon,heading_deg", "52°30'N,4,0", 'lat: expected a number, found "52°30\'N"', "decimal degrees"),
+        ("lat,lon,heading_deg", "52,4,north", "heading_deg: expected a number, found 'north'", "plain numbers"),
+        ("lat,lon,height,heading_deg", "52,4,,0", "height: expected a number, found none", "--camera-height"),
+        ("x,y,heading_deg", "12 m,4,0", "x: expected a number, found '12 m'", "metres"),
+        ("lat,lon,heading_deg,fx,cx,cy,width_px,height_px", '52,4,0,"1,500",1,1,9,9', "found '1,500' (2 rows)", ""),
+    ],
+)
+def test_a_column_without_any_number_is_named_with_what_it_has(
+    tmp_path: Path, header: str, row: str, said: str, hint: str
+) -> None:
+    poses = poses_of(tmp_path, f"image,{header}", f"a.jpg,{row}", f"b.jpg,{row}")
+    with pytest.raises(InputError) as caught:
+        read_csv_poses(poses, camera=None if "fx" in header else CAMERA)
+    assert f"poses.csv line 2: {said.partition(':')[0] if hint else 'fx'}" in str(caught.value)
+    assert said in str(caught.value)
+    assert hint in caught.value.hint
+
+
+def test_a_depth_that_is_no_number_is_not_lost_in_silence(tmp_path: Path) -> None:
+    rows = ["lat,lon,bearing,depth", *["52,4,10,12"] * 1, "52,4,20,-", "52,4,30,", "52,4,40,12 m"]
+    path = write(tmp_path / "bearings.csv", "\n".join(rows) + "\n")
+    dataset = read_bearings(path, max_rejected=0.5)
+    assert len(dataset.detections) == 3
+    assert dataset.detections.range_m is not None
+    assert_allclose(dataset.detections.range_m, [12.0, np.nan, np.nan])
+    with pytest.raises(InputError, match="1 of 4 boxes cannot be used"):
+        read_bearings(path)
 
 
 @pytest.mark.parametrize(
@@ -258,8 +291,8 @@ def test_key_points_as_fractions_of_a_panorama(tmp_path: Path) -> None:
         ("image,x,y,heading_deg", "a.jpg,1e9,4,1", {"crs": "EPSG:32632"}, "is no place in it"),
         ("image,lat,lon,heading_deg,timestamp", "a.jpg,52,4,1,noon", {}, "line 2: timestamp: expected seconds"),
         ("image,lat,lon,qw,qx,qy,qz", "a.jpg,52,4,1,2,3,4", {}, "a number of its pose is missing"),
-        ("image,lat,lon,heading_deg", "a.jpg,52,4,x", {}, "a number of its pose is missing"),
-        ("image,lat,lon,heading_deg", "a.jpg,52,x,0", {}, "no image has a place"),
+        ("image,lat,lon,heading_deg", "a.jpg,52,4,x", {}, "heading_deg: expected a number, found 'x'"),
+        ("image,lat,lon,heading_deg", "a.jpg,52,x,0", {}, "lon: expected a number, found 'x'"),
         ("image,lat,lon,heading_deg", "a.jpg,52,4,0\na.jpg,52,4,0", {}, "occur more than once, the first is 'a.jpg'"),
     ],
 )

@@ -118,6 +118,23 @@ def test_a_range_and_a_vertical_sigma_may_be_given(tmp_path: Path) -> None:
     assert not found.size_px.any()
 
 
+def test_names_as_windows_writes_them(tmp_path: Path) -> None:
+    """Separators the other way, suffixes in capitals, lines that end in two characters."""
+    boxes = write(tmp_path / "boxes.json", COCO.replace("a/1.jpg", "a\\\\1.JPG").replace("\n", "\r\n"))
+    assert_allclose(read(tmp_path, boxes).detections.center_px, [CENTER])
+    labels = write(tmp_path / "labels" / "1.TXT", YOLO.replace("\n", "\r\n")).parent
+    assert_allclose(read(tmp_path, labels).detections.center_px, [CENTER])
+
+
+@pytest.mark.parametrize(("start", "what"), [(b"\x1f\x8b\x08", "is gzip"), (b"PK\3\4", "is a zip archive")])
+def test_packed_files_are_named(tmp_path: Path, start: bytes, what: str) -> None:
+    path = tmp_path / "boxes.json"
+    path.write_bytes(start + b"\0" * 40)
+    said = refusal(lambda: read(tmp_path, path))
+    assert what in said
+    assert "unpack it first" in said
+
+
 def test_a_polygon_of_yolo_counts_as_its_box(tmp_path: Path) -> None:
     labels = detections_in(tmp_path, "yolo")
     write(labels / "a" / "1.txt", "2 0.15625 0.125 0.1875 0.104166666667 0.21875 0.125 0.1875 0.145833333333\n")

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pa_csv
+from numpy.typing import NDArray
 
 from valuemap.arrow import numbers_to_arrow
 from valuemap.errors import InputError
@@ -28,7 +29,9 @@ def read_csv_arrow(
     Fields are separated by commas, or by semicolons or tabs where the header line has no comma; numbers then may have
     decimal commas. Gzip and a byte order mark are read through. A column whose name is that of a type but for the case
     of its letters is taken as that. With `has_missing` an empty field is a missing value; else it is an empty text,
-    and no number. With `bad_numbers_are_nan`, what should be a float64 and is no number is NaN, not an error.
+    and no number. With `bad_numbers_are_nan`, what should be a float64 and is no number is NaN, not an error; which
+    fields are no numbers the metadata of the column say (`odd_fields`). Empty rows at the end, as spreadsheets leave
+    them, are none.
 
     Raises
     ------
@@ -55,7 +58,7 @@ def read_csv_arrow(
         table = table.rename_columns([same.get(name.strip().lower(), name.strip()) for name in table.column_names])
     except (pa.ArrowException, OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
         reason = str(error).splitlines()[0]
-        raise InputError(f"{path}: cannot be read as CSV: {reason}", hint=hint) from error
+        raise InputError(f"{path}: cannot be read as CSV: {reason}", hint=_better_hint(path, hint)) from error
     # Where a quote in the header line is not closed, its columns are not those that the types were given for.
     if any(field.type != types.get(field.name, field.type) for field in table.schema):
         raise InputError(f"{path}: the first line has a quotation mark that is not closed", hint=hint)
@@ -71,8 +74,38 @@ def _start_of_large(path: Path) -> bytes | None:
         return None
     with path.open("rb") as file:
         start = file.read(_START)
+        file.seek(max(path.stat().st_size - _LOOKED_AT, 0))
+        end = file.read()
+    after = end[len(end.rstrip(_SEPARATORS)) :].splitlines()
+    if any(after[1:]):  # Empty rows at its end are to be left out.
+        return None
     is_plain = start[:1].isalpha() and not start.startswith(_NO_TEXT) and b"\0" not in start[:_LOOKED_AT]
     return start if len(start) == _START and is_plain and b"\n" in start else None
+
+
+def odd_fields(table: pa.Table, name: str) -> tuple[NDArray[np.int64], str]:
+    """Return the rows of the fields of a column of numbers that are other texts, and the first of these."""
+    found = table.schema.field(name).metadata or {}
+    return np.frombuffer(found.get(_ODD_ROWS, b""), dtype=np.int64), found.get(_ODD, b"").decode("utf-8", "replace")
+
+
+_ODD, _ODD_ROWS = b"valuemap: first field that is no number", b"valuemap: rows of fields that are no numbers"
+_NOTHING = frozenset({"", "nan", "na", "n/a", "none", "null", "-"})
+"""How tables say that nothing is known."""
+
+
+def _better_hint(path: Path, hint: str) -> str:
+    """Return what helps with a file that is no CSV, by what it begins with."""
+    try:
+        content = _read_text_bytes(path, hint)
+        content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        return f"byte {error.start} is not UTF-8: save it as CSV in UTF-8; {hint}"
+    except (InputError, OSError, EOFError, zlib.error):
+        return hint
+    if content.lstrip().startswith(b"#"):
+        return f"the first line names the columns: remove the lines that begin with #; {hint}"
+    return hint
 
 
 def _read_text_bytes(path: Path, hint: str) -> bytes:
@@ -94,6 +127,10 @@ def _read_text_bytes(path: Path, hint: str) -> bytes:
     if b"\0" in content[:_LOOKED_AT]:
         raise InputError(f"{path}: cannot be read as CSV: it is no text", hint=hint)
     content = content.removeprefix(codecs.BOM_UTF8)
+    ends = len(content.rstrip(_SEPARATORS))
+    after = content[ends:]
+    # A row of separators alone is none; those of the last row that is one stay.
+    content = content[: ends + len(after.splitlines(keepends=True)[0])] if after else content
     # A header line without an end is a table without rows, too.
     return content if not content or b"\n" in content or b"\r" in content else content + b"\n"
 
@@ -116,6 +153,7 @@ _ALWAYS_UNPACKED = 64 * 2**20
 _START = 2**20
 """Files of no more bytes are read at once."""
 _NO_TEXT = (b"PK\3\4", b"PAR1")
+_SEPARATORS = b" \t\r\n,;"
 _LOOKED_AT = 1000
 """Bytes that say what a file is."""
 
@@ -160,13 +198,21 @@ def _parse_odd_csv(
     table = _parse_csv(source, separator, {**options, "column_types": as_texts})
     for name, kind in type_of.items():
         if kind == pa.float64() and table.column_names.count(name) == 1:
-            values = np.array([_number_or_nan(text, decimal) for text in table.column(name).to_pylist()])
-            table = table.set_column(table.column_names.index(name), name, numbers_to_arrow(values))
+            texts = table.column(name).to_pylist()
+            values = np.array([_number_or_nan(text, decimal) for text in texts])
+            odd = [
+                row
+                for row in np.flatnonzero(np.isnan(values)).tolist()
+                if (texts[row] or "").strip().lower() not in _NOTHING
+            ]
+            metadata = {_ODD: texts[odd[0]].strip()[:40], _ODD_ROWS: np.array(odd).tobytes()} if odd else None
+            field = pa.field(name, pa.float64(), metadata=metadata)
+            table = table.set_column(table.column_names.index(name), field, numbers_to_arrow(values))
     return table
 
 
 def _number_or_nan(text: str | None, decimal: str) -> float:
     try:
-        return float((text or "nan").replace(decimal, "."))
+        return math.nan if "_" in (text or "") else float((text or "nan").replace(decimal, "."))
     except ValueError:
         return math.nan

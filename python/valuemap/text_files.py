@@ -31,6 +31,7 @@ def check_file(path: Path, expected: str) -> Path:
 def read_text(path: Path, expected: str) -> str:
     """Return a file as text; `expected` says in words what should be there."""
     check_file(path, expected)
+    refuse_packed(path, expected)
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
@@ -42,6 +43,18 @@ def read_text(path: Path, expected: str) -> str:
     if not text.strip():
         raise InputError(f"{path}: is empty", hint=f"expected {expected}")
     return text
+
+
+def refuse_packed(path: Path, expected: str) -> None:
+    """Raise `InputError` where a file that should be text is packed."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(4)
+    except OSError:
+        return  # Whoever reads it says why.
+    for mark, what in ((b"\x1f\x8b", "gzip"), (b"PK\3\4", "a zip archive or a spreadsheet")):
+        if start.startswith(mark):
+            raise InputError(f"{path}: is {what}", hint=f"unpack it first; expected {expected}")
 
 
 def read_json(path: Path, expected: str) -> Any:

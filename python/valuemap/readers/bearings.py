@@ -86,7 +86,7 @@ def read_bearings(
         passes=[passes[row] for row in first],
         source=str(bearings),
     )
-    depth_m = table.numbers("depth") if table.has("depth") else None
+    depth_m = table.numbers_or_none("depth") if table.has("depth") else None
     x_px = ((bearing_deg / 360.0 + 0.5) % 1.0) * _WIDTH_PX
     dataset = assemble(
         name=bearings.stem,

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from valuemap.arrow import numbers_from_arrow
-from valuemap.csv_table import read_csv_arrow
+from valuemap.csv_table import odd_fields, read_csv_arrow
 from valuemap.errors import InputError, SettingError
 from valuemap.readers.files import check_file
 from valuemap.readers.texts import Texts
@@ -137,6 +137,25 @@ class CsvFile:
         values: Floats = numbers_from_arrow(self._column(name)).astype(np.float64)
         return values
 
+    def some_numbers(self, name: str, hint: str) -> Floats:
+        """Return a column as numbers (N), not all of which are NaN; `hint` says what to do where they are."""
+        values = self.numbers(name)
+        if np.isnan(values).all():
+            rows, text = odd_fields(self._table, self._name[name])
+            found = f"{text!r}" if len(rows) else "none"
+            raise InputError(
+                f"{self.line(int(rows[0]) if len(rows) else 0)}: {name}: expected a number, found {found}, and none in "
+                f"any of {len(values)} rows",
+                hint=hint,
+            )
+        return values
+
+    def numbers_or_none(self, name: str) -> Floats:
+        """Return a column as numbers (N), NaN where nothing is known and infinite where there is another text."""
+        values = self.numbers(name)
+        values[odd_fields(self._table, self._name[name])[0]] = np.inf
+        return values
+
     def finite_numbers(self, name: str) -> Floats:
         """Return a column as numbers (N) all of which are finite."""
         values = self.numbers(name)
@@ -153,7 +172,8 @@ class CsvFile:
         """Raise one error for all wrong rows (N), showing the first."""
         rows = np.flatnonzero(wrong)
         if len(rows):
-            found = reprlib.repr(self._column(name)[int(rows[0])].as_py())
+            odd, text = odd_fields(self._table, self._name[name])
+            found = reprlib.repr(text if len(odd) and odd[0] == rows[0] else self._column(name)[int(rows[0])].as_py())
             raise InputError(
                 f"{self.line(int(rows[0]))}: {name}: expected {expected}, found {found} ({len(rows)} rows)",
                 hint=self._hint,

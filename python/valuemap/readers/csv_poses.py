@@ -37,6 +37,10 @@ _NUMBERS = (
     *("position_sigma_m", "rotation_sigma_deg"),
 )
 _HEADINGS = ("heading_deg", "heading_rad", "yaw_deg", "yaw_rad")
+_NO_DEGREES = "write decimal degrees, as 52.5123 or -0.1276, without letters and signs"
+_NO_METRES = "write metres as plain numbers, as 1234.5"
+_NO_HEIGHT = "write metres as plain numbers, or remove the column and give --camera-height"
+_NO_NUMBER = "write plain numbers, or remove the column if nothing of it is known"
 
 
 @dataclass(frozen=True)
@@ -163,15 +167,15 @@ def _place(
             raise SettingError(
                 "crs and up: do not go with columns lat, lon", hint="leave them away: lat, lon are WGS84"
             )
-        height = table.numbers("height") if table.has("height") else level
-        place = np.stack([table.numbers("lon"), table.numbers("lat"), height], axis=1)
+        height = table.some_numbers("height", _NO_HEIGHT) if table.has("height") else level
+        place = np.stack([table.some_numbers(name, _NO_DEGREES) for name in ("lon", "lat")] + [height], axis=1)
         if vertical is None:
             return _on_earth(place_on_earth(place, anchor, first, source=source))
         return _on_earth(place_in_crs(place, "EPSG:4326", anchor, first, vertical=vertical, source=source))
     if not table.has("x", "y"):
         raise table.missing("lat, lon or x, y")
-    height = next((table.numbers(name) for name in ("z", "height") if table.has(name)), level)
-    position = np.stack([table.numbers("x"), table.numbers("y"), height], axis=1)
+    height = next((table.some_numbers(name, _NO_HEIGHT) for name in ("z", "height") if table.has(name)), level)
+    position = np.stack([table.some_numbers(name, _NO_METRES) for name in ("x", "y")] + [height], axis=1)
     if crs is not None:
         if up is not None:
             raise SettingError("up: does not go with crs", hint="leave it away: heights are along z")
@@ -195,7 +199,7 @@ def _local_from_cam(table: CsvFile, rotation: str, axes: str) -> Floats:
             raise InputError(
                 f"{table.path}: has both a quaternion and {headings[0]}", hint="remove the columns that do not count"
             )
-        quaternion = np.stack([table.numbers(name) for name in _QUATERNION], axis=1)
+        quaternion = np.stack([table.some_numbers(name, _NO_NUMBER) for name in _QUATERNION], axis=1)
         matrix = rotations_of_quaternions(quaternion)
         local_from_axes = matrix if rotation == "world_from_cam" else matrix.transpose(0, 2, 1)
         turned: Floats = local_from_axes @ AXES[axes]
@@ -203,7 +207,7 @@ def _local_from_cam(table: CsvFile, rotation: str, axes: str) -> Floats:
     if len(headings) != 1:
         raise table.missing(f"one of {', '.join(_HEADINGS)}, or {', '.join(_QUATERNION)}")
     name = headings[0]
-    angle_rad = table.numbers(name) * (math.pi / 180.0 if name.endswith("_deg") else 1.0)
+    angle_rad = table.some_numbers(name, _NO_NUMBER) * (math.pi / 180.0 if name.endswith("_deg") else 1.0)
     if name.endswith("_rad") and np.nanmax(np.abs(angle_rad), initial=0.0) > 4.0 * math.pi:
         raise InputError(
             f"{table.path}: {name}: expected radians, found {np.nanmax(np.abs(angle_rad)):g}",
@@ -211,7 +215,7 @@ def _local_from_cam(table: CsvFile, rotation: str, axes: str) -> Floats:
         )
     heading_rad = angle_rad if name.startswith("heading") else math.pi / 2.0 - angle_rad
     pitch, roll = (
-        np.radians(table.numbers(column)) if table.has(column) else np.zeros(len(table))
+        np.radians(table.some_numbers(column, _NO_NUMBER)) if table.has(column) else np.zeros(len(table))
         for column in ("pitch_deg", "roll_deg")
     )
     return local_from_cam(heading_rad, pitch, roll)
@@ -271,7 +275,7 @@ def _seconds(text: str, table: CsvFile, row: int) -> float:
 
 
 def _optional(table: CsvFile, name: str) -> Floats | None:
-    return table.numbers(name) if table.has(name) else None
+    return table.numbers_or_none(name) if table.has(name) else None
 
 
 def _radians(degrees: Floats | None) -> Floats | None:

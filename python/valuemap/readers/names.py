@@ -10,9 +10,10 @@ from pathlib import PurePosixPath
 def match_images(names: Collection[str], known: Sequence[str]) -> dict[str, int]:
     """Return the index in `known` of each of `names` that can be told for sure; the others are left out.
 
-    The exact name counts first, then the name without its suffix, the base name (without folders), and the base name
-    without its suffix: each only if no other name and no other known image has the same. `cam1/7.jpg` must not become
-    `cam0/7.jpg` only because `cam1` is not among the known, nor `7.png` become `7.jpg` beside another `7.jpg`.
+    The exact name counts first, then the name with Windows' separators turned, the name without its suffix, the base
+    name (without folders), and the base name without its suffix. Each counts only if no other name and no other known
+    image has the same. `cam1/7.jpg` must not become `cam0/7.jpg` only because `cam1` is not among the known, nor
+    `7.png` become `7.jpg` beside another `7.jpg`.
     """
     distinct = set(names)
     found: dict[str, int] = {}
@@ -29,12 +30,17 @@ def match_images(names: Collection[str], known: Sequence[str]) -> dict[str, int]
     return found
 
 
+def _slashed(name: str) -> str:
+    return name.replace("\\", "/")
+
+
 def _without_suffix(name: str) -> str:
-    return str(PurePosixPath(name).with_suffix("")) if PurePosixPath(name).suffix in _PICTURES else name
+    path = PurePosixPath(_slashed(name))
+    return str(path.with_suffix("")) if path.suffix in _PICTURES else str(path)
 
 
 def _base(name: str) -> str:
-    return PurePosixPath(name).name
+    return PurePosixPath(_slashed(name)).name
 
 
 _PICTURES = frozenset(
@@ -42,4 +48,10 @@ _PICTURES = frozenset(
     for lower in (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".ppm", ".txt")
     for suffix in (lower, lower.upper())
 )
-_KEYS: tuple[Callable[[str], str], ...] = (str, _without_suffix, _base, lambda name: _base(_without_suffix(name)))
+_KEYS: tuple[Callable[[str], str], ...] = (
+    str,
+    _slashed,
+    _without_suffix,
+    _base,
+    lambda name: _base(_without_suffix(name)),
+)

@@ -33,7 +33,7 @@ def read_csv_boxes(file: DetectionFile) -> NamedBoxes:
     """
     table = CsvFile(file.path, _EXPECTED, texts=_TEXTS, numbers=_NUMBERS, columns=file.columns)
     center, size = _boxes(table)
-    optional = {name: table.numbers(name) if table.has(name) else None for name in _OPTIONAL}
+    optional = {name: table.numbers_or_none(name) if table.has(name) else None for name in _OPTIONAL}
     return NamedBoxes(
         image_names=table.texts("image"),
         class_names=table.texts("class") if table.has("class") else Texts.repeated(file.class_name, len(table)),

@@ -29,7 +29,9 @@ def read_yolo(file: DetectionFile) -> NamedBoxes:
         There are no such files, a file is not text, or a row is of another form.
     """
     folder = check_folder(file.path, _EXPECTED)
-    paths = sorted(path for path in folder.rglob("*.txt") if path.name not in _NAMES_FILES)
+    paths = sorted(
+        path for path in folder.rglob("*") if path.suffix.lower() == ".txt" and path.name not in _NAMES_FILES
+    )
     if not paths:
         raise InputError(f"{folder}: there are no .txt files in it", hint=f"expected {_EXPECTED}")
     names = _class_names(folder)

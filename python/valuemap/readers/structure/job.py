@@ -62,6 +62,11 @@ class Job:
         """Return their standard deviations (N)."""
         return np.array([picture.sigma_m for picture in self.pictures], dtype=np.float64)
 
+    def drives(self) -> Ints:
+        """Return the number (N) of the drive of each picture."""
+        names = [picture.drive for picture in self.pictures]
+        return np.unique(names, return_inverse=True)[1].reshape(-1).astype(np.int64)
+
 
 @dataclass(frozen=True, eq=False)
 class Posed:

@@ -64,7 +64,7 @@ def find_models(job: Job, workspace: Path, *, threads: int, progress: Progress) 
     if len(ids) >= LEAST_IMAGES:
         progress("finding poses", 0, len(ids))
         pairs = read_pairs(workspace, ids, whole.cameras)
-        whole.poses = start_of(pairs, len(job.pictures), job.gps_in_world_m(), job.sigma_m())
+        whole.poses = start_of(pairs, job.drives(), job.gps_in_world_m(), job.sigma_m())
         progress("finding poses", len(ids), len(ids))
     if not whole.poses:
         raise InputError(
@@ -294,7 +294,7 @@ def _sights(job: Job, model: pycolmap.Reconstruction, row_of: dict[int, int], ou
         has_focal={number + 1: known for number, known in enumerate(job.has_focal)},
         gps_in_world_m=job.gps_in_world_m()[rows],
         sigma_m=job.sigma_m()[rows],
-        drive=np.unique([job.pictures[row].drive for row in rows], return_inverse=True)[1].reshape(-1),
+        drive=job.drives()[rows],
         image=of_image[fine],
         point=of_point,
         pixel=np.array(pixel, dtype=np.float64).reshape(-1, 2)[fine],

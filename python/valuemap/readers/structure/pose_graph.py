@@ -1,13 +1,15 @@
 """All pictures at once from their pairs: rotations, then the lengths of ways, then positions.
 
 Nothing grows from a first pair, so nothing bends: every pair has its say, and those that contradict the others lose it
-(L1 norm, then Cauchy's loss; each step is one sparse linear system). How long the way of one pair is beside that of
-another, what both see says: a feature of a picture has one depth, by whichever pair it is measured. The GPS gives the
-scale of what hangs together so, its place, and where north is.
+(L1 norm, then Cauchy's loss; each step is one sparse linear system). Pictures that follow each other show one place;
+others that are near may show two houses alike, and count only where the way around does not contradict. How long the
+way of one pair is beside that of another, what both see says: a feature of a picture has one depth, by whichever pair
+it is measured. The GPS gives the scale of what hangs together so, its place, and where north is.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -19,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from valuemap.readers.structure.onto_earth import similarity_onto
 from valuemap.readers.structure.two_views import Pair, Way, find_way
-from valuemap.tables import Floats, Ints
+from valuemap.tables import Bools, Floats, Ints
 
 LEAST_IMAGES = 3
 """Pictures with a GPS position, which a turn, a scale and a place need."""
@@ -32,6 +34,11 @@ _ROTATION_SIGMA_RAD, _ENOUGH = 0.005, 100
 (the focal length, the lens) is in all matches."""
 _LARGEST_TURN_RAD = 0.05
 """Pairs that are so far off the rotations of all others are not of one place."""
+_FOLLOWING = 12
+"""Pictures of a drive that follow each other by so many at most are of one place."""
+_OTHER_PLACE_RAD = 0.35
+"""A round of four corners turns so much too far, 20 degrees, where a focal length is five per cent wrong: EXIF knows it
+to a millimetre. Houses alike in another street turn a picture by 90 or 180 degrees."""
 _LEAST_PARALLAX_RAD = 0.01
 """Below it, 5 px at a focal length of 500 px, matches that are right to a pixel say nothing about a depth."""
 _LEAST_SHARED = 8
@@ -74,12 +81,15 @@ class _Edges:
 
 
 def start_of(
-    pairs: Sequence[Pair], count: int, gps_in_world_m: Floats, sigma_m: Floats
+    pairs: Sequence[Pair], drive: Ints, gps_in_world_m: Floats, sigma_m: Floats
 ) -> dict[int, tuple[Floats, Floats]]:
     """Return poses (cam_from_world, centre) by row, of pictures that hang together with three that have a GPS position.
 
-    `gps_in_world_m` (count, 3) is NaN where there is none, `sigma_m` (count) its standard deviation.
+    `drive` (count) numbers the drive of each, rows are in driving order; `gps_in_world_m` (count, 3) is NaN where there
+    is none, `sigma_m` (count) its standard deviation.
     """
+    count = len(drive)
+    pairs = _of_one_place(pairs, drive)
     rotation = _rotations(pairs, count)
     pairs = [pair for pair in pairs if np.linalg.norm(_turn_off(pair, rotation)) < _LARGEST_TURN_RAD]
     ways = [find_way(pair.ray[0] @ rotation[pair.first], pair.ray[1] @ rotation[pair.second]) for pair in pairs]
@@ -102,12 +112,52 @@ def start_of(
     return poses
 
 
+def _of_one_place(pairs: Sequence[Pair], drive: Ints) -> list[Pair]:
+    """Return pairs without those that turn otherwise than pictures on the way from one of the two to the other.
+
+    How sure that way is, the pairs along it say: their variances add up as resistances do.
+    """
+    count = len(drive)
+    place = np.zeros(count, dtype=np.int64)
+    for each in np.unique(drive):
+        place[drive == each] = np.arange((drive == each).sum())
+    one, two, sigma = _between(pairs)
+    follows: Bools = np.asarray((drive[one] == drive[two]) & (np.abs(place[two] - place[one]) <= _FOLLOWING))
+    along = [pair for pair, is_along in zip(pairs, follows, strict=True) if is_along]
+    if len(along) == len(pairs) or not along:
+        return list(pairs)
+    rotation = _rotations(along, count)
+    agrees = follows.copy()
+    agrees[follows] = [np.linalg.norm(_turn_off(pair, rotation)) < _LARGEST_TURN_RAD for pair in along]
+    group = _components(one[agrees], two[agrees], count)
+    weight = 1.0 / sigma[agrees] ** 2
+    between = coo_matrix((-weight, (one[agrees], two[agrees])), shape=(count, count))
+    total = np.bincount(one[agrees], weight, count) + np.bincount(two[agrees], weight, count)
+    factors = splu(((between + between.T).tocsc() + diags(total + _RIDGE * weight.max())).tocsc())
+    kept = []
+    for number, pair in enumerate(pairs):
+        if not follows[number] and group[pair.first] == group[pair.second]:
+            way = np.zeros(count)
+            way[pair.first], way[pair.second] = 1.0, -1.0
+            sure = 3.0 * math.sqrt(max(float(way @ factors.solve(way)), 0.0))
+            if np.linalg.norm(_turn_off(pair, rotation)) > _OTHER_PLACE_RAD + sure:
+                continue
+        kept.append(pair)
+    return kept
+
+
+def _between(pairs: Sequence[Pair]) -> tuple[Ints, Ints, Floats]:
+    """Return the rows of both pictures of pairs (M), and the standard deviation of their rotation."""
+    one = np.array([pair.first for pair in pairs], dtype=np.int64)
+    two = np.array([pair.second for pair in pairs], dtype=np.int64)
+    matches = np.array([min(len(pair.feature), _ENOUGH) for pair in pairs], dtype=np.float64)
+    return one, two, _ROTATION_SIGMA_RAD * np.sqrt(_ENOUGH / matches)
+
+
 def _rotations(pairs: Sequence[Pair], count: int) -> Floats:
     """Return rotations (count, 3, 3), cam from a world of each group of pictures that pairs hold together."""
     rotation = _grown(pairs, count)
-    one = np.array([pair.first for pair in pairs], dtype=np.int64)
-    two = np.array([pair.second for pair in pairs], dtype=np.int64)
-    sigma = _ROTATION_SIGMA_RAD * np.sqrt(_ENOUGH / np.array([min(len(pair.feature), _ENOUGH) for pair in pairs]))
+    one, two, sigma = _between(pairs)
     for loss in _losses():
         # R_two exp(w_two) = turn R_one exp(w_one), in the world's axes.
         edges = _Edges(one, two, np.array([_turn_off(pair, rotation) for pair in pairs]).reshape(-1, 3), sigma)
