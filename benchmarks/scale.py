@@ -147,8 +147,10 @@ def cpu_s() -> float:
 
 
 def simulate_only(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Simulate a city district by district."""
-    with dataset_of(argparse.Namespace(preset=arguments.preset, dataset=None)) as folder:
+    """Simulate a city district by district; it stays where --dataset says."""
+    if arguments.dataset is not None:
+        write_dataset_in_pieces(simulate_districts(PRESETS[arguments.preset], seed=0), arguments.dataset)
+    with dataset_of(arguments) as folder:
         size = rows_on_disk(folder)
     return {"images_and_detections": size, "cpu_seconds": round(cpu_s(), 1), "peak_memory_mb": peak_mb()}
 
@@ -171,6 +173,12 @@ def partition(arguments: argparse.Namespace) -> dict[str, Any]:
             "cpu_seconds": round(cpu_s() - before, 1),
             "peak_memory_mb": peak_mb(),
         }
+
+
+def whole(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Map a dataset as `valuemap map` does by itself: in memory, or in tiles on disk where it is large."""
+    with dataset_of(arguments) as folder, tempfile.TemporaryDirectory() as name:
+        return measured(folder, Path(name) / "map")
 
 
 def cells(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -485,6 +493,7 @@ def years(dataset: Dataset, removed: Ints, added: Ints, moved: Ints) -> tuple[Da
 PARTS = {
     "simulate": simulate_only,
     "partition": partition,
+    "map": whole,
     "cells": cells,
     "kills": kills,
     "update": update,
