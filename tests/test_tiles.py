@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ from valuemap.tiles.seams import join_cells
 from valuemap.tiles.solve import Solved, solve_cell
 from valuemap.tiles.source import InMemory
 from valuemap.tiles.store import hash_piece
-from valuemap.tiles.work import open_work, written
+from valuemap.tiles.work import MARKER, open_work, remove_work, written
 
 GRID = Grid.of(Frame(), 60.0)
 # With all noise known, only the classes are learned.
@@ -564,6 +565,25 @@ def test_whenever_a_run_is_ended_nothing_temporary_is_left(tmp_path: Path, where
         (work / where / ".tmp-1" / "part.parquet").write_bytes(b"half")
         raise KeyboardInterrupt
     assert sorted(path.name for path in (tmp_path / "work").rglob("*")) == ["cells", "valuemap-work.json"]
+
+
+def test_what_is_removed_is_never_there_by_half(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open_work(tmp_path / "work", resume=False) as work:
+        (work / "partition-1").mkdir()
+        for name in ("a", "b"):
+            (work / "partition-1" / name).write_bytes(b"1")
+
+    def killed(path: Path) -> None:
+        next(file for file in sorted(Path(path).rglob("*")) if file.is_file() and file.name in "ab").unlink()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(shutil, "rmtree", killed)
+        remove_work(work)
+    # What goes on from here takes no partition for whole that lacks a part, and the folder for its own.
+    with open_work(work, resume=True):
+        assert not (work / "partition-1").exists()
+        assert {path.name for path in work.iterdir()} <= {"cells", MARKER}
 
 
 def test_a_second_run_into_the_same_folder_is_refused(long_street: Path, tmp_path: Path) -> None:

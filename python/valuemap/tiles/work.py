@@ -61,8 +61,9 @@ def has_parts(path: Path) -> bool:
 
 
 def remove_work(path: Path) -> None:
-    """Remove the folder of a run that is over."""
+    """Remove the folder of a run that is over: the marker last, so that what a kill leaves of it is still ours."""
     with suppress(OSError):
+        _empty(path)
         shutil.rmtree(path)
 
 
@@ -127,10 +128,15 @@ def _remove_temporary(path: Path) -> None:
 
 
 def _remove(entry: Path) -> None:
-    if entry.is_dir() and not entry.is_symlink():
+    """Remove a file or folder; a folder is renamed first, so that what is there under its name is always whole."""
+    if not entry.is_dir() or entry.is_symlink():
+        entry.unlink(missing_ok=True)
+    elif entry.name.startswith(_TEMPORARY):
         shutil.rmtree(entry)
     else:
-        entry.unlink(missing_ok=True)
+        aside = Path(tempfile.mkdtemp(prefix=_TEMPORARY, dir=entry.parent))
+        entry.replace(aside / entry.name)
+        shutil.rmtree(aside)
 
 
 def _sync_all(paths: Sequence[Path]) -> None:
