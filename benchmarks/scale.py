@@ -242,8 +242,9 @@ def update(arguments: argparse.Namespace) -> dict[str, Any]:
         calibration = ("--calibration", str(folder / "map"))
         full, _ = timed("map", both, "--out", str(folder / "full"), *SET)
         again, _ = timed("map", both, "--out", str(folder / "rebuilt"), *SET, *calibration)
-        known = {path.name for path in (folder / "map" / "cells").iterdir()}
-        cells = {path.name for path in (folder / "updated" / "cells").iterdir()}
+        known, cells = (
+            {path.name for path in (folder / each / "cells").glob("*.parquet")} for each in ("map", "updated")
+        )
         updated, rebuilt = (labels_of(folder / each) for each in ("updated", "rebuilt"))
     return {
         **size,
