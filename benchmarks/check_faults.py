@@ -39,6 +39,7 @@ from kitti_signs import SEQUENCES, import_sequence, read_points
 from machine import describe_machine, keep_record
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.examine import Examination, examine
+from valuemap.check.fault import keep_rows
 from valuemap.dataset import Dataset, Frame, rows_of
 from valuemap.errors import ValuemapError
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
@@ -475,9 +476,34 @@ def pass_time_shift(dataset: Dataset) -> Dataset | None:
     return None if code is None else _later(dataset, 0.5, dataset.images.pass_id.codes == code)
 
 
+SHIFT_S, LONGEST_GAP_S = 0.6, 1.0
+
+
 def time_shift(dataset: Dataset) -> Dataset:
     """Set the clock of all poses 0.6 s off."""
-    return _later(dataset, 0.6, np.ones(len(dataset.images), dtype=np.bool_))
+    return _later(dataset, SHIFT_S, np.ones(len(dataset.images), dtype=np.bool_))
+
+
+def going_on(dataset: Dataset) -> Dataset:
+    """Leave out the last images of passes and those before gaps: `time_shift` has no poses for them, and makes some up.
+
+    KITTI-TS has bursts of some ten images, so that of every drive two fifths are such.
+    """
+    return keep_rows(dataset, images=_goes_on(dataset))
+
+
+def _goes_on(dataset: Dataset) -> NDArray[np.bool_]:
+    """Return which images (N) are followed by poses around the time of the shift, a second apart at most."""
+    time_s, codes = dataset.images.timestamp_s, dataset.images.pass_id.codes
+    assert time_s is not None
+    goes_on = np.zeros(len(codes), dtype=np.bool_)
+    for code in np.unique(codes):
+        members = np.flatnonzero(codes == code)
+        known = np.sort(time_s[members])
+        after = np.searchsorted(known, time_s[members] + SHIFT_S)
+        is_inside = after < len(known)
+        goes_on[members[is_inside]] = np.diff(known)[after[is_inside] - 1] <= LONGEST_GAP_S
+    return goes_on
 
 
 def _dealt(count: int) -> NDArray[np.int64]:
@@ -692,7 +718,7 @@ FAULTS: dict[str, Fault] = {
     "scale": Fault(scale, has_fix=False),
     "pass_offset": Fault(pass_offset),
     "pass_time_shift": Fault(pass_time_shift),
-    "time_shift": Fault(time_shift),
+    "time_shift": Fault(time_shift, compared=going_on),
     "camera_height": Fault(camera_height),
     "passes_no_drives": Fault(passes_no_drives, compared=as_driven),
     "interleaved_passes": Fault(interleaved_passes),

@@ -1,12 +1,16 @@
 """Fuzz the readers, the tables, the settings and the border of the core with structured input.
 
     python benchmarks/fuzz.py [--cases N] [--core-cases N] [--seconds S] [--seed N] [--only TARGET ...] [--json FILE]
+                              [--go-on]
 
 Every case makes whole input, spoils a value, a row, a column, a key, bytes or an array of it, and reads or maps it. It
 must end in a result, or in an error of one line with a hint: any other exception, a panic of the core, and a case of
-more than 20 seconds are faults. Case k of a target has the seed "SEED/TARGET/k", so that one case can be run again:
+more than 20 seconds of the processor are faults. Case k of a target has the seed "SEED/TARGET/k", so that one case can
+be run again:
 
     python benchmarks/fuzz.py --only TARGET --case K
+
+The JSON file is written as the run goes, and with `--go-on` an interrupted run goes on from it.
 
 With `--core-cases` so many cases of `crates/valuemap-core/tests/hostile_input.rs` go through the core without Python
 before, built with its assertions and with overflows as faults: needs cargo.
@@ -18,6 +22,7 @@ from __future__ import annotations
 
 import argparse
 import faulthandler
+import json
 import logging
 import os
 import resource
@@ -38,10 +43,12 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from fuzzing import Fuzz, Target
 from machine import describe_machine, keep_record
 
-LONGEST_S = 20
+LONGEST_S, LONGEST_ASLEEP_S = 20, 600
+"""Of the processor, and by the clock: of a busy machine a case may get little."""
 MOST_MEMORY = 6 * 2**30
 """Of addresses: what asks for more fails at once instead of filling the machine."""
 MOST_SHOWN = 3
+KEPT_EVERY_S = 60.0
 SHARES = {"border of the core": 8.0}
 """All targets get the same time, but this one, behind which there is no Python to catch what goes wrong."""
 
@@ -69,7 +76,8 @@ def _alarm(_number: int, _frame: FrameType | None) -> None:
 
 def run_case(target: Target, seed: str) -> BaseException | None:
     """Run one case; return what it must not raise."""
-    signal.alarm(LONGEST_S)
+    signal.setitimer(signal.ITIMER_PROF, LONGEST_S)
+    signal.alarm(LONGEST_ASLEEP_S)
     try:
         target.run(Random(seed))
     except KeyboardInterrupt:
@@ -78,6 +86,7 @@ def run_case(target: Target, seed: str) -> BaseException | None:
         return error
     finally:
         signal.alarm(0)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
     return None
 
 
@@ -120,6 +129,29 @@ def run_core(cases: int, seed: int) -> tuple[dict[str, dict[str, float]], dict[s
     return done, faults
 
 
+def record_of(
+    options: argparse.Namespace,
+    done: Counter[str],
+    seconds: dict[str, float],
+    of_core: dict[str, dict[str, float]],
+    faults: dict[str, dict[str, Any]],
+) -> dict[str, Any]:
+    """Return what is kept: how it was run, how many cases of what, and all faults."""
+    return {
+        "benchmark": "fuzz",
+        "command": f"python benchmarks/fuzz.py --cases {done.total()} --core-cases {options.core_cases} "
+        f"--seed {options.seed}",
+        **describe_machine(),
+        "cases": done.total(),
+        "seconds": round(sum(seconds.values()), 1),
+        "cases_by_target": dict(sorted(done.items())),
+        "seconds_by_target": {name: round(seconds[name], 1) for name in sorted(done)},
+        "core_cases": sum(int(each["cases"]) for each in of_core.values()),
+        "core_by_test": of_core,
+        "faults": faults,
+    }
+
+
 def main() -> int:
     """Run the benchmark; return the exit code: 1 where there are faults."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -130,11 +162,16 @@ def main() -> int:
     parser.add_argument("--only", nargs="*", default=[])
     parser.add_argument("--case", type=int, help="one case, with its traceback")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--go-on", action="store_true", help="go on from what the JSON file has")
     options = parser.parse_args()
-    of_core, faults_of_core = run_core(options.core_cases, options.seed) if options.core_cases else ({}, {})
+    before_that = json.loads(options.json.read_text(encoding="utf-8")) if options.go_on else {}
+    of_core, faults_of_core = before_that.get("core_by_test", {}), before_that.get("faults", {})
+    if options.core_cases and not of_core:
+        of_core, faults_of_core = run_core(options.core_cases, options.seed)
     faulthandler.enable()
     logging.disable(logging.CRITICAL)
     signal.signal(signal.SIGALRM, _alarm)
+    signal.signal(signal.SIGPROF, _alarm)
     resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, MOST_MEMORY))
     memory = Path("/dev/shm")
     with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder:
@@ -144,10 +181,10 @@ def main() -> int:
             if error is not None:
                 traceback.print_exception(error)
             return int(error is not None)
-        start = time.perf_counter()
+        start = kept_s = time.perf_counter()
         last = Path(folder) / "last-case"  # In memory: on a disk this takes longer than many a case.
-        done: Counter[str] = Counter()
-        seconds = dict.fromkeys((target.name for target in targets), 0.0)
+        done = Counter(before_that.get("cases_by_target", {}))
+        seconds = {target.name: before_that.get("seconds_by_target", {}).get(target.name, 0.0) for target in targets}
         faults: dict[str, dict[str, Any]] = faults_of_core
         while done.total() < options.cases and time.perf_counter() - start < options.seconds:
             target = min(targets, key=lambda each: seconds[each.name] / SHARES.get(each.name, 1.0))
@@ -167,26 +204,13 @@ def main() -> int:
                 if known["count"] == 1:
                     print(f"FAULT {key} (case {number})", flush=True)
             seconds[target.name] += time.perf_counter() - before
-        elapsed = time.perf_counter() - start
+            if time.perf_counter() - kept_s > KEPT_EVERY_S:
+                kept_s = time.perf_counter()
+                keep_record(options.json, record_of(options, done, seconds, of_core, faults))
     for name, count in sorted(done.items()):
         print(f"{name:24} {count:8} cases {1e3 * seconds[name] / count:7.2f} ms each")
-    print(f"{done.total()} cases in {elapsed:.0f} s, {len(faults)} faults")
-    keep_record(
-        options.json,
-        {
-            "benchmark": "fuzz",
-            "command": f"python benchmarks/fuzz.py --cases {done.total()} --core-cases {options.core_cases} "
-            f"--seed {options.seed}",
-            **describe_machine(),
-            "cases": done.total(),
-            "seconds": round(elapsed, 1),
-            "cases_by_target": dict(sorted(done.items())),
-            "seconds_by_target": {name: round(seconds[name], 1) for name in sorted(done)},
-            "core_cases": sum(int(each["cases"]) for each in of_core.values()),
-            "core_by_test": of_core,
-            "faults": faults,
-        },
-    )
+    print(f"{done.total()} cases in {sum(seconds.values()):.0f} s, {len(faults)} faults")
+    keep_record(options.json, record_of(options, done, seconds, of_core, faults))
     return int(bool(faults))
 
 

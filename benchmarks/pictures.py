@@ -1,6 +1,6 @@
 """From a folder of rendered street pictures with a GPS position in each, and nothing else, to poses and a map.
 
-    python benchmarks/pictures.py [--seed 1] [--pass-row 1] [--pictures 208] [--gps-sigma 2] [--work DIR] [--json FILE]
+    python benchmarks/pictures.py [--seed 1] [--pass-row 1] [--pictures N] [--gps-sigma 2] [--work DIR] [--json FILE]
 
 A drive round the blocks of a simulated city by day is rendered. EXIF gets a position with noise of `--gps-sigma` on
 each axis, the time and the focal length. `valuemap import pictures` finds the poses. They are compared with the true
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 import subprocess
 import sys
 import tempfile
@@ -55,6 +56,7 @@ CITY = (
     "rotation_drift_deg=0",
 )
 START_S = 1.7e9
+GPS_SIGMA_M = 2.0
 FILM_MM = 36.0
 
 
@@ -63,18 +65,32 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="poses and a map from rendered pictures with GPS positions")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--pass-row", type=int, default=1, help="which drive; the default is by day")
-    parser.add_argument("--pictures", type=int, default=208, help="of its beginning; the default is the whole drive")
-    parser.add_argument("--gps-sigma", type=float, default=2.0, help="noise of each axis, m")
+    parser.add_argument("--pictures", type=int, default=1000, help="of its beginning; the default is the whole drive")
+    parser.add_argument("--gps-sigma", type=float, default=GPS_SIGMA_M, help="noise of each axis, m")
     parser.add_argument("--work", type=Path, help="folder for everything, to go on after an interruption")
-    parser.add_argument("--json", type=Path, help="file to write the figures to")
+    parser.add_argument("--json", type=Path, help="file to write the figures to, beside those of other drives")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         work = options.work or Path(temporary)
         result = run(work, options.seed, options.pass_row, options.pictures, options.gps_sigma)
     for name, value in result.items():
         print(f"{name}: {value}")
-    command = " ".join(["python", "benchmarks/pictures.py", *sys.argv[1:]])
-    keep_record(options.json, {"command": command, **describe_machine(), **result})
+    keep_record(options.json, record_of(options, result))
+
+
+def record_of(options: argparse.Namespace, result: dict[str, Any]) -> dict[str, Any]:
+    """Return what is kept: this drive beside the others that the file has."""
+    is_there = options.json is not None and options.json.is_file()
+    others = json.loads(options.json.read_text(encoding="utf-8"))["results"] if is_there else {}
+    drive = f"seed {options.seed}, pass {options.pass_row}"
+    if options.gps_sigma != GPS_SIGMA_M:
+        drive += f", GPS of {options.gps_sigma:g} m"
+    return {
+        "benchmark": "pictures",
+        "command": "python benchmarks/pictures.py --seed SEED --pass-row PASS --json FILE, drive by drive",
+        **describe_machine(),
+        "results": dict(sorted({**others, drive: result}.items())),
+    }
 
 
 def run(work: Path, seed: int, pass_row: int, count: int, gps_sigma_m: float) -> dict[str, Any]:

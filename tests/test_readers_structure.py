@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,12 @@ from valuemap.tables import Floats, Ints
 
 
 def drive_with_points(
-    seed: int, *, gps_sigma_m: float = 1.0, pixel_sigma: float = 0.5, lasting: float = 0.0
+    seed: int,
+    *,
+    gps_sigma_m: float = 1.0,
+    pixel_sigma: float = 0.5,
+    lasting: float = 0.0,
+    turn_deg: float = 90.0,
 ) -> tuple[Sights, Floats, Floats]:
     """A camera that looks 4 degrees up drives round a corner; true rotations and centres, and what is seen of it.
 
@@ -48,7 +54,9 @@ def drive_with_points(
     """
     random = np.random.default_rng(seed)
     count, width, height, focal = 40, 640, 480, 500.0
-    corner = np.concatenate([np.zeros(20), np.linspace(0.0, np.pi / 2.0, 8), np.full(12, np.pi / 2.0)])
+    corner = np.concatenate(
+        [np.zeros(20), np.linspace(0.0, np.radians(turn_deg), 8), np.full(12, np.radians(turn_deg))]
+    )
     ahead = np.stack([np.sin(corner), np.cos(corner), np.zeros(count)], axis=1)
     center = np.cumsum(2.0 * ahead, axis=0) + [0.0, 0.0, 1.6]
     look = Rotation.from_euler("zx", np.stack([-corner, np.full(count, np.radians(4.0))], axis=1)).as_matrix()
@@ -122,6 +130,32 @@ def test_errors_of_features_that_last_are_not_taken_for_none() -> None:
         found = adjust(sights, np.zeros(len(sights.row), dtype=np.int64))
         sigma.append(float(np.median(found.sigma_in_part[:, 0])))
     assert sigma[1] > 0.75 * sigma[0]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_corner_that_features_bend_is_straightened_by_the_gps(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By all features the corner has 94 degrees, by the GPS 90: what features weigh in all is learned from that."""
+    sights, _, bent = drive_with_points(seed, gps_sigma_m=0.5, turn_deg=94.0)
+    _, _, center = drive_with_points(seed)
+    sights = replace(sights, gps_in_world_m=sights.gps_in_world_m - bent + center)
+    one_part = np.zeros(len(sights.row), dtype=np.int64)
+    rest = after_moving_the_whole(adjust(sights, one_part).center_in_world_m, center)
+    assert np.sqrt((rest**2).sum(axis=1).mean()) < 0.15
+    monkeypatch.setattr("valuemap.readers.structure.adjust._growth_of_features", lambda *_: 1.0)
+    rest = after_moving_the_whole(adjust(sights, one_part).center_in_world_m, center)
+    assert np.sqrt((rest**2).sum(axis=1).mean()) > 0.3
+
+
+def test_a_gps_that_wanders_does_not_bend_what_features_know() -> None:
+    sights, _, center = drive_with_points(1)
+    random = np.random.default_rng(4)
+    off = random.normal(0.0, 1.0, center.shape)
+    for i in range(1, len(off)):
+        off[i] = 0.9 * off[i - 1] + np.sqrt(1.0 - 0.9**2) * off[i]
+    sights = replace(sights, gps_in_world_m=center + off * [1.0, 1.0, 2.0])
+    found = adjust(sights, np.zeros(len(sights.row), dtype=np.int64))
+    rest = after_moving_the_whole(found.center_in_world_m, center)
+    assert np.sqrt((rest**2).sum(axis=1).mean()) < 0.15
 
 
 def test_an_outlier_of_the_gps_moves_nothing() -> None:

@@ -7,6 +7,10 @@ Errors of features last: one is off in a picture as it was in the one before, wh
 of each other. So the covariance of the poses is that of the scatter between points (the sandwich of Huber, 1967, and of
 Liang and Zeger, 1986): what all sights of a point pull together counts, not how many they are.
 
+What bends a street a little bends it for all its points: windows alike, a lens that is not quite its model. No scatter
+between points shows it, but the GPS does. By how much features weigh too much is estimated with what the GPS says of
+the shape, by the likelihood of its positions with all poses and points integrated out (Patterson and Thompson, 1971).
+
 Errors of a GPS follow each other: what looks like a hundred positions may be worth ten. How much its residuals along a
 drive are alike says by how much their sigma must grow. The vertical is known from cameras that are held level: their
 axis x is horizontal on average, which counts once a drive, not once a picture, as all lean in the same way. They may
@@ -33,6 +37,12 @@ _DAMPING = (1e-6, 1e-12, 1e3)
 _LEAST_SIGMA_PX = 0.2
 _NEAREST_M = 0.3
 _CAUCHY, _BEHIND = 2.5, 30.0
+_GROWTHS = 2.0 ** np.arange(0.0, 6.5, 0.5)
+"""Of variances: no growth, up to eight times the standard deviation."""
+_SURE = 2.71
+"""What the logarithm of a likelihood ratio, doubled, exceeds by chance once in twenty, where nothing grows."""
+_LEAST_SHARE = 1e-6
+"""Of the priors, that holds what features alone leave open."""
 _HEIGHT_SHARE = 2.0
 _FOCAL_SHARE, _GUESSED_FOCAL_SHARE, _DISTORTION_SIGMA = 0.05, 0.5, 0.2
 _LONGEST_RUN = 50
@@ -127,13 +137,15 @@ class _Linear:
 class _Weights:
     """Square roots of the weights of features (M), of GPS positions (N, 3) and of roll and pitch (N, 2).
 
-    `sigma_px` is the standard deviation of features that are no outliers.
+    `sigma_px` is the standard deviation of features that are no outliers. `growth` is that of the variance of what they
+    say together of the shape of streets.
     """
 
     sigma_px: float
     feature: Floats
     gps: Floats
     level: Floats
+    growth: float
 
 
 def adjust(sights: Sights, part: Ints) -> Adjusted:
@@ -146,8 +158,11 @@ def adjust(sights: Sights, part: Ints) -> Adjusted:
     here = _settled(_converged(sights, sights, worse), part, sights, worse)
     worse = gps_inflation(_gps_off(here), here.drive)
     here = _settled(_converged(here, sights, worse), part, sights, worse)
-    weights = _weigh(here, worse)
-    scatter = _scatter(_linearised(here, weights), here)
+    growth = _growth_of_features(here, sights, worse, part)
+    here = _settled(_converged(here, sights, worse, growth), part, sights, worse, growth)
+    weights = _weigh(here, worse, growth)
+    # Weights are less by the growth, and what features pull is more than these say.
+    scatter = growth * _scatter(_linearised(here, weights), here)
     meat = scatter + _priors(here, weights, sights, scatter.shape[0])[0]
     # What weights lose where errors grow is information that their sum counts and that there is not (Huber, 1981).
     equations = _equations(
@@ -157,11 +172,34 @@ def adjust(sights: Sights, part: Ints) -> Adjusted:
     return Adjusted(here.cam_from_world, here.center_in_world_m, here.cameras, np.sqrt(variance), np.sqrt(in_part))
 
 
-def _converged(here: Sights, first: Sights, worse: Floats) -> Sights:
+def _growth_of_features(here: Sights, first: Sights, worse: Floats, part: Ints) -> float:
+    """Return by how much the variance of what features say of the shape of parts must grow, at least 1.
+
+    With what features say, F, and priors, P, about where both agree best, positions by GPS have a variance of
+    g F^-1 + P^-1 about the shape by features. Of all g tried that is taken under which they are likeliest, if it is
+    more than chance. Moves of a part as a whole (7) are none of its shape.
+    """
+    weights = _weigh(here, worse)
+    matrix, right, _ = _equations(here, weights, first).without_points(0.0)
+    priors, right_of_priors = _priors(here, weights, first, matrix.shape[0])
+    features, right_of_features = matrix - priors, right - right_of_priors
+    alone = splu((features + _LEAST_SHARE * priors).tocsc()).solve(right_of_features)
+    shape = matrix.shape[0] - 7 * len(np.unique(part))
+    cost = []
+    for growth in _GROWTHS:
+        factors = splu((features / growth + priors).tocsc())
+        both = right_of_features / growth + right_of_priors
+        quadratic = right_of_features @ alone / growth - both @ factors.solve(both)
+        cost.append(quadratic + np.log(np.abs(factors.U.diagonal())).sum() + shape * np.log(growth))
+    best = int(np.argmin(cost))
+    return float(_GROWTHS[best]) if cost[0] - cost[best] > _SURE else 1.0
+
+
+def _converged(here: Sights, first: Sights, worse: Floats, growth: float = 1.0) -> Sights:
     """Return the sights with all moved to where they agree best, the GPS with sigmas `worse` (N) times as large."""
     damping, least, most = _DAMPING
     for _ in range(_MOST_STEPS):
-        weights = _weigh(here, worse)
+        weights = _weigh(here, worse, growth)
         equations = _equations(here, weights, first)
         cost = _cost(here, weights, first)
         while damping < most:
@@ -201,13 +239,13 @@ def _residuals(sights: Sights) -> Floats:
     return np.asarray(_project(sights, _in_camera(sights)) - sights.pixel)
 
 
-def _weigh(sights: Sights, worse: Floats) -> _Weights:
+def _weigh(sights: Sights, worse: Floats, growth: float = 1.0) -> _Weights:
     residual = np.linalg.norm(_residuals(sights), axis=1)
     fine = np.isfinite(residual)
     # The length of two normal errors has a median of 1.18 sigmas.
     sigma_px = max(float(np.median(residual[fine])) / 1.18, _LEAST_SIGMA_PX)
     feature = np.zeros(len(residual))
-    feature[fine] = 1.0 / sigma_px / np.sqrt(1.0 + (residual[fine] / (_CAUCHY * sigma_px)) ** 2)
+    feature[fine] = 1.0 / sigma_px / np.sqrt(growth * (1.0 + (residual[fine] / (_CAUCHY * sigma_px)) ** 2))
     off = _gps_off(sights)
     known = np.isfinite(off).all(axis=1)
     gps = np.zeros_like(off)
@@ -217,7 +255,7 @@ def _weigh(sights: Sights, worse: Floats) -> _Weights:
         gps[known] = 1.0 / sigma[:, None] / [1.0, 1.0, _HEIGHT_SHARE]
     count = np.bincount(sights.drive)[sights.drive]
     level = 1.0 / (np.array([_ROLL_SIGMA_RAD, _PITCH_SIGMA_RAD]) * np.sqrt(count)[:, None])
-    return _Weights(sigma_px, feature, gps, level)
+    return _Weights(sigma_px, feature, gps, level, growth)
 
 
 def _slope_share(sights: Sights, weights: _Weights) -> float:
@@ -292,7 +330,7 @@ def _cost(sights: Sights, weights: _Weights, first: Sights) -> float:
     """Return the sum of squares in sigmas: of features with Cauchy's loss, of the rest with the weights as they are."""
     size = np.linalg.norm(_residuals(sights), axis=1) / (_CAUCHY * weights.sigma_px)
     # What comes to lie behind its camera is an outlier like others.
-    total = _CAUCHY**2 * float(np.log1p(np.where(np.isfinite(size), size, _BEHIND) ** 2).sum())
+    total = _CAUCHY**2 / weights.growth * float(np.log1p(np.where(np.isfinite(size), size, _BEHIND) ** 2).sum())
     total += float(np.nansum(((sights.center_in_world_m - sights.gps_in_world_m) * weights.gps) ** 2))
     total += float(((_slopes(sights) * weights.level) ** 2).sum())
     total += sum((root * off) ** 2 for _, root, off in _intrinsic_weights(sights, first))
@@ -467,7 +505,7 @@ def _variances(matrix: Any, meat: Any, sights: Sights, part: Ints) -> tuple[Floa
     return both[0], both[1]
 
 
-def _settled(sights: Sights, part: Ints, first: Sights, worse: Floats) -> Sights:
+def _settled(sights: Sights, part: Ints, first: Sights, worse: Floats, growth: float = 1.0) -> Sights:
     """Move, turn and scale each part as a whole to where GPS and level cameras want it.
 
     Features say nothing of that, and what the others say of it is so little beside them that steps of everything at
@@ -478,7 +516,7 @@ def _settled(sights: Sights, part: Ints, first: Sights, worse: Floats) -> Sights
     for _ in range(_WHOLE_STEPS):
         size = 6 * len(sights.row)
         matrix, right = _priors(
-            sights, _weigh(sights, worse), first, size + sum(map(len, _intrinsic_columns(sights).values()))
+            sights, _weigh(sights, worse, growth), first, size + sum(map(len, _intrinsic_columns(sights).values()))
         )
         turn, center = sights.cam_from_world.copy(), sights.center_in_world_m.copy()
         points = sights.point_in_world_m.copy()
