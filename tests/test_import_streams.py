@@ -99,6 +99,15 @@ def test_damage_far_inside_a_large_table_is_one_error(tmp_path: Path, monkeypatc
         imported(folder, tmp_path / "out")
 
 
+def test_as_many_reasons_as_rows_are_told_apart() -> None:
+    why = vet.Verdicts(300)
+    for row in range(300):
+        why.mark(np.arange(300) == row, vet._Reason(f"reason {row}", "hint"))
+    assert [why.reasons[code].text for code in why.code.tolist()] == [f"reason {row}" for row in range(300)]
+    why.mark(np.ones(2, np.bool_), vet._Reason("late", "hint"), slice(298, 300))
+    assert why.reasons[why.code[299]].text == "reason 299"
+
+
 def test_texts_that_repeat_are_held_once() -> None:
     texts = Texts.of(["b", "a", "b", "", "a"])
     assert list(texts) == ["b", "a", "b", "", "a"]

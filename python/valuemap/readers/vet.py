@@ -220,7 +220,7 @@ class Verdicts:
     """For each row (N) the first reason that was found against it, as a code, or -1."""
 
     def __init__(self, count: int) -> None:
-        self.code = np.full(count, -1, dtype=np.int8)
+        self.code = np.full(count, -1, dtype=np.int32)
         self.reasons: list[_Reason] = []
 
     def mark(self, wrong: Bools | np.bool_, reason: _Reason, part: slice = slice(None)) -> None:
