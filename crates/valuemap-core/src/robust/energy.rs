@@ -254,23 +254,16 @@ pub fn object(
     start: Vector3<f64>,
     others: Vec<u32>,
 ) -> Option<Object> {
-    let first = *votes.first()?;
-    let class = model.class_of(first);
+    unseen(model, votes, start)?.with_looks(model, lookout, others)
+}
+
+/// The same before it is asked who should have seen it: J is not less than its energy.
+#[must_use]
+pub fn unseen(model: &Model<'_>, votes: Vec<u32>, start: Vector3<f64>) -> Option<Object> {
+    let class = model.scene.rays.class[*votes.first()? as usize];
     let fit = fit(model, &votes, start)?;
-    let (of_votes, ln_size) = energy_of_votes(model, &votes, &fit);
-    let seen = lookout.looks(model, &fit.point, &votes, &others);
-    let energy = of_votes - 2.0 * seen.ln_likelihood(class);
-    let real = seen.real(class);
-    energy.is_finite().then(|| Object {
-        class: model.scene.rays.class[first as usize],
-        votes,
-        fit,
-        ln_size,
-        others,
-        seen,
-        real,
-        energy,
-    })
+    let (energy, ln_size) = energy_of_votes(model, &votes, &fit);
+    Some(Object { class, votes, fit, ln_size, others: Vec::new(), seen: Seen::default(), real: 1.0, energy })
 }
 
 /// J of an object but for the looks at it, equations (1) to (4), of which it is not less; and the logarithm of its size, m.
@@ -308,6 +301,17 @@ pub fn by_place(objects: &[Object]) -> RTree<GeomWithData<[f64; 3], usize>> {
 }
 
 impl Object {
+    /// One that was [`unseen`], with the looks at it; `others` are images (ascending) with detections in its gate.
+    #[must_use]
+    pub fn with_looks(mut self, model: &Model<'_>, lookout: &Lookout, others: Vec<u32>) -> Option<Self> {
+        let class = &model.classes[self.class as usize];
+        self.seen = lookout.looks(model, &self.fit.point, &self.votes, &others);
+        self.energy -= 2.0 * self.seen.ln_likelihood(class);
+        self.real = self.seen.real(class);
+        self.others = others;
+        self.energy.is_finite().then_some(self)
+    }
+
     /// Probability that it exists and is real, if its votes are clutter otherwise.
     #[must_use]
     pub fn existence(&self) -> f64 {

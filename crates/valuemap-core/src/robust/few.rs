@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use super::assign::{gain_alone, places_of};
 use super::company::Sure;
-use super::energy::{Object, by_place, energy_of_votes, fit, object};
+use super::energy::{Object, by_place, object, unseen};
 use super::index::RayIndex;
 use super::looks::Lookout;
 use super::model::{ClassModel, Model};
@@ -117,13 +117,18 @@ impl Nursery<'_> {
     fn grown(&self, ray: u32, may_vote: &dyn Fn(u32) -> bool) -> Option<Object> {
         let model = self.model;
         let class = model.class_of(ray);
-        let start = self.most_probable(ray, class)?;
-        if !self.may_be(ray, class, start) {
+        // Before images are asked who sees it, which takes most of the time.
+        let alone = unseen(model, vec![ray], self.most_probable(ray, class)?)?;
+        let [_, of_others @ ..] = class.ln_odds_of_few;
+        if of_others.iter().all(|&ln_odds| ln_odds <= LEAST_LN_ODDS) && !self.may_be_alone(class, &alone) {
             return None;
         }
-        let mut best = object(model, self.lookout, vec![ray], start, Vec::new())?;
+        let mut votes = self.votes_of(&alone, ray, may_vote);
+        if votes.len() == 1 && !self.may_be_alone(class, &alone) {
+            return None;
+        }
+        let mut best = alone.with_looks(model, self.lookout, Vec::new())?;
         for _ in 0..ROUNDS {
-            let votes = self.votes_of(&best, ray, may_vote);
             if votes == best.votes {
                 break;
             }
@@ -131,6 +136,7 @@ impl Nursery<'_> {
                 Some(more) if more.energy < best.energy => best = more,
                 _ => break,
             }
+            votes = self.votes_of(&best, ray, may_vote);
         }
         let seen = self.lookout.looks_of_few(model, &best.fit.point, &best.votes);
         best.energy += 2.0 * (best.seen.ln_likelihood(class) - seen.ln_likelihood(class));
@@ -159,19 +165,10 @@ impl Nursery<'_> {
         votes
     }
 
-    /// Whether there can be an object on a ray, before images are asked who sees it: alone, if it had been expected nowhere else, or with others
-    /// where such objects are not ruled out.
-    fn may_be(&self, ray: u32, class: &ClassModel, start: Vector3<f64>) -> bool {
-        let model = self.model;
-        let [of_one, of_others @ ..] = class.ln_odds_of_few;
-        if of_others.iter().any(|&ln_odds| ln_odds > LEAST_LN_ODDS) {
-            return true;
-        }
-        fit(model, &[ray], start).is_some_and(|fit| {
-            let (energy, _) = energy_of_votes(model, &[ray], &fit);
-            let density = self.ln_density(class, model.scene.rays.class[ray as usize], &[ray], &fit.point);
-            of_one + density - 0.5 * energy > LEAST_LN_ODDS
-        })
+    /// Whether an object that one ray alone votes for may be there, whoever else should have seen it.
+    fn may_be_alone(&self, class: &ClassModel, alone: &Object) -> bool {
+        let density = self.ln_density(class, alone.class, &alone.votes, &alone.fit.point);
+        class.ln_odds_of_few[0] + density - 0.5 * alone.energy > LEAST_LN_ODDS
     }
 
     /// How much denser objects are at a place, with the company they have there, than clutter is at the elevations of some rays, in logarithms.
