@@ -16,6 +16,13 @@
 //! kernel, which sees `f32` relative to the cluster's origin and errs only towards testing too much.
 //! The result does not depend on the number of threads.
 
+// The streets of the integration tests serve the unit tests too; they name the crate as its users do.
+#[cfg(test)]
+extern crate self as valuemap_core;
+#[cfg(test)]
+#[path = "../tests/street/mod.rs"]
+mod street;
+
 pub mod ballot;
 pub mod evidence;
 pub mod hypothesis;

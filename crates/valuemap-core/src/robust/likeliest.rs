@@ -67,7 +67,8 @@ pub fn misfit(
     progress: &Progress,
 ) -> Result<(f64, Vec<u32>), Halt> {
     let range_m = settings.viability.max_range_m;
-    let rays = rays.unwrap_or_else(|| sample::places(scene, CALIBRATION_RAYS.0, range_m));
+    let mut rays = rays.unwrap_or_else(|| sample::places(scene, CALIBRATION_RAYS.0, range_m));
+    rays.retain(|&ray| scene.ray(ray).is_usable());
     let likeliest = Likeliest::of_starts(scene, guess, known, settings, &rays, progress)?;
     Ok((likeliest.best.map_or(f64::INFINITY, |best| best.value), rays))
 }
@@ -211,4 +212,27 @@ fn likelihood(model: &Model<'_>, objects: &[Object], rays: &[u32]) -> f64 {
         all + here().map(|object| object.energy + 2.0 * change * object.votes.len() as f64).sum::<f64>()
     };
     (0..model.classes.len()).map(of_class).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+    use crate::street;
+
+    #[test]
+    fn rays_that_are_none_do_not_count() -> Result<(), Halt> {
+        let objects: Vec<Vector3<f64>> = (0..8).map(|i| Vector3::new(25.0 + 9.0 * f64::from(i), 5.0, 3.0)).collect();
+        let mut scene = street::street(80, 1.0, &objects, &[[0.7, -0.4], [-0.9, 0.8], [0.3, -0.5]]);
+        let all: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
+        std::sync::Arc::make_mut(&mut scene.rays).rays[7].residual_from_world.fill(f64::NAN);
+        let of = |rays: Vec<u32>| {
+            misfit(&scene, &street::NOISE, Known::default(), &street::SETTINGS, Some(rays), &Progress::default())
+        };
+        let (value, used) = of(all)?;
+        assert!(value.is_finite() && used == scene.usable_rays(), "{value}");
+        assert_eq!(value.to_bits(), of(scene.usable_rays())?.0.to_bits());
+        Ok(())
+    }
 }
