@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use proptest::prelude::*;
-use valuemap_core::robust::drift::{DRIFT_LENGTH_M, Drive, LEG_M, Look};
+use valuemap_core::robust::drift::{DRIFT_LENGTH_M, Drive, LEG_M, Look, OneLook};
 use valuemap_core::robust::noise::Sigmas;
 use valuemap_core::robust::poses::{Belief, Legs, smooth};
 use valuemap_core::robust::scene::View;
@@ -125,6 +125,22 @@ proptest! {
                     .sum();
                 prop_assert!((found[axis] - (looks[k].residual[axis] - drift)).abs() < 1e-8);
             }
+        }
+    }
+
+    #[test]
+    fn one_look_is_a_drive_of_one(looks in looks(), weight in 0.1..1.0_f64) {
+        for look in looks.into_iter().map(|look| Look { label: 0, ..look.by_itself() }) {
+            let one = OneLook::of(&look, weight).ok_or(TestCaseError::fail("no solution"))?;
+            let looks = [look];
+            let drive = Drive::along(&looks, &[weight], 1).ok_or(TestCaseError::fail("no solution"))?;
+            let (information, gradient) = drive.normals.of_one();
+            let is_same = |a: f64, b: f64| (a - b).abs() < 1e-9 * b.abs().max(1.0);
+            prop_assert!((one.information - information).norm() < 1e-9 * information.norm().max(1.0));
+            prop_assert!((one.gradient - gradient).norm() < 1e-9 * gradient.norm().max(1.0));
+            prop_assert!(is_same(one.square, drive.normals.square));
+            prop_assert!(is_same(one.log_determinant, drive.log_determinant()));
+            prop_assert!((one.left - drive.left()[0]).norm() < 1e-8);
         }
     }
 

@@ -410,6 +410,48 @@ impl<'a> Drive<'a> {
     }
 }
 
+/// What a look that is the only one of its visit at the only label says, all pose errors taken out: [`Drive::along`] of one look, by the
+/// covariance of its two residuals.
+pub struct OneLook {
+    /// Information about the position, 1/m².
+    pub information: Matrix3<f64>,
+    /// Gradient of half the squared residuals, 1/m.
+    pub gradient: Vector3<f64>,
+    /// Squared residuals in sigmas.
+    pub square: f64,
+    /// Logarithm of the determinant of the covariance of the residuals, px⁴.
+    pub log_determinant: f64,
+    /// The residual, px, after the most probable error of the pose is taken out.
+    pub left: Vector2<f64>,
+}
+
+impl OneLook {
+    /// Of a look [by itself](Look::by_itself), which counts with a weight; nothing if its numbers overflow.
+    #[must_use]
+    pub fn of(look: &Look, weight: f64) -> Option<Self> {
+        let shared = look.shared_sigma().each();
+        let by_pose = [0, 1].map(|axis| look.by_pose(axis).component_mul(&shared));
+        let detection = look.detection_px2 / weight;
+        let (xx, yy) = (detection + by_pose[0].norm_squared(), detection + by_pose[1].norm_squared());
+        let xy = by_pose[0].dot(&by_pose[1]);
+        let determinant = xx * yy - xy * xy;
+        if !(xx > 0.0 && determinant > 0.0) {
+            return None;
+        }
+        let [rx, ry] = look.residual;
+        let white = [(yy * rx - xy * ry) / determinant, (xx * ry - xy * rx) / determinant];
+        let [x, y] = &look.by_point;
+        let (of_x, of_y) = ((x * yy - y * xy) / determinant, (y * xx - x * xy) / determinant);
+        Some(Self {
+            information: of_x * x.transpose() + of_y * y.transpose(),
+            gradient: x * white[0] + y * white[1],
+            square: rx * white[0] + ry * white[1],
+            log_determinant: determinant.ln() + 2.0 * weight.ln(),
+            left: Vector2::from(white) * detection,
+        })
+    }
+}
+
 /// The most probable error that an image has for itself if its drift is as said, m and rad; nothing if numbers overflow.
 fn own_error(looks: &[Look], weights: &[f64], drift: &Vector6) -> Option<Vector6> {
     let own = looks[0].own_sigma.each();
