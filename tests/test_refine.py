@@ -497,7 +497,8 @@ def test_equations_tell_what_others_are_without_a_group_as_a_fit_without_it_does
     covariance = fits["fewer"][1].covariance
     assert covariance is not None
     for ours, theirs in zip(told.constants, fits["fewer"][1].constants, strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-9)
+        # What observations hardly tell is known to fewer digits.
+        np.testing.assert_allclose(ours, theirs, atol=1e-5 * np.abs(theirs).max() + 1e-9)
     np.testing.assert_allclose(told.covariance, covariance, rtol=1e-6, atol=1e-12)
 
 
