@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 PICTURES = "images"
 """The folder of a dataset that holds its pictures, where it has some."""
 
-NEAREST_M = 4.0
-"""Nearer than this no image is expected to see an object."""
 SECTOR_COSINE = math.cos(math.radians(15.0))
 """Directions of looking that differ by less than 15 degrees are one sector."""
 
@@ -218,9 +216,8 @@ class Evidence:
     def misses(self, label_id: int) -> Misses:
         """Return the images that should have seen a label and did not vote for it.
 
-        An image should have seen it if it pictures the label, at least 4 m away, from a direction within 15 degrees
-        of those of its votes and not farther away than the farthest of these votes: the rule by which the method
-        counts `expected`.
+        An image should have seen it if it pictures the label from a direction within 15 degrees of those of its
+        votes, no nearer and no farther than the votes from there: the rule by which the method counts `expected`.
         """
         row = self.label_row(label_id)
         point = self.result.labels.position_in_world_m[row]
@@ -237,28 +234,26 @@ class Evidence:
         distance = np.linalg.norm(toward, axis=1)
         direction = toward / distance[:, None]
         middles = _sector_middles(direction)
-        farthest = np.zeros(len(middles))
-        np.maximum.at(farthest, np.argmax(direction @ middles.T, axis=1), distance)
+        sector = np.argmax(direction @ middles.T >= SECTOR_COSINE, axis=1)
+        nearest, farthest = np.full(len(middles), np.inf), np.zeros(len(middles))
+        np.minimum.at(nearest, sector, distance)
+        np.maximum.at(farthest, sector, distance)
 
         around = self.images_around(point_in_world_m, float(farthest.max()) * _ROUNDING)
         near = np.setdiff1d(around, voter_image_row)
         away = self.center_in_world_m[near] - point_in_world_m
-        distance = np.linalg.norm(away, axis=1)
-        apart = away / np.maximum(distance, 1e-9)[:, None] @ middles.T
-        sector = np.argmax(apart, axis=1)
-        should = (
-            (distance >= NEAREST_M)
-            & (distance <= farthest[sector] * _ROUNDING)
-            & (apart[np.arange(len(near)), sector] >= SECTOR_COSINE)
+        distance = np.linalg.norm(away, axis=1)[:, None]
+        is_held = (
+            (away @ middles.T >= SECTOR_COSINE * distance)
+            & (distance >= nearest / _ROUNDING)
+            & (distance <= farthest * _ROUNDING)
         )
-        near = near[should]
+        near = near[is_held.any(axis=1)]
         return np.asarray(near[self.is_pictured(near, self.project(near, point_in_world_m))])
 
     def looks_at(self, point_in_world_m: Floats) -> Misses:
         """Return all images that picture a place within `max_range_m`; `nearest_*` is over detections of any class."""
         near = self.images_around(point_in_world_m, self.max_range_m)
-        distance = np.linalg.norm(self.center_in_world_m[near] - point_in_world_m, axis=1)
-        near = near[distance >= NEAREST_M]
         near = near[self.is_pictured(near, self.project(near, point_in_world_m))]
         return self._misses_at(near, point_in_world_m, class_name=None)
 

@@ -25,6 +25,7 @@ use valuemap_core::robust::rearrange::{TriedPairs, rearrange_pairs};
 use valuemap_core::robust::repair::{Tried, repair};
 use valuemap_core::robust::scene::{Frustum, Scene};
 use valuemap_core::robust::search::{Depth, search};
+use valuemap_core::robust::seen::Looks;
 
 use street::{FOCAL_PX, GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, joined, moved, object, street};
 
@@ -327,10 +328,30 @@ proptest! {
             view.camera = u32::from(!seen.contains(&image));
         }
         let looked_away = World::new(&turned, &[(votes, object)]).objects[0].clone();
-        prop_assert!(looked.seen.images > looked_away.seen.images);
+        let expected = |object: &Object| object.seen.sectors.iter().flatten().map(|looks| looks.expected).sum::<f64>();
+        prop_assert!(expected(&looked) > expected(&looked_away));
         prop_assert!((looked.fit.energy - looked_away.fit.energy).abs() < 1e-9 * looked.fit.energy.abs().max(1.0));
         prop_assert!(looked.energy > looked_away.energy + 1.0, "{} {}", looked.energy, looked_away.energy);
     }
+}
+
+#[test]
+fn a_viewpoint_is_as_much_of_a_hit_as_the_share_of_its_images_that_see() {
+    let object = Vector3::new(40.0, 5.0, 3.0);
+    let mut scene = street(80, 0.25, &[object], &[[0.0, 0.0]]);
+    for (image, view) in (0..).zip(&mut scene.views) {
+        view.viewpoint = image / 4;
+    }
+    let model = Model::new(&scene, &NOISE, &SETTINGS);
+    let hits = |every: usize| {
+        let votes: Vec<u32> = scene.usable_rays().into_iter().step_by(every).collect();
+        let seen = Lookout::new(&scene, 60.0).looks(&model, &object, &votes, &[]);
+        let sum = |of: fn(&Looks) -> f64| seen.sectors.iter().flatten().map(of).sum::<f64>();
+        (sum(|looks| looks.hits), sum(|looks| looks.expected))
+    };
+    let ((all, looks), (some, _)) = (hits(1), hits(4));
+    assert!(looks > 10.0 && (all - looks).abs() < 1e-9, "{all} {looks}");
+    assert!((some / all - 0.25).abs() < 0.05, "{some} {all}");
 }
 
 /// A scene with some of its rays alone.

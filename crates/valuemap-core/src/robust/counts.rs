@@ -99,7 +99,7 @@ fn at_most(bound: f64, value: impl Fn(f64) -> f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::super::energy::anywhere;
-    use super::super::looks::Seen;
+    use super::super::seen::Seen;
     use super::*;
 
     fn of_votes(votes: usize, energy: f64) -> Object {

@@ -7,12 +7,12 @@
 //!   + ln|information| - 3 ln 2 pi - 2 ln births_c     (2) the position, marginalised, and the price of a birth
 //!   + 2 sum_i ln clutter_c                            (3) what the votes are otherwise
 //!   - 2 sum_i ln ratio(size_i)                        (4) boxes of one object have one physical size
-//!   - 2 ln [ (1 - phi_c) prod_pass usual(hits; looks) + phi_c prod_pass any(hits; looks) ]
-//!                                                     (5) who should have seen it, and did not: beta-binomial
+//!   - 2 ln [ (1 - phi) real_c(hits; looks) + phi false_c(hits; looks) ]
+//!                                                     (5) who should have seen it, and did not, by side and pass
 //! ```
 //!
-//! The second product of (5) is that of a false thing: parked, reflected, or mistaken for an object at times. Its detections meet as
-//! those of an object do, but in any share of the looks, none or all of a pass.
+//! The second term of (5) is that of a false thing: parked, reflected, or mistaken for an object at times. Its detections meet as
+//! those of an object do, but on one pass alone or in fewer of the looks (see [`super::seen`]).
 
 use std::f64::consts::PI;
 
@@ -20,12 +20,13 @@ use nalgebra::{Matrix3, Vector3};
 use rstar::RTree;
 use rstar::primitives::GeomWithData;
 
-use super::drift::{Drive, Look};
+use super::drift::{Drive, Look, OneLook};
 use super::estimate::is_one_visit;
 use super::heights::height_m;
-use super::looks::{Lookout, Seen};
+use super::looks::Lookout;
 use super::model::{Model, Sizes};
 use super::scene::Scene;
+use super::seen::Seen;
 use super::sizes::size_terms;
 
 /// Residuals beyond this many sigmas count less, in proportion (Huber): 95 % efficient where errors are Gaussian at 1.35, more above.
@@ -149,11 +150,18 @@ fn terms(model: &Model<'_>, votes: &[u32], weights: &[f64], point: &Vector3<f64>
         chi2: Vec::with_capacity(votes.len()),
     };
     for visit in visits(scene, votes) {
-        let mut looks = Vec::with_capacity(visit.len());
-        for &ray in visit {
-            looks.push(Look::of(scene, model.noise, ray, 0, point)?.by_itself());
-        }
         let first = sum.chi2.len();
+        let look_of = |ray: u32| Look::of(scene, model.noise, ray, 0, point).map(Look::by_itself);
+        if let [ray] = visit {
+            let look = look_of(*ray)?;
+            let one = OneLook::of(&look, weights[first])?;
+            sum.information += one.information;
+            sum.gradient += one.gradient;
+            sum.energy += one.square + one.log_determinant;
+            sum.chi2.push(one.left.norm_squared() / look.variance);
+            continue;
+        }
+        let looks: Vec<Look> = visit.iter().map(|&ray| look_of(ray)).collect::<Option<_>>()?;
         let drive = Drive::along(&looks, &weights[first..first + visit.len()], 1)?;
         let (information, gradient) = drive.normals.of_one();
         sum.information += information;

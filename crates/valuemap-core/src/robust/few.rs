@@ -64,10 +64,14 @@ pub fn objects_of_few(
     }
     found.retain(|object| object.votes.len() >= least_votes);
     for object in &mut found {
-        let ln_odds = model.classes[object.class as usize].ln_odds_of_few;
-        object.energy -= 2.0 * ln_odds[object.votes.len().min(ln_odds.len()) - 1];
+        object.energy -= 2.0 * ln_odds(&model.classes[object.class as usize], object.votes.len());
     }
     Ok(found)
+}
+
+/// Logarithm of the odds of objects of so many votes, among what is left.
+fn ln_odds(class: &ClassModel, votes: usize) -> f64 {
+    class.ln_odds_of_few[votes.min(class.ln_odds_of_few.len()) - 1]
 }
 
 /// The objects that are there.
@@ -117,16 +121,20 @@ impl Nursery<'_> {
     fn grown(&self, ray: u32, may_vote: &dyn Fn(u32) -> bool) -> Option<Object> {
         let model = self.model;
         let class = model.class_of(ray);
-        // Before images are asked who sees it, which takes most of the time.
         let alone = unseen(model, vec![ray], self.most_probable(ray, class)?)?;
-        let [_, of_others @ ..] = class.ln_odds_of_few;
-        if of_others.iter().all(|&ln_odds| ln_odds <= LEAST_LN_ODDS) && !self.may_be_alone(class, &alone) {
+        let (votes, gain) = self.votes_of(&alone, ray, may_vote);
+        // Before it is estimated with all of them, which takes most of the time.
+        if !self.may_be(class, &alone, &votes, gain) {
             return None;
         }
-        let mut votes = self.votes_of(&alone, ray, may_vote);
-        if votes.len() == 1 && !self.may_be_alone(class, &alone) {
-            return None;
-        }
+        let mut best = self.joined(alone, ray, votes, may_vote)?;
+        best.energy -= 2.0 * self.ln_density(class, best.class, &best.votes, &best.fit.point);
+        (!self.beside.explains(model, &best)).then_some(best)
+    }
+
+    /// The object that one of a ray alone becomes with the other votes that it may have, with those who should have seen it.
+    fn joined(&self, alone: Object, ray: u32, mut votes: Vec<u32>, may_vote: &dyn Fn(u32) -> bool) -> Option<Object> {
+        let model = self.model;
         let mut best = alone.with_looks(model, self.lookout, Vec::new())?;
         for _ in 0..ROUNDS {
             if votes == best.votes {
@@ -136,39 +144,40 @@ impl Nursery<'_> {
                 Some(more) if more.energy < best.energy => best = more,
                 _ => break,
             }
-            votes = self.votes_of(&best, ray, may_vote);
+            votes = self.votes_of(&best, ray, may_vote).0;
         }
-        let seen = self.lookout.looks_of_few(model, &best.fit.point, &best.votes);
-        best.energy += 2.0 * (best.seen.ln_likelihood(class) - seen.ln_likelihood(class));
-        best.energy -= 2.0 * self.ln_density(class, best.class, &best.votes, &best.fit.point);
-        (best.real, best.seen) = (seen.real(class), seen);
-        (!self.beside.explains(model, &best)).then_some(best)
+        Some(best)
     }
 
-    /// The ray, and those that an object has from other images, one of each.
-    fn votes_of(&self, object: &Object, ray: u32, may_vote: &dyn Fn(u32) -> bool) -> Vec<u32> {
+    /// The ray, and those that an object has from other images, one of each; and how much more probable each of these is than clutter, in
+    /// logarithms, added up.
+    fn votes_of(&self, object: &Object, ray: u32, may_vote: &dyn Fn(u32) -> bool) -> (Vec<u32>, f64) {
         let model = self.model;
+        let image = model.scene.rays.image[ray as usize];
         let hits = self.index.hits_of_any(&places_of(object), object.class, model.class_of(ray).farthest_m);
-        let mut votes: Vec<(u32, f64, u32)> = hits
+        let mut others: Vec<(u32, f64, u32)> = hits
             .into_iter()
-            .filter(|hit| may_vote(hit.ray))
-            .map(|hit| {
-                (hit.image, if hit.ray == ray { f64::INFINITY } else { gain_alone(model, object, hit.ray) }, hit.ray)
-            })
+            .filter(|hit| hit.image != image && may_vote(hit.ray))
+            .map(|hit| (hit.image, gain_alone(model, object, hit.ray), hit.ray))
             .filter(|(_, gain, _)| *gain > 0.0)
             .collect();
-        votes.sort_by(|a, b| a.0.cmp(&b.0).then(b.1.total_cmp(&a.1)).then(a.2.cmp(&b.2)));
-        votes.dedup_by_key(|vote| vote.0);
-        let mut votes: Vec<u32> = votes.into_iter().map(|vote| vote.2).chain([ray]).collect();
+        others.sort_by(|a, b| a.0.cmp(&b.0).then(b.1.total_cmp(&a.1)).then(a.2.cmp(&b.2)));
+        others.dedup_by_key(|vote| vote.0);
+        let gain = others.iter().map(|vote| vote.1).sum();
+        let mut votes: Vec<u32> = others.into_iter().map(|vote| vote.2).chain([ray]).collect();
         votes.sort_unstable();
-        votes.dedup();
-        votes
+        (votes, gain)
     }
 
-    /// Whether an object that one ray alone votes for may be there, whoever else should have seen it.
-    fn may_be_alone(&self, class: &ClassModel, alone: &Object) -> bool {
-        let density = self.ln_density(class, alone.class, &alone.votes, &alone.fit.point);
-        class.ln_odds_of_few[0] + density - 0.5 * alone.energy > LEAST_LN_ODDS
+    /// Whether an object of some votes may be there, about where one of them alone stands. They are worth no more together than each is to that one.
+    fn may_be(&self, class: &ClassModel, alone: &Object, votes: &[u32], gain: f64) -> bool {
+        let density = self.ln_density(class, alone.class, votes, &alone.fit.point);
+        let at_most = ln_odds(class, votes.len()) + density - 0.5 * alone.energy + gain;
+        if at_most <= LEAST_LN_ODDS {
+            return false;
+        }
+        let seen = self.lookout.looks(self.model, &alone.fit.point, votes, &[]);
+        at_most + seen.ln_likelihood(class) > LEAST_LN_ODDS && seen.real(class).ln() > LEAST_LN_ODDS
     }
 
     /// How much denser objects are at a place, with the company they have there, than clutter is at the elevations of some rays, in logarithms.

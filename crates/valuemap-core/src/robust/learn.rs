@@ -4,10 +4,13 @@ use super::clutter::{elevation_factor, score_ratio};
 use super::company::company;
 use super::energy::{Object, implied_size};
 use super::heights::{Heights, ground_m2 as ground_m2_within, height_m};
-use super::looks::{Lookout, Looks};
-use super::model::{ClassModel, FALSE_SHARE, Model, ODD_PASSES, Rates};
+use super::looks::Lookout;
+use super::model::{ClassModel, Model, ODD_PASSES, Rates};
 use super::reach::reach;
+use super::seen::Looks;
 
+/// Steps of expectation and maximisation: some ten change the rates by less than a thousandth.
+const STEPS: usize = 20;
 /// Objects with fewer votes do not serve.
 const MIN_VOTES: usize = 6;
 /// The part of the votes that is nearer than what counts as seen from everywhere.
@@ -77,13 +80,12 @@ impl<'a> Evidence<'a> {
         let of = |column: &[f64], rays: &[u32]| rays.iter().map(|&ray| column[ray as usize]).collect::<Vec<f64>>();
         learned.score_ratio = score_ratio(&of(&model.scene.score, &in_class), &of(&model.scene.score, &clutter));
         learned.clutter_by_elevation = elevation_factor(&of(&model.sin_elevation, &clutter), self.looked_at);
-        let is_sure = |object: &&Object| object.votes.len() >= MIN_VOTES && object.real > 0.5;
-        let sure: Vec<&Object> = of_class.iter().copied().filter(is_sure).collect();
+        let has_many = |object: &&Object| object.votes.len() >= MIN_VOTES;
+        let many: Vec<&Object> = of_class.iter().copied().filter(has_many).collect();
+        let sure: Vec<&Object> = many.iter().copied().filter(|object| object.real > 0.5).collect();
         if sure.len() >= MIN_OBJECTS {
             learned.is_learned = true;
-            (learned.rates, learned.odd_passes) = rates(&sure, before);
-            let false_share = of_class.iter().map(|object| 1.0 - object.real).sum::<f64>() / of_class.len() as f64;
-            learned.false_share = false_share.clamp(FALSE_SHARE.0, FALSE_SHARE.2);
+            (learned.rates, learned.odd_passes) = rates(&many, before);
             (learned.nearest_m, learned.farthest_m) = distances_between_m(model, &sure);
             let (spread, object) = sizes(model, &sure);
             learned.sizes.spread = spread.max(LEAST_SPREAD);
@@ -173,44 +175,90 @@ fn median(values: &mut [f64]) -> Option<f64> {
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
-/// How often objects are detected in the usual pass, how much that differs between them, and the share of odd passes: one step of expectation and
-/// maximisation.
+/// How often objects are detected in the usual pass from where they have most votes, how much that differs between them, and the share of odd
+/// passes: by expectation and maximisation, so that what is false in the end has told nothing. From two starts, the likelier: objects that differ
+/// much, of which few are false, and objects that are alike.
 fn rates(objects: &[&Object], before: &ClassModel) -> (Rates, f64) {
-    let mut passes: Vec<(Looks, f64, f64)> = objects.iter().flat_map(|object| object.seen.usual(before)).collect();
-    passes.retain(|(pass, ..)| pass.expected >= 3.0);
-    let visible: f64 = passes.iter().map(|pass| pass.1).sum();
-    let odd = 1.0 - passes.iter().map(|pass| pass.2).sum::<f64>() / visible;
-    let passes: Vec<(Looks, f64)> = passes.into_iter().map(|(pass, _, usual)| (pass, usual)).collect();
-    let odd = odd.clamp(ODD_PASSES.0, ODD_PASSES.2);
-    rates_of(&passes).map_or((before.rates, before.odd_passes), |rates| (rates, odd))
+    let mut shares: Vec<f64> = objects.iter().filter_map(|object| object.seen.main_share()).collect();
+    let alike = median(&mut shares).map_or(Rates::ALIKE, |share| Rates { recall: recall(share), ..Rates::ALIKE });
+    let from = |rates: Rates| {
+        let class = learned_rates(objects, ClassModel { rates, odd_passes: ODD_PASSES.1, ..*before })?;
+        let ln_likelihood: f64 = objects.iter().map(|object| object.seen.ln_likelihood(&class)).sum();
+        Some((ln_likelihood, class))
+    };
+    let starts = [from(Rates::GUESS), from(alike)].into_iter().flatten();
+    let likeliest = starts.max_by(|a, b| a.0.total_cmp(&b.0)).map_or(*before, |(_, class)| class);
+    (likeliest.rates, likeliest.odd_passes)
 }
 
-/// A beta distribution of detection rates, by the method of moments, from looks that each count in part. Nothing of few looks.
+/// The same from one start; nothing if there are few looks.
+fn learned_rates(objects: &[&Object], mut class: ClassModel) -> Option<ClassModel> {
+    for _ in 0..STEPS {
+        let of_object = |object: &&Object| {
+            let passes = object.seen.usual(&class).into_iter();
+            passes.filter(|(pass, ..)| pass.expected >= 3.0).collect::<Vec<(Looks, f64, f64)>>()
+        };
+        let sides: Vec<Vec<(Looks, f64, f64)>> = objects.iter().map(of_object).collect();
+        let real: f64 = sides.iter().flatten().map(|pass| pass.1).sum();
+        let odd = 1.0 - sides.iter().flatten().map(|pass| pass.2).sum::<f64>() / real;
+        let of_side =
+            |passes: Vec<(Looks, f64, f64)>| passes.into_iter().map(|(pass, _, usual)| (pass, usual)).collect();
+        let sides: Vec<Vec<(Looks, f64)>> = sides.into_iter().map(of_side).collect();
+        let rates = rates_of(&sides)?;
+        class = ClassModel { rates, odd_passes: odd.clamp(ODD_PASSES.0, ODD_PASSES.2), ..class };
+    }
+    Some(class)
+}
+
+/// A share of hits as a rate: no detector sees all, and none that serves sees nothing.
+fn recall(share: f64) -> f64 {
+    share.clamp(0.05, 0.98)
+}
+
+/// Detection rates by the method of moments, from looks by side and pass that each count in part. Nothing of few looks.
 #[must_use]
-pub(super) fn rates_of(all: &[(Looks, f64)]) -> Option<Rates> {
-    let expected: f64 = all.iter().map(|(looks, share)| share * looks.expected).sum();
-    let hits: f64 = all.iter().map(|(looks, share)| share * looks.hits).sum();
+pub(super) fn rates_of(sides: &[Vec<(Looks, f64)>]) -> Option<Rates> {
+    let all = || sides.iter().flatten();
+    let expected: f64 = all().map(|(looks, share)| share * looks.expected).sum();
+    let hits: f64 = all().map(|(looks, share)| share * looks.hits).sum();
     if expected < LEAST_LOOKS {
         return None;
     }
-    let recall = f64::clamp(hits / expected, 0.05, 0.98);
+    let recall = recall(hits / expected);
+    let variance = recall * (1.0 - recall);
     // The variance of a share of n looks is p (1 - p) (1 + (n - 1) / (1 + s)) / n.
     let (mut excess, mut most) = (0.0, 0.0);
-    for (looks, share) in all {
+    for (looks, share) in all() {
         let n = looks.expected;
         let away = looks.hits / n - recall;
-        excess += share * (n * away * away - recall * (1.0 - recall));
-        most += share * (n - 1.0) * recall * (1.0 - recall);
+        excess += share * (n * away * away - variance);
+        most += share * (n - 1.0) * variance;
     }
-    let correlation = f64::clamp(excess / most, 0.01, 0.5);
-    Some(Rates { recall, concentration: 1.0 / correlation - 1.0 })
+    let of_all = f64::clamp(excess / most, 0.01, 0.5);
+    // Two passes of one side have in common what sides differ by.
+    let (mut common, mut pairs) = (0.0, 0.0);
+    for passes in sides {
+        let [mut away, mut looks, mut away2, mut looks2] = [0.0; 4];
+        for (pass, share) in passes {
+            let (a, n) = (share * (pass.hits - recall * pass.expected), share * pass.expected);
+            (away, looks, away2, looks2) = (away + a, looks + n, away2 + a * a, looks2 + n * n);
+        }
+        if looks > 0.0 {
+            common += (away * away - away2) / looks;
+            pairs += (looks * looks - looks2) / looks;
+        }
+    }
+    let of_sides = if pairs > 0.0 { f64::clamp(common / (pairs * variance), 0.0, of_all - 0.01) } else { 0.0 };
+    let within = f64::clamp((of_all - of_sides) / (1.0 - of_sides), 0.01, 0.5);
+    // The derivative of the logit is 1 / (p (1 - p)).
+    Some(Rates { recall, concentration: 1.0 / within - 1.0, between: (of_sides / variance).sqrt() })
 }
 
 #[cfg(test)]
 mod tests {
     use super::super::energy::anywhere;
-    use super::super::looks::Seen;
     use super::super::scene::Scene;
+    use super::super::seen::Seen;
     use super::super::{Settings, Without};
     use super::*;
     use crate::hypothesis::Viability;
@@ -221,12 +269,46 @@ mod tests {
         let sectors = [[20.0, 8.0, 16.0, 12.0, 18.0, 10.0], [0.0, 0.0, 1.0, 0.0, 2.0, 0.0]]
             .map(|hits| hits.into_iter().map(pass).collect())
             .to_vec();
-        anywhere(1, Seen { sectors, images: 240 }, -100.0)
+        anywhere(1, Seen { sectors }, -100.0)
     }
 
     #[test]
     fn passes_are_not_odd_from_where_an_object_is_not_seen() {
         let objects: Vec<Object> = (0..9).map(|_| seen_from_one_side()).collect();
+        let (rates, odd_passes) = rates(&objects.iter().collect::<Vec<_>>(), &guess());
+        assert!((rates.recall - 0.7).abs() < 0.05, "{rates:?}");
+        assert!(odd_passes < 0.1, "{odd_passes}");
+    }
+
+    #[test]
+    fn what_looks_like_an_object_at_times_does_not_tell_how_often_objects_are_seen() {
+        let seen = |hits: &[f64]| {
+            let passes = hits.iter().map(|&hits| Looks { expected: 40.0, hits }).collect();
+            anywhere(1, Seen { sectors: vec![passes] }, -100.0)
+        };
+        let objects = (0..60).map(|i| seen(&[34.0 + f64::from(i % 5), 38.0 - f64::from(i % 3)]));
+        let lookalikes = (0..12).map(|i| seen(&[17.0 + f64::from(i % 9), 22.0 - f64::from(i % 7)]));
+        let all: Vec<Object> = objects.chain(lookalikes).collect();
+        let (rates, odd_passes) = rates(&all.iter().collect::<Vec<_>>(), &guess());
+        assert!(rates.recall > 0.88 && rates.concentration > 15.0, "{rates:?}");
+        let class = ClassModel { rates, odd_passes, ..guess() };
+        let least = all[..60].iter().map(|object| object.seen.real(&class)).fold(1.0, f64::min);
+        let most = all[60..].iter().map(|object| object.seen.real(&class)).fold(0.0, f64::max);
+        assert!(least > 0.9 && most < 0.5, "{least} {most}");
+    }
+
+    #[test]
+    fn objects_that_all_looks_see_have_rates_as_well() {
+        let passes = || vec![Looks { expected: 12.0, hits: 12.0 }];
+        let objects: Vec<Object> = (0..20).map(|_| anywhere(1, Seen { sectors: vec![passes()] }, -100.0)).collect();
+        let (rates, odd_passes) = rates(&objects.iter().collect::<Vec<_>>(), &guess());
+        assert!(rates.recall > 0.9 && rates.concentration > 1.0 && rates.between >= 0.0, "{rates:?}");
+        let class = ClassModel { rates, odd_passes, ..guess() };
+        assert!(objects[0].seen.real(&class) > 0.9);
+    }
+
+    /// What is thought of a class at first.
+    fn guess() -> ClassModel {
         let viability = Viability {
             max_reprojection_error_px: f64::NAN,
             min_parallax_rad: 0.0,
@@ -241,11 +323,21 @@ mod tests {
             min_existence: 0.5,
             without: Without::default(),
         };
-        let mut class = ClassModel::guess(&Scene::default(), &settings, 0, (f64::NAN, f64::NAN));
-        for _ in 0..5 {
-            (class.rates, class.odd_passes) = rates(&objects.iter().collect::<Vec<_>>(), &class);
-        }
-        assert!((class.rates.recall - 0.7).abs() < 0.05, "{:?}", class.rates);
-        assert!(class.odd_passes < 0.1, "{}", class.odd_passes);
+        ClassModel::guess(&Scene::default(), &settings, 0, (f64::NAN, f64::NAN))
+    }
+
+    #[test]
+    fn what_sides_differ_by_is_told_from_what_passes_differ_by() {
+        let pass = |hits: f64| (Looks { expected: 20.0, hits }, 1.0);
+        let of_sides = |hits: &[[f64; 4]]| {
+            let sides: Vec<Vec<(Looks, f64)>> =
+                hits.iter().map(|side| side.iter().map(|&h| pass(h)).collect()).collect();
+            rates_of(&sides).unwrap_or(Rates::ANY)
+        };
+        let by_side = of_sides(&[[18.0, 17.0, 18.0, 19.0], [8.0, 9.0, 8.0, 7.0], [13.0, 14.0, 12.0, 13.0]]);
+        let by_pass = of_sides(&[[18.0, 8.0, 13.0, 14.0], [17.0, 9.0, 12.0, 13.0], [18.0, 8.0, 19.0, 7.0]]);
+        assert!(by_side.between > 0.6 && by_side.concentration > 50.0, "{by_side:?}");
+        assert!(by_pass.between < 0.1 && by_pass.concentration < 20.0, "{by_pass:?}");
+        assert!((by_side.recall - by_pass.recall).abs() < 1e-9);
     }
 }

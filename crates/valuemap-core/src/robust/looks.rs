@@ -1,8 +1,9 @@
 //! Which images should have seen an object: its looks.
 //!
-//! A look is a viewpoint of a pass with an image that has the point in its picture, from a direction and a distance from which the
-//! object was voted for. A viewpoint that has a vote is a hit. Where another detection lies in the point's gate, the object may be
-//! hidden behind that one, or be one with it in the picture: half a look.
+//! A look is a viewpoint of a pass with an image that has the point in its picture, from a direction from which the object was voted for and
+//! a distance from which its class is detected. It is as much of a hit as the share of its images that have a vote. One from where fewer are
+//! detected is as much less of a look. Where another detection lies in the point's gate, the object may be hidden behind that one, or be one with it in the picture:
+//! half a look.
 
 use nalgebra::Vector3;
 use rstar::RTree;
@@ -10,8 +11,9 @@ use rstar::primitives::GeomWithData;
 use rustc_hash::FxHashMap;
 
 use super::energy::Object;
-use super::model::{ClassModel, Model, Rates};
+use super::model::Model;
 use super::scene::Scene;
+use super::seen::{Looks, Seen};
 
 /// Images are grouped by cubes of this share of the range: some hundred cubes are in reach of a point.
 const CUBE_SHARE: f64 = 1.0 / 6.0;
@@ -20,111 +22,6 @@ const CUBE_SHARE: f64 = 1.0 / 6.0;
 const SECTOR_COSINE: f64 = 0.966;
 /// A look at a point where another detection is counts so much: hidden as often as not.
 const HIDDEN_LOOK: f64 = 0.5;
-
-/// Looks of one pass at an object.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Looks {
-    /// Viewpoints that should have seen it.
-    pub expected: f64,
-    /// Viewpoints that did.
-    pub hits: f64,
-}
-
-/// All looks at an object.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct Seen {
-    /// By sector, and there by pass.
-    pub sectors: Vec<Vec<Looks>>,
-    /// Images that should have seen it.
-    pub images: u32,
-}
-
-/// Logarithms of how probable the looks of one sector are: if the object is seen from there as usual, and if in any share of the looks, one for all
-/// passes or each its own.
-struct OfSector {
-    usual: f64,
-    any: f64,
-    hits: f64,
-    expected: f64,
-}
-
-impl OfSector {
-    fn new(passes: &[Looks], class: &ClassModel) -> Self {
-        let (mut usual, mut each, mut hits, mut expected) = (0.0, 0.0, 0.0, 0.0);
-        for pass in passes {
-            let any = Rates::ANY.log_likelihood(pass.hits, pass.expected);
-            let as_usual = class.rates.log_likelihood(pass.hits, pass.expected);
-            usual += ((1.0 - class.odd_passes) * as_usual.exp() + class.odd_passes * any.exp()).ln();
-            each += any;
-            hits += pass.hits;
-            expected += pass.expected;
-        }
-        let any = ln_sum(each, Rates::ANY.log_likelihood(hits, expected)) - std::f64::consts::LN_2;
-        Self { usual, any, hits, expected }
-    }
-
-    /// From as many directions an object is seen as usual as it is not.
-    fn either(&self) -> f64 {
-        ln_sum(self.usual, self.any) - std::f64::consts::LN_2
-    }
-}
-
-/// `ln(e^a + e^b)`.
-fn ln_sum(a: f64, b: f64) -> f64 {
-    a.max(b) + (-(a - b).abs()).exp().ln_1p()
-}
-
-impl Seen {
-    /// Logarithms of how probable the looks are at a real object, which is seen as usual from where it has most votes, and at a false thing.
-    #[must_use]
-    pub fn log_likelihoods(&self, class: &ClassModel) -> (f64, f64) {
-        let sectors: Vec<OfSector> = self.sectors.iter().map(|passes| OfSector::new(passes, class)).collect();
-        let more = |a: &&OfSector, b: &&OfSector| a.hits.total_cmp(&b.hits).then(a.expected.total_cmp(&b.expected));
-        let main = sectors.iter().max_by(more).map_or(0.0, |main| main.usual - main.either());
-        let real = main + sectors.iter().map(OfSector::either).sum::<f64>();
-        let strange = sectors.iter().map(|sector| sector.any).sum::<f64>();
-        (real + (-class.false_share).ln_1p(), strange + class.false_share.ln())
-    }
-
-    /// Logarithm of how probable the looks are at anything, real or false.
-    #[must_use]
-    pub fn ln_likelihood(&self, class: &ClassModel) -> f64 {
-        let (real, strange) = self.log_likelihoods(class);
-        ln_sum(real, strange)
-    }
-
-    /// Passes that see an object, or should have from where others do; and minus the logarithm of how probable it is of those without a hit
-    /// to have none.
-    #[must_use]
-    pub fn missed(&self, class: &ClassModel) -> (usize, f64) {
-        let passes = self.sectors.iter().flatten().filter(|pass| pass.expected > 0.0);
-        let missed = passes.clone().filter(|pass| pass.hits == 0.0);
-        (passes.count(), missed.map(|pass| -OfSector::new(&[*pass], class).usual).sum())
-    }
-
-    /// Probability that what has these looks is real rather than false.
-    #[must_use]
-    pub fn real(&self, class: &ClassModel) -> f64 {
-        (self.log_likelihoods(class).0 - self.ln_likelihood(class)).exp()
-    }
-
-    /// The looks of all passes; how probable it is that they are from where the object is usually seen, and that it is seen as usual on
-    /// this pass as well.
-    #[must_use]
-    pub fn usual(&self, class: &ClassModel) -> Vec<(Looks, f64, f64)> {
-        let of_sector = |passes: &Vec<Looks>| {
-            let sector = OfSector::new(passes, class);
-            let visible = (sector.usual - ln_sum(sector.usual, sector.any)).exp();
-            let of_pass = move |pass: &Looks| {
-                let usual = (1.0 - class.odd_passes) * class.rates.log_likelihood(pass.hits, pass.expected).exp();
-                let any = class.odd_passes * Rates::ANY.log_likelihood(pass.hits, pass.expected).exp();
-                (*pass, visible, visible * usual / (usual + any))
-            };
-            passes.iter().map(of_pass).collect::<Vec<_>>()
-        };
-        self.sectors.iter().flat_map(of_sector).collect()
-    }
-}
 
 /// All images by place.
 pub struct Lookout {
@@ -153,18 +50,14 @@ impl Lookout {
         self.cubes.locate_within_distance((*point).into(), reach * reach).flat_map(|near| near.data.iter().copied())
     }
 
-    /// The looks at a point that some rays (one per image, ascending) vote for; `others` are images (ascending) with a detection in its gate.
+    /// The looks at a point that some rays (one per image, ascending) vote for, from as near and as far as their class is detected; `others` are
+    /// images (ascending) with a detection in its gate.
     #[must_use]
     pub fn looks(&self, model: &Model<'_>, point: &Vector3<f64>, voters: &[u32], others: &[u32]) -> Seen {
-        let nearest_m = voters.first().map_or(f64::INFINITY, |&ray| model.class_of(ray).nearest_m);
-        self.looks_within(model, point, voters, others, (nearest_m, 0.0), |_| 1.0)
-    }
-
-    /// The same, with looks from as near and as far as the class is detected: few votes do not tell from where their object is seen.
-    #[must_use]
-    pub fn looks_of_few(&self, model: &Model<'_>, point: &Vector3<f64>, voters: &[u32]) -> Seen {
         let Some(class) = voters.first().map(|&ray| model.class_of(ray)) else { return Seen::default() };
-        self.looks_within(model, point, voters, &[], (0.0, class.farthest_m), |distance_m| class.reach.at(distance_m))
+        // Before anything is learned, objects are seen from between their nearest and their farthest vote.
+        let distances_m = if class.is_learned { (0.0, class.farthest_m) } else { (f64::INFINITY, 0.0) };
+        self.looks_within(model, point, voters, others, distances_m, |distance_m| class.reach.at(distance_m))
     }
 
     /// Tells of objects whether all images in reach of them have only detections among some rays: their votes are counted in full.
@@ -183,6 +76,23 @@ impl Lookout {
             let is_near = |&image: &u32| (model.scene.views[image as usize].center - point).norm() <= reach_m;
             !self.around(point, reach_m).filter(is_near).any(|image| is_left_out[image as usize])
         }
+    }
+
+    /// How many images should have seen a point that some rays (one per image, ascending) vote for, these included: those that have it in their picture
+    /// from a direction from which it was voted for, no nearer and no farther than the votes from there.
+    #[must_use]
+    pub fn expected(&self, scene: &Scene, point: &Vector3<f64>, voters: &[u32]) -> u32 {
+        let sectors = Sectors::of(scene, point, voters, (f64::INFINITY, 0.0));
+        let farthest = sectors.0.iter().map(|sector| sector.farthest_m).fold(0.0, f64::max);
+        let mut hits: Vec<u32> = voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
+        hits.sort_unstable();
+        let has_missed = |image: &u32| {
+            let view = &scene.views[*image as usize];
+            hits.binary_search(image).is_err()
+                && sectors.holding(&(view.center - point)).is_some()
+                && scene.is_in_picture(view, point)
+        };
+        (hits.len() + self.around(point, farthest).filter(has_missed).count()) as u32
     }
 
     /// How far the images are, m, that look at a point from where some rays vote for it, up to `farthest_m`, and whether they have a vote.
@@ -240,20 +150,21 @@ impl Lookout {
         }
         // Images are numbered along the drives: sorted, those of a viewpoint are side by side.
         looks.sort_unstable_by_key(|look| (look.sector, look.image));
-        let images = looks.len() as u32;
         let view = |look: &Look| &scene.views[look.image as usize];
         let of_pass = |pass: &[Look]| {
             let mut sum = Looks { expected: 0.0, hits: 0.0 };
             for images in pass.chunk_by(|a, b| view(a).viewpoint == view(b).viewpoint) {
-                let hit = images.iter().any(|image| image.is_hit);
-                sum.hits += f64::from(u8::from(hit));
-                sum.expected += if hit { 1.0 } else { images.iter().map(|image| image.weight).fold(0.0, f64::max) };
+                let hits = images.iter().filter(|image| image.is_hit).count() as f64;
+                let all: f64 = images.iter().map(|image| image.weight).sum();
+                let most = images.iter().map(|image| image.weight).fold(0.0, f64::max);
+                sum.hits += if hits > 0.0 { most * hits / all } else { 0.0 };
+                sum.expected += most;
             }
             sum
         };
         let of_sector = |sector: &[Look]| sector.chunk_by(|a, b| view(a).pass == view(b).pass).map(of_pass).collect();
         let sectors = looks.chunk_by(|a, b| a.sector == b.sector).map(of_sector).collect();
-        Seen { sectors, images }
+        Seen { sectors }
     }
 }
 

@@ -38,6 +38,7 @@ pub mod repair;
 pub mod sample;
 pub mod scene;
 pub mod search;
+pub mod seen;
 pub mod sizes;
 mod spd;
 
@@ -87,6 +88,9 @@ pub struct Without {
 
 /// Rays of the places that the noise is estimated from, about: from each start, and from the best in the end.
 const CALIBRATION_RAYS: (usize, usize) = (4_000, 10_000);
+/// Rays that classes are learned from, about: some hundred objects of some hundred votes each. Of fifty, a few that are hardly seen tell whether the
+/// others are seen alike.
+const CLASS_RAYS: usize = 30_000;
 /// Places that classes are learned from are so many ranges wide: most objects in them are seen by no other images.
 const WIDE: f64 = 3.0;
 /// Scenes with more rays than this are searched less deeply, if that changes little.
@@ -174,7 +178,7 @@ pub fn self_calibrate(
         likeliest_noise(scene, guess, known, settings, &more, progress)?
     };
     let mut model = Model::new(scene, &noise, settings);
-    let wide = sample::places(scene, CALIBRATION_RAYS.1, WIDE * settings.viability.max_range_m);
+    let wide = sample::places(scene, CLASS_RAYS, WIDE * settings.viability.max_range_m);
     let objects = learn_from(&mut model, &wide, progress)?;
     let is_small = !is_part && scene.usable_rays().len() <= MOST_RAYS;
     let is_deep = is_small || {
@@ -232,7 +236,11 @@ pub fn find(
     let noise = &calibration.noise;
     let mut model = Model::new(scene, noise, settings);
     model.know(&calibration.classes, calibration.pooled);
-    let (begun, first) = initial::labels(&model, !calibration.is_deep, progress)?;
+    let (begun, first) = if std::env::var("XFEW").is_ok() {
+        (initial::labels_of_few(&model, &rays, progress)?, initial::Tally::default())
+    } else {
+        initial::labels(&model, !calibration.is_deep, progress)?
+    };
     progress.advance()?;
     let mut tally =
         Tally { hypotheses: first.nominations, births: first.accepted, deaths: first.doubted + first.outvoted };
@@ -242,31 +250,25 @@ pub fn find(
     let variance_factor = calibrate::variance_factor(scene, noise, &placed(&objects), objects.len().max(1));
     let claimed: usize = objects.iter().map(|object| object.votes.len()).sum();
     let energy = objects.iter().map(|object| object.energy).sum();
-    let existence = initial::existence(&model, &objects, &estimates, first.doubted);
     let few = if settings.least_votes < settings.min_votes {
         few::objects_of_few(&model, &rays, &objects, settings.least_votes as usize, progress)?
     } else {
         Vec::new()
     };
-    let of_few: Vec<Estimate> =
-        few.iter().map(|o| Estimate { point: o.fit.point, covariance: o.fit.covariance }).collect();
-    let judged = initial::existence(&model, &few, &of_few, first.doubted);
-    let few = few.into_iter().zip(of_few).zip(judged).map(|((object, estimate), (judged, _))| {
-        // Of few votes nothing is expected of the looks that is not in J.
-        let is_judged = object.votes.len() >= settings.min_votes as usize;
-        let existence = if is_judged { object.existence().min(judged) } else { object.existence() };
-        Finding { estimate, existence, expected: object.seen.images, votes: object.votes }
+    let few = few.into_iter().map(|object| {
+        let estimate = Estimate { point: object.fit.point, covariance: object.fit.covariance };
+        (object, estimate)
     });
-    let mut findings: Vec<Finding> = objects
-        .into_iter()
-        .zip(estimates)
-        .zip(existence)
-        .map(|((object, mut estimate), (existence, expected))| {
-            estimate.covariance *= variance_factor;
+    let scaled = |estimate: Estimate| Estimate { covariance: estimate.covariance * variance_factor, ..estimate };
+    let all = objects.into_iter().zip(estimates.into_iter().map(scaled)).chain(few);
+    let lookout = Lookout::new(scene, settings.viability.max_range_m);
+    let mut findings: Vec<Finding> = all
+        .map(|(object, estimate)| (object.existence(), object, estimate))
+        .filter(|(existence, ..)| *existence >= settings.min_existence)
+        .map(|(existence, object, estimate)| {
+            let expected = lookout.expected(scene, &estimate.point, &object.votes);
             Finding { estimate, existence, expected, votes: object.votes }
         })
-        .chain(few)
-        .filter(|finding| finding.existence >= settings.min_existence)
         .collect();
     findings.sort_by_key(|finding| finding.votes[0]);
     Ok(Findings {

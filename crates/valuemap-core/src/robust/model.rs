@@ -29,8 +29,6 @@ pub struct ClassModel {
     pub farthest_m: f64,
     /// The share of the passes in which an object is seen in any share of the looks, or none: hidden, or from where it is not detected.
     pub odd_passes: f64,
-    /// The share of what is born that is false.
-    pub false_share: f64,
     /// Logarithm of the clutter: detections per image and steradian that show no object.
     pub ln_clutter_per_sr: f64,
     /// Logarithm of the density of objects, 1/m³.
@@ -62,7 +60,6 @@ impl ClassModel {
             nearest_m: f64::INFINITY,
             farthest_m: settings.viability.max_range_m,
             odd_passes: ODD_PASSES.1,
-            false_share: FALSE_SHARE.1,
             ln_clutter_per_sr: (detections.max(1) as f64 / scene.solid_angle_sr()).ln(),
             ln_births_per_m3: -3.0 * settings.viability.max_range_m.ln(),
             ln_births_per_m2: f64::NAN,
@@ -84,10 +81,10 @@ impl ClassModel {
             f64::from(u8::from(self.is_learned)),
             self.rates.recall,
             self.rates.concentration,
+            self.rates.between,
             self.nearest_m,
             self.farthest_m,
             self.odd_passes,
-            self.false_share,
             self.ln_clutter_per_sr,
             self.ln_births_per_m3,
             self.ln_births_per_m2,
@@ -117,10 +114,10 @@ impl ClassModel {
             is_learned,
             recall,
             concentration,
+            between,
             nearest_m,
             farthest_m,
             odd_passes,
-            false_share,
             ln_clutter_per_sr,
             ln_births_per_m3,
             ln_births_per_m2,
@@ -135,11 +132,10 @@ impl ClassModel {
         ] = numbers;
         Some(Self {
             is_learned: is_learned > 0.0,
-            rates: Rates { recall, concentration },
+            rates: Rates { recall, concentration, between },
             nearest_m,
             farthest_m,
             odd_passes,
-            false_share,
             ln_clutter_per_sr,
             ln_births_per_m3,
             ln_births_per_m2,
@@ -177,13 +173,16 @@ impl ClassModel {
     }
 }
 
-/// How often an object is detected: a share of the looks that differs from pass to pass, a beta distribution.
+/// How often an object is detected: a share of the looks that differs from object to object and from side to side, a logit-normal distribution,
+/// and around that from pass to pass, a beta distribution.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rates {
     /// Its mean.
     pub recall: f64,
-    /// How little it differs between passes: the sum of both parameters of the beta distribution, in looks.
+    /// How little it differs between the passes of one side: the sum of both parameters of the beta distribution, in looks.
     pub concentration: f64,
+    /// Standard deviation of the logit of the share between sides.
+    pub between: f64,
 }
 
 /// Logarithms of box sizes as angles, and of physical sizes in metres: angle times depth.
@@ -350,18 +349,33 @@ impl<'a> Model<'a> {
     }
 }
 
-/// The share of false things among what is born: at least, before anything is learned, at most. Rule of succession: of a hundred objects one
-/// may be false though none is known.
-pub const FALSE_SHARE: (f64, f64, f64) = (0.01, 0.1, 0.5);
+/// The share of false things among what is born. It is not learned: of two passes, a real object that one of them missed and a thing that the other
+/// did not meet look the same, and whatever is thought of them confirms itself.
+pub const FALSE_SHARE: f64 = 0.1;
+
+/// Standard deviation of the share of hits between sides, at least.
+const LEAST_BETWEEN: f64 = 0.05;
 
 /// The share of odd passes: at least, before anything is learned, at most.
 pub const ODD_PASSES: (f64, f64, f64) = (0.05, 0.2, 0.5);
 
 impl Rates {
     /// Of things of which nothing is known (Jeffreys).
-    pub const ANY: Self = Self { recall: 0.5, concentration: 1.0 };
+    pub const ANY: Self = Self { recall: 0.5, concentration: 1.0, between: 0.0 };
     /// Before anything is learned.
-    pub const GUESS: Self = Self { recall: 0.7, concentration: 3.0 };
+    pub const GUESS: Self = Self { recall: 0.7, concentration: 3.0, between: 0.0 };
+    /// Of objects of which each is seen in the same share of the looks: as many tell a tenth from none.
+    pub const ALIKE: Self = Self { recall: 0.7, concentration: 100.0, between: 0.0 };
+
+    /// How probable it is that a side has a share of hits, but for a factor: the logit is normal.
+    #[must_use]
+    pub fn density(&self, share: f64) -> f64 {
+        let logit = |p: f64| (p / (1.0 - p)).ln();
+        // No narrower than shares are told apart.
+        let sigma = self.between.max(LEAST_BETWEEN / (self.recall * (1.0 - self.recall)));
+        let away = (logit(share) - logit(self.recall)) / sigma;
+        (-0.5 * away * away).exp() / (share * (1.0 - share))
+    }
 
     /// What one more hit instead of a miss is worth, about.
     #[must_use]
@@ -416,7 +430,7 @@ mod tests {
 
     #[test]
     fn the_beta_binomial_is_that_of_whole_numbers() {
-        let rates = Rates { recall: 0.6, concentration: 4.0 };
+        let rates = Rates { recall: 0.6, concentration: 4.0, between: 0.0 };
         // B(2.4 + 2, 1.6 + 1) / B(2.4, 1.6) = (2.4 * 3.4 * 1.6) / (4 * 5 * 6).
         let expected = (2.4_f64 * 3.4 * 1.6 / (4.0 * 5.0 * 6.0)).ln();
         assert!((rates.log_likelihood(2.0, 3.0) - expected).abs() < 1e-9);

@@ -10,7 +10,6 @@ use rstar::primitives::GeomWithData;
 use rustc_hash::FxHasher;
 
 use crate::robust::calibrate;
-use crate::robust::energy::Object;
 use crate::robust::estimate::{Care, Elsewhere, Estimate, Joint, Limits, Start};
 use crate::robust::noise::Noise;
 use crate::robust::scene::{Scene, View};
@@ -113,27 +112,6 @@ pub fn from_voters(
         revision: Revision::default(),
         known: Known::default(),
     })
-}
-
-/// An object as a label; other detections in its gate explain why it has none there.
-#[must_use]
-pub fn of_object(scene: &Scene, object: &Object, estimate: Estimate) -> Label {
-    let image = |&ray: &u32| scene.rays.image[ray as usize];
-    let voted: Vec<u32> = object.votes.iter().map(image).collect();
-    let undecided = object.others.iter().copied().filter(|image| voted.binary_search(image).is_err()).collect();
-    Label {
-        estimate,
-        side: side_of(scene, &object.votes, &estimate.point),
-        class: object.class,
-        voters: object.votes.clone(),
-        weights: Vec::new(),
-        undecided,
-        unseen_from: Vec::new(),
-        elsewhere: Vec::new(),
-        refused: Vec::new(),
-        revision: Revision::default(),
-        known: Known::default(),
-    }
 }
 
 /// Mean of the unit directions from a point to the cameras of its voters.

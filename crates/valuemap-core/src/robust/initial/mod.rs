@@ -15,10 +15,6 @@ pub mod settle;
 
 use nalgebra::Vector3;
 
-use rayon::prelude::*;
-
-use super::energy::Object;
-use super::estimate::Estimate;
 use super::keyframes::Keyframes;
 use super::model::Model;
 use crate::progress::{Halt, Progress};
@@ -97,16 +93,6 @@ pub fn labels(model: &Model<'_>, is_quick: bool, progress: &Progress) -> Result<
     let labels = settle::outclass(model.scene, model.noise, labels);
     tally.outvoted += (before - labels.len()) as u64;
     Ok((begun(labels), tally))
-}
-
-/// The probability that each object exists, and the images that should have seen it, by the looks at it.
-#[must_use]
-pub fn existence(model: &Model<'_>, objects: &[Object], estimates: &[Estimate], doubted: u64) -> Vec<(f64, u32)> {
-    let lookout = existence::Lookout::new(model.scene);
-    let both = objects.iter().zip(estimates);
-    let labels: Vec<Label> = both.map(|(object, estimate)| label::of_object(model.scene, object, *estimate)).collect();
-    let sectors: Vec<_> = labels.par_iter().map(|label| lookout.sectors(label).into()).collect();
-    court::judge(model.scene, &model.spreads, &sectors, &labels, model.settings, doubted).of_labels
 }
 
 fn begun(labels: Vec<Label>) -> Vec<Begun> {

@@ -1,0 +1,321 @@
+//! How probable the looks at an object are: if it is real, and if it is false.
+//!
+//! A real object is seen in a share of the looks from each side that differs from side to side and, around that, from pass to pass; on an odd
+//! pass in any share. From some sides it is seen less. What is false is there on one pass alone, any of them, or seen less than a
+//! real one from everywhere: the side with most hits tells.
+
+use std::cmp::Ordering;
+use std::f64::consts::LN_2;
+
+use super::model::{ClassModel, FALSE_SHARE, Rates, ln_gamma};
+
+/// Shares of hits that sides may have: about as finely as some dozen looks tell them apart.
+const SHARES: usize = 12;
+/// Looks of one pass at an object.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Looks {
+    /// Viewpoints that should have seen it.
+    pub expected: f64,
+    /// Viewpoints that did.
+    pub hits: f64,
+}
+
+/// All looks at an object.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Seen {
+    /// By sector, and there by pass.
+    pub sectors: Vec<Vec<Looks>>,
+}
+
+/// The shares of hits that the sides of objects of a class may have.
+struct Shares<'a> {
+    class: &'a ClassModel,
+    each: [Share; SHARES],
+    /// Logarithm of the gamma function of the concentration.
+    ln_gamma: f64,
+}
+
+/// One of them: its beta distribution over passes.
+#[derive(Clone, Copy)]
+struct Share {
+    hit: f64,
+    miss: f64,
+    /// Logarithms of the gamma function of both.
+    ln_gamma: (f64, f64),
+    /// How probable it is that a side has it: as usual, and where it is seen less.
+    ln_usual: f64,
+    ln_less: f64,
+}
+
+impl<'a> Shares<'a> {
+    fn of(class: &'a ClassModel) -> Self {
+        let Rates { recall, concentration, .. } = class.rates;
+        let shares: [f64; SHARES] = std::array::from_fn(|k| (k as f64 + 0.5) / SHARES as f64);
+        let usual = shares.map(|share| class.rates.density(share));
+        let less = shares.map(|share| f64::from(u8::from(share < recall)));
+        let ln_of = |weights: &[f64; SHARES], k: usize| (weights[k] / weights.iter().sum::<f64>()).ln();
+        let each = std::array::from_fn(|k| {
+            let (hit, miss) = (shares[k] * concentration, (1.0 - shares[k]) * concentration);
+            let ln_gamma = (ln_gamma(hit), ln_gamma(miss));
+            Share { hit, miss, ln_gamma, ln_usual: ln_of(&usual, k), ln_less: ln_of(&less, k) }
+        });
+        Self { class, each, ln_gamma: ln_gamma(concentration) }
+    }
+
+    /// How probable the looks of a pass are from a side of each share, if it is a usual pass; and if it is an odd one.
+    fn of_pass(&self, pass: &Looks) -> ([f64; SHARES], f64) {
+        let odd = self.class.odd_passes;
+        let any = odd * Rates::ANY.log_likelihood(pass.hits, pass.expected).exp();
+        let ln_all = self.ln_gamma - ln_gamma(self.class.rates.concentration + pass.expected);
+        let usual = self.each.map(|share| {
+            let (hit, miss) = (share.hit + pass.hits, share.miss + pass.expected - pass.hits);
+            let ln_usual = ln_gamma(hit) - share.ln_gamma.0 + ln_gamma(miss) - share.ln_gamma.1 + ln_all;
+            (1.0 - odd) * ln_usual.exp()
+        });
+        (usual, any)
+    }
+
+    /// Logarithms of how probable the looks of some passes are from a side of each share.
+    fn of_passes(&self, passes: &[Looks]) -> [f64; SHARES] {
+        let mut sum = [0.0; SHARES];
+        for pass in passes {
+            let (usual, any) = self.of_pass(pass);
+            sum.iter_mut().zip(usual).for_each(|(sum, usual)| *sum += (usual + any).ln());
+        }
+        sum
+    }
+}
+
+/// Logarithms of how probable the looks of one sector are: if the object is seen from there as usual, if less or differently on each pass,
+/// and if it is false.
+struct OfSector {
+    usual: f64,
+    any: f64,
+    falsely: f64,
+    hits: f64,
+    expected: f64,
+}
+
+impl OfSector {
+    fn new(passes: &[Looks], shares: &Shares<'_>) -> Self {
+        let (mut each, mut hits, mut expected) = (0.0, 0.0, 0.0);
+        let (mut present, mut of_present) = (0, 0.0);
+        for pass in passes {
+            let any = Rates::ANY.log_likelihood(pass.hits, pass.expected);
+            each += any;
+            hits += pass.hits;
+            expected += pass.expected;
+            if pass.hits > 0.0 {
+                present += 1;
+                of_present += any;
+            }
+        }
+        let of_shares = shares.of_passes(passes);
+        let with = |ln_weight: fn(&Share) -> f64| {
+            ln_sum_of(&std::array::from_fn::<f64, SHARES, _>(|k| of_shares[k] + ln_weight(&shares.each[k])))
+        };
+        let less = with(|share| share.ln_less);
+        // What two passes meet at one place does not pass by.
+        let passing = if present == 1 { of_present + ln_met_by_one(passes.len()) } else { f64::NEG_INFINITY };
+        let (falsely, any) = (ln_sum(passing, less) - LN_2, ln_sum(each, less) - LN_2);
+        Self { usual: with(|share| share.ln_usual), any, falsely, hits, expected }
+    }
+
+    /// That from where an object has most votes is the greatest.
+    fn by_hits(&self, other: &Self) -> Ordering {
+        self.hits.total_cmp(&other.hits).then(self.expected.total_cmp(&other.expected))
+    }
+
+    /// From as many directions an object is seen as usual as it is not.
+    fn either(&self) -> f64 {
+        ln_sum(self.usual, self.any) - LN_2
+    }
+}
+
+/// Logarithm of how probable it is that a certain one of some passes alone meets what is there on any share of them, up to every other, if
+/// any does: the mean of `p (1 - p)^(passes - 1)` over p between 0 and 1/2, by that of `1 - (1 - p)^passes`.
+fn ln_met_by_one(passes: usize) -> f64 {
+    // Half the mean of (1 - p)^(power - 1).
+    let up_to = |power: f64| (1.0 - (-power).exp2()) / power;
+    let passes = passes as f64;
+    (2.0 * (up_to(passes) - up_to(passes + 1.0)) / (1.0 - 2.0 * up_to(passes + 1.0))).ln()
+}
+
+/// `ln(sum of e^x)`.
+fn ln_sum_of(logarithms: &[f64]) -> f64 {
+    let most = logarithms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    most + logarithms.iter().map(|x| (x - most).exp()).sum::<f64>().ln()
+}
+
+/// `ln(e^a + e^b)`.
+fn ln_sum(a: f64, b: f64) -> f64 {
+    a.max(b) + (-(a - b).abs()).exp().ln_1p()
+}
+
+impl Seen {
+    /// Logarithms of how probable the looks are at a real object, which is seen as usual from where it has most votes, and at a false thing. From other
+    /// sides both may be seen as usual or not.
+    #[must_use]
+    pub fn log_likelihoods(&self, class: &ClassModel) -> (f64, f64) {
+        let shares = Shares::of(class);
+        let sectors: Vec<OfSector> = self.sectors.iter().map(|passes| OfSector::new(passes, &shares)).collect();
+        let all: f64 = sectors.iter().map(OfSector::either).sum();
+        let (usual, falsely) = sectors.iter().max_by(|a, b| a.by_hits(b)).map_or((0.0, 0.0), |main| {
+            let others = all - main.either();
+            (others + main.usual, others + main.falsely)
+        });
+        (usual + (-FALSE_SHARE).ln_1p(), falsely + FALSE_SHARE.ln())
+    }
+
+    /// Logarithm of how probable the looks are at anything, real or false.
+    #[must_use]
+    pub fn ln_likelihood(&self, class: &ClassModel) -> f64 {
+        let (real, falsely) = self.log_likelihoods(class);
+        ln_sum(real, falsely)
+    }
+
+    /// Passes that see an object from where it has most votes, or should have; and minus the logarithm of how probable it is of those without a hit
+    /// to have none.
+    #[must_use]
+    pub fn missed(&self, class: &ClassModel) -> (usize, f64) {
+        let shares = Shares::of(class);
+        let Some((passes, _)) = self.main(&shares) else { return (0, 0.0) };
+        let looked = passes.iter().filter(|pass| pass.expected > 0.0);
+        let missed = looked.clone().filter(|pass| pass.hits == 0.0);
+        (looked.count(), missed.map(|pass| -OfSector::new(&[*pass], &shares).usual).sum())
+    }
+
+    /// The share of hits from where it has most votes.
+    #[must_use]
+    pub fn main_share(&self) -> Option<f64> {
+        let sum = |passes: &Vec<Looks>| passes.iter().fold((0.0, 0.0), |sum, p| (sum.0 + p.hits, sum.1 + p.expected));
+        let (hits, expected) = self.sectors.iter().map(sum).max_by(|a, b| a.0.total_cmp(&b.0))?;
+        (expected > 0.0).then(|| hits / expected)
+    }
+
+    /// The looks of each pass from where the object has most votes.
+    fn main(&self, shares: &Shares<'_>) -> Option<(&Vec<Looks>, OfSector)> {
+        let sectors = self.sectors.iter().map(|passes| (passes, OfSector::new(passes, shares)));
+        sectors.max_by(|(_, a), (_, b)| a.by_hits(b))
+    }
+
+    /// Probability that what has these looks is real rather than false.
+    #[must_use]
+    pub fn real(&self, class: &ClassModel) -> f64 {
+        let (real, falsely) = self.log_likelihoods(class);
+        (real - ln_sum(real, falsely)).exp()
+    }
+
+    /// The looks of all passes from where the object has most votes; how probable it is that it is seen as usual from there, and that it is on this
+    /// pass as well.
+    #[must_use]
+    pub fn usual(&self, class: &ClassModel) -> Vec<(Looks, f64, f64)> {
+        let shares = Shares::of(class);
+        let Some((passes, main)) = self.main(&shares) else { return Vec::new() };
+        let real = self.real(class);
+        let of_shares = shares.of_passes(passes);
+        let weights: [f64; SHARES] =
+            std::array::from_fn(|k| (of_shares[k] + shares.each[k].ln_usual - main.usual).exp());
+        let of_pass = |pass: &Looks| {
+            let (usual, any) = shares.of_pass(pass);
+            let usual = weights.iter().zip(usual).map(|(weight, usual)| weight * usual / (usual + any));
+            (*pass, real, real * usual.sum::<f64>())
+        };
+        passes.iter().map(of_pass).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Settings;
+    use super::super::Without;
+    use super::super::scene::Scene;
+    use super::*;
+    use crate::hypothesis::Viability;
+
+    fn class(between: f64) -> ClassModel {
+        let viability = Viability {
+            max_reprojection_error_px: f64::NAN,
+            min_parallax_rad: 0.0,
+            min_range_m: 2.0,
+            max_range_m: 60.0,
+        };
+        let settings = Settings {
+            viability,
+            gate_sigmas: 3.5,
+            min_votes: 3,
+            least_votes: 1,
+            min_existence: 0.5,
+            without: Without::default(),
+        };
+        let rates = Rates { recall: 0.75, concentration: 30.0, between };
+        ClassModel {
+            rates,
+            odd_passes: 0.1,
+            ..ClassModel::guess(&Scene::default(), &settings, 0, (f64::NAN, f64::NAN))
+        }
+    }
+
+    fn seen(sectors: &[&[(f64, f64)]]) -> Seen {
+        let pass = |&(hits, expected): &(f64, f64)| Looks { expected, hits };
+        Seen { sectors: sectors.iter().map(|passes| passes.iter().map(pass).collect()).collect() }
+    }
+
+    #[test]
+    fn what_is_seen_more_often_than_usual_on_all_passes_is_real() {
+        let often = seen(&[&[(9.0, 9.0), (5.0, 5.0), (9.0, 10.0), (6.0, 6.0), (9.0, 9.0), (7.0, 8.0)]]);
+        assert!(often.real(&class(0.5)) > 0.95);
+    }
+
+    #[test]
+    fn what_is_seen_less_often_than_usual_is_real_where_sides_differ() {
+        let less = seen(&[&[(17.0, 40.0), (16.0, 40.0), (18.0, 40.0), (17.0, 40.0)]]);
+        assert!(less.real(&class(0.0)) < 0.5, "{}", less.real(&class(0.0)));
+        assert!(less.real(&class(0.8)) > 0.8, "{}", less.real(&class(0.8)));
+    }
+
+    #[test]
+    fn what_is_hardly_seen_from_other_sides_is_real() {
+        let usual = [(15.0, 20.0); 5];
+        let hardly = [(2.0, 20.0), (0.0, 20.0), (1.0, 20.0), (3.0, 20.0), (2.0, 20.0)];
+        let alone = seen(&[&usual]).real(&class(0.3));
+        let beside = seen(&[&usual, &hardly, &hardly, &hardly]).real(&class(0.3));
+        assert!(alone > 0.9 && (alone - beside).abs() < 1e-9, "{alone} {beside}");
+    }
+
+    #[test]
+    fn what_one_pass_alone_meets_is_false_and_what_two_meet_is_not() {
+        let one = seen(&[&[(14.0, 20.0), (0.0, 20.0), (0.0, 20.0), (0.0, 20.0), (0.0, 20.0)]]);
+        assert!(one.real(&class(0.3)) < 0.05, "{}", one.real(&class(0.3)));
+        let since_then = seen(&[&[(0.0, 20.0), (0.0, 20.0), (0.0, 20.0), (16.0, 20.0), (15.0, 20.0)]]);
+        assert!(since_then.real(&class(0.3)) > 0.5, "{}", since_then.real(&class(0.3)));
+        let most = seen(&[&[(14.0, 20.0), (0.0, 20.0), (15.0, 20.0), (16.0, 20.0), (14.0, 20.0)]]);
+        assert!(most.real(&class(0.3)) > 0.95, "{}", most.real(&class(0.3)));
+    }
+
+    #[test]
+    fn passes_miss_an_object_where_it_has_most_votes_or_not_at_all() {
+        let side: &[(f64, f64)] = &[(9.0, 10.0), (0.0, 10.0), (8.0, 10.0)];
+        let (alone, beside) = (seen(&[side]), seen(&[&[(0.0, 20.0), (1.0, 20.0), (0.0, 20.0)], side]));
+        let (passes, missed) = alone.missed(&class(0.3));
+        assert!(passes == 3 && missed > 1.0, "{passes} {missed}");
+        assert_eq!(beside.missed(&class(0.3)), (passes, missed));
+    }
+
+    #[test]
+    fn what_is_seen_now_and_then_from_everywhere_is_false() {
+        let now_and_then = seen(&[&[(2.0, 20.0), (1.0, 20.0), (3.0, 20.0), (2.0, 20.0)]]);
+        assert!(now_and_then.real(&class(0.3)) < 0.05, "{}", now_and_then.real(&class(0.3)));
+    }
+
+    #[test]
+    fn what_passes_by_is_met_by_one_pass_as_often_as_the_integral_says() {
+        for passes in [1, 2, 3, 12] {
+            let steps = 10_000;
+            let share = |i: u32| 0.5 * (f64::from(i) + 0.5) / f64::from(steps);
+            let by_one: f64 = (0..steps).map(|i| share(i) * (1.0 - share(i)).powi(passes - 1)).sum();
+            let by_any: f64 = (0..steps).map(|i| 1.0 - (1.0 - share(i)).powi(passes)).sum();
+            assert!((ln_met_by_one(passes as usize) - (by_one / by_any).ln()).abs() < 1e-6, "{passes}");
+        }
+    }
+}
