@@ -20,6 +20,8 @@ from valuemap.dataset import Dataset, rows_of
 from valuemap.errors import InputError
 from valuemap.tables import Floats
 
+FIELD_DATA = Path(__file__).parents[2] / "shared" / "data"
+
 
 def rays_of(dataset: Dataset) -> tuple[Floats, Floats]:
     """Return the centres and directions (N, 3) of the rays of all detections."""
@@ -211,6 +213,16 @@ def test_signs_of_both_methods_are_compared() -> None:
     score = kitti_signs.score_labels(np.array([[0.5, 0, 0], [10, 1.5, 0]]), signs, np.array([True] * 3), signs)
     told = kitti_signs.add_up({"a": score, "b": score}).to_json()
     assert (told["signs_of_both"], told["median_distance_survey_m"]) == (4, 1.0)
+
+
+def test_sigmas_that_were_not_estimated_are_not_kept() -> None:
+    """Poses of this drive are good but for a curve; the smallest sigmas of a start have six labels of two signs."""
+    folder = FIELD_DATA / "kitti_signs"
+    if not folder.is_dir():
+        pytest.skip("the KITTI signs are not on this machine")
+    score = kitti_signs.run_sequence(folder, "09", MapConfig(), None)
+    assert score.tracks_matched == score.tracks
+    assert score.labels <= score.distinct_labels + 1
 
 
 def test_all_are_run_with_one_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
