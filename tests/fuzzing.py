@@ -88,8 +88,8 @@ def hostile_text(random: Random) -> str:
 
 
 def hostile_tree(random: Random) -> Any:
-    """Return something for the place of another thing in JSON."""
-    return random.choice([random.choice(TREES), hostile_number(random), hostile_text(random)])
+    """Return something for the place of another thing in JSON, a new one: what is put in is spoiled further."""
+    return random.choice([copy.deepcopy(random.choice(TREES)), hostile_number(random), hostile_text(random)])
 
 
 def spoil_tree(random: Random, tree: Any) -> Any:

@@ -8,7 +8,17 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fuzzing import Fuzz, core_border, hostile_arrays, must_end_well, settings_texts, spoil_bytes, spoil_lines
+from fuzzing import (
+    TREES,
+    Fuzz,
+    core_border,
+    hostile_arrays,
+    must_end_well,
+    settings_texts,
+    spoil_bytes,
+    spoil_file,
+    spoil_lines,
+)
 from valuemap.errors import InputError
 from valuemap.readers import READERS
 from valuemap.readers.detections import DETECTIONS
@@ -59,3 +69,13 @@ def test_what_the_fuzzer_lets_pass_and_what_not() -> None:
         must_end_well(lambda: 1 // 0)
     assert len({spoil_lines(Random(seed), "a,b\n1,2\n3,4") for seed in range(50)}) > 20
     assert len({spoil_bytes(Random(seed), bytes(40)) for seed in range(50)}) > 20
+
+
+def test_a_case_depends_on_its_seed_alone() -> None:
+    def spoiled() -> list[bytes]:
+        return [spoil_file(Random(seed), "a.json", b'{"a": [1, {"b": [2]}], "c": {"d": 3}}') for seed in range(2000)]
+
+    trees = repr(TREES)
+    first = spoiled()
+    assert repr(TREES) == trees
+    assert spoiled() == first
