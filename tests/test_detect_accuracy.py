@@ -266,7 +266,7 @@ def test_simulated_pictures_are_drawn_on_request(tmp_path: Path) -> None:
 
 
 def test_the_command_line_starts_without_slow_libraries() -> None:
-    slow = ("onnxruntime", "cv2", "onnx", "torch", "PIL")
+    slow = ("onnxruntime", "cv2", "onnx", "torch", "PIL", "scipy.stats")
     code = f"import sys, valuemap.cli, valuemap.pipeline\nprint([name for name in {slow!r} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -14,7 +14,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from valuemap.refine.adjust import Adjustment, Chain, Scales, adjust, triangulate
 from valuemap.refine.estimate import DRIFT_FACTOR, WIDE, Estimate, everything
@@ -436,6 +435,8 @@ def _held_out(
     found: Estimate, seen: Observations, chain: Chain, scales: Scales, active: tuple[Bools, ...], state: State
 ) -> tuple[float, float, int]:
     """Return the gain on objects that had no part in the fit, the chance that it is luck, and the number of objects."""
+    from scipy import stats  # Slow to import, and only this test needs it.
+
     things = len(found.class_code)
     half = _halves(state.point_in_world_m)
     gains = []
