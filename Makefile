@@ -41,7 +41,8 @@ bench: setup
 	cargo bench --locked --package valuemap-core
 	$(RUN) python benchmarks/speed.py
 
-# Cities larger than memory, tiles of any size, runs that are killed, changes between years.
+# Cities larger than memory, tiles of any size, runs that are killed, changes between years, updates. The last, a map
+# of ten times nyc, takes hours.
 bench-scale: setup
 	$(RUN) python benchmarks/scale.py simulate --preset 10x-nyc --json benchmarks/results/scale.json
 	$(RUN) python benchmarks/scale.py partition --preset 10x-nyc --json benchmarks/results/scale.json
@@ -50,6 +51,8 @@ bench-scale: setup
 	$(RUN) python benchmarks/scale.py change --json benchmarks/results/scale.json
 	$(RUN) python benchmarks/scale.py cells --preset nyc --json benchmarks/results/scale.json
 	$(RUN) python benchmarks/scale.py kills --preset nyc --json benchmarks/results/scale.json
+	$(RUN) python benchmarks/scale.py update --preset nyc --json benchmarks/results/scale.json
+	$(RUN) python benchmarks/scale.py map --preset 10x-nyc --json benchmarks/results/scale.json
 
 # The bundled model of traffic lights, from rendered and real pictures: see docs/model_card.md.
 model: EXTRAS := train
