@@ -833,6 +833,11 @@ def test_bad_kitti_poses(tmp_path: Path, change: Callable[[str], str], said: str
             "its width or height is not above 0 (1, the first is ",
         ),
         ("frame,x1,y1,x2,y2\n1,2000,3,2004,5\n", "its centre lies outside its picture (1"),
+        (
+            "frame,x1,y1,x2,y2,label,conf\n1,2,3,4,5,light,0.4\n",
+            "has no column 'class', and its column 'label' is none of image, class, x1, y1, x2, y2, frame",
+        ),
+        ("frame,x1,y1,x2,y2,class,conf\n1,2,3,4,5,light,0.4\n", "has no column 'score', and its column 'conf' is none"),
     ],
 )
 def test_bad_kitti_boxes(tmp_path: Path, boxes: str, said: str) -> None:

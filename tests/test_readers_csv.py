@@ -319,6 +319,30 @@ def test_a_header_that_is_no_utf8_is_one_line(tmp_path: Path) -> None:
 # Bearings.
 
 
+@pytest.mark.parametrize(
+    ("header", "name", "theirs"),
+    [("Label,score", "class", "Label"), ("category_id,score", "class", "category_id"), ("class,conf", "score", "conf")],
+)
+def test_a_class_or_score_under_another_name_is_not_lost_in_silence(
+    tmp_path: Path, header: str, name: str, theirs: str
+) -> None:
+    poses = poses_of(tmp_path, "image,lat,lon,heading_deg", "a.jpg,0,0,90")
+    boxes = write(tmp_path / "boxes.csv", f"image,x,y,track,{header}\na.jpg,320,240,7,light,0.5\n")
+    bearings = write(tmp_path / "bearings.csv", f"lat,lon,bearing,track,{header}\n0,0,90,7,light,0.5\n")
+    said = f"has no column '{name}', and its column '{theirs}' is none of "
+    columns = {name: theirs}
+
+    def read_boxes(columns: dict[str, str]) -> Dataset:
+        return read_csv_poses(poses, camera=CAMERA, detections=DetectionFile(boxes, columns=columns))
+
+    for path, read in ((boxes, read_boxes), (bearings, lambda columns: read_bearings(bearings, columns=columns))):
+        with pytest.raises(InputError, match=re.escape(f"{path}: {said}")) as error:
+            read({})
+        assert f"{name}={theirs}" in error.value.hint
+        detections = read(columns).detections  # Of the track, which nobody asks for, nothing is said.
+        assert (detections.class_name.texts(), detections.score.tolist()) == (["light"], [0.5])
+
+
 def two_bearings(tmp_path: Path) -> Path:
     """From (0, 0) an object 30 m north and 40 m east; from 60 m east of there the same."""
     east = 60.0 / DEGREE_EAST_M

@@ -94,11 +94,11 @@ def read_bearings(
         images=images,
         detections=FoundBoxes(
             image_row=image_of,
-            class_names=table.texts("class") if table.has("class") else [class_name] * len(table),
+            class_names=table.texts("class") if table.has_optional("class") else [class_name] * len(table),
             center_px=np.stack([x_px, np.full(len(table), _HEIGHT_PX / 2.0)], axis=1),
             size_px=np.zeros((len(table), 2)),
             are_points=True,
-            score=table.numbers("score") if table.has("score") else np.ones(len(table)),
+            score=table.numbers("score") if table.has_optional("score") else np.ones(len(table)),
             where=table.line,
             range_m=depth_m,
             range_sigma_m=None if depth_m is None else depth_sigma * depth_m,

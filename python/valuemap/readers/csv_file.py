@@ -17,6 +17,11 @@ from valuemap.readers.texts import Texts
 from valuemap.tables import Bools, Floats
 
 _NAMES = {pa.int64(): "whole numbers", pa.float64(): "numbers", pa.string(): "texts"}
+_NAMES_OF_OTHERS = {
+    "class": ("label", "category", "class_name", "category_name", "class_id", "category_id"),
+    "score": ("conf", "confidence", "probability"),
+}
+"""What detectors and their tools call these columns."""
 
 
 def read_csv(path: Path, required: Mapping[str, pa.DataType], optional: Mapping[str, pa.DataType]) -> pa.Table:
@@ -113,6 +118,20 @@ class CsvFile:
     def has(self, *names: str) -> bool:
         """Say whether all of these columns are there."""
         return all(self._name.get(name) in self._table.column_names for name in names)
+
+    def has_optional(self, name: str) -> bool:
+        """Say whether a class or a score is there; refuse a table that has it under a name of others."""
+        if self.has(name):
+            return True
+        read = set(self._name.values())
+        others = (theirs for theirs in self._table.column_names if theirs.lower() in _NAMES_OF_OTHERS[name])
+        theirs = next((theirs for theirs in others if theirs not in read), None)
+        if theirs is not None:
+            raise InputError(
+                f"{self.path}: has no column {name!r}, and its column {theirs!r} is none of {', '.join(self._name)}",
+                hint=f"an option says what a column is called in the file, {name}={theirs}; or remove the column",
+            )
+        return False
 
     def texts(self, name: str) -> Texts:
         """Return a column as texts (N) without spaces around them; an empty field is an empty text."""

@@ -260,10 +260,10 @@ def _detections(
     known = (camera >= 0) & (frame >= 0) & (frame < frames) & (frame % 1.0 == 0.0)
     return FoundBoxes(
         image_row=np.where(known, camera * frames + np.where(known, frame, 0.0), -1.0).astype(np.int64),
-        class_names=table.texts("class") if table.has("class") else [file.class_name] * len(frame),
+        class_names=table.texts("class") if table.has_optional("class") else [file.class_name] * len(frame),
         center_px=(corners_px[:, :2] + corners_px[:, 2:]) / 2.0 + _PIXEL_CENTER,
         size_px=corners_px[:, 2:] - corners_px[:, :2],
-        score=(table.numbers("score") if table.has("score") else np.full(len(frame), file.full_score))
+        score=(table.numbers("score") if table.has_optional("score") else np.full(len(frame), file.full_score))
         / file.full_score,
         where=table.line,
         image_names=[f"frame {number:.17g}" for number in frame.tolist()],

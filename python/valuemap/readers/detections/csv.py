@@ -33,13 +33,14 @@ def read_csv_boxes(file: DetectionFile) -> NamedBoxes:
     """
     table = CsvFile(file.path, _EXPECTED, texts=_TEXTS, numbers=_NUMBERS, columns=file.columns)
     center, size = _boxes(table)
+    has_class, has_score = table.has_optional("class"), table.has_optional("score")
     optional = {name: table.numbers_or_none(name) if table.has(name) else None for name in _OPTIONAL}
     return NamedBoxes(
         image_names=table.texts("image"),
-        class_names=table.texts("class") if table.has("class") else Texts.repeated(file.class_name, len(table)),
+        class_names=table.texts("class") if has_class else Texts.repeated(file.class_name, len(table)),
         center=center,
         size=size,
-        score=table.numbers("score") if table.has("score") else np.full(len(table), file.full_score),
+        score=table.numbers("score") if has_score else np.full(len(table), file.full_score),
         where=partial(line_of, file.path),  # The table need not be kept for it.
         fractions=file.fractions,
         range_m=optional["range_m"],
