@@ -7,12 +7,13 @@ listed there and was not changed since. All others stay, and where one would hav
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 
@@ -240,9 +241,10 @@ def _decide(
 
 def _take_places(workspace: Path, path: Path, *, force: bool = False) -> None:
     """Remove what is stale and rename what is new: done twice or after an interruption, it comes to the same."""
+    ledger_of = functools.cache(_ledger)
     with suppress(FileNotFoundError):
         for name in map(os.fsdecode, (workspace / _STALE).read_bytes().split(b"\0")):
-            if name and _is_inside(name) and (force or _is_ours(path / name)):
+            if name and _is_inside(name) and (force or _is_ours(path / name, ledger_of)):
                 (path / name).unlink(missing_ok=True)
     for name in _files_below(workspace / _DECIDED):
         (path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -260,9 +262,9 @@ def _is_inside(name: str) -> bool:
     return not name.startswith("/") and ".." not in name.split("/")
 
 
-def _is_ours(path: Path) -> bool:
-    """Return whether a file is as valuemap wrote it."""
-    hashes = _ledger(path.parent).get(os.fsencode(path.name), set())
+def _is_ours(path: Path, ledger_of: Callable[[Path], dict[bytes, set[bytes]]] | None = None) -> bool:
+    """Return whether a file is as valuemap wrote it, by the ledger of its folder, which is read if nobody has."""
+    hashes = (ledger_of or _ledger)(path.parent).get(os.fsencode(path.name), set())
     try:
         return bool(hashes) and stat.S_ISREG(path.lstat().st_mode) and _sha256(path) in hashes
     except OSError:
@@ -273,9 +275,10 @@ def _own_files_below(path: Path, folder: str) -> list[str]:
     """Return the names, relative to `path`, of the files below one of its folders that are as valuemap wrote them."""
     if (path / folder).is_symlink():
         return []  # It leads out.
+    ledger_of = functools.cache(_ledger)
     places = (Path(place) for place, _, _ in os.walk(path / folder))  # Follows no link.
-    files = (place / os.fsdecode(name) for place in places for name in _ledger(place))
-    return sorted(file.relative_to(path).as_posix() for file in files if _is_ours(file))
+    files = (place / os.fsdecode(name) for place in places for name in ledger_of(place))
+    return sorted(file.relative_to(path).as_posix() for file in files if _is_ours(file, ledger_of))
 
 
 def _ledger(folder: Path) -> dict[bytes, set[bytes]]:

@@ -1,6 +1,7 @@
 //! The noise that makes rays likeliest: sought from several starts, each time from the map that is found with it.
 
 use std::f64::consts::PI;
+use std::rc::Rc;
 
 use super::calibrate::{Known, calibrate};
 use super::energy::Object;
@@ -148,7 +149,9 @@ impl Round {
 /// What makes the same rays likeliest so far.
 #[derive(Default)]
 struct Likeliest {
-    best: Option<Round>,
+    best: Option<Rc<Round>>,
+    /// The last step from the same start: what it leaves over is no longer that of a start.
+    last: Option<Rc<Round>>,
     /// From how many starts it was sought.
     starts: usize,
 }
@@ -168,7 +171,7 @@ impl Likeliest {
         let mut likeliest = Self::default();
         for factor in STARTS {
             let start = guess.scaled(factor, known);
-            if likeliest.best.as_ref().is_some_and(|best| !best.may_be_larger(scene, &start)) {
+            if likeliest.last.as_ref().is_some_and(|last| !last.may_be_larger(scene, &start)) {
                 break;
             }
             likeliest.starts += 1;
@@ -185,11 +188,15 @@ impl Likeliest {
         mut noise: Noise,
         step: impl Fn(&Noise) -> Result<Round, Halt>,
     ) -> Result<(), Halt> {
-        for _ in 0..count {
-            let found = step(&noise)?;
+        let mut is_best = false;
+        for step_number in 1..=count {
+            let found = Rc::new(step(&noise)?);
             noise = found.again;
             if self.best.as_ref().is_none_or(|best| found.value < best.value) {
-                self.best = Some(found);
+                (self.best, is_best) = (Some(Rc::clone(&found)), true);
+            }
+            if is_best && step_number == count {
+                self.last = Some(found);
             }
         }
         Ok(())
