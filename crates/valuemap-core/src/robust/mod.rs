@@ -236,11 +236,7 @@ pub fn find(
     let noise = &calibration.noise;
     let mut model = Model::new(scene, noise, settings);
     model.know(&calibration.classes, calibration.pooled);
-    let (begun, first) = if std::env::var("XFEW").is_ok() {
-        (initial::labels_of_few(&model, &rays, progress)?, initial::Tally::default())
-    } else {
-        initial::labels(&model, !calibration.is_deep, progress)?
-    };
+    let (begun, first) = initial::labels(&model, !calibration.is_deep, progress)?;
     progress.advance()?;
     let mut tally =
         Tally { hypotheses: first.nominations, births: first.accepted, deaths: first.doubted + first.outvoted };
