@@ -28,12 +28,12 @@ const ROUNDS: usize = 3;
 /// [`Halt::Cancelled`] when `progress` says so.
 pub fn objects_of_few(
     model: &Model<'_>,
+    lookout: &Lookout,
     rays: &[u32],
     objects: &[Object],
     least_votes: usize,
     progress: &Progress,
 ) -> Result<Vec<Object>, Halt> {
-    let lookout = Lookout::new(model.scene, model.settings.viability.max_range_m);
     let mut is_taken = vec![false; model.scene.rays.rays.len()];
     objects.iter().flat_map(|object| &object.votes).for_each(|&ray| is_taken[ray as usize] = true);
     let is_free = |ray: &u32| !is_taken[*ray as usize] && model.class_of(*ray).heights.is_some();
@@ -41,7 +41,7 @@ pub fn objects_of_few(
     let index = RayIndex::new(model.scene, &model.spreads, model.settings.gate_sigmas, free.iter().copied());
     let beside = Beside::new(model, objects);
     let sure: Vec<Sure> = (0..model.classes.len() as u32).map(|class| Sure::of(objects, class)).collect();
-    let nursery = Nursery { model, lookout: &lookout, index: &index, beside: &beside, sure: &sure };
+    let nursery = Nursery { model, lookout, index: &index, beside: &beside, sure: &sure };
     let begin = |&ray: &u32| {
         progress.check()?;
         Ok(nursery.grown(ray, &|_| true).map(|object| (object, ray)))

@@ -188,16 +188,17 @@ impl Likeliest {
         mut noise: Noise,
         step: impl Fn(&Noise) -> Result<Round, Halt>,
     ) -> Result<(), Halt> {
-        let mut is_best = false;
-        for step_number in 1..=count {
+        let (mut last, mut is_best) = (None, false);
+        for _ in 0..count {
             let found = Rc::new(step(&noise)?);
             noise = found.again;
             if self.best.as_ref().is_none_or(|best| found.value < best.value) {
                 (self.best, is_best) = (Some(Rc::clone(&found)), true);
             }
-            if is_best && step_number == count {
-                self.last = Some(found);
-            }
+            last = Some(found);
+        }
+        if is_best {
+            self.last = last;
         }
         Ok(())
     }

@@ -50,6 +50,21 @@ impl Lookout {
         self.cubes.locate_within_distance((*point).into(), reach * reach).flat_map(|near| near.data.iter().copied())
     }
 
+    /// The images that look at a point from one of some sectors and have it in their picture, each with the sector, in no order.
+    fn looking<'a>(
+        &'a self,
+        scene: &'a Scene,
+        point: &'a Vector3<f64>,
+        sectors: &'a Sectors,
+    ) -> impl Iterator<Item = (u32, usize)> + 'a {
+        let farthest_m = sectors.0.iter().map(|sector| sector.farthest_m).fold(0.0, f64::max);
+        self.around(point, farthest_m).filter_map(move |image| {
+            let view = &scene.views[image as usize];
+            let sector = sectors.holding(&(view.center - point))?;
+            scene.is_in_picture(view, point).then_some((image, sector))
+        })
+    }
+
     /// The looks at a point that some rays (one per image, ascending) vote for, from as near and as far as their class is detected; `others` are
     /// images (ascending) with a detection in its gate.
     #[must_use]
@@ -57,7 +72,39 @@ impl Lookout {
         let Some(class) = voters.first().map(|&ray| model.class_of(ray)) else { return Seen::default() };
         // Before anything is learned, objects are seen from between their nearest and their farthest vote.
         let distances_m = if class.is_learned { (0.0, class.farthest_m) } else { (f64::INFINITY, 0.0) };
-        self.looks_within(model, point, voters, others, distances_m, |distance_m| class.reach.at(distance_m))
+        let scene = model.scene;
+        let sectors = Sectors::of(scene, point, voters, distances_m);
+        let mut looks: Vec<Look> = Vec::with_capacity(2 * voters.len());
+        for &ray in voters {
+            let view = scene.view(ray);
+            let sector = sectors.nearest(&(view.center - point));
+            looks.push(Look { sector, image: scene.rays.image[ray as usize], weight: 1.0, is_hit: true });
+        }
+        let hits = images_of(scene, voters);
+        for (image, sector) in self.looking(scene, point, &sectors) {
+            if hits.binary_search(&image).is_err() {
+                let hidden = if others.binary_search(&image).is_ok() { HIDDEN_LOOK } else { 1.0 };
+                let weight = hidden * class.reach.at((scene.views[image as usize].center - point).norm());
+                looks.push(Look { sector, image, weight, is_hit: false });
+            }
+        }
+        // Images are numbered along the drives: sorted, those of a viewpoint are side by side.
+        looks.sort_unstable_by_key(|look| (look.sector, look.image));
+        let view = |look: &Look| &scene.views[look.image as usize];
+        let of_pass = |pass: &[Look]| {
+            let mut sum = Looks { expected: 0.0, hits: 0.0 };
+            for images in pass.chunk_by(|a, b| view(a).viewpoint == view(b).viewpoint) {
+                let hits = images.iter().filter(|image| image.is_hit).count() as f64;
+                let all: f64 = images.iter().map(|image| image.weight).sum();
+                let most = images.iter().map(|image| image.weight).fold(0.0, f64::max);
+                sum.hits += if hits > 0.0 { most * hits / all } else { 0.0 };
+                sum.expected += most;
+            }
+            sum
+        };
+        let of_sector = |sector: &[Look]| sector.chunk_by(|a, b| view(a).pass == view(b).pass).map(of_pass).collect();
+        let sectors = looks.chunk_by(|a, b| a.sector == b.sector).map(of_sector).collect();
+        Seen { sectors }
     }
 
     /// Tells of objects whether all images in reach of them have only detections among some rays: their votes are counted in full.
@@ -83,16 +130,9 @@ impl Lookout {
     #[must_use]
     pub fn expected(&self, scene: &Scene, point: &Vector3<f64>, voters: &[u32]) -> u32 {
         let sectors = Sectors::of(scene, point, voters, (f64::INFINITY, 0.0));
-        let farthest = sectors.0.iter().map(|sector| sector.farthest_m).fold(0.0, f64::max);
-        let mut hits: Vec<u32> = voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
-        hits.sort_unstable();
-        let has_missed = |image: &u32| {
-            let view = &scene.views[*image as usize];
-            hits.binary_search(image).is_err()
-                && sectors.holding(&(view.center - point)).is_some()
-                && scene.is_in_picture(view, point)
-        };
-        (hits.len() + self.around(point, farthest).filter(has_missed).count()) as u32
+        let hits = images_of(scene, voters);
+        let missed = self.looking(scene, point, &sectors).filter(|(image, _)| hits.binary_search(image).is_err());
+        (hits.len() + missed.count()) as u32
     }
 
     /// How far the images are, m, that look at a point from where some rays vote for it, up to `farthest_m`, and whether they have a vote.
@@ -106,65 +146,12 @@ impl Lookout {
     ) -> Vec<(f64, bool)> {
         let scene = model.scene;
         let sectors = Sectors::of(scene, point, voters, (0.0, farthest_m));
-        let mut hits: Vec<u32> = voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
-        hits.sort_unstable();
-        let distance_m = |image: u32| (scene.views[image as usize].center - point).norm();
-        let is_looking = |&image: &u32| {
-            let view = &scene.views[image as usize];
-            let is_here = || sectors.holding(&(view.center - point)).is_some();
-            distance_m(image) <= farthest_m && is_here() && scene.is_in_picture(view, point)
-        };
-        let looking = self.around(point, farthest_m).filter(is_looking);
-        looking.map(|image| (distance_m(image), hits.binary_search(&image).is_ok())).collect()
-    }
-
-    /// The looks from the distances of the votes, and those given; one without a vote counts as much of a look as `weight` says.
-    fn looks_within(
-        &self,
-        model: &Model<'_>,
-        point: &Vector3<f64>,
-        voters: &[u32],
-        others: &[u32],
-        distances_m: (f64, f64),
-        weight: impl Fn(f64) -> f64,
-    ) -> Seen {
-        let scene = model.scene;
-        let sectors = Sectors::of(scene, point, voters, distances_m);
-        let farthest = sectors.0.iter().map(|sector| sector.farthest_m).fold(0.0, f64::max);
-        let mut looks: Vec<Look> = Vec::with_capacity(2 * voters.len());
-        for &ray in voters {
-            let view = scene.view(ray);
-            let sector = sectors.nearest(&(view.center - point));
-            looks.push(Look { sector, image: scene.rays.image[ray as usize], weight: 1.0, is_hit: true });
-        }
-        let mut hits = looks.iter().map(|look| look.image).collect::<Vec<u32>>();
-        hits.sort_unstable();
-        for image in self.around(point, farthest) {
-            let view = &scene.views[image as usize];
-            let Some(sector) = sectors.holding(&(view.center - point)) else { continue };
-            if hits.binary_search(&image).is_err() && scene.is_in_picture(view, point) {
-                let hidden = if others.binary_search(&image).is_ok() { HIDDEN_LOOK } else { 1.0 };
-                let weight = hidden * weight((view.center - point).norm());
-                looks.push(Look { sector, image, weight, is_hit: false });
-            }
-        }
-        // Images are numbered along the drives: sorted, those of a viewpoint are side by side.
-        looks.sort_unstable_by_key(|look| (look.sector, look.image));
-        let view = |look: &Look| &scene.views[look.image as usize];
-        let of_pass = |pass: &[Look]| {
-            let mut sum = Looks { expected: 0.0, hits: 0.0 };
-            for images in pass.chunk_by(|a, b| view(a).viewpoint == view(b).viewpoint) {
-                let hits = images.iter().filter(|image| image.is_hit).count() as f64;
-                let all: f64 = images.iter().map(|image| image.weight).sum();
-                let most = images.iter().map(|image| image.weight).fold(0.0, f64::max);
-                sum.hits += if hits > 0.0 { most * hits / all } else { 0.0 };
-                sum.expected += most;
-            }
-            sum
-        };
-        let of_sector = |sector: &[Look]| sector.chunk_by(|a, b| view(a).pass == view(b).pass).map(of_pass).collect();
-        let sectors = looks.chunk_by(|a, b| a.sector == b.sector).map(of_sector).collect();
-        Seen { sectors }
+        let hits = images_of(scene, voters);
+        let looking = self.looking(scene, point, &sectors).map(|(image, _)| {
+            let distance_m = (scene.views[image as usize].center - point).norm();
+            (distance_m, hits.binary_search(&image).is_ok())
+        });
+        looking.filter(|(distance_m, _)| *distance_m <= farthest_m).collect()
     }
 }
 
@@ -174,6 +161,13 @@ struct Look {
     image: u32,
     weight: f64,
     is_hit: bool,
+}
+
+/// The images of some rays, ascending.
+fn images_of(scene: &Scene, rays: &[u32]) -> Vec<u32> {
+    let mut images: Vec<u32> = rays.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
+    images.sort_unstable();
+    images
 }
 
 /// From where an object is seen.

@@ -213,7 +213,7 @@ fn learn_from(model: &mut Model<'_>, rays: &[u32], progress: &Progress) -> Resul
     let objects = search(model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
     let lookout = Lookout::new(model.scene, model.settings.viability.max_range_m);
     learn(model, &lookout, rays, &objects);
-    let few = few::objects_of_few(model, rays, &objects, 1, progress)?;
+    let few = few::objects_of_few(model, &lookout, rays, &objects, 1, progress)?;
     let whole = {
         let is_whole = lookout.whole(model, rays);
         [&objects, &few].map(|all| all.iter().filter(|object| is_whole(object)).cloned().collect::<Vec<Object>>())
@@ -246,8 +246,9 @@ pub fn find(
     let variance_factor = calibrate::variance_factor(scene, noise, &placed(&objects), objects.len().max(1));
     let claimed: usize = objects.iter().map(|object| object.votes.len()).sum();
     let energy = objects.iter().map(|object| object.energy).sum();
+    let lookout = Lookout::new(scene, settings.viability.max_range_m);
     let few = if settings.least_votes < settings.min_votes {
-        few::objects_of_few(&model, &rays, &objects, settings.least_votes as usize, progress)?
+        few::objects_of_few(&model, &lookout, &rays, &objects, settings.least_votes as usize, progress)?
     } else {
         Vec::new()
     };
@@ -257,7 +258,6 @@ pub fn find(
     });
     let scaled = |estimate: Estimate| Estimate { covariance: estimate.covariance * variance_factor, ..estimate };
     let all = objects.into_iter().zip(estimates.into_iter().map(scaled)).chain(few);
-    let lookout = Lookout::new(scene, settings.viability.max_range_m);
     let mut findings: Vec<Finding> = all
         .map(|(object, estimate)| (object.existence(), object, estimate))
         .filter(|(existence, ..)| *existence >= settings.min_existence)
