@@ -49,7 +49,7 @@ const CORNERS = 4;
 const INDICES = [0, 1, 2, 2, 1, 3];
 
 /** So many parts most layers hand the GPU in one frame: more would make the page wait for it. */
-const PARTS_A_FRAME = 2;
+const PARTS_A_FRAME = 8;
 
 /** What a list of triangles for a part reads. */
 function rectangles(): Uint16Array {

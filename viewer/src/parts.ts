@@ -1,7 +1,7 @@
 /** Shapes in parts that lie near each other: the GPU is handed those that are in view, a few in every frame, each once. */
 
 /** As many shapes are in each part but the last. */
-export const PART = 4096;
+export const PART = 512;
 
 export interface Box {
   left: number;
