@@ -172,9 +172,8 @@ def measure(map_: Path, dataset: Path | None, screenshot: Path, clicks: int) -> 
         "labels_drawn": seen["drawn"],
         "pan": _rounded(seen["pan"]),
         "zoom": _rounded(seen["zoom"]),
-        "click_median_ms": round(statistics.median(seen["clicks_ms"])),
-        "click_worst_ms": round(max(seen["clicks_ms"])),
-        "click_median_cpu_ms": round(statistics.median(seen["clicks_cpu_ms"])),
+        "click_by_hand": _clicks(seen["by_hand"]),
+        "click_at_once": _clicks(seen["at_once"]),
         "answer_median_ms": round(statistics.median(seen["answers_ms"])),
         "complaints": seen["complaints"],
     }
@@ -204,10 +203,20 @@ def _in_browser(script: str, *arguments: str) -> dict[str, Any]:
     return seen
 
 
-def _quickest(runs: list[Figures], by: str) -> Figures:
-    """Return the run that was disturbed least by what else the machine did, with what all runs say of one figure."""
-    best = min(runs, key=lambda run: run[by])
-    return {**best, f"{by}_of_all_runs": [run[by] for run in runs]}
+def _middle(runs: list[Figures], by: str) -> Figures:
+    """Return the middle one of all runs by one figure, with what all of them say of it."""
+    middle = sorted(runs, key=lambda run: run[by])[len(runs) // 2]
+    return {**middle, f"{by}_of_all_runs": [run[by] for run in runs]}
+
+
+def _clicks(seen: dict[str, list[float]]) -> dict[str, int]:
+    """Return the time to the answer, to the next paint (Event Timing), and of the page's main thread."""
+    return {
+        "median_ms": round(statistics.median(seen["ms"])),
+        "worst_ms": round(max(seen["ms"])),
+        "painted_median_ms": round(statistics.median(seen["painted_ms"])),
+        "median_cpu_ms": round(statistics.median(seen["cpu_ms"])),
+    }
 
 
 def _rounded(figures: dict[str, Any]) -> dict[str, int | None]:
@@ -225,7 +234,7 @@ def main() -> None:
     parser.add_argument("--images", type=int, default=400_000)
     parser.add_argument("--passes", type=int, default=100)
     parser.add_argument("--clicks", type=int, default=10)
-    parser.add_argument("--repeats", type=int, default=1, help="the quickest run counts: others share the machine")
+    parser.add_argument("--repeats", type=int, default=1, help="the middle run counts: others share the machine")
     parser.add_argument("--screenshot", type=Path, default=Path("viewer-large.png"))
     parser.add_argument("--json", type=Path, help="figures of other names in this file are kept")
     given = parser.parse_args()
@@ -236,9 +245,9 @@ def main() -> None:
     repeats = range(given.repeats)
     if given.map is not None:
         runs = [measure(given.map, given.dataset, given.screenshot, given.clicks) for _ in repeats]
-        measured[given.name] = _quickest(runs, "interactive_ms")
+        measured[given.name] = _middle(runs, "interactive_ms")
     if given.report is not None:
-        measured[f"report of {given.name}"] = _quickest([measure_report(given.report) for _ in repeats], "ready_ms")
+        measured[f"report of {given.name}"] = _middle([measure_report(given.report) for _ in repeats], "ready_ms")
     if given.map is None and given.report is None:
         with tempfile.TemporaryDirectory() as folder:
             sizes = given.labels, given.images, given.passes
