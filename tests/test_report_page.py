@@ -27,7 +27,7 @@ from valuemap.evaluate import Evaluation, evaluate_map
 from valuemap.evidence import Evidence
 from valuemap.experiment import CURVES, PassesResult, Quartiles
 from valuemap.map_folder import Map
-from valuemap.report.figures import normalized_errors
+from valuemap.report.figures import existence, normalized_errors, passes, residuals_by_depth
 from valuemap.report.page import inline_data, shown
 from valuemap.report.paper import ReportTable, paper_tables
 from valuemap.report.run_tables import accuracy_tables, doubtful_rows, run_tables, worst_rows
@@ -335,6 +335,20 @@ def test_cells_are_readable(cell: Any, text: str) -> None:
 )
 def test_what_is_nearly_certain_is_not_called_certain(value: float, text: str) -> None:
     assert probability(value) == text
+
+
+def test_what_marks_mean_is_not_said_over_the_marks() -> None:
+    evidence = city()
+    evaluation = evaluate_map(evidence.result, evidence.dataset)
+    drawn = residuals_by_depth(evidence), existence(evidence.result, evaluation), passes(passes_result())
+    for figure in (each.figure for each in drawn if each is not None):
+        figure.draw_without_rendering()
+        (legend,) = figure.legends
+        words = legend.get_window_extent()
+        assert legend.get_texts()
+        assert 0.0 <= words.x0 < words.x1 <= figure.bbox.width
+        assert not any(words.overlaps(axes.get_window_extent()) for axes in figure.axes)
+        assert not any(axes.get_legend() for axes in figure.axes)
 
 
 def test_names_of_figures_are_readable_and_say_their_units() -> None:

@@ -51,6 +51,12 @@ def _figure(panels: int, height_in: float = 3.6, *, width_in: float = _WIDTH_IN)
     return figure, list(np.atleast_1d(figure.subplots(1, panels)))
 
 
+def _explain(figure: Figure, axes: Axes) -> None:
+    """Say above all panels what the marks of one mean: inside, curves would run through the words."""
+    handles, _ = axes.get_legend_handles_labels()
+    figure.legend(handles=handles, loc="outside upper right", ncols=len(handles))
+
+
 def residuals_by_depth(evidence: Evidence) -> ReportFigure | None:
     """Draw how large residuals are at which distance, in pixels and in sigmas; None without votes."""
     votes, labels = evidence.result.votes, evidence.result.labels
@@ -73,8 +79,7 @@ def residuals_by_depth(evidence: Evidence) -> ReportFigure | None:
             axes.set_xlim(left=0.0)
         expected = math.sqrt(2.0 * math.log(2.0))
         in_sigmas.axhline(expected, color=FAINT_INK, linewidth=0.9, linestyle=":", label="median if all is as assumed")
-        in_px.legend()
-        in_sigmas.legend()
+        _explain(figure, in_sigmas)
     return ReportFigure(
         "residuals_by_depth",
         "Residuals by depth",
@@ -113,6 +118,7 @@ def existence(result: Map, evaluation: Evaluation | None) -> ReportFigure | None
         panels[0].margins(y=0.12)
         if ranges is not None:
             _draw_reliability(panels[1], ranges)
+            _explain(figure, panels[1])
         for axes in panels:
             axes.set_xlabel("probability of existence")
             axes.set_xticks(range(len(bins)), names, fontsize=8.5, rotation=20 if len(bins) > 4 else 0)
@@ -150,7 +156,6 @@ def _draw_reliability(axes: Axes, ranges: Sequence[ExistenceRange]) -> None:
     axes.set_ylim(0.0, 1.05)
     axes.set_xlim(-0.6, len(ranges) - 0.4)
     axes.set_ylabel("share of labels")
-    axes.legend(loc="lower right")
 
 
 def covariance(result: Map, evaluation: Evaluation | None) -> ReportFigure | None:
@@ -270,7 +275,7 @@ def passes(result: PassesResult) -> ReportFigure:
                 axes.set_ylim(0.0, 1.03)
             else:
                 axes.set_ylim(bottom=0.0)
-        panels[0].legend(loc="lower right")
+        _explain(figure, panels[0])
     return ReportFigure(
         "passes",
         "What more passes bring",
