@@ -458,7 +458,10 @@ def choose_changed(place_m: np.ndarray[Any, Any], objects: Ints) -> tuple[Ints, 
 
 
 def years(dataset: Dataset, removed: Ints, added: Ints, moved: Ints) -> tuple[Dataset, Dataset]:
-    """Return every other pass as the first year and as the second, with what each shows."""
+    """Return the first half of all passes as the first year and the others as the second, with what each shows.
+
+    Passes are rounds through every street, one after the other: in each year all streets are driven as often.
+    """
     images, detections = dataset.images, dataset.detections
     assert dataset.truth_detections is not None
     assert dataset.truth is not None
@@ -466,7 +469,7 @@ def years(dataset: Dataset, removed: Ints, added: Ints, moved: Ints) -> tuple[Da
     object_of[rows_of(dataset.truth_detections.detection_id, detections.detection_id)] = (
         dataset.truth_detections.object_id
     )
-    late = images.pass_id.codes % 2 == 1
+    late = images.pass_id.codes >= len(images.pass_id.names) // 2
     image_row = rows_of(detections.image_id, images.image_id)
     is_late = late[image_row]
     is_seen = np.where(is_late, ~np.isin(object_of, removed), ~np.isin(object_of, added))

@@ -42,7 +42,7 @@ from valuemap.tiles.sample import is_sampled, sampled_squares
 from valuemap.tiles.seams import join_cells
 from valuemap.tiles.solve import Solved, solve_cell
 from valuemap.tiles.source import InMemory
-from valuemap.tiles.store import hash_piece
+from valuemap.tiles.store import hash_piece, hash_settings
 from valuemap.tiles.work import MARKER, open_work, remove_work, written
 
 GRID = Grid.of(Frame(), 60.0)
@@ -467,7 +467,9 @@ def test_pieces_on_disk_are_those_in_memory(long_street: Path, tmp_path: Path, m
     assert on_disk.cells == in_memory.cells
     assert on_disk.drives_record == in_memory.drives_record
     for cell in [*on_disk.cells, WHOLE]:
-        hashes = {hash_piece(source.piece(cell), cell, GRID, None, KNOWN) for source in (on_disk, in_memory)}
+        hashes = {
+            hash_piece(source.piece(cell), cell, hash_settings(GRID, None, KNOWN)) for source in (on_disk, in_memory)
+        }
         assert len(hashes) == 1 or cell == WHOLE  # Which they are not: it stands for the sample here.
     assert np.array_equal(on_disk.sample().detection_id, in_memory.sample().detection_id)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +22,20 @@ from valuemap.evidence import Evidence
 from valuemap.map_folder import Map
 from valuemap.refine import Refined
 from valuemap.rejected import find_rejected
-from valuemap.tables import Categories, Changes, Floats, IdBridge, join_tables, read_table, table_to_arrow
+from valuemap.tables import (
+    Categories,
+    Changes,
+    Floats,
+    IdBridge,
+    Ints,
+    Labels,
+    join_tables,
+    read_table,
+    table_to_arrow,
+)
 from valuemap.tiles.compare import Comparison
-from valuemap.update import compare
-from valuemap.update.changes import judge, match_labels, match_places
+from valuemap.update import compare, update
+from valuemap.update.changes import Verdicts, judge, match_labels, match_places
 from valuemap.update.join import join_datasets
 from valuemap.update.looks import HIDDEN_OF, Lookout, Looks, Sights
 
@@ -120,29 +130,56 @@ def test_states_say_what_became_of_each_object(years: Path) -> None:
         assert state_at(new, place, start_m=FAR_M) == ("confirmed", id_at(old, place, start_m=FAR_M))
 
 
-def test_what_moved_is_told_where_all_the_data_have_one_label_for_both_places(years: Path) -> None:
+@dataclass(frozen=True)
+class Compared:
+    """What `compare` takes of the years: the map before, that of all the data, that of the new passes, and the data."""
+
+    before: Map
+    told: Map
+    alone: Map
+    both: Dataset
+    images_before: Ints
+
+    def with_rebuilt(self, rebuilt: Map) -> tuple[Map, Changes, IdBridge]:
+        """Compare with another map of all the data."""
+        return compare(self.before, rebuilt, self.alone, self.both, self.images_before)
+
+    def blind(self) -> tuple[Map, int, int]:
+        """Return the map of all the data of who takes things for standing still, and the labels that it has as one.
+
+        It has the old label, with the votes of both places.
+        """
+        moved, gone = id_at(self.told, MOVED_TO), id_at(self.before, MOVED_FROM)
+        of_gone = self.before.votes.take(self.before.votes.label_id == gone)
+        labels = [
+            self.told.labels.take(self.told.labels.label_id != moved).replace(state=None),
+            self.before.labels.take(self.before.labels.label_id == gone).replace(label_id=np.array([9000])),
+        ]
+        of_told = np.where(self.told.votes.label_id == moved, 9000, self.told.votes.label_id)
+        votes = join_tables(
+            [
+                self.told.votes.replace(label_id=of_told),
+                of_gone.replace(label_id=np.full(len(of_gone), 9000)),
+            ]
+        )
+        in_order = votes.take(np.argsort(votes.label_id, kind="stable"))
+        return replace(self.told, labels=join_tables(labels), votes=in_order), moved, gone
+
+
+@pytest.fixture(scope="module")
+def compared(years: Path) -> Compared:
     old, both = valuemap.read_map(years / "map"), valuemap.read_dataset(years / "map2" / "dataset")
     is_new = ~np.isin(both.images.image_id, valuemap.read_dataset(years / "first").images.image_id)
     of_new = np.isin(both.detections.image_id, both.images.image_id[is_new])
     added = replace(both, images=both.images.take(is_new), detections=both.detections.take(of_new))
     alone = valuemap.build_map(added, valuemap.MapConfig().with_settings(SET))
-    # What a map makes of it that takes it for standing still: the old label with the votes of both.
-    told = valuemap.read_map(years / "map2")
-    moved, gone = id_at(told, MOVED_TO), id_at(old, MOVED_FROM)
-    of_gone = old.votes.take(old.votes.label_id == gone)
-    labels = [
-        told.labels.take(told.labels.label_id != moved).replace(state=None),
-        old.labels.take(old.labels.label_id == gone).replace(label_id=np.array([9000])),
-    ]
-    votes = join_tables(
-        [
-            told.votes.replace(label_id=np.where(told.votes.label_id == moved, 9000, told.votes.label_id)),
-            of_gone.replace(label_id=np.full(len(of_gone), 9000)),
-        ]
-    )
-    in_order = votes.take(np.argsort(votes.label_id, kind="stable"))
-    blind = replace(told, labels=join_tables(labels), votes=in_order)
-    result, changes, _ = compare(old, blind, alone, both, both.images.image_id[~is_new])
+    return Compared(old, valuemap.read_map(years / "map2"), alone, both, both.images.image_id[~is_new])
+
+
+def test_what_moved_is_told_where_all_the_data_have_one_label_for_both_places(compared: Compared) -> None:
+    old = compared.before
+    blind, _, gone = compared.blind()
+    result, changes, _ = compared.with_rebuilt(blind)
     assert state_at(result, MOVED_TO) == ("moved", gone)
     assert state_at(result, MOVED_FROM) is None
     for place in STAYS:
@@ -151,6 +188,45 @@ def test_what_moved_is_told_where_all_the_data_have_one_label_for_both_places(ye
     assert (kinds.count("moved"), kinds.count("removed"), kinds.count("added")) == (1, 1, 1)
     assert np.all(np.bincount(np.unique(result.votes.detection_id, return_inverse=True)[1]) == 1)
     assert np.bincount(result.votes.label_id)[result.labels.label_id].tolist() == result.labels.votes.tolist()
+
+
+def test_labels_are_those_of_all_the_data_where_nothing_is_told_to_have_changed(
+    compared: Compared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stands_still(new: Labels, before: Ints, *_: object) -> Verdicts:
+        return Verdicts(before, ["confirmed" if row >= 0 else "new" for row in before], np.full(len(new), -1))
+
+    monkeypatch.setattr(update, "judge", stands_still)
+    blind, _, gone = compared.blind()
+    result, _, _ = compared.with_rebuilt(blind)
+    assert state_at(result, MOVED_FROM) == ("confirmed", gone)
+    votes = {tuple(votes_of(each, label)) for each, label in ((result, gone), (blind, 9000))}
+    assert len(votes) == 1
+    assert state_at(result, MOVED_TO) is None
+
+
+def test_what_was_put_up_is_told_though_all_the_data_have_no_label_for_it(compared: Compared) -> None:
+    told, fresh = compared.told, id_at(compared.told, ADDED)
+    without = replace(
+        told,
+        labels=told.labels.take(told.labels.label_id != fresh).replace(state=None),
+        votes=told.votes.take(told.votes.label_id != fresh),
+    )
+    result, changes, _ = compared.with_rebuilt(without)
+    there = state_at(result, ADDED)
+    assert there is not None
+    assert there[0] == "new"
+    row = changes.label_id.tolist().index(there[1])
+    assert changes.change.texts()[row] == "added"
+    assert changes.hits[row] >= 6
+
+
+def test_what_one_drive_met_has_not_been_put_up() -> None:
+    missed, seen = Looks(9, 0, -9.0, 0, 0), Looks(9, 9, 20.0, 0, 0, seen_by=2)
+    assert update.has_appeared(missed, seen)
+    assert not update.has_appeared(missed, replace(seen, seen_by=1))
+    assert not update.has_appeared(replace(missed, log_odds=-1.0), seen)
+    assert not update.has_appeared(missed, replace(seen, log_odds=1.0))
 
 
 def test_labels_of_two_epochs_are_one_where_their_covariances_say_so(years: Path) -> None:

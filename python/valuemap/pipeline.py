@@ -119,7 +119,7 @@ class Run:
 
 
 def build_map_of_folder(
-    folder: Path, config: MapConfig, run: Run, *, progress: Progress = silent
+    folder: Path, config: MapConfig, run: Run, *, held: Dataset | None = None, progress: Progress = silent
 ) -> tuple[Map, list[Path]]:
     """Find the objects that a dataset folder shows, which may be larger than memory.
 
@@ -131,6 +131,8 @@ def build_map_of_folder(
         Settings.
     run
         Where and how it is made.
+    held
+        What is in the folder, where it is in memory already: it is not read again.
     progress
         Called as progress(what, done, total).
 
@@ -153,7 +155,7 @@ def build_map_of_folder(
     threads = run.engine.threads_of_task(1)
     is_large = run.tile_size_m is not None or run.engine.needs_paths or images + detections > LARGEST_IN_MEMORY
     if config.method == "paper" or not is_large:
-        dataset = ensure_checked(read_dataset(folder))
+        dataset = ensure_checked(held or read_dataset(folder))
         if config.method == "paper":
             return build_map(dataset, config, threads=threads, progress=progress), []
         _check_detections(dataset.name, len(dataset.detections))
@@ -164,7 +166,7 @@ def build_map_of_folder(
         name, frame, note = dataset.name, dataset.frame, _note_on_poses(dataset)
     else:
         if images + detections <= MOST_CORRECTED and detections:
-            refined = _refined(ensure_checked(read_dataset(folder)), config, stages, threads, progress)
+            refined = _refined(ensure_checked(held or read_dataset(folder)), config, stages, threads, progress)
             if refined.is_corrected:
                 folder = run.work / CORRECTED
                 write_dataset(refined.dataset, folder)
@@ -179,7 +181,9 @@ def build_map_of_folder(
     result = _as_map(name, frame, size, passes, config, labels, votes, counts, stages, poses)
     if refined is not None and refined.is_corrected:
         result = replace(result, corrected=refined.dataset)
-    return _with_note(_with_rejected(result, lambda: result.corrected or read_dataset(folder), stages), note), cells
+    return _with_note(
+        _with_rejected(result, lambda: result.corrected or held or read_dataset(folder), stages), note
+    ), cells
 
 
 def _refined(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, progress: Progress) -> Refined:

@@ -17,7 +17,7 @@ from valuemap.sightings import cast_sightings
 from valuemap.tiles.grid import WHOLE
 from valuemap.tiles.sample import SAMPLE_DETECTIONS
 from valuemap.tiles.source import Source
-from valuemap.tiles.store import hash_piece
+from valuemap.tiles.store import hash_piece, hash_settings
 from valuemap.tiles.work import written
 
 
@@ -36,7 +36,7 @@ def calibrate(
     is_part = source.cells != [WHOLE] and len(sample.detection_id) >= SAMPLE_DETECTIONS
     if work is None:
         return _estimated(sample, is_part, config, engine, progress)
-    file = work / f"calibration.{hash_piece(sample, WHOLE, source.grid, None, config)}.json"
+    file = work / f"calibration.{hash_piece(sample, WHOLE, hash_settings(source.grid, None, config))}.json"
     if not file.is_file():
         calibration = _estimated(sample, is_part, config, engine, progress)
         with written(file) as temporary:

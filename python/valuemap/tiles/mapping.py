@@ -12,16 +12,20 @@ from valuemap.robust import Calibration
 from valuemap.tiles.grid import Cell
 from valuemap.tiles.solve import Solved, solve_cell
 from valuemap.tiles.source import Source
-from valuemap.tiles.store import cell_file, hash_piece, load_cells, save_cell
+from valuemap.tiles.store import cell_file, hash_piece, hash_settings, load_cells, save_cell
 
 
 @dataclass(frozen=True)
 class CellTask:
-    """What is done with a cell: all that is needed travels with it, the data as a source that reads it."""
+    """What is done with a cell: all that is needed travels with it, the data as a source that reads it.
+
+    `settings` is the hash of what all cells depend on.
+    """
 
     source: Source
     calibration: Calibration
     config: MapConfig
+    settings: str
     threads: int
     store: Path | None = None
     known: Path | None = None
@@ -33,7 +37,7 @@ class CellTask:
             return None
         grid, file = self.source.grid, None
         if self.store is not None:
-            key = hash_piece(piece, cell, grid, self.calibration, self.config)
+            key = hash_piece(piece, cell, self.settings)
             file = cell_file(self.store, cell, key)
             if file.is_file():
                 return file
@@ -66,7 +70,8 @@ def solve_cells(
         Where those of an older map are, which are not made again either.
     """
     cells = source.cells
-    task = CellTask(source, calibration, config, engine.threads_of_task(len(cells)), store, known)
+    settings = hash_settings(source.grid, calibration, config)
+    task = CellTask(source, calibration, config, settings, engine.threads_of_task(len(cells)), store, known)
     if len(cells) == 1:  # It tells how far it is.
         result = task(cells[0], progress)
         return [] if result is None else [result]

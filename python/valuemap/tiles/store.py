@@ -32,15 +32,23 @@ def cell_file(folder: Path, cell: Cell, key: str) -> Path:
     return folder / f"{cell.name}.{key}.parquet"
 
 
-def hash_piece(piece: InOrder, cell: Cell, grid: Grid, calibration: Calibration | None, config: MapConfig) -> str:
-    """Return the hash of all that the labels of a cell depend on."""
-    digest = hashlib.sha256()
+def hash_settings(grid: Grid, calibration: Calibration | None, config: MapConfig) -> str:
+    """Return the hash of all that the labels of every cell depend on."""
     head = {
         "valuemap": version("valuemap"),
-        "cell": [cell.base, cell.level, cell.place],
         "grid": vars(grid),
         "settings": config.as_dict(),
         "calibration": None if calibration is None else calibration_to_json(calibration),
+    }
+    return hashlib.sha256(json.dumps(head, sort_keys=True).encode()).hexdigest()
+
+
+def hash_piece(piece: InOrder, cell: Cell, settings: str) -> str:
+    """Return the hash of all that the labels of a cell depend on; `settings` is what `hash_settings` returned."""
+    digest = hashlib.sha256()
+    head = {
+        "settings": settings,
+        "cell": [cell.base, cell.level, cell.place],
         "frame": piece.dataset.frame.to_json(),
     }
     digest.update(json.dumps(head, sort_keys=True).encode())

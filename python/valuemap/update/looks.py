@@ -33,8 +33,8 @@ SURE = math.log(20.0)
 class Looks:
     """How often some drives looked at an object, in how many of these looks they saw it, and when.
 
-    `log_odds` is by how much they speak for the object: the logarithm of the likelihood ratio. Times are NaN where
-    images have none.
+    `log_odds` is by how much they speak for the object: the logarithm of the likelihood ratio. `seen_by` is the number
+    of drives that saw it. Times are NaN where images have none.
     """
 
     looks: int
@@ -42,6 +42,7 @@ class Looks:
     log_odds: float
     first_s: float
     last_s: float
+    seen_by: int = 0
 
     @property
     def misses(self) -> int:
@@ -100,7 +101,14 @@ class Lookout:
         """Return what looks say, where so large a share of drives cannot see an object that is there."""
         ratio = self._ratio(sights.hits, sights.looks)
         odds = np.logaddexp(math.log(1.0 - hidden_share) + ratio, math.log(hidden_share))
-        return Looks(int(sights.looks.sum()), int(sights.hits.sum()), float(odds.sum()), sights.first_s, sights.last_s)
+        return Looks(
+            looks=int(sights.looks.sum()),
+            hits=int(sights.hits.sum()),
+            log_odds=float(odds.sum()),
+            first_s=sights.first_s,
+            last_s=sights.last_s,
+            seen_by=int(np.count_nonzero(sights.hits)),
+        )
 
     def _sights(self, image: Ints, is_hit: Bools, *, new: bool) -> Sights:
         here = self._is_new[image] == new

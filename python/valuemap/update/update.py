@@ -28,6 +28,8 @@ from valuemap.update.looks import Lookout, Looks
 
 ADDED = "added"
 """Where in the folder of work the dataset of the added passes is kept."""
+DRIVES_OF_NEW = 2
+"""So many drives must have met what only the added passes have: a parked van is met by one."""
 _DATASET_FILES = (MARKER, "cameras.parquet", "images.parquet", "detections.parquet")
 
 
@@ -78,7 +80,7 @@ def update_map(
     joined = ensure_checked(join_datasets(first, second))
     write_dataset_in_pieces([joined], run.work / DATASET)
     run = replace(run, calibration=calibration, known=old / CELLS)
-    rebuilt, cells = build_map_of_folder(run.work / DATASET, _settings(before), run, progress=progress)
+    rebuilt, cells = build_map_of_folder(run.work / DATASET, _settings(before), run, held=joined, progress=progress)
     # The poses that the labels were found with, where those of whole drives were corrected.
     posed = rebuilt.corrected or joined
     alone = _map_alone(posed, first.images.image_id, before, run, progress)
@@ -102,30 +104,17 @@ def compare(
     moved, the rebuilt map, which takes it for standing still, may have one label for both places; then those of the
     epochs stand for it.
     """
-    rows = _Rows.of(before, rebuilt, alone)
     is_new = ~np.isin(joined.images.image_id, images_before)
-    max_range_m = _settings(before).vote.max_range_m
-    center_m = camera_centers(joined.images)
-    near = cKDTree(center_m[is_new]).query(rows.labels.position_in_world_m)[0]
-    touched = np.asarray(near <= max_range_m)
-    is_asked = touched | (rows.before < 0)
-    # What an epoch alone has elsewhere is no sight of this object.
-    looked = _without_claimed(rows, is_asked, before, alone, joined, is_new)
-    lookout = _lookout(replace(rebuilt, labels=rows.labels, votes=looked), is_asked, joined, center_m, is_new)
-    states = before.labels.state.texts() if before.labels.state is not None else ["confirmed"] * len(before.labels)
-    sights = {}
-    with counted(progress, "looking for changes", int(is_asked.sum())) as looked_at:
-        for row in np.flatnonzero(is_asked).tolist():
-            sights[row] = lookout.at(int(rows.labels.label_id[row]))
-            looked_at(len(sights))
-    were_there = {row: at for row, at in sights.items() if rows.before[row] >= 0 and states[rows.before[row]] != "gone"}
-    hidden = lookout.hidden_share([first for first, _ in were_there.values()])
-    looks = {
-        row: (lookout.looks(first, hidden), lookout.looks(second, hidden)) for row, (first, second) in sights.items()
-    }
-    verdicts = judge(rows.labels, rows.before, states, rows.stands, looks)
-    # What only the added passes have, and all the data do not, is there only if it explains what is gone.
-    unfounded = rows.is_of_alone & (verdicts.moved_from < 0) & ~rows.is_founded
+    rows = _Rows.of(before, rebuilt, alone)
+    verdicts, looks, hidden = _judged(rows, before, rebuilt, alone, joined, is_new, progress)
+    # Where nothing has changed, the map of all the data is right: it knows more than each epoch alone.
+    while len(unchanged := rows.unchanged(verdicts)):
+        rows = _Rows.of(before, rebuilt, alone, whole=np.concatenate([rows.whole, unchanged]))
+        verdicts, looks, hidden = _judged(rows, before, rebuilt, alone, joined, is_new, progress)
+    # What only the added passes have, and all the data do not, is there only if it explains what is gone, or was put up
+    # since: then the looks from before that speak against it are those of drives that could not see it yet.
+    unfounded = rows.is_of_alone & (verdicts.moved_from < 0) & (rows.part_of < 0)
+    unfounded &= ~np.array([row in looks and has_appeared(*looks[row]) for row in range(len(unfounded))], np.bool_)
     if unfounded.any():
         rows, verdicts, looks = _left_out(rows, verdicts, looks, unfounded)
     ids = number(before.labels, verdicts)
@@ -141,6 +130,37 @@ def compare(
     told = {"hidden_share": round(hidden, 4), **_counts(verdicts.state, is_kept, changes)}
     run = {**rebuilt.run, "update": told}
     return Map(rebuilt.frame, kept.take(order), votes, run), changes, bridge
+
+
+def _judged(
+    rows: _Rows, before: Map, rebuilt: Map, alone: Map, joined: Dataset, is_new: Bools, progress: Progress
+) -> tuple[Verdicts, dict[int, tuple[Looks, Looks]], float]:
+    """Return what became of labels, how both epochs looked at those that were asked for, and the share of drives that
+    are blind to an object.
+    """
+    center_m = camera_centers(joined.images)
+    near = cKDTree(center_m[is_new]).query(rows.labels.position_in_world_m)[0]
+    is_asked = np.asarray(near <= _settings(before).vote.max_range_m) | (rows.before < 0)
+    # What an epoch alone has elsewhere is no sight of this object.
+    looked = _without_claimed(rows, is_asked, before, alone, joined, is_new)
+    lookout = _lookout(replace(rebuilt, labels=rows.labels, votes=looked), is_asked, joined, center_m, is_new)
+    states = before.labels.state.texts() if before.labels.state is not None else ["confirmed"] * len(before.labels)
+    sights = {}
+    with counted(progress, "looking for changes", int(is_asked.sum())) as looked_at:
+        for row in np.flatnonzero(is_asked).tolist():
+            sights[row] = lookout.at(int(rows.labels.label_id[row]))
+            looked_at(len(sights))
+    were_there = {row: at for row, at in sights.items() if rows.before[row] >= 0 and states[rows.before[row]] != "gone"}
+    hidden = lookout.hidden_share([first for first, _ in were_there.values()])
+    looks = {
+        row: (lookout.looks(first, hidden), lookout.looks(second, hidden)) for row, (first, second) in sights.items()
+    }
+    return judge(rows.labels, rows.before, states, rows.stands, looks), looks, hidden
+
+
+def has_appeared(first: Looks, second: Looks) -> bool:
+    """Return whether something was not there before, and stands there since: what one drive met may have passed by."""
+    return first.say_gone and second.say_there and second.seen_by >= DRIVES_OF_NEW
 
 
 def _in_frame_of(rebuilt: Map, before: Map) -> Map:
@@ -168,7 +188,7 @@ def _map_alone(joined: Dataset, images_before: Ints, before: Map, run: Run, prog
     write_dataset_in_pieces([added], run.work / ADDED)
     config = _settings(before).with_settings(["correct_poses=0"])
     run = replace(run, known=None)
-    return build_map_of_folder(run.work / ADDED, config, run, progress=progress)[0]
+    return build_map_of_folder(run.work / ADDED, config, run, held=added, progress=progress)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +196,9 @@ class _Rows:
     """All labels (N) that are judged: of the rebuilt map, then of the added passes alone, then of the map before.
 
     Labels are numbered from 1. `before` (N) is the old label that each is, `common` (N) how many votes they share;
-    `stands` (N) tells what both epochs alone have in one place, `is_founded` (N) what the rebuilt map has too, if only
-    as another object.
+    `stands` (N) tells what both epochs alone have in one place, or what is to be taken for it, `part_of` (N) the label
+    (row) of the rebuilt map that has the votes of both places of an object that may have moved, -1 of all others;
+    `whole` are those labels of it that are not taken apart.
     """
 
     labels: Labels
@@ -186,11 +207,13 @@ class _Rows:
     common: Ints
     stands: Bools
     is_of_alone: Bools
-    is_founded: Bools
+    part_of: Ints
     is_lost: Bools
+    whole: Ints
 
     @classmethod
-    def of(cls, before: Map, rebuilt: Map, alone: Map) -> _Rows:
+    def of(cls, before: Map, rebuilt: Map, alone: Map, whole: Ints | None = None) -> _Rows:
+        whole = np.empty(0, np.int64) if whole is None else whole
         labels, votes = rebuilt.labels.replace(state=None), rebuilt.votes
         old, common = match_labels(before.labels, before.votes, labels, votes)
         fresh, _ = match_labels(alone.labels, alone.votes, labels, votes)
@@ -198,13 +221,17 @@ class _Rows:
         partner = np.where(fresh >= 0, same[fresh], -1)
         # One label of what stood here before and of what stands there now.
         mixed = (old >= 0) & (fresh >= 0) & (partner < 0) & ~np.isin(old, same)
+        mixed[whole] = False
         by_place = (old < 0) & (partner >= 0) & ~np.isin(partner, old)
         old = np.where(by_place, partner, old)
         stands = np.isin(old, same[same >= 0]) & (old >= 0)
+        stands[whole] = True
         extra = np.flatnonzero(
             (same < 0) & (~np.isin(np.arange(len(same)), fresh) | np.isin(np.arange(len(same)), fresh[mixed]))
         )
-        founded = np.isin(extra, fresh[mixed])
+        taken_apart = np.flatnonzero(mixed)
+        part_of_extra = np.full(len(alone.labels), -1)
+        part_of_extra[fresh[mixed]] = taken_apart
         lost = np.setdiff1d(np.arange(len(before.labels)), old)
         parts = [
             (
@@ -228,9 +255,19 @@ class _Rows:
             ),
             stands=np.concatenate([stands[~mixed], zeros[1], stands[mixed], np.isin(lost, same)]),
             is_of_alone=np.concatenate([zeros[0], ~zeros[1], zeros[2], zeros[3]]),
-            is_founded=np.concatenate([zeros[0], founded, zeros[2], zeros[3]]),
+            part_of=np.concatenate(
+                [np.full(kept, -1), part_of_extra[extra], taken_apart, np.full(len(lost), -1)],
+            ),
             is_lost=np.concatenate([zeros[0], zeros[1], zeros[2], ~zeros[3]]),
+            whole=whole,
         )
+
+    def unchanged(self, verdicts: Verdicts) -> Ints:
+        """Return the labels (rows) of the rebuilt map that were taken apart though nothing is gone from there."""
+        parts = np.flatnonzero((self.part_of >= 0) & ~self.is_of_alone)
+        moved = np.isin(parts, verdicts.moved_from)
+        gone = np.array([verdicts.state[row] == "gone" for row in parts.tolist()], np.bool_)
+        return self.part_of[parts[~(moved | gone)]]
 
 
 def _taken(source: Map, rows: Ints) -> tuple[Labels, Votes]:
@@ -301,13 +338,14 @@ def _left_out(
     new_row[kept] = np.arange(len(kept))
     is_vote_kept = ~is_out[rows.votes.label_id - 1]
     votes = rows.votes.take(np.flatnonzero(is_vote_kept))
-    columns = ("before", "common", "stands", "is_of_alone", "is_founded", "is_lost")
+    columns = ("before", "common", "stands", "is_of_alone", "part_of", "is_lost")
     moved_from = verdicts.moved_from[kept]
     return (
         _Rows(
             labels=rows.labels.take(kept).replace(label_id=np.arange(1, len(kept) + 1)),
             votes=votes.replace(label_id=new_row[votes.label_id - 1] + 1),
             **{name: getattr(rows, name)[kept] for name in columns},
+            whole=rows.whole,
         ),
         Verdicts(
             verdicts.before[kept],
