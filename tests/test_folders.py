@@ -13,6 +13,7 @@ import pytest
 
 from valuemap.errors import OutputError
 from valuemap.folders import LEDGER, check_files, check_place, new_file, new_folder, remove_file, settle
+from valuemap.system import folder_lock
 
 MARKER = "run.json"
 PARTS = (MARKER, "labels.parquet")
@@ -228,6 +229,27 @@ def test_a_ledger_that_names_files_elsewhere_removes_none(tmp_path: Path) -> Non
 def test_the_ledger_is_one_that_sha256sum_checks(tmp_path: Path) -> None:
     write_folder(tmp_path, "new")
     assert (tmp_path / LEDGER).read_text() == f"{hashlib.sha256(b'new').hexdigest()}  {MARKER}\n"
+
+
+def test_a_ledger_does_not_grow_with_each_set_of_files(tmp_path: Path) -> None:
+    def lines(*places: str) -> list[int]:
+        return [len((tmp_path / place / LEDGER).read_text(encoding="utf-8").splitlines()) for place in places]
+
+    for number in range(4):
+        with new_folder(tmp_path / "out", parts=("a", "b"), part_folders=("of",)) as folder:
+            (folder / "of").mkdir()
+            for name in ("a", "of/c", f"of/{number}"):
+                (folder / name).write_text(f"{name} {number}", encoding="utf-8")
+    assert lines("out", "out/of") == [1, 2]
+    subprocess.run(["sha256sum", "--check", "--strict", LEDGER], cwd=tmp_path / "out/of", check=True)
+    # What somebody else has noted, and is about to put in place, stays noted.
+    (tmp_path / "out" / ".valuemap-new-other").mkdir()
+    with (
+        folder_lock(tmp_path / "out" / ".valuemap-new-other"),
+        new_folder(tmp_path / "out", parts=("a", "b"), part_folders=("of",)) as folder,
+    ):
+        (folder / "a").write_text("new", encoding="utf-8")
+    assert lines("out") == [2]
 
 
 def test_a_file_in_the_place_of_a_folder_is_refused(tmp_path: Path) -> None:

@@ -246,10 +246,28 @@ def _take_places(workspace: Path, path: Path, *, force: bool = False) -> None:
         for name in map(os.fsdecode, (workspace / _STALE).read_bytes().split(b"\0")):
             if name and _is_inside(name) and (force or _is_ours(path / name, ledger_of)):
                 (path / name).unlink(missing_ok=True)
+    places = set()
     for name in _files_below(workspace / _DECIDED):
         (path / name).parent.mkdir(parents=True, exist_ok=True)
         (workspace / _DECIDED / name).replace(path / name)
+        places.add((path / name).parent)
     shutil.rmtree(workspace / _DECIDED)
+    if list(path.glob(f"{_STAGING}*")) == [workspace]:  # Nobody has noted files that are not in place yet.
+        for place in places:
+            _shorten(place, workspace / LEDGER)
+
+
+def _shorten(folder: Path, temporary: Path) -> None:
+    """Keep of a ledger one line, the last, for each file that is there: it would grow with each set of files."""
+    ledger = folder / LEDGER
+    with suppress(OSError):
+        before = ledger.stat()
+        last = {name: line for line in ledger.read_bytes().splitlines(True) if (name := line.partition(b"  ")[2])}
+        lines = [line for name, line in last.items() if os.path.lexists(folder / os.fsdecode(name.rstrip(b"\n")))]
+        temporary.write_bytes(b"".join(lines))
+        sync_file(temporary)
+        if not ledger.is_symlink() and ledger.stat().st_size == before.st_size:  # Nobody has added to it meanwhile.
+            temporary.replace(ledger)
 
 
 def _files_below(folder: Path) -> list[str]:
