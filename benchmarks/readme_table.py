@@ -27,12 +27,12 @@ OTHERS = {
     "paper": "recall 0.93 and 0.90, false per label 2.3 and 4.9%, duplicates 8.0 and 3.3% (paper, its own cities)",
     # Ibid., section V: 19 minutes for the clusters of New York City and 3.1 for the triangulation.
     "paper seconds": "22.1 min (paper, its own machines)",
-    # Krylov, Kenny, Dahyot, "Automatic Discovery and Geotagging of Objects from Street View Imagery", 2018.
-    "london": "F1 0.70 (Krylov et al. 2018)",
-    # ProjectSidewalk, sidewalk-auto-labeler: its published sites, scored by `bend_ramps.py --peer`.
-    "bend": "0.907 covered, 0.246 unmatched (sidewalk-auto-labeler)",
+    # What others reach on real data; before a colon the row of field.md that holds their figures.
+    "london": "krylov:(Krylov et al. 2018, written anew from the paper; 0.70 as published, with a network for depth)",
+    "bend": "published sites:(sidewalk-auto-labeler, its published sites)",
     # AutoTS, 2025: with the association given, and a network for depth.
     "kitti_ts": "0.31, 0.54 (AutoTS 2025, test part, association given)",
+    "av2_static": "colmap, given:(COLMAP, association given)",
 }
 
 
@@ -93,29 +93,54 @@ def _rows() -> Iterator[tuple[str, str, str, str, str]]:
 
 
 def _field_rows() -> Iterator[tuple[str, str, str, str, str]]:
-    """Yield the rows of real data."""
-    for name, part, data, what, keys, other in (
+    """Yield the rows of real data: ours from `field.py --json`, all others from the tables of its `--peers`."""
+    ours, tables = _results("field"), _peers()
+    signs = _results("kitti_signs_paper")
+    for name, part, table, data, what, keys, other in (
         (
-            "kitti_signs", "total", "KITTI, 27 surveyed signs", "signs found within 2 m and 1 m; precision",
+            "kitti_signs", "total", "", "KITTI, 27 surveyed signs", "signs found within 2 m and 1 m; precision",
             ("signs_found_2m", "signs_found_1m", "precision"), "-",
         ),
         (
-            "london_tl", "london", "London, lights in panoramas", "F1 within 6 m",
+            "london_tl", "london", "london_tl bearings", "London, 50 lights in panoramas", "F1 within 6 m",
             ("f1_6m",), OTHERS["london"],
         ),
         (
-            "bend_ramps", "bend", "Bend, curb ramps in panoramas", "covered, unmatched",
-            ("covered", "unmatched"), OTHERS["bend"],
+            "bend_ramps", "bend", "bend_ramps", "Bend, 5,771 curb ramps in panoramas",
+            "covered, unmatched, median distance (m)", ("covered", "unmatched", "median_distance_m"), OTHERS["bend"],
         ),
         (
-            "kitti_ts", "kitti_ts", "KITTI raw, 216 signs with classes", "found within 1 m and 2 m",
+            "kitti_ts", "kitti_ts", "kitti_ts", "KITTI raw, 216 signs with classes", "found within 1 m and 2 m",
             ("recall_1m", "recall_2m"), OTHERS["kitti_ts"],
         ),
+        (
+            "av2_static", "total", "av2_static", "Argoverse 2, 18 bollards, cones and a sign", "recall, precision",
+            ("recall", "precision"), OTHERS["av2_static"],
+        ),
     ):  # fmt: skip
-        ours = _results(f"{name}_robust") or _results(name)
-        if ours:
-            paper = _results(f"{name}_paper")
-            yield data, what, _figures(ours[part], keys), _figures(paper[part], keys) if paper else "-", other
+        if not ours:
+            return
+        paper = tables.get(table, {}).get("paper") or (signs and signs[part] if name == "kitti_signs" else None)
+        peer, _, said = other.partition(":")
+        measured = tables.get(table, {}).get(peer)
+        yield (
+            data,
+            what,
+            _figures(ours[name][part], keys),
+            _figures(paper, keys) if paper else "-",
+            f"{_figures(measured, keys)} {said}" if measured else other,
+        )
+
+
+def _peers() -> dict[str, dict[str, dict[str, float]]]:
+    """Return what all methods reached on the same real data: by table, method and column of field.md."""
+    path = RESULTS / "field.md"
+    tables: dict[str, dict[str, dict[str, float]]] = {}
+    for section in path.read_text(encoding="utf-8").split("\n### ")[1:] if path.is_file() else []:
+        title, *lines = section.splitlines()
+        head, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if "|" in line]
+        tables[title] = {row[0]: dict(zip(head[1:], map(float, row[1:]), strict=True)) for row in rows}
+    return tables
 
 
 def _results(name: str) -> Any:

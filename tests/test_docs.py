@@ -168,6 +168,18 @@ def test_the_table_of_figures_is_that_of_the_results() -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_the_table_of_figures_has_the_peers_on_real_data() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    for name, peer in (
+        ("London", "Krylov"),
+        ("Bend", "auto-labeler"),
+        ("KITTI raw", "AutoTS"),
+        ("Argoverse", "COLMAP"),
+    ):
+        (row,) = re.findall(rf"^\| {name}.*$", readme, flags=re.MULTILINE)
+        assert peer in row
+
+
 def test_every_page_is_in_the_site_once() -> None:
     site = re.findall(r"^ +- [^:]+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), flags=re.MULTILINE)
     pages = (str(page.relative_to(ROOT / "docs")) for page in PAGES if (ROOT / "docs") in page.parents)
