@@ -28,7 +28,7 @@ def passes_command(
     min_passes: Annotated[int, typer.Option(min=2, help="Clusters with fewer passes do not count.")] = 5,
     radius: Annotated[float, typer.Option(help="Metres within which a label can be an object.")] = 2.0,
     method: MethodName = DEFAULT_METHOD,
-    threads: Annotated[int, typer.Option(min=0, help="Threads, 0 for one a core; the result is the same.")] = 0,
+    threads: Annotated[int, typer.Option(min=0, help="Threads, 0 for one per core; the result is the same.")] = 0,
     assignments: Settings = None,
     as_json: AsJson = False,
 ) -> None:

@@ -47,7 +47,7 @@ def map_command(
     dataset: Annotated[Path, typer.Argument(help="Folder that an import or simulate command wrote.")],
     out: Annotated[Path, typer.Option("--out", help="Folder to write the map to.")],
     method: MethodName = DEFAULT_METHOD,
-    threads: Annotated[int, typer.Option(min=0, help="Threads, 0 for one a core; the map is the same.")] = 0,
+    threads: Annotated[int, typer.Option(min=0, help="Threads, 0 for one per core; the map is the same.")] = 0,
     picture: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw the map from above, as .png or .svg.")
     ] = None,

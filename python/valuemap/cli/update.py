@@ -29,7 +29,7 @@ def update_command(
     dataset: Annotated[
         Path | None, typer.Option(help="Dataset of the map. Default: where the map says that it is.")
     ] = None,
-    threads: Annotated[int, typer.Option(min=0, help="Threads, 0 for one a core; the map is the same.")] = 0,
+    threads: Annotated[int, typer.Option(min=0, help="Threads, 0 for one per core; the map is the same.")] = 0,
     tile_size: TileSize = None,
     engine: EngineName = "threads",
     ray_address: RayAddress = None,

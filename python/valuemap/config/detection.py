@@ -49,7 +49,7 @@ class DetectConfig(Settings):
         1, unit="pictures", low=1, high=1024, effect="pictures of one size that go through the network together"
     )
     decoders: int = declare(
-        0, unit="threads", high=256, effect="threads that decode pictures ahead of the network; 0 for one a core"
+        0, unit="threads", high=256, effect="threads that decode pictures ahead of the network; 0 for one per core"
     )
     panorama_view_deg: float = declare(
         90.0,

@@ -29,7 +29,7 @@ def import_pictures(
     ] = None,
     camera: CameraText = None,
     gps_sigma: Annotated[float, typer.Option(help="Metres, of GPS positions that do not say theirs.")] = 3.0,
-    threads: Annotated[int, typer.Option(min=0, max=1024, help="Of structure from motion, 0 for one a core.")] = 0,
+    threads: Annotated[int, typer.Option(min=0, max=1024, help="Of structure from motion, 0 for one per core.")] = 0,
     anchor: Anchor = None,
     max_rejected: MaxRejected = MAX_REJECTED,
     force: Force = False,
