@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import fields
+from fnmatch import fnmatch
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -178,6 +179,13 @@ def test_the_table_of_figures_has_the_peers_on_real_data() -> None:
     ):
         (row,) = re.findall(rf"^\| {name}.*$", readme, flags=re.MULTILINE)
         assert peer in row
+
+
+def test_every_result_of_a_benchmark_is_explained() -> None:
+    text = (ROOT / "benchmarks" / "README.md").read_text(encoding="utf-8")
+    named = re.findall(r"`(?:results/)?([\w*]+\.(?:json|md))`", text)
+    results = sorted(path.name for path in (ROOT / "benchmarks" / "results").iterdir())
+    assert [name for name in results if not any(fnmatch(name, each) for each in named)] == []
 
 
 def test_every_page_is_in_the_site_once() -> None:
