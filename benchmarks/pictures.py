@@ -1,6 +1,7 @@
 """From a folder of rendered street pictures with a GPS position in each, and nothing else, to poses and a map.
 
-    python benchmarks/pictures.py [--seed 1] [--pass-row 1] [--pictures N] [--gps-sigma 2] [--work DIR] [--json FILE]
+    python benchmarks/pictures.py [--seed 1] [--pass-row 1] [--pictures N] [--gps-sigma 2] [--spacing 2.5]
+                                  [--work DIR] [--json FILE]
 
 A drive round the blocks of a simulated city by day is rendered. EXIF gets a position with noise of `--gps-sigma` on
 each axis, the time and the focal length. `valuemap import pictures` finds the poses. They are compared with the true
@@ -49,7 +50,6 @@ CITY = (
     "keep_before_signal_m=1000",
     "red_light_share=0.2",
     "standing_interval_s=2",
-    "frame_spacing_m=2.5",
     "position_white_m=0",
     "position_drift_m=0",
     "rotation_white_deg=0",
@@ -57,6 +57,7 @@ CITY = (
 )
 START_S = 1.7e9
 GPS_SIGMA_M = 2.0
+SPACING_M = 2.5
 FILM_MM = 36.0
 
 
@@ -67,12 +68,13 @@ def main() -> None:
     parser.add_argument("--pass-row", type=int, default=1, help="which drive; the default is by day")
     parser.add_argument("--pictures", type=int, default=1000, help="of its beginning; the default is the whole drive")
     parser.add_argument("--gps-sigma", type=float, default=GPS_SIGMA_M, help="noise of each axis, m")
+    parser.add_argument("--spacing", type=float, default=SPACING_M, help="way from picture to picture, m")
     parser.add_argument("--work", type=Path, help="folder for everything, to go on after an interruption")
     parser.add_argument("--json", type=Path, help="file to write the figures to, beside those of other drives")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         work = options.work or Path(temporary)
-        result = run(work, options.seed, options.pass_row, options.pictures, options.gps_sigma)
+        result = run(work, options)
     for name, value in result.items():
         print(f"{name}: {value}")
     keep_record(options.json, record_of(options, result))
@@ -85,6 +87,8 @@ def record_of(options: argparse.Namespace, result: dict[str, Any]) -> dict[str, 
     drive = f"seed {options.seed}, pass {options.pass_row}"
     if options.gps_sigma != GPS_SIGMA_M:
         drive += f", GPS of {options.gps_sigma:g} m"
+    if options.spacing != SPACING_M:
+        drive += f", every {options.spacing:g} m"
     return {
         "benchmark": "pictures",
         "command": "python benchmarks/pictures.py --seed SEED --pass-row PASS --json FILE, drive by drive",
@@ -93,11 +97,13 @@ def record_of(options: argparse.Namespace, result: dict[str, Any]) -> dict[str, 
     }
 
 
-def run(work: Path, seed: int, pass_row: int, count: int, gps_sigma_m: float) -> dict[str, Any]:
+def run(work: Path, options: argparse.Namespace) -> dict[str, Any]:
     """Return all figures."""
     work.mkdir(parents=True, exist_ok=True)
-    recording = record_city(PRESETS["small"].with_settings(CITY), seed=seed)
-    rows = np.flatnonzero(recording.frames.pass_row == pass_row)[:count]
+    seed, pass_row, gps_sigma_m = options.seed, options.pass_row, options.gps_sigma
+    city = (*CITY, f"frame_spacing_m={options.spacing:g}")
+    recording = record_city(PRESETS["small"].with_settings(city), seed=seed)
+    rows = np.flatnonzero(recording.frames.pass_row == pass_row)[: options.pictures]
     photos, truth, found = work / "photos", work / "truth", work / "found"
     names = take_photos(recording, rows, photos, gps_sigma_m)
     start = time.perf_counter()
@@ -114,11 +120,16 @@ def run(work: Path, seed: int, pass_row: int, count: int, gps_sigma_m: float) ->
     )
     write_dataset(true, truth, force=True)
     result = {
-        "city": list(CITY),
+        "city": list(city),
         "seed": seed,
         "weather": light_of_pass(pass_row, seed=seed).weather.name,
         "gps_sigma_m": gps_sigma_m,
         "pictures": len(names),
+        "relative_error_that_the_gps_alone_leaves_m": figures(
+            relative_errors(
+                gps_error_of_true_shape(recording, rows, gps_sigma_m), recording.frames.center_in_world_m[rows]
+            )
+        ),
         **compare_poses(true, read_dataset(found)),
         "import_seconds": round(seconds, 1),
     }
@@ -150,8 +161,7 @@ def valuemap(*arguments: str) -> None:
 def take_photos(recording: Recording, rows: Any, folder: Path, gps_sigma_m: float) -> list[str]:
     """Write pictures with what a telephone would say of them; return their names."""
     images = recording.dataset.images
-    noise = np.random.default_rng(recording.seed).normal(0.0, gps_sigma_m, (len(images), 3))
-    place = lon_lat_height_from_enu(recording.frames.center_in_world_m + noise, ANCHOR)
+    place = lon_lat_height_from_enu(gps_positions(recording, gps_sigma_m), ANCHOR)
     config, names = recording.config, images.name.to_pylist()
     missing = [row for row in rows.tolist() if not (folder / names[row]).is_file()]
     for picture in render_pictures(recording, rows=missing):
@@ -178,6 +188,12 @@ def take_photos(recording: Recording, rows: Any, folder: Path, gps_sigma_m: floa
     return [names[row] for row in rows.tolist()]
 
 
+def gps_positions(recording: Recording, sigma_m: float) -> Floats:
+    """Return where the GPS says that pictures (N, 3) were taken."""
+    center: Floats = recording.frames.center_in_world_m
+    return center + np.random.default_rng(recording.seed).normal(0.0, sigma_m, center.shape)
+
+
 def sexagesimal(degrees: float) -> tuple[float, float, float]:
     """Return degrees, minutes and seconds."""
     minutes = (degrees - int(degrees)) * 60.0
@@ -194,9 +210,6 @@ def compare_poses(true: Dataset, found: Dataset) -> dict[str, Any]:
     error = center - true_center
     turned = np.einsum("nij,nkj->nik", rotation_matrices(found.images), rotation_matrices(true.images)[row])
     turned_rad = Rotation.from_matrix(turned).magnitude()
-    apart = np.linalg.norm(true_center[:, None] - true_center[None], axis=2)
-    near = (apart > 40.0) & (apart < 60.0)
-    relative = np.linalg.norm(error[:, None] - error[None], axis=2)[near]
     assert found.images.position_sigma_m is not None
     assert found.images.rotation_sigma_rad is not None
     in_part = rigid_rest(center, true_center)
@@ -207,7 +220,7 @@ def compare_poses(true: Dataset, found: Dataset) -> dict[str, Any]:
         "focal_px": [round(float(params[0]), 1) for params in found.cameras.params],
         "position_error_m": figures(np.linalg.norm(error, axis=1)),
         "rotation_error_deg": figures(np.degrees(turned_rad)),
-        "relative_error_40_to_60_m_m": figures(relative),
+        "relative_error_40_to_60_m_m": figures(relative_errors(error, true_center)),
         "position_sigma_m": figures(found.images.position_sigma_m),
         "position_error_after_moving_the_whole_m": figures(in_part),
         "position_error_over_sigma_rms": round(
@@ -216,13 +229,36 @@ def compare_poses(true: Dataset, found: Dataset) -> dict[str, Any]:
     }
 
 
-def rigid_rest(center_m: Floats, true_m: Floats) -> Floats:
-    """Return how far positions (N, 3) are from the true ones where the whole is moved, turned and scaled."""
-    a, b = center_m - center_m.mean(axis=0), true_m - true_m.mean(axis=0)
+def relative_errors(error_m: Floats, true_m: Floats) -> Floats:
+    """Return how wrong the ways are between positions (N, 3) that are 40 to 60 m apart."""
+    apart = np.linalg.norm(true_m[:, None] - true_m[None], axis=2)
+    near = (apart > 40.0) & (apart < 60.0)
+    between: Floats = np.linalg.norm(error_m[:, None] - error_m[None], axis=2)[near]
+    return between
+
+
+def moved_onto(target_m: Floats, shape_m: Floats) -> Floats:
+    """Return a shape (N, 3) moved, turned and scaled to where it is nearest to others (Umeyama, 1991)."""
+    a, b = shape_m - shape_m.mean(axis=0), target_m - target_m.mean(axis=0)
     turn, _ = Rotation.align_vectors(b, a)
     scale = (b * turn.apply(a)).sum() / (a**2).sum()
-    rest: Floats = np.linalg.norm(scale * turn.apply(a) - b, axis=1)
+    moved: Floats = scale * turn.apply(a) + target_m.mean(axis=0)
+    return moved
+
+
+def rigid_rest(center_m: Floats, true_m: Floats) -> Floats:
+    """Return how far positions (N, 3) are from the true ones where the whole is moved, turned and scaled."""
+    rest: Floats = np.linalg.norm(moved_onto(center_m, true_m) - center_m, axis=1)
     return rest
+
+
+def gps_error_of_true_shape(recording: Recording, rows: Any, sigma_m: float) -> Floats:
+    """Return the errors (N, 3) of who knows the shape of a drive and has its place, turn and scale from the GPS.
+
+    Pictures say nothing of these three: no structure from motion is better than that, but by chance.
+    """
+    true_m: Floats = recording.frames.center_in_world_m[rows]
+    return moved_onto(gps_positions(recording, sigma_m)[rows], true_m) - true_m
 
 
 def figures(values: Floats) -> dict[str, float]:

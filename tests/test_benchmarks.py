@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import dense
 import fleets
+import pictures
 from block import block
 from bound import Views, cramer_rao_covariances, residual_covariance, true_views
 from cities import PASSING_KINDS, passing_things, reliability, seeds_from
@@ -235,6 +236,23 @@ def test_a_shift_of_the_whole_map_costs_nothing_between_neighbours() -> None:
     assert len(fleets.squared_errors_between(outcome(random), outcome(random))) == 3
     between = fleets.squared_errors_between(outcome(random), outcome(missed))
     np.testing.assert_allclose(between, [np.sum((random[0] - random[2]) ** 2)])
+
+
+def test_what_the_gps_leaves_of_a_true_shape_is_its_place_turn_and_scale() -> None:
+    random = np.random.default_rng(0)
+    shape = random.uniform(0.0, 100.0, (40, 3))
+    moved = 1.02 * shape @ Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix().T + [5.0, 6.0, 7.0]
+    np.testing.assert_allclose(pictures.moved_onto(moved, shape), moved, atol=1e-9)
+    # Of 120 numbers with noise of 1 a fit of seven takes seven.
+    left = np.mean([
+        ((pictures.moved_onto(noisy, shape) - shape) ** 2).sum()
+        for noisy in shape + random.normal(0.0, 1.0, (200, *shape.shape))
+    ])  # fmt: skip
+    assert left == pytest.approx(7.0, abs=0.8)
+    # Ways between positions know nothing of a shift of all; those of a longer shape are longer by that.
+    street = np.column_stack([np.arange(0.0, 101.0, 10.0), np.zeros(11), np.zeros(11)])
+    assert pictures.relative_errors(np.full((11, 3), 3.0), street).max() == 0.0
+    np.testing.assert_allclose(pictures.relative_errors(0.01 * street, street), 0.5)
 
 
 def test_seeds_are_numbers_and_ranges() -> None:
