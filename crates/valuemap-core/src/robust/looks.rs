@@ -12,7 +12,7 @@ use rustc_hash::FxHashMap;
 
 use super::energy::Object;
 use super::model::Model;
-use super::scene::Scene;
+use super::scene::{Scene, View};
 use super::seen::{Looks, Seen};
 
 /// Images are grouped by cubes of this share of the range: some hundred cubes are in reach of a point.
@@ -161,6 +161,17 @@ struct Look {
     image: u32,
     weight: f64,
     is_hit: bool,
+}
+
+/// How many looks at an object the images of some rays are: those that have it in their picture, from where and as far as its class is detected.
+#[must_use]
+pub fn looks_among(model: &Model<'_>, object: &Object, rays: &[u32]) -> f64 {
+    let (scene, point) = (model.scene, &object.fit.point);
+    let class = &model.classes[object.class as usize];
+    let sectors = Sectors::of(scene, point, &object.votes, (0.0, class.farthest_m));
+    let is_look = |view: &&View| sectors.holding(&(view.center - point)).is_some() && scene.is_in_picture(view, point);
+    let views = rays.iter().map(|&ray| scene.view(ray)).filter(is_look);
+    views.map(|view| class.reach.at((view.center - point).norm())).sum()
 }
 
 /// The images of some rays, ascending.

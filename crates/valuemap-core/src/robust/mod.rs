@@ -4,7 +4,7 @@
 //! 2. [`propose`](mod@propose): each ray meets few partners ([`sample`]) and proposes the point that a sample of images supports best.
 //! 3. [`births`](mod@births): the best supported hypothesis takes its votes, and is born if J ([`energy`]) falls.
 //! 4. [`assign`](mod@assign): all objects compete for all detections.
-//! 5. [`finish`](mod@finish): positions and covariances, objects of a place together ([`estimate`](mod@estimate), [`drift`], [`contest`]).
+//! 5. [`switches`]: what pictures show to be another object is left out. [`finish`](mod@finish): positions and covariances, objects of a place together ([`estimate`](mod@estimate), [`drift`], [`contest`]).
 //! 6. [`likeliest`], [`calibrate`]: the noise itself is estimated from the residuals; [`learn`](mod@learn): rates, sizes and clutter are.
 
 pub mod assign;
@@ -41,6 +41,7 @@ pub mod search;
 pub mod seen;
 pub mod sizes;
 mod spd;
+pub mod switches;
 
 use crate::hypothesis::Viability;
 use crate::progress::{Halt, Progress};
@@ -59,6 +60,7 @@ use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 use scene::Scene;
 use search::{Depth, search};
+use switches::are_others;
 
 /// Settings of the robust method.
 #[derive(Debug, Clone, Copy)]
@@ -257,8 +259,13 @@ pub fn find(
         (object, estimate)
     });
     let scaled = |estimate: Estimate| Estimate { covariance: estimate.covariance * variance_factor, ..estimate };
-    let all = objects.into_iter().zip(estimates.into_iter().map(scaled)).chain(few);
+    let all: Vec<(Object, Estimate)> = objects.into_iter().zip(estimates.into_iter().map(scaled)).chain(few).collect();
+    let are_others = are_others(&model, &all.iter().map(|(object, _)| object).collect::<Vec<_>>());
+    tally.deaths += are_others.iter().filter(|is_other| **is_other).count() as u64;
     let mut findings: Vec<Finding> = all
+        .into_iter()
+        .zip(are_others)
+        .filter_map(|(one, is_other)| (!is_other).then_some(one))
         .map(|(object, estimate)| (object.existence(), object, estimate))
         .filter(|(existence, ..)| *existence >= settings.min_existence)
         .map(|(existence, object, estimate)| {
