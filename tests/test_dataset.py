@@ -129,6 +129,12 @@ PINHOLE_PARAMS = [[500.0, 500.0, 320.0, 240.0], [600.0, 600.0, 400.0, 300.0, 0.0
             "COLMAP's order",
         ),
         (
+            "cameras",
+            with_column("readout_s", [None, 30.0]),
+            r"row with camera_id 2: readout_s: expected at most 1 s, or no value, found 30\.0 \(1 rows\)$",
+            "30 ms are 0.03",
+        ),
+        (
             "images",
             with_value("camera_id", 2, 9),
             r"images\.parquet, row with image_id 30: camera_id: expected an id that is in cameras\.parquet, found 9",

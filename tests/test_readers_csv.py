@@ -224,6 +224,20 @@ def test_cameras_passes_times_rigs_and_sigmas_come_from_columns(tmp_path: Path) 
     assert read_dataset(tmp_path / "dataset").images.rig_id is not None
 
 
+def test_cameras_with_other_readout_times_are_others(tmp_path: Path) -> None:
+    rows = ("b.jpg,0,0.0001,0,0.03", "a.jpg,0,0,0,", "c.jpg,0,0.0002,0,-0.02", "d.jpg,0,0.0003,0,0.03")
+    dataset = read_csv_poses(poses_of(tmp_path, "image,lat,lon,heading_deg,readout_s", *rows), camera=CAMERA)
+    write_dataset(dataset, tmp_path / "dataset")
+    again = read_dataset(tmp_path / "dataset")
+    assert again.cameras.readout_s is not None
+    assert_allclose(again.cameras.readout_s, [np.nan, -0.02, 0.03])
+    assert again.images.camera_id.tolist() == [1, 3, 2, 3]
+    plain = read_csv_poses(
+        poses_of(tmp_path, "image,lat,lon,heading_deg", "a.jpg,0,0,0", "b.jpg,0,0.0001,0"), camera=CAMERA
+    )
+    assert plain.cameras.readout_s is None
+
+
 def test_a_camera_model_may_stand_in_a_row(tmp_path: Path) -> None:
     poses = poses_of(
         tmp_path,

@@ -12,13 +12,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import valuemap
+from test_simulate import EXACT_BOXES, EXACT_POSES
 from valuemap import pipeline
-from valuemap.cameras import camera_poses
-from valuemap.config import SimulationConfig
-from valuemap.dataset import Dataset, write_dataset
+from valuemap.cameras import camera_poses, cast_rays
+from valuemap.config import MapConfig, SimulationConfig
+from valuemap.dataset import Dataset, rows_of, write_dataset
 from valuemap.drives import Drives, find_drives, in_driving_order
 from valuemap.engine.threads import ThreadEngine
-from valuemap.refine import FITS_NO_BETTER, Refined, adjust, poses, refine_poses
+from valuemap.refine import FITS_NO_BETTER, Refined, adjust, expose_rows, poses, refine_poses
 from valuemap.refine.adjust import Adjustment, Scales
 from valuemap.refine.estimate import delay_together, lay, mounts_alone, segment
 from valuemap.refine.footage import Footage, Sigmas, find_motion, gather, in_working_frame
@@ -235,6 +236,72 @@ def test_poses_that_are_moved_on_tremble_as_before() -> None:
     motion, center = find_motion(dataset, drives), camera_poses(dataset.images)[1]
     for late_s, velocity in ((0.1, motion.forward_mps), (-0.1, motion.backward_mps)):
         assert trembling(center + late_s * velocity, drives) > 0.95 * trembling(center, drives)
+
+
+ROLLING = EXACT_POSES | {"readout_s": 0.06}
+
+
+def test_images_get_the_poses_of_the_rows_of_their_detections() -> None:
+    rolling = city(**ROLLING, **EXACT_BOXES)
+    exposed, record = expose_rows(rolling)
+    before, after = (missed_px(dataset) for dataset in (rolling, exposed))
+    # Some lights are not on the mean row of all in their image.
+    assert np.mean(after) < 0.6 * np.mean(before)
+    alone = np.bincount(rolling.detections.image_id, minlength=len(rolling.images))[image_of_missed(rolling)] == 1
+    assert np.mean(after[alone]) < 0.3 * np.mean(before[alone])
+    assert exposed.cameras.readout_s is None
+    assert record["rows"]["images_without_times"] == 0
+    assert record["rows"]["mean_s"] < -0.001  # Lights are in the upper half of the picture.
+    np.testing.assert_array_equal(exposed.images.timestamp_s, rolling.images.timestamp_s)
+
+
+def missed_px(dataset: Dataset) -> Floats:
+    """Return how far (N), px, true lights are from where they were detected, where they are detected exactly."""
+    assert dataset.truth is not None
+    assert dataset.truth_detections is not None
+    detection = rows_of(dataset.truth_detections.detection_id, dataset.detections.detection_id)
+    thing = rows_of(dataset.truth_detections.object_id, dataset.truth.object_id)
+    rays = cast_rays(dataset)
+    away = dataset.truth.position_in_world_m[thing] - rays.center_in_world_m[detection]
+    a, b, c = np.einsum("nij,nj->in", rays.residual_from_world[detection], away)
+    return np.asarray(np.hypot(a / c, b / c))
+
+
+def image_of_missed(dataset: Dataset) -> Ints:
+    """Return the images (rows, N) of the same detections."""
+    assert dataset.truth_detections is not None
+    detection = rows_of(dataset.truth_detections.detection_id, dataset.detections.detection_id)
+    return rows_of(dataset.detections.image_id[detection], dataset.images.image_id)
+
+
+def test_poses_stay_where_rows_are_not_told_apart_or_nobody_knows_how_fast_images_move() -> None:
+    still = city()
+    assert expose_rows(still) == (still, {})
+    untold = replace_cameras(still, np.array([np.nan]))
+    assert expose_rows(untold) == (untold, {})
+    without = dataclasses.replace(city(**ROLLING), images=city(**ROLLING).images.replace(timestamp_s=None))
+    exposed, record = expose_rows(without)
+    assert record["rows"]["images"] == 0
+    assert record["rows"]["images_without_times"] == len(without.images)
+    np.testing.assert_allclose(camera_poses(exposed.images)[1], camera_poses(without.images)[1], atol=1e-9)
+
+
+def replace_cameras(dataset: Dataset, readout_s: Floats) -> Dataset:
+    return dataclasses.replace(dataset, cameras=dataset.cameras.replace(readout_s=readout_s))
+
+
+def test_a_rolling_shutter_costs_a_map_nothing_where_it_is_stated() -> None:
+    rolling = city(**ROLLING)
+    result = valuemap.build_map(rolling, MapConfig().with_settings(["correct_poses=0"]))
+    assert result.corrected is not None
+    assert result.corrected.cameras.readout_s is None
+    assert result.run["poses"]["rows"]["images"] > 0
+    unstated = dataclasses.replace(rolling, cameras=rolling.cameras.replace(readout_s=None))
+    off_m = [
+        valuemap.evaluate_map(each, rolling, radius_m=2.0).position_rmse_m
+        for each in (result, valuemap.build_map(unstated, MapConfig().with_settings(["correct_poses=0"])))
+    ]
+    assert off_m[0] < 0.8 * off_m[1]
 
 
 def trembling(center: Floats, drives: Drives) -> float:

@@ -513,7 +513,8 @@ def test_drift_is_the_recursion_it_claims_to_be() -> None:
 def line_of_frames(distance_m: Floats, pass_row: Ints) -> Frames:
     zeros, rows = np.zeros(len(distance_m)), np.arange(len(distance_m))
     points = np.zeros((len(zeros), 3))
-    return Frames(pass_row, distance_m, zeros, zeros, points, zeros, zeros, 0 * rows, rows, points, zeros)
+    moved = (points, zeros, points, zeros)
+    return Frames(pass_row, distance_m, zeros, zeros, points, zeros, zeros, 0 * rows, rows, *moved)
 
 
 def test_sigmas_of_poses_are_written_on_demand() -> None:

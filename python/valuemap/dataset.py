@@ -54,6 +54,8 @@ _FARTHEST_M = 1e12
 """From the origin of the world: beyond, squares of distances leave what numbers hold."""
 _LARGEST_PX = 1e9
 """Of a box or a parameter of a camera: no picture has so many."""
+_LONGEST_READOUT_S = 1.0
+"""Of a picture: rolling shutters take hundredths of a second, so that more is milliseconds."""
 _ROUNDING = 1e-12
 _LEADS_OUT = r"^/|^[A-Za-z]:|^\\\\|(^|[/\\])\.\.([/\\]|$)|\x00"
 
@@ -348,6 +350,18 @@ def check_cameras(cameras: Cameras, source: str) -> None:
                 f"{where}: params: {model} expects {len(names)} finite numbers ({expected}), found {params.tolist()}",
                 hint=f"give the parameters in COLMAP's order, in pixels, none above {_LARGEST_PX:g}",
             )
+    if cameras.readout_s is not None:
+        _refuse(
+            np.abs(cameras.readout_s) > _LONGEST_READOUT_S,
+            cameras.readout_s,
+            cameras.camera_id,
+            source,
+            "cameras",
+            "camera_id",
+            "readout_s",
+            f"expected at most {_LONGEST_READOUT_S:g} s, or no value",
+            hint="it is in seconds, from the first row of a picture to the last; 30 ms are 0.03",
+        )
 
 
 def check_images(images: Images, cameras: Cameras, source: str) -> Images:

@@ -25,7 +25,7 @@ from valuemap.notes import Findings, cameras_not_upright, find_notes
 from valuemap.partition import partition_images
 from valuemap.portions import rows_on_disk
 from valuemap.progress import Progress, silent
-from valuemap.refine import FITS_NO_BETTER, Refined, refine_poses
+from valuemap.refine import FITS_NO_BETTER, Refined, expose_rows, refine_poses
 from valuemap.rejected import rejected_of_map
 from valuemap.robust import Calibration, calibration_to_json
 from valuemap.system import peak_memory_mb
@@ -187,6 +187,13 @@ def build_map_of_folder(
 
 
 def _refined(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, progress: Progress) -> Refined:
+    """Give images the poses of the rows of their detections, then correct what poses of drives are proven wrong by."""
+    exposed, rows = expose_rows(dataset)
+    refined = _proven(exposed, config, stages, threads, progress)
+    return replace(refined, record={**refined.record, **rows}, is_corrected=True) if rows else refined
+
+
+def _proven(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, progress: Progress) -> Refined:
     """Correct what whole drives' poses are proven wrong by, if that makes the same detections likelier."""
     if len(dataset.images) + len(dataset.detections) > MOST_CORRECTED and config.poses.correct_poses:
         return Refined(dataset, {"found": "nothing", "because": _TOO_LARGE})

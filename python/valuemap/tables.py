@@ -139,7 +139,11 @@ class Table:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Cameras(Table):
-    """Intrinsics. `model` is a COLMAP model name, `params` in COLMAP's order (pixels, centre of pixel 0 at 0.5)."""
+    """Intrinsics. `model` is a COLMAP model name, `params` in COLMAP's order (pixels, centre of pixel 0 at 0.5).
+
+    `readout_s` is how much later the last row of a picture is exposed than the first one, negative where the last row
+    comes first; NaN where all rows are exposed at once. Poses and timestamps are those of the middle row.
+    """
 
     KEY: ClassVar[str | None] = "camera_id"
 
@@ -148,6 +152,7 @@ class Cameras(Table):
     width_px: Ints = _column("int", ("width",))
     height_px: Ints = _column("int", ("height",))
     params: list[Floats] = _column("floats", ("params",))
+    readout_s: Floats | None = _column("float", ("readout_s",), optional=True, nullable=True)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -337,6 +337,9 @@ class SimulationConfig(Settings):
     focal_error_share: float = declare(
         0.0, unit="1", low=-0.5, high=0.5, effect="the recorded focal length is too long by this share of itself"
     )
+    readout_s: float = declare(
+        0.0, unit="s", high=0.2, effect="the last row of a picture is exposed so much later than the first one"
+    )
 
     # What is recorded.
     write_pose_sigmas: int = declare(

@@ -9,19 +9,23 @@ import numpy as np
 import pycolmap
 
 from valuemap.errors import InputError, SettingError
-from valuemap.tables import Cameras, Categories, Ints
+from valuemap.tables import Cameras, Categories, Floats, Ints
 
 _LARGEST_PX = 1_000_000
 
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera: COLMAP's name of the model, size in pixels, and parameters in COLMAP's order and pixel convention."""
+    """One camera: COLMAP's name of the model, size in pixels, parameters in COLMAP's order and pixel convention.
+
+    `readout_s` is how much later its last row is exposed than its first one, where it is known.
+    """
 
     model: str
     width: int
     height: int
     params: tuple[float, ...]
+    readout_s: float | None = None
 
 
 def make_cameras(cameras: Sequence[Camera], source: str) -> tuple[Cameras, Ints]:
@@ -43,7 +47,7 @@ def make_cameras(cameras: Sequence[Camera], source: str) -> tuple[Cameras, Ints]
                 f"{source}: camera: expected a focal length above 0 and finite parameters, found {list(camera.params)}",
                 hint="focal lengths are in pixels",
             )
-    distinct = sorted(set(cameras), key=lambda camera: (camera.model, camera.width, camera.height, camera.params))
+    distinct = sorted(set(cameras), key=_by_value)
     id_of = {camera: number for number, camera in enumerate(distinct, start=1)}
     table = Cameras(
         camera_id=np.arange(1, len(distinct) + 1, dtype=np.int64),
@@ -51,8 +55,21 @@ def make_cameras(cameras: Sequence[Camera], source: str) -> tuple[Cameras, Ints]
         width_px=np.array([camera.width for camera in distinct], dtype=np.int64),
         height_px=np.array([camera.height for camera in distinct], dtype=np.int64),
         params=[np.array(camera.params, dtype=np.float64) for camera in distinct],
+        readout_s=_readout_s(distinct),
     )
     return table, np.array([id_of[camera] for camera in cameras], dtype=np.int64)
+
+
+def _by_value(camera: Camera) -> tuple[str, int, int, tuple[float, ...], float]:
+    readout_s = -np.inf if camera.readout_s is None else camera.readout_s
+    return camera.model, camera.width, camera.height, camera.params, readout_s
+
+
+def _readout_s(cameras: Sequence[Camera]) -> Floats | None:
+    """Return the readout times (N) of cameras; nothing if none states one."""
+    if all(camera.readout_s is None for camera in cameras):
+        return None
+    return np.array([np.nan if camera.readout_s is None else camera.readout_s for camera in cameras])
 
 
 def parse_camera(text: str, pixel_center: float = 0.5) -> Camera:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -34,7 +34,7 @@ _TEXTS = ("image", "pass", "rig", "timestamp", "model", "params")
 _NUMBERS = (
     *("lat", "lon", "height", "x", "y", "z", "qw", "qx", "qy", "qz", "pitch_deg", "roll_deg"),
     *("heading_deg", "heading_rad", "yaw_deg", "yaw_rad", "width_px", "height_px", "fx", "fy", "cx", "cy"),
-    *("position_sigma_m", "rotation_sigma_deg"),
+    *("position_sigma_m", "rotation_sigma_deg", "readout_s"),
 )
 _HEADINGS = ("heading_deg", "heading_rad", "yaw_deg", "yaw_rad")
 _NO_DEGREES = "write decimal degrees, as 52.5123 or -0.1276, without letters and signs"
@@ -73,7 +73,7 @@ def read_csv_poses(
 
     Columns: `image` (name); a place, `lat, lon` in degrees or `x, y`, with `height` or `z`; an orientation; and as far
     as known a camera, `pass`, `timestamp` (seconds, or ISO 8601, in UTC where it says no zone), `rig` (equal for images
-    taken at one time by one car), `position_sigma_m` and `rotation_sigma_deg`.
+    taken at one time by one car), `position_sigma_m`, `rotation_sigma_deg` and `readout_s` of the camera.
 
     An orientation is a quaternion `qw, qx, qy, qz`, or one of `heading_deg`, `heading_rad` (clockwise from north) and
     `yaw_deg`, `yaw_rad` (counter-clockwise from east) of the middle of the picture, with `pitch_deg` (up) and
@@ -122,7 +122,7 @@ def read_csv_poses(
     table = CsvFile(poses, _EXPECTED, texts=_TEXTS, numbers=_NUMBERS, columns=columns)
     names = table.filled_texts("image")
     where = _place(table, names, crs, vertical, anchor, up, camera_height_m)
-    cameras, camera_id = make_cameras(_cameras(table, camera, pixel_center), str(poses))
+    cameras, camera_id = make_cameras(_with_readout(table, _cameras(table, camera, pixel_center)), str(poses))
     images = make_images(
         names=names,
         camera_id=camera_id,
@@ -246,6 +246,15 @@ def _cameras(table: CsvFile, camera: str | None, pixel_center: float) -> list[Ca
             "width_px, height_px and fx, cx, cy or model, params, where no camera is given for all images"
         )
     return [parse_camera(camera, pixel_center)] * len(table)
+
+
+def _with_readout(table: CsvFile, cameras: list[Camera]) -> list[Camera]:
+    """Return the cameras (N) with the readout times that the table has for them."""
+    readout_s = _optional(table, "readout_s")
+    if readout_s is None:
+        return cameras
+    known = [None if math.isnan(seconds) else seconds for seconds in readout_s.tolist()]
+    return [replace(camera, readout_s=seconds) for camera, seconds in zip(cameras, known, strict=True)]
 
 
 def _timestamps(table: CsvFile) -> Floats:

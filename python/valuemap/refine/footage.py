@@ -12,7 +12,7 @@ from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives
 from valuemap.refine.adjust import Chain
 from valuemap.refine.landmarks import keyframes
-from valuemap.refine.residuals import Observations, Views
+from valuemap.refine.residuals import Observations, Views, rotations
 from valuemap.tables import Bools, Floats, Ints
 
 NODE_M = 10.0
@@ -264,6 +264,14 @@ def find_motion(dataset: Dataset, drives: Drives, *, late_s: Floats | None = Non
             back[rows[1:]] = np.where(starts[1:, None] | ends[1:, None], back[rows[1:]], before)
             on[rows], back[rows] = np.where(same, mean, on[rows]), np.where(same, mean, back[rows])
     return Motion(forward, backward, turn_on, turn_back, is_timed)
+
+
+def moved_on(motion: Motion, rotation: Floats, center: Floats, late_s: Floats) -> tuple[Floats, Floats]:
+    """Return rotations (N, 3, 3) into cameras and centres (N, 3) so much later (N) than those given, or earlier."""
+    late, ahead = late_s[:, None], late_s[:, None] >= 0.0
+    moved = center + late * np.where(ahead, motion.forward_mps, motion.backward_mps)
+    turned = rotations(late * np.where(ahead, motion.forward_radps, motion.backward_radps)) @ rotation
+    return turned, moved
 
 
 def _trembles(on: Floats, back: Floats) -> Bools:

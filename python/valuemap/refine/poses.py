@@ -17,7 +17,7 @@ from valuemap.drives import Drives, in_driving_order
 from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
 from valuemap.refine.estimate import Estimate, delay_together, estimate, lay, mounts_alone
-from valuemap.refine.footage import Footage, find_motion, gather, in_working_frame, moving_late
+from valuemap.refine.footage import Footage, find_motion, gather, in_working_frame, moved_on, moving_late
 from valuemap.refine.jumps import Legs, find_hints, find_jumps
 from valuemap.refine.landmarks import find_landmarks
 from valuemap.refine.residuals import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
@@ -209,10 +209,9 @@ def _laid(
     images, drives = footage.whole.images, footage.whole_drives
     rotation, center = camera_poses(images)
     if late_s:
-        motion = find_motion(footage.whole, drives, late_s=np.full(len(center), late_s))
-        ahead = late_s > 0.0
-        center = center + late_s * (motion.forward_mps if ahead else motion.backward_mps)
-        rotation = rotations(late_s * (motion.forward_radps if ahead else motion.backward_radps)) @ rotation
+        late = np.full(len(center), late_s)
+        motion = find_motion(footage.whole, drives, late_s=late)
+        rotation, center = moved_on(motion, rotation, center, late)
     rotation = rotations(turned_rad[drives.pass_code]) @ rotation
     if known is not None:
         center = center + known[1][known[0].of(drives.pass_code, drives.order)]
@@ -267,11 +266,9 @@ def _apply(dataset: Dataset, drives: Drives, found: _Found, selected: Selected, 
     drive, camera = drives.pass_code, rows_of(images.camera_id, dataset.cameras.camera_id)
     leg = found.result.legs.of(drive, drives.order)
     rotation, center = camera_poses(images)
-    late_s = (delay[drive, 0] + camera_delay[camera, 0])[:, None]
-    motion = find_motion(dataset, drives, late_s=late_s[:, 0])
-    ahead = late_s >= 0.0
-    center = center + np.where(ahead, motion.forward_mps, motion.backward_mps) * late_s + unit_m * offset[leg] @ axes
-    turned = rotations(np.where(ahead, motion.forward_radps, motion.backward_radps) * late_s) @ rotation
+    late_s = delay[drive, 0] + camera_delay[camera, 0]
+    turned, center = moved_on(find_motion(dataset, drives, late_s=late_s), rotation, center, late_s)
+    center = center + unit_m * offset[leg] @ axes
     turned = rotations(mount[drive] + camera_mount[camera]) @ turned
     quat = Rotation.from_matrix(turned).as_quat(canonical=True, scalar_first=True)
     moved = images.replace(

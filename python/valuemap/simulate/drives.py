@@ -13,6 +13,7 @@ from valuemap.simulate.paths import Path, lay_path
 from valuemap.simulate.routes import Route, route_at_random, routes_over_every_street
 from valuemap.simulate.rows import join_rows
 from valuemap.simulate.streams import random_stream
+from valuemap.simulate.streets import Hills
 from valuemap.tables import Bools, Floats, Ints, Table
 
 KEEP_RANGE = (0.7, 1.5)
@@ -37,7 +38,8 @@ class Frames(Table):
     `center_in_world_m` (N, 3) the camera centre; `heading_rad` (N) where it looks, counter-clockwise from east;
     `pitch_rad` (N) how far up; `camera_row` (N) which camera of the car it is, `exposure_row` (N) is one number for all
     that the car's cameras took at one time. `late_m` (N, 3) and `late_rad` (N) say how far the camera moved and turned
-    left since the time of the pose that is recorded.
+    left since the time of the pose that is recorded; `readout_m` (N, 3) and `readout_rad` (N) how far from the exposure
+    of the first row of the picture to that of the last one. All else is of the middle row.
     """
 
     pass_row: Ints
@@ -51,6 +53,8 @@ class Frames(Table):
     exposure_row: Ints
     late_m: Floats
     late_rad: Floats
+    readout_m: Floats
+    readout_rad: Floats
 
     def cam_from_world(self) -> Floats:
         """Return rotations (N, 3, 3) into camera axes: x right, y down, z forward."""
@@ -115,6 +119,8 @@ def _drive_route(route: Route, city: City, config: SimulationConfig, seed: int, 
     has_lights = city.is_signalised[reached[:, 0], reached[:, 1], route.direction]
     distance_m, time_s = _expose(path, *_stops(path, has_lights, config, random), config, random)
     past_m = np.interp(time_s - config.pose_delay_s, time_s, distance_m) if config.pose_delay_s else distance_m
+    half_s = 0.5 * config.readout_s
+    rows_m = np.stack([np.interp(time_s + late_s, time_s, distance_m) for late_s in (-half_s, half_s)], axis=1)
 
     ahead_m = _distance_to_next(path.middle_at_m[has_lights], distance_m)
     # Lights round a corner are not ahead.
@@ -123,17 +129,18 @@ def _drive_route(route: Route, city: City, config: SimulationConfig, seed: int, 
         ahead_m = np.zeros(len(distance_m))
     kept = ahead_m <= config.keep_before_signal_m * (KEEP_RANGE[1] if config.detections else 1.0)
     distance_m, time_s, ahead_m, past_m = distance_m[kept], time_s[kept], ahead_m[kept], past_m[kept]
+    first_m, last_m = rows_m[kept].T
 
     ground, heading = path.walk(distance_m)
     hills = city.streets.hills
     rise = (hills.slope(ground) * np.stack([np.cos(heading), np.sin(heading)], axis=1)).sum(axis=1)
     center = np.column_stack([ground, hills.height_m(ground) + config.camera_height_m])
     late_m, late_rad = np.zeros_like(center), np.zeros(len(heading))
+    readout_m, readout_rad = late_m, late_rad
     if config.pose_delay_s:
-        past_ground, past_heading = path.walk(past_m)
-        late_m[:, :2] = ground - past_ground
-        late_m[:, 2] = hills.height_m(ground) - hills.height_m(past_ground)
-        late_rad = np.angle(np.exp(1j * (heading - past_heading)))
+        late_m, late_rad = _moved(path, hills, past_m, distance_m)
+    if config.readout_s:
+        readout_m, readout_rad = _moved(path, hills, first_m, last_m)
     return Frames(
         pass_row=np.full(len(distance_m), pass_row, dtype=np.int64),
         distance_m=distance_m,
@@ -146,7 +153,16 @@ def _drive_route(route: Route, city: City, config: SimulationConfig, seed: int, 
         exposure_row=np.zeros(len(distance_m), dtype=np.int64),
         late_m=late_m,
         late_rad=late_rad,
+        readout_m=readout_m,
+        readout_rad=readout_rad,
     )
+
+
+def _moved(path: Path, hills: Hills, from_m: Floats, to_m: Floats) -> tuple[Floats, Floats]:
+    """Return how far (N, 3) a camera moves, and turns left (N), between distances (N) along a path."""
+    (start, start_rad), (end, end_rad) = path.walk(from_m), path.walk(to_m)
+    moved_m = np.column_stack([end - start, hills.height_m(end) - hills.height_m(start)])
+    return moved_m, np.asarray(np.angle(np.exp(1j * (end_rad - start_rad))))
 
 
 def _stops(

@@ -17,6 +17,8 @@ from valuemap.tables import Bools, Floats, Ints, Table
 
 _CHUNK_FRAMES = 50_000
 _NEAREST_M = 1.0
+_ROUNDS_OF_ROWS = 4
+"""The row tells the time, the time the row: what is off falls each round to the share of the picture that passes."""
 NARROWEST = 0.3
 """A light seen from the side still looks this wide, as share of its width: it has visors."""
 
@@ -62,9 +64,11 @@ def _see_in_chunk(targets: Targets, frames: Frames, streets: Streets, config: Si
     turn = np.where(targets.is_round[target_row], 1.0, cos_facing(to_target, targets.facing_rad[target_row]))
     if config.side_offset_m:
         to_target = to_target + _offset_of_side(to_target, targets.uneven_m[target_row])
-    in_cam = np.einsum("nij,nj->ni", frames.cam_from_world()[frame_row], to_target)
-    depth_m = np.maximum(in_cam[:, 2:], _NEAREST_M)
     picture_px = np.array([config.image_width_px, config.image_height_px])
+    in_cam = np.einsum("nij,nj->ni", frames.cam_from_world()[frame_row], to_target)
+    for _ in range(_ROUNDS_OF_ROWS if config.readout_s else 0):
+        in_cam = _at_its_row(in_cam, to_target, frames, frame_row, config)
+    depth_m = np.maximum(in_cam[:, 2:], _NEAREST_M)
     from_middle_px = config.focal_px * in_cam[:, :2] / depth_m
     size_px = config.focal_px * targets.size_m[target_row] / depth_m
     size_px[:, 0] *= np.maximum(turn, NARROWEST)
@@ -89,6 +93,18 @@ def _see_in_chunk(targets: Targets, frames: Frames, streets: Streets, config: Si
     rows = rows[np.lexsort((target_row[rows], frame_row[rows]))]
     center_px = picture_px / 2.0 + from_middle_px[rows]
     return Sightings(frame_row[rows], target_row[rows], center_px, size_px[rows], ~is_whole[rows])
+
+
+def _at_its_row(in_cam: Floats, to_target: Floats, frames: Frames, frame_row: Ints, config: SimulationConfig) -> Floats:
+    """Return targets (N, 3) in camera axes when the row is exposed on which they are seen as they were (N, 3)."""
+    height_px = config.focal_px * in_cam[:, 1] / np.maximum(in_cam[:, 2], _NEAREST_M)
+    share = np.clip(height_px / config.image_height_px, -0.5, 0.5)
+    away = to_target - share[:, None] * frames.readout_m[frame_row]
+    # The camera has turned left: what it sees has turned right.
+    turned_rad = -share * frames.readout_rad[frame_row]
+    cos, sin = np.cos(turned_rad), np.sin(turned_rad)
+    away = np.stack([cos * away[:, 0] - sin * away[:, 1], sin * away[:, 0] + cos * away[:, 1], away[:, 2]], axis=1)
+    return np.asarray(np.einsum("nij,nj->ni", frames.cam_from_world()[frame_row], away))
 
 
 def _offset_of_side(to_target: Floats, uneven_m: Floats) -> Floats:

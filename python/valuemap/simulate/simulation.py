@@ -210,6 +210,7 @@ def _cameras(config: SimulationConfig) -> Cameras:
         width_px=np.full(config.cameras, config.image_width_px),
         height_px=np.full(config.cameras, config.image_height_px),
         params=[np.array([focal_px, focal_px, *center_px])] * config.cameras,
+        readout_s=np.full(config.cameras, config.readout_s) if config.readout_s else None,
     )
 
 
