@@ -157,7 +157,8 @@ def command_line(
         results = run(options, config)
         print(table(results))
         settings = "".join(f" --set {assignment}" for assignment in options.settings)
-        command = f"python benchmarks/{script}.py DATA_DIR --method {options.method}{settings}"
+        details = " --details" if getattr(options, "details", False) else ""
+        command = f"python benchmarks/{script}.py DATA_DIR --method {options.method}{details}{settings}"
         record = {"benchmark": script, "command": command, **describe_machine(), "settings": config.as_dict()}
         keep_record(options.json, {**record, "results": results})
     except ValuemapError as error:
