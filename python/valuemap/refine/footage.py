@@ -13,7 +13,7 @@ from valuemap.drives import Drives
 from valuemap.refine.adjust import Chain
 from valuemap.refine.landmarks import keyframes
 from valuemap.refine.residuals import Observations, Views, rotations
-from valuemap.tables import Bools, Floats, Ints
+from valuemap.tables import Bools, Floats, Images, Ints
 
 NODE_M = 10.0
 """Drift is the same within so much of a drive."""
@@ -123,6 +123,14 @@ class Motion:
     is_timed: Bools
 
 
+def with_poses(images: Images, rotation: Floats, center: Floats) -> Images:
+    """Return images with other poses as `camera_poses` gives them: rotations into cameras (N, 3, 3), centres (N, 3)."""
+    quat = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
+    return images.replace(
+        cam_from_world_quat=quat, cam_from_world_m=-np.einsum("nij,nj->ni", rotation_of(quat), center)
+    )
+
+
 def in_working_frame(dataset: Dataset, drives: Drives, unit_m: float) -> tuple[Dataset, Drives]:
     """Return a dataset and its drives in the frame of this package: x east, y north, z up, in units of `unit_m`.
 
@@ -131,13 +139,9 @@ def in_working_frame(dataset: Dataset, drives: Drives, unit_m: float) -> tuple[D
     axes = np.vstack([dataset.frame.east_north(), dataset.frame.up])
     rotation, center = camera_poses(dataset.images)
     center = (center - np.median(center, axis=0)) @ axes.T / unit_m
-    quat = Rotation.from_matrix(rotation @ axes.T).as_quat(canonical=True, scalar_first=True)
-    turned = rotation_of(quat)
     sigma = dataset.images.position_sigma_m
-    images = dataset.images.replace(
-        cam_from_world_quat=quat,
-        cam_from_world_m=-np.einsum("nij,nj->ni", turned, center),
-        position_sigma_m=None if sigma is None else sigma / unit_m,
+    images = with_poses(dataset.images, rotation @ axes.T, center).replace(
+        position_sigma_m=None if sigma is None else sigma / unit_m
     )
     frame = replace(dataset.frame, up=(0.0, 0.0, 1.0), anchor=None)
     return replace(dataset, images=images, frame=frame), replace(drives, driven_m=drives.driven_m / unit_m)

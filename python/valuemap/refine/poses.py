@@ -7,17 +7,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
-from valuemap.cameras import camera_poses, colmap_camera, rotation_of
+from valuemap.cameras import camera_poses, colmap_camera
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives, in_driving_order
 from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
 from valuemap.refine.estimate import Estimate, delay_together, estimate, lay, mounts_alone
-from valuemap.refine.footage import Footage, find_motion, gather, in_working_frame, moved_on, moving_late
+from valuemap.refine.footage import Footage, find_motion, gather, in_working_frame, moved_on, moving_late, with_poses
 from valuemap.refine.jumps import Legs, find_hints, find_jumps
 from valuemap.refine.landmarks import find_landmarks
 from valuemap.refine.residuals import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
@@ -215,11 +214,7 @@ def _laid(
     rotation = rotations(turned_rad[drives.pass_code]) @ rotation
     if known is not None:
         center = center + known[1][known[0].of(drives.pass_code, drives.order)]
-    quat = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
-    moved = images.replace(
-        cam_from_world_quat=quat, cam_from_world_m=-np.einsum("nij,nj->ni", rotation_of(quat), center)
-    )
-    return gather(replace(footage.whole, images=moved), drives)
+    return gather(replace(footage.whole, images=with_poses(images, rotation, center)), drives)
 
 
 def _sample(dataset: Dataset, drives: Drives) -> Bools | None:
@@ -270,10 +265,7 @@ def _apply(dataset: Dataset, drives: Drives, found: _Found, selected: Selected, 
     turned, center = moved_on(find_motion(dataset, drives, late_s=late_s), rotation, center, late_s)
     center = center + unit_m * offset[leg] @ axes
     turned = rotations(mount[drive] + camera_mount[camera]) @ turned
-    quat = Rotation.from_matrix(turned).as_quat(canonical=True, scalar_first=True)
-    moved = images.replace(
-        cam_from_world_quat=quat, cam_from_world_m=-np.einsum("nij,nj->ni", rotation_of(quat), center)
-    )
+    moved = with_poses(images, turned, center)
     params = []
     for row, values in enumerate(dataset.cameras.params):
         values = values.copy()

@@ -11,12 +11,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from valuemap.cameras import camera_poses, rotation_of
+from valuemap.cameras import camera_poses
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import find_drives
-from valuemap.refine.footage import find_motion, moved_on
+from valuemap.refine.footage import find_motion, moved_on, with_poses
 from valuemap.tables import Floats
 
 
@@ -32,12 +31,10 @@ def expose_rows(dataset: Dataset) -> tuple[Dataset, dict[str, Any]]:
     images = dataset.images
     motion = find_motion(dataset, find_drives(images))
     late_s = np.where(motion.is_timed, _lateness(dataset, np.nan_to_num(readout_s)), 0.0)
-    rotation, center = moved_on(motion, *camera_poses(images), late_s)
-    quat = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
-    moved_m = np.linalg.norm(center - camera_poses(images)[1], axis=1)
-    moved = images.replace(
-        cam_from_world_quat=quat, cam_from_world_m=-np.einsum("nij,nj->ni", rotation_of(quat), center)
-    )
+    rotation, center = camera_poses(images)
+    moved_rotation, moved_center = moved_on(motion, rotation, center, late_s)
+    moved_m = np.linalg.norm(moved_center - center, axis=1)
+    moved = with_poses(images, moved_rotation, moved_center)
     has_moved = late_s != 0.0
     record = {
         "images": int(has_moved.sum()),

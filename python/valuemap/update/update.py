@@ -105,12 +105,17 @@ def compare(
     epochs stand for it.
     """
     is_new = ~np.isin(joined.images.image_id, images_before)
+    center_m = camera_centers(joined.images)
+
+    def judged(rows: _Rows) -> tuple[Verdicts, dict[int, tuple[Looks, Looks]], float]:
+        return _judged(rows, before, rebuilt, alone, joined, center_m, is_new, progress)
+
     rows = _Rows.of(before, rebuilt, alone)
-    verdicts, looks, hidden = _judged(rows, before, rebuilt, alone, joined, is_new, progress)
+    verdicts, looks, hidden = judged(rows)
     # Where nothing has changed, the map of all the data is right: it knows more than each epoch alone.
     while len(unchanged := rows.unchanged(verdicts)):
         rows = _Rows.of(before, rebuilt, alone, whole=np.concatenate([rows.whole, unchanged]))
-        verdicts, looks, hidden = _judged(rows, before, rebuilt, alone, joined, is_new, progress)
+        verdicts, looks, hidden = judged(rows)
     # What only the added passes have, and all the data do not, is there only if it explains what is gone, or was put up
     # since: then the looks from before that speak against it are those of drives that could not see it yet.
     unfounded = rows.is_of_alone & (verdicts.moved_from < 0) & (rows.part_of < 0)
@@ -133,12 +138,18 @@ def compare(
 
 
 def _judged(
-    rows: _Rows, before: Map, rebuilt: Map, alone: Map, joined: Dataset, is_new: Bools, progress: Progress
+    rows: _Rows,
+    before: Map,
+    rebuilt: Map,
+    alone: Map,
+    joined: Dataset,
+    center_m: Floats,
+    is_new: Bools,
+    progress: Progress,
 ) -> tuple[Verdicts, dict[int, tuple[Looks, Looks]], float]:
     """Return what became of labels, how both epochs looked at those that were asked for, and the share of drives that
     are blind to an object.
     """
-    center_m = camera_centers(joined.images)
     near = cKDTree(center_m[is_new]).query(rows.labels.position_in_world_m)[0]
     is_asked = np.asarray(near <= _settings(before).vote.max_range_m) | (rows.before < 0)
     # What an epoch alone has elsewhere is no sight of this object.

@@ -309,6 +309,14 @@ pub fn by_place(objects: &[Object]) -> RTree<GeomWithData<[f64; 3], usize>> {
 }
 
 impl Object {
+    /// Whether an image shows both this and another object.
+    #[must_use]
+    pub fn is_seen_beside(&self, scene: &Scene, other: &Self) -> bool {
+        let image = |ray: &u32| scene.rays.image[*ray as usize];
+        let images: Vec<u32> = other.votes.iter().map(image).collect();
+        self.votes.iter().any(|ray| images.binary_search(&image(ray)).is_ok())
+    }
+
     /// One that was [`unseen`], with the looks at it; `others` are images (ascending) with detections in its gate.
     #[must_use]
     pub fn with_looks(mut self, model: &Model<'_>, lookout: &Lookout, others: Vec<u32>) -> Option<Self> {

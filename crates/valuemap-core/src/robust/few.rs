@@ -97,12 +97,7 @@ impl<'a> Beside<'a> {
             let is_near = covariance
                 .cholesky()
                 .is_none_or(|cholesky| apart.dot(&cholesky.solve(&apart)) <= model.settings.gate_sigmas.powi(2));
-            let image = |ray: &u32| model.scene.rays.image[*ray as usize];
-            let is_seen_beside = || {
-                let images: Vec<u32> = other.votes.iter().map(image).collect();
-                object.votes.iter().any(|ray| images.binary_search(&image(ray)).is_ok())
-            };
-            other.class == object.class && is_near && !is_seen_beside()
+            other.class == object.class && is_near && !object.is_seen_beside(model.scene, other)
         })
     }
 }

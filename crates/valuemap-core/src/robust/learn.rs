@@ -259,9 +259,8 @@ mod tests {
     use super::super::energy::anywhere;
     use super::super::scene::Scene;
     use super::super::seen::Seen;
-    use super::super::{Settings, Without};
     use super::*;
-    use crate::hypothesis::Viability;
+    use crate::street::SETTINGS;
 
     /// An object that all passes see as usual from one side, and hardly any from another.
     fn seen_from_one_side() -> Object {
@@ -309,21 +308,7 @@ mod tests {
 
     /// What is thought of a class at first.
     fn guess() -> ClassModel {
-        let viability = Viability {
-            max_reprojection_error_px: f64::NAN,
-            min_parallax_rad: 0.0,
-            min_range_m: 2.0,
-            max_range_m: 60.0,
-        };
-        let settings = Settings {
-            viability,
-            gate_sigmas: 3.5,
-            min_votes: 3,
-            least_votes: 1,
-            min_existence: 0.5,
-            without: Without::default(),
-        };
-        ClassModel::guess(&Scene::default(), &settings, 0, (f64::NAN, f64::NAN))
+        ClassModel::guess(&Scene::default(), &SETTINGS, 0, (f64::NAN, f64::NAN))
     }
 
     #[test]

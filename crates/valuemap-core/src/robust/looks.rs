@@ -58,11 +58,8 @@ impl Lookout {
         sectors: &'a Sectors,
     ) -> impl Iterator<Item = (u32, usize)> + 'a {
         let farthest_m = sectors.0.iter().map(|sector| sector.farthest_m).fold(0.0, f64::max);
-        self.around(point, farthest_m).filter_map(move |image| {
-            let view = &scene.views[image as usize];
-            let sector = sectors.holding(&(view.center - point))?;
-            scene.is_in_picture(view, point).then_some((image, sector))
-        })
+        self.around(point, farthest_m)
+            .filter_map(move |image| Some((image, sectors.looked_from(scene, &scene.views[image as usize], point)?)))
     }
 
     /// The looks at a point that some rays (one per image, ascending) vote for, from as near and as far as their class is detected; `others` are
@@ -169,8 +166,8 @@ pub fn looks_among(model: &Model<'_>, object: &Object, rays: &[u32]) -> f64 {
     let (scene, point) = (model.scene, &object.fit.point);
     let class = &model.classes[object.class as usize];
     let sectors = Sectors::of(scene, point, &object.votes, (0.0, class.farthest_m));
-    let is_look = |view: &&View| sectors.holding(&(view.center - point)).is_some() && scene.is_in_picture(view, point);
-    let views = rays.iter().map(|&ray| scene.view(ray)).filter(is_look);
+    let views = rays.iter().map(|&ray| scene.view(ray));
+    let views = views.filter(|view| sectors.looked_from(scene, view, point).is_some());
     views.map(|view| class.reach.at((view.center - point).norm())).sum()
 }
 
@@ -222,6 +219,12 @@ impl Sectors {
                 && sector.direction.dot(away) >= SECTOR_COSINE * distance
         };
         self.0.iter().position(holds)
+    }
+
+    /// The sector from which an image looks at a point that it has in its picture.
+    fn looked_from(&self, scene: &Scene, view: &View, point: &Vector3<f64>) -> Option<usize> {
+        let sector = self.holding(&(view.center - point))?;
+        scene.is_in_picture(view, point).then_some(sector)
     }
 
     /// The sector of a vote from so far away.

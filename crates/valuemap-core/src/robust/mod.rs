@@ -4,7 +4,8 @@
 //! 2. [`propose`](mod@propose): each ray meets few partners ([`sample`]) and proposes the point that a sample of images supports best.
 //! 3. [`births`](mod@births): the best supported hypothesis takes its votes, and is born if J ([`energy`]) falls.
 //! 4. [`assign`](mod@assign): all objects compete for all detections.
-//! 5. [`switches`]: what pictures show to be another object is left out. [`finish`](mod@finish): positions and covariances, objects of a place together ([`estimate`](mod@estimate), [`drift`], [`contest`]).
+//! 5. [`finish`](mod@finish): positions and covariances, objects of a place together ([`estimate`](mod@estimate), [`drift`], [`contest`]).
+//!    [`few`]: what one or two looks make. [`switches`]: what the pictures show to be another object is left out.
 //! 6. [`likeliest`], [`calibrate`]: the noise itself is estimated from the residuals; [`learn`](mod@learn): rates, sizes and clutter are.
 
 pub mod assign;
@@ -28,7 +29,6 @@ pub mod likeliest;
 pub mod looks;
 pub mod model;
 pub mod noise;
-
 pub mod poses;
 pub mod propose;
 pub mod quick;

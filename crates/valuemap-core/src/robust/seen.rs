@@ -11,6 +11,7 @@ use super::model::{ClassModel, FALSE_SHARE, Rates, ln_gamma};
 
 /// Shares of hits that sides may have: about as finely as some dozen looks tell them apart.
 const SHARES: usize = 12;
+
 /// Looks of one pass at an object.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Looks {
@@ -227,32 +228,16 @@ impl Seen {
 
 #[cfg(test)]
 mod tests {
-    use super::super::Settings;
-    use super::super::Without;
     use super::super::scene::Scene;
     use super::*;
-    use crate::hypothesis::Viability;
+    use crate::street::SETTINGS;
 
     fn class(between: f64) -> ClassModel {
-        let viability = Viability {
-            max_reprojection_error_px: f64::NAN,
-            min_parallax_rad: 0.0,
-            min_range_m: 2.0,
-            max_range_m: 60.0,
-        };
-        let settings = Settings {
-            viability,
-            gate_sigmas: 3.5,
-            min_votes: 3,
-            least_votes: 1,
-            min_existence: 0.5,
-            without: Without::default(),
-        };
         let rates = Rates { recall: 0.75, concentration: 30.0, between };
         ClassModel {
             rates,
             odd_passes: 0.1,
-            ..ClassModel::guess(&Scene::default(), &settings, 0, (f64::NAN, f64::NAN))
+            ..ClassModel::guess(&Scene::default(), &SETTINGS, 0, (f64::NAN, f64::NAN))
         }
     }
 

@@ -67,15 +67,12 @@ fn goes_on_as(model: &Model<'_>, objects: &[&Object], votes: &[(u32, usize)]) ->
 /// Whether no image shows both of two objects, the weaker one is seen on one visit alone, and that each is missed in all images of the other that
 /// look at it is more than chance.
 fn are_exclusive(model: &Model<'_>, stronger: &Object, weaker: &Object) -> bool {
-    let scene = model.scene;
-    let images = |object: &Object| object.votes.iter().map(|&ray| scene.rays.image[ray as usize]).collect::<Vec<u32>>();
-    let of_stronger = images(stronger);
-    if images(weaker).iter().any(|image| of_stronger.binary_search(image).is_ok()) {
+    if weaker.is_seen_beside(model.scene, stronger) {
         return false;
     }
     let looks = looks_among(model, stronger, &weaker.votes).min(looks_among(model, weaker, &stronger.votes));
     let recall = model.classes[stronger.class as usize].rates.recall;
-    visits(scene, &weaker.votes).count() == 1 && looks * (1.0 - recall).ln() < LN_BY_CHANCE
+    visits(model.scene, &weaker.votes).count() == 1 && looks * (1.0 - recall).ln() < LN_BY_CHANCE
 }
 
 /// Whether two rays, one of each of two objects, show one thing in two images nearby: as near to each other, and as large, as one thing would be.
