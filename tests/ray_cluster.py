@@ -1,13 +1,17 @@
-"""Two Ray nodes on the loopback of this machine, with token authentication: maps on them are those of threads.
+"""Two Ray nodes on the loopback of this machine, with token authentication: what is made on them is that of threads.
 
 Run by `test_ray.py` in a process of its own, as Ray leaves threads and warnings behind: python ray_cluster.py FOLDER.
 """
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import signal
 import sys
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +20,14 @@ import numpy as np
 
 from valuemap import pipeline
 from valuemap.cameras import rotation_matrices
-from valuemap.config import MapConfig
+from valuemap.config import DetectConfig, MapConfig
 from valuemap.dataset import Dataset
+from valuemap.detect import BUNDLED_MODEL, shards
+from valuemap.detect.run import RECORD, detect_dataset
 from valuemap.engine.engine import Engine
 from valuemap.engine.ray import RayEngine, import_ray
 from valuemap.engine.threads import ThreadEngine
-from valuemap.errors import ClusterError, InputError, ValuemapError
+from valuemap.errors import ClusterError, InputError, SettingError, ValuemapError
 from valuemap.map_folder import write_map
 from valuemap.pipeline import Run, build_map_of_folder
 from valuemap.progress import Progress
@@ -70,6 +76,59 @@ def always_dies(_number: int, _progress: Progress) -> int:
     return 0
 
 
+def same_process(_number: int, _progress: Progress) -> int:
+    return os.getpid()
+
+
+def error_of(run: Callable[[], object]) -> ValuemapError:
+    try:
+        run()
+    except ValuemapError as error:
+        return error
+    raise AssertionError("nothing went wrong")
+
+
+def detect_as_threads(folder: Path, engine: Engine) -> None:
+    """Look at the pictures of `pictures` on the cluster, interrupted once: the bytes are those of one process."""
+    os.chdir(folder)  # Paths go to other folders as they are meant here.
+    model, config = Path("finder.onnx"), DetectConfig(batch=3)
+    whole = shutil.copytree("pictures", "detected")
+    detect_dataset(whole, model, config)
+
+    def stop(_what: str, done: int, total: int) -> None:
+        if done < total and len(Path("pictures/.detect.journal").read_bytes().splitlines()) > 1:
+            raise KeyboardInterrupt
+
+    setattr(shards, "SHARD_PICTURES", 4)  # noqa: B010
+    with suppress(KeyboardInterrupt):
+        detect_dataset("pictures", model, config, engine=engine, progress=stop)
+    told = list[int]()
+    detect_dataset("pictures", model, config, engine=engine, progress=lambda _what, done, _total: told.append(done))
+    assert 0 < told[0] < 20, told
+    assert len(told) == 1 + -(-(20 - told[0]) // 3), told  # Three pictures a shard: whole groups.
+    assert (told, told[-1]) == (sorted(told), 20), told
+    assert Path("pictures/detections.parquet").read_bytes() == Path("detected/detections.parquet").read_bytes()
+    record, expected = (json.loads(Path(name, RECORD).read_text(encoding="utf-8")) for name in ("pictures", "detected"))
+    assert record["pictures_of_an_interrupted_run"] == told[0]
+    assert [record[key] for key in ("counts", "unusable", "settings")] == [
+        expected[key] for key in ("counts", "unusable", "settings")
+    ]
+    detect_dataset("pictures", BUNDLED_MODEL, engine=engine)
+    # The GPU of the second node is none: what is told is what happens there, not here.
+    error = error_of(lambda: detect_dataset("pictures", model, DetectConfig(provider="cuda"), engine=engine))
+    assert isinstance(error, SettingError), error
+    assert "--provider cuda" in str(error), error
+
+
+def gpus_stay(folder: Path, engine: Engine) -> None:
+    """Run tasks on the one GPU of the cluster: in one process, in others where that is lost, and not for ever."""
+    assert len({pid for _, pid in engine.run(same_process, range(5), on_gpus=True)}) == 1
+    assert list(engine.run(dies, [str(folder / "gpu")], on_gpus=True)) == [(0, 1)]
+    assert str(error_of(lambda: list(engine.run(fails, range(6), on_gpus=True)))) == "the fourth cannot be"
+    error = error_of(lambda: list(engine.run(always_dies, range(1), on_gpus=True)))
+    assert str(error).startswith("task 0 was lost 4 times"), error
+
+
 def tell(folder: Path, what: str) -> None:
     """Add a line to `told.txt`: Ray writes to the standard output whenever it likes, within our lines too."""
     with (folder / "told.txt").open("a", encoding="utf-8") as file:
@@ -80,7 +139,7 @@ def main(folder: Path) -> None:
     from ray.cluster_utils import Cluster
 
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "node_ip_address": "127.0.0.2"})
-    second = cluster.add_node(num_cpus=1, node_ip_address="127.0.0.3")
+    second = cluster.add_node(num_cpus=1, num_gpus=1, node_ip_address="127.0.0.3")
     cluster.wait_for_nodes()
     engine = RayEngine(cluster.address)
     assert sum(node["Alive"] for node in ray.nodes()) == 2
@@ -98,18 +157,15 @@ def main(folder: Path) -> None:
 
     assert sorted(engine.run(dies, [str(folder / f"dead-{i}") for i in range(3)])) == [(0, 1), (1, 1), (2, 1)]
     tell(folder, "workers killed")
-    told = ""
-    try:
-        list(engine.run(fails, range(6)))
-    except ValuemapError as error:
-        told = str(error)
-    assert told == "the fourth cannot be", told
-    try:
-        list(engine.run(always_dies, range(1)))
-    except ClusterError as error:
-        told = str(error)
-    assert told.startswith("task 0 was lost 4 times"), told
+    assert str(error_of(lambda: list(engine.run(fails, range(6))))) == "the fourth cannot be"
+    error = error_of(lambda: list(engine.run(always_dies, range(1))))
+    assert isinstance(error, ClusterError), error
+    assert str(error).startswith("task 0 was lost 4 times"), error
     tell(folder, "failures told")
+    gpus_stay(folder, engine)
+    tell(folder, "GPUs stay")
+    detect_as_threads(folder, engine)
+    tell(folder, "detected")
 
     killed: list[Any] = []
 

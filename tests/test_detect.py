@@ -8,6 +8,7 @@ import os
 import shutil
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from told import Told
 from valuemap import build_map, read_dataset, write_dataset
 from valuemap.config import DetectConfig
 from valuemap.dataset import Dataset
-from valuemap.detect import BUNDLED_MODEL, infer
+from valuemap.detect import BUNDLED_MODEL, infer, shards
 from valuemap.detect.boxes import Boxes
 from valuemap.detect.found import match_pictures, read_found
 from valuemap.detect.infer import Detector, Task
@@ -38,6 +39,7 @@ from valuemap.detect.tiles import are_cut, merge_views, plan_tiles
 from valuemap.detect.truth import find_truth_detections
 from valuemap.errors import InputError, OutputError, SettingError
 from valuemap.folders import LEDGER
+from valuemap.progress import silent
 from valuemap.readers.colmap import read_colmap
 from valuemap.simulate import PRESETS, simulate
 from valuemap.summary import summarize_dataset
@@ -371,13 +373,13 @@ def test_only_a_few_pictures_are_decoded_ahead(tmp_path: Path, finder: Path, mon
 # Interrupted runs.
 
 
-def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path: Path, finder: Path) -> None:
+def noisy_pictures(folder: Path) -> Path:
+    """Write a dataset of 20 images with a noisy picture each, but for one that is damaged."""
     base = small_dataset()
     images = base.images.take(np.repeat(0, 20)).replace(
         image_id=np.arange(20), name=pa.array([f"{i}.png" for i in range(20)])
     )
     detections = base.detections.take(np.array([0])).replace(image_id=np.array([0]))
-    folder = tmp_path / "data"
     write_dataset(Dataset("long", base.frame, base.cameras, images, detections), folder)
     random = np.random.default_rng(2)
     for i in range(20):
@@ -385,6 +387,11 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path: Path, finder: Pa
         noisy = np.clip(pixels + random.normal(0, 25, pixels.shape), 0, 255).astype(np.uint8)
         save(folder / "images" / f"{i}.png", noisy)
     (folder / "images" / "3.png").write_text("damaged")
+    return folder
+
+
+def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path: Path, finder: Path) -> None:
+    folder = noisy_pictures(tmp_path / "data")
     before = (folder / "detections.parquet").read_bytes()
     config = DetectConfig(batch=3)
     whole = shutil.copytree(folder, tmp_path / "whole")
@@ -411,6 +418,70 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path: Path, finder: Pa
     assert record["pictures_of_an_interrupted_run"] == 12
     assert record["counts"] == expected["counts"]
     assert record["unusable"] == expected["unusable"]
+
+
+class Elsewhere:
+    """An engine as a cluster is one: paths go to it, and what begins last is done first."""
+
+    needs_paths = True
+
+    def __init__(self, before: Callable[[], object] = lambda: None) -> None:
+        self.before, self.ran = before, list[tuple[int, bool]]()
+
+    def threads_of_task(self, *_: object, **__: object) -> int:
+        return 1
+
+    def run(self, work: Any, tasks: Any, *, on_gpus: bool = False) -> Any:
+        self.ran.append((len(tasks), on_gpus))
+        self.before()
+        yield from ((number, work(tasks[number], silent)) for number in reversed(range(len(tasks))))
+
+
+def test_pictures_looked_at_elsewhere_in_any_order_give_the_same_bytes(
+    tmp_path: Path, finder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = noisy_pictures(tmp_path / "data")
+    whole = shutil.copytree(folder, tmp_path / "whole")
+    detect_dataset(whole, finder, DetectConfig(batch=3))
+    monkeypatch.setattr(shards, "SHARD_PICTURES", 7)
+    engine, told = Elsewhere(), Told()
+    monkeypatch.chdir(tmp_path)
+    detect_dataset("data", finder, DetectConfig(batch=3), engine=engine, progress=told)
+    told.check("pictures")
+    assert engine.ran == [(4, False)]  # Six at a time: whole groups.
+    assert (folder / "detections.parquet").read_bytes() == (whole / "detections.parquet").read_bytes()
+    # Of pictures that go to GPUs only the cluster need have one.
+    with pytest.raises(SettingError, match="--provider cuda"):
+        detect_dataset("data", finder, DetectConfig(provider="cuda"), engine=engine)
+    assert engine.ran[1:] == [(3, True)]
+
+
+def test_machines_that_have_other_files_are_told_of(tmp_path: Path, finder: Path) -> None:
+    folder, model = noisy_pictures(tmp_path / "data"), shutil.copy(finder, tmp_path / "finder.onnx")
+    picture, hidden = folder / "images" / "5.png", tmp_path / "hidden.png"
+    engine = Elsewhere(lambda: picture.rename(hidden))
+
+    def seen_again(what: str, done: int, total: int) -> None:
+        if done:
+            raise AssertionError("a picture that is there was taken for missing")
+
+    found = engine.run
+
+    def run(*arguments: Any, **options: Any) -> Any:
+        for each in found(*arguments, **options):
+            hidden.rename(picture)
+            yield each
+
+    engine.run = run  # type: ignore[method-assign]
+    with pytest.raises(InputError, match=r"5\.png: is not there on all machines"):
+        detect_dataset(folder, model, engine=engine, progress=seen_again)
+    assert not (folder / RECORD).exists()
+    with pytest.raises(InputError, match=r"finder\.onnx: no such file on"):
+        detect_dataset(folder, model, DetectConfig(batch=2), engine=Elsewhere(Path(model).unlink))
+    shutil.copy(finder, model)
+    other = partial(red_finder, Path(model), {"valuemap.minimum_component_px": "9"})
+    with pytest.raises(InputError, match=r"finder\.onnx: is another file on"):
+        detect_dataset(folder, model, DetectConfig(batch=4), engine=Elsewhere(other))
 
 
 def test_a_model_that_cannot_be_run_is_one_clear_line_and_leaves_nothing_behind(

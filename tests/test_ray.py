@@ -1,4 +1,4 @@
-"""Maps on a Ray cluster of two nodes, where Ray is installed; and what is said where it is not."""
+"""Maps and detections on a Ray cluster of two nodes, where Ray is installed; and what is said where it is not."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ import pytest
 from typer.testing import CliRunner
 
 import valuemap
+from test_detect import noisy_pictures
 from test_tiles import streets
+from tiny_models import red_finder
 from valuemap.cli.commands import app
 from valuemap.engine.choose import engine_named
 from valuemap.engine.ray import RayEngine, import_ray
@@ -27,6 +29,8 @@ LIMIT_S = 400.0
 @pytest.mark.skipif(not IS_INSTALLED, reason="ray is not installed: pip install 'valuemap[ray]'")
 def test_two_nodes_give_the_map_of_threads_whatever_is_killed(tmp_path: Path) -> None:
     valuemap.write_dataset(streets(0.0, 445.0, 3000.0), tmp_path / "street")
+    noisy_pictures(tmp_path / "pictures")
+    red_finder(tmp_path / "finder.onnx")
     # As below `uv run` in another project: Ray looks at the command lines of all processes above.
     (tmp_path / "pyproject.toml").write_text('[project]\nname = "other"\nversion = "0"\n', encoding="utf-8")
     python, script = shlex.quote(sys.executable), shlex.quote(str(Path(__file__).with_name("ray_cluster.py")))
@@ -36,7 +40,7 @@ def test_two_nodes_give_the_map_of_threads_whatever_is_killed(tmp_path: Path) ->
     )
     assert done.returncode == 0, done.stdout + done.stderr
     told = (tmp_path / "told.txt").read_text(encoding="utf-8").splitlines()
-    assert told == ["identical", "workers killed", "failures told", "node killed"]
+    assert told == ["identical", "workers killed", "failures told", "GPUs stay", "detected", "node killed"]
 
 
 class RaySays:
@@ -92,6 +96,9 @@ def test_engines_that_cannot_be_say_so(tmp_path: Path, monkeypatch: pytest.Monke
         engine_named("ray")
     valuemap.write_dataset(streets(0.0), tmp_path / "street")
     result = CliRunner().invoke(app, ["map", str(tmp_path / "street"), "--out", str(tmp_path / "map"), "--engine=ray"])
+    assert result.exit_code == 1
+    assert "Ray is not installed" in result.output
+    result = CliRunner().invoke(app, ["detect", str(tmp_path), "--model=bundled", "--engine=ray"])
     assert result.exit_code == 1
     assert "Ray is not installed" in result.output
     assert sorted(path.name for path in tmp_path.iterdir()) == ["street"]

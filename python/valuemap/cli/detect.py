@@ -11,9 +11,10 @@ import typer
 
 from valuemap import dataset as dataset_folder
 from valuemap.cli.app import app, on_interrupt
-from valuemap.cli.options import AsJson, Force, Settings
+from valuemap.cli.options import AsJson, EngineName, Force, RayAddress, Settings
 from valuemap.cli.show import SHOWN_PROBLEMS, progress_bars, show
 from valuemap.config import DetectConfig, ModelKind, Provider
+from valuemap.engine.choose import engine_named
 from valuemap.errors import SettingError
 
 
@@ -38,6 +39,8 @@ def detect_command(
     out: Annotated[
         Path | None, typer.Option(help="Where the results of a folder of pictures go; default: into it.")
     ] = None,
+    engine: EngineName = "threads",
+    ray_address: RayAddress = None,
     assignments: Settings = None,
     force: Force = False,
     as_json: AsJson = False,
@@ -65,10 +68,11 @@ def detect_command(
         )
     state, hint = "the detections are as before", "run the same command again to go on from here"
     with on_interrupt(state, hint), progress_bars() as progress:
+        where = engine_named(engine, ray_address=ray_address)
         if is_dataset:
-            detect_dataset(place, model, config, pictures=images, force=force, progress=progress)
+            detect_dataset(place, model, config, pictures=images, engine=where, force=force, progress=progress)
         else:
-            detect_folder(place, model, config, out=out, force=force, progress=progress)
+            detect_folder(place, model, config, out=out, engine=where, force=force, progress=progress)
     record = json.loads(((out or place) / RECORD).read_text(encoding="utf-8"))
     if as_json:
         print(json.dumps(record, indent=2))

@@ -58,7 +58,7 @@ class _Prepared:
 class Detector:
     """A model with what to do before and after it.
 
-    Results depend on the model, the settings and the pictures of a group of `batch`, never on threads.
+    Results depend on the model, the settings and the pictures of a group of `batch`, never on threads (0: one a core).
 
     Raises
     ------
@@ -66,13 +66,15 @@ class Detector:
         As `load_model` and `choose_classes`.
     """
 
-    def __init__(self, model: Path, config: DetectConfig) -> None:
+    def __init__(self, model: Path, config: DetectConfig, *, threads: int = 0) -> None:
         self.config = config
-        self.model: Model = load_model(model, config)
+        self.model: Model = load_model(model, config, threads=threads)
         self.wanted: WantedClasses = choose_classes(config.classes, self.model.class_names)
         if self.model.class_count is not None:
             self.wanted.columns(self.model.class_count)  # Complains now, not after the first picture.
         self.min_score = self.model.min_score if config.min_score is None else config.min_score
+        self._decoders = config.decoders or threads or os.cpu_count() or 1
+        self._views: dict[Size, PanoramaViews] = {}
 
     def run(self, tasks: Sequence[Task]) -> Iterator[list[Outcome]]:
         """Yield what became of the pictures, group by group, in their order.
@@ -80,15 +82,15 @@ class Detector:
         Memory does not grow with the number of pictures.
         """
         sizes = {task.camera for task in tasks if task.is_panorama and task.camera is not None}
-        views = {size: plan_views(size, self.config) for size in sorted(sizes)}
-        decoders = self.config.decoders or os.cpu_count() or 1
+        self._views |= {size: plan_views(size, self.config) for size in sorted(sizes - self._views.keys())}
+        decoders = self._decoders
         ahead: deque[Future[_Prepared | Outcome]] = deque()
         waiting = iter(tasks)
         with ThreadPoolExecutor(decoders, thread_name_prefix="decode") as pool:
             try:
                 while True:
                     while len(ahead) < decoders + self.config.batch and (task := next(waiting, None)) is not None:
-                        ahead.append(pool.submit(self._prepare, task, views))
+                        ahead.append(pool.submit(self._prepare, task))
                     if not ahead:
                         return
                     count = min(self.config.batch, len(ahead))
@@ -96,14 +98,14 @@ class Detector:
             finally:
                 pool.shutdown(cancel_futures=True)
 
-    def _prepare(self, task: Task, views: dict[Size, PanoramaViews]) -> _Prepared | Outcome:
+    def _prepare(self, task: Task) -> _Prepared | Outcome:
         """Decode one picture and cut it into what the network sees; runs in the decoding threads."""
         try:
             picture = read_picture(task.path, upright=not task.is_panorama)
             in_stored_pixels = _is_of_stored_pixels(picture, task)
             if not self._has_structure(picture):
                 return Outcome(Boxes.none(), picture.stored, was_turned=picture.orientation != 1, has_structure=False)
-            around = views[picture.stored] if task.is_panorama else None
+            around = self._views[picture.stored] if task.is_panorama else None
             scenes = (
                 [picture.pixels] if around is None else [around.draw(picture.pixels, i) for i in range(around.count)]
             )

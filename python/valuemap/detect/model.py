@@ -117,8 +117,8 @@ class Model:
                 out[i] -= np.float32(how.mean[i] / how.std[i])
 
 
-def load_model(path: Path, config: DetectConfig) -> Model:
-    """Open an ONNX file and find out what it is.
+def load_model(path: Path, config: DetectConfig, *, threads: int = 0) -> Model:
+    """Open an ONNX file and find out what it is; it is run on so many threads, 0 for one a core.
 
     Raises
     ------
@@ -130,7 +130,7 @@ def load_model(path: Path, config: DetectConfig) -> Model:
     if not path.is_file():
         raise InputError(f"{path}: no such file", hint="give an ONNX file, or bundled")
     content = path.read_bytes()
-    session = _open(path, content, config.provider)
+    session = _open(path, content, config.provider, threads)
     inputs, outputs = session.get_inputs(), session.get_outputs()
     metadata = session.get_modelmeta().custom_metadata_map
     if len(inputs) != 1 or inputs[0].type not in _DTYPES or len(inputs[0].shape) not in (3, 4):
@@ -152,7 +152,7 @@ def load_model(path: Path, config: DetectConfig) -> Model:
     fixed = (width, height) if isinstance(width, int) and isinstance(height, int) else None
     size = config.size_px
     if fixed is not None and (config.size == "picture" or (size is not None and size != fixed)):
-        session = _open(path, _with_free_size(content), config.provider)
+        session = _open(path, _with_free_size(content), config.provider, threads)
         fixed = None
     if kind == "boxes" and all(len(output.shape) != 3 for output in outputs):
         batch = 1  # Its boxes have no batch: they would be those of the first picture.
@@ -181,11 +181,12 @@ def load_model(path: Path, config: DetectConfig) -> Model:
     )
 
 
-def _open(path: Path, content: bytes, provider: str) -> Any:
+def _open(path: Path, content: bytes, provider: str, threads: int) -> Any:
     wanted = _PROVIDERS[provider]
     if wanted not in onnxruntime.get_available_providers():
         raise _no_provider(provider)
     options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
     options.log_severity_level = 4  # Errors come as exceptions; warnings are about the export.
     # Threads that wait for work would otherwise spin, on the cores that decode the next pictures.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")

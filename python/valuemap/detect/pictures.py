@@ -26,6 +26,9 @@ _EXIF_ORIENTATION = 0x0112
 _SWAPS_SIDES = frozenset((5, 6, 7, 8))
 
 
+NO_SUCH_FILE = "no such file"
+
+
 class UnusablePicture(Exception):
     """A picture that cannot be used; the text says why."""
 
@@ -59,7 +62,7 @@ def read_picture(path: Path, *, upright: bool = True) -> Picture:
         There is no such file, it is no picture, or it is damaged or cut short.
     """
     if not path.is_file():  # A pipe would be waited for.
-        raise UnusablePicture("is no file" if path.exists() else "no such file")
+        raise UnusablePicture("is no file" if path.exists() else NO_SUCH_FILE)
     try:
         with Image.open(path) as image:
             stored = image.size

@@ -6,8 +6,8 @@ import hashlib
 import json
 import time
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,12 @@ from valuemap.config import DetectConfig
 from valuemap.dataset import read_images, rows_of
 from valuemap.detect.boxes import Boxes
 from valuemap.detect.infer import Detector, Task
-from valuemap.detect.journal import Journal
+from valuemap.detect.journal import Journal, Outcome
 from valuemap.detect.panorama import MODEL as PANORAMA
 from valuemap.detect.pictures import list_pictures
+from valuemap.detect.shards import detect_in_shards
 from valuemap.detect.truth import find_truth_detections
+from valuemap.engine.engine import Engine
 from valuemap.errors import InputError, OutputError
 from valuemap.folders import check_files, new_file, remove_file
 from valuemap.progress import Progress, counted, silent
@@ -52,6 +54,7 @@ def detect_dataset(
     config: DetectConfig | None = None,
     *,
     pictures: str | Path | None = None,
+    engine: Engine | None = None,
     force: bool = False,
     progress: Progress = silent,
 ) -> Detections:
@@ -72,6 +75,9 @@ def detect_dataset(
         Settings; the defaults where not given.
     pictures
         Folder in which the names of the images are; default: `images` in the dataset.
+    engine
+        Where the pictures are looked at; default: in this process. The detections are the same, and an interrupted run
+        may go on with another one.
     force
         Replace detections that valuemap did not write, too.
     progress
@@ -83,6 +89,8 @@ def detect_dataset(
         The dataset or the model cannot be used, or none of the pictures.
     SettingError
         A class that the model does not have, or a provider that is not installed.
+    ClusterError
+        As the engine.
     OutputError
         The dataset has detections that valuemap did not write, or cannot be written.
     """
@@ -92,11 +100,10 @@ def detect_dataset(
     place = Path(pictures) if pictures is not None else folder / "images"
     if not place.is_dir():
         raise InputError(f"{place}: no such folder of pictures", hint="say where the pictures are with --images")
-    detector = Detector(Path(model), config)
     names = images.name.to_pylist()
-    with _Run(detector, folder, _tasks_of(place, names, cameras, images), names) as run:
+    with _Run(Path(model), config, folder, _tasks_of(place, names, cameras, images), names, engine) as run:
         run.finish(progress)
-        detections = _as_detections(detector, run.journal, images)
+        detections = _as_detections(run.detector, run.journal, images)
         # The old pairs go first: at no time do they stand beside detections that they are not of.
         remove_file(folder / _TRUTH_DETECTIONS, force=force)
         with new_file(folder / _DETECTIONS, force=force) as path:
@@ -115,6 +122,7 @@ def detect_folder(
     config: DetectConfig | None = None,
     *,
     out: str | Path | None = None,
+    engine: Engine | None = None,
     force: bool = False,
     progress: Progress = silent,
 ) -> Path:
@@ -142,16 +150,11 @@ def detect_folder(
     if not paths:
         raise InputError(f"{folder}: there are no pictures in it", hint="give a dataset or a folder of pictures")
     check_files(target, (RESULTS, RECORD), force=force)
-    detector = Detector(Path(model), config)
     names = [path.relative_to(folder).as_posix() for path in paths]
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{target}: cannot be written: {error.strerror}", hint="choose another --out") from error
-    with _Run(detector, target, [Task(path) for path in paths], names) as run:
+    with _Run(Path(model), config, target, [Task(path) for path in paths], names, engine) as run:
         run.finish(progress)
         with new_file(target / RESULTS, force=force) as path:
-            _write_coco(path, detector, run.journal, names)
+            _write_coco(path, run.detector, run.journal, names)
         run.write_record(force=force)
     return target / RESULTS
 
@@ -184,13 +187,27 @@ def detect_pictures(
 
 
 class _Run:
-    """A run over pictures by name, with its journal in the folder that the results go to."""
+    """A run over pictures by name, with its journal in the folder that the results go to.
 
-    def __init__(self, detector: Detector, folder: Path, tasks: Sequence[Task], names: Sequence[str]) -> None:
-        self.detector, self.folder, self.tasks, self.names = detector, folder, tasks, names
+    Where other processes look at the pictures the model is opened here for what it is called and takes, on any machine.
+    """
+
+    def __init__(
+        self,
+        model: Path,
+        config: DetectConfig,
+        folder: Path,
+        tasks: Sequence[Task],
+        names: Sequence[str],
+        engine: Engine | None,
+    ) -> None:
+        self.config, self.folder, self.tasks, self.names = config, folder, tasks, names
+        self.engine = engine if engine is not None and engine.needs_paths else None
+        self.detector = Detector(model, config if self.engine is None else replace(config, provider="cpu"))
         self.seconds = 0.0
         try:
-            self.journal = Journal(folder / _JOURNAL, self._identity(), detector.config.batch)
+            folder.mkdir(parents=True, exist_ok=True)
+            self.journal = Journal(folder / _JOURNAL, self._identity(), config.batch)
         except OSError as error:
             raise OutputError(
                 f"{folder}: cannot be written: {error.strerror}", hint="check the folder's permissions, or use --out"
@@ -219,12 +236,17 @@ class _Run:
         InputError
             Not one of the pictures can be used.
         """
-        start, total = time.perf_counter(), len(self.tasks)
-        progress("pictures", self.done, total)
-        for group in self.detector.run(self.tasks[self.done :]):
-            self.journal.write(group)
-            self.done += len(group)
-            progress("pictures", self.done, total)
+        start, total, found, written = time.perf_counter(), len(self.tasks), self.done, 0
+        ahead: dict[int, list[Outcome]] = {}
+        progress("pictures", found, total)
+        for number, outcomes in self._outcomes():
+            ahead[number] = outcomes
+            while written in ahead:
+                self.journal.write(ahead[written])
+                self.done += len(ahead.pop(written))
+                written += 1
+            found += len(outcomes)
+            progress("pictures", found, total)
         self.seconds = time.perf_counter() - start
         problems = [outcome.problem for outcome in self.journal.read()]
         if all(problems):
@@ -233,6 +255,13 @@ class _Run:
                 f"{self.tasks[0].path}: {problems[0]} (none of {total} pictures can be used)",
                 hint="are these the right pictures? Of a dataset, --images says where they are",
             )
+
+    def _outcomes(self) -> Iterator[tuple[int, list[Outcome]]]:
+        """Yield what became of the pictures that are to be looked at, in numbered groups, in any order."""
+        tasks = self.tasks[self.done :]
+        if self.engine is None:
+            return enumerate(self.detector.run(tasks))
+        return detect_in_shards(self.detector, self.config, tasks, self.engine)
 
     def write_record(self, *, force: bool) -> None:
         """Write detect.json and forget the journal."""
@@ -266,7 +295,7 @@ class _Run:
 
     def _identity(self) -> dict[str, Any]:
         """Return all that the result depends on."""
-        model, config = self.detector.model, asdict(self.detector.config)
+        model, config = self.detector.model, asdict(self.config)
         del config["decoders"]
         pictures = "\n".join(
             f"{name} {task.camera} {task.is_panorama}" for name, task in zip(self.names, self.tasks, strict=True)

@@ -20,13 +20,14 @@ class Engine(Protocol):
     needs_paths: bool
     """Whether tasks may be done in other processes, to which paths go, not arrays."""
 
-    def threads_of_task(self, tasks: int) -> int:
+    def threads_of_task(self, tasks: int, *, on_gpus: bool = False) -> int:
         """Return how many threads each of so many tasks may work on."""
         ...
 
-    def run(self, work: Work[T, R], tasks: Sequence[T]) -> Iterator[tuple[int, R]]:
+    def run(self, work: Work[T, R], tasks: Sequence[T], *, on_gpus: bool = False) -> Iterator[tuple[int, R]]:
         """Yield the number of a task and what the work makes of it, as they get done, in any order.
 
+        With `on_gpus` a task in another process has a GPU to itself, and the process stays for the next one.
         An exception of a task ends the others, and is raised. A task may be done again where a machine is lost, so it
         must come to the same then.
         """

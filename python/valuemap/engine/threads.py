@@ -28,12 +28,12 @@ class ThreadEngine:
     def __init__(self, threads: int = 0) -> None:
         self.threads = bounded_threads(threads) or os.cpu_count() or 1
 
-    def threads_of_task(self, tasks: int) -> int:
+    def threads_of_task(self, tasks: int, *, on_gpus: bool = False) -> int:  # noqa: ARG002
         """Return how many threads each of so many tasks may work on."""
         return max(1, self.threads // max(tasks, 1))
 
-    def run(self, work: Work[T, R], tasks: Sequence[T]) -> Iterator[tuple[int, R]]:
-        """Yield the number of a task and what the work makes of it, as they get done."""
+    def run(self, work: Work[T, R], tasks: Sequence[T], *, on_gpus: bool = False) -> Iterator[tuple[int, R]]:  # noqa: ARG002
+        """Yield the number of a task and what the work makes of it, as they get done; all see all GPUs."""
         if len(tasks) <= 1 or self.threads == 1:  # Here, where signals are heard.
             yield from ((number, work(task, silent)) for number, task in enumerate(tasks))
             return
