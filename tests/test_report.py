@@ -18,7 +18,17 @@ from valuemap.dataset import Dataset, Frame
 from valuemap.errors import OutputError
 from valuemap.evaluate import evaluate_map
 from valuemap.map_folder import Map
-from valuemap.report.above import _class_groups, _close_side_m, _fitted, _legend_entries, draw_map, plot_map
+from valuemap.report.above import (
+    _MISTAKE_STYLES,
+    _class_groups,
+    _close_side_m,
+    _fitted,
+    _legend_entries,
+    _marker,
+    _marker_scale,
+    draw_map,
+    plot_map,
+)
 from valuemap.report.ground import (
     ELLIPSE_SIGMAS,
     Ground,
@@ -279,6 +289,12 @@ def test_far_labels_do_not_decide_what_is_shown() -> None:
     assert left_out == 1
     assert np.all(size < 200.0)
     assert any("1 far away" in str(entry.get_label()) for entry in _legend_entries(ground, left_out))
+
+
+def test_a_few_mistakes_stay_visible_among_many_labels_and_many_do_not_hide_the_map() -> None:
+    of_many_labels = _marker_scale(5000)
+    few, many = (_marker(_MISTAKE_STYLES["false"], of_many_labels, count)["markersize"] for count in (5, 2000))
+    assert few > 1.8 * many
 
 
 def test_the_legend_has_no_empty_rows() -> None:

@@ -41,7 +41,14 @@ def test_from_disk_without_a_network_a_click_shows_what_a_label_rests_on(page: P
     assert seen["labels"] == len(labels)
     assert seen["colors"] > 20, "the map is drawn"
     assert seen["chosen"].startswith(f"Label {labels.label_id[row]}: ")
-    assert len(set(seen["marks"])) == len(seen["marks"]) == 4, "marks are told apart in print, without their colours"
+    hostile, dataset = hostile_city()
+    matches = evaluate_map(hostile, dataset).matches
+    labelled, objects = matches.label_outcome, matches.object_outcome
+    there = {labelled.names[code] for code in labelled.codes} - {"true"}
+    there |= {objects.names[code] for code in objects.codes}
+    there |= {hostile.labels.class_name.names[code] for code in hostile.labels.class_name.codes}
+    assert len(set(seen["marks"])) == len(seen["marks"]), "marks are told apart in print, without their colours"
+    assert len(seen["marks"]) == len(there), "what the map shows, and nothing that it does not"
     assert seen["rows"] == min(300, labels.votes[row])
     assert seen["cleared"]
     assert seen["again"] == seen["chosen"]
@@ -58,6 +65,10 @@ def test_with_scripts_off_tables_figures_and_lists_show(page: Path, tmp_path: Pa
     assert (seen["map"], seen["controls"]) == (1, 0), "a picture of the map, and nothing that needs scripts"
     assert seen["figures"] == 4  # No label is of the class of an object, so nothing says how honest covariances are.
     assert seen["tables"] >= 9
+    assert seen["phone"]["beyond"] <= 0
+    assert seen["phone"]["lines"] < 1.0, "words are not broken into letters"
+    assert seen["print"]["proportion"] == pytest.approx(0.5, abs=0.01)
+    assert 300 < seen["print"]["height"] < 1000, "on one sheet of paper"
     assert seen["cards"] > 5
     assert "Table 3. Results" in seen["text"]
     for name in HOSTILE:

@@ -298,6 +298,15 @@ def test_table_3_is_the_evaluation() -> None:
     assert table["recall"][1:] == pytest.approx((0.934, 0.901), abs=1e-3)
 
 
+def test_without_heights_table_3_has_horizontal_errors() -> None:
+    evaluation = evaluation_of()
+    flat_objects = replace(evaluation.matches.objects, has_height=False)
+    flat = replace(evaluation, matches=replace(evaluation.matches, objects=flat_objects))
+    spatial, horizontal = (cells(paper_tables(city().result, city().dataset, each)[2]) for each in (evaluation, flat))
+    assert spatial["position error, median (m)"][0] == pytest.approx(evaluation.position_median_m)
+    assert horizontal["horizontal position error, rms (m)"][0] == pytest.approx(evaluation.horizontal_rmse_m)
+
+
 def test_the_worst_come_first() -> None:
     result, evaluation = city().result, evaluation_of()
     rows = worst_rows(result, evaluation)
@@ -307,6 +316,19 @@ def test_the_worst_come_first() -> None:
     existence = result.labels.existence
     assert existence is not None
     assert_array_equal(existence[doubtful_rows(result)], np.sort(existence)[: len(doubtful_rows(result))])
+
+
+def test_of_false_labels_the_surest_is_the_worst() -> None:
+    result, evaluation = city().result, evaluation_of()
+    existence, count = result.labels.existence, len(result.labels)
+    assert existence is not None
+    none_found = replace(
+        evaluation.matches,
+        object_of_label=np.full(count, -1),
+        label_outcome=Categories.from_texts(["false"] * count),
+    )
+    rows = worst_rows(result, replace(evaluation, matches=none_found))
+    assert_array_equal(existence[rows], np.sort(existence)[::-1][: len(rows)])
 
 
 def test_honest_covariances_are_called_honest() -> None:

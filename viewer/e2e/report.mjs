@@ -87,5 +87,24 @@ seen.cards = await visible(".card");
 seen.controls = await visible("#explore, button");
 seen.text = await page.locator("body").innerText();
 if (screenshots[2]) await page.screenshot({ path: screenshots[2], fullPage: true });
+// On a phone nothing is wider than the screen, and no row is higher than its words need.
+await page.setViewportSize({ width: 390, height: 844 });
+seen.phone = await page.evaluate(() => ({
+  beyond: document.documentElement.scrollWidth - innerWidth,
+  lines: Math.max(...[...document.querySelectorAll("#tables td:first-child")].map((cell) => {
+    const line = parseFloat(getComputedStyle(cell).fontSize) * 1.5;
+    return cell.getBoundingClientRect().height / line / Math.ceil(cell.innerText.length / 8 + 1);
+  })),
+}));
+// In print a picture that is higher than the paper keeps its proportions.
+await page.setViewportSize({ width: 1280, height: 900 });
+await page.emulateMedia({ media: "print" });
+seen.print = await page.evaluate(async () => {
+  const picture = document.querySelector("#static-map img");
+  picture.src = 'data:image/svg+xml,<svg xmlns="http://www.w3.org/2000/svg" width="1000" height="2000"/>';
+  await picture.decode();
+  const { width, height } = picture.getBoundingClientRect();
+  return { proportion: width / height, height };
+});
 await browser.close();
 console.log(JSON.stringify(seen));

@@ -76,7 +76,7 @@ class _Style:
     face: str = "none"
     edge_width_pt: float = 1.2
     min_scale: float = 0.0
-    """Markers shrink where there are many, but what is wrong must stay visible."""
+    """Markers shrink where there are many labels, but a few that are wrong must stay visible."""
 
 
 _OBJECT_STYLES = {
@@ -358,11 +358,11 @@ def _class_groups(ground: Ground) -> list[tuple[_Style, Ints]]:
 
 
 def _draw_points(axes: Axes, points: Floats, style: _Style, marker_scale: float, *, zorder: float) -> None:
-    axes.plot(points[:, 0], points[:, 1], zorder=zorder, **_marker(style, marker_scale))
+    axes.plot(points[:, 0], points[:, 1], zorder=zorder, **_marker(style, marker_scale, len(points)))
 
 
-def _marker(style: _Style, scale: float) -> dict[str, Any]:
-    scale = max(scale, style.min_scale)
+def _marker(style: _Style, scale: float, count: int = 1) -> dict[str, Any]:
+    scale = max(scale, min(style.min_scale, _marker_scale(count)))
     return {
         "linestyle": "none",
         "marker": style.marker,

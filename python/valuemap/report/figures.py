@@ -153,7 +153,7 @@ def _draw_reliability(axes: Axes, ranges: Sequence[ExistenceRange]) -> None:
         markeredgewidth=2.2,
         label="claimed, mean",
     )
-    axes.set_ylim(0.0, 1.05)
+    axes.set_ylim(-0.04, 1.05)
     axes.set_xlim(-0.6, len(ranges) - 0.4)
     axes.set_ylabel("share of labels")
 
@@ -192,7 +192,7 @@ def covariance(result: Map, evaluation: Evaluation | None) -> ReportFigure | Non
             left, bottom, "overconfident below,\ntoo careful above the line", ha=side, fontsize=9, color=FAINT_INK
         )
         axes.legend(loc="upper left")
-        top = max(3.0 * dimensions, float(np.quantile(squared, 0.98)))
+        top = float(np.clip(np.quantile(squared, 0.98), 3.0 * dimensions, 8.0 * dimensions))
         edges = np.linspace(0.0, top, 25).tolist()
         bars.hist(np.minimum(squared, top), edges, density=True, color=BLUE, alpha=0.75, label="this map")
         bars.plot(
@@ -256,11 +256,17 @@ def stages(result: Map) -> ReportFigure | None:
     )
 
 
+def curve_name(name: str) -> str:
+    """Return what a curve measures, with its unit."""
+    title, unit = CURVES[name]
+    return title if unit == "1" else f"{title} ({unit})"
+
+
 def passes(result: PassesResult) -> ReportFigure:
     """Draw recall, reprojection error and position error against the number of passes, as in the paper's Fig. 4."""
     with drawing():
         figure, panels = _figure(len(CURVES), 3.6, width_in=12.0)
-        for axes, (name, (title, unit)) in zip(panels, CURVES.items(), strict=True):
+        for axes, (name, (_, unit)) in zip(panels, CURVES.items(), strict=True):
             curve = result.curves.get(name, [])
             n = [each.passes for each in curve]
             axes.fill_between(
@@ -268,9 +274,9 @@ def passes(result: PassesResult) -> ReportFigure:
                 label="half of the clusters",
             )  # fmt: skip
             axes.plot(n, [each.median for each in curve], color=BLUE, marker="o", markersize=5, label="median cluster")
-            axes.set_xlabel("passes")
-            axes.set_ylabel(title if unit == "1" else f"{title} ({unit})")
-            axes.set_xticks(n)
+            axes.set_xlabel("passes (clusters that have as many)")
+            axes.set_ylabel(curve_name(name))
+            axes.set_xticks(n, [f"{each.passes}\n({each.clusters})" for each in curve])
             if unit == "1":
                 axes.set_ylim(0.0, 1.03)
             else:
@@ -281,6 +287,7 @@ def passes(result: PassesResult) -> ReportFigure:
         "What more passes bring",
         f"Quartiles over the {result.clusters:,} clusters that at least {result.min_passes} passes drove through, each "
         f"with the mean of {result.seeds} random orders of its passes, against {result.reference}. The reprojection "
-        "error is in the images of a pass that was left out. Compare Fig. 4 (a) to (d) of the paper.",
+        "error is in the images of a pass that was left out. Few clusters have many passes: the ends of the curves are "
+        "of other places. Compare Fig. 4 (a) to (d) of the paper.",
         figure,
     )

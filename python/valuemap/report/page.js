@@ -44,14 +44,24 @@
   var chosen = -1, near = 4;                    // The label that was clicked, half width of its close views in metres.
   var style = {};
 
+  // How the labels of a class are drawn, the most frequent first: a sign for the legend, and the corners of the mark in
+  // units of its radius (none: a circle). Another shape too: in print, and to many people, colours are no difference.
+  var marks = [["\u25cf"], ["\u25c6", 0, -1.3, 1.3, 0, 0, 1.3, -1.3, 0], ["\u25b2", 0, -1.3, 1.2, 0.9, -1.2, 0.9],
+    ["\u25a0", -1, -1, 1, -1, 1, 1, -1, 1], ["\u25bc", 0, 1.3, 1.2, -0.9, -1.2, -0.9],
+    ["\u271a", -0.5, -1.3, 0.5, -1.3, 0.5, -0.5, 1.3, -0.5, 1.3, 0.5, 0.5, 0.5, 0.5, 1.3, -0.5, 1.3, -0.5, 0.5, -1.3, 0.5, -1.3, -0.5, -0.5, -0.5],
+    ["\u25ac", -1.5, -0.6, 1.5, -0.6, 1.5, 0.6, -1.5, 0.6]];
+
   function readStyle() {
     var css = getComputedStyle(document.documentElement);
     ["paper", "ground", "ink", "faint", "rule", "accent", "street", "street-edge", "bad", "warn", "good"].forEach(
       function (name) { style[name] = css.getPropertyValue("--" + name).trim(); });
+    style.dark = isDark();
   }
 
   function passColor(pass) { return "hsl(" + ((pass * 137.508 + 200) % 360).toFixed(0) + " 62% 52%)"; }
-  function classColor(code) { return head.class_colors[Math.min(head.class_rank[code], head.class_colors.length - 1)]; }
+  function isDark() { return !!window.matchMedia && matchMedia("(prefers-color-scheme: dark)").matches; }
+  function classMark(code) { return Math.min(head.class_rank[code], marks.length - 1); }
+  function classColor(code) { return head.class_colors[+style.dark][classMark(code)]; }
   function isShown(i) {
     var only = byId("class").value;
     if (only !== "" && data.label_class[i] !== +only) return false;
@@ -139,7 +149,7 @@
       brush.fillStyle = brush.strokeStyle = classColor(data.label_class[i]);
       brush.lineWidth = 1;
       ellipse(brush, px, py, i, s);
-      brush.beginPath(); brush.arc(px, py, radius, 0, 2 * Math.PI); brush.fill();
+      trace(px, py, radius, marks[classMark(data.label_class[i])]); brush.fill();
       brush.strokeStyle = style.paper; brush.lineWidth = 0.8; brush.stroke();
       var outcome = data.label_outcome.length ? data.label_outcome[i] : 2;
       if (outcome !== 2) {
@@ -160,6 +170,13 @@
       }
     }
     scaleBar(brush, size, s);
+  }
+
+  function trace(px, py, radius, mark) {
+    brush.beginPath();
+    if (mark.length === 1) { brush.arc(px, py, radius, 0, 2 * Math.PI); return; }
+    for (var c = 1; c < mark.length; c += 2) brush.lineTo(px + mark[c] * radius, py + mark[c + 1] * radius);
+    brush.closePath();
   }
 
   function drawRays(ox, oy, s) {
@@ -389,6 +406,32 @@
     for (var i = 0; named && i < count; i++) if (String(data.label_id[i]) === named[1]) { choose(i, true); return; }
   }
 
+  // What the map shows, and nothing that it does not.
+  function legend() {
+    var box = byId("legend"), there = { label: {}, object: {}, "class": {} };
+    for (var i = 0; i < count; i++) there["class"][data.label_class[i]] = true;
+    data.label_outcome.forEach(function (code) { there.label[code] = true; });
+    data.object_outcome.forEach(function (code) { there.object[code] = true; });
+    function entry(sign, text) {
+      var made = element("span", undefined, box), mark = element("b", sign, made);
+      made.appendChild(document.createTextNode(text));
+      return mark;
+    }
+    box.textContent = "";
+    var codes = Object.keys(there["class"]).map(Number), others = 0;
+    codes.sort(function (a, b) { return head.class_rank[a] - head.class_rank[b]; });
+    codes.forEach(function (code) {
+      if (codes.length > marks.length && head.class_rank[code] >= marks.length - 1) { others += 1; return; }
+      entry(marks[classMark(code)][0], head.classes[code]).style.color = classColor(code);
+    });
+    if (others) entry(marks[marks.length - 1][0], others + " other classes").style.color = head.class_colors[+style.dark][marks.length - 1];
+    [["object", 0, "\u25cb", "true object, found", "good"], ["object", 1, "\u25a1", "true object, missed", "bad"],
+      ["object", 2, "\u25ab", "true object, not recoverable", "unsure"], ["label", 1, "\u2715", "false label", "bad"],
+      ["label", 0, "\u25b3", "duplicate", "warn"]].forEach(function (mark) {
+      if (there[mark[0]][mark[1]]) entry(mark[2], mark[3]).className = mark[4];
+    });
+  }
+
   function setUp() {
     readStyle();
     byId("explore").hidden = false;
@@ -409,22 +452,9 @@
         byId("explore").scrollIntoView({ block: "start" });
       });
     });
-    head.classes.forEach(function (name, code) {
-      if (head.class_rank[code] >= 12) return;
-      var entry = element("span", undefined, byId("legend"));
-      element("i", undefined, entry).style.background = classColor(code);
-      entry.appendChild(document.createTextNode(name));
-    });
-    if (data.label_outcome.length) {
-      [["\u25cb", "true object, found", "good"], ["\u25a1", "true object, missed", "bad"], ["\u2715", "false label", "bad"],
-        ["\u25b3", "duplicate", "warn"]].forEach(function (mark) {
-        var entry = element("span", undefined, byId("legend"));
-        element("b", mark[0], entry).className = mark[2];
-        entry.appendChild(document.createTextNode(mark[1]));
-      });
-    }
+    legend();
     if (window.ResizeObserver) new ResizeObserver(redraw).observe(map); else window.addEventListener("resize", redraw);
-    if (window.matchMedia) matchMedia("(prefers-color-scheme: dark)").addEventListener("change", function () { readStyle(); choose(chosen, false); });
+    if (window.matchMedia) matchMedia("(prefers-color-scheme: dark)").addEventListener("change", function () { readStyle(); legend(); choose(chosen, false); });
     choose(-1, false);
     showAll();
     chooseNamed();

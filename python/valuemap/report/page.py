@@ -20,10 +20,10 @@ import numpy as np
 from valuemap.evaluate import LABEL_OUTCOMES, OBJECT_OUTCOMES, Evaluation
 from valuemap.evidence import Evidence
 from valuemap.map_folder import Map
+from valuemap.report.errors import error_m
 from valuemap.report.figures import ReportFigure
 from valuemap.report.ground import ellipses, horizontal_axes, look_down
 from valuemap.report.paper import Cell, ReportTable
-from valuemap.report.run_tables import error_m
 from valuemap.report.style import BLUE, GREY, PURPLE, SKY, YELLOW
 from valuemap.tables import Floats
 
@@ -31,6 +31,7 @@ _HERE = Path(__file__).parent
 _MOST_NAMED_IMAGES = 50_000
 """With more voting images than this the page gives their rows instead of their names, which would be most of it."""
 _CLASS_COLORS = (BLUE, PURPLE, SKY, YELLOW, "#7a5195", "#8c564b", GREY)
+_CLASS_COLORS_ON_BLACK = (SKY, "#e39cc4", "#9be3c5", "#f0e442", "#b79ae0", "#d49a86", "#b8bec4")
 _INVITATION = "Click a label. The wheel or + and - zoom, dragging or arrow keys move, n and p step from label to label."
 
 
@@ -121,7 +122,8 @@ def page_text(content: Content) -> str:
 <section id="figures"><h2>Figures</h2>
 {figures}</section>
 <section id="tables"><h2>Tables</h2>
-{tables}</section>
+<div class="all">
+{tables}</div></section>
 <section id="notes"><h2>Notes</h2><ul>{notes}</ul></section>
 </main>
 <script id="data" type="application/json">{_json(content.data)}</script>
@@ -161,9 +163,10 @@ def _table(table: ReportTable) -> str:
     columns = "".join(f'<th scope="col">{_text(name)}</th>' for name in table.columns)
     rows = "".join("<tr>" + "".join(f"<td>{_text(shown(cell))}</td>" for cell in row) + "</tr>" for row in table.rows)
     notes = "".join(f'<p class="note">{_text(note)}</p>' for note in table.notes)
+    wide = " wide" if len(table.columns) > 3 else ""
     return (
-        f'<h3>{_text(table.title)}</h3><div class="scroll"><table><thead><tr>{columns}</tr></thead>'
-        f"<tbody>{rows}</tbody></table></div>{notes}"
+        f'<div class="table{wide}"><h3>{_text(table.title)}</h3><div class="scroll">'
+        f"<table><thead><tr>{columns}</tr></thead><tbody>{rows}</tbody></table></div>{notes}</div>"
     )
 
 
@@ -277,7 +280,7 @@ def inline_data(
         "axis_names": [name.removesuffix(" (m)") for name in axis_names],
         "classes": list(labels.class_name.names),
         "class_rank": rank.tolist(),
-        "class_colors": list(_CLASS_COLORS),
+        "class_colors": [list(_CLASS_COLORS), list(_CLASS_COLORS_ON_BLACK)],
         "outcomes": list(LABEL_OUTCOMES),
         "invitation": _INVITATION,
     }

@@ -15,6 +15,7 @@ from valuemap.dataset import Dataset, rows_of
 from valuemap.evaluate import Evaluation
 from valuemap.map_folder import Map
 from valuemap.partition import partition_images
+from valuemap.report.errors import error_m
 
 Cell = int | float | str | None
 
@@ -61,7 +62,7 @@ def paper_tables(result: Map, dataset: Dataset, evaluation: Evaluation | None) -
         _table_2(dataset, cluster),
     ]
     if evaluation is not None:
-        tables.append(_table_3(dataset.name, evaluation))
+        tables.append(_table_3(dataset.name, result, evaluation))
     return tables
 
 
@@ -122,7 +123,7 @@ def _table_2(dataset: Dataset, cluster: np.ndarray[tuple[int], np.dtype[np.int64
     )
 
 
-def _table_3(name: str, evaluation: Evaluation) -> ReportTable:
+def _table_3(name: str, result: Map, evaluation: Evaluation) -> ReportTable:
     rows: tuple[tuple[Cell, ...], ...] = (
         ("true positives", evaluation.true_positives, 156, 1560),
         ("false positives", evaluation.false_positives, 4, 84),
@@ -132,8 +133,7 @@ def _table_3(name: str, evaluation: Evaluation) -> ReportTable:
         ("false positives per true positive", _share(evaluation.false_positives, evaluation), 4 / 156, 84 / 1560),
         ("duplicates per true positive", _share(evaluation.duplicates, evaluation), 14 / 156, 56 / 1560),
         ("mean reprojection error (px)", _known(evaluation.mean_reprojection_error_px), 2.94, 3.24),
-        ("position error, rms (m)", _known(evaluation.position_rmse_m), None, None),
-        ("position error, median (m)", _known(evaluation.position_median_m), None, None),
+        *_position_errors(result, evaluation),
     )
     return ReportTable(
         "table_3_results",
@@ -143,9 +143,19 @@ def _table_3(name: str, evaluation: Evaluation) -> ReportTable:
         (
             f"Labels and objects are matched one to one within {evaluation.radius_m:g} m.",
             "The paper's results were inspected by hand; its recall and shares are computed from its counts.",
+            "Where the truth holds only part of the objects, labels of the others count as false.",
             *(f"{note[0].upper()}{note[1:]}." for note in evaluation.notes),
         ),
     )
+
+
+def _position_errors(result: Map, evaluation: Evaluation) -> tuple[tuple[Cell, ...], ...]:
+    """Return the rows of the errors of positions: horizontal ones where the truth has no heights."""
+    error = error_m(result, evaluation)
+    error = error[~np.isnan(error)]
+    what = "position error" if evaluation.matches.objects.has_height else "horizontal position error"
+    rms, median = (math.sqrt(np.mean(error**2)), float(np.median(error))) if len(error) else (None, None)
+    return (f"{what}, rms (m)", rms, None, None), (f"{what}, median (m)", median, None, None)
 
 
 def _known(value: float) -> float | None:

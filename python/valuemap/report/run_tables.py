@@ -10,8 +10,9 @@ import numpy as np
 from valuemap.config import MapConfig
 from valuemap.evaluate import Evaluation
 from valuemap.map_folder import Map
+from valuemap.report.errors import error_m, spread_m
 from valuemap.report.paper import Cell, ReportTable
-from valuemap.tables import Floats, Ints
+from valuemap.tables import Ints
 
 DOUBTFUL = 12
 """How many of the most doubtful labels, and of the worst, are listed."""
@@ -75,8 +76,8 @@ def doubtful_rows(result: Map) -> Ints:
 def worst_rows(result: Map, evaluation: Evaluation | None) -> Ints:
     """Return the rows of the worst labels, the worst first.
 
-    With truth: false ones, duplicates, then those farthest from their objects. Without: those with the largest
-    uncertainty.
+    With truth: false ones and then duplicates, the surest first, then those farthest from their objects. Without:
+    those with the largest uncertainty.
     """
     labels = result.labels
     if evaluation is None:
@@ -85,26 +86,9 @@ def worst_rows(result: Map, evaluation: Evaluation | None) -> Ints:
     names = np.array(matches.label_outcome.names)
     rank = np.array([{"false": 0, "duplicate": 1}.get(name, 2) for name in names])[matches.label_outcome.codes]
     error = error_m(result, evaluation)
-    return np.asarray(np.lexsort((labels.label_id, -np.nan_to_num(error, nan=-1.0), rank))[:DOUBTFUL])
-
-
-def error_m(result: Map, evaluation: Evaluation) -> Floats:
-    """Return the distance (labels) of every true label from its object, NaN for the others."""
-    matches = evaluation.matches
-    row = matches.object_of_label
-    error = np.full(len(row), np.nan)
-    found = row >= 0
-    apart = result.labels.position_in_world_m[found] - matches.object_in_world_m[row[found]]
-    if not matches.objects.has_height:
-        apart -= np.outer(apart @ np.array(result.frame.up), result.frame.up)
-    error[found] = np.linalg.norm(apart, axis=1)
-    return error
-
-
-def spread_m(result: Map) -> Floats:
-    """Return the standard deviation (labels) of each position, over all directions: the root of the trace."""
-    trace = result.labels.covariance_m2[:, [0, 3, 5]].sum(axis=1)
-    return np.asarray(np.sqrt(np.maximum(trace, 0.0)))
+    sureness = labels.votes if labels.existence is None else labels.existence
+    badness = np.where(np.isnan(error), sureness, error)
+    return np.asarray(np.lexsort((labels.label_id, -badness, rank))[:DOUBTFUL])
 
 
 def label_table(name: str, title: str, result: Map, rows: Ints, evaluation: Evaluation | None) -> ReportTable:

@@ -20,16 +20,15 @@ from valuemap.progress import Progress, silent
 from valuemap.report import figures
 from valuemap.report.above import plot_map
 from valuemap.report.crops import chosen_voters, thumbnail, voter_crop
-from valuemap.report.figures import ReportFigure
+from valuemap.report.errors import error_m, spread_m
+from valuemap.report.figures import ReportFigure, curve_name
 from valuemap.report.page import Card, Content, inline_data, page_text
 from valuemap.report.paper import Cell, ReportTable, paper_tables
 from valuemap.report.run_tables import (
     accuracy_tables,
     doubtful_rows,
-    error_m,
     label_table,
     run_tables,
-    spread_m,
     worst_rows,
 )
 from valuemap.report.style import FORMATS, probability
@@ -120,7 +119,7 @@ def write_report(
         lists=(
             (
                 "The worst",
-                "Labels that are no objects, duplicates, then those farthest from their objects."
+                "Labels that match no object and duplicates, the surest first, then those farthest from their objects."
                 if evaluation is not None
                 else "Labels whose positions are the least certain.",
                 tuple(_cards(result, worst, evaluation, crops)),
@@ -133,7 +132,7 @@ def write_report(
                 tuple(_cards(result, others, evaluation, crops)),
             ),
         ),
-        notes=tuple(_notes(result, dataset, evidence, evaluation, crops)),
+        notes=tuple(_notes(result, dataset, evidence, evaluation, passes, crops)),
         data=data,
         details=details,
     )
@@ -200,7 +199,7 @@ def _figures(
 
 def _passes_table(passes: PassesResult) -> ReportTable:
     rows = tuple(
-        (name, each.passes, each.clusters, each.lower, each.median, each.upper)
+        (curve_name(name), each.passes, each.clusters, each.lower, each.median, each.upper)
         for name, curve in passes.curves.items()
         for each in curve
     )
@@ -265,9 +264,8 @@ def _cards(
     for row in map(int, rows):
         expected = "" if labels.expected is None else f" of {labels.expected[row]}"
         passes = f"{labels.passes[row]} {'pass' if labels.passes[row] == 1 else 'passes'}"
-        lines = [f"{labels.votes[row]}{expected} images, {passes}, sigma {spread[row]:.2f}\u00a0m"]
-        if labels.existence is not None:
-            lines.append(f"exists with probability {probability(labels.existence[row])}")
+        existence = "" if labels.existence is None else f", existence {probability(labels.existence[row])}"
+        lines = [f"{labels.votes[row]}{expected} images, {passes}", f"sigma {spread[row]:.2f}\u00a0m{existence}"]
         if evaluation is not None and error is not None:
             outcome = evaluation.matches.label_outcome
             off = f", {error[row]:.2f}\u00a0m off" if np.isfinite(error[row]) else ""
@@ -306,6 +304,7 @@ def _notes(
     dataset: Dataset | None,
     evidence: Evidence | None,
     evaluation: Evaluation | None,
+    passes: PassesResult | None,
     crops: dict[int, list[tuple[str, str]]],
 ) -> Iterable[str]:
     yield from (str(note) for note in result.run.get("notes", []) if isinstance(note, str))
@@ -313,6 +312,8 @@ def _notes(
         yield from (f"{note[0].upper()}{note[1:]}." for note in evaluation.notes)
     else:
         yield "Nothing was compared with a truth: give one with --truth."
+    if passes is None and dataset is not None:
+        yield "What more passes bring was not measured: valuemap experiment passes does, and --passes shows it."
     if dataset is None:
         yield "The dataset of the map was not given: streets, rays, crops and the paper's tables are missing."
     elif not crops:
