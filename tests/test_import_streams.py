@@ -1,17 +1,25 @@
-"""Large tables of boxes: read in blocks and judged in portions, to the same bytes as at once."""
+"""Large tables of boxes, and COCO's: read in blocks and judged in portions, to the same bytes as at once."""
 
 from __future__ import annotations
 
+import json
+import sys
+import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import valuemap
-from valuemap import csv_table
+from valuemap import csv_table, json_lists
 from valuemap.errors import InputError
+from valuemap.json_lists import read_json_lists
 from valuemap.readers import READERS, vet
+from valuemap.readers.detections import DetectionFile
+from valuemap.readers.detections.coco import read_coco
 from valuemap.readers.texts import Texts
+from valuemap.text_files import read_json
 
 HEADER = "image,class,left,top,width,height,score,range_m"
 
@@ -121,3 +129,174 @@ def test_texts_that_repeat_are_held_once() -> None:
     assert texts[1:3].categories(str).names == ("a", "b")
     assert list(Texts.repeated("x", 2)) == ["x", "x"]
     assert Texts.of([]).categories(str).names == ()
+
+
+# COCO's files.
+
+
+def coco(folder: Path, *, results: bool = False, after: int = 0) -> Path:
+    """Write the boxes of `write` as COCO's, with what is not needed in them, and some that cannot be used."""
+    lines = (folder / "boxes.csv").read_text().splitlines()[1:]
+    rows = [line.split(",") for line in lines]
+    images = [{"id": 100 - i, "file_name": f"{i // 20}/{i}.jpg", "width": 640, "height": 480} for i in range(40)]
+    number = {image["file_name"]: image["id"] for image in images}
+    boxes: list[Any] = [
+        {
+            "image_id": name if results else number.get(name, 7),
+            "category_id": {"light": 1, " sign ": 2}.get(kind, 9),
+            "bbox": [float(left), float(top), float(width), float(height)],
+            "score": float(score),
+            "segmentation": [[0.25] * 99, '\\"ü]}\u00fc' * 9],
+        }
+        for name, kind, left, top, width, height, score, _ in rows
+    ]
+    boxes[11]["bbox"], boxes[12]["score"] = [1, 2, None, float("nan")], "high"
+    content: Any = boxes
+    if not results:
+        boxes = [{**box, "id": 5 * i} for i, box in enumerate(boxes)]
+        categories = [{"id": 1, "name": "light"}, {"id": 2, "name": "sign"}]
+        content = {"info": {"a": [1, {}]}, "annotations": boxes, "licenses": [[], {}], "images": images, "x": []}
+        content |= {"categories": categories, "y": 1e5}
+    path = folder / "boxes.json"
+    path.write_text(json.dumps(content, indent=1, ensure_ascii=False))
+    return path
+
+
+def coco_imported(folder: Path, out: Path) -> dict[str, bytes]:
+    dataset = READERS["csv"](folder / "poses.csv", detections=folder / "boxes.json", max_rejected=0.05)
+    valuemap.write_dataset(dataset, out)
+    return {path.name: path.read_bytes() for path in out.glob("*.parquet")}
+
+
+@pytest.mark.parametrize("results", [False, True])
+def test_an_import_of_coco_in_portions_is_that_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, results: bool
+) -> None:
+    folder = write(tmp_path / "data")
+    coco(folder, results=results)
+    at_once = coco_imported(folder, tmp_path / "whole")
+    assert "rejected.parquet" in at_once
+    monkeypatch.setattr(json_lists, "_BLOCK", 300)
+    monkeypatch.setattr(json_lists, "PORTION", 7)
+    assert coco_imported(folder, tmp_path / "parts") == at_once
+    data = valuemap.read_dataset(tmp_path / "parts")
+    assert data.rejected is not None
+    assert (
+        f"{folder / 'boxes.json'}: {'results' if results else 'annotations'}[1999]" in data.rejected.place.to_pylist()
+    )
+    assert list(data.detections.detection_id[:3]) == ([0, 1, 2] if results else [0, 5, 10])
+
+
+def test_a_large_coco_file_is_never_in_memory_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = coco(write(tmp_path / "data"))
+    monkeypatch.setattr(json_lists, "_BLOCK", 2**14)
+    monkeypatch.setattr(json_lists, "PORTION", 20)
+    tracemalloc.start()
+    boxes = read_coco(DetectionFile(path))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(boxes.score) == 2000
+    assert peak < path.stat().st_size / 4
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c["annotations"].__setitem__(1500, 3), r"annotations\[1500\]: expected an object, found 3"),
+        (lambda c: c["images"][39].pop("id"), r"images\[39\]: id: expected a whole number or a text, found None"),
+        (lambda c: c["images"][38].update(id=90), r"images\[38\]: id 90 is there twice"),
+        (lambda c: c["categories"][1].update(id=1), r"categories\[1\]: id 1 is there twice"),
+        (lambda c: c.update(annotations={}), "there is no list named annotations"),
+        (lambda c: c.update(annotations=[]), "there are no detections in it"),
+        (lambda c: c.pop("images"), "there is no list named images"),
+        (lambda c: c.update(categories={"1": "light"}), "there is no list named categories"),
+    ],
+)
+def test_errors_of_coco_in_portions_say_the_entry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: Any, message: str
+) -> None:
+    path = coco(write(tmp_path / "data"))
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+    monkeypatch.setattr(json_lists, "PORTION", 7)
+    with pytest.raises(InputError, match=message):
+        read_coco(DetectionFile(path))
+
+
+def test_of_lists_of_one_name_the_last_counts(tmp_path: Path) -> None:
+    path = coco(write(tmp_path / "data"))
+    box = '{"image_id": 100, "category_id": 1, "bbox": [1, 2, 3, 4], "id": 1}'
+    path.write_text(
+        path.read_text().rstrip()[:-1] + f', "annotations": [{box}], "images": 3, "images": [], "images": []}}'
+    )
+    boxes = read_coco(DetectionFile(path))
+    assert (len(boxes.score), boxes.other_names, list(boxes.image_names)) == (1, [], ["image_id 100"])
+
+
+def in_portions(path: Path) -> Any:
+    """Return what a JSON file holds, put together from its portions; or what is said against it."""
+    found: Any = {}
+    try:
+        for portion in read_json_lists(path, "JSON"):
+            if portion.entries is None and portion.key is None:
+                found = portion.value
+            elif portion.key is None:
+                found = [] if portion.first == 0 else found
+                assert len(found) == portion.first
+                found += portion.entries or []
+            elif portion.entries is None or portion.first == 0:
+                found[portion.key] = portion.value if portion.entries is None else list(portion.entries)
+            else:
+                assert len(found[portion.key]) == portion.first
+                found[portion.key] += portion.entries
+    except InputError as error:
+        return str(error)
+    return found
+
+
+def at_once(path: Path) -> Any:
+    """Return the same by the json module, of a text that is whole."""
+    try:
+        return read_json(path, "JSON")
+    except InputError as error:
+        return str(error)
+
+
+WHOLE = [
+    '{"a": [1, -2.5e-3, "x\\u00e4\\ud83d\\ude00", null, true, [], {}], "b": {"c": [1]}, "a b": [], "d": 12345678}',
+    '[{"k": [1.25, NaN, -Infinity]}, {"k": "line\\n"}, 10000000, "text",\r\n {"k": "ü€😀"}]',
+    " \n[\n]\n ",
+    "{}",
+    "-12.5e+7",
+    '"no list"',
+]
+
+
+def test_portions_of_json_are_the_file_and_their_errors_those_of_the_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    random = np.random.default_rng(7)
+    monkeypatch.setattr(json_lists, "PORTION", 2)
+    path = tmp_path / "file.json"
+    told = set()
+    for case in range(1200):
+        text = WHOLE[case % len(WHOLE)]
+        at = int(random.integers(0, len(text) + 1))
+        mark = random.choice(list('[]{}",:\\ue1-.+x \n'))
+        text = [text, text[:at], text[:at] + mark + text[at:], text[:at] + text[at + 1 :]][case // len(WHOLE) % 4]
+        content = text.encode()
+        if case % 50 == 49:
+            content = content[: at // 2] + b"\xff" + content[at // 2 :]
+        if case % 3 == 0:
+            content = b"\xef\xbb\xbf" + content
+        path.write_bytes(content)
+        expected = at_once(path)
+        monkeypatch.setattr(json_lists, "_BLOCK", int(random.integers(1, 40)))
+        found = in_portions(path)
+        assert repr(found) == repr(expected) or (
+            # Later versions of Python say in other words that a comma has nothing behind it.
+            sys.version_info >= (3, 13) and "Illegal trailing comma" in str(expected) and "JSON" in str(found)
+        ), content
+        told.add(str(expected).partition(": line")[0].partition("JSON: ")[2])
+    assert len(told) > 8, told

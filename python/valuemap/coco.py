@@ -14,6 +14,7 @@ from valuemap.errors import InputError
 from valuemap.tables import Floats
 from valuemap.text_files import read_json
 
+EXPECTED = "a JSON file in COCO's format"
 _FORMAT_HINT = "COCO's format is described at https://cocodataset.org/#format-data"
 _HUGE = 1e300
 _NO_BOX = [float("nan")] * 4
@@ -38,16 +39,17 @@ MAYBE_TEXT = Kind(lambda value: isinstance(value, str), "a text")
 
 @dataclass(frozen=True)
 class Entries:
-    """A list of JSON objects and where it stands, for errors."""
+    """A list of JSON objects and where it stands, for errors; or a part of it, from the entry `first` on."""
 
     where: str
     entries: list[dict[str, Any]]
+    first: int = 0
 
     def __post_init__(self) -> None:
         wrong = next((row for row, entry in enumerate(self.entries) if not isinstance(entry, dict)), None)
         if wrong is not None:
             raise InputError(
-                f"{self.where}[{wrong}]: expected an object, found {reprlib.repr(self.entries[wrong])}",
+                f"{self.where}[{self.first + wrong}]: expected an object, found {reprlib.repr(self.entries[wrong])}",
                 hint=_FORMAT_HINT,
             )
 
@@ -58,7 +60,7 @@ class Entries:
         if wrong is not None:
             found = reprlib.repr(values[wrong])
             raise InputError(
-                f"{self.where}[{wrong}]: {key}: expected {kind.expected}, found {found}",
+                f"{self.where}[{self.first + wrong}]: {key}: expected {kind.expected}, found {found}",
                 hint=_FORMAT_HINT,
             )
         return values
@@ -110,23 +112,6 @@ class Labelled:
     skipped: list[str]
 
 
-def read_coco_json(path: Path) -> Any:
-    """Return what a COCO file holds, as JSON."""
-    return read_json(path, "a JSON file in COCO's format")
-
-
-def list_in(content: Any, key: str, path: Path) -> list[Any]:
-    """Return one of the lists of a COCO file."""
-    found = content.get(key) if isinstance(content, dict) else None
-    if not isinstance(found, list):
-        raise InputError(
-            f"{path}: expected a list of results, or an object with lists named images and annotations; "
-            f"there is no list named {key}",
-            hint="is it a COCO file?",
-        )
-    return found
-
-
 def read_labelled(path: Path) -> Labelled:
     """Read `images` (id, file_name), `annotations` (image_id, category_id, bbox, maybe score) and `categories`.
 
@@ -135,7 +120,7 @@ def read_labelled(path: Path) -> Labelled:
     InputError
         The file is missing, is no JSON, or lacks one of the lists.
     """
-    content = read_coco_json(path)
+    content = read_json(path, EXPECTED)
     lists: dict[str, list[Any]] = {}
     for key in ("images", "annotations", "categories"):
         if not isinstance(content, dict) or not isinstance(content.get(key), list):

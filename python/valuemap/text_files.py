@@ -35,14 +35,19 @@ def read_text(path: Path, expected: str) -> str:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: cannot be read as text: byte {error.start} is not UTF-8", hint=f"expected {expected}, in UTF-8"
-        ) from error
+        raise not_utf8(path, error.start, expected) from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}", hint=f"expected {expected}") from error
     if not text.strip():
         raise InputError(f"{path}: is empty", hint=f"expected {expected}")
     return text
+
+
+def not_utf8(path: Path, byte: int, expected: str) -> InputError:
+    """Return what is wrong with a file that is no text; bytes are counted behind a mark of their order."""
+    return InputError(
+        f"{path}: cannot be read as text: byte {byte} is not UTF-8", hint=f"expected {expected}, in UTF-8"
+    )
 
 
 def refuse_packed(path: Path, expected: str) -> None:

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from valuemap.coco import ID, MAYBE_TEXT, TEXT, Entries, list_in, read_coco_json
+from valuemap.coco import EXPECTED, ID, MAYBE_TEXT, TEXT, Entries
 from valuemap.errors import InputError
+from valuemap.json_lists import read_json_lists
 from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes
-from valuemap.tables import Ints
+from valuemap.readers.texts import Texts
+from valuemap.tables import Floats, Ints
 
 
 def read_coco(file: DetectionFile) -> NamedBoxes:
@@ -23,96 +28,200 @@ def read_coco(file: DetectionFile) -> NamedBoxes:
     centre needs no further half pixel. Without `categories` the class of id 9 is `class-9`; without `score`
     the score is 1. Where every annotation has a whole number of its own as `id`, that is its detection_id.
 
+    The file is read in portions, so that of a box only its numbers are held.
+
     Raises
     ------
     InputError
         The file is no COCO file or has no boxes, or one does not say its image or class.
     """
     path = file.path
-    content = read_coco_json(path)
-    is_results = isinstance(content, list)
-    boxes = Entries(f"{path}: {'results' if is_results else 'annotations'}", _boxes_in(content, path))
-    listed = Entries(f"{path}: images", [] if is_results else list_in(content, "images", path))
-    bbox_px = boxes.boxes()
+    lists: dict[str | None, Any] = {}
+    for portion in read_json_lists(path, EXPECTED):
+        key, where = portion.key, f"{path}: {portion.key or 'results'}"
+        if portion.entries is None:  # The last of a name counts.
+            lists[key] = portion.value
+        elif key in _LISTS:
+            if portion.first == 0:
+                lists[key] = _LISTS[key](where)
+            lists[key].add(Entries(where, portion.entries, portion.first))
+    boxes = lists[None] if isinstance(lists.get(None), _Results) else _list_in(lists, "annotations", path)
+    if not boxes.count:
+        raise InputError(f"{path}: there are no detections in it", hint="did the detector find anything?")
+    images = _Named("") if isinstance(boxes, _Results) else _list_in(lists, "images", path)
+    categories = _list_in(lists, "categories", path).name_of if lists.get("categories") else None
     return NamedBoxes(
-        image_names=_names_of_results(boxes) if is_results else _names_of_annotations(boxes, listed),
-        class_names=_class_names(boxes, content, path),
-        center=bbox_px[:, :2] + bbox_px[:, 2:] / 2.0,
-        size=bbox_px[:, 2:],
-        score=boxes.numbers("score", 1.0),
+        image_names=boxes.image_names(images.name_of),
+        class_names=boxes.classes.texts(lambda key: _name_of_class(key, categories)),
+        center=_together(boxes.center),
+        size=_together(boxes.size),
+        score=_together(boxes.score),
         where=lambda row: f"{boxes.where}[{row}]",
-        detection_id=None if is_results else _own_ids(boxes),
-        pictures=_sizes(listed),
-        other_names=listed.column("file_name", TEXT),
+        detection_id=boxes.own_ids(),
+        pictures=images.sizes,
+        other_names=list(images.name_of.values()),
     )
 
 
-def _boxes_in(content: Any, path: Path) -> list[Any]:
-    boxes: list[Any] = content if isinstance(content, list) else list_in(content, "annotations", path)
-    if not boxes:
-        raise InputError(f"{path}: there are no detections in it", hint="did the detector find anything?")
-    return boxes
+class _Numbered:
+    """A value an entry, as the number of the one that is like it; what is no id is a tuple of how it is written."""
+
+    def __init__(self) -> None:
+        self._number: dict[Any, int] = {}
+        self._codes: list[NDArray[np.int32]] = []
+
+    def add(self, values: list[Any]) -> None:
+        number = self._number
+        keys = (value if ID.accepts(value) else (reprlib.repr(value),) for value in values)
+        self._codes.append(np.fromiter((number.setdefault(key, len(number)) for key in keys), np.int32, len(values)))
+
+    def texts(self, text_of: Callable[[Any], str]) -> Texts:
+        """Return the text of each value; two values may have the same."""
+        texts = Texts.of([text_of(key) for key in self._number])
+        return Texts(texts.codes[_together(self._codes)], texts.distinct)
 
 
-def _sizes(listed: Entries) -> dict[str, tuple[int, int]]:
-    sizes = ((entry["file_name"], entry.get("width"), entry.get("height")) for entry in listed.entries)
-    return {name: (width, height) for name, width, height in sizes if width is not None and height is not None}
+class _Boxes:
+    """What boxes are, without what more their entries hold."""
+
+    def __init__(self, where: str) -> None:
+        self.where, self.count = where, 0
+        self.images, self.classes = _Numbered(), _Numbered()
+        self.center: list[Floats] = []
+        self.size: list[Floats] = []
+        self.score: list[Floats] = []
+
+    def add(self, entries: Entries) -> None:
+        bbox_px = entries.boxes().reshape(-1, 4)
+        self.classes.add([entry.get("category_id") for entry in entries.entries])
+        self.center.append(bbox_px[:, :2] + bbox_px[:, 2:] / 2.0)
+        self.size.append(bbox_px[:, 2:].copy())
+        self.score.append(entries.numbers("score", 1.0))
+        self.count += len(bbox_px)
 
 
-def _names_of_annotations(boxes: Entries, listed: Entries) -> list[str]:
-    """Return the file name of each annotation; of an image that is not listed its id, which is no file name."""
-    ids, names = listed.column("id", ID), listed.column("file_name", TEXT)
-    name_of = _without_repeats(ids, names, listed.where)
-    image_ids = [entry.get("image_id") for entry in boxes.entries]
-    return [
-        name_of[key] if ID.accepts(key) and key in name_of else f"image_id {reprlib.repr(key)}" for key in image_ids
-    ]
+class _Annotations(_Boxes):
+    """Boxes with an `image_id` of a listed image."""
+
+    def __init__(self, where: str) -> None:
+        super().__init__(where)
+        self._ids: list[Ints] | None = []
+
+    def add(self, entries: Entries) -> None:
+        self.images.add([entry.get("image_id") for entry in entries.entries])
+        ids = [entry.get("id") for entry in entries.entries]
+        if not all(type(value) is int and 0 <= value < 2**63 for value in ids):
+            self._ids = None
+        elif self._ids is not None:
+            self._ids.append(np.array(ids, dtype=np.int64))
+        super().add(entries)
+
+    def image_names(self, name_of: Mapping[Any, str]) -> Texts:
+        """Return the file name of each box; of an image that is not listed its id, which is no file name."""
+        return self.images.texts(lambda key: name_of.get(key) or f"image_id {_written(key)}")
+
+    def own_ids(self) -> Ints | None:
+        """Return the ids of the boxes, where each has a whole number of its own."""
+        if self._ids is None:
+            return None
+        ids = _together(self._ids)
+        ascending = np.sort(ids)
+        return None if (ascending[1:] == ascending[:-1]).any() else ids
 
 
-def _names_of_results(boxes: Entries) -> list[str]:
-    """Return the file name of each result: a bare number might be the id of another image elsewhere."""
-    image_ids = boxes.column("image_id", ID, default="")
-    names: list[str] = [
-        name or (image_id if isinstance(image_id, str) else "")
-        for name, image_id in zip(boxes.column("file_name", MAYBE_TEXT, default=""), image_ids, strict=True)
-    ]
-    unnamed = [row for row, name in enumerate(names) if not name]
-    if unnamed:
+class _Results(_Boxes):
+    """Boxes that name their file: a bare number might be the id of another image elsewhere."""
+
+    def __init__(self, where: str) -> None:
+        super().__init__(where)
+        self._unnamed: list[tuple[int, Any]] = []
+
+    def add(self, entries: Entries) -> None:
+        image_ids = entries.column("image_id", ID, default="")
+        names: list[str] = [
+            name or (image_id if isinstance(image_id, str) else "")
+            for name, image_id in zip(entries.column("file_name", MAYBE_TEXT, default=""), image_ids, strict=True)
+        ]
+        self.images.add(names)
+        self._unnamed += [(entries.first + row, image_ids[row]) for row, name in enumerate(names) if not name]
+        super().add(entries)
+
+    def image_names(self, _name_of: Mapping[Any, str]) -> Texts:
+        """Return the file name of each box."""
+        if self._unnamed:
+            row, image_id = self._unnamed[0]
+            raise InputError(
+                f"{self.where}[{row}]: image_id {image_id!r} does not say which file it is "
+                f"({len(self._unnamed)} entries)",
+                hint="add file_name to every result, or put the results as annotations into an object, beside "
+                "the list named images that the detector ran on",
+            )
+        return self.images.texts(str)
+
+    def own_ids(self) -> None:
+        """Return nothing: results have no ids."""
+        return
+
+
+class _Named:
+    """The names of images or categories by id, and the sizes of pictures by name."""
+
+    def __init__(self, where: str, text: str = "file_name") -> None:
+        self._where, self._text = where, text
+        self.name_of: dict[Any, str] = {}
+        self.sizes: dict[str, tuple[int, int]] = {}
+
+    def __len__(self) -> int:
+        return len(self.name_of)
+
+    def add(self, entries: Entries) -> None:
+        ids, names = entries.column("id", ID), entries.column(self._text, TEXT)
+        for row, (key, name, entry) in enumerate(zip(ids, names, entries.entries, strict=True), start=entries.first):
+            if key in self.name_of:
+                raise InputError(
+                    f"{self._where}[{row}]: id {key!r} is there twice", hint="give every entry an id of its own"
+                )
+            self.name_of[key] = name
+            width, height = entry.get("width"), entry.get("height")
+            if width is not None and height is not None:
+                self.sizes[name] = (width, height)
+
+
+_LISTS: Mapping[str | None, Callable[[str], _Boxes | _Named]] = {
+    None: _Results,
+    "annotations": _Annotations,
+    "images": _Named,
+    "categories": partial(_Named, text="name"),
+}
+"""What is made of each list; None is the whole file."""
+
+
+def _list_in(lists: Mapping[str | None, Any], key: str, path: Path) -> Any:
+    found = lists.get(key)
+    if not isinstance(found, _Boxes | _Named):
         raise InputError(
-            f"{boxes.where}[{unnamed[0]}]: image_id {image_ids[unnamed[0]]!r} does not say which file it is "
-            f"({len(unnamed)} entries)",
-            hint="add file_name to every result, or put the results as annotations into an object, beside "
-            "the list named images that the detector ran on",
+            f"{path}: expected a list of results, or an object with lists named images and annotations; "
+            f"there is no list named {key}",
+            hint="is it a COCO file?",
         )
-    return names
-
-
-def _without_repeats(ids: list[Any], texts: list[str], where: str) -> dict[Any, str]:
-    found = dict(zip(ids, texts, strict=True))
-    if len(found) < len(ids):
-        seen = set()
-        row = next(row for row, key in enumerate(ids) if key in seen or seen.add(key))  # type: ignore[func-returns-value]
-        raise InputError(f"{where}[{row}]: id {ids[row]!r} is there twice", hint="give every entry an id of its own")
     return found
 
 
-def _class_names(boxes: Entries, content: Any, path: Path) -> list[str]:
-    """Return the class of each box; of those that have none, or one that is not listed, an empty text."""
-    category_ids = [entry.get("category_id") for entry in boxes.entries]
-    if isinstance(content, list) or not content.get("categories"):
-        return [_class_of_id(key) for key in category_ids]
-    categories = Entries(f"{path}: categories", list_in(content, "categories", path))
-    name_of = _without_repeats(categories.column("id", ID), categories.column("name", TEXT), categories.where)
-    return [name_of.get(key, "") if ID.accepts(key) else "" for key in category_ids]
+def _name_of_class(key: Any, name_of: Mapping[Any, str] | None) -> str:
+    """Return the class of a category; of one that is no id, or not listed where some are, an empty text."""
+    if name_of is not None:
+        return name_of.get(key, "")
+    if isinstance(key, str):
+        return key
+    return f"class-{key}" if isinstance(key, int) else ""
 
 
-def _class_of_id(key: Any) -> str:
-    if not ID.accepts(key):
-        return ""
-    return key if isinstance(key, str) else f"class-{key}"
+def _written(key: Any) -> str:
+    return str(key[0]) if isinstance(key, tuple) else reprlib.repr(key)
 
 
-def _own_ids(boxes: Entries) -> Ints | None:
-    ids = [entry.get("id") for entry in boxes.entries]
-    is_whole = all(type(value) is int and 0 <= value < 2**63 for value in ids)
-    return np.array(ids, dtype=np.int64) if is_whole and len(set(ids)) == len(ids) else None
+def _together(parts: list[Any]) -> Any:
+    """Return parts of an array as one, and forget them."""
+    together = np.concatenate(parts)
+    parts.clear()
+    return together
