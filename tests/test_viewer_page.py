@@ -68,6 +68,7 @@ def test_what_is_rejected_stays_rejected(tmp_path: Path) -> None:
         }
         assert again["filtered"]["votes"] < len(others)
         assert again["note"].startswith('"><img')
+        assert again["phone"] == {"beyond": 0, "list": [False, True, False]}
         # One list of triangles for all labels, one for all tracks; the street that both passes drove is drawn once.
         # Around what is selected is a mark; where it was moved to another one, and a line between them.
         for seen, labels, marks in ((first, len(before.labels), 3), (again, len(others), 1)):
@@ -108,7 +109,8 @@ def test_the_page_of_the_demo(tmp_path: Path) -> None:
     whole = dataclasses.replace(valuemap.read_dataset(Path(demo) / "dataset"), truth_detections=None)
     passes = sorted(set(whole.images.pass_id.texts()))
     pictures = Path(demo) / "dataset" / "images"
-    before = _map_by_command(part(whole, *passes[: len(passes) // 2]), tmp_path)
+    half = part(whole, *passes[: len(passes) // 2])
+    before = _map_by_command(half, tmp_path)
     place = before.labels.position_in_world_m
     apart = np.linalg.norm(place[:, None] - place, axis=2) + 1e9 * np.eye(len(place))
     row = int(np.argmax(apart.min(axis=1)))
@@ -120,6 +122,9 @@ def test_the_page_of_the_demo(tmp_path: Path) -> None:
         label_id = int(before.labels.label_id[row])
         first = in_browser("review.mjs", address, "reject", label_id, tmp_path / "shot.png")
         assert first["drawn"] == len(before.labels)
+        outcomes = set(valuemap.evaluate_map(before, half).matches.object_outcome.texts())
+        told = {"found": "true object", "missed": "missed", "not recoverable": "not recoverable"}
+        assert {told[each] for each in outcomes} == set(told.values()) & set(first["legend"]), "what there is of truth"
         assert first["crops"] >= 1
         assert first["heading"] == "Why is there nothing here?"
         assert len(first["answer"]) > 40

@@ -119,6 +119,19 @@ if (step === "reject") {
 }
 // A city from far away: streets driven twice are drawn once.
 seen.far = await frameFrom(page, -5);
+seen.legend = await page.locator("#legend span").allInnerTexts();
+// On a phone everything is within reach: the filters and the list behind a button, and nothing beyond the screen.
+if (step !== "reject") {
+  await page.keyboard.press("Escape");
+  await page.setViewportSize({ width: 390, height: 844 });
+  seen.phone = { beyond: await page.locator("#bar").evaluate((bar) => bar.scrollWidth - bar.clientWidth) };
+  seen.phone.list = [await page.locator("#list").isVisible()];
+  await page.click("#menu");
+  seen.phone.list.push(await page.locator("#list").isVisible());
+  await page.locator("#list [data-label]").first().click();
+  await page.waitForSelector("#details h2");
+  seen.phone.list.push(await page.locator("#list").isVisible());
+}
 // What a screen reader would say: everything that can be used has a name.
 seen.unnamed = await page.evaluate(() =>
   [...document.querySelectorAll("button, input, textarea, select, a[href], [role], canvas")]

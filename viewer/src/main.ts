@@ -84,6 +84,8 @@ class Page {
 
   private readonly sigmaUp: Float32Array;
   private readonly lost: Lost[];
+  /** What became of true objects: what there is of it. */
+  private ofObjects = new Set<string>();
 
   private async loadTheRest(): Promise<void> {
     const { head } = this;
@@ -92,7 +94,10 @@ class Page {
     if (head.has.truth) {
       const truth = await api.truth();
       if (truth.has("outcome")) {
-        this.map.setTruth({ position: plane(truth.get("position")), outcome: truth.get<Uint8Array>("outcome"), labelOutcome: truth.get<Uint8Array>("label_outcome") });
+        const outcome = truth.get<Uint8Array>("outcome");
+        this.map.setTruth({ position: plane(truth.get("position")), outcome, labelOutcome: truth.get<Uint8Array>("label_outcome") });
+        this.ofObjects = new Set(Array.from(outcome, (number) => head.outcomes[number]));
+        this.renderLegend();
       }
     }
     if (head.has.rejected) this.map.setRejected((await api.rejected()).get("position"));
@@ -137,6 +142,7 @@ class Page {
       h("div", { class: "name", title: head.folder }, h("b", {}, head.name), h("span", { class: "muted" }, ` ${plural(head.counts.labels, "label")}${head.has.dataset ? ` from ${plural(head.counts.detections, "detection")} in ${plural(head.counts.images, "image")}, ${plural(head.passes.length, "pass", "passes")}` : ""}`)),
       h("span", { id: "shown", class: "muted" }),
       search,
+      h("button", { id: "menu", title: "Filters and list", "aria-label": "Filters and list", onclick: () => document.body.classList.toggle("filtering") }, "☰"),
       h("button", { title: "Fit everything (0)", "aria-label": "Fit everything", onclick: () => this.map.fit() }, "⤢"),
       h("button", { title: "Light or dark (D)", "aria-label": "Light or dark", onclick: () => this.toggleDark() }, "◐"),
       h("button", { title: "Keys (?)", "aria-label": "Keys", onclick: () => showKeys() }, "?"),
@@ -162,7 +168,12 @@ class Page {
     } else {
       for (const name of ["true", "duplicate", "false"]) entries.push(h("span", {}, dot(css(OUTCOMES[name])), name));
     }
-    if (head.has.truth && settings.layers.has("truth")) entries.push(h("span", {}, ring(css(OUTCOMES.found)), "true object"), h("span", {}, ring(css(OUTCOMES.missed)), "missed"));
+    if (settings.layers.has("truth")) {
+      const named = { found: "true object", missed: "missed", "not recoverable": "not recoverable" };
+      for (const [outcome, text] of Object.entries(named)) {
+        if (this.ofObjects.has(outcome)) entries.push(h("span", {}, ring(css(OUTCOMES[outcome]), outcome !== "found"), text));
+      }
+    }
     legend.replaceChildren(...entries);
   }
 
@@ -294,6 +305,7 @@ class Page {
   private async openLabel(id: number, move = true): Promise<void> {
     const begun = performance.now();
     const row = this.labels.rowOf.get(id);
+    document.body.classList.remove("filtering");
     this.selection = { kind: "label", id };
     if (row === undefined) {
       renderProblem(this.panel(), `Label ${id}`, `There is no label ${id} in this map.`, this.panelEvents);
@@ -499,9 +511,10 @@ function answered(begun: number): void {
   requestAnimationFrame(() => setTimeout(() => performance.measure("valuemap:click", { start: begun, end: performance.now() })));
 }
 
-function ring(color: string): Node {
-  const mark = dot("none") as SVGSVGElement;
+function ring(color: string, filled: boolean): Node {
+  const mark = dot(color) as SVGSVGElement;
   const circle = mark.firstElementChild!;
+  circle.setAttribute("fill-opacity", filled ? "0.35" : "0");
   circle.setAttribute("stroke", color);
   circle.setAttribute("stroke-width", "0.4");
   circle.setAttribute("r", "0.75");

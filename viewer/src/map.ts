@@ -446,7 +446,9 @@ export class MapView {
     if (!this.truth || !this.truth.position.length) return;
     const { position, outcome } = this.truth;
     const line = Uint32Array.from(outcome, (number) => packed(OUTCOMES[this.outcomes[number]] ?? OUTCOMES.found, 255));
-    this.truthDiscs = ringed({ length: outcome.length, position, fill: line, line });
+    // What was not found is filled: not by its colour alone is it told from what was.
+    const fill = line.map((color, i) => faded(color, this.outcomes[outcome[i]] === "found" ? 0 : 0.35));
+    this.truthDiscs = { length: outcome.length, position, fill, line };
   }
 
   private makeRejected(): void {
