@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import itertools
 import json
 import os
@@ -18,12 +20,14 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
+from typer.testing import CliRunner
 
 from small_dataset import rewrite, small_dataset, with_value
 from test_cli import colmap_model
 from tiny_models import red_finder, says
 from told import Told
-from valuemap import build_map, read_dataset, write_dataset
+from valuemap import build_map, read_dataset, remote, write_dataset
+from valuemap.cli.commands import app
 from valuemap.config import DetectConfig
 from valuemap.dataset import Dataset
 from valuemap.detect import BUNDLED_MODEL, infer, shards
@@ -41,6 +45,7 @@ from valuemap.errors import InputError, OutputError, SettingError
 from valuemap.folders import LEDGER
 from valuemap.progress import silent
 from valuemap.readers.colmap import read_colmap
+from valuemap.remote import UrlPath
 from valuemap.simulate import PRESETS, simulate
 from valuemap.summary import summarize_dataset
 from valuemap.tables import Cameras, Categories
@@ -482,6 +487,70 @@ def test_machines_that_have_other_files_are_told_of(tmp_path: Path, finder: Path
     other = partial(red_finder, Path(model), {"valuemap.minimum_component_px": "9"})
     with pytest.raises(InputError, match=r"finder\.onnx: is another file on"):
         detect_dataset(folder, model, DetectConfig(batch=4), engine=Elsewhere(other))
+
+
+# Pictures at URLs.
+
+
+def test_pictures_may_be_in_a_store(tmp_path: Path, finder: Path) -> None:
+    folder = noisy_pictures(tmp_path / "data")
+    (folder / "images" / "7.png").unlink()
+    whole = shutil.copytree(folder, tmp_path / "whole")
+    detect_dataset(whole, finder)
+    expected = json.loads((whole / RECORD).read_text())
+    assert expected["counts"]["unusable_pictures"] == 2
+    away = (folder / "images").rename(tmp_path / "away 100%23")
+    urls = [away.as_uri()]
+    if importlib.util.find_spec("fsspec"):
+        fsspec = importlib.import_module("fsspec")
+        memory = fsspec.filesystem("memory")
+        for path in away.iterdir():
+            memory.pipe(f"/valuemap/away/{path.name}", path.read_bytes())
+        urls += ["memory://valuemap/away", "fsspec+memory://valuemap/away"]
+    for url, engine in itertools.product(urls, (None, Elsewhere())):
+        detect_dataset(folder, finder, pictures=url, engine=engine)
+        assert (folder / "detections.parquet").read_bytes() == (whole / "detections.parquet").read_bytes()
+        record = json.loads((folder / RECORD).read_text())
+        assert (record["unusable"], record["counts"]) == (expected["unusable"], expected["counts"])
+    result = CliRunner().invoke(app, ["detect", str(folder), f"--model={finder}", f"--images={urls[0]}"])
+    assert result.exit_code == 0, result.output
+    for wrong, message in (
+        (f"{urls[0]}/none", "no such folder"),
+        ("nowhere://a:secret@b/c", "nowhere://b/c: no store"),
+    ):
+        with pytest.raises(InputError, match=message) as refusal:
+            detect_dataset(folder, finder, pictures=wrong)
+        assert "secret" not in f"{refusal.value} {refusal.value.hint}"
+
+
+def test_a_store_that_fails_ends_a_run_which_goes_on_later(
+    tmp_path: Path, finder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = noisy_pictures(tmp_path / "data")
+    whole = shutil.copytree(folder, tmp_path / "whole")
+    detect_dataset(whole, finder)
+    url = (folder / "images").as_uri()
+    read = UrlPath.read_bytes
+
+    class Failing:
+        def open_input_file(self, _path: str) -> None:
+            raise OSError("AWS Error NETWORK_CONNECTION\nand more")
+
+    def read_some(place: UrlPath) -> bytes:
+        if place.name == "11.png":
+            monkeypatch.setattr(remote, "_system_of", lambda _root: (Failing(), "/x"))
+        return read(place)
+
+    with monkeypatch.context():
+        monkeypatch.setattr(UrlPath, "read_bytes", read_some)
+        with pytest.raises(
+            InputError, match=r"/images/11\.png: cannot be read: AWS Error NETWORK_CONNECTION and more$"
+        ):
+            detect_dataset(folder, finder, DetectConfig(decoders=1), pictures=url)
+    monkeypatch.undo()
+    detect_dataset(folder, finder, DetectConfig(decoders=1), pictures=url)
+    assert (folder / "detections.parquet").read_bytes() == (whole / "detections.parquet").read_bytes()
+    assert json.loads((folder / RECORD).read_text())["pictures_of_an_interrupted_run"] > 5
 
 
 def test_a_model_that_cannot_be_run_is_one_clear_line_and_leaves_nothing_behind(

@@ -34,7 +34,8 @@ def detect_command(
     provider: Annotated[Provider, typer.Option(help="What the network runs on.")] = DetectConfig.provider,
     kind: Annotated[ModelKind | None, typer.Option(help="What the outputs mean; default: found out.")] = None,
     images: Annotated[
-        Path | None, typer.Option(help="Folder of the pictures of a dataset; default: images in it.")
+        str | None,
+        typer.Option(metavar="FOLDER|URL", help="Where the pictures of a dataset are; default: images in it."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Where the results of a folder of pictures go; default: into it.")

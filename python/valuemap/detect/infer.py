@@ -23,6 +23,7 @@ from valuemap.detect.panorama import PanoramaViews, plan_views
 from valuemap.detect.pictures import Picture, UnusablePicture, read_picture
 from valuemap.detect.structure import coarse_share
 from valuemap.detect.tiles import Window, are_cut, inner_borders, merge_views, plan_tiles
+from valuemap.remote import UrlPath
 
 _ALL_INNER = (True, True, True, True)
 
@@ -31,7 +32,7 @@ _ALL_INNER = (True, True, True, True)
 class Task:
     """One picture to look at; `camera` is the width and height that its camera says, if it has one."""
 
-    path: Path
+    path: Path | UrlPath
     camera: Size | None = None
     is_panorama: bool = False
 

@@ -7,6 +7,7 @@ trained on upright pictures. So the network sees the upright picture, and its bo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from valuemap.detect.boxes import Boxes
 from valuemap.detect.letterbox import Pixels, Size
+from valuemap.remote import UrlPath
 from valuemap.tables import Floats
 
 Image.MAX_IMAGE_PIXELS = None  # Pillow's own limit takes large panoramas for attacks; MAX_PIXELS is ours.
@@ -53,18 +55,19 @@ class Picture:
         return boxes.moved(center, boxes.size_px[:, ::-1].copy() if swaps else boxes.size_px)
 
 
-def read_picture(path: Path, *, upright: bool = True) -> Picture:
+def read_picture(path: Path | UrlPath, *, upright: bool = True) -> Picture:
     """Decode a picture, all of it.
 
     Raises
     ------
     UnusablePicture
         There is no such file, it is no picture, or it is damaged or cut short.
+    InputError
+        The store that it is in cannot be read.
     """
-    if not path.is_file():  # A pipe would be waited for.
-        raise UnusablePicture("is no file" if path.exists() else NO_SUCH_FILE)
+    source = _source(path)
     try:
-        with Image.open(path) as image:
+        with Image.open(source) as image:
             stored = image.size
             _refuse_too_large(stored)
             orientation = image.getexif().get(_EXIF_ORIENTATION, 1) if upright else 1
@@ -79,6 +82,17 @@ def read_picture(path: Path, *, upright: bool = True) -> Picture:
         reason = str(error).splitlines()[0] if str(error) else repr(error)
         raise UnusablePicture(f"cannot be decoded: {reason}") from error
     return Picture(pixels, orientation, stored)
+
+
+def _source(path: Path | UrlPath) -> Path | BytesIO:
+    if isinstance(path, UrlPath):
+        try:
+            return BytesIO(path.read_bytes())
+        except FileNotFoundError:
+            raise UnusablePicture(NO_SUCH_FILE) from None
+    if not path.is_file():  # A pipe would be waited for.
+        raise UnusablePicture("is no file" if path.exists() else NO_SUCH_FILE)
+    return path
 
 
 def _refuse_too_large(stored: Size) -> None:

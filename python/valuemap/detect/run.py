@@ -27,6 +27,7 @@ from valuemap.engine.engine import Engine
 from valuemap.errors import InputError, OutputError
 from valuemap.folders import check_files, new_file, remove_file
 from valuemap.progress import Progress, counted, silent
+from valuemap.remote import UrlPath, place_of
 from valuemap.tables import Cameras, Categories, Detections, Images, Truth, read_table, write_table
 
 RECORD = "detect.json"
@@ -74,7 +75,7 @@ def detect_dataset(
     config
         Settings; the defaults where not given.
     pictures
-        Folder in which the names of the images are; default: `images` in the dataset.
+        Folder, or URL as a text, in which the names of the images are; default: `images` in the dataset.
     engine
         Where the pictures are looked at; default: in this process. The detections are the same, and an interrupted run
         may go on with another one.
@@ -97,7 +98,7 @@ def detect_dataset(
     folder, config = Path(dataset), config or DetectConfig()
     cameras, images = read_images(folder)
     check_files(folder, (_DETECTIONS, _TRUTH_DETECTIONS, RECORD), force=force)
-    place = Path(pictures) if pictures is not None else folder / "images"
+    place = place_of(pictures) if pictures is not None else folder / "images"
     if not place.is_dir():
         raise InputError(f"{place}: no such folder of pictures", hint="say where the pictures are with --images")
     names = images.name.to_pylist()
@@ -309,7 +310,7 @@ class _Run:
         }
 
 
-def _tasks_of(place: Path, names: Sequence[str], cameras: Cameras, images: Images) -> list[Task]:
+def _tasks_of(place: Path | UrlPath, names: Sequence[str], cameras: Cameras, images: Images) -> list[Task]:
     camera_row = rows_of(images.camera_id, cameras.camera_id)
     models = cameras.model.texts()
     return [
