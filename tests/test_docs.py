@@ -194,6 +194,16 @@ def test_every_page_is_in_the_site_once() -> None:
     assert sorted(site) == sorted(page for page in pages if not page.startswith("notes/"))
 
 
+def test_the_site_fetches_nothing_from_elsewhere() -> None:
+    pages = sorted((ROOT / "build" / "site").rglob("*.html"))
+    if not pages:
+        pytest.skip("the site is not built: make docs")
+    fetched = re.compile(
+        r"<(?:script|img|iframe)[^>]* src=\"?(?:https?:)?//|<link[^>]*stylesheet[^>]*href=\"?(?:https?:)?//"
+    )
+    assert [page.name for page in pages if fetched.search(page.read_text(encoding="utf-8"))] == []
+
+
 def write_colmap_model(dataset: Dataset, folder: Path) -> None:
     """Write cameras and poses as COLMAP's texts."""
     folder.mkdir()
