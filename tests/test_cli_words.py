@@ -17,9 +17,11 @@ from valuemap.cli import show as shown
 from valuemap.cli.commands import app
 from valuemap.cli.export import Format
 from valuemap.cli.import_.options import DetectionFormat
+from valuemap.cli.options import EngineName
 from valuemap.cli.simulate import Preset
 from valuemap.config import list_settings
 from valuemap.dataset import write_dataset
+from valuemap.engine.choose import ENGINES
 from valuemap.map_folder import write_map
 from valuemap.pipeline import build_map
 from valuemap.readers.detections import DETECTIONS
@@ -37,6 +39,7 @@ def test_choices_are_what_there_is() -> None:
     assert set(get_args(DetectionFormat)) == {"auto", *DETECTIONS}
     assert set(get_args(Preset)) == set(PRESETS)
     assert set(get_args(Axes)) == set(AXES)
+    assert set(get_args(get_args(EngineName)[0])) == set(ENGINES)
 
 
 @pytest.mark.parametrize(

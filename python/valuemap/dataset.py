@@ -139,7 +139,7 @@ class Dataset:
         passes = len(np.unique(self.images.pass_id.codes))
         truth = "" if self.truth is None else f", {len(self.truth):,} true objects"
         return (
-            f"Dataset({self.name!r}: {len(self.images):,} images of {passes:,} passes, "
+            f"Dataset({self.name!r}: {len(self.images):,} images of {passes:,} {'pass' if passes == 1 else 'passes'}, "
             f"{len(self.detections):,} detections{truth})"
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -48,7 +48,8 @@ Vertical = Annotated[
     ),
 ]
 EngineName = Annotated[
-    str, typer.Option("--engine", help="threads: on this machine; ray: on a cluster, see docs/cluster.md.")
+    Literal["threads", "ray"],
+    typer.Option("--engine", help="threads: on this machine; ray: on a cluster, see docs/cluster.md."),
 ]
 RayAddress = Annotated[
     str | None,

@@ -311,7 +311,7 @@ def _draw_miss(axes: Axes, evidence: Evidence, pictures: Path | None, misses: Mi
     elif misses.nearest_label[i] >= 0:
         why = f"{misses.nearest_px[i]:.0f} px to one of label {misses.nearest_label[i]}"
     else:
-        why = f"{misses.nearest_px[i]:.0f} px to the next detection"
+        why = f"{misses.nearest_px[i]:.0f} px to the next box"
     _caption(axes, _short_name(evidence, image_row), why)
 
 
