@@ -51,6 +51,7 @@ def test_options_of_poses_and_detections_reach_the_reader(tmp_path: Path) -> Non
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
     dataset = read_dataset(tmp_path / "out")
+    assert dataset.name == "out", "called like its folder, not like one of the files that it is made of"
     assert dataset.cameras.params[0].tolist() == [500, 500, 320, 240]
     assert dataset.images.pass_id.texts() == ["mon", "tue"]
     assert_allclose(dataset.detections.center_px, [[160.0, 240.0]])

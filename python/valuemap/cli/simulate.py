@@ -37,7 +37,7 @@ def simulate_command(
     if config.districts > 1:
         with progress_bars() as progress:
             write_dataset_in_pieces(
-                simulate_districts(config, seed=seed, name=preset, progress=progress), out, force=force
+                simulate_districts(config, seed=seed, name=out.resolve().name, progress=progress), out, force=force
             )
         finish_dataset_of_pieces(out, as_json=as_json)
         return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import typer
@@ -29,7 +30,8 @@ def check_out(out: Path, *, force: bool) -> None:
 
 
 def finish_dataset(dataset: Dataset, out: Path, *, force: bool, as_json: bool) -> None:
-    """Write the dataset, say on stdout what it holds, and on stderr what was left out."""
+    """Write the dataset under the name of its folder, say on stdout what it holds, and on stderr what was left out."""
+    dataset = replace(dataset, name=out.resolve().name)
     write_dataset(dataset, out, force=force)
     facts = summarize_dataset(dataset)
     if as_json:
