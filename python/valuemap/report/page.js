@@ -292,8 +292,8 @@
     var facts = element("dl", undefined, panel);
     function fact(name, value) { element("dt", name, facts); element("dd", value, facts); }
     var at = [0, 1, 2].map(function (axis) { return (data.label_at[3 * i + axis] + head.origin[axis]).toFixed(2); });
-    fact(head.axis_names.join(", ") + ", up (m)", at.join("  "));
-    if (data.lon_lat.length) fact("lon, lat", data.lon_lat[2 * i].toFixed(7) + "  " + data.lon_lat[2 * i + 1].toFixed(7));
+    fact(head.axis_names.join(", ") + ", up (m)", at.join(", "));
+    if (data.lon_lat.length) fact("lon, lat", data.lon_lat[2 * i].toFixed(7) + ", " + data.lon_lat[2 * i + 1].toFixed(7));
     fact("95 % ellipse, half axes", data.half_axes[2 * i].toFixed(3) + " x " + data.half_axes[2 * i + 1].toFixed(3) + " m");
     fact("sigma of the height", data.up_sigma[i].toFixed(3) + " m");
     if (data.existence.length) fact("existence", data.existence[i] > 0.9995 ? "> 0.999" : data.existence[i].toFixed(3));
