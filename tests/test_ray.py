@@ -86,6 +86,20 @@ def test_what_a_cluster_cannot_do_is_told_from_what_it_lost(monkeypatch: pytest.
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.skipif(not IS_INSTALLED, reason="ray is not installed: pip install 'valuemap[ray]'")
+def test_a_gpu_has_its_share_of_the_cores_and_one_must_be_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    import_ray()
+    machines: list[dict[str, float]] = [{"CPU": 64.0}, {"CPU": 9.0, "GPU": 2.0}, {"CPU": 5.0, "GPU": 1.0}]
+    cluster = RaySays(RuntimeError())
+    cluster.nodes = lambda: [{"Alive": True, "Resources": machine} for machine in machines]  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "ray", cluster)
+    assert RayEngine().threads_of_task(100, on_gpus=True) == 4
+    del machines[1:]
+    with pytest.raises(ClusterError, match="no machine of the cluster has a GPU") as caught:
+        list(RayEngine().run(lambda _task, _progress: None, [0], on_gpus=True))
+    assert "--provider cpu" in caught.value.hint
+
+
 def test_engines_that_cannot_be_say_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SettingError, match="there is no such engine"):
         engine_named("spark")
