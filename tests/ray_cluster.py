@@ -35,7 +35,8 @@ from valuemap.refine import Refined
 from valuemap.tiles.compare import Comparison
 from valuemap.tiles.work import open_work
 
-os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "a" * 64}
+# Nodes of a busy machine take longer to begin than Ray waits.
+os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "a" * 64, "RAY_raylet_start_wait_time_s": "120"}
 ray = import_ray()
 
 KNOWN = MapConfig(detection_sigma_px=1.5, position_sigma_m=0.05, rotation_sigma_deg=0.05)
