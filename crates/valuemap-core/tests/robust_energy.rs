@@ -10,11 +10,11 @@ use std::sync::Arc;
 use nalgebra::{Isometry3, Point3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;
+use valuemap_core::hypothesis::Viability;
 use valuemap_core::progress::Progress;
-use valuemap_core::robust::Tally;
 use valuemap_core::robust::assign::{claims_of_all, images_of};
 use valuemap_core::robust::calibrate::Placed;
-use valuemap_core::robust::energy::{Object, object as object_of};
+use valuemap_core::robust::energy::{Object, fit, object as object_of};
 use valuemap_core::robust::index::RayIndex;
 use valuemap_core::robust::learn::learn;
 use valuemap_core::robust::looks::Lookout;
@@ -26,6 +26,7 @@ use valuemap_core::robust::repair::{Tried, repair};
 use valuemap_core::robust::scene::{Frustum, Scene};
 use valuemap_core::robust::search::{Depth, search};
 use valuemap_core::robust::seen::Looks;
+use valuemap_core::robust::{Settings, Tally};
 
 use street::{FOCAL_PX, GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, joined, moved, object, street};
 
@@ -352,6 +353,18 @@ fn a_viewpoint_is_as_much_of_a_hit_as_the_share_of_its_images_that_see() {
     let ((all, looks), (some, _)) = (hits(1), hits(4));
     assert!(looks > 10.0 && (all - looks).abs() < 1e-9, "{all} {looks}");
     assert!((some / all - 0.25).abs() < 0.05, "{some} {all}");
+}
+
+#[test]
+fn what_nobody_sees_within_the_range_is_no_object() {
+    // From 46 to 37 m away.
+    let object = Vector3::new(46.0, 5.0, 3.0);
+    let scene = street(10, 1.0, &[object], &[[0.2, 0.1], [-0.1, -0.2]]);
+    let with = |max_range_m: f64| {
+        let settings = Settings { viability: Viability { max_range_m, ..SETTINGS.viability }, ..SETTINGS };
+        fit(&Model::new(&scene, &NOISE, &settings), &scene.usable_rays(), object).is_some()
+    };
+    assert!(with(60.0) && with(40.0) && !with(30.0));
 }
 
 /// A scene with some of its rays alone.

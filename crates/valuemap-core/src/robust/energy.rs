@@ -90,8 +90,8 @@ impl Terms {
     }
 }
 
-/// The position of an object, by damped Gauss-Newton with Huber's weights from a point nearby. Nothing if it is behind a voter, or if the
-/// votes do not fix it.
+/// The position of an object, by damped Gauss-Newton with Huber's weights from a point nearby. Nothing if it is behind a voter, if the votes do not
+/// fix it, or if all voters are out of range: without parallax, whatever the detector's noise is runs to infinity.
 #[must_use]
 pub fn fit(model: &Model<'_>, votes: &[u32], start: Vector3<f64>) -> Option<Fit> {
     let mut weights = vec![1.0; votes.len()];
@@ -124,8 +124,18 @@ pub fn fit(model: &Model<'_>, votes: &[u32], start: Vector3<f64>) -> Option<Fit>
     }
     let cholesky = here.information.cholesky()?;
     let ln_information = 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
-    let finite = point.iter().all(|number| number.is_finite());
-    finite.then(|| Fit { point, covariance: cholesky.inverse(), energy: here.energy + ln_information, chi2: here.chi2 })
+    is_in_range(model, votes, &point).then(|| Fit {
+        point,
+        covariance: cholesky.inverse(),
+        energy: here.energy + ln_information,
+        chi2: here.chi2,
+    })
+}
+
+/// Whether any of some votes is cast from within the range.
+fn is_in_range(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> bool {
+    let range_m = model.settings.viability.max_range_m;
+    votes.iter().any(|&ray| (model.scene.ray(ray).center - point).norm() <= range_m)
 }
 
 /// Set weights to Huber's of some squared residuals; whether any is another one now.
