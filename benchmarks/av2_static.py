@@ -31,7 +31,9 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from field_data import (
+    Change,
     Figures,
+    as_it_is,
     cameras_of,
     command_line,
     dataset_of,
@@ -150,13 +152,13 @@ def score_labels(
     }
 
 
-def run(data_dir: Path, config: MapConfig) -> dict[str, Figures]:
+def run(data_dir: Path, config: MapConfig, change: Change = as_it_is) -> dict[str, Figures]:
     """Map and score each log, all of them together, and each class of them together."""
     parts: list[tuple[str, Floats, NDArray[Any], Floats, NDArray[Any], Bools]] = []
     results: dict[str, Figures] = {}
     seconds = 0.0
     for number, log in enumerate(logs(data_dir)):
-        result, took = timed_map(load(data_dir, log), config)
+        result, took = timed_map(change(load(data_dir, log)), config)
         truth = read_columns(data_dir / log / "gt_city.csv")
         apart = np.array([1e6 * number, 0.0, 0.0])  # So that no object of one log is near a label of another.
         part = (

@@ -46,7 +46,9 @@ from scipy.stats import chi2
 
 from field_data import (
     PANORAMA_SIZE_PX,
+    Change,
     Figures,
+    as_it_is,
     command_line,
     dataset_of,
     enu,
@@ -167,9 +169,9 @@ def score_peer(data_dir: Path) -> Figures:
     return score_labels(enu(sites["lat"], sites["lon"], anchor_of(data_dir))[:, :2], covariance, *truth(data_dir))
 
 
-def run(data_dir: Path, config: MapConfig) -> dict[str, Figures]:
+def run(data_dir: Path, config: MapConfig, change: Change = as_it_is) -> dict[str, Figures]:
     """Map and score."""
-    result, seconds = timed_map(load(data_dir), config)
+    result, seconds = timed_map(change(load(data_dir)), config)
     xx, xy, _, yy, _, _ = result.labels.covariance_m2.T
     covariance = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
     figures = score_labels(result.labels.position_in_world_m[:, :2], covariance, *truth(data_dir))

@@ -1,15 +1,18 @@
 """All benchmarks on real data with one command: what the default method does outside our own cities.
 
-    python benchmarks/field.py DATA_ROOT [--only NAME ...] [--laws] [--json FILE] [--method NAME] [--set name=value ...]
+    python benchmarks/field.py DATA_ROOT [--only NAME ...] [--laws] [--thinned TIMES] [--json FILE] [--method NAME]
+                               [--set name=value ...]
 
 DATA_ROOT has a folder a data set, named as here; what each holds and what is counted stands at the top of the script of
-that name. A data set whose folder is not there is said and left out. With --laws the laws of `laws.py` follow: shuffled
-ids, renamed passes, a world of another size.
+that name. A data set whose folder is not there is said and left out. With --thinned each is mapped TIMES times more,
+each time without another tenth of its detections: how much the figures are chance. With --laws the laws of `laws.py`
+follow: shuffled ids, renamed passes, a world of another size.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 import time
 from collections.abc import Callable
@@ -18,6 +21,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import av2_static
 import bend_ramps
 import kitti_signs
@@ -25,19 +30,23 @@ import kitti_ts
 import laws
 import london_tl
 import peers
-from field_data import Figures
+from field_data import Change, Figures, as_it_is
 from machine import describe_machine, keep_record
 from valuemap.config import MapConfig
+from valuemap.dataset import Dataset
 from valuemap.errors import InputError, ValuemapError
 from valuemap.system import peak_memory_mb
 
-RUNS: dict[str, Callable[[Path, MapConfig], dict[str, Figures]]] = {
+RUNS: dict[str, Callable[[Path, MapConfig, Change], dict[str, Figures]]] = {
     "kitti_signs": kitti_signs.run,
     "av2_static": av2_static.run,
     "london_tl": london_tl.run,
     "kitti_ts": kitti_ts.run,
     "bend_ramps": bend_ramps.run,
 }
+
+LEFT_OUT = 0.1
+"""The share of the detections that is left out of what is thinned."""
 
 SHOWN: dict[str, tuple[tuple[str, str, str], ...]] = {
     "kitti_signs": (
@@ -84,21 +93,55 @@ SHOWN: dict[str, tuple[tuple[str, str, str], ...]] = {
 
 def run(data_root: Path, config: MapConfig, only: list[str] | None = None) -> dict[str, dict[str, Figures]]:
     """Run the benchmarks named, or all whose data is there; return figures by data set and part."""
-    names = only or [name for name in RUNS if (data_root / name).is_dir()]
-    if not names:
-        raise InputError(f"{data_root}: none of {', '.join(RUNS)} in it", hint="give the folder that holds the data")
+    names = _names(data_root, only)
     for name in RUNS:
         if name not in names:
             print(f"left out: {name}", file=sys.stderr)
     results = {}
     for name in names:
         start = time.perf_counter()
-        results[name] = RUNS[name](data_root / name, config)
+        results[name] = RUNS[name](data_root / name, config, as_it_is)
         total = list(results[name].values())[-1]
         print(_lines(name, total, time.perf_counter() - start), flush=True)
         if name == "av2_static":
             print(_by_class(results[name]), flush=True)
     return results
+
+
+def _names(data_root: Path, only: list[str] | None) -> list[str]:
+    names = only or [name for name in RUNS if (data_root / name).is_dir()]
+    if not names:
+        raise InputError(f"{data_root}: none of {', '.join(RUNS)} in it", hint="give the folder that holds the data")
+    return names
+
+
+def run_thinned(
+    data_root: Path, config: MapConfig, only: list[str] | None, times: int
+) -> dict[str, dict[str, list[float | None]]]:
+    """Run the same as often, each time without another tenth of the detections; return what each figure was."""
+    names = _names(data_root, only)
+    jobs = [(data_root / name, config, seed) for name in names for seed in range(times)]
+    with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
+        totals = list(pool.map(_run_thin, jobs))
+    results = {}
+    for row, name in enumerate(names):
+        of_name = totals[row * times : (row + 1) * times]
+        results[name] = {figure: [total[figure] for total in of_name] for figure, *_ in SHOWN[name]}
+        print(f"{name}, thinned {times} times: least, middle and most")
+        for figure, words, goal in SHOWN[name]:
+            found = np.array([np.nan if value is None else value for value in results[name][figure]])
+            print(f"    {words:28}{found.min():>9.4g}{np.median(found):>9.4g}{found.max():>9.4g}  {goal}")
+    return results
+
+
+def _run_thin(job: tuple[Path, MapConfig, int]) -> Figures:
+    data_dir, config, seed = job
+
+    def thin(dataset: Dataset) -> Dataset:
+        is_kept = np.random.default_rng(seed).random(len(dataset.detections)) >= LEFT_OUT
+        return dataclasses.replace(dataset, detections=dataset.detections.take(is_kept))
+
+    return list(RUNS[data_dir.name](data_dir, config, thin).values())[-1]
 
 
 def _lines(name: str, total: dict[str, Any], seconds: float) -> str:
@@ -164,7 +207,7 @@ def _measure(data_dir: Path, part: str, method: str) -> tuple[Figures, float, in
         if part == "london_tl":
             results = london_tl.run(data_dir, config, with_range=True)
         else:
-            results = RUNS[part.split()[0]](data_dir, config)
+            results = RUNS[part.split()[0]](data_dir, config, as_it_is)
         found = list(results.values())[-1]
     else:
         found = peers.PEERS[part][method](data_dir, part)
@@ -177,6 +220,7 @@ def main() -> int:
     parser.add_argument("data_root", type=Path, metavar="DATA_ROOT")
     parser.add_argument("--only", nargs="+", choices=list(RUNS), metavar="NAME", help=f"of {', '.join(RUNS)}")
     parser.add_argument("--laws", action="store_true", help="check laws that no map may break as well; slow")
+    parser.add_argument("--thinned", type=int, metavar="TIMES", help="and so often without a tenth of the detections")
     parser.add_argument("--peers", type=Path, metavar="FILE", help="compare with other methods; a table in Markdown")
     parser.add_argument("--json", type=Path, help="write all figures, settings and machine there")
     parser.add_argument("--method", default=MapConfig().method)
@@ -193,10 +237,13 @@ def main() -> int:
         config = MapConfig(method=options.method).with_settings(options.settings)
         results = run(options.data_root, config, options.only)
         kept = laws.run(options.data_root, config, options.only) if options.laws else {}
+        thinned = run_thinned(options.data_root, config, options.only, options.thinned) if options.thinned else {}
         settings = "".join(f" --set {assignment}" for assignment in options.settings)
-        command = f"python benchmarks/field.py DATA_ROOT --method {options.method}{settings}"
+        times = f" --thinned {options.thinned}" if options.thinned else ""
+        command = f"python benchmarks/field.py DATA_ROOT --method {options.method}{times}{settings}"
         record = {"benchmark": "field", "command": command, **describe_machine(), "settings": config.as_dict()}
-        keep_record(options.json, {**record, "results": results, **({"laws": kept} if kept else {})})
+        more = {name: value for name, value in (("laws", kept), ("thinned", thinned)) if value}
+        keep_record(options.json, {**record, "results": results, **more})
     except ValuemapError as error:
         print(f"error: {error}\nhint: {error.hint}", file=sys.stderr)
         return 1

@@ -125,6 +125,14 @@ def dataset_of(
     )
 
 
+Change = Callable[[Dataset], Dataset]
+
+
+def as_it_is(dataset: Dataset) -> Dataset:
+    """Return the dataset."""
+    return dataset
+
+
 def timed_map(dataset: Dataset, config: MapConfig) -> tuple[Map, float]:
     """Return the map of a dataset and the seconds that it took."""
     start = time.perf_counter()

@@ -37,6 +37,7 @@ from pyarrow import csv
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
+from field_data import Change, as_it_is
 from machine import describe_machine, keep_record
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, write_dataset
@@ -141,15 +142,17 @@ def import_sequence(data_dir: Path, sequence: str) -> Dataset:
     )
 
 
-def run(data_dir: Path, config: MapConfig) -> dict[str, dict[str, Any]]:
+def run(data_dir: Path, config: MapConfig, change: Change = as_it_is) -> dict[str, dict[str, Any]]:
     """Map and score every sequence, and all together."""
-    scores = {sequence: run_sequence(data_dir, sequence, config, None) for sequence in SEQUENCES}
+    scores = {sequence: run_sequence(data_dir, sequence, config, None, change) for sequence in SEQUENCES}
     return {name: score.to_json() for name, score in {**scores, "total": add_up(scores)}.items()}
 
 
-def run_sequence(data_dir: Path, sequence: str, config: MapConfig, out: Path | None) -> Score:
+def run_sequence(
+    data_dir: Path, sequence: str, config: MapConfig, out: Path | None, change: Change = as_it_is
+) -> Score:
     """Import, map and evaluate one sequence; keep dataset and map under `out`."""
-    dataset = import_sequence(data_dir, sequence)
+    dataset = change(import_sequence(data_dir, sequence))
     start = time.perf_counter()
     result = build_map(dataset, config)
     seconds = time.perf_counter() - start

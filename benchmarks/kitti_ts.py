@@ -26,7 +26,9 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from field_data import (
+    Change,
     Figures,
+    as_it_is,
     cameras_of,
     command_line,
     dataset_of,
@@ -111,9 +113,9 @@ def score_labels(labels: Floats, label_class: NDArray[Any], signs: Floats, sign_
     }
 
 
-def run(data_dir: Path, config: MapConfig) -> dict[str, Figures]:
+def run(data_dir: Path, config: MapConfig, change: Change = as_it_is) -> dict[str, Figures]:
     """Map and score."""
-    result, seconds = timed_map(load(data_dir), config)
+    result, seconds = timed_map(change(load(data_dir)), config)
     names = np.array(result.labels.class_name.names, str)[result.labels.class_name.codes]
     figures = score_labels(result.labels.position_in_world_m[:, :2], names, *truth(data_dir))
     return {"kitti_ts": {**figures, "map_seconds": round(seconds, 2)}}

@@ -26,7 +26,9 @@ from scipy.spatial.distance import cdist
 
 from field_data import (
     PANORAMA_SIZE_PX,
+    Change,
     Figures,
+    as_it_is,
     command_line,
     dataset_of,
     enu,
@@ -112,9 +114,11 @@ def score_labels(labels: Floats, lights: Floats) -> Figures:
     return figures
 
 
-def run(data_dir: Path, config: MapConfig, *, with_range: bool = False) -> dict[str, Figures]:
+def run(
+    data_dir: Path, config: MapConfig, change: Change = as_it_is, *, with_range: bool = False
+) -> dict[str, Figures]:
     """Map and score."""
-    result, seconds = timed_map(load(data_dir, with_range=with_range), config)
+    result, seconds = timed_map(change(load(data_dir, with_range=with_range)), config)
     figures = score_labels(result.labels.position_in_world_m[:, :2], truth(data_dir))
     return {"london": {**figures, "map_seconds": round(seconds, 2)}}
 
