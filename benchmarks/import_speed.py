@@ -1,19 +1,18 @@
-"""How long an import takes, and how much memory: COLMAP's model and COCO boxes, and tables of images and boxes.
+"""How long an import takes, and how much memory: COLMAP's model with COCO boxes, and tables of images and boxes.
 
-    python benchmarks/import_speed.py [--images N] [--detections N] [--rows N] [--points N] [--json FILE]
+    python benchmarks/import_speed.py [--images N] [--detections N ...] [--points N] [--json FILE]
 
-Writes a model (cameras, images with observations of points, rigs and frames, as COLMAP 4 does) and a COCO file into a
-temporary folder, and runs `valuemap import colmap` on them as a process of its own. Then `valuemap import csv` with a
-table of images and boxes in any order in a table, ten an image, and the same with boxes in a COCO file; each with a
-thirtieth of the boxes, too, so that what a box takes is told apart from what Python takes. It reports seconds,
-processor seconds and peak memory, and how many processes wanted the processors meanwhile. The dataset that comes out is
-read back and counted.
+Writes a model (cameras, images with observations of points, rigs and frames, as COLMAP 4 does) and COCO files of
+several sizes into a temporary folder, and runs `valuemap import colmap` on them as processes of their own; then
+`valuemap import csv` with a table of the images, and tables of boxes in any order. All have the same images, so that
+what a box takes is told apart from the rest; the fewest boxes are imported with three times the images, too, which says
+what an image takes. It reports seconds, processor seconds and peak memory, and how many processes wanted the processors
+meanwhile. The dataset that comes out is read back and counted.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import os
 import struct
@@ -27,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from machine import describe_machine, keep_record
-from valuemap.dataset import read_dataset
+from valuemap.portions import DatasetReader
 
 _STEP_M = 2.0
 _IMAGES_OF_A_PASS = 1000
@@ -108,10 +107,10 @@ def run_import(folder: Path, *what: str) -> dict[str, Any]:
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     seconds = time.perf_counter() - start
     processor_s, peak_mb = json.loads(done.stderr.splitlines()[-1])
-    dataset = read_dataset(folder / "dataset")
+    dataset = DatasetReader(folder / "dataset")
     return {
-        "images": len(dataset.images),
-        "detections": len(dataset.detections),
+        "images": sum(map(len, dataset.images())),
+        "detections": sum(map(len, dataset.detections())),
         "seconds": round(seconds, 1),
         "processor_seconds": processor_s,
         "peak_memory_mb": peak_mb,
@@ -133,41 +132,52 @@ main()
 """
 
 
+def import_colmap(images: int, detections: int, points: int) -> dict[str, Any]:
+    """Import a model and a COCO file that are written for it."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_model(folder / "model", images, points)
+        write_coco(folder / "boxes.json", images, detections)
+        sizes = {path.name: path.stat().st_size for path in (folder / "model" / "images.bin", folder / "boxes.json")}
+        took = run_import(folder, "colmap", str(folder / "model"), "--detections", str(folder / "boxes.json"))
+    return {"points_per_image": points, "bytes": sizes, **took}
+
+
+def import_csv(images: int, detections: int, _points: int) -> dict[str, Any]:
+    """Import tables that are written for it."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_tables(folder / "tables", images, detections)
+        tables = [folder / "tables" / f"{which}.csv" for which in ("images", "boxes")]
+        sizes = {path.name: path.stat().st_size for path in tables}
+        return {"bytes": sizes, **run_import(folder, "csv", str(tables[0]), "--detections", str(tables[1]))}
+
+
 def main() -> int:
     """Run the benchmark; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--images", type=int, default=100_000)
-    parser.add_argument("--detections", type=int, default=1_000_000)
+    parser.add_argument("--detections", type=int, nargs="+", default=[1_000_000, 3_000_000, 10_000_000])
     parser.add_argument("--points", type=int, default=200, help="observations of points an image, which are not needed")
-    parser.add_argument("--rows", type=int, default=3_000_000, help="boxes in a table")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
+    counts = sorted(options.detections)
+    sizes = [(3 * options.images, counts[0]), *((options.images, count) for count in counts)]
     results: dict[str, Any] = {}
-    expected: dict[str, tuple[int, int]] = {"colmap": (options.images, options.detections)}
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        write_model(folder / "model", options.images, options.points)
-        write_coco(folder / "boxes.json", options.images, options.detections)
-        sizes = {path.name: path.stat().st_size for path in (folder / "model" / "images.bin", folder / "boxes.json")}
-        took = run_import(folder, "colmap", str(folder / "model"), "--detections", str(folder / "boxes.json"))
-        results["colmap"] = {"points_per_image": options.points, "bytes": sizes, **took}
-        print(json.dumps(results["colmap"]), flush=True)
-    for kind, rows in itertools.product(("csv", "coco"), (options.rows // 30, options.rows)):
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            write_tables(folder / "tables", rows // 10, rows)
-            images, boxes = (folder / "tables" / f"{which}.csv" for which in ("images", "boxes"))
-            if kind == "coco":
-                boxes = folder / "boxes.json"
-                write_coco(boxes, rows // 10, rows)
-            size = boxes.stat().st_size
-            took = run_import(folder, "csv", str(images), "--detections", str(boxes))
-            results[f"{kind} {rows}"], expected[f"{kind} {rows}"] = {"bytes": size, **took}, (rows // 10, rows)
-            print(kind, json.dumps(results[f"{kind} {rows}"]), flush=True)
-    for kind in ("csv", "coco"):
-        few, many = (results[f"{kind} {rows}"] for rows in (options.rows // 30, options.rows))
-        grown_mb = many["peak_memory_mb"] - few["peak_memory_mb"]
-        results[f"{kind}_mb_per_million_rows"] = round(1e6 * grown_mb / (many["detections"] - few["detections"]))
+    is_right = True
+    for kind, run in (("colmap and coco", import_colmap), ("csv", import_csv)):
+        found = []
+        for images, detections in sizes:
+            took = run(images, detections, options.points)
+            is_right &= (took["images"], took["detections"]) == (images, detections)
+            found.append(took)
+            print(kind, json.dumps(took), flush=True)
+        more_images, few, many = found[0], found[1], found[-1]
+        results[kind] = {
+            "runs": found,
+            "bytes_per_image": _per(more_images, few, "images"),
+            "bytes_per_detection": _per(many, few, "detections") if many is not few else None,
+        }
     keep_record(
         options.json,
         {
@@ -178,7 +188,12 @@ def main() -> int:
             "results": results,
         },
     )
-    return int(any((results[key]["images"], results[key]["detections"]) != size for key, size in expected.items()))
+    return int(not is_right)
+
+
+def _per(more: dict[str, Any], few: dict[str, Any], what: str) -> int:
+    """Return how many bytes the peak grows by for each image or detection more."""
+    return round(2**20 * (more["peak_memory_mb"] - few["peak_memory_mb"]) / (more[what] - few[what]))
 
 
 if __name__ == "__main__":

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import json
+import os
 import sys
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import valuemap
-from valuemap import csv_table, json_lists
-from valuemap.errors import InputError
+from valuemap import csv_table, json_lists, tables
+from valuemap.errors import InputError, OutputError
 from valuemap.json_lists import read_json_lists
-from valuemap.readers import READERS, vet
+from valuemap.readers import READERS, boxes, row_file, vet
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.detections.coco import read_coco
 from valuemap.readers.texts import Texts
@@ -51,12 +57,20 @@ def imported(folder: Path, out: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in out.glob("*.parquet")}
 
 
+def in_small_portions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let what is in memory together be a few rows, so that there are many portions, parts and blocks."""
+    monkeypatch.setattr(row_file, "PORTION", 77)
+    monkeypatch.setattr(row_file.KeyBounds, "_STEP", 3)
+    monkeypatch.setattr(json_lists, "PORTION", 31)
+    monkeypatch.setattr(csv_table, "_BLOCK", 999)
+    monkeypatch.setattr(csv_table, "_START", 1000)
+
+
 def test_an_import_in_blocks_and_portions_is_that_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write(tmp_path / "data")
     at_once = imported(folder, tmp_path / "whole")
     assert "rejected.parquet" in at_once
-    monkeypatch.setattr(csv_table, "_START", 1000)
-    monkeypatch.setattr(vet, "_PORTION", 7)
+    in_small_portions(monkeypatch)
     assert imported(folder, tmp_path / "parts") == at_once
     rejected = valuemap.read_dataset(tmp_path / "parts").rejected
     assert rejected is not None
@@ -112,7 +126,7 @@ def test_as_many_reasons_as_rows_are_told_apart() -> None:
     for row in range(300):
         why.mark(np.arange(300) == row, vet._Reason(f"reason {row}", "hint"))
     assert [why.reasons[code].text for code in why.code.tolist()] == [f"reason {row}" for row in range(300)]
-    why.mark(np.ones(2, np.bool_), vet._Reason("late", "hint"), slice(298, 300))
+    why.mark(np.arange(300) >= 298, vet._Reason("late", "hint"))
     assert why.reasons[why.code[299]].text == "reason 299"
 
 
@@ -140,7 +154,7 @@ def coco(folder: Path, *, results: bool = False, after: int = 0) -> Path:
     rows = [line.split(",") for line in lines]
     images = [{"id": 100 - i, "file_name": f"{i // 20}/{i}.jpg", "width": 640, "height": 480} for i in range(40)]
     number = {image["file_name"]: image["id"] for image in images}
-    boxes: list[Any] = [
+    entries: list[Any] = [
         {
             "image_id": name if results else number.get(name, 7),
             "category_id": {"light": 1, " sign ": 2}.get(kind, 9),
@@ -150,12 +164,12 @@ def coco(folder: Path, *, results: bool = False, after: int = 0) -> Path:
         }
         for name, kind, left, top, width, height, score, _ in rows
     ]
-    boxes[11]["bbox"], boxes[12]["score"] = [1, 2, None, float("nan")], "high"
-    content: Any = boxes
+    entries[11]["bbox"], entries[12]["score"] = [1, 2, None, float("nan")], "high"
+    content: Any = entries
     if not results:
-        boxes = [{**box, "id": 5 * i} for i, box in enumerate(boxes)]
+        entries = [{**box, "id": 5 * i} for i, box in enumerate(entries)]
         categories = [{"id": 1, "name": "light"}, {"id": 2, "name": "sign"}]
-        content = {"info": {"a": [1, {}]}, "annotations": boxes, "licenses": [[], {}], "images": images, "x": []}
+        content = {"info": {"a": [1, {}]}, "annotations": entries, "licenses": [[], {}], "images": images, "x": []}
         content |= {"categories": categories, "y": 1e5}
     path = folder / "boxes.json"
     path.write_text(json.dumps(content, indent=1, ensure_ascii=False))
@@ -187,15 +201,122 @@ def test_an_import_of_coco_in_portions_is_that_at_once(
     assert list(data.detections.detection_id[:3]) == ([0, 1, 2] if results else [0, 5, 10])
 
 
+def many(folder: Path, count: int, kind: str) -> Path:
+    """Write so many boxes in 40 images, one in a hundred of which cannot be used, and one of which is there twice."""
+    random = np.random.default_rng(6)
+    image = random.integers(0, 40, count).tolist()
+    box = random.uniform([0, 0, 5, 5, 0], [600, 440, 40, 40, 1], (count, 5)).round(4).tolist()
+    box[100:count:100] = [[-50.0, *values[1:]] for values in box[100:count:100]]
+    box[50:count:100], image[50:count:100] = box[49:count:100], image[49:count:100]
+    if kind == "csv":
+        lines = [f"{i // 20}/{i}.jpg,light,{','.join(map(str, b))}" for i, b in zip(image, box, strict=True)]
+        path, text = folder / f"{count}.csv", "\n".join(["image,class,left,top,width,height,score", *lines])
+    else:
+        ids = random.permutation(count).tolist()
+        names = [{"id": i, "file_name": f"{i // 20}/{i}.jpg"} for i in range(40)]
+        entries = [
+            {"id": number, "image_id": i, "category_id": 1, "bbox": b[:4], "score": b[4]}
+            for number, i, b in zip(ids, image, box, strict=True)
+        ]
+        content = {"images": names, "categories": [{"id": 1, "name": "light"}], "annotations": entries}
+        path, text = folder / f"{count}.json", json.dumps(content)
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["csv", "coco"])
+def test_memory_does_not_grow_with_the_boxes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    poses = write(tmp_path / "data") / "poses.csv"
+    in_small_portions(monkeypatch)
+    monkeypatch.setattr(row_file, "PORTION", 1000)
+    monkeypatch.setattr(csv_table, "_BLOCK", 20_000)
+    monkeypatch.setattr(json_lists, "_BLOCK", 20_000)
+    monkeypatch.setattr(tables, "ROWS_OF_GROUP", 1000)
+
+    in_arrow: list[int] = []
+    append = row_file.RowFile.append
+
+    def looking(self: row_file.RowFile, rows: row_file.Rows) -> None:
+        in_arrow.append(pa.total_allocated_bytes())
+        append(self, rows)
+
+    monkeypatch.setattr(row_file.RowFile, "append", looking)
+
+    def peak(count: int) -> tuple[int, int]:
+        """Return the peak of what Python held, and of what Arrow held where portions are put away."""
+        path = many(tmp_path, count, kind)
+        in_arrow.clear()
+        tracemalloc.start()
+        found = READERS["csv"].in_portions(poses, detections=path, max_rejected=0.05)
+        found.write(tmp_path / f"out {count}")
+        python = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return python, max(in_arrow)
+
+    few, more = peak(10_000), peak(60_000)
+    # What is between the portions: 24 bytes for each row that is left out, and where parts and groups are.
+    assert more[0] - few[0] < 8 * 50_000
+    assert more[1] < 1.5 * few[1] + 10_000
+    # The same with all in one portion, and of a table in one block.
+    monkeypatch.setattr(row_file, "PORTION", 10**6)
+    monkeypatch.setattr(csv_table, "_BLOCK", 10**9)
+    whole = peak(60_000)
+    assert whole[0] - few[0] > 50 * 50_000
+    assert (whole[1] > 3 * more[1]) == (kind == "csv")
+
+
+def test_files_are_the_same_however_detections_come(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write(tmp_path / "data")
+    monkeypatch.setattr(tables, "ROWS_OF_GROUP", 300)
+    in_small_portions(monkeypatch)
+    found = READERS["csv"].in_portions(folder / "poses.csv", detections=folder / "boxes.csv", max_rejected=0.05)
+    found.write(tmp_path / "streamed" / "city")
+    valuemap.write_dataset(replace(found.whole(), name="city"), tmp_path / "whole" / "city")
+    names = sorted(path.name for path in (tmp_path / "whole" / "city").iterdir())
+    assert "rejected.parquet" in names
+    for name in names:
+        assert (tmp_path / "streamed" / "city" / name).read_bytes() == (tmp_path / "whole" / "city" / name).read_bytes()
+    assert pq.ParquetFile(tmp_path / "streamed" / "city" / "detections.parquet").num_row_groups == 7
+
+
+def test_no_room_for_temporary_files_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Full(io.BytesIO):
+        def flush(self) -> None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    folder = write(tmp_path / "data")
+    monkeypatch.setattr("tempfile.TemporaryFile", Full)
+    with pytest.raises(OutputError, match="cannot be written: No space left on device") as told:
+        imported(folder, tmp_path / "out")
+    assert "TMPDIR" in told.value.hint
+
+
+def test_ids_that_do_not_ascend_are_told_apart_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    in_small_portions(monkeypatch)
+    random = np.random.default_rng(8)
+    for repeat in (False, True):
+        ids = random.permutation(2**40 + np.arange(1000) ** 3)
+        if repeat:
+            ids[977] = ids[13]
+        rows = row_file.RowFile(boxes.structure(("detection_id",)))
+        for first in range(0, 1000, 90):
+            portion = np.zeros(len(ids[first : first + 90]), rows.dtype)
+            portion["detection_id"] = ids[first : first + 90]
+            rows.append(portion)
+        distinct, bounds = boxes.are_distinct(rows)
+        assert distinct != repeat
+        assert 1 < len(bounds) < 100
+
+
 def test_a_large_coco_file_is_never_in_memory_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = coco(write(tmp_path / "data"))
     monkeypatch.setattr(json_lists, "_BLOCK", 2**14)
     monkeypatch.setattr(json_lists, "PORTION", 20)
     tracemalloc.start()
-    boxes = read_coco(DetectionFile(path))
+    found = read_coco(DetectionFile(path))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert len(boxes.score) == 2000
+    assert len(found.rows) == 2000
     assert peak < path.stat().st_size / 4
 
 
@@ -230,8 +351,8 @@ def test_of_lists_of_one_name_the_last_counts(tmp_path: Path) -> None:
     path.write_text(
         path.read_text().rstrip()[:-1] + f', "annotations": [{box}], "images": 3, "images": [], "images": []}}'
     )
-    boxes = read_coco(DetectionFile(path))
-    assert (len(boxes.score), boxes.other_names, list(boxes.image_names)) == (1, [], ["image_id 100"])
+    found = read_coco(DetectionFile(path))
+    assert (len(found.rows), found.other_names, list(found.image_names)) == (1, [], ["image_id 100"])
 
 
 def in_portions(path: Path) -> Any:

@@ -41,7 +41,7 @@ def assembled(found: FoundBoxes, images: Images | None = None, **options: Any) -
         anchor=None,
         source="here",
         **options,
-    )
+    ).whole()
 
 
 def spoilt(values: Any, row: int, value: Any) -> Any:

@@ -7,8 +7,9 @@ import csv
 import gzip
 import io
 import math
+import re
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,31 +39,68 @@ def read_csv_arrow(
     InputError
         The file is empty or no CSV, or a value is not of its type; `hint` says what is expected.
     """
+    found = read_csv_portions(path, types, has_missing=has_missing, hint=hint, bad_numbers_are_nan=bad_numbers_are_nan)
+    return _joined(list(found))
+
+
+def read_csv_portions(
+    path: Path, types: Mapping[str, pa.DataType], *, has_missing: bool, hint: str, bad_numbers_are_nan: bool = False
+) -> Iterator[pa.Table]:
+    """Yield a CSV file as `read_csv_arrow` reads it, a large plain text in portions; there is at least one.
+
+    Columns of a large one that `types` does not name are bytes.
+    """
+    names: list[str] | None = None
+    rows = 0
     try:
         start = _start_of_large(path)
         content = start or _read_text_bytes(path, hint)
-        source = path if start else content
-        separator, names = _header(content)
-        type_of = _types_by_header(names, types)
+        separator, header = _header(content)
+        # What others are would be guessed anew from each portion.
+        type_of = dict.fromkeys(header if start else (), pa.binary()) | _types_by_header(header, types)
         options: dict[str, Any] = {
             "column_types": type_of,
             "null_values": None if has_missing else [],
             "strings_can_be_null": has_missing,
         }
-        try:
-            table = _parse_csv(source, separator, options)
-        except pa.ArrowInvalid:
-            table = _parse_odd_csv(source, separator, options, bad_numbers_are_nan)
-        exact = {name.strip() for name in table.column_names}
-        same = {name.lower(): name for name in types if name not in exact}
-        table = table.rename_columns([same.get(name.strip().lower(), name.strip()) for name in table.column_names])
+        for block in _blocks(path) if start else [content]:
+            try:
+                table = _parse_csv(block, separator, options, names)
+            except pa.ArrowInvalid:
+                table = _parse_odd_csv(block, separator, options, names, bad_numbers_are_nan)
+            names = names or table.column_names
+            exact = {name.strip() for name in names}
+            same = {name.lower(): name for name in types if name not in exact}
+            table = table.rename_columns([same.get(name.strip().lower(), name.strip()) for name in names])
+            # Where a quote in the header line is not closed, its columns are not those that the types were given for.
+            if any(field.type != types.get(field.name, field.type) for field in table.schema):
+                raise InputError(f"{path}: the first line has a quotation mark that is not closed", hint=hint)
+            rows += len(table)
+            yield table
     except (pa.ArrowException, OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
-        reason = str(error).splitlines()[0]
+        # A portion begins behind the header line, but for the first.
+        reason = _ROW.sub(lambda row: f"Row #{int(row[1]) + (rows + 1 if names else 0)}", str(error).splitlines()[0])
         raise InputError(f"{path}: cannot be read as CSV: {reason}", hint=_better_hint(path, hint)) from error
-    # Where a quote in the header line is not closed, its columns are not those that the types were given for.
-    if any(field.type != types.get(field.name, field.type) for field in table.schema):
-        raise InputError(f"{path}: the first line has a quotation mark that is not closed", hint=hint)
-    return table
+
+
+def _blocks(path: Path) -> Iterator[bytes]:
+    """Yield a text in blocks of whole lines."""
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            yield block + file.readline()
+
+
+def _joined(tables: list[pa.Table]) -> pa.Table:
+    """Return portions as one table that says which fields are no numbers."""
+    if len(tables) == 1:
+        return tables[0]
+    first = np.cumsum([0, *map(len, tables)])
+    fields = []
+    for column, field in enumerate(tables[0].schema):
+        odd = [_odd_fields(table.schema.field(column)) for table in tables]
+        rows = np.concatenate([at + found for at, (found, _) in zip(first, odd, strict=False)])
+        fields.append(field.with_metadata(_metadata(rows, next((text for found, text in odd if len(found)), ""))))
+    return pa.concat_tables([table.cast(pa.schema(fields)) for table in tables])
 
 
 def _start_of_large(path: Path) -> bytes | None:
@@ -85,8 +123,16 @@ def _start_of_large(path: Path) -> bytes | None:
 
 def odd_fields(table: pa.Table, name: str) -> tuple[NDArray[np.int64], str]:
     """Return the rows of the fields of a column of numbers that are other texts, and the first of these."""
-    found = table.schema.field(name).metadata or {}
+    return _odd_fields(table.schema.field(name))
+
+
+def _odd_fields(field: pa.Field) -> tuple[NDArray[np.int64], str]:
+    found = field.metadata or {}
     return np.frombuffer(found.get(_ODD_ROWS, b""), dtype=np.int64), found.get(_ODD, b"").decode("utf-8", "replace")
+
+
+def _metadata(odd_rows: NDArray[np.int64], text: str) -> dict[bytes, bytes] | None:
+    return {_ODD: text.encode(), _ODD_ROWS: odd_rows.tobytes()} if len(odd_rows) else None
 
 
 _ODD, _ODD_ROWS = b"valuemap: first field that is no number", b"valuemap: rows of fields that are no numbers"
@@ -152,6 +198,9 @@ _MOST_UNPACKED_TIMES = 100
 _ALWAYS_UNPACKED = 64 * 2**20
 _START = 2**20
 """Files of no more bytes are read at once."""
+_BLOCK = 2**24
+"""Bytes of a larger file that are read together."""
+_ROW = re.compile(r"Row #(\d+)")
 _NO_TEXT = (b"PK\3\4", b"PAR1")
 _SEPARATORS = b" \t\r\n,;"
 _LOOKED_AT = 1000
@@ -173,29 +222,29 @@ def _types_by_header(names: Sequence[str], types: Mapping[str, pa.DataType]) -> 
     return {name: types[wanted] for name, wanted in found.items() if wanted in types}
 
 
-def _parse_csv(source: bytes | Path, separator: str, options: Mapping[str, Any]) -> pa.Table:
-    with source.open("rb") if isinstance(source, Path) else pa.BufferReader(source) as file:
-        return pa_csv.read_csv(
-            file,
-            read_options=pa_csv.ReadOptions(use_threads=False),  # Else errors do not say the row.
-            parse_options=pa_csv.ParseOptions(delimiter=separator),
-            convert_options=pa_csv.ConvertOptions(**options),
-        )
+def _parse_csv(source: bytes, separator: str, options: Mapping[str, Any], names: list[str] | None) -> pa.Table:
+    """Read what begins with a header line, or has columns of these names."""
+    return pa_csv.read_csv(
+        pa.BufferReader(source),
+        read_options=pa_csv.ReadOptions(use_threads=False, column_names=names),  # With threads errors say no row.
+        parse_options=pa_csv.ParseOptions(delimiter=separator),
+        convert_options=pa_csv.ConvertOptions(**options),
+    )
 
 
 def _parse_odd_csv(
-    source: bytes | Path, separator: str, options: dict[str, Any], bad_numbers_are_nan: bool
+    source: bytes, separator: str, options: dict[str, Any], names: list[str] | None, bad_numbers_are_nan: bool
 ) -> pa.Table:
     """Read what cannot be read at once: decimal commas, or fields that should be numbers and are none."""
     decimal = "." if separator == "," else ","
     try:
-        return _parse_csv(source, separator, {**options, "decimal_point": decimal})
+        return _parse_csv(source, separator, {**options, "decimal_point": decimal}, names)
     except pa.ArrowInvalid:
         if not bad_numbers_are_nan:
             raise
     type_of: dict[str, pa.DataType] = options["column_types"]
     as_texts = {name: pa.string() if kind == pa.float64() else kind for name, kind in type_of.items()}
-    table = _parse_csv(source, separator, {**options, "column_types": as_texts})
+    table = _parse_csv(source, separator, {**options, "column_types": as_texts}, names)
     for name, kind in type_of.items():
         if kind == pa.float64() and table.column_names.count(name) == 1:
             texts = table.column(name).to_pylist()
@@ -205,7 +254,7 @@ def _parse_odd_csv(
                 for row in np.flatnonzero(np.isnan(values)).tolist()
                 if (texts[row] or "").strip().lower() not in _NOTHING
             ]
-            metadata = {_ODD: texts[odd[0]].strip()[:40], _ODD_ROWS: np.array(odd).tobytes()} if odd else None
+            metadata = _metadata(np.array(odd, np.int64), texts[odd[0]].strip()[:40] if odd else "")
             field = pa.field(name, pa.float64(), metadata=metadata)
             table = table.set_column(table.column_names.index(name), field, numbers_to_arrow(values))
     return table

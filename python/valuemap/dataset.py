@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -34,6 +34,7 @@ from valuemap.tables import (
     Truth,
     TruthDetections,
     check_table,
+    in_groups,
     read_table,
     write_table,
 )
@@ -228,13 +229,49 @@ def write_dataset_in_pieces(pieces: Iterable[Dataset], path: str | Path, *, forc
         for number, piece in enumerate(pieces):
             piece = ensure_checked(piece)
             if number == 0:
-                head = {"format_version": FORMAT_VERSION, "name": piece.name, "frame": piece.frame.to_json()}
-                (folder / MARKER).write_text(json.dumps(head, indent=2) + "\n", encoding="utf-8")
-                write_table(piece.cameras, folder / "cameras.parquet")
+                _write_head(piece, folder)
             for name, table in _tables_of(piece).items():
                 if number == 0:
                     writers[name] = opened.enter_context(TableWriter(folder / f"{name}.parquet"))
                 writers[name].write(table)
+
+
+def write_dataset_in_portions(
+    dataset: Dataset,
+    detections: Iterable[Detections],
+    rejected: Iterable[RejectedRows],
+    path: str | Path,
+    *,
+    force: bool = False,
+) -> None:
+    """Write a dataset as `write_dataset`, its detections and what was left out in portions: to the same bytes.
+
+    Detections come by ascending ids. What `dataset` has of the two does not count.
+    """
+    dataset = check_dataset(dataset, source=dataset.name)
+    images = dataset.images
+
+    def checked() -> Iterator[Detections]:
+        for portion in detections:
+            check_detections(portion, images.image_id, images.camera_id, dataset.cameras, dataset.name)
+            yield portion
+
+    tables: dict[str, Iterable[Table]] = {name: [table] for name, table in _tables_of(dataset).items()}
+    tables |= {"detections": checked(), "rejected": rejected}
+    with new_folder(Path(path), parts=PARTS, part_folders=PART_FOLDERS, force=force) as folder:
+        _write_head(dataset, folder)
+        for name, portions in tables.items():
+            with ExitStack() as opened:
+                writer = None
+                for group in in_groups(portions):
+                    writer = writer or opened.enter_context(TableWriter(folder / f"{name}.parquet"))
+                    writer.write(group)
+
+
+def _write_head(dataset: Dataset, folder: Path) -> None:
+    head = {"format_version": FORMAT_VERSION, "name": dataset.name, "frame": dataset.frame.to_json()}
+    (folder / MARKER).write_text(json.dumps(head, indent=2) + "\n", encoding="utf-8")
+    write_table(dataset.cameras, folder / "cameras.parquet")
 
 
 def _tables_of(dataset: Dataset) -> dict[str, Table]:

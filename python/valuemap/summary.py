@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,7 @@ from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import find_drives
 from valuemap.map_folder import Map
-from valuemap.tables import Categories, Floats, Ints
+from valuemap.tables import Categories, Detections, Floats, Ints
 
 _MANY = 10
 """So many detections in an image, and more, are counted together."""
@@ -18,8 +20,18 @@ _MANY = 10
 
 def summarize_dataset(dataset: Dataset) -> dict[str, Any]:
     """Return the facts of a dataset by name, ready for JSON."""
-    images, detections = dataset.images, dataset.detections
-    detections_of_image = np.bincount(rows_of(detections.image_id, images.image_id), minlength=len(images))
+    return summarize_portions(dataset, [dataset.detections])
+
+
+def summarize_portions(dataset: Dataset, portions: Iterable[Detections]) -> dict[str, Any]:
+    """Return the facts of a dataset whose detections come in portions; those in `dataset` do not count."""
+    images = dataset.images
+    detections_of_image = np.zeros(len(images), np.int64)
+    of_class: Counter[str] = Counter()
+    for portion in portions:
+        detections_of_image += np.bincount(rows_of(portion.image_id, images.image_id), minlength=len(images))
+        of_class.update(_classes(portion.class_name))
+    count = int(detections_of_image.sum())
     drives = find_drives(images).record
     facts: dict[str, Any] = {
         "dataset": dataset.name,
@@ -33,9 +45,9 @@ def summarize_dataset(dataset: Dataset) -> dict[str, Any]:
         "images_ordered_by": drives["images_ordered_by"],
         "images_on_rigs": drives["images_on_rigs"],
         "extent_m": _extent(camera_centers(images)),
-        "detections": len(detections),
-        "classes": _classes(detections.class_name),
-        "detections_per_image": len(detections) / len(images),
+        "detections": count,
+        "classes": dict(sorted(of_class.items())),
+        "detections_per_image": count / len(images),
         "images_by_detections": _histogram(detections_of_image),
     }
     if dataset.truth is not None:

@@ -8,7 +8,7 @@ held in ascending order of their key, so that nothing depends on the order of ro
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _SHOWN_NAMES, _SHOWN_ROWS = 5, 10
+ROWS_OF_GROUP = 2**20
+"""Rows of a table that are one group in a file: a reader of a part of it reads whole groups."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -199,6 +201,12 @@ class Detections(Table):
     range_m: Floats | None = _column("float", ("range_m",), optional=True, nullable=True)
     range_sigma_m: Floats | None = _column("float", ("range_sigma_m",), optional=True, nullable=True)
     vertical_sigma_px: Floats | None = _column("float", ("vertical_sigma_px",), optional=True, nullable=True)
+
+    @classmethod
+    def none(cls) -> Self:
+        """Return no detections: they are still to be made, or elsewhere."""
+        numbers, pairs = np.empty(0, np.int64), np.empty((0, 2))
+        return cls(numbers, numbers, Categories(np.empty(0, np.int32), ()), pairs, pairs, np.empty(0))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -473,6 +481,24 @@ def join_tables(tables: Sequence[T]) -> T:
     return type(tables[0])(**columns)
 
 
+def in_groups(tables: Iterable[T]) -> Iterator[T]:
+    """Yield tables of one kind as others of as many rows as a group in a file has, the last of fewer, in their order.
+
+    So a file is the same however its rows come.
+    """
+    held: list[T] = []
+    count, is_first = 0, True
+    for table in tables:
+        held.append(table)
+        count += len(table)
+        while count > ROWS_OF_GROUP:
+            together = join_tables(held)
+            yield together[:ROWS_OF_GROUP]
+            held, count, is_first = [together[ROWS_OF_GROUP:]], count - ROWS_OF_GROUP, False
+    if held and (count or is_first):
+        yield join_tables(held)
+
+
 def _join_categories(columns: Sequence[Categories]) -> Categories:
     names = tuple(sorted({name for column in columns for name in column.names}))
     rank = {name: code for code, name in enumerate(names)}
@@ -658,7 +684,7 @@ class TableWriter:
             # Dictionaries of all columns made the votes of a large city 10 % larger, and took twice as long to write.
             texts = [n for f in fields(table) if f.metadata["kind"] == "category" for n in f.metadata["names"]]
             self._writer = pq.ParquetWriter(self._file, rows.schema, compression="zstd", use_dictionary=texts)
-        self._writer.write_table(rows)
+        self._writer.write_table(rows, row_group_size=ROWS_OF_GROUP)
 
     def __exit__(self, *_: object) -> None:
         with self._file:

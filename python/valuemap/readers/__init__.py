@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import wraps
-from inspect import signature
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping
 
-from valuemap.dataset import Dataset
 from valuemap.readers.argoverse2 import read_argoverse2
 from valuemap.readers.bearings import read_bearings
 from valuemap.readers.colmap import read_colmap
@@ -21,27 +16,11 @@ from valuemap.readers.nuscenes import read_nuscenes
 from valuemap.readers.opensfm import read_opensfm
 from valuemap.readers.panoramax import read_panoramax
 from valuemap.readers.pictures import read_pictures
+from valuemap.readers.reader import Reader
 from valuemap.readers.ros import read_ros
 from valuemap.readers.tum import read_tum
 
-
-def _taking_texts(reader: Callable[..., Dataset]) -> Callable[..., Dataset]:
-    """Return a reader that takes texts where it expects paths, as people write them."""
-    parameters = signature(reader)
-    paths = {name for name, parameter in parameters.parameters.items() if "Path" in str(parameter.annotation)}
-
-    @wraps(reader)
-    def read(*arguments: Any, **options: Any) -> Dataset:
-        given = parameters.bind(*arguments, **options)
-        for name in paths & given.arguments.keys():
-            if isinstance(given.arguments[name], str):
-                given.arguments[name] = Path(given.arguments[name])
-        return reader(*given.args, **given.kwargs)
-
-    return read
-
-
-_READERS: dict[str, Callable[..., Dataset]] = {
+READERS: Mapping[str, Reader[...]] = {
     "argoverse2": read_argoverse2,
     "bearings": read_bearings,
     "colmap": read_colmap,
@@ -57,5 +36,4 @@ _READERS: dict[str, Callable[..., Dataset]] = {
     "ros": read_ros,
     "tum": read_tum,
 }
-READERS = {name: _taking_texts(reader) for name, reader in _READERS.items()}
 """What `valuemap import NAME` calls; paths may be given as texts."""

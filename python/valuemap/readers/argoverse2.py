@@ -10,10 +10,9 @@ import pyarrow as pa
 import pyarrow.feather
 
 from valuemap.arrow import numbers_from_arrow
-from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, assemble
+from valuemap.readers.assemble import MAX_REJECTED, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_folder, file_in
@@ -24,6 +23,7 @@ from valuemap.readers.poses import (
     rigs_by_time,
     rotations_of_quaternions,
 )
+from valuemap.readers.reader import Reader
 from valuemap.tables import Floats, Ints
 
 _EXPECTED = "a folder of an Argoverse 2 log, or of several, with city_SE3_egovehicle.feather and calibration"
@@ -55,6 +55,7 @@ class _Log:
     city: str | None
 
 
+@Reader
 def read_argoverse2(
     logs: Path,
     *,
@@ -64,7 +65,7 @@ def read_argoverse2(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
-) -> Dataset:
+) -> Imported:
     """Read the cameras of one log, or of all logs of one city in a folder; every image has the pose of its own instant.
 
     The images are the files of `sensors/cameras`, named `LOG/sensors/cameras/CAMERA/NANOSECONDS.jpg`; for a single log

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.dataset import Dataset, Frame, check_dataset
+from valuemap.dataset import Dataset, Frame, check_dataset, write_dataset_in_portions
 from valuemap.errors import InputError, SettingError
-from valuemap.readers.vet import MAX_REJECTED, FoundBoxes, Rejections, number_detections, vet_boxes, vet_images
-from valuemap.tables import Cameras, Floats, Images, Truth
+from valuemap.readers.boxes import FiledBoxes, FoundBoxes
+from valuemap.readers.vet import MAX_REJECTED, Rejections, number_detections, vet_boxes, vet_images
+from valuemap.tables import Cameras, Detections, Floats, Images, RejectedRows, Truth, join_tables
 
-__all__ = ["MAX_REJECTED", "ONE_PASS", "FoundBoxes", "assemble", "number_detections"]
+__all__ = ["MAX_REJECTED", "ONE_PASS", "FoundBoxes", "Imported", "assemble", "number_detections"]
 
 ONE_PASS = "all"
 """The pass of images about whose passes nothing is known."""
@@ -26,12 +29,42 @@ _MIN_MEAN_UP = 0.1
 _MAX_TILT_FROM_ENU_RAD = math.radians(60.0)
 
 
+@dataclass(frozen=True, eq=False)
+class Imported:
+    """A checked dataset whose detections, and what was left out, are in temporary files.
+
+    `dataset` has all but these, which come in portions, the detections by their ids.
+    """
+
+    dataset: Dataset
+    detections: Callable[[], Iterator[Detections]]
+    left_out: Rejections
+
+    def rejected(self) -> Iterator[RejectedRows]:
+        """Yield what was left out; nothing where that is nothing."""
+        return self.left_out.portions()
+
+    def whole(self) -> Dataset:
+        """Return all of it in memory."""
+        rejected = list(self.rejected())
+        return dataclasses.replace(
+            self.dataset,
+            detections=join_tables(list(self.detections())),
+            rejected=join_tables(rejected) if rejected else None,
+        )
+
+    def write(self, path: Path, *, force: bool = False) -> None:
+        """Write all of it under the name of the folder, as `valuemap.dataset.write_dataset` does, in portions."""
+        named = dataclasses.replace(self.dataset, name=path.resolve().name)
+        write_dataset_in_portions(named, self.detections(), self.rejected(), path, force=force)
+
+
 def assemble(
     *,
     name: str,
     cameras: Cameras,
     images: Images,
-    detections: FoundBoxes,
+    detections: FoundBoxes | FiledBoxes,
     up: tuple[float, float, float] | None,
     anchor: tuple[float, float, float] | None,
     source: str,
@@ -40,7 +73,7 @@ def assemble(
     max_rejected: float = MAX_REJECTED,
     unposed: Mapping[int, str] | None = None,
     unreadable: Mapping[str, str] | None = None,
-) -> Dataset:
+) -> Imported:
     """Return the checked dataset of what a reader found; what cannot be used is left out and listed in it.
 
     Parameters
@@ -78,20 +111,21 @@ def assemble(
     rejections = Rejections(source, max_rejected)
     rejections.add_unreadable(unreadable or {})
     posed, usable = vet_images(images, rejections, where_image, unposed)
+    if isinstance(detections, FoundBoxes):
+        detections = detections.filed(images.name)
     boxes = vet_boxes(detections, images, usable, cameras, rejections)
-    del detections  # Of many boxes there is no room for both.
     unframed = Dataset(
         name=name,
         frame=Frame(),
         cameras=cameras,
         images=posed,
-        detections=boxes,
+        detections=Detections.none(),
         truth=truth,
-        rejected=rejections.table(),
     )
     dataset = check_dataset(unframed, source=source)
     _check_steps(dataset.images, source)
-    return dataclasses.replace(dataset, frame=_frame(dataset.images, up, anchor, source))
+    dataset = dataclasses.replace(dataset, frame=_frame(dataset.images, up, anchor, source))
+    return Imported(dataset, boxes, rejections)
 
 
 def _frame(

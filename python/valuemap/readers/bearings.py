@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, assemble
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
 from valuemap.readers.cameras_of import make_cameras, parse_camera
 from valuemap.readers.csv_file import CsvFile
 from valuemap.readers.poses import local_from_cam, make_images, place_on_earth
+from valuemap.readers.reader import Reader
 from valuemap.tables import Floats, Ints
 
 _EXPECTED = "a CSV file with columns lat, lon, bearing (degrees clockwise from north) and maybe depth (metres)"
@@ -26,6 +26,7 @@ VERTICAL_SIGMA_PX = _HEIGHT_PX / math.sqrt(2.0 * math.pi)
 """A normal density of this deviation is at its peak as high as the even one over the picture: no evidence."""
 
 
+@Reader
 def read_bearings(
     bearings: Path,
     *,
@@ -36,7 +37,7 @@ def read_bearings(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
-) -> Dataset:
+) -> Imported:
     """Read a table with one row a detection: `lat, lon` of the camera, `bearing` and maybe `depth` of the object.
 
     Every distinct place is an image, a panorama that looks north, or every distinct text in the column `image` where

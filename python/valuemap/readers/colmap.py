@@ -10,19 +10,20 @@ import numpy as np
 import pyarrow as pa
 import pycolmap
 
-from valuemap.dataset import Dataset
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, assemble
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
 from valuemap.readers.colmap_files import copy_without_points, find_model
 from valuemap.readers.csv_file import read_csv
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.names import match_images
+from valuemap.readers.reader import Reader
 from valuemap.tables import Cameras, Categories, Images, Ints
 
 _LARGEST_PX = 2**31
 
 
+@Reader
 def read_colmap(
     model_dir: Path,
     *,
@@ -32,7 +33,7 @@ def read_colmap(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
-) -> Dataset:
+) -> Imported:
     """Read a COLMAP model and the detections in its images.
 
     Camera, image and pose conventions of valuemap are COLMAP's own, so numbers and ids are taken as they are.

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 
 from valuemap.arrow import numbers_from_arrow
-from valuemap.csv_table import odd_fields, read_csv_arrow
+from valuemap.csv_table import odd_fields, read_csv_arrow, read_csv_portions
 from valuemap.errors import InputError, SettingError
 from valuemap.readers.files import check_file
 from valuemap.readers.texts import Texts
@@ -66,6 +66,8 @@ class CsvFile:
         Names of columns, lower case, that are texts and numbers; others are not looked at.
     columns
         Under which name a column stands in the file, where it is another one.
+    table, first_row
+        A portion of the file, as it was read, and which row it begins with; without, the whole file.
 
     Raises
     ------
@@ -83,9 +85,11 @@ class CsvFile:
         texts: Sequence[str],
         numbers: Sequence[str],
         columns: Mapping[str, str] | None = None,
+        table: pa.Table | None = None,
+        first_row: int = 0,
     ) -> None:
-        self.path = path
-        self._hint = f"expected {expected}"
+        self.path, self._first_row = path, first_row
+        self._hint = _hint(expected)
         columns = columns or {}
         unknown = [name for name in columns if name not in (*texts, *numbers)]
         if unknown:
@@ -93,16 +97,16 @@ class CsvFile:
                 f"column {unknown[0]}={columns[unknown[0]]}: there is no column {unknown[0]!r}",
                 hint=f"the names before = are among {', '.join((*texts, *numbers))}",
             )
-        check_file(path, expected)
-        # Texts that repeat, as the names of images do of boxes, are held once.
-        kinds = dict.fromkeys(texts, pa.dictionary(pa.int32(), pa.string())) | dict.fromkeys(numbers, pa.float64())
-        # A column that has another's name does not count as that.
-        renamed = {columns.get(name, name): kind for name, kind in kinds.items()}
-        self._table = read_csv_arrow(path, renamed, has_missing=False, hint=self._hint, bad_numbers_are_nan=True)
+        names = (*texts, *numbers)
+        if table is None:
+            check_file(path, expected)
+            types = _types(texts, numbers, columns)
+            table = read_csv_arrow(path, types, has_missing=False, hint=self._hint, bad_numbers_are_nan=True)
+        self._table = table
         if self._table.num_rows == 0:
             raise InputError(f"{path}: no rows after the first line", hint="check what wrote the file")
         self._name = {
-            name: columns.get(name, name) for name in kinds if name in columns or name not in columns.values()
+            name: columns.get(name, name) for name in names if name in columns or name not in columns.values()
         }
         for ours, theirs in columns.items():
             if theirs not in self._table.column_names:
@@ -200,7 +204,7 @@ class CsvFile:
 
     def line(self, row: int) -> str:
         """Return where a row stands, for errors."""
-        return line_of(self.path, row)
+        return line_of(self.path, self._first_row + row)
 
     def missing(self, expected: str) -> InputError:
         """Return the error that says which columns are expected."""
@@ -213,6 +217,29 @@ class CsvFile:
         if not self.has(name):
             raise self.missing(f"a column {name!r}")
         return self._table.column(self._name[name])
+
+
+def csv_portions(
+    path: Path, expected: str, *, texts: Sequence[str], numbers: Sequence[str], columns: Mapping[str, str]
+) -> Iterator[CsvFile]:
+    """Yield a CSV file in portions, each as a `CsvFile`, whose parameters these are."""
+    check_file(path, expected)
+    types, first_row = _types(texts, numbers, columns), 0
+    for table in read_csv_portions(path, types, has_missing=False, hint=_hint(expected), bad_numbers_are_nan=True):
+        yield CsvFile(path, expected, texts=texts, numbers=numbers, columns=columns, table=table, first_row=first_row)
+        first_row += len(table)
+
+
+def _types(texts: Sequence[str], numbers: Sequence[str], columns: Mapping[str, str]) -> dict[str, pa.DataType]:
+    """Return the types of columns by their names in a file."""
+    # Texts that repeat, as the names of images do of boxes, are held once.
+    kinds = dict.fromkeys(texts, pa.dictionary(pa.int32(), pa.string())) | dict.fromkeys(numbers, pa.float64())
+    # A column that has another's name does not count as that.
+    return {columns.get(name, name): kind for name, kind in kinds.items()}
+
+
+def _hint(expected: str) -> str:
+    return f"expected {expected}"
 
 
 def line_of(path: Path, row: int) -> str:

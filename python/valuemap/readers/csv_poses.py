@@ -10,10 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, assemble
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras, parse_camera
 from valuemap.readers.csv_file import CsvFile
 from valuemap.readers.detections import DetectionFile, read_detections
@@ -26,6 +25,7 @@ from valuemap.readers.poses import (
     place_on_earth,
     rotations_of_quaternions,
 )
+from valuemap.readers.reader import Reader
 from valuemap.tables import Floats
 
 _EXPECTED = "a CSV file with columns image; lat, lon or x, y; and heading_deg, yaw_rad or qw, qx, qy, qz"
@@ -52,6 +52,7 @@ class _Where:
     anchor: tuple[float, float, float] | None
 
 
+@Reader
 def read_csv_poses(
     poses: Path,
     *,
@@ -68,7 +69,7 @@ def read_csv_poses(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
-) -> Dataset:
+) -> Imported:
     """Read a table with one row an image.
 
     Columns: `image` (name); a place, `lat, lon` in degrees or `x, y`, with `height` or `z`; an orientation; and as far

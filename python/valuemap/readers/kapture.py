@@ -8,14 +8,14 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, assemble
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras, parse_camera
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_folder, file_in, read_text
 from valuemap.readers.poses import make_images
+from valuemap.readers.reader import Reader
 from valuemap.tables import Floats
 
 _EXPECTED = "a kapture folder with sensors/sensors.txt, sensors/records_camera.txt and sensors/trajectories.txt"
@@ -33,6 +33,7 @@ class _Pose:
         return _Pose(self.rotation @ other.rotation, self.rotation @ other.translation_m + self.translation_m)
 
 
+@Reader
 def read_kapture(
     folder: Path,
     *,
@@ -41,7 +42,7 @@ def read_kapture(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
-) -> Dataset:
+) -> Imported:
     """Read a kapture folder, version 1.
 
     Poses take the world into the device (quaternion w, x, y, z, then translation), and rigs the rig into the sensor;

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, assemble
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.csv_file import CsvFile
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import read_text
 from valuemap.readers.poses import local_from_cam, make_images
+from valuemap.readers.reader import Reader
 from valuemap.tables import Floats, Images
 
 _CORNERS = ("x1", "y1", "x2", "y2")
@@ -28,6 +28,7 @@ _EXPECTED_TIMES = "KITTI's times.txt, with the seconds of a frame a row"
 _EXPECTED_BOXES = "a CSV file with columns frame, x1, y1, x2, y2 and maybe camera, class, score"
 
 
+@Reader
 def read_kitti(
     poses: Path,
     *,
@@ -43,7 +44,7 @@ def read_kitti(
     heading_deg: float | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
-) -> Dataset:
+) -> Imported:
     """Read the poses of one drive with one or several rectified cameras, and the detections in its frames.
 
     Everything in pixels follows the source's convention, that the centre of the top-left pixel is (0, 0), and

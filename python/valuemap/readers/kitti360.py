@@ -9,15 +9,15 @@ import pycolmap
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, assemble
+from valuemap.readers.assemble import MAX_REJECTED, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_folder, file_in, read_text, read_yaml
 from valuemap.readers.json_values import Json
 from valuemap.readers.poses import make_images
+from valuemap.readers.reader import Reader
 from valuemap.tables import Floats
 
 _EXPECTED = "KITTI-360's folder with calibration/ and data_poses/SEQUENCE/poses.txt"
@@ -26,6 +26,7 @@ _WIDEST_RAD = np.radians(90.0)
 _MAX_FIT_PX = 0.5
 
 
+@Reader
 def read_kitti360(
     root: Path,
     *,
@@ -36,7 +37,7 @@ def read_kitti360(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
-) -> Dataset:
+) -> Imported:
     """Read one sequence: the pose of the car, the place of the camera in it, and what rectified it undone.
 
     The image of frame 123 of camera 0 is `SEQUENCE/image_00/data_rect/0000000123.png`, and of camera 2

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from valuemap.dataset import Dataset
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, assemble
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_file, file_in, read_json
 from valuemap.readers.json_values import Json
 from valuemap.readers.poses import local_from_cam, make_images, place_on_earth
+from valuemap.readers.reader import Reader
 from valuemap.readers.vector_tile import outline_of_tile
 from valuemap.tables import Floats, Images
 
@@ -42,6 +42,7 @@ class _Found:
     where: list[str] = field(default_factory=list)
 
 
+@Reader
 def read_mapillary(
     export: Path,
     *,
@@ -49,7 +50,7 @@ def read_mapillary(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
-) -> Dataset:
+) -> Imported:
     """Read JSON that the API answered with: the fields asked for, for one image or for many; nothing is fetched.
 
     Positions are `computed_geometry` and `computed_altitude` where structure from motion has them, else `geometry`.

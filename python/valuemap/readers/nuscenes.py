@@ -8,15 +8,15 @@ from typing import TypeVar
 
 import numpy as np
 
-from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, assemble
+from valuemap.readers.assemble import MAX_REJECTED, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_folder, file_in, read_json
 from valuemap.readers.json_values import Json
 from valuemap.readers.poses import make_images, rotations_of_quaternions
+from valuemap.readers.reader import Reader
 
 _EXPECTED = "a folder of nuScenes' tables, such as v1.0-trainval, with sample_data.json and ego_pose.json"
 _ORIGINS = {
@@ -31,6 +31,7 @@ _MICRO = 1e-6
 T = TypeVar("T")
 
 
+@Reader
 def read_nuscenes(
     tables: Path,
     *,
@@ -41,7 +42,7 @@ def read_nuscenes(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
-) -> Dataset:
+) -> Imported:
     """Read the cameras of all scenes of one location; every image has the ego pose of its own instant.
 
     An image is named by its `filename` and is of the pass of its scene; the key frames of one sample are a rig. The

@@ -7,20 +7,21 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, assemble
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import file_in, read_json
 from valuemap.readers.json_values import Json
 from valuemap.readers.poses import make_images
+from valuemap.readers.reader import Reader
 
 _EXPECTED = "OpenSfM's reconstruction.json: a list of reconstructions with cameras and shots"
 _REFERENCE = "reference_lla.json"
 
 
+@Reader
 def read_opensfm(
     reconstruction: Path,
     *,
@@ -29,7 +30,7 @@ def read_opensfm(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
-) -> Dataset:
+) -> Imported:
     """Read all reconstructions of a file, whose origin is `reference_lla` in it or in the file of that name beside it.
 
     Rotations are axis-angle, world to camera. Lengths are fractions of the larger side of the picture about its middle,

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from valuemap.dataset import Dataset
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, assemble
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_file, file_in, read_json
 from valuemap.readers.json_values import Json
 from valuemap.readers.poses import local_from_cam, make_images, place_on_earth
+from valuemap.readers.reader import Reader
 from valuemap.tables import Images
 
 _EXPECTED = "JSON of Panoramax: a STAC item, or a collection of features with geometry, properties and id"
@@ -41,6 +41,7 @@ class _Found:
     where: list[str] = field(default_factory=list)
 
 
+@Reader
 def read_panoramax(
     export: Path,
     *,
@@ -50,7 +51,7 @@ def read_panoramax(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
-) -> Dataset:
+) -> Imported:
     """Read items as the API gives them; nothing is fetched.
 
     The heading of the middle of a picture is `view:azimuth`; `pers:pitch` and `pers:roll` are used where they are

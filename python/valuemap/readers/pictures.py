@@ -10,15 +10,15 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, assemble
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras, parse_camera
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.exif import Exif, check_whole, read_exif
 from valuemap.readers.files import check_folder, check_names, file_in
 from valuemap.readers.poses import OnEarth, local_from_cam, make_images, place_on_earth
+from valuemap.readers.reader import Reader
 from valuemap.readers.structure import Picture, Posed, find_poses
 from valuemap.tables import Floats
 
@@ -44,6 +44,7 @@ class _Found:
     unreadable: dict[str, str]
 
 
+@Reader
 def read_pictures(
     folder: Path,
     *,
@@ -57,7 +58,7 @@ def read_pictures(
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
     tell: Callable[[str], None] | None = None,
-) -> Dataset:
+) -> Imported:
     """Read pictures of a folder and its folders, find their poses, and put them on the Earth.
 
     Panoramas (equirectangular by their GPano tags, or by `camera`) stand at their GPS position with their heading,

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, FoundBoxes, assemble
+from valuemap.readers.assemble import MAX_REJECTED, FoundBoxes, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.poses import interpolate_poses, make_images, rigs_by_time
+from valuemap.readers.reader import Reader
 from valuemap.tables import Floats, Images, Ints
 
 _EXPECTED = "a bag of ROS 1 (.bag) or ROS 2 (a folder with metadata.yaml, or .mcap)"
@@ -86,6 +86,7 @@ class _Bag:
     )
 
 
+@Reader
 def read_ros(
     bags: Sequence[Path],
     *,
@@ -100,7 +101,7 @@ def read_ros(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
-) -> Dataset:
+) -> Imported:
     """Read bags of one drive: `CameraInfo`, `TFMessage` or poses, and `Detection2DArray` messages.
 
     Every message of detections is an image, named `FRAME/SECONDS.NANOSECONDS.png` by its header; without detections

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from valuemap.dataset import Dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, assemble
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
 from valuemap.readers.cameras_of import make_cameras, parse_camera
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import read_text
 from valuemap.readers.poses import AXES, interpolate_poses, make_images, rotations_of_quaternions
+from valuemap.readers.reader import Reader
 from valuemap.tables import Floats, Ints
 
 _EXPECTED = "a text file with rows: timestamp tx ty tz qx qy qz qw, camera to world"
@@ -21,6 +21,7 @@ _EXPECTED_LIST = "a text file with rows: timestamp filename"
 _NANO = 1_000_000_000
 
 
+@Reader
 def read_tum(
     trajectory: Path,
     *,
@@ -34,7 +35,7 @@ def read_tum(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
-) -> Dataset:
+) -> Imported:
     """Read a trajectory of `timestamp tx ty tz qx qy qz qw` (x first!), camera to world, in seconds and metres.
 
     Parameters

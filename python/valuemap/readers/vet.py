@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import functools
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from valuemap.errors import InputError, SettingError
-from valuemap.readers.texts import Texts
+from valuemap.readers import row_file
+from valuemap.readers.boxes import FiledBoxes, are_distinct, structure
+from valuemap.readers.row_file import PartFile, RowFile, Rows, bounds_by_count
 from valuemap.tables import Bools, Cameras, Categories, Detections, Floats, Images, Ints, RejectedRows
 
 MAX_REJECTED = 0.01
@@ -18,8 +22,6 @@ MAX_REJECTED = 0.01
 _QUATERNION_TOLERANCE = 1e-3
 _MAX_SIZE_OF_PICTURE = 2.0
 _SHOWN_REASONS = 3
-_PORTION = 500_000
-"""Boxes that are looked at together."""
 
 
 @dataclass(frozen=True)
@@ -62,54 +64,51 @@ _NO_ROTATION = _Reason(
 
 
 @dataclass(frozen=True, eq=False)
-class FoundBoxes:
-    """Boxes as a reader found them, in any order, checked by nobody yet.
+class _LeftOut:
+    """Rows (K of `total`) of one table that cannot be used, ascending, with the reason against each as a code.
 
-    Parameters
-    ----------
-    image_row
-        Row (N) of each box's image in the reader's table of images; -1 where it is not among them.
-    class_names, score
-        One a box (N); an empty text for a class, and NaN for a score, that the file does not have.
-    center_px, size_px
-        Centre and size (N, 2) in pixels, centre of the top-left pixel at (0.5, 0.5); NaN for what is no number.
-    where
-        Returns the place of a box in the user's files, for its index here.
-    image_names
-        The names (N) that the file has for the images; needed where some `image_row` is -1.
-    detection_id
-        Distinct ids (N). Without them the boxes are numbered from 0 by image, place, size, class and score,
-        so that the numbers do not depend on the order of the boxes.
-    range_m, range_sigma_m
-        Measured distances (N) in metres, NaN where there is none.
-    vertical_sigma_px
-        Standard deviations (N) of the centre's y, NaN where it is that of its x.
-    are_points
-        The boxes are directions without a size, so that a size of 0 is right.
+    `class_names` are the classes that they have, and `described` yields what is listed of some of them, in portions.
     """
 
-    image_row: Ints
-    class_names: Sequence[str]
-    center_px: Floats
-    size_px: Floats
-    score: Floats
-    where: Callable[[int], str]
-    image_names: Sequence[str] | None = None
-    detection_id: Ints | None = None
-    range_m: Floats | None = None
-    range_sigma_m: Floats | None = None
-    vertical_sigma_px: Floats | None = None
-    are_points: bool = False
+    table: str
+    total: int
+    rows: Ints
+    codes: Ints
+    reasons: Sequence[_Reason]
+    class_names: Collection[str]
+    described: Callable[[Ints, Sequence[str]], Iterator[RejectedRows]]
 
-    @staticmethod
-    def none() -> FoundBoxes:
-        """Return no boxes: they are still to be found in the pictures."""
-        nothing = np.empty(0)
-        pairs = np.empty((0, 2))
-        return FoundBoxes(nothing.astype(np.int64), [], pairs, pairs, nothing, str)
+    def portions(self, chosen: slice | Ints = slice(None)) -> Iterator[RejectedRows]:
+        """Yield what is listed of all of them, or of some."""
+        texts = [self.reasons[code].text for code in self.codes[chosen].tolist()]
+        yield from self.described(self.rows[chosen], texts)
 
-    def __len__(self) -> int:
-        return len(self.image_row)
+    def counts(self) -> dict[str, int]:
+        """Return how many there are by reason, in the order of the first of each."""
+        found, first, count = np.unique(self.codes, return_index=True, return_counts=True)
+        return {self.reasons[found[i]].text: int(count[i]) for i in np.argsort(first)}
+
+    def refuse_too_many(self, source: str, max_share: float) -> None:
+        """Raise `InputError` where they are too many of all."""
+        what = {"detections": "boxes", "images": "images"}[self.table]
+        counts = np.array([reason.counts for reason in self.reasons])
+        share = int(np.sum(counts[self.codes])) / self.total
+        if len(self.rows) < self.total and share <= max_share:
+            return
+        count = self.counts()
+        leading = sorted(count, key=lambda text: -count[text])
+        codes = [next(i for i, reason in enumerate(self.reasons) if reason.text == text) for text in leading]
+        told = []
+        for text, code in zip(leading[:_SHOWN_REASONS], codes, strict=False):
+            first = next(self.portions(np.flatnonzero(self.codes == code)[:1]))
+            told.append(f"{text} ({count[text]}, the first is {first.place[0].as_py()}{_found(first)})")
+        everything = len(self.rows) == self.total
+        limit = "none is left" if everything else f"more than {100.0 * max_share:g} %"
+        way_round = "" if everything else f"; or leave them out with --max-rejected {np.ceil(share * 100.0) / 100.0:g}"
+        raise InputError(
+            f"{source}: {len(self.rows)} of {self.total} {what} cannot be used, {limit}: {'; '.join(told)}",
+            hint=f"{self.reasons[codes[0]].hint}{way_round}",
+        )
 
 
 @dataclass(eq=False)
@@ -118,7 +117,7 @@ class Rejections:
 
     source: str
     max_share: float = MAX_REJECTED
-    _parts: list[RejectedRows] = field(default_factory=list)
+    _parts: list[_LeftOut] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.max_share <= 1.0:
@@ -127,108 +126,97 @@ class Rejections:
                 hint="for example 0.05 for one row in twenty",
             )
 
-    def table(self) -> RejectedRows | None:
-        """Return all of them, or None where there are none."""
-        if not any(map(len, self._parts)):
-            return None
+    def __len__(self) -> int:
+        return sum(len(part.rows) for part in self._parts)
 
-        def together(name: str) -> Categories:
-            return Categories.from_texts([text for part in self._parts for text in getattr(part, name).texts()])
+    def portions(self) -> Iterator[RejectedRows]:
+        """Yield all of them in portions; all have the same categories."""
+        tables = tuple(sorted({part.table for part in self._parts}))
+        reasons = tuple(sorted({text for part in self._parts for text in part.counts()}))
+        classes = tuple(sorted({text for part in self._parts for text in part.class_names}))
+        for part in self._parts:
+            for rows in part.portions():
+                yield rows.replace(
+                    table=_recoded(rows.table, tables),
+                    reason=_recoded(rows.reason, reasons),
+                    class_name=_recoded(rows.class_name, classes),
+                )
 
-        return RejectedRows(
-            table=together("table"),
-            place=pa.concat_arrays([part.place for part in self._parts]),
-            reason=together("reason"),
-            image_name=pa.concat_arrays([part.image_name for part in self._parts]),
-            class_name=together("class_name"),
-            center_px=np.concatenate([part.center_px for part in self._parts]),
-            size_px=np.concatenate([part.size_px for part in self._parts]),
-            score=np.concatenate([part.score for part in self._parts]),
-        )
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Return how many rows were left out, by table and reason, the most frequent reason first."""
+        counts: dict[str, dict[str, int]] = {}
+        for part in self._parts:
+            of_table = counts.setdefault(part.table, {})
+            for text, count in part.counts().items():
+                of_table[text] = of_table.get(text, 0) + count
+        return {table: dict(sorted(by.items(), key=lambda item: (-item[1], item[0]))) for table, by in counts.items()}
 
-    def add(
-        self,
-        table: str,
-        why: Verdicts,
-        *,
-        where: Callable[[int], str],
-        image_names: Callable[[int], str],
-        boxes: FoundBoxes | None = None,
-    ) -> None:
-        """Take the rows of `why` that have a reason; raise `InputError` where they are too many of all."""
-        rows = np.flatnonzero(why.code >= 0)
-        if not len(rows):
-            return
-        nothing = np.full(len(rows), np.nan)
-        pairs = np.full((len(rows), 2), np.nan)
-        part = RejectedRows(
-            table=Categories.from_texts([table] * len(rows)),
-            place=pa.array([_text(where(row)) for row in rows.tolist()], pa.string()),
-            reason=Categories.from_texts([why.reasons[code].text for code in why.code[rows].tolist()]),
-            image_name=pa.array([_text(image_names(row)) for row in rows.tolist()], pa.string()),
-            class_name=Categories.from_texts([_text(boxes.class_names[row]) if boxes else "" for row in rows.tolist()]),
-            center_px=pairs if boxes is None else _finite(boxes.center_px[rows]),
-            size_px=pairs if boxes is None else _finite(boxes.size_px[rows]),
-            score=nothing if boxes is None else _finite(boxes.score[rows]),
-        )
-        self._parts.append(part)
-        self._refuse_too_many(table, why, part)
+    def add(self, part: _LeftOut) -> None:
+        """Take rows; raise `InputError` where they are too many of all."""
+        if len(part.rows):
+            self._parts.append(part)
+            part.refuse_too_many(self.source, self.max_share)
 
     def add_unreadable(self, reason_of: Mapping[str, str]) -> None:
         """Take pictures that cannot be read at all, by name."""
-        count = len(reason_of)
-        if count:
-            nothing = Categories.from_texts([""] * count)
-            self._parts.append(
-                RejectedRows(
-                    table=Categories.from_texts(["images"] * count),
-                    place=pa.array([_text(f"{self.source}/{name}") for name in reason_of], pa.string()),
-                    reason=Categories.from_texts([_text(reason) for reason in reason_of.values()]),
-                    image_name=pa.array([_text(name) for name in reason_of], pa.string()),
-                    class_name=nothing,
-                    center_px=np.full((count, 2), np.nan),
-                    size_px=np.full((count, 2), np.nan),
-                    score=np.full(count, np.nan),
-                )
-            )
-
-    def _refuse_too_many(self, table: str, why: Verdicts, part: RejectedRows) -> None:
-        what = {"detections": "boxes", "images": "images"}[table]
-        counted = [code for code in why.code.tolist() if code >= 0 and why.reasons[code].counts]
-        share = len(counted) / len(why.code)
-        if len(part) < len(why.code) and share <= self.max_share:
+        if not reason_of:
             return
-        reason_of = part.reason.texts()
-        count = {reason: sum(text == reason for text in reason_of) for reason in dict.fromkeys(reason_of)}
-        leading = sorted(count, key=lambda reason: -count[reason])
-        told = [
-            f"{reason} ({count[reason]}, the first is {part.place[reason_of.index(reason)].as_py()}"
-            f"{_found(part, reason_of.index(reason))})"
-            for reason in leading[:_SHOWN_REASONS]
-        ]
-        everything = len(part) == len(why.code)
-        limit = "none is left" if everything else f"more than {100.0 * self.max_share:g} %"
-        way_round = "" if everything else f"; or leave them out with --max-rejected {np.ceil(share * 100.0) / 100.0:g}"
-        hint = next(reason.hint for reason in why.reasons if reason.text == leading[0])
-        raise InputError(
-            f"{self.source}: {len(part)} of {len(why.code)} {what} cannot be used, {limit}: {'; '.join(told)}",
-            hint=f"{hint}{way_round}",
+        names = list(reason_of)
+        reasons = [_Reason(_text(text), "", counts=False) for text in sorted(set(reason_of.values()))]
+        code_of = {reason.text: code for code, reason in enumerate(reasons)}
+
+        def described(rows: Ints, texts: Sequence[str]) -> Iterator[RejectedRows]:
+            of_row = [names[row] for row in rows.tolist()]
+            yield _rejected_images(of_row, [f"{self.source}/{name}" for name in of_row], texts)
+
+        codes = np.array([code_of[_text(reason_of[name])] for name in names], np.int64)
+        self._parts.append(_LeftOut("images", len(names), np.arange(len(names)), codes, reasons, {""}, described))
+
+
+def _rejected_images(names: Sequence[str], places: Sequence[str], reasons: Sequence[str]) -> RejectedRows:
+    count = len(names)
+    return RejectedRows(
+        table=Categories.from_texts(["images"] * count),
+        place=pa.array([_text(place) for place in places], pa.string()),
+        reason=Categories.from_texts(reasons),
+        image_name=pa.array([_text(name) for name in names], pa.string()),
+        class_name=Categories.from_texts([""] * count),
+        center_px=np.full((count, 2), np.nan),
+        size_px=np.full((count, 2), np.nan),
+        score=np.full(count, np.nan),
+    )
+
+
+def _rejected_boxes(boxes: FiledBoxes, rows: Ints, reasons: Sequence[str]) -> Iterator[RejectedRows]:
+    """Yield what is listed of some boxes, ascending, in portions."""
+    window = rows // row_file.PORTION
+    for portion in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(window)) + 1):
+        first, last = int(rows[portion[0]]), int(rows[portion[-1]])
+        values = boxes.read(first, last - first + 1)[rows[portion] - first]
+        yield RejectedRows(
+            table=Categories.from_texts(["detections"] * len(portion)),
+            place=pa.array([_text(boxes.where(row)) for row in rows[portion].tolist()], pa.string()),
+            reason=Categories.from_texts([reasons[i] for i in portion.tolist()]),
+            image_name=pa.array([_text(boxes.image_names[code]) for code in values["image"].tolist()], pa.string()),
+            class_name=Categories.from_texts([_text(boxes.class_names[code]) for code in values["class"].tolist()]),
+            center_px=_finite(values["center"]),
+            size_px=_finite(values["size"]),
+            score=_finite(values["score"]),
         )
 
 
 class Verdicts:
-    """For each row (N) the first reason that was found against it, as a code, or -1."""
+    """For each row (N) of a portion the first reason that was found against it, as a code of `reasons`, or -1."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, reasons: list[_Reason] | None = None) -> None:
         self.code = np.full(count, -1, dtype=np.int32)
-        self.reasons: list[_Reason] = []
+        self.reasons: list[_Reason] = [] if reasons is None else reasons
 
-    def mark(self, wrong: Bools | np.bool_, reason: _Reason, part: slice = slice(None)) -> None:
-        """Note a reason against rows, or a part of them, that have none yet."""
+    def mark(self, wrong: Bools | np.bool_, reason: _Reason) -> None:
+        """Note a reason against rows that have none yet."""
         if reason not in self.reasons:
             self.reasons.append(reason)
-        code = self.code[part]
-        code[wrong & (code < 0)] = self.reasons.index(reason)
+        self.code[wrong & (self.code < 0)] = self.reasons.index(reason)
 
     @property
     def fine(self) -> Bools:
@@ -257,132 +245,203 @@ def vet_images(
         length = np.linalg.norm(images.cam_from_world_quat, axis=1)
         why.mark(~(np.abs(length - 1.0) <= _QUATERNION_TOLERANCE), _NO_ROTATION)
 
-    def name(row: int) -> str:
-        return str(images.name[row].as_py())
+    def described(rows: Ints, texts: Sequence[str]) -> Iterator[RejectedRows]:
+        names = [str(images.name[row].as_py()) for row in rows.tolist()]
+        if where is None:
+            places = [f"{rejections.source}: image {name!r}" for name in names]
+        else:
+            places = [where(row) for row in rows.tolist()]
+        yield _rejected_images(names, places, texts)
 
-    rejections.add(
-        "images",
-        why,
-        where=where or (lambda row: f"{rejections.source}: image {name(row)!r}"),
-        image_names=name,
-    )
+    wrong = np.flatnonzero(why.code >= 0)
+    codes = why.code[wrong].astype(np.int64)
+    rejections.add(_LeftOut("images", len(images), wrong, codes, why.reasons, {""}, described))
     return (images if why.fine.all() else images.take(why.fine)), why.fine
 
 
-def vet_boxes(boxes: FoundBoxes, images: Images, usable: Bools, cameras: Cameras, rejections: Rejections) -> Detections:
-    """Return the boxes that can be used, numbered; the others go to the rejections.
+def vet_boxes(
+    boxes: FiledBoxes, images: Images, usable: Bools, cameras: Cameras, rejections: Rejections
+) -> Callable[[], Iterator[Detections]]:
+    """Return what yields the boxes that can be used, numbered and in portions; the others go to the rejections.
+
+    Boxes are looked at in the order of the file, then by image, as one is there twice in one image only, and come out
+    by their ids. What is between lies in temporary files.
 
     `images` are those that `image_row` counts, with all that were left out; `usable` (N) says which were not.
     """
-    classes = Texts.of(boxes.class_names).categories(_text)
-    why = Verdicts(len(boxes))
-    row = np.asarray(boxes.image_row, np.int64)
-    # Ids of cameras that are not there are found by the checks at the door.
-    order = np.argsort(cameras.camera_id)
-    place = np.searchsorted(cameras.camera_id[order], images.camera_id)
-    camera_of_image = order[np.minimum(place, len(order) - 1)]
-    picture_px = np.column_stack([cameras.width_px, cameras.height_px]).astype(np.float64)
-    ranges = [values for values in (boxes.range_m, boxes.range_sigma_m, boxes.vertical_sigma_px) if values is not None]
-    no_image = _Reason(
-        "its image is not among the images with a pose",
-        f"images are matched by file name, as in {str(images.name[0].as_py())!r}: correct the names",
-    )
-    # In portions: what is between takes more memory than the boxes.
-    for start in range(0, len(boxes), _PORTION):
-        part = slice(start, start + _PORTION)
-        of, center, size, score = row[part], boxes.center_px[part], boxes.size_px[part], boxes.score[part]
-        why.mark(of < 0, no_image, part)
-        why.mark((of >= 0) & ~usable[of], _LEFT_OUT, part)
-        why.mark(~np.isfinite(np.column_stack([center, size, score])).all(axis=1), _NOT_FINITE, part)
-        if not boxes.are_points:
-            why.mark(~(size > 0.0).all(axis=1), _NO_SIZE, part)
-        picture = picture_px[camera_of_image[of]]
-        why.mark((size > _MAX_SIZE_OF_PICTURE * picture).any(axis=1), _TOO_LARGE, part)
-        why.mark(((center < 0.0) | (center > picture)).any(axis=1), _OUTSIDE, part)
-        why.mark((score < 0.0) | (score > 1.0), _SCORE, part)
-        for values in ranges:
-            why.mark((values[part] <= 0.0) | np.isinf(values[part]), _RANGE, part)
-        why.mark(classes.codes[part] == classes.code_of(""), _NO_CLASS, part)
-    why.mark(_repeated(boxes, classes, why.fine), _TWICE)
+    by_id = np.argsort(images.image_id, kind="stable")
+    rank = np.empty(len(images), np.int64)
+    rank[by_id] = np.arange(len(images))
+    texts = [_text(text) for text in boxes.class_names]
+    classes = tuple(sorted(set(texts)))
+    code_of = {name: code for code, name in enumerate(classes)}
+    class_code = np.array([code_of[text] for text in texts], np.int64)
+    count = np.zeros(len(images), np.int64)
+    for _, portion in boxes.rows.portions():
+        np.add.at(count, rank[boxes.image_row[portion["image"]]], 1)
+    has_ids, bounds_of_ids = are_distinct(boxes.rows) if boxes.has_ids else (False, bounds_by_count(count[:0]))
+    more = (*(("detection_id",) if has_ids else ()), *boxes.optional())
+    of_image = PartFile(structure(("row", *more)), bounds_by_count(count))
+    left_out = _Noted(boxes, classes)
+    judge = _Judge(images, usable, cameras, are_points=boxes.are_points, ranges=boxes.optional())
+    for first, portion in boxes.portions():
+        of = boxes.image_row[portion["image"]]
+        kind = class_code[portion["class"]]
+        why = judge.verdicts(portion, of, kind == code_of.get("", -1), left_out.reasons)
+        left_out.note(first + np.flatnonzero(~why.fine), why.code[~why.fine].astype(np.int64), kind[~why.fine])
+        fine = np.empty(int(why.fine.sum()), of_image.dtype)
+        for name in ("center", "size", "score", *more):
+            fine[name] = portion[name][why.fine]
+        fine["row"], fine["image"] = first + np.flatnonzero(why.fine), rank[of[why.fine]]
+        fine["class"] = kind[why.fine]
+        of_image.append(fine, fine["image"])
+    by_number, in_order = PartFile(of_image.dtype, bounds_of_ids), RowFile(of_image.dtype)
+    for part in of_image.parts():
+        again = _repeated(part, has_ids=has_ids)
+        left_out.note_repeated(part[again])
+        part = part[~again]
+        if has_ids:
+            by_number.append(part, part["detection_id"])
+        else:
+            in_order.append(part[_order(*(part[name] for name in ("image", "class", "center", "size", "score")))])
+    rejections.add(left_out.all())
 
-    def image_name(i: int) -> str:
-        if boxes.image_names is not None:
-            return boxes.image_names[i]
-        return str(images.name[row[i]].as_py()) if row[i] >= 0 else ""
+    def portions() -> Iterator[Detections]:
+        for ids, part in _by_id(by_number) if has_ids else _counted(in_order):
+            yield Detections(
+                detection_id=ids,
+                image_id=images.image_id[by_id[part["image"]]],
+                class_name=Categories(part["class"].copy(), classes),
+                **{f"{name}_px": part[name].copy() for name in ("center", "size")},
+                **{name: part[name].copy() for name in ("score", *boxes.optional())},
+            )
 
-    rejections.add("detections", why, where=boxes.where, image_names=image_name, boxes=boxes)
-    fine = slice(None) if why.fine.all() else why.fine  # A slice takes no memory.
-    return number_detections(
-        images.image_id[row[fine]],
-        Categories(classes.codes[fine], classes.names),
-        boxes.center_px[fine],
-        boxes.size_px[fine],
-        boxes.score[fine],
-        None if boxes.detection_id is None else boxes.detection_id[fine],
-        None if boxes.range_m is None else boxes.range_m[fine],
-        None if boxes.range_sigma_m is None else boxes.range_sigma_m[fine],
-        None if boxes.vertical_sigma_px is None else boxes.vertical_sigma_px[fine],
-    )
-
-
-def number_detections(
-    image_id: Ints,
-    class_names: Sequence[str] | Categories,
-    center_px: Floats,
-    size_px: Floats,
-    score: Floats,
-    detection_id: Ints | None = None,
-    range_m: Floats | None = None,
-    range_sigma_m: Floats | None = None,
-    vertical_sigma_px: Floats | None = None,
-) -> Detections:
-    """Return boxes that can all be used as detections; `image_id` (N) is of `Images`, the rest as in `FoundBoxes`."""
-    classes = class_names if isinstance(class_names, Categories) else Categories.from_texts(class_names)
-    if detection_id is None:
-        order = np.lexsort((score, classes.codes, *size_px.T, *center_px.T, image_id))
-        ids: Ints = np.arange(len(order), dtype=np.int64)
-    else:
-        order = np.argsort(detection_id)
-        ids = detection_id[order]
-    return Detections(
-        detection_id=ids,
-        image_id=image_id[order],
-        class_name=classes.take(order),
-        center_px=center_px[order],
-        size_px=size_px[order],
-        score=score[order],
-        range_m=None if range_m is None else range_m[order],
-        range_sigma_m=None if range_sigma_m is None else range_sigma_m[order],
-        vertical_sigma_px=None if vertical_sigma_px is None else vertical_sigma_px[order],
-    )
+    return portions
 
 
-def _repeated(boxes: FoundBoxes, classes: Categories, fine: Bools) -> Bools:
+def _by_id(file: PartFile) -> Iterator[tuple[Ints, Rows]]:
+    """Yield the rows by their own ids."""
+    for part in file.parts():
+        part = part[np.argsort(part["detection_id"])]
+        yield part["detection_id"].copy(), part
+
+
+def _counted(file: RowFile) -> Iterator[tuple[Ints, Rows]]:
+    """Yield the rows with numbers from 0."""
+    for first, part in file.portions():
+        yield np.arange(first, first + len(part)), part
+
+
+class _Judge:
+    """Looks at boxes by themselves, portion by portion."""
+
+    def __init__(
+        self, images: Images, usable: Bools, cameras: Cameras, *, are_points: bool, ranges: Sequence[str]
+    ) -> None:
+        # Ids of cameras that are not there are found by the checks at the door.
+        order = np.argsort(cameras.camera_id)
+        place = np.searchsorted(cameras.camera_id[order], images.camera_id)
+        self._camera_of_image = order[np.minimum(place, len(order) - 1)]
+        self._picture_px = np.column_stack([cameras.width_px, cameras.height_px]).astype(np.float64)
+        self._usable, self._are_points, self._ranges = usable, are_points, ranges
+        self._no_image = _Reason(
+            "its image is not among the images with a pose",
+            f"images are matched by file name, as in {str(images.name[0].as_py())!r}: correct the names",
+        )
+
+    def verdicts(self, portion: Rows, image_row: Ints, has_no_class: Bools, reasons: list[_Reason]) -> Verdicts:
+        """Return what is wrong with each box."""
+        why = Verdicts(len(portion), reasons)
+        center, size, score = portion["center"], portion["size"], portion["score"]
+        why.mark(image_row < 0, self._no_image)
+        why.mark((image_row >= 0) & ~self._usable[image_row], _LEFT_OUT)
+        why.mark(~np.isfinite(np.column_stack([center, size, score])).all(axis=1), _NOT_FINITE)
+        if not self._are_points:
+            why.mark(~(size > 0.0).all(axis=1), _NO_SIZE)
+        picture = self._picture_px[self._camera_of_image[image_row]]
+        why.mark((size > _MAX_SIZE_OF_PICTURE * picture).any(axis=1), _TOO_LARGE)
+        why.mark(((center < 0.0) | (center > picture)).any(axis=1), _OUTSIDE)
+        why.mark((score < 0.0) | (score > 1.0), _SCORE)
+        for name in self._ranges:
+            why.mark((portion[name] <= 0.0) | np.isinf(portion[name]), _RANGE)
+        why.mark(has_no_class, _NO_CLASS)
+        return why
+
+
+class _Noted:
+    """Which boxes are left out, as it is found out."""
+
+    def __init__(self, boxes: FiledBoxes, classes: Sequence[str]) -> None:
+        self.reasons: list[_Reason] = []
+        self._boxes, self._classes = boxes, classes
+        self._rows: list[Ints] = [np.empty(0, np.int64)]
+        self._codes: list[Ints] = [np.empty(0, np.int64)]
+        self._kinds: set[int] = set()
+
+    def note(self, rows: Ints, codes: Ints, kinds: Ints) -> None:
+        """Note the reasons (N) against boxes of these classes, by their codes."""
+        self._rows.append(rows)
+        self._codes.append(codes)
+        self._kinds.update(np.unique(kinds).tolist())
+
+    def note_repeated(self, part: Rows) -> None:
+        """Note boxes that are there already."""
+        if _TWICE not in self.reasons:
+            self.reasons.append(_TWICE)
+        self.note(part["row"], np.full(len(part), self.reasons.index(_TWICE)), part["class"])
+
+    def all(self) -> _LeftOut:
+        """Return all of them."""
+        rows, codes = np.concatenate(self._rows), np.concatenate(self._codes)
+        order = np.argsort(rows)
+        names = {self._classes[kind] for kind in self._kinds}
+        described = functools.partial(_rejected_boxes, self._boxes)
+        return _LeftOut("detections", len(self._boxes), rows[order], codes[order], self.reasons, names, described)
+
+
+def _repeated(boxes: Rows, *, has_ids: bool) -> Bools:
     """Return which boxes (N) another one repeats that has the same image, class, place and size.
 
     The one with the highest score stays, of these the one with the lowest id or that stands first.
     """
     result = np.zeros(len(boxes), dtype=np.bool_)
-    rows = np.flatnonzero(fine)
-    same = (boxes.image_row, classes.codes, *boxes.center_px.T, *boxes.size_px.T)
+    same = (boxes["image"], boxes["class"], *boxes["center"].T, *boxes["size"].T)
     # Most boxes have no twin: a hash finds those that may have one, which alone are then sorted by all columns.
     mixed = np.zeros(len(boxes), dtype=np.uint64)
-    for start in range(0, len(boxes), _PORTION):
-        part = mixed[start : start + _PORTION]
-        for column in same:
-            values = column[start : start + _PORTION] + 0.0  # -0 becomes 0, which it equals.
-            part[:] = (part ^ values.view(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
-            part ^= part >> np.uint64(29)
-    mixed = mixed[rows]
+    for column in same:
+        values = np.ascontiguousarray(column, np.float64) + 0.0  # -0 becomes 0, which it equals.
+        mixed = (mixed ^ values.view(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
+        mixed ^= mixed >> np.uint64(29)
     ascending = np.sort(mixed)
-    maybe = rows[np.isin(mixed, ascending[1:][ascending[1:] == ascending[:-1]])]
-    tie = maybe if boxes.detection_id is None else boxes.detection_id[maybe]
-    maybe = maybe[np.lexsort((tie, -boxes.score[maybe], *(column[maybe] for column in same)))]
+    maybe = np.flatnonzero(np.isin(mixed, ascending[1:][ascending[1:] == ascending[:-1]]))
+    tie = boxes["detection_id" if has_ids else "row"][maybe]
+    maybe = maybe[np.lexsort((tie, -boxes["score"][maybe], *(column[maybe] for column in same)))]
     is_repeat = np.ones(max(len(maybe) - 1, 0), dtype=np.bool_)
     for column in same:
         is_repeat &= column[maybe[1:]] == column[maybe[:-1]]
     result[maybe[1:][is_repeat]] = True
     return result
+
+
+def number_detections(
+    image_id: Ints, class_names: Sequence[str], center_px: Floats, size_px: Floats, score: Floats
+) -> Detections:
+    """Return boxes (N) that can all be used as detections; `image_id` is of `Images`, the rest as in `FoundBoxes`."""
+    classes = Categories.from_texts(class_names)
+    order = _order(image_id, classes.codes, center_px, size_px, score)
+    ids = np.arange(len(order), dtype=np.int64)
+    return Detections(ids, image_id[order], classes.take(order), center_px[order], size_px[order], score[order])
+
+
+def _order(image: Ints, kind: NDArray[np.int32], center_px: Floats, size_px: Floats, score: Floats) -> Ints:
+    """Return the order by which boxes are numbered that have no ids."""
+    return np.lexsort((score, kind, *size_px.T, *center_px.T, image))
+
+
+def _recoded(column: Categories, names: tuple[str, ...]) -> Categories:
+    """Return the same texts as categories of more names."""
+    code = np.array([names.index(name) for name in column.names], np.int32)
+    return Categories(code[column.codes] if len(column) else column.codes, names)
 
 
 def _text(text: str) -> str:
@@ -394,14 +453,14 @@ def _finite(values: Floats) -> Floats:
     return np.where(np.isfinite(values), values, np.nan)
 
 
-def _found(part: RejectedRows, row: int) -> str:
+def _found(row: RejectedRows) -> str:
     """Return what a box was, where the file said it."""
-    if part.table.texts()[row] != "detections":
+    if row.table.texts()[0] != "detections":
         return ""
-    x, y = part.center_px[row]
-    width, height = part.size_px[row]
-    image = part.image_name[row].as_py()
-    return f": {image!r}, centre {x:g} {y:g}, size {width:g} x {height:g}, score {part.score[row]:g}"
+    x, y = row.center_px[0]
+    width, height = row.size_px[0]
+    image = row.image_name[0].as_py()
+    return f": {image!r}, centre {x:g} {y:g}, size {width:g} x {height:g}, score {row.score[0]:g}"
 
 
 def count_reasons(rejected: RejectedRows) -> dict[str, dict[str, int]]:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from valuemap.cli.import_.app import check_out, finish_dataset, import_app
+from valuemap.cli.import_.app import check_out, finish_import, import_app
 from valuemap.cli.import_.options import Anchor, CameraHeight, ClassName, Columns
 from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected
 from valuemap.cli.show import progress_bars
@@ -33,7 +33,7 @@ def import_bearings(
 
     check_out(out, force=force)
     with progress_bars() as progress:
-        dataset = READERS["bearings"](
+        found = READERS["bearings"].in_portions(
             bearings,
             columns=parse_columns(columns or []),
             class_name=class_name,
@@ -43,4 +43,4 @@ def import_bearings(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out, force=force, as_json=as_json)
+    finish_import(found, out, force=force, as_json=as_json)

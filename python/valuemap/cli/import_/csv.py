@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from valuemap.cli.import_.app import check_out, finish_dataset, import_app
+from valuemap.cli.import_.app import check_out, finish_import, import_app
 from valuemap.cli.import_.options import Anchor, CameraHeight, CameraText, Columns, PixelCenter, with_detections
 from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected, Up, Vertical
 from valuemap.cli.show import progress_bars
@@ -42,7 +42,7 @@ def import_csv(
 
     check_out(out, force=force)
     with progress_bars() as progress:
-        dataset = READERS["csv"](
+        found = READERS["csv"].in_portions(
             poses,
             detections=detections,
             camera=camera,
@@ -58,4 +58,4 @@ def import_csv(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out, force=force, as_json=as_json)
+    finish_import(found, out, force=force, as_json=as_json)

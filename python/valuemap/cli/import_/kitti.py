@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from valuemap.cli.import_.app import check_out, finish_dataset, import_app
+from valuemap.cli.import_.app import check_out, finish_import, import_app
 from valuemap.cli.import_.options import Anchor, with_detections
 from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected, Up
 from valuemap.cli.show import progress_bars
@@ -45,7 +45,7 @@ def import_kitti(
 
     check_out(out, force=force)
     with progress_bars() as progress:
-        dataset = READERS["kitti"](
+        found = READERS["kitti"].in_portions(
             poses,
             intrinsics=intrinsics,
             calibration=calibration,
@@ -59,4 +59,4 @@ def import_kitti(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out, force=force, as_json=as_json)
+    finish_import(found, out, force=force, as_json=as_json)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from valuemap.cli.import_.app import check_out, finish_dataset, import_app
+from valuemap.cli.import_.app import check_out, finish_import, import_app
 from valuemap.cli.import_.options import Anchor, with_detections
 from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected
 from valuemap.cli.show import progress_bars
@@ -31,11 +31,11 @@ def import_mapillary(
 
     check_out(out, force=force)
     with progress_bars() as progress:
-        dataset = READERS["mapillary"](
+        found = READERS["mapillary"].in_portions(
             export,
             detections=detections,
             anchor=anchor,
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out, force=force, as_json=as_json)
+    finish_import(found, out, force=force, as_json=as_json)

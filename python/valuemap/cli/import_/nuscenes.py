@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from valuemap.cli.import_.app import check_out, finish_dataset, import_app
+from valuemap.cli.import_.app import check_out, finish_import, import_app
 from valuemap.cli.import_.options import Anchor, with_detections
 from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected, Up
 from valuemap.cli.show import progress_bars
@@ -34,7 +34,7 @@ def import_nuscenes(
 
     check_out(out, force=force)
     with progress_bars() as progress:
-        dataset = READERS["nuscenes"](
+        found = READERS["nuscenes"].in_portions(
             tables,
             detections=detections,
             location=location,
@@ -44,4 +44,4 @@ def import_nuscenes(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out, force=force, as_json=as_json)
+    finish_import(found, out, force=force, as_json=as_json)

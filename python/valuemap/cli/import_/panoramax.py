@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from valuemap.cli.import_.app import check_out, finish_dataset, import_app
+from valuemap.cli.import_.app import check_out, finish_import, import_app
 from valuemap.cli.import_.options import Anchor, CameraHeight, with_detections
 from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected
 from valuemap.cli.show import progress_bars
@@ -33,7 +33,7 @@ def import_panoramax(
 
     check_out(out, force=force)
     with progress_bars() as progress:
-        dataset = READERS["panoramax"](
+        found = READERS["panoramax"].in_portions(
             export,
             detections=detections,
             class_key=class_key,
@@ -42,4 +42,4 @@ def import_panoramax(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out, force=force, as_json=as_json)
+    finish_import(found, out, force=force, as_json=as_json)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from valuemap.cli.import_.app import check_out, finish_dataset, import_app
+from valuemap.cli.import_.app import check_out, finish_import, import_app
 from valuemap.cli.import_.options import Anchor, CameraText, with_detections
 from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected
 from valuemap.cli.show import progress_bars, show_notes
@@ -41,7 +41,7 @@ def import_pictures(
     check_out(out, force=force)
     notes: list[str] = []
     with progress_bars() as progress:
-        dataset = READERS["pictures"](
+        found = READERS["pictures"].in_portions(
             folder,
             workspace=workspace or out.with_name(f"{out.name}.sfm"),
             poses=poses,
@@ -54,5 +54,5 @@ def import_pictures(
             progress=progress,
             tell=notes.append,
         )
-    finish_dataset(dataset, out, force=force, as_json=as_json)
+    finish_import(found, out, force=force, as_json=as_json)
     show_notes(notes)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from valuemap.cli.import_.app import check_out, finish_dataset, import_app
+from valuemap.cli.import_.app import check_out, finish_import, import_app
 from valuemap.cli.import_.options import Anchor, PixelCenter, with_detections
 from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected, Up
 from valuemap.cli.show import progress_bars
@@ -38,7 +38,7 @@ def import_tum(
 
     check_out(out, force=force)
     with progress_bars() as progress:
-        dataset = READERS["tum"](
+        found = READERS["tum"].in_portions(
             trajectory,
             detections=detections,
             camera=camera,
@@ -51,4 +51,4 @@ def import_tum(
             max_rejected=max_rejected,
             progress=progress,
         )
-    finish_dataset(dataset, out, force=force, as_json=as_json)
+    finish_import(found, out, force=force, as_json=as_json)

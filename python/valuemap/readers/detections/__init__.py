@@ -8,7 +8,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from valuemap.errors import InputError, SettingError
-from valuemap.readers.assemble import FoundBoxes
+from valuemap.readers.boxes import FiledBoxes, FoundBoxes
 from valuemap.readers.detections.bosch import read_bosch
 from valuemap.readers.detections.coco import read_coco
 from valuemap.readers.detections.csv import read_csv_boxes
@@ -32,7 +32,7 @@ DETECTIONS: dict[str, Callable[[DetectionFile], NamedBoxes]] = {
 _OF_SUFFIX = {".json": "coco", ".xml": "cvat", ".yaml": "bosch", ".yml": "bosch", ".csv": "csv", ".txt": "csv"}
 
 
-def read_detections(file: DetectionFile | Path | None, images: Images, cameras: Cameras) -> FoundBoxes:
+def read_detections(file: DetectionFile | Path | None, images: Images, cameras: Cameras) -> FoundBoxes | FiledBoxes:
     """Read boxes and find their images by name; None where they are still to be found in the pictures.
 
     Raises

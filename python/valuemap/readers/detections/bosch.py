@@ -30,7 +30,7 @@ def read_bosch(file: DetectionFile) -> NamedBoxes:
             edges.append([box[key].number() for key in ("x_min", "y_min", "x_max", "y_max")])
             where.append(box.where)
     found = np.array(edges, dtype=np.float64).reshape(-1, 4)
-    return NamedBoxes(
+    return NamedBoxes.of_columns(
         image_names=images,
         class_names=classes,
         center=(found[:, :2] + found[:, 2:]) / 2.0,

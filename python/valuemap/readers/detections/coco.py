@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from valuemap.coco import EXPECTED, ID, MAYBE_TEXT, TEXT, Entries
 from valuemap.errors import InputError
 from valuemap.json_lists import read_json_lists
+from valuemap.readers.boxes import BoxWriter
 from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes
-from valuemap.readers.texts import Texts
-from valuemap.tables import Floats, Ints
+from valuemap.tables import Ints
 
 
 def read_coco(file: DetectionFile) -> NamedBoxes:
@@ -28,7 +27,7 @@ def read_coco(file: DetectionFile) -> NamedBoxes:
     centre needs no further half pixel. Without `categories` the class of id 9 is `class-9`; without `score`
     the score is 1. Where every annotation has a whole number of its own as `id`, that is its detection_id.
 
-    The file is read in portions, so that of a box only its numbers are held.
+    The file is read in portions, and of a box its numbers are kept, in a temporary file.
 
     Raises
     ------
@@ -46,18 +45,16 @@ def read_coco(file: DetectionFile) -> NamedBoxes:
                 lists[key] = _LISTS[key](where)
             lists[key].add(Entries(where, portion.entries, portion.first))
     boxes = lists[None] if isinstance(lists.get(None), _Results) else _list_in(lists, "annotations", path)
-    if not boxes.count:
+    if not len(boxes.writer.rows):
         raise InputError(f"{path}: there are no detections in it", hint="did the detector find anything?")
     images = _Named("") if isinstance(boxes, _Results) else _list_in(lists, "images", path)
     categories = _list_in(lists, "categories", path).name_of if lists.get("categories") else None
     return NamedBoxes(
+        rows=boxes.writer.rows,
         image_names=boxes.image_names(images.name_of),
-        class_names=boxes.classes.texts(lambda key: _name_of_class(key, categories)),
-        center=_together(boxes.center),
-        size=_together(boxes.size),
-        score=_together(boxes.score),
-        where=lambda row: f"{boxes.where}[{row}]",
-        detection_id=boxes.own_ids(),
+        class_names=[_name_of_class(key, categories) for key in boxes.classes.keys],
+        where=partial(_place_of, boxes.where),
+        has_ids=boxes.has_ids,
         pictures=images.sizes,
         other_names=list(images.name_of.values()),
     )
@@ -68,65 +65,55 @@ class _Numbered:
 
     def __init__(self) -> None:
         self._number: dict[Any, int] = {}
-        self._codes: list[NDArray[np.int32]] = []
 
-    def add(self, values: list[Any]) -> None:
+    @property
+    def keys(self) -> list[Any]:
+        """The distinct values by their numbers."""
+        return list(self._number)
+
+    def codes_of(self, values: list[Any]) -> Ints:
+        """Return the number of each value (N)."""
         number = self._number
         keys = (value if ID.accepts(value) else (reprlib.repr(value),) for value in values)
-        self._codes.append(np.fromiter((number.setdefault(key, len(number)) for key in keys), np.int32, len(values)))
-
-    def texts(self, text_of: Callable[[Any], str]) -> Texts:
-        """Return the text of each value; two values may have the same."""
-        texts = Texts.of([text_of(key) for key in self._number])
-        return Texts(texts.codes[_together(self._codes)], texts.distinct)
+        return np.fromiter((number.setdefault(key, len(number)) for key in keys), np.int64, len(values))
 
 
 class _Boxes:
     """What boxes are, without what more their entries hold."""
 
-    def __init__(self, where: str) -> None:
-        self.where, self.count = where, 0
-        self.images, self.classes = _Numbered(), _Numbered()
-        self.center: list[Floats] = []
-        self.size: list[Floats] = []
-        self.score: list[Floats] = []
+    has_ids = False
 
-    def add(self, entries: Entries) -> None:
+    def __init__(self, where: str) -> None:
+        self.where, self.writer = where, BoxWriter()
+        self.images, self.classes = _Numbered(), _Numbered()
+
+    def write(self, entries: Entries, images: list[Any], ids: Ints | None = None) -> None:
+        """Keep the boxes of these images."""
         bbox_px = entries.boxes().reshape(-1, 4)
-        self.classes.add([entry.get("category_id") for entry in entries.entries])
-        self.center.append(bbox_px[:, :2] + bbox_px[:, 2:] / 2.0)
-        self.size.append(bbox_px[:, 2:].copy())
-        self.score.append(entries.numbers("score", 1.0))
-        self.count += len(bbox_px)
+        self.writer.add(
+            image=self.images.codes_of(images),
+            kind=self.classes.codes_of([entry.get("category_id") for entry in entries.entries]),
+            center=bbox_px[:, :2] + bbox_px[:, 2:] / 2.0,
+            size=bbox_px[:, 2:],
+            score=entries.numbers("score", 1.0),
+            detection_id=ids,
+        )
 
 
 class _Annotations(_Boxes):
-    """Boxes with an `image_id` of a listed image."""
+    """Boxes with an `image_id` of a listed image, and maybe whole numbers as ids."""
 
-    def __init__(self, where: str) -> None:
-        super().__init__(where)
-        self._ids: list[Ints] | None = []
+    has_ids = True
 
     def add(self, entries: Entries) -> None:
-        self.images.add([entry.get("image_id") for entry in entries.entries])
         ids = [entry.get("id") for entry in entries.entries]
-        if not all(type(value) is int and 0 <= value < 2**63 for value in ids):
-            self._ids = None
-        elif self._ids is not None:
-            self._ids.append(np.array(ids, dtype=np.int64))
-        super().add(entries)
+        self.has_ids &= all(type(value) is int and 0 <= value < 2**63 for value in ids)
+        images = [entry.get("image_id") for entry in entries.entries]
+        self.write(entries, images, np.array(ids, np.int64) if self.has_ids else np.zeros(len(ids), np.int64))
 
-    def image_names(self, name_of: Mapping[Any, str]) -> Texts:
-        """Return the file name of each box; of an image that is not listed its id, which is no file name."""
-        return self.images.texts(lambda key: name_of.get(key) or f"image_id {_written(key)}")
-
-    def own_ids(self) -> Ints | None:
-        """Return the ids of the boxes, where each has a whole number of its own."""
-        if self._ids is None:
-            return None
-        ids = _together(self._ids)
-        ascending = np.sort(ids)
-        return None if (ascending[1:] == ascending[:-1]).any() else ids
+    def image_names(self, name_of: Mapping[Any, str]) -> list[str]:
+        """Return the file names of the images; of one that is not listed its id, which is no file name."""
+        return [name_of.get(key) or f"image_id {_written(key)}" for key in self.images.keys]
 
 
 class _Results(_Boxes):
@@ -142,12 +129,11 @@ class _Results(_Boxes):
             name or (image_id if isinstance(image_id, str) else "")
             for name, image_id in zip(entries.column("file_name", MAYBE_TEXT, default=""), image_ids, strict=True)
         ]
-        self.images.add(names)
         self._unnamed += [(entries.first + row, image_ids[row]) for row, name in enumerate(names) if not name]
-        super().add(entries)
+        self.write(entries, names)
 
-    def image_names(self, _name_of: Mapping[Any, str]) -> Texts:
-        """Return the file name of each box."""
+    def image_names(self, _name_of: Mapping[Any, str]) -> list[str]:
+        """Return the file names of the images."""
         if self._unnamed:
             row, image_id = self._unnamed[0]
             raise InputError(
@@ -156,11 +142,7 @@ class _Results(_Boxes):
                 hint="add file_name to every result, or put the results as annotations into an object, beside "
                 "the list named images that the detector ran on",
             )
-        return self.images.texts(str)
-
-    def own_ids(self) -> None:
-        """Return nothing: results have no ids."""
-        return
+        return self.images.keys
 
 
 class _Named:
@@ -220,8 +202,5 @@ def _written(key: Any) -> str:
     return str(key[0]) if isinstance(key, tuple) else reprlib.repr(key)
 
 
-def _together(parts: list[Any]) -> Any:
-    """Return parts of an array as one, and forget them."""
-    together = np.concatenate(parts)
-    parts.clear()
-    return together
+def _place_of(where: str, row: int) -> str:
+    return f"{where}[{row}]"

@@ -6,7 +6,8 @@ from functools import partial
 
 import numpy as np
 
-from valuemap.readers.csv_file import CsvFile, line_of
+from valuemap.readers.boxes import OPTIONAL, BoxWriter
+from valuemap.readers.csv_file import CsvFile, csv_portions, line_of
 from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes
 from valuemap.readers.texts import Texts
 from valuemap.tables import Floats
@@ -15,8 +16,7 @@ _EXPECTED = "a CSV file with columns image and x1, y1, x2, y2, or left, top, wid
 
 
 _TEXTS = ("image", "class")
-_OPTIONAL = ("range_m", "range_sigma_m", "vertical_sigma_px")
-_NUMBERS = ("x1", "y1", "x2", "y2", "left", "top", "x", "y", "width", "height", "score", *_OPTIONAL)
+_NUMBERS = ("x1", "y1", "x2", "y2", "left", "top", "x", "y", "width", "height", "score", *OPTIONAL)
 
 
 def read_csv_boxes(file: DetectionFile) -> NamedBoxes:
@@ -26,26 +26,35 @@ def read_csv_boxes(file: DetectionFile) -> NamedBoxes:
     `width, height` or, for key points, without. Optional are `class`, `score`, `range_m`, `range_sigma_m` (metres) and
     `vertical_sigma_px`.
 
+    The file is read in portions, and of a box its numbers are kept, in a temporary file.
+
     Raises
     ------
     InputError
         The file is no such table.
     """
-    table = CsvFile(file.path, _EXPECTED, texts=_TEXTS, numbers=_NUMBERS, columns=file.columns)
-    center, size = _boxes(table)
-    has_class, has_score = table.has_optional("class"), table.has_optional("score")
-    optional = {name: table.numbers_or_none(name) if table.has(name) else None for name in _OPTIONAL}
+    writer = BoxWriter()
+    has_sizes = True
+    for table in csv_portions(file.path, _EXPECTED, texts=_TEXTS, numbers=_NUMBERS, columns=file.columns):
+        center, size = _boxes(table)
+        has_sizes = size is not None
+        has_class, has_score = table.has_optional("class"), table.has_optional("score")
+        classes = table.texts("class") if has_class else Texts.repeated(file.class_name, len(table))
+        writer.add(
+            image=writer.images.codes_of(table.texts("image")),
+            kind=writer.classes.codes_of(classes),
+            center=center,
+            size=size,
+            score=table.numbers("score") if has_score else np.full(len(table), file.full_score),
+            **{name: table.numbers_or_none(name) for name in OPTIONAL if table.has(name)},
+        )
     return NamedBoxes(
-        image_names=table.texts("image"),
-        class_names=table.texts("class") if has_class else Texts.repeated(file.class_name, len(table)),
-        center=center,
-        size=size,
-        score=table.numbers("score") if has_score else np.full(len(table), file.full_score),
-        where=partial(line_of, file.path),  # The table need not be kept for it.
+        rows=writer.rows,
+        image_names=writer.images.texts,
+        class_names=writer.classes.texts,
+        where=partial(line_of, file.path),
         fractions=file.fractions,
-        range_m=optional["range_m"],
-        range_sigma_m=optional["range_sigma_m"],
-        vertical_sigma_px=optional["vertical_sigma_px"],
+        are_points=not has_sizes,
     )
 
 

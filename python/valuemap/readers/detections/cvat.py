@@ -62,7 +62,7 @@ def read_cvat(file: DetectionFile) -> NamedBoxes:
     if not found.names:
         raise InputError(f"{file.path}: there are no images in it", hint=f"expected {_EXPECTED}")
     edges = np.array(found.edges, dtype=np.float64).reshape(-1, 4)
-    return NamedBoxes(
+    return NamedBoxes.of_columns(
         image_names=found.images,
         class_names=found.classes,
         center=(edges[:, :2] + edges[:, 2:]) / 2.0,

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from valuemap.dataset import rows_of
 from valuemap.errors import InputError, SettingError
-from valuemap.readers.assemble import FoundBoxes
+from valuemap.readers.boxes import BoxWriter, FiledBoxes
 from valuemap.readers.names import match_images
-from valuemap.readers.texts import Texts
+from valuemap.readers.row_file import RowFile
 from valuemap.tables import Cameras, Floats, Images, Ints
 
 
@@ -56,30 +57,57 @@ class DetectionFile:
 
 @dataclass(frozen=True, eq=False)
 class NamedBoxes:
-    """Boxes (N) of images that are known by name.
+    """Boxes (N) of images that are known by name, in a temporary file.
 
-    Centres and sizes (N, 2) are in pixels from the picture's corner, or fractions of its width and height; NaN where
-    the file holds no number. Without sizes nothing is known of them. `where(row)` says where a box stands in the file,
-    `pictures` the width and height of pictures as far as the file says.
+    Parameters
+    ----------
+    rows
+        Their numbers, with a number for each distinct name of an image and class. Centres and sizes are in pixels from
+        the picture's corner, or fractions of its width and height; NaN where the file holds no number.
+    image_names, class_names
+        The names by their numbers.
+    where
+        Returns where a box stands in the file, for its row.
+    fractions
+        Whether they are fractions.
+    are_points
+        Whether nothing is known of sizes.
+    has_ids
+        Whether all have whole numbers of their own.
+    pictures
+        Width and height of pictures as far as the file says.
+    other_names
+        Names of images without boxes: what is told apart by them must be told apart.
     """
 
+    rows: RowFile
     image_names: Sequence[str]
     class_names: Sequence[str]
-    center: Floats
-    size: Floats | None
-    score: Floats
     where: Callable[[int], str]
     fractions: bool = False
-    detection_id: Ints | None = None
+    are_points: bool = False
+    has_ids: bool = False
     pictures: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     other_names: Sequence[str] = ()
-    """Names of images without boxes: what is told apart by them must be told apart."""
-    range_m: Floats | None = None
-    range_sigma_m: Floats | None = None
-    vertical_sigma_px: Floats | None = None
+
+    @classmethod
+    def of_columns(
+        cls,
+        image_names: Sequence[str],
+        class_names: Sequence[str],
+        center: Floats,
+        size: Floats,
+        score: Floats,
+        **rest: Any,
+    ) -> NamedBoxes:
+        """Return boxes (N) that are in memory; `rest` is as above."""
+        writer = BoxWriter()
+        names = writer.images.codes_of(image_names), writer.classes.codes_of(class_names)
+        writer.add(image=names[0], kind=names[1], center=center, size=size, score=score)
+        return cls(writer.rows, writer.images.texts, writer.classes.texts, **rest)
 
 
-def find_images(boxes: NamedBoxes, images: Images, cameras: Cameras, file: DetectionFile) -> FoundBoxes:
+def find_images(boxes: NamedBoxes, images: Images, cameras: Cameras, file: DetectionFile) -> FiledBoxes:
     """Return the boxes with the rows of their images, -1 where there is none of the name.
 
     Raises
@@ -87,39 +115,32 @@ def find_images(boxes: NamedBoxes, images: Images, cameras: Cameras, file: Detec
     InputError
         There are no boxes, or they were made on pictures of another size.
     """
-    if not len(boxes.image_names):
+    if not len(boxes.rows):
         raise InputError(f"{file.path}: there are no detections in it", hint="did the detector find anything?")
-    names = Texts.of(boxes.image_names)
-    row_of = match_images({*names.distinct, *boxes.other_names}, images.name.to_pylist())
-    row_of_name = np.array([row_of.get(name, -1) for name in names.distinct], dtype=np.int64)
-    image_row = row_of_name[names.codes]
+    row_of = match_images({*boxes.image_names, *boxes.other_names}, images.name.to_pylist())
+    image_row = np.array([row_of.get(name, -1) for name in boxes.image_names], dtype=np.int64)
     camera_row = rows_of(images.camera_id, cameras.camera_id)
-    _refuse_other_sizes(boxes, names.distinct, row_of, camera_row, cameras, file.path)
-    center, size = boxes.center, boxes.size
-    if boxes.fractions:
-        picture_px = np.stack([cameras.width_px, cameras.height_px], axis=1)[camera_row[image_row]].astype(np.float64)
-        center, size = center * picture_px, None if size is None else size * picture_px
-    return FoundBoxes(
+    _refuse_other_sizes(boxes, row_of, camera_row, cameras, file.path)
+    picture_px = np.stack([cameras.width_px, cameras.height_px], axis=1)[camera_row[image_row]].astype(np.float64)
+    return FiledBoxes(
+        rows=boxes.rows,
         image_row=image_row,
+        image_names=boxes.image_names,
         class_names=boxes.class_names,
-        center_px=center + (0.5 - file.pixel_center),
-        size_px=np.zeros((len(image_row), 2)) if size is None else size,
-        are_points=boxes.size is None,
-        score=boxes.score / file.full_score,
         where=boxes.where,
-        image_names=names,
-        detection_id=boxes.detection_id,
-        range_m=boxes.range_m,
-        range_sigma_m=boxes.range_sigma_m,
-        vertical_sigma_px=boxes.vertical_sigma_px,
+        has_ids=boxes.has_ids,
+        are_points=boxes.are_points,
+        picture_px=picture_px if boxes.fractions else None,
+        shift_px=0.5 - file.pixel_center,
+        full_score=file.full_score,
     )
 
 
 def _refuse_other_sizes(
-    boxes: NamedBoxes, names: Sequence[str], row_of: Mapping[str, int], camera_row: Ints, cameras: Cameras, path: Path
+    boxes: NamedBoxes, row_of: Mapping[str, int], camera_row: Ints, cameras: Cameras, path: Path
 ) -> None:
     """Refuse boxes that were made on pictures of another size than the cameras', resized or undistorted."""
-    used = set(names)
+    used = set(boxes.image_names)
     for name, size in boxes.pictures.items():
         if name not in used or name not in row_of:
             continue

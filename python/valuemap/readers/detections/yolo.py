@@ -50,7 +50,7 @@ def read_yolo(file: DetectionFile) -> NamedBoxes:
             scores.append(score * file.full_score)
             where.append(f"{path} line {line}")
     boxes = np.array(places, dtype=np.float64).reshape(-1, 4)
-    return NamedBoxes(
+    return NamedBoxes.of_columns(
         image_names=images,
         class_names=classes,
         center=boxes[:, :2],
