@@ -164,12 +164,12 @@ def main() -> int:
     counts = sorted(options.detections)
     sizes = [(3 * options.images, counts[0]), *((options.images, count) for count in counts)]
     results: dict[str, Any] = {}
-    is_right = True
+    is_right: bool = True
     for kind, run in (("colmap and coco", import_colmap), ("csv", import_csv)):
         found = []
         for images, detections in sizes:
             took = run(images, detections, options.points)
-            is_right &= (took["images"], took["detections"]) == (images, detections)
+            is_right = is_right and bool(took["images"] == images and took["detections"] == detections)
             found.append(took)
             print(kind, json.dumps(took), flush=True)
         more_images, few, many = found[0], found[1], found[-1]
