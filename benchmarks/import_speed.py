@@ -193,7 +193,8 @@ def main() -> int:
 
 def _per(more: dict[str, Any], few: dict[str, Any], what: str) -> int:
     """Return how many bytes the peak grows by for each image or detection more."""
-    return round(2**20 * (more["peak_memory_mb"] - few["peak_memory_mb"]) / (more[what] - few[what]))
+    grown = 2**20 * float(more["peak_memory_mb"] - few["peak_memory_mb"])
+    return round(grown / float(more[what] - few[what]))
 
 
 if __name__ == "__main__":
