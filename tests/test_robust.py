@@ -116,6 +116,24 @@ def test_the_class_with_most_votes_has_the_place_and_others_do_not_vote() -> Non
     assert result.labels.votes[0] > 0.9 * len(lights)
 
 
+def test_a_detector_that_confuses_classes_makes_hardly_a_label_more() -> None:
+    city = block(passes_per_street=3, lookalikes_per_light=0.0, sign_row_spacing_m=20.0, class_confusion=0.15)
+    dataset = simulate(city, seed=5, name="block")
+    result = valuemap.build_map(dataset)
+    score = valuemap.evaluate_map(result, dataset)
+    assert score.recall > 0.95
+    assert score.precision > 0.9  # 0.6 where each class is for itself.
+    confusions = result.run["calibration"]["confusions"]
+    assert confusions["traffic_sign"]["traffic_light"] == pytest.approx(0.15, abs=0.05)
+    # Twelve lights are too few to tell: they are confused like all objects.
+    assert confusions["traffic_light"]["traffic_sign"] == pytest.approx(0.15, abs=0.05)
+    codes = dataset.detections.class_name.codes[
+        np.searchsorted(dataset.detections.detection_id, result.votes.detection_id)
+    ]
+    of_label = result.labels.class_name.codes[np.searchsorted(result.labels.label_id, result.votes.label_id)]
+    assert np.mean(codes != of_label) == pytest.approx(0.15, abs=0.05)
+
+
 @pytest.fixture(scope="module")
 def driven_block() -> tuple[Dataset, valuemap.Map]:
     dataset = simulate(block(passes_per_street=4, lookalikes_per_light=0.0), seed=5, name="block")

@@ -389,6 +389,7 @@ def test_no_group_of_drives_is_too_large() -> None:
 
 def test_what_few_groups_find_is_left_out() -> None:
     def found(*labels: tuple[float, list[int]]) -> Candidates:
+        """Of the second class where the first voter is 20 or more."""
         count = len(labels)
         return Candidates(
             np.array([[x, 0.0, 5.0] for x, _ in labels]).reshape(-1, 3),
@@ -397,25 +398,27 @@ def test_what_few_groups_find_is_left_out() -> None:
             covariance_m2=np.tile(0.01 * np.eye(3), (count, 1, 1)),
             existence=np.full(count, 0.9),
             expected=np.full(count, 4),
+            class_code=np.array([int(voters[0] >= 20) for _, voters in labels], np.int64),
         )
 
-    classes = Categories(np.array([0] * 20 + [1] * 20, np.int32), ("light", "sign"))
     groups = [
         found((0.0, [8, 9]), (5.0, [2, 3])),
         found((0.1, [4, 5]), (0.15, [24, 25])),  # The second is of another class.
         found((-0.1, [6, 7]), (0.1, [26, 27]), (0.6, [10, 11])),  # The third is another one.
         found((0.2, [0])),
     ]
-    joined, left_out = join_groups(groups, classes)
+    joined, left_out = join_groups(groups)
     assert joined.position_in_world_m[:, 0] == pytest.approx([0.05, 0.125])
     assert joined.voters.tolist() == [0, 4, 5, 6, 7, 8, 9, 24, 25, 26, 27]
     assert joined.voter_offsets.tolist() == [0, 7, 11]
     assert joined.expected is not None
     assert joined.expected.tolist() == [16, 8]
+    assert joined.class_code is not None
+    assert joined.class_code.tolist() == [0, 1]
     assert joined.covariance_m2 is not None
     assert joined.covariance_m2[0] == pytest.approx(0.0025 * np.eye(3))
     assert left_out == 2
-    assert len(join_groups([found(), found()], classes)[0]) == 0
+    assert len(join_groups([found(), found()])[0]) == 0
 
 
 # On disk, interrupted, twice.

@@ -81,7 +81,7 @@ class Scene:
 _Noise = tuple[float, ...]
 _Settings = tuple[float, float, float, float, int, int, float, bool, bool]
 
-_Calibration = tuple[_Noise, bool, Sequence[Sequence[float] | None], Sequence[float]]
+_Calibration = tuple[_Noise, bool, Sequence[Sequence[float] | None], Sequence[float], Sequence[Sequence[float]]]
 
 def calibrate(
     scene: Scene,
@@ -103,7 +103,7 @@ def misfit(
 ) -> tuple[float, NDArray[np.uint32]]: ...
 def find_labels(
     scene: Scene, calibration: _Calibration, settings: _Settings, threads: int, progress: Callable[[int, int], None]
-) -> tuple[_Floats, tuple[_Offsets, _Indices], _Floats, _Floats, _Offsets, dict[str, float]]: ...
+) -> tuple[_Floats, _Indices, tuple[_Offsets, _Indices], _Floats, _Floats, _Offsets, dict[str, float]]: ...
 def objects_of(
     scene: Scene,
     noise: _Noise,

@@ -9,7 +9,7 @@ from valuemap.cameras import Rays
 from valuemap.config import NoiseConfig
 from valuemap.dataset import Dataset, number_passes
 from valuemap.geodesy import lon_lat_height_from_enu
-from valuemap.tables import Candidates, Floats, Ints, Labels, Votes
+from valuemap.tables import Candidates, Categories, Floats, Ints, Labels, Votes
 
 _UPPER_TRIANGLE = (0, 1, 2, 4, 5, 8)
 
@@ -49,7 +49,7 @@ def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config
     facing = _mean_in_groups(_mean_in_groups(_unit_vectors(toward_camera), pass_of_voter), label_of_pass)
     labels = Labels(
         label_id=np.arange(1, len(candidates) + 1),
-        class_name=detections.class_name.take(voters[starts]),
+        class_name=_classes(candidates, detections.class_name),
         position_in_world_m=position,
         covariance_m2=covariance.reshape(-1, 9)[:, _UPPER_TRIANGLE],
         votes=count,
@@ -74,6 +74,12 @@ def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config
         residual_sigmas=residual_px / sigma_px,
     )
     return labels, votes
+
+
+def _classes(candidates: Candidates, of_detection: Categories) -> Categories:
+    if candidates.class_code is None:
+        return of_detection.take(candidates.voters[candidates.voter_offsets[:-1]].astype(np.int64))
+    return Categories(candidates.class_code.astype(of_detection.codes.dtype), of_detection.names)
 
 
 def residual_sigma_px(residual_px: Floats, labels: int) -> float:

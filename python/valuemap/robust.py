@@ -56,10 +56,14 @@ class Calibration:
     """What is learned of each class of the sample, by its name: the numbers of the core's `ClassModel::to_row`."""
     pooled: tuple[float, ...]
     """What is learned of all classes together: what others are like."""
+    confusions: dict[str, dict[str, float]]
+    """By class of the object and said class: the share of its detections. Only where classes are taken for others."""
 
     def as_tuple(self, class_names: Sequence[str]) -> tuple[Any, ...]:
         """Return it as the core takes it, for classes in this order."""
-        return self.noise.as_tuple(), self.is_deep, [self.classes.get(name) for name in class_names], self.pooled
+        classes = [self.classes.get(name) for name in class_names]
+        shares = [[self.confusions.get(name, {}).get(said, 0.0) for said in class_names] for name in class_names]
+        return self.noise.as_tuple(), self.is_deep, classes, self.pooled, shares
 
 
 def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
@@ -76,6 +80,10 @@ def calibration_from_json(value: Any, *, source: str) -> Calibration:
             is_deep=bool(value["is_deep"]),
             classes={name: _numbers(row) for name, row in value["classes"].items()},
             pooled=_numbers(value["pooled"]),
+            confusions={
+                name: {said: float(share) for said, share in shares.items()}
+                for name, shares in value["confusions"].items()
+            },
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{source}: is no calibration: {error}", hint="make the map again") from error
@@ -141,7 +149,7 @@ def calibrate(
     guess, known = _guess(config.noise)
     steps = _core.CALIBRATION_STEPS + (_core.SEARCH_STEPS if is_part else 0)
     with counted(progress, "estimating the noise", steps) as tell:
-        noise, is_deep, classes, pooled = _core.calibrate(
+        noise, is_deep, classes, pooled, shares = _core.calibrate(
             scene.core, guess.as_tuple(), known, _settings(config), is_part, threads, lambda done, _total: tell(done)
         )
     estimated = Noise(*noise)
@@ -150,7 +158,17 @@ def calibrate(
         is_deep=is_deep,
         classes={name: tuple(row) for name, row in zip(scene.class_names, classes, strict=False) if row is not None},
         pooled=tuple(pooled),
+        confusions=_by_name(shares, scene.class_names),
     )
+
+
+def _by_name(shares: Sequence[Sequence[float]], class_names: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Return the shares above 0 of a square table by the names of its rows and columns."""
+    by_name = {
+        name: {said: share for said, share in zip(class_names, row, strict=False) if share > 0.0}
+        for name, row in zip(class_names, shares, strict=False)
+    }
+    return {name: row for name, row in by_name.items() if row}
 
 
 def misfit(
@@ -183,7 +201,7 @@ def find_labels(
 ) -> tuple[Candidates, dict[str, Any]]:
     """Return the labels, ordered by first detection, and counts of what was found and rejected."""
     with counted(progress, "finding labels", steps_of_labels(calibration)) as tell:
-        position, (offsets, voters), covariance, existence, expected, counts = _core.find_labels(
+        position, class_code, (offsets, voters), covariance, existence, expected, counts = _core.find_labels(
             scene.core,
             calibration.as_tuple(scene.class_names),
             _settings(config),
@@ -192,7 +210,9 @@ def find_labels(
         )
     covariance = covariance.reshape(-1, 3, 3)
     counts = {_COUNTED_AS.get(name, name): value for name, value in counts.items()}
-    return Candidates(position, offsets, voters, None, covariance, existence, expected), counts
+    return Candidates(
+        position, offsets, voters, None, covariance, existence, expected, class_code.astype(np.int64)
+    ), counts
 
 
 def _all_own(noise: Noise) -> Noise:

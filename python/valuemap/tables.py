@@ -277,8 +277,8 @@ class Candidates:
 
     `position_in_world_m` (N, 3); the voters of candidate i are the rows `voters[voter_offsets[i] :
     voter_offsets[i + 1]]` of the detections, ascending. `cluster` (N) is where it was found (paper); `covariance_m2`
-    (N, 3, 3), the probability of `existence` (N) and the number of images `expected` to see it (N) are what the
-    robust method adds.
+    (N, 3, 3), the probability of `existence` (N), the number of images `expected` to see it (N) and the code of its class
+    `class_code` (N) are what the robust method adds; without, voters are all of one class.
     """
 
     position_in_world_m: Floats
@@ -288,6 +288,7 @@ class Candidates:
     covariance_m2: Floats | None = None
     existence: Floats | None = None
     expected: Ints | None = None
+    class_code: Ints | None = None
 
     def __len__(self) -> int:
         return len(self.position_in_world_m)
@@ -297,9 +298,8 @@ class Candidates:
         first, count = self.voter_offsets[rows], np.diff(self.voter_offsets)[rows]
         offsets = np.concatenate([[0], np.cumsum(count)])
         voters = self.voters[np.repeat(first - offsets[:-1], count) + np.arange(offsets[-1])]
-        columns = {
-            name: _take(getattr(self, name), rows) for name in ("cluster", "covariance_m2", "existence", "expected")
-        }
+        names = ("cluster", "covariance_m2", "existence", "expected", "class_code")
+        columns = {name: _take(getattr(self, name), rows) for name in names}
         return Candidates(self.position_in_world_m[rows], offsets, voters, **columns)
 
     def row_of_voter(self) -> Ints:

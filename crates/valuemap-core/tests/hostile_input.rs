@@ -26,6 +26,7 @@ use valuemap_core::partition::partition;
 use valuemap_core::progress::Progress;
 use valuemap_core::ray::{Ray, Rays};
 use valuemap_core::robust::calibrate::Known;
+use valuemap_core::robust::confusion::Confusions;
 use valuemap_core::robust::likeliest::misfit;
 use valuemap_core::robust::model::ClassModel;
 use valuemap_core::robust::noise::Noise;
@@ -397,10 +398,12 @@ fn evidence_of_hostile_points() {
 #[test]
 fn labels_of_hostile_scenes() {
     let classes = vec(proptest::option::of(class_model()), 0..3);
-    let cases = (columns(12), noise(), any::<bool>(), classes, class_model(), settings());
-    run("find", 200, &cases, |(columns, noise, is_deep, classes, pooled, settings)| {
+    let shares = vec(vec(0.0..=1.0_f64, 0..3), 0..3);
+    let cases = (columns(12), noise(), any::<bool>(), classes, class_model(), shares, settings());
+    run("find", 200, &cases, |(columns, noise, is_deep, classes, pooled, shares, settings)| {
         let scene = columns.scene();
-        let calibration = Calibration { noise, is_deep, classes, pooled, starts: 0 };
+        let confusions = Confusions::of_shares(&shares);
+        let calibration = Calibration { noise, is_deep, classes, pooled, confusions, starts: 0 };
         let found = find(&scene, &calibration, &settings, &Progress::default()).unwrap();
         for finding in &found.findings {
             all_finite("point", finding.estimate.point.iter())?;

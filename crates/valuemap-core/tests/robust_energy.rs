@@ -14,6 +14,7 @@ use valuemap_core::hypothesis::Viability;
 use valuemap_core::progress::Progress;
 use valuemap_core::robust::assign::{claims_of_all, images_of};
 use valuemap_core::robust::calibrate::Placed;
+use valuemap_core::robust::confusion::Confusions;
 use valuemap_core::robust::energy::{Object, fit, object as object_of};
 use valuemap_core::robust::index::RayIndex;
 use valuemap_core::robust::learn::learn;
@@ -143,7 +144,7 @@ proptest! {
         prop_assert!(ClassModel::from_row(&row[1..]).is_none());
         let mut other = Model::new(&scene, &DRIFTING, &SETTINGS);
         let own = other.classes[0];
-        other.know(&[None], model.pooled);
+        other.know(&[None], model.pooled, &Confusions::none(1));
         prop_assert_eq!(other.classes[0].ln_clutter_per_sr.to_bits(), own.ln_clutter_per_sr.to_bits());
         if model.pooled.is_learned {
             prop_assert_eq!(other.classes[0].rates, model.pooled.rates);

@@ -165,7 +165,7 @@ proptest! {
             .map(|(votes, point)| object_of(&model, &lookout, votes, point, Vec::new()).unwrap());
         let starts = labels.iter().map(|label| Start { voters: &label.votes, weights: &[], point: label.fit.point });
         let solution = Joint::new(&scene, &DRIFTING, starts, Care::Exact).solve().unwrap();
-        let contested = Contest::new(&scene, &DRIFTING, GATE_SIGMAS, &labels).contested(&solution);
+        let contested = Contest::new(&model, &labels).contested(&solution);
         let shows_twin: BTreeSet<u32> = labels[1].votes.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
         for (((of, ray), _), is_contested) in solution.own_chi2().into_iter().zip(contested) {
             let seen = scene.ray(ray);

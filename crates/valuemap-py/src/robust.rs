@@ -10,6 +10,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use valuemap_core::hypothesis::Viability;
 use valuemap_core::robust::calibrate::Known;
+use valuemap_core::robust::confusion::Confusions;
 use valuemap_core::robust::model::ClassModel;
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::scene::{Frustum, Scene as CoreScene, View};
@@ -181,10 +182,11 @@ fn settings_of(
     Ok(Settings { viability, gate_sigmas, min_votes, least_votes, min_existence, without: Without { polish, merge } })
 }
 
-/// A calibration: the noise, whether all moves pay, numbers of each class where anything is known of it, and those of all classes together.
-type CalibrationValues = (NoiseValues, bool, Vec<Option<Vec<f64>>>, Vec<f64>);
+/// A calibration: the noise, whether all moves pay, numbers of each class where anything is known of it, those of all classes together, and the shares
+/// of the detections of each class that are said to be of each other.
+type CalibrationValues = (NoiseValues, bool, Vec<Option<Vec<f64>>>, Vec<f64>, Vec<Vec<f64>>);
 
-fn calibration_of((noise, is_deep, classes, pooled): CalibrationValues) -> PyResult<Calibration> {
+fn calibration_of((noise, is_deep, classes, pooled, shares): CalibrationValues) -> PyResult<Calibration> {
     let of = |row: Vec<f64>| {
         // Edges of steps may be infinite.
         let finite: Vec<f64> = row.iter().copied().filter(|number| !number.is_infinite()).collect();
@@ -193,8 +195,13 @@ fn calibration_of((noise, is_deep, classes, pooled): CalibrationValues) -> PyRes
             PyValueError::new_err("calibration: expected as many numbers of a class as calibrate returns")
         })
     };
+    let is_share = |row: &Vec<f64>| row.iter().all(|share| (0.0..=1.0).contains(share));
+    if !shares.iter().all(is_share) {
+        return Err(PyValueError::new_err("calibration: expected shares of confused detections between 0 and 1"));
+    }
     Ok(Calibration {
         starts: 0,
+        confusions: Confusions::of_shares(&shares),
         noise: noise_of(noise)?,
         is_deep,
         classes: classes.into_iter().map(|row| row.map(of).transpose()).collect::<PyResult<_>>()?,
@@ -233,7 +240,7 @@ pub fn calibrate(
         noise.rotation_drift_rad,
     ];
     let classes = found.classes.iter().map(|class| class.as_ref().map(ClassModel::to_row)).collect();
-    Ok((noise, found.is_deep, classes, found.pooled.to_row()))
+    Ok((noise, found.is_deep, classes, found.pooled.to_row(), found.confusions.shares().to_vec()))
 }
 
 /// How badly rays fit, and which, `valuemap_core::robust::likeliest::misfit`.
@@ -265,9 +272,10 @@ pub fn misfit<'py>(
     Ok((value, rays.into_pyarray(py)))
 }
 
-/// Positions, voters, covariances (N, 9), existence, expected images, and counts.
+/// Positions, classes, voters, covariances (N, 9), existence, expected images, and counts.
 type Found<'py> = (
     Bound<'py, PyArray2<f64>>,
+    Bound<'py, PyArray1<u32>>,
     Groups<'py>,
     Bound<'py, PyArray2<f64>>,
     Bound<'py, PyArray1<f64>>,
@@ -299,8 +307,10 @@ pub fn find_labels<'py>(
     }
     let existence: Vec<f64> = found.findings.iter().map(|finding| finding.existence).collect();
     let expected: Vec<i64> = found.findings.iter().map(|finding| i64::from(finding.expected)).collect();
+    let class: Vec<u32> = labels().map(|label| label.class).collect();
     Ok((
         matrix(py, labels().map(|label| label.estimate.point))?,
+        class.into_pyarray(py),
         (offsets.into_pyarray(py), voters.into_pyarray(py)),
         matrix(py, labels().map(|label| label.estimate.covariance))?,
         existence.into_pyarray(py),

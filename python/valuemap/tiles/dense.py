@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from valuemap.drives import InOrder
-from valuemap.tables import Candidates, Categories, Floats, Ints
+from valuemap.tables import Candidates, Floats, Ints
 
 _SAME_CHI2 = 16.27
 """Squared sigmas (chi-square, 3 axes, 99.9 %) within which labels of two groups are one object."""
@@ -51,21 +51,20 @@ def groups_of_drives(piece: InOrder, most_detections: int) -> list[Ints]:
     return [np.flatnonzero(of_image == group) for group in range(len(load))]
 
 
-def join_groups(found: list[Candidates], classes: Categories) -> tuple[Candidates, int]:
+def join_groups(found: list[Candidates]) -> tuple[Candidates, int]:
     """Return the labels of groups as one map, by their first detections, and how many were left out.
 
-    The voters of all groups are rows of the same detections, whose `classes` (D) are given; covariances, existences and
-    expected votes must be there.
+    The voters of all groups are rows of the same detections; covariances, existences, expected votes and classes must
+    be there.
     """
     position = np.concatenate([group.position_in_world_m for group in found])
-    covariance, existence, expected = (
-        np.concatenate([getattr(group, name) for group in found]) for name in ("covariance_m2", "existence", "expected")
-    )
+    names = ("covariance_m2", "existence", "expected", "class_code")
+    columns = {name: np.concatenate([getattr(group, name) for group in found]) for name in names}
+    covariance, existence, expected, code = columns.values()
     information = np.linalg.inv(covariance) if len(covariance) else covariance
     voters = [
         group.voters[a:b] for group in found for a, b in zip(group.voter_offsets, group.voter_offsets[1:], strict=False)
     ]
-    code = np.array([classes.codes[each[0]] for each in voters], np.int64)
     objects: list[list[int]] = []
     first = 0
     for group in found:
@@ -97,6 +96,7 @@ def join_groups(found: list[Candidates], classes: Categories) -> tuple[Candidate
         covariance_m2=np.array(spread).reshape(-1, 3, 3),
         existence=np.array([existence[rows].max() for rows in kept]),
         expected=np.array([expected[rows].sum() for rows in kept], np.int64),
+        class_code=np.array([code[rows[0]] for rows in kept], np.int64),
     ), len(objects) - len(kept)
 
 

@@ -101,7 +101,7 @@ def _by_groups(
             of_group, of_counts = find_labels(scene, calibration, config, threads=threads, progress=go_on)
             found.append(replace(of_group, voters=detection_row[of_group.voters].astype(np.uint32)))
             counts.append({"images": len(rows), **of_counts})
-    joined, left_out = join_groups(found, piece.dataset.detections.class_name)
+    joined, left_out = join_groups(found)
     return joined, {**summed(counts), "dense_groups": len(groups), "labels_of_few_groups": left_out}
 
 

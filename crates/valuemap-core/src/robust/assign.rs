@@ -220,7 +220,7 @@ pub fn claims_of_all(
     let range_m = model.settings.viability.max_range_m * VOTE_RANGE;
     let of_object = |(i, object): (usize, &Object)| {
         progress.check()?;
-        let hits = index.hits_of_any(&places_of(object), object.class, range_m);
+        let hits = index.hits_of_any(&places_of(object), &|said| model.confusions.may_be(object.class, said), range_m);
         let claim = |hit: super::index::Hit| Claim {
             image: hit.image,
             object: i as u32,
@@ -259,7 +259,7 @@ fn gain(model: &Model<'_>, object: &Object, ray: u32, pose: &PoseError) -> f64 {
         return f64::NEG_INFINITY;
     }
     let depth_m = model.scene.ray(ray).project(&object.fit.point).z;
-    model.vote_gain(ray, chi2, covariance.determinant(), depth_m, object.ln_size)
+    model.vote_gain(object.class, ray, chi2, covariance.determinant(), depth_m, object.ln_size)
 }
 
 /// What an object gains by a ray if nothing is known of the pose error of its image.

@@ -102,7 +102,7 @@ impl Nursery<'_> {
         let mut hits = Vec::new();
         for _ in 0..MAX_ROUNDS {
             hits = index.all_hits(&point, class, range_m);
-            let again = best_votes(model, &hits, &point, ln_size, may_vote);
+            let again = best_votes(model, class, &hits, &point, ln_size, may_vote);
             if again.len() < min_votes {
                 return None;
             }
@@ -130,9 +130,10 @@ impl Nursery<'_> {
     }
 }
 
-/// Of some hits the rays, ascending, that are votes rather than clutter: the best of each image.
+/// Of some hits the rays, ascending, that are votes for an object of a class rather than clutter: the best of each image.
 fn best_votes(
     model: &Model<'_>,
+    class: u32,
     hits: &[Hit],
     point: &Vector3<f64>,
     ln_size: f64,
@@ -141,7 +142,7 @@ fn best_votes(
     let gain = |hit: &Hit| {
         let depth_m = model.scene.ray(hit.ray).project(point).z;
         let variance = model.spreads[hit.ray as usize].variance(depth_m);
-        model.vote_gain(hit.ray, hit.chi2, variance * variance, depth_m, ln_size)
+        model.vote_gain(class, hit.ray, hit.chi2, variance * variance, depth_m, ln_size)
     };
     let may = hits.iter().filter(|hit| may_vote(hit.ray)).map(|hit| (hit, gain(hit)));
     let mut may: Vec<(&Hit, f64)> = may.filter(|(_, gain)| *gain > 0.0).collect();

@@ -13,8 +13,7 @@ use rustc_hash::FxHashSet;
 use super::energy::{Object, by_place};
 use super::estimate::{Estimate, Solution};
 use super::index::chi2_in_gate;
-use super::noise::Noise;
-use super::scene::Scene;
+use super::model::Model;
 
 /// Labels farther apart do not contest each other's votes, m.
 const NEIGHBOR_M: f64 = 3.0;
@@ -26,9 +25,7 @@ const LEAST_DIFFERENCE: f64 = 1e-2;
 
 /// Labels that might have each other's votes.
 pub struct Contest<'a> {
-    scene: &'a Scene,
-    noise: &'a Noise,
-    gate_sigmas: f64,
+    model: &'a Model<'a>,
     labels: &'a [Object],
     tree: RTree<GeomWithData<[f64; 3], usize>>,
     /// The images that show each label.
@@ -38,10 +35,10 @@ pub struct Contest<'a> {
 impl<'a> Contest<'a> {
     /// Begin with all labels of a scene.
     #[must_use]
-    pub fn new(scene: &'a Scene, noise: &'a Noise, gate_sigmas: f64, labels: &'a [Object]) -> Self {
-        let images = |label: &Object| label.votes.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
+    pub fn new(model: &'a Model<'a>, labels: &'a [Object]) -> Self {
+        let images = |label: &Object| label.votes.iter().map(|&ray| model.scene.rays.image[ray as usize]).collect();
         let shown_in = labels.par_iter().map(images).collect();
-        Self { scene, noise, gate_sigmas, labels, tree: by_place(labels), shown_in }
+        Self { model, labels, tree: by_place(labels), shown_in }
     }
 
     /// For each vote of a solution whether a neighbor that its image does not show might have it.
@@ -58,10 +55,11 @@ impl<'a> Contest<'a> {
 
     /// Never the label that has it: its images are those that show it.
     fn might_have(&self, neighbor: usize, ray: u32) -> bool {
-        let (seen, spread) = (self.scene.ray(ray), self.noise.total(self.scene, ray));
-        self.labels[neighbor].class == self.scene.rays.class[ray as usize]
-            && !self.shown_in[neighbor].contains(&self.scene.rays.image[ray as usize])
-            && chi2_in_gate(seen, &self.labels[neighbor].fit.point, &spread, self.gate_sigmas).is_some()
+        let (scene, gate_sigmas) = (self.model.scene, self.model.settings.gate_sigmas);
+        let (seen, spread) = (scene.ray(ray), self.model.noise.total(scene, ray));
+        self.model.confusions.may_be(self.labels[neighbor].class, scene.rays.class[ray as usize])
+            && !self.shown_in[neighbor].contains(&scene.rays.image[ray as usize])
+            && chi2_in_gate(seen, &self.labels[neighbor].fit.point, &spread, gate_sigmas).is_some()
     }
 }
 

@@ -6,7 +6,8 @@
 //! J = sum_v [ r' C^-1 r + ln|C| ] + 2 n ln 2 pi       (1) residuals; C: detections, poses of images, drift of the pass, marginalised
 //!   + ln|information| - 3 ln 2 pi - 2 ln births_c     (2) the position, marginalised, and the price of a birth
 //!   + 2 sum_i ln clutter_c                            (3) what the votes are otherwise
-//!   - 2 sum_i ln ratio(size_i)                        (4) boxes of one object have one physical size
+//!   - 2 sum_i [ ln ratio(size_i) + ln share(class_i) ]
+//!                                                     (4) boxes of one object have one physical size, and what a class is taken for
 //!   - 2 ln [ (1 - phi) real_c(hits; looks) + phi false_c(hits; looks) ]
 //!                                                     (5) who should have seen it, and did not, by side and pass
 //! ```
@@ -209,7 +210,7 @@ pub(super) struct HeightTerms {
 
 /// Logarithm of the density of heights at a point, with information and gradient of its position; nothing before heights are learned.
 pub(super) fn height_terms(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> Option<HeightTerms> {
-    let heights = model.class_of(*votes.first()?).heights?;
+    let heights = model.class_of_votes(votes)?.heights?;
     let up = model.up?;
     let height_m = height_m(model.scene, model.up, votes, point)?;
     let (part, share) = heights.part_at(height_m)?;
@@ -252,7 +253,8 @@ pub fn size_of(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> f64 {
     }
     let middle = sizes.len() / 2;
     let median = *sizes.select_nth_unstable_by(middle, f64::total_cmp).1;
-    let Sizes { object: (mean, sd), spread, .. } = model.class_of(votes[0]).sizes;
+    let Some(class) = model.class_of_votes(votes) else { return median };
+    let Sizes { object: (mean, sd), spread, .. } = class.sizes;
     if mean.is_nan() {
         return median;
     }
@@ -278,16 +280,16 @@ pub fn object(
 /// The same before it is asked who should have seen it: J is not less than its energy.
 #[must_use]
 pub fn unseen(model: &Model<'_>, votes: Vec<u32>, start: Vector3<f64>) -> Option<Object> {
-    let class = model.scene.rays.class[*votes.first()? as usize];
+    let class = model.likeliest_class(&votes)?;
     let fit = fit(model, &votes, start)?;
-    let (energy, ln_size) = energy_of_votes(model, &votes, &fit);
+    let (energy, ln_size) = energy_of_votes(model, class, &votes, &fit);
     Some(Object { class, votes, fit, ln_size, others: Vec::new(), seen: Seen::default(), real: 1.0, energy })
 }
 
 /// J of an object but for the looks at it, equations (1) to (4), of which it is not less; and the logarithm of its size, m.
 #[must_use]
-pub fn energy_of_votes(model: &Model<'_>, votes: &[u32], fit: &Fit) -> (f64, f64) {
-    let class = model.class_of(votes[0]);
+pub fn energy_of_votes(model: &Model<'_>, of_class: u32, votes: &[u32], fit: &Fit) -> (f64, f64) {
+    let class = &model.classes[of_class as usize];
     let ln_size = size_of(model, votes, &fit.point);
     let n = votes.len() as f64;
     let ln_2_pi = (2.0 * PI).ln();
@@ -296,7 +298,9 @@ pub fn energy_of_votes(model: &Model<'_>, votes: &[u32], fit: &Fit) -> (f64, f64
         .iter()
         .map(|&ray| {
             let depth_m = model.scene.ray(ray).project(&fit.point).z;
-            class.sizes.log_ratio(model.ln_angle[ray as usize], depth_m, ln_size) + model.ln_score_ratio(ray)
+            class.sizes.log_ratio(model.ln_angle[ray as usize], depth_m, ln_size)
+                + model.ln_score_ratio(ray)
+                + model.confusions.ln_share(of_class, model.scene.rays.class[ray as usize])
         })
         .sum();
     let of_size = prior_of_size(&class.sizes, ln_size);

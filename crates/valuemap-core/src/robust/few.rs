@@ -97,7 +97,7 @@ impl<'a> Beside<'a> {
             let is_near = covariance
                 .cholesky()
                 .is_none_or(|cholesky| apart.dot(&cholesky.solve(&apart)) <= model.settings.gate_sigmas.powi(2));
-            other.class == object.class && is_near && !object.is_seen_beside(model.scene, other)
+            model.confusions.may_be(other.class, object.class) && is_near && !object.is_seen_beside(model.scene, other)
         })
     }
 }
@@ -149,7 +149,8 @@ impl Nursery<'_> {
     fn votes_of(&self, object: &Object, ray: u32, may_vote: &dyn Fn(u32) -> bool) -> (Vec<u32>, f64) {
         let model = self.model;
         let image = model.scene.rays.image[ray as usize];
-        let hits = self.index.hits_of_any(&places_of(object), object.class, model.class_of(ray).farthest_m);
+        let may_be = |said| model.confusions.may_be(object.class, said);
+        let hits = self.index.hits_of_any(&places_of(object), &may_be, model.class_of(ray).farthest_m);
         let mut others: Vec<(u32, f64, u32)> = hits
             .into_iter()
             .filter(|hit| hit.image != image && may_vote(hit.ray))

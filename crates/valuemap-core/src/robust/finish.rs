@@ -15,7 +15,7 @@ const MOST_OBJECTS: usize = 12;
 /// The estimate of every object, in their order.
 #[must_use]
 pub fn finish(model: &Model<'_>, objects: &[Object]) -> Vec<Estimate> {
-    let contest = Contest::new(model.scene, model.noise, model.settings.gate_sigmas, objects);
+    let contest = Contest::new(model, objects);
     let mut estimates: Vec<Estimate> =
         objects.iter().map(|object| Estimate { point: object.fit.point, covariance: object.fit.covariance }).collect();
     let places = places(objects, model.settings.viability.max_range_m * PLACE_SHARE);

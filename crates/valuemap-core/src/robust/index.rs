@@ -96,12 +96,12 @@ impl<'a> RayIndex<'a> {
     /// All rays of one class within `range_m` that a point projects onto within their gates, in no order.
     #[must_use]
     pub fn all_hits(&self, point: &Vector3<f64>, class: u32, range_m: f64) -> Vec<Hit> {
-        self.hits_of_any(std::slice::from_ref(point), class, range_m)
+        self.hits_of_any(std::slice::from_ref(point), &|said| said == class, range_m)
     }
 
-    /// The rays that [`all_hits`](Self::all_hits) finds for any of some points, each with its least residual; in no order.
+    /// The rays of some classes that [`all_hits`](Self::all_hits) finds for any of some points, each with its least residual; in no order.
     #[must_use]
-    pub fn hits_of_any(&self, points: &[Vector3<f64>], class: u32, range_m: f64) -> Vec<Hit> {
+    pub fn hits_of_any(&self, points: &[Vector3<f64>], is_of: &dyn Fn(u32) -> bool, range_m: f64) -> Vec<Hit> {
         let Some(&middle) = points.get(points.len() / 2) else { return Vec::new() };
         let span = points.iter().map(|point| (point - middle).norm()).fold(0.0, f64::max);
         let reach = range_m + span + self.reach_m;
@@ -125,7 +125,7 @@ impl<'a> RayIndex<'a> {
                     of_ray.min_by(|a, b| a.chi2.total_cmp(&b.chi2))
                 };
                 // Points far away may be in the gate of lanes without a ray, as far as single precision tells.
-                let of_class = |&bit: &u32| place.classes.get(lane_of(bit)) == Some(&class);
+                let of_class = |&bit: &u32| place.classes.get(lane_of(bit)).is_some_and(|&class| is_of(class));
                 hits.extend(ones(any).filter(of_class).filter_map(nearest));
             }
         }

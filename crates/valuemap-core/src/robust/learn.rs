@@ -12,7 +12,7 @@ use super::seen::Looks;
 /// Steps of expectation and maximisation: some ten change the rates by less than a thousandth.
 const STEPS: usize = 20;
 /// Objects with fewer votes do not serve.
-const MIN_VOTES: usize = 6;
+pub const MIN_VOTES: usize = 6;
 /// The part of the votes that is nearer than what counts as seen from everywhere.
 const NEAR_VOTES: f64 = 0.05;
 /// Fewer of these tell nothing, and what was thought before stays.

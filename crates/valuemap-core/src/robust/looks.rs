@@ -66,7 +66,7 @@ impl Lookout {
     /// images (ascending) with a detection in its gate.
     #[must_use]
     pub fn looks(&self, model: &Model<'_>, point: &Vector3<f64>, voters: &[u32], others: &[u32]) -> Seen {
-        let Some(class) = voters.first().map(|&ray| model.class_of(ray)) else { return Seen::default() };
+        let Some(class) = model.class_of_votes(voters) else { return Seen::default() };
         // Before anything is learned, objects are seen from between their nearest and their farthest vote.
         let distances_m = if class.is_learned { (0.0, class.farthest_m) } else { (f64::INFINITY, 0.0) };
         let scene = model.scene;

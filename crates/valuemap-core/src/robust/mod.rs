@@ -6,13 +6,15 @@
 //! 4. [`assign`](mod@assign): all objects compete for all detections.
 //! 5. [`finish`](mod@finish): positions and covariances, objects of a place together ([`estimate`](mod@estimate), [`drift`], [`contest`]).
 //!    [`few`]: what one or two looks make. [`switches`]: what the pictures show to be another object is left out.
-//! 6. [`likeliest`], [`calibrate`]: the noise itself is estimated from the residuals; [`learn`](mod@learn): rates, sizes and clutter are.
+//! 6. [`likeliest`], [`calibrate`]: the noise itself is estimated from the residuals; [`learn`](mod@learn): rates, sizes and clutter are;
+//!    [`confusion`]: what classes are taken for.
 
 pub mod assign;
 pub mod births;
 pub mod calibrate;
 pub mod clutter;
 pub mod company;
+pub mod confusion;
 pub mod contest;
 pub mod counts;
 pub mod drift;
@@ -43,10 +45,13 @@ pub mod sizes;
 mod spd;
 pub mod switches;
 
+use std::sync::Arc;
+
 use crate::hypothesis::Viability;
 use crate::progress::{Halt, Progress};
 
 use calibrate::Known;
+use confusion::Confusions;
 use energy::{Object, object};
 use estimate::Estimate;
 use finish::finish;
@@ -112,6 +117,8 @@ pub struct Calibration {
     pub classes: Vec<Option<ClassModel>>,
     /// What is learned of all classes together: what others are like.
     pub pooled: ClassModel,
+    /// Which classes are taken for which.
+    pub confusions: Confusions,
     /// Whether all moves pay, from all images.
     pub is_deep: bool,
     /// From how many starts the noise was sought; 0 if it was known.
@@ -123,6 +130,8 @@ pub struct Calibration {
 pub struct Finding {
     /// Position and covariance.
     pub estimate: Estimate,
+    /// Its class: that of most of its votes, but for confusions.
+    pub class: u32,
     /// The rays that vote for it, ascending.
     pub votes: Vec<u32>,
     /// Probability that it exists.
@@ -188,7 +197,7 @@ pub fn self_calibrate(
         changed_share(&objects, &deeper) > LEAST_CHANGE
     };
     let classes = model.classes.iter().copied().map(Some).collect();
-    Ok(Calibration { noise, classes, pooled: model.pooled, is_deep, starts })
+    Ok(Calibration { noise, classes, pooled: model.pooled, confusions: model.confusions, is_deep, starts })
 }
 
 /// The share of the objects of two maps of the same rays that are not in both: with half of their votes.
@@ -209,12 +218,21 @@ fn changed_share(some: &[Object], others: &[Object]) -> f64 {
     lost as f64 / (some.len() + others.len()).max(1) as f64
 }
 
-/// Learn the classes of a model from the map of some rays, and return that.
+/// Learn the classes of a model from the map of some rays, and return that. Where classes are taken for each other, all competes once more.
 fn learn_from(model: &mut Model<'_>, rays: &[u32], progress: &Progress) -> Result<Vec<Object>, Halt> {
     let begun = initial::labels_of_few(model, rays, progress)?;
-    let objects = search(model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
+    let mut objects = search(model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
     let lookout = Lookout::new(model.scene, model.settings.viability.max_range_m);
     learn(model, &lookout, rays, &objects);
+    if model.classes.len() > 1 {
+        let spreads = Arc::clone(&model.spreads);
+        let index = RayIndex::new(model.scene, &spreads, model.settings.gate_sigmas, rays.iter().copied());
+        model.confusions = Confusions::learn(model, &lookout, &index, &objects);
+        if model.confusions.is_any() {
+            objects = search(model, rays, placed(&objects), Depth::Shallow, true, &mut Tally::default(), progress)?;
+            learn(model, &lookout, rays, &objects);
+        }
+    }
     let few = few::objects_of_few(model, &lookout, rays, &objects, 1, progress)?;
     let whole = {
         let is_whole = lookout.whole(model, rays);
@@ -237,7 +255,7 @@ pub fn find(
     let rays = scene.usable_rays();
     let noise = &calibration.noise;
     let mut model = Model::new(scene, noise, settings);
-    model.know(&calibration.classes, calibration.pooled);
+    model.know(&calibration.classes, calibration.pooled, &calibration.confusions);
     let (begun, first) = initial::labels(&model, !calibration.is_deep, progress)?;
     progress.advance()?;
     let mut tally =
@@ -270,7 +288,7 @@ pub fn find(
         .filter(|(existence, ..)| *existence >= settings.min_existence)
         .map(|(existence, object, estimate)| {
             let expected = lookout.expected(scene, &estimate.point, &object.votes);
-            Finding { estimate, existence, expected, votes: object.votes }
+            Finding { estimate, class: object.class, existence, expected, votes: object.votes }
         })
         .collect();
     findings.sort_by_key(|finding| finding.votes[0]);

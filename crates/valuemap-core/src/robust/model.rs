@@ -9,6 +9,7 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 
 use super::clutter::Steps;
+use super::confusion::Confusions;
 use super::counts::FEW;
 use super::heights::{Heights, up_of};
 use super::noise::{Noise, Spread};
@@ -257,6 +258,8 @@ pub struct Model<'a> {
     pub classes: Vec<ClassModel>,
     /// What is learned of all classes together.
     pub pooled: ClassModel,
+    /// Which classes are taken for which.
+    pub confusions: Confusions,
     /// Settings of the run.
     pub settings: &'a Settings,
 }
@@ -275,7 +278,7 @@ impl<'a> Model<'a> {
             ClassModel::guess(scene, settings, rays.len(), mean_and_sd(&angles))
         };
         let all = || usable.iter().map(|&ray| ray as usize);
-        let classes =
+        let classes: Vec<ClassModel> =
             (0..count as u32).map(|class| of(all().filter(|&ray| scene.rays.class[ray] == class).collect())).collect();
         let pooled = of(all().collect());
         let up = up_of(scene);
@@ -289,6 +292,7 @@ impl<'a> Model<'a> {
             ln_angle,
             sin_elevation,
             usable: usable.len(),
+            confusions: Confusions::none(classes.len()),
             classes,
             pooled,
             settings,
@@ -296,8 +300,9 @@ impl<'a> Model<'a> {
     }
 
     /// Take what is known of the classes; those that nothing is known of are like all together, but for their clutter and the angles of their boxes.
-    pub fn know(&mut self, classes: &[Option<ClassModel>], pooled: ClassModel) {
+    pub fn know(&mut self, classes: &[Option<ClassModel>], pooled: ClassModel, confusions: &Confusions) {
         self.pooled = pooled;
+        self.confusions = confusions.among(self.classes.len());
         for (class, own) in self.classes.iter_mut().enumerate() {
             *own = classes.get(class).copied().flatten().unwrap_or_else(|| pooled.with_own(own));
         }
@@ -322,6 +327,18 @@ impl<'a> Model<'a> {
         &self.classes[self.scene.rays.class[ray as usize] as usize]
     }
 
+    /// The class that an object with some votes most probably is of.
+    #[must_use]
+    pub fn likeliest_class(&self, votes: &[u32]) -> Option<u32> {
+        self.confusions.likeliest(votes.iter().map(|&ray| self.scene.rays.class[ray as usize]))
+    }
+
+    /// What is learned about it.
+    #[must_use]
+    pub fn class_of_votes(&self, votes: &[u32]) -> Option<&ClassModel> {
+        self.likeliest_class(votes).map(|class| &self.classes[class as usize])
+    }
+
     /// Logarithm of the clutter around a ray, per squared pixel.
     #[inline]
     #[must_use]
@@ -336,16 +353,17 @@ impl<'a> Model<'a> {
         self.class_of(ray).score_ratio.at(self.scene.score[ray as usize])
     }
 
-    /// How much more probable, in logarithms, a detection is as a vote than as clutter, if its object, of size `ln_size`, is where the
+    /// How much more probable, in logarithms, a detection is as a vote than as clutter, if its object, of a class and of size `ln_size`, is where the
     /// residual has a squared length of `chi2` sigmas with a covariance of determinant `px4`.
     #[inline]
     #[must_use]
-    pub fn vote_gain(&self, ray: u32, chi2: f64, px4: f64, depth_m: f64, ln_size: f64) -> f64 {
-        let class = self.class_of(ray);
+    pub fn vote_gain(&self, class: u32, ray: u32, chi2: f64, px4: f64, depth_m: f64, ln_size: f64) -> f64 {
+        let learned = &self.classes[class as usize];
         -0.5 * (chi2 + px4.ln()) - (2.0 * PI).ln() - self.ln_clutter_per_px2(ray)
-            + class.sizes.log_ratio(self.ln_angle[ray as usize], depth_m, ln_size)
+            + learned.sizes.log_ratio(self.ln_angle[ray as usize], depth_m, ln_size)
             + self.ln_score_ratio(ray)
-            + class.rates.log_odds()
+            + self.confusions.ln_share(class, self.scene.rays.class[ray as usize])
+            + learned.rates.log_odds()
     }
 }
 

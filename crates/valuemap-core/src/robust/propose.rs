@@ -281,8 +281,14 @@ impl<'a> Neighborhood<'a> {
                     continue;
                 }
                 let variance = partner.spread.variance(projected.z);
-                let gain =
-                    self.model.vote_gain(partner.number, chi2, variance * variance, projected.z, meeting.ln_size);
+                let gain = self.model.vote_gain(
+                    own.class,
+                    partner.number,
+                    chi2,
+                    variance * variance,
+                    projected.z,
+                    meeting.ln_size,
+                );
                 let best = &mut gains[partner.place as usize];
                 *best = best.max(gain);
             }

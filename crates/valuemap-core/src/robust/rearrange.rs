@@ -108,9 +108,11 @@ pub fn exclude(
             let (Some(first), Some(second)) = (&kept[a], &kept[b]) else { continue };
             let claims = claims_of_all(model, index, &[first.clone(), second.clone()], progress)?;
             let pair = Pair { model, lookout, of: [first, second], claims: [&claims[0], &claims[1]] };
-            let weaker = if first.votes.len() < second.votes.len() { a } else { b };
+            let (weaker, class) =
+                if first.votes.len() < second.votes.len() { (a, second.class) } else { (b, first.class) };
             // A detector takes one thing for another now and then: the class with more votes has the place.
-            let merged = if first.class == second.class { pair.merged() } else { None };
+            let merged = if may_be_one(model, first, second) { pair.merged() } else { None };
+            let merged = merged.filter(|merged| merged.class == class);
             kept[weaker] = None;
             if let Some(merged) = merged {
                 (kept[a], kept[b]) = (None, None);
@@ -124,6 +126,11 @@ pub fn exclude(
         objects = left;
         objects.sort_by_key(|object| object.votes[0]);
     }
+}
+
+/// Whether two objects may be one by their classes.
+pub(super) fn may_be_one(model: &Model<'_>, a: &Object, b: &Object) -> bool {
+    model.confusions.may_be(a.class, b.class) || model.confusions.may_be(b.class, a.class)
 }
 
 /// Pairs of objects of which one may have some of what the other has.
@@ -150,7 +157,9 @@ fn pairs(model: &Model<'_>, objects: &[Object], claims: &[Vec<Claim>]) -> Vec<(u
     let tree = by_place(objects);
     for (i, object) in objects.iter().enumerate() {
         let near = tree.locate_within_distance(object.fit.point.into(), reach_m * reach_m).map(|near| near.data);
-        pairs.extend(near.filter(|&other| other > i && objects[other].class == object.class).map(|other| (i, other)));
+        pairs.extend(
+            near.filter(|&other| other > i && may_be_one(model, &objects[other], object)).map(|other| (i, other)),
+        );
     }
     pairs.sort_unstable();
     pairs.dedup();

@@ -244,11 +244,12 @@ impl Candidate {
             let projected = scene.ray(ray).project(&point);
             let spread = &model.spreads[ray as usize];
             let chi2 = chi2(&projected, spread);
-            if scene.rays.class[ray as usize] != class || !(projected.z > 0.0 && chi2 < limit) {
+            let is_in_gate = projected.z > 0.0 && chi2 < limit;
+            if !is_in_gate || !model.confusions.may_be(class, scene.rays.class[ray as usize]) {
                 continue;
             }
             let variance = spread.variance(projected.z);
-            let gain = model.vote_gain(ray, chi2, variance * variance, projected.z, ln_size);
+            let gain = model.vote_gain(class, ray, chi2, variance * variance, projected.z, ln_size);
             if gain <= 0.0 {
                 continue;
             }

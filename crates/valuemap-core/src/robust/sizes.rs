@@ -26,7 +26,7 @@ pub struct SizeTerms {
 /// What the boxes of votes of one object say about its position, linearised at a point; nothing where boxes tell nothing.
 #[must_use]
 pub fn size_terms(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> Option<SizeTerms> {
-    let sizes = model.class_of(*votes.first()?).sizes;
+    let sizes = model.class_of_votes(votes)?.sizes;
     // Before sizes are learned, they prune and no more.
     if !sizes.tell() || sizes.object.0.is_nan() {
         return None;

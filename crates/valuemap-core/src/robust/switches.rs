@@ -8,6 +8,7 @@ use super::drift::LEG_M;
 use super::energy::{Object, implied_size, visits};
 use super::looks::looks_among;
 use super::model::Model;
+use super::rearrange::may_be_one;
 
 /// That an object is missed in all images that show another one is chance where it is more probable than one in a thousand: so many objects has a map.
 const LN_BY_CHANCE: f64 = -6.9;
@@ -87,7 +88,7 @@ fn show_one(model: &Model<'_>, objects: [&Object; 2], rays: [u32; 2]) -> bool {
         let [s, t] = rays.map(|ray| implied_size(model, ray, &point));
         a.z > 0.0 && b.z > 0.0 && is_near && model.class_of(rays[0]).sizes.agree(s, t, gate)
     };
-    objects[0].class == objects[1].class && objects.into_iter().any(is_one)
+    may_be_one(model, objects[0], objects[1]) && objects.into_iter().any(is_one)
 }
 
 #[cfg(test)]

@@ -149,7 +149,7 @@ impl<'a> Association<'a> {
 
     /// All claims of a label, by ray; none is a vote yet.
     fn claims_of(&self, label: &Label) -> Vec<Claim> {
-        let mut hits = self.index.hits_of_any(&places_of(&label.estimate), label.class, self.range_m);
+        let mut hits = self.index.hits_of_any(&places_of(&label.estimate), &|class| class == label.class, self.range_m);
         hits.retain(|hit| label.faces(self.scene, hit.ray));
         hits.sort_by_key(|hit| hit.ray);
         let of_hit = |Hit { ray, image, chi2 }: Hit| {

@@ -1,0 +1,104 @@
+//! A detector that takes what is of one class for another one.
+#![allow(clippy::unwrap_used, missing_docs)]
+
+mod street;
+
+use std::sync::Arc;
+
+use nalgebra::Vector3;
+use valuemap_core::progress::Progress;
+use valuemap_core::robust::calibrate::Known;
+use valuemap_core::robust::confusion::Confusions;
+use valuemap_core::robust::scene::Scene;
+use valuemap_core::robust::{Calibration, Finding, Settings, find, self_calibrate};
+
+use street::{NOISE, SETTINGS, joined, street};
+
+/// Twenty lights on the left and twenty signs on the right, and their classes.
+fn objects() -> Vec<(Vector3<f64>, u32)> {
+    let side = |class: u32| {
+        let of = if class == 0 { 1.0 } else { -1.0 };
+        (0..20).map(move |i| (Vector3::new(20.0 + 11.0 * f64::from(i), 5.0 * of, 3.0 + of), class))
+    };
+    side(0).chain(side(1)).collect()
+}
+
+/// Two drives past these, each of which takes every seventh detection of a light for a sign.
+fn confused_street(objects: &[(Vector3<f64>, u32)]) -> Scene {
+    let points: Vec<Vector3<f64>> = objects.iter().map(|object| object.0).collect();
+    let errors = [[0.3, -0.2], [-0.4, 0.1], [0.2, 0.4], [-0.1, -0.3], [0.5, 0.2]];
+    let mut scene = joined(vec![street(130, 2.0, &points, &errors), street(130, 2.0, &points, &errors[2..])]);
+    let said: Vec<u32> = (0..scene.rays.rays.len() as u32).map(|ray| class_of(&scene, objects, ray)).collect();
+    let lights = (0..said.len()).filter(|&ray| said[ray] == 0).enumerate();
+    let confused: Vec<usize> = lights.filter(|(i, _)| i % 7 == 3).map(|(_, ray)| ray).collect();
+    let rays = Arc::make_mut(&mut scene.rays);
+    rays.class = said;
+    for ray in confused {
+        rays.class[ray] = 1;
+    }
+    scene
+}
+
+/// The class of the object that a ray shows.
+fn class_of(scene: &Scene, objects: &[(Vector3<f64>, u32)], ray: u32) -> u32 {
+    let error = |object: &&(Vector3<f64>, u32)| scene.ray(ray).squared_error(&object.0);
+    objects.iter().min_by(|a, b| error(a).total_cmp(&error(b))).unwrap().1
+}
+
+fn calibrated(scene: &Scene) -> Calibration {
+    let known = Known { detection: true, position: true, rotation: true };
+    self_calibrate(scene, &NOISE, known, &SETTINGS, false, &Progress::default()).unwrap()
+}
+
+fn found(scene: &Scene, calibration: &Calibration) -> Vec<Finding> {
+    find(scene, calibration, &Settings { least_votes: 1, ..SETTINGS }, &Progress::default()).unwrap().findings
+}
+
+#[test]
+fn what_is_taken_for_another_class_is_one_object_of_its_own() {
+    let objects = objects();
+    let scene = confused_street(&objects);
+    let calibration = calibrated(&scene);
+    let shares = calibration.confusions.shares();
+    assert!((shares[0][1] - 1.0 / 7.0).abs() < 0.03 && shares[1][0] < 1e-12, "{shares:?}");
+
+    let map = found(&scene, &calibration);
+    assert_eq!(map.len(), objects.len());
+    for finding in &map {
+        let near = objects.iter().find(|object| (object.0 - finding.estimate.point).norm() < 1.0).unwrap();
+        assert_eq!(finding.class, near.1);
+    }
+    let confused =
+        |finding: &&Finding| finding.votes.iter().any(|&ray| scene.rays.class[ray as usize] != finding.class);
+    assert!(map.iter().filter(confused).count() > 15);
+
+    let without = found(&scene, &Calibration { confusions: Confusions::none(2), ..calibration });
+    assert!(without.len() > objects.len(), "{}", without.len());
+}
+
+#[test]
+fn classes_of_few_objects_are_confused_like_all_together() {
+    let objects: Vec<(Vector3<f64>, u32)> =
+        objects().into_iter().filter(|object| object.1 == 0 || object.0.x < 80.0).collect();
+    let shares = calibrated(&confused_street(&objects)).confusions.shares().to_vec();
+    let of_all = shares[1][0];
+    assert!((0.5 * shares[0][1]..shares[0][1]).contains(&of_all), "{shares:?}");
+}
+
+#[test]
+fn what_stands_beside_is_no_confusion() {
+    let lights = objects().into_iter().filter(|object| object.1 == 0);
+    let both: Vec<(Vector3<f64>, u32)> =
+        lights.flat_map(|(at, _)| [(at, 0), (at + Vector3::new(0.1, 0.0, -0.15), 1)]).collect();
+    let mut scene = confused_street(&both);
+    let said: Vec<u32> = (0..scene.rays.rays.len() as u32).map(|ray| class_of(&scene, &both, ray)).collect();
+    let rays = Arc::make_mut(&mut scene.rays);
+    // Lights are missed instead of taken for signs: what is seen there is the sign beside them.
+    for (ray, (was, is)) in rays.rays.iter_mut().zip(rays.class.iter().zip(&said)) {
+        if was != is {
+            ray.residual_from_world.fill(f64::NAN);
+        }
+    }
+    rays.class = said;
+    assert!(!calibrated(&scene).confusions.is_any());
+}
