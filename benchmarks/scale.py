@@ -163,7 +163,7 @@ def partition(arguments: argparse.Namespace) -> dict[str, Any]:
         with open_work(Path(name) / "work", resume=False) as work:
             found = partition_dataset(folder, work, MapConfig())
             seconds = time.perf_counter() - start
-            files = [path for path in found.folder.rglob("*") if path.is_file()]
+            files = [path for path in work.glob("partition-*/**/*") if path.is_file()]
             disk = sum(path.stat().st_size for path in files)
         return {
             "counts": found.counts,

@@ -19,6 +19,7 @@ import numpy as np
 from valuemap.dataset import Dataset, Frame
 from valuemap.errors import InputError
 from valuemap.folders import new_folder, settle
+from valuemap.remote import Place, name_of, read_all
 from valuemap.tables import Labels, Rejected, Votes, read_table, table_to_arrow, write_table
 
 if TYPE_CHECKING:
@@ -117,7 +118,7 @@ def write_map(
     result: Map,
     path: str | Path,
     *,
-    cells: Sequence[Path] = (),
+    cells: Sequence[Place] = (),
     files: Mapping[str, Path] = MappingProxyType({}),
     force: bool = False,
 ) -> None:
@@ -132,9 +133,13 @@ def write_map(
         calibration = run.pop("calibration", None)
         if calibration is not None:
             (folder / CALIBRATION).write_text(json.dumps(calibration, indent=2) + "\n", encoding="utf-8")
-        for name, file in {**{f"{CELLS}/{cell.name}": cell for cell in cells}, **files}.items():
+        for name, file in files.items():
             (folder / name).parent.mkdir(exist_ok=True)
             shutil.copyfile(file, folder / name)
+        if cells:
+            (folder / CELLS).mkdir()
+        for cell, content in zip(cells, read_all(cells), strict=True):
+            (folder / CELLS / name_of(cell)).write_bytes(content)
         (folder / MARKER).write_text(json.dumps(run, indent=2) + "\n", encoding="utf-8")
         write_labels(result, folder / "labels.parquet")
         write_table(result.votes, folder / "votes.parquet")

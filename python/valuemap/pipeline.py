@@ -27,6 +27,7 @@ from valuemap.portions import rows_on_disk
 from valuemap.progress import Progress, silent
 from valuemap.refine import FITS_NO_BETTER, Refined, expose_rows, refine_poses
 from valuemap.rejected import rejected_of_map
+from valuemap.remote import Place, UrlPath
 from valuemap.robust import Calibration, calibration_to_json
 from valuemap.system import peak_memory_mb
 from valuemap.tables import Labels, Votes
@@ -35,6 +36,7 @@ from valuemap.tiles.compare import Comparison, compare_poses
 from valuemap.tiles.mapping import loaded, solve_cells
 from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.seams import join_cells
+from valuemap.tiles.solve import Solved
 from valuemap.tiles.source import InMemory, Source
 from valuemap.tiles.work import CELLS
 from valuemap.vote import vote_in_clusters
@@ -108,7 +110,8 @@ class Run:
 
     `tile_size_m` is how large the units are that the dataset is cut into on disk: None for what is usual, where it is
     larger than memory; it changes no label. `calibration` is that of another map to use, None to estimate it. `known`
-    is where the cells of an older map are, which are not solved again where nothing changed.
+    is where the cells of an older map are, which are not solved again where nothing changed. `store` is where the parts
+    are that tasks share, None for the folder `work`.
     """
 
     work: Path
@@ -116,11 +119,17 @@ class Run:
     tile_size_m: float | None = None
     calibration: Calibration | None = None
     known: Path | None = None
+    store: UrlPath | None = None
+
+    @property
+    def parts(self) -> Place:
+        """Where what tasks read and write is."""
+        return self.store or self.work
 
 
 def build_map_of_folder(
     folder: Path, config: MapConfig, run: Run, *, held: Dataset | None = None, progress: Progress = silent
-) -> tuple[Map, list[Path]]:
+) -> tuple[Map, list[Place]]:
     """Find the objects that a dataset folder shows, which may be larger than memory.
 
     Parameters
@@ -145,7 +154,7 @@ def build_map_of_folder(
     -------
     Map
         The map that `build_map` makes of the dataset.
-    list[Path]
+    list[Place]
         The files of its cells; none of a dataset that is no wider than one.
     """
     images, detections = rows_on_disk(folder)
@@ -171,7 +180,9 @@ def build_map_of_folder(
                 folder = run.work / CORRECTED
                 write_dataset(refined.dataset, folder)
         with stages.measured("partition"):
-            on_disk = partition_dataset(folder, run.work, config, tile_size_m=run.tile_size_m, progress=progress)
+            on_disk = partition_dataset(
+                folder, run.work, config, store=run.store, tile_size_m=run.tile_size_m, progress=progress
+            )
         source, name, frame, size = on_disk, on_disk.name, on_disk.frame, on_disk.counts
         _check_detections(name, size["detections"])
     labels, votes, counts, cells = _robust(source, config, stages, run.engine, progress, run)
@@ -284,20 +295,20 @@ def _robust(
     engine: Engine,
     progress: Progress,
     run: Run | None = None,
-) -> tuple[Labels, Votes, dict[str, Any], list[Path]]:
+) -> tuple[Labels, Votes, dict[str, Any], list[Place]]:
     """Noise estimated from a sample, and in each cell the map with the least J that is found; docs/method.md."""
     with stages.measured("calibrate"):
         given = None if run is None else run.calibration
-        calibration = calibrate(source, config, given, None if run is None else run.work, engine, progress)
+        calibration = calibrate(source, config, given, None if run is None else run.parts, engine, progress)
     with stages.measured("find"):
-        store = run.work / CELLS if run is not None and len(source.cells) > 1 else None
+        store = run.parts / CELLS if run is not None and len(source.cells) > 1 else None
         known = None if run is None else run.known
         solved = solve_cells(source, calibration, config, engine, progress, store=store, known=known)
     with stages.measured("join"):
         labels, votes, counts = join_cells(loaded(solved), source.grid, config)
     estimated = calibration_to_json(calibration)
     counts = {**counts, "drives": source.drives_record, "noise": estimated["noise"], "calibration": estimated}
-    return labels, votes, counts, [result for result in solved if isinstance(result, Path)]
+    return labels, votes, counts, [result for result in solved if not isinstance(result, Solved)]
 
 
 def _without_ray(rays: Rays) -> dict[str, int]:

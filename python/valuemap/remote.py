@@ -1,14 +1,19 @@
-"""Files at URLs, in object stores or wherever else PyArrow or fsspec can read, as much like paths as reading needs."""
+"""Files at URLs, in object stores or wherever else PyArrow or fsspec can go, as much like paths as is needed.
+
+Files are written at once: in object stores one is there whole, or not at all.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
-from valuemap.errors import InputError
+from valuemap.errors import InputError, OutputError
 from valuemap.text_files import first_line
 
 
@@ -64,9 +69,64 @@ class UrlPath:
             raise self._unreadable(error) from error
         return content
 
+    def write_bytes(self, content: bytes) -> None:
+        """Write the file, in place of one that is there.
+
+        Raises
+        ------
+        OutputError
+            It cannot be written.
+        """
+        system, path = self._place()
+        try:
+            if (store := _fsspec_of(system)) is not None:
+                store.pipe_file(path, content)
+            else:
+                with system.open_output_stream(path) as file:
+                    file.write(content)
+        except Exception as error:
+            raise self._unwritable(error) from error
+
+    def names(self) -> list[str]:
+        """Return the names of all files below this one, ascending; none where there is no such folder."""
+        import pyarrow.fs as pa_fs
+
+        system, path = self._place()
+        try:
+            _forget_listings(system)
+            found = system.get_file_info(pa_fs.FileSelector(path, recursive=True, allow_not_found=True))
+        except Exception as error:
+            raise self._unreadable(error) from error
+        above = len(path.strip("/")) + 1
+        return sorted(info.path.strip("/")[above:] for info in found if info.type == pa_fs.FileType.File)
+
+    def unlink(self) -> None:
+        """Remove the file, if it is there."""
+        system, path = self._place()
+        try:
+            system.delete_file(path)
+        except FileNotFoundError:
+            pass
+        except Exception as error:
+            if self.is_file():
+                raise self._unwritable(error) from error
+
+    def remove_folder(self) -> None:
+        """Remove the folder with all that is in it, if it is there."""
+        system, path = self._place()
+        try:
+            _forget_listings(system)
+            system.delete_dir(path)
+        except FileNotFoundError:
+            pass
+        except Exception as error:
+            if self.is_dir():
+                raise self._unwritable(error) from error
+
     def _type(self) -> str:
         system, path = self._place()
         try:
+            _forget_listings(system)
             return str(system.get_file_info(path).type.name)
         except Exception as error:
             raise self._unreadable(error) from error
@@ -75,6 +135,12 @@ class UrlPath:
         system, path = _system_of(self.root)
         return system, f"{path.rstrip('/')}/{self.name}" if self.name else path
 
+    def _unwritable(self, error: Exception) -> OutputError:
+        return OutputError(
+            f"{self}: cannot be written: {first_line(error)}",
+            hint="can this machine reach it, and may it write there? The same command with --resume then goes on",
+        )
+
     def _unreadable(self, error: Exception) -> InputError:
         return InputError(
             f"{self}: cannot be read: {first_line(error)}",
@@ -82,9 +148,54 @@ class UrlPath:
         )
 
 
+Place = Path | UrlPath
+"""Where a file or folder is."""
+_AT_ONCE = 16
+"""Files that are read from a store together: to wait for each would take longer than to work on it."""
+
+
+def name_of(place: Place) -> str:
+    """Return the last part of the name of a file."""
+    return place.name.rpartition("/")[2]
+
+
+def read_all(places: Sequence[Place]) -> Iterator[bytes]:
+    """Yield what files hold, in their order."""
+    if not any(isinstance(place, UrlPath) for place in places):
+        yield from (place.read_bytes() for place in places)
+        return
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        for first in range(0, len(places), _AT_ONCE):
+            yield from pool.map(lambda place: place.read_bytes(), places[first : first + _AT_ONCE])
+
+
+def _fsspec_of(system: Any) -> Any | None:
+    """Return the file system of fsspec that one of PyArrow goes through, if it does."""
+    return getattr(getattr(system, "handler", None), "fs", None)
+
+
+def _forget_listings(system: Any) -> None:
+    """Let a file system look again for what others have written; some of fsspec's remember what they saw."""
+    if (store := _fsspec_of(system)) is not None:
+        store.invalidate_cache()
+
+
 def place_of(text: str | Path) -> Path | UrlPath:
     """Return what a user calls a place: a URL or a path."""
     return UrlPath(text) if isinstance(text, str) and "://" in text else Path(text)
+
+
+def folder_of(place: Place) -> Place:
+    """Return the folder that a URL of this machine's own files names; other places as they are."""
+    parts = urlsplit(str(place)) if isinstance(place, UrlPath) else None
+    return Path(unquote(parts.path)) if parts is not None and parts.scheme == "file" else place
+
+
+def _with_one_request(root: str) -> str:
+    """Return a URL by which a file is written to S3 in one request, where it would be three."""
+    if not root.startswith("s3://") or "allow_delayed_open" in root:
+        return root
+    return f"{root}{'&' if '?' in root else '?'}allow_delayed_open=true"
 
 
 @lru_cache
@@ -95,7 +206,7 @@ def _system_of(root: str) -> tuple[Any, str]:
 
     try:
         try:
-            found: tuple[Any, str] = pa_fs.FileSystem.from_uri(root)
+            found: tuple[Any, str] = pa_fs.FileSystem.from_uri(_with_one_request(root))
         except pa.ArrowInvalid:
             if root.startswith("fsspec+"):
                 raise

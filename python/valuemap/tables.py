@@ -487,15 +487,17 @@ def in_groups(tables: Iterable[T]) -> Iterator[T]:
     So a file is the same however its rows come.
     """
     held: list[T] = []
-    count, is_first = 0, True
+    count = 0
     for table in tables:
+        while count + len(table) > ROWS_OF_GROUP:
+            missing = ROWS_OF_GROUP - count
+            group = join_tables([*held, table[:missing]])
+            held, count, table = [], 0, table[missing:]
+            yield group
+            del group  # Before the next one is put together.
         held.append(table)
         count += len(table)
-        while count > ROWS_OF_GROUP:
-            together = join_tables(held)
-            yield together[:ROWS_OF_GROUP]
-            held, count, is_first = [together[ROWS_OF_GROUP:]], count - ROWS_OF_GROUP, False
-    if held and (count or is_first):
+    if held:
         yield join_tables(held)
 
 

@@ -89,12 +89,13 @@ def map_command(
     if control is not None and not control.is_file():
         raise InputError(f"{control}: no such file", hint="give a table of surveyed objects, such as a .csv")
     given = None if calibration is None else read_calibration(calibration)
-    with working(work, out, resume=resume) as folder, progress_bars() as progress:
+    with working(work, out, resume=resume) as place, progress_bars() as progress:
         run = Run(
-            folder,
+            place.folder,
             engine_named(engine, threads=threads, ray_address=ray_address),
             tile_size_m=tile_size,
             calibration=given,
+            store=place.store,
         )
         result, cells = build_map_of_folder(dataset, config, run, progress=progress)
         if control is not None or write_poses_to is not None:

@@ -35,8 +35,13 @@ TileSize = Annotated[
     ),
 ]
 Work = Annotated[
-    Path | None,
-    typer.Option("--work", metavar="FOLDER", help="Folder for unfinished parts. Default: beside --out, named .work."),
+    str | None,
+    typer.Option(
+        "--work",
+        metavar="FOLDER|URL",
+        help="Where unfinished parts are kept: a folder, or a place in a store (s3://bucket/run). "
+        "Default: beside --out, named .work.",
+    ),
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with what an interrupted run has left.")]
 Vertical = Annotated[

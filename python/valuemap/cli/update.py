@@ -40,9 +40,9 @@ def update_command(
 ) -> None:
     """Add new passes to a map: only what they touch is solved again, ids stay, and changes are told."""
     check_place(out, parts=map_folder.PARTS, force=force)
-    with working(work, out, resume=resume) as folder, progress_bars() as progress:
+    with working(work, out, resume=resume) as place, progress_bars() as progress:
         where = engine_named(engine, threads=threads, ray_address=ray_address)
-        run = Run(folder, where, tile_size_m=tile_size)
+        run = Run(place.folder, where, tile_size_m=tile_size, store=place.store)
         result, cells, files = update_map(old, added, run, dataset=dataset, progress=progress)
         result.run["dataset_folder"] = map_folder.DATASET
         write_map(result, out, cells=cells, files=files, force=force)

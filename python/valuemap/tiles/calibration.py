@@ -11,6 +11,7 @@ from valuemap.engine.engine import Engine
 from valuemap.errors import InputError
 from valuemap.map_folder import CALIBRATION, read_json
 from valuemap.progress import Progress
+from valuemap.remote import Place
 from valuemap.robust import Calibration, Scene, calibration_from_json, calibration_to_json
 from valuemap.robust import calibrate as calibrate_scene
 from valuemap.sightings import cast_sightings
@@ -18,14 +19,14 @@ from valuemap.tiles.grid import WHOLE
 from valuemap.tiles.sample import SAMPLE_DETECTIONS
 from valuemap.tiles.source import Source
 from valuemap.tiles.store import hash_piece, hash_settings
-from valuemap.tiles.work import written
+from valuemap.tiles.work import put
 
 
 def calibrate(
     source: Source,
     config: MapConfig,
     given: Calibration | None,
-    work: Path | None,
+    work: Place | None,
     engine: Engine,
     progress: Progress,
 ) -> Calibration:
@@ -39,9 +40,8 @@ def calibrate(
     file = work / f"calibration.{hash_piece(sample, WHOLE, hash_settings(source.grid, None, config))}.json"
     if not file.is_file():
         calibration = _estimated(sample, is_part, config, engine, progress)
-        with written(file) as temporary:
-            temporary.write_text(json.dumps(calibration_to_json(calibration)), encoding="utf-8")
-    return calibration_from_json(json.loads(file.read_text(encoding="utf-8")), source=str(file))
+        put(file, json.dumps(calibration_to_json(calibration)).encode())
+    return calibration_from_json(json.loads(file.read_bytes()), source=str(file))
 
 
 def read_calibration(path: Path) -> Calibration:

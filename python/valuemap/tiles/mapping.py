@@ -8,6 +8,7 @@ from pathlib import Path
 from valuemap.config import MapConfig
 from valuemap.engine.engine import Engine
 from valuemap.progress import Progress, counted
+from valuemap.remote import Place
 from valuemap.robust import Calibration
 from valuemap.tiles.grid import Cell
 from valuemap.tiles.solve import Solved, solve_cell
@@ -27,10 +28,10 @@ class CellTask:
     config: MapConfig
     settings: str
     threads: int
-    store: Path | None = None
+    store: Place | None = None
     known: Path | None = None
 
-    def __call__(self, cell: Cell, progress: Progress) -> Solved | Path | None:
+    def __call__(self, cell: Cell, progress: Progress) -> Solved | Place | None:
         """Return the labels of a cell, or where they are; nothing where there are no images."""
         piece = self.source.piece(cell)
         if not len(piece.image_id):
@@ -57,9 +58,9 @@ def solve_cells(
     engine: Engine,
     progress: Progress,
     *,
-    store: Path | None = None,
+    store: Place | None = None,
     known: Path | None = None,
-) -> list[Solved | Path]:
+) -> list[Solved | Place]:
     """Return the labels of all cells, ascending, that have images in or around them, or where they are.
 
     Parameters
@@ -75,7 +76,7 @@ def solve_cells(
     if len(cells) == 1:  # It tells how far it is.
         result = task(cells[0], progress)
         return [] if result is None else [result]
-    solved: list[Solved | Path | None] = [None] * len(cells)
+    solved: list[Solved | Place | None] = [None] * len(cells)
     with counted(progress, "cells", len(cells)) as tell:
         for done, (number, result) in enumerate(engine.run(task, cells), start=1):
             solved[number] = result
@@ -83,7 +84,7 @@ def solve_cells(
     return [result for result in solved if result is not None]
 
 
-def loaded(solved: list[Solved | Path]) -> list[Solved]:
-    """Return the labels of cells, read where they are on disk."""
-    read = iter(load_cells([result for result in solved if isinstance(result, Path)]))
-    return [next(read) if isinstance(result, Path) else result for result in solved]
+def loaded(solved: list[Solved | Place]) -> list[Solved]:
+    """Return the labels of cells, read where they are in files."""
+    read = iter(load_cells([result for result in solved if not isinstance(result, Solved)]))
+    return [result if isinstance(result, Solved) else next(read) for result in solved]

@@ -12,14 +12,15 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
-import shutil
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -31,14 +32,25 @@ from valuemap.dataset import Dataset, Frame, rows_of
 from valuemap.drives import Drives, InOrder
 from valuemap.portions import DatasetReader, rows_on_disk
 from valuemap.progress import Progress, silent
-from valuemap.tables import Cameras, Categories, Detections, Floats, Images, Ints, Table, read_table, write_table
+from valuemap.remote import Place, UrlPath, read_all
+from valuemap.tables import (
+    Cameras,
+    Categories,
+    Detections,
+    Floats,
+    Images,
+    Ints,
+    Table,
+    table_from_arrow,
+    table_to_arrow,
+)
 from valuemap.tiles.fleet import Fleet
 from valuemap.tiles.grid import LEVELS, WHOLE, Cell, Census, Grid, cells_across_tile, smallest_squares
 from valuemap.tiles.piece import piece_of_rows
 from valuemap.tiles.places import PlaceIndex
 from valuemap.tiles.sample import sampled_squares
 from valuemap.tiles.source import VIEWPOINT_SHARE
-from valuemap.tiles.work import written
+from valuemap.tiles.work import TEMPORARY, written_folder
 
 _META, _CAMERAS = "partition.json", "cameras.parquet"
 _DRIVES = ("pass_code", "order", "driven_m", "viewpoint")
@@ -48,9 +60,9 @@ T = TypeVar("T", bound=Table)
 
 @dataclass(frozen=True)
 class OnDisk:
-    """The pieces of a partition: only a path, which travels to other processes."""
+    """The pieces of a partition: only a place, which travels to other processes."""
 
-    folder: Path
+    folder: Place
 
     def piece(self, cell: Cell) -> InOrder:
         """Return what a cell is solved with."""
@@ -100,7 +112,7 @@ class OnDisk:
 
     @cached_property
     def _meta(self) -> dict[str, Any]:
-        meta: dict[str, Any] = json.loads((self.folder / _META).read_text(encoding="utf-8"))
+        meta: dict[str, Any] = json.loads((self.folder / _META).read_bytes())
         return meta
 
     def _read(self, tiles: list[tuple[int, int]], squares: Ints | None = None) -> InOrder:
@@ -121,7 +133,7 @@ class OnDisk:
         dataset = Dataset(
             name=self.name,
             frame=self.frame,
-            cameras=read_table(Cameras, self.folder / _CAMERAS),
+            cameras=table_from_arrow(Cameras, _parsed((self.folder / _CAMERAS).read_bytes()), source=str(self.folder)),
             images=table.replace(image_id=np.arange(len(place))),
             detections=detections.replace(detection_id=np.arange(len(order)), image_id=row[order]),
         )
@@ -154,30 +166,41 @@ class OnDisk:
 
 
 def partition_dataset(
-    dataset: Path, work: Path, config: MapConfig, *, tile_size_m: float | None = None, progress: Progress = silent
+    dataset: Path,
+    work: Path,
+    config: MapConfig,
+    *,
+    store: Place | None = None,
+    tile_size_m: float | None = None,
+    progress: Progress = silent,
 ) -> OnDisk:
-    """Write the pieces of a dataset into a folder of work; those that are there already are taken.
+    """Write the pieces of a dataset into a folder of work, or a store; those that are there already are taken.
 
     Raises
     ------
     InputError
         As `read_dataset`.
     """
-    folder = work / f"partition-{_key(dataset, config, tile_size_m)}"
-    if not folder.is_dir():
-        with written(folder) as temporary:
-            temporary.mkdir()
-            _Writer(dataset, temporary, config, tile_size_m, progress).write()
-    return OnDisk(folder)
+    place = (store or work) / f"partition-{_key(dataset, config, tile_size_m)}"
+    if not (place / _META).is_file():
+        with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=work) as aside, written_folder(place) as folder:
+            _Writer(dataset, folder, Path(aside), config, tile_size_m, progress).write()
+    return OnDisk(place)
 
 
 class _Writer:
     """Writes the pieces of a dataset, of which only portions are in memory."""
 
     def __init__(
-        self, dataset: Path, folder: Path, config: MapConfig, tile_size_m: float | None, progress: Progress
+        self,
+        dataset: Path,
+        folder: Place,
+        aside: Path,
+        config: MapConfig,
+        tile_size_m: float | None,
+        progress: Progress,
     ) -> None:
-        self.folder, self.progress = folder, progress
+        self.folder, self.aside, self.progress = folder, aside, progress
         self.max_range_m = config.vote.max_range_m
         self.reader = DatasetReader(dataset)
         self.grid = Grid.of(self.reader.frame, self.max_range_m)
@@ -185,11 +208,9 @@ class _Writer:
         self.columns: dict[str, dict[str, str]] = {"images": {}, "detections": {}}
 
     def write(self) -> None:
-        aside = self.folder / "aside"
-        aside.mkdir()
         step_m = self.max_range_m * VIEWPOINT_SHARE
-        fleet = Fleet(self.reader, aside / "fleet", viewpoint_step_m=step_m, progress=self.progress)
-        index = PlaceIndex(aside / "places", fleet.count)
+        fleet = Fleet(self.reader, self.aside / "fleet", viewpoint_step_m=step_m, progress=self.progress)
+        index = PlaceIndex(self.aside / "places", fleet.count)
         census = Census.of(self.grid, np.empty((0, 2)), np.empty(0, np.int64))
         for number, batch in enumerate(fleet.batches()):
             place_m = self.grid.images_on_ground(batch.images)
@@ -208,10 +229,9 @@ class _Writer:
             self._spread("detections", number, _to_columns(portion, {"place": place}), place_m)
             done += len(portion)
             self.progress("cutting into tiles", done, total)
-        shutil.rmtree(aside)
         cells = census.cells(self.grid)
         squares = census.square if cells == [WHOLE] else sampled_squares(census)
-        write_table(self.reader.cameras, self.folder / _CAMERAS)
+        self._write(_CAMERAS, lambda file: pq.write_table(table_to_arrow(self.reader.cameras), file))
         record = {
             "name": self.reader.name,
             "frame": self.reader.frame.to_json(),
@@ -224,7 +244,7 @@ class _Writer:
             "drives": fleet.record,
             "counts": {"images": fleet.count, "detections": total},
         }
-        (self.folder / _META).write_text(json.dumps(record) + "\n", encoding="utf-8")
+        self._write(_META, lambda file: file.write(json.dumps(record).encode() + b"\n"))
 
     def _spread(self, kind: str, number: int, table: pa.Table, place_m: Floats) -> None:
         """Write rows, in this order, to all tiles that they are in or around."""
@@ -233,10 +253,22 @@ class _Writer:
         else:
             self.columns[kind] = self.columns[kind] or {column.name: str(column.type) for column in table.schema}
         for tile, rows in self._tiles_of(place_m):
-            folder = self.folder / kind / _hive(tile)
-            folder.mkdir(parents=True, exist_ok=True)
-            with (folder / f"part-{number}.parquet").open("wb") as file:
-                pq.write_table(table.take(numbers_to_arrow(rows)), file, compression="lz4", use_dictionary=False)
+            of_tile = table.take(numbers_to_arrow(rows))
+            self._write(
+                f"{kind}/{_hive(tile)}/part-{number}.parquet",
+                partial(pq.write_table, of_tile, compression="lz4", use_dictionary=False),
+            )
+
+    def _write(self, name: str, write_to: Callable[[BinaryIO], Any]) -> None:
+        place = self.folder / name
+        if isinstance(place, UrlPath):
+            content = io.BytesIO()
+            write_to(content)
+            place.write_bytes(content.getvalue())
+            return
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with place.open("wb") as file:
+            write_to(file)
 
     def _tiles_of(self, place_m: Floats) -> Iterator[tuple[tuple[int, int], Ints]]:
         """Yield the tiles that places (N, 2) are in or around, and which are there, ascending."""
@@ -314,13 +346,17 @@ def _from_columns(kind: type[T], table: pa.Table, categories: list[str]) -> T:
     return kind(**values)
 
 
-def _read_parts(folder: Path, columns: dict[str, str]) -> pa.Table:
+def _read_parts(folder: Place, columns: dict[str, str]) -> pa.Table:
     """Return all parts in a folder, in their order; none have the columns all the same."""
-    parts = []
-    for path in sorted(folder.glob("part-*.parquet"), key=lambda path: int(path.stem.partition("-")[2])):
-        with path.open("rb") as file:
-            parts.append(pq.ParquetFile(file).read())
+    names = folder.names() if isinstance(folder, UrlPath) else [path.name for path in folder.glob("part-*.parquet")]
+    names.sort(key=lambda name: int(name.removeprefix("part-").removesuffix(".parquet")))
+    places = [folder / name for name in names]
+    parts = [_parsed(content) for content in read_all(places)]
     if parts:
         return pa.concat_tables(parts).combine_chunks()
     types = {"int64": pa.int64(), "int32": pa.int32(), "double": pa.float64()}
     return pa.schema([pa.field(name, types[kind]) for name, kind in columns.items()]).empty_table()
+
+
+def _parsed(content: bytes) -> pa.Table:
+    return pq.ParquetFile(pa.BufferReader(content)).read()

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,16 +18,18 @@ from valuemap.arrow import numbers_from_arrow, numbers_to_arrow
 from valuemap.config import MapConfig
 from valuemap.drives import InOrder
 from valuemap.errors import InputError
+from valuemap.remote import Place, read_all
 from valuemap.robust import Calibration, calibration_to_json
 from valuemap.tables import Categories, Ints, Labels, Table, Votes, table_from_arrow, table_to_arrow
 from valuemap.tiles.grid import Cell, Grid
 from valuemap.tiles.solve import Solved
-from valuemap.tiles.work import written
+from valuemap.tiles.work import put
 
+_AGAIN = "remove it, and make the map again"
 _VOTE_COLUMNS = ("detection_id", "image_id", "residual_px", "residual_sigmas")
 
 
-def cell_file(folder: Path, cell: Cell, key: str) -> Path:
+def cell_file(folder: Place, cell: Cell, key: str) -> Place:
     """Return where the labels of a cell are, made from what has this hash."""
     return folder / f"{cell.name}.{key}.parquet"
 
@@ -88,7 +90,7 @@ def _add_table(digest: Any, table: Table, without: tuple[str, ...]) -> None:
     digest.update(str(len(table)).encode())
 
 
-def save_cell(solved: Solved, path: Path) -> None:
+def save_cell(solved: Solved, place: Place) -> None:
     """Write the labels of a cell with their votes: a row a label."""
     table = table_to_arrow(solved.labels)
     votes = table_to_arrow(solved.votes)
@@ -102,22 +104,23 @@ def save_cell(solved: Solved, path: Path) -> None:
     cell = {"base": solved.cell.base, "level": solved.cell.level, "place": solved.cell.place}
     head = {"cell": cell, "counts": solved.counts, "classes": solved.labels.class_name.names}
     table = table.replace_schema_metadata({"valuemap": json.dumps(head)})
-    with written(path) as temporary, temporary.open("wb") as file:
-        pq.write_table(table, file, compression="zstd")
+    file = io.BytesIO()
+    pq.write_table(table, file, compression="zstd")
+    put(place, file.getvalue())
 
 
-def load_cells(paths: Sequence[Path]) -> list[Solved]:
+def load_cells(places: Sequence[Place]) -> list[Solved]:
     """Read what `save_cell` wrote of some cells; raises `InputError` where a file is damaged."""
-    if not paths:
+    if not places:
         return []
-    heads, tables = zip(*map(_read, paths), strict=True)
+    heads, tables = zip(*map(_parsed, places, _contents(places)), strict=True)
     # All are checked as one table: of a small one that takes longer than reading it.
     table = pa.concat_tables(tables)
     first = np.cumsum([0, *map(len, tables)])
     number = numbers_to_arrow(np.arange(table.num_rows))
     label_id = numbers_from_arrow(table.column(Labels.KEY))
     table = table.set_column(table.column_names.index(Labels.KEY), Labels.KEY, number)
-    labels = table_from_arrow(Labels, table, source=str(paths[0].parent)).replace(label_id=label_id)
+    labels = table_from_arrow(Labels, table, source=str(places[0])).replace(label_id=label_id)
     votes = {name: _flat(table.column(f"vote.{name}")) for name in (*_VOTE_COLUMNS, "pass")}
     of_label = np.repeat(label_id, labels.votes)
     first_vote = np.concatenate([[0], np.cumsum(labels.votes)])[first]
@@ -142,16 +145,22 @@ def load_cells(paths: Sequence[Path]) -> list[Solved]:
     return cells
 
 
-def _read(path: Path) -> tuple[dict[str, Any], pa.Table]:
+def _contents(places: Sequence[Place]) -> Iterator[bytes]:
+    try:
+        yield from read_all(places)
+    except OSError as error:
+        raise InputError(f"{places[0]} and others: cannot be read: {error}", hint=_AGAIN) from error
+
+
+def _parsed(place: Place, content: bytes) -> tuple[dict[str, Any], pa.Table]:
     """Return what a file of a cell says of it, and its rows."""
     try:
-        with path.open("rb") as file:
-            table = pq.ParquetFile(file).read(use_threads=False)
+        table = pq.ParquetFile(pa.BufferReader(content)).read(use_threads=False)
         head = json.loads(table.schema.metadata[b"valuemap"])
         cell = head["cell"]
         head = {**head, "cell": Cell(tuple(cell["base"]), cell["level"], tuple(cell["place"]))}
     except (pa.ArrowException, OSError, KeyError, ValueError, TypeError) as error:
-        raise InputError(f"{path}: cannot be read: {error}", hint="remove it, and make the map again") from error
+        raise InputError(f"{place}: cannot be read: {error}", hint=_AGAIN) from error
     return head, table.replace_schema_metadata(None)
 
 

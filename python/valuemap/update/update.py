@@ -19,6 +19,7 @@ from valuemap.map_folder import BRIDGE, CELLS, CHANGES, DATASET, Map, read_map
 from valuemap.pipeline import Run, build_map_of_folder
 from valuemap.progress import Progress, counted, silent
 from valuemap.rejected import rejected_of_map
+from valuemap.remote import Place
 from valuemap.tables import Bools, Categories, Changes, Floats, IdBridge, Ints, Labels, Votes, join_tables, write_table
 from valuemap.tiles.calibration import read_calibration
 from valuemap.tiles.source import VIEWPOINT_SHARE
@@ -35,7 +36,7 @@ _DATASET_FILES = (MARKER, "cameras.parquet", "images.parquet", "detections.parqu
 
 def update_map(
     old: Path, added: Path, run: Run, *, dataset: Path | None = None, progress: Progress = silent
-) -> tuple[Map, list[Path], dict[str, Path]]:
+) -> tuple[Map, list[Place], dict[str, Path]]:
     """Add the passes of a dataset to a map.
 
     The settings are those of the map, and so is what was estimated of its dataset: the labels are those of a map of
@@ -59,7 +60,7 @@ def update_map(
     -------
     Map
         The new map; its labels have states.
-    list[Path]
+    list[Place]
         The files of its cells.
     dict[str, Path]
         Further files by their names in the folder of the map: its dataset, what changed, and the bridge of ids.
