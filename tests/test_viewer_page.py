@@ -73,30 +73,48 @@ def test_what_is_rejected_stays_rejected(tmp_path: Path) -> None:
         # Around what is selected is a mark; where it was moved to another one, and a line between them.
         for seen, labels, marks in ((first, len(before.labels), 3), (again, len(others), 1)):
             track, street = 1, 1
-            assert seen["far"] == {"instances": 0, "corners": 6 * (labels + marks + track + street)}
+            assert (seen["far"]["instances"], seen["far"]["all"]) == (0, 6 * (labels + track + street))
+            moved = seen["far"]["moved"]
+            assert (moved["pictures"], moved["painted"], moved["screen"]) == (1, 0, 6 * marks)
         _check_texts_and_requests(again, client)
 
 
-def test_zooming_over_many_images_is_done_in_small_steps(tmp_path: Path) -> None:
-    """No frame hands the GPU more than eight parts of each layer of any map, and nothing is handed over twice."""
+def test_many_labels_and_images_are_painted_in_small_steps(tmp_path: Path) -> None:
+    """No frame paints more than 16 parts of 512 shapes, of any map, and somebody who moves the map repaints nothing."""
     require_browser()
-    dataset, result = made_up_city(500, 80_000, 20)
+    dataset, result = made_up_city(12_000, 80_000, 20)
     valuemap.write_dataset(dataset, tmp_path / "dataset")
     write_map(result, tmp_path / "map")
-    # 512 shapes a part; a line has 20 bytes at each of four corners, a disc 16. Uniforms and labels are little.
-    most = 8 * 512 * 4 * (2 * 20 + 2 * 16) + 100_000
+    # A line has 20 bytes at each of four corners, a disc 16. Uniforms are little.
+    corners, most = 16 * 512 * 6, 16 * 512 * 4 * 20 + 100_000
     for client in serve(lambda: Scene(tmp_path / "map"), tmp_path / "map" / "review.json"):
         seen = in_browser("levels.mjs", client.server.address, -4.5, -3.0, -1.0, 2.0)
         assert seen["noted"]["complaints"] == []
-        assert max(step["most"] for step in [seen["opened"], *seen["first"], seen["hidden"]]) < most
+        steps = [seen["opened"], *seen["first"], seen["hidden"]]
+        assert max(step["most"] for step in steps) < most
         assert max(step["all"] for step in seen["first"]) > most, "the map is too small to tell"
-        for first, again in zip(seen["first"], seen["again"], strict=True):
-            assert again["all"] < 100_000
-            assert again["frame"] == first["frame"]
-        drawn = [step["frame"]["corners"] for step in seen["first"]]
+        for step in [*seen["first"], *seen["again"], seen["hidden"]]:
+            frame = step["frame"]
+            assert (frame["instances"], frame["moved"]["painted"], frame["moved"]["screen"]) == (0, 0, 0)
+            assert frame["moved"]["pictures"] == 1
+            assert frame["most"] <= corners
+        drawn = [step["frame"]["all"] for step in seen["first"]]
+        assert drawn[0] > corners, "the map is too small to tell"
+        assert drawn[0] >= 6 * len(result.labels), "every label is painted"
         assert drawn[-1] < max(drawn), "what is out of view is not drawn"
         assert drawn[-1] < 60_000, "parts are small: from near they reach little beyond the view"
-        assert 0 < seen["hidden"]["frame"]["corners"] < drawn[0]
+        assert 0 < seen["hidden"]["frame"]["all"] < drawn[0]
+        _check_moved_picture(client.server.address, tmp_path)
+
+
+def _check_moved_picture(address: str, folder: Path) -> None:
+    """The ground that was moved looks like ground that is painted where it was moved to."""
+    shots = [folder / f"{name}.png" for name in ("before", "moved", "painted")]
+    seen = in_browser("moved.mjs", address, 60, *shots)
+    assert seen["painted"] == 0 < seen["paintedAnew"]
+    before, moved, painted = (np.asarray(Image.open(path).convert("RGB")).astype(int) for path in shots)
+    assert np.mean(np.any(before != painted, axis=2)) > 0.02
+    assert np.mean(np.max(np.abs(moved - painted), axis=2) > 8) < 0.001
 
 
 def test_the_page_of_the_demo(tmp_path: Path) -> None:

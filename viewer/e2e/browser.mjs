@@ -7,21 +7,34 @@ export async function open(url, { width = 1440, height = 900, theme = "light" } 
     args: ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
   });
   const context = await browser.newContext({ viewport: { width, height }, colorScheme: theme });
-  // What each frame hands the GPU: shapes drawn one by one, and corners of triangles in lists.
+  // What is drawn: shapes one by one (instances); corners of triangles in lists, on the screen in this frame, and on
+  // pictures in this frame, in the frame with the most, and in all; rectangles with a picture in this frame.
   await context.addInitScript(() => {
-    const count = (name, of) => {
-      const draw = WebGL2RenderingContext.prototype[name];
+    window.drawn = { instances: 0, screen: 0, pictures: 0, painted: 0, most: 0, all: 0 };
+    const wrap = (name, before) => {
+      const call = WebGL2RenderingContext.prototype[name];
       WebGL2RenderingContext.prototype[name] = function (...given) {
-        const [instances, corners] = of(given);
-        window.given = { instances: (window.given?.instances ?? 0) + instances, corners: (window.given?.corners ?? 0) + corners };
-        return draw.apply(this, given);
+        before(...given);
+        return call.apply(this, given);
       };
     };
-    count("drawArraysInstanced", (given) => [given[3], 0]);
-    count("drawElementsInstanced", (given) => [given[4], 0]);
-    count("drawArrays", (given) => [0, given[2]]);
-    count("drawElements", (given) => [0, given[1]]);
-    // The bytes that the GPU was handed: in this frame, in the frame with the most, and in all.
+    let target = null;
+    wrap("bindFramebuffer", (which, framebuffer) => {
+      if (which !== WebGL2RenderingContext.READ_FRAMEBUFFER) target = framebuffer;
+    });
+    wrap("drawArraysInstanced", (mode, first, count, instances) => (window.drawn.instances += instances));
+    wrap("drawElementsInstanced", (mode, count, type, offset, instances) => (window.drawn.instances += instances));
+    wrap("drawArrays", () => window.drawn.pictures++);
+    wrap("drawElements", (mode, count) => {
+      const { drawn } = window;
+      if (!target) drawn.screen += count;
+      else {
+        drawn.painted += count;
+        drawn.all += count;
+        drawn.most = Math.max(drawn.most, drawn.painted);
+      }
+    });
+  // The bytes that the GPU was handed: in this frame, in the frame with the most, and in all.
     window.handed = { now: 0, most: 0, all: 0 };
     for (const [name, at] of [["bufferData", 1], ["bufferSubData", 2]]) {
       const hand = WebGL2RenderingContext.prototype[name];
@@ -35,6 +48,7 @@ export async function open(url, { width = 1440, height = 900, theme = "light" } 
     }
     const frame = () => {
       window.handed.now = 0;
+      Object.assign(window.drawn, { screen: 0, pictures: 0, painted: 0 });
       requestAnimationFrame(frame);
     };
     requestAnimationFrame(frame);
@@ -65,16 +79,25 @@ export async function lookFrom(page, zoom) {
   await page.waitForFunction(() => document.body.dataset.settled === "true");
 }
 
-/** What one frame draws, seen from this zoom. */
+/** What moving the map draws at this zoom: a frame of a small step, and all frames until the ground is painted anew. */
 export async function frameFrom(page, zoom) {
   await lookFrom(page, zoom);
-  return page.evaluate(async () => {
-    const painted = () => new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(resolve)));
-    window.given = undefined;
-    const view = window.valuemap.getView();
-    window.valuemap.setView({ ...view, east: view.east + 1 });
-    while (!window.given) await painted();
-    window.valuemap.setView(view);
-    return window.given;
-  });
+  const stepped = (px) =>
+    page.evaluate(async (step) => {
+      Object.assign(window.drawn, { instances: 0, most: 0, all: 0 });
+      document.body.dataset.settled = "false";
+      const view = window.valuemap.getView();
+      window.valuemap.setView({ ...view, east: view.east + step / 2 ** view.zoom });
+      let frame = { pictures: 0 };
+      while (!frame.pictures || document.body.dataset.settled !== "true") {
+        // After the page's own callback, in which it draws.
+        await new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve)));
+        if (window.drawn.pictures) frame = { ...window.drawn };
+      }
+      return frame;
+    }, px);
+  const moved = await stepped(20);
+  const { most, all, instances } = await stepped(200);
+  await lookFrom(page, zoom);
+  return { moved, most, all, instances };
 }

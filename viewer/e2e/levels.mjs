@@ -1,4 +1,4 @@
-// What the GPU is handed while somebody zooms: node levels.mjs URL ZOOM..., prints bytes as JSON.
+// What the GPU is handed and draws while somebody zooms and moves the map: node levels.mjs URL ZOOM..., prints bytes and corners as JSON.
 import { frameFrom, lookFrom, open } from "./browser.mjs";
 
 const [url, ...zooms] = process.argv.slice(2);

@@ -6,6 +6,7 @@ import type { LabelDetails, PlaceDetails, Shot, State } from "./api";
 import { classColor, type Color, existenceColor, OUTCOMES, packed, passColor, STATES } from "./colors";
 import type { Columns } from "./columns";
 import { Drives } from "./drives";
+import { Ground, PictureLayer, type Slices } from "./ground";
 import { DiscLayer, type Discs, type Lines, LinesLayer } from "./meshes";
 import type { Box } from "./parts";
 import { MAX_ZOOM, MIN_ZOOM, type Settings, type View } from "./state";
@@ -68,7 +69,9 @@ export interface MapEvents {
 export class MapView {
   private readonly deck: Deck<OrthographicView>;
   private readonly drives: Drives;
-  private layers: (DiscLayer | LinesLayer)[] = [];
+  private readonly ground = new Ground();
+  /** Changes whenever the ground is to be painted anew. */
+  private content = 0;
   private view: View;
   private settings: Settings;
   private states: State[];
@@ -82,8 +85,6 @@ export class MapView {
   private rays: { shots: Shot[]; misses: Shot[]; to: [number, number] } | null = null;
   private lit: Shot | null = null;
   private buffers: Buffers | null = null;
-  /** The labels in a box around the view, where it is near. */
-  private near: { box: Box; dots: Discs; ellipses: Discs } | null = null;
   private pressed: { x: number; y: number } | null = null;
   /** Of the map in pixels. Asking the element each time would make the browser lay the page out again for every move. */
   private width = 0;
@@ -104,7 +105,7 @@ export class MapView {
     this.states = states;
     this.around = boundsOf([this.labels.position, cameras.rows("position") ? plane(cameras.get("position")) : new Float32Array()]);
     this.view = view ?? this.fitting();
-    this.drives = new Drives(cameras, () => this.draw());
+    this.drives = new Drives(cameras, () => this.repaint());
     this.drives.hide(settings.hiddenPasses);
     this.deck = new Deck({
       parent: parent as HTMLDivElement,
@@ -113,14 +114,16 @@ export class MapView {
       viewState: this.deckView(),
       controller: { doubleClickZoom: false, keyboard: false, scrollZoom: { speed: 0.02, smooth: false }, inertia: false },
       useDevicePixels: true,
-      // The shapes smooth their own edges, and every frame draws all of them: four samples a pixel and a copy of the
-      // picture would double the time of a frame where there is no graphics card.
+      effects: [this.ground],
+      layerFilter: this.ground.drawn as never,
+      // The shapes smooth their own edges: four samples a pixel and a copy of the picture would double the time of a
+      // frame where there is no graphics card.
       deviceProps: { type: "webgl", webgl: { antialias: false, preserveDrawingBuffer: false } },
       onViewStateChange: ({ viewState }) => {
         const [east, north] = viewState.target as number[];
         this.setView({ east, north, zoom: viewState.zoom as number });
       },
-      onAfterRender: () => this.events.onDrawn(),
+      onAfterRender: () => this.wasDrawn(),
       getCursor: ({ isDragging }) => (isDragging ? "grabbing" : "crosshair"),
       layers: [],
     });
@@ -140,7 +143,6 @@ export class MapView {
 
   setView(view: View): void {
     this.view = { ...view, zoom: Math.min(MAX_ZOOM, Math.max(MIN_ZOOM, view.zoom)) };
-    this.deck.setProps({ viewState: this.deckView() });
     this.draw();
     this.events.onView(this.view);
   }
@@ -196,10 +198,10 @@ export class MapView {
     ];
   }
 
-  private deckView() {
+  private deckView({ east, north, zoom } = this.view) {
     return {
-      target: [this.view.east, this.view.north, 0] as [number, number, number],
-      zoom: this.view.zoom,
+      target: [east, north, 0] as [number, number, number],
+      zoom,
       minZoom: MIN_ZOOM,
       maxZoom: MAX_ZOOM,
     };
@@ -248,7 +250,7 @@ export class MapView {
   setRejected(position: Float32Array): void {
     this.rejected = plane(position);
     this.makeRejected();
-    this.draw();
+    this.repaint();
   }
 
   select(at: [number, number] | null, movedTo: [number, number] | null = null): void {
@@ -350,68 +352,86 @@ export class MapView {
     });
     this.index?.finish();
     this.buffers = { length, position, fill, line, shape };
-    this.near = null;
     this.drives.hide(this.settings.hiddenPasses);
     this.makeRays();
+    this.repaint();
+    this.filtered = this.content;
+  }
+
+  /** The content of the ground since the labels were filtered last. */
+  private filtered = Infinity;
+
+  /** The labels in a box, in the order in which they are drawn. */
+  private labelsIn({ left, bottom, right, top }: Box): Buffers | null {
+    if (!this.buffers || !this.index) return null;
+    const rows = this.index.range(left, bottom, right, top);
+    return rows.length === this.buffers.length ? this.buffers : taken(this.buffers, Uint32Array.from(rows).sort());
+  }
+
+  private readonly wanted = () => ({ view: this.view, width: this.width, height: this.height, content: this.content });
+
+  /** Paint the ground anew: something else is to be seen on it. */
+  private repaint(): void {
+    this.content++;
     this.draw();
   }
 
-  /** The ground that the map shows, widened by a part of its own size on every side. */
-  private ground(margin: number): Box {
-    const [left, top] = this.toGround(0, 0);
-    const [right, bottom] = this.toGround(this.width, this.height);
-    const [x, y] = [margin * (right - left), margin * (top - bottom)];
-    return { left: left - x, right: right + x, bottom: bottom - y, top: top + y };
-  }
-
-  /** From near only what is around the view is drawn, taken anew when the view leaves that. */
-  private nearLabels(): { dots: Discs; ellipses: Discs } | null {
-    if (!this.buffers || !this.index) return null;
-    if (!this.near || !contains(this.near.box, this.ground(0))) {
-      const box = this.ground(1);
-      const rows = this.index.range(box.left, box.bottom, box.right, box.top).sort((a, b) => a - b);
-      const dots = taken(this.buffers, rows);
-      // Ellipses are pale, with an outline in the same colour.
-      this.near = { box, dots, ellipses: { ...dots, fill: dots.fill.map((color) => faded(color, 0.22)), line: dots.fill } };
-    }
-    return this.near;
-  }
-
   private draw(): void {
-    const scale = 2 ** this.view.zoom;
-    const near = scale > NEAR_SCALE;
-    const around = near ? this.nearLabels() : null;
-    // Dots shrink where labels would cover each other; their size changes no buffer.
-    // From near they shrink again, so that ellipses show.
-    const radius = scale < 0.15 ? 2.6 : scale < 1 ? 3.6 : scale < 24 ? 5 : 3.5;
-    const dots = { radius, lineWidth: radius < 3 ? 0.5 : 1.25 };
-    const { layers } = this.settings;
-    this.layers = [
-      ...this.trackLayers(),
-      new DiscLayer({ id: "truth", discs: this.truthDiscs, lineWidth: 1.75, visible: layers.has("truth"), radius: this.view.zoom < 0 ? 5 : 9 }),
-      new DiscLayer({ id: "rejected", discs: this.rejectedDiscs, visible: layers.has("rejected"), radius: this.view.zoom < 0 ? 1.5 : 3 }),
-      new DiscLayer({ id: "ellipses", discs: around && around.ellipses, shaped: true, radius: ELLIPSE_95, lineWidth: 1.5, visible: near && layers.has("ellipses") }),
+    const { ground, view } = this;
+    ground.need(this.wanted(), (size, slices) => this.groundLayers(view, size, slices));
+    const aligned = ground.aligned(view);
+    const layers = [
+      ...ground.layers,
+      new PictureLayer({ id: "picture", ground, place: ground.place(aligned, this.width, this.height), parameters: { blend: false, depthCompare: "always" } }),
       ...this.rayLayers(),
-      new DiscLayer({ id: "labels", discs: this.buffers, partsAFrame: Infinity, ...dots, visible: !near }),
-      new DiscLayer({ id: "labels-near", discs: around && around.dots, ...dots, visible: near }),
       new DiscLayer({ id: "selected", discs: this.marks.at, radius: 11, lineWidth: 2.5 }),
       new LinesLayer({ id: "moved", lines: this.marks.moved, width: 1.5 }),
     ];
-    this.deck.setProps({ layers: this.layers });
+    this.deck.setProps({ layers, viewState: this.deckView(aligned) });
   }
 
-  /** Whether all labels in view are drawn. */
+  private wasDrawn(): void {
+    this.events.onDrawn();
+    const { ground } = this;
+    if (ground.texture === this.picture) return;
+    this.picture = ground.texture;
+    this.draw();
+  }
+
+  private picture: unknown = null;
+
+  /** What lies still, as it is painted for a view. */
+  private groundLayers(view: View, [width, height]: [number, number], slices: Slices): (DiscLayer | LinesLayer)[] {
+    const scale = 2 ** view.zoom;
+    // Dots shrink where labels would cover each other. From near they shrink again, so that ellipses show.
+    const radius = scale < 0.15 ? 2.6 : scale < 1 ? 3.6 : scale < 24 ? 5 : 3.5;
+    const { layers } = this.settings;
+    const [x, y] = [width / 2 / scale, height / 2 / scale];
+    const discs = this.labelsIn({ left: view.east - x, bottom: view.north - y, right: view.east + x, top: view.north + y });
+    const shaped = discs && scale > NEAR_SCALE && layers.has("ellipses") ? discs : null;
+    // Ellipses are pale, with an outline in the same colour.
+    const ellipses = shaped && { ...shaped, fill: shaped.fill.map((color) => faded(color, 0.22)), line: shaped.fill };
+    return [
+      ...this.trackLayers(view, slices),
+      new DiscLayer({ id: "truth", slices, discs: this.truthDiscs, lineWidth: 1.75, visible: layers.has("truth"), radius: view.zoom < 0 ? 5 : 9 }),
+      new DiscLayer({ id: "rejected", slices, discs: this.rejectedDiscs, visible: layers.has("rejected"), radius: view.zoom < 0 ? 1.5 : 3 }),
+      new DiscLayer({ id: "ellipses", slices, discs: ellipses, shaped: true, radius: ELLIPSE_95, lineWidth: 1.5 }),
+      new DiscLayer({ id: "labels", slices, discs, radius, lineWidth: radius < 3 ? 0.5 : 1.25 }),
+    ];
+  }
+
+  /** Whether all labels that the filters leave are drawn. */
   labelsDrawn(): boolean {
-    return this.layers.every((layer) => !layer.id.startsWith("labels") || !layer.props.visible || layer.complete);
+    return this.ground.has(this.filtered);
   }
 
   /** Whether everything in view is drawn, as finely as it will be. */
   settled(): boolean {
-    return !this.drives.waiting && this.layers.every((layer) => !layer.props.visible || layer.complete);
+    return !this.drives.waiting && !this.ground.painting && this.ground.shows(this.wanted());
   }
 
-  private trackLayers(): (DiscLayer | LinesLayer)[] {
-    const metres = this.metresPerPixel();
+  private trackLayers(view: View, slices: Slices): (DiscLayer | LinesLayer)[] {
+    const metres = 2 ** -view.zoom;
     const { layers } = this.settings;
     this.drives.need(spacingAt(metres));
     const level = this.drives.at(spacingAt(metres), this.dark);
@@ -419,12 +439,12 @@ export class MapView {
     const streetPx = Math.max(STREET_LEAST_PX, STREET_M / metres);
     const visible = layers.has("tracks");
     const visibleStreets = visible && this.showStreets;
-    const showImages = layers.has("cameras") && this.view.zoom > CAMERAS_FROM_ZOOM;
+    const showImages = layers.has("cameras") && view.zoom > CAMERAS_FROM_ZOOM;
     return [
-      new LinesLayer({ id: "streets", lines: streets && streets.streets, width: streetPx, visible: visibleStreets }),
-      new DiscLayer({ id: "corners", discs: streets && streets.corners, radius: streetPx / 2, visible: visibleStreets && streetPx >= ROUND_FROM_PX }),
-      new LinesLayer({ id: "tracks", lines: level && level.tracks, width: 1.5, visible }),
-      new DiscLayer({ id: "cameras", discs: level && level.images, radius: 2, visible: showImages }),
+      new LinesLayer({ id: "streets", slices, lines: streets && streets.streets, width: streetPx, visible: visibleStreets }),
+      new DiscLayer({ id: "corners", slices, discs: streets && streets.corners, radius: streetPx / 2, visible: visibleStreets && streetPx >= ROUND_FROM_PX }),
+      new LinesLayer({ id: "tracks", slices, lines: level && level.tracks, width: 1.5, visible }),
+      new DiscLayer({ id: "cameras", slices, discs: level && level.images, radius: 2, visible: showImages }),
     ];
   }
 
@@ -433,7 +453,7 @@ export class MapView {
   /** Whether the ground that was driven is drawn as streets: not over a basemap, which has its own. */
   setStreets(shown: boolean): void {
     this.showStreets = shown;
-    this.draw();
+    this.repaint();
   }
 
   /** What changes with what is shown, never with the view. */
@@ -547,17 +567,13 @@ export class MapView {
   }
 }
 
-function contains(outer: Box, inner: Box): boolean {
-  return outer.left <= inner.left && outer.right >= inner.right && outer.bottom <= inner.bottom && outer.top >= inner.top;
-}
-
-function taken(all: Buffers, rows: number[]): Buffers {
+function taken(all: Buffers, rows: Uint32Array): Buffers {
   const length = rows.length;
   const part: Buffers = {
     length,
     position: new Float32Array(2 * length),
-    fill: Uint32Array.from(rows, (row) => all.fill[row]),
-    line: Uint32Array.from(rows, (row) => all.line[row]),
+    fill: rows.map((row) => all.fill[row]),
+    line: rows.map((row) => all.line[row]),
     shape: new Float32Array(4 * length),
   };
   rows.forEach((row, i) => {

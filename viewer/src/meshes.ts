@@ -9,6 +9,7 @@
 import { type DefaultProps, Layer, project32 } from "@deck.gl/core";
 import { Buffer, type VertexArray } from "@luma.gl/core";
 import { Model } from "@luma.gl/engine";
+import type { Slices } from "./ground";
 import { PART, partsWithin } from "./parts";
 
 /** Discs in the order in which they are drawn. */
@@ -48,9 +49,6 @@ interface Mesh {
 const CORNERS = 4;
 const INDICES = [0, 1, 2, 2, 1, 3];
 
-/** So many parts most layers hand the GPU in one frame: more would make the page wait for it. */
-const PARTS_A_FRAME = 8;
-
 /** What a list of triangles for a part reads. */
 function rectangles(): Uint16Array {
   const indices = new Uint16Array(INDICES.length * PART);
@@ -84,9 +82,11 @@ interface MeshState {
   indices: Buffer;
   /** By mesh, those that were in view. */
   parts: Map<Mesh, Part[]>;
-  /** The mesh of which everything in view was there last. */
-  whole: Mesh | null;
-  complete: boolean;
+}
+
+interface MeshProps {
+  /** Of a picture, of which a few parts are painted in every frame; what is drawn in every frame has none. */
+  slices: Slices | null;
 }
 
 interface Shaders {
@@ -95,11 +95,8 @@ interface Shaders {
   modules: object[];
 }
 
-/**
- * What both kinds have in common: a mesh in parts, which are handed to the GPU once they are in view, a few in every
- * frame. Until all of a new mesh are there, the mesh before is drawn.
- */
-abstract class MeshLayer<Props extends object> extends Layer<Props> {
+/** What both kinds have in common: a mesh in parts, which are handed to the GPU once they are in view. */
+abstract class MeshLayer<Props extends object> extends Layer<Props & MeshProps> {
   static layerName = "MeshLayer";
   declare state: MeshState;
 
@@ -109,11 +106,6 @@ abstract class MeshLayer<Props extends object> extends Layer<Props> {
   protected abstract layout(): { name: string; format: "float32x2" | "float32x4" | "unorm8x4" }[];
   protected abstract shaders(): Shaders;
   protected abstract uniforms(): Record<string, Record<string, number>>;
-  /** How many parts the GPU is handed in one frame. */
-  protected partsAFrame(): number {
-    return PARTS_A_FRAME;
-  }
-
   /** How many pixels a shape reaches beyond its points. */
   protected abstract reachPx(): number;
 
@@ -126,34 +118,20 @@ abstract class MeshLayer<Props extends object> extends Layer<Props> {
     // At once, while the page opens: to compile takes long.
     const model = new Model(device, { ...this.getShaders(), id: this.props.id, topology: "triangle-list", bufferLayout: this.layout() });
     const indices = device.createBuffer({ usage: Buffer.INDEX, data: rectangles() });
-    this.state = { model, indices, parts: new Map(), whole: null, complete: false };
-  }
-
-  /** Whether everything in view is drawn. */
-  get complete(): boolean {
-    return !this.mesh() || !!this.state?.complete;
+    this.state = { model, indices, parts: new Map() };
   }
 
   draw(): void {
     const { state } = this;
+    const { slices } = this.props;
     const mesh = this.mesh();
     if (!mesh) return;
+    for (const other of [...state.parts.keys()]) if (other !== mesh && (!mesh.family || other.family !== mesh.family)) this.forget(other);
     const inView = this.partsInView(mesh);
     const made = this.partsOf(mesh);
-    const missing = inView.filter((part) => !made[part]);
-    const most = this.partsAFrame();
-    for (const part of missing.slice(0, most)) made[part] = this.made(part, mesh);
-    state.complete = missing.length <= most;
-    if (state.complete && state.whole !== mesh) {
-      state.whole = mesh;
-      for (const other of state.parts.keys()) if (other !== mesh && (!mesh.family || other.family !== mesh.family)) this.forget(other);
-    }
-    if (!state.complete) this.setNeedsRedraw();
-    const drawn = state.whole ?? mesh;
     state.model.shaderInputs.setProps(this.uniforms());
-    for (const number of drawn === mesh ? inView : this.partsInView(drawn)) {
-      const part = this.partsOf(drawn)[number];
-      if (!part) continue;
+    for (const number of slices ? slices.take(this.id, inView) : inView) {
+      const part = (made[number] ??= this.made(number, mesh));
       state.model.vertexArray = part.vertices;
       state.model.setVertexCount(INDICES.length * part.count);
       state.model.draw(this.context.renderPass);
@@ -220,19 +198,17 @@ interface DiscProps {
   lineWidth: number;
   /** In pixels: ellipses are no smaller than that. */
   minRadius: number;
-  /** What the page is there for is drawn at once, and follows a filter while it is dragged. */
-  partsAFrame: number;
 }
 
 export class DiscLayer extends MeshLayer<DiscProps> {
   static layerName = "DiscLayer";
-  static defaultProps: DefaultProps<DiscProps> = {
+  static defaultProps: DefaultProps<DiscProps & MeshProps> = {
+    slices: { type: "object", value: null, optional: true },
     discs: { type: "object", value: null, optional: true },
     shaped: false,
     radius: 1,
     lineWidth: 0,
     minRadius: 0.5,
-    partsAFrame: PARTS_A_FRAME,
   };
 
   protected shaders() {
@@ -321,10 +297,6 @@ void main(void) {
     return this.props.radius + this.props.lineWidth + 1;
   }
 
-  protected partsAFrame(): number {
-    return this.props.partsAFrame;
-  }
-
   protected uniforms() {
     const { radius, lineWidth, minRadius } = this.props;
     return { disc: { radius, lineWidth, minRadius } };
@@ -345,7 +317,11 @@ interface LineProps {
 
 export class LinesLayer extends MeshLayer<LineProps> {
   static layerName = "LinesLayer";
-  static defaultProps: DefaultProps<LineProps> = { lines: { type: "object", value: null, optional: true }, width: 1 };
+  static defaultProps: DefaultProps<LineProps & MeshProps> = {
+    slices: { type: "object", value: null, optional: true },
+    lines: { type: "object", value: null, optional: true },
+    width: 1,
+  };
 
   protected shaders() {
     return {
@@ -409,6 +385,6 @@ void main(void) {
   }
 }
 
-function uniformModule(name: string, source: string, uniforms: string[]) {
+export function uniformModule(name: string, source: string, uniforms: string[]) {
   return { name, vs: source, fs: source, uniformTypes: Object.fromEntries(uniforms.map((each) => [each, "f32" as const])) };
 }

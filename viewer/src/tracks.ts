@@ -51,6 +51,12 @@ export const STREET_M = 9;
 /** Streets narrower than that have no round ends, which nobody would see. */
 export const ROUND_FROM_PX = 4;
 
+/** Lines that follow each other are one where that moves them by no more than this part of a pixel. */
+const STRAIGHT_PX = 0.25;
+
+/** No more lines become one, so that making a level takes a time in proportion to it. */
+const MOST_IN_ONE = 32;
+
 /** The coarsest first, 0 for all images. */
 export const SPACINGS = [160, 40, 12, 4, 0];
 
@@ -100,16 +106,18 @@ export function thinned(full: Level, spacing: number): Level {
 /** What is drawn of a level without the hidden passes. */
 export function drawnOf(level: Level, hidden: ReadonlySet<number>): Drawn {
   const { spacing } = level;
-  const tracks = lines(level, distinct(level, hidden, spacing / 2));
+  // A pixel is never smaller where the level is drawn.
+  const tolerance = (STRAIGHT_PX * spacing) / APART_PX;
+  const tracks = straight(level, distinct(level, hidden, spacing / 2), tolerance);
   const finest = spacing === 0;
-  const streets = finest ? new Uint8Array(level.pass.length) : distinct(level, hidden, Math.max(spacing, STREET_M) / 2);
+  const streets = finest ? [] : straight(level, distinct(level, hidden, Math.max(spacing, STREET_M) / 2), tolerance);
   // Coarser levels are only seen from too far away for round ends.
   const round = spacing <= (APART_PX * STREET_M) / ROUND_FROM_PX;
   const images: number[] = [];
   if (finest) for (let row = 0; row < level.pass.length; row++) if (!hidden.has(level.pass[row])) images.push(row);
   return {
     spacing,
-    tracks,
+    tracks: lines(level, tracks),
     streets: lines(level, streets),
     corners: points(level, round ? corners(streets) : []),
     images: points(level, images),
@@ -123,35 +131,59 @@ export function buffersOf(drawn: Drawn): ArrayBuffer[] {
   );
 }
 
-/** Both ends of all lines that are drawn, those between two lines once. */
-function corners(drawn: Uint8Array): number[] {
-  const rows: number[] = [];
-  drawn.forEach((shown, row) => {
-    if (!shown) return;
-    if (!drawn[row - 1]) rows.push(row);
-    rows.push(row + 1);
-  });
-  return rows;
+/** The rows of both ends of every line, one line after the other. */
+type Ends = number[];
+
+/** The lines that are drawn, with those in one that follow each other and leave out no point by more than the tolerance. */
+export function straight({ points }: Level, drawn: Uint8Array, tolerance: number): Ends {
+  const ends: Ends = [];
+  for (let row = 0; row < drawn.length; row++) {
+    if (!drawn[row]) continue;
+    const from = row;
+    while (tolerance > 0 && drawn[row + 1] && row - from < MOST_IN_ONE && near(points, from, row + 2, tolerance)) row++;
+    ends.push(from, row + 1);
+  }
+  return ends;
 }
 
-function lines({ points, pass }: Level, drawn: Uint8Array): Lines {
-  const rows: number[] = [];
-  drawn.forEach((shown, row) => shown && rows.push(row));
-  const east = new Float32Array(rows.length);
-  const north = new Float32Array(rows.length);
-  rows.forEach((row, i) => {
-    east[i] = (points[3 * row] + points[3 * row + 3]) / 2;
-    north[i] = (points[3 * row + 1] + points[3 * row + 4]) / 2;
-  });
-  const ends = new Float32Array(4 * rows.length);
-  const passes = new Int32Array(rows.length);
+/** Whether the points between two rows are no farther than that from the line between the two, and one after the other along it. */
+function near(points: Float32Array, from: number, to: number, tolerance: number): boolean {
+  const [x, y] = [points[3 * from], points[3 * from + 1]];
+  const [east, north] = [points[3 * to] - x, points[3 * to + 1] - y];
+  const length = Math.hypot(east, north);
+  let before = 0;
+  for (let row = from + 1; row <= to; row++) {
+    const [right, up] = [points[3 * row] - x, points[3 * row + 1] - y];
+    const along = right * east + up * north;
+    if (along < before || Math.abs(right * north - up * east) > tolerance * length) return false;
+    before = along;
+  }
+  return true;
+}
+
+/** Both ends of all lines, those between two lines once. */
+function corners(ends: Ends): number[] {
+  return ends.filter((row, i) => i % 2 || row !== ends[i - 1]);
+}
+
+function lines({ points, pass }: Level, rows: Ends): Lines {
+  const count = rows.length / 2;
+  const east = new Float32Array(count);
+  const north = new Float32Array(count);
+  for (let i = 0; i < count; i++) {
+    const [from, to] = [3 * rows[2 * i], 3 * rows[2 * i + 1]];
+    east[i] = (points[from] + points[to]) / 2;
+    north[i] = (points[from + 1] + points[to + 1]) / 2;
+  }
+  const ends = new Float32Array(4 * count);
+  const passes = new Int32Array(count);
   nearby(east, north).forEach((at, i) => {
-    const row = rows[at];
-    ends[4 * i] = points[3 * row];
-    ends[4 * i + 1] = points[3 * row + 1];
-    ends[4 * i + 2] = points[3 * row + 3];
-    ends[4 * i + 3] = points[3 * row + 4];
-    passes[i] = pass[row];
+    const [from, to] = [3 * rows[2 * at], 3 * rows[2 * at + 1]];
+    ends[4 * i] = points[from];
+    ends[4 * i + 1] = points[from + 1];
+    ends[4 * i + 2] = points[to];
+    ends[4 * i + 3] = points[to + 1];
+    passes[i] = pass[rows[2 * at]];
   });
   return { ends, pass: passes, bounds: boundsOfParts(ends, 2) };
 }
