@@ -18,13 +18,14 @@ import pyarrow.parquet as pq
 import pytest
 
 import valuemap
-from valuemap import csv_table, json_lists, tables
+from valuemap import csv_table, json_lists, portions, tables
 from valuemap.errors import InputError, OutputError
 from valuemap.json_lists import read_json_lists
 from valuemap.readers import READERS, boxes, row_file, vet
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.detections.coco import read_coco
 from valuemap.readers.texts import Texts
+from valuemap.tables import Categories, Detections
 from valuemap.text_files import read_json
 
 HEADER = "image,class,left,top,width,height,score,range_m"
@@ -278,6 +279,26 @@ def test_files_are_the_same_however_detections_come(tmp_path: Path, monkeypatch:
     for name in names:
         assert (tmp_path / "streamed" / "city" / name).read_bytes() == (tmp_path / "whole" / "city" / name).read_bytes()
     assert pq.ParquetFile(tmp_path / "streamed" / "city" / "detections.parquet").num_row_groups == 7
+
+
+def test_what_was_read_of_a_file_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    count, random = 200_000, np.random.default_rng(9)
+    monkeypatch.setattr(tables, "ROWS_OF_GROUP", 10_000)
+    detections = Detections(
+        detection_id=np.arange(count),
+        image_id=random.integers(0, 2**40, count),
+        class_name=Categories(np.zeros(count, np.int32), ("light",)),
+        center_px=random.random((count, 2)),
+        size_px=random.random((count, 2)),
+        score=random.random(count),
+    )
+    tables.write_table(detections, tmp_path / "detections.parquet")
+    tracemalloc.start()
+    lengths = [len(portion) for portion in portions.read_portions(Detections, tmp_path / "detections.parquet", 10_000)]
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert lengths == [10_000] * 20
+    assert peak < 4 * 10_000 * 64
 
 
 def test_no_room_for_temporary_files_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

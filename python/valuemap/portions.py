@@ -79,7 +79,7 @@ def _batches(path: Path, rows: int, columns: list[str] | None) -> Iterator[pa.Ta
         raise InputError(f"{path}: no such file", hint="give the folder that an import or simulate command wrote")
     try:
         with path.open("rb") as file:
-            source = pq.ParquetFile(file)
+            source = pq.ParquetFile(file, pre_buffer=False)  # Else all of it is in memory in the end.
             if source.metadata.num_rows == 0:
                 yield source.read(columns)
             for batch in source.iter_batches(rows, columns=columns):
