@@ -277,8 +277,8 @@ class Candidates:
 
     `position_in_world_m` (N, 3); the voters of candidate i are the rows `voters[voter_offsets[i] :
     voter_offsets[i + 1]]` of the detections, ascending. `cluster` (N) is where it was found (paper); `covariance_m2`
-    (N, 3, 3), the probability of `existence` (N), the number of images `expected` to see it (N) and the code of its class
-    `class_code` (N) are what the robust method adds; without, voters are all of one class.
+    (N, 3, 3), the probability of `existence` (N), the number of images `expected` to see it (N) and the code of its
+    class `class_code` (N) are what the robust method adds; without, voters are all of one class.
     """
 
     position_in_world_m: Floats
