@@ -113,6 +113,8 @@ def _check_moved_picture(address: str, folder: Path) -> None:
     shots = [folder / f"{name}.png" for name in ("before", "moved", "painted")]
     seen = in_browser("moved.mjs", address, 60, *shots)
     assert seen["painted"] == 0 < seen["paintedAnew"]
+    first, second, rested = seen["zoomed"]
+    assert first == second == 0 < rested
     before, moved, painted = (np.asarray(Image.open(path).convert("RGB")).astype(int) for path in shots)
     assert np.mean(np.any(before != painted, axis=2)) > 0.02
     assert np.mean(np.max(np.abs(moved - painted), axis=2) > 8) < 0.001

@@ -10,6 +10,12 @@ const cpu = async () => {
   const { metrics } = await tools.send("Performance.getMetrics");
   return 1000 * metrics.find((metric) => metric.name === "ThreadTime").value;
 };
+// And that of the browser's drawing, which is most of a frame where there is no graphics card.
+const all = await browser.newBrowserCDPSession();
+const drawingCpu = async () => {
+  const { processInfo } = await all.send("SystemInfo.getProcessInfo");
+  return 1000 * processInfo.find((each) => each.type === "GPU").cpuTime;
+};
 await page.evaluate(() => {
   window.longTasks = [];
   new PerformanceObserver((list) => {
@@ -38,8 +44,10 @@ async function frames(action) {
   });
   const start = await now();
   const before = await cpu();
+  const drawnBefore = await drawingCpu();
   await action();
   const used = (await cpu()) - before;
+  const drawn = (await drawingCpu()) - drawnBefore;
   const between = await page.evaluate(() => {
     cancelAnimationFrame(window.counting);
     return window.counted.slice(1).map((time, i) => time - window.counted[i]);
@@ -52,6 +60,7 @@ async function frames(action) {
     median_frame_ms: median(between),
     longest_frame_ms: Math.max(...between),
     cpu_per_frame_ms: used / Math.max(1, between.length),
+    drawing_cpu_per_frame_ms: drawn / Math.max(1, between.length),
   };
 }
 const median = (values) => [...values].sort((a, b) => a - b)[Math.floor(values.length / 2)] ?? null;

@@ -17,6 +17,29 @@ await page.evaluate((step) => {
 }, Number(px));
 await shoot(moved);
 const seen = { noted, painted: await page.evaluate(() => window.drawn.all) };
+// Somebody who zooms by little sees the same picture stretched, until the zoom rests; the test says when.
+seen.zoomed = await page.evaluate(async () => {
+  const later = window.setTimeout;
+  const rests = [];
+  window.setTimeout = (call) => rests.push(call);
+  const view = window.valuemap.getView();
+  const frame = async (zoom) => {
+    Object.assign(window.drawn, { all: 0, pictures: 0 });
+    window.valuemap.setView({ ...view, zoom });
+    while (!window.drawn.pictures) await new Promise((resolve) => requestAnimationFrame(() => later(resolve)));
+    return window.drawn.all;
+  };
+  const painted = [await frame(view.zoom + 0.1), await frame(view.zoom + 0.2)];
+  window.setTimeout = later;
+  document.body.dataset.settled = "false";
+  for (const rest of rests) rest();
+  while (document.body.dataset.settled !== "true") await new Promise(requestAnimationFrame);
+  painted.push(window.drawn.all);
+  window.valuemap.setView(view);
+  return painted;
+});
+await settled();
+await page.evaluate(() => Object.assign(window.drawn, { all: 0 }));
 // Dark and light again: it is painted anew at this place.
 await page.keyboard.press("d");
 await settled();

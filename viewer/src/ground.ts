@@ -19,6 +19,9 @@ const MARGIN_PX = 256;
 /** A picture is painted anew when the view has moved by so much: what is left of the margin lasts until it is there. */
 const MOVED_PX = 96;
 
+/** By so much (a power of two, a fifth) a picture is stretched while somebody zooms, before another one is painted. */
+const STRETCH = 0.25;
+
 /** So many parts (parts.ts) are painted in one frame: without a graphics card they take as long as all the rest of it. */
 const PARTS_A_FRAME = 16;
 
@@ -97,6 +100,12 @@ export class Ground implements Effect {
     if (shown.width !== wanted.width || shown.height !== wanted.height) return false;
     const scale = 2 ** wanted.view.zoom;
     return Math.max(Math.abs(wanted.view.east - shown.view.east), Math.abs(wanted.view.north - shown.view.north)) * scale <= movedPx;
+  }
+
+  /** Whether the picture will do while somebody zooms. */
+  servesZoom({ content, view, width, height }: Wanted): boolean {
+    const { shown } = this;
+    return !!shown && shown.content === content && shown.width === width && shown.height === height && Math.abs(shown.view.zoom - view.zoom) < STRETCH;
   }
 
   /** Whether there is a picture of this content or a later one. */

@@ -19,6 +19,8 @@ const CAMERAS_FROM_ZOOM = 1.5;
 /** From this many pixels of a metre on ellipses are drawn, and only what is around the view. */
 const NEAR_SCALE = 0.8;
 const STREET_LEAST_PX = 3;
+/** A zoom that has not changed for so long is the one to be painted sharply. */
+const REST_MS = 100;
 
 /** Labels as they are drawn, with ellipses in true scale. */
 type Buffers = Discs & { shape: Float32Array };
@@ -142,10 +144,21 @@ export class MapView {
   }
 
   setView(view: View): void {
-    this.view = { ...view, zoom: Math.min(MAX_ZOOM, Math.max(MIN_ZOOM, view.zoom)) };
+    const zoom = Math.min(MAX_ZOOM, Math.max(MIN_ZOOM, view.zoom));
+    if (zoom !== this.view.zoom) {
+      clearTimeout(this.zooming);
+      this.zooming = window.setTimeout(() => {
+        this.zooming = 0;
+        this.draw();
+      }, REST_MS);
+    }
+    this.view = { ...view, zoom };
     this.draw();
     this.events.onView(this.view);
   }
+
+  /** The timer while somebody zooms. */
+  private zooming = 0;
 
   zoomBy(steps: number): void {
     this.setView({ ...this.view, zoom: this.view.zoom + steps });
@@ -378,7 +391,8 @@ export class MapView {
 
   private draw(): void {
     const { ground, view } = this;
-    ground.need(this.wanted(), (size, slices) => this.groundLayers(view, size, slices));
+    const wanted = this.wanted();
+    if (!this.zooming || !ground.servesZoom(wanted)) ground.need(wanted, (size, slices) => this.groundLayers(view, size, slices));
     const aligned = ground.aligned(view);
     const layers = [
       ...ground.layers,
