@@ -255,7 +255,7 @@ def test_memory_does_not_grow_with_the_boxes(tmp_path: Path, monkeypatch: pytest
         return python, max(in_arrow)
 
     few, more = peak(10_000), peak(60_000)
-    # Not a third of what the boxes take: what is listed of a group of those left out is texts of Python, half a megabyte.
+    # Less than the boxes take: what is listed of a group of those left out is texts, half a megabyte.
     assert more[0] - few[0] < 20 * 50_000
     assert more[1] < 1.5 * few[1] + 10_000
     # The same with all in one portion, and of a table in one block.
