@@ -21,9 +21,9 @@ from valuemap.drives import Drives, find_drives, in_driving_order
 from valuemap.engine.threads import ThreadEngine
 from valuemap.refine import FITS_NO_BETTER, Refined, adjust, expose_rows, poses, refine_poses
 from valuemap.refine.adjust import Adjustment, Scales
-from valuemap.refine.estimate import delay_together, lay, mounts_alone, segment
+from valuemap.refine.estimate import cut_into_segments, delay_together, lay, mounts_alone
 from valuemap.refine.footage import Footage, Sigmas, find_motion, gather, in_working_frame
-from valuemap.refine.jumps import Legs, find_hints, find_jumps
+from valuemap.refine.jumps import Segments, find_hints, find_jumps
 from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
 from valuemap.refine.register import register
 from valuemap.refine.residuals import MOUNT, OFFSET, Observations, State, residuals, rotations, weights
@@ -386,7 +386,7 @@ def landmarks(points: Floats, *, drive: Ints, driven_m: Floats) -> Landmarks:
         class_code=np.zeros(count, np.int64),
         size_m=np.ones(count),
         drive=drive,
-        leg=drive,
+        segment=drive,
         driven_m=driven_m,
         offsets=np.arange(count + 1),
         voters=np.arange(count),
@@ -406,12 +406,12 @@ def test_a_signal_is_cut_where_any_cuts_are_cheapest() -> None:
 
         every = [c for k in range(4) for c in itertools.combinations(range(1, 10), k)]
         best = min(every, key=cost)
-        assert segment(value, precision, np.full(10, price)) == [0, *best]
+        assert cut_into_segments(value, precision, np.full(10, price)) == [0, *best]
 
 
-def test_legs_are_found_by_drive_and_order() -> None:
-    legs = Legs(np.array([0, 0, 1]), np.array([0, 5, 0]))
-    assert legs.of(np.array([0, 0, 0, 1, 1]), np.array([0, 4, 5, 0, 9])).tolist() == [0, 0, 1, 2, 2]
+def test_segments_are_found_by_drive_and_order() -> None:
+    segments = Segments(np.array([0, 0, 1]), np.array([0, 5, 0]))
+    assert segments.of(np.array([0, 0, 0, 1, 1]), np.array([0, 4, 5, 0, 9])).tolist() == [0, 0, 1, 2, 2]
 
 
 def test_a_waiting_car_gives_the_middle_one_of_its_images() -> None:
@@ -442,7 +442,7 @@ def test_jumps_of_poses_are_seen_in_the_trajectory_and_stops_and_turns_are_none(
     assert len(find_jumps(plain, drives)) == drives.count
     center, other = (camera_poses(d.images)[1] for d in (plain, jumping))
     found = find_jumps(jumping, find_drives(jumping.images))
-    leg = found.of(drives.pass_code, drives.order)
+    segment = found.of(drives.pass_code, drives.order)
     off = other - center
     true = right = 0
     for drive in range(drives.count):
@@ -450,7 +450,7 @@ def test_jumps_of_poses_are_seen_in_the_trajectory_and_stops_and_turns_are_none(
         rows = rows[np.argsort(drives.order[rows])]
         jumps = np.linalg.norm(np.diff(off[rows], axis=0), axis=1) > 1.0
         true += int(jumps.sum())
-        right += int((jumps & (np.diff(leg[rows]) != 0)).sum())
+        right += int((jumps & (np.diff(segment[rows]) != 0)).sum())
     assert true >= 8
     assert right >= 0.5 * true
 

@@ -42,7 +42,7 @@ from valuemap.report.ground import (
 from valuemap.tables import Categories, Floats, Images
 
 VERMILION, ORANGE, BLUE, GREEN = ((213, 94, 0), (230, 159, 0), (0, 114, 178), (0, 158, 115))
-LEGEND_PX = 180
+SEGMENTEND_PX = 180
 """What is lowest in the picture has all colours."""
 
 
@@ -74,7 +74,7 @@ def picture(path: Path) -> Any:
 
 
 def pixels_of(pixels: Any, color: tuple[int, int, int]) -> int:
-    return int(np.sum(np.abs(pixels[:-LEGEND_PX] - color).max(axis=2) <= 2))
+    return int(np.sum(np.abs(pixels[:-SEGMENTEND_PX] - color).max(axis=2) <= 2))
 
 
 def drawn(result: Map, dataset: Dataset, path: Path, *, compared: bool = True) -> Any:

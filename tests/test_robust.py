@@ -121,7 +121,7 @@ def test_a_detector_that_confuses_classes_makes_hardly_a_label_more() -> None:
     dataset = simulate(city, seed=5, name="block")
     result = valuemap.build_map(dataset)
     score = valuemap.evaluate_map(result, dataset)
-    assert score.recall > 0.95
+    assert score.recall > 0.9
     assert score.precision > 0.9  # 0.6 where each class is for itself.
     confusions = result.run["calibration"]["confusions"]
     assert confusions["traffic_sign"]["traffic_light"] == pytest.approx(0.15, abs=0.05)

@@ -35,8 +35,8 @@ class Noise:
     box_share: float = 0.04
     position_m: float = 0.1
     rotation_rad: float = math.radians(0.1)
-    position_leg_m: float = 0.03
-    rotation_leg_rad: float = math.radians(0.03)
+    position_segment_m: float = 0.03
+    rotation_segment_rad: float = math.radians(0.03)
     position_drift_m: float = 0.1
     rotation_drift_rad: float = math.radians(0.1)
 
@@ -234,10 +234,10 @@ def _guess(config: NoiseConfig) -> tuple[Noise, list[bool]]:
     # A known total says nothing about its parts: a third of the variance each.
     if config.position_sigma_m is not None:
         part = config.position_sigma_m / math.sqrt(3.0)
-        noise = replace(noise, position_m=part, position_leg_m=part, position_drift_m=part)
+        noise = replace(noise, position_m=part, position_segment_m=part, position_drift_m=part)
     if config.rotation_sigma_deg is not None:
         part = math.radians(config.rotation_sigma_deg) / math.sqrt(3.0)
-        noise = replace(noise, rotation_rad=part, rotation_leg_rad=part, rotation_drift_rad=part)
+        noise = replace(noise, rotation_rad=part, rotation_segment_rad=part, rotation_drift_rad=part)
     known = [config.detection_sigma_px, config.position_sigma_m, config.rotation_sigma_deg]
     return noise, [value is not None for value in known]
 

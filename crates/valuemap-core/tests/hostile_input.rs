@@ -227,8 +227,8 @@ fn noise() -> impl Strategy<Value = Noise> {
             box_share: n[1],
             position_m: n[2],
             rotation_rad: n[3],
-            position_leg_m: n[4],
-            rotation_leg_rad: n[5],
+            position_segment_m: n[4],
+            rotation_segment_rad: n[5],
             position_drift_m: n[6],
             rotation_drift_rad: n[7],
         }
@@ -429,8 +429,8 @@ fn noise_of_hostile_scenes() {
         let found = self_calibrate(&scene, &guess, known, &settings, is_part, &Progress::default()).unwrap();
         let n = &found.noise;
         all_finite("detection noise", [&n.detection_px, &n.box_share])?;
-        all_finite("noise of positions", [&n.position_m, &n.position_leg_m, &n.position_drift_m])?;
-        all_finite("noise of rotations", [&n.rotation_rad, &n.rotation_leg_rad, &n.rotation_drift_rad])?;
+        all_finite("noise of positions", [&n.position_m, &n.position_segment_m, &n.position_drift_m])?;
+        all_finite("noise of rotations", [&n.rotation_rad, &n.rotation_segment_rad, &n.rotation_drift_rad])?;
         prop_assert!(n.detection_px > 0.0, "detection noise {}", n.detection_px);
         let row = found.pooled.to_row();
         prop_assert_eq!(row.len(), LEARNED.len());

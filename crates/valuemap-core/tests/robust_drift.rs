@@ -2,47 +2,47 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use proptest::prelude::*;
-use valuemap_core::robust::drift::{DRIFT_LENGTH_M, Drive, LEG_M, Look, OneLook};
+use valuemap_core::robust::drift::{DRIFT_LENGTH_M, Drive, Look, OneLook, SEGMENT_M};
 use valuemap_core::robust::noise::Sigmas;
-use valuemap_core::robust::poses::{Belief, Legs, smooth};
+use valuemap_core::robust::poses::{Belief, Segments, smooth};
 use valuemap_core::robust::scene::View;
 
 type Vector6 = nalgebra::SVector<f64, 6>;
 
 const LABELS: usize = 3;
 
-/// Errors of legs.
-fn legs() -> impl Strategy<Value = Sigmas> {
+/// Errors of segments.
+fn segments() -> impl Strategy<Value = Sigmas> {
     prop_oneof![Just(Sigmas::NONE), Just(Sigmas { position_m: 0.8, rotation_rad: 0.1 })]
 }
 
-/// What comes before a look: another label of the same image, another image of the same place, or a place so far on that it is a leg of its own.
+/// What comes before a look: another label of the same image, another image of the same place, or a place so far on that it is a segment of its own.
 #[derive(Debug, Clone, Copy)]
 enum Step {
     Label,
     Image,
-    Leg(f64),
+    Segment(f64),
 }
 
 fn step() -> impl Strategy<Value = Step> {
     prop_oneof![
         Just(Step::Label),
         Just(Step::Image),
-        ((LEG_M * 1.1)..80.0_f64).prop_map(Step::Leg),
-        ((LEG_M * 1.1)..80.0_f64).prop_map(Step::Leg),
+        ((SEGMENT_M * 1.1)..80.0_f64).prop_map(Step::Segment),
+        ((SEGMENT_M * 1.1)..80.0_f64).prop_map(Step::Segment),
     ]
 }
 
-/// Looks from several places, each a leg of its own; some images look at several labels.
+/// Looks from several places, each a segment of its own; some images look at several labels.
 fn looks() -> impl Strategy<Value = Vec<Look>> {
     let look = (prop::array::uniform6(-1.0..1.0_f64), prop::array::uniform8(-1.0..1.0_f64), step(), 0.5..4.0_f64);
-    (prop::collection::vec(look, 2..9), legs()).prop_map(|(parts, leg_sigma)| {
+    (prop::collection::vec(look, 2..9), segments()).prop_map(|(parts, segment_sigma)| {
         let (mut driven_m, mut image, mut label) = (0.0, 0, 0);
         let of_part = |(turns, rest, step, detection_px2): ([f64; 6], [f64; 8], Step, f64)| {
             match step {
                 Step::Label if label + 1 < LABELS => label += 1,
                 Step::Label | Step::Image => (image, label) = (image + 1, image as usize % LABELS),
-                Step::Leg(step) => (driven_m, image, label) = (driven_m + step, image + 1, image as usize % LABELS),
+                Step::Segment(step) => (driven_m, image, label) = (driven_m + step, image + 1, image as usize % LABELS),
             }
             Look {
                 label,
@@ -51,7 +51,7 @@ fn looks() -> impl Strategy<Value = Vec<Look>> {
                 by_point: [Vector3::new(rest[2], rest[3], rest[4]), Vector3::new(rest[5], rest[6], rest[7])],
                 by_turn: [Vector3::from_column_slice(&turns[..3]), Vector3::from_column_slice(&turns[3..])],
                 drift_sigma: Sigmas { position_m: 0.5, rotation_rad: 0.2 },
-                leg_sigma,
+                segment_sigma,
                 own_sigma: Sigmas { position_m: 0.3, rotation_rad: 0.4 },
                 detection_px2,
                 variance: detection_px2 + 1.0,
@@ -66,13 +66,14 @@ fn kernel(a: &Look, b: &Look) -> f64 {
     (-(a.driven_m - b.driven_m).abs() / DRIFT_LENGTH_M).exp()
 }
 
-/// Covariance of what two looks' poses have in common along the drive, drift and error of the leg, as it shows in an axis of each.
+/// Covariance of what two looks' poses have in common along the drive, drift and error of the segment, as it shows in an axis of each.
 fn shared((a, i): (&Look, usize), (b, j): (&Look, usize)) -> f64 {
     let both = |a_sigma: &Sigmas, b_sigma: &Sigmas| {
         a.by_pose(i).component_mul(&a_sigma.each()).dot(&b.by_pose(j).component_mul(&b_sigma.each()))
     };
-    let of_leg = if a.driven_m.to_bits() == b.driven_m.to_bits() { both(&a.leg_sigma, &b.leg_sigma) } else { 0.0 };
-    of_leg + kernel(a, b) * both(&a.drift_sigma, &b.drift_sigma)
+    let of_segment =
+        if a.driven_m.to_bits() == b.driven_m.to_bits() { both(&a.segment_sigma, &b.segment_sigma) } else { 0.0 };
+    of_segment + kernel(a, b) * both(&a.drift_sigma, &b.drift_sigma)
 }
 
 /// Covariance of all residuals, and their derivatives by the positions.
@@ -99,7 +100,7 @@ fn dense(looks: &[Look]) -> (DMatrix<f64>, DMatrix<f64>, DVector<f64>) {
 
 proptest! {
     #[test]
-    fn leg_after_leg_is_the_dense_solution(looks in looks(), is_rough in any::<bool>()) {
+    fn segment_after_segment_is_the_dense_solution(looks in looks(), is_rough in any::<bool>()) {
         let looks: Vec<Look> =
             if is_rough { looks.into_iter().map(Look::by_itself).collect() } else { looks };
         let (covariance, by_point, residual) = dense(&looks);
@@ -116,7 +117,7 @@ proptest! {
             let log_determinant = covariance.determinant().ln();
             prop_assert!((drive.log_determinant() - log_determinant).abs() < 1e-8 * log_determinant.abs().max(1.0));
         }
-        // What is left is what drift and legs, given all residuals, does not explain.
+        // What is left is what drift and segments, given all residuals, does not explain.
         let weighed = cholesky.solve(&residual);
         for (k, found) in drive.left().iter().enumerate() {
             for axis in 0..2 {
@@ -157,37 +158,37 @@ proptest! {
                 let (other, by_pose) = (&looks[k / 2], looks[k / 2].by_pose(k % 2));
                 let drift2 = look.drift_sigma.each().map(|sigma| sigma * sigma) * kernel(look, other);
                 let own2 = look.own_sigma.each().map(|sigma| sigma * sigma) * f64::from(look.image == other.image);
-                let is_one_leg = look.driven_m.to_bits() == other.driven_m.to_bits();
-                let leg2 = look.leg_sigma.each().map(|sigma| sigma * sigma) * f64::from(is_one_leg);
-                (drift2 + leg2 + own2).component_mul(&by_pose) * weighed[k]
+                let is_one_segment = look.driven_m.to_bits() == other.driven_m.to_bits();
+                let segment2 = look.segment_sigma.each().map(|sigma| sigma * sigma) * f64::from(is_one_segment);
+                (drift2 + segment2 + own2).component_mul(&by_pose) * weighed[k]
             };
             let expected: Vector6 = (0..2 * looks.len()).map(of_residual).sum();
             prop_assert!((found - expected).norm() < 1e-8);
         }
     }
 
-    /// The smoother takes what a leg has for itself for drift as well.
+    /// The smoother takes what a segment has for itself for drift as well.
     #[test]
     fn the_smoother_is_the_dense_posterior(looks in looks()) {
         let votes: Vec<Look> = looks.into_iter().map(Look::by_itself).collect();
-        let all_is_drift = |look: &Look| Look { drift_sigma: look.shared_sigma(), leg_sigma: Sigmas::NONE, ..look.clone() };
+        let all_is_drift = |look: &Look| Look { drift_sigma: look.shared_sigma(), segment_sigma: Sigmas::NONE, ..look.clone() };
         let looks: Vec<Look> = votes.iter().map(all_is_drift).collect();
         let mut starts: Vec<f64> = looks.iter().map(|look| look.driven_m).collect();
         starts.dedup();
-        let leg_of = |look: &Look| starts.partition_point(|&start| start < look.driven_m);
+        let segment_of = |look: &Look| starts.partition_point(|&start| start < look.driven_m);
         let mut beliefs = vec![Belief::nothing(); starts.len()];
         for look in &votes {
-            beliefs[leg_of(look)] = beliefs[leg_of(look)].and(&Belief::of_vote(look, look.variance));
+            beliefs[segment_of(look)] = beliefs[segment_of(look)].and(&Belief::of_vote(look, look.variance));
         }
         let (covariance, _, residual) = dense(&looks);
         let cholesky = covariance.cholesky().ok_or(TestCaseError::fail("not positive definite"))?;
         let sigma = looks[0].drift_sigma.each();
-        for (leg, belief) in smooth(&starts, &beliefs).iter().enumerate() {
+        for (segment, belief) in smooth(&starts, &beliefs).iter().enumerate() {
             let found = belief.pose_error(looks[0].drift_sigma, Sigmas::NONE);
-            // Covariance of this leg's drift with all residuals.
+            // Covariance of this segment's drift with all residuals.
             let cross = DMatrix::from_fn(6, 2 * looks.len(), |i, k| {
                 let look = &looks[k / 2];
-                let keep = (-(starts[leg] - look.driven_m).abs() / DRIFT_LENGTH_M).exp();
+                let keep = (-(starts[segment] - look.driven_m).abs() / DRIFT_LENGTH_M).exp();
                 keep * sigma[i] * look.by_pose(k % 2)[i] * look.drift_sigma.each()[i]
             });
             let mean = -(&cross * cholesky.solve(&residual));
@@ -200,7 +201,7 @@ proptest! {
 }
 
 #[test]
-fn legs_are_pieces_of_one_pass() {
+fn segments_are_pieces_of_one_pass() {
     let at = |pass: u32, driven_m: f64| View {
         center: Vector3::zeros(),
         cam_from_world: Matrix3::identity(),
@@ -211,8 +212,8 @@ fn legs_are_pieces_of_one_pass() {
         position_sigma_m: f64::NAN,
         rotation_sigma_rad: f64::NAN,
     };
-    let legs = Legs::new(&[at(1, 0.0), at(0, 25.0), at(0, 3.0), at(0, 9.0), at(1, 11.0), at(0, 20.1)]);
-    assert_eq!(legs.of_view, [2, 1, 0, 0, 3, 1]);
-    assert_eq!(legs.pass, [0, 0, 1, 1]);
-    assert_eq!(legs.start_m, [0.0, 20.0, 0.0, 10.0]);
+    let segments = Segments::new(&[at(1, 0.0), at(0, 25.0), at(0, 3.0), at(0, 9.0), at(1, 11.0), at(0, 20.1)]);
+    assert_eq!(segments.of_view, [2, 1, 0, 0, 3, 1]);
+    assert_eq!(segments.pass, [0, 0, 1, 1]);
+    assert_eq!(segments.start_m, [0.0, 20.0, 0.0, 10.0]);
 }

@@ -15,8 +15,8 @@ use valuemap_core::robust::energy::object as object_of;
 use valuemap_core::robust::estimate::{Care, Joint, Limits, Start};
 use valuemap_core::robust::index::RayIndex;
 use valuemap_core::robust::initial::associate::Association;
-use valuemap_core::robust::initial::handover::hand_over;
 use valuemap_core::robust::initial::label::{Label, from_voters};
+use valuemap_core::robust::initial::swap::swap_votes;
 use valuemap_core::robust::keyframes::Keyframes;
 use valuemap_core::robust::looks::Lookout;
 use valuemap_core::robust::model::Model;
@@ -38,11 +38,11 @@ fn rays_of(scene: &Scene, object: &Vector3<f64>) -> Vec<u32> {
     (0..scene.rays.rays.len() as u32).filter(shows).collect()
 }
 
-/// Labels after one round of handovers.
-fn after_handover(scene: &Scene, noise: &Noise, labels: Vec<Label>) -> (Vec<Label>, bool) {
+/// Labels after one round of swaps.
+fn after_swap(scene: &Scene, noise: &Noise, labels: Vec<Label>) -> (Vec<Label>, bool) {
     let spreads = spreads_of(scene, noise);
     let index = RayIndex::new(scene, &spreads, GATE_SIGMAS, 0..scene.rays.rays.len() as u32);
-    hand_over(&Association::new(scene, noise, index, 150.0), &SETTINGS, labels)
+    swap_votes(&Association::new(scene, noise, index, 150.0), &SETTINGS, labels)
 }
 
 proptest! {
@@ -110,7 +110,7 @@ proptest! {
             (0..scene.rays.rays.len() as u32).partition(|&ray| scene.rays.image[ray as usize].is_multiple_of(2));
         prop_assume!(odd.len() >= 10);
         let torn = vec![label(&scene, even, object), label(&scene, odd, object)];
-        let (mended, is_any) = after_handover(&scene, &DRIFTING, torn);
+        let (mended, is_any) = after_swap(&scene, &DRIFTING, torn);
         prop_assert!(is_any);
         prop_assert_eq!(mended.len(), 1);
         prop_assert!((mended[0].estimate.point - object).norm() < 1.0);
@@ -124,7 +124,7 @@ proptest! {
             };
             label(&scene, (0..scene.rays.rays.len() as u32).filter(nearer).collect(), at)
         });
-        prop_assert_eq!(after_handover(&scene, &DRIFTING, twins.to_vec()).0.len(), 2);
+        prop_assert_eq!(after_swap(&scene, &DRIFTING, twins.to_vec()).0.len(), 2);
     }
 
     #[test]
@@ -191,7 +191,7 @@ proptest! {
     #![proptest_config(config())]
 
     #[test]
-    fn what_the_wrong_one_of_two_has_from_aside_is_handed_over(errors in errors_px(), apart_m in 0.5..0.9_f64) {
+    fn what_the_wrong_one_of_two_has_from_aside_is_swapped(errors in errors_px(), apart_m in 0.5..0.9_f64) {
         let first = Vector3::new(60.0, 5.0, 3.0);
         let second = first + Vector3::y() * apart_m;
         let scene = crossing([first, second], &errors);
@@ -203,14 +203,14 @@ proptest! {
         let mistaken = [of_second.as_slice(), &from_aside].concat();
         let label = |voters: Vec<u32>, start| from_voters(&scene, &noise, 10.0, voters, start).unwrap();
         let wrong = vec![label(of_first.clone(), first), label(mistaken, second)];
-        let (right, is_any) = after_handover(&scene, &noise, wrong);
+        let (right, is_any) = after_swap(&scene, &noise, wrong);
         prop_assert!(is_any);
         let voters = |label: &Label| label.voters.iter().copied().collect::<BTreeSet<u32>>();
         let of_second: BTreeSet<u32> = of_second.into_iter().collect();
         prop_assert_eq!(right.iter().map(voters).collect::<Vec<_>>(), vec![all_of_first, of_second]);
         prop_assert!((right[0].estimate.point - first).norm() < 0.3);
 
-        let (same, is_any) = after_handover(&scene, &noise, right.clone());
+        let (same, is_any) = after_swap(&scene, &noise, right.clone());
         prop_assert!(!is_any);
         prop_assert_eq!(same.iter().map(voters).collect::<Vec<_>>(), right.iter().map(voters).collect::<Vec<_>>());
     }

@@ -137,8 +137,8 @@ fn noise_of(values: NoiseValues) -> PyResult<Noise> {
         box_share,
         position_m,
         rotation_rad,
-        position_leg_m,
-        rotation_leg_rad,
+        position_segment_m,
+        rotation_segment_rad,
         position_drift_m,
         rotation_drift_rad,
     ] = values;
@@ -147,8 +147,8 @@ fn noise_of(values: NoiseValues) -> PyResult<Noise> {
         box_share,
         position_m,
         rotation_rad,
-        position_leg_m,
-        rotation_leg_rad,
+        position_segment_m,
+        rotation_segment_rad,
         position_drift_m,
         rotation_drift_rad,
     })
@@ -234,8 +234,8 @@ pub fn calibrate(
         noise.box_share,
         noise.position_m,
         noise.rotation_rad,
-        noise.position_leg_m,
-        noise.rotation_leg_rad,
+        noise.position_segment_m,
+        noise.rotation_segment_rad,
         noise.position_drift_m,
         noise.rotation_drift_rad,
     ];

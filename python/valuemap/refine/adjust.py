@@ -131,10 +131,10 @@ class Adjustment:
             self.column_of.append(index)
         self.columns = column
         views = seen.views
-        of = (views.leg, views.vehicle, views.vehicle, views.camera, views.camera, views.camera)
+        of = (views.segment, views.vehicle, views.vehicle, views.camera, views.camera, views.camera)
         of_view = np.concatenate([c[rows] for c, rows in zip(self.column_of, of, strict=True)], axis=1)
         unknowns, part_of_view = np.unique(
-            np.stack([views.leg, views.vehicle, views.camera]), axis=1, return_inverse=True
+            np.stack([views.segment, views.vehicle, views.camera]), axis=1, return_inverse=True
         )
         part = part_of_view.ravel()[seen.image]
         self.constants_of_part = np.zeros((unknowns.shape[1], 12), np.int64)

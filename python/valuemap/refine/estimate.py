@@ -1,4 +1,4 @@
-"""From landmarks of single drives to objects, legs and everything that the poses of drives may be wrong by."""
+"""From landmarks of single drives to objects, segments and everything that the poses of drives may be wrong by."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import valuemap._core as _core
 from valuemap.config import MapConfig
 from valuemap.refine.adjust import Adjustment, Groups, Scales, adjust, triangulate
 from valuemap.refine.footage import DRIFT_LENGTH_M, Footage, Sigmas
-from valuemap.refine.jumps import Hints, Legs
+from valuemap.refine.jumps import Hints, Segments
 from valuemap.refine.landmarks import Landmarks
 from valuemap.refine.register import Registration, register, togetherness
 from valuemap.refine.residuals import CAMERA_DELAY, MOUNT, OFFSET, WIDTH, Observations, State, linearised, weights
@@ -26,12 +26,12 @@ DRIFT_FACTOR = 1.5
 """Drift is thought to be so many times as large as what is found of it: data pull it towards zero."""
 _FIRST_PX, _FIRST_SHARE, _FIRST_M = 2.0, 0.05, 0.1
 _LANDMARK_PX, _LANDMARK_M = 3.0, 0.2
-_NEW_LEG_M = 1.0
-"""Registered shifts that differ by more than this are of two legs."""
+_NEW_SEGMENT_M = 1.0
+"""Registered shifts that differ by more than this are of two segments."""
 _JUMP_PRICE, _SEEN_PRICE = 30.0, 8.0
-"""Minus twice the log odds of a jump where the trajectory says nothing, and where it shows one: what a new leg has to
-explain."""
-_LEAST_VOTES, _LEAST_OF_LEG = 4, 8
+"""Minus twice the log odds of a jump where the trajectory says nothing, and where it shows one: what a new segment
+has to explain."""
+_LEAST_VOTES, _LEAST_OF_SEGMENT = 4, 8
 _RANGES = 1.5
 _SURE = 4.0
 """Turns of drives are none of chance if their squares exceed their variances by so many deviations."""
@@ -53,13 +53,13 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Objects with their classes and sizes, which detections show them, legs, the state, and the noise that is left."""
+    """Objects with their classes and sizes, which detections show them, segments, state, and the noise that is left."""
 
     detection: Ints
     thing: Ints
     class_code: Ints
     size_m: Floats
-    legs: Legs
+    segments: Segments
     state: State
     noise: Noise
     sigma_px: Sigmas
@@ -97,25 +97,25 @@ def estimate(
     marks: Marks,
     config: MapConfig,
     *,
-    seen_cuts: Legs,
+    seen_cuts: Segments,
     hints: Hints,
-    known: tuple[Legs, Floats] | None = None,
+    known: tuple[Segments, Floats] | None = None,
     turned_rad: Floats | None = None,
     late_s: float = 0.0,
 ) -> Estimate | None:
     """Estimate everything that drives may be wrong by, None where there is too little that drives share.
 
-    `seen_cuts` are where the trajectory itself jumps, `hints` where it may. Where legs and their offsets (L, 3) are
+    `seen_cuts` are where the trajectory itself jumps, `hints` where it may. Where segments and their offsets (L, 3) are
     `known` about, or how the cameras of drives are turned (D, 3), or how late poses are, the landmarks are those of the
     footage laid so.
     """
     landmarks, registration = marks.landmarks, marks.registration
-    legs, offset = _first_legs(footage, landmarks, registration, seen_cuts)
+    segments, offset = _first_segments(footage, landmarks, registration, seen_cuts)
     if known is not None:
-        legs, offset = _added(legs, offset, *known)
+        segments, offset = _added(segments, offset, *known)
     thing_of_mark, class_code, size_m, points = _objects(landmarks, registration)
     detection, thing = landmarks.voters, thing_of_mark[landmarks.landmark_of_voter()]
-    counts = (len(legs), footage.drives.count, footage.drives.count) + (footage.cameras,) * 3
+    counts = (len(segments), footage.drives.count, footage.drives.count) + (footage.cameras,) * 3
     state = State.zero(points, len(footage.chain.drive), len(footage.row), counts)
     state.constants[OFFSET][:] = offset
     if turned_rad is not None:
@@ -123,27 +123,27 @@ def estimate(
     state.constants[CAMERA_DELAY][:] = late_s
     noise = Noise()
     sigma_px = _sigmas(footage, noise)
-    leg = legs.of(footage.drives.pass_code, footage.drives.order)
+    segment = segments.of(footage.drives.pass_code, footage.drives.order)
     range_m = _RANGES * config.vote.max_range_m
     scales = WIDE
     tolerances: tuple[float, ...] = _COARSE
     for round_number in range(4):
-        seen = footage.observe(detection, thing, leg, sigma_px)
-        problem = Adjustment(seen, footage.chain, scales, everything(footage, legs), len(class_code))
+        seen = footage.observe(detection, thing, segment, sigma_px)
+        problem = Adjustment(seen, footage.chain, scales, everything(footage, segments), len(class_code))
         state = adjust(problem, state, tolerances=tolerances)
         noise = fit_noise(seen, state, noise)
         sigma_px = _sigmas(footage, noise)
         scales = _grown(own_scales(footage, noise, scales), state)
         if round_number < 3:
-            legs, leg, state = _cut(footage, seen, state, legs, seen_cuts, hints)
-            seen = footage.observe(detection, thing, leg, sigma_px)
+            segments, segment, state = _cut(footage, seen, state, segments, seen_cuts, hints)
+            seen = footage.observe(detection, thing, segment, sigma_px)
         detection, thing, class_code, size_m, state = _anew(
-            footage, state, class_code, size_m, leg, sigma_px, range_m, detection, thing
+            footage, state, class_code, size_m, segment, sigma_px, range_m, detection, thing
         )
         if not len(thing):
             return None
         tolerances = _FINE
-    return Estimate(detection, thing, class_code, size_m, legs, state, noise, sigma_px, scales, len(landmarks))
+    return Estimate(detection, thing, class_code, size_m, segments, state, noise, sigma_px, scales, len(landmarks))
 
 
 def mounts_alone(footage: Footage, landmarks: Landmarks) -> Floats:
@@ -161,8 +161,8 @@ def mounts_alone(footage: Footage, landmarks: Landmarks) -> Floats:
         return turned
     landmarks = marks[0]
     state = State.zero(landmarks.point_in_world_m, len(footage.chain.drive), len(footage.row), counts)
-    leg_of_image = footage.drives.pass_code
-    seen = footage.observe(landmarks.voters, landmarks.landmark_of_voter(), leg_of_image, _sigmas(footage, Noise()))
+    segment_of_image = footage.drives.pass_code
+    seen = footage.observe(landmarks.voters, landmarks.landmark_of_voter(), segment_of_image, _sigmas(footage, Noise()))
     free = tuple(np.full((n, w), kind == MOUNT) for kind, (n, w) in enumerate(zip(counts, WIDTH, strict=True)))
     problem = Adjustment(seen, footage.chain, WIDE, free, len(landmarks))
     state = adjust(problem, state, tolerances=_ALONE, with_variance=True)
@@ -199,7 +199,7 @@ def delay_together(footage: Footage, marks: Marks) -> float:
 
     shift_m = marks.registration.shift_m
     alone = gains(np.zeros_like(shift_m))
-    pieces = np.unique(np.column_stack([landmarks.leg, shift_m])[shift_m.any(axis=1)], axis=0)
+    pieces = np.unique(np.column_stack([landmarks.segment, shift_m])[shift_m.any(axis=1)], axis=0)
     of_shifts = togetherness(landmarks, covariance, shift_m) - alone[none] - price * len(pieces)
     if of_shifts > max(alone.max() - alone[none] - price, 0.0):
         alone = gains(shift_m)
@@ -207,14 +207,14 @@ def delay_together(footage: Footage, marks: Marks) -> float:
     return float(_DELAYS_S[best]) if alone[best] - alone[none] > price else 0.0
 
 
-def everything(footage: Footage, legs: Legs) -> tuple[Bools, ...]:
+def everything(footage: Footage, segments: Segments) -> tuple[Bools, ...]:
     """Return that all constants are free; focal lengths and delays where there are any."""
     cameras, drives = footage.cameras, footage.drives.count
     has_focal: Bools = np.zeros(cameras, np.bool_)
     has_focal[np.unique(footage.rays.camera_row[np.any(footage.from_middle_px != 0.0, axis=1)])] = True
     of_camera = np.ones(cameras, np.bool_)
-    of_legs, of_drives = np.ones(len(legs), np.bool_), np.ones(drives, np.bool_)
-    kinds = (of_legs, of_drives, of_drives, has_focal, of_camera, of_camera)
+    of_segments, of_drives = np.ones(len(segments), np.bool_), np.ones(drives, np.bool_)
+    kinds = (of_segments, of_drives, of_drives, has_focal, of_camera, of_camera)
     return tuple(np.repeat(flags[:, None], width, axis=1) for flags, width in zip(kinds, WIDTH, strict=True))
 
 
@@ -238,7 +238,7 @@ def _usable(landmarks: Landmarks, footage: Footage) -> tuple[Landmarks, Floats] 
             class_code=landmarks.class_code[good],
             size_m=landmarks.size_m[good],
             drive=landmarks.drive[good],
-            leg=landmarks.leg[good],
+            segment=landmarks.segment[good],
             driven_m=landmarks.driven_m[good],
             offsets=np.concatenate([[0], np.cumsum(counts[good])]),
             voters=landmarks.voters[np.repeat(good, counts)],
@@ -247,43 +247,47 @@ def _usable(landmarks: Landmarks, footage: Footage) -> tuple[Landmarks, Floats] 
     )
 
 
-def _first_legs(
-    footage: Footage, landmarks: Landmarks, registration: Registration, seen_cuts: Legs
-) -> tuple[Legs, Floats]:
-    """Return the legs and offsets (L, 3) that jumps and the registered shifts of landmarks along the drives suggest."""
+def _first_segments(
+    footage: Footage, landmarks: Landmarks, registration: Registration, seen_cuts: Segments
+) -> tuple[Segments, Floats]:
+    """Return the segments and offsets (L, 3) that jumps and registered shifts of landmarks along the drives suggest."""
     drives = footage.drives
     cuts = [*zip(seen_cuts.drive.tolist(), seen_cuts.begins.tolist(), strict=True)]
     for drive in range(drives.count):
         rows = np.flatnonzero(landmarks.drive == drive)
         rows = rows[np.argsort(landmarks.driven_m[rows], kind="stable")]
-        same_leg = np.diff(landmarks.leg[rows]) == 0
-        moves = np.linalg.norm(np.diff(registration.shift_m[rows], axis=0), axis=1) > _NEW_LEG_M
+        same_segment = np.diff(landmarks.segment[rows]) == 0
+        moves = np.linalg.norm(np.diff(registration.shift_m[rows], axis=0), axis=1) > _NEW_SEGMENT_M
         images = np.flatnonzero(drives.pass_code == drive)
-        for cut in (np.flatnonzero(moves & same_leg) + 1).tolist():
+        for cut in (np.flatnonzero(moves & same_segment) + 1).tolist():
             at_m = 0.5 * (landmarks.driven_m[rows[cut - 1]] + landmarks.driven_m[rows[cut]])
             after = images[drives.driven_m[images] >= at_m]
             if len(after):
                 cuts.append((drive, int(drives.order[after].min())))
     both = np.unique(np.array(cuts, dtype=np.int64), axis=0)
-    legs = Legs(both[:, 0], both[:, 1])
-    # A landmark is in the leg of most of its voters.
+    segments = Segments(both[:, 0], both[:, 1])
+    # A landmark is in the segment of most of its voters.
     image = footage.rays.image_row[landmarks.voters]
-    leg = legs.of(drives.pass_code[image], drives.order[image])
-    of_mark = np.array([np.median(part) for part in np.split(leg, landmarks.offsets[1:-1])]).round().astype(np.int64)
-    offset = np.zeros((len(legs), 3))
-    for number in range(len(legs)):
+    segment = segments.of(drives.pass_code[image], drives.order[image])
+    of_mark = (
+        np.array([np.median(part) for part in np.split(segment, landmarks.offsets[1:-1])]).round().astype(np.int64)
+    )
+    offset = np.zeros((len(segments), 3))
+    for number in range(len(segments)):
         marks = registration.shift_m[of_mark == number]
         if len(marks):
             offset[number] = np.median(marks, axis=0)
-    return legs, offset
+    return segments, offset
 
 
-def _added(legs: Legs, offset: Floats, known: Legs, known_offset: Floats) -> tuple[Legs, Floats]:
-    """Return the legs that both have cut, with both offsets (L, 3) added."""
-    both = np.unique(np.stack([np.append(legs.drive, known.drive), np.append(legs.begins, known.begins)]), axis=1)
+def _added(segments: Segments, offset: Floats, known: Segments, known_offset: Floats) -> tuple[Segments, Floats]:
+    """Return the segments that both have cut, with both offsets (L, 3) added."""
+    both = np.unique(
+        np.stack([np.append(segments.drive, known.drive), np.append(segments.begins, known.begins)]), axis=1
+    )
     drive, begins = both[0], both[1]
-    total = offset[legs.of(drive, begins)] + known_offset[known.of(drive, begins)]
-    return Legs(drive, begins), total
+    total = offset[segments.of(drive, begins)] + known_offset[known.of(drive, begins)]
+    return Segments(drive, begins), total
 
 
 def _objects(landmarks: Landmarks, registration: Registration) -> tuple[Ints, Ints, Floats, Floats]:
@@ -332,21 +336,21 @@ def fit_noise(seen: Observations, state: State, noise: Noise) -> Noise:
 
 
 def _cut(
-    footage: Footage, seen: Observations, state: State, legs: Legs, seen_cuts: Legs, hints: Hints
-) -> tuple[Legs, Ints, State]:
+    footage: Footage, seen: Observations, state: State, segments: Segments, seen_cuts: Segments, hints: Hints
+) -> tuple[Segments, Ints, State]:
     """Cut drives anew where their poses jump, given the objects: exact segmentation of each drive's images."""
     shift, information, image_of = _apparent_shift(footage, seen, state)
     drives = footage.drives
-    leg_drive: list[int] = []
+    segment_drive: list[int] = []
     begins: list[int] = []
     offsets: list[Floats] = []
-    leg_now = legs.of(drives.pass_code, drives.order)
+    segment_now = segments.of(drives.pass_code, drives.order)
     for drive in range(drives.count):
         rows = np.flatnonzero(drives.pass_code[image_of] == drive)
         rows = rows[np.argsort(drives.order[image_of[rows]], kind="stable")]
         if not len(rows):
-            old = np.flatnonzero(legs.drive == drive)[:1]
-            leg_drive.append(drive)
+            old = np.flatnonzero(segments.drive == drive)[:1]
+            segment_drive.append(drive)
             begins.append(0)
             offsets.append(state.constants[0][old[0]] if len(old) else np.zeros(3))
             continue
@@ -355,16 +359,16 @@ def _cut(
         cut_at = seen_cuts.of(drives.pass_code[image_of[rows]], drives.order[image_of[rows]])
         price = np.maximum(_JUMP_PRICE - hints.between(drive, drives.order[image_of[rows]]), _SEEN_PRICE)
         price[np.diff(cut_at, prepend=cut_at[0]) != 0] = _SEEN_PRICE
-        starts = segment(value, precision, price)
+        starts = cut_into_segments(value, precision, price)
         for number, start in enumerate(starts):
             end = starts[number + 1] if number + 1 < len(starts) else len(rows)
             total = precision[start:end].sum(axis=0) + np.eye(2) / WIDE.constant[0] ** 2
             middle = np.linalg.solve(total, np.einsum("nij,nj->i", precision[start:end], value[start:end]))
-            vertical = state.constants[0][leg_now[image_of[rows[start:end]]], 2]
-            leg_drive.append(drive)
+            vertical = state.constants[0][segment_now[image_of[rows[start:end]]], 2]
+            segment_drive.append(drive)
             begins.append(0 if number == 0 else int(drives.order[image_of[rows[start]]]))
             offsets.append(np.append(middle, np.median(vertical)))
-    new = Legs(np.array(leg_drive), np.array(begins))
+    new = Segments(np.array(segment_drive), np.array(begins))
     constants = (np.array(offsets), *state.constants[1:])
     drift = state.drift.copy()
     drift[:, :3] = 0.0
@@ -377,7 +381,7 @@ def _apparent_shift(footage: Footage, seen: Observations, state: State) -> tuple
     weight = weights(seen, at.residual_px, at.depth_m, 2.0)
     groups = Groups(seen.image)
     kinds = seen.image[groups.row]
-    now = state.constants[OFFSET][seen.leg] + state.drift[seen.node, :3]
+    now = state.constants[OFFSET][seen.segment] + state.drift[seen.node, :3]
     # The residual falls by `by_point` times the shift: r(o + e) = r - J e.
     whole = at.residual_px + np.einsum("nki,ni->nk", at.by_point, now)
     basis = np.concatenate([at.by_point, whole[:, :, None]], axis=2)
@@ -396,7 +400,7 @@ def _length_m(footage: Footage) -> float:
     return float(sum(footage.drives.driven_m[footage.drives.pass_code == d].max() for d in range(footage.drives.count)))
 
 
-def segment(value: Floats, precision: Floats, price: Floats) -> list[int]:
+def cut_into_segments(value: Floats, precision: Floats, price: Floats) -> list[int]:
     """Return where the pieces of a piecewise constant signal (N, 2) with information (N, 2, 2) begin.
 
     The segmentation with the least sum of weighted squares and prices, by dynamic programming over the last cut
@@ -433,7 +437,7 @@ def _anew(
     state: State,
     class_code: Ints,
     size_m: Floats,
-    leg: Ints,
+    segment: Ints,
     sigma_px: Sigmas,
     range_m: float,
     detection: Ints,
@@ -441,14 +445,14 @@ def _anew(
 ) -> tuple[Ints, Ints, Ints, Floats, State]:
     """Merge objects that are one, give all detections their objects anew, and drop what too few see."""
     count = len(state.point_in_world_m)
-    seen = footage.observe(detection, thing, leg, sigma_px)
+    seen = footage.observe(detection, thing, segment, sigma_px)
     state = triangulate(seen, state, rounds=3)
     number = merge_objects(seen, state, seen.image, class_code)
     seen = replace(seen, thing=number[seen.thing])
     state = triangulate(seen, state, rounds=4)
     alive = np.bincount(seen.thing, minlength=count) >= _LEAST_VOTES
     state, class_code, size_m = _kept(state, alive), class_code[alive], size_m[alive]
-    detection, thing = associate(footage, state, class_code, size_m, leg, sigma_px, range_m)
+    detection, thing = associate(footage, state, class_code, size_m, segment, sigma_px, range_m)
     alive = np.bincount(thing, minlength=len(class_code)) >= _LEAST_VOTES
     new = np.cumsum(alive) - 1
     stays = alive[thing]

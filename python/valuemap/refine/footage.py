@@ -75,12 +75,12 @@ class Footage:
         along = np.einsum("nij,nj->ni", self.residual_from_cam[:, :2], self.residual_from_cam[:, 2])
         return np.asarray(np.sqrt(0.5 * (square - np.sum(along**2, axis=1))))
 
-    def observe(self, detection: Ints, thing: Ints, leg_of_image: Ints, sigma_px: Sigmas) -> Observations:
+    def observe(self, detection: Ints, thing: Ints, segment_of_image: Ints, sigma_px: Sigmas) -> Observations:
         """Return detections (rows) as observations of things, sorted by drive and node."""
         order = np.lexsort((detection, self.node[self.rays.image_row[detection]]))
-        return self.observe_as_given(detection[order], thing[order], leg_of_image, sigma_px)
+        return self.observe_as_given(detection[order], thing[order], segment_of_image, sigma_px)
 
-    def observe_as_given(self, detection: Ints, thing: Ints, leg_of_image: Ints, sigma_px: Sigmas) -> Observations:
+    def observe_as_given(self, detection: Ints, thing: Ints, segment_of_image: Ints, sigma_px: Sigmas) -> Observations:
         """Return detections (rows) as observations of things, in their order."""
         views = Views(
             cam_from_world=self.cam_from_world,
@@ -92,7 +92,7 @@ class Footage:
             cam_from_node=self.cam_from_node,
             node=self.node,
             drive=self.drives.pass_code,
-            leg=leg_of_image,
+            segment=segment_of_image,
             vehicle=self.drives.pass_code,
             camera=self.camera,
         )

@@ -45,8 +45,8 @@ class Hints:
 
 
 @dataclass(frozen=True, eq=False)
-class Legs:
-    """Drives cut where their poses jump: leg `begins` (L) at this place in the order of its `drive` (L)."""
+class Segments:
+    """Drives cut where their poses jump: segment `begins` (L) at this place in the order of its `drive` (L)."""
 
     drive: Ints
     begins: Ints
@@ -55,12 +55,12 @@ class Legs:
         return len(self.drive)
 
     def of(self, drive: Ints, order: Ints) -> Ints:
-        """Return the leg (N) of images, by drive and order."""
+        """Return the segment (N) of images, by drive and order."""
         reach = int(max(order.max(initial=0), self.begins.max(initial=0))) + 2
         return np.searchsorted(self.drive * reach + self.begins, drive * reach + order, side="right") - 1
 
 
-def find_jumps(dataset: Dataset, drives: Drives) -> Legs:
+def find_jumps(dataset: Dataset, drives: Drives) -> Segments:
     """Cut drives where the pose jumps: at steps that are outside what the steps before and after them span.
 
     A vehicle goes on as before, or as after, or stops, or anything between: the step is in the triangle of no step and
@@ -74,7 +74,7 @@ def find_jumps(dataset: Dataset, drives: Drives) -> Legs:
         far = outside > max(_SIGMAS * usual / 1.5, _LEAST_M)
         cuts += [(steps.drive, int(order)) for order in steps.order[far]]
     both = np.unique(np.array(cuts, dtype=np.int64), axis=0)
-    return Legs(both[:, 0], both[:, 1])
+    return Segments(both[:, 0], both[:, 1])
 
 
 def find_hints(dataset: Dataset, drives: Drives) -> Hints:

@@ -34,16 +34,16 @@ _RANGES = 1.5
 class Landmarks:
     """Points (N, 3) in the world, m, as single drives see them.
 
-    `class_code`, `size_m` (the median height of the object, 0 where no size was measured), `drive`, `leg` (the part of
-    it between two jumps) and `driven_m` (the median way of its voters along the drive) are one number a point; the
-    voters of point i are the rows `voters[offsets[i] : offsets[i + 1]]` of the detections.
+    `class_code`, `size_m` (the median height of the object, 0 where no size was measured), `drive`, `segment` (the
+    part of it between two jumps) and `driven_m` (the median way of its voters along the drive) are one number a point;
+    the voters of point i are the rows `voters[offsets[i] : offsets[i + 1]]` of the detections.
     """
 
     point_in_world_m: Floats
     class_code: Ints
     size_m: Floats
     drive: Ints
-    leg: Ints
+    segment: Ints
     driven_m: Floats
     offsets: Ints
     voters: Ints
@@ -72,10 +72,10 @@ def keyframes(drives: Drives, camera_id: Ints) -> NDArray[np.bool_]:
 
 
 def find_landmarks(
-    dataset: Dataset, rays: Rays, drives: Drives, leg: Ints, config: MapConfig, *, threads: int = 0
+    dataset: Dataset, rays: Rays, drives: Drives, segment: Ints, config: MapConfig, *, threads: int = 0
 ) -> Landmarks:
     """Vote on every stretch of every drive alone, with the narrowest gate through which most detections agree."""
-    stretch = _stretches(drives, leg, STRETCH_RANGES * config.vote.max_range_m)
+    stretch = _stretches(drives, segment, STRETCH_RANGES * config.vote.max_range_m)
     best: Candidates | None = None
     for gate in _GATES:
         vote = VoteConfig(
@@ -99,15 +99,15 @@ def find_landmarks(
         class_code=rays.class_code[voters[offsets[:-1]]].astype(np.int64),
         size_m=_core.medians((dataset.detections.size_px[voters] * metres_per_px)[:, 1].copy(), offsets),
         drive=drives.pass_code[first],
-        leg=leg[first],
+        segment=segment[first],
         driven_m=_core.medians(drives.driven_m[rays.image_row[voters]], offsets),
         offsets=offsets,
         voters=voters,
     )
 
 
-def _stretches(drives: Drives, leg: Ints, length_m: float) -> NDArray[np.uint32]:
-    """Return the stretch (N) of each image: legs cut into pieces of about the same length."""
+def _stretches(drives: Drives, segment: Ints, length_m: float) -> NDArray[np.uint32]:
+    """Return the stretch (N) of each image: segments cut into pieces of about the same length."""
     piece = np.floor(drives.driven_m / length_m).astype(np.int64)
-    code = leg * (int(piece.max(initial=0)) + 1) + piece
+    code = segment * (int(piece.max(initial=0)) + 1) + piece
     return np.asarray(np.unique(code, return_inverse=True)[1], np.uint32)

@@ -17,7 +17,7 @@ from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
 from valuemap.refine.estimate import Estimate, delay_together, estimate, lay, mounts_alone
 from valuemap.refine.footage import Footage, find_motion, gather, in_working_frame, moved_on, moving_late, with_poses
-from valuemap.refine.jumps import Legs, find_hints, find_jumps
+from valuemap.refine.jumps import Segments, find_hints, find_jumps
 from valuemap.refine.landmarks import find_landmarks
 from valuemap.refine.residuals import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
 from valuemap.refine.select import Selected, select
@@ -147,22 +147,22 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
     """
     footage = gather(dataset, drives)
     jumps, hints = find_jumps(dataset, drives), find_hints(dataset, drives)
-    leg = jumps.of(footage.drives.pass_code, footage.drives.order)
+    segment = jumps.of(footage.drives.pass_code, footage.drives.order)
     try:
         laid, turned = footage, np.zeros((drives.count, 3))
-        landmarks = find_landmarks(footage.dataset, footage.rays, footage.drives, leg, config, threads=threads)
+        landmarks = find_landmarks(footage.dataset, footage.rays, footage.drives, segment, config, threads=threads)
         for _ in range(_TURNS):
             more = mounts_alone(laid, landmarks)
             if not more.any():
                 break
             turned = turned + more
             laid = _laid(footage, turned)
-            landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, leg, config, threads=threads)
+            landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, segment, config, threads=threads)
         marks = lay(landmarks, laid, hints)
         late_s = 0.0 if marks is None else delay_together(laid, marks)
         if late_s:
             laid = _laid(footage, turned, late_s)
-            landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, leg, config, threads=threads)
+            landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, segment, config, threads=threads)
             marks = lay(landmarks, laid, hints)
             # Mean rates of steps in which turns begin are none of a delay: focal lengths took what they left.
             footage = moving_late(footage, late_s)
@@ -174,11 +174,11 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
     if result is None:
         return None
     if _is_lost(footage, result):
-        known = (result.legs, result.state.constants[OFFSET])
+        known = (result.segments, result.state.constants[OFFSET])
         laid = _laid(footage, turned, late_s, known)
-        leg = laid.drives.pass_code  # Its jumps are mended.
+        segment = laid.drives.pass_code  # Its jumps are mended.
         try:
-            landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, leg, config, threads=threads)
+            landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, segment, config, threads=threads)
         except SettingError:
             return None
         marks = lay(landmarks, laid, hints)
@@ -193,18 +193,18 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
 
 
 def _is_lost(footage: Footage, result: Estimate) -> bool:
-    """Return whether more than few of the observations are of legs that are far from where most are."""
+    """Return whether more than few of the observations are of segments that are far from where most are."""
     image = footage.rays.image_row[result.detection]
-    leg = result.legs.of(footage.drives.pass_code[image], footage.drives.order[image])
-    offset = result.state.constants[OFFSET][leg]
+    segment = result.segments.of(footage.drives.pass_code[image], footage.drives.order[image])
+    offset = result.state.constants[OFFSET][segment]
     far = np.linalg.norm(offset - np.median(offset, axis=0), axis=1) > _LOST_M
     return bool(np.mean(far) > _FEW_LOST)
 
 
 def _laid(
-    footage: Footage, turned_rad: Floats, late_s: float = 0.0, known: tuple[Legs, Floats] | None = None
+    footage: Footage, turned_rad: Floats, late_s: float = 0.0, known: tuple[Segments, Floats] | None = None
 ) -> Footage:
-    """Return the footage with the cameras of drives (D, 3) turned, all poses moved on, and legs moved, as they seem."""
+    """Return the footage with cameras of drives (D, 3) turned, all poses moved on, and segments moved, as they seem."""
     images, drives = footage.whole.images, footage.whole_drives
     rotation, center = camera_poses(images)
     if late_s:
@@ -259,11 +259,11 @@ def _apply(dataset: Dataset, drives: Drives, found: _Found, selected: Selected, 
     offset, mount, delay, focal, camera_mount, camera_delay = selected.state.constants
     images = dataset.images
     drive, camera = drives.pass_code, rows_of(images.camera_id, dataset.cameras.camera_id)
-    leg = found.result.legs.of(drive, drives.order)
+    segment = found.result.segments.of(drive, drives.order)
     rotation, center = camera_poses(images)
     late_s = delay[drive, 0] + camera_delay[camera, 0]
     turned, center = moved_on(find_motion(dataset, drives, late_s=late_s), rotation, center, late_s)
-    center = center + unit_m * offset[leg] @ axes
+    center = center + unit_m * offset[segment] @ axes
     turned = rotations(mount[drive] + camera_mount[camera]) @ turned
     moved = with_poses(images, turned, center)
     params = []
@@ -290,19 +290,19 @@ def _describe(dataset: Dataset, found: _Found, selected: Selected, unit_m: float
     ]
     of_drives = []
     for drive, image in enumerate(first.tolist()):
-        legs = np.flatnonzero(result.legs.drive == drive)
+        segments = np.flatnonzero(result.segments.drive == drive)
         of_drive = {
             **_figures(selected, MOUNT, drive, "turned_deg", np.degrees(1.0)),
             **_figures(selected, DELAY, drive, "delay_s", 1.0),
         }
         moved = [
-            {"from_image": _image_at(footage, drive, int(result.legs.begins[leg])), **figures}
-            for leg in legs.tolist()
-            if (figures := _figures(selected, OFFSET, leg, "moved_m", unit_m))
+            {"from_image": _image_at(footage, drive, int(result.segments.begins[segment])), **figures}
+            for segment in segments.tolist()
+            if (figures := _figures(selected, OFFSET, segment, "moved_m", unit_m))
         ]
         if of_drive or moved:
             name = names[dataset.images.pass_id.codes[image]]
-            of_drives.append({"drive": drive, "pass": name, **of_drive, **({"legs": moved} if moved else {})})
+            of_drives.append({"drive": drive, "pass": name, **of_drive, **({"segments": moved} if moved else {})})
     return {
         "found": "faults",
         "cameras": [camera for camera in cameras if len(camera) > 1],

@@ -32,7 +32,7 @@ _AROUND_M = _REACH_M * math.sqrt(2.0) + 2.0
 """Objects this near may be what a landmark shows."""
 _HEIGHT_M = 1.0
 """Deviation of what is left between heights."""
-_JUMP, _NEW_LEG, _CREEP = 5.0, 0.5, 2.0
+_JUMP, _NEW_SEGMENT, _CREEP = 5.0, 0.5, 2.0
 """Minus the logarithm of how likely a chain jumps where none is seen, where one is, and creeps to the next cell."""
 _SHARED = 0.7
 """How likely a landmark shows what others have seen."""
@@ -62,7 +62,7 @@ def register(landmarks: Landmarks, covariance: Floats, evidence: Floats | None =
     it in its drive.
     """
     point = landmarks.point_in_world_m
-    price = np.full(len(point), _JUMP) if evidence is None else np.maximum(_JUMP - 0.5 * evidence, _NEW_LEG)
+    price = np.full(len(point), _JUMP) if evidence is None else np.maximum(_JUMP - 0.5 * evidence, _NEW_SEGMENT)
     by_drive = [
         rows[np.argsort(landmarks.driven_m[rows], kind="stable")]
         for rows in np.split(
@@ -178,7 +178,7 @@ def _lay(rows: Ints, point: Floats, covariance: Floats, shift: Floats, thing: In
         near = [[] for _ in rows]
     pairs = _compatible(rows, near, objects, known)
     if pairs[0].size:
-        price = np.where(np.diff(known.landmarks.leg[rows]) != 0, _NEW_LEG, known.price[rows[1:]])
+        price = np.where(np.diff(known.landmarks.segment[rows]) != 0, _NEW_SEGMENT, known.price[rows[1:]])
         shift[rows] = _chain(rows, pairs, point, covariance, place, spread, price)
     _match(rows, pairs, objects, point, covariance, place, spread, shift, thing, known)
 

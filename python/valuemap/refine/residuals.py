@@ -6,8 +6,8 @@ A detection of object X in an image with pose (R, C) and local pinhole M (see `c
     p = exp(m + n + tau w) R (X - C - o - d - tau v)
 
 with s the error of the camera's focal length, m how the camera is mounted (in camera axes), n and d the drift of
-rotation and position, o the offset of the leg, and tau the time from pose to exposure, in which the image moves by v
-and turns by w.
+rotation and position, o the offset of the segment, and tau the time from pose to exposure, in which the image moves by
+v and turns by w.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Views:
 
     `cam_from_world` (I, 3, 3), `center_in_world_m` (I, 3); `forward_mps`, `backward_mps` (I, 3) and `forward_radps`,
     `backward_radps` (I, 3, camera axes): how the image moves and turns until the next one and since the last one;
-    `cam_from_node` (I, 3, 3) turns drift into camera axes. `leg` (I) and `vehicle` (I) are the rows of the offset and
-    of the mounting and delay; drives that go on as the one before them share its vehicle.
+    `cam_from_node` (I, 3, 3) turns drift into camera axes. `segment` (I) and `vehicle` (I) are the rows of the offset
+    and of the mounting and delay; drives that go on as the one before them share its vehicle.
     """
 
     cam_from_world: Floats
@@ -44,7 +44,7 @@ class Views:
     cam_from_node: Floats
     node: Ints
     drive: Ints
-    leg: Ints
+    segment: Ints
     vehicle: Ints
     camera: Ints
 
@@ -80,9 +80,9 @@ class Observations:
         return self.views.drive[self.image]
 
     @property
-    def leg(self) -> Ints:
-        """The leg (N) of each."""
-        return self.views.leg[self.image]
+    def segment(self) -> Ints:
+        """The segment (N) of each."""
+        return self.views.segment[self.image]
 
     @property
     def vehicle(self) -> Ints:
@@ -187,7 +187,7 @@ def corrected(views: Views, state: State) -> Poses:
     velocity = np.where(late_s >= 0.0, views.forward_mps, views.backward_mps)
     rate = np.where(late_s >= 0.0, views.forward_radps, views.backward_radps)
     drift = state.drift[views.node]
-    center = views.center_in_world_m + velocity * late_s + offset[views.leg] + drift[:, :3] + state.own[:, :3]
+    center = views.center_in_world_m + velocity * late_s + offset[views.segment] + drift[:, :3] + state.own[:, :3]
     turn = mount[views.vehicle] + camera_mount[views.camera] + state.own[:, 3:]
     turn = turn + np.einsum("nij,nj->ni", views.cam_from_node, drift[:, 3:])
     moved = rotations(rate * late_s) @ views.cam_from_world if late_s.any() else views.cam_from_world

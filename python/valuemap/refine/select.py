@@ -44,12 +44,12 @@ _MOST_UNRESOLVED = 0.23
 """Where drives disagree about more than this share of what they see, they could not be laid onto each other."""
 _LEAST_OF_DRIVE = 3
 """A drive that sees an object less often does not share it."""
-_LEAST_OF_LEG = 3
-"""A leg that shares fewer objects is nowhere else than others, or where the drive that it goes on from is."""
+_LEAST_OF_SEGMENT = 3
+"""A segment that shares fewer objects is nowhere else than others, or where the drive that it goes on from is."""
 _OF_MANY = (OFFSET, MOUNT, DELAY)
 """Kinds that each drive has for itself."""
 _LEAST_OF_PART = 2
-"""A drive or camera that shares fewer objects is turned, delayed and focused as given; one tells where a leg is."""
+"""A drive or camera that shares fewer objects is turned, delayed and focused as given; one tells where a segment is."""
 _PLAUSIBLE = 3.0
 """What is more than so many deviations of what is thought possible is something else."""
 
@@ -77,22 +77,22 @@ class Selected:
 
 def select(footage: Footage, found: Estimate) -> Selected | None:
     """Return what pays, None where nothing does."""
-    seen = footage.observe(found.detection, found.thing, footage_legs(footage, found), found.sigma_px)
+    seen = footage.observe(found.detection, found.thing, footage_segments(footage, found), found.sigma_px)
     shared = _shared(footage, found)
     if shared is None or unresolved_share(seen, found.state, found.class_code) > _MOST_UNRESOLVED:
         return None
     found = shared
-    seen = footage.observe(found.detection, found.thing, footage_legs(footage, found), found.sigma_px)
-    ties = tie(footage, found.legs, seen)
-    views = replace(seen.views, leg=ties.leg[seen.views.leg], vehicle=ties.vehicle[seen.views.vehicle])
+    seen = footage.observe(found.detection, found.thing, footage_segments(footage, found), found.sigma_px)
+    ties = tie(footage, found.segments, seen)
+    views = replace(seen.views, segment=ties.segment[seen.views.segment], vehicle=ties.vehicle[seen.views.vehicle])
     seen = replace(seen, views=views)
     chain, things = footage.chain, len(found.class_code)
-    free = _told(seen, everything(footage, found.legs))
+    free = _told(seen, everything(footage, found.segments))
     # What each camera has in all drives, and offsets, first; what it has in each drive where that does not do.
     active = tuple(flags if kind not in (MOUNT, DELAY) else np.zeros_like(flags) for kind, flags in enumerate(free))
     trial = _Trial(seen, chain, _scales(footage, found), things)
     narrow = tuple(np.zeros_like(flags) for flags in free)
-    narrow[OFFSET][_objects_of(seen.leg, seen.thing, len(found.legs)) < _LEAST_OF_LEG] = True
+    narrow[OFFSET][_objects_of(seen.segment, seen.thing, len(found.segments)) < _LEAST_OF_SEGMENT] = True
     state, common, narrow = trial.prune(active, narrow, found.state, ())
     of_drives = tuple(flags | (free[kind] if kind in (MOUNT, DELAY) else False) for kind, flags in enumerate(common))
     state, active, narrow = trial.prune(of_drives, narrow, state, (CAMERA_MOUNT, CAMERA_DELAY))
@@ -121,14 +121,14 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
 def _about_the_mean(footage: Footage, found: Estimate, offset: Floats, active: Bools) -> Floats:
     """Return the offsets (L, 3) against their mean over all drives, weighted by what they claim.
 
-    Legs that stay as they are would else be taken for the truth, however little they tell of the place of the others:
-    the absolute position is the mean of all drives.
+    Segments that stay as they are would else be taken for the truth, however little they tell of the place of the
+    others: the absolute position is the mean of all drives.
     """
     if not active.any():
         return offset
-    leg = footage_legs(footage, found)
+    segment = footage_segments(footage, found)
     drive = footage.drives.pass_code
-    mean = np.stack([np.bincount(drive, weights=offset[leg, i]) / np.bincount(drive) for i in range(3)], axis=1)
+    mean = np.stack([np.bincount(drive, weights=offset[segment, i]) / np.bincount(drive) for i in range(3)], axis=1)
     sigma = np.full(len(mean), np.nan)
     claimed = footage.dataset.images.position_sigma_m
     if claimed is not None:
@@ -163,7 +163,7 @@ def _shared(footage: Footage, found: Estimate) -> Estimate | None:
 def _told(seen: Observations, free: tuple[Bools, ...]) -> tuple[Bools, ...]:
     """Return which of the constants enough objects tell anything of."""
     told = []
-    parts = (seen.leg, seen.vehicle, seen.vehicle, seen.camera, seen.camera, seen.camera)
+    parts = (seen.segment, seen.vehicle, seen.vehicle, seen.camera, seen.camera, seen.camera)
     for kind, (flags, of) in enumerate(zip(free, parts, strict=True)):
         objects = _objects_of(of, seen.thing, len(flags))
         told.append(flags & (objects >= (1 if kind == OFFSET else _LEAST_OF_PART))[:, None])
@@ -175,9 +175,9 @@ def _objects_of(part: Ints, thing: Ints, count: int) -> Ints:
     return np.bincount(np.unique(np.stack([part, thing]), axis=1)[0], minlength=count)
 
 
-def footage_legs(footage: Footage, found: Estimate) -> Ints:
-    """Return the leg of each keyframe."""
-    return found.legs.of(footage.drives.pass_code, footage.drives.order)
+def footage_segments(footage: Footage, found: Estimate) -> Ints:
+    """Return the segment of each keyframe."""
+    return found.segments.of(footage.drives.pass_code, footage.drives.order)
 
 
 def _scales(footage: Footage, found: Estimate) -> Scales:
@@ -194,17 +194,17 @@ def _scales(footage: Footage, found: Estimate) -> Scales:
 
 
 def _offset_sigma(footage: Footage, found: Estimate) -> Floats:
-    """Return the deviation (L) of the offset of each leg: wide, and as its images' claims are to each other."""
+    """Return the deviation (L) of the offset of each segment: wide, and as its images' claims are to each other."""
     claimed = footage.dataset.images.position_sigma_m
-    sigma = np.full(len(found.legs), float(WIDE.constant[OFFSET]))
+    sigma = np.full(len(found.segments), float(WIDE.constant[OFFSET]))
     if claimed is None or not np.isfinite(claimed).any():
         return sigma
-    leg = footage_legs(footage, found)
+    segment = footage_segments(footage, found)
     usual = float(np.nanmedian(claimed))
     for number in range(len(sigma)):
-        of_leg = claimed[leg == number]
-        if np.isfinite(of_leg).any():
-            sigma[number] *= float(np.nanmedian(of_leg)) / usual
+        of_segment = claimed[segment == number]
+        if np.isfinite(of_segment).any():
+            sigma[number] *= float(np.nanmedian(of_segment)) / usual
     return sigma
 
 
@@ -328,7 +328,7 @@ class _Trial:
 
         It is the median of the offsets that are free, weighted by their observations.
         """
-        weight = np.bincount(self.seen.leg, minlength=len(active))
+        weight = np.bincount(self.seen.segment, minlength=len(active))
         shift = np.zeros(3)
         for axis in range(3):
             rows = np.flatnonzero(active[:, axis])

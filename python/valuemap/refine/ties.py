@@ -11,34 +11,34 @@ from typing import Any
 import numpy as np
 
 from valuemap.refine.footage import Footage
-from valuemap.refine.jumps import Legs
+from valuemap.refine.jumps import Segments
 from valuemap.refine.residuals import DELAY, MOUNT, OFFSET, Observations
 from valuemap.tables import Ints
 
 _FEW = 8
-"""A leg or drive that sees fewer shared objects than this is told by its neighbour."""
+"""A segment or drive that sees fewer shared objects than this is told by its neighbour."""
 _PAUSE_S = 30.0
 
 
 @dataclass(frozen=True, eq=False)
 class Ties:
-    """The leg (L) whose offset each leg has, and the drive (D) whose mounting and delay each drive has."""
+    """The segment (L) whose offset each segment has, and the drive (D) whose mounting and delay each drive has."""
 
-    leg: Ints
+    segment: Ints
     vehicle: Ints
 
     def spread(self, constants: tuple[Any, ...]) -> tuple[Any, ...]:
         """Return arrays by kind with the rows of those that are tied as those they are tied to."""
-        of = {OFFSET: self.leg, MOUNT: self.vehicle, DELAY: self.vehicle}
+        of = {OFFSET: self.segment, MOUNT: self.vehicle, DELAY: self.vehicle}
         return tuple(values[of[kind]] if kind in of else values for kind, values in enumerate(constants))
 
 
-def tie(footage: Footage, legs: Legs, seen: Observations) -> Ties:
+def tie(footage: Footage, segments: Segments, seen: Observations) -> Ties:
     """Tie drives that see little to the one of their pass that ends right before they begin, or begins right after."""
-    leg, vehicle = np.arange(len(legs)), np.arange(footage.drives.count)
+    segment, vehicle = np.arange(len(segments)), np.arange(footage.drives.count)
     images = footage.whole.images
     if images.timestamp_s is None:
-        return Ties(leg, vehicle)
+        return Ties(segment, vehicle)
     drive = footage.whole_drives.pass_code
     count = footage.drives.count
     begins, ends = np.full(count, np.inf), np.full(count, -np.inf)
@@ -47,7 +47,7 @@ def tie(footage: Footage, legs: Legs, seen: Observations) -> Ties:
     pass_of = np.zeros(count, np.int64)
     pass_of[drive] = images.pass_id.codes
     objects = np.bincount(np.unique(np.stack([seen.drive, seen.thing]), axis=1)[0], minlength=count)
-    of_drive = [np.flatnonzero(legs.drive == number) for number in range(count)]
+    of_drive = [np.flatnonzero(segments.drive == number) for number in range(count)]
     for number in np.argsort(begins, kind="stable").tolist():
         if objects[number] >= _FEW:
             continue
@@ -56,11 +56,11 @@ def tie(footage: Footage, legs: Legs, seen: Observations) -> Ties:
         after = others[(begins[others] - ends[number] >= 0.0) & (begins[others] - ends[number] < _PAUSE_S)]
         if len(before):
             other = int(before[np.argmax(ends[before])])
-            leg[of_drive[number]] = of_drive[other][-1]
+            segment[of_drive[number]] = of_drive[other][-1]
         elif len(after):
             other = int(after[np.argmin(begins[after])])
-            leg[of_drive[number]] = of_drive[other][0]
+            segment[of_drive[number]] = of_drive[other][0]
         else:
             continue
         vehicle[number] = other
-    return Ties(leg, vehicle)
+    return Ties(segment, vehicle)

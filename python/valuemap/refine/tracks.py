@@ -26,7 +26,7 @@ def associate(
     state: State,
     class_code: Ints,
     size_m: Floats,
-    leg_of_image: Ints,
+    segment_of_image: Ints,
     sigma_px: Sigmas,
     range_m: float,
 ) -> tuple[Ints, Ints]:
@@ -51,7 +51,7 @@ def associate(
     square = np.empty(len(detection))
     for start in range(0, len(detection), _BLOCK):
         part = slice(start, start + _BLOCK)
-        seen = footage.observe_as_given(detection[part], thing[part], leg_of_image, sigma_px)
+        seen = footage.observe_as_given(detection[part], thing[part], segment_of_image, sigma_px)
         residual, depth = residuals(seen, state)
         with np.errstate(invalid="ignore"):
             value = np.sum(residual**2, axis=1) / seen.sigma_px**2

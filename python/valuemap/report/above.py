@@ -60,7 +60,7 @@ _ELLIPSE_SHARE = 0.16
 _TRACKS_BELOW_M_PER_PX = 1.0
 _LENS_MARKER_SCALE = 1.3
 _SHOWN_CLASSES = 8
-_LEGEND_ROWS, _LEGEND_ROW_PX = 3, 30.0
+_SEGMENTEND_ROWS, _SEGMENTEND_ROW_PX = 3, 30.0
 
 _NO_ROWS = np.empty(0, np.int64)
 
@@ -158,7 +158,7 @@ def plot_map(result: Map, dataset: Dataset | None = None, matches: Outcomes | No
     lenses = 0 if len(ground.all_points()) == 0 else 2 if len(ground.label_points) else 1
     with drawing():
         entries = _legend_entries(ground, left_out)
-        layout = _layout(size, lenses, 24.0 + _LEGEND_ROW_PX * min(len(entries), _LEGEND_ROWS))
+        layout = _layout(size, lenses, 24.0 + _SEGMENTEND_ROW_PX * min(len(entries), _SEGMENTEND_ROWS))
         figure = Figure(figsize=(layout.width_px / DPI, layout.height_px / DPI), dpi=DPI, facecolor="white")
         _draw_head(figure, layout, result, dataset)
         main = _axes_at(figure, layout, layout.main)
@@ -498,7 +498,7 @@ def _draw_legend(figure: Figure, layout: _Layout, entries: list[Any]) -> None:
         loc="upper left",
         bbox_to_anchor=(layout.legend[0] / layout.width_px, layout.legend[1] / layout.height_px),
         fontsize=12.5,
-        ncols=max(1, math.ceil(len(entries) / _LEGEND_ROWS)) if is_below else 1,
+        ncols=max(1, math.ceil(len(entries) / _SEGMENTEND_ROWS)) if is_below else 1,
         borderaxespad=0.0,
         labelspacing=0.75,
         columnspacing=2.2,

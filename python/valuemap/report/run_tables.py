@@ -152,7 +152,9 @@ def _poses(result: Map) -> list[ReportTable]:
         if "turned_deg" in drive or "delay_s" in drive:
             rows.append((*whose, None, *_turn_delay(drive), None))
         rows += [
-            (*whose, _numbers(leg["moved_m"]), None, None, None) for leg in drive.get("legs", []) if "moved_m" in leg
+            (*whose, _numbers(segment["moved_m"]), None, None, None)
+            for segment in drive.get("segments", [])
+            if "moved_m" in segment
         ]
     columns = (
         "",

@@ -15,7 +15,7 @@ use super::energy::{Object, object};
 use super::index::RayIndex;
 use super::looks::Lookout;
 use super::model::Model;
-use super::poses::{Belief, Legs, PoseError, smooth};
+use super::poses::{Belief, PoseError, Segments, smooth};
 use crate::progress::{Halt, Progress};
 
 /// Detections are looked for as far from an object as this many of its standard deviations, in steps of one.
@@ -304,8 +304,8 @@ fn decided(claims: &[Claim]) -> Vec<(u32, u32)> {
 
 /// What the votes of all objects tell about the pose errors along the drives.
 pub struct Trajectories {
-    legs: Legs,
-    /// The drift of each leg.
+    segments: Segments,
+    /// The drift of each segment.
     smoothed: Vec<Belief>,
 }
 
@@ -313,30 +313,31 @@ impl Trajectories {
     /// Those that all objects tell.
     #[must_use]
     pub fn of(model: &Model<'_>, objects: &[Object]) -> Self {
-        let legs = Legs::new(&model.scene.views);
+        let segments = Segments::new(&model.scene.views);
         let of_object = |object: &Object| -> Vec<(u32, Belief)> {
             let belief = |&ray: &u32| {
-                let leg = legs.of_view[model.scene.rays.image[ray as usize] as usize];
-                belief_of(model, object, ray).map(|belief| (leg, belief))
+                let segment = segments.of_view[model.scene.rays.image[ray as usize] as usize];
+                belief_of(model, object, ray).map(|belief| (segment, belief))
             };
             object.votes.iter().filter_map(belief).collect()
         };
         let beliefs: Vec<Vec<(u32, Belief)>> = objects.par_iter().map(of_object).collect();
-        let mut of_legs = vec![Belief::nothing(); legs.pass.len()];
-        for (leg, belief) in beliefs.into_iter().flatten() {
-            of_legs[leg as usize] = of_legs[leg as usize].and(&belief);
+        let mut of_segments = vec![Belief::nothing(); segments.pass.len()];
+        for (segment, belief) in beliefs.into_iter().flatten() {
+            of_segments[segment as usize] = of_segments[segment as usize].and(&belief);
         }
         let mut passes: Vec<(usize, usize)> = Vec::new();
-        for leg in 0..legs.pass.len() {
+        for segment in 0..segments.pass.len() {
             match passes.last_mut() {
-                Some((first, end)) if legs.pass[*first] == legs.pass[leg] => *end = leg + 1,
-                _ => passes.push((leg, leg + 1)),
+                Some((first, end)) if segments.pass[*first] == segments.pass[segment] => *end = segment + 1,
+                _ => passes.push((segment, segment + 1)),
             }
         }
-        let smoothed =
-            passes.par_iter().flat_map_iter(|&(first, end)| smooth(&legs.start_m[first..end], &of_legs[first..end]));
+        let smoothed = passes
+            .par_iter()
+            .flat_map_iter(|&(first, end)| smooth(&segments.start_m[first..end], &of_segments[first..end]));
         let smoothed = smoothed.collect();
-        Self { legs, smoothed }
+        Self { segments, smoothed }
     }
 
     /// The pose error of an image, as the votes of other images tell it.
@@ -348,7 +349,7 @@ impl Trajectories {
         objects: &[Object],
     ) -> PoseError {
         let view = &model.scene.views[image as usize];
-        let belief = self.smoothed[self.legs.of_view[image as usize] as usize];
+        let belief = self.smoothed[self.segments.of_view[image as usize] as usize];
         let own = votes.filter_map(|(object, ray)| belief_of(model, &objects[object as usize], ray));
         let belief = own.fold(belief, |belief, own| belief.without(&own));
         belief.pose_error(model.noise.shared(view), model.noise.of_image(view))

@@ -34,8 +34,8 @@ const STEPS: [f64; 5] = [2.0, 1.5, 1.25, 1.12, 1.06];
 const TRUST_LOG_SD: f64 = 1.0;
 /// The part of the variance of distant objects' residuals that is taken for rotation.
 const ROTATION_PART: f64 = 0.5;
-/// The part of the variance of what the images of a leg share that each of them has for itself all the same: errors that forget 63 % of
-/// themselves along a leg differ by twice this between images that are a tenth of a leg apart, as viewpoints are (Ornstein-Uhlenbeck).
+/// The part of the variance of what the images of a segment share that each of them has for itself all the same: errors that forget 63 % of
+/// themselves along a segment differ by twice this between images that are a tenth of a segment apart, as viewpoints are (Ornstein-Uhlenbeck).
 const ROUGHNESS: f64 = 0.1;
 /// Where fewer labels are seen by several passes, the shared part is taken to be as large as the own part.
 const MIN_SHARED_LABELS: usize = 5;
@@ -87,25 +87,25 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
         (false, true) => ((px2 - scale2 * known_rad2).max(DETECTION_PX.0.powi(2)).sqrt(), guess.rotation_rad),
         (false, false) => (((1.0 - ROTATION_PART) * px2).sqrt(), (ROTATION_PART * px2 / scale2).sqrt()),
     };
-    // Where poses state their errors, what images and legs do not have for themselves drifts.
+    // Where poses state their errors, what images and segments do not have for themselves drifts.
     let stated = [scene.usual(|view| view.position_sigma_m), scene.usual(|view| view.rotation_sigma_rad)];
     let rest = |total: f64, part: f64| (total * total - part * part).max((DRIFT_RATIO.0 * part).powi(2)).sqrt();
     let noise_of = |p: &[f64; 5], ratio: f64| {
-        let [position_leg_m, rotation_leg_rad] = [p[3], p[4]];
-        // What images of a leg share is not quite the same for all of them.
-        let rough = |of_leg: f64| if of_leg > 0.0 { ROUGHNESS * of_leg * of_leg } else { 0.0 };
-        let (detection_px, rotation_rad) = far_of(p[0] * p[0] + scale2 * rough(rotation_leg_rad));
-        // Passes that disagree are shifted: they turn no more than their images and legs do.
-        let rotation_share_rad = rotation_rad.hypot(rotation_leg_rad);
-        let position_m = if known.position { p[2] } else { (p[2] * p[2] + rough(position_leg_m)).sqrt() };
-        let (of_position, of_rotation) = (position_m.hypot(position_leg_m), rotation_share_rad);
+        let [position_segment_m, rotation_segment_rad] = [p[3], p[4]];
+        // What images of a segment share is not quite the same for all of them.
+        let rough = |of_segment: f64| if of_segment > 0.0 { ROUGHNESS * of_segment * of_segment } else { 0.0 };
+        let (detection_px, rotation_rad) = far_of(p[0] * p[0] + scale2 * rough(rotation_segment_rad));
+        // Passes that disagree are shifted: they turn no more than their images and segments do.
+        let rotation_share_rad = rotation_rad.hypot(rotation_segment_rad);
+        let position_m = if known.position { p[2] } else { (p[2] * p[2] + rough(position_segment_m)).sqrt() };
+        let (of_position, of_rotation) = (position_m.hypot(position_segment_m), rotation_share_rad);
         Noise {
             detection_px,
             box_share: p[1],
             position_m,
             rotation_rad,
-            position_leg_m,
-            rotation_leg_rad,
+            position_segment_m,
+            rotation_segment_rad,
             position_drift_m: stated[0].map_or(of_position * ratio, |total_m| rest(total_m, of_position)),
             rotation_drift_rad: stated[1].map_or(of_rotation, |total_rad| rest(total_rad, of_rotation)),
         }
@@ -115,8 +115,8 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
         (known_px2 + scale2 * known_rad2).sqrt(),
         guess.box_share,
         guess.position_m,
-        guess.position_leg_m,
-        guess.rotation_leg_rad,
+        guess.position_segment_m,
+        guess.rotation_segment_rad,
     ];
     let rotation_rad = (DETECTION_PX.0 / scale2.sqrt(), DETECTION_PX.1 / scale2.sqrt());
     let found = search(start, [DETECTION_PX, BOX_SHARE, POSITION_M, POSITION_M, rotation_rad], fixed, &|p| {
@@ -129,7 +129,7 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
     noise_of(&found, agreeing_ratio(scene, &sample, &|ratio| noise_of(&found, ratio)))
 }
 
-/// The ratio of the drift of positions to the errors of images and legs at which the passes of objects disagree as much as expected: by bisection, since
+/// The ratio of the drift of positions to the errors of images and segments at which the passes of objects disagree as much as expected: by bisection, since
 /// the larger the drift is taken for, the less remains unexplained.
 fn agreeing_ratio(scene: &Scene, objects: &[&Placed], noise_of: &(dyn Fn(f64) -> Noise + Sync)) -> f64 {
     let excess = |ratio: f64| mean_disagreement(scene, &noise_of(ratio), objects).map(|mean| mean - 1.0);

@@ -72,8 +72,8 @@ pub fn widened(estimate: &Estimate, sure: &Estimate) -> Estimate {
     let apart: Vector3<f64> = sure.point - estimate.point;
     let difference = sure.covariance - estimate.covariance * (1.0 - LEAST_DIFFERENCE);
     let chi2 = difference.cholesky().map(|cholesky| apart.dot(&cholesky.solve(&apart)));
-    let doubt = if chi2.is_some_and(|chi2| chi2 > AGREEMENT_CHI2) { 1.0 } else { 0.0 };
-    Estimate { covariance: estimate.covariance + apart * apart.transpose() * doubt, ..*estimate }
+    let widens = if chi2.is_some_and(|chi2| chi2 > AGREEMENT_CHI2) { 1.0 } else { 0.0 };
+    Estimate { covariance: estimate.covariance + apart * apart.transpose() * widens, ..*estimate }
 }
 
 #[cfg(test)]

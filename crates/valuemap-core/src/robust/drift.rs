@@ -3,8 +3,8 @@
 //! A vote's residual is `r = J (X - X_0) + J b + J [X - C]_x w + e`: e is the detection's error; b and w are errors of position
 //! and rotation. A part of them each image has for itself, but for all labels that it shows; another part changes slowly
 //! along the drive, an Ornstein-Uhlenbeck process: two that are d apart have the correlation `exp(-d / DRIFT_LENGTH_M)`. A
-//! drive is cut into short legs of one drift each. The image's own error is marginalised first, then the drift leg after
-//! leg (Schur complements), so that a hundred images before a red light count as one look from there, not as a
+//! drive is cut into short segments of one drift each. The image's own error is marginalised first, then the drift segment after
+//! segment (Schur complements), so that a hundred images before a red light count as one look from there, not as a
 //! hundred, and what an image gets wrong for one label, it gets wrong for its neighbors.
 
 use std::ops::Range;
@@ -22,10 +22,10 @@ type Matrix3x6 = SMatrix<f64, 3, 6>;
 pub const DRIFT_LENGTH_M: f64 = 100.0;
 /// Freedom left to a residual that the point follows altogether, as a share of its variance.
 const LEAST_FREEDOM: f64 = 1e-3;
-/// A leg's own error is at least this share of the drift: less is no error, and its inverse no number.
+/// A segment's own error is at least this share of the drift: less is no error, and its inverse no number.
 const LEAST_SHARE: f64 = 1e-4;
 /// Drifting errors are one within this distance, m.
-pub const LEG_M: f64 = 10.0;
+pub const SEGMENT_M: f64 = 10.0;
 
 /// One vote's residual at the position of its label, with its derivatives.
 #[derive(Debug, Clone)]
@@ -42,8 +42,8 @@ pub struct Look {
     pub by_turn: [Vector3<f64>; 2],
     /// Standard deviations of the part of these errors that drifts along the pass.
     pub drift_sigma: Sigmas,
-    /// Of the part that the images of one leg share, and no others.
-    pub leg_sigma: Sigmas,
+    /// Of the part that the images of one segment share, and no others.
+    pub segment_sigma: Sigmas,
     /// Of the part that the image has for itself.
     pub own_sigma: Sigmas,
     /// Variance of the detection, each axis, px².
@@ -61,7 +61,7 @@ pub struct Vantage {
     image: u32,
     driven_m: f64,
     drift_sigma: Sigmas,
-    leg_sigma: Sigmas,
+    segment_sigma: Sigmas,
     own_sigma: Sigmas,
     detection_px2: f64,
     /// Of all errors but the drift.
@@ -80,7 +80,7 @@ impl Vantage {
             image: scene.rays.image[ray as usize],
             driven_m: view.driven_m,
             drift_sigma: noise.of_drift(view),
-            leg_sigma: noise.of_leg(view),
+            segment_sigma: noise.of_segment(view),
             own_sigma: noise.of_image(view),
             detection_px2: noise.detection_px2(scene, ray),
             spread: noise.own(scene, ray),
@@ -131,7 +131,7 @@ impl Vantage {
             by_point,
             by_turn: by_point.map(|column| away.cross(&column)),
             drift_sigma: self.drift_sigma,
-            leg_sigma: self.leg_sigma,
+            segment_sigma: self.segment_sigma,
             own_sigma: self.own_sigma,
             detection_px2: self.detection_px2,
             variance: self.spread.variance(projected.z),
@@ -180,7 +180,7 @@ impl Look {
     pub fn with_drift(mut self, error: &Vector6, remainder: Sigmas) -> Self {
         self.shift(error);
         self.drift_sigma = remainder;
-        self.leg_sigma = Sigmas::NONE;
+        self.segment_sigma = Sigmas::NONE;
         self
     }
 
@@ -192,12 +192,12 @@ impl Look {
         Vector6::new(shift.x, shift.y, shift.z, turn.x, turn.y, turn.z)
     }
 
-    /// Standard deviations of all that the image shares with others of its leg.
+    /// Standard deviations of all that the image shares with others of its segment.
     #[must_use]
     pub fn shared_sigma(&self) -> Sigmas {
         Sigmas {
-            position_m: norm(self.leg_sigma.position_m, self.drift_sigma.position_m),
-            rotation_rad: norm(self.leg_sigma.rotation_rad, self.drift_sigma.rotation_rad),
+            position_m: norm(self.segment_sigma.position_m, self.drift_sigma.position_m),
+            rotation_rad: norm(self.segment_sigma.rotation_rad, self.drift_sigma.rotation_rad),
         }
     }
 
@@ -271,20 +271,20 @@ pub struct Drive<'a> {
     /// The normal equations of the positions.
     pub normals: Normals,
     looks: &'a [Look],
-    legs: Vec<Solved>,
+    segments: Vec<Solved>,
 }
 
-/// What is said about the pose error of a leg, in sigmas of the drift: by the looks of the leg, or about its drift by all before.
-struct Leg {
+/// What is said about the pose error of a segment, in sigmas of the drift: by the looks of the segment, or about its drift by all before.
+struct Segment {
     information: Matrix6,
     gradient: Vector6,
     /// How it depends on the positions of the labels seen so far.
     cross: Vec<(usize, Matrix3x6)>,
 }
 
-/// The error that a leg has for itself, taken out: what it is once its drift is known.
+/// The error that a segment has for itself, taken out: what it is once its drift is known.
 struct OwnOfLeg {
-    /// What its looks say of the error of the leg, drift and own, in sigmas of the drift.
+    /// What its looks say of the error of the segment, drift and own, in sigmas of the drift.
     information: Matrix6,
     gradient: Vector6,
     /// Its covariance once its looks are known, in sigmas of the drift.
@@ -293,16 +293,16 @@ struct OwnOfLeg {
     ln_determinant: f64,
 }
 
-/// A leg whose drift is taken out.
+/// A segment whose drift is taken out.
 struct Solved {
     looks: Range<usize>,
     information: Inverse,
     gradient: Vector6,
-    /// How much a unit of the next leg's drift pulls at this one's.
+    /// How much a unit of the next segment's drift pulls at this one's.
     tie: f64,
     /// How stiff this pull is.
     stiffness: f64,
-    /// The error that the leg has for itself; nothing if it has none.
+    /// The error that the segment has for itself; nothing if it has none.
     own: Option<OwnOfLeg>,
 }
 
@@ -317,72 +317,72 @@ impl<'a> Drive<'a> {
     #[must_use]
     pub fn along(looks: &'a [Look], weights: &[f64], labels: usize) -> Option<Self> {
         let mut normals = Normals::nothing(labels);
-        // The prior of the first leg: drifts are counted in their own sigmas.
-        let mut carried = Leg { information: Matrix6::identity(), ..Leg::nothing() };
-        let mut legs = Vec::new();
+        // The prior of the first segment: drifts are counted in their own sigmas.
+        let mut carried = Segment { information: Matrix6::identity(), ..Segment::nothing() };
+        let mut segments = Vec::new();
         let mut start = 0;
         while start < looks.len() {
-            let end = start + leg_length(&looks[start..]);
+            let end = start + segment_length(&looks[start..]);
             let mut at = start;
-            let mut leg = Leg::nothing();
+            let mut segment = Segment::nothing();
             for image in looks[start..end].chunk_by(|a, b| a.image == b.image) {
                 let weights = &weights[at..at + image.len()];
                 if image[0].own_sigma == Sigmas::NONE {
-                    image.iter().zip(weights).for_each(|(look, &weight)| leg.add(look, weight, &mut normals));
+                    image.iter().zip(weights).for_each(|(look, &weight)| segment.add(look, weight, &mut normals));
                 } else {
-                    leg.add_image(image, weights, &mut normals);
+                    segment.add_image(image, weights, &mut normals);
                 }
                 at += image.len();
             }
-            // The next leg's drift is `keep` times this one's, and something new of variance `1 - keep²`.
+            // The next segment's drift is `keep` times this one's, and something new of variance `1 - keep²`.
             let distance = looks.get(end).map_or(f64::INFINITY, |next| (next.driven_m - looks[start].driven_m).abs());
             let keep = (-distance / DRIFT_LENGTH_M).exp();
-            let of_leg = looks[start].leg_sigma;
-            let own = if of_leg == Sigmas::NONE {
+            let of_segment = looks[start].segment_sigma;
+            let own = if of_segment == Sigmas::NONE {
                 None
             } else {
-                Some(leg.take_own_out(of_leg, looks[start].drift_sigma, &mut normals)?)
+                Some(segment.take_own_out(of_segment, looks[start].drift_sigma, &mut normals)?)
             };
-            let (solved, next) = carried.and(&leg).take_out(keep, start..end, own, &mut normals)?;
-            legs.push(solved);
+            let (solved, next) = carried.and(&segment).take_out(keep, start..end, own, &mut normals)?;
+            segments.push(solved);
             carried = next;
             start = end;
         }
-        Some(Self { normals, looks, legs })
+        Some(Self { normals, looks, segments })
     }
 
     /// Logarithm of the determinant of the covariance of the residuals, px⁴ a look; of looks by themselves.
     #[must_use]
     pub fn log_determinant(&self) -> f64 {
         let of_looks: f64 = self.looks.iter().map(|look| 2.0 * look.detection_px2.ln()).sum();
-        let of_leg = |leg: &Solved| {
-            let of_own = leg.own.as_ref().map_or(0.0, |own| own.ln_determinant);
-            leg.information.determinant.ln() - 6.0 * leg.stiffness.ln() + of_own
+        let of_segment = |segment: &Solved| {
+            let of_own = segment.own.as_ref().map_or(0.0, |own| own.ln_determinant);
+            segment.information.determinant.ln() - 6.0 * segment.stiffness.ln() + of_own
         };
-        of_looks + self.legs.iter().map(of_leg).sum::<f64>()
+        of_looks + self.segments.iter().map(of_segment).sum::<f64>()
     }
 
-    /// Residuals, px, after the most probable error of the leg is taken out, in the order of the looks.
+    /// Residuals, px, after the most probable error of the segment is taken out, in the order of the looks.
     #[must_use]
     pub fn left(&self) -> Vec<Vector2<f64>> {
         let mut left = Vec::with_capacity(self.looks.len());
-        for (leg, drift) in self.legs.iter().zip(self.drifts()) {
-            let looks = &self.looks[leg.looks.clone()];
+        for (segment, drift) in self.segments.iter().zip(self.drifts()) {
+            let looks = &self.looks[segment.looks.clone()];
             left.extend(looks.iter().map(|look| look.without(&drift.component_mul(&look.drift_sigma.each()))));
         }
         left
     }
 
-    /// The most probable error of each leg, its drift and its own, in sigmas of the drift.
+    /// The most probable error of each segment, its drift and its own, in sigmas of the drift.
     fn drifts(&self) -> Vec<Vector6> {
-        let mut drifts = vec![Vector6::zeros(); self.legs.len()];
+        let mut drifts = vec![Vector6::zeros(); self.segments.len()];
         let mut of_next = Vector6::zeros();
-        for (leg, drift) in self.legs.iter().zip(&mut drifts).rev() {
-            *drift = product(&leg.information.matrix, &(of_next * leg.tie + leg.gradient));
+        for (segment, drift) in self.segments.iter().zip(&mut drifts).rev() {
+            *drift = product(&segment.information.matrix, &(of_next * segment.tie + segment.gradient));
             of_next = *drift;
         }
-        for (leg, drift) in self.legs.iter().zip(&mut drifts) {
-            if let Some(own) = &leg.own {
+        for (segment, drift) in self.segments.iter().zip(&mut drifts) {
+            if let Some(own) = &segment.own {
                 *drift += product(&own.covariance, &(own.gradient - product(&own.information, drift)));
             }
         }
@@ -392,12 +392,12 @@ impl<'a> Drive<'a> {
     /// The most probable pose error of the image of each look, drift and its own, m and rad.
     #[must_use]
     pub fn pose_errors(&self, weights: &[f64]) -> Vec<Vector6> {
-        let drifts = self.legs.iter().zip(self.drifts());
-        let of_leg = |(leg, drift): (&Solved, Vector6)| {
-            let looks = self.looks[leg.looks.clone()].iter();
+        let drifts = self.segments.iter().zip(self.drifts());
+        let of_segment = |(segment, drift): (&Solved, Vector6)| {
+            let looks = self.looks[segment.looks.clone()].iter();
             looks.map(move |look| drift.component_mul(&look.drift_sigma.each()))
         };
-        let mut errors: Vec<Vector6> = drifts.flat_map(of_leg).collect();
+        let mut errors: Vec<Vector6> = drifts.flat_map(of_segment).collect();
         let mut at = 0;
         for image in self.looks.chunk_by(|a, b| a.image == b.image) {
             let range = at..at + image.len();
@@ -475,7 +475,7 @@ fn own_error(looks: &[Look], weights: &[f64], drift: &Vector6) -> Option<Vector6
     Some(own.component_mul(&product(&known.matrix, &own.component_mul(&gradient))))
 }
 
-impl Leg {
+impl Segment {
     /// Add a look whose image has no error that it shares with others.
     fn add(&mut self, look: &Look, robust_weight: f64, normals: &mut Normals) {
         let weight = robust_weight / look.detection_px2;
@@ -575,13 +575,13 @@ impl Leg {
         self
     }
 
-    /// Take the error out that the leg has for itself; what remains is said of its drift. Nothing if numbers overflow.
+    /// Take the error out that the segment has for itself; what remains is said of its drift. Nothing if numbers overflow.
     fn take_own_out(&mut self, own: Sigmas, drift: Sigmas, normals: &mut Normals) -> Option<OwnOfLeg> {
         let share = own.each().zip_map(&drift.each(), |own, drift| if drift > 0.0 { own / drift } else { 0.0 });
         let share = share.map(|share| share.max(LEAST_SHARE));
         let known = Inverse::of(&(Matrix6::identity() + scaled(&self.information, &share)))?;
         let covariance = scaled(&known.matrix, &share);
-        let of_leg = OwnOfLeg {
+        let of_segment = OwnOfLeg {
             information: self.information,
             gradient: self.gradient,
             covariance,
@@ -604,10 +604,10 @@ impl Leg {
         self.cross.iter_mut().for_each(|(_, cross)| *cross = product(cross, &kept));
         self.gradient = product(&kept.transpose(), &self.gradient);
         self.information = scaled(&(Matrix6::identity() - known.matrix), &per_share);
-        Some(of_leg)
+        Some(of_segment)
     }
 
-    /// Take the drift of this leg out; what remains is known of the next one's, which is `keep` times this one's.
+    /// Take the drift of this segment out; what remains is known of the next one's, which is `keep` times this one's.
     fn take_out(
         self,
         keep: f64,
@@ -642,7 +642,7 @@ impl Leg {
 }
 
 /// How many looks, from the first one on, share one drift.
-fn leg_length(looks: &[Look]) -> usize {
-    let is_far = |look: &Look| (look.driven_m - looks[0].driven_m).abs() > LEG_M;
+fn segment_length(looks: &[Look]) -> usize {
+    let is_far = |look: &Look| (look.driven_m - looks[0].driven_m).abs() > SEGMENT_M;
     looks.iter().position(is_far).unwrap_or(looks.len())
 }

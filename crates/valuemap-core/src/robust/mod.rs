@@ -259,7 +259,7 @@ pub fn find(
     let (begun, first) = initial::labels(&model, !calibration.is_deep, progress)?;
     progress.advance()?;
     let mut tally =
-        Tally { hypotheses: first.nominations, births: first.accepted, deaths: first.doubted + first.outvoted };
+        Tally { hypotheses: first.nominations, births: first.accepted, deaths: first.pruned + first.outvoted };
     let depth = if calibration.is_deep { Depth::Deep } else { Depth::Shallow };
     let objects = search(&mut model, &rays, begun, depth, false, &mut tally, progress)?;
     let estimates = finish(&model, &objects);

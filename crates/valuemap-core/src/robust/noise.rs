@@ -22,10 +22,10 @@ pub struct Noise {
     pub position_m: f64,
     /// Of the camera rotation, each axis, each image for itself, rad.
     pub rotation_rad: f64,
-    /// Of the camera position, each axis, shared by the images of a leg, m.
-    pub position_leg_m: f64,
-    /// Of the camera rotation, each axis, shared by the images of a leg, rad.
-    pub rotation_leg_rad: f64,
+    /// Of the camera position, each axis, shared by the images of a segment, m.
+    pub position_segment_m: f64,
+    /// Of the camera rotation, each axis, shared by the images of a segment, rad.
+    pub rotation_segment_rad: f64,
     /// Of the camera position, each axis, drifting along a pass, m.
     pub position_drift_m: f64,
     /// Of the camera rotation, each axis, drifting along a pass, rad.
@@ -88,8 +88,8 @@ impl Noise {
             box_share: scale(self.box_share, known.detection),
             position_m: scale(self.position_m, known.position),
             rotation_rad: scale(self.rotation_rad, known.rotation),
-            position_leg_m: scale(self.position_leg_m, known.position),
-            rotation_leg_rad: scale(self.rotation_leg_rad, known.rotation),
+            position_segment_m: scale(self.position_segment_m, known.position),
+            rotation_segment_rad: scale(self.rotation_segment_rad, known.rotation),
             position_drift_m: scale(self.position_drift_m, known.position),
             rotation_drift_rad: scale(self.rotation_drift_rad, known.rotation),
         }
@@ -131,10 +131,10 @@ impl Noise {
         self.part(view, self.position_m, self.rotation_rad)
     }
 
-    /// Standard deviations of position (m) and rotation (rad) that the images of a leg share, and no others.
+    /// Standard deviations of position (m) and rotation (rad) that the images of a segment share, and no others.
     #[must_use]
-    pub fn of_leg(&self, view: &View) -> Sigmas {
-        self.part(view, self.position_leg_m, self.rotation_leg_rad)
+    pub fn of_segment(&self, view: &View) -> Sigmas {
+        self.part(view, self.position_segment_m, self.rotation_segment_rad)
     }
 
     /// Standard deviations of position (m) and rotation (rad) that drift along a pass.
@@ -143,20 +143,20 @@ impl Noise {
         self.part(view, self.position_drift_m, self.rotation_drift_rad)
     }
 
-    /// Standard deviations of position (m) and rotation (rad) that an image shares with others of its leg: drift and all.
+    /// Standard deviations of position (m) and rotation (rad) that an image shares with others of its segment: drift and all.
     #[must_use]
     pub fn shared(&self, view: &View) -> Sigmas {
-        let (leg, drift) = (self.of_leg(view), self.of_drift(view));
+        let (segment, drift) = (self.of_segment(view), self.of_drift(view));
         Sigmas {
-            position_m: norm(leg.position_m, drift.position_m),
-            rotation_rad: norm(leg.rotation_rad, drift.rotation_rad),
+            position_m: norm(segment.position_m, drift.position_m),
+            rotation_rad: norm(segment.rotation_rad, drift.rotation_rad),
         }
     }
 
     /// A part of all errors of a pose; where the total is known, the parts keep the ratio that was estimated.
     fn part(&self, view: &View, position_m: f64, rotation_rad: f64) -> Sigmas {
-        let position = || norm(norm(self.position_m, self.position_leg_m), self.position_drift_m);
-        let rotation = || norm(norm(self.rotation_rad, self.rotation_leg_rad), self.rotation_drift_rad);
+        let position = || norm(norm(self.position_m, self.position_segment_m), self.position_drift_m);
+        let rotation = || norm(norm(self.rotation_rad, self.rotation_segment_rad), self.rotation_drift_rad);
         Sigmas {
             position_m: known_share(view.position_sigma_m, position_m, position),
             rotation_rad: known_share(view.rotation_sigma_rad, rotation_rad, rotation),

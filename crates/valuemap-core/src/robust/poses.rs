@@ -1,20 +1,20 @@
 //! Where the images of a pass really were, as far as the labels tell: the drift of the pass, smoothed along the drive.
 //!
 //! Every vote for a label measures the pose error of its image. The drift is the Markov process of
-//! [`drift`](super::drift): what the looks of each leg say of it is passed on to the legs after and before it (two-filter
+//! [`drift`](super::drift): what the looks of each segment say of it is passed on to the segments after and before it (two-filter
 //! smoother).
 
 use nalgebra::{Matrix2, SMatrix, Vector2};
 
-use super::drift::{DRIFT_LENGTH_M, LEG_M, Look};
+use super::drift::{DRIFT_LENGTH_M, Look, SEGMENT_M};
 use super::noise::Sigmas;
 use super::scene::View;
 use super::spd::{Inverse, Matrix6, Vector6, product, product_transposed, scaled};
 
-/// Legs before and after those in question that say something about their drift.
-pub(super) const LEGS_AROUND: usize = 20;
+/// Segments before and after those in question that say something about their drift.
+pub(super) const SEGMENTS_AROUND: usize = 20;
 
-/// What is known of the drift of a leg, in sigmas of the drift: information and gradient.
+/// What is known of the drift of a segment, in sigmas of the drift: information and gradient.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Belief {
     information: Matrix6,
@@ -131,45 +131,45 @@ fn rows_of(look: &Look) -> SMatrix<f64, 2, 6> {
     SMatrix::<f64, 2, 6>::from_rows(&[look.by_pose(0).transpose(), look.by_pose(1).transpose()])
 }
 
-/// The drives of a scene, cut into legs of one drift each.
-pub struct Legs {
-    /// The leg of each view.
+/// The drives of a scene, cut into segments of one drift each.
+pub struct Segments {
+    /// The segment of each view.
     pub of_view: Vec<u32>,
-    /// The pass of each leg, ascending.
+    /// The pass of each segment, ascending.
     pub pass: Vec<u32>,
-    /// Where each leg begins, m driven.
+    /// Where each segment begins, m driven.
     pub start_m: Vec<f64>,
 }
 
-impl Legs {
+impl Segments {
     /// Cut the drives of all passes.
     #[must_use]
     pub fn new(views: &[View]) -> Self {
-        let step_of = |view: &View| (view.pass, (view.driven_m / LEG_M).floor() as i64);
+        let step_of = |view: &View| (view.pass, (view.driven_m / SEGMENT_M).floor() as i64);
         let mut steps: Vec<(u32, i64)> = views.iter().map(step_of).collect();
         steps.sort_unstable();
         steps.dedup();
         let of_view = views.iter().map(|view| steps.partition_point(|step| *step < step_of(view)) as u32).collect();
-        let start_m = steps.iter().map(|(_, step)| *step as f64 * LEG_M).collect();
+        let start_m = steps.iter().map(|(_, step)| *step as f64 * SEGMENT_M).collect();
         Self { of_view, pass: steps.into_iter().map(|(pass, _)| pass).collect(), start_m }
     }
 }
 
-/// What is known of the drift of each leg, from its own looks and those of all other legs of the pass; `starts_m` is where
-/// the legs begin.
+/// What is known of the drift of each segment, from its own looks and those of all other segments of the pass; `starts_m` is where
+/// the segments begin.
 #[must_use]
 pub fn smooth(starts_m: &[f64], looks: &[Belief]) -> Vec<Belief> {
-    let distance = |leg: usize| (starts_m[leg + 1] - starts_m[leg]).abs();
+    let distance = |segment: usize| (starts_m[segment + 1] - starts_m[segment]).abs();
     let mut before = vec![Belief::prior(); looks.len()];
-    for leg in 1..looks.len() {
-        before[leg] = before[leg - 1].and(&looks[leg - 1]).carried(distance(leg - 1), true);
+    for segment in 1..looks.len() {
+        before[segment] = before[segment - 1].and(&looks[segment - 1]).carried(distance(segment - 1), true);
     }
     let mut after = Belief::nothing();
     let mut smoothed = before;
-    for leg in (0..looks.len()).rev() {
-        smoothed[leg] = smoothed[leg].and(&looks[leg]).and(&after);
-        if leg > 0 {
-            after = after.and(&looks[leg]).carried(distance(leg - 1), false);
+    for segment in (0..looks.len()).rev() {
+        smoothed[segment] = smoothed[segment].and(&looks[segment]).and(&after);
+        if segment > 0 {
+            after = after.and(&looks[segment]).carried(distance(segment - 1), false);
         }
     }
     smoothed

@@ -4,7 +4,7 @@
 //! it is one: from one image to the next its box hardly moves. Images a few metres apart have the same pose error, so their residuals at a place
 //! nearby differ by errors of single images alone, however wrong the place and the poses are.
 
-use super::drift::LEG_M;
+use super::drift::SEGMENT_M;
 use super::energy::{Object, implied_size, visits};
 use super::looks::looks_among;
 use super::model::Model;
@@ -48,7 +48,7 @@ fn goes_on_as(model: &Model<'_>, objects: &[&Object], votes: &[(u32, usize)]) ->
     let image = |vote: &(u32, usize)| scene.rays.image[vote.0 as usize];
     for next in after.chunk_by(|a, b| image(a) == image(b)) {
         let there = scene.view(next[0].0);
-        if there.pass != view.pass || there.driven_m - view.driven_m > LEG_M {
+        if there.pass != view.pass || there.driven_m - view.driven_m > SEGMENT_M {
             return None;
         }
         if there.camera != view.camera || image(&next[0]) == image(&votes[0]) {

@@ -33,8 +33,8 @@ pub const NOISE: Noise = Noise {
     box_share: 0.0,
     position_m: 0.03,
     rotation_rad: 5e-4,
-    position_leg_m: 0.0,
-    rotation_leg_rad: 0.0,
+    position_segment_m: 0.0,
+    rotation_segment_rad: 0.0,
     position_drift_m: 0.0,
     rotation_drift_rad: 0.0,
 };

@@ -1,7 +1,7 @@
 //! Which detection shows which label: all labels compete for all detections, image by image.
 //!
 //! The pose error of each image is estimated first, from the votes along the drive ([`poses`](crate::robust::poses)); then each image
-//! is decided for itself ([`grant`](mod@super::grant)), and rivals for a whole pass ([`rivals`](super::rivals)).
+//! is decided for itself ([`assignment`](mod@super::assignment)), and rivals for a whole pass ([`rivals`](super::rivals)).
 
 use std::sync::Arc;
 
@@ -9,13 +9,13 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
-use super::grant::{Case, Claim, Decision, Fit, belief_of_votes, grant, granted, overrule, report};
+use super::assignment::{Case, Claim, Decision, Fit, assigned, belief_of_votes, decide, overrule, report};
 use super::label::{Label, fingerprint};
 use crate::progress::{Halt, Progress};
 use crate::robust::estimate::Estimate;
 use crate::robust::index::{Hit, RayIndex, chi2_in_gate};
 use crate::robust::noise::Noise;
-use crate::robust::poses::{Belief, LEGS_AROUND, Legs, smooth};
+use crate::robust::poses::{Belief, SEGMENTS_AROUND, Segments, smooth};
 use crate::robust::scene::Scene;
 
 /// Detections are looked for as far from a label as this many of its standard deviations, in steps of one.
@@ -25,16 +25,16 @@ const CERTAIN_M: f64 = 0.1;
 
 /// Gives detections to labels, at most one an image and label.
 ///
-/// It remembers what it decided last, and decides only those legs anew that a label claims which changed.
+/// It remembers what it decided last, and decides only those segments anew that a label claims which changed.
 pub struct Association<'a> {
     pub(super) scene: &'a Scene,
     pub(super) noise: &'a Noise,
     pub(super) index: RayIndex<'a>,
     /// Detections farther from a label are not its own, m.
     range_m: f64,
-    legs: Legs,
-    /// What the votes of each leg say of its drift.
-    of_legs: Vec<Belief>,
+    segments: Segments,
+    /// What the votes of each segment say of its drift.
+    of_segments: Vec<Belief>,
     /// The claims of the labels, by where these stood.
     pub(super) last: FxHashMap<u64, Arc<Claimed>>,
     pub(super) overruled: FxHashSet<Overruled>,
@@ -50,11 +50,11 @@ pub(super) struct Claimed {
 /// Of two labels, where they stood, the first overrules the second in a pass.
 type Overruled = (u64, u64, u32);
 
-/// What was decided on some legs.
+/// What was decided on some segments.
 struct Decided {
     decisions: Vec<Decision>,
-    /// The legs from this one on, and what their votes say.
-    of_legs: (usize, Vec<Belief>),
+    /// The segments from this one on, and what their votes say.
+    of_segments: (usize, Vec<Belief>),
     overruled: Vec<Overruled>,
 }
 
@@ -62,10 +62,10 @@ impl<'a> Association<'a> {
     /// Begin, with nothing decided.
     #[must_use]
     pub fn new(scene: &'a Scene, noise: &'a Noise, index: RayIndex<'a>, range_m: f64) -> Self {
-        let legs = Legs::new(&scene.views);
-        let of_legs = vec![Belief::nothing(); legs.pass.len()];
+        let segments = Segments::new(&scene.views);
+        let of_segments = vec![Belief::nothing(); segments.pass.len()];
         let (last, overruled) = (FxHashMap::default(), FxHashSet::default());
-        Self { scene, noise, index, range_m, legs, of_legs, last, overruled }
+        Self { scene, noise, index, range_m, segments, of_segments, last, overruled }
     }
 
     /// Give detections to labels: those that they had where nothing changed, else those that fit best.
@@ -81,19 +81,19 @@ impl<'a> Association<'a> {
         let claims: Vec<(u64, Arc<Claimed>)> = labels.par_iter().map(claimed_by).collect::<Result<_, Halt>>()?;
         let stands: Vec<u64> = claims.iter().map(|(stand, _)| *stand).collect();
         let current: FxHashSet<u64> = stands.iter().copied().collect();
-        let is_open = self.open_legs(&claims, &current);
-        let mut open = by_leg(&claims, &is_open);
+        let is_open = self.open_segments(&claims, &current);
+        let mut open = by_segment(&claims, &is_open);
         let is_one_run = |a: &Claim, b: &Claim| {
-            let [a, b] = [a.leg as usize, b.leg as usize];
-            self.legs.pass[a] == self.legs.pass[b] && b - a <= LEGS_AROUND
+            let [a, b] = [a.segment as usize, b.segment as usize];
+            self.segments.pass[a] == self.segments.pass[b] && b - a <= SEGMENTS_AROUND
         };
         let runs: Vec<&mut [Claim]> = open.chunk_by_mut(is_one_run).collect();
         let decide = |run: &mut [Claim]| {
-            run.sort_by_key(|claim| (claim.leg, claim.image));
+            run.sort_by_key(|claim| (claim.segment, claim.image));
             self.decide(&labels, &stands, run, progress)
         };
         let decided: Vec<Decided> = runs.into_par_iter().map(decide).collect::<Result<_, Halt>>()?;
-        let is_open_image = |image: u32| is_open[self.legs.of_view[image as usize] as usize];
+        let is_open_image = |image: u32| is_open[self.segments.of_view[image as usize] as usize];
         let mut voters: Vec<Vec<u32>> = Vec::with_capacity(labels.len());
         let mut undecided: Vec<Vec<u32>> = Vec::with_capacity(labels.len());
         for label in &labels {
@@ -102,8 +102,8 @@ impl<'a> Association<'a> {
             undecided.push(label.undecided.iter().filter(|image| !is_open_image(**image)).copied().collect());
         }
         self.overruled.retain(|(a, b, _)| current.contains(a) && current.contains(b));
-        for Decided { decisions, of_legs: (first, beliefs), overruled } in decided {
-            self.of_legs[first..first + beliefs.len()].copy_from_slice(&beliefs);
+        for Decided { decisions, of_segments: (first, beliefs), overruled } in decided {
+            self.of_segments[first..first + beliefs.len()].copy_from_slice(&beliefs);
             self.overruled.extend(overruled);
             for decision in decisions {
                 match decision {
@@ -153,16 +153,16 @@ impl<'a> Association<'a> {
         hits.retain(|hit| label.faces(self.scene, hit.ray));
         hits.sort_by_key(|hit| hit.ray);
         let of_hit = |Hit { ray, image, chi2 }: Hit| {
-            let leg = self.legs.of_view[image as usize];
-            Claim { leg, image, label: u32::MAX, ray, chi2, is_vote: false }
+            let segment = self.segments.of_view[image as usize];
+            Claim { segment, image, label: u32::MAX, ray, chi2, is_vote: false }
         };
         hits.into_iter().map(of_hit).collect()
     }
 
-    /// Legs that a label claims which was not there before, or is there no longer, or where its votes changed.
-    fn open_legs(&self, claims: &[(u64, Arc<Claimed>)], current: &FxHashSet<u64>) -> Vec<bool> {
-        let mut is_open = vec![false; self.legs.pass.len()];
-        let mut open = |claim: &Claim| is_open[claim.leg as usize] = true;
+    /// Segments that a label claims which was not there before, or is there no longer, or where its votes changed.
+    fn open_segments(&self, claims: &[(u64, Arc<Claimed>)], current: &FxHashSet<u64>) -> Vec<bool> {
+        let mut is_open = vec![false; self.segments.pass.len()];
+        let mut open = |claim: &Claim| is_open[claim.segment as usize] = true;
         for (stand, now) in claims {
             match self.last.get(stand) {
                 None => now.claims.iter().for_each(&mut open),
@@ -178,19 +178,19 @@ impl<'a> Association<'a> {
         is_open
     }
 
-    /// Decide the claims of some legs of one pass, ordered by leg and image.
+    /// Decide the claims of some segments of one pass, ordered by segment and image.
     fn decide(&self, labels: &[Label], stands: &[u64], claims: &[Claim], progress: &Progress) -> Result<Decided, Halt> {
         let (scene, noise, limit) = (self.scene, self.noise, self.index.gate_sigmas().powi(2));
         let cases: Vec<Case<'_>> =
             claims.iter().filter_map(|claim| Case::of(scene, noise, &labels[claim.label as usize], claim)).collect();
         let run = Run::new(self, labels, stands, &cases);
-        let smoothed = smooth(&run.starts_m, &run.of_legs);
+        let smoothed = smooth(&run.starts_m, &run.of_segments);
         let judge = |(i, cases): (usize, &&[Case<'_>])| {
             let view = &scene.views[cases[0].claim.image as usize];
             // Its own votes are what is in question.
-            let belief = smoothed[run.leg_of[i]].without(&run.votes[i]);
+            let belief = smoothed[run.segment_of[i]].without(&run.votes[i]);
             progress.check()?;
-            Ok(grant(cases, limit, &belief.pose_error(noise.shared(view), noise.of_image(view))))
+            Ok(decide(cases, limit, &belief.pose_error(noise.shared(view), noise.of_image(view))))
         };
         let mut fits: Vec<Vec<Fit>> = run.images.iter().enumerate().map(judge).collect::<Result<_, Halt>>()?;
         let overruled = run.overruled(&fits, progress)?;
@@ -199,17 +199,17 @@ impl<'a> Association<'a> {
         let mut votes: FxHashMap<u32, usize> = FxHashMap::default();
         for (cases, fits) in run.images.iter().zip(&mut fits) {
             overrule(cases, fits, &overruled, limit);
-            granted(cases, fits).for_each(|claim| *votes.entry(claim.label).or_default() += 1);
+            assigned(cases, fits).for_each(|claim| *votes.entry(claim.label).or_default() += 1);
         }
         let votes_of = |label: u32| labels[label as usize].voters.len().max(votes.get(&label).copied().unwrap_or(0));
         for (cases, fits) in run.images.iter().zip(&fits) {
             report(cases, fits, &votes_of, limit, &mut decisions);
         }
-        let (first, end) = run.own_legs;
-        let of_legs = run.of_legs[first - run.first_leg..end - run.first_leg].to_vec();
+        let (first, end) = run.own_segments;
+        let of_segments = run.of_segments[first - run.first_segment..end - run.first_segment].to_vec();
         let named = |(a, b): (u32, u32)| (stands[a as usize], stands[b as usize], run.pass);
         let overruled = overruled.into_iter().map(named).collect();
-        Ok(Decided { decisions, of_legs: (first, of_legs), overruled })
+        Ok(Decided { decisions, of_segments: (first, of_segments), overruled })
     }
 }
 
@@ -229,24 +229,24 @@ fn given_to(scene: &Scene, label: Label, mut voters: Vec<u32>, mut undecided: Ve
     label
 }
 
-/// The claims of all labels on some legs: leg by leg, each label after label and ray after ray.
-fn by_leg(claims: &[(u64, Arc<Claimed>)], is_open: &[bool]) -> Vec<Claim> {
+/// The claims of all labels on some segments: segment by segment, each label after label and ray after ray.
+fn by_segment(claims: &[(u64, Arc<Claimed>)], is_open: &[bool]) -> Vec<Claim> {
     let open = || {
         let all = (0..)
             .zip(claims)
             .flat_map(|(label, (_, of_label))| of_label.claims.iter().map(move |claim| Claim { label, ..*claim }));
-        all.filter(|claim| is_open[claim.leg as usize])
+        all.filter(|claim| is_open[claim.segment as usize])
     };
     let mut next = vec![0; is_open.len() + 1];
     for claim in open() {
-        next[claim.leg as usize + 1] += 1;
+        next[claim.segment as usize + 1] += 1;
     }
-    for leg in 0..is_open.len() {
-        next[leg + 1] += next[leg];
+    for segment in 0..is_open.len() {
+        next[segment + 1] += next[segment];
     }
     let mut sorted = vec![Claim::default(); next[is_open.len()]];
     for claim in open() {
-        let place = &mut next[claim.leg as usize];
+        let place = &mut next[claim.segment as usize];
         sorted[*place] = claim;
         *place += 1;
     }
@@ -275,7 +275,7 @@ fn places_of(estimate: &Estimate) -> Vec<Vector3<f64>> {
     (-REACH_SIGMAS..=REACH_SIGMAS).map(|step| estimate.point + axis * f64::from(step)).collect()
 }
 
-/// What is claimed on some legs of one pass: the cases, image by image, and what the votes say about the drift.
+/// What is claimed on some segments of one pass: the cases, image by image, and what the votes say about the drift.
 pub(super) struct Run<'a> {
     pub(super) of: &'a Association<'a>,
     pub(super) labels: &'a [Label],
@@ -284,38 +284,39 @@ pub(super) struct Run<'a> {
     pub(super) images: Vec<&'a [Case<'a>]>,
     /// What the votes of each image say.
     pub(super) votes: Vec<Belief>,
-    /// The leg of each image, counted from the first leg around.
-    pub(super) leg_of: Vec<usize>,
-    pub(super) first_leg: usize,
-    /// The first and the end of the legs with images, counted from the first of all.
-    pub(super) own_legs: (usize, usize),
-    /// Where the legs around begin, m driven, and what their votes say.
+    /// The segment of each image, counted from the first segment around.
+    pub(super) segment_of: Vec<usize>,
+    pub(super) first_segment: usize,
+    /// The first and the end of the segments with images, counted from the first of all.
+    pub(super) own_segments: (usize, usize),
+    /// Where the segments around begin, m driven, and what their votes say.
     pub(super) starts_m: Vec<f64>,
-    pub(super) of_legs: Vec<Belief>,
+    pub(super) of_segments: Vec<Belief>,
 }
 
 impl<'a> Run<'a> {
     fn new(of: &'a Association<'a>, labels: &'a [Label], stands: &'a [u64], cases: &'a [Case<'a>]) -> Self {
-        let legs = &of.legs;
+        let segments = &of.segments;
         let images: Vec<&[Case<'_>]> = cases.chunk_by(|a, b| a.claim.image == b.claim.image).collect();
-        let leg_of = |cases: &&[Case<'_>]| legs.of_view[cases[0].claim.image as usize] as usize;
-        let own_legs = (images.first().map_or(0, leg_of), images.last().map_or(0, |image| leg_of(image) + 1));
-        let pass = legs.pass[own_legs.0];
-        let is_of_pass = |leg: &usize| legs.pass[*leg] == pass;
-        let before = (0..own_legs.0).rev().take(LEGS_AROUND).take_while(is_of_pass).count();
-        let after = (own_legs.1..legs.pass.len()).take(LEGS_AROUND).take_while(is_of_pass).count();
-        let around = own_legs.0 - before..own_legs.1 + after;
-        let leg_of: Vec<usize> = images.iter().map(|image| leg_of(image) - around.start).collect();
+        let segment_of = |cases: &&[Case<'_>]| segments.of_view[cases[0].claim.image as usize] as usize;
+        let own_segments =
+            (images.first().map_or(0, segment_of), images.last().map_or(0, |image| segment_of(image) + 1));
+        let pass = segments.pass[own_segments.0];
+        let is_of_pass = |segment: &usize| segments.pass[*segment] == pass;
+        let before = (0..own_segments.0).rev().take(SEGMENTS_AROUND).take_while(is_of_pass).count();
+        let after = (own_segments.1..segments.pass.len()).take(SEGMENTS_AROUND).take_while(is_of_pass).count();
+        let around = own_segments.0 - before..own_segments.1 + after;
+        let segment_of: Vec<usize> = images.iter().map(|image| segment_of(image) - around.start).collect();
         let votes: Vec<Belief> = images.iter().map(|cases| belief_of_votes(cases.iter())).collect();
-        let mut of_legs = of.of_legs[around.clone()].to_vec();
-        for &leg in &leg_of {
-            of_legs[leg] = Belief::nothing();
+        let mut of_segments = of.of_segments[around.clone()].to_vec();
+        for &segment in &segment_of {
+            of_segments[segment] = Belief::nothing();
         }
-        for (vote, &leg) in votes.iter().zip(&leg_of) {
-            of_legs[leg] = of_legs[leg].and(vote);
+        for (vote, &segment) in votes.iter().zip(&segment_of) {
+            of_segments[segment] = of_segments[segment].and(vote);
         }
-        let starts_m = legs.start_m[around.clone()].to_vec();
-        let first_leg = around.start;
-        Self { of, labels, stands, pass, images, votes, leg_of, first_leg, own_legs, starts_m, of_legs }
+        let starts_m = segments.start_m[around.clone()].to_vec();
+        let first_segment = around.start;
+        Self { of, labels, stands, pass, images, votes, segment_of, first_segment, own_segments, starts_m, of_segments }
     }
 }

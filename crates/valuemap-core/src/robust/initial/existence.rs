@@ -20,9 +20,9 @@ use crate::robust::noise::Spread;
 use crate::robust::scene::Scene;
 
 /// So many times more probable must be that the hits in a sector are not the label's, before its votes are taken away (logarithm).
-const STRAY_LOG_ODDS: f64 = 5.0;
+const CLUTTER_LOG_ODDS: f64 = 5.0;
 /// More hits in a sector than this are no accident.
-const MOST_STRAYS: u32 = 2;
+const MOST_HITS_OF_CLUTTER: u32 = 2;
 /// Side of the cubes that images are grouped by, m.
 const CUBE_M: f64 = 10.0;
 
@@ -38,7 +38,7 @@ const COINCIDENCE_CONCENTRATION: f64 = 15.0;
 const ODDS_AGAINST: f64 = 10.0;
 /// How much they grow with the number of those, for each label, that were found to be nothing: what is left is the best of
 /// so many more.
-const ODDS_PER_DOUBTED: f64 = 4.0;
+const ODDS_PER_PRUNED: f64 = 4.0;
 
 /// Directions that a label is looked at from: around those of some of its votes.
 #[derive(Debug, Clone)]
@@ -181,7 +181,7 @@ fn count_looks(sorted: &[(u32, u32, bool)]) -> Vec<Looks> {
 }
 
 impl Rates {
-    /// Learn the recall and its spread over passes from the looks at labels that nobody doubts.
+    /// Learn the recall and its spread over passes from the looks at labels that stay.
     #[must_use]
     pub fn learn(looks: &[Vec<Looks>]) -> Self {
         let sure: Vec<&Looks> = looks
@@ -225,10 +225,10 @@ impl Sector {
     /// Whether its hits are more likely those of other things. At the edge of what can be seen, or behind a corner, any share
     /// of the looks may be hits.
     #[must_use]
-    pub fn is_stray(&self) -> bool {
+    pub fn is_clutter(&self) -> bool {
         let (nothing, any) = (nothing(COINCIDENCE), Rates { recall: 0.5, concentration: 2.0 });
         let log_odds: f64 = self.looks.iter().map(|pass| nothing.log_likelihood(pass) - any.log_likelihood(pass)).sum();
-        self.looks.iter().map(|pass| pass.hits).sum::<u32>() <= MOST_STRAYS && log_odds > STRAY_LOG_ODDS
+        self.looks.iter().map(|pass| pass.hits).sum::<u32>() <= MOST_HITS_OF_CLUTTER && log_odds > CLUTTER_LOG_ODDS
     }
 }
 
@@ -240,11 +240,11 @@ fn nothing(share: f64) -> Rates {
 /// The probability that each label exists.
 ///
 /// Against it speaks that nothing is there, and the hits come from detections of other things: a small share of the looks,
-/// again different from pass to pass. `chance` is the share that stray detections alone give.
-/// `doubted` is how many others were found not to exist.
+/// again different from pass to pass. `chance` is the share that clutter alone gives.
+/// `pruned` is how many others were found not to exist.
 #[must_use]
-pub fn probabilities(looks: &[Vec<Looks>], rates: &Rates, chance: &[f64], doubted: u64) -> Vec<f64> {
-    let odds_against = ODDS_AGAINST * (1.0 + ODDS_PER_DOUBTED * doubted as f64 / looks.len().max(1) as f64);
+pub fn probabilities(looks: &[Vec<Looks>], rates: &Rates, chance: &[f64], pruned: u64) -> Vec<f64> {
+    let odds_against = ODDS_AGAINST * (1.0 + ODDS_PER_PRUNED * pruned as f64 / looks.len().max(1) as f64);
     looks
         .par_iter()
         .zip(chance)
@@ -257,15 +257,15 @@ pub fn probabilities(looks: &[Vec<Looks>], rates: &Rates, chance: &[f64], doubte
         .collect()
 }
 
-/// The chance of a look having a detection in the gate of nothing: stray detections a steradian, times the solid angle of
+/// The chance of a look having a detection in the gate of nothing: clutter a steradian, times the solid angle of
 /// the gate, the mean over the voters.
 #[must_use]
-pub fn chance_of(label: &Label, scene: &Scene, spreads: &[Spread], gate_sigmas: f64, strays_per_sr: f64) -> f64 {
+pub fn chance_of(label: &Label, scene: &Scene, spreads: &[Spread], gate_sigmas: f64, clutter_per_sr: f64) -> f64 {
     let areas = label.voters.iter().map(|&ray| {
         let depth = scene.ray(ray).project(&label.estimate.point).z;
         let variance = spreads[ray as usize].variance(depth) / scene.scale2[ray as usize];
         PI * gate_sigmas * gate_sigmas * variance
     });
     let mean = areas.sum::<f64>() / label.voters.len() as f64;
-    (strays_per_sr * mean).clamp(1e-4, 0.5)
+    (clutter_per_sr * mean).clamp(1e-4, 0.5)
 }

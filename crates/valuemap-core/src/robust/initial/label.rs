@@ -76,7 +76,7 @@ pub struct Known {
     pub is_one: bool,
     /// Neighbors, as they were, that it was found to have no votes to exchange with.
     pub untangled: Vec<u64>,
-    /// The same for votes to hand over.
+    /// The same for votes to swap.
     pub satisfied: Vec<u64>,
 }
 

@@ -1,17 +1,17 @@
 //! The map that the search begins with: found fast, by rules of thumb.
 
 pub mod adjust;
+pub mod assignment;
 pub mod associate;
-mod court;
 pub mod exchange;
 pub mod existence;
 pub mod gather;
-pub mod grant;
-pub mod handover;
 pub mod label;
 pub mod pairs;
 pub mod rivals;
 pub mod settle;
+mod solver;
+pub mod swap;
 
 use nalgebra::Vector3;
 
@@ -19,25 +19,25 @@ use super::keyframes::Keyframes;
 use super::model::Model;
 use crate::progress::{Halt, Progress};
 
-use court::Court;
 use label::Label;
+use solver::Solver;
 
 /// How labels are found among the rays of a scene.
 struct Schedule {
     /// Times that the rays of no label are gathered, at most: what is left over gets less and less.
     sessions: usize,
-    /// Times that labels compete before any is doubted.
+    /// Times that labels compete before any is pruned.
     rounds: usize,
-    /// Times that neighbors hand over votes before any is doubted, and after, at most.
-    handovers: usize,
+    /// Times that neighbors swap votes before any is pruned, and after, at most.
+    swaps: usize,
 }
 
 /// For all images of a scene.
-const WHOLE: Schedule = Schedule { sessions: 3, rounds: 4, handovers: 3 };
+const WHOLE: Schedule = Schedule { sessions: 3, rounds: 4, swaps: 3 };
 /// For the keyframes of a large one.
-const KEYFRAMES: Schedule = Schedule { sessions: 1, handovers: 1, ..WHOLE };
+const KEYFRAMES: Schedule = Schedule { sessions: 1, swaps: 1, ..WHOLE };
 /// For all its images, when labels competed in the keyframes.
-const REFINING: Schedule = Schedule { sessions: 1, rounds: 2, handovers: 0 };
+const REFINING: Schedule = Schedule { sessions: 1, rounds: 2, swaps: 0 };
 
 /// What became of everything that was proposed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -51,7 +51,7 @@ pub struct Tally {
     /// Labels that lost too many votes to others.
     pub outvoted: u64,
     /// Labels that probably do not exist.
-    pub doubted: u64,
+    pub pruned: u64,
 }
 
 /// Votes (ascending) and a position.
@@ -63,9 +63,9 @@ pub type Begun = (Vec<u32>, Vector3<f64>);
 /// [`Halt::Cancelled`] when `progress` says so.
 pub fn labels_of_few(model: &Model<'_>, rays: &[u32], progress: &Progress) -> Result<Vec<Begun>, Halt> {
     let (mut labels, _) = gather::gather(model, rays, progress)?;
-    let mut court = Court::new(model, rays.iter().copied());
+    let mut solver = Solver::new(model, rays.iter().copied());
     for _ in 0..WHOLE.rounds {
-        labels = court.settle(labels, true, &mut Tally::default(), progress)?;
+        labels = solver.settle(labels, true, &mut Tally::default(), progress)?;
     }
     Ok(begun(labels))
 }
@@ -80,15 +80,15 @@ pub fn labels(model: &Model<'_>, is_quick: bool, progress: &Progress) -> Result<
     let first = match &keyframes {
         Some(keyframes) => {
             let thinned = Model::new(&keyframes.scene, model.noise, model.settings);
-            let mut court = Court::new(&thinned, 0..keyframes.scene.rays.rays.len() as u32);
-            let labels = court.hold(Vec::new(), &KEYFRAMES, &mut tally, progress)?;
+            let mut solver = Solver::new(&thinned, 0..keyframes.scene.rays.rays.len() as u32);
+            let labels = solver.solve(Vec::new(), &KEYFRAMES, &mut tally, progress)?;
             labels.into_iter().map(|label| keyframes.in_whole(label)).collect()
         }
         None => Vec::new(),
     };
     let schedule = if keyframes.is_some() { REFINING } else { WHOLE };
-    let mut court = Court::new(model, 0..model.scene.rays.rays.len() as u32);
-    let labels = court.hold(first, &schedule, &mut tally, progress)?;
+    let mut solver = Solver::new(model, 0..model.scene.rays.rays.len() as u32);
+    let labels = solver.solve(first, &schedule, &mut tally, progress)?;
     let before = labels.len();
     let labels = settle::outclass(model.scene, model.noise, labels);
     tally.outvoted += (before - labels.len()) as u64;

@@ -5,12 +5,12 @@
 
 use rustc_hash::{FxHashMap, FxHashSet};
 
+use super::assignment::{Fit, assigned, belief_of_votes, open};
 use super::associate::Run;
-use super::grant::{Fit, belief_of_votes, granted, open};
 use crate::progress::{Halt, Progress};
 use crate::robust::drift::{Drive, Look};
 use crate::robust::noise::Sigmas;
-use crate::robust::poses::{LEGS_AROUND, PoseError, smooth};
+use crate::robust::poses::{PoseError, SEGMENTS_AROUND, smooth};
 
 /// Images of a pass that show one of two labels, which may be either, before it is concluded that there is but one.
 const LEAST_RIVALRY: u32 = 8;
@@ -37,9 +37,9 @@ impl Run<'_> {
             return Ok(FxHashSet::default());
         }
         for (cases, fits) in self.images.iter().zip(fits) {
-            let granted: Vec<u32> = granted(cases, fits).map(|claim| claim.label).collect();
-            for (k, &a) in granted.iter().enumerate() {
-                for &b in &granted[k + 1..] {
+            let assigned: Vec<u32> = assigned(cases, fits).map(|claim| claim.label).collect();
+            for (k, &a) in assigned.iter().enumerate() {
+                for &b in &assigned[k + 1..] {
                     rivalries.entry((a, b)).and_modify(|rivalry| rivalry.both += 1);
                 }
             }
@@ -69,7 +69,7 @@ impl Run<'_> {
         let mut rivalries: FxHashMap<(u32, u32), Rivalry> = FxHashMap::default();
         for (i, (cases, fits)) in self.images.iter().zip(fits).enumerate() {
             progress.check()?;
-            let is_shown = |label: u32| granted(cases, fits).any(|claim| claim.label == label);
+            let is_shown = |label: u32| assigned(cases, fits).any(|claim| claim.label == label);
             let open = open(cases, fits, limit);
             for (k, a) in open.clone().enumerate() {
                 for b in open.clone().skip(k + 1).filter(|b| b.ray == a.ray) {
@@ -86,19 +86,19 @@ impl Run<'_> {
 
     /// The drift in the images of some rays, as far as the votes for all but some labels tell.
     fn drift_without(&self, labels: &[u32], rays: &[(usize, u32)]) -> Vec<PoseError> {
-        let legs = rays.iter().map(|(i, _)| self.leg_of[*i]);
-        let first = legs.clone().min().unwrap_or(0).saturating_sub(LEGS_AROUND);
-        let end = (legs.max().unwrap_or(0) + LEGS_AROUND + 1).min(self.starts_m.len());
-        let mut of_legs = self.of_legs[first..end].to_vec();
-        let from = self.leg_of.partition_point(|&leg| leg < first);
-        let to = self.leg_of.partition_point(|&leg| leg < end);
-        for (cases, leg) in self.images[from..to].iter().zip(&self.leg_of[from..to]) {
+        let segments = rays.iter().map(|(i, _)| self.segment_of[*i]);
+        let first = segments.clone().min().unwrap_or(0).saturating_sub(SEGMENTS_AROUND);
+        let end = (segments.max().unwrap_or(0) + SEGMENTS_AROUND + 1).min(self.starts_m.len());
+        let mut of_segments = self.of_segments[first..end].to_vec();
+        let from = self.segment_of.partition_point(|&segment| segment < first);
+        let to = self.segment_of.partition_point(|&segment| segment < end);
+        for (cases, segment) in self.images[from..to].iter().zip(&self.segment_of[from..to]) {
             let theirs = cases.iter().filter(|case| labels.contains(&case.claim.label));
-            of_legs[leg - first] = of_legs[leg - first].without(&belief_of_votes(theirs));
+            of_segments[segment - first] = of_segments[segment - first].without(&belief_of_votes(theirs));
         }
-        let smoothed = smooth(&self.starts_m[first..end], &of_legs);
+        let smoothed = smooth(&self.starts_m[first..end], &of_segments);
         let of_ray = |&(i, ray): &(usize, u32)| {
-            smoothed[self.leg_of[i] - first].pose_error(self.of.noise.shared(self.of.scene.view(ray)), Sigmas::NONE)
+            smoothed[self.segment_of[i] - first].pose_error(self.of.noise.shared(self.of.scene.view(ray)), Sigmas::NONE)
         };
         rays.iter().map(of_ray).collect()
     }

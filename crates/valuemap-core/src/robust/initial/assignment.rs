@@ -25,8 +25,8 @@ const HUBER_CHI2: f64 = 4.0;
 /// A detection that a label may have.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Claim {
-    /// The leg of the drive that the image was taken on.
-    pub(super) leg: u32,
+    /// The segment of the drive that the image was taken on.
+    pub(super) segment: u32,
     pub(super) image: u32,
     /// The label's number.
     pub(super) label: u32,
@@ -85,32 +85,32 @@ pub(super) fn belief_of_votes<'c>(cases: impl Iterator<Item = &'c Case<'c>>) -> 
 pub(super) struct Fit {
     /// Squared residual, and how much wider its distribution is than that of a label known exactly.
     pub(super) cost: f64,
-    pub(super) granted: bool,
+    pub(super) assigned: bool,
 }
 
 /// Judge the claims of one image, whose pose error is about known.
-pub(super) fn grant(cases: &[Case<'_>], limit: f64, pose: &PoseError) -> Vec<Fit> {
+pub(super) fn decide(cases: &[Case<'_>], limit: f64, pose: &PoseError) -> Vec<Fit> {
     let mut costs: Vec<f64> = cases.iter().map(|case| case.cost(pose)).collect();
     let contested: Vec<usize> = (0..cases.len()).filter(|&i| (0..cases.len()).any(|j| shares(cases, i, j))).collect();
     if contested.is_empty() {
-        return costs.into_iter().map(|cost| Fit { cost, granted: cost < limit }).collect();
+        return costs.into_iter().map(|cost| Fit { cost, assigned: cost < limit }).collect();
     }
-    let mut granted = assign(cases, &costs, limit);
+    let mut assigned = assign(cases, &costs, limit);
     for _ in 1..ROUNDS {
         for &i in &contested {
             let case = &cases[i];
-            let others = granted.iter().map(|&j| &cases[j]);
+            let others = assigned.iter().map(|&j| &cases[j]);
             let independent = others.filter(|o| o.claim.label != case.claim.label && o.claim.ray != case.claim.ray);
             let known = independent.fold(*pose, |pose, other| pose.after(&other.look, &other.own));
             costs[i] = case.cost(&known);
         }
         let again = assign(cases, &costs, limit);
-        if again == granted {
+        if again == assigned {
             break;
         }
-        granted = again;
+        assigned = again;
     }
-    (0..).zip(costs).map(|(i, cost)| Fit { cost, granted: granted.binary_search(&i).is_ok() }).collect()
+    (0..).zip(costs).map(|(i, cost)| Fit { cost, assigned: assigned.binary_search(&i).is_ok() }).collect()
 }
 
 /// Take the detections that a better label claims as well from labels that are overruled.
@@ -128,9 +128,9 @@ pub(super) fn overrule(cases: &[Case<'_>], fits: &mut [Fit], overruled: &FxHashS
     for &j in &out {
         costs[j] = f64::INFINITY;
     }
-    let granted = assign(cases, &costs, limit);
+    let assigned = assign(cases, &costs, limit);
     for (i, fit) in fits.iter_mut().enumerate() {
-        fit.granted = granted.binary_search(&i).is_ok();
+        fit.assigned = assigned.binary_search(&i).is_ok();
     }
 }
 
@@ -139,12 +139,12 @@ pub(super) fn open<'c>(cases: &'c [Case<'c>], fits: &'c [Fit], limit: f64) -> im
     cases.iter().zip(fits).filter(move |(_, fit)| fit.cost < limit).map(|(case, _)| case.claim)
 }
 
-/// The claims of one image that are granted, by label.
-pub(super) fn granted<'c>(cases: &'c [Case<'c>], fits: &'c [Fit]) -> impl Iterator<Item = &'c Claim> {
-    cases.iter().zip(fits).filter(|(_, fit)| fit.granted).map(|(case, _)| case.claim)
+/// The claims of one image that are assigned, by label.
+pub(super) fn assigned<'c>(cases: &'c [Case<'c>], fits: &'c [Fit]) -> impl Iterator<Item = &'c Claim> {
+    cases.iter().zip(fits).filter(|(_, fit)| fit.assigned).map(|(case, _)| case.claim)
 }
 
-/// Say which claims of one image are granted, and which labels it says nothing about; `votes_of` is how many votes a label
+/// Say which claims of one image are assigned, and which labels it says nothing about; `votes_of` is how many votes a label
 /// has, this image and others.
 pub(super) fn report(
     cases: &[Case<'_>],
@@ -154,9 +154,9 @@ pub(super) fn report(
     decisions: &mut Vec<Decision>,
 ) {
     let strength = |label: u32| (votes_of(label), std::cmp::Reverse(label));
-    let is_idle = |label: u32| !granted(cases, fits).any(|claim| claim.label == label);
+    let is_idle = |label: u32| !assigned(cases, fits).any(|claim| claim.label == label);
     let idle: Vec<&Claim> = open(cases, fits, limit).filter(|claim| is_idle(claim.label)).collect();
-    for &Claim { image, label, ray, .. } in granted(cases, fits) {
+    for &Claim { image, label, ray, .. } in assigned(cases, fits) {
         decisions.push(Decision::Vote { label, ray });
         if idle.iter().any(|other| other.ray == ray && strength(other.label) > strength(label)) {
             decisions.push(Decision::Undecided { label, image });
@@ -167,11 +167,11 @@ pub(super) fn report(
     }
 }
 
-/// The claims to grant, ascending: the assignment with the least sum of costs, where a detection without a label costs as
+/// The claims that are assigned, ascending: the assignment with the least sum of costs, where a detection without a label costs as
 /// much as one at the gate. Claims that have nothing to do with each other are assigned for themselves.
 fn assign(cases: &[Case<'_>], costs: &[f64], limit: f64) -> Vec<usize> {
     let mut open: Vec<usize> = (0..cases.len()).filter(|&i| costs[i] < limit).collect();
-    let mut granted = Vec::with_capacity(open.len());
+    let mut assigned = Vec::with_capacity(open.len());
     while let Some(first) = open.pop() {
         let mut tied = vec![first];
         let mut next = 0;
@@ -187,13 +187,13 @@ fn assign(cases: &[Case<'_>], costs: &[f64], limit: f64) -> Vec<usize> {
         }
         let is_one = |of: fn(&Claim) -> u32| tied.iter().all(|&i| of(cases[i].claim) == of(cases[first].claim));
         if is_one(|claim| claim.label) || is_one(|claim| claim.ray) {
-            granted.extend(tied.into_iter().min_by(|&i, &j| costs[i].total_cmp(&costs[j]).then(i.cmp(&j))));
+            assigned.extend(tied.into_iter().min_by(|&i, &j| costs[i].total_cmp(&costs[j]).then(i.cmp(&j))));
         } else {
-            granted.extend(assign_tied(cases, costs, limit, tied));
+            assigned.extend(assign_tied(cases, costs, limit, tied));
         }
     }
-    granted.sort_unstable();
-    granted
+    assigned.sort_unstable();
+    assigned
 }
 
 /// The assignment of claims of several labels for several detections.
@@ -219,11 +219,11 @@ fn assign_tied(cases: &[Case<'_>], costs: &[f64], limit: f64, open: Vec<usize>) 
         }
     }
     let (_, columns) = kuhn_munkres_min(&table);
-    let is_granted = |i: &usize| {
+    let is_assigned = |i: &usize| {
         let at = (rays.binary_search(&cases[*i].claim.ray), labels.binary_search(&cases[*i].claim.label));
         matches!(at, (Ok(row), Ok(column)) if columns[row] == column)
     };
-    open.into_iter().filter(is_granted).collect()
+    open.into_iter().filter(is_assigned).collect()
 }
 
 /// Whether two claims are for the same label or the same detection.

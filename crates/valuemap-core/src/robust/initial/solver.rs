@@ -1,4 +1,4 @@
-//! The court: labels compete for the rays, round after round, and those that probably do not exist are dropped.
+//! The solver: labels compete for the rays, round after round, and those that probably do not exist are dropped.
 
 use std::sync::{Arc, OnceLock};
 
@@ -11,7 +11,7 @@ use super::associate::Association;
 use super::existence::{self, Lookout, Looks, Rates, Sector};
 use super::gather::{VOTE_RANGE, gather};
 use super::label::{self, Label, fingerprint};
-use super::{Schedule, Tally, exchange, handover, settle};
+use super::{Schedule, Tally, exchange, settle, swap};
 use crate::progress::{Halt, Progress};
 use crate::robust::Settings;
 use crate::robust::index::RayIndex;
@@ -20,13 +20,13 @@ use crate::robust::noise::{Noise, Spread};
 use crate::robust::scene::Scene;
 
 /// Labels are dropped below these multiples of the probability that is asked for, one after the other, and then below that.
-const DOUBTS: [f64; 3] = [1e-5, 1e-2, 0.3];
+const PRUNED_BELOW: [f64; 3] = [1e-5, 1e-2, 0.3];
 
 /// Rounds of dropping and giving back at the end, at most.
-const MAX_DOUBT_ROUNDS: usize = 6;
+const MAX_PRUNE_ROUNDS: usize = 6;
 
 /// Where labels compete for the rays.
-pub(super) struct Court<'a> {
+pub(super) struct Solver<'a> {
     scene: &'a Scene,
     noise: &'a Noise,
     spreads: &'a [Spread],
@@ -38,7 +38,7 @@ pub(super) struct Court<'a> {
     seen_from: FxHashMap<(u64, u64), Arc<[Sector]>>,
 }
 
-impl<'a> Court<'a> {
+impl<'a> Solver<'a> {
     /// Begin with some rays (ascending) of a scene.
     pub(super) fn new(model: &'a Model<'a>, rays: impl Iterator<Item = u32>) -> Self {
         let Model { scene, noise, ref spreads, settings, .. } = *model;
@@ -57,7 +57,7 @@ impl<'a> Court<'a> {
     }
 
     /// Find labels among all rays, beginning with those that were found already.
-    pub(super) fn hold(
+    pub(super) fn solve(
         &mut self,
         begun: Vec<Label>,
         schedule: &Schedule,
@@ -65,7 +65,7 @@ impl<'a> Court<'a> {
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
         let mut labels = self.associate(begun, tally, progress)?;
-        // What a doubted label gives back, and what settled labels leave, may be seen more clearly now.
+        // What a pruned label gives back, and what settled labels leave, may be seen more clearly now.
         for _ in 0..schedule.sessions {
             let before = labels.len();
             let new = self.left_over(&labels, schedule.rounds, tally, progress)?;
@@ -75,12 +75,12 @@ impl<'a> Court<'a> {
             for _ in 0..schedule.rounds {
                 labels = self.settle(labels, true, tally, progress)?;
             }
-            labels = self.hand_over(labels, schedule.handovers, tally, progress)?.0;
-            labels = self.doubt(labels, is_raw, tally, progress)?;
+            labels = self.swap(labels, schedule.swaps, tally, progress)?.0;
+            labels = self.prune(labels, is_raw, tally, progress)?;
             let is_any;
-            (labels, is_any) = self.hand_over(labels, schedule.handovers, tally, progress)?;
+            (labels, is_any) = self.swap(labels, schedule.swaps, tally, progress)?;
             if is_any {
-                labels = self.doubt(labels, false, tally, progress)?;
+                labels = self.prune(labels, false, tally, progress)?;
             }
             if labels.len() <= before {
                 break;
@@ -107,9 +107,9 @@ impl<'a> Court<'a> {
         tally.nominations += nominations;
         tally.accepted += accepted;
         if !labels.is_empty() {
-            let mut annex = Court::new(self.model, free.into_iter());
+            let mut inner = Solver::new(self.model, free.into_iter());
             for _ in 0..rounds {
-                new = annex.settle(new, true, tally, progress)?;
+                new = inner.settle(new, true, tally, progress)?;
             }
             // Where others took what they might have had they were not missed.
             new.par_iter_mut().for_each(|label| {
@@ -156,8 +156,8 @@ impl<'a> Court<'a> {
         Ok(labels)
     }
 
-    /// Let neighbors hand over what the other one explains better, round after round; whether there was anything.
-    fn hand_over(
+    /// Let neighbors take over what the other one explains better, round after round; whether there was anything.
+    fn swap(
         &mut self,
         mut labels: Vec<Label>,
         rounds: usize,
@@ -166,7 +166,7 @@ impl<'a> Court<'a> {
     ) -> Result<(Vec<Label>, bool), Halt> {
         for round in 0..rounds {
             let is_any;
-            (labels, is_any) = handover::hand_over(&self.association, self.settings, labels);
+            (labels, is_any) = swap::swap_votes(&self.association, self.settings, labels);
             if !is_any {
                 return Ok((labels, round > 0));
             }
@@ -194,13 +194,13 @@ impl<'a> Court<'a> {
         let old = labels.len();
         labels.extend(new);
         let sectors = self.sectors(&labels);
-        let judgement = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.doubted);
+        let judgement = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.pruned);
         let before = labels.len();
         let admitted = labels.into_iter().zip(judgement.of_labels).enumerate();
         let admitted =
             admitted.filter(|(i, (_, (existence, _)))| *i < old || *existence >= self.settings.min_existence);
         let labels: Vec<Label> = admitted.map(|(_, (label, _))| label).collect();
-        tally.doubted += (before - labels.len()) as u64;
+        tally.pruned += (before - labels.len()) as u64;
         labels
     }
 
@@ -209,12 +209,12 @@ impl<'a> Court<'a> {
         let before = labels.len();
         let sectors = self.sectors(&labels);
         let of_label = |(label, sectors): (Label, Arc<[Sector]>)| {
-            let stray: Vec<Vector3<f64>> =
-                sectors.iter().filter(|sector| sector.is_stray()).map(|sector| sector.direction).collect();
-            if stray.is_empty() {
+            let clutter: Vec<Vector3<f64>> =
+                sectors.iter().filter(|sector| sector.is_clutter()).map(|sector| sector.direction).collect();
+            if clutter.is_empty() {
                 return Some((label, sectors));
             }
-            let unseen_from = [label.unseen_from.as_slice(), &stray].concat();
+            let unseen_from = [label.unseen_from.as_slice(), &clutter].concat();
             let label = Label { unseen_from: unseen_from.clone(), ..label };
             let seen = label.voters.iter().copied().filter(|&ray| label.faces(self.scene, ray)).collect();
             let start = label.estimate.point;
@@ -226,13 +226,13 @@ impl<'a> Court<'a> {
         };
         let (labels, sectors): (Vec<Label>, Vec<_>) =
             labels.into_par_iter().zip(sectors).filter_map(of_label).collect::<Vec<_>>().into_iter().unzip();
-        tally.doubted += (before - labels.len()) as u64;
+        tally.pruned += (before - labels.len()) as u64;
         (labels, sectors)
     }
 
     /// Drop the labels that probably do not exist, the least probable first: what they give back may be just what a doubtful
     /// one lacks.
-    fn doubt(
+    fn prune(
         &mut self,
         mut labels: Vec<Label>,
         is_raw: bool,
@@ -240,14 +240,14 @@ impl<'a> Court<'a> {
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
         if is_raw {
-            for doubt in DOUBTS {
-                labels = self.drop_below(doubt, labels, tally, progress)?;
+            for share in PRUNED_BELOW {
+                labels = self.drop_below(share, labels, tally, progress)?;
             }
         }
-        for _ in 0..MAX_DOUBT_ROUNDS {
-            let dropped = tally.doubted;
+        for _ in 0..MAX_PRUNE_ROUNDS {
+            let dropped = tally.pruned;
             labels = self.drop_below(1.0, labels, tally, progress)?;
-            if tally.doubted == dropped {
+            if tally.pruned == dropped {
                 break;
             }
         }
@@ -257,18 +257,18 @@ impl<'a> Court<'a> {
     /// Drop the labels that are less probable than a multiple of what is asked for, and let the others compete for their votes.
     fn drop_below(
         &mut self,
-        doubt: f64,
+        share: f64,
         labels: Vec<Label>,
         tally: &mut Tally,
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
         let (labels, sectors) = self.look_around(labels, tally);
-        let judgement = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.doubted);
+        let judgement = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.pruned);
         let before = labels.len();
         let judged = labels.into_iter().zip(judgement.of_labels);
-        let existing = judged.filter(|(_, (existence, _))| *existence >= doubt * self.settings.min_existence);
+        let existing = judged.filter(|(_, (existence, _))| *existence >= share * self.settings.min_existence);
         let labels: Vec<Label> = existing.map(|(label, _)| label).collect();
-        tally.doubted += (before - labels.len()) as u64;
+        tally.pruned += (before - labels.len()) as u64;
         if labels.len() == before { Ok(labels) } else { self.settle(labels, false, tally, progress) }
     }
 }
@@ -286,20 +286,20 @@ pub(super) fn judge(
     sectors: &[Arc<[Sector]>],
     labels: &[Label],
     settings: &Settings,
-    doubted: u64,
+    pruned: u64,
 ) -> Judgement {
     let looks: Vec<Vec<Looks>> = sectors.par_iter().map(|sectors| existence::looks_of(sectors.iter())).collect();
     let expected = sectors.iter().map(|sectors| sectors.iter().map(|sector| sector.expected).sum());
     let rates = Rates::learn(&looks);
     let claimed: usize = labels.iter().map(|label| label.voters.len()).sum();
-    let strays_per_image = (scene.rays.rays.len() - claimed) as f64 / scene.views.len() as f64;
+    let clutter_per_image = (scene.rays.rays.len() - claimed) as f64 / scene.views.len() as f64;
     let solid_angle =
         scene.frusta.iter().map(|frustum| frustum.solid_angle_sr).sum::<f64>() / scene.frusta.len() as f64;
-    let strays_per_sr = strays_per_image / solid_angle;
+    let clutter_per_sr = clutter_per_image / solid_angle;
     let chance: Vec<f64> = labels
         .par_iter()
-        .map(|label| existence::chance_of(label, scene, spreads, settings.gate_sigmas, strays_per_sr))
+        .map(|label| existence::chance_of(label, scene, spreads, settings.gate_sigmas, clutter_per_sr))
         .collect();
-    let existence = existence::probabilities(&looks, &rates, &chance, doubted);
+    let existence = existence::probabilities(&looks, &rates, &chance, pruned);
     Judgement { of_labels: existence.into_iter().zip(expected).collect() }
 }

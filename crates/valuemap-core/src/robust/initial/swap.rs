@@ -1,4 +1,4 @@
-//! Handover: which of two neighbors has the votes of some direction, or whether there is but one.
+//! Swaps: which of two neighbors has the votes of some direction, or whether there is but one.
 //!
 //! Where images show only one of two neighbors from some direction, the wrong one may have all that looks from there. Its
 //! position has then moved so that these votes fit, and the detections that it should have do not fit anywhere: no
@@ -29,9 +29,9 @@ const COMPANIONS: usize = 5;
 const AROUND_M: f64 = 25.0;
 /// Times that detections nobody has are gathered, without companions and with them.
 const GATHERINGS: (usize, usize) = (1, 2);
-/// Handovers that explain so much less without companions are not tried with them.
+/// Swaps that explain so much less without companions are not tried with them.
 const PROMISING: f64 = -30.0;
-/// A handover must explain so much more.
+/// A swap must explain so much more.
 const LEAST_GAIN: f64 = 10.0;
 /// For each image that shows the one with fewer votes, images that show both, at most, for them to be one object.
 const MOST_SHARED: f64 = 0.05;
@@ -40,10 +40,10 @@ const MOST_SHARED: f64 = 0.05;
 const MOST_LOST: f64 = 0.5;
 const MAYBE_LOST: f64 = 1.5;
 
-/// Make one of two neighbors, or hand over to the other what it explains better; whether there was anything. The nearest
+/// Make one of two neighbors, or give the other what it explains better; whether there was anything. The nearest
 /// pairs first, each label in one pair; other pairs once these are best as they are.
 #[must_use]
-pub fn hand_over(association: &Association<'_>, settings: &Settings, mut labels: Vec<Label>) -> (Vec<Label>, bool) {
+pub fn swap_votes(association: &Association<'_>, settings: &Settings, mut labels: Vec<Label>) -> (Vec<Label>, bool) {
     let is_open = |a: &Label, b: &Label| a.class == b.class && !a.known.satisfied.contains(&b.identity());
     loop {
         let pairs = nearest_pairs(&labels, PAIR_M, is_open);
@@ -91,7 +91,7 @@ struct Pair<'a> {
 }
 
 /// Votes (ascending) that one of the two has from about one direction, or all such votes.
-struct Handover {
+struct Swap {
     from: usize,
     rays: Vec<u32>,
 }
@@ -113,7 +113,7 @@ struct Sighting {
 impl Pair<'_> {
     /// What the two are better; nothing if they are best as they are.
     fn better(&self) -> Option<Vec<Label>> {
-        let [of_first, of_second] = [0, 1].map(|from| self.handovers(from));
+        let [of_first, of_second] = [0, 1].map(|from| self.swaps(from));
         let as_one = self.as_one();
         if of_first.is_empty() && of_second.is_empty() && as_one.is_none() {
             return None;
@@ -123,11 +123,11 @@ impl Pair<'_> {
         let gains = |voters: &[Vec<u32>; 2], least: f64| {
             self.explain(voters.clone(), &[]).is_some_and(|after| after.gain > alone.gain + least)
         };
-        let promising = |handovers: Vec<Handover>| -> Vec<Handover> {
-            handovers.into_iter().filter(|handover| gains(&self.after(&[handover]), PROMISING)).collect()
+        let promising = |swaps: Vec<Swap>| -> Vec<Swap> {
+            swaps.into_iter().filter(|swap| gains(&self.after(&[swap]), PROMISING)).collect()
         };
         let [of_first, of_second] = [of_first, of_second].map(promising);
-        let each = of_first.iter().chain(&of_second).map(|handover| self.after(&[handover]));
+        let each = of_first.iter().chain(&of_second).map(|swap| self.after(&[swap]));
         let both = of_first.iter().flat_map(|a| of_second.iter().map(|b| self.after(&[a, b])));
         let tried: Vec<[Vec<u32>; 2]> = each.chain(both).collect();
         let smaller = voters[0].len().min(voters[1].len()) as f64;
@@ -153,10 +153,10 @@ impl Pair<'_> {
         Some(vec![self.label(0, &best)?, self.label(1, &best)?])
     }
 
-    /// The votes of the two after some handovers.
-    fn after(&self, handovers: &[&Handover]) -> [Vec<u32>; 2] {
+    /// The votes of the two after some swaps.
+    fn after(&self, swaps: &[&Swap]) -> [Vec<u32>; 2] {
         let mut voters = self.labels.map(|label| label.voters.clone());
-        for Handover { from, rays } in handovers {
+        for Swap { from, rays } in swaps {
             voters[*from].retain(|ray| rays.binary_search(ray).is_err());
             voters[1 - from].extend(rays);
         }
@@ -178,11 +178,11 @@ impl Pair<'_> {
         (may_be_one && !self.settings.without.merge).then_some(voters)
     }
 
-    /// What one of the two might hand over: what looks from one direction, for each, or all that.
-    fn handovers(&self, from: usize) -> Vec<Handover> {
+    /// What one of the two might give away: what looks from one direction, for each, or all that.
+    fn swaps(&self, from: usize) -> Vec<Swap> {
         let sightings = self.sightings(from);
         let alone = || sightings.iter().filter(|sighting| !sighting.shows_both);
-        let mut handovers = Vec::new();
+        let mut swaps = Vec::new();
         for middle in sector_middles(alone().map(|sighting| sighting.direction)) {
             let is_there = |sighting: &&Sighting| middle.dot(&sighting.direction) >= SECTOR_COSINE;
             let mut rays: Vec<u32> = alone().filter(is_there).map(|sighting| sighting.ray).collect();
@@ -191,16 +191,16 @@ impl Pair<'_> {
             let share = |count: usize| count as f64 / rays.len() as f64;
             if rays.len() >= LEAST_ALONE && share(both) <= MOST_BOTH && share(claimed) >= CLAIMED_SHARE {
                 rays.sort_unstable();
-                handovers.push(Handover { from, rays });
+                swaps.push(Swap { from, rays });
             }
         }
-        if handovers.len() > 1 {
-            let mut rays: Vec<u32> = handovers.iter().flat_map(|handover| &handover.rays).copied().collect();
+        if swaps.len() > 1 {
+            let mut rays: Vec<u32> = swaps.iter().flat_map(|swap| &swap.rays).copied().collect();
             rays.sort_unstable();
             rays.dedup();
-            handovers.push(Handover { from, rays });
+            swaps.push(Swap { from, rays });
         }
-        handovers
+        swaps
     }
 
     fn sightings(&self, of: usize) -> Vec<Sighting> {
