@@ -19,6 +19,7 @@ from valuemap.notes import (
     cameras_not_upright,
     classes_spelled_alike,
     close_twins,
+    confused_classes,
     find_notes,
     implausible_size,
     no_labels,
@@ -65,6 +66,15 @@ def test_an_empty_map_is_told_and_nothing_else_of_it() -> None:
     assert len(told) == 1
     assert told[0].startswith("no object was found")
     assert no_labels(findings(sized(1.0))) is None
+
+
+def test_a_detector_that_confuses_classes_is_told() -> None:
+    result = with_votes([10, 20, 30, 10], [0, 0, 0, 1])
+    assert confused_classes(findings(result)) is None
+    assert confused_classes(findings(result, counts={"votes_of_another_class": 0})) is None
+    note = confused_classes(findings(result, counts={"votes_of_another_class": 1}))
+    assert note is not None
+    assert note.startswith("25.0 % of the votes are detections of another class")
 
 
 @pytest.mark.parametrize(("votes", "told"), [(2, "60 % of the detections belong to no label"), (3, None)])

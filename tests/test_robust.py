@@ -127,11 +127,13 @@ def test_a_detector_that_confuses_classes_makes_hardly_a_label_more() -> None:
     assert confusions["traffic_sign"]["traffic_light"] == pytest.approx(0.15, abs=0.05)
     # Twelve lights are too few to tell: they are confused like all objects.
     assert confusions["traffic_light"]["traffic_sign"] == pytest.approx(0.15, abs=0.05)
+    assert any("another class than their label's" in note for note in result.run["notes"])
     codes = dataset.detections.class_name.codes[
         np.searchsorted(dataset.detections.detection_id, result.votes.detection_id)
     ]
     of_label = result.labels.class_name.codes[np.searchsorted(result.labels.label_id, result.votes.label_id)]
     assert np.mean(codes != of_label) == pytest.approx(0.15, abs=0.05)
+    assert np.sum(codes != of_label) == result.run["counts"]["votes_of_another_class"]
 
 
 @pytest.fixture(scope="module")

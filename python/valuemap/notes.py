@@ -59,6 +59,17 @@ def unused_detections(findings: Findings) -> str | None:
     )
 
 
+def confused_classes(findings: Findings) -> str | None:
+    """Say that the detector takes objects of one class for others."""
+    confused, votes = findings.counts.get("votes_of_another_class", 0), len(findings.votes)
+    if not confused or not votes:
+        return None
+    return (
+        f"{100.0 * confused / votes:.1f} % of the votes are detections of another class than their label's: the "
+        "detector takes objects of one class for another (run.json: calibration, confusions)"
+    )
+
+
 def noise_at_bound(findings: Findings) -> str | None:
     """Say that the noise was estimated as large as it can be."""
     noise = findings.counts.get("noise")
@@ -130,7 +141,7 @@ def classes_spelled_alike(findings: Findings) -> str | None:
     if not alike:
         return None
     shown = " and ".join(repr(name) for name in alike[0])
-    return f"the classes {shown} differ in spelling only: detections of one never support labels of the other"
+    return f"the classes {shown} differ in spelling only: detections of one hardly support labels of the other"
 
 
 def cameras_not_upright(cosine_to_sky: Floats) -> str | None:
@@ -147,6 +158,7 @@ def cameras_not_upright(cosine_to_sky: Floats) -> str | None:
 NOTES: tuple[Callable[[Findings], str | None], ...] = (
     no_labels,
     unused_detections,
+    confused_classes,
     noise_at_bound,
     implausible_size,
     close_twins,

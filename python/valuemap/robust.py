@@ -110,6 +110,11 @@ class Scene:
         """The names of the classes, by code."""
         return self._dataset.detections.class_name.names
 
+    @property
+    def class_code(self) -> Ints:
+        """The class (N) that each detection is said to be of."""
+        return self._dataset.detections.class_name.codes.astype(np.int64)
+
     @cached_property
     def core(self) -> _core.Scene:
         """Everything that was seen, copied once."""
@@ -209,6 +214,9 @@ def find_labels(
             lambda done, _total: tell(done),
         )
     covariance = covariance.reshape(-1, 3, 3)
+    said = scene.class_code[voters.astype(np.int64)]
+    is_confused = said != np.repeat(class_code, np.diff(offsets))
+    counts = {"votes_of_another_class": int(is_confused.sum()), **counts}
     counts = {_COUNTED_AS.get(name, name): value for name, value in counts.items()}
     return Candidates(
         position, offsets, voters, None, covariance, existence, expected, class_code.astype(np.int64)
