@@ -176,6 +176,18 @@ def test_classes_that_are_spelled_alike_are_told() -> None:
     assert classes_spelled_alike(findings(map_of([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]], ["-", "+"]))) is None
 
 
+def test_heights_that_were_not_measured_are_told() -> None:
+    scene = random_scene(3, images=40, objects=6, clutter=10)
+    dataset = as_dataset(scene, passes=["one", "two"] * 20)
+    sigma_px = np.full(len(dataset.detections), np.nan)
+    plain = replace(dataset, detections=dataset.detections.replace(vertical_sigma_px=sigma_px))
+    assert build_map(plain).run["notes"] == []
+    stated = np.where(np.arange(len(sigma_px)) < 9, 800.0, np.nan)
+    bearings = replace(dataset, detections=dataset.detections.replace(vertical_sigma_px=stated))
+    (note,) = build_map(bearings).run["notes"]
+    assert note.startswith(f"9 of {len(sigma_px)} detections have a vertical_sigma_px")
+
+
 def test_quaternions_in_another_order_are_told() -> None:
     assert cameras_not_upright(np.array([1.0, 0.9, -0.2])) is None
     scene = random_scene(3, images=40, objects=6, clutter=10)

@@ -155,6 +155,17 @@ def cameras_not_upright(cosine_to_sky: Floats) -> str | None:
     )
 
 
+def heights_not_measured(vertical_sigma_px: Floats | None) -> str | None:
+    """Say that the map takes heights of detections (N standard deviations, NaN where none is stated) for measured."""
+    stated = 0 if vertical_sigma_px is None else int(np.isfinite(vertical_sigma_px).sum())
+    if not stated or vertical_sigma_px is None:
+        return None
+    return (
+        f"{stated} of {len(vertical_sigma_px)} detections have a vertical_sigma_px, which the map does not use: where "
+        "it is large the heights of labels mean nothing, and their positions are less sure than their covariances say"
+    )
+
+
 NOTES: tuple[Callable[[Findings], str | None], ...] = (
     no_labels,
     unused_detections,

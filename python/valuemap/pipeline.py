@@ -21,7 +21,7 @@ from valuemap.engine.threads import ThreadEngine
 from valuemap.errors import InputError
 from valuemap.map_folder import Map
 from valuemap.merge import merge_clusters
-from valuemap.notes import Findings, cameras_not_upright, find_notes
+from valuemap.notes import Findings, cameras_not_upright, find_notes, heights_not_measured
 from valuemap.partition import partition_images
 from valuemap.portions import rows_on_disk
 from valuemap.progress import Progress, silent
@@ -101,7 +101,7 @@ def build_map(
     if refined is not None and refined.is_corrected:
         result = replace(result, corrected=refined.dataset)
     result = _with_rejected(result, lambda: result.corrected or dataset, stages)
-    return _with_note(result, _note_on_poses(dataset))
+    return _with_notes(result, _notes_on_input(dataset))
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ def build_map_of_folder(
     images, detections = rows_on_disk(folder)
     stages = _Stages()
     refined: Refined | None = None
-    note: str | None = None
+    notes: list[str] = []
     threads = run.engine.threads_of_task(1)
     is_large = run.tile_size_m is not None or run.engine.needs_paths or images + detections > LARGEST_IN_MEMORY
     if config.method == "paper" or not is_large:
@@ -172,7 +172,7 @@ def build_map_of_folder(
         with stages.measured("order"):
             source: Source = InMemory(refined.dataset, config)
         size = {"images": len(dataset.images), "detections": len(dataset.detections)}
-        name, frame, note = dataset.name, dataset.frame, _note_on_poses(dataset)
+        name, frame, notes = dataset.name, dataset.frame, _notes_on_input(dataset)
     else:
         if images + detections <= MOST_CORRECTED and detections:
             refined = _refined(ensure_checked(held or read_dataset(folder)), config, stages, threads, progress)
@@ -192,9 +192,8 @@ def build_map_of_folder(
     result = _as_map(name, frame, size, passes, config, labels, votes, counts, stages, poses)
     if refined is not None and refined.is_corrected:
         result = replace(result, corrected=refined.dataset)
-    return _with_note(
-        _with_rejected(result, lambda: result.corrected or held or read_dataset(folder), stages), note
-    ), cells
+    result = _with_rejected(result, lambda: result.corrected or held or read_dataset(folder), stages)
+    return _with_notes(result, notes), cells
 
 
 def _refined(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, progress: Progress) -> Refined:
@@ -232,13 +231,15 @@ def _with_rejected(result: Map, read: Callable[[], Dataset], stages: _Stages) ->
     return replace(result, rejected=rejected, run={**result.run, "stages": stages.records})
 
 
-def _note_on_poses(dataset: Dataset) -> str | None:
-    return cameras_not_upright(-rotation_matrices(dataset.images)[:, 1] @ np.array(dataset.frame.up))
+def _notes_on_input(dataset: Dataset) -> list[str]:
+    cosine_to_sky = -rotation_matrices(dataset.images)[:, 1] @ np.array(dataset.frame.up)
+    notes = (cameras_not_upright(cosine_to_sky), heights_not_measured(dataset.detections.vertical_sigma_px))
+    return [note for note in notes if note is not None]
 
 
-def _with_note(result: Map, note: str | None) -> Map:
+def _with_notes(result: Map, notes: list[str]) -> Map:
     is_too_large = result.run.get("poses", {}).get("because") == _TOO_LARGE
-    notes = [text for text in (note, _NOTE_ON_SIZE if is_too_large else None) if text is not None]
+    notes = [*notes, *([_NOTE_ON_SIZE] if is_too_large else [])]
     return replace(result, run={**result.run, "notes": [*notes, *result.run["notes"]]}) if notes else result
 
 
