@@ -81,7 +81,9 @@ class Scene:
 _Noise = tuple[float, ...]
 _Settings = tuple[float, float, float, float, int, int, float, bool, bool]
 
-_Calibration = tuple[_Noise, bool, Sequence[Sequence[float] | None], Sequence[float], Sequence[Sequence[float]]]
+_Calibration = tuple[
+    _Noise, bool, Sequence[Sequence[float] | None], Sequence[float], Sequence[Sequence[tuple[int, float]]]
+]
 
 def calibrate(
     scene: Scene,

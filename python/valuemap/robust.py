@@ -62,7 +62,11 @@ class Calibration:
     def as_tuple(self, class_names: Sequence[str]) -> tuple[Any, ...]:
         """Return it as the core takes it, for classes in this order."""
         classes = [self.classes.get(name) for name in class_names]
-        shares = [[self.confusions.get(name, {}).get(said, 0.0) for said in class_names] for name in class_names]
+        code = {name: number for number, name in enumerate(class_names)}
+        shares = [
+            [(code[said], share) for said, share in self.confusions.get(name, {}).items() if said in code]
+            for name in class_names
+        ]
         return self.noise.as_tuple(), self.is_deep, classes, self.pooled, shares
 
 
@@ -167,13 +171,10 @@ def calibrate(
     )
 
 
-def _by_name(shares: Sequence[Sequence[float]], class_names: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Return the shares above 0 of a square table by the names of its rows and columns."""
-    by_name = {
-        name: {said: share for said, share in zip(class_names, row, strict=False) if share > 0.0}
-        for name, row in zip(class_names, shares, strict=False)
-    }
-    return {name: row for name, row in by_name.items() if row}
+def _by_name(shares: Sequence[Sequence[tuple[int, float]]], class_names: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Return the shares of other classes by names, of those classes that have any."""
+    rows = zip(class_names, shares, strict=False)
+    return {name: {class_names[said]: share for said, share in row} for name, row in rows if row}
 
 
 def misfit(

@@ -398,11 +398,11 @@ fn evidence_of_hostile_points() {
 #[test]
 fn labels_of_hostile_scenes() {
     let classes = vec(proptest::option::of(class_model()), 0..3);
-    let shares = vec(vec(0.0..=1.0_f64, 0..3), 0..3);
+    let shares = vec(vec((0..4_u32, 0.0..=1.0_f64), 0..3), 0..3);
     let cases = (columns(12), noise(), any::<bool>(), classes, class_model(), shares, settings());
     run("find", 200, &cases, |(columns, noise, is_deep, classes, pooled, shares, settings)| {
         let scene = columns.scene();
-        let confusions = Confusions::of_shares(&shares);
+        let confusions = Confusions::of_shares(shares.clone());
         let calibration = Calibration { noise, is_deep, classes, pooled, confusions, starts: 0 };
         let found = find(&scene, &calibration, &settings, &Progress::default()).unwrap();
         for finding in &found.findings {

@@ -59,8 +59,8 @@ fn what_is_taken_for_another_class_is_one_object_of_its_own() {
     let objects = objects();
     let scene = confused_street(&objects);
     let calibration = calibrated(&scene);
-    let shares = calibration.confusions.shares();
-    assert!((shares[0][1] - 1.0 / 7.0).abs() < 0.03 && shares[1][0] < 1e-12, "{shares:?}");
+    let share = |object, said| calibration.confusions.ln_share(object, said).exp();
+    assert!((share(0, 1) - 1.0 / 7.0).abs() < 0.03 && share(1, 0) < 1e-12, "{:?}", calibration.confusions);
 
     let map = found(&scene, &calibration);
     assert_eq!(map.len(), objects.len());
@@ -72,7 +72,7 @@ fn what_is_taken_for_another_class_is_one_object_of_its_own() {
         |finding: &&Finding| finding.votes.iter().any(|&ray| scene.rays.class[ray as usize] != finding.class);
     assert!(map.iter().filter(confused).count() > 15);
 
-    let without = found(&scene, &Calibration { confusions: Confusions::none(2), ..calibration });
+    let without = found(&scene, &Calibration { confusions: Confusions::default(), ..calibration });
     assert!(without.len() > objects.len(), "{}", without.len());
 }
 
@@ -80,9 +80,9 @@ fn what_is_taken_for_another_class_is_one_object_of_its_own() {
 fn classes_of_few_objects_are_confused_like_all_together() {
     let objects: Vec<(Vector3<f64>, u32)> =
         objects().into_iter().filter(|object| object.1 == 0 || object.0.x < 80.0).collect();
-    let shares = calibrated(&confused_street(&objects)).confusions.shares().to_vec();
-    let of_all = shares[1][0];
-    assert!((0.5 * shares[0][1]..shares[0][1]).contains(&of_all), "{shares:?}");
+    let confusions = calibrated(&confused_street(&objects)).confusions;
+    let share = |object, said| confusions.ln_share(object, said).exp();
+    assert!((0.5 * share(0, 1)..share(0, 1)).contains(&share(1, 0)), "{confusions:?}");
 }
 
 #[test]

@@ -144,7 +144,7 @@ proptest! {
         prop_assert!(ClassModel::from_row(&row[1..]).is_none());
         let mut other = Model::new(&scene, &DRIFTING, &SETTINGS);
         let own = other.classes[0];
-        other.know(&[None], model.pooled, &Confusions::none(1));
+        other.know(&[None], model.pooled, &Confusions::default());
         prop_assert_eq!(other.classes[0].ln_clutter_per_sr.to_bits(), own.ln_clutter_per_sr.to_bits());
         if model.pooled.is_learned {
             prop_assert_eq!(other.classes[0].rates, model.pooled.rates);

@@ -182,9 +182,9 @@ fn settings_of(
     Ok(Settings { viability, gate_sigmas, min_votes, least_votes, min_existence, without: Without { polish, merge } })
 }
 
-/// A calibration: the noise, whether all moves pay, numbers of each class where anything is known of it, those of all classes together, and the shares
-/// of the detections of each class that are said to be of each other.
-type CalibrationValues = (NoiseValues, bool, Vec<Option<Vec<f64>>>, Vec<f64>, Vec<Vec<f64>>);
+/// A calibration: the noise, whether all moves pay, numbers of each class where anything is known of it, those of all classes together, and, of
+/// the detections of each class, which others some are said to be of, with their shares.
+type CalibrationValues = (NoiseValues, bool, Vec<Option<Vec<f64>>>, Vec<f64>, Vec<Vec<(u32, f64)>>);
 
 fn calibration_of((noise, is_deep, classes, pooled, shares): CalibrationValues) -> PyResult<Calibration> {
     let of = |row: Vec<f64>| {
@@ -195,13 +195,13 @@ fn calibration_of((noise, is_deep, classes, pooled, shares): CalibrationValues) 
             PyValueError::new_err("calibration: expected as many numbers of a class as calibrate returns")
         })
     };
-    let is_share = |row: &Vec<f64>| row.iter().all(|share| (0.0..=1.0).contains(share));
+    let is_share = |row: &Vec<(u32, f64)>| row.iter().all(|(_, share)| (0.0..=1.0).contains(share));
     if !shares.iter().all(is_share) {
         return Err(PyValueError::new_err("calibration: expected shares of confused detections between 0 and 1"));
     }
     Ok(Calibration {
         starts: 0,
-        confusions: Confusions::of_shares(&shares),
+        confusions: Confusions::of_shares(shares),
         noise: noise_of(noise)?,
         is_deep,
         classes: classes.into_iter().map(|row| row.map(of).transpose()).collect::<PyResult<_>>()?,

@@ -3,6 +3,8 @@
 //! A detector gives an object one box. Where boxes of another class lie in an object's gate more often in images in which its own class missed it than in
 //! those in which it did not, they are its own. What stands beside it is there in both.
 
+use std::collections::BTreeMap;
+
 use super::assign::places_of;
 use super::energy::Object;
 use super::index::RayIndex;
@@ -10,69 +12,48 @@ use super::learn::MIN_VOTES;
 use super::looks::Lookout;
 use super::model::Model;
 
-/// The shares of the detections of objects of each class that are said to be of each class.
-#[derive(Debug, Clone, PartialEq)]
+/// Of the detections of objects of each class, the shares that are said to be of other classes: few of all pairs of classes.
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Confusions {
-    /// By class of the object and said class; of what is said to be what it is, 0.
-    shares: Vec<Vec<f64>>,
-    /// Logarithms, by class of the object and said class; minus infinity where it never is.
-    ln_share: Vec<f64>,
+    /// By class of the object: said class, ascending, with its share.
+    shares: Vec<Vec<(u32, f64)>>,
+    /// Logarithm of what is left of each class: said to be what it is.
+    ln_right: Vec<f64>,
     is_any: bool,
 }
 
 /// What objects of one class tell, each of which counts as one: neighbors stay where they are from image to image.
+#[derive(Default, Clone)]
 struct Tally {
     objects: f64,
     /// Votes of all.
     votes: f64,
     /// By said class: boxes in place of votes, beyond those that stand beside it; and their squares, object by object.
-    instead: Vec<f64>,
-    squares: Vec<f64>,
+    instead: BTreeMap<u32, (f64, f64)>,
     /// The same of all classes together.
     of_any: (f64, f64),
 }
 
 impl Confusions {
-    /// No class is taken for another one.
+    /// From the said classes of each class and their shares; those of classes beyond are what they are said to be.
     #[must_use]
-    pub fn none(classes: usize) -> Self {
-        Self::of_shares(&vec![Vec::new(); classes])
-    }
-
-    /// From the shares of each class, by class of the object and said class; what is left of each is said to be what it is. Shares that are not
-    /// there are 0.
-    #[must_use]
-    pub fn of_shares(shares: &[Vec<f64>]) -> Self {
-        let classes = shares.len();
-        let mut ln_share = vec![f64::NEG_INFINITY; classes * classes];
-        let of = |class: usize, said: usize| {
-            if class == said { 0.0 } else { shares[class].get(said).copied().unwrap_or(0.0) }
-        };
-        let shares: Vec<Vec<f64>> =
-            (0..classes).map(|class| (0..classes).map(|said| of(class, said)).collect()).collect();
-        for (class, of_class) in shares.iter().enumerate() {
-            for (said, &share) in of_class.iter().enumerate().filter(|(_, share)| **share > 0.0) {
-                ln_share[class * classes + said] = share.ln();
-            }
-            let right = 1.0 - of_class.iter().sum::<f64>();
-            ln_share[class * classes + class] = right.max(f64::MIN_POSITIVE).ln();
+    pub fn of_shares(shares: Vec<Vec<(u32, f64)>>) -> Self {
+        let mut shares = shares;
+        for (class, row) in (0..).zip(&mut shares) {
+            row.retain(|&(said, share)| said != class && share > 0.0);
+            row.sort_unstable_by_key(|&(said, _)| said);
+            row.dedup_by_key(|&mut (said, _)| said);
         }
-        let is_any = shares.iter().flatten().any(|share| *share > 0.0);
-        Self { shares, ln_share, is_any }
+        let right = |row: &Vec<(u32, f64)>| 1.0 - row.iter().map(|(_, share)| share).sum::<f64>();
+        let ln_right = shares.iter().map(|row| right(row).max(f64::MIN_POSITIVE).ln()).collect();
+        let is_any = shares.iter().any(|row| !row.is_empty());
+        Self { shares, ln_right, is_any }
     }
 
     /// What [`of_shares`](Self::of_shares) took.
     #[must_use]
-    pub fn shares(&self) -> &[Vec<f64>] {
+    pub fn shares(&self) -> &[Vec<(u32, f64)>] {
         &self.shares
-    }
-
-    /// The same among the first of so many classes: others are what they are said to be.
-    #[must_use]
-    pub fn among(&self, classes: usize) -> Self {
-        let mut shares = self.shares.clone();
-        shares.resize(classes, Vec::new());
-        Self::of_shares(&shares)
     }
 
     /// Whether any class is taken for another one.
@@ -85,7 +66,11 @@ impl Confusions {
     #[inline]
     #[must_use]
     pub fn ln_share(&self, class: u32, said: u32) -> f64 {
-        self.ln_share[class as usize * self.shares.len() + said as usize]
+        if class == said {
+            return self.ln_right.get(class as usize).copied().unwrap_or(0.0);
+        }
+        let row = self.shares.get(class as usize).map_or(&[][..], Vec::as_slice);
+        row.binary_search_by_key(&said, |&(said, _)| said).map_or(f64::NEG_INFINITY, |place| row[place].1.ln())
     }
 
     /// Whether an object of a class is ever taken for one of another.
@@ -103,18 +88,16 @@ impl Confusions {
         if !self.is_any {
             return Some(first);
         }
-        let mut counts = vec![0.0; self.shares.len()];
-        std::iter::once(first).chain(said).for_each(|said| counts[said as usize] += 1.0);
-        let ln_likelihood = |class: u32| -> f64 {
-            let said = (0..).zip(&counts).filter(|(_, count)| **count > 0.0);
-            said.map(|(said, count)| count * self.ln_share(class, said)).sum()
+        let mut all: Vec<u32> = std::iter::once(first).chain(said).collect();
+        all.sort_unstable();
+        let counts: Vec<(u32, f64)> = all.chunk_by(|a, b| a == b).map(|same| (same[0], same.len() as f64)).collect();
+        let ln_likelihood =
+            |class: u32| -> f64 { counts.iter().map(|&(said, count)| count * self.ln_share(class, said)).sum() };
+        // An object is at times said to be what it is. Of what no class explains, most are right.
+        let likelier = |a: &(u32, f64), b: &(u32, f64)| {
+            ln_likelihood(a.0).total_cmp(&ln_likelihood(b.0)).then(a.1.total_cmp(&b.1)).then(b.0.cmp(&a.0))
         };
-        // Of what no class explains, most are right.
-        let by_likelihood = |a: &u32, b: &u32| {
-            let [of_a, of_b] = [*a, *b].map(|class| (ln_likelihood(class), counts[class as usize]));
-            of_a.0.total_cmp(&of_b.0).then(of_a.1.total_cmp(&of_b.1)).then(b.cmp(a))
-        };
-        (0..self.shares.len() as u32).max_by(by_likelihood)
+        counts.iter().copied().max_by(likelier).map(|(class, _)| class)
     }
 
     /// Learn them from a map: those that are more than chance by as many standard deviations as a gate has. Of classes of so few objects that
@@ -122,8 +105,7 @@ impl Confusions {
     #[must_use]
     pub fn learn(model: &Model<'_>, lookout: &Lookout, index: &RayIndex<'_>, objects: &[Object]) -> Self {
         let sigmas = model.settings.gate_sigmas;
-        let classes = model.classes.len();
-        let mut tallies: Vec<Tally> = (0..classes).map(|_| Tally::new(classes)).collect();
+        let mut tallies: Vec<Tally> = vec![Tally::default(); model.classes.len()];
         let is_sure = |object: &&Object| object.votes.len() >= MIN_VOTES && object.real > 0.5;
         for object in objects.iter().filter(is_sure) {
             tallies[object.class as usize].count(model, lookout, index, object);
@@ -132,16 +114,19 @@ impl Confusions {
         let instead: f64 = tallies.iter().map(|tally| tally.of_any.0).sum();
         let squares: f64 = tallies.iter().map(|tally| tally.of_any.1).sum();
         let pooled = if is_more(instead, squares, sigmas) { instead / (votes + instead) } else { 0.0 };
-        let of_class = |(class, tally): (usize, &Tally)| {
-            if tally.objects >= sigmas * sigmas {
+        let seen: Vec<(u32, f64)> =
+            (0..).zip(&tallies).map(|(class, tally)| (class, tally.votes)).filter(|(_, votes)| *votes > 0.0).collect();
+        let of_class = |tally: &Tally| -> Vec<(u32, f64)> {
+            if tally.objects >= sigmas * sigmas || !(tally.objects > 0.0 && pooled > 0.0) {
                 return tally.shares(sigmas);
             }
-            let others: f64 = votes - tally.votes;
-            let share =
-                |(said, of_said): (usize, &Tally)| if said == class { 0.0 } else { pooled * of_said.votes / others };
-            tallies.iter().enumerate().map(share).map(|share| if share.is_finite() { share } else { 0.0 }).collect()
+            let others = votes - tally.votes;
+            seen.iter()
+                .map(|&(said, of_said)| (said, pooled * of_said / others))
+                .filter(|row| row.1.is_finite())
+                .collect()
         };
-        Self::of_shares(&tallies.iter().enumerate().map(of_class).collect::<Vec<_>>())
+        Self::of_shares(tallies.iter().map(of_class).collect())
     }
 }
 
@@ -151,10 +136,6 @@ fn is_more(sum: f64, squares: f64, sigmas: f64) -> bool {
 }
 
 impl Tally {
-    fn new(classes: usize) -> Self {
-        Self { objects: 0.0, votes: 0.0, instead: vec![0.0; classes], squares: vec![0.0; classes], of_any: (0.0, 0.0) }
-    }
-
     fn count(&mut self, model: &Model<'_>, lookout: &Lookout, index: &RayIndex<'_>, object: &Object) {
         let scene = model.scene;
         let image = |ray: u32| scene.rays.image[ray as usize];
@@ -170,9 +151,9 @@ impl Tally {
         said.dedup();
         let instead = |of_class: &[(u32, u32)]| {
             let beside = of_class.iter().filter(|(_, image)| voting.binary_search(image).is_ok()).count() as f64;
-            (of_class[0].0 as usize, of_class.len() as f64 - beside - beside * missing / votes)
+            (of_class[0].0, of_class.len() as f64 - beside - beside * missing / votes)
         };
-        let instead: Vec<(usize, f64)> = said.chunk_by(|a, b| a.0 == b.0).map(instead).collect();
+        let instead: Vec<(u32, f64)> = said.chunk_by(|a, b| a.0 == b.0).map(instead).collect();
         // What most boxes take for something else is something else.
         if instead.iter().any(|(_, instead)| *instead > votes) {
             return;
@@ -182,17 +163,17 @@ impl Tally {
         let any: f64 = instead.iter().map(|(_, instead)| instead).sum();
         self.of_any = (self.of_any.0 + any, self.of_any.1 + any * any);
         for (said, instead) in instead {
-            self.instead[said] += instead;
-            self.squares[said] += instead * instead;
+            let sums = self.instead.entry(said).or_default();
+            *sums = (sums.0 + instead, sums.1 + instead * instead);
         }
     }
 
-    /// The share of each class among the detections of the objects of one.
-    fn shares(&self, sigmas: f64) -> Vec<f64> {
-        let more = |(&instead, &squares): (&f64, &f64)| if is_more(instead, squares, sigmas) { instead } else { 0.0 };
-        let more: Vec<f64> = self.instead.iter().zip(&self.squares).map(more).collect();
-        let all = self.votes + more.iter().sum::<f64>();
-        more.into_iter().map(|more| more / all.max(1.0)).collect()
+    /// The said classes of the objects of one, and their shares of its detections.
+    fn shares(&self, sigmas: f64) -> Vec<(u32, f64)> {
+        let more = self.instead.iter().filter(|(_, (instead, squares))| is_more(*instead, *squares, sigmas));
+        let more: Vec<(u32, f64)> = more.map(|(&said, &(instead, _))| (said, instead)).collect();
+        let all = self.votes + more.iter().map(|(_, more)| more).sum::<f64>();
+        more.into_iter().map(|(said, more)| (said, more / all)).collect()
     }
 }
 
@@ -202,7 +183,7 @@ mod tests {
 
     /// A third of what is of class 0 is said to be of class 1.
     fn confused() -> Confusions {
-        Confusions::of_shares(&[vec![0.0, 1.0 / 3.0], Vec::new(), Vec::new()])
+        Confusions::of_shares(vec![vec![(1, 1.0 / 3.0), (0, 0.5), (2, 0.0)], Vec::new()])
     }
 
     #[test]
@@ -211,17 +192,17 @@ mod tests {
         assert_eq!(confused().likeliest([1, 1, 1].into_iter()), Some(1));
         assert_eq!(confused().likeliest([2, 0, 2].into_iter()), Some(2));
         assert_eq!(confused().likeliest(std::iter::empty()), None);
-        assert_eq!(Confusions::none(3).likeliest([1, 0, 0].into_iter()), Some(1));
+        assert_eq!(Confusions::default().likeliest([1, 0, 0].into_iter()), Some(1));
     }
 
     #[test]
     fn shares_are_those_that_are_stored() {
         let confused = confused();
+        assert_eq!(confused.shares(), [vec![(1, 1.0 / 3.0)], Vec::new()]);
         assert!(confused.is_any() && confused.may_be(0, 1) && !confused.may_be(1, 0) && confused.may_be(1, 1));
         assert!((confused.ln_share(0, 0) - (2.0_f64 / 3.0).ln()).abs() < 1e-12);
-        assert_eq!(Confusions::of_shares(confused.shares()), confused);
-        let more = confused.among(4);
-        assert!(more.may_be(0, 1) && more.ln_share(3, 3).abs() < 1e-12 && !more.may_be(3, 0));
-        assert!(!Confusions::none(2).is_any() && Confusions::none(2).ln_share(1, 1).abs() < 1e-300);
+        assert!(confused.ln_share(9, 9).abs() < 1e-300 && !confused.may_be(9, 0));
+        assert_eq!(Confusions::of_shares(confused.shares().to_vec()), confused);
+        assert!(!Confusions::default().is_any() && Confusions::default().ln_share(1, 1).abs() < 1e-300);
     }
 }

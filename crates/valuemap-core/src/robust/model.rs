@@ -278,7 +278,7 @@ impl<'a> Model<'a> {
             ClassModel::guess(scene, settings, rays.len(), mean_and_sd(&angles))
         };
         let all = || usable.iter().map(|&ray| ray as usize);
-        let classes: Vec<ClassModel> =
+        let classes =
             (0..count as u32).map(|class| of(all().filter(|&ray| scene.rays.class[ray] == class).collect())).collect();
         let pooled = of(all().collect());
         let up = up_of(scene);
@@ -292,7 +292,7 @@ impl<'a> Model<'a> {
             ln_angle,
             sin_elevation,
             usable: usable.len(),
-            confusions: Confusions::none(classes.len()),
+            confusions: Confusions::default(),
             classes,
             pooled,
             settings,
@@ -302,7 +302,7 @@ impl<'a> Model<'a> {
     /// Take what is known of the classes; those that nothing is known of are like all together, but for their clutter and the angles of their boxes.
     pub fn know(&mut self, classes: &[Option<ClassModel>], pooled: ClassModel, confusions: &Confusions) {
         self.pooled = pooled;
-        self.confusions = confusions.among(self.classes.len());
+        self.confusions = confusions.clone();
         for (class, own) in self.classes.iter_mut().enumerate() {
             *own = classes.get(class).copied().flatten().unwrap_or_else(|| pooled.with_own(own));
         }
