@@ -15,7 +15,7 @@ from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
 from valuemap import pipeline
 from valuemap.cameras import rotation_matrices
 from valuemap.cli.commands import app
-from valuemap.dataset import Dataset
+from valuemap.dataset import Dataset, ensure_checked
 from valuemap.drives import find_drives
 from valuemap.errors import InputError
 from valuemap.evidence import Evidence
@@ -439,3 +439,16 @@ def test_an_update_is_one_run_where_poses_are_corrected(tmp_path: Path, monkeypa
     # What it is compared with is where the corrected poses put it.
     changes = read_table(Changes, tmp_path / "map2" / "changes.parquet")
     assert changes.change.texts() == ["unchanged"] * len(STAYS)
+
+
+def test_joined_dataset_need_not_be_checked_again(years: Path) -> None:
+    first, second = (valuemap.read_dataset(years / name) for name in ("first", "second"))
+    joined = join_datasets(first, second)
+    assert ensure_checked(joined) is joined
+    # What is not looked at again would have been found right, and not changed.
+    again = ensure_checked(replace(joined))
+    assert again is not joined
+    for name in ("cameras", "images", "detections"):
+        assert table_to_arrow(getattr(again, name)).equals(table_to_arrow(getattr(joined, name)))
+    # What was made by hand was never checked: nor is what it became a part of.
+    assert ensure_checked(by_hand := join_datasets(replace(first), second)) is not by_hand

@@ -166,6 +166,16 @@ def ensure_checked(dataset: Dataset) -> Dataset:
     return check_dataset(dataset, source=dataset.name)
 
 
+def checked_as(dataset: Dataset, *parts: Dataset) -> Dataset:
+    """Return a dataset whose rows are those of others, which refer to each other as they did there.
+
+    If these are checked it is too, and is not checked again.
+    """
+    if all(part in _CHECKED for part in parts):
+        _CHECKED.add(dataset)
+    return dataset
+
+
 def read_dataset(path: str | Path, *, are_boxes_checked: bool = True) -> Dataset:
     """Read and check a dataset folder; without `are_boxes_checked` boxes may be anywhere, for those who ask why.
 
@@ -427,8 +437,9 @@ def check_images(images: Images, cameras: Cameras, source: str) -> Images:
 
 def _check_names(images: Images, source: str) -> None:
     """Refuse names that lead out of the folder of the pictures: they are opened by them."""
-    leads_out = pc.match_substring_regex(images.name, _LEADS_OUT).to_pylist()
-    if True in leads_out:
+    found = pc.match_substring_regex(images.name, _LEADS_OUT)
+    if pc.any(found).as_py():
+        leads_out = found.to_pylist()
         row = leads_out.index(True)
         raise InputError(
             f"{source}/images.parquet, row with image_id {images.image_id[row]}: name: expected a path in the folder "

@@ -346,9 +346,9 @@ def _vehicles(shots: _Shots) -> tuple[Ints, Ints, int]:
     given_of_stream[stream] = shots.given
     if not len(i):
         return shots.given, exposure, 0
-    rig_of_stream = _connected(stream[i], stream[j], streams)
+    rig_of_stream = connected(stream[i], stream[j], streams)
     exposure = _expose_together(clock, stream, rig_of_stream, exposure)
-    given = _connected(shots.given[i], shots.given[j], int(shots.given.max()) + 1)
+    given = connected(shots.given[i], shots.given[j], int(shots.given.max()) + 1)
     on_rig = np.bincount(rig_of_stream, minlength=streams)
     return _by_first(given[shots.given]), exposure, int(np.sum(on_rig > 1))
 
@@ -479,7 +479,7 @@ def _expose_together(clock: Floats, stream: Ints, rig_of_stream: Ints, exposure:
     return exposure
 
 
-def _connected(a: Ints, b: Ints, count: int) -> Ints:
+def connected(a: Ints, b: Ints, count: int) -> Ints:
     """Return the lowest member (count) of the connected group of each of `count` things, of which pairs are one."""
     lowest = np.arange(count)
     a, b = np.unique(np.stack([a, b]), axis=1)
@@ -955,6 +955,12 @@ class InOrder:
     drives: Drives
     image_id: Ints
     detection_id: Ints
+
+    @cached_property
+    def first_detection(self) -> Ints:
+        """The first detection (row) of each image (N), and behind the last one how many there are (N + 1)."""
+        count = np.bincount(self.dataset.detections.image_id, minlength=len(self.dataset.images))
+        return np.concatenate([[0], np.cumsum(count)])
 
 
 def driving_order(images: Images, drives: Drives) -> Ints:

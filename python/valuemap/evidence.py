@@ -12,21 +12,18 @@ import stat
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from valuemap.cameras import Rays, camera_centers, cast_rays, colmap_camera, rotation_matrices
 from valuemap.dataset import MARKER, Dataset, number_passes, rows_of
 from valuemap.drives import find_drives
 from valuemap.errors import InputError
 from valuemap.map_folder import Map
+from valuemap.nearby import Nearby
 from valuemap.tables import Bools, Floats, Ints
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 
 PICTURES = "images"
 """The folder of a dataset that holds its pictures, where it has some."""
@@ -296,21 +293,19 @@ class Evidence:
         """Return the rows of the images taken within a distance of a point, ascending."""
         place = self.dataset.frame.east_north() @ point_in_world_m
         # What is near is near from above: looking there first costs nothing in a map of a whole city.
-        rows = np.array(sorted(self._plan.query_ball_point(place, radius_m * _ROUNDING)), dtype=np.int64)
+        rows = np.sort(self._plan.pairs(place[None], radius_m * _ROUNDING)[1])
         away = self.center_in_world_m[rows] - point_in_world_m
         distance = self._horizontal_m(away) if horizontally else np.linalg.norm(away, axis=1)
         return rows[distance <= radius_m]
 
     def nearest_image(self, point_in_world_m: Floats) -> int:
         """Return the row of the image that was taken nearest to a point, seen from above."""
-        return int(self._plan.query(self.dataset.frame.east_north() @ point_in_world_m)[1])
+        return int(np.argmin(self._horizontal_m(self.center_in_world_m - point_in_world_m)))
 
     @cached_property
-    def _plan(self) -> cKDTree:
+    def _plan(self) -> Nearby:
         """An index of the images by where they were taken, seen from above."""
-        from scipy.spatial import cKDTree  # Slow to import, and only clicks need it.
-
-        return cKDTree(self.center_in_world_m @ self.dataset.frame.east_north().T)
+        return Nearby(self.center_in_world_m @ self.dataset.frame.east_north().T)
 
     def project(self, image_row: Ints, point_in_world_m: Floats) -> Floats:
         """Return where points, one (3) or one per image (N, 3), are in images, px (N, 2); NaN behind the camera."""

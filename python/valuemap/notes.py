@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from valuemap.config import MapConfig
+from valuemap.nearby import Nearby
 from valuemap.tables import Floats, Labels, Votes
 
 _UNUSED_SHARE = 0.5
@@ -186,8 +186,9 @@ def _twins(labels: Labels) -> list[tuple[int, int]]:
     if len(labels) < 2 or not largest_m > 0.0:
         return []
     reach_m = _TWIN_SIGMAS * math.sqrt(2.0) * largest_m
-    pairs = cKDTree(labels.position_in_world_m).query_pairs(reach_m, output_type="ndarray")
-    pairs = pairs[labels.class_name.codes[pairs[:, 0]] == labels.class_name.codes[pairs[:, 1]]]
+    place_m, code = labels.position_in_world_m, labels.class_name.codes
+    pairs = np.stack(Nearby(place_m).pairs(place_m, reach_m), axis=1)
+    pairs = pairs[(pairs[:, 0] < pairs[:, 1]) & (code[pairs[:, 0]] == code[pairs[:, 1]])]
     away_m = labels.position_in_world_m[pairs[:, 0]] - labels.position_in_world_m[pairs[:, 1]]
     both = covariance[pairs[:, 0]] + covariance[pairs[:, 1]]
     squared_sigmas = np.einsum("ni,nij,nj->n", away_m, np.linalg.pinv(both), away_m)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 import valuemap._core as _core
 from valuemap.cameras import Rays, cast_rays
@@ -245,7 +245,7 @@ def _labels_there(evidence: Evidence, left: _LeftOver, found: Candidates) -> tup
     )
     spread = labels.covariance_m2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     names = left.dataset.detections.class_name.take(found.voters[found.voter_offsets[:-1]].astype(np.int64))
-    near = cKDTree(labels.position_in_world_m).query_ball_point(found.position_in_world_m, _SAME_PLACE_M)
+    near = scipy.spatial.cKDTree(labels.position_in_world_m).query_ball_point(found.position_in_world_m, _SAME_PLACE_M)
     for row, rows in enumerate(near):
         if not rows:
             continue

@@ -15,10 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import sparse
-from scipy.linalg import cho_factor, cho_solve
-from scipy.linalg.lapack import dpbtrf, dtbtrs
-from scipy.sparse.linalg import splu
+import scipy
 
 from valuemap.refine.residuals import (
     Linearised,
@@ -73,7 +70,7 @@ class Groups:
         begins = np.flatnonzero(starts)
         self.row = order[begins]
         pointers = np.append(begins, len(order))
-        self.members = sparse.csr_array((np.ones(len(order)), order, pointers), shape=(len(begins), len(order)))
+        self.members = scipy.sparse.csr_array((np.ones(len(order)), order, pointers), shape=(len(begins), len(order)))
 
     def sum(self, values: Floats) -> Floats:
         """Return the sums (M, ...) of values (N, ...)."""
@@ -231,7 +228,7 @@ class Adjustment:
             gain += float(left @ left)
             for place, columns in drives.parts:
                 left[place] -= solved[place, : len(columns)] @ step[columns]
-            moved, _ = dtbtrs(factor, left[:, None], uplo=b"L", trans=b"T")
+            moved, _ = scipy.linalg.lapack.dtbtrs(factor, left[:, None], uplo=b"L", trans=b"T")
             drift[drives.nodes] += moved.reshape(-1, 6)
         points = state.point_in_world_m + np.clip(step[: 3 * self.things].reshape(-1, 3), -_LONGEST_M, _LONGEST_M)
         constants = []
@@ -276,10 +273,10 @@ class Adjustment:
         np.add.at(cross, drives.at_constants, of_constants[drives.rows_of_constants].ravel())
         right = cross.reshape(drives.width + 1, 6 * count).T
         right[:, -1] = gradient.ravel()
-        factor, failed = dpbtrf(band, lower=1, overwrite_ab=1)
+        factor, failed = scipy.linalg.lapack.dpbtrf(band, lower=1, overwrite_ab=1)
         if failed:
             raise np.linalg.LinAlgError("the information of drift is not positive definite")
-        solved, _ = dtbtrs(factor, right, uplo=b"L", overwrite_b=1)
+        solved, _ = scipy.linalg.lapack.dtbtrs(factor, right, uplo=b"L", overwrite_b=1)
         for rows, columns in drives.parts:
             own = solved[rows, : len(columns)]
             system.take_block(columns, own.T @ own, own.T @ solved[rows, -1])
@@ -375,15 +372,17 @@ class _System:
     def solve(self, first: int | None) -> tuple[Floats, Floats | None]:
         """Return the solution, and the covariance of the columns from `first` on."""
         if self.matrix is not None:
-            factor = cho_factor(self.matrix[:-1, :-1], lower=True, overwrite_a=True, check_finite=False)
-            solution = cho_solve(factor, self.right, check_finite=False)
+            factor = scipy.linalg.cho_factor(self.matrix[:-1, :-1], lower=True, overwrite_a=True, check_finite=False)
+            solution = scipy.linalg.cho_solve(factor, self.right, check_finite=False)
             if first is None:
                 return solution, None
             # The factor of what is left once the objects are eliminated is its lower right corner.
             corner = factor[0][first:, first:]
-            return solution, cho_solve((corner, True), np.eye(len(corner)), check_finite=False)
+            return solution, scipy.linalg.cho_solve((corner, True), np.eye(len(corner)), check_finite=False)
         values, rows, columns = (np.concatenate(part) for part in zip(*self.entries, strict=True))
-        sparse_factor = splu(sparse.csc_matrix((values, (rows, columns)), shape=(self.columns, self.columns)))
+        sparse_factor = scipy.sparse.linalg.splu(
+            scipy.sparse.csc_matrix((values, (rows, columns)), shape=(self.columns, self.columns))
+        )
         solution = np.asarray(sparse_factor.solve(self.right))
         if first is None:
             return solution, None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from valuemap.cameras import Rays, camera_poses, cast_rays, colmap_camera, rotation_of
 from valuemap.dataset import Dataset, rows_of
@@ -125,7 +125,7 @@ class Motion:
 
 def with_poses(images: Images, rotation: Floats, center: Floats) -> Images:
     """Return images with other poses as `camera_poses` gives them: rotations into cameras (N, 3, 3), centres (N, 3)."""
-    quat = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
+    quat = scipy.spatial.transform.Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
     return images.replace(
         cam_from_world_quat=quat, cam_from_world_m=-np.einsum("nij,nj->ni", rotation_of(quat), center)
     )

@@ -20,8 +20,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
+import scipy
 
 from valuemap.refine.landmarks import Landmarks
 from valuemap.tables import Floats, Ints
@@ -90,7 +89,7 @@ def togetherness(landmarks: Landmarks, covariance: Floats, shift_m: Floats) -> f
     `covariance` (N, 3, 3), m², is that of the landmarks. Which are around is told before they are moved.
     """
     point, size = landmarks.point_in_world_m, np.where(landmarks.size_m > 0.0, landmarks.size_m, np.nan)
-    a, b = cKDTree(point[:, :2]).query_pairs(_AROUND_M, output_type="ndarray").T
+    a, b = scipy.spatial.cKDTree(point[:, :2]).query_pairs(_AROUND_M, output_type="ndarray").T
     fits = (landmarks.drive[a] != landmarks.drive[b]) & (landmarks.class_code[a] == landmarks.class_code[b])
     fits &= ~(np.abs(np.log(size[a] / size[b])) > math.log(_SAME_SIZE))
     a, b = a[fits], b[fits]
@@ -109,7 +108,7 @@ def _order_of_laying(point: Floats, by_drive: list[Ints]) -> list[int]:
     """Return the drives, the one with most landmarks first, then always one that meets most of what is known."""
     if not by_drive:
         return []
-    tree = [cKDTree(point[rows]) for rows in by_drive]
+    tree = [scipy.spatial.cKDTree(point[rows]) for rows in by_drive]
     met = np.array([[int(a.count_neighbors(b, _REACH_M)) if a is not b else 0 for b in tree] for a in tree])
     seen = (met > 0) * np.array([len(rows) for rows in by_drive])[:, None]
     left = set(range(len(by_drive)))
@@ -173,7 +172,8 @@ def _lay(rows: Ints, point: Floats, covariance: Floats, shift: Floats, thing: In
     objects, place, spread = known.alive()
     near: list[list[int]]
     if len(objects):
-        near = list(cKDTree(place[:, :2]).query_ball_point(point[rows, :2], _AROUND_M, return_sorted=True))  # type: ignore[arg-type]
+        tree = scipy.spatial.cKDTree(place[:, :2])
+        near = list(tree.query_ball_point(point[rows, :2], _AROUND_M, return_sorted=True))  # type: ignore[arg-type]
     else:
         near = [[] for _ in rows]
     pairs = _compatible(rows, near, objects, known)
@@ -284,7 +284,7 @@ def _match(
         cost = np.full((len(ours), len(theirs) + len(ours)), 1e6)
         cost[i, j] = square
         cost[np.arange(len(ours)), len(theirs) + np.arange(len(ours))] = _GATE2
-        for a, b in zip(*linear_sum_assignment(cost), strict=True):
+        for a, b in zip(*scipy.optimize.linear_sum_assignment(cost), strict=True):
             if b < len(theirs):
                 row = int(rows[ours[a]])
                 thing[row] = int(objects[theirs[b]])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from valuemap.refine.adjust import Groups
 from valuemap.refine.footage import Footage, Sigmas
@@ -34,7 +34,7 @@ def associate(
     if not len(state.point_in_world_m):
         return np.empty(0, np.int64), np.empty(0, np.int64)
     images = len(footage.row)
-    tree = cKDTree(footage.center_in_world_m)
+    tree = scipy.spatial.cKDTree(footage.center_in_world_m)
     near: list[list[int]] = list(tree.query_ball_point(state.point_in_world_m, range_m, return_sorted=True))  # type: ignore[arg-type]
     by_image: list[list[int]] = [[] for _ in range(images)]
     for k, found in enumerate(near):
@@ -81,7 +81,7 @@ def merge_objects(seen: Observations, state: State, image: Ints, class_code: Int
     """Return the new number (K) of each object: those in one place that no image shows together are one."""
     count = len(state.point_in_world_m)
     number = np.arange(count)
-    pairs = cKDTree(state.point_in_world_m).query_pairs(_ONE_M, output_type="ndarray")
+    pairs = scipy.spatial.cKDTree(state.point_in_world_m).query_pairs(_ONE_M, output_type="ndarray")
     if not len(pairs):
         return number
     shows = [set(image[rows].tolist()) for rows in _rows_of(seen.thing, count)]
@@ -108,7 +108,7 @@ def unresolved_share(seen: Observations, state: State, class_code: Ints) -> floa
     no image, are one that the drives do not agree about. What is seen from different sides are two faces.
     """
     count = len(state.point_in_world_m)
-    pairs = cKDTree(state.point_in_world_m).query_pairs(_BESIDE_M, output_type="ndarray")
+    pairs = scipy.spatial.cKDTree(state.point_in_world_m).query_pairs(_BESIDE_M, output_type="ndarray")
     pairs = pairs[class_code[pairs[:, 0]] == class_code[pairs[:, 1]]]
     shows = [set(seen.image[rows].tolist()) for rows in _rows_of(seen.thing, count)]
     toward = state.point_in_world_m[seen.thing] - corrected(seen.views, state).center_in_world_m[seen.image]

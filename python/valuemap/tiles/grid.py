@@ -80,7 +80,10 @@ class Grid:
 
     def on_ground(self, point_in_world_m: Floats) -> Floats:
         """Return the places (N, 2) of points (N, 3) on the ground."""
-        return np.asarray(point_in_world_m @ np.array(self.east_north).T)
+        across = np.array(self.east_north)
+        if np.count_nonzero(across) == 2 and np.all(across.max(axis=1) == 1.0):  # Two axes of the frame, as usual.
+            return np.ascontiguousarray(point_in_world_m[:, across.argmax(axis=1)])
+        return np.asarray(point_in_world_m @ across.T)
 
     def images_on_ground(self, images: Images) -> Floats:
         """Return the places (N, 2) of images on the ground."""

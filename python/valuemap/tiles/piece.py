@@ -16,9 +16,8 @@ def piece_of_rows(ordered: InOrder, rows: Ints) -> InOrder:
     Drives and viewpoints are numbered anew, in their order: what else is in the data must not matter.
     """
     images, detections = ordered.dataset.images, ordered.dataset.detections
-    # The detections are in the order of their images, whose ids are their rows.
-    first, end = (np.searchsorted(detections.image_id, rows, side=side) for side in ("left", "right"))
-    count = end - first
+    first = ordered.first_detection[rows]
+    count = ordered.first_detection[rows + 1] - first
     detection_rows = np.repeat(first - (np.cumsum(count) - count), count) + np.arange(int(count.sum()))
     drives, cameras = ordered.drives, ordered.dataset.cameras
     return InOrder(
@@ -34,12 +33,17 @@ def piece_of_rows(ordered: InOrder, rows: Ints) -> InOrder:
             rejected=None,
         ),
         Drives(
-            pass_code=np.unique(drives.pass_code[rows], return_inverse=True)[1],
+            pass_code=_numbered(drives.pass_code[rows]),
             order=drives.order[rows],
             driven_m=drives.driven_m[rows],
-            viewpoint=np.unique(drives.viewpoint[rows], return_inverse=True)[1],
+            viewpoint=_numbered(drives.viewpoint[rows]),
             record={},
         ),
         ordered.image_id[rows],
         ordered.detection_id[detection_rows],
     )
+
+
+def _numbered(ascending: Ints) -> Ints:
+    """Return numbers (N) that ascend, without gaps and from 0."""
+    return np.concatenate([[0], np.cumsum(np.diff(ascending) != 0)])[: len(ascending)]

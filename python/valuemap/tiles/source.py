@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
+import pyarrow as pa
 
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
@@ -52,7 +54,10 @@ class InMemory:
         self.grid: Grid = Grid.of(dataset.frame, max_range_m)
         self._ordered = in_driving_order(dataset, viewpoint_step_m=max_range_m * VIEWPOINT_SHARE)
         self.drives_record: dict[str, Any] = self._ordered.drives.record
-        images, detections = self._ordered.dataset.images, self._ordered.dataset.detections
+        # Nothing that comes after looks at names, as there are none of pieces on disk.
+        images = self._ordered.dataset.images.replace(name=pa.repeat("", len(dataset.images)))
+        self._ordered = replace(self._ordered, dataset=replace(self._ordered.dataset, images=images))
+        detections = self._ordered.dataset.detections
         self._place_m = self.grid.images_on_ground(images)
         self._census = Census.of(self.grid, self._place_m, np.bincount(detections.image_id, minlength=len(images)))
         self.cells: list[Cell] = self._census.cells(self.grid)

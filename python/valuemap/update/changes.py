@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+import scipy
 
 from valuemap.dataset import rows_of
+from valuemap.drives import connected
+from valuemap.nearby import Nearby
 from valuemap.tables import Bools, Categories, Changes, Floats, IdBridge, Ints, Labels, Votes
 from valuemap.update.looks import Looks
 
@@ -77,27 +76,34 @@ def match_places(old: Labels, new: Labels) -> Ints:
         return before
     codes = {name: code for code, name in enumerate(old.class_name.names)}
     code = np.array([codes.get(name, -1) for name in new.class_name.names])[new.class_name.codes]
-    tree = cKDTree(old.position_in_world_m)
-    near = [tree.query_ball_point(place, MOVED_WITHIN_M) for place in new.position_in_world_m]
-    i = np.concatenate([np.array(others, np.int64) for others in near])
-    j = np.repeat(np.arange(len(new)), [len(others) for others in near])
+    j, i = Nearby(old.position_in_world_m).pairs(new.position_in_world_m, MOVED_WITHIN_M)
     same = old.class_name.codes[i] == code[j]
     i, j = i[same], j[same]
     gain = SAME_PLACE_CHI2 - _apart(old, i, new, j)
     i, j, gain = i[gain >= 0.0], j[gain >= 0.0], gain[gain >= 0.0]
+    if not len(i):
+        return before
     # What has nothing to do with each other is paired by itself.
-    graph = coo_array((np.ones(len(i)), (i, len(old) + j)), shape=(len(old) + len(new),) * 2)
-    group = connected_components(graph, directed=False)[1][i]
+    group = connected(i, len(old) + j, len(old) + len(new))[i]
     order = np.lexsort((j, i, group))
     for pairs in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
         rows, row = np.unique(i[pairs], return_inverse=True)
         columns, column = np.unique(j[pairs], return_inverse=True)
         table = np.full((len(rows), len(columns)), -np.inf)
         table[row, column] = gain[pairs]
-        for first, second in zip(*linear_sum_assignment(np.maximum(table, -1.0), maximize=True), strict=True):
+        for first, second in zip(*_likeliest(np.maximum(table, -1.0)), strict=True):
             if table[first, second] >= 0.0:
                 before[columns[second]] = rows[first]
     return before
+
+
+def _likeliest(gain: Floats) -> tuple[Ints, Ints]:
+    """Return the rows and columns of the pairs whose gains (N, M) have the largest sum; each is of one pair."""
+    if min(gain.shape) > 1:
+        row, column = scipy.optimize.linear_sum_assignment(gain, maximize=True)
+        return row, column
+    best = np.unravel_index([int(np.argmax(gain))], gain.shape)  # Of most there is one: SciPy is slow to import.
+    return best[0], best[1]
 
 
 def judge(
@@ -145,13 +151,11 @@ def _pairs(position_m: Floats, code: list[int], fresh: list[int], gone: list[int
     """Return pairs of new and gone labels of one class that are near each other, the nearest first."""
     if not fresh or not gone:
         return []
-    tree = cKDTree(position_m[gone])
-    near = [tree.query_ball_point(position_m[row], MOVED_WITHIN_M) for row in fresh]
+    near = Nearby(position_m[gone]).pairs(position_m[fresh], MOVED_WITHIN_M)
     found = [
-        (float(np.linalg.norm(position_m[row] - position_m[gone[i]])), row, gone[i])
-        for row, others in zip(fresh, near, strict=True)
-        for i in others
-        if code[row] == code[gone[i]]
+        (float(np.linalg.norm(position_m[fresh[j]] - position_m[gone[i]])), fresh[j], gone[i])
+        for j, i in zip(*(rows.tolist() for rows in near), strict=True)
+        if code[fresh[j]] == code[gone[i]]
     ]
     pairs: list[tuple[int, int]] = []
     for _, row, source in sorted(found):

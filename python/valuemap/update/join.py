@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from valuemap.dataset import Dataset
+from valuemap.dataset import Dataset, checked_as
 from valuemap.errors import InputError
 from valuemap.tables import Categories, Floats, Ints, Table, join_tables
 
@@ -31,6 +31,7 @@ def join_datasets(first: Dataset, second: Dataset) -> Dataset:
             f"{second.frame.to_json()}",
             hint="import it again with the same origin",
         )
+    given = first
     cameras = second.cameras.replace(camera_id=_beyond(second.cameras.camera_id, first.cameras.camera_id))
     images = second.images.replace(
         image_id=_beyond(second.images.image_id, first.images.image_id),
@@ -45,7 +46,7 @@ def join_datasets(first: Dataset, second: Dataset) -> Dataset:
         detection_id=_beyond(second.detections.detection_id, first.detections.detection_id),
         image_id=_renumbered(second.detections.image_id, second.images.image_id, images.image_id),
     )
-    return replace(
+    joined = replace(
         first,
         cameras=_joined(first.cameras, cameras),
         images=_joined(first.images, images),
@@ -54,6 +55,7 @@ def join_datasets(first: Dataset, second: Dataset) -> Dataset:
         truth_detections=None,
         rejected=None,
     )
+    return checked_as(joined, given, second)
 
 
 def _joined(first: T, second: T) -> T:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig
@@ -16,6 +15,7 @@ from valuemap.drives import find_drives
 from valuemap.errors import InputError
 from valuemap.evidence import Evidence, find_dataset
 from valuemap.map_folder import BRIDGE, CELLS, CHANGES, DATASET, Map, read_map
+from valuemap.nearby import Nearby
 from valuemap.pipeline import Run, build_map_of_folder
 from valuemap.progress import Progress, counted, silent
 from valuemap.rejected import rejected_of_map
@@ -111,11 +111,12 @@ def compare(
     def judged(rows: _Rows) -> tuple[Verdicts, dict[int, tuple[Looks, Looks]], float]:
         return _judged(rows, before, rebuilt, alone, joined, center_m, is_new, progress)
 
-    rows = _Rows.of(before, rebuilt, alone)
+    matches = _Matches.of(before, rebuilt, alone)
+    rows = _Rows.of(before, rebuilt, alone, matches)
     verdicts, looks, hidden = judged(rows)
     # Where nothing has changed, the map of all the data is right: it knows more than each epoch alone.
     while len(unchanged := rows.unchanged(verdicts)):
-        rows = _Rows.of(before, rebuilt, alone, whole=np.concatenate([rows.whole, unchanged]))
+        rows = _Rows.of(before, rebuilt, alone, matches, whole=np.concatenate([rows.whole, unchanged]))
         verdicts, looks, hidden = judged(rows)
     # What only the added passes have, and all the data do not, is there only if it explains what is gone, or was put up
     # since: then the looks from before that speak against it are those of drives that could not see it yet.
@@ -151,8 +152,8 @@ def _judged(
     """Return what became of labels, how both epochs looked at those that were asked for, and the share of drives that
     are blind to an object.
     """
-    near = cKDTree(center_m[is_new]).query(rows.labels.position_in_world_m)[0]
-    is_asked = np.asarray(near <= _settings(before).vote.max_range_m) | (rows.before < 0)
+    is_near = Nearby(center_m[is_new]).have_any(rows.labels.position_in_world_m, _settings(before).vote.max_range_m)
+    is_asked = is_near | (rows.before < 0)
     # What an epoch alone has elsewhere is no sight of this object.
     looked = _without_claimed(rows, is_asked, before, alone, joined, is_new)
     lookout = _lookout(replace(rebuilt, labels=rows.labels, votes=looked), is_asked, joined, center_m, is_new)
@@ -204,6 +205,26 @@ def _map_alone(joined: Dataset, images_before: Ints, before: Map, run: Run, prog
 
 
 @dataclass(frozen=True, eq=False)
+class _Matches:
+    """The label (row) before that each of the rebuilt map is by its votes, `old`, with how many are `common` (N).
+
+    `fresh` (N) is the one of the added passes alone, `same` (M) that before which stands where each of these does; -1
+    where there is none.
+    """
+
+    old: Ints
+    common: Ints
+    fresh: Ints
+    same: Ints
+
+    @classmethod
+    def of(cls, before: Map, rebuilt: Map, alone: Map) -> _Matches:
+        old, common = match_labels(before.labels, before.votes, rebuilt.labels, rebuilt.votes)
+        fresh, _ = match_labels(alone.labels, alone.votes, rebuilt.labels, rebuilt.votes)
+        return cls(old, common, fresh, match_places(before.labels, alone.labels))
+
+
+@dataclass(frozen=True, eq=False)
 class _Rows:
     """All labels (N) that are judged: of the rebuilt map, then of the added passes alone, then of the map before.
 
@@ -224,12 +245,10 @@ class _Rows:
     whole: Ints
 
     @classmethod
-    def of(cls, before: Map, rebuilt: Map, alone: Map, whole: Ints | None = None) -> _Rows:
+    def of(cls, before: Map, rebuilt: Map, alone: Map, matches: _Matches, whole: Ints | None = None) -> _Rows:
         whole = np.empty(0, np.int64) if whole is None else whole
         labels, votes = rebuilt.labels.replace(state=None), rebuilt.votes
-        old, common = match_labels(before.labels, before.votes, labels, votes)
-        fresh, _ = match_labels(alone.labels, alone.votes, labels, votes)
-        same = match_places(before.labels, alone.labels)
+        old, common, fresh, same = matches.old, matches.common, matches.fresh, matches.same
         partner = np.where(fresh >= 0, same[fresh], -1)
         # One label of what stood here before and of what stands there now.
         mixed = (old >= 0) & (fresh >= 0) & (partner < 0) & ~np.isin(old, same)
@@ -314,7 +333,7 @@ def _lookout(asked: Map, is_asked: Bools, joined: Dataset, center_m: Floats, is_
     low_m, high_m = place_m[is_asked].min(axis=0, initial=np.inf), place_m[is_asked].max(axis=0, initial=-np.inf)
     near = np.flatnonzero(np.all((center_m >= low_m - farthest_m) & (center_m <= high_m + farthest_m), axis=1))
     if len(near):
-        near = near[cKDTree(place_m[is_asked]).query(center_m[near])[0] <= farthest_m]
+        near = near[Nearby(place_m[is_asked]).have_any(center_m[near], farthest_m)]
     # Whole passes, since an order is told by all of it.
     of_passes = np.flatnonzero(np.isin(images.pass_id.codes, images.pass_id.codes[near]))
     max_range_m = _settings(asked).vote.max_range_m
