@@ -107,17 +107,12 @@ class Scene:
     def __init__(self, dataset: Dataset, drives: Drives, rays: Rays) -> None:
         self._dataset = dataset
         self._drives = drives
-        self._rays = rays
+        self.rays = rays
 
     @property
     def class_names(self) -> Sequence[str]:
         """The names of the classes, by code."""
         return self._dataset.detections.class_name.names
-
-    @property
-    def class_code(self) -> Ints:
-        """The class (N) that each detection is said to be of."""
-        return self._dataset.detections.class_name.codes.astype(np.int64)
 
     @cached_property
     def core(self) -> _core.Scene:
@@ -126,7 +121,7 @@ class Scene:
         normals, solid_angle_sr = picture_bounds(self._dataset.cameras)
         cam_from_world, center_in_world_m = camera_poses(images)
         return _core.Scene(
-            self._rays.core,
+            self.rays.core,
             box_px=np.ascontiguousarray(detections.size_px[:, 1]),
             score=_or_nan(detections.score, len(detections)),
             range_m=_or_nan(detections.range_m, len(detections)),
@@ -215,7 +210,7 @@ def find_labels(
             lambda done, _total: tell(done),
         )
     covariance = covariance.reshape(-1, 3, 3)
-    said = scene.class_code[voters.astype(np.int64)]
+    said = scene.rays.class_code[voters.astype(np.int64)]
     is_confused = said != np.repeat(class_code, np.diff(offsets))
     counts = {"votes_of_another_class": int(is_confused.sum()), **counts}
     counts = {_COUNTED_AS.get(name, name): value for name, value in counts.items()}

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use super::assign::places_of;
 use super::energy::Object;
 use super::index::RayIndex;
-use super::learn::MIN_VOTES;
+use super::learn::is_sure;
 use super::looks::Lookout;
 use super::model::Model;
 
@@ -37,8 +37,7 @@ struct Tally {
 impl Confusions {
     /// From the said classes of each class and their shares; those of classes beyond are what they are said to be.
     #[must_use]
-    pub fn of_shares(shares: Vec<Vec<(u32, f64)>>) -> Self {
-        let mut shares = shares;
+    pub fn of_shares(mut shares: Vec<Vec<(u32, f64)>>) -> Self {
         for (class, row) in (0..).zip(&mut shares) {
             row.retain(|&(said, share)| said != class && share > 0.0);
             row.sort_unstable_by_key(|&(said, _)| said);
@@ -106,8 +105,7 @@ impl Confusions {
     pub fn learn(model: &Model<'_>, lookout: &Lookout, index: &RayIndex<'_>, objects: &[Object]) -> Self {
         let sigmas = model.settings.gate_sigmas;
         let mut tallies: Vec<Tally> = vec![Tally::default(); model.classes.len()];
-        let is_sure = |object: &&Object| object.votes.len() >= MIN_VOTES && object.real > 0.5;
-        for object in objects.iter().filter(is_sure) {
+        for object in objects.iter().filter(|object| is_sure(object)) {
             tallies[object.class as usize].count(model, lookout, index, object);
         }
         let votes: f64 = tallies.iter().map(|tally| tally.votes).sum();

@@ -12,13 +12,13 @@ use super::seen::Looks;
 /// Steps of expectation and maximisation: some ten change the rates by less than a thousandth.
 const STEPS: usize = 20;
 /// Objects with fewer votes do not serve.
-pub const MIN_VOTES: usize = 6;
+const MIN_VOTES: usize = 6;
 /// The part of the votes that is nearer than what counts as seen from everywhere.
 const NEAR_VOTES: f64 = 0.05;
 /// Fewer of these tell nothing, and what was thought before stays.
 const MIN_OBJECTS: usize = 5;
 /// Rates of fewer looks are known worse than to a tenth.
-const LEAST_LOOKS: f64 = 30.0;
+pub(super) const LEAST_LOOKS: f64 = 30.0;
 /// The median absolute deviation of a normal distribution, in standard deviations.
 const MAD_OF_NORMAL: f64 = 0.6745;
 /// A spread of sizes is no smaller: boxes are whole pixels, and edges are not the same all around.
@@ -80,9 +80,8 @@ impl<'a> Evidence<'a> {
         let of = |column: &[f64], rays: &[u32]| rays.iter().map(|&ray| column[ray as usize]).collect::<Vec<f64>>();
         learned.score_ratio = score_ratio(&of(&model.scene.score, &in_class), &of(&model.scene.score, &clutter));
         learned.clutter_by_elevation = elevation_factor(&of(&model.sin_elevation, &clutter), self.looked_at);
-        let has_many = |object: &&Object| object.votes.len() >= MIN_VOTES;
-        let many: Vec<&Object> = of_class.iter().copied().filter(has_many).collect();
-        let sure: Vec<&Object> = many.iter().copied().filter(|object| object.real > 0.5).collect();
+        let many: Vec<&Object> = of_class.iter().copied().filter(|object| has_many(object)).collect();
+        let sure: Vec<&Object> = many.iter().copied().filter(|object| is_sure(object)).collect();
         if sure.len() >= MIN_OBJECTS {
             learned.is_learned = true;
             (learned.rates, learned.odd_passes) = rates(&many, before);
@@ -104,9 +103,19 @@ impl<'a> Evidence<'a> {
     }
 }
 
+/// Whether an object has enough votes to serve.
+fn has_many(object: &Object) -> bool {
+    object.votes.len() >= MIN_VOTES
+}
+
+/// Whether it has, and is real rather than false.
+pub(super) fn is_sure(object: &Object) -> bool {
+    has_many(object) && object.real > 0.5
+}
+
 /// The ground from which objects are seen, m²: as far from the cameras as all but few votes are; nothing where nobody knows what is up.
 fn ground_m2(model: &Model<'_>, objects: &[Object]) -> f64 {
-    let sure: Vec<&Object> = objects.iter().filter(|object| object.votes.len() >= MIN_VOTES).collect();
+    let sure: Vec<&Object> = objects.iter().filter(|object| has_many(object)).collect();
     let mut distances = distances_m(model, &sure);
     let place = (distances.len() as f64 * (1.0 - NEAR_VOTES)) as usize;
     match model.up {

@@ -2,14 +2,12 @@
 
 use super::clutter::{BINS, Steps};
 use super::energy::Object;
+use super::learn::LEAST_LOOKS;
 use super::looks::Lookout;
 use super::model::Model;
 
 /// Objects that tell, at most: a share of some thousand looks is known to 1 %.
 const MOST_OBJECTS: usize = 400;
-
-/// A share of as many looks is known to a tenth.
-const FEW_LOOKS: f64 = 30.0;
 
 /// The share of the looks at sure objects that are hits, by distance up to `farthest_m`, over that where it is largest.
 #[must_use]
@@ -29,7 +27,7 @@ pub fn reach(model: &Model<'_>, lookout: &Lookout, sure: &[&Object], farthest_m:
 /// does not make all others rare.
 fn by_distance(hits: &[f64; BINS], looks: &[f64; BINS], farthest_m: f64) -> Steps {
     let share = hits.iter().sum::<f64>() / looks.iter().sum::<f64>();
-    let shares: [f64; BINS] = std::array::from_fn(|bin| (hits[bin] + FEW_LOOKS * share) / (looks[bin] + FEW_LOOKS));
+    let shares: [f64; BINS] = std::array::from_fn(|bin| (hits[bin] + LEAST_LOOKS * share) / (looks[bin] + LEAST_LOOKS));
     let largest = shares.iter().copied().fold(0.0, f64::max);
     if largest > 0.0 { Steps::even(farthest_m, shares.map(|share| share / largest)) } else { Steps::ONE }
 }
