@@ -78,7 +78,7 @@ def compare_maps(city: Path, folder: Path, on_ray: tuple[str, ...]) -> dict[str,
     ]
     counts = json.loads((outs[1] / "run.json").read_text(encoding="utf-8"))["counts"]
     size = {name: counts[name] for name in ("images", "detections", "labels")}
-    cells = len(list((outs[1] / "cells").glob("*.parquet")))
+    cells = len(list((outs[1] / "cells").glob("*.arrow")))
     return {**size, "cells": cells, "identical": digest(outs[0]) == digest(outs[1]), **beside(took)}
 
 

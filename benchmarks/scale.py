@@ -224,7 +224,7 @@ def killed(command: tuple[str, ...], out: Path) -> dict[str, Any]:
             shutil.rmtree(again)
             continue
         work = again.with_name(f"{again.name}.work")
-        killed_at.append([round(after_s, 1), len(list(work.glob("cells/*.parquet")))])
+        killed_at.append([round(after_s, 1), len(list(work.glob("cells/*.arrow")))])
         subprocess.run(program(*options), check=True, capture_output=True)
         identical += contents(again) == expected
         assert not work.exists()
@@ -250,7 +250,7 @@ def update(arguments: argparse.Namespace) -> dict[str, Any]:
         full, _ = timed("map", both, "--out", str(folder / "full"), *SET)
         again, _ = timed("map", both, "--out", str(folder / "rebuilt"), *SET, *calibration)
         known, cells = (
-            {path.name for path in (folder / each / "cells").glob("*.parquet")} for each in ("map", "updated")
+            {path.name for path in (folder / each / "cells").glob("*.arrow")} for each in ("map", "updated")
         )
         updated, rebuilt = (labels_of(folder / each) for each in ("updated", "rebuilt"))
     return {

@@ -40,7 +40,7 @@ def finish(process: subprocess.Popen[str]) -> tuple[int, str]:
 
 
 def parts(work: Path) -> list[Path]:
-    return list(work.glob("cells/*.parquet"))
+    return list(work.glob("cells/*.arrow"))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM that a process can hear")
@@ -66,7 +66,7 @@ def test_a_terminated_run_says_so_in_one_line_and_goes_on(street: Path, tmp_path
 
 
 # What an update has made when it is killed: the data as one, a cell, and what is new alone.
-MOMENTS = ("dataset/detections.parquet", "cells/*.parquet", "added/detections.parquet")
+MOMENTS = ("dataset/detections.parquet", "cells/*.arrow", "added/detections.parquet")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")

@@ -137,7 +137,7 @@ def test_what_is_in_a_store_is_not_made_again(
     assert len(cut) == 1
     # Without --resume nothing of it is taken.
     (UrlPath(url) / MARKER).write_bytes(b"{}")
-    (UrlPath(url) / "cells" / "left.parquet").write_bytes(b"of another run")
+    (UrlPath(url) / "cells" / "left.arrow").write_bytes(b"of another run")
     assert mapped(street, tmp_path / "again", "--work", url, *TILES) == expected
     assert len(cut) == 2
     assert UrlPath(url).names() == []

@@ -428,7 +428,7 @@ def files(folder: Path) -> dict[str, bytes]:
     """What a map says, with the parts that an update starts from; not how long it took."""
     names = ("labels.parquet", "votes.parquet", "calibration.json")
     found = {name: (folder / name).read_bytes() for name in names}
-    return found | {path.name: path.read_bytes() for path in sorted((folder / "cells").glob("*.parquet"))}
+    return found | {path.name: path.read_bytes() for path in sorted((folder / "cells").glob("*.arrow"))}
 
 
 def mapped(dataset: Path, out: Path, *options: str) -> dict[str, bytes]:

@@ -333,7 +333,7 @@ def test_an_update_is_a_map_of_all_the_data_but_for_the_ids(years: Path, tmp_pat
     missing = contents(rebuilt) - contents(updated)
     assert contents(updated) <= contents(rebuilt)
     assert len(missing) <= 1  # Where the moved one was.
-    cells = [{path.name for path in (folder / "cells").glob("*.parquet")} for folder in (tmp_path / "all", years / "map2")]  # fmt: skip # noqa: E501
+    cells = [{path.name for path in (folder / "cells").glob("*.arrow")} for folder in (tmp_path / "all", years / "map2")]  # fmt: skip # noqa: E501
     assert cells[0] == cells[1]
 
 
@@ -342,7 +342,7 @@ def votes_of(result: Map, label_id: int) -> list[int]:
 
 
 def test_cells_that_nobody_drove_through_are_not_solved_again(years: Path) -> None:
-    before, after = ({p.name for p in (years / name / "cells").glob("*.parquet")} for name in ("map", "map2"))
+    before, after = ({p.name for p in (years / name / "cells").glob("*.arrow")} for name in ("map", "map2"))
     assert before & after
     assert after - before
     assert all(name.startswith("1_") for name in before & after)

@@ -52,3 +52,9 @@ def texts_to_arrow(texts: Sequence[str]) -> pa.Array:
         ) from error
     offsets = np.cumsum([0, *map(len, encoded)], dtype=np.int32)
     return pa.StringArray.from_buffers(len(encoded), pa.py_buffer(offsets), pa.py_buffer(b"".join(encoded)))
+
+
+def no_texts(count: int) -> pa.Array:
+    """Return so many empty texts (`pyarrow.repeat` imports pandas, too)."""
+    offsets = np.zeros(count + 1, np.int32)
+    return pa.StringArray.from_buffers(count, pa.py_buffer(offsets), pa.py_buffer(b""))

@@ -111,7 +111,8 @@ class Run:
     `tile_size_m` is how large the units are that the dataset is cut into on disk: None for what is usual, where it is
     larger than memory; it changes no label. `calibration` is that of another map to use, None to estimate it. `known`
     is where the cells of an older map are, which are not solved again where nothing changed. `store` is where the parts
-    are that tasks share, None for the folder `work`.
+    are that tasks share, None for the folder `work`. Without `keeps_rejected` hypotheses that became no labels are not
+    looked for: the map is only a step to another one.
     """
 
     work: Path
@@ -120,6 +121,7 @@ class Run:
     calibration: Calibration | None = None
     known: Path | None = None
     store: UrlPath | None = None
+    keeps_rejected: bool = True
 
     @property
     def parts(self) -> Place:
@@ -192,7 +194,8 @@ def build_map_of_folder(
     result = _as_map(name, frame, size, passes, config, labels, votes, counts, stages, poses)
     if refined is not None and refined.is_corrected:
         result = replace(result, corrected=refined.dataset)
-    result = _with_rejected(result, lambda: result.corrected or held or read_dataset(folder), stages)
+    if run.keeps_rejected:
+        result = _with_rejected(result, lambda: result.corrected or held or read_dataset(folder), stages)
     return _with_notes(result, notes), cells
 
 

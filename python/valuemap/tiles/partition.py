@@ -26,7 +26,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from valuemap.arrow import numbers_from_arrow, numbers_to_arrow
+from valuemap.arrow import no_texts, numbers_from_arrow, numbers_to_arrow
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, Frame, rows_of
 from valuemap.drives import Drives, InOrder
@@ -329,7 +329,7 @@ def _from_columns(kind: type[T], table: pa.Table, categories: list[str]) -> T:
     for field in fields(kind):
         names, of = field.metadata["names"], field.metadata["kind"]
         if of == "text":
-            values[field.name] = pa.repeat("", table.num_rows)
+            values[field.name] = no_texts(table.num_rows)
         elif names[0] not in table.column_names:
             values[field.name] = None
         elif of == "category":

@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
-import pyarrow as pa
 
+from valuemap.arrow import no_texts
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
 from valuemap.drives import InOrder, in_driving_order
@@ -55,7 +55,7 @@ class InMemory:
         self._ordered = in_driving_order(dataset, viewpoint_step_m=max_range_m * VIEWPOINT_SHARE)
         self.drives_record: dict[str, Any] = self._ordered.drives.record
         # Nothing that comes after looks at names, as there are none of pieces on disk.
-        images = self._ordered.dataset.images.replace(name=pa.repeat("", len(dataset.images)))
+        images = self._ordered.dataset.images.replace(name=no_texts(len(dataset.images)))
         self._ordered = replace(self._ordered, dataset=replace(self._ordered.dataset, images=images))
         detections = self._ordered.dataset.detections
         self._place_m = self.grid.images_on_ground(images)

@@ -149,7 +149,7 @@ def has_parts(place: Place) -> bool:
     """Return whether a run has left anything to go on from."""
     if isinstance(place, UrlPath):
         return any(name.startswith((f"{CELLS}/", "partition-")) for name in place.names())
-    return any(place.glob(f"{CELLS}/*.parquet")) or any(place.glob("partition-*"))
+    return any(place.glob(f"{CELLS}/*.arrow")) or any(place.glob("partition-*"))
 
 
 def remove_work(place: Place) -> None:

@@ -47,11 +47,12 @@ def match_labels(old: Labels, old_votes: Votes, new: Labels, new_votes: Votes) -
     Pairs with more common votes go first, then lower ids; each label is of one pair.
     """
     before, common = np.full(len(new), -1), np.zeros(len(new), np.int64)
-    order = np.argsort(old_votes.detection_id, kind="stable")
-    known = old_votes.detection_id[order]
-    at = np.searchsorted(known, new_votes.detection_id)
-    has = np.flatnonzero(known[np.minimum(at, len(known) - 1)] == new_votes.detection_id) if len(known) else at[:0]
-    rows = rows_of(old_votes.label_id[order[at[has]]], old.label_id), rows_of(new_votes.label_id[has], new.label_id)
+    order, asked = (np.argsort(votes.detection_id, kind="stable") for votes in (old_votes, new_votes))
+    known, ids = old_votes.detection_id[order], new_votes.detection_id[asked]
+    at = np.searchsorted(known, ids)  # In order, which takes an eighth of the time.
+    has = np.flatnonzero(known[np.minimum(at, len(known) - 1)] == ids) if len(known) else at[:0]
+    voted = old_votes.label_id[order[at[has]]], new_votes.label_id[asked[has]]
+    rows = rows_of(voted[0], old.label_id), rows_of(voted[1], new.label_id)
     pair, count = np.unique(rows[0] * len(new) + rows[1], return_counts=True)
     i, j = pair // max(len(new), 1), pair % max(len(new), 1)
     able = np.flatnonzero(count >= SAME_SHARE * np.minimum(old.votes[i], new.votes[j]))

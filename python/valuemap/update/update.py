@@ -78,16 +78,16 @@ def update_map(
     first, second = read_dataset(place), read_dataset(added)
     if not len(second.detections):
         raise InputError(f"{added}: there are no detections in it", hint="find some with valuemap detect")
-    joined = ensure_checked(join_datasets(first, second))
+    joined, images_before = ensure_checked(join_datasets(first, second)), first.images.image_id
+    del first, second  # There is as much in them as in the two as one.
     write_dataset_in_pieces([joined], run.work / DATASET)
-    run = replace(run, calibration=calibration, known=old / CELLS)
+    run = replace(run, calibration=calibration, known=old / CELLS, keeps_rejected=False)
     rebuilt, cells = build_map_of_folder(run.work / DATASET, _settings(before), run, held=joined, progress=progress)
     # The poses that the labels were found with, where those of whole drives were corrected.
     posed = rebuilt.corrected or joined
-    alone = _map_alone(posed, first.images.image_id, before, run, progress)
-    result, changes, bridge = compare(
-        _in_frame_of(rebuilt, before), rebuilt, alone, posed, first.images.image_id, progress=progress
-    )
+    alone = _map_alone(posed, images_before, before, run, progress)
+    before = _in_frame_of(rebuilt, before)
+    result, changes, bridge = compare(before, rebuilt, alone, posed, images_before, progress=progress)
     result = replace(result, rejected=rejected_of_map(result, lambda: posed))
     for name, table in ((CHANGES, changes), (BRIDGE, bridge)):
         write_table(table, run.work / name)
