@@ -49,11 +49,11 @@ class Categories:
             column = column.combine_chunks()
         if not pa.types.is_dictionary(column.type):
             column = column.dictionary_encode()
-        found = column.dictionary.to_pylist()
-        names = tuple(sorted(set(found)))
+        found, codes = column.dictionary.to_pylist(), numbers_from_arrow(column.indices)
+        is_used = np.bincount(codes.astype(np.int64), minlength=len(found)) > 0
+        names = tuple(sorted({name for name, used in zip(found, is_used.tolist(), strict=True) if used}))
         rank = {name: i for i, name in enumerate(names)}
-        recode = np.array([rank[name] for name in found], dtype=np.int32)
-        codes = numbers_from_arrow(column.indices)
+        recode = np.array([rank.get(name, -1) for name in found], dtype=np.int32)
         return cls(recode[codes] if len(codes) else np.empty(0, np.int32), names)
 
     def __len__(self) -> int:
@@ -751,8 +751,10 @@ def _read_column(column: pa.ChunkedArray, name: str, spec: Any, source: str) -> 
             f"{source}: column {name!r}: expected {_EXPECTED[kind]}, found {column.type}",
             hint=f"write {name!r} with another type",
         )
-    if pa.types.is_dictionary(column.type):
-        column = column.cast(column.type.value_type)  # Unused and missing texts in the dictionary do not count.
+    if pa.types.is_dictionary(column.type) and (
+        kind != "category" or any(chunk.dictionary.null_count for chunk in column.chunks)
+    ):
+        column = column.cast(column.type.value_type)  # What is missing in the dictionary is so in the rows.
     if column.null_count and not nullable:
         row = int(np.flatnonzero(column.is_null().to_numpy())[0])
         raise InputError(

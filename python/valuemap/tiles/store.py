@@ -75,7 +75,7 @@ def hash_piece(piece: InOrder, cell: Cell, settings: str) -> str:
         piece.image_id,
         piece.detection_id,
     ):
-        digest.update(np.ascontiguousarray(column).tobytes())
+        digest.update(np.ascontiguousarray(column))
     return digest.hexdigest()[:32]
 
 
@@ -89,7 +89,7 @@ def _add_table(digest: Any, table: Table, without: tuple[str, ...]) -> None:
             digest.update(json.dumps(value.names).encode())
             value = value.codes
         for array in value if isinstance(value, list) else [value]:
-            digest.update(np.ascontiguousarray(array).tobytes())
+            digest.update(np.ascontiguousarray(array))
     digest.update(str(len(table)).encode())
 
 
@@ -108,7 +108,8 @@ def save_cell(solved: Solved, place: Place) -> None:
     head = {"cell": cell, "counts": solved.counts, "classes": solved.labels.class_name.names}
     table = table.replace_schema_metadata({"valuemap": json.dumps(head)})
     file = io.BytesIO()
-    with pa.ipc.new_file(file, table.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")) as writer:
+    options = pa.ipc.IpcWriteOptions(compression="zstd", use_threads=False)
+    with pa.ipc.new_file(file, table.schema, options=options) as writer:
         writer.write_table(table)
     put(place, file.getvalue())
 
@@ -159,7 +160,8 @@ def _contents(places: Sequence[Place]) -> Iterator[bytes]:
 def _parsed(place: Place, content: bytes) -> tuple[dict[str, Any], pa.Table]:
     """Return what a file of a cell says of it, and its rows."""
     try:
-        table = pa.ipc.open_file(pa.BufferReader(content)).read_all()
+        options = pa.ipc.IpcReadOptions(use_threads=False)
+        table = pa.ipc.open_file(pa.BufferReader(content), options=options).read_all()
         table.validate(full=True)  # Nothing else finds offsets that lead out of a column.
         head = json.loads(table.schema.metadata[b"valuemap"])
         cell = head["cell"]

@@ -152,11 +152,13 @@ def _judged(
     """Return what became of labels, how both epochs looked at those that were asked for, and the share of drives that
     are blind to an object.
     """
-    is_near = Nearby(center_m[is_new]).have_any(rows.labels.position_in_world_m, _settings(before).vote.max_range_m)
+    max_range_m = _settings(before).vote.max_range_m
+    is_near = Nearby(center_m[is_new]).have_any(rows.labels.position_in_world_m, max_range_m)
     is_asked = is_near | (rows.before < 0)
     # What an epoch alone has elsewhere is no sight of this object.
     looked = _without_claimed(rows, is_asked, before, alone, joined, is_new)
-    lookout = _lookout(replace(rebuilt, labels=rows.labels, votes=looked), is_asked, joined, center_m, is_new)
+    asked = replace(rebuilt, labels=rows.labels, votes=looked)
+    lookout = _lookout(asked, is_asked, joined, center_m, is_new, max_range_m)
     states = before.labels.state.texts() if before.labels.state is not None else ["confirmed"] * len(before.labels)
     sights = {}
     with counted(progress, "looking for changes", int(is_asked.sum())) as looked_at:
@@ -321,7 +323,9 @@ def _numbered(parts: list[tuple[Labels, Votes]]) -> tuple[Labels, Votes]:
     return join_tables(labels), join_tables(votes)
 
 
-def _lookout(asked: Map, is_asked: Bools, joined: Dataset, center_m: Floats, is_new: Bools) -> Lookout:
+def _lookout(
+    asked: Map, is_asked: Bools, joined: Dataset, center_m: Floats, is_new: Bools, max_range_m: float
+) -> Lookout:
     """Return what counts looks at some labels of a map; its votes are theirs, and its labels numbered from 1.
 
     Only images that may have seen one of them are asked: those no farther from it than the farthest of all votes.
@@ -336,7 +340,6 @@ def _lookout(asked: Map, is_asked: Bools, joined: Dataset, center_m: Floats, is_
         near = near[Nearby(place_m[is_asked]).have_any(center_m[near], farthest_m)]
     # Whole passes, since an order is told by all of it.
     of_passes = np.flatnonzero(np.isin(images.pass_id.codes, images.pass_id.codes[near]))
-    max_range_m = _settings(asked).vote.max_range_m
     drives = find_drives(images.take(of_passes), viewpoint_step_m=max_range_m * VIEWPOINT_SHARE)
     among = np.searchsorted(of_passes, near)
     columns = ("pass_code", "order", "driven_m", "viewpoint")
