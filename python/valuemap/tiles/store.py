@@ -75,7 +75,7 @@ def hash_piece(piece: InOrder, cell: Cell, settings: str) -> str:
         piece.image_id,
         piece.detection_id,
     ):
-        digest.update(np.ascontiguousarray(column))
+        digest.update(np.ascontiguousarray(column).data)
     return digest.hexdigest()[:32]
 
 
@@ -89,7 +89,7 @@ def _add_table(digest: Any, table: Table, without: tuple[str, ...]) -> None:
             digest.update(json.dumps(value.names).encode())
             value = value.codes
         for array in value if isinstance(value, list) else [value]:
-            digest.update(np.ascontiguousarray(array))
+            digest.update(np.ascontiguousarray(array).data)
     digest.update(str(len(table)).encode())
 
 
