@@ -19,17 +19,18 @@ from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import Dataset, rows_of, write_dataset
 from valuemap.drives import Drives, find_drives, in_driving_order
 from valuemap.engine.threads import ThreadEngine
-from valuemap.refine import FITS_NO_BETTER, Refined, adjust, expose_rows, poses, refine_poses
+from valuemap.refine import FITS_NO_BETTER, Refined, adjust, expose_rows, poses, refine_poses, tracks
 from valuemap.refine.adjust import Adjustment, Scales
 from valuemap.refine.estimate import cut_into_segments, delay_together, lay, mounts_alone
-from valuemap.refine.footage import Footage, Sigmas, find_motion, gather, in_working_frame
-from valuemap.refine.jumps import Segments, find_hints, find_jumps
+from valuemap.refine.footage import Footage, Sigmas, _within, find_motion, gather, in_working_frame
+from valuemap.refine.jumps import Links, Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
 from valuemap.refine.register import register
 from valuemap.refine.residuals import MOUNT, OFFSET, Observations, State, residuals, rotations, weights
 from valuemap.refine.select import _Equations
+from valuemap.refine.tracks import merge_objects
 from valuemap.simulate import simulate
-from valuemap.tables import Floats, Images, Ints
+from valuemap.tables import Bools, Floats, Images, Ints
 from valuemap.tiles.work import open_work
 
 CITY = SimulationConfig(
@@ -414,6 +415,22 @@ def test_segments_are_found_by_drive_and_order() -> None:
     assert segments.of(np.array([0, 0, 0, 1, 1]), np.array([0, 4, 5, 0, 9])).tolist() == [0, 0, 1, 2, 2]
 
 
+def test_what_drives_that_drift_see_beside_itself_is_one_object_but_for_two_that_an_image_shows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(tracks, "_covariances", lambda *_: np.tile(1e-6 * np.eye(3), (2, 1, 1)))
+    seen, state, _ = few_observations()
+    # Every observation is of one of two places; the second one is 0.4 m beside the first.
+    thing = np.asarray(seen.drive == seen.drive[0], np.int64)
+    point = state.point_in_world_m[:1] + np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0]])
+    beside = dataclasses.replace(seen, thing=thing)
+    state = dataclasses.replace(state, point_in_world_m=point)
+    classes = np.zeros(2, np.int64)
+    assert merge_objects(beside, state, seen.image, classes, 0.2).tolist() == [0, 0]
+    assert merge_objects(beside, state, seen.image, classes, 0.01).tolist() == [0, 1]
+    assert merge_objects(beside, state, np.zeros(len(seen), np.int64), classes, 0.2).tolist() == [0, 1]
+
+
 def test_a_waiting_car_gives_the_middle_one_of_its_images() -> None:
     dataset = city()
     drives = find_drives(dataset.images)
@@ -455,6 +472,49 @@ def test_jumps_of_poses_are_seen_in_the_trajectory_and_stops_and_turns_are_none(
     assert right >= 0.5 * true
 
 
+def jumps_of(plain: Dataset, jumping: Dataset, drives: Drives) -> dict[tuple[int, int], Floats]:
+    """Return how far (2) poses jump, by drive and the place in its order that they jump before."""
+    off = (camera_poses(jumping.images)[1] - camera_poses(plain.images)[1])[:, :2]
+    jumps: dict[tuple[int, int], Floats] = {}
+    for drive in range(drives.count):
+        rows = np.flatnonzero(drives.pass_code == drive)
+        rows = rows[np.argsort(drives.order[rows])]
+        for at in np.flatnonzero(np.linalg.norm(np.diff(off[rows], axis=0), axis=1) > 0.5) + 1:
+            jumps[drive, int(drives.order[rows[at]])] = off[rows[at]] - off[rows[at - 1]]
+    return jumps
+
+
+def test_a_trajectory_proves_jumps_of_a_metre_and_says_how_far_they_are() -> None:
+    plain, jumping = city(), city(jump_m=1.0, jumps_per_km=10.0)
+    drives = find_drives(jumping.images)
+    true = jumps_of(plain, jumping, drives)
+    found = mend(jumping, drives)
+    told = {(d, b): j for d, b, j in zip(found.drive.tolist(), found.begins.tolist(), found.jump_m, strict=True)}
+    right = [place for place in told if place in true]
+    assert len(true) >= 8
+    assert len(right) >= 0.8 * len(true)
+    assert len(right) >= 0.9 * len(told)
+    apart = np.array([told[place] - true[place] for place in right])
+    assert np.sqrt(np.mean(apart**2)) < 0.3
+    # Stops and turns are none.
+    assert len(mend(plain, find_drives(plain.images)).drive) == 0
+
+
+def test_jumps_are_taken_back_one_after_the_other_and_links_say_the_same() -> None:
+    jumping = city(jump_m=1.0, jumps_per_km=10.0)
+    drives = find_drives(jumping.images)
+    jumps = mend(jumping, drives)
+    links = jumps.links(jumps.segments, set())
+    np.testing.assert_allclose(
+        jumps.offset_m[links.second, :2] - jumps.offset_m[links.first, :2], links.apart_m, atol=1e-12
+    )
+    back = jumps.offset_m[jumps.segments.of(drives.pass_code, drives.order)]
+    for drive in range(drives.count):
+        np.testing.assert_allclose(back[drives.pass_code == drive].mean(axis=0), 0.0, atol=1e-12)
+    refuted = {(int(jumps.drive[0]), int(jumps.begins[0]))}
+    assert len(jumps.links(jumps.segments, refuted).second) == len(links.second) - 1
+
+
 def few_observations() -> tuple[Observations, State, Footage]:
     """Return what some drives see of a few objects, with all kinds of errors somewhat wrong, and the footage."""
     ordered = in_driving_order(city(pass_shift_m=0.3, focal_error_share=0.01), viewpoint_step_m=1.0)
@@ -488,7 +548,10 @@ def test_a_step_is_that_of_all_unknowns_in_one_matrix(dense_limit: int, monkeypa
         state, constants=tuple(np.where(a, c, 0.0) for a, c in zip(active, state.constants, strict=True))
     )
     scales = Scales(0.2, 0.004, 0.1, 0.002, (3.0, 0.03, 0.2, 0.05, 0.03, 0.2))
-    problem = Adjustment(seen, footage.chain, scales, active, len(state.point_in_world_m))
+    # One of them is to a segment that is not free.
+    information = np.array([[[30.0, 5.0], [5.0, 20.0]], [[9.0, 0.0], [0.0, 9.0]]])
+    links = Links(np.array([0, 2]), np.array([1, 3]), np.array([[0.7, -0.2], [0.1, 0.4]]), information)
+    problem = Adjustment(seen, footage.chain, scales, active, len(state.point_in_world_m), links)
     after, gain = problem.step(state, 2.0, with_variance=True)
     assert after.covariance is not None
 
@@ -538,6 +601,17 @@ def test_a_step_is_that_of_all_unknowns_in_one_matrix(dense_limit: int, monkeypa
     mean[last:] = np.concatenate([c[flags] for c, flags in zip(state.constants, active, strict=True)])
     hessian = jacobian.T @ (weight[:, None] * jacobian) + prior
     right = -jacobian.T @ (weight * residual.ravel()) - prior @ mean
+    place = np.full(active[OFFSET].shape, -1)
+    place[active[OFFSET]] = last + np.arange(int(active[OFFSET].sum()))
+    for first_one, second, apart, of in zip(links.first, links.second, links.apart_m, information, strict=True):
+        by = np.zeros((2, count))
+        for axis in range(2):
+            by[axis, place[second, axis]] += 1.0
+            if place[first_one, axis] >= 0:
+                by[axis, place[first_one, axis]] -= 1.0
+        left = state.constants[OFFSET][second, :2] - state.constants[OFFSET][first_one, :2] - apart
+        hessian += by.T @ of @ by
+        right -= by.T @ of @ left
     expected = np.asarray(np.linalg.solve(hessian, right))
     literal = moved(expected)
     np.testing.assert_allclose(after.point_in_world_m, literal.point_in_world_m, atol=1e-4)
@@ -557,7 +631,7 @@ def test_equations_tell_what_others_are_without_a_group_as_a_fit_without_it_does
     # Equal weights: what a fit without the group has others of is no part of the comparison.
     fits = {}
     for name, flags in (("all", active), ("fewer", fewer)):
-        problem = Adjustment(seen, footage.chain, scales, flags, len(state.point_in_world_m))
+        problem = Adjustment(seen, footage.chain, scales, flags, len(state.point_in_world_m), Links.none())
         fits[name] = problem, problem.step(state, 1e6, with_variance=True)[0]
     told = _Equations.at(*fits["all"]).solved(fewer, scales)
     covariance = fits["fewer"][1].covariance
@@ -581,6 +655,24 @@ def test_poses_that_are_right_cost_few_steps(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(Adjustment, "step", counted)
     refine_poses(city(), valuemap.MapConfig())
     assert 10 < taken < 60
+
+
+def test_velocities_change_at_once_where_a_car_stops_beside_images_that_are_missing() -> None:
+    # Four images a second at 8 m/s until 3.1 s, and standing from then on; nothing is seen from 4 to 8 s.
+    time_s: Floats = np.concatenate([0.25 * np.arange(17), 8.0 + 0.25 * np.arange(8)])
+    at_m = 8.0 * np.minimum(time_s, 3.1)
+    step_s = np.diff(time_s)
+    speed = np.column_stack([np.diff(at_m) / step_s, np.zeros((len(step_s), 2))])
+    usable: Bools = np.asarray(step_s < 1.0)
+    true = (8.0 * np.minimum(time_s[:-1] + 0.2, 3.1) - at_m[:-1]) / 0.2
+    found = _within(speed, step_s, np.full(len(step_s), 0.2), usable)
+    np.testing.assert_allclose(found[:, 0], true, atol=1e-9)
+    # A turn that goes on where nothing is seen: the mean rate until images are there again tells nothing of it.
+    rate = np.where(time_s[:-1] < 3.5, 0.0, 60.0)
+    rate[14], rate[16] = 24.0, 5.0
+    for is_usable, first in ((usable, 0.0), (np.ones_like(usable), 24.0)):
+        found = _within(np.column_stack([rate] * 3), step_s, np.full(len(step_s), 0.1), is_usable)
+        np.testing.assert_allclose(found[14], first, atol=1e-9)
 
 
 @pytest.mark.parametrize("late_s", [0.03, 0.1, -0.03, -0.1])

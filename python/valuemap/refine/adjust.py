@@ -17,7 +17,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from valuemap.refine.jumps import Links
 from valuemap.refine.residuals import (
+    OFFSET,
     Linearised,
     Observations,
     State,
@@ -115,8 +117,15 @@ class Adjustment:
     """The normal equations of observations; `active` (by kind: count, width) says which constants are free."""
 
     def __init__(
-        self, seen: Observations, chain: Chain, scales: Scales, active: tuple[Bools, ...], things: int
+        self,
+        seen: Observations,
+        chain: Chain,
+        scales: Scales,
+        active: tuple[Bools, ...],
+        things: int,
+        links: Links,
     ) -> None:
+        self.links = links
         self.seen, self.chain, self.scales, self.active, self.things = seen, chain, scales, active, things
         # Columns of the constants after those of the objects.
         self.column_of: list[Ints] = []
@@ -215,6 +224,7 @@ class Adjustment:
             free = self.active[kind]
             sigma = np.broadcast_to(np.asarray(self.scales.constant[kind], np.float64), free.shape)[free]
             system.add_diagonal(index[free], sigma**-2, -(sigma**-2) * state.constants[kind][free])
+        self._link(system, state.constants[OFFSET])
         nodes = np.zeros((len(self.chain.drive), _BASIS, _BASIS))
         nodes[self.node[self.by_node.row]] = self.by_node.sum(products)
         beside = _TO_DRIFT.T @ self.by_node_and_part.sum(products) @ _TO_CONSTANTS
@@ -239,6 +249,16 @@ class Adjustment:
             constants.append(values)
         after = State(points, drift, state.own, tuple(constants), covariance)
         return replace(after, own=self._own_errors(after, tolerance)), gain
+
+    def _link(self, system: _System, offset: Floats) -> None:
+        """Add what trajectories say of the offsets (L, 3) of segments."""
+        pair = np.stack([self.links.first, self.links.second], axis=1)
+        columns = self.column_of[OFFSET][pair, :2].reshape(-1, 4)
+        sign = np.array([[1.0, -1.0], [-1.0, 1.0]])
+        blocks = np.einsum("ab,nij->naibj", sign, self.links.information).reshape(-1, 4, 4)
+        left = offset[pair[:, 1], :2] - offset[pair[:, 0], :2] - self.links.apart_m
+        pull = np.einsum("nij,nj->ni", self.links.information, left)
+        system.add(columns, columns, blocks, np.concatenate([pull, -pull], axis=1))
 
     def _products(self, at: Linearised, tolerance: float) -> Floats:
         """Return the sums (P, 12, 12) of the weighted products of derivatives and residuals, in the finest groups."""

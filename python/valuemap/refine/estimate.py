@@ -11,7 +11,7 @@ import valuemap._core as _core
 from valuemap.config import MapConfig
 from valuemap.refine.adjust import Adjustment, Groups, Scales, adjust, triangulate
 from valuemap.refine.footage import DRIFT_LENGTH_M, Footage, Sigmas
-from valuemap.refine.jumps import Hints, Segments
+from valuemap.refine.jumps import Hints, Jumps, Links, Segments
 from valuemap.refine.landmarks import Landmarks
 from valuemap.refine.register import Registration, register, togetherness
 from valuemap.refine.residuals import CAMERA_DELAY, MOUNT, OFFSET, WIDTH, Observations, State, linearised, weights
@@ -28,7 +28,7 @@ _FIRST_PX, _FIRST_SHARE, _FIRST_M = 2.0, 0.05, 0.1
 _LANDMARK_PX, _LANDMARK_M = 3.0, 0.2
 _NEW_SEGMENT_M = 1.0
 """Registered shifts that differ by more than this are of two segments."""
-_JUMP_PRICE, _SEEN_PRICE = 30.0, 8.0
+_JUMP_PRICE, _SEEN_PRICE = 20.0, 8.0
 """Minus twice the log odds of a jump where the trajectory says nothing, and where it shows one: what a new segment
 has to explain."""
 _LEAST_VOTES, _LEAST_OF_SEGMENT = 4, 8
@@ -60,6 +60,7 @@ class Estimate:
     class_code: Ints
     size_m: Floats
     segments: Segments
+    links: Links
     state: State
     noise: Noise
     sigma_px: Sigmas
@@ -99,6 +100,7 @@ def estimate(
     *,
     seen_cuts: Segments,
     hints: Hints,
+    jumps: Jumps,
     known: tuple[Segments, Floats] | None = None,
     turned_rad: Floats | None = None,
     late_s: float = 0.0,
@@ -118,6 +120,7 @@ def estimate(
     counts = (len(segments), footage.drives.count, footage.drives.count) + (footage.cameras,) * 3
     state = State.zero(points, len(footage.chain.drive), len(footage.row), counts)
     state.constants[OFFSET][:] = offset
+    links = jumps.links(segments, set())
     if turned_rad is not None:
         state.constants[MOUNT][:] = turned_rad
     state.constants[CAMERA_DELAY][:] = late_s
@@ -129,13 +132,14 @@ def estimate(
     tolerances: tuple[float, ...] = _COARSE
     for round_number in range(4):
         seen = footage.observe(detection, thing, segment, sigma_px)
-        problem = Adjustment(seen, footage.chain, scales, everything(footage, segments), len(class_code))
+        problem = Adjustment(seen, footage.chain, scales, everything(footage, segments), len(class_code), links)
         state = adjust(problem, state, tolerances=tolerances)
         noise = fit_noise(seen, state, noise)
         sigma_px = _sigmas(footage, noise)
         scales = _grown(own_scales(footage, noise, scales), state)
         if round_number < 3:
-            segments, segment, state = _cut(footage, seen, state, segments, seen_cuts, hints)
+            segments, links, state = _cut(footage, seen, state, segments, seen_cuts, hints, jumps)
+            segment = segments.of(footage.drives.pass_code, footage.drives.order)
             seen = footage.observe(detection, thing, segment, sigma_px)
         detection, thing, class_code, size_m, state = _anew(
             footage, state, class_code, size_m, segment, sigma_px, range_m, detection, thing
@@ -143,7 +147,9 @@ def estimate(
         if not len(thing):
             return None
         tolerances = _FINE
-    return Estimate(detection, thing, class_code, size_m, segments, state, noise, sigma_px, scales, len(landmarks))
+    return Estimate(
+        detection, thing, class_code, size_m, segments, links, state, noise, sigma_px, scales, len(landmarks)
+    )
 
 
 def mounts_alone(footage: Footage, landmarks: Landmarks) -> Floats:
@@ -164,7 +170,7 @@ def mounts_alone(footage: Footage, landmarks: Landmarks) -> Floats:
     segment_of_image = footage.drives.pass_code
     seen = footage.observe(landmarks.voters, landmarks.landmark_of_voter(), segment_of_image, _sigmas(footage, Noise()))
     free = tuple(np.full((n, w), kind == MOUNT) for kind, (n, w) in enumerate(zip(counts, WIDTH, strict=True)))
-    problem = Adjustment(seen, footage.chain, WIDE, free, len(landmarks))
+    problem = Adjustment(seen, footage.chain, WIDE, free, len(landmarks), Links.none())
     state = adjust(problem, state, tolerances=_ALONE, with_variance=True)
     assert state.covariance is not None
     at = problem.column_of[MOUNT] - 3 * len(landmarks)
@@ -336,43 +342,68 @@ def fit_noise(seen: Observations, state: State, noise: Noise) -> Noise:
 
 
 def _cut(
-    footage: Footage, seen: Observations, state: State, segments: Segments, seen_cuts: Segments, hints: Hints
-) -> tuple[Segments, Ints, State]:
-    """Cut drives anew where their poses jump, given the objects: exact segmentation of each drive's images."""
+    footage: Footage,
+    seen: Observations,
+    state: State,
+    segments: Segments,
+    seen_cuts: Segments,
+    hints: Hints,
+    jumps: Jumps,
+) -> tuple[Segments, Links, State]:
+    """Cut drives anew where their poses jump, given the objects: exact segmentation of each drive's images.
+
+    Jumps that trajectories prove are taken back first. They stay cuts; where one more cut pays there, the jump is
+    another one than the trajectory says.
+    """
     shift, information, image_of = _apparent_shift(footage, seen, state)
     drives = footage.drives
-    segment_drive: list[int] = []
-    begins: list[int] = []
+    begins: list[tuple[int, int]] = []
     offsets: list[Floats] = []
+    refuted: set[tuple[int, int]] = set()
     segment_now = segments.of(drives.pass_code, drives.order)
     for drive in range(drives.count):
         rows = np.flatnonzero(drives.pass_code[image_of] == drive)
         rows = rows[np.argsort(drives.order[image_of[rows]], kind="stable")]
+        known = np.flatnonzero(jumps.segments.drive == drive)
         if not len(rows):
             old = np.flatnonzero(segments.drive == drive)[:1]
-            segment_drive.append(drive)
-            begins.append(0)
+            begins.append((drive, 0))
             offsets.append(state.constants[0][old[0]] if len(old) else np.zeros(3))
             continue
-        value = shift[rows, :2]
+        order = drives.order[image_of[rows]]
+        mended = jumps.offset_m[jumps.segments.of(np.full(len(rows), drive), order), :2]
+        value = shift[rows, :2] - mended
         precision = np.linalg.inv(np.linalg.inv(information[rows])[:, :2, :2])
-        cut_at = seen_cuts.of(drives.pass_code[image_of[rows]], drives.order[image_of[rows]])
-        price = np.maximum(_JUMP_PRICE - hints.between(drive, drives.order[image_of[rows]]), _SEEN_PRICE)
+        cut_at = seen_cuts.of(drives.pass_code[image_of[rows]], order)
+        price = np.maximum(_JUMP_PRICE - hints.between(drive, order), _SEEN_PRICE)
         price[np.diff(cut_at, prepend=cut_at[0]) != 0] = _SEEN_PRICE
         starts = cut_into_segments(value, precision, price)
+        cuts: dict[int, Floats] = {}
         for number, start in enumerate(starts):
             end = starts[number + 1] if number + 1 < len(starts) else len(rows)
             total = precision[start:end].sum(axis=0) + np.eye(2) / WIDE.constant[0] ** 2
             middle = np.linalg.solve(total, np.einsum("nij,nj->i", precision[start:end], value[start:end]))
             vertical = state.constants[0][segment_now[image_of[rows[start:end]]], 2]
-            segment_drive.append(drive)
-            begins.append(0 if number == 0 else int(drives.order[image_of[rows[start]]]))
-            offsets.append(np.append(middle, np.median(vertical)))
-    new = Segments(np.array(segment_drive), np.array(begins))
+            first = 0
+            if number > 0:
+                between = jumps.segments.begins[known]
+                between = between[(between > order[start - 1]) & (between <= order[start])]
+                refuted |= {(drive, int(begin)) for begin in between}
+                first = int(between[-1]) if len(between) else int(order[start])
+            cuts[first] = np.append(middle, np.median(vertical))
+        # Pieces hold what is left of the offsets once jumps are taken back.
+        pieces = np.array(sorted(cuts))
+        for begin in sorted({*cuts, *jumps.segments.begins[known].tolist()}):
+            left = cuts[int(pieces[np.searchsorted(pieces, begin, side="right") - 1])]
+            back = jumps.offset_m[jumps.segments.of(np.array([drive]), np.array([begin]))[0]]
+            begins.append((drive, begin))
+            offsets.append(left + back)
+    both = np.array(begins, dtype=np.int64)
+    new = Segments(both[:, 0], both[:, 1])
     constants = (np.array(offsets), *state.constants[1:])
     drift = state.drift.copy()
     drift[:, :3] = 0.0
-    return new, new.of(drives.pass_code, drives.order), replace(state, constants=constants, drift=drift)
+    return new, jumps.links(new, refuted), replace(state, constants=constants, drift=drift)
 
 
 def _apparent_shift(footage: Footage, seen: Observations, state: State) -> tuple[Floats, Floats, Ints]:
@@ -447,7 +478,7 @@ def _anew(
     count = len(state.point_in_world_m)
     seen = footage.observe(detection, thing, segment, sigma_px)
     state = triangulate(seen, state, rounds=3)
-    number = merge_objects(seen, state, seen.image, class_code)
+    number = merge_objects(seen, state, seen.image, class_code, WIDE.drift_m)
     seen = replace(seen, thing=number[seen.thing])
     state = triangulate(seen, state, rounds=4)
     alive = np.bincount(seen.thing, minlength=count) >= _LEAST_VOTES

@@ -249,14 +249,11 @@ def find_motion(dataset: Dataset, drives: Drives, *, late_s: Floats | None = Non
         seconds = np.where(usable, step, np.inf)[:, None]
         speed = np.diff(center[rows], axis=0) / seconds
         rate = _turns(rotation[rows]) / seconds
-        ahead = behind = rate
-        if late_s is not None:
-            ahead = _within(rate, step, np.abs(late_s[rows[:-1]]))
-            behind = _within(rate[::-1], step[::-1], np.abs(late_s[rows[:0:-1]]))[::-1]
-        for values, after, before, on, back in (
-            (speed, speed, speed, forward, backward),
-            (rate, ahead, behind, turn_on, turn_back),
-        ):
+        for values, on, back in ((speed, forward, backward), (rate, turn_on, turn_back)):
+            after = before = values
+            if late_s is not None:
+                after = _within(values, step, np.abs(late_s[rows[:-1]]), usable)
+                before = _within(values[::-1], step[::-1], np.abs(late_s[rows[:0:-1]]), usable[::-1])[::-1]
             on[rows[:-1]], back[rows[1:]] = values, values
             # At an end, as on the other side.
             starts, ends = np.append(True, ~usable), np.append(~usable, True)
@@ -287,22 +284,23 @@ def _trembles(on: Floats, back: Floats) -> Bools:
     return np.asarray((apart <= _TREMBLES * np.median(apart))[:, None])
 
 
-def _within(rate: Floats, step_s: Floats, late_s: Floats) -> Floats:
+def _within(rate: Floats, step_s: Floats, late_s: Floats, usable: Bools) -> Floats:
     """Return the mean rates (N, 3) of the first `late_s` (N) of each step, from those of whole steps (N, 3).
 
-    Rates are means over steps. Where one is between those beside it, and they differ by far more than each of them from
-    the one beyond it, the rate changes at once within the step, where it explains the mean (the subcell resolution of
+    Steps that are not `usable` (N) tell nothing of those beside them. Rates, of places or of rotations, are means over
+    steps. Where one is between those beside it, and they differ by far more than each of them from the one beyond it,
+    the rate changes at once within the step, where it explains the mean (the subcell resolution of
     Harten 1989). Elsewhere it is the mean.
     """
     mean = rate.copy()
     if len(rate) < 5:
         return mean
-    change = np.linalg.norm(np.diff(rate, axis=0), axis=1)
+    change = np.where(usable[1:] & usable[:-1], np.linalg.norm(np.diff(rate, axis=0), axis=1), 0.0)
     across = rate[1:-3] - rate[3:-1]
     square = np.sum(across**2, axis=1)
     is_sudden = np.sqrt(square) > _SUDDEN * np.maximum(change[:-3], change[3:])
     share = np.sum((rate[2:-2] - rate[3:-1]) * across, axis=1) / np.where(square > 0.0, square, 1.0)
-    is_sudden &= (share > 0.0) & (share < 1.0)
+    is_sudden &= (share > 0.0) & (share < 1.0) & usable[1:-3] & usable[2:-2] & usable[3:-1]
     until = share * step_s[2:-2]
     late = late_s[2:-2]
     before = np.where(late > until, until / np.where(late > 0.0, late, 1.0), 1.0)[:, None]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset
 from valuemap.drives import Drives
-from valuemap.tables import Floats, Ints
+from valuemap.tables import Bools, Floats, Ints
 
 _FASTER = 1.2
 """A step that much longer than those around it is none of a vehicle."""
@@ -21,6 +21,11 @@ _MOST_STEPS = 4.0
 _JUMP_M = 2.0
 """Deviation of jumps, each axis."""
 _LEAST_SIGMA_M = 0.02
+_RARE = 13.8
+"""Minus twice the log odds of a jump before anything is known: one step in a thousand."""
+_FARTHEST_M = 6.0
+"""What is farther than drives are laid is no jump of poses: images are missing."""
+_MOST_JUMPS = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,13 +40,46 @@ class Hints:
     evidence: Floats
 
     def between(self, drive: int, order: Ints) -> Floats:
-        """Return the most that speaks (N) for a jump after the image before and not after this one, 0 at the first."""
+        """Return the most that speaks (N) for a jump after the image before and not after this one, 0 at the first.
+
+        Where the trajectory says nothing of any step between them, it is 0; where all are usual, less.
+        """
         low, high = np.searchsorted(self.drive, [drive, drive + 1])
         at = low + np.searchsorted(self.order[low:high], order, side="right")
         most = np.zeros(len(order))
         for i in np.flatnonzero(np.diff(at)) + 1:
-            most[i] = max(0.0, float(self.evidence[at[i - 1] : at[i]].max()))
+            most[i] = float(self.evidence[at[i - 1] : at[i]].max())
         return most
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """What trajectories say of the offsets of segments (K) after each other: second - first is so much (K, 2), m.
+
+    `information` (K, 2, 2) is the inverse of its covariance.
+    """
+
+    first: Ints
+    second: Ints
+    apart_m: Floats
+    information: Floats
+
+    @staticmethod
+    def none() -> Links:
+        """Return none."""
+        return Links(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
+
+    def without(self, segments: Bools) -> Links:
+        """Return those of which no segment is among these (L): what is as far off as others has not jumped."""
+        kept = ~(segments[self.first] | segments[self.second])
+        return Links(self.first[kept], self.second[kept], self.apart_m[kept], self.information[kept])
+
+    def groups(self, count: int) -> Ints:
+        """Return one number (count) for all segments that are linked."""
+        number = np.arange(count)
+        for a, b in sorted(zip(self.first.tolist(), self.second.tolist(), strict=True)):
+            number[b] = number[a]
+        return number
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +98,31 @@ class Segments:
         return np.searchsorted(self.drive * reach + self.begins, drive * reach + order, side="right") - 1
 
 
+@dataclass(frozen=True, eq=False)
+class Jumps:
+    """Jumps (J) before a place in the order of a drive: how far (J, 2), m, with their covariances (J, 2, 2).
+
+    `segments` (L) are between them, and `offset_m` (L, 3) takes the jumps back; drives stay where their images are in
+    the mean.
+    """
+
+    segments: Segments
+    offset_m: Floats
+    drive: Ints
+    begins: Ints
+    jump_m: Floats
+    covariance_m2: Floats
+
+    def links(self, segments: Segments, refuted: set[tuple[int, int]]) -> Links:
+        """Return what the jumps say of segments that begin there, without those that are refuted (drive, begins)."""
+        here = [(d, b) not in refuted for d, b in zip(self.drive.tolist(), self.begins.tolist(), strict=True)]
+        rows = np.flatnonzero(np.array(here, dtype=np.bool_))
+        second = segments.of(self.drive[rows], self.begins[rows])
+        kept = (segments.begins[second] == self.begins[rows]) & (self.begins[rows] > 0)
+        rows, second = rows[kept], second[kept]
+        return Links(second - 1, second, -self.jump_m[rows], np.linalg.inv(self.covariance_m2[rows]))
+
+
 def find_jumps(dataset: Dataset, drives: Drives) -> Segments:
     """Cut drives where the pose jumps: at steps that are outside what the steps before and after them span.
 
@@ -67,57 +130,124 @@ def find_jumps(dataset: Dataset, drives: Drives) -> Segments:
     those two. How far usual steps are outside of it is the trembling of the poses.
     """
     cuts: list[tuple[int, int]] = [(drive, 0) for drive in range(drives.count)]
-    for steps in _steps_of_drives(dataset, drives):
+    for track in _tracks(dataset, drives):
+        steps = track.steps()
         ahead = _FASTER * steps.seconds[:, None]
         outside = _from_triangle(steps.step_m, steps.before_mps * ahead, steps.after_mps * ahead)
         usual = float(np.median(np.linalg.norm(steps.unexpected_m(), axis=1)))
         far = outside > max(_SIGMAS * usual / 1.5, _LEAST_M)
-        cuts += [(steps.drive, int(order)) for order in steps.order[far]]
+        cuts += [(track.drive, int(order)) for order in track.order[steps.row[far]]]
     both = np.unique(np.array(cuts, dtype=np.int64), axis=0)
     return Segments(both[:, 0], both[:, 1])
 
 
 def find_hints(dataset: Dataset, drives: Drives) -> Hints:
-    """Return how much each step speaks for a jump: by how much it is likelier with one than without.
-
-    What a step differs by from those before and after it is normal, along the way and across it, with the deviation
-    that it usually has in its drive; and wider by that of jumps where there is one.
-    """
-    parts = []
-    for steps in _steps_of_drives(dataset, drives):
-        unexpected = steps.unexpected_m()
-        way = steps.before_mps + steps.after_mps
-        length = np.linalg.norm(way, axis=1, keepdims=True)
-        way = np.where(length > 0.0, way / np.maximum(length, 1e-9), np.array([1.0, 0.0]))
-        along = np.sum(unexpected * way, axis=1)
-        across = unexpected[:, 1] * way[:, 0] - unexpected[:, 0] * way[:, 1]
-        evidence = np.zeros(len(along))
-        for value in (along, across):
-            variance = max(1.4826 * float(np.median(np.abs(value))), _LEAST_SIGMA_M) ** 2
-            evidence += value**2 / variance - value**2 / (variance + _JUMP_M**2) - np.log1p(_JUMP_M**2 / variance)
-        parts.append(np.column_stack([np.full(len(along), steps.drive), steps.order, evidence]))
-    table = np.concatenate([np.empty((0, 3)), *parts])
+    """Return how much each step speaks for a jump: by how much it is likelier with one than without."""
+    parts = [np.empty((0, 3))]
+    for track in _tracks(dataset, drives):
+        steps = track.steps()
+        evidence = _Test.of(steps, _usual(steps)).evidence
+        parts.append(np.column_stack([np.full(len(evidence), track.drive), track.order[steps.row], evidence]))
+    table = np.concatenate(parts)
     return Hints(table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2])
+
+
+def mend(dataset: Dataset, drives: Drives) -> Jumps:
+    """Return the jumps that trajectories prove: the likeliest is taken back, then the next one, until none is left.
+
+    A jump makes the steps beside it unlike others, too: it is where most is explained once it is taken back. A drive
+    with more than one in ten steps does not go as a vehicle does: none of its jumps is proven.
+    """
+    found: dict[int, list[tuple[int, Floats, Floats]]] = {}
+    for track in _tracks(dataset, drives):
+        usual = _usual(track.steps())
+        jumps: list[tuple[int, Floats, Floats]] = []
+        while True:
+            steps = track.steps()
+            test = _Test.of(steps, usual)
+            evidence = np.where(np.linalg.norm(test.jump_m, axis=1) < _FARTHEST_M, test.evidence, -np.inf)
+            best = int(np.argmax(evidence))
+            if evidence[best] <= _RARE or len(jumps) > _MOST_JUMPS * len(steps.row):
+                break
+            here = np.arange(max(best - 1, 0), min(best + 2, len(steps.row)))
+            here = here[np.isfinite(evidence[here])]
+            tried = [track.without(steps.row[i], test.jump_m[i]) for i in here]
+            left = [float(_Test.of(other.steps(), usual).misfit.sum()) for other in tried]
+            which = int(np.argmin(left))
+            at, track = here[which], tried[which]
+            jumps.append((int(track.order[steps.row[at]]), test.jump_m[at], test.covariance_m2[at]))
+        if len(jumps) <= _MOST_JUMPS * len(track.order):
+            found[track.drive] = sorted(jumps, key=lambda jump: jump[0])
+    cuts, offsets, told = [], [], []
+    for drive in range(drives.count):
+        jumps = found.get(drive, [])
+        offset = -np.cumsum(np.array([np.zeros(2), *(jump for _, jump, _ in jumps)]), axis=0)
+        begins = np.array([order for order, _, _ in jumps], dtype=np.int64)
+        offset -= offset[np.searchsorted(begins, drives.order[drives.pass_code == drive], side="right")].mean(axis=0)
+        cuts += [(drive, 0), *((drive, int(begin)) for begin in begins)]
+        offsets.append(np.column_stack([offset, np.zeros(len(offset))]))
+        told += [(drive, *jump) for jump in jumps]
+    both = np.array(cuts, dtype=np.int64)
+    return Jumps(
+        Segments(both[:, 0], both[:, 1]),
+        np.concatenate(offsets),
+        np.array([drive for drive, *_ in told], dtype=np.int64),
+        np.array([order for _, order, *_ in told], dtype=np.int64),
+        np.array([jump for _, _, jump, _ in told], dtype=np.float64).reshape(-1, 2),
+        np.array([covariance for *_, covariance in told], dtype=np.float64).reshape(-1, 2, 2),
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class _Steps:
-    """Steps (N) of one drive that have one before and one after them, on the ground, and the order they lead to."""
+    """Steps (N) of one drive that have one before and one after them, on the ground, and the image that they lead to.
 
-    drive: int
-    order: Ints
+    Velocities are those of one step, and of two where there are two: those tremble half as much.
+    """
+
+    row: Ints
     step_m: Floats
     seconds: Floats
     before_mps: Floats
     after_mps: Floats
+    long_before_mps: Floats
+    long_after_mps: Floats
 
     def unexpected_m(self) -> Floats:
         """Return what the steps (N, 2) are other than the mean of those before and after."""
         return np.asarray(self.step_m - 0.5 * (self.before_mps + self.after_mps) * self.seconds[:, None])
 
 
-def _steps_of_drives(dataset: Dataset, drives: Drives) -> Iterator[_Steps]:
-    """Yield the steps of the camera with most images in each drive; seconds are images where there are no times."""
+@dataclass(frozen=True, eq=False)
+class _Track:
+    """Where one drive was (n, 2) on the ground and when (n); seconds are images where there are no times."""
+
+    drive: int
+    order: Ints
+    center_m: Floats
+    when_s: Floats
+
+    def steps(self) -> _Steps:
+        """Return its steps."""
+        seconds, step = np.diff(self.when_s), np.diff(self.center_m, axis=0)
+        near = seconds <= _MOST_STEPS * np.median(seconds)
+        velocity = step / seconds[:, None]
+        inner = np.flatnonzero(near[1:-1] & near[:-2] & near[2:]) + 1
+        two, last = 0.5 * (velocity[1:] + velocity[:-1]), len(step) - 1
+        is_long = near[np.maximum(inner - 2, 0)] & (inner >= 2)
+        before = np.where(is_long[:, None], two[np.maximum(inner - 2, 0)], velocity[inner - 1])
+        is_long = near[np.minimum(inner + 2, last)] & (inner + 2 <= last)
+        after = np.where(is_long[:, None], two[np.minimum(inner + 1, last - 1)], velocity[inner + 1])
+        return _Steps(inner + 1, step[inner], seconds[inner], velocity[inner - 1], velocity[inner + 1], before, after)
+
+    def without(self, row: int, jump_m: Floats) -> _Track:
+        """Return the track without a jump (2) before this image."""
+        back = np.where(np.arange(len(self.order))[:, None] >= row, jump_m, 0.0)
+        return replace(self, center_m=self.center_m - back)
+
+
+def _tracks(dataset: Dataset, drives: Drives) -> Iterator[_Track]:
+    """Yield where the camera with most images in each drive was, where it took enough steps."""
     center = camera_centers(dataset.images)[:, :2]
     time = dataset.images.timestamp_s
     camera = np.unique(dataset.images.camera_id, return_inverse=True)[1]
@@ -130,15 +260,72 @@ def _steps_of_drives(dataset: Dataset, drives: Drives) -> Iterator[_Steps]:
         when = np.arange(len(rows), dtype=np.float64) if time is None else time[rows]
         if not (np.all(np.isfinite(when)) and np.all(np.diff(when) > 0.0)):
             when = np.arange(len(rows), dtype=np.float64)
-        seconds, step = np.diff(when), np.diff(center[rows], axis=0)
-        near = seconds <= _MOST_STEPS * np.median(seconds)
-        velocity = step / seconds[:, None]
-        inner = np.flatnonzero(near[1:-1] & near[:-2] & near[2:]) + 1
-        if len(inner) < 3:
-            continue
-        yield _Steps(
-            drive, drives.order[rows[inner + 1]], step[inner], seconds[inner], velocity[inner - 1], velocity[inner + 1]
+        track = _Track(drive, drives.order[rows], center[rows], when)
+        if len(track.steps().row) >= 3:
+            yield track
+
+
+@dataclass(frozen=True, eq=False)
+class _Test:
+    """What each step (N) says of a jump (N, 2) that is in it, with the covariance (N, 2, 2) of that.
+
+    `evidence` (N) is minus twice the log of how much likelier the step is without one, `misfit` (N) minus twice the log
+    of how likely it is without.
+    """
+
+    jump_m: Floats
+    covariance_m2: Floats
+    evidence: Floats
+    misfit: Floats
+
+    @classmethod
+    def of(cls, steps: _Steps, usual_m: Floats) -> _Test:
+        """Test the steps of a drive where what is unexpected of them is usually so much (2), see `_usual`.
+
+        What a step is other than the mean of the velocities before and after is normal; and wider by jumps where there
+        is one. The velocities of two steps are used where those are surer, and of one where the vehicle was still
+        standing, or turning, in the other.
+        """
+        near = _unexpected(steps, steps.before_mps, steps.after_mps, float(usual_m[0]))
+        far = _unexpected(steps, steps.long_before_mps, steps.long_after_mps, float(usual_m[1]))
+        is_far = np.trace(far[1], axis1=1, axis2=2) < np.trace(near[1], axis1=1, axis2=2)
+        jump = np.where(is_far[:, None], far[0], near[0])
+        covariance = np.where(is_far[:, None, None], far[1], near[1])
+        wide = covariance + _JUMP_M**2 * np.eye(2)
+        misfit, with_jump = (
+            np.einsum("ni,nij,nj->n", jump, np.linalg.inv(of), jump) + np.log(np.linalg.det(of))
+            for of in (covariance, wide)
         )
+        return cls(jump, covariance, misfit - with_jump, misfit)
+
+
+def _usual(steps: _Steps) -> Floats:
+    """Return the deviation (2), each axis, of what steps are other than expected: by velocities of one step, of two."""
+    by = ((steps.before_mps, steps.after_mps), (steps.long_before_mps, steps.long_after_mps))
+    unexpected = [steps.step_m - 0.5 * (before + after) * steps.seconds[:, None] for before, after in by]
+    return np.maximum(1.4826 * np.median(np.abs(unexpected), axis=(1, 2)), _LEAST_SIGMA_M)
+
+
+def _unexpected(steps: _Steps, before_mps: Floats, after_mps: Floats, usual_m: float) -> tuple[Floats, Floats]:
+    """Return what steps (N, 2) are other than the mean of two velocities, and the covariance (N, 2, 2) of that.
+
+    Where the velocities differ, the vehicle brakes, sets off or turns within the step, nobody knows when: the step is
+    uniform between both. One that turns evenly is off the chord between them by v (sin(a) / a - cos(a)), with a half of
+    the angle.
+    """
+    before, after = before_mps * steps.seconds[:, None], after_mps * steps.seconds[:, None]
+    change = after - before
+    covariance = usual_m**2 * np.eye(2) + np.einsum("ni,nj->nij", change, change) / 12.0
+    turn = np.arccos(np.clip(np.sum(_unit(before) * _unit(after), axis=1), -1.0, 1.0))
+    slower = np.minimum(np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1))
+    covariance += ((slower * turn**2 / 12.0) ** 2)[:, None, None] * np.eye(2)
+    return steps.step_m - 0.5 * (before + after), covariance
+
+
+def _unit(vector: Floats) -> Floats:
+    """Return vectors (N, 2) of length 1; (1, 0) for those of none."""
+    length = np.linalg.norm(vector, axis=1, keepdims=True)
+    return np.asarray(np.where(length > 0.0, vector / np.maximum(length, 1e-9), np.array([1.0, 0.0])))
 
 
 def _from_triangle(point: Floats, a: Floats, b: Floats) -> Floats:

@@ -17,7 +17,7 @@ from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
 from valuemap.refine.estimate import Estimate, delay_together, estimate, lay, mounts_alone
 from valuemap.refine.footage import Footage, find_motion, gather, in_working_frame, moved_on, moving_late, with_poses
-from valuemap.refine.jumps import Segments, find_hints, find_jumps
+from valuemap.refine.jumps import Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import find_landmarks
 from valuemap.refine.residuals import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
 from valuemap.refine.select import Selected, select
@@ -146,22 +146,26 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
     poses that are late are moved on, as one thing seen from two sides is two else.
     """
     footage = gather(dataset, drives)
-    jumps, hints = find_jumps(dataset, drives), find_hints(dataset, drives)
-    segment = jumps.of(footage.drives.pass_code, footage.drives.order)
+    proven = mend(dataset, drives)
+    known = (proven.segments, proven.offset_m)
     try:
-        laid, turned = footage, np.zeros((drives.count, 3))
-        landmarks = find_landmarks(footage.dataset, footage.rays, footage.drives, segment, config, threads=threads)
+        turned = np.zeros((drives.count, 3))
+        laid = _laid(footage, turned, 0.0, known) if len(known[0]) > drives.count else footage
+        # What is left once the jumps that trajectories prove are taken back.
+        jumps, hints = find_jumps(laid.whole, laid.whole_drives), find_hints(laid.whole, laid.whole_drives)
+        segment = jumps.of(laid.drives.pass_code, laid.drives.order)
+        landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, segment, config, threads=threads)
         for _ in range(_TURNS):
             more = mounts_alone(laid, landmarks)
             if not more.any():
                 break
             turned = turned + more
-            laid = _laid(footage, turned)
+            laid = _laid(footage, turned, 0.0, known)
             landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, segment, config, threads=threads)
         marks = lay(landmarks, laid, hints)
         late_s = 0.0 if marks is None else delay_together(laid, marks)
         if late_s:
-            laid = _laid(footage, turned, late_s)
+            laid = _laid(footage, turned, late_s, known)
             landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, segment, config, threads=threads)
             marks = lay(landmarks, laid, hints)
             # Mean rates of steps in which turns begin are none of a delay: focal lengths took what they left.
@@ -170,7 +174,17 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
         return None
     if marks is None:
         return None
-    result = estimate(footage, marks, config, seen_cuts=jumps, hints=hints, turned_rad=turned, late_s=late_s)
+    result = estimate(
+        footage,
+        marks,
+        config,
+        seen_cuts=jumps,
+        hints=hints,
+        jumps=proven,
+        known=known,
+        turned_rad=turned,
+        late_s=late_s,
+    )
     if result is None:
         return None
     if _is_lost(footage, result):
@@ -185,7 +199,15 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
         again = None
         if marks is not None:
             again = estimate(
-                footage, marks, config, seen_cuts=jumps, hints=hints, known=known, turned_rad=turned, late_s=late_s
+                footage,
+                marks,
+                config,
+                seen_cuts=jumps,
+                hints=hints,
+                jumps=proven,
+                known=known,
+                turned_rad=turned,
+                late_s=late_s,
             )
         if again is not None and len(again.thing) >= len(result.thing):
             result = again

@@ -18,6 +18,7 @@ import numpy as np
 from valuemap.refine.adjust import Adjustment, Chain, Scales, adjust, triangulate
 from valuemap.refine.estimate import DRIFT_FACTOR, WIDE, Estimate, everything
 from valuemap.refine.footage import Footage
+from valuemap.refine.jumps import Links
 from valuemap.refine.residuals import (
     CAMERA_DELAY,
     CAMERA_MOUNT,
@@ -87,12 +88,14 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
     views = replace(seen.views, segment=ties.segment[seen.views.segment], vehicle=ties.vehicle[seen.views.vehicle])
     seen = replace(seen, views=views)
     chain, things = footage.chain, len(found.class_code)
-    free = _told(seen, everything(footage, found.segments))
+    linked = found.links.groups(len(found.segments))
+    free = _told(seen, everything(footage, found.segments), linked)
     # What each camera has in all drives, and offsets, first; what it has in each drive where that does not do.
     active = tuple(flags if kind not in (MOUNT, DELAY) else np.zeros_like(flags) for kind, flags in enumerate(free))
-    trial = _Trial(seen, chain, _scales(footage, found), things)
     narrow = tuple(np.zeros_like(flags) for flags in free)
-    narrow[OFFSET][_objects_of(seen.segment, seen.thing, len(found.segments)) < _LEAST_OF_SEGMENT] = True
+    objects = _objects_of(linked[seen.segment], seen.thing, len(found.segments))[linked]
+    narrow[OFFSET][objects < _LEAST_OF_SEGMENT] = True
+    trial = _Trial(seen, chain, _scales(footage, found), things, found.links, linked, bound=narrow)
     state, common, narrow = trial.prune(active, narrow, found.state, ())
     of_drives = tuple(flags | (free[kind] if kind in (MOUNT, DELAY) else False) for kind, flags in enumerate(common))
     state, active, narrow = trial.prune(of_drives, narrow, state, (CAMERA_MOUNT, CAMERA_DELAY))
@@ -100,7 +103,8 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
     if not any(flags.any() for flags in active):
         return None
     scales = trial.narrowed(narrow)
-    problem = Adjustment(seen, chain, scales, active, things)
+    found = replace(found, links=found.links.without(narrow[OFFSET][:, 0] | ~active[OFFSET][:, 0]))
+    problem = Adjustment(seen, chain, scales, active, things, found.links)
     state = adjust(problem, state, tolerances=_REFIT, with_variance=True)
     gain, chance, held_out = _held_out(found, seen, chain, scales, active, state)
     parameters = sum(int(flags.sum()) for flags in active)
@@ -160,12 +164,13 @@ def _shared(footage: Footage, found: Estimate) -> Estimate | None:
     )
 
 
-def _told(seen: Observations, free: tuple[Bools, ...]) -> tuple[Bools, ...]:
-    """Return which of the constants enough objects tell anything of."""
+def _told(seen: Observations, free: tuple[Bools, ...], linked: Ints) -> tuple[Bools, ...]:
+    """Return which of the constants enough objects tell anything of; segments that are `linked` (L) tell each other."""
     told = []
-    parts = (seen.segment, seen.vehicle, seen.vehicle, seen.camera, seen.camera, seen.camera)
+    parts = (linked[seen.segment], seen.vehicle, seen.vehicle, seen.camera, seen.camera, seen.camera)
     for kind, (flags, of) in enumerate(zip(free, parts, strict=True)):
         objects = _objects_of(of, seen.thing, len(flags))
+        objects = objects[linked] if kind == OFFSET else objects
         told.append(flags & (objects >= (1 if kind == OFFSET else _LEAST_OF_PART))[:, None])
     return tuple(told)
 
@@ -210,12 +215,19 @@ def _offset_sigma(footage: Footage, found: Estimate) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """What parameters are tried on: observations of `things` objects, and what is thought of errors a priori."""
+    """What parameters are tried on: observations of `things` objects, and what is thought of errors a priori.
+
+    Segments that are `linked` (L) by jumps that trajectories prove are wide if one of them pays: which of them are as
+    far off as usual, nobody knows. `bound` are parameters (by kind) that are narrow whatever they would explain.
+    """
 
     seen: Observations
     chain: Chain
     scales: Scales
     things: int
+    links: Links
+    linked: Ints
+    bound: tuple[Bools, ...]
 
     def smallest(self) -> dict[int, float]:
         """Return by kind what is no more than drift is."""
@@ -242,21 +254,31 @@ class _Trial:
         """Drop whole groups of parameters of which none pays, the poorest first; then narrow those that do not pay.
 
         What does not pay of a camera is dropped too. Kinds that are `fixed` are not judged. What the others are without
-        a group is told by the normal equations; what is left then is fitted and judged anew.
+        a group is told by the normal equations; what is left then is fitted and judged anew. What is narrow and would
+        pay, now that others are narrow, is widened again, once.
         """
         tolerances: tuple[float, ...] = _REFIT
+        settled = tuple(flags.copy() for flags in self.bound)
         while True:
-            problem = Adjustment(self.seen, self.chain, self.narrowed(narrow), active, self.things)
+            problem = Adjustment(self.seen, self.chain, self.narrowed(narrow), active, self.things, self.links)
             state = adjust(problem, state, tolerances=tolerances, with_variance=True)
-            left, thin = self._judged(_Equations.at(problem, state), active, narrow, fixed)
+            left, thin = self._judged(_Equations.at(problem, state), active, narrow, fixed, settled)
             if _is_same((*left, *thin), (*active, *narrow)):
                 return self._regauged(state, active[OFFSET] & ~narrow[OFFSET]), active, narrow
             active, narrow, tolerances = left, thin, _ANEW
 
     def _judged(
-        self, equations: _Equations, active: tuple[Bools, ...], narrow: tuple[Bools, ...], fixed: tuple[int, ...]
+        self,
+        equations: _Equations,
+        active: tuple[Bools, ...],
+        narrow: tuple[Bools, ...],
+        fixed: tuple[int, ...],
+        settled: tuple[Bools, ...],
     ) -> tuple[tuple[Bools, ...], tuple[Bools, ...]]:
-        """Return what stays of parameters, and which of them are narrow, once all that is left pays."""
+        """Return what stays of parameters, and which of them are narrow, once all that is left pays.
+
+        What is widened is marked in `settled`: what is narrow and marked there stays so.
+        """
         while True:
             fit = equations.solved(active, self.narrowed(narrow))
             worth = self._worth(fit, active, narrow)
@@ -280,12 +302,23 @@ class _Trial:
                     if kind in fixed:
                         continue
                     if kind in _OF_MANY:
-                        thin[kind][active[kind] & (worth[kind] <= 0.0)] = True
+                        pays = self._together(kind, worth[kind] > 0.0)
+                        widened = active[kind] & narrow[kind] & ~settled[kind] & pays
+                        thin[kind][active[kind] & ~pays] = True
+                        thin[kind][widened], settled[kind][widened] = False, True
                     else:
                         changed[kind][worth[kind] <= 0.0] = False
                 if _is_same((*changed, *thin), (*active, *narrow)):
                     return active, narrow
             active, narrow = changed, thin
+
+    def _together(self, kind: int, pays: Bools) -> Bools:
+        """Return which parameters pay, or one of those that they are linked with."""
+        if kind != OFFSET:
+            return pays
+        together = np.zeros_like(pays)
+        np.logical_or.at(together, self.linked, pays)
+        return together[self.linked]
 
     def _worth(self, fit: _Fit, active: tuple[Bools, ...], narrow: tuple[Bools, ...]) -> list[Floats]:
         """Return for each parameter by how much its evidence exceeds its price; below 0 where it is too small."""
@@ -300,8 +333,15 @@ class _Trial:
                 constants = np.where(active[kind].any(axis=0), constants - agreed, constants)
             for columns in _groups(kind):
                 free = active[kind][:, columns].all(axis=1)
+                is_narrow = narrow[kind][:, columns].any(axis=1)
                 value[np.flatnonzero(free)[:, None], columns] = -1.0
-                rows = np.flatnonzero(free & ~narrow[kind][:, columns].any(axis=1))
+                rows = np.flatnonzero(free & ~is_narrow)
+                thin = np.flatnonzero(free & is_narrow)
+                if len(thin) and kind in _OF_MANY:
+                    theta, square = self._if_wide(fit, kind, index[thin][:, columns], thin, columns)
+                    evidence = square - len(columns) * price - 2.0 * math.log(max(len(rows), 1))
+                    is_fault = np.linalg.norm(theta, axis=1) > _BEYOND_DRIFT * smallest[kind]
+                    value[thin[:, None], columns] = np.where(is_fault, evidence, -1.0)[:, None]
                 if not len(rows):
                     continue
                 at = index[rows][:, columns]
@@ -322,6 +362,19 @@ class _Trial:
                 value[rows[:, None], columns] = np.where(is_fault, evidence, -1.0)[:, None]
             worth.append(value)
         return worth
+
+    def _if_wide(self, fit: _Fit, kind: int, at: Ints, rows: Ints, columns: list[int]) -> tuple[Floats, Floats]:
+        """Return what parameters (N, width) that are narrow would be if they were not, and their squared sigmas (N).
+
+        Their prior is taken out of the posterior, all others stay as they are. `at` are their places in the covariance.
+        """
+        wide = np.broadcast_to(np.asarray(self.scales.constant[kind]), fit.constants[kind].shape)[rows][:, columns]
+        pull = np.maximum(self.smallest()[kind] ** -2.0 - wide**-2.0, 0.0)
+        information = np.linalg.inv(fit.covariance[at[:, :, None], at[:, None, :]])
+        right = np.einsum("nij,nj->ni", information, fit.constants[kind][rows][:, columns])
+        freed = information - pull[:, :, None] * np.eye(len(columns))
+        theta = np.linalg.solve(freed, right[:, :, None])[:, :, 0]
+        return theta, np.einsum("ni,ni->n", theta, right)
 
     def _agreed_shift(self, offset: Floats, active: Bools) -> Floats:
         """Return the place (3) on which most drives agree: drives that are off do not move it.
@@ -444,7 +497,7 @@ def _held_out(
         fitted = seen.take(half[seen.thing] == side)
         judged = seen.take(half[seen.thing] != side)
         start = replace(state, drift=np.zeros_like(state.drift))
-        problem = Adjustment(fitted, chain, scales, active, things)
+        problem = Adjustment(fitted, chain, scales, active, things, found.links)
         fit = adjust(problem, start, tolerances=_REFIT)
         fit = replace(fit, drift=np.zeros_like(state.drift), own=np.zeros_like(state.own))
         given = replace(fit, constants=tuple(np.zeros_like(c) for c in fit.constants))

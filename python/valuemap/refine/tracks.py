@@ -77,8 +77,11 @@ def associate(
     return detection[rows], thing[rows]
 
 
-def merge_objects(seen: Observations, state: State, image: Ints, class_code: Ints) -> Ints:
-    """Return the new number (K) of each object: those in one place that no image shows together are one."""
+def merge_objects(seen: Observations, state: State, image: Ints, class_code: Ints, drift_m: float) -> Ints:
+    """Return the new number (K) of each object: those in one place that no image shows together are one.
+
+    What is one place for drives that drift, each by `drift_m` on each axis, may be two as their rays have it.
+    """
     count = len(state.point_in_world_m)
     number = np.arange(count)
     pairs = scipy.spatial.cKDTree(state.point_in_world_m).query_pairs(_ONE_M, output_type="ndarray")
@@ -87,7 +90,7 @@ def merge_objects(seen: Observations, state: State, image: Ints, class_code: Int
     shows = [set(image[rows].tolist()) for rows in _rows_of(seen.thing, count)]
     covariance = _covariances(seen, state, count)
     apart = state.point_in_world_m[pairs[:, 0]] - state.point_in_world_m[pairs[:, 1]]
-    total = covariance[pairs[:, 0]] + covariance[pairs[:, 1]] + 0.05**2 * np.eye(3)
+    total = covariance[pairs[:, 0]] + covariance[pairs[:, 1]] + 2.0 * drift_m**2 * np.eye(3)
     square = np.einsum("ni,ni->n", apart, np.linalg.solve(total, apart[:, :, None])[:, :, 0])
     for k in np.argsort(square, kind="stable").tolist():
         if not square[k] < _CLOSE2:
