@@ -11,11 +11,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from typer.testing import CliRunner
 
 from small_dataset import ANCHOR, rewrite, small_dataset, with_column, with_value
+from valuemap import portions
+from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, Frame, read_dataset, rows_of, write_dataset
 from valuemap.errors import InputError, OutputError
 from valuemap.folders import LEDGER, new_file
+from valuemap.summary import summarize_dataset, summarize_portions
 from valuemap.tables import Categories, table_to_arrow
 
 TABLES = ("cameras", "images", "detections", "truth", "truth_detections")
@@ -93,6 +97,25 @@ def test_a_detection_may_reach_out_of_its_picture_by_a_box(folder: Path) -> None
 
 def test_rows_of_ids() -> None:
     assert_array_equal(rows_of(np.array([30, 10, 30]), np.array([10, 20, 30])), [2, 0, 2])
+    assert_array_equal(rows_of(np.array([12, 10, 12]), np.array([10, 11, 12])), [2, 0, 2])
+    assert_array_equal(rows_of(np.array([13, 10, 13]), np.array([10, 11, 13])), [2, 0, 2])
+    assert_array_equal(rows_of(np.empty(0, np.int64), np.empty(0, np.int64)), [])
+
+
+def test_what_a_dataset_holds_is_told_of_portions(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rewrite(folder / "detections.parquet", lambda table: table.take(pa.array([3, 0, 4, 1, 2])))
+    whole = summarize_dataset(read_dataset(folder))
+    monkeypatch.setattr(portions, "ROWS", 2)
+    dataset, of_folder = portions.read_dataset_in_portions(folder)
+    parts = list(of_folder)
+    assert [len(part) for part in parts] == [2, 2, 1]
+    assert summarize_portions(dataset, parts) == whole
+    told = CliRunner().invoke(app, ["info", str(folder), "--json"])
+    assert json.loads(told.stdout) == whole
+    rewrite(folder / "detections.parquet", with_value("image_id", 4, 99))
+    for read in (lambda: read_dataset(folder), lambda: list(portions.read_dataset_in_portions(folder)[1])):
+        with pytest.raises(InputError, match="detections.parquet, row with detection_id .*: image_id: expected an id"):
+            read()
 
 
 # Refusals.

@@ -57,6 +57,19 @@ def census(place_m: Floats, grid: Grid = GRID) -> Census:
     return Census.of(grid, place_m, np.ones(len(place_m), np.int64))
 
 
+def test_places_are_counted_alike_near_and_far_from_each_other() -> None:
+    random = np.random.default_rng(5)
+    near_m = random.uniform(-2000.0, 2000.0, (500, 2))
+    counted = census(near_m)
+    with_one_far = census(
+        np.concatenate([near_m, [[1e9, 1e9]]])
+    )  # Between them are more squares than there are places.
+    assert np.array_equal(counted.square, with_one_far.square[:-1])
+    assert np.array_equal(counted.images, with_one_far.images[:-1])
+    assert np.array_equal(counted.square, np.unique(counted.square, axis=0))
+    assert np.array_equal(with_one_far.detections, [*counted.detections, 1])
+
+
 @settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1), most=st.sampled_from([20, 100, 10**6]))
 def test_every_place_is_in_one_cell(seed: int, most: int) -> None:

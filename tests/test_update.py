@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -346,6 +349,33 @@ def test_cells_that_nobody_drove_through_are_not_solved_again(years: Path) -> No
     assert before & after
     assert after - before
     assert all(name.startswith("1_") for name in before & after)
+
+
+def test_what_was_rejected_is_looked_for_once_and_pandas_not_at_all(years: Path, tmp_path: Path) -> None:
+    code = """
+import sys
+import valuemap.cli
+from valuemap import rejected
+found, find = [], rejected.find_rejected
+rejected.find_rejected = lambda *given: found.append(given) or find(*given)
+try:
+    valuemap.cli.main()
+finally:
+    print(len(found), "pandas" in sys.modules)
+"""
+    options = ["update", years / "map", "--add", years / "second", "--out", tmp_path / "map"]
+    done = subprocess.run([sys.executable, "-c", code, *map(str, options)], capture_output=True, text=True, check=True)
+    assert done.stdout.split()[-2:] == ["1", "False"], done.stdout
+
+
+def test_a_damaged_cell_of_the_old_map_is_named(years: Path, tmp_path: Path) -> None:
+    shutil.copytree(years / "map", tmp_path / "map")
+    for cell in (tmp_path / "map" / "cells").iterdir():
+        cell.write_bytes(cell.read_bytes()[:-100])
+    options = ["--add", years / "second", "--dataset", years / "first", "--out", tmp_path / "map2"]
+    result = CliRunner().invoke(app, ["update", str(tmp_path / "map"), *map(str, options)])
+    assert result.exit_code != 0
+    assert ".arrow: cannot be read" in "".join(result.output.split("\n"))
 
 
 def test_updated_maps_keep_what_was_rejected_of_all_the_data(years: Path) -> None:

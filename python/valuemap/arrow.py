@@ -24,7 +24,7 @@ def numbers_from_arrow(column: pa.Array | pa.ChunkedArray) -> NDArray[Any]:
     if isinstance(column, pa.ChunkedArray):
         column = column.combine_chunks()
     if column.null_count:
-        column = pc.fill_null(column, float("nan"))
+        column = pc.fill_null(column, _MISSING if column.type == _MISSING.type else float("nan"))
     return np.from_dlpack(column)
 
 
@@ -34,6 +34,9 @@ def numbers_to_arrow(values: NDArray[Any], *, nullable: bool = False) -> pa.Arra
     validity = pa.py_buffer(np.packbits(~np.isnan(values), bitorder="little")) if nullable else None
     kind = _TYPES[values.dtype.str[1:]]
     return pa.Array.from_buffers(kind, len(values), [validity, pa.py_buffer(values)])
+
+
+_MISSING = numbers_to_arrow(np.array([np.nan]))[0]
 
 
 def texts_to_arrow(texts: Sequence[str]) -> pa.Array:

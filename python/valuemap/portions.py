@@ -12,9 +12,18 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from valuemap.arrow import numbers_from_arrow
-from valuemap.dataset import MARKER, Frame, check_cameras, check_images, read_head
+from valuemap.dataset import (
+    MARKER,
+    Dataset,
+    Frame,
+    check_cameras,
+    check_detections,
+    check_images,
+    read_head,
+    read_images,
+)
 from valuemap.errors import InputError
-from valuemap.tables import Cameras, Detections, Images, Ints, Table, read_table, table_from_arrow
+from valuemap.tables import Cameras, Detections, Images, Ints, Table, Truth, read_table, table_from_arrow
 
 ROWS = 500_000
 """Rows that are read at a time."""
@@ -49,6 +58,31 @@ class DatasetReader:
         return read_portions(Detections, self.folder / "detections.parquet", self.rows)
 
 
+def read_dataset_in_portions(folder: Path) -> tuple[Dataset, Iterator[Detections]]:
+    """Read and check a dataset as `read_dataset`, its detections in portions, which are read as they are asked for.
+
+    The dataset itself has none; which detections show which true object is not read.
+    """
+    reader = DatasetReader(folder)
+    cameras, images = read_images(folder)
+    truth = folder / "truth.parquet"
+    dataset = Dataset(
+        name=reader.name,
+        frame=reader.frame,
+        cameras=cameras,
+        images=images,
+        detections=Detections.none(),
+        truth=read_table(Truth, truth) if truth.is_file() else None,
+    )
+
+    def portions() -> Iterator[Detections]:
+        for portion in reader.detections():
+            check_detections(portion, images.image_id, images.camera_id, cameras, str(folder))
+            yield portion
+
+    return dataset, portions()
+
+
 def rows_on_disk(folder: Path) -> tuple[int, int]:
     """Return how many images and detections a dataset folder has, from the ends of its files."""
     return _count(folder / "images.parquet"), _count(folder / "detections.parquet")
@@ -68,7 +102,8 @@ def read_portions(kind: type[T], path: Path, rows: int) -> Iterator[T]:
 
 def _count(path: Path) -> int:
     try:
-        rows: int = pq.ParquetFile(path).metadata.num_rows
+        with path.open("rb") as file:  # Arrow takes no path that is not UTF-8.
+            rows: int = pq.ParquetFile(file).metadata.num_rows
     except (pa.ArrowException, OSError):
         return 0  # Whoever reads it says what is wrong.
     return rows
@@ -116,8 +151,10 @@ def _check_unique(kind: type[Table], path: Path, rows: int) -> None:
 
 def _ids(kind: type[Table], path: Path, rows: int) -> Iterator[Ints]:
     assert kind.KEY is not None
-    if kind.KEY not in pq.ParquetFile(path).schema_arrow.names if path.is_file() and _count(path) else False:
-        return  # Whoever reads the table says what is wrong.
+    if path.is_file() and _count(path):
+        with path.open("rb") as file:
+            if kind.KEY not in pq.ParquetFile(file).schema_arrow.names:
+                return  # Whoever reads the table says what is wrong.
     for batch in _batches(path, rows, [kind.KEY]):
         column = batch.column(kind.KEY)
         if not pa.types.is_integer(column.type) or column.null_count:

@@ -13,10 +13,10 @@ from valuemap import map_folder
 from valuemap.cli.app import app
 from valuemap.cli.options import AsJson
 from valuemap.cli.show import show
-from valuemap.dataset import read_dataset
 from valuemap.errors import InputError
 from valuemap.map_folder import read_map
-from valuemap.summary import summarize_dataset, summarize_map
+from valuemap.portions import read_dataset_in_portions
+from valuemap.summary import summarize_map, summarize_portions
 
 
 @app.command("info")
@@ -28,7 +28,7 @@ def info_command(
     if (folder / map_folder.MARKER).is_file():
         facts = summarize_map(read_map(folder))
     elif (folder / dataset_folder.MARKER).is_file():
-        facts = summarize_dataset(read_dataset(folder))
+        facts = summarize_portions(*read_dataset_in_portions(folder))
     else:
         raise InputError(
             f"{folder}: is neither a dataset nor a map",
