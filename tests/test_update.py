@@ -16,9 +16,9 @@ import valuemap
 from literal import Pinhole, Sighting
 from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
 from valuemap import pipeline
-from valuemap.cameras import rotation_matrices
+from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.cli.commands import app
-from valuemap.dataset import Dataset, ensure_checked
+from valuemap.dataset import Dataset, ensure_checked, rows_of
 from valuemap.drives import find_drives
 from valuemap.errors import InputError
 from valuemap.evidence import Evidence
@@ -349,6 +349,17 @@ def test_cells_that_nobody_drove_through_are_not_solved_again(years: Path) -> No
     assert before & after
     assert after - before
     assert all(name.startswith("1_") for name in before & after)
+
+
+def test_cells_of_a_dataset_that_was_changed_are_solved_again(years: Path, tmp_path: Path) -> None:
+    first = valuemap.read_dataset(years / "first")
+    center_px = first.detections.center_px.copy()
+    place_m = camera_centers(first.images)[rows_of(first.detections.image_id, first.images.image_id)]
+    center_px[np.argmax(place_m[:, 0])] += 0.25  # Where no new pass drove.
+    valuemap.write_dataset(replace(first, detections=first.detections.replace(center_px=center_px)), tmp_path / "first")
+    run("update", years / "map", "--add", years / "second", "--dataset", tmp_path / "first", "--out", tmp_path / "map2")
+    before, after = ({p.name for p in (each / "cells").glob("*.arrow")} for each in (years / "map", tmp_path / "map2"))
+    assert not before & after
 
 
 def test_what_was_rejected_is_looked_for_once_and_pandas_not_at_all(years: Path, tmp_path: Path) -> None:
