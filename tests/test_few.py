@@ -18,11 +18,11 @@ NEAR_SIGMAS = 4.0
 
 @pytest.fixture(scope="module")
 def sparse() -> tuple[Dataset, Floats]:
-    """Return one picture in ten of a city, and where its lights are."""
+    """Return one picture in fifteen of a city, and where its lights are."""
     settings = {"streets_north_south": 4, "streets_east_west": 4, "lights": 80, "lookalikes_per_light": 0.0}
     whole = simulate(block(**settings), seed=5, name="sparse")
     assert whole.truth is not None
-    rows = np.flatnonzero(np.random.default_rng(1).random(len(whole.images)) < 1 / 10)
+    rows = np.flatnonzero(np.random.default_rng(1).random(len(whole.images)) < 1 / 15)
     images = whole.images.take(rows)
     detections = whole.detections.take(np.flatnonzero(np.isin(whole.detections.image_id, images.image_id)))
     part = replace(whole, images=images, detections=detections, truth=None, truth_detections=None)
@@ -45,8 +45,9 @@ def test_objects_of_few_looks_are_where_objects_of_their_class_are(sparse: tuple
     result = valuemap.build_map(dataset, known)
     without = valuemap.build_map(dataset, known.with_settings(["least_votes=3"]))
     right = is_right(result, objects)
-    assert right.sum() - is_right(without, objects).sum() >= 2
-    assert len(result.labels) - len(without.labels) <= 4  # Nearly all of these are right.
+    more_right = right.sum() - is_right(without, objects).sum()
+    assert more_right >= 4
+    assert len(result.labels) - len(without.labels) - more_right <= 2
     few = result.labels.votes < 3
     assert few.any()
     assert right[few].all()
@@ -55,5 +56,5 @@ def test_objects_of_few_looks_are_where_objects_of_their_class_are(sparse: tuple
     assert result.labels.covariance_m2 is not None
     assert result.labels.existence is not None
     size_m2 = result.labels.covariance_m2[:, [0, 3, 5]].sum(axis=1)
-    assert size_m2[few].min() > 10.0 * np.median(size_m2[~few])
+    assert np.median(size_m2[few]) > 2.0 * np.median(size_m2[~few])
     assert result.labels.existence[few].max() < 0.99

@@ -41,6 +41,9 @@ const ROUGHNESS: f64 = 0.1;
 const MIN_SHARED_LABELS: usize = 5;
 /// One label says no more than this about the disagreement of passes, as a multiple of what is expected.
 const MOST_DISAGREEMENT: f64 = 5.0;
+/// Where the noise is sought, how much passes of a label disagree counts up to this many standard deviations: 95 % efficient where errors are Gaussian (Huber, "Robust
+/// estimation of a location parameter", 1964).
+const HUBER_SIGMAS: f64 = 1.345;
 
 /// What is searched for, and where: least and most. Boxes of objects of one size grow as errors of position do, with one over
 /// the distance: a detector that is off by more than this share of its boxes is not one, what is more is the position's.
@@ -132,11 +135,10 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
 /// The ratio of the drift of positions to the errors of images and segments at which the passes of objects disagree as much as expected: by bisection, since
 /// the larger the drift is taken for, the less remains unexplained.
 fn agreeing_ratio(scene: &Scene, objects: &[&Placed], noise_of: &(dyn Fn(f64) -> Noise + Sync)) -> f64 {
-    let excess = |ratio: f64| mean_disagreement(scene, &noise_of(ratio), objects).map(|mean| mean - 1.0);
     let (mut low, mut high) = (DRIFT_RATIO.0.ln(), DRIFT_RATIO.1.ln());
     for _ in 0..12 {
         let middle = 0.5 * (low + high);
-        match excess(middle.exp()) {
+        match excess(disagreements(scene, &noise_of(middle.exp()), objects)) {
             None => return 1.0,
             Some(excess) if excess > 0.0 => low = middle,
             Some(_) => high = middle,
@@ -150,24 +152,50 @@ fn agreeing_ratio(scene: &Scene, objects: &[&Placed], noise_of: &(dyn Fn(f64) ->
 #[must_use]
 pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Placed], most: usize) -> f64 {
     let labels: Vec<&Placed> = labels.iter().step_by((labels.len() / most).max(1)).collect();
-    mean_disagreement(scene, noise, &labels).unwrap_or(1.0).max(1.0)
+    mean(disagreements(scene, noise, &labels)).unwrap_or(1.0).max(1.0)
 }
 
-fn mean_disagreement(scene: &Scene, noise: &Noise, labels: &[&Placed]) -> Option<f64> {
-    mean(labels.par_iter().map(|label| disagreement(scene, noise, label)).collect())
+fn disagreements(scene: &Scene, noise: &Noise, labels: &[&Placed]) -> Vec<Option<Disagreement>> {
+    labels.par_iter().map(|label| disagreement(scene, noise, label)).collect()
 }
 
-/// The mean of those that are known, without letting one say too much.
+/// The mean of those that are known, a degree of freedom, without letting one say too much.
 #[must_use]
-pub fn mean(of_labels: Vec<Option<f64>>) -> Option<f64> {
-    let known: Vec<f64> = of_labels.into_iter().flatten().map(|d| d.min(MOST_DISAGREEMENT)).collect();
+pub fn mean(of_labels: Vec<Option<Disagreement>>) -> Option<f64> {
+    let known: Vec<f64> =
+        of_labels.into_iter().flatten().map(|one| (one.square / one.freedom).min(MOST_DISAGREEMENT)).collect();
     (known.len() >= MIN_SHARED_LABELS).then(|| known.iter().sum::<f64>() / known.len() as f64)
 }
 
-/// How far the positions that the passes of a label give it alone lie from their mean: squared, in sigmas, a degree of
-/// freedom. Nothing for labels of a single pass.
+/// By how many standard deviations disagreements are larger than expected, of most labels: Huber's psi, summed. A label of two objects disagrees
+/// whatever the noise is; where a fifth of the labels are such, the mean is as expected with no noise at all.
+fn excess(of_labels: Vec<Option<Disagreement>>) -> Option<f64> {
+    let known: Vec<f64> =
+        of_labels.into_iter().flatten().map(|one| one.sigmas().clamp(-HUBER_SIGMAS, HUBER_SIGMAS)).collect();
+    (known.len() >= MIN_SHARED_LABELS).then(|| known.iter().sum())
+}
+
+/// How far the positions that the passes of a label give it alone lie from their mean.
+#[derive(Debug, Clone, Copy)]
+pub struct Disagreement {
+    /// Squared, in sigmas.
+    square: f64,
+    /// Degrees of freedom.
+    freedom: f64,
+}
+
+impl Disagreement {
+    /// By how many standard deviations it is larger than expected: its cubic root is nearly Gaussian (Wilson and Hilferty, "The distribution of
+    /// chi-square", 1931).
+    fn sigmas(&self) -> f64 {
+        let variance = 2.0 / (9.0 * self.freedom);
+        ((self.square / self.freedom).cbrt() - (1.0 - variance)) / variance.sqrt()
+    }
+}
+
+/// How far the positions that the passes of a label give it alone lie from their mean. Nothing for labels of a single pass.
 #[must_use]
-pub fn disagreement(scene: &Scene, noise: &Noise, (votes, point): &Placed) -> Option<f64> {
+pub fn disagreement(scene: &Scene, noise: &Noise, (votes, point): &Placed) -> Option<Disagreement> {
     let (mut information, mut gradient, mut alone, mut passes) = (Matrix3::zeros(), Vector3::zeros(), 0.0, 0);
     for pass in by_pass(scene, votes).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS) {
         let looks = looks_at(scene, noise, pass, point)?;
@@ -178,7 +206,7 @@ pub fn disagreement(scene: &Scene, noise: &Noise, (votes, point): &Placed) -> Op
         passes += 1;
     }
     let together = gradient.dot(&information.cholesky()?.solve(&gradient));
-    (passes >= 2).then(|| (alone - together) / (3.0 * f64::from(passes - 1)))
+    (passes >= 2).then(|| Disagreement { square: (alone - together).max(0.0), freedom: 3.0 * f64::from(passes - 1) })
 }
 
 /// Minimise a cost over positive parameters by a pattern search in their logarithms, with a prior around the start.

@@ -3,8 +3,10 @@
 use std::f64::consts::PI;
 use std::rc::Rc;
 
+use rayon::prelude::*;
+
 use super::calibrate::{Known, calibrate};
-use super::energy::Object;
+use super::energy::{Object, fit};
 use super::model::Model;
 use super::noise::Noise;
 use super::scene::Scene;
@@ -44,9 +46,22 @@ pub(super) fn likeliest_noise(
     if more.len() == few.len() {
         return Ok((noise, starts));
     }
-    let mut likeliest = Likeliest::default();
-    likeliest.steps(MORE_ROUNDS, noise, |noise| round(scene, noise, known, settings, more, progress))?;
-    Ok((likeliest.noise().unwrap_or(noise), starts))
+    Ok((of_more(noise, |noise| round(scene, noise, known, settings, more, progress))?, starts))
+}
+
+/// The noise that makes more rays likeliest, some steps on from one: the one that a map was found with, or the one that was estimated from it, if
+/// the map is likelier with that. Starts are not compared so: what makes the map of a poor one likeliest is a wrong noise.
+fn of_more(mut noise: Noise, step: impl Fn(&Noise) -> Result<Round, Halt>) -> Result<Noise, Halt> {
+    let (mut best, mut least) = (noise, f64::INFINITY);
+    for _ in 0..MORE_ROUNDS {
+        let found = step(&noise)?;
+        let value = found.value + found.change.min(0.0);
+        if value < least {
+            (best, least) = (if found.change < 0.0 { found.again } else { found.noise }, value);
+        }
+        noise = found.again;
+    }
+    Ok(best)
 }
 
 /// Minus twice the logarithm of how likely some rays are with the noise that makes them likeliest, up to a constant of these rays; of a sample of
@@ -82,9 +97,18 @@ fn round(
     let mut model = Model::new(scene, noise, &settings);
     let begun = initial::labels_of_few(&model, rays, progress)?;
     let objects = search(&mut model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
+    let (value, left) = (likelihood(&model, &objects, rays), Left::of(&model, &objects, rays));
     let again = calibrate(scene, noise, &placed(&objects), known);
-    let value = likelihood(&model, &objects, rays);
-    Ok(Round { noise: *noise, value, again, left: Left::of(&model, &objects, rays) })
+    let change = change_of_fits(&model.with_noise(&again), &objects);
+    Ok(Round { noise: *noise, value, change, again, left })
+}
+
+/// What J of some objects changes by, their votes as they are, with the noise of a model.
+fn change_of_fits(model: &Model<'_>, objects: &[Object]) -> f64 {
+    let of_object = |object: &Object| {
+        fit(model, &object.votes, object.fit.point).map_or(f64::INFINITY, |fit| fit.energy - object.fit.energy)
+    };
+    objects.par_iter().map(of_object).collect::<Vec<f64>>().iter().sum()
 }
 
 /// What a step of the calibration finds with a noise.
@@ -94,6 +118,8 @@ struct Round {
     value: f64,
     /// The noise that is estimated from the map that it makes.
     again: Noise,
+    /// What the value changes by with that, the map as it is.
+    change: f64,
     left: Left,
 }
 
@@ -244,6 +270,23 @@ mod tests {
         let (value, used) = of(all)?;
         assert!(value.is_finite() && used == scene.usable_rays(), "{value}");
         assert_eq!(value.to_bits(), of(scene.usable_rays())?.0.to_bits());
+        Ok(())
+    }
+
+    #[test]
+    fn of_more_rays_the_noise_that_makes_a_map_likeliest_is_kept_not_the_one_that_it_was_found_with() -> Result<(), Halt>
+    {
+        let noise_of = |detection_px: f64| Noise { detection_px, ..street::NOISE };
+        let with = |change: f64| {
+            of_more(noise_of(0.5), |noise| {
+                let left = Left { chi2: 0.0, votes: Vec::new(), clutter: Vec::new(), passes: (0, 0.0) };
+                // The first map is the likeliest.
+                let value = if noise.detection_px < 1.0 { 0.0 } else { 100.0 };
+                Ok(Round { noise: *noise, value, again: noise_of(noise.detection_px + 0.5), change, left })
+            })
+        };
+        assert!((with(-10.0)?.detection_px - 1.0).abs() < 1e-12);
+        assert!((with(10.0)?.detection_px - 0.5).abs() < 1e-12);
         Ok(())
     }
 }

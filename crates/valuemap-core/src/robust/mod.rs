@@ -102,8 +102,10 @@ const CLASS_RAYS: usize = 30_000;
 const WIDE: f64 = 3.0;
 /// Scenes with more rays than this are searched less deeply, if that changes little.
 const MOST_RAYS: usize = 100_000;
-/// All moves pay if they change more of the objects than this: a sample of some dozen tells no less.
-const LEAST_CHANGE: f64 = 0.05;
+/// All moves take some ten times as long: they pay if they change more than one object in ten.
+const LEAST_CHANGE: f64 = 0.1;
+/// By so many standard deviations of the share more: what a sample says by chance pays nowhere.
+const LEAST_CHANGE_SIGMAS: f64 = 2.0;
 
 /// Steps of [`self_calibrate`] at most, as progress counts them, but for the search that tells whether all moves pay: the noise, and the classes.
 pub const CALIBRATION_STEPS: usize = likeliest::NOISE_STEPS + 1;
@@ -194,28 +196,27 @@ pub fn self_calibrate(
     let is_small = !is_part && scene.usable_rays().len() <= MOST_RAYS;
     let is_deep = is_small || {
         let deeper = search(&mut model, &wide, placed(&objects), Depth::Deep, false, &mut Tally::default(), progress)?;
-        changed_share(&objects, &deeper) > LEAST_CHANGE
+        is_changed(&objects, &deeper)
     };
     let classes = model.classes.iter().copied().map(Some).collect();
     Ok(Calibration { noise, classes, pooled: model.pooled, confusions: model.confusions, is_deep, starts })
 }
 
-/// The share of the objects of two maps of the same rays that are not in both: with half of their votes.
-fn changed_share(some: &[Object], others: &[Object]) -> f64 {
-    let owners = |objects: &[Object]| -> FxHashMap<u32, usize> {
-        objects.iter().enumerate().flat_map(|(i, object)| object.votes.iter().map(move |&ray| (ray, i))).collect()
+/// Whether so many objects of two maps of the same rays are not in both that it is no chance. One is in both if most of its votes are most of
+/// those of one of the other map.
+fn is_changed(some: &[Object], others: &[Object]) -> bool {
+    let owner: FxHashMap<u32, usize> =
+        others.iter().enumerate().flat_map(|(i, object)| object.votes.iter().map(move |&ray| (ray, i))).collect();
+    let is_kept = |object: &&Object| {
+        let mut of: Vec<usize> = object.votes.iter().filter_map(|ray| owner.get(ray).copied()).collect();
+        of.sort_unstable();
+        let is_most = |votes: &[usize]| 2 * votes.len() > object.votes.len().max(others[votes[0]].votes.len());
+        of.chunk_by(|a, b| a == b).any(is_most)
     };
-    let lost = |objects: &[Object], owner: &FxHashMap<u32, usize>| {
-        let is_lost = |object: &&Object| {
-            let mut of: Vec<usize> = object.votes.iter().filter_map(|ray| owner.get(ray).copied()).collect();
-            of.sort_unstable();
-            let most = of.chunk_by(|a, b| a == b).map(<[usize]>::len).max().unwrap_or(0);
-            2 * most < object.votes.len()
-        };
-        objects.iter().filter(is_lost).count()
-    };
-    let lost = lost(some, &owners(others)) + lost(others, &owners(some));
-    lost as f64 / (some.len() + others.len()).max(1) as f64
+    let kept = some.iter().filter(is_kept).count();
+    let count = (some.len() + others.len()).max(1) as f64;
+    let chance = (LEAST_CHANGE * (1.0 - LEAST_CHANGE) / count).sqrt();
+    1.0 - 2.0 * kept as f64 / count > LEAST_CHANGE + LEAST_CHANGE_SIGMAS * chance
 }
 
 /// Learn the classes of a model from the map of some rays, and return that. Where classes are taken for each other, all competes once more.
@@ -340,4 +341,40 @@ pub fn objects_of(
         object(&model, &lookout, o.votes, o.fit.point, assign::images_of(&claims))
     };
     Ok(objects.into_iter().zip(claims).filter_map(again).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Matrix3;
+
+    use super::*;
+
+    fn with_votes(first: u32, count: u32) -> Object {
+        let fit = energy::Fit {
+            point: nalgebra::Vector3::zeros(),
+            covariance: Matrix3::identity(),
+            energy: 0.0,
+            chi2: Vec::new(),
+        };
+        let (ln_size, others, seen) = (f64::NAN, Vec::new(), seen::Seen::default());
+        Object { class: 0, votes: (first..first + count).collect(), fit, ln_size, others, seen, real: 1.0, energy: 0.0 }
+    }
+
+    #[test]
+    fn all_moves_pay_if_they_change_more_than_one_object_in_ten_and_that_is_no_chance() {
+        let some: Vec<Object> = (0..100).map(|i| with_votes(10 * i, 10)).collect();
+        // Each of the first is two halves: none of them is what it was.
+        let halved = |count: u32| -> Vec<Object> {
+            (0..100)
+                .flat_map(|i| {
+                    let parts = if i < count { vec![(0, 5), (5, 5)] } else { vec![(0, 10)] };
+                    parts.into_iter().map(move |(first, votes)| with_votes(10 * i + first, votes))
+                })
+                .collect()
+        };
+        assert!(!is_changed(&some, &some));
+        // 24 of 208 are 11.5 %, with a standard deviation of 2.1 %.
+        assert!(!is_changed(&some, &halved(8)));
+        assert!(is_changed(&some, &halved(12)) && is_changed(&halved(12), &some));
+    }
 }

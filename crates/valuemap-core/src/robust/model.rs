@@ -299,6 +299,15 @@ impl<'a> Model<'a> {
         }
     }
 
+    /// The same with another noise.
+    #[must_use]
+    pub fn with_noise<'b>(self, noise: &'b Noise) -> Model<'b>
+    where
+        'a: 'b,
+    {
+        Model { noise, spreads: Arc::new(spreads_of(self.scene, noise)), ..self }
+    }
+
     /// Take what is known of the classes; those that nothing is known of are like all together, but for their clutter and the angles of their boxes.
     pub fn know(&mut self, classes: &[Option<ClassModel>], pooled: ClassModel, confusions: &Confusions) {
         self.pooled = pooled;

@@ -71,7 +71,7 @@ pub struct Revision {
 #[derive(Debug, Clone, Default)]
 pub struct Known {
     /// How far its visits disagree, see [`variance_factor`](crate::robust::calibrate::variance_factor).
-    pub disagreement: OnceLock<Option<f64>>,
+    pub disagreement: OnceLock<Option<calibrate::Disagreement>>,
     /// Whether it was found not to be two.
     pub is_one: bool,
     /// Neighbors, as they were, that it was found to have no votes to exchange with.
