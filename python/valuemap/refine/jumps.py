@@ -25,6 +25,8 @@ _RARE = 13.8
 """Minus twice the log odds of a jump before anything is known: one step in a thousand."""
 _FARTHEST_M = 6.0
 """What is farther than drives are laid is no jump of poses: images are missing."""
+_TOLD_M = 0.5
+"""Jumps that a trajectory tells worse, as the vehicle stops or turns there, are left to objects."""
 _MOST_JUMPS = 0.1
 
 
@@ -165,7 +167,9 @@ def mend(dataset: Dataset, drives: Drives) -> Jumps:
         while True:
             steps = track.steps()
             test = _Test.of(steps, usual)
-            evidence = np.where(np.linalg.norm(test.jump_m, axis=1) < _FARTHEST_M, test.evidence, -np.inf)
+            is_told = np.linalg.eigvalsh(test.covariance_m2)[:, 1] < _TOLD_M**2
+            is_told &= np.linalg.norm(test.jump_m, axis=1) < _FARTHEST_M
+            evidence = np.where(is_told, test.evidence, -np.inf)
             best = int(np.argmax(evidence))
             if evidence[best] <= _RARE or len(jumps) > _MOST_JUMPS * len(steps.row):
                 break
