@@ -136,7 +136,7 @@ def find_jumps(dataset: Dataset, drives: Drives) -> Segments:
         steps = track.steps()
         ahead = _FASTER * steps.seconds[:, None]
         outside = _from_triangle(steps.step_m, steps.before_mps * ahead, steps.after_mps * ahead)
-        usual = float(np.median(np.linalg.norm(steps.unexpected_m(), axis=1)))
+        usual = float(np.median(np.linalg.norm(steps.unexpected_m(steps.before_mps, steps.after_mps), axis=1)))
         far = outside > max(_SIGMAS * usual / 1.5, _LEAST_M)
         cuts += [(track.drive, int(order)) for order in track.order[steps.row[far]]]
     both = np.unique(np.array(cuts, dtype=np.int64), axis=0)
@@ -217,9 +217,9 @@ class _Steps:
     long_before_mps: Floats
     long_after_mps: Floats
 
-    def unexpected_m(self) -> Floats:
-        """Return what the steps (N, 2) are other than the mean of those before and after."""
-        return np.asarray(self.step_m - 0.5 * (self.before_mps + self.after_mps) * self.seconds[:, None])
+    def unexpected_m(self, before_mps: Floats, after_mps: Floats) -> Floats:
+        """Return what the steps (N, 2) are other than the mean of velocities (N, 2) before and after."""
+        return np.asarray(self.step_m - 0.5 * (before_mps + after_mps) * self.seconds[:, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,7 +306,7 @@ class _Test:
 def _usual(steps: _Steps) -> Floats:
     """Return the deviation (2), each axis, of what steps are other than expected: by velocities of one step, of two."""
     by = ((steps.before_mps, steps.after_mps), (steps.long_before_mps, steps.long_after_mps))
-    unexpected = [steps.step_m - 0.5 * (before + after) * steps.seconds[:, None] for before, after in by]
+    unexpected = [steps.unexpected_m(before, after) for before, after in by]
     return np.maximum(1.4826 * np.median(np.abs(unexpected), axis=(1, 2)), _LEAST_SIGMA_M)
 
 

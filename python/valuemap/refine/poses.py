@@ -15,7 +15,7 @@ from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives, in_driving_order
 from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
-from valuemap.refine.estimate import Estimate, delay_together, estimate, lay, mounts_alone
+from valuemap.refine.estimate import Estimate, Marks, delay_together, estimate, lay, mounts_alone
 from valuemap.refine.footage import Footage, find_motion, gather, in_working_frame, moved_on, moving_late, with_poses
 from valuemap.refine.jumps import Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import find_landmarks
@@ -174,17 +174,21 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
         return None
     if marks is None:
         return None
-    result = estimate(
-        footage,
-        marks,
-        config,
-        seen_cuts=jumps,
-        hints=hints,
-        jumps=proven,
-        known=known,
-        turned_rad=turned,
-        late_s=late_s,
-    )
+
+    def estimated(marks: Marks, known: tuple[Segments, Floats]) -> Estimate | None:
+        return estimate(
+            footage,
+            marks,
+            config,
+            seen_cuts=jumps,
+            hints=hints,
+            jumps=proven,
+            known=known,
+            turned_rad=turned,
+            late_s=late_s,
+        )
+
+    result = estimated(marks, known)
     if result is None:
         return None
     if _is_lost(footage, result):
@@ -196,19 +200,7 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
         except SettingError:
             return None
         marks = lay(landmarks, laid, hints)
-        again = None
-        if marks is not None:
-            again = estimate(
-                footage,
-                marks,
-                config,
-                seen_cuts=jumps,
-                hints=hints,
-                jumps=proven,
-                known=known,
-                turned_rad=turned,
-                late_s=late_s,
-            )
+        again = None if marks is None else estimated(marks, known)
         if again is not None and len(again.thing) >= len(result.thing):
             result = again
     return _Found(footage, result, select(footage, result))

@@ -168,7 +168,7 @@ pub fn mean(of_labels: Vec<Option<Disagreement>>) -> Option<f64> {
 }
 
 /// By how many standard deviations disagreements are larger than expected, of most labels: Huber's psi, summed. A label of two objects disagrees
-/// whatever the noise is; where a fifth of the labels are such, the mean is as expected with no noise at all.
+/// whatever the noise is; where a fifth of the labels are such, no drift is so large that the mean is as expected.
 fn excess(of_labels: Vec<Option<Disagreement>>) -> Option<f64> {
     let known: Vec<f64> =
         of_labels.into_iter().flatten().map(|one| one.sigmas().clamp(-HUBER_SIGMAS, HUBER_SIGMAS)).collect();
