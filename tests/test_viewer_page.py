@@ -101,7 +101,7 @@ def test_many_labels_and_images_are_painted_in_small_steps(tmp_path: Path) -> No
         drawn = [step["frame"]["all"] for step in seen["first"]]
         assert drawn[0] > corners, "the map is too small to tell"
         assert drawn[0] >= 6 * len(result.labels), "every label is painted"
-        assert drawn[1] < 6 * (len(result.labels) + 4_000), "a straight street is a few lines, not one every 12 m"
+        assert drawn[1] < 6 * (len(result.labels) + 6_000), "a straight street is a few lines, not one every 12 m"
         assert drawn[-1] < max(drawn), "what is out of view is not drawn"
         assert drawn[-1] < 60_000, "parts are small: from near they reach little beyond the view"
         assert 0 < seen["hidden"]["frame"]["all"] < drawn[0]

@@ -70,18 +70,19 @@ export async function open(url, { width = 1440, height = 900, theme = "light" } 
 /** Where a label is on the screen. */
 export const screenOf = (page, id) => page.evaluate((label) => window.valuemap.screenOf(label), id);
 
-/** Look from this zoom, and wait until everything in view is drawn. */
-export async function lookFrom(page, zoom) {
+/** Look from this zoom, at another place if one is given, and wait until everything in view is drawn. */
+export async function lookFrom(page, zoom, place = {}) {
   await page.evaluate((wanted) => {
     document.body.dataset.settled = "false"; // Until a frame of the new view says that it is.
-    window.valuemap.setView({ ...window.valuemap.getView(), zoom: wanted });
-  }, zoom);
+    window.valuemap.setView({ ...window.valuemap.getView(), ...wanted });
+  }, { ...place, zoom });
   await page.waitForFunction(() => document.body.dataset.settled === "true");
 }
 
-/** What moving the map draws at this zoom: a frame of a small step, and all frames until the ground is painted anew. */
+/** What moving the map draws at this zoom: a frame of a small step, and all frames until the ground is painted anew. The map ends where it was. */
 export async function frameFrom(page, zoom) {
   await lookFrom(page, zoom);
+  const start = await page.evaluate(() => window.valuemap.getView());
   const stepped = (px) =>
     page.evaluate(async (step) => {
       Object.assign(window.drawn, { instances: 0, most: 0, all: 0 });
@@ -98,6 +99,6 @@ export async function frameFrom(page, zoom) {
     }, px);
   const moved = await stepped(20);
   const { most, all, instances } = await stepped(200);
-  await lookFrom(page, zoom);
+  await lookFrom(page, zoom, start);
   return { moved, most, all, instances };
 }
