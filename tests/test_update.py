@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,10 +38,11 @@ from valuemap.tables import (
     table_to_arrow,
 )
 from valuemap.tiles.compare import Comparison
+from valuemap.update import changes as changes_of_labels
 from valuemap.update import compare, update
-from valuemap.update.changes import Verdicts, judge, match_labels, match_places
+from valuemap.update.changes import Verdicts, _likeliest, judge, match_labels, match_places
 from valuemap.update.join import join_datasets
-from valuemap.update.looks import HIDDEN_OF, Lookout, Looks, Sights
+from valuemap.update.looks import HIDDEN_OF, Chances, Lookout, Looks, Sights
 
 SET = ("detection_sigma_px=1.5", "position_sigma_m=0.05", "rotation_sigma_deg=0.05")
 LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -208,6 +210,29 @@ def test_labels_are_those_of_all_the_data_where_nothing_is_told_to_have_changed(
     assert state_at(result, MOVED_TO) is None
 
 
+def test_what_is_judged_again_is_not_looked_for_again(compared: Compared, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[bytes, bytes]] = []
+    rounds: list[int] = []
+    look = Lookout.at
+
+    def looks(lookout: Lookout, label_id: int) -> tuple[Sights, Sights]:
+        found = lookout._evidence.result
+        row = lookout._evidence.label_row(label_id)
+        votes = found.votes.detection_id[found.votes.label_id == label_id]
+        asked.append((found.labels.position_in_world_m[row].tobytes(), votes.tobytes()))
+        return look(lookout, label_id)
+
+    def stands_still(new: Labels, before: Ints, *rest: Any) -> Verdicts:
+        rounds.append(len(new))
+        return replace(judge(new, before, *rest), state=["confirmed"] * len(new), moved_from=np.full(len(new), -1))
+
+    monkeypatch.setattr(Lookout, "at", looks)
+    monkeypatch.setattr(update, "judge", stands_still)
+    compared.with_rebuilt(compared.blind()[0])
+    assert len(rounds) == 2
+    assert len(asked) == len(set(asked)) > 0
+
+
 def test_what_was_put_up_is_told_though_all_the_data_have_no_label_for_it(compared: Compared) -> None:
     told, fresh = compared.told, id_at(compared.told, ADDED)
     without = replace(
@@ -250,7 +275,10 @@ def test_labels_of_two_epochs_are_one_where_their_covariances_say_so(years: Path
     assert sorted(match_places(labels, twice).tolist()) == sorted([*range(len(labels)), *[-1] * len(labels)])
 
 
-def test_of_two_heads_side_by_side_neither_takes_the_place_of_the_other(years: Path) -> None:
+def test_of_two_heads_side_by_side_neither_takes_the_place_of_the_other(
+    years: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(changes_of_labels, "scipy", None)  # Slow to import: it is not asked about so few.
     labels = valuemap.read_map(years / "map").labels[:2]
     sigma_m = np.tile([0.01, 0.0, 0.0, 0.01, 0.0, 0.01], (2, 1))
     heads = labels.replace(position_in_world_m=np.array([[0.0, 0, 0], [0.6, 0, 0]]), covariance_m2=sigma_m)
@@ -258,6 +286,17 @@ def test_of_two_heads_side_by_side_neither_takes_the_place_of_the_other(years: P
     again = heads.replace(position_in_world_m=heads.position_in_world_m + [0.35, 0.0, 0.0])
     assert match_places(heads, again).tolist() == [0, 1]
     assert match_places(heads, again[1:]).tolist() == [1]
+
+
+def test_labels_are_paired_in_the_likeliest_way_however_many_ways_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(4)
+    for shape in [(1, 1), (1, 5), (4, 1), (2, 2), (2, 3), (3, 2), (3, 5), (4, 4)] * 5:
+        gain = random.normal(size=shape)
+        few = list(zip(*_likeliest(gain), strict=True))
+        with monkeypatch.context() as patched:
+            patched.setattr(changes_of_labels, "FEW_WAYS", 0)
+            assert sorted(few) == sorted(zip(*_likeliest(gain), strict=True))
+    assert len(_likeliest(random.normal(size=(40, 30)))[0]) == 30  # More ways than can be looked at.
 
 
 def test_what_was_rather_missed_has_moved_where_something_new_stands_beside_it(years: Path) -> None:
@@ -277,20 +316,21 @@ def test_what_was_rather_missed_has_moved_where_something_new_stands_beside_it(y
 def test_one_drive_that_missed_says_gone_only_where_drives_seldom_miss_what_is_there(years: Path) -> None:
     result, dataset = valuemap.read_map(years / "map"), valuemap.read_dataset(years / "first")
     is_new = np.zeros(len(dataset.images), np.bool_)
-    lookout = Lookout(Evidence(result, dataset), find_drives(dataset.images), is_new, 0.9)
+    lookout = Lookout(Evidence(result, dataset), find_drives(dataset.images), is_new)
+    chances = Chances(0.9)
 
     def sights(*hits: int) -> Sights:
         return Sights(np.full(len(hits), 10), np.array(hits), 0.0, 1.0)
 
-    assert lookout.hidden_share([]) == 1.0 / HIDDEN_OF
-    seldom = lookout.hidden_share([sights(9, 8, 9)] * 50)
-    often = lookout.hidden_share([sights(9, 8, 0)] * 50)
+    assert chances.hidden_share([]) == 1.0 / HIDDEN_OF
+    seldom = chances.hidden_share([sights(9, 8, 9)] * 50)
+    often = chances.hidden_share([sights(9, 8, 0)] * 50)
     assert seldom == 1.0 / (150 + HIDDEN_OF)
     assert often == 51.0 / (150 + HIDDEN_OF)
-    assert lookout.looks(sights(0), seldom).say_gone
-    assert not lookout.looks(sights(0), often).say_gone
-    assert lookout.looks(sights(0, 0, 0), often).say_gone
-    assert lookout.looks(sights(9), often).say_there
+    assert chances.looks(sights(0), seldom).say_gone
+    assert not chances.looks(sights(0), often).say_gone
+    assert chances.looks(sights(0, 0, 0), often).say_gone
+    assert chances.looks(sights(9), often).say_there
     # Of what is asked in a map: three drives saw each object.
     first, second = lookout.at(id_at(result, STAYS[0]))
     assert len(first.looks) == 3

@@ -433,7 +433,10 @@ def check_images(images: Images, cameras: Cameras, source: str) -> Images:
     for name in ("position_sigma_m", "rotation_sigma_rad"):
         _check_positive(getattr(images, name), images.image_id, source, "images", "image_id", name)
     # Those of unit length to rounding stay as they are, so that writing and reading again changes no bit.
-    scale = np.where(np.abs(norm - 1.0) > _ROUNDING, norm, 1.0)
+    is_off = np.abs(norm - 1.0) > _ROUNDING
+    if not is_off.any():
+        return images
+    scale = np.where(is_off, norm, 1.0)
     return images.replace(cam_from_world_quat=images.cam_from_world_quat / scale[:, None])
 
 

@@ -15,6 +15,7 @@ time, then place), and all ties are broken by it.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -158,7 +159,7 @@ class Ways:
         self._first = first = np.flatnonzero(exposure == np.arange(len(exposure)))
         self._exposure_of_shot = (np.cumsum(exposure == np.arange(len(exposure))) - 1)[exposure]
         self._track = track = _order_exposures(shots, vehicle[first], first)
-        self._place_m = shots.center_m[first][track.exposure]
+        self._place_m = shots.center_m.take(first[track.exposure], axis=0)
         self._steps = _Steps.of(self._place_m, track)
         low_m, high_m = self._place_m.min(axis=0, initial=np.inf), self._place_m.max(axis=0, initial=-np.inf)
         step_m, speed, taken = (
@@ -179,7 +180,7 @@ class Ways:
         earliest = np.minimum.reduceat(first[track.exposure], starts) if len(starts) else starts
         rank[np.argsort(earliest, kind="stable")] = np.arange(len(starts))
         along = np.argsort(rank[drive], kind="stable")
-        drive, place_m, exposure_along = rank[drive][along], place_m[along], track.exposure[along]
+        drive, place_m, exposure_along = rank[drive][along], place_m.take(along, axis=0), track.exposure[along]
         begins = np.diff(drive, prepend=-1) > 0
         order = np.arange(len(drive)) - np.maximum.accumulate(np.where(begins, np.arange(len(drive)), 0))
         opens = _viewpoint_openings(place_m, begins, viewpoint_step_m)
@@ -189,7 +190,9 @@ class Ways:
         position[exposure_along] = np.arange(len(first))
         of_row = np.empty(len(shots), np.int64)
         of_row[shots.row] = position[self._exposure_of_shot]
-        told = np.bincount(track.told_by[np.argsort(track.exposure)][self._exposure_of_shot], minlength=3)
+        told_by = np.empty(len(first), np.int64)
+        told_by[track.exposure] = track.told_by
+        told = np.bincount(told_by[self._exposure_of_shot], minlength=3)
         record = {
             "passes": int(np.count_nonzero(np.bincount(shots.images.pass_id.codes))),
             "drives": len(starts),
@@ -244,7 +247,7 @@ class _Shots:
         is_timed = ~np.isnan(time_s[row])
         given = _by_first(images.pass_id.codes[row].astype(np.int64) * 2 + is_timed)
         camera = _by_first(images.camera_id[row])
-        return cls(images, row, center_m[row], time_s[row], given, camera)
+        return cls(images, row, center_m.take(row, axis=0), time_s[row], given, camera)
 
     @cached_property
     def _parts_of_untimed(self) -> _NameParts:
@@ -392,7 +395,7 @@ def _rig_pairs(
     if not len(members) or stream[members].min() == stream[members].max():
         return members[:0], members[:0]
     time, of = clock[members], stream[members]
-    cadence, step_m = _own_cadence(time, of, shots.center_m[members])
+    cadence, step_m = _own_cadence(time, of, shots.center_m.take(members, axis=0))
     found = []
     for lag in range(1, min(_MOST_CAMERAS, len(members))):
         near = time[lag:] - time[:-lag] <= 0.5 * np.minimum(cadence[lag:], cadence[:-lag])
@@ -444,7 +447,7 @@ def _own_cadence(time: Floats, stream: Ints, center_m: Floats) -> tuple[Floats, 
     order = np.argsort(stream, kind="stable")
     same = np.diff(stream[order]) == 0
     gap = np.where(same, np.diff(time[order]), np.inf)
-    away_m = np.where(same, _lengths(np.diff(center_m[order], axis=0)), np.nan)
+    away_m = np.where(same, _lengths(np.diff(center_m.take(order, axis=0), axis=0)), np.nan)
     cadence, step_m = np.empty(len(order)), np.empty(len(order))
     cadence[order] = np.minimum(np.concatenate([[np.inf], gap]), np.concatenate([gap, [np.inf]]))
     before_m, after_m = np.concatenate([[np.nan], away_m]), np.concatenate([away_m, [np.nan]])
@@ -595,11 +598,12 @@ class _Track:
 def _order_exposures(shots: _Shots, vehicle: Ints, first: Ints) -> _Track:
     """Return the exposures (first shots, E) of vehicles (E) in driving order."""
     by_vehicle = _sort_codes(vehicle)
-    place_m, time_s = shots.center_m[first], shots.time_s[first]
+    place_m, time_s = shots.center_m.take(first, axis=0), shots.time_s[first]
     runs = _runs(vehicle[by_vehicle])
     ordered, told_by = by_vehicle.copy(), np.zeros(len(first), np.int64)
     taken = np.diff(time_s[by_vehicle], prepend=np.nan)
-    believed = _is_a_way(place_m[by_vehicle], vehicle[by_vehicle]) & ~np.isnan(time_s[by_vehicle[runs[:-1]]])
+    believed = _is_a_way(place_m.take(by_vehicle, axis=0), vehicle[by_vehicle])
+    believed &= ~np.isnan(time_s[by_vehicle[runs[:-1]]])
     group = vehicle[by_vehicle].astype(np.int64)
     pieces: list[_Track] = []
     for number in np.flatnonzero(~believed):
@@ -875,9 +879,10 @@ def _revisits(place_m: Floats, drive: Ints, usual_m: Floats, may: Bools, ground:
     if not len(able):
         return result
     back, before = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
-    for shift in ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5)):
-        cell = np.floor(place_m[able][:, ground] / (2.0 * near_m[able, None]) + shift).astype(np.int64)
-        key = (drive[able] * np.int64(1_000_003) + cell[:, 0]) * np.int64(1_000_003) + cell[:, 1]
+    widths = [place_m[able, axis] / (2.0 * near_m[able]) for axis in ground]
+    rows, columns = ([np.floor(width + shift).astype(np.int64) for shift in (0.0, 0.5)] for width in widths)
+    for row, column in itertools.product(rows, columns):
+        key = (drive[able] * np.int64(1_000_003) + row) * np.int64(1_000_003) + column
         enters = np.concatenate([[True], key[1:] != key[:-1]])
         leaves = np.concatenate([enters[1:], [True]])
         kept = np.flatnonzero(enters | leaves)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from valuemap.cameras import Rays, camera_centers, cast_rays, colmap_camera, rotation_matrices
+from valuemap.cameras import Rays, camera_centers, cast_rays, colmap_camera, rotation_of
 from valuemap.dataset import MARKER, Dataset, number_passes, rows_of
 from valuemap.drives import find_drives
 from valuemap.errors import InputError
@@ -311,9 +311,9 @@ class Evidence:
         """Return where points, one (3) or one per image (N, 3), are in images, px (N, 2); NaN behind the camera."""
         images, cameras = self.dataset.images, self.dataset.cameras
         point = np.broadcast_to(np.asarray(point_in_world_m, np.float64), (len(image_row), 3))
-        seen_from = images.take(image_row)
-        in_cam = np.einsum("nij,nj->ni", rotation_matrices(seen_from), point) + seen_from.cam_from_world_m
-        camera_row = rows_of(seen_from.camera_id, cameras.camera_id)
+        rotation = rotation_of(images.cam_from_world_quat[image_row])
+        in_cam = np.einsum("nij,nj->ni", rotation, point) + images.cam_from_world_m[image_row]
+        camera_row = rows_of(images.camera_id[image_row], cameras.camera_id)
         pixel = np.full((len(image_row), 2), np.nan)
         for row in np.unique(camera_row):
             members = np.flatnonzero(camera_row == row)

@@ -166,7 +166,8 @@ def read_map(path: str | Path) -> Map:
         run["calibration"] = read_json(folder / CALIBRATION)
     labels, votes = read_table(Labels, folder / "labels.parquet"), read_table(Votes, folder / "votes.parquet")
     # Who removes labels from the table, as a filter in pandas does, need not know of their votes.
-    votes = votes.take(np.isin(votes.label_id, labels.label_id))
+    known = np.isin(votes.label_id, labels.label_id)
+    votes = votes if known.all() else votes.take(known)
     rejected = read_table(Rejected, folder / REJECTED) if (folder / REJECTED).is_file() else None
     frame = Frame.from_json(run.pop("frame", None), source=str(head))
     return Map(frame=frame, labels=labels, votes=votes, run=run, rejected=rejected)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import (
@@ -22,8 +22,10 @@ from rich.progress import Progress as ProgressBars
 from rich.table import Table
 from rich.text import Text
 
-from valuemap.evaluate import Evaluation
 from valuemap.progress import Progress
+
+if TYPE_CHECKING:
+    from valuemap.evaluate import Evaluation
 
 SHOWN_PROBLEMS = 5
 """How many problems of one kind are printed before the rest is counted."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -23,6 +25,9 @@ SAME_PLACE_CHI2 = 30.0
 beyond 16.3 if covariances are right, and beyond this if deviations are 1.35 times what they say."""
 CHANGED_CHI2 = 16.27
 """Squared sigmas (chi-square, 3 axes, 99.9 %) from which on a label is elsewhere than before."""
+
+FEW_WAYS = 1000
+"""Of so few ways to pair labels all are looked at: that takes less time than importing SciPy does, 0.5 s."""
 
 STATES = ("confirmed", "gone", "moved", "new", "uncertain")
 KINDS = ("added", "changed", "moved", "removed", "unchanged")
@@ -100,11 +105,15 @@ def match_places(old: Labels, new: Labels) -> Ints:
 
 def _likeliest(gain: Floats) -> tuple[Ints, Ints]:
     """Return the rows and columns of the pairs whose gains (N, M) have the largest sum; each is of one pair."""
-    if min(gain.shape) > 1:
+    rows, columns = gain.shape
+    if rows > columns:
+        column, row = _likeliest(gain.T)
+        return row, column
+    if math.perm(columns, rows) > FEW_WAYS:
         row, column = scipy.optimize.linear_sum_assignment(gain, maximize=True)
         return row, column
-    best = np.unravel_index([int(np.argmax(gain))], gain.shape)  # Of most there is one: SciPy is slow to import.
-    return best[0], best[1]
+    ways = np.array(list(itertools.permutations(range(columns), rows)))
+    return np.arange(rows), ways[np.argmax(gain[np.arange(rows), ways].sum(axis=1))]
 
 
 def judge(

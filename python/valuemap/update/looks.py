@@ -16,6 +16,7 @@ import numpy as np
 
 from valuemap.drives import Drives
 from valuemap.evidence import Evidence
+from valuemap.map_folder import Map
 from valuemap.tables import Bools, Floats, Ints
 
 HIDDEN_OF = 50
@@ -76,9 +77,8 @@ class Sights:
 class Lookout:
     """Counts looks at the labels of a map in one of two epochs; `is_new` (images) tells the images of the second."""
 
-    def __init__(self, evidence: Evidence, drives: Drives, is_new: Bools, recall: float) -> None:
+    def __init__(self, evidence: Evidence, drives: Drives, is_new: Bools) -> None:
         self._evidence, self._drives, self._is_new = evidence, drives, is_new
-        self._recall = min(max(recall, RECALL_BOUNDS[0]), RECALL_BOUNDS[1])
 
     def at(self, label_id: int) -> tuple[Sights, Sights]:
         """Return how the drives of the first epoch, and of the second, saw a label."""
@@ -88,6 +88,30 @@ class Lookout:
         image = np.concatenate([hit, missed])
         is_hit = np.arange(len(image)) < len(hit)
         return self._sights(image, is_hit, new=False), self._sights(image, is_hit, new=True)
+
+    def _sights(self, image: Ints, is_hit: Bools, *, new: bool) -> Sights:
+        here = self._is_new[image] == new
+        image, is_hit = image[here], is_hit[here]
+        views, view = np.unique(self._drives.viewpoint[image], return_inverse=True)
+        was_hit = np.bincount(view, is_hit, len(views)) > 0
+        drive = np.empty(len(views), np.int64)
+        drive[view] = self._drives.pass_code[image]
+        _, of = np.unique(drive, return_inverse=True)
+        time = self._evidence.dataset.images.timestamp_s
+        first, last = (math.nan, math.nan) if time is None else _range(time[image])
+        return Sights(np.bincount(of), np.bincount(of, was_hit).astype(np.int64), first, last)
+
+
+class Chances:
+    """What looks say, where an object that is there, and not hidden, is seen in so large a share of them."""
+
+    def __init__(self, recall: float) -> None:
+        self._recall = min(max(recall, RECALL_BOUNDS[0]), RECALL_BOUNDS[1])
+
+    @classmethod
+    def of(cls, result: Map) -> Chances:
+        """Return the chances of what found a map."""
+        return cls(result.run["counts"].get("detection_rate", 0.5))
 
     def hidden_share(self, sights: Sequence[Sights]) -> float:
         """Return the share of drives that cannot see an object, of how drives saw objects that were there."""
@@ -109,18 +133,6 @@ class Lookout:
             last_s=sights.last_s,
             seen_by=int(np.count_nonzero(sights.hits)),
         )
-
-    def _sights(self, image: Ints, is_hit: Bools, *, new: bool) -> Sights:
-        here = self._is_new[image] == new
-        image, is_hit = image[here], is_hit[here]
-        views, view = np.unique(self._drives.viewpoint[image], return_inverse=True)
-        was_hit = np.bincount(view, is_hit, len(views)) > 0
-        drive = np.empty(len(views), np.int64)
-        drive[view] = self._drives.pass_code[image]
-        _, of = np.unique(drive, return_inverse=True)
-        time = self._evidence.dataset.images.timestamp_s
-        first, last = (math.nan, math.nan) if time is None else _range(time[image])
-        return Sights(np.bincount(of), np.bincount(of, was_hit).astype(np.int64), first, last)
 
     def _ratio(self, hits: Ints, looks: Ints) -> Floats:
         """Return the logarithms of how much likelier the looks of drives (N) are if nothing hides the object."""

@@ -25,7 +25,7 @@ from valuemap.tiles.calibration import read_calibration
 from valuemap.tiles.source import VIEWPOINT_SHARE
 from valuemap.update.changes import STATES, Verdicts, judge, match_labels, match_places, number, tell
 from valuemap.update.join import join_datasets
-from valuemap.update.looks import Lookout, Looks
+from valuemap.update.looks import Chances, Lookout, Looks, Sights
 
 ADDED = "added"
 """Where in the folder of work the dataset of the added passes is kept."""
@@ -107,9 +107,10 @@ def compare(
     """
     is_new = ~np.isin(joined.images.image_id, images_before)
     center_m = camera_centers(joined.images)
+    seen: dict[bytes, tuple[Sights, Sights]] = {}
 
     def judged(rows: _Rows) -> tuple[Verdicts, dict[int, tuple[Looks, Looks]], float]:
-        return _judged(rows, before, rebuilt, alone, joined, center_m, is_new, progress)
+        return _judged(rows, before, rebuilt, alone, joined, center_m, is_new, seen, progress)
 
     matches = _Matches.of(before, rebuilt, alone)
     rows = _Rows.of(before, rebuilt, alone, matches)
@@ -147,30 +148,58 @@ def _judged(
     joined: Dataset,
     center_m: Floats,
     is_new: Bools,
+    seen: dict[bytes, tuple[Sights, Sights]],
     progress: Progress,
 ) -> tuple[Verdicts, dict[int, tuple[Looks, Looks]], float]:
     """Return what became of labels, how both epochs looked at those that were asked for, and the share of drives that
-    are blind to an object.
+    are blind to an object; `seen` keeps how labels with the same votes in the same place were seen.
     """
     max_range_m = _settings(before).vote.max_range_m
     is_near = Nearby(center_m[is_new]).have_any(rows.labels.position_in_world_m, max_range_m)
     is_asked = is_near | (rows.before < 0)
     # What an epoch alone has elsewhere is no sight of this object.
     looked = _without_claimed(rows, is_asked, before, alone, joined, is_new)
-    asked = replace(rebuilt, labels=rows.labels, votes=looked)
-    lookout = _lookout(asked, is_asked, joined, center_m, is_new, max_range_m)
+    sights = _sights(rows, looked, is_asked, seen, rebuilt, joined, center_m, is_new, max_range_m, progress)
     states = before.labels.state.texts() if before.labels.state is not None else ["confirmed"] * len(before.labels)
-    sights = {}
-    with counted(progress, "looking for changes", int(is_asked.sum())) as looked_at:
-        for row in np.flatnonzero(is_asked).tolist():
-            sights[row] = lookout.at(int(rows.labels.label_id[row]))
-            looked_at(len(sights))
     were_there = {row: at for row, at in sights.items() if rows.before[row] >= 0 and states[rows.before[row]] != "gone"}
-    hidden = lookout.hidden_share([first for first, _ in were_there.values()])
+    chances = Chances.of(rebuilt)
+    hidden = chances.hidden_share([first for first, _ in were_there.values()])
     looks = {
-        row: (lookout.looks(first, hidden), lookout.looks(second, hidden)) for row, (first, second) in sights.items()
+        row: (chances.looks(first, hidden), chances.looks(second, hidden)) for row, (first, second) in sights.items()
     }
     return judge(rows.labels, rows.before, states, rows.stands, looks), looks, hidden
+
+
+def _sights(
+    rows: _Rows,
+    looked: Votes,
+    is_asked: Bools,
+    seen: dict[bytes, tuple[Sights, Sights]],
+    rebuilt: Map,
+    joined: Dataset,
+    center_m: Floats,
+    is_new: Bools,
+    max_range_m: float,
+    progress: Progress,
+) -> dict[int, tuple[Sights, Sights]]:
+    """Return how both epochs saw the labels (rows) that are asked for; `seen` says what is known, and is told more."""
+    asked = np.flatnonzero(is_asked)
+    ids, place_m = rows.labels.label_id[asked], rows.labels.position_in_world_m[asked]
+    first, end = (np.searchsorted(looked.label_id, ids, side=side) for side in ("left", "right"))
+    votes = (looked.detection_id[a:b] for a, b in zip(first, end, strict=True))
+    keys = [place.tobytes() + of.tobytes() for place, of in zip(place_m, votes, strict=True)]
+    todo = [number for number, key in enumerate(keys) if key not in seen]
+    if todo:
+        is_unseen = np.zeros(len(rows.labels), np.bool_)
+        is_unseen[asked[todo]] = True
+        votes_of_unseen = looked.take(np.flatnonzero(is_unseen[looked.label_id - 1]))
+        unseen = replace(rebuilt, labels=rows.labels, votes=votes_of_unseen)
+        lookout = _lookout(unseen, is_unseen, joined, center_m, is_new, max_range_m)
+        with counted(progress, "looking for changes", len(todo)) as looked_at:
+            for done, number in enumerate(todo, start=1):
+                seen[keys[number]] = lookout.at(int(ids[number]))
+                looked_at(done)
+    return {row: seen[key] for row, key in zip(asked.tolist(), keys, strict=True)}
 
 
 def has_appeared(first: Looks, second: Looks) -> bool:
@@ -345,9 +374,8 @@ def _lookout(
     columns = ("pass_code", "order", "driven_m", "viewpoint")
     voters = np.unique(rows_of(votes.detection_id, joined.detections.detection_id))
     part = replace(joined, images=images.take(near), detections=joined.detections.take(voters))
-    recall = asked.run["counts"].get("detection_rate", 0.5)
     drives = replace(drives, **{name: getattr(drives, name)[among] for name in columns})
-    return Lookout(Evidence(asked, part), drives, is_new[near], recall)
+    return Lookout(Evidence(asked, part), drives, is_new[near])
 
 
 def _without_claimed(rows: _Rows, is_asked: Bools, before: Map, alone: Map, joined: Dataset, is_new: Bools) -> Votes:
