@@ -12,7 +12,15 @@ from scipy.spatial.transform import Rotation
 from block import block
 from camera_models import measure
 from small_dataset import small_dataset
-from valuemap.cameras import Rays, camera_centers, cast_rays, colmap_camera, rotation_matrices
+from valuemap.cameras import (
+    Rays,
+    camera_centers,
+    camera_poses,
+    cast_rays,
+    colmap_camera,
+    directions_down,
+    rotation_matrices,
+)
 from valuemap.dataset import Dataset, Frame
 from valuemap.tables import Cameras, Categories, Detections, Floats, Images
 
@@ -281,3 +289,16 @@ def test_a_city_is_mapped_as_well_through_any_camera() -> None:
     assert found["pinhole"] >= 0.9 * result["pinhole"]["objects"]
     assert all(abs(other - found["pinhole"]) <= 1 for other in found.values()), found
     assert result["largest_difference"]["rms_m"] < 0.15, result
+
+
+def test_centers_and_directions_are_those_of_the_rotations() -> None:
+    random = np.random.default_rng(2)
+    quat = random.normal(size=(9000, 4))
+    images = small_dataset().images.take(np.zeros(len(quat), np.int64))
+    images = images.replace(
+        cam_from_world_quat=quat / np.linalg.norm(quat, axis=1)[:, None],
+        cam_from_world_m=random.normal(0.0, 1000.0, (len(quat), 3)),
+    )
+    rotation, center_m = camera_poses(images)
+    assert_array_equal(camera_centers(images), center_m)
+    assert_array_equal(directions_down(images), rotation[:, 1])

@@ -30,10 +30,11 @@ from valuemap.progress import silent
 from valuemap.robust import Calibration, Noise, Scene, calibrate, find_labels
 from valuemap.sightings import cast_sightings
 from valuemap.simulate import simulate
-from valuemap.tables import Candidates, Categories, Floats, Labels, Votes, table_to_arrow
+from valuemap.tables import Candidates, Categories, Floats, Labels, Votes, join_tables, table_to_arrow
 from valuemap.tiles import fleet, places
 from valuemap.tiles import grid as grid_module
 from valuemap.tiles.dense import groups_of_drives, join_groups
+from valuemap.tiles.fingerprint import Fingerprints
 from valuemap.tiles.fleet import Fleet
 from valuemap.tiles.grid import LEVELS, WHOLE, Cell, Census, Grid, Places
 from valuemap.tiles.mapping import solve_cells
@@ -42,7 +43,7 @@ from valuemap.tiles.sample import is_sampled, sampled_squares
 from valuemap.tiles.seams import join_cells
 from valuemap.tiles.solve import Solved, solve_cell
 from valuemap.tiles.source import InMemory
-from valuemap.tiles.store import hash_piece, hash_settings
+from valuemap.tiles.store import hash_settings
 from valuemap.tiles.work import MARKER, open_work, remove_work, written
 
 GRID = Grid.of(Frame(), 60.0)
@@ -473,6 +474,71 @@ def test_tiles_of_any_size_on_disk_or_in_memory_give_the_same_map(
     assert sorted(path.name for path in tmp_path.iterdir() if "work" in path.name) == []
 
 
+def fingerprint(piece: InOrder, cell: Cell, settings: str = "") -> str:
+    return Fingerprints(piece).of(np.arange(len(piece.image_id)), cell, settings)
+
+
+def test_fingerprints_tell_all_that_labels_depend_on() -> None:
+    piece = InMemory(streets(0.0), KNOWN).piece(WHOLE)
+    dataset, drives = piece.dataset, piece.drives
+    images, detections = dataset.images, dataset.detections
+    images = images.replace(timestamp_s=np.arange(1.0 * len(images)), rig_id=np.arange(len(images)))
+    other_cameras = dataset.cameras.replace(camera_id=dataset.cameras.camera_id + 1)
+    cameras = join_tables([dataset.cameras, other_cameras])
+    piece = replace(piece, dataset=(dataset := replace(dataset, cameras=cameras, images=images)))
+    known = fingerprint(piece, WHOLE)
+    renamed = images.replace(
+        name=images.name.take(list(range(len(images)))[::-1]),
+        pass_id=Categories(images.pass_id.codes, tuple(f"{name}-again" for name in images.pass_id.names)),
+    )
+    assert fingerprint(replace(piece, dataset=replace(dataset, images=renamed)), WHOLE) == known
+
+    def other(values: Any) -> Any:
+        """Return values of which the last one is the least bit more."""
+        if isinstance(values, Categories):
+            return Categories(other(values.codes), (*values.names, "other"))
+        changed = values.copy()
+        changed[-1] = np.nextafter(changed[-1], np.inf) if changed.dtype.kind == "f" else changed[-1] + 1
+        return changed
+
+    one_less = np.arange(len(detections) - 1)
+    in_another = np.sort(np.append(detections.image_id[:-1], 0))
+    each = np.arange(len(images))
+    tables: list[dict[str, Any]] = [
+        *(
+            {table: rows.replace(**{name: other(getattr(rows, name))})}
+            for table, rows, names in (
+                ("images", images, "camera_id cam_from_world_quat cam_from_world_m pass_id rig_id timestamp_s"),
+                ("detections", detections, "class_name center_px size_px score"),
+            )
+            for name in names.split()
+        ),
+        {"images": images.replace(timestamp_s=None)},
+        {"detections": detections.replace(image_id=in_another)},
+        {"cameras": cameras.replace(width_px=cameras.width_px + 1)},
+        {"cameras": cameras.replace(params=[params + 0.5 for params in cameras.params])},
+        {"cameras": cameras.replace(readout_s=np.full(len(cameras), 0.02))},
+    ]
+    drives_of_others: list[dict[str, Any]] = [
+        *({name: other(getattr(drives, name))} for name in ("order", "driven_m")),
+        {"pass_code": each},
+        {"viewpoint": np.zeros_like(each)},
+    ]
+    others = [
+        *(replace(piece, dataset=replace(dataset, **changed)) for changed in tables),
+        *(replace(piece, drives=replace(drives, **changed)) for changed in drives_of_others),
+        *(replace(piece, **{name: other(getattr(piece, name))}) for name in ("image_id", "detection_id")),
+        replace(
+            piece,
+            dataset=replace(dataset, detections=detections.take(one_less)),
+            detection_id=piece.detection_id[one_less],
+        ),
+    ]
+    told = {fingerprint(each, WHOLE) for each in others}
+    told |= {known, fingerprint(piece, Cell((1, 0))), fingerprint(piece, WHOLE, "other settings")}
+    assert len(told) == len(others) + 3
+
+
 def test_pieces_on_disk_are_those_in_memory(long_street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module, name in ((portions, "ROWS"), (fleet, "BATCH"), (places, "SHARE")):
         monkeypatch.setattr(module, name, 50)
@@ -483,10 +549,11 @@ def test_pieces_on_disk_are_those_in_memory(long_street: Path, tmp_path: Path, m
     assert on_disk.cells == in_memory.cells
     assert on_disk.drives_record == in_memory.drives_record
     for cell in [*on_disk.cells, WHOLE]:
-        hashes = {
-            hash_piece(source.piece(cell), cell, hash_settings(GRID, None, KNOWN)) for source in (on_disk, in_memory)
-        }
+        settings = hash_settings(GRID, None, KNOWN)
+        hashes = {fingerprint(source.piece(cell), cell, settings) for source in (on_disk, in_memory)}
         assert len(hashes) == 1 or cell == WHOLE  # Which they are not: it stands for the sample here.
+        assert in_memory.fingerprint(cell, settings) == fingerprint(in_memory.piece(cell), cell, settings)
+        assert on_disk.fingerprint(cell, settings) is None
     assert np.array_equal(on_disk.sample().detection_id, in_memory.sample().detection_id)
 
 

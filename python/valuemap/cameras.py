@@ -72,13 +72,29 @@ class Rays:
 
 def camera_centers(images: Images) -> Floats:
     """Return the camera centres (N, 3) in metres in the world, -R^T t."""
-    return camera_poses(images)[1]
+    place = np.empty((3, len(images)))
+    for first in range(0, len(images), _BLOCK):
+        # `camera_poses`, without the matrices in between: half the time.
+        rows = slice(first, first + _BLOCK)
+        w, x, y, z = np.ascontiguousarray(images.cam_from_world_quat[rows].T)
+        a, b, c = np.ascontiguousarray(images.cam_from_world_m[rows].T)
+        xx, yy, zz, xy, xz, yz, wx, wy, wz = x * x, y * y, z * z, x * y, x * z, y * z, w * x, w * y, w * z
+        place[0, rows] = (1.0 - 2.0 * (yy + zz)) * a + 2.0 * (xy + wz) * b + 2.0 * (xz - wy) * c
+        place[1, rows] = 2.0 * (xy - wz) * a + (1.0 - 2.0 * (xx + zz)) * b + 2.0 * (yz + wx) * c
+        place[2, rows] = 2.0 * (xz + wy) * a + 2.0 * (yz - wx) * b + (1.0 - 2.0 * (xx + yy)) * c
+    return np.ascontiguousarray(np.negative(place, out=place).T)
 
 
 def camera_poses(images: Images) -> tuple[Floats, Floats]:
     """Return the rotation matrices (N, 3, 3) and the camera centres (N, 3) of images."""
     cam_from_world = rotation_matrices(images)
     return cam_from_world, -np.einsum("nji,nj->ni", cam_from_world, images.cam_from_world_m)
+
+
+def directions_down(images: Images) -> Floats:
+    """Return the unit vectors (N, 3) in the world that go down in each picture: the second rows of R."""
+    w, x, y, z = np.ascontiguousarray(images.cam_from_world_quat.T)
+    return np.stack([2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)], axis=1)
 
 
 def rotation_matrices(images: Images) -> Floats:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from valuemap.cameras import Rays, cast_rays, rotation_matrices
+from valuemap.cameras import Rays, cast_rays, directions_down
 from valuemap.config import MapConfig, bounded_threads
 from valuemap.dataset import Dataset, Frame, ensure_checked, read_dataset, write_dataset
 from valuemap.describe import describe_labels
@@ -235,7 +235,7 @@ def _with_rejected(result: Map, read: Callable[[], Dataset], stages: _Stages) ->
 
 
 def _notes_on_input(dataset: Dataset) -> list[str]:
-    cosine_to_sky = -rotation_matrices(dataset.images)[:, 1] @ np.array(dataset.frame.up)
+    cosine_to_sky = -directions_down(dataset.images) @ np.array(dataset.frame.up)
     notes = (cameras_not_upright(cosine_to_sky), heights_not_measured(dataset.detections.vertical_sigma_px))
     return [note for note in notes if note is not None]
 

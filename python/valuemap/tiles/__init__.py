@@ -3,6 +3,7 @@
 1. `grid`: the cells of a dataset.
 2. `piece`: what a cell is solved with: its images and those around it.
 3. `sample`: the part of a dataset that is calibrated on.
-4. `solve`: the labels of one cell.
-5. `seams`: the labels of all cells as one map.
+4. `fingerprint`: what tells pieces apart.
+5. `solve`: the labels of one cell.
+6. `seams`: the labels of all cells as one map.
 """

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
+
 from valuemap.config import MapConfig
 from valuemap.drives import InOrder
 from valuemap.engine.engine import Engine
@@ -15,10 +17,11 @@ from valuemap.remote import Place
 from valuemap.robust import Calibration, Scene, calibration_from_json, calibration_to_json
 from valuemap.robust import calibrate as calibrate_scene
 from valuemap.sightings import cast_sightings
+from valuemap.tiles.fingerprint import Fingerprints
 from valuemap.tiles.grid import WHOLE
 from valuemap.tiles.sample import SAMPLE_DETECTIONS
 from valuemap.tiles.source import Source
-from valuemap.tiles.store import hash_piece, hash_settings
+from valuemap.tiles.store import hash_settings
 from valuemap.tiles.work import put
 
 
@@ -37,7 +40,8 @@ def calibrate(
     is_part = source.cells != [WHOLE] and len(sample.detection_id) >= SAMPLE_DETECTIONS
     if work is None:
         return _estimated(sample, is_part, config, engine, progress)
-    file = work / f"calibration.{hash_piece(sample, WHOLE, hash_settings(source.grid, None, config))}.json"
+    rows, settings = np.arange(len(sample.image_id)), hash_settings(source.grid, None, config)
+    file = work / f"calibration.{Fingerprints(sample).of(rows, WHOLE, settings)}.json"
     if not file.is_file():
         calibration = _estimated(sample, is_part, config, engine, progress)
         put(file, json.dumps(calibration_to_json(calibration)).encode())

@@ -11,8 +11,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Frame
@@ -120,7 +122,7 @@ def smallest_squares(grid: Grid, place_m: Floats) -> Ints:
     return np.asarray(np.floor((place_m + 0.5 * grid.side_m) / (grid.side_m / 2**LEVELS)).astype(np.int64))
 
 
-def _numbered(keys: Ints) -> tuple[Ints, Ints]:
+def numbered(keys: NDArray[Any]) -> tuple[Ints, Ints]:
     """Return which whole numbers from 0 there are, ascending, and which of them each key (N) is."""
     if keys.max(initial=0) > 4 * len(keys):
         found, number = np.unique(keys, return_inverse=True)
@@ -149,7 +151,7 @@ class Census:
         square = smallest_squares(grid, place_m)
         low = square.min(axis=0)
         across = int(square[:, 1].max() - low[1]) + 1
-        keys, inverse = _numbered((square[:, 0] - low[0]) * across + square[:, 1] - low[1])
+        keys, inverse = numbered((square[:, 0] - low[0]) * across + square[:, 1] - low[1])
         found = np.column_stack([keys // across, keys % across]) + low
         extent = (*place_m.min(axis=0).tolist(), *place_m.max(axis=0).tolist())
         return cls(

@@ -5,15 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from valuemap.config import MapConfig
 from valuemap.engine.engine import Engine
 from valuemap.progress import Progress, counted
 from valuemap.remote import Place
 from valuemap.robust import Calibration
+from valuemap.tiles.fingerprint import Fingerprints
 from valuemap.tiles.grid import Cell
 from valuemap.tiles.solve import Solved, solve_cell
 from valuemap.tiles.source import Source
-from valuemap.tiles.store import cell_file, hash_piece, hash_settings, load_cells, save_cell
+from valuemap.tiles.store import cell_file, hash_settings, load_cells, save_cell
 
 
 @dataclass(frozen=True)
@@ -33,22 +36,29 @@ class CellTask:
 
     def __call__(self, cell: Cell, progress: Progress) -> Solved | Place | None:
         """Return the labels of a cell, or where they are; nothing where there are no images."""
+        key = None if self.store is None else self.source.fingerprint(cell, self.settings)
+        if key is not None and (done := self._done(cell, key)) is not None:
+            return done
         piece = self.source.piece(cell)
         if not len(piece.image_id):
             return None
         grid, file = self.source.grid, None
         if self.store is not None:
-            key = hash_piece(piece, cell, self.settings)
+            if key is None:
+                key = Fingerprints(piece).of(np.arange(len(piece.image_id)), cell, self.settings)
+                if (done := self._done(cell, key)) is not None:
+                    return done
             file = cell_file(self.store, cell, key)
-            if file.is_file():
-                return file
-            if self.known is not None and (again := cell_file(self.known, cell, key)).is_file():
-                return again
         solved = solve_cell(piece, cell, grid, self.calibration, self.config, threads=self.threads, progress=progress)
         if file is None:
             return solved
         save_cell(solved, file)
         return file
+
+    def _done(self, cell: Cell, key: str) -> Place | None:
+        """Return where the labels of a cell are, made from what has this hash, if they are there."""
+        places = (place for place in (self.store, self.known) if place is not None)
+        return next((file for place in places if (file := cell_file(place, cell, key)).is_file()), None)
 
 
 def solve_cells(

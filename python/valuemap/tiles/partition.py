@@ -72,6 +72,10 @@ class OnDisk:
         place_m = self.grid.images_on_ground(ordered.dataset.images)
         return piece_of_rows(ordered, np.flatnonzero(self.grid.is_within(cell, place_m, self.grid.halo_m)))
 
+    def fingerprint(self, cell: Cell, settings: str) -> str | None:  # noqa: ARG002
+        """Return nothing: the piece must be read for it."""
+        return None
+
     def sample(self) -> InOrder:
         """Return what is calibrated on: all of what is one cell."""
         squares = np.array(self._meta["sample"], np.int64).reshape(-1, 2)

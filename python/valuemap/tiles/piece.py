@@ -33,10 +33,10 @@ def piece_of_rows(ordered: InOrder, rows: Ints) -> InOrder:
             rejected=None,
         ),
         Drives(
-            pass_code=_numbered(drives.pass_code[rows]),
+            pass_code=renumbered(drives.pass_code[rows]),
             order=drives.order[rows],
             driven_m=drives.driven_m[rows],
-            viewpoint=_numbered(drives.viewpoint[rows]),
+            viewpoint=renumbered(drives.viewpoint[rows]),
             record={},
         ),
         ordered.image_id[rows],
@@ -44,6 +44,6 @@ def piece_of_rows(ordered: InOrder, rows: Ints) -> InOrder:
     )
 
 
-def _numbered(ascending: Ints) -> Ints:
+def renumbered(ascending: Ints) -> Ints:
     """Return numbers (N) that ascend, without gaps and from 0."""
     return np.concatenate([[0], np.cumsum(np.diff(ascending) != 0)])[: len(ascending)]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
+from threading import Lock
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,6 +13,7 @@ from valuemap.arrow import no_texts
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
 from valuemap.drives import InOrder, in_driving_order
+from valuemap.tiles.fingerprint import Fingerprints
 from valuemap.tiles.grid import WHOLE, Cell, Census, Grid, Places
 from valuemap.tiles.piece import piece_of_rows
 from valuemap.tiles.sample import is_sampled
@@ -41,6 +44,10 @@ class Source(Protocol):
         """Return what a cell is solved with; it may have no detections, or not even images."""
         ...
 
+    def fingerprint(self, cell: Cell, settings: str) -> str | None:
+        """Return what `Fingerprints` tell of a piece, where that is known before the piece is made."""
+        ...
+
     def sample(self) -> InOrder:
         """Return what is calibrated on."""
         ...
@@ -62,10 +69,22 @@ class InMemory:
         self._census = Census.of(self.grid, self._place_m, np.bincount(detections.image_id, minlength=len(images)))
         self.cells: list[Cell] = self._census.cells(self.grid)
         self._places = Places(self.grid, self._place_m)
+        self._lock = Lock()
 
     def piece(self, cell: Cell) -> InOrder:
         """Return what a cell is solved with."""
         return self._ordered if cell == WHOLE else piece_of_rows(self._ordered, self._places.around(cell))
+
+    def fingerprint(self, cell: Cell, settings: str) -> str:
+        """Return what tells the piece of a cell apart."""
+        with self._lock:  # Several threads would all make the same.
+            fingerprints = self._fingerprints
+        rows = np.arange(len(self._ordered.image_id)) if cell == WHOLE else self._places.around(cell)
+        return fingerprints.of(rows, cell, settings)
+
+    @cached_property
+    def _fingerprints(self) -> Fingerprints:
+        return Fingerprints(self._ordered)
 
     def sample(self) -> InOrder:
         """Return what is calibrated on: all of what is one cell."""

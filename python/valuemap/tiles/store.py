@@ -10,7 +10,6 @@ import hashlib
 import io
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
 from importlib.metadata import version
 from typing import Any
 
@@ -19,11 +18,10 @@ import pyarrow as pa
 
 from valuemap.arrow import numbers_from_arrow, numbers_to_arrow
 from valuemap.config import MapConfig
-from valuemap.drives import InOrder
 from valuemap.errors import InputError
 from valuemap.remote import Place, read_all
 from valuemap.robust import Calibration, calibration_to_json
-from valuemap.tables import Categories, Ints, Labels, Table, Votes, table_from_arrow, table_to_arrow
+from valuemap.tables import Categories, Ints, Labels, Votes, table_from_arrow, table_to_arrow
 from valuemap.tiles.grid import Cell, Grid
 from valuemap.tiles.solve import Solved
 from valuemap.tiles.work import put
@@ -46,51 +44,6 @@ def hash_settings(grid: Grid, calibration: Calibration | None, config: MapConfig
         "calibration": None if calibration is None else calibration_to_json(calibration),
     }
     return hashlib.sha256(json.dumps(head, sort_keys=True).encode()).hexdigest()
-
-
-def hash_piece(piece: InOrder, cell: Cell, settings: str) -> str:
-    """Return the hash of all that the labels of a cell depend on; `settings` is what `hash_settings` returned."""
-    digest = hashlib.sha256()
-    head = {
-        "settings": settings,
-        "cell": [cell.base, cell.level, cell.place],
-        "frame": piece.dataset.frame.to_json(),
-    }
-    digest.update(json.dumps(head, sort_keys=True).encode())
-    # What the labels do not depend on: names, and what passes are called.
-    for table, without in (
-        (piece.dataset.cameras, ()),
-        (piece.dataset.images, ("name", "pass_id")),
-        (piece.dataset.detections, ()),
-    ):
-        _add_table(digest, table, without)
-    passes = np.unique(piece.dataset.images.pass_id.codes, return_inverse=True)[1]
-    drives = piece.drives
-    for column in (
-        passes,
-        drives.pass_code,
-        drives.order,
-        drives.driven_m,
-        drives.viewpoint,
-        piece.image_id,
-        piece.detection_id,
-    ):
-        digest.update(np.ascontiguousarray(column).data)
-    return digest.hexdigest()[:32]
-
-
-def _add_table(digest: Any, table: Table, without: tuple[str, ...]) -> None:
-    for field in fields(table):
-        value = getattr(table, field.name)
-        digest.update(f"{field.name} {value is None};".encode())
-        if value is None or field.name in without:
-            continue
-        if isinstance(value, Categories):
-            digest.update(json.dumps(value.names).encode())
-            value = value.codes
-        for array in value if isinstance(value, list) else [value]:
-            digest.update(np.ascontiguousarray(array).data)
-    digest.update(str(len(table)).encode())
 
 
 def save_cell(solved: Solved, place: Place) -> None:

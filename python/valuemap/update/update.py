@@ -423,11 +423,14 @@ def _once(votes: Votes, ids: Ints, is_of_alone: Bools) -> tuple[Votes, Ints]:
 
     Labels of the added passes alone keep theirs: they are there because others had taken their votes wrongly.
     """
-    yields = ~np.isin(votes.label_id, ids[is_of_alone])
-    order = np.lexsort((votes.label_id, yields, votes.detection_id))
-    again = np.concatenate([[False], np.diff(votes.detection_id[order]) == 0])
-    votes = votes.take(np.sort(order[~again]))
-    votes = votes.take(np.argsort(votes.label_id, kind="stable"))
+    ids_voting = np.sort(votes.detection_id)
+    of_several = np.flatnonzero(np.isin(votes.detection_id, ids_voting[1:][np.diff(ids_voting) == 0]))
+    yields = ~np.isin(votes.label_id[of_several], ids[is_of_alone])
+    order = of_several[np.lexsort((votes.label_id[of_several], yields, votes.detection_id[of_several]))]
+    again = order[1:][np.diff(votes.detection_id[order]) == 0]
+    votes = votes.take(np.delete(np.arange(len(votes)), again)) if len(again) else votes
+    if np.any(np.diff(votes.label_id) < 0):
+        votes = votes.take(np.argsort(votes.label_id, kind="stable"))
     first, end = (np.searchsorted(votes.label_id, ids, side=side) for side in ("left", "right"))
     return votes, end - first
 
