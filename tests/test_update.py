@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 import valuemap
 from literal import Pinhole, Sighting
 from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
-from valuemap import pipeline
+from valuemap import pipeline, portions
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, ensure_checked, rows_of
@@ -29,6 +29,7 @@ from valuemap.rejected import find_rejected
 from valuemap.tables import (
     Categories,
     Changes,
+    Detections,
     Floats,
     IdBridge,
     Ints,
@@ -41,7 +42,7 @@ from valuemap.tiles.compare import Comparison
 from valuemap.update import changes as changes_of_labels
 from valuemap.update import compare, update
 from valuemap.update.changes import Verdicts, _likeliest, judge, match_labels, match_places
-from valuemap.update.join import join_datasets
+from valuemap.update.join import join_datasets, join_in_portions
 from valuemap.update.looks import HIDDEN_OF, Chances, Lookout, Looks, Sights
 
 SET = ("detection_sigma_px=1.5", "position_sigma_m=0.05", "rotation_sigma_deg=0.05")
@@ -218,7 +219,7 @@ def test_what_is_judged_again_is_not_looked_for_again(compared: Compared, monkey
     def looks(lookout: Lookout, label_id: int) -> tuple[Sights, Sights]:
         found = lookout._evidence.result
         row = lookout._evidence.label_row(label_id)
-        votes = found.votes.detection_id[found.votes.label_id == label_id]
+        votes = lookout._votes.detection_id[lookout._votes.label_id == label_id]
         asked.append((found.labels.position_in_world_m[row].tobytes(), votes.tobytes()))
         return look(lookout, label_id)
 
@@ -316,7 +317,7 @@ def test_what_was_rather_missed_has_moved_where_something_new_stands_beside_it(y
 def test_one_drive_that_missed_says_gone_only_where_drives_seldom_miss_what_is_there(years: Path) -> None:
     result, dataset = valuemap.read_map(years / "map"), valuemap.read_dataset(years / "first")
     is_new = np.zeros(len(dataset.images), np.bool_)
-    lookout = Lookout(Evidence(result, dataset), find_drives(dataset.images), is_new)
+    lookout = Lookout(Evidence(result, dataset), find_drives(dataset.images), is_new, result.votes)
     chances = Chances(0.9)
 
     def sights(*hits: int) -> Sights:
@@ -382,6 +383,40 @@ def test_an_update_is_a_map_of_all_the_data_but_for_the_ids(years: Path, tmp_pat
 
 def votes_of(result: Map, label_id: int) -> list[int]:
     return list(result.votes.detection_id[result.votes.label_id == label_id].tolist())
+
+
+def test_an_update_in_portions_is_that_in_memory(years: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (update, pipeline):
+        monkeypatch.setattr(module, "LARGEST_IN_MEMORY", 0)
+    monkeypatch.setattr(portions, "ROWS", 50)
+    monkeypatch.setattr(update, "join_datasets", None)
+    run("update", years / "map", "--add", years / "second", "--out", tmp_path / "map2")
+    for name in ("labels.parquet", "votes.parquet", "changes.parquet", "bridge.parquet", "rejected.parquet"):
+        assert (tmp_path / "map2" / name).read_bytes() == (years / "map2" / name).read_bytes(), name
+    one, other = (valuemap.read_dataset(each / "map2" / "dataset") for each in (tmp_path, years))
+    for name in ("cameras", "images", "detections"):
+        assert table_to_arrow(getattr(one, name)).equals(table_to_arrow(getattr(other, name)))
+
+
+def test_datasets_are_joined_in_portions_as_they_are_in_memory(years: Path) -> None:
+    first, second = (valuemap.read_dataset(years / name) for name in ("first", "second"))
+    ranged = second.detections.replace(range_m=np.full(len(second.detections), 20.0))
+    second = ensure_checked(replace(second, detections=ranged))
+    both = join_datasets(first, second)
+    head, part = replace(first, detections=Detections.none()), len(first.detections) // 2
+    parts = iter([first.detections[:part], first.detections[part:]])
+    joined, added, all_portions = join_in_portions(head, parts, int(first.detections.detection_id[-1]), second)
+    detections = join_tables(list(all_portions))
+    for table, expected in ((detections, both.detections), (joined.images, both.images)):
+        assert table_to_arrow(table).equals(table_to_arrow(expected))
+    is_new = ~np.isin(both.images.image_id, first.images.image_id)
+    assert np.array_equal(added.images.image_id, both.images.image_id[is_new])
+    assert np.array_equal(added.detections.detection_id, both.detections.detection_id[-len(second.detections) :])
+    # What another dataset has in between goes behind, too: ids ascend.
+    odd = replace(first, detections=first.detections.replace(detection_id=2 * first.detections.detection_id))
+    between = replace(second, detections=second.detections.replace(detection_id=2 * second.detections.detection_id + 1))
+    ids = [each.detection_id for each in join_in_portions(head, iter([odd.detections]), int(odd.detections.detection_id[-1]), between)[2]]  # fmt: skip # noqa: E501
+    assert np.all(np.diff(np.concatenate(ids)) > 0)
 
 
 def test_cells_that_nobody_drove_through_are_not_solved_again(years: Path) -> None:

@@ -88,6 +88,12 @@ def rows_on_disk(folder: Path) -> tuple[int, int]:
     return _count(folder / "images.parquet"), _count(folder / "detections.parquet")
 
 
+def largest_detection(folder: Path) -> int:
+    """Return the largest id of the detections of a dataset folder, -1 where there are none."""
+    ids = _ids(Detections, folder / "detections.parquet", ROWS)
+    return max((int(of_batch.max(initial=-1)) for of_batch in ids), default=-1)
+
+
 def read_portions(kind: type[T], path: Path, rows: int) -> Iterator[T]:
     """Yield a table in portions of so many rows at most, at least one portion; each is checked and sorted by itself.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from typing import TypeVar
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from valuemap.dataset import Dataset, checked_as
 from valuemap.errors import InputError
-from valuemap.tables import Categories, Floats, Ints, Table, join_tables
+from valuemap.tables import Categories, Detections, Floats, Ints, Table, join_tables
 
 T = TypeVar("T", bound=Table)
 
@@ -25,13 +26,43 @@ def join_datasets(first: Dataset, second: Dataset) -> Dataset:
     InputError
         They are not in one frame.
     """
+    joined, added = _join_images(first, second)
+    ids = _beyond(added.detection_id, first.detections.detection_id)
+    detections = _joined(first.detections, added.replace(detection_id=ids))
+    return checked_as(replace(joined, detections=detections), first, second)
+
+
+def join_in_portions(
+    first: Dataset, portions: Iterator[Detections], largest_id: int, second: Dataset
+) -> tuple[Dataset, Dataset, Iterator[Detections]]:
+    """Return both datasets as one without detections, the second as a part of it, and the detections in portions.
+
+    The first has no detections: these are the `portions`, with ids up to `largest_id`. Ids of the second are shifted
+    beyond it, so that they ascend. All else is as `join_datasets` has it.
+    """
+    joined, added = _join_images(first, second)
+    added = added.replace(detection_id=added.detection_id + max(0, largest_id + 1 - int(added.detection_id[0])))
+    is_added = ~np.isin(joined.images.image_id, first.images.image_id)
+    of_second = replace(joined, images=joined.images.take(is_added), detections=added)
+
+    def all_portions() -> Iterator[Detections]:
+        last = added
+        for portion in portions:
+            like, last = _alike(portion, added)
+            yield like
+        yield last
+
+    return joined, of_second, all_portions()
+
+
+def _join_images(first: Dataset, second: Dataset) -> tuple[Dataset, Detections]:
+    """Return both datasets as one without detections, and those of the second, of images with their ids in it."""
     if first.frame != second.frame:
         raise InputError(
             f"{second.name}: expected the frame of {first.name}, {first.frame.to_json()}, found "
             f"{second.frame.to_json()}",
             hint="import it again with the same origin",
         )
-    given = first
     cameras = second.cameras.replace(camera_id=_beyond(second.cameras.camera_id, first.cameras.camera_id))
     images = second.images.replace(
         image_id=_beyond(second.images.image_id, first.images.image_id),
@@ -42,24 +73,28 @@ def join_datasets(first: Dataset, second: Dataset) -> Dataset:
         rigs = _own_rigs(first.images.rig_id, len(first.images))
         images = images.replace(rig_id=_beyond(_own_rigs(images.rig_id, len(images)), rigs))
         first = replace(first, images=first.images.replace(rig_id=rigs))
-    detections = second.detections.replace(
-        detection_id=_beyond(second.detections.detection_id, first.detections.detection_id),
-        image_id=_renumbered(second.detections.image_id, second.images.image_id, images.image_id),
-    )
     joined = replace(
         first,
         cameras=_joined(first.cameras, cameras),
         images=_joined(first.images, images),
-        detections=_joined(first.detections, detections),
+        detections=Detections.none(),
         truth=None,
         truth_detections=None,
         rejected=None,
     )
-    return checked_as(joined, given, second)
+    image_id = _renumbered(second.detections.image_id, second.images.image_id, images.image_id)
+    return joined, second.detections.replace(image_id=image_id)
 
 
 def _joined(first: T, second: T) -> T:
     """Return two tables as one, ascending; values that one of them does not have are missing."""
+    table = join_tables(_alike(first, second))
+    key: Ints = getattr(table, str(table.KEY))
+    return table if np.all(np.diff(key) > 0) else table.take(np.argsort(key, kind="stable"))
+
+
+def _alike(first: T, second: T) -> tuple[T, T]:
+    """Return two tables with the same columns; values that one of them does not have are missing."""
     for f in fields(first):
         if f.metadata["nullable"]:
             one, other = getattr(first, f.name), getattr(second, f.name)
@@ -67,9 +102,7 @@ def _joined(first: T, second: T) -> T:
                 first = first.replace(**{f.name: _missing(len(first))})
             elif other is None and one is not None:
                 second = second.replace(**{f.name: _missing(len(second))})
-    table = join_tables([first, second])
-    key: Ints = getattr(table, str(table.KEY))
-    return table if np.all(np.diff(key) > 0) else table.take(np.argsort(key, kind="stable"))
+    return first, second
 
 
 def _missing(count: int) -> Floats:

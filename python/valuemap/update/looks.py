@@ -14,10 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.dataset import rows_of
 from valuemap.drives import Drives
 from valuemap.evidence import Evidence
 from valuemap.map_folder import Map
-from valuemap.tables import Bools, Floats, Ints
+from valuemap.tables import Bools, Floats, Ints, Votes
 
 HIDDEN_OF = 50
 """Before anything is learned one in so many drives cannot see an object that is there: as much as so many drives say.
@@ -75,14 +76,19 @@ class Sights:
 
 
 class Lookout:
-    """Counts looks at the labels of a map in one of two epochs; `is_new` (images) tells the images of the second."""
+    """Counts looks at the labels of a map in one of two epochs; `is_new` (images) tells the images of the second.
 
-    def __init__(self, evidence: Evidence, drives: Drives, is_new: Bools) -> None:
-        self._evidence, self._drives, self._is_new = evidence, drives, is_new
+    `votes` are those of the labels, in their order; they are of images of the evidence, which needs no detections.
+    """
+
+    def __init__(self, evidence: Evidence, drives: Drives, is_new: Bools, votes: Votes) -> None:
+        self._evidence, self._drives, self._is_new, self._votes = evidence, drives, is_new, votes
+        self._image_row = rows_of(votes.image_id, evidence.dataset.images.image_id)
 
     def at(self, label_id: int) -> tuple[Sights, Sights]:
         """Return how the drives of the first epoch, and of the second, saw a label."""
-        hit = self._evidence.image_row[self._evidence.vote_rows(label_id)]
+        first, end = np.searchsorted(self._votes.label_id, [label_id, label_id + 1])
+        hit = self._image_row[first:end]
         place = self._evidence.result.labels.position_in_world_m[self._evidence.label_row(label_id)]
         missed = self._evidence.should_have_seen(place, hit)
         image = np.concatenate([hit, missed])

@@ -10,21 +10,43 @@ import numpy as np
 
 from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig
-from valuemap.dataset import MARKER, Dataset, ensure_checked, read_dataset, rows_of, write_dataset_in_pieces
+from valuemap.dataset import (
+    MARKER,
+    Dataset,
+    ensure_checked,
+    read_dataset,
+    read_images,
+    rows_of,
+    write_dataset_in_pieces,
+    write_dataset_in_portions,
+)
 from valuemap.drives import find_drives
 from valuemap.errors import InputError
 from valuemap.evidence import Evidence, find_dataset
 from valuemap.map_folder import BRIDGE, CELLS, CHANGES, DATASET, Map, read_map
 from valuemap.nearby import Nearby
-from valuemap.pipeline import Run, build_map_of_folder
+from valuemap.pipeline import LARGEST_IN_MEMORY, Run, build_map_of_folder
+from valuemap.portions import largest_detection, read_dataset_in_portions, rows_on_disk
 from valuemap.progress import Progress, counted, silent
 from valuemap.rejected import rejected_of_map
 from valuemap.remote import Place
-from valuemap.tables import Bools, Categories, Changes, Floats, IdBridge, Ints, Labels, Votes, join_tables, write_table
+from valuemap.tables import (
+    Bools,
+    Categories,
+    Changes,
+    Detections,
+    Floats,
+    IdBridge,
+    Ints,
+    Labels,
+    Votes,
+    join_tables,
+    write_table,
+)
 from valuemap.tiles.calibration import read_calibration
 from valuemap.tiles.source import VIEWPOINT_SHARE
 from valuemap.update.changes import STATES, Verdicts, judge, match_labels, match_places, number, tell
-from valuemap.update.join import join_datasets
+from valuemap.update.join import join_datasets, join_in_portions
 from valuemap.update.looks import Chances, Lookout, Looks, Sights
 
 ADDED = "added"
@@ -75,24 +97,67 @@ def update_map(
     place = find_dataset(old, before.run, dataset)
     if place is None:
         raise InputError(f"{old}: its dataset is not where it was", hint="say where it is with --dataset")
-    first, second = read_dataset(place), read_dataset(added)
+    second = read_dataset(added)
     if not len(second.detections):
         raise InputError(f"{added}: there are no detections in it", hint="find some with valuemap detect")
-    joined, images_before = ensure_checked(join_datasets(first, second)), first.images.image_id
-    del first, second  # There is as much in them as in the two as one.
-    write_dataset_in_pieces([joined], run.work / DATASET)
     run = replace(run, calibration=calibration, known=old / CELLS, keeps_rejected=False)
-    rebuilt, cells = build_map_of_folder(run.work / DATASET, _settings(before), run, held=joined, progress=progress)
-    # The poses that the labels were found with, where those of whole drives were corrected.
-    posed = rebuilt.corrected or joined
-    alone = _map_alone(posed, images_before, before, run, progress)
+    updated = _updated_in_portions if _is_large(place, added) else _updated_in_memory
+    rebuilt, cells, alone, posed, images_before = updated(place, second, before, run, progress)
+    del second
     before = _in_frame_of(rebuilt, before)
     result, changes, bridge = compare(before, rebuilt, alone, posed, images_before, progress=progress)
-    result = replace(result, rejected=rejected_of_map(result, lambda: posed))
+    result = replace(result, rejected=rejected_of_map(result, lambda: _with_detections(posed, run)))
     for name, table in ((CHANGES, changes), (BRIDGE, bridge)):
         write_table(table, run.work / name)
     files = {f"{DATASET}/{name}": run.work / DATASET / name for name in _DATASET_FILES}
     return result, cells, {**files, CHANGES: run.work / CHANGES, BRIDGE: run.work / BRIDGE}
+
+
+def _is_large(*datasets: Path) -> bool:
+    """Return whether datasets are too large to be in memory whole."""
+    return sum(sum(rows_on_disk(folder)) for folder in datasets) > LARGEST_IN_MEMORY
+
+
+def _with_detections(posed: Dataset, run: Run) -> Dataset:
+    return posed if len(posed.detections) else read_dataset(run.work / DATASET)
+
+
+_Updated = tuple[Map, list[Place], Map, Dataset, Ints]
+"""The map of all the data, the files of its cells, that of the added passes alone, the dataset with the poses that both
+were found with, and the ids of the images that the map before had."""
+
+
+def _updated_in_memory(place: Path, second: Dataset, before: Map, run: Run, progress: Progress) -> _Updated:
+    """Return what is compared, of datasets that fit into memory."""
+    first = read_dataset(place)
+    joined, images_before = ensure_checked(join_datasets(first, second)), first.images.image_id
+    del first, second  # There is as much in them as in the two as one.
+    write_dataset_in_pieces([joined], run.work / DATASET)
+    rebuilt, cells = build_map_of_folder(run.work / DATASET, _settings(before), run, held=joined, progress=progress)
+    # The poses that the labels were found with, where those of whole drives were corrected.
+    posed = rebuilt.corrected or joined
+    is_new = ~np.isin(posed.images.image_id, images_before)
+    of_new = is_new[rows_of(posed.detections.image_id, posed.images.image_id)]
+    added = replace(posed, images=posed.images.take(is_new), detections=posed.detections.take(of_new))
+    return rebuilt, cells, _map_alone(added, before, run, progress), posed, images_before
+
+
+def _updated_in_portions(place: Path, second: Dataset, before: Map, run: Run, progress: Progress) -> _Updated:
+    """Return what is compared, of datasets of which only images are in memory, and not while cells are solved.
+
+    The dataset that is returned has no detections. Poses are taken as they are in datasets as large as these.
+    """
+    first, portions = read_dataset_in_portions(place)
+    joined, added, portions = join_in_portions(first, portions, largest_detection(place), second)
+    images_before = first.images.image_id
+    del first, second
+    write_dataset_in_portions(joined, portions, (), run.work / DATASET)
+    name = joined.name
+    del joined, portions
+    rebuilt, cells = build_map_of_folder(run.work / DATASET, _settings(before), run, progress=progress)
+    alone = _map_alone(added, before, run, progress)
+    cameras, images = read_images(run.work / DATASET)
+    return rebuilt, cells, alone, Dataset(name, before.frame, cameras, images, Detections.none()), images_before
 
 
 def compare(
@@ -223,12 +288,9 @@ def _in_frame_of(rebuilt: Map, before: Map) -> Map:
     return replace(before, labels=before.labels.replace(position_in_world_m=position))
 
 
-def _map_alone(joined: Dataset, images_before: Ints, before: Map, run: Run, progress: Progress) -> Map:
+def _map_alone(added: Dataset, before: Map, run: Run, progress: Progress) -> Map:
     """Return the map of the added passes alone, with their poses as they are in the joined dataset."""
-    images, detections = joined.images, joined.detections
-    is_new = ~np.isin(images.image_id, images_before)
-    of_new = is_new[rows_of(detections.image_id, images.image_id)]
-    added = ensure_checked(replace(joined, images=images.take(is_new), detections=detections.take(of_new)))
+    added = ensure_checked(added)
     write_dataset_in_pieces([added], run.work / ADDED)
     config = _settings(before).with_settings(["correct_poses=0"])
     run = replace(run, known=None)
@@ -372,10 +434,10 @@ def _lookout(
     drives = find_drives(images.take(of_passes), viewpoint_step_m=max_range_m * VIEWPOINT_SHARE)
     among = np.searchsorted(of_passes, near)
     columns = ("pass_code", "order", "driven_m", "viewpoint")
-    voters = np.unique(rows_of(votes.detection_id, joined.detections.detection_id))
-    part = replace(joined, images=images.take(near), detections=joined.detections.take(voters))
+    part = replace(joined, images=images.take(near), detections=Detections.none())
     drives = replace(drives, **{name: getattr(drives, name)[among] for name in columns})
-    return Lookout(Evidence(asked, part), drives, is_new[near])
+    labels = replace(asked, votes=votes[:0])
+    return Lookout(Evidence(labels, part), drives, is_new[near], votes)
 
 
 def _without_claimed(rows: _Rows, is_asked: Bools, before: Map, alone: Map, joined: Dataset, is_new: Bools) -> Votes:
