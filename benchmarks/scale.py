@@ -106,22 +106,30 @@ def measured(folder: Path, out: Path, *options: str) -> dict[str, Any]:
 def timed(*command: str) -> tuple[dict[str, float], dict[str, Any]]:
     """Run a command of valuemap, and return what it took, and what it says."""
     start = time.perf_counter()
-    with tempfile.TemporaryFile() as told:
-        process = subprocess.Popen(
-            program(*command, "--json"), stdout=told, stderr=subprocess.DEVNULL, env=as_installed()
+    with tempfile.TemporaryFile() as told, tempfile.TemporaryFile() as used:
+        subprocess.run(
+            [sys.executable, "-S", "-c", _MEASURE, *program(*command, "--json")],
+            stdout=told,
+            stderr=used,
+            env=as_installed(),
+            check=True,
         )
-        _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode:
-            raise subprocess.CalledProcessError(process.returncode, process.args)
+        seconds = time.perf_counter() - start
         told.seek(0)
-        run = json.load(told)
-    took = {
-        "seconds": round(time.perf_counter() - start, 1),
-        "cpu_seconds": round(used.ru_utime + used.ru_stime, 2),
-        "peak_memory_mb": used.ru_maxrss >> 10,
-    }
-    return took, run
+        used.seek(0)
+        return {"seconds": round(seconds, 1), **json.load(used)}, json.load(told)
+
+
+_MEASURE = """
+import json, resource, subprocess, sys
+status = subprocess.run(sys.argv[1:], stderr=subprocess.DEVNULL).returncode
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+took = {"cpu_seconds": round(used.ru_utime + used.ru_stime, 2), "peak_memory_mb": used.ru_maxrss >> 10}
+print(json.dumps(took), file=sys.stderr)
+sys.exit(status)
+"""
+"""Runs a command, and prints what it took. A process that is started counts the peak memory of who started it as its
+own, so one that has little starts it."""
 
 
 def as_installed() -> dict[str, str]:

@@ -47,6 +47,24 @@ def test_the_labels_of_a_map_on_earth_are_a_layer(tmp_path: Path) -> None:
     assert (layer.geometry.x.round(1) == -0.1).all()
 
 
+def test_further_files_are_linked_or_copied_where_there_are_no_links(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "images").write_bytes(b"long")
+    files = {"dataset/images.parquet": tmp_path / "images"}
+    write_map(MAPS[0], tmp_path / "linked", files=files)
+    assert (tmp_path / "linked" / "dataset" / "images.parquet").samefile(tmp_path / "images")
+
+    def no_links(*_: object) -> None:
+        raise OSError
+
+    monkeypatch.setattr("os.link", no_links)
+    write_map(MAPS[0], tmp_path / "copied", files=files)
+    copied = tmp_path / "copied" / "dataset" / "images.parquet"
+    assert copied.read_bytes() == b"long"
+    assert not copied.samefile(tmp_path / "images")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

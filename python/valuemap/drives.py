@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrow import no_texts
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.dataset import Dataset, rows_of
 from valuemap.tables import Bools, Floats, Images, Ints
@@ -976,14 +977,16 @@ def driving_order(images: Images, drives: Drives) -> Ints:
     return np.lexsort((*images.cam_from_world_m.T, *images.cam_from_world_quat.T, order))
 
 
-def in_driving_order(dataset: Dataset, *, viewpoint_step_m: float = 1.0) -> InOrder:
+def in_driving_order(dataset: Dataset, *, viewpoint_step_m: float = 1.0, keeps_names: bool = True) -> InOrder:
     """Return a dataset with its rows in an order that ids, names and the order of rows do not change.
 
     Images follow the drives, those of one exposure by place and direction; the detections of an image go from left
-    to right.
+    to right. Without `keeps_names` those of images are empty.
     """
     images, detections = dataset.images, dataset.detections
     drives = find_drives(images, viewpoint_step_m=viewpoint_step_m)
+    if not keeps_names:
+        images = images.replace(name=no_texts(len(images)))
     image_row = rows_of(detections.image_id, images.image_id)
     rows = driving_order(images, drives)
     if np.any(np.diff(rows) <= 0):

@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import json
+import os
 import reprlib
 import shutil
 from collections.abc import Mapping, Sequence
@@ -125,8 +126,8 @@ def write_map(
     """Write a map as a folder; an older map that is there is replaced, never half.
 
     Other files in the folder stay. Where one that valuemap did not write is in the way, an `OutputError` says so; with
-    `force` it is replaced. `cells` are the files of its cells, `files` others by their names in the folder;
-    all are copied.
+    `force` it is replaced. `cells` are the files of its cells, `files` others by their names in the folder,
+    which nobody changes any more: where the disk knows links they are linked, else copied, as cells are.
     """
     with new_folder(Path(path), parts=PARTS, part_folders=(CELLS, DATASET), force=force) as folder:
         run = {**result.run, "frame": result.frame.to_json()}
@@ -135,7 +136,10 @@ def write_map(
             (folder / CALIBRATION).write_text(json.dumps(calibration, indent=2) + "\n", encoding="utf-8")
         for name, file in files.items():
             (folder / name).parent.mkdir(exist_ok=True)
-            shutil.copyfile(file, folder / name)
+            try:
+                os.link(file, folder / name)  # Nobody writes into a file that is there.
+            except OSError:  # On another disk, or one that knows no links.
+                shutil.copyfile(file, folder / name)
         if cells:
             (folder / CELLS).mkdir()
         for cell, content in zip(cells, read_all(cells), strict=True):

@@ -25,6 +25,7 @@ _Hashes = NDArray[np.uint64]
 _ODD = np.uint64(0x9E3779B97F4A7C15)
 """2^64 divided by the golden ratio, odd: multiplied by it, each bit reaches those above it."""
 _HALF = np.uint64(32)
+_BLOCK = 2**13
 
 
 class Fingerprints:
@@ -79,14 +80,17 @@ def _columns(table: Table, without: Sequence[str]) -> dict[str, NDArray[Any]]:
 
 def _hashes(columns: Sequence[NDArray[Any]]) -> _Hashes:
     """Return a number for each row (N) of some columns (N) or (N, K), in which each bit of the row has its part."""
-    mixed = np.zeros(len(columns[0]), np.uint64)
-    for column in columns:
-        for values in column.T if column.ndim == 2 else [column]:
-            wide = values if values.dtype.itemsize == 8 else values.astype(np.int64)
+    values = [each for column in columns for each in (column.T if column.ndim == 2 else [column])]
+    hashes = np.zeros(len(columns[0]), np.uint64)
+    for first in range(0, len(hashes), _BLOCK):  # What fits into the caches takes half the time.
+        rows = slice(first, first + _BLOCK)
+        mixed = hashes[rows]
+        for each in values:
+            wide = each[rows] if each.dtype.itemsize == 8 else each[rows].astype(np.int64)
             mixed ^= np.ascontiguousarray(wide).view(np.uint64)
             mixed *= _ODD
             mixed ^= mixed >> _HALF
-    return mixed
+    return hashes
 
 
 def _hashes_of_cameras(cameras: Cameras) -> _Hashes:

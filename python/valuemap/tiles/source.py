@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property
 from threading import Lock
 from typing import Any, Protocol
 
 import numpy as np
 
-from valuemap.arrow import no_texts
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
 from valuemap.drives import InOrder, in_driving_order
@@ -59,12 +57,11 @@ class InMemory:
     def __init__(self, dataset: Dataset, config: MapConfig) -> None:
         max_range_m = config.vote.max_range_m
         self.grid: Grid = Grid.of(dataset.frame, max_range_m)
-        self._ordered = in_driving_order(dataset, viewpoint_step_m=max_range_m * VIEWPOINT_SHARE)
-        self.drives_record: dict[str, Any] = self._ordered.drives.record
         # Nothing that comes after looks at names, as there are none of pieces on disk.
-        images = self._ordered.dataset.images.replace(name=no_texts(len(dataset.images)))
-        self._ordered = replace(self._ordered, dataset=replace(self._ordered.dataset, images=images))
-        detections = self._ordered.dataset.detections
+        step_m = max_range_m * VIEWPOINT_SHARE
+        self._ordered = in_driving_order(dataset, viewpoint_step_m=step_m, keeps_names=False)
+        self.drives_record: dict[str, Any] = self._ordered.drives.record
+        images, detections = self._ordered.dataset.images, self._ordered.dataset.detections
         self._place_m = self.grid.images_on_ground(images)
         self._census = Census.of(self.grid, self._place_m, np.bincount(detections.image_id, minlength=len(images)))
         self.cells: list[Cell] = self._census.cells(self.grid)
