@@ -61,6 +61,13 @@ def test_the_peak_memory_is_that_of_this_process() -> None:
     assert after >= min(before + 250, len(block) // 2**20)
 
 
+def test_the_peak_memory_is_not_that_of_who_started_the_process() -> None:
+    block = bytearray(os.urandom(1)) * (300 * 2**20)
+    code = "from valuemap import system; print(system.peak_memory_mb())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < len(block) // 2**20
+
+
 def test_a_folder_is_locked_once(tmp_path: Path) -> None:
     with system.folder_lock(tmp_path), pytest.raises(BlockingIOError), system.folder_lock(tmp_path):
         raise AssertionError
