@@ -21,7 +21,7 @@ from valuemap.drives import Drives, find_drives, in_driving_order
 from valuemap.engine.threads import ThreadEngine
 from valuemap.refine import FITS_NO_BETTER, Refined, adjust, expose_rows, poses, refine_poses, tracks
 from valuemap.refine.adjust import Adjustment, Scales
-from valuemap.refine.estimate import cut_into_segments, delay_together, lay, mounts_alone
+from valuemap.refine.estimate import cut_into_segments, delay_together, lay, mounts_alone, prices
 from valuemap.refine.footage import Footage, Sigmas, _within, find_motion, gather, in_working_frame
 from valuemap.refine.jumps import Links, Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
@@ -408,6 +408,29 @@ def test_a_signal_is_cut_where_any_cuts_are_cheapest() -> None:
         every = [c for k in range(4) for c in itertools.combinations(range(1, 10), k)]
         best = min(every, key=cost)
         assert cut_into_segments(value, precision, np.full(10, price)) == [0, *best]
+
+
+@pytest.mark.parametrize(
+    ("evidence", "is_shown", "gain", "is_cut"),
+    [
+        # One step in a thousand jumps: minus twice the log odds are 13.8.
+        (0.0, False, 20.0, False),
+        (0.0, False, 24.0, True),
+        (-6.0, False, 24.0, False),
+        (6.0, False, 20.0, True),
+        (99.0, False, 7.0, False),
+        (99.0, False, 9.0, True),
+        (-6.0, True, 9.0, True),
+    ],
+)
+def test_jumps_are_as_rare_as_one_step_in_a_thousand_but_where_a_trajectory_speaks_for_them(
+    evidence: float, is_shown: bool, gain: float, is_cut: bool
+) -> None:
+    # Each of the twenty is half a step from the mean of all.
+    value = np.repeat([[0.0, 0.0], [np.sqrt(gain / 5.0), 0.0]], 10, axis=0)
+    precision = np.tile(np.eye(2), (20, 1, 1))
+    price = prices(np.full(20, evidence), np.full(20, is_shown))
+    assert (len(cut_into_segments(value, precision, price)) > 1) == is_cut
 
 
 def test_segments_are_found_by_drive_and_order() -> None:

@@ -94,15 +94,15 @@ def calibrate(
     threads: int,
     progress: Callable[[int, int], None],
 ) -> _Calibration: ...
-def misfit(
-    scene: Scene,
+def misfits(
+    scenes: tuple[Scene, Scene],
+    second_of_first: NDArray[np.uint32],
     guess: _Noise,
     known: list[bool],
     settings: _Settings,
-    rays: NDArray[np.uint32] | None,
     threads: int,
     progress: Callable[[int, int], None],
-) -> tuple[float, NDArray[np.uint32]]: ...
+) -> tuple[tuple[float, float], int]: ...
 def find_labels(
     scene: Scene, calibration: _Calibration, settings: _Settings, threads: int, progress: Callable[[int, int], None]
 ) -> tuple[_Floats, _Indices, tuple[_Offsets, _Indices], _Floats, _Floats, _Offsets, dict[str, float]]: ...

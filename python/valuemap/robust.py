@@ -172,20 +172,31 @@ def _by_name(shares: Sequence[Sequence[tuple[int, float]]], class_names: Sequenc
     return {name: {class_names[said]: share for said, share in row} for name, row in rows if row}
 
 
-def misfit(
-    scene: Scene, config: MapConfig, rays: Ints | None = None, *, threads: int = 0, tell: Callable[[int], None]
-) -> tuple[float, Ints]:
-    """Return how badly some detections (rows, N) fit, those of a sample of places where none are given, and which.
+def misfits(
+    scenes: tuple[Scene, Scene],
+    second_of_first: Ints,
+    config: MapConfig,
+    *,
+    threads: int,
+    tell: Callable[[int], None],
+) -> tuple[tuple[float, float], int]:
+    """Return how badly the same detections, those of a sample of places, fit in two scenes, and how many they are.
 
     Minus twice the logarithm of their likelihood, up to a constant of theirs. What is true makes them likelier.
-    `tell` hears again and again how many of `MISFIT_STEPS` are done, and stops the work by an exception.
+    `second_of_first` (N) is the row in the second scene of each detection of the first. `tell` hears again and again
+    how many of `MISFIT_STEPS` are done, and stops the work by an exception.
     """
     guess, known = _guess(config.noise)
-    rows = None if rays is None else rays.astype(np.uint32)
-    value, used = _core.misfit(
-        scene.core, guess.as_tuple(), known, _settings(config), rows, threads, lambda done, _total: tell(done)
+    (first, second), count = _core.misfits(
+        (scenes[0].core, scenes[1].core),
+        second_of_first.astype(np.uint32),
+        guess.as_tuple(),
+        known,
+        _settings(config),
+        threads,
+        lambda done, _total: tell(done),
     )
-    return value, used.astype(np.int64)
+    return (first, second), count
 
 
 def steps_of_labels(calibration: Calibration) -> int:

@@ -27,7 +27,7 @@ use valuemap_core::progress::Progress;
 use valuemap_core::ray::{Ray, Rays};
 use valuemap_core::robust::calibrate::Known;
 use valuemap_core::robust::confusion::Confusions;
-use valuemap_core::robust::likeliest::misfit;
+use valuemap_core::robust::likeliest::misfits;
 use valuemap_core::robust::model::ClassModel;
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::scene::{Frustum, Scene, View};
@@ -440,18 +440,16 @@ fn noise_of_hostile_scenes() {
 
 #[test]
 fn misfits_of_hostile_scenes() {
-    let rays = proptest::option::of(vec(any::<Index>(), 0..9));
-    run("misfit", 40, &(columns(8), noise(), known(), settings(), rays), |(columns, guess, known, settings, rays)| {
-        let scene = columns.scene();
-        let count = scene.rays.rays.len();
-        let rays = rays.filter(|_| count > 0).map(|rays| {
-            let mut rays: Vec<u32> = rays.iter().map(|ray| ray.index(count) as u32).collect();
-            rays.sort_unstable();
-            rays.dedup();
-            rays
-        });
-        let (_, used) = misfit(&scene, &guess, known, &settings, rays, &Progress::default()).unwrap();
-        prop_assert!(used.iter().all(|&ray| (ray as usize) < count) && used.is_sorted_by(|a, b| a < b));
+    let cases = (columns(8), columns(8), noise(), known(), settings(), any::<bool>());
+    run("misfits", 40, &cases, |(first, second, guess, known, settings, turns)| {
+        let (first, second) = (first.scene(), second.scene());
+        let count = first.rays.rays.len();
+        // Of the same rays, in the same order or the other.
+        let second = if second.rays.rays.len() == count { second } else { first.clone() };
+        let numbers = 0..count as u32;
+        let numbers: Vec<u32> = if turns { numbers.rev().collect() } else { numbers.collect() };
+        let (_, used) = misfits([&first, &second], &numbers, &guess, known, &settings, &Progress::default()).unwrap();
+        prop_assert!(used <= count);
         Ok(())
     });
 }

@@ -247,7 +247,7 @@ fn medians<'py>(
 #[pymodule]
 mod _core {
     #[pymodule_export]
-    use super::robust::{Scene, calibrate, find_labels, misfit, objects_of};
+    use super::robust::{Scene, calibrate, find_labels, misfits, objects_of};
     #[pymodule_export]
     const CALIBRATION_STEPS: usize = valuemap_core::robust::CALIBRATION_STEPS;
     #[pymodule_export]

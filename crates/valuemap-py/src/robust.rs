@@ -243,33 +243,34 @@ pub fn calibrate(
     Ok((noise, found.is_deep, classes, found.pooled.to_row(), found.confusions.shares().to_vec()))
 }
 
-/// How badly rays fit, and which, `valuemap_core::robust::likeliest::misfit`.
+/// How badly the same rays fit in two scenes, and how many they are, `valuemap_core::robust::likeliest::misfits`.
 #[pyfunction]
 #[allow(clippy::too_many_arguments)]
-pub fn misfit<'py>(
+pub fn misfits<'py>(
     py: Python<'py>,
-    scene: &Scene,
+    scenes: (PyRef<'py, Scene>, PyRef<'py, Scene>),
+    second_of_first: PyReadonlyArray1<'py, u32>,
     guess: NoiseValues,
     known: [bool; 3],
     settings: SettingValues,
-    rays: Option<PyReadonlyArray1<'py, u32>>,
     threads: usize,
     progress: &Bound<'py, PyAny>,
-) -> PyResult<(f64, Bound<'py, PyArray1<u32>>)> {
+) -> PyResult<([f64; 2], usize)> {
     let settings = settings_of(settings)?;
     let guess = noise_of(guess)?;
     let known = Known { detection: known[0], position: known[1], rotation: known[2] };
-    let rays = rays.map(|rays| rays.as_slice().map(<[u32]>::to_vec)).transpose()?;
-    let count = scene.0.rays.rays.len();
-    if rays.iter().flatten().any(|&ray| ray as usize >= count)
-        || rays.iter().any(|rays| !rays.is_sorted_by(|a, b| a < b))
+    let scenes = [&scenes.0.0, &scenes.1.0];
+    let numbers = second_of_first.as_slice()?;
+    let mut sorted = numbers.to_vec();
+    sorted.sort_unstable();
+    if scenes.iter().any(|scene| scene.rays.rays.len() != numbers.len())
+        || !sorted.into_iter().eq(0..numbers.len() as u32)
     {
-        return Err(PyValueError::new_err(format!("rays: expected numbers below {count} in ascending order")));
+        return Err(PyValueError::new_err("second_of_first: expected each ray of two scenes of the same rays once"));
     }
-    let (value, rays) = with_progress(py, threads, 0, progress, |progress| {
-        valuemap_core::robust::likeliest::misfit(&scene.0, &guess, known, &settings, rays, progress)
-    })?;
-    Ok((value, rays.into_pyarray(py)))
+    with_progress(py, threads, 0, progress, |progress| {
+        valuemap_core::robust::likeliest::misfits(scenes, numbers, &guess, known, &settings, progress)
+    })
 }
 
 /// Positions, classes, voters, covariances (N, 9), existence, expected images, and counts.

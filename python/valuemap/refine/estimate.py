@@ -11,7 +11,7 @@ import valuemap._core as _core
 from valuemap.config import MapConfig
 from valuemap.refine.adjust import Adjustment, Groups, Scales, adjust, triangulate
 from valuemap.refine.footage import DRIFT_LENGTH_M, Footage, Sigmas
-from valuemap.refine.jumps import Hints, Jumps, Links, Segments
+from valuemap.refine.jumps import RARE, Hints, Jumps, Links, Segments
 from valuemap.refine.landmarks import Landmarks
 from valuemap.refine.register import Registration, register, togetherness
 from valuemap.refine.residuals import CAMERA_DELAY, MOUNT, OFFSET, WIDTH, Observations, State, linearised, weights
@@ -28,9 +28,9 @@ _FIRST_PX, _FIRST_SHARE, _FIRST_M = 2.0, 0.05, 0.1
 _LANDMARK_PX, _LANDMARK_M = 3.0, 0.2
 _NEW_SEGMENT_M = 1.0
 """Registered shifts that differ by more than this are of two segments."""
-_JUMP_PRICE, _SEEN_PRICE = 20.0, 8.0
-"""Minus twice the log odds of a jump where the trajectory says nothing, and where it shows one: what a new segment
-has to explain."""
+_SEGMENT_PRICE = 8.0
+"""What a new segment has to explain, in squares of sigmas, where the trajectory shows the jump: by Bayes' information
+criterion, the price of two offsets that 55 coordinates tell."""
 _LEAST_VOTES, _LEAST_OF_SEGMENT = 4, 8
 _RANGES = 1.5
 _SURE = 4.0
@@ -375,9 +375,8 @@ def _cut(
         value = shift[rows, :2] - mended
         precision = np.linalg.inv(np.linalg.inv(information[rows])[:, :2, :2])
         cut_at = seen_cuts.of(drives.pass_code[image_of[rows]], order)
-        price = np.maximum(_JUMP_PRICE - hints.between(drive, order), _SEEN_PRICE)
-        price[np.diff(cut_at, prepend=cut_at[0]) != 0] = _SEEN_PRICE
-        starts = cut_into_segments(value, precision, price)
+        is_shown = np.diff(cut_at, prepend=cut_at[0]) != 0
+        starts = cut_into_segments(value, precision, prices(hints.between(drive, order), is_shown))
         cuts: dict[int, Floats] = {}
         for number, start in enumerate(starts):
             end = starts[number + 1] if number + 1 < len(starts) else len(rows)
@@ -429,6 +428,14 @@ def _apparent_shift(footage: Footage, seen: Observations, state: State) -> tuple
 
 def _length_m(footage: Footage) -> float:
     return float(sum(footage.drives.driven_m[footage.drives.pass_code == d].max() for d in range(footage.drives.count)))
+
+
+def prices(evidence: Floats, is_shown: Bools) -> Floats:
+    """Return what new segments (N) have to explain: their own price, and the odds of a jump before anything is known.
+
+    What the trajectory speaks for a jump, `evidence`, speaks against these odds; where it shows one they do not count.
+    """
+    return _SEGMENT_PRICE + np.where(is_shown, 0.0, np.maximum(RARE - evidence, 0.0))
 
 
 def cut_into_segments(value: Floats, precision: Floats, price: Floats) -> list[int]:

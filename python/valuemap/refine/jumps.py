@@ -21,7 +21,7 @@ _MOST_STEPS = 4.0
 _JUMP_M = 2.0
 """Deviation of jumps, each axis."""
 _LEAST_SIGMA_M = 0.02
-_RARE = 13.8
+RARE = 13.8
 """Minus twice the log odds of a jump before anything is known: one step in a thousand."""
 _FARTHEST_M = 6.0
 """What is farther than drives are laid is no jump of poses: images are missing."""
@@ -171,7 +171,7 @@ def mend(dataset: Dataset, drives: Drives) -> Jumps:
             is_told &= np.linalg.norm(test.jump_m, axis=1) < _FARTHEST_M
             evidence = np.where(is_told, test.evidence, -np.inf)
             best = int(np.argmax(evidence))
-            if evidence[best] <= _RARE or len(jumps) > _MOST_JUMPS * len(steps.row):
+            if evidence[best] <= RARE or len(jumps) > _MOST_JUMPS * len(steps.row):
                 break
             here = np.arange(max(best - 1, 0), min(best + 2, len(steps.row)))
             here = here[np.isfinite(evidence[here])]

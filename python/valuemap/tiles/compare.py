@@ -11,7 +11,7 @@ from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
 from valuemap.drives import InOrder, in_driving_order
 from valuemap.progress import Progress, counted
-from valuemap.robust import MISFIT_STEPS, Scene, misfit
+from valuemap.robust import MISFIT_STEPS, Scene, misfits
 from valuemap.sightings import cast_sightings
 from valuemap.tiles.piece import piece_of_rows
 from valuemap.tiles.source import VIEWPOINT_SHARE, InMemory
@@ -49,15 +49,14 @@ def compare_poses(
     Both datasets have the same images and detections.
     """
     old = InMemory(before, config).sample()
-    scene = Scene(old.dataset, old.drives, cast_sightings(old.dataset)[0])
-    with counted(progress, "comparing poses", 2 * MISFIT_STEPS) as tell:
-        of_old, rays = misfit(scene, config, threads=threads, tell=tell)
-        new = _same_images(after, old, config)
-        scene = Scene(new.dataset, new.drives, cast_sightings(new.dataset)[0])
-        # They are in another order where poses tell the order.
-        same = np.flatnonzero(np.isin(new.detection_id, old.detection_id[rays]))
-        of_new, _ = misfit(scene, config, same, threads=threads, tell=lambda done: tell(MISFIT_STEPS + done))
-    return Comparison(of_old, of_new, parameters * math.log(2 * len(rays)), len(rays))
+    new = _same_images(after, old, config)
+    first, second = (Scene(one.dataset, one.drives, cast_sightings(one.dataset)[0]) for one in (old, new))
+    # They are in another order where poses tell the order.
+    order = np.argsort(new.detection_id)
+    second_of_first = order[np.searchsorted(new.detection_id, old.detection_id, sorter=order)]
+    with counted(progress, "comparing poses", MISFIT_STEPS) as tell:
+        (of_old, of_new), rays = misfits((first, second), second_of_first, config, threads=threads, tell=tell)
+    return Comparison(of_old, of_new, parameters * math.log(2 * rays), rays)
 
 
 def _same_images(dataset: Dataset, like: InOrder, config: MapConfig) -> InOrder:

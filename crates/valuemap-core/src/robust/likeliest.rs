@@ -5,7 +5,7 @@ use std::rc::Rc;
 
 use rayon::prelude::*;
 
-use super::calibrate::{Known, calibrate};
+use super::calibrate::{Known, Placed, calibrate};
 use super::energy::{Object, fit};
 use super::model::Model;
 use super::noise::Noise;
@@ -26,10 +26,12 @@ const MOST_UNSEEN: f64 = 2.0 / std::f64::consts::E;
 /// The noise is sought from starts that differ by these factors.
 const STARTS: [f64; 5] = [0.15, 0.5, 1.5, 5.0, 15.0];
 
-/// Steps of [`misfit`] at most, as progress counts them.
-pub const MISFIT_STEPS: usize = STARTS.len() * CALIBRATION_ROUNDS;
+/// Steps from all starts at most, as progress counts them.
+const START_STEPS: usize = STARTS.len() * CALIBRATION_ROUNDS;
+/// Steps of [`misfits`] at most: in each scene those from all starts, and from the map of the other.
+pub const MISFIT_STEPS: usize = 2 * (START_STEPS + 1);
 /// Steps of the search for the noise at most.
-pub(super) const NOISE_STEPS: usize = MISFIT_STEPS + MORE_ROUNDS;
+pub(super) const NOISE_STEPS: usize = START_STEPS + MORE_ROUNDS;
 
 /// The noise that makes the rays of some places likeliest, `more` and some of them, and from how many starts it was sought.
 pub(super) fn likeliest_noise(
@@ -41,12 +43,13 @@ pub(super) fn likeliest_noise(
     progress: &Progress,
 ) -> Result<(Noise, usize), Halt> {
     let few = sample::places(scene, CALIBRATION_RAYS.0, settings.viability.max_range_m);
-    let likeliest = Likeliest::of_starts(scene, guess, known, settings, &few, progress)?;
+    let of = |rays| Sample { scene, rays, known, settings: wider(settings), progress };
+    let likeliest = Likeliest::of_starts(&of(&few), guess)?;
     let (noise, starts) = (likeliest.noise().unwrap_or(*guess), likeliest.starts);
     if more.len() == few.len() {
         return Ok((noise, starts));
     }
-    Ok((of_more(noise, |noise| round(scene, noise, known, settings, more, progress))?, starts))
+    Ok((of_more(noise, |noise| of(more).round(noise))?, starts))
 }
 
 /// The noise that makes more rays likeliest, some steps on from one: the one that a map was found with, or the one that was estimated from it, if
@@ -57,50 +60,98 @@ fn of_more(mut noise: Noise, step: impl Fn(&Noise) -> Result<Round, Halt>) -> Re
         let found = step(&noise)?;
         let value = found.value + found.change.min(0.0);
         if value < least {
-            (best, least) = (if found.change < 0.0 { found.again } else { found.noise }, value);
+            (best, least) = (*found.likelier_noise(), value);
         }
         noise = found.again;
     }
     Ok(best)
 }
 
-/// Minus twice the logarithm of how likely some rays are with the noise that makes them likeliest, up to a constant of these rays; of a sample of
-/// places where none are given, and which. It compares poses: what is true makes the same rays likelier.
+/// Minus twice the logarithm of how likely the same rays, of a sample of places, are in two scenes, each with the noise that makes them likeliest
+/// there, up to a constant of these rays; and how many they are. It compares poses: what is true makes the same rays likelier. `second_of_first`
+/// has the number in the second scene of each ray of the first.
+///
+/// A search may end above the least value, and in one scene farther above it than in the other. So each scene is offered the map of the other as
+/// well: it goes on with the noise that makes it likeliest there.
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
-pub fn misfit(
-    scene: &Scene,
+pub fn misfits(
+    scenes: [&Scene; 2],
+    second_of_first: &[u32],
     guess: &Noise,
     known: Known,
     settings: &Settings,
-    rays: Option<Vec<u32>>,
     progress: &Progress,
-) -> Result<(f64, Vec<u32>), Halt> {
-    let range_m = settings.viability.max_range_m;
-    let mut rays = rays.unwrap_or_else(|| sample::places(scene, CALIBRATION_RAYS.0, range_m));
-    rays.retain(|&ray| scene.ray(ray).is_usable());
-    let likeliest = Likeliest::of_starts(scene, guess, known, settings, &rays, progress)?;
-    Ok((likeliest.best.map_or(f64::INFINITY, |best| best.value), rays))
+) -> Result<([f64; 2], usize), Halt> {
+    let mut first_of_second = vec![0; second_of_first.len()];
+    (0..).zip(second_of_first).for_each(|(ray, &there): (u32, &u32)| first_of_second[there as usize] = ray);
+    let mut first = sample::places(scenes[0], CALIBRATION_RAYS.0, settings.viability.max_range_m);
+    first.retain(|&ray| scenes[0].ray(ray).is_usable() && scenes[1].ray(second_of_first[ray as usize]).is_usable());
+    let second = renamed(&first, second_of_first);
+    let of = |scene, rays| Sample { scene, rays, known, settings: wider(settings), progress };
+    let samples = [of(scenes[0], &first), of(scenes[1], &second)];
+    let found = [Likeliest::of_starts(&samples[0], guess)?.best, Likeliest::of_starts(&samples[1], guess)?.best];
+    let least = |here: usize, numbers: &[u32]| -> Result<f64, Halt> {
+        let [Some(own), Some(other)] = [&found[here], &found[1 - here]] else { return Ok(f64::INFINITY) };
+        let rename = |(votes, point): &Placed| (renamed(votes, numbers), *point);
+        let map: Vec<Placed> = other.map.iter().map(rename).collect();
+        let noise = samples[here].noise_of(&other.noise, &map);
+        Ok(own.value.min(samples[here].round_from(&noise, map)?.value))
+    };
+    Ok(([least(0, &first_of_second)?, least(1, second_of_first)?], first.len()))
 }
 
-/// One step: how likely some rays are with a noise, and the noise that is estimated from the map that it makes.
-fn round(
-    scene: &Scene,
-    noise: &Noise,
+/// Rays by other numbers, ascending.
+fn renamed(rays: &[u32], numbers: &[u32]) -> Vec<u32> {
+    let mut rays: Vec<u32> = rays.iter().map(|&ray| numbers[ray as usize]).collect();
+    rays.sort_unstable();
+    rays
+}
+
+/// Settings with the gate that the noise is estimated with.
+fn wider(settings: &Settings) -> Settings {
+    Settings { gate_sigmas: settings.gate_sigmas * CALIBRATION_GATE, ..*settings }
+}
+
+/// Some rays of a scene whose noise is sought.
+struct Sample<'a> {
+    scene: &'a Scene,
+    rays: &'a [u32],
     known: Known,
-    settings: &Settings,
-    rays: &[u32],
-    progress: &Progress,
-) -> Result<Round, Halt> {
-    let settings = Settings { gate_sigmas: settings.gate_sigmas * CALIBRATION_GATE, ..*settings };
-    let mut model = Model::new(scene, noise, &settings);
-    let begun = initial::labels_of_few(&model, rays, progress)?;
-    let objects = search(&mut model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
-    let (value, left) = (likelihood(&model, &objects, rays), Left::of(&model, &objects, rays));
-    let again = calibrate(scene, noise, &placed(&objects), known);
-    let change = change_of_fits(&model.with_noise(&again), &objects);
-    Ok(Round { noise: *noise, value, change, again, left })
+    settings: Settings,
+    progress: &'a Progress,
+}
+
+impl Sample<'_> {
+    /// One step: how likely the rays are with a noise, and the noise that is estimated from the map that it makes.
+    fn round(&self, noise: &Noise) -> Result<Round, Halt> {
+        let model = Model::new(self.scene, noise, &self.settings);
+        let begun = initial::labels_of_few(&model, self.rays, self.progress)?;
+        self.searched(model, begun)
+    }
+
+    /// The same from a map that is there.
+    fn round_from(&self, noise: &Noise, begun: Vec<Placed>) -> Result<Round, Halt> {
+        self.searched(Model::new(self.scene, noise, &self.settings), begun)
+    }
+
+    fn searched(&self, mut model: Model<'_>, begun: Vec<Placed>) -> Result<Round, Halt> {
+        let noise = model.noise;
+        let objects = search(&mut model, self.rays, begun, Depth::Shallow, true, &mut Tally::default(), self.progress)?;
+        let (value, left) = (likelihood(&model, &objects, self.rays), Left::of(&model, &objects, self.rays));
+        let map = placed(&objects);
+        let again = calibrate(self.scene, noise, &map, self.known);
+        let change = change_of_fits(&model.with_noise(&again), &objects);
+        Ok(Round { noise: *noise, map, value, change, again, left })
+    }
+
+    /// The noise that is estimated from a map whose objects are put where another noise has them.
+    fn noise_of(&self, noise: &Noise, map: &[Placed]) -> Noise {
+        let model = Model::new(self.scene, noise, &self.settings);
+        let place = |(votes, point): &Placed| Some((votes.clone(), fit(&model, votes, *point)?.point));
+        calibrate(self.scene, noise, &map.par_iter().filter_map(place).collect::<Vec<Placed>>(), self.known)
+    }
 }
 
 /// What J of some objects changes by, their votes as they are, with the noise of a model.
@@ -114,6 +165,8 @@ fn change_of_fits(model: &Model<'_>, objects: &[Object]) -> f64 {
 /// What a step of the calibration finds with a noise.
 struct Round {
     noise: Noise,
+    /// The objects of the map that it makes.
+    map: Vec<Placed>,
     /// Minus twice the logarithm of how likely the rays are with it.
     value: f64,
     /// The noise that is estimated from the map that it makes.
@@ -153,6 +206,11 @@ impl Left {
 }
 
 impl Round {
+    /// That of the two noises with which the map is likelier.
+    fn likelier_noise(&self) -> &Noise {
+        if self.change < 0.0 { &self.again } else { &self.noise }
+    }
+
     /// Whether a larger noise may make the rays likelier. If it explained the votes without any residual, and the rays of no object as well,
     /// each of them would still be as improbable as a residual of 0 is: how much more so than now, grows with the noise. But passes that
     /// disagree by more than is thought do not see each other's objects, and that is no residual.
@@ -186,23 +244,15 @@ impl Likeliest {
     /// From each start some steps: it takes one to learn what passes disagree about, and another to see what that explains. What it starts with
     /// is no estimate, and not kept, however likely it makes the rays: too small, it may have an object for every few of them. Larger starts than
     /// may be likelier are left out.
-    fn of_starts(
-        scene: &Scene,
-        guess: &Noise,
-        known: Known,
-        settings: &Settings,
-        rays: &[u32],
-        progress: &Progress,
-    ) -> Result<Self, Halt> {
+    fn of_starts(sample: &Sample<'_>, guess: &Noise) -> Result<Self, Halt> {
         let mut likeliest = Self::default();
         for factor in STARTS {
-            let start = guess.scaled(factor, known);
-            if likeliest.last.as_ref().is_some_and(|last| !last.may_be_larger(scene, &start)) {
+            let start = guess.scaled(factor, sample.known);
+            if likeliest.last.as_ref().is_some_and(|last| !last.may_be_larger(sample.scene, &start)) {
                 break;
             }
             likeliest.starts += 1;
-            let step = |noise: &Noise| round(scene, noise, known, settings, rays, progress);
-            likeliest.steps(CALIBRATION_ROUNDS - 1, step(&start)?.again, step)?;
+            likeliest.steps(CALIBRATION_ROUNDS - 1, sample.round(&start)?.again, |noise| sample.round(noise))?;
         }
         Ok(likeliest)
     }
@@ -235,7 +285,8 @@ impl Likeliest {
 }
 
 /// Minus twice the logarithm of the likelihood of some rays, clutter and votes, up to a constant: J, and the Poisson process of what is clutter
-/// otherwise, whose density is that of the rays of no object.
+/// otherwise, whose density is that of the rays of no object, and whose scores have that of all rays once those of votes are taken out:
+/// `p(score) = (share ratio + 1 - share) p_clutter(score)`.
 fn likelihood(model: &Model<'_>, objects: &[Object], rays: &[u32]) -> f64 {
     let scene = model.scene;
     let of_class = |class: usize| {
@@ -245,7 +296,9 @@ fn likelihood(model: &Model<'_>, objects: &[Object], rays: &[u32]) -> f64 {
         let clutter = of_class().count() - votes;
         let ln_clutter = ((clutter + 1) as f64 / model.solid_angle_sr(rays.len())).ln();
         let change = ln_clutter - model.classes[class].ln_clutter_per_sr;
-        let all: f64 = of_class().map(|&ray| -2.0 * (model.ln_clutter_per_px2(ray) + change)).sum();
+        let share = (votes as f64 / of_class().count().max(1) as f64).min(1.0);
+        let ln_score = |ray: u32| -(share * model.ln_score_ratio(ray).exp() + 1.0 - share).ln();
+        let all: f64 = of_class().map(|&ray| -2.0 * (model.ln_clutter_per_px2(ray) + change + ln_score(ray))).sum();
         all + here().map(|object| object.energy + 2.0 * change * object.votes.len() as f64).sum::<f64>()
     };
     (0..model.classes.len()).map(of_class).sum()
@@ -253,23 +306,99 @@ fn likelihood(model: &Model<'_>, objects: &[Object], rays: &[u32]) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Vector3;
+    use nalgebra::{Isometry3, Vector3};
 
+    use super::super::energy::object;
+    use super::super::learn::learn;
+    use super::super::looks::Lookout;
     use super::*;
     use crate::street;
 
+    /// Between minus a half and a half.
+    fn uniform(number: u64) -> f64 {
+        sample::scramble(number) as f64 / u64::MAX as f64 - 0.5
+    }
+
+    /// Two rows of three, 0.5 m apart, as four drives see them that are off by up to half of some metres on each axis.
+    fn rows(off_m: f64, seed: u64) -> Vec<Scene> {
+        let in_row = |i: i32| Vector3::new(25.0 + 12.0 * f64::from(i / 3), 4.0 + 0.5 * f64::from(i % 3), 3.0);
+        let objects: Vec<Vector3<f64>> = (0..6).map(in_row).collect();
+        let errors: Vec<[f64; 2]> = (0..997).map(|i| [2 * i, 2 * i + 1].map(|number| 4.0 * uniform(number))).collect();
+        let drive = |drive: u64| {
+            let [x, y, z] = [0, 1, 2].map(|axis| off_m * uniform(seed + 3 * drive + axis));
+            street::moved(street::street(20, 2.5, &objects, &errors), &Isometry3::translation(x, y, z))
+        };
+        (0..4).map(drive).collect()
+    }
+
+    fn whole<'a>(scene: &'a Scene, rays: &'a [u32], progress: &'a Progress) -> Sample<'a> {
+        Sample { scene, rays, known: Known::default(), settings: wider(&street::SETTINGS), progress }
+    }
+
+    fn misfits_of(scenes: [&Scene; 2], second_of_first: &[u32]) -> Result<([f64; 2], usize), Halt> {
+        let (known, progress) = (Known::default(), Progress::default());
+        misfits(scenes, second_of_first, &street::NOISE, known, &street::SETTINGS, &progress)
+    }
+
+    fn eight_in_a_street() -> Scene {
+        let objects: Vec<Vector3<f64>> = (0..8).map(|i| Vector3::new(25.0 + 9.0 * f64::from(i), 5.0, 3.0)).collect();
+        street::street(80, 1.0, &objects, &[[0.7, -0.4], [-0.9, 0.8], [0.3, -0.5]])
+    }
+
     #[test]
     fn rays_that_are_none_do_not_count() -> Result<(), Halt> {
-        let objects: Vec<Vector3<f64>> = (0..8).map(|i| Vector3::new(25.0 + 9.0 * f64::from(i), 5.0, 3.0)).collect();
-        let mut scene = street::street(80, 1.0, &objects, &[[0.7, -0.4], [-0.9, 0.8], [0.3, -0.5]]);
-        let all: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
+        let mut scene = eight_in_a_street();
         std::sync::Arc::make_mut(&mut scene.rays).rays[7].residual_from_world.fill(f64::NAN);
-        let of = |rays: Vec<u32>| {
-            misfit(&scene, &street::NOISE, Known::default(), &street::SETTINGS, Some(rays), &Progress::default())
+        let same: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
+        let ([one, other], rays) = misfits_of([&scene, &scene], &same)?;
+        assert!(one.is_finite() && rays == scene.usable_rays().len(), "{one} {rays}");
+        assert_eq!(one.to_bits(), other.to_bits());
+        Ok(())
+    }
+
+    #[test]
+    fn a_scene_is_offered_the_map_of_the_other() -> Result<(), Halt> {
+        // In the second scene the drives are where they say, and in the other order.
+        let (first, second) = (street::joined(rows(0.8, 8000)), rows(0.0, 0));
+        let second = street::joined(second.into_iter().rev().collect());
+        let (rays, progress) = (first.usable_rays(), Progress::default());
+        let sample = whole(&first, &rays, &progress);
+        let alone = Likeliest::of_starts(&sample, &street::NOISE)?.best.map_or(f64::NAN, |best| best.value);
+        let of_drive = rays.len() as u32 / 4;
+        let second_of_first: Vec<u32> =
+            rays.iter().map(|ray| (3 - ray / of_drive) * of_drive + ray % of_drive).collect();
+        let [offered, there] = misfits_of([&first, &second], &second_of_first)?.0;
+        assert!(there < offered && offered < alone - 100.0, "{there} {offered} {alone}");
+        Ok(())
+    }
+
+    #[test]
+    fn scores_say_no_more_than_which_rays_are_votes() -> Result<(), Halt> {
+        let mut scene = eight_in_a_street();
+        let (rays, progress) = (scene.usable_rays(), Progress::default());
+        let map = whole(&scene, &rays, &progress).round(&street::NOISE)?.map;
+        // Two objects are left out: what they have is clutter, and has lower scores.
+        let map = &map[..map.len() - 2];
+        let votes: usize = map.iter().map(|(votes, _)| votes.len()).sum();
+        let share = votes as f64 / rays.len() as f64;
+        let entropy = -share * share.ln() - (1.0 - share) * (1.0 - share).ln();
+        let value = |scene: &Scene| {
+            let mut model = Model::new(scene, &street::NOISE, &street::SETTINGS);
+            let lookout = Lookout::new(scene, street::VIABILITY.max_range_m);
+            let place = |model: &Model<'_>| -> Vec<Object> {
+                map.iter().filter_map(|(votes, at)| object(model, &lookout, votes.clone(), *at, Vec::new())).collect()
+            };
+            let objects = place(&model);
+            learn(&mut model, &lookout, &rays, &objects);
+            likelihood(&model, &place(&model), &rays)
         };
-        let (value, used) = of(all)?;
-        assert!(value.is_finite() && used == scene.usable_rays(), "{value}");
-        assert_eq!(value.to_bits(), of(scene.usable_rays())?.0.to_bits());
+        scene.score.fill(f64::NAN);
+        let without = value(&scene);
+        scene.score.fill(0.3);
+        map.iter().flat_map(|(votes, _)| votes).for_each(|&ray| scene.score[ray as usize] = 0.8);
+        let gain = without - value(&scene);
+        let most = 2.0 * rays.len() as f64 * entropy;
+        assert!(gain > 0.8 * most && gain <= most, "{gain} {most}");
         Ok(())
     }
 
@@ -282,7 +411,14 @@ mod tests {
                 let left = Left { chi2: 0.0, votes: Vec::new(), clutter: Vec::new(), passes: (0, 0.0) };
                 // The first map is the likeliest.
                 let value = if noise.detection_px < 1.0 { 0.0 } else { 100.0 };
-                Ok(Round { noise: *noise, value, again: noise_of(noise.detection_px + 0.5), change, left })
+                Ok(Round {
+                    noise: *noise,
+                    map: Vec::new(),
+                    value,
+                    again: noise_of(noise.detection_px + 0.5),
+                    change,
+                    left,
+                })
             })
         };
         assert!((with(-10.0)?.detection_px - 1.0).abs() < 1e-12);
