@@ -15,11 +15,14 @@ use super::energy::{Object, object};
 use super::index::RayIndex;
 use super::looks::Lookout;
 use super::model::Model;
+use super::noise::{Noise, norm};
 use super::poses::{Belief, PoseError, Segments, smooth};
 use crate::progress::{Halt, Progress};
 
-/// Detections are looked for as far from an object as this many of its standard deviations, in steps of one.
-const REACH_SIGMAS: i32 = 4;
+/// Detections are looked for as far from an object as this many of its standard deviations.
+const REACH_SIGMAS: f64 = 4.0;
+/// In so many steps at most: an object whose depth is hardly known is looked for where it may be by its size, not for ever.
+const MOST_STEPS: f64 = 32.0;
 /// Gains are whole numbers of this part, so that sums do not depend on their order.
 const GAIN_UNIT: f64 = 1e-6;
 /// Squared residuals beyond this many squared sigmas count less in the drift, in proportion to their root.
@@ -220,7 +223,8 @@ pub fn claims_of_all(
     let range_m = model.settings.viability.max_range_m * VOTE_RANGE;
     let of_object = |(i, object): (usize, &Object)| {
         progress.check()?;
-        let hits = index.hits_of_any(&places_of(object), &|said| model.confusions.may_be(object.class, said), range_m);
+        let hits =
+            index.hits_of_any(&places_of(model, object), &|said| model.confusions.may_be(object.class, said), range_m);
         let claim = |hit: super::index::Hit| Claim {
             image: hit.image,
             object: i as u32,
@@ -234,7 +238,7 @@ pub fn claims_of_all(
 }
 
 /// Where an object may be: along the direction that it is least known in, so densely that gates leave no gap.
-pub(super) fn places_of(object: &Object) -> Vec<Vector3<f64>> {
+pub(super) fn places_of(model: &Model<'_>, object: &Object) -> Vec<Vector3<f64>> {
     let axes = object.fit.covariance.symmetric_eigen();
     let longest = axes.eigenvalues.imax();
     let sigma = axes.eigenvalues[longest].max(0.0).sqrt();
@@ -242,8 +246,13 @@ pub(super) fn places_of(object: &Object) -> Vec<Vector3<f64>> {
     if sigma * sigma < 4.0 * across.max(0.0) {
         return vec![object.fit.point];
     }
-    let axis = axes.eigenvectors.column(longest) * sigma;
-    (-REACH_SIGMAS..=REACH_SIGMAS).map(|step| object.fit.point + axis * f64::from(step)).collect()
+    let reach = axes.eigenvectors.column(longest) * (sigma * REACH_SIGMAS);
+    // A gate is at least as wide as errors of position make it.
+    let Noise { position_m, position_segment_m, position_drift_m, .. } = *model.noise;
+    let gate_m = model.settings.gate_sigmas * norm(norm(position_m, position_segment_m), position_drift_m);
+    let gates = sigma * REACH_SIGMAS / gate_m;
+    let steps = if gates > REACH_SIGMAS { gates.ceil().min(MOST_STEPS) } else { REACH_SIGMAS };
+    (-steps as i32..=steps as i32).map(|step| object.fit.point + reach * (f64::from(step) / steps)).collect()
 }
 
 /// What an object gains by a ray over leaving it to clutter; negative infinity outside its gate.

@@ -116,8 +116,8 @@ impl Nursery<'_> {
     fn grown(&self, ray: u32, may_vote: &dyn Fn(u32) -> bool) -> Option<Object> {
         let model = self.model;
         let class = model.class_of(ray);
-        let alone = unseen(model, vec![ray], self.most_probable(ray, class)?)?;
-        let (votes, gain) = self.votes_of(&alone, ray, may_vote);
+        let alone = unseen(model, vec![ray], most_probable(model, ray, class)?)?;
+        let (votes, gain) = votes_on(model, self.index, &alone, ray, may_vote);
         // Before it is estimated with all of them, which takes most of the time.
         if !self.may_be(class, &alone, &votes, gain) {
             return None;
@@ -139,30 +139,9 @@ impl Nursery<'_> {
                 Some(more) if more.energy < best.energy => best = more,
                 _ => break,
             }
-            votes = self.votes_of(&best, ray, may_vote).0;
+            votes = votes_on(model, self.index, &best, ray, may_vote).0;
         }
         Some(best)
-    }
-
-    /// The ray, and those that an object has from other images, one of each; and how much more probable each of these is than clutter, in
-    /// logarithms, added up.
-    fn votes_of(&self, object: &Object, ray: u32, may_vote: &dyn Fn(u32) -> bool) -> (Vec<u32>, f64) {
-        let model = self.model;
-        let image = model.scene.rays.image[ray as usize];
-        let may_be = |said| model.confusions.may_be(object.class, said);
-        let hits = self.index.hits_of_any(&places_of(object), &may_be, model.class_of(ray).farthest_m);
-        let mut others: Vec<(u32, f64, u32)> = hits
-            .into_iter()
-            .filter(|hit| hit.image != image && may_vote(hit.ray))
-            .map(|hit| (hit.image, gain_alone(model, object, hit.ray), hit.ray))
-            .filter(|(_, gain, _)| *gain > 0.0)
-            .collect();
-        others.sort_by(|a, b| a.0.cmp(&b.0).then(b.1.total_cmp(&a.1)).then(a.2.cmp(&b.2)));
-        others.dedup_by_key(|vote| vote.0);
-        let gain = others.iter().map(|vote| vote.1).sum();
-        let mut votes: Vec<u32> = others.into_iter().map(|vote| vote.2).chain([ray]).collect();
-        votes.sort_unstable();
-        (votes, gain)
     }
 
     /// Whether an object of some votes may be there, about where one of them alone stands. They are worth no more together than each is to that one.
@@ -182,25 +161,51 @@ impl Nursery<'_> {
         let clutter: f64 = sines.map(|sine| learned.clutter_by_elevation.at(sine)).sum();
         learned.company.at(self.sure[class as usize].nearness(place, None)) - clutter
     }
+}
 
-    /// Where an object of a class most probably is on a ray: as high and as large as others.
-    fn most_probable(&self, ray: u32, class: &ClassModel) -> Option<Vector3<f64>> {
-        let (heights, up) = (class.heights.as_ref()?, self.model.up?);
-        let cast = self.model.scene.ray(ray);
-        let climb = cast.direction.dot(&up);
-        let ln_angle = self.model.ln_angle[ray as usize];
-        let (mean, sd) = class.sizes.object;
-        let sd = sd.hypot(class.sizes.spread);
-        let ln_density = |distance_m: f64| {
-            let away = (ln_angle + distance_m.ln() - mean) / sd;
-            let of_size = if class.sizes.tell() && away.is_finite() { -0.5 * away * away } else { 0.0 };
-            heights.ln_density(climb * distance_m) + 2.0 * distance_m.ln() + of_size
-        };
-        let nearest_m = self.model.settings.viability.min_range_m.max(class.farthest_m * 1e-3);
-        let steps = ((class.farthest_m / nearest_m).log10() * PLACES_PER_DECADE).ceil().max(1.0);
-        let places = (0..=steps as usize).map(|i| nearest_m * (class.farthest_m / nearest_m).powf(i as f64 / steps));
-        let best = places.map(|distance_m| (ln_density(distance_m), distance_m));
-        let (_, distance_m) = best.max_by(|a, b| a.0.total_cmp(&b.0))?;
-        Some(cast.center + cast.direction * distance_m)
-    }
+/// Where an object of a class most probably is on a ray: as high and as large as others.
+pub(super) fn most_probable(model: &Model<'_>, ray: u32, class: &ClassModel) -> Option<Vector3<f64>> {
+    let (heights, up) = (class.heights.as_ref()?, model.up?);
+    let cast = model.scene.ray(ray);
+    let climb = cast.direction.dot(&up);
+    let ln_angle = model.ln_angle[ray as usize];
+    let (mean, sd) = class.sizes.object;
+    let sd = sd.hypot(class.sizes.spread);
+    let ln_density = |distance_m: f64| {
+        let away = (ln_angle + distance_m.ln() - mean) / sd;
+        let of_size = if class.sizes.tell() && away.is_finite() { -0.5 * away * away } else { 0.0 };
+        heights.ln_density(climb * distance_m) + 2.0 * distance_m.ln() + of_size
+    };
+    let nearest_m = model.settings.viability.min_range_m.max(class.farthest_m * 1e-3);
+    let steps = ((class.farthest_m / nearest_m).log10() * PLACES_PER_DECADE).ceil().max(1.0);
+    let places = (0..=steps as usize).map(|i| nearest_m * (class.farthest_m / nearest_m).powf(i as f64 / steps));
+    let best = places.map(|distance_m| (ln_density(distance_m), distance_m));
+    let (_, distance_m) = best.max_by(|a, b| a.0.total_cmp(&b.0))?;
+    Some(cast.center + cast.direction * distance_m)
+}
+
+/// A ray, and those that an object on it has from other images, one of each; and how much more probable each of these is than clutter, in
+/// logarithms, added up.
+pub(super) fn votes_on(
+    model: &Model<'_>,
+    index: &RayIndex<'_>,
+    object: &Object,
+    ray: u32,
+    may_vote: &dyn Fn(u32) -> bool,
+) -> (Vec<u32>, f64) {
+    let image = model.scene.rays.image[ray as usize];
+    let may_be = |said| model.confusions.may_be(object.class, said);
+    let hits = index.hits_of_any(&places_of(model, object), &may_be, model.class_of(ray).farthest_m);
+    let mut others: Vec<(u32, f64, u32)> = hits
+        .into_iter()
+        .filter(|hit| hit.image != image && may_vote(hit.ray))
+        .map(|hit| (hit.image, gain_alone(model, object, hit.ray), hit.ray))
+        .filter(|(_, gain, _)| *gain > 0.0)
+        .collect();
+    others.sort_by(|a, b| a.0.cmp(&b.0).then(b.1.total_cmp(&a.1)).then(a.2.cmp(&b.2)));
+    others.dedup_by_key(|vote| vote.0);
+    let gain = others.iter().map(|vote| vote.1).sum();
+    let mut votes: Vec<u32> = others.into_iter().map(|vote| vote.2).chain([ray]).collect();
+    votes.sort_unstable();
+    (votes, gain)
 }

@@ -11,10 +11,15 @@ use super::seen::Looks;
 
 /// Steps of expectation and maximisation: some ten change the rates by less than a thousandth.
 const STEPS: usize = 20;
-/// Objects with fewer votes do not serve.
+/// Objects with fewer votes do not serve where there are better ones.
 const MIN_VOTES: usize = 6;
+/// If fewer than `MIN_OBJECTS` of all classes have so many, those with at least this many serve where elevations are measured: rays alone tell where they
+/// are, with three residuals to spare. Of bearings alone there would be one.
+const LEAST_VOTES: usize = 3;
 /// The part of the votes that is nearer than what counts as seen from everywhere.
 const NEAR_VOTES: f64 = 0.05;
+/// Boxes that are all put on one elevation, as those of bearings are on the horizon, differ in its sine by no more than rounding.
+const LEAST_ELEVATIONS: f64 = 1e-6;
 /// Fewer of these tell nothing, and what was thought before stays.
 const MIN_OBJECTS: usize = 5;
 /// Rates of fewer looks are known worse than to a tenth.
@@ -53,20 +58,27 @@ struct Evidence<'a> {
     solid_angle_sr: f64,
     ground_m2: f64,
     looked_at: (f64, f64),
+    /// Objects with fewer votes do not serve.
+    least_votes: usize,
 }
 
 impl<'a> Evidence<'a> {
     fn new(model: &'a Model<'a>, lookout: &'a Lookout, rays: &[u32], objects: &'a [Object]) -> Self {
         let mut is_vote = vec![false; model.scene.rays.rays.len()];
         objects.iter().flat_map(|object| &object.votes).for_each(|&ray| is_vote[ray as usize] = true);
+        let sure = objects.iter().filter(|object| is_sure(object)).count();
+        let looked_at = span(&model.sin_elevation);
+        let are_elevations_measured = looked_at.1 - looked_at.0 > LEAST_ELEVATIONS;
+        let least_votes = if sure < MIN_OBJECTS && are_elevations_measured { LEAST_VOTES } else { MIN_VOTES };
         Self {
             model,
             lookout,
             objects,
             is_vote,
             solid_angle_sr: model.solid_angle_sr(rays.len()),
-            ground_m2: ground_m2(model, objects) * model.share_of(rays.len()),
-            looked_at: span(&model.sin_elevation),
+            ground_m2: ground_m2(model, objects, least_votes) * model.share_of(rays.len()),
+            looked_at,
+            least_votes,
         }
     }
 
@@ -80,8 +92,9 @@ impl<'a> Evidence<'a> {
         let of = |column: &[f64], rays: &[u32]| rays.iter().map(|&ray| column[ray as usize]).collect::<Vec<f64>>();
         learned.score_ratio = score_ratio(&of(&model.scene.score, &in_class), &of(&model.scene.score, &clutter));
         learned.clutter_by_elevation = elevation_factor(&of(&model.sin_elevation, &clutter), self.looked_at);
-        let many: Vec<&Object> = of_class.iter().copied().filter(|object| has_many(object)).collect();
-        let sure: Vec<&Object> = many.iter().copied().filter(|object| is_sure(object)).collect();
+        let many: Vec<&Object> =
+            of_class.iter().copied().filter(|object| object.votes.len() >= self.least_votes).collect();
+        let sure: Vec<&Object> = many.iter().copied().filter(|object| object.real > 0.5).collect();
         if sure.len() >= MIN_OBJECTS {
             learned.is_learned = true;
             (learned.rates, learned.odd_passes) = rates(&many, before);
@@ -103,19 +116,14 @@ impl<'a> Evidence<'a> {
     }
 }
 
-/// Whether an object has enough votes to serve.
-fn has_many(object: &Object) -> bool {
-    object.votes.len() >= MIN_VOTES
-}
-
-/// Whether it has, and is real rather than false.
+/// Whether an object has many votes, and is real rather than false.
 pub(super) fn is_sure(object: &Object) -> bool {
-    has_many(object) && object.real > 0.5
+    object.votes.len() >= MIN_VOTES && object.real > 0.5
 }
 
 /// The ground from which objects are seen, m²: as far from the cameras as all but few votes are; nothing where nobody knows what is up.
-fn ground_m2(model: &Model<'_>, objects: &[Object]) -> f64 {
-    let sure: Vec<&Object> = objects.iter().filter(|object| has_many(object)).collect();
+fn ground_m2(model: &Model<'_>, objects: &[Object], least_votes: usize) -> f64 {
+    let sure: Vec<&Object> = objects.iter().filter(|object| object.votes.len() >= least_votes).collect();
     let mut distances = distances_m(model, &sure);
     let place = (distances.len() as f64 * (1.0 - NEAR_VOTES)) as usize;
     match model.up {

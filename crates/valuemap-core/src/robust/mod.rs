@@ -36,6 +36,7 @@ pub mod propose;
 pub mod quick;
 pub mod reach;
 pub mod rearrange;
+pub mod regrow;
 pub mod repair;
 pub mod sample;
 pub mod scene;

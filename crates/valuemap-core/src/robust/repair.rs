@@ -8,7 +8,8 @@ use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::assign::{Claim, Trajectories, assign_among, claims_of_all, images_of};
-use super::energy::{Object, implied_size, object, size_of};
+use super::energy::{Object, fit, implied_size, object, size_of, visits};
+use super::few::most_probable;
 use super::index::{RayIndex, chi2};
 use super::looks::Lookout;
 use super::model::Model;
@@ -31,6 +32,10 @@ const ROUNDS: usize = 3;
 const CANDIDATES: usize = 4;
 /// Times that a hypothesis is estimated on what votes for it.
 const POLISHINGS: usize = 4;
+/// Objects of more visits are not tried in parts: rays of two objects do not meet in one place on so many.
+const MOST_VISITS: usize = 6;
+/// Votes are of one side if their directions differ by less than 30 degrees (cosine).
+const SIDE_COSINE: f64 = 0.866;
 /// The gate of these votes, as a share of the gate of all.
 const CLOSE: f64 = 0.5;
 /// J that falls by less stays as it is.
@@ -59,7 +64,7 @@ pub fn repair(
     for (i, object) in objects.iter().enumerate() {
         object.votes.iter().for_each(|&ray| owner[ray as usize] = i as u32);
     }
-    let mut open = neighborhoods(&objects, &claims, &owner);
+    let mut open = neighborhoods(model, &objects, &claims, &owner);
     open.retain(|place| !tried.0.contains(&fingerprint(&objects, place, attempt)));
     let mut any = false;
     let mut objects: Vec<Option<Object>> = objects.into_iter().map(Some).collect();
@@ -150,10 +155,26 @@ fn anew(place: &Place<'_>, old: &[&Object], attempt: u64, progress: &Progress) -
         );
     }
     let as_it_is: Vec<usize> = (0..old.len()).collect();
+    let mut starts = vec![as_it_is, Vec::new()];
+    for (i, object) in old.iter().enumerate() {
+        let first = candidates.len();
+        for part in parts_of(model, object) {
+            for new in candidates_of(model, rays, object, &part) {
+                if candidates.iter().all(|other| other.votes != new.votes) {
+                    candidates.push(new);
+                }
+            }
+        }
+        // One object gives way to two: adding one and dropping one does not get there.
+        if candidates.len() > first {
+            starts.push((0..old.len()).filter(|&other| other != i).chain(first..candidates.len()).collect());
+        }
+    }
+    starts.push((old.len()..candidates.len()).collect());
     let before: f64 = old.iter().map(|object| object.energy).sum();
     let mut best: Option<(f64, Vec<Object>)> = None;
     let mut seen: Vec<Vec<usize>> = Vec::new();
-    for start in [as_it_is, Vec::new()] {
+    for start in starts {
         let chosen = choose(&candidates, rays.len(), start);
         if seen.contains(&chosen) {
             continue;
@@ -300,6 +321,43 @@ fn polished(model: &Model<'_>, rays: &[u32], hypothesis: &Hypothesis) -> Option<
     (candidate.votes.len() >= model.settings.min_votes as usize).then_some(candidate)
 }
 
+/// Votes of an object from one visit or one side alone, and from all others: rays of two objects, each seen from one side, meet where none is.
+fn parts_of(model: &Model<'_>, object: &Object) -> Vec<Vec<u32>> {
+    let mut groups: Vec<Vec<u32>> = visits(model.scene, &object.votes).map(<[u32]>::to_vec).collect();
+    if groups.len() > MOST_VISITS {
+        return Vec::new();
+    }
+    let mut sides: Vec<(Vector3<f64>, Vec<u32>)> = Vec::new();
+    for &ray in &object.votes {
+        let direction = model.scene.ray(ray).direction;
+        match sides.iter_mut().find(|(first, _)| first.dot(&direction) > SIDE_COSINE) {
+            Some((_, side)) => side.push(ray),
+            None => sides.push((direction, vec![ray])),
+        }
+    }
+    groups.extend(sides.into_iter().map(|(_, side)| side));
+    let others = |group: &Vec<u32>| object.votes.iter().copied().filter(|ray| !group.contains(ray)).collect();
+    let mut parts: Vec<Vec<u32>> = groups.iter().map(others).chain(groups.iter().cloned()).collect();
+    let least = (model.settings.min_votes as usize).max(1);
+    parts.retain(|part| (least..object.votes.len()).contains(&part.len()));
+    parts.sort();
+    parts.dedup();
+    parts
+}
+
+/// Where some of an object's votes alone put it: from one side size and height tell how far, so the search for it begins there as well.
+fn candidates_of(model: &Model<'_>, rays: &[u32], object: &Object, part: &[u32]) -> Vec<Candidate> {
+    let class = &model.classes[object.class as usize];
+    let starts = [Some(object.fit.point), most_probable(model, part[0], class)];
+    let candidate = |start: Vector3<f64>| {
+        let point = fit(model, part, start)?.point;
+        let ln_size = size_of(model, part, &point);
+        Some(Candidate::new(model, rays, object.class, point, ln_size, model.settings.gate_sigmas))
+    };
+    let candidates = starts.into_iter().flatten().filter_map(candidate);
+    candidates.filter(|candidate| candidate.votes.len() >= model.settings.min_votes as usize).collect()
+}
+
 /// Which candidates explain all rays best, together: local search from a start by adding one, and dropping those that it makes needless
 /// (uncapacitated facility location; Charikar and Guha, SIAM J. Comput. 2005).
 fn choose(candidates: &[Candidate], rays: usize, start: Vec<usize>) -> Vec<usize> {
@@ -357,8 +415,9 @@ fn value_of(candidates: &[Candidate], rays: usize, chosen: &[usize]) -> f64 {
     best.iter().sum::<f64>() - chosen.iter().map(|&c| candidates[c].cost).sum::<f64>()
 }
 
-/// Objects that may have each other's votes: for each object with such neighbors those it shares most with, the most entangled first.
-fn neighborhoods(objects: &[Object], claims: &[Vec<Claim>], owner: &[u32]) -> Vec<Vec<usize>> {
+/// Objects that may have each other's votes: for each object with such neighbors those it shares most with, the most entangled first; and objects that
+/// may be two, alone.
+fn neighborhoods(model: &Model<'_>, objects: &[Object], claims: &[Vec<Claim>], owner: &[u32]) -> Vec<Vec<usize>> {
     let mut shared: FxHashMap<(usize, usize), usize> = FxHashMap::default();
     for (i, claims) in claims.iter().enumerate() {
         for claim in claims {
@@ -378,7 +437,7 @@ fn neighborhoods(objects: &[Object], claims: &[Vec<Claim>], owner: &[u32]) -> Ve
     }
     let mut places: Vec<(f64, Vec<usize>)> = Vec::new();
     for (i, mut near) in neighbors.into_iter().enumerate() {
-        if near.is_empty() && !fits_badly(&objects[i]) {
+        if near.is_empty() && !fits_badly(&objects[i]) && parts_of(model, &objects[i]).is_empty() {
             continue;
         }
         near.sort_unstable_by(|a, b| b.cmp(a));

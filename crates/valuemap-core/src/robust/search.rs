@@ -1,7 +1,8 @@
 //! The search: from a map that is there to begin with, moves that are committed only if J falls.
 //!
 //! In each round all objects compete for all detections, pairs merge and exchange, neighborhoods are destroyed and repaired, and what
-//! is left over gives birth; until nothing lowers J. A search that `learns` learns the classes of its model anew in each round.
+//! is left over gives birth, also to objects that take votes from others; until nothing lowers J. A search that `learns` learns the classes of its
+//! model anew in each round.
 
 use std::sync::Arc;
 
@@ -18,6 +19,7 @@ use super::looks::Lookout;
 use super::model::Model;
 use super::propose::Who;
 use super::rearrange::{TriedPairs, exclude, rearrange_pairs};
+use super::regrow::regrow;
 use super::repair::{Tried, repair};
 use crate::progress::{Halt, Progress};
 
@@ -83,6 +85,10 @@ pub fn search(
             tally.births += born.len() as u64;
             any |= !born.is_empty();
             objects.extend(born);
+            // What is left of objects that lost votes to others.
+            let (regrown, better) = regrow(model, &lookout, &index, rays, objects, progress)?;
+            any |= better;
+            objects = regrown;
             progress.advance()?;
         }
         if !any {
