@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import pickle
 import shutil
 import subprocess
 import time
 import urllib.request
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -202,6 +204,29 @@ def test_of_two_runs_that_begin_together_not_both_go_on(url: str) -> None:
         thread.join()
     assert len(outcomes) == 2
     assert outcomes.count("runs") <= 1
+
+
+class ChangedMeanwhile:
+    """A store whose file is replaced, or removed, once somebody has looked how large it is."""
+
+    def __init__(self, then: bytes | None) -> None:
+        self._then, self._looks = then, 0
+
+    def open_input_file(self, path: str) -> io.BytesIO:
+        self._looks += 1
+        if self._looks == 1:
+            raise OSError("failed to flush response stream")
+        if self._then is None:
+            raise FileNotFoundError(path)
+        return io.BytesIO(self._then)
+
+
+@pytest.mark.parametrize("then", [b"2", None])
+def test_a_file_that_changes_meanwhile_is_read_again(then: bytes | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = ChangedMeanwhile(then)
+    monkeypatch.setattr(UrlPath, "_place", lambda _: (store, "path"))
+    with nullcontext() if then else pytest.raises(FileNotFoundError):
+        assert UrlPath("memory://city/living-1").read_bytes() == then
 
 
 def test_what_is_not_ours_stays(street: Path, tmp_path: Path, url: str) -> None:

@@ -59,14 +59,23 @@ class UrlPath:
         InputError
             Whether there is one cannot be known: the network is down, say, or it may not be read.
         """
-        system, path = self._place()
         try:
-            with system.open_input_file(path) as file:
-                content: bytes = file.read()
+            return self._content()
         except FileNotFoundError:
             raise
-        except Exception as error:  # Of fsspec's systems each has its own.
-            raise self._unreadable(error) from error
+        except Exception:  # Of fsspec's systems each has its own.
+            # What another run removes or writes anew between a look at its size and at its content fails like this.
+            try:
+                return self._content()
+            except FileNotFoundError:
+                raise
+            except Exception as error:
+                raise self._unreadable(error) from error
+
+    def _content(self) -> bytes:
+        system, path = self._place()
+        with system.open_input_file(path) as file:
+            content: bytes = file.read()
         return content
 
     def write_bytes(self, content: bytes) -> None:
