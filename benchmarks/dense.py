@@ -2,7 +2,8 @@
 
 Scenes of simulated streets. Dense ones: rows of two to six signs side by side, street lamps, trees, posts along both
 sides of every street, driven six times in each direction (posts three times). Hard ones: the lights of `robust.py` with
-one fault of the detector, of the poses or of the drives each, or with an image every 20 m (`sparse`). All settings of the method are its defaults.
+one fault of the detector, of the poses or of the drives each, or with an image every 20 m (`sparse`). All settings of
+the method are its defaults.
 
 Counted over all seeds of a scene: recall of the objects whose Cramer-Rao bound (`bound.py`; root of the trace) is at
 most 0.5 m and that have enough detections; precision, of all labels; duplicates, labels that only lack an object
