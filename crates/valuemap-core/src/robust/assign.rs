@@ -375,3 +375,25 @@ fn belief_of(model: &Model<'_>, object: &Object, ray: u32) -> Option<Belief> {
     let robust = (HUBER_CHI2 / chi2).sqrt().min(1.0);
     Some(Belief::of_vote(&look, variance / robust))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::energy::anywhere;
+    use super::super::seen::Seen;
+    use super::*;
+    use crate::street;
+
+    #[test]
+    fn places_along_a_badly_known_axis_leave_no_gap_between_gates() {
+        let noise = Noise { position_m: 0.5, ..street::NOISE };
+        let scene = street::street(4, 1.0, &[Vector3::new(20.0, 3.0, 2.0)], &[[0.0, 0.0]]);
+        let model = Model::new(&scene, &noise, &street::SETTINGS);
+        let mut object = anywhere(3, Seen::default(), -10.0);
+        object.fit.covariance = nalgebra::Matrix3::from_diagonal(&Vector3::new(16.0, 0.04, 0.04));
+        let places = places_of(&model, &object);
+        let reach_m = (places[places.len() - 1] - places[0]).norm();
+        assert!((reach_m - 2.0 * 4.0 * REACH_SIGMAS).abs() < 1e-9, "{reach_m}");
+        let gate_m = street::GATE_SIGMAS * noise.position_m;
+        assert!(places.windows(2).all(|pair| (pair[1] - pair[0]).norm() <= gate_m));
+    }
+}

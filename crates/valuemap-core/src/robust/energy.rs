@@ -236,6 +236,30 @@ pub(super) fn visits<'v>(scene: &'v Scene, votes: &'v [u32]) -> impl Iterator<It
     votes.chunk_by(|&a, &b| is_one_visit(scene.view(a), scene.view(b)))
 }
 
+/// Rays in groups that look from one side each: from directions with no less than a cosine to the first of the group.
+pub(super) fn by_side(looks: impl Iterator<Item = (u32, Vector3<f64>)>, least_cosine: f64) -> Vec<Vec<u32>> {
+    let mut sides: Vec<(Vector3<f64>, Vec<u32>)> = Vec::new();
+    for (ray, direction) in looks {
+        match sides.iter_mut().find(|(first, _)| first.dot(&direction) >= least_cosine) {
+            Some((_, side)) => side.push(ray),
+            None => sides.push((direction, vec![ray])),
+        }
+    }
+    sides.into_iter().map(|(_, side)| side).collect()
+}
+
+/// The owner of a ray that no object has.
+pub(super) const NOBODY: u32 = u32::MAX;
+
+/// Which of some objects each ray of a scene votes for, or [`NOBODY`].
+pub(super) fn owners(scene: &Scene, objects: &[Object]) -> Vec<u32> {
+    let mut owner = vec![NOBODY; scene.rays.rays.len()];
+    for (i, object) in (0..).zip(objects) {
+        object.votes.iter().for_each(|&ray| owner[ray as usize] = i);
+    }
+    owner
+}
+
 /// Logarithm of the physical size that a ray's box implies at a point, m.
 #[inline]
 #[must_use]

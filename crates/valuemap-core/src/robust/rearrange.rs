@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::assign::{Claim, claims_of_all, gain_alone, images_of};
-use super::energy::{Object, by_place, object, visits};
+use super::energy::{NOBODY, Object, by_place, by_side, object, owners, visits};
 use super::index::RayIndex;
 use super::looks::Lookout;
 use super::model::Model;
@@ -135,15 +135,12 @@ pub(super) fn may_be_one(model: &Model<'_>, a: &Object, b: &Object) -> bool {
 
 /// Pairs of objects of which one may have some of what the other has.
 fn pairs(model: &Model<'_>, objects: &[Object], claims: &[Vec<Claim>]) -> Vec<(usize, usize)> {
-    let mut owner = vec![u32::MAX; model.scene.rays.rays.len()];
-    for (i, object) in objects.iter().enumerate() {
-        object.votes.iter().for_each(|&ray| owner[ray as usize] = i as u32);
-    }
+    let owner = owners(model.scene, objects);
     let mut shared: FxHashMap<(usize, usize), usize> = FxHashMap::default();
     for (i, claims) in claims.iter().enumerate() {
         for claim in claims {
             let other = owner[claim.ray as usize];
-            if other != u32::MAX && other as usize != i {
+            if other != NOBODY && other as usize != i {
                 *shared.entry((i, other as usize)).or_default() += 1;
             }
         }
@@ -225,15 +222,8 @@ impl Pair<'_> {
             images
         };
         let mut parts: Vec<Vec<u32>> = visits(scene, &votes).map(images).collect();
-        let mut sides: Vec<(nalgebra::Vector3<f64>, Vec<u32>)> = Vec::new();
-        for &ray in &votes {
-            let direction = (scene.ray(ray).center - middle).normalize();
-            match sides.iter_mut().find(|(side, _)| side.dot(&direction) >= SIDE_COSINE) {
-                Some((_, of_side)) => of_side.push(ray),
-                None => sides.push((direction, vec![ray])),
-            }
-        }
-        parts.extend(sides.iter().map(|(_, votes)| images(votes)));
+        let looks = votes.iter().map(|&ray| (ray, (scene.ray(ray).center - middle).normalize()));
+        parts.extend(by_side(looks, SIDE_COSINE).iter().map(|votes| images(votes)));
         parts.sort_unstable();
         parts.dedup();
         parts

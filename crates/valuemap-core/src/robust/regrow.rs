@@ -9,7 +9,7 @@ use rustc_hash::FxHashSet;
 
 use super::assign::{gain_alone, places_of};
 use super::births::VOTE_RANGE;
-use super::energy::{Object, object, unseen};
+use super::energy::{NOBODY, Object, object, owners, unseen};
 use super::few::{most_probable, votes_on};
 use super::index::RayIndex;
 use super::looks::Lookout;
@@ -43,12 +43,9 @@ pub fn regrow(
     objects: Vec<Object>,
     progress: &Progress,
 ) -> Result<(Vec<Object>, bool), Halt> {
-    let mut owner = vec![usize::MAX; model.scene.rays.rays.len()];
-    for (i, object) in objects.iter().enumerate() {
-        object.votes.iter().for_each(|&ray| owner[ray as usize] = i);
-    }
+    let owner = owners(model.scene, &objects);
     let garden = Garden { model, lookout, index, objects: &objects, owner: &owner };
-    let free: Vec<u32> = rays.iter().copied().filter(|&ray| owner[ray as usize] == usize::MAX).collect();
+    let free: Vec<u32> = rays.iter().copied().filter(|&ray| owner[ray as usize] == NOBODY).collect();
     let try_one = |&ray: &u32| {
         progress.check()?;
         Ok(garden.birth_on(ray))
@@ -82,7 +79,7 @@ struct Garden<'a> {
     index: &'a RayIndex<'a>,
     objects: &'a [Object],
     /// The object of each ray.
-    owner: &'a [usize],
+    owner: &'a [u32],
 }
 
 impl Garden<'_> {
@@ -90,7 +87,7 @@ impl Garden<'_> {
     fn birth_on(&self, ray: u32) -> Option<Birth> {
         let Self { model, lookout, .. } = *self;
         let class = model.class_of(ray);
-        let is_free = |ray: u32| self.owner[ray as usize] == usize::MAX;
+        let is_free = |ray: u32| self.owner[ray as usize] == NOBODY;
         let mut born = unseen(model, vec![ray], most_probable(model, ray, class)?)?;
         for _ in 0..ROUNDS {
             let (votes, _) = votes_on(model, self.index, &born, ray, &is_free);
@@ -109,7 +106,7 @@ impl Garden<'_> {
             return None;
         }
         for (vote, _) in taken {
-            let other = self.owner[vote as usize];
+            let other = self.owner[vote as usize] as usize;
             if birth.iter().any(|(i, _): &(usize, Option<Object>)| *i == other) {
                 continue;
             }
@@ -138,7 +135,7 @@ impl Garden<'_> {
         let hits = self.index.hits_of_any(&places_of(model, born), &may_be, range_m);
         let mut takes: Vec<(u32, f64)> = hits
             .into_iter()
-            .filter(|hit| self.owner[hit.ray as usize] != usize::MAX && !images.contains(&hit.image))
+            .filter(|hit| self.owner[hit.ray as usize] != NOBODY && !images.contains(&hit.image))
             .map(|hit| (hit.ray, gain_alone(model, born, hit.ray)))
             .filter(|(_, gain)| *gain > 0.0)
             .collect();

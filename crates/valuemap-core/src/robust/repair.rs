@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::assign::{Claim, Trajectories, assign_among, claims_of_all, images_of};
-use super::energy::{Object, fit, implied_size, object, size_of, visits};
+use super::energy::{NOBODY, Object, by_side, fit, implied_size, object, owners, size_of, visits};
 use super::few::most_probable;
 use super::index::{RayIndex, chi2};
 use super::looks::Lookout;
@@ -60,10 +60,7 @@ pub fn repair(
 ) -> Result<(Vec<Object>, bool), Halt> {
     let claims = claims_of_all(model, index, &objects, progress)?;
     let poses = Trajectories::of(model, &objects);
-    let mut owner = vec![u32::MAX; model.scene.rays.rays.len()];
-    for (i, object) in objects.iter().enumerate() {
-        object.votes.iter().for_each(|&ray| owner[ray as usize] = i as u32);
-    }
+    let owner = owners(model.scene, &objects);
     let mut open = neighborhoods(model, &objects, &claims, &owner);
     open.retain(|place| !tried.0.contains(&fingerprint(&objects, place, attempt)));
     let mut any = false;
@@ -83,11 +80,8 @@ pub fn repair(
         progress.check()?;
         let old: Vec<&Object> = place.iter().filter_map(|&i| objects[i].as_ref()).collect();
         let mut rays: Vec<u32> = old.iter().flat_map(|object| object.votes.iter().copied()).collect();
-        let leftover = place
-            .iter()
-            .flat_map(|&i| &claims[i])
-            .map(|claim| claim.ray)
-            .filter(|&ray| owner[ray as usize] == u32::MAX);
+        let leftover =
+            place.iter().flat_map(|&i| &claims[i]).map(|claim| claim.ray).filter(|&ray| owner[ray as usize] == NOBODY);
         rays.extend(leftover);
         rays.sort_unstable();
         rays.dedup();
@@ -254,7 +248,7 @@ impl Candidate {
         let limit = gate_sigmas * gate_sigmas;
         let of_class = model.classes[class as usize];
         let (mut gains, mut farthest): (Vec<(usize, f64)>, f64) = (Vec::new(), 0.0);
-        let (mut images, mut last) = (0_usize, u32::MAX);
+        let (mut images, mut last) = (0_usize, NOBODY);
         let (mut variance_m2, mut seen) = (f64::INFINITY, Vec::new());
         for (place, &ray) in rays.iter().enumerate() {
             let image = scene.rays.image[ray as usize];
@@ -327,15 +321,8 @@ fn parts_of(model: &Model<'_>, object: &Object) -> Vec<Vec<u32>> {
     if groups.len() > MOST_VISITS {
         return Vec::new();
     }
-    let mut sides: Vec<(Vector3<f64>, Vec<u32>)> = Vec::new();
-    for &ray in &object.votes {
-        let direction = model.scene.ray(ray).direction;
-        match sides.iter_mut().find(|(first, _)| first.dot(&direction) > SIDE_COSINE) {
-            Some((_, side)) => side.push(ray),
-            None => sides.push((direction, vec![ray])),
-        }
-    }
-    groups.extend(sides.into_iter().map(|(_, side)| side));
+    let looks = object.votes.iter().map(|&ray| (ray, model.scene.ray(ray).direction));
+    groups.extend(by_side(looks, SIDE_COSINE));
     let others = |group: &Vec<u32>| object.votes.iter().copied().filter(|ray| !group.contains(ray)).collect();
     let mut parts: Vec<Vec<u32>> = groups.iter().map(others).chain(groups.iter().cloned()).collect();
     let least = (model.settings.min_votes as usize).max(1);
@@ -422,7 +409,7 @@ fn neighborhoods(model: &Model<'_>, objects: &[Object], claims: &[Vec<Claim>], o
     for (i, claims) in claims.iter().enumerate() {
         for claim in claims {
             let other = owner[claim.ray as usize];
-            if other != u32::MAX && other as usize != i {
+            if other != NOBODY && other as usize != i {
                 let other = other as usize;
                 *shared.entry((i.min(other), i.max(other))).or_default() += 1;
             }
