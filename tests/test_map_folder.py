@@ -52,14 +52,18 @@ def test_further_files_are_linked_or_copied_where_there_are_no_links(
 ) -> None:
     (tmp_path / "images").write_bytes(b"long")
     files = {"dataset/images.parquet": tmp_path / "images"}
-    write_map(MAPS[0], tmp_path / "linked", files=files)
+    (tmp_path / "0_0.arrow").write_bytes(b"labels")
+    cells = [tmp_path / "0_0.arrow"]
+    write_map(MAPS[0], tmp_path / "linked", cells=cells, files=files)
     assert (tmp_path / "linked" / "dataset" / "images.parquet").samefile(tmp_path / "images")
+    assert (tmp_path / "linked" / "cells" / "0_0.arrow").samefile(cells[0])
 
     def no_links(*_: object) -> None:
         raise OSError
 
     monkeypatch.setattr("os.link", no_links)
-    write_map(MAPS[0], tmp_path / "copied", files=files)
+    write_map(MAPS[0], tmp_path / "copied", cells=cells, files=files)
+    assert (tmp_path / "copied" / "cells" / "0_0.arrow").read_bytes() == b"labels"
     copied = tmp_path / "copied" / "dataset" / "images.parquet"
     assert copied.read_bytes() == b"long"
     assert not copied.samefile(tmp_path / "images")

@@ -41,7 +41,7 @@ from valuemap.tables import (
 from valuemap.tiles.compare import Comparison
 from valuemap.update import changes as changes_of_labels
 from valuemap.update import compare, update
-from valuemap.update.changes import Verdicts, _likeliest, judge, match_labels, match_places
+from valuemap.update.changes import Verdicts, _likeliest, first_rows, judge, match_labels, match_places
 from valuemap.update.join import join_datasets, join_in_portions
 from valuemap.update.looks import HIDDEN_OF, Chances, Lookout, Looks, Sights
 
@@ -194,6 +194,18 @@ def test_what_moved_is_told_where_all_the_data_have_one_label_for_both_places(co
     assert (kinds.count("moved"), kinds.count("removed"), kinds.count("added")) == (1, 1, 1)
     assert np.all(np.bincount(np.unique(result.votes.detection_id, return_inverse=True)[1]) == 1)
     assert np.bincount(result.votes.label_id)[result.labels.label_id].tolist() == result.labels.votes.tolist()
+
+
+@pytest.mark.parametrize("spread", [1, 1000])
+def test_first_rows_are_those_of_a_search_row_by_row(spread: int) -> None:
+    """With gaps few and many: two ways to look ids up."""
+    random = np.random.default_rng(5)
+    keys, ids = (spread * random.integers(0, 60, count) + 7 for count in (40, 100))
+    expected = [next((row for row, key in enumerate(keys.tolist()) if key == each), -1) for each in ids.tolist()]
+    assert first_rows(ids, keys).tolist() == expected
+    assert -1 in expected
+    assert first_rows(ids[:0], keys).tolist() == []
+    assert first_rows(ids, keys[:0]).tolist() == [-1] * len(ids)
 
 
 def test_labels_are_those_of_all_the_data_where_nothing_is_told_to_have_changed(

@@ -127,7 +127,7 @@ def write_map(
 
     Other files in the folder stay. Where one that valuemap did not write is in the way, an `OutputError` says so; with
     `force` it is replaced. `cells` are the files of its cells, `files` others by their names in the folder,
-    which nobody changes any more: where the disk knows links they are linked, else copied, as cells are.
+    which nobody changes any more: where the disk knows links they are linked, else copied, and so are cells.
     """
     with new_folder(Path(path), parts=PARTS, part_folders=(CELLS, DATASET), force=force) as folder:
         run = {**result.run, "frame": result.frame.to_json()}
@@ -136,19 +136,28 @@ def write_map(
             (folder / CALIBRATION).write_text(json.dumps(calibration, indent=2) + "\n", encoding="utf-8")
         for name, file in files.items():
             (folder / name).parent.mkdir(exist_ok=True)
-            try:
-                os.link(file, folder / name)  # Nobody writes into a file that is there.
-            except OSError:  # On another disk, or one that knows no links.
-                shutil.copyfile(file, folder / name)
+            _place(file, folder / name)
         if cells:
             (folder / CELLS).mkdir()
-        for cell, content in zip(cells, read_all(cells), strict=True):
+        afar = [cell for cell in cells if not isinstance(cell, Path)]
+        for cell in cells:
+            if isinstance(cell, Path):
+                _place(cell, folder / CELLS / cell.name)
+        for cell, content in zip(afar, read_all(afar), strict=True):
             (folder / CELLS / name_of(cell)).write_bytes(content)
         (folder / MARKER).write_text(json.dumps(run, indent=2) + "\n", encoding="utf-8")
         write_labels(result, folder / "labels.parquet")
         write_table(result.votes, folder / "votes.parquet")
         if result.rejected is not None:
             write_table(result.rejected, folder / REJECTED)
+
+
+def _place(file: Path, place: Path) -> None:
+    """Link a file that nobody changes any more, or copy it."""
+    try:
+        os.link(file, place)  # Nobody writes into a file that is there.
+    except OSError:  # On another disk, or one that knows no links.
+        shutil.copyfile(file, place)
 
 
 def read_map(path: str | Path) -> Map:

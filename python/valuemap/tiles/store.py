@@ -61,7 +61,7 @@ def save_cell(solved: Solved, place: Place) -> None:
     head = {"cell": cell, "counts": solved.counts, "classes": solved.labels.class_name.names}
     table = table.replace_schema_metadata({"valuemap": json.dumps(head)})
     file = io.BytesIO()
-    options = pa.ipc.IpcWriteOptions(compression="zstd", use_threads=False)
+    options = pa.ipc.IpcWriteOptions(compression="lz4", use_threads=False)
     with pa.ipc.new_file(file, table.schema, options=options) as writer:
         writer.write_table(table)
     put(place, file.getvalue())

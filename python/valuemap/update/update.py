@@ -45,7 +45,7 @@ from valuemap.tables import (
 )
 from valuemap.tiles.calibration import read_calibration
 from valuemap.tiles.source import VIEWPOINT_SHARE
-from valuemap.update.changes import STATES, Verdicts, judge, match_labels, match_places, number, tell
+from valuemap.update.changes import STATES, Verdicts, first_rows, judge, match_labels, match_places, number, tell
 from valuemap.update.join import join_datasets, join_in_portions
 from valuemap.update.looks import Chances, Lookout, Looks, Sights
 
@@ -406,11 +406,10 @@ def _numbered(parts: list[tuple[Labels, Votes]]) -> tuple[Labels, Votes]:
     for table, of in parts:
         ids = np.arange(first, first + len(table))
         first += len(table)
-        order = np.argsort(table.label_id, kind="stable")
-        row = order[np.searchsorted(table.label_id[order], of.label_id)] if len(of) else np.empty(0, np.int64)
-        by_label = np.argsort(row, kind="stable")
+        row = first_rows(of.label_id, table.label_id)
+        of = of.replace(label_id=ids[row])
         labels.append(table.replace(label_id=ids))
-        votes.append(of.replace(label_id=ids[row]).take(by_label))
+        votes.append(of.take(np.argsort(row, kind="stable")) if np.any(np.diff(row) < 0) else of)
     return join_tables(labels), join_tables(votes)
 
 
@@ -485,8 +484,8 @@ def _once(votes: Votes, ids: Ints, is_of_alone: Bools) -> tuple[Votes, Ints]:
 
     Labels of the added passes alone keep theirs: they are there because others had taken their votes wrongly.
     """
-    ids_voting = np.sort(votes.detection_id)
-    of_several = np.flatnonzero(np.isin(votes.detection_id, ids_voting[1:][np.diff(ids_voting) == 0]))
+    is_first = first_rows(votes.detection_id, votes.detection_id) == np.arange(len(votes))
+    of_several = np.flatnonzero(np.isin(votes.detection_id, votes.detection_id[~is_first]))
     yields = ~np.isin(votes.label_id[of_several], ids[is_of_alone])
     order = of_several[np.lexsort((votes.label_id[of_several], yields, votes.detection_id[of_several]))]
     again = order[1:][np.diff(votes.detection_id[order]) == 0]
