@@ -36,7 +36,7 @@ from valuemap.tiles import grid as grid_module
 from valuemap.tiles.dense import groups_of_drives, join_groups
 from valuemap.tiles.fingerprint import Fingerprints
 from valuemap.tiles.fleet import Fleet
-from valuemap.tiles.grid import LEVELS, WHOLE, Cell, Census, Grid, Places
+from valuemap.tiles.grid import LEVELS, WHOLE, Cell, Census, Grid, Places, smallest_squares
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.sample import is_sampled, sampled_squares
@@ -150,6 +150,9 @@ def test_the_sample_does_not_depend_on_what_is_elsewhere() -> None:
     again = {tuple(square) for square in sampled_squares(census(with_more), detections=500).tolist()}
     assert {square for square in again if square[0] < 60} <= chosen
     assert is_sampled(GRID, census(place_m), place_m).all()  # Few enough to take all.
+    expected = [tuple(square) in chosen for square in smallest_squares(GRID, place_m).tolist()]
+    assert is_sampled(GRID, census(place_m), place_m, 500).tolist() == expected
+    assert 0 < sum(expected) < len(expected)
 
 
 # Seams, by hand: cell 0 is left of x = 480 m, cell 1 right of it.

@@ -7,5 +7,6 @@ from __future__ import annotations
 
 from valuemap.check.examine import Examination, examine
 from valuemap.check.fault import Finding
+from valuemap.check.quality import far_images
 
-__all__ = ["Examination", "Finding", "examine"]
+__all__ = ["Examination", "Finding", "examine", "far_images"]

@@ -12,6 +12,7 @@ from valuemap.check.registry import CONVENTIONS, FAULTS
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
+from valuemap.tables import Images
 
 _MOST_ROUNDS = 4
 """Of one stage: one fault may hide behind another, but not for ever."""
@@ -36,13 +37,15 @@ class Examination:
         }
 
 
-def examine(dataset: Dataset, *, progress: Progress = silent) -> Examination:
+def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progress = silent) -> Examination:
     """Look for all known faults in a dataset.
 
     Parameters
     ----------
     dataset
         Posed images with detections. Nothing is asked of it but that its tables fit together.
+    drives
+        Images of whole passes, where the dataset is a part of another and has pieces of passes.
     progress
         Called as progress(what, done, total).
 
@@ -64,11 +67,12 @@ def examine(dataset: Dataset, *, progress: Progress = silent) -> Examination:
     findings: list[Finding] = []
     notes: list[str] = []
     gate_share, meets = 1.0, True
+    is_part = drives is not None
     rivals: tuple[str, ...] = ()
     for stage in STAGES:
         for _ in range(_MOST_ROUNDS):
             known = frozenset(finding.fault for finding in findings)
-            view = View(dataset, gate_share=gate_share, known=known, meets=meets, rivals=rivals)
+            view = View(dataset, gate_share=gate_share, known=known, meets=meets, rivals=rivals, drives=drives)
             if stage == "conventions":
                 verdict = hold_contest(view, CONVENTIONS, progress)
                 if verdict.suspicion is not None:
@@ -97,9 +101,11 @@ def examine(dataset: Dataset, *, progress: Progress = silent) -> Examination:
             fixes: list[Fix] = [each.fix for each in found if each.fix is not None]
             for fix in fixes:
                 dataset = fix(dataset)
+            if fixes and is_part:  # They put pieces of passes right, not these.
+                drives = dataset.images[:0]
             if not fixes:
                 break
-    prospects = describe_prospects(View(dataset, gate_share=gate_share))
+    prospects = describe_prospects(View(dataset, gate_share=gate_share, drives=drives))
     return Examination(tuple(findings), prospects, dataset, tuple(notes))
 
 

@@ -21,7 +21,7 @@ from valuemap.check.sample import (
     sample_stretches,
 )
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats
+from valuemap.tables import Floats, Images
 
 Fix = Callable[[Dataset], Dataset]
 Stage = Literal["tables", "conventions", "positions", "fine", "results"]
@@ -86,8 +86,11 @@ class View:
         known: frozenset[str] = frozenset(),
         meets: bool = True,
         rivals: tuple[str, ...] = (),
+        drives: Images | None = None,
     ) -> None:
         self.dataset = dataset
+        self.drives = dataset.images if drives is None else drives
+        """Images of whole passes: all that there are, or some, if any, where the dataset is a part of another."""
         self.meets = meets
         """Whether rays can be told to meet better than by chance: else points where they meet are no objects."""
         self.rivals = rivals

@@ -277,7 +277,7 @@ def _rounded(period: float) -> float:
 def _find_jumping(view: View, name: str, *, is_interleaved: bool) -> Finding | None:
     if view.known & {"interleaved_passes", "passes_no_drives"}:
         return None
-    passes = _jumping_passes(view.dataset)
+    passes = _jumping_passes(view.drives)
     passes = [each for each in passes if each["interleaved"] == is_interleaved]
     if not passes:
         return None
@@ -300,8 +300,9 @@ def _find_jumping(view: View, name: str, *, is_interleaved: bool) -> Finding | N
     )
 
 
-def _jumping_passes(dataset: Dataset) -> list[dict[str, Any]]:
-    images = dataset.images
+def _jumping_passes(images: Images) -> list[dict[str, Any]]:
+    if not len(images):
+        return []
     center = camera_centers(images)
     found = []
     for code, rows in _passes_in_order(images):
@@ -377,7 +378,7 @@ def _rechained(dataset: Dataset) -> Dataset:
     center = camera_centers(images)
     names = np.array(images.pass_id.texts(), dtype=object)
     scattered: list[Ints] = []
-    bad = {each["name"]: each["interleaved"] for each in _jumping_passes(dataset)}
+    bad = {each["name"]: each["interleaved"] for each in _jumping_passes(dataset.images)}
     for code, rows in _passes_in_order(images):
         name = images.pass_id.names[code]
         if name not in bad:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 import valuemap._core as _core
+from valuemap.cameras import camera_centers
 from valuemap.check.fault import View
 from valuemap.check.sample import driving_order
 
@@ -71,9 +72,11 @@ def _share_without(view: View) -> float:
 
 def _gaps(view: View) -> dict[str, Any]:
     """Return how often a drive is interrupted, and the longest way without an image."""
-    images = view.dataset.images
+    images = view.drives
+    if not len(images):
+        return {"passes": len(np.unique(view.dataset.images.pass_id.codes)), "step_m": round(view.step_m, 3)}
     order = driving_order(images)
-    step = np.linalg.norm(np.diff(view.center_in_world_m[order], axis=0), axis=1)
+    step = np.linalg.norm(np.diff(camera_centers(images)[order], axis=0), axis=1)
     step = step[np.diff(images.pass_id.codes[order]) == 0]
     gaps = step[step > _GAP_TIMES * view.step_m]
     return {

@@ -76,7 +76,7 @@ class FarImages(Fault):
 
     def find(self, view: View) -> Finding | None:
         """Look for few images much farther from the middle than all others."""
-        far = _far_images(view.center_in_world_m)
+        far = far_images(view.center_in_world_m)
         count = int(far.sum())
         if count == 0:
             return None
@@ -310,8 +310,8 @@ def _repeated_images(dataset: Dataset) -> Bools:
     return repeated
 
 
-def _far_images(center: Floats) -> Bools:
-    """Return which images (N) are ten times farther from the middle than 95 % of all, with nothing in between."""
+def far_images(center: Floats) -> Bools:
+    """Return which of some places (N, D) are ten times farther from the middle than 95 % of all, and none between."""
     distance = np.linalg.norm(center - np.median(center, axis=0), axis=1)
     usual = float(np.quantile(distance, 1.0 - _MOST_FAR))
     far: Bools = distance > _FAR_TIMES * usual
@@ -323,7 +323,7 @@ def _far_images(center: Floats) -> Bools:
 def _without_far(dataset: Dataset) -> Dataset:
     from valuemap.cameras import camera_centers
 
-    return keep_rows(dataset, images=~_far_images(camera_centers(dataset.images)))
+    return keep_rows(dataset, images=~far_images(camera_centers(dataset.images)))
 
 
 def _grid_step(values: Floats) -> float | None:

@@ -15,6 +15,7 @@ from valuemap.cli.show import log, progress_bars, show
 from valuemap.dataset import read_dataset, write_dataset
 from valuemap.errors import SettingError
 from valuemap.folders import check_place
+from valuemap.tiles.part import is_large, read_part
 
 _WRONG = 3
 """Exit code where something is wrong: scripts can tell it from a command that failed (1) and from bad use (2)."""
@@ -31,7 +32,7 @@ def check_command(
     as_json: AsJson = False,
 ) -> None:
     """Say what is wrong with a dataset, how sure that is, and what the data can give."""
-    from valuemap.check import examine
+    from valuemap.check import examine, far_images
 
     if fix is not None:
         if fix.resolve() == dataset.resolve():
@@ -39,13 +40,20 @@ def check_command(
                 f"--fix {fix}: this is the dataset itself", hint="give another folder: what is given stays as it is"
             )
         check_place(fix, parts=dataset_folder.PARTS, force=force)
-    given = read_dataset(dataset, are_boxes_checked=False)
+    # What is put right is so in all rows.
+    part = read_part(dataset, also=far_images, are_boxes_checked=False) if fix is None and is_large(dataset) else None
+    given = read_dataset(dataset, are_boxes_checked=False) if part is None else part.dataset
     with progress_bars() as progress:
-        outcome = examine(given, progress=progress)
+        outcome = examine(given, drives=None if part is None else part.drives, progress=progress)
+    told = outcome.to_json()
+    if part is not None:
+        told |= {"looked_at": part.to_json(), "prospects": {**told["prospects"], **part.counts}}
     if as_json:
-        print(json.dumps({"dataset": given.name, **outcome.to_json()}, indent=2))
+        print(json.dumps({"dataset": given.name, **told}, indent=2))
     else:
-        _tell(outcome.to_json())
+        _tell(told)
+        if part is not None:
+            print(f"\nnote: {part.note}")
     if fix is not None:
         write_dataset(outcome.fixed, fix, force=force)
         fixed = sum(finding.fix is not None for finding in outcome.findings)

@@ -15,6 +15,7 @@ from valuemap.errors import OutputError
 from valuemap.evaluate import evaluate_map
 from valuemap.evidence import find_dataset
 from valuemap.map_folder import read_map
+from valuemap.tiles.part import is_large, part_of_map
 
 
 @app.command("report")
@@ -48,10 +49,15 @@ def report_command(
         raise OutputError(f"{out}: a report is an HTML file", hint="name a file that ends in .html")
     result = read_map(map_)
     folder = find_dataset(map_, result.run, dataset)
-    data = None if folder is None else read_dataset(folder)
+    is_part = folder is not None and is_large(folder)
+    data = None
+    if folder is not None and is_part:
+        result, data = part_of_map(result, folder)
+    elif folder is not None:
+        data = read_dataset(folder)
     known = truth if truth is not None else data if data is not None and data.truth is not None else None
     evaluation = None
-    if known is not None:
+    if known is not None and not is_part:
         evaluation = evaluate_map(
             result,
             known,

@@ -17,11 +17,13 @@ _NEAR = 2
 """Places are this many of the smallest squares of the grid wide: objects in most of one are seen from it alone."""
 
 
-def is_sampled(grid: Grid, census: Census, place_m: Floats) -> Bools:
-    """Return which of some places (N, 2) are calibrated on."""
-    squares = sampled_squares(census).tolist()
-    chosen = {(x, y) for x, y in squares}
-    return np.array([(x, y) in chosen for x, y in smallest_squares(grid, place_m).tolist()], np.bool_)
+def is_sampled(grid: Grid, census: Census, place_m: Floats, detections: int = SAMPLE_DETECTIONS) -> Bools:
+    """Return which of some places (N, 2) are in a sample of about so many detections."""
+    square, chosen = smallest_squares(grid, place_m), sampled_squares(census, detections)
+    low = np.minimum(square.min(axis=0, initial=2**62), chosen.min(axis=0, initial=2**62))
+    across = int(max(square[:, 1].max(initial=0), chosen[:, 1].max(initial=0)) - low[1]) + 1
+    key, of_chosen = ((each[:, 0] - low[0]) * across + each[:, 1] - low[1] for each in (square, chosen))
+    return np.isin(key, of_chosen)
 
 
 def sampled_squares(census: Census, detections: int = SAMPLE_DETECTIONS) -> Ints:
