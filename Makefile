@@ -51,6 +51,7 @@ bench-scale: setup
 	$(RUN) python benchmarks/scale.py change --json benchmarks/results/scale.json
 	$(RUN) python benchmarks/scale.py cells --preset nyc --json benchmarks/results/scale.json
 	$(RUN) python benchmarks/scale.py kills --preset nyc --json benchmarks/results/scale.json
+	$(RUN) python benchmarks/scale.py tiles --preset nyc --json benchmarks/results/scale.json
 	$(RUN) python benchmarks/scale.py update --preset nyc --json benchmarks/results/scale.json
 	$(RUN) python benchmarks/on_ray.py --json benchmarks/results/on_ray.json
 	$(RUN) python benchmarks/scale.py map --preset 10x-nyc --json benchmarks/results/scale.json

@@ -52,8 +52,8 @@ SEEDS_CHOSEN_ON = 5
 """What tells changes was chosen on the seeds below this one: those from it on are measured."""
 KILLS = 10
 UPDATED_SHARE = 0.05
-RUNS = 5
-"""So often updates and maps of all data are timed."""
+RUNS, RUNS_OF_TILES = 5, 3
+"""So often updates and maps of all data, and maps in one piece and in tiles, are timed."""
 POSES_AS_THEY_ARE = "correct_poses=0"
 """Poses of whole drives are looked at in all data, whatever is added: tiles and changes have no part in that."""
 SET = (f"--set={POSES_AS_THEY_ARE}",)
@@ -103,23 +103,41 @@ def measured(folder: Path, out: Path, *options: str) -> dict[str, Any]:
     }
 
 
-def timed(*command: str) -> tuple[dict[str, float], dict[str, Any]]:
-    """Run a command of valuemap, and return what it took, and what it says."""
+def timed(*command: str, program_of: tuple[str, ...] | None = None) -> tuple[dict[str, float], dict[str, Any]]:
+    """Run a command of valuemap, or of another program, and return what it took, and what it says."""
+    took, told = taken(*(program_of or COMMAND), *command, "--json")
+    return took, json.loads(told)
+
+
+def taken(*command: str) -> tuple[dict[str, float], str]:
+    """Run Python with some arguments, and return what it took, and what it says."""
     start = time.perf_counter()
     with tempfile.TemporaryFile() as told, tempfile.TemporaryFile() as used:
-        subprocess.run(
-            [sys.executable, "-S", "-c", _MEASURE, *program(*command, "--json")],
+        done = subprocess.run(
+            [sys.executable, "-S", "-c", _MEASURE, sys.executable, *command],
             stdout=told,
             stderr=used,
             env=as_installed(),
-            check=True,
+            check=False,
         )
         seconds = time.perf_counter() - start
         told.seek(0)
         used.seek(0)
-        return {"seconds": round(seconds, 1), **json.load(used)}, json.load(told)
+        if done.returncode not in (0, FOUND_WRONG):
+            raise SystemExit(f"{' '.join(command)}: ended with {done.returncode}")
+        return {"seconds": round(seconds, 1), **json.load(used)}, told.read().decode()
 
 
+COMMAND = ("-m", "valuemap.cli")
+FOUND_WRONG = 3
+"""How `check` ends where something is wrong with a dataset."""
+_ONE_CELL = (
+    "-c",
+    "from dataclasses import replace; from valuemap.tiles.grid import Grid; of = Grid.of; "
+    "Grid.of = lambda *data: replace(of(*data), side_m=1e7, most_detections=10**9); "
+    "from valuemap.cli import main; main()",
+)
+"""The command, where all data is one cell, however wide it is: as there was before there were cells."""
 _MEASURE = """
 import json, resource, subprocess, sys
 status = subprocess.run(sys.argv[1:], stderr=subprocess.DEVNULL).returncode
@@ -146,7 +164,7 @@ def least(runs: list[dict[str, float]]) -> dict[str, Any]:
 
 def program(*command: str) -> list[str]:
     """Return a command of valuemap."""
-    return [sys.executable, "-m", "valuemap.cli", *command]
+    return [sys.executable, *COMMAND, *command]
 
 
 def digest(folder: Path) -> str:
@@ -210,9 +228,43 @@ def partition(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def whole(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Map a dataset as `valuemap map` does by itself: in memory, or in tiles on disk where it is large."""
+    """Map a dataset as `valuemap map` does by itself, in memory or in tiles on disk; check it and report on the map."""
     with dataset_of(arguments) as folder, tempfile.TemporaryDirectory() as name:
-        return measured(folder, Path(name) / "map")
+        out = Path(name) / "map"
+        result = measured(folder, out)
+        checked, told = timed("check", str(folder))
+        reported, _ = taken(*COMMAND, "report", str(out), "--out", str(Path(name) / "report.html"))
+        looked_at = {"looked_at": told["looked_at"]} if "looked_at" in told else {}
+        found = [finding["fault"] for finding in told["findings"]]
+        return {**result, "check": {**checked, **looked_at, "found": found}, "report": reported}
+
+
+def tiles(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Map a dataset in one piece, in cells in memory, and in tiles on disk, in turn: what cells and tiles cost."""
+    ways = {
+        "one cell": (_ONE_CELL, ()),
+        "cells in memory": (COMMAND, ()),
+        "tiles on disk": (COMMAND, ("--tile-size", "1000")),
+    }
+    took: dict[str, list[dict[str, float]]] = {name: [] for name in ways}
+    found: dict[str, Any] = {}
+    with dataset_of(arguments) as folder, tempfile.TemporaryDirectory() as name:
+        for _ in range(RUNS_OF_TILES):
+            for way, (program_of_way, options) in ways.items():
+                out = Path(name) / way
+                shutil.rmtree(out, ignore_errors=True)
+                command = ("map", str(folder), "--out", str(out), *options, *SET)
+                seconds, run = timed(*command, program_of=program_of_way)
+                took[way].append(seconds)
+                found[way] = {"map": digest(out), "labels": run["counts"]["labels"]}
+    runs = {way: {**least(took[way]), **found[way]} for way in ways}
+    cpu = {way: run["cpu_seconds"] for way, run in runs.items()}
+    return {
+        "runs": runs,
+        "tiles_on_disk_to_one_cell": round(cpu["tiles on disk"] / cpu["one cell"], 3),
+        "tiles_on_disk_to_cells_in_memory": round(cpu["tiles on disk"] / cpu["cells in memory"], 3),
+        "identical": runs["tiles on disk"]["map"] == runs["cells in memory"]["map"],
+    }
 
 
 def cells(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -552,6 +604,7 @@ PARTS = {
     "simulate": simulate_only,
     "partition": partition,
     "map": whole,
+    "tiles": tiles,
     "cells": cells,
     "kills": kills,
     "update": update,
