@@ -40,7 +40,7 @@ from valuemap.tiles.grid import LEVELS, WHOLE, Cell, Census, Grid, Places, small
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.sample import is_sampled, sampled_squares
-from valuemap.tiles.seams import join_cells
+from valuemap.tiles.seams import _Rows, join_cells
 from valuemap.tiles.solve import Solved, solve_cell
 from valuemap.tiles.source import InMemory
 from valuemap.tiles.store import hash_settings
@@ -244,6 +244,17 @@ def test_each_detection_votes_once_and_what_is_counted_follows() -> None:
         (470.0, [0, 1, 2, 3, 4, 5]),
         (495.0, [20, 21, 22]),
     ]
+
+
+@pytest.mark.parametrize("spread", [1, 10**12])
+def test_votes_of_several_are_those_of_detections_counted_one_by_one(spread: int) -> None:
+    random = np.random.default_rng(8)
+    detection = spread * random.integers(3, 90, 60)
+    none = np.zeros(60, np.int64)
+    expected = [row for row, each in enumerate(detection.tolist()) if np.sum(detection == each) > 1]
+    assert 0 < len(expected) < 60
+    assert _Rows(none, none, none, none, detection).of_several.tolist() == expected
+    assert _Rows(*[none[:0]] * 5).of_several.tolist() == []
 
 
 # Whole maps.

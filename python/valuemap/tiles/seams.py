@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ import numpy as np
 from valuemap.config import MapConfig
 from valuemap.describe import residual_sigma_px
 from valuemap.tables import Bools, Ints, Labels, Votes, join_tables
-from valuemap.tiles.grid import Grid
+from valuemap.tiles.grid import Grid, numbered
 from valuemap.tiles.solve import Solved, summed
 
 _SAME_SHARE = 0.5
@@ -43,6 +44,12 @@ class _Rows:
     def is_own(self) -> Bools:
         """Which labels (N) lie in the cell that found them."""
         return np.asarray(self.home == self.cell)
+
+    @cached_property
+    def of_several(self) -> Ints:
+        """The votes (rows) by detections that vote more than once: few, and nothing is to be decided of the others."""
+        number = numbered(self.detection_id - self.detection_id.min(initial=0))[1]
+        return np.flatnonzero(np.bincount(number)[number] > 1)
 
 
 def join_cells(solved: Sequence[Solved], grid: Grid, config: MapConfig) -> tuple[Labels, Votes, dict[str, Any]]:
@@ -102,7 +109,7 @@ def _decide(rows: _Rows, min_votes: int) -> tuple[Bools, Bools, dict[str, int]]:
             is_kept[label] = True
             counts["labels_at_home_nowhere"] += 1
     # Each detection votes for the first of those that are kept.
-    vote = np.flatnonzero(is_kept[rows.label_of_vote])
+    vote = rows.of_several[is_kept[rows.label_of_vote[rows.of_several]]]
     vote = vote[np.lexsort((rank[rows.label_of_vote[vote]], rows.detection_id[vote]))]
     again = np.flatnonzero(np.diff(rows.detection_id[vote]) == 0) + 1
     has_vote[vote[again]] = False
@@ -115,10 +122,11 @@ def _decide(rows: _Rows, min_votes: int) -> tuple[Bools, Bools, dict[str, int]]:
 
 def _shared(rows: _Rows) -> Ints:
     """Return (label, other label, detections that vote for both) of all pairs, in both orders (P, 3)."""
-    order = np.lexsort((rows.label_of_vote, rows.detection_id))
-    label, detection = rows.label_of_vote[order], rows.detection_id[order]
+    vote = rows.of_several
+    vote = vote[np.lexsort((rows.label_of_vote[vote], rows.detection_id[vote]))]
+    label, detection = rows.label_of_vote[vote], rows.detection_id[vote]
     pairs = [np.empty((0, 2), np.int64)]
-    for step in range(1, len(order)):
+    for step in range(1, len(vote)):
         near = np.flatnonzero(detection[step:] == detection[:-step])
         if not len(near):
             break
