@@ -33,7 +33,7 @@ from valuemap.readers.structure import Picture, Posed, find_poses, process
 from valuemap.readers.structure.adjust import Sights, adjust, gps_inflation
 from valuemap.readers.structure.features import find_features, image_ids
 from valuemap.readers.structure.job import Job, prepare, read_answer, read_job, write_answer
-from valuemap.readers.structure.mapping import confirmed, contradicts_gps
+from valuemap.readers.structure.mapping import _triangulated, _Whole, confirmed, contradicts_gps
 from valuemap.readers.structure.pairs import pairs_to_match
 from valuemap.tables import Floats, Ints
 
@@ -204,6 +204,33 @@ def test_what_only_two_pictures_see_counts_where_they_share_little_else() -> Non
     image = np.concatenate([np.tile([0, 1, 2], 60), [0, 1], np.tile([2, 3], 10), [3]])
     point = np.concatenate([np.repeat(np.arange(60), 3), [60, 60], np.repeat(np.arange(61, 71), 2), [71]])
     assert confirmed(image, point).tolist() == [True] * 180 + [False] * 2 + [True] * 20 + [False]
+
+
+def test_what_two_pictures_alone_see_far_away_is_kept(tmp_path: Path) -> None:
+    """At a corner little else says how a camera turned: 60 points 150 m away, 0.4 to 1 degree between their sights."""
+    random, centers = np.random.default_rng(0), [np.zeros(3), np.array([1.2, 0.0, 0.0]), np.array([2.5, 0.0, 0.0])]
+    points = np.array([-40.0, -30.0, 150.0]) + random.random((60, 3)) * [80.0, 60.0, 20.0]
+    camera = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.0))
+    rows = [Picture(f"{i}.jpg", picture(tmp_path / f"{i}.jpg"), 0, each, 1.0, "a") for i, each in enumerate(centers)]
+    job, work = Job(rows, [camera], [True]), tmp_path / "work"
+    prepare(work, job)
+    find_features(job, work, threads=1, progress=lambda *_: None)
+    with pycolmap.Database.open(work / "database.db") as database:
+        database.clear_keypoints()
+        for i, center in enumerate(centers):
+            seen = points - center
+            pixels = 500.0 * seen[:, :2] / seen[:, 2:] + [320.0, 240.0]
+            database.write_keypoints(i + 1, np.asarray(pixels, dtype=np.float32))
+        for one, two, which in ((1, 2, np.arange(30)), (2, 3, np.arange(30, 60))):
+            matches = np.stack([which, which], axis=1).astype(np.uint32)
+            database.write_matches(one, two, matches)
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config, geometry.inlier_matches = pycolmap.TwoViewGeometryConfiguration.CALIBRATED, matches
+            database.write_two_view_geometry(one, two, geometry)
+        cameras = {each.camera_id: each for each in database.read_all_cameras()}
+    whole = _Whole({i: (np.eye(3), each) for i, each in enumerate(centers)}, cameras)
+    model = _triangulated(job, work, {0: 1, 1: 2, 2: 3}, whole, 4.0, 1)
+    assert model.num_points3D() == 60
 
 
 # Features.
