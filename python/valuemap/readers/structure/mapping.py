@@ -36,8 +36,8 @@ _TOLERANCES_PX = (12.0, 4.0, 4.0)
 """Of points, round by round: at first poses are as wrong as pairs say."""
 _SHARP_PX, _ANGLE_DEG = 4.0, 2.0
 _LEAST_ANGLE_DEG = 0.3
-"""Between two sights of a point: features are right to 0.4 px, 0.05 degrees at a focal length of 500 px, so that a depth
-is known to a sixth. What is farther tells how a camera turns, and at corners little else does."""
+"""Between two sights of a point: features are right to 0.4 px, 0.05 degrees at a focal length of 500 px, and a depth
+then to a sixth. What is farther tells how a camera turns, and at corners little else does."""
 
 NO_FILE = "its features cannot be found: the file is damaged"
 NO_MATCH = "too little of it is seen in other pictures"
