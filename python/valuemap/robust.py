@@ -151,7 +151,7 @@ def calibrate(
     What the config sets of the noise stays as it is. The scene may be a part of what is mapped.
     """
     guess, known = _guess(config.noise)
-    steps = _core.CALIBRATION_STEPS + (_core.SEARCH_STEPS if is_part else 0)
+    steps = _core.CALIBRATION_STEPS + (2 * _core.SEARCH_STEPS if is_part else 0)
     with counted(progress, "estimating the noise", steps) as tell:
         noise, is_deep, classes, pooled, shares = _core.calibrate(
             scene.core, guess.as_tuple(), known, _settings(config), is_part, threads, lambda done, _total: tell(done)

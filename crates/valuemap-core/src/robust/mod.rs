@@ -63,7 +63,7 @@ use looks::Lookout;
 use model::{ClassModel, Model, Rates};
 use noise::{Noise, Spread};
 use rayon::prelude::*;
-use rustc_hash::FxHashMap;
+use rustc_hash::{FxHashMap, FxHashSet};
 use scene::Scene;
 use search::{Depth, search};
 use switches::are_others;
@@ -107,6 +107,8 @@ const MOST_RAYS: usize = 100_000;
 const LEAST_CHANGE: f64 = 0.1;
 /// By so many standard deviations of the share more: what a sample says by chance pays nowhere.
 const LEAST_CHANGE_SIGMAS: f64 = 2.0;
+/// It is asked of one in so many of the places that classes are learned from first: some fifty objects tell none from one in ten.
+const SOME_OF_PLACES: usize = 5;
 
 /// Steps of [`self_calibrate`] at most, as progress counts them, but for the search that tells whether all moves pay: the noise, and the classes.
 pub const CALIBRATION_STEPS: usize = likeliest::NOISE_STEPS + 1;
@@ -196,16 +198,36 @@ pub fn self_calibrate(
     let objects = learn_from(&mut model, &wide, progress)?;
     let is_small = !is_part && scene.usable_rays().len() <= MOST_RAYS;
     let is_deep = is_small || {
-        let deeper = search(&mut model, &wide, placed(&objects), Depth::Deep, false, &mut Tally::default(), progress)?;
-        is_changed(&objects, &deeper)
+        // A part of the places says it, unless it is a near thing.
+        let some = sample::places(scene, CLASS_RAYS / SOME_OF_PLACES, WIDE * settings.viability.max_range_m);
+        changes_much(&mut model, &some, &objects, progress)?.unwrap_or(true)
+            && changes_much(&mut model, &wide, &objects, progress)?.is_some_and(|changes| changes)
     };
     let classes = model.classes.iter().copied().map(Some).collect();
     Ok(Calibration { noise, classes, pooled: model.pooled, confusions: model.confusions, is_deep, starts })
 }
 
-/// Whether so many objects of two maps of the same rays are not in both that it is no chance. One is in both if most of its votes are most of
-/// those of one of the other map.
-fn is_changed(some: &[Object], others: &[Object]) -> bool {
+/// Whether all moves change many objects of some rays (ascending) whose map is known; nothing if that may be chance. Rays of objects that have others
+/// as well stay out.
+fn changes_much(
+    model: &mut Model<'_>,
+    rays: &[u32],
+    objects: &[Object],
+    progress: &Progress,
+) -> Result<Option<bool>, Halt> {
+    let is_here = |ray: &u32| rays.binary_search(ray).is_ok();
+    let (whole, partly): (Vec<&Object>, Vec<&Object>) =
+        objects.iter().partition(|object| object.votes.iter().all(is_here));
+    let elsewhere: FxHashSet<u32> = partly.iter().flat_map(|object| &object.votes).copied().collect();
+    let rays: Vec<u32> = rays.iter().copied().filter(|ray| !elsewhere.contains(ray)).collect();
+    let whole: Vec<Object> = whole.into_iter().cloned().collect();
+    let deeper = search(model, &rays, placed(&whole), Depth::Deep, false, &mut Tally::default(), progress)?;
+    Ok(is_changed(&whole, &deeper))
+}
+
+/// Whether many objects of two maps of the same rays are not in both; nothing if that may be chance. One is in both if most of its votes are most
+/// of those of one of the other map.
+fn is_changed(some: &[Object], others: &[Object]) -> Option<bool> {
     let owner: FxHashMap<u32, usize> =
         others.iter().enumerate().flat_map(|(i, object)| object.votes.iter().map(move |&ray| (ray, i))).collect();
     let is_kept = |object: &&Object| {
@@ -217,7 +239,8 @@ fn is_changed(some: &[Object], others: &[Object]) -> bool {
     let kept = some.iter().filter(is_kept).count();
     let count = (some.len() + others.len()).max(1) as f64;
     let chance = (LEAST_CHANGE * (1.0 - LEAST_CHANGE) / count).sqrt();
-    1.0 - 2.0 * kept as f64 / count > LEAST_CHANGE + LEAST_CHANGE_SIGMAS * chance
+    let more = 1.0 - 2.0 * kept as f64 / count - LEAST_CHANGE;
+    (more.abs() > LEAST_CHANGE_SIGMAS * chance).then_some(more > 0.0)
 }
 
 /// Learn the classes of a model from the map of some rays, and return that. Where classes are taken for each other, all competes once more.
@@ -373,9 +396,9 @@ mod tests {
                 })
                 .collect()
         };
-        assert!(!is_changed(&some, &some));
+        assert_eq!(is_changed(&some, &some), Some(false));
         // 24 of 208 are 11.5 %, with a standard deviation of 2.1 %.
-        assert!(!is_changed(&some, &halved(8)));
-        assert!(is_changed(&some, &halved(12)) && is_changed(&halved(12), &some));
+        assert_eq!(is_changed(&some, &halved(8)), None);
+        assert!(is_changed(&some, &halved(12)) == Some(true) && is_changed(&halved(12), &some) == Some(true));
     }
 }

@@ -10,6 +10,7 @@ use super::energy::{NOBODY, Object, by_place, by_side, object, owners, visits};
 use super::index::RayIndex;
 use super::looks::Lookout;
 use super::model::Model;
+use super::repair::MOST_VISITS;
 use super::sample::scramble;
 use crate::progress::{Halt, Progress};
 
@@ -234,14 +235,15 @@ impl Pair<'_> {
         let scene = self.model.scene;
         let is_in = |ray: &u32| images.binary_search(&scene.rays.image[*ray as usize]).is_ok();
         let [a, b] = self.of.map(|object| object.votes.iter().copied().partition::<Vec<u32>, _>(is_in));
-        if a.0.len() + b.0.len() == 0 {
+        // What has no votes left, and what takes all of the other's, are the two as they are.
+        if a.0.len() + b.0.len() == 0 || a.1.len() + b.1.len() == 0 {
             return None;
         }
         let min_votes = self.model.settings.min_votes as usize;
         let mut found = Vec::with_capacity(2);
         for (i, (kept, taken)) in [(&a.1, &b.0), (&b.1, &a.0)].into_iter().enumerate() {
             let mut votes: Vec<u32> = kept.iter().chain(taken).copied().collect();
-            if votes.len() < min_votes {
+            if votes.len() < min_votes || !self.may_take(i, kept, taken) {
                 return None;
             }
             votes.sort_unstable();
@@ -252,8 +254,71 @@ impl Pair<'_> {
         let fits = found.iter().all(|object| object.energy < 0.0 && object.fit.chi2.iter().all(|chi2| *chi2 <= limit));
         fits.then_some(found)
     }
+
+    /// Whether one that keeps some votes may take others: on many visits it stays where it is, so these have to be in its gate there.
+    fn may_take(&self, one: usize, kept: &[u32], taken: &[u32]) -> bool {
+        let stays = visits(self.model.scene, kept).count() > MOST_VISITS;
+        let gate: FxHashSet<u32> = self.claims[one].iter().map(|claim| claim.ray).collect();
+        !stays || taken.iter().all(|ray| gate.contains(ray))
+    }
 }
 
 fn fingerprint(object: &Object) -> u64 {
     object.votes.iter().fold(0, |sum, &ray| scramble(sum ^ u64::from(ray)))
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+    use crate::street;
+
+    #[test]
+    fn what_an_object_of_many_visits_may_not_take_it_could_not_keep() -> Result<(), Halt> {
+        let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
+        let (mut taken, mut refused) = (0, 0);
+        for apart_m in [0.05, 0.1, 0.2, 0.4, 1.0, 2.5] {
+            let first = Vector3::new(30.0, 4.0, 3.0);
+            let both = [first, first + Vector3::y() * apart_m];
+            let drive = |i: usize| street::street(10, 2.0, &both, &errors[7 * i..]);
+            let scene = street::joined((0..MOST_VISITS + 2).map(drive).collect());
+            let mut model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
+            let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+            let rays = scene.usable_rays();
+            let of = |model: &Model<'_>| -> Vec<Object> {
+                let votes = |i: usize| rays.iter().copied().skip(i).step_by(2).collect();
+                (0..2).filter_map(|i| object(model, &lookout, votes(i), both[i], Vec::new())).collect()
+            };
+            let begun = of(&model);
+            super::super::learn::learn(&mut model, &lookout, &rays, &begun);
+            let objects = of(&model);
+            let index = RayIndex::new(&scene, &model.spreads, street::GATE_SIGMAS, rays.iter().copied());
+            let claims = claims_of_all(&model, &index, &objects, &Progress::default())?;
+            let pair = Pair {
+                model: &model,
+                lookout: &lookout,
+                of: [&objects[0], &objects[1]],
+                claims: [&claims[0], &claims[1]],
+            };
+            let visit = |votes: &[u32]| -> [Vec<u32>; 2] {
+                votes.iter().copied().partition::<Vec<u32>, _>(|&ray| scene.view(ray).pass > 0).into()
+            };
+            let [kept, _] = visit(&objects[0].votes);
+            let [_, other] = visit(&objects[1].votes);
+            let mut votes = [kept.clone(), other.clone()].concat();
+            votes.sort_unstable();
+            let after = object(&model, &lookout, votes, first, Vec::new());
+            let limit = street::GATE_SIGMAS.powi(2);
+            let is_kept = after.is_some_and(|after| after.fit.chi2.iter().all(|chi2| *chi2 <= limit));
+            let may = pair.may_take(0, &kept, &other);
+            assert!(may || !is_kept, "{apart_m}");
+            (taken, refused) = (taken + usize::from(may), refused + usize::from(!may));
+            // On few visits it may move to where they are.
+            let few: Vec<u32> = kept.iter().copied().filter(|&ray| scene.view(ray).pass == 1).collect();
+            assert!(pair.may_take(0, &few, &other));
+        }
+        assert!(taken > 0 && refused > 0, "{taken} {refused}");
+        Ok(())
+    }
 }

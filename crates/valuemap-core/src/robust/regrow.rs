@@ -9,11 +9,12 @@ use rustc_hash::FxHashSet;
 
 use super::assign::{gain_alone, places_of};
 use super::births::VOTE_RANGE;
-use super::energy::{NOBODY, Object, object, owners, unseen};
+use super::energy::{NOBODY, Object, object, owners, unseen, visits};
 use super::few::{most_probable, votes_on};
 use super::index::RayIndex;
 use super::looks::Lookout;
 use super::model::Model;
+use super::repair::MOST_VISITS;
 use crate::progress::{Halt, Progress};
 
 /// Times that an object gathers rays of no other and is estimated again, at most.
@@ -31,21 +32,24 @@ struct Birth {
     others: Vec<(usize, Option<Object>)>,
 }
 
-/// Let objects be born of rays that no object has; whether any was. `index` has all rays.
+/// Let objects be born of rays that no object has and votes that others lose; whether any was. Objects of many visits lose none.
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
 pub fn regrow(
     model: &Model<'_>,
     lookout: &Lookout,
-    index: &RayIndex<'_>,
     rays: &[u32],
     objects: Vec<Object>,
     progress: &Progress,
 ) -> Result<(Vec<Object>, bool), Halt> {
     let owner = owners(model.scene, &objects);
-    let garden = Garden { model, lookout, index, objects: &objects, owner: &owner };
+    let of_few = open_to_others(model, &objects);
     let free: Vec<u32> = rays.iter().copied().filter(|&ray| owner[ray as usize] == NOBODY).collect();
+    let index_of =
+        |rays: &[u32]| RayIndex::new(model.scene, &model.spreads, model.settings.gate_sigmas, rays.iter().copied());
+    let garden =
+        Garden { model, lookout, free: &index_of(&free), of_few: &index_of(&of_few), objects: &objects, owner: &owner };
     let try_one = |&ray: &u32| {
         progress.check()?;
         Ok(garden.birth_on(ray))
@@ -73,10 +77,19 @@ pub fn regrow(
     Ok((objects, any))
 }
 
+/// The votes of objects of few visits: rays of two objects do not meet in one place on many.
+fn open_to_others(model: &Model<'_>, objects: &[Object]) -> Vec<u32> {
+    let is_of_few = |object: &&Object| visits(model.scene, &object.votes).count() <= MOST_VISITS;
+    objects.iter().filter(is_of_few).flat_map(|object| object.votes.iter().copied()).collect()
+}
+
 struct Garden<'a> {
     model: &'a Model<'a>,
     lookout: &'a Lookout,
-    index: &'a RayIndex<'a>,
+    /// The rays of no object.
+    free: &'a RayIndex<'a>,
+    /// The votes of the objects of few visits.
+    of_few: &'a RayIndex<'a>,
     objects: &'a [Object],
     /// The object of each ray.
     owner: &'a [u32],
@@ -87,10 +100,12 @@ impl Garden<'_> {
     fn birth_on(&self, ray: u32) -> Option<Birth> {
         let Self { model, lookout, .. } = *self;
         let class = model.class_of(ray);
-        let is_free = |ray: u32| self.owner[ray as usize] == NOBODY;
         let mut born = unseen(model, vec![ray], most_probable(model, ray, class)?)?;
+        if self.takes(&born).is_empty() {
+            return None;
+        }
         for _ in 0..ROUNDS {
-            let (votes, _) = votes_on(model, self.index, &born, ray, &is_free);
+            let (votes, _) = votes_on(model, self.free, &born, ray, &|_| true);
             if votes == born.votes {
                 break;
             }
@@ -121,7 +136,7 @@ impl Garden<'_> {
                 birth.push((other, left));
             }
         }
-        let is_one = born.votes.len() >= model.settings.min_votes as usize && born.energy < 0.0;
+        let is_one = born.votes.len() >= model.settings.min_votes as usize && born.energy < 0.0 && !birth.is_empty();
         (is_one && change < -LEAST_FALL).then_some(Birth { change, born, others: birth })
     }
 
@@ -132,10 +147,10 @@ impl Garden<'_> {
         let images: Vec<u32> = born.votes.iter().map(|&ray| image(ray)).collect();
         let may_be = |said| model.confusions.may_be(born.class, said);
         let range_m = model.settings.viability.max_range_m * VOTE_RANGE;
-        let hits = self.index.hits_of_any(&places_of(model, born), &may_be, range_m);
+        let hits = self.of_few.hits_of_any(&places_of(model, born), &may_be, range_m);
         let mut takes: Vec<(u32, f64)> = hits
             .into_iter()
-            .filter(|hit| self.owner[hit.ray as usize] != NOBODY && !images.contains(&hit.image))
+            .filter(|hit| !images.contains(&hit.image))
             .map(|hit| (hit.ray, gain_alone(model, born, hit.ray)))
             .filter(|(_, gain)| *gain > 0.0)
             .collect();
@@ -156,5 +171,27 @@ impl Garden<'_> {
         let left = left.filter(|left| left.energy < 0.0);
         let energy = left.as_ref().map_or(0.0, |left| left.energy);
         (left, energy - old.energy)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+    use crate::street;
+
+    #[test]
+    fn objects_of_many_visits_lose_no_votes() {
+        let at = Vector3::new(30.0, 4.0, 3.0);
+        let drive = || street::street(5, 2.0, &[at], &[[0.4, -0.3], [-0.2, 0.5], [0.1, 0.2]]);
+        for (drives, is_open) in [(MOST_VISITS, true), (MOST_VISITS + 1, false)] {
+            let scene = street::joined((0..drives).map(|_| drive()).collect());
+            let model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
+            let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+            let one = object(&model, &lookout, scene.usable_rays(), at, Vec::new());
+            let open = open_to_others(&model, &one.into_iter().collect::<Vec<Object>>());
+            assert_eq!(open, if is_open { scene.usable_rays() } else { Vec::new() });
+        }
     }
 }

@@ -33,7 +33,7 @@ const CANDIDATES: usize = 4;
 /// Times that a hypothesis is estimated on what votes for it.
 const POLISHINGS: usize = 4;
 /// Objects of more visits are not tried in parts: rays of two objects do not meet in one place on so many.
-const MOST_VISITS: usize = 6;
+pub const MOST_VISITS: usize = 6;
 /// Votes are of one side if their directions differ by less than 30 degrees (cosine).
 const SIDE_COSINE: f64 = 0.866;
 /// The gate of these votes, as a share of the gate of all.

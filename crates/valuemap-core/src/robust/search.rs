@@ -86,7 +86,7 @@ pub fn search(
             any |= !born.is_empty();
             objects.extend(born);
             // What is left of objects that lost votes to others.
-            let (regrown, better) = regrow(model, &lookout, &index, rays, objects, progress)?;
+            let (regrown, better) = regrow(model, &lookout, rays, objects, progress)?;
             any |= better;
             objects = regrown;
             progress.advance()?;
