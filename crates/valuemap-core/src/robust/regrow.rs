@@ -101,9 +101,6 @@ impl Garden<'_> {
         let Self { model, lookout, .. } = *self;
         let class = model.class_of(ray);
         let mut born = unseen(model, vec![ray], most_probable(model, ray, class)?)?;
-        if self.takes(&born).is_empty() {
-            return None;
-        }
         for _ in 0..ROUNDS {
             let (votes, _) = votes_on(model, self.free, &born, ray, &|_| true);
             if votes == born.votes {
@@ -136,7 +133,7 @@ impl Garden<'_> {
                 birth.push((other, left));
             }
         }
-        let is_one = born.votes.len() >= model.settings.min_votes as usize && born.energy < 0.0 && !birth.is_empty();
+        let is_one = born.votes.len() >= model.settings.min_votes as usize && born.energy < 0.0;
         (is_one && change < -LEAST_FALL).then_some(Birth { change, born, others: birth })
     }
 
