@@ -51,7 +51,7 @@ use std::sync::Arc;
 use crate::hypothesis::Viability;
 use crate::progress::{Halt, Progress};
 
-use calibrate::Known;
+use calibrate::{Known, Placed};
 use confusion::Confusions;
 use energy::{Object, object};
 use estimate::Estimate;
@@ -200,29 +200,36 @@ pub fn self_calibrate(
     let is_deep = is_small || {
         // A part of the places says it, unless it is a near thing.
         let some = sample::places(scene, CLASS_RAYS / SOME_OF_PLACES, WIDE * settings.viability.max_range_m);
-        changes_much(&mut model, &some, &objects, progress)?.unwrap_or(true)
-            && changes_much(&mut model, &wide, &objects, progress)?.is_some_and(|changes| changes)
+        let mut changes = |rays: &[u32]| changes_much(&mut model, rays, &objects, progress);
+        match changes(&some)? {
+            None if some.len() < wide.len() => changes(&wide)?.unwrap_or(false),
+            of_some => of_some.unwrap_or(false),
+        }
     };
     let classes = model.classes.iter().copied().map(Some).collect();
     Ok(Calibration { noise, classes, pooled: model.pooled, confusions: model.confusions, is_deep, starts })
 }
 
-/// Whether all moves change many objects of some rays (ascending) whose map is known; nothing if that may be chance. Rays of objects that have others
-/// as well stay out.
+/// Whether all moves change many objects of some places (their rays, ascending) of which the map is known; nothing if that may be chance. Rays of
+/// objects that have others as well stay out, and so do drives where there are many.
 fn changes_much(
     model: &mut Model<'_>,
     rays: &[u32],
     objects: &[Object],
     progress: &Progress,
 ) -> Result<Option<bool>, Halt> {
-    let is_here = |ray: &u32| rays.binary_search(ray).is_ok();
-    let (whole, partly): (Vec<&Object>, Vec<&Object>) =
-        objects.iter().partition(|object| object.votes.iter().all(is_here));
+    let is_whole = |object: &&Object| object.votes.iter().all(|ray| rays.binary_search(ray).is_ok());
+    let (whole, partly): (Vec<&Object>, Vec<&Object>) = objects.iter().partition(is_whole);
     let elsewhere: FxHashSet<u32> = partly.iter().flat_map(|object| &object.votes).copied().collect();
-    let rays: Vec<u32> = rays.iter().copied().filter(|ray| !elsewhere.contains(ray)).collect();
-    let whole: Vec<Object> = whole.into_iter().cloned().collect();
-    let deeper = search(model, &rays, placed(&whole), Depth::Deep, false, &mut Tally::default(), progress)?;
-    Ok(is_changed(&whole, &deeper))
+    let left = rays.iter().copied().filter(|ray| !elsewhere.contains(ray)).collect();
+    let rays = sample::passes(model.scene, left, CLASS_RAYS);
+    let votes_here =
+        |object: &Object| object.votes.iter().copied().filter(|ray| rays.binary_search(ray).is_ok()).collect();
+    let begun = whole.iter().map(|object| (votes_here(object), object.fit.point));
+    let begun = begun.filter(|(votes, _): &Placed| votes.len() >= model.settings.min_votes as usize).collect();
+    let shallow = search(model, &rays, begun, Depth::Shallow, false, &mut Tally::default(), progress)?;
+    let deeper = search(model, &rays, placed(&shallow), Depth::Deep, false, &mut Tally::default(), progress)?;
+    Ok(is_changed(&shallow, &deeper))
 }
 
 /// Whether many objects of two maps of the same rays are not in both; nothing if that may be chance. One is in both if most of its votes are most
@@ -334,7 +341,7 @@ pub fn spreads_of(scene: &Scene, noise: &Noise) -> Vec<Spread> {
 }
 
 /// Votes and positions of objects.
-fn placed(objects: &[Object]) -> Vec<calibrate::Placed> {
+fn placed(objects: &[Object]) -> Vec<Placed> {
     objects.iter().map(|object| (object.votes.clone(), object.fit.point)).collect()
 }
 
@@ -346,7 +353,7 @@ pub fn objects_of(
     scene: &Scene,
     noise: &Noise,
     settings: &Settings,
-    begun: Vec<calibrate::Placed>,
+    begun: Vec<Placed>,
     is_searched: bool,
     progress: &Progress,
 ) -> Result<Vec<Object>, Halt> {

@@ -173,23 +173,26 @@ struct Pair<'a> {
 }
 
 impl Pair<'_> {
-    /// What lowers J most, and by how much.
+    /// Both as one, if that lowers J; else the exchange that lowers it most. And by how much.
     fn best(&self) -> Option<(f64, Vec<Object>)> {
         let before: f64 = self.of.iter().map(|object| object.energy).sum();
-        let mut best: Option<(f64, Vec<Object>)> = None;
-        let mut consider = |found: Option<Vec<Object>>| {
-            if let Some(found) = found {
-                let change = found.iter().map(|object| object.energy).sum::<f64>() - before;
-                if change < best.as_ref().map_or(-LEAST_FALL, |best| best.0) {
-                    best = Some((change, found));
-                }
-            }
+        let better = |found: Vec<Object>| {
+            let change = found.iter().map(|object| object.energy).sum::<f64>() - before;
+            (change < -LEAST_FALL).then_some((change, found))
         };
-        consider(self.merged().map(|object| vec![object]));
-        for part in self.parts() {
-            consider(self.exchanged(&part));
+        if let Some(merged) = self.merged().and_then(|object| better(vec![object])) {
+            return Some(merged);
         }
-        best
+        let try_part = |part: &Vec<u32>| Some((self.exchanged(part).and_then(better)?, part.clone()));
+        let (mut found, parts): (Vec<_>, Vec<Vec<u32>>) = self.parts().iter().filter_map(try_part).unzip();
+        // What helps on one visit each, helps most on all of them.
+        if parts.len() > 1 {
+            let mut images = parts.concat();
+            images.sort_unstable();
+            images.dedup();
+            found.extend(self.exchanged(&images).and_then(better));
+        }
+        found.into_iter().reduce(|best, found| if found.0 < best.0 { found } else { best })
     }
 
     /// Both as one.

@@ -8,7 +8,7 @@ use std::cmp::Reverse;
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
-use rustc_hash::FxHashMap;
+use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::scene::Scene;
 
@@ -121,6 +121,30 @@ pub fn places(scene: &Scene, rays: usize, radius_m: f64) -> Vec<u32> {
     usable.into_iter().filter(|&ray| taken[image_of(ray)]).collect()
 }
 
+/// Those of some rays (ascending) that are of whole passes, chosen at random, together about as many as asked for.
+#[must_use]
+pub fn passes(scene: &Scene, rays: Vec<u32>, most: usize) -> Vec<u32> {
+    if rays.len() <= most {
+        return rays;
+    }
+    let mut count: FxHashMap<u32, usize> = FxHashMap::default();
+    for &ray in &rays {
+        *count.entry(scene.view(ray).pass).or_default() += 1;
+    }
+    let mut order: Vec<(u64, u32)> = count.keys().map(|&pass| (scramble(u64::from(pass)), pass)).collect();
+    order.sort_unstable();
+    let mut found = 0;
+    let mut taken: FxHashSet<u32> = FxHashSet::default();
+    for (_, pass) in order {
+        if found >= most {
+            break;
+        }
+        found += count[&pass];
+        taken.insert(pass);
+    }
+    rays.into_iter().filter(|&ray| taken.contains(&scene.view(ray).pass)).collect()
+}
+
 /// Images by the cube that they were taken in.
 fn by_cell(centers: &[Vector3<f64>], images: impl Iterator<Item = u32>, side_m: f64) -> FxHashMap<[i64; 3], Vec<u32>> {
     let mut cells: FxHashMap<[i64; 3], Vec<u32>> = FxHashMap::default();
@@ -150,4 +174,27 @@ pub fn scramble(number: u64) -> u64 {
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
     z ^ (z >> 31)
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+    use crate::street;
+
+    #[test]
+    fn of_many_drives_some_are_taken_whole() {
+        let at = Vector3::new(30.0, 4.0, 3.0);
+        let drive = || street::street(5, 2.0, &[at], &[[0.0, 0.0]]);
+        let scene = street::joined((0..20).map(|_| drive()).collect());
+        let all = scene.usable_rays();
+        assert_eq!(passes(&scene, all.clone(), all.len()), all);
+        let some = passes(&scene, all.clone(), 22);
+        // Five drives of five rays are the first that are enough.
+        assert_eq!(some.len(), 25);
+        assert!(some.is_sorted());
+        let of = |pass: u32| some.iter().filter(|&&ray| scene.view(ray).pass == pass).count();
+        assert!((0..20).all(|pass| of(pass) == 0 || of(pass) == 5));
+    }
 }

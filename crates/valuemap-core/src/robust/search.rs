@@ -85,10 +85,12 @@ pub fn search(
             tally.births += born.len() as u64;
             any |= !born.is_empty();
             objects.extend(born);
-            // What is left of objects that lost votes to others.
-            let (regrown, better) = regrow(model, &lookout, rays, objects, progress)?;
-            any |= better;
-            objects = regrown;
+            // What is left of objects that lost votes to others, once nothing else helps: all rays that are left over are tried.
+            if !any || round + 1 == rounds {
+                let (regrown, better) = regrow(model, &lookout, rays, objects, progress)?;
+                any |= better;
+                objects = regrown;
+            }
             progress.advance()?;
         }
         if !any {
