@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from block import block
-from camera_models import measure
+from camera_models import cameras_like, distances_m, measure, seen_through
 from small_dataset import small_dataset
 from valuemap.cameras import (
     Rays,
@@ -22,6 +22,7 @@ from valuemap.cameras import (
     rotation_matrices,
 )
 from valuemap.dataset import Dataset, Frame
+from valuemap.simulate import PRESETS, simulate
 from valuemap.tables import Cameras, Categories, Detections, Floats, Images
 
 WIDTH, HEIGHT = 800, 600
@@ -289,6 +290,13 @@ def test_a_city_is_mapped_as_well_through_any_camera() -> None:
     assert found["pinhole"] >= 0.9 * result["pinhole"]["objects"]
     assert all(abs(other - found["pinhole"]) <= 1 for other in found.values()), found
     assert result["largest_difference"]["rms_m"] < 0.15, result
+
+
+def test_of_a_panorama_the_side_that_is_never_searched_is_not_looked_at() -> None:
+    """Boxes of pinholes put into panoramas: what is aside or behind has no box, and is as real. Else 26 are found."""
+    city = simulate(PRESETS["small"], seed=0, name="ahead")
+    found, objects, _ = distances_m(seen_through(city, *cameras_like(city)["equirectangular"]))
+    assert len(found) >= objects - 1
 
 
 def test_centers_and_directions_are_those_of_the_rotations() -> None:

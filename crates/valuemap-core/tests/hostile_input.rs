@@ -183,8 +183,9 @@ impl Columns {
         let frustum = |(i, &solid_angle_sr): (usize, &f64)| Frustum {
             normals: if i == 0 { self.normals.iter().map(|&n| n.into()).collect() } else { Vec::new() },
             solid_angle_sr,
+            blind: None,
         };
-        Scene {
+        let mut scene = Scene {
             scale2: rays.iter().map(Ray::pixels_per_unit2).collect(),
             rays: Arc::new(Rays { rays, image: self.image.clone(), class: self.class.clone() }),
             box_px: self.box_px.clone(),
@@ -193,7 +194,9 @@ impl Columns {
             range_sigma_m: self.range_sigma_m.clone(),
             views: (0..self.center.len()).map(view).collect(),
             frusta: self.solid_angle_sr.iter().enumerate().map(frustum).collect(),
-        }
+        };
+        scene.find_blind_sides();
+        scene
     }
 }
 

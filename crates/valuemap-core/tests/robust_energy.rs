@@ -320,7 +320,7 @@ proptest! {
         prop_assume!(count >= 12);
         let kept: Vec<u32> = (0..count as u32).filter(|ray| ray % 3 == 0 || *ray + 1 == count as u32).collect();
         let mut scene = only(&whole, &kept);
-        let away = Frustum { normals: vec![-Vector3::z()], solid_angle_sr: scene.frusta[0].solid_angle_sr };
+        let away = Frustum { normals: vec![-Vector3::z()], ..scene.frusta[0].clone() };
         scene.frusta.push(away);
         let seen: BTreeSet<u32> = scene.rays.image.iter().copied().collect();
         let votes: Vec<u32> = (0..kept.len() as u32).collect();

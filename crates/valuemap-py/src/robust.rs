@@ -109,9 +109,10 @@ impl Scene {
             .map(|(normals, &solid_angle_sr)| Frustum {
                 normals: normals.iter().filter(|n| n[0].is_finite()).map(|&n| n.into()).collect(),
                 solid_angle_sr,
+                blind: None,
             })
             .collect();
-        Ok(Self(CoreScene {
+        let mut scene = CoreScene {
             scale2: rays.core().rays.iter().map(valuemap_core::ray::Ray::pixels_per_unit2).collect(),
             rays: Arc::clone(rays.core()),
             box_px: box_px.to_vec(),
@@ -120,7 +121,9 @@ impl Scene {
             range_sigma_m: range_sigma_m.to_vec(),
             views,
             frusta,
-        }))
+        };
+        scene.find_blind_sides();
+        Ok(Self(scene))
     }
 }
 

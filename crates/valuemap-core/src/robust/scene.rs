@@ -1,5 +1,6 @@
 //! What the robust method knows: rays with their boxes, and all images, also those without detections.
 
+use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
 
 use nalgebra::{Matrix3, Vector3};
@@ -56,7 +57,22 @@ pub struct Frustum {
     pub normals: Vec<Vector3<f64>>,
     /// How much of the sphere it covers, sr.
     pub solid_angle_sr: f64,
+    /// Where a camera that sees all around detects nothing, if anywhere.
+    pub blind: Option<BlindSide>,
 }
+
+/// Directions from a camera in which nothing is ever detected: of panoramas often a part alone is searched.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct BlindSide {
+    /// Its middle, rad: about the vertical axis of the camera, 0 ahead and positive to the right.
+    pub middle_rad: f64,
+    /// Half of its width, rad.
+    pub half_width_rad: f64,
+}
+
+/// A gap between detections is a blind side if so many would be in it were they as many everywhere: even where they are twenty times as rare as
+/// elsewhere, one gap in 150 would be as empty by chance.
+const ENOUGH_FOR_BLIND: f64 = 100.0;
 
 impl Scene {
     /// The median of a number that views state, if most of them do.
@@ -97,6 +113,80 @@ impl Scene {
     #[must_use]
     pub fn is_in_picture(&self, view: &View, point: &Vector3<f64>) -> bool {
         let in_camera = view.cam_from_world * (point - view.center);
-        self.frusta[view.camera as usize].normals.iter().all(|normal| normal.dot(&in_camera) >= 0.0)
+        let frustum = &self.frusta[view.camera as usize];
+        frustum.normals.iter().all(|normal| normal.dot(&in_camera) >= 0.0)
+            && frustum.blind.is_none_or(|blind| !blind.covers(azimuth_rad(&in_camera)))
+    }
+
+    /// Find where cameras that see all around detect nothing: the widest gap between detections, if it is no chance.
+    pub fn find_blind_sides(&mut self) {
+        let mut azimuths: Vec<Vec<f64>> = vec![Vec::new(); self.frusta.len()];
+        for ray in self.usable_rays() {
+            let view = self.view(ray);
+            azimuths[view.camera as usize].push(azimuth_rad(&(view.cam_from_world * self.ray(ray).direction)));
+        }
+        for (frustum, azimuths) in self.frusta.iter_mut().zip(azimuths) {
+            frustum.blind = if frustum.normals.is_empty() { BlindSide::of(azimuths) } else { None };
+        }
+    }
+}
+
+/// The direction of a point in camera axes about the vertical axis, rad.
+fn azimuth_rad(in_camera: &Vector3<f64>) -> f64 {
+    in_camera.x.atan2(in_camera.z)
+}
+
+impl BlindSide {
+    /// The widest gap between some azimuths, rad, if it is no chance.
+    fn of(mut azimuths_rad: Vec<f64>) -> Option<Self> {
+        azimuths_rad.sort_by(f64::total_cmp);
+        let (first, last) = (*azimuths_rad.first()?, *azimuths_rad.last()?);
+        let gaps = azimuths_rad.windows(2).map(|pair| (pair[1] - pair[0], pair[0]));
+        let (width, begin) = gaps.fold((first + TAU - last, last), |a, b| if b.0 > a.0 { b } else { a });
+        let expected = width / TAU * azimuths_rad.len() as f64;
+        let side = Self { middle_rad: begin + 0.5 * width, half_width_rad: 0.5 * width };
+        (expected >= ENOUGH_FOR_BLIND).then_some(side)
+    }
+
+    fn covers(&self, azimuth_rad: f64) -> bool {
+        let away = (azimuth_rad - self.middle_rad + PI).rem_euclid(TAU) - PI;
+        away.abs() < self.half_width_rad
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::street;
+
+    #[test]
+    fn the_side_on_which_nothing_is_detected_is_not_looked_at() {
+        // To the right of a drive along x, from 12 degrees ahead to 12 degrees behind it.
+        let objects: Vec<Vector3<f64>> = (0..60).map(|i| Vector3::new(2.0 * f64::from(i), -5.0, 3.0)).collect();
+        let mut scene = street::street(60, 2.0, &objects, &[[0.0, 0.0]]);
+        let (ahead, right, left) = (Vector3::x() * 40.0, Vector3::y() * -10.0, Vector3::y() * 10.0);
+        let sees =
+            |scene: &Scene, to: &Vector3<f64>| scene.is_in_picture(&scene.views[0], &(scene.views[0].center + to));
+        scene.find_blind_sides();
+        assert!(scene.frusta[0].blind.is_some());
+        assert!(!sees(&scene, &left) && !sees(&scene, &-ahead));
+        assert!(sees(&scene, &(ahead + right)));
+        // A camera with bounds has no other side, and few detections tell none.
+        scene.frusta[0].normals = vec![Vector3::z()];
+        scene.find_blind_sides();
+        assert!(scene.frusta[0].blind.is_none());
+        let mut few = street::street(6, 2.0, &objects[..3], &[[0.0, 0.0]]);
+        few.find_blind_sides();
+        assert!(few.frusta[0].blind.is_none() && sees(&few, &left));
+    }
+
+    #[test]
+    fn a_gap_may_lie_behind() {
+        let ahead: Vec<f64> = (0..400).map(|i| -1.0 + 0.005 * f64::from(i)).collect();
+        let blind = BlindSide::of(ahead).unwrap_or(BlindSide { middle_rad: 0.0, half_width_rad: 0.0 });
+        assert!(blind.covers(PI) && blind.covers(-PI) && blind.covers(1.1) && blind.covers(-1.1));
+        assert!(!blind.covers(0.9) && !blind.covers(-0.9));
+        assert_eq!(BlindSide::of((0..400).map(|i| -PI + TAU * f64::from(i) / 400.0).collect()), None);
+        assert_eq!(BlindSide::of(Vec::new()), None);
     }
 }

@@ -80,7 +80,7 @@ pub fn street(images: usize, spacing_m: f64, objects: &[Vector3<f64>], errors_px
         range_m: vec![f64::NAN; count],
         range_sigma_m: vec![f64::NAN; count],
         views: (0..).zip(&centers).map(view).collect(),
-        frusta: vec![Frustum { normals: Vec::new(), solid_angle_sr: 12.0 }],
+        frusta: vec![Frustum { solid_angle_sr: 12.0, ..Frustum::default() }],
         rays: Arc::new(rays),
     }
 }
