@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from check_faults import FAULTS as INJECTED
 from check_faults import good_city
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check import examine
+from valuemap.check import examine, lenses
 from valuemap.check.agreement import Agreement, compare, gains_of_objects, measure_agreement
 from valuemap.check.cameras import PARAMETERS, _Correction, _followed, _is_wider_gate_only, with_focal
 from valuemap.check.contest import _compare, _joined, _Reading, _suspicion, hold_contest
@@ -405,3 +405,18 @@ def test_the_command_reads_boxes_that_others_refuse_and_spares_what_is_given(goo
     run = CliRunner().invoke(app, ["check", str(tmp_path / "given"), "--fix", str(tmp_path / "given")])
     assert run.exit_code != 0
     assert (tmp_path / "given" / "detections.parquet").is_file()
+
+
+@pytest.mark.parametrize(("rise", "is_named"), [(0.2, False), (1.0, True)])
+def test_a_lens_is_named_only_where_it_changes_a_map(
+    view: View, rise: float, is_named: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of many places a rise is sure however small: errors of poses are fewer pixels where pictures are narrower."""
+    random = np.random.default_rng(0)
+
+    def gains(_: View, version: Dataset) -> Floats:
+        return 100.0 + (0.0 if version is view.dataset else rise) + random.normal(0.0, 0.3, 200)
+
+    monkeypatch.setattr(lenses, "gains_of_all", gains)
+    found = lenses.LensModel().find(view)
+    assert (found is not None) == is_named

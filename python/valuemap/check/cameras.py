@@ -16,6 +16,7 @@ from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.agreement import Comparison, compare, measure_agreement
 from valuemap.check.fault import (
     LEAST_CHANCE,
+    LEAST_RISE,
     Fault,
     Finding,
     Stage,
@@ -32,9 +33,6 @@ from valuemap.check.sample import pixels_per_radian
 from valuemap.dataset import Dataset
 from valuemap.tables import Cameras, Floats
 
-_LEAST_RISE = 0.02
-"""Passes have errors of their own, which few passes do not average out: what costs less than one part in fifty of the
-agreement is within them, and changes no map."""
 _MOST_DOUBLINGS, _MOST_STEPS = 6, 12
 """Of a search that ends by itself as soon as the agreement falls: of turns it need not."""
 
@@ -143,7 +141,7 @@ def _find_correction(view: View) -> _Correction | None:
         value, sigma, gains = _better(view, parameter, value, sigma, gains)
         comparison = compare(gains, given)
         chance = max(chance, comparison.chance * tests * 2)  # Of each parameter two values are tried.
-        if chance > LEAST_CHANCE or comparison.difference < _LEAST_RISE * float(given.sum()):
+        if chance > LEAST_CHANCE or comparison.difference < LEAST_RISE * float(given.sum()):
             continue
         if name == "log_focal" and _is_wider_gate_only(view, given, parameter.change(view.dataset, value)):
             continue
@@ -158,7 +156,7 @@ def _is_wider_gate_only(view: View, given: Floats, dataset: Dataset) -> bool:
     Errors of poses are angles: pictures said to be six times as wide make them a sixth of the pixels.
     """
     at_one_angle = float(gains_of_all(view, dataset, is_gate_an_angle=True).sum())
-    return at_one_angle < (1.0 - _LEAST_RISE) * float(given.sum())
+    return at_one_angle < (1.0 - LEAST_RISE) * float(given.sum())
 
 
 class _CommonError(Fault):

@@ -33,6 +33,9 @@ GATE_RAD = 0.012
 WIDER_GATE = 4.0
 """Detections of heat maps or panoramas with compass headings may be off by degrees."""
 _MANY_DETECTIONS = 8000
+LEAST_RISE = 0.02
+"""Passes have errors of their own, which few passes do not average out: what costs less than one part in fifty of the
+agreement is within them, and changes no map."""
 LEAST_CHANCE = 1e-3
 """A finding that good data would give with a probability above this, all that was tried counted, is none."""
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from valuemap.check.agreement import compare
-from valuemap.check.fault import LEAST_CHANCE, Convention, Fault, Finding, Fix, Stage, View, gains_of_all
+from valuemap.check.fault import LEAST_CHANCE, LEAST_RISE, Convention, Fault, Finding, Fix, Stage, View, gains_of_all
 from valuemap.dataset import Dataset
 from valuemap.tables import Cameras, Categories, Floats
 
@@ -22,6 +22,9 @@ _SHORT = 0.2
 _FILM_MM = 36.0
 _OFF_MIDDLE = 0.05
 """Principal points are nearer to the middle than this share of the picture, or were mistaken for something else."""
+_AT_BORDERS = 0.2
+"""The share of the agreement that a lens has a say in: of simulated `nyc` so many boxes are in the outer half of the
+picture, by width or height."""
 
 
 class FocalUnit(Convention):
@@ -81,7 +84,9 @@ class LensModel(Fault):
         best: tuple[str, Fix, Floats] | None = None
         for how, fix in readings:
             gain = gains_of_all(view, fix(view.dataset))
-            if compare(gain, given).chance * len(readings) > LEAST_CHANCE:
+            comparison = compare(gain, given)
+            rises = comparison.difference >= _AT_BORDERS * LEAST_RISE * float(given.sum())
+            if comparison.chance * len(readings) > LEAST_CHANCE or not rises:
                 continue
             if best is None or compare(gain, best[2]).chance < LEAST_CHANCE:
                 best = how, fix, gain
