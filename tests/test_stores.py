@@ -87,7 +87,7 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 def quickly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let runs say often that they live, and not be waited for long."""
     monkeypatch.setattr(work, "_BEAT_S", 0.05)
-    monkeypatch.setattr(work, "_WAIT_S", 0.6)
+    monkeypatch.setattr(work, "_WAIT_S", 3.0)
 
 
 def run(street: Path, out: Path, *options: str) -> tuple[int, str]:
@@ -175,7 +175,7 @@ def test_a_second_run_is_refused_while_the_first_lives_and_takes_over_when_it_do
         refused = pytest.raises(OutputError, match="another run is at work here")
         with refused, open_store(place, resume=False, tell=told.append):
             pass
-        assert told == [f"{place}: another run is, or was, at work here: waiting 0.6 s for a sign of life"]
+        assert told == [f"{place}: another run is, or was, at work here: waiting 3 s for a sign of life"]
         assert (place / "cells" / "a").read_bytes() == b"1"
     # One that was killed says nothing more.
     (place / "living-killed").write_bytes(b"7")
