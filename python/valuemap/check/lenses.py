@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from valuemap.check.agreement import compare
+from valuemap.check.agreement import Comparison, compare
 from valuemap.check.fault import LEAST_CHANCE, LEAST_RISE, Convention, Fault, Finding, Fix, Stage, View, gains_of_all
 from valuemap.dataset import Dataset
 from valuemap.tables import Cameras, Categories, Floats
@@ -81,7 +81,7 @@ class LensModel(Fault):
         if not readings:
             return None
         given = gains_of_all(view, view.dataset)
-        best: tuple[str, Fix, Floats] | None = None
+        best: tuple[str, Fix, Floats, Comparison] | None = None
         for how, fix in readings:
             gain = gains_of_all(view, fix(view.dataset))
             comparison = compare(gain, given)
@@ -89,19 +89,19 @@ class LensModel(Fault):
             if comparison.chance * len(readings) > LEAST_CHANCE or not rises:
                 continue
             if best is None or compare(gain, best[2]).chance < LEAST_CHANCE:
-                best = how, fix, gain
+                best = how, fix, gain, comparison
         if best is None:
             return None
-        comparison = compare(best[2], given)
+        how, fix, _, comparison = best
         return Finding(
             fault=self.name,
             what="The cameras have another lens than the pictures were taken with.",
-            why=f"Read as {best[0]}, the agreement of rays rises by {comparison.difference:.0f} "
+            why=f"Read as {how}, the agreement of rays rises by {comparison.difference:.0f} "
             f"({comparison.places} places).",
             do="Of undistorted pictures give PINHOLE with their own fx fy cx cy; else the model of the lens.",
             chance=comparison.chance * len(readings),
-            figures={"reading": best[0], **comparison.to_json()},
-            fix=best[1],
+            figures={"reading": how, **comparison.to_json()},
+            fix=fix,
         )
 
 

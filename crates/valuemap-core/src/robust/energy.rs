@@ -248,6 +248,9 @@ pub(super) fn by_side(looks: impl Iterator<Item = (u32, Vector3<f64>)>, least_co
     sides.into_iter().map(|(_, side)| side).collect()
 }
 
+/// A move that lowers J by less is not committed: less is rounding.
+pub(super) const LEAST_GAIN_OF_MOVE: f64 = 1e-6;
+
 /// The owner of a ray that no object has.
 pub(super) const NOBODY: u32 = u32::MAX;
 

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::assign::{Claim, claims_of_all, gain_alone, images_of};
-use super::energy::{NOBODY, Object, by_place, by_side, object, owners, visits};
+use super::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, by_place, by_side, object, owners, visits};
 use super::index::RayIndex;
 use super::looks::Lookout;
 use super::model::Model;
@@ -23,8 +23,6 @@ const SIDE_COSINE: f64 = 0.906;
 /// Two objects of a class are no nearer to each other than this share of their size: things are solid, and boxes show their middle to
 /// within a fraction of their size.
 const EXCLUSIVE_SHARE: f64 = 0.25;
-/// J that falls by less stays as it is.
-const LEAST_FALL: f64 = 1e-6;
 
 /// Pairs that were tried in vain, by their votes.
 #[derive(Default)]
@@ -178,7 +176,7 @@ impl Pair<'_> {
         let before: f64 = self.of.iter().map(|object| object.energy).sum();
         let better = |found: Vec<Object>| {
             let change = found.iter().map(|object| object.energy).sum::<f64>() - before;
-            (change < -LEAST_FALL).then_some((change, found))
+            (change < -LEAST_GAIN_OF_MOVE).then_some((change, found))
         };
         if let Some(merged) = self.merged().and_then(|object| better(vec![object])) {
             return Some(merged);
@@ -260,9 +258,11 @@ impl Pair<'_> {
 
     /// Whether one that keeps some votes may take others: on many visits it stays where it is, so these have to be in its gate there.
     fn may_take(&self, one: usize, kept: &[u32], taken: &[u32]) -> bool {
-        let stays = visits(self.model.scene, kept).count() > MOST_VISITS;
+        if taken.is_empty() || visits(self.model.scene, kept).count() <= MOST_VISITS {
+            return true;
+        }
         let gate: FxHashSet<u32> = self.claims[one].iter().map(|claim| claim.ray).collect();
-        !stays || taken.iter().all(|ray| gate.contains(ray))
+        taken.iter().all(|ray| gate.contains(ray))
     }
 }
 

@@ -9,7 +9,7 @@ use rustc_hash::FxHashSet;
 
 use super::assign::{gain_alone, places_of};
 use super::births::VOTE_RANGE;
-use super::energy::{NOBODY, Object, object, owners, unseen, visits};
+use super::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, object, owners, unseen, visits};
 use super::few::{most_probable, votes_on};
 use super::index::RayIndex;
 use super::looks::Lookout;
@@ -21,8 +21,6 @@ use crate::progress::{Halt, Progress};
 const ROUNDS: usize = 3;
 /// Votes of others that it tries to take, at most: those that it explains best.
 const MOST_TAKEN: usize = 8;
-/// J that falls by less stays as it is.
-const LEAST_FALL: f64 = 1e-6;
 
 /// An object that may be born, and what becomes of those whose votes it takes.
 struct Birth {
@@ -114,7 +112,9 @@ impl Garden<'_> {
         let taken = self.takes(&born);
         // Each is worth no more to it than it would be at its best.
         let at_most: f64 = taken.iter().map(|(_, gain)| gain).sum();
-        if born.votes.len() + taken.len() < model.settings.min_votes as usize || change - 2.0 * at_most > -LEAST_FALL {
+        if born.votes.len() + taken.len() < model.settings.min_votes as usize
+            || change - 2.0 * at_most > -LEAST_GAIN_OF_MOVE
+        {
             return None;
         }
         for (vote, _) in taken {
@@ -127,14 +127,14 @@ impl Garden<'_> {
             votes.sort_unstable();
             let Some(more) = object(model, lookout, votes, born.fit.point, Vec::new()) else { continue };
             let (left, lost) = self.without(other, vote);
-            if more.energy - born.energy + lost < -LEAST_FALL {
+            if more.energy - born.energy + lost < -LEAST_GAIN_OF_MOVE {
                 change += more.energy - born.energy + lost;
                 born = more;
                 birth.push((other, left));
             }
         }
         let is_one = born.votes.len() >= model.settings.min_votes as usize && born.energy < 0.0;
-        (is_one && change < -LEAST_FALL).then_some(Birth { change, born, others: birth })
+        (is_one && change < -LEAST_GAIN_OF_MOVE).then_some(Birth { change, born, others: birth })
     }
 
     /// The votes of other objects that one explains better than clutter does, from images that show nothing else of it, with what each gains; the best first.

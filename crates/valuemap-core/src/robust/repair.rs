@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::assign::{Claim, Trajectories, assign_among, claims_of_all, images_of};
-use super::energy::{NOBODY, Object, by_side, fit, implied_size, object, owners, size_of, visits};
+use super::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, by_side, fit, implied_size, object, owners, size_of, visits};
 use super::few::most_probable;
 use super::index::{RayIndex, chi2};
 use super::looks::Lookout;
@@ -38,8 +38,6 @@ pub const MOST_VISITS: usize = 6;
 const SIDE_COSINE: f64 = 0.866;
 /// The gate of these votes, as a share of the gate of all.
 const CLOSE: f64 = 0.5;
-/// J that falls by less stays as it is.
-const LEAST_FALL: f64 = 1e-6;
 
 /// Neighborhoods that were tried in vain, by the votes of their objects.
 #[derive(Default)]
@@ -176,7 +174,7 @@ fn anew(place: &Place<'_>, old: &[&Object], attempt: u64, progress: &Progress) -
         let found = place.objects(&candidates, &chosen, progress)?;
         seen.push(chosen);
         let energy: f64 = found.iter().map(|object| object.energy).sum();
-        if energy < best.as_ref().map_or(before, |best| best.0) - LEAST_FALL {
+        if energy < best.as_ref().map_or(before, |best| best.0) - LEAST_GAIN_OF_MOVE {
             best = Some((energy, found));
         }
     }
@@ -248,7 +246,7 @@ impl Candidate {
         let limit = gate_sigmas * gate_sigmas;
         let of_class = model.classes[class as usize];
         let (mut gains, mut farthest): (Vec<(usize, f64)>, f64) = (Vec::new(), 0.0);
-        let (mut images, mut last) = (0_usize, NOBODY);
+        let (mut images, mut last) = (0_usize, u32::MAX);
         let (mut variance_m2, mut seen) = (f64::INFINITY, Vec::new());
         for (place, &ray) in rays.iter().enumerate() {
             let image = scene.rays.image[ray as usize];
@@ -355,7 +353,7 @@ fn choose(candidates: &[Candidate], rays: usize, start: Vec<usize>) -> Vec<usize
         for c in (0..candidates.len()).filter(|c| !chosen.contains(c)) {
             let trial = pruned(candidates, rays, chosen.iter().copied().chain([c]).collect());
             let of_trial = value_of(candidates, rays, &trial);
-            if of_trial > best.as_ref().map_or(value, |best| best.0) + LEAST_FALL {
+            if of_trial > best.as_ref().map_or(value, |best| best.0) + LEAST_GAIN_OF_MOVE {
                 best = Some((of_trial, trial));
             }
         }

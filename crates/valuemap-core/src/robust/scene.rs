@@ -123,10 +123,12 @@ impl Scene {
         let mut azimuths: Vec<Vec<f64>> = vec![Vec::new(); self.frusta.len()];
         for ray in self.usable_rays() {
             let view = self.view(ray);
-            azimuths[view.camera as usize].push(azimuth_rad(&(view.cam_from_world * self.ray(ray).direction)));
+            if self.frusta[view.camera as usize].normals.is_empty() {
+                azimuths[view.camera as usize].push(azimuth_rad(&(view.cam_from_world * self.ray(ray).direction)));
+            }
         }
         for (frustum, azimuths) in self.frusta.iter_mut().zip(azimuths) {
-            frustum.blind = if frustum.normals.is_empty() { BlindSide::of(azimuths) } else { None };
+            frustum.blind = BlindSide::of(azimuths);
         }
     }
 }
