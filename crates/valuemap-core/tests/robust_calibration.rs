@@ -4,13 +4,17 @@
 
 mod street;
 
+use std::sync::Arc;
+
 use nalgebra::{Isometry3, Vector3};
 use street::{NOISE, SETTINGS, joined, moved, street};
 use valuemap_core::progress::Progress;
-use valuemap_core::robust::calibrate::{Known, Placed, calibrate};
+use valuemap_core::robust::calibrate::{Known, Placed, calibrate, disagreement, mean};
 use valuemap_core::robust::noise::Noise;
+use valuemap_core::robust::quick::quick_estimate;
 use valuemap_core::robust::sample::scramble;
-use valuemap_core::robust::{Calibration, self_calibrate};
+use valuemap_core::robust::scene::Scene;
+use valuemap_core::robust::{Calibration, self_calibrate, spreads_of};
 
 /// The sum of twelve uniform numbers less 6 is as good as normal.
 fn normal(number: u64) -> f64 {
@@ -79,4 +83,75 @@ fn a_few_labels_of_two_objects_say_nothing_about_how_far_passes_drift() {
     let (of_right, of_some_wrong) = (drift_m(0), drift_m(5));
     assert!((0.08..0.25).contains(&of_right), "{of_right}");
     assert!((0.6..1.5).contains(&(of_some_wrong / of_right)), "{of_right} {of_some_wrong}");
+}
+
+/// Standard deviation of where images are said to be, each for itself, of [`from_two_sides`].
+const OFF_M: f64 = 0.5;
+
+/// Objects of a street and their true votes, seen on six drives in turn from either end by a camera whose positions are off.
+fn from_two_sides() -> (Scene, Vec<Placed>) {
+    let objects: Vec<Vector3<f64>> = (0..16).map(|i| Vector3::new(60.0 + 7.0 * f64::from(i), 6.0, 3.0)).collect();
+    let errors: Vec<[f64; 2]> = (0..997).map(|i| [normal(2 * i), normal(2 * i + 1)]).collect();
+    // Half a turn about the middle of the street.
+    let back = Isometry3::new(Vector3::new(220.0, 0.0, 0.0), Vector3::new(0.0, 0.0, std::f64::consts::PI));
+    let of_drive = |drive: u64, object: &Vector3<f64>| {
+        let there = if drive.is_multiple_of(2) { Isometry3::identity() } else { back };
+        moved(
+            street(220, 1.0, &[there.inverse() * nalgebra::Point3::from(*object)].map(|at| at.coords), &errors),
+            &there,
+        )
+    };
+    let parts = objects.iter().flat_map(|object| (0..6).map(move |drive| (drive, object)));
+    let mut scene = joined(parts.map(|(drive, object)| of_drive(drive, object)).collect());
+    let mut labels: Vec<Placed> = objects.iter().map(|&object| (Vec::new(), object)).collect();
+    let images = scene.rays.image.clone();
+    for (ray, &image) in images.iter().enumerate() {
+        let (votes, point) = &mut labels[image as usize / 220 / 6];
+        // Nearer, the residuals of so wrong positions are far from linear.
+        if scene.rays.rays[ray].project(point).z > 15.0 {
+            votes.push(ray as u32);
+        }
+        let off = Vector3::from_fn(|axis, _| OFF_M * normal(9000 + 3 * u64::from(image) + axis as u64));
+        Arc::make_mut(&mut scene.rays).rays[ray].center += off;
+        scene.views[image as usize].center += off;
+    }
+    for view in &mut scene.views {
+        view.pass %= 6;
+    }
+    (scene, labels)
+}
+
+#[test]
+fn drives_from_two_sides_agree_however_wrong_positions_of_images_are() {
+    let (scene, labels) = from_two_sides();
+    let truth = Noise { position_m: OFF_M, position_drift_m: 0.05, ..NOISE };
+    let disagreements = labels.iter().map(|label| disagreement(&scene, &truth, label)).collect();
+    let of_mean = mean(disagreements).unwrap();
+    assert!((0.7..1.3).contains(&of_mean), "{of_mean}");
+}
+
+#[test]
+fn quick_estimates_from_one_side_are_off_to_neither() {
+    let (scene, labels) = from_two_sides();
+    let noise = Noise { position_m: OFF_M, ..NOISE };
+    let spreads = spreads_of(&scene, &noise);
+    let away_m = |(votes, point): &Placed| {
+        let of_side: Vec<u32> = votes.iter().copied().filter(|&ray| scene.view(ray).pass.is_multiple_of(2)).collect();
+        (quick_estimate(&scene, &spreads, &of_side, *point).unwrap() - point).x
+    };
+    let all: Vec<f64> = labels.iter().map(away_m).collect();
+    let of_mean = all.iter().sum::<f64>() / all.len() as f64;
+    let deviation = (all.iter().map(|one| (one - of_mean).powi(2)).sum::<f64>() / all.len() as f64).sqrt();
+    assert!(of_mean.abs() < 3.0 * deviation / (all.len() as f64).sqrt(), "{of_mean} {deviation}");
+}
+
+#[test]
+fn the_noise_of_positions_is_found_from_drives_of_two_sides() {
+    let (scene, labels) = from_two_sides();
+    for position_m in [0.15, 1.0] {
+        let guess = Noise { position_m, position_segment_m: 0.03, rotation_segment_rad: 5e-4, ..NOISE };
+        let found = calibrate(&scene, &guess, &labels, Known::default());
+        assert!((0.9..1.1).contains(&(found.position_m / OFF_M)), "{found:?}");
+        assert!(found.position_drift_m < 0.5 * OFF_M, "{found:?}");
+    }
 }

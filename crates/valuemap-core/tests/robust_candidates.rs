@@ -21,9 +21,10 @@ use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::propose::{Who, propose};
 use valuemap_core::robust::quick::quick_estimate;
 use valuemap_core::robust::sample::{Sampler, level_of};
+use valuemap_core::robust::scene::Scene;
 use valuemap_core::robust::spreads_of;
 
-use street::{GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, object, street};
+use street::{GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, joined, object, street};
 
 proptest! {
     #![proptest_config(config())]
@@ -186,4 +187,43 @@ proptest! {
         }
         prop_assert!(!labels.is_empty());
     }
+}
+
+/// A scene in which an object 30 m along a street is seen from its first 9 m, and one more image looks along the street from `ahead_m` before it.
+fn with_image_at(object: Vector3<f64>, ahead_m: f64) -> Scene {
+    let mut there = street(1, 1.0, &[object], &[[0.0; 2]]);
+    let center = object - Vector3::x() * ahead_m;
+    Arc::make_mut(&mut there.rays).rays[0].center = center;
+    there.views[0].center = center;
+    joined(vec![street(10, 1.0, &[object], &[[0.3, -0.2]]), there])
+}
+
+#[test]
+fn no_step_of_an_estimate_leads_behind_a_voter() {
+    let object = Vector3::new(30.0, 2.0, 3.0);
+    // The last image has passed it.
+    let scene = with_image_at(object, -2.0);
+    let noise = Noise { position_m: 0.5, ..NOISE };
+    let spreads = spreads_of(&scene, &noise);
+    let voters: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
+    let start = object + Vector3::new(4.0, 0.2, 0.3);
+    let quick = quick_estimate(&scene, &spreads, &voters, start).unwrap();
+    let rough = estimate(&scene, &noise, &voters, start, Care::Rough).unwrap().point;
+    assert!(quick.x > 32.0 && rough.x > 32.0, "{quick} {rough}");
+}
+
+#[test]
+fn cameras_that_may_be_beyond_the_object_do_not_vote_for_it() {
+    let object = Vector3::new(30.0, 2.0, 3.0);
+    let mut scene = with_image_at(object, 0.5);
+    scene.frusta[0].solid_angle_sr = 0.6;
+    let noise = Noise { position_m: 0.5, ..NOISE };
+    let rays: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
+    let model = Model::new(&scene, &noise, &SETTINGS);
+    let index = RayIndex::new(&scene, &model.spreads, GATE_SIGMAS, rays.iter().copied());
+    let last = rays.len() as u32 - 1;
+    assert!(index.all_hits(&object, 0, 100.0).iter().any(|hit| hit.ray == last));
+    let (found, _) = gather(&model, &rays, &Progress::default()).unwrap();
+    let voters: Vec<&u32> = found.iter().flat_map(|label| &label.voters).collect();
+    assert!(voters.len() == 10 && !voters.contains(&&last), "{voters:?}");
 }

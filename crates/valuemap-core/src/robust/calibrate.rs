@@ -124,7 +124,7 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
     let rotation_rad = (DETECTION_PX.0 / scale2.sqrt(), DETECTION_PX.1 / scale2.sqrt());
     let found = search(start, [DETECTION_PX, BOX_SHARE, POSITION_M, POSITION_M, rotation_rad], fixed, &|p| {
         let noise = noise_of(p, 1.0);
-        sum(&|object| minus_log_likelihood(scene, &noise, &object.0, &object.1))
+        sum(&|object| minus_log_likelihood(scene, &noise, guess, &object.0, &object.1))
     });
     if stated[0].is_some() {
         return noise_of(&found, 1.0);
@@ -198,7 +198,7 @@ impl Disagreement {
 pub fn disagreement(scene: &Scene, noise: &Noise, (votes, point): &Placed) -> Option<Disagreement> {
     let (mut information, mut gradient, mut alone, mut passes) = (Matrix3::zeros(), Vector3::zeros(), 0.0, 0);
     for pass in by_pass(scene, votes).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS) {
-        let looks = looks_at(scene, noise, pass, point)?;
+        let looks = looks_at(scene, noise, noise, pass, point)?;
         let (of_pass, by_pass) = Drive::at_one(&looks)?.normals.of_one();
         alone += by_pass.dot(&of_pass.cholesky()?.solve(&by_pass));
         information += of_pass;
@@ -271,16 +271,16 @@ fn sample<'a>(scene: &Scene, guess: &Noise, labels: &'a [Placed]) -> Vec<&'a Pla
 /// Squared residuals of a label in sigmas, shared errors taken out, a residual.
 fn misfit(scene: &Scene, noise: &Noise, label: &Placed) -> f64 {
     let passes = by_pass(scene, &label.0);
-    let of_pass = |pass| Some(Drive::at_one(&looks_at(scene, noise, pass, &label.1)?)?.normals.square);
+    let of_pass = |pass| Some(Drive::at_one(&looks_at(scene, noise, noise, pass, &label.1)?)?.normals.square);
     passes.filter_map(of_pass).sum::<f64>() / label.0.len() as f64
 }
 
 /// Minus twice the logarithm of the restricted likelihood of votes' residuals (ascending) around a point, up to a constant: each visit may
 /// put the object elsewhere, so that what visits disagree about is not taken for errors within them.
-fn minus_log_likelihood(scene: &Scene, noise: &Noise, votes: &[u32], point: &Vector3<f64>) -> f64 {
+fn minus_log_likelihood(scene: &Scene, noise: &Noise, of_sight: &Noise, votes: &[u32], point: &Vector3<f64>) -> f64 {
     let mut value = 0.0;
     for visit in by_pass(scene, votes).filter(|visit| visit.len() >= MIN_VOTES_OF_VISIT) {
-        let Some(looks) = looks_at(scene, noise, visit, point) else { return 0.0 };
+        let Some(looks) = looks_at(scene, noise, of_sight, visit, point) else { return 0.0 };
         let Some(drive) = Drive::at_one(&looks) else { return 0.0 };
         let (information, gradient) = drive.normals.of_one();
         let Some(cholesky) = information.cholesky() else { return 0.0 };

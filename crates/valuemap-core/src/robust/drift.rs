@@ -66,6 +66,8 @@ pub struct Vantage {
     detection_px2: f64,
     /// Of all errors but the drift.
     spread: Spread,
+    /// The same as the line of sight is turned with it.
+    of_sight: Spread,
     /// Measured range with its standard deviation, m; NaN where there is none.
     pub range_m: [f64; 2],
 }
@@ -75,6 +77,7 @@ impl Vantage {
     #[must_use]
     pub fn of(scene: &Scene, noise: &Noise, ray: u32) -> Self {
         let view = scene.view(ray);
+        let own = noise.own(scene, ray);
         Self {
             ray: *scene.ray(ray),
             image: scene.rays.image[ray as usize],
@@ -83,9 +86,18 @@ impl Vantage {
             segment_sigma: noise.of_segment(view),
             own_sigma: noise.of_image(view),
             detection_px2: noise.detection_px2(scene, ray),
-            spread: noise.own(scene, ray),
+            spread: own,
+            of_sight: own,
             range_m: [scene.range_m[ray as usize], scene.range_sigma_m[ray as usize]],
         }
+    }
+
+    /// The same, but with the line of sight that another noise makes probable: while the noise is sought, lines that follow it would be
+    /// one more thing to fit.
+    #[must_use]
+    pub fn with_sight_of(mut self, scene: &Scene, noise: &Noise, ray: u32) -> Self {
+        self.of_sight = noise.own(scene, ray);
+        self
     }
 
     /// The camera centre, m.
@@ -95,15 +107,16 @@ impl Vantage {
     }
 
     /// The look at one of some labels, which is at `point`; nothing if that is behind it.
+    ///
+    /// Its derivatives are those of the line of sight as it probably is, given this residual alone. Those of the line from where the
+    /// camera is said to be are wrong in the same way as the residual is: what both have in common moves a label away from the cameras,
+    /// however many look at it, so that drives from two sides never agree.
     #[must_use]
     pub fn look(&self, label: usize, point: &Vector3<f64>) -> Option<Look> {
-        self.look_along(&self.ray, label, point)
+        self.look_along(&self.ray, label, point, |depth| self.of_sight.share_of_position(depth))
     }
 
-    /// The same with its derivatives where its image probably was, whose pose error is about `error`, m and rad.
-    ///
-    /// Derivatives at the measured poses are wrong in the same way as the residuals are: what both have in common
-    /// moves a label away from the cameras, however many look at it.
+    /// The same with its derivatives where its image probably was, given all looks together: its pose error is about `error`, m and rad.
     #[must_use]
     pub fn look_where_it_was(&self, label: usize, point: &Vector3<f64>, error: &Vector6) -> Option<Look> {
         let (shift, turn) = (error.fixed_rows::<3>(0), error.fixed_rows::<3>(3));
@@ -113,15 +126,21 @@ impl Vantage {
             center: self.ray.center + shift,
             direction: turn * self.ray.direction,
         };
-        let mut look = self.look_along(&probable, label, point)?;
+        let mut look = self.look_along(&probable, label, point, |_| 0.0)?;
         look.shift(error);
         Some(look)
     }
 
     #[inline]
-    fn look_along(&self, ray: &Ray, label: usize, point: &Vector3<f64>) -> Option<Look> {
+    fn look_along(
+        &self,
+        ray: &Ray,
+        label: usize,
+        point: &Vector3<f64>,
+        share_of_position: impl Fn(f64) -> f64,
+    ) -> Option<Look> {
         let projected = ray.project(point);
-        let (residual, rows) = ray.linearize_at(&projected)?;
+        let (residual, rows) = ray.linearize_beside(&projected, share_of_position(projected.z))?;
         let away = point - ray.center;
         let by_point = rows.map(|row| row.transpose());
         Some(Look {

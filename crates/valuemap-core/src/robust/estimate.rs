@@ -20,6 +20,8 @@ pub const ROUGH_M: f64 = 1e-2;
 /// A pass that comes back after so long a drive has another drift, m.
 const FORGOTTEN_M: f64 = 250.0;
 const LONGEST_STEP_M: f64 = 5.0;
+/// A step that leads behind a voter is cut to a quarter, so many times at most.
+const MAX_CUTS: i32 = 6;
 /// Votes are judged once a step is shorter than this, in sigmas, root mean square of the labels.
 const NEAR_SIGMAS: f64 = 0.3;
 /// Rounds of leaving out votes, at most.
@@ -195,8 +197,7 @@ impl<'a> Joint<'a> {
             rounds += 1;
         };
         // The last step may have gone behind a voter.
-        let is_in_front = |&(label, ray): &(usize, u32)| self.scene.ray(ray).project(&self.points[label]).z > 0.0;
-        self.votes.iter().all(is_in_front).then_some(())?;
+        self.is_in_front().then_some(())?;
         let estimates = self.estimates(&information.inverse());
         Some(Solution { joint: self, here, refused, estimates })
     }
@@ -226,12 +227,23 @@ impl<'a> Joint<'a> {
         retain(&mut self.pose_errors, leaves);
     }
 
-    /// Move the points, each not too far.
+    /// Move the points, each not too far, and none behind a voter if a part of the way is not.
     fn step(&mut self, step: &DVector<f64>) {
-        for (k, point) in self.points.iter_mut().enumerate() {
-            let step = step.fixed_rows::<3>(3 * k);
-            *point += step * (LONGEST_STEP_M / step.norm()).min(1.0);
+        let from = self.points.clone();
+        for share in shares_of_step() {
+            for (k, (point, from)) in self.points.iter_mut().zip(&from).enumerate() {
+                let step = step.fixed_rows::<3>(3 * k);
+                *point = from + step * (share * (LONGEST_STEP_M / step.norm()).min(1.0));
+            }
+            if self.is_in_front() {
+                break;
+            }
         }
+    }
+
+    /// Whether all points are in front of their voters.
+    fn is_in_front(&self) -> bool {
+        self.votes.iter().all(|&(label, ray)| self.scene.ray(ray).project(&self.points[label]).z > 0.0)
     }
 
     fn estimates(&self, covariance: &DMatrix<f64>) -> Vec<Estimate> {
@@ -386,6 +398,11 @@ impl Solution<'_> {
     }
 }
 
+/// All of a step, and less and less of it, for where it leads behind a voter: far away residuals are linear, nearby they are not.
+pub fn shares_of_step() -> impl Iterator<Item = f64> {
+    (0..=MAX_CUTS).map(|cuts| 0.25_f64.powi(cuts))
+}
+
 /// Which votes with the residuals `own` do not fit the gate and must leave: of each label the worst first, since one bad
 /// vote makes good ones look bad.
 fn unfit(votes: &[(usize, u32)], own: &[f64], gate_sigmas: f64) -> Vec<bool> {
@@ -449,13 +466,21 @@ pub fn by_pass<'a>(scene: &'a Scene, voters: &'a [u32]) -> impl Iterator<Item = 
     voters.chunk_by(|&a, &b| is_one_visit(scene.view(a), scene.view(b)))
 }
 
-/// The looks of the voters of one visit at a point, each by itself; nothing if it is behind one of them.
+/// The looks of the voters of one visit at a point, each by itself, along the lines of sight that a noise makes probable; nothing if it is behind
+/// one of them.
 #[must_use]
-pub fn looks_at(scene: &Scene, noise: &Noise, voters: &[u32], point: &Vector3<f64>) -> Option<Vec<Look>> {
+pub fn looks_at(
+    scene: &Scene,
+    noise: &Noise,
+    of_sight: &Noise,
+    voters: &[u32],
+    point: &Vector3<f64>,
+) -> Option<Vec<Look>> {
     // Not collected: an iterator of options does not say how many there will be.
     let mut looks = Vec::with_capacity(voters.len());
     for &ray in voters {
-        looks.push(Look::of(scene, noise, ray, 0, point)?.by_itself());
+        let vantage = Vantage::of(scene, noise, ray).with_sight_of(scene, of_sight, ray);
+        looks.push(vantage.look(0, point)?.by_itself());
     }
     Some(looks)
 }

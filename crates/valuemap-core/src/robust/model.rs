@@ -362,6 +362,15 @@ impl<'a> Model<'a> {
         self.class_of(ray).score_ratio.at(self.scene.score[ray as usize])
     }
 
+    /// Whether a ray may be more probable as a vote for a point than as clutter. Not where the camera is so near that, for all that is known of its
+    /// position, the object might be anywhere in the picture, or behind it.
+    #[inline]
+    #[must_use]
+    pub fn may_tell(&self, ray: u32, point: &Vector3<f64>) -> bool {
+        let variance_px2 = self.spreads[ray as usize].variance(self.scene.ray(ray).project(point).z);
+        (2.0 * PI * variance_px2).ln() + self.ln_clutter_per_px2(ray) < 0.0
+    }
+
     /// How much more probable, in logarithms, a detection is as a vote than as clutter, if its object, of a class and of size `ln_size`, is where the
     /// residual has a squared length of `chi2` sigmas with a covariance of determinant `px4`.
     #[inline]

@@ -71,6 +71,14 @@ impl Spread {
         self.far_px2 + self.near_px2 / (depth * depth)
     }
 
+    /// The share of the variance at a depth that comes from the position of the camera.
+    #[inline]
+    #[must_use]
+    pub fn share_of_position(&self, depth: f64) -> f64 {
+        let near_px2 = self.near_px2 / (depth * depth);
+        near_px2 / (self.far_px2 + near_px2)
+    }
+
     /// The gate at a number of sigmas.
     #[must_use]
     pub fn gate(&self, sigmas: f64) -> Gate {

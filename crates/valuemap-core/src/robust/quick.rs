@@ -5,7 +5,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::estimate::ROUGH_M;
+use super::estimate::{ROUGH_M, shares_of_step};
 use super::index::chi2;
 use super::noise::Spread;
 use super::scene::Scene;
@@ -27,7 +27,7 @@ pub fn quick_estimate(scene: &Scene, spreads: &[Spread], voters: &[u32], start: 
         for &voter in voters {
             let (ray, spread) = (scene.ray(voter), &spreads[voter as usize]);
             let projected = ray.project(&point);
-            let (residual, rows) = ray.linearize_at(&projected)?;
+            let (residual, rows) = ray.linearize_beside(&projected, spread.share_of_position(projected.z))?;
             let robust = (HUBER_CHI2 / chi2(&projected, spread)).sqrt().min(1.0);
             let weight = robust / spread.variance(projected.z);
             for (r, row) in residual.into_iter().zip(rows) {
@@ -38,7 +38,10 @@ pub fn quick_estimate(scene: &Scene, spreads: &[Spread], voters: &[u32], start: 
         }
         let step = -information.cholesky()?.solve(&gradient);
         let length = step.norm();
-        point += step * (LONGEST_STEP_M / length).min(1.0);
+        let step = step * (LONGEST_STEP_M / length).min(1.0);
+        // As far as no voter has it behind.
+        let is_in_front = |at: &Vector3<f64>| voters.iter().all(|&voter| scene.ray(voter).project(at).z > 0.0);
+        point = shares_of_step().map(|share| point + step * share).find(is_in_front)?;
         if length < ROUGH_M {
             break;
         }

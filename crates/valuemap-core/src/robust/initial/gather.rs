@@ -7,10 +7,8 @@ use rayon::prelude::*;
 
 use super::label::{Label, first_voter, from_voters};
 use crate::progress::{Halt, Progress};
-use crate::robust::Settings;
 use crate::robust::index::RayIndex;
 use crate::robust::model::Model;
-use crate::robust::noise::Noise;
 use crate::robust::propose::{Hypothesis, Who, propose};
 use crate::robust::quick::quick_estimate;
 
@@ -29,7 +27,7 @@ const MAX_ROUNDS: usize = 8;
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
 pub fn gather(model: &Model<'_>, rays: &[u32], progress: &Progress) -> Result<(Vec<Label>, [u64; 2]), Halt> {
-    let Model { scene, noise, ref spreads, settings, .. } = *model;
+    let Model { scene, ref spreads, settings, .. } = *model;
     let range_m = settings.viability.max_range_m * VOTE_RANGE;
     let mut labels: Vec<Label> = Vec::new();
     let mut claimed = vec![false; scene.rays.rays.len()];
@@ -51,7 +49,7 @@ pub fn gather(model: &Model<'_>, rays: &[u32], progress: &Progress) -> Result<(V
                 }
                 let class = scene.rays.class[nomination.rays[0] as usize];
                 let keep = |ray: u32| !claimed[ray as usize];
-                polish(noise, &index, nomination.point, class, range_m, settings, &keep)
+                polish(model, &index, nomination.point, class, range_m, &keep)
             };
             let polished: Vec<Option<Label>> =
                 batch.par_iter().map(|nomination| polish_one(nomination, &claimed)).collect();
@@ -84,19 +82,19 @@ pub fn gather(model: &Model<'_>, rays: &[u32], progress: &Progress) -> Result<(V
 /// Nothing if fewer than `min_votes` remain.
 #[must_use]
 fn polish(
-    noise: &Noise,
+    model: &Model<'_>,
     index: &RayIndex<'_>,
     start: Vector3<f64>,
     class: u32,
     range_m: f64,
-    settings: &Settings,
     keep: &dyn Fn(u32) -> bool,
 ) -> Option<Label> {
-    let scene = index.scene();
+    let Model { scene, noise, settings, .. } = *model;
     let min_votes = settings.min_votes as usize;
     let rounds = if settings.without.polish { 0 } else { MAX_ROUNDS };
     let voters_at = |point: &Vector3<f64>| -> Vec<u32> {
-        index.hits(point, class, range_m, keep).iter().map(|hit| hit.ray).collect()
+        let keep = |ray: u32| keep(ray) && model.may_tell(ray, point);
+        index.hits(point, class, range_m, &keep).iter().map(|hit| hit.ray).collect()
     };
     let mut gathered = voters_at(&start);
     let mut point = start;
