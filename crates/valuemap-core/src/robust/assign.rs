@@ -11,7 +11,7 @@ use rustc_hash::FxHashMap;
 
 use super::births::VOTE_RANGE;
 use super::drift::Look;
-use super::energy::{Object, object};
+use super::energy::{Object, fitting};
 use super::index::RayIndex;
 use super::looks::Lookout;
 use super::model::Model;
@@ -125,19 +125,7 @@ fn commit(
         if votes.len() < min_votes {
             return Ok(Change::Death);
         }
-        let moved = object(model, lookout, votes.clone(), objects[i].fit.point, images_of(&claims[i]));
-        let limit = model.settings.gate_sigmas.powi(2);
-        let moved = moved.and_then(|moved| {
-            if moved.fit.chi2.iter().all(|chi2| *chi2 <= limit) {
-                return Some(moved);
-            }
-            let fits = moved.votes.iter().zip(&moved.fit.chi2).filter(|(_, chi2)| **chi2 <= limit);
-            let left: Vec<u32> = fits.map(|(&ray, _)| ray).collect();
-            if left.len() < min_votes {
-                return None;
-            }
-            object(model, lookout, left, moved.fit.point, moved.others)
-        });
+        let moved = fitting(model, lookout, votes.clone(), objects[i].fit.point, images_of(&claims[i]));
         Ok(moved.filter(|moved| moved.energy < 0.0).map_or(Change::Death, |moved| Change::To(Box::new(moved))))
     };
     let changes: Vec<Change> = votes.par_iter().enumerate().map(changed).collect::<Result<_, Halt>>()?;

@@ -4,7 +4,7 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use super::energy::{Object, implied_size, object, size_of};
+use super::energy::{Object, fitting, implied_size, size_of};
 use super::index::{Hit, RayIndex};
 use super::looks::Lookout;
 use super::model::Model;
@@ -115,17 +115,8 @@ impl Nursery<'_> {
         }
         let mut others: Vec<u32> = hits.iter().map(|hit| hit.image).collect();
         others.sort_unstable();
-        let mut found = object(model, lookout, votes, point, others)?;
         // Votes that do not fit once the drift of their visit is known are clutter's.
-        let limit = model.settings.gate_sigmas * model.settings.gate_sigmas;
-        if found.fit.chi2.iter().any(|&chi2| chi2 > limit) {
-            let fits = found.votes.iter().zip(&found.fit.chi2).filter(|(_, chi2)| **chi2 <= limit);
-            let left: Vec<u32> = fits.map(|(&ray, _)| ray).collect();
-            if left.len() < min_votes {
-                return None;
-            }
-            found = object(model, lookout, left, found.fit.point, found.others)?;
-        }
+        let found = fitting(model, lookout, votes, point, others)?;
         (found.energy < 0.0).then_some(found)
     }
 }

@@ -304,7 +304,29 @@ pub fn object(
     unseen(model, votes, start)?.with_looks(model, lookout, others)
 }
 
-/// The same before it is asked who should have seen it: J is not less than its energy.
+/// An object with those of some votes (ascending) that fit it, all together; nothing if too few do.
+#[must_use]
+pub fn fitting(
+    model: &Model<'_>,
+    lookout: &Lookout,
+    votes: Vec<u32>,
+    start: Vector3<f64>,
+    others: Vec<u32>,
+) -> Option<Object> {
+    let limit = model.settings.gate_sigmas.powi(2);
+    let found = object(model, lookout, votes, start, others)?;
+    if found.fit.chi2.iter().all(|chi2| *chi2 <= limit) {
+        return Some(found);
+    }
+    let fits = found.votes.iter().zip(&found.fit.chi2).filter(|(_, chi2)| **chi2 <= limit);
+    let left: Vec<u32> = fits.map(|(&ray, _)| ray).collect();
+    if left.len() < model.settings.min_votes as usize {
+        return None;
+    }
+    object(model, lookout, left, found.fit.point, found.others)
+}
+
+/// An [`object`] before it is asked who should have seen it: J is not less than its energy.
 #[must_use]
 pub fn unseen(model: &Model<'_>, votes: Vec<u32>, start: Vector3<f64>) -> Option<Object> {
     let class = model.likeliest_class(&votes)?;

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::assign::{Claim, claims_of_all, gain_alone, images_of};
-use super::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, by_place, by_side, object, owners, visits};
+use super::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, by_place, by_side, fitting, object, owners, visits};
 use super::index::RayIndex;
 use super::looks::Lookout;
 use super::model::Model;
@@ -48,7 +48,7 @@ pub fn rearrange_pairs(
         pairs.retain(|&(a, b)| !tried.0.contains(&(prints[a], prints[b])));
         let try_one = |&(a, b): &(usize, usize)| {
             progress.check()?;
-            Ok(Pair { model, lookout, of: [&objects[a], &objects[b]], claims: [&claims[a], &claims[b]] }.best())
+            Ok(Pair::new(model, lookout, [&objects[a], &objects[b]], [&claims[a], &claims[b]]).best())
         };
         let found: Vec<Option<(f64, Vec<Object>)>> =
             pairs.par_iter().with_max_len(1).map(try_one).collect::<Result<_, Halt>>()?;
@@ -106,7 +106,7 @@ pub fn exclude(
         for (_, a, b) in near {
             let (Some(first), Some(second)) = (&kept[a], &kept[b]) else { continue };
             let claims = claims_of_all(model, index, &[first.clone(), second.clone()], progress)?;
-            let pair = Pair { model, lookout, of: [first, second], claims: [&claims[0], &claims[1]] };
+            let pair = Pair::new(model, lookout, [first, second], [&claims[0], &claims[1]]);
             let (weaker, class) =
                 if first.votes.len() < second.votes.len() { (a, second.class) } else { (b, first.class) };
             // A detector takes one thing for another now and then: the class with more votes has the place.
@@ -168,9 +168,16 @@ struct Pair<'a> {
     lookout: &'a Lookout,
     of: [&'a Object; 2],
     claims: [&'a [Claim]; 2],
+    /// The rays of these.
+    gates: [FxHashSet<u32>; 2],
 }
 
-impl Pair<'_> {
+impl<'a> Pair<'a> {
+    fn new(model: &'a Model<'a>, lookout: &'a Lookout, of: [&'a Object; 2], claims: [&'a [Claim]; 2]) -> Self {
+        let gates = claims.map(|claims| claims.iter().map(|claim| claim.ray).collect());
+        Self { model, lookout, of, claims, gates }
+    }
+
     /// Both as one, if that lowers J; else the exchange that lowers it most. And by how much.
     fn best(&self) -> Option<(f64, Vec<Object>)> {
         let before: f64 = self.of.iter().map(|object| object.energy).sum();
@@ -212,7 +219,8 @@ impl Pair<'_> {
         object(self.model, self.lookout, votes, larger.fit.point, others)
     }
 
-    /// Images, ascending, whose votes may be exchanged together: those of a visit, and those that look from one side.
+    /// Images, ascending, whose votes may be exchanged together: those of a visit, and those that look from one side; all of them, and those that show
+    /// only one of the two which might as well be the other.
     fn parts(&self) -> Vec<Vec<u32>> {
         let scene = self.model.scene;
         let mut votes: Vec<u32> = self.of.iter().flat_map(|object| object.votes.iter().copied()).collect();
@@ -226,43 +234,65 @@ impl Pair<'_> {
         let mut parts: Vec<Vec<u32>> = visits(scene, &votes).map(images).collect();
         let looks = votes.iter().map(|&ray| (ray, (scene.ray(ray).center - middle).normalize()));
         parts.extend(by_side(looks, SIDE_COSINE).iter().map(|votes| images(votes)));
+        let contested: Vec<Vec<u32>> = (0..2).map(|i| self.contested(i)).collect();
+        let among = |part: &Vec<u32>, contested: &Vec<u32>| -> Vec<u32> {
+            part.iter().copied().filter(|image| contested.binary_search(image).is_ok()).collect()
+        };
+        let of_parts: Vec<Vec<u32>> =
+            parts.iter().flat_map(|part| contested.iter().map(move |contested| among(part, contested))).collect();
+        parts.extend(of_parts);
+        parts.extend(contested);
+        parts.retain(|part| !part.is_empty());
         parts.sort_unstable();
         parts.dedup();
         parts
     }
 
-    /// Both after an exchange of what they have in some images; nothing if one has nothing left, or too little may be exchanged.
+    /// The images, ascending, that show one of the two and not the other, whose vote there might as well be the other's.
+    fn contested(&self, of: usize) -> Vec<u32> {
+        let image = |ray: &u32| self.model.scene.rays.image[*ray as usize];
+        let shown: FxHashSet<u32> = self.of[1 - of].votes.iter().map(image).collect();
+        let votes =
+            self.of[of].votes.iter().filter(|ray| self.gates[1 - of].contains(ray) && !shown.contains(&image(ray)));
+        votes.map(image).collect()
+    }
+
+    /// Both after an exchange of what they have in some images, as far as they may take it; nothing if one has nothing left.
     fn exchanged(&self, images: &[u32]) -> Option<Vec<Object>> {
-        let scene = self.model.scene;
-        let is_in = |ray: &u32| images.binary_search(&scene.rays.image[*ray as usize]).is_ok();
-        let [a, b] = self.of.map(|object| object.votes.iter().copied().partition::<Vec<u32>, _>(is_in));
+        let image = |ray: u32| self.model.scene.rays.image[ray as usize];
+        let split = |images: &[u32]| {
+            self.of.map(|object| {
+                object.votes.iter().copied().partition::<Vec<u32>, _>(|&ray| images.binary_search(&image(ray)).is_ok())
+            })
+        };
+        let [mut a, mut b] = split(images);
+        let barred: FxHashSet<u32> =
+            self.barred(0, &a.1, &b.0).chain(self.barred(1, &b.1, &a.0)).map(|ray| image(*ray)).collect();
+        if !barred.is_empty() {
+            let left: Vec<u32> = images.iter().copied().filter(|image| !barred.contains(image)).collect();
+            [a, b] = split(&left);
+        }
         // What has no votes left, and what takes all of the other's, are the two as they are.
         if a.0.len() + b.0.len() == 0 || a.1.len() + b.1.len() == 0 {
             return None;
         }
-        let min_votes = self.model.settings.min_votes as usize;
         let mut found = Vec::with_capacity(2);
         for (i, (kept, taken)) in [(&a.1, &b.0), (&b.1, &a.0)].into_iter().enumerate() {
             let mut votes: Vec<u32> = kept.iter().chain(taken).copied().collect();
-            if votes.len() < min_votes || !self.may_take(i, kept, taken) {
+            if votes.len() < self.model.settings.min_votes as usize {
                 return None;
             }
             votes.sort_unstable();
             let old = self.of[i];
-            found.push(object(self.model, self.lookout, votes, old.fit.point, images_of(self.claims[i]))?);
+            found.push(fitting(self.model, self.lookout, votes, old.fit.point, images_of(self.claims[i]))?);
         }
-        let limit = self.model.settings.gate_sigmas.powi(2);
-        let fits = found.iter().all(|object| object.energy < 0.0 && object.fit.chi2.iter().all(|chi2| *chi2 <= limit));
-        fits.then_some(found)
+        found.iter().all(|object| object.energy < 0.0).then_some(found)
     }
 
-    /// Whether one that keeps some votes may take others: on many visits it stays where it is, so these have to be in its gate there.
-    fn may_take(&self, one: usize, kept: &[u32], taken: &[u32]) -> bool {
-        if taken.is_empty() || visits(self.model.scene, kept).count() <= MOST_VISITS {
-            return true;
-        }
-        let gate: FxHashSet<u32> = self.claims[one].iter().map(|claim| claim.ray).collect();
-        taken.iter().all(|ray| gate.contains(ray))
+    /// Which of some votes one may not take that keeps others: on many visits it stays where it is, so they have to be in its gate there.
+    fn barred<'v>(&'v self, one: usize, kept: &[u32], taken: &'v [u32]) -> impl Iterator<Item = &'v u32> {
+        let is_free = visits(self.model.scene, kept).count() <= MOST_VISITS;
+        taken.iter().filter(move |ray| !is_free && !self.gates[one].contains(ray))
     }
 }
 
@@ -298,12 +328,7 @@ mod tests {
             let objects = of(&model);
             let index = RayIndex::new(&scene, &model.spreads, street::GATE_SIGMAS, rays.iter().copied());
             let claims = claims_of_all(&model, &index, &objects, &Progress::default())?;
-            let pair = Pair {
-                model: &model,
-                lookout: &lookout,
-                of: [&objects[0], &objects[1]],
-                claims: [&claims[0], &claims[1]],
-            };
+            let pair = Pair::new(&model, &lookout, [&objects[0], &objects[1]], [&claims[0], &claims[1]]);
             let visit = |votes: &[u32]| -> [Vec<u32>; 2] {
                 votes.iter().copied().partition::<Vec<u32>, _>(|&ray| scene.view(ray).pass > 0).into()
             };
@@ -314,12 +339,12 @@ mod tests {
             let after = object(&model, &lookout, votes, first, Vec::new());
             let limit = street::GATE_SIGMAS.powi(2);
             let is_kept = after.is_some_and(|after| after.fit.chi2.iter().all(|chi2| *chi2 <= limit));
-            let may = pair.may_take(0, &kept, &other);
+            let may = pair.barred(0, &kept, &other).count() == 0;
             assert!(may || !is_kept, "{apart_m}");
             (taken, refused) = (taken + usize::from(may), refused + usize::from(!may));
             // On few visits it may move to where they are.
             let few: Vec<u32> = kept.iter().copied().filter(|&ray| scene.view(ray).pass == 1).collect();
-            assert!(pair.may_take(0, &few, &other));
+            assert!(pair.barred(0, &few, &other).count() == 0);
         }
         assert!(taken > 0 && refused > 0, "{taken} {refused}");
         Ok(())
