@@ -6,7 +6,7 @@ mod street;
 
 use std::sync::Arc;
 
-use nalgebra::{Isometry3, Vector3};
+use nalgebra::{Isometry3, Rotation3, Vector3};
 use street::{NOISE, SETTINGS, joined, moved, street};
 use valuemap_core::progress::Progress;
 use valuemap_core::robust::calibrate::{Known, Placed, calibrate, disagreement, mean};
@@ -154,4 +154,64 @@ fn the_noise_of_positions_is_found_from_drives_of_two_sides() {
         assert!((0.9..1.1).contains(&(found.position_m / OFF_M)), "{found:?}");
         assert!(found.position_drift_m < 0.5 * OFF_M, "{found:?}");
     }
+}
+
+/// How far poses are off, each axis of each image, and boxes: either both errors of the poses or both of the boxes.
+const OFF_SHARE: f64 = 0.1;
+const OFF_RAD: f64 = 3e-3;
+
+/// What is estimated of two drives past pairs of objects of 1 m, with errors that move a box of them as far, be they of poses or of boxes.
+fn noise_of(are_of_poses: bool) -> Noise {
+    let objects: Vec<Vector3<f64>> = (0..12)
+        .map(|i| Vector3::new(25.0 + 12.0 * f64::from(i / 2), if i % 2 == 0 { 5.0 } else { -6.0 }, 3.0))
+        .collect();
+    let drive = |number: u64| {
+        let of_axis = |part: u64, at: u64, axis: u64| normal((100 * number + part) * 10_000 + 3 * at + axis);
+        let without = street(80, 1.0, &objects, &[[0.0, 0.0]]);
+        let depth_m = |ray: &valuemap_core::ray::Ray| {
+            objects.iter().map(|object| ray.project(object)).find(|at| at.x.hypot(at.y) < 1e-6 * at.z).unwrap().z
+        };
+        let depths: Vec<f64> = without.rays.rays.iter().map(depth_m).collect();
+        let of_box = |(at, depth): (u64, &f64)| {
+            let off_px = street::FOCAL_PX * OFF_RAD.hypot(OFF_SHARE / depth);
+            [0, 1]
+                .map(|axis| 0.5 * of_axis(0, at, axis) + if are_of_poses { 0.0 } else { off_px * of_axis(1, at, axis) })
+        };
+        let errors: Vec<[f64; 2]> = (0..).zip(&depths).map(of_box).collect();
+        let mut scene = street(80, 1.0, &objects, &errors);
+        scene.box_px = depths.iter().map(|depth| street::FOCAL_PX / depth).collect();
+        if are_of_poses {
+            let images = scene.rays.image.clone();
+            let off = |image: u32| Vector3::from_fn(|axis, _| OFF_SHARE * of_axis(2, u64::from(image), axis as u64));
+            let turn = |image: u32| {
+                Rotation3::new(Vector3::from_fn(|axis, _| OFF_RAD * of_axis(3, u64::from(image), axis as u64)))
+            };
+            for (ray, image) in Arc::make_mut(&mut scene.rays).rays.iter_mut().zip(images) {
+                ray.center += off(image);
+                ray.residual_from_world *= turn(image).inverse();
+                ray.direction = turn(image) * ray.direction;
+            }
+            for (image, view) in (0..).zip(&mut scene.views) {
+                view.center += off(image);
+                view.cam_from_world *= turn(image).inverse();
+            }
+        }
+        scene
+    };
+    let scene = joined((0..2).map(drive).collect());
+    let guess = Noise { box_share: 0.04, position_m: 0.1, ..NOISE };
+    self_calibrate(&scene, &guess, Known::default(), &SETTINGS, false, &Progress::default()).unwrap().noise
+}
+
+#[test]
+fn what_the_objects_of_an_image_have_in_common_is_its_poses_error() {
+    // By how much more errors of poses move a box than its own, far away and nearby.
+    let ratios = |noise: &Noise| {
+        [street::FOCAL_PX * noise.rotation_rad / noise.detection_px, noise.position_m / noise.box_share]
+    };
+    let [of_poses, of_boxes] = [true, false].map(noise_of);
+    assert!(ratios(&of_poses).iter().all(|ratio| *ratio > 3.0), "{of_poses:?}");
+    assert!(ratios(&of_boxes).iter().all(|ratio| *ratio < 1.0 / 3.0), "{of_boxes:?}");
+    assert!((0.7..1.3).contains(&(of_poses.position_m / OFF_SHARE)), "{of_poses:?}");
+    assert!((0.7..1.3).contains(&(of_boxes.box_share / OFF_SHARE)), "{of_boxes:?}");
 }

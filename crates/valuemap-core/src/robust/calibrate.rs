@@ -3,8 +3,9 @@
 //! The size of the errors by restricted maximum likelihood: the parameters that make the residuals of a sample of well
 //! supported labels most likely, positions marginalised. Depth tells errors of position from those in pixels, and box
 //! size the part that grows with it; what is rotation and what is detection, residuals of one focal length do not tell,
-//! so each gets half. How much of the pose error a pass shares shows only where passes meet: it is what makes the
-//! positions that the passes of a label would give it alone differ as much as they do.
+//! so each gets half, until images that show several objects tell ([`split`](mod@super::split)). How much of the pose
+//! error a pass shares shows only where passes meet: it is what makes the positions that the passes of a label would
+//! give it alone differ as much as they do.
 
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
@@ -47,8 +48,8 @@ const HUBER_SIGMAS: f64 = 1.345;
 
 /// What is searched for, and where: least and most. Boxes of objects of one size grow as errors of position do, with one over
 /// the distance: a detector that is off by more than this share of its boxes is not one, what is more is the position's.
-const DETECTION_PX: (f64, f64) = (0.05, 30.0);
-const BOX_SHARE: (f64, f64) = (1e-3, 0.15);
+pub(super) const DETECTION_PX: (f64, f64) = (0.05, 30.0);
+pub(super) const BOX_SHARE: (f64, f64) = (1e-3, 0.15);
 const POSITION_M: (f64, f64) = (1e-4, 5.0);
 /// Shared errors over own errors of a pose.
 const DRIFT_RATIO: (f64, f64) = (0.1, 1000.0);

@@ -175,8 +175,9 @@ impl Look {
     }
 
     /// The look, which counts with a weight, with the error that its image has for itself added to the detection's: mixed so that
-    /// both residuals are independent, with variance 1. Only for the one look of an image; nothing if numbers overflow.
-    fn whitened(&self, weight: f64) -> Option<Self> {
+    /// both residuals are independent, with variance 1; and the determinant of their covariance, px⁴. Only for the one look of an image; nothing if
+    /// numbers overflow.
+    fn whitened(&self, weight: f64) -> Option<(Self, f64)> {
         let own = self.own_sigma.each();
         let scaled = [0, 1].map(|axis| self.by_pose(axis).component_mul(&own));
         let detection = self.detection_px2 / weight;
@@ -191,7 +192,7 @@ impl Look {
         white.by_point[1] = (self.by_point[1] - white.by_point[0] * tie) / second;
         white.by_turn[1] = (self.by_turn[1] - white.by_turn[0] * tie) / second;
         white.detection_px2 = 1.0;
-        (first * second > 0.0).then_some(white)
+        (first * second > 0.0).then_some((white, (first * second).powi(2)))
     }
 
     /// The look with a pose error, m and rad, taken out that is known but for some remainder, which then is the drift.
@@ -291,6 +292,8 @@ pub struct Drive<'a> {
     pub normals: Normals,
     looks: &'a [Look],
     segments: Vec<Solved>,
+    /// What the errors that images have for themselves add to the logarithm of the determinant.
+    ln_determinant_of_images: f64,
 }
 
 /// What is said about the pose error of a segment, in sigmas of the drift: by the looks of the segment, or about its drift by all before.
@@ -339,6 +342,7 @@ impl<'a> Drive<'a> {
         // The prior of the first segment: drifts are counted in their own sigmas.
         let mut carried = Segment { information: Matrix6::identity(), ..Segment::nothing() };
         let mut segments = Vec::new();
+        let mut ln_determinant_of_images = 0.0;
         let mut start = 0;
         while start < looks.len() {
             let end = start + segment_length(&looks[start..]);
@@ -349,7 +353,7 @@ impl<'a> Drive<'a> {
                 if image[0].own_sigma == Sigmas::NONE {
                     image.iter().zip(weights).for_each(|(look, &weight)| segment.add(look, weight, &mut normals));
                 } else {
-                    segment.add_image(image, weights, &mut normals);
+                    ln_determinant_of_images += segment.add_image(image, weights, &mut normals);
                 }
                 at += image.len();
             }
@@ -367,10 +371,10 @@ impl<'a> Drive<'a> {
             carried = next;
             start = end;
         }
-        Some(Self { normals, looks, segments })
+        Some(Self { normals, looks, segments, ln_determinant_of_images })
     }
 
-    /// Logarithm of the determinant of the covariance of the residuals, px⁴ a look; of looks by themselves.
+    /// Logarithm of the determinant of the covariance of the residuals, px⁴ a look, as if all counted alike.
     #[must_use]
     pub fn log_determinant(&self) -> f64 {
         let of_looks: f64 = self.looks.iter().map(|look| 2.0 * look.detection_px2.ln()).sum();
@@ -378,7 +382,7 @@ impl<'a> Drive<'a> {
             let of_own = segment.own.as_ref().map_or(0.0, |own| own.ln_determinant);
             segment.information.determinant.ln() - 6.0 * segment.stiffness.ln() + of_own
         };
-        of_looks + self.segments.iter().map(of_segment).sum::<f64>()
+        of_looks + self.ln_determinant_of_images + self.segments.iter().map(of_segment).sum::<f64>()
     }
 
     /// Residuals, px, after the most probable error of the segment is taken out, in the order of the looks.
@@ -475,7 +479,7 @@ impl OneLook {
 fn own_error(looks: &[Look], weights: &[f64], drift: &Vector6) -> Option<Vector6> {
     let own = looks[0].own_sigma.each();
     if let ([look], [weight]) = (looks, weights) {
-        let white = look.whitened(*weight)?;
+        let (white, _) = look.whitened(*weight)?;
         let left = white.without(drift);
         let gradient = white.by_pose(0) * left.x + white.by_pose(1) * left.y;
         return Some(own.component_mul(&own.component_mul(&gradient)));
@@ -529,13 +533,12 @@ impl Segment {
         self.gradient += Vector6::new(shift.x, shift.y, shift.z, turn.x, turn.y, turn.z);
     }
 
-    /// Add the looks of one image, its own error taken out.
-    fn add_image(&mut self, looks: &[Look], weights: &[f64], normals: &mut Normals) {
+    /// Add the looks of one image, its own error taken out; returns what that adds to the logarithm of the determinant.
+    fn add_image(&mut self, looks: &[Look], weights: &[f64], normals: &mut Normals) -> f64 {
         if let ([look], [weight]) = (looks, weights) {
-            if let Some(look) = look.whitened(*weight) {
-                self.add(&look, 1.0, normals);
-            }
-            return;
+            let Some((white, determinant)) = look.whitened(*weight) else { return 0.0 };
+            self.add(&white, 1.0, normals);
+            return (determinant * weight * weight).ln() - 2.0 * look.detection_px2.ln();
         }
         let (mut of_pose, mut gradient) = (Matrix6::zeros(), Vector6::zeros());
         let mut crosses: Vec<(usize, Matrix3x6)> = Vec::with_capacity(looks.len());
@@ -554,7 +557,7 @@ impl Segment {
             crosses.push((look.label, cross));
         }
         let (own, drift) = (looks[0].own_sigma.each(), looks[0].drift_sigma.each());
-        let Some(known) = Inverse::of(&(Matrix6::identity() + scaled(&of_pose, &own))) else { return };
+        let Some(known) = Inverse::of(&(Matrix6::identity() + scaled(&of_pose, &own))) else { return 0.0 };
         // The covariance of the image's own error, once its looks are known.
         let error = scaled(&known.matrix, &own);
         normals.square -= gradient.dot(&product(&error, &gradient));
@@ -573,6 +576,7 @@ impl Segment {
         }
         self.information += scaled(&product(&of_pose, &kept), &drift);
         self.gradient += drift.component_mul(&product(&kept.transpose(), &gradient));
+        known.determinant.ln()
     }
 
     fn add_cross(&mut self, label: usize, cross: &Matrix3x6) {

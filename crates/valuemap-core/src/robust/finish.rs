@@ -44,7 +44,7 @@ fn together(model: &Model<'_>, objects: &[Object], place: &[usize], contest: &Co
 }
 
 /// The objects around those with the most votes, each object in one place.
-fn places(objects: &[Object], radius_m: f64) -> Vec<Vec<usize>> {
+pub(super) fn places(objects: &[Object], radius_m: f64) -> Vec<Vec<usize>> {
     let tree = by_place(objects);
     let mut order: Vec<usize> = (0..objects.len()).collect();
     order.sort_by_key(|&i| (std::cmp::Reverse(objects[i].votes.len()), i));

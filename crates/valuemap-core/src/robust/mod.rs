@@ -7,7 +7,7 @@
 //! 5. [`finish`](mod@finish): positions and covariances, objects of a place together ([`estimate`](mod@estimate), [`drift`], [`contest`]).
 //!    [`few`]: what one or two looks make. [`switches`]: what the pictures show to be another object is left out.
 //! 6. [`likeliest`], [`calibrate`]: the noise itself is estimated from the residuals; [`learn`](mod@learn): rates, sizes and clutter are;
-//!    [`confusion`]: what classes are taken for.
+//!    [`confusion`]: what classes are taken for; [`split`](mod@split): what of the noise is the poses' and what the detections'.
 
 pub mod assign;
 pub mod births;
@@ -44,6 +44,7 @@ pub mod search;
 pub mod seen;
 pub mod sizes;
 mod spd;
+pub mod split;
 pub mod switches;
 
 use std::sync::Arc;
@@ -196,6 +197,7 @@ pub fn self_calibrate(
     let mut model = Model::new(scene, &noise, settings);
     let wide = sample::places(scene, CLASS_RAYS, WIDE * settings.viability.max_range_m);
     let objects = learn_from(&mut model, &wide, progress)?;
+    let noise = split::split(&model, known, &objects);
     let is_small = !is_part && scene.usable_rays().len() <= MOST_RAYS;
     let is_deep = is_small || {
         // A part of the places says it, unless it is a near thing.

@@ -302,10 +302,43 @@ fn fingerprint(object: &Object) -> u64 {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Vector3;
+    use nalgebra::{Isometry3, Vector3};
 
     use super::*;
     use crate::street;
+
+    #[test]
+    fn what_a_visit_shows_of_one_of_two_neighbors_alone_goes_to_that_one() -> Result<(), Halt> {
+        let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
+        let both = [Vector3::new(30.0, 4.0, 3.0), Vector3::new(30.0, 5.0, 3.0)];
+        // Two drives see both, and one that crosses them sees the second alone, which is as far ahead of it as the first is of the others.
+        let crossing = Isometry3::new(Vector3::new(34.0, -25.0, 0.0), Vector3::z() * std::f64::consts::FRAC_PI_2);
+        let drive = |i: usize| street::street(10, 2.0, &both, &errors[7 * i..]);
+        let scene = street::joined(vec![
+            drive(0),
+            drive(1),
+            street::moved(street::street(10, 2.0, &both[..1], &errors[14..]), &crossing),
+        ]);
+        let mut model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let rays = scene.usable_rays();
+        let (of_both, of_one): (Vec<u32>, Vec<u32>) = rays.iter().partition(|&&ray| scene.view(ray).pass < 2);
+        let every_other =
+            |rays: &[u32], first: usize| -> Vec<u32> { rays.iter().copied().skip(first).step_by(2).collect() };
+        let votes = |i: usize| [every_other(&of_both, i), every_other(&of_one, i)].concat();
+        let of = |model: &Model<'_>| -> Vec<Object> {
+            (0..2).filter_map(|i| object(model, &lookout, votes(i), both[i], Vec::new())).collect()
+        };
+        let begun = of(&model);
+        super::super::learn::learn(&mut model, &lookout, &rays, &begun);
+        let index = RayIndex::new(&scene, &model.spreads, street::GATE_SIGMAS, rays.iter().copied());
+        let (model, mut tried) = (&model, TriedPairs::default());
+        let (found, is_better) = rearrange_pairs(model, &lookout, &index, of(model), &mut tried, &Progress::default())?;
+        assert!(is_better);
+        assert_eq!(found[0].votes, every_other(&of_both, 0));
+        assert_eq!(found[1].votes, [every_other(&of_both, 1), of_one].concat());
+        Ok(())
+    }
 
     #[test]
     fn what_an_object_of_many_visits_may_not_take_it_could_not_keep() -> Result<(), Halt> {

@@ -1,0 +1,214 @@
+//! What the objects of an image have in common: how much of the noise is the pose's, and how much each detection's.
+//!
+//! At one object alone they cannot be told apart: an error of the position moves a box by `f / depth`, one that grows with the box of an object of one
+//! size does as well, and a rotation is as good as an error of so many pixels. But a pose moves all objects of an image alike, and detections are each off by
+//! themselves. So the two shares are those that make the residuals of the objects of a place, taken together, likeliest (restricted
+//! maximum likelihood, positions and drift marginalised). How large the noise is in all stays as it is.
+
+use nalgebra::Vector3;
+use rayon::prelude::*;
+
+use super::calibrate::{BOX_SHARE, DETECTION_PX, Known};
+use super::drift::{Drive, Look, Normals, Vantage};
+use super::energy::Object;
+use super::estimate::is_one_visit;
+use super::finish::places;
+use super::model::Model;
+use super::noise::Noise;
+
+/// Votes that serve, about: of a thousand images that show several objects each, a share is known to a few hundredths.
+const SAMPLE_VOTES: usize = 5_000;
+/// Shares are tried in so many steps first.
+const STEPS: usize = 5;
+/// Then so many times on both sides of the best, each time in steps half as long: to a hundredth.
+const HALVINGS: usize = 4;
+/// The two shares are sought in turn, so many times.
+const TURNS: usize = 2;
+/// The share of the pose is no less than this, and no more than 1 less this: no noise is no density.
+const LEAST_SHARE: f64 = 0.02;
+/// Shares are taken for what they seem if minus twice the logarithm of the likelihood falls by more than this: what two parameters gain by chance (Akaike).
+const LEAST_FALL: f64 = 4.0;
+/// Residuals beyond this many sigmas count less, in proportion (Huber).
+const HUBER_SIGMAS: f64 = 2.0;
+
+/// Objects of one place, with what their votes see.
+struct Place {
+    /// Object of the place and ray of each vote, by pass and image.
+    votes: Vec<(usize, u32)>,
+    weights: Vec<f64>,
+    points: Vec<Vector3<f64>>,
+}
+
+/// The noise of a model with the shares of pose and detection that the objects of images tell; `known` parts stay as they are.
+#[must_use]
+pub fn split(model: &Model<'_>, known: Known, objects: &[Object]) -> Noise {
+    let (noise, scene) = (*model.noise, model.scene);
+    // Where poses state their errors, the shares of these are known as well.
+    let is_stated =
+        scene.usual(|view| view.position_sigma_m).is_some() || scene.usual(|view| view.rotation_sigma_rad).is_some();
+    if known.detection || is_stated {
+        return noise;
+    }
+    let places = sample(model, objects);
+    let Some(scale) = Scale::of(model, &places) else { return noise };
+    let value = |noise: &Noise| -> f64 {
+        // Summed in the order of the places, so that threads do not change the result.
+        let each: Vec<Option<f64>> = places.par_iter().map(|place| place.minus_log_likelihood(model, noise)).collect();
+        each.iter().map(|value| value.unwrap_or(f64::INFINITY)).sum()
+    };
+    let before = value(&noise);
+    let mut best = (before, noise);
+    for _ in 0..TURNS {
+        if !known.position {
+            best = least(best, scale.least_of_position(&noise), &|share| scale.with_position(&best.1, share), &value);
+        }
+        if !known.rotation {
+            best = least(best, LEAST_SHARE, &|share| scale.with_rotation(&best.1, share), &value);
+        }
+    }
+    if before - best.0 > LEAST_FALL { best.1 } else { noise }
+}
+
+/// The noise with the least value among those of shares from `lowest` on, or the one that is the best so far.
+fn least(
+    mut best: (f64, Noise),
+    lowest: f64,
+    noise_of: &dyn Fn(f64) -> Noise,
+    value: &dyn Fn(&Noise) -> f64,
+) -> (f64, Noise) {
+    let highest = 1.0 - LEAST_SHARE;
+    let mut at = None;
+    let mut attempt = |share: f64, at: &mut Option<f64>| {
+        let noise = noise_of(share);
+        let found = value(&noise);
+        if found < best.0 {
+            (best, *at) = ((found, noise), Some(share));
+        }
+    };
+    let step = (highest - lowest) / STEPS as f64;
+    for i in 0..=STEPS {
+        attempt(lowest + step * i as f64, &mut at);
+    }
+    let mut reach = 0.5 * step;
+    for _ in 0..HALVINGS {
+        let Some(middle) = at else { break };
+        for share in [middle - reach, middle + reach] {
+            if (lowest..=highest).contains(&share) {
+                attempt(share, &mut at);
+            }
+        }
+        reach *= 0.5;
+    }
+    best
+}
+
+/// What turns pixels into metres and radians.
+struct Scale {
+    /// Mean squared focal length, px².
+    px2: f64,
+    /// Median size of objects, m.
+    size_m: f64,
+}
+
+impl Scale {
+    /// That of the votes of some places; nothing if there are none.
+    fn of(model: &Model<'_>, places: &[Place]) -> Option<Self> {
+        let votes =
+            || places.iter().flat_map(|place| place.votes.iter().map(|&(label, ray)| (place.points[label], ray)));
+        let mut sizes: Vec<f64> = votes()
+            .map(|(point, ray)| {
+                let depth_m = model.scene.ray(ray).project(&point).z;
+                model.scene.box_px[ray as usize] * depth_m / model.scene.scale2[ray as usize].sqrt()
+            })
+            .filter(|size| size.is_finite() && *size > 0.0)
+            .collect();
+        if sizes.is_empty() {
+            return None;
+        }
+        let middle = sizes.len() / 2;
+        let size_m = *sizes.select_nth_unstable_by(middle, f64::total_cmp).1;
+        let px2 = votes().map(|(_, ray)| model.scene.scale2[ray as usize]).sum::<f64>() / votes().count() as f64;
+        Some(Self { px2, size_m })
+    }
+
+    /// What grows as objects come near, m².
+    fn near_m2(&self, noise: &Noise) -> f64 {
+        noise.position_m.powi(2) + (noise.box_share * self.size_m).powi(2)
+    }
+
+    /// The least share of it that may be the position's: a detector is not off by more than so much of its boxes.
+    fn least_of_position(&self, noise: &Noise) -> f64 {
+        LEAST_SHARE.max(1.0 - (BOX_SHARE.1 * self.size_m).powi(2) / self.near_m2(noise))
+    }
+
+    /// Noise of which the position has a share of what grows as objects come near.
+    fn with_position(&self, noise: &Noise, share: f64) -> Noise {
+        let near_m2 = self.near_m2(noise);
+        Noise {
+            position_m: (share * near_m2).sqrt(),
+            box_share: ((1.0 - share) * near_m2).sqrt() / self.size_m,
+            ..*noise
+        }
+    }
+
+    /// Noise of which the rotation has a share of what does not.
+    fn with_rotation(&self, noise: &Noise, share: f64) -> Noise {
+        let far_px2 = noise.detection_px.powi(2) + self.px2 * noise.rotation_rad.powi(2);
+        Noise {
+            detection_px: ((1.0 - share) * far_px2).sqrt().max(DETECTION_PX.0),
+            rotation_rad: (share * far_px2 / self.px2).sqrt(),
+            ..*noise
+        }
+    }
+}
+
+/// Places of which images show several objects, every so many of them.
+fn sample(model: &Model<'_>, objects: &[Object]) -> Vec<Place> {
+    let places = places(objects, model.settings.viability.max_range_m);
+    let votes = |place: &Vec<usize>| place.iter().map(|&i| objects[i].votes.len()).sum::<usize>();
+    let several: Vec<&Vec<usize>> = places.iter().filter(|place| place.len() > 1).collect();
+    let every = several.iter().map(|place| votes(place)).sum::<usize>().div_ceil(SAMPLE_VOTES).max(1);
+    let of = |place: &Vec<usize>| Place::of(model, objects, place);
+    let served = several.into_iter().step_by(every).map(of);
+    served.filter(|place| place.minus_log_likelihood(model, model.noise).is_some()).collect()
+}
+
+impl Place {
+    fn of(model: &Model<'_>, objects: &[Object], members: &[usize]) -> Self {
+        let mut counted: Vec<((usize, u32), f64)> = Vec::new();
+        for (label, &i) in members.iter().enumerate() {
+            let weight = |chi2: &f64| (HUBER_SIGMAS / chi2.sqrt()).min(1.0);
+            counted.extend(
+                objects[i].votes.iter().zip(&objects[i].fit.chi2).map(|(&ray, chi2)| ((label, ray), weight(chi2))),
+            );
+        }
+        counted.sort_by_key(|&((label, ray), _)| (model.scene.view(ray).pass, ray, label));
+        let (votes, weights) = counted.into_iter().unzip();
+        Self { votes, weights, points: members.iter().map(|&i| objects[i].fit.point).collect() }
+    }
+
+    /// Minus twice the logarithm of the restricted likelihood of all residuals together, up to a constant; nothing where numbers overflow or the
+    /// votes fix no position.
+    fn minus_log_likelihood(&self, model: &Model<'_>, noise: &Noise) -> Option<f64> {
+        let scene = model.scene;
+        let mut looks: Vec<Look> = Vec::with_capacity(self.votes.len());
+        for &(label, ray) in &self.votes {
+            let vantage = Vantage::of(scene, noise, ray).with_sight_of(scene, model.noise, ray);
+            looks.push(vantage.look(label, &self.points[label])?);
+        }
+        let mut all = Normals::nothing(self.points.len());
+        let mut value = 0.0;
+        let mut first = 0;
+        for visit in self.votes.chunk_by(|a, b| is_one_visit(scene.view(a.1), scene.view(b.1))) {
+            let of_visit = first..first + visit.len();
+            let drive = Drive::along(&looks[of_visit.clone()], &self.weights[of_visit], self.points.len())?;
+            all.information += &drive.normals.information;
+            all.gradient += &drive.normals.gradient;
+            value += drive.normals.square + drive.log_determinant();
+            first += visit.len();
+        }
+        let cholesky = all.information.cholesky()?;
+        value += 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
+        Some(value - all.gradient.dot(&cholesky.solve(&all.gradient)))
+    }
+}
