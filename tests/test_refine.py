@@ -19,7 +19,7 @@ from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import Dataset, rows_of, write_dataset
 from valuemap.drives import Drives, find_drives, in_driving_order
 from valuemap.engine.threads import ThreadEngine
-from valuemap.refine import FITS_NO_BETTER, Refined, adjust, expose_rows, poses, refine_poses, tracks
+from valuemap.refine import FITS_NO_BETTER, Refined, adjust, expose_rows, poses, refine_again, refine_poses, tracks
 from valuemap.refine.adjust import Adjustment, Scales
 from valuemap.refine.estimate import cut_into_segments, delay_together, lay, mounts_alone, prices
 from valuemap.refine.footage import Footage, Sigmas, _within, find_motion, gather, in_working_frame
@@ -116,6 +116,25 @@ def drop_images(dataset: Dataset, like: Dataset) -> Dataset:
     names = set(like.images.name.to_pylist())
     rows = np.array([name in names for name in dataset.images.name.to_pylist()])
     return dataclasses.replace(dataset, images=dataset.images.take(np.flatnonzero(rows)))
+
+
+def test_a_map_tells_better_than_what_single_drives_see_how_drives_lie_to_each_other() -> None:
+    # Of two lights beside each other a drive alone does not know which another one saw.
+    faulty, clean = (simulate(dataclasses.replace(CITY, pass_shift_m=shift_m), seed=7) for shift_m in (1.5, 0.0))
+    at_first = refine_poses(faulty, valuemap.MapConfig())
+    at_last = valuemap.build_map(faulty).corrected
+    assert at_last is not None
+    assert errors(at_first.dataset, clean)[0] > 0.4
+    assert errors(at_last, clean)[0] < 0.25
+
+
+def test_poses_are_estimated_with_a_map_only_where_some_were_corrected() -> None:
+    faulty, result = map_of_shifted_city()
+    refined = refine_poses(faulty, valuemap.MapConfig())
+    as_given = Refined(faulty, {"found": "nothing"})
+    assert refine_again(faulty, as_given, result.labels, result.votes, valuemap.MapConfig()) is as_given
+    none = result.labels.take(np.zeros(len(result.labels), np.bool_))
+    assert refine_again(faulty, refined, none, result.votes, valuemap.MapConfig()) is refined
 
 
 def test_what_drives_are_off_by_is_found_before_their_objects_are() -> None:
@@ -333,8 +352,9 @@ def test_rows_names_and_ids_change_nothing_of_what_is_found() -> None:
     shuffled = dataclasses.replace(
         faulty, images=images.replace(image_id=np.arange(len(order))), detections=detections, truth_detections=None
     )
-    other = refine_poses(shuffled, valuemap.MapConfig()).dataset.images
-    assert np.array_equal(refined.dataset.images.cam_from_world_m[order], other.cam_from_world_m)
+    other = valuemap.build_map(shuffled).corrected
+    assert other is not None
+    assert np.array_equal(refined.dataset.images.cam_from_world_m[order], other.images.cam_from_world_m)
 
 
 def test_constellations_tell_how_drives_lie_to_each_other() -> None:

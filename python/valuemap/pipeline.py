@@ -25,7 +25,7 @@ from valuemap.notes import Findings, cameras_not_upright, find_notes, heights_no
 from valuemap.partition import partition_images
 from valuemap.portions import rows_on_disk
 from valuemap.progress import Progress, silent
-from valuemap.refine import FITS_NO_BETTER, Refined, expose_rows, refine_poses
+from valuemap.refine import FITS_NO_BETTER, Refined, expose_rows, refine_again, refine_poses
 from valuemap.rejected import rejected_of_map
 from valuemap.remote import Place, UrlPath
 from valuemap.robust import Calibration, calibration_to_json
@@ -222,9 +222,13 @@ def _proven(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, 
             return refined
         found = compared(dataset, refined.dataset, refined.record.get("parameters", 0))
         record = {**refined.record, **found.figures()}
-        if found.is_better:
-            return replace(refined, record=record)
-        return Refined(dataset, {**record, "found": "nothing", "because": FITS_NO_BETTER})
+        if not found.is_better:
+            return Refined(dataset, {**record, "found": "nothing", "because": FITS_NO_BETTER})
+        # A map tells better than landmarks of single drives which detection shows which object.
+        source = InMemory(refined.dataset, config)
+        labels, votes, *_ = _robust(source, config, _Stages(), ThreadEngine(threads), progress)
+        again = refine_again(dataset, refined, labels, votes, config, progress=progress)
+        return replace(again, record={**record, **again.record})
 
 
 def _with_rejected(result: Map, read: Callable[[], Dataset], stages: _Stages) -> Map:

@@ -39,6 +39,8 @@ _TOLD_RAD = math.radians(0.5)
 """Drives whose turns are less sure than this say nothing of how much drives are turned."""
 _ALONE = (4.0, 3.0, 2.0, 2.0)
 _DELAYS_S = 0.02 * np.arange(-15, 16)
+_AGAIN = 2
+"""Times that drives are cut anew where it is known which detection shows which object, as offsets move cuts."""
 _COARSE, _FINE = (6.0, 6.0, 4.0, 4.0, 3.0, 2.0, 2.0), (2.0, 1.5, 1.0, 1.0, 1.0)
 
 
@@ -93,26 +95,32 @@ def lay(landmarks: Landmarks, footage: Footage, hints: Hints) -> Marks | None:
     return Marks(landmarks, covariance, register(landmarks, covariance, evidence))
 
 
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """What trajectories alone tell of where poses jump: where they do, where they may, and what is proven of it."""
+
+    seen_cuts: Segments
+    hints: Hints
+    jumps: Jumps
+
+
 def estimate(
     footage: Footage,
     marks: Marks,
     config: MapConfig,
+    told: Trajectories,
     *,
-    seen_cuts: Segments,
-    hints: Hints,
-    jumps: Jumps,
     known: tuple[Segments, Floats] | None = None,
     turned_rad: Floats | None = None,
     late_s: float = 0.0,
 ) -> Estimate | None:
     """Estimate everything that drives may be wrong by, None where there is too little that drives share.
 
-    `seen_cuts` are where the trajectory itself jumps, `hints` where it may. Where segments and their offsets (L, 3) are
-    `known` about, or how the cameras of drives are turned (D, 3), or how late poses are, the landmarks are those of the
-    footage laid so.
+    Where segments and their offsets (L, 3) are `known` about, or how the cameras of drives are turned (D, 3), or how
+    late poses are, the landmarks are those of the footage laid so.
     """
     landmarks, registration = marks.landmarks, marks.registration
-    segments, offset = _first_segments(footage, landmarks, registration, seen_cuts)
+    segments, offset = _first_segments(footage, landmarks, registration, told.seen_cuts)
     if known is not None:
         segments, offset = _added(segments, offset, *known)
     thing_of_mark, class_code, size_m, points = _objects(landmarks, registration)
@@ -120,36 +128,47 @@ def estimate(
     counts = (len(segments), footage.drives.count, footage.drives.count) + (footage.cameras,) * 3
     state = State.zero(points, len(footage.chain.drive), len(footage.row), counts)
     state.constants[OFFSET][:] = offset
-    links = jumps.links(segments, set())
     if turned_rad is not None:
         state.constants[MOUNT][:] = turned_rad
     state.constants[CAMERA_DELAY][:] = late_s
-    noise = Noise()
-    sigma_px = _sigmas(footage, noise)
-    segment = segments.of(footage.drives.pass_code, footage.drives.order)
+    noise, links = Noise(), told.jumps.links(segments, set())
+    errors = (noise, _sigmas(footage, noise), WIDE)
+    now = Estimate(detection, thing, class_code, size_m, segments, links, state, *errors, len(landmarks))
     range_m = _RANGES * config.vote.max_range_m
-    scales = WIDE
-    tolerances: tuple[float, ...] = _COARSE
-    for round_number in range(4):
-        seen = footage.observe(detection, thing, segment, sigma_px)
-        problem = Adjustment(seen, footage.chain, scales, everything(footage, segments), len(class_code), links)
-        state = adjust(problem, state, tolerances=tolerances)
-        noise = fit_noise(seen, state, noise)
-        sigma_px = _sigmas(footage, noise)
-        scales = _grown(own_scales(footage, noise, scales), state)
-        if round_number < 3:
-            segments, links, state = _cut(footage, seen, state, segments, seen_cuts, hints, jumps)
-            segment = segments.of(footage.drives.pass_code, footage.drives.order)
-            seen = footage.observe(detection, thing, segment, sigma_px)
-        detection, thing, class_code, size_m, state = _anew(
-            footage, state, class_code, size_m, segment, sigma_px, range_m, detection, thing
-        )
-        if not len(thing):
+    for tolerances in (_COARSE, _FINE, _FINE):
+        now = _associated(footage, _cut(footage, _adjusted(footage, now, tolerances), told), range_m)
+        if not len(now.thing):
             return None
-        tolerances = _FINE
-    return Estimate(
-        detection, thing, class_code, size_m, segments, links, state, noise, sigma_px, scales, len(landmarks)
-    )
+    now = _associated(footage, _adjusted(footage, now, _FINE), range_m)
+    return now if len(now.thing) else None
+
+
+def estimate_again(footage: Footage, found: Estimate, told: Trajectories) -> Estimate:
+    """Estimate everything anew with the objects and the detections that an estimate has, about where it has them."""
+    now = replace(found, state=triangulate(_seen(footage, found), found.state))
+    for _ in range(_AGAIN):
+        now = _cut(footage, _adjusted(footage, now, _FINE), told)
+    return _adjusted(footage, now, _FINE)
+
+
+def _seen(footage: Footage, now: Estimate) -> Observations:
+    return footage.observe(now.detection, now.thing, segments_of(footage, now.segments), now.sigma_px)
+
+
+def segments_of(footage: Footage, segments: Segments) -> Ints:
+    """Return the segment of each keyframe."""
+    return segments.of(footage.drives.pass_code, footage.drives.order)
+
+
+def _adjusted(footage: Footage, now: Estimate, tolerances: tuple[float, ...]) -> Estimate:
+    """Return an estimate with all unknowns adjusted, then its noise and drift."""
+    seen = _seen(footage, now)
+    free = everything(footage, now.segments)
+    problem = Adjustment(seen, footage.chain, now.scales, free, len(now.class_code), now.links)
+    state = adjust(problem, now.state, tolerances=tolerances)
+    noise = fit_noise(seen, state, now.noise)
+    scales = _grown(own_scales(footage, noise, now.scales), state)
+    return replace(now, state=state, noise=noise, sigma_px=_sigmas(footage, noise), scales=scales)
 
 
 def mounts_alone(footage: Footage, landmarks: Landmarks) -> Floats:
@@ -341,26 +360,19 @@ def fit_noise(seen: Observations, state: State, noise: Noise) -> Noise:
     return Noise(px, min(noise.share * factor, 0.3), min(noise.image_m * factor, 0.5))
 
 
-def _cut(
-    footage: Footage,
-    seen: Observations,
-    state: State,
-    segments: Segments,
-    seen_cuts: Segments,
-    hints: Hints,
-    jumps: Jumps,
-) -> tuple[Segments, Links, State]:
+def _cut(footage: Footage, now: Estimate, told: Trajectories) -> Estimate:
     """Cut drives anew where their poses jump, given the objects: exact segmentation of each drive's images.
 
     Jumps that trajectories prove are taken back first. They stay cuts; where one more cut pays there, the jump is
     another one than the trajectory says.
     """
-    shift, information, image_of = _apparent_shift(footage, seen, state)
+    state, segments, jumps = now.state, now.segments, told.jumps
+    shift, information, image_of = _apparent_shift(footage, _seen(footage, now), state)
     drives = footage.drives
     begins: list[tuple[int, int]] = []
     offsets: list[Floats] = []
     refuted: set[tuple[int, int]] = set()
-    segment_now = segments.of(drives.pass_code, drives.order)
+    segment_now = segments_of(footage, segments)
     for drive in range(drives.count):
         rows = np.flatnonzero(drives.pass_code[image_of] == drive)
         rows = rows[np.argsort(drives.order[image_of[rows]], kind="stable")]
@@ -374,9 +386,9 @@ def _cut(
         mended = jumps.offset_m[jumps.segments.of(np.full(len(rows), drive), order), :2]
         value = shift[rows, :2] - mended
         precision = np.linalg.inv(np.linalg.inv(information[rows])[:, :2, :2])
-        cut_at = seen_cuts.of(drives.pass_code[image_of[rows]], order)
+        cut_at = told.seen_cuts.of(drives.pass_code[image_of[rows]], order)
         is_shown = np.diff(cut_at, prepend=cut_at[0]) != 0
-        starts = cut_into_segments(value, precision, prices(hints.between(drive, order), is_shown))
+        starts = cut_into_segments(value, precision, prices(told.hints.between(drive, order), is_shown))
         cuts: dict[int, Floats] = {}
         for number, start in enumerate(starts):
             end = starts[number + 1] if number + 1 < len(starts) else len(rows)
@@ -402,7 +414,8 @@ def _cut(
     constants = (np.array(offsets), *state.constants[1:])
     drift = state.drift.copy()
     drift[:, :3] = 0.0
-    return new, jumps.links(new, refuted), replace(state, constants=constants, drift=drift)
+    state = replace(state, constants=constants, drift=drift)
+    return replace(now, segments=new, links=jumps.links(new, refuted), state=state)
 
 
 def _apparent_shift(footage: Footage, seen: Observations, state: State) -> tuple[Floats, Floats, Ints]:
@@ -470,31 +483,29 @@ def cut_into_segments(value: Floats, precision: Floats, price: Floats) -> list[i
     return starts[::-1]
 
 
-def _anew(
-    footage: Footage,
-    state: State,
-    class_code: Ints,
-    size_m: Floats,
-    segment: Ints,
-    sigma_px: Sigmas,
-    range_m: float,
-    detection: Ints,
-    thing: Ints,
-) -> tuple[Ints, Ints, Ints, Floats, State]:
+def _associated(footage: Footage, now: Estimate, range_m: float) -> Estimate:
     """Merge objects that are one, give all detections their objects anew, and drop what too few see."""
-    count = len(state.point_in_world_m)
-    seen = footage.observe(detection, thing, segment, sigma_px)
-    state = triangulate(seen, state, rounds=3)
+    count, class_code, size_m = len(now.state.point_in_world_m), now.class_code, now.size_m
+    seen = _seen(footage, now)
+    state = triangulate(seen, now.state, rounds=3)
     number = merge_objects(seen, state, seen.image, class_code, WIDE.drift_m)
     seen = replace(seen, thing=number[seen.thing])
     state = triangulate(seen, state, rounds=4)
     alive = np.bincount(seen.thing, minlength=count) >= _LEAST_VOTES
     state, class_code, size_m = _kept(state, alive), class_code[alive], size_m[alive]
-    detection, thing = associate(footage, state, class_code, size_m, segment, sigma_px, range_m)
+    segment = segments_of(footage, now.segments)
+    detection, thing = associate(footage, state, class_code, size_m, segment, now.sigma_px, range_m)
     alive = np.bincount(thing, minlength=len(class_code)) >= _LEAST_VOTES
     new = np.cumsum(alive) - 1
     stays = alive[thing]
-    return detection[stays], new[thing[stays]], class_code[alive], size_m[alive], _kept(state, alive)
+    return replace(
+        now,
+        detection=detection[stays],
+        thing=new[thing[stays]],
+        class_code=class_code[alive],
+        size_m=size_m[alive],
+        state=_kept(state, alive),
+    )
 
 
 def _kept(state: State, alive: Bools) -> State:

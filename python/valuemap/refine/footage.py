@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from valuemap.cameras import Rays, camera_poses, cast_rays, colmap_camera, rotation_of
+from valuemap.cameras import Rays, camera_centers, camera_poses, cast_rays, colmap_camera, rotation_of
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives
 from valuemap.refine.adjust import Chain
@@ -136,15 +136,25 @@ def in_working_frame(dataset: Dataset, drives: Drives, unit_m: float) -> tuple[D
 
     Every length below is in such units, so that a world of another scale, with a range of that scale, gives the same.
     """
-    axes = np.vstack([dataset.frame.east_north(), dataset.frame.up])
     rotation, center = camera_poses(dataset.images)
-    center = (center - np.median(center, axis=0)) @ axes.T / unit_m
+    center = points_in_working_frame(dataset, center, unit_m)
     sigma = dataset.images.position_sigma_m
-    images = with_poses(dataset.images, rotation @ axes.T, center).replace(
+    images = with_poses(dataset.images, rotation @ _axes(dataset).T, center).replace(
         position_sigma_m=None if sigma is None else sigma / unit_m
     )
     frame = replace(dataset.frame, up=(0.0, 0.0, 1.0), anchor=None)
     return replace(dataset, images=images, frame=frame), replace(drives, driven_m=drives.driven_m / unit_m)
+
+
+def points_in_working_frame(dataset: Dataset, point_in_world_m: Floats, unit_m: float) -> Floats:
+    """Return points (N, 3) of the world of a dataset in the frame that `in_working_frame` gives it."""
+    middle = np.median(camera_centers(dataset.images), axis=0)
+    return np.asarray((point_in_world_m - middle) @ _axes(dataset).T / unit_m)
+
+
+def _axes(dataset: Dataset) -> Floats:
+    """Return east, north and up in the world, as rows."""
+    return np.vstack([dataset.frame.east_north(), dataset.frame.up])
 
 
 def gather(dataset: Dataset, drives: Drives) -> Footage:

@@ -12,16 +12,34 @@ from threadpoolctl import threadpool_limits
 from valuemap.cameras import camera_poses, colmap_camera
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, rows_of
-from valuemap.drives import Drives, in_driving_order
+from valuemap.drives import Drives, InOrder, in_driving_order
 from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
-from valuemap.refine.estimate import Estimate, Marks, delay_together, estimate, lay, mounts_alone
-from valuemap.refine.footage import Footage, find_motion, gather, in_working_frame, moved_on, moving_late, with_poses
+from valuemap.refine.estimate import (
+    Estimate,
+    Marks,
+    Trajectories,
+    delay_together,
+    estimate,
+    estimate_again,
+    lay,
+    mounts_alone,
+)
+from valuemap.refine.footage import (
+    Footage,
+    find_motion,
+    gather,
+    in_working_frame,
+    moved_on,
+    moving_late,
+    points_in_working_frame,
+    with_poses,
+)
 from valuemap.refine.jumps import Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import find_landmarks
 from valuemap.refine.residuals import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
 from valuemap.refine.select import Selected, select
-from valuemap.tables import Bools, Floats
+from valuemap.tables import Bools, Floats, Labels, Votes
 
 USUAL_RANGE_M = 60.0
 """Lengths in this package are metres where `max_range_m` is this; they grow with it."""
@@ -43,12 +61,23 @@ FitsBetter = Callable[[Dataset, Dataset, int], bool]
 
 
 @dataclass(frozen=True, eq=False)
+class Found:
+    """What was estimated, and what of it is proven."""
+
+    footage: Footage
+    told: Trajectories
+    result: Estimate
+    selected: Selected | None
+
+
+@dataclass(frozen=True, eq=False)
 class Refined:
     """A dataset with better poses and cameras, or as it was; `record` says in `run.json` what was found."""
 
     dataset: Dataset
     record: dict[str, Any]
     is_corrected: bool = False
+    found: Found | None = None
 
 
 def refine_poses(
@@ -112,10 +141,72 @@ def _refined(
     if sample is None or _is_proven(found):
         found = _find(moved, drives, config, threads)
     progress("comparing drives", 2, 2)
+    return _corrected(dataset, ordered, found, unit_m)
+
+
+def refine_again(
+    dataset: Dataset, refined: Refined, labels: Labels, votes: Votes, config: MapConfig, *, progress: Progress = silent
+) -> Refined:
+    """Estimate anew what poses of drives are wrong by, with the objects of a map of the dataset that was corrected.
+
+    Landmarks of single drives are taken for each other where several lights stand beside each other, and then drives
+    are laid onto each other wrongly, by less than lights are apart. A map knows better which detection shows which.
+
+    Parameters
+    ----------
+    dataset
+        What `refine_poses` was given.
+    refined
+        What it made of it.
+    labels, votes
+        A map of that.
+    config
+        Ranges as in mapping.
+    progress
+        Called as progress(what, done, total).
+
+    Returns
+    -------
+    Refined
+        Where nothing was corrected, or nothing is proven with these objects, it is what was given.
+    """
+    before = refined.found
+    if before is None or before.selected is None or not len(labels):
+        return refined
+    progress("comparing drives", 0, 1)
+    with threadpool_limits(limits=1, user_api="blas"):
+        unit_m = config.vote.max_range_m / USUAL_RANGE_M
+        ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
+        footage = before.footage
+        # Rows of the dataset in driving order are the ids of the footage's detections.
+        thing = np.full(len(dataset.detections), -1)
+        thing[rows_of(votes.detection_id, ordered.detection_id)] = rows_of(votes.label_id, labels.label_id)
+        thing = thing[footage.dataset.detections.detection_id]
+        detection = np.flatnonzero(thing >= 0)
+        kinds, first, code = np.unique(thing[detection], return_index=True, return_inverse=True)
+        # Numbered along the drives, so that the order of labels does not show in the last digits.
+        along = np.argsort(first)
+        kinds, first, thing = kinds[along], first[along], np.argsort(along)[code]
+        points = points_in_working_frame(ordered.dataset, labels.position_in_world_m[kinds], unit_m)
+        start = replace(
+            before.result,
+            detection=detection,
+            thing=thing,
+            class_code=footage.rays.class_code[detection[first]].astype(np.int64),
+            size_m=np.full(len(kinds), np.nan),
+            state=replace(before.selected.state, point_in_world_m=points),
+        )
+        result = estimate_again(footage, start, before.told)
+        after = replace(before, result=result, selected=select(footage, result))
+        progress("comparing drives", 1, 1)
+        return _corrected(dataset, ordered, after, unit_m) if _is_proven(after) else refined
+
+
+def _corrected(dataset: Dataset, ordered: InOrder, found: Found | None, unit_m: float) -> Refined:
+    """Return a dataset corrected by what was proven of it `ordered`, in the order of its rows."""
     if found is None or found.selected is None:
         return Refined(dataset, {"found": "nothing", **_looked_at(found)})
     corrected = _apply(ordered.dataset, ordered.drives, found, found.selected, unit_m)
-    # Back in the order of the given rows.
     row = np.empty(len(dataset.images), np.int64)
     row[rows_of(ordered.image_id, dataset.images.image_id)] = np.arange(len(row))
     images = dataset.images.replace(
@@ -123,23 +214,14 @@ def _refined(
         cam_from_world_m=corrected.images.cam_from_world_m[row],
     )
     record = {**_describe(ordered.dataset, found, found.selected, unit_m), **_looked_at(found)}
-    return Refined(replace(dataset, images=images, cameras=corrected.cameras), record, is_corrected=True)
+    return Refined(replace(dataset, images=images, cameras=corrected.cameras), record, is_corrected=True, found=found)
 
 
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """What was estimated, and what of it is proven."""
-
-    footage: Footage
-    result: Estimate
-    selected: Selected | None
-
-
-def _is_proven(found: _Found | None) -> bool:
+def _is_proven(found: Found | None) -> bool:
     return found is not None and found.selected is not None
 
 
-def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> _Found | None:
+def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> Found | None:
     """Estimate on a dataset in the working frame; where drives are far off, with landmarks of drives laid right.
 
     Cameras askew are turned first, drive by drive, as what drives see is turned about them else and fits nowhere; then
@@ -174,19 +256,10 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
         return None
     if marks is None:
         return None
+    told = Trajectories(jumps, hints, proven)
 
     def estimated(marks: Marks, known: tuple[Segments, Floats]) -> Estimate | None:
-        return estimate(
-            footage,
-            marks,
-            config,
-            seen_cuts=jumps,
-            hints=hints,
-            jumps=proven,
-            known=known,
-            turned_rad=turned,
-            late_s=late_s,
-        )
+        return estimate(footage, marks, config, told, known=known, turned_rad=turned, late_s=late_s)
 
     result = estimated(marks, known)
     if result is None:
@@ -203,7 +276,7 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
         again = None if marks is None else estimated(marks, known)
         if again is not None and len(again.thing) >= len(result.thing):
             result = again
-    return _Found(footage, result, select(footage, result))
+    return Found(footage, told, result, select(footage, result))
 
 
 def _is_lost(footage: Footage, result: Estimate) -> bool:
@@ -261,13 +334,13 @@ def _part(dataset: Dataset, drives: Drives, chosen: Bools) -> tuple[Dataset, Dri
     return replace(dataset, images=dataset.images.take(row), detections=detections, truth_detections=None), part
 
 
-def _looked_at(found: _Found | None) -> dict[str, Any]:
+def _looked_at(found: Found | None) -> dict[str, Any]:
     if found is None:
         return {"landmarks": 0, "shared_objects": 0}
     return {"landmarks": found.result.landmarks, "shared_objects": len(found.result.class_code)}
 
 
-def _apply(dataset: Dataset, drives: Drives, found: _Found, selected: Selected, unit_m: float) -> Dataset:
+def _apply(dataset: Dataset, drives: Drives, found: Found, selected: Selected, unit_m: float) -> Dataset:
     """Return the dataset with the poses and cameras corrected."""
     axes = np.vstack([dataset.frame.east_north(), dataset.frame.up])
     offset, mount, delay, focal, camera_mount, camera_delay = selected.state.constants
@@ -288,7 +361,7 @@ def _apply(dataset: Dataset, drives: Drives, found: _Found, selected: Selected, 
     return replace(dataset, images=moved, cameras=dataset.cameras.replace(params=params))
 
 
-def _describe(dataset: Dataset, found: _Found, selected: Selected, unit_m: float) -> dict[str, Any]:
+def _describe(dataset: Dataset, found: Found, selected: Selected, unit_m: float) -> dict[str, Any]:
     """Return what was found, by camera and by drive: corrections with their standard deviations."""
     names, footage, result = dataset.images.pass_id.names, found.footage, found.result
     drives = footage.whole_drives

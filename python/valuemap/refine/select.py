@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from valuemap.refine.adjust import Adjustment, Chain, Scales, adjust, triangulate
-from valuemap.refine.estimate import DRIFT_FACTOR, WIDE, Estimate, everything
+from valuemap.refine.estimate import DRIFT_FACTOR, WIDE, Estimate, everything, segments_of
 from valuemap.refine.footage import Footage
 from valuemap.refine.jumps import Links
 from valuemap.refine.residuals import (
@@ -78,12 +78,12 @@ class Selected:
 
 def select(footage: Footage, found: Estimate) -> Selected | None:
     """Return what pays, None where nothing does."""
-    seen = footage.observe(found.detection, found.thing, footage_segments(footage, found), found.sigma_px)
+    seen = footage.observe(found.detection, found.thing, segments_of(footage, found.segments), found.sigma_px)
     shared = _shared(footage, found)
     if shared is None or unresolved_share(seen, found.state, found.class_code) > _MOST_UNRESOLVED:
         return None
     found = shared
-    seen = footage.observe(found.detection, found.thing, footage_segments(footage, found), found.sigma_px)
+    seen = footage.observe(found.detection, found.thing, segments_of(footage, found.segments), found.sigma_px)
     ties = tie(footage, found.segments, seen)
     views = replace(seen.views, segment=ties.segment[seen.views.segment], vehicle=ties.vehicle[seen.views.vehicle])
     seen = replace(seen, views=views)
@@ -130,7 +130,7 @@ def _about_the_mean(footage: Footage, found: Estimate, offset: Floats, active: B
     """
     if not active.any():
         return offset
-    segment = footage_segments(footage, found)
+    segment = segments_of(footage, found.segments)
     drive = footage.drives.pass_code
     mean = np.stack([np.bincount(drive, weights=offset[segment, i]) / np.bincount(drive) for i in range(3)], axis=1)
     sigma = np.full(len(mean), np.nan)
@@ -180,11 +180,6 @@ def _objects_of(part: Ints, thing: Ints, count: int) -> Ints:
     return np.bincount(np.unique(np.stack([part, thing]), axis=1)[0], minlength=count)
 
 
-def footage_segments(footage: Footage, found: Estimate) -> Ints:
-    """Return the segment of each keyframe."""
-    return found.segments.of(footage.drives.pass_code, footage.drives.order)
-
-
 def _scales(footage: Footage, found: Estimate) -> Scales:
     """Return priors with a drift as large as what is found of it, and offsets as claimed where they are."""
     drift = np.sqrt(np.mean(found.state.drift**2, axis=0))
@@ -204,7 +199,7 @@ def _offset_sigma(footage: Footage, found: Estimate) -> Floats:
     sigma = np.full(len(found.segments), float(WIDE.constant[OFFSET]))
     if claimed is None or not np.isfinite(claimed).any():
         return sigma
-    segment = footage_segments(footage, found)
+    segment = segments_of(footage, found.segments)
     usual = float(np.nanmedian(claimed))
     for number in range(len(sigma)):
         of_segment = claimed[segment == number]
