@@ -231,17 +231,19 @@ impl<'a> Pair<'a> {
             images.dedup();
             images
         };
-        let mut parts: Vec<Vec<u32>> = visits(scene, &votes).map(images).collect();
+        let of_visits: Vec<Vec<u32>> = visits(scene, &votes).map(images).collect();
         let looks = votes.iter().map(|&ray| (ray, (scene.ray(ray).center - middle).normalize()));
-        parts.extend(by_side(looks, SIDE_COSINE).iter().map(|votes| images(votes)));
+        let of_sides: Vec<Vec<u32>> = by_side(looks, SIDE_COSINE).iter().map(|votes| images(votes)).collect();
         let contested: Vec<Vec<u32>> = (0..2).map(|i| self.contested(i)).collect();
         let among = |part: &Vec<u32>, contested: &Vec<u32>| -> Vec<u32> {
             part.iter().copied().filter(|image| contested.binary_search(image).is_ok()).collect()
         };
-        let of_parts: Vec<Vec<u32>> =
-            parts.iter().flat_map(|part| contested.iter().map(move |contested| among(part, contested))).collect();
-        parts.extend(of_parts);
-        parts.extend(contested);
+        // One of many visits moves an object little: what is contested on it alone is not worth the work.
+        let few_visits = of_visits.iter().filter(|_| of_visits.len() <= MOST_VISITS);
+        let of_contested: Vec<Vec<u32>> = (of_sides.iter().chain(few_visits))
+            .flat_map(|part| contested.iter().map(move |contested| among(part, contested)))
+            .collect();
+        let mut parts = [of_visits, of_sides, of_contested, contested].concat();
         parts.retain(|part| !part.is_empty());
         parts.sort_unstable();
         parts.dedup();
