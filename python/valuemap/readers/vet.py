@@ -461,12 +461,3 @@ def _found(row: RejectedRows) -> str:
     width, height = row.size_px[0]
     image = row.image_name[0].as_py()
     return f": {image!r}, centre {x:g} {y:g}, size {width:g} x {height:g}, score {row.score[0]:g}"
-
-
-def count_reasons(rejected: RejectedRows) -> dict[str, dict[str, int]]:
-    """Return how many rows were left out, by table and reason, the most frequent reason first."""
-    counts: dict[str, dict[str, int]] = {}
-    for table, reason in zip(rejected.table.texts(), rejected.reason.texts(), strict=True):
-        of_table = counts.setdefault(table, {})
-        of_table[reason] = of_table.get(reason, 0) + 1
-    return {table: dict(sorted(by.items(), key=lambda item: (-item[1], item[0]))) for table, by in counts.items()}

@@ -273,11 +273,13 @@ pub(super) fn rates_of(sides: &[Vec<(Looks, f64)>]) -> Option<Rates> {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Vector3;
+
     use super::super::energy::anywhere;
     use super::super::scene::Scene;
     use super::super::seen::Seen;
     use super::*;
-    use crate::street::SETTINGS;
+    use crate::street::{self, SETTINGS};
 
     /// An object that all passes see as usual from one side, and hardly any from another.
     fn seen_from_one_side() -> Object {
@@ -286,6 +288,23 @@ mod tests {
             .map(|hits| hits.into_iter().map(pass).collect())
             .to_vec();
         anywhere(1, Seen { sectors }, -100.0)
+    }
+
+    #[test]
+    fn objects_of_few_votes_teach_only_where_there_are_no_others_and_elevations_are_measured() {
+        let scene = street::street(12, 2.0, &[Vector3::new(30.0, 4.0, 3.0)], &[[0.0, 0.0]]);
+        let mut model = Model::new(&scene, &street::NOISE, &SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let rays = scene.usable_rays();
+        let few = |model: &Model<'_>, objects: &[Object]| Evidence::new(model, &lookout, &rays, objects).least_votes;
+        let sure: Vec<Object> = (0..MIN_OBJECTS).map(|_| anywhere(MIN_VOTES, Seen::default(), -100.0)).collect();
+        assert_eq!(few(&model, &sure), MIN_VOTES);
+        assert_eq!(few(&model, &sure[1..]), LEAST_VOTES);
+        // Bearings: all boxes are put on the horizon, but for rounding.
+        for (i, sine) in model.sin_elevation.iter_mut().enumerate() {
+            *sine = 1e-12 * (i % 3) as f64;
+        }
+        assert_eq!(few(&model, &sure[1..]), MIN_VOTES);
     }
 
     #[test]
