@@ -2,6 +2,9 @@
 //!
 //! Where two objects are seen from two directions, rays meet in four places: which belong together only J of all four can tell.
 
+use std::collections::BTreeMap;
+
+use nalgebra::Vector3;
 use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
@@ -23,6 +26,9 @@ const SIDE_COSINE: f64 = 0.906;
 /// Two objects of a class are no nearer to each other than this share of their size: things are solid, and boxes show their middle to
 /// within a fraction of their size.
 const EXCLUSIVE_SHARE: f64 = 0.25;
+
+/// What is near is within a half of the farthest distance, and so many times a half of that: from 60 m to 2 m.
+const NEAR_HALVINGS: i32 = 5;
 
 /// Pairs that were tried in vain, by their votes.
 #[derive(Default)]
@@ -189,7 +195,9 @@ impl<'a> Pair<'a> {
             return Some(merged);
         }
         let try_part = |part: &Vec<u32>| Some((self.exchanged(part).and_then(better)?, part.clone()));
-        let (mut found, parts): (Vec<_>, Vec<Vec<u32>>) = self.parts().iter().filter_map(try_part).unzip();
+        let (parts, near) = self.parts();
+        let (mut found, parts): (Vec<_>, Vec<Vec<u32>>) = parts.iter().filter_map(try_part).unzip();
+        found.extend(near.iter().filter_map(|part| self.settled(&self.exchanged(part)?).and_then(better)));
         // What helps on one visit each, helps most on all of them.
         if parts.len() > 1 {
             let mut images = parts.concat();
@@ -220,8 +228,8 @@ impl<'a> Pair<'a> {
     }
 
     /// Images, ascending, whose votes may be exchanged together: those of a visit, and those that look from one side; all of them, and those that show
-    /// only one of the two which might as well be the other.
-    fn parts(&self) -> Vec<Vec<u32>> {
+    /// only one of the two which might as well be the other. Then those that are near, about: each image is to decide once more.
+    fn parts(&self) -> (Vec<Vec<u32>>, Vec<Vec<u32>>) {
         let scene = self.model.scene;
         let mut votes: Vec<u32> = self.of.iter().flat_map(|object| object.votes.iter().copied()).collect();
         votes.sort_unstable();
@@ -240,14 +248,27 @@ impl<'a> Pair<'a> {
         };
         // One of many visits moves an object little: what is contested on it alone is not worth the work.
         let few_visits = of_visits.iter().filter(|_| of_visits.len() <= MOST_VISITS);
-        let of_contested: Vec<Vec<u32>> = (of_sides.iter().chain(few_visits))
-            .flat_map(|part| contested.iter().map(move |contested| among(part, contested)))
-            .collect();
-        let mut parts = [of_visits, of_sides, of_contested, contested].concat();
-        parts.retain(|part| !part.is_empty());
-        parts.sort_unstable();
-        parts.dedup();
-        parts
+        let small: Vec<&Vec<u32>> = of_sides.iter().chain(few_visits).collect();
+        let of_contested: Vec<Vec<u32>> =
+            small.iter().flat_map(|part| contested.iter().map(|contested| among(part, contested))).collect();
+        let near: Vec<Vec<u32>> = small.iter().flat_map(|part| self.nearer(part, &middle)).collect();
+        let parts = [of_visits, of_sides, of_contested, contested].concat();
+        let each = |mut parts: Vec<Vec<u32>>| {
+            parts.retain(|part| !part.is_empty());
+            parts.sort_unstable();
+            parts.dedup();
+            parts
+        };
+        (each(parts), each(near))
+    }
+
+    /// Of some images, ascending, those within a half of the distance of the farthest from a point, within a quarter, and so on: where two objects have
+    /// exchanged what is seen of them from near, both lie where rays cross, too near or too far.
+    fn nearer(&self, images: &[u32], point: &Vector3<f64>) -> Vec<Vec<u32>> {
+        let distance_m = |image: u32| (self.model.scene.views[image as usize].center - point).norm();
+        let farthest_m = images.iter().map(|&image| distance_m(image)).fold(0.0, f64::max);
+        let within = |m: f64| -> Vec<u32> { images.iter().copied().filter(|&image| distance_m(image) <= m).collect() };
+        (1..=NEAR_HALVINGS).map(|halvings| within(farthest_m * 0.5_f64.powi(halvings))).collect()
     }
 
     /// The images, ascending, that show one of the two and not the other, whose vote there might as well be the other's.
@@ -278,17 +299,39 @@ impl<'a> Pair<'a> {
         if a.0.len() + b.0.len() == 0 || a.1.len() + b.1.len() == 0 {
             return None;
         }
+        self.with_votes([[a.1, b.0].concat(), [b.1, a.0].concat()], self.of)
+    }
+
+    /// Both with some votes each, from where two objects are; nothing if that is not two objects.
+    fn with_votes(&self, votes: [Vec<u32>; 2], from: [&Object; 2]) -> Option<Vec<Object>> {
         let mut found = Vec::with_capacity(2);
-        for (i, (kept, taken)) in [(&a.1, &b.0), (&b.1, &a.0)].into_iter().enumerate() {
-            let mut votes: Vec<u32> = kept.iter().chain(taken).copied().collect();
+        for (i, mut votes) in votes.into_iter().enumerate() {
             if votes.len() < self.model.settings.min_votes as usize {
                 return None;
             }
             votes.sort_unstable();
-            let old = self.of[i];
-            found.push(fitting(self.model, self.lookout, votes, old.fit.point, images_of(self.claims[i]))?);
+            found.push(fitting(self.model, self.lookout, votes, from[i].fit.point, images_of(self.claims[i]))?);
         }
         found.iter().all(|object| object.energy < 0.0).then_some(found)
+    }
+
+    /// Both with the votes that each explains best, image by image, of those that they have.
+    fn settled(&self, both: &[Object]) -> Option<Vec<Object>> {
+        let mut of_image: BTreeMap<u32, [Option<u32>; 2]> = BTreeMap::new();
+        for (i, object) in both.iter().enumerate() {
+            for &ray in &object.votes {
+                of_image.entry(self.model.scene.rays.image[ray as usize]).or_default()[i] = Some(ray);
+            }
+        }
+        let gain = |i: usize, ray: Option<u32>| ray.map_or(0.0, |ray| gain_alone(self.model, &both[i], ray));
+        let mut votes = [Vec::new(), Vec::new()];
+        for [a, b] in of_image.into_values() {
+            let is_other = gain(0, b) + gain(1, a) > gain(0, a) + gain(1, b);
+            let [first, second] = if is_other { [b, a] } else { [a, b] };
+            votes[0].extend(first);
+            votes[1].extend(second);
+        }
+        self.with_votes(votes, [&both[0], &both[1]])
     }
 
     /// Which of some votes one may not take that keeps others: on many visits it stays where it is, so they have to be in its gate there.
@@ -304,8 +347,9 @@ fn fingerprint(object: &Object) -> u64 {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{Isometry3, Vector3};
+    use nalgebra::Isometry3;
 
+    use super::super::noise::Noise;
     use super::*;
     use crate::street;
 
@@ -339,6 +383,41 @@ mod tests {
         assert!(is_better);
         assert_eq!(found[0].votes, every_other(&of_both, 0));
         assert_eq!(found[1].votes, [every_other(&of_both, 1), of_one].concat());
+        Ok(())
+    }
+
+    #[test]
+    fn what_two_neighbors_have_exchanged_from_near_they_exchange_back() -> Result<(), Halt> {
+        let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
+        let both = [Vector3::new(48.0, 3.0, 3.0), Vector3::new(48.0, 3.6, 3.0)];
+        let drive = |i: usize| street::street(45, 1.0, &both, &errors[7 * i..]);
+        let scene = street::joined(vec![drive(0), drive(1)]);
+        let noise = Noise { position_m: 0.1, position_drift_m: 0.15, ..street::NOISE };
+        let mut model = Model::new(&scene, &noise, &street::SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let rays = scene.usable_rays();
+        // Rays alternate; within 15 m each has what the other shows.
+        let is_near = |ray: u32| (scene.ray(ray).center - both[0]).norm() < 15.0;
+        let swapped = |i: usize| -> Vec<u32> {
+            rays.iter()
+                .copied()
+                .enumerate()
+                .filter(|&(k, ray)| (k + usize::from(is_near(ray))) % 2 == i)
+                .map(|(_, ray)| ray)
+                .collect()
+        };
+        let of = |model: &Model<'_>| -> Vec<Object> {
+            (0..2).filter_map(|i| object(model, &lookout, swapped(i), both[i], Vec::new())).collect()
+        };
+        let begun = of(&model);
+        super::super::learn::learn(&mut model, &lookout, &rays, &begun);
+        let index = RayIndex::new(&scene, &model.spreads, street::GATE_SIGMAS, rays.iter().copied());
+        let (model, mut tried) = (&model, TriedPairs::default());
+        let (found, _) = rearrange_pairs(model, &lookout, &index, of(model), &mut tried, &Progress::default())?;
+        for (i, object) in found.iter().enumerate() {
+            assert!(object.votes.iter().all(|ray| *ray as usize % 2 == i));
+            assert!(object.votes.len() >= rays.len() / 2 - 2);
+        }
         Ok(())
     }
 

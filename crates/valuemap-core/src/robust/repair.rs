@@ -147,7 +147,7 @@ fn anew(place: &Place<'_>, old: &[&Object], attempt: u64, progress: &Progress) -
         );
     }
     let as_it_is: Vec<usize> = (0..old.len()).collect();
-    let mut starts = vec![as_it_is, Vec::new()];
+    let (mut starts, mut sets) = (vec![as_it_is, Vec::new()], Vec::new());
     for (i, object) in old.iter().enumerate() {
         let first = candidates.len();
         for part in parts_of(model, object) {
@@ -158,6 +158,9 @@ fn anew(place: &Place<'_>, old: &[&Object], attempt: u64, progress: &Progress) -
             }
         }
         // One object gives way to two: adding one and dropping one does not get there.
+        if let Some(two) = best_two(&candidates, rays.len(), first) {
+            sets.push((0..old.len()).filter(|&other| other != i).chain(two).collect());
+        }
         if candidates.len() > first {
             starts.push((0..old.len()).filter(|&other| other != i).chain(first..candidates.len()).collect());
         }
@@ -166,8 +169,8 @@ fn anew(place: &Place<'_>, old: &[&Object], attempt: u64, progress: &Progress) -
     let before: f64 = old.iter().map(|object| object.energy).sum();
     let mut best: Option<(f64, Vec<Object>)> = None;
     let mut seen: Vec<Vec<usize>> = Vec::new();
-    for start in starts {
-        let chosen = choose(&candidates, rays.len(), start);
+    sets.splice(0..0, starts.into_iter().map(|start| choose(&candidates, rays.len(), start)));
+    for chosen in sets {
         if seen.contains(&chosen) {
             continue;
         }
@@ -341,6 +344,14 @@ fn candidates_of(model: &Model<'_>, rays: &[u32], object: &Object, part: &[u32])
     };
     let candidates = starts.into_iter().flatten().filter_map(candidate);
     candidates.filter(|candidate| candidate.votes.len() >= model.settings.min_votes as usize).collect()
+}
+
+/// The two of the candidates from the first on that explain all rays best, whatever they cost: gains without drifts and looks do not tell well
+/// whether one is two.
+fn best_two(candidates: &[Candidate], rays: usize, first: usize) -> Option<[usize; 2]> {
+    let pairs = (first..candidates.len()).flat_map(|a| (a + 1..candidates.len()).map(move |b| [a, b]));
+    let valued = pairs.map(|pair| (value_of(candidates, rays, &pair), pair));
+    valued.reduce(|best, pair| if pair.0 > best.0 { pair } else { best }).map(|(_, pair)| pair)
 }
 
 /// Which candidates explain all rays best, together: local search from a start by adding one, and dropping those that it makes needless
