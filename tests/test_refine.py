@@ -135,6 +135,8 @@ def test_poses_are_estimated_with_a_map_only_where_some_were_corrected() -> None
     assert refine_again(faulty, as_given, result.labels, result.votes, valuemap.MapConfig()) is as_given
     none = result.labels.take(np.zeros(len(result.labels), np.bool_))
     assert refine_again(faulty, refined, none, result.votes, valuemap.MapConfig()) is refined
+    unseen = result.votes.take(np.zeros(len(result.votes), np.bool_))
+    assert refine_again(faulty, refined, result.labels, unseen, valuemap.MapConfig()) is refined
 
 
 def test_what_drives_are_off_by_is_found_before_their_objects_are() -> None:

@@ -228,7 +228,7 @@ def _proven(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, 
         source = InMemory(refined.dataset, config)
         labels, votes, *_ = _robust(source, config, _Stages(), ThreadEngine(threads), progress)
         again = refine_again(dataset, refined, labels, votes, config, progress=progress)
-        return replace(again, record={**record, **again.record})
+        return replace(again, record={**record, **again.record}, found=None)
 
 
 def _with_rejected(result: Map, read: Callable[[], Dataset], stages: _Stages) -> Map:

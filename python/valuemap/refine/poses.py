@@ -183,6 +183,8 @@ def refine_again(
         thing[rows_of(votes.detection_id, ordered.detection_id)] = rows_of(votes.label_id, labels.label_id)
         thing = thing[footage.dataset.detections.detection_id]
         detection = np.flatnonzero(thing >= 0)
+        if not len(detection):
+            return refined
         kinds, first, code = np.unique(thing[detection], return_index=True, return_inverse=True)
         # Numbered along the drives, so that the order of labels does not show in the last digits.
         along = np.argsort(first)
