@@ -104,12 +104,12 @@ const CLASS_RAYS: usize = 30_000;
 const WIDE: f64 = 3.0;
 /// Scenes with more rays than this are searched less deeply, if that changes little.
 const MOST_RAYS: usize = 100_000;
-/// All moves take some ten times as long: they pay if they change more than one object in ten.
+/// All moves take some ten times as long: they pay if they change more than one object in ten of those that are kept.
 const LEAST_CHANGE: f64 = 0.1;
 /// By so many standard deviations of the share more: what a sample says by chance pays nowhere.
 const LEAST_CHANGE_SIGMAS: f64 = 2.0;
-/// It is asked of one in so many of the places that classes are learned from first: some fifty objects tell none from one in ten.
-const SOME_OF_PLACES: usize = 5;
+/// It is asked of so many parts of the places that classes are learned from, one after the other, until they tell: a part has some twenty objects.
+const PARTS_OF_PLACES: usize = 5;
 
 /// Steps of [`self_calibrate`] at most, as progress counts them, but for the search that tells whether all moves pay: the noise, and the classes.
 pub const CALIBRATION_STEPS: usize = likeliest::NOISE_STEPS + 1;
@@ -199,27 +199,33 @@ pub fn self_calibrate(
     let objects = learn_from(&mut model, &wide, progress)?;
     let noise = split::split(&model, known, &objects);
     let is_small = !is_part && scene.usable_rays().len() <= MOST_RAYS;
-    let is_deep = is_small || {
-        // A part of the places says it, unless it is a near thing.
-        let some = sample::places(scene, CLASS_RAYS / SOME_OF_PLACES, WIDE * settings.viability.max_range_m);
-        let mut changes = |rays: &[u32]| changes_much(&mut model, rays, &objects, progress);
-        match changes(&some)? {
-            None if some.len() < wide.len() => changes(&wide)?.unwrap_or(false),
-            of_some => of_some.unwrap_or(false),
-        }
-    };
+    let is_deep = is_small || all_moves_pay(&mut model, &objects, progress)?;
     let classes = model.classes.iter().copied().map(Some).collect();
     Ok(Calibration { noise, classes, pooled: model.pooled, confusions: model.confusions, is_deep, starts })
 }
 
-/// Whether all moves change many objects of some places (their rays, ascending) of which the map is known; nothing if that may be chance. Rays of
-/// objects that have others as well stay out, and so do drives where there are many.
-fn changes_much(
-    model: &mut Model<'_>,
-    rays: &[u32],
-    objects: &[Object],
-    progress: &Progress,
-) -> Result<Option<bool>, Halt> {
+/// Whether all moves change many objects of the places that classes are learned from, of which the map is known.
+fn all_moves_pay(model: &mut Model<'_>, objects: &[Object], progress: &Progress) -> Result<bool, Halt> {
+    let (mut change, mut asked) = (Change::default(), Vec::new());
+    for part in 1..=PARTS_OF_PLACES {
+        let more = sample::places(
+            model.scene,
+            CLASS_RAYS * part / PARTS_OF_PLACES,
+            WIDE * model.settings.viability.max_range_m,
+        );
+        let rays: Vec<u32> = more.iter().copied().filter(|ray| asked.binary_search(ray).is_err()).collect();
+        change.add(changed(model, &rays, objects, progress)?);
+        if let Some(is_much) = change.is_much() {
+            return Ok(is_much);
+        }
+        asked = more;
+    }
+    Ok(false)
+}
+
+/// How many objects of some places (their rays, ascending) all moves change. Rays of objects that have others as well stay out, and so do drives
+/// where there are many.
+fn changed(model: &mut Model<'_>, rays: &[u32], objects: &[Object], progress: &Progress) -> Result<Change, Halt> {
     let is_whole = |object: &&Object| object.votes.iter().all(|ray| rays.binary_search(ray).is_ok());
     let (whole, partly): (Vec<&Object>, Vec<&Object>) = objects.iter().partition(is_whole);
     let elsewhere: FxHashSet<u32> = partly.iter().flat_map(|object| &object.votes).copied().collect();
@@ -231,25 +237,49 @@ fn changes_much(
     let begun = begun.filter(|(votes, _): &Placed| votes.len() >= model.settings.min_votes as usize).collect();
     let shallow = search(model, &rays, begun, Depth::Shallow, false, &mut Tally::default(), progress)?;
     let deeper = search(model, &rays, placed(&shallow), Depth::Deep, false, &mut Tally::default(), progress)?;
-    Ok(is_changed(&shallow, &deeper))
+    Ok(Change::of(&shallow, &deeper, model.settings.min_existence))
 }
 
-/// Whether many objects of two maps of the same rays are not in both; nothing if that may be chance. One is in both if most of its votes are most
-/// of those of one of the other map.
-fn is_changed(some: &[Object], others: &[Object]) -> Option<bool> {
-    let owner: FxHashMap<u32, usize> =
-        others.iter().enumerate().flat_map(|(i, object)| object.votes.iter().map(move |&ray| (ray, i))).collect();
-    let is_kept = |object: &&Object| {
-        let mut of: Vec<usize> = object.votes.iter().filter_map(|ray| owner.get(ray).copied()).collect();
-        of.sort_unstable();
-        let is_most = |votes: &[usize]| 2 * votes.len() > object.votes.len().max(others[votes[0]].votes.len());
-        of.chunk_by(|a, b| a == b).any(is_most)
-    };
-    let kept = some.iter().filter(is_kept).count();
-    let count = (some.len() + others.len()).max(1) as f64;
-    let chance = (LEAST_CHANGE * (1.0 - LEAST_CHANGE) / count).sqrt();
-    let more = 1.0 - 2.0 * kept as f64 / count - LEAST_CHANGE;
-    (more.abs() > LEAST_CHANGE_SIGMAS * chance).then_some(more > 0.0)
+/// How many objects of two maps of the same rays are in both.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+struct Change {
+    kept: usize,
+    /// Of both maps together.
+    objects: usize,
+}
+
+impl Change {
+    /// An object is in both maps if most of its votes are most of those of one of the other map. What exists less probably than `min_existence` is in
+    /// no map that a user sees, and does not count.
+    fn of(some: &[Object], others: &[Object], min_existence: f64) -> Self {
+        let shown = |objects: &[Object]| -> Vec<Vec<u32>> {
+            let likely = objects.iter().filter(|object| object.existence() >= min_existence);
+            likely.map(|object| object.votes.clone()).collect()
+        };
+        let (some, others) = (shown(some), shown(others));
+        let owner: FxHashMap<u32, usize> =
+            others.iter().enumerate().flat_map(|(i, votes)| votes.iter().map(move |&ray| (ray, i))).collect();
+        let is_kept = |votes: &&Vec<u32>| {
+            let mut of: Vec<usize> = votes.iter().filter_map(|ray| owner.get(ray).copied()).collect();
+            of.sort_unstable();
+            let is_most = |shared: &[usize]| 2 * shared.len() > votes.len().max(others[shared[0]].len());
+            of.chunk_by(|a, b| a == b).any(is_most)
+        };
+        Self { kept: some.iter().filter(is_kept).count(), objects: some.len() + others.len() }
+    }
+
+    fn add(&mut self, other: Self) {
+        self.kept += other.kept;
+        self.objects += other.objects;
+    }
+
+    /// Whether many objects are not in both; nothing if that may be chance.
+    fn is_much(self) -> Option<bool> {
+        let count = self.objects.max(1) as f64;
+        let chance = (LEAST_CHANGE * (1.0 - LEAST_CHANGE) / count).sqrt();
+        let more = 1.0 - 2.0 * self.kept as f64 / count - LEAST_CHANGE;
+        (more.abs() > LEAST_CHANGE_SIGMAS * chance).then_some(more > 0.0)
+    }
 }
 
 /// Learn the classes of a model from the map of some rays, and return that. Where classes are taken for each other, all competes once more.
@@ -390,7 +420,8 @@ mod tests {
             chi2: Vec::new(),
         };
         let (ln_size, others, seen) = (f64::NAN, Vec::new(), seen::Seen::default());
-        Object { class: 0, votes: (first..first + count).collect(), fit, ln_size, others, seen, real: 1.0, energy: 0.0 }
+        let votes = (first..first + count).collect();
+        Object { class: 0, votes, fit, ln_size, others, seen, real: 1.0, energy: -100.0 }
     }
 
     #[test]
@@ -405,9 +436,18 @@ mod tests {
                 })
                 .collect()
         };
-        assert_eq!(is_changed(&some, &some), Some(false));
+        let changed = |some: &[Object], others: &[Object]| Change::of(some, others, 0.55).is_much();
+        assert_eq!(changed(&some, &some), Some(false));
         // 24 of 208 are 11.5 %, with a standard deviation of 2.1 %.
-        assert_eq!(is_changed(&some, &halved(8)), None);
-        assert!(is_changed(&some, &halved(12)) == Some(true) && is_changed(&halved(12), &some) == Some(true));
+        assert_eq!(changed(&some, &halved(8)), None);
+        assert!(changed(&some, &halved(12)) == Some(true) && changed(&halved(12), &some) == Some(true));
+        // 27 of 209 are 12.9 %, with a standard deviation of 2.1 %: one part does not tell, three do.
+        let part = Change::of(&some, &halved(9), 0.55);
+        let mut parts = Change::default();
+        (0..3).for_each(|_| parts.add(part));
+        assert_eq!((part.is_much(), parts.is_much()), (None, Some(true)));
+        // What only all moves find, and is in no map: a third of all.
+        let ghosts = (0..50).map(|i| Object { real: 0.4, ..with_votes(10_000 + 10 * i, 10) });
+        assert_eq!(changed(&some, &some.iter().cloned().chain(ghosts).collect::<Vec<_>>()), Some(false));
     }
 }
