@@ -28,14 +28,10 @@ WITHOUT: dict[str, list[str]] = {
         f"position_sigma_m={math.hypot(_GUESS.position_m, _GUESS.position_drift_m)}",
         f"rotation_sigma_deg={math.degrees(math.hypot(_GUESS.rotation_rad, _GUESS.rotation_drift_rad))}",
     ],
-    "polish": [],
     "existence": ["min_existence=0"],
-    "merge by evidence": [],
-    "shared noise": [],
+    **{part: [] for part in robust.PARTS},
 }
-"""What is left out, and the settings that leave it out."""
-LEFT_OUT = {"polish": "polish", "merge by evidence": "merge", "shared noise": "shared_noise"}
-"""Parts that no setting leaves out, by their names in `valuemap.robust`."""
+"""What is left out, and the settings that leave it out; parts that none does by their names in `valuemap.robust`."""
 KITTI_FIGURES = ("signs_found_2m", "signs_found_1m", "precision", "track_recall")
 
 
@@ -52,7 +48,7 @@ def main() -> None:
     cases = [prepare(city(options.passes), seed) for seed in options.seeds]
     results: list[dict[str, Any]] = []
     for part, config in configs.items():
-        robust.LEFT_OUT = {LEFT_OUT[part]} if part in LEFT_OUT else set()
+        robust.LEFT_OUT = {part} & set(robust.PARTS)
         figures = add_up([measure(case, config) for case in cases])
         results.append({"without": part, "settings": WITHOUT[part], **figures})
         print(line(f"without {part}", figures), flush=True)

@@ -56,6 +56,7 @@ def see(
     rays: Rays, point_in_world_m: _Floats, voter_offsets: _Offsets, voters: _Indices
 ) -> tuple[_Floats, _Floats, _Floats]: ...
 def medians(values: _Floats, offsets: _Offsets) -> _Floats: ...
+def parts() -> list[str]: ...
 
 class Scene:
     def __init__(
@@ -79,7 +80,7 @@ class Scene:
     ) -> None: ...
 
 _Noise = tuple[float, ...]
-_Settings = tuple[float, float, float, float, int, int, float, bool, bool]
+_Settings = tuple[float, float, float, float, int, int, float, list[str]]
 
 _Calibration = tuple[
     _Noise, bool, Sequence[Sequence[float] | None], Sequence[float], Sequence[Sequence[tuple[int, float]]]

@@ -19,8 +19,10 @@ from valuemap.errors import InputError
 from valuemap.progress import Progress, counted, silent
 from valuemap.tables import Candidates, Floats, Ints
 
+PARTS: tuple[str, ...] = tuple(_core.parts())
+"""Parts of the method: moves of the search, terms of J, and what is done before and after; the core's `parts.rs`."""
 LEFT_OUT: set[str] = set()
-"""Parts of the method to leave out: polish, merge, shared_noise. For the ablation benchmark; not a setting."""
+"""Those to leave out. For tests and the ablation benchmark; not a setting."""
 
 
 @dataclass(frozen=True)
@@ -156,9 +158,8 @@ def calibrate(
         noise, is_deep, classes, pooled, shares = _core.calibrate(
             scene.core, guess.as_tuple(), known, _settings(config), is_part, threads, lambda done, _total: tell(done)
         )
-    estimated = Noise(*noise)
     return Calibration(
-        noise=_all_own(estimated) if "shared_noise" in LEFT_OUT and not all(known) else estimated,
+        noise=Noise(*noise),
         is_deep=is_deep,
         classes={name: tuple(row) for name, row in zip(scene.class_names, classes, strict=False) if row is not None},
         pooled=tuple(pooled),
@@ -230,17 +231,6 @@ def find_labels(
     ), counts
 
 
-def _all_own(noise: Noise) -> Noise:
-    """Return noise of the same size of which images share nothing."""
-    return replace(
-        noise,
-        position_m=math.hypot(noise.position_m, noise.position_drift_m),
-        rotation_rad=math.hypot(noise.rotation_rad, noise.rotation_drift_rad),
-        position_drift_m=0.0,
-        rotation_drift_rad=0.0,
-    )
-
-
 def _guess(config: NoiseConfig) -> tuple[Noise, list[bool]]:
     """Return where the estimation starts, and whether detection, position and rotation are set by the user."""
     noise = Noise()
@@ -257,7 +247,7 @@ def _guess(config: NoiseConfig) -> tuple[Noise, list[bool]]:
     return noise, [value is not None for value in known]
 
 
-def _settings(config: MapConfig) -> tuple[float, float, float, float, int, int, float, bool, bool]:
+def _settings(config: MapConfig) -> tuple[float, float, float, float, int, int, float, list[str]]:
     vote = config.vote
     return (
         math.radians(vote.min_parallax_deg),
@@ -267,8 +257,7 @@ def _settings(config: MapConfig) -> tuple[float, float, float, float, int, int, 
         vote.min_votes,
         config.existence.least_votes,
         config.existence.min_existence,
-        "polish" in LEFT_OUT,
-        "merge" in LEFT_OUT,
+        sorted(LEFT_OUT),
     )
 
 

@@ -30,8 +30,9 @@ use valuemap_core::robust::confusion::Confusions;
 use valuemap_core::robust::likeliest::misfits;
 use valuemap_core::robust::model::ClassModel;
 use valuemap_core::robust::noise::Noise;
+use valuemap_core::robust::parts::{Part, Without};
 use valuemap_core::robust::scene::{Frustum, Scene, View};
-use valuemap_core::robust::{Calibration, Settings, Without, find, objects_of, self_calibrate};
+use valuemap_core::robust::{Calibration, Settings, find, objects_of, self_calibrate};
 use valuemap_core::select::Stop;
 use valuemap_core::triangulate::unit_covariance;
 use valuemap_core::vote::{Candidate, count_units, vote};
@@ -238,10 +239,15 @@ fn noise() -> impl Strategy<Value = Noise> {
     })
 }
 
+/// One part of the method, or none.
+fn names(number: usize) -> Vec<String> {
+    Part::ALL.get(number % (Part::ALL.len() + 1)).map(|(_, name)| (*name).to_owned()).into_iter().collect()
+}
+
 fn settings() -> impl Strategy<Value = Settings> {
     let votes = prop_oneof![4 => 0..4_u32, 1 => Just(u32::MAX)];
-    (0..24_usize, hostile(), votes.clone(), votes, any::<[bool; 2]>()).prop_map(
-        |(which, number, min_votes, least_votes, [polish, merge])| {
+    (0..24_usize, hostile(), votes.clone(), votes, any::<usize>()).prop_map(
+        |(which, number, min_votes, least_votes, part)| {
             let mut s = [0.035, 2.0, 60.0, 3.5, 0.5];
             if which < s.len() && number.is_finite() {
                 s[which] = number;
@@ -264,7 +270,7 @@ fn settings() -> impl Strategy<Value = Settings> {
                 min_votes,
                 least_votes,
                 min_existence,
-                without: Without { polish, merge },
+                without: Without::named(&names(part)).unwrap_or_default(),
             }
         },
     )

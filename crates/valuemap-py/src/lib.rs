@@ -244,6 +244,12 @@ fn medians<'py>(
     Ok(medians.into_pyarray(py))
 }
 
+/// The names of the parts of the robust method that can be left out, `valuemap_core::robust::parts::Part`.
+#[pyfunction]
+fn parts() -> Vec<&'static str> {
+    valuemap_core::robust::parts::Part::ALL.iter().map(|(_, name)| *name).collect()
+}
+
 #[pymodule]
 mod _core {
     #[pymodule_export]
@@ -255,5 +261,5 @@ mod _core {
     #[pymodule_export]
     const SEARCH_STEPS: usize = valuemap_core::robust::search::SEARCH_STEPS;
     #[pymodule_export]
-    use super::{Rays, medians, merge_labels, partition_images, see, unit_covariance, vote_in_clusters};
+    use super::{Rays, medians, merge_labels, partition_images, parts, see, unit_covariance, vote_in_clusters};
 }

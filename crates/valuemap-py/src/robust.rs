@@ -13,8 +13,9 @@ use valuemap_core::robust::calibrate::Known;
 use valuemap_core::robust::confusion::Confusions;
 use valuemap_core::robust::model::ClassModel;
 use valuemap_core::robust::noise::Noise;
+use valuemap_core::robust::parts::Without;
 use valuemap_core::robust::scene::{Frustum, Scene as CoreScene, View};
-use valuemap_core::robust::{Calibration, Findings, Settings, Without, find, self_calibrate};
+use valuemap_core::robust::{Calibration, Findings, Settings, find, self_calibrate};
 
 use crate::Rays;
 use crate::arrays::{
@@ -166,11 +167,12 @@ const LONGEST_M: f64 = 1e6;
 /// No greatest range is shorter, m: places are looked up in cubes of that size.
 const SHORTEST_M: f64 = 1e-6;
 
-/// Least parallax (rad), least and largest range (m), gate (sigmas), least votes without and with heights, least existence; without polish, merge.
-type SettingValues = (f64, f64, f64, f64, u32, u32, f64, bool, bool);
+/// Least parallax (rad), least and largest range (m), gate (sigmas), least votes without and with heights, least existence; the
+/// names of parts that are left out.
+type SettingValues = (f64, f64, f64, f64, u32, u32, f64, Vec<String>);
 
 fn settings_of(
-    (min_parallax_rad, min_range_m, max_range_m, gate_sigmas, min_votes, least_votes, min_existence, polish, merge): SettingValues,
+    (min_parallax_rad, min_range_m, max_range_m, gate_sigmas, min_votes, least_votes, min_existence, without): SettingValues,
 ) -> PyResult<Settings> {
     check_finite("settings", &[min_parallax_rad, min_range_m, max_range_m, gate_sigmas, min_existence])?;
     check_within("settings", &[min_range_m, max_range_m], LONGEST_M)?;
@@ -182,7 +184,9 @@ fn settings_of(
         )));
     }
     let viability = Viability { max_reprojection_error_px: f64::NAN, min_parallax_rad, min_range_m, max_range_m };
-    Ok(Settings { viability, gate_sigmas, min_votes, least_votes, min_existence, without: Without { polish, merge } })
+    let without = Without::named(&without)
+        .map_err(|name| PyValueError::new_err(format!("settings: no part of the method is called {name:?}")))?;
+    Ok(Settings { viability, gate_sigmas, min_votes, least_votes, min_existence, without })
 }
 
 /// A calibration: the noise, whether all moves pay, numbers of each class where anything is known of it, those of all classes together, and, of

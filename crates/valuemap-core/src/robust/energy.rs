@@ -26,6 +26,7 @@ use super::estimate::is_one_visit;
 use super::heights::height_m;
 use super::looks::Lookout;
 use super::model::{Model, Sizes};
+use super::parts::Part;
 use super::scene::Scene;
 use super::seen::Seen;
 use super::sizes::size_terms;
@@ -383,6 +384,9 @@ impl Object {
     /// One that was [`unseen`], with the looks at it; `others` are images (ascending) with detections in its gate.
     #[must_use]
     pub fn with_looks(mut self, model: &Model<'_>, lookout: &Lookout, others: Vec<u32>) -> Option<Self> {
+        if !model.settings.has(Part::Looks) {
+            return Some(Self { others, ..self });
+        }
         let class = &model.classes[self.class as usize];
         self.seen = lookout.looks(model, &self.fit.point, &self.votes, &others);
         self.energy -= 2.0 * self.seen.ln_likelihood(class);

@@ -6,6 +6,7 @@ use super::contest::{Contest, widened};
 use super::energy::{Object, by_place};
 use super::estimate::{Care, Estimate, Joint, Start};
 use super::model::Model;
+use super::parts::Part;
 
 /// Objects within this share of the range of the one with the most votes are estimated with it.
 const PLACE_SHARE: f64 = 0.4;
@@ -38,7 +39,8 @@ fn together(model: &Model<'_>, objects: &[Object], place: &[usize], contest: &Co
         return place.iter().flat_map(|&i| together(model, objects, &[i], contest)).collect();
     };
     let contested = contest.contested(&solution);
-    let sure = contested.contains(&true).then(|| solution.without(&contested)).flatten();
+    let is_contested = contested.contains(&true) && model.settings.has(Part::Contest);
+    let sure = is_contested.then(|| solution.without(&contested)).flatten();
     let sure = sure.as_ref().unwrap_or(&solution.estimates);
     place.iter().zip(&solution.estimates).zip(sure).map(|((&i, found), sure)| (i, widened(found, sure))).collect()
 }

@@ -6,6 +6,7 @@ use super::energy::{Object, implied_size};
 use super::heights::{Heights, ground_m2 as ground_m2_within, height_m};
 use super::looks::Lookout;
 use super::model::{ClassModel, Model, ODD_PASSES, Rates};
+use super::parts::Part;
 use super::reach::reach;
 use super::seen::Looks;
 
@@ -90,8 +91,13 @@ impl<'a> Evidence<'a> {
         let ln_clutter_per_sr = ((clutter.len() + 1) as f64 / self.solid_angle_sr).ln();
         let mut learned = ClassModel { ln_clutter_per_sr, ..*before };
         let of = |column: &[f64], rays: &[u32]| rays.iter().map(|&ray| column[ray as usize]).collect::<Vec<f64>>();
-        learned.score_ratio = score_ratio(&of(&model.scene.score, &in_class), &of(&model.scene.score, &clutter));
-        learned.clutter_by_elevation = elevation_factor(&of(&model.sin_elevation, &clutter), self.looked_at);
+        let has = |part: Part| model.settings.has(part);
+        if has(Part::Scores) {
+            learned.score_ratio = score_ratio(&of(&model.scene.score, &in_class), &of(&model.scene.score, &clutter));
+        }
+        if has(Part::Elevations) {
+            learned.clutter_by_elevation = elevation_factor(&of(&model.sin_elevation, &clutter), self.looked_at);
+        }
         let many: Vec<&Object> =
             of_class.iter().copied().filter(|object| object.votes.len() >= self.least_votes).collect();
         let sure: Vec<&Object> = many.iter().copied().filter(|object| object.real > 0.5).collect();
@@ -102,10 +108,14 @@ impl<'a> Evidence<'a> {
             let (spread, object) = sizes(model, &sure);
             learned.sizes.spread = spread.max(LEAST_SPREAD);
             learned.sizes.object = (object.0, object.1.max(learned.sizes.spread));
-            learned.heights = heights(model, &sure);
+            learned.heights = if has(Part::Heights) { heights(model, &sure) } else { None };
             learned.ln_births_per_m2 = (of_class.len() as f64 / self.ground_m2).ln();
-            learned.reach = reach(model, self.lookout, &sure, learned.farthest_m);
-            learned.company = company(model, self.objects, &learned, of_class[0].class);
+            if has(Part::Reach) {
+                learned.reach = reach(model, self.lookout, &sure, learned.farthest_m);
+            }
+            if has(Part::Company) {
+                learned.company = company(model, self.objects, &learned, of_class[0].class);
+            }
         }
         learned
     }

@@ -31,6 +31,7 @@ pub mod likeliest;
 pub mod looks;
 pub mod model;
 pub mod noise;
+pub mod parts;
 pub mod poses;
 pub mod propose;
 pub mod quick;
@@ -63,6 +64,7 @@ use likeliest::likeliest_noise;
 use looks::Lookout;
 use model::{ClassModel, Model, Rates};
 use noise::{Noise, Spread};
+use parts::{Part, Without};
 use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 use scene::Scene;
@@ -86,13 +88,13 @@ pub struct Settings {
     pub without: Without,
 }
 
-/// Parts of the method that can be left out.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Without {
-    /// Nominations get the voters of the point where they were made.
-    pub polish: bool,
-    /// Labels of one object stay several.
-    pub merge: bool,
+impl Settings {
+    /// Whether a part of the method is in use.
+    #[inline]
+    #[must_use]
+    pub const fn has(&self, part: Part) -> bool {
+        !self.without.has(part)
+    }
 }
 
 /// Rays of the places that the noise is estimated from, about: from each start, and from the best in the end.
@@ -189,15 +191,14 @@ pub fn self_calibrate(
     progress: &Progress,
 ) -> Result<Calibration, Halt> {
     let more = sample::places(scene, CALIBRATION_RAYS.1, settings.viability.max_range_m);
-    let (noise, starts) = if known.detection && known.position && known.rotation {
-        (*guess, 0)
-    } else {
-        likeliest_noise(scene, guess, known, settings, &more, progress)?
-    };
+    let is_known = known.detection && known.position && known.rotation;
+    let (noise, starts) =
+        if is_known { (*guess, 0) } else { likeliest_noise(scene, guess, known, settings, &more, progress)? };
     let mut model = Model::new(scene, &noise, settings);
     let wide = sample::places(scene, CLASS_RAYS, WIDE * settings.viability.max_range_m);
     let objects = learn_from(&mut model, &wide, progress)?;
-    let noise = split::split(&model, known, &objects);
+    let noise = if settings.has(Part::NoiseSplit) { split::split(&model, known, &objects) } else { noise };
+    let noise = if settings.has(Part::SharedNoise) || is_known { noise } else { noise.all_own() };
     let is_small = !is_part && scene.usable_rays().len() <= MOST_RAYS;
     let is_deep = is_small || all_moves_pay(&mut model, &objects, progress)?;
     let classes = model.classes.iter().copied().map(Some).collect();
@@ -288,7 +289,7 @@ fn learn_from(model: &mut Model<'_>, rays: &[u32], progress: &Progress) -> Resul
     let mut objects = search(model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
     let lookout = Lookout::new(model.scene, model.settings.viability.max_range_m);
     learn(model, &lookout, rays, &objects);
-    if model.classes.len() > 1 {
+    if model.classes.len() > 1 && model.settings.has(Part::Confusions) {
         let spreads = Arc::clone(&model.spreads);
         let index = RayIndex::new(model.scene, &spreads, model.settings.gate_sigmas, rays.iter().copied());
         model.confusions = Confusions::learn(model, &lookout, &index, &objects);
@@ -327,7 +328,11 @@ pub fn find(
     let depth = if calibration.is_deep { Depth::Deep } else { Depth::Shallow };
     let objects = search(&mut model, &rays, begun, depth, false, &mut tally, progress)?;
     let estimates = finish(&model, &objects);
-    let variance_factor = calibrate::variance_factor(scene, noise, &placed(&objects), objects.len().max(1));
+    let variance_factor = if settings.has(Part::Scaling) {
+        calibrate::variance_factor(scene, noise, &placed(&objects), objects.len().max(1))
+    } else {
+        1.0
+    };
     let claimed: usize = objects.iter().map(|object| object.votes.len()).sum();
     let energy = objects.iter().map(|object| object.energy).sum();
     let lookout = Lookout::new(scene, settings.viability.max_range_m);

@@ -13,6 +13,7 @@ use super::confusion::Confusions;
 use super::counts::FEW;
 use super::heights::{Heights, up_of};
 use super::noise::{Noise, Spread};
+use super::parts::Part;
 use super::scene::Scene;
 use super::{Settings, spreads_of};
 use crate::ray::Ray;
@@ -270,8 +271,10 @@ impl<'a> Model<'a> {
     pub fn new(scene: &'a Scene, noise: &'a Noise, settings: &'a Settings) -> Self {
         let usable = scene.usable_rays();
         let spreads = spreads_of(scene, noise);
-        let ln_angle: Vec<f64> =
-            scene.box_px.iter().zip(&scene.scale2).map(|(&size, &scale2)| (size / scale2.sqrt()).ln()).collect();
+        let angle = |(&size, &scale2): (&f64, &f64)| {
+            if settings.has(Part::Sizes) { (size / scale2.sqrt()).ln() } else { f64::NAN }
+        };
+        let ln_angle: Vec<f64> = scene.box_px.iter().zip(&scene.scale2).map(angle).collect();
         let count = scene.rays.class.iter().max().map_or(0, |&last| last as usize + 1);
         let of = |rays: Vec<usize>| {
             let angles: Vec<f64> = rays.iter().map(|&ray| ln_angle[ray]).filter(|angle| angle.is_finite()).collect();

@@ -87,6 +87,18 @@ impl Spread {
 }
 
 impl Noise {
+    /// Noise of the same size of which the images of a drive share nothing.
+    #[must_use]
+    pub fn all_own(&self) -> Self {
+        Self {
+            position_m: self.position_m.hypot(self.position_drift_m),
+            rotation_rad: self.rotation_rad.hypot(self.rotation_drift_rad),
+            position_drift_m: 0.0,
+            rotation_drift_rad: 0.0,
+            ..*self
+        }
+    }
+
     /// The same with all parts that are not known larger by a factor.
     #[must_use]
     pub fn scaled(&self, factor: f64, known: Known) -> Self {

@@ -13,6 +13,7 @@ use super::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, by_place, by_side, fitti
 use super::index::RayIndex;
 use super::looks::Lookout;
 use super::model::Model;
+use super::parts::Part;
 use super::repair::MOST_VISITS;
 use super::sample::scramble;
 use crate::progress::{Halt, Progress};
@@ -191,7 +192,8 @@ impl<'a> Pair<'a> {
             let change = found.iter().map(|object| object.energy).sum::<f64>() - before;
             (change < -LEAST_GAIN_OF_MOVE).then_some((change, found))
         };
-        if let Some(merged) = self.merged().and_then(|object| better(vec![object])) {
+        let merged = if self.model.settings.has(Part::Merging) { self.merged() } else { None };
+        if let Some(merged) = merged.and_then(|object| better(vec![object])) {
             return Some(merged);
         }
         let try_part = |part: &Vec<u32>| Some((self.exchanged(part).and_then(better)?, part.clone()));
@@ -242,7 +244,9 @@ impl<'a> Pair<'a> {
         let of_visits: Vec<Vec<u32>> = visits(scene, &votes).map(images).collect();
         let looks = votes.iter().map(|&ray| (ray, (scene.ray(ray).center - middle).normalize()));
         let of_sides: Vec<Vec<u32>> = by_side(looks, SIDE_COSINE).iter().map(|votes| images(votes)).collect();
-        let contested: Vec<Vec<u32>> = (0..2).map(|i| self.contested(i)).collect();
+        let has = |part: Part| self.model.settings.has(part);
+        let contested: Vec<Vec<u32>> =
+            (0..2).filter(|_| has(Part::ContestedExchanges)).map(|i| self.contested(i)).collect();
         let among = |part: &Vec<u32>, contested: &Vec<u32>| -> Vec<u32> {
             part.iter().copied().filter(|image| contested.binary_search(image).is_ok()).collect()
         };
@@ -251,8 +255,12 @@ impl<'a> Pair<'a> {
         let small: Vec<&Vec<u32>> = of_sides.iter().chain(few_visits).collect();
         let of_contested: Vec<Vec<u32>> =
             small.iter().flat_map(|part| contested.iter().map(|contested| among(part, contested))).collect();
-        let near: Vec<Vec<u32>> = small.iter().flat_map(|part| self.nearer(part, &middle)).collect();
-        let parts = [of_visits, of_sides, of_contested, contested].concat();
+        let near =
+            small.iter().filter(|_| has(Part::NearExchanges)).flat_map(|part| self.nearer(part, &middle)).collect();
+        let mut parts = [of_contested, contested].concat();
+        if has(Part::Exchanges) {
+            parts.extend(of_visits.into_iter().chain(of_sides));
+        }
         let each = |mut parts: Vec<Vec<u32>>| {
             parts.retain(|part| !part.is_empty());
             parts.sort_unstable();

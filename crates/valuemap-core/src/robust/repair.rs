@@ -13,6 +13,7 @@ use super::few::most_probable;
 use super::index::{RayIndex, chi2};
 use super::looks::Lookout;
 use super::model::Model;
+use super::parts::Part;
 use super::propose::{Hypothesis, propose_among};
 use super::quick::quick_estimate;
 use super::sample::scramble;
@@ -158,7 +159,8 @@ fn anew(place: &Place<'_>, old: &[&Object], attempt: u64, progress: &Progress) -
             }
         }
         // One object gives way to two: adding one and dropping one does not get there.
-        if let Some(two) = best_two(&candidates, rays.len(), first) {
+        let two = if model.settings.has(Part::TwoForOne) { best_two(&candidates, rays.len(), first) } else { None };
+        if let Some(two) = two {
             sets.push((0..old.len()).filter(|&other| other != i).chain(two).collect());
         }
         if candidates.len() > first {
@@ -319,7 +321,7 @@ fn polished(model: &Model<'_>, rays: &[u32], hypothesis: &Hypothesis) -> Option<
 /// Votes of an object from one visit or one side alone, and from all others: rays of two objects, each seen from one side, meet where none is.
 fn parts_of(model: &Model<'_>, object: &Object) -> Vec<Vec<u32>> {
     let mut groups: Vec<Vec<u32>> = visits(model.scene, &object.votes).map(<[u32]>::to_vec).collect();
-    if groups.len() > MOST_VISITS {
+    if groups.len() > MOST_VISITS || !model.settings.has(Part::Halves) {
         return Vec::new();
     }
     let looks = object.votes.iter().map(|&ray| (ray, model.scene.ray(ray).direction));

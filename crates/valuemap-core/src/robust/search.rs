@@ -17,6 +17,7 @@ use super::index::RayIndex;
 use super::learn::learn;
 use super::looks::Lookout;
 use super::model::Model;
+use super::parts::Part;
 use super::propose::Who;
 use super::rearrange::{TriedPairs, exclude, rearrange_pairs};
 use super::regrow::regrow;
@@ -66,7 +67,9 @@ pub fn search(
         let again = |o: Object| object(model, &lookout, o.votes, o.fit.point, o.others);
         objects = objects.into_par_iter().filter_map(again).filter(|object| object.energy < 0.0).collect();
         let before = objects.len();
-        let (assigned, mut any) = assign(model, &lookout, &index, objects, progress)?;
+        let has = |part: Part| model.settings.has(part);
+        let (assigned, mut any) =
+            if has(Part::Assignment) { assign(model, &lookout, &index, objects, progress)? } else { (objects, false) };
         objects = assigned;
         tally.deaths += (before - objects.len()) as u64;
         progress.advance()?;
@@ -74,19 +77,27 @@ pub fn search(
             let (rearranged, better) = rearrange_pairs(model, &lookout, &index, objects, &mut tried_pairs, progress)?;
             any |= better;
             progress.advance()?;
-            let (repaired, better) = repair(model, &lookout, &index, rearranged, &mut tried, round as u64, progress)?;
+            let (repaired, better) = if has(Part::Repair) {
+                repair(model, &lookout, &index, rearranged, &mut tried, round as u64, progress)?
+            } else {
+                (rearranged, false)
+            };
             any |= better;
             progress.advance()?;
             objects = repaired;
             is_taken.fill(false);
             objects.iter().flat_map(|o| &o.votes).for_each(|&ray| is_taken[ray as usize] = true);
-            let (born, hypotheses) = births(model, &lookout, rays, &mut is_taken, &[Who::All], progress)?;
+            let (born, hypotheses) = if has(Part::Births) {
+                births(model, &lookout, rays, &mut is_taken, &[Who::All], progress)?
+            } else {
+                (Vec::new(), 0)
+            };
             tally.hypotheses += hypotheses;
             tally.births += born.len() as u64;
             any |= !born.is_empty();
             objects.extend(born);
             // What is left of objects that lost votes to others, once nothing else helps: all rays that are left over are tried.
-            if !any || round + 1 == rounds {
+            if has(Part::TakenVotes) && (!any || round + 1 == rounds) {
                 let (regrown, better) = regrow(model, &lookout, rays, objects, progress)?;
                 any |= better;
                 objects = regrown;
@@ -97,7 +108,9 @@ pub fn search(
             break;
         }
     }
-    let mut objects = exclude(model, &lookout, &index, objects, progress)?;
+    if model.settings.has(Part::Exclusion) {
+        objects = exclude(model, &lookout, &index, objects, progress)?;
+    }
     objects.retain(|object| object.energy < 0.0);
     objects.sort_by_key(|object| object.votes[0]);
     Ok(objects)

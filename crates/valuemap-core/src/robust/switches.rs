@@ -8,6 +8,7 @@ use super::drift::SEGMENT_M;
 use super::energy::{Object, implied_size, visits};
 use super::looks::looks_among;
 use super::model::Model;
+use super::parts::Part;
 use super::rearrange::may_be_one;
 
 /// That an object is missed in all images that show another one is chance where it is more probable than one in a thousand: so many objects has a map.
@@ -16,7 +17,7 @@ const LN_BY_CHANCE: f64 = -6.9;
 /// Whether each of some objects is another one of them in the pictures, which J would miss more.
 #[must_use]
 pub fn are_others(model: &Model<'_>, objects: &[&Object]) -> Vec<bool> {
-    let mut switches = switches(model, objects);
+    let mut switches = if model.settings.has(Part::IdentitySwitches) { switches(model, objects) } else { Vec::new() };
     let energy = |i: usize| objects[i].energy;
     switches
         .sort_by(|a, b| energy(a.0).total_cmp(&energy(b.0)).then(energy(a.1).total_cmp(&energy(b.1))).then(a.cmp(b)));

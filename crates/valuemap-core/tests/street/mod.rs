@@ -9,9 +9,10 @@ use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 use valuemap_core::hypothesis::Viability;
 use valuemap_core::ray::{Ray, Rays};
+use valuemap_core::robust::Settings;
 use valuemap_core::robust::noise::Noise;
+use valuemap_core::robust::parts::Without;
 use valuemap_core::robust::scene::{Frustum, Scene, View};
-use valuemap_core::robust::{Settings, Without};
 
 pub const FOCAL_PX: f64 = 600.0;
 pub const GATE_SIGMAS: f64 = 3.5;
@@ -24,7 +25,7 @@ pub const SETTINGS: Settings = Settings {
     min_votes: 3,
     least_votes: 3,
     min_existence: 0.5,
-    without: Without { polish: false, merge: false },
+    without: Without::NOTHING,
 };
 
 /// Without errors that a pass shares, which the quick estimate knows nothing of.

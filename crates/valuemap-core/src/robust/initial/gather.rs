@@ -9,6 +9,7 @@ use super::label::{Label, first_voter, from_voters};
 use crate::progress::{Halt, Progress};
 use crate::robust::index::RayIndex;
 use crate::robust::model::Model;
+use crate::robust::parts::Part;
 use crate::robust::propose::{Hypothesis, Who, propose};
 use crate::robust::quick::quick_estimate;
 
@@ -91,7 +92,7 @@ fn polish(
 ) -> Option<Label> {
     let Model { scene, noise, settings, .. } = *model;
     let min_votes = settings.min_votes as usize;
-    let rounds = if settings.without.polish { 0 } else { MAX_ROUNDS };
+    let rounds = if settings.has(Part::Polishing) { MAX_ROUNDS } else { 0 };
     let voters_at = |point: &Vector3<f64>| -> Vec<u32> {
         let keep = |ray: u32| keep(ray) && model.may_tell(ray, point);
         index.hits(point, class, range_m, &keep).iter().map(|hit| hit.ray).collect()

@@ -17,6 +17,7 @@ use crate::robust::Settings;
 use crate::robust::index::RayIndex;
 use crate::robust::model::Model;
 use crate::robust::noise::{Noise, Spread};
+use crate::robust::parts::Part;
 use crate::robust::scene::Scene;
 
 /// Labels are dropped below these multiples of the probability that is asked for, one after the other, and then below that.
@@ -141,7 +142,7 @@ impl<'a> Solver<'a> {
         let labels = adjust(scene, noise, gate, min_votes, &labels);
         let left = labels.len();
         let labels = if may_split { settle::split(scene, noise, gate, labels, min_votes) } else { labels };
-        let labels = if settings.without.merge { labels } else { settle::fuse(scene, noise, gate, labels) };
+        let labels = if settings.has(Part::Merging) { settle::fuse(scene, noise, gate, labels) } else { labels };
         tally.outvoted += (associated - left) as u64;
         tally.fused += left.saturating_sub(labels.len()) as u64;
         Ok(labels)

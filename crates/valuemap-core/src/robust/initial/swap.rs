@@ -15,6 +15,7 @@ use super::label::{Label, SECTOR_COSINE, by_place, direction_to, from_voters, se
 use super::pairs::{nearest_pairs, replaced};
 use crate::robust::Settings;
 use crate::robust::estimate::{Care, Joint, Limits, Start};
+use crate::robust::parts::Part;
 
 /// Labels farther apart than this do not have each other's votes, m.
 const PAIR_M: f64 = 3.0;
@@ -175,7 +176,7 @@ impl Pair<'_> {
         let mut voters = [Vec::new(), Vec::new()];
         voters[1 - smaller] = [many.voters.as_slice(), &new].concat();
         let may_be_one = shared as f64 <= MOST_SHARED * few.voters.len() as f64;
-        (may_be_one && !self.settings.without.merge).then_some(voters)
+        (may_be_one && self.settings.has(Part::Merging)).then_some(voters)
     }
 
     /// What one of the two might give away: what looks from one direction, for each, or all that.

@@ -1,0 +1,114 @@
+//! The parts of the method that can be left out, one by one: what a part is worth is what fails without it.
+
+/// A move of the search, a term of J, or what is done once before or after the search.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Part {
+    /// What proposes labels of the initial map is estimated on all that votes for it.
+    Polishing,
+    /// All objects compete for all rays, image by image.
+    Assignment,
+    /// Two objects become one.
+    Merging,
+    /// Two objects exchange what they have on a visit or from a side.
+    Exchanges,
+    /// Two objects exchange what images show of one of them alone.
+    ContestedExchanges,
+    /// Two objects exchange what they have from near.
+    NearExchanges,
+    /// Neighborhoods are destroyed and repaired.
+    Repair,
+    /// Objects of few visits are tried in parts.
+    Halves,
+    /// The two best parts of an object are tried whatever they cost.
+    TwoForOne,
+    /// Objects are born of what is left over.
+    Births,
+    /// Objects are born with votes of others.
+    TakenVotes,
+    /// Solid things are not in one place.
+    Exclusion,
+    /// What begins to be seen where another object ends is that object.
+    IdentitySwitches,
+    /// Boxes of one object tell one size.
+    Sizes,
+    /// Objects of a class are about as high.
+    Heights,
+    /// Scores tell votes from clutter.
+    Scores,
+    /// Clutter is denser at some elevations.
+    Elevations,
+    /// Objects are detected less from afar.
+    Reach,
+    /// Objects are denser near others.
+    Company,
+    /// Who should have seen an object and did not.
+    Looks,
+    /// Classes that are taken for each other.
+    Confusions,
+    /// What the images of a visit share of their pose errors.
+    SharedNoise,
+    /// The noise is split between poses and detections by what the objects of an image have in common.
+    NoiseSplit,
+    /// Contested votes widen covariances.
+    Contest,
+    /// Covariances are scaled by how far passes disagree.
+    Scaling,
+}
+
+impl Part {
+    /// All parts with their names.
+    pub const ALL: [(Self, &'static str); 25] = [
+        (Self::Polishing, "polishing"),
+        (Self::Assignment, "assignment"),
+        (Self::Merging, "merging"),
+        (Self::Exchanges, "exchanges"),
+        (Self::ContestedExchanges, "contested_exchanges"),
+        (Self::NearExchanges, "near_exchanges"),
+        (Self::Repair, "repair"),
+        (Self::Halves, "halves"),
+        (Self::TwoForOne, "two_for_one"),
+        (Self::Births, "births"),
+        (Self::TakenVotes, "taken_votes"),
+        (Self::Exclusion, "exclusion"),
+        (Self::IdentitySwitches, "identity_switches"),
+        (Self::Sizes, "sizes"),
+        (Self::Heights, "heights"),
+        (Self::Scores, "scores"),
+        (Self::Elevations, "elevations"),
+        (Self::Reach, "reach"),
+        (Self::Company, "company"),
+        (Self::Looks, "looks"),
+        (Self::Confusions, "confusions"),
+        (Self::SharedNoise, "shared_noise"),
+        (Self::NoiseSplit, "noise_split"),
+        (Self::Contest, "contest"),
+        (Self::Scaling, "scaling"),
+    ];
+}
+
+/// Parts that are left out.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Without(u32);
+
+impl Without {
+    /// None.
+    pub const NOTHING: Self = Self(0);
+
+    /// The parts of these names; the first name that is none.
+    ///
+    /// # Errors
+    /// A name that no part has.
+    pub fn named(names: &[String]) -> Result<Self, &str> {
+        names.iter().try_fold(Self::NOTHING, |without, name| {
+            let (part, _) = Part::ALL.iter().find(|(_, of_part)| of_part == name).ok_or(name.as_str())?;
+            Ok(Self(without.0 | 1 << *part as u32))
+        })
+    }
+
+    /// Whether a part is left out.
+    #[inline]
+    #[must_use]
+    pub const fn has(self, part: Part) -> bool {
+        self.0 >> part as u32 & 1 == 1
+    }
+}
