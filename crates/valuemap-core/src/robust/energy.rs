@@ -214,10 +214,9 @@ pub(super) fn height_terms(model: &Model<'_>, votes: &[u32], point: &Vector3<f64
     let heights = model.class_of_votes(votes)?.heights?;
     let up = model.up?;
     let height_m = height_m(model.scene, model.up, votes, point)?;
-    let (part, share) = heights.part_at(height_m)?;
-    let weight = share / (part.sigma_m * part.sigma_m + camera_m2(model, votes));
-    let (information, gradient) = (up * up.transpose() * weight, up * (weight * (height_m - part.mean_m)));
-    Some(HeightTerms { ln_density: heights.ln_density(height_m), information, gradient })
+    let terms = heights.terms_at(height_m, camera_m2(model, votes));
+    let (information, gradient) = (up * up.transpose() * terms.information, up * terms.gradient);
+    Some(HeightTerms { ln_density: terms.ln_density, information, gradient })
 }
 
 /// Variance of the mean position of the cameras of some votes, each axis, m²: heights are above where the cameras are said to be.

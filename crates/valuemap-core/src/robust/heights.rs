@@ -49,7 +49,8 @@ impl Heights {
             let parameters = (3 * count - 1) as f64;
             (parameters * (heights_m.len() as f64).ln() - 2.0 * likelihood, heights)
         });
-        of_parts.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, heights)| heights)
+        let likeliest = of_parts.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, heights)| heights);
+        likeliest.map(|heights| Self { parts: heights.parts.map(|part| part.of_another(heights_m.len())), ..heights })
     }
 
     /// As many numbers.
@@ -86,20 +87,47 @@ impl Heights {
         self.parts.iter().map(|part| part.share * part.mean_m).sum()
     }
 
-    /// The distribution that a height is most probably of, and how probably it is of any.
+    /// What heights say of an object at a height that is known with some variance, m²: the cameras may be higher or lower than they are said to be.
     #[must_use]
-    pub fn part_at(&self, height_m: f64) -> Option<(Part, f64)> {
-        let weighted = |part: &Part| part.share * part.density(height_m);
-        let part = self.parts.iter().max_by(|a, b| weighted(a).total_cmp(&weighted(b)))?;
-        let of_part = (1.0 - ELSEWHERE) * weighted(part);
-        Some((*part, of_part / self.ln_density(height_m).exp()))
+    pub fn terms_at(&self, height_m: f64, variance_m2: f64) -> Terms {
+        let (mut density, mut slope, mut bend) = (self.ln_elsewhere.exp(), 0.0, 0.0);
+        for part in &self.parts {
+            let part = Part { sigma_m: part.sigma_m.hypot(variance_m2.sqrt()), ..*part };
+            let of_part = (1.0 - ELSEWHERE) * part.share * part.density(height_m);
+            let precision = part.sigma_m.powi(-2);
+            let pull = (height_m - part.mean_m) * precision;
+            density += of_part;
+            slope += of_part * pull;
+            bend += of_part * (precision - pull * pull);
+        }
+        let gradient = slope / density;
+        // Between two heights, and beyond all, it curves the other way: that tells nothing of how well the height is known.
+        let information = (bend / density + gradient * gradient).max(0.0);
+        Terms { ln_density: density.ln(), gradient, information }
     }
+}
+
+/// What heights say of an object at one of them.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Terms {
+    /// The logarithm of the density, 1/m.
+    pub ln_density: f64,
+    /// Minus its derivative, 1/m.
+    pub gradient: f64,
+    /// Minus its second derivative, 1/m²; 0 where that is negative.
+    pub information: f64,
 }
 
 impl Part {
     fn density(&self, height_m: f64) -> f64 {
         let away = (height_m - self.mean_m) / self.sigma_m;
         (-0.5 * away * away).exp() / (self.sigma_m * (2.0 * PI).sqrt())
+    }
+
+    /// What so many objects tell of the height of another one: the variance of a sample is too small, and its mean is not known exactly.
+    fn of_another(self, objects: usize) -> Self {
+        let n = (self.share * objects as f64).max(2.0);
+        Self { sigma_m: self.sigma_m * ((n + 1.0) / (n - 1.0)).sqrt(), ..self }
     }
 }
 
@@ -197,6 +225,47 @@ fn median(values: &[f64]) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Poles of 2 m and masts of 3 m that differ by 0.3 m each.
+    fn overlapping() -> Heights {
+        let part = |mean_m: f64| Part { share: 0.5, mean_m, sigma_m: 0.3 };
+        Heights { parts: [part(2.0), part(3.0), Part { share: 0.0, ..part(2.0) }], ln_elsewhere: -8.0 }
+    }
+
+    #[test]
+    fn terms_are_derivatives_of_the_density() {
+        let heights = overlapping();
+        for height_m in [1.4, 1.9, 2.2, 2.5, 2.9, 3.3] {
+            let at = |height_m: f64| heights.terms_at(height_m, 0.04);
+            let (before, here, after) = (at(height_m - 1e-4), at(height_m), at(height_m + 1e-4));
+            assert!((here.gradient + (after.ln_density - before.ln_density) / 2e-4).abs() < 1e-5);
+            let information = (after.gradient - before.gradient) / 2e-4;
+            assert!((here.information - information.max(0.0)).abs() < 1e-4);
+        }
+    }
+
+    #[test]
+    fn between_two_heights_neither_tells_how_high_something_is() {
+        let heights = overlapping();
+        assert_eq!(heights.terms_at(2.5, 0.0).information, 0.0);
+        assert!(heights.terms_at(2.0, 0.0).information > 0.9 / 0.09);
+        // The camera is known no better than that.
+        assert!(heights.terms_at(2.0, 1.0).information < 1.0);
+    }
+
+    #[test]
+    fn few_objects_tell_less_of_another_one() {
+        let sigma_m = |count: usize| {
+            let heights: Vec<f64> = (0..count).map(|i| 5.0 + 0.1 * f64::from(i as u32 % 2)).collect();
+            Heights::learn(&heights, &vec![0.01; count], 50.0).map(|learned| {
+                let parts = learned.parts.iter().filter(|part| part.share > 0.0);
+                parts.map(|part| part.sigma_m).fold(0.0, f64::max)
+            })
+        };
+        // (n + 1) / (n - 1) times the variance of 0.05 m, or of the floor of 0.01 m where each height is a part.
+        assert!(sigma_m(4).is_some_and(|sigma| sigma > 0.01 * 1.7));
+        assert!(sigma_m(4) > sigma_m(400));
+    }
 
     #[test]
     fn masts_and_poles_are_told_apart() {
