@@ -23,7 +23,7 @@ use rstar::primitives::GeomWithData;
 
 use super::drift::{Drive, Look, OneLook};
 use super::estimate::is_one_visit;
-use super::heights::height_m;
+use super::heights::{HeightTerms, height_m};
 use super::looks::Lookout;
 use super::model::{Model, Sizes};
 use super::parts::Part;
@@ -194,29 +194,25 @@ fn terms(model: &Model<'_>, votes: &[u32], weights: &[f64], point: &Vector3<f64>
         sum.gradient += sizes.gradient;
         sum.of_priors += sizes.square;
     }
-    if let Some(HeightTerms { ln_density, information, gradient }) = height_terms(model, votes, point) {
-        sum.information += information;
-        sum.gradient += gradient;
-        sum.of_priors -= 2.0 * ln_density;
+    if let Some((up, terms)) = height_terms(model, votes, point, camera_m2(model, votes)) {
+        sum.information += up * up.transpose() * terms.information;
+        sum.gradient += up * terms.gradient;
+        sum.of_priors -= 2.0 * terms.ln_density;
     }
     sum.cost().is_finite().then_some(sum)
 }
 
-/// What heights say about a position: the logarithm of their density, 1/m, and the normal equations.
-pub(super) struct HeightTerms {
-    pub(super) ln_density: f64,
-    pub(super) information: Matrix3<f64>,
-    pub(super) gradient: Vector3<f64>,
-}
-
-/// Logarithm of the density of heights at a point, with information and gradient of its position; nothing before heights are learned.
-pub(super) fn height_terms(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> Option<HeightTerms> {
+/// What the heights of its class say of an object with some votes at a point, with a variance of the cameras' heights, m²; and what is up. Nothing before
+/// heights are learned.
+pub(super) fn height_terms(
+    model: &Model<'_>,
+    votes: &[u32],
+    point: &Vector3<f64>,
+    variance_m2: f64,
+) -> Option<(Vector3<f64>, HeightTerms)> {
     let heights = model.class_of_votes(votes)?.heights?;
-    let up = model.up?;
     let height_m = height_m(model.scene, model.up, votes, point)?;
-    let terms = heights.terms_at(height_m, camera_m2(model, votes));
-    let (information, gradient) = (up * up.transpose() * terms.information, up * terms.gradient);
-    Some(HeightTerms { ln_density: terms.ln_density, information, gradient })
+    Some((model.up?, heights.terms_at(height_m, variance_m2)))
 }
 
 /// Variance of the mean position of the cameras of some votes, each axis, m²: heights are above where the cameras are said to be.

@@ -6,6 +6,7 @@
 //! adjustment with priors on the poses).
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector2, Vector3};
+use rustc_hash::FxHashMap;
 
 use super::drift::{Drive, Look, Normals, Vantage};
 use super::energy::height_terms;
@@ -256,28 +257,43 @@ impl<'a> Joint<'a> {
     }
 
     fn evaluate(&self) -> Option<Evaluation> {
-        // Not collected: an iterator of options does not say how many there will be.
-        let mut looks = Vec::with_capacity(self.votes.len());
-        for ((&(label, _), vantage), error) in self.votes.iter().zip(&self.vantages).zip(&self.pose_errors) {
-            let point = &self.points[label];
-            looks.push(match self.care {
-                Care::Rough => vantage.look(label, point)?.by_itself(),
-                Care::Exact => vantage.look_where_it_was(label, point, error)?,
-            });
-        }
+        let heights = self.heights();
         let mut normals = Normals::nothing(self.points.len());
-        let mut of_visits = Vec::new();
-        let mut pose_errors = Vec::new();
-        let mut left: Vec<Vector2<f64>> = Vec::with_capacity(looks.len());
+        let (mut of_visits, mut pose_errors) = (Vec::new(), Vec::new());
+        let mut looks: Vec<Look> = Vec::with_capacity(self.votes.len());
+        let mut left: Vec<Vector2<f64>> = Vec::with_capacity(self.votes.len());
         for votes in self.visits() {
-            let range = left.len()..left.len() + votes.len();
-            let drive = Drive::along(&looks[range.clone()], &self.weights[range.clone()], self.points.len())?;
+            let range = looks.len()..looks.len() + votes.len();
+            // What heights say goes among the looks: the visit's drift is theirs as well.
+            let mut along: Vec<Look> = Vec::with_capacity(votes.len());
+            let (mut weights, mut is_vote) = (Vec::with_capacity(votes.len()), Vec::with_capacity(votes.len()));
+            for i in range.clone() {
+                let (label, vantage) = (self.votes[i].0, &self.vantages[i]);
+                let point = &self.points[label];
+                let look = match self.care {
+                    Care::Rough => vantage.look(label, point)?.by_itself(),
+                    Care::Exact => vantage.look_where_it_was(label, point, &self.pose_errors[i])?,
+                };
+                let height =
+                    heights.get(&i).map(|(up, higher_m, variance_m2)| look.at_height(up, *higher_m, *variance_m2));
+                looks.push(look.clone());
+                along.push(look);
+                weights.push(self.weights[i]);
+                is_vote.push(true);
+                if let Some(height) = height {
+                    along.push(height);
+                    weights.push(1.0);
+                    is_vote.push(false);
+                }
+            }
+            let drive = Drive::along(&along, &weights, self.points.len())?;
             normals.information += &drive.normals.information;
             normals.gradient += &drive.normals.gradient;
             normals.square += drive.normals.square;
-            left.extend(drive.left());
+            left.extend(drive.left().into_iter().zip(&is_vote).filter(|(_, is_vote)| **is_vote).map(|(left, _)| left));
             if self.care == Care::Exact {
-                pose_errors.extend(drive.pose_errors(&self.weights[range]));
+                let errors = drive.pose_errors(&weights).into_iter().zip(&is_vote);
+                pose_errors.extend(errors.filter(|(_, is_vote)| **is_vote).map(|(error, _)| error));
             }
             of_visits.push(drive.normals);
         }
@@ -310,20 +326,55 @@ impl<'a> Joint<'a> {
 impl Joint<'_> {
     fn add_priors(&self, normals: &mut Normals) {
         let Some(model) = self.model else { return };
-        let mut votes: Vec<Vec<u32>> = vec![Vec::new(); self.points.len()];
-        for &(label, ray) in &self.votes {
-            votes[label].push(ray);
-        }
-        for (label, (votes, point)) in votes.iter().zip(&self.points).enumerate() {
+        for (label, (votes, point)) in self.votes_of_labels().iter().zip(&self.points).enumerate() {
             if let Some(terms) = size_terms(model, votes, point) {
                 normals.add(label, label, &terms.information);
                 normals.add_gradient(label, &terms.gradient);
             }
-            if let Some(terms) = height_terms(model, votes, point) {
-                normals.add(label, label, &terms.information);
-                normals.add_gradient(label, &terms.gradient);
+        }
+    }
+
+    /// The rays that vote for each label.
+    fn votes_of_labels(&self) -> Vec<Vec<u32>> {
+        let mut votes: Vec<Vec<u32>> = vec![Vec::new(); self.points.len()];
+        for &(label, ray) in &self.votes {
+            votes[label].push(ray);
+        }
+        votes
+    }
+
+    /// What is known of heights, by the number of the vote whose image it is said of, the nearest of each visit: what is up, how much too high its label
+    /// is, m, and the variance of that, m². A height is above cameras, so how high these are is as unknown to it as to the votes; each visit has
+    /// as large a share of what it tells.
+    fn heights(&self) -> FxHashMap<usize, (Vector3<f64>, f64, f64)> {
+        let mut found = FxHashMap::default();
+        let Some(model) = self.model else { return found };
+        let mut nearest: Vec<Vec<(f64, usize)>> = vec![Vec::new(); self.points.len()];
+        let mut at = 0;
+        for votes in self.visits() {
+            let mut of_visit: FxHashMap<usize, (f64, usize)> = FxHashMap::default();
+            for (i, &(label, ray)) in (at..).zip(votes) {
+                let distance_m = (self.scene.ray(ray).center - self.points[label]).norm();
+                let best = of_visit.entry(label).or_insert((distance_m, i));
+                if distance_m < best.0 {
+                    *best = (distance_m, i);
+                }
+            }
+            for (label, best) in of_visit {
+                nearest[label].push(best);
+            }
+            at += votes.len();
+        }
+        for ((votes, point), nearest) in self.votes_of_labels().iter().zip(&self.points).zip(&nearest) {
+            let Some((up, terms)) = height_terms(model, votes, point, 0.0) else { continue };
+            if terms.information > 0.0 {
+                let (higher_m, variance_m2) = (terms.gradient / terms.information, terms.information.recip());
+                for &(_, i) in nearest {
+                    found.insert(i, (up, higher_m, variance_m2 * nearest.len() as f64));
+                }
             }
         }
+        found
     }
 }
 

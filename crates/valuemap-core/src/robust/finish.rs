@@ -67,3 +67,40 @@ pub(super) fn places(objects: &[Object], radius_m: f64) -> Vec<Vec<usize>> {
     }
     places
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::super::energy::object;
+    use super::super::heights::Heights;
+    use super::super::looks::Lookout;
+    use super::super::noise::Noise;
+    use super::*;
+    use crate::street;
+
+    #[test]
+    fn heights_tell_how_far_objects_are_but_not_how_high_the_cameras_were() {
+        let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
+        let objects: Vec<Vector3<f64>> =
+            (0..10).map(|i| Vector3::new(30.0 + f64::from(i), f64::from(i - 5), 3.0)).collect();
+        let scene = street::street(4, 2.0, &objects, &errors);
+        let noise = Noise { position_drift_m: 0.2, ..street::NOISE };
+        let mut model = Model::new(&scene, &noise, &street::SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let votes = |i: usize| scene.usable_rays().into_iter().skip(i).step_by(objects.len()).collect();
+        let found: Vec<Object> =
+            (0..10).filter_map(|i| object(&model, &lookout, votes(i), objects[i], Vec::new())).collect();
+        assert_eq!(found.len(), objects.len());
+        let without = finish(&model, &found);
+        let heights: Vec<f64> = (0..60).map(|i| 3.0 + 0.01 * f64::from(i % 5 - 2)).collect();
+        model.classes[0].heights = Heights::learn(&heights, &[0.02; 60], 50.0);
+        let with = finish(&model, &found);
+        let sigma_m = |estimate: &Estimate, axis: usize| estimate.covariance[(axis, axis)].sqrt();
+        // Those that are not begun near their height are taken for objects that are elsewhere.
+        let told = with.iter().zip(&without).filter(|(with, without)| sigma_m(with, 0) < 0.5 * sigma_m(without, 0));
+        assert!(told.count() >= 7);
+        // All cameras may be 0.2 m higher or lower than is said, and all objects with them.
+        assert!(with.iter().all(|with| sigma_m(with, 2) > 0.19));
+    }
+}
