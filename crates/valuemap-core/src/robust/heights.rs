@@ -11,7 +11,7 @@ use rustc_hash::FxHashSet;
 use super::scene::Scene;
 
 /// Normal distributions that are tried, at most.
-const MOST_PARTS: usize = 3;
+const MOST_COMPONENTS: usize = 3;
 /// Rounds of expectation and maximisation, at most.
 const ROUNDS: usize = 50;
 /// The share of objects that are anywhere: on bridges, on hills. As of sizes that are odd by chance (model.rs).
@@ -19,7 +19,7 @@ const ELSEWHERE: f64 = 0.05;
 
 /// A normal distribution among others.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Part {
+pub struct Component {
     /// Its share of the objects.
     pub share: f64,
     /// Its mean, m.
@@ -32,7 +32,7 @@ pub struct Part {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Heights {
     /// The distributions; their shares add up to 1, those of the last may be 0.
-    pub parts: [Part; MOST_PARTS],
+    pub components: [Component; MOST_COMPONENTS],
     /// Logarithm of the density of what is anywhere, 1/m.
     ln_elsewhere: f64,
 }
@@ -43,24 +43,27 @@ impl Heights {
     pub fn learn(heights_m: &[f64], sigmas_m: &[f64], range_m: f64) -> Option<Self> {
         let floor_m = median(sigmas_m)?;
         let ln_elsewhere = ELSEWHERE.ln() - (2.0 * range_m).ln();
-        let of_parts = (1..=MOST_PARTS).map(|count| {
-            let heights = Self { parts: parts(heights_m, count, floor_m), ln_elsewhere };
+        let of_components = (1..=MOST_COMPONENTS).map(|count| {
+            let heights = Self { components: components(heights_m, count, floor_m), ln_elsewhere };
             let likelihood: f64 = heights_m.iter().map(|&height| heights.ln_density(height)).sum();
             let parameters = (3 * count - 1) as f64;
             (parameters * (heights_m.len() as f64).ln() - 2.0 * likelihood, heights)
         });
-        let likeliest = of_parts.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, heights)| heights);
-        likeliest.map(|heights| Self { parts: heights.parts.map(|part| part.of_another(heights_m.len())), ..heights })
+        let likeliest = of_components.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, heights)| heights);
+        likeliest.map(|heights| Self {
+            components: heights.components.map(|component| component.of_another(heights_m.len())),
+            ..heights
+        })
     }
 
     /// As many numbers.
-    pub const NUMBERS: usize = 3 * MOST_PARTS + 1;
+    pub const NUMBERS: usize = 3 * MOST_COMPONENTS + 1;
 
     /// As numbers, for storage.
     #[must_use]
     pub fn to_row(&self) -> [f64; Self::NUMBERS] {
-        std::array::from_fn(|place| match self.parts.get(place / 3) {
-            Some(part) => [part.share, part.mean_m, part.sigma_m][place % 3],
+        std::array::from_fn(|place| match self.components.get(place / 3) {
+            Some(component) => [component.share, component.mean_m, component.sigma_m][place % 3],
             None => self.ln_elsewhere,
         })
     }
@@ -68,37 +71,38 @@ impl Heights {
     /// What `to_row` returned; nothing if they are not numbers.
     #[must_use]
     pub fn from_row(row: &[f64; Self::NUMBERS]) -> Option<Self> {
-        let part = |i: usize| Part { share: row[3 * i], mean_m: row[3 * i + 1], sigma_m: row[3 * i + 2] };
+        let component = |i: usize| Component { share: row[3 * i], mean_m: row[3 * i + 1], sigma_m: row[3 * i + 2] };
         row.iter()
             .all(|number| number.is_finite())
-            .then(|| Self { parts: std::array::from_fn(part), ln_elsewhere: row[Self::NUMBERS - 1] })
+            .then(|| Self { components: std::array::from_fn(component), ln_elsewhere: row[Self::NUMBERS - 1] })
     }
 
     /// Logarithm of the density at a height, 1/m.
     #[must_use]
     pub fn ln_density(&self, height_m: f64) -> f64 {
-        let of_parts: f64 = self.parts.iter().map(|part| part.share * part.density(height_m)).sum();
-        ((1.0 - ELSEWHERE) * of_parts + self.ln_elsewhere.exp()).ln()
+        let of_components: f64 =
+            self.components.iter().map(|component| component.share * component.density(height_m)).sum();
+        ((1.0 - ELSEWHERE) * of_components + self.ln_elsewhere.exp()).ln()
     }
 
     /// Their mean, m.
     #[must_use]
     pub fn mean_m(&self) -> f64 {
-        self.parts.iter().map(|part| part.share * part.mean_m).sum()
+        self.components.iter().map(|component| component.share * component.mean_m).sum()
     }
 
     /// What heights say of an object at a height that is known with some variance, m²: the cameras may be higher or lower than they are said to be.
     #[must_use]
     pub fn terms_at(&self, height_m: f64, variance_m2: f64) -> HeightTerms {
         let (mut density, mut slope, mut bend) = (self.ln_elsewhere.exp(), 0.0, 0.0);
-        for part in &self.parts {
-            let part = Part { sigma_m: part.sigma_m.hypot(variance_m2.sqrt()), ..*part };
-            let of_part = (1.0 - ELSEWHERE) * part.share * part.density(height_m);
-            let precision = part.sigma_m.powi(-2);
-            let pull = (height_m - part.mean_m) * precision;
-            density += of_part;
-            slope += of_part * pull;
-            bend += of_part * (precision - pull * pull);
+        for component in &self.components {
+            let component = Component { sigma_m: component.sigma_m.hypot(variance_m2.sqrt()), ..*component };
+            let of_component = (1.0 - ELSEWHERE) * component.share * component.density(height_m);
+            let precision = component.sigma_m.powi(-2);
+            let pull = (height_m - component.mean_m) * precision;
+            density += of_component;
+            slope += of_component * pull;
+            bend += of_component * (precision - pull * pull);
         }
         let gradient = slope / density;
         // Between two heights, and beyond all, it curves the other way: that tells nothing of how well the height is known.
@@ -118,7 +122,7 @@ pub struct HeightTerms {
     pub information: f64,
 }
 
-impl Part {
+impl Component {
     fn density(&self, height_m: f64) -> f64 {
         let away = (height_m - self.mean_m) / self.sigma_m;
         (-0.5 * away * away).exp() / (self.sigma_m * (2.0 * PI).sqrt())
@@ -132,35 +136,40 @@ impl Part {
 }
 
 /// The mixture of `count` distributions that makes some heights most likely, begun at their quantiles.
-fn parts(heights_m: &[f64], count: usize, floor_m: f64) -> [Part; MOST_PARTS] {
+fn components(heights_m: &[f64], count: usize, floor_m: f64) -> [Component; MOST_COMPONENTS] {
     let mut sorted = heights_m.to_vec();
     sorted.sort_by(f64::total_cmp);
     let quantile = |q: f64| sorted[((sorted.len() as f64 * q) as usize).min(sorted.len() - 1)];
     let width = (quantile(0.9) - quantile(0.1)).max(floor_m) / count as f64;
-    let mut parts = [Part { share: 0.0, mean_m: quantile(0.5), sigma_m: width.max(floor_m) }; MOST_PARTS];
-    for (i, part) in parts.iter_mut().enumerate().take(count) {
-        (part.share, part.mean_m) = (1.0 / count as f64, quantile((i as f64 + 0.5) / count as f64));
+    let mut components =
+        [Component { share: 0.0, mean_m: quantile(0.5), sigma_m: width.max(floor_m) }; MOST_COMPONENTS];
+    for (i, component) in components.iter_mut().enumerate().take(count) {
+        (component.share, component.mean_m) = (1.0 / count as f64, quantile((i as f64 + 0.5) / count as f64));
     }
     for _ in 0..ROUNDS {
-        let before = parts;
+        let before = components;
         let total: Vec<f64> = heights_m
             .iter()
-            .map(|&height| before.iter().map(|part| part.share * part.density(height)).sum::<f64>() + f64::MIN_POSITIVE)
+            .map(|&height| {
+                before.iter().map(|component| component.share * component.density(height)).sum::<f64>()
+                    + f64::MIN_POSITIVE
+            })
             .collect();
-        for (part, old) in parts.iter_mut().zip(&before).take(count) {
+        for (component, old) in components.iter_mut().zip(&before).take(count) {
             let weights: Vec<f64> =
                 heights_m.iter().zip(&total).map(|(&height, total)| old.share * old.density(height) / total).collect();
             let sum = weights.iter().sum::<f64>().max(f64::MIN_POSITIVE);
             let mean_m = heights_m.iter().zip(&weights).map(|(height, weight)| height * weight).sum::<f64>() / sum;
             let of_square = |(height, weight): (&f64, &f64)| weight * (height - mean_m).powi(2);
             let variance = heights_m.iter().zip(&weights).map(of_square).sum::<f64>() / sum;
-            *part = Part { share: sum / heights_m.len() as f64, mean_m, sigma_m: variance.sqrt().max(floor_m) };
+            *component =
+                Component { share: sum / heights_m.len() as f64, mean_m, sigma_m: variance.sqrt().max(floor_m) };
         }
-        if parts.iter().zip(&before).all(|(new, old)| (new.mean_m - old.mean_m).abs() < 1e-3 * floor_m) {
+        if components.iter().zip(&before).all(|(new, old)| (new.mean_m - old.mean_m).abs() < 1e-3 * floor_m) {
             break;
         }
     }
-    parts
+    components
 }
 
 /// How high a point is above the cameras of some rays, m: the nearest count most, roads go up and down. Nothing where nobody knows what is up.
@@ -228,8 +237,11 @@ mod tests {
 
     /// Poles of 2 m and masts of 3 m that differ by 0.3 m each.
     fn overlapping() -> Heights {
-        let part = |mean_m: f64| Part { share: 0.5, mean_m, sigma_m: 0.3 };
-        Heights { parts: [part(2.0), part(3.0), Part { share: 0.0, ..part(2.0) }], ln_elsewhere: -8.0 }
+        let component = |mean_m: f64| Component { share: 0.5, mean_m, sigma_m: 0.3 };
+        Heights {
+            components: [component(2.0), component(3.0), Component { share: 0.0, ..component(2.0) }],
+            ln_elsewhere: -8.0,
+        }
     }
 
     #[test]
@@ -258,11 +270,11 @@ mod tests {
         let sigma_m = |count: usize| {
             let heights: Vec<f64> = (0..count).map(|i| 5.0 + 0.1 * f64::from(i as u32 % 2)).collect();
             Heights::learn(&heights, &vec![0.01; count], 50.0).map(|learned| {
-                let parts = learned.parts.iter().filter(|part| part.share > 0.0);
-                parts.map(|part| part.sigma_m).fold(0.0, f64::max)
+                let components = learned.components.iter().filter(|component| component.share > 0.0);
+                components.map(|component| component.sigma_m).fold(0.0, f64::max)
             })
         };
-        // (n + 1) / (n - 1) times the variance of 0.05 m, or of the floor of 0.01 m where each height is a part.
+        // (n + 1) / (n - 1) times the variance of 0.05 m, or of the floor of 0.01 m where each height is a component.
         assert!(sigma_m(4).is_some_and(|sigma| sigma > 0.01 * 1.7));
         assert!(sigma_m(4) > sigma_m(400));
     }
@@ -274,9 +286,9 @@ mod tests {
         let learned = Heights::learn(&heights, &[0.05; 60], 50.0);
         let means: Vec<f64> = learned
             .iter()
-            .flat_map(|learned| learned.parts)
-            .filter(|part| part.share > 0.0)
-            .map(|part| part.mean_m)
+            .flat_map(|learned| learned.components)
+            .filter(|component| component.share > 0.0)
+            .map(|component| component.mean_m)
             .collect();
         assert_eq!(means.len(), 2);
         assert!((means[0].min(means[1]) - 2.0).abs() < 0.2 && (means[0].max(means[1]) - 5.0).abs() < 0.2);

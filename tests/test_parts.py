@@ -1,0 +1,170 @@
+"""Each part of the robust method has a scene that fails without it, and no part has none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.optimize import linear_sum_assignment
+
+import valuemap
+from block import block
+from test_few import some_pictures
+from valuemap import robust
+from valuemap.dataset import Dataset
+from valuemap.simulate import simulate
+from valuemap.tables import Floats
+
+NEAR_M = 2.0
+HONEST_CHI2 = 16.0
+POSES_AS_THEY_ARE = valuemap.MapConfig().with_settings(["correct_poses=0"])
+NO_LIGHTS = {"has_lights": 0, "lookalikes_per_light": 0.0}
+BLOCKS: dict[str, dict[str, float]] = {
+    "lights": {},
+    "drifts": {"position_drift_m": 0.4, "position_white_m": 0.05, "passes_per_street": 3},
+    "poor detector": {"recall_mean": 0.35, "clutter_per_image": 0.5, "passes_per_street": 3},
+    "temporary": {"temporary_per_1000_images": 10.0},
+    "confused classes": {"class_confusion": 0.15, "sign_row_spacing_m": 20.0, "lookalikes_per_light": 0.0},
+    "rows": {"sign_row_spacing_m": 30.0, "sign_apart_m": 0.9, "passes_per_street": 1, **NO_LIGHTS},
+    "close rows": {"sign_row_spacing_m": 30.0, "sign_apart_m": 0.5, **NO_LIGHTS},
+    "trees": {"tree_spacing_m": 8.0, "max_sight_m": 60.0, "passes_per_street": 1, **NO_LIGHTS},
+}
+"""Changes of the block's settings; scenes of few pictures are those of `test_few.py`."""
+FEW_PICTURES = "few pictures"
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """How good a map is: `chi2` (N) are the squared normalised errors of right labels, of those within 2 m."""
+
+    objects: int
+    labels: int
+    chi2: Floats
+    existence: Floats
+    variance_m2: Floats
+    energy: float
+
+    @property
+    def right(self) -> int:
+        """Labels that are near an object, one each."""
+        return len(self.chi2)
+
+    @property
+    def honest(self) -> int:
+        """Right labels that say how wrong they may be."""
+        return int((self.chi2 < HONEST_CHI2).sum())
+
+    @property
+    def wrong(self) -> int:
+        """Labels that are near no object of their own, and objects without one."""
+        return self.labels + self.objects - 2 * self.right
+
+
+@cache
+def scene(name: str, seed: int) -> tuple[Dataset, Floats]:
+    """Return a scene, and where its objects are."""
+    if name == FEW_PICTURES:
+        return some_pictures(seed, one_in=15)
+    dataset = simulate(block(**BLOCKS[name]), seed=seed, name="block")
+    assert dataset.truth is not None
+    return dataset, dataset.truth.position_in_world_m
+
+
+def score(name: str, seed: int, without: str | None = None) -> Score:
+    """Map a scene, perhaps without a part of the method."""
+    dataset, objects = scene(name, seed)
+    robust.LEFT_OUT = {without} if without else set()
+    try:
+        result = valuemap.build_map(dataset, POSES_AS_THEY_ARE)
+    finally:
+        robust.LEFT_OUT = set()
+    labels = result.labels
+    assert labels.covariance_m2 is not None
+    assert labels.existence is not None
+    xx, xy, xz, yy, yz, zz = labels.covariance_m2.T
+    covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
+    apart_m = np.linalg.norm(labels.position_in_world_m[:, None] - objects, axis=2)
+    label, of = linear_sum_assignment(np.where(apart_m < NEAR_M, apart_m - 1e6, 0.0))
+    is_near = apart_m[label, of] < NEAR_M
+    error_m = labels.position_in_world_m[label[is_near]] - objects[of[is_near]]
+    chi2 = np.einsum("ni,nij,nj->n", error_m, np.linalg.inv(covariance[label[is_near]]), error_m)
+    counts = result.run["counts"]
+    trace_m2 = np.trace(covariance, axis1=1, axis2=2)
+    existence = labels.existence[label[is_near]]
+    return Score(len(objects), len(labels), chi2, existence, trace_m2, counts["energy"])
+
+
+whole = cache(score)
+
+
+def j_is_higher(best: Score, without: Score) -> bool:
+    """A move of the search: J of the map is higher without it."""
+    return without.energy > best.energy + 1.0
+
+
+def more_is_wrong(best: Score, without: Score) -> bool:
+    return without.wrong > best.wrong
+
+
+def fewer_are_honest(best: Score, without: Score) -> bool:
+    return without.honest < best.honest
+
+
+def errors_are_larger_than_said(best: Score, without: Score) -> bool:
+    return bool(without.chi2.mean() > 1.2 * best.chi2.mean())
+
+
+def less_is_said_of_what_is_contested(best: Score, without: Score) -> bool:
+    return bool(without.variance_m2.sum() < 0.999 * best.variance_m2.sum() and without.chi2.mean() > best.chi2.mean())
+
+
+def what_is_there_is_believed_less(best: Score, without: Score) -> bool:
+    return bool(without.existence.mean() < best.existence.mean() - 1e-3)
+
+
+Fails = Callable[[Score, Score], bool]
+CASES: dict[str, tuple[str, int, Fails]] = {
+    "polishing": ("close rows", 5, more_is_wrong),
+    "assignment": ("trees", 5, j_is_higher),
+    "merging": ("close rows", 5, more_is_wrong),
+    "exchanges": ("temporary", 5, j_is_higher),
+    "contested_exchanges": ("rows", 5, j_is_higher),
+    "near_exchanges": ("rows", 7, j_is_higher),
+    "repair": ("rows", 5, j_is_higher),
+    "halves": (FEW_PICTURES, 5, more_is_wrong),
+    "two_for_one": (FEW_PICTURES, 5, more_is_wrong),
+    "births": ("drifts", 5, j_is_higher),
+    "taken_votes": (FEW_PICTURES, 5, j_is_higher),
+    "exclusion": (FEW_PICTURES, 11, more_is_wrong),
+    "sizes": (FEW_PICTURES, 5, more_is_wrong),
+    "heights": (FEW_PICTURES, 5, fewer_are_honest),
+    "scores": ("poor detector", 5, more_is_wrong),
+    "elevations": (FEW_PICTURES, 10, fewer_are_honest),
+    "reach": ("drifts", 5, what_is_there_is_believed_less),
+    "company": (FEW_PICTURES, 10, fewer_are_honest),
+    "looks": ("lights", 5, more_is_wrong),
+    "confusions": ("confused classes", 5, more_is_wrong),
+    "shared_noise": ("drifts", 5, errors_are_larger_than_said),
+    "noise_split": ("close rows", 5, more_is_wrong),
+    "contest": ("lights", 5, less_is_said_of_what_is_contested),
+    "scaling": ("drifts", 5, errors_are_larger_than_said),
+}
+"""By part: a scene, its seed, and what is worse there without the part."""
+ELSEWHERE = {"identity_switches": "the unit tests of switches.rs: simulated poses do not bend while a car turns"}
+"""Parts that no simulated scene fails without, and what pins them."""
+
+
+@pytest.mark.parametrize("part", CASES)
+def test_a_scene_fails_without(part: str) -> None:
+    name, seed, fails = CASES[part]
+    best = whole(name, seed)
+    assert fails(best, score(name, seed, without=part))
+    assert not fails(best, best)
+
+
+def test_every_part_has_a_scene() -> None:
+    assert {*CASES, *ELSEWHERE} == set(robust.PARTS)
+    assert not CASES.keys() & ELSEWHERE.keys()
