@@ -257,48 +257,26 @@ impl<'a> Joint<'a> {
     }
 
     fn evaluate(&self) -> Option<Evaluation> {
-        let heights = self.heights();
+        let Looks { all: looks, weights, is_vote, ends } = self.looks()?;
         let mut normals = Normals::nothing(self.points.len());
-        let (mut of_visits, mut pose_errors) = (Vec::new(), Vec::new());
-        let mut looks: Vec<Look> = Vec::with_capacity(self.votes.len());
-        let mut left: Vec<Vector2<f64>> = Vec::with_capacity(self.votes.len());
-        for votes in self.visits() {
-            let range = looks.len()..looks.len() + votes.len();
-            // What heights say goes among the looks: the visit's drift is theirs as well.
-            let mut along: Vec<Look> = Vec::with_capacity(votes.len());
-            let (mut weights, mut is_vote) = (Vec::with_capacity(votes.len()), Vec::with_capacity(votes.len()));
-            for i in range.clone() {
-                let (label, vantage) = (self.votes[i].0, &self.vantages[i]);
-                let point = &self.points[label];
-                let look = match self.care {
-                    Care::Rough => vantage.look(label, point)?.by_itself(),
-                    Care::Exact => vantage.look_where_it_was(label, point, &self.pose_errors[i])?,
-                };
-                let height =
-                    heights.get(&i).map(|(up, higher_m, variance_m2)| look.at_height(up, *higher_m, *variance_m2));
-                looks.push(look.clone());
-                along.push(look);
-                weights.push(self.weights[i]);
-                is_vote.push(true);
-                if let Some(height) = height {
-                    along.push(height);
-                    weights.push(1.0);
-                    is_vote.push(false);
-                }
-            }
-            let drive = Drive::along(&along, &weights, self.points.len())?;
+        let (mut of_visits, mut pose_errors) = (Vec::with_capacity(ends.len()), Vec::new());
+        let mut left: Vec<Vector2<f64>> = Vec::with_capacity(looks.len());
+        for end in ends {
+            let range = left.len()..end;
+            let drive = Drive::along(&looks[range.clone()], &weights[range.clone()], self.points.len())?;
             normals.information += &drive.normals.information;
             normals.gradient += &drive.normals.gradient;
             normals.square += drive.normals.square;
-            left.extend(drive.left().into_iter().zip(&is_vote).filter(|(_, is_vote)| **is_vote).map(|(left, _)| left));
+            left.extend(drive.left());
             if self.care == Care::Exact {
-                let errors = drive.pose_errors(&weights).into_iter().zip(&is_vote);
+                let errors = drive.pose_errors(&weights[range.clone()]).into_iter().zip(&is_vote[range]);
                 pose_errors.extend(errors.filter(|(_, is_vote)| **is_vote).map(|(error, _)| error));
             }
             of_visits.push(drive.normals);
         }
+        let votes = || (0..looks.len()).filter(|&i| is_vote[i]).map(|i| (&looks[i], weights[i], &left[i]));
         let mut alone = vec![Matrix3::zeros(); self.points.len()];
-        for (look, weight) in looks.iter().zip(&self.weights) {
+        for (look, weight, _) in votes() {
             for column in &look.by_point {
                 alone[look.label] += column * column.transpose() * (weight / look.variance);
             }
@@ -310,8 +288,7 @@ impl<'a> Joint<'a> {
         }
         let alone: Vec<Matrix3<f64>> =
             alone.into_iter().map(|alone| Some(alone.cholesky()?.inverse())).collect::<Option<_>>()?;
-        let own = looks.iter().zip(&self.weights).zip(&left);
-        let own = own.map(|((look, weight), left)| look.studentised(left, &alone[look.label], *weight)).collect();
+        let own = votes().map(|(look, weight, left)| look.studentised(left, &alone[look.label], weight)).collect();
         for (&(label, _), vantage) in self.votes.iter().zip(&self.vantages) {
             if let Some((information, gradient)) = range_terms(vantage, &self.points[label]) {
                 normals.add(label, label, &information);
@@ -323,7 +300,51 @@ impl<'a> Joint<'a> {
     }
 }
 
+/// The looks of some votes, visit by visit, and what heights say as further ones.
+struct Looks {
+    all: Vec<Look>,
+    weights: Vec<f64>,
+    is_vote: Vec<bool>,
+    /// Where each visit ends.
+    ends: Vec<usize>,
+}
+
 impl Joint<'_> {
+    /// What is seen of the labels where they are; nothing if one is behind a voter. What heights say goes among the looks: the visit's drift is theirs
+    /// as well.
+    fn looks(&self) -> Option<Looks> {
+        let heights = self.heights();
+        let count = self.votes.len() + heights.len();
+        let mut looks = Looks {
+            all: Vec::with_capacity(count),
+            weights: Vec::with_capacity(count),
+            is_vote: Vec::with_capacity(count),
+            ends: Vec::new(),
+        };
+        let mut at = 0;
+        for votes in self.visits() {
+            for (i, &(label, _)) in (at..).zip(votes) {
+                let (vantage, point) = (&self.vantages[i], &self.points[label]);
+                let look = match self.care {
+                    Care::Rough => vantage.look(label, point)?.by_itself(),
+                    Care::Exact => vantage.look_where_it_was(label, point, &self.pose_errors[i])?,
+                };
+                let height = heights.get(&i).map(|(up, higher_m, m2)| look.at_height(up, *higher_m, *m2));
+                looks.all.push(look);
+                looks.weights.push(self.weights[i]);
+                looks.is_vote.push(true);
+                if let Some(height) = height {
+                    looks.all.push(height);
+                    looks.weights.push(1.0);
+                    looks.is_vote.push(false);
+                }
+            }
+            at += votes.len();
+            looks.ends.push(looks.all.len());
+        }
+        Some(looks)
+    }
+
     fn add_priors(&self, normals: &mut Normals) {
         let Some(model) = self.model else { return };
         for (label, (votes, point)) in self.votes_of_labels().iter().zip(&self.points).enumerate() {
@@ -367,7 +388,8 @@ impl Joint<'_> {
         }
         for ((votes, point), nearest) in self.votes_of_labels().iter().zip(&self.points).zip(&nearest) {
             let Some((up, terms)) = height_terms(model, votes, point, 0.0) else { continue };
-            if terms.information > 0.0 {
+            // What tells less than that an object is in range tells nothing.
+            if terms.information * model.settings.viability.max_range_m.powi(2) > 1.0 {
                 let (higher_m, variance_m2) = (terms.gradient / terms.information, terms.information.recip());
                 for &(_, i) in nearest {
                     found.insert(i, (up, higher_m, variance_m2 * nearest.len() as f64));
