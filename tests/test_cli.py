@@ -56,6 +56,23 @@ def one_line_and_a_hint(code: int, stdout: str, stderr: str) -> str:
     return stderr
 
 
+def test_threads_of_blas_do_not_wait_in_a_loop() -> None:
+    asked = """
+import sys
+from valuemap.cli import main
+sys.argv = ["valuemap", "info", "--help"]
+try:
+    main()
+except SystemExit:
+    import numpy, threadpoolctl
+    pools = threadpoolctl.threadpool_info()
+    print("threads:", [pool["num_threads"] for pool in pools if pool["internal_api"] == "openblas"])
+"""
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.splitlines()[-1] == "threads: [1]"
+
+
 @pytest.fixture
 def street(tmp_path: Path) -> Path:
     folder = tmp_path / "street"
