@@ -526,8 +526,8 @@ def read_arrow(path: Path) -> pa.Table:
     if not path.is_file():
         raise InputError(f"{path}: no such file", hint="give the folder that an import or simulate command wrote")
     try:
-        # Not pq.read_table, which imports pandas before it reads.
-        table = pq.ParquetFile(pa.BufferReader(path.read_bytes())).read()
+        # Not pq.read_table, which imports pandas before it reads. One thread: others cost more than they save.
+        table = pq.ParquetFile(pa.BufferReader(path.read_bytes())).read(use_threads=False)
         table.validate(full=True)  # Finds texts that are not UTF-8, which nothing else would before they are used.
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = str(error).splitlines()[0]
