@@ -110,6 +110,8 @@ const MOST_RAYS: usize = 100_000;
 const LEAST_CHANGE: f64 = 0.1;
 /// By so many standard deviations of the share more: what a sample says by chance pays nowhere.
 const LEAST_CHANGE_SIGMAS: f64 = 2.0;
+/// Below so many expected changes the normal distribution says nothing of their number.
+const LEAST_EXPECTED: f64 = 5.0;
 /// It is asked of so many parts of the places that classes are learned from, one after the other, until they tell: a part has some twenty objects.
 const PARTS_OF_PLACES: usize = 5;
 
@@ -276,7 +278,10 @@ impl Change {
 
     /// Whether many objects are not in both; nothing if that may be chance.
     fn is_much(self) -> Option<bool> {
-        let count = self.objects.max(1) as f64;
+        let count = self.objects as f64;
+        if count * LEAST_CHANGE < LEAST_EXPECTED {
+            return None;
+        }
         let chance = (LEAST_CHANGE * (1.0 - LEAST_CHANGE) / count).sqrt();
         let more = 1.0 - 2.0 * self.kept as f64 / count - LEAST_CHANGE;
         (more.abs() > LEAST_CHANGE_SIGMAS * chance).then_some(more > 0.0)
@@ -451,6 +456,8 @@ mod tests {
         let mut parts = Change::default();
         (0..3).for_each(|_| parts.add(part));
         assert_eq!((part.is_much(), parts.is_much()), (None, Some(true)));
+        // Where hardly anything is found, it is no change that hardly anything is in both.
+        assert_eq!((changed(&[], &[]), changed(&some[..1], &some[1..20])), (None, None));
         // What only all moves find, and is in no map: a third of all.
         let ghosts = (0..50).map(|i| Object { real: 0.4, ..with_votes(10_000 + 10 * i, 10) });
         assert_eq!(changed(&some, &some.iter().cloned().chain(ghosts).collect::<Vec<_>>()), Some(false));
