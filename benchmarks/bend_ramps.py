@@ -65,7 +65,7 @@ from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
 from valuemap.pipeline import build_map
-from valuemap.tables import Bools, Floats, Ints
+from valuemap.tables import Bools, Floats, Ints, covariance_matrices
 
 RADIUS_M = 2.5
 COVERAGE_M = 25.0
@@ -172,8 +172,7 @@ def score_peer(data_dir: Path) -> Figures:
 def run(data_dir: Path, config: MapConfig, change: Change = as_it_is) -> dict[str, Figures]:
     """Map and score."""
     result, seconds = timed_map(change(load(data_dir)), config)
-    xx, xy, _, yy, _, _ = result.labels.covariance_m2.T
-    covariance = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+    covariance = covariance_matrices(result.labels.covariance_m2)[:, :2, :2]
     figures = score_labels(result.labels.position_in_world_m[:, :2], covariance, *truth(data_dir))
     return {"bend": {**figures, "map_seconds": round(seconds, 2)}}
 
@@ -257,8 +256,7 @@ def _halves(dataset: Dataset, config: MapConfig) -> tuple[Floats, Ints]:
         halves.append(build_map(part, config).labels)
     one, other = halves
     first, second, _ = match_nearest_first(one.position_in_world_m[:, :2], other.position_in_world_m[:, :2], RADIUS_M)
-    xx, xy, _, yy, _, _ = (one.covariance_m2[first] + other.covariance_m2[second]).T
-    covariance = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+    covariance = covariance_matrices(one.covariance_m2[first] + other.covariance_m2[second])[:, :2, :2]
     apart = (one.position_in_world_m[first] - other.position_in_world_m[second])[:, :2]
     squared = np.einsum("ni,nij,nj->n", apart, np.linalg.inv(covariance), apart)
     return squared, np.minimum(one.votes[first], other.votes[second])

@@ -16,7 +16,7 @@ from valuemap.config import SimulationConfig
 from valuemap.dataset import rows_of
 from valuemap.simulate import Recording, record_city
 from valuemap.simulate.detector import KINDS
-from valuemap.tables import Bools, Floats, Ints
+from valuemap.tables import Bools, Floats, Ints, covariance_matrices
 
 RELIABILITY_RANGES = ((0.5, 0.6), (0.6, 0.7), (0.7, 0.8), (0.8, 0.9), (0.9, 0.99), (0.99, 1.0), (0.9, 1.0))
 PASSING_KINDS = ("temporary", "reflections")
@@ -102,8 +102,7 @@ def measure(case: Case, config: valuemap.MapConfig, *, min_detections: int = 3) 
     is_real = matches.object_of_label >= 0
     objects = matches.object_of_label[is_real]
     error = labels.position_in_world_m[is_real] - dataset.truth.position_in_world_m[objects]
-    xx, xy, xz, yy, yz, zz = labels.covariance_m2[is_real].T
-    covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
+    covariance = covariance_matrices(labels.covariance_m2[is_real])
     return Outcome(
         objects=int(counts.sum()),
         found=int((counts & (matches.label_of_object >= 0)).sum()),

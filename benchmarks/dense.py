@@ -39,7 +39,7 @@ from more_data import part_of
 from valuemap.config import SimulationConfig
 from valuemap.dataset import Dataset, rows_of, write_dataset
 from valuemap.simulate import PRESETS, Recording, record_city, simulate
-from valuemap.tables import Bools, Floats, Ints
+from valuemap.tables import Bools, Floats, Ints, covariance_matrices
 
 RIGHT_SIGMAS = 3.0
 
@@ -208,7 +208,7 @@ def measure(recording: Recording, config: valuemap.MapConfig, scene: Scene) -> O
     counts = is_bound & is_detected
     labels = result.labels
     assert dataset.truth is not None
-    covariance = covariances(labels.covariance_m2)
+    covariance = covariance_matrices(labels.covariance_m2)
     class_code = np.array([dataset.truth.class_name.code_of(name) for name in labels.class_name.names], dtype=np.int64)
     error = labels.position_in_world_m[:, None] - dataset.truth.position_in_world_m
     squared = np.einsum("loi,lij,loj->lo", error, np.linalg.inv(covariance), error)
@@ -262,11 +262,6 @@ def show_mostly(result: valuemap.Map, dataset: Dataset, objects: Bools) -> Bools
     pairs, votes = np.unique(np.stack([label[others], of_vote[others]]), axis=1, return_counts=True)
     most = 2 * votes > result.labels.votes[pairs[0]]
     return np.asarray(np.isin(np.arange(len(result.labels)), pairs[0, most]))
-
-
-def covariances(six_m2: Floats) -> Floats:
-    """Return matrices (N, 3, 3) of the six numbers (N, 6) xx, xy, xz, yy, yz, zz."""
-    return six_m2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
 def is_right(distance_m: Floats, squared_sigmas: Floats, right_m: tuple[float, float]) -> Bools:

@@ -32,6 +32,7 @@ from machine import write_record
 from valuemap.dataset import Dataset
 from valuemap.map_folder import Map
 from valuemap.simulate import simulate
+from valuemap.tables import covariance_matrices
 
 Part = tuple[str, Dataset, Callable[[Map], dict[str, Any]]]
 
@@ -115,8 +116,7 @@ def _kitti_ts(data_dir: Path) -> Iterator[Part]:
 
 def _bend(data_dir: Path) -> Iterator[Part]:
     def score(result: Map) -> dict[str, Any]:
-        xx, xy, _, yy, _, _ = result.labels.covariance_m2.T
-        covariance = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+        covariance = covariance_matrices(result.labels.covariance_m2)[:, :2, :2]
         truth = bend_ramps.truth(data_dir)
         return bend_ramps.score_labels(result.labels.position_in_world_m[:, :2], covariance, *truth)
 

@@ -11,7 +11,7 @@ import valuemap
 from block import block
 from valuemap.dataset import Dataset
 from valuemap.simulate import simulate
-from valuemap.tables import Bools, Floats
+from valuemap.tables import Bools, Floats, covariance_matrices
 
 NEAR_SIGMAS = 4.0
 
@@ -37,8 +37,7 @@ def sparse() -> tuple[Dataset, Floats]:
 def is_right(result: valuemap.Map, objects: Floats) -> Bools:
     """Return which labels (N) have an object within four of their own sigmas."""
     labels = result.labels
-    xx, xy, xz, yy, yz, zz = labels.covariance_m2.T
-    covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
+    covariance = covariance_matrices(labels.covariance_m2)
     error = labels.position_in_world_m[:, None] - objects
     squared = np.einsum("nmi,nij,nmj->nm", error, np.linalg.inv(covariance), error)
     return np.asarray(squared.min(axis=1) < NEAR_SIGMAS**2)

@@ -16,7 +16,7 @@ from test_few import some_pictures
 from valuemap import robust
 from valuemap.dataset import Dataset
 from valuemap.simulate import simulate
-from valuemap.tables import Floats
+from valuemap.tables import Floats, covariance_matrices
 
 NEAR_M = 2.0
 HONEST_CHI2 = 16.0
@@ -84,8 +84,7 @@ def score(name: str, seed: int, without: str | None = None) -> Score:
     labels = result.labels
     assert labels.covariance_m2 is not None
     assert labels.existence is not None
-    xx, xy, xz, yy, yz, zz = labels.covariance_m2.T
-    covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
+    covariance = covariance_matrices(labels.covariance_m2)
     apart_m = np.linalg.norm(labels.position_in_world_m[:, None] - objects, axis=2)
     label, of = linear_sum_assignment(np.where(apart_m < NEAR_M, apart_m - 1e6, 0.0))
     is_near = apart_m[label, of] < NEAR_M

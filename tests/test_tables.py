@@ -26,6 +26,8 @@ from valuemap.tables import (
     TruthDetections,
     TruthPoints,
     Votes,
+    covariance_columns,
+    covariance_matrices,
     read_table,
     table_from_arrow,
     table_to_arrow,
@@ -35,6 +37,16 @@ from valuemap.tables import (
 
 def images() -> pa.Table:
     return table_to_arrow(small_dataset().images)
+
+
+def test_covariances_are_columns_of_a_table_and_matrices() -> None:
+    columns = np.array([[1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [7.0, 0.0, 0.0, 8.0, 0.0, 9.0]])
+    matrices = covariance_matrices(columns)
+    assert_array_equal(matrices[0], [[1.0, 2.0, 3.0], [2.0, 4.0, 5.0], [3.0, 5.0, 6.0]])
+    assert_array_equal(matrices[1], np.diag([7.0, 8.0, 9.0]))
+    assert_array_equal(covariance_matrices((1.0, 2.0, 3.0, 4.0, 5.0, 6.0)), matrices[0])
+    assert_array_equal(covariance_columns(matrices), columns)
+    assert covariance_matrices(np.empty((0, 6))).shape == (0, 3, 3)
 
 
 def assert_same_table(first: Any, second: Any) -> None:

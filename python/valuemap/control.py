@@ -24,7 +24,7 @@ from valuemap.errors import InputError
 from valuemap.evaluate.truth import TrueObjects
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import Map
-from valuemap.tables import Floats, Ints, Labels
+from valuemap.tables import Floats, Ints, Labels, covariance_columns, covariance_matrices
 
 REACH_M = 10.0
 """Shifts up to this are looked for."""
@@ -40,7 +40,6 @@ _LEAST_FOR_ROTATION = 6
 _TURN_PRICE = 10.0
 """What a rotation must explain, in squared sigmas."""
 _SPLITS, _LEFT_OUT = 50, 0.3
-_UPPER = (0, 1, 2, 4, 5, 8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +161,7 @@ class _Labels:
     @classmethod
     def of(cls, result: Map) -> _Labels:
         axes, labels = _axes(result), result.labels
-        full = labels.covariance_m2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        full = covariance_matrices(labels.covariance_m2)
         return cls(labels.position_in_world_m @ axes.T, axes @ full @ axes.T, labels.class_name.texts())
 
 
@@ -320,7 +319,7 @@ def _absolute(labels: Labels, place_m: Floats, found: Georeference, axes: Floats
     design[:, np.arange(3), np.arange(3)] = 1.0
     design[:, 0, 3], design[:, 1, 3] = -arm[:, 1], arm[:, 0]
     common = axes.T @ (design @ found.covariance @ design.transpose(0, 2, 1)) @ axes
-    return np.asarray(labels.covariance_m2 + common.reshape(-1, 9)[:, _UPPER])
+    return np.asarray(labels.covariance_m2 + covariance_columns(common))
 
 
 def _moved_dataset(dataset: Dataset, found: Georeference, axes: Floats) -> Dataset:

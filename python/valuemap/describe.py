@@ -9,9 +9,7 @@ from valuemap.cameras import Rays
 from valuemap.config import NoiseConfig
 from valuemap.dataset import Dataset, number_passes
 from valuemap.geodesy import lon_lat_height_from_enu
-from valuemap.tables import Candidates, Categories, Floats, Ints, Labels, Votes
-
-_UPPER_TRIANGLE = (0, 1, 2, 4, 5, 8)
+from valuemap.tables import Candidates, Categories, Floats, Ints, Labels, Votes, covariance_columns
 
 
 def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config: NoiseConfig) -> tuple[Labels, Votes]:
@@ -51,7 +49,7 @@ def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config
         label_id=np.arange(1, len(candidates) + 1),
         class_name=_classes(candidates, detections.class_name),
         position_in_world_m=position,
-        covariance_m2=covariance.reshape(-1, 9)[:, _UPPER_TRIANGLE],
+        covariance_m2=covariance_columns(covariance),
         votes=count,
         passes=np.bincount(label_of_pass, minlength=len(candidates)),
         object_width_m=_core.medians(size_m[:, 0].copy(), candidates.voter_offsets),

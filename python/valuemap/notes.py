@@ -11,7 +11,7 @@ import numpy as np
 
 from valuemap.config import MapConfig
 from valuemap.nearby import Nearby
-from valuemap.tables import Floats, Labels, Votes
+from valuemap.tables import Floats, Labels, Votes, covariance_matrices
 
 _UNUSED_SHARE = 0.5
 _PLAUSIBLE_SIZE_M = (0.05, 10.0)
@@ -181,7 +181,7 @@ NOTES: tuple[Callable[[Findings], str | None], ...] = (
 
 def _twins(labels: Labels) -> list[tuple[int, int]]:
     """Return the rows of labels of one class whose difference is less than its standard deviation in that direction."""
-    covariance = _matrices(labels.covariance_m2)
+    covariance = covariance_matrices(labels.covariance_m2)
     largest_m = float(np.sqrt(np.max(np.trace(covariance, axis1=1, axis2=2), initial=0.0)))
     if len(labels) < 2 or not largest_m > 0.0:
         return []
@@ -194,9 +194,3 @@ def _twins(labels: Labels) -> list[tuple[int, int]]:
     squared_sigmas = np.einsum("ni,nij,nj->n", away_m, np.linalg.pinv(both), away_m)
     rows = np.sort(pairs[squared_sigmas < _TWIN_SIGMAS**2], axis=1)
     return [(int(first), int(second)) for first, second in rows[np.lexsort(rows.T[::-1])]]
-
-
-def _matrices(covariance_m2: Floats) -> Floats:
-    """Return covariances (N, 6) as matrices (N, 3, 3)."""
-    xx, xy, xz, yy, yz, zz = covariance_m2.T
-    return np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)

@@ -20,7 +20,7 @@ from valuemap.dataset import Dataset, rows_of
 from valuemap.evidence import Evidence
 from valuemap.map_folder import Map
 from valuemap.partition import partition_images
-from valuemap.tables import Bools, Candidates, Categories, Floats, Ints, Rejected
+from valuemap.tables import Bools, Candidates, Categories, Floats, Ints, Rejected, covariance_matrices
 from valuemap.vote import vote_in_clusters
 
 MOST_KEPT = 10_000
@@ -243,7 +243,7 @@ def _labels_there(evidence: Evidence, left: _LeftOver, found: Candidates) -> tup
     own = sigma_px**2 * _core.unit_covariance(
         left.rays.core, found.position_in_world_m, found.voter_offsets, found.voters
     )
-    spread = labels.covariance_m2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    spread = covariance_matrices(labels.covariance_m2)
     names = left.dataset.detections.class_name.take(found.voters[found.voter_offsets[:-1]].astype(np.int64))
     near = scipy.spatial.cKDTree(labels.position_in_world_m).query_ball_point(found.position_in_world_m, _SAME_PLACE_M)
     for row, rows in enumerate(near):

@@ -24,7 +24,7 @@ from valuemap.errors import InputError
 from valuemap.folders import new_file
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import Map
-from valuemap.tables import Categories, Floats, Ints, Labels
+from valuemap.tables import Categories, Floats, Ints, Labels, covariance_matrices
 
 Verdict = Literal["accepted", "rejected", "noted"]
 State = Literal["open", "accepted", "rejected", "check again"]
@@ -395,7 +395,7 @@ def _claims_of_places(decisions: Sequence[Decision], labels: Labels) -> list[tup
     centers, covariances, classes = [], [], []
     for each in decisions:
         centers.append(np.array(each.position_in_world_m))
-        covariances.append(_matrix(each.covariance_m2))
+        covariances.append(covariance_matrices(each.covariance_m2))
         classes.append(labels.class_name.code_of(each.class_name))
     decided = cKDTree(np.array(centers))
     known: set[_Point] = set()
@@ -418,7 +418,7 @@ def _claims_of_places(decisions: Sequence[Decision], labels: Labels) -> list[tup
             rows = rows[labels.class_name.codes[rows] == code]
         for row in rows:
             away = labels.position_in_world_m[row] - center
-            spread = covariance + _matrix(labels.covariance_m2[row]) + _POSITION_FLOOR_M**2 * np.eye(3)
+            spread = covariance + covariance_matrices(labels.covariance_m2[row]) + _POSITION_FLOOR_M**2 * np.eye(3)
             price = float(away @ np.linalg.solve(spread, away))
             if price <= _GATE:
                 claims.append((claimant, int(row), price))
@@ -515,11 +515,6 @@ def _voters(result: Map, dataset: Dataset, label_id: int) -> tuple[tuple[str, fl
 
 def _voter(image_name: str, center_px: Floats) -> tuple[str, float, float]:
     return image_name, round(float(center_px[0]), 1), round(float(center_px[1]), 1)
-
-
-def _matrix(covariance_m2: Sequence[float] | Floats) -> Floats:
-    xx, xy, xz, yy, yz, zz = (float(part) for part in covariance_m2)
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def _point(values: Any) -> _Point:

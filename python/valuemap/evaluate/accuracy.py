@@ -16,7 +16,7 @@ import numpy as np
 from valuemap.dataset import Frame
 from valuemap.errors import SettingError
 from valuemap.evaluate.matching import Matches
-from valuemap.tables import Floats, Labels
+from valuemap.tables import Floats, Labels, covariance_matrices
 
 MIN_CHECK_POINTS = 30
 """Of ASPRS, Edition 2."""
@@ -151,7 +151,7 @@ def measure_accuracy(
     enu_from_world = np.vstack([frame.east_north(), frame.up])
     error = offset @ enu_from_world.T
     stated = labels.covariance_m2 if labels.absolute_covariance_m2 is None else labels.absolute_covariance_m2
-    covariance = enu_from_world @ _matrices(stated[found]) @ enu_from_world.T
+    covariance = enu_from_world @ covariance_matrices(stated[found]) @ enu_from_world.T
     if not matches.objects.has_height:
         error[:, 2] = np.nan
     return _statement(error, covariance, truth_sigma_m)
@@ -187,11 +187,6 @@ def _statement(error_m: Floats, covariance_m2: Floats, truth_sigma_m: float | No
         in_95_height_less_bias=_share(less_bias[:, 2] ** 2, height_limit),
         stated_sigma_factor=_number(math.sqrt(np.median(horizontal_less) / _CHI2_50_OF_2)) if count else math.nan,
     )
-
-
-def _matrices(covariance_m2: Floats) -> Floats:
-    """Return symmetric matrices (N, 3, 3) of xx, xy, xz, yy, yz, zz (N, 6)."""
-    return covariance_m2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
 def _squared_horizontal(error_m: Floats, covariance_m2: Floats) -> Floats:

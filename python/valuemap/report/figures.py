@@ -15,7 +15,7 @@ from valuemap.evidence import Evidence
 from valuemap.experiment import CURVES, PassesResult
 from valuemap.map_folder import Map
 from valuemap.report.style import BLUE, DPI, FAINT_INK, GREEN, GREY, INK, ORANGE, VERMILION, drawing, figure_bytes
-from valuemap.tables import Floats
+from valuemap.tables import Floats, covariance_matrices
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -215,7 +215,7 @@ def normalized_errors(result: Map, evaluation: Evaluation) -> tuple[Floats, int]
     matches = evaluation.matches
     rows = np.flatnonzero(matches.object_of_label >= 0)
     apart = result.labels.position_in_world_m[rows] - matches.object_in_world_m[matches.object_of_label[rows]]
-    full = result.labels.covariance_m2[rows][:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    full = covariance_matrices(result.labels.covariance_m2[rows])
     dimensions = 3
     if not matches.objects.has_height:
         axes = result.frame.east_north()

@@ -12,7 +12,7 @@ from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset, Frame
 from valuemap.drives import find_drives
 from valuemap.map_folder import Map
-from valuemap.tables import Categories, Floats, Images, Ints
+from valuemap.tables import Categories, Floats, Images, Ints, covariance_matrices
 
 ELLIPSE_SIGMAS = 2.4477468306808161
 """Half axis of the ellipse that holds 95 % of a 2D normal distribution: sqrt(chi2.ppf(0.95, 2))."""
@@ -110,8 +110,8 @@ def _rows_by_text(outcome: Categories) -> dict[str, Ints]:
 
 def ellipses(covariance_m2: Floats, axes_in_world: Floats) -> tuple[Floats, Floats]:
     """Return half axes (N, 2; major first) in metres and angles (N) of the 95 % ellipses of covariances (N, 6)."""
-    full = covariance_m2[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
-    variance, direction = np.linalg.eigh(axes_in_world @ full @ axes_in_world.T)  # Ascending.
+    flat = axes_in_world @ covariance_matrices(covariance_m2) @ axes_in_world.T
+    variance, direction = np.linalg.eigh(flat)  # Ascending.
     half_axes_m = ELLIPSE_SIGMAS * np.sqrt(np.maximum(variance[:, ::-1], 0.0))
     return half_axes_m, np.arctan2(direction[:, 1, 1], direction[:, 0, 1])
 

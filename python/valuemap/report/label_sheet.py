@@ -12,7 +12,7 @@ import numpy as np
 from valuemap.evidence import Evidence, Misses, Voters
 from valuemap.report.above import plain_line
 from valuemap.report.crops import LEAST_SIDE_PX, Crop, miss_crop, voter_crop
-from valuemap.report.ground import ELLIPSE_SIGMAS, ellipses, horizontal_axes
+from valuemap.report.ground import ellipses, horizontal_axes
 from valuemap.report.style import BLUE, DPI, FAINT_INK, GROUND, INK, ORANGE, RULE, drawing, probability
 from valuemap.tables import Floats, Ints
 
@@ -191,15 +191,14 @@ def _draw_views(figure: Figure, evidence: Evidence, row: int, voters: Voters, mi
     sideways = np.stack([down @ mean, direction @ up], axis=1)
 
     _draw_seen_from(views[0], evidence, row, voters, misses, axes_in_world)
-    half_axes, angle = (each[0] for each in ellipses(labels.covariance_m2[[row]], axes_in_world))
-    full = labels.covariance_m2[row][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
-    along_up = np.stack([mean @ axes_in_world, up])
-    side_axes, side_angle = _ellipse(along_up @ full @ along_up.T)
+    covariance_m2, along_up = labels.covariance_m2[[row]], np.stack([mean @ axes_in_world, up])
+    half_axes, angle = (each[0] for each in ellipses(covariance_m2, axes_in_world))
+    side_axes, side_angle = (each[0] for each in ellipses(covariance_m2, along_up))
     reach = 4.0 * float(np.nanmax([*half_axes, *side_axes]))
     reach = min(max(reach, 0.25), 60.0) if math.isfinite(reach) else 5.0
     colors = [pass_color(int(number)) for number in voters.pass_number]
     for axes, origin, heading, (half, turn), what in (
-        (views[1], from_above, down, (half_axes, float(angle)), "Rays from above"),
+        (views[1], from_above, down, (half_axes, angle), "Rays from above"),
         (views[2], from_side, sideways, (side_axes, side_angle), "Rays from the side"),
     ):
         _draw_rays(axes, origin[places], heading[places], [colors[i] for i in places], reach)
@@ -209,12 +208,6 @@ def _draw_views(figure: Figure, evidence: Evidence, row: int, voters: Voters, mi
     views[1].set_ylabel(f"{names[1].removesuffix(' (m)')} from the label (m)")
     views[2].set_xlabel("along the mean direction of looking (m)")
     views[2].set_ylabel("up from the label (m)")
-
-
-def _ellipse(covariance: Floats) -> tuple[Floats, float]:
-    variance, direction = np.linalg.eigh(covariance)
-    half: Floats = ELLIPSE_SIGMAS * np.sqrt(np.maximum(variance[::-1], 0.0))
-    return half, float(np.arctan2(direction[1, 1], direction[0, 1]))
 
 
 def _frame(axes: Axes) -> None:

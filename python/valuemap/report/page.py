@@ -25,7 +25,7 @@ from valuemap.report.figures import ReportFigure
 from valuemap.report.ground import ellipses, horizontal_axes, look_down
 from valuemap.report.paper import Cell, ReportTable
 from valuemap.report.style import BLUE, GREY, PURPLE, SKY, YELLOW
-from valuemap.tables import Floats
+from valuemap.tables import Floats, covariance_matrices
 
 _HERE = Path(__file__).parent
 _MOST_NAMED_IMAGES = 50_000
@@ -238,7 +238,7 @@ def inline_data(
     position = labels.position_in_world_m @ basis.T
     origin = np.round(np.median(position, axis=0)) if len(position) else np.zeros(3)
     half_axes_m, angle = ellipses(labels.covariance_m2, basis[:2])
-    full = labels.covariance_m2[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    full = covariance_matrices(labels.covariance_m2)
     up = np.array(result.frame.up)
     drives = [*ground.drives, *ground.joins]
     points = np.concatenate([*drives, ground.all_points(), np.empty((0, 2))])

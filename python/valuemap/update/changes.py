@@ -13,7 +13,7 @@ import scipy
 from valuemap.dataset import rows_of
 from valuemap.drives import connected
 from valuemap.nearby import Nearby
-from valuemap.tables import Bools, Categories, Changes, Floats, IdBridge, Ints, Labels, Votes
+from valuemap.tables import Bools, Categories, Changes, Floats, IdBridge, Ints, Labels, Votes, covariance_matrices
 from valuemap.update.looks import Looks
 
 SAME_SHARE = 0.5
@@ -268,5 +268,5 @@ def _differ(old: Labels, before: Ints, new: Labels, rows: Ints) -> Bools:
 def _apart(old: Labels, i: Ints, new: Labels, j: Ints) -> Floats:
     """Return the distances (N) of pairs of labels in squared sigmas."""
     away = new.position_in_world_m[j] - old.position_in_world_m[i]
-    spread = (old.covariance_m2[i] + new.covariance_m2[j])[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    spread = covariance_matrices(old.covariance_m2[i] + new.covariance_m2[j])
     return np.asarray(np.einsum("ni,nij,nj->n", away, np.linalg.pinv(spread), away))

@@ -21,7 +21,7 @@ from valuemap.evaluate import Evaluation, evaluate_map
 from valuemap.evidence import PICTURES, Evidence, find_dataset
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import read_map
-from valuemap.tables import Floats
+from valuemap.tables import Floats, covariance_matrices
 from valuemap.viewer.columns import pack_columns
 
 OUTCOMES = ("", "true", "duplicate", "false", "found", "missed", "not recoverable")
@@ -174,7 +174,7 @@ class Scene:
     def labels_body(self) -> bytes:
         """The labels as columns."""
         labels = self.result.labels
-        covariance = _matrices(labels.covariance_m2)
+        covariance = covariance_matrices(labels.covariance_m2)
         covariance = self.local_from_world @ covariance @ self.local_from_world.T
         return pack_columns(
             {
@@ -259,11 +259,6 @@ class Scene:
         if self.evidence is None or self.evidence.dataset.truth is None:
             return None
         return evaluate_map(self.result, self.evidence.dataset)
-
-
-def _matrices(covariance_m2: Floats) -> Floats:
-    """Return covariances (N, 6) as matrices (N, 3, 3)."""
-    return covariance_m2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
 def _ellipses(covariance: Floats) -> Floats:

@@ -12,7 +12,7 @@ from valuemap.dataset import Dataset, rows_of
 from valuemap.errors import InputError, OutputError
 from valuemap.geodesy import crs_from_lon_lat_height
 from valuemap.map_folder import Map
-from valuemap.tables import Floats, Ints, table_to_arrow
+from valuemap.tables import Floats, Ints, covariance_matrices, table_to_arrow
 
 if TYPE_CHECKING:
     import geopandas
@@ -103,7 +103,7 @@ class Export:
         """How wrong the positions may be, on the ground and in height."""
         up = np.array(self.result.frame.up)
         east, north = self.result.frame.east_north()
-        covariance_m2 = _symmetric(self.result.labels.covariance_m2)
+        covariance_m2 = covariance_matrices(self.result.labels.covariance_m2)
         ground = np.stack([east, north])
         values, vectors = np.linalg.eigh(ground @ covariance_m2 @ ground.T)
         minor_m, major_m = np.sqrt(np.maximum(values, 0.0)).T
@@ -224,11 +224,6 @@ def records(export: Export) -> list[dict[str, Any]]:
     return [
         {name: column[row] for name, column in columns.items() if column[row] is not None} for row in range(len(table))
     ]
-
-
-def _symmetric(upper: Floats) -> Floats:
-    """Return matrices (N, 3, 3) of their upper triangles xx, xy, xz, yy, yz, zz (N, 6)."""
-    return upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
 def _rank_in_runs(values: Ints) -> Ints:

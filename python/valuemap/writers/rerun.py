@@ -12,7 +12,7 @@ from valuemap.dataset import Dataset, Frame, number_passes, rows_of
 from valuemap.drives import find_drives
 from valuemap.errors import SettingError
 from valuemap.map_folder import Map
-from valuemap.tables import Floats, Ints
+from valuemap.tables import Floats, Ints, covariance_matrices
 from valuemap.writers.attributes import Export
 
 _COLORS = np.array(
@@ -110,8 +110,7 @@ def _ellipsoids(covariance_m2: Floats) -> tuple[Floats, Floats]:
     """Return half axes (N, 3) in metres and rotations (N, 4; x, y, z, w) of 95 % ellipsoids of covariances (N, 6)."""
     if not len(covariance_m2):
         return np.empty((0, 3)), np.empty((0, 4))
-    full = covariance_m2[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
-    variance, direction = np.linalg.eigh(full)
+    variance, direction = np.linalg.eigh(covariance_matrices(covariance_m2))
     direction[np.linalg.det(direction) < 0.0] *= -1.0  # A rotation, not a reflection.
     half_sizes_m: Floats = _SIGMAS_95 * np.sqrt(np.maximum(variance, 0.0))
     return half_sizes_m, Rotation.from_matrix(direction).as_quat()
