@@ -124,6 +124,7 @@ def test_azimuths_are_clockwise_from_north() -> None:
 def test_a_frame_of_its_own_has_a_north() -> None:
     np.testing.assert_allclose(Frame().east_north(), [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], atol=1e-15)
     np.testing.assert_allclose(Frame(up=(0.0, -1.0, 0.0)).east_north(), [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], atol=1e-15)
+    np.testing.assert_allclose(Frame().east_north_up(), np.eye(3), atol=1e-15)
     tilted = Frame(up=(0.0, 0.6, 0.8)).east_north()
     np.testing.assert_allclose(tilted, [[1.0, 0.0, 0.0], [0.0, 0.8, -0.6]], atol=1e-15)
 

@@ -130,7 +130,7 @@ def apply_control(result: Map, points: TrueObjects, dataset: Dataset | None = No
     """
     found = find_georeference(result, points)
     proof = leave_out(result, points, found)
-    axes = _axes(result)
+    axes = result.frame.east_north_up()
     labels = result.labels
     place = labels.position_in_world_m @ axes.T
     moved = _moved(place, found) @ axes
@@ -160,7 +160,7 @@ class _Labels:
 
     @classmethod
     def of(cls, result: Map) -> _Labels:
-        axes, labels = _axes(result), result.labels
+        axes, labels = result.frame.east_north_up(), result.labels
         full = covariance_matrices(labels.covariance_m2)
         return cls(labels.position_in_world_m @ axes.T, axes @ full @ axes.T, labels.class_name.texts())
 
@@ -178,11 +178,7 @@ class _Points:
     def of(cls, result: Map, points: TrueObjects) -> _Points:
         sigma = np.zeros(len(points)) if points.sigma_m is None else np.nan_to_num(points.sigma_m)
         names = None if points.class_name is None else points.class_name.texts()
-        return cls(points.position_in_world_m @ _axes(result).T, sigma, names, points.has_height)
-
-
-def _axes(result: Map) -> Floats:
-    return np.vstack([result.frame.east_north(), result.frame.up])
+        return cls(points.position_in_world_m @ result.frame.east_north_up().T, sigma, names, points.has_height)
 
 
 def _find(labels: _Labels, points: _Points, rows: Ints) -> Georeference:
@@ -349,7 +345,7 @@ def _describe(found: Georeference, proof: LeftOut | None, points: int, result: M
         "shift_sigma_m": [round(float(v), 4) for v in sigma[:3]],
         "turn_deg": round(math.degrees(found.turn_rad), 6),
         "turn_sigma_deg": round(math.degrees(float(sigma[3])), 6),
-        "pivot_m": [round(float(v), 4) for v in found.pivot_m @ _axes(result)],
+        "pivot_m": [round(float(v), 4) for v in found.pivot_m @ result.frame.east_north_up()],
         "spread_m": round(found.spread_m, 4),
     }
     if proof is not None:

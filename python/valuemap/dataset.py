@@ -94,6 +94,10 @@ class Frame:
         north /= np.linalg.norm(north)
         return np.stack([np.cross(north, up), north])
 
+    def east_north_up(self) -> Floats:
+        """Return `east_north` and up as rows (3, 3): the rotation from the world into these axes."""
+        return np.vstack([self.east_north(), self.up])
+
     def to_json(self) -> dict[str, Any]:
         """Return the `frame` object of dataset.json and run.json."""
         if self.anchor is not None:

@@ -148,7 +148,7 @@ def measure_accuracy(
         )
     found = matches.object_of_label >= 0
     offset = labels.position_in_world_m[found] - matches.object_in_world_m[matches.object_of_label[found]]
-    enu_from_world = np.vstack([frame.east_north(), frame.up])
+    enu_from_world = frame.east_north_up()
     error = offset @ enu_from_world.T
     stated = labels.covariance_m2 if labels.absolute_covariance_m2 is None else labels.absolute_covariance_m2
     covariance = enu_from_world @ covariance_matrices(stated[found]) @ enu_from_world.T

@@ -139,7 +139,7 @@ def in_working_frame(dataset: Dataset, drives: Drives, unit_m: float) -> tuple[D
     rotation, center = camera_poses(dataset.images)
     center = points_in_working_frame(dataset, center, unit_m)
     sigma = dataset.images.position_sigma_m
-    images = with_poses(dataset.images, rotation @ _axes(dataset).T, center).replace(
+    images = with_poses(dataset.images, rotation @ dataset.frame.east_north_up().T, center).replace(
         position_sigma_m=None if sigma is None else sigma / unit_m
     )
     frame = replace(dataset.frame, up=(0.0, 0.0, 1.0), anchor=None)
@@ -149,12 +149,7 @@ def in_working_frame(dataset: Dataset, drives: Drives, unit_m: float) -> tuple[D
 def points_in_working_frame(dataset: Dataset, point_in_world_m: Floats, unit_m: float) -> Floats:
     """Return points (N, 3) of the world of a dataset in the frame that `in_working_frame` gives it."""
     middle = np.median(camera_centers(dataset.images), axis=0)
-    return np.asarray((point_in_world_m - middle) @ _axes(dataset).T / unit_m)
-
-
-def _axes(dataset: Dataset) -> Floats:
-    """Return east, north and up in the world, as rows."""
-    return np.vstack([dataset.frame.east_north(), dataset.frame.up])
+    return np.asarray((point_in_world_m - middle) @ dataset.frame.east_north_up().T / unit_m)
 
 
 def gather(dataset: Dataset, drives: Drives) -> Footage:

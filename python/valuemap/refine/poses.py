@@ -344,7 +344,7 @@ def _looked_at(found: Found | None) -> dict[str, Any]:
 
 def _apply(dataset: Dataset, drives: Drives, found: Found, selected: Selected, unit_m: float) -> Dataset:
     """Return the dataset with the poses and cameras corrected."""
-    axes = np.vstack([dataset.frame.east_north(), dataset.frame.up])
+    axes = dataset.frame.east_north_up()
     offset, mount, delay, focal, camera_mount, camera_delay = selected.state.constants
     images = dataset.images
     drive, camera = drives.pass_code, rows_of(images.camera_id, dataset.cameras.camera_id)

@@ -69,7 +69,7 @@ class Scene:
         self.lock = threading.Lock()
         """Held while something about the evidence is computed, so that nothing is computed twice at once."""
         frame = self.result.frame
-        self.local_from_world = np.concatenate([frame.east_north(), [frame.up]])
+        self.local_from_world = frame.east_north_up()
         """East, north and up as unit vectors (3, 3) in the world."""
         self.origin_in_world_m = self._origin()
         """The point (3) in the world that is 0, 0, 0 on the page."""
