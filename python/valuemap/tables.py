@@ -134,6 +134,11 @@ class Table:
         """Return the rows given by indices or by a mask, as the same type of table."""
         return type(self)(**{f.name: _take(getattr(self, f.name), rows) for f in fields(self)})
 
+    def by_key(self) -> Self:
+        """Return the rows in ascending order of the key."""
+        key: Ints = getattr(self, str(self.KEY))
+        return self if np.all(np.diff(key) > 0) else self.take(np.argsort(key, kind="stable"))
+
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields replaced."""
         return dataclasses.replace(self, **changes)

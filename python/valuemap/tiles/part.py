@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from valuemap.dataset import Dataset, check_detections, checked_as, rows_of
 from valuemap.map_folder import Map
 from valuemap.nearby import Nearby
 from valuemap.portions import DatasetReader, rows_on_disk
-from valuemap.tables import Bools, Detections, Floats, Images, Ints, Table, Truth, join_tables, read_table
+from valuemap.tables import Bools, Detections, Floats, Images, Ints, Truth, join_tables, read_table
 from valuemap.tiles.grid import MOST_DETECTIONS, Census, Grid
 from valuemap.tiles.sample import is_sampled
 
@@ -26,8 +26,6 @@ LARGEST_WHOLE = 2_000_000
 """Datasets with more images and detections are looked at in part: one that has no more takes about 2 GB."""
 LARGEST_PART = MOST_DETECTIONS
 """A part has about so many detections, and images without any; so many images of whole passes are looked at."""
-
-T = TypeVar("T", bound=Table)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,8 +179,8 @@ class _Rows:
                 name=self._reader.name,
                 frame=self._reader.frame,
                 cameras=self._reader.cameras,
-                images=_by_key(join_tables(images)),
-                detections=_by_key(join_tables(detections)),
+                images=join_tables(images).by_key(),
+                detections=join_tables(detections).by_key(),
                 truth=read_table(Truth, truth) if truth.is_file() else None,
             )
         )
@@ -200,10 +198,4 @@ class _Rows:
         for images in self._reader.images():
             is_chosen = np.array([name in chosen for name in images.pass_id.names], np.bool_)
             taken.append(images.take(is_chosen[images.pass_id.codes]))
-        return _by_key(join_tables(taken))
-
-
-def _by_key(table: T) -> T:
-    """Return a table with its rows by their ids."""
-    key: Ints = getattr(table, str(table.KEY))
-    return table if np.all(np.diff(key) > 0) else table.take(np.argsort(key, kind="stable"))
+        return join_tables(taken).by_key()

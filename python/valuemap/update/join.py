@@ -88,9 +88,7 @@ def _join_images(first: Dataset, second: Dataset) -> tuple[Dataset, Detections]:
 
 def _joined(first: T, second: T) -> T:
     """Return two tables as one, ascending; values that one of them does not have are missing."""
-    table = join_tables(_alike(first, second))
-    key: Ints = getattr(table, str(table.KEY))
-    return table if np.all(np.diff(key) > 0) else table.take(np.argsort(key, kind="stable"))
+    return join_tables(_alike(first, second)).by_key()
 
 
 def _alike(first: T, second: T) -> tuple[T, T]:
