@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from valuemap.errors import InputError
-from valuemap.text_files import check_file, first_line, not_utf8, refuse_packed
+from valuemap.text_files import check_file, not_json, not_utf8, refuse_packed
 
 PORTION = 20_000
 """Entries that are held together: objects of Python take a kilobyte each."""
@@ -67,9 +67,7 @@ def read_json_lists(path: Path, expected: str) -> Iterator[Portion]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}", hint=f"expected {expected}") from error
     except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"{path}: cannot be read as JSON: {first_line(error)}", hint="is it whole? Write or download it again"
-        ) from error
+        raise not_json(path, error) from error
 
 
 def _content(text: _Text) -> Iterator[Portion]:

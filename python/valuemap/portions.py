@@ -23,7 +23,7 @@ from valuemap.dataset import (
     read_images,
 )
 from valuemap.errors import InputError
-from valuemap.tables import Cameras, Detections, Images, Ints, Table, Truth, read_table, table_from_arrow
+from valuemap.tables import Cameras, Detections, Images, Ints, Table, Truth, not_parquet, read_table, table_from_arrow
 
 ROWS = 500_000
 """Rows that are read at a time."""
@@ -128,10 +128,7 @@ def _batches(path: Path, rows: int, columns: list[str] | None) -> Iterator[pa.Ta
                 table.validate(full=True)  # Finds texts that are not UTF-8.
                 yield table
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(
-            f"{path}: cannot be read as Parquet: {reason}", hint="the file is damaged or cut short: write it again"
-        ) from error
+        raise not_parquet(path, error) from error
 
 
 def _check_unique(kind: type[Table], path: Path, rows: int) -> None:

@@ -546,11 +546,16 @@ def read_arrow(path: Path) -> pa.Table:
         table = pq.ParquetFile(pa.BufferReader(path.read_bytes())).read(use_threads=False)
         table.validate(full=True)  # Finds texts that are not UTF-8, which nothing else would before they are used.
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(
-            f"{path}: cannot be read as Parquet: {reason}", hint="the file is damaged or cut short: write it again"
-        ) from error
+        raise not_parquet(path, error) from error
     return table
+
+
+def not_parquet(path: Path, error: Exception) -> InputError:
+    """Return the error of a file that is no whole Parquet."""
+    reason = str(error).splitlines()[0]
+    return InputError(
+        f"{path}: cannot be read as Parquet: {reason}", hint="the file is damaged or cut short: write it again"
+    )
 
 
 def table_from_arrow(kind: type[T], table: pa.Table, *, source: str) -> T:

@@ -68,9 +68,14 @@ def read_json(path: Path, expected: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"{path}: cannot be read as JSON: {first_line(error)}", hint="is it whole? Write or download it again"
-        ) from error
+        raise not_json(path, error) from error
+
+
+def not_json(path: Path, error: Exception) -> InputError:
+    """Return the error of a file that is no JSON."""
+    return InputError(
+        f"{path}: cannot be read as JSON: {first_line(error)}", hint="is it whole? Write or download it again"
+    )
 
 
 def first_line(error: BaseException) -> str:
