@@ -15,6 +15,7 @@ import numpy as np
 
 from valuemap.dataset import Frame
 from valuemap.errors import SettingError
+from valuemap.evaluate.figures import to_json
 from valuemap.evaluate.matching import Matches
 from valuemap.tables import Floats, Labels, covariance_matrices
 
@@ -70,8 +71,7 @@ class PositionalAccuracy:
 
     def to_json(self) -> dict[str, int | float | None]:
         """Return the figures by name, None where there is nothing to measure."""
-        values = dataclasses.asdict(self)
-        return {name: None if value is None or math.isnan(value) else value for name, value in values.items()}
+        return to_json(dataclasses.asdict(self))
 
     @property
     def statement(self) -> str:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from valuemap.dataset import Frame
+from valuemap.evaluate.figures import share, to_json
 from valuemap.evaluate.matching import match_labels
 from valuemap.evaluate.truth import TrueObjects
 from valuemap.tables import Labels
@@ -33,8 +33,7 @@ class ChanceFloor:
 
     def to_json(self) -> dict[str, float | None]:
         """Return the figures by name, None where there is nothing to count."""
-        values = dataclasses.asdict(self)
-        return {name: None if math.isnan(value) else value for name, value in values.items()}
+        return to_json(dataclasses.asdict(self))
 
 
 def measure_chance(labels: Labels, objects: TrueObjects, frame: Frame, *, radius_m: float) -> ChanceFloor:
@@ -51,6 +50,6 @@ def measure_chance(labels: Labels, objects: TrueObjects, frame: Frame, *, radius
     return ChanceFloor(
         shift_m=shift_m,
         matches=matched,
-        precision=matched / len(labels) if len(labels) else math.nan,
-        recall=sum(recalls) / len(recalls) / recoverable if recoverable else math.nan,
+        precision=share(matched, len(labels)),
+        recall=share(sum(recalls) / len(recalls), recoverable),
     )

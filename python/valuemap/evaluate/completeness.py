@@ -8,11 +8,11 @@ should be present, recoverable or not.
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.evaluate.figures import share, to_json
 from valuemap.evaluate.matching import LABEL_OUTCOMES, Matches
 
 
@@ -38,8 +38,7 @@ class Completeness:
 
     def to_json(self) -> dict[str, int | float | None]:
         """Return the figures by name, None where there is nothing to count."""
-        values = dataclasses.asdict(self)
-        return {name: None if math.isnan(value) else value for name, value in values.items()}
+        return to_json(dataclasses.asdict(self))
 
 
 def measure_completeness(matches: Matches) -> Completeness:
@@ -52,17 +51,13 @@ def measure_completeness(matches: Matches) -> Completeness:
     return Completeness(
         items=items,
         excess_items=excess,
-        excess_rate=_rate(excess, items),
+        excess_rate=share(excess, items),
         duplicate_items=int(np.sum(matches.label_outcome.codes == duplicate)),
         missing_items=missing,
-        missing_rate=_rate(missing, items),
+        missing_rate=share(missing, items),
         missing_not_recoverable=int(np.sum(is_missing & ~matches.objects.counts_in_recall)),
         split_objects=split,
-        split_rate=_rate(split, matched),
+        split_rate=share(split, matched),
         merged_labels=merged,
-        merge_rate=_rate(merged, matched),
+        merge_rate=share(merged, matched),
     )
-
-
-def _rate(part: int, whole: int) -> float:
-    return part / whole if whole else math.nan

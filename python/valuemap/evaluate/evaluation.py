@@ -17,6 +17,7 @@ from valuemap.evaluate.accuracy import PositionalAccuracy, measure_accuracy
 from valuemap.evaluate.chance import ChanceFloor, measure_chance
 from valuemap.evaluate.class_names import note_classes
 from valuemap.evaluate.completeness import Completeness, measure_completeness
+from valuemap.evaluate.figures import share, to_json
 from valuemap.evaluate.matching import LABEL_OUTCOMES, Matches, match_labels
 from valuemap.evaluate.recoverable import near_images
 from valuemap.evaluate.reliability import ExistenceRange, measure_reliability
@@ -76,8 +77,7 @@ class Evaluation:
 
     def measures(self) -> dict[str, int | float | None]:
         """Return the measures of this class by name, None where there is nothing to measure."""
-        values = {name: getattr(self, name) for name in _MEASURES}
-        return {name: None if math.isnan(value) else value for name, value in values.items()}
+        return to_json({name: getattr(self, name) for name in _MEASURES})
 
     def to_json(self) -> dict[str, Any]:
         """Return all figures by name, None where there is nothing to measure."""
@@ -190,8 +190,8 @@ def _measure(
         duplicates=int(outcomes[LABEL_OUTCOMES.index("duplicate")]),
         false_positives=int(outcomes[LABEL_OUTCOMES.index("false")]),
         false_negatives=missed,
-        recall=_ratio(recoverable - missed, recoverable),
-        precision=_ratio(true_positives, labels),
+        recall=share(recoverable - missed, recoverable),
+        precision=share(true_positives, labels),
         position_rmse_m=_root_mean_square(distance),
         position_median_m=float(np.median(distance)) if true_positives else math.nan,
         horizontal_rmse_m=_root_mean_square(horizontal),
@@ -221,10 +221,6 @@ def _notes(objects: TrueObjects) -> tuple[str, ...]:
         ),
     }
     return tuple(note for note, applies in notes.items() if applies)
-
-
-def _ratio(part: int, whole: int) -> float:
-    return part / whole if whole else math.nan
 
 
 def _root_mean_square(values: Floats) -> float:
