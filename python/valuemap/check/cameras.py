@@ -27,7 +27,7 @@ from valuemap.check.fault import (
     with_poses,
 )
 from valuemap.check.fit import Estimate, Parameter, estimate
-from valuemap.check.lenses import FOCAL_LENGTHS
+from valuemap.check.lenses import FOCAL_LENGTHS, focals, with_params
 from valuemap.check.passes import moved_along
 from valuemap.check.sample import pixels_per_radian
 from valuemap.dataset import Dataset
@@ -92,11 +92,9 @@ def settled_errors(view: View) -> Estimate:
 
 
 def _parameters(view: View) -> tuple[Parameter, ...]:
-    return PARAMETERS if _has_focal(view.dataset) else tuple(p for p in PARAMETERS if p.name != "log_focal")
-
-
-def _has_focal(dataset: Dataset) -> bool:
-    return all(FOCAL_LENGTHS.get(dataset.cameras.model.names[code], 0) for code in dataset.cameras.model.codes)
+    cameras = view.dataset.cameras
+    has_focal = all(focals(cameras, row) for row in range(len(cameras)))
+    return PARAMETERS if has_focal else tuple(p for p in PARAMETERS if p.name != "log_focal")
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,7 +315,7 @@ def _principal_points_at_integers(view: View) -> Finding | None:
     rows: list[int] = []
     middles = 0
     for row, params in enumerate(cameras.params):
-        count = FOCAL_LENGTHS.get(cameras.model.names[cameras.model.codes[row]], 0)
+        count = focals(cameras, row)
         if not count:
             continue
         off = 2.0 * params[count : count + 2] - [cameras.width_px[row], cameras.height_px[row]]
@@ -327,7 +325,7 @@ def _principal_points_at_integers(view: View) -> Finding | None:
     if not rows or middles:
         return None
     first = cameras.params[rows[0]]
-    count = FOCAL_LENGTHS[cameras.model.names[cameras.model.codes[rows[0]]]]
+    count = focals(cameras, rows[0])
     return Finding(
         fault=HalfPixel.name,
         what="The principal points are half a pixel off: they count from the middle of the first pixel.",
@@ -343,9 +341,9 @@ def _principal_points_at_integers(view: View) -> Finding | None:
 def _with_principal_points(dataset: Dataset, rows: list[int], shift_px: float) -> Dataset:
     params = [values.copy() for values in dataset.cameras.params]
     for row in rows:
-        count = FOCAL_LENGTHS[dataset.cameras.model.names[dataset.cameras.model.codes[row]]]
+        count = focals(dataset.cameras, row)
         params[row][count : count + 2] += shift_px
-    return Dataset(**{**vars(dataset), "cameras": dataset.cameras.replace(params=params)})
+    return with_params(dataset, params)
 
 
 def _boxes_cut_aside(view: View) -> Finding | None:

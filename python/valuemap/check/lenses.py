@@ -38,9 +38,7 @@ class FocalUnit(Convention):
         """Yield focal lengths in millimetres of film, in shares of the picture, and as angles."""
         cameras = dataset.cameras
         longer = np.maximum(cameras.width_px, cameras.height_px).astype(np.float64)
-        focal = np.array(
-            [params[0] if _has_focal(cameras, row) else np.nan for row, params in enumerate(cameras.params)]
-        )
+        focal = np.array([params[0] if focals(cameras, row) else np.nan for row, params in enumerate(cameras.params)])
         if np.all(np.isnan(focal)):
             return
         if np.nanmax(focal / longer) < _SHORT:
@@ -115,23 +113,21 @@ def _lenses(dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         yield "fisheyes (equidistant)", lambda whole: _with_model(whole, "OPENCV_FISHEYE")
 
 
-def _has_focal(cameras: Cameras, row: int) -> bool:
-    return cameras.model.names[cameras.model.codes[row]] in FOCAL_LENGTHS
-
-
-def _focals(cameras: Cameras, row: int) -> int:
-    return FOCAL_LENGTHS[cameras.model.names[cameras.model.codes[row]]]
+def focals(cameras: Cameras, row: int) -> int:
+    """Return how many focal lengths a camera has: its first parameters; 0 where its model has none."""
+    return FOCAL_LENGTHS.get(cameras.model.names[cameras.model.codes[row]], 0)
 
 
 def _is_off_middle(cameras: Cameras, row: int) -> bool:
-    if not _has_focal(cameras, row):
+    if not focals(cameras, row):
         return False
-    at = _focals(cameras, row)
+    at = focals(cameras, row)
     size = np.array([cameras.width_px[row], cameras.height_px[row]], dtype=np.float64)
     return bool(np.any(np.abs(cameras.params[row][at : at + 2] / size - 0.5) > _OFF_MIDDLE))
 
 
-def _with_params(dataset: Dataset, params: list[Floats]) -> Dataset:
+def with_params(dataset: Dataset, params: list[Floats]) -> Dataset:
+    """Return a dataset with other parameters of its cameras."""
     return Dataset(**{**vars(dataset), "cameras": dataset.cameras.replace(params=params)})
 
 
@@ -147,10 +143,10 @@ class _Focal:
         params = []
         for row, values in enumerate(dataset.cameras.params):
             changed = values.copy()
-            if _has_focal(dataset.cameras, row):
-                changed[: _focals(dataset.cameras, row)] *= self._factor[row]
+            if focals(dataset.cameras, row):
+                changed[: focals(dataset.cameras, row)] *= self._factor[row]
             params.append(changed)
-        return _with_params(dataset, params)
+        return with_params(dataset, params)
 
 
 def _with_principal_points(dataset: Dataset, change: Callable[[Floats, Floats], Floats]) -> Dataset:
@@ -158,10 +154,10 @@ def _with_principal_points(dataset: Dataset, change: Callable[[Floats, Floats], 
     params = [values.copy() for values in cameras.params]
     for row, values in enumerate(params):
         if _is_off_middle(cameras, row):
-            at = _focals(cameras, row)
+            at = focals(cameras, row)
             size = np.array([cameras.width_px[row], cameras.height_px[row]], dtype=np.float64)
             values[at : at + 2] = change(values[at : at + 2].copy(), size)
-    return _with_params(dataset, params)
+    return with_params(dataset, params)
 
 
 def _with_model(dataset: Dataset, model: str) -> Dataset:
@@ -187,8 +183,8 @@ def _with_opposite_distortion(dataset: Dataset) -> Dataset:
     params = []
     for row, values in enumerate(dataset.cameras.params):
         changed = values.copy()
-        if _has_focal(dataset.cameras, row):
-            at = _focals(dataset.cameras, row)
+        if focals(dataset.cameras, row):
+            at = focals(dataset.cameras, row)
             changed[at + 2 :] *= -1.0
         params.append(changed)
-    return _with_params(dataset, params)
+    return with_params(dataset, params)
