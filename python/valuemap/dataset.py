@@ -352,6 +352,13 @@ def rows_of(ids: Ints, keys: Ints) -> Ints:
     return np.searchsorted(keys, ids).astype(np.int64)
 
 
+def evenly(rows: Ints, most: int) -> Ints:
+    """Return at most so many of some rows (N), spread evenly over all of them."""
+    if len(rows) <= most:
+        return rows
+    return np.asarray(rows[np.linspace(0, len(rows) - 1, most).round().astype(np.int64)])
+
+
 def number_passes(images: Images) -> Ints:
     """Return the number (N) of each image's pass, in the order of their first images: the names do not matter."""
     _, first, inverse = np.unique(images.pass_id.codes, return_index=True, return_inverse=True)

@@ -16,7 +16,7 @@ import scipy
 import valuemap._core as _core
 from valuemap.cameras import Rays, cast_rays
 from valuemap.config import PartitionConfig, VoteConfig
-from valuemap.dataset import Dataset, rows_of
+from valuemap.dataset import Dataset, evenly, rows_of
 from valuemap.evidence import Evidence
 from valuemap.map_folder import Map
 from valuemap.partition import partition_images
@@ -141,7 +141,7 @@ def _thinned(cluster: Ints, code: Ints) -> Ints:
     order = np.lexsort((code, cluster))
     _, first, count = np.unique(np.stack([cluster[order], code[order]]), axis=1, return_index=True, return_counts=True)
     kept = [
-        order[start : start + size][np.linspace(0, size - 1, min(size, _MOST_AROUND)).round().astype(np.int64)]
+        evenly(order[start : start + size], _MOST_AROUND)
         for start, size in zip(first.tolist(), count.tolist(), strict=True)
     ]
     return np.sort(np.concatenate(kept)) if kept else np.empty(0, np.int64)

@@ -19,7 +19,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from valuemap.dataset import Dataset, Frame, rows_of
+from valuemap.dataset import Dataset, Frame, evenly, rows_of
 from valuemap.errors import InputError
 from valuemap.folders import new_file
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
@@ -502,9 +502,7 @@ def _cost_of_exchange(
 def _voters(result: Map, dataset: Dataset, label_id: int) -> tuple[tuple[str, float, float], ...]:
     """Return the boxes that voted for a label, some of them evenly where there are many."""
     votes = result.votes
-    rows = np.flatnonzero(votes.label_id == label_id)
-    if len(rows) > _KEPT_VOTERS:
-        rows = rows[np.linspace(0, len(rows) - 1, _KEPT_VOTERS).round().astype(np.int64)]
+    rows = evenly(np.flatnonzero(votes.label_id == label_id), _KEPT_VOTERS)
     detection_row = rows_of(votes.detection_id[rows], dataset.detections.detection_id)
     image_row = rows_of(votes.image_id[rows], dataset.images.image_id)
     return tuple(

@@ -11,7 +11,7 @@ import numpy as np
 
 from valuemap.dataset import Dataset
 from valuemap.map_folder import Map
-from valuemap.report.ground import Ground, Outcomes, busiest_place, closest_pair, extent_of, look_down
+from valuemap.report.ground import Ground, Outcomes, busiest_place, closest_pair, extent_of, look_down, thinned
 from valuemap.report.style import (
     BLACK,
     BLUE,
@@ -32,6 +32,7 @@ from valuemap.report.style import (
     YELLOW,
     check_format,
     drawing,
+    number_of,
     plain,
     save_figure,
 )
@@ -258,13 +259,13 @@ def plain_line(text: str, most: int) -> str:
 
 
 def _summary(result: Map, dataset: Dataset | None) -> str:
-    labels = f"{len(result.labels):,} {'label' if len(result.labels) == 1 else 'labels'}"
+    labels = number_of(len(result.labels), "label")
     if dataset is None:
         return f"{labels} with {len(result.votes):,} votes"
     passes = len(np.unique(dataset.images.pass_id.codes))
     return (
         f"{labels} from {len(dataset.detections):,} detections in "
-        f"{len(dataset.images):,} images of {passes:,} {'pass' if passes == 1 else 'passes'}"
+        f"{len(dataset.images):,} images of {number_of(passes, 'pass', 'passes')}"
     )
 
 
@@ -301,10 +302,7 @@ def _draw_streets(axes: Axes, ground: Ground, window: _Window) -> None:
 
 def _thinned(line: Floats, window: _Window) -> Floats:
     """Return a line without points that are within a pixel of the last one; a single point stays visible."""
-    cell = np.floor(line / window.meters_per_px)
-    keep = np.ones(len(line), np.bool_)
-    keep[1:-1] = np.any(cell[1:-1] != cell[:-2], axis=1)
-    thin = line[keep]
+    thin = thinned(line, window.meters_per_px)
     return np.repeat(thin, 2, axis=0) if len(thin) == 1 else thin
 
 

@@ -176,6 +176,14 @@ def _heading(stretch: Floats) -> Floats | None:
     return np.asarray(away[far[0]] / distance[far[0]])
 
 
+def thinned(line: Floats, step_m: float) -> Floats:
+    """Return a line (N, 2) without points that are in the same cell of the ground as the one before; its ends stay."""
+    cell = np.floor(line / step_m)
+    keep = np.ones(len(line), np.bool_)
+    keep[1:-1] = np.any(cell[1:-1] != cell[:-2], axis=1)
+    return line[keep]
+
+
 # Where to look.
 
 

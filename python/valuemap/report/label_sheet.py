@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from valuemap.dataset import evenly
 from valuemap.evidence import Evidence, Misses, Voters
 from valuemap.report.above import plain_line
 from valuemap.report.crops import LEAST_SIDE_PX, Crop, miss_crop, voter_crop
 from valuemap.report.ground import ellipses, horizontal_axes
-from valuemap.report.style import BLUE, DPI, FAINT_INK, GROUND, INK, ORANGE, RULE, drawing, probability
+from valuemap.report.style import BLUE, DPI, FAINT_INK, GROUND, INK, ORANGE, RULE, drawing, number_of, probability
 from valuemap.tables import Floats, Ints
 
 if TYPE_CHECKING:
@@ -98,11 +99,11 @@ def _rows(evidence: Evidence, voters: Voters, misses: Misses) -> list[_Row]:
     for number in shown:
         places = np.flatnonzero(voters.pass_number == number)
         name = plain_line(evidence.pass_name(int(voters.image_row[places[0]])), 60)
-        spread = _evenly(places, _CROPS_PER_ROW)
+        spread = evenly(places, _CROPS_PER_ROW)
         some = f", {len(spread)} of them" if len(spread) < len(places) else ""
         rows.append(
             _Row(
-                f"Pass {name}: {len(places):,} {'vote' if len(places) == 1 else 'votes'}{some}",
+                f"Pass {name}: {number_of(len(places), 'vote')}{some}",
                 spread,
                 pass_color(int(number)),
             )
@@ -116,20 +117,11 @@ def _rows(evidence: Evidence, voters: Voters, misses: Misses) -> list[_Row]:
             last.color,
         )
     if len(misses):
-        spread = _evenly(np.arange(len(misses)), _CROPS_PER_ROW)
+        spread = evenly(np.arange(len(misses)), _CROPS_PER_ROW)
         some = f", {len(spread)} of them" if len(spread) < len(misses) else ""
-        images = "image" if len(misses) == 1 else "images"
-        title = f"{len(misses):,} {images} that should have seen it and did not vote{some}"
+        title = f"{number_of(len(misses), 'image')} that should have seen it and did not vote{some}"
         rows.append(_Row(title, spread, INK, misses=True))
     return rows
-
-
-def _evenly(places: Ints, most: int) -> Ints:
-    """Return at most so many, evenly along the drive."""
-    if len(places) <= most:
-        return places
-    chosen: Ints = places[np.round(np.linspace(0, len(places) - 1, most)).astype(np.int64)]
-    return chosen
 
 
 def _typical_side(voters: Voters) -> float:
@@ -145,9 +137,7 @@ def _draw_head(figure: Figure, evidence: Evidence, row: int, voters: Voters, mis
     )  # fmt: skip
     passes = len(np.unique(voters.pass_number))
     seen = len(voters) + len(misses)
-    facts = [
-        f"{len(voters):,} of {seen:,} images that should have seen it, {passes:,} {'pass' if passes == 1 else 'passes'}"
-    ]
+    facts = [f"{len(voters):,} of {seen:,} images that should have seen it, {number_of(passes, 'pass', 'passes')}"]
     if labels.existence is not None:
         facts.append(f"exists with probability {probability(labels.existence[row])}")
     facts.append(f"reprojection rms {labels.reprojection_rms_px[row]:.2f} px")
@@ -183,7 +173,7 @@ def _draw_views(figure: Figure, evidence: Evidence, row: int, voters: Voters, mi
     ]
     center = evidence.center_in_world_m[voters.image_row] - point
     direction = evidence.rays.direction_in_world[voters.detection_row]
-    places = _evenly(np.arange(len(voters)), _MOST_RAYS)
+    places = evenly(np.arange(len(voters)), _MOST_RAYS)
     from_above, down = center @ axes_in_world.T, direction @ axes_in_world.T
     mean = down.sum(axis=0)
     mean = mean / (np.linalg.norm(mean) or 1.0)
@@ -241,7 +231,7 @@ def _draw_seen_from(
     axes.set_aspect("equal")
     for number in np.unique(voters.pass_number):
         of_pass = cameras[voters.pass_number == number]
-        for x, y in of_pass[_evenly(np.arange(len(of_pass)), 60)]:
+        for x, y in of_pass[evenly(np.arange(len(of_pass)), 60)]:
             axes.plot([0.0, x], [0.0, y], color=pass_color(int(number)), linewidth=0.7, alpha=0.4, zorder=2)
         axes.plot(of_pass[:, 0], of_pass[:, 1], ".", color=pass_color(int(number)), markersize=5, zorder=3)
     axes.plot(missed[:, 0], missed[:, 1], "x", color=INK, markersize=4.5, alpha=0.8, zorder=3, label="did not vote")

@@ -22,7 +22,7 @@ from valuemap.evidence import Evidence
 from valuemap.map_folder import Map
 from valuemap.report.errors import error_m
 from valuemap.report.figures import ReportFigure
-from valuemap.report.ground import ellipses, horizontal_axes, look_down
+from valuemap.report.ground import ellipses, horizontal_axes, look_down, thinned
 from valuemap.report.paper import Cell, ReportTable
 from valuemap.report.style import BLUE, GREY, PURPLE, SKY, YELLOW
 from valuemap.tables import Floats, covariance_matrices
@@ -244,7 +244,7 @@ def inline_data(
     points = np.concatenate([*drives, ground.all_points(), np.empty((0, 2))])
     low, high = (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(2), np.ones(2))
     step = max(0.5, float(np.max(high - low)) / 6000.0)
-    drives = [_thinned(drive - origin[:2], step) for drive in drives]
+    drives = [thinned(drive - origin[:2], step) for drive in drives]
     count = np.bincount(labels.class_name.codes, minlength=len(labels.class_name.names))
     rank = np.empty(len(count), np.int64)
     rank[np.lexsort((np.arange(len(count)), -count))] = np.arange(len(count))
@@ -322,11 +322,3 @@ def _votes(
     }
     names = [str(name) for name in images.name.take(cameras).to_pylist()] if len(cameras) <= _MOST_NAMED_IMAGES else []
     return arrays, names, [of_pass.get(n, "") for n in range(int(number.max(initial=-1)) + 1)]
-
-
-def _thinned(line: Floats, step_m: float) -> Floats:
-    """Return a line without points that are in the same cell of the ground as the one before."""
-    cell = np.floor(line / step_m)
-    keep = np.ones(len(line), np.bool_)
-    keep[1:-1] = np.any(cell[1:-1] != cell[:-2], axis=1)
-    return line[keep]

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from valuemap.dataset import evenly
 from valuemap.evidence import Evidence, Misses, PassingRays
 from valuemap.rejected import figures_in_words
 from valuemap.report.above import plain_line
 from valuemap.report.crops import crop_at
 from valuemap.report.ground import horizontal_axes
 from valuemap.report.label_sheet import draw_crop, pass_color
-from valuemap.report.style import BLUE, DPI, FAINT_INK, GREY, GROUND, INK, ORANGE, RULE, VERMILION, drawing
+from valuemap.report.style import BLUE, DPI, FAINT_INK, GREY, GROUND, INK, ORANGE, RULE, VERMILION, drawing, number_of
 from valuemap.tables import REJECTION_REASONS, Floats, Ints, Rejected
 
 if TYPE_CHECKING:
@@ -208,30 +209,28 @@ def _about_rays(evidence: Evidence, point: Floats, passing: PassingRays, looks: 
         return [f"No image pictures this place {far}: nothing could be seen here."]
     passes = len(np.unique(looks.pass_number))
     verb = "pictures" if len(looks) == 1 else "picture"
-    pictured = f"{_many(len(looks), 'image')} of {_many(passes, 'pass', 'passes')} {verb} it"
+    pictured = f"{number_of(len(looks), 'image')} of {number_of(passes, 'pass', 'passes')} {verb} it"
     if len(passing) == 0:
         return [
             f"{pictured} {far}. No detection points to within {radius_m:g} m of it: the detector found nothing here."
         ]
-    points = "points" if len(passing) == 1 else "point"
-    reasons = [
-        f"{pictured} {far}. {_many(len(passing), 'detection')} {points} to within {radius_m:g} m of it, at some height."
-    ]
+    point_there = f"{number_of(len(passing), 'detection')} {'points' if len(passing) == 1 else 'point'}"
+    reasons = [f"{pictured} {far}. {point_there} to within {radius_m:g} m of it, at some height."]
     taken = passing.label_id[passing.label_id >= 0]
     ids, count = np.unique(taken, return_counts=True)
     for place in np.lexsort((ids, -count))[:_SHOWN_RIVALS]:
         position = evidence.result.labels.position_in_world_m[evidence.label_row(int(ids[place]))]
         number = int(count[place])
         away = np.linalg.norm((position - point) @ evidence.result.frame.east_north().T)
-        reasons.append(f"{_many(number, 'detection')} {_verb(number)} for label {ids[place]}, {away:.1f} m away.")
+        reasons.append(f"{number_of(number, 'detection')} {_verb(number)} for label {ids[place]}, {away:.1f} m away.")
     free = np.flatnonzero(passing.label_id < 0)
     if len(free) == 0:
         reasons.append("None of them is left over: all vote for other labels.")
         return reasons
     images = len(np.unique(passing.image_row[free]))
     reasons.append(
-        f"{_many(len(free), 'detection')} in {_many(images, 'image')} of "
-        f"{_many(len(np.unique(passing.pass_number[free])), 'pass', 'passes')} {_verb(len(free))} for nothing."
+        f"{number_of(len(free), 'detection')} in {number_of(images, 'image')} of "
+        f"{number_of(len(np.unique(passing.pass_number[free])), 'pass', 'passes')} {_verb(len(free))} for nothing."
     )
     reasons += _missing(evidence, passing, free, images)
     return reasons
@@ -269,10 +268,6 @@ def _missing(evidence: Evidence, passing: PassingRays, free: Ints, images: int) 
 
 def _verb(count: int) -> str:
     return "votes" if count == 1 else "vote"
-
-
-def _many(count: int, one: str, several: str | None = None) -> str:
-    return f"{count:,} {one if count == 1 else several or one + 's'}"
 
 
 # The picture.
@@ -323,15 +318,8 @@ def _shown_looks(answer: PlaceAnswer) -> Ints:
     """Return the images (places in `looks`) to show: those with a detection that is left over first."""
     pointing = np.flatnonzero(np.isin(answer.looks.image_row, answer.passing.image_row[answer.passing.label_id < 0]))
     others = np.setdiff1d(np.arange(len(answer.looks)), pointing)
-    first = _evenly(pointing, _CROPS)
-    return np.concatenate([first, _evenly(others, _CROPS - len(first))])
-
-
-def _evenly(places: Ints, most: int) -> Ints:
-    """Return at most so many, evenly along the drive."""
-    if len(places) <= most:
-        return places
-    return np.asarray(places[np.round(np.linspace(0, len(places) - 1, most)).astype(np.int64)])
+    first = evenly(pointing, _CROPS)
+    return np.concatenate([first, evenly(others, _CROPS - len(first))])
 
 
 def _draw_look(axes: Axes, evidence: Evidence, answer: PlaceAnswer, pictures: Path | None, look: int) -> None:

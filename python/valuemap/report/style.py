@@ -100,6 +100,11 @@ def figure_bytes(figure: Figure, suffix: str) -> bytes:
     return buffer.getvalue()
 
 
+def number_of(count: int, one: str, several: str | None = None) -> str:
+    """Return a number with what it counts, in the singular or the plural."""
+    return f"{count:,} {one if count == 1 else several or one + 's'}"
+
+
 def probability(value: float) -> str:
     """Return a probability in words of three decimals; what is nearly certain is not called certain."""
     if value > 0.9995:

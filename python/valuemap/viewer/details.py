@@ -10,6 +10,7 @@ from valuemap.errors import InputError
 from valuemap.evidence import Evidence, Misses, PassingRays, pictures_there
 from valuemap.rejected import figures_in_words, find_rejected
 from valuemap.report.place_sheet import explain_place
+from valuemap.report.style import number_of
 from valuemap.tables import REJECTION_REASONS, Floats, Ints, Rejected
 from valuemap.viewer.scene import Scene, number, numbers
 
@@ -281,8 +282,8 @@ def _answer_without_dataset(details: dict[str, Any]) -> str:
     if details["rejected"]:
         best = details["rejected"][0]
         sentences.append(
-            f"A hypothesis ({best['class']}) {best['away_m']:.2f} m away had {_count(best['votes'], 'vote')} of "
-            f"{_count(best['passes'], 'pass', 'passes')}. It was rejected: {best['why']}."
+            f"A hypothesis ({best['class']}) {best['away_m']:.2f} m away had {number_of(best['votes'], 'vote')} of "
+            f"{number_of(best['passes'], 'pass', 'passes')}. It was rejected: {best['why']}."
         )
     elif details["kept"]:
         sentences.append(f"No rejected hypothesis of this map is within {PLACE_RADIUS_M:g} m.")
@@ -290,7 +291,3 @@ def _answer_without_dataset(details: dict[str, Any]) -> str:
         sentences.append("The map keeps no rejected hypotheses.")
     sentences.append("Without the dataset nobody can tell which images pictured this place.")
     return " ".join(sentences)
-
-
-def _count(count: int, one: str, many: str | None = None) -> str:
-    return f"{count:,} {one if count == 1 else many or one + 's'}"
