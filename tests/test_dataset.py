@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from small_dataset import ANCHOR, rewrite, small_dataset, with_column, with_value
 from valuemap import portions
 from valuemap.cli.commands import app
-from valuemap.dataset import Dataset, Frame, read_dataset, rows_of, write_dataset
+from valuemap.dataset import Dataset, Frame, evenly, read_dataset, rows_of, write_dataset
 from valuemap.errors import InputError, OutputError
 from valuemap.folders import LEDGER, new_file
 from valuemap.summary import summarize_dataset, summarize_portions
@@ -100,6 +100,13 @@ def test_rows_of_ids() -> None:
     assert_array_equal(rows_of(np.array([12, 10, 12]), np.array([10, 11, 12])), [2, 0, 2])
     assert_array_equal(rows_of(np.array([13, 10, 13]), np.array([10, 11, 13])), [2, 0, 2])
     assert_array_equal(rows_of(np.empty(0, np.int64), np.empty(0, np.int64)), [])
+
+
+def test_some_rows_of_many_are_evenly_spread() -> None:
+    rows = np.arange(10, 21)
+    assert evenly(rows, 11) is rows
+    assert_array_equal(evenly(rows, 3), [10, 15, 20])
+    assert len(evenly(rows, 0)) == 0
 
 
 def test_what_a_dataset_holds_is_told_of_portions(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

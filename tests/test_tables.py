@@ -49,6 +49,12 @@ def test_covariances_are_columns_of_a_table_and_matrices() -> None:
     assert covariance_matrices(np.empty((0, 6))).shape == (0, 3, 3)
 
 
+def test_rows_come_in_the_order_of_their_keys() -> None:
+    images = small_dataset().images
+    assert images.by_key() is images
+    assert_same_table(images.take(np.arange(len(images))[::-1]).by_key(), images)
+
+
 def assert_same_table(first: Any, second: Any) -> None:
     assert table_to_arrow(first).equals(table_to_arrow(second))
 
