@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from valuemap import folders
 from valuemap.errors import OutputError
-from valuemap.folders import LEDGER, check_files, check_place, new_file, new_folder, remove_file, settle
+from valuemap.folders import LEDGER, check_files, check_place, new_file, new_folder, remove_file, settle, take_over
 from valuemap.system import folder_lock
 
 MARKER = "run.json"
@@ -229,6 +230,44 @@ def test_a_ledger_that_names_files_elsewhere_removes_none(tmp_path: Path) -> Non
 def test_the_ledger_is_one_that_sha256sum_checks(tmp_path: Path) -> None:
     write_folder(tmp_path, "new")
     assert (tmp_path / LEDGER).read_text() == f"{hashlib.sha256(b'new').hexdigest()}  {MARKER}\n"
+
+
+@pytest.mark.parametrize("has_older", [True, False])
+def test_files_that_are_taken_over_are_not_hashed_again(
+    has_older: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_folder(tmp_path / "first", "same")
+    if has_older:
+        write_folder(tmp_path / "second", "older")
+    hashed: list[str] = []
+    hash_of = folders._sha256
+    monkeypatch.setattr(folders, "_sha256", lambda path: hashed.append(path.name) or hash_of(path))  # type: ignore[func-returns-value]
+    (tmp_path / "foreign").write_text("of nobody")
+    with new_folder(tmp_path / "second", parts=PARTS, part_folders=["inner"]) as folder:
+        (folder / "new").write_text("new")
+        hashed.clear()
+        take_over(
+            {
+                tmp_path / "first" / MARKER: folder / MARKER,
+                tmp_path / "first" / "inner" / "data": folder / "inner" / "data",
+                tmp_path / "foreign": folder / "foreign",
+            }
+        )
+    monkeypatch.undo()
+    # What is in the place of an older one is hashed to see whether that is ours.
+    assert [name for name in hashed if name in ("new", "foreign")] == ["foreign", "new"]
+    assert has_older or len(hashed) == 2
+    for place in (tmp_path / "second", tmp_path / "second" / "inner"):
+        subprocess.run(["sha256sum", "--check", "--strict", LEDGER], cwd=place, check=True)
+
+
+def test_what_was_changed_before_it_was_taken_over_is_not_ours(tmp_path: Path) -> None:
+    write_folder(tmp_path / "first", "same")
+    (tmp_path / "first" / MARKER).write_text("changed")
+    with new_folder(tmp_path / "second", parts=PARTS) as folder:
+        take_over({tmp_path / "first" / MARKER: folder / MARKER})
+    with pytest.raises(OutputError, match="not ours to replace"):
+        check_files(tmp_path / "second", PARTS)
 
 
 def test_a_ledger_does_not_grow_with_each_set_of_files(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 
@@ -72,8 +72,9 @@ def new_folder(
                     workspace = _moved(workspace, path)
                 _decide(workspace, path, files, parts, part_folders, force=force)
             else:
+                ledger_of = functools.cache(_ledger)
                 for name in files:
-                    _note(fresh / name, fresh / name)
+                    _note(fresh / name, fresh / name, ledger_of)
                 fresh.replace(path)
     except OSError as error:
         raise _cannot_write(path, error) from error
@@ -155,7 +156,7 @@ def new_file(path: Path, *, force: bool = False, keep_record: bool = True) -> It
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
         if keep_record:
-            _note(temporary, path)
+            _note(temporary, path, lambda _: {})
         temporary.replace(path)
     except OSError as error:
         raise _cannot_write(path, error) from error
@@ -174,6 +175,27 @@ def remove_file(path: Path, *, force: bool = False) -> None:
     """
     check_files(path.parent, [path.name], force=force)
     path.unlink(missing_ok=True)
+
+
+def take_over(files: Mapping[Path, Path]) -> None:
+    """Link files that nobody changes any more to places in a folder that `new_folder` yields, or copy them.
+
+    What the ledgers of their folders say of them goes along, so that they are not hashed again. One that was changed
+    since is as little ours in its new place as it was before.
+    """
+    lines: dict[Path, list[tuple[bytes, str]]] = {}
+    ledger_of = functools.cache(_ledger)
+    for file, place in files.items():
+        place.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(file, place)
+        except OSError:  # On another disk, or one that knows no links.
+            shutil.copyfile(file, place)
+        known = ledger_of(file.parent).get(os.fsencode(file.name), set())
+        if len(known) == 1:
+            lines.setdefault(place.parent, []).append((next(iter(known)), place.name))
+    for folder, of_folder in lines.items():
+        _write_lines(folder, of_folder)
 
 
 def _followed(path: Path) -> Path:
@@ -227,8 +249,9 @@ def _decide(
     force: bool,
 ) -> None:
     """Let the fresh files take the places of the older ones; from the first rename on there is no way back."""
+    ledger_of = functools.cache(_ledger)
     for name in files:
-        _note(workspace / _FRESH / name, path / name)
+        _note(workspace / _FRESH / name, path / name, ledger_of)
         sync_file(workspace / _FRESH / name)
     stale = [name for name in parts if name not in files and os.path.lexists(path / name)]
     for folder in part_folders:
@@ -316,16 +339,29 @@ def _ledger(folder: Path) -> dict[bytes, set[bytes]]:
     return found
 
 
-def _note(content: Path, place: Path) -> None:
-    """Add a file to the ledger of the folder that it is to be in, before it is there."""
-    name = os.fsencode(place.name)
-    if b"\n" in name:
-        raise OutputError(f"{place!r}: a line break in a name cannot be kept on record", hint="choose another name")
-    place.parent.mkdir(parents=True, exist_ok=True)
-    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | OWN_FILE
-    descriptor = os.open(place.parent / LEDGER, flags, 0o666)
+def _note(content: Path, place: Path, ledger_of: Callable[[Path], dict[bytes, set[bytes]]]) -> None:
+    """Add a file to the ledger of the folder that it is to be in, before it is there.
+
+    A hash that the ledger of the folder where it is now lists already is not made again.
+    """
+    known = ledger_of(content.parent).get(os.fsencode(content.name), set())
+    if not known or content != place:
+        _write_lines(place.parent, [(next(iter(known)) if len(known) == 1 else _sha256(content), place.name)])
+
+
+def _write_lines(folder: Path, lines: Iterable[tuple[bytes, str]]) -> None:
+    """Add hashes of files, by their names, to the ledger of a folder, which is made if it is not there."""
+    content = b""
+    for digest, name in lines:
+        if "\n" in name:
+            raise OutputError(
+                f"{folder / name!r}: a line break in a name cannot be kept on record", hint="choose another name"
+            )
+        content += digest + b"  " + os.fsencode(name) + b"\n"
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder / LEDGER, os.O_WRONLY | os.O_CREAT | os.O_APPEND | OWN_FILE, 0o666)
     try:
-        os.write(descriptor, _sha256(content) + b"  " + name + b"\n")
+        os.write(descriptor, content)
     finally:
         os.close(descriptor)
 

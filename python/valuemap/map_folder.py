@@ -6,9 +6,7 @@ import base64
 import html
 import io
 import json
-import os
 import reprlib
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +17,7 @@ import numpy as np
 
 from valuemap.dataset import Dataset, Frame
 from valuemap.errors import InputError
-from valuemap.folders import new_folder, settle
+from valuemap.folders import new_folder, settle, take_over
 from valuemap.remote import Place, name_of, read_all
 from valuemap.tables import Labels, Rejected, Votes, read_table, table_to_arrow, write_table
 
@@ -134,15 +132,11 @@ def write_map(
         calibration = run.pop("calibration", None)
         if calibration is not None:
             (folder / CALIBRATION).write_text(json.dumps(calibration, indent=2) + "\n", encoding="utf-8")
-        for name, file in files.items():
-            (folder / name).parent.mkdir(exist_ok=True)
-            _place(file, folder / name)
         if cells:
             (folder / CELLS).mkdir()
         afar = [cell for cell in cells if not isinstance(cell, Path)]
-        for cell in cells:
-            if isinstance(cell, Path):
-                _place(cell, folder / CELLS / cell.name)
+        here = {cell: folder / CELLS / cell.name for cell in cells if isinstance(cell, Path)}
+        take_over({file: folder / name for name, file in files.items()} | here)
         for cell, content in zip(afar, read_all(afar), strict=True):
             (folder / CELLS / name_of(cell)).write_bytes(content)
         (folder / MARKER).write_text(json.dumps(run, indent=2) + "\n", encoding="utf-8")
@@ -150,14 +144,6 @@ def write_map(
         write_table(result.votes, folder / "votes.parquet")
         if result.rejected is not None:
             write_table(result.rejected, folder / REJECTED)
-
-
-def _place(file: Path, place: Path) -> None:
-    """Link a file that nobody changes any more, or copy it."""
-    try:
-        os.link(file, place)  # Nobody writes into a file that is there.
-    except OSError:  # On another disk, or one that knows no links.
-        shutil.copyfile(file, place)
 
 
 def read_map(path: str | Path) -> Map:
