@@ -21,7 +21,7 @@ from small_dataset import small_dataset
 from test_cli import COMMAND, complains, heard_by_default, works
 from test_detect import painted, save
 from tiny_models import red_finder
-from valuemap import read_dataset, write_dataset
+from valuemap import config, read_dataset, write_dataset
 from valuemap.detect.accuracy import FoundBoxes, evaluate_boxes
 from valuemap.detect.found import match_pictures
 from valuemap.detect.labels import LabelledPicture, LabelledPictures
@@ -263,6 +263,16 @@ def test_simulated_pictures_are_drawn_on_request(tmp_path: Path) -> None:
         with Image.open(tmp_path / "city" / "images" / name) as picture:
             assert picture.size == (160, 120)
     assert (tmp_path / "city" / "boxes.json").is_file()
+
+
+def test_maps_are_made_without_the_settings_of_other_commands() -> None:
+    names = tuple(f"valuemap.config.{name}" for name in ("detection", "simulation", "training"))
+    code = f"import sys, valuemap.cli.update\nprint([name for name in {names!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+    assert all(hasattr(config, name) for name in config.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
+        config.Nothing  # noqa: B018
 
 
 def test_the_command_line_starts_without_slow_libraries() -> None:
