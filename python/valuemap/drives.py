@@ -162,7 +162,7 @@ class Ways:
         self._track = track = _order_exposures(shots, vehicle[first], first)
         self._place_m = shots.center_m.take(first[track.exposure], axis=0)
         self._steps = _Steps.of(self._place_m, track)
-        low_m, high_m = self._place_m.min(axis=0, initial=np.inf), self._place_m.max(axis=0, initial=-np.inf)
+        low_m, high_m = bounds(self._place_m)
         step_m, speed, taken = (
             _quantiles(values, track.group, 0.75)
             for values in (self._steps.step_m, self._steps.speed, self._steps.taken)
@@ -182,8 +182,8 @@ class Ways:
         rank[np.argsort(earliest, kind="stable")] = np.arange(len(starts))
         along = np.argsort(rank[drive], kind="stable")
         drive, place_m, exposure_along = rank[drive][along], place_m.take(along, axis=0), track.exposure[along]
-        begins = np.diff(drive, prepend=-1) > 0
-        order = np.arange(len(drive)) - np.maximum.accumulate(np.where(begins, np.arange(len(drive)), 0))
+        begins = _begins(drive)
+        order = _since(begins)
         opens = _viewpoint_openings(place_m, begins, viewpoint_step_m)
         driven_m = _driven_m(place_m, begins, opens)
 
@@ -204,6 +204,13 @@ class Ways:
         }
         drives = Drives(drive[of_row], order[of_row], driven_m[of_row], (np.cumsum(opens) - 1)[of_row], record)
         return drives, shots.row[np.sort(earliest)]
+
+
+def bounds(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the least and largest (K) of each column of values (N, K); of none infinity, and its negative."""
+    # Along rows of few numbers NumPy takes seven times as long.
+    least = [column.min() if len(column) else np.inf for column in values.T]
+    return np.array(least), np.array([column.max() if len(column) else -np.inf for column in values.T])
 
 
 def are_dates(images: Images) -> Bools:
@@ -671,12 +678,14 @@ def _quantiles(values: Floats, group: Ints, share: float) -> Floats:
 
     Values are rounded to single precision: then one sort of whole numbers, by group and value, does it.
     """
+    is_nan = np.isnan(values)
     bits = (values + 0.0).astype(np.float32).view(np.uint32)  # No -0; bits of positive numbers sort as these do.
-    bits = np.where(np.isnan(values), np.uint32(2**32 - 1), bits ^ np.where(bits >> 31, 2**32 - 1, 2**31).astype("u4"))
+    bits ^= (bits.view(np.int32) >> 31).view(np.uint32) | np.uint32(2**31)  # Of negative ones all bits, else the sign.
+    bits[is_nan] = 2**32 - 1
     keys = np.sort((group.astype(np.uint64) << np.uint64(32)) | bits)
     groups = int(group.max(initial=-1)) + 1
     size = np.bincount(group, minlength=groups)
-    number = size - np.bincount(group[np.isnan(values)], minlength=groups)
+    number = size - np.bincount(group[is_nan], minlength=groups)
     some = np.flatnonzero(number)
     at = (np.cumsum(size) - size)[some] + (share * (number[some] - 1) + 0.5).astype(np.int64)
     found = keys[at].astype(np.uint32)
@@ -702,7 +711,9 @@ def _lengths(vectors: Floats) -> Floats:
 
 def _steps_m(place_m: Floats) -> Floats:
     """Return how far each of some places (N, 3) in a row is from the one before, the first 0."""
-    return _lengths(np.diff(place_m, axis=0, prepend=place_m[:1]))
+    step_m = np.zeros(len(place_m))
+    step_m[1:] = _lengths(place_m[1:] - place_m[:-1])
+    return step_m
 
 
 def _summed_m(step_m: Floats) -> Floats:
@@ -710,9 +721,23 @@ def _summed_m(step_m: Floats) -> Floats:
     return np.asarray(np.cumsum(np.rint(step_m * _PARTS_OF_A_METRE).astype(np.int64)) / _PARTS_OF_A_METRE)
 
 
+def _begins(values: Ints) -> Bools:
+    """Return where (N) runs of equal values begin."""
+    begins = np.ones(len(values), np.bool_)
+    np.not_equal(values[1:], values[:-1], out=begins[1:])
+    return begins
+
+
+def _since(begins: Bools) -> Ints:
+    """Return how many rows (N) it is since the last one where something begins, as it does in the first."""
+    first = np.flatnonzero(begins)
+    count = np.diff(np.append(first, len(begins)))
+    return np.asarray(np.arange(len(begins)) - np.repeat(first, count))
+
+
 def _runs(values: Ints) -> Ints:
     """Return where runs of equal values begin, and the end."""
-    return np.concatenate([np.flatnonzero(np.diff(values, prepend=values[:1] - 1)), [len(values)]]).astype(np.int64)
+    return np.append(np.flatnonzero(_begins(values)), len(values))
 
 
 def _is_a_way(place_m: Floats, group: Ints) -> Bools:
@@ -821,7 +846,7 @@ class _Steps:
 
     @classmethod
     def of(cls, place_m: Floats, track: _Track) -> _Steps:
-        begins = np.diff(track.group, prepend=-1) != 0
+        begins = _begins(track.group)
         step_m = _steps_m(place_m)
         step_m[begins] = np.nan
         taken = np.where(begins, np.nan, track.taken)
@@ -946,7 +971,7 @@ def _viewpoint_openings(place_m: Floats, begins: Bools, step_m: float) -> Bools:
 def _driven_m(place_m: Floats, begins: Bools, opens: Bools) -> Floats:
     """Return how far (E) drives had come where the viewpoint of each exposure began."""
     start = np.flatnonzero(opens)
-    way_m = np.linalg.norm(np.diff(place_m[start], axis=0, prepend=place_m[:1]), axis=1)
+    way_m = _steps_m(place_m.take(start, axis=0))
     way_m[begins[start]] = 0.0
     total_m = _summed_m(way_m)
     at_begin_m = np.maximum.accumulate(np.where(begins[start], total_m, 0.0))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Frame
+from valuemap.drives import bounds
 from valuemap.errors import SettingError
 from valuemap.tables import Bools, Floats, Images, Ints
 
@@ -98,7 +99,8 @@ class Grid:
         index = np.array(cell.base) * 2**cell.level + np.array(cell.place)
         # The upper corner is computed as the lower one of the next square: no place is in two, or in none.
         low, high = (step * (self.side_m / 2**cell.level) - 0.5 * self.side_m for step in (index, index + 1))
-        inside: Bools = np.all((place_m >= low - around_m) & (place_m < high + around_m), axis=1)
+        is_above, is_below = place_m >= low - around_m, place_m < high + around_m
+        inside: Bools = is_above[:, 0] & is_above[:, 1] & is_below[:, 0] & is_below[:, 1]
         return inside
 
     def find(self, place_m: Floats, cells: Sequence[Cell]) -> Ints:
@@ -149,16 +151,16 @@ class Census:
         if not len(place_m):
             return cls(np.empty((0, 2), np.int64), np.empty(0, np.int64), np.empty(0, np.int64))
         square = smallest_squares(grid, place_m)
-        low = square.min(axis=0)
-        across = int(square[:, 1].max() - low[1]) + 1
+        low, high = bounds(square)
+        across = int(high[1] - low[1]) + 1
         keys, inverse = numbered((square[:, 0] - low[0]) * across + square[:, 1] - low[1])
         found = np.column_stack([keys // across, keys % across]) + low
-        extent = (*place_m.min(axis=0).tolist(), *place_m.max(axis=0).tolist())
+        least_m, largest_m = (bound.tolist() for bound in bounds(place_m))
         return cls(
             found,
             np.bincount(inverse, minlength=len(found)),
             np.bincount(inverse, detections, len(found)).astype(np.int64),
-            extent,
+            (*least_m, *largest_m),
         )
 
     @classmethod
@@ -220,8 +222,8 @@ class Places:
     def __init__(self, grid: Grid, place_m: Floats) -> None:
         self._grid, self._place_m = grid, place_m
         square = smallest_squares(grid, place_m)
-        self._low = square.min(axis=0, initial=2**62)
-        self._across = int((square - self._low).max(axis=0, initial=0)[1]) + 1
+        low, high = bounds(square) if len(square) else (square.sum(axis=0),) * 2
+        self._low, self._across = low, int(high[1] - low[1]) + 1
         key = self._key(square)
         # Numbers of 16 bits are sorted by counting.
         self._order = np.argsort(key.astype(np.uint16) if key.max(initial=0) < 2**16 else key, kind="stable")

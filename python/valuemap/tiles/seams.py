@@ -125,13 +125,14 @@ def _shared(rows: _Rows) -> Ints:
     vote = rows.of_several
     vote = vote[np.lexsort((rows.label_of_vote[vote], rows.detection_id[vote]))]
     label, detection = rows.label_of_vote[vote], rows.detection_id[vote]
-    pairs = [np.empty((0, 2), np.int64)]
+    pairs = [np.empty(0, np.int64)]
     for step in range(1, len(vote)):
         near = np.flatnonzero(detection[step:] == detection[:-step])
         if not len(near):
             break
-        pairs.append(np.stack([label[near], label[near + step]], axis=1))
-    pair, count = np.unique(np.concatenate(pairs), axis=0, return_counts=True)
+        pairs.append(label[near] * len(rows.votes) + label[near + step])
+    keys, count = np.unique(np.concatenate(pairs), return_counts=True)
+    pair = np.stack(np.divmod(keys, max(len(rows.votes), 1)), axis=1)
     both = np.concatenate([pair, pair[:, ::-1]])
     return np.column_stack([both, np.concatenate([count, count])])
 
