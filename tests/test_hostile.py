@@ -79,7 +79,20 @@ def test_a_text_that_is_no_unicode_is_refused() -> None:
         Categories.from_texts(["\udcff.jpg"])
 
 
-@pytest.mark.parametrize("name", ["../secret.jpg", "/etc/passwd", "a/../../secret.jpg", "..", "a/..", "a\0b"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../secret.jpg",
+        "/etc/passwd",
+        "a/../../secret.jpg",
+        "..",
+        "a/..",
+        "a\0b",
+        "C:a.jpg",
+        r"\\host\a.jpg",
+        r"a\..\b.jpg",
+    ],
+)
 def test_names_of_images_that_lead_out_are_refused(name: str, folder: Path) -> None:
     rewrite(folder / "images.parquet", with_value("name", 1, name))
     for read in (read_dataset, read_images):
