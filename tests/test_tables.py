@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 from small_dataset import small_dataset, with_column, with_value
+from valuemap.arrow import in_one
 from valuemap.errors import InputError
 from valuemap.tables import (
     Cameras,
@@ -89,6 +90,13 @@ def test_texts_of_a_dictionary_that_no_row_has_do_not_count() -> None:
     assert table_from_arrow(Truth, truth, source="s").class_name.names == ("a", "b")
 
 
+def test_a_column_in_one_piece_is_not_copied() -> None:
+    column = pa.chunked_array([pa.array([1.0, 2.0])])
+    assert in_one(column).buffers()[1].address == column.chunk(0).buffers()[1].address
+    assert in_one(pa.chunked_array([["a"], ["b"]])).to_pylist() == ["a", "b"]
+    assert in_one(pa.chunked_array([], pa.string())).to_pylist() == []
+
+
 def test_code_of_a_name() -> None:
     categories = Categories.from_texts(["b", "a"])
     assert [categories.code_of(name) for name in ("a", "b", "c")] == [0, 1, -1]
@@ -121,6 +129,14 @@ def test_the_order_of_rows_does_not_matter(order: list[int]) -> None:
 def test_lists_and_texts_are_sorted_along() -> None:
     cameras = table_to_arrow(small_dataset().cameras).take(pa.array([1, 0]))
     assert_same_table(table_from_arrow(Cameras, cameras, source="s"), small_dataset().cameras)
+
+
+def test_a_slice_copies_no_numbers() -> None:
+    for table in (small_dataset().images, small_dataset().detections, small_dataset().cameras):
+        for rows in (slice(1, None), slice(0, 1), slice(2, 2), slice(None, None, 2)):
+            assert_same_table(table[rows], table.take(np.arange(len(table))[rows]))
+    detections = small_dataset().detections
+    assert np.shares_memory(detections[1:].center_px, detections.center_px)
 
 
 def test_rows_can_be_taken_by_index_and_by_mask() -> None:

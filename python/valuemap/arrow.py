@@ -21,11 +21,17 @@ _TYPES = {"f8": pa.float64(), "i8": pa.int64(), "i4": pa.int32()}
 
 def numbers_from_arrow(column: pa.Array | pa.ChunkedArray) -> NDArray[Any]:
     """Return numbers (N) as an array that must not be written to; missing ones are NaN."""
-    if isinstance(column, pa.ChunkedArray):
-        column = column.combine_chunks()
+    column = in_one(column)
     if column.null_count:
         column = pc.fill_null(column, _MISSING if column.type == _MISSING.type else float("nan"))
     return np.from_dlpack(column)
+
+
+def in_one(column: pa.Array | pa.ChunkedArray) -> pa.Array:
+    """Return a column (N) as one array, without a copy where it is in one piece: `combine_chunks` always copies."""
+    if isinstance(column, pa.Array):
+        return column
+    return column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
 
 
 def numbers_to_arrow(values: NDArray[Any], *, nullable: bool = False) -> pa.Array:

@@ -19,7 +19,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from valuemap.arrow import numbers_from_arrow, numbers_to_arrow, texts_to_arrow
+from valuemap.arrow import in_one, numbers_from_arrow, numbers_to_arrow, texts_to_arrow
 from valuemap.errors import InputError
 
 if TYPE_CHECKING:
@@ -44,9 +44,7 @@ class Categories:
     @classmethod
     def from_texts(cls, texts: Sequence[str] | pa.Array | pa.ChunkedArray) -> Self:
         """Encode texts (N) so that equal columns get equal codes whatever the order of rows."""
-        column = texts if isinstance(texts, pa.ChunkedArray | pa.Array) else texts_to_arrow(texts)
-        if isinstance(column, pa.ChunkedArray):
-            column = column.combine_chunks()
+        column = in_one(texts if isinstance(texts, pa.ChunkedArray | pa.Array) else texts_to_arrow(texts))
         if not pa.types.is_dictionary(column.type):
             column = column.dictionary_encode()
         found, codes = column.dictionary.to_pylist(), numbers_from_arrow(column.indices)
@@ -102,9 +100,9 @@ class Table:
         return len(getattr(self, fields(self)[0].name))
 
     def __getitem__(self, rows: NDArray[Any] | Sequence[int] | Sequence[bool] | slice) -> Self:
-        """Return some rows as the same type of table: by a mask, by indices, or by a slice."""
+        """Return some rows as the same type of table: by a mask, by indices, or by a slice, which copies nothing."""
         if isinstance(rows, slice):
-            return self.take(np.arange(len(self))[rows])
+            return type(self)(**{f.name: _cut(getattr(self, f.name), rows) for f in fields(self)})
         if isinstance(rows, int | np.integer):
             raise TypeError(f"a table has no single rows: take [{rows}:{rows + 1}] of it")
         chosen = np.asarray(rows)
@@ -518,10 +516,11 @@ def in_groups(tables: Iterable[T]) -> Iterator[T]:
 
 
 def _join_categories(columns: Sequence[Categories]) -> Categories:
-    names = tuple(sorted({name for column in columns for name in column.names}))
+    names_of = {id(column.names): column.names for column in columns}  # Parts of one column share theirs.
+    names = tuple(sorted({name for each in names_of.values() for name in each}))
     rank = {name: code for code, name in enumerate(names)}
-    recode = [np.array([rank[name] for name in column.names], np.int32) for column in columns]
-    codes = [new[column.codes] if len(column) else column.codes for new, column in zip(recode, columns, strict=True)]
+    recode = {key: np.array([rank[name] for name in each], np.int32) for key, each in names_of.items()}
+    codes = [recode[id(column.names)][column.codes] if len(column) else column.codes for column in columns]
     return Categories(np.concatenate(codes), names)
 
 
@@ -715,6 +714,12 @@ class TableWriter:
                 self._writer.close()
 
 
+def _cut(value: Any, rows: slice) -> Any:
+    if value is None:
+        return None
+    return Categories(value.codes[rows], value.names) if isinstance(value, Categories) else value[rows]
+
+
 def _take(value: Any, rows: NDArray[Any]) -> Any:
     if value is None:
         return None
@@ -785,7 +790,7 @@ def _read_column(column: pa.ChunkedArray, name: str, spec: Any, source: str) -> 
     if kind == "category":
         return Categories.from_texts(column)
     if kind == "text":
-        return pc.cast(column, pa.string()).combine_chunks()
+        return in_one(pc.cast(column, pa.string()))
     if kind == "floats":
         return [np.asarray(row, dtype=np.float64) for row in column.to_pylist()]
     if kind == "int":

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from valuemap.arrow import numbers_from_arrow, numbers_to_arrow
+from valuemap.arrow import in_one, numbers_from_arrow, numbers_to_arrow
 from valuemap.config import MapConfig
 from valuemap.errors import InputError
 from valuemap.remote import Place, read_all
@@ -125,8 +125,7 @@ def _parsed(place: Place, content: bytes) -> tuple[dict[str, Any], pa.Table]:
 
 
 def _listed(column: pa.Array | pa.ChunkedArray, offsets: pa.Array) -> pa.Array:
-    values = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
-    return pa.ListArray.from_arrays(offsets, values)
+    return pa.ListArray.from_arrays(offsets, in_one(column))
 
 
 def _flat(column: pa.ChunkedArray) -> Any:
