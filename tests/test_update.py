@@ -5,6 +5,8 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+import threading
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +18,12 @@ from typer.testing import CliRunner
 import valuemap
 from literal import Pinhole, Sighting
 from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
-from valuemap import pipeline, portions
+from valuemap import map_folder, pipeline, portions
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.cli.commands import app
-from valuemap.dataset import Dataset, ensure_checked, rows_of
+from valuemap.dataset import Dataset, ensure_checked, rows_of, write_dataset_in_pieces
 from valuemap.drives import find_drives
-from valuemap.errors import InputError
+from valuemap.errors import InputError, OutputError
 from valuemap.evidence import Evidence
 from valuemap.map_folder import Map
 from valuemap.refine import Refined
@@ -40,7 +42,7 @@ from valuemap.tables import (
 )
 from valuemap.tiles.compare import Comparison
 from valuemap.update import changes as changes_of_labels
-from valuemap.update import compare, update
+from valuemap.update import compare, join, update
 from valuemap.update.changes import Verdicts, _likeliest, first_rows, judge, match_labels, match_places
 from valuemap.update.join import join_datasets, join_in_portions
 from valuemap.update.looks import HIDDEN_OF, Chances, Lookout, Looks, Sights
@@ -429,6 +431,71 @@ def test_datasets_are_joined_in_portions_as_they_are_in_memory(years: Path) -> N
     between = replace(second, detections=second.detections.replace(detection_id=2 * second.detections.detection_id + 1))
     ids = [each.detection_id for each in join_in_portions(head, iter([odd.detections]), int(odd.detections.detection_id[-1]), between)[2]]  # fmt: skip # noqa: E501
     assert np.all(np.diff(np.concatenate(ids)) > 0)
+
+
+@pytest.mark.parametrize("most_runs", [0, 10_000])
+@pytest.mark.parametrize("every", [1, 3, 1000])
+def test_rows_of_both_datasets_ascend_whatever_ids_they_have(
+    most_runs: int, every: int, years: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = valuemap.read_dataset(years / "first")
+    monkeypatch.setattr(join, "_MOST_RUNS", most_runs)
+    is_second = np.arange(len(whole.images)) // every % 2 == 1
+    of_second = is_second[rows_of(whole.detections.image_id, whole.images.image_id)]
+    if not is_second.any():  # None is in between: all are before.
+        is_second[-1], of_second = True, whole.detections.image_id == whole.images.image_id[-1]
+    first, second = (
+        replace(whole, images=whole.images[chosen], detections=whole.detections[rows], truth=None)
+        for chosen, rows in ((~is_second, ~of_second), (is_second, of_second))
+    )
+    # Of one camera with the same id: that of the second is called otherwise.
+    both = join_datasets(first, second)
+    images = both.images.replace(camera_id=whole.images.camera_id, pass_id=whole.images.pass_id)
+    assert table_to_arrow(images).equals(table_to_arrow(whole.images))
+    assert table_to_arrow(both.detections).equals(table_to_arrow(whole.detections))
+
+
+def test_a_dataset_that_cannot_be_written_is_told_and_no_map_is_left(
+    years: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write(pieces: Sequence[Dataset], path: Path) -> None:
+        if path.name == map_folder.DATASET:
+            raise OutputError(f"{path}: cannot be written: No space left on device", hint="check free space")
+        write_dataset_in_pieces(pieces, path)
+
+    monkeypatch.setattr(update, "write_dataset_in_pieces", write)
+    options = [years / "map", "--add", years / "second", "--out", tmp_path / "map2"]
+    result = CliRunner().invoke(app, ["update", *map(str, options)])
+    assert result.exit_code == 1
+    assert "No space left" in result.stderr
+    assert not (tmp_path / "map2").exists()
+
+
+@pytest.mark.parametrize("tile_size", [[], ["--tile-size", "500"]])
+def test_a_dataset_is_on_disk_before_it_is_cut(
+    tile_size: list[str], years: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes_on = threading.Event()
+    seen: list[bool] = []
+    build = pipeline.build_map_of_folder
+
+    def write(pieces: Sequence[Dataset], path: Path) -> None:
+        if path.name == map_folder.DATASET and not tile_size:
+            assert goes_on.wait(60.0)  # What is in memory needs no folder.
+        write_dataset_in_pieces(pieces, path)
+
+    def built(folder: Path, *given: Any, **named: Any) -> Any:
+        if folder.name == map_folder.DATASET:
+            seen.append(folder.exists())
+            goes_on.set()
+        return build(folder, *given, **named)
+
+    monkeypatch.setattr(update, "write_dataset_in_pieces", write)
+    monkeypatch.setattr(update, "build_map_of_folder", built)
+    run("update", years / "map", "--add", years / "second", "--out", tmp_path / "map2", *tile_size)
+    assert seen == [bool(tile_size)]
+    for name in ("labels.parquet", "votes.parquet", "changes.parquet", "dataset/detections.parquet"):
+        assert (tmp_path / "map2" / name).read_bytes() == (years / "map2" / name).read_bytes(), name
 
 
 def test_cells_that_nobody_drove_through_are_not_solved_again(years: Path) -> None:

@@ -128,6 +128,10 @@ class Run:
         """Where what tasks read and write is."""
         return self.store or self.work
 
+    def cuts_on_disk(self, rows: int) -> bool:
+        """Return whether a dataset of so many images and detections is cut into tiles on disk, from its folder."""
+        return self.tile_size_m is not None or self.engine.needs_paths or rows > LARGEST_IN_MEMORY
+
 
 def build_map_of_folder(
     folder: Path, config: MapConfig, run: Run, *, held: Dataset | None = None, progress: Progress = silent
@@ -143,7 +147,8 @@ def build_map_of_folder(
     run
         Where and how it is made.
     held
-        What is in the folder, where it is in memory already: it is not read again.
+        What is in the folder, where it is in memory already: it is not read again, and the folder needs to be there
+        only where `run.cuts_on_disk`.
     progress
         Called as progress(what, done, total).
 
@@ -159,13 +164,12 @@ def build_map_of_folder(
     list[Place]
         The files of its cells; none of a dataset that is no wider than one.
     """
-    images, detections = rows_on_disk(folder)
+    images, detections = rows_on_disk(folder) if held is None else (len(held.images), len(held.detections))
     stages = _Stages()
     refined: Refined | None = None
     notes: list[str] = []
     threads = run.engine.threads_of_task(1)
-    is_large = run.tile_size_m is not None or run.engine.needs_paths or images + detections > LARGEST_IN_MEMORY
-    if config.method == "paper" or not is_large:
+    if config.method == "paper" or not run.cuts_on_disk(images + detections):
         dataset = ensure_checked(held or read_dataset(folder))
         if config.method == "paper":
             return build_map(dataset, config, threads=threads, progress=progress), []

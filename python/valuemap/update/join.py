@@ -13,6 +13,8 @@ from valuemap.errors import InputError
 from valuemap.tables import Categories, Detections, Floats, Ints, Table, join_tables
 
 T = TypeVar("T", bound=Table)
+_MOST_RUNS = 1000
+"""Tables are joined run by run, which takes half the time and memory, unless there are more."""
 
 
 def join_datasets(first: Dataset, second: Dataset) -> Dataset:
@@ -88,7 +90,18 @@ def _join_images(first: Dataset, second: Dataset) -> tuple[Dataset, Detections]:
 
 def _joined(first: T, second: T) -> T:
     """Return two tables as one, ascending; values that one of them does not have are missing."""
-    return join_tables(_alike(first, second)).by_key()
+    first, second = _alike(first, second)
+    ids, ids_of_second = (getattr(table, str(first.KEY)) for table in (first, second))
+    before = np.searchsorted(ids, ids_of_second)
+    # Runs of the second between two rows of the first: mostly the ids of a pass follow each other.
+    starts = np.flatnonzero(np.diff(before, prepend=-1))
+    if len(starts) > _MOST_RUNS:
+        return join_tables([first, second]).by_key()
+    pieces, row, ends = [], 0, [*starts[1:].tolist(), len(second)]
+    for start, end, until in zip(starts.tolist(), ends, before[starts].tolist(), strict=True):
+        pieces += [first[row:until], second[start:end]]
+        row = until
+    return join_tables([*pieces, first[row:]])
 
 
 def _alike(first: T, second: T) -> tuple[T, T]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -132,8 +133,12 @@ def _updated_in_memory(place: Path, second: Dataset, before: Map, run: Run, prog
     first = read_dataset(place)
     joined, images_before = ensure_checked(join_datasets(first, second)), first.images.image_id
     del first, second  # There is as much in them as in the two as one.
-    write_dataset_in_pieces([joined], run.work / DATASET)
-    rebuilt, cells = build_map_of_folder(run.work / DATASET, _settings(before), run, held=joined, progress=progress)
+    with ThreadPoolExecutor(1) as beside:
+        written = beside.submit(write_dataset_in_pieces, [joined], run.work / DATASET)
+        if run.cuts_on_disk(len(joined.images) + len(joined.detections)):
+            written.result()
+        rebuilt, cells = build_map_of_folder(run.work / DATASET, _settings(before), run, held=joined, progress=progress)
+        written.result()
     # The poses that the labels were found with, where those of whole drives were corrected.
     posed = rebuilt.corrected or joined
     is_new = ~np.isin(posed.images.image_id, images_before)
@@ -425,7 +430,8 @@ def _lookout(
     away_m = center_m[rows_of(votes.image_id, images.image_id)] - place_m[votes.label_id - 1]
     farthest_m = 1.001 * float(np.linalg.norm(away_m, axis=1).max(initial=0.0))
     low_m, high_m = place_m[is_asked].min(axis=0, initial=np.inf), place_m[is_asked].max(axis=0, initial=-np.inf)
-    near = np.flatnonzero(np.all((center_m >= low_m - farthest_m) & (center_m <= high_m + farthest_m), axis=1))
+    axes = zip(center_m.T, low_m - farthest_m, high_m + farthest_m, strict=True)
+    near = np.flatnonzero(np.all([(low <= along_m) & (along_m <= high) for along_m, low, high in axes], axis=0))
     if len(near):
         near = near[Nearby(place_m[is_asked]).have_any(center_m[near], farthest_m)]
     # Whole passes, since an order is told by all of it.
