@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy
@@ -78,6 +79,23 @@ class Groups:
         """Return the sums (M, ...) of values (N, ...)."""
         flat = values.reshape(len(values), -1)
         return np.asarray(self.members @ flat).reshape(-1, *values.shape[1:])
+
+    @cached_property
+    def _by_size(self) -> list[tuple[Ints, Ints]]:
+        """The groups of each size, and their members (groups, size)."""
+        starts, sizes = self.members.indptr[:-1].astype(np.int64), np.diff(self.members.indptr)
+        groups = [np.flatnonzero(sizes == size) for size in np.unique(sizes)]
+        order = self.members.indices.astype(np.int64)
+        return [(of, order[starts[of][:, None] + np.arange(sizes[of[0]])]) for of in groups]
+
+    def products(self, rows: Floats) -> Floats:
+        """Return the sums (M, width, width) of A^T A of matrices A (N, height, width), without making those of each."""
+        _, height, width = rows.shape
+        sums = np.empty((len(self.row), width, width))
+        for groups, members in self._by_size:
+            stacked = rows[members].reshape(len(groups), members.shape[1] * height, width)
+            sums[groups] = stacked.transpose(0, 2, 1) @ stacked
+        return sums
 
 
 def _selection() -> tuple[Floats, Floats]:
@@ -270,7 +288,7 @@ class Adjustment:
         basis[:, :, _RESIDUAL] = at.residual_px
         basis[weight == 0.0] = 0.0  # What is behind its camera may be infinite.
         basis *= np.sqrt(weight)[:, None, None]
-        return self.finest.sum(basis.transpose(0, 2, 1) @ basis)
+        return self.finest.products(basis)
 
     def _eliminate(
         self, drives: _Drives, sums: tuple[Floats, Floats, Floats], drift: Floats, system: _System
@@ -328,7 +346,7 @@ class Adjustment:
         basis = np.concatenate([-at.by_point, at.by_turn, at.residual_px[:, :, None]], axis=2)
         basis[share == 0.0] = 0.0
         basis *= np.sqrt(share)[:, None, None]
-        products = self.by_image.sum(basis.transpose(0, 2, 1) @ basis)
+        products = self.by_image.products(basis)
         information = products[:, :6, :6] + np.diag(np.repeat([self.scales.own_m**-2, self.scales.own_rad**-2], 3))
         own = np.zeros_like(state.own)
         own[self.image] = -np.linalg.solve(information, products[:, :6, 6:])[:, :, 0]
@@ -433,7 +451,7 @@ def triangulate(seen: Observations, state: State, *, rounds: int = 8, tolerance:
         basis = np.concatenate([at.by_point, at.residual_px[:, :, None]], axis=2)
         basis[weight == 0.0] = 0.0
         basis *= np.sqrt(weight)[:, None, None]
-        products = groups.sum(basis.transpose(0, 2, 1) @ basis)
+        products = groups.products(basis)
         step = -np.linalg.solve(products[:, :3, :3] + 1e-6 * np.eye(3), products[:, :3, 3:])[:, :, 0]
         points = state.point_in_world_m.copy()
         points[thing] += np.clip(step, -5.0, 5.0)

@@ -12,6 +12,7 @@ v and turns by w.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -145,6 +146,10 @@ class Poses:
     velocity_mps: Floats
     rate_radps: Floats
 
+    def vectors(self) -> tuple[Floats, Floats, Floats]:
+        """Return centres, velocities and rates."""
+        return self.center_in_world_m, self.velocity_mps, self.rate_radps
+
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
@@ -164,20 +169,19 @@ class Linearised:
 
 def rotations(vector_rad: Floats) -> Floats:
     """Return rotation matrices (N, 3, 3) of rotation vectors (N, 3), Rodrigues' formula."""
-    angle = np.linalg.norm(vector_rad, axis=1)
-    safe = np.where(angle > 1e-12, angle, 1.0)
-    cross = _skew(vector_rad / safe[:, None])
-    sin, cos = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    return np.asarray(np.eye(3) + sin * cross + (1.0 - cos) * (cross @ cross))
-
-
-def _skew(vector: Floats) -> Floats:
-    """Return the matrices (N, 3, 3) whose product with a vector is the cross product."""
-    matrix = np.zeros((len(vector), 3, 3))
+    square = np.einsum("ni,ni->n", vector_rad, vector_rad)
+    angle = np.sqrt(square)
+    is_none = angle <= 1e-12
+    sine = np.where(is_none, 1.0, np.sin(angle) / np.where(is_none, 1.0, angle))
+    versine = np.where(is_none, 0.5, 2.0 * (np.sin(0.5 * angle) / np.where(is_none, 1.0, angle)) ** 2)
+    matrix = (versine[:, None] * vector_rad)[:, :, None] * vector_rad[:, None, :]
+    about = sine[:, None] * vector_rad
     for axis in range(3):
         i, j = (axis + 1) % 3, (axis + 2) % 3
-        matrix[:, i, j], matrix[:, j, i] = -vector[:, axis], vector[:, axis]
-    return matrix
+        matrix[:, axis, axis] += np.cos(angle)
+        matrix[:, i, j] -= about[:, axis]
+        matrix[:, j, i] += about[:, axis]
+    return np.asarray(matrix)
 
 
 def corrected(views: Views, state: State) -> Poses:
@@ -230,20 +234,40 @@ def cost(seen: Observations, state: State) -> Floats:
 def linearised(seen: Observations, state: State) -> Linearised:
     """Return residuals without the images' own errors, to first order around them, and derivatives."""
     poses = corrected(seen.views, state)
-    p, abc = _in_pinhole(seen, state, poses)
-    stretch = state.constants[FOCAL][seen.camera]
-    depth = np.where(np.abs(abc[:, 2]) > 1e-6, abc[:, 2], 1e-6)
-    ratio = abc[:, :2] / depth[:, None]
-    m = seen.residual_from_cam
-    by_p = (1.0 + stretch)[:, :, None] * (m[:, :2] - ratio[:, :, None] * m[:, 2:]) / depth[:, None, None]
-    by_point = by_p @ poses.cam_from_world[seen.image]
-    by_turn = np.empty_like(by_p)
-    for axis in range(3):  # p x by_p
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        by_turn[:, :, axis] = p[:, i, None] * by_p[:, :, j] - p[:, j, None] * by_p[:, :, i]
-    by_delay = np.einsum("nki,ni->nk", by_turn, poses.rate_radps[seen.image])
-    by_delay -= np.einsum("nki,ni->nk", by_point, poses.velocity_mps[seen.image])
-    own = state.own[seen.image]
-    residual = (1.0 + stretch) * ratio + stretch * seen.from_middle_px
-    residual += np.einsum("nki,ni->nk", by_point, own[:, :3]) - np.einsum("nki,ni->nk", by_turn, own[:, 3:])
-    return Linearised(residual, abc[:, 2], by_point, by_turn, by_delay, ratio + seen.from_middle_px)
+    # Number by number: sums over the last, shortest axis take several times as long.
+    r = np.take(np.ascontiguousarray(poses.cam_from_world.reshape(-1, 9).T), seen.image, axis=1).reshape(3, 3, -1)
+    m = np.ascontiguousarray(seen.residual_from_cam.reshape(-1, 9).T).reshape(3, 3, -1)
+    center, velocity, rate = (_of(values, seen.image) for values in poses.vectors())
+    apart = _of(state.point_in_world_m, seen.thing) - center
+    p = [_dot(row, apart) for row in r]
+    a, b, c = (_dot(row, p) for row in m)
+    stretch = state.constants[FOCAL][seen.camera, 0]
+    depth = np.where(np.abs(c) > 1e-6, c, 1e-6)
+    own = _of(state.own, seen.image)
+    count = len(seen)
+    by_point, by_turn = np.empty((2, 3, count)), np.empty((2, 3, count))
+    residual, by_delay, by_focal = np.empty((2, count)), np.empty((2, count)), np.empty((2, count))
+    scale = (1.0 + stretch) / depth
+    for k, numerator in enumerate((a, b)):
+        ratio = numerator / depth
+        by_p = [(m[k, j] - ratio * m[2, j]) * scale for j in range(3)]
+        for axis in range(3):
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            by_point[k, axis] = _dot(by_p, r[:, axis])
+            by_turn[k, axis] = p[i] * by_p[j] - p[j] * by_p[i]  # p x by_p
+        by_delay[k] = _dot(by_turn[k], rate) - _dot(by_point[k], velocity)
+        by_focal[k] = ratio + seen.from_middle_px[:, k]
+        residual[k] = (1.0 + stretch) * ratio + stretch * seen.from_middle_px[:, k]
+        residual[k] += _dot(by_point[k], own[:3]) - _dot(by_turn[k], own[3:])
+    of_points, of_turns = (np.moveaxis(values, 2, 0) for values in (by_point, by_turn))
+    return Linearised(residual.T, c, of_points, of_turns, by_delay.T, by_focal.T)
+
+
+def _of(vectors: Floats, rows: Ints) -> Floats:
+    """Return the numbers (width, N) of some rows of vectors (M, width)."""
+    return np.take(np.ascontiguousarray(vectors.T), rows, axis=1)
+
+
+def _dot(one: Sequence[Floats] | Floats, other: Sequence[Floats] | Floats) -> Floats:
+    """Return the products (N) of vectors, number by number (3, N)."""
+    return np.asarray(one[0] * other[0] + one[1] * other[1] + one[2] * other[2])

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import chain
+
 import numpy as np
 import scipy
 
 from valuemap.refine.adjust import Groups
 from valuemap.refine.footage import Footage, Sigmas
-from valuemap.refine.residuals import Observations, State, corrected, linearised, residuals, weights
+from valuemap.refine.residuals import FOCAL, Observations, State, corrected, linearised, weights
 from valuemap.tables import Floats, Ints
 
 GATE_SIGMAS = 5.0
@@ -18,7 +20,6 @@ _TOGETHER = 0.1
 _SAME_SIDE = 0.7
 """Cosine between mean directions of view: within 45 degrees is the same side."""
 _CLOSE2 = 16.0
-_BLOCK = 2_000_000
 
 
 def associate(
@@ -33,48 +34,72 @@ def associate(
     """Return pairs of detection (row) and object: one to one in each image, the closest first, within the gate."""
     if not len(state.point_in_world_m):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    images = len(footage.row)
-    tree = scipy.spatial.cKDTree(footage.center_in_world_m)
-    near: list[list[int]] = list(tree.query_ball_point(state.point_in_world_m, range_m, return_sorted=True))  # type: ignore[arg-type]
-    by_image: list[list[int]] = [[] for _ in range(images)]
-    for k, found in enumerate(near):
-        for place in found:
-            by_image[place].append(k)
-    image_of = footage.rays.image_row
-    count = np.array([len(found) for found in by_image])
-    detection = np.repeat(np.arange(len(image_of)), count[image_of])
+    detection, thing = _near(footage, state.point_in_world_m, class_code, range_m)
     if not len(detection):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    thing = np.concatenate([np.array(by_image[i], dtype=np.int64) for i in image_of.tolist()])
-    fits = class_code[thing] == footage.rays.class_code[detection]
-    detection, thing = detection[fits], thing[fits]
-    square = np.empty(len(detection))
-    for start in range(0, len(detection), _BLOCK):
-        part = slice(start, start + _BLOCK)
-        seen = footage.observe_as_given(detection[part], thing[part], segment_of_image, sigma_px)
-        residual, depth = residuals(seen, state)
-        with np.errstate(invalid="ignore"):
-            value = np.sum(residual**2, axis=1) / seen.sigma_px**2
-            value = np.where((depth > 0.5) & np.isfinite(value), value, np.inf)
-        box = footage.dataset.detections.size_px[detection[part], 1]
-        metres_per_px = depth / seen.pixels_per_unit()
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.abs(np.log(box * metres_per_px / size_m[thing[part]]))
-        square[part] = np.where(ratio > np.log(2.0), np.inf, value)
+    everything = np.arange(len(footage.rays))
+    seen = footage.observe_as_given(everything, np.zeros_like(everything), segment_of_image, sigma_px)
+    poses = corrected(seen.views, state)
+    from_world = seen.residual_from_cam @ poses.cam_from_world[seen.image]
+    offset = -np.einsum("nij,nj->in", from_world, poses.center_in_world_m[seen.image])
+    rows = np.ascontiguousarray(from_world.reshape(-1, 9).T).reshape(3, 3, -1)
+    x, y, z = np.ascontiguousarray(state.point_in_world_m.T)
+
+    def project(axis: int) -> Floats:
+        """Return a row of the local pinholes of the detections that are left times their objects."""
+        a, b, c = rows[axis]
+        return np.asarray(
+            a[detection] * x[thing] + b[detection] * y[thing] + c[detection] * z[thing] + offset[axis][detection]
+        )
+
+    depth = project(2)
+    box = footage.dataset.detections.size_px[:, 1] / seen.pixels_per_unit()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        fits = ~(np.abs(np.log(box[detection] * depth / size_m[thing])) > np.log(2.0)) & (depth > 0.5)
+    detection, thing, depth = detection[fits], thing[fits], depth[fits]
+    stretch = state.constants[FOCAL][seen.camera, 0]
+    square = np.zeros(len(detection))
+    for axis in range(2):
+        residual = (1.0 + stretch[detection]) * project(axis) / depth
+        square += (residual + (stretch * seen.from_middle_px[:, axis])[detection]) ** 2
+    square /= seen.sigma_px[detection] ** 2
     fits = square < GATE_SIGMAS**2
     detection, thing, square = detection[fits], thing[fits], square[fits]
-    taken = set()
-    kept = []
-    image = image_of[detection]
-    has = np.full(len(image_of), -1)
-    for k in np.argsort(square, kind="stable").tolist():
-        key = (int(image[k]), int(thing[k]))
-        if has[detection[k]] < 0 and key not in taken:
-            has[detection[k]] = thing[k]
-            taken.add(key)
-            kept.append(k)
-    rows = np.sort(np.array(kept, dtype=np.int64))
-    return detection[rows], thing[rows]
+    kept = _one_to_one(footage.rays.image_row[detection], detection, thing, square)
+    return detection[kept], thing[kept]
+
+
+def _near(footage: Footage, point: Floats, class_code: Ints, range_m: float) -> tuple[Ints, Ints]:
+    """Return pairs of detection (row, ascending) and object of its class (ascending) within a range of its image."""
+    tree = scipy.spatial.cKDTree(footage.center_in_world_m)
+    near: list[list[int]] = list(tree.query_ball_point(point, range_m))  # type: ignore[arg-type]
+    thing = np.repeat(np.arange(len(near)), [len(found) for found in near])
+    image = np.array(list(chain.from_iterable(near)), dtype=np.int64)
+    order = np.lexsort((thing, image))
+    thing = thing[order]
+    begins = np.searchsorted(image[order], np.arange(len(footage.row) + 1))
+    image_of = footage.rays.image_row
+    count = np.diff(begins)[image_of]
+    detection = np.repeat(np.arange(len(image_of)), count)
+    place = np.arange(len(detection)) - np.repeat(np.cumsum(count) - count, count)
+    thing = thing[begins[image_of[detection]] + place]
+    fits = class_code[thing] == footage.rays.class_code[detection]
+    return detection[fits], thing[fits]
+
+
+def _one_to_one(image: Ints, detection: Ints, thing: Ints, square: Floats) -> Ints:
+    """Return the rows (ascending) of pairs that are taken, the closest first: one of each detection and each object."""
+    things = int(thing.max(initial=0)) + 1
+    _, of_detection, detections = np.unique(detection, return_inverse=True, return_counts=True)
+    _, of_object, objects = np.unique(image * things + thing, return_inverse=True, return_counts=True)
+    taken = (detections[of_detection] == 1) & (objects[of_object] == 1)
+    # Only pairs that have a rival need an order.
+    rivals = np.flatnonzero(~taken)
+    has, shown = np.zeros(len(detections), np.bool_), np.zeros(len(objects), np.bool_)
+    for k in rivals[np.argsort(square[rivals], kind="stable")].tolist():
+        if not has[of_detection[k]] and not shown[of_object[k]]:
+            has[of_detection[k]] = shown[of_object[k]] = taken[k] = True
+    return np.flatnonzero(taken)
 
 
 def merge_objects(seen: Observations, state: State, image: Ints, class_code: Ints, drift_m: float) -> Ints:
@@ -138,5 +163,5 @@ def _covariances(seen: Observations, state: State, count: int) -> Floats:
     by_point = np.where(root[:, None, None] > 0.0, at.by_point * root[:, None, None], 0.0)
     information = np.zeros((count, 3, 3))
     groups = Groups(seen.thing)
-    information[seen.thing[groups.row]] = groups.sum(by_point.transpose(0, 2, 1) @ by_point)
+    information[seen.thing[groups.row]] = groups.products(by_point)
     return np.asarray(np.linalg.inv(information + 1e-4 * np.eye(3)))
