@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,15 +21,17 @@ from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import Dataset, rows_of, write_dataset
 from valuemap.drives import Drives, find_drives, in_driving_order
 from valuemap.engine.threads import ThreadEngine
-from valuemap.refine import FITS_NO_BETTER, Refined, adjust, expose_rows, poses, refine_again, refine_poses, tracks
+from valuemap.refine import Refined, adjust, expose_rows, poses, refine_again, refine_poses, tracks
+from valuemap.refine import estimate as refine_estimate
+from valuemap.refine import select as refine_select
 from valuemap.refine.adjust import Adjustment, Scales
-from valuemap.refine.estimate import cut_into_segments, delay_together, lay, mounts_alone, prices
+from valuemap.refine.estimate import Estimate, cut_into_segments, delay_together, lay, mounts_alone, prices
 from valuemap.refine.footage import Footage, Sigmas, _within, find_motion, gather, in_working_frame
 from valuemap.refine.jumps import Links, Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
 from valuemap.refine.register import register
 from valuemap.refine.residuals import MOUNT, OFFSET, Observations, State, residuals, rotations, weights
-from valuemap.refine.select import _Equations
+from valuemap.refine.select import Selected, _Equations, _Trial
 from valuemap.refine.tracks import merge_objects
 from valuemap.simulate import simulate
 from valuemap.tables import Bools, Floats, Images, Ints
@@ -91,31 +95,79 @@ def test_shifts_of_passes_of_three_metres_are_found_to_three_decimetres() -> Non
     assert np.abs(mean.mean(axis=0)).max() < 0.3
 
 
-@pytest.mark.parametrize("fits_better", [False, True])
-def test_what_a_sample_proves_must_explain_it_better(fits_better: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("is_proven", [False, True])
+def test_all_is_estimated_only_where_a_sample_proves_a_fault(is_proven: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     faulty = city(pass_shift_m=3.0)
     monkeypatch.setattr(poses, "_SAMPLE", len(faulty.detections) // 3)
-    asked: list[tuple[int, int]] = []
+    looked_at: list[int] = []
 
-    def judge(before: Dataset, after: Dataset, parameters: int) -> bool:
-        asked.append((len(before.detections), parameters))
-        off = [errors(one, drop_images(city(), one))[0] for one in (before, after)]
-        assert off[1] < 0.2 * off[0]
-        return fits_better
+    def counted(footage: Footage, found: Estimate) -> Selected | None:
+        looked_at.append(len(footage.whole.detections))
+        return refine_select.select(footage, found) if is_proven else None
 
-    refined = refine_poses(faulty, valuemap.MapConfig(), fits_better=judge)
-    assert len(asked) == 1
-    assert asked[0][0] < len(faulty.detections)
-    assert asked[0][1] > 2
-    assert refined.is_corrected == fits_better
-    assert refined.record.get("because") == (None if fits_better else FITS_NO_BETTER)
+    monkeypatch.setattr(poses, "select", counted)
+    assert refine_poses(faulty, valuemap.MapConfig()).is_corrected == is_proven
+    assert looked_at[0] < len(faulty.detections)
+    assert looked_at[1:] == ([len(faulty.detections)] if is_proven else [])
 
 
-def drop_images(dataset: Dataset, like: Dataset) -> Dataset:
-    """Return a dataset with those images alone that another has."""
-    names = set(like.images.name.to_pylist())
-    rows = np.array([name in names for name in dataset.images.name.to_pylist()])
-    return dataclasses.replace(dataset, images=dataset.images.take(np.flatnonzero(rows)))
+@pytest.mark.parametrize("shift_m", [0.0, 3.0])
+def test_drives_that_are_far_off_are_laid_anew_after_a_first_estimate(
+    shift_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+
+    def noted(name: str, make: Callable[..., Any]) -> Callable[..., Any]:
+        def told(*given: Any, **more: Any) -> Any:
+            done.append(name)
+            return make(*given, **more)
+
+        return told
+
+    monkeypatch.setattr(poses, "begin", noted("begin", refine_estimate.begin))
+    monkeypatch.setattr(poses, "go_on", noted("go_on", refine_estimate.go_on))
+    refine_poses(city(pass_shift_m=shift_m), valuemap.MapConfig())
+    assert done == (["begin", "begin", "go_on"] if shift_m else ["begin", "go_on"])
+
+
+def test_the_same_equations_are_not_fitted_again_where_other_kinds_are_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted: list[tuple[object, ...]] = []
+    prune = _Trial.prune
+
+    def noted(problem: Adjustment, state: State, **more: Any) -> State:
+        fitted.append((*(flags.tobytes() for flags in problem.active), *map(repr, problem.scales.constant)))
+        return adjust.adjust(problem, state, **more)
+
+    def pruned(self: _Trial, *given: Any) -> Any:
+        fitted.clear()
+        after = prune(self, *given)
+        assert len(fitted) == len(set(fitted))
+        return after
+
+    monkeypatch.setattr(refine_select, "adjust", noted)
+    monkeypatch.setattr(_Trial, "prune", pruned)
+    assert refine_poses(city(pass_shift_m=3.0), valuemap.MapConfig()).is_corrected
+
+
+def test_the_map_that_tells_votes_is_of_the_images_that_poses_are_estimated_with() -> None:
+    faulty, config = city(pass_shift_m=3.0), valuemap.MapConfig()
+    refined = refine_poses(faulty, config)
+    assert refined.found is not None
+    shown = poses.keyframes_of(faulty, refined, config)
+    assert len(shown.images) == len(refined.found.footage.row) < len(faulty.images)
+    assert len(shown.detections) == len(refined.found.footage.detection_row)
+    row = rows_of(shown.images.image_id, refined.dataset.images.image_id)
+    assert np.array_equal(shown.images.cam_from_world_m, refined.dataset.images.cam_from_world_m[row])
+    noise = poses.noise_left(refined, config)
+    found = refined.found.result
+    assert noise.detection_sigma_px == found.noise.px
+    assert noise.position_sigma_m == pytest.approx(np.hypot(found.noise.image_m, found.scales.drift_m))
+    # A world of another scale has errors of that scale, and what is set stays.
+    larger = dataclasses.replace(config, vote=dataclasses.replace(config.vote, max_range_m=120.0))
+    twice = poses.noise_left(refined, larger).position_sigma_m
+    assert twice == pytest.approx(2.0 * np.hypot(found.noise.image_m, found.scales.drift_m))
+    stated = dataclasses.replace(config, noise=dataclasses.replace(config.noise, position_sigma_m=0.5))
+    assert poses.noise_left(refined, stated).position_sigma_m == 0.5
 
 
 def test_a_map_tells_better_than_what_single_drives_see_how_drives_lie_to_each_other() -> None:
@@ -124,8 +176,7 @@ def test_a_map_tells_better_than_what_single_drives_see_how_drives_lie_to_each_o
     at_first = refine_poses(faulty, valuemap.MapConfig())
     at_last = valuemap.build_map(faulty).corrected
     assert at_last is not None
-    assert errors(at_first.dataset, clean)[0] > 0.4
-    assert errors(at_last, clean)[0] < 0.25
+    assert errors(at_last, clean)[0] < min(0.25, 0.75 * errors(at_first.dataset, clean)[0])
 
 
 def test_poses_are_estimated_with_a_map_only_where_some_were_corrected() -> None:
@@ -173,7 +224,7 @@ def test_short_drives_have_the_offset_of_the_one_they_go_on_from() -> None:
 def test_cells_on_disk_get_the_poses_that_were_corrected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     faulty, result = map_of_shifted_city()
     write_dataset(faulty, tmp_path / "data")
-    monkeypatch.setattr(pipeline, "refine_poses", lambda *_, **__: shifted_city()[1])
+    monkeypatch.setattr(pipeline, "_proven", lambda *_: shifted_city()[1])
     (tmp_path / "work").mkdir()
     run = pipeline.Run(tmp_path / "work", ThreadEngine(1), tile_size_m=150.0)
     with open_work(tmp_path / "work", resume=False) as work:
@@ -233,7 +284,7 @@ def test_errors_are_estimated_with_the_rates_of_the_delay_that_poses_start_with(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     late, seen = city(pose_delay_s=0.1), []
-    monkeypatch.setattr(poses, "estimate", lambda footage, *_, late_s, **__: seen.append((footage, late_s)))
+    monkeypatch.setattr(poses, "begin", lambda footage, *_, late_s, **__: seen.append((footage, late_s)))
     ordered = in_driving_order(late, viewpoint_step_m=1.0)
     assert poses._find(ordered.dataset, ordered.drives, valuemap.MapConfig(), 1) is None
     footage, late_s = seen[0]
@@ -428,7 +479,7 @@ def landmarks(points: Floats, *, drive: Ints, driven_m: Floats) -> Landmarks:
     )
 
 
-def test_a_signal_is_cut_where_any_cuts_are_cheapest() -> None:
+def test_a_signal_is_cut_where_any_cuts_are_cheapest(monkeypatch: pytest.MonkeyPatch) -> None:
     random = np.random.default_rng(3)
     for _ in range(5):
         value = np.repeat([[0.0, 0.0], [1.5, -1.0], [0.0, 0.0]], [3, 4, 3], axis=0) + random.normal(0.0, 0.4, (10, 2))
@@ -442,6 +493,10 @@ def test_a_signal_is_cut_where_any_cuts_are_cheapest() -> None:
         every = [c for k in range(4) for c in itertools.combinations(range(1, 10), k)]
         best = min(every, key=cost)
         assert cut_into_segments(value, precision, np.full(10, price)) == [0, *best]
+        # However many of its pieces are looked at together.
+        with monkeypatch.context() as patched:
+            patched.setattr(refine_estimate, "_PIECES", 30)
+            assert cut_into_segments(value, precision, np.full(10, price)) == [0, *best]
 
 
 @pytest.mark.parametrize(
@@ -486,6 +541,30 @@ def test_what_drives_that_drift_see_beside_itself_is_one_object_but_for_two_that
     assert merge_objects(beside, state, seen.image, classes, 0.2).tolist() == [0, 0]
     assert merge_objects(beside, state, seen.image, classes, 0.01).tolist() == [0, 1]
     assert merge_objects(beside, state, np.zeros(len(seen), np.int64), classes, 0.2).tolist() == [0, 1]
+
+
+def test_the_closest_pairs_are_taken_first_one_to_one_in_each_image() -> None:
+    random = np.random.default_rng(5)
+    for _ in range(20):
+        pairs = np.unique(random.integers(0, 6, (14, 2)), axis=0)
+        image, square = pairs[:, 0] // 2, random.uniform(size=len(pairs))
+        literal: list[int] = []
+        for k in np.argsort(square).tolist():
+            rivals = [
+                o
+                for o in literal
+                if pairs[o, 0] == pairs[k, 0] or (image[o] == image[k] and pairs[o, 1] == pairs[k, 1])
+            ]
+            literal += [] if rivals else [k]
+        assert tracks._one_to_one(image, pairs[:, 0], pairs[:, 1], square).tolist() == sorted(literal)
+
+
+def test_products_of_groups_are_the_sums_of_those_of_their_members() -> None:
+    random = np.random.default_rng(6)
+    code, rows = random.integers(0, 9, 40), random.normal(size=(40, 2, 5))
+    groups = adjust.Groups(code)
+    expected = [np.sum([row.T @ row for row in rows[code == kind]], axis=0) for kind in np.unique(code)]
+    np.testing.assert_allclose(groups.products(rows), expected, atol=1e-12)
 
 
 def test_a_waiting_car_gives_the_middle_one_of_its_images() -> None:
@@ -695,7 +774,7 @@ def test_equations_tell_what_others_are_without_a_group_as_a_fit_without_it_does
     assert covariance is not None
     for ours, theirs in zip(told.constants, fits["fewer"][1].constants, strict=True):
         # What observations hardly tell is known to fewer digits.
-        np.testing.assert_allclose(ours, theirs, atol=1e-5 * np.abs(theirs).max() + 1e-9)
+        np.testing.assert_allclose(ours, theirs, atol=1e-4 * np.abs(theirs).max() + 1e-9)
     sigma = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(told.covariance / np.outer(sigma, sigma), covariance / np.outer(sigma, sigma), atol=1e-4)
 

@@ -25,14 +25,14 @@ from valuemap.notes import Findings, cameras_not_upright, find_notes, heights_no
 from valuemap.partition import partition_images
 from valuemap.portions import rows_on_disk
 from valuemap.progress import Progress, silent
-from valuemap.refine import FITS_NO_BETTER, Refined, expose_rows, refine_again, refine_poses
+from valuemap.refine import FITS_NO_BETTER, Refined, expose_rows, keyframes_of, noise_left, refine_again, refine_poses
 from valuemap.rejected import rejected_of_map
 from valuemap.remote import Place, UrlPath
 from valuemap.robust import Calibration, calibration_to_json
 from valuemap.system import peak_memory_mb
 from valuemap.tables import Labels, Votes
 from valuemap.tiles.calibration import calibrate
-from valuemap.tiles.compare import Comparison, compare_poses
+from valuemap.tiles.compare import compare_poses
 from valuemap.tiles.mapping import loaded, solve_cells
 from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.seams import join_cells
@@ -215,24 +215,37 @@ def _proven(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, 
     if len(dataset.images) + len(dataset.detections) > MOST_CORRECTED and config.poses.correct_poses:
         return Refined(dataset, {"found": "nothing", "because": _TOO_LARGE})
 
-    def compared(before: Dataset, after: Dataset, parameters: int) -> Comparison:
-        return compare_poses(before, after, parameters, config, threads=threads, progress=progress)
-
     with stages.measured("poses"):
-        refined = refine_poses(
-            dataset, config, threads=threads, progress=progress, fits_better=lambda *part: compared(*part).is_better
-        )
+        refined = refine_poses(dataset, config, threads=threads, progress=progress)
         if not refined.is_corrected:
             return refined
-        found = compared(dataset, refined.dataset, refined.record.get("parameters", 0))
+        parameters = refined.record.get("parameters", 0)
+        found = compare_poses(dataset, refined.dataset, parameters, config, threads=threads, progress=progress)
         record = {**refined.record, **found.figures()}
         if not found.is_better:
             return Refined(dataset, {**record, "found": "nothing", "because": FITS_NO_BETTER})
+        if refined.found is None:
+            return replace(refined, record=record)
         # A map tells better than landmarks of single drives which detection shows which object.
-        source = InMemory(refined.dataset, config)
-        labels, votes, *_ = _robust(source, config, _Stages(), ThreadEngine(threads), progress)
+        labels, votes = _map_of_keyframes(dataset, refined, config, ThreadEngine(threads), progress)
         again = refine_again(dataset, refined, labels, votes, config, progress=progress)
         return replace(again, record={**record, **again.record}, found=None)
+
+
+def _map_of_keyframes(
+    dataset: Dataset, refined: Refined, config: MapConfig, engine: Engine, progress: Progress
+) -> tuple[Labels, Votes]:
+    """Return a map that says which detection shows which object, and no more.
+
+    It is of the images that poses are estimated with. Its noise is what was left there, and not sought.
+    """
+    config = replace(config, noise=noise_left(refined, config))
+    source = InMemory(keyframes_of(dataset, refined, config), config)
+    calibration = calibrate(source, config, None, None, engine, progress)
+    labels, votes, _ = join_cells(
+        loaded(solve_cells(source, calibration, config, engine, progress)), source.grid, config
+    )
+    return labels, votes
 
 
 def _with_rejected(result: Map, read: Callable[[], Dataset], stages: _Stages) -> Map:

@@ -1,6 +1,6 @@
 """Errors of the poses of whole drives, found from the objects that drives share, once for all that comes after."""
 
-from valuemap.refine.poses import FITS_NO_BETTER, Refined, refine_again, refine_poses
+from valuemap.refine.poses import FITS_NO_BETTER, Refined, keyframes_of, noise_left, refine_again, refine_poses
 from valuemap.refine.shutter import expose_rows
 
-__all__ = ["FITS_NO_BETTER", "Refined", "expose_rows", "refine_again", "refine_poses"]
+__all__ = ["FITS_NO_BETTER", "Refined", "expose_rows", "keyframes_of", "noise_left", "refine_again", "refine_poses"]

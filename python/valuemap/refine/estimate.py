@@ -13,7 +13,7 @@ from valuemap.refine.adjust import Adjustment, Groups, Scales, adjust, triangula
 from valuemap.refine.footage import DRIFT_LENGTH_M, Footage, Sigmas
 from valuemap.refine.jumps import RARE, Hints, Jumps, Links, Segments
 from valuemap.refine.landmarks import Landmarks
-from valuemap.refine.register import Registration, register, togetherness
+from valuemap.refine.register import Around, Registration, register
 from valuemap.refine.residuals import CAMERA_DELAY, MOUNT, OFFSET, WIDTH, Observations, State, linearised, weights
 from valuemap.refine.tracks import associate, merge_objects
 from valuemap.tables import Bools, Floats, Ints
@@ -39,9 +39,13 @@ _TOLD_RAD = math.radians(0.5)
 """Drives whose turns are less sure than this say nothing of how much drives are turned."""
 _ALONE = (4.0, 3.0, 2.0, 2.0)
 _DELAYS_S = 0.02 * np.arange(-15, 16)
+_PIECES = 200_000
+"""So many pieces of a signal are looked at together: 2 MB for each of their numbers."""
 _AGAIN = 2
 """Times that drives are cut anew where it is known which detection shows which object, as offsets move cuts."""
-_COARSE, _FINE = (6.0, 6.0, 4.0, 4.0, 3.0, 2.0, 2.0), (2.0, 1.5, 1.0, 1.0, 1.0)
+_MORE_ROUNDS = 2
+"""Times that drives are cut and detections associated anew, after the first time."""
+_COARSE, _FINE = (6.0, 4.0, 3.0, 2.0), (2.0, 1.5, 1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +108,7 @@ class Trajectories:
     jumps: Jumps
 
 
-def estimate(
+def begin(
     footage: Footage,
     marks: Marks,
     config: MapConfig,
@@ -114,7 +118,7 @@ def estimate(
     turned_rad: Floats | None = None,
     late_s: float = 0.0,
 ) -> Estimate | None:
-    """Estimate everything that drives may be wrong by, None where there is too little that drives share.
+    """Return a first estimate of all that drives may be wrong by, None where there is too little that drives share.
 
     Where segments and their offsets (L, 3) are `known` about, or how the cameras of drives are turned (D, 3), or how
     late poses are, the landmarks are those of the footage laid so.
@@ -134,13 +138,27 @@ def estimate(
     noise, links = Noise(), told.jumps.links(segments, set())
     errors = (noise, _sigmas(footage, noise), WIDE)
     now = Estimate(detection, thing, class_code, size_m, segments, links, state, *errors, len(landmarks))
-    range_m = _RANGES * config.vote.max_range_m
-    for tolerances in (_COARSE, _FINE, _FINE):
-        now = _associated(footage, _cut(footage, _adjusted(footage, now, tolerances), told), range_m)
-        if not len(now.thing):
-            return None
-    now = _associated(footage, _adjusted(footage, now, _FINE), range_m)
+    return _round(footage, now, _COARSE, config, told)
+
+
+def go_on(footage: Footage, begun: Estimate, config: MapConfig, told: Trajectories) -> Estimate | None:
+    """Return an estimate that has settled, from a first one."""
+    now: Estimate | None = begun
+    for _ in range(_MORE_ROUNDS):
+        now = None if now is None else _round(footage, now, _FINE, config, told)
+    return None if now is None else _associated(footage, _adjusted(footage, now, _FINE), _range_m(config))
+
+
+def _round(
+    footage: Footage, now: Estimate, tolerances: tuple[float, ...], config: MapConfig, told: Trajectories
+) -> Estimate | None:
+    """Adjust all unknowns, cut drives and associate anew; None where nothing is left."""
+    now = _associated(footage, _cut(footage, _adjusted(footage, now, tolerances), told), _range_m(config))
     return now if len(now.thing) else None
+
+
+def _range_m(config: MapConfig) -> float:
+    return _RANGES * config.vote.max_range_m
 
 
 def estimate_again(footage: Footage, found: Estimate, told: Trajectories) -> Estimate:
@@ -219,13 +237,15 @@ def delay_together(footage: Footage, marks: Marks) -> float:
     mean = np.stack([np.bincount(mark, weights=axis) / voters for axis in velocity.T], axis=1)
     price, none = math.log(len(landmarks)), len(_DELAYS_S) // 2
 
+    around = Around.of(landmarks, covariance)
+
     def gains(shift_m: Floats) -> Floats:
-        return np.array([togetherness(landmarks, covariance, shift_m + delay * mean) for delay in _DELAYS_S])
+        return np.array([around.togetherness(shift_m + delay * mean) for delay in _DELAYS_S])
 
     shift_m = marks.registration.shift_m
     alone = gains(np.zeros_like(shift_m))
     pieces = np.unique(np.column_stack([landmarks.segment, shift_m])[shift_m.any(axis=1)], axis=0)
-    of_shifts = togetherness(landmarks, covariance, shift_m) - alone[none] - price * len(pieces)
+    of_shifts = around.togetherness(shift_m) - alone[none] - price * len(pieces)
     if of_shifts > max(alone.max() - alone[none] - price, 0.0):
         alone = gains(shift_m)
     best = int(np.argmax(alone))
@@ -430,7 +450,7 @@ def _apparent_shift(footage: Footage, seen: Observations, state: State) -> tuple
     basis = np.concatenate([at.by_point, whole[:, :, None]], axis=2)
     basis[weight == 0.0] = 0.0
     basis *= np.sqrt(weight)[:, None, None]
-    products = groups.sum(basis.transpose(0, 2, 1) @ basis)
+    products = groups.products(basis)
     information, right = products[:, :3, :3], products[:, :3, 3]
     shift = np.linalg.solve(information + 0.1 * np.eye(3), right[:, :, None])[:, :, 0]
     # What drifts along the way is no jump: so many images share one value of the process.
@@ -466,15 +486,18 @@ def cut_into_segments(value: Floats, precision: Floats, price: Floats) -> list[i
     best = np.full(count + 1, np.inf)
     best[0] = -price[0]
     last = np.zeros(count + 1, np.int64)
-    for end in range(1, count + 1):
-        p, q = a[end] - a[:end], b[end] - b[:end]
-        determinant = p[:, 0] * p[:, 2] - p[:, 1] ** 2
-        fit = (p[:, 2] * q[:, 0] ** 2 - 2.0 * p[:, 1] * q[:, 0] * q[:, 1] + p[:, 0] * q[:, 1] ** 2) / np.maximum(
-            determinant, 1e-12
-        )
-        total = best[:end] + (c[end] - c[:end] - fit) + price[:end]
-        last[end] = int(np.argmin(total))
-        best[end] = total[last[end]]
+    block = max(1, _PIECES // max(count, 1))
+    for first in range(1, count + 1, block):
+        until = min(first + block, count + 1)
+        # What pieces cost, by where they end and begin.
+        p, q = (sums[first:until, None] - sums[None, : until - 1] for sums in (a, b))
+        determinant = p[:, :, 0] * p[:, :, 2] - p[:, :, 1] ** 2
+        fit = p[:, :, 2] * q[:, :, 0] ** 2 - 2.0 * p[:, :, 1] * q[:, :, 0] * q[:, :, 1] + p[:, :, 0] * q[:, :, 1] ** 2
+        piece = c[first:until, None] - c[: until - 1] - fit / np.maximum(determinant, 1e-12) + price[: until - 1]
+        for end in range(first, until):
+            total = best[:end] + piece[end - first, :end]
+            last[end] = int(np.argmin(total))
+            best[end] = total[last[end]]
     starts = []
     end = count
     while end > 0:

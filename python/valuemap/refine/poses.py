@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from valuemap.cameras import camera_poses, colmap_camera
-from valuemap.config import MapConfig
+from valuemap.config import MapConfig, NoiseConfig
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives, InOrder, in_driving_order
 from valuemap.errors import SettingError
@@ -19,9 +19,10 @@ from valuemap.refine.estimate import (
     Estimate,
     Marks,
     Trajectories,
+    begin,
     delay_together,
-    estimate,
     estimate_again,
+    go_on,
     lay,
     mounts_alone,
 )
@@ -56,9 +57,6 @@ _LOST_M, _FEW_LOST = 0.5, 0.05
 FITS_NO_BETTER = "the poses as given fit better"
 """Why nothing is corrected where faults are found that do not make the detections likelier by more than they cost."""
 
-FitsBetter = Callable[[Dataset, Dataset, int], bool]
-"""Says whether the second of two datasets, which so many parameters tell apart, explains its detections better."""
-
 
 @dataclass(frozen=True, eq=False)
 class Found:
@@ -86,7 +84,6 @@ def refine_poses(
     *,
     threads: int = 0,
     progress: Progress = silent,
-    fits_better: FitsBetter | None = None,
 ) -> Refined:
     """Estimate what whole drives' poses are wrong by, from the objects that drives share; correct what is proven.
 
@@ -100,8 +97,6 @@ def refine_poses(
         Threads to work on, 0 for one a core. The result does not depend on it.
     progress
         Called as progress(what, done, total).
-    fits_better
-        Where it is given, what a sample proves must also explain the sample better, or the rest is not looked at.
 
     Returns
     -------
@@ -114,12 +109,10 @@ def refine_poses(
         return Refined(dataset, {"found": "nothing", "because": "few detections"})
     # Small matrices: more threads are slower, and how many there are would show in the last digits.
     with threadpool_limits(limits=1, user_api="blas"):
-        return _refined(dataset, config, threads, progress, fits_better)
+        return _refined(dataset, config, threads, progress)
 
 
-def _refined(
-    dataset: Dataset, config: MapConfig, threads: int, progress: Progress, fits_better: FitsBetter | None
-) -> Refined:
+def _refined(dataset: Dataset, config: MapConfig, threads: int, progress: Progress) -> Refined:
     unit_m = config.vote.max_range_m / USUAL_RANGE_M
     ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
     if ordered.drives.count < 2:
@@ -133,11 +126,6 @@ def _refined(
     if sample is not None:
         found = _find(*_part(moved, drives, sample), config, threads)
         progress("comparing drives", 1, 2)
-        if found is not None and found.selected is not None and fits_better is not None:
-            given, of_part = _part(ordered.dataset, ordered.drives, sample)
-            there = _apply(given, of_part, found, found.selected, unit_m)
-            if not fits_better(given, there, found.selected.parameters):
-                return Refined(dataset, {"found": "nothing", "because": FITS_NO_BETTER, **_looked_at(found)})
     if sample is None or _is_proven(found):
         found = _find(moved, drives, config, threads)
     progress("comparing drives", 2, 2)
@@ -204,6 +192,37 @@ def refine_again(
         return _corrected(dataset, ordered, after, unit_m) if _is_proven(after) else refined
 
 
+def keyframes_of(dataset: Dataset, refined: Refined, config: MapConfig) -> Dataset:
+    """Return the images, with their detections, that poses were estimated with, as they were corrected.
+
+    `dataset` is what `refine_poses` was given. It needs that something was corrected.
+    """
+    assert refined.found is not None
+    ordered = in_driving_order(dataset, viewpoint_step_m=config.vote.max_range_m / USUAL_RANGE_M)
+    shown, image_id = refined.dataset, ordered.image_id[refined.found.footage.row]
+    return replace(
+        shown,
+        images=shown.images.take(np.flatnonzero(np.isin(shown.images.image_id, image_id))),
+        detections=shown.detections.take(np.isin(shown.detections.image_id, image_id)),
+        truth_detections=None,
+    )
+
+
+def noise_left(refined: Refined, config: MapConfig) -> NoiseConfig:
+    """Return what detections of corrected poses are off by, as `refine_poses` found it; what is set stays as it is.
+
+    Drift is as large as it is thought to be, and not as it was found: drives that were laid onto each other wrongly
+    are what a map is to tell.
+    """
+    assert refined.found is not None
+    noise, scales = refined.found.result.noise, refined.found.result.scales
+    unit_m = config.vote.max_range_m / USUAL_RANGE_M
+    given = config.noise
+    left = (noise.px, unit_m * math.hypot(noise.image_m, scales.drift_m), math.degrees(scales.drift_rad))
+    names = ("detection_sigma_px", "position_sigma_m", "rotation_sigma_deg")
+    return replace(given, **{n: value for n, value in zip(names, left, strict=True) if getattr(given, n) is None})
+
+
 def _corrected(dataset: Dataset, ordered: InOrder, found: Found | None, unit_m: float) -> Refined:
     """Return a dataset corrected by what was proven of it `ordered`, in the order of its rows."""
     if found is None or found.selected is None:
@@ -260,14 +279,14 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
         return None
     told = Trajectories(jumps, hints, proven)
 
-    def estimated(marks: Marks, known: tuple[Segments, Floats]) -> Estimate | None:
-        return estimate(footage, marks, config, told, known=known, turned_rad=turned, late_s=late_s)
+    def begun(marks: Marks, known: tuple[Segments, Floats]) -> Estimate | None:
+        return begin(footage, marks, config, told, known=known, turned_rad=turned, late_s=late_s)
 
-    result = estimated(marks, known)
-    if result is None:
+    first = begun(marks, known)
+    if first is None:
         return None
-    if _is_lost(footage, result):
-        known = (result.segments, result.state.constants[OFFSET])
+    if _is_lost(footage, first):
+        known = (first.segments, first.state.constants[OFFSET])
         laid = _laid(footage, turned, late_s, known)
         segment = laid.drives.pass_code  # Its jumps are mended.
         try:
@@ -275,9 +294,12 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
         except SettingError:
             return None
         marks = lay(landmarks, laid, hints)
-        again = None if marks is None else estimated(marks, known)
-        if again is not None and len(again.thing) >= len(result.thing):
-            result = again
+        again = None if marks is None else begun(marks, known)
+        if again is not None and len(again.thing) >= len(first.thing):
+            first = again
+    result = go_on(footage, first, config, told)
+    if result is None:
+        return None
     return Found(footage, told, result, select(footage, result))
 
 

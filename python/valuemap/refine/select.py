@@ -96,10 +96,9 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
     objects = _objects_of(linked[seen.segment], seen.thing, len(found.segments))[linked]
     narrow[OFFSET][objects < _LEAST_OF_SEGMENT] = True
     trial = _Trial(seen, chain, _scales(footage, found), things, found.links, linked, bound=narrow)
-    state, common, narrow = trial.prune(active, narrow, found.state, ())
+    state, common, narrow = trial.prune(active, narrow, found.state, ((),))
     of_drives = tuple(flags | (free[kind] if kind in (MOUNT, DELAY) else False) for kind, flags in enumerate(common))
-    state, active, narrow = trial.prune(of_drives, narrow, state, (CAMERA_MOUNT, CAMERA_DELAY))
-    state, active, narrow = trial.prune(active, narrow, state, ())
+    state, active, narrow = trial.prune(of_drives, narrow, state, ((CAMERA_MOUNT, CAMERA_DELAY), ()))
     if not any(flags.any() for flags in active):
         return None
     scales = trial.narrowed(narrow)
@@ -244,23 +243,29 @@ class _Trial:
         return replace(self.scales, constant=tuple(sigmas))
 
     def prune(
-        self, active: tuple[Bools, ...], narrow: tuple[Bools, ...], state: State, fixed: tuple[int, ...]
+        self, active: tuple[Bools, ...], narrow: tuple[Bools, ...], state: State, fixed: tuple[tuple[int, ...], ...]
     ) -> tuple[State, tuple[Bools, ...], tuple[Bools, ...]]:
         """Drop whole groups of parameters of which none pays, the poorest first; then narrow those that do not pay.
 
-        What does not pay of a camera is dropped too. Kinds that are `fixed` are not judged. What the others are without
-        a group is told by the normal equations; what is left then is fitted and judged anew. What is narrow and would
-        pay, now that others are narrow, is widened again, once.
+        What does not pay of a camera is dropped too. Kinds that are `fixed` are not judged, at first those of the first
+        of these, then those of the next. What the others are without a group is told by the normal equations; what is
+        left then is fitted and judged anew. What is narrow and would pay, now that others are narrow, is widened again,
+        once for each that is fixed.
         """
-        tolerances: tuple[float, ...] = _REFIT
-        settled = tuple(flags.copy() for flags in self.bound)
-        while True:
-            problem = Adjustment(self.seen, self.chain, self.narrowed(narrow), active, self.things, self.links)
-            state = adjust(problem, state, tolerances=tolerances, with_variance=True)
-            left, thin = self._judged(_Equations.at(problem, state), active, narrow, fixed, settled)
-            if _is_same((*left, *thin), (*active, *narrow)):
-                return self._regauged(state, active[OFFSET] & ~narrow[OFFSET]), active, narrow
-            active, narrow, tolerances = left, thin, _ANEW
+        equations: _Equations | None = None
+        for kinds in fixed:
+            tolerances: tuple[float, ...] = _REFIT
+            settled = tuple(flags.copy() for flags in self.bound)
+            while True:
+                if equations is None:
+                    problem = Adjustment(self.seen, self.chain, self.narrowed(narrow), active, self.things, self.links)
+                    state = adjust(problem, state, tolerances=tolerances, with_variance=True)
+                    equations = _Equations.at(problem, state)
+                left, thin = self._judged(equations, active, narrow, kinds, settled)
+                if _is_same((*left, *thin), (*active, *narrow)):
+                    break
+                active, narrow, tolerances, equations = left, thin, _ANEW, None
+        return self._regauged(state, active[OFFSET] & ~narrow[OFFSET]), active, narrow
 
     def _judged(
         self,
