@@ -5,6 +5,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -93,6 +96,21 @@ def test_shifts_of_passes_of_three_metres_are_found_to_three_decimetres() -> Non
     moved = camera_poses(refined.dataset.images)[1] - camera_poses(faulty.images)[1]
     mean = np.stack([np.bincount(drive, weights=axis) / np.bincount(drive) for axis in moved.T], axis=1)
     assert np.abs(mean.mean(axis=0)).max() < 0.3
+
+
+def test_all_that_multiplies_matrices_has_one_thread_from_the_beginning() -> None:
+    # In a process of its own, as SciPy is loaded in this one.
+    program = """
+from threadpoolctl import threadpool_info
+from valuemap.refine.poses import one_blas_thread
+with one_blas_thread():
+    blas = [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+    import scipy.linalg
+    assert len(blas) == sum(library["user_api"] == "blas" for library in threadpool_info())
+    assert set(blas) == {1}, blas
+"""
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "2"}
+    subprocess.run([sys.executable, "-c", program], check=True, env=environment)
 
 
 @pytest.mark.parametrize("is_proven", [False, True])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from threadpoolctl import threadpool_limits
 
 from valuemap.cameras import camera_poses, colmap_camera
@@ -107,9 +108,18 @@ def refine_poses(
         return Refined(dataset, {"found": "nothing", "because": "correct_poses is 0"})
     if len(dataset.detections) < _LEAST_DETECTIONS:
         return Refined(dataset, {"found": "nothing", "because": "few detections"})
-    # Small matrices: more threads are slower, and how many there are would show in the last digits.
-    with threadpool_limits(limits=1, user_api="blas"):
+    with one_blas_thread():
         return _refined(dataset, config, threads, progress)
+
+
+def one_blas_thread() -> threadpool_limits:
+    """Return what limits all that multiplies matrices to one thread while it is entered.
+
+    Matrices are small: more threads are slower, and how many there are would show in the last digits.
+    """
+    # SciPy has a BLAS of its own. It is loaded when it is first asked for, and only what is loaded can be limited.
+    assert scipy.linalg.lapack
+    return threadpool_limits(limits=1, user_api="blas")
 
 
 def _refined(dataset: Dataset, config: MapConfig, threads: int, progress: Progress) -> Refined:
@@ -162,7 +172,7 @@ def refine_again(
     if before is None or before.selected is None or not len(labels):
         return refined
     progress("comparing drives", 0, 1)
-    with threadpool_limits(limits=1, user_api="blas"):
+    with one_blas_thread():
         unit_m = config.vote.max_range_m / USUAL_RANGE_M
         ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
         footage = before.footage
