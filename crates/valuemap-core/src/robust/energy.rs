@@ -76,13 +76,18 @@ pub struct Fit {
 }
 
 /// The terms of one evaluation.
-struct Terms {
-    information: Matrix3<f64>,
-    gradient: Vector3<f64>,
-    energy: f64,
+#[derive(Debug)]
+pub(super) struct Terms {
+    /// Information about the position, 1/m².
+    pub(super) information: Matrix3<f64>,
+    /// Gradient of half of the squared residuals, 1/m.
+    pub(super) gradient: Vector3<f64>,
+    /// Equation (1) but for its constant.
+    pub(super) energy: f64,
     /// What sizes and heights add: they are judged by equations (2) and (4).
     of_priors: f64,
-    chi2: Vec<f64>,
+    /// Squared residual of each vote in sigmas, the drift of its visit taken out.
+    pub(super) chi2: Vec<f64>,
 }
 
 impl Terms {
@@ -151,55 +156,82 @@ fn weights_of(chi2: &[f64], weights: &mut [f64]) -> bool {
     any
 }
 
+impl Terms {
+    /// Of no vote.
+    pub(super) fn none() -> Self {
+        Self {
+            information: Matrix3::zeros(),
+            gradient: Vector3::zeros(),
+            energy: 0.0,
+            of_priors: 0.0,
+            chi2: Vec::new(),
+        }
+    }
+
+    /// Add what the votes of one visit say.
+    pub(super) fn add(&mut self, visit: &Self) {
+        self.information += visit.information;
+        self.gradient += visit.gradient;
+        self.energy += visit.energy;
+        self.chi2.extend(&visit.chi2);
+    }
+
+    /// Add what is known of sizes and heights.
+    pub(super) fn add_priors(&mut self, model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) {
+        if let Some(sizes) = size_terms(model, votes, point) {
+            self.information += sizes.information;
+            self.gradient += sizes.gradient;
+            self.of_priors += sizes.square;
+        }
+        if let Some((up, terms)) = height_terms(model, votes, point, camera_m2(model, votes)) {
+            self.information += up * up.transpose() * terms.information;
+            self.gradient += up * terms.gradient;
+            self.of_priors -= 2.0 * terms.ln_density;
+        }
+    }
+}
+
 /// Equation (1) at a point, with what a step needs.
 fn terms(model: &Model<'_>, votes: &[u32], weights: &[f64], point: &Vector3<f64>) -> Option<Terms> {
-    let scene = model.scene;
-    let mut sum = Terms {
-        information: Matrix3::zeros(),
-        gradient: Vector3::zeros(),
-        energy: 0.0,
-        of_priors: 0.0,
-        chi2: Vec::with_capacity(votes.len()),
-    };
-    for visit in visits(scene, votes) {
+    let mut sum = Terms::none();
+    for visit in visits(model.scene, votes) {
         let first = sum.chi2.len();
-        let look_of = |ray: u32| Look::of(scene, model.noise, ray, 0, point).map(Look::by_itself);
-        if let [ray] = visit {
-            let look = look_of(*ray)?;
-            let one = OneLook::of(&look, weights[first])?;
-            sum.information += one.information;
-            sum.gradient += one.gradient;
-            sum.energy += one.square + one.log_determinant;
-            sum.chi2.push(one.left.norm_squared() / look.variance);
-            continue;
-        }
-        let looks: Vec<Look> = visit.iter().map(|&ray| look_of(ray)).collect::<Option<_>>()?;
-        let drive = Drive::along(&looks, &weights[first..first + visit.len()], 1)?;
-        let (information, gradient) = drive.normals.of_one();
-        sum.information += information;
-        sum.gradient += gradient;
-        sum.energy += drive.normals.square + drive.log_determinant();
-        for (look, left) in looks.iter().zip(drive.left()) {
-            sum.chi2.push(left.norm_squared() / look.variance);
-        }
+        sum.add(&terms_of_visit(model, visit, &weights[first..first + visit.len()], point)?);
     }
-    for (&chi2, &weight) in sum.chi2.iter().zip(weights) {
+    sum.add_priors(model, votes, point);
+    sum.cost().is_finite().then_some(sum)
+}
+
+/// Equation (1) of the votes of one visit.
+fn terms_of_visit(model: &Model<'_>, visit: &[u32], weights: &[f64], point: &Vector3<f64>) -> Option<Terms> {
+    let look_of = |ray: u32| Look::of(model.scene, model.noise, ray, 0, point).map(Look::by_itself);
+    let mut terms = if let [ray] = visit {
+        let look = look_of(*ray)?;
+        let OneLook { information, gradient, square, log_determinant, left } = OneLook::of(&look, weights[0])?;
+        let chi2 = vec![left.norm_squared() / look.variance];
+        Terms { information, gradient, energy: square + log_determinant, of_priors: 0.0, chi2 }
+    } else {
+        let looks: Vec<Look> = visit.iter().map(|&ray| look_of(ray)).collect::<Option<_>>()?;
+        let drive = Drive::along(&looks, weights, 1)?;
+        let (information, gradient) = drive.normals.of_one();
+        let chi2 = looks.iter().zip(drive.left()).map(|(look, left)| left.norm_squared() / look.variance).collect();
+        let energy = drive.normals.square + drive.log_determinant();
+        Terms { information, gradient, energy, of_priors: 0.0, chi2 }
+    };
+    for (&chi2, &weight) in terms.chi2.iter().zip(weights) {
         // Huber's loss is 2 c |r| - c² beyond c, of which the weighted square is c |r|.
         if weight < 1.0 {
-            sum.energy += (HUBER_SIGMAS * chi2.sqrt() - HUBER_SIGMAS * HUBER_SIGMAS).max(0.0);
+            terms.energy += (HUBER_SIGMAS * chi2.sqrt() - HUBER_SIGMAS * HUBER_SIGMAS).max(0.0);
         }
     }
-    if let Some(sizes) = size_terms(model, votes, point) {
-        sum.information += sizes.information;
-        sum.gradient += sizes.gradient;
-        sum.of_priors += sizes.square;
-    }
-    if let Some((up, terms)) = height_terms(model, votes, point, camera_m2(model, votes)) {
-        sum.information += up * up.transpose() * terms.information;
-        sum.gradient += up * terms.gradient;
-        sum.of_priors -= 2.0 * terms.ln_density;
-    }
-    sum.cost().is_finite().then_some(sum)
+    Some(terms)
+}
+
+/// The same with the weights that their residuals there have.
+pub(super) fn weighted_terms_of_visit(model: &Model<'_>, visit: &[u32], point: &Vector3<f64>) -> Option<Terms> {
+    let mut weights = vec![1.0; visit.len()];
+    let terms = terms_of_visit(model, visit, &weights, point)?;
+    if weights_of(&terms.chi2, &mut weights) { terms_of_visit(model, visit, &weights, point) } else { Some(terms) }
 }
 
 /// What the heights of its class say of an object with some votes at a point, with a variance of the cameras' heights, m²; and what is up. Nothing before
@@ -309,8 +341,14 @@ pub fn fitting(
     start: Vector3<f64>,
     others: Vec<u32>,
 ) -> Option<Object> {
+    fitting_unseen(model, votes, start)?.with_looks(model, lookout, others)
+}
+
+/// The same before it is asked who should have seen it.
+#[must_use]
+pub fn fitting_unseen(model: &Model<'_>, votes: Vec<u32>, start: Vector3<f64>) -> Option<Object> {
     let limit = model.settings.gate_sigmas.powi(2);
-    let found = object(model, lookout, votes, start, others)?;
+    let found = unseen(model, votes, start)?;
     if found.fit.chi2.iter().all(|chi2| *chi2 <= limit) {
         return Some(found);
     }
@@ -319,7 +357,7 @@ pub fn fitting(
     if left.len() < model.settings.min_votes as usize {
         return None;
     }
-    object(model, lookout, left, found.fit.point, found.others)
+    unseen(model, left, found.fit.point)
 }
 
 /// An [`object`] before it is asked who should have seen it: J is not less than its energy.

@@ -257,7 +257,8 @@ impl<'a> Joint<'a> {
     }
 
     fn evaluate(&self) -> Option<Evaluation> {
-        let Looks { all: looks, weights, is_vote, ends } = self.looks()?;
+        let of_labels = if self.model.is_some() { self.votes_of_labels() } else { Vec::new() };
+        let OfVisits { looks, weights, is_vote, ends } = self.looks(&of_labels)?;
         let mut normals = Normals::nothing(self.points.len());
         let (mut of_visits, mut pose_errors) = (Vec::with_capacity(ends.len()), Vec::new());
         let mut left: Vec<Vector2<f64>> = Vec::with_capacity(looks.len());
@@ -295,14 +296,14 @@ impl<'a> Joint<'a> {
                 normals.add_gradient(label, &gradient);
             }
         }
-        self.add_priors(&mut normals);
+        self.add_sizes(&of_labels, &mut normals);
         Some(Evaluation { normals, of_visits, own, pose_errors })
     }
 }
 
 /// The looks of some votes, visit by visit, and what heights say as further ones.
-struct Looks {
-    all: Vec<Look>,
+struct OfVisits {
+    looks: Vec<Look>,
     weights: Vec<f64>,
     is_vote: Vec<bool>,
     /// Where each visit ends.
@@ -312,11 +313,11 @@ struct Looks {
 impl Joint<'_> {
     /// What is seen of the labels where they are; nothing if one is behind a voter. What heights say goes among the looks: the visit's drift is theirs
     /// as well.
-    fn looks(&self) -> Option<Looks> {
-        let heights = self.heights();
+    fn looks(&self, of_labels: &[Vec<u32>]) -> Option<OfVisits> {
+        let heights = self.heights(of_labels);
         let count = self.votes.len() + heights.len();
-        let mut looks = Looks {
-            all: Vec::with_capacity(count),
+        let mut found = OfVisits {
+            looks: Vec::with_capacity(count),
             weights: Vec::with_capacity(count),
             is_vote: Vec::with_capacity(count),
             ends: Vec::new(),
@@ -330,24 +331,24 @@ impl Joint<'_> {
                     Care::Exact => vantage.look_where_it_was(label, point, &self.pose_errors[i])?,
                 };
                 let height = heights.get(&i).map(|(up, higher_m, m2)| look.at_height(up, *higher_m, *m2));
-                looks.all.push(look);
-                looks.weights.push(self.weights[i]);
-                looks.is_vote.push(true);
+                found.looks.push(look);
+                found.weights.push(self.weights[i]);
+                found.is_vote.push(true);
                 if let Some(height) = height {
-                    looks.all.push(height);
-                    looks.weights.push(1.0);
-                    looks.is_vote.push(false);
+                    found.looks.push(height);
+                    found.weights.push(1.0);
+                    found.is_vote.push(false);
                 }
             }
             at += votes.len();
-            looks.ends.push(looks.all.len());
+            found.ends.push(found.looks.len());
         }
-        Some(looks)
+        Some(found)
     }
 
-    fn add_priors(&self, normals: &mut Normals) {
+    fn add_sizes(&self, of_labels: &[Vec<u32>], normals: &mut Normals) {
         let Some(model) = self.model else { return };
-        for (label, (votes, point)) in self.votes_of_labels().iter().zip(&self.points).enumerate() {
+        for (label, (votes, point)) in of_labels.iter().zip(&self.points).enumerate() {
             if let Some(terms) = size_terms(model, votes, point) {
                 normals.add(label, label, &terms.information);
                 normals.add_gradient(label, &terms.gradient);
@@ -367,7 +368,7 @@ impl Joint<'_> {
     /// What is known of heights, by the number of the vote whose image it is said of, the nearest of each visit: what is up, how much too high its label
     /// is, m, and the variance of that, m². A height is above cameras, so how high these are is as unknown to it as to the votes; each visit has
     /// as large a share of what it tells.
-    fn heights(&self) -> FxHashMap<usize, (Vector3<f64>, f64, f64)> {
+    fn heights(&self, of_labels: &[Vec<u32>]) -> FxHashMap<usize, (Vector3<f64>, f64, f64)> {
         let mut found = FxHashMap::default();
         let Some(model) = self.model else { return found };
         let mut nearest: Vec<Vec<(f64, usize)>> = vec![Vec::new(); self.points.len()];
@@ -386,7 +387,7 @@ impl Joint<'_> {
             }
             at += votes.len();
         }
-        for ((votes, point), nearest) in self.votes_of_labels().iter().zip(&self.points).zip(&nearest) {
+        for ((votes, point), nearest) in of_labels.iter().zip(&self.points).zip(&nearest) {
             let Some((up, terms)) = height_terms(model, votes, point, 0.0) else { continue };
             // What tells less than that an object is in range tells nothing.
             if terms.information * model.settings.viability.max_range_m.powi(2) > 1.0 {

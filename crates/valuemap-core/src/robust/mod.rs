@@ -22,6 +22,7 @@ pub mod energy;
 pub mod estimate;
 pub mod few;
 pub mod finish;
+mod foresee;
 pub mod heights;
 pub mod index;
 pub mod initial;

@@ -9,7 +9,8 @@ use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::assign::{Claim, claims_of_all, gain_alone, images_of};
-use super::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, by_place, by_side, fitting, object, owners, visits};
+use super::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, by_place, by_side, fitting_unseen, object, owners, visits};
+use super::foresee::Foresight;
 use super::index::RayIndex;
 use super::looks::Lookout;
 use super::model::Model;
@@ -196,16 +197,37 @@ impl<'a> Pair<'a> {
         if let Some(merged) = merged.and_then(|object| better(vec![object])) {
             return Some(merged);
         }
-        let try_part = |part: &Vec<u32>| Some((self.exchanged(part).and_then(better)?, part.clone()));
+        let mut foresight = Foresight::new(self.model, self.lookout, self.of, self.claims.map(images_of));
         let (parts, near) = self.parts();
-        let (mut found, parts): (Vec<_>, Vec<Vec<u32>>) = parts.iter().filter_map(try_part).unzip();
-        found.extend(near.iter().filter_map(|part| self.settled(&self.exchanged(part)?).and_then(better)));
+        let (mut found, mut helpful) = (Vec::new(), Vec::new());
+        for part in &parts {
+            let Some(votes) = self.exchanged(part) else { continue };
+            if foresight.as_mut().is_none_or(|foresight| foresight.may_help(&votes))
+                && let Some(exchange) = self.with_votes(votes, self.of, before).and_then(better)
+            {
+                found.push(exchange);
+                helpful.push(part.clone());
+            }
+        }
+        for part in &near {
+            let Some(votes) = self.exchanged(part) else { continue };
+            if let Some(foresight) = &mut foresight {
+                let Some(both) = foresight.unseen(&votes) else { continue };
+                if !foresight.may_help(&self.settled(&both)) {
+                    continue;
+                }
+            }
+            let Some(both) = self.unseen_with_votes(votes, self.of) else { continue };
+            found.extend(self.with_votes(self.settled(&both), [&both[0], &both[1]], before).and_then(better));
+        }
         // What helps on one visit each, helps most on all of them.
-        if parts.len() > 1 {
-            let mut images = parts.concat();
+        if helpful.len() > 1 {
+            let mut images = helpful.concat();
             images.sort_unstable();
             images.dedup();
-            found.extend(self.exchanged(&images).and_then(better));
+            found.extend(
+                self.exchanged(&images).and_then(|votes| self.with_votes(votes, self.of, before)).and_then(better),
+            );
         }
         found.into_iter().reduce(|best, found| if found.0 < best.0 { found } else { best })
     }
@@ -288,8 +310,8 @@ impl<'a> Pair<'a> {
         votes.map(image).collect()
     }
 
-    /// Both after an exchange of what they have in some images, as far as they may take it; nothing if one has nothing left.
-    fn exchanged(&self, images: &[u32]) -> Option<Vec<Object>> {
+    /// The votes of both (ascending) after an exchange of what they have in some images, as far as they may take it; nothing if that is no exchange.
+    fn exchanged(&self, images: &[u32]) -> Option<[Vec<u32>; 2]> {
         let image = |ray: u32| self.model.scene.rays.image[ray as usize];
         let split = |images: &[u32]| {
             self.of.map(|object| {
@@ -307,24 +329,31 @@ impl<'a> Pair<'a> {
         if a.0.len() + b.0.len() == 0 || a.1.len() + b.1.len() == 0 {
             return None;
         }
-        self.with_votes([[a.1, b.0].concat(), [b.1, a.0].concat()], self.of)
+        Some([[a.1, b.0].concat(), [b.1, a.0].concat()].map(sorted))
     }
 
-    /// Both with some votes each, from where two objects are; nothing if that is not two objects.
-    fn with_votes(&self, votes: [Vec<u32>; 2], from: [&Object; 2]) -> Option<Vec<Object>> {
-        let mut found = Vec::with_capacity(2);
-        for (i, mut votes) in votes.into_iter().enumerate() {
-            if votes.len() < self.model.settings.min_votes as usize {
-                return None;
-            }
-            votes.sort_unstable();
-            found.push(fitting(self.model, self.lookout, votes, from[i].fit.point, images_of(self.claims[i]))?);
-        }
+    /// Both with some votes (ascending) each, from where two objects are; nothing if that is not two objects, or if J of both is not below `most`.
+    fn with_votes(&self, votes: [Vec<u32>; 2], from: [&Object; 2], most: f64) -> Option<Vec<Object>> {
+        // J is not less than that of an object before it is asked who should have seen it.
+        let unseen = self.unseen_with_votes(votes, from);
+        let unseen = unseen.filter(|both| both.iter().map(|object| object.energy).sum::<f64>() < most)?;
+        let with_looks =
+            |(object, claims): (Object, &&[Claim])| object.with_looks(self.model, self.lookout, images_of(claims));
+        let found: Vec<Object> = unseen.into_iter().zip(&self.claims).map(with_looks).collect::<Option<_>>()?;
         found.iter().all(|object| object.energy < 0.0).then_some(found)
     }
 
-    /// Both with the votes that each explains best, image by image, of those that they have.
-    fn settled(&self, both: &[Object]) -> Option<Vec<Object>> {
+    /// The same before it is asked who should have seen them.
+    fn unseen_with_votes(&self, votes: [Vec<u32>; 2], from: [&Object; 2]) -> Option<Vec<Object>> {
+        let is_enough = |votes: &Vec<u32>| votes.len() >= self.model.settings.min_votes as usize;
+        if !votes.iter().all(is_enough) {
+            return None;
+        }
+        votes.into_iter().zip(from).map(|(votes, from)| fitting_unseen(self.model, votes, from.fit.point)).collect()
+    }
+
+    /// The votes (ascending) that each of two explains best, image by image, of those that they have.
+    fn settled(&self, both: &[Object]) -> [Vec<u32>; 2] {
         let mut of_image: BTreeMap<u32, [Option<u32>; 2]> = BTreeMap::new();
         for (i, object) in both.iter().enumerate() {
             for &ray in &object.votes {
@@ -339,7 +368,7 @@ impl<'a> Pair<'a> {
             votes[0].extend(first);
             votes[1].extend(second);
         }
-        self.with_votes(votes, [&both[0], &both[1]])
+        votes.map(sorted)
     }
 
     /// Which of some votes one may not take that keeps others: on many visits it stays where it is, so they have to be in its gate there.
@@ -347,6 +376,11 @@ impl<'a> Pair<'a> {
         let is_free = visits(self.model.scene, kept).count() <= MOST_VISITS;
         taken.iter().filter(move |ray| !is_free && !self.gates[one].contains(ray))
     }
+}
+
+fn sorted(mut votes: Vec<u32>) -> Vec<u32> {
+    votes.sort_unstable();
+    votes
 }
 
 fn fingerprint(object: &Object) -> u64 {

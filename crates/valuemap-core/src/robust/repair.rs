@@ -148,7 +148,7 @@ fn anew(place: &Place<'_>, old: &[&Object], attempt: u64, progress: &Progress) -
         );
     }
     let as_it_is: Vec<usize> = (0..old.len()).collect();
-    let (mut starts, mut sets) = (vec![as_it_is, Vec::new()], Vec::new());
+    let (mut starts, mut twos) = (vec![as_it_is, Vec::new()], Vec::new());
     for (i, object) in old.iter().enumerate() {
         let first = candidates.len();
         for part in parts_of(model, object) {
@@ -161,7 +161,7 @@ fn anew(place: &Place<'_>, old: &[&Object], attempt: u64, progress: &Progress) -
         // One object gives way to two: adding one and dropping one does not get there.
         let two = if model.settings.has(Part::TwoForOne) { best_two(&candidates, rays.len(), first) } else { None };
         if let Some(two) = two {
-            sets.push((0..old.len()).filter(|&other| other != i).chain(two).collect());
+            twos.push((0..old.len()).filter(|&other| other != i).chain(two).collect());
         }
         if candidates.len() > first {
             starts.push((0..old.len()).filter(|&other| other != i).chain(first..candidates.len()).collect());
@@ -171,8 +171,8 @@ fn anew(place: &Place<'_>, old: &[&Object], attempt: u64, progress: &Progress) -
     let before: f64 = old.iter().map(|object| object.energy).sum();
     let mut best: Option<(f64, Vec<Object>)> = None;
     let mut seen: Vec<Vec<usize>> = Vec::new();
-    sets.splice(0..0, starts.into_iter().map(|start| choose(&candidates, rays.len(), start)));
-    for chosen in sets {
+    let chosen_from = |start| choose(&candidates, rays.len(), start);
+    for chosen in starts.into_iter().map(chosen_from).chain(twos) {
         if seen.contains(&chosen) {
             continue;
         }
