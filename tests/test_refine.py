@@ -28,7 +28,8 @@ from valuemap.refine import Refined, adjust, expose_rows, poses, refine_again, r
 from valuemap.refine import estimate as refine_estimate
 from valuemap.refine import select as refine_select
 from valuemap.refine.adjust import Adjustment, Scales
-from valuemap.refine.estimate import Estimate, cut_into_segments, delay_together, lay, mounts_alone, prices
+from valuemap.refine.delay import _is_gain, delay_alone
+from valuemap.refine.estimate import Estimate, cut_into_segments, mounts_alone, prices
 from valuemap.refine.footage import Footage, Sigmas, _within, find_motion, gather, in_working_frame
 from valuemap.refine.jumps import Links, Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
@@ -127,6 +128,21 @@ def test_all_is_estimated_only_where_a_sample_proves_a_fault(is_proven: bool, mo
     assert refine_poses(faulty, valuemap.MapConfig()).is_corrected == is_proven
     assert looked_at[0] < len(faulty.detections)
     assert looked_at[1:] == ([len(faulty.detections)] if is_proven else [])
+
+
+def test_a_sample_tells_how_late_all_poses_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    late, looked_at = city(pose_delay_s=0.1), []
+    monkeypatch.setattr(poses, "_SAMPLE", len(late.detections) // 3)
+
+    def counted(laid: Callable[[float], Footage], *given: Any, **more: Any) -> float:
+        looked_at.append(len(laid(0.0).whole.detections))
+        return delay_alone(laid, *given, **more)
+
+    monkeypatch.setattr(poses, "delay_alone", counted)
+    refined = refine_poses(late, valuemap.MapConfig())
+    assert len(looked_at) == 1
+    assert looked_at[0] < len(late.detections)
+    assert refined.record["cameras"][0]["delay_s"] == pytest.approx(0.1, abs=0.005)
 
 
 @pytest.mark.parametrize("shift_m", [0.0, 3.0])
@@ -320,16 +336,31 @@ def test_errors_are_estimated_with_the_rates_of_the_delay_that_poses_start_with(
     assert (off["found"] > 1.0).sum() < 0.3 * (off["mean"] > 1.0).sum()
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.1])
-def test_what_drives_see_comes_together_at_the_delay_of_their_poses(delay_s: float) -> None:
-    ordered = in_driving_order(city(pose_delay_s=delay_s), viewpoint_step_m=1.0)
+def delay_of(dataset: Dataset) -> float:
+    """Return how late its poses are as its drives alone tell it, s."""
+    ordered = in_driving_order(dataset, viewpoint_step_m=1.0)
     footage = gather(*in_working_frame(ordered.dataset, ordered.drives, 1.0))
-    drive, hints = footage.drives.pass_code, find_hints(footage.dataset, footage.drives)
-    marks = lay(
-        find_landmarks(footage.dataset, footage.rays, footage.drives, drive, valuemap.MapConfig()), footage, hints
-    )
-    assert marks is not None
-    assert delay_together(footage, marks) == pytest.approx(delay_s, abs=0.05)
+    askew = np.zeros((ordered.drives.count, 3))
+    config, drive = valuemap.MapConfig(), footage.drives.pass_code
+    return delay_alone(lambda late_s: poses._laid(footage, askew, late_s), drive, config)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.1, 0.15])
+def test_drives_alone_tell_how_late_their_poses_are(delay_s: float) -> None:
+    assert delay_of(city(pose_delay_s=delay_s)) == pytest.approx(delay_s, abs=0.011)
+
+
+def test_a_camera_that_sees_more_sharply_tells_a_delay_between_two_that_are_tried() -> None:
+    # Through the gate of the votes alone, 0.01 s are too much where it turns.
+    sharp = {"focal_px": 1500.0, "image_width_px": 1920, "image_height_px": 1440}
+    assert delay_of(city(pose_delay_s=0.11, **sharp)) == pytest.approx(0.11, abs=0.011)
+
+
+def test_a_delay_gains_votes_on_more_stretches_than_by_chance() -> None:
+    assert _is_gain(np.array([5, 4, 0, 6, 3, 5]))
+    assert not _is_gain(np.array([40, 0, 0, 0, 0, 0]))
+    assert not _is_gain(np.array([5, -4, 0, 6, -3, -2]))
+    assert not _is_gain(np.zeros(6, np.int64))
 
 
 def test_poses_that_are_moved_on_tremble_as_before() -> None:

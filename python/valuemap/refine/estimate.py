@@ -13,7 +13,7 @@ from valuemap.refine.adjust import Adjustment, Groups, Scales, adjust, triangula
 from valuemap.refine.footage import DRIFT_LENGTH_M, Footage, Sigmas
 from valuemap.refine.jumps import RARE, Hints, Jumps, Links, Segments
 from valuemap.refine.landmarks import Landmarks
-from valuemap.refine.register import Around, Registration, register
+from valuemap.refine.register import Registration, register
 from valuemap.refine.residuals import CAMERA_DELAY, MOUNT, OFFSET, WIDTH, Observations, State, linearised, weights
 from valuemap.refine.tracks import associate, merge_objects
 from valuemap.tables import Bools, Floats, Ints
@@ -38,7 +38,6 @@ _SURE = 4.0
 _TOLD_RAD = math.radians(0.5)
 """Drives whose turns are less sure than this say nothing of how much drives are turned."""
 _ALONE = (4.0, 3.0, 2.0, 2.0)
-_DELAYS_S = 0.02 * np.arange(-15, 16)
 _PIECES = 200_000
 """So many pieces of a signal are looked at together: 2 MB for each of their numbers."""
 _AGAIN = 2
@@ -220,36 +219,6 @@ def mounts_alone(footage: Footage, landmarks: Landmarks) -> Floats:
             wide = max(float(np.average(value[told] ** 2 - of[told], weights=1.0 / of[told])), 0.0)
             turned[:, axis] = value * wide / (wide + of)
     return turned
-
-
-def delay_together(footage: Footage, marks: Marks) -> float:
-    """Return by how many seconds all poses seem to be late: that by which what drives see best comes together.
-
-    A delay moves what is seen from opposite directions apart, so that later steps would take one thing for two. It is
-    no more than a start for them. Zero where another delay does not explain more than its price: every pair of
-    landmarks counts twice in the sum, so the price of Bayes' information criterion is the logarithm of their number.
-    Where the shifts of the registration explain more than a delay does, each at its price, it is told beside them.
-    """
-    landmarks, covariance = marks.landmarks, marks.covariance
-    mark, image = landmarks.landmark_of_voter(), footage.rays.image_row[landmarks.voters]
-    velocity = 0.5 * (footage.motion.forward_mps[image] + footage.motion.backward_mps[image])
-    voters = np.diff(landmarks.offsets)
-    mean = np.stack([np.bincount(mark, weights=axis) / voters for axis in velocity.T], axis=1)
-    price, none = math.log(len(landmarks)), len(_DELAYS_S) // 2
-
-    around = Around.of(landmarks, covariance)
-
-    def gains(shift_m: Floats) -> Floats:
-        return np.array([around.togetherness(shift_m + delay * mean) for delay in _DELAYS_S])
-
-    shift_m = marks.registration.shift_m
-    alone = gains(np.zeros_like(shift_m))
-    pieces = np.unique(np.column_stack([landmarks.segment, shift_m])[shift_m.any(axis=1)], axis=0)
-    of_shifts = around.togetherness(shift_m) - alone[none] - price * len(pieces)
-    if of_shifts > max(alone.max() - alone[none] - price, 0.0):
-        alone = gains(shift_m)
-    best = int(np.argmax(alone))
-    return float(_DELAYS_S[best]) if alone[best] - alone[none] > price else 0.0
 
 
 def everything(footage: Footage, segments: Segments) -> tuple[Bools, ...]:

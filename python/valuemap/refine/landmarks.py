@@ -19,7 +19,7 @@ from valuemap.drives import Drives
 from valuemap.tables import Candidates, Floats, Ints
 from valuemap.vote import vote_in_clusters
 
-STRETCH_RANGES = 1.5
+_STRETCH_RANGES = 1.5
 """A stretch is as long as so many largest ranges: an object is seen from before it on one of two of them."""
 _GATES = (1.0, 2.0, 4.0)
 """Multiples of `max_reprojection_error_px` that are tried: poses that tremble need a wider one."""
@@ -75,17 +75,11 @@ def find_landmarks(
     dataset: Dataset, rays: Rays, drives: Drives, segment: Ints, config: MapConfig, *, threads: int = 0
 ) -> Landmarks:
     """Vote on every stretch of every drive alone, with the narrowest gate through which most detections agree."""
-    stretch = _stretches(drives, segment, STRETCH_RANGES * config.vote.max_range_m)
+    stretch = stretches(drives, segment, config)
     best: Candidates | None = None
     for gate in _GATES:
-        vote = VoteConfig(
-            max_reprojection_error_px=gate * config.vote.max_reprojection_error_px,
-            min_parallax_deg=config.vote.min_parallax_deg,
-            min_range_m=config.vote.min_range_m,
-            max_range_m=_RANGES * config.vote.max_range_m,
-            min_votes=_LEAST_VOTES,
-        )
-        found, _ = vote_in_clusters(rays, stretch, vote, threads=threads)
+        gate_px = gate * config.vote.max_reprojection_error_px
+        found = vote_on_stretches(rays, stretch, config, gate_px, threads=threads)
         if best is None or len(found.voters) > len(best.voters):
             best = found
         if len(found.voters) >= _ENOUGH * len(rays):
@@ -106,8 +100,22 @@ def find_landmarks(
     )
 
 
-def _stretches(drives: Drives, segment: Ints, length_m: float) -> NDArray[np.uint32]:
+def vote_on_stretches(
+    rays: Rays, stretch: NDArray[np.uint32], config: MapConfig, gate_px: float, *, threads: int = 0
+) -> Candidates:
+    """Vote on every stretch (N, of each image) alone, through a gate."""
+    vote = VoteConfig(
+        max_reprojection_error_px=gate_px,
+        min_parallax_deg=config.vote.min_parallax_deg,
+        min_range_m=config.vote.min_range_m,
+        max_range_m=_RANGES * config.vote.max_range_m,
+        min_votes=_LEAST_VOTES,
+    )
+    return vote_in_clusters(rays, stretch, vote, threads=threads)[0]
+
+
+def stretches(drives: Drives, segment: Ints, config: MapConfig) -> NDArray[np.uint32]:
     """Return the stretch (N) of each image: segments cut into pieces of about the same length."""
-    piece = np.floor(drives.driven_m / length_m).astype(np.int64)
+    piece = np.floor(drives.driven_m / (_STRETCH_RANGES * config.vote.max_range_m)).astype(np.int64)
     code = segment * (int(piece.max(initial=0)) + 1) + piece
     return np.asarray(np.unique(code, return_inverse=True)[1], np.uint32)

@@ -16,12 +16,12 @@ from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives, InOrder, in_driving_order
 from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
+from valuemap.refine.delay import delay_alone
 from valuemap.refine.estimate import (
     Estimate,
     Marks,
     Trajectories,
     begin,
-    delay_together,
     estimate_again,
     go_on,
     lay,
@@ -61,8 +61,9 @@ FITS_NO_BETTER = "the poses as given fit better"
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What was estimated, and what of it is proven."""
+    """What was estimated, from poses moved on by `late_s`, and what of it is proven."""
 
+    late_s: float
     footage: Footage
     told: Trajectories
     result: Estimate
@@ -136,8 +137,10 @@ def _refined(dataset: Dataset, config: MapConfig, threads: int, progress: Progre
     if sample is not None:
         found = _find(*_part(moved, drives, sample), config, threads)
         progress("comparing drives", 1, 2)
-    if sample is None or _is_proven(found):
+    if sample is None:
         found = _find(moved, drives, config, threads)
+    elif found is not None and _is_proven(found):
+        found = _find(moved, drives, config, threads, late_s=found.late_s)
     progress("comparing drives", 2, 2)
     return _corrected(dataset, ordered, found, unit_m)
 
@@ -252,11 +255,14 @@ def _is_proven(found: Found | None) -> bool:
     return found is not None and found.selected is not None
 
 
-def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> Found | None:
+def _find(
+    dataset: Dataset, drives: Drives, config: MapConfig, threads: int, *, late_s: float | None = None
+) -> Found | None:
     """Estimate on a dataset in the working frame; where drives are far off, with landmarks of drives laid right.
 
-    Cameras askew are turned first, drive by drive, as what drives see is turned about them else and fits nowhere; then
-    poses that are late are moved on, as one thing seen from two sides is two else.
+    Poses that are late are moved on first, as one thing seen from two sides is two else. Then cameras askew are turned,
+    drive by drive, as what drives see is turned about them else and fits nowhere. `late_s` is None where it is not
+    known.
     """
     footage = gather(dataset, drives)
     proven = mend(dataset, drives)
@@ -267,27 +273,27 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
         # What is left once the jumps that trajectories prove are taken back.
         jumps, hints = find_jumps(laid.whole, laid.whole_drives), find_hints(laid.whole, laid.whole_drives)
         segment = jumps.of(laid.drives.pass_code, laid.drives.order)
+        if late_s is None:
+            late_s = delay_alone(lambda s: _laid(footage, turned, s, known), segment, config, threads=threads)
+        if late_s:
+            laid = _laid(footage, turned, late_s, known)
         landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, segment, config, threads=threads)
         for _ in range(_TURNS):
             more = mounts_alone(laid, landmarks)
             if not more.any():
                 break
             turned = turned + more
-            laid = _laid(footage, turned, 0.0, known)
-            landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, segment, config, threads=threads)
-        marks = lay(landmarks, laid, hints)
-        late_s = 0.0 if marks is None else delay_together(laid, marks)
-        if late_s:
             laid = _laid(footage, turned, late_s, known)
             landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, segment, config, threads=threads)
-            marks = lay(landmarks, laid, hints)
-            # Mean rates of steps in which turns begin are none of a delay: focal lengths took what they left.
-            footage = moving_late(footage, late_s)
+        marks = lay(landmarks, laid, hints)
     except SettingError:  # So many detections in one place that their votes fill the memory.
         return None
     if marks is None:
         return None
     told = Trajectories(jumps, hints, proven)
+    if late_s:
+        # Mean rates of steps in which turns begin are none of a delay: focal lengths took what they left.
+        footage = moving_late(footage, late_s)
 
     def begun(marks: Marks, known: tuple[Segments, Floats]) -> Estimate | None:
         return begin(footage, marks, config, told, known=known, turned_rad=turned, late_s=late_s)
@@ -310,7 +316,7 @@ def _find(dataset: Dataset, drives: Drives, config: MapConfig, threads: int) -> 
     result = go_on(footage, first, config, told)
     if result is None:
         return None
-    return Found(footage, told, result, select(footage, result))
+    return Found(late_s, footage, told, result, select(footage, result))
 
 
 def _is_lost(footage: Footage, result: Estimate) -> bool:

@@ -83,46 +83,6 @@ def register(landmarks: Landmarks, covariance: Floats, evidence: Floats | None =
     return Registration(shift, thing)
 
 
-@dataclass(frozen=True, eq=False)
-class Around:
-    """Pairs (P) of landmarks of different drives that may show one object, with how well each pair is told.
-
-    `first` and `second` (P) are rows of `point_in_world_m` (N, 3); `information` (P, 3, 3), 1/m², is that of their
-    difference, and `height` (P), 1/m³, the density where there is none.
-    """
-
-    point_in_world_m: Floats
-    first: Ints
-    second: Ints
-    information: Floats
-    height: Floats
-
-    @staticmethod
-    def of(landmarks: Landmarks, covariance: Floats) -> Around:
-        """Return those of landmarks with covariances (N, 3, 3), m²: which are around is told before they are moved."""
-        point, size = landmarks.point_in_world_m, np.where(landmarks.size_m > 0.0, landmarks.size_m, np.nan)
-        a, b = scipy.spatial.cKDTree(point[:, :2]).query_pairs(_AROUND_M, output_type="ndarray").T
-        fits = (landmarks.drive[a] != landmarks.drive[b]) & (landmarks.class_code[a] == landmarks.class_code[b])
-        fits &= ~(np.abs(np.log(size[a] / size[b])) > math.log(_SAME_SIZE))
-        a, b = a[fits], b[fits]
-        total = covariance[a] + covariance[b] + np.diag([_SMOOTH_M**2, _SMOOTH_M**2, _HEIGHT_M**2])
-        return Around(point, a, b, np.linalg.inv(total), 1.0 / np.sqrt(np.linalg.det(2.0 * np.pi * total)))
-
-    def togetherness(self, shift_m: Floats) -> float:
-        """Return the sum of log L of landmarks moved by shifts (N, 3), m, given those of other drives around them."""
-        moved = self.point_in_world_m + shift_m
-        apart = moved[self.first] - moved[self.second]
-        square = np.einsum("ni,nij,nj->n", apart, self.information, apart)
-        density = self.height * np.exp(-0.5 * square)
-        count = len(moved)
-        around = np.bincount(self.first, minlength=count) + np.bincount(self.second, minlength=count)
-        found = np.bincount(self.first, weights=density, minlength=count)
-        found += np.bincount(self.second, weights=density, minlength=count)
-        found = found[around > 0] / around[around > 0]
-        volume_m3 = math.pi * _AROUND_M**2 * _HIGH_M
-        return float(np.sum(np.log(1.0 - _SHARED + _SHARED * volume_m3 * found)))
-
-
 def _order_of_laying(point: Floats, by_drive: list[Ints]) -> list[int]:
     """Return the drives, the one with most landmarks first, then always one that meets most of what is known."""
     if not by_drive:
