@@ -80,7 +80,7 @@ def test_every_place_is_in_one_cell(seed: int, most: int) -> None:
     cells = census(place_m, grid).cells(grid)
     inside = np.stack([grid.is_within(cell, place_m) for cell in cells])
     assert np.all(inside.sum(axis=0) == 1)
-    assert np.array_equal(grid.find(place_m, cells), np.argmax(inside, axis=0))
+    assert np.array_equal(grid.find(place_m, list(cells)), np.argmax(inside, axis=0))
     assert (max(cell.level for cell in cells) > 0) == (most < 10**6)
 
 
@@ -95,7 +95,7 @@ def test_borders_belong_to_one_side() -> None:
 
 def test_what_is_no_wider_than_a_cell_is_one_wherever_it_is() -> None:
     place_m = np.array([[470.0, 470.0], [1400.0, 1420.0]])
-    assert census(place_m).cells(GRID) == [WHOLE]
+    assert census(place_m).cells(GRID) == {WHOLE: 2}
     assert len(census(place_m).cells(replace(GRID, most_detections=1))) > 1  # But not if it is too dense.
     assert len(census(place_m + [[0.0, 0.0], [100.0, 0.0]]).cells(GRID)) > 1
 
@@ -655,6 +655,42 @@ def test_what_was_made_with_other_settings_is_not_taken(long_street: Path, tmp_p
         other = solve_cells(source, noisy, KNOWN, ThreadEngine(2), silent, store=work / "cells")
     assert first == again
     assert not set(map(str, first)) & set(map(str, other))
+
+
+class Listed(ThreadEngine):
+    """Threads that remember what they were given."""
+
+    def run(self, work: Any, tasks: Any, *, on_gpus: bool = False) -> Any:
+        self.work, self.tasks = work, list(tasks)
+        return super().run(work, tasks, on_gpus=on_gpus)
+
+
+def test_cells_with_most_detections_are_solved_first(long_street: Path, tmp_path: Path) -> None:
+    dataset = valuemap.read_dataset(long_street)
+    last = int(dataset.images.image_id[-1])
+    sparse = dataset.detections.take(dataset.detections.image_id > last // 2)  # The cells of the first half have less.
+    dataset = replace(dataset, detections=sparse, truth_detections=None)
+    valuemap.write_dataset(dataset, tmp_path / "dataset")
+    for source in (InMemory(dataset, KNOWN), partition_dataset(tmp_path / "dataset", tmp_path, KNOWN)):
+        engine = Listed(2)
+        solve_cells(source, learned(source.sample()), KNOWN, engine, silent)
+        sizes = dict(zip(source.cells, source.sizes, strict=True))
+        assert [sizes[cell] for cell in engine.tasks] == sorted(source.sizes, reverse=True)
+        assert engine.tasks != source.cells
+
+
+def test_cells_that_are_known_leave_all_threads_to_the_others(long_street: Path, tmp_path: Path) -> None:
+    with open_work(tmp_path / "work", resume=False) as work:
+        source = InMemory(valuemap.read_dataset(long_street), KNOWN)
+        known, engine = learned(source.sample()), Listed(2)
+        first = solve_cells(source, known, KNOWN, engine, silent, store=work / "cells")
+        assert len(engine.tasks) > 2
+        assert engine.work.threads == 1
+        assert isinstance(first[1], Path)
+        first[1].unlink()
+        assert solve_cells(source, known, KNOWN, engine, silent, store=work / "cells") == first
+    assert engine.tasks == source.cells[1:2]
+    assert engine.work.threads == 2
 
 
 @pytest.mark.parametrize("where", [".", "cells"])

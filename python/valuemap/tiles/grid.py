@@ -178,22 +178,22 @@ class Census:
         high = np.maximum(self.extent_m[2:], other.extent_m[2:]).tolist()
         return Census(square, images.astype(np.int64), detections.astype(np.int64), (*low, *high))
 
-    def cells(self, grid: Grid) -> list[Cell]:
-        """Return the cells, ascending, that may have images in or around them."""
+    def cells(self, grid: Grid) -> dict[Cell, int]:
+        """Return the cells, ascending, that may have images in or around them, with how many detections there are."""
         is_narrow = not len(self.square) or max(np.subtract(self.extent_m[2:], self.extent_m[:2])) <= grid.side_m
         if is_narrow and self.detections.sum() <= grid.most_detections:
-            return [WHOLE]
+            return {WHOLE: int(self.detections.sum())}
         reach = grid.halo_squares
         around = np.concatenate([self.square + step for step in np.ndindex(2 * reach + 1, 2 * reach + 1)]) - reach
         bases = np.unique(around >> LEVELS, axis=0).tolist()
-        return sorted(cell for x, y in bases for cell in self._split(grid, Cell((x, y))))
+        return dict(sorted(found for x, y in bases for found in self._split(grid, Cell((x, y)))))
 
-    def _split(self, grid: Grid, cell: Cell) -> list[Cell]:
+    def _split(self, grid: Grid, cell: Cell) -> list[tuple[Cell, int]]:
         images, detections = self._around(grid, cell)
         if images == 0:
             return []
         if detections <= grid.most_detections or cell.level == LEVELS:
-            return [cell]
+            return [(cell, detections)]
         x, y = cell.place
         parts = [Cell(cell.base, cell.level + 1, (2 * x + i, 2 * y + j)) for i, j in np.ndindex(2, 2)]
         return [final for part in parts for final in self._split(grid, part)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,14 +36,12 @@ class CellTask:
 
     def __call__(self, cell: Cell, progress: Progress) -> Solved | Place | None:
         """Return the labels of a cell, or where they are; nothing where there are no images."""
-        key = None if self.store is None else self.source.fingerprint(cell, self.settings)
-        if key is not None and (done := self._done(cell, key)) is not None:
-            return done
         piece = self.source.piece(cell)
         if not len(piece.image_id):
             return None
         grid, file = self.source.grid, None
         if self.store is not None:
+            key = self.source.fingerprint(cell, self.settings)
             if key is None:
                 key = Fingerprints(piece).of(np.arange(len(piece.image_id)), cell, self.settings)
                 if (done := self._done(cell, key)) is not None:
@@ -54,6 +52,11 @@ class CellTask:
             return solved
         save_cell(solved, file)
         return file
+
+    def done(self, cell: Cell) -> Place | None:
+        """Return where the labels of a cell are, if they are there and that is known before its piece is made."""
+        key = None if self.store is None else self.source.fingerprint(cell, self.settings)
+        return None if key is None else self._done(cell, key)
 
     def _done(self, cell: Cell, key: str) -> Place | None:
         """Return where the labels of a cell are, made from what has this hash, if they are there."""
@@ -86,11 +89,15 @@ def solve_cells(
     if len(cells) == 1:  # It tells how far it is.
         result = task(cells[0], progress)
         return [] if result is None else [result]
-    solved: list[Solved | Place | None] = [None] * len(cells)
     with counted(progress, "cells", len(cells)) as tell:
-        for done, (number, result) in enumerate(engine.run(task, cells), start=1):
-            solved[number] = result
-            tell(done)
+        solved: list[Solved | Place | None] = [task.done(cell) for cell in cells]
+        largest_first = np.argsort(-np.array(source.sizes), kind="stable").tolist()  # So that all cores end together.
+        todo = [row for row in largest_first if solved[row] is None]
+        task = replace(task, threads=engine.threads_of_task(len(todo)))
+        tell(len(cells) - len(todo))
+        for left, (place, result) in enumerate(engine.run(task, [cells[row] for row in todo]), start=1):
+            solved[todo[place]] = result
+            tell(len(cells) - len(todo) + left)
     return [result for result in solved if result is not None]
 
 

@@ -87,7 +87,12 @@ class OnDisk:
     @cached_property
     def cells(self) -> list[Cell]:
         """The cells, ascending."""
-        return [Cell((x, y), level, (i, j)) for (x, y), level, (i, j) in self._meta["cells"]]
+        return [Cell((x, y), level, (i, j)) for (x, y), level, (i, j), _ in self._meta["cells"]]
+
+    @property
+    def sizes(self) -> list[int]:
+        """How many detections there are in and around each cell."""
+        return [size for *_, size in self._meta["cells"]]
 
     @cached_property
     def grid(self) -> Grid:
@@ -234,14 +239,14 @@ class _Writer:
             done += len(portion)
             self.progress("cutting into tiles", done, total)
         cells = census.cells(self.grid)
-        squares = census.square if cells == [WHOLE] else sampled_squares(census)
+        squares = census.square if WHOLE in cells else sampled_squares(census)
         self._write(_CAMERAS, lambda file: pq.write_table(table_to_arrow(self.reader.cameras), file))
         record = {
             "name": self.reader.name,
             "frame": self.reader.frame.to_json(),
             "max_range_m": self.max_range_m,
             "cells_across": self.cells_across,
-            "cells": [[cell.base, cell.level, cell.place] for cell in cells],
+            "cells": [[cell.base, cell.level, cell.place, size] for cell, size in cells.items()],
             "sample": squares.tolist(),
             "classes": list(classes),
             "columns": self.columns,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cached_property
-from threading import Lock
 from typing import Any, Protocol
 
 import numpy as np
@@ -31,6 +30,11 @@ class Source(Protocol):
     @property
     def cells(self) -> list[Cell]:
         """The cells, ascending."""
+        ...
+
+    @property
+    def sizes(self) -> list[int]:
+        """How many detections there are in and around each cell, by which it takes long to solve."""
         ...
 
     @property
@@ -64,9 +68,10 @@ class InMemory:
         images, detections = self._ordered.dataset.images, self._ordered.dataset.detections
         self._place_m = self.grid.images_on_ground(images)
         self._census = Census.of(self.grid, self._place_m, np.bincount(detections.image_id, minlength=len(images)))
-        self.cells: list[Cell] = self._census.cells(self.grid)
+        cells = self._census.cells(self.grid)
+        self.cells: list[Cell] = list(cells)
+        self.sizes: list[int] = list(cells.values())
         self._places = Places(self.grid, self._place_m)
-        self._lock = Lock()
 
     def piece(self, cell: Cell) -> InOrder:
         """Return what a cell is solved with."""
@@ -74,10 +79,8 @@ class InMemory:
 
     def fingerprint(self, cell: Cell, settings: str) -> str:
         """Return what tells the piece of a cell apart."""
-        with self._lock:  # Several threads would all make the same.
-            fingerprints = self._fingerprints
         rows = np.arange(len(self._ordered.image_id)) if cell == WHOLE else self._places.around(cell)
-        return fingerprints.of(rows, cell, settings)
+        return self._fingerprints.of(rows, cell, settings)
 
     @cached_property
     def _fingerprints(self) -> Fingerprints:
