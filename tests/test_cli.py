@@ -56,6 +56,21 @@ def one_line_and_a_hint(code: int, stdout: str, stderr: str) -> str:
     return stderr
 
 
+def test_no_package_is_asked_for_plugins() -> None:
+    asked = """
+import sys
+import importlib.metadata as metadata
+def entry_points(**group): raise AssertionError(group)
+metadata.entry_points = entry_points
+from valuemap.cli import main
+sys.argv = ["valuemap", "map", "--help"]
+main()
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "PYDANTIC_DISABLE_PLUGINS"}
+    done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+
+
 def test_threads_of_blas_do_not_wait_in_a_loop() -> None:
     asked = """
 import sys

@@ -16,6 +16,7 @@ def main() -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         # Arrow then takes memory that arrays gave back: that of a pool of its own is zeroed first, 0.2 s of an update.
         os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
+        os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # They are looked for in all packages there are.
         gc.disable()  # What is imported stays: looking for garbage among it takes a fifth of the time.
         from valuemap.cli.app import app
         from valuemap.cli.load import load_commands
