@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from threading import Barrier
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from valuemap.dataset import Dataset, Frame, evenly, read_dataset, rows_of, writ
 from valuemap.errors import InputError, OutputError
 from valuemap.folders import LEDGER, new_file
 from valuemap.summary import summarize_dataset, summarize_portions
-from valuemap.tables import Categories, table_to_arrow
+from valuemap.tables import Categories, Detections, Images, read_table, table_to_arrow
 
 TABLES = ("cameras", "images", "detections", "truth", "truth_detections")
 
@@ -93,6 +94,30 @@ def test_a_detection_may_reach_out_of_its_picture_by_a_box(folder: Path) -> None
     rewrite(folder / "detections.parquet", with_value("x", 0, -10.0))
     rewrite(folder / "detections.parquet", with_value("y", 1, 500.0))
     assert len(read_dataset(folder).detections) == 5
+
+
+@pytest.mark.parametrize(("width", "is_fine"), [(640, False), (800, True)])  # The other camera has 800 px.
+def test_a_picture_ends_where_that_of_its_camera_does(folder: Path, width: int, is_fine: bool) -> None:
+    rewrite(folder / "cameras.parquet", with_value("width", 0, width))
+    rewrite(folder / "cameras.parquet", with_value("height", 0, 600))
+    rewrite(folder / "detections.parquet", with_value("x", 0, 700.0))
+    if is_fine:
+        assert len(read_dataset(folder).detections) == 5
+    rewrite(folder / "detections.parquet", with_value("x", 0, width + 10.1))
+    with pytest.raises(InputError, match=rf"detection_id 100: x: expected a centre .* found {width + 10.1}"):
+        read_dataset(folder)
+
+
+def test_images_and_detections_are_read_beside_each_other(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    both = Barrier(2)
+
+    def waits(kind: Any, path: Path) -> Any:
+        if kind in (Images, Detections):
+            both.wait(timeout=30.0)  # Raises where the other one does not come.
+        return read_table(kind, path)
+
+    monkeypatch.setattr("valuemap.dataset.read_table", waits)
+    assert_same_dataset(read_dataset(folder), small_dataset())
 
 
 def test_rows_of_ids() -> None:

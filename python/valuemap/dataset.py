@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -195,18 +196,20 @@ def read_dataset(path: str | Path, *, are_boxes_checked: bool = True) -> Dataset
         name: read_table(kind, folder / f"{name}.parquet") if (folder / f"{name}.parquet").is_file() else None
         for name, kind in (("truth", Truth), ("truth_detections", TruthDetections), ("rejected", RejectedRows))
     }
-    return check_dataset(
-        Dataset(
+    frame = Frame.from_json(head.get("frame"), source=str(folder / MARKER))
+    cameras = read_table(Cameras, folder / "cameras.parquet")
+    with ThreadPoolExecutor(1) as beside:
+        detections = beside.submit(read_table, Detections, folder / "detections.parquet")
+        images = read_table(Images, folder / "images.parquet")
+        dataset = Dataset(
             name=str(head.get("name", folder.name)),
-            frame=Frame.from_json(head.get("frame"), source=str(folder / MARKER)),
-            cameras=read_table(Cameras, folder / "cameras.parquet"),
-            images=read_table(Images, folder / "images.parquet"),
-            detections=read_table(Detections, folder / "detections.parquet"),
+            frame=frame,
+            cameras=cameras,
+            images=images,
+            detections=detections.result(),
             **optional,  # type: ignore[arg-type]
-        ),
-        source=str(folder),
-        are_boxes_checked=are_boxes_checked,
-    )
+        )
+    return check_dataset(dataset, source=str(folder), are_boxes_checked=are_boxes_checked)
 
 
 def read_images(path: str | Path) -> tuple[Cameras, Images]:
@@ -492,19 +495,24 @@ def check_detections(
     if not are_boxes_checked:
         return
     where = (source, "detections", "detection_id")
+    center_px, size_px = detections.center_px, detections.size_px
+    # Both columns at once: one of them alone takes as long.
+    is_negative, is_too_large = size_px < 0.0, size_px > _LARGEST_PX
     for i, name in enumerate(("width", "height")):
-        size = detections.size_px[:, i]
-        _refuse(size < 0.0, size, ids, *where, name, "expected at least 0 px")
-        _refuse(size > _LARGEST_PX, size, ids, *where, name, f"expected at most {_LARGEST_PX:g} px")
+        _refuse(is_negative[:, i], size_px[:, i], ids, *where, name, "expected at least 0 px")
+        _refuse(is_too_large[:, i], size_px[:, i], ids, *where, name, f"expected at most {_LARGEST_PX:g} px")
     for name in ("range_m", "range_sigma_m", "vertical_sigma_px"):
         _check_positive(getattr(detections, name), ids, *where, name)
-    camera_row = rows_of(camera_id, cameras.camera_id)[rows_of(detections.image_id, image_id)]
-    for i, (axis, extent) in enumerate((("x", cameras.width_px), ("y", cameras.height_px))):
-        center, size, limit = detections.center_px[:, i], detections.size_px[:, i], extent[camera_row]
-        outside: Bools = (center < -size) | (center > limit + size)
+    extent_px = np.column_stack([cameras.width_px, cameras.height_px])
+    if np.all(extent_px == extent_px[:1]):
+        extent_px = extent_px[:1]  # Nobody has to ask which camera it was.
+    else:
+        extent_px = extent_px[rows_of(camera_id, cameras.camera_id)[rows_of(detections.image_id, image_id)]]
+    is_outside = (center_px < -size_px) | (center_px > extent_px + size_px)
+    for i, axis in enumerate(("x", "y")):
         _refuse(
-            outside,
-            center,
+            is_outside[:, i],
+            center_px[:, i],
             ids,
             *where,
             axis,
