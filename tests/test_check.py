@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,16 +15,19 @@ from typer.testing import CliRunner
 
 from check_faults import FAULTS as INJECTED
 from check_faults import good_city
+from small_dataset import small_dataset
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check import examine, lenses
+from valuemap.check import cameras, examine, fit, lenses
 from valuemap.check.agreement import Agreement, compare, gains_of_objects, measure_agreement
+from valuemap.check.boxes import PictureSize
 from valuemap.check.cameras import PARAMETERS, _Correction, _followed, _is_wider_gate_only, with_focal
 from valuemap.check.contest import _compare, _joined, _Reading, _suspicion, hold_contest
 from valuemap.check.fault import LEAST_CHANCE, Convention, View, gains_of_all, keep_rows, with_poses
-from valuemap.check.fit import Parameter, estimate
+from valuemap.check.fit import Estimate, Parameter, estimate
 from valuemap.check.headings import headings, level_rotations, rotations_of
 from valuemap.check.offsets import find_shift
-from valuemap.check.passes import _at_a_seam, _seen_m, moved_along
+from valuemap.check.passes import _at_a_seam, _jumping_passes, _seen_m, moved_along
+from valuemap.check.quality import TruthElsewhere
 from valuemap.check.registry import CONVENTIONS, FAULTS
 from valuemap.check.sample import driving_order
 from valuemap.check.seams import worst_seam
@@ -31,6 +35,7 @@ from valuemap.check.sizes import object_heights
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, read_dataset, write_dataset
 from valuemap.errors import InputError
+from valuemap.simulate import PRESETS, simulate
 from valuemap.tables import Categories, Floats
 
 _CONVENTIONS = {convention.name for convention in CONVENTIONS}
@@ -225,6 +230,115 @@ def test_what_agrees_the_more_the_farther_is_followed_so_far_and_no_farther(
     assert len(tried) <= 1 + 6 + 12
 
 
+def test_what_the_opposite_gives_as_well_is_no_correction(view: View, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poses that are moved along a drive either way are smoother than measured ones, so rays agree the better."""
+    random = np.random.default_rng(0)
+
+    def gains(_view: View, version: Dataset, **_: bool) -> Floats:
+        return np.full(40, 100.0 if version is view.dataset else 110.0) + random.normal(0.0, 1.0, 40)
+
+    monkeypatch.setattr(cameras, "gains_of_all", gains)
+    monkeypatch.setattr(cameras, "_better", lambda *given: given[2:])
+    certain = Estimate(("along",), np.array([0.5]), np.array([[1e-6]]), 40, 400)
+    monkeypatch.setattr(cameras, "common_errors", lambda _: certain)
+    assert cameras._find_correction(view) is None
+
+
+def test_a_vote_whose_camera_has_no_ray_a_step_away_is_left_out(view: View, monkeypatch: pytest.MonkeyPatch) -> None:
+    residuals = fit._residuals
+
+    def without_one(*given: Any) -> Floats:
+        found = residuals(*given)
+        found[0] = np.inf
+        return found
+
+    monkeypatch.setattr(fit, "_residuals", without_one)
+    found = estimate(view.dataset, view.many_places, view.gate_px, PARAMETERS[:1])
+    assert found is not None
+    assert abs(found.value[0]) < 3.0 * found.of("pitch")[1]
+
+
+def test_a_pass_that_drives_its_streets_again_and_again_is_a_drive() -> None:
+    """Its laps lie closer to each other than its steps are long."""
+    lap, step = np.divmod(np.arange(400), 40)
+    angle = 2.0 * np.pi * (step + 0.09 * lap) / 40
+    center = np.stack([50.0 * np.cos(angle), 50.0 * np.sin(angle), 0.0 * angle], axis=1)
+    images = small_dataset().images.take(np.zeros(400, dtype=np.int64))
+    images = images.replace(
+        image_id=np.arange(400),
+        cam_from_world_quat=np.tile([1.0, 0.0, 0.0, 0.0], (400, 1)),
+        cam_from_world_m=-center,
+        timestamp_s=np.arange(400.0),
+    )
+    assert _jumping_passes(images) == []
+    dealt = np.random.default_rng(0).permutation(400).astype(np.float64)
+    assert len(_jumping_passes(images.replace(timestamp_s=dealt))) == 1
+
+
+_LOOSE = replace(
+    PRESETS["small"], position_white_m=0.4, position_drift_m=1.5, rotation_white_deg=0.3, rotation_drift_deg=0.8
+)
+"""Poses as of a phone: metres and most of a degree off."""
+
+
+@pytest.fixture(scope="module")
+def loose() -> View:
+    return View(simulate(replace(_LOOSE, passes_per_street=1), seed=302))
+
+
+def test_rays_that_hardly_part_do_not_say_how_large_things_are(loose: View) -> None:
+    height_m, points = object_heights(loose)["traffic_light"]
+    assert height_m == pytest.approx(1.0, rel=0.3)
+    assert points >= 3
+
+
+def test_truth_is_not_called_misplaced_where_poses_are_metres_off(loose: View) -> None:
+    assert TruthElsewhere().find(loose) is None
+    assert loose.dataset.truth is not None
+    moved = loose.dataset.truth.replace(position_in_world_m=loose.dataset.truth.position_in_world_m + [2e4, 0.0, 0.0])
+    assert TruthElsewhere().find(View(replace(loose.dataset, truth=moved))) is not None
+
+
+def test_nothing_measured_is_given_up_where_another_reading_stands_the_cameras_up() -> None:
+    given = simulate(_LOOSE, seed=300)
+    spoiled = INJECTED["inverted_poses"].spoil(given)
+    assert spoiled is not None
+    finding = hold_contest(View(spoiled), CONVENTIONS).finding
+    assert finding is not None
+    assert finding.fault == "inverted_poses"
+
+
+def test_boxes_are_not_said_to_be_of_pictures_that_they_would_not_be_in(good: Dataset) -> None:
+    assert not [how for how, _ in PictureSize().readings(good) if "boxes 2 " in how]
+    halved = INJECTED["picture_size"].spoil(good)
+    assert halved is not None
+    assert [how for how, _ in PictureSize().readings(halved) if "boxes 2 " in how]
+
+
+def test_a_focal_length_is_no_lens(view: View, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fisheye for a pinhole makes up for part of a focal length that is too long."""
+    random = np.random.default_rng(0)
+
+    def gains(_: View, version: Dataset) -> Floats:
+        is_lens = version.cameras.model.names == ("OPENCV_FISHEYE",)
+        is_shorter = version.cameras.params[0][0] < 0.95 * view.dataset.cameras.params[0][0]
+        return np.full(200, 100.0 + 10.0 * is_lens + 20.0 * is_shorter) + random.normal(0.0, 0.3, 200)
+
+    monkeypatch.setattr(lenses, "gains_of_all", gains)
+    assert lenses.LensModel().find(view) is None
+
+
+def test_a_wrong_camera_of_passes_with_few_stretches_is_named() -> None:
+    spoiled = INJECTED["wrong_camera"].spoil(good_city(300))
+    assert spoiled is not None
+    assert cameras.WrongCamera().find(View(spoiled)) is not None
+
+
+def test_images_of_one_time_have_no_speed(good: Dataset) -> None:
+    images = good.images.replace(timestamp_s=np.floor(np.asarray(good.images.timestamp_s)))
+    worst_seam(replace(good, images=images), camera_centers(images))
+
+
 def test_every_fault_of_the_registry_is_injected() -> None:
     known = _CONVENTIONS | set(_FAULT)
     assert set(INJECTED) <= known
@@ -415,7 +529,8 @@ def test_a_lens_is_named_only_where_it_changes_a_map(
     random = np.random.default_rng(0)
 
     def gains(_: View, version: Dataset) -> Floats:
-        return 100.0 + (0.0 if version is view.dataset else rise) + random.normal(0.0, 0.3, 200)
+        is_lens = version.cameras.model.names != view.dataset.cameras.model.names
+        return 100.0 + (rise if is_lens else 0.0) + random.normal(0.0, 0.3, 200)
 
     monkeypatch.setattr(lenses, "gains_of_all", gains)
     found = lenses.LensModel().find(view)

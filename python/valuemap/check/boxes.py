@@ -18,6 +18,8 @@ from valuemap.tables import Bools, Floats, Ints
 _NORMALISED_LIMIT = 2.0
 _STRAYS = 0.02
 """A gap with more boxes in it than this share of those beside it is none."""
+_NEARLY_ALL = 0.99
+"""Of the boxes have their middle in the picture."""
 
 
 def picture_sizes(dataset: Dataset) -> Floats:
@@ -154,12 +156,14 @@ class PictureSize(Convention):
     do: ClassVar[str] = "Give width, height and parameters of the cameras for the pictures that were looked at."
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
-        """Yield boxes of pictures enlarged or shrunk."""
+        """Yield boxes of pictures enlarged or shrunk, but not so much that they would be outside of theirs."""
+        reach = float(np.quantile((dataset.detections.center_px / picture_sizes(dataset)).max(axis=1), _NEARLY_ALL))
         for name, factor in (
             ("4", 4.0), ("3", 3.0), ("2", 2.0), ("1.5", 1.5), ("4/3", 4 / 3), ("3/4", 0.75),
             ("2/3", 2 / 3), ("1/2", 0.5), ("1/3", 1 / 3), ("1/4", 0.25),
         ):  # fmt: skip
-            yield f"boxes {name} times as large", _Scaled(factor)
+            if factor < 1.0 or factor * reach <= 1.0:
+                yield f"boxes {name} times as large", _Scaled(factor)
 
 
 class MirroredPictures(Convention):

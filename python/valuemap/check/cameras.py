@@ -137,7 +137,9 @@ def _find_correction(view: View) -> _Correction | None:
         parameter = next(p for p in PARAMETERS if p.name == name)
         gains = gains_of_all(view, parameter.change(view.dataset, value))
         value, sigma, gains = _better(view, parameter, value, sigma, gains)
-        comparison = compare(gains, given)
+        # What the opposite gives as well is none of it: poses moved along their drives are smoother than measured ones.
+        opposite = gains_of_all(view, parameter.change(view.dataset, -value))
+        comparison = compare(gains, opposite if opposite.sum() > given.sum() else given)
         chance = max(chance, comparison.chance * tests * 2)  # Of each parameter two values are tried.
         if chance > LEAST_CHANCE or comparison.difference < LEAST_RISE * float(given.sum()):
             continue
@@ -242,7 +244,10 @@ class TimeShift(_CommonError):
 
     name: ClassVar[str] = "time_shift"
     parameters: ClassVar[tuple[str, ...]] = ("along",)
-    do: ClassVar[str] = "Correct the clock between cameras and poses (trigger, exposure or network delay)."
+    do: ClassVar[str] = (
+        "Correct the clock between cameras and poses (trigger, exposure or network delay). If it is a whole number of "
+        "images: are detections listed with the images before or after theirs?"
+    )
 
     def says(self, view: View, name: str, value: float) -> str:
         """Return what is wrong."""
@@ -416,20 +421,22 @@ def _best_cameras(view: View) -> tuple[list[dict[str, Any]], float]:
     place_camera = np.zeros(sample.places, dtype=np.int64)
     place_pass[sample.place_of_image] = images.pass_id.codes
     place_camera[sample.place_of_image] = images.camera_id
-    gains = {}
+    gains: dict[int, Floats] = {}
     for row, camera in enumerate(cameras.camera_id.tolist()):
-        other = with_images(sample.dataset, camera_id=np.full(len(images), camera))
+        version = with_images(sample.dataset, camera_id=np.full(len(images), camera))
         gate_px = view.gate_px * pixels_per_radian_of(view.dataset, row) / pixels_per_radian(view.dataset)
-        gains[camera] = measure_agreement(other, sample.place_of_image, gate_px).gain
+        gains[camera] = measure_agreement(version, sample.place_of_image, gate_px).gain
     best: list[dict[str, Any]] = []
-    better, worse = [], []
+    better: list[Floats] = []
+    worse: list[Floats] = []
     groups = np.unique(np.stack([place_pass, place_camera], axis=1), axis=0)
     for code, camera in groups.tolist():
         of_group = (place_pass == code) & (place_camera == camera)
         given = gains[camera][of_group]
         comparisons = {other: compare(gain[of_group], given) for other, gain in gains.items() if other != camera}
         other = min(comparisons, key=lambda each: (comparisons[each].chance, -comparisons[each].difference))
-        if comparisons[other].chance > _SUSPICIOUS:
+        least_rise = LEAST_RISE * float(given.sum())
+        if comparisons[other].chance > _SUSPICIOUS or comparisons[other].difference < least_rise:
             continue
         better.append(gains[other][of_group])
         worse.append(given)
@@ -451,7 +458,7 @@ def _best_cameras(view: View) -> tuple[list[dict[str, Any]], float]:
     return (best, chance) if chance < LEAST_CHANCE else ([], 1.0)
 
 
-_SUSPICIOUS = 0.01
+_SUSPICIOUS = 0.05
 _MOST_CAMERAS = 6
 
 

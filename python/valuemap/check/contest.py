@@ -143,6 +143,8 @@ def _judge(view: View, readings: Sequence[_Reading], top: _Reading) -> Finding |
     if given in alike:
         return None
     alike = [reading for reading in alike if reading.is_upright] or alike
+    if not given.is_upright:  # What was measured may well stand: nothing need be given up for a guess.
+        alike = [reading for reading in alike if not reading.is_guess] or alike
     most = max(total[id(reading)] for reading in alike)
     chosen = next(reading for reading in alike if total[id(reading)] > (1.0 - _TIE) * most)
     assert chosen.convention is not None

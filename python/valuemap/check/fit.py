@@ -109,21 +109,17 @@ def _solve(dataset: Dataset, sample: Sample, gate_px: float, parameters: tuple[P
     voter, point_of = voters[rows], np.repeat(np.arange(len(kept)), votes[kept])
     point = agreement.points_in_world_m[kept]
     residual = _residuals(rays, voter, point[point_of])
-    slope = np.stack(
-        [
-            (
-                _at(dataset, sample, p, p.step, voter, point[point_of])
-                - _at(dataset, sample, p, -p.step, voter, point[point_of])
-            )
-            / (2.0 * p.step)
-            for p in parameters
-        ],
-        axis=2,
-    )
+    slope = np.stack([_slope(dataset, sample, p, voter, point[point_of]) for p in parameters], axis=2)
     of_point = _slopes_of_points(rays, voter, point[point_of])
+    # A step may take a pixel to where its camera has no ray.
+    tells = np.all(
+        [np.isfinite(each).reshape(len(rows), -1).all(axis=1) for each in (residual, slope, of_point)], axis=0
+    )
+    for values in (residual, slope, of_point):
+        values[~tells] = 0.0
     size = np.linalg.norm(residual, axis=1)
     scale = _CAUCHY * max(float(np.median(size)), 1e-9)
-    weight = 1.0 / (1.0 + (size / scale) ** 2)
+    weight = tells / (1.0 + (size / scale) ** 2)
     place = sample.place_of_image[rays.image_row[voter]]
     gradient, curvature = _eliminate(residual, slope, of_point, weight, point_of, place)
     total = curvature.sum(axis=0)
@@ -138,13 +134,20 @@ def _solve(dataset: Dataset, sample: Sample, gate_px: float, parameters: tuple[P
     return Estimate(tuple(p.name for p in parameters), value, inverse @ meat @ inverse, count, len(kept))
 
 
-def _at(dataset: Dataset, sample: Sample, parameter: Parameter, value: float, voter: Ints, point: Floats) -> Floats:
-    return _residuals(cast_rays(sample.of(parameter.change(dataset, value))), voter, point)
+def _slope(dataset: Dataset, sample: Sample, parameter: Parameter, voter: Ints, point: Floats) -> Floats:
+    """Return d residual / d parameter (N, 2)."""
+    ahead, behind = (
+        _residuals(cast_rays(sample.of(parameter.change(dataset, way * parameter.step))), voter, point)
+        for way in (1.0, -1.0)
+    )
+    with np.errstate(invalid="ignore"):
+        return np.asarray((ahead - behind) / (2.0 * parameter.step))
 
 
 def _residuals(rays: Rays, voter: Ints, point: Floats) -> Floats:
     local = np.einsum("nij,nj->ni", rays.residual_from_world[voter], point - rays.center_in_world_m[voter])
-    return np.asarray(local[:, :2] / local[:, 2:])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(local[:, :2] / local[:, 2:])
 
 
 def _slopes_of_points(rays: Rays, voter: Ints, point: Floats) -> Floats:
@@ -172,7 +175,7 @@ def _eliminate(
     np.add.at(g, point_of, np.einsum("n,nkp,nk->np", weight, slope, residual))
     np.add.at(h, point_of, np.einsum("n,nkp,nkq->npq", weight, slope, slope))
     trace = np.trace(a, axis1=1, axis2=2)
-    inverse = np.linalg.inv(a + (1e-9 * trace[:, None, None]) * np.eye(3))
+    inverse = np.linalg.inv(a + np.maximum(1e-9 * trace, 1e-12)[:, None, None] * np.eye(3))
     g = g - np.einsum("nip,nij,nj->np", b, inverse, c)
     h = h - np.einsum("nip,nij,njq->npq", b, inverse, b)
     first = np.searchsorted(point_of, np.arange(count))

@@ -88,7 +88,7 @@ class LensModel(Fault):
                 continue
             if best is None or compare(gain, best[2]).chance < LEAST_CHANCE:
                 best = how, fix, gain, comparison
-        if best is None:
+        if best is None or any(self._agreement(view, factor) >= best[2].sum() for factor in _FOCAL_FACTORS):
             return None
         how, fix, _, comparison = best
         return Finding(
@@ -101,6 +101,14 @@ class LensModel(Fault):
             figures={"reading": how, **comparison.to_json()},
             fix=fix,
         )
+
+    def _agreement(self, view: View, focal_factor: float) -> float:
+        """Return how well rays agree with other focal lengths, which are more often wrong than the kind of lens."""
+        count = len(view.dataset.cameras)
+        return float(gains_of_all(view, _Focal(np.full(count, focal_factor))(view.dataset)).sum())
+
+
+_FOCAL_FACTORS = (0.7, 0.8, 0.9, 1.1, 1.25, 1.4)
 
 
 def _lenses(dataset: Dataset) -> Iterator[tuple[str, Fix]]:

@@ -312,11 +312,12 @@ def _jumping_passes(images: Images) -> list[dict[str, Any]]:
         moving = rows[np.append(True, step > standing_m(step))]
         if len(moving) < _LEAST_IMAGES:
             continue
-        step = np.linalg.norm(np.diff(center[moving], axis=0), axis=1)
+        way = np.diff(center[moving], axis=0)
+        step = np.linalg.norm(way, axis=1)
         nearest = _typical_gap(center[moving])
         if nearest <= 0.0:
             continue
-        jumps = float((step > _JUMP_TIMES * nearest).mean())
+        jumps = float(((step > _JUMP_TIMES * nearest) & ~_leads_on(way)).mean())
         if jumps <= _MOST_JUMPS:
             continue
         # Of few drives in turn, one of the last images is near; of none, hardly ever.
@@ -335,6 +336,16 @@ def _jumping_passes(images: Images) -> list[dict[str, Any]]:
             }
         )
     return found
+
+
+def _leads_on(way: Floats) -> Bools:
+    """Return which steps (N, 3) go on from the one before and lead to the one after, as those of a drive do.
+
+    Where a pass drives a road again and again, its nearest image is of another lap, much nearer than any step.
+    """
+    turn = np.linalg.norm(np.diff(way, axis=0), axis=1)
+    turns = np.stack([np.append(0.0, turn), np.append(turn, 0.0)])
+    return np.asarray((turns <= np.linalg.norm(way, axis=1)).all(axis=0))
 
 
 def _passes_in_order(images: Images) -> Iterator[tuple[int, Ints]]:

@@ -54,14 +54,15 @@ def describe_prospects(view: View) -> dict[str, Any]:
         "passes_per_place": _spread(passes[kept].astype(np.float64), 0),
         "parallax_deg": _spread(np.degrees(parallax_rad[kept]), 1),
         "residual_px": round(sigma_px, 2),
-        "expected_accuracy_m": _spread(sigma_m[kept], 3),
     }
+    if np.any(np.isfinite(sigma_m[kept])):  # Rays that are parallel say nothing of how far.
+        facts["expected_accuracy_m"] = _spread(sigma_m[kept], 3)
     return facts
 
 
 def _spread(values: np.ndarray[Any, Any], digits: int) -> dict[str, float]:
     """Return the 10th, 50th and 90th percentile."""
-    low, middle, high = np.quantile(values, [0.1, 0.5, 0.9])
+    low, middle, high = np.quantile(values[np.isfinite(values)], [0.1, 0.5, 0.9])
     return {"p10": round(float(low), digits), "median": round(float(middle), digits), "p90": round(float(high), digits)}
 
 

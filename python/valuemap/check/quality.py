@@ -194,9 +194,9 @@ class TruthElsewhere(Fault):
         tests = len(points) * len(objects) * len(_TRUTH_AXES)
         chance = float(stats.binom.sf(there - 1, there + here, 0.5)) * tests if there > here else 1.0
         fits = fix is not None and chance < LEAST_CHANCE
-        if not fits and here > 0:
-            return None  # It may well know other objects than are seen here.
-        distance = float(np.median(cKDTree(objects).query(points)[0]))
+        if not fits and (here > 0 or _is_nearest_where_it_is(points, objects, view)):
+            return None  # It may well know other objects than are seen here, or poses are metres off.
+        distance = _median_distance(points, objects)
         return Finding(
             fault=self.name,
             what="The truth is not where the rays meet: another frame, or far off.",
@@ -255,6 +255,21 @@ def _certain_points(view: View) -> Floats:
         return np.empty((0, 3))
     certain = votes >= max(5.0, float(np.median(votes)))
     return np.asarray(point[certain])
+
+
+def _is_nearest_where_it_is(points: Floats, objects: Floats, view: View) -> bool:
+    """Return whether objects are nearer to points than if all were moved on the ground by twice as far, any way."""
+    here = _median_distance(points, objects)
+    east, north = view.dataset.frame.east_north()
+    ways = [np.cos(angle) * east + np.sin(angle) * north for angle in np.linspace(0.0, 2.0 * np.pi, _WAYS, False)]
+    return all(here < _median_distance(points, objects + 2.0 * here * way) for way in ways)
+
+
+_WAYS = 16
+
+
+def _median_distance(points: Floats, objects: Floats) -> float:
+    return float(np.median(cKDTree(objects).query(points)[0]))
 
 
 def _matches(points: Floats, objects: Floats, within_m: float) -> int:

@@ -96,12 +96,12 @@ def _successors(passes: list[Ints], time: Floats, camera: Ints, gap_s: float) ->
 def _jumps(rows: Ints, time: Floats, center: Floats) -> Floats:
     """Return the jump (N - 3, 3) between the second and third of each four successive images."""
     when, where = time[rows], center[rows]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # Of images of one time no speed is known.
         before = (where[1:-2] - where[:-3]) / (when[1:-2] - when[:-3])[:, None]
         after = (where[3:] - where[2:-1]) / (when[3:] - when[2:-1])[:, None]
-    gap = where[2:-1] - where[1:-2]
-    seconds = (when[2:-1] - when[1:-2])[:, None]
-    first, second = gap - before * seconds, gap - after * seconds
+        gap = where[2:-1] - where[1:-2]
+        seconds = (when[2:-1] - when[1:-2])[:, None]
+        first, second = gap - before * seconds, gap - after * seconds
     is_first = np.linalg.norm(first, axis=1) <= np.linalg.norm(second, axis=1)
     return np.where(is_first[:, None], first, second)
 

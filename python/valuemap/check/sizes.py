@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 import valuemap._core as _core
-from valuemap.check.fault import View
+from valuemap.check.fault import GATE_RAD, View
 
 _LEAST_VOTES = 5
+_LEAST_GATES = 6.0
+"""Rays of so many gates between them tell how far a thing is to a sixth, were they off by a whole gate."""
 _ANYTHING = (0.05, 10.0)
 _HEIGHTS_M = (
     # Housings of two or three lenses of 0.2 or 0.3 m (EN 12368, MUTCD), with or without a back plate.
@@ -29,7 +31,8 @@ def plausible_heights(class_name: str) -> tuple[float, float]:
 def object_heights(view: View) -> dict[str, tuple[float, int]]:
     """Return, for each class, the median height in metres of the points where rays meet, and how many these are.
 
-    Classes whose detections are points without a size are left out.
+    Classes whose detections are points without a size are left out, and points whose rays are too near each other to
+    tell how far they are.
     """
     agreement = view.agreement
     found = agreement.found
@@ -37,7 +40,9 @@ def object_heights(view: View) -> dict[str, tuple[float, int]]:
     if not len(found) or not view.meets:
         return {}
     detections = view.stretches.dataset.detections
-    _, metres_per_px, _ = _core.see(agreement.rays.core, found.position_in_world_m, found.voter_offsets, found.voters)
+    _, metres_per_px, parallax_rad = _core.see(
+        agreement.rays.core, found.position_in_world_m, found.voter_offsets, found.voters
+    )
     height_m = detections.size_px[found.voters.astype(np.int64), 1] * metres_per_px[:, 1]
     median = _core.medians(height_m.copy(), found.voter_offsets)
     class_code = detections.class_name.codes[found.voters[found.voter_offsets[:-1]].astype(np.int64)]
@@ -47,6 +52,7 @@ def object_heights(view: View) -> dict[str, tuple[float, int]]:
         # Chance makes points of few votes; what most votes are for is what is there.
         of_class &= votes >= np.median(votes[of_class]) if np.any(of_class) else of_class
         of_class &= median > 0.0  # Key points have no size.
+        of_class &= parallax_rad > _LEAST_GATES * GATE_RAD * view.gate_share
         if np.any(of_class):
             result[name] = (float(np.median(median[of_class])), int(of_class.sum()))
     return result
