@@ -185,6 +185,12 @@ PINHOLE_PARAMS = [[500.0, 500.0, 320.0, 240.0], [600.0, 600.0, 400.0, 300.0, 0.0
         ),
         (
             "cameras",
+            with_column("params", [[*PINHOLE_PARAMS[0][:1], -500.0, *PINHOLE_PARAMS[0][2:]], PINHOLE_PARAMS[1]]),
+            r"row with camera_id 1: params: expected focal lengths above 0, found \[500\.0, -500\.0",
+            "COLMAP's order",
+        ),
+        (
+            "cameras",
             with_column("readout_s", [None, 30.0]),
             r"row with camera_id 2: readout_s: expected at most 1 s, or no value, found 30\.0 \(1 rows\)$",
             "30 ms are 0.03",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -133,6 +134,26 @@ def test_packed_files_are_named(tmp_path: Path, start: bytes, what: str) -> None
     said = refusal(lambda: read(tmp_path, path))
     assert what in said
     assert "unpack it first" in said
+
+
+def test_coco_as_tools_write_it(tmp_path: Path) -> None:
+    """A score that is null, sizes as texts, and polygons without a box."""
+    content = json.loads(COCO)
+    content["images"] = [{**each, "width": "640", "height": "480"} for each in content["images"]]
+    annotation = {key: value for key, value in content["annotations"][0].items() if key != "bbox"}
+    corners = [[100, 50, 140, 50, 140, 70], [100, 60, 120, 60, 120, 70]]
+    content["annotations"] = [{**annotation, "score": None, "segmentation": corners}]
+    dataset = read(tmp_path, write(tmp_path / "boxes.json", json.dumps(content)))
+    assert dataset.detections.center_px.tolist() == [[120.0, 60.0]]
+    assert dataset.detections.size_px.tolist() == [[40.0, 20.0]]
+    assert dataset.detections.score.tolist() == [1.0]
+
+
+def test_a_label_file_of_blank_lines_says_that_nothing_is_there(tmp_path: Path) -> None:
+    labels = detections_in(tmp_path, "yolo")
+    write(labels / "a" / "2.txt", "\ufeff\r\n\n")
+    (tmp_path / "data.yaml").rename(tmp_path / "data.yml")
+    assert read(tmp_path, labels).detections.class_name.texts() == ["light"]
 
 
 def test_a_polygon_of_yolo_counts_as_its_box(tmp_path: Path) -> None:

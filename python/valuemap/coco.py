@@ -66,13 +66,17 @@ class Entries:
         return values
 
     def numbers(self, key: str, default: float) -> Floats:
-        """Return one number an entry (N), NaN where there is something else."""
-        values = (entry.get(key, default) for entry in self.entries)
+        """Return one number an entry (N), NaN where there is something else; null is as good as none."""
+        found = (entry.get(key) for entry in self.entries)
+        values = (default if value is None else value for value in found)
         return np.array([value if _is_number(value) else np.nan for value in values], dtype=np.float64)
 
     def boxes(self) -> Floats:
-        """Return x, y, width, height (N, 4), NaN where these are no four numbers."""
-        found = [entry.get("bbox") for entry in self.entries]
+        """Return x, y, width, height (N, 4), NaN where these are no four numbers.
+
+        An entry without a box has that around its polygons.
+        """
+        found = [entry["bbox"] if entry.get("bbox") else _around(entry.get("segmentation")) for entry in self.entries]
         return np.array(
             [
                 box if isinstance(box, list) and len(box) == 4 and all(map(_is_number, box)) else _NO_BOX
@@ -90,6 +94,21 @@ class Entries:
             else:
                 found[entry["id"]] = entry[key]
         return found
+
+
+def _around(polygons: Any) -> list[float] | None:
+    """Return the box around polygons of x, y, x, y and so on; None where they are something else."""
+    if not isinstance(polygons, list) or not all(isinstance(each, list) for each in polygons):
+        return None
+    numbers = [value for each in polygons for value in each]
+    if len(numbers) < _LEAST_NUMBERS or any(len(each) % 2 for each in polygons) or not all(map(_is_number, numbers)):
+        return None
+    x, y = numbers[::2], numbers[1::2]
+    return [min(x), min(y), max(x) - min(x), max(y) - min(y)]
+
+
+_LEAST_NUMBERS = 6
+"""Of a polygon: three corners."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,6 +57,7 @@ _FARTHEST_M = 1e12
 """From the origin of the world: beyond, squares of distances leave what numbers hold."""
 _LARGEST_PX = 1e9
 """Of a box or a parameter of a camera: no picture has so many."""
+_FOCAL_LENGTHS = ("f", "fx", "fy")
 _LONGEST_READOUT_S = 1.0
 """Of a picture: rolling shutters take hundredths of a second, so that more is milliseconds."""
 _ROUNDING = 1e-12
@@ -413,6 +414,11 @@ def check_cameras(cameras: Cameras, source: str) -> None:
             raise InputError(
                 f"{where}: params: {model} expects {len(names)} finite numbers ({expected}), found {params.tolist()}",
                 hint=f"give the parameters in COLMAP's order, in pixels, none above {_LARGEST_PX:g}",
+            )
+        if not all(value > 0.0 for name, value in zip(names, params, strict=True) if name in _FOCAL_LENGTHS):
+            raise InputError(
+                f"{where}: params: expected focal lengths above 0, found {params.tolist()} ({expected})",
+                hint="give the parameters in COLMAP's order, in pixels",
             )
     if cameras.readout_s is not None:
         _refuse(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import tempfile
 from collections import Counter
 from pathlib import Path, PurePosixPath
@@ -13,7 +14,7 @@ import pycolmap
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
-from valuemap.readers.colmap_files import copy_without_points, find_model
+from valuemap.readers.colmap_files import copy_without_points, find_model, has_mark
 from valuemap.readers.csv_file import read_csv
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.names import match_images
@@ -110,6 +111,8 @@ def _load(files: list[Path], model_dir: Path) -> pycolmap.Reconstruction:
         for path in files:
             if path.name == "images.bin":
                 copy_without_points(path, Path(folder) / path.name)
+            elif path.suffix == ".txt" and has_mark(path):
+                (Path(folder) / path.name).write_bytes(path.read_bytes().removeprefix(codecs.BOM_UTF8))
             else:
                 (Path(folder) / path.name).symlink_to(path.resolve())
         (Path(folder) / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")

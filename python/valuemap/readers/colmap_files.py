@@ -7,6 +7,8 @@ missing.
 
 from __future__ import annotations
 
+import codecs
+import math
 import mmap
 import re
 import struct
@@ -50,6 +52,12 @@ def find_model(model_dir: Path) -> list[Path]:
     )
 
 
+def has_mark(path: Path) -> bool:
+    """Return whether a text file begins with a byte order mark, as Windows' editors write it."""
+    with path.open("rb") as file:
+        return file.read(len(codecs.BOM_UTF8)) == codecs.BOM_UTF8
+
+
 def copy_without_points(path: Path, to: Path) -> None:
     """Copy a whole images.bin without the observations of points: they are most of it, and not needed."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data, to.open("wb") as copy:
@@ -85,8 +93,13 @@ def _check_binary(path: Path) -> None:
 
 def _camera_end(data: mmap.mmap, start: int) -> int:
     (model,) = struct.unpack_from("<i", data, start + 4)
-    names = pycolmap.Camera(model=pycolmap.CameraModelId(model), width=1, height=1).params_info
-    return start + 24 + 8 * len(names.split(","))
+    return start + 24 + 8 * len(_params_of(pycolmap.CameraModelId(model)))
+
+
+def _params_of(model: pycolmap.CameraModelId) -> list[str]:
+    """Return the names of the parameters of a camera model."""
+    names = pycolmap.Camera(model=model, width=1, height=1).params_info
+    return [name.strip() for name in names.split(",")]
 
 
 def _name_end(data: mmap.mmap, start: int) -> int:
@@ -126,10 +139,10 @@ _RECORD_ENDS: dict[str, Callable[[mmap.mmap, int], int]] = {
 
 def _check_text(path: Path) -> None:
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as text: {error}", hint="export the model again") from error
-    records = _count_images(path, lines) if path.stem == "images" else sum(map(_is_data, lines))
+    records = {"cameras": _check_cameras, "images": _check_images}.get(path.stem, _count)(path, lines)
     announced = re.search(r"^# Number of \w+: (\d+)", "\n".join(lines[:10]), re.MULTILINE)
     if announced and records < int(announced[1]):
         raise InputError(
@@ -142,19 +155,59 @@ def _is_data(line: str) -> bool:
     return bool(line.strip()) and not line.lstrip().startswith("#")
 
 
-def _count_images(path: Path, lines: list[str]) -> int:
+def _count(_path: Path, lines: list[str]) -> int:
+    return sum(map(_is_data, lines))
+
+
+def _check_cameras(path: Path, lines: list[str]) -> int:
+    """Return the number of cameras; refuse a row that is none, which pycolmap does without saying where."""
+    known: set[int] = set()
+    for number, line in enumerate(lines, start=1):
+        if not _is_data(line):
+            continue
+        where, fields = f"{path} line {number}", line.split()
+        model = pycolmap.CameraModelId.__members__.get(fields[1] if len(fields) > 1 else "")
+        if model is None or fields[1] == "INVALID":
+            raise InputError(
+                f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {_short(line)}",
+                hint="models are those of COLMAP in capitals, as PINHOLE or OPENCV",
+            )
+        names = _params_of(model)
+        if len(fields) != 4 + len(names) or not _are_numbers(fields[4:]):
+            raise InputError(
+                f"{where}: {fields[1]} expects {len(names)} finite numbers ({', '.join(names)}) after the size, "
+                f"found {' '.join(fields[4:])!r}",
+                hint="every camera takes one line: CAMERA_ID MODEL WIDTH HEIGHT PARAMS",
+            )
+        _refuse_no_ids({"WIDTH": fields[2], "HEIGHT": fields[3]}, where)
+        _add_id("CAMERA_ID", fields[0], known, where)
+    return len(known)
+
+
+def _check_images(path: Path, lines: list[str]) -> int:
     """Return the number of images: each has a line for its pose and one, maybe empty, for its points."""
-    count, row = 0, 0
+    cameras = path.with_name("cameras.txt").read_text(encoding="utf-8-sig").splitlines()
+    camera_ids = {int(line.split()[0]) for line in cameras if _is_data(line)}
+    known: set[int] = set()
+    row = 0
     while row < len(lines):
         if not _is_data(lines[row]):
             row += 1
             continue
-        fields = lines[row].split()
-        if len(fields) != 10:
+        where, fields = f"{path} line {row + 1}", lines[row].split()
+        if len(fields) != 10 or not _are_numbers(fields[1:8]):
             raise InputError(
-                f"{path} line {row + 1}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, "
-                f"found {len(fields)} fields",
-                hint="image names with spaces are only possible in a binary model (COLMAP's model_converter)",
+                f"{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, found {_short(lines[row])} "
+                f"({len(fields)} fields)",
+                hint="all but the name are finite numbers; image names with spaces are only possible in a binary model "
+                "(COLMAP's model_converter)",
+            )
+        _add_id("IMAGE_ID", fields[0], known, where)
+        _refuse_no_ids({"CAMERA_ID": fields[8]}, where)
+        if int(fields[8]) not in camera_ids:
+            raise InputError(
+                f"{where}: camera {fields[8]} of image {fields[9]!r} is not in cameras.txt",
+                hint="export the model again, or add the camera",
             )
         if row + 1 == len(lines) or len(lines[row + 1].split()) % 3:
             raise InputError(
@@ -162,5 +215,38 @@ def _count_images(path: Path, lines: list[str]) -> int:
                 "(X Y POINT3D_ID ...)",
                 hint="every image takes two lines; the second may be empty, but it must be there",
             )
-        count, row = count + 1, row + 2
-    return count
+        row += 2
+    return len(known)
+
+
+_LARGEST_ID = 2**32 - 2
+
+
+def _add_id(name: str, text: str, known: set[int], where: str) -> None:
+    _refuse_no_ids({name: text}, where)
+    if int(text) in known:
+        raise InputError(f"{where}: {name} {text} is there twice", hint="give every row an id of its own")
+    known.add(int(text))
+
+
+def _refuse_no_ids(text_of: dict[str, str], where: str) -> None:
+    for name, text in text_of.items():
+        if not (text.isascii() and text.isdigit() and len(text) <= _DIGITS and int(text) <= _LARGEST_ID):
+            raise InputError(
+                f"{where}: {name}: expected a whole number from 0 to {_LARGEST_ID}, found {text[:40]!r}",
+                hint="COLMAP's ids and sizes have 32 bits",
+            )
+
+
+_DIGITS = 20
+
+
+def _are_numbers(texts: list[str]) -> bool:
+    try:
+        return all(math.isfinite(float(text)) for text in texts)
+    except ValueError:
+        return False
+
+
+def _short(line: str) -> str:
+    return repr(line.strip()[:60])

@@ -164,9 +164,17 @@ class _Named:
                     f"{self._where}[{row}]: id {key!r} is there twice", hint="give every entry an id of its own"
                 )
             self.name_of[key] = name
-            width, height = entry.get("width"), entry.get("height")
-            if width is not None and height is not None:
+            if entry.get("width") is not None and entry.get("height") is not None:
+                width, height = (_as_number(entry[side]) for side in ("width", "height"))
                 self.sizes[name] = (width, height)
+
+
+def _as_number(value: Any) -> Any:
+    """Return a number that is written as a text; what is none as it is, for the refusal that will name it."""
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
 
 
 _LISTS: Mapping[str | None, Callable[[str], _Boxes | _Named]] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes
 from valuemap.readers.files import check_folder, file_in, read_text, read_yaml
 
 _EXPECTED = "a folder of text files with rows: class cx cy width height [confidence], as fractions of the picture"
-_NAMES_FILES = ("data.yaml", "dataset.yaml", "classes.txt", "obj.names")
+_NAMES_FILES = ("data.yaml", "data.yml", "dataset.yaml", "dataset.yml", "classes.txt", "obj.names")
 _LARGEST_CLASS = 100_000
 
 
@@ -38,7 +39,7 @@ def read_yolo(file: DetectionFile) -> NamedBoxes:
     images, classes, places, scores, where = [], [], [], [], []
     for path in paths:
         name = path.relative_to(folder).as_posix()
-        if file_in(folder, name, _EXPECTED).stat().st_size == 0:
+        if _is_blank(file_in(folder, name, _EXPECTED)):
             continue  # Nothing is in the picture.
         for line, row in enumerate(read_text(path, _EXPECTED).splitlines(), start=1):
             if not row.strip():
@@ -59,6 +60,14 @@ def read_yolo(file: DetectionFile) -> NamedBoxes:
         where=where.__getitem__,
         fractions=True,
     )
+
+
+def _is_blank(path: Path) -> bool:
+    return path.stat().st_size <= _MOST_BLANK and not path.read_bytes().removeprefix(codecs.BOM_UTF8).strip()
+
+
+_MOST_BLANK = 16
+"""Bytes of a file that may hold a mark and the ends of lines, and no row."""
 
 
 def _row(row: str, where: str) -> tuple[int, list[float], float]:
@@ -86,7 +95,7 @@ def _class_names(folder: Path) -> dict[int, str] | None:
             if path.is_file():
                 found = (
                     _names_in(read_yaml(path, "a YAML file with names"), path)
-                    if path.suffix == ".yaml"
+                    if path.suffix in (".yaml", ".yml")
                     else read_text(path, "one name of a class a line").splitlines()
                 )
                 pairs = found.items() if isinstance(found, dict) else enumerate(found)
