@@ -410,3 +410,8 @@ def test_the_package_offers_what_it_says() -> None:
     assert set(valuemap.__all__) <= set(dir(valuemap))
     with pytest.raises(AttributeError, match="has no attribute 'build_maps'"):
         _ = valuemap.build_maps
+
+
+def test_a_command_whose_output_is_closed_ends_well() -> None:
+    closed = subprocess.run(["sh", "-c", '"$@" >&-', "sh", *COMMAND, "--version"], capture_output=True, check=False)
+    assert b"Traceback" not in closed.stderr

@@ -376,3 +376,17 @@ def test_a_link_or_a_pipe_in_the_place_of_a_file_is_refused(tmp_path: Path) -> N
 def test_a_folder_in_the_place_of_a_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="is a folder, a file is to be written there"), new_file(tmp_path):
         pass
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_map_is_not_written_over_a_dataset_nor_the_other_way_round(tmp_path: Path, force: bool) -> None:
+    """Both have a table of what was left out, under one name."""
+    datasets = ("dataset.json", "rejected.parquet")
+    with new_folder(tmp_path / "data", parts=datasets) as folder:
+        (folder / "dataset.json").write_text("given")
+    write_folder(tmp_path / "map", "given")
+    before = content(tmp_path)
+    for path, parts in ((tmp_path / "data", PARTS), (tmp_path / "map", datasets)):
+        with pytest.raises(OutputError, match=r"holds a (dataset|map), which would be lost"):
+            check_place(path, parts=parts, force=force)
+    assert content(tmp_path) == before

@@ -59,6 +59,7 @@ def new_folder(
         path = _followed(path)
         if path.exists():
             settle(path)
+            _refuse_other_kind(path, parts)
             check_files(path, parts, force=force)
         workspace = _workspace_for(path)
         with _locked(workspace, is_new=True):
@@ -113,6 +114,17 @@ def check_files(folder: Path, names: Collection[str], *, force: bool = False) ->
                 f"{path}: is not ours to replace: valuemap did not write it, or it was changed since",
                 hint="choose another place, or replace it with --force",
             )
+
+
+def _refuse_other_kind(folder: Path, parts: Collection[str]) -> None:
+    """Keep a map from being written over a dataset, and a dataset over a map: some of their files have one name."""
+    other = next((head for head in _KIND_OF if head not in parts and (folder / head).exists()), None)
+    if other is not None and not _KIND_OF.keys().isdisjoint(parts):
+        raise OutputError(f"{folder}: holds {_KIND_OF[other]}, which would be lost", hint="choose another --out")
+
+
+_KIND_OF = {"dataset.json": "a dataset", "run.json": "a map"}
+"""What a folder is, by the file that every such folder has."""
 
 
 class _Tried(Exception):

@@ -23,7 +23,8 @@ def main() -> None:
 
         load_commands(sys.argv[1:])
         for stream in (sys.stdout, sys.stderr):  # Names of files need not be UTF-8.
-            stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+            if stream is not None:  # Closed, as by a service.
+                stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
         gc.freeze()  # Nor is it looked through later, or at the end, which takes 0.1 s.
         gc.enable()
     end_in_order()

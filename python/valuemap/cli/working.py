@@ -30,7 +30,7 @@ def working(given: str | None, out: Path, *, resume: bool) -> Iterator[Workplace
     It is that which the user names, a folder or a URL, else a folder beside `out`.
     """
     out = out.absolute()
-    place = folder_of(place_of(given)) if given else out.with_name(f"{out.name}.work")
+    place = folder_of(place_of(given)) if given else out.parent / f"{out.name}.work"
     if isinstance(place, UrlPath):
         with (
             open_store(place, resume=resume, tell=log.print) as store,
