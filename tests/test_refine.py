@@ -24,6 +24,7 @@ from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import Dataset, rows_of, write_dataset
 from valuemap.drives import Drives, find_drives, in_driving_order
 from valuemap.engine.threads import ThreadEngine
+from valuemap.progress import silent
 from valuemap.refine import Refined, adjust, expose_rows, poses, refine_again, refine_poses, tracks
 from valuemap.refine import estimate as refine_estimate
 from valuemap.refine import select as refine_select
@@ -39,6 +40,7 @@ from valuemap.refine.select import Selected, _Equations, _Trial
 from valuemap.refine.tracks import merge_objects
 from valuemap.simulate import simulate
 from valuemap.tables import Bools, Floats, Images, Ints
+from valuemap.tiles.compare import Comparison
 from valuemap.tiles.work import open_work
 
 CITY = SimulationConfig(
@@ -211,6 +213,42 @@ def test_a_map_tells_better_than_what_single_drives_see_how_drives_lie_to_each_o
     at_last = valuemap.build_map(faulty).corrected
     assert at_last is not None
     assert errors(at_last, clean)[0] < min(0.25, 0.75 * errors(at_first.dataset, clean)[0])
+
+
+def test_a_map_proves_what_single_drives_leave_in_doubt() -> None:
+    config = valuemap.MapConfig()
+    faulty = simulate(dataclasses.replace(CITY, focal_error_share=0.02), seed=20)
+    doubtful = refine_poses(faulty, config)
+    assert doubtful.found is not None
+    assert doubtful.dataset is faulty
+    assert not doubtful.is_corrected
+    refined = pipeline._told_by_a_map(faulty, doubtful, config, 1, silent)
+    assert refined.is_corrected
+    assert refined.record["cameras"][0]["focal_length_factor"] == pytest.approx(0.98, abs=0.005)
+
+
+@pytest.mark.parametrize(("is_proven", "is_told"), [(True, True), (False, True), (False, False)])
+def test_what_is_proven_is_compared_before_a_map_tells_more_and_what_is_in_doubt_after(
+    is_proven: bool, is_told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset, done = city(), []
+    at_first = Refined(dataset, {"found": "nothing"})
+    at_last = Refined(dataset, {"found": "faults"}, is_corrected=True)
+
+    def told(_: Dataset, refined: Refined, *__: Any) -> Refined:
+        done.append("map")
+        return at_last if is_told else refined
+
+    def compared(*_: Any, **__: Any) -> Comparison:
+        done.append("compare")
+        return Comparison(2.0, 1.0, 0.0, 10)
+
+    monkeypatch.setattr(pipeline, "refine_poses", lambda *_, **__: at_last if is_proven else at_first)
+    monkeypatch.setattr(pipeline, "_told_by_a_map", told)
+    monkeypatch.setattr(pipeline, "compare_poses", compared)
+    refined = pipeline._proven(dataset, valuemap.MapConfig(), pipeline._Stages(), 1, silent)
+    assert refined.is_corrected == is_told
+    assert done == (["compare", "map"] if is_proven else ["map", "compare"] if is_told else ["map"])
 
 
 def test_poses_are_estimated_with_a_map_only_where_some_were_corrected() -> None:

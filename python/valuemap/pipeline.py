@@ -217,19 +217,27 @@ def _proven(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, 
 
     with stages.measured("poses"):
         refined = refine_poses(dataset, config, threads=threads, progress=progress)
+        is_proven = refined.is_corrected
+        if not is_proven:
+            refined = _told_by_a_map(dataset, refined, config, threads, progress)
         if not refined.is_corrected:
-            return refined
+            return replace(refined, found=None)
         parameters = refined.record.get("parameters", 0)
         found = compare_poses(dataset, refined.dataset, parameters, config, threads=threads, progress=progress)
         record = {**refined.record, **found.figures()}
         if not found.is_better:
             return Refined(dataset, {**record, "found": "nothing", "because": FITS_NO_BETTER})
-        if refined.found is None:
-            return replace(refined, record=record)
-        # A map tells better than landmarks of single drives which detection shows which object.
-        labels, votes = _map_of_keyframes(dataset, refined, config, ThreadEngine(threads), progress)
-        again = refine_again(dataset, refined, labels, votes, config, progress=progress)
-        return replace(again, record={**record, **again.record}, found=None)
+        if is_proven:
+            refined = _told_by_a_map(dataset, refined, config, threads, progress)
+        return replace(refined, record={**record, **refined.record}, found=None)
+
+
+def _told_by_a_map(dataset: Dataset, refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:
+    """Estimate once more what poses are wrong by, where anything was found: a map knows better what is one object."""
+    if refined.found is None:
+        return refined
+    labels, votes = _map_of_keyframes(dataset, refined, config, ThreadEngine(threads), progress)
+    return refine_again(dataset, refined, labels, votes, config, progress=progress)
 
 
 def _map_of_keyframes(

@@ -72,7 +72,10 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """A dataset with better poses and cameras, or as it was; `record` says in `run.json` what was found."""
+    """A dataset with better poses and cameras, or as it was; `record` says in `run.json` what was found.
+
+    `found` is what a map may tell more of: it was corrected, or is in doubt.
+    """
 
     dataset: Dataset
     record: dict[str, Any]
@@ -139,7 +142,7 @@ def _refined(dataset: Dataset, config: MapConfig, threads: int, progress: Progre
         progress("comparing drives", 1, 2)
     if sample is None:
         found = _find(moved, drives, config, threads)
-    elif found is not None and _is_proven(found):
+    elif found is not None and found.selected is not None:
         found = _find(moved, drives, config, threads, late_s=found.late_s)
     progress("comparing drives", 2, 2)
     return _corrected(dataset, ordered, found, unit_m)
@@ -202,7 +205,8 @@ def refine_again(
         result = estimate_again(footage, start, before.told)
         after = replace(before, result=result, selected=select(footage, result))
         progress("comparing drives", 1, 1)
-        return _corrected(dataset, ordered, after, unit_m) if _is_proven(after) else refined
+        again = _corrected(dataset, ordered, after, unit_m)
+        return again if again.is_corrected else refined
 
 
 def keyframes_of(dataset: Dataset, refined: Refined, config: MapConfig) -> Dataset:
@@ -210,9 +214,13 @@ def keyframes_of(dataset: Dataset, refined: Refined, config: MapConfig) -> Datas
 
     `dataset` is what `refine_poses` was given. It needs that something was corrected.
     """
-    assert refined.found is not None
-    ordered = in_driving_order(dataset, viewpoint_step_m=config.vote.max_range_m / USUAL_RANGE_M)
-    shown, image_id = refined.dataset, ordered.image_id[refined.found.footage.row]
+    found = refined.found
+    assert found is not None
+    assert found.selected is not None
+    unit_m = config.vote.max_range_m / USUAL_RANGE_M
+    ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
+    shown = refined.dataset if refined.is_corrected else _moved(dataset, ordered, found, found.selected, unit_m)
+    image_id = ordered.image_id[found.footage.row]
     return replace(
         shown,
         images=shown.images.take(np.flatnonzero(np.isin(shown.images.image_id, image_id))),
@@ -237,22 +245,26 @@ def noise_left(refined: Refined, config: MapConfig) -> NoiseConfig:
 
 
 def _corrected(dataset: Dataset, ordered: InOrder, found: Found | None, unit_m: float) -> Refined:
-    """Return a dataset corrected by what was proven of it `ordered`, in the order of its rows."""
+    """Return a dataset corrected by what was proven of it `ordered`; as it is where nothing was."""
     if found is None or found.selected is None:
         return Refined(dataset, {"found": "nothing", **_looked_at(found)})
-    corrected = _apply(ordered.dataset, ordered.drives, found, found.selected, unit_m)
+    if not found.selected.is_proven:
+        return Refined(dataset, {"found": "nothing", **_looked_at(found)}, found=found)
+    record = {**_describe(ordered.dataset, found, found.selected, unit_m), **_looked_at(found)}
+    moved = _moved(dataset, ordered, found, found.selected, unit_m)
+    return Refined(moved, record, is_corrected=True, found=found)
+
+
+def _moved(dataset: Dataset, ordered: InOrder, found: Found, selected: Selected, unit_m: float) -> Dataset:
+    """Return a dataset corrected by what was selected of it `ordered`, in the order of its rows."""
+    corrected = _apply(ordered.dataset, ordered.drives, found, selected, unit_m)
     row = np.empty(len(dataset.images), np.int64)
     row[rows_of(ordered.image_id, dataset.images.image_id)] = np.arange(len(row))
     images = dataset.images.replace(
         cam_from_world_quat=corrected.images.cam_from_world_quat[row],
         cam_from_world_m=corrected.images.cam_from_world_m[row],
     )
-    record = {**_describe(ordered.dataset, found, found.selected, unit_m), **_looked_at(found)}
-    return Refined(replace(dataset, images=images, cameras=corrected.cameras), record, is_corrected=True, found=found)
-
-
-def _is_proven(found: Found | None) -> bool:
-    return found is not None and found.selected is not None
+    return replace(dataset, images=images, cameras=corrected.cameras)
 
 
 def _find(

@@ -39,7 +39,8 @@ _BEYOND_DRIFT = 2.0
 """What is no more than so many deviations of drift is drift."""
 _LEAST_FOCAL = 0.003
 _REFIT, _ANEW = (1.5, 1.0, 1.0, 1.0), (1.0, 1.0, 1.0)
-_LEAST_CHANCE = 1e-3
+_LEAST_CHANCE = 0.01
+"""What is less likely luck than this is to be looked at: whether all detections are likelier is asked afterwards."""
 _LEAST_OBJECTS = 8
 _MOST_UNRESOLVED = 0.23
 """Where drives disagree about more than this share of what they see, they could not be laid onto each other."""
@@ -69,6 +70,11 @@ class Selected:
     gain: float
     chance: float
     held_out: int
+
+    @property
+    def is_proven(self) -> bool:
+        """Whether the gain is hardly luck."""
+        return self.chance < _LEAST_CHANCE
 
     @property
     def parameters(self) -> int:
@@ -107,7 +113,7 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
     state = adjust(problem, state, tolerances=_REFIT, with_variance=True)
     gain, chance, held_out = _held_out(found, seen, chain, scales, active, state)
     parameters = sum(int(flags.sum()) for flags in active)
-    if not chance < _LEAST_CHANCE or gain <= parameters * math.log(2 * len(seen)):
+    if gain <= parameters * math.log(2 * len(seen)):
         return None
     deviation = []
     assert state.covariance is not None
@@ -118,7 +124,8 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
         deviation.append(values)
     constants, active, deviations = (ties.spread(values) for values in (state.constants, active, tuple(deviation)))
     constants = (_about_the_mean(footage, found, constants[OFFSET], active[OFFSET]), *constants[1:])
-    return Selected(replace(state, constants=constants), active, deviations, gain, chance, held_out)
+    state = replace(state, constants=constants)
+    return Selected(state, active, deviations, gain, chance, held_out)
 
 
 def _about_the_mean(footage: Footage, found: Estimate, offset: Floats, active: Bools) -> Floats:
