@@ -22,7 +22,7 @@ import pycolmap
 
 from valuemap.anchor import check_anchor, is_place
 from valuemap.errors import InputError
-from valuemap.folders import new_folder, settle
+from valuemap.folders import DATASET_MARKER, new_folder, settle
 from valuemap.tables import (
     Bools,
     Cameras,
@@ -42,7 +42,7 @@ from valuemap.tables import (
 )
 
 FORMAT_VERSION = 1
-MARKER = "dataset.json"
+MARKER = DATASET_MARKER
 PARTS = (
     MARKER,
     *(f"{name}.parquet" for name in ("cameras", "images", "detections", "truth", "truth_detections", "rejected")),

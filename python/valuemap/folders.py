@@ -123,7 +123,8 @@ def _refuse_other_kind(folder: Path, parts: Collection[str]) -> None:
         raise OutputError(f"{folder}: holds {_KIND_OF[other]}, which would be lost", hint="choose another --out")
 
 
-_KIND_OF = {"dataset.json": "a dataset", "run.json": "a map"}
+DATASET_MARKER, MAP_MARKER = "dataset.json", "run.json"
+_KIND_OF = {DATASET_MARKER: "a dataset", MAP_MARKER: "a map"}
 """What a folder is, by the file that every such folder has."""
 
 

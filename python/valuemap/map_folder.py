@@ -17,7 +17,7 @@ import numpy as np
 
 from valuemap.dataset import Dataset, Frame
 from valuemap.errors import InputError
-from valuemap.folders import new_folder, settle, take_over
+from valuemap.folders import MAP_MARKER, new_folder, settle, take_over
 from valuemap.remote import Place, name_of, read_all
 from valuemap.tables import Labels, Rejected, Votes, read_table, table_to_arrow, write_table
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-MARKER = "run.json"
+MARKER = MAP_MARKER
 REVIEW = "review.json"
 """What people decided about the labels (`valuemap.review`): the one file that a new map in the same folder keeps."""
 CALIBRATION = "calibration.json"

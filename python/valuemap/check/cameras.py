@@ -27,11 +27,11 @@ from valuemap.check.fault import (
     with_poses,
 )
 from valuemap.check.fit import Estimate, Parameter, estimate
-from valuemap.check.lenses import FOCAL_LENGTHS, focals, with_params
+from valuemap.check.lenses import Focal, focals, with_params
 from valuemap.check.passes import moved_along
 from valuemap.check.sample import pixels_per_radian
 from valuemap.dataset import Dataset
-from valuemap.tables import Cameras, Floats
+from valuemap.tables import Floats
 
 _MOST_DOUBLINGS, _MOST_STEPS = 6, 12
 """Of a search that ends by itself as soon as the agreement falls: of turns it need not."""
@@ -49,14 +49,7 @@ def _turn(axis: int) -> Any:
 
 def with_focal(dataset: Dataset, log_factor: float) -> Dataset:
     """Return a dataset with all focal lengths multiplied by exp(log_factor)."""
-    params = []
-    for row, values in enumerate(dataset.cameras.params):
-        model = dataset.cameras.model.names[dataset.cameras.model.codes[row]]
-        changed = values.copy()
-        changed[: FOCAL_LENGTHS.get(model, 0)] *= np.exp(log_factor)
-        params.append(changed)
-    cameras: Cameras = dataset.cameras.replace(params=params)
-    return Dataset(**{**vars(dataset), "cameras": cameras})
+    return Focal(np.full(len(dataset.cameras), np.exp(log_factor)))(dataset)
 
 
 def _shift_along(dataset: Dataset, forward_m: float) -> Dataset:
@@ -459,6 +452,7 @@ def _best_cameras(view: View) -> tuple[list[dict[str, Any]], float]:
 
 
 _SUSPICIOUS = 0.05
+"""One pass in twenty is so by luck: what is judged together is not judged by this alone."""
 _MOST_CAMERAS = 6
 
 

@@ -42,10 +42,10 @@ class FocalUnit(Convention):
         if np.all(np.isnan(focal)):
             return
         if np.nanmax(focal / longer) < _SHORT:
-            yield "focal lengths in shares of the longer side of the picture", _Focal(longer)
-            yield "focal lengths in millimetres of film 36 mm wide", _Focal(longer / _FILM_MM)
+            yield "focal lengths in shares of the longer side of the picture", Focal(longer)
+            yield "focal lengths in millimetres of film 36 mm wide", Focal(longer / _FILM_MM)
             half = np.radians(np.clip(focal, 1.0, 179.0)) / 2.0
-            yield "fields of view in degrees for focal lengths", _Focal(cameras.width_px / 2.0 / np.tan(half) / focal)
+            yield "fields of view in degrees for focal lengths", Focal(cameras.width_px / 2.0 / np.tan(half) / focal)
 
 
 class PrincipalPoint(Convention):
@@ -105,10 +105,11 @@ class LensModel(Fault):
     def _agreement(self, view: View, focal_factor: float) -> float:
         """Return how well rays agree with other focal lengths, which are more often wrong than the kind of lens."""
         count = len(view.dataset.cameras)
-        return float(gains_of_all(view, _Focal(np.full(count, focal_factor))(view.dataset)).sum())
+        return float(gains_of_all(view, Focal(np.full(count, focal_factor))(view.dataset)).sum())
 
 
 _FOCAL_FACTORS = (0.7, 0.8, 0.9, 1.1, 1.25, 1.4)
+"""Steps of about a tenth and more, to beyond the nearest sizes that pictures are scaled to, 3/4 and 4/3."""
 
 
 def _lenses(dataset: Dataset) -> Iterator[tuple[str, Fix]]:
@@ -139,7 +140,7 @@ def with_params(dataset: Dataset, params: list[Floats]) -> Dataset:
     return Dataset(**{**vars(dataset), "cameras": dataset.cameras.replace(params=params)})
 
 
-class _Focal:
+class Focal:
     """Focal lengths times a factor of each camera."""
 
     def __init__(self, factor: Floats) -> None:
@@ -148,6 +149,7 @@ class _Focal:
         """The same angle is so many times as many pixels."""
 
     def __call__(self, dataset: Dataset) -> Dataset:
+        """Return a dataset with these focal lengths."""
         params = []
         for row, values in enumerate(dataset.cameras.params):
             changed = values.copy()

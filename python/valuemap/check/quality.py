@@ -266,6 +266,7 @@ def _is_nearest_where_it_is(points: Floats, objects: Floats, view: View) -> bool
 
 
 _WAYS = 16
+"""Ways round, 22.5 degrees apart: a shift between two of them is 2 % shorter along the nearest."""
 
 
 def _median_distance(points: Floats, objects: Floats) -> float:
