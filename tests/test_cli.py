@@ -415,3 +415,26 @@ def test_the_package_offers_what_it_says() -> None:
 def test_a_command_whose_output_is_closed_ends_well() -> None:
     closed = subprocess.run(["sh", "-c", '"$@" >&-', "sh", *COMMAND, "--version"], capture_output=True, check=False)
     assert b"Traceback" not in closed.stderr
+
+
+_FULL = Path("/dev/full")
+
+
+@pytest.mark.skipif(not _FULL.exists(), reason="there is no disk that is always full")
+def test_output_that_cannot_be_written_is_one_line_once_the_work_is_done(street: Path, tmp_path: Path) -> None:
+    with _FULL.open("wb") as full:
+        for words in (["import", "--help"], ["map", str(street), "--out", str(tmp_path / "map")]):
+            done = subprocess.run([*COMMAND, *words], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+            told = "".join(line for line in done.stderr.splitlines(keepends=True) if not line.startswith("Wrote "))
+            assert "No space left" in one_line_and_a_hint(done.returncode, "", told)
+        assert (tmp_path / "map" / "labels.parquet").is_file()
+        assert subprocess.run([*COMMAND, "--version"], stderr=full, check=False).returncode == 0
+
+
+def test_a_reader_that_has_seen_enough_is_no_error(street: Path) -> None:
+    for words in (["import", "colmap", "--help"], ["info", str(street)]):
+        reader, writer = os.pipe()
+        os.close(reader)
+        done = subprocess.run([*COMMAND, *words], stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+        os.close(writer)
+        assert (done.returncode, done.stderr) == (0, "")

@@ -18,14 +18,19 @@ def main() -> None:
         os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
         os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # They are looked for in all packages there are.
         gc.disable()  # What is imported stays: looking for garbage among it takes a fifth of the time.
-        from valuemap.cli.app import app
+        from valuemap.cli.app import app, complain
         from valuemap.cli.load import load_commands
+        from valuemap.cli.output import end_output, watch_output
 
         load_commands(sys.argv[1:])
-        for stream in (sys.stdout, sys.stderr):  # Names of files need not be UTF-8.
-            if stream is not None:  # Closed, as by a service.
-                stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+        watch_output()
         gc.freeze()  # Nor is it looked through later, or at the end, which takes 0.1 s.
         gc.enable()
     end_in_order()
-    app()
+    try:
+        app()
+    finally:
+        error = end_output()
+        if error is not None:
+            complain(f"error: not all that this command prints could be written: {error.strerror}", "is the disk full?")
+            sys.exit(1)
