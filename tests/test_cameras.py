@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from block import block
 from camera_models import cameras_like, distances_m, measure, seen_through
 from small_dataset import small_dataset
+from valuemap.camera_models import Pinhole, names_of_params
 from valuemap.cameras import (
     Rays,
     camera_centers,
@@ -19,6 +20,7 @@ from valuemap.cameras import (
     cast_rays,
     colmap_camera,
     directions_down,
+    lens_of,
     rotation_matrices,
 )
 from valuemap.dataset import Dataset, Frame
@@ -278,6 +280,22 @@ def test_the_centre_of_the_top_left_pixel_is_at_one_half() -> None:
         1.0,
         1.0,
     ]
+
+
+@pytest.mark.parametrize("model", WITHOUT_DISTORTION)
+def test_pinholes_are_those_of_colmap_to_the_bit(model: str) -> None:
+    random = np.random.default_rng(3)
+    cameras = dataset_of(model, PARAMS[model], np.array([[402.0, 297.0]])).cameras
+    ours, theirs = lens_of(cameras, 0), colmap_camera(cameras, 0)
+    assert isinstance(ours, Pinhole)
+    pixel = np.concatenate([random.uniform(-WIDTH, 2.0 * WIDTH, (1000, 2)), [[np.nan, 1.0]]])
+    assert_array_equal(ours.cam_ray_from_img(pixel), theirs.cam_ray_from_img(pixel))
+    point = np.concatenate([random.normal(size=(1000, 3)), [[1.0, 1.0, 0.0], [1.0, 1.0, 1e-16], [np.nan, 1.0, 1.0]]])
+    assert_array_equal(ours.img_from_cam(point), theirs.img_from_cam(point))
+    assert (ours.width, ours.height) == (theirs.width, theirs.height)
+    assert ours.is_perspective_pinhole() == theirs.is_perspective_pinhole()
+    assert ours.is_spherical() == theirs.is_spherical()
+    assert names_of_params(model) == theirs.params_info
 
 
 # The same city through other cameras.

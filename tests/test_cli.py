@@ -359,6 +359,42 @@ main()
     assert done.stdout.split() == ["__future__", "valuemap", "valuemap.cli", "valuemap.cli.signals", "2"]
 
 
+def test_pycolmap_leaves_sigterm_to_who_hears_it() -> None:
+    code = """
+import os, signal, sys
+signal.signal(signal.SIGTERM, lambda *_: os._exit(7))
+import valuemap.colmap
+assert "pycolmap" in sys.modules
+os.kill(os.getpid(), signal.SIGTERM)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (7, "")
+
+
+def test_a_map_of_pinholes_needs_no_pycolmap(street: Path, tmp_path: Path) -> None:
+    code = """
+import sys
+from valuemap.cli import main
+try:
+    main()
+finally:
+    assert "pycolmap" not in sys.modules
+"""
+    command = [
+        sys.executable,
+        "-c",
+        code,
+        "map",
+        str(street),
+        "--out",
+        str(tmp_path / "map"),
+        "--set",
+        "correct_poses=0",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize("module", ["gc", "valuemap.cli.app", "pyarrow"])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_while_libraries_are_imported_is_one_line(number: signal.Signals, module: str) -> None:

@@ -57,6 +57,17 @@ def test_what_is_imported_is_required_and_what_is_required_is_imported() -> None
     assert set(BROUGHT_ALONG.values()) <= declared
 
 
+def test_pycolmap_is_imported_from_one_place() -> None:
+    """Who imports it hands SIGTERM to glog."""
+    folder = ROOT / "python" / "valuemap"
+    importing = [
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*.py")
+        if re.search(r"^ *import pycolmap", path.read_text(encoding="utf-8"), re.MULTILINE)
+    ]
+    assert importing == ["colmap.py"]
+
+
 def test_the_extra_all_is_all_extras() -> None:
     extras = dict(PROJECT["optional-dependencies"])
     (everything,) = extras.pop("all")

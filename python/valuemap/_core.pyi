@@ -118,3 +118,14 @@ def objects_of(
     threads: int,
     progress: Callable[[int, int], None],
 ) -> tuple[_Floats, tuple[_Offsets, _Indices], _Floats]: ...
+def camera_centers(cam_from_world_quat: _Floats, cam_from_world_m: _Floats, /) -> _Floats: ...
+def revisits(
+    place_m: _Floats,
+    drive: NDArray[np.int64],
+    driven_m: _Floats,
+    near_m: _Floats,
+    away_m: _Floats,
+    ground: Sequence[int],
+    /,
+) -> NDArray[np.bool_]: ...
+def viewpoint_openings(place_m: _Floats, begins: NDArray[np.bool_], step_m: float, /) -> NDArray[np.bool_]: ...

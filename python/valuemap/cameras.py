@@ -14,14 +14,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 import valuemap._core as _core
+from valuemap import camera_models
+from valuemap.camera_models import Lens
 from valuemap.dataset import Dataset, rows_of
 from valuemap.tables import Cameras, Floats, Images, Ints
+
+if TYPE_CHECKING:
+    from valuemap.colmap import pycolmap
 
 _LEAST_FORWARD = 0.1
 """Corners of a picture less forward than this (cosine to the axis) bound no pyramid."""
@@ -72,17 +77,8 @@ class Rays:
 
 def camera_centers(images: Images) -> Floats:
     """Return the camera centres (N, 3) in metres in the world, -R^T t."""
-    place = np.empty((3, len(images)))
-    for first in range(0, len(images), _BLOCK):
-        # `camera_poses`, without the matrices in between: half the time.
-        rows = slice(first, first + _BLOCK)
-        w, x, y, z = np.ascontiguousarray(images.cam_from_world_quat[rows].T)
-        a, b, c = np.ascontiguousarray(images.cam_from_world_m[rows].T)
-        xx, yy, zz, xy, xz, yz, wx, wy, wz = x * x, y * y, z * z, x * y, x * z, y * z, w * x, w * y, w * z
-        place[0, rows] = (1.0 - 2.0 * (yy + zz)) * a + 2.0 * (xy + wz) * b + 2.0 * (xz - wy) * c
-        place[1, rows] = 2.0 * (xy - wz) * a + (1.0 - 2.0 * (xx + zz)) * b + 2.0 * (yz + wx) * c
-        place[2, rows] = 2.0 * (xz + wy) * a + 2.0 * (yz - wx) * b + (1.0 - 2.0 * (xx + yy)) * c
-    return np.ascontiguousarray(np.negative(place, out=place).T)
+    quat, translation_m = images.cam_from_world_quat, images.cam_from_world_m
+    return _core.camera_centers(np.ascontiguousarray(quat), np.ascontiguousarray(translation_m))
 
 
 def camera_poses(images: Images) -> tuple[Floats, Floats]:
@@ -117,14 +113,19 @@ def rotation_of(quat: Floats) -> Floats:
     return np.array(rows).transpose(2, 0, 1)
 
 
+def lens_of(cameras: Cameras, row: int) -> Lens:
+    """Return how the camera in one row of the cameras table pictures points."""
+    return camera_models.lens_of(*_model_of(cameras, row))
+
+
 def colmap_camera(cameras: Cameras, row: int) -> pycolmap.Camera:
     """Return one row of the cameras table as pycolmap's camera."""
-    return pycolmap.Camera(
-        model=cameras.model.names[cameras.model.codes[row]],
-        width=int(cameras.width_px[row]),
-        height=int(cameras.height_px[row]),
-        params=cameras.params[row],
-    )
+    return camera_models.colmap_camera(*_model_of(cameras, row))
+
+
+def _model_of(cameras: Cameras, row: int) -> tuple[str, int, int, Floats]:
+    model = cameras.model.names[cameras.model.codes[row]]
+    return model, int(cameras.width_px[row]), int(cameras.height_px[row]), cameras.params[row]
 
 
 def cast_rays(dataset: Dataset, *, is_left_out: NDArray[np.bool_] | None = None) -> Rays:
@@ -135,7 +136,7 @@ def cast_rays(dataset: Dataset, *, is_left_out: NDArray[np.bool_] | None = None)
     residual_from_cam = np.empty((len(detections), 3, 3))
     direction_in_cam = np.empty((len(detections), 3))
     for row in range(len(cameras)):
-        camera = colmap_camera(cameras, row)
+        camera = lens_of(cameras, row)
         for members in _blocks(np.flatnonzero(camera_row == row)):
             residual_from_cam[members], direction_in_cam[members] = _local_pinholes(
                 camera, detections.center_px[members]
@@ -167,7 +168,7 @@ def picture_bounds(cameras: Cameras) -> tuple[Floats, Floats]:
     """
     normals, solid_angle = np.full((len(cameras), 4, 3), np.nan), np.full(len(cameras), 4.0 * np.pi)
     for row in range(len(cameras)):
-        camera = colmap_camera(cameras, row)
+        camera = lens_of(cameras, row)
         width, height = camera.width, camera.height
         corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
         ray = np.asarray(camera.cam_ray_from_img(corners))
@@ -183,7 +184,7 @@ def _triangle_sr(a: Floats, b: Floats, c: Floats) -> float:
     return float(2.0 * np.arctan2(abs(a @ np.cross(b, c)), 1.0 + a @ b + b @ c + c @ a))
 
 
-def _local_pinholes(camera: pycolmap.Camera, center_px: Floats) -> tuple[Floats, Floats]:
+def _local_pinholes(camera: Lens, center_px: Floats) -> tuple[Floats, Floats]:
     """Return M in camera axes (N, 3, 3) and the unit ray in camera axes (N, 3) of detections (N, 2)."""
     ray = np.asarray(camera.cam_ray_from_img(center_px))
     # Where a model has no ray, e.g. beyond 90 degrees of a fisheye, COLMAP may answer with another one.
@@ -205,7 +206,7 @@ def _local_pinholes(camera: pycolmap.Camera, center_px: Floats) -> tuple[Floats,
     return residual_from_cam, ray
 
 
-def _pixels_per_step(camera: pycolmap.Camera, virtual_from_cam: Floats | None, plane: Floats, axis: int) -> Floats:
+def _pixels_per_step(camera: Lens, virtual_from_cam: Floats | None, plane: Floats, axis: int) -> Floats:
     """Return the column (N, 2) of d pi / d p for one axis of the virtual plane, by central differences."""
     ends = []
     for step in (_JACOBIAN_STEP, -_JACOBIAN_STEP):
@@ -216,7 +217,7 @@ def _pixels_per_step(camera: pycolmap.Camera, virtual_from_cam: Floats | None, p
     return _pixels_between(camera, ends[0], ends[1]) / (2.0 * _JACOBIAN_STEP)
 
 
-def _pixels_between(camera: pycolmap.Camera, first_px: Floats, second_px: Floats) -> Floats:
+def _pixels_between(camera: Lens, first_px: Floats, second_px: Floats) -> Floats:
     """Return first - second (N, 2); the seam of a panorama is no jump of the world."""
     difference: Floats = np.asarray(first_px) - np.asarray(second_px)
     if camera.is_spherical():

@@ -18,9 +18,9 @@ from weakref import WeakSet
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pycolmap
 
 from valuemap.anchor import check_anchor, is_place
+from valuemap.camera_models import camera_models, names_of_params
 from valuemap.errors import InputError
 from valuemap.folders import DATASET_MARKER, new_folder, settle
 from valuemap.tables import (
@@ -399,8 +399,9 @@ def check_cameras(cameras: Cameras, source: str) -> None:
     for row in range(len(cameras)):
         where = f"{source}/cameras.parquet, row with camera_id {cameras.camera_id[row]}"
         model = cameras.model.names[cameras.model.codes[row]]
-        if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
-            known = ", ".join(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
+        expected = names_of_params(model)
+        if expected is None:
+            known = ", ".join(camera_models())
             raise InputError(f"{where}: model: found {model!r}", hint=f"use one of COLMAP's camera models: {known}")
         width, height, params = int(cameras.width_px[row]), int(cameras.height_px[row]), cameras.params[row]
         if width <= 0 or height <= 0:
@@ -408,7 +409,6 @@ def check_cameras(cameras: Cameras, source: str) -> None:
                 f"{where}: width and height: expected pixels above 0, found {width} x {height}",
                 hint="give the size of the pictures that the detections were made on",
             )
-        expected = pycolmap.Camera(model=model, width=width, height=height).params_info
         names = [name.strip() for name in expected.split(",")]
         if len(params) != len(names) or not np.all(np.abs(params) <= _LARGEST_PX):
             raise InputError(

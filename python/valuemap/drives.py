@@ -15,8 +15,6 @@ time, then place), and all ties are broken by it.
 
 from __future__ import annotations
 
-import itertools
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import valuemap._core as _core
 from valuemap.arrow import no_texts
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.dataset import Dataset, rows_of
@@ -69,9 +68,6 @@ _ROUNDING = 1e-6
 
 _PARTS_OF_A_METRE = 2.0**26
 """Ways are summed in such parts: sums of a whole fleet, 130,000 km, are exact."""
-
-_SIDE_BY_SIDE = 16
-"""Fewer runs than this are faster one by one."""
 
 TIME, NAME, CHAIN = 0, 1, 2
 _TOLD_BY = ("time", "name", "chain")
@@ -184,7 +180,7 @@ class Ways:
         drive, place_m, exposure_along = rank[drive][along], place_m.take(along, axis=0), track.exposure[along]
         begins = _begins(drive)
         order = _since(begins)
-        opens = _viewpoint_openings(place_m, begins, viewpoint_step_m)
+        opens = _core.viewpoint_openings(place_m, begins, viewpoint_step_m)
         driven_m = _driven_m(place_m, begins, opens)
 
         position = np.empty(len(first), np.int64)
@@ -695,15 +691,6 @@ def _quantiles(values: Floats, group: Ints, share: float) -> Floats:
     return quantile
 
 
-def _by_key(key: Ints) -> Ints:
-    """Return an order in which equal keys (N) are next to each other, ascending; so may be some others, by chance."""
-    bits = np.uint64(len(key).bit_length())
-    mixed = key.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)  # Spreads over the upper bits: 2^64 / golden ratio.
-    at = np.arange(len(key), dtype=np.uint64)
-    ordered = np.sort((mixed >> bits << bits) | at)  # Much faster than a stable argsort.
-    return (ordered & ((np.uint64(1) << bits) - np.uint64(1))).astype(np.int64)
-
-
 def _lengths(vectors: Floats) -> Floats:
     """Return the lengths (N) of vectors (N, 3)."""
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)))  # Several times as fast as the norm of NumPy.
@@ -874,7 +861,7 @@ def _cuts(place_m: Floats, track: _Track, steps: _Steps, own: Usual, usual: Usua
         pause = timed & (waited > _PAUSE_STEPS * usual_taken) & (far | (waited > _STOP_STEPS * usual_taken))
     jump = far & too_fast & ~pause
     drive = np.cumsum(begins | jump | pause)
-    revisit = _revisits(place_m, drive, usual_m, track.told_by != CHAIN, usual.ground_axes)
+    revisit = _revisits(place_m, drive, steps, usual_m, track.told_by != CHAIN, usual.ground_axes)
     reasons = {"pauses": pause, "jumps": jump, "revisits": revisit}
     counts = {name: int(mask.sum()) for name, mask in reasons.items() if mask.any()}
     return _Cuts(begins | jump | pause | revisit, counts)
@@ -890,82 +877,17 @@ def _usual(own: Floats, of_all: Floats) -> Floats:
     return np.asarray(np.maximum(own, floor))
 
 
-def _revisits(place_m: Floats, drive: Ints, usual_m: Floats, may: Bools, ground: Ints) -> Bools:
+def _revisits(place_m: Floats, drive: Ints, steps: _Steps, usual_m: Floats, may: Bools, ground: Ints) -> Bools:
     """Return where (E) a drive comes back to where it has been, having left: what follows is a drive of its own.
 
-    A place is as wide as some usual steps. All is done on the ground (the axes `ground`), in four grids of cells of
-    twice that width, each shifted by half a cell, so that any two near places share a cell.
+    A place is as wide as some usual steps, on the ground (the axes `ground`).
     """
-    count = len(drive)
     near_m = np.where((usual_m > 0.0) & may, _REVISIT_STEPS * usual_m, np.nan)
-    step_m = _steps_m(place_m)
-    way_m = _summed_m(np.where(step_m > _STILL_SHARE * usual_m, step_m, 0.0))
-    able = np.flatnonzero(~np.isnan(near_m))
-    result = np.zeros(count, np.bool_)
-    if not len(able):
-        return result
-    back, before = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
-    widths = [place_m[able, axis] / (2.0 * near_m[able]) for axis in ground]
-    rows, columns = ([np.floor(width + shift).astype(np.int64) for shift in (0.0, 0.5)] for width in widths)
-    for row, column in itertools.product(rows, columns):
-        key = (drive[able] * np.int64(1_000_003) + row) * np.int64(1_000_003) + column
-        enters = np.concatenate([[True], key[1:] != key[:-1]])
-        leaves = np.concatenate([enters[1:], [True]])
-        kept = np.flatnonzero(enters | leaves)
-        kept = kept[_by_key(key[kept])]
-        i, j = able[kept[1:]], able[kept[:-1]]
-        again = (key[kept[1:]] == key[kept[:-1]]) & enters[kept[1:]] & leaves[kept[:-1]]
-        again &= way_m[i] - way_m[j] >= _AWAY_STEPS * usual_m[i]
-        again[again] = (
-            _lengths(place_m[i[again]] - place_m[j[again]]) <= 4.0 * near_m[i[again]]
-        )  # Not by a key's chance.
-        back.append(i[again])
-        before.append(j[again])
-    i, j = np.concatenate(back), np.concatenate(before)
-    order = np.lexsort((-j, i))
-    start = 0
-    for here, there in zip(i[order].tolist(), j[order].tolist(), strict=True):
-        if there >= start:
-            result[here] = True
-            start = here
-    return result
+    way_m = _summed_m(np.where(steps.step_m > _STILL_SHARE * usual_m, steps.step_m, 0.0))
+    return _core.revisits(place_m, drive, way_m, near_m, _AWAY_STEPS * usual_m, ground.tolist())
 
 
 # Viewpoints.
-
-
-def _viewpoint_openings(place_m: Floats, begins: Bools, step_m: float) -> Bools:
-    """Return where (E) along drives viewpoints begin."""
-    moved_m = _steps_m(place_m)
-    opens = begins | (moved_m > step_m)
-    # Sure whatever the viewpoint's begin: it lies within a step of the exposure before.
-    sure = begins | (moved_m > 2.0 * step_m)
-    # As long as each moves by a step, each begins one; only from the first that does not on, one has to look back.
-    at = np.arange(len(opens))
-    last_sure = np.maximum.accumulate(np.where(sure, at, 0))
-    last_still = np.maximum.accumulate(np.where(opens, -1, at)) if len(at) else at
-    unsure = np.flatnonzero(~sure & (last_still > last_sure))
-    if not len(unsure):
-        return np.asarray(opens)
-    # Runs of them do not depend on each other: all go ahead side by side, the last few long ones by themselves.
-    head = np.flatnonzero(np.diff(unsure, prepend=-2) != 1)
-    here, end = unsure[head], unsure[np.concatenate([head[1:], [len(unsure)]]) - 1] + 1
-    begin = here - 1
-    while len(here) > _SIDE_BY_SIDE:
-        new = _lengths(place_m[here] - place_m[begin]) > step_m
-        opens[here] = new
-        begin = np.where(new, here, begin)
-        here = here + 1
-        goes_on = here < end
-        here, end, begin = here[goes_on], end[goes_on], begin[goes_on]
-    for first, last, since in zip(here.tolist(), end.tolist(), begin.tolist(), strict=True):
-        places = place_m[since:last].tolist()
-        start = places[0]
-        for i in range(first, last):
-            opens[i] = new_here = math.dist(places[i - since], start) > step_m
-            if new_here:
-                start = places[i - since]
-    return np.asarray(opens)
 
 
 def _driven_m(place_m: Floats, begins: Bools, opens: Bools) -> Floats:

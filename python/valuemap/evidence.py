@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from valuemap.cameras import Rays, camera_centers, cast_rays, colmap_camera, rotation_of
+from valuemap.cameras import Rays, camera_centers, cast_rays, lens_of, rotation_of
 from valuemap.dataset import MARKER, Dataset, number_passes, rows_of
 from valuemap.drives import find_drives
 from valuemap.errors import InputError
@@ -317,7 +317,7 @@ class Evidence:
         pixel = np.full((len(image_row), 2), np.nan)
         for row in np.unique(camera_row):
             members = np.flatnonzero(camera_row == row)
-            pixel[members] = colmap_camera(cameras, int(row)).img_from_cam(in_cam[members])
+            pixel[members] = lens_of(cameras, int(row)).img_from_cam(in_cam[members])
         return pixel
 
     def is_pictured(self, image_row: Ints, pixel: Floats) -> Bools:

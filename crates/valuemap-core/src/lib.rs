@@ -12,7 +12,7 @@
 //! 5. [`triangulate`] refines each winner over all its voters.
 //! 6. [`merge`]: labels of different clusters that stand for one object become one.
 //!
-//! [`vote`] is steps 2 to 5 for all clusters. Everything is `f64` in the caller's world frame, but for the
+//! [`drives`] puts images in order before. [`vote`] is steps 2 to 5 for all clusters. Everything is `f64` in the caller's world frame, but for the
 //! kernel, which sees `f32` relative to the cluster's origin and errs only towards testing too much.
 //! The result does not depend on the number of threads.
 
@@ -24,6 +24,7 @@ extern crate self as valuemap_core;
 mod street;
 
 pub mod ballot;
+pub mod drives;
 pub mod evidence;
 pub mod hypothesis;
 pub mod kernel;

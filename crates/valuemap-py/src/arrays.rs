@@ -11,12 +11,12 @@ use valuemap_core::{SMatrix, Vector3};
 /// Groups of rays: offsets (N + 1) into the members, and the members.
 pub type Groups<'py> = (Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<u32>>);
 
-/// Rows of an (N, 3) array, without a copy.
-pub fn rows_of<'a>(array: &'a PyReadonlyArray2<'_, f64>) -> PyResult<&'a [[f64; 3]]> {
-    if array.shape()[1] != 3 {
-        return Err(PyValueError::new_err("expected an array of shape (N, 3)"));
+/// Rows of an (N, WIDTH) array, without a copy.
+pub fn rows_of<'a, const WIDTH: usize>(array: &'a PyReadonlyArray2<'_, f64>) -> PyResult<&'a [[f64; WIDTH]]> {
+    if array.shape()[1] != WIDTH {
+        return Err(PyValueError::new_err(format!("expected an array of shape (N, {WIDTH})")));
     }
-    Ok(array.as_slice()?.as_chunks::<3>().0)
+    Ok(array.as_slice()?.as_chunks().0)
 }
 
 /// Vectors or matrices, column by column, as the rows of an array of shape (N, width).

@@ -2,6 +2,7 @@
 #![allow(clippy::needless_pass_by_value)] // Python hands its arguments over by value.
 
 mod arrays;
+mod drives;
 mod robust;
 mod run;
 
@@ -252,6 +253,8 @@ fn parts() -> Vec<&'static str> {
 
 #[pymodule]
 mod _core {
+    #[pymodule_export]
+    use super::drives::{camera_centers, revisits, viewpoint_openings};
     #[pymodule_export]
     use super::robust::{Scene, calibrate, find_labels, misfits, objects_of};
     #[pymodule_export]

@@ -182,11 +182,11 @@ def _take_places(dataset: Dataset, of_image: Ints, most_detections: int) -> Samp
 
 def pixels_per_radian(dataset: Dataset) -> float:
     """Return the median over cameras of how many pixels a radian has in the middle of the picture."""
-    from valuemap.cameras import colmap_camera
+    from valuemap.cameras import lens_of
 
     scales = []
     for row in range(len(dataset.cameras)):
-        camera = colmap_camera(dataset.cameras, row)
+        camera = lens_of(dataset.cameras, row)
         middle = np.array([[camera.width / 2.0, camera.height / 2.0], [camera.width / 2.0 + 1.0, camera.height / 2.0]])
         ray = np.asarray(camera.cam_ray_from_img(middle))
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)

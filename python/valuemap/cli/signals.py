@@ -31,22 +31,9 @@ def exit_code(number: int) -> int:
     return 128 + number
 
 
-class end_at_once:  # noqa: N801  # It is used as a statement.
-    """While nothing has begun, end on a signal right away: an exception could come in the middle of an import.
-
-    SIGTERM waits until the block ends, as glog, which pycolmap brings along, takes it over and prints a stack trace.
-    """
-
-    def __enter__(self) -> None:
-        _handle(_end_at_once)
-        if hasattr(_signal, "pthread_sigmask"):  # Not on Windows, where none of these comes from outside.
-            waiting = {number for number in _ENDING if number != _signal.SIGINT}
-            self.before = _signal.pthread_sigmask(_signal.SIG_BLOCK, waiting)
-
-    def __exit__(self, *_: object) -> None:
-        _handle(_end_at_once)
-        if hasattr(_signal, "pthread_sigmask"):
-            _signal.pthread_sigmask(_signal.SIG_SETMASK, self.before)
+def end_at_once() -> None:
+    """While nothing has begun, end on a signal right away: an exception could come in the middle of an import."""
+    _handle(_end_at_once)
 
 
 def end_in_order() -> None:

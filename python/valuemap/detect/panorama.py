@@ -12,9 +12,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
+from valuemap.colmap import pycolmap
 from valuemap.config import DetectConfig
 from valuemap.detect.boxes import Boxes
 from valuemap.detect.letterbox import Pixels, Size

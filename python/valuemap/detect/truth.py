@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from valuemap.cameras import camera_poses, colmap_camera
+from valuemap.cameras import camera_poses, lens_of
 from valuemap.dataset import rows_of
 from valuemap.tables import Bools, Cameras, Detections, Floats, Images, Ints, Truth, TruthDetections
 
@@ -71,7 +71,7 @@ def _project(cameras: Cameras, camera_row: Ints, in_cam_m: Floats) -> Floats:
     """Return pixels (N, 2) of points in front of their cameras, NaN for the others."""
     place = np.full((len(in_cam_m), 2), np.nan)
     for row in np.unique(camera_row):
-        camera = colmap_camera(cameras, int(row))
+        camera = lens_of(cameras, int(row))
         members = np.flatnonzero((camera_row == row) & ((in_cam_m[:, 2] > 0.0) | camera.is_spherical()))
         place[members] = camera.img_from_cam(in_cam_m[members])
     return place

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 
+from valuemap.camera_models import names_of_params
 from valuemap.errors import InputError, SettingError
 from valuemap.tables import Cameras, Categories, Floats, Ints
 
@@ -85,7 +85,8 @@ def parse_camera(text: str, pixel_center: float = 0.5) -> Camera:
     """
     hint = 'for example "PINHOLE 1242 375 721.5 721.5 609.6 172.9" or "EQUIRECTANGULAR 8192 4096"'
     name, *rest = text.split() or [""]
-    if name not in pycolmap.CameraModelId.__members__ or name == "INVALID":
+    expected = names_of_params(name)
+    if expected is None:
         raise SettingError(f"camera {text!r}: expected one of COLMAP's camera models first", hint=hint)
     try:
         width, height = int(rest[0]), int(rest[1])
@@ -96,7 +97,7 @@ def parse_camera(text: str, pixel_center: float = 0.5) -> Camera:
         raise SettingError(f"camera {text!r}: expected a width and height in pixels", hint=hint)
     if name == "EQUIRECTANGULAR":
         params = params or [float(width), float(height)]
-    names = [part.strip() for part in pycolmap.Camera(model=name, width=width, height=height).params_info.split(",")]
+    names = [part.strip() for part in expected.split(",")]
     if len(params) != len(names) or not np.isfinite(params).all():
         raise SettingError(f"camera {text!r}: {name} has the parameters {', '.join(names)}", hint=hint)
     shifted = [

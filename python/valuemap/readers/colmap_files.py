@@ -15,8 +15,7 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-import pycolmap
-
+from valuemap.colmap import pycolmap
 from valuemap.errors import InputError
 
 _NEEDED = ("cameras", "images")

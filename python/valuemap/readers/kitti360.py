@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from valuemap.colmap import pycolmap
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, Imported, assemble

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 
 from valuemap.cameras import colmap_camera
 from valuemap.dataset import Dataset, rows_of
 from valuemap.errors import InputError
 from valuemap.writers.attributes import Export
+
+if TYPE_CHECKING:
+    from valuemap.colmap import pycolmap
 
 _COLORS = ((230, 75, 53), (77, 187, 213), (0, 160, 135), (60, 84, 136), (243, 155, 127), (132, 145, 180))
 
@@ -29,6 +32,8 @@ def write_colmap(export: Export, folder: Path) -> None:
     InputError
         The dataset of the map is not known.
     """
+    from valuemap.colmap import pycolmap  # Slow to import, and only this format needs it.
+
     dataset = export.dataset
     if dataset is None:
         raise InputError(
@@ -47,6 +52,8 @@ def write_colmap(export: Export, folder: Path) -> None:
 
 def _add_images(model: pycolmap.Reconstruction, dataset: Dataset) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     """Add all images with their detections; return the number (detections) of each detection within its image."""
+    from valuemap.colmap import pycolmap
+
     images, detections = dataset.images, dataset.detections
     image_row = rows_of(detections.image_id, images.image_id)
     order = np.argsort(image_row, kind="stable")
@@ -73,6 +80,8 @@ def _add_labels(
     dataset: Dataset,
     first_point: np.ndarray[tuple[int], np.dtype[np.int64]],
 ) -> None:
+    from valuemap.colmap import pycolmap
+
     result = export.result
     export.image_row_of_vote  # noqa: B018  Raises where votes are not by this dataset.
     number = first_point[rows_of(result.votes.detection_id, dataset.detections.detection_id)]

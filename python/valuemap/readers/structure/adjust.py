@@ -23,11 +23,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import pycolmap
 from scipy.sparse import bsr_matrix, coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
+from valuemap.colmap import pycolmap
 from valuemap.tables import Bools, Floats, Ints
 
 _MOST_STEPS, _ENOUGH = 20, 1e-4

@@ -41,8 +41,7 @@ def main() -> None:
 
 def work(workspace: Path, threads: int, progress: Any) -> None:
     """Find poses, and keep them in the folder."""
-    import pycolmap
-
+    from valuemap.colmap import pycolmap
     from valuemap.readers.structure.features import find_features
     from valuemap.readers.structure.job import read_job, write_answer
     from valuemap.readers.structure.mapping import find_models

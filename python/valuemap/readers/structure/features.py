@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
+from valuemap.colmap import pycolmap
 from valuemap.progress import Progress
 from valuemap.readers.structure.job import DATABASE, LINKS, Job
 

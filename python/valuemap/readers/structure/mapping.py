@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from valuemap.colmap import pycolmap
 from valuemap.errors import InputError
 from valuemap.progress import Progress
 from valuemap.readers.cameras_of import Camera

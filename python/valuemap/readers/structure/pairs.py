@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from scipy.spatial import cKDTree
 
+from valuemap.colmap import pycolmap
 from valuemap.progress import Progress
 from valuemap.readers.structure.features import image_ids
 from valuemap.readers.structure.job import DATABASE, Job

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pycolmap
 
+from valuemap.colmap import pycolmap
 from valuemap.readers.structure.job import DATABASE
 from valuemap.tables import Bools, Floats, Ints
 
