@@ -371,21 +371,23 @@ os.kill(os.getpid(), signal.SIGTERM)
     assert (done.returncode, done.stderr) == (7, "")
 
 
-def test_a_map_of_pinholes_needs_no_pycolmap(street: Path, tmp_path: Path) -> None:
-    code = """
+@pytest.mark.parametrize("module", ["pyarrow.compute", "pycolmap"])
+def test_a_map_of_pinholes_needs_nothing_that_is_slow_to_import(module: str, tmp_path: Path) -> None:
+    valuemap.write_dataset(as_dataset(random_scene(5, images=40, objects=6)), tmp_path / "local")
+    code = f"""
 import sys
 from valuemap.cli import main
 try:
     main()
 finally:
-    assert "pycolmap" not in sys.modules
+    assert "{module}" not in sys.modules
 """
     command = [
         sys.executable,
         "-c",
         code,
         "map",
-        str(street),
+        str(tmp_path / "local"),
         "--out",
         str(tmp_path / "map"),
         "--set",

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 from small_dataset import small_dataset, with_column, with_value
-from valuemap.arrow import in_one
+from valuemap.arrow import in_one, numbers_from_arrow, take_texts, texts_to_arrow
 from valuemap.errors import InputError
 from valuemap.tables import (
     Cameras,
@@ -329,3 +329,21 @@ def test_text_that_is_not_utf8_is_refused(tmp_path: Path) -> None:
 def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"images\.parquet: no such file$"):
         read_table(Images, tmp_path / "images.parquet")
+
+
+@pytest.mark.parametrize("kind", [pa.string(), pa.large_string()])
+def test_texts_are_taken_as_by_arrow(kind: pa.DataType) -> None:
+    texts = pa.array(["cut off", "a", "", "häuser/1.jpg", "b" * 300, "", "z"], kind)[1:]
+    for rows in ([], [0], [5, 1, 1, 3, 0, 2], list(range(6)), [4, 1]):
+        taken = take_texts(texts, np.array(rows, np.int64))
+        taken.validate(full=True)
+        assert taken.to_pylist() == texts.take(pa.array(rows, pa.int64())).to_pylist()
+    assert take_texts(texts_to_arrow(["", ""]), np.array([1, 0])).to_pylist() == ["", ""]
+
+
+@pytest.mark.parametrize("kind", [pa.float64(), pa.float32(), pa.int64()])
+def test_numbers_that_are_missing_are_nan(kind: pa.DataType) -> None:
+    column = pa.array([9, None, *range(20), None, 5], kind)[1:]
+    expected = [np.nan, *range(20), np.nan, 5]
+    np.testing.assert_array_equal(numbers_from_arrow(column), expected)
+    np.testing.assert_array_equal(numbers_from_arrow(pa.chunked_array([column[:3], column[3:]])), expected)

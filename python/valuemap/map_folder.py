@@ -155,12 +155,7 @@ def read_map(path: str | Path) -> Map:
         The folder is not a map, or a file in it is damaged.
     """
     folder = Path(path)
-    head = folder / MARKER
-    settle(folder)
-    if not head.is_file():
-        raise InputError(f"{folder}: is not a map: there is no {MARKER} in it", hint="make one with valuemap map")
-    run = read_json(head)
-    _check_run(run, str(head))
+    run = read_record(folder)
     if (folder / CALIBRATION).is_file():
         run["calibration"] = read_json(folder / CALIBRATION)
     labels, votes = read_table(Labels, folder / "labels.parquet"), read_table(Votes, folder / "votes.parquet")
@@ -168,8 +163,19 @@ def read_map(path: str | Path) -> Map:
     known = np.isin(votes.label_id, labels.label_id)
     votes = votes if known.all() else votes.take(known)
     rejected = read_table(Rejected, folder / REJECTED) if (folder / REJECTED).is_file() else None
-    frame = Frame.from_json(run.pop("frame", None), source=str(head))
+    frame = Frame.from_json(run.pop("frame", None), source=str(folder / MARKER))
     return Map(frame=frame, labels=labels, votes=votes, run=run, rejected=rejected)
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """Read what run.json of a map says; raises `InputError` where the folder is no map."""
+    head = folder / MARKER
+    settle(folder)
+    if not head.is_file():
+        raise InputError(f"{folder}: is not a map: there is no {MARKER} in it", hint="make one with valuemap map")
+    run = read_json(head)
+    _check_run(run, str(head))
+    return run
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from valuemap.arrow import in_one, numbers_from_arrow, numbers_to_arrow, texts_to_arrow
+from valuemap.arrow import as_type, in_one, numbers_from_arrow, numbers_to_arrow, take_texts, texts_to_arrow
 from valuemap.errors import InputError
 
 if TYPE_CHECKING:
@@ -44,10 +43,14 @@ class Categories:
     @classmethod
     def from_texts(cls, texts: Sequence[str] | pa.Array | pa.ChunkedArray) -> Self:
         """Encode texts (N) so that equal columns get equal codes whatever the order of rows."""
-        column = in_one(texts if isinstance(texts, pa.ChunkedArray | pa.Array) else texts_to_arrow(texts))
-        if not pa.types.is_dictionary(column.type):
-            column = column.dictionary_encode()
-        found, codes = column.dictionary.to_pylist(), numbers_from_arrow(column.indices)
+        if isinstance(texts, pa.ChunkedArray | pa.Array):
+            column = in_one(texts)
+            column = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
+            found, codes = column.dictionary.to_pylist(), numbers_from_arrow(column.indices)
+        else:
+            number: dict[str, int] = {}
+            codes = np.array([number.setdefault(text, len(number)) for text in texts], np.int32)
+            found = texts_to_arrow(list(number)).to_pylist()  # All can be written.
         is_used = np.bincount(codes.astype(np.int64), minlength=len(found)) > 0
         names = tuple(sorted({name for name, used in zip(found, is_used.tolist(), strict=True) if used}))
         rank = {name: i for i, name in enumerate(names)}
@@ -727,7 +730,7 @@ def _take(value: Any, rows: NDArray[Any]) -> Any:
         return value.take(rows)
     if isinstance(value, pa.Array):
         indices = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
-        return value.take(numbers_to_arrow(indices.astype(np.int64)))
+        return take_texts(value, indices)
     if isinstance(value, list):
         return [value[i] for i in (np.flatnonzero(rows) if rows.dtype == np.bool_ else rows)]
     # A fraction of the time of value[rows] where a row has several numbers.
@@ -790,7 +793,7 @@ def _read_column(column: pa.ChunkedArray, name: str, spec: Any, source: str) -> 
     if kind == "category":
         return Categories.from_texts(column)
     if kind == "text":
-        return in_one(pc.cast(column, pa.string()))
+        return in_one(as_type(column, pa.string()))
     if kind == "floats":
         return [np.asarray(row, dtype=np.float64) for row in column.to_pylist()]
     if kind == "int":
@@ -806,12 +809,12 @@ def _read_column(column: pa.ChunkedArray, name: str, spec: Any, source: str) -> 
     return values
 
 
-def _numbers(column: pa.ChunkedArray, as_type: pa.DataType, name: str, source: str) -> NDArray[Any]:
+def _numbers(column: pa.ChunkedArray, kind: pa.DataType, name: str, source: str) -> NDArray[Any]:
     try:
-        return numbers_from_arrow(column.cast(as_type))
+        return numbers_from_arrow(as_type(column, kind))
     except pa.ArrowInvalid as error:
         raise InputError(
-            f"{source}: column {name!r}: expected numbers that {as_type} can hold: {error}",
+            f"{source}: column {name!r}: expected numbers that {kind} can hold: {error}",
             hint="are these ids below 2^63, timestamps in seconds?",
         ) from error
 

@@ -129,5 +129,8 @@ def _listed(column: pa.Array | pa.ChunkedArray, offsets: pa.Array) -> pa.Array:
 
 
 def _flat(column: pa.ChunkedArray) -> Any:
-    values: Ints = numbers_from_arrow(pa.chunked_array([chunk.flatten() for chunk in column.chunks], column.type.value_type))  # fmt: skip # noqa: E501
+    """Return the numbers of all lists, one after the other, none of which is missing."""
+    chunks = [chunk for chunk in column.chunks if len(chunk)]
+    parts = [chunk.values[chunk.offsets[0].as_py() : chunk.offsets[-1].as_py()] for chunk in chunks]
+    values: Ints = numbers_from_arrow(pa.chunked_array(parts, column.type.value_type))
     return values

@@ -24,7 +24,7 @@ from valuemap.dataset import (
 from valuemap.drives import find_drives
 from valuemap.errors import InputError
 from valuemap.evidence import Evidence, find_dataset
-from valuemap.map_folder import BRIDGE, CELLS, CHANGES, DATASET, Map, read_map
+from valuemap.map_folder import BRIDGE, CELLS, CHANGES, DATASET, Map, read_map, read_record
 from valuemap.nearby import Nearby
 from valuemap.pipeline import LARGEST_IN_MEMORY, Run, build_map_of_folder
 from valuemap.portions import largest_detection, read_dataset_in_portions, rows_on_disk
@@ -93,18 +93,23 @@ def update_map(
     InputError
         One of the folders is not what it should be, the map was not made by this version, or the frames differ.
     """
-    before = read_map(old)
-    calibration = read_calibration(old)
-    place = find_dataset(old, before.run, dataset)
+    place = find_dataset(old, read_record(old), dataset)
     if place is None:
         raise InputError(f"{old}: its dataset is not where it was", hint="say where it is with --dataset")
-    second = read_dataset(added)
-    if not len(second.detections):
-        raise InputError(f"{added}: there are no detections in it", hint="find some with valuemap detect")
-    run = replace(run, calibration=calibration, known=old / CELLS, keeps_rejected=False)
-    updated = _updated_in_portions if _is_large(place, added) else _updated_in_memory
-    rebuilt, cells, alone, posed, images_before = updated(place, second, before, run, progress)
-    del second
+    run = replace(run, calibration=read_calibration(old), known=old / CELLS, keeps_rejected=False)
+    with ThreadPoolExecutor(1) as beside:
+        reading = beside.submit(read_map, old)
+        second = read_dataset(added)
+        if not len(second.detections):
+            raise InputError(f"{added}: there are no detections in it", hint="find some with valuemap detect")
+        both = None if _is_large(place, added) else _joined(place, second)
+        before = reading.result()
+    if both is None:
+        updated = _updated_in_portions(place, second, before, run, progress)
+    else:
+        updated = _updated_in_memory(*both, before, run, progress)
+    rebuilt, cells, alone, posed, images_before = updated
+    del second, both, updated
     before = _in_frame_of(rebuilt, before)
     result, changes, bridge = compare(before, rebuilt, alone, posed, images_before, progress=progress)
     result = replace(result, rejected=rejected_of_map(result, lambda: _with_detections(posed, run)))
@@ -128,11 +133,14 @@ _Updated = tuple[Map, list[Place], Map, Dataset, Ints]
 were found with, and the ids of the images that the map before had."""
 
 
-def _updated_in_memory(place: Path, second: Dataset, before: Map, run: Run, progress: Progress) -> _Updated:
-    """Return what is compared, of datasets that fit into memory."""
+def _joined(place: Path, second: Dataset) -> tuple[Dataset, Ints]:
+    """Return two datasets as one, and the ids of the images of the first."""
     first = read_dataset(place)
-    joined, images_before = ensure_checked(join_datasets(first, second)), first.images.image_id
-    del first, second  # There is as much in them as in the two as one.
+    return ensure_checked(join_datasets(first, second)), first.images.image_id
+
+
+def _updated_in_memory(joined: Dataset, images_before: Ints, before: Map, run: Run, progress: Progress) -> _Updated:
+    """Return what is compared, of datasets that fit into memory."""
     with ThreadPoolExecutor(1) as beside:
         written = beside.submit(write_dataset_in_pieces, [joined], run.work / DATASET)
         if run.cuts_on_disk(len(joined.images) + len(joined.detections)):
