@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import valuemap._core as _core
-from valuemap.arrow import no_texts
+from valuemap.arrow import no_texts, take_texts
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.dataset import Dataset, rows_of
 from valuemap.tables import Bools, Floats, Images, Ints
@@ -266,7 +266,7 @@ class _Shots:
 
     def names(self, shots: Ints) -> list[str]:
         """Return the names of some."""
-        return list(self.images.name.take(self.row[shots]).to_pylist())
+        return list(take_texts(self.images.name, self.row[shots]).to_pylist())
 
     def cam_from_world(self, shots: Ints) -> Floats:
         """Return the rotations (N, 3, 3) of some."""
