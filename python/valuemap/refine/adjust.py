@@ -5,6 +5,9 @@ neighbouring nodes only: each drive's nodes are eliminated by a banded Cholesky 
 and the constants, whose normal equations lose Y^T Y with L Y = C, where C are the products with the nodes. Steps are
 those of Gauss-Newton with Cauchy's weights, until the next one would hardly lower the cost.
 
+What an image is off by itself moves all that it shows, so that its detections are not independent of each other. It is
+eliminated before the nodes, image by image, in the same way.
+
 Where things stand in the equations depends on who sees what alone: it is found once for all steps. In each step the
 products of the derivatives of an observation are added up over those of one node and object before anything else.
 """
@@ -21,7 +24,6 @@ import scipy
 from valuemap.refine.jumps import Links
 from valuemap.refine.residuals import (
     OFFSET,
-    Linearised,
     Observations,
     State,
     linearised,
@@ -167,13 +169,16 @@ class Adjustment:
         node = seen.node
         self.finest = Groups(node, seen.thing, part)
         self.node, self.thing, self.part = (code[self.finest.row] for code in (node, seen.thing, part))
-        self.by_node = Groups(self.node)
         self.by_node_and_part = Groups(self.node, self.part)
+        both = self.by_node_and_part.row
+        self.by_node, self.by_part = Groups(self.node[both]), Groups(self.part[both])
         self.by_thing = Groups(self.thing)
         self.by_thing_and_part = Groups(self.thing, self.part)
-        self.by_part = Groups(self.part)
         self.by_image = Groups(seen.image)
         self.image = seen.image[self.by_image.row]
+        self.image_row = np.searchsorted(self.image, seen.image)
+        # An image is of one node and one part: as sorted, these are the groups of `by_node_and_part`.
+        self.images_by_node_and_part = Groups(seen.node[self.by_image.row], part[self.by_image.row])
         self.drives = list(self._together())
 
     def _together(self) -> Iterator[_Drives]:
@@ -219,23 +224,36 @@ class Adjustment:
                 ],
             )
 
-    def step(self, state: State, tolerance: float, *, with_variance: bool = False) -> tuple[State, float]:
+    def step(
+        self, state: State, tolerance: float, *, with_variance: bool = False, of_things: bool = False
+    ) -> tuple[State, float]:
         """Return the state after one step of Gauss-Newton with weights of this tolerance, and what it gains.
 
-        The gain is that of chi-squared if the residuals were linear and the weights stayed.
+        The gain is that of chi-squared if the residuals were linear and the weights stayed. The covariance is that of
+        the constants, or `of_things` and constants.
         """
-        products = self._products(linearised(self.seen, state), tolerance)
-        things = self.by_thing.sum(products)
-        parts = self.by_part.sum(products)
+        rows, own = self._weighted(state, tolerance)
+        products, of_image = self.finest.products(rows), self._shared_by_image(rows, own)
+        # What all detections of an image have in common is taken from what they say of the image's node and part, ...
+        both = self.by_node_and_part.sum(products)
+        both -= self.images_by_node_and_part.sum(of_image.whole.transpose(0, 2, 1) @ of_image.whole)
+        parts, node_products = self.by_part.sum(both), self.by_node.sum(both)
+        # ... of each object together with these, ...
+        beside_thing = products[:, :, :3] - self.finest.sum(
+            of_image.whole[self.image_row].transpose(0, 2, 1) @ of_image.of_thing
+        )
+        things = self.by_thing.sum(beside_thing)
         system = _System(self.columns, self.things)
         thing = self.thing[self.by_thing.row]
         of_thing = 3 * thing[:, None] + np.arange(3)
-        of_part = self.constants_of_part[self.part[self.by_part.row]]
-        system.add(of_thing, of_thing, things[:, :3, :3], -things[:, :3, _RESIDUAL])
+        of_part = self.constants_of_part[self.part[self.by_node_and_part.row[self.by_part.row]]]
+        system.add(of_thing, of_thing, self.by_thing.sum(products[:, :3, :3]), -things[:, _RESIDUAL])
+        # ... and of objects that it shows together.
+        system.take_sparse(self._between_things(of_image.of_thing))
         of_constants = _TO_CONSTANTS.T @ parts
         system.add(of_part, of_part, of_constants @ _TO_CONSTANTS, -of_constants[:, :, _RESIDUAL])
         pairs = self.by_thing_and_part
-        beside = _TO_CONSTANTS.T @ pairs.sum(products[:, :, :3])
+        beside = _TO_CONSTANTS.T @ pairs.sum(beside_thing)
         system.add_beside(self.constants_of_part[self.part[pairs.row]], 3 * self.thing[pairs.row], beside)
         system.add_diagonal(np.arange(3 * self.things), np.full(3 * self.things, _DAMPING))
         for kind, index in enumerate(self.column_of):
@@ -244,11 +262,10 @@ class Adjustment:
             system.add_diagonal(index[free], sigma**-2, -(sigma**-2) * state.constants[kind][free])
         self._link(system, state.constants[OFFSET])
         nodes = np.zeros((len(self.chain.drive), _BASIS, _BASIS))
-        nodes[self.node[self.by_node.row]] = self.by_node.sum(products)
-        beside = _TO_DRIFT.T @ self.by_node_and_part.sum(products) @ _TO_CONSTANTS
-        sums = (_TO_DRIFT.T @ products[:, :, :3], beside, _TO_DRIFT.T @ nodes)
+        nodes[self.node[self.by_node_and_part.row[self.by_node.row]]] = node_products
+        sums = (_TO_DRIFT.T @ beside_thing, _TO_DRIFT.T @ both @ _TO_CONSTANTS, _TO_DRIFT.T @ nodes)
         eliminated = [self._eliminate(drives, sums, state.drift, system) for drives in self.drives]
-        step, covariance = system.solve(3 * self.things if with_variance else None)
+        step, covariance = system.solve(0 if of_things else 3 * self.things if with_variance else None)
         gain = float(system.right @ step)
         drift = state.drift.copy()
         for drives, (factor, solved) in zip(self.drives, eliminated, strict=True):
@@ -278,9 +295,11 @@ class Adjustment:
         pull = np.einsum("nij,nj->ni", self.links.information, left)
         system.add(columns, columns, blocks, np.concatenate([pull, -pull], axis=1))
 
-    def _products(self, at: Linearised, tolerance: float) -> Floats:
-        """Return the sums (P, 12, 12) of the weighted products of derivatives and residuals, in the finest groups."""
+    def _weighted(self, state: State, tolerance: float) -> tuple[Floats, Floats]:
+        """Return derivatives with residuals (N, 2, 12), and those by the image's own error (N, 2, 6), both weighted."""
+        at = linearised(self.seen, state)
         weight = weights(self.seen, at.residual_px, at.depth_m, tolerance)
+        weight = weight * self.seen.sigma_px**2 / self.seen.detection_sigma_px**2
         basis = np.empty((len(self.seen), 2, _BASIS))
         basis[:, :, _POINT:_TURN], basis[:, :, _TURN:_DELAY_AT] = at.by_point, at.by_turn
         basis[:, :, _DELAY_AT], basis[:, :, _FOCAL_AT] = at.by_delay, at.by_focal
@@ -288,7 +307,28 @@ class Adjustment:
         basis[:, :, _RESIDUAL] = at.residual_px
         basis[weight == 0.0] = 0.0  # What is behind its camera may be infinite.
         basis *= np.sqrt(weight)[:, None, None]
-        return self.finest.products(basis)
+        return basis, np.concatenate([-basis[:, :, _POINT:_TURN], basis[:, :, _TURN:_DELAY_AT]], axis=2)
+
+    def _shared_by_image(self, rows: Floats, own: Floats) -> _OfImages:
+        """Return what takes images' own errors out of the products of weighted derivatives (N, 2, 12)."""
+        information = self.by_image.products(own) + self._own_precision()
+        to_own = np.linalg.inv(np.linalg.cholesky(information))[self.image_row] @ own.transpose(0, 2, 1)
+        of_rows = to_own @ rows
+        return _OfImages(self.by_image.sum(of_rows), of_rows[:, :, :3])
+
+    def _between_things(self, of_thing: Floats) -> scipy.sparse.coo_array:
+        """Return what products of pairs of objects (3 K, 3 K) lose, by what they share (N, 6, 3) with images."""
+        row = 6 * self.image_row[:, None, None] + np.arange(6)[:, None]
+        column = 3 * self.seen.thing[:, None, None] + np.arange(3)
+        at = [np.broadcast_to(index, of_thing.shape).ravel() for index in (row, column)]
+        shared = scipy.sparse.csr_array(
+            (of_thing.ravel(), (at[0], at[1])), shape=(6 * len(self.image), 3 * self.things)
+        )
+        return scipy.sparse.coo_array(shared.T @ shared)
+
+    def _own_precision(self) -> Floats:
+        """Return the information (6, 6) that is thought to be had of an image's own error."""
+        return np.diag(np.repeat([self.scales.own_m**-2, self.scales.own_rad**-2], 3))
 
     def _eliminate(
         self, drives: _Drives, sums: tuple[Floats, Floats, Floats], drift: Floats, system: _System
@@ -340,17 +380,23 @@ class Adjustment:
 
     def _own_errors(self, state: State, tolerance: float) -> Floats:
         """Return what each image (I, 6) is probably off by itself, given all else."""
-        at = linearised(self.seen, state)
-        share = weights(self.seen, at.residual_px, at.depth_m, tolerance)
-        share = share * self.seen.sigma_px**2 / self.seen.detection_sigma_px**2
-        basis = np.concatenate([-at.by_point, at.by_turn, at.residual_px[:, :, None]], axis=2)
-        basis[share == 0.0] = 0.0
-        basis *= np.sqrt(share)[:, None, None]
-        products = self.by_image.products(basis)
-        information = products[:, :6, :6] + np.diag(np.repeat([self.scales.own_m**-2, self.scales.own_rad**-2], 3))
+        rows, by_own = self._weighted(state, tolerance)
+        products = self.by_image.products(np.concatenate([by_own, rows[:, :, _RESIDUAL:]], axis=2))
         own = np.zeros_like(state.own)
+        information = products[:, :6, :6] + self._own_precision()
         own[self.image] = -np.linalg.solve(information, products[:, :6, 6:])[:, :, 0]
         return own
+
+
+@dataclass(frozen=True, eq=False)
+class _OfImages:
+    """With L L^T the information of an image's own error and B the derivatives by it, L^-1 B^T times those by others.
+
+    `whole` (images, 6, 12) are the sums over an image, `of_thing` (N, 6, 3) those by the object of each detection.
+    """
+
+    whole: Floats
+    of_thing: Floats
 
 
 class _System:
@@ -396,6 +442,10 @@ class _System:
         else:
             self._add(columns[:, None], columns[None, :], -block)
         self._right[columns] -= right
+
+    def take_sparse(self, block: scipy.sparse.coo_array) -> None:
+        """Take a block away that begins at the first row and column."""
+        self._add(block.row.astype(np.int64), block.col.astype(np.int64), -block.data)
 
     def _add(self, rows: Ints, columns: Ints, values: Floats) -> None:
         if self.matrix is not None:
