@@ -17,16 +17,18 @@ from check_faults import FAULTS as INJECTED
 from check_faults import good_city
 from small_dataset import small_dataset
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check import cameras, examine, fit, lenses
+from valuemap.check import cameras, contest, examine, fit, lenses
 from valuemap.check.agreement import Agreement, compare, gains_of_objects, measure_agreement
 from valuemap.check.boxes import PictureSize
-from valuemap.check.cameras import PARAMETERS, _Correction, _followed, _is_wider_gate_only, with_focal
+from valuemap.check.cameras import PARAMETERS, _followed, _is_wider_gate_only, with_focal
 from valuemap.check.contest import _compare, _joined, _Reading, _suspicion, hold_contest
 from valuemap.check.fault import LEAST_CHANCE, Convention, View, gains_of_all, keep_rows, with_poses
 from valuemap.check.fit import Estimate, Parameter, estimate
 from valuemap.check.headings import headings, level_rotations, rotations_of
+from valuemap.check.loose import Correction, Loose
 from valuemap.check.offsets import find_shift
-from valuemap.check.passes import _at_a_seam, _jumping_passes, _seen_m, moved_along
+from valuemap.check.passes import _at_a_seam, _jumping_passes, _rolling_period, _seen_m, _unrolled, moved_along
+from valuemap.check.poses import PitchAndRoll
 from valuemap.check.quality import TruthElsewhere
 from valuemap.check.registry import CONVENTIONS, FAULTS
 from valuemap.check.sample import driving_order
@@ -44,6 +46,9 @@ _SEEN_AGAIN = {"passes_no_drives"}
 _RECOVERED = {"degrees_for_radians": 0.6}
 """Degrees read as radians lose whole turns, which the direction of travel does not always give back."""
 _FAULT = {fault.name: fault for fault in FAULTS}
+
+
+_ESTIMATE = Estimate(("along",), np.array([0.5]), np.array([[1e-6]]), 40, 400)
 
 
 @pytest.fixture(scope="module")
@@ -192,17 +197,16 @@ def test_the_gate_is_one_angle_whatever_the_focal_length(good: Dataset, view: Vi
     wide = with_focal(coarse.dataset, -2.0)
     sample = coarse.many_places
     in_pixels = measure_agreement(sample.of(wide), sample.place_of_image, coarse.gate_px).gain.sum()
-    given = gains_of_all(coarse, coarse.dataset)
     assert gains_of_all(coarse, wide, is_gate_an_angle=True).sum() < 0.5 * in_pixels
-    assert _is_wider_gate_only(coarse, given, wide)
-    assert not _is_wider_gate_only(coarse, given, with_focal(coarse.dataset, 0.0))
+    assert _is_wider_gate_only(coarse, wide)
+    assert not _is_wider_gate_only(coarse, with_focal(coarse.dataset, 0.0))
 
 
 def test_a_shift_in_time_is_followed_where_least_squares_stay_behind(good: Dataset, view: View) -> None:
     shifted = View(with_poses(good, rotation_matrices(good.images), moved_along(good, 5.0)))
     parameter = next(each for each in PARAMETERS if each.name == "along")
     given = gains_of_all(shifted, shifted.dataset)
-    start = _Correction(parameter, -1.0, 0.05, 1e-9, compare(given, given))
+    start = Correction(parameter, -1.0, 0.05, 1e-9, compare(given, given), _ESTIMATE)
     found = _followed(shifted, start, given)
     assert found.value == pytest.approx(-5.0, abs=0.3)
     assert found.comparison.difference > 0.0
@@ -224,7 +228,7 @@ def test_what_agrees_the_more_the_farther_is_followed_so_far_and_no_farther(
 
     monkeypatch.setattr("valuemap.check.cameras.gains_of_all", gains)
     given = np.zeros(40)
-    start = _Correction(Parameter("along", change, 0.1), 1.0, 1e-12, 1e-9, compare(given, given))
+    start = Correction(Parameter("along", change, 0.1), 1.0, 1e-12, 1e-9, compare(given, given), _ESTIMATE)
     found = _followed(View(good), start, given)
     assert 64.0 <= found.value <= 128.0
     assert len(tried) <= 1 + 6 + 12
@@ -239,8 +243,7 @@ def test_what_the_opposite_gives_as_well_is_no_correction(view: View, monkeypatc
 
     monkeypatch.setattr(cameras, "gains_of_all", gains)
     monkeypatch.setattr(cameras, "_better", lambda *given: given[2:])
-    certain = Estimate(("along",), np.array([0.5]), np.array([[1e-6]]), 40, 400)
-    monkeypatch.setattr(cameras, "common_errors", lambda _: certain)
+    monkeypatch.setattr(cameras, "common_errors", lambda _: _ESTIMATE)
     assert cameras._find_correction(view) is None
 
 
@@ -279,11 +282,105 @@ _LOOSE = replace(
     PRESETS["small"], position_white_m=0.4, position_drift_m=1.5, rotation_white_deg=0.3, rotation_drift_deg=0.8
 )
 """Poses as of a phone: metres and most of a degree off."""
+_LOOSE_BY = ("position_white_m", "position_drift_m", "rotation_white_deg", "rotation_drift_deg")
 
 
 @pytest.fixture(scope="module")
 def loose() -> View:
     return View(simulate(replace(_LOOSE, passes_per_street=1), seed=302))
+
+
+def one_pass(seed: int, **changes: float) -> Dataset:
+    """Return a small city that each street of is driven once."""
+    return good_city(seed, passes_per_street=1, **changes)
+
+
+def test_what_looks_like_noise_to_a_narrow_gate_is_seen_by_a_wide_one() -> None:
+    """Errors of 1 m and 0.6 degrees, and a camera that is 3 degrees askew."""
+    phone = {"position_white_m": 0.4, "position_drift_m": 1.0, "rotation_white_deg": 0.3, "rotation_drift_deg": 0.5}
+    given = good_city(300, **phone)
+    assert cameras._find_beyond_noise(View(given)) is None
+    askew = INJECTED["camera_yaw"].spoil(given)
+    assert askew is not None
+    assert cameras._find_correction(View(askew)) is None
+    found = cameras._find_beyond_noise(View(askew))
+    assert found is not None
+    assert found.parameter.name == "yaw"
+    assert np.degrees(found.value) == pytest.approx(-3.0, abs=0.7)
+
+
+def test_a_shift_in_time_of_a_short_drive_is_named() -> None:
+    late = INJECTED["time_shift"].spoil(one_pass(301))
+    assert late is not None
+    assert cameras._find_correction(View(late)) is None
+    found = cameras.TimeShift().find(View(late))
+    assert found is not None
+    assert "ahead" in found.what
+
+
+def test_a_focal_length_is_told_where_all_rays_of_an_object_vote() -> None:
+    spoiled = INJECTED["focal_length"].spoil(one_pass(302))
+    assert spoiled is not None
+    assert cameras.FocalLength().find(View(spoiled)) is not None
+    narrow, shorter = View(spoiled), with_focal(spoiled, -0.29)
+    at_one_angle = gains_of_all(narrow, shorter, is_gate_an_angle=True).sum()
+    assert at_one_angle < 0.98 * gains_of_all(narrow, spoiled).sum()  # As of poses that are off by metres.
+
+
+def test_a_focal_length_is_no_tilt(monkeypatch: pytest.MonkeyPatch) -> None:
+    spoiled = View(with_focal(one_pass(303), 0.45))
+    assert cameras._find_beyond_noise(spoiled) is None
+    monkeypatch.setattr(Loose, "_is_focal", lambda *_: False)
+    wrong = cameras._find_beyond_noise(spoiled)
+    assert wrong is not None
+    assert wrong.parameter.name == "pitch"
+
+
+def test_how_cameras_are_mounted_is_part_of_pitch_and_roll() -> None:
+    """The cameras look up 3 degrees, which the noise hides: it is put right, and no second fault."""
+    given = one_pass(300)
+    spoiled = INJECTED["pitch_and_roll"].spoil(given)
+    assert spoiled is not None
+    outcome = examine(spoiled)
+    assert [finding.fault for finding in outcome.findings] == ["pitch_and_roll"]
+    assert np.median(headings(outcome.fixed)[1]) == pytest.approx(np.median(headings(given)[1]), abs=np.radians(0.3))
+
+
+def test_pitch_and_roll_of_a_phone_are_not_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = View(good_city(300, **{name: getattr(_LOOSE, name) for name in _LOOSE_BY}))
+    assert hold_contest(given, [PitchAndRoll()]).finding is None
+    monkeypatch.setattr(PitchAndRoll, "least_times", None)
+    assert hold_contest(given, [PitchAndRoll()]).finding is not None
+
+
+def test_a_camera_that_looks_too_low_is_not_upside_down(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = good_city(300)
+    rotation = Rotation.from_euler("x", 4.0, degrees=True).as_matrix() @ rotation_matrices(given.images)
+    low = with_poses(given, rotation, camera_centers(given.images))
+    verdict = hold_contest(View(low), CONVENTIONS)
+    assert verdict.finding is None
+    assert verdict.suspicion is None
+    monkeypatch.setattr(contest, "_is_small_turn", lambda *_: False)
+    wrong = hold_contest(View(low), CONVENTIONS).finding
+    assert wrong is not None
+    assert wrong.fault == "mirrored_pictures"
+
+
+def test_names_of_one_camera_after_the_other_are_no_clock_that_starts_over() -> None:
+    images = small_dataset().images.take(np.zeros(60, dtype=np.int64))
+    camera, frame = np.divmod(np.arange(60), 30)
+    images = images.replace(
+        image_id=np.arange(60),
+        name=pa.array([f"{'left' if c == 0 else 'right'}/{f:03d}.jpg" for c, f in zip(camera, frame, strict=True)]),
+        camera_id=camera,
+        timestamp_s=0.5 * frame,
+    )
+    given = replace(small_dataset(), images=images)
+    assert _rolling_period(given) is None
+    rolling = replace(given, images=images.replace(timestamp_s=np.asarray(images.timestamp_s) % 10.0))
+    assert _rolling_period(rolling) == (10.0, 2)
+    unrolled = np.asarray(_unrolled(rolling).images.timestamp_s)
+    np.testing.assert_allclose(unrolled, np.asarray(images.timestamp_s))
 
 
 def test_rays_that_hardly_part_do_not_say_how_large_things_are(loose: View) -> None:

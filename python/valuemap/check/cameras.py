@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -13,10 +13,11 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check.agreement import Comparison, compare, measure_agreement
+from valuemap.check.agreement import compare, measure_agreement
 from valuemap.check.fault import (
     LEAST_CHANCE,
     LEAST_RISE,
+    WIDER_GATE,
     Fault,
     Finding,
     Stage,
@@ -28,6 +29,7 @@ from valuemap.check.fault import (
 )
 from valuemap.check.fit import Estimate, Parameter, estimate
 from valuemap.check.lenses import Focal, focals, with_params
+from valuemap.check.loose import Correction, Loose
 from valuemap.check.passes import moved_along
 from valuemap.check.sample import pixels_per_radian
 from valuemap.dataset import Dataset
@@ -61,7 +63,7 @@ PARAMETERS = (
     Parameter("yaw", _turn(1), 1e-5),
     Parameter("roll", _turn(2), 1e-5),
     Parameter("log_focal", with_focal, 1e-5),
-    Parameter("along", _shift_along, 1e-3),
+    Parameter("along", _shift_along, 1e-3, is_length=True),
 )
 
 
@@ -90,37 +92,26 @@ def _parameters(view: View) -> tuple[Parameter, ...]:
     return PARAMETERS if has_focal else tuple(p for p in PARAMETERS if p.name != "log_focal")
 
 
-@dataclass(frozen=True, eq=False)
-class _Correction:
-    """One parameter changed by a value, how sure that is, and how well the rays agree then."""
-
-    parameter: Parameter
-    value: float
-    sigma: float
-    chance: float
-    comparison: Comparison
-
-
-def _best_correction(view: View) -> _Correction | None:
+def _best_correction(view: View) -> Correction | None:
     """Return the one change that lets rays agree best, None where none is told from nothing; worked out once a view.
 
     The estimate must be told from its standard error, and the agreement with the correction from that without. One at a
     time, the best first: of a shift along the drive a little looks like a wrong focal length.
     """
     if "correction" not in view.memory:
-        view.memory["correction"] = _find_correction(view)
-    found: _Correction | None = view.memory["correction"]
+        view.memory["correction"] = _find_correction(view) or _find_beyond_noise(view)
+    found: Correction | None = view.memory["correction"]
     return found
 
 
-def _find_correction(view: View) -> _Correction | None:
+def _find_correction(view: View) -> Correction | None:
     found = common_errors(view)
     if found is None:
         return None
     tests = len(found.names)
     freedom = max(found.places - tests, 1)
     given: Floats | None = None
-    best: _Correction | None = None
+    best: Correction | None = None
     for name in found.names:
         value, sigma = found.of(name)
         chance = 2.0 * float(stats.t.sf(abs(value) / sigma, freedom)) * tests
@@ -136,20 +127,31 @@ def _find_correction(view: View) -> _Correction | None:
         chance = max(chance, comparison.chance * tests * 2)  # Of each parameter two values are tried.
         if chance > LEAST_CHANCE or comparison.difference < LEAST_RISE * float(given.sum()):
             continue
-        if name == "log_focal" and _is_wider_gate_only(view, given, parameter.change(view.dataset, value)):
+        if name == "log_focal" and _is_wider_gate_only(view, parameter.change(view.dataset, value)):
             continue
         if best is None or comparison.difference > best.comparison.difference:
-            best = _Correction(parameter, value, sigma, chance, comparison)
+            best = Correction(parameter, value, sigma, chance, comparison, found)
     return None if best is None or given is None else _followed(view, best, given)
 
 
-def _is_wider_gate_only(view: View, given: Floats, dataset: Dataset) -> bool:
+def _find_beyond_noise(view: View) -> Correction | None:
+    """Return a change of one parameter that is larger than what single rays miss by, where the gate is too narrow.
+
+    How cameras hang to a side is estimated, and not named: it turns rays by little.
+    """
+    parameters = tuple(parameter for parameter in PARAMETERS if parameter.name != "log_focal")
+    return Loose(view).correction(parameters, frozenset({"pitch", "yaw", "along"}))
+
+
+def _is_wider_gate_only(view: View, dataset: Dataset) -> bool:
     """Return whether rays agree with other focal lengths only because the gate, in pixels, is a wider angle then.
 
-    Errors of poses are angles: pictures said to be six times as wide make them a sixth of the pixels.
+    Errors of poses are angles: pictures said to be six times as wide make them a sixth of the pixels. So the gate is
+    one angle, and so wide that all rays of an object vote either way: how close they pass counts, not how many do.
     """
-    at_one_angle = float(gains_of_all(view, dataset, is_gate_an_angle=True).sum())
-    return at_one_angle < (1.0 - LEAST_RISE) * float(given.sum())
+    wide = View(view.dataset, gate_share=view.gate_share * WIDER_GATE)
+    at_one_angle = float(gains_of_all(wide, dataset, is_gate_an_angle=True).sum())
+    return at_one_angle < float(gains_of_all(wide, view.dataset).sum())
 
 
 class _CommonError(Fault):
@@ -164,9 +166,7 @@ class _CommonError(Fault):
         best = _best_correction(view)
         if best is None or best.parameter.name not in self.parameters:
             return None
-        found = common_errors(view)
-        assert found is not None
-        name, value = best.parameter.name, best.value
+        name, value, found = best.parameter.name, best.value, best.estimate
         return Finding(
             fault=self.name,
             what=self.says(view, name, value),
@@ -193,6 +193,7 @@ class CameraTilt(_CommonError):
 
     name: ClassVar[str] = "camera_tilt"
     parameters: ClassVar[tuple[str, ...]] = ("pitch", "roll")
+    completes: ClassVar[frozenset[str]] = frozenset({"pitch_and_roll"})  # Whose noise hides how cameras are mounted.
     do: ClassVar[str] = "Correct the rotation between car and camera, or the principal point's y."
 
     def says(self, view: View, name: str, value: float) -> str:
@@ -260,7 +261,7 @@ def _better(view: View, parameter: Parameter, value: float, sigma: float, gains:
     return (settled, settled_sigma, settled_gains) if settled_gains.sum() > gains.sum() else (value, sigma, gains)
 
 
-def _followed(view: View, best: _Correction, given: Floats) -> _Correction:
+def _followed(view: View, best: Correction, given: Floats) -> Correction:
     """Return a correction as far as the agreement of rays rises with it.
 
     Least squares know only the votes that there are. Of an error as large as the way between objects most are wrong,
@@ -290,7 +291,7 @@ def _followed(view: View, best: _Correction, given: Floats) -> _Correction:
     comparison = compare(gains[value], given)
     # The values tried count as tests, as those before did.
     chance = max(best.chance, comparison.chance * len(gains))
-    return _Correction(best.parameter, value, best.sigma, chance, comparison)
+    return replace(best, value=value, chance=chance, comparison=comparison)
 
 
 def _changed(dataset: Dataset, *, parameter: Parameter, value: float) -> Dataset:

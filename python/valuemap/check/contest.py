@@ -21,6 +21,7 @@ import numpy as np
 
 from valuemap.cameras import rotation_matrices
 from valuemap.check.agreement import Agreement, Comparison, compare, gains_of_objects, measure_agreement
+from valuemap.check.cameras import PARAMETERS
 from valuemap.check.fault import LEAST_CHANCE, WIDER_GATE, Convention, Finding, Fix, View, uprightness
 from valuemap.check.sample import Sample
 from valuemap.dataset import Dataset
@@ -31,6 +32,8 @@ _ALONG_AXIS = 0.985
 """The cosine of 10 degrees, which cars and their cameras lean at most."""
 _ENOUGH_PLACES = 12
 """What a sample is cut into where there are detections enough."""
+_SMALL_TURNS_RAD = np.radians([2.0, 4.0, 6.0])
+"""At most a degree from any turn that a mount may be off by."""
 _FROM_RAYS = 0.05
 """However upright cameras stand under a reading, rays must prefer it beyond this chance."""
 _SUSPICIOUS = 0.05
@@ -66,6 +69,11 @@ class _Reading:
         """Whether it gives up what was measured."""
         return self.convention is not None and self.convention.is_guess
 
+    def is_worth(self, given: _Reading) -> bool:
+        """Return whether rays agree so much better than as given that it is no mere noise that is taken off."""
+        times = None if self.convention is None else self.convention.least_times
+        return times is None or self.total >= times * given.total
+
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
@@ -87,16 +95,18 @@ def hold_contest(view: View, conventions: Sequence[Convention], progress: Progre
     rivals: tuple[str, ...] = ()
     for gate_share in (view.gate_share, view.gate_share * WIDER_GATE):
         at_gate = view if gate_share == view.gate_share else View(view.dataset, gate_share=gate_share)
-        readings = _try_all(at_gate, conventions, progress)
-        top, tests = max(readings, key=lambda reading: reading.total), len(readings)
+        tried = _try_all(at_gate, conventions, progress)
+        readings = [each for each in tried if each.is_worth(tried[0])]
+        top, tests = max(readings, key=lambda reading: reading.total), len(tried)
         rivals = _rivals(readings)
         by_rays = _compare([top.agreement], [at_gate.chance]).chance
         if _joined(by_rays, top, readings[0]) * tests > LEAST_CHANCE:
             continue
         finding = _judge(at_gate, readings, top)
-        if finding is not None:
-            return Verdict(finding, gate_share)
-        return Verdict(None, gate_share, _suspicion(readings[0], top, tests), rivals)
+        suspicion = None if finding is not None else _suspicion(readings[0], top, tests)
+        if (finding or suspicion) and _is_small_turn(at_gate, top.total):
+            return Verdict(None, gate_share)
+        return Verdict(finding, gate_share, suspicion, () if finding is not None else rivals)
     return Verdict(None, None, rivals=rivals)
 
 
@@ -169,6 +179,18 @@ def _judge(view: View, readings: Sequence[_Reading], top: _Reading) -> Finding |
         },
         fix=chosen.fix,
     )
+
+
+def _is_small_turn(view: View, total: float) -> bool:
+    """Return whether rays agree as well if cameras are turned a little, which is a smaller mistake than any other.
+
+    Cameras that look too low, read upside down, look too high: up to half as much.
+    """
+    sample, turns = view.stretches, (turn for turn in PARAMETERS if turn.name in ("pitch", "yaw"))
+    turned = (
+        turn.change(sample.dataset, way * angle) for turn in turns for angle in _SMALL_TURNS_RAD for way in (-1, 1)
+    )
+    return any(measure_agreement(each, sample.place_of_image, view.gate_px).gain.sum() >= total for each in turned)
 
 
 def _suspicion(given: _Reading, top: _Reading, tests: int) -> str | None:

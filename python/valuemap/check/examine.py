@@ -17,6 +17,7 @@ from valuemap.tables import Images
 _MOST_ROUNDS = 4
 """Of one stage: one fault may hide behind another, but not for ever."""
 _MOST_TOLD = 4
+_COMPLETES = {fault.name: fault.completes for fault in FAULTS}
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +98,7 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
                 found = [] if verdict.finding is None else [verdict.finding]
             else:
                 found = _look(view, stage, progress)
-            findings += found
+            findings += [each for each in found if not _COMPLETES.get(each.fault, frozenset()) & known]
             fixes: list[Fix] = [each.fix for each in found if each.fix is not None]
             for fix in fixes:
                 dataset = fix(dataset)

@@ -32,7 +32,7 @@ GATE_RAD = 0.012
 """Rays that pass closer than this agree: 0.7 degrees, 6 px at a focal length of 500 px."""
 WIDER_GATE = 4.0
 """Detections of heat maps or panoramas with compass headings may be off by degrees."""
-_MANY_DETECTIONS = 8000
+MANY_DETECTIONS = 8000
 LEAST_RISE = 0.02
 """Passes have errors of their own, which few passes do not average out: what costs less than one part in fifty of the
 agreement is within them, and changes no map."""
@@ -127,7 +127,7 @@ class View:
     @cached_property
     def many_places(self) -> Sample:
         """More places, for what is too small to show at few."""
-        return sample_places(self.dataset, most_detections=_MANY_DETECTIONS)
+        return sample_places(self.dataset, most_detections=MANY_DETECTIONS)
 
     @cached_property
     def agreement(self) -> Agreement:
@@ -183,6 +183,8 @@ class Fault(ABC):
     stage: ClassVar[Stage]
     explained_by: ClassVar[frozenset[str]] = frozenset()
     """Faults that look like this one too: where one of them was found, this one is not looked for."""
+    completes: ClassVar[frozenset[str]] = frozenset()
+    """Faults whose fix guesses what this one measures: after them it is put right, but it is no finding of its own."""
 
     @abstractmethod
     def find(self, view: View) -> Finding | None:
@@ -197,6 +199,8 @@ class Convention(ABC):
     do: ClassVar[str]
     is_guess: ClassVar[bool] = False
     """Whether readings give measured values up for guessed ones."""
+    least_times: ClassVar[float | None] = None
+    """How many times as well as given rays must agree, where without the noise of good data they agree better."""
 
     @abstractmethod
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:

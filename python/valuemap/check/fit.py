@@ -4,7 +4,7 @@ Points where rays meet are taken from a vote; the residuals of their votes are l
 common parameters (a turn of the cameras in their mounts, the logarithm of the focal length, a shift along the drive),
 the points are eliminated, and the parameters solved for, with weights after Cauchy. Images of one place share their
 errors, so the standard errors come from the scatter between places (the sandwich of Liang and Zeger, 1986), not from
-the number of detections.
+the number of detections. Where errors of poses last longer than a place, whole blocks of places are what scatters.
 """
 
 from __future__ import annotations
@@ -35,11 +35,12 @@ _CAUCHY = 2.4
 
 @dataclass(frozen=True)
 class Parameter:
-    """One thing to estimate: how it changes a dataset, and the step of the numeric derivative."""
+    """One thing to estimate, an angle or a length: how it changes a dataset, and the step of the derivative."""
 
     name: str
     change: Change
     step: float
+    is_length: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,16 +70,18 @@ def estimate(
     parameters: tuple[Parameter, ...],
     *,
     start: Estimate | None = None,
+    blocks: int | None = None,
 ) -> Estimate | None:
     """Estimate parameters on a sample of a dataset; None where there is too little to go by.
 
-    A few rounds tell whether there is an error at all. From a `start` that says so it goes on until it stays.
+    A few rounds tell whether there is an error at all. From a `start` that says so it goes on until it stays. Places
+    are joined to so many `blocks`, if given, whose scatter standard errors come from.
     """
     value = np.zeros(len(parameters)) if start is None else start.value
     result = start
     for _ in range(_ROUNDS if start is None else _MOST_ROUNDS):
         current = apply(dataset, parameters, value)
-        found = _solve(current, sample, gate_px, parameters)
+        found = _solve(current, sample, gate_px, parameters, blocks)
         if found is None:
             return start
         value = value + found.value
@@ -97,7 +100,9 @@ def apply(dataset: Dataset, parameters: tuple[Parameter, ...], value: Floats | M
     return dataset
 
 
-def _solve(dataset: Dataset, sample: Sample, gate_px: float, parameters: tuple[Parameter, ...]) -> Estimate | None:
+def _solve(
+    dataset: Dataset, sample: Sample, gate_px: float, parameters: tuple[Parameter, ...], blocks: int | None
+) -> Estimate | None:
     agreement = measure_agreement(sample.of(dataset), sample.place_of_image, gate_px)
     found, rays = agreement.found, cast_rays(sample.of(dataset))
     votes = np.diff(found.voter_offsets)
@@ -120,7 +125,9 @@ def _solve(dataset: Dataset, sample: Sample, gate_px: float, parameters: tuple[P
     size = np.linalg.norm(residual, axis=1)
     scale = _CAUCHY * max(float(np.median(size)), 1e-9)
     weight = tells / (1.0 + (size / scale) ** 2)
-    place = sample.place_of_image[rays.image_row[voter]]
+    place = sample.place_of_image[rays.image_row[voter]].astype(np.int64)
+    if blocks is not None:  # Places are numbered along the drives.
+        place = place * blocks // max(sample.places, blocks)
     gradient, curvature = _eliminate(residual, slope, of_point, weight, point_of, place)
     total = curvature.sum(axis=0)
     if len(curvature) < _LEAST_PLACES or np.linalg.matrix_rank(total) < len(parameters):

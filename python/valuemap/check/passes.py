@@ -237,9 +237,9 @@ def _rolling_period(dataset: Dataset) -> tuple[float, int] | None:
     images = dataset.images
     if images.timestamp_s is None or not np.all(np.isfinite(images.timestamp_s)):
         return None
-    order = driving_order(images, by_time=False)
-    time, codes = images.timestamp_s[order], images.pass_id.codes[order]
-    step = np.diff(time)[np.diff(codes) == 0]
+    order, starts = _by_name(images)
+    time = images.timestamp_s[order]
+    step = np.diff(time)[~starts[1:]]
     falls, forward = -step[step < 0.0], step[step > 0.0]
     if len(falls) < 1 or len(forward) < 10 or len(falls) > 0.1 * len(step):
         return None
@@ -249,13 +249,23 @@ def _rolling_period(dataset: Dataset) -> tuple[float, int] | None:
     return (period, len(falls)) if within and falls.max() > 10.0 * usual else None
 
 
+def _by_name(images: Images) -> tuple[Ints, Bools]:
+    """Return the rows of images in the order of their names, and where (N) the next pass or camera of one begins.
+
+    Names of a car with several cameras often are those of one camera after the other.
+    """
+    order = driving_order(images, by_time=False)
+    order = order[np.lexsort((images.camera_id[order], images.pass_id.codes[order]))]
+    pass_and_camera = np.stack([images.pass_id.codes[order], images.camera_id[order]])
+    return order, np.append(True, (np.diff(pass_and_camera, axis=1) != 0).any(axis=0))
+
+
 def _unrolled(dataset: Dataset) -> Dataset:
     found = _rolling_period(dataset)
     assert found is not None
     images = dataset.images
-    order = driving_order(images, by_time=False)
+    order, start = _by_name(images)
     time = np.asarray(images.timestamp_s)[order]
-    start = np.diff(images.pass_id.codes[order], prepend=-1) != 0
     falls = np.diff(time, prepend=time[0]) < 0.0
     falls[start] = False
     laps = np.cumsum(falls)

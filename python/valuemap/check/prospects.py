@@ -9,6 +9,7 @@ import numpy as np
 import valuemap._core as _core
 from valuemap.cameras import camera_centers
 from valuemap.check.fault import View
+from valuemap.check.loose import LEAST_TIMES, Loose
 from valuemap.check.sample import driving_order
 
 _GAP_TIMES = 10.0
@@ -28,6 +29,10 @@ def describe_prospects(view: View) -> dict[str, Any]:
         "scores": "none" if np.ptp(dataset.detections.score) == 0.0 else "vary",
         **_gaps(view),
     }
+    misses = Loose(view).misses(dataset)
+    if misses is not None:
+        facts["turn_of_all_cameras_seen_from_deg"] = round(LEAST_TIMES * float(np.degrees(misses.angle_rad)), 2)
+        facts["shift_of_all_poses_seen_from_m"] = round(LEAST_TIMES * misses.distance_m, 2)
     agreement = view.agreement_at_places
     facts["detections_that_meet_others"] = round(agreement.share, 3)
     found = agreement.found

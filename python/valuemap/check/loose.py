@@ -1,0 +1,124 @@
+"""Errors that all images share, told from the noise of loose poses: metres and degrees, as of a phone.
+
+At the gate at which good rays meet, the votes of loose poses are those that happen to agree with the poses as given:
+an estimate from them stays near zero. At a wider gate all rays of an object vote, and the estimate goes to where the
+error is. It rests on stretches of single passes, in which poses drift together; the scatter between blocks of stretches
+says how sure it is.
+
+What noise does to such an estimate no scatter tells, as it is of one sign. In simulated cities without a fault, with
+errors of positions of 0.2 to 2.5 m and of rotations of 0.1 to 1.3 degrees, it was below three times what single rays
+miss by. So less than that is not named, and the output says what would be. Focal lengths, which take most of it up, are
+not estimated here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+import valuemap._core as _core
+from valuemap.check.agreement import Comparison, compare, measure_agreement
+from valuemap.check.fault import GATE_RAD, LEAST_CHANCE, MANY_DETECTIONS, WIDER_GATE, View
+from valuemap.check.fit import Estimate, Parameter, apply, estimate
+from valuemap.check.lenses import FOCAL_FACTORS, Focal
+from valuemap.check.sample import Sample, pixels_per_radian, sample_stretches
+from valuemap.dataset import Dataset
+from valuemap.tables import Floats
+
+LEAST_TIMES = 3.0
+"""An error of all images is seen from so many times what single rays miss by."""
+_HALF_WAY = 0.5
+"""The first rounds go at least so far."""
+_BLOCKS = 8
+"""Of hundreds of metres each, longer than poses drift together."""
+_AGAINST = 0.05
+"""Rays must agree better with a correction than with its opposite, and than without, beyond this chance."""
+
+
+@dataclass(frozen=True)
+class Misses:
+    """What the middle one of all votes misses its point by: an angle, and a distance there."""
+
+    angle_rad: float
+    distance_m: float
+
+    def of(self, parameter: Parameter) -> float:
+        """Return it in the unit of a parameter."""
+        return self.distance_m if parameter.is_length else self.angle_rad
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """One parameter changed by a value, how sure that is, and how well the rays agree then."""
+
+    parameter: Parameter
+    value: float
+    sigma: float
+    chance: float
+    comparison: Comparison
+    estimate: Estimate
+
+
+class Loose:
+    """A dataset at a gate wide enough for all rays of an object, however loose its poses are."""
+
+    def __init__(self, view: View) -> None:
+        self._dataset = view.dataset
+        self._sample: Sample = sample_stretches(view.dataset, most_detections=MANY_DETECTIONS)
+        self._gate_px = GATE_RAD * max(view.gate_share, WIDER_GATE) * pixels_per_radian(view.dataset)
+
+    def misses(self, dataset: Dataset) -> Misses | None:
+        """Return what votes miss by with the poses of a version of the dataset; None where nothing votes."""
+        agreement = measure_agreement(self._sample.of(dataset), self._sample.place_of_image, self._gate_px)
+        found, rays = agreement.found, agreement.rays
+        if not len(found):
+            return None
+        residual_px, _, _ = _core.see(rays.core, found.position_in_world_m, found.voter_offsets, found.voters)
+        angle_rad = float(np.median(residual_px)) / pixels_per_radian(dataset)
+        point = np.repeat(found.position_in_world_m, np.diff(found.voter_offsets), axis=0)
+        ray_m = np.linalg.norm(point - rays.center_in_world_m[found.voters.astype(np.int64)], axis=1)
+        return Misses(angle_rad, angle_rad * float(np.median(ray_m)))
+
+    def correction(self, parameters: tuple[Parameter, ...], told: frozenset[str]) -> Correction | None:
+        """Return the change of one parameter, of those `told`, with which rays agree best; None where none is sure."""
+        found = self._settled(parameters)
+        misses = None if found is None else self.misses(apply(self._dataset, parameters, found.value))
+        if found is None or misses is None:
+            return None
+        given = self._gain(self._dataset)
+        best: Correction | None = None
+        for parameter in parameters:
+            value, sigma = found.of(parameter.name)
+            chance = 2.0 * float(stats.t.sf(abs(value) / sigma, found.places - 1)) * len(parameters)
+            is_seen = parameter.name in told and abs(value) >= LEAST_TIMES * misses.of(parameter)
+            if not is_seen or chance > LEAST_CHANCE:
+                continue
+            gain, opposite = (self._gain(parameter.change(self._dataset, way * value)) for way in (1.0, -1.0))
+            comparison = compare(gain, opposite if opposite.sum() > given.sum() else given)
+            if comparison.chance * len(parameters) > _AGAINST or self._is_focal(float(gain.sum())):
+                continue
+            if best is None or comparison.difference > best.comparison.difference:
+                best = Correction(parameter, value, sigma, chance, comparison, found)
+        return best
+
+    def _settled(self, parameters: tuple[Parameter, ...]) -> Estimate | None:
+        """Return the estimate followed to its end, if after the first rounds it may be one of an error."""
+        first = estimate(self._dataset, self._sample, self._gate_px, parameters, blocks=_BLOCKS)
+        misses = None if first is None else self.misses(apply(self._dataset, parameters, first.value))
+        if first is None or misses is None:
+            return None
+        least = LEAST_TIMES * _HALF_WAY
+        if all(abs(first.of(each.name)[0]) < least * misses.of(each) for each in parameters):
+            return None
+        return estimate(self._dataset, self._sample, self._gate_px, parameters, start=first, blocks=_BLOCKS)
+
+    def _is_focal(self, gain: float) -> bool:
+        """Return whether other focal lengths, at a gate of the same angle, let rays agree as well as that."""
+        others = (Focal(np.full(len(self._dataset.cameras), factor)) for factor in FOCAL_FACTORS)
+        return any(self._gain(other(self._dataset), other.gate_factor).sum() >= gain for other in others)
+
+    def _gain(self, dataset: Dataset, gate_factor: float = 1.0) -> Floats:
+        sample, gate_px = self._sample, self._gate_px * gate_factor
+        return measure_agreement(sample.of(dataset), sample.place_of_image, gate_px).gain
