@@ -33,7 +33,7 @@ from valuemap.check.quality import TruthElsewhere
 from valuemap.check.registry import CONVENTIONS, FAULTS
 from valuemap.check.sample import driving_order
 from valuemap.check.seams import worst_seam
-from valuemap.check.sizes import object_heights
+from valuemap.check.sizes import are_outside, object_heights
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, read_dataset, write_dataset
 from valuemap.errors import InputError
@@ -384,9 +384,17 @@ def test_names_of_one_camera_after_the_other_are_no_clock_that_starts_over() -> 
 
 
 def test_rays_that_hardly_part_do_not_say_how_large_things_are(loose: View) -> None:
-    height_m, points = object_heights(loose)["traffic_light"]
-    assert height_m == pytest.approx(1.0, rel=0.3)
-    assert points >= 3
+    height_m = object_heights(loose)["traffic_light"]
+    assert np.median(height_m) == pytest.approx(1.0, rel=0.3)
+    assert len(height_m) >= 3
+
+
+def test_three_lights_taken_for_large_are_no_other_unit() -> None:
+    assert not are_outside(np.array([1.1, 2.2, 2.4]), 0.45, 2.0)
+    assert are_outside(np.array([0.06, 0.07, 0.08]), 0.45, 2.0)
+    assert are_outside(np.array([0.06, 0.07, 0.22]), 0.45, 2.0)
+    assert are_outside(np.array([2.1, 2.2, 2.2, 2.3]), 0.45, 2.0)
+    assert not are_outside(np.array([0.06, 0.07, 0.08]), 0.05, 2.0)
 
 
 def test_truth_is_not_called_misplaced_where_poses_are_metres_off(loose: View) -> None:

@@ -130,7 +130,8 @@ class HalfSizes(Fault):
                 f"no box comes closer to the border of its picture than {figures['gap']:g} of its own size, although "
                 f"{near.within + far.within} are within one and a half sizes"
             )
-        for name, (height_m, objects) in heights.items():
+        for name, height_of_each_m in heights.items():
+            height_m, objects = float(np.median(height_of_each_m)), len(height_of_each_m)
             low, high = plausible_heights(name)
             figures[f"height_m of {name}"] = round(height_m, 3)
             if low > 0.1 and objects >= 3 and low / 3.0 < height_m < low * 1.35 <= 2.0 * height_m <= high:

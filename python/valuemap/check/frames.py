@@ -12,7 +12,7 @@ from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.fault import Convention, Fault, Finding, Fix, Stage, View, with_images, with_poses
 from valuemap.check.headings import driving_azimuths, headings, rotations_of, turned
 from valuemap.check.passes import median_speed_mps
-from valuemap.check.sizes import object_heights, plausible_heights
+from valuemap.check.sizes import are_outside, object_heights, plausible_heights
 from valuemap.check.turns import rotations_from_degrees
 from valuemap.dataset import Dataset, Frame
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
@@ -195,10 +195,11 @@ class Scale(Fault):
         reasons, figures = [], {}
         factors = []
         heights = object_heights(view)
-        for name, (height_m, objects) in heights.items():
+        for name, height_of_each_m in heights.items():
+            height_m, objects = float(np.median(height_of_each_m)), len(height_of_each_m)
             low, high = plausible_heights(name)
             figures[f"height_m of {name}"] = round(height_m, 4)
-            if objects >= 3 and not low <= height_m <= high:
+            if are_outside(height_of_each_m, low, high):
                 reasons.append(
                     f"{name} are {height_m:.3g} m high (median of {objects} places; {low:g} to {high:g} m is usual)"
                 )

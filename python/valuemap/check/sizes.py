@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from scipy import stats
 
 import valuemap._core as _core
 from valuemap.check.fault import GATE_RAD, View
+from valuemap.tables import Floats
 
 _LEAST_VOTES = 5
 _LEAST_GATES = 6.0
@@ -28,8 +32,31 @@ def plausible_heights(class_name: str) -> tuple[float, float]:
     return _ANYTHING
 
 
-def object_heights(view: View) -> dict[str, tuple[float, int]]:
-    """Return, for each class, the median height in metres of the points where rays meet, and how many these are.
+def are_outside(height_m: Floats, low_m: float, high_m: float) -> bool:
+    """Return whether heights (N) of objects are, in the middle, beyond limits by more than they scatter, in logarithms.
+
+    A few objects that are taken for too far or too near, as loose poses have it, say nothing of the rest. But where all
+    are beyond by a factor of two, however they scatter, it is not that.
+    """
+    if len(height_m) < _LEAST_OBJECTS:
+        return False
+    if height_m.max() < low_m / 2.0 or height_m.min() > 2.0 * high_m:
+        return True
+    median_m = float(np.median(height_m))
+    beyond = abs(math.log(median_m / min(max(median_m, low_m), high_m)))
+    if beyond == 0.0:
+        return False
+    error = float(np.log(height_m).std(ddof=1)) / math.sqrt(len(height_m))
+    return error == 0.0 or float(stats.t.sf(beyond / error, len(height_m) - 1)) < _OUTSIDE
+
+
+_LEAST_OBJECTS = 3
+_OUTSIDE = 0.01
+"""The limits have room of their own: the usual height is a factor of two from either."""
+
+
+def object_heights(view: View) -> dict[str, Floats]:
+    """Return, for each class, the heights in metres of the points where rays meet.
 
     Classes whose detections are points without a size are left out, and points whose rays are too near each other to
     tell how far they are.
@@ -46,7 +73,7 @@ def object_heights(view: View) -> dict[str, tuple[float, int]]:
     height_m = detections.size_px[found.voters.astype(np.int64), 1] * metres_per_px[:, 1]
     median = _core.medians(height_m.copy(), found.voter_offsets)
     class_code = detections.class_name.codes[found.voters[found.voter_offsets[:-1]].astype(np.int64)]
-    result = {}
+    result: dict[str, Floats] = {}
     for code, name in enumerate(detections.class_name.names):
         of_class = (class_code == code) & (votes >= _LEAST_VOTES)
         # Chance makes points of few votes; what most votes are for is what is there.
@@ -54,5 +81,5 @@ def object_heights(view: View) -> dict[str, tuple[float, int]]:
         of_class &= median > 0.0  # Key points have no size.
         of_class &= parallax_rad > _LEAST_GATES * GATE_RAD * view.gate_share
         if np.any(of_class):
-            result[name] = (float(np.median(median[of_class])), int(of_class.sum()))
+            result[name] = median[of_class]
     return result
