@@ -8,8 +8,8 @@
 //!   + 2 sum_i ln clutter_c                            (3) what the votes are otherwise
 //!   - 2 sum_i [ ln ratio(size_i) + ln share(class_i) ]
 //!                                                     (4) boxes of one object have one physical size, and what a class is taken for
-//!   - 2 ln [ (1 - phi) real_c(hits; looks) + phi false_c(hits; looks) ]
-//!                                                     (5) who should have seen it, and did not, by side and pass
+//!   - 2 ln [ (1 - phi) real_c(hits; looks) + phi false_c(hits; looks) ] + 2 sum_w ln binomial(images_w, hits_w)
+//!                                                     (5) who should have seen it, and did not, by side, pass and viewpoint w
 //! ```
 //!
 //! The second term of (5) is that of a false thing: parked, reflected, or mistaken for an object at times. Its detections meet as

@@ -297,7 +297,7 @@ mod tests {
         let sectors = [[20.0, 8.0, 16.0, 12.0, 18.0, 10.0], [0.0, 0.0, 1.0, 0.0, 2.0, 0.0]]
             .map(|hits| hits.into_iter().map(pass).collect())
             .to_vec();
-        anywhere(1, Seen { sectors }, -100.0)
+        anywhere(1, Seen { sectors, ln_turns: 0.0 }, -100.0)
     }
 
     #[test]
@@ -329,7 +329,7 @@ mod tests {
     fn what_looks_like_an_object_at_times_does_not_tell_how_often_objects_are_seen() {
         let seen = |hits: &[f64]| {
             let passes = hits.iter().map(|&hits| Looks { expected: 40.0, hits }).collect();
-            anywhere(1, Seen { sectors: vec![passes] }, -100.0)
+            anywhere(1, Seen { sectors: vec![passes], ln_turns: 0.0 }, -100.0)
         };
         let objects = (0..60).map(|i| seen(&[34.0 + f64::from(i % 5), 38.0 - f64::from(i % 3)]));
         let lookalikes = (0..12).map(|i| seen(&[17.0 + f64::from(i % 9), 22.0 - f64::from(i % 7)]));
@@ -345,7 +345,8 @@ mod tests {
     #[test]
     fn objects_that_all_looks_see_have_rates_as_well() {
         let passes = || vec![Looks { expected: 12.0, hits: 12.0 }];
-        let objects: Vec<Object> = (0..20).map(|_| anywhere(1, Seen { sectors: vec![passes()] }, -100.0)).collect();
+        let objects: Vec<Object> =
+            (0..20).map(|_| anywhere(1, Seen { sectors: vec![passes()], ln_turns: 0.0 }, -100.0)).collect();
         let (rates, odd_passes) = rates(&objects.iter().collect::<Vec<_>>(), &guess());
         assert!(rates.recall > 0.9 && rates.concentration > 1.0 && rates.between >= 0.0, "{rates:?}");
         let class = ClassModel { rates, odd_passes, ..guess() };

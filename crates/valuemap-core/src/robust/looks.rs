@@ -1,8 +1,9 @@
 //! Which images should have seen an object: its looks.
 //!
 //! A look is a viewpoint of a pass with an image that has the point in its picture, from a direction from which the object was voted for and
-//! a distance from which its class is detected. It is as much of a hit as the share of its images that have a vote. One from where fewer are
-//! detected is as much less of a look. Where another detection lies in the point's gate, the object may be hidden behind that one, or be one with it in the picture:
+//! a distance from which its class is detected. It is as much of a hit as the share of its images that have a vote; which of them have it has a
+//! price of its own, or of one object that a car sees while it stands two would be made, with the votes of each on its side of the middle. One from
+//! where fewer are detected is as much less of a look. Where another detection lies in the point's gate, the object may be hidden behind that one, or be one with it in the picture:
 //! half a look.
 
 use nalgebra::Vector3;
@@ -11,7 +12,8 @@ use rstar::primitives::GeomWithData;
 use rustc_hash::FxHashMap;
 
 use super::energy::Object;
-use super::model::Model;
+use super::model::{Model, ln_gamma};
+use super::parts::Part;
 use super::scene::{Scene, View};
 use super::seen::{Looks, Seen};
 
@@ -88,7 +90,8 @@ impl Lookout {
         // Images are numbered along the drives: sorted, those of a viewpoint are side by side.
         looks.sort_unstable_by_key(|look| (look.sector, look.image));
         let view = |look: &Look| &scene.views[look.image as usize];
-        let of_pass = |pass: &[Look]| {
+        let mut ln_turns = 0.0;
+        let mut of_pass = |pass: &[Look]| {
             let mut sum = Looks { expected: 0.0, hits: 0.0 };
             for images in pass.chunk_by(|a, b| view(a).viewpoint == view(b).viewpoint) {
                 let hits = images.iter().filter(|image| image.is_hit).count() as f64;
@@ -96,12 +99,16 @@ impl Lookout {
                 let most = images.iter().map(|image| image.weight).fold(0.0, f64::max);
                 sum.hits += if hits > 0.0 { most * hits / all } else { 0.0 };
                 sum.expected += most;
+                if hits > 0.0 && hits < all && model.settings.has(Part::Turns) {
+                    ln_turns += ln_choices(all, hits);
+                }
             }
             sum
         };
-        let of_sector = |sector: &[Look]| sector.chunk_by(|a, b| view(a).pass == view(b).pass).map(of_pass).collect();
-        let sectors = looks.chunk_by(|a, b| a.sector == b.sector).map(of_sector).collect();
-        Seen { sectors }
+        let mut of_sector =
+            |sector: &[Look]| sector.chunk_by(|a, b| view(a).pass == view(b).pass).map(&mut of_pass).collect();
+        let sectors = looks.chunk_by(|a, b| a.sector == b.sector).map(&mut of_sector).collect();
+        Seen { sectors, ln_turns }
     }
 
     /// Tells of objects whether all images in reach of them have only detections among some rays: their votes are counted in full.
@@ -150,6 +157,11 @@ impl Lookout {
         });
         looking.filter(|(distance_m, _)| *distance_m <= farthest_m).collect()
     }
+}
+
+/// Logarithm of in how many ways some of all images are chosen: the binomial coefficient.
+fn ln_choices(all: f64, some: f64) -> f64 {
+    ln_gamma(all + 1.0) - ln_gamma(some + 1.0) - ln_gamma(all - some + 1.0)
 }
 
 /// An image that should have seen an object.
@@ -233,5 +245,47 @@ impl Sectors {
             let cosines = self.0.iter().map(|sector| sector.direction.dot(away));
             cosines.enumerate().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(0, |(sector, _)| sector)
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::energy::object;
+    use super::super::parts::Without;
+    use super::super::scene::Scene;
+    use super::*;
+    use crate::robust::Settings;
+    use crate::street;
+
+    /// J of what a standing car and one that drives see of one object, and of two that are seen in turn: by the one that stands each with what is to
+    /// one side of the middle, by the other each in every other image.
+    fn energies(settings: &Settings) -> (f64, f64) {
+        let errors: Vec<[f64; 2]> = (0..97).map(|i| [2.0_f64.sqrt() * (f64::from(i) * 1.7).sin(), 0.0]).collect();
+        let at = Vector3::new(30.0, 4.0, 3.0);
+        let standing = street::street(160, 0.0, &[at], &errors);
+        let views = standing.views.iter().map(|view| View { viewpoint: 0, ..*view }).collect();
+        let driving = street::street(10, 2.0, &[at], &errors);
+        let scene = street::joined(vec![Scene { views, ..standing }, driving]);
+        let model = Model::new(&scene, &street::NOISE, settings);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let energy = |votes: Vec<u32>| object(&model, &lookout, votes, at, Vec::new()).map_or(f64::NAN, |o| o.energy);
+        let is_first =
+            |ray: &u32| if *ray < 160 { errors[*ray as usize % errors.len()][0] > 0.0 } else { ray.is_multiple_of(2) };
+        let (first, second) = scene.usable_rays().iter().partition(|ray| is_first(ray));
+        (energy(scene.usable_rays()), energy(first) + energy(second))
+    }
+
+    #[test]
+    fn what_a_standing_car_sees_is_not_two_objects_in_turn() {
+        let (one, two) = energies(&street::SETTINGS);
+        assert!(one < two, "{one} {two}");
+        let without = Without::named(&["turns".to_owned()]).unwrap_or_default();
+        let (one, two) = energies(&Settings { without, ..street::SETTINGS });
+        assert!(two < one, "{one} {two}");
+    }
+
+    #[test]
+    fn choices_are_counted() {
+        assert!((ln_choices(5.0, 2.0).exp() - 10.0).abs() < 1e-6 && ln_choices(4.0, 4.0).abs() < 1e-9);
     }
 }

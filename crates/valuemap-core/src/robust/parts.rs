@@ -43,6 +43,8 @@ pub enum Part {
     Company,
     /// Who should have seen an object and did not.
     Looks,
+    /// Images of one viewpoint do not show now one of two objects and now the other.
+    Turns,
     /// Classes that are taken for each other.
     Confusions,
     /// What the images of a visit share of their pose errors.
@@ -57,7 +59,7 @@ pub enum Part {
 
 impl Part {
     /// All parts with their names.
-    pub const ALL: [(Self, &'static str); 25] = [
+    pub const ALL: [(Self, &'static str); 26] = [
         (Self::Polishing, "polishing"),
         (Self::Assignment, "assignment"),
         (Self::Merging, "merging"),
@@ -78,6 +80,7 @@ impl Part {
         (Self::Reach, "reach"),
         (Self::Company, "company"),
         (Self::Looks, "looks"),
+        (Self::Turns, "turns"),
         (Self::Confusions, "confusions"),
         (Self::SharedNoise, "shared_noise"),
         (Self::NoiseSplit, "noise_split"),

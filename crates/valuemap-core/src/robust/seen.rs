@@ -26,6 +26,8 @@ pub struct Looks {
 pub struct Seen {
     /// By sector, and there by pass.
     pub sectors: Vec<Vec<Looks>>,
+    /// Logarithm of how many choices of so many of the images of each viewpoint there are: those with the hits are one of them.
+    pub ln_turns: f64,
 }
 
 /// The shares of hits that the sides of objects of a class may have.
@@ -172,7 +174,7 @@ impl Seen {
     #[must_use]
     pub fn ln_likelihood(&self, class: &ClassModel) -> f64 {
         let (real, falsely) = self.log_likelihoods(class);
-        ln_sum(real, falsely)
+        ln_sum(real, falsely) - self.ln_turns
     }
 
     /// Passes that see an object from where it has most votes, or should have; and minus the logarithm of how probable it is of those without a hit
@@ -243,7 +245,7 @@ mod tests {
 
     fn seen(sectors: &[&[(f64, f64)]]) -> Seen {
         let pass = |&(hits, expected): &(f64, f64)| Looks { expected, hits };
-        Seen { sectors: sectors.iter().map(|passes| passes.iter().map(pass).collect()).collect() }
+        Seen { sectors: sectors.iter().map(|passes| passes.iter().map(pass).collect()).collect(), ln_turns: 0.0 }
     }
 
     #[test]
