@@ -330,10 +330,26 @@ def test_a_focal_length_is_told_where_all_rays_of_an_object_vote() -> None:
 def test_a_focal_length_is_no_tilt(monkeypatch: pytest.MonkeyPatch) -> None:
     spoiled = View(with_focal(one_pass(303), 0.45))
     assert cameras._find_beyond_noise(spoiled) is None
-    monkeypatch.setattr(Loose, "_is_focal", lambda *_: False)
+    monkeypatch.setattr(Loose, "_beside", lambda self, parameters, _rival, name: self._settled(parameters).of(name)[0])
     wrong = cameras._find_beyond_noise(spoiled)
     assert wrong is not None
     assert wrong.parameter.name == "pitch"
+
+
+def test_an_error_that_is_put_right_in_two_steps_is_named_once() -> None:
+    given = one_pass(310)
+    rotation = Rotation.from_euler("y", 6.0, degrees=True).as_matrix() @ rotation_matrices(given.images)
+    askew = with_poses(given, rotation, camera_centers(given.images))
+    outcome = examine(askew)
+    assert [finding.fault for finding in outcome.findings] == ["camera_yaw"]
+    first = outcome.findings[0].fix
+    assert first is not None
+    rest = [
+        Rotation.from_matrix(rotation_matrices(each.images) @ rotation_matrices(given.images).transpose(0, 2, 1))
+        for each in (first(askew), outcome.fixed)
+    ]
+    assert np.degrees(rest[0].magnitude().mean()) > 1.0
+    assert np.degrees(rest[1].magnitude().mean()) < 0.3
 
 
 def test_how_cameras_are_mounted_is_part_of_pitch_and_roll() -> None:

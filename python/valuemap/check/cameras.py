@@ -139,8 +139,9 @@ def _find_beyond_noise(view: View) -> Correction | None:
 
     How cameras hang to a side is estimated, and not named: it turns rays by little.
     """
-    parameters = tuple(parameter for parameter in PARAMETERS if parameter.name != "log_focal")
-    return Loose(view).correction(parameters, frozenset({"pitch", "yaw", "along"}))
+    focal = next((each for each in _parameters(view) if each.name == "log_focal"), None)
+    others = tuple(each for each in PARAMETERS if each.name != "log_focal")
+    return Loose(view).correction(others, frozenset({"pitch", "yaw", "along"}), focal)
 
 
 def _is_wider_gate_only(view: View, dataset: Dataset) -> bool:
@@ -193,7 +194,8 @@ class CameraTilt(_CommonError):
 
     name: ClassVar[str] = "camera_tilt"
     parameters: ClassVar[tuple[str, ...]] = ("pitch", "roll")
-    completes: ClassVar[frozenset[str]] = frozenset({"pitch_and_roll"})  # Whose noise hides how cameras are mounted.
+    # The noise of pitch and roll hides how cameras are mounted.
+    completes: ClassVar[frozenset[str]] = frozenset({"camera_tilt", "pitch_and_roll"})
     do: ClassVar[str] = "Correct the rotation between car and camera, or the principal point's y."
 
     def says(self, view: View, name: str, value: float) -> str:
@@ -209,6 +211,7 @@ class CameraYaw(_CommonError):
 
     name: ClassVar[str] = "camera_yaw"
     parameters: ClassVar[tuple[str, ...]] = ("yaw",)
+    completes: ClassVar[frozenset[str]] = frozenset({"camera_yaw"})
     do: ClassVar[str] = "Correct the rotation between car and camera, or the principal point's x."
 
     def says(self, view: View, name: str, value: float) -> str:
@@ -222,6 +225,7 @@ class FocalLength(_CommonError):
 
     name: ClassVar[str] = "focal_length"
     parameters: ClassVar[tuple[str, ...]] = ("log_focal",)
+    completes: ClassVar[frozenset[str]] = frozenset({"focal_length"})
     do: ClassVar[str] = "Calibrate the cameras, or scale their focal lengths: of which picture size are they?"
 
     def says(self, view: View, name: str, value: float) -> str:
@@ -238,6 +242,7 @@ class TimeShift(_CommonError):
 
     name: ClassVar[str] = "time_shift"
     parameters: ClassVar[tuple[str, ...]] = ("along",)
+    completes: ClassVar[frozenset[str]] = frozenset({"time_shift"})
     do: ClassVar[str] = (
         "Correct the clock between cameras and poses (trigger, exposure or network delay). If it is a whole number of "
         "images: are detections listed with the images before or after theirs?"

@@ -184,7 +184,7 @@ class Fault(ABC):
     explained_by: ClassVar[frozenset[str]] = frozenset()
     """Faults that look like this one too: where one of them was found, this one is not looked for."""
     completes: ClassVar[frozenset[str]] = frozenset()
-    """Faults whose fix guesses what this one measures: after them it is put right, but it is no finding of its own."""
+    """Faults whose fix leaves a rest that this one measures: after them it is put right, and no finding of its own."""
 
     @abstractmethod
     def find(self, view: View) -> Finding | None:

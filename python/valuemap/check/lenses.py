@@ -88,7 +88,7 @@ class LensModel(Fault):
                 continue
             if best is None or compare(gain, best[2]).chance < LEAST_CHANCE:
                 best = how, fix, gain, comparison
-        if best is None or any(self._agreement(view, factor) >= best[2].sum() for factor in FOCAL_FACTORS):
+        if best is None or any(self._agreement(view, factor) >= best[2].sum() for factor in _FOCAL_FACTORS):
             return None
         how, fix, _, comparison = best
         return Finding(
@@ -108,7 +108,7 @@ class LensModel(Fault):
         return float(gains_of_all(view, Focal(np.full(count, focal_factor))(view.dataset)).sum())
 
 
-FOCAL_FACTORS = (0.7, 0.8, 0.9, 1.1, 1.25, 1.4)
+_FOCAL_FACTORS = (0.7, 0.8, 0.9, 1.1, 1.25, 1.4)
 """Steps of about a tenth and more, to beyond the nearest sizes that pictures are scaled to, 3/4 and 4/3."""
 
 

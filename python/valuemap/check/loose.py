@@ -22,7 +22,6 @@ import valuemap._core as _core
 from valuemap.check.agreement import Comparison, compare, measure_agreement
 from valuemap.check.fault import GATE_RAD, LEAST_CHANCE, MANY_DETECTIONS, WIDER_GATE, View
 from valuemap.check.fit import Estimate, Parameter, apply, estimate
-from valuemap.check.lenses import FOCAL_FACTORS, Focal
 from valuemap.check.sample import Sample, pixels_per_radian, sample_stretches
 from valuemap.dataset import Dataset
 from valuemap.tables import Floats
@@ -81,8 +80,13 @@ class Loose:
         ray_m = np.linalg.norm(point - rays.center_in_world_m[found.voters.astype(np.int64)], axis=1)
         return Misses(angle_rad, angle_rad * float(np.median(ray_m)))
 
-    def correction(self, parameters: tuple[Parameter, ...], told: frozenset[str]) -> Correction | None:
-        """Return the change of one parameter, of those `told`, with which rays agree best; None where none is sure."""
+    def correction(
+        self, parameters: tuple[Parameter, ...], told: frozenset[str], rival: Parameter | None
+    ) -> Correction | None:
+        """Return the change of one parameter, of those `told`, with which rays agree best; None where none is sure.
+
+        The `rival` is one that noise takes for something else, so it is no part of the estimate.
+        """
         found = self._settled(parameters)
         misses = None if found is None else self.misses(apply(self._dataset, parameters, found.value))
         if found is None or misses is None:
@@ -97,7 +101,11 @@ class Loose:
                 continue
             gain, opposite = (self._gain(parameter.change(self._dataset, way * value)) for way in (1.0, -1.0))
             comparison = compare(gain, opposite if opposite.sum() > given.sum() else given)
-            if comparison.chance * len(parameters) > _AGAINST or self._is_focal(float(gain.sum())):
+            if comparison.chance * len(parameters) > _AGAINST:
+                continue
+            # What another focal length explains as well is none of it.
+            beside = self._beside(parameters, rival, parameter.name)
+            if np.sign(beside) != np.sign(value) or abs(beside) < LEAST_TIMES * misses.of(parameter):
                 continue
             if best is None or comparison.difference > best.comparison.difference:
                 best = Correction(parameter, value, sigma, chance, comparison, found)
@@ -114,11 +122,13 @@ class Loose:
             return None
         return estimate(self._dataset, self._sample, self._gate_px, parameters, start=first, blocks=_BLOCKS)
 
-    def _is_focal(self, gain: float) -> bool:
-        """Return whether other focal lengths, at a gate of the same angle, let rays agree as well as that."""
-        others = (Focal(np.full(len(self._dataset.cameras), factor)) for factor in FOCAL_FACTORS)
-        return any(self._gain(other(self._dataset), other.gate_factor).sum() >= gain for other in others)
+    def _beside(self, parameters: tuple[Parameter, ...], rival: Parameter | None, name: str) -> float:
+        """Return the estimate of a parameter beside a rival one."""
+        every = parameters if rival is None else (*parameters, rival)
+        found = estimate(self._dataset, self._sample, self._gate_px, every, blocks=_BLOCKS)
+        if found is not None:
+            found = estimate(self._dataset, self._sample, self._gate_px, every, start=found, blocks=_BLOCKS)
+        return 0.0 if found is None else found.of(name)[0]
 
-    def _gain(self, dataset: Dataset, gate_factor: float = 1.0) -> Floats:
-        sample, gate_px = self._sample, self._gate_px * gate_factor
-        return measure_agreement(sample.of(dataset), sample.place_of_image, gate_px).gain
+    def _gain(self, dataset: Dataset) -> Floats:
+        return measure_agreement(self._sample.of(dataset), self._sample.place_of_image, self._gate_px).gain
