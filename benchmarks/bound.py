@@ -53,6 +53,35 @@ def cramer_rao_covariances(views: Views, config: SimulationConfig, objects: int)
     return bound
 
 
+def joint_cramer_rao_covariance(views: Views, config: SimulationConfig, objects: int) -> Floats:
+    """Return the bound (objects, 3, objects, 3) in m² of all objects together, from all views of each pass together.
+
+    An error of a pose is one for all that its image shows, so that objects tell it, and are better known against each
+    other than each alone. It is the bound where it is known which detection shows which object. Objects that fewer than
+    two views show have infinite variances.
+    """
+    information = np.zeros((objects, 3, objects, 3))
+    for number in np.unique(views.pass_row):
+        of_pass = views.take(np.flatnonzero(views.pass_row == number))
+        whitened = cho_solve(cho_factor(residual_covariance(of_pass, config)), of_objects(of_pass, objects))
+        information += (of_objects(of_pass, objects).T @ whitened).reshape(information.shape)
+    rows = np.flatnonzero(np.bincount(views.object_row, minlength=objects) >= 2)
+    bound = np.zeros_like(information)
+    bound[np.arange(objects), :, np.arange(objects), :] = np.diag([np.inf] * 3) if objects else 0.0
+    seen = information[rows][:, :, rows].reshape(3 * len(rows), 3 * len(rows))
+    bound[rows[:, None], :, rows[None, :], :] = (
+        np.linalg.inv(seen).reshape(len(rows), 3, len(rows), 3).transpose(0, 2, 1, 3)
+    )
+    return bound
+
+
+def of_objects(views: Views, objects: int) -> Floats:
+    """Return the derivatives (2N, 3 objects) of the residuals of views (N) by the positions of all objects."""
+    derivatives = np.zeros((len(views), 2, objects, 3))
+    derivatives[np.arange(len(views)), :, views.object_row] = views.of_point
+    return derivatives.reshape(2 * len(views), 3 * objects)
+
+
 def true_views(recording: Recording) -> Views:
     """Return detections that show whole objects, one of each in an image, with true poses, boxes and derivatives."""
     dataset, config, objects = recording.dataset, recording.config, recording.city.objects

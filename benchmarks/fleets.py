@@ -8,6 +8,8 @@ of the poses or of the camera each. All settings of the method are its defaults.
     between        root mean square error of the vector from one object to another within 50 m, over the pairs that are
                    found with the fault and without
     ratio          of that to the same without the fault: what the fault costs where neighbours count
+    bound          the Cramer-Rao bound of `between` (`bound.py`) with the noise of the poses that is simulated, if it
+                   were known which detection shows which object, and what whole drives and cameras are wrong by
 """
 
 from __future__ import annotations
@@ -24,12 +26,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 import valuemap
+from bound import joint_cramer_rao_covariance, true_views
 from cities import city, ratio, seeds_from
 from machine import write_record
 from valuemap.config import SimulationConfig
 from valuemap.dataset import rows_of
-from valuemap.simulate import simulate
-from valuemap.tables import Floats
+from valuemap.simulate import record_city
+from valuemap.tables import Floats, Ints
 
 PASSES = 20
 SMALL: dict[str, Any] = {"streets_north_south": 2, "streets_east_west": 2, "passes_per_street": 5}
@@ -58,13 +61,17 @@ FAULTS: dict[str, dict[str, float]] = {
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What became of one city: `error_m` (objects, 3) is that of the label of each, NaN without a right one."""
+    """What became of one city: `error_m` (objects, 3) is that of the label of each, NaN without a right one.
+
+    `bound_m2` (objects, 3, objects, 3) is the least covariance of these errors.
+    """
 
     objects: int
     found: int
     labels: int
     position_in_world_m: Floats
     error_m: Floats
+    bound_m2: Floats
     detections: int
     seconds: float
 
@@ -93,7 +100,8 @@ def main() -> None:
 
 def map_city(simulation: SimulationConfig, seed: int, config: valuemap.MapConfig) -> Outcome:
     """Simulate a city, map it and compare with the truth."""
-    dataset = simulate(simulation, seed=seed, name=f"city-{seed}")
+    recording = record_city(simulation, seed=seed, name=f"city-{seed}")
+    dataset = recording.dataset
     truth, shown = dataset.truth, dataset.truth_detections
     assert truth is not None
     assert shown is not None
@@ -114,17 +122,32 @@ def map_city(simulation: SimulationConfig, seed: int, config: valuemap.MapConfig
         labels=len(result.labels),
         position_in_world_m=truth.position_in_world_m,
         error_m=error_m,
+        bound_m2=joint_cramer_rao_covariance(true_views(recording), simulation, len(truth)),
         detections=len(dataset.detections),
         seconds=seconds,
     )
 
 
-def squared_errors_between(outcome: Outcome, other: Outcome) -> Floats:
-    """Return squared errors (P), m², of the vectors between near objects that both maps hold, in the first map."""
+def neighbors(outcome: Outcome, other: Outcome) -> tuple[Ints, Ints]:
+    """Return the pairs (P) of near objects that both maps hold."""
     pairs = cKDTree(outcome.position_in_world_m).query_pairs(NEIGHBOR_M, output_type="ndarray")
     is_found = np.isfinite(outcome.error_m[:, 0]) & np.isfinite(other.error_m[:, 0])
     a, b = pairs[is_found[pairs].all(axis=1)].T
+    return a, b
+
+
+def squared_errors_between(outcome: Outcome, other: Outcome) -> Floats:
+    """Return squared errors (P), m², of the vectors between near objects that both maps hold, in the first map."""
+    a, b = neighbors(outcome, other)
     return np.asarray(np.sum((outcome.error_m[a] - outcome.error_m[b]) ** 2, axis=1))
+
+
+def squared_bounds_between(outcome: Outcome, other: Outcome) -> Floats:
+    """Return the least that squared errors between near objects (P), m², can be in the mean."""
+    a, b = neighbors(outcome, other)
+    of_both = [outcome.bound_m2[i, :, j, :] for i, j in ((a, a), (b, b), (a, b))]
+    first, second, together = (np.einsum("pii->p", part) for part in of_both)
+    return np.asarray(first + second - 2.0 * together)
 
 
 def add_up(outcomes: Sequence[Outcome], clean: Sequence[Outcome]) -> dict[str, Any]:
@@ -135,12 +158,16 @@ def add_up(outcomes: Sequence[Outcome], clean: Sequence[Outcome]) -> dict[str, A
         np.sqrt(np.mean(np.concatenate([squared_errors_between(*pair) for pair in zip(ours, theirs, strict=True)])))
         for ours, theirs in ((outcomes, clean), (clean, outcomes))
     )
+    bound = np.sqrt(
+        np.mean(np.concatenate([squared_bounds_between(*pair) for pair in zip(outcomes, clean, strict=True)]))
+    )
     figures = {
         "recall": ratio(sum(o.found for o in outcomes), objects),
         "precision": ratio(int(np.isfinite(errors_m2).sum()), labels),
         "position_rmse_m": float(np.sqrt(np.nanmean(errors_m2))),
         "rmse_between_neighbors_m": float(between),
         "ratio_to_clean": float(between / between_in_clean),
+        "bound_between_neighbors_m": float(bound),
         "seconds": sum(o.seconds for o in outcomes),
     }
     return {
@@ -157,7 +184,8 @@ def _line(figures: dict[str, Any]) -> str:
         f"{figures['name']:10} objects {figures['objects']:4d}  labels {figures['labels']:4d}  "
         f"recall {figures['recall']:.4f}  precision {figures['precision']:.4f}  "
         f"rmse {figures['position_rmse_m']:.3f} m  between neighbours {figures['rmse_between_neighbors_m']:.3f} m = "
-        f"{figures['ratio_to_clean']:.2f} of clean  {figures['detections']} detections  {figures['seconds']:.1f} s"
+        f"{figures['ratio_to_clean']:.2f} of clean  bound {figures['bound_between_neighbors_m']:.3f} m  "
+        f"{figures['detections']} detections  {figures['seconds']:.1f} s"
     )
 
 

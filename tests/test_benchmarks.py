@@ -15,7 +15,13 @@ import dense
 import fleets
 import pictures
 from block import block
-from bound import Views, cramer_rao_covariances, residual_covariance, true_views
+from bound import (
+    Views,
+    cramer_rao_covariances,
+    joint_cramer_rao_covariance,
+    residual_covariance,
+    true_views,
+)
 from cities import PASSING_KINDS, passing_things, reliability, seeds_from
 from literal import Pinhole, Sighting
 from more_data import part_of, reprojection_errors_px, tour_of_images
@@ -67,6 +73,32 @@ def test_the_bound_has_the_right_limits(small_city: Recording, length_m: float, 
         assert len(np.unique(of_light.pass_row)) > 1
         expected = information(of_light, config, is_shared=is_shared)
         np.testing.assert_allclose(bound[light], np.linalg.inv(expected), rtol=1e-6)
+
+
+def test_objects_that_images_show_together_are_better_known_against_each_other(small_city: Recording) -> None:
+    lights = len(small_city.city.lights)
+    views = true_views(small_city)
+    light = int(views.object_row[0])
+    of_light = views.take(views.object_row == light)
+    single = joint_cramer_rao_covariance(of_light, small_city.config, lights)
+    alone = cramer_rao_covariances(of_light, small_city.config, lights)
+    np.testing.assert_allclose(single[light, :, light], alone[light], rtol=1e-6)
+    assert np.isinf(np.trace(single[(light + 1) % lights, :, (light + 1) % lights]))
+    # Poses that are off by the same 10 m in a whole pass move all objects alike.
+    config = dataclasses.replace(
+        small_city.config,
+        position_drift_m=10.0,
+        drift_length_m=1e12,
+        position_white_m=0.0,
+        rotation_white_deg=0.0,
+        rotation_drift_deg=0.0,
+    )
+    bound = joint_cramer_rao_covariance(views, config, lights)
+    of_pass = views.object_row[views.pass_row == views.pass_row[0]]
+    a, b = np.unique(of_pass)[:2]
+    apart = bound[a, :, a] + bound[b, :, b] - bound[a, :, b] - bound[b, :, a]
+    assert np.trace(bound[a, :, a]) > 1.0
+    assert np.trace(apart) < 0.01 * np.trace(bound[a, :, a])
 
 
 def test_residuals_scatter_as_the_bound_takes_them_to(small_city: Recording) -> None:
@@ -219,9 +251,12 @@ def test_reprojection_errors_are_those_of_the_pinhole() -> None:
 def test_a_shift_of_the_whole_map_costs_nothing_between_neighbours() -> None:
     place = np.array([[0.0, 0.0, 0.0], [30.0, 0.0, 0.0], [0.0, 40.0, 0.0], [200.0, 0.0, 0.0]])
 
+    # Each object has a variance of 1 m² on each axis, and all of them 4 m² in common.
+    bound_m2 = np.einsum("ab,ij->aibj", np.eye(4) + 4.0, np.eye(3))
+
     def outcome(error_m: Floats) -> fleets.Outcome:
         found = int(np.isfinite(error_m[:, 0]).sum())
-        return fleets.Outcome(4, found, found, place, error_m, 100, 1.0)
+        return fleets.Outcome(4, found, found, place, error_m, bound_m2, 100, 1.0)
 
     random = np.random.default_rng(0).standard_normal((4, 3))
     shifted = fleets.add_up([outcome(random + [3.0, 0.0, 0.0])], [outcome(random)])
@@ -230,6 +265,7 @@ def test_a_shift_of_the_whole_map_costs_nothing_between_neighbours() -> None:
     assert shifted["position_rmse_m"] > 2.0
     doubled = fleets.add_up([outcome(2.0 * random)], [outcome(random)])
     assert doubled["ratio_to_clean"] == 2.0
+    assert doubled["bound_between_neighbors_m"] == pytest.approx(6.0**0.5, abs=1e-4)
     # Pairs of (0, 1), (0, 2) and (1, 2) are near; without object 1 only (0, 2).
     missed = np.array(random)
     missed[1] = np.nan

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy
 from scipy.spatial.transform import Rotation
 
 import valuemap
@@ -39,7 +40,7 @@ from valuemap.refine.residuals import MOUNT, OFFSET, Observations, State, residu
 from valuemap.refine.select import Selected, _Equations, _Trial
 from valuemap.refine.tracks import merge_objects
 from valuemap.simulate import simulate
-from valuemap.tables import Bools, Floats, Images, Ints
+from valuemap.tables import Bools, Floats, Images, Ints, covariance_matrices
 from valuemap.tiles.compare import Comparison
 from valuemap.tiles.work import open_work
 
@@ -50,6 +51,15 @@ CITY = SimulationConfig(
     passes_per_street=3,
     lookalikes_per_light=0.0,
 )
+
+
+DASHCAM = {
+    "position_white_m": 0.48,
+    "position_drift_m": 0.64,
+    "rotation_white_deg": 0.3,
+    "rotation_drift_deg": 0.4,
+}
+"""Poses of a dash camera: each image is 0.8 m and 0.5 degrees off on each axis."""
 
 
 def city(**faults: float) -> Dataset:
@@ -281,6 +291,56 @@ def off_from_each_other(result: valuemap.Map, dataset: Dataset) -> float:
     truth = dataset.truth.position_in_world_m[object_row[is_right]]
     off_m = result.labels.position_in_world_m[is_right] - truth
     return float(np.sqrt(((off_m - off_m.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+
+def between_neighbors(result: valuemap.Map, dataset: Dataset) -> tuple[float, float]:
+    """Return the error of vectors between objects within 50 m, m (RMS), and the mean normalised error of labels."""
+    assert dataset.truth is not None
+    label = valuemap.evaluate_map(result, dataset, radius_m=4.0).matches.label_of_object
+    place = dataset.truth.position_in_world_m[label >= 0]
+    error = result.labels.position_in_world_m[label[label >= 0]] - place
+    a, b = scipy.spatial.cKDTree(place).query_pairs(50.0, output_type="ndarray").T
+    covariance = covariance_matrices(result.labels.covariance_m2)[label[label >= 0]]
+    square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error)
+    return float(np.sqrt(np.mean(np.sum((error[a] - error[b]) ** 2, axis=1)))), float(square.mean())
+
+
+def test_all_that_images_show_tells_what_they_are_off_by_themselves() -> None:
+    config = dataclasses.replace(CITY, passes_per_street=5)
+    clean, faulty = (simulate(dataclasses.replace(config, **faults), seed=0) for faults in ({}, DASHCAM))  # type: ignore[arg-type]
+    result = valuemap.build_map(faulty)
+    alone = valuemap.build_map(faulty, valuemap.MapConfig().with_settings(["correct_poses=0"]))
+    assert result.run["poses"]["found"] == "errors of images"
+    assert result.corrected is not None
+    assert errors(result.corrected, clean)[0] < 0.7 * errors(faulty, clean)[0]
+    (between_m, square), (between_alone_m, _) = (between_neighbors(one, faulty) for one in (result, alone))
+    assert between_m < 0.5 * between_alone_m
+    # What residuals leave once images are moved is a few centimetres: errors of images count in the covariance.
+    assert square < 6.0
+
+
+def test_errors_of_images_are_no_noise_of_detections() -> None:
+    """Images whose poses are exact stay, however poor the detector: what one object says another does not confirm."""
+    poor = city(pixel_noise_px=5.0, **EXACT_POSES)
+    assert refine_poses(poor, valuemap.MapConfig()).is_noisy
+    assert pipeline._by_images(poor, valuemap.MapConfig(), 1, silent) is None
+
+
+def test_single_images_are_looked_at_only_where_they_are_off_by_more_than_was_thought(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clean, asked = city(), []
+    monkeypatch.setattr(pipeline, "_by_images", lambda dataset, *_: asked.append(dataset))
+    for is_noisy in (False, True):
+        monkeypatch.setattr(
+            pipeline,
+            "refine_poses",
+            lambda dataset, *_, is_noisy=is_noisy, **__: Refined(dataset, {}, is_noisy=is_noisy),
+        )
+        pipeline._proven(clean, valuemap.MapConfig(), pipeline._Stages(), 1, silent)
+    assert len(asked) == 1
+    monkeypatch.undo()
+    assert not refine_poses(clean, valuemap.MapConfig()).is_noisy
 
 
 def test_short_drives_have_the_offset_of_the_one_they_go_on_from() -> None:
@@ -859,6 +919,10 @@ def test_a_step_is_that_of_all_unknowns_in_one_matrix(dense_limit: int, monkeypa
         np.testing.assert_allclose(ours, theirs, atol=1e-4)
     assert gain == pytest.approx(right @ expected, rel=1e-3)
     np.testing.assert_allclose(after.covariance, np.linalg.inv(hessian)[last:, last:], rtol=1e-2, atol=1e-7)
+    of_things = problem.step(state, 2.0, of_things=True)[0].covariance
+    assert of_things is not None
+    literal_of_things = np.linalg.inv(hessian)[:first, :first]
+    np.testing.assert_allclose(of_things[:first, :first], literal_of_things, rtol=1e-2, atol=1e-5)
 
 
 def test_equations_tell_what_others_are_without_a_group_as_a_fit_without_it_does() -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from valuemap.cameras import Rays, cast_rays, directions_down
+from valuemap.cameras import Rays, camera_centers, cast_rays, directions_down
 from valuemap.config import MapConfig, bounded_threads
 from valuemap.dataset import Dataset, Frame, ensure_checked, read_dataset, write_dataset
 from valuemap.describe import describe_labels
@@ -25,12 +25,21 @@ from valuemap.notes import Findings, cameras_not_upright, find_notes, heights_no
 from valuemap.partition import partition_images
 from valuemap.portions import rows_on_disk
 from valuemap.progress import Progress, silent
-from valuemap.refine import FITS_NO_BETTER, Refined, expose_rows, keyframes_of, noise_left, refine_again, refine_poses
+from valuemap.refine import (
+    FITS_NO_BETTER,
+    Refined,
+    bundle,
+    expose_rows,
+    keyframes_of,
+    noise_left,
+    refine_again,
+    refine_poses,
+)
 from valuemap.rejected import rejected_of_map
 from valuemap.remote import Place, UrlPath
-from valuemap.robust import Calibration, calibration_to_json
+from valuemap.robust import Calibration, Noise, calibration_to_json
 from valuemap.system import peak_memory_mb
-from valuemap.tables import Labels, Votes
+from valuemap.tables import Labels, Votes, covariance_columns
 from valuemap.tiles.calibration import calibrate
 from valuemap.tiles.compare import compare_poses
 from valuemap.tiles.mapping import loaded, solve_cells
@@ -50,6 +59,10 @@ _NOTE_ON_SIZE = (
     "the dataset is larger than what poses are looked at of: they were taken as they are (map a part of it to learn "
     "what whole drives are off by; correct_poses=0 says that this is known)"
 )
+_MAPS_OF_IMAGES = 5
+"""Maps that tell errors of images, at most, before the one that stays."""
+_SETTLED = 0.1
+"""Images that move by less than this share of what they are off by have settled: they add a hundredth to its square."""
 CORRECTED = "corrected"
 """Where in the folder of work a dataset is kept whose poses were corrected."""
 
@@ -94,6 +107,7 @@ def build_map(
         with stages.measured("order"):
             source = InMemory(refined.dataset, config)
         labels, votes, counts, _ = _robust(source, config, stages, ThreadEngine(threads), progress)
+        labels = _with_errors_of_images(refined, labels, votes, config)
     size = {"images": len(dataset.images), "detections": len(dataset.detections)}
     passes = len(np.unique(dataset.images.pass_id.codes))
     poses = None if refined is None else refined.record
@@ -192,6 +206,8 @@ def build_map_of_folder(
         source, name, frame, size = on_disk, on_disk.name, on_disk.frame, on_disk.counts
         _check_detections(name, size["detections"])
     labels, votes, counts, cells = _robust(source, config, stages, run.engine, progress, run)
+    if refined is not None:
+        labels = _with_errors_of_images(refined, labels, votes, config)
     passes = source.drives_record["passes"]
     untouched = _TOO_LARGE if config.poses.correct_poses else "correct_poses is 0"
     poses = {"found": "nothing", "because": untouched} if refined is None else refined.record
@@ -217,19 +233,67 @@ def _proven(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, 
 
     with stages.measured("poses"):
         refined = refine_poses(dataset, config, threads=threads, progress=progress)
-        is_proven = refined.is_corrected
-        if not is_proven:
-            refined = _told_by_a_map(dataset, refined, config, threads, progress)
-        if not refined.is_corrected:
-            return replace(refined, found=None)
-        parameters = refined.record.get("parameters", 0)
-        found = compare_poses(dataset, refined.dataset, parameters, config, threads=threads, progress=progress)
-        record = {**refined.record, **found.figures()}
-        if not found.is_better:
-            return Refined(dataset, {**record, "found": "nothing", "because": FITS_NO_BETTER})
-        if is_proven:
-            refined = _told_by_a_map(dataset, refined, config, threads, progress)
-        return replace(refined, record={**record, **refined.record}, found=None)
+        # Where single images are far off, what whole drives seem to be off by is mostly theirs.
+        of_images = _by_images(dataset, config, threads, progress) if refined.is_noisy else None
+        return of_images or _of_drives(dataset, refined, config, threads, progress)
+
+
+def _of_drives(dataset: Dataset, refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:
+    """Keep what whole drives were found to be off by if it makes detections likelier, and estimate it with a map."""
+    is_proven = refined.is_corrected
+    if not is_proven:
+        refined = _told_by_a_map(dataset, refined, config, threads, progress)
+    if not refined.is_corrected:
+        return replace(refined, found=None)
+    parameters = refined.record.get("parameters", 0)
+    found = compare_poses(dataset, refined.dataset, parameters, config, threads=threads, progress=progress)
+    record = {**refined.record, **found.figures()}
+    if not found.is_better:
+        return Refined(dataset, {**record, "found": "nothing", "because": FITS_NO_BETTER})
+    if is_proven:
+        refined = _told_by_a_map(dataset, refined, config, threads, progress)
+    return replace(refined, record={**record, **refined.record}, found=None)
+
+
+def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progress) -> Refined | None:
+    """Correct what single images are probably off by, given a map; None where that is not proven.
+
+    It is proven with the map of the poses as they were: each half of its objects places the images for the other half.
+    """
+    engine, moved = ThreadEngine(threads), before
+    noise: Noise | None = None
+    figures: dict[str, float] = {}
+    for number in range(_MAPS_OF_IMAGES):
+        source = InMemory(moved, config)
+        calibration = calibrate(source, config, None, None, engine, progress)
+        cells = loaded(solve_cells(source, calibration, config, engine, progress))
+        labels, votes, _ = join_cells(cells, source.grid, config)
+        noise = noise or calibration.noise
+        told = bundle(before, labels, votes, noise, config)
+        if number == 0:
+            is_proven, figures = told.is_proven()
+            if not is_proven:
+                return None
+        last, moved = moved, replace(before, images=told.images(before.images))
+        step_m = camera_centers(moved.images) - camera_centers(last.images)
+        if np.sqrt(np.mean(step_m**2)) < _SETTLED * noise.position_m:
+            break
+    assert noise is not None
+    record = {"found": "errors of images", "images": len(before.images), **figures}
+    return Refined(moved, record, is_corrected=True, before_images=(before, noise))
+
+
+def _with_errors_of_images(refined: Refined, labels: Labels, votes: Votes, config: MapConfig) -> Labels:
+    """Return labels with covariances that know of errors of images, where these were corrected.
+
+    What is left of residuals once images are moved does not say how well they were.
+    """
+    if refined.before_images is None or not len(labels):
+        return labels
+    told = bundle(refined.before_images[0], labels, votes, refined.before_images[1], config)
+    columns = labels.covariance_m2.copy()
+    columns[told.label] = covariance_columns(told.covariances())
+    return labels.replace(covariance_m2=columns)
 
 
 def _told_by_a_map(dataset: Dataset, refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:

@@ -55,6 +55,11 @@ class Noise:
     share: float = _FIRST_SHARE
     image_m: float = _FIRST_M
 
+    @property
+    def is_larger_than_thought(self) -> bool:
+        """Whether images are off by more than was thought possible before anything was known."""
+        return self.px > _FIRST_PX
+
 
 @dataclass(frozen=True, eq=False)
 class Estimate:

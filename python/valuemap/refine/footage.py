@@ -152,9 +152,9 @@ def points_in_working_frame(dataset: Dataset, point_in_world_m: Floats, unit_m: 
     return np.asarray((point_in_world_m - middle) @ dataset.frame.east_north_up().T / unit_m)
 
 
-def gather(dataset: Dataset, drives: Drives) -> Footage:
-    """Take the keyframes of a dataset in driving order and in the working frame."""
-    chosen = keyframes(drives, dataset.images.camera_id)
+def gather(dataset: Dataset, drives: Drives, *, every_image: bool = False) -> Footage:
+    """Take the keyframes, or every image, of a dataset in driving order and in the working frame."""
+    chosen = np.ones(len(dataset.images), np.bool_) if every_image else keyframes(drives, dataset.images.camera_id)
     row = np.flatnonzero(chosen)
     images = dataset.images.take(row)
     image_row = rows_of(dataset.detections.image_id, dataset.images.image_id)

@@ -41,6 +41,7 @@ from valuemap.refine.jumps import Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import find_landmarks
 from valuemap.refine.residuals import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
 from valuemap.refine.select import Selected, select
+from valuemap.robust import Noise
 from valuemap.tables import Bools, Floats, Labels, Votes
 
 USUAL_RANGE_M = 60.0
@@ -74,13 +75,16 @@ class Found:
 class Refined:
     """A dataset with better poses and cameras, or as it was; `record` says in `run.json` what was found.
 
-    `found` is what a map may tell more of: it was corrected, or is in doubt.
+    `found` is what a map may tell more of: it was corrected, or is in doubt. Where `is_noisy`, single images are off by
+    more than was thought possible. `before_images` is what errors of single images were taken from, where they were.
     """
 
     dataset: Dataset
     record: dict[str, Any]
     is_corrected: bool = False
     found: Found | None = None
+    is_noisy: bool = False
+    before_images: tuple[Dataset, Noise] | None = None
 
 
 def refine_poses(
@@ -246,13 +250,14 @@ def noise_left(refined: Refined, config: MapConfig) -> NoiseConfig:
 
 def _corrected(dataset: Dataset, ordered: InOrder, found: Found | None, unit_m: float) -> Refined:
     """Return a dataset corrected by what was proven of it `ordered`; as it is where nothing was."""
+    is_noisy = found is not None and found.result.noise.is_larger_than_thought
     if found is None or found.selected is None:
-        return Refined(dataset, {"found": "nothing", **_looked_at(found)})
+        return Refined(dataset, {"found": "nothing", **_looked_at(found)}, is_noisy=is_noisy)
     if not found.selected.is_proven:
-        return Refined(dataset, {"found": "nothing", **_looked_at(found)}, found=found)
+        return Refined(dataset, {"found": "nothing", **_looked_at(found)}, found=found, is_noisy=is_noisy)
     record = {**_describe(ordered.dataset, found, found.selected, unit_m), **_looked_at(found)}
     moved = _moved(dataset, ordered, found, found.selected, unit_m)
-    return Refined(moved, record, is_corrected=True, found=found)
+    return Refined(moved, record, is_corrected=True, found=found, is_noisy=is_noisy)
 
 
 def _moved(dataset: Dataset, ordered: InOrder, found: Found, selected: Selected, unit_m: float) -> Dataset:

@@ -39,7 +39,7 @@ _BEYOND_DRIFT = 2.0
 """What is no more than so many deviations of drift is drift."""
 _LEAST_FOCAL = 0.003
 _REFIT, _ANEW = (1.5, 1.0, 1.0, 1.0), (1.0, 1.0, 1.0)
-_LEAST_CHANCE = 0.01
+LEAST_CHANCE = 0.01
 """What is less likely luck than this is to be looked at: whether all detections are likelier is asked afterwards."""
 _LEAST_OBJECTS = 8
 _MOST_UNRESOLVED = 0.23
@@ -74,7 +74,7 @@ class Selected:
     @property
     def is_proven(self) -> bool:
         """Whether the gain is hardly luck."""
-        return self.chance < _LEAST_CHANCE
+        return self.chance < LEAST_CHANCE
 
     @property
     def parameters(self) -> int:
@@ -495,10 +495,8 @@ def _held_out(
     found: Estimate, seen: Observations, chain: Chain, scales: Scales, active: tuple[Bools, ...], state: State
 ) -> tuple[float, float, int]:
     """Return the gain on objects that had no part in the fit, the chance that it is luck, and the number of objects."""
-    from scipy import stats  # Slow to import, and only this test needs it.
-
     things = len(found.class_code)
-    half = _halves(state.point_in_world_m)
+    half = halves(state.point_in_world_m)
     gains = []
     for side in (0, 1):
         fitted = seen.take(half[seen.thing] == side)
@@ -516,15 +514,22 @@ def _held_out(
         is_judged = np.bincount(judged.thing, minlength=things) > 0
         gains.append((by_thing[0] - by_thing[1])[is_judged])
     gain = np.concatenate(gains)
+    return float(gain.sum()), chance_of_gain(gain), len(gain)
+
+
+def chance_of_gain(gain: Floats) -> float:
+    """Return the probability that what objects (N) gain is luck, by their mean and by their ranks."""
+    from scipy import stats  # Slow to import, and only this test needs it.
+
     if len(gain) < _LEAST_OBJECTS:
-        return float(gain.sum()), 1.0, len(gain)
+        return 1.0
     scatter = float(gain.std(ddof=1)) / math.sqrt(len(gain))
     chance = float(stats.t.sf(float(gain.mean()) / scatter, len(gain) - 1)) if scatter > 0.0 else 0.0
     by_rank = float(stats.wilcoxon(gain, alternative="greater").pvalue)
-    return float(gain.sum()), min(1.0, 2.0 * min(chance, by_rank)), len(gain)
+    return min(1.0, 2.0 * min(chance, by_rank))
 
 
-def _halves(point: Floats) -> Ints:
+def halves(point: Floats) -> Ints:
     """Deal objects into two halves by turns along their places, so that drives see some of both everywhere."""
     order = np.lexsort((point[:, 2], point[:, 1], np.round(point[:, 0] / 10.0)))
     half = np.empty(len(point), np.int64)

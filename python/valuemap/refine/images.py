@@ -1,0 +1,145 @@
+"""What single images are off by, told by all that each of them shows: a bundle adjustment with the objects of a map.
+
+A map takes errors of poses as noise of each object apart. Where images are off by more than objects are apart, that
+does not say which detection shows which. But an error of an image, and the drift of its drive, is one for all that it
+shows: together, objects tell it. So images are moved by what they are probably off by given a map, and mapped again.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from valuemap.cameras import camera_poses
+from valuemap.config import MapConfig
+from valuemap.dataset import Dataset, rows_of
+from valuemap.drives import InOrder, in_driving_order
+from valuemap.refine.adjust import Adjustment, Scales, adjust, triangulate
+from valuemap.refine.estimate import WIDE, everything
+from valuemap.refine.footage import Footage, Sigmas, gather, in_working_frame, points_in_working_frame, with_poses
+from valuemap.refine.jumps import Links, Segments
+from valuemap.refine.poses import USUAL_RANGE_M, one_blas_thread
+from valuemap.refine.residuals import Observations, State, corrected, cost
+from valuemap.refine.select import LEAST_CHANCE, chance_of_gain, halves
+from valuemap.robust import Noise
+from valuemap.tables import Floats, Images, Ints, Labels, Votes
+
+_TOLERANCES = (4.0, 3.0, 3.0, 3.0, 3.0)
+"""Votes of a map are the wrong object's now and then: Cauchy's weights stay wide of what errors of images leave."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """The images of a dataset with what they see of the objects (K) of a map, the rows `label` (K) of its labels.
+
+    `scales` are what errors of images and drift are thought to be a priori. All is in the working frame, in units of
+    `unit_m`.
+    """
+
+    ordered: InOrder
+    unit_m: float
+    footage: Footage
+    seen: Observations
+    scales: Scales
+    state: State
+    label: Ints
+
+    def adjusted(self, seen: Observations) -> State:
+        """Return objects, drift and errors of images as some of the observations tell them."""
+        with one_blas_thread():
+            return adjust(self._problem(seen), self.state, tolerances=_TOLERANCES)
+
+    def _problem(self, seen: Observations) -> Adjustment:
+        none = tuple(np.zeros_like(flags) for flags in everything(self.footage, _whole_drives(self.footage)))
+        return Adjustment(seen, self.footage.chain, self.scales, none, len(self.label), Links.none())
+
+    def gain(self) -> tuple[float, float]:
+        """Return by how much rays of objects meet better that had no part in it, and the chance that it is luck.
+
+        The gain is in units of chi-squared, of poses as each half of the objects has them for the other half.
+        """
+        half, things = halves(self.state.point_in_world_m), len(self.label)
+        gains = []
+        for side in (0, 1):
+            judged = self.seen.take(half[self.seen.thing] != side)
+            poses = corrected(judged.views, self.adjusted(self.seen.take(half[self.seen.thing] == side)))
+            views = replace(
+                judged.views, cam_from_world=poses.cam_from_world, center_in_world_m=poses.center_in_world_m
+            )
+            given, moved = (
+                np.bincount(rays.thing, weights=cost(rays, triangulate(rays, self.state)), minlength=things)
+                for rays in (judged, replace(judged, views=views))
+            )
+            gains.append((given - moved)[np.unique(judged.thing)])
+        return float(np.concatenate(gains).sum()), chance_of_gain(np.concatenate(gains))
+
+    def is_proven(self) -> tuple[bool, dict[str, float]]:
+        """Return whether the gain is hardly luck, and what `run.json` says of it."""
+        gain, chance = self.gain()
+        return chance < LEAST_CHANCE, {"gain_on_held_out": round(gain, 1), "chance_of_that": float(f"{chance:.2g}")}
+
+    def images(self, like: Images) -> Images:
+        """Return images `like` those of the dataset with the poses that they probably have."""
+        poses = corrected(self.seen.views, self.adjusted(self.seen))
+        axes, unit_m = self.ordered.dataset.frame.east_north_up(), self.unit_m
+        _, center = camera_poses(self.ordered.dataset.images)
+        center = center + unit_m * (poses.center_in_world_m - self.footage.center_in_world_m) @ axes
+        moved = with_poses(self.ordered.dataset.images, poses.cam_from_world @ axes, center)
+        row = rows_of(like.image_id, self.ordered.image_id)
+        return like.replace(
+            cam_from_world_quat=moved.cam_from_world_quat[row], cam_from_world_m=moved.cam_from_world_m[row]
+        )
+
+    def covariances(self) -> Floats:
+        """Return the covariances (K, 3, 3) in m² of the objects, errors of all images and drift marginalised."""
+        state = self.adjusted(self.seen)
+        with one_blas_thread():
+            covariance = self._problem(self.seen).step(state, _TOLERANCES[-1], of_things=True)[0].covariance
+        assert covariance is not None
+        things = np.arange(len(self.label))
+        axes = self.ordered.dataset.frame.east_north_up()
+        blocks = covariance.reshape(len(things), 3, len(things), 3)[things, :, things, :]
+        return np.asarray(self.unit_m**2 * axes.T @ blocks @ axes)
+
+
+def bundle(dataset: Dataset, labels: Labels, votes: Votes, noise: Noise, config: MapConfig) -> Bundle:
+    """Return the images of a dataset with what they see of a map, which `noise` is of poses as they are given.
+
+    The map may have been made with other poses of the same images.
+    """
+    unit_m = config.vote.max_range_m / USUAL_RANGE_M
+    ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
+    footage = gather(*in_working_frame(ordered.dataset, ordered.drives, unit_m), every_image=True)
+    # Rows of the dataset in driving order are the ids of the footage's detections.
+    label = np.full(len(dataset.detections), -1)
+    label[rows_of(votes.detection_id, ordered.detection_id)] = rows_of(votes.label_id, labels.label_id)
+    label = label[footage.dataset.detections.detection_id]
+    detection = np.flatnonzero(label >= 0)
+    kinds, first, code = np.unique(label[detection], return_index=True, return_inverse=True)
+    # Numbered along the drives, so that the order of labels does not show in the last digits.
+    along = np.argsort(first)
+    kinds, thing = kinds[along], np.argsort(along)[code]
+    box = np.maximum(footage.dataset.detections.size_px[:, 1], 0.0)
+    alone = np.hypot(noise.detection_px, noise.box_share * box)
+    # As everywhere in this package, a metre of the camera is as many pixels as the box of a thing of a metre.
+    of_image = np.hypot(noise.position_m / unit_m * box, noise.rotation_rad * footage.pixels_per_rad())
+    segments = _whole_drives(footage)
+    seen = footage.observe(detection, thing, footage.drives.pass_code, Sigmas(np.hypot(alone, of_image), alone))
+    points = points_in_working_frame(ordered.dataset, labels.position_in_world_m[kinds], unit_m)
+    counts = tuple(map(len, everything(footage, segments)))
+    state = triangulate(seen, State.zero(points, len(footage.chain.drive), len(footage.row), counts))
+    scales = Scales(
+        drift_m=max(math.hypot(noise.position_drift_m, noise.position_segment_m) / unit_m, 1e-3),
+        drift_rad=max(math.hypot(noise.rotation_drift_rad, noise.rotation_segment_rad), 1e-5),
+        own_m=max(noise.position_m / unit_m, 1e-3),
+        own_rad=max(noise.rotation_rad, 1e-5),
+        constant=WIDE.constant,
+    )
+    return Bundle(ordered, unit_m, footage, seen, scales, state, kinds)
+
+
+def _whole_drives(footage: Footage) -> Segments:
+    count = footage.drives.count
+    return Segments(np.arange(count), np.zeros(count, np.int64))
