@@ -311,19 +311,22 @@ impl<'a> Pair<'a> {
     }
 
     /// The votes of both (ascending) after an exchange of what they have in some images, as far as they may take it; nothing if that is no exchange.
+    ///
+    /// To exchange most of what two have is to exchange the rest, by other names: so each stays about where it is, with its claims.
     fn exchanged(&self, images: &[u32]) -> Option<[Vec<u32>; 2]> {
         let image = |ray: u32| self.model.scene.rays.image[ray as usize];
-        let split = |images: &[u32]| {
-            self.of.map(|object| {
-                object.votes.iter().copied().partition::<Vec<u32>, _>(|&ray| images.binary_search(&image(ray)).is_ok())
-            })
+        let is_within = |ray: u32| images.binary_search(&image(ray)).is_ok();
+        let votes = || self.of.iter().flat_map(|object| &object.votes);
+        let is_rest = 2 * votes().filter(|&&ray| is_within(ray)).count() > votes().count();
+        let split = |barred: &FxHashSet<u32>| {
+            let goes = |ray: u32| is_within(ray) != is_rest && !barred.contains(&image(ray));
+            self.of.map(|object| object.votes.iter().copied().partition::<Vec<u32>, _>(|&ray| goes(ray)))
         };
-        let [mut a, mut b] = split(images);
+        let [mut a, mut b] = split(&FxHashSet::default());
         let barred: FxHashSet<u32> =
             self.barred(0, &a.1, &b.0).chain(self.barred(1, &b.1, &a.0)).map(|ray| image(*ray)).collect();
         if !barred.is_empty() {
-            let left: Vec<u32> = images.iter().copied().filter(|image| !barred.contains(image)).collect();
-            [a, b] = split(&left);
+            [a, b] = split(&barred);
         }
         // What has no votes left, and what takes all of the other's, are the two as they are.
         if a.0.len() + b.0.len() == 0 || a.1.len() + b.1.len() == 0 {
@@ -460,6 +463,29 @@ mod tests {
             assert!(object.votes.iter().all(|ray| *ray as usize % 2 == i));
             assert!(object.votes.len() >= rays.len() / 2 - 2);
         }
+        Ok(())
+    }
+
+    #[test]
+    fn to_exchange_most_of_what_two_have_is_to_exchange_the_rest() -> Result<(), Halt> {
+        let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
+        let both = [Vector3::new(30.0, 4.0, 3.0), Vector3::new(30.0, 5.0, 3.0)];
+        let scene = street::joined((0..3).map(|i| street::street(10, 2.0, &both, &errors[7 * i..])).collect());
+        let model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let rays = scene.usable_rays();
+        let votes = |i: usize| rays.iter().copied().skip(i).step_by(2).collect();
+        let objects: Vec<Object> =
+            (0..2).filter_map(|i| object(&model, &lookout, votes(i), both[i], Vec::new())).collect();
+        let index = RayIndex::new(&scene, &model.spreads, street::GATE_SIGMAS, rays.iter().copied());
+        let claims = claims_of_all(&model, &index, &objects, &Progress::default())?;
+        let pair = Pair::new(&model, &lookout, [&objects[0], &objects[1]], [&claims[0], &claims[1]]);
+        let (one, rest): (Vec<u32>, Vec<u32>) = (0..30).partition(|&image| scene.views[image as usize].pass == 0);
+        let exchanged = pair.exchanged(&rest);
+        assert_eq!(exchanged, pair.exchanged(&one));
+        // Each keeps what it has on two of three drives.
+        let is_own = |ray: &&u32| objects[0].votes.binary_search(ray).is_ok();
+        assert_eq!(exchanged.map(|[first, _]| first.iter().filter(is_own).count()), Some(20));
         Ok(())
     }
 
