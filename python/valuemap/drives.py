@@ -915,6 +915,20 @@ class InOrder:
         count = np.bincount(self.dataset.detections.image_id, minlength=len(self.dataset.images))
         return np.concatenate([[0], np.cumsum(count)])
 
+    def rows_of_images(self, image_id: Ints) -> Ints:
+        """Return the rows (M) of images by the ids (M) they had, all of which must be there."""
+        return _rows_by_id(image_id, self.image_id)
+
+    def rows_of_detections(self, detection_id: Ints) -> Ints:
+        """Return the rows (M) of detections by the ids (M) they had, all of which must be there."""
+        return _rows_by_id(detection_id, self.detection_id)
+
+
+def _rows_by_id(ids: Ints, keys: Ints) -> Ints:
+    """Return the row in unique `keys` (N), in any order, of each of `ids` (M)."""
+    by_id = np.argsort(keys)
+    return by_id[rows_of(ids, keys[by_id])]
+
 
 def driving_order(images: Images, drives: Drives) -> Ints:
     """Return the rows of images (N) along their drives, those of one exposure by place and direction."""

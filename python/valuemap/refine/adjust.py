@@ -14,7 +14,7 @@ products of the derivatives of an observation are added up over those of one nod
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -32,6 +32,8 @@ from valuemap.refine.residuals import (
 from valuemap.tables import Bools, Floats, Ints
 
 _DENSE_LIMIT = 3000
+_AT_ONCE = 32
+"""Objects of which covariances are solved for together: 100 columns take 50 MB where 20,000 objects are adjusted."""
 _DAMPING = 1e-6
 """Added to the information of objects, so that one that nothing tells stays."""
 _LONGEST_M = 20.0
@@ -230,7 +232,7 @@ class Adjustment:
         """Return the state after one step of Gauss-Newton with weights of this tolerance, and what it gains.
 
         The gain is that of chi-squared if the residuals were linear and the weights stayed. The covariance is that of
-        the constants, or `of_things` and constants.
+        the constants, or those (K, 3, 3) `of_things`.
         """
         rows, own = self._weighted(state, tolerance)
         products, of_image = self.finest.products(rows), self._shared_by_image(rows, own)
@@ -265,7 +267,7 @@ class Adjustment:
         nodes[self.node[self.by_node_and_part.row[self.by_node.row]]] = node_products
         sums = (_TO_DRIFT.T @ beside_thing, _TO_DRIFT.T @ both @ _TO_CONSTANTS, _TO_DRIFT.T @ nodes)
         eliminated = [self._eliminate(drives, sums, state.drift, system) for drives in self.drives]
-        step, covariance = system.solve(0 if of_things else 3 * self.things if with_variance else None)
+        step, covariance = system.solve(3 * self.things if with_variance else None, of_things=of_things)
         gain = float(system.right @ step)
         drift = state.drift.copy()
         for drives, (factor, solved) in zip(self.drives, eliminated, strict=True):
@@ -457,11 +459,13 @@ class _System:
         rows, columns = np.broadcast_to(rows, values.shape)[used], np.broadcast_to(columns, values.shape)[used]
         self.entries.append((values[used], rows, columns))
 
-    def solve(self, first: int | None) -> tuple[Floats, Floats | None]:
-        """Return the solution, and the covariance of the columns from `first` on."""
+    def solve(self, first: int | None, *, of_things: bool = False) -> tuple[Floats, Floats | None]:
+        """Return the solution, and the covariance of the columns from `first` on, or those (K, 3, 3) `of_things`."""
         if self.matrix is not None:
             factor = scipy.linalg.cho_factor(self.matrix[:-1, :-1], lower=True, overwrite_a=True, check_finite=False)
             solution = scipy.linalg.cho_solve(factor, self.right, check_finite=False)
+            if of_things:
+                return solution, self._blocks(lambda units: scipy.linalg.cho_solve(factor, units, check_finite=False))
             if first is None:
                 return solution, None
             # The factor of what is left once the objects are eliminated is its lower right corner.
@@ -472,6 +476,8 @@ class _System:
             scipy.sparse.csc_matrix((values, (rows, columns)), shape=(self.columns, self.columns))
         )
         solution = np.asarray(sparse_factor.solve(self.right))
+        if of_things:
+            return solution, self._blocks(sparse_factor.solve)
         if first is None:
             return solution, None
         covariance = np.empty((self.columns - first, self.columns - first))
@@ -480,6 +486,16 @@ class _System:
             unit[column] = 1.0
             covariance[:, column - first] = sparse_factor.solve(unit)[first:]
         return solution, covariance
+
+    def _blocks(self, solved: Callable[[Floats], Floats]) -> Floats:
+        """Return the covariances (K, 3, 3) of objects, few at a time: that of all is as large as they are squared."""
+        blocks = np.empty((self.things, 3, 3))
+        for first in range(0, self.things, _AT_ONCE):
+            things = np.arange(min(_AT_ONCE, self.things - first))
+            units = np.eye(self.columns, 3 * len(things), -3 * first)
+            covariance = solved(units)[3 * first : 3 * (first + len(things))].reshape(len(things), 3, len(things), 3)
+            blocks[first + things] = covariance[things, :, things, :]
+        return blocks
 
 
 def adjust(problem: Adjustment, state: State, *, tolerances: tuple[float, ...], with_variance: bool = False) -> State:

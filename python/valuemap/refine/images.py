@@ -87,7 +87,7 @@ class Bundle:
         _, center = camera_poses(self.ordered.dataset.images)
         center = center + unit_m * (poses.center_in_world_m - self.footage.center_in_world_m) @ axes
         moved = with_poses(self.ordered.dataset.images, poses.cam_from_world @ axes, center)
-        row = rows_of(like.image_id, self.ordered.image_id)
+        row = self.ordered.rows_of_images(like.image_id)
         return like.replace(
             cam_from_world_quat=moved.cam_from_world_quat[row], cam_from_world_m=moved.cam_from_world_m[row]
         )
@@ -98,10 +98,8 @@ class Bundle:
         with one_blas_thread():
             covariance = self._problem(self.seen).step(state, _TOLERANCES[-1], of_things=True)[0].covariance
         assert covariance is not None
-        things = np.arange(len(self.label))
         axes = self.ordered.dataset.frame.east_north_up()
-        blocks = covariance.reshape(len(things), 3, len(things), 3)[things, :, things, :]
-        return np.asarray(self.unit_m**2 * axes.T @ blocks @ axes)
+        return np.asarray(self.unit_m**2 * axes.T @ covariance @ axes)
 
 
 def bundle(dataset: Dataset, labels: Labels, votes: Votes, noise: Noise, config: MapConfig) -> Bundle:
@@ -114,7 +112,7 @@ def bundle(dataset: Dataset, labels: Labels, votes: Votes, noise: Noise, config:
     footage = gather(*in_working_frame(ordered.dataset, ordered.drives, unit_m), every_image=True)
     # Rows of the dataset in driving order are the ids of the footage's detections.
     label = np.full(len(dataset.detections), -1)
-    label[rows_of(votes.detection_id, ordered.detection_id)] = rows_of(votes.label_id, labels.label_id)
+    label[ordered.rows_of_detections(votes.detection_id)] = rows_of(votes.label_id, labels.label_id)
     label = label[footage.dataset.detections.detection_id]
     detection = np.flatnonzero(label >= 0)
     kinds, first, code = np.unique(label[detection], return_index=True, return_inverse=True)

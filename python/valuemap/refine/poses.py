@@ -188,7 +188,7 @@ def refine_again(
         footage = before.footage
         # Rows of the dataset in driving order are the ids of the footage's detections.
         thing = np.full(len(dataset.detections), -1)
-        thing[rows_of(votes.detection_id, ordered.detection_id)] = rows_of(votes.label_id, labels.label_id)
+        thing[ordered.rows_of_detections(votes.detection_id)] = rows_of(votes.label_id, labels.label_id)
         thing = thing[footage.dataset.detections.detection_id]
         detection = np.flatnonzero(thing >= 0)
         if not len(detection):
@@ -263,8 +263,7 @@ def _corrected(dataset: Dataset, ordered: InOrder, found: Found | None, unit_m: 
 def _moved(dataset: Dataset, ordered: InOrder, found: Found, selected: Selected, unit_m: float) -> Dataset:
     """Return a dataset corrected by what was selected of it `ordered`, in the order of its rows."""
     corrected = _apply(ordered.dataset, ordered.drives, found, selected, unit_m)
-    row = np.empty(len(dataset.images), np.int64)
-    row[rows_of(ordered.image_id, dataset.images.image_id)] = np.arange(len(row))
+    row = ordered.rows_of_images(dataset.images.image_id)
     images = dataset.images.replace(
         cam_from_world_quat=corrected.images.cam_from_world_quat[row],
         cam_from_world_m=corrected.images.cam_from_world_m[row],

@@ -121,7 +121,8 @@ class State:
     own: Floats
     constants: tuple[Floats, ...]
     covariance: Floats | None = None
-    """Of the constants that are free (C, C), in the order of `Adjustment.column_of`, all else marginalised."""
+    """Of the constants that are free (C, C), in the order of `Adjustment.column_of`, all else marginalised; or that of
+    each object (K, 3, 3), if it was asked for."""
 
     @staticmethod
     def zero(points: Floats, nodes: int, images: int, counts: tuple[int, ...]) -> State:
