@@ -29,6 +29,7 @@ from valuemap.engine.threads import ThreadEngine
 from valuemap.progress import silent
 from valuemap.refine import Refined, adjust, expose_rows, poses, refine_again, refine_poses, tracks
 from valuemap.refine import estimate as refine_estimate
+from valuemap.refine import images as refine_images
 from valuemap.refine import select as refine_select
 from valuemap.refine.adjust import Adjustment, Scales
 from valuemap.refine.delay import _is_gain, delay_alone
@@ -336,6 +337,15 @@ def test_errors_of_images_are_no_noise_of_detections() -> None:
     poor = city(pixel_noise_px=5.0, **EXACT_POSES)
     assert refine_poses(poor, valuemap.MapConfig()).is_noisy
     assert pipeline._by_images(poor, valuemap.MapConfig(), 1, silent) is None
+
+
+def test_a_part_of_many_objects_says_whether_images_are_off() -> None:
+    assert refine_images._in_runs(999).all()
+    asked = refine_images._in_runs(5000)
+    assert asked.sum() == 1000
+    # In runs of what lies side by side, evenly spread.
+    assert np.flatnonzero(np.diff(asked.astype(int)) == 1).tolist() == list(range(499, 4999, 500))
+    assert np.flatnonzero(np.diff(asked.astype(int)) == -1).tolist() == list(range(99, 4999, 500))
 
 
 def test_single_images_are_looked_at_only_where_they_are_off_by_more_than_was_thought(
