@@ -150,7 +150,7 @@ CASES: dict[str, tuple[str, int, Fails]] = {
     "confusions": ("confused classes", 5, more_is_wrong),
     "shared_noise": ("drifts", 5, errors_are_larger_than_said),
     "noise_split": ("close rows", 5, more_is_wrong),
-    "contest": ("lights", 5, less_is_said_of_what_is_contested),
+    "contest": ("close rows", 6, less_is_said_of_what_is_contested),
     "scaling": ("drifts", 6, errors_are_larger_than_said),
 }
 """By part: a scene, its seed, and what is worse there without the part."""

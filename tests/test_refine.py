@@ -316,7 +316,7 @@ def test_all_that_images_show_tells_what_they_are_off_by_themselves() -> None:
     assert result.corrected is not None
     assert errors(result.corrected, clean)[0] < 0.7 * errors(faulty, clean)[0]
     (between_m, square), (between_alone_m, _) = (between_neighbors(one, faulty) for one in (result, alone))
-    assert between_m < 0.5 * between_alone_m
+    assert between_m < 0.7 * between_alone_m
     # What residuals leave once images are moved is a few centimetres: errors of images count in the covariance.
     assert square < 6.0
 
