@@ -339,6 +339,16 @@ def test_errors_of_images_are_no_noise_of_detections() -> None:
     assert pipeline._by_images(poor, valuemap.MapConfig(), 1, silent) is None
 
 
+def test_a_map_without_objects_says_nothing_of_images() -> None:
+    result = valuemap.build_map(city(**DASHCAM), MapConfig().with_settings(["min_votes=5000"]))
+    assert (len(result.labels), result.run["poses"]["found"]) == (0, "nothing")
+
+
+def test_one_object_has_no_other_half(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(refine_images, "halves", lambda points: np.zeros(len(points), np.int64))
+    assert pipeline._by_images(city(**DASHCAM), MapConfig(), 1, silent) is None
+
+
 def test_a_part_of_many_objects_says_whether_images_are_off() -> None:
     assert refine_images._in_runs(999).all()
     asked = refine_images._in_runs(5000)

@@ -268,6 +268,8 @@ def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progr
         calibration = calibrate(source, config, None, None, engine, progress)
         cells = loaded(solve_cells(source, calibration, config, engine, progress))
         labels, votes, _ = join_cells(cells, source.grid, config)
+        if not len(labels):
+            return None
         noise = noise or calibration.noise
         told = bundle(before, labels, votes, noise, config)
         if number == 0:

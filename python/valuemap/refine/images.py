@@ -66,6 +66,8 @@ class Bundle:
         """
         half, things = halves(self.state.point_in_world_m), len(self.label)
         asked = self.seen.take(_in_runs(things)[self.seen.thing])
+        if len(np.unique(half[asked.thing])) < 2:  # There is no other half.
+            return 0.0, 1.0
         gains = []
         for side in (0, 1):
             judged = asked.take(half[asked.thing] != side)
