@@ -264,13 +264,10 @@ def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progr
     noise: Noise | None = None
     figures: dict[str, float] = {}
     for number in range(_MAPS_OF_IMAGES):
-        source = InMemory(moved, config)
-        calibration = calibrate(source, config, None, None, engine, progress)
-        cells = loaded(solve_cells(source, calibration, config, engine, progress))
-        labels, votes, _ = join_cells(cells, source.grid, config)
+        labels, votes, of_map = _map_alone(moved, config, engine, progress)
         if not len(labels):
             return None
-        noise = noise or calibration.noise
+        noise = noise or of_map
         told = bundle(before, labels, votes, noise, config)
         if number == 0:
             is_proven, figures = told.is_proven()
@@ -314,12 +311,17 @@ def _map_of_keyframes(
     It is of the images that poses are estimated with. Its noise is what was left there, and not sought.
     """
     config = replace(config, noise=noise_left(refined, config))
-    source = InMemory(keyframes_of(dataset, refined, config), config)
-    calibration = calibrate(source, config, None, None, engine, progress)
-    labels, votes, _ = join_cells(
-        loaded(solve_cells(source, calibration, config, engine, progress)), source.grid, config
-    )
+    labels, votes, _ = _map_alone(keyframes_of(dataset, refined, config), config, engine, progress)
     return labels, votes
+
+
+def _map_alone(dataset: Dataset, config: MapConfig, engine: Engine, progress: Progress) -> tuple[Labels, Votes, Noise]:
+    """Return labels and votes of a dataset in memory and the noise that they were found with, and keep nothing."""
+    source = InMemory(dataset, config)
+    calibration = calibrate(source, config, None, None, engine, progress)
+    cells = loaded(solve_cells(source, calibration, config, engine, progress))
+    labels, votes, _ = join_cells(cells, source.grid, config)
+    return labels, votes, calibration.noise
 
 
 def _with_rejected(result: Map, read: Callable[[], Dataset], stages: _Stages) -> Map:

@@ -9,11 +9,11 @@ import scipy
 
 from valuemap.cameras import Rays, camera_centers, camera_poses, cast_rays, colmap_camera, rotation_of
 from valuemap.dataset import Dataset, rows_of
-from valuemap.drives import Drives
+from valuemap.drives import Drives, InOrder
 from valuemap.refine.adjust import Chain
 from valuemap.refine.landmarks import keyframes
 from valuemap.refine.residuals import Observations, Views, rotations
-from valuemap.tables import Bools, Floats, Images, Ints
+from valuemap.tables import Bools, Floats, Images, Ints, Labels, Votes
 
 NODE_M = 10.0
 """Drift is the same within so much of a drive."""
@@ -150,6 +150,22 @@ def points_in_working_frame(dataset: Dataset, point_in_world_m: Floats, unit_m: 
     """Return points (N, 3) of the world of a dataset in the frame that `in_working_frame` gives it."""
     middle = np.median(camera_centers(dataset.images), axis=0)
     return np.asarray((point_in_world_m - middle) @ dataset.frame.east_north_up().T / unit_m)
+
+
+def shown_objects(footage: Footage, ordered: InOrder, labels: Labels, votes: Votes) -> tuple[Ints, Ints, Ints, Ints]:
+    """Return the detections (N) that labels of a map have, with their objects (N), and of each object its label.
+
+    `footage` is of the dataset `ordered`: rows of that are the ids of its detections. Of each object (K) there are the
+    row of its label and the place of its first detection among the N.
+    """
+    label = np.full(len(ordered.detection_id), -1)
+    label[ordered.rows_of_detections(votes.detection_id)] = rows_of(votes.label_id, labels.label_id)
+    label = label[footage.dataset.detections.detection_id]
+    detection = np.flatnonzero(label >= 0)
+    kinds, first, code = np.unique(label[detection], return_index=True, return_inverse=True)
+    # Numbered along the drives, so that the order of labels does not show in the last digits.
+    along = np.argsort(first)
+    return detection, np.argsort(along)[code], kinds[along], first[along]
 
 
 def gather(dataset: Dataset, drives: Drives, *, every_image: bool = False) -> Footage:

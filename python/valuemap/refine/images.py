@@ -14,11 +14,19 @@ import numpy as np
 
 from valuemap.cameras import camera_poses
 from valuemap.config import MapConfig
-from valuemap.dataset import Dataset, rows_of
+from valuemap.dataset import Dataset
 from valuemap.drives import InOrder, in_driving_order
 from valuemap.refine.adjust import Adjustment, Scales, adjust, triangulate
 from valuemap.refine.estimate import WIDE, everything
-from valuemap.refine.footage import Footage, Sigmas, gather, in_working_frame, points_in_working_frame, with_poses
+from valuemap.refine.footage import (
+    Footage,
+    Sigmas,
+    gather,
+    in_working_frame,
+    points_in_working_frame,
+    shown_objects,
+    with_poses,
+)
 from valuemap.refine.jumps import Links, Segments
 from valuemap.refine.poses import USUAL_RANGE_M, one_blas_thread
 from valuemap.refine.residuals import Observations, State, corrected, cost
@@ -117,15 +125,7 @@ def bundle(dataset: Dataset, labels: Labels, votes: Votes, noise: Noise, config:
     unit_m = config.vote.max_range_m / USUAL_RANGE_M
     ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
     footage = gather(*in_working_frame(ordered.dataset, ordered.drives, unit_m), every_image=True)
-    # Rows of the dataset in driving order are the ids of the footage's detections.
-    label = np.full(len(dataset.detections), -1)
-    label[ordered.rows_of_detections(votes.detection_id)] = rows_of(votes.label_id, labels.label_id)
-    label = label[footage.dataset.detections.detection_id]
-    detection = np.flatnonzero(label >= 0)
-    kinds, first, code = np.unique(label[detection], return_index=True, return_inverse=True)
-    # Numbered along the drives, so that the order of labels does not show in the last digits.
-    along = np.argsort(first)
-    kinds, thing = kinds[along], np.argsort(along)[code]
+    detection, thing, kinds, _ = shown_objects(footage, ordered, labels, votes)
     box = np.maximum(footage.dataset.detections.size_px[:, 1], 0.0)
     alone = np.hypot(noise.detection_px, noise.box_share * box)
     # As everywhere in this package, a metre of the camera is as many pixels as the box of a thing of a metre.

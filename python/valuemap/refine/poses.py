@@ -35,6 +35,7 @@ from valuemap.refine.footage import (
     moved_on,
     moving_late,
     points_in_working_frame,
+    shown_objects,
     with_poses,
 )
 from valuemap.refine.jumps import Segments, find_hints, find_jumps, mend
@@ -186,17 +187,9 @@ def refine_again(
         unit_m = config.vote.max_range_m / USUAL_RANGE_M
         ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
         footage = before.footage
-        # Rows of the dataset in driving order are the ids of the footage's detections.
-        thing = np.full(len(dataset.detections), -1)
-        thing[ordered.rows_of_detections(votes.detection_id)] = rows_of(votes.label_id, labels.label_id)
-        thing = thing[footage.dataset.detections.detection_id]
-        detection = np.flatnonzero(thing >= 0)
+        detection, thing, kinds, first = shown_objects(footage, ordered, labels, votes)
         if not len(detection):
             return refined
-        kinds, first, code = np.unique(thing[detection], return_index=True, return_inverse=True)
-        # Numbered along the drives, so that the order of labels does not show in the last digits.
-        along = np.argsort(first)
-        kinds, first, thing = kinds[along], first[along], np.argsort(along)[code]
         points = points_in_working_frame(ordered.dataset, labels.position_in_world_m[kinds], unit_m)
         start = replace(
             before.result,
