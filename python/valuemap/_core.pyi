@@ -12,6 +12,7 @@ _Indices = NDArray[np.uint32]
 CALIBRATION_STEPS: int
 MISFIT_STEPS: int
 SEARCH_STEPS: int
+STEPS_OF_ONCE: int
 
 class Rays:
     def __init__(

@@ -202,7 +202,7 @@ def misfits(
 
 def steps_of_labels(calibration: Calibration) -> int:
     """Return in how many steps labels are found, at most: where they begin, and the moves of the search."""
-    return 1 + (_core.SEARCH_STEPS if calibration.is_deep else 1)
+    return 1 + (_core.SEARCH_STEPS if calibration.is_deep else _core.STEPS_OF_ONCE)
 
 
 _COUNTED_AS = {"recall": "detection_rate", "recall_concentration": "detection_rate_concentration"}

@@ -254,7 +254,7 @@ proptest! {
             .collect();
         prop_assume!(votes.len() == 3);
         prop_assert!(World::new(&scene, &[(votes.clone(), at)]).objects[0].energy > 0.0);
-        for depth in [Depth::Deep, Depth::Shallow] {
+        for depth in [Depth::Deep, Depth::Once, Depth::Shallow] {
             let mut model = Model::new(&scene, &DRIFTING, &SETTINGS);
             let rays: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
             let begun = vec![(votes.clone(), at)];
@@ -268,11 +268,24 @@ proptest! {
     #[test]
     fn a_search_counts_its_moves(at in object(), errors in errors_px()) {
         let scene = street(40, 3.0, &[at], &errors);
-        for (depth, moves) in [(Depth::Shallow, 1), (Depth::Deep, 4)] {
+        for (depth, moves) in [(Depth::Shallow, 1), (Depth::Once, 2), (Depth::Deep, 4)] {
             let (mut model, progress) = (Model::new(&scene, &DRIFTING, &SETTINGS), Progress::default());
             search(&mut model, &scene.usable_rays(), Vec::new(), depth, true, &mut Tally::default(), &progress).unwrap();
             prop_assert!(progress.done() >= moves && progress.done().is_multiple_of(moves), "{}", progress.done());
         }
+    }
+
+    /// Pins births where not all moves pay: what the initial map missed is no object of few looks, which each of its rays would grow anew.
+    #[test]
+    fn what_is_left_over_is_born_where_not_all_moves_pay(at in object(), errors in errors_px()) {
+        let scene = street(40, 3.0, &[at], &errors);
+        let all = scene.usable_rays();
+        prop_assume!(all.len() >= 10);
+        let mut model = Model::new(&scene, &DRIFTING, &SETTINGS);
+        let found = search(&mut model, &all, Vec::new(), Depth::Once, false, &mut Tally::default(), &Progress::default());
+        let found = found.unwrap();
+        prop_assert_eq!(found.len(), 1);
+        prop_assert!(2 * found[0].votes.len() > all.len());
     }
 
     /// Pins exclusion: two boxes of one thing are votes of two objects otherwise.

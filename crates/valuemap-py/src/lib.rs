@@ -264,5 +264,7 @@ mod _core {
     #[pymodule_export]
     const SEARCH_STEPS: usize = valuemap_core::robust::search::SEARCH_STEPS;
     #[pymodule_export]
+    const STEPS_OF_ONCE: usize = valuemap_core::robust::search::STEPS_OF_ONCE;
+    #[pymodule_export]
     use super::{Rays, medians, merge_labels, partition_images, parts, see, unit_covariance, vote_in_clusters};
 }

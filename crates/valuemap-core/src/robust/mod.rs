@@ -239,9 +239,9 @@ fn changed(model: &mut Model<'_>, rays: &[u32], objects: &[Object], progress: &P
         |object: &Object| object.votes.iter().copied().filter(|ray| rays.binary_search(ray).is_ok()).collect();
     let begun = whole.iter().map(|object| (votes_here(object), object.fit.point));
     let begun = begun.filter(|(votes, _): &Placed| votes.len() >= model.settings.min_votes as usize).collect();
-    let shallow = search(model, &rays, begun, Depth::Shallow, false, &mut Tally::default(), progress)?;
-    let deeper = search(model, &rays, placed(&shallow), Depth::Deep, false, &mut Tally::default(), progress)?;
-    Ok(Change::of(&shallow, &deeper, model.settings.min_existence))
+    let once = search(model, &rays, begun, Depth::Once, false, &mut Tally::default(), progress)?;
+    let deeper = search(model, &rays, placed(&once), Depth::Deep, false, &mut Tally::default(), progress)?;
+    Ok(Change::of(&once, &deeper, model.settings.min_existence))
 }
 
 /// How many objects of two maps of the same rays are in both.
@@ -331,7 +331,7 @@ pub fn find(
     progress.advance()?;
     let mut tally =
         Tally { hypotheses: first.nominations, births: first.accepted, deaths: first.pruned + first.outvoted };
-    let depth = if calibration.is_deep { Depth::Deep } else { Depth::Shallow };
+    let depth = if calibration.is_deep { Depth::Deep } else { Depth::Once };
     let objects = search(&mut model, &rays, begun, depth, false, &mut tally, progress)?;
     let estimates = finish(&model, &objects);
     let variance_factor = if settings.has(Part::Scaling) {

@@ -1,8 +1,8 @@
 //! The search: from a map that is there to begin with, moves that are committed only if J falls.
 //!
 //! In each round all objects compete for all detections, pairs merge and exchange, neighborhoods are destroyed and repaired, and what
-//! is left over gives birth, also to objects that take votes from others; until nothing lowers J. A search that `learns` learns the classes of its
-//! model anew in each round.
+//! is left over gives birth, also to objects that take votes from others; until nothing lowers J. Where all that does not pay, objects compete and are
+//! born once. A search that `learns` learns the classes of its model anew in each round.
 
 use std::sync::Arc;
 
@@ -28,12 +28,16 @@ use crate::progress::{Halt, Progress};
 const ROUNDS: usize = 6;
 /// Steps of a search with all moves at most, as progress counts them: the four kinds of moves of each round.
 pub const SEARCH_STEPS: usize = 4 * ROUNDS;
+/// Steps of a search in which objects compete and are born once.
+pub const STEPS_OF_ONCE: usize = 2;
 
 /// How far the search goes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Depth {
     /// What is there competes, and dies if J falls.
     Shallow,
+    /// That, and then what is left over gives birth.
+    Once,
     /// All moves, until none lowers J.
     Deep,
 }
@@ -85,24 +89,22 @@ pub fn search(
             any |= better;
             progress.advance()?;
             objects = repaired;
+        }
+        if depth >= Depth::Once && has(Part::Births) {
             is_taken.fill(false);
             objects.iter().flat_map(|o| &o.votes).for_each(|&ray| is_taken[ray as usize] = true);
-            let (born, hypotheses) = if has(Part::Births) {
-                births(model, &lookout, rays, &mut is_taken, &[Who::All], progress)?
-            } else {
-                (Vec::new(), 0)
-            };
+            let (born, hypotheses) = births(model, &lookout, rays, &mut is_taken, &[Who::All], progress)?;
             tally.hypotheses += hypotheses;
             tally.births += born.len() as u64;
             any |= !born.is_empty();
             objects.extend(born);
-            // What is left of objects that lost votes to others, once nothing else helps: all rays that are left over are tried.
-            if has(Part::TakenVotes) && (!any || round + 1 == rounds) {
-                let (regrown, better) = regrow(model, &lookout, rays, objects, progress)?;
-                any |= better;
-                objects = regrown;
-            }
             progress.advance()?;
+        }
+        // What is left of objects that lost votes to others, once nothing else helps: all rays that are left over are tried.
+        if depth == Depth::Deep && has(Part::TakenVotes) && (!any || round + 1 == rounds) {
+            let (regrown, better) = regrow(model, &lookout, rays, objects, progress)?;
+            any |= better;
+            objects = regrown;
         }
         if !any {
             break;
