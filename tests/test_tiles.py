@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import threading
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -43,7 +45,7 @@ from valuemap.tiles.sample import is_sampled, sampled_squares
 from valuemap.tiles.seams import _Rows, join_cells
 from valuemap.tiles.solve import Solved, solve_cell
 from valuemap.tiles.source import InMemory
-from valuemap.tiles.store import hash_settings
+from valuemap.tiles.store import hash_settings, load_cells
 from valuemap.tiles.work import MARKER, open_work, remove_work, written
 
 GRID = Grid.of(Frame(), 60.0)
@@ -649,10 +651,10 @@ def test_what_was_made_with_other_settings_is_not_taken(long_street: Path, tmp_p
         source = InMemory(valuemap.read_dataset(long_street), KNOWN)
         known = learned(source.sample())
         noisy = replace(known, noise=Noise(detection_px=3.0))
-        first = solve_cells(source, known, KNOWN, ThreadEngine(1), silent, store=work / "cells")
-        again = solve_cells(source, known, KNOWN, ThreadEngine(2), (told := Told()), store=work / "cells")
+        _, first = solve_cells(source, known, KNOWN, ThreadEngine(1), silent, store=work / "cells")
+        _, again = solve_cells(source, known, KNOWN, ThreadEngine(2), (told := Told()), store=work / "cells")
         told.check("cells")
-        other = solve_cells(source, noisy, KNOWN, ThreadEngine(2), silent, store=work / "cells")
+        _, other = solve_cells(source, noisy, KNOWN, ThreadEngine(2), silent, store=work / "cells")
     assert first == again
     assert not set(map(str, first)) & set(map(str, other))
 
@@ -662,7 +664,7 @@ class Listed(ThreadEngine):
 
     def run(self, work: Any, tasks: Any, *, on_gpus: bool = False) -> Any:
         self.work, self.tasks = work, list(tasks)
-        return super().run(work, tasks, on_gpus=on_gpus)
+        return super().run(work, self.tasks, on_gpus=on_gpus)
 
 
 def test_cells_with_most_detections_are_solved_first(long_street: Path, tmp_path: Path) -> None:
@@ -683,14 +685,58 @@ def test_cells_that_are_known_leave_all_threads_to_the_others(long_street: Path,
     with open_work(tmp_path / "work", resume=False) as work:
         source = InMemory(valuemap.read_dataset(long_street), KNOWN)
         known, engine = learned(source.sample()), Listed(2)
-        first = solve_cells(source, known, KNOWN, engine, silent, store=work / "cells")
+        labels, first = solve_cells(source, known, KNOWN, engine, silent, store=work / "cells")
         assert len(engine.tasks) > 2
         assert engine.work.threads == 1
         assert isinstance(first[1], Path)
         first[1].unlink()
-        assert solve_cells(source, known, KNOWN, engine, silent, store=work / "cells") == first
+        again, files = solve_cells(source, known, KNOWN, engine, silent, store=work / "cells")
+        assert files == first
+        assert [of.cell for of in again] == [of.cell for of in labels] == source.cells
     assert engine.tasks == source.cells[1:2]
     assert engine.work.threads == 2
+
+
+def test_what_is_known_is_read_while_the_others_are_solved(
+    long_street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    is_read = threading.Event()
+
+    def solve(*given: Any, **named: Any) -> Solved:
+        assert is_read.wait(60.0)
+        return solve_cell(*given, **named)
+
+    def load(files: Any) -> list[Solved]:
+        is_read.set()
+        return load_cells(files)
+
+    with open_work(tmp_path / "work", resume=False) as work:
+        source = InMemory(valuemap.read_dataset(long_street), KNOWN)
+        known, engine = learned(source.sample()), ThreadEngine(2)
+        labels, files = solve_cells(source, known, KNOWN, engine, silent, store=work / "cells")
+        for file in files[1:3]:
+            assert isinstance(file, Path)
+            file.unlink()
+        monkeypatch.setattr("valuemap.tiles.mapping.solve_cell", solve)
+        monkeypatch.setattr("valuemap.tiles.mapping.load_cells", load)
+        again, same = solve_cells(source, known, KNOWN, engine, silent, store=work / "cells")
+    assert same == files
+    assert [each.votes.detection_id.tolist() for each in again] == [each.votes.detection_id.tolist() for each in labels]
+
+
+def test_threads_do_not_wait_until_all_tasks_are_known() -> None:
+    is_found = threading.Event()
+
+    def tasks() -> Iterator[int]:
+        yield from (0, 1)
+        is_found.set()
+        yield 2
+
+    def work(task: int, _progress: object) -> int:
+        assert is_found.wait(60.0)
+        return 10 * task
+
+    assert dict(ThreadEngine(2).run(work, tasks())) == {0: 0, 1: 10, 2: 20}
 
 
 @pytest.mark.parametrize("where", [".", "cells"])

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +27,7 @@ from valuemap.drives import find_drives
 from valuemap.errors import InputError, OutputError
 from valuemap.evidence import Evidence
 from valuemap.map_folder import Map
+from valuemap.progress import Stopped
 from valuemap.refine import Refined
 from valuemap.rejected import find_rejected
 from valuemap.tables import (
@@ -471,31 +473,88 @@ def test_a_dataset_that_cannot_be_written_is_told_and_no_map_is_left(
     assert not (tmp_path / "map2").exists()
 
 
-@pytest.mark.parametrize("tile_size", [[], ["--tile-size", "500"]])
-def test_a_dataset_is_on_disk_before_it_is_cut(
-    tile_size: list[str], years: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    goes_on = threading.Event()
+FILES = ("labels.parquet", "votes.parquet", "changes.parquet", "dataset/detections.parquet")
+
+
+def test_a_dataset_is_on_disk_before_it_is_cut(years: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[bool] = []
     build = pipeline.build_map_of_folder
-
-    def write(pieces: Sequence[Dataset], path: Path) -> None:
-        if path.name == map_folder.DATASET and not tile_size:
-            assert goes_on.wait(60.0)  # What is in memory needs no folder.
-        write_dataset_in_pieces(pieces, path)
 
     def built(folder: Path, *given: Any, **named: Any) -> Any:
         if folder.name == map_folder.DATASET:
             seen.append(folder.exists())
-            goes_on.set()
         return build(folder, *given, **named)
 
-    monkeypatch.setattr(update, "write_dataset_in_pieces", write)
     monkeypatch.setattr(update, "build_map_of_folder", built)
-    run("update", years / "map", "--add", years / "second", "--out", tmp_path / "map2", *tile_size)
-    assert seen == [bool(tile_size)]
-    for name in ("labels.parquet", "votes.parquet", "changes.parquet", "dataset/detections.parquet"):
+    run("update", years / "map", "--add", years / "second", "--out", tmp_path / "map2", "--tile-size", "500")
+    assert seen == [True]
+    for name in FILES:
         assert (tmp_path / "map2" / name).read_bytes() == (years / "map2" / name).read_bytes(), name
+
+
+def test_what_takes_one_core_is_done_beside_other_work(
+    years: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    is_mapped_alone, is_written, is_compared = (threading.Event() for _ in range(3))
+    build = pipeline.build_map_of_folder
+
+    def built(folder: Path, config: valuemap.MapConfig, run: pipeline.Run, **named: Any) -> Any:
+        result = build(folder, config, run, **named)
+        if folder.name == map_folder.DATASET:
+            assert is_mapped_alone.wait(60.0)
+        else:
+            is_mapped_alone.set()
+        return result
+
+    def write(pieces: Sequence[Dataset], path: Path) -> None:
+        if path.name == map_folder.DATASET:
+            is_written.set()
+            assert is_compared.wait(60.0)
+        write_dataset_in_pieces(pieces, path)
+
+    def compared(*given: Any, **named: Any) -> Any:
+        is_compared.set()
+        assert is_written.wait(60.0)
+        return compare(*given, **named)
+
+    monkeypatch.setattr(update, "build_map_of_folder", built)
+    monkeypatch.setattr(update, "write_dataset_in_pieces", write)
+    monkeypatch.setattr(update, "compare", compared)
+    run("update", years / "map", "--add", years / "second", "--out", tmp_path / "map2")
+    for name in FILES:
+        assert (tmp_path / "map2" / name).read_bytes() == (years / "map2" / name).read_bytes(), name
+
+
+def test_an_update_that_ends_ends_what_is_done_beside_it(
+    years: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    build = pipeline.build_map_of_folder
+    is_begun, ended = threading.Event(), list[str]()
+
+    def built(folder: Path, config: valuemap.MapConfig, run: pipeline.Run, *, progress: Any, **named: Any) -> Any:
+        if folder.name == map_folder.DATASET:
+
+            def fail(what: str, _done: int, _total: int) -> None:
+                if what == "cells":
+                    assert is_begun.wait(60.0)
+                    raise InputError("ended", hint="begin again")
+
+            return build(folder, config, run, progress=fail, **named)
+        is_begun.set()
+        try:
+            for _ in range(6000):
+                progress("beside", 0, 1)
+                time.sleep(0.01)
+        except Stopped as stopped:
+            ended.append(type(stopped).__name__)
+            raise
+
+    monkeypatch.setattr(update, "build_map_of_folder", built)
+    given = [years / "map", "--add", years / "second", "--out", tmp_path / "map2"]
+    result = CliRunner().invoke(app, ["update", *map(str, given)])
+    assert result.exit_code == 1
+    assert "ended" in result.stderr
+    assert ended == ["Stopped"]
 
 
 def test_cells_that_nobody_drove_through_are_not_solved_again(years: Path) -> None:

@@ -42,10 +42,9 @@ from valuemap.system import peak_memory_mb
 from valuemap.tables import Labels, Votes, covariance_columns
 from valuemap.tiles.calibration import calibrate
 from valuemap.tiles.compare import compare_poses
-from valuemap.tiles.mapping import loaded, solve_cells
+from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.seams import join_cells
-from valuemap.tiles.solve import Solved
 from valuemap.tiles.source import InMemory, Source
 from valuemap.tiles.work import CELLS
 from valuemap.vote import vote_in_clusters
@@ -148,7 +147,13 @@ class Run:
 
 
 def build_map_of_folder(
-    folder: Path, config: MapConfig, run: Run, *, held: Dataset | None = None, progress: Progress = silent
+    folder: Path,
+    config: MapConfig,
+    run: Run,
+    *,
+    held: Dataset | None = None,
+    posed: Callable[[Dataset], None] | None = None,
+    progress: Progress = silent,
 ) -> tuple[Map, list[Place]]:
     """Find the objects that a dataset folder shows, which may be larger than memory.
 
@@ -163,6 +168,9 @@ def build_map_of_folder(
     held
         What is in the folder, where it is in memory already: it is not read again, and the folder needs to be there
         only where `run.cuts_on_disk`.
+    posed
+        Called with the dataset that labels are found in, which has the poses that they are found with, before they are;
+        not where it is cut on disk.
     progress
         Called as progress(what, done, total).
 
@@ -189,6 +197,8 @@ def build_map_of_folder(
             return build_map(dataset, config, threads=threads, progress=progress), []
         _check_detections(dataset.name, len(dataset.detections))
         refined = _refined(dataset, config, stages, threads, progress)
+        if posed is not None:
+            posed(refined.dataset)
         with stages.measured("order"):
             source: Source = InMemory(refined.dataset, config)
         size = {"images": len(dataset.images), "detections": len(dataset.detections)}
@@ -319,7 +329,7 @@ def _map_alone(dataset: Dataset, config: MapConfig, engine: Engine, progress: Pr
     """Return labels and votes of a dataset in memory and the noise that they were found with, and keep nothing."""
     source = InMemory(dataset, config)
     calibration = calibrate(source, config, None, None, engine, progress)
-    cells = loaded(solve_cells(source, calibration, config, engine, progress))
+    cells, _ = solve_cells(source, calibration, config, engine, progress)
     labels, votes, _ = join_cells(cells, source.grid, config)
     return labels, votes, calibration.noise
 
@@ -404,12 +414,12 @@ def _robust(
     with stages.measured("find"):
         store = run.parts / CELLS if run is not None and len(source.cells) > 1 else None
         known = None if run is None else run.known
-        solved = solve_cells(source, calibration, config, engine, progress, store=store, known=known)
+        solved, files = solve_cells(source, calibration, config, engine, progress, store=store, known=known)
     with stages.measured("join"):
-        labels, votes, counts = join_cells(loaded(solved), source.grid, config)
+        labels, votes, counts = join_cells(solved, source.grid, config)
     estimated = calibration_to_json(calibration)
     counts = {**counts, "drives": source.drives_record, "noise": estimated["noise"], "calibration": estimated}
-    return labels, votes, counts, [result for result in solved if not isinstance(result, Solved)]
+    return labels, votes, counts, files
 
 
 def _without_ray(rays: Rays) -> dict[str, int]:

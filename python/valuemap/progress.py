@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from threading import Event
 
 Progress = Callable[[str, int, int], None]
 """Called as `progress(what, done, total)`, from the calling thread, whenever something got done.
@@ -14,6 +15,20 @@ Each kind of work begins with 0 of a total, which stays, and ends with all of it
 
 def silent(what: str, done: int, total: int) -> None:
     """Report nothing; the default of every stage."""
+
+
+class Stopped(Exception):
+    """Work beside other work was told to end."""
+
+
+def until(is_over: Event) -> Progress:
+    """Return what reports nothing, for work in another thread, and raises `Stopped` once that is over."""
+
+    def go_on(_what: str, _done: int, _total: int) -> None:
+        if is_over.is_set():
+            raise Stopped
+
+    return go_on
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import Protocol, TypeVar
 
 from valuemap.progress import Progress
@@ -24,8 +24,10 @@ class Engine(Protocol):
         """Return how many threads each of so many tasks may work on."""
         ...
 
-    def run(self, work: Work[T, R], tasks: Sequence[T], *, on_gpus: bool = False) -> Iterator[tuple[int, R]]:
+    def run(self, work: Work[T, R], tasks: Iterable[T], *, on_gpus: bool = False) -> Iterator[tuple[int, R]]:
         """Yield the number of a task and what the work makes of it, as they get done, in any order.
+
+        What tasks there are may be found out while the first of them are done.
 
         With `on_gpus` a task in another process has a GPU to itself, and the process stays for the next one.
         An exception of a task ends the others, and is raised. A task may be done again where a machine is lost, so it

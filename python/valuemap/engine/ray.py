@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -87,11 +87,11 @@ class RayEngine:
             return max(TASK_CPUS, self._gpus()[1])
         return TASK_CPUS if tasks > 1 else 0  # What is done alone is done here.
 
-    def run(self, work: Work[T, R], tasks: Sequence[T], *, on_gpus: bool = False) -> Iterator[tuple[int, R]]:
+    def run(self, work: Work[T, R], tasks: Iterable[T], *, on_gpus: bool = False) -> Iterator[tuple[int, R]]:
         """Yield the number of a task and what the work makes of it, as they get done."""
-        return self._run_on_gpus(work, tasks) if on_gpus else self._run_on_cores(work, tasks)
+        return self._run_on_gpus(work, list(tasks)) if on_gpus else self._run_on_cores(work, tasks)
 
-    def _run_on_cores(self, work: Work[T, R], tasks: Sequence[T]) -> Iterator[tuple[int, R]]:
+    def _run_on_cores(self, work: Work[T, R], tasks: Iterable[T]) -> Iterator[tuple[int, R]]:
         ray = self._ray
         remote = ray.remote(num_cpus=TASK_CPUS, max_retries=RETRIES, runtime_env={"env_vars": _ONE_THREAD})(_done)
         work_in_store = ray.put(work)

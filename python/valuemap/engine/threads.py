@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from itertools import chain, islice
 from threading import Event
 from typing import TypeVar
 
 from valuemap.config import bounded_threads
 from valuemap.engine.engine import Work
-from valuemap.progress import silent
+from valuemap.progress import silent, until
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-
-class _Stopped(Exception):
-    """Another task failed, or a signal came."""
 
 
 class ThreadEngine:
@@ -32,23 +29,22 @@ class ThreadEngine:
         """Return how many threads each of so many tasks may work on."""
         return max(1, self.threads // max(tasks, 1))
 
-    def run(self, work: Work[T, R], tasks: Sequence[T], *, on_gpus: bool = False) -> Iterator[tuple[int, R]]:  # noqa: ARG002
+    def run(self, work: Work[T, R], tasks: Iterable[T], *, on_gpus: bool = False) -> Iterator[tuple[int, R]]:  # noqa: ARG002
         """Yield the number of a task and what the work makes of it, as they get done; all see all GPUs."""
-        if len(tasks) <= 1 or self.threads == 1:  # Here, where signals are heard.
-            yield from ((number, work(task, silent)) for number, task in enumerate(tasks))
+        tasks = iter(tasks)
+        first = list(islice(tasks, 2))
+        todo = enumerate(chain(first, tasks))
+        if len(first) <= 1 or self.threads == 1:  # Here, where signals are heard.
+            yield from ((number, work(task, silent)) for number, task in todo)
             return
         is_over = Event()
-
-        def go_on(_what: str, _done: int, _total: int) -> None:
-            if is_over.is_set():
-                raise _Stopped
-
-        todo = iter(enumerate(tasks))
+        go_on = until(is_over)  # No further once another task failed, or a signal came.
         running: dict[Future[R], int] = {}
         with ThreadPoolExecutor(self.threads) as pool:
             try:
                 while True:
-                    while len(running) < self.threads and (task := next(todo, None)) is not None:
+                    # One waits, so that no thread does while the next one is found.
+                    while len(running) <= self.threads and (task := next(todo, None)) is not None:
                         running[pool.submit(work, task[1], go_on)] = task[0]
                     if not running:
                         return
@@ -57,3 +53,5 @@ class ThreadEngine:
                         yield running.pop(future), future.result()
             finally:
                 is_over.set()
+                for future in running:
+                    future.cancel()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -73,13 +75,13 @@ def solve_cells(
     *,
     store: Place | None = None,
     known: Path | None = None,
-) -> list[Solved | Place]:
-    """Return the labels of all cells, ascending, that have images in or around them, or where they are.
+) -> tuple[list[Solved], list[Place]]:
+    """Return the labels of all cells, ascending, that have images in or around them, and the files they are in.
 
     Parameters
     ----------
     store
-        Where the labels of each cell are kept; what is there is not made again.
+        Where the labels of each cell are kept; what is there is not made again. There are no files without it.
     known
         Where those of an older map are, which are not made again either.
     """
@@ -87,21 +89,43 @@ def solve_cells(
     settings = hash_settings(source.grid, calibration, config)
     task = CellTask(source, calibration, config, settings, engine.threads_of_task(len(cells)), store, known)
     if len(cells) == 1:  # It tells how far it is.
-        result = task(cells[0], progress)
-        return [] if result is None else [result]
+        return _loaded({cells[0]: task(cells[0], progress)}, {})
+    results: dict[Cell, Solved | Place | None] = {}
+    read: dict[Cell, Solved] = {}
     with counted(progress, "cells", len(cells)) as tell:
-        solved: list[Solved | Place | None] = [task.done(cell) for cell in cells]
-        largest_first = np.argsort(-np.array(source.sizes), kind="stable").tolist()  # So that all cores end together.
-        todo = [row for row in largest_first if solved[row] is None]
-        task = replace(task, threads=engine.threads_of_task(len(todo)))
-        tell(len(cells) - len(todo))
-        for left, (place, result) in enumerate(engine.run(task, [cells[row] for row in todo]), start=1):
-            solved[todo[place]] = result
-            tell(len(cells) - len(todo) + left)
-    return [result for result in solved if result is not None]
+        unsolved = _unsolved(source, task, results)
+        first = list(islice(unsolved, max(2, engine.threads_of_task(1))))  # No more of them share out the threads.
+        todo = list(first)
+
+        def others() -> Iterator[Cell]:
+            """Look for the others, and read what is done, while the first are solved."""
+            todo.extend(unsolved)
+            done = {cell: file for cell in set(cells).difference(todo) if isinstance(file := results[cell], Place)}
+            read.update(zip(done, load_cells(list(done.values())), strict=True))
+            yield from todo[len(first) :]
+
+        task = replace(task, threads=engine.threads_of_task(len(first)))
+        for number, result in engine.run(task, chain(first, others())):
+            results[todo[number]] = result
+            tell(len(results))
+    return _loaded({cell: results[cell] for cell in cells}, read)
 
 
-def loaded(solved: list[Solved | Place]) -> list[Solved]:
-    """Return the labels of cells, read where they are in files."""
-    read = iter(load_cells([result for result in solved if not isinstance(result, Solved)]))
-    return [result if isinstance(result, Solved) else next(read) for result in solved]
+def _unsolved(source: Source, task: CellTask, results: dict[Cell, Solved | Place | None]) -> Iterator[Cell]:
+    """Yield the cells that are not done, the largest first, so that all cores end together; enter where others are."""
+    for row in np.argsort(-np.array(source.sizes), kind="stable").tolist():
+        cell = source.cells[row]
+        place = task.done(cell)
+        if place is None:
+            yield cell
+        else:
+            results[cell] = place
+
+
+def _loaded(results: dict[Cell, Solved | Place | None], read: dict[Cell, Solved]) -> tuple[list[Solved], list[Place]]:
+    """Return the labels of cells, read where they are in files and not read yet, and the files."""
+    places = {cell: file for cell, file in results.items() if file is not None and not isinstance(file, Solved)}
+    unread = [cell for cell in places if cell not in read]
+    read = {**read, **dict(zip(unread, load_cells([places[cell] for cell in unread]), strict=True))}
+    solved = (read.get(cell, result) for cell, result in results.items() if result is not None)
+    return [each for each in solved if isinstance(each, Solved)], list(places.values())

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from valuemap.map_folder import BRIDGE, CELLS, CHANGES, DATASET, Map, read_map, 
 from valuemap.nearby import Nearby
 from valuemap.pipeline import LARGEST_IN_MEMORY, Run, build_map_of_folder
 from valuemap.portions import largest_detection, read_dataset_in_portions, rows_on_disk
-from valuemap.progress import Progress, counted, silent
+from valuemap.progress import Progress, counted, silent, until
 from valuemap.rejected import rejected_of_map
 from valuemap.remote import Place
 from valuemap.tables import (
@@ -104,15 +105,17 @@ def update_map(
             raise InputError(f"{added}: there are no detections in it", hint="find some with valuemap detect")
         both = None if _is_large(place, added) else _joined(place, second)
         before = reading.result()
-    if both is None:
-        updated = _updated_in_portions(place, second, before, run, progress)
-    else:
-        updated = _updated_in_memory(*both, before, run, progress)
-    rebuilt, cells, alone, posed, images_before = updated
-    del second, both, updated
-    before = _in_frame_of(rebuilt, before)
-    result, changes, bridge = compare(before, rebuilt, alone, posed, images_before, progress=progress)
-    result = replace(result, rejected=rejected_of_map(result, lambda: _with_detections(posed, run)))
+        if both is None:
+            rebuilt, cells, alone, posed, images_before = _updated_in_portions(place, second, before, run, progress)
+        else:
+            rebuilt, cells, alone, posed, images_before = _updated_in_memory(*both, before, run, beside, progress)
+        # Both take one core.
+        written = None if both is None or _cuts_on_disk(both[0], run) else beside.submit(_write, both[0], run)
+        before = _in_frame_of(rebuilt, before)
+        result, changes, bridge = compare(before, rebuilt, alone, posed, images_before, progress=progress)
+        result = replace(result, rejected=rejected_of_map(result, lambda: _with_detections(posed, run)))
+        if written is not None:
+            written.result()
     for name, table in ((CHANGES, changes), (BRIDGE, bridge)):
         write_table(table, run.work / name)
     files = {f"{DATASET}/{name}": run.work / DATASET / name for name in _DATASET_FILES}
@@ -139,20 +142,48 @@ def _joined(place: Path, second: Dataset) -> tuple[Dataset, Ints]:
     return ensure_checked(join_datasets(first, second)), first.images.image_id
 
 
-def _updated_in_memory(joined: Dataset, images_before: Ints, before: Map, run: Run, progress: Progress) -> _Updated:
-    """Return what is compared, of datasets that fit into memory."""
-    with ThreadPoolExecutor(1) as beside:
-        written = beside.submit(write_dataset_in_pieces, [joined], run.work / DATASET)
-        if run.cuts_on_disk(len(joined.images) + len(joined.detections)):
-            written.result()
-        rebuilt, cells = build_map_of_folder(run.work / DATASET, _settings(before), run, held=joined, progress=progress)
-        written.result()
-    # The poses that the labels were found with, where those of whole drives were corrected.
-    posed = rebuilt.corrected or joined
+def _cuts_on_disk(joined: Dataset, run: Run) -> bool:
+    return run.cuts_on_disk(len(joined.images) + len(joined.detections))
+
+
+def _write(joined: Dataset, run: Run) -> None:
+    write_dataset_in_pieces([joined], run.work / DATASET)
+
+
+def _updated_in_memory(
+    joined: Dataset, images_before: Ints, before: Map, run: Run, beside: ThreadPoolExecutor, progress: Progress
+) -> _Updated:
+    """Return what is compared, of datasets that fit into memory; what is cut on disk is written.
+
+    The added passes are mapped while most of the others' cells are found to be known.
+    """
+    if _cuts_on_disk(joined, run):
+        _write(joined, run)
+    alone: Future[Map] | None = None
+    is_over = Event()
+
+    def map_alone(posed: Dataset) -> None:
+        nonlocal alone
+        alone = beside.submit(_map_of_added, posed, images_before, before, run, until(is_over))
+
+    try:
+        rebuilt, cells = build_map_of_folder(
+            run.work / DATASET, _settings(before), run, held=joined, posed=map_alone, progress=progress
+        )
+        # The poses that the labels were found with, where those of whole drives were corrected.
+        posed = rebuilt.corrected or joined
+        of_added = alone.result() if alone else _map_of_added(posed, images_before, before, run, progress)
+    finally:
+        is_over.set()
+    return rebuilt, cells, of_added, posed, images_before
+
+
+def _map_of_added(posed: Dataset, images_before: Ints, before: Map, run: Run, progress: Progress) -> Map:
+    """Return the map of the images of a dataset that the map before did not have."""
     is_new = ~np.isin(posed.images.image_id, images_before)
     of_new = is_new[rows_of(posed.detections.image_id, posed.images.image_id)]
     added = replace(posed, images=posed.images.take(is_new), detections=posed.detections.take(of_new))
-    return rebuilt, cells, _map_alone(added, before, run, progress), posed, images_before
+    return _map_alone(added, before, run, progress)
 
 
 def _updated_in_portions(place: Path, second: Dataset, before: Map, run: Run, progress: Progress) -> _Updated:
