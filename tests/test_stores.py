@@ -254,7 +254,7 @@ class Pickling(Elsewhere):
     """An engine in other processes: what goes to them is pickled."""
 
     def run(self, work: Any, tasks: Any, *, on_gpus: bool = False) -> Any:
-        sent = pickle.dumps((work, tasks))
+        sent = pickle.dumps((work, list(tasks)))
         assert len(sent) < 20_000
         return super().run(*pickle.loads(sent), on_gpus=on_gpus)
 

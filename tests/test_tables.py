@@ -307,6 +307,17 @@ def test_params_must_be_lists_of_numbers() -> None:
             table_from_arrow(Cameras, with_column("params", wrong)(cameras), source="s")
 
 
+def test_ids_and_numbers_are_encoded_by_what_they_have_in_common(tmp_path: Path) -> None:
+    write_table(small_dataset().detections, tmp_path / "detections.parquet")
+    group = pq.ParquetFile(tmp_path / "detections.parquet").metadata.row_group(0)
+    columns = [group.column(number) for number in range(group.num_columns)]
+    encodings = {column.path_in_schema: column.encodings for column in columns}
+    assert "DELTA_BINARY_PACKED" in encodings["detection_id"]
+    assert "BYTE_STREAM_SPLIT" in encodings["x"]
+    assert any("DICTIONARY" in each for each in encodings["class"])
+    assert {column.compression for column in columns} == {"SNAPPY"}
+
+
 @pytest.mark.parametrize("kept", [0, 3, 200, -1])
 def test_a_truncated_file_is_refused(kept: int, tmp_path: Path) -> None:
     path = tmp_path / "detections.parquet"
