@@ -125,7 +125,7 @@ def taken(*command: str) -> tuple[dict[str, float], str]:
         used.seek(0)
         if done.returncode not in (0, FOUND_WRONG):
             raise SystemExit(f"{' '.join(command)}: ended with {done.returncode}")
-        return {"seconds": round(seconds, 1), **json.load(used)}, told.read().decode()
+        return {"seconds": round(seconds, 2), **json.load(used)}, told.read().decode()
 
 
 COMMAND = ("-m", "valuemap.cli")
