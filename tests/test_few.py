@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,10 +17,12 @@ from valuemap.tables import Bools, Floats, covariance_matrices
 NEAR_SIGMAS = 4.0
 
 
-def some_pictures(seed: int, one_in: int) -> tuple[Dataset, Floats]:
-    """Return one picture in so many of a city, and where its lights are."""
+def some_pictures(
+    seed: int, one_in: int, change: Callable[[Dataset], Dataset] = lambda whole: whole
+) -> tuple[Dataset, Floats]:
+    """Return one picture in so many of a city, which is changed before, and where its lights are."""
     settings = {"streets_north_south": 4, "streets_east_west": 4, "lights": 80, "lookalikes_per_light": 0.0}
-    whole = simulate(block(**settings), seed=seed, name="sparse")
+    whole = change(simulate(block(**settings), seed=seed, name="sparse"))
     assert whole.truth is not None
     rows = np.flatnonzero(np.random.default_rng(1).random(len(whole.images)) < 1 / one_in)
     images = whole.images.take(rows)

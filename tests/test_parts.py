@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -14,7 +14,8 @@ import valuemap
 from block import block
 from test_few import some_pictures
 from valuemap import robust
-from valuemap.dataset import Dataset
+from valuemap.cameras import camera_centers
+from valuemap.dataset import Dataset, rows_of
 from valuemap.simulate import simulate
 from valuemap.tables import Floats, covariance_matrices
 
@@ -35,6 +36,8 @@ BLOCKS: dict[str, dict[str, float]] = {
 }
 """Changes of the block's settings; scenes of few pictures are those of `test_few.py`."""
 FEW_PICTURES = "few pictures"
+RANGES = "few pictures with ranges"
+RANGE_SHARE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +72,29 @@ def scene(name: str, seed: int) -> tuple[Dataset, Floats]:
     """Return a scene, and where its objects are."""
     if name == FEW_PICTURES:
         return some_pictures(seed, one_in=15)
+    if name == RANGES:
+        return some_pictures(seed, one_in=15, change=lambda whole: with_ranges(whole, seed))
     dataset = simulate(block(**BLOCKS[name]), seed=seed, name="block")
     assert dataset.truth is not None
     return dataset, dataset.truth.position_in_world_m
+
+
+def with_ranges(dataset: Dataset, seed: int) -> Dataset:
+    """Return a dataset whose detections have ranges: a tenth off, those of clutter anywhere."""
+    rng, detections, truth, shown = (
+        np.random.default_rng(seed),
+        dataset.detections,
+        dataset.truth,
+        dataset.truth_detections,
+    )
+    assert truth is not None
+    assert shown is not None
+    range_m = rng.uniform(5.0, 60.0, len(detections))
+    row = rows_of(shown.detection_id, detections.detection_id)
+    center_m = camera_centers(dataset.images)[rows_of(detections.image_id[row], dataset.images.image_id)]
+    away_m = truth.position_in_world_m[rows_of(shown.object_id, truth.object_id)] - center_m
+    range_m[row] = np.linalg.norm(away_m, axis=1) * rng.lognormal(0.0, RANGE_SHARE, len(row))
+    return replace(dataset, detections=detections.replace(range_m=range_m, range_sigma_m=RANGE_SHARE * range_m))
 
 
 def score(name: str, seed: int, without: str | None = None) -> Score:
@@ -140,6 +163,7 @@ CASES: dict[str, tuple[str, int, Fails]] = {
     "taken_votes": (FEW_PICTURES, 5, j_is_higher),
     "exclusion": (FEW_PICTURES, 11, more_is_wrong),
     "sizes": (FEW_PICTURES, 5, more_is_wrong),
+    "ranges": (RANGES, 5, more_is_wrong),
     "heights": (FEW_PICTURES, 5, fewer_are_honest),
     "scores": ("poor detector", 5, more_is_wrong),
     "elevations": (FEW_PICTURES, 10, fewer_are_honest),

@@ -176,12 +176,17 @@ impl Terms {
         self.chi2.extend(&visit.chi2);
     }
 
-    /// Add what is known of sizes and heights.
+    /// Add what is known of sizes, ranges and heights.
     pub(super) fn add_priors(&mut self, model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) {
         if let Some(sizes) = size_terms(model, votes, point) {
             self.information += sizes.information;
             self.gradient += sizes.gradient;
             self.of_priors += sizes.square;
+        }
+        for terms in votes.iter().filter_map(|&ray| model.range_terms(ray, point)) {
+            self.information += terms.information;
+            self.gradient += terms.gradient;
+            self.of_priors += terms.square;
         }
         if let Some((up, terms)) = height_terms(model, votes, point, camera_m2(model, votes)) {
             self.information += up * up.transpose() * terms.information;
@@ -382,6 +387,7 @@ pub fn energy_of_votes(model: &Model<'_>, of_class: u32, votes: &[u32], fit: &Fi
         .map(|&ray| {
             let depth_m = model.scene.ray(ray).project(&fit.point).z;
             class.sizes.log_ratio(model.ln_angle[ray as usize], depth_m, ln_size)
+                + model.ln_range_ratio(ray, depth_m)
                 + model.ln_score_ratio(ray)
                 + model.confusions.ln_share(of_class, model.scene.rays.class[ray as usize])
         })

@@ -12,6 +12,7 @@ use super::drift::{Drive, Look, Normals, Vantage};
 use super::energy::height_terms;
 use super::model::Model;
 use super::noise::Noise;
+use super::ranges::range_terms;
 use super::scene::{Scene, View};
 use super::sizes::size_terms;
 use super::spd::Vector6;
@@ -291,9 +292,9 @@ impl<'a> Joint<'a> {
             alone.into_iter().map(|alone| Some(alone.cholesky()?.inverse())).collect::<Option<_>>()?;
         let own = votes().map(|(look, weight, left)| look.studentised(left, &alone[look.label], weight)).collect();
         for (&(label, _), vantage) in self.votes.iter().zip(&self.vantages) {
-            if let Some((information, gradient)) = range_terms(vantage, &self.points[label]) {
-                normals.add(label, label, &information);
-                normals.add_gradient(label, &gradient);
+            if let Some(terms) = range_terms(vantage.range_m, vantage.center(), &self.points[label]) {
+                normals.add(label, label, &terms.information);
+                normals.add_gradient(label, &terms.gradient);
             }
         }
         self.add_sizes(&of_labels, &mut normals);
@@ -515,18 +516,6 @@ pub fn estimate(scene: &Scene, noise: &Noise, voters: &[u32], start: Vector3<f64
         .solve()?
         .estimates
         .pop()
-}
-
-/// Information and gradient of a measured range: one more observation of its voter, along the viewing direction.
-fn range_terms(vantage: &Vantage, point: &Vector3<f64>) -> Option<(Matrix3<f64>, Vector3<f64>)> {
-    let [range, sigma] = vantage.range_m;
-    (range.is_finite() && sigma.is_finite()).then(|| {
-        let away = point - vantage.center();
-        let direction = away.normalize();
-        let residual = (away.norm() - range) / sigma;
-        let weight = (HUBER_SIGMAS / residual.abs()).min(1.0) / sigma;
-        (direction * direction.transpose() * (weight / sigma), direction * (weight * residual))
-    })
 }
 
 /// Whether two views, successive among those of something, are of one visit: of a pass that has not forgotten its drift.

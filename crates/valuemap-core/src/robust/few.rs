@@ -36,7 +36,8 @@ pub fn objects_of_few(
 ) -> Result<Vec<Object>, Halt> {
     let mut is_taken = vec![false; model.scene.rays.rays.len()];
     objects.iter().flat_map(|object| &object.votes).for_each(|&ray| is_taken[ray as usize] = true);
-    let is_free = |ray: &u32| !is_taken[*ray as usize] && model.class_of(*ray).heights.is_some();
+    let tells = |ray: u32| model.class_of(ray).heights.is_some() || model.has_range(ray);
+    let is_free = |ray: &u32| !is_taken[*ray as usize] && tells(*ray);
     let free: Vec<u32> = rays.iter().copied().filter(is_free).collect();
     let index = RayIndex::new(model.scene, &model.spreads, model.settings.gate_sigmas, free.iter().copied());
     let beside = Beside::new(model, objects);
@@ -163,18 +164,24 @@ impl Nursery<'_> {
     }
 }
 
-/// Where an object of a class most probably is on a ray: as high and as large as others.
+/// Where an object of a class most probably is on a ray: as high and as large as others, and as far away as measured; nothing where neither heights nor
+/// ranges tell.
 pub(super) fn most_probable(model: &Model<'_>, ray: u32, class: &ClassModel) -> Option<Vector3<f64>> {
-    let (heights, up) = (class.heights.as_ref()?, model.up?);
+    let heights = class.heights.as_ref().zip(model.up);
+    if heights.is_none() && !model.has_range(ray) {
+        return None;
+    }
     let cast = model.scene.ray(ray);
-    let climb = cast.direction.dot(&up);
+    let of_one_m = cast.project(&(cast.center + cast.direction)).z;
     let ln_angle = model.ln_angle[ray as usize];
     let (mean, sd) = class.sizes.object;
     let sd = sd.hypot(class.sizes.spread);
     let ln_density = |distance_m: f64| {
         let away = (ln_angle + distance_m.ln() - mean) / sd;
         let of_size = if class.sizes.tell() && away.is_finite() { -0.5 * away * away } else { 0.0 };
-        heights.ln_density(climb * distance_m) + 2.0 * distance_m.ln() + of_size
+        let of_height = heights.map_or(0.0, |(heights, up)| heights.ln_density(cast.direction.dot(&up) * distance_m));
+        let of_range = model.ln_range_ratio(ray, distance_m * of_one_m);
+        of_height + 2.0 * distance_m.ln() + of_size + of_range
     };
     let nearest_m = model.settings.viability.min_range_m.max(class.farthest_m * 1e-3);
     let steps = ((class.farthest_m / nearest_m).log10() * PLACES_PER_DECADE).ceil().max(1.0);

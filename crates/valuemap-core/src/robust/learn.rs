@@ -355,7 +355,7 @@ mod tests {
 
     /// What is thought of a class at first.
     fn guess() -> ClassModel {
-        ClassModel::guess(&Scene::default(), &SETTINGS, 0, (f64::NAN, f64::NAN))
+        ClassModel::guess(&Scene::default(), &SETTINGS, 0, (f64::NAN, f64::NAN), (f64::NAN, f64::NAN))
     }
 
     #[test]

@@ -36,6 +36,7 @@ pub mod parts;
 pub mod poses;
 pub mod propose;
 pub mod quick;
+pub mod ranges;
 pub mod reach;
 pub mod rearrange;
 pub mod regrow;

@@ -14,6 +14,7 @@ use super::counts::FEW;
 use super::heights::{Heights, up_of};
 use super::noise::{Noise, Spread};
 use super::parts::Part;
+use super::ranges::{Measured, RangeTerms, measured, range_terms};
 use super::scene::Scene;
 use super::{Settings, spreads_of};
 use crate::ray::Ray;
@@ -51,11 +52,20 @@ pub struct ClassModel {
     pub company: Steps,
     /// How large detections are.
     pub sizes: Sizes,
+    /// Mean and standard deviation of the measured ranges of all detections, as depths, ln m.
+    pub ranges: (f64, f64),
 }
 
 impl ClassModel {
-    /// Before anything is learned: all detections of a class may be clutter; `angle` is mean and standard deviation of the angles of its boxes, ln rad.
-    pub(super) fn guess(scene: &Scene, settings: &Settings, detections: usize, angle: (f64, f64)) -> Self {
+    /// Before anything is learned: all detections of a class may be clutter; `angle` is mean and standard deviation of the angles of its boxes, ln rad,
+    /// `ranges` of what is measured of their depths, ln m.
+    pub(super) fn guess(
+        scene: &Scene,
+        settings: &Settings,
+        detections: usize,
+        angle: (f64, f64),
+        ranges: (f64, f64),
+    ) -> Self {
         Self {
             is_learned: false,
             rates: Rates::GUESS,
@@ -72,6 +82,7 @@ impl ClassModel {
             company: Steps::NONE,
             heights: None,
             sizes: Sizes::guess(angle),
+            ranges,
         }
     }
 
@@ -98,6 +109,8 @@ impl ClassModel {
             self.ln_odds_of_few[0],
             self.ln_odds_of_few[1],
             self.ln_odds_of_few[2],
+            self.ranges.0,
+            self.ranges.1,
         ];
         let steps = [self.clutter_by_elevation, self.score_ratio, self.reach, self.company].map(|steps| steps.to_row());
         numbers.into_iter().chain(heights).chain(steps.into_iter().flatten()).collect()
@@ -106,7 +119,7 @@ impl ClassModel {
     /// What `to_row` returned; nothing of another number of numbers.
     #[must_use]
     pub fn from_row(row: &[f64]) -> Option<Self> {
-        let (numbers, rest) = row.split_first_chunk::<18>()?;
+        let (numbers, rest) = row.split_first_chunk::<20>()?;
         let (heights, rest) = rest.split_first_chunk::<{ Heights::NUMBERS }>()?;
         let (clutter, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
         let (scores, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
@@ -131,6 +144,8 @@ impl ClassModel {
             ln_odds_of_one,
             ln_odds_of_two,
             ln_odds_of_more,
+            range_mean,
+            range_sd,
         ] = numbers;
         Some(Self {
             is_learned: is_learned > 0.0,
@@ -148,10 +163,11 @@ impl ClassModel {
             ln_odds_of_few: [ln_odds_of_one, ln_odds_of_two, ln_odds_of_more],
             company: Steps::from_row(company),
             sizes: Sizes { angle: (angle_mean, angle_sd), object: (object_mean, object_sd), spread },
+            ranges: (range_mean, range_sd),
         })
     }
 
-    /// Like this, but with the clutter of another class and the angles of its boxes; that itself if nothing is learned.
+    /// Like this, but with the clutter of another class, the angles of its boxes and its ranges; that itself if nothing is learned.
     #[must_use]
     pub fn with_own(&self, own: &Self) -> Self {
         if !self.is_learned {
@@ -161,6 +177,7 @@ impl ClassModel {
             ln_clutter_per_sr: own.ln_clutter_per_sr,
             sizes: Sizes { spread: self.sizes.spread, ..own.sizes },
             heights: None,
+            ranges: own.ranges,
             ..*self
         }
     }
@@ -251,6 +268,8 @@ pub struct Model<'a> {
     pub spreads: Arc<Vec<Spread>>,
     /// Logarithm of the angle that each ray's box spans, rad; not finite where it has no box.
     pub ln_angle: Vec<f64>,
+    /// The measured range of each ray; empty where none is measured.
+    ranges: Vec<Measured>,
     /// Sine of each ray's elevation; not a number where nobody knows what is up.
     pub sin_elevation: Vec<f64>,
     /// How many rays there are that may vote.
@@ -275,10 +294,13 @@ impl<'a> Model<'a> {
             if settings.has(Part::Sizes) { (size / scale2.sqrt()).ln() } else { f64::NAN }
         };
         let ln_angle: Vec<f64> = scene.box_px.iter().zip(&scene.scale2).map(angle).collect();
+        let ranges = if settings.has(Part::Ranges) { measured(scene) } else { Vec::new() };
         let count = scene.rays.class.iter().max().map_or(0, |&last| last as usize + 1);
         let of = |rays: Vec<usize>| {
             let angles: Vec<f64> = rays.iter().map(|&ray| ln_angle[ray]).filter(|angle| angle.is_finite()).collect();
-            ClassModel::guess(scene, settings, rays.len(), mean_and_sd(&angles))
+            let depths: Vec<f64> = rays.iter().filter_map(|&ray| ranges.get(ray)).map(|range| range.ln_depth).collect();
+            let depths: Vec<f64> = depths.into_iter().filter(|depth| depth.is_finite()).collect();
+            ClassModel::guess(scene, settings, rays.len(), mean_and_sd(&angles), mean_and_sd(&depths))
         };
         let all = || usable.iter().map(|&ray| ray as usize);
         let classes =
@@ -293,6 +315,7 @@ impl<'a> Model<'a> {
             up,
             spreads: Arc::new(spreads),
             ln_angle,
+            ranges,
             sin_elevation,
             usable: usable.len(),
             confusions: Confusions::default(),
@@ -365,6 +388,28 @@ impl<'a> Model<'a> {
         self.class_of(ray).score_ratio.at(self.scene.score[ray as usize])
     }
 
+    /// How much more probable, in logarithms, the measured range of a ray is of an object at a depth than of clutter; 0 where none is measured.
+    #[inline]
+    #[must_use]
+    pub fn ln_range_ratio(&self, ray: u32, depth_m: f64) -> f64 {
+        let range = self.ranges.get(ray as usize);
+        range.map_or(0.0, |range| range.log_ratio(depth_m, self.class_of(ray).ranges))
+    }
+
+    /// Whether the range of a ray is measured.
+    #[must_use]
+    pub fn has_range(&self, ray: u32) -> bool {
+        self.ranges.get(ray as usize).is_some_and(Measured::is_there)
+    }
+
+    /// What the measured range of a ray says of a point; nothing where none is measured.
+    #[must_use]
+    pub fn range_terms(&self, ray: u32, point: &Vector3<f64>) -> Option<RangeTerms> {
+        let (scene, row) = (self.scene, ray as usize);
+        let told = || range_terms([scene.range_m[row], scene.range_sigma_m[row]], &scene.ray(ray).center, point);
+        self.has_range(ray).then(told)?
+    }
+
     /// Whether a ray may be more probable as a vote for a point than as clutter. Not where the camera is so near that, for all that is known of its
     /// position, the object might be anywhere in the picture, or behind it.
     #[inline]
@@ -382,6 +427,7 @@ impl<'a> Model<'a> {
         let learned = &self.classes[class as usize];
         -0.5 * (chi2 + px4.ln()) - (2.0 * PI).ln() - self.ln_clutter_per_px2(ray)
             + learned.sizes.log_ratio(self.ln_angle[ray as usize], depth_m, ln_size)
+            + self.ln_range_ratio(ray, depth_m)
             + self.ln_score_ratio(ray)
             + self.confusions.ln_share(class, self.scene.rays.class[ray as usize])
             + learned.rates.log_odds()

@@ -31,6 +31,8 @@ pub enum Part {
     IdentitySwitches,
     /// Boxes of one object tell one size.
     Sizes,
+    /// An object stands as far away as measured.
+    Ranges,
     /// Objects of a class are about as high.
     Heights,
     /// Scores tell votes from clutter.
@@ -59,7 +61,7 @@ pub enum Part {
 
 impl Part {
     /// All parts with their names.
-    pub const ALL: [(Self, &'static str); 26] = [
+    pub const ALL: [(Self, &'static str); 27] = [
         (Self::Polishing, "polishing"),
         (Self::Assignment, "assignment"),
         (Self::Merging, "merging"),
@@ -74,6 +76,7 @@ impl Part {
         (Self::Exclusion, "exclusion"),
         (Self::IdentitySwitches, "identity_switches"),
         (Self::Sizes, "sizes"),
+        (Self::Ranges, "ranges"),
         (Self::Heights, "heights"),
         (Self::Scores, "scores"),
         (Self::Elevations, "elevations"),

@@ -298,7 +298,7 @@ impl<'a> Neighborhood<'a> {
         let farthest = self.images.iter().zip(&gains).filter(|(_, gain)| **gain > 0.0);
         let distance = |image: u32| (scene.views[image as usize].center - self.origin - meeting.point).norm();
         let farthest = farthest.map(|(&image, _)| distance(image)).fold(to_point.norm(), f64::max);
-        let (mut votes, mut support) = (0, 0.0);
+        let (mut votes, mut support) = (0, self.model.ln_range_ratio(own.number, own.ray.project(&meeting.point).z));
         for (&image, &gain) in self.images.iter().zip(&gains).filter(|(image, _)| **image != own.image) {
             if gain > 0.0 {
                 votes += 1;

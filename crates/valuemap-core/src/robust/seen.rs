@@ -239,7 +239,7 @@ mod tests {
         ClassModel {
             rates,
             odd_passes: 0.1,
-            ..ClassModel::guess(&Scene::default(), &SETTINGS, 0, (f64::NAN, f64::NAN))
+            ..ClassModel::guess(&Scene::default(), &SETTINGS, 0, (f64::NAN, f64::NAN), (f64::NAN, f64::NAN))
         }
     }
 
