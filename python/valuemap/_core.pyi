@@ -90,7 +90,7 @@ _Calibration = tuple[
 def calibrate(
     scene: Scene,
     guess: _Noise,
-    known: list[bool],
+    known: tuple[list[bool], float],
     settings: _Settings,
     is_part: bool,
     threads: int,
@@ -100,7 +100,7 @@ def misfits(
     scenes: tuple[Scene, Scene],
     second_of_first: NDArray[np.uint32],
     guess: _Noise,
-    known: list[bool],
+    known: tuple[list[bool], float],
     settings: _Settings,
     threads: int,
     progress: Callable[[int, int], None],

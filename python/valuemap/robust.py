@@ -17,6 +17,7 @@ from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives
 from valuemap.errors import InputError
 from valuemap.progress import Progress, counted, silent
+from valuemap.rounding import rounding_px
 from valuemap.tables import Candidates, Floats, Ints
 
 PARTS: tuple[str, ...] = tuple(_core.parts())
@@ -117,6 +118,11 @@ class Scene:
         return self._dataset.detections.class_name.names
 
     @cached_property
+    def rounding_px(self) -> float:
+        """The standard deviation that rounding alone gives the centres of detections, px."""
+        return rounding_px(self._dataset)
+
+    @cached_property
     def core(self) -> _core.Scene:
         """Everything that was seen, copied once."""
         images, detections = self._dataset.images, self._dataset.detections
@@ -152,7 +158,7 @@ def calibrate(
 
     What the config sets of the noise stays as it is. The scene may be a part of what is mapped.
     """
-    guess, known = _guess(config.noise)
+    guess, known = _guess(config.noise, scene.rounding_px)
     steps = _core.CALIBRATION_STEPS + (2 * _core.SEARCH_STEPS if is_part else 0)
     with counted(progress, "estimating the noise", steps) as tell:
         noise, is_deep, classes, pooled, shares = _core.calibrate(
@@ -187,7 +193,7 @@ def misfits(
     `second_of_first` (N) is the row in the second scene of each detection of the first. `tell` hears again and again
     how many of `MISFIT_STEPS` are done, and stops the work by an exception.
     """
-    guess, known = _guess(config.noise)
+    guess, known = _guess(config.noise, scenes[0].rounding_px)
     (first, second), count = _core.misfits(
         (scenes[0].core, scenes[1].core),
         second_of_first.astype(np.uint32),
@@ -231,8 +237,11 @@ def find_labels(
     ), counts
 
 
-def _guess(config: NoiseConfig) -> tuple[Noise, list[bool]]:
-    """Return where the estimation starts, and whether detection, position and rotation are set by the user."""
+def _guess(config: NoiseConfig, least_px: float) -> tuple[Noise, tuple[list[bool], float]]:
+    """Return where the estimation starts, and what is known: what the user sets, and that detections are rounded.
+
+    The former are detection, position and rotation; detections are off by at least `least_px`.
+    """
     noise = Noise()
     if config.detection_sigma_px is not None:
         noise = replace(noise, detection_px=config.detection_sigma_px, box_share=0.0)
@@ -244,7 +253,7 @@ def _guess(config: NoiseConfig) -> tuple[Noise, list[bool]]:
         part = math.radians(config.rotation_sigma_deg) / math.sqrt(3.0)
         noise = replace(noise, rotation_rad=part, rotation_segment_rad=part, rotation_drift_rad=part)
     known = [config.detection_sigma_px, config.position_sigma_m, config.rotation_sigma_deg]
-    return noise, [value is not None for value in known]
+    return noise, ([value is not None for value in known], least_px)
 
 
 def _settings(config: MapConfig) -> tuple[float, float, float, float, int, int, float, list[str]]:

@@ -281,7 +281,7 @@ static LEARNED: LazyLock<Vec<f64>> = LazyLock::new(|| {
     let objects: Vec<Vector3<f64>> =
         (0..12).map(|i| Vector3::new(20.0 + 9.0 * f64::from(i), 6.0 - f64::from(i % 3), 4.0)).collect();
     let scene = street::street(60, 2.0, &objects, &[[0.4, -0.2], [-0.5, 0.3], [0.1, 0.6]]);
-    let known = Known { detection: true, position: true, rotation: true };
+    let known = Known { detection: true, position: true, rotation: true, least_px: 0.0 };
     let found = self_calibrate(&scene, &street::NOISE, known, &street::SETTINGS, false, &Progress::default());
     found.unwrap().pooled.to_row()
 });
@@ -427,7 +427,12 @@ fn labels_of_hostile_scenes() {
 }
 
 fn known() -> impl Strategy<Value = Known> {
-    any::<[bool; 3]>().prop_map(|[detection, position, rotation]| Known { detection, position, rotation })
+    (any::<[bool; 3]>(), any::<f64>()).prop_map(|([detection, position, rotation], least_px)| Known {
+        detection,
+        position,
+        rotation,
+        least_px,
+    })
 }
 
 #[test]

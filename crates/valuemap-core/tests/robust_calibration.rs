@@ -24,11 +24,17 @@ fn normal(number: u64) -> f64 {
 
 /// What is estimated of a street whose detections are off by a standard deviation, beginning with 1 px.
 fn calibrated(sigma_px: f64) -> Calibration {
+    calibrated_of_rounded(sigma_px, 0.0)
+}
+
+/// The same where detections are rounded, which they are off by at least.
+fn calibrated_of_rounded(sigma_px: f64, least_px: f64) -> Calibration {
     let objects: Vec<Vector3<f64>> =
         (0..12).map(|i| Vector3::new(25.0 + 9.0 * f64::from(i), if i % 2 == 0 { 5.0 } else { -6.0 }, 3.0)).collect();
     let errors: Vec<[f64; 2]> = (0..997).map(|i| [2 * i, 2 * i + 1].map(|number| sigma_px * normal(number))).collect();
     let scene = street(120, 1.0, &objects, &errors);
-    self_calibrate(&scene, &NOISE, Known::default(), &SETTINGS, false, &Progress::default()).unwrap()
+    let known = Known { least_px, ..Known::default() };
+    self_calibrate(&scene, &NOISE, known, &SETTINGS, false, &Progress::default()).unwrap()
 }
 
 fn far_px(calibration: &Calibration) -> f64 {
@@ -48,6 +54,13 @@ fn where_little_fits_it_is_tried_and_found() {
     let found = calibrated(10.0);
     assert!((6.0..14.0).contains(&far_px(&found)), "{:?}", found.noise);
     assert!(found.starts > calibrated(1.0).starts, "{}", found.starts);
+}
+
+/// Pins that few bearings which meet by chance are not more exact than they are written down.
+#[test]
+fn noise_is_not_below_that_of_rounding() {
+    assert!(far_px(&calibrated(0.5)) < 1.0);
+    assert!(far_px(&calibrated_of_rounded(0.5, 3.0)) > 2.99);
 }
 
 /// How far passes drift, each axis, m, as it is estimated from the true votes of objects of a street; but for some, of which every other pass

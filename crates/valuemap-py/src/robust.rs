@@ -216,6 +216,11 @@ fn calibration_of((noise, is_deep, classes, pooled, shares): CalibrationValues) 
     })
 }
 
+/// What is known of the noise: detection, position, rotation, and what detections are off by at least, px.
+fn known_of(([detection, position, rotation], least_px): ([bool; 3], f64)) -> Known {
+    Known { detection, position, rotation, least_px }
+}
+
 /// Estimate the noise from the data and learn the classes, `valuemap_core::robust::self_calibrate`.
 #[pyfunction]
 #[allow(clippy::too_many_arguments)]
@@ -223,7 +228,7 @@ pub fn calibrate(
     py: Python<'_>,
     scene: &Scene,
     guess: NoiseValues,
-    known: [bool; 3],
+    known: ([bool; 3], f64),
     settings: SettingValues,
     is_part: bool,
     threads: usize,
@@ -231,7 +236,7 @@ pub fn calibrate(
 ) -> PyResult<CalibrationValues> {
     let settings = settings_of(settings)?;
     let guess = noise_of(guess)?;
-    let known = Known { detection: known[0], position: known[1], rotation: known[2] };
+    let known = known_of(known);
     let found = with_progress(py, threads, 0, progress, |progress| {
         self_calibrate(&scene.0, &guess, known, &settings, is_part, progress)
     })?;
@@ -258,14 +263,14 @@ pub fn misfits<'py>(
     scenes: (PyRef<'py, Scene>, PyRef<'py, Scene>),
     second_of_first: PyReadonlyArray1<'py, u32>,
     guess: NoiseValues,
-    known: [bool; 3],
+    known: ([bool; 3], f64),
     settings: SettingValues,
     threads: usize,
     progress: &Bound<'py, PyAny>,
 ) -> PyResult<([f64; 2], usize)> {
     let settings = settings_of(settings)?;
     let guess = noise_of(guess)?;
-    let known = Known { detection: known[0], position: known[1], rotation: known[2] };
+    let known = known_of(known);
     let scenes = [&scenes.0.0, &scenes.1.0];
     let numbers = second_of_first.as_slice()?;
     let mut sorted = numbers.to_vec();

@@ -48,7 +48,7 @@ const HUBER_SIGMAS: f64 = 1.345;
 
 /// What is searched for, and where: least and most. Boxes of objects of one size grow as errors of position do, with one over
 /// the distance: a detector that is off by more than this share of its boxes is not one, what is more is the position's.
-pub(super) const DETECTION_PX: (f64, f64) = (0.05, 30.0);
+const DETECTION_PX: (f64, f64) = (0.05, 30.0);
 pub(super) const BOX_SHARE: (f64, f64) = (1e-3, 0.15);
 const POSITION_M: (f64, f64) = (1e-4, 5.0);
 /// Shared errors over own errors of a pose.
@@ -66,6 +66,15 @@ pub struct Known {
     pub position: bool,
     /// The rotations' part.
     pub rotation: bool,
+    /// Detections are off by at least this, px: they are rounded.
+    pub least_px: f64,
+}
+
+impl Known {
+    /// Within what the noise of detections is, px.
+    pub(super) fn detection_px(&self) -> (f64, f64) {
+        (DETECTION_PX.0.max(self.least_px).min(DETECTION_PX.1), DETECTION_PX.1)
+    }
 }
 
 /// Estimate the noise, starting from a guess.
@@ -85,10 +94,11 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
     let scale2 = scale2.sum::<f64>() / sample.iter().map(|object| object.0.len()).sum::<usize>() as f64;
     // What is rotation of an image alone and what is its detections', residuals of one focal length do not tell.
     let (known_px2, known_rad2) = (guess.detection_px.powi(2), guess.rotation_rad.powi(2));
+    let (least_px, most_px) = known.detection_px();
     let far_of = |px2: f64| match (known.detection, known.rotation) {
         (true, true) => (guess.detection_px, guess.rotation_rad),
         (true, false) => (guess.detection_px, ((px2 - known_px2).max(0.0) / scale2).sqrt()),
-        (false, true) => ((px2 - scale2 * known_rad2).max(DETECTION_PX.0.powi(2)).sqrt(), guess.rotation_rad),
+        (false, true) => ((px2 - scale2 * known_rad2).max(least_px.powi(2)).sqrt(), guess.rotation_rad),
         (false, false) => (((1.0 - ROTATION_PART) * px2).sqrt(), (ROTATION_PART * px2 / scale2).sqrt()),
     };
     // Where poses state their errors, what images and segments do not have for themselves drifts.
@@ -123,7 +133,7 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
         guess.rotation_segment_rad,
     ];
     let rotation_rad = (DETECTION_PX.0 / scale2.sqrt(), DETECTION_PX.1 / scale2.sqrt());
-    let found = search(start, [DETECTION_PX, BOX_SHARE, POSITION_M, POSITION_M, rotation_rad], fixed, &|p| {
+    let found = search(start, [(least_px, most_px), BOX_SHARE, POSITION_M, POSITION_M, rotation_rad], fixed, &|p| {
         let noise = noise_of(p, 1.0);
         sum(&|object| minus_log_likelihood(scene, &noise, guess, &object.0, &object.1))
     });

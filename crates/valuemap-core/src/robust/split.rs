@@ -8,7 +8,7 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use super::calibrate::{BOX_SHARE, DETECTION_PX, Known};
+use super::calibrate::{BOX_SHARE, Known};
 use super::drift::{Drive, Look, Normals, Vantage};
 use super::energy::Object;
 use super::estimate::is_one_visit;
@@ -56,6 +56,7 @@ pub fn split(model: &Model<'_>, known: Known, objects: &[Object]) -> Noise {
         let each: Vec<Option<f64>> = places.par_iter().map(|place| place.minus_log_likelihood(model, noise)).collect();
         each.iter().map(|value| value.unwrap_or(f64::INFINITY)).sum()
     };
+    let (least_px, _) = known.detection_px();
     let before = value(&noise);
     let mut best = (before, noise);
     for _ in 0..TURNS {
@@ -63,7 +64,7 @@ pub fn split(model: &Model<'_>, known: Known, objects: &[Object]) -> Noise {
             best = least(best, scale.least_of_position(&noise), &|share| scale.with_position(&best.1, share), &value);
         }
         if !known.rotation {
-            best = least(best, LEAST_SHARE, &|share| scale.with_rotation(&best.1, share), &value);
+            best = least(best, LEAST_SHARE, &|share| scale.with_rotation(&best.1, share, least_px), &value);
         }
     }
     if before - best.0 > LEAST_FALL { best.1 } else { noise }
@@ -151,11 +152,11 @@ impl Scale {
         }
     }
 
-    /// Noise of which the rotation has a share of what does not.
-    fn with_rotation(&self, noise: &Noise, share: f64) -> Noise {
+    /// Noise of which the rotation has a share of what does not, and detections at least so much, px.
+    fn with_rotation(&self, noise: &Noise, share: f64, least_px: f64) -> Noise {
         let far_px2 = noise.detection_px.powi(2) + self.px2 * noise.rotation_rad.powi(2);
         Noise {
-            detection_px: ((1.0 - share) * far_px2).sqrt().max(DETECTION_PX.0),
+            detection_px: ((1.0 - share) * far_px2).sqrt().max(least_px),
             rotation_rad: (share * far_px2 / self.px2).sqrt(),
             ..*noise
         }
