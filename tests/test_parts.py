@@ -16,8 +16,10 @@ from test_few import some_pictures
 from valuemap import robust
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset, rows_of
+from valuemap.sightings import cast_sightings
 from valuemap.simulate import simulate
 from valuemap.tables import Floats, covariance_matrices
+from valuemap.tiles.source import InMemory
 
 NEAR_M = 2.0
 HONEST_CHI2 = 16.0
@@ -188,6 +190,17 @@ def test_a_scene_fails_without(part: str) -> None:
     best = whole(name, seed)
     assert fails(best, score(name, seed, without=part))
     assert not fails(best, best)
+
+
+def test_what_is_left_over_is_born_where_not_all_moves_pay(monkeypatch: pytest.MonkeyPatch) -> None:
+    ordered = InMemory(scene("trees", 5)[0], POSES_AS_THEY_ARE).sample()
+    seen = robust.Scene(ordered.dataset, ordered.drives, cast_sightings(ordered.dataset)[0])
+    known = replace(robust.calibrate(seen, POSES_AS_THEY_ARE), is_deep=False)
+    _, counts = robust.find_labels(seen, known, POSES_AS_THEY_ARE)
+    monkeypatch.setattr(robust, "LEFT_OUT", {"births"})
+    _, without = robust.find_labels(seen, known, POSES_AS_THEY_ARE)
+    assert counts["births"] > without["births"]
+    assert counts["energy"] < without["energy"] - 1.0
 
 
 def test_every_part_has_a_scene() -> None:

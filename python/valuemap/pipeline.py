@@ -152,7 +152,7 @@ def build_map_of_folder(
     run: Run,
     *,
     held: Dataset | None = None,
-    posed: Callable[[Dataset], None] | None = None,
+    on_posed: Callable[[Dataset], None] | None = None,
     progress: Progress = silent,
 ) -> tuple[Map, list[Place]]:
     """Find the objects that a dataset folder shows, which may be larger than memory.
@@ -168,7 +168,7 @@ def build_map_of_folder(
     held
         What is in the folder, where it is in memory already: it is not read again, and the folder needs to be there
         only where `run.cuts_on_disk`.
-    posed
+    on_posed
         Called with the dataset that labels are found in, which has the poses that they are found with, before they are;
         not where it is cut on disk.
     progress
@@ -197,8 +197,8 @@ def build_map_of_folder(
             return build_map(dataset, config, threads=threads, progress=progress), []
         _check_detections(dataset.name, len(dataset.detections))
         refined = _refined(dataset, config, stages, threads, progress)
-        if posed is not None:
-            posed(refined.dataset)
+        if on_posed is not None:
+            on_posed(refined.dataset)
         with stages.measured("order"):
             source: Source = InMemory(refined.dataset, config)
         size = {"images": len(dataset.images), "detections": len(dataset.detections)}

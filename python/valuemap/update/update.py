@@ -168,7 +168,7 @@ def _updated_in_memory(
 
     try:
         rebuilt, cells = build_map_of_folder(
-            run.work / DATASET, _settings(before), run, held=joined, posed=map_alone, progress=progress
+            run.work / DATASET, _settings(before), run, held=joined, on_posed=map_alone, progress=progress
         )
         # The poses that the labels were found with, where those of whole drives were corrected.
         posed = rebuilt.corrected or joined
