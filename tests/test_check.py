@@ -202,6 +202,17 @@ def test_the_gate_is_one_angle_whatever_the_focal_length(good: Dataset, view: Vi
     assert not _is_wider_gate_only(coarse, with_focal(coarse.dataset, 0.0))
 
 
+def test_a_focal_length_that_is_followed_to_a_wider_gate_only_is_not_named(
+    good: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong = with_focal(good, 0.1)
+    named = cameras._find_correction(View(wrong))
+    assert named is not None
+    assert named.parameter.name == "log_focal"
+    monkeypatch.setattr("valuemap.check.cameras._followed", lambda _view, best, _given: replace(best, value=-2.0))
+    assert cameras._find_correction(View(wrong)) is None
+
+
 def test_a_shift_in_time_is_followed_where_least_squares_stay_behind(good: Dataset, view: View) -> None:
     shifted = View(with_poses(good, rotation_matrices(good.images), moved_along(good, 5.0)))
     parameter = next(each for each in PARAMETERS if each.name == "along")
