@@ -12,6 +12,7 @@ from scipy import stats
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
+from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.agreement import compare, measure_agreement
 from valuemap.check.fault import (
     LEAST_CHANCE,
@@ -22,9 +23,9 @@ from valuemap.check.fault import (
     Stage,
     View,
     gains_of_all,
-    with_centers,
     with_detections,
     with_images,
+    with_poses,
 )
 from valuemap.check.fit import Estimate, Parameter, estimate
 from valuemap.check.lenses import Focal, focals, with_params
@@ -42,14 +43,8 @@ def _turn(axis: int) -> Any:
     def change(dataset: Dataset, angle_rad: float) -> Dataset:
         vector = np.zeros(3)
         vector[axis] = angle_rad
-        turn, images = Rotation.from_rotvec(vector), dataset.images
-        quaternion = turn * Rotation.from_quat(images.cam_from_world_quat, scalar_first=True)
-        # The camera stays where it is: with t = -R C, what turns R turns t.
-        return with_images(
-            dataset,
-            cam_from_world_quat=quaternion.as_quat(canonical=True, scalar_first=True),
-            cam_from_world_m=turn.apply(images.cam_from_world_m),
-        )
+        rotation = Rotation.from_rotvec(vector).as_matrix() @ rotation_matrices(dataset.images)
+        return with_poses(dataset, rotation, camera_centers(dataset.images))
 
     return change
 
@@ -60,7 +55,7 @@ def with_focal(dataset: Dataset, log_factor: float) -> Dataset:
 
 
 def _shift_along(dataset: Dataset, forward_m: float) -> Dataset:
-    return with_centers(dataset, moved_along(dataset, forward_m))
+    return with_poses(dataset, rotation_matrices(dataset.images), moved_along(dataset, forward_m))
 
 
 PARAMETERS = (

@@ -217,12 +217,6 @@ def with_detections(dataset: Dataset, **changes: Any) -> Dataset:
     return Dataset(**{**vars(dataset), "detections": dataset.detections.replace(**changes)})
 
 
-def with_centers(dataset: Dataset, center_in_world_m: Floats) -> Dataset:
-    """Return a dataset with other camera centres (N, 3), and rotations as they are."""
-    translation = -np.einsum("nij,nj->ni", rotation_matrices(dataset.images), center_in_world_m)
-    return with_images(dataset, cam_from_world_m=translation)
-
-
 def with_poses(dataset: Dataset, rotation: Floats, center_in_world_m: Floats) -> Dataset:
     """Return a dataset with other rotations from the world to the camera (N, 3, 3) and camera centres (N, 3)."""
     from scipy.spatial.transform import Rotation
