@@ -198,6 +198,23 @@ def test_opensfm(tmp_path: Path) -> None:
     assert "says where it is" in refusal(lambda: read_opensfm(path, anchor=(1.0, 2.0, 3.0)))
 
 
+def test_cameras_of_opensfm_may_be_turned_where_it_says_where_it_is(tmp_path: Path) -> None:
+    """OpenSfM does not turn pictures: those taken upright have their own up to the side."""
+    path = opensfm_in(tmp_path)
+    parts = json.loads(path.read_text())
+    for shot in parts[0]["shots"].values():
+        quarter = Rotation.from_euler("z", 90, degrees=True)
+        shot["rotation"] = (quarter * Rotation.from_rotvec(shot["rotation"])).as_rotvec().tolist()
+        shot["translation"] = quarter.apply(shot["translation"]).tolist()
+    write(path, json.dumps(parts))
+    dataset = read_opensfm(path)
+    assert dataset.frame.anchor == (LAT, LON, 40.0)
+    assert_allclose(camera_centers(dataset.images), CENTERS, atol=1e-9)
+    del parts[0]["reference_lla"]
+    write(path, json.dumps(parts))
+    assert "with an anchor z is up" in refusal(lambda: read_opensfm(path, anchor=(LAT, LON, 40.0)))
+
+
 def brown_radial(r: float) -> float:
     return 1 - 0.1 * r**2 + 0.02 * r**4 + 0.003 * r**6
 
@@ -572,7 +589,16 @@ def tile(corners: list[tuple[int, int]], extent: int = 4096) -> str:
     return base64.b64encode(b"\x1a" + varint(len(layer)) + layer).decode()
 
 
-def mapillary_in(folder: Path) -> Path:
+# Where a point of the picture as stored is in the picture as shown, fractions from the top left, by EXIF orientation.
+SHOWN: dict[int, Callable[[float, float], tuple[float, float]]] = {
+    1: lambda x, y: (x, y),
+    3: lambda x, y: (1.0 - x, 1.0 - y),
+    6: lambda x, y: (1.0 - y, x),
+    8: lambda x, y: (y, 1.0 - x),
+}
+
+
+def mapillary_in(folder: Path, orientation: int = 1) -> Path:
     """Radial cameras with positions from ENU, rotations about local axes, and outlines in 4096ths of the picture."""
     data = []
     for i, (rotation, center) in enumerate(zip(WORLD_FROM_CAM, CENTERS, strict=True)):
@@ -580,7 +606,7 @@ def mapillary_in(folder: Path) -> Path:
         distorted = np.array([x, y]) * (1 - 0.05 * (x * x + y * y))
         u, v = 640 * 0.8 * distorted + [320, 240]
         half = 40
-        cx, cy = u / 640 * 4096, v / 480 * 4096
+        cx, cy = (4096 * part for part in SHOWN[orientation](u / 640, v / 480))
         box = [(cx - half, cy - half), (cx + half, cy - half), (cx + half, cy + half), (cx - half, cy + half)]
         corners = [(round(a), round(b)) for a, b in box]
         to_wgs = Transformer.from_pipeline(
@@ -601,6 +627,7 @@ def mapillary_in(folder: Path) -> Path:
                 "camera_parameters": [0.8, -0.05, 0.0],
                 "width": WIDTH,
                 "height": HEIGHT,
+                "exif_orientation": orientation,
                 "detections": {"data": [{"id": f"d{i}", "value": "object--traffic-light", "geometry": tile(corners)}]},
             }
         )
@@ -615,6 +642,32 @@ def test_mapillary(tmp_path: Path) -> None:
     assert dataset.detections.class_name.texts() == ["object--traffic-light"] * 3
     assert_allclose(dataset.detections.size_px, [[80 / 4096 * 640, 80 / 4096 * 480]] * 3)
     assert dataset.images.pass_id.texts() == ["seq"] * 3
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 8])
+def test_outlines_of_mapillary_are_in_pictures_as_shown(tmp_path: Path, orientation: int) -> None:
+    """Its cameras and rotations are of pictures as stored, its outlines of pictures turned upright."""
+    check_scene(read_mapillary(mapillary_in(tmp_path, orientation), anchor=(LAT, LON, 0.0)), within_m=0.01)
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_mapillary_without_structure_from_motion_is_level_as_shown(tmp_path: Path, orientation: int) -> None:
+    """A quarter right of the middle of the picture, as people see it upright, and on the horizon."""
+    image = {
+        "id": 7,
+        "width": 1000,
+        "height": 500,
+        "camera_type": "perspective",
+        "camera_parameters": [1.0, 0.0, 0.0],
+        "compass_angle": 30.0,
+        "geometry": {"type": "Point", "coordinates": [LON, LAT]},
+        "exif_orientation": orientation,
+        "detections": [{"value": "a", "geometry": tile([(3062, 2038), (3082, 2038), (3082, 2058), (3062, 2058)])}],
+    }
+    dataset = read_mapillary(write(tmp_path / "images.json", json.dumps(image)))
+    right_px = (500 if orientation in (6, 8) else 1000) / 4
+    assert_allclose(azimuths_deg(dataset), 30.0 + np.degrees(np.arctan(right_px / 1000.0)), atol=1e-9)
+    assert_allclose(cast_rays(dataset).direction_in_world[:, 2], 0.0, atol=1e-12)
 
 
 def test_mapillary_without_structure_from_motion_is_level_with_its_compass(tmp_path: Path) -> None:

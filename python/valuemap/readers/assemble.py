@@ -67,6 +67,7 @@ def assemble(
     detections: FoundBoxes | FiledBoxes,
     up: tuple[float, float, float] | None,
     anchor: tuple[float, float, float] | None,
+    is_on_earth: bool = False,
     source: str,
     where_image: Callable[[int], str] | None = None,
     truth: Truth | None = None,
@@ -87,6 +88,9 @@ def assemble(
     anchor
         WGS84 latitude, longitude (degrees) and ellipsoidal height (m) of the origin, where the poses are in
         the ENU frame there already (x east, y north, z up, metres).
+    is_on_earth
+        The poses are in that frame because the data say where on the Earth they are, not because somebody says so.
+        Then cameras may be turned: pictures taken upright or upside down.
     source
         What errors name as the place of the data.
     where_image
@@ -124,7 +128,7 @@ def assemble(
     )
     dataset = check_dataset(unframed, source=source)
     _check_steps(dataset.images, source)
-    dataset = dataclasses.replace(dataset, frame=_frame(dataset.images, up, anchor, source))
+    dataset = dataclasses.replace(dataset, frame=_frame(dataset.images, up, anchor, is_on_earth, source))
     return Imported(dataset, boxes, rejections)
 
 
@@ -132,6 +136,7 @@ def _frame(
     images: Images,
     up: tuple[float, float, float] | None,
     anchor: tuple[float, float, float] | None,
+    is_on_earth: bool,
     source: str,
 ) -> Frame:
     if up is not None and anchor is not None:
@@ -144,7 +149,9 @@ def _frame(
     mean_up: Floats = -rotation_matrices(images)[:, 1].mean(axis=0)  # Camera axes: y down.
     length = float(np.linalg.norm(mean_up))
     if anchor is not None:
-        _check_anchor(anchor, mean_up, length, source)
+        _check_anchor(anchor)
+        if not is_on_earth and length >= _MIN_MEAN_UP:
+            _check_is_enu(mean_up / length, source)
         return Frame(anchor=anchor)
     if length < _MIN_MEAN_UP:
         raise InputError(
@@ -155,15 +162,19 @@ def _frame(
     return Frame(up=(x, y, z))
 
 
-def _check_anchor(anchor: tuple[float, float, float], mean_up: Floats, length: float, source: str) -> None:
+def _check_anchor(anchor: tuple[float, float, float]) -> None:
     lat, lon, height = anchor
     if not (abs(lat) <= 90.0 and abs(lon) <= 360.0 and math.isfinite(height)):
         raise SettingError(
             f"anchor: expected latitude, longitude (degrees) and height (m), found {lat} {lon} {height}",
             hint="for example 52.3702 4.8952 43.0: latitude first",
         )
-    if length >= _MIN_MEAN_UP and mean_up[2] / length < math.cos(_MAX_TILT_FROM_ENU_RAD):
-        x, y, z = mean_up / length
+
+
+def _check_is_enu(mean_up: Floats, source: str) -> None:
+    """Refuse poses that somebody says are east, north, up, but whose cameras' own mean up (3, unit length) is not z."""
+    if mean_up[2] < math.cos(_MAX_TILT_FROM_ENU_RAD):
+        x, y, z = mean_up
         raise InputError(
             f"{source}: with an anchor z is up, but the cameras' own up is ({x:.2f}, {y:.2f}, {z:.2f})",
             hint="bring the poses into the ENU frame of the anchor first (COLMAP: model_aligner "

@@ -16,7 +16,7 @@ from valuemap.errors import InputError
 
 _FILM_WIDTH_MM = 36.0
 _LARGEST_PX = 200_000_000
-_ROLL_DEG = {3: 180.0, 6: 90.0, 8: -90.0}
+ROLL_DEG = {3: 180.0, 6: 90.0, 8: -90.0}
 """Roll of a camera whose picture must be turned by this orientation to stand upright: 6 is a quarter turn clockwise,
 so up is at the left of the picture as stored, and the camera's right side was down."""
 
@@ -77,7 +77,7 @@ def read_exif(path: Path) -> Exif:
         sigma_m=_positive(gps.get(GPS.GPSHPositioningError)),
         heading_deg=None if heading is None else heading % 360.0,
         pitch_deg=pano.get("PosePitchDegrees", 0.0),
-        roll_deg=pano.get("PoseRollDegrees", _ROLL_DEG.get(orientation, 0.0) if isinstance(orientation, int) else 0.0),
+        roll_deg=pano.get("PoseRollDegrees", ROLL_DEG.get(orientation, 0.0) if isinstance(orientation, int) else 0.0),
         focal_px=focal_px,
         time_s=_time(exif, gps),
     )

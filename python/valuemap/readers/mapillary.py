@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
+from valuemap.readers.exif import ROLL_DEG
 from valuemap.readers.files import check_file, file_in, read_json
 from valuemap.readers.json_values import Json
 from valuemap.readers.poses import local_from_cam, make_images, place_on_earth
@@ -24,6 +26,13 @@ _EXPECTED = "JSON of Mapillary's API v4: an image, or data: a list of images, ea
 _MILLI = 1e-3
 _HEIGHT_WITHOUT_SFM_M = 2.0
 
+_STORED: dict[int, Callable[[float, float, float, float], list[float]]] = {
+    3: lambda left, top, right, bottom: [1.0 - right, 1.0 - bottom, 1.0 - left, 1.0 - top],
+    6: lambda left, top, right, bottom: [top, 1.0 - right, bottom, 1.0 - left],
+    8: lambda left, top, right, bottom: [1.0 - bottom, left, 1.0 - top, right],
+}
+"""Edges of a box in the picture as stored, of those in the picture turned upright by this EXIF orientation."""
+
 
 @dataclass
 class _Found:
@@ -32,6 +41,7 @@ class _Found:
     ids: list[str] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
     cameras: list[Camera] = field(default_factory=list)
+    orientation: list[int] = field(default_factory=list)
     place: list[list[float]] = field(default_factory=list)
     rotation: list[Floats] = field(default_factory=list)
     passes: list[str] = field(default_factory=list)
@@ -56,7 +66,8 @@ def read_mapillary(
     Positions are `computed_geometry` and `computed_altitude` where structure from motion has them, else `geometry`.
     The rotation is `computed_rotation`, axis-angle from east, north, up at the image into the camera, else level with
     `computed_compass_angle` or `compass_angle`. `camera_parameters` are focal length over the larger side, k1, k2.
-    Passes are sequences, images are named `ID.jpg`, and `captured_at` is in milliseconds.
+    Passes are sequences, images are named `ID.jpg`, and `captured_at` is in milliseconds. Cameras, rotations and sizes
+    are those of pictures as stored, compass angles and outlines those of pictures turned by `exif_orientation`.
 
     Detections are lists of `value` and `geometry` (a vector tile as base64), in `detections` of an image, or in a file
     `detections.json` beside the export: an object of image ids with such lists, or a list of `data` with `image`.
@@ -111,6 +122,7 @@ def read_mapillary(
         detections=_boxes(found, images) if detections is None else read_detections(detections, images, cameras),
         up=None,
         anchor=placed.anchor,
+        is_on_earth=True,
         source=str(export),
         max_rejected=max_rejected,
     )
@@ -130,6 +142,7 @@ def _entries(content: Json) -> list[Json]:
 def _add_image(image: Json, found: _Found) -> None:
     key = image["id"].key()
     width, height = image["width"].whole(), image["height"].whole()
+    orientation = image["exif_orientation"].whole() if "exif_orientation" in image else 1
     has_sfm = "computed_geometry" in image
     lon, lat = (image["computed_geometry"] if has_sfm else image["geometry"])["coordinates"].numbers(2)
     altitude = next(
@@ -140,10 +153,11 @@ def _add_image(image: Json, found: _Found) -> None:
     else:
         angle = next((image[name] for name in ("computed_compass_angle", "compass_angle") if name in image), None)
         heading = np.radians([image["compass_angle"].number() if angle is None else angle.number()])
-        rotation = local_from_cam(heading, np.zeros(1), np.zeros(1))[0]
+        rotation = local_from_cam(heading, np.zeros(1), np.radians([ROLL_DEG.get(orientation, 0.0)]))[0]
     found.ids.append(key)
     found.names.append(f"{key}.jpg")
     found.cameras.append(_camera(image, width, height))
+    found.orientation.append(orientation)
     found.place.append([float(lon), float(lat), altitude])
     found.rotation.append(rotation)
     sequence = image.get("sequence")
@@ -200,10 +214,16 @@ def _boxes(found: _Found, images: Images) -> FoundBoxes:
     if not found.edges:
         return FoundBoxes.none()
     camera_of = dict(zip(found.ids, found.cameras, strict=True))
+    orientation_of = dict(zip(found.ids, found.orientation, strict=True))
     row_of = {name.removesuffix(".jpg"): row for row, name in enumerate(images.name.to_pylist())}
     nowhere = next(iter(found.cameras))
     size = np.array([[(c := camera_of.get(key, nowhere)).width, c.height] for key in found.image_of_box], np.float64)
-    edges = np.array(found.edges)
+    edges = np.array(
+        [
+            _STORED[turned](*shown) if (turned := orientation_of.get(key, 1)) in _STORED else shown
+            for key, shown in zip(found.image_of_box, found.edges, strict=True)
+        ]
+    )
     return FoundBoxes(
         image_row=np.array([row_of.get(key, -1) for key in found.image_of_box], dtype=np.int64),
         class_names=found.classes,

@@ -102,6 +102,7 @@ def read_opensfm(
         detections=read_detections(detections, images, cameras),
         up=up,
         anchor=reference or anchor,
+        is_on_earth=reference is not None,
         source=str(path),
         max_rejected=max_rejected,
     )

@@ -113,6 +113,7 @@ def read_panoramax(
         detections=_boxes(found, names, images) if detections is None else read_detections(detections, images, cameras),
         up=None,
         anchor=placed.anchor,
+        is_on_earth=True,
         source=str(export),
         max_rejected=max_rejected,
     )
