@@ -215,6 +215,26 @@ def test_cameras_of_opensfm_may_be_turned_where_it_says_where_it_is(tmp_path: Pa
     assert "with an anchor z is up" in refusal(lambda: read_opensfm(path, anchor=(LAT, LON, 40.0)))
 
 
+def test_a_capture_time_of_zero_is_none_in_opensfm(tmp_path: Path) -> None:
+    """So it says of pictures without a date, which are not 50 years older than the others."""
+    path = opensfm_in(tmp_path)
+    parts = json.loads(path.read_text())
+    parts[0]["shots"]["1.jpg"]["capture_time"] = 0.0
+    times = read_opensfm(write(path, json.dumps(parts))).images.timestamp_s
+    assert times is not None
+    assert np.isnan(times[1])
+    assert_allclose(times[[0, 2]], STAMPS_NS[[0, 2]] / 1e9)
+
+
+def test_a_camera_of_opensfm_without_a_type_is_perspective(tmp_path: Path) -> None:
+    """As old versions wrote it."""
+    plain: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "focal": 0.8, "k1": -0.1, "k2": 0.02}
+    typed = {**plain, "projection_type": "perspective"}
+    found, expected = (read_opensfm(opensfm_in(tmp_path / str(i), camera)) for i, camera in enumerate((plain, typed)))
+    assert_allclose(found.cameras.params[0], expected.cameras.params[0])
+    assert found.cameras.model.texts() == expected.cameras.model.texts()
+
+
 def brown_radial(r: float) -> float:
     return 1 - 0.1 * r**2 + 0.02 * r**4 + 0.003 * r**6
 
@@ -752,6 +772,27 @@ def test_panoramax(tmp_path: Path) -> None:
     assert by_key.frame.anchor == (LAT, LON, 0.0)
     away = enu_from_lon_lat_height(np.array([[LON + 1e-4, LAT, 0.0]]), (LAT, LON, 0.0))
     assert_allclose(camera_centers(by_key.images)[1], away[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["opensfm", "mapillary", "panoramax"])
+def test_panoramas_that_are_cut_are_refused(tmp_path: Path, name: str) -> None:
+    """Their heights are angles too: taken for half a turn, all that is off the horizon is somewhere else."""
+    if name == "opensfm":
+        path = opensfm_in(tmp_path, {"projection_type": "spherical", "width": 4096, "height": 1024})
+    elif name == "mapillary":
+        path = mapillary_in(tmp_path)
+        content = json.loads(path.read_text())
+        content["data"][1] |= {"camera_type": "spherical", "camera_parameters": [], "width": 4096, "height": 1024}
+        write(path, json.dumps(content))
+    else:
+        path = panoramax_in(tmp_path)
+        write(path, path.read_text().replace("[2000, 1000]", "[4096, 1024]"))
+    read: dict[str, Callable[[Path], Any]] = {
+        "opensfm": read_opensfm,
+        "mapillary": read_mapillary,
+        "panoramax": read_panoramax,
+    }
+    assert "expected a panorama twice as wide as high, found 4096 x 1024" in refusal(lambda: read[name](path))
 
 
 def test_poses_without_numbers_are_not_interpolated() -> None:

@@ -12,6 +12,7 @@ from valuemap.errors import InputError, SettingError
 from valuemap.tables import Cameras, Categories, Floats, Ints
 
 _LARGEST_PX = 1_000_000
+_ROUNDING_PX = 2
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,24 @@ class Camera:
     height: int
     params: tuple[float, ...]
     readout_s: float | None = None
+
+
+def panorama(width: int, height: int, where: str) -> Camera:
+    """Return the camera of an equirectangular picture whose pixels are as wide as high, `where` it stands.
+
+    COLMAP's model spreads half a turn over the height, so that one of which the top or bottom was cut has none.
+
+    Raises
+    ------
+    InputError
+        It is not twice as wide as high.
+    """
+    if abs(width - 2 * height) > _ROUNDING_PX:
+        raise InputError(
+            f"{where}: expected a panorama twice as wide as high, found {width} x {height} pixels",
+            hint="those that are cut are not read: leave their images out",
+        )
+    return Camera("EQUIRECTANGULAR", width, height, (float(width), float(height)))
 
 
 def make_cameras(cameras: Sequence[Camera], source: str) -> tuple[Cameras, Ints]:

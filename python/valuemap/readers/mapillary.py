@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
-from valuemap.readers.cameras_of import Camera, make_cameras
+from valuemap.readers.cameras_of import Camera, make_cameras, panorama
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.exif import ROLL_DEG
 from valuemap.readers.files import check_file, file_in, read_json
@@ -175,7 +175,7 @@ def _sequence(value: Json) -> str:
 def _camera(image: Json, width: int, height: int) -> Camera:
     kind = image["camera_type"].text()
     if kind in ("spherical", "equirectangular"):
-        return Camera("EQUIRECTANGULAR", width, height, (float(width), float(height)))
+        return panorama(width, height, image.where)
     if kind not in ("perspective", "fisheye", "brown"):
         raise image["camera_type"].wrong("expected perspective, fisheye, spherical or equirectangular")
     values = [entry.number() for entry in image["camera_parameters"].entries()]

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
-from valuemap.readers.cameras_of import Camera, make_cameras
+from valuemap.readers.cameras_of import Camera, make_cameras, panorama
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import file_in, read_json
 from valuemap.readers.json_values import Json
@@ -69,7 +69,8 @@ def read_opensfm(
             camera_of.append(cameras_here[key])
             rotation.append(shot["rotation"].numbers(3))
             translation.append(shot["translation"].numbers(3))
-            time.append(shot["capture_time"].number() if "capture_time" in shot else np.nan)
+            seconds = shot["capture_time"].number() if "capture_time" in shot else 0.0
+            time.append(seconds or np.nan)  # It writes 0 for pictures without a date.
             folder = str(PurePosixPath(name).parent)
             sequence = shot["skey"].text() if "skey" in shot else (folder if folder != "." else ONE_PASS)
             passes.append(f"{number}/{sequence}" if len(parts) > 1 else sequence)
@@ -112,10 +113,10 @@ def read_opensfm(
 
 def _camera(value: Json) -> Camera:
     """Return one camera; COLMAP's models are the same functions of other names."""
-    kind = value["projection_type"].text()
+    kind = value["projection_type"].text() if "projection_type" in value else "perspective"
     width, height = value["width"].whole(), value["height"].whole()
     if kind in ("spherical", "equirectangular"):
-        return Camera("EQUIRECTANGULAR", width, height, (float(width), float(height)))
+        return panorama(width, height, value.where)
     size = max(width, height)
 
     def of(name: str, default: float | None = None) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
-from valuemap.readers.cameras_of import Camera, make_cameras
+from valuemap.readers.cameras_of import Camera, make_cameras, panorama
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_file, file_in, read_json
 from valuemap.readers.json_values import Json
@@ -153,7 +153,7 @@ def _camera(properties: Json) -> Camera:
     width, height = (int(value) for value in orientation["sensor_array_dimensions"].numbers(2))
     view_deg = orientation["field_of_view"].number()
     if view_deg == _WHOLE_TURN_DEG:
-        return Camera("EQUIRECTANGULAR", width, height, (float(width), float(height)))
+        return panorama(width, height, orientation.where)
     if not 0.0 < view_deg < 170.0:
         raise orientation["field_of_view"].wrong("expected degrees, 360 for a panorama, else below 170")
     focal = width / 2.0 / math.tan(math.radians(view_deg) / 2.0)
