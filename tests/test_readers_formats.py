@@ -162,6 +162,18 @@ def test_kapture(tmp_path: Path) -> None:
     assert len(set(dataset.images.rig_id.tolist())) == 3
 
 
+def test_a_camera_of_kapture_that_has_no_pose_may_be_unknown(tmp_path: Path) -> None:
+    """Queries come with UNKNOWN_CAMERA, width and height; nothing is asked of what is skipped."""
+    sensors = kapture_in(tmp_path) / "sensors" / "sensors.txt"
+    known = sensors.read_text()
+    write(sensors, known + f"phone, gs9, camera, UNKNOWN_CAMERA, {WIDTH}, {HEIGHT}\n")
+    records = tmp_path / "sensors" / "records_camera.txt"
+    write(records, records.read_text() + f"{STAMPS_NS[0] + 7}, phone, query/1.jpg\n")
+    assert len(read_kapture(tmp_path).images) == 3
+    write(sensors, known.replace("PINHOLE", "UNKNOWN_CAMERA"))
+    assert "sensors.txt line 2: camera 'UNKNOWN_CAMERA" in refusal(lambda: read_kapture(tmp_path))
+
+
 # OpenSfM.
 
 

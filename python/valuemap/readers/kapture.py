@@ -71,6 +71,7 @@ def read_kapture(
     sensors = _sensors(folder)
     rigs = _rigs(folder)
     poses = _trajectories(folder)
+    cameras_of: dict[str, Camera] = {}  # Of those with a pose alone: kapture need not know the others.
     names, camera_of, found, rig, time, device_of = [], [], [], [], [], []
     for row in _table(folder, "records_camera.txt", 3):
         stamp, device, name = row.fields[0], row.fields[1], ",".join(row.fields[2:])
@@ -80,7 +81,9 @@ def read_kapture(
         if posed is not None:
             pose, owner = posed
             names.append(name)
-            camera_of.append(sensors[device])
+            if device not in cameras_of:
+                cameras_of[device] = _camera(sensors[device])
+            camera_of.append(cameras_of[device])
             found.append(pose)
             rig.append(f"{stamp}/{owner}")
             time.append(_seconds(stamp, row))
@@ -151,17 +154,16 @@ def _table(folder: Path, name: str, least: int, *, optional: bool = False) -> li
     return rows
 
 
-def _sensors(folder: Path) -> dict[str, Camera]:
-    """Return the cameras by name: sensor_id, name, type, model, width, height, parameters."""
-    found = {}
-    for row in _table(folder, "sensors.txt", 3):
-        if row.fields[2] != "camera":
-            continue
-        try:
-            found[row.fields[0]] = parse_camera(" ".join(row.fields[3:]))
-        except SettingError as error:
-            raise InputError(f"{row.where}: {error}", hint="kapture's camera models have COLMAP's names") from error
-    return found
+def _sensors(folder: Path) -> dict[str, _Row]:
+    """Return the rows of cameras by name: sensor_id, name, type, model, width, height, parameters."""
+    return {row.fields[0]: row for row in _table(folder, "sensors.txt", 3) if row.fields[2] == "camera"}
+
+
+def _camera(row: _Row) -> Camera:
+    try:
+        return parse_camera(" ".join(row.fields[3:]))
+    except SettingError as error:
+        raise InputError(f"{row.where}: {error}", hint="kapture's camera models have COLMAP's names") from error
 
 
 def _rigs(folder: Path) -> dict[str, dict[str, _Pose]]:
