@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -134,6 +135,21 @@ def test_packed_files_are_named(tmp_path: Path, start: bytes, what: str) -> None
     said = refusal(lambda: read(tmp_path, path))
     assert what in said
     assert "unpack it first" in said
+
+
+def test_a_packed_table_is_known_by_its_name(tmp_path: Path) -> None:
+    path = tmp_path / "boxes.CSV.gz"
+    path.write_bytes(gzip.compress(CORNERS.encode()))
+    assert_allclose(read(tmp_path, path).detections.center_px, [CENTER])
+
+
+@pytest.mark.parametrize(("turn", "size"), [("90.0", (20.0, 40.0)), ("180", (40.0, 20.0)), ("30", (44.6410, 37.3205))])
+def test_the_box_around_a_turned_box_of_cvat(tmp_path: Path, turn: str, size: tuple[float, float]) -> None:
+    """Rectangles may be turned about their middle, in degrees."""
+    path = write(tmp_path / "a.xml", CVAT.replace('occluded="0"', f'occluded="0" rotation="{turn}"'))
+    found = read(tmp_path, path).detections
+    assert_allclose(found.center_px, [CENTER])
+    assert_allclose(found.size_px, [size], atol=1e-4)
 
 
 def test_coco_as_tools_write_it(tmp_path: Path) -> None:

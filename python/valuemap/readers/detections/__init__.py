@@ -61,7 +61,7 @@ def _format_of(file: DetectionFile) -> str:
         return file.format
     if file.path.is_dir():
         return "yolo"
-    found = _OF_SUFFIX.get(file.path.suffix.lower())
+    found = _OF_SUFFIX.get(Path(file.path.name.lower().removesuffix(".gz")).suffix)
     if found is None:
         check_file(file.path, "a file with detections, or a folder of YOLO's")
         raise InputError(

@@ -21,6 +21,7 @@ class _Found:
     images: list[str] = field(default_factory=list)
     classes: list[str] = field(default_factory=list)
     edges: list[list[float]] = field(default_factory=list)
+    turn_deg: list[float] = field(default_factory=list)
     pictures: dict[str, tuple[int, int]] = field(default_factory=dict)
     names: list[str] = field(default_factory=list)
     open_image: str | None = None
@@ -28,6 +29,8 @@ class _Found:
 
 def read_cvat(file: DetectionFile) -> NamedBoxes:
     """Read the boxes of `<image name width height>` elements: `<box label xtl ytl xbr ybr>` in pixels from the corner.
+
+    Of a box that is turned about its middle (`rotation`, degrees), the upright box around it counts.
 
     Tracks of videos have frame numbers instead of file names and are refused.
 
@@ -57,16 +60,19 @@ def read_cvat(file: DetectionFile) -> NamedBoxes:
             found.images.append(found.open_image)
             found.classes.append(_text(attributes, "label", where))
             found.edges.append([_number(attributes, key, where) for key in ("xtl", "ytl", "xbr", "ybr")])
+            found.turn_deg.append(_number(attributes, "rotation", where) if "rotation" in attributes else 0.0)
 
     read_xml(file.path, _EXPECTED, on_element)
     if not found.names:
         raise InputError(f"{file.path}: there are no images in it", hint=f"expected {_EXPECTED}")
     edges = np.array(found.edges, dtype=np.float64).reshape(-1, 4)
+    size = edges[:, 2:] - edges[:, :2]
+    turn = np.radians(found.turn_deg)[:, None]
     return NamedBoxes.of_columns(
         image_names=found.images,
         class_names=found.classes,
         center=(edges[:, :2] + edges[:, 2:]) / 2.0,
-        size=edges[:, 2:] - edges[:, :2],
+        size=np.abs(np.cos(turn)) * size + np.abs(np.sin(turn)) * size[:, ::-1],
         score=np.full(len(edges), file.full_score),
         where=found.where.__getitem__,
         pictures=found.pictures,
