@@ -786,6 +786,54 @@ def test_panoramax(tmp_path: Path) -> None:
     assert_allclose(camera_centers(by_key.images)[1], away[0], atol=1e-9)
 
 
+@pytest.mark.parametrize("missing", ["place", "heading"])
+@pytest.mark.parametrize("name", ["mapillary", "panoramax"])
+def test_an_image_without_a_pose_is_left_out_and_listed(tmp_path: Path, name: str, missing: str) -> None:
+    """One of many must not stop the others; what stands in its place is null, or nothing."""
+    if name == "mapillary":
+        path = mapillary_in(tmp_path)
+        content = json.loads(path.read_text())
+        image = content["data"][1]
+        if missing == "place":
+            del image["computed_geometry"]
+            image["geometry"] = None
+        else:
+            del image["computed_rotation"]
+            image["compass_angle"] = None
+    else:
+        path = panoramax_in(tmp_path)
+        content = json.loads(path.read_text())
+        item = content["features"][1]
+        if missing == "place":
+            item["geometry"] = None
+        else:
+            item["properties"]["view:azimuth"] = None
+    write(path, json.dumps(content))
+    read: Callable[..., Any] = read_mapillary if name == "mapillary" else read_panoramax
+    assert "images cannot be used" in refusal(lambda: read(path))
+    dataset = read(path, max_rejected=0.5)
+    left_out = "1001.jpg" if name == "mapillary" else "b.jpg"
+    assert left_out not in dataset.images.name.to_pylist()
+    assert dataset.rejected is not None
+    assert set(dataset.rejected.image_name.to_pylist()) == {left_out}
+
+
+@pytest.mark.parametrize("name", ["mapillary", "panoramax"])
+def test_a_box_without_a_class_is_left_out_and_listed(tmp_path: Path, name: str) -> None:
+    if name == "mapillary":
+        path = mapillary_in(tmp_path)
+        content = json.loads(path.read_text())
+        del content["data"][1]["detections"]["data"][0]["value"]
+    else:
+        path = panoramax_in(tmp_path)
+        content = json.loads(path.read_text())
+        content["features"][1]["properties"]["annotations"][0]["semantics"] = None
+    write(path, json.dumps(content))
+    read: Callable[..., Any] = read_mapillary if name == "mapillary" else read_panoramax
+    assert "its class is missing" in refusal(lambda: read(path))
+    assert len(read(path, max_rejected=0.5).detections) == (2 if name == "mapillary" else 1)
+
+
 @pytest.mark.parametrize("name", ["opensfm", "mapillary", "panoramax"])
 def test_panoramas_that_are_cut_are_refused(tmp_path: Path, name: str) -> None:
     """Their heights are angles too: taken for half a turn, all that is off the horizon is somewhere else."""

@@ -84,7 +84,7 @@ def read_mapillary(
     Raises
     ------
     InputError
-        A file is missing, damaged or of another format, or an image has no place or camera.
+        A file is missing, damaged or of another format, or an image has no size or camera.
     """
     paths = (
         [file_in(export, path.name, _EXPECTED) for path in sorted(export.glob("*.json")) if path.stem != "detections"]
@@ -143,16 +143,16 @@ def _add_image(image: Json, found: _Found) -> None:
     key = image["id"].key()
     width, height = image["width"].whole(), image["height"].whole()
     orientation = image["exif_orientation"].whole() if "exif_orientation" in image else 1
-    has_sfm = "computed_geometry" in image
-    lon, lat = (image["computed_geometry"] if has_sfm else image["geometry"])["coordinates"].numbers(2)
+    point = next((image[name] for name in ("computed_geometry", "geometry") if name in image), None)
+    lon, lat = (np.nan, np.nan) if point is None else point["coordinates"].numbers(2)
     altitude = next(
         (image[name].number() for name in ("computed_altitude", "altitude") if name in image), _HEIGHT_WITHOUT_SFM_M
     )
     if "computed_rotation" in image:
         rotation = Rotation.from_rotvec(image["computed_rotation"].numbers(3)).inv().as_matrix()
     else:
-        angle = next((image[name] for name in ("computed_compass_angle", "compass_angle") if name in image), None)
-        heading = np.radians([image["compass_angle"].number() if angle is None else angle.number()])
+        angles = ("computed_compass_angle", "compass_angle")
+        heading = np.radians([next((image[name].number() for name in angles if name in image), np.nan)])
         rotation = local_from_cam(heading, np.zeros(1), np.radians([ROLL_DEG.get(orientation, 0.0)]))[0]
     found.ids.append(key)
     found.names.append(f"{key}.jpg")
@@ -205,7 +205,8 @@ def _add_box(detection: Json, image: str, found: _Found) -> None:
     except ValueError as error:
         raise geometry.wrong(f"expected a vector tile as base64, which {error}") from error
     found.image_of_box.append(image)
-    found.classes.append(detection["value"].text())
+    value = detection.get("value")
+    found.classes.append("" if value is None else value.text())
     found.edges.append([*points.min(axis=0).tolist(), *points.max(axis=0).tolist()])
     found.where.append(detection.where)
 

@@ -74,7 +74,7 @@ def read_panoramax(
     Raises
     ------
     InputError
-        A file is missing, damaged or of another format, or an item lacks its place, heading or field of view.
+        A file is missing, damaged or of another format, or an item lacks its size or field of view.
     """
     paths = (
         [file_in(export, path.name, _EXPECTED) for path in sorted(export.glob("*.*json"))]
@@ -123,14 +123,16 @@ def read_panoramax(
 
 def _add_item(item: Json, found: _Found, class_key: str | None, camera_height_m: float) -> None:
     properties = item["properties"]
-    coordinates = item["geometry"]["coordinates"]
-    is_3d = isinstance(coordinates.value, list) and len(coordinates.value) == 3
-    lon, lat, height = (*coordinates.numbers(3 if is_3d else 2).tolist(), camera_height_m)[:3]
     found.ids.append(item["id"].key())
     found.cameras.append(_camera(properties))
-    found.place.append([lon, lat, height])
+    found.place.append(
+        _place(item["geometry"]["coordinates"], camera_height_m) if "geometry" in item else [math.nan] * 3
+    )
     found.angles_deg.append(
-        [properties["view:azimuth"].number(), *(_number(properties, name, 0.0) for name in ("pers:pitch", "pers:roll"))]
+        [
+            _number(properties, name, default)
+            for name, default in (("view:azimuth", math.nan), ("pers:pitch", 0.0), ("pers:roll", 0.0))
+        ]
     )
     found.passes.append(item["collection"].text() if "collection" in item else ONE_PASS)
     found.time.append(_seconds(properties["datetime"]) if "datetime" in properties else math.nan)
@@ -142,6 +144,12 @@ def _add_item(item: Json, found: _Found, class_key: str | None, camera_height_m:
         found.classes.append(_class(annotation, class_key))
         found.edges.append(_edges(annotation["shape"]))
         found.where.append(annotation.where)
+
+
+def _place(coordinates: Json, camera_height_m: float) -> list[float]:
+    """Return longitude, latitude and height."""
+    is_3d = isinstance(coordinates.value, list) and len(coordinates.value) == 3
+    return [*coordinates.numbers(3 if is_3d else 2).tolist(), camera_height_m][:3]
 
 
 def _number(properties: Json, name: str, default: float) -> float:
@@ -169,7 +177,8 @@ def _seconds(value: Json) -> float:
 
 
 def _class(annotation: Json, class_key: str | None) -> str:
-    tags = [(tag["key"].text(), tag["value"].key()) for tag in annotation["semantics"].entries()]
+    semantics = annotation.get("semantics")
+    tags = [(tag["key"].text(), tag["value"].key()) for tag in (() if semantics is None else semantics.entries())]
     if class_key is not None:
         return next((value for key, value in tags if key == class_key), "")
     return "=".join(tags[0]) if tags else ""
