@@ -128,6 +128,22 @@ def test_geopackage_has_labels_ellipses_votes_and_cameras(tmp_path: Path) -> Non
     assert votes["picture"].tolist()[0] == "a/1.jpg"
 
 
+def test_lines_and_areas_of_a_geopackage_do_not_go_around_the_earth(tmp_path: Path) -> None:
+    """Cameras are on the one side of longitude 180 and labels on the other, and one label is on it."""
+    frame = Frame(anchor=(-17.0, 179.9999, 5.0))
+    assert frame.anchor is not None
+    positions = POSITIONS + [[7.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    positions[1, 0] = enu_from_lon_lat_height(np.array([[180.0, -17.0, 5.0]]), frame.anchor)[0, 0]
+    result = a_map(frame)
+    places = lon_lat_height_from_enu(positions, frame.anchor)
+    labels = result.labels.replace(position_in_world_m=positions, lon_lat_height=places)
+    export_map(dataclasses.replace(result, labels=labels), tmp_path / "map.gpkg", dataset=small_dataset(frame))
+    assert places[0, 0] < -179.0
+    for layer in ("ellipses", "votes"):
+        bounds = geopandas.read_file(tmp_path / "map.gpkg", layer=layer).geometry.bounds
+        assert ((bounds.maxx - bounds.minx) < 0.01).all(), layer
+
+
 def test_geopackage_brings_its_styles(tmp_path: Path) -> None:
     export_map(a_map(), tmp_path / "map.gpkg", dataset=small_dataset(GEOREFERENCED))
     with sqlite3.connect(tmp_path / "map.gpkg") as database:
@@ -254,6 +270,17 @@ def test_opendrive_signals_say_where_and_how_exactly(tmp_path: Path) -> None:
     assert error is not None
     assert float(error.attrib["xyAbsolute"]) == pytest.approx(np.hypot(0.2, 0.1), abs=1e-4)
     assert float(error.attrib["zAbsolute"]) == pytest.approx(0.3, abs=1e-4)
+
+
+def test_the_number_of_a_sign_is_a_text_in_opendrive(tmp_path: Path) -> None:
+    """A value needs a unit, which a class does not say; and codes of Vienna are none of OpenDRIVE's own."""
+    speed = map_of([[1.0, 2.0, 3.0]], ["regulatory--maximum-speed-limit-50--g1"])
+    export_map(speed, tmp_path / "map.xodr")
+    (signal,) = signals_of(tmp_path / "map.xodr")
+    assert (signal.attrib["type"], signal.attrib["text"]) == ("C,14", "50")
+    assert not {"value", "unit", "country"} & set(signal.attrib)
+    export_map(a_map(), tmp_path / "lights.xodr")
+    assert signals_of(tmp_path / "lights.xodr")[0].attrib["country"] == "OpenDRIVE"
 
 
 def test_opendrive_roads_carry_their_signals(tmp_path: Path) -> None:

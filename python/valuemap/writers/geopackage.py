@@ -14,7 +14,7 @@ import numpy as np
 from valuemap.cameras import camera_poses
 from valuemap.errors import OutputError
 from valuemap.geodesy import lon_lat_height_from_enu
-from valuemap.tables import Floats
+from valuemap.tables import Floats, Ints
 from valuemap.writers import qgis_style
 from valuemap.writers.attributes import Export, iso_times
 
@@ -86,7 +86,7 @@ def _ellipses(export: Export) -> geopandas.GeoDataFrame:
     import shapely
 
     rings = ellipse_rings_in_world_m(export)
-    placed = _placed(export, rings.reshape(-1, 3)).reshape(rings.shape)
+    placed = _together(export, _placed(export, rings.reshape(-1, 3)).reshape(rings.shape), np.arange(len(rings)))
     table = export.attributes[["label_id", "class", "ellipse_major_m", "ellipse_minor_m", "ellipse_azimuth_deg"]]
     return geopandas.GeoDataFrame(table, geometry=shapely.polygons(placed), crs=export.places.crs)
 
@@ -114,8 +114,8 @@ def _votes(export: Export) -> geopandas.GeoDataFrame:
     table["pass"] = [images.pass_id.names[code] for code in images.pass_id.codes[image]]
     label = np.searchsorted(export.result.labels.label_id, votes.label_id)
     starts = _placed(export, camera_poses(images)[1])[image]
-    lines = shapely.linestrings(np.stack([starts, export.places.coordinates[label]], axis=1))
-    return geopandas.GeoDataFrame(table, geometry=lines, crs=export.places.crs)
+    lines = _together(export, np.stack([starts, export.places.coordinates[label]], axis=1), label)
+    return geopandas.GeoDataFrame(table, geometry=shapely.linestrings(lines), crs=export.places.crs)
 
 
 def _cameras(export: Export) -> geopandas.GeoDataFrame:
@@ -148,6 +148,19 @@ def _placed(export: Export, position_in_world_m: Floats) -> Floats:
         return position_in_world_m
     geographic = lon_lat_height_from_enu(position_in_world_m, anchor)
     return export.placed(geographic)
+
+
+def _together(export: Export, coordinates: Floats, label: Ints) -> Floats:
+    """Return lines or rings (N, corners, 3) that do not go around the Earth, of labels in rows (N) of the places.
+
+    Longitudes jump from 180 to -180; here they go on beyond, on the side where the label is.
+    """
+    from pyproj import CRS
+
+    if export.places.crs is None or not CRS.from_user_input(export.places.crs).is_geographic:
+        return coordinates
+    turns = np.round((coordinates[..., 0] - export.places.coordinates[label, None, 0]) / 360.0)
+    return coordinates - 360.0 * np.stack([turns, 0.0 * turns, 0.0 * turns], axis=-1)
 
 
 def _finish(path: Path, rows: dict[str, int], export: Export) -> None:
