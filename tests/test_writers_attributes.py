@@ -5,11 +5,14 @@ from __future__ import annotations
 import csv
 import dataclasses
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
 import geopandas
 import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
+import pyogrio
 import pytest
 from numpy.testing import assert_allclose
 from pyproj import Transformer
@@ -170,8 +173,56 @@ def test_heights_above_a_zero_given_in_metres(tmp_path: Path) -> None:
     assert_allclose(plain["crs_z"] - sea["crs_z"], 46.5, atol=1e-6)
     assert_allclose(sea["crs_z"], degrees["crs_z"], atol=1e-6)
     assert_allclose(degrees["crs_x"], ANCHOR[1], atol=1e-3)
-    with pytest.raises(OutputError, match="holds WGS84 longitude and latitude only"):
+    with pytest.raises(OutputError, match="only, not heights above another zero"):
         export_map(result, tmp_path / "a.kml", vertical="46.5")
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4326", "epsg:4979", "4326", "OGC:CRS84"])
+@pytest.mark.parametrize("name", ["map.geojson", "map.kml"])
+def test_wgs84_may_be_asked_of_formats_that_are_always_wgs84(name: str, crs: str, tmp_path: Path) -> None:
+    export_map(geographic_map(), tmp_path / name, crs=crs)
+    export_map(geographic_map(), tmp_path / "plain" / name)
+    places = [pyogrio.read_dataframe(tmp_path / folder / name).geometry[0].wkt for folder in (".", "plain")]
+    assert places[0] == places[1]
+
+
+@pytest.mark.parametrize(("name", "options"), [("map.xodr", {}), ("map.rrd", {}), ("model", {"format_name": "colmap"})])
+def test_formats_with_a_frame_of_their_own_refuse_reference_systems(
+    name: str, options: dict[str, Any], tmp_path: Path
+) -> None:
+    both: list[dict[str, Any]] = [{"crs": "EPSG:32630"}, {"crs": "EPSG:32630", "vertical": "46.5"}]
+    for asked in both:
+        with pytest.raises(OutputError, match=r"only, not (EPSG:32630|heights above another zero)"):
+            export_map(geographic_map(), tmp_path / name, dataset=small_dataset(), **options, **asked)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_columns_have_their_types_without_any_label(tmp_path: Path) -> None:
+    """So that tables of several maps go together."""
+    types = []
+    for folder, positions in (("some", [[1.0, 2.0, 3.0]]), ("none", [])):
+        export_map(map_of(positions), tmp_path / f"{folder}.parquet", dataset=small_dataset())
+        schema = pq.read_schema(tmp_path / f"{folder}.parquet")
+        types.append({field.name: str(field.type).removeprefix("large_") for field in schema})
+    assert types[0] == types[1]
+    assert types[1]["first_seen_time"] == types[1]["picture_1"] == "string"
+
+
+def test_a_size_that_was_not_measured_is_missing(tmp_path: Path) -> None:
+    """Key points have no size: their labels have one of 0."""
+    result = voted_map([(0, 100)], frame=Frame(anchor=ANCHOR))
+    nothing = np.zeros(len(result.labels))
+    labels = result.labels.replace(object_width_m=nothing, object_height_m=nothing)
+    result = dataclasses.replace(result, labels=labels)
+    export_map(result, tmp_path / "map.csv")
+    assert pd.read_csv(tmp_path / "map.csv")[["object_width_m", "object_height_m"]].isna().all().all()
+    export_map(result, tmp_path / "map.xodr")
+    signal = ElementTree.parse(tmp_path / "map.xodr").getroot().find("road/signals/signal")
+    assert signal is not None
+    assert not {"height", "width"} & set(signal.attrib)
+    export_map(result, tmp_path / "map.lanelet2.osm")
+    keys = {tag.attrib["k"] for tag in ElementTree.parse(tmp_path / "map.lanelet2.osm").getroot().iter("tag")}
+    assert "height" not in keys
 
 
 def test_a_reference_system_must_exist_and_the_map_have_a_place_in_it(tmp_path: Path) -> None:

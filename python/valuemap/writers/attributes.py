@@ -28,6 +28,9 @@ _FIRST_DATE_S = 631_152_000.0
 WGS84 = "EPSG:4979"
 """Longitude, latitude and ellipsoidal height."""
 
+_CODES_OF_WGS84 = ("4326", "4979", "OGC:CRS84")
+"""What people call it: coordinates are east before north whatever the order of its own axes."""
+
 
 @dataclass(frozen=True, eq=False)
 class Places:
@@ -56,6 +59,8 @@ class Export:
         labels = self.result.labels
         table = table_to_arrow(labels).to_pandas()
         table["class"] = table["class"].astype("string")  # No labels have no classes: categories of none have no type.
+        for name in ("object_width_m", "object_height_m"):
+            table[name] = table[name].where(table[name] > 0.0)  # Key points have no size.
         ellipse = self.ellipses
         table["sigma_m"] = np.hypot(ellipse.major_m, ellipse.minor_m)
         table["sigma_height_m"] = ellipse.height_m
@@ -73,7 +78,7 @@ class Export:
             places = self.places
             for axis, column in zip("xyz", places.coordinates.T, strict=True):
                 table[f"crs_{axis}"] = column
-        texts = [name for name in table.columns if table[name].dtype == object]
+        texts = [name for name in table.columns if name.endswith("_time") or name.startswith("picture_")]
         typed: pd.DataFrame = table.astype(dict.fromkeys(texts, "string"))
         return typed
 
@@ -183,6 +188,25 @@ def iso_times(timestamp_s: Floats) -> list[str | None]:
     return [f"{text}Z" if is_date else None for text, is_date in zip(texts, known >= _FIRST_DATE_S, strict=True)]
 
 
+def refuse_crs(export: Export, holds: str) -> None:
+    """Refuse another reference system where one is asked for, of a format that has its own; `holds` says which.
+
+    Raises
+    ------
+    OutputError
+        Another reference system is asked for.
+    """
+    if export.crs is None:
+        return
+    from pyproj import CRS
+
+    named = CRS.from_user_input(export.crs).name if "[" in export.crs else export.crs  # WKT is long.
+    raise OutputError(
+        f"{holds} only, not {'heights above another zero' if export.zero_height_m else named}",
+        hint="leave --crs and --vertical away, or export to .gpkg, .parquet, .fgb or .csv",
+    )
+
+
 def needs_places(export: Export, what: str) -> Floats:
     """Return longitude, latitude and height (N, 3) for a format that holds nothing else.
 
@@ -193,11 +217,8 @@ def needs_places(export: Export, what: str) -> Floats:
     OutputError
         Another reference system is asked for.
     """
-    if export.crs is not None:
-        raise OutputError(
-            f"{what} holds WGS84 longitude and latitude only, not {export.crs}",
-            hint="leave --crs away, or export to .gpkg, .parquet, .fgb or .csv",
-        )
+    if export.zero_height_m or (export.crs or "EPSG:4326").upper().removeprefix("EPSG:") not in _CODES_OF_WGS84:
+        refuse_crs(export, f"{what} holds WGS84 longitude and latitude")
     if export.result.labels.lon_lat_height is None:
         raise InputError(
             f"the map is not geo-referenced, and {what} holds longitude and latitude only",

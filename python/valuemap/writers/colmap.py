@@ -10,7 +10,7 @@ import numpy as np
 from valuemap.cameras import colmap_camera
 from valuemap.dataset import Dataset, rows_of
 from valuemap.errors import InputError
-from valuemap.writers.attributes import Export
+from valuemap.writers.attributes import Export, refuse_crs
 
 if TYPE_CHECKING:
     from valuemap.colmap import pycolmap
@@ -31,9 +31,12 @@ def write_colmap(export: Export, folder: Path) -> None:
     ------
     InputError
         The dataset of the map is not known.
+    OutputError
+        Another reference system is asked for.
     """
     from valuemap.colmap import pycolmap  # Slow to import, and only this format needs it.
 
+    refuse_crs(export, "a COLMAP model holds metres in the frame of the map")
     dataset = export.dataset
     if dataset is None:
         raise InputError(

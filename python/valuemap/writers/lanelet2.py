@@ -76,7 +76,8 @@ def _tags(row: dict[str, object]) -> dict[str, str]:
         found = find_sign(name)
         code = found[0].vienna or found[0].mapillary if found is not None else name
         tags = {"type": "traffic_sign", "subtype": code}
-    tags["height"] = f"{row['object_height_m']:.3f}"
+    if "object_height_m" in row:
+        tags["height"] = f"{row['object_height_m']:.3f}"
     tags["sigma_m"] = f"{row['sigma_m']:.3f}"
     if "existence" in row:
         tags["existence"] = f"{row['existence']:.4f}"

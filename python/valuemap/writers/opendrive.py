@@ -10,7 +10,7 @@ import numpy as np
 
 from valuemap.geodesy import crs_from_lon_lat_height
 from valuemap.tables import Floats
-from valuemap.writers.attributes import Export, records
+from valuemap.writers.attributes import Export, records, refuse_crs
 from valuemap.writers.sign_codes import find_sign, is_traffic_light
 from valuemap.writers.xml import child, write_xml
 
@@ -33,6 +33,7 @@ def write_opendrive(export: Export, path: Path) -> None:
     OutputError
         Another reference system is asked for.
     """
+    refuse_crs(export, "OpenDRIVE holds metres of a projection at the anchor")
     points, projection = _coordinates(export)
     root = ElementTree.Element("OpenDRIVE")
     low, high = (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(3), np.zeros(3))
@@ -119,7 +120,7 @@ def _signal(
     road_heading: float,
     length_m: float,
 ) -> None:
-    name, height_m = str(row["class"]), float(str(row["object_height_m"]))
+    name, height_m = str(row["class"]), float(str(row.get("object_height_m", 0.0)))
     is_light = is_traffic_light(name)
     found = find_sign(name)
     code = None if found is None else found[0].vienna or found[0].mapillary
@@ -136,14 +137,15 @@ def _signal(
         zOffset=f"{z - height_m / 2.0:.4f}",
         dynamic="yes" if is_light else "no",
         orientation="none",
-        country="OpenDRIVE",
+        country="OpenDRIVE" if is_light else None,
         type=_SIGNAL_TRAFFIC_LIGHT if is_light else code or "-1",
         subtype="-1",
-        value=number,
-        height=f"{height_m:.3f}",
-        width=f"{row['object_width_m']:.3f}",
+        height=f"{height_m:.3f}" if "object_height_m" in row else None,
+        width=f"{row['object_width_m']:.3f}" if "object_width_m" in row else None,
         hOffset=f"{_turn(facing - road_heading):.6f}",
     )
+    if number is not None:
+        signal.set("text", number)  # A value must have a unit, and a class does not say whether km/h or mph.
     child(
         signal,
         "positionInertial",

@@ -13,7 +13,7 @@ from valuemap.drives import find_drives
 from valuemap.errors import SettingError
 from valuemap.map_folder import Map
 from valuemap.tables import Floats, Ints, covariance_matrices
-from valuemap.writers.attributes import Export
+from valuemap.writers.attributes import Export, refuse_crs
 
 _COLORS = np.array(
     [(0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233), (213, 94, 0), (240, 228, 66)],
@@ -38,7 +38,10 @@ def write_rerun(export: Export, path: Path) -> None:
     ------
     SettingError
         The extra rerun is not installed.
+    OutputError
+        Another reference system is asked for.
     """
+    refuse_crs(export, "a recording of Rerun holds metres in the frame of the map")
     try:
         import rerun
     except ImportError as error:
