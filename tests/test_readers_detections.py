@@ -181,6 +181,23 @@ def test_a_polygon_of_yolo_counts_as_its_box(tmp_path: Path) -> None:
     assert dataset.detections.class_name.texts() == ["class-2"]
 
 
+@pytest.mark.parametrize(
+    "row",
+    [
+        "0 0.15625 0.125 0.1875 0.104166666667 0.21875 0.125 0.1875 0.145833333333 0.5",  # A polygon.
+        "0 0.1875 0.125 0.0625 0.0416666666666667 0.5 1",  # Of the first object that was tracked.
+        "0 0.1875 0.125 0.0625 0.0416666666666667 0.5 27",
+    ],
+)
+def test_confidences_of_polygons_and_numbers_of_tracks_of_yolo(tmp_path: Path, row: str) -> None:
+    labels = detections_in(tmp_path, "yolo")
+    write(labels / "a" / "1.txt", row + "\n")
+    found = read(tmp_path, labels).detections
+    assert_allclose(found.center_px, [CENTER], atol=1e-6)
+    assert_allclose(found.size_px, [SIZE], atol=1e-6)
+    assert_allclose(found.score, [0.5])
+
+
 @pytest.mark.parametrize("kind", DETECTIONS)
 def test_boxes_of_unknown_images_are_left_out_and_named(tmp_path: Path, kind: str) -> None:
     path = detections_in(tmp_path, kind)
@@ -223,7 +240,14 @@ def test_folders_without_labels(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "row",
-    ["0 0.1 0.2 0.3", "light 0.1 0.2 0.3 0.4", "-1 0.1 0.2 0.3 0.4", "0 0.1 0.2 0.3 0.4 0.5 0.6 0.7", "0.5 1 1 1 1"],
+    [
+        "0 0.1 0.2 0.3",
+        "light 0.1 0.2 0.3 0.4",
+        "-1 0.1 0.2 0.3 0.4",
+        "0 0.1 0.2 0.3 0.4 0.5 0.6 0.7",
+        "0.5 1 1 1 1",
+        "0 0.1 0.1 0.2 0.1 0.2 0.2 0.1 0.2 0.5 12",  # The number of a track is no place.
+    ],
 )
 def test_rows_that_are_not_yolos(tmp_path: Path, row: str) -> None:
     folder = detections_in(tmp_path, "yolo")

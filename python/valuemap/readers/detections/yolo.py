@@ -20,8 +20,9 @@ _LARGEST_CLASS = 100_000
 def read_yolo(file: DetectionFile) -> NamedBoxes:
     """Read a folder of files `NAME.txt` for the pictures `NAME.jpg`, with rows of fractions of the picture.
 
-    A row is class, centre x and y, width, height and maybe the confidence; an odd number of values from 7 up is a class
-    and a polygon, of which the box counts. `data.yaml`, `dataset.yaml` (names), `classes.txt` or `obj.names` in the
+    A row is class, centre x and y, width, height and maybe the confidence, and after it the number of a track. An odd
+    number of values from 7 up is a class and a polygon, of which the box counts, an even one from 10 up has the
+    confidence too. `data.yaml`, `dataset.yaml` (names), `classes.txt` or `obj.names` in the
     folder or the one above name the classes; else class 9 is `class-9`.
 
     Raises
@@ -71,21 +72,30 @@ _MOST_BLANK = 16
 
 
 def _row(row: str, where: str) -> tuple[int, list[float], float]:
+    """Return class, place and confidence; what Ultralytics writes after these of a track is only a whole number."""
     fields = row.split()
     try:
         code, values = int(fields[0]), [float(field) for field in fields[1:]]
     except ValueError:
         code, values = -1, []
-    if not 0 <= code < _LARGEST_CLASS or not (len(values) in (4, 5) or (len(values) >= 6 and len(values) % 2 == 0)):
+    is_numbered = fields[-1].isdecimal() and values[-1:] >= [1.0]
+    if len(values) == 6 and is_numbered:
+        values.pop()
+    elif len(values) > 6 and is_numbered and values[-1] > 1.0:
+        code = -1  # Of an outline: its number would be a corner.
+    is_outline = len(values) >= 6 and len(values) % 2 == 0
+    is_scored_outline = len(values) >= 9 and len(values) % 2 == 1
+    if not 0 <= code < _LARGEST_CLASS or not (len(values) in (4, 5) or is_outline or is_scored_outline):
         raise InputError(
             f"{where}: expected class cx cy width height [confidence], found {row.strip()[:60]!r}",
             hint="the class is a whole number, the others are fractions of the picture's width and height",
         )
-    if len(values) <= 5:
-        return code, values[:4], values[4] if len(values) == 5 else 1.0
+    score = values.pop() if len(values) % 2 == 1 else 1.0
+    if len(values) == 4:
+        return code, values, score
     x, y = np.array(values[::2]), np.array(values[1::2])
     low, high = (x.min(), y.min()), (x.max(), y.max())
-    return code, [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, high[0] - low[0], high[1] - low[1]], 1.0
+    return code, [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, high[0] - low[0], high[1] - low[1]], score
 
 
 def _class_names(folder: Path) -> dict[int, str] | None:
