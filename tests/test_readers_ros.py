@@ -81,11 +81,19 @@ class Bag:
         self.writer.write(self.connections[topic], stamp_ns, self.store.serialize_cdr(message, kind))
 
 
-def camera_info(bag: Bag, stamp_ns: int, model: str = "plumb_bob", d: tuple[float, ...] = (0.0,) * 5) -> Any:
+def camera_info(
+    bag: Bag,
+    stamp_ns: int,
+    model: str = "plumb_bob",
+    d: tuple[float, ...] = (0.0,) * 5,
+    window: tuple[int, int, int, int] = (0, 0, 0, 0),
+    binning: int = 0,
+) -> Any:
     k = np.array([FX, 0, CX, 0, FY, CY, 0, 0, 1], np.float64)
     p = np.array([400.0, 0, 300, 0, 0, 400, 200, 0, 0, 0, 1, 0])
-    roi = bag.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
-    parts = (np.array(d, np.float64), k, np.eye(3).ravel(), p, 0, 0, roi)
+    left, top, width, height = window
+    roi = bag.make("sensor_msgs/msg/RegionOfInterest", left, top, height, width, False)
+    parts = (np.array(d, np.float64), k, np.eye(3).ravel(), p, binning, binning, roi)
     return bag.make("sensor_msgs/msg/CameraInfo", bag.header("cam_optical", stamp_ns), 480, 640, model, *parts)
 
 
@@ -107,7 +115,15 @@ def detections(bag: Bag, stamp_ns: int, center_px: Any) -> Any:
     return bag.make("vision_msgs/msg/Detection2DArray", header, [found])
 
 
-def write_bag(path: Path, *, poses: str = "tf", model: str = "plumb_bob", d: tuple[float, ...] = (0.0,) * 5) -> Path:
+def write_bag(
+    path: Path,
+    *,
+    poses: str = "tf",
+    model: str = "plumb_bob",
+    d: tuple[float, ...] = (0.0,) * 5,
+    window: tuple[int, int, int, int] = (0, 0, 0, 0),
+    binning: int = 0,
+) -> Path:
     """Images between the poses, which are every half second: on a straight way at constant turn these are exact."""
     bag = Bag(path)
     optical = Rotation.from_matrix(CAR_FROM_CAM)
@@ -130,9 +146,10 @@ def write_bag(path: Path, *, poses: str = "tf", model: str = "plumb_bob", d: tup
         turn = Rotation.from_euler("z", 0.04 * (number + 0.2))
         in_car = turn.inv().apply(OBJECT - place)
         x, y, z = CAR_FROM_CAM.T @ (in_car - CAMERA_IN_CAR)
-        bag.write("/camera_info", camera_info(bag, stamp, model, d), stamp)
+        bag.write("/camera_info", camera_info(bag, stamp, model, d, window, binning), stamp)
         # Pixels of CameraInfo count from the middle of the top-left one, boxes from the picture's corner.
-        bag.write("/detections", detections(bag, stamp, (FX * x / z + CX + 0.5, FY * y / z + CY + 0.5)), stamp)
+        center_px = np.array([FX * x / z + CX + 0.5, FY * y / z + CY + 0.5])
+        bag.write("/detections", detections(bag, stamp, (center_px - window[:2]) / max(binning, 1)), stamp)
     bag.writer.close()
     return path
 
@@ -150,6 +167,19 @@ def test_boxes_of_a_bag_meet_where_the_object_is(tmp_path: Path, poses: str) -> 
     assert_allclose(dataset.images.timestamp_s - 1e9, [0.1, 0.6, 1.1], atol=1e-6)
     first = 0.2 * CARS[1][0] + Rotation.from_euler("z", 0.008).apply(CAMERA_IN_CAR)
     assert_allclose(camera_centers(dataset.images)[0], first, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("window", "binning", "size"),
+    [((0, 0, 0, 0), 2, (320, 240)), ((100, 40, 500, 400), 1, (500, 400)), ((100, 40, 500, 400), 2, (250, 200))],
+)
+def test_pictures_may_be_a_part_of_what_a_camera_sees_and_smaller(
+    tmp_path: Path, window: tuple[int, int, int, int], binning: int, size: tuple[int, int]
+) -> None:
+    """K and P are of the full resolution; boxes are in the pictures that the camera gave."""
+    dataset = read_ros([write_bag(tmp_path / "bag", window=window, binning=binning)], longest_gap_s=1.0)
+    assert_allclose(meeting_point(dataset), OBJECT, atol=1e-6)
+    assert (dataset.cameras.width_px[0], dataset.cameras.height_px[0]) == size
 
 
 def test_images_in_gaps_of_the_poses_have_none(tmp_path: Path) -> None:

@@ -297,10 +297,18 @@ def _add_camera(message: Any, bag: _Bag, rectified: bool) -> None:
             hint="import boxes on the raw pictures",
         )
     matrix = p.reshape(3, 4) if rectified else k.reshape(3, 3)
-    pinhole = (matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5)
+    # K and P are of the full resolution; pictures are a window of it, of pixels that are several ones each. 0 is none.
+    window, across, down = message.roi, max(int(message.binning_x), 1), max(int(message.binning_y), 1)
+    pinhole = (
+        matrix[0, 0] / across,
+        matrix[1, 1] / down,
+        (matrix[0, 2] + 0.5 - window.x_offset) / across,
+        (matrix[1, 2] + 0.5 - window.y_offset) / down,
+    )
+    width, height = (window.width or message.width) // across, (window.height or message.height) // down
     model, distortion = ("PINHOLE", ()) if rectified else _distortion(message.distortion_model, d, frame)
     params = tuple(float(value) for value in (*pinhole, *distortion))
-    bag.cameras[frame] = Camera(model, int(message.width), int(message.height), params)
+    bag.cameras[frame] = Camera(model, int(width), int(height), params)
 
 
 def _distortion(model: str, d: Floats, frame: str) -> tuple[str, tuple[float, ...]]:
