@@ -103,6 +103,14 @@ def test_pitch_is_up_and_roll_turns_the_right_side_down(tmp_path: Path) -> None:
     assert_allclose(rolled, np.array([0.0, 500.0, -300.0]) / np.hypot(500.0, 300.0), atol=1e-5)
 
 
+@pytest.mark.parametrize(("roll", "y"), [(90, -1.0), (180, 0.0)])
+def test_all_cameras_may_be_turned_where_angles_say_so(tmp_path: Path, roll: int, y: float) -> None:
+    """Pictures taken upright, or upside down: their own up says nothing about the frame."""
+    rows = [f"{name}.jpg,52.000{name},4,0,{roll}" for name in "12"]
+    dataset = read_csv_poses(poses_of(tmp_path, "image,lat,lon,heading_deg,roll_deg", *rows), camera=CAMERA)
+    assert_allclose(rotation_matrices(dataset.images)[0, 0, 2], y, atol=1e-9)  # The picture's right, in the world.
+
+
 def test_quaternions_of_both_directions_and_of_other_axes(tmp_path: Path) -> None:
     """A camera that looks along x with z up: x right of it is -y, down is -z. By hand: w x y z = (1, -1, 1, -1) / 2."""
     boxes = boxes_of(tmp_path, ("a.jpg", 620, 140))

@@ -144,6 +144,7 @@ def read_csv_poses(
         detections=read_detections(detections, images, cameras),
         up=up,
         anchor=where.anchor,
+        is_on_earth=not table.has(*_QUATERNION),  # Angles are about the horizon, whatever they are.
         source=str(poses),
         max_rejected=max_rejected,
     )
