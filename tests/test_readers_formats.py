@@ -819,6 +819,30 @@ def test_an_image_without_a_pose_is_left_out_and_listed(tmp_path: Path, name: st
 
 
 @pytest.mark.parametrize("name", ["mapillary", "panoramax"])
+def test_an_image_that_two_answers_tell_the_same_of_is_one(tmp_path: Path, name: str) -> None:
+    """Questions for places next to each other have images in common."""
+    path = (mapillary_in if name == "mapillary" else panoramax_in)(tmp_path / "once")
+    read: Callable[..., Any] = read_mapillary if name == "mapillary" else read_panoramax
+    once = read(path)
+    first, second = json.loads(path.read_text()), json.loads(path.read_text())
+    images = second["data" if name == "mapillary" else "features"]
+    images[0]["thumb_url"] = "of another hour"
+    del images[1:]
+    for number, content in enumerate((second, first)):
+        write(tmp_path / "twice" / f"{number}.json", json.dumps(content))
+    twice = read(tmp_path / "twice")
+    assert_allclose(camera_centers(twice.images), camera_centers(once.images))
+    assert_allclose(twice.detections.center_px, once.detections.center_px)
+    assert twice.rejected is None
+    if name == "mapillary":
+        images[0]["computed_altitude"] += 1.0
+    else:
+        images[0]["properties"]["view:azimuth"] += 1.0
+    write(tmp_path / "twice" / "0.json", json.dumps(second))
+    assert "occur more than once" in refusal(lambda: read(tmp_path / "twice"))
+
+
+@pytest.mark.parametrize("name", ["mapillary", "panoramax"])
 def test_a_box_without_a_class_is_left_out_and_listed(tmp_path: Path, name: str) -> None:
     if name == "mapillary":
         path = mapillary_in(tmp_path)

@@ -36,8 +36,9 @@ _STORED: dict[int, Callable[[float, float, float, float], list[float]]] = {
 
 @dataclass
 class _Found:
-    """Images and boxes read so far."""
+    """Images and boxes read so far; `told` is a hash of what was read of each image, by its id."""
 
+    told: dict[str, int] = field(default_factory=dict)
     ids: list[str] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
     cameras: list[Camera] = field(default_factory=list)
@@ -154,18 +155,25 @@ def _add_image(image: Json, found: _Found) -> None:
         angles = ("computed_compass_angle", "compass_angle")
         heading = np.radians([next((image[name].number() for name in angles if name in image), np.nan)])
         rotation = local_from_cam(heading, np.zeros(1), np.radians([ROLL_DEG.get(orientation, 0.0)]))[0]
+    camera, place = _camera(image, width, height), [float(lon), float(lat), altitude]
+    sequence = image.get("sequence")
+    name = ONE_PASS if sequence is None else _sequence(sequence)
+    time = image["captured_at"].number() * _MILLI if "captured_at" in image else np.nan
+    boxes = _entries(image["detections"]) if "detections" in image else []
+    told = hash(repr((camera, orientation, place, rotation.tolist(), name, time, [box.value for box in boxes])))
+    if found.told.get(key) == told:
+        return  # Answers for places next to each other have images in common.
+    found.told[key] = told
     found.ids.append(key)
     found.names.append(f"{key}.jpg")
-    found.cameras.append(_camera(image, width, height))
+    found.cameras.append(camera)
     found.orientation.append(orientation)
-    found.place.append([float(lon), float(lat), altitude])
+    found.place.append(place)
     found.rotation.append(rotation)
-    sequence = image.get("sequence")
-    found.passes.append(ONE_PASS if sequence is None else _sequence(sequence))
-    found.time.append(image["captured_at"].number() * _MILLI if "captured_at" in image else np.nan)
-    if "detections" in image:
-        for detection in _entries(image["detections"]):
-            _add_box(detection, key, found)
+    found.passes.append(name)
+    found.time.append(time)
+    for detection in boxes:
+        _add_box(detection, key, found)
 
 
 def _sequence(value: Json) -> str:

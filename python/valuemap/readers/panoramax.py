@@ -26,8 +26,9 @@ _WHOLE_TURN_DEG = 360.0
 
 @dataclass
 class _Found:
-    """Images and boxes read so far."""
+    """Images and boxes read so far; `told` is a hash of what was read of each item, by its id."""
 
+    told: dict[str, int] = field(default_factory=dict)
     ids: list[str] = field(default_factory=list)
     cameras: list[Camera] = field(default_factory=list)
     place: list[list[float]] = field(default_factory=list)
@@ -123,23 +124,29 @@ def read_panoramax(
 
 def _add_item(item: Json, found: _Found, class_key: str | None, camera_height_m: float) -> None:
     properties = item["properties"]
-    found.ids.append(item["id"].key())
-    found.cameras.append(_camera(properties))
-    found.place.append(
-        _place(item["geometry"]["coordinates"], camera_height_m) if "geometry" in item else [math.nan] * 3
-    )
-    found.angles_deg.append(
-        [
-            _number(properties, name, default)
-            for name, default in (("view:azimuth", math.nan), ("pers:pitch", 0.0), ("pers:roll", 0.0))
-        ]
-    )
-    found.passes.append(item["collection"].text() if "collection" in item else ONE_PASS)
-    found.time.append(_seconds(properties["datetime"]) if "datetime" in properties else math.nan)
+    key, camera = item["id"].key(), _camera(properties)
+    place = _place(item["geometry"]["coordinates"], camera_height_m) if "geometry" in item else [math.nan] * 3
+    angles_deg = [
+        _number(properties, name, default)
+        for name, default in (("view:azimuth", math.nan), ("pers:pitch", 0.0), ("pers:roll", 0.0))
+    ]
+    collection = item["collection"].text() if "collection" in item else ONE_PASS
+    time = _seconds(properties["datetime"]) if "datetime" in properties else math.nan
     sigma = _number(properties, "quality:horizontal_accuracy", math.nan)
-    found.sigma_m.append(sigma if sigma > 0.0 else math.nan)
     holder = next((part for part in (properties, item) if "annotations" in part), None)
-    for annotation in holder["annotations"].entries() if holder is not None else ():
+    annotations = [] if holder is None else list(holder["annotations"].entries())
+    told = hash(repr((camera, place, angles_deg, collection, time, sigma, [each.value for each in annotations])))
+    if found.told.get(key) == told:
+        return  # Answers for places next to each other have items in common.
+    found.told[key] = told
+    found.ids.append(key)
+    found.cameras.append(camera)
+    found.place.append(place)
+    found.angles_deg.append(angles_deg)
+    found.passes.append(collection)
+    found.time.append(time)
+    found.sigma_m.append(sigma if sigma > 0.0 else math.nan)
+    for annotation in annotations:
         found.image_of_box.append(len(found.ids) - 1)
         found.classes.append(_class(annotation, class_key))
         found.edges.append(_edges(annotation["shape"]))
