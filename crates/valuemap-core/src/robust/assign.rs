@@ -9,7 +9,6 @@ use pathfinding::prelude::{Matrix, kuhn_munkres};
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use super::births::VOTE_RANGE;
 use super::drift::Look;
 use super::energy::{Object, fitting};
 use super::index::RayIndex;
@@ -208,7 +207,7 @@ pub fn claims_of_all(
     objects: &[Object],
     progress: &Progress,
 ) -> Result<Vec<Vec<Claim>>, Halt> {
-    let range_m = model.settings.viability.max_range_m * VOTE_RANGE;
+    let range_m = model.reach_m();
     let of_object = |(i, object): (usize, &Object)| {
         progress.check()?;
         let hits =

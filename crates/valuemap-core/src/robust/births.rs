@@ -12,8 +12,6 @@ use super::propose::{Hypothesis, Who, propose};
 use super::quick::quick_estimate;
 use crate::progress::{Halt, Progress};
 
-/// Detections this many times farther than the farthest proposed point still vote.
-pub const VOTE_RANGE: f64 = 2.5;
 /// Hypotheses that are tried side by side.
 const BATCH: usize = 64;
 /// Rounds of estimating and gathering votes again, at most.
@@ -94,7 +92,7 @@ impl Nursery<'_> {
         let Self { model, lookout, index } = *self;
         let min_votes = model.settings.min_votes as usize;
         let class = model.scene.rays.class[seeds[0] as usize];
-        let range_m = model.settings.viability.max_range_m * VOTE_RANGE;
+        let range_m = model.reach_m();
         let sizes: Vec<f64> = seeds.iter().map(|&ray| implied_size(model, ray, &start)).collect();
         let mut ln_size = sizes.iter().sum::<f64>() / sizes.len() as f64;
         let mut point = start;

@@ -178,15 +178,11 @@ impl Terms {
 
     /// Add what is known of sizes, ranges and heights.
     pub(super) fn add_priors(&mut self, model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) {
-        if let Some(sizes) = size_terms(model, votes, point) {
-            self.information += sizes.information;
-            self.gradient += sizes.gradient;
-            self.of_priors += sizes.square;
-        }
-        for terms in votes.iter().filter_map(|&ray| model.range_terms(ray, point)) {
-            self.information += terms.information;
-            self.gradient += terms.gradient;
-            self.of_priors += terms.square;
+        let of_ranges = votes.iter().filter_map(|&ray| model.range_terms(ray, point));
+        for prior in size_terms(model, votes, point).into_iter().chain(of_ranges) {
+            self.information += prior.information;
+            self.gradient += prior.gradient;
+            self.of_priors += prior.square;
         }
         if let Some((up, terms)) = height_terms(model, votes, point, camera_m2(model, votes)) {
             self.information += up * up.transpose() * terms.information;

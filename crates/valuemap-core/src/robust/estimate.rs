@@ -291,13 +291,7 @@ impl<'a> Joint<'a> {
         let alone: Vec<Matrix3<f64>> =
             alone.into_iter().map(|alone| Some(alone.cholesky()?.inverse())).collect::<Option<_>>()?;
         let own = votes().map(|(look, weight, left)| look.studentised(left, &alone[look.label], weight)).collect();
-        for (&(label, _), vantage) in self.votes.iter().zip(&self.vantages) {
-            if let Some(terms) = range_terms(vantage.range_m, vantage.center(), &self.points[label]) {
-                normals.add(label, label, &terms.information);
-                normals.add_gradient(label, &terms.gradient);
-            }
-        }
-        self.add_sizes(&of_labels, &mut normals);
+        self.add_priors(&of_labels, &mut normals);
         Some(Evaluation { normals, of_visits, own, pose_errors })
     }
 }
@@ -347,13 +341,18 @@ impl Joint<'_> {
         Some(found)
     }
 
-    fn add_sizes(&self, of_labels: &[Vec<u32>], normals: &mut Normals) {
-        let Some(model) = self.model else { return };
-        for (label, (votes, point)) in of_labels.iter().zip(&self.points).enumerate() {
-            if let Some(terms) = size_terms(model, votes, point) {
-                normals.add(label, label, &terms.information);
-                normals.add_gradient(label, &terms.gradient);
-            }
+    /// Add what measured ranges and sizes say of the labels.
+    fn add_priors(&self, of_labels: &[Vec<u32>], normals: &mut Normals) {
+        let of_ranges = self.votes.iter().zip(&self.vantages).filter_map(|(&(label, _), vantage)| {
+            Some((label, range_terms(vantage.range_m, vantage.center(), &self.points[label])?))
+        });
+        let of_sizes = of_labels
+            .iter()
+            .enumerate()
+            .filter_map(|(label, votes)| Some((label, size_terms(self.model?, votes, &self.points[label])?)));
+        for (label, prior) in of_ranges.chain(of_sizes) {
+            normals.add(label, label, &prior.information);
+            normals.add_gradient(label, &prior.gradient);
         }
     }
 

@@ -34,6 +34,7 @@ pub mod model;
 pub mod noise;
 pub mod parts;
 pub mod poses;
+pub mod prior;
 pub mod propose;
 pub mod quick;
 pub mod ranges;

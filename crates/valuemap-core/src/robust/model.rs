@@ -14,7 +14,8 @@ use super::counts::FEW;
 use super::heights::{Heights, up_of};
 use super::noise::{Noise, Spread};
 use super::parts::Part;
-use super::ranges::{Measured, RangeTerms, measured, range_terms};
+use super::prior::Prior;
+use super::ranges::{Measured, measured, range_terms};
 use super::scene::Scene;
 use super::{Settings, spreads_of};
 use crate::ray::Ray;
@@ -215,6 +216,8 @@ pub struct Sizes {
     pub spread: f64,
 }
 
+/// Detections this many times farther than `max_range_m` still vote.
+const VOTE_RANGE: f64 = 2.5;
 /// A vote's size disagrees with its object's by chance in this share of the votes: half hidden, cut, merged with another. It bounds
 /// what one size can say. 5 % as in robust regression (Huber and Ronchetti, "Robust Statistics", 2009, section 1).
 const ODD_SIZES: f64 = 0.05;
@@ -362,6 +365,12 @@ impl<'a> Model<'a> {
         &self.classes[self.scene.rays.class[ray as usize] as usize]
     }
 
+    /// How far from its camera an object may be that a detection votes for, m.
+    #[must_use]
+    pub fn reach_m(&self) -> f64 {
+        self.settings.viability.max_range_m * VOTE_RANGE
+    }
+
     /// The class that an object with some votes most probably is of.
     #[must_use]
     pub fn likeliest_class(&self, votes: &[u32]) -> Option<u32> {
@@ -404,7 +413,7 @@ impl<'a> Model<'a> {
 
     /// What the measured range of a ray says of a point; nothing where none is measured.
     #[must_use]
-    pub fn range_terms(&self, ray: u32, point: &Vector3<f64>) -> Option<RangeTerms> {
+    pub fn range_terms(&self, ray: u32, point: &Vector3<f64>) -> Option<Prior> {
         let (scene, row) = (self.scene, ray as usize);
         let told = || range_terms([scene.range_m[row], scene.range_sigma_m[row]], &scene.ray(ray).center, point);
         self.has_range(ray).then(told)?

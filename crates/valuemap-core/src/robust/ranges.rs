@@ -4,8 +4,9 @@
 //! in parts of it. Ranges of clutter are those of all detections. Networks that tell depth from one picture err widely now and then, so one range says
 //! no more than a part of the detections allows.
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::Vector3;
 
+use super::prior::Prior;
 use super::scene::Scene;
 
 /// A range is another thing's in this share of the votes: of what is behind the object or before it. As of sizes that are odd by chance (model.rs).
@@ -55,27 +56,16 @@ impl Measured {
     }
 }
 
-/// What a measured range says of a position.
-#[derive(Debug, Clone, Copy)]
-pub struct RangeTerms {
-    /// Information, 1/m².
-    pub information: Matrix3<f64>,
-    /// Gradient of half the square, 1/m.
-    pub gradient: Vector3<f64>,
-    /// Squared error in standard deviations, by its weight.
-    pub square: f64,
-}
-
 /// What a range with its standard deviation, m, measured from a camera's centre, says of a point: one more observation, along the line of sight. Nothing
 /// where there is none.
 #[must_use]
-pub fn range_terms([range_m, sigma_m]: [f64; 2], center: &Vector3<f64>, point: &Vector3<f64>) -> Option<RangeTerms> {
+pub fn range_terms([range_m, sigma_m]: [f64; 2], center: &Vector3<f64>, point: &Vector3<f64>) -> Option<Prior> {
     (range_m.is_finite() && sigma_m.is_finite()).then(|| {
         let away = point - center;
         let direction = away.normalize();
         let residual = (away.norm() - range_m) / sigma_m;
         let weight = (HUBER_SIGMAS / residual.abs()).min(1.0) / sigma_m;
-        RangeTerms {
+        Prior {
             information: direction * direction.transpose() * (weight / sigma_m),
             gradient: direction * (weight * residual),
             square: weight * sigma_m * residual * residual,

@@ -8,7 +8,6 @@ use rayon::prelude::*;
 use rustc_hash::FxHashSet;
 
 use super::assign::{gain_alone, places_of};
-use super::births::VOTE_RANGE;
 use super::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, object, owners, unseen, visits};
 use super::few::{most_probable, votes_on};
 use super::index::RayIndex;
@@ -143,7 +142,7 @@ impl Garden<'_> {
         let image = |ray: u32| model.scene.rays.image[ray as usize];
         let images: Vec<u32> = born.votes.iter().map(|&ray| image(ray)).collect();
         let may_be = |said| model.confusions.may_be(born.class, said);
-        let range_m = model.settings.viability.max_range_m * VOTE_RANGE;
+        let range_m = model.reach_m();
         let hits = self.of_few.hits_of_any(&places_of(model, born), &may_be, range_m);
         let mut takes: Vec<(u32, f64)> = hits
             .into_iter()

@@ -8,24 +8,14 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::energy::{size_of, visits};
 use super::model::Model;
+use super::prior::Prior;
 
 /// Sizes that disagree by more than this many standard deviations count less, in proportion (Huber): boxes are cut and hidden in part.
 const HUBER_SIGMAS: f64 = 2.0;
 
-/// Normal equations of a position by the sizes of its votes' boxes.
-#[derive(Debug, Clone, Copy)]
-pub struct SizeTerms {
-    /// Information, 1/m².
-    pub information: Matrix3<f64>,
-    /// Gradient of half the squares, 1/m.
-    pub gradient: Vector3<f64>,
-    /// Squared errors of the logarithms, in standard deviations.
-    pub square: f64,
-}
-
 /// What the boxes of votes of one object say about its position, linearised at a point; nothing where boxes tell nothing.
 #[must_use]
-pub fn size_terms(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> Option<SizeTerms> {
+pub fn size_terms(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> Option<Prior> {
     let sizes = model.class_of_votes(votes)?.sizes;
     // Before sizes are learned, they prune and no more.
     if !sizes.tell() || sizes.object.0.is_nan() {
@@ -48,8 +38,7 @@ pub fn size_terms(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> Opt
     let all = of_prior + boxes.iter().map(|(weight, ..)| weight).sum::<f64>();
     let size = (mean * of_prior + boxes.iter().map(|(weight, size, _)| weight * size).sum::<f64>()) / all;
     let away = size - mean;
-    let mut terms =
-        SizeTerms { information: Matrix3::zeros(), gradient: Vector3::zeros(), square: away * away * of_prior };
+    let mut terms = Prior { information: Matrix3::zeros(), gradient: Vector3::zeros(), square: away * away * of_prior };
     let mut pull = Vector3::zeros();
     for (weight, of_box, by_point) in boxes {
         let error = of_box - size;

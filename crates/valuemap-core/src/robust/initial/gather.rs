@@ -13,8 +13,6 @@ use crate::robust::parts::Part;
 use crate::robust::propose::{Hypothesis, Who, propose};
 use crate::robust::quick::quick_estimate;
 
-/// Detections this many times farther than the farthest proposed point still vote.
-pub const VOTE_RANGE: f64 = 2.5;
 /// Hypothesiss that are polished side by side.
 const BATCH: usize = 16;
 /// Who nominates, round after round, each time with the rays that are left over.
@@ -29,7 +27,7 @@ const MAX_ROUNDS: usize = 8;
 /// [`Halt::Cancelled`] when `progress` says so.
 pub fn gather(model: &Model<'_>, rays: &[u32], progress: &Progress) -> Result<(Vec<Label>, [u64; 2]), Halt> {
     let Model { scene, ref spreads, settings, .. } = *model;
-    let range_m = settings.viability.max_range_m * VOTE_RANGE;
+    let range_m = model.reach_m();
     let mut labels: Vec<Label> = Vec::new();
     let mut claimed = vec![false; scene.rays.rays.len()];
     let mut counts = [0_u64; 2];

@@ -9,7 +9,7 @@ use rustc_hash::FxHashMap;
 use super::adjust::adjust;
 use super::associate::Association;
 use super::existence::{self, Lookout, Looks, Rates, Sector};
-use super::gather::{VOTE_RANGE, gather};
+use super::gather::gather;
 use super::label::{self, Label, fingerprint};
 use super::{Schedule, Tally, exchange, settle, swap};
 use crate::progress::{Halt, Progress};
@@ -44,7 +44,7 @@ impl<'a> Solver<'a> {
     pub(super) fn new(model: &'a Model<'a>, rays: impl Iterator<Item = u32>) -> Self {
         let Model { scene, noise, ref spreads, settings, .. } = *model;
         let index = RayIndex::new(scene, spreads, settings.gate_sigmas, rays);
-        let range_m = settings.viability.max_range_m * VOTE_RANGE;
+        let range_m = model.reach_m();
         Self {
             scene,
             noise,
