@@ -22,7 +22,7 @@ from valuemap.check.agreement import Agreement, compare, gains_of_objects, measu
 from valuemap.check.boxes import PictureSize
 from valuemap.check.cameras import PARAMETERS, _followed, _is_wider_gate_only, with_focal
 from valuemap.check.contest import _compare, _joined, _Reading, _suspicion, hold_contest
-from valuemap.check.fault import LEAST_CHANCE, Convention, View, gains_of_all, keep_rows, with_poses
+from valuemap.check.fault import LEAST_CHANCE, Convention, View, gains_of_all, keep_rows, with_centers, with_poses
 from valuemap.check.fit import Estimate, Parameter, estimate
 from valuemap.check.headings import headings, level_rotations, rotations_of
 from valuemap.check.loose import Correction, Loose
@@ -184,7 +184,7 @@ def test_a_seam_that_rays_cannot_see_is_no_fault(good: Dataset, view: View, monk
     drive = one_drive_in_two(good)
     is_late = drive.images.pass_id.codes == drive.images.pass_id.code_of("late")
     up = np.where(is_late[:, None], [0.0, 0.0, 0.5 * seen_m], 0.0)
-    jumps = View(with_poses(drive, rotation_matrices(drive.images), camera_centers(drive.images) + up))
+    jumps = View(with_centers(drive, camera_centers(drive.images) + up))
     assert _at_a_seam(jumps) is not None
     monkeypatch.setattr("valuemap.check.passes._seen_m", lambda _: seen_m)
     assert _at_a_seam(jumps) is None
@@ -193,7 +193,7 @@ def test_a_seam_that_rays_cannot_see_is_no_fault(good: Dataset, view: View, monk
 def test_the_gate_is_one_angle_whatever_the_focal_length(good: Dataset, view: View) -> None:
     """Pictures said to be wider make errors of poses fewer pixels, which is no agreement."""
     noisy = camera_centers(good.images) + np.random.default_rng(3).normal(0.0, 1.0, (len(good.images), 3))
-    coarse = View(with_poses(good, rotation_matrices(good.images), noisy))
+    coarse = View(with_centers(good, noisy))
     wide = with_focal(coarse.dataset, -2.0)
     sample = coarse.many_places
     in_pixels = measure_agreement(sample.of(wide), sample.place_of_image, coarse.gate_px).gain.sum()
@@ -214,7 +214,7 @@ def test_a_focal_length_that_is_followed_to_a_wider_gate_only_is_not_named(
 
 
 def test_a_shift_in_time_is_followed_where_least_squares_stay_behind(good: Dataset, view: View) -> None:
-    shifted = View(with_poses(good, rotation_matrices(good.images), moved_along(good, 5.0)))
+    shifted = View(with_centers(good, moved_along(good, 5.0)))
     parameter = next(each for each in PARAMETERS if each.name == "along")
     given = gains_of_all(shifted, shifted.dataset)
     start = Correction(parameter, -1.0, 0.05, 1e-9, compare(given, given), _ESTIMATE)
@@ -594,7 +594,7 @@ def test_a_pass_that_jumps_where_it_goes_on_from_another_is_named_and_put_back(
     assert worst_seam(drive, camera_centers(drive.images)) is None
     center, is_late = camera_centers(drive.images), drive.images.pass_id.codes == drive.images.pass_id.code_of("late")
     there = moved_along(drive, 4.0) if move is None else center + move
-    spoiled = with_poses(drive, rotation_matrices(drive.images), np.where(is_late[:, None], there, center))
+    spoiled = with_centers(drive, np.where(is_late[:, None], there, center))
     finding = _FAULT[fault].find(View(spoiled))
     assert finding is not None
     assert "By its times pass late goes on where early ends" in finding.why
@@ -612,7 +612,7 @@ def test_drives_far_apart_that_follow_each_other_by_chance_have_no_seam(good: Da
     drive = one_drive_in_two(good)
     is_late = drive.images.pass_id.codes == drive.images.pass_id.code_of("late")
     there = camera_centers(drive.images) + np.where(is_late[:, None], [60.0, 0.0, 0.0], 0.0)
-    elsewhere = with_poses(drive, rotation_matrices(drive.images), there)
+    elsewhere = with_centers(drive, there)
     assert worst_seam(elsewhere, camera_centers(elsewhere.images)) is None
 
 

@@ -23,6 +23,7 @@ from valuemap.check.fault import (
     Stage,
     View,
     gains_of_all,
+    with_centers,
     with_detections,
     with_images,
     with_poses,
@@ -55,7 +56,7 @@ def with_focal(dataset: Dataset, log_factor: float) -> Dataset:
 
 
 def _shift_along(dataset: Dataset, forward_m: float) -> Dataset:
-    return with_poses(dataset, rotation_matrices(dataset.images), moved_along(dataset, forward_m))
+    return with_centers(dataset, moved_along(dataset, forward_m))
 
 
 PARAMETERS = (
@@ -63,7 +64,7 @@ PARAMETERS = (
     Parameter("yaw", _turn(1), 1e-5),
     Parameter("roll", _turn(2), 1e-5),
     Parameter("log_focal", with_focal, 1e-5),
-    Parameter("along", _shift_along, 1e-3, is_length=True),
+    Parameter("along", _shift_along, 1e-3, is_length=True, of_drives=True),
 )
 
 

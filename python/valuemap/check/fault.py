@@ -226,6 +226,12 @@ def with_poses(dataset: Dataset, rotation: Floats, center_in_world_m: Floats) ->
     return with_images(dataset, cam_from_world_quat=quaternion, cam_from_world_m=translation)
 
 
+def with_centers(dataset: Dataset, center_in_world_m: Floats) -> Dataset:
+    """Return a dataset with other camera centres (N, 3) that look as they did."""
+    translation = -np.einsum("nij,nj->ni", rotation_matrices(dataset.images), center_in_world_m)
+    return with_images(dataset, cam_from_world_m=translation)
+
+
 def keep_rows(dataset: Dataset, *, images: Any = None, detections: Any = None) -> Dataset:
     """Return a dataset with some images (mask) and some detections (mask) only, and nothing that refers to others."""
     kept_images = dataset.images if images is None else dataset.images.take(images)

@@ -9,7 +9,7 @@ the number of detections. Where errors of poses last longer than a place, whole 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,12 +35,16 @@ _CAUCHY = 2.4
 
 @dataclass(frozen=True)
 class Parameter:
-    """One thing to estimate, an angle or a length: how it changes a dataset, and the step of the derivative."""
+    """One thing to estimate, an angle or a length: how it changes a dataset, and the step of the derivative.
+
+    One `of_drives` changes an image by those before and after it; others change each image or camera by itself.
+    """
 
     name: str
     change: Change
     step: float
     is_length: bool = False
+    of_drives: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +84,7 @@ def estimate(
     value = np.zeros(len(parameters)) if start is None else start.value
     result = start
     for _ in range(_ROUNDS if start is None else _MOST_ROUNDS):
-        current = apply(dataset, parameters, value)
-        found = _solve(current, sample, gate_px, parameters, blocks)
+        found = _solve(_Changed(dataset, sample, parameters, value), gate_px, blocks)
         if found is None:
             return start
         value = value + found.value
@@ -100,11 +103,33 @@ def apply(dataset: Dataset, parameters: tuple[Parameter, ...], value: Floats | M
     return dataset
 
 
-def _solve(
-    dataset: Dataset, sample: Sample, gate_px: float, parameters: tuple[Parameter, ...], blocks: int | None
-) -> Estimate | None:
-    agreement = measure_agreement(sample.of(dataset), sample.place_of_image, gate_px)
-    found, rays = agreement.found, cast_rays(sample.of(dataset))
+class _Changed:
+    """The images of a sample with parameters changed by values: a thousandth of a large dataset."""
+
+    def __init__(self, dataset: Dataset, sample: Sample, parameters: tuple[Parameter, ...], value: Floats) -> None:
+        self.sample, self.parameters = sample, parameters
+        self._whole = apply(dataset, parameters, {p.name: v for p, v in _pairs(parameters, value) if p.of_drives})
+        self._alone = {p.name: v for p, v in _pairs(parameters, value) if not p.of_drives}
+        self.images = self._of(self._whole)
+
+    def by(self, parameter: Parameter, change: float) -> Dataset:
+        """Return the images with one parameter changed further."""
+        if parameter.of_drives:
+            return self._of(parameter.change(self._whole, change))
+        return parameter.change(self.images, change)
+
+    def _of(self, whole: Dataset) -> Dataset:
+        return apply(self.sample.of(whole), self.parameters, self._alone)
+
+
+def _pairs(parameters: tuple[Parameter, ...], value: Floats) -> Iterator[tuple[Parameter, float]]:
+    return zip(parameters, value.tolist(), strict=True)
+
+
+def _solve(changed: _Changed, gate_px: float, blocks: int | None) -> Estimate | None:
+    sample, parameters = changed.sample, changed.parameters
+    agreement = measure_agreement(changed.images, sample.place_of_image, gate_px)
+    found, rays = agreement.found, cast_rays(changed.images)
     votes = np.diff(found.voter_offsets)
     kept = np.flatnonzero(votes >= _LEAST_VOTES)
     if len(kept) < 3 * len(parameters):
@@ -114,7 +139,7 @@ def _solve(
     voter, point_of = voters[rows], np.repeat(np.arange(len(kept)), votes[kept])
     point = agreement.points_in_world_m[kept]
     residual = _residuals(rays, voter, point[point_of])
-    slope = np.stack([_slope(dataset, sample, p, voter, point[point_of]) for p in parameters], axis=2)
+    slope = np.stack([_slope(changed, p, voter, point[point_of]) for p in parameters], axis=2)
     of_point = _slopes_of_points(rays, voter, point[point_of])
     # A step may take a pixel to where its camera has no ray.
     tells = np.all(
@@ -141,11 +166,10 @@ def _solve(
     return Estimate(tuple(p.name for p in parameters), value, inverse @ meat @ inverse, count, len(kept))
 
 
-def _slope(dataset: Dataset, sample: Sample, parameter: Parameter, voter: Ints, point: Floats) -> Floats:
+def _slope(changed: _Changed, parameter: Parameter, voter: Ints, point: Floats) -> Floats:
     """Return d residual / d parameter (N, 2)."""
     ahead, behind = (
-        _residuals(cast_rays(sample.of(parameter.change(dataset, way * parameter.step))), voter, point)
-        for way in (1.0, -1.0)
+        _residuals(cast_rays(changed.by(parameter, way * parameter.step)), voter, point) for way in (1.0, -1.0)
     )
     with np.errstate(invalid="ignore"):
         return np.asarray((ahead - behind) / (2.0 * parameter.step))

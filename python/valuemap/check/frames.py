@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check.fault import Convention, Fault, Finding, Fix, Stage, View, with_images, with_poses
+from valuemap.check.fault import Convention, Fault, Finding, Fix, Stage, View, with_centers, with_images, with_poses
 from valuemap.check.headings import driving_azimuths, headings, rotations_of, turned
 from valuemap.check.passes import median_speed_mps
 from valuemap.check.sizes import are_outside, object_heights, plausible_heights
@@ -257,7 +257,7 @@ def _swap_on_the_earth(dataset: Dataset) -> Dataset:
         geographic = lon_lat_height_from_enu(points, (lat, lon, height))
         return enu_from_lon_lat_height(np.ascontiguousarray(geographic[:, [1, 0, 2]]), swapped_anchor)
 
-    moved = with_poses(dataset, rotation_matrices(dataset.images), swap(camera_centers(dataset.images)))
+    moved = with_centers(dataset, swap(camera_centers(dataset.images)))
     return Dataset(**{**vars(moved), "frame": Frame(anchor=swapped_anchor)})
 
 
@@ -284,7 +284,7 @@ class _OtherPositions:
         self._axes = axes
 
     def __call__(self, dataset: Dataset) -> Dataset:
-        return with_poses(dataset, rotation_matrices(dataset.images), camera_centers(dataset.images) @ self._axes.T)
+        return with_centers(dataset, camera_centers(dataset.images) @ self._axes.T)
 
 
 class _Headings:

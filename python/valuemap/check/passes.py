@@ -25,9 +25,9 @@ from valuemap.check.fault import (
     Fix,
     Stage,
     View,
+    with_centers,
     with_detections,
     with_images,
-    with_poses,
 )
 from valuemap.check.headings import driving_azimuths
 from valuemap.check.offsets import densest, pairs_within
@@ -711,7 +711,7 @@ class _Realigned:
         is_moved: Bools = dataset.images.pass_id.codes == dataset.images.pass_id.code_of(self._shift.pass_name)
         offset_m = self._shift.offset_m
         moved = moved_along(dataset, offset_m[0]) if self._shift.is_along else center + offset_m
-        return with_poses(dataset, rotation_matrices(dataset.images), np.where(is_moved[:, None], moved, center))
+        return with_centers(dataset, np.where(is_moved[:, None], moved, center))
 
 
 def moved_along(dataset: Dataset, forward_m: float) -> Floats:

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check.fault import Convention, Fix, with_images, with_poses
+from valuemap.check.fault import Convention, Fix, with_centers, with_images, with_poses
 from valuemap.check.headings import headings, rotations_of
 from valuemap.dataset import Dataset
 from valuemap.tables import Floats
@@ -112,7 +112,7 @@ def _invert_rotation(dataset: Dataset) -> Dataset:
 
 
 def _center_from_translation(dataset: Dataset) -> Dataset:
-    return with_poses(dataset, rotation_matrices(dataset.images), np.asarray(dataset.images.cam_from_world_m))
+    return with_centers(dataset, np.asarray(dataset.images.cam_from_world_m))
 
 
 def steadied(dataset: Dataset) -> Dataset:

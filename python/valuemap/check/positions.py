@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.spatial import cKDTree
 
-from valuemap.cameras import camera_centers, rotation_matrices
+from valuemap.cameras import camera_centers
 from valuemap.check.agreement import Comparison, compare
-from valuemap.check.fault import LEAST_CHANCE, Convention, Fault, Finding, Fix, Stage, View, with_poses
+from valuemap.check.fault import LEAST_CHANCE, Convention, Fault, Finding, Fix, Stage, View, with_centers
 from valuemap.check.passes import meeting_of_passes
 from valuemap.check.sample import driving_order
 from valuemap.dataset import Dataset
@@ -140,7 +140,7 @@ def _interpolated(dataset: Dataset) -> Dataset:
             late = when > when[fix[-1]]
             between[late] = value[fix[-1]] + speed * (when[late] - when[fix[-1]])
             moved[order[rows], axis] = between
-    return with_poses(dataset, rotation_matrices(images), moved)
+    return with_centers(dataset, moved)
 
 
 def _grid(view: View) -> tuple[str, float] | None:
@@ -254,4 +254,4 @@ class _Lifted:
         names: list[Any] = dataset.images.pass_id.texts()
         lift = -np.array([self._levels.get(name, 0.0) for name in names])
         center = camera_centers(dataset.images) + lift[:, None] * np.array(dataset.frame.up)
-        return with_poses(dataset, rotation_matrices(dataset.images), center)
+        return with_centers(dataset, center)
