@@ -90,6 +90,23 @@ proptest! {
         prop_assert_eq!(of(Who::Part), all);
     }
 
+    #[test]
+    fn a_ray_speaks_less_for_a_point_that_is_not_as_far_away_as_measured(object in object(), errors in errors_px()) {
+        let mut scene = street(70, 2.0, &[object], &errors);
+        let count = scene.rays.rays.len() as u32;
+        scene.range_m = (0..count).map(|ray| (scene.ray(ray).center - object).norm()).collect();
+        scene.range_sigma_m = vec![1.0; count as usize];
+        let support = |scene: &Scene, ray: u32| {
+            let model = Model::new(scene, &NOISE, &SETTINGS);
+            let all = propose(&model, &scene.usable_rays(), Who::All, &Progress::default()).unwrap();
+            all.into_iter().find(|hypothesis| hypothesis.rays[0] == ray).map(|hypothesis| hypothesis.support)
+        };
+        let ray = count / 2;
+        let Some(given) = support(&scene, ray) else { return Ok(()) };
+        scene.range_m[ray as usize] *= 3.0;
+        prop_assert!(support(&scene, ray).is_none_or(|wrong| wrong < given - 1.0));
+    }
+
 }
 
 proptest! {

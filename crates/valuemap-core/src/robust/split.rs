@@ -213,3 +213,26 @@ impl Place {
         Some(value - all.gradient.dot(&cholesky.solve(&all.gradient)))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn detections_keep_the_noise_of_their_rounding_whatever_share_the_rotation_has() {
+        let scale = Scale { px2: 1e6, size_m: 0.3 };
+        let noise = Noise {
+            detection_px: 1.0,
+            box_share: 0.05,
+            position_m: 0.1,
+            rotation_rad: 1e-3,
+            position_segment_m: 0.0,
+            rotation_segment_rad: 0.0,
+            position_drift_m: 0.0,
+            rotation_drift_rad: 0.0,
+        };
+        let of = |least_px| scale.with_rotation(&noise, 0.98, least_px);
+        assert!(of(0.0).detection_px < 0.21 && of(0.5).detection_px.to_bits() == 0.5_f64.to_bits());
+        assert!((of(0.5).rotation_rad - (0.98_f64 * 2.0).sqrt() * 1e-3).abs() < 1e-9);
+    }
+}
