@@ -77,6 +77,7 @@ SHOWN: dict[str, tuple[tuple[str, str, str], ...]] = {
         ("labels", "labels", ""),
         ("precision_2m", "precision at 2 m", ""),
         ("duplicate_labels_2m", "duplicates", ""),
+        ("facing_right", "face as said, 45 deg", ">= 0.86"),
     ),
     "bend_ramps": (
         ("covered", "covered of 5771", ">= 0.709"),

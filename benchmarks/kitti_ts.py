@@ -11,7 +11,9 @@ names and no timestamps. Images of other drives are driven hours or days apart.
 
 What is counted: R@1m and R@2m, signs with a label of their class within 1 m and 2 m in the plane, one to one, over all
 signs; right labels, within 2 m of a sign of their class, over all labels: precision at 2 m (of what somebody
-annotated).
+annotated). Facing: of the signs found within 2 m whose `faces_class` is known, how many labels face within 45 degrees
+of where it says. What its codes mean stands nowhere; they are read as 1: against the drive of the images that show the
+sign, 2: across it, 0: not known.
 """
 
 from __future__ import annotations
@@ -41,12 +43,16 @@ from field_data import (
     timed_map,
 )
 from kitti_signs import match_one_to_one, median
+from valuemap.cameras import rotation_matrices
 from valuemap.config import MapConfig
-from valuemap.dataset import Dataset
-from valuemap.tables import Floats
+from valuemap.dataset import Dataset, rows_of
+from valuemap.map_folder import Map
+from valuemap.tables import Floats, Ints
 
 RADII_M = (1.0, 2.0)
 CAMERA_HEIGHT_M = 1.65
+AGAINST_THE_DRIVE, ACROSS = 1, 2
+RIGHT_FACING_DEG = 45.0
 PIXEL_CENTER = 0.5
 
 
@@ -113,12 +119,40 @@ def score_labels(labels: Floats, label_class: NDArray[Any], signs: Floats, sign_
     }
 
 
+def drive_azimuths_rad(result: Map, dataset: Dataset) -> Floats:
+    """Return where the images that show each label look on average (N), clockwise from north."""
+    image = rows_of(dataset.detections.image_id, dataset.images.image_id)
+    voter = image[rows_of(result.votes.detection_id, dataset.detections.detection_id)]
+    forward = np.zeros((len(result.labels), 3))
+    label = rows_of(result.votes.label_id, result.labels.label_id)
+    np.add.at(forward, label, rotation_matrices(dataset.images)[voter, 2])
+    return np.asarray(np.arctan2(forward[:, 0], forward[:, 1]))
+
+
+def score_facing(facing_rad: Floats, drive_rad: Floats, faces_class: Ints) -> Figures:
+    """Count which of some labels face where their signs are said to; all (N), azimuths clockwise from north."""
+    is_known = np.isin(faces_class, (AGAINST_THE_DRIVE, ACROSS))
+    against = -np.cos(facing_rad - drive_rad)
+    across = np.abs(np.sin(facing_rad - drive_rad))
+    least = np.cos(np.radians(RIGHT_FACING_DEG))
+    is_right = np.where(faces_class == ACROSS, across, against) >= least
+    known = int(is_known.sum())
+    return {"facing_known": known, "facing_right": ratio(int(is_right[is_known].sum()), known)}
+
+
 def run(data_dir: Path, config: MapConfig, change: Change = as_it_is) -> dict[str, Figures]:
     """Map and score."""
-    result, seconds = timed_map(change(load(data_dir)), config)
+    dataset = change(load(data_dir))
+    result, seconds = timed_map(dataset, config)
+    place, (signs, sign_class) = result.labels.position_in_world_m[:, :2], truth(data_dir)
     names = np.array(result.labels.class_name.names, str)[result.labels.class_name.codes]
-    figures = score_labels(result.labels.position_in_world_m[:, :2], names, *truth(data_dir))
-    return {"kitti_ts": {**figures, "map_seconds": round(seconds, 2)}}
+    figures = score_labels(place, names, signs, sign_class)
+    distance_m = cdist(place, signs)
+    label, sign = match_one_to_one(distance_m, (names[:, None] == sign_class) & (distance_m <= max(RADII_M)))
+    faces_class = read_columns(data_dir / "signs.csv")["faces_class"][sign]
+    drive_rad = drive_azimuths_rad(result, dataset)
+    facing = score_facing(result.labels.facing_azimuth_rad[label], drive_rad[label], faces_class)
+    return {"kitti_ts": {**figures, **facing, "map_seconds": round(seconds, 2)}}
 
 
 def main() -> int:

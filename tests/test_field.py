@@ -175,6 +175,13 @@ def test_signs_are_found_by_labels_of_their_class() -> None:
     assert [figures[n] for n in ("right_labels_2m", "duplicate_labels_2m", "precision_2m")] == [3, 1, 0.75]
 
 
+def test_signs_face_against_the_drive_or_across_it() -> None:
+    north, south, east = 0.0, np.pi, np.pi / 2.0
+    facing = np.array([south, south + 0.7, south + 0.9, north, east, -east, south, east])
+    figures = kitti_ts.score_facing(facing, np.full(8, north), np.array([1, 1, 1, 1, 2, 2, 2, 0]))
+    assert figures == {"facing_known": 7, "facing_right": round(4 / 7, 4)}
+
+
 def test_ramps_are_matched_nearest_first() -> None:
     """The most matches would be two: the nearest pair takes the ramp that the other label needs."""
     labels, ramps = np.array([[0.0, 0.0], [2.0, 0.0]]), np.array([[1.2, 0.0], [4.4, 0.0]])
