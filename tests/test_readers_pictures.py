@@ -138,6 +138,14 @@ def test_pictures_with_a_heading_are_taken_as_they_are(tmp_path: Path) -> None:
     assert_allclose(dataset.images.position_sigma_m, 3.0)
 
 
+def test_pictures_may_all_be_taken_upright(tmp_path: Path) -> None:
+    for number in range(3):
+        picture(tmp_path / f"{number}.jpg", tags(52.0 + 1e-4 * number, 4.0, GPSImgDirection=90.0, Orientation=6))
+    dataset = read_pictures(tmp_path, poses="exif")
+    right = rotation_matrices(dataset.images)[:, 0]
+    assert_allclose(right, np.tile([0.0, 0.0, -1.0], (3, 1)), atol=1e-4)
+
+
 def test_panoramas_need_no_structure_from_motion(tmp_path: Path) -> None:
     xmp = b'<x GPano:ProjectionType="equirectangular" GPano:PoseHeadingDegrees="180"/>'
     picture(tmp_path / "p.jpg", tags(52.0, 4.0), (64, 32), xmp=xmp)

@@ -160,6 +160,7 @@ def read_pictures(
         detections=read_detections(detections, images, table),
         up=None,
         anchor=found.placed.anchor,
+        is_on_earth=True,
         source=str(folder),
         max_rejected=max_rejected,
         unposed={row_of[found.names[row]]: reason for row, reason in why_not.items()},
