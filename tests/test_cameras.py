@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from block import block
 from camera_models import cameras_like, distances_m, measure, seen_through
 from small_dataset import small_dataset
-from valuemap.camera_models import Pinhole, names_of_params
+from valuemap.camera_models import Pinhole, camera_models, names_of_params, places_of_params
 from valuemap.cameras import (
     Rays,
     camera_centers,
@@ -296,6 +296,14 @@ def test_pinholes_are_those_of_colmap_to_the_bit(model: str) -> None:
     assert ours.is_perspective_pinhole() == theirs.is_perspective_pinhole()
     assert ours.is_spherical() == theirs.is_spherical()
     assert names_of_params(model) == theirs.params_info
+
+
+@pytest.mark.parametrize("model", camera_models())
+def test_focal_lengths_and_principal_points_are_where_colmap_has_them(model: str) -> None:
+    names = names_of_params(model)
+    assert names is not None
+    theirs = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=np.ones(len(names.split(","))))
+    assert places_of_params(model) == (list(theirs.focal_length_idxs()), list(theirs.principal_point_idxs()))
 
 
 # The same city through other cameras.

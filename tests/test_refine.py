@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 import laws
 import valuemap
 from test_simulate import EXACT_BOXES, EXACT_POSES
-from valuemap import pipeline
+from valuemap import camera_models, pipeline
 from valuemap.cameras import camera_poses, cast_rays
 from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import Dataset, rows_of, write_dataset
@@ -111,6 +111,14 @@ def test_shifts_of_passes_of_three_metres_are_found_to_three_decimetres() -> Non
     moved = camera_poses(refined.dataset.images)[1] - camera_poses(faulty.images)[1]
     mean = np.stack([np.bincount(drive, weights=axis) / np.bincount(drive) for axis in moved.T], axis=1)
     assert np.abs(mean.mean(axis=0)).max() < 0.3
+
+
+def test_poses_of_pinholes_are_corrected_without_pycolmap(monkeypatch: pytest.MonkeyPatch) -> None:
+    def asked(*_: Any) -> None:
+        raise AssertionError("pycolmap is asked")
+
+    monkeypatch.setattr(camera_models, "colmap_camera", asked)
+    assert refine_poses(city(pass_shift_m=3.0), valuemap.MapConfig()).is_corrected
 
 
 def test_all_that_multiplies_matrices_has_one_thread_from_the_beginning() -> None:

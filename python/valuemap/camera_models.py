@@ -107,6 +107,15 @@ def names_of_params(model: str) -> str | None:
     return names
 
 
+def places_of_params(model: str) -> tuple[list[int], list[int]]:
+    """Return which parameters of a model are its focal lengths, and which its principal point; panoramas have none."""
+    names = [name.strip() for name in (names_of_params(model) or "").split(",")]
+    focal, middle = (
+        [place for place, name in enumerate(names) if name in of] for of in (("f", "fx", "fy"), ("cx", "cy"))
+    )
+    return focal, middle
+
+
 def camera_models() -> list[str]:
     """Return the names of COLMAP's camera models."""
     from valuemap.colmap import pycolmap

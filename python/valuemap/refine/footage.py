@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from valuemap.cameras import Rays, camera_centers, camera_poses, cast_rays, colmap_camera, rotation_of
+from valuemap.camera_models import places_of_params
+from valuemap.cameras import Rays, camera_centers, camera_poses, cast_rays, rotation_of
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives, InOrder
 from valuemap.refine.adjust import Chain
@@ -233,13 +234,11 @@ def _nodes(drives: Drives) -> tuple[Chain, Ints, Ints]:
 def _from_middle(dataset: Dataset, rays: Rays) -> Floats:
     """Return detections (N, 2) relative to the principal point; 0 in cameras without a focal length."""
     offset = np.zeros((len(rays), 2))
-    for row in range(len(dataset.cameras)):
-        camera = colmap_camera(dataset.cameras, row)
-        if not len(camera.focal_length_idxs()):
-            continue
-        middle = np.array([camera.principal_point_x, camera.principal_point_y])
-        members = rays.camera_row == row
-        offset[members] = dataset.detections.center_px[members] - middle
+    for row, model in enumerate(dataset.cameras.model.texts()):
+        focal, middle = places_of_params(model)
+        if focal:
+            members = rays.camera_row == row
+            offset[members] = dataset.detections.center_px[members] - dataset.cameras.params[row][middle]
     return offset
 
 

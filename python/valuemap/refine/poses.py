@@ -10,7 +10,8 @@ import numpy as np
 import scipy
 from threadpoolctl import threadpool_limits
 
-from valuemap.cameras import camera_poses, colmap_camera
+from valuemap.camera_models import places_of_params
+from valuemap.cameras import camera_poses
 from valuemap.config import MapConfig, NoiseConfig
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives, InOrder, in_driving_order
@@ -403,9 +404,9 @@ def _apply(dataset: Dataset, drives: Drives, found: Found, selected: Selected, u
     turned = rotations(mount[drive] + camera_mount[camera]) @ turned
     moved = with_poses(images, turned, center)
     params = []
-    for row, values in enumerate(dataset.cameras.params):
-        values = values.copy()
-        values[list(colmap_camera(dataset.cameras, row).focal_length_idxs())] *= 1.0 + focal[row, 0]
+    for row, model in enumerate(dataset.cameras.model.texts()):
+        values = dataset.cameras.params[row].copy()
+        values[places_of_params(model)[0]] *= 1.0 + focal[row, 0]
         params.append(values)
     return replace(dataset, images=moved, cameras=dataset.cameras.replace(params=params))
 
