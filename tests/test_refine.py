@@ -24,17 +24,18 @@ from valuemap import camera_models, pipeline
 from valuemap.cameras import camera_poses, cast_rays
 from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import Dataset, rows_of, write_dataset
-from valuemap.drives import Drives, find_drives, in_driving_order
+from valuemap.drives import Drives, InOrder, find_drives, in_driving_order
 from valuemap.engine.threads import ThreadEngine
 from valuemap.progress import silent
 from valuemap.refine import Refined, adjust, expose_rows, poses, refine_again, refine_poses, tracks
 from valuemap.refine import estimate as refine_estimate
+from valuemap.refine import footage as refine_footage
 from valuemap.refine import images as refine_images
 from valuemap.refine import select as refine_select
 from valuemap.refine.adjust import Adjustment, Scales
 from valuemap.refine.delay import _is_gain, delay_alone
 from valuemap.refine.estimate import Estimate, cut_into_segments, mounts_alone, prices
-from valuemap.refine.footage import Footage, Sigmas, _within, find_motion, gather, in_working_frame
+from valuemap.refine.footage import Footage, Motion, Sigmas, _within, find_motion, gather, in_working_frame
 from valuemap.refine.jumps import Links, Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
 from valuemap.refine.register import register
@@ -315,10 +316,18 @@ def between_neighbors(result: valuemap.Map, dataset: Dataset) -> tuple[float, fl
     return float(np.sqrt(np.mean(np.sum((error[a] - error[b]) ** 2, axis=1)))), float(square.mean())
 
 
-def test_all_that_images_show_tells_what_they_are_off_by_themselves() -> None:
+def test_all_that_images_show_tells_what_they_are_off_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
     config = dataclasses.replace(CITY, passes_per_street=5)
     clean, faulty = (simulate(dataclasses.replace(config, **faults), seed=0) for faults in ({}, DASHCAM))  # type: ignore[arg-type]
+    ordered: list[Dataset] = []
+
+    def in_order(dataset: Dataset, **options: Any) -> InOrder:
+        ordered.append(dataset)
+        return in_driving_order(dataset, **options)
+
+    monkeypatch.setattr(refine_images, "in_driving_order", in_order)
     result = valuemap.build_map(faulty)
+    assert len(ordered) == 1  # For all maps.
     alone = valuemap.build_map(faulty, valuemap.MapConfig().with_settings(["correct_poses=0"]))
     assert result.run["poses"]["found"] == "errors of images"
     assert result.corrected is not None
@@ -763,6 +772,21 @@ def test_a_waiting_car_gives_the_middle_one_of_its_images() -> None:
     longest = np.argmax(np.bincount(drives.viewpoint))
     members = np.sort(drives.order[drives.viewpoint == longest])
     assert drives.order[chosen & (drives.viewpoint == longest)][0] == members[len(members) // 2]
+
+
+def test_velocities_are_found_once_and_only_where_they_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[Dataset] = []
+
+    def find(dataset: Dataset, drives: Drives, **options: Any) -> Motion:
+        found.append(dataset)
+        return find_motion(dataset, drives, **options)
+
+    monkeypatch.setattr(refine_footage, "find_motion", find)
+    ordered = in_driving_order(city())
+    footage = gather(ordered.dataset, ordered.drives)
+    assert not found
+    assert footage.motion is footage.motion
+    assert len(found) == 1
 
 
 def test_velocities_are_those_of_the_trajectory() -> None:

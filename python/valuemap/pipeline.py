@@ -30,6 +30,7 @@ from valuemap.refine import (
     Refined,
     bundle,
     expose_rows,
+    gather_images,
     keyframes_of,
     noise_left,
     refine_again,
@@ -106,7 +107,7 @@ def build_map(
         with stages.measured("order"):
             source = InMemory(refined.dataset, config)
         labels, votes, counts, _ = _robust(source, config, stages, ThreadEngine(threads), progress)
-        labels = _with_errors_of_images(refined, labels, votes, config)
+        labels = _with_errors_of_images(refined, labels, votes)
     size = {"images": len(dataset.images), "detections": len(dataset.detections)}
     passes = len(np.unique(dataset.images.pass_id.codes))
     poses = None if refined is None else refined.record
@@ -217,7 +218,7 @@ def build_map_of_folder(
         _check_detections(name, size["detections"])
     labels, votes, counts, cells = _robust(source, config, stages, run.engine, progress, run)
     if refined is not None:
-        labels = _with_errors_of_images(refined, labels, votes, config)
+        labels = _with_errors_of_images(refined, labels, votes)
     passes = source.drives_record["passes"]
     untouched = _TOO_LARGE if config.poses.correct_poses else "correct_poses is 0"
     poses = {"found": "nothing", "because": untouched} if refined is None else refined.record
@@ -270,7 +271,7 @@ def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progr
 
     It is proven with the map of the poses as they were: each half of its objects places the images for the other half.
     """
-    engine, moved = ThreadEngine(threads), before
+    engine, moved, images = ThreadEngine(threads), before, gather_images(before, config)
     noise: Noise | None = None
     figures: dict[str, float] = {}
     for number in range(_MAPS_OF_IMAGES):
@@ -278,7 +279,7 @@ def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progr
         if not len(labels):
             return None
         noise = noise or of_map
-        told = bundle(before, labels, votes, noise, config)
+        told = bundle(images, labels, votes, noise)
         if number == 0:
             is_proven, figures = told.is_proven()
             if not is_proven:
@@ -289,17 +290,18 @@ def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progr
             break
     assert noise is not None
     record = {"found": "errors of images", "images": len(before.images), **figures}
-    return Refined(moved, record, is_corrected=True, before_images=(before, noise))
+    return Refined(moved, record, is_corrected=True, before_images=(images, noise))
 
 
-def _with_errors_of_images(refined: Refined, labels: Labels, votes: Votes, config: MapConfig) -> Labels:
+def _with_errors_of_images(refined: Refined, labels: Labels, votes: Votes) -> Labels:
     """Return labels with covariances that know of errors of images, where these were corrected.
 
     What is left of residuals once images are moved does not say how well they were.
     """
     if refined.before_images is None or not len(labels):
         return labels
-    told = bundle(refined.before_images[0], labels, votes, refined.before_images[1], config)
+    images, noise = refined.before_images
+    told = bundle(images, labels, votes, noise)
     columns = labels.covariance_m2.copy()
     columns[told.label] = covariance_columns(told.covariances())
     return labels.replace(covariance_m2=columns)

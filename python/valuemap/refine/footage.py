@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy
@@ -57,13 +58,20 @@ class Footage:
     rays: Rays
     cam_from_world: Floats
     center_in_world_m: Floats
-    motion: Motion
     camera: Ints
     chain: Chain
     node: Ints
     cam_from_node: Floats
     from_middle_px: Floats
     residual_from_cam: Floats
+    late_s: float | None = None
+
+    @cached_property
+    def motion(self) -> Motion:
+        """How keyframes move; where it is known how `late_s` poses are, in that part of each step alone."""
+        late_s = None if self.late_s is None else np.full(len(self.whole.images), self.late_s)
+        motion = find_motion(self.whole, self.whole_drives, late_s=late_s)
+        return Motion(**{name: value[self.row] for name, value in vars(motion).items()})
 
     @property
     def cameras(self) -> int:
@@ -109,6 +117,15 @@ class Footage:
 
 
 @dataclass(frozen=True, eq=False)
+class AllImages:
+    """The dataset `ordered`, and all its images in the working frame, which is in units of `unit_m`."""
+
+    ordered: InOrder
+    unit_m: float
+    footage: Footage
+
+
+@dataclass(frozen=True, eq=False)
 class Motion:
     """How images (N) move, m/s in the world, and turn, rad/s in camera axes, until the next and since the last one.
 
@@ -130,6 +147,12 @@ def with_poses(images: Images, rotation: Floats, center: Floats) -> Images:
     return images.replace(
         cam_from_world_quat=quat, cam_from_world_m=-np.einsum("nij,nj->ni", rotation_of(quat), center)
     )
+
+
+def with_poses_in_order(images: Images, ordered: InOrder, rotation: Floats, center: Floats) -> Images:
+    """Return images of the dataset `ordered`, in any order, with other poses, which are given in its order."""
+    row = ordered.rows_of_images(images.image_id)
+    return with_poses(images, rotation[row], center[row])
 
 
 def in_working_frame(dataset: Dataset, drives: Drives, unit_m: float) -> tuple[Dataset, Drives]:
@@ -196,7 +219,6 @@ def gather(dataset: Dataset, drives: Drives, *, every_image: bool = False) -> Fo
         rays=rays,
         cam_from_world=rotation,
         center_in_world_m=center,
-        motion=_take(find_motion(dataset, drives), row),
         camera=camera,
         chain=chain,
         node=node,
@@ -204,16 +226,6 @@ def gather(dataset: Dataset, drives: Drives, *, every_image: bool = False) -> Fo
         from_middle_px=_from_middle(part, rays),
         residual_from_cam=in_cam,
     )
-
-
-def moving_late(footage: Footage, late_s: float) -> Footage:
-    """Return the footage with the rates of poses that are about so late, as `find_motion` has them."""
-    motion = find_motion(footage.whole, footage.whole_drives, late_s=np.full(len(footage.whole.images), late_s))
-    return replace(footage, motion=_take(motion, footage.row))
-
-
-def _take(motion: Motion, rows: Ints) -> Motion:
-    return Motion(**{name: value[rows] for name, value in vars(motion).items()})
 
 
 def _nodes(drives: Drives) -> tuple[Chain, Ints, Ints]:

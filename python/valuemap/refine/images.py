@@ -15,17 +15,18 @@ import numpy as np
 from valuemap.cameras import camera_poses
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
-from valuemap.drives import InOrder, in_driving_order
+from valuemap.drives import in_driving_order
 from valuemap.refine.adjust import Adjustment, Scales, adjust, triangulate
 from valuemap.refine.estimate import WIDE, everything
 from valuemap.refine.footage import (
+    AllImages,
     Footage,
     Sigmas,
     gather,
     in_working_frame,
     points_in_working_frame,
     shown_objects,
-    with_poses,
+    with_poses_in_order,
 )
 from valuemap.refine.jumps import Links, Segments
 from valuemap.refine.poses import USUAL_RANGE_M, one_blas_thread
@@ -46,13 +47,10 @@ _RUN = 100
 class Bundle:
     """The images of a dataset with what they see of the objects (K) of a map, the rows `label` (K) of its labels.
 
-    `scales` are what errors of images and drift are thought to be a priori. All is in the working frame, in units of
-    `unit_m`.
+    `scales` are what errors of images and drift are thought to be a priori, in the working frame.
     """
 
-    ordered: InOrder
-    unit_m: float
-    footage: Footage
+    of: AllImages
     seen: Observations
     scales: Scales
     state: State
@@ -64,8 +62,9 @@ class Bundle:
             return adjust(self._problem(seen), self.state, tolerances=_TOLERANCES)
 
     def _problem(self, seen: Observations) -> Adjustment:
-        none = tuple(np.zeros_like(flags) for flags in everything(self.footage, _whole_drives(self.footage)))
-        return Adjustment(seen, self.footage.chain, self.scales, none, len(self.label), Links.none())
+        footage = self.of.footage
+        none = tuple(np.zeros_like(flags) for flags in everything(footage, _whole_drives(footage)))
+        return Adjustment(seen, footage.chain, self.scales, none, len(self.label), Links.none())
 
     def gain(self) -> tuple[float, float]:
         """Return by how much rays of objects meet better that had no part in it, and the chance that it is luck.
@@ -98,14 +97,10 @@ class Bundle:
     def images(self, like: Images) -> Images:
         """Return images `like` those of the dataset with the poses that they probably have."""
         poses = corrected(self.seen.views, self.adjusted(self.seen))
-        axes, unit_m = self.ordered.dataset.frame.east_north_up(), self.unit_m
-        _, center = camera_poses(self.ordered.dataset.images)
-        center = center + unit_m * (poses.center_in_world_m - self.footage.center_in_world_m) @ axes
-        moved = with_poses(self.ordered.dataset.images, poses.cam_from_world @ axes, center)
-        row = self.ordered.rows_of_images(like.image_id)
-        return like.replace(
-            cam_from_world_quat=moved.cam_from_world_quat[row], cam_from_world_m=moved.cam_from_world_m[row]
-        )
+        ordered, step = self.of.ordered, poses.center_in_world_m - self.of.footage.center_in_world_m
+        axes = ordered.dataset.frame.east_north_up()
+        center = camera_poses(ordered.dataset.images)[1] + self.of.unit_m * step @ axes
+        return with_poses_in_order(like, ordered, poses.cam_from_world @ axes, center)
 
     def covariances(self) -> Floats:
         """Return the covariances (K, 3, 3) in m² of the objects, errors of all images and drift marginalised."""
@@ -113,18 +108,25 @@ class Bundle:
         with one_blas_thread():
             covariance = self._problem(self.seen).step(state, _TOLERANCES[-1], of_things=True)[0].covariance
         assert covariance is not None
-        axes = self.ordered.dataset.frame.east_north_up()
-        return np.asarray(self.unit_m**2 * axes.T @ covariance @ axes)
+        axes = self.of.ordered.dataset.frame.east_north_up()
+        return np.asarray(self.of.unit_m**2 * axes.T @ covariance @ axes)
 
 
-def bundle(dataset: Dataset, labels: Labels, votes: Votes, noise: Noise, config: MapConfig) -> Bundle:
-    """Return the images of a dataset with what they see of a map, which `noise` is of poses as they are given.
+def gather_images(dataset: Dataset, config: MapConfig) -> AllImages:
+    """Return all images of a dataset as maps are bundled with them."""
+    unit_m = config.vote.max_range_m / USUAL_RANGE_M
+    ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
+    return AllImages(
+        ordered, unit_m, gather(*in_working_frame(ordered.dataset, ordered.drives, unit_m), every_image=True)
+    )
+
+
+def bundle(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> Bundle:
+    """Return images with what they see of a map; `noise` is that of maps of their poses.
 
     The map may have been made with other poses of the same images.
     """
-    unit_m = config.vote.max_range_m / USUAL_RANGE_M
-    ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
-    footage = gather(*in_working_frame(ordered.dataset, ordered.drives, unit_m), every_image=True)
+    ordered, unit_m, footage = images.ordered, images.unit_m, images.footage
     detection, thing, kinds, _ = shown_objects(footage, ordered, labels, votes)
     box = np.maximum(footage.dataset.detections.size_px[:, 1], 0.0)
     alone = np.hypot(noise.detection_px, noise.box_share * box)
@@ -142,7 +144,7 @@ def bundle(dataset: Dataset, labels: Labels, votes: Votes, noise: Noise, config:
         own_rad=max(noise.rotation_rad, 1e-5),
         constant=WIDE.constant,
     )
-    return Bundle(ordered, unit_m, footage, seen, scales, state, kinds)
+    return Bundle(images, seen, scales, state, kinds)
 
 
 def _in_runs(things: int) -> Bools:

@@ -29,15 +29,16 @@ from valuemap.refine.estimate import (
     mounts_alone,
 )
 from valuemap.refine.footage import (
+    AllImages,
     Footage,
     find_motion,
     gather,
     in_working_frame,
     moved_on,
-    moving_late,
     points_in_working_frame,
     shown_objects,
     with_poses,
+    with_poses_in_order,
 )
 from valuemap.refine.jumps import Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import find_landmarks
@@ -86,7 +87,7 @@ class Refined:
     is_corrected: bool = False
     found: Found | None = None
     is_noisy: bool = False
-    before_images: tuple[Dataset, Noise] | None = None
+    before_images: tuple[AllImages, Noise] | None = None
 
 
 def refine_poses(
@@ -255,14 +256,26 @@ def _corrected(dataset: Dataset, ordered: InOrder, found: Found | None, unit_m: 
 
 
 def _moved(dataset: Dataset, ordered: InOrder, found: Found, selected: Selected, unit_m: float) -> Dataset:
-    """Return a dataset corrected by what was selected of it `ordered`, in the order of its rows."""
-    corrected = _apply(ordered.dataset, ordered.drives, found, selected, unit_m)
-    row = ordered.rows_of_images(dataset.images.image_id)
-    images = dataset.images.replace(
-        cam_from_world_quat=corrected.images.cam_from_world_quat[row],
-        cam_from_world_m=corrected.images.cam_from_world_m[row],
+    """Return a dataset, with its poses and cameras corrected by what was selected of it `ordered`."""
+    images, drives = ordered.dataset.images, ordered.drives
+    offset, mount, delay, focal, camera_mount, camera_delay = selected.state.constants
+    drive, camera = drives.pass_code, rows_of(images.camera_id, dataset.cameras.camera_id)
+    segment = found.result.segments.of(drive, drives.order)
+    rotation, center = camera_poses(images)
+    late_s = delay[drive, 0] + camera_delay[camera, 0]
+    rotation, center = moved_on(find_motion(ordered.dataset, drives, late_s=late_s), rotation, center, late_s)
+    center = center + unit_m * offset[segment] @ dataset.frame.east_north_up()
+    rotation = rotations(mount[drive] + camera_mount[camera]) @ rotation
+    params = []
+    for row, model in enumerate(dataset.cameras.model.texts()):
+        values = dataset.cameras.params[row].copy()
+        values[places_of_params(model)[0]] *= 1.0 + focal[row, 0]
+        params.append(values)
+    return replace(
+        dataset,
+        images=with_poses_in_order(dataset.images, ordered, rotation, center),
+        cameras=dataset.cameras.replace(params=params),
     )
-    return replace(dataset, images=images, cameras=corrected.cameras)
 
 
 def _find(
@@ -303,7 +316,7 @@ def _find(
     told = Trajectories(jumps, hints, proven)
     if late_s:
         # Mean rates of steps in which turns begin are none of a delay: focal lengths took what they left.
-        footage = moving_late(footage, late_s)
+        footage = replace(footage, late_s=late_s)
 
     def begun(marks: Marks, known: tuple[Segments, Floats]) -> Estimate | None:
         return begin(footage, marks, config, told, known=known, turned_rad=turned, late_s=late_s)
@@ -388,27 +401,6 @@ def _looked_at(found: Found | None) -> dict[str, Any]:
     if found is None:
         return {"landmarks": 0, "shared_objects": 0}
     return {"landmarks": found.result.landmarks, "shared_objects": len(found.result.class_code)}
-
-
-def _apply(dataset: Dataset, drives: Drives, found: Found, selected: Selected, unit_m: float) -> Dataset:
-    """Return the dataset with the poses and cameras corrected."""
-    axes = dataset.frame.east_north_up()
-    offset, mount, delay, focal, camera_mount, camera_delay = selected.state.constants
-    images = dataset.images
-    drive, camera = drives.pass_code, rows_of(images.camera_id, dataset.cameras.camera_id)
-    segment = found.result.segments.of(drive, drives.order)
-    rotation, center = camera_poses(images)
-    late_s = delay[drive, 0] + camera_delay[camera, 0]
-    turned, center = moved_on(find_motion(dataset, drives, late_s=late_s), rotation, center, late_s)
-    center = center + unit_m * offset[segment] @ axes
-    turned = rotations(mount[drive] + camera_mount[camera]) @ turned
-    moved = with_poses(images, turned, center)
-    params = []
-    for row, model in enumerate(dataset.cameras.model.texts()):
-        values = dataset.cameras.params[row].copy()
-        values[places_of_params(model)[0]] *= 1.0 + focal[row, 0]
-        params.append(values)
-    return replace(dataset, images=moved, cameras=dataset.cameras.replace(params=params))
 
 
 def _describe(dataset: Dataset, found: Found, selected: Selected, unit_m: float) -> dict[str, Any]:
