@@ -42,9 +42,14 @@ from valuemap.refine.register import register
 from valuemap.refine.residuals import MOUNT, OFFSET, Observations, State, residuals, rotations, weights
 from valuemap.refine.select import Selected, _Equations, _Trial
 from valuemap.refine.tracks import merge_objects
+from valuemap.remote import Place
+from valuemap.robust import calibration_from_json
 from valuemap.simulate import simulate
 from valuemap.tables import Bools, Floats, Images, Ints, covariance_matrices
 from valuemap.tiles.compare import Comparison
+from valuemap.tiles.mapping import solve_cells
+from valuemap.tiles.solve import Solved
+from valuemap.tiles.source import InMemory
 from valuemap.tiles.work import open_work
 
 CITY = SimulationConfig(
@@ -353,7 +358,33 @@ def test_errors_of_images_are_no_noise_of_detections() -> None:
     """Images whose poses are exact stay, however poor the detector: what one object says another does not confirm."""
     poor = city(pixel_noise_px=5.0, **EXACT_POSES)
     assert refine_poses(poor, valuemap.MapConfig()).is_noisy
-    assert pipeline._by_images(poor, valuemap.MapConfig(), 1, silent) is None
+    assert not pipeline._by_images(poor, valuemap.MapConfig(), 1, silent).is_corrected
+
+
+def test_poses_that_stay_are_mapped_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    poor, mapped = city(pixel_noise_px=5.0, **EXACT_POSES), []
+    run = pipeline.Run(tmp_path, ThreadEngine(1))
+
+    def solve(source: InMemory, *arguments: Any, **options: Any) -> tuple[list[Solved], list[Place]]:
+        mapped.append(len(source.sample().image_id) == len(poor.images))
+        return solve_cells(source, *arguments, **options)
+
+    def build(made: pipeline.Run) -> valuemap.Map:
+        return pipeline.build_map_of_folder(tmp_path, MapConfig(), made, held=poor)[0]
+
+    monkeypatch.setattr(pipeline, "solve_cells", solve)
+    once, in_folder = valuemap.build_map(poor), build(run)
+    assert sum(mapped) == 2
+    calibration = calibration_from_json(once.run["calibration"], source="")
+    other = build(dataclasses.replace(run, calibration=dataclasses.replace(calibration, is_deep=False)))
+    assert sum(mapped) == 4  # Of another calibration, it is another map.
+    assert other.run["calibration"] != once.run["calibration"]
+    monkeypatch.setattr(pipeline, "_by_images", lambda dataset, *_: Refined(dataset, {}))
+    twice = valuemap.build_map(poor)
+    for same in (once, in_folder):
+        assert np.array_equal(same.labels.position_in_world_m, twice.labels.position_in_world_m)
+        assert np.array_equal(same.votes.detection_id, twice.votes.detection_id)
+        assert [same.run[name] for name in ("poses", "counts")] == [twice.run[name] for name in ("poses", "counts")]
 
 
 def test_a_map_without_objects_says_nothing_of_images() -> None:
@@ -363,7 +394,7 @@ def test_a_map_without_objects_says_nothing_of_images() -> None:
 
 def test_one_object_has_no_other_half(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refine_images, "halves", lambda points: np.zeros(len(points), np.int64))
-    assert pipeline._by_images(city(**DASHCAM), MapConfig(), 1, silent) is None
+    assert not pipeline._by_images(city(**DASHCAM), MapConfig(), 1, silent).is_corrected
 
 
 def test_a_part_of_many_objects_says_whether_images_are_off() -> None:
@@ -379,7 +410,12 @@ def test_single_images_are_looked_at_only_where_they_are_off_by_more_than_was_th
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clean, asked = city(), []
-    monkeypatch.setattr(pipeline, "_by_images", lambda dataset, *_: asked.append(dataset))
+
+    def by_images(dataset: Dataset, *_: Any) -> Refined:
+        asked.append(dataset)
+        return Refined(dataset, {})
+
+    monkeypatch.setattr(pipeline, "_by_images", by_images)
     for is_noisy in (False, True):
         monkeypatch.setattr(
             pipeline,

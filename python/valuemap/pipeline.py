@@ -27,6 +27,7 @@ from valuemap.portions import rows_on_disk
 from valuemap.progress import Progress, silent
 from valuemap.refine import (
     FITS_NO_BETTER,
+    Mapped,
     Refined,
     bundle,
     expose_rows,
@@ -38,7 +39,7 @@ from valuemap.refine import (
 )
 from valuemap.rejected import rejected_of_map
 from valuemap.remote import Place, UrlPath
-from valuemap.robust import Calibration, Noise, calibration_to_json
+from valuemap.robust import Calibration, calibration_to_json
 from valuemap.system import peak_memory_mb
 from valuemap.tables import Labels, Votes, covariance_columns
 from valuemap.tiles.calibration import calibrate
@@ -106,7 +107,7 @@ def build_map(
         refined = _refined(dataset, config, stages, threads, progress)
         with stages.measured("order"):
             source = InMemory(refined.dataset, config)
-        labels, votes, counts, _ = _robust(source, config, stages, ThreadEngine(threads), progress)
+        labels, votes, counts, _ = _robust(source, config, stages, ThreadEngine(threads), progress, refined.as_given)
         labels = _with_errors_of_images(refined, labels, votes)
     size = {"images": len(dataset.images), "detections": len(dataset.detections)}
     passes = len(np.unique(dataset.images.pass_id.codes))
@@ -216,7 +217,8 @@ def build_map_of_folder(
             )
         source, name, frame, size = on_disk, on_disk.name, on_disk.frame, on_disk.counts
         _check_detections(name, size["detections"])
-    labels, votes, counts, cells = _robust(source, config, stages, run.engine, progress, run)
+    as_given = None if refined is None else refined.as_given
+    labels, votes, counts, cells = _robust(source, config, stages, run.engine, progress, as_given, run)
     if refined is not None:
         labels = _with_errors_of_images(refined, labels, votes)
     passes = source.drives_record["passes"]
@@ -244,9 +246,14 @@ def _proven(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, 
 
     with stages.measured("poses"):
         refined = refine_poses(dataset, config, threads=threads, progress=progress)
+        if not refined.is_noisy:
+            return _of_drives(dataset, refined, config, threads, progress)
         # Where single images are far off, what whole drives seem to be off by is mostly theirs.
-        of_images = _by_images(dataset, config, threads, progress) if refined.is_noisy else None
-        return of_images or _of_drives(dataset, refined, config, threads, progress)
+        of_images = _by_images(dataset, config, threads, progress)
+        if of_images.is_corrected:
+            return of_images
+        refined = _of_drives(dataset, refined, config, threads, progress)
+        return refined if refined.is_corrected else replace(refined, as_given=of_images.as_given)
 
 
 def _of_drives(dataset: Dataset, refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:
@@ -266,29 +273,29 @@ def _of_drives(dataset: Dataset, refined: Refined, config: MapConfig, threads: i
     return replace(refined, record={**record, **refined.record}, found=None)
 
 
-def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progress) -> Refined | None:
-    """Correct what single images are probably off by, given a map; None where that is not proven.
+def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progress) -> Refined:
+    """Correct what single images are probably off by, given a map, where that is proven.
 
     It is proven with the map of the poses as they were: each half of its objects places the images for the other half.
     """
     engine, moved, images = ThreadEngine(threads), before, gather_images(before, config)
-    noise: Noise | None = None
+    as_given: Mapped | None = None
     figures: dict[str, float] = {}
     for number in range(_MAPS_OF_IMAGES):
-        labels, votes, of_map = _map_alone(moved, config, engine, progress)
+        _, labels, votes, _ = mapped = _map_alone(moved, config, engine, progress)
+        as_given = as_given or mapped
         if not len(labels):
-            return None
-        noise = noise or of_map
+            return Refined(before, {}, as_given=as_given)
+        noise = as_given[0].noise
         told = bundle(images, labels, votes, noise)
         if number == 0:
             is_proven, figures = told.is_proven()
             if not is_proven:
-                return None
+                return Refined(before, {}, as_given=as_given)
         last, moved = moved, replace(before, images=told.images(before.images))
         step_m = camera_centers(moved.images) - camera_centers(last.images)
         if np.sqrt(np.mean(step_m**2)) < _SETTLED * noise.position_m:
             break
-    assert noise is not None
     record = {"found": "errors of images", "images": len(before.images), **figures}
     return Refined(moved, record, is_corrected=True, before_images=(images, noise))
 
@@ -323,17 +330,16 @@ def _map_of_keyframes(
     It is of the images that poses are estimated with. Its noise is what was left there, and not sought.
     """
     config = replace(config, noise=noise_left(refined, config))
-    labels, votes, _ = _map_alone(keyframes_of(dataset, refined, config), config, engine, progress)
+    _, labels, votes, _ = _map_alone(keyframes_of(dataset, refined, config), config, engine, progress)
     return labels, votes
 
 
-def _map_alone(dataset: Dataset, config: MapConfig, engine: Engine, progress: Progress) -> tuple[Labels, Votes, Noise]:
-    """Return labels and votes of a dataset in memory and the noise that they were found with, and keep nothing."""
+def _map_alone(dataset: Dataset, config: MapConfig, engine: Engine, progress: Progress) -> Mapped:
+    """Return the map of a dataset in memory, and keep nothing."""
     source = InMemory(dataset, config)
     calibration = calibrate(source, config, None, None, engine, progress)
     cells, _ = solve_cells(source, calibration, config, engine, progress)
-    labels, votes, _ = join_cells(cells, source.grid, config)
-    return labels, votes, calibration.noise
+    return calibration, *join_cells(cells, source.grid, config)
 
 
 def _with_rejected(result: Map, read: Callable[[], Dataset], stages: _Stages) -> Map:
@@ -407,18 +413,26 @@ def _robust(
     stages: _Stages,
     engine: Engine,
     progress: Progress,
+    as_given: Mapped | None,
     run: Run | None = None,
 ) -> tuple[Labels, Votes, dict[str, Any], list[Place]]:
-    """Noise estimated from a sample, and in each cell the map with the least J that is found; docs/method.md."""
-    with stages.measured("calibrate"):
-        given = None if run is None else run.calibration
-        calibration = calibrate(source, config, given, None if run is None else run.parts, engine, progress)
-    with stages.measured("find"):
-        store = run.parts / CELLS if run is not None and len(source.cells) > 1 else None
-        known = None if run is None else run.known
-        solved, files = solve_cells(source, calibration, config, engine, progress, store=store, known=known)
-    with stages.measured("join"):
-        labels, votes, counts = join_cells(solved, source.grid, config)
+    """Noise estimated from a sample, and in each cell the map with the least J that is found; docs/method.md.
+
+    A map of the same poses that was made before stays, unless cells are to be kept, or another calibration is given.
+    """
+    given = None if run is None else run.calibration
+    store = run.parts / CELLS if run is not None and len(source.cells) > 1 else None
+    files: list[Place] = []
+    if as_given is not None and given is None and store is None:
+        calibration, labels, votes, counts = as_given
+    else:
+        with stages.measured("calibrate"):
+            calibration = calibrate(source, config, given, None if run is None else run.parts, engine, progress)
+        with stages.measured("find"):
+            known = None if run is None else run.known
+            solved, files = solve_cells(source, calibration, config, engine, progress, store=store, known=known)
+        with stages.measured("join"):
+            labels, votes, counts = join_cells(solved, source.grid, config)
     estimated = calibration_to_json(calibration)
     counts = {**counts, "drives": source.drives_record, "noise": estimated["noise"], "calibration": estimated}
     return labels, votes, counts, files

@@ -44,7 +44,7 @@ from valuemap.refine.jumps import Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import find_landmarks
 from valuemap.refine.residuals import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
 from valuemap.refine.select import Selected, select
-from valuemap.robust import Noise
+from valuemap.robust import Calibration, Noise
 from valuemap.tables import Bools, Floats, Labels, Votes
 
 USUAL_RANGE_M = 60.0
@@ -74,12 +74,17 @@ class Found:
     selected: Selected | None
 
 
+Mapped = tuple[Calibration, Labels, Votes, dict[str, Any]]
+"""A map of a dataset: what was estimated before, labels, votes, and what was counted."""
+
+
 @dataclass(frozen=True, eq=False)
 class Refined:
     """A dataset with better poses and cameras, or as it was; `record` says in `run.json` what was found.
 
     `found` is what a map may tell more of: it was corrected, or is in doubt. Where `is_noisy`, single images are off by
     more than was thought possible. `before_images` is what errors of single images were taken from, where they were.
+    `as_given` is the map of the dataset as it was, where one was made and nothing is corrected.
     """
 
     dataset: Dataset
@@ -88,6 +93,7 @@ class Refined:
     found: Found | None = None
     is_noisy: bool = False
     before_images: tuple[AllImages, Noise] | None = None
+    as_given: Mapped | None = None
 
 
 def refine_poses(
