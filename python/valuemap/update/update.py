@@ -105,12 +105,16 @@ def update_map(
             raise InputError(f"{added}: there are no detections in it", hint="find some with valuemap detect")
         both = None if _is_large(place, added) else _joined(place, second)
         before = reading.result()
+        written: Future[None] | None = None
         if both is None:
             rebuilt, cells, alone, posed, images_before = _updated_in_portions(place, second, before, run, progress)
         else:
+            is_cut = run.cuts_on_disk(len(both[0].images) + len(both[0].detections))
+            if is_cut:
+                _write(both[0], run)
             rebuilt, cells, alone, posed, images_before = _updated_in_memory(*both, before, run, beside, progress)
-        # Both take one core.
-        written = None if both is None or _cuts_on_disk(both[0], run) else beside.submit(_write, both[0], run)
+            if not is_cut:  # Beside what comes next: both take one core.
+                written = beside.submit(_write, both[0], run)
         before = _in_frame_of(rebuilt, before)
         result, changes, bridge = compare(before, rebuilt, alone, posed, images_before, progress=progress)
         result = replace(result, rejected=rejected_of_map(result, lambda: _with_detections(posed, run)))
@@ -142,10 +146,6 @@ def _joined(place: Path, second: Dataset) -> tuple[Dataset, Ints]:
     return ensure_checked(join_datasets(first, second)), first.images.image_id
 
 
-def _cuts_on_disk(joined: Dataset, run: Run) -> bool:
-    return run.cuts_on_disk(len(joined.images) + len(joined.detections))
-
-
 def _write(joined: Dataset, run: Run) -> None:
     write_dataset_in_pieces([joined], run.work / DATASET)
 
@@ -153,12 +153,10 @@ def _write(joined: Dataset, run: Run) -> None:
 def _updated_in_memory(
     joined: Dataset, images_before: Ints, before: Map, run: Run, beside: ThreadPoolExecutor, progress: Progress
 ) -> _Updated:
-    """Return what is compared, of datasets that fit into memory; what is cut on disk is written.
+    """Return what is compared, of datasets that fit into memory; what is cut on disk is written already.
 
     The added passes are mapped while most of the others' cells are found to be known.
     """
-    if _cuts_on_disk(joined, run):
-        _write(joined, run)
     alone: Future[Map] | None = None
     is_over = Event()
 
