@@ -14,9 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from reading import refusal, write
 from valuemap.cameras import camera_centers, rotation_matrices
+from valuemap.errors import InputError
 from valuemap.readers.exif import read_exif
 from valuemap.readers.pictures import read_pictures
-from valuemap.readers.structure import similarity_onto
+from valuemap.readers.structure import Picture, Posed, similarity_onto
 
 ANCHOR = (52.0, 4.0, 40.0)
 
@@ -144,6 +145,27 @@ def test_pictures_may_all_be_taken_upright(tmp_path: Path) -> None:
     dataset = read_pictures(tmp_path, poses="exif")
     right = rotation_matrices(dataset.images)[:, 0]
     assert_allclose(right, np.tile([0.0, 0.0, -1.0], (3, 1)), atol=1e-4)
+
+
+def test_structure_from_motion_leaves_out_pictures_taken_on_their_side(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number, orientation in enumerate((1, 6, 1, 8)):
+        picture(tmp_path / f"{number}.jpg", tags(52.0 + 1e-4 * number, 4.0, Orientation=orientation))
+    asked: list[str] = []
+
+    def find_poses(pictures: list[Picture], *_: Any, **__: Any) -> Posed:
+        asked.extend(each.name for each in pictures)
+        raise InputError("asked", hint="nothing")
+
+    monkeypatch.setattr("valuemap.readers.pictures.find_poses", find_poses)
+    assert refusal(lambda: read_pictures(tmp_path, workspace=tmp_path / "work")) == "asked | nothing"
+    assert asked == ["0.jpg", "2.jpg"]
+    for name in asked:
+        (tmp_path / name).unlink()
+    assert "none of 2 pictures has a pose; of the first: it was taken on its side" in refusal(
+        lambda: read_pictures(tmp_path, workspace=tmp_path / "work")
+    )
 
 
 def test_panoramas_need_no_structure_from_motion(tmp_path: Path) -> None:

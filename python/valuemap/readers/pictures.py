@@ -29,6 +29,11 @@ _FOCAL_GUESS = 1.2
 """Focal length over the larger side where nothing is known: about 45 degrees."""
 _SHOWN = 3
 _NO_PLACE = "it has no GPS position"
+_TURNED = (
+    "it was taken on its side or upside down (EXIF orientation), and structure from motion takes cameras for level"
+)
+_MOST_ROLL_DEG = 45.0
+"""Half a quarter turn: EXIF knows quarter turns alone."""
 _NO_HEADING = "it has no heading (GPSImgDirection, or PoseHeadingDegrees of a panorama)"
 
 
@@ -107,7 +112,10 @@ def read_pictures(
     sigma_m, sigma_rad = found.sigma_m.copy(), np.full(len(found.names), np.nan)
     part = np.full(len(found.names), -1)
     why_not: dict[int, str] = {}
-    rows = np.flatnonzero(~by_heading)
+    is_turned = ~by_heading & (np.abs([exif.roll_deg for exif in found.exif]) > _MOST_ROLL_DEG)
+    why_not |= dict.fromkeys(np.flatnonzero(is_turned).tolist(), _TURNED)
+    rotation[is_turned], center[is_turned] = np.nan, np.nan
+    rows = np.flatnonzero(~by_heading & ~is_turned)
     if len(rows):
         if workspace is None:
             raise SettingError("workspace: structure from motion needs a folder to work in", hint="give --workspace")
@@ -132,6 +140,11 @@ def read_pictures(
         refined = {distinct[number]: value for number, value in posed.cameras.items()}
         cameras = [each if by_heading[row] else refined.get(each, each) for row, each in enumerate(cameras)]
     has_pose = np.isfinite(center).all(axis=1) & np.isfinite(rotation).all(axis=(1, 2))
+    if not has_pose.any() and len(why_not):
+        raise InputError(
+            f"{folder}: none of {len(found.names)} pictures has a pose; of the first: {next(iter(why_not.values()))}",
+            hint="turn the pictures as their EXIF orientation says, save them so (exiftran -a), and detect in these",
+        )
     if not has_pose.any():
         raise InputError(
             f"{folder}: no picture has a heading (GPSImgDirection, or PoseHeadingDegrees of a panorama)",
