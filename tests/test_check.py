@@ -23,7 +23,7 @@ from valuemap.check.boxes import PictureSize
 from valuemap.check.cameras import PARAMETERS, _followed, _is_wider_gate_only, with_focal
 from valuemap.check.contest import _compare, _joined, _Reading, _suspicion, hold_contest
 from valuemap.check.fault import LEAST_CHANCE, Convention, View, gains_of_all, keep_rows, with_centers, with_poses
-from valuemap.check.fit import Estimate, Parameter, estimate
+from valuemap.check.fit import Changed, Estimate, Parameter, apply, estimate
 from valuemap.check.headings import headings, level_rotations, rotations_of
 from valuemap.check.loose import Correction, Loose
 from valuemap.check.offsets import find_shift
@@ -270,6 +270,20 @@ def test_a_vote_whose_camera_has_no_ray_a_step_away_is_left_out(view: View, monk
     found = estimate(view.dataset, view.many_places, view.gate_px, PARAMETERS[:1])
     assert found is not None
     assert abs(found.value[0]) < 3.0 * found.of("pitch")[1]
+
+
+def test_the_images_of_a_sample_change_as_they_do_in_the_whole(good: Dataset, view: View) -> None:
+    """What they are moved along are the drives of the whole dataset."""
+    sample = view.stretches
+    value = np.array([0.02, -0.03, 0.01, 0.04, 1.5])
+    changed, whole = Changed(good, sample, PARAMETERS, value), apply(good, PARAMETERS, value)
+    pairs = [(changed.images, sample.of(whole))]
+    pairs += [(changed.by(each, 0.1), sample.of(each.change(whole, 0.1))) for each in PARAMETERS]
+    for part, expected in pairs:
+        np.testing.assert_allclose(rotation_matrices(part.images), rotation_matrices(expected.images), atol=1e-12)
+        np.testing.assert_allclose(camera_centers(part.images), camera_centers(expected.images), atol=1e-9)
+        np.testing.assert_allclose(part.cameras.params[0], expected.cameras.params[0])
+    assert not np.allclose(camera_centers(changed.images.images), camera_centers(sample.of(good).images))
 
 
 def test_a_pass_that_drives_its_streets_again_and_again_is_a_drive() -> None:

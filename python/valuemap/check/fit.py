@@ -84,7 +84,7 @@ def estimate(
     value = np.zeros(len(parameters)) if start is None else start.value
     result = start
     for _ in range(_ROUNDS if start is None else _MOST_ROUNDS):
-        found = _solve(_Changed(dataset, sample, parameters, value), gate_px, blocks)
+        found = _solve(Changed(dataset, sample, parameters, value), gate_px, blocks)
         if found is None:
             return start
         value = value + found.value
@@ -103,7 +103,7 @@ def apply(dataset: Dataset, parameters: tuple[Parameter, ...], value: Floats | M
     return dataset
 
 
-class _Changed:
+class Changed:
     """The images of a sample with parameters changed by values: a thousandth of a large dataset."""
 
     def __init__(self, dataset: Dataset, sample: Sample, parameters: tuple[Parameter, ...], value: Floats) -> None:
@@ -126,7 +126,7 @@ def _pairs(parameters: tuple[Parameter, ...], value: Floats) -> Iterator[tuple[P
     return zip(parameters, value.tolist(), strict=True)
 
 
-def _solve(changed: _Changed, gate_px: float, blocks: int | None) -> Estimate | None:
+def _solve(changed: Changed, gate_px: float, blocks: int | None) -> Estimate | None:
     sample, parameters = changed.sample, changed.parameters
     agreement = measure_agreement(changed.images, sample.place_of_image, gate_px)
     found, rays = agreement.found, cast_rays(changed.images)
@@ -166,7 +166,7 @@ def _solve(changed: _Changed, gate_px: float, blocks: int | None) -> Estimate | 
     return Estimate(tuple(p.name for p in parameters), value, inverse @ meat @ inverse, count, len(kept))
 
 
-def _slope(changed: _Changed, parameter: Parameter, voter: Ints, point: Floats) -> Floats:
+def _slope(changed: Changed, parameter: Parameter, voter: Ints, point: Floats) -> Floats:
     """Return d residual / d parameter (N, 2)."""
     ahead, behind = (
         _residuals(cast_rays(changed.by(parameter, way * parameter.step)), voter, point) for way in (1.0, -1.0)
