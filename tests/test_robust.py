@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 import valuemap
+import valuemap._core as _core
 from block import block
 from literal import Floats, Pinhole, Sighting
 from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
 from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import Dataset
+from valuemap.errors import InputError
+from valuemap.robust import Noise, calibration_from_json
 from valuemap.simulate import simulate
 from valuemap.tables import Categories
 
@@ -197,3 +200,12 @@ def test_a_stricter_existence_keeps_fewer() -> None:
     configs = [MapConfig().with_settings([*known, f"min_existence={least}"]) for least in (0.0, 0.97)]
     kept = [len(valuemap.build_map(dataset, config).labels) for config in configs]
     assert kept[0] > kept[1] > 0
+
+
+def test_a_calibration_of_another_version_is_refused() -> None:
+    row = [0.5] * _core.CLASS_NUMBERS
+    noise = dict.fromkeys((each.name for each in dataclasses.fields(Noise)), 0.1)
+    value = {"noise": noise, "is_deep": False, "classes": {"light": row}, "pooled": row, "confusions": {}}
+    assert calibration_from_json(value, source="run.json").classes == {"light": tuple(row)}
+    with pytest.raises(InputError, match="run.json: is no calibration: expected [0-9]+ numbers of each class"):
+        calibration_from_json({**value, "classes": {"light": row[1:]}}, source="run.json")

@@ -101,6 +101,8 @@ def _finite(row: Sequence[float]) -> list[float | None]:
 
 
 def _numbers(row: Sequence[float | None]) -> tuple[float, ...]:
+    if len(row) != _core.CLASS_NUMBERS:
+        raise ValueError(f"expected {_core.CLASS_NUMBERS} numbers of each class, as this version of valuemap has")
     return tuple(math.nan if number is None else float(number) for number in row)
 
 

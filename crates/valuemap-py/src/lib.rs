@@ -258,6 +258,8 @@ mod _core {
     #[pymodule_export]
     use super::robust::{Scene, calibrate, find_labels, misfits, objects_of};
     #[pymodule_export]
+    const CLASS_NUMBERS: usize = valuemap_core::robust::model::ClassModel::NUMBERS;
+    #[pymodule_export]
     const CALIBRATION_STEPS: usize = valuemap_core::robust::CALIBRATION_STEPS;
     #[pymodule_export]
     const MISFIT_STEPS: usize = valuemap_core::robust::likeliest::MISFIT_STEPS;

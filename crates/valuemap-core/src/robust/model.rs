@@ -87,6 +87,9 @@ impl ClassModel {
         }
     }
 
+    /// How many numbers it is stored as.
+    pub const NUMBERS: usize = 20 + Heights::NUMBERS + 4 * Steps::NUMBERS;
+
     /// All of it as numbers, for storage.
     #[must_use]
     pub fn to_row(&self) -> Vec<f64> {
