@@ -114,12 +114,11 @@ def read_pictures(
     why_not: dict[int, str] = {}
     is_turned = ~by_heading & (np.abs([exif.roll_deg for exif in found.exif]) > _MOST_ROLL_DEG)
     why_not |= dict.fromkeys(np.flatnonzero(is_turned).tolist(), _TURNED)
-    rotation[is_turned], center[is_turned] = np.nan, np.nan
+    rotation[~by_heading], center[~by_heading] = np.nan, np.nan
     rows = np.flatnonzero(~by_heading & ~is_turned)
     if len(rows):
         if workspace is None:
             raise SettingError("workspace: structure from motion needs a folder to work in", hint="give --workspace")
-        rotation[rows], center[rows] = np.nan, np.nan
         distinct = sorted({cameras[row] for row in rows}, key=lambda c: (c.model, c.width, c.height, c.params))
         known_focal = {cameras[row] for row in rows if given is not None or found.exif[row].focal_px is not None}
         posed = find_poses(
