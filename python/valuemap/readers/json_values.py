@@ -103,3 +103,17 @@ class Json:
 
     def _at(self, value: Any, step: str) -> Json:
         return Json(value, self.where + step, self.hint)
+
+
+class Told:
+    """What answers told of each image, by its id: those for places next to each other have images in common."""
+
+    def __init__(self) -> None:
+        self._hash: dict[str, int] = {}
+
+    def again(self, key: str, *values: Any) -> bool:
+        """Return whether the values, which have the same text where they are the same, were told of an image before."""
+        told = hash(repr(values))
+        is_again = self._hash.get(key) == told
+        self._hash[key] = told
+        return is_again

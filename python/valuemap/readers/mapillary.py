@@ -16,7 +16,7 @@ from valuemap.readers.cameras_of import Camera, make_cameras, panorama
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.exif import ROLL_DEG
 from valuemap.readers.files import check_file, file_in, read_json
-from valuemap.readers.json_values import Json
+from valuemap.readers.json_values import Json, Told
 from valuemap.readers.poses import local_from_cam, make_images, place_on_earth
 from valuemap.readers.reader import Reader
 from valuemap.readers.vector_tile import outline_of_tile
@@ -36,9 +36,9 @@ _STORED: dict[int, Callable[[float, float, float, float], list[float]]] = {
 
 @dataclass
 class _Found:
-    """Images and boxes read so far; `told` is a hash of what was read of each image, by its id."""
+    """Images and boxes read so far, and what was told of them."""
 
-    told: dict[str, int] = field(default_factory=dict)
+    told: Told = field(default_factory=Told)
     ids: list[str] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
     cameras: list[Camera] = field(default_factory=list)
@@ -160,10 +160,8 @@ def _add_image(image: Json, found: _Found) -> None:
     name = ONE_PASS if sequence is None else _sequence(sequence)
     time = image["captured_at"].number() * _MILLI if "captured_at" in image else np.nan
     boxes = _entries(image["detections"]) if "detections" in image else []
-    told = hash(repr((camera, orientation, place, rotation.tolist(), name, time, [box.value for box in boxes])))
-    if found.told.get(key) == told:
-        return  # Answers for places next to each other have images in common.
-    found.told[key] = told
+    if found.told.again(key, camera, orientation, place, rotation.tolist(), name, time, [box.value for box in boxes]):
+        return
     found.ids.append(key)
     found.names.append(f"{key}.jpg")
     found.cameras.append(camera)

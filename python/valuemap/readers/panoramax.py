@@ -15,7 +15,7 @@ from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Import
 from valuemap.readers.cameras_of import Camera, make_cameras, panorama
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_file, file_in, read_json
-from valuemap.readers.json_values import Json
+from valuemap.readers.json_values import Json, Told
 from valuemap.readers.poses import local_from_cam, make_images, place_on_earth
 from valuemap.readers.reader import Reader
 from valuemap.tables import Images
@@ -26,9 +26,9 @@ _WHOLE_TURN_DEG = 360.0
 
 @dataclass
 class _Found:
-    """Images and boxes read so far; `told` is a hash of what was read of each item, by its id."""
+    """Images and boxes read so far, and what was told of them."""
 
-    told: dict[str, int] = field(default_factory=dict)
+    told: Told = field(default_factory=Told)
     ids: list[str] = field(default_factory=list)
     cameras: list[Camera] = field(default_factory=list)
     place: list[list[float]] = field(default_factory=list)
@@ -135,10 +135,8 @@ def _add_item(item: Json, found: _Found, class_key: str | None, camera_height_m:
     sigma = _number(properties, "quality:horizontal_accuracy", math.nan)
     holder = next((part for part in (properties, item) if "annotations" in part), None)
     annotations = [] if holder is None else list(holder["annotations"].entries())
-    told = hash(repr((camera, place, angles_deg, collection, time, sigma, [each.value for each in annotations])))
-    if found.told.get(key) == told:
-        return  # Answers for places next to each other have items in common.
-    found.told[key] = told
+    if found.told.again(key, camera, place, angles_deg, collection, time, sigma, [each.value for each in annotations]):
+        return
     found.ids.append(key)
     found.cameras.append(camera)
     found.place.append(place)
