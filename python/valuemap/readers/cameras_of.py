@@ -13,6 +13,7 @@ from valuemap.tables import Cameras, Categories, Floats, Ints
 
 _LARGEST_PX = 1_000_000
 _ROUNDING_PX = 2
+"""Each side may be a pixel off where pictures were made smaller: two of the width for one of the height."""
 
 
 @dataclass(frozen=True)
