@@ -21,14 +21,14 @@ use nalgebra::{Matrix3, Vector3};
 use rstar::RTree;
 use rstar::primitives::GeomWithData;
 
-use super::drift::{Drive, Look, OneLook};
+use super::drift::{Drive, Look, OneLook, Vantage};
 use super::estimate::is_one_visit;
 use super::heights::{HeightTerms, height_m};
 use super::looks::Lookout;
 use super::model::{Model, Sizes};
 use super::parts::Part;
 use super::scene::Scene;
-use super::seen::Seen;
+use super::seen::{Seen, Shares};
 use super::sizes::size_terms;
 
 /// Residuals beyond this many sigmas count less, in proportion (Huber): 95 % efficient where errors are Gaussian at 1.35, more above.
@@ -101,11 +101,12 @@ impl Terms {
 /// fix it, or if all voters are out of range: without parallax, whatever the detector's noise is runs to infinity.
 #[must_use]
 pub fn fit(model: &Model<'_>, votes: &[u32], start: Vector3<f64>) -> Option<Fit> {
+    let fitting = Fitting::new(model, votes);
     let mut weights = vec![1.0; votes.len()];
     let mut point = start;
-    let mut here = terms(model, votes, &weights, &point)?;
+    let mut here = fitting.terms(&weights, &point)?;
     if weights_of(&here.chi2, &mut weights) {
-        here = terms(model, votes, &weights, &point)?;
+        here = fitting.terms(&weights, &point)?;
     }
     let mut is_weighted = true;
     for _ in 0..MAX_STEPS {
@@ -114,8 +115,7 @@ pub fn fit(model: &Model<'_>, votes: &[u32], start: Vector3<f64>) -> Option<Fit>
             break;
         }
         let better = (0..MAX_HALVINGS).find_map(|_| {
-            let next =
-                terms(model, votes, &weights, &(point + step)).filter(|next| next.cost() <= here.cost() + LEAST_FALL);
+            let next = fitting.terms(&weights, &(point + step)).filter(|next| next.cost() <= here.cost() + LEAST_FALL);
             if next.is_none() {
                 step *= 0.25;
             }
@@ -127,7 +127,7 @@ pub fn fit(model: &Model<'_>, votes: &[u32], start: Vector3<f64>) -> Option<Fit>
         is_weighted = !weights_of(&here.chi2, &mut weights);
     }
     if !is_weighted {
-        here = terms(model, votes, &weights, &point)?;
+        here = fitting.terms(&weights, &point)?;
     }
     let cholesky = here.information.cholesky()?;
     let ln_information = 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
@@ -176,15 +176,15 @@ impl Terms {
         self.chi2.extend(&visit.chi2);
     }
 
-    /// Add what is known of sizes, ranges and heights.
-    pub(super) fn add_priors(&mut self, model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) {
+    /// Add what is known of sizes, ranges and heights; `camera_m2` is the [variance](camera_m2) of the cameras' heights.
+    pub(super) fn add_priors(&mut self, model: &Model<'_>, votes: &[u32], point: &Vector3<f64>, camera_m2: f64) {
         let of_ranges = votes.iter().filter_map(|&ray| model.range_terms(ray, point));
         for prior in size_terms(model, votes, point).into_iter().chain(of_ranges) {
             self.information += prior.information;
             self.gradient += prior.gradient;
             self.of_priors += prior.square;
         }
-        if let Some((up, terms)) = height_terms(model, votes, point, camera_m2(model, votes)) {
+        if let Some((up, terms)) = height_terms(model, votes, point, camera_m2) {
             self.information += up * up.transpose() * terms.information;
             self.gradient += up * terms.gradient;
             self.of_priors -= 2.0 * terms.ln_density;
@@ -192,47 +192,92 @@ impl Terms {
     }
 }
 
-/// Equation (1) at a point, with what a step needs.
-fn terms(model: &Model<'_>, votes: &[u32], weights: &[f64], point: &Vector3<f64>) -> Option<Terms> {
-    let mut sum = Terms::none();
-    for visit in visits(model.scene, votes) {
-        let first = sum.chi2.len();
-        sum.add(&terms_of_visit(model, visit, &weights[first..first + visit.len()], point)?);
-    }
-    sum.add_priors(model, votes, point);
-    sum.cost().is_finite().then_some(sum)
+/// Votes whose object is sought, with what stays the same wherever it is.
+struct Fitting<'a> {
+    model: &'a Model<'a>,
+    votes: &'a [u32],
+    /// From where each is cast.
+    vantages: Vec<Vantage>,
+    /// How many votes each visit has.
+    of_visits: Vec<usize>,
+    camera_m2: f64,
 }
 
-/// Equation (1) of the votes of one visit.
-fn terms_of_visit(model: &Model<'_>, visit: &[u32], weights: &[f64], point: &Vector3<f64>) -> Option<Terms> {
-    let look_of = |ray: u32| Look::of(model.scene, model.noise, ray, 0, point).map(Look::by_itself);
-    let mut terms = if let [ray] = visit {
-        let look = look_of(*ray)?;
+impl<'a> Fitting<'a> {
+    fn new(model: &'a Model<'a>, votes: &'a [u32]) -> Self {
+        let vantages = vantages_of(model, votes);
+        let of_visits = visits(model.scene, votes).map(<[u32]>::len).collect();
+        Self { model, votes, vantages, of_visits, camera_m2: camera_m2(model, votes) }
+    }
+
+    /// Equation (1) at a point, with what a step needs.
+    fn terms(&self, weights: &[f64], point: &Vector3<f64>) -> Option<Terms> {
+        let mut sum = Terms { chi2: Vec::with_capacity(self.votes.len()), ..Terms::none() };
+        for &count in &self.of_visits {
+            let first = sum.chi2.len();
+            let visit = first..first + count;
+            let said = say(&self.vantages[visit.clone()], &weights[visit], point, &mut sum.chi2)?;
+            sum.information += said.information;
+            sum.gradient += said.gradient;
+            sum.energy += said.energy;
+        }
+        sum.add_priors(self.model, self.votes, point, self.camera_m2);
+        sum.cost().is_finite().then_some(sum)
+    }
+}
+
+/// From where some votes are cast.
+fn vantages_of(model: &Model<'_>, votes: &[u32]) -> Vec<Vantage> {
+    votes.iter().map(|&ray| Vantage::of(model.scene, model.noise, ray)).collect()
+}
+
+/// Equation (1) of the votes of one visit, but for their squared residuals.
+struct Said {
+    information: Matrix3<f64>,
+    gradient: Vector3<f64>,
+    energy: f64,
+}
+
+/// What the votes of one visit say of a point; their squared residuals are added to `chi2`.
+fn say(visit: &[Vantage], weights: &[f64], point: &Vector3<f64>, chi2: &mut Vec<f64>) -> Option<Said> {
+    let first = chi2.len();
+    let look_from = |vantage: &Vantage| vantage.look(0, point).map(Look::by_itself);
+    let mut said = if let [vantage] = visit {
+        let look = look_from(vantage)?;
         let OneLook { information, gradient, square, log_determinant, left } = OneLook::of(&look, weights[0])?;
-        let chi2 = vec![left.norm_squared() / look.variance];
-        Terms { information, gradient, energy: square + log_determinant, of_priors: 0.0, chi2 }
+        chi2.push(left.norm_squared() / look.variance);
+        Said { information, gradient, energy: square + log_determinant }
     } else {
-        let looks: Vec<Look> = visit.iter().map(|&ray| look_of(ray)).collect::<Option<_>>()?;
+        // Not collected: an iterator of options does not say how many there will be.
+        let mut looks = Vec::with_capacity(visit.len());
+        for vantage in visit {
+            looks.push(look_from(vantage)?);
+        }
         let drive = Drive::along(&looks, weights, 1)?;
         let (information, gradient) = drive.normals.of_one();
-        let chi2 = looks.iter().zip(drive.left()).map(|(look, left)| left.norm_squared() / look.variance).collect();
-        let energy = drive.normals.square + drive.log_determinant();
-        Terms { information, gradient, energy, of_priors: 0.0, chi2 }
+        chi2.extend(looks.iter().zip(drive.left()).map(|(look, left)| left.norm_squared() / look.variance));
+        Said { information, gradient, energy: drive.normals.square + drive.log_determinant() }
     };
-    for (&chi2, &weight) in terms.chi2.iter().zip(weights) {
+    for (&chi2, &weight) in chi2[first..].iter().zip(weights) {
         // Huber's loss is 2 c |r| - c² beyond c, of which the weighted square is c |r|.
         if weight < 1.0 {
-            terms.energy += (HUBER_SIGMAS * chi2.sqrt() - HUBER_SIGMAS * HUBER_SIGMAS).max(0.0);
+            said.energy += (HUBER_SIGMAS * chi2.sqrt() - HUBER_SIGMAS * HUBER_SIGMAS).max(0.0);
         }
     }
-    Some(terms)
+    Some(said)
 }
 
-/// The same with the weights that their residuals there have.
+/// Equation (1) of the votes of one visit, with the weights that their residuals there have.
 pub(super) fn weighted_terms_of_visit(model: &Model<'_>, visit: &[u32], point: &Vector3<f64>) -> Option<Terms> {
-    let mut weights = vec![1.0; visit.len()];
-    let terms = terms_of_visit(model, visit, &weights, point)?;
-    if weights_of(&terms.chi2, &mut weights) { terms_of_visit(model, visit, &weights, point) } else { Some(terms) }
+    let vantages = vantages_of(model, visit);
+    let (mut weights, mut chi2) = (vec![1.0; visit.len()], Vec::with_capacity(visit.len()));
+    let mut said = say(&vantages, &weights, point, &mut chi2)?;
+    if weights_of(&chi2, &mut weights) {
+        chi2.clear();
+        said = say(&vantages, &weights, point, &mut chi2)?;
+    }
+    let Said { information, gradient, energy } = said;
+    Some(Terms { information, gradient, energy, of_priors: 0.0, chi2 })
 }
 
 /// What the heights of its class say of an object with some votes at a point, with a variance of the cameras' heights, m²; and what is up. Nothing before
@@ -249,7 +294,7 @@ pub(super) fn height_terms(
 }
 
 /// Variance of the mean position of the cameras of some votes, each axis, m²: heights are above where the cameras are said to be.
-fn camera_m2(model: &Model<'_>, votes: &[u32]) -> f64 {
+pub(super) fn camera_m2(model: &Model<'_>, votes: &[u32]) -> f64 {
     let (mut sum, mut visits_count) = (0.0, 0.0_f64);
     for visit in visits(model.scene, votes) {
         let view = model.scene.view(visit[0]);
@@ -302,8 +347,13 @@ pub fn implied_size(model: &Model<'_>, ray: u32, point: &Vector3<f64>) -> f64 {
 /// The size of an object: the median of what its votes imply, drawn to what its class is like where votes are few.
 #[must_use]
 pub fn size_of(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> f64 {
-    let mut sizes: Vec<f64> =
-        votes.iter().map(|&ray| implied_size(model, ray, point)).filter(|s| s.is_finite()).collect();
+    usual_size(model, votes, votes.iter().map(|&ray| implied_size(model, ray, point)))
+}
+
+/// The same from what each of its votes implies.
+pub(super) fn usual_size(model: &Model<'_>, votes: &[u32], implied: impl Iterator<Item = f64>) -> f64 {
+    let mut sizes: Vec<f64> = Vec::with_capacity(votes.len());
+    sizes.extend(implied.filter(|size| size.is_finite()));
     if sizes.is_empty() {
         return f64::NAN;
     }
@@ -424,8 +474,9 @@ impl Object {
         }
         let class = &model.classes[self.class as usize];
         self.seen = lookout.looks(model, &self.fit.point, &self.votes, &others);
-        self.energy -= 2.0 * self.seen.ln_likelihood(class);
-        self.real = self.seen.real(class);
+        let judged = self.seen.judged(&Shares::of(class));
+        self.energy -= 2.0 * judged.ln_likelihood();
+        self.real = judged.real();
         self.others = others;
         self.energy.is_finite().then_some(self)
     }

@@ -13,6 +13,7 @@ use super::energy::{Object, by_place, object, unseen};
 use super::index::RayIndex;
 use super::looks::Lookout;
 use super::model::{ClassModel, Model};
+use super::seen::Shares;
 use crate::progress::{Halt, Progress};
 
 /// Places along a ray that are compared: so many to a factor of ten in distance are 8 % apart, less than what sizes tell.
@@ -153,7 +154,8 @@ impl Nursery<'_> {
             return false;
         }
         let seen = self.lookout.looks(self.model, &alone.fit.point, votes, &[]);
-        at_most + seen.ln_likelihood(class) > LEAST_LN_ODDS && seen.real(class).ln() > LEAST_LN_ODDS
+        let judged = seen.judged(&Shares::of(class));
+        at_most + judged.ln_likelihood() > LEAST_LN_ODDS && judged.real().ln() > LEAST_LN_ODDS
     }
 
     /// How much denser objects are at a place, with the company they have there, than clutter is at the elevations of some rays, in logarithms.

@@ -5,7 +5,7 @@
 
 use rustc_hash::FxHashMap;
 
-use super::energy::{Fit, Object, Terms, energy_of_votes, fitting_unseen, visits, weighted_terms_of_visit};
+use super::energy::{Fit, Object, Terms, camera_m2, energy_of_votes, fitting_unseen, visits, weighted_terms_of_visit};
 use super::looks::Lookout;
 use super::model::Model;
 use super::seen::Seen;
@@ -104,7 +104,7 @@ impl<'a> Foresight<'a> {
             }
             sum.add(known.get(visit)?.as_ref()?);
         }
-        sum.add_priors(model, votes, &point);
+        sum.add_priors(model, votes, &point, camera_m2(model, votes));
         Some(sum)
     }
 }

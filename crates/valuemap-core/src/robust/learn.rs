@@ -1,5 +1,7 @@
 //! What a map tells about each class: how often its objects are detected, how large they are, how much clutter there is.
 
+use rayon::prelude::*;
+
 use super::clutter::{elevation_factor, score_ratio};
 use super::company::company;
 use super::energy::{Object, implied_size};
@@ -8,7 +10,7 @@ use super::looks::Lookout;
 use super::model::{ClassModel, Model, ODD_PASSES, Rates};
 use super::parts::Part;
 use super::reach::reach;
-use super::seen::Looks;
+use super::seen::{Looks, Shares};
 
 /// Steps of expectation and maximisation: some ten change the rates by less than a thousandth.
 const STEPS: usize = 20;
@@ -36,9 +38,14 @@ pub fn learn(model: &mut Model<'_>, lookout: &Lookout, rays: &[u32], objects: &[
     let evidence = Evidence::new(model, lookout, rays, objects);
     let all: Vec<&Object> = objects.iter().collect();
     let pooled = evidence.learned(&all, rays, &model.pooled);
+    let is_only = |before: &ClassModel| model.classes.len() == 1 && has_same_numbers(before, &model.pooled);
     let classes: Vec<ClassModel> = (0..)
         .zip(&model.classes)
         .map(|(class, before)| {
+            // All together are the only one.
+            if pooled.is_learned && is_only(before) {
+                return pooled;
+            }
             let of_class: Vec<&Object> = all.iter().copied().filter(|object| object.class == class).collect();
             let rays: Vec<u32> =
                 rays.iter().copied().filter(|&ray| model.scene.rays.class[ray as usize] == class).collect();
@@ -47,6 +54,11 @@ pub fn learn(model: &mut Model<'_>, lookout: &Lookout, rays: &[u32], objects: &[
         })
         .collect();
     (model.pooled, model.classes) = (pooled, classes);
+}
+
+/// Whether two classes are alike to the bit, what is no number as well.
+fn has_same_numbers(a: &ClassModel, b: &ClassModel) -> bool {
+    a.to_row().iter().map(|number| number.to_bits()).eq(b.to_row().iter().map(|number| number.to_bits()))
 }
 
 /// What classes are learned from.
@@ -210,10 +222,12 @@ fn rates(objects: &[&Object], before: &ClassModel) -> (Rates, f64) {
     let alike = median(&mut shares).map_or(Rates::ALIKE, |share| Rates { recall: recall(share), ..Rates::ALIKE });
     let from = |rates: Rates| {
         let class = learned_rates(objects, ClassModel { rates, odd_passes: ODD_PASSES.1, ..*before })?;
-        let ln_likelihood: f64 = objects.iter().map(|object| object.seen.ln_likelihood(&class)).sum();
+        let shares = Shares::of(&class);
+        let ln_likelihood: f64 = objects.iter().map(|object| object.seen.judged(&shares).ln_likelihood()).sum();
         Some((ln_likelihood, class))
     };
-    let starts = [from(Rates::GUESS), from(alike)].into_iter().flatten();
+    let (differing, alike) = rayon::join(|| from(Rates::GUESS), || from(alike));
+    let starts = [differing, alike].into_iter().flatten();
     let likeliest = starts.max_by(|a, b| a.0.total_cmp(&b.0)).map_or(*before, |(_, class)| class);
     (likeliest.rates, likeliest.odd_passes)
 }
@@ -221,11 +235,12 @@ fn rates(objects: &[&Object], before: &ClassModel) -> (Rates, f64) {
 /// The same from one start; nothing if there are few looks.
 fn learned_rates(objects: &[&Object], mut class: ClassModel) -> Option<ClassModel> {
     for _ in 0..STEPS {
+        let shares = Shares::of(&class);
         let of_object = |object: &&Object| {
-            let passes = object.seen.usual(&class).into_iter();
+            let passes = object.seen.usual(&shares).into_iter();
             passes.filter(|(pass, ..)| pass.expected >= 3.0).collect::<Vec<(Looks, f64, f64)>>()
         };
-        let sides: Vec<Vec<(Looks, f64, f64)>> = objects.iter().map(of_object).collect();
+        let sides: Vec<Vec<(Looks, f64, f64)>> = objects.par_iter().map(of_object).collect();
         let real: f64 = sides.iter().flatten().map(|pass| pass.1).sum();
         let odd = 1.0 - sides.iter().flatten().map(|pass| pass.2).sum::<f64>() / real;
         let of_side =
@@ -285,7 +300,7 @@ pub(super) fn rates_of(sides: &[Vec<(Looks, f64)>]) -> Option<Rates> {
 mod tests {
     use nalgebra::Vector3;
 
-    use super::super::energy::anywhere;
+    use super::super::energy::{anywhere, object};
     use super::super::scene::Scene;
     use super::super::seen::Seen;
     use super::*;
@@ -318,6 +333,26 @@ mod tests {
     }
 
     #[test]
+    fn the_only_class_is_all_classes_together() {
+        let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
+        let all: Vec<Vector3<f64>> = (0..6).map(|i| Vector3::new(25.0 + 3.0 * f64::from(i), 4.0, 3.0)).collect();
+        let scene = street::joined((0..3).map(|i| street::street(12, 2.0, &all, &errors[7 * i..])).collect());
+        let mut model = Model::new(&scene, &street::NOISE, &SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let rays = scene.usable_rays();
+        let votes = |i: usize| rays.iter().copied().skip(i).step_by(all.len()).collect();
+        let objects: Vec<Object> =
+            (0..all.len()).filter_map(|i| object(&model, &lookout, votes(i), all[i], Vec::new())).collect();
+        let by_itself = {
+            let evidence = Evidence::new(&model, &lookout, &rays, &objects);
+            evidence.learned(&objects.iter().collect::<Vec<_>>(), &rays, &model.classes[0])
+        };
+        learn(&mut model, &lookout, &rays, &objects);
+        assert!(by_itself.is_learned && has_same_numbers(&model.classes[0], &by_itself));
+        assert!(has_same_numbers(&model.pooled, &by_itself));
+    }
+
+    #[test]
     fn passes_are_not_odd_from_where_an_object_is_not_seen() {
         let objects: Vec<Object> = (0..9).map(|_| seen_from_one_side()).collect();
         let (rates, odd_passes) = rates(&objects.iter().collect::<Vec<_>>(), &guess());
@@ -337,8 +372,8 @@ mod tests {
         let (rates, odd_passes) = rates(&all.iter().collect::<Vec<_>>(), &guess());
         assert!(rates.recall > 0.88 && rates.concentration > 15.0, "{rates:?}");
         let class = ClassModel { rates, odd_passes, ..guess() };
-        let least = all[..60].iter().map(|object| object.seen.real(&class)).fold(1.0, f64::min);
-        let most = all[60..].iter().map(|object| object.seen.real(&class)).fold(0.0, f64::max);
+        let least = all[..60].iter().map(|object| object.seen.judged(&Shares::of(&class)).real()).fold(1.0, f64::min);
+        let most = all[60..].iter().map(|object| object.seen.judged(&Shares::of(&class)).real()).fold(0.0, f64::max);
         assert!(least > 0.9 && most < 0.5, "{least} {most}");
     }
 
@@ -350,7 +385,7 @@ mod tests {
         let (rates, odd_passes) = rates(&objects.iter().collect::<Vec<_>>(), &guess());
         assert!(rates.recall > 0.9 && rates.concentration > 1.0 && rates.between >= 0.0, "{rates:?}");
         let class = ClassModel { rates, odd_passes, ..guess() };
-        assert!(objects[0].seen.real(&class) > 0.9);
+        assert!(objects[0].seen.judged(&Shares::of(&class)).real() > 0.9);
     }
 
     /// What is thought of a class at first.

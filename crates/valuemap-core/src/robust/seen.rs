@@ -31,7 +31,7 @@ pub struct Seen {
 }
 
 /// The shares of hits that the sides of objects of a class may have.
-struct Shares<'a> {
+pub(super) struct Shares<'a> {
     class: &'a ClassModel,
     each: [Share; SHARES],
     /// Logarithm of the gamma function of the concentration.
@@ -51,7 +51,7 @@ struct Share {
 }
 
 impl<'a> Shares<'a> {
-    fn of(class: &'a ClassModel) -> Self {
+    pub(super) fn of(class: &'a ClassModel) -> Self {
         let Rates { recall, concentration, .. } = class.rates;
         let shares: [f64; SHARES] = std::array::from_fn(|k| (k as f64 + 0.5) / SHARES as f64);
         let usual = shares.map(|share| class.rates.density(share));
@@ -65,10 +65,11 @@ impl<'a> Shares<'a> {
         Self { class, each, ln_gamma: ln_gamma(concentration) }
     }
 
-    /// How probable the looks of a pass are from a side of each share, if it is a usual pass; and if it is an odd one.
-    fn of_pass(&self, pass: &Looks) -> ([f64; SHARES], f64) {
+    /// How probable the looks of a pass are from a side of each share, if it is a usual pass; and if it is an odd one, of which any share is
+    /// as probable as `ln_any` says.
+    fn of_pass(&self, pass: &Looks, ln_any: f64) -> ([f64; SHARES], f64) {
         let odd = self.class.odd_passes;
-        let any = odd * Rates::ANY.log_likelihood(pass.hits, pass.expected).exp();
+        let any = odd * ln_any.exp();
         let ln_all = self.ln_gamma - ln_gamma(self.class.rates.concentration + pass.expected);
         let usual = self.each.map(|share| {
             let (hit, miss) = (share.hit + pass.hits, share.miss + pass.expected - pass.hits);
@@ -77,21 +78,18 @@ impl<'a> Shares<'a> {
         });
         (usual, any)
     }
+}
 
-    /// Logarithms of how probable the looks of some passes are from a side of each share.
-    fn of_passes(&self, passes: &[Looks]) -> [f64; SHARES] {
-        let mut sum = [0.0; SHARES];
-        for pass in passes {
-            let (usual, any) = self.of_pass(pass);
-            sum.iter_mut().zip(usual).for_each(|(sum, usual)| *sum += (usual + any).ln());
-        }
-        sum
-    }
+/// Logarithm of how probable the looks of a pass are if nothing is known of what is seen.
+fn ln_any(pass: &Looks) -> f64 {
+    Rates::ANY.log_likelihood(pass.hits, pass.expected)
 }
 
 /// Logarithms of how probable the looks of one sector are: if the object is seen from there as usual, if less or differently on each pass,
 /// and if it is false.
 struct OfSector {
+    /// From a side of each share.
+    of_shares: [f64; SHARES],
     usual: f64,
     any: f64,
     falsely: f64,
@@ -103,8 +101,11 @@ impl OfSector {
     fn new(passes: &[Looks], shares: &Shares<'_>) -> Self {
         let (mut each, mut hits, mut expected) = (0.0, 0.0, 0.0);
         let (mut present, mut of_present) = (0, 0.0);
+        let mut of_shares = [0.0; SHARES];
         for pass in passes {
-            let any = Rates::ANY.log_likelihood(pass.hits, pass.expected);
+            let any = ln_any(pass);
+            let (usual, odd) = shares.of_pass(pass, any);
+            of_shares.iter_mut().zip(usual).for_each(|(sum, usual)| *sum += (usual + odd).ln());
             each += any;
             hits += pass.hits;
             expected += pass.expected;
@@ -113,7 +114,6 @@ impl OfSector {
                 of_present += any;
             }
         }
-        let of_shares = shares.of_passes(passes);
         let with = |ln_weight: fn(&Share) -> f64| {
             ln_sum_of(&std::array::from_fn::<f64, SHARES, _>(|k| of_shares[k] + ln_weight(&shares.each[k])))
         };
@@ -121,7 +121,7 @@ impl OfSector {
         // What two passes meet at one place does not pass by.
         let passing = if present == 1 { of_present + ln_met_by_one(passes.len()) } else { f64::NEG_INFINITY };
         let (falsely, any) = (ln_sum(passing, less) - LN_2, ln_sum(each, less) - LN_2);
-        Self { usual: with(|share| share.ln_usual), any, falsely, hits, expected }
+        Self { of_shares, usual: with(|share| share.ln_usual), any, falsely, hits, expected }
     }
 
     /// That from where an object has most votes is the greatest.
@@ -155,26 +155,42 @@ fn ln_sum(a: f64, b: f64) -> f64 {
     a.max(b) + (-(a - b).abs()).exp().ln_1p()
 }
 
+/// How probable all looks at an object are: logarithms.
+pub(super) struct Judged {
+    sectors: Vec<OfSector>,
+    /// The sector from where it has most votes; nothing if nobody looks.
+    main: Option<usize>,
+    /// If it is real, seen as usual from where it has most votes; and if it is false. From other sides both may be seen as usual or not.
+    ln_real: f64,
+    ln_false: f64,
+    ln_turns: f64,
+}
+
+impl Judged {
+    /// Logarithm of how probable the looks are at anything, real or false.
+    pub(super) fn ln_likelihood(&self) -> f64 {
+        ln_sum(self.ln_real, self.ln_false) - self.ln_turns
+    }
+
+    /// Probability that what has these looks is real rather than false.
+    pub(super) fn real(&self) -> f64 {
+        (self.ln_real - ln_sum(self.ln_real, self.ln_false)).exp()
+    }
+}
+
 impl Seen {
-    /// Logarithms of how probable the looks are at a real object, which is seen as usual from where it has most votes, and at a false thing. From other
-    /// sides both may be seen as usual or not.
-    #[must_use]
-    pub fn log_likelihoods(&self, class: &ClassModel) -> (f64, f64) {
-        let shares = Shares::of(class);
-        let sectors: Vec<OfSector> = self.sectors.iter().map(|passes| OfSector::new(passes, &shares)).collect();
+    /// How probable the looks are at an object of a class.
+    pub(super) fn judged(&self, shares: &Shares<'_>) -> Judged {
+        let sectors: Vec<OfSector> = self.sectors.iter().map(|passes| OfSector::new(passes, shares)).collect();
         let all: f64 = sectors.iter().map(OfSector::either).sum();
-        let (usual, falsely) = sectors.iter().max_by(|a, b| a.by_hits(b)).map_or((0.0, 0.0), |main| {
+        let main = sectors.iter().enumerate().max_by(|(_, a), (_, b)| a.by_hits(b)).map(|(place, _)| place);
+        let (usual, falsely) = main.map_or((0.0, 0.0), |main| {
+            let main = &sectors[main];
             let others = all - main.either();
             (others + main.usual, others + main.falsely)
         });
-        (usual + (-FALSE_SHARE).ln_1p(), falsely + FALSE_SHARE.ln())
-    }
-
-    /// Logarithm of how probable the looks are at anything, real or false.
-    #[must_use]
-    pub fn ln_likelihood(&self, class: &ClassModel) -> f64 {
-        let (real, falsely) = self.log_likelihoods(class);
-        ln_sum(real, falsely) - self.ln_turns
+        let (ln_real, ln_false) = (usual + (-FALSE_SHARE).ln_1p(), falsely + FALSE_SHARE.ln());
+        Judged { sectors, main, ln_real, ln_false, ln_turns: self.ln_turns }
     }
 
     /// Passes that see an object from where it has most votes, or should have; and minus the logarithm of how probable it is of those without a hit
@@ -182,8 +198,8 @@ impl Seen {
     #[must_use]
     pub fn missed(&self, class: &ClassModel) -> (usize, f64) {
         let shares = Shares::of(class);
-        let Some((passes, _)) = self.main(&shares) else { return (0, 0.0) };
-        let looked = passes.iter().filter(|pass| pass.expected > 0.0);
+        let Some(main) = self.judged(&shares).main else { return (0, 0.0) };
+        let looked = self.sectors[main].iter().filter(|pass| pass.expected > 0.0);
         let missed = looked.clone().filter(|pass| pass.hits == 0.0);
         (looked.count(), missed.map(|pass| -OfSector::new(&[*pass], &shares).usual).sum())
     }
@@ -196,35 +212,20 @@ impl Seen {
         (expected > 0.0).then(|| hits / expected)
     }
 
-    /// The looks of each pass from where the object has most votes.
-    fn main(&self, shares: &Shares<'_>) -> Option<(&Vec<Looks>, OfSector)> {
-        let sectors = self.sectors.iter().map(|passes| (passes, OfSector::new(passes, shares)));
-        sectors.max_by(|(_, a), (_, b)| a.by_hits(b))
-    }
-
-    /// Probability that what has these looks is real rather than false.
-    #[must_use]
-    pub fn real(&self, class: &ClassModel) -> f64 {
-        let (real, falsely) = self.log_likelihoods(class);
-        (real - ln_sum(real, falsely)).exp()
-    }
-
     /// The looks of all passes from where the object has most votes; how probable it is that it is seen as usual from there, and that it is on this
     /// pass as well.
-    #[must_use]
-    pub fn usual(&self, class: &ClassModel) -> Vec<(Looks, f64, f64)> {
-        let shares = Shares::of(class);
-        let Some((passes, main)) = self.main(&shares) else { return Vec::new() };
-        let real = self.real(class);
-        let of_shares = shares.of_passes(passes);
+    pub(super) fn usual(&self, shares: &Shares<'_>) -> Vec<(Looks, f64, f64)> {
+        let judged = self.judged(shares);
+        let Some(main) = judged.main else { return Vec::new() };
+        let (real, of_main) = (judged.real(), &judged.sectors[main]);
         let weights: [f64; SHARES] =
-            std::array::from_fn(|k| (of_shares[k] + shares.each[k].ln_usual - main.usual).exp());
+            std::array::from_fn(|k| (of_main.of_shares[k] + shares.each[k].ln_usual - of_main.usual).exp());
         let of_pass = |pass: &Looks| {
-            let (usual, any) = shares.of_pass(pass);
+            let (usual, any) = shares.of_pass(pass, ln_any(pass));
             let usual = weights.iter().zip(usual).map(|(weight, usual)| weight * usual / (usual + any));
             (*pass, real, real * usual.sum::<f64>())
         };
-        passes.iter().map(of_pass).collect()
+        self.sectors[main].iter().map(of_pass).collect()
     }
 }
 
@@ -248,36 +249,40 @@ mod tests {
         Seen { sectors: sectors.iter().map(|passes| passes.iter().map(pass).collect()).collect(), ln_turns: 0.0 }
     }
 
+    fn real(seen: &Seen, between: f64) -> f64 {
+        seen.judged(&Shares::of(&class(between))).real()
+    }
+
     #[test]
     fn what_is_seen_more_often_than_usual_on_all_passes_is_real() {
         let often = seen(&[&[(9.0, 9.0), (5.0, 5.0), (9.0, 10.0), (6.0, 6.0), (9.0, 9.0), (7.0, 8.0)]]);
-        assert!(often.real(&class(0.5)) > 0.95);
+        assert!(real(&often, 0.5) > 0.95);
     }
 
     #[test]
     fn what_is_seen_less_often_than_usual_is_real_where_sides_differ() {
         let less = seen(&[&[(17.0, 40.0), (16.0, 40.0), (18.0, 40.0), (17.0, 40.0)]]);
-        assert!(less.real(&class(0.0)) < 0.5, "{}", less.real(&class(0.0)));
-        assert!(less.real(&class(0.8)) > 0.8, "{}", less.real(&class(0.8)));
+        assert!(real(&less, 0.0) < 0.5, "{}", real(&less, 0.0));
+        assert!(real(&less, 0.8) > 0.8, "{}", real(&less, 0.8));
     }
 
     #[test]
     fn what_is_hardly_seen_from_other_sides_is_real() {
         let usual = [(15.0, 20.0); 5];
         let hardly = [(2.0, 20.0), (0.0, 20.0), (1.0, 20.0), (3.0, 20.0), (2.0, 20.0)];
-        let alone = seen(&[&usual]).real(&class(0.3));
-        let beside = seen(&[&usual, &hardly, &hardly, &hardly]).real(&class(0.3));
+        let alone = real(&seen(&[&usual]), 0.3);
+        let beside = real(&seen(&[&usual, &hardly, &hardly, &hardly]), 0.3);
         assert!(alone > 0.9 && (alone - beside).abs() < 1e-9, "{alone} {beside}");
     }
 
     #[test]
     fn what_one_pass_alone_meets_is_false_and_what_two_meet_is_not() {
         let one = seen(&[&[(14.0, 20.0), (0.0, 20.0), (0.0, 20.0), (0.0, 20.0), (0.0, 20.0)]]);
-        assert!(one.real(&class(0.3)) < 0.05, "{}", one.real(&class(0.3)));
+        assert!(real(&one, 0.3) < 0.05, "{}", real(&one, 0.3));
         let since_then = seen(&[&[(0.0, 20.0), (0.0, 20.0), (0.0, 20.0), (16.0, 20.0), (15.0, 20.0)]]);
-        assert!(since_then.real(&class(0.3)) > 0.5, "{}", since_then.real(&class(0.3)));
+        assert!(real(&since_then, 0.3) > 0.5, "{}", real(&since_then, 0.3));
         let most = seen(&[&[(14.0, 20.0), (0.0, 20.0), (15.0, 20.0), (16.0, 20.0), (14.0, 20.0)]]);
-        assert!(most.real(&class(0.3)) > 0.95, "{}", most.real(&class(0.3)));
+        assert!(real(&most, 0.3) > 0.95, "{}", real(&most, 0.3));
     }
 
     #[test]
@@ -292,7 +297,7 @@ mod tests {
     #[test]
     fn what_is_seen_now_and_then_from_everywhere_is_false() {
         let now_and_then = seen(&[&[(2.0, 20.0), (1.0, 20.0), (3.0, 20.0), (2.0, 20.0)]]);
-        assert!(now_and_then.real(&class(0.3)) < 0.05, "{}", now_and_then.real(&class(0.3)));
+        assert!(real(&now_and_then, 0.3) < 0.05, "{}", real(&now_and_then, 0.3));
     }
 
     #[test]

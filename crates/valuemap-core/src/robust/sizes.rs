@@ -6,7 +6,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::energy::{size_of, visits};
+use super::energy::{usual_size, visits};
 use super::model::Model;
 use super::prior::Prior;
 
@@ -21,15 +21,18 @@ pub fn size_terms(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> Opt
     if !sizes.tell() || sizes.object.0.is_nan() {
         return None;
     }
-    let usual = size_of(model, votes, point);
+    let place_of = |&ray: &u32| {
+        let depth_m = model.scene.ray(ray).project(point).z;
+        (depth_m, model.ln_angle[ray as usize] + depth_m.ln())
+    };
+    let implied: Vec<(f64, f64)> = votes.iter().map(place_of).collect();
+    let usual = usual_size(model, votes, implied.iter().map(|(_, size)| *size));
     let per_square = 1.0 / (sizes.spread * sizes.spread);
     let (mean, of_prior) = (sizes.object.0, 1.0 / (sizes.object.1 * sizes.object.1));
     let mut boxes: Vec<(f64, f64, Vector3<f64>)> = Vec::with_capacity(votes.len());
     let looks = visits(model.scene, votes).flat_map(|visit| visit.iter().map(|&ray| (ray, visit.len() as f64)));
-    for (ray, together) in looks {
+    for ((ray, together), (depth_m, size)) in looks.zip(implied) {
         let cast = model.scene.ray(ray);
-        let depth_m = cast.project(point).z;
-        let size = model.ln_angle[ray as usize] + depth_m.ln();
         if size.is_finite() {
             let weight = (HUBER_SIGMAS * sizes.spread / (size - usual).abs()).min(1.0) * per_square / together;
             boxes.push((weight, size, cast.residual_from_world.row(2).transpose() / depth_m));
