@@ -128,10 +128,11 @@ fn best_votes(
     ln_size: f64,
     may_vote: &dyn Fn(u32) -> bool,
 ) -> Vec<u32> {
+    let votes_for = model.votes_for(class);
     let gain = |hit: &Hit| {
         let depth_m = model.scene.ray(hit.ray).project(point).z;
         let variance = model.spreads[hit.ray as usize].variance(depth_m);
-        model.vote_gain(class, hit.ray, hit.chi2, variance * variance, depth_m, ln_size)
+        votes_for.gain(hit.ray, hit.chi2, variance * variance, depth_m, ln_size)
     };
     let may = hits.iter().filter(|hit| may_vote(hit.ray)).map(|hit| (hit, gain(hit)));
     let mut may: Vec<(&Hit, f64)> = may.filter(|(_, gain)| *gain > 0.0).collect();

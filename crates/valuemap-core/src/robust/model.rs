@@ -274,6 +274,8 @@ pub struct Model<'a> {
     pub spreads: Arc<Vec<Spread>>,
     /// Logarithm of the angle that each ray's box spans, rad; not finite where it has no box.
     pub ln_angle: Vec<f64>,
+    /// Logarithm of the squared pixels that a unit of each ray's virtual image plane spans.
+    ln_scale2: Vec<f64>,
     /// The measured range of each ray; empty where none is measured.
     ranges: Vec<Measured>,
     /// Sine of each ray's elevation; not a number where nobody knows what is up.
@@ -300,6 +302,7 @@ impl<'a> Model<'a> {
             if settings.has(Part::Sizes) { (size / scale2.sqrt()).ln() } else { f64::NAN }
         };
         let ln_angle: Vec<f64> = scene.box_px.iter().zip(&scene.scale2).map(angle).collect();
+        let ln_scale2 = scene.scale2.iter().map(|scale2| scale2.ln()).collect();
         let ranges = if settings.has(Part::Ranges) { measured(scene) } else { Vec::new() };
         let count = scene.rays.class.iter().max().map_or(0, |&last| last as usize + 1);
         let of = |rays: Vec<usize>| {
@@ -321,6 +324,7 @@ impl<'a> Model<'a> {
             up,
             spreads: Arc::new(spreads),
             ln_angle,
+            ln_scale2,
             ranges,
             sin_elevation,
             usable: usable.len(),
@@ -390,7 +394,7 @@ impl<'a> Model<'a> {
     #[inline]
     #[must_use]
     pub fn ln_clutter_per_px2(&self, ray: u32) -> f64 {
-        self.class_of(ray).ln_clutter_per_sr - self.scene.scale2[ray as usize].ln()
+        self.class_of(ray).ln_clutter_per_sr - self.ln_scale2[ray as usize]
     }
 
     /// How much more probable, in logarithms, a vote has the score of a ray than clutter has.
@@ -436,13 +440,38 @@ impl<'a> Model<'a> {
     #[inline]
     #[must_use]
     pub fn vote_gain(&self, class: u32, ray: u32, chi2: f64, px4: f64, depth_m: f64, ln_size: f64) -> f64 {
+        self.votes_for(class).gain(ray, chi2, px4, depth_m, ln_size)
+    }
+
+    /// The same for many votes.
+    #[inline]
+    #[must_use]
+    pub fn votes_for(&self, class: u32) -> VotesFor<'_> {
         let learned = &self.classes[class as usize];
-        -0.5 * (chi2 + px4.ln()) - (2.0 * PI).ln() - self.ln_clutter_per_px2(ray)
-            + learned.sizes.log_ratio(self.ln_angle[ray as usize], depth_m, ln_size)
-            + self.ln_range_ratio(ray, depth_m)
-            + self.ln_score_ratio(ray)
-            + self.confusions.ln_share(class, self.scene.rays.class[ray as usize])
-            + learned.rates.log_odds()
+        VotesFor { model: self, class, learned, log_odds: learned.rates.log_odds() }
+    }
+}
+
+/// What votes for objects of a class are worth.
+pub struct VotesFor<'a> {
+    model: &'a Model<'a>,
+    class: u32,
+    learned: &'a ClassModel,
+    log_odds: f64,
+}
+
+impl VotesFor<'_> {
+    /// See [`Model::vote_gain`].
+    #[inline]
+    #[must_use]
+    pub fn gain(&self, ray: u32, chi2: f64, px4: f64, depth_m: f64, ln_size: f64) -> f64 {
+        let Self { model, class, learned, log_odds } = *self;
+        -0.5 * (chi2 + px4.ln()) - (2.0 * PI).ln() - model.ln_clutter_per_px2(ray)
+            + learned.sizes.log_ratio(model.ln_angle[ray as usize], depth_m, ln_size)
+            + model.ln_range_ratio(ray, depth_m)
+            + model.ln_score_ratio(ray)
+            + model.confusions.ln_share(class, model.scene.rays.class[ray as usize])
+            + log_odds
     }
 }
 

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
 use super::index::chi2;
-use super::model::{Model, Sizes};
+use super::model::{Model, Sizes, VotesFor};
 use super::noise::Spread;
 use super::sample::{Sampler, level_of, scramble};
 use super::scene::Scene;
@@ -140,6 +140,8 @@ struct Neighborhood<'a> {
     max_cosine: f64,
     origin: Vector3<f64>,
     images: &'a [u32],
+    /// Where each of them was taken, from the origin, m.
+    centers: Vec<Vector3<f64>>,
     partners: Vec<Partner>,
     gates: Gates,
 }
@@ -209,6 +211,7 @@ impl<'a> Neighborhood<'a> {
             max_cosine: model.settings.viability.min_parallax_rad.cos(),
             origin,
             images,
+            centers: images.iter().map(|&image| model.scene.views[image as usize].center - origin).collect(),
             partners,
             gates,
         }
@@ -216,17 +219,22 @@ impl<'a> Neighborhood<'a> {
 
     fn best_meeting(&self, ray: u32) -> Option<Hypothesis> {
         let own = Partner::new(self.model, ray, 0, &self.origin);
-        let sizes = &self.model.class_of(ray).sizes;
-        let meetings = self.partners.iter().filter_map(|other| self.meet(&own, other, sizes));
-        let meetings: Vec<Meeting> = meetings.take(MEETINGS).collect();
+        let meetings = self.meetings(&own);
         let points: Vec<Vector3<f64>> = meetings.iter().map(|meeting| meeting.point).collect();
         let words = self.gates.words();
         let (mut maybe, mut sure) = (vec![0; points.len() * words], vec![0; points.len() * words]);
         self.gates.test(&points, &mut maybe, &mut sure);
+        let votes_for = self.model.votes_for(own.class);
         let mut best: Option<(f64, usize)> = None;
         for (i, meeting) in meetings.iter().enumerate() {
-            let (votes, support) = self.support(&own, meeting, &maybe[i * words..(i + 1) * words]);
-            if votes >= 2 && best.is_none_or(|(most, _)| support > most) {
+            let gains = self.gains(&own, &votes_for, meeting, &maybe[i * words..(i + 1) * words]);
+            let (votes, at_most) = self.votes(&own, meeting, &gains);
+            // Who should have seen it and did not makes no meeting more probable, and takes long to find.
+            if votes < 2 || best.is_some_and(|(most, _)| !(at_most > most)) {
+                continue;
+            }
+            let support = self.support(&own, meeting, &gains);
+            if best.is_none_or(|(most, _)| support > most) {
                 best = Some((support, i));
             }
         }
@@ -235,6 +243,12 @@ impl<'a> Neighborhood<'a> {
             rays: [ray, meetings[i].partner],
             support,
         })
+    }
+
+    /// Where a ray meets others, the first of them.
+    fn meetings(&self, own: &Partner) -> Vec<Meeting> {
+        let sizes = &self.model.class_of(own.number).sizes;
+        self.partners.iter().filter_map(|other| self.meet(own, other, sizes)).take(MEETINGS).collect()
     }
 
     /// Where two rays meet, if it lies in the gates of both and their boxes may be of one size there.
@@ -255,22 +269,21 @@ impl<'a> Neighborhood<'a> {
         if !ranges.iter().all(in_range) {
             return None;
         }
-        let [of_own, of_other] = [own.ln_angle + ranges[0].ln(), other.ln_angle + ranges[1].ln()];
-        if !sizes.agree(of_own, of_other, self.model.settings.gate_sigmas) {
-            return None;
-        }
         let on_own = own.ray.center + own.ray.direction * ranges[0];
         let on_other = other.ray.center + other.ray.direction * ranges[1];
         let [own_m2, other_m2] = [own.variance_m2(ranges[0]), other.variance_m2(ranges[1])];
         let point = on_own + (on_other - on_own) * (own_m2 / (own_m2 + other_m2));
-        let fits = own.chi2(&point) < self.gate_chi2 && other.chi2(&point) < self.gate_chi2;
-        fits.then_some(Meeting { point, partner: other.number, ln_size: 0.5 * (of_own + of_other) })
+        if !(own.chi2(&point) < self.gate_chi2 && other.chi2(&point) < self.gate_chi2) {
+            return None;
+        }
+        // Last, since logarithms take longer than all that.
+        let [of_own, of_other] = [own.ln_angle + ranges[0].ln(), other.ln_angle + ranges[1].ln()];
+        let agree = sizes.agree(of_own, of_other, self.model.settings.gate_sigmas);
+        agree.then_some(Meeting { point, partner: other.number, ln_size: 0.5 * (of_own + of_other) })
     }
 
-    /// Images of the sample with a ray in whose gate the point lies, and how much more probable that makes it; what should have seen it and
-    /// did not, makes it less so.
-    fn support(&self, own: &Partner, meeting: &Meeting, maybe: &[u64]) -> (u32, f64) {
-        let rates = self.model.class_of(own.number).rates;
+    /// What each image of the sample gains by a meeting: that of its best ray in whose gate the point lies; of none less than nothing.
+    fn gains(&self, own: &Partner, votes_for: &VotesFor<'_>, meeting: &Meeting, maybe: &[u64]) -> Vec<f64> {
         let mut gains = vec![f64::NEG_INFINITY; self.images.len()];
         for (word, &maybe) in maybe.iter().enumerate() {
             for bit in ones(maybe) {
@@ -281,40 +294,98 @@ impl<'a> Neighborhood<'a> {
                     continue;
                 }
                 let variance = partner.spread.variance(projected.z);
-                let gain = self.model.vote_gain(
-                    own.class,
-                    partner.number,
-                    chi2,
-                    variance * variance,
-                    projected.z,
-                    meeting.ln_size,
-                );
+                let gain = votes_for.gain(partner.number, chi2, variance * variance, projected.z, meeting.ln_size);
                 let best = &mut gains[partner.place as usize];
                 *best = best.max(gain);
             }
         }
-        let scene = self.model.scene;
-        let to_point = meeting.point - own.ray.center;
-        let farthest = self.images.iter().zip(&gains).filter(|(_, gain)| **gain > 0.0);
-        let distance = |image: u32| (scene.views[image as usize].center - self.origin - meeting.point).norm();
-        let farthest = farthest.map(|(&image, _)| distance(image)).fold(to_point.norm(), f64::max);
-        let (mut votes, mut support) = (0, self.model.ln_range_ratio(own.number, own.ray.project(&meeting.point).z));
-        for (&image, &gain) in self.images.iter().zip(&gains).filter(|(image, _)| **image != own.image) {
-            if gain > 0.0 {
-                votes += 1;
-                support += gain + rates.log_miss();
-                continue;
-            }
-            let view = &scene.views[image as usize];
-            let away = meeting.point - (view.center - self.origin);
-            let length = away.norm();
-            let should = length <= farthest
-                && away.dot(&to_point) >= ASIDE_COSINE * length * to_point.norm()
-                && scene.is_in_picture(view, &(meeting.point + self.origin));
-            if should {
-                support += rates.log_miss();
-            }
+        gains
+    }
+
+    /// Images of the sample that gain by a meeting, and how much more probable that makes it, whoever else should have seen it.
+    fn votes(&self, own: &Partner, meeting: &Meeting, gains: &[f64]) -> (u32, f64) {
+        let log_miss = self.model.class_of(own.number).rates.log_miss();
+        let (mut votes, mut support) = (0, self.support_of_range(own, meeting));
+        for (_, gain) in self.images.iter().zip(gains).filter(|(image, gain)| **image != own.image && **gain > 0.0) {
+            votes += 1;
+            support += gain + log_miss;
         }
         (votes, support)
+    }
+
+    /// How much more probable the measured range of a ray makes a meeting.
+    fn support_of_range(&self, own: &Partner, meeting: &Meeting) -> f64 {
+        self.model.ln_range_ratio(own.number, own.ray.project(&meeting.point).z)
+    }
+
+    /// How much more probable the images of the sample make a meeting: those that gain by it, and those that should have seen it and did not. It is no
+    /// more than [`votes`](Self::votes) say, rounding and all: what is added besides, in the same order, is negative.
+    fn support(&self, own: &Partner, meeting: &Meeting, gains: &[f64]) -> f64 {
+        let log_miss = self.model.class_of(own.number).rates.log_miss();
+        let scene = self.model.scene;
+        let to_point = meeting.point - own.ray.center;
+        let range = to_point.norm();
+        let farthest = self.centers.iter().zip(gains).filter(|(_, gain)| **gain > 0.0);
+        let farthest = farthest.map(|(center, _)| (center - meeting.point).norm()).fold(range, f64::max);
+        let mut support = self.support_of_range(own, meeting);
+        for ((&image, center), &gain) in self.images.iter().zip(&self.centers).zip(gains) {
+            if image == own.image {
+                continue;
+            }
+            if gain > 0.0 {
+                support += gain + log_miss;
+                continue;
+            }
+            let away = meeting.point - center;
+            let length = away.norm();
+            let should = length <= farthest
+                && away.dot(&to_point) >= ASIDE_COSINE * length * range
+                && scene.is_in_picture(&scene.views[image as usize], &(meeting.point + self.origin));
+            if should {
+                support += log_miss;
+            }
+        }
+        support
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::street;
+
+    #[test]
+    fn the_best_meeting_is_the_first_of_those_with_most_support_of_all() {
+        let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
+        let all = [Vector3::new(30.0, 4.0, 3.0), Vector3::new(31.0, 4.6, 3.2), Vector3::new(24.0, -5.0, 4.0)];
+        let scene = street::joined((0..4).map(|i| street::street(10, 2.0, &all, &errors[7 * i..])).collect());
+        let model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
+        let rays = scene.usable_rays();
+        let by_image = ByImage::new(&scene, &rays);
+        let images: Vec<u32> = (0..scene.views.len() as u32).collect();
+        let neighborhood = Neighborhood::new(&model, 0, &images, &|image| by_image.rays(image));
+        // All partners are asked, whatever the gates say.
+        let mut everybody = vec![0; neighborhood.gates.words()];
+        (0..neighborhood.partners.len()).for_each(|lane| everybody[lane / LANES] |= 1 << (lane % LANES));
+        let (mut found, mut pruned) = (0, 0);
+        for ray in rays {
+            let own = Partner::new(&model, ray, 0, &neighborhood.origin);
+            let votes_for = model.votes_for(own.class);
+            let mut best: Option<(f64, Vector3<f64>)> = None;
+            for meeting in neighborhood.meetings(&own) {
+                let gains = neighborhood.gains(&own, &votes_for, &meeting, &everybody);
+                let (votes, at_most) = neighborhood.votes(&own, &meeting, &gains);
+                let support = neighborhood.support(&own, &meeting, &gains);
+                assert!(support <= at_most);
+                pruned += usize::from(support < at_most);
+                if votes >= 2 && best.is_none_or(|(most, _)| support > most) {
+                    best = Some((support, meeting.point + neighborhood.origin));
+                }
+            }
+            let quick = neighborhood.best_meeting(ray).map(|best| (best.support, best.point));
+            assert_eq!(quick, best);
+            found += usize::from(best.is_some());
+        }
+        assert!(found > 60 && pruned > 0, "{found} {pruned}");
     }
 }

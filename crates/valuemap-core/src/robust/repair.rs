@@ -249,7 +249,8 @@ impl Candidate {
     fn new(model: &Model<'_>, rays: &[u32], class: u32, point: Vector3<f64>, ln_size: f64, gate_sigmas: f64) -> Self {
         let scene = model.scene;
         let limit = gate_sigmas * gate_sigmas;
-        let of_class = model.classes[class as usize];
+        let of_class = &model.classes[class as usize];
+        let votes_for = model.votes_for(class);
         let (mut gains, mut farthest): (Vec<(usize, f64)>, f64) = (Vec::new(), 0.0);
         let (mut images, mut last) = (0_usize, u32::MAX);
         let (mut variance_m2, mut seen) = (f64::INFINITY, Vec::new());
@@ -267,7 +268,7 @@ impl Candidate {
                 continue;
             }
             let variance = spread.variance(projected.z);
-            let gain = model.vote_gain(class, ray, chi2, variance * variance, projected.z, ln_size);
+            let gain = votes_for.gain(ray, chi2, variance * variance, projected.z, ln_size);
             if gain <= 0.0 {
                 continue;
             }
