@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use proptest::prelude::*;
-use valuemap_core::robust::drift::{DRIFT_LENGTH_M, Drive, Look, OneLook, SEGMENT_M};
+use valuemap_core::robust::drift::{DRIFT_LENGTH_M, Drive, Look, Normals, OneLook, SEGMENT_M};
 use valuemap_core::robust::noise::Sigmas;
 use valuemap_core::robust::poses::{Belief, Segments, smooth};
 use valuemap_core::robust::scene::View;
@@ -60,6 +60,29 @@ fn looks() -> impl Strategy<Value = Vec<Look>> {
         };
         parts.into_iter().map(of_part).collect()
     })
+}
+
+proptest! {
+    /// What is said of the labels that a visit sees is said of no others.
+    #[test]
+    fn a_visit_says_of_the_labels_that_it_sees_what_it_says_among_all(looks in looks()) {
+        let weights = vec![0.7; looks.len()];
+        let mut labels: Vec<usize> = looks.iter().map(|look| look.label).collect();
+        labels.sort_unstable();
+        labels.dedup();
+        let place = |label: usize| labels.partition_point(|&before| before < label);
+        let alone: Vec<Look> = looks.iter().map(|look| Look { label: place(look.label), ..look.clone() }).collect();
+        let of_those = Drive::along(&alone, &weights, labels.len()).map(|drive| drive.normals);
+        let among_all = Drive::along(&looks, &weights, LABELS).map(|drive| drive.normals);
+        let (Some(of_those), Some(among_all)) = (of_those, among_all) else {
+            return Err(TestCaseError::fail("numbers overflow"));
+        };
+        let mut spread = Normals::nothing(LABELS);
+        spread.add_those_of(&labels, &of_those);
+        prop_assert_eq!(spread.information, among_all.information);
+        prop_assert_eq!(spread.gradient, among_all.gradient);
+        prop_assert_eq!(spread.square.to_bits(), among_all.square.to_bits());
+    }
 }
 
 fn kernel(a: &Look, b: &Look) -> f64 {

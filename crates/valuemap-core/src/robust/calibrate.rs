@@ -9,8 +9,9 @@
 
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
+use rustc_hash::FxHashMap;
 
-use super::drift::Drive;
+use super::drift::{Drive, Look};
 use super::estimate::{by_pass, looks_at};
 use super::noise::Noise;
 use super::scene::Scene;
@@ -86,10 +87,8 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
     if sample.len() < 3 {
         return *guess;
     }
-    let sum = |of: &(dyn Fn(&Placed) -> f64 + Sync)| -> f64 {
-        // Summed in the order of the labels, so that threads do not change the result.
-        sample.par_iter().map(|label| of(label)).collect::<Vec<f64>>().iter().sum()
-    };
+    let visits_of = |label: &&Placed| VisitOf::all(scene, guess, label);
+    let visits: Vec<Option<Vec<VisitOf>>> = sample.par_iter().map(visits_of).collect();
     let scale2 = sample.iter().flat_map(|object| &object.0).map(|&ray| scene.scale2[ray as usize]);
     let scale2 = scale2.sum::<f64>() / sample.iter().map(|object| object.0.len()).sum::<usize>() as f64;
     // What is rotation of an image alone and what is its detections', residuals of one focal length do not tell.
@@ -135,7 +134,12 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
     let rotation_rad = (DETECTION_PX.0 / scale2.sqrt(), DETECTION_PX.1 / scale2.sqrt());
     let found = search(start, [(least_px, most_px), BOX_SHARE, POSITION_M, POSITION_M, rotation_rad], fixed, &|p| {
         let noise = noise_of(p, 1.0);
-        sum(&|object| minus_log_likelihood(scene, &noise, guess, &object.0, &object.1))
+        let of_label = |visits: &Option<Vec<VisitOf>>| {
+            let all = visits.iter().flatten().map(|visit| visit.minus_log_likelihood(scene, &noise));
+            all.collect::<Option<Vec<[f64; 3]>>>().map_or(0.0, |terms| terms.iter().flatten().sum())
+        };
+        // Summed in the order of the labels, so that threads do not change the result.
+        visits.par_iter().with_max_len(1).map(of_label).collect::<Vec<f64>>().iter().sum()
     });
     if stated[0].is_some() {
         return noise_of(&found, 1.0);
@@ -232,10 +236,14 @@ fn search<const N: usize>(
         best[i] = best[i].clamp(bounds[i].0, bounds[i].1);
     }
     let center = best;
-    let penalised = |parameters: &[f64; N]| {
+    let of = |parameters: &[f64; N]| {
         let away = (0..N).filter(|&i| !fixed[i]).map(|i| (parameters[i] / center[i]).ln() / TRUST_LOG_SD);
         cost(parameters) + away.map(|away| away * away).sum::<f64>()
     };
+    // Where a round of all parameters changed none of them, the next one tries the same.
+    let mut known: FxHashMap<[u64; N], f64> = FxHashMap::default();
+    let mut penalised =
+        |parameters: &[f64; N]| *known.entry(parameters.map(f64::to_bits)).or_insert_with(|| of(parameters));
     let mut least = penalised(&best);
     for step in STEPS {
         for i in (0..N).chain(0..N).filter(|&i| !fixed[i]) {
@@ -286,18 +294,75 @@ fn misfit(scene: &Scene, noise: &Noise, label: &Placed) -> f64 {
     passes.filter_map(of_pass).sum::<f64>() / label.0.len() as f64
 }
 
-/// Minus twice the logarithm of the restricted likelihood of votes' residuals (ascending) around a point, up to a constant: each visit may
-/// put the object elsewhere, so that what visits disagree about is not taken for errors within them.
-fn minus_log_likelihood(scene: &Scene, noise: &Noise, of_sight: &Noise, votes: &[u32], point: &Vector3<f64>) -> f64 {
-    let mut value = 0.0;
-    for visit in by_pass(scene, votes).filter(|visit| visit.len() >= MIN_VOTES_OF_VISIT) {
-        let Some(looks) = looks_at(scene, noise, of_sight, visit, point) else { return 0.0 };
-        let Some(drive) = Drive::at_one(&looks) else { return 0.0 };
-        let (information, gradient) = drive.normals.of_one();
-        let Some(cholesky) = information.cholesky() else { return 0.0 };
-        value += drive.normals.square + drive.log_determinant();
-        value += 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
-        value -= gradient.dot(&cholesky.solve(&gradient));
+/// A visit of a label: what stays the same of its looks while the noise is sought, with ray and depth, m.
+struct VisitOf(Vec<(u32, f64, Look)>);
+
+impl VisitOf {
+    /// The visits of a label along the lines of sight that a noise makes probable; nothing if the label is behind a voter.
+    fn all(scene: &Scene, of_sight: &Noise, (votes, point): &Placed) -> Option<Vec<Self>> {
+        let of_visit = |visit: &[u32]| {
+            let looks = looks_at(scene, of_sight, of_sight, visit, point)?;
+            let depths_m = visit.iter().map(|&ray| scene.ray(ray).project(point).z);
+            Some(Self(visit.iter().copied().zip(depths_m).zip(looks).map(|((ray, m), look)| (ray, m, look)).collect()))
+        };
+        by_pass(scene, votes).filter(|visit| visit.len() >= MIN_VOTES_OF_VISIT).map(of_visit).collect()
     }
-    value
+
+    /// Minus twice the logarithm of the restricted likelihood of its residuals, up to a constant, in three terms: each visit may
+    /// put the object elsewhere, so that what visits disagree about is not taken for errors within them. Nothing if numbers overflow.
+    fn minus_log_likelihood(&self, scene: &Scene, noise: &Noise) -> Option<[f64; 3]> {
+        let Self(looks) = self;
+        let looks: Vec<Look> =
+            looks.iter().map(|(ray, depth_m, look)| look.with_noise(scene, noise, *ray, *depth_m)).collect();
+        let drive = Drive::at_one(&looks)?;
+        let (information, gradient) = drive.normals.of_one();
+        let cholesky = information.cholesky()?;
+        let ln_information = 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
+        Some([
+            drive.normals.square + drive.log_determinant(),
+            ln_information,
+            -gradient.dot(&cholesky.solve(&gradient)),
+        ])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::RefCell;
+
+    use super::*;
+    use crate::street;
+
+    #[test]
+    fn looks_with_another_noise_are_those_that_would_be_had_with_it() {
+        let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
+        let point = Vector3::new(30.0, 4.0, 3.0);
+        let scene = street::joined((0..3).map(|i| street::street(10, 2.0, &[point], &errors[7 * i..])).collect());
+        let noise =
+            Noise { detection_px: 2.5, position_segment_m: 0.02, ..street::NOISE.scaled(1.7, Known::default()) };
+        let placed = (scene.usable_rays(), point);
+        let visits = VisitOf::all(&scene, &street::NOISE, &placed).unwrap_or_default();
+        assert_eq!(visits.len(), 3);
+        for (VisitOf(looks), votes) in visits.iter().zip(by_pass(&scene, &placed.0)) {
+            let again: Vec<Look> =
+                looks.iter().map(|(ray, depth_m, look)| look.with_noise(&scene, &noise, *ray, *depth_m)).collect();
+            assert_eq!(Some(again), looks_at(&scene, &noise, &street::NOISE, votes, &point));
+        }
+    }
+
+    #[test]
+    fn the_least_cost_is_found_and_nothing_is_tried_twice() {
+        let tried: RefCell<Vec<[u64; 2]>> = RefCell::default();
+        let cost = |p: &[f64; 2]| {
+            tried.borrow_mut().push(p.map(f64::to_bits));
+            1e6 * ((p[0] / 3.0).ln().powi(2) + (p[1] * p[0] / 2.0).ln().powi(2))
+        };
+        let found = search([1.0, 1.0], [(0.01, 100.0); 2], [false; 2], &cost);
+        assert!((found[0] - 3.0).abs() < 0.1 && (found[1] - 2.0 / 3.0).abs() < 0.05, "{found:?}");
+        let mut tried = tried.into_inner();
+        let count = tried.len();
+        tried.sort_unstable();
+        tried.dedup();
+        assert_eq!(tried.len(), count);
+    }
 }

@@ -28,7 +28,7 @@ const LEAST_SHARE: f64 = 1e-4;
 pub const SEGMENT_M: f64 = 10.0;
 
 /// One vote's residual at the position of its label, with its derivatives.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Look {
     /// Which of the labels it is a look at.
     pub label: usize,
@@ -111,6 +111,7 @@ impl Vantage {
     /// Its derivatives are those of the line of sight as it probably is, given this residual alone. Those of the line from where the
     /// camera is said to be are wrong in the same way as the residual is: what both have in common moves a label away from the cameras,
     /// however many look at it, so that drives from two sides never agree.
+    #[inline]
     #[must_use]
     pub fn look(&self, label: usize, point: &Vector3<f64>) -> Option<Look> {
         self.look_along(&self.ray, label, point, |depth| self.of_sight.share_of_position(depth))
@@ -167,11 +168,27 @@ impl Look {
     }
 
     /// The look as if its image had its own error for this label alone: less than what is known, and much quicker.
+    #[inline]
     #[must_use]
     pub fn by_itself(mut self) -> Self {
         self.detection_px2 = self.variance;
         self.own_sigma = Sigmas::NONE;
         self
+    }
+
+    /// The look of a ray [by itself](Self::by_itself) with another noise along the same line of sight; its label is `depth_m` away.
+    #[must_use]
+    pub fn with_noise(&self, scene: &Scene, noise: &Noise, ray: u32, depth_m: f64) -> Self {
+        let view = scene.view(ray);
+        let variance = noise.own(scene, ray).variance(depth_m);
+        Self {
+            drift_sigma: noise.of_drift(view),
+            segment_sigma: noise.of_segment(view),
+            own_sigma: Sigmas::NONE,
+            detection_px2: variance,
+            variance,
+            ..self.clone()
+        }
     }
 
     /// The look, which counts with a weight, with the error that its image has for itself added to the detection's: mixed so that
@@ -291,6 +308,19 @@ impl Normals {
     pub fn add_gradient(&mut self, a: usize, rows: &Vector3<f64>) {
         let mut view = self.gradient.fixed_rows_mut::<3>(3 * a);
         view += rows;
+    }
+
+    /// Add what is said of some of the labels.
+    pub fn add_those_of(&mut self, labels: &[usize], some: &Self) {
+        for (b, &second) in labels.iter().enumerate() {
+            for (a, &first) in labels.iter().enumerate() {
+                let mut view = self.information.fixed_view_mut::<3, 3>(3 * first, 3 * second);
+                view += some.information.fixed_view::<3, 3>(3 * a, 3 * b);
+            }
+            let mut view = self.gradient.fixed_rows_mut::<3>(3 * second);
+            view += some.gradient.fixed_rows::<3>(3 * b);
+        }
+        self.square += some.square;
     }
 
     /// What was said of the only label.

@@ -259,28 +259,29 @@ impl<'a> Joint<'a> {
 
     fn evaluate(&self) -> Option<Evaluation> {
         let of_labels = if self.model.is_some() { self.votes_of_labels() } else { Vec::new() };
-        let OfVisits { looks, weights, is_vote, ends } = self.looks(&of_labels)?;
+        let OfVisits { looks, weights, is_vote, visits } = self.looks(&of_labels)?;
         let mut normals = Normals::nothing(self.points.len());
-        let (mut of_visits, mut pose_errors) = (Vec::with_capacity(ends.len()), Vec::new());
+        let (mut of_visits, mut pose_errors) = (Vec::with_capacity(visits.len()), Vec::new());
         let mut left: Vec<Vector2<f64>> = Vec::with_capacity(looks.len());
-        for end in ends {
+        for (labels, end) in visits {
             let range = left.len()..end;
-            let drive = Drive::along(&looks[range.clone()], &weights[range.clone()], self.points.len())?;
-            normals.information += &drive.normals.information;
-            normals.gradient += &drive.normals.gradient;
-            normals.square += drive.normals.square;
+            let drive = Drive::along(&looks[range.clone()], &weights[range.clone()], labels.len())?;
+            normals.add_those_of(&labels, &drive.normals);
             left.extend(drive.left());
             if self.care == Care::Exact {
                 let errors = drive.pose_errors(&weights[range.clone()]).into_iter().zip(&is_vote[range]);
                 pose_errors.extend(errors.filter(|(_, is_vote)| **is_vote).map(|(error, _)| error));
             }
-            of_visits.push(drive.normals);
+            of_visits.push((labels, drive.normals));
         }
-        let votes = || (0..looks.len()).filter(|&i| is_vote[i]).map(|i| (&looks[i], weights[i], &left[i]));
+        let votes = || {
+            let of_votes = (0..looks.len()).filter(|&i| is_vote[i]).map(|i| (&looks[i], weights[i], &left[i]));
+            self.votes.iter().map(|(label, _)| *label).zip(of_votes)
+        };
         let mut alone = vec![Matrix3::zeros(); self.points.len()];
-        for (look, weight, _) in votes() {
+        for (label, (look, weight, _)) in votes() {
             for column in &look.by_point {
-                alone[look.label] += column * column.transpose() * (weight / look.variance);
+                alone[label] += column * column.transpose() * (weight / look.variance);
             }
         }
         // Labels without votes stay where they are.
@@ -290,7 +291,7 @@ impl<'a> Joint<'a> {
         }
         let alone: Vec<Matrix3<f64>> =
             alone.into_iter().map(|alone| Some(alone.cholesky()?.inverse())).collect::<Option<_>>()?;
-        let own = votes().map(|(look, weight, left)| look.studentised(left, &alone[look.label], weight)).collect();
+        let own = votes().map(|(label, (look, weight, left))| look.studentised(left, &alone[label], weight)).collect();
         self.add_priors(&of_labels, &mut normals);
         Some(Evaluation { normals, of_visits, own, pose_errors })
     }
@@ -298,11 +299,12 @@ impl<'a> Joint<'a> {
 
 /// The looks of some votes, visit by visit, and what heights say as further ones.
 struct OfVisits {
+    /// Each at a label by its place among those of its visit: most visits see few of many.
     looks: Vec<Look>,
     weights: Vec<f64>,
     is_vote: Vec<bool>,
-    /// Where each visit ends.
-    ends: Vec<usize>,
+    /// The labels of each visit, ascending, and where it ends.
+    visits: Vec<(Vec<usize>, usize)>,
 }
 
 impl Joint<'_> {
@@ -315,15 +317,19 @@ impl Joint<'_> {
             looks: Vec::with_capacity(count),
             weights: Vec::with_capacity(count),
             is_vote: Vec::with_capacity(count),
-            ends: Vec::new(),
+            visits: Vec::new(),
         };
         let mut at = 0;
         for votes in self.visits() {
+            let mut labels: Vec<usize> = votes.iter().map(|(label, _)| *label).collect();
+            labels.sort_unstable();
+            labels.dedup();
             for (i, &(label, _)) in (at..).zip(votes) {
                 let (vantage, point) = (&self.vantages[i], &self.points[label]);
+                let place = labels.partition_point(|&before| before < label);
                 let look = match self.care {
-                    Care::Rough => vantage.look(label, point)?.by_itself(),
-                    Care::Exact => vantage.look_where_it_was(label, point, &self.pose_errors[i])?,
+                    Care::Rough => vantage.look(place, point)?.by_itself(),
+                    Care::Exact => vantage.look_where_it_was(place, point, &self.pose_errors[i])?,
                 };
                 let height = heights.get(&i).map(|(up, higher_m, m2)| look.at_height(up, *higher_m, *m2));
                 found.looks.push(look);
@@ -336,7 +342,7 @@ impl Joint<'_> {
                 }
             }
             at += votes.len();
-            found.ends.push(found.looks.len());
+            found.visits.push((labels, found.looks.len()));
         }
         Some(found)
     }
@@ -449,10 +455,12 @@ impl Solution<'_> {
         for &(label, _) in &joint.votes {
             voters[label] += 1;
         }
-        for (votes, of_visit) in joint.visits().zip(&here.of_visits) {
-            let rest = &here.normals.information - &of_visit.information * OTHERS_SHARE;
+        for (votes, (labels, of_visit)) in joint.visits().zip(&here.of_visits) {
+            let mut all = Normals::nothing(joint.points.len());
+            all.add_those_of(labels, of_visit);
+            let rest = &here.normals.information - all.information * OTHERS_SHARE;
             let Some(rest) = rest.cholesky() else { continue };
-            let step = rest.solve(&(&of_visit.gradient * OTHERS_SHARE - &here.normals.gradient));
+            let step = rest.solve(&(all.gradient * OTHERS_SHARE - &here.normals.gradient));
             let others = joint.estimates(&rest.inverse());
             let mut of_visit = vec![0_usize; joint.points.len()];
             for &(label, _) in votes {
@@ -499,7 +507,8 @@ fn retain<T>(all: &mut Vec<T>, leaves: &[bool]) {
 /// The normal equations of all votes, and how well each fits.
 struct Evaluation {
     normals: Normals,
-    of_visits: Vec<Normals>,
+    /// Of the labels of each visit, ascending.
+    of_visits: Vec<(Vec<usize>, Normals)>,
     /// See [`Solution::own_chi2`].
     own: Vec<f64>,
     /// The most probable pose error of the image of each vote; none while estimates are rough.

@@ -1,7 +1,7 @@
 //! The noise that makes rays likeliest: sought from several starts, each time from the map that is found with it.
 
 use std::f64::consts::PI;
-use std::rc::Rc;
+use std::sync::Arc;
 
 use rayon::prelude::*;
 
@@ -91,7 +91,10 @@ pub fn misfits(
     let second = renamed(&first, second_of_first);
     let of = |scene, rays| Sample { scene, rays, known, settings: wider(settings), progress };
     let samples = [of(scenes[0], &first), of(scenes[1], &second)];
-    let found = [Likeliest::of_starts(&samples[0], guess)?.best, Likeliest::of_starts(&samples[1], guess)?.best];
+    // Side by side: samples are so small that threads wait for each other within each of them.
+    let sought = |here: usize| Likeliest::of_starts(&samples[here], guess);
+    let (first_found, second_found) = rayon::join(|| sought(0), || sought(1));
+    let found = [first_found?.best, second_found?.best];
     let least = |here: usize, numbers: &[u32]| -> Result<f64, Halt> {
         let [Some(own), Some(other)] = [&found[here], &found[1 - here]] else { return Ok(f64::INFINITY) };
         let rename = |(votes, point): &Placed| (renamed(votes, numbers), *point);
@@ -99,7 +102,8 @@ pub fn misfits(
         let noise = samples[here].noise_of(&other.noise, &map);
         Ok(own.value.min(samples[here].round_from(&noise, map)?.value))
     };
-    Ok(([least(0, &first_of_second)?, least(1, second_of_first)?], first.len()))
+    let (of_first, of_second) = rayon::join(|| least(0, &first_of_second), || least(1, second_of_first));
+    Ok(([of_first?, of_second?], first.len()))
 }
 
 /// Rays by other numbers, ascending.
@@ -233,9 +237,9 @@ impl Round {
 /// What makes the same rays likeliest so far.
 #[derive(Default)]
 struct Likeliest {
-    best: Option<Rc<Round>>,
+    best: Option<Arc<Round>>,
     /// The last step from the same start: what it leaves over is no longer that of a start.
-    last: Option<Rc<Round>>,
+    last: Option<Arc<Round>>,
     /// From how many starts it was sought.
     starts: usize,
 }
@@ -266,10 +270,10 @@ impl Likeliest {
     ) -> Result<(), Halt> {
         let (mut last, mut is_best) = (None, false);
         for _ in 0..count {
-            let found = Rc::new(step(&noise)?);
+            let found = Arc::new(step(&noise)?);
             noise = found.again;
             if self.best.as_ref().is_none_or(|best| found.value < best.value) {
-                (self.best, is_best) = (Some(Rc::clone(&found)), true);
+                (self.best, is_best) = (Some(Arc::clone(&found)), true);
             }
             last = Some(found);
         }

@@ -181,8 +181,9 @@ impl<'a> Association<'a> {
     /// Decide the claims of some segments of one pass, ordered by segment and image.
     fn decide(&self, labels: &[Label], stands: &[u64], claims: &[Claim], progress: &Progress) -> Result<Decided, Halt> {
         let (scene, noise, limit) = (self.scene, self.noise, self.index.gate_sigmas().powi(2));
-        let cases: Vec<Case<'_>> =
-            claims.iter().filter_map(|claim| Case::of(scene, noise, &labels[claim.label as usize], claim)).collect();
+        // Not collected: hardly any is left out, and an iterator that may does not say how many there will be.
+        let mut cases: Vec<Case<'_>> = Vec::with_capacity(claims.len());
+        cases.extend(claims.iter().filter_map(|claim| Case::of(scene, noise, &labels[claim.label as usize], claim)));
         let run = Run::new(self, labels, stands, &cases);
         let smoothed = smooth(&run.starts_m, &run.of_segments);
         let judge = |(i, cases): (usize, &&[Case<'_>])| {
