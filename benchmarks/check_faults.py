@@ -304,6 +304,15 @@ def degrees_for_radians(dataset: Dataset) -> Dataset:
     return _from_angles(dataset, np.degrees(azimuth), np.degrees(pitch), np.degrees(roll))
 
 
+def tilt_convention(dataset: Dataset) -> Dataset | None:
+    """Let pitch count downwards, where there is any to speak of."""
+    azimuth, pitch, roll = _angles(dataset)
+    return None if np.abs(pitch).mean() < LEAST_PITCH_RAD else _from_angles(dataset, azimuth, -pitch, roll)
+
+
+LEAST_PITCH_RAD = np.radians(2.0)
+
+
 def pitch_and_roll(dataset: Dataset) -> Dataset:
     """Pitch and roll of a poor sensor."""
     azimuth, _, _ = _angles(dataset)
@@ -332,6 +341,12 @@ def rotation_sigma_stated(dataset: Dataset) -> Dataset:
     """State in radians what `rotation_sigma_in_degrees` states in degrees."""
     degrees = rotation_sigma_in_degrees(dataset).images.rotation_sigma_rad
     return replace(dataset, images=dataset.images.replace(rotation_sigma_rad=np.radians(np.asarray(degrees))))
+
+
+def headings_constant(dataset: Dataset) -> Dataset:
+    """Take all cameras to look north: the column was not there."""
+    azimuth, pitch, roll = _angles(dataset)
+    return _from_angles(dataset, np.zeros_like(azimuth), pitch, roll)
 
 
 def _with_params(dataset: Dataset, change: Callable[[Floats], Floats]) -> Dataset:
@@ -701,7 +716,9 @@ FAULTS: dict[str, Fault] = {
     "lat_lon_swapped": Fault(lat_lon_swapped),
     "heading_convention": Fault(heading_convention),
     "degrees_for_radians": Fault(degrees_for_radians),
+    "tilt_convention": Fault(tilt_convention),
     "pitch_and_roll": Fault(pitch_and_roll, has_fix=False),  # What the sensor did not measure does not come back.
+    "headings_constant": Fault(headings_constant),
     "up_direction": Fault(up_direction),
     "rotation_sigma_in_degrees": Fault(rotation_sigma_in_degrees, compared=rotation_sigma_stated),
     "focal_length": Fault(focal_length),

@@ -36,6 +36,8 @@ COST_OF_A_POINT = 1.5
 """A point has three coordinates to please three residuals of its own with: half of them are no evidence."""
 _LEAST_RANGE_M, _GREATEST_RANGE_M = 1e-6, 1e5
 _LEAST_PARALLAX_DEG = 1.0
+_GREATEST_GATE_PX = 1e5
+"""What the vote takes at most: a reading under which a radian has millions of pixels is refuted at any gate."""
 _LEAST_PLACES = 4
 _MOST_EXACT = 50
 
@@ -71,6 +73,7 @@ class Agreement:
 
 def measure_agreement(dataset: Dataset, place_of_image: NDArray[np.uint32], gate_px: float) -> Agreement:
     """Vote on a sample: `place_of_image` (images) says which images are looked at together, from 0 without gaps."""
+    gate_px = min(gate_px, _GREATEST_GATE_PX)
     middle_in_world_m = np.median(camera_centers(dataset.images), axis=0)
     rays = cast_rays(_around(dataset, middle_in_world_m))
     places = int(place_of_image.max(initial=0)) + 1

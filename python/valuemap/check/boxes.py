@@ -16,6 +16,9 @@ from valuemap.dataset import Dataset, rows_of
 from valuemap.tables import Bools, Floats, Ints
 
 _NORMALISED_LIMIT = 2.0
+_MOST_OUT = 1.02
+"""A box cut at its centre ends half its size outside, and with its corner for its centre a whole one."""
+_FEET_IN_A_METRE = 3.28
 _STRAYS = 0.02
 """A gap with more boxes in it than this share of those beside it is none."""
 _NEARLY_ALL = 0.99
@@ -134,7 +137,9 @@ class HalfSizes(Fault):
             height_m, objects = float(np.median(height_of_each_m)), len(height_of_each_m)
             low, high = plausible_heights(name)
             figures[f"height_m of {name}"] = round(height_m, 3)
-            if low > 0.1 and objects >= 3 and low / 3.0 < height_m < low * 1.35 <= 2.0 * height_m <= high:
+            # Of a unit that is not the metre, feet are the nearest to a half.
+            is_half = height_m > math.sqrt(low * high) / math.sqrt(2.0 * _FEET_IN_A_METRE)
+            if low > 0.1 and objects >= 3 and is_half and height_m < low * 1.35 <= 2.0 * height_m <= high:
                 reasons.append(f"{name} are {height_m:.2g} m high; twice that is usual")
         if not reasons:
             return None
@@ -160,11 +165,17 @@ class PictureSize(Convention):
         """Yield boxes of pictures enlarged or shrunk, but not so much that they would be outside of theirs."""
         reach = float(np.quantile((dataset.detections.center_px / picture_sizes(dataset)).max(axis=1), _NEARLY_ALL))
         for name, factor in (
-            ("4", 4.0), ("3", 3.0), ("2", 2.0), ("1.5", 1.5), ("4/3", 4 / 3), ("3/4", 0.75),
-            ("2/3", 2 / 3), ("1/2", 0.5), ("1/3", 1 / 3), ("1/4", 0.25),
+            ("4", 4.0), ("3", 3.0), ("2", 2.0), ("1.5", 1.5), ("4/3", 4 / 3), ("5/4", 1.25), ("6/5", 1.2),
+            ("5/6", 5 / 6), ("4/5", 0.8), ("3/4", 0.75), ("2/3", 2 / 3), ("1/2", 0.5), ("1/3", 1 / 3), ("1/4", 0.25),
         ):  # fmt: skip
             if factor < 1.0 or factor * reach <= 1.0:
                 yield f"boxes {name} times as large", _Scaled(factor)
+        farthest = float(np.quantile(dataset.detections.center_px.max(axis=1), _NEARLY_ALL))
+        for side in _SQUARES_PX:
+            if farthest > side or side > _LARGER_SQUARE * farthest:
+                continue
+            yield f"boxes of pictures squeezed into {side} x {side} px", _OfSquare(side, is_squeezed=True)
+            yield f"boxes of pictures fitted into {side} x {side} px with bars", _OfSquare(side, is_squeezed=False)
 
 
 class MirroredPictures(Convention):
@@ -180,6 +191,14 @@ class MirroredPictures(Convention):
         yield "top and bottom exchanged", _Flipped(x=False, y=True)
         yield "turned upside down", _Flipped(x=True, y=True)
         yield "x and y exchanged (row, column)", _swap_axes
+        yield "turned a quarter to the right", partial(_turned_by_a_quarter, to_right=True)
+        yield "turned a quarter to the left", partial(_turned_by_a_quarter, to_right=False)
+
+
+_SQUARES_PX = (100, 224, 300, 416, 512, 608, 640, 768, 800, 1000, 1024, 1280, 1536)
+"""What detectors take their pictures in (and 100 and 1000, for percent and thousandths of them)."""
+_LARGER_SQUARE = 1.25
+"""Of many boxes the farthest are near the far side of the longer direction of their pictures."""
 
 
 @dataclass(frozen=True)
@@ -224,8 +243,8 @@ def _chance_of_gap(reaching: _Ends, keeping: _Ends) -> float:
     """
     reach = -0.5 if np.sum(reaching.ends < -0.52) >= 3 else 0.0
     out = int((reaching.ends < reach - 0.02).sum())
-    if out < 3:
-        return 1.0
+    if out < 3 or int((reaching.ends < -_MOST_OUT).sum()) > _STRAYS * out:
+        return 1.0  # Boxes that lie outside of their pictures are of other pictures.
     return _chance_of_empty(keeping.ends, reach + 0.5, 1.0)
 
 
@@ -271,6 +290,21 @@ class _Scaled:
         )
 
 
+class _OfSquare:
+    """Boxes of the pictures that a detector saw in a square, squeezed in both directions or with bars at two sides."""
+
+    def __init__(self, side_px: float, *, is_squeezed: bool) -> None:
+        self._side_px, self._is_squeezed = side_px, is_squeezed
+        self.gate_factor = 1.0
+
+    def __call__(self, dataset: Dataset) -> Dataset:
+        detections, extent = dataset.detections, picture_sizes(dataset)
+        shown = extent if self._is_squeezed else np.broadcast_to(extent.max(axis=1, keepdims=True), extent.shape)
+        factor = shown / self._side_px
+        center = detections.center_px * factor - (shown - extent) / 2.0
+        return with_detections(dataset, center_px=center, size_px=detections.size_px * factor)
+
+
 class _Flipped:
     """Boxes mirrored."""
 
@@ -287,6 +321,15 @@ def _swap_axes(dataset: Dataset) -> Dataset:
     return with_detections(
         dataset, center_px=detections.center_px[:, ::-1].copy(), size_px=detections.size_px[:, ::-1].copy()
     )
+
+
+def _turned_by_a_quarter(dataset: Dataset, *, to_right: bool) -> Dataset:
+    """Turn boxes back that were measured in a picture turned to the right, or to the left, by a quarter."""
+    swapped, extent = _swap_axes(dataset), picture_sizes(dataset)
+    center = swapped.detections.center_px
+    axis = 1 if to_right else 0
+    center[:, axis] = extent[:, axis] - center[:, axis]
+    return swapped
 
 
 def rows_in_images(dataset: Dataset) -> Ints:

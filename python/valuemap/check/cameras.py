@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.agreement import compare, measure_agreement
 from valuemap.check.fault import (
+    GATE_RAD,
     LEAST_CHANCE,
     LEAST_RISE,
     WIDER_GATE,
@@ -29,6 +31,7 @@ from valuemap.check.fault import (
     with_poses,
 )
 from valuemap.check.fit import Estimate, Parameter, estimate
+from valuemap.check.groups import Group, groups_of
 from valuemap.check.lenses import Focal, focals, with_params
 from valuemap.check.loose import Correction, Loose
 from valuemap.check.passes import moved_along
@@ -71,7 +74,7 @@ PARAMETERS = (
 def common_errors(view: View) -> Estimate | None:
     """Return the estimate of what all images may share, worked out once a view."""
     if "common_errors" not in view.memory:
-        view.memory["common_errors"] = estimate(view.dataset, view.many_places, view.gate_px, _parameters(view))
+        view.memory["common_errors"] = estimate(view.dataset, view.many_places, view.gate_px, parameters_of(view))
     found: Estimate | None = view.memory["common_errors"]
     return found
 
@@ -81,13 +84,14 @@ def settled_errors(view: View) -> Estimate:
     if "settled_errors" not in view.memory:
         start = common_errors(view)
         assert start is not None
-        settled = estimate(view.dataset, view.many_places, view.gate_px, _parameters(view), start=start)
+        settled = estimate(view.dataset, view.many_places, view.gate_px, parameters_of(view), start=start)
         view.memory["settled_errors"] = settled
     found: Estimate = view.memory["settled_errors"]
     return found
 
 
-def _parameters(view: View) -> tuple[Parameter, ...]:
+def parameters_of(view: View) -> tuple[Parameter, ...]:
+    """Return what all images may share: without focal lengths where a camera has none."""
     cameras = view.dataset.cameras
     has_focal = all(focals(cameras, row) for row in range(len(cameras)))
     return PARAMETERS if has_focal else tuple(p for p in PARAMETERS if p.name != "log_focal")
@@ -100,9 +104,78 @@ def _best_correction(view: View) -> Correction | None:
     time, the best first: of a shift along the drive a little looks like a wrong focal length.
     """
     if "correction" not in view.memory:
-        view.memory["correction"] = _find_correction(view) or _find_beyond_noise(view)
+        every = _find_correction(view) or _find_beyond_noise(view)
+        view.memory["correction"] = _better_explained(view, every, _find_of_one_group(view))
     found: Correction | None = view.memory["correction"]
     return found
+
+
+_OF_A_CAMERA, _OF_A_PASS = frozenset({"pitch", "yaw", "roll", "log_focal"}), frozenset({"pitch", "yaw", "roll"})
+"""What one camera may have of its own, and what changes when it is mounted anew for a drive."""
+
+
+def _find_of_one_group(view: View) -> Correction | None:
+    """Return the change of one camera, or of the cameras of one pass, by which rays gain most.
+
+    Its size is estimated from the group's own rays; that it is no accident must show in how they meet all others.
+    """
+    groups, compared = groups_of(view.dataset), 0
+    given: Floats | None = None
+    best: Correction | None = None
+    for group in groups:
+        alone = group.alone(view)
+        for own in _estimates_of(alone, _OF_A_CAMERA if group.pass_name is None else _OF_A_PASS, len(groups)):
+            given = gains_of_all(view, view.dataset) if given is None else given
+            compared += 1
+            correction = replace(own, group=group)
+            comparison = compare(gains_of_all(view, correction(view.dataset)), given)
+            correction = replace(correction, comparison=comparison, chance=max(own.chance, comparison.chance))
+            if best is None or comparison.difference > best.comparison.difference:
+                best = correction
+    if best is None or best.chance * compared > LEAST_CHANCE:
+        return None
+    return replace(best, chance=best.chance * compared)
+
+
+def _estimates_of(alone: View, told: frozenset[str], groups: int) -> Iterator[Correction]:
+    """Yield the changes of a group that its own rays tell from nothing, if a map would show them."""
+    found = common_errors(alone)
+    if found is None:
+        return
+    freedom = max(found.places - len(found.names), 1)
+    for name in found.names:
+        value, sigma = found.of(name)
+        chance = 2.0 * float(stats.t.sf(abs(value) / sigma, freedom)) * len(found.names) * groups
+        if name not in told or chance > LEAST_CHANCE:
+            continue
+        parameter = next(p for p in PARAMETERS if p.name == name)
+        given = gains_of_all(alone, alone.dataset)
+        gains = gains_of_all(alone, parameter.change(alone.dataset, value))
+        value, sigma, gains = _better(alone, parameter, value, sigma, gains)
+        rise = compare(gains, given)
+        if rise.difference < LEAST_RISE * float(given.sum()):
+            continue
+        own = _followed(alone, Correction(parameter, value, sigma, chance, rise, found), given)
+        least = _LEAST_LOG_FOCAL if name == "log_focal" else _LEAST_GATES * GATE_RAD * alone.gate_share
+        if abs(own.value) < least:
+            continue
+        if name == "log_focal" and _is_wider_gate_only(alone, parameter.change(alone.dataset, own.value)):
+            continue
+        yield replace(own, chance=chance)
+
+
+_LEAST_GATES = 2.0
+"""How many gates (1.4 degrees) one group must be turned by: mounts are known to a degree, and levels assumed to one."""
+_LEAST_LOG_FOCAL = 0.05
+"""So much of a focal length moves what is 30 degrees from the axis as far."""
+
+
+def _better_explained(view: View, every: Correction | None, one: Correction | None) -> Correction | None:
+    """Return which of two corrections, of all images and of one group, lets all rays agree better."""
+    if every is None or one is None:
+        return every or one
+    of_every, of_one = (float(gains_of_all(view, each(view.dataset)).sum()) for each in (every, one))
+    return one if of_one > of_every else every
 
 
 def _find_correction(view: View) -> Correction | None:
@@ -145,7 +218,7 @@ def _find_beyond_noise(view: View) -> Correction | None:
 
     How cameras hang to a side is estimated, and not named: it turns rays by little.
     """
-    focal = next((each for each in _parameters(view) if each.name == "log_focal"), None)
+    focal = next((each for each in parameters_of(view) if each.name == "log_focal"), None)
     others = tuple(each for each in PARAMETERS if each.name != "log_focal")
     return Loose(view).correction(others, frozenset({"pitch", "yaw", "along"}), focal)
 
@@ -176,14 +249,22 @@ class _CommonError(Fault):
         name, value, found = best.parameter.name, best.value, best.estimate
         return Finding(
             fault=self.name,
-            what=self.says(view, name, value),
+            what=self.says(view, name, value)
+            if best.group is None
+            else _only(best.group, self.says(view, name, value)),
             why=f"{self.shows(view, name, value, best.sigma)} over {found.places} places and {found.points} objects; "
             f"corrected, the agreement of rays rises by {best.comparison.difference:.0f} "
             f"({best.comparison.places} places).",
             do=self.do,
             chance=best.chance,
-            figures={"estimates": found.to_json(), "parameter": name, **best.comparison.to_json()},
-            fix=partial(_changed, parameter=best.parameter, value=value),
+            figures={
+                "estimates": found.to_json(),
+                "parameter": name,
+                **({} if best.group is None else {"of": best.group.text}),
+                **best.comparison.to_json(),
+            },
+            fix=best,
+            of=None if best.group is None else best.group.text,
         )
 
     @abstractmethod
@@ -305,8 +386,8 @@ def _followed(view: View, best: Correction, given: Floats) -> Correction:
     return replace(best, value=value, chance=chance, comparison=comparison)
 
 
-def _changed(dataset: Dataset, *, parameter: Parameter, value: float) -> Dataset:
-    return parameter.change(dataset, value)
+def _only(group: Group, what: str) -> str:
+    return f"Only {group.text}: {what[0].lower()}{what[1:]}"
 
 
 class HalfPixel(Fault):

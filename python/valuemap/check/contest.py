@@ -14,7 +14,7 @@ cameras, say) is better or worse for whole stretches, and always compared by pla
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +23,7 @@ from valuemap.cameras import rotation_matrices
 from valuemap.check.agreement import Agreement, Comparison, compare, gains_of_objects, measure_agreement
 from valuemap.check.cameras import PARAMETERS
 from valuemap.check.fault import LEAST_CHANCE, WIDER_GATE, Convention, Finding, Fix, View, uprightness
+from valuemap.check.groups import Group, OfGroup, fits_one_group, groups_of
 from valuemap.check.sample import Sample
 from valuemap.dataset import Dataset
 from valuemap.progress import Progress, silent
@@ -38,6 +39,8 @@ _FROM_RAYS = 0.05
 """However upright cameras stand under a reading, rays must prefer it beyond this chance."""
 _SUSPICIOUS = 0.05
 """What good data would give with a probability above this, all that was tried counted, is not even told."""
+_FAR_WORSE = 0.5
+"""A group whose detections agree less than half as well as those of others has a contest of its own."""
 _LEAST_PRODUCT = 1e-300
 _TIE = 1e-3
 """Gains as close as this are the same: readings that differ in the last digits only."""
@@ -53,6 +56,8 @@ class _Reading:
     agreement: Agreement
     uprightness: float
     is_along_axis: bool = False
+    tests: int = 1
+    """How often the chance of an accident counts: conventions have the same share, and their readings share that."""
 
     @property
     def is_upright(self) -> bool:
@@ -97,17 +102,67 @@ def hold_contest(view: View, conventions: Sequence[Convention], progress: Progre
         at_gate = view if gate_share == view.gate_share else View(view.dataset, gate_share=gate_share)
         tried = _try_all(at_gate, conventions, progress)
         readings = [each for each in tried if each.is_worth(tried[0])]
-        top, tests = max(readings, key=lambda reading: reading.total), len(tried)
+        top = max(readings, key=lambda reading: reading.total)
         rivals = _rivals(readings)
         by_rays = _compare([top.agreement], [at_gate.chance]).chance
-        if _joined(by_rays, top, readings[0]) * tests > LEAST_CHANCE:
+        if _joined(by_rays, top, readings[0]) * top.tests > LEAST_CHANCE:
             continue
         finding = _judge(at_gate, readings, top)
-        suspicion = None if finding is not None else _suspicion(readings[0], top, tests)
+        suspicion = None if finding is not None else _suspicion(readings[0], top)
         if (finding or suspicion) and _is_small_turn(at_gate, top.total):
             return Verdict(None, gate_share)
         return Verdict(finding, gate_share, suspicion, () if finding is not None else rivals)
     return Verdict(None, None, rivals=rivals)
+
+
+def find_odd_group(view: View, conventions: Sequence[Convention], progress: Progress = silent) -> Finding | None:
+    """Look for a camera or a pass whose rays alone agree far worse than those of others, and hold its own contest.
+
+    What is good in all others is no mistake of the frame, and what changes more than the group is not tried.
+    """
+    groups = groups_of(view.dataset)
+    alone = {group: group.alone(view) for group in groups}
+    worth = {group: each.agreement.gain.sum() / max(each.agreement.detections, 1) for group, each in alone.items()}
+    for group in sorted(
+        groups, key=lambda each: (each.pass_name is not None, worth[each])
+    ):  # A camera is in many passes.
+        others = [
+            worth[each] for each in groups if each != group and (each.pass_name is None) == (group.pass_name is None)
+        ]
+        if not others or worth[group] > _FAR_WORSE * float(np.median(others)):
+            continue
+        part = alone[group].dataset
+        own = [_OfOneGroup(convention, part, group) for convention in conventions]
+        finding = hold_contest(alone[group], own, progress).finding
+        if finding is None or finding.fix is None or finding.chance is None:
+            continue
+        chance = finding.chance * len(groups)
+        if chance > LEAST_CHANCE:
+            continue
+        return replace(
+            finding,
+            what=f"Only {group.text}: {finding.what}",
+            chance=chance,
+            figures={"of": group.text, **finding.figures},
+            fix=OfGroup(group, finding.fix),
+            of=group.text,
+        )
+    return None
+
+
+class _OfOneGroup(Convention):
+    """A convention with those of its readings that change nothing but one group."""
+
+    def __init__(self, convention: Convention, part: Dataset, group: Group) -> None:
+        self._convention, self._part, self._group = convention, part, group
+        self.name, self.what, self.do = convention.name, convention.what, convention.do  # type: ignore[misc]
+        self.is_guess, self.least_times = convention.is_guess, convention.least_times  # type: ignore[misc]
+
+    def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
+        """Yield those."""
+        for how, fix in self._convention.readings(dataset):
+            if fits_one_group(fix, self._part, self._group):
+                yield how, fix
 
 
 def _rivals(readings: Sequence[_Reading]) -> tuple[str, ...]:
@@ -119,20 +174,22 @@ def _rivals(readings: Sequence[_Reading]) -> tuple[str, ...]:
         reading.how
         for reading in readings[1:]
         if not reading.is_guess
-        and _by_attitude(reading) * len(readings) < _SUSPICIOUS
-        and _compare_readings(given, reading).chance * len(readings) > LEAST_CHANCE
+        and _by_attitude(reading) * reading.tests < _SUSPICIOUS
+        and _compare_readings(given, reading).chance * reading.tests > LEAST_CHANCE
     )
 
 
 def _try_all(view: View, conventions: Sequence[Convention], progress: Progress) -> list[_Reading]:
     sample = view.stretches
-    tried = [(convention, how, fix) for convention in conventions for how, fix in convention.readings(sample.dataset)]
+    of_each = [(convention, list(convention.readings(sample.dataset))) for convention in conventions]
+    shares = sum(bool(found) for _, found in of_each)
+    tried = [(convention, how, fix, shares * len(found)) for convention, found in of_each for how, fix in found]
     readings = [_Reading(None, "as given", None, view.agreement, view.uprightness, _is_along_axis(view.dataset))]
-    for number, (convention, how, fix) in enumerate(tried):
+    for number, (convention, how, fix, tests) in enumerate(tried):
         progress("trying other conventions", number, len(tried))
         other = fix(sample.dataset)
         agreement = _measure(other, sample, view.gate_px, fix)
-        readings.append(_Reading(convention, how, fix, agreement, uprightness(other)))
+        readings.append(_Reading(convention, how, fix, agreement, uprightness(other), tests=tests))
     progress("trying other conventions", len(tried), len(tried))
     return readings
 
@@ -143,13 +200,13 @@ def _measure(dataset: Dataset, sample: Sample, gate_px: float, fix: Fix | None) 
 
 
 def _judge(view: View, readings: Sequence[_Reading], top: _Reading) -> Finding | None:
-    tests, given = len(readings), readings[0]
-    alike = [r for r in readings if _chance(top, r, given) * tests > LEAST_CHANCE]
+    given = readings[0]
+    alike = [r for r in readings if _chance(top, r, given) * top.tests > LEAST_CHANCE]
     everywhere = {id(reading): _everywhere(view, reading) for reading in alike}
     total = {id(reading): sum(float(each.gain.sum()) for each in everywhere[id(reading)]) for reading in alike}
     if len(alike) > 1:
         best = max(alike, key=lambda reading: total[id(reading)])
-        alike = [r for r in alike if _chance(best, r, given, everywhere) * tests > LEAST_CHANCE]
+        alike = [r for r in alike if _chance(best, r, given, everywhere) * best.tests > LEAST_CHANCE]
     if given in alike:
         return None
     alike = [reading for reading in alike if reading.is_upright] or alike
@@ -169,7 +226,7 @@ def _judge(view: View, readings: Sequence[_Reading], top: _Reading) -> Finding |
         f"others, with an agreement of {chosen.total:.0f}; as given {given.agreement.share:.0%} and {given.total:.0f}, "
         f"by chance {view.chance.share:.0%} and {view.chance.gain.sum():.0f} ({comparison.places} {comparison.of}).",
         do=chosen.convention.do,
-        chance=min(chance * tests, 1.0),
+        chance=min(chance * chosen.tests, 1.0),
         figures={
             "reading": chosen.how,
             "agreement_as_given": round(given.total, 1),
@@ -193,9 +250,9 @@ def _is_small_turn(view: View, total: float) -> bool:
     return any(measure_agreement(each, sample.place_of_image, view.gate_px).gain.sum() >= total for each in turned)
 
 
-def _suspicion(given: _Reading, top: _Reading, tests: int) -> str | None:
+def _suspicion(given: _Reading, top: _Reading) -> str | None:
     comparison = _compare_readings(top, given)
-    if top.convention is None or _joined(comparison.chance, top, given) * tests > _SUSPICIOUS:
+    if top.convention is None or _joined(comparison.chance, top, given) * top.tests > _SUSPICIOUS:
         return None
     return (
         f"Read as {top.how}, {top.agreement.share:.0%} of {top.agreement.detections} detections meet others, as given "

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from valuemap.check.contest import hold_contest
+from valuemap.check.contest import find_odd_group, hold_contest
 from valuemap.check.fault import STAGES, Finding, Fix, View
 from valuemap.check.prospects import describe_prospects
 from valuemap.check.registry import CONVENTIONS, FAULTS
@@ -95,10 +96,13 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
                         f"data were read as {', or '.join(told)}, and the rays are too few to tell which."
                     )
                 gate_share = verdict.gate_share or gate_share
-                found = [] if verdict.finding is None else [verdict.finding]
+                finding = verdict.finding
+                if finding is None and meets:
+                    finding = find_odd_group(view, CONVENTIONS, progress)
+                found = [] if finding is None else [finding]
             else:
                 found = _look(view, stage, progress)
-            findings += [each for each in found if not _COMPLETES.get(each.fault, frozenset()) & known]
+            findings += [each for each in found if not _is_rest(each, findings)]
             fixes: list[Fix] = [each.fix for each in found if each.fix is not None]
             for fix in fixes:
                 dataset = fix(dataset)
@@ -108,6 +112,12 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
                 break
     prospects = describe_prospects(View(dataset, gate_share=gate_share, drives=drives))
     return Examination(tuple(findings), prospects, dataset, tuple(notes))
+
+
+def _is_rest(finding: Finding, before: Sequence[Finding]) -> bool:
+    """Return whether a finding is what the fixes of earlier ones left of the same mistake."""
+    completes = _COMPLETES.get(finding.fault, frozenset())
+    return any(each.fault in completes and each.of in (None, finding.of) for each in before)
 
 
 def _look(view: View, stage: str, progress: Progress) -> list[Finding]:

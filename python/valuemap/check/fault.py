@@ -56,6 +56,8 @@ class Finding:
     chance: float | None = None
     figures: Mapping[str, Any] = field(default_factory=dict)
     fix: Fix | None = None
+    of: str | None = None
+    """What alone is wrong (a camera, a pass); None where all that is looked at may be."""
 
     @property
     def sure(self) -> str:

@@ -7,27 +7,45 @@ from collections.abc import Iterator
 from typing import ClassVar
 
 import numpy as np
+from scipy import stats
 
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check.fault import Convention, Fault, Finding, Fix, Stage, View, with_centers, with_images, with_poses
+from valuemap.check.fault import (
+    GATE_RAD,
+    LEAST_CHANCE,
+    Convention,
+    Fault,
+    Finding,
+    Fix,
+    Stage,
+    View,
+    with_centers,
+    with_images,
+    with_poses,
+)
 from valuemap.check.headings import driving_azimuths, headings, rotations_of, turned
+from valuemap.check.lenses import focals
+from valuemap.check.offsets import find_shift
 from valuemap.check.passes import median_speed_mps
+from valuemap.check.quality import certain_points, flattened, matches
 from valuemap.check.sizes import are_outside, object_heights, plausible_heights
 from valuemap.check.turns import rotations_from_degrees
-from valuemap.dataset import Dataset, Frame
+from valuemap.dataset import Dataset, Frame, rows_of
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
-from valuemap.tables import Floats
+from valuemap.tables import Floats, Images
 
 _WORLD_AXES: dict[str, list[list[float]]] = {
     "north, east, down": [[0, 1, 0], [1, 0, 0], [0, 0, -1]],
-    "north, west, up": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
-    "x south, y east, z up": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
-    "west, south, up": [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
+    "north, west, up (headings from another direction)": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
+    "x south, y east, z up (headings from another direction)": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+    "west, south, up (headings from the opposite direction)": [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
     "y up, z back": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
     "y down, z forward": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
     "east, south, down": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
 }
 """Takes the world of the positions into that in which the rotations are given."""
+_POSITIONS_IN = ("y up, z back", "y down, z forward", "north, east, down", "east, south, down")
+"""Those in which up is elsewhere: of the others it is one whether positions or rotations are turned."""
 _MIRRORED: dict[str, list[list[float]]] = {
     "x the other way": [[-1, 0, 0], [0, 1, 0], [0, 0, 1]],
     "y the other way": [[1, 0, 0], [0, -1, 0], [0, 0, 1]],
@@ -36,6 +54,8 @@ _MIRRORED: dict[str, list[list[float]]] = {
 _LEAST_UPRIGHT = 0.5
 _SIGMA_LIMIT_RAD = 0.35
 """A pose whose rotation is not known to 20 degrees is none: such a column is in degrees."""
+_TIMES_THE_GATE = 6.0
+"""Rays that meet at the gate are not of rotations known to no more than so many times as much."""
 _SPEEDS_MPS = (0.2, 70.0)
 """From pushing a cart to the fastest road."""
 
@@ -44,13 +64,17 @@ class WorldAxes(Convention):
     """Positions in one world, rotations in another: ENU and NED, y up and z up."""
 
     name: ClassVar[str] = "world_axes"
-    what: ClassVar[str] = "Positions and rotations are in different worlds (ENU and NED, y up and z up)."
-    do: ClassVar[str] = "Turn positions and rotations into one world: x east, y north, z up."
+    what: ClassVar[str] = (
+        "Positions and rotations are in different worlds (ENU and NED, y up and z up, headings from north or east)."
+    )
+    do: ClassVar[str] = "Turn positions and rotations into one world: x east, y north, z up, headings from north."
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield rotations given in other axes than the positions."""
         for name, axes in _WORLD_AXES.items():
             yield f"rotations in {name}", _OtherWorld(np.array(axes, dtype=np.float64))
+        for name in _POSITIONS_IN:  # Cameras stand then as they are given.
+            yield f"positions in {name}", _OtherPositions(np.array(_WORLD_AXES[name], dtype=np.float64).T)
 
 
 class MirroredPositions(Convention):
@@ -92,9 +116,27 @@ class HeadingConvention(Convention):
     do: ClassVar[str] = "Say what headings mean: clockwise from north (compass) or counter-clockwise from east."
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
-        """Yield headings mirrored."""
+        """Yield headings mirrored, from each of the four directions; only turned they are `WorldAxes`."""
         yield "counter-clockwise from east taken for clockwise from north", _Headings(lambda a: np.pi / 2.0 - a)
         yield "counter-clockwise taken for clockwise", _Headings(lambda a: -a)
+        yield "counter-clockwise from west taken for clockwise from north", _Headings(lambda a: -a - np.pi / 2.0)
+        yield "counter-clockwise from south taken for clockwise from north", _Headings(lambda a: np.pi - a)
+
+
+class TiltConvention(Convention):
+    """Pitch that counts downwards, roll that counts the other way, or one taken for the other."""
+
+    name: ClassVar[str] = "tilt_convention"
+    what: ClassVar[str] = "Pitch or roll count the other way than they were read, or are taken for each other."
+    do: ClassVar[str] = "Say what the angles mean: pitch counts upwards, roll counts to the left."
+
+    def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
+        """Yield pitch, roll and both negated, and the one for the other."""
+        yield "pitch the other way", _Tilts([[-1, 0], [0, 1]])
+        yield "pitch and roll the other way", _Tilts([[-1, 0], [0, -1]])
+        yield "pitch and roll exchanged", _Tilts([[0, 1], [1, 0]])
+        yield "pitch and roll exchanged, one the other way", _Tilts([[0, -1], [1, 0]])
+        yield "pitch and roll exchanged, the other the other way", _Tilts([[0, 1], [-1, 0]])
 
 
 class DegreesForRadians(Convention):
@@ -110,6 +152,8 @@ class DegreesForRadians(Convention):
         for name, zero in (("clockwise from north", 0.0), ("counter-clockwise from east", np.pi / 2.0)):
             yield f"degrees {name} read as radians", _DegreesReadAsRadians(zero)
             yield f"radians {name} read as degrees", _RadiansReadAsDegrees(zero)
+            yield f"headings in degrees {name} read as radians", _DegreesReadAsRadians(zero, tilts=False)
+            yield f"headings in radians {name} read as degrees", _RadiansReadAsDegrees(zero, tilts=False)
 
 
 class HeadingsUseless(Convention):
@@ -123,6 +167,61 @@ class HeadingsUseless(Convention):
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield headings from the positions."""
         yield "headings along the drive", _heading_from_motion
+
+
+class ConstantHeadings(Fault):
+    """Cameras that look one way wherever they are driven: a column of headings that was never filled."""
+
+    name: ClassVar[str] = "headings_constant"
+    stage: ClassVar[Stage] = "positions"  # Of poses read wrongly, headings may be none.
+
+    def find(self, view: View) -> Finding | None:
+        """Compare how much the cameras turn with how much their ways do; panoramas may all be turned to north."""
+        dataset = view.dataset
+        camera_row = rows_of(dataset.images.camera_id, dataset.cameras.camera_id)
+        azimuth_rad, _, _ = headings(dataset)
+        way_rad, is_moving = driving_azimuths(dataset)
+        told = []
+        for row in np.unique(camera_row).tolist():
+            mine = camera_row == row
+            moving = mine & is_moving
+            if not focals(dataset.cameras, row) or moving.sum() < _LEAST_MOVING:
+                continue
+            told.append((_spread_rad(azimuth_rad[mine]), _spread_rad(way_rad[moving])))
+        if not told or any(turns > _STEADY_RAD or way < _WAYS_RAD for turns, way in told):
+            return None
+        images = dataset.images
+        return Finding(
+            fault=self.name,
+            what="The headings say nothing: all images of a camera look the same way, wherever it is driven.",
+            why=f"The headings of a camera scatter by {math.degrees(max(turns for turns, _ in told)):.2g} degrees, "
+            f"the directions in which its images move by {math.degrees(min(way for _, way in told)):.0f} degrees.",
+            do=HeadingsUseless.do,
+            figures={"cameras": len(told), "images": len(images)},
+            fix=None if _expose_together(images) else _heading_from_motion,  # Which way looks each of a car's cameras?
+        )
+
+
+_LEAST_MOVING = 20
+_STEADY_RAD = math.radians(0.5)
+_WAYS_RAD = math.radians(20.0)
+"""No camera of a car keeps its heading to half a degree while the car's turns by twenty."""
+
+
+def _expose_together(images: Images) -> bool:
+    """Return whether cars have several cameras, or may have: of images with several cameras no times are known."""
+    if len(np.unique(images.camera_id)) == 1:
+        return False
+    if images.timestamp_s is None:
+        return True
+    together = np.stack([images.pass_id.codes.astype(np.float64), images.timestamp_s])
+    return len(np.unique(together, axis=1).T) < len(images)
+
+
+def _spread_rad(azimuth_rad: Floats) -> float:
+    """Return the circular standard deviation of azimuths (N)."""
+    length = float(np.hypot(np.mean(np.cos(azimuth_rad)), np.mean(np.sin(azimuth_rad))))
+    return math.sqrt(max(-2.0 * math.log(max(length, 1e-12)), 0.0))
 
 
 class UpDirection(Fault):
@@ -162,20 +261,22 @@ class RotationSigmaUnit(Fault):
     """rotation_sigma_rad that holds degrees."""
 
     name: ClassVar[str] = "rotation_sigma_in_degrees"
-    stage: ClassVar[Stage] = "tables"
+    stage: ClassVar[Stage] = "positions"  # When it is known at which gate rays meet.
 
     def find(self, view: View) -> Finding | None:
-        """Look for standard deviations that leave nothing of a rotation."""
+        """Look for standard deviations that leave nothing of a rotation, or that rays give the lie to."""
         sigma = view.dataset.images.rotation_sigma_rad
         if sigma is None or not np.any(np.isfinite(sigma)):
             return None
         median = float(np.nanmedian(sigma))
-        if median <= _SIGMA_LIMIT_RAD:
+        seen = _TIMES_THE_GATE * GATE_RAD * view.gate_share if view.meets else math.inf
+        if median <= min(_SIGMA_LIMIT_RAD, seen):
             return None
+        why = "which is no pose" if median > _SIGMA_LIMIT_RAD else "but rays meet at a tenth of that"
         return Finding(
             fault=self.name,
             what="rotation_sigma_rad holds degrees.",
-            why=f"Its median is {median:.3g}: as radians that is {math.degrees(median):.0f} degrees, which is no pose.",
+            why=f"Its median is {median:.3g}: as radians that is {math.degrees(median):.0f} degrees, {why}.",
             do="Convert the column to radians.",
             figures={"median": median},
             fix=lambda dataset: with_images(
@@ -191,7 +292,10 @@ class Scale(Fault):
     stage: ClassVar[Stage] = "results"
 
     def find(self, view: View) -> Finding | None:
-        """Compare the size of objects and the speed of the car with what there is."""
+        """Compare where objects are with the truth, and their size and the speed of the car with what there is."""
+        by_truth = _scale_by_truth(view)
+        if by_truth is not None:
+            return by_truth
         reasons, figures = [], {}
         factors = []
         heights = object_heights(view)
@@ -220,6 +324,49 @@ class Scale(Fault):
             do=f"Scale the poses (about {figures['factor']:g} times): by GPS positions or a known distance.",
             figures=figures,
         )
+
+
+def _scale_by_truth(view: View) -> Finding | None:
+    """Return the unit in which most points where rays meet get a true object; None where it is the metre or unknown."""
+    truth, points = view.dataset.truth, certain_points(view)
+    if truth is None or min(len(truth), len(points)) < _LEAST_TRUTH or not view.meets:
+        return None
+    tolerance_m = max(view.step_m / 2.0, 1e-9)
+    points, objects = flattened(points, truth, view), flattened(truth.position_in_world_m, truth, view)
+    matched = {unit: _matched_in(unit_m, points, objects, tolerance_m) for unit, unit_m in _UNITS_M.items()}
+    unit = max(matched, key=lambda each: matched[each])
+    if unit == "metres" or matched[unit] < 2 * matched["metres"]:
+        return None
+    tests = len(points) * len(objects) * len(_UNITS_M)
+    chance = float(stats.binom.sf(matched[unit] - 1, matched[unit] + matched["metres"], 0.5)) * tests
+    if chance > LEAST_CHANCE:
+        return None
+    factor = _UNITS_M[unit]
+    return Finding(
+        fault=Scale.name,
+        what="The world is not in metres.",
+        why=f"Read in {unit} (times {factor:g}), {matched[unit]} of {len(points)} points where many rays meet have a "
+        f"true object within {tolerance_m * factor:.2g} m, in metres {matched['metres']}.",
+        do=f"Scale the positions of the images {factor:g} times.",
+        chance=chance,
+        figures={"factor": factor, "matched": matched["metres"], "matched_if_scaled": matched[unit]},
+        fix=lambda dataset: with_centers(dataset, factor * camera_centers(dataset.images)),
+    )
+
+
+_LEAST_TRUTH = 5
+_UNITS_M = {
+    "metres": 1.0, "kilometres": 1000.0, "decimetres": 0.1, "centimetres": 0.01, "millimetres": 0.001,
+    "feet": 0.3048, "inches": 0.0254, "miles": 1609.344, "metres taken for feet": 1 / 0.3048,
+    "metres taken for centimetres": 100.0, "metres taken for decimetres": 10.0,
+}  # fmt: skip
+
+
+def _matched_in(unit_m: float, points: Floats, objects: Floats, tolerance: float) -> int:
+    """Return how many points have an object as near as the tolerance (in their own unit), after the best shift."""
+    there = objects / unit_m
+    shift = find_shift(there, points, tolerance, within_m=None)
+    return 0 if shift is None else matches(points, there + shift.offset_m, tolerance)
 
 
 def _vector(parts: Floats) -> str:
@@ -299,11 +446,24 @@ class _Headings:
         return with_poses(dataset, turned(dataset, by), camera_centers(dataset.images))
 
 
-class _RadiansReadAsDegrees:
-    """All angles 57 times too small."""
+class _Tilts:
+    """Pitch and roll made of each other; headings stay."""
 
-    def __init__(self, zero_rad: float) -> None:
+    def __init__(self, of_pitch_and_roll: list[list[int]]) -> None:
+        self._matrix = np.array(of_pitch_and_roll, dtype=np.float64)
+
+    def __call__(self, dataset: Dataset) -> Dataset:
+        azimuth, pitch, roll = headings(dataset)
+        pitch, roll = self._matrix @ [pitch, roll]
+        return with_poses(dataset, rotations_of(azimuth, pitch, roll, dataset.frame), camera_centers(dataset.images))
+
+
+class _RadiansReadAsDegrees:
+    """All angles, or those of the compass only, 57 times too small."""
+
+    def __init__(self, zero_rad: float, *, tilts: bool = True) -> None:
         self._zero_rad = zero_rad
+        self._tilts = np.degrees(1.0) if tilts else 1.0
 
     def __call__(self, dataset: Dataset) -> Dataset:
         azimuth, pitch, roll = headings(dataset)
@@ -311,16 +471,18 @@ class _RadiansReadAsDegrees:
         angle = way * (azimuth - self._zero_rad)
         angle = np.arctan2(np.sin(angle), np.cos(angle))
         whole = self._zero_rad + way * np.degrees(angle)
-        rotation = rotations_of(whole, np.degrees(pitch), np.degrees(roll), dataset.frame)
+        rotation = rotations_of(whole, self._tilts * pitch, self._tilts * roll, dataset.frame)
         return with_poses(dataset, rotation, camera_centers(dataset.images))
 
 
 class _DegreesReadAsRadians:
     """Angles 57 times too large, of which whole turns are lost: the drive says how many."""
 
-    def __init__(self, zero_rad: float) -> None:
-        self._zero_rad = zero_rad
+    def __init__(self, zero_rad: float, *, tilts: bool = True) -> None:
+        self._zero_rad, self._tilts = zero_rad, tilts
 
     def __call__(self, dataset: Dataset) -> Dataset:
-        rotation = rotations_from_degrees(dataset, zero_rad=self._zero_rad, clockwise=not self._zero_rad)
+        rotation = rotations_from_degrees(
+            dataset, zero_rad=self._zero_rad, clockwise=not self._zero_rad, tilts=self._tilts
+        )
         return with_poses(dataset, rotation, camera_centers(dataset.images))

@@ -22,6 +22,7 @@ import valuemap._core as _core
 from valuemap.check.agreement import Comparison, compare, measure_agreement
 from valuemap.check.fault import GATE_RAD, LEAST_CHANCE, MANY_DETECTIONS, WIDER_GATE, View
 from valuemap.check.fit import Estimate, Parameter, apply, estimate
+from valuemap.check.groups import Group, OfGroup
 from valuemap.check.sample import Sample, pixels_per_radian, sample_stretches
 from valuemap.dataset import Dataset
 from valuemap.tables import Floats
@@ -58,6 +59,14 @@ class Correction:
     chance: float
     comparison: Comparison
     estimate: Estimate
+    group: Group | None = None
+    """What alone is corrected; None where all is."""
+
+    def __call__(self, dataset: Dataset) -> Dataset:
+        """Return a dataset with the parameter changed by the value."""
+        if self.group is None:
+            return self.parameter.change(dataset, self.value)
+        return OfGroup(self.group, lambda part: self.parameter.change(part, self.value))(dataset)
 
 
 class Loose:

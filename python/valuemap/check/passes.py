@@ -19,6 +19,7 @@ from valuemap.check.boxes import rows_in_images
 from valuemap.check.fault import (
     GATE_RAD,
     LEAST_CHANCE,
+    LEAST_RISE,
     Convention,
     Fault,
     Finding,
@@ -66,7 +67,7 @@ class ShiftedDetections(Convention):
     do: ClassVar[str] = "Match detections and images by name, not by their place in a list (one counts from 1?)."
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
-        """Yield detections moved by one image along each pass."""
+        """Yield detections moved by one image along each pass and camera; by more, that is a shift in time."""
         yield "detections of the next image", _ByImages(1)
         yield "detections of the image before", _ByImages(-1)
 
@@ -140,8 +141,8 @@ class NoDrives(Fault):
     stage: ClassVar[Stage] = "positions"
 
     def find(self, view: View) -> Finding | None:
-        """Look for passes whose images are in no order that a car drove."""
-        return _find_jumping(view, self.name, is_interleaved=False)
+        """Look for passes whose images are in no order that a car drove, or that take turns along one drive."""
+        return _find_in_turn(view, self.name) or _find_jumping(view, self.name, is_interleaved=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,6 +311,73 @@ def _find_jumping(view: View, name: str, *, is_interleaved: bool) -> Finding | N
     )
 
 
+def _find_in_turn(view: View, name: str) -> Finding | None:
+    found = _passes_in_turn(view.drives)
+    if found is None:
+        return None
+    names, share, images = found
+    several = len(set(names.values()))
+    return Finding(
+        fault=name,
+        what=f"{len(names)} passes are {'one drive' if several == 1 else f'{several} drives'}: their images take turns "
+        "along one road.",
+        why=f"In the order of their times, {share:.0%} of the {images} images go on where one of another pass and the "
+        "same camera just was.",
+        do="Give all images of a drive one pass id (is it a batch, a split or a folder?).",
+        figures={"passes": len(names), "drives": several, "images": images, "in_turn": round(share, 3)},
+        fix=_joined_passes,
+    )
+
+
+def _passes_in_turn(images: Images) -> tuple[dict[str, str], float, int] | None:
+    """Return under which one name passes (N) that take turns belong, how many images do and of how many.
+
+    Two images that follow each other in time, of one camera, are of one drive where the second is as far from the first
+    as the car gets in that time. Of passes that only meet, or follow each other, few are.
+    """
+    time = images.timestamp_s
+    if time is None or not np.all(np.isfinite(time)) or len(images) < _LEAST_IMAGES:
+        return None
+    center, codes = camera_centers(images), images.pass_id.codes.astype(np.int64)
+    order = np.lexsort((np.arange(len(time)), time, images.camera_id))
+    before, after = order[:-1], order[1:]
+    follows = (images.camera_id[before] == images.camera_id[after]) & (time[after] > time[before])
+    step_m = np.linalg.norm(center[after] - center[before], axis=1)
+    seconds = time[after] - time[before]
+    moves = follows & (step_m > 0.0)
+    if moves.sum() < _LEAST_IMAGES:
+        return None
+    usual_m = float(np.median(step_m[moves]))
+    speed_mps = float(np.median(step_m[moves] / seconds[moves]))
+    changes = follows & (codes[before] != codes[after])
+    goes_on = changes & (step_m <= np.maximum(_FASTER * speed_mps * seconds, 1e-9)) & (step_m <= _NEAR_STEPS * usual_m)
+    share = float(goes_on.sum()) / max(float(follows.sum()), 1.0)
+    if share < _IN_TURN or goes_on.sum() < _MOSTLY_ON * changes.sum():
+        return None
+    count = len(images.pass_id.names)
+    pairs = coo_matrix((np.ones(int(goes_on.sum())), (codes[before[goes_on]], codes[after[goes_on]])), (count, count))
+    often = pairs.tocsr()
+    often.data[often.data < _IN_TURN * _IN_TURN * np.bincount(codes).min()] = 0.0
+    often.eliminate_zeros()
+    _, drive = connected_components(often, directed=False)
+    first = {int(of): images.pass_id.names[code] for code, of in reversed(list(enumerate(drive)))}
+    joined = {images.pass_id.names[code]: first[int(of)] for code, of in enumerate(drive) if np.sum(drive == of) > 1}
+    return (joined, share, len(images)) if joined else None
+
+
+_IN_TURN, _MOSTLY_ON = 0.25, 0.8
+"""Of images so many change the pass where they go on, and of all changes of pass so many are such."""
+_FASTER, _NEAR_STEPS = 3.0, 5.0
+
+
+def _joined_passes(dataset: Dataset) -> Dataset:
+    found = _passes_in_turn(dataset.images)
+    if found is None:
+        return dataset
+    names = [found[0].get(name, name) for name in dataset.images.pass_id.texts()]
+    return with_images(dataset, pass_id=Categories.from_texts(names))
+
+
 def _jumping_passes(images: Images) -> list[dict[str, Any]]:
     if not len(images):
         return []
@@ -433,7 +501,7 @@ def _strands(dataset: Dataset, rows: Ints) -> Ints:
 
 
 class _ByImages:
-    """Detections moved along their passes by a number of images; those of the ends stay."""
+    """Detections moved along the images of their pass and camera by a number of them; those of the ends stay."""
 
     def __init__(self, images: int) -> None:
         self._images = images
@@ -441,11 +509,14 @@ class _ByImages:
     def __call__(self, dataset: Dataset) -> Dataset:
         images = dataset.images
         order = driving_order(images)
+        order = order[np.lexsort((images.camera_id[order], images.pass_id.codes[order]))]
         rank = np.empty(len(order), dtype=np.int64)
         rank[order] = np.arange(len(order))
         to = np.clip(np.arange(len(order)) - self._images, 0, len(order) - 1)
-        codes = images.pass_id.codes[order]
-        to = np.where(codes[to] == codes, to, np.arange(len(order)))
+        same = (images.pass_id.codes[order[to]] == images.pass_id.codes[order]) & (
+            images.camera_id[order[to]] == images.camera_id[order]
+        )
+        to = np.where(same, to, np.arange(len(order)))
         moved = order[to][rank]
         return with_detections(dataset, image_id=images.image_id[moved[rows_in_images(dataset)]])
 
@@ -546,7 +617,9 @@ def _apart_from_others(view: View) -> PassShift | None:
         return None
     meeting, heading = points.meeting, points.heading
     point, of_pass, class_code = meeting.point, meeting.pass_of_point, meeting.class_of_point
-    tolerance_m, within_m = view.step_m / 2.0, _SEARCH_STEPS * view.step_m
+    within_m = _SEARCH_STEPS * view.step_m
+    # Offsets as small as rays can see, if that is less than images are apart.
+    tolerance_m = min(view.step_m / 2.0, _seen_m(view) or view.step_m / 2.0)
     codes, number = np.unique(of_pass, return_counts=True)
     tried = codes[np.argsort(-number, kind="stable")][:_MOST_PASSES]
     candidates: list[tuple[int, int, bool, Floats]] = []
@@ -636,6 +709,8 @@ def _best_shift(
         comparison = compare(gain, given)
         chance = min(1.0, comparison.chance * _SEARCHED * len(candidates))
         total, without = float(gain.sum()), float(given.sum())
+        if total - without < LEAST_RISE * without:
+            continue
         # Of two ways to say the same, a shift in the world is the simpler one.
         rise = (total - without) * (1.0 if not is_along else 0.95)
         if chance < LEAST_CHANCE and np.linalg.norm(offset) > tolerance_m and (best is None or rise > best[0]):

@@ -20,6 +20,8 @@ _CAMERA_AXES: dict[str, list[list[float]]] = {
     "x right, y forward, z up": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
     "x left, y up, z forward": [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
     "x left, y down, z back": [[-1, 0, 0], [0, 1, 0], [0, 0, -1]],
+    "x down, y left, z forward": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+    "x up, y right, z forward": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
 }
 """Takes a point in the axes named to x right, y down, z forward."""
 

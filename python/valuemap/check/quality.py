@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
 from typing import Any, ClassVar
 
@@ -9,11 +10,13 @@ import numpy as np
 from scipy import stats
 from scipy.spatial import cKDTree
 
+from valuemap.cameras import camera_centers
 from valuemap.check.boxes import rows_in_images
 from valuemap.check.fault import LEAST_CHANCE, Fault, Finding, Stage, View, keep_rows, with_detections
 from valuemap.check.offsets import find_shift
+from valuemap.check.sample import driving_order
 from valuemap.dataset import Dataset
-from valuemap.tables import Bools, Categories, Floats, Truth
+from valuemap.tables import Bools, Categories, Floats, Images, Truth
 
 _SAME_SHARE = 0.05
 """Boxes of one class whose centres and sizes differ by less than this share of their size are one box, twice."""
@@ -75,8 +78,8 @@ class FarImages(Fault):
     stage: ClassVar[Stage] = "tables"
 
     def find(self, view: View) -> Finding | None:
-        """Look for few images much farther from the middle than all others."""
-        far = far_images(view.center_in_world_m)
+        """Look for few images much farther from the middle than all others, or far from the rest of their drive."""
+        far = far_images(view.center_in_world_m) | strays(view.dataset.images)
         count = int(far.sum())
         if count == 0:
             return None
@@ -100,7 +103,7 @@ class QuantisedBoxes(Fault):
     """Centres on a coarse grid."""
 
     name: ClassVar[str] = "quantised_boxes"
-    stage: ClassVar[Stage] = "tables"
+    stage: ClassVar[Stage] = "results"  # Boxes of pictures of another size are on another grid.
 
     def find(self, view: View) -> Finding | None:
         """Look for a step of more than a pixel that all centres keep to."""
@@ -120,7 +123,7 @@ class QuantisedBoxes(Fault):
 
 
 class ClassSpelling(Fault):
-    """Classes that differ only in case, spaces or underscores."""
+    """Classes that differ only in case, spaces, underscores or a plural s."""
 
     name: ClassVar[str] = "class_spelling"
     stage: ClassVar[Stage] = "tables"
@@ -133,7 +136,7 @@ class ClassSpelling(Fault):
         shown = "; ".join(" and ".join(repr(name) for name in sorted(names)) for names in groups)
         return Finding(
             fault=self.name,
-            what="Classes differ only in capitals, spaces, hyphens or underscores.",
+            what="Classes differ only in capitals, spaces, hyphens, underscores or a plural s.",
             why=f"There are {shown}: detections of them never support each other, and labels match no truth.",
             do="Spell each class one way.",
             figures={"classes": [sorted(names) for names in groups]},
@@ -170,13 +173,13 @@ class TruthElsewhere(Fault):
 
     def find(self, view: View) -> Finding | None:
         """Look for the shift, after other orders of axes, by which most points where rays meet get an object."""
-        truth, points = view.dataset.truth, _certain_points(view)
+        truth, points = view.dataset.truth, certain_points(view)
         if truth is None or len(truth) < _LEAST_TRUTH or len(points) < _LEAST_TRUTH or not view.meets:
             return None
         tolerance_m = max(view.step_m / 2.0, 1e-9)
-        objects = _flattened(truth.position_in_world_m, truth, view)
-        points = _flattened(points, truth, view)
-        here = _matches(points, objects, tolerance_m)
+        objects = flattened(truth.position_in_world_m, truth, view)
+        points = flattened(points, truth, view)
+        here = matches(points, objects, tolerance_m)
         if here >= _ENOUGH_TRUTH * min(len(points), len(objects)):
             return None
         there, how, fix = here, "", None
@@ -185,7 +188,7 @@ class TruthElsewhere(Fault):
             shift = find_shift(turned, points, tolerance_m, within_m=None)
             if shift is None:
                 continue
-            matched = _matches(points, turned + shift.offset_m, tolerance_m)
+            matched = matches(points, turned + shift.offset_m, tolerance_m)
             if matched > there:
                 moved_m = float(np.linalg.norm(shift.offset_m))
                 there, how = matched, f" With {name} and a shift of {moved_m:.4g} m, {matched} have one."
@@ -227,7 +230,7 @@ _TRUTH_AXES: dict[str, list[list[float]]] = {
 }
 
 
-def _flattened(points: Floats, truth: Truth, view: View) -> Floats:
+def flattened(points: Floats, truth: Truth, view: View) -> Floats:
     """Return points (N, 3) as they are, or where the truth knows no heights (all are equal) on the ground."""
     up = np.array(view.dataset.frame.up)
     if float(np.ptp(truth.position_in_world_m @ up)) > 0.0:
@@ -247,7 +250,7 @@ class _MovedTruth:
         return Dataset(**{**vars(dataset), "truth": dataset.truth.replace(position_in_world_m=position)})
 
 
-def _certain_points(view: View) -> Floats:
+def certain_points(view: View) -> Floats:
     """Return the points (N, 3) where rays of many images meet: the half with most votes."""
     found, point = view.agreement.found, view.agreement.points_in_world_m
     votes = np.diff(found.voter_offsets)
@@ -273,7 +276,8 @@ def _median_distance(points: Floats, objects: Floats) -> float:
     return float(np.median(cKDTree(objects).query(points)[0]))
 
 
-def _matches(points: Floats, objects: Floats, within_m: float) -> int:
+def matches(points: Floats, objects: Floats, within_m: float) -> int:
+    """Return how many points (N, D) have an object (M, D) within a distance."""
     return int((np.asarray(cKDTree(objects).query(points)[0]) <= within_m).sum())
 
 
@@ -336,10 +340,36 @@ def far_images(center: Floats) -> Bools:
     return far
 
 
-def _without_far(dataset: Dataset) -> Dataset:
-    from valuemap.cameras import camera_centers
+def strays(images: Images) -> Bools:
+    """Return which images (N) are a jump away from their drive, which goes on behind them where it was before them."""
+    order = driving_order(images)
+    order = order[np.lexsort((images.camera_id[order], images.pass_id.codes[order]))]
+    center = camera_centers(images)[order]
+    starts = (np.diff(images.pass_id.codes[order]) != 0) | (np.diff(images.camera_id[order]) != 0)
+    step_m = np.linalg.norm(np.diff(center, axis=0), axis=1)
+    moving = step_m[~starts & (step_m > 0.0)]
+    found = np.zeros(len(order), dtype=np.bool_)
+    if not len(moving):
+        return found
+    usual_m = float(np.median(moving))
+    jumps = ~starts & (step_m > _STRAY_STEPS * usual_m)
+    if jumps.sum() > _MOST_FAR * len(order):
+        return found  # Of images in no order all steps are jumps.
+    cuts = np.flatnonzero(jumps | starts) + 1
+    for first, last in itertools.pairwise(cuts.tolist()):
+        returns = jumps[first - 1] and jumps[last - 1]
+        way_on_m = float(np.linalg.norm(center[last] - center[first - 1]))
+        if returns and last - first <= _MOST_STRAYS and way_on_m <= _GOES_ON_STEPS * usual_m * (last - first + 1):
+            found[order[first:last]] = True
+    return found
 
-    return keep_rows(dataset, images=~far_images(camera_centers(dataset.images)))
+
+_STRAY_STEPS, _GOES_ON_STEPS, _MOST_STRAYS = 50.0, 3.0, 10
+"""No car is fifty steps away for some images, without having been seen on the way, and back at once."""
+
+
+def _without_far(dataset: Dataset) -> Dataset:
+    return keep_rows(dataset, images=~(far_images(camera_centers(dataset.images)) | strays(dataset.images)))
 
 
 def _grid_step(values: Floats) -> float | None:
@@ -358,7 +388,8 @@ def _grid_step(values: Floats) -> float | None:
 
 
 def _key(name: str) -> str:
-    return "".join(letter for letter in name.casefold() if letter.isalnum())
+    letters = "".join(letter for letter in name.casefold() if letter.isalnum())
+    return letters[:-1] if letters.endswith("s") else letters
 
 
 def _spellings(dataset: Dataset) -> list[set[str]]:

@@ -11,8 +11,10 @@ from valuemap.check.boxes import (
     TopLeftAsCenter,
 )
 from valuemap.check.cameras import CameraTilt, CameraYaw, FocalLength, HalfPixel, TimeShift, WrongCamera
+from valuemap.check.distortion import LensModel
 from valuemap.check.fault import Convention, Fault
 from valuemap.check.frames import (
+    ConstantHeadings,
     DegreesForRadians,
     HeadingConvention,
     HeadingsUseless,
@@ -20,10 +22,11 @@ from valuemap.check.frames import (
     MirroredPositions,
     RotationSigmaUnit,
     Scale,
+    TiltConvention,
     UpDirection,
     WorldAxes,
 )
-from valuemap.check.lenses import FocalUnit, LensModel, PrincipalPoint
+from valuemap.check.lenses import FocalUnit, PrincipalPoint
 from valuemap.check.passes import (
     CameraHeight,
     InterleavedPasses,
@@ -55,6 +58,7 @@ CONVENTIONS: tuple[Convention, ...] = (
     WorldAxes(),
     MirroredPositions(),
     HeadingConvention(),
+    TiltConvention(),
     DegreesForRadians(),
     PictureSize(),
     MirroredPictures(),
@@ -75,12 +79,12 @@ FAULTS: tuple[Fault, ...] = (
     RepeatedImages(),
     ClassSpelling(),
     EqualScores(),
-    QuantisedBoxes(),
-    RotationSigmaUnit(),
     RoundedPositions(),
     TopLeftAsCenter(),
     HalfPixel(),
     UpDirection(),
+    ConstantHeadings(),
+    RotationSigmaUnit(),
     RollingTimes(),
     InterleavedPasses(),
     NoDrives(),
@@ -97,6 +101,7 @@ FAULTS: tuple[Fault, ...] = (
     TimeShift(),
     HalfSizes(),
     Scale(),
+    QuantisedBoxes(),
     TruthElsewhere(),
 )
 """All other mistakes; they are looked for stage by stage, in this order in a stage."""

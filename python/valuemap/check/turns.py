@@ -23,7 +23,7 @@ _ROUNDS = 2
 """The first headings tell how far the camera moves outwards in bends and how far cars look off their way."""
 
 
-def rotations_from_degrees(dataset: Dataset, *, zero_rad: float, clockwise: bool) -> Floats:
+def rotations_from_degrees(dataset: Dataset, *, zero_rad: float, clockwise: bool, tilts: bool = True) -> Floats:
     """Return the rotations (N, 3, 3) that the degrees meant which were read as radians.
 
     Parameters
@@ -34,6 +34,8 @@ def rotations_from_degrees(dataset: Dataset, *, zero_rad: float, clockwise: bool
         The azimuth, clockwise from north, from which headings count.
     clockwise
         Whether they count clockwise.
+    tilts
+        Whether pitch and roll were degrees as well; else they are right as they are.
     """
     way = 1.0 if clockwise else -1.0
     azimuth, pitch, roll = headings(dataset)
@@ -41,7 +43,7 @@ def rotations_from_degrees(dataset: Dataset, *, zero_rad: float, clockwise: bool
     travel = _Travel(dataset, order)
     usual_pitch = None
     # The longest pass first, with the smallest pitch there can be: the others are mounted as it is.
-    for rows in sorted(travel.passes, key=len, reverse=True):
+    for rows in sorted(travel.passes, key=len, reverse=True) if tilts else ():
         images = order[rows]
         over = images[_is_turned_over(pitch[images], roll[images])]
         azimuth[over], pitch[over], roll[over] = azimuth[over] + np.pi, np.pi - pitch[over], roll[over] + np.pi
@@ -62,7 +64,8 @@ def rotations_from_degrees(dataset: Dataset, *, zero_rad: float, clockwise: bool
             right[order[rows]] = zero_rad + way * np.radians(heading_deg)
         outwards_m = travel.outwards_m(right[order])
         off_deg = travel.off_deg(right[order], outwards_m)
-    return rotations_of(right, np.radians(pitch), np.radians(roll), dataset.frame)
+    unit = np.radians(1.0) if tilts else 1.0
+    return rotations_of(right, unit * pitch, unit * roll, dataset.frame)
 
 
 class _Travel:
