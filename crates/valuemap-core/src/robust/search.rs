@@ -12,7 +12,7 @@ use super::Tally;
 use super::assign::assign;
 use super::births::births;
 use super::calibrate::Placed;
-use super::energy::{Object, object};
+use super::energy::{Object, object, unseen};
 use super::index::RayIndex;
 use super::learn::learn;
 use super::looks::Lookout;
@@ -59,7 +59,10 @@ pub fn search(
     let mut is_taken = vec![false; model.scene.rays.rays.len()];
     let spreads = Arc::clone(&model.spreads);
     let index = RayIndex::new(model.scene, &spreads, model.settings.gate_sigmas, rays.iter().copied());
-    let begin = |(votes, point): Placed| object(model, &lookout, votes, point, Vec::new());
+    // Who should have seen objects tells what classes are like; of each it is asked below.
+    let begin = |(votes, point): Placed| {
+        if learns { object(model, &lookout, votes, point, Vec::new()) } else { unseen(model, votes, point) }
+    };
     let mut objects: Vec<Object> = begun.into_par_iter().filter_map(begin).collect();
     let (mut tried, mut tried_pairs) = (Tried::default(), TriedPairs::default());
     let rounds = if depth == Depth::Deep { ROUNDS } else { 1 };
