@@ -14,9 +14,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from valuemap.cameras import camera_poses
 from valuemap.dataset import Dataset
@@ -210,6 +207,8 @@ def _candidates(labels: _Labels, points: _Points, rows: Ints, used: int) -> tupl
     """Return pairs of point and label of one class within reach."""
     if not len(labels.place_m):
         return np.empty(0, np.int64), np.empty(0, np.int64)
+    from scipy.spatial import cKDTree  # Slow to import, and only maps with control points need it.
+
     tree = cKDTree(labels.place_m[:, :used])
     near: list[list[int]] = list(tree.query_ball_point(points.place_m[rows, :used], REACH_M, return_sorted=True))  # type: ignore[arg-type]
     pairs = [
@@ -258,6 +257,8 @@ def _match(labels: _Labels, points: _Points, point: Ints, label: Ints, found: Ge
         return match
     ours, i = np.unique(point[fits], return_inverse=True)
     theirs, j = np.unique(label[fits], return_inverse=True)
+    from scipy.optimize import linear_sum_assignment  # As slow.
+
     cost = np.full((len(ours), len(theirs) + len(ours)), 1e6)
     cost[i, j] = square[fits]
     cost[np.arange(len(ours)), len(theirs) + np.arange(len(ours))] = _GATE**2
@@ -320,6 +321,8 @@ def _absolute(labels: Labels, place_m: Floats, found: Georeference, axes: Floats
 
 def _moved_dataset(dataset: Dataset, found: Georeference, axes: Floats) -> Dataset:
     """Return the dataset with its images moved as the labels are."""
+    from scipy.spatial.transform import Rotation  # As slow.
+
     rotation, center = camera_poses(dataset.images)
     moved = _moved(center @ axes.T, found) @ axes
     turn = axes.T @ Rotation.from_rotvec([0.0, 0.0, found.turn_rad]).as_matrix() @ axes

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset, Frame, number_passes, rows_of
@@ -111,6 +110,8 @@ def _texts(result: Map) -> list[str]:
 
 def _ellipsoids(covariance_m2: Floats) -> tuple[Floats, Floats]:
     """Return half axes (N, 3) in metres and rotations (N, 4; x, y, z, w) of 95 % ellipsoids of covariances (N, 6)."""
+    from scipy.spatial.transform import Rotation  # Slow to import, and only this format needs it.
+
     if not len(covariance_m2):
         return np.empty((0, 3)), np.empty((0, 4))
     variance, direction = np.linalg.eigh(covariance_matrices(covariance_m2))
