@@ -485,6 +485,15 @@ def test_drives_alone_tell_how_their_cameras_are_turned() -> None:
         assert np.abs(turned[long, 1] + true[long]).max() < 0.6
 
 
+def test_the_drift_of_a_drive_of_any_length_says_nothing_of_that_of_the_next() -> None:
+    driven_m = np.array([0.0, 100_000.0, 0.0, 50.0])
+    drives = Drives(np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1]), driven_m, np.arange(4), {})
+    chain, node, _ = refine_footage._nodes(drives)
+    assert node.tolist() == [0, 1, 2, 3]
+    assert chain.drive.tolist() == [0, 0, 1, 1]
+    np.testing.assert_allclose(chain.keep, [0.0, 0.0, 0.0, np.exp(-50.0 / refine_footage.DRIFT_LENGTH_M)])
+
+
 def test_cameras_mounted_askew_are_turned_back() -> None:
     clean, faulty = city(), city(pass_yaw_deg=1.5)
     refined = refine_poses(faulty, valuemap.MapConfig())

@@ -235,12 +235,14 @@ def _nodes(drives: Drives) -> tuple[Chain, Ints, Ints]:
     kinds, first, node = np.unique(code, return_index=True, return_inverse=True)
     drive = drives.pass_code[first]
     middle_m = np.bincount(node, weights=drives.driven_m) / np.bincount(node)
+    # Nothing is kept from one drive to the next; how far into theirs both nodes are says nothing.
     keep = np.zeros(len(kinds))
-    keep[1:] = np.exp(-np.diff(middle_m) / DRIFT_LENGTH_M) * (np.diff(drive) == 0)
+    goes_on = np.flatnonzero(np.diff(drive) == 0)
+    keep[goes_on + 1] = np.exp(-np.diff(middle_m)[goes_on] / DRIFT_LENGTH_M)
     # All cameras of an exposure turn with the first of it.
     exposure = drives.pass_code * (int(drives.order.max(initial=0)) + 1) + drives.order
     _, lead, of = np.unique(exposure, return_index=True, return_inverse=True)
-    return Chain(drive, np.maximum(keep, 0.0)), node, lead[of]
+    return Chain(drive, keep), node, lead[of]
 
 
 def _from_middle(dataset: Dataset, rays: Rays) -> Floats:
