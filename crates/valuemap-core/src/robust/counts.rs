@@ -2,7 +2,7 @@
 //!
 //! Where objects have ten votes each, hardly any has one. The numbers of objects with 1, 2, 3, ... votes are taken to be log-concave, as those of a
 //! Poisson distribution are and of most mixtures of it: `N1 N3 <= N2²` and `N2 N4 <= N3²`; where too few have three or four votes to tell, they are
-//! those of a negative binomial distribution, by the method of moments. What the energies of objects of few votes add up to is brought down to that.
+//! those of the negative binomial distribution that makes the others likeliest. What the energies of objects of few votes add up to is brought down to that.
 
 use super::energy::Object;
 use super::model::{Model, ln_gamma, mean_and_sd};
@@ -15,6 +15,8 @@ const ROUNDS: usize = 60;
 const MOST: f64 = 50.0;
 /// The largest k: a Poisson distribution, for all that is known.
 const LEAST_DISPERSION: f64 = 1e3;
+/// Votes of an object, on average, are no fewer: objects that nobody sees are not counted.
+const LEAST_MEAN: f64 = 1.0;
 /// Objects of one vote, of two, and of more that rays alone do not tell.
 pub const FEW: usize = 3;
 /// Objects of so many votes are there without those of few.
@@ -41,9 +43,10 @@ pub fn ln_odds_of_few(objects: &[&Object], few: &[&Object]) -> [f64; FEW] {
         .filter(|&votes| votes >= LEAST_VOTES)
         .map(|n| n as f64)
         .collect();
-    let usual = |n: usize| negative_binomial(&votes, n);
+    let counts = Counts::of(&votes);
+    let usual = |n: usize| counts.at(n);
     let bound = |here: f64, next: f64, n: usize| {
-        if here.min(next) < ENOUGH { usual(n) } else { (here * here / next).max(usual(n)) }
+        if here.min(next) < ENOUGH { usual(n) } else { here * here / next }
     };
     let most = few.iter().map(|object| object.votes.len()).max().unwrap_or(0);
     let more = |ln_odds: f64| (LEAST_VOTES..=most).map(|votes| expected(votes, ln_odds)).sum::<f64>();
@@ -54,21 +57,72 @@ pub fn ln_odds_of_few(objects: &[&Object], few: &[&Object]) -> [f64; FEW] {
     [of_one, of_two, of_more]
 }
 
-/// How many objects of `n` votes there are if the others, of three votes or more, are of a negative binomial distribution.
-fn negative_binomial(votes: &[f64], n: usize) -> f64 {
-    let (mean, sd) = mean_and_sd(votes);
-    if votes.is_empty() {
-        return 0.0;
+/// How many objects of each number of votes there are, by those of three votes or more.
+struct Counts {
+    /// Of three votes or more.
+    objects: f64,
+    mean: f64,
+    /// A Poisson distribution whose mean differs from object to object has the variance mean + mean² / k.
+    k: f64,
+}
+
+impl Counts {
+    /// The negative binomial distribution that makes some votes likeliest, of those from [`LEAST_VOTES`] on: what has fewer is missing among them. With k of
+    /// at least one its numbers are log-concave.
+    fn of(votes: &[f64]) -> Self {
+        let objects = votes.len() as f64;
+        let mean = mean_and_sd(votes).0;
+        let with = |ln_k: f64| Self { objects, ..Self::with_mean(mean, ln_k.exp()) };
+        let misfit = |ln_k: f64| -> f64 {
+            let counts = with(ln_k);
+            let ln_more = counts.share_of_more().ln();
+            votes.iter().map(|&n| ln_more - counts.ln_share(n)).sum()
+        };
+        with(least_of(misfit, 0.0, LEAST_DISPERSION.ln()))
     }
-    // Poisson distributions whose means differ: their variance is the mean and mean² / k.
-    let k = mean * mean / (sd * sd - mean).max(mean * mean / LEAST_DISPERSION);
-    let share = |n: usize| {
-        let n = n as f64;
+
+    /// That with a mean of those from [`LEAST_VOTES`] on: it grows with the mean of all.
+    fn with_mean(mean_of_more: f64, k: f64) -> Self {
+        let with = |mean: f64| Self { objects: 0.0, mean, k };
+        let (mut low, mut high) = (LEAST_MEAN, mean_of_more.max(LEAST_MEAN));
+        for _ in 0..ROUNDS {
+            let middle = 0.5 * (low + high);
+            if with(middle).mean_of_more() <= mean_of_more { low = middle } else { high = middle }
+        }
+        with(low)
+    }
+
+    fn ln_share(&self, n: f64) -> f64 {
+        let Self { mean, k, .. } = *self;
         let ln_choose = ln_gamma(n + k) - ln_gamma(k) - ln_gamma(n + 1.0);
-        (ln_choose + k * (k / (k + mean)).ln() + n * (mean / (k + mean)).ln()).exp()
-    };
-    let few: f64 = (0..LEAST_VOTES).map(share).sum();
-    votes.len() as f64 * share(n) / (1.0 - few).max(f64::MIN_POSITIVE)
+        ln_choose + k * (k / (k + mean)).ln() + n * (mean / (k + mean)).ln()
+    }
+
+    fn few(&self) -> impl Iterator<Item = (f64, f64)> {
+        (0..LEAST_VOTES).map(|n| (n as f64, self.ln_share(n as f64).exp()))
+    }
+
+    fn share_of_more(&self) -> f64 {
+        1.0 - self.few().map(|(_, share)| share).sum::<f64>()
+    }
+
+    fn mean_of_more(&self) -> f64 {
+        (self.mean - self.few().map(|(n, share)| n * share).sum::<f64>()) / self.share_of_more()
+    }
+
+    /// How many objects have `n` votes.
+    fn at(&self, n: usize) -> f64 {
+        if self.objects == 0.0 { 0.0 } else { self.objects * self.ln_share(n as f64).exp() / self.share_of_more() }
+    }
+}
+
+/// Where a function of one minimum between two places is least.
+fn least_of(value: impl Fn(f64) -> f64, mut low: f64, mut high: f64) -> f64 {
+    for _ in 0..ROUNDS {
+        let third = (high - low) / 3.0;
+        if value(low + third) <= value(high - third) { high -= third } else { low += third }
+    }
+    0.5 * (low + high)
 }
 
 /// Learn it for all classes of a model, from the objects of a map and those of few votes beside it.
@@ -119,6 +173,27 @@ mod tests {
     }
 
     #[test]
+    fn where_few_objects_tell_those_of_fewer_votes_are_missing_among_them() {
+        // Of fifty objects with two votes on average (Poisson), as many as usual have 3, 4 and 5; 13.5 have two and 13.5 have one.
+        let numbers = [(3, 9), (4, 5), (5, 2)];
+        let many = numbers.map(|(votes, count)| vec![of_votes(votes, -60.0); count]).concat();
+        let few = [1, 2].map(|votes| vec![of_votes(votes, -6.0); 60]).concat();
+        let odds = ln_odds_of_few(&many.iter().collect::<Vec<_>>(), &few.iter().collect::<Vec<_>>());
+        let two = expected(&few[60..], odds[1]);
+        let one = expected(&few[..60], odds[0]);
+        assert!((10.0..25.0).contains(&two) && (10.0..25.0).contains(&one), "{two} {one}");
+    }
+
+    #[test]
+    fn where_all_objects_have_three_votes_no_more_have_fewer_than_with_one_on_average() {
+        let many = vec![of_votes(3, -60.0); 6];
+        let few = vec![of_votes(1, -6.0); 200];
+        let [of_one, ..] = ln_odds_of_few(&many.iter().collect::<Vec<_>>(), &few.iter().collect::<Vec<_>>());
+        let one = expected(&few, of_one);
+        assert!(one > 6.0 && one < 6.0 * 6.0, "{one}");
+    }
+
+    #[test]
     fn numbers_of_objects_by_votes_are_log_concave() {
         let many: Vec<Object> = [(3, 40), (4, 60), (5, 60)]
             .into_iter()
@@ -128,8 +203,7 @@ mod tests {
         let odds = ln_odds_of_few(&many.iter().collect::<Vec<_>>(), &few.iter().collect::<Vec<_>>());
         let of = |votes: usize| few.iter().filter(|object| object.votes.len() == votes).cloned().collect::<Vec<_>>();
         let (one, two) = (expected(&of(1), odds[0]), expected(&of(2), odds[1]));
-        // The larger of both bounds holds: that of log-concave numbers is the least that there may be.
-        assert!((40.0 * 40.0 / 60.0 - 0.01..32.0).contains(&two), "{two}");
-        assert!((two * two / 40.0 - 0.01..two).contains(&one), "{one}");
+        assert!((two - 40.0 * 40.0 / 60.0).abs() < 0.01, "{two}");
+        assert!((one - two * two / 40.0).abs() < 0.01, "{one}");
     }
 }

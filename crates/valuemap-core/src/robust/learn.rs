@@ -19,6 +19,8 @@ const MIN_VOTES: usize = 6;
 /// If fewer than `MIN_OBJECTS` of all classes have so many, those with at least this many serve where elevations are measured: rays alone tell where they
 /// are, with three residuals to spare. Of bearings alone there would be one.
 const LEAST_VOTES: usize = 3;
+/// Shares of odd passes that are compared: so many that a tenth of their deviation is between two where a thousand passes tell.
+const ODD_SHARES: usize = 45;
 /// The part of the votes that is nearer than what counts as seen from everywhere.
 const NEAR_VOTES: f64 = 0.05;
 /// Boxes that are all put on one elevation, as those of bearings are on the horizon, differ in its sine by no more than rounding.
@@ -222,14 +224,33 @@ fn rates(objects: &[&Object], before: &ClassModel) -> (Rates, f64) {
     let alike = median(&mut shares).map_or(Rates::ALIKE, |share| Rates { recall: recall(share), ..Rates::ALIKE });
     let from = |rates: Rates| {
         let class = learned_rates(objects, ClassModel { rates, odd_passes: ODD_PASSES.1, ..*before })?;
-        let shares = Shares::of(&class);
-        let ln_likelihood: f64 = objects.iter().map(|object| object.seen.judged(&shares).ln_likelihood()).sum();
-        Some((ln_likelihood, class))
+        Some((ln_likelihood(objects, &class), class))
     };
     let (differing, alike) = rayon::join(|| from(Rates::GUESS), || from(alike));
     let starts = [differing, alike].into_iter().flatten();
-    let likeliest = starts.max_by(|a, b| a.0.total_cmp(&b.0)).map_or(*before, |(_, class)| class);
-    (likeliest.rates, likeliest.odd_passes)
+    let Some((_, likeliest)) = starts.max_by(|a, b| a.0.total_cmp(&b.0)) else {
+        return (before.rates, before.odd_passes);
+    };
+    (likeliest.rates, odd_passes(objects, &likeliest))
+}
+
+/// The share of odd passes to expect, whatever it is within its bounds: where few objects tell, the likeliest share is as good as any other.
+fn odd_passes(objects: &[&Object], class: &ClassModel) -> f64 {
+    let (least, _, most) = ODD_PASSES;
+    let shares: [f64; ODD_SHARES] =
+        std::array::from_fn(|k| least + (most - least) * (k as f64 + 0.5) / ODD_SHARES as f64);
+    let ln_likelihood = |&odd_passes: &f64| ln_likelihood(objects, &ClassModel { odd_passes, ..*class });
+    let ln_likelihoods: Vec<f64> = shares.par_iter().map(ln_likelihood).collect();
+    let highest = ln_likelihoods.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let weights: Vec<f64> = ln_likelihoods.iter().map(|of_share| (of_share - highest).exp()).collect();
+    let sum: f64 = weights.iter().zip(shares).map(|(weight, share)| weight * share).sum();
+    sum / weights.iter().sum::<f64>()
+}
+
+/// Logarithm of how probable the looks at some objects are.
+fn ln_likelihood(objects: &[&Object], class: &ClassModel) -> f64 {
+    let shares = Shares::of(class);
+    objects.iter().map(|object| object.seen.judged(&shares).ln_likelihood()).sum()
 }
 
 /// The same from one start; nothing if there are few looks.
@@ -358,6 +379,26 @@ mod tests {
         let (rates, odd_passes) = rates(&objects.iter().collect::<Vec<_>>(), &guess());
         assert!((rates.recall - 0.7).abs() < 0.05, "{rates:?}");
         assert!(odd_passes < 0.1, "{odd_passes}");
+    }
+
+    #[test]
+    fn few_objects_do_not_tell_that_hardly_any_pass_is_odd() {
+        let seen = |hits: f64| {
+            let passes = vec![Looks { expected: 20.0, hits }];
+            anywhere(1, Seen { sectors: vec![passes], ln_turns: 0.0 }, -100.0)
+        };
+        let of = |count: usize| -> Vec<Object> { (0..count).map(|i| seen(16.0 + (i % 3) as f64)).collect() };
+        let class_of = |count: usize| {
+            let objects = of(count);
+            let (rates, odd_passes) = rates(&objects.iter().collect::<Vec<_>>(), &guess());
+            ClassModel { rates, odd_passes, ..guess() }
+        };
+        let (few, many) = (class_of(6), class_of(600));
+        assert!(few.odd_passes > 0.12 && many.odd_passes < 0.06, "{} {}", few.odd_passes, many.odd_passes);
+        // So what is seen less there may be real after all.
+        let less = seen(3.0).seen;
+        let [by_few, by_many] = [&few, &many].map(|class| less.judged(&Shares::of(class)).real());
+        assert!(by_few > 0.5 && by_many < 0.4, "{by_few} {by_many}");
     }
 
     #[test]
