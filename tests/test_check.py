@@ -19,7 +19,7 @@ from small_dataset import small_dataset
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check import cameras, contest, distortion, examine, fit
 from valuemap.check.agreement import Agreement, compare, gains_of_objects, measure_agreement
-from valuemap.check.boxes import PictureSize, _chance_of_gap, _Ends, picture_sizes, rows_in_images
+from valuemap.check.boxes import PictureSize, _chance_of_gap, _Ends, _OfSquare, picture_sizes, rows_in_images
 from valuemap.check.cameras import PARAMETERS, _followed, _is_wider_gate_only, with_focal
 from valuemap.check.contest import _compare, _joined, _Reading, _suspicion, hold_contest
 from valuemap.check.fault import (
@@ -34,6 +34,7 @@ from valuemap.check.fault import (
     with_poses,
 )
 from valuemap.check.fit import Changed, Estimate, Parameter, apply, estimate
+from valuemap.check.frames import WorldAxes
 from valuemap.check.headings import headings, level_rotations, rotations_of
 from valuemap.check.loose import Correction, Loose
 from valuemap.check.offsets import find_shift
@@ -786,6 +787,36 @@ def test_one_camera_upside_down_is_named_alone_and_undone(good: Dataset, monkeyp
     np.testing.assert_allclose(rotation_matrices(outcome.fixed.images), rotation_matrices(good.images), atol=1e-9)
     monkeypatch.setattr(contest, "_FAR_WORSE", 0.0)
     assert contest.find_odd_group(View(spoiled), CONVENTIONS) is None
+
+
+def test_what_leaves_rays_of_a_group_in_disagreement_is_not_what_is_wrong_with_it(
+    good: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spoiled = of_camera(good, turned_by(good, "z", 180.0), 1)
+    right = contest.find_odd_group(View(spoiled), CONVENTIONS)
+    assert right is not None
+    nothing = contest.Verdict(replace(right, chance=1e-9, fix=lambda dataset: dataset), 1.0)
+    monkeypatch.setattr(contest, "hold_contest", lambda *_: nothing)
+    assert contest.find_odd_group(View(spoiled), CONVENTIONS) is None
+
+
+def test_one_camera_has_no_world_of_its_own(good: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    about_up = Rotation.from_rotvec(np.pi / 2.0 * np.asarray(good.frame.up)).as_matrix()
+    turned = with_poses(good, rotation_matrices(good.images) @ about_up, camera_centers(good.images))
+    spoiled = View(of_camera(good, turned, 1))
+    finding = contest.find_odd_group(spoiled, CONVENTIONS)
+    assert finding is None or finding.fault != "world_axes"
+    monkeypatch.setattr(WorldAxes, "is_of_world", False)
+    finding = contest.find_odd_group(spoiled, CONVENTIONS)
+    assert finding is not None
+    assert finding.fault == "world_axes"
+
+
+@pytest.mark.parametrize("is_squeezed", [True, False])
+def test_the_gate_is_one_angle_whatever_square_boxes_were_measured_in(is_squeezed: bool, good: Dataset) -> None:
+    width, height = picture_sizes(good)[0]
+    pixel = np.sqrt(width * height) if is_squeezed else max(width, height)
+    assert _OfSquare(good, 416, is_squeezed=is_squeezed).gate_factor == pytest.approx(pixel / 416.0)
 
 
 def test_one_camera_that_looks_too_low_is_named_and_the_others_stay(good: Dataset) -> None:

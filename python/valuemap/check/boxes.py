@@ -174,8 +174,11 @@ class PictureSize(Convention):
         for side in _SQUARES_PX:
             if farthest > side or side > _LARGER_SQUARE * farthest:
                 continue
-            yield f"boxes of pictures squeezed into {side} x {side} px", _OfSquare(side, is_squeezed=True)
-            yield f"boxes of pictures fitted into {side} x {side} px with bars", _OfSquare(side, is_squeezed=False)
+            for how, is_squeezed in (
+                ("squeezed into {0} x {0} px", True),
+                ("fitted into {0} x {0} px with bars", False),
+            ):
+                yield f"boxes of pictures {how.format(side)}", _OfSquare(dataset, side, is_squeezed=is_squeezed)
 
 
 class MirroredPictures(Convention):
@@ -293,15 +296,20 @@ class _Scaled:
 class _OfSquare:
     """Boxes of the pictures that a detector saw in a square, squeezed in both directions or with bars at two sides."""
 
-    def __init__(self, side_px: float, *, is_squeezed: bool) -> None:
+    def __init__(self, dataset: Dataset, side_px: float, *, is_squeezed: bool) -> None:
         self._side_px, self._is_squeezed = side_px, is_squeezed
-        self.gate_factor = 1.0
+        # A pixel of the square is so many of the picture, on average of both directions.
+        self.gate_factor = float(np.exp(np.median(np.log(self._shown(dataset) / side_px).mean(axis=1))))
+
+    def _shown(self, dataset: Dataset) -> Floats:
+        """Return what of each detection's picture (N, 2), in its pixels, is as large as the square."""
+        extent = picture_sizes(dataset)
+        return extent if self._is_squeezed else np.broadcast_to(extent.max(axis=1, keepdims=True), extent.shape)
 
     def __call__(self, dataset: Dataset) -> Dataset:
-        detections, extent = dataset.detections, picture_sizes(dataset)
-        shown = extent if self._is_squeezed else np.broadcast_to(extent.max(axis=1, keepdims=True), extent.shape)
+        detections, shown = dataset.detections, self._shown(dataset)
         factor = shown / self._side_px
-        center = detections.center_px * factor - (shown - extent) / 2.0
+        center = detections.center_px * factor - (shown - picture_sizes(dataset)) / 2.0
         return with_detections(dataset, center_px=center, size_px=detections.size_px * factor)
 
 

@@ -118,26 +118,29 @@ def hold_contest(view: View, conventions: Sequence[Convention], progress: Progre
 def find_odd_group(view: View, conventions: Sequence[Convention], progress: Progress = silent) -> Finding | None:
     """Look for a camera or a pass whose rays alone agree far worse than those of others, and hold its own contest.
 
-    What is good in all others is no mistake of the frame, and what changes more than the group is not tried.
+    What is good in all others is no mistake of the frame, and what changes more than the group is not tried. A reading
+    is believed if rays agree with it about as well as those of others do: else it fits by chance what is otherwise
+    wrong.
     """
     groups = groups_of(view.dataset)
     alone = {group: group.alone(view) for group in groups}
-    worth = {group: each.agreement.gain.sum() / max(each.agreement.detections, 1) for group, each in alone.items()}
-    for group in sorted(
-        groups, key=lambda each: (each.pass_name is not None, worth[each])
-    ):  # A camera is in many passes.
+    worth = {group: _worth_of(each) for group, each in alone.items()}
+    # Cameras first: one is in many passes.
+    for group in sorted(groups, key=lambda each: (each.pass_name is not None, worth[each])):
         others = [
             worth[each] for each in groups if each != group and (each.pass_name is None) == (group.pass_name is None)
         ]
-        if not others or worth[group] > _FAR_WORSE * float(np.median(others)):
+        least = _FAR_WORSE * float(np.median(others)) if others else 0.0
+        if worth[group] >= least:
             continue
         part = alone[group].dataset
-        own = [_OfOneGroup(convention, part, group) for convention in conventions]
+        may_be = [each for each in conventions if group.pass_name is not None or not each.is_of_world]
+        own = [_OfOneGroup(convention, part, group) for convention in may_be]
         finding = hold_contest(alone[group], own, progress).finding
         if finding is None or finding.fix is None or finding.chance is None:
             continue
-        chance = finding.chance * len(groups)
-        if chance > LEAST_CHANCE:
+        chance, mended = finding.chance * len(groups), View(finding.fix(part), gate_share=view.gate_share)
+        if chance > LEAST_CHANCE or _worth_of(mended) < least:
             continue
         return replace(
             finding,
@@ -148,6 +151,11 @@ def find_odd_group(view: View, conventions: Sequence[Convention], progress: Prog
             of=group.text,
         )
     return None
+
+
+def _worth_of(view: View) -> float:
+    """Return how well a detection agrees with others."""
+    return float(view.agreement.gain.sum()) / max(view.agreement.detections, 1)
 
 
 class _OfOneGroup(Convention):

@@ -203,6 +203,8 @@ class Convention(ABC):
     """Whether readings give measured values up for guessed ones."""
     least_times: ClassVar[float | None] = None
     """How many times as well as given rays must agree, where without the noise of good data they agree better."""
+    is_of_world: ClassVar[bool] = False
+    """Whether it is about the world, which all cameras of a vehicle share: one camera alone has none of its own."""
 
     @abstractmethod
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:

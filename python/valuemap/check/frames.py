@@ -64,6 +64,7 @@ class WorldAxes(Convention):
     """Positions in one world, rotations in another: ENU and NED, y up and z up."""
 
     name: ClassVar[str] = "world_axes"
+    is_of_world: ClassVar[bool] = True
     what: ClassVar[str] = (
         "Positions and rotations are in different worlds (ENU and NED, y up and z up, headings from north or east)."
     )
@@ -81,6 +82,7 @@ class MirroredPositions(Convention):
     """One axis of the positions goes the other way: a left-handed world."""
 
     name: ClassVar[str] = "mirrored_positions"
+    is_of_world: ClassVar[bool] = True
     what: ClassVar[str] = "One axis of the positions goes the other way: the world is left-handed."
     do: ClassVar[str] = "Negate that axis of the positions; the world must be right-handed."
 
@@ -94,6 +96,7 @@ class LatLonSwapped(Convention):
     """Latitude where longitude is expected, or northing where easting is."""
 
     name: ClassVar[str] = "lat_lon_swapped"
+    is_of_world: ClassVar[bool] = True
     what: ClassVar[str] = "Latitude and longitude (or north and east) of the positions are swapped."
     do: ClassVar[str] = "Exchange the two columns and import again; headings stay as they are."
 
@@ -112,6 +115,7 @@ class HeadingConvention(Convention):
     """Compass headings and mathematical angles taken for each other."""
 
     name: ClassVar[str] = "heading_convention"
+    is_of_world: ClassVar[bool] = True
     what: ClassVar[str] = "Headings count from another direction, or the other way round, than they were read."
     do: ClassVar[str] = "Say what headings mean: clockwise from north (compass) or counter-clockwise from east."
 
@@ -127,6 +131,7 @@ class TiltConvention(Convention):
     """Pitch that counts downwards, roll that counts the other way, or one taken for the other."""
 
     name: ClassVar[str] = "tilt_convention"
+    is_of_world: ClassVar[bool] = True
     what: ClassVar[str] = "Pitch or roll count the other way than they were read, or are taken for each other."
     do: ClassVar[str] = "Say what the angles mean: pitch counts upwards, roll counts to the left."
 

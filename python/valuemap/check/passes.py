@@ -368,6 +368,8 @@ def _passes_in_turn(images: Images) -> tuple[dict[str, str], float, int] | None:
 _IN_TURN, _MOSTLY_ON = 0.25, 0.8
 """Of images so many change the pass where they go on, and of all changes of pass so many are such."""
 _FASTER, _NEAR_STEPS = 3.0, 5.0
+"""What goes on is no faster than so many times the usual speed, and no farther than so many usual steps: cars speed up,
+and images are left out."""
 
 
 def _joined_passes(dataset: Dataset) -> Dataset:
