@@ -32,7 +32,7 @@ from valuemap.check.fault import (
 )
 from valuemap.check.headings import driving_azimuths
 from valuemap.check.offsets import densest, pairs_within
-from valuemap.check.sample import driving_order, standing_m
+from valuemap.check.sample import driving_order, order_by_camera, standing_m
 from valuemap.check.seams import Seam, worst_seam
 from valuemap.dataset import Dataset
 from valuemap.tables import Bools, Categories, Floats, Images, Ints
@@ -255,8 +255,7 @@ def _by_name(images: Images) -> tuple[Ints, Bools]:
 
     Names of a car with several cameras often are those of one camera after the other.
     """
-    order = driving_order(images, by_time=False)
-    order = order[np.lexsort((images.camera_id[order], images.pass_id.codes[order]))]
+    order = order_by_camera(images, by_time=False)
     pass_and_camera = np.stack([images.pass_id.codes[order], images.camera_id[order]])
     return order, np.append(True, (np.diff(pass_and_camera, axis=1) != 0).any(axis=0))
 
@@ -510,8 +509,7 @@ class _ByImages:
 
     def __call__(self, dataset: Dataset) -> Dataset:
         images = dataset.images
-        order = driving_order(images)
-        order = order[np.lexsort((images.camera_id[order], images.pass_id.codes[order]))]
+        order = order_by_camera(images)
         rank = np.empty(len(order), dtype=np.int64)
         rank[order] = np.arange(len(order))
         to = np.clip(np.arange(len(order)) - self._images, 0, len(order) - 1)

@@ -14,7 +14,7 @@ from valuemap.cameras import camera_centers
 from valuemap.check.boxes import rows_in_images
 from valuemap.check.fault import LEAST_CHANCE, Fault, Finding, Stage, View, keep_rows, with_detections
 from valuemap.check.offsets import find_shift
-from valuemap.check.sample import driving_order
+from valuemap.check.sample import order_by_camera
 from valuemap.dataset import Dataset
 from valuemap.tables import Bools, Categories, Floats, Images, Truth
 
@@ -79,7 +79,7 @@ class FarImages(Fault):
 
     def find(self, view: View) -> Finding | None:
         """Look for few images much farther from the middle than all others, or far from the rest of their drive."""
-        far = far_images(view.center_in_world_m) | strays(view.dataset.images)
+        far = _far_or_stray(view.dataset.images)
         count = int(far.sum())
         if count == 0:
             return None
@@ -342,8 +342,7 @@ def far_images(center: Floats) -> Bools:
 
 def strays(images: Images) -> Bools:
     """Return which images (N) are a jump away from their drive, which goes on behind them where it was before them."""
-    order = driving_order(images)
-    order = order[np.lexsort((images.camera_id[order], images.pass_id.codes[order]))]
+    order = order_by_camera(images)
     center = camera_centers(images)[order]
     starts = (np.diff(images.pass_id.codes[order]) != 0) | (np.diff(images.camera_id[order]) != 0)
     step_m = np.linalg.norm(np.diff(center, axis=0), axis=1)
@@ -368,8 +367,12 @@ _STRAY_STEPS, _GOES_ON_STEPS, _MOST_STRAYS = 50.0, 3.0, 10
 """No car is fifty steps away for some images, without having been seen on the way, and back at once."""
 
 
+def _far_or_stray(images: Images) -> Bools:
+    return far_images(camera_centers(images)) | strays(images)
+
+
 def _without_far(dataset: Dataset) -> Dataset:
-    return keep_rows(dataset, images=~(far_images(camera_centers(dataset.images)) | strays(dataset.images)))
+    return keep_rows(dataset, images=~_far_or_stray(dataset.images))
 
 
 def _grid_step(values: Floats) -> float | None:

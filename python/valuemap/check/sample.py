@@ -67,6 +67,12 @@ def driving_order(images: Images, *, by_time: bool = True) -> Ints:
     return np.lexsort((_rank_of_names(images), images.pass_id.codes)).astype(np.int64)
 
 
+def order_by_camera(images: Images, *, by_time: bool = True) -> Ints:
+    """Return the rows of images pass by pass and there camera by camera, those of one camera in driving order."""
+    order = driving_order(images, by_time=by_time)
+    return order[np.lexsort((images.camera_id[order], images.pass_id.codes[order]))]
+
+
 def _rank_of_names(images: Images) -> Ints:
     """Return the place (N) of each name among all, where numbers count as numbers."""
     keys = [
