@@ -56,15 +56,21 @@ impl Steps {
         self.edges.partition_point(|edge| *edge <= x)
     }
 
-    /// Edges so that about as many of some numbers are in each bin; `values` are 0.
-    fn of_quantiles(numbers: impl Iterator<Item = f64>) -> Self {
+    /// Edges so that about as many of some numbers are in each bin; `values` are 0. Numbers within a `resolution` are not told apart: an edge is halfway
+    /// between two that are farther from each other, and bins are no narrower.
+    fn of_quantiles(numbers: impl Iterator<Item = f64>, resolution: f64) -> Self {
         let mut sorted: Vec<f64> = numbers.filter(|number| number.is_finite()).collect();
         sorted.sort_by(f64::total_cmp);
         let mut steps = Self::NONE;
-        let mut edges: Vec<f64> = (1..BINS).filter_map(|i| sorted.get(sorted.len() * i / BINS).copied()).collect();
-        edges.dedup();
-        // Nothing is below the least.
-        edges.retain(|edge| sorted.first().is_some_and(|least| edge > least));
+        let halfway = |i: usize| {
+            let above = *sorted.get(sorted.len() * i / BINS)?;
+            // Nothing is below the least.
+            let first = sorted.partition_point(|&number| number < above - resolution);
+            let below = sorted[..first].last()?;
+            Some(0.5 * (below + sorted[first]))
+        };
+        let mut edges: Vec<f64> = (1..BINS).filter_map(halfway).collect();
+        edges.dedup_by(|next, edge| *next - *edge <= resolution);
         steps.edges.iter_mut().zip(edges).for_each(|(edge, value)| *edge = value);
         steps
     }
@@ -83,7 +89,7 @@ pub fn score_ratio(votes: &[f64], clutter: &[f64]) -> Steps {
     if finite(votes).min(finite(clutter)) < LEAST_DETECTIONS {
         return Steps::NONE;
     }
-    let mut steps = Steps::of_quantiles(votes.iter().chain(clutter).copied());
+    let mut steps = Steps::of_quantiles(votes.iter().chain(clutter).copied(), 0.0);
     let used = steps.edges.iter().filter(|edge| edge.is_finite()).count() + 1;
     let (of_votes, of_clutter) = (steps.counts(votes), steps.counts(clutter));
     // Pooled where the share of votes falls (pool adjacent violators), with one more of each kind in each pool.
@@ -108,13 +114,14 @@ pub fn score_ratio(votes: &[f64], clutter: &[f64]) -> Steps {
     steps
 }
 
-/// How much denser, in logarithms, clutter is at some sines of elevation than it would be if all heights that are `looked_at` had as much.
+/// How much denser, in logarithms, clutter is at some sines of elevation, which are measured to a `resolution`, than it would be if all heights that
+/// are `looked_at` had as much.
 #[must_use]
-pub fn elevation_factor(clutter: &[f64], looked_at: (f64, f64)) -> Steps {
+pub fn elevation_factor(clutter: &[f64], looked_at: (f64, f64), resolution: f64) -> Steps {
     if clutter.len() < LEAST_DETECTIONS || looked_at.1 <= looked_at.0 {
         return Steps::NONE;
     }
-    let mut steps = Steps::of_quantiles(clutter.iter().copied());
+    let mut steps = Steps::of_quantiles(clutter.iter().copied(), resolution);
     let used = steps.edges.iter().filter(|edge| edge.is_finite()).count() + 1;
     let counts = steps.counts(clutter);
     for (bin, count) in counts.into_iter().enumerate().take(used) {
@@ -144,7 +151,7 @@ mod tests {
 
     #[test]
     fn steps_are_what_is_stored_of_them() {
-        let steps = elevation_factor(&(0..300).map(f64::from).collect::<Vec<_>>(), (-10.0, 400.0));
+        let steps = elevation_factor(&(0..300).map(f64::from).collect::<Vec<_>>(), (-10.0, 400.0), 0.1);
         assert_eq!(Steps::from_row(&steps.to_row()), steps);
         assert_eq!(Steps::from_row(&Steps::ONE.to_row()), Steps::ONE);
         assert!((Steps::even(120.0, std::array::from_fn(|i| i as f64)).at(65.0) - 6.0).abs() < 1e-12);
@@ -153,8 +160,18 @@ mod tests {
     #[test]
     fn clutter_is_dense_where_it_is() {
         let clutter: Vec<f64> = (0..300).map(|i| 0.1 + f64::from(i) / 3000.0).collect();
-        let factor = elevation_factor(&clutter, (-1.0, 1.0));
+        let factor = elevation_factor(&clutter, (-1.0, 1.0), 1e-3);
         assert!((factor.at(0.15) - 20.0_f64.ln()).abs() < 0.2);
         assert!(factor.at(-0.5) < 0.0 && factor.at(0.9) < 0.0);
+    }
+
+    #[test]
+    fn clutter_on_a_grid_is_as_dense_as_clutter_between() {
+        // On a grid of ten rows, each off by rounding: as many in each as if they were spread.
+        let clutter: Vec<f64> = (0..300).map(|i| f64::from(i % 10) / 10.0 + f64::from(i) * 1e-16).collect();
+        let factor = elevation_factor(&clutter, (-0.05, 0.95), 0.01);
+        assert!((0..10).all(|row| factor.at(f64::from(row) / 10.0).abs() < 0.8), "{factor:?}");
+        let all: f64 = (0..1000).map(|i| factor.at(-0.05 + f64::from(i) / 1000.0).exp() / 1000.0).sum();
+        assert!((all - 1.0).abs() < 1e-2, "{all}");
     }
 }

@@ -110,7 +110,10 @@ impl<'a> Evidence<'a> {
             learned.score_ratio = score_ratio(&of(&model.scene.score, &in_class), &of(&model.scene.score, &clutter));
         }
         if has(Part::Elevations) {
-            learned.clutter_by_elevation = elevation_factor(&of(&model.sin_elevation, &clutter), self.looked_at);
+            let mut sigmas: Vec<f64> = clutter.iter().map(|&ray| far_sigma_rad(model, ray)).collect();
+            let resolution = median(&mut sigmas).unwrap_or(0.0);
+            learned.clutter_by_elevation =
+                elevation_factor(&of(&model.sin_elevation, &clutter), self.looked_at, resolution);
         }
         let many: Vec<&Object> =
             of_class.iter().copied().filter(|object| object.votes.len() >= self.least_votes).collect();
@@ -167,6 +170,11 @@ fn heights(model: &Model<'_>, objects: &[&Object]) -> Option<Heights> {
     };
     let (heights_m, sigmas_m): (Vec<f64>, Vec<f64>) = objects.iter().filter_map(of_object).unzip();
     Heights::learn(&heights_m, &sigmas_m, model.settings.viability.max_range_m)
+}
+
+/// Standard deviation of the direction of a ray, each axis, rad.
+fn far_sigma_rad(model: &Model<'_>, ray: u32) -> f64 {
+    (model.spreads[ray as usize].far_px2 / model.scene.scale2[ray as usize]).sqrt()
 }
 
 /// The least and the greatest of some numbers, those that are not numbers aside.
