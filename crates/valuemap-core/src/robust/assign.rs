@@ -1,8 +1,8 @@
-//! Association: which detection shows which object, image by image.
+//! Association by global nearest neighbour: which detection shows which object, image by image.
 //!
-//! All objects compete for all detections. In each image the assignment with the greatest sum of gains wins (global nearest
-//! neighbor), the pose error of the image as far as the votes of its pass tell it taken out. What changes is committed group by
-//! group of objects that exchange rays, and only where J falls.
+//! All objects compete for all detections. In each image the assignment with the greatest sum of gains wins, with the pose error
+//! of the image taken out as far as the votes of its pass tell it. Objects that exchange rays form a group, and a group changes
+//! only if J (equations (1) to (5) of `docs/method.md`) falls.
 
 use nalgebra::{Matrix2, SMatrix, Vector3};
 use pathfinding::prelude::{Matrix, kuhn_munkres};
