@@ -1,5 +1,7 @@
-//! Births: the best supported hypothesis takes the rays that it explains better than clutter does, and is born if J falls; and so
-//! on with the rays that are left.
+//! Births: hypotheses among the rays of no object become objects if J falls.
+//!
+//! The best supported hypothesis takes the rays that it explains better than clutter does, equations (1) to (5) of
+//! `docs/method.md`. Births go on with the rays that are left.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
