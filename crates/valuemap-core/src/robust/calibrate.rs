@@ -1,11 +1,10 @@
-//! Self-calibration: the noise is estimated from the residuals of the labels themselves.
+//! Self-calibration: the noise is estimated from the residuals of the labels by restricted maximum likelihood.
 //!
-//! The size of the errors by restricted maximum likelihood: the parameters that make the residuals of a sample of well
-//! supported labels most likely, positions marginalised. Depth tells errors of position from those in pixels, and box
-//! size the part that grows with it; what is rotation and what is detection, residuals of one focal length do not tell,
-//! so each gets half, until images that show several objects tell ([`split`](mod@super::split)). How much of the pose
-//! error a pass shares shows only where passes meet: it is what makes the positions that the passes of a label would
-//! give it alone differ as much as they do.
+//! Positions are marginalised, so that they take no freedom from the noise. Depth tells errors of position from those in pixels,
+//! and box size tells the part that grows with the box. Residuals of one focal length do not tell rotation from detection: each
+//! gets half, until images that show several objects tell ([`split`](mod@super::split)). The error that a pass shares shows only
+//! where passes meet: it makes the positions that each pass alone would give a label differ as much as they do. Errors of this
+//! kind are the C of equation (1) of `docs/method.md`.
 
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
