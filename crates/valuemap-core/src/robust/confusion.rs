@@ -1,7 +1,8 @@
-//! Confusions: what a detector takes an object of a class for, learned from the map.
+//! Confusions: the classes that a detector reports for objects of a class, learned from the map.
 //!
-//! A detector gives an object one box. Where boxes of another class lie in an object's gate more often in images in which its own class missed it than in
-//! those in which it did not, they are its own. What stands beside it is there in both.
+//! They are share_c(class) of equation (4) of `docs/method.md`. A detector gives an object one box. Boxes of another class belong
+//! to an object if they lie in its gate more often in images without a vote of its own class than in images with one. What stands
+//! beside the object is there in both.
 
 use std::collections::BTreeMap;
 
