@@ -1,8 +1,8 @@
-//! Contested votes: of two neighbors an image shows only one, and it might be either.
+//! Contested votes: an image shows only one of two neighbours, and its detection might be of either.
 //!
-//! Which of the two got the vote is decided by residuals that the pose errors hide, and decided alike for all that look from
-//! there: no covariance knows of it. If the position without the contested votes is another one than with them, some of
-//! them are the neighbor's, and how far the two are apart is how little the position is known.
+//! Pose errors hide which of the two it is, and decide it alike for all images from there, so no covariance knows of it. The
+//! position is estimated once more without the contested votes. If the two positions differ by more than their covariances allow
+//! (Hausman, "Specification Tests in Econometrics", 1978), their difference widens the covariance.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
