@@ -1,11 +1,10 @@
-//! Errors that the images of a pass share: they drift along the drive.
+//! Pose errors that the images of a pass share: the covariance C of equation (1) of `docs/method.md`.
 //!
 //! A vote's residual is `r = J (X - X_0) + J b + J [X - C]_x w + e`: e is the detection's error; b and w are errors of position
-//! and rotation. A part of them each image has for itself, but for all labels that it shows; another part changes slowly
-//! along the drive, an Ornstein-Uhlenbeck process: two that are d apart have the correlation `exp(-d / DRIFT_LENGTH_M)`. A
-//! drive is cut into short segments of one drift each. The image's own error is marginalised first, then the drift segment after
-//! segment (Schur complements), so that a hundred images before a red light count as one look from there, not as a
-//! hundred, and what an image gets wrong for one label, it gets wrong for its neighbors.
+//! and rotation. One part of them is the image's own, shared by all labels that it shows. Another part drifts along the drive as
+//! an Ornstein-Uhlenbeck process: two errors d apart have the correlation `exp(-d / DRIFT_LENGTH_M)`. A drive is cut into short
+//! segments of one drift each. The image's own error is marginalised first, then the drift segment by segment (Schur
+//! complements), so that a hundred images before a red light count as one look.
 
 use std::ops::Range;
 
