@@ -1,9 +1,9 @@
-//! Where objects are, and how sure that is: least squares over their votes, with the errors of the poses.
+//! Positions and covariances: least squares over the votes, with the errors of the poses marginalised.
 //!
-//! Each visit of a pass gives its normal equations with its pose errors taken out ([`drift`](super::drift)); they add
-//! up, and the inverse of their sum is the covariance. Labels that are estimated together share what their images get wrong: a
-//! label alone cannot tell an error of its pass from one of its own, its neighbors in the same images can (a bundle
-//! adjustment with priors on the poses).
+//! Each visit of a pass gives its normal equations with its pose errors taken out ([`drift`](super::drift)). Their sum is the
+//! information of the positions, and its inverse the covariance. A label alone cannot tell an error of its pass from one of its
+//! own position; its neighbours in the same images can. So labels may be estimated together: a bundle adjustment with priors on
+//! the poses.
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector2, Vector3};
 use rustc_hash::FxHashMap;
