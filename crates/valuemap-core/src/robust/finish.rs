@@ -1,4 +1,7 @@
-//! Positions and covariances for good: the objects of one place are estimated together, since they share what their images get wrong.
+//! Final positions and covariances: the objects of one place are estimated together.
+//!
+//! Objects of one place share the pose errors of their images ([`estimate`](super::estimate)). Votes that a neighbour might have
+//! widen the covariance ([`contest`](super::contest)).
 
 use rayon::prelude::*;
 
