@@ -1,7 +1,7 @@
-//! What two objects would be worth with other votes, foreseen: one step from where they are.
+//! Prediction of J for two objects with other votes, by one step from where they are: it saves fits of swaps in vain.
 //!
-//! J of an object is a sum over visits, so that of all that two objects exchange only the visits with a part in it are looked at anew. An object of many
-//! visits stays about where it is, so what is foreseen of it is about what a fit ends at; one of few is fitted.
+//! Equation (1) of `docs/method.md` is a sum over visits, so only visits of which votes change hands are evaluated anew. An
+//! object of many visits stays about where it is, so its J is predicted closely. An object of few visits is fitted.
 
 use rustc_hash::FxHashMap;
 
