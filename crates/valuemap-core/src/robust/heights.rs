@@ -1,7 +1,8 @@
-//! How high objects of a class are above the cameras: what narrows down where one is that was hardly seen.
+//! Heights of the objects of a class above the cameras: they locate objects that few images see.
 //!
-//! Lights hang on masts and stand on poles: a mixture of few normal distributions, learned from the objects that many images fix, as many
-//! as the Bayesian information criterion (Schwarz, 1978) asks for; and a share of objects that are anywhere.
+//! They are a mixture of up to three normal distributions, since lights hang on masts and stand on poles, and a share of objects
+//! that are anywhere. The mixture is learned from objects that many images fix, with as many parts as the Bayesian information
+//! criterion (Schwarz, 1978) asks for. Its density is a factor of births_c in equation (2) of `docs/method.md`.
 
 use std::f64::consts::PI;
 
