@@ -1,4 +1,6 @@
-//! Which rays see a point: all rays, grouped by the place they were taken from, ready for the kernel.
+//! Spatial index of the rays: which rays see a point.
+//!
+//! Rays are grouped by the place that they were taken from, and laid out for the vectorised kernel ([`kernel`](crate::kernel)).
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
