@@ -1,7 +1,7 @@
-//! Keyframes: in a large scene a part of the images tells which labels there are; all of them tell where exactly.
+//! Keyframes: one image per camera, pass and stretch of the drive, to find the labels of large scenes faster.
 //!
-//! Images a few metres apart see the same. What they disagree about is found out with one of them as well as with all, in
-//! a fraction of the time.
+//! Images a few metres apart see the same. One of them tells which labels there are, as well as all of them, in a fraction of the
+//! time. All images tell afterwards where the labels are exactly.
 
 use std::sync::Arc;
 
