@@ -1,4 +1,7 @@
-//! The noise that makes rays likeliest: sought from several starts, each time from the map that is found with it.
+//! Search for the noise that makes the rays likeliest: from several starts, each time with a map found anew.
+//!
+//! A map depends on the noise and the noise on the map, so that one start may end at a poor pair. Starts are compared by J with
+//! the density of clutter ([`calibrate`](super::calibrate) does a step).
 
 use std::f64::consts::PI;
 use std::sync::Arc;
