@@ -1,8 +1,7 @@
-//! Where the images of a pass really were, as far as the labels tell: the drift of the pass, smoothed along the drive.
+//! Pose errors of the images of a pass, as far as its votes tell: the drift, smoothed along the drive.
 //!
-//! Every vote for a label measures the pose error of its image. The drift is the Markov process of
-//! [`drift`](super::drift): what the looks of each segment say of it is passed on to the segments after and before it (two-filter
-//! smoother).
+//! Every vote for a label measures the pose error of its image. The drift is the Markov process of [`drift`](super::drift): a
+//! two-filter smoother passes what the looks of each segment say of it to the segments after and before.
 
 use nalgebra::{Matrix2, SMatrix, Vector2};
 
