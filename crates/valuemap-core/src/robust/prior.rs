@@ -1,4 +1,4 @@
-//! What is known of a position besides where its detections are, as normal equations.
+//! Observations of a position besides the centres of its detections (sizes, ranges), as normal equations.
 
 use nalgebra::{Matrix3, Vector3};
 
