@@ -1,4 +1,6 @@
-//! Hypotheses, bounded: each ray meets few partners, and proposes the meeting that a sample of the images supports best.
+//! Hypotheses, bounded: each ray meets few partners and proposes the point that a sample of the images supports best.
+//!
+//! All pairs of rays would be quadratic in the number of passes; with a fixed number of partners the work per image is constant.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
