@@ -1,7 +1,7 @@
-//! Where an object is, in a hurry: least squares over its voters as if every image had its pose error for itself.
+//! Quick estimate of a position: least squares over its votes as if every image had its pose error for itself.
 //!
-//! A few times cheaper than [`estimate`](super::estimate), without its covariance and a little less exact: good enough
-//! to gather voters around.
+//! It is a few times cheaper than [`estimate`](super::estimate), gives no covariance and is a little less exact: good enough to
+//! gather votes around a point.
 
 use nalgebra::{Matrix3, Vector3};
 
