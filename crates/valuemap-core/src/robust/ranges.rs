@@ -1,8 +1,8 @@
-//! What measured ranges say: a detection whose distance is known as well is an object's if that stands about as far away.
+//! Measured ranges: ratio(range_i) of equation (4) of `docs/method.md`, and an observation of the position.
 //!
-//! With the logarithms d of the distance of the object and r of the measured range, `d - r` is an error of standard deviation `share`, that of the range
-//! in parts of it. Ranges of clutter are those of all detections. Networks that tell depth from one picture err widely now and then, so one range says
-//! no more than a part of the detections allows.
+//! With the logarithms d of the distance of the object and r of the measured range, `d - r` is an error of standard deviation
+//! `share`, that of the range relative to the range. Ranges of clutter are distributed as those of all detections. Networks that
+//! estimate depth from one picture err widely now and then, so a share of odd ranges bounds what one range says.
 
 use nalgebra::Vector3;
 
