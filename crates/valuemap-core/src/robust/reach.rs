@@ -1,4 +1,6 @@
-//! How far objects of a class are detected: the share of the looks that are hits, by distance.
+//! Detection rate by distance: the share of the looks at a class that are hits, over that where it is largest.
+//!
+//! It weighs looks from afar in equation (5) of `docs/method.md`, where a miss says less.
 
 use super::clutter::{BINS, Steps};
 use super::energy::Object;
