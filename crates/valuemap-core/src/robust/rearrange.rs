@@ -1,6 +1,7 @@
-//! Moves of two objects: they become one, or exchange what they have from one direction or on one visit.
+//! Merges and swaps: two objects become one, or exchange votes of one side, one visit or from near by, if J falls.
 //!
-//! Where two objects are seen from two directions, rays meet in four places: which belong together only J of all four can tell.
+//! Where two objects are seen from two directions, their rays meet in four places. Which of these are objects is decided by J of
+//! both objects together, and not vote by vote.
 
 use std::collections::BTreeMap;
 
