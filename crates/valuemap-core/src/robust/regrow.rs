@@ -1,8 +1,8 @@
-//! Births from a ray: an object stands on a ray of no object where its class stands, and takes what it explains better, also from other objects.
+//! Births with votes of others: an object is born on a ray of no object and takes votes from other objects, if J of all falls.
 //!
-//! Rays of one approach hardly differ in direction: they propose no point, but size and height tell where one is. Where such an object has
-//! lost a vote to another one, what is left of it is too little to be born, and the other one fits well enough to keep the vote. Only both
-//! together have less J.
+//! Rays of one approach hardly differ in direction and propose no point, but size and height locate an object on one of them. If
+//! it has lost a vote to another object, what is left is too little for a birth, and the other object fits well enough to keep
+//! the vote. Only both changes together lower J.
 
 use rayon::prelude::*;
 use rustc_hash::FxHashSet;
