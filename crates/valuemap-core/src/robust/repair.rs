@@ -1,7 +1,8 @@
-//! Destroy and repair: the objects of a small neighborhood are taken away, others are born from their detections, and the better of
+//! Destroy and repair: the objects of a small neighbourhood are removed, others are born from their detections, and the better of
 //! both, by J, stays.
 //!
-//! It is the one move that untangles what exchanged detections: halves of objects, objects in between, objects behind each other.
+//! It is the one move that untangles objects which exchanged detections: halves of objects, objects between two others, and
+//! objects behind each other. It also splits an object in two.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
