@@ -1,8 +1,8 @@
 //! Partner images: a bounded, reproducible sample of the images around an image, however many passes there are.
 //!
-//! Every image has a fixed random priority. Level l holds the images with priority below 2^-l, so levels thin out
-//! evenly; the sparsest level that still has enough images around serves. The choice depends on distances and image
-//! numbers alone, not on the frame.
+//! Every image has a fixed random priority. Level l holds the images with priority below 2^-l, so levels thin out evenly. The
+//! sparsest level that still has enough images around serves. The choice depends on distances and image numbers alone, not on the
+//! frame.
 
 use std::cmp::Reverse;
 
