@@ -1,4 +1,6 @@
-//! What the robust method knows: rays with their boxes, and all images, also those without detections.
+//! The input of the robust method: rays with their boxes, and all images, also those without detections.
+//!
+//! Images without detections count because they may be misses, equation (5) of `docs/method.md`.
 
 use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
