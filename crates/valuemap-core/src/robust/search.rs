@@ -1,8 +1,8 @@
-//! The search: from a map that is there to begin with, moves that are committed only if J falls.
+//! The search for the map with the least J: moves from an initial map, committed only if J falls.
 //!
-//! In each round all objects compete for all detections, pairs merge and exchange, neighborhoods are destroyed and repaired, and what
-//! is left over gives birth, also to objects that take votes from others; until nothing lowers J. Where all that does not pay, objects compete and are
-//! born once. A search that `learns` learns the classes of its model anew in each round.
+//! Each round has assignment, merges and swaps, destroy and repair, and births, until no move lowers J. Births with votes of
+//! others come last. Where all moves are not worth their time, there is one round of assignment, deaths and births. A search that
+//! `learns` learns the classes of its model anew in each round.
 
 use std::sync::Arc;
 
