@@ -1,8 +1,9 @@
-//! What boxes say of depth: the boxes of one object have one physical size, so that each is as much larger as it is nearer.
+//! Sizes of boxes as observations of depth: the boxes of one object have one physical size.
 //!
-//! With the logarithms a of a box's angle, d of its depth and s of the object's size, `a + d - s` is an error of standard deviation
-//! `spread`, and s is one of those that the class has, of mean and standard deviation `object`. The size is marginalised: what is left tells
-//! where the object is by how large its boxes are. What the boxes of a visit get wrong they get wrong alike: they count as one.
+//! With the logarithms a of a box's angle, d of its depth and s of the object's size, `a + d - s` is an error of standard
+//! deviation `spread`, and s has the mean and standard deviation of its class, `object`. The size is marginalised, which leaves
+//! an observation of the position. Boxes of one visit share their errors and count as one. It goes with size in equation (4) of
+//! `docs/method.md`.
 
 use nalgebra::{Matrix3, Vector3};
 
