@@ -1,5 +1,6 @@
-//! Inverses of symmetric positive definite matrices of six rows, by closed forms for their blocks of three: what pose errors
-//! need all the time.
+//! Inverses of symmetric positive definite 6x6 matrices, by closed forms for their 3x3 blocks.
+//!
+//! Pose errors have six components and are marginalised everywhere, so that this is the innermost step.
 
 use nalgebra::{Matrix3, SMatrix, SVector};
 
