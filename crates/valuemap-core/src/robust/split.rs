@@ -1,9 +1,9 @@
-//! What the objects of an image have in common: how much of the noise is the pose's, and how much each detection's.
+//! Split of the noise between poses and detections, by what the objects of an image have in common.
 //!
-//! At one object alone they cannot be told apart: an error of the position moves a box by `f / depth`, one that grows with the box of an object of one
-//! size does as well, and a rotation is as good as an error of so many pixels. But a pose moves all objects of an image alike, and detections are each off by
-//! themselves. So the two shares are those that make the residuals of the objects of a place, taken together, likeliest (restricted
-//! maximum likelihood, positions and drift marginalised). How large the noise is in all stays as it is.
+//! At one object alone the two cannot be told apart: an error of position moves a box by `f / depth`, and so does an error that
+//! grows with the box of an object of one size; a rotation is as good as an error in pixels. But a pose moves all objects of an
+//! image alike, and each detection is off by itself. So the two shares make the residuals of all objects of a place together
+//! likeliest (restricted maximum likelihood, positions and drift marginalised). The noise in all stays as large as it is.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
