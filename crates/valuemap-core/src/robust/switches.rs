@@ -1,8 +1,8 @@
-//! Identity switches: what begins to be seen just where another object ends, and is never seen beside it, is that object.
+//! Identity switches: an object that begins to be seen where another one ends, and never beside it, is that other one.
 //!
-//! Poses that are off for some metres put what is seen from there somewhere else, and two objects explain it better than one. But in the pictures
-//! it is one: from one image to the next its box hardly moves. Images a few metres apart have the same pose error, so their residuals at a place
-//! nearby differ by errors of single images alone, however wrong the place and the poses are.
+//! Poses that are off by some metres put what is seen from there somewhere else, and two objects then have less J than one. In
+//! the pictures it is one: its box hardly moves from one image to the next. Images a few metres apart have the same pose error,
+//! so their residuals at a place nearby differ by errors of single images alone, however wrong the place and the poses are.
 
 use super::drift::SEGMENT_M;
 use super::energy::{Object, implied_size, visits};
