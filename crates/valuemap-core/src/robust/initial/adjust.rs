@@ -1,4 +1,6 @@
-//! Adjustment: the labels of one place are estimated together ([`Joint`]), without the votes that disagree.
+//! Adjustment: the labels of one place are estimated together ([`Joint`]), without the votes that do not fit.
+//!
+//! Labels of a place share the pose errors of their images, which tells errors of a pass from errors of a label.
 
 use std::hash::{Hash, Hasher};
 
