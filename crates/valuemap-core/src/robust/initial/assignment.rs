@@ -1,9 +1,8 @@
-//! One image: which of its detections shows which of the labels that claim it.
+//! Assignment in one image: which of its detections shows which of the labels that claim it.
 //!
-//! The labels in an image are off by its pose error together; what is left of a residual, that error taken out, tells two heads on
-//! one pole apart where the error is as large as their distance. Where several labels and detections could go
-//! together, the assignment with the least sum of costs wins (joint compatibility; the costs are those of maximum
-//! likelihood).
+//! All labels in an image are off by its pose error together. With that error taken out, residuals tell two heads on one pole
+//! apart even where the error is as large as their distance. Among labels and detections that could go together, the assignment
+//! with the least sum of costs wins (joint compatibility; the costs are those of maximum likelihood).
 
 use nalgebra::{Matrix2, SMatrix};
 use pathfinding::prelude::{Matrix, kuhn_munkres_min};
