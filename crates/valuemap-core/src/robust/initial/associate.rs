@@ -1,7 +1,7 @@
-//! Which detection shows which label: all labels compete for all detections, image by image.
+//! Association: all labels compete for all detections, image by image.
 //!
-//! The pose error of each image is estimated first, from the votes along the drive ([`poses`](crate::robust::poses)); then each image
-//! is decided for itself ([`assignment`](mod@super::assignment)), and rivals for a whole pass ([`rivals`](super::rivals)).
+//! The pose error of each image is estimated first, from the votes along the drive ([`poses`](crate::robust::poses)). Then each
+//! image is decided for itself ([`assignment`](mod@super::assignment)), and rivals for a whole pass ([`rivals`](super::rivals)).
 
 use std::sync::Arc;
 
