@@ -1,9 +1,9 @@
-//! Exchange: two labels side by side may have each other's votes from some directions, and have moved so that these votes
-//! fit; then no single vote changes sides.
+//! Exchange: two neighbours may have each other's votes from some directions, and have moved so that these votes fit; then no
+//! single vote changes sides.
 //!
-//! Where an image shows both, the difference of their detections does not depend on the pose's error, and says how the
-//! one lies from the other, up to which is which. The difference of the positions that explains most images is
-//! sought among those that pairs of images propose; it says in which images the two must be swapped.
+//! In an image that shows both, the difference of their detections does not depend on the pose error. It says where the one lies
+//! from the other, up to which is which. Pairs of images propose differences of the positions; the one that explains most images
+//! says in which images the two must be swapped.
 
 use nalgebra::{Matrix2x3, Matrix3, Vector2, Vector3};
 use rayon::prelude::*;
