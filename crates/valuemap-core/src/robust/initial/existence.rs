@@ -1,11 +1,9 @@
-//! Does a label exist? Hits and misses among the looks that should have seen it.
+//! First test of existence: hits and misses among the looks that should have seen a label.
 //!
-//! A look is a viewpoint (all images of a pass at one place) with at least one image that has the label in its picture,
-//! from a direction and distance from which it was seen. A real object is detected in a share of the looks, which
-//! varies from pass to pass (beta-binomial); where there is nothing, a look has a detection in the gate only by chance.
-//!
-//! A direction from which a label is looked at many times and hit a few is not one that it is seen from: its few votes
-//! are other things'.
+//! A look is a viewpoint with at least one image that has the label in its picture, from a direction and distance from which it
+//! was seen. A real object is detected in a share of the looks that varies from pass to pass (beta-binomial). Where there is
+//! nothing, a look has a detection in the gate by chance alone. Where a label is looked at many times from a direction and hit a
+//! few times, these votes are of other things. Equation (5) of `docs/method.md` replaces this in the search.
 
 use std::f64::consts::PI;
 
