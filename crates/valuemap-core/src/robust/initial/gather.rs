@@ -1,6 +1,7 @@
-//! Gathering: the best supported nomination is polished, on its voters and from its estimate, until the voters stay the
-//! same; its voters leave; and so on. Where there are many images the rays of a few of them nominate first; all
-//! rays that are left over get further rounds among themselves.
+//! Gathering: hypotheses become labels, the best supported one first.
+//!
+//! A point is estimated on its voters and gathers voters around the estimate, until they stay the same. Its voters are then
+//! taken. Where there are many images, the rays of a part of them propose first; the rays that are left get further rounds.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
