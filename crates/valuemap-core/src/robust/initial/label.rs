@@ -1,4 +1,4 @@
-//! A label in the making: a point, the rays that support it, and the side it is seen from.
+//! A label of the initial map: a position with its covariance, the rays that vote for it, and the side that it is seen from.
 
 use std::hash::{Hash, Hasher};
 use std::sync::OnceLock;
