@@ -1,4 +1,4 @@
-//! Pairs of labels that lie near each other, and what becomes of them.
+//! Pairs of labels near each other, disjoint and the nearest first, and their replacement by what is better.
 
 use rayon::prelude::*;
 
