@@ -1,7 +1,7 @@
-//! Rivals: two labels of which a pass shows only one, where it might be either.
+//! Rivals: two labels of which a pass shows only one, and it might be either.
 //!
-//! There is one object, and one of the labels is not to be seen from there. All that the pass shows of it together is
-//! weighed, with the drift of the pass as its other labels tell it.
+//! There is then one object, and one of the labels is not visible from there. All that the pass shows of the two together decides
+//! which, with the drift of the pass as its other labels tell it.
 
 use rustc_hash::{FxHashMap, FxHashSet};
 
