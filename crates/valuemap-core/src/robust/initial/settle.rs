@@ -1,4 +1,6 @@
-//! Settling: labels that stand for two objects become two, those that stand for one object become one.
+//! Splits and merges: a label whose two sides disagree becomes two, and two labels that agree become one.
+//!
+//! Agreement is tested by the Mahalanobis distance of positions, since no distance in metres fits all covariances.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
