@@ -1,4 +1,4 @@
-//! The solver: labels compete for the rays, round after round, and those that probably do not exist are dropped.
+//! The loop of the initial map: labels compete for the rays, round after round, and those that probably do not exist are dropped.
 
 use std::sync::{Arc, OnceLock};
 
