@@ -1,10 +1,10 @@
-//! Swaps: which of two neighbors has the votes of some direction, or whether there is but one.
+//! Swaps: which of two neighbours has the votes of some direction, or whether there is only one object.
 //!
-//! Where images show only one of two neighbors from some direction, the wrong one may have all that looks from there. Its
-//! position has then moved so that these votes fit, and the detections that it should have do not fit anywhere: no
-//! single vote changes sides. Both are estimated anew as if the other one had these votes, with what then fits of the
-//! detections that nobody has; the explanation that leaves less unexplained stays. And where one label explains nearly all
-//! that both do, and hardly any image shows both, there is one object.
+//! Where images show only one of two neighbours from some direction, the wrong one may have all those votes. Its position has
+//! then moved so that they fit, the detections that it should have fit nowhere, and no single vote changes sides. Both are
+//! estimated anew as if the other one had these votes, with the unassigned detections that then fit, and the explanation that
+//! leaves less unexplained stays. Where one label explains nearly all that both do, and hardly any image shows both, there is one
+//! object.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
