@@ -6,7 +6,7 @@
 /// Values are sorted into so many bins of about as many detections each.
 pub const BINS: usize = 12;
 /// Votes and clutter of fewer detections than this tell nothing: two or three of each in a bin.
-const LEAST_DETECTIONS: usize = 30;
+const LEAST_DETECTIONS: f64 = 30.0;
 
 /// A function that is constant between some edges.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -75,39 +75,50 @@ impl Steps {
         steps
     }
 
-    fn counts(&self, numbers: &[f64]) -> [f64; BINS] {
-        let mut counts = [0.0; BINS];
-        numbers.iter().filter(|number| number.is_finite()).for_each(|&number| counts[self.bin(number)] += 1.0);
-        counts
+    /// The sum of some weights in each bin.
+    fn sums(&self, numbers: impl Iterator<Item = (f64, f64)>) -> [f64; BINS] {
+        let mut sums = [0.0; BINS];
+        numbers.filter(|(number, _)| number.is_finite()).for_each(|(number, weight)| sums[self.bin(number)] += weight);
+        sums
     }
 }
 
 /// How much more probable, in logarithms, votes have a score than clutter has; it does not fall with the score.
 #[must_use]
 pub fn score_ratio(votes: &[f64], clutter: &[f64]) -> Steps {
-    let finite = |scores: &[f64]| scores.iter().filter(|score| score.is_finite()).count();
-    if finite(votes).min(finite(clutter)) < LEAST_DETECTIONS {
+    let of_votes = votes.iter().map(|&score| (score, [1.0, 0.0]));
+    let of_clutter = clutter.iter().map(|&score| (score, [0.0, 1.0]));
+    rising_ratio(&of_votes.chain(of_clutter).collect::<Vec<_>>())
+}
+
+/// How much more probable, in logarithms, a number is of one kind of thing than of another, if it does not fall with the number; each number comes with
+/// the probabilities that it is of either kind. Nothing is told by few of one kind.
+#[must_use]
+pub fn rising_ratio(numbers: &[(f64, [f64; 2])]) -> Steps {
+    let finite = || numbers.iter().copied().filter(|(number, _)| number.is_finite());
+    let [first, other] = finite().fold([0.0; 2], |sums, (_, of)| [sums[0] + of[0], sums[1] + of[1]]);
+    if first.min(other) < LEAST_DETECTIONS {
         return Steps::NONE;
     }
-    let mut steps = Steps::of_quantiles(votes.iter().chain(clutter).copied(), 0.0);
+    let mut steps = Steps::of_quantiles(finite().map(|(number, _)| number), 0.0);
     let used = steps.edges.iter().filter(|edge| edge.is_finite()).count() + 1;
-    let (of_votes, of_clutter) = (steps.counts(votes), steps.counts(clutter));
-    // Pooled where the share of votes falls (pool adjacent violators), with one more of each kind in each pool.
+    let of_first = steps.sums(finite().map(|(number, of)| (number, of[0])));
+    let of_other = steps.sums(finite().map(|(number, of)| (number, of[1])));
+    // Pooled where the share of the first kind falls (pool adjacent violators), with one more of each kind in each pool.
     let mut pools: Vec<(f64, f64, usize)> = Vec::with_capacity(used);
     for bin in 0..used {
-        pools.push((of_votes[bin], of_clutter[bin], 1));
-        while let [.., (v0, c0, n0), (v1, c1, n1)] = pools[..] {
-            if (v1 + 1.0) * (c0 + 1.0) >= (v0 + 1.0) * (c1 + 1.0) {
+        pools.push((of_first[bin], of_other[bin], 1));
+        while let [.., (a0, b0, n0), (a1, b1, n1)] = pools[..] {
+            if (a1 + 1.0) * (b0 + 1.0) >= (a0 + 1.0) * (b1 + 1.0) {
                 break;
             }
             pools.truncate(pools.len() - 2);
-            pools.push((v0 + v1, c0 + c1, n0 + n1));
+            pools.push((a0 + a1, b0 + b1, n0 + n1));
         }
     }
-    let (all_votes, all_clutter) = (of_votes.iter().sum::<f64>(), of_clutter.iter().sum::<f64>());
     let mut bin = 0;
-    for (votes, clutter, bins) in pools {
-        let ratio = ((votes + 1.0) / (all_votes + used as f64)) / ((clutter + 1.0) / (all_clutter + used as f64));
+    for (a, b, bins) in pools {
+        let ratio = ((a + 1.0) / (first + used as f64)) / ((b + 1.0) / (other + used as f64));
         steps.values[bin..bin + bins].fill(ratio.ln());
         bin += bins;
     }
@@ -118,12 +129,12 @@ pub fn score_ratio(votes: &[f64], clutter: &[f64]) -> Steps {
 /// are `looked_at` had as much.
 #[must_use]
 pub fn elevation_factor(clutter: &[f64], looked_at: (f64, f64), resolution: f64) -> Steps {
-    if clutter.len() < LEAST_DETECTIONS || looked_at.1 <= looked_at.0 {
+    if (clutter.len() as f64) < LEAST_DETECTIONS || looked_at.1 <= looked_at.0 {
         return Steps::NONE;
     }
     let mut steps = Steps::of_quantiles(clutter.iter().copied(), resolution);
     let used = steps.edges.iter().filter(|edge| edge.is_finite()).count() + 1;
-    let counts = steps.counts(clutter);
+    let counts = steps.sums(clutter.iter().map(|&sine| (sine, 1.0)));
     for (bin, count) in counts.into_iter().enumerate().take(used) {
         let from = if bin == 0 { looked_at.0 } else { steps.edges[bin - 1] };
         let to = if bin + 1 == used { looked_at.1 } else { steps.edges[bin] };

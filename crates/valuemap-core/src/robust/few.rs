@@ -65,10 +65,15 @@ pub fn objects_of_few(
         }
     }
     found.retain(|object| object.votes.len() >= least_votes);
-    for object in &mut found {
+    add_odds(model, &mut found);
+    Ok(found)
+}
+
+/// Add to J of objects what their numbers of votes say, equation (8).
+pub(super) fn add_odds(model: &Model<'_>, objects: &mut [Object]) {
+    for object in objects {
         object.energy -= 2.0 * ln_odds(&model.classes[object.class as usize], object.votes.len());
     }
-    Ok(found)
 }
 
 /// Logarithm of the odds of objects of so many votes, among what is left.

@@ -5,7 +5,7 @@
 //! 3. [`births`](mod@births): the best supported hypothesis takes its votes, and is born if J ([`energy`]) falls.
 //! 4. [`assign`](mod@assign): all objects compete for all detections.
 //! 5. [`finish`](mod@finish): positions and covariances, objects of a place together ([`estimate`](mod@estimate), [`drift`], [`contest`]).
-//!    [`few`]: what one or two looks make. [`switches`]: what the pictures show to be another object is left out.
+//!    [`few`]: what one or two looks make. [`existence`]: which objects exist. [`switches`]: what the pictures show to be another object is left out.
 //! 6. [`likeliest`], [`calibrate`]: the noise itself is estimated from the residuals; [`learn`](mod@learn): rates, sizes and clutter are;
 //!    [`confusion`]: what classes are taken for; [`split`](mod@split): what of the noise is the poses' and what the detections'.
 
@@ -20,6 +20,7 @@ pub mod counts;
 pub mod drift;
 pub mod energy;
 pub mod estimate;
+pub mod existence;
 pub mod few;
 pub mod finish;
 mod foresee;
@@ -307,11 +308,13 @@ fn learn_from(model: &mut Model<'_>, rays: &[u32], progress: &Progress) -> Resul
         }
     }
     let few = few::objects_of_few(model, &lookout, rays, &objects, 1, progress)?;
-    let whole = {
+    let [whole, mut whole_of_few] = {
         let is_whole = lookout.whole(model, rays);
         [&objects, &few].map(|all| all.iter().filter(|object| is_whole(object)).cloned().collect::<Vec<Object>>())
     };
-    counts::learn_counts(model, &whole[0], &whole[1]);
+    counts::learn_counts(model, &whole, &whole_of_few);
+    few::add_odds(model, &mut whole_of_few);
+    existence::learn_existence(model, &whole, &whole_of_few);
     Ok(objects)
 }
 
@@ -349,6 +352,7 @@ pub fn find(
     } else {
         Vec::new()
     };
+    let existences = existence::existences(&model, &objects, &few);
     let few = few.into_iter().map(|object| {
         let estimate = Estimate { point: object.fit.point, covariance: object.fit.covariance };
         (object, estimate)
@@ -359,9 +363,10 @@ pub fn find(
     tally.deaths += are_others.iter().filter(|is_other| **is_other).count() as u64;
     let mut findings: Vec<Finding> = all
         .into_iter()
+        .zip(existences)
         .zip(are_others)
         .filter_map(|(one, is_other)| (!is_other).then_some(one))
-        .map(|(object, estimate)| (object.existence(), object, estimate))
+        .map(|((object, estimate), existence)| (existence, object, estimate))
         .filter(|(existence, ..)| *existence >= settings.min_existence)
         .map(|(existence, object, estimate)| {
             let expected = lookout.expected(scene, &estimate.point, &object.votes);

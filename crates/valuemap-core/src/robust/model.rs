@@ -11,6 +11,7 @@ use nalgebra::Vector3;
 use super::clutter::Steps;
 use super::confusion::Confusions;
 use super::counts::FEW;
+use super::existence::Existing;
 use super::heights::{Heights, up_of};
 use super::noise::{Noise, Spread};
 use super::parts::Part;
@@ -51,6 +52,8 @@ pub struct ClassModel {
     pub ln_odds_of_few: [f64; FEW],
     /// How much denser objects are near others, in logarithms, by minus the distance to the nearest one, m.
     pub company: Steps,
+    /// What tells beside the looks at an object whether it exists.
+    pub existing: Existing,
     /// How large detections are.
     pub sizes: Sizes,
     /// Mean and standard deviation of the measured ranges of all detections, as depths, ln m.
@@ -81,6 +84,7 @@ impl ClassModel {
             reach: Steps::ONE,
             ln_odds_of_few: [0.0; FEW],
             company: Steps::NONE,
+            existing: Existing::UNTOLD,
             heights: None,
             sizes: Sizes::guess(angle),
             ranges,
@@ -88,7 +92,7 @@ impl ClassModel {
     }
 
     /// How many numbers it is stored as.
-    pub const NUMBERS: usize = 20 + Heights::NUMBERS + 4 * Steps::NUMBERS;
+    pub const NUMBERS: usize = 20 + Heights::NUMBERS + 4 * Steps::NUMBERS + Existing::NUMBERS;
 
     /// All of it as numbers, for storage.
     #[must_use]
@@ -117,7 +121,7 @@ impl ClassModel {
             self.ranges.1,
         ];
         let steps = [self.clutter_by_elevation, self.score_ratio, self.reach, self.company].map(|steps| steps.to_row());
-        numbers.into_iter().chain(heights).chain(steps.into_iter().flatten()).collect()
+        numbers.into_iter().chain(heights).chain(steps.into_iter().flatten()).chain(self.existing.to_row()).collect()
     }
 
     /// What `to_row` returned; nothing of another number of numbers.
@@ -128,7 +132,8 @@ impl ClassModel {
         let (clutter, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
         let (scores, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
         let (reach, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
-        let company = rest.try_into().ok()?;
+        let (company, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
+        let existing = Existing::from_row(rest.try_into().ok()?)?;
         let &[
             is_learned,
             recall,
@@ -167,6 +172,7 @@ impl ClassModel {
             ln_odds_of_few: [ln_odds_of_one, ln_odds_of_two, ln_odds_of_more],
             company: Steps::from_row(company),
             sizes: Sizes { angle: (angle_mean, angle_sd), object: (object_mean, object_sd), spread },
+            existing,
             ranges: (range_mean, range_sd),
         })
     }

@@ -43,6 +43,8 @@ pub enum Part {
     Reach,
     /// Objects are denser near others.
     Company,
+    /// Scores and company tell which objects exist.
+    Existence,
     /// Who should have seen an object and did not.
     Looks,
     /// Images of one viewpoint do not show now one of two objects and now the other.
@@ -61,7 +63,7 @@ pub enum Part {
 
 impl Part {
     /// All parts with their names.
-    pub const ALL: [(Self, &'static str); 27] = [
+    pub const ALL: [(Self, &'static str); 28] = [
         (Self::Polishing, "polishing"),
         (Self::Assignment, "assignment"),
         (Self::Merging, "merging"),
@@ -82,6 +84,7 @@ impl Part {
         (Self::Elevations, "elevations"),
         (Self::Reach, "reach"),
         (Self::Company, "company"),
+        (Self::Existence, "existence"),
         (Self::Looks, "looks"),
         (Self::Turns, "turns"),
         (Self::Confusions, "confusions"),

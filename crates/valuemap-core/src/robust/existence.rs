@@ -1,0 +1,247 @@
+//! Which objects exist: what tells them from false things beside the looks at them.
+//!
+//! J says whether anything is there, and the looks how many of the things with such looks are real (see [`super::seen`]). Where each has few looks, these
+//! say much the same of all. But what is false, an apron of a driveway or a reflection, has lower scores and stands apart from others. So the odds of real
+//! against false are multiplied by how much more probable the mean score of an object, and its distance to the nearest sure one, are of real things than
+//! of false ones. Both ratios are monotone, and learned by expectation and maximisation (Dempster, Laird and Rubin 1977). How many are real stays what the
+//! looks say: scores and distances tell which ones.
+
+use super::clutter::{Steps, rising_ratio};
+use super::company::Sure;
+use super::energy::Object;
+use super::model::Model;
+use super::parts::Part;
+
+/// Steps of expectation and maximisation: as many more change no probability by more than a hundredth.
+const STEPS: usize = 40;
+/// No probability is surer than this: a thousand objects of a class tell no more.
+const LEAST_DOUBT: f64 = 1e-6;
+/// Rounds of bisection: logarithms of odds are right to a billionth.
+const ROUNDS: usize = 36;
+/// Odds are shifted by no more than this factor, in logarithms.
+const MOST: f64 = 30.0;
+
+/// What is learned of one class.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Existing {
+    /// How much more probable a mean score is of what is real, in logarithms.
+    pub by_score: Steps,
+    /// How much more probable the nearness of the nearest sure object is.
+    pub by_nearness: Steps,
+    /// What is added to the logarithm of all odds, so that as many are real as the looks say.
+    pub ln_odds: f64,
+}
+
+impl Existing {
+    /// Nothing beside J and looks tells.
+    pub const UNTOLD: Self = Self { by_score: Steps::NONE, by_nearness: Steps::NONE, ln_odds: 0.0 };
+
+    /// As many numbers.
+    pub const NUMBERS: usize = 2 * Steps::NUMBERS + 1;
+
+    /// As numbers, for storage.
+    #[must_use]
+    pub fn to_row(&self) -> Vec<f64> {
+        [&self.by_score.to_row()[..], &self.by_nearness.to_row()[..], &[self.ln_odds]].concat()
+    }
+
+    /// What `to_row` returned.
+    #[must_use]
+    pub fn from_row(row: &[f64; Self::NUMBERS]) -> Option<Self> {
+        let (by_score, rest) = row.split_first_chunk::<{ Steps::NUMBERS }>()?;
+        let (by_nearness, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
+        let &[ln_odds] = rest else { return None };
+        Some(Self { by_score: Steps::from_row(by_score), by_nearness: Steps::from_row(by_nearness), ln_odds })
+    }
+
+    /// By expectation and maximisation from what J and the looks say of some things.
+    fn learn(told: &[Told]) -> Self {
+        let real_of = |existing: &Self| -> Vec<f64> { told.iter().map(|one| existing.real(one)).collect() };
+        let sum = |real: &[f64]| -> f64 { told.iter().zip(real).map(|(one, real)| one.there * real).sum() };
+        let mut existing = Self::UNTOLD;
+        let mut real = real_of(&existing);
+        let all = sum(&real);
+        for _ in 0..STEPS {
+            let of = |number: fn(&Told) -> f64| -> Vec<(f64, [f64; 2])> {
+                let kinds = |(one, real): (&Told, &f64)| (number(one), [one.there * real, one.there * (1.0 - real)]);
+                told.iter().zip(&real).map(kinds).collect()
+            };
+            let (by_score, by_nearness) = (rising_ratio(&of(|one| one.score)), rising_ratio(&of(|one| one.nearness)));
+            existing = Self { by_score, by_nearness, ln_odds: 0.0 };
+            if existing.tells_nothing() {
+                return Self::UNTOLD;
+            }
+            let with = |ln_odds: f64| Self { ln_odds, ..existing };
+            existing = with(at_most(all, |ln_odds| sum(&real_of(&with(ln_odds)))));
+            real = real_of(&existing);
+        }
+        existing
+    }
+
+    /// The probability that what is no clutter is real rather than false.
+    fn real(&self, told: &Told) -> f64 {
+        let ln_factor = self.ln_odds + self.by_score.at(told.score) + self.by_nearness.at(told.nearness);
+        probability(told.ln_odds() + ln_factor)
+    }
+
+    fn tells_nothing(&self) -> bool {
+        self.by_score == Steps::NONE && self.by_nearness == Steps::NONE
+    }
+}
+
+/// Where an ascending function of what is added to the logarithm of odds is not above a number.
+fn at_most(most: f64, of: impl Fn(f64) -> f64) -> f64 {
+    let (mut low, mut high) = (-MOST, MOST);
+    for _ in 0..ROUNDS {
+        let middle = 0.5 * (low + high);
+        if of(middle) <= most { low = middle } else { high = middle }
+    }
+    low
+}
+
+fn probability(ln_odds: f64) -> f64 {
+    1.0 / (1.0 + (-ln_odds).exp())
+}
+
+/// What tells whether an object exists.
+#[derive(Debug, Clone, Copy)]
+struct Told {
+    /// The probability that it is no clutter: what J says.
+    there: f64,
+    /// The probability that it is real rather than false then: what the looks say.
+    real: f64,
+    /// The mean score of its votes; not a number if none has one.
+    score: f64,
+    /// Minus the distance to the nearest sure object of its class but itself, m; not a number if there is none.
+    nearness: f64,
+}
+
+impl Told {
+    fn ln_odds(&self) -> f64 {
+        (self.real / (1.0 - self.real)).ln()
+    }
+}
+
+/// What tells of each of some objects and then of some of few votes, whether it exists.
+fn told_of(model: &Model<'_>, objects: &[Object], few: &[Object]) -> Vec<Told> {
+    let sure: Vec<Sure> = (0..model.classes.len() as u32).map(|class| Sure::of(objects, class)).collect();
+    let told = |(object, row): (&Object, Option<usize>)| {
+        let scores = object.votes.iter().map(|&ray| model.scene.score[ray as usize]).filter(|score| score.is_finite());
+        let (sum, count) = scores.fold((0.0, 0.0), |(sum, count), score| (sum + score, count + 1.0));
+        let nearness = sure[object.class as usize].nearness(&object.fit.point, row);
+        let real = object.real.clamp(LEAST_DOUBT, 1.0 - LEAST_DOUBT);
+        Told { there: probability(-0.5 * object.energy), real, score: sum / count, nearness }
+    };
+    let rows = (0..objects.len()).map(Some).chain(few.iter().map(|_| None));
+    objects.iter().chain(few).zip(rows).map(told).collect()
+}
+
+/// Learn it for all classes of a model, from the objects of a map and those of few votes beside it.
+pub fn learn_existence(model: &mut Model<'_>, objects: &[Object], few: &[Object]) {
+    if !model.settings.has(Part::Existence) {
+        return;
+    }
+    let told = told_of(model, objects, few);
+    let class_of = |row: usize| objects.iter().chain(few).nth(row).map(|object| object.class);
+    let classes: Vec<Option<u32>> = (0..told.len()).map(class_of).collect();
+    model.pooled.existing = Existing::learn(&told);
+    for (class, learned) in (0..).zip(&mut model.classes) {
+        let of_class = told.iter().zip(&classes).filter(|(_, of)| **of == Some(class)).map(|(told, _)| *told);
+        learned.existing = Existing::learn(&of_class.collect::<Vec<_>>());
+    }
+}
+
+/// The probability that each of some objects exists, and then of some of few votes.
+#[must_use]
+pub fn existences(model: &Model<'_>, objects: &[Object], few: &[Object]) -> Vec<f64> {
+    let existence = |(object, told): (&Object, Told)| {
+        let existing = &model.classes[object.class as usize].existing;
+        if existing.tells_nothing() { object.existence() } else { told.there * existing.real(&told) }
+    };
+    objects.iter().chain(few).zip(told_of(model, objects, few)).map(existence).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::super::Settings;
+    use super::super::energy::anywhere;
+    use super::super::parts::Without;
+    use super::super::seen::Seen;
+    use super::*;
+    use crate::street::{NOISE, SETTINGS, street};
+
+    /// Objects of which two in three exist; scores of these are higher, and others are near them.
+    fn told(count: usize, real: f64) -> Vec<Told> {
+        let one = |i: usize| {
+            let (is_real, at_random) = (i % 3 > 0, (i * 7 % 100) as f64 / 100.0);
+            let score = if is_real { 0.5 + 0.5 * at_random } else { 0.8 * at_random };
+            let nearness = if is_real { -20.0 * at_random } else { -60.0 * ((i * 11 % 100) as f64 / 100.0) };
+            Told { there: 1.0, real, score, nearness }
+        };
+        (0..count).map(one).collect()
+    }
+
+    #[test]
+    fn scores_and_company_tell_which_are_real_and_not_how_many() {
+        // Looks know a little of which are.
+        let mut all = told(900, 0.7);
+        all.iter_mut().enumerate().for_each(|(i, one)| one.real += if i % 3 > 0 { 0.05 } else { -0.05 });
+        let existing = Existing::learn(&all);
+        let sum = |is_real: bool, real: fn(&Existing, &Told) -> f64| -> f64 {
+            let of = all.iter().enumerate().filter(|(i, _)| (i % 3 > 0) == is_real);
+            of.map(|(_, one)| real(&existing, one)).sum()
+        };
+        let by_looks = sum(true, |_, one| one.real) + sum(false, |_, one| one.real);
+        let (real, falsely) = (sum(true, Existing::real), sum(false, Existing::real));
+        assert!((real + falsely - by_looks).abs() < 1e-3, "{by_looks}");
+        assert!(real > 0.9 * 600.0 && falsely < 0.4 * 300.0, "{real} {falsely}");
+    }
+
+    #[test]
+    fn of_few_that_do_not_exist_nothing_is_learned() {
+        assert_eq!(Existing::learn(&told(900, 0.99)), Existing::UNTOLD);
+        assert_eq!(Existing::learn(&[]), Existing::UNTOLD);
+    }
+
+    #[test]
+    fn what_is_learned_is_what_is_stored_of_it() {
+        let existing = Existing::learn(&told(900, 0.7));
+        let row: Result<[f64; Existing::NUMBERS], _> = existing.to_row().try_into();
+        assert!(row.is_ok_and(|row| Existing::from_row(&row) == Some(existing)));
+    }
+
+    #[test]
+    fn of_two_objects_that_were_seen_alike_the_one_with_the_higher_scores_exists_rather() {
+        let signs: Vec<Vector3<f64>> = (1..20).map(|i| Vector3::new(20.0 * f64::from(i), 4.0, 3.0)).collect();
+        let mut scene = street(200, 2.0, &signs, &[[0.0; 2]]);
+        let scores: Vec<f64> = told(scene.score.len(), 0.7).iter().map(|told| told.score).collect();
+        scene.score.clone_from(&scores);
+        let with_real = |ray: usize| {
+            let real = if ray % 3 > 0 { 0.75 } else { 0.65 };
+            Object { votes: vec![ray as u32], real, ..anywhere(1, Seen::default(), -20.0) }
+        };
+        let few: Vec<Object> = (0..scores.len()).map(with_real).collect();
+        let existence = |settings: &Settings| {
+            let mut model = Model::new(&scene, &NOISE, settings);
+            learn_existence(&mut model, &[], &few);
+            existences(&model, &[], &few)
+        };
+        let mean = |existence: &[f64], is_real: bool| {
+            let of: Vec<f64> = (0..few.len()).filter(|i| (i % 3 > 0) == is_real).map(|i| existence[i]).collect();
+            of.iter().sum::<f64>() / of.len() as f64
+        };
+        let found = existence(&SETTINGS);
+        assert!(
+            mean(&found, true) > 0.85 && mean(&found, false) < 0.5,
+            "{} {}",
+            mean(&found, true),
+            mean(&found, false)
+        );
+        let names = ["existence".to_owned()];
+        let without = Without::named(&names);
+        let left_out = existence(&Settings { without: without.unwrap_or_default(), ..SETTINGS });
+        assert!(left_out.iter().zip(&few).all(|(existence, object)| (existence - object.existence()).abs() < 1e-12));
+    }
+}
