@@ -17,7 +17,7 @@ from check_faults import FAULTS as INJECTED
 from check_faults import good_city
 from small_dataset import small_dataset
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check import cameras, contest, distortion, examine, fit
+from valuemap.check import cameras, contest, distortion, examine, fit, mounts
 from valuemap.check.agreement import Agreement, compare, gains_of_objects, measure_agreement
 from valuemap.check.boxes import PictureSize, _chance_of_gap, _Ends, _OfSquare, picture_sizes, rows_in_images
 from valuemap.check.cameras import PARAMETERS, _followed, _is_wider_gate_only, with_focal
@@ -43,9 +43,9 @@ from valuemap.check.passes import (
     _jumping_passes,
     _passes_in_turn,
     _rolling_period,
-    _seen_m,
     _unrolled,
     moved_along,
+    seen_m,
 )
 from valuemap.check.poses import PitchAndRoll
 from valuemap.check.quality import TruthElsewhere, strays
@@ -196,14 +196,14 @@ def test_attitudes_speak_where_cameras_lie_askew_only(view: View) -> None:
 
 
 def test_a_seam_that_rays_cannot_see_is_no_fault(good: Dataset, view: View, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen_m = _seen_m(view)
-    assert 0.1 < seen_m < 1.0  # Objects are 10 to 80 m away, the gate is 0.012 rad.
+    seen = seen_m(view)
+    assert 0.1 < seen < 1.0  # Objects are 10 to 80 m away, the gate is 0.012 rad.
     drive = one_drive_in_two(good)
     is_late = drive.images.pass_id.codes == drive.images.pass_id.code_of("late")
-    up = np.where(is_late[:, None], [0.0, 0.0, 0.5 * seen_m], 0.0)
+    up = np.where(is_late[:, None], [0.0, 0.0, 0.5 * seen], 0.0)
     jumps = View(with_centers(drive, camera_centers(drive.images) + up))
     assert _at_a_seam(jumps) is not None
-    monkeypatch.setattr("valuemap.check.passes._seen_m", lambda _: seen_m)
+    monkeypatch.setattr("valuemap.check.passes.seen_m", lambda _: seen)
     assert _at_a_seam(jumps) is None
 
 
@@ -505,7 +505,7 @@ def test_images_of_one_time_have_no_speed(good: Dataset) -> None:
 def test_every_fault_of_the_registry_is_injected() -> None:
     known = _CONVENTIONS | set(_FAULT)
     assert set(INJECTED) <= known
-    assert known - set(INJECTED) == {"headings_useless"}
+    assert known - set(INJECTED) == {"headings_useless", "cameras_exchanged"}
     assert len(known) == len(CONVENTIONS) + len(FAULTS)
 
 
@@ -810,6 +810,130 @@ def test_one_camera_has_no_world_of_its_own(good: Dataset, monkeypatch: pytest.M
     finding = contest.find_odd_group(spoiled, CONVENTIONS)
     assert finding is not None
     assert finding.fault == "world_axes"
+
+
+def rig(seed: int, cameras: int = 3) -> Dataset:
+    """Return a small city that cars with several cameras drive, 60 degrees from each other."""
+    return simulate(replace(PRESETS["small"], cameras=cameras, camera_spread_deg=60.0, write_pose_sigmas=1), seed=seed)
+
+
+@pytest.fixture(scope="module")
+def good_rig() -> Dataset:
+    return rig(11)
+
+
+def exchanged(dataset: Dataset, first: int, second: int) -> Dataset:
+    """Return a dataset with the poses of two cameras exchanged, image by image as they are listed."""
+    rows = [np.flatnonzero(dataset.images.camera_id == camera) for camera in (first, second)]
+    time = np.asarray(dataset.images.timestamp_s)
+    np.testing.assert_array_equal(time[rows[0]], time[rows[1]])
+    other = np.arange(len(time))
+    other[rows[0]], other[rows[1]] = rows[1], rows[0]
+    images = dataset.images
+    return with_images(
+        dataset, cam_from_world_quat=images.cam_from_world_quat[other], cam_from_world_m=images.cam_from_world_m[other]
+    )
+
+
+def lowered(dataset: Dataset, metres: float) -> Dataset:
+    return with_centers(dataset, camera_centers(dataset.images) - metres * np.asarray(dataset.frame.up))
+
+
+def test_a_good_rig_raises_nothing(good_rig: Dataset) -> None:
+    assert examine(good_rig).findings == ()
+
+
+@pytest.mark.parametrize("pair", [(0, 1), (0, 2)])
+def test_exchanged_cameras_are_named_alone_and_put_back(pair: tuple[int, int], good_rig: Dataset) -> None:
+    outcome = examine(exchanged(good_rig, *pair))
+    assert [finding.fault for finding in outcome.findings] == ["cameras_exchanged"]
+    assert outcome.findings[0].figures["reading"] == f"poses of cameras {pair[0]} and {pair[1]} exchanged"
+    np.testing.assert_array_equal(rotation_matrices(outcome.fixed.images), rotation_matrices(good_rig.images))
+
+
+def test_cameras_that_expose_a_little_later_are_one_rig(good_rig: Dataset) -> None:
+    """And those of another rhythm than half a step are none."""
+    time, camera = np.asarray(good_rig.images.timestamp_s), good_rig.images.camera_id
+    late = with_images(good_rig, timestamp_s=time + 0.01 * camera)
+    first, second = mounts._together(late.images, 0, 1)
+    assert len(first) == (camera == 0).sum()
+    np.testing.assert_allclose(time[first], time[second])
+    no_rig = with_images(good_rig, timestamp_s=time + 1e4 * camera)
+    assert len(mounts._together(no_rig.images, 0, 1)[0]) == 0
+    assert list(mounts.CamerasExchanged().readings(with_images(good_rig, timestamp_s=None))) == []
+
+
+def test_what_one_camera_sees_in_its_right_size_is_no_other_unit(
+    good_rig: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two of three cameras are exchanged: their rays meet where things are three times as large."""
+    spoiled = View(replace(exchanged(good_rig, 0, 1), truth=None, truth_detections=None))
+    assert _FAULT["scale"].find(spoiled) is None
+    small = View(replace(with_centers(good_rig, 0.07 * camera_centers(good_rig.images)), truth=None))
+    assert _FAULT["scale"].find(small) is not None
+    monkeypatch.setattr("valuemap.check.frames.do_groups_agree", lambda *_: True)
+    assert _FAULT["scale"].find(spoiled) is not None
+
+
+def test_a_camera_that_sees_little_is_turned_by_what_the_others_see(
+    good_rig: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spoiled = of_camera(good_rig, turned_by(good_rig, "y", 4.0), 2)
+    outcome = examine(spoiled)
+    assert [(finding.fault, finding.of) for finding in outcome.findings] == [("camera_yaw", "camera 2")]
+    off = rotation_matrices(outcome.fixed.images) @ rotation_matrices(good_rig.images).transpose(0, 2, 1)
+    assert np.degrees(Rotation.from_matrix(off).magnitude()).max() < 0.5
+    monkeypatch.setattr(cameras, "_estimates_by_others", lambda *_: [])
+    assert cameras._find_of_one_group(View(spoiled)) is None
+
+
+def test_a_camera_that_is_too_low_is_named_and_the_others_stay(good_rig: Dataset) -> None:
+    outcome = examine(of_camera(good_rig, lowered(good_rig, 1.0), 1))
+    assert [(finding.fault, finding.of) for finding in outcome.findings] == [("camera_height", "camera 1")]
+    center, right = camera_centers(outcome.fixed.images), camera_centers(good_rig.images)
+    np.testing.assert_allclose(center, right, atol=0.15)
+    others = good_rig.images.camera_id != 1
+    np.testing.assert_allclose(center[others], right[others], atol=1e-9)
+
+
+@pytest.mark.parametrize("camera_id", [0, 1, 2])
+def test_half_sizes_of_one_camera_are_named_and_the_others_stay(camera_id: int, good_rig: Dataset) -> None:
+    mine = (good_rig.images.camera_id == camera_id)[rows_in_images(good_rig)]
+    size_px = np.where(mine[:, None], 0.5, 1.0) * good_rig.detections.size_px
+    finding = _FAULT["boxes_half_size"].find(View(with_detections(good_rig, size_px=size_px)))
+    assert finding is not None
+    assert finding.of == f"camera {camera_id}"
+    assert finding.fix is not None
+    fixed = finding.fix(with_detections(good_rig, size_px=size_px))
+    np.testing.assert_allclose(fixed.detections.size_px, good_rig.detections.size_px)
+
+
+@pytest.mark.parametrize("factor", [0.9, 0.6])
+def test_pictures_of_any_size_are_named_alone(factor: float, good: Dataset) -> None:
+    detections = good.detections
+    spoiled = with_detections(good, center_px=factor * detections.center_px, size_px=factor * detections.size_px)
+    outcome = examine(spoiled)
+    assert [finding.fault for finding in outcome.findings] == ["picture_size"]
+    np.testing.assert_allclose(outcome.fixed.detections.center_px, detections.center_px, rtol=0.02)
+
+
+def test_panoramas_in_which_things_are_all_round_are_not_of_larger_pictures(good: Dataset) -> None:
+    """Bend: narrower panoramas make rays more alike, and so agree better; but nothing would be seen to one side."""
+    cameras_ = good.cameras
+    params = [
+        np.array([width, height], dtype=np.float64)
+        for width, height in zip(cameras_.width_px, cameras_.height_px, strict=True)
+    ]
+    all_round = cameras_.replace(model=Categories.from_texts(["EQUIRECTANGULAR"] * len(cameras_)), params=params)
+    assert [how for how, _ in PictureSize().readings(good) if "9/10" in how]
+    assert not [how for how, _ in PictureSize().readings(replace(good, cameras=all_round)) if "9/10" in how]
+
+
+def test_a_pass_a_third_of_a_second_off_is_named() -> None:
+    given = good_city(11)
+    is_late = given.images.pass_id.codes == given.images.pass_id.code_of("pass-0003")
+    late = np.where(is_late[:, None], moved_along(given, 2.4), camera_centers(given.images))
+    assert _FAULT["pass_time_shift"].find(View(with_centers(given, late))) is not None
 
 
 @pytest.mark.parametrize("is_squeezed", [True, False])

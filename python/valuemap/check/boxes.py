@@ -11,7 +11,21 @@ from typing import ClassVar
 import numpy as np
 from scipy import stats
 
-from valuemap.check.fault import LEAST_CHANCE, Convention, Fault, Finding, Fix, Stage, View, with_detections
+from valuemap.check.agreement import measure_agreement
+from valuemap.check.fault import (
+    GATE_RAD,
+    LEAST_CHANCE,
+    LEAST_RISE,
+    Convention,
+    Fault,
+    Finding,
+    Fix,
+    Stage,
+    View,
+    with_detections,
+)
+from valuemap.check.groups import Group, OfGroup
+from valuemap.check.lenses import focals
 from valuemap.dataset import Dataset, rows_of
 from valuemap.tables import Bools, Floats, Ints
 
@@ -120,8 +134,11 @@ class HalfSizes(Fault):
 
     def find(self, view: View) -> Finding | None:
         """See whether boxes keep half a size from all borders, or objects are half as high as their kind is."""
-        from valuemap.check.sizes import object_heights, plausible_heights
+        from valuemap.check.sizes import half_sized_group, object_heights, plausible_heights
 
+        of_group = half_sized_group(view)
+        if of_group is not None:
+            return _half_of_group(*of_group)
         near, far = _border_ends(view.dataset)
         chance = max(_chance_of_margin(near), _chance_of_margin(far)) if near.within and far.within else 1.0
         chance = min(chance, _chance_of_margin(near + far))
@@ -150,8 +167,25 @@ class HalfSizes(Fault):
             do="Write whole widths and heights, not distances from the centre to the sides.",
             chance=chance if chance < LEAST_CHANCE else LEAST_CHANCE / 10.0,
             figures=figures,
-            fix=lambda dataset: with_detections(dataset, size_px=2.0 * dataset.detections.size_px),
+            fix=_doubled,
         )
+
+
+def _half_of_group(group: Group, name: str, height_m: float, others_m: float, chance: float) -> Finding:
+    return Finding(
+        fault=HalfSizes.name,
+        what=f"Only {group.text}: width and height of the boxes are half of what they should be.",
+        why=f"By its boxes {name} are {height_m:.2g} m high (median), by those of the others {others_m:.2g} m.",
+        do="Write whole widths and heights, not distances from the centre to the sides.",
+        chance=chance,
+        figures={"of": group.text, f"height_m of {name}": round(height_m, 3), "height_m of others": round(others_m, 3)},
+        fix=OfGroup(group, _doubled),
+        of=group.text,
+    )
+
+
+def _doubled(dataset: Dataset) -> Dataset:
+    return with_detections(dataset, size_px=2.0 * dataset.detections.size_px)
 
 
 class PictureSize(Convention):
@@ -163,12 +197,15 @@ class PictureSize(Convention):
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield boxes of pictures enlarged or shrunk, but not so much that they would be outside of theirs."""
+        # In panoramas things are seen all round: there is no border that boxes keep from.
+        is_all_round = not any(focals(dataset.cameras, row) for row in range(len(dataset.cameras)))
         reach = float(np.quantile((dataset.detections.center_px / picture_sizes(dataset)).max(axis=1), _NEARLY_ALL))
         for name, factor in (
             ("4", 4.0), ("3", 3.0), ("2", 2.0), ("1.5", 1.5), ("4/3", 4 / 3), ("5/4", 1.25), ("6/5", 1.2),
+            ("10/9", 10 / 9), ("20/19", 20 / 19), ("19/20", 0.95), ("9/10", 0.9),
             ("5/6", 5 / 6), ("4/5", 0.8), ("3/4", 0.75), ("2/3", 2 / 3), ("1/2", 0.5), ("1/3", 1 / 3), ("1/4", 0.25),
         ):  # fmt: skip
-            if factor < 1.0 or factor * reach <= 1.0:
+            if factor * reach <= 1.0 if factor > 1.0 else reach > 1.0 or not is_all_round:
                 yield f"boxes {name} times as large", _Scaled(factor)
         farthest = float(np.quantile(dataset.detections.center_px.max(axis=1), _NEARLY_ALL))
         for side in _SQUARES_PX:
@@ -179,6 +216,26 @@ class PictureSize(Convention):
                 ("fitted into {0} x {0} px with bars", False),
             ):
                 yield f"boxes of pictures {how.format(side)}", _OfSquare(dataset, side, is_squeezed=is_squeezed)
+
+    def refined(self, view: View, how: str, fix: Fix) -> tuple[str, Fix]:
+        """Look for the size between those that are tried: pictures are scaled by any number."""
+        if not isinstance(fix, _Scaled):
+            return how, fix
+        sample = view.stretches
+
+        def gain(scaled: _Scaled) -> float:
+            gate_px = view.gate_px * scaled.gate_factor
+            return float(measure_agreement(scaled(sample.dataset), sample.place_of_image, gate_px).gain.sum())
+
+        beside = fix.gate_factor * np.exp(np.arange(-_HALF_A_STEP, _HALF_A_STEP, GATE_RAD))
+        best = max((_Scaled(float(factor)) for factor in beside), key=gain)
+        if gain(best) < (1.0 + LEAST_RISE) * gain(fix):
+            return how, fix
+        return f"boxes {best.gate_factor:.3g} times as large", best
+
+
+_HALF_A_STEP = math.log(3.0 / 2.0) / 2.0
+"""Half the widest step between the sizes tried; beside one of them in steps of the gate, at 45 degrees."""
 
 
 class MirroredPictures(Convention):

@@ -31,10 +31,10 @@ from valuemap.check.fault import (
     with_poses,
 )
 from valuemap.check.fit import Estimate, Parameter, estimate
-from valuemap.check.groups import Group, groups_of
+from valuemap.check.groups import Group, OfGroup, groups_of
 from valuemap.check.lenses import Focal, focals, with_params
 from valuemap.check.loose import Correction, Loose
-from valuemap.check.passes import moved_along
+from valuemap.check.passes import find_height_of_pass, moved_along, seen_m
 from valuemap.check.sample import pixels_per_radian
 from valuemap.dataset import Dataset
 from valuemap.tables import Floats
@@ -69,6 +69,14 @@ PARAMETERS = (
     Parameter("log_focal", with_focal, 1e-5),
     Parameter("along", _shift_along, 1e-3, is_length=True, of_drives=True),
 )
+
+
+def _raised(dataset: Dataset, up_m: float) -> Dataset:
+    return with_centers(dataset, camera_centers(dataset.images) + up_m * np.array(dataset.frame.up))
+
+
+_OF_A_MOUNT = (*PARAMETERS[:3], Parameter("up", _raised, 1e-3, is_length=True))
+"""How one camera of several hangs: its own rays do not know how high, but those of the others do."""
 
 
 def common_errors(view: View) -> Estimate | None:
@@ -117,14 +125,18 @@ _OF_A_CAMERA, _OF_A_PASS = frozenset({"pitch", "yaw", "roll", "log_focal"}), fro
 def _find_of_one_group(view: View) -> Correction | None:
     """Return the change of one camera, or of the cameras of one pass, by which rays gain most.
 
-    Its size is estimated from the group's own rays; that it is no accident must show in how they meet all others.
+    Its size is estimated from the group's own rays, or of a camera from how they meet those of the others; that it is
+    no accident must show in how they meet all others.
     """
     groups, compared = groups_of(view.dataset), 0
     given: Floats | None = None
     best: Correction | None = None
     for group in groups:
         alone = group.alone(view)
-        for own in _estimates_of(alone, _OF_A_CAMERA if group.pass_name is None else _OF_A_PASS, len(groups)):
+        told = list(_estimates_of(alone, _OF_A_CAMERA if group.pass_name is None else _OF_A_PASS, len(groups)))
+        if group.pass_name is None:
+            told += _estimates_by_others(view, group, alone, len(groups))
+        for own in told:
             given = gains_of_all(view, view.dataset) if given is None else given
             compared += 1
             correction = replace(own, group=group)
@@ -142,10 +154,9 @@ def _estimates_of(alone: View, told: frozenset[str], groups: int) -> Iterator[Co
     found = common_errors(alone)
     if found is None:
         return
-    freedom = max(found.places - len(found.names), 1)
     for name in found.names:
         value, sigma = found.of(name)
-        chance = 2.0 * float(stats.t.sf(abs(value) / sigma, freedom)) * len(found.names) * groups
+        chance = _chance_of(found, name, groups)
         if name not in told or chance > LEAST_CHANCE:
             continue
         parameter = next(p for p in PARAMETERS if p.name == name)
@@ -162,6 +173,44 @@ def _estimates_of(alone: View, told: frozenset[str], groups: int) -> Iterator[Co
         if name == "log_focal" and _is_wider_gate_only(alone, parameter.change(alone.dataset, own.value)):
             continue
         yield replace(own, chance=chance)
+
+
+def _estimates_by_others(view: View, group: Group, alone: View, groups: int) -> Iterator[Correction]:
+    """Yield the changes of a camera's mount that its rays need to meet those of the others, if a map would show them.
+
+    What one camera sees little of alone, others see as well; and only they tell how high it is.
+    """
+    own = tuple(_of_group(parameter, group) for parameter in _OF_A_MOUNT)
+    first = estimate(view.dataset, view.many_places, view.gate_px, own)
+    if first is None:
+        return
+    # Of a camera that is off by gates few votes are right, and the first rounds see little of it.
+    found = estimate(view.dataset, view.many_places, view.gate_px, own, start=first)
+    assert found is not None
+    given, least_rise = gains_of_all(view, view.dataset), LEAST_RISE * float(gains_of_all(alone, alone.dataset).sum())
+    for parameter, changes in zip(_OF_A_MOUNT, own, strict=True):
+        value, sigma = found.of(parameter.name)
+        chance = _chance_of(found, parameter.name, groups)
+        least = seen_m(view) if parameter.is_length else _LEAST_GATES * GATE_RAD * view.gate_share
+        if chance > LEAST_CHANCE or abs(value) < least:
+            continue
+        rise = compare(gains_of_all(view, changes.change(view.dataset, value)), given)
+        if rise.difference >= least_rise:
+            yield Correction(parameter, value, sigma, chance, rise, found)
+
+
+def _of_group(parameter: Parameter, group: Group) -> Parameter:
+    def change(dataset: Dataset, value: float) -> Dataset:
+        return OfGroup(group, lambda part: parameter.change(part, value))(dataset)
+
+    return replace(parameter, change=change)
+
+
+def _chance_of(found: Estimate, name: str, groups: int) -> float:
+    """Return how likely one of all parameters of all groups is as far from nothing."""
+    value, sigma = found.of(name)
+    freedom = max(found.places - len(found.names), 1)
+    return 2.0 * float(stats.t.sf(abs(value) / sigma, freedom)) * len(found.names) * groups
 
 
 _LEAST_GATES = 2.0
@@ -322,6 +371,27 @@ class FocalLength(_CommonError):
     def shows(self, view: View, name: str, value: float, sigma: float) -> str:
         """Return the factor."""
         return f"The factor is {np.exp(value):.3f} ± {sigma:.3f}"
+
+
+class CameraHeight(_CommonError):
+    """Cameras of a pass, or one of several on a car, that are at another height than their poses say."""
+
+    name: ClassVar[str] = "camera_height"
+    parameters: ClassVar[tuple[str, ...]] = ("up",)
+    completes: ClassVar[frozenset[str]] = frozenset({"camera_height"})
+    do: ClassVar[str] = "Correct the position of the camera on the car."
+
+    def find(self, view: View) -> Finding | None:
+        """Take the offset of the pass that is farthest from good, if it is up or down; else that of a camera."""
+        return find_height_of_pass(view, self.name) or super().find(view)
+
+    def says(self, view: View, name: str, value: float) -> str:
+        """Return what is wrong."""
+        return f"The cameras are {abs(value):.2f} m too {'low' if value > 0 else 'high'}."
+
+    def shows(self, view: View, name: str, value: float, sigma: float) -> str:
+        """Return metres."""
+        return f"The estimate is {value:.2f} ± {sigma:.2f} m"
 
 
 class TimeShift(_CommonError):

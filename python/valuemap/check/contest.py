@@ -165,6 +165,7 @@ class _OfOneGroup(Convention):
         self._convention, self._part, self._group = convention, part, group
         self.name, self.what, self.do = convention.name, convention.what, convention.do  # type: ignore[misc]
         self.is_guess, self.least_times = convention.is_guess, convention.least_times  # type: ignore[misc]
+        self.refined = convention.refined  # type: ignore[method-assign]
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield those."""
@@ -224,25 +225,27 @@ def _judge(view: View, readings: Sequence[_Reading], top: _Reading) -> Finding |
     chosen = next(reading for reading in alike if total[id(reading)] > (1.0 - _TIE) * most)
     assert chosen.convention is not None
     everywhere[id(given)] = _everywhere(view, given)
+    assert chosen.fix is not None
+    how, fix = chosen.convention.refined(view, chosen.how, chosen.fix)
     comparison = _compare_readings(chosen, given, everywhere)
     # What the stretches alone have decided, places that few passes meet do not take back.
     chance = min(_chance(chosen, given, given), _chance(chosen, given, given, everywhere))
     return Finding(
         fault=chosen.convention.name,
         what=chosen.convention.what,
-        why=f"Read as {chosen.how}, {chosen.agreement.share:.0%} of {chosen.agreement.detections} detections meet "
+        why=f"Read as {how}, {chosen.agreement.share:.0%} of {chosen.agreement.detections} detections meet "
         f"others, with an agreement of {chosen.total:.0f}; as given {given.agreement.share:.0%} and {given.total:.0f}, "
         f"by chance {view.chance.share:.0%} and {view.chance.gain.sum():.0f} ({comparison.places} {comparison.of}).",
         do=chosen.convention.do,
         chance=min(chance * chosen.tests, 1.0),
         figures={
-            "reading": chosen.how,
+            "reading": how,
             "agreement_as_given": round(given.total, 1),
             "agreement_if_read_so": round(chosen.total, 1),
             "agreement_by_chance": round(float(view.chance.gain.sum()), 1),
             **comparison.to_json(),
         },
-        fix=chosen.fix,
+        fix=fix,
     )
 
 

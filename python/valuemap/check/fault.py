@@ -210,6 +210,10 @@ class Convention(ABC):
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield (how the data would be read, the dataset read so) for everything to try."""
 
+    def refined(self, view: View, how: str, fix: Fix) -> tuple[str, Fix]:
+        """Return a reading that rays agree with, or one beside it that they agree with better still."""
+        return how, fix
+
 
 def with_images(dataset: Dataset, **changes: Any) -> Dataset:
     """Return a dataset with some columns of its images replaced."""

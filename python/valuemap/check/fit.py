@@ -81,6 +81,8 @@ def estimate(
     A few rounds tell whether there is an error at all. From a `start` that says so it goes on until it stays. Places
     are joined to so many `blocks`, if given, whose scatter standard errors come from.
     """
+    if not len(sample.dataset.detections):
+        return start
     value = np.zeros(len(parameters)) if start is None else start.value
     result = start
     for _ in range(_ROUNDS if start is None else _MOST_ROUNDS):

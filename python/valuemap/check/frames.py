@@ -28,7 +28,7 @@ from valuemap.check.lenses import focals
 from valuemap.check.offsets import find_shift
 from valuemap.check.passes import median_speed_mps
 from valuemap.check.quality import certain_points, flattened, matches
-from valuemap.check.sizes import are_outside, object_heights, plausible_heights
+from valuemap.check.sizes import are_outside, do_groups_agree, object_heights, plausible_heights
 from valuemap.check.turns import rotations_from_degrees
 from valuemap.dataset import Dataset, Frame, rows_of
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
@@ -308,7 +308,7 @@ class Scale(Fault):
             height_m, objects = float(np.median(height_of_each_m)), len(height_of_each_m)
             low, high = plausible_heights(name)
             figures[f"height_m of {name}"] = round(height_m, 4)
-            if are_outside(height_of_each_m, low, high):
+            if are_outside(height_of_each_m, low, high) and do_groups_agree(view, name, low, high):
                 reasons.append(
                     f"{name} are {height_m:.3g} m high (median of {objects} places; {low:g} to {high:g} m is usual)"
                 )

@@ -52,8 +52,6 @@ _SEARCH_STEPS = 8.0
 """How far a pass may be off, in median steps between images."""
 _MOST_PASSES = 60
 _MOST_CANDIDATES = 6
-_SEARCHED = 19
-"""Shifts that are looked at around each candidate."""
 _LEAST_PAIRS = 4
 
 
@@ -200,22 +198,16 @@ class PassTimeShift(Fault):
         )  # fmt: skip
 
 
-class CameraHeight(Fault):
-    """A pass whose camera is at the wrong height."""
-
-    name: ClassVar[str] = "camera_height"
-    stage: ClassVar[Stage] = "fine"
-
-    def find(self, view: View) -> Finding | None:
-        """Take the offset of the pass that is farthest from good, if it is up or down."""
-        shift = worst_pass(view)
-        if shift is None or shift.is_along or not _is_vertical(view, shift.offset_m):
-            return None
-        up_m = float(shift.offset_m @ np.array(view.dataset.frame.up))
-        return _shift_finding(self.name, shift,
-            f"The camera of pass {shift.pass_name} is {abs(up_m):.2f} m too {'low' if up_m > 0 else 'high'}.",
-            "Correct the height of its camera above the ground, or use one datum of heights for all passes.",
-        )  # fmt: skip
+def find_height_of_pass(view: View, fault: str) -> Finding | None:
+    """Take the offset of the pass that is farthest from good, if it is up or down."""
+    shift = worst_pass(view)
+    if shift is None or shift.is_along or not _is_vertical(view, shift.offset_m):
+        return None
+    up_m = float(shift.offset_m @ np.array(view.dataset.frame.up))
+    return _shift_finding(fault, shift,
+        f"The camera of pass {shift.pass_name} is {abs(up_m):.2f} m too {'low' if up_m > 0 else 'high'}.",
+        "Correct the height of its camera above the ground, or use one datum of heights for all passes.",
+    )  # fmt: skip
 
 
 def median_speed_mps(view: View) -> float | None:
@@ -578,7 +570,7 @@ def _worst_pass(view: View) -> PassShift | None:
     return _apart_from_others(view) or _at_a_seam(view)
 
 
-def _seen_m(view: View) -> float:
+def seen_m(view: View) -> float:
     """Return how far poses must be off to be seen at all: the gate of rays at the usual distance of what they show."""
     if not len(view.dataset.detections) or not len(view.agreement.found):
         return 0.0
@@ -591,7 +583,7 @@ def _seen_m(view: View) -> float:
 def _at_a_seam(view: View) -> PassShift | None:
     """Return the shift that closes the largest jump between passes that are one drive: of the shorter of the two."""
     seam = worst_seam(view.dataset, view.center_in_world_m)
-    if seam is None or seam.chance > LEAST_CHANCE or float(np.linalg.norm(seam.jump_m)) < _seen_m(view):
+    if seam is None or seam.chance > LEAST_CHANCE or float(np.linalg.norm(seam.jump_m)) < seen_m(view):
         return None
     images = view.dataset.images
     count = {name: int((images.pass_id.codes == images.pass_id.code_of(name)).sum()) for name in images.pass_id.names}
@@ -619,7 +611,7 @@ def _apart_from_others(view: View) -> PassShift | None:
     point, of_pass, class_code = meeting.point, meeting.pass_of_point, meeting.class_of_point
     within_m = _SEARCH_STEPS * view.step_m
     # Offsets as small as rays can see, if that is less than images are apart.
-    tolerance_m = min(view.step_m / 2.0, _seen_m(view) or view.step_m / 2.0)
+    tolerance_m = min(view.step_m / 2.0, seen_m(view) or view.step_m / 2.0)
     codes, number = np.unique(of_pass, return_counts=True)
     tried = codes[np.argsort(-number, kind="stable")][:_MOST_PASSES]
     candidates: list[tuple[int, int, bool, Floats]] = []
@@ -698,6 +690,7 @@ def _best_shift(
 
         offset = offset_m * [1.0, 0.0, 0.0] if is_along else offset_m.copy()
         gain = gain_of(offset)
+        first = compare(gain, given)
         for reach in (1.0, 0.5, 0.25):
             for axis in (0,) if is_along else (0, 1, 2):
                 for way in (-reach, reach):
@@ -706,8 +699,8 @@ def _best_shift(
                     gain_there = gain_of(other)
                     if gain_there.sum() > gain.sum():
                         offset, gain = other, gain_there
-        comparison = compare(gain, given)
-        chance = min(1.0, comparison.chance * _SEARCHED * len(candidates))
+        # The pairs of points chose where to look; how well rays meet there has not been looked at before.
+        chance = min(1.0, first.chance * len(candidates))
         total, without = float(gain.sum()), float(given.sum())
         if total - without < LEAST_RISE * without:
             continue

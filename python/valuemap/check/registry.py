@@ -10,7 +10,15 @@ from valuemap.check.boxes import (
     PictureSize,
     TopLeftAsCenter,
 )
-from valuemap.check.cameras import CameraTilt, CameraYaw, FocalLength, HalfPixel, TimeShift, WrongCamera
+from valuemap.check.cameras import (
+    CameraHeight,
+    CameraTilt,
+    CameraYaw,
+    FocalLength,
+    HalfPixel,
+    TimeShift,
+    WrongCamera,
+)
 from valuemap.check.distortion import LensModel
 from valuemap.check.fault import Convention, Fault
 from valuemap.check.frames import (
@@ -27,8 +35,8 @@ from valuemap.check.frames import (
     WorldAxes,
 )
 from valuemap.check.lenses import FocalUnit, PrincipalPoint
+from valuemap.check.mounts import CamerasExchanged
 from valuemap.check.passes import (
-    CameraHeight,
     InterleavedPasses,
     NoDrives,
     PassOffset,
@@ -63,6 +71,7 @@ CONVENTIONS: tuple[Convention, ...] = (
     PictureSize(),
     MirroredPictures(),
     ShiftedDetections(),
+    CamerasExchanged(),
     FocalUnit(),
     PrincipalPoint(),
     HeldPositions(),

@@ -8,7 +8,8 @@ import numpy as np
 from scipy import stats
 
 import valuemap._core as _core
-from valuemap.check.fault import GATE_RAD, View
+from valuemap.check.fault import GATE_RAD, LEAST_CHANCE, View
+from valuemap.check.groups import Group, groups_of
 from valuemap.tables import Floats
 
 _LEAST_VOTES = 5
@@ -55,12 +56,63 @@ _OUTSIDE = 0.01
 """The limits have room of their own: the usual height is a factor of two from either."""
 
 
-def object_heights(view: View) -> dict[str, Floats]:
-    """Return, for each class, the heights in metres of the points where rays meet.
+def object_heights(view: View, group: Group | None = None, *, is_without: bool = False) -> dict[str, Floats]:
+    """Return, for each class, the heights in metres of the points where rays meet, by the boxes of a group or without.
 
     Classes whose detections are points without a size are left out, and points whose rays are too near each other to
     tell how far they are.
     """
+    heights = {name: _medians(of_votes) for name, of_votes in _heights_of_votes(view, group, is_without).items()}
+    return {name: values for name, values in heights.items() if len(values)}
+
+
+def heights_of_groups(view: View) -> dict[Group, dict[str, Floats]]:
+    """Return the heights of objects by camera and by pass, where there are several."""
+    return {group: object_heights(view, group) for group in groups_of(view.dataset)}
+
+
+def do_groups_agree(view: View, name: str, low_m: float, high_m: float) -> bool:
+    """Return whether no camera and no pass sees the objects of a class within limits, by more than they scatter.
+
+    All share one world: what some of them see in its right size is no other unit, but a mistake of the others.
+    """
+    of_groups = [heights[name] for heights in heights_of_groups(view).values() if name in heights]
+    return not any(_are_within(height_m, low_m, high_m) for height_m in of_groups)
+
+
+def _are_within(height_m: Floats, low_m: float, high_m: float) -> bool:
+    """Return whether heights (N) are, in the middle, within limits by more than they scatter, in logarithms."""
+    if len(height_m) < _LEAST_OBJECTS:
+        return False
+    logarithm = np.log(height_m)
+    inside = min(float(logarithm.mean()) - math.log(low_m), math.log(high_m) - float(logarithm.mean()))
+    error = float(logarithm.std(ddof=1)) / math.sqrt(len(height_m))
+    return inside > error * float(stats.t.isf(_OUTSIDE, len(height_m) - 1))
+
+
+def half_sized_group(view: View) -> tuple[Group, str, float, float, float] | None:
+    """Return the camera or pass by whose boxes things are half as high as by all others', if one is.
+
+    With it the class, both heights in metres, and the chance: that in logarithms they are nearer to equal than to a
+    half (Welch's t). None where no group is.
+    """
+    of_groups = heights_of_groups(view)
+    found: list[tuple[Group, str, float, float, float]] = []
+    for group, heights in of_groups.items():
+        others = object_heights(view, group, is_without=True)
+        for name in heights.keys() & others.keys():
+            own, rest = np.log(heights[name]), np.log(others[name])
+            if min(len(own), len(rest)) < _LEAST_OBJECTS:
+                continue
+            test = stats.ttest_ind(own + math.log(2.0) / 2.0, rest, equal_var=False, alternative="less")
+            chance, ratio = float(test.pvalue) * len(of_groups) * len(heights), float(own.mean() - rest.mean())
+            if chance < LEAST_CHANCE and ratio > -1.5 * math.log(2.0):
+                found.append((group, name, math.exp(np.median(own)), math.exp(np.median(rest)), chance))
+    return min(found, key=lambda each: each[4], default=None)
+
+
+def _heights_of_votes(view: View, group: Group | None, is_without: bool) -> dict[str, list[Floats]]:
+    """Return, for each class and point, the heights in metres by the votes of a group (None: all), or by all others."""
     agreement = view.agreement
     found = agreement.found
     votes = np.diff(found.voter_offsets)
@@ -73,7 +125,11 @@ def object_heights(view: View) -> dict[str, Floats]:
     height_m = detections.size_px[found.voters.astype(np.int64), 1] * metres_per_px[:, 1]
     median = _core.medians(height_m.copy(), found.voter_offsets)
     class_code = detections.class_name.codes[found.voters[found.voter_offsets[:-1]].astype(np.int64)]
-    result: dict[str, Floats] = {}
+    row = agreement.rays.image_row[found.voters.astype(np.int64)]
+    is_told = np.ones(len(row), np.bool_)
+    if group is not None:
+        is_told = group.images_of(view.stretches.dataset)[row] != is_without
+    result: dict[str, list[Floats]] = {}
     for code, name in enumerate(detections.class_name.names):
         of_class = (class_code == code) & (votes >= _LEAST_VOTES)
         # Chance makes points of few votes; what most votes are for is what is there.
@@ -81,5 +137,10 @@ def object_heights(view: View) -> dict[str, Floats]:
         of_class &= median > 0.0  # Key points have no size.
         of_class &= parallax_rad > _LEAST_GATES * GATE_RAD * view.gate_share
         if np.any(of_class):
-            result[name] = median[of_class]
+            spans = zip(found.voter_offsets[:-1][of_class], found.voter_offsets[1:][of_class], strict=True)
+            result[name] = [height_m[first:last][is_told[first:last]] for first, last in spans]
     return result
+
+
+def _medians(of_votes: list[Floats]) -> Floats:
+    return np.array([np.median(values) for values in of_votes if len(values)])
