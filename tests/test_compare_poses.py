@@ -14,6 +14,8 @@ from valuemap.dataset import Dataset
 from valuemap.progress import silent
 from valuemap.refine import Refined
 from valuemap.simulate import simulate
+from valuemap.tables import Ints
+from valuemap.tiles import compare
 from valuemap.tiles.compare import Comparison, compare_poses
 
 
@@ -67,6 +69,19 @@ def test_a_correction_that_is_not_worth_its_parameters_is_not_taken(
     assert valuemap.build_map(wrong).corrected is not None
     right.record["parameters"] = 10**6
     assert valuemap.build_map(wrong).corrected is None
+
+
+def test_a_sample_pays_its_share_of_the_price(city: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fleet has hundreds of parameters, estimated from ten times the detections that are compared."""
+
+    def of_a_tenth(scenes: object, second_of_first: Ints, *_: object, **__: object) -> tuple[tuple[float, float], int]:
+        return (100.0, 90.0), len(second_of_first) // 10
+
+    monkeypatch.setattr(compare, "misfits", of_a_tenth)
+    found, all_of_it = compared(city, city, parameters=10), len(city.detections)
+    assert found.detections <= 0.1 * all_of_it
+    assert found.price == pytest.approx(10 * np.log(2 * all_of_it) * found.detections / all_of_it)
+    assert found.price < 0.1 * 10 * np.log(2 * all_of_it) + 1e-9
 
 
 def test_a_correction_that_fits_worse_is_not_taken(city: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,7 +22,8 @@ class Comparison:
     """Minus twice the log likelihood of the same detections with poses before and after, up to one constant.
 
     Each has the noise that is likeliest for it. `price` is that of the parameters by which poses differ, by the
-    Bayesian information criterion (Schwarz 1978), where each detection has two coordinates.
+    Bayesian information criterion (Schwarz 1978), where each detection has two coordinates. A sample pays its share, since
+    the parameters were estimated from all detections, and explain all of them.
     """
 
     before: float
@@ -56,7 +57,8 @@ def compare_poses(
     second_of_first = order[np.searchsorted(new.detection_id, old.detection_id, sorter=order)]
     with counted(progress, "comparing poses", MISFIT_STEPS) as tell:
         (of_old, of_new), rays = misfits((first, second), second_of_first, config, threads=threads, tell=tell)
-    return Comparison(of_old, of_new, parameters * math.log(2 * rays), rays)
+    price = parameters * math.log(2 * len(before.detections)) * rays / len(before.detections)
+    return Comparison(of_old, of_new, price, rays)
 
 
 def _same_images(dataset: Dataset, like: InOrder, config: MapConfig) -> InOrder:
