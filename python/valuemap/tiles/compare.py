@@ -22,8 +22,8 @@ class Comparison:
     """Minus twice the log likelihood of the same detections with poses before and after, up to one constant.
 
     Each has the noise that is likeliest for it. `price` is that of the parameters by which poses differ, by the
-    Bayesian information criterion (Schwarz 1978), where each detection has two coordinates. A sample pays its share, since
-    the parameters were estimated from all detections, and explain all of them.
+    Bayesian information criterion (Schwarz 1978), where each detection has two coordinates. A sample pays its share,
+    since the parameters were estimated from all detections, and explain all of them.
     """
 
     before: float
