@@ -1,6 +1,6 @@
 //! Confusions: the classes that a detector reports for objects of a class, learned from the map.
 //!
-//! They are share_c(class) of equation (4) of `docs/method.md`. A detector gives an object one box. Boxes of another class belong
+//! They are `share_c(class)` of equation (4) of `docs/method.md`. A detector gives an object one box. Boxes of another class belong
 //! to an object if they lie in its gate more often in images without a vote of its own class than in images with one. What stands
 //! beside the object is there in both.
 

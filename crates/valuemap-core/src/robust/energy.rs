@@ -1,19 +1,19 @@
 //! J: minus twice the logarithm of how much more probable a map is than that all detections are clutter.
 //!
-//! J is a sum over objects, see `docs/method.md`. For one of class c with n votes in visits v:
+//! J is a sum over objects. The symbols are those of `docs/method.md`; for an object of class c with n votes i in visits v:
 //!
 //! ```text
-//! J = sum_v [ r' C^-1 r + ln|C| ] + 2 n ln 2 pi       (1) residuals; C: detections, poses of images, drift of the pass, marginalised
+//! J = sum_v [ r' C^-1 r + ln|C| ] + 2 n ln 2 pi       (1) residuals, pose errors marginalised
 //!   + ln|information| - 3 ln 2 pi - 2 ln births_c     (2) the position, marginalised, and the price of a birth
 //!   + 2 sum_i ln clutter_c                            (3) what the votes are otherwise
-//!   - 2 sum_i [ ln ratio(size_i) + ln share(class_i) ]
-//!                                                     (4) boxes of one object have one physical size, and what a class is taken for
-//!   - 2 ln [ (1 - phi) real_c(hits; looks) + phi false_c(hits; looks) ] + 2 sum_w ln binomial(images_w, hits_w)
-//!                                                     (5) who should have seen it, and did not, by side, pass and viewpoint w
+//!   - 2 sum_i [ ln ratio(size_i) + ln ratio(range_i) + ln ratio(score_i) + ln share_c(class_i) ]
+//!   - 2 ln prior_c(size)                              (4) what a detection says beyond its centre
+//!   - 2 ln [ real(looks) + false(looks) ] + 2 sum_w ln binomial(images_w, hits_w)
+//!                                                     (5) the looks, by side, pass and viewpoint w
 //! ```
 //!
-//! The second term of (5) is that of a false thing: parked, reflected, or mistaken for an object at times. Its detections meet as
-//! those of an object do, but on one pass alone or in fewer of the looks (see [`super::seen`]).
+//! In (5) `false` is a false thing: parked, reflected, or regularly mistaken for an object. Its detections meet as those of an object do, but on one pass
+//! alone or in fewer of the looks (see [`super::seen`]).
 
 use std::f64::consts::PI;
 

@@ -2,7 +2,7 @@
 //!
 //! They are a mixture of up to three normal distributions, since lights hang on masts and stand on poles, and a share of objects
 //! that are anywhere. The mixture is learned from objects that many images fix, with as many parts as the Bayesian information
-//! criterion (Schwarz, 1978) asks for. Its density is a factor of births_c in equation (2) of `docs/method.md`.
+//! criterion (Schwarz, 1978) asks for. Its density is a factor of `births_c` in equation (2) of `docs/method.md`.
 
 use std::f64::consts::PI;
 

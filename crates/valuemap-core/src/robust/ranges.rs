@@ -1,4 +1,4 @@
-//! Measured ranges: ratio(range_i) of equation (4) of `docs/method.md`, and an observation of the position.
+//! Measured ranges: `ratio(range_i)` of equation (4) of `docs/method.md`, and an observation of the position.
 //!
 //! With the logarithms d of the distance of the object and r of the measured range, `d - r` is an error of standard deviation
 //! `share`, that of the range relative to the range. Ranges of clutter are distributed as those of all detections. Networks that
