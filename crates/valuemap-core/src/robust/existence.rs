@@ -172,10 +172,15 @@ mod tests {
     use super::*;
     use crate::street::{NOISE, SETTINGS, street};
 
-    /// Objects of which two in three exist; scores of these are higher, and others are near them.
+    /// Two in three are real.
+    fn is_real(i: usize) -> bool {
+        !i.is_multiple_of(3)
+    }
+
+    /// Objects of which two in three are real; scores of these are higher, and others are near them.
     fn told(count: usize, real: f64) -> Vec<Told> {
         let one = |i: usize| {
-            let (is_real, at_random) = (i % 3 > 0, (i * 7 % 100) as f64 / 100.0);
+            let (is_real, at_random) = (is_real(i), (i * 7 % 100) as f64 / 100.0);
             let score = if is_real { 0.5 + 0.5 * at_random } else { 0.8 * at_random };
             let nearness = if is_real { -20.0 * at_random } else { -60.0 * ((i * 11 % 100) as f64 / 100.0) };
             Told { there: 1.0, real, score, nearness }
@@ -187,10 +192,10 @@ mod tests {
     fn scores_and_company_tell_which_are_real_and_not_how_many() {
         // Looks know a little of which are.
         let mut all = told(900, 0.7);
-        all.iter_mut().enumerate().for_each(|(i, one)| one.real += if i % 3 > 0 { 0.05 } else { -0.05 });
+        all.iter_mut().enumerate().for_each(|(i, one)| one.real += if is_real(i) { 0.05 } else { -0.05 });
         let existing = Existing::learn(&all);
-        let sum = |is_real: bool, real: fn(&Existing, &Told) -> f64| -> f64 {
-            let of = all.iter().enumerate().filter(|(i, _)| (i % 3 > 0) == is_real);
+        let sum = |real_ones: bool, real: fn(&Existing, &Told) -> f64| -> f64 {
+            let of = all.iter().enumerate().filter(|(i, _)| is_real(*i) == real_ones);
             of.map(|(_, one)| real(&existing, one)).sum()
         };
         let by_looks = sum(true, |_, one| one.real) + sum(false, |_, one| one.real);
@@ -219,7 +224,7 @@ mod tests {
         let scores: Vec<f64> = told(scene.score.len(), 0.7).iter().map(|told| told.score).collect();
         scene.score.clone_from(&scores);
         let with_real = |ray: usize| {
-            let real = if ray % 3 > 0 { 0.75 } else { 0.65 };
+            let real = if is_real(ray) { 0.75 } else { 0.65 };
             Object { votes: vec![ray as u32], real, ..anywhere(1, Seen::default(), -20.0) }
         };
         let few: Vec<Object> = (0..scores.len()).map(with_real).collect();
@@ -228,8 +233,8 @@ mod tests {
             learn_existence(&mut model, &[], &few);
             existences(&model, &[], &few)
         };
-        let mean = |existence: &[f64], is_real: bool| {
-            let of: Vec<f64> = (0..few.len()).filter(|i| (i % 3 > 0) == is_real).map(|i| existence[i]).collect();
+        let mean = |existence: &[f64], real_ones: bool| {
+            let of: Vec<f64> = (0..few.len()).filter(|i| is_real(*i) == real_ones).map(|i| existence[i]).collect();
             of.iter().sum::<f64>() / of.len() as f64
         };
         let found = existence(&SETTINGS);
