@@ -1,7 +1,7 @@
-//! What tells votes from clutter in one picture alone: the score of a detection, and how high it is in the picture.
+//! The score of a detection and its elevation in the picture: what they say of votes against clutter.
 //!
-//! Both are learned from the map: the scores of votes against those of detections of no object, monotone (isotonic regression); the elevations of
-//! the latter against all that cameras look at.
+//! Both are densities by bins, learned from the map. The ratio of scores is monotone (isotonic regression, pool adjacent violators); elevations of clutter
+//! are compared with all that the cameras look at, and are told apart no better than they are measured.
 
 /// Values are sorted into so many bins of about as many detections each.
 pub const BINS: usize = 12;

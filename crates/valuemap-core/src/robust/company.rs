@@ -1,7 +1,7 @@
-//! The company that objects keep: lights, signs and ramps stand together at crossings, so that where one is for sure another one is more probable.
+//! How near the next sure object of the class is: equation (7) of `docs/method.md`.
 //!
-//! The density of objects on the ground is a function of the distance to the nearest other one, learned from the map itself: how often sure objects
-//! have another one so near, over how often any seen place has.
+//! Lights, signs and ramps stand together at crossings. The ratio is learned from the map: how often a sure object has another one within a distance, over
+//! how often any seen place has one.
 
 use nalgebra::Vector3;
 use rstar::RTree;

@@ -1,8 +1,8 @@
-//! How many objects of few votes there can be, by how many there are of more.
+//! How many objects of few votes there can be, by how many there are of more: equation (8) of `docs/method.md`.
 //!
-//! Where objects have ten votes each, hardly any has one. The numbers of objects with 1, 2, 3, ... votes are taken to be log-concave, as those of a
-//! Poisson distribution are and of most mixtures of it: `N1 N3 <= N2²` and `N2 N4 <= N3²`; where too few have three or four votes to tell, they are
-//! those of the negative binomial distribution that makes the others likeliest. What the energies of objects of few votes add up to is brought down to that.
+//! The numbers N1, N2, N3, ... of objects with 1, 2, 3, ... votes are taken to be log-concave, as those of a Poisson distribution and of most mixtures of
+//! it: `N1 N3 <= N2²` and `N2 N4 <= N3²`. Where too few have three or four votes to tell, they are those of the likeliest negative binomial
+//! distribution. The odds of objects of few votes are lowered until their expected number is within these bounds.
 
 use super::energy::Object;
 use super::model::{Model, ln_gamma, mean_and_sd};

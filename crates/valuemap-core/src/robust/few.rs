@@ -1,8 +1,8 @@
-//! Objects of few looks: one or two detections, and what is known of all objects of their class.
+//! Objects of one or two votes, which their rays alone do not fix: equations (6) to (8) of `docs/method.md`.
 //!
-//! A ray that no object has is an object's if one stands on it where its class stands: as high, as large, as far. Its position is that of a ray with
-//! heights and sizes as observations, so its covariance is large and honest. Against it counts what is true of every object, equations (1) to (5),
-//! and that clutter is where detectors look for objects: its density is that of the elevations at which it is found.
+//! An unassigned ray is explained by an object where objects of its class stand: at their height, of their size, as far away as they are detected or as
+//! was measured. Its covariance is that of the ray, with heights and sizes as observations. The energy is that of every object, and three terms more: the
+//! density of clutter at the elevation of the ray, how near sure objects are, and how many objects of so few votes there can be.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;

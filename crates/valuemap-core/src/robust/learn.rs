@@ -1,4 +1,6 @@
-//! What a map tells about each class: how often its objects are detected, how large they are, how much clutter there is.
+//! What a map tells about each class: detection rates, sizes, heights, distances, birth density, clutter and scores.
+//!
+//! Robust moments over sure objects, and expectation maximisation for the rates. Classes of too few sure objects are taken to be like all together.
 
 use rayon::prelude::*;
 

@@ -1,10 +1,9 @@
-//! Which images should have seen an object: its looks.
+//! The looks at an object: the viewpoints that should see it.
 //!
-//! A look is a viewpoint of a pass with an image that has the point in its picture, from a direction from which the object was voted for and
-//! a distance from which its class is detected. It is as much of a hit as the share of its images that have a vote; which of them have it has a
-//! price of its own, or of one object that a car sees while it stands two would be made, with the votes of each on its side of the middle. One from
-//! where fewer are detected is as much less of a look. Where another detection lies in the point's gate, the object may be hidden behind that one, or be one with it in the picture:
-//! half a look.
+//! A look is a viewpoint of a pass that has the point in its picture, from a side from which the object was voted for, at a distance from which its class
+//! is detected; it counts less where fewer are detected, and half where another detection in the gate may hide the object. It is as much of a hit as the
+//! share of its images that have a vote. Which of the images have one is one of equally probable choices, the last term of equation (5) of
+//! `docs/method.md`: without this price a standing car would see two objects in turn.
 
 use nalgebra::Vector3;
 use rstar::RTree;

@@ -1,13 +1,13 @@
 //! The robust method: one energy J, and a search for the map with the least.
 //!
 //! 1. [`scene`], [`noise`], [`model`]: what was seen, its errors, and what is learned about each class.
-//! 2. [`propose`](mod@propose): each ray meets few partners ([`sample`]) and proposes the point that a sample of images supports best.
-//! 3. [`births`](mod@births): the best supported hypothesis takes its votes, and is born if J ([`energy`]) falls.
-//! 4. [`assign`](mod@assign): all objects compete for all detections.
+//! 2. [`likeliest`], [`calibrate`], [`split`](mod@split): the noise, by restricted maximum likelihood. [`learn`](mod@learn), [`confusion`]: the classes.
+//! 3. [`propose`](mod@propose): each ray meets few partners ([`sample`]) and proposes the point that a sample of images supports best.
+//!    [`initial`]: the map that the search begins with.
+//! 4. [`search`](mod@search): moves that are committed only if J ([`energy`]) falls. [`assign`](mod@assign): all detections of an image.
+//!    [`rearrange`]: merges and exchanges of two objects. [`repair`](mod@repair): neighbourhoods. [`births`](mod@births), [`regrow`](mod@regrow): births.
 //! 5. [`finish`](mod@finish): positions and covariances, objects of a place together ([`estimate`](mod@estimate), [`drift`], [`contest`]).
-//!    [`few`]: what one or two looks make. [`existence`]: which objects exist. [`switches`]: what the pictures show to be another object is left out.
-//! 6. [`likeliest`], [`calibrate`]: the noise itself is estimated from the residuals; [`learn`](mod@learn): rates, sizes and clutter are;
-//!    [`confusion`]: what classes are taken for; [`split`](mod@split): what of the noise is the poses' and what the detections'.
+//! 6. [`few`]: objects of one or two votes. [`existence`]: which objects exist. [`switches`]: identity switches are left out.
 
 pub mod assign;
 pub mod births;

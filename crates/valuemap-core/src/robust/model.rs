@@ -1,7 +1,7 @@
 //! What the terms of J are made of: the scene, its noise, and what is learned about each class.
 //!
-//! All rates are densities, so that nothing here has a scale: clutter in detections per image and steradian, births in
-//! objects per cubic metre of the space that votes span.
+//! All rates are densities, so that nothing here has a scale: clutter in detections per image and steradian, births in objects per cubic metre, or per
+//! square metre of ground where heights are known.
 
 use std::f64::consts::PI;
 use std::sync::Arc;

@@ -1,4 +1,4 @@
-//! The parts of the method that can be left out, one by one: what a part is worth is what fails without it.
+//! The parts of the method, each of which can be left out in tests and ablations: a part that no scene misses does not belong here.
 
 /// A move of the search, a term of J, or what is done once before or after the search.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

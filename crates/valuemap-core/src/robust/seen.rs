@@ -1,8 +1,8 @@
-//! How probable the looks at an object are: if it is real, and if it is false.
+//! The likelihood of the looks at an object, if it is real and if it is false: equation (5) of `docs/method.md`.
 //!
-//! A real object is seen in a share of the looks from each side that differs from side to side and, around that, from pass to pass; on an odd
-//! pass in any share. From some sides it is seen less. What is false is there on one pass alone, any of them, or seen less than a
-//! real one from everywhere: the side with most hits tells.
+//! The hit rate of a real object differs from side to side (logit-normal) and, around that, from pass to pass (beta-binomial); an odd pass may have any
+//! rate. A false thing is there on one pass alone, or is seen less than a real object from everywhere. Only the side with most hits decides, since from
+//! other sides a real object may be seen less as well.
 
 use std::cmp::Ordering;
 use std::f64::consts::LN_2;

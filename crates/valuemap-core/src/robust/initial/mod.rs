@@ -1,4 +1,8 @@
-//! The map that the search begins with: found fast, by rules of thumb.
+//! The initial map: where the search begins, found fast by rules and not by J.
+//!
+//! Labels are gathered from proposals ([`gather`]), compete for detections ([`associate`], [`assignment`]), are estimated together by place ([`adjust`]),
+//! exchange votes with neighbours ([`exchange`], [`swap`]), merge and split ([`settle`], [`rivals`]), and are dropped where the looks speak against them
+//! ([`existence`]). In large scenes keyframes go first.
 
 pub mod adjust;
 pub mod assignment;
