@@ -90,14 +90,21 @@ def prepare(config: SimulationConfig, seed: int) -> Case:
 
 def measure(case: Case, config: valuemap.MapConfig, *, min_detections: int = 3) -> Outcome:
     """Map a city and compare with the truth: objects count that are recoverable and have so many detections."""
+    start = time.perf_counter()
+    result = valuemap.build_map(case.recording.dataset, config)
+    return compare(case, result, time.perf_counter() - start, min_detections=min_detections)
+
+
+def compare(
+    case: Case, result: valuemap.Map, seconds: float, *, min_detections: int = 3, max_bound_m: float = np.inf
+) -> Outcome:
+    """Compare a map that took so long with the truth: as `measure`, and objects count whose bound is no larger."""
     dataset = case.recording.dataset
     assert dataset.truth is not None
-    start = time.perf_counter()
-    result = valuemap.build_map(dataset, config)
-    seconds = time.perf_counter() - start
     evaluation = valuemap.evaluate_map(result, dataset)
     matches, labels = evaluation.matches, result.labels
     counts = matches.objects.counts_in_recall & (case.detections >= min_detections)
+    counts &= np.trace(case.bound_m2, axis1=1, axis2=2) <= max_bound_m**2
 
     is_real = matches.object_of_label >= 0
     objects = matches.object_of_label[is_real]

@@ -3,6 +3,6 @@
 from valuemap.simulate.city import build_city
 from valuemap.simulate.districts import simulate_districts
 from valuemap.simulate.presets import PRESETS
-from valuemap.simulate.simulation import Recording, record_city, simulate
+from valuemap.simulate.simulation import Recording, record_city, record_drives, simulate
 
-__all__ = ["PRESETS", "Recording", "build_city", "record_city", "simulate", "simulate_districts"]
+__all__ = ["PRESETS", "Recording", "build_city", "record_city", "record_drives", "simulate", "simulate_districts"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -35,6 +36,22 @@ class Sightings(Table):
     center_px: Floats
     size_px: Floats
     is_cut: Bools
+
+
+class Look(Protocol):
+    """How a kind of camera sees targets: `see` with a pinhole."""
+
+    def __call__(
+        self,
+        targets: Targets,
+        frames: Frames,
+        streets: Streets,
+        config: SimulationConfig,
+        *,
+        progress: Progress,
+        what: str,
+    ) -> Sightings:
+        """Return all views of targets."""
 
 
 def see(

@@ -19,7 +19,7 @@ from valuemap.simulate.drives import KEEP_RANGE, Frames, drive, mount_cameras
 from valuemap.simulate.false_objects import clutter, place_temporary, reflect
 from valuemap.simulate.pose_errors import pose_errors
 from valuemap.simulate.rows import join_rows
-from valuemap.simulate.sightings import Sightings, see
+from valuemap.simulate.sightings import Look, Sightings, see
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.targets import CLASSES, classes_in
 from valuemap.tables import Bools, Cameras, Categories, Detections, Floats, Images, Ints, Truth, TruthDetections
@@ -88,10 +88,41 @@ def record_city(
         )
     city = build_city(config, seed=seed)
     exposures = drive(city, config, seed=seed, progress=progress)
+    return record_drives(city, exposures, config, seed=seed, name=name, progress=progress)
+
+
+def record_drives(
+    city: City,
+    exposures: Frames,
+    config: SimulationConfig,
+    *,
+    seed: int,
+    name: str = "simulated",
+    progress: Progress = silent,
+    look: Look = see,
+) -> Recording:
+    """Record drives through a city, both of which may come from elsewhere, such as from a real map.
+
+    Parameters
+    ----------
+    city
+        What stands there. Of its streets only the hills and the houses that hide things are used.
+    exposures
+        The true exposures of cameras that look ahead.
+    config, seed, name, progress
+        As of `record_city`; what they say of the city and of its drives is not used.
+    look
+        What a camera sees. The dataset's cameras are pinholes: with another `look` they have to be exchanged.
+
+    Raises
+    ------
+    SettingError
+        A number of detections that the other settings cannot give, or no detection.
+    """
     errors = pose_errors(exposures, config, seed=seed)
     frames = mount_cameras(exposures, config)
-    sightings = see(city.lights, frames, city.streets, config, progress=progress, what="seeing lights")
-    boxes = _detect_everything(city, sightings, frames, config, seed=seed, progress=progress)
+    sightings = look(city.lights, frames, city.streets, config, progress=progress, what="seeing lights")
+    boxes = _detect_everything(city, sightings, frames, config, look, seed=seed, progress=progress)
     is_hidden = hidden_by_traffic(sightings, frames, config, seed=seed, kind="lights")
     kept = _kept_frames(frames, boxes, config)
     if config.shuffle_ids:
@@ -156,7 +187,14 @@ def _dataset(
 
 
 def _detect_everything(
-    city: City, of_lights: Sightings, frames: Frames, config: SimulationConfig, *, seed: int, progress: Progress
+    city: City,
+    of_lights: Sightings,
+    frames: Frames,
+    config: SimulationConfig,
+    look: Look,
+    *,
+    seed: int,
+    progress: Progress,
 ) -> Boxes:
     """Return all boxes, by frame and in it from left to right, so that their order tells nothing."""
     recall = recall_of_passes(int(frames.pass_row[-1]) + 1, config, seed=seed)
@@ -173,7 +211,7 @@ def _detect_everything(
     for kind, targets in kinds.items():
         if len(targets) == 0:
             continue
-        seen = see(targets, frames, city.streets, config, progress=progress, what=f"seeing {kind}")
+        seen = look(targets, frames, city.streets, config, progress=progress, what=f"seeing {kind}")
         parts.append(detect(seen, targets, frames, recall, config, seed=seed, kind=kind))
     boxes = join_rows(parts)
     return boxes.take(np.lexsort((boxes.center_px[:, 1], boxes.center_px[:, 0], boxes.frame_row)))
