@@ -170,7 +170,7 @@ CASES: dict[str, tuple[str, int, Fails]] = {
     "scores": ("poor detector", 5, more_is_wrong),
     "elevations": (FEW_PICTURES, 11, more_is_wrong),
     "reach": ("drifts", 5, what_is_there_is_believed_less),
-    "company": (FEW_PICTURES, 11, more_is_wrong),
+    "company": (FEW_PICTURES, 5, more_is_wrong),
     "looks": ("lights", 5, more_is_wrong),
     "turns": ("standing", 7, more_is_wrong),
     "confusions": ("confused classes", 5, more_is_wrong),
