@@ -164,7 +164,7 @@ def san_francisco(data_dir: Path, config: SimulationConfig, tours: float, *, see
     corner_m = np.array(lanes[0]["curve"][0][:2])
     position_m = boundary.mean(axis=1)[:, :2] - corner_m
     across = boundary[:, 0, :2] - boundary[:, 1, :2]
-    # Seen from before it, the first corner of a signal is on the right of the second.
+    # Seen from before it, the first corner of a signal is on the left of the second.
     facing_rad = np.arctan2(across[:, 0], -across[:, 1])
     lights = lights_at(
         np.column_stack([position_m, np.full(len(position_m), LIGHT_ABOVE_M)]),

@@ -65,9 +65,9 @@ def drives(tours: float) -> Layout:
     return Layout(lambda root, seed: san_francisco(root / "apollo_san_francisco", config, tours, seed=seed), False)
 
 
-def panoramas(year: int, position_sigma_m: float, second_head_share: float = 0.0) -> Layout:
-    """Return panoramas of Dublin."""
-    config = dataclasses.replace(
+def panorama_config(position_sigma_m: float) -> SimulationConfig:
+    """Return how panoramas with such errors of positions are detected in: the picture is the band round the horizon."""
+    return dataclasses.replace(
         SimulationConfig(),
         image_width_px=PANORAMA_SIZE_PX[0],
         image_height_px=BAND_HEIGHT_PX,
@@ -85,6 +85,11 @@ def panoramas(year: int, position_sigma_m: float, second_head_share: float = 0.0
         write_timestamps=0,
         shuffle_names=1,
     )
+
+
+def panoramas(year: int, position_sigma_m: float, second_head_share: float = 0.0) -> Layout:
+    """Return panoramas of Dublin."""
+    config = panorama_config(position_sigma_m)
     return Layout(lambda root, seed: dublin(root / "dublin_tl", config, year, second_head_share, seed=seed), True)
 
 
