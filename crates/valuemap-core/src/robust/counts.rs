@@ -11,8 +11,8 @@ use super::model::{Model, ln_gamma, mean_and_sd};
 const ENOUGH: f64 = 10.0;
 /// Rounds of bisection: odds are right to a millionth.
 const ROUNDS: usize = 60;
-/// No odds are brought down by more than this factor, in logarithms.
-const MOST: f64 = 50.0;
+/// No odds are changed by more than this factor, in logarithms.
+pub(super) const MOST: f64 = 50.0;
 /// The largest k: a Poisson distribution, for all that is known.
 const LEAST_DISPERSION: f64 = 1e3;
 /// Votes of an object, on average, are no fewer: objects that nobody sees are not counted.
@@ -50,10 +50,10 @@ pub fn ln_odds_of_few(objects: &[&Object], few: &[&Object]) -> [f64; FEW] {
     };
     let most = few.iter().map(|object| object.votes.len()).max().unwrap_or(0);
     let more = |ln_odds: f64| (LEAST_VOTES..=most).map(|votes| expected(votes, ln_odds)).sum::<f64>();
-    let of_more = at_most((LEAST_VOTES..=MOST_VOTES).map(usual).sum(), more);
+    let of_more = at_most((LEAST_VOTES..=MOST_VOTES).map(usual).sum(), 0.0, more);
     let (three, four) = (count(3), count(4));
-    let of_two = at_most(bound(three, four, 2), |ln_odds| expected(2, ln_odds));
-    let of_one = at_most(bound(expected(2, of_two), three, 1), |ln_odds| expected(1, ln_odds));
+    let of_two = at_most(bound(three, four, 2), 0.0, |ln_odds| expected(2, ln_odds));
+    let of_one = at_most(bound(expected(2, of_two), three, 1), 0.0, |ln_odds| expected(1, ln_odds));
     [of_one, of_two, of_more]
 }
 
@@ -137,12 +137,12 @@ fn of_class(objects: &[Object], class: u32) -> Vec<&Object> {
     objects.iter().filter(|object| object.class == class).collect()
 }
 
-/// The largest number not above 0 with which an ascending function is not above a bound.
-fn at_most(bound: f64, value: impl Fn(f64) -> f64) -> f64 {
-    if value(0.0) <= bound {
-        return 0.0;
+/// The largest number not above `most`, nor more than [`MOST`] below 0, with which an ascending function is not above a bound.
+pub(super) fn at_most(bound: f64, most: f64, value: impl Fn(f64) -> f64) -> f64 {
+    if value(most) <= bound {
+        return most;
     }
-    let (mut low, mut high) = (-MOST, 0.0);
+    let (mut low, mut high) = (-MOST, most);
     for _ in 0..ROUNDS {
         let middle = 0.5 * (low + high);
         if value(middle) <= bound { low = middle } else { high = middle }

@@ -8,18 +8,15 @@
 
 use super::clutter::{Steps, rising_ratio};
 use super::company::Sure;
+use super::counts::{MOST, at_most};
 use super::energy::Object;
 use super::model::Model;
 use super::parts::Part;
 
 /// Steps of expectation and maximisation: as many more change no probability by more than a hundredth.
 const STEPS: usize = 40;
-/// No probability is surer than this: a thousand objects of a class tell no more.
+/// No probability is surer than this, so that odds stay finite: no looks tell so much.
 const LEAST_DOUBT: f64 = 1e-6;
-/// Rounds of bisection: logarithms of odds are right to a billionth.
-const ROUNDS: usize = 36;
-/// Odds are shifted by no more than this factor, in logarithms.
-const MOST: f64 = 30.0;
 
 /// What is learned of one class.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -72,7 +69,7 @@ impl Existing {
                 return Self::UNTOLD;
             }
             let with = |ln_odds: f64| Self { ln_odds, ..existing };
-            existing = with(at_most(all, |ln_odds| sum(&real_of(&with(ln_odds)))));
+            existing = with(at_most(all, MOST, |ln_odds| sum(&real_of(&with(ln_odds)))));
             real = real_of(&existing);
         }
         existing
@@ -87,16 +84,6 @@ impl Existing {
     fn tells_nothing(&self) -> bool {
         self.by_score == Steps::NONE && self.by_nearness == Steps::NONE
     }
-}
-
-/// Where an ascending function of what is added to the logarithm of odds is not above a number.
-fn at_most(most: f64, of: impl Fn(f64) -> f64) -> f64 {
-    let (mut low, mut high) = (-MOST, MOST);
-    for _ in 0..ROUNDS {
-        let middle = 0.5 * (low + high);
-        if of(middle) <= most { low = middle } else { high = middle }
-    }
-    low
 }
 
 fn probability(ln_odds: f64) -> f64 {
@@ -142,18 +129,24 @@ pub fn learn_existence(model: &mut Model<'_>, objects: &[Object], few: &[Object]
         return;
     }
     let told = told_of(model, objects, few);
-    let class_of = |row: usize| objects.iter().chain(few).nth(row).map(|object| object.class);
-    let classes: Vec<Option<u32>> = (0..told.len()).map(class_of).collect();
     model.pooled.existing = Existing::learn(&told);
+    if let [only] = &mut model.classes[..] {
+        only.existing = model.pooled.existing;
+        return;
+    }
     for (class, learned) in (0..).zip(&mut model.classes) {
-        let of_class = told.iter().zip(&classes).filter(|(_, of)| **of == Some(class)).map(|(told, _)| *told);
-        learned.existing = Existing::learn(&of_class.collect::<Vec<_>>());
+        let of_class = objects.iter().chain(few).zip(&told).filter(|(object, _)| object.class == class);
+        learned.existing = Existing::learn(&of_class.map(|(_, told)| *told).collect::<Vec<_>>());
     }
 }
 
 /// The probability that each of some objects exists, and then of some of few votes.
 #[must_use]
 pub fn existences(model: &Model<'_>, objects: &[Object], few: &[Object]) -> Vec<f64> {
+    // As in most scenes: what would tell is not asked for.
+    if model.classes.iter().all(|class| class.existing.tells_nothing()) {
+        return objects.iter().chain(few).map(Object::existence).collect();
+    }
     let existence = |(object, told): (&Object, Told)| {
         let existing = &model.classes[object.class as usize].existing;
         if existing.tells_nothing() { object.existence() } else { told.there * existing.real(&told) }
