@@ -205,7 +205,8 @@ class PictureSize(Convention):
             ("10/9", 10 / 9), ("20/19", 20 / 19), ("19/20", 0.95), ("9/10", 0.9),
             ("5/6", 5 / 6), ("4/5", 0.8), ("3/4", 0.75), ("2/3", 2 / 3), ("1/2", 0.5), ("1/3", 1 / 3), ("1/4", 0.25),
         ):  # fmt: skip
-            if factor * reach <= 1.0 if factor > 1.0 else reach > 1.0 or not is_all_round:
+            is_possible = factor * reach <= 1.0 if factor > 1.0 else reach > 1.0 or not is_all_round
+            if is_possible:
                 yield f"boxes {name} times as large", _Scaled(factor)
         farthest = float(np.quantile(dataset.detections.center_px.max(axis=1), _NEARLY_ALL))
         for side in _SQUARES_PX:

@@ -129,7 +129,6 @@ def _find_of_one_group(view: View) -> Correction | None:
     no accident must show in how they meet all others.
     """
     groups, compared = groups_of(view.dataset), 0
-    given: Floats | None = None
     best: Correction | None = None
     for group in groups:
         alone = group.alone(view)
@@ -137,10 +136,9 @@ def _find_of_one_group(view: View) -> Correction | None:
         if group.pass_name is None:
             told += _estimates_by_others(view, group, alone, len(groups))
         for own in told:
-            given = gains_of_all(view, view.dataset) if given is None else given
             compared += 1
             correction = replace(own, group=group)
-            comparison = compare(gains_of_all(view, correction(view.dataset)), given)
+            comparison = compare(gains_of_all(view, correction(view.dataset)), _given_gains(view))
             correction = replace(correction, comparison=comparison, chance=max(own.chance, comparison.chance))
             if best is None or comparison.difference > best.comparison.difference:
                 best = correction
@@ -187,7 +185,7 @@ def _estimates_by_others(view: View, group: Group, alone: View, groups: int) -> 
     # Of a camera that is off by gates few votes are right, and the first rounds see little of it.
     found = estimate(view.dataset, view.many_places, view.gate_px, own, start=first)
     assert found is not None
-    given, least_rise = gains_of_all(view, view.dataset), LEAST_RISE * float(gains_of_all(alone, alone.dataset).sum())
+    given, least_rise = _given_gains(view), LEAST_RISE * float(gains_of_all(alone, alone.dataset).sum())
     for parameter, changes in zip(_OF_A_MOUNT, own, strict=True):
         value, sigma = found.of(parameter.name)
         chance = _chance_of(found, parameter.name, groups)
@@ -197,6 +195,14 @@ def _estimates_by_others(view: View, group: Group, alone: View, groups: int) -> 
         rise = compare(gains_of_all(view, changes.change(view.dataset, value)), given)
         if rise.difference >= least_rise:
             yield Correction(parameter, value, sigma, chance, rise, found)
+
+
+def _given_gains(view: View) -> Floats:
+    """Return what rays gain as the dataset is given, worked out once a view."""
+    if "given_gains" not in view.memory:
+        view.memory["given_gains"] = gains_of_all(view, view.dataset)
+    found: Floats = view.memory["given_gains"]
+    return found
 
 
 def _of_group(parameter: Parameter, group: Group) -> Parameter:
@@ -232,15 +238,13 @@ def _find_correction(view: View) -> Correction | None:
     if found is None:
         return None
     tests = len(found.names)
-    freedom = max(found.places - tests, 1)
-    given: Floats | None = None
     best: Correction | None = None
     for name in found.names:
         value, sigma = found.of(name)
-        chance = 2.0 * float(stats.t.sf(abs(value) / sigma, freedom)) * tests
+        chance = _chance_of(found, name, 1)
         if chance > LEAST_CHANCE:
             continue
-        given = gains_of_all(view, view.dataset) if given is None else given
+        given = _given_gains(view)
         parameter = next(p for p in PARAMETERS if p.name == name)
         gains = gains_of_all(view, parameter.change(view.dataset, value))
         value, sigma, gains = _better(view, parameter, value, sigma, gains)

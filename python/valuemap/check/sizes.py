@@ -56,6 +56,10 @@ _OUTSIDE = 0.01
 """The limits have room of their own: the usual height is a factor of two from either."""
 
 
+_HALF_OR_A_QUARTER = -1.5 * math.log(2.0)
+"""The logarithm of a ratio that is as near to a half as to a quarter."""
+
+
 def object_heights(view: View, group: Group | None = None, *, is_without: bool = False) -> dict[str, Floats]:
     """Return, for each class, the heights in metres of the points where rays meet, by the boxes of a group or without.
 
@@ -67,8 +71,12 @@ def object_heights(view: View, group: Group | None = None, *, is_without: bool =
 
 
 def heights_of_groups(view: View) -> dict[Group, dict[str, Floats]]:
-    """Return the heights of objects by camera and by pass, where there are several."""
-    return {group: object_heights(view, group) for group in groups_of(view.dataset)}
+    """Return the heights of objects by camera and by pass, where there are several, worked out once a view."""
+    if "heights_of_groups" not in view.memory:
+        heights = {group: object_heights(view, group) for group in groups_of(view.dataset)}
+        view.memory["heights_of_groups"] = heights
+    found: dict[Group, dict[str, Floats]] = view.memory["heights_of_groups"]
+    return found
 
 
 def do_groups_agree(view: View, name: str, low_m: float, high_m: float) -> bool:
@@ -106,7 +114,7 @@ def half_sized_group(view: View) -> tuple[Group, str, float, float, float] | Non
                 continue
             test = stats.ttest_ind(own + math.log(2.0) / 2.0, rest, equal_var=False, alternative="less")
             chance, ratio = float(test.pvalue) * len(of_groups) * len(heights), float(own.mean() - rest.mean())
-            if chance < LEAST_CHANCE and ratio > -1.5 * math.log(2.0):
+            if chance < LEAST_CHANCE and ratio > _HALF_OR_A_QUARTER:
                 found.append((group, name, math.exp(np.median(own)), math.exp(np.median(rest)), chance))
     return min(found, key=lambda each: each[4], default=None)
 
