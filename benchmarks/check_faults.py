@@ -1,16 +1,17 @@
 """Put each known fault into good data and see whether `valuemap check` names it, and whether its fix undoes it.
 
-    python benchmarks/check_faults.py [--seeds N ...] [--spoiled N ...] [--kitti-signs DIR] [--kitti-ts DIR]
-                                      [--only FAULT ...] [--json FILE] [--go-on]
+    python benchmarks/check_faults.py [--seeds N ...] [--rigs N ...] [--spoiled N ...] [--kitti-signs DIR]
+                                      [--kitti-ts DIR] [--only FAULT ...] [--json FILE] [--go-on]
 
-Good data are simulated cities (two cameras, time stamps, a geo-reference, truth; faults go into the first), and where
-their folders are given KITTI odometry 00, 05, 07, 09 (see kitti_signs.py; faults go into 00) and KITTI-TS
+Good data are simulated cities (two cameras, time stamps, a geo-reference, truth; faults go into the first), simulated
+cities whose cars have three cameras (what only rigs can have goes into the first), and where their folders are given
+KITTI odometry 00, 05, 07, 09 (see kitti_signs.py; faults go into 00) and KITTI-TS
 (`images.csv`, `detections.csv`, `signs.csv`). Faults are written here, apart from the package: no fix is used to make
 the fault that it undoes.
 
 What is counted
 
-    named     the fault is among the findings
+    named     the fault is among the findings, of a rig with the camera that has it
     others    findings of other names beside it, first ones included
     clean     findings in data without a fault: there should be none
     recovered the map of the fixed data has as many of the true objects as that of the unharmed data, less 2 %
@@ -57,12 +58,13 @@ class Fault:
     """How a fault gets into data; None where the data have nothing to put it into.
 
     `compared` makes of good data those that the fixed ones are compared to, where a fault writes over what no fix can
-    know.
+    know. `of` is the camera that the finding must name, where one alone is wrong.
     """
 
     spoil: Callable[[Dataset], Dataset | None]
     has_fix: bool = True
     compared: Callable[[Dataset], Dataset] = lambda good: good
+    of: str | None = None
 
 
 # ---------------------------------------------------------------------------------------------- good data
@@ -96,6 +98,12 @@ def with_second_camera(dataset: Dataset, *, scale: float) -> Dataset:
         images=dataset.images.replace(camera_id=is_second.astype(np.int64)),
         detections=detections.replace(center_px=detections.center_px * factor, size_px=detections.size_px * factor),
     )
+
+
+def good_rig(seed: int) -> Dataset:
+    """Return a simulated city that cars with three cameras drive, 60 degrees from each other."""
+    config = replace(PRESETS["small"], cameras=3, camera_spread_deg=60.0, write_pose_sigmas=1)
+    return simulate(config, seed=seed, name=f"rig-{seed}")
 
 
 def good_kitti(data_dir: Path, sequence: str) -> Dataset:
@@ -758,6 +766,52 @@ FAULTS: dict[str, Fault] = {
 }
 
 
+# ---------------------------------------------------------------------------------------------- faults of rigs
+
+
+def exchanged(dataset: Dataset, first: int, second: int) -> Dataset:
+    """Exchange the poses of two cameras, image by image as they are listed."""
+    camera_id, time_s = dataset.images.camera_id, np.asarray(dataset.images.timestamp_s)
+    one, other = (np.flatnonzero(camera_id == camera) for camera in (first, second))
+    assert np.array_equal(time_s[one], time_s[other])
+    row = np.arange(len(camera_id))
+    row[one], row[other] = other, one
+    rotation, center = _poses(dataset)
+    return posed(dataset, rotation[row], center[row])
+
+
+def of_camera(dataset: Dataset, spoiled: Dataset, camera_id: int) -> Dataset:
+    """Return a dataset whose images and boxes of one camera are as in another."""
+    mine = dataset.images.camera_id == camera_id
+    (rotation, center), (other_rotation, other_center) = _poses(dataset), _poses(spoiled)
+    result = posed(
+        dataset,
+        np.where(mine[:, None, None], other_rotation, rotation),
+        np.where(mine[:, None], other_center, center),
+    )
+    box, detections = mine[rows(dataset), None], dataset.detections
+    return boxed(
+        result,
+        np.where(box, spoiled.detections.center_px, detections.center_px),
+        np.where(box, spoiled.detections.size_px, detections.size_px),
+    )
+
+
+def lowered(dataset: Dataset) -> Dataset:
+    """All cameras a metre lower."""
+    rotation, center = _poses(dataset)
+    return posed(dataset, rotation, center - np.array(dataset.frame.up))
+
+
+RIG_FAULTS: dict[str, Fault] = {
+    "cameras_exchanged": Fault(lambda good: exchanged(good, 0, 1)),
+    "boxes_half_size": Fault(lambda good: of_camera(good, boxes_half_size(good), 1), of="camera 1"),
+    "camera_yaw": Fault(lambda good: of_camera(good, camera_yaw(good), 2), of="camera 2"),
+    "camera_height": Fault(lambda good: of_camera(good, lowered(good), 0), of="camera 0"),
+}
+"""What only one camera of several has."""
+
+
 # ---------------------------------------------------------------------------------------------- measuring
 
 
@@ -812,7 +866,7 @@ def measure(good: Dataset, name: str, fault: Fault, unharmed: int | None) -> dic
     seconds = time.perf_counter() - start
     findings = [finding.fault for finding in outcome.findings]
     result: dict[str, Any] = {
-        "named": name in findings,
+        "named": any(finding.fault == name and fault.of in (None, finding.of) for finding in outcome.findings),
         "others": [finding for finding in findings if finding != name],
         "seconds": round(seconds, 2),
     }
@@ -828,10 +882,8 @@ def measure(good: Dataset, name: str, fault: Fault, unharmed: int | None) -> dic
     return result
 
 
-def run(
-    good: Dataset, only: list[str], record: dict[str, Any], *, spoils: bool = True, maps: bool = True
-) -> Iterator[None]:
-    """Check one good dataset as it is and with every fault; yield when more of it stands in the record."""
+def run(good: Dataset, faults: dict[str, Fault], record: dict[str, Any], *, maps: bool = True) -> Iterator[None]:
+    """Check one good dataset as it is and with each fault; yield when more of it stands in the record."""
     if not record:
         start = time.perf_counter()
         clean = examine(good)
@@ -842,9 +894,9 @@ def run(
             "faults": {},
         }
         yield
-    left = [each for each in _chosen(only) if each[0] not in (*record["faults"], *record["nowhere"])] if spoils else []
+    left = {name: fault for name, fault in faults.items() if name not in (*record["faults"], *record["nowhere"])}
     unharmed = found_objects(good, good) if maps and left and good.truth is not None else None
-    for name, fault in left:
+    for name, fault in left.items():
         result = measure(good, name, fault, unharmed)
         if result is None:
             record["nowhere"].append(name)
@@ -852,10 +904,6 @@ def run(
             record["faults"][name] = result
             print(f"  {name:28} {_line(result)}", flush=True)
         yield
-
-
-def _chosen(only: list[str]) -> Iterator[tuple[str, Fault]]:
-    return ((name, fault) for name, fault in FAULTS.items() if not only or name in only)
 
 
 def _line(result: dict[str, Any]) -> str:
@@ -898,10 +946,13 @@ def main() -> int:
     """Run the benchmark; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="*", default=list(range(10)))
+    parser.add_argument("--rigs", type=int, nargs="*", default=[0, 1, 2])
     parser.add_argument("--kitti-signs", type=Path, metavar="DIR")
     parser.add_argument("--kitti-ts", type=Path, metavar="DIR")
-    parser.add_argument("--only", nargs="*", default=[], choices=sorted(FAULTS))
-    parser.add_argument("--spoiled", type=int, nargs="*", default=[0], help="seeds of the cities that faults go into")
+    parser.add_argument("--only", nargs="*", default=[], choices=sorted({**FAULTS, **RIG_FAULTS}))
+    parser.add_argument(
+        "--spoiled", type=int, nargs="*", default=[0], help="seeds of cities and rigs that faults go into"
+    )
     parser.add_argument("--clean", action="store_true", help="look at good data only")
     parser.add_argument("--no-maps", action="store_true", help="do not map what the fixes make")
     parser.add_argument("--json", type=Path)
@@ -909,10 +960,11 @@ def main() -> int:
     options = parser.parse_args()
     records = json.loads(options.json.read_text(encoding="utf-8"))["results"] if options.go_on else {}
     try:
-        for name, good, spoils in _datasets(options):
+        for name, good, possible in _datasets(options):
             print(name, flush=True)
             record = records.setdefault(name, {})
-            for _ in run(good, options.only, record, spoils=spoils and not options.clean, maps=not options.no_maps):
+            faults = {} if options.clean else {k: v for k, v in possible.items() if k in (options.only or possible)}
+            for _ in run(good, faults, record, maps=not options.no_maps):
                 keep_record(options.json, record_of(records))  # It takes long.
             for finding in record["clean"]:
                 print(f"  CLEAN DATA: {finding['fault']}: {finding['why']}")
@@ -935,14 +987,17 @@ def record_of(records: dict[str, dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _datasets(options: argparse.Namespace) -> Iterator[tuple[str, Dataset, bool]]:
+def _datasets(options: argparse.Namespace) -> Iterator[tuple[str, Dataset, dict[str, Fault]]]:
+    """Yield each good dataset with its name and the faults that go into it."""
     for seed in options.seeds:
-        yield f"city {seed}", good_city(seed), seed in options.spoiled
+        yield f"city {seed}", good_city(seed), FAULTS if seed in options.spoiled else {}
+    for seed in options.rigs:
+        yield f"rig {seed}", good_rig(seed), RIG_FAULTS if seed in options.spoiled else {}
     if options.kitti_signs is not None:
         for sequence in SEQUENCES:
-            yield f"KITTI {sequence}", good_kitti(options.kitti_signs, sequence), sequence == "00"
+            yield f"KITTI {sequence}", good_kitti(options.kitti_signs, sequence), FAULTS if sequence == "00" else {}
     if options.kitti_ts is not None:
-        yield "KITTI-TS", good_kitti_ts(options.kitti_ts), True
+        yield "KITTI-TS", good_kitti_ts(options.kitti_ts), FAULTS
 
 
 if __name__ == "__main__":

@@ -40,6 +40,8 @@ _GREATEST_GATE_PX = 1e5
 """What the vote takes at most: a reading under which a radian has millions of pixels is refuted at any gate."""
 _LEAST_PLACES = 4
 _MOST_EXACT = 50
+_ROUNDING = 1e-6
+"""Gains that differ by a smaller share of themselves differ in their last digits only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,10 +167,11 @@ def compare(better: Floats, worse: Floats) -> Comparison:
     """Test the paired differences of gains (places) against their scatter, one-sided.
 
     Student's t has most power where places are alike, Wilcoxon's signed ranks where few of them are much larger; the
-    better of both counts, times two for the choice. Places that neither convention makes anything of do not count.
+    better of both counts, times two for the choice. Places where both are the same tell nothing and do not count; those
+    that a camera does not see say nothing of it.
     """
-    tells = (better != 0.0) | (worse != 0.0)
-    difference = (better - worse)[tells]
+    difference = better - worse
+    difference = difference[np.abs(difference) > _ROUNDING * np.maximum(np.abs(better), np.abs(worse))]
     count = len(difference)
     total = float(difference.sum())
     if count < _LEAST_PLACES or total <= 0.0:

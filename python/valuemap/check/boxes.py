@@ -210,7 +210,7 @@ class PictureSize(Convention):
                 yield f"boxes {name} times as large", _Scaled(factor)
         farthest = float(np.quantile(dataset.detections.center_px.max(axis=1), _NEARLY_ALL))
         for side in _SQUARES_PX:
-            if farthest > side or side > _LARGER_SQUARE * farthest:
+            if farthest > side:
                 continue
             for how, is_squeezed in (
                 ("squeezed into {0} x {0} px", True),
@@ -258,8 +258,6 @@ class MirroredPictures(Convention):
 
 _SQUARES_PX = (100, 224, 300, 416, 512, 608, 640, 768, 800, 1000, 1024, 1280, 1536)
 """What detectors take their pictures in (and 100 and 1000, for percent and thousandths of them)."""
-_LARGER_SQUARE = 1.25
-"""Of many boxes the farthest are near the far side of the longer direction of their pictures."""
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ import numpy as np
 
 from valuemap.cameras import rotation_matrices
 from valuemap.check.agreement import Agreement, Comparison, compare, gains_of_objects, measure_agreement
-from valuemap.check.cameras import PARAMETERS
-from valuemap.check.fault import LEAST_CHANCE, WIDER_GATE, Convention, Finding, Fix, View, uprightness
+from valuemap.check.cameras import PARAMETERS, WrongCamera
+from valuemap.check.fault import LEAST_CHANCE, WIDER_GATE, Convention, Finding, Fix, View, gains_of_all, uprightness
 from valuemap.check.groups import Group, OfGroup, fits_one_group, groups_of
 from valuemap.check.sample import Sample
 from valuemap.dataset import Dataset
@@ -99,7 +99,7 @@ def hold_contest(view: View, conventions: Sequence[Convention], progress: Progre
     """Compare all readings. The gate is widened where rays, read in any way, meet no better than by chance."""
     rivals: tuple[str, ...] = ()
     for gate_share in (view.gate_share, view.gate_share * WIDER_GATE):
-        at_gate = view if gate_share == view.gate_share else View(view.dataset, gate_share=gate_share)
+        at_gate = view if gate_share == view.gate_share else View(view.dataset, gate_share=gate_share, known=view.known)
         tried = _try_all(at_gate, conventions, progress)
         readings = [each for each in tried if each.is_worth(tried[0])]
         top = max(readings, key=lambda reading: reading.total)
@@ -142,7 +142,7 @@ def find_odd_group(view: View, conventions: Sequence[Convention], progress: Prog
         chance, mended = finding.chance * len(groups), View(finding.fix(part), gate_share=view.gate_share)
         if chance > LEAST_CHANCE or _worth_of(mended) < least:
             continue
-        return replace(
+        odd = replace(
             finding,
             what=f"Only {group.text}: {finding.what}",
             chance=chance,
@@ -150,7 +150,21 @@ def find_odd_group(view: View, conventions: Sequence[Convention], progress: Prog
             fix=OfGroup(group, finding.fix),
             of=group.text,
         )
+        return _better_explained(view, WrongCamera().find(view), odd)
     return None
+
+
+def _better_explained(view: View, camera: Finding | None, odd: Finding) -> Finding:
+    """Return which of two findings lets all rays agree better: images with the camera of others, or an odd group.
+
+    Pictures of another size are those of a camera of the table, where there is one of that size.
+    """
+    if camera is None:
+        return odd
+    of_camera, of_odd = (
+        float(gains_of_all(view, each.fix(view.dataset)).sum()) for each in (camera, odd) if each.fix is not None
+    )
+    return camera if of_camera > (1.0 - _TIE) * of_odd else odd
 
 
 def _worth_of(view: View) -> float:
@@ -165,6 +179,7 @@ class _OfOneGroup(Convention):
         self._convention, self._part, self._group = convention, part, group
         self.name, self.what, self.do = convention.name, convention.what, convention.do  # type: ignore[misc]
         self.is_guess, self.least_times = convention.is_guess, convention.least_times  # type: ignore[misc]
+        self.explained_by = convention.explained_by  # type: ignore[misc]
         self.refined = convention.refined  # type: ignore[method-assign]
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
@@ -190,7 +205,8 @@ def _rivals(readings: Sequence[_Reading]) -> tuple[str, ...]:
 
 def _try_all(view: View, conventions: Sequence[Convention], progress: Progress) -> list[_Reading]:
     sample = view.stretches
-    of_each = [(convention, list(convention.readings(sample.dataset))) for convention in conventions]
+    possible = [convention for convention in conventions if not convention.explained_by & view.known]
+    of_each = [(convention, list(convention.readings(sample.dataset))) for convention in possible]
     shares = sum(bool(found) for _, found in of_each)
     tried = [(convention, how, fix, shares * len(found)) for convention, found in of_each for how, fix in found]
     readings = [_Reading(None, "as given", None, view.agreement, view.uprightness, _is_along_axis(view.dataset))]

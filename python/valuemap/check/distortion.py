@@ -28,6 +28,8 @@ class LensModel(Fault):
 
     name: ClassVar[str] = "lens_model"
     stage: ClassVar[Stage] = "fine"
+    # Headings along the drive are off in bends, to one side.
+    explained_by: ClassVar[frozenset[str]] = frozenset({"headings_constant", "headings_useless"})
 
     def find(self, view: View) -> Finding | None:
         """Try pinholes for cameras with a lens, distortion of the other sign, and fisheyes for pinholes.

@@ -203,6 +203,8 @@ class Convention(ABC):
     """Whether readings give measured values up for guessed ones."""
     least_times: ClassVar[float | None] = None
     """How many times as well as given rays must agree, where without the noise of good data they agree better."""
+    explained_by: ClassVar[frozenset[str]] = frozenset()
+    """Faults whose fix leaves nothing that this one could be: where one of them was found, it is not tried."""
     is_of_world: ClassVar[bool] = False
     """Whether it is about the world, which all cameras of a vehicle share: one camera alone has none of its own."""
 

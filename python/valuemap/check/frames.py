@@ -151,6 +151,7 @@ class DegreesForRadians(Convention):
     what: ClassVar[str] = "The angles of the poses are in the wrong unit: degrees and radians are mixed up."
     do: ClassVar[str] = "Convert the angles (180/pi) and import again."
     is_guess: ClassVar[bool] = True
+    explained_by: ClassVar[frozenset[str]] = frozenset({"headings_constant", "headings_useless"})
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield degrees that were read as radians, and radians read as degrees, as compass or mathematical angles."""
@@ -178,10 +179,12 @@ class ConstantHeadings(Fault):
     """Cameras that look one way wherever they are driven: a column of headings that was never filled."""
 
     name: ClassVar[str] = "headings_constant"
-    stage: ClassVar[Stage] = "positions"  # Of poses read wrongly, headings may be none.
+    stage: ClassVar[Stage] = "tables"  # What says nothing is in no convention and in no unit.
 
     def find(self, view: View) -> Finding | None:
         """Compare how much the cameras turn with how much their ways do; panoramas may all be turned to north."""
+        if view.uprightness < _LEAST_UPRIGHT:  # Of cameras that lie, headings are no headings.
+            return None
         dataset = view.dataset
         camera_row = rows_of(dataset.images.camera_id, dataset.cameras.camera_id)
         azimuth_rad, _, _ = headings(dataset)
@@ -193,14 +196,14 @@ class ConstantHeadings(Fault):
             if not focals(dataset.cameras, row) or moving.sum() < _LEAST_MOVING:
                 continue
             told.append((_spread_rad(azimuth_rad[mine]), _spread_rad(way_rad[moving])))
-        if not told or any(turns > _STEADY_RAD or way < _WAYS_RAD for turns, way in told):
+        if any(turns > _STEADY_RAD for turns, _ in told) or all(way < _WAYS_RAD for _, way in told):
             return None
         images = dataset.images
         return Finding(
             fault=self.name,
             what="The headings say nothing: all images of a camera look the same way, wherever it is driven.",
             why=f"The headings of a camera scatter by {math.degrees(max(turns for turns, _ in told)):.2g} degrees, "
-            f"the directions in which its images move by {math.degrees(min(way for _, way in told)):.0f} degrees.",
+            f"the directions in which its images move by {math.degrees(max(way for _, way in told)):.0f} degrees.",
             do=HeadingsUseless.do,
             figures={"cameras": len(told), "images": len(images)},
             fix=None if _expose_together(images) else _heading_from_motion,  # Which way looks each of a car's cameras?
@@ -208,9 +211,10 @@ class ConstantHeadings(Fault):
 
 
 _LEAST_MOVING = 20
-_STEADY_RAD = math.radians(0.5)
 _WAYS_RAD = math.radians(20.0)
-"""No camera of a car keeps its heading to half a degree while the car's turns by twenty."""
+_STEADY_RAD = math.radians(1.0) * _WAYS_RAD / 2.0
+"""No camera of a car keeps its heading while the car's turns by twenty degrees. Headings in radians that were read as
+degrees would turn by twice as much."""
 
 
 def _expose_together(images: Images) -> bool:
@@ -226,7 +230,7 @@ def _expose_together(images: Images) -> bool:
 def _spread_rad(azimuth_rad: Floats) -> float:
     """Return the circular standard deviation of azimuths (N)."""
     length = float(np.hypot(np.mean(np.cos(azimuth_rad)), np.mean(np.sin(azimuth_rad))))
-    return math.sqrt(max(-2.0 * math.log(max(length, 1e-12)), 0.0))
+    return math.sqrt(max(0.0, -2.0 * math.log(max(length, 1e-12))))
 
 
 class UpDirection(Fault):

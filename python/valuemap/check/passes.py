@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -32,7 +33,7 @@ from valuemap.check.fault import (
 )
 from valuemap.check.headings import driving_azimuths
 from valuemap.check.offsets import densest, pairs_within
-from valuemap.check.sample import driving_order, order_by_camera, standing_m
+from valuemap.check.sample import FASTER, driving_order, order_by_camera, standing_m
 from valuemap.check.seams import Seam, worst_seam
 from valuemap.dataset import Dataset
 from valuemap.tables import Bools, Categories, Floats, Images, Ints
@@ -306,25 +307,28 @@ def _find_in_turn(view: View, name: str) -> Finding | None:
     found = _passes_in_turn(view.drives)
     if found is None:
         return None
-    names, share, images = found
+    names, share, chance = found
     several = len(set(names.values()))
     return Finding(
         fault=name,
         what=f"{len(names)} passes are {'one drive' if several == 1 else f'{several} drives'}: their images take turns "
         "along one road.",
-        why=f"In the order of their times, {share:.0%} of the {images} images go on where one of another pass and the "
-        "same camera just was.",
+        why=f"In the order of their times, {share:.0%} of the images of all but the longest of them are next to one of "
+        "another pass and the same camera, no farther than a car gets in that time.",
         do="Give all images of a drive one pass id (is it a batch, a split or a folder?).",
-        figures={"passes": len(names), "drives": several, "images": images, "in_turn": round(share, 3)},
+        chance=chance,
+        figures={"passes": len(names), "drives": several, "in_turn": round(share, 3)},
         fix=_joined_passes,
     )
 
 
-def _passes_in_turn(images: Images) -> tuple[dict[str, str], float, int] | None:
-    """Return under which one name passes (N) that take turns belong, how many images do and of how many.
+def _passes_in_turn(images: Images) -> tuple[dict[str, str], float, float] | None:
+    """Return under which one name passes (N) that take turns belong, which share of their images do, and the chance.
 
-    Two images that follow each other in time, of one camera, are of one drive where the second is as far from the first
-    as the car gets in that time. Of passes that only meet, or follow each other, few are.
+    Two images that follow each other in time, of one camera, are of one drive where the second is no farther from the
+    first than a car gets in that time. Passes that go on in each other to and fro take turns if most of their images
+    are next to one of another pass. Those of the longest pass do not count, as few images may be dealt out of many.
+    Drives that follow each other do not come back. Where drives meet or overlap, few of their images are.
     """
     time = images.timestamp_s
     if time is None or not np.all(np.isfinite(time)) or len(images) < _LEAST_IMAGES:
@@ -338,29 +342,27 @@ def _passes_in_turn(images: Images) -> tuple[dict[str, str], float, int] | None:
     moves = follows & (step_m > 0.0)
     if moves.sum() < _LEAST_IMAGES:
         return None
-    usual_m = float(np.median(step_m[moves]))
     speed_mps = float(np.median(step_m[moves] / seconds[moves]))
-    changes = follows & (codes[before] != codes[after])
-    goes_on = changes & (step_m <= np.maximum(_FASTER * speed_mps * seconds, 1e-9)) & (step_m <= _NEAR_STEPS * usual_m)
-    share = float(goes_on.sum()) / max(float(follows.sum()), 1.0)
-    if share < _IN_TURN or goes_on.sum() < _MOSTLY_ON * changes.sum():
-        return None
-    count = len(images.pass_id.names)
-    pairs = coo_matrix((np.ones(int(goes_on.sum())), (codes[before[goes_on]], codes[after[goes_on]])), (count, count))
-    often = pairs.tocsr()
-    often.data[often.data < _IN_TURN * _IN_TURN * np.bincount(codes).min()] = 0.0
-    often.eliminate_zeros()
-    _, drive = connected_components(often, directed=False)
-    first = {int(of): images.pass_id.names[code] for code, of in reversed(list(enumerate(drive)))}
-    joined = {images.pass_id.names[code]: first[int(of)] for code, of in enumerate(drive) if np.sum(drive == of) > 1}
-    return (joined, share, len(images)) if joined else None
-
-
-_IN_TURN, _MOSTLY_ON = 0.25, 0.8
-"""Of images so many change the pass where they go on, and of all changes of pass so many are such."""
-_FASTER, _NEAR_STEPS = 3.0, 5.0
-"""What goes on is no faster than so many times the usual speed, and no farther than so many usual steps: cars speed up,
-and images are left out."""
+    goes_on = follows & (codes[before] != codes[after]) & (step_m <= FASTER * speed_mps * seconds)
+    first, second, count = before[goes_on], after[goes_on], len(images.pass_id.names)
+    pairs = coo_matrix((np.ones(len(first)), (codes[first], codes[second])), (count, count))
+    _, drive = connected_components(pairs, directed=True, connection="strong")
+    is_next = np.zeros(len(images), dtype=np.bool_)
+    together = drive[codes[first]] == drive[codes[second]]
+    is_next[first[together]] = is_next[second[together]] = True
+    length, turns = np.bincount(codes, minlength=count), np.bincount(codes[is_next], minlength=count)
+    drives = [members for each in np.unique(drive) if len(members := np.flatnonzero(drive == each)) > 1]
+    names: dict[str, str] = {}
+    told = []
+    for members in drives:
+        shorter = np.delete(members, np.argmax(length[members]))
+        in_turn, most = int(turns[shorter].sum()), int(length[shorter].sum())
+        chance = float(stats.binom.sf(in_turn - 1, most, 0.5)) * len(drives)
+        if chance < LEAST_CHANCE:
+            told.append((chance, in_turn, most))
+            names |= {images.pass_id.names[code]: images.pass_id.names[members[0]] for code in members.tolist()}
+    chances, seen, of = zip(*told, strict=True) if told else ((), (), ())
+    return (names, sum(seen) / sum(of), max(chances)) if names else None
 
 
 def _joined_passes(dataset: Dataset) -> Dataset:

@@ -14,7 +14,7 @@ from valuemap.cameras import camera_centers
 from valuemap.check.boxes import rows_in_images
 from valuemap.check.fault import LEAST_CHANCE, Fault, Finding, Stage, View, keep_rows, with_detections
 from valuemap.check.offsets import find_shift
-from valuemap.check.sample import order_by_camera
+from valuemap.check.sample import FASTER, order_by_camera
 from valuemap.dataset import Dataset
 from valuemap.tables import Bools, Categories, Floats, Images, Truth
 
@@ -75,7 +75,7 @@ class FarImages(Fault):
     """Images far from the rest."""
 
     name: ClassVar[str] = "far_images"
-    stage: ClassVar[Stage] = "tables"
+    stage: ClassVar[Stage] = "positions"  # Of poses read wrongly, positions jump.
 
     def find(self, view: View) -> Finding | None:
         """Look for few images much farther from the middle than all others, or far from the rest of their drive."""
@@ -358,12 +358,12 @@ def strays(images: Images) -> Bools:
     for first, last in itertools.pairwise(cuts.tolist()):
         returns = jumps[first - 1] and jumps[last - 1]
         way_on_m = float(np.linalg.norm(center[last] - center[first - 1]))
-        if returns and last - first <= _MOST_STRAYS and way_on_m <= _GOES_ON_STEPS * usual_m * (last - first + 1):
+        if returns and last - first <= _MOST_STRAYS and way_on_m <= FASTER * usual_m * (last - first + 1):
             found[order[first:last]] = True
     return found
 
 
-_STRAY_STEPS, _GOES_ON_STEPS, _MOST_STRAYS = 50.0, 3.0, 10
+_STRAY_STEPS, _MOST_STRAYS = 50.0, 10
 """No car is fifty steps away for some images, without having been seen on the way, and back at once."""
 
 

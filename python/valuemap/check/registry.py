@@ -63,8 +63,8 @@ CONVENTIONS: tuple[Convention, ...] = (
     CameraAxes(),
     CenterAsTranslation(),
     LatLonSwapped(),
+    MirroredPositions(),  # On flat ground of the same effect as other axes, and the smaller mistake.
     WorldAxes(),
-    MirroredPositions(),
     HeadingConvention(),
     TiltConvention(),
     DegreesForRadians(),

@@ -27,6 +27,8 @@ _IMAGES_OF_A_STRETCH = 200
 _STANDING = 0.2
 _PLACE_STEPS = 16.0
 """Radius of a place in median steps between images: tens of metres in street images, and no metre in it."""
+FASTER = 3.0
+"""No car goes faster than so many times its usual speed, or its images farther from each other than so many steps."""
 
 
 @dataclass(frozen=True, eq=False)
