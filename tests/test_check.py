@@ -1007,6 +1007,18 @@ def pass_of_each(drive: Dataset, number: NDArray[np.integer]) -> Dataset:
     return with_images(drive, pass_id=Categories.from_texts(names.tolist()))
 
 
+def test_images_that_only_a_wrong_reading_puts_far_away_stay(good: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in KITTI-TS, where bursts of images jump if their poses are inverted."""
+    center = camera_centers(good.images)
+    monkeypatch.setattr(
+        "valuemap.check.quality.strays",
+        lambda images: np.arange(len(images)) < 5 * (not np.allclose(camera_centers(images), center)),
+    )
+    spoiled = INJECTED["inverted_poses"].spoil(good)
+    assert spoiled is not None
+    assert named(spoiled) == ["inverted_poses"]
+
+
 def test_a_few_images_dealt_out_of_many_take_turns_and_pieces_that_overlap_do_not(good: Dataset) -> None:
     drive = keep_rows(good, images=good.images.pass_id.codes == 0)
     count = np.arange(len(drive.images))
