@@ -5,8 +5,8 @@
 
 /// Values are sorted into so many bins of about as many detections each.
 pub const BINS: usize = 12;
-/// Votes and clutter of fewer detections than this tell nothing: two or three of each in a bin.
-const LEAST_DETECTIONS: f64 = 30.0;
+/// Fewer of one kind tell nothing: their number is known no better than to a third (Poisson).
+const LEAST_DETECTIONS: f64 = 10.0;
 
 /// A function that is constant between some edges.
 #[derive(Debug, Clone, Copy, PartialEq)]

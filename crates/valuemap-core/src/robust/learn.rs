@@ -129,8 +129,12 @@ impl<'a> Evidence<'a> {
             learned.sizes.object = (object.0, object.1.max(learned.sizes.spread));
             learned.heights = if has(Part::Heights) { heights(model, &sure) } else { None };
             learned.ln_births_per_m2 = (of_class.len() as f64 / self.ground_m2).ln();
+            let (by_distance, by_angle) = reach(model, self.lookout, &sure, learned.farthest_m);
             if has(Part::Reach) {
-                learned.reach = reach(model, self.lookout, &sure, learned.farthest_m);
+                learned.reach = by_distance;
+            }
+            if has(Part::Aspect) {
+                learned.aspect = by_angle;
             }
             if has(Part::Company) {
                 learned.company = company(model, self.objects, &learned, of_class[0].class);

@@ -17,6 +17,7 @@ use super::noise::{Noise, Spread};
 use super::parts::Part;
 use super::prior::Prior;
 use super::ranges::{Measured, measured, range_terms};
+use super::reach::Aspect;
 use super::scene::Scene;
 use super::{Settings, spreads_of};
 use crate::ray::Ray;
@@ -48,6 +49,8 @@ pub struct ClassModel {
     pub score_ratio: Steps,
     /// The share of the looks from some distance, m, that are hits, of that where it is largest.
     pub reach: Steps,
+    /// The share of the looks at some angle to the nearest vote, rad, that are hits, of that where it is largest.
+    pub aspect: Aspect,
     /// What is added to the logarithm of the odds of objects of one vote, of two, and of more that rays alone do not tell: what the numbers of others allow.
     pub ln_odds_of_few: [f64; FEW],
     /// How much denser objects are near others, in logarithms, by minus the distance to the nearest one, m.
@@ -82,6 +85,7 @@ impl ClassModel {
             clutter_by_elevation: Steps::NONE,
             score_ratio: Steps::NONE,
             reach: Steps::ONE,
+            aspect: Aspect::ONE,
             ln_odds_of_few: [0.0; FEW],
             company: Steps::NONE,
             existing: Existing::UNTOLD,
@@ -92,7 +96,7 @@ impl ClassModel {
     }
 
     /// How many numbers it is stored as.
-    pub const NUMBERS: usize = 20 + Heights::NUMBERS + 4 * Steps::NUMBERS + Existing::NUMBERS;
+    pub const NUMBERS: usize = 20 + Heights::NUMBERS + 6 * Steps::NUMBERS + Existing::NUMBERS;
 
     /// All of it as numbers, for storage.
     #[must_use]
@@ -120,7 +124,15 @@ impl ClassModel {
             self.ranges.0,
             self.ranges.1,
         ];
-        let steps = [self.clutter_by_elevation, self.score_ratio, self.reach, self.company].map(|steps| steps.to_row());
+        let steps = [
+            self.clutter_by_elevation,
+            self.score_ratio,
+            self.reach,
+            self.aspect.within_pass,
+            self.aspect.between_passes,
+            self.company,
+        ];
+        let steps = steps.map(|steps| steps.to_row());
         numbers.into_iter().chain(heights).chain(steps.into_iter().flatten()).chain(self.existing.to_row()).collect()
     }
 
@@ -132,6 +144,8 @@ impl ClassModel {
         let (clutter, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
         let (scores, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
         let (reach, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
+        let (within_pass, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
+        let (between_passes, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
         let (company, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
         let existing = Existing::from_row(rest.try_into().ok()?)?;
         let &[
@@ -169,6 +183,10 @@ impl ClassModel {
             clutter_by_elevation: Steps::from_row(clutter),
             score_ratio: Steps::from_row(scores),
             reach: Steps::from_row(reach),
+            aspect: Aspect {
+                within_pass: Steps::from_row(within_pass),
+                between_passes: Steps::from_row(between_passes),
+            },
             ln_odds_of_few: [ln_odds_of_one, ln_odds_of_two, ln_odds_of_more],
             company: Steps::from_row(company),
             sizes: Sizes { angle: (angle_mean, angle_sd), object: (object_mean, object_sd), spread },

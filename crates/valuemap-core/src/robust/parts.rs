@@ -41,6 +41,8 @@ pub enum Part {
     Elevations,
     /// Objects are detected less from afar.
     Reach,
+    /// Objects are detected less from directions that are farther from those of their votes.
+    Aspect,
     /// Objects are denser near others.
     Company,
     /// Scores and company tell which objects exist.
@@ -63,7 +65,7 @@ pub enum Part {
 
 impl Part {
     /// All parts with their names.
-    pub const ALL: [(Self, &'static str); 28] = [
+    pub const ALL: [(Self, &'static str); 29] = [
         (Self::Polishing, "polishing"),
         (Self::Assignment, "assignment"),
         (Self::Merging, "merging"),
@@ -83,6 +85,7 @@ impl Part {
         (Self::Scores, "scores"),
         (Self::Elevations, "elevations"),
         (Self::Reach, "reach"),
+        (Self::Aspect, "aspect"),
         (Self::Company, "company"),
         (Self::Existence, "existence"),
         (Self::Looks, "looks"),
