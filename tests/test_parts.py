@@ -176,7 +176,7 @@ CASES: dict[str, tuple[str, int, Fails]] = {
     "ranges": (RANGES, 5, more_is_wrong),
     "heights": (FEW_PICTURES, 5, fewer_are_honest),
     "scores": ("poor detector", 5, more_is_wrong),
-    "elevations": (FEW_PICTURES, 11, more_is_wrong),
+    "elevations": (FEW_PICTURES, 16, more_is_wrong),
     "reach": ("drifts", 5, what_is_there_is_believed_less),
     "aspect": ("narrow", 7, what_is_there_is_believed_less),
     "company": (FEW_PICTURES, 5, more_is_wrong),

@@ -4,6 +4,7 @@
 
 use rayon::prelude::*;
 
+use super::aspect::Aspect;
 use super::clutter::{elevation_factor, score_ratio};
 use super::company::company;
 use super::energy::{Object, implied_size};
@@ -129,12 +130,11 @@ impl<'a> Evidence<'a> {
             learned.sizes.object = (object.0, object.1.max(learned.sizes.spread));
             learned.heights = if has(Part::Heights) { heights(model, &sure) } else { None };
             learned.ln_births_per_m2 = (of_class.len() as f64 / self.ground_m2).ln();
-            let (by_distance, by_angle) = reach(model, self.lookout, &sure, learned.farthest_m);
             if has(Part::Reach) {
-                learned.reach = by_distance;
+                learned.reach = reach(model, self.lookout, &sure, learned.farthest_m);
             }
             if has(Part::Aspect) {
-                learned.aspect = by_angle;
+                learned.aspect = Aspect::learn(model, self.lookout, &sure, learned.farthest_m);
             }
             if has(Part::Company) {
                 learned.company = company(model, self.objects, &learned, of_class[0].class);

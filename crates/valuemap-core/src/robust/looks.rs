@@ -5,14 +5,12 @@
 //! share of its images that have a vote. Which of the images have one is one of equally probable choices, the last term of equation (5) of
 //! `docs/method.md`: without this price a standing car would see two objects in turn.
 
-use std::f64::consts::PI;
-
 use nalgebra::Vector3;
 use rstar::RTree;
 use rstar::primitives::GeomWithData;
 use rustc_hash::FxHashMap;
 
-use super::clutter::BINS;
+use super::aspect::Directions;
 use super::energy::Object;
 use super::model::{ClassModel, Model, ln_gamma};
 use super::parts::Part;
@@ -24,12 +22,8 @@ const CUBE_SHARE: f64 = 1.0 / 6.0;
 /// Half of the angle of a sector (cosine of 15 degrees): housings and faces are detected about so much farther to the side than
 /// the farthest vote, and no more is known.
 const SECTOR_COSINE: f64 = 0.966;
-/// The same as an angle, rad.
-pub(super) const WIDEST_RAD: f64 = PI / 12.0;
 /// A look at a point where another detection is counts so much: hidden as often as not.
 const HIDDEN_LOOK: f64 = 0.5;
-/// Votes from directions nearer to each other than this, rad, count as one direction: half of what rates by angle are told apart by.
-const SAME_DIRECTION_RAD: f64 = 0.5 * WIDEST_RAD / BINS as f64;
 
 /// All images by place.
 pub struct Lookout {
@@ -91,7 +85,7 @@ impl Lookout {
             if hits.binary_search(&image).is_err() {
                 let hidden = if others.binary_search(&image).is_ok() { HIDDEN_LOOK } else { 1.0 };
                 let view = &scene.views[image as usize];
-                let weight = hidden * seen_from.rate(class, view.pass, &(view.center - point));
+                let weight = hidden * rate(class, &seen_from, view, point);
                 looks.push(Look { sector, image, weight, is_hit: false });
             }
         }
@@ -147,42 +141,16 @@ impl Lookout {
         (hits.len() + missed.count()) as u32
     }
 
-    /// The looks at a point from where some rays vote for it, up to `farthest_m`.
+    /// The images that look at a point from where some rays vote for it, up to `farthest_m`, and whether they have a vote.
     #[must_use]
-    pub fn seen(&self, model: &Model<'_>, point: &Vector3<f64>, voters: &[u32], farthest_m: f64) -> Vec<Sight> {
+    pub fn seen(&self, model: &Model<'_>, point: &Vector3<f64>, voters: &[u32], farthest_m: f64) -> Vec<(u32, bool)> {
         let scene = model.scene;
         let sectors = Sectors::of(scene, point, voters, (0.0, farthest_m));
         let hits = images_of(scene, voters);
-        let direction = |view: &View| (view.center - point).normalize();
-        let of_votes: Vec<(&View, Vector3<f64>)> =
-            hits.iter().map(|&image| &scene.views[image as usize]).map(|view| (view, direction(view))).collect();
-        let looking = self.looking(scene, point, &sectors).map(|(image, _)| {
-            let view = &scene.views[image as usize];
-            let seen_from = direction(view);
-            let to_votes = |is_meant: &dyn Fn(&View) -> bool| {
-                angle_rad(of_votes.iter().filter(|(of, _)| is_meant(of)).map(|(_, direction)| direction), &seen_from)
-            };
-            Sight {
-                distance_m: (view.center - point).norm(),
-                within_rad: to_votes(&|of| of.pass == view.pass && of.viewpoint != view.viewpoint),
-                between_rad: to_votes(&|of| of.pass != view.pass),
-                is_hit: hits.binary_search(&image).is_ok(),
-            }
-        });
-        looking.filter(|sight| sight.distance_m <= farthest_m).collect()
+        let is_near = |image: &u32| (scene.views[*image as usize].center - point).norm() <= farthest_m;
+        let images = self.looking(scene, point, &sectors).map(|(image, _)| image).filter(is_near);
+        images.map(|image| (image, hits.binary_search(&image).is_ok())).collect()
     }
-}
-
-/// What an image shows of an object that it looks at.
-pub struct Sight {
-    /// How far away it is, m.
-    pub distance_m: f64,
-    /// The angle to the nearest vote of another viewpoint of the pass, rad.
-    pub within_rad: f64,
-    /// The angle to the nearest vote of another pass, rad.
-    pub between_rad: f64,
-    /// Whether it has a vote.
-    pub is_hit: bool,
 }
 
 /// Logarithm of in how many ways some of all images are chosen: the binomial coefficient.
@@ -207,7 +175,14 @@ pub fn looks_among(model: &Model<'_>, object: &Object, rays: &[u32]) -> f64 {
     let views = rays.iter().map(|&ray| scene.view(ray));
     let views = views.filter(|view| sectors.looked_from(scene, view, point).is_some());
     let seen_from = Directions::of(scene, point, &object.votes);
-    views.map(|view| seen_from.rate(class, view.pass, &(view.center - point))).sum()
+    views.map(|view| rate(class, &seen_from, view, point)).sum()
+}
+
+/// How much rarer than at best a class is detected in an image that looks at a point.
+fn rate(class: &ClassModel, seen_from: &Directions, view: &View, point: &Vector3<f64>) -> f64 {
+    let away = view.center - point;
+    let distance_m = away.norm();
+    class.reach.at(distance_m) * seen_from.rate(&class.aspect, view.pass, &(away / distance_m))
 }
 
 /// The images of some rays, ascending.
@@ -215,52 +190,6 @@ fn images_of(scene: &Scene, rays: &[u32]) -> Vec<u32> {
     let mut images: Vec<u32> = rays.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
     images.sort_unstable();
     images
-}
-
-/// The directions from which an object is voted for.
-struct Directions {
-    /// Of each pass, by pass.
-    of_passes: Vec<(u32, Vector3<f64>)>,
-    /// Of all passes, none nearer to another one than `SAME_DIRECTION_RAD`.
-    all: Vec<Vector3<f64>>,
-}
-
-impl Directions {
-    fn of(scene: &Scene, point: &Vector3<f64>, voters: &[u32]) -> Self {
-        let of_vote = |&ray: &u32| (scene.view(ray).pass, (scene.view(ray).center - point).normalize());
-        let mut of_passes: Vec<(u32, Vector3<f64>)> = voters.iter().map(of_vote).collect();
-        of_passes.sort_by_key(|(pass, _)| *pass);
-        // Of a car that stands one is enough.
-        of_passes.dedup_by(|next, last| next.0 == last.0 && angle_rad([&last.1], &next.1) <= SAME_DIRECTION_RAD);
-        let mut all = Vec::new();
-        for (_, direction) in &of_passes {
-            if angle_rad(&all, direction) > SAME_DIRECTION_RAD {
-                all.push(*direction);
-            }
-        }
-        Self { of_passes, all }
-    }
-
-    /// How much rarer than at best a class is detected by a camera of a pass that is so far away.
-    fn rate(&self, class: &ClassModel, pass: u32, away: &Vector3<f64>) -> f64 {
-        let distance_m = away.norm();
-        let direction = away / distance_m;
-        let of_pass = &self.of_passes[self.of_passes.partition_point(|(of_vote, _)| *of_vote < pass)..];
-        let of_pass = of_pass.iter().take_while(|(of_vote, _)| *of_vote == pass).map(|(_, direction)| direction);
-        let within_rad = angle_rad(of_pass, &direction);
-        let by_angle = if within_rad <= WIDEST_RAD {
-            class.aspect.within_pass.at(within_rad)
-        } else {
-            class.aspect.between_passes.at(angle_rad(&self.all, &direction))
-        };
-        by_angle * class.reach.at(distance_m)
-    }
-}
-
-/// The angle between a direction and the nearest of some others, rad, up to the third order.
-fn angle_rad<'a>(others: impl IntoIterator<Item = &'a Vector3<f64>>, direction: &Vector3<f64>) -> f64 {
-    let cosine = others.into_iter().map(|other| other.dot(direction)).fold(-1.0, f64::max);
-    (2.0 - 2.0 * cosine).max(0.0).sqrt()
 }
 
 /// From where an object is seen.
@@ -323,10 +252,8 @@ impl Sectors {
 
 #[cfg(test)]
 mod tests {
-    use super::super::clutter::Steps;
     use super::super::energy::object;
     use super::super::parts::Without;
-    use super::super::reach::Aspect;
     use super::super::scene::Scene;
     use super::*;
     use crate::robust::Settings;
@@ -357,57 +284,6 @@ mod tests {
         let without = Without::named(&["turns".to_owned()]).unwrap_or_default();
         let (one, two) = energies(&Settings { without, ..street::SETTINGS });
         assert!(two < one, "{one} {two}");
-    }
-
-    #[test]
-    fn misses_count_less_the_farther_they_are_from_votes_of_their_pass_or_else_of_others() {
-        let at = Vector3::new(40.0, 8.0, 3.0);
-        let scene =
-            street::joined(vec![street::street(15, 2.0, &[at], &[[0.0; 2]]), street::street(15, 2.0, &[], &[])]);
-        let mut model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
-        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
-        // The first images of the first pass have votes, the last 26 degrees aside.
-        let votes = scene.usable_rays()[..8].to_vec();
-        let expected = |model: &Model<'_>| {
-            let seen = lookout.looks(model, &at, &votes, &[]);
-            let of_pass = |pass: usize| seen.sectors[0].get(pass).map_or(0.0, |looks| looks.expected);
-            [of_pass(0), of_pass(1)]
-        };
-        model.classes[0].is_learned = true;
-        model.classes[0].farthest_m = 50.0;
-        let whole = expected(&model);
-        let falling = Steps::even(WIDEST_RAD, std::array::from_fn(|bin| if bin == 0 { 1.0 } else { 0.0 }));
-        model.classes[0].aspect.within_pass = falling;
-        let within = expected(&model);
-        assert!(
-            (8.0..whole[0] - 0.5).contains(&within[0]) && (within[1] - whole[1]).abs() < 1e-12,
-            "{whole:?} {within:?}"
-        );
-        model.classes[0].aspect = Aspect { within_pass: Steps::ONE, between_passes: falling };
-        let between = expected(&model);
-        assert!(
-            (8.0..whole[1] - 0.5).contains(&between[1]) && (between[0] - whole[0]).abs() < 1e-12,
-            "{whole:?} {between:?}"
-        );
-    }
-
-    #[test]
-    fn an_image_is_as_far_from_votes_as_from_those_of_other_viewpoints_and_passes() {
-        let at = Vector3::new(40.0, 8.0, 3.0);
-        let scene = street::joined(vec![street::street(5, 2.0, &[at], &[[0.0; 2]]); 2]);
-        let model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
-        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
-        let mut sights = lookout.seen(&model, &at, &scene.usable_rays()[..6], 50.0);
-        sights.sort_by(|a, b| a.between_rad.total_cmp(&b.between_rad));
-        let hits = sights.iter().filter(|sight| sight.is_hit).count();
-        assert_eq!((sights.len(), hits), (10, 6));
-        // Where both passes have the same place, one has a vote there: but the pass with one vote has no other.
-        assert!(sights[0].between_rad < 1e-6);
-        let alone = sights.iter().filter(|sight| sight.is_hit && sight.within_rad > WIDEST_RAD).count();
-        assert_eq!(alone, 1);
-        let next_rad = 2.0 * 8.0 / (40.0_f64.powi(2) + 8.0 * 8.0);
-        let nearest = sights.iter().filter(|sight| sight.is_hit).map(|sight| sight.within_rad).fold(9.0, f64::min);
-        assert!((0.9..1.6).contains(&(nearest / next_rad)), "{nearest} {next_rad}");
     }
 
     #[test]

@@ -9,6 +9,7 @@
 //! 5. [`finish`](mod@finish): positions and covariances, objects of a place together ([`estimate`](mod@estimate), [`drift`], [`contest`]).
 //! 6. [`few`]: objects of one or two votes. [`existence`]: which objects exist. [`switches`]: identity switches are left out.
 
+pub mod aspect;
 pub mod assign;
 pub mod births;
 pub mod calibrate;

@@ -8,6 +8,7 @@ use std::sync::Arc;
 
 use nalgebra::Vector3;
 
+use super::aspect::Aspect;
 use super::clutter::Steps;
 use super::confusion::Confusions;
 use super::counts::FEW;
@@ -17,7 +18,6 @@ use super::noise::{Noise, Spread};
 use super::parts::Part;
 use super::prior::Prior;
 use super::ranges::{Measured, measured, range_terms};
-use super::reach::Aspect;
 use super::scene::Scene;
 use super::{Settings, spreads_of};
 use crate::ray::Ray;
@@ -49,7 +49,7 @@ pub struct ClassModel {
     pub score_ratio: Steps,
     /// The share of the looks from some distance, m, that are hits, of that where it is largest.
     pub reach: Steps,
-    /// The share of the looks at some angle to the nearest vote, rad, that are hits, of that where it is largest.
+    /// The same of the looks from some angle to the nearest vote.
     pub aspect: Aspect,
     /// What is added to the logarithm of the odds of objects of one vote, of two, and of more that rays alone do not tell: what the numbers of others allow.
     pub ln_odds_of_few: [f64; FEW],
@@ -96,7 +96,7 @@ impl ClassModel {
     }
 
     /// How many numbers it is stored as.
-    pub const NUMBERS: usize = 20 + Heights::NUMBERS + 6 * Steps::NUMBERS + Existing::NUMBERS;
+    pub const NUMBERS: usize = 20 + Heights::NUMBERS + 4 * Steps::NUMBERS + Aspect::NUMBERS + Existing::NUMBERS;
 
     /// All of it as numbers, for storage.
     #[must_use]
@@ -124,16 +124,9 @@ impl ClassModel {
             self.ranges.0,
             self.ranges.1,
         ];
-        let steps = [
-            self.clutter_by_elevation,
-            self.score_ratio,
-            self.reach,
-            self.aspect.within_pass,
-            self.aspect.between_passes,
-            self.company,
-        ];
-        let steps = steps.map(|steps| steps.to_row());
-        numbers.into_iter().chain(heights).chain(steps.into_iter().flatten()).chain(self.existing.to_row()).collect()
+        let steps = [self.clutter_by_elevation, self.score_ratio, self.reach, self.company].map(|steps| steps.to_row());
+        let told = self.aspect.to_row().into_iter().chain(self.existing.to_row());
+        numbers.into_iter().chain(heights).chain(steps.into_iter().flatten()).chain(told).collect()
     }
 
     /// What `to_row` returned; nothing of another number of numbers.
@@ -144,9 +137,8 @@ impl ClassModel {
         let (clutter, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
         let (scores, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
         let (reach, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
-        let (within_pass, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
-        let (between_passes, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
         let (company, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
+        let (aspect, rest) = rest.split_first_chunk::<{ Aspect::NUMBERS }>()?;
         let existing = Existing::from_row(rest.try_into().ok()?)?;
         let &[
             is_learned,
@@ -183,10 +175,7 @@ impl ClassModel {
             clutter_by_elevation: Steps::from_row(clutter),
             score_ratio: Steps::from_row(scores),
             reach: Steps::from_row(reach),
-            aspect: Aspect {
-                within_pass: Steps::from_row(within_pass),
-                between_passes: Steps::from_row(between_passes),
-            },
+            aspect: Aspect::from_row(aspect),
             ln_odds_of_few: [ln_odds_of_one, ln_odds_of_two, ln_odds_of_more],
             company: Steps::from_row(company),
             sizes: Sizes { angle: (angle_mean, angle_sd), object: (object_mean, object_sd), spread },

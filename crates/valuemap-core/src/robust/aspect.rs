@@ -1,0 +1,236 @@
+//! Detection rate by viewing angle: how much rarer objects are detected from directions that are farther from those of their votes.
+//!
+//! Faces turn their backs to some cameras, poles to none. It weighs looks in equation (5) of `docs/method.md`: a miss from where an object may not be seen
+//! says less. What an angle says depends on how many votes there are: beside a single vote an object may be seen as far as any is, but between a hundred
+//! there is hardly a side left that is seen and has none. So the share of hits is learned by the angle to the nearest of 1, 2, 4 and more votes of the same pass,
+//! and to the nearest vote of 1, 2, 4 and more other passes.
+
+use std::f64::consts::PI;
+
+use nalgebra::Vector3;
+
+use super::clutter::BINS;
+use super::energy::Object;
+use super::looks::Lookout;
+use super::model::Model;
+use super::reach::{MOST_OBJECTS, relative};
+use super::scene::{Scene, View};
+
+/// Larger angles are another side, rad: what is seen from there says nothing of here.
+pub const WIDEST_RAD: f64 = PI / 12.0;
+/// Directions nearer to each other than this, rad, are one: half of what rates are told apart by.
+const SAME_DIRECTION_RAD: f64 = 0.5 * WIDEST_RAD / BINS as f64;
+/// From how many votes or passes on: powers of two, to 32.
+const LEVELS: usize = 6;
+
+/// The share of the looks at a class that are hits, over that where it is largest, by the angle to the nearest vote.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Aspect {
+    /// To the nearest of so many votes of the same pass.
+    pub within_pass: [[f64; BINS]; LEVELS],
+    /// To the nearest vote of so many passes, where the pass itself has none near.
+    pub between_passes: [[f64; BINS]; LEVELS],
+}
+
+impl Aspect {
+    /// Seen from everywhere.
+    pub const ONE: Self = Self { within_pass: [[1.0; BINS]; LEVELS], between_passes: [[1.0; BINS]; LEVELS] };
+
+    /// As many numbers.
+    pub const NUMBERS: usize = 2 * LEVELS * BINS;
+
+    /// As numbers, for storage.
+    #[must_use]
+    pub fn to_row(&self) -> Vec<f64> {
+        [self.within_pass, self.between_passes].concat().concat()
+    }
+
+    /// What `to_row` returned.
+    #[must_use]
+    pub fn from_row(row: &[f64; Self::NUMBERS]) -> Self {
+        let of = |first: usize| -> [[f64; BINS]; LEVELS] {
+            std::array::from_fn(|level| std::array::from_fn(|bin| row[(first + level) * BINS + bin]))
+        };
+        Self { within_pass: of(0), between_passes: of(LEVELS) }
+    }
+
+    /// The shares of hits by angle that the looks at sure objects up to `farthest_m` tell.
+    #[must_use]
+    pub fn learn(model: &Model<'_>, lookout: &Lookout, sure: &[&Object], farthest_m: f64) -> Self {
+        let [mut within, mut between] = [[[[0.0; 2]; BINS]; LEVELS]; 2];
+        for object in sure.iter().step_by(sure.len().div_ceil(MOST_OBJECTS).max(1)) {
+            let point = &object.fit.point;
+            let directions = Directions::of(model.scene, point, &object.votes);
+            for (image, is_hit) in lookout.seen(model, point, &object.votes, farthest_m) {
+                let view = &model.scene.views[image as usize];
+                let count = |of_bins: &mut [[f64; 2]; BINS], angle_rad: f64| {
+                    if angle_rad <= WIDEST_RAD {
+                        let of_bin = &mut of_bins[bin(angle_rad)];
+                        *of_bin = [of_bin[0] + f64::from(u8::from(is_hit)), of_bin[1] + 1.0];
+                    }
+                };
+                for level in 0..LEVELS {
+                    let angles_rad = directions.angles_to_some(view, point, 1 << level);
+                    count(&mut within[level], angles_rad[0]);
+                    count(&mut between[level], angles_rad[1]);
+                }
+            }
+        }
+        let relative = |of_bins: [[f64; 2]; BINS]| relative(&of_bins).unwrap_or([1.0; BINS]);
+        Self { within_pass: within.map(relative), between_passes: between.map(relative) }
+    }
+}
+
+/// Which rates so many votes or passes have.
+fn level(count: usize) -> usize {
+    (count.max(1).ilog2() as usize).min(LEVELS - 1)
+}
+
+fn bin(angle_rad: f64) -> usize {
+    ((angle_rad / WIDEST_RAD * BINS as f64) as usize).min(BINS - 1)
+}
+
+/// The directions from which an object is voted for.
+pub struct Directions {
+    /// By pass, along the drive there, with the viewpoint: one for each.
+    of_passes: Vec<Vec<(u32, Vector3<f64>)>>,
+    /// The passes, ascending.
+    passes: Vec<u32>,
+    /// Of all passes, none nearer to another one than `SAME_DIRECTION_RAD`.
+    all: Vec<Vector3<f64>>,
+}
+
+impl Directions {
+    /// Those of some rays (ascending) that vote for a point.
+    #[must_use]
+    pub fn of(scene: &Scene, point: &Vector3<f64>, voters: &[u32]) -> Self {
+        let mut views: Vec<&View> = voters.iter().map(|&ray| scene.view(ray)).collect();
+        views.sort_by_key(|view| view.pass);
+        views.dedup_by_key(|view| view.viewpoint);
+        let direction = |view: &&View| (view.viewpoint, (view.center - point).normalize());
+        let of_passes: Vec<Vec<(u32, Vector3<f64>)>> =
+            views.chunk_by(|a, b| a.pass == b.pass).map(|pass| pass.iter().map(direction).collect()).collect();
+        let mut all: Vec<Vector3<f64>> = Vec::new();
+        for (_, direction) in of_passes.iter().flatten() {
+            if angle_rad(&all, direction) > SAME_DIRECTION_RAD {
+                all.push(*direction);
+            }
+        }
+        let mut passes: Vec<u32> = views.iter().map(|view| view.pass).collect();
+        passes.dedup();
+        Self { of_passes, passes, all }
+    }
+
+    /// How much rarer than at best an object is detected by a camera that looks at it from a direction.
+    #[must_use]
+    pub fn rate(&self, aspect: &Aspect, pass: u32, direction: &Vector3<f64>) -> f64 {
+        if let Ok(own) = self.passes.binary_search(&pass) {
+            let own = &self.of_passes[own];
+            let within_rad = angle_rad(own.iter().map(|(_, direction)| direction), direction);
+            if within_rad <= WIDEST_RAD {
+                return aspect.within_pass[level(own.len())][bin(within_rad)];
+            }
+        }
+        aspect.between_passes[level(self.passes.len())][bin(angle_rad(&self.all, direction))]
+    }
+
+    /// The angles between the direction of a view and the nearest of so many votes of the same pass but for its own viewpoint, and the nearest vote of
+    /// so many other passes, rad; half a turn and more where there are not so many. Which ones is by chance, so that they are anywhere.
+    fn angles_to_some(&self, view: &View, point: &Vector3<f64>, count: usize) -> [f64; 2] {
+        let direction = (view.center - point).normalize();
+        let is_own = |pass: usize| self.passes[pass] == view.pass;
+        let votes = (0..self.passes.len()).filter(|&pass| is_own(pass)).flat_map(|pass| &self.of_passes[pass]);
+        let votes: Vec<&Vector3<f64>> =
+            votes.filter(|(viewpoint, _)| *viewpoint != view.viewpoint).map(|(_, direction)| direction).collect();
+        let others: Vec<usize> = (0..self.passes.len()).filter(|&pass| !is_own(pass)).collect();
+        let of_others = some(&others, count, view.viewpoint).into_iter().flat_map(|&pass| &self.of_passes[pass]);
+        [
+            angle_rad(some(&votes, count, view.viewpoint).into_iter().copied(), &direction),
+            angle_rad(of_others.map(|(_, direction)| direction), &direction),
+        ]
+    }
+}
+
+/// So many of some things, as far from each other as may be, beginning anywhere; none if there are not so many.
+fn some<T>(all: &[T], count: usize, anywhere: u32) -> Vec<&T> {
+    if all.len() < count {
+        return Vec::new();
+    }
+    (0..count).map(|i| &all[(i * all.len() / count + anywhere as usize) % all.len()]).collect()
+}
+
+/// The angle between a direction and the nearest of some others, rad, up to the third order.
+fn angle_rad<'a>(others: impl IntoIterator<Item = &'a Vector3<f64>>, direction: &Vector3<f64>) -> f64 {
+    let cosine = others.into_iter().map(|other| other.dot(direction)).fold(-1.0, f64::max);
+    (2.0 - 2.0 * cosine).max(0.0).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::street;
+
+    /// The share of hits falls to nothing at once.
+    const FALLING: [f64; BINS] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+
+    #[test]
+    fn misses_count_less_the_farther_they_are_from_votes_of_their_pass_or_else_of_others() {
+        let at = Vector3::new(40.0, 8.0, 3.0);
+        let scene =
+            street::joined(vec![street::street(15, 2.0, &[at], &[[0.0; 2]]), street::street(15, 2.0, &[], &[])]);
+        let mut model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        // The first images of the first pass have votes, the last are 20 degrees aside.
+        let votes = scene.usable_rays()[..8].to_vec();
+        let expected = |model: &Model<'_>| {
+            let seen = lookout.looks(model, &at, &votes, &[]);
+            let of_pass = |pass: usize| seen.sectors[0].get(pass).map_or(0.0, |looks| looks.expected);
+            [of_pass(0), of_pass(1)]
+        };
+        model.classes[0].is_learned = true;
+        model.classes[0].farthest_m = 50.0;
+        let whole = expected(&model);
+        model.classes[0].aspect.within_pass[3] = FALLING;
+        let within = expected(&model);
+        assert!((8.0..whole[0] - 0.5).contains(&within[0]) && (within[1] - whole[1]).abs() < 1e-12);
+        model.classes[0].aspect = Aspect::ONE;
+        model.classes[0].aspect.between_passes[0] = FALLING;
+        let between = expected(&model);
+        assert!((1.0..whole[1] - 0.5).contains(&between[1]) && (between[0] - whole[0]).abs() < 1e-12);
+    }
+
+    #[test]
+    fn rates_are_those_of_as_many_votes_and_passes() {
+        assert_eq!([0, 1, 3, 4, 31, 32, 1000].map(level), [0, 0, 1, 2, 4, 5, 5]);
+    }
+
+    #[test]
+    fn some_of_all_are_apart_and_anywhere() {
+        let all: Vec<usize> = (0..8).collect();
+        let [first, next] = [0, 1].map(|anywhere| some(&all, 4, anywhere).into_iter().copied().collect::<Vec<_>>());
+        assert_eq!((first, next), (vec![0, 2, 4, 6], vec![1, 3, 5, 7]));
+        assert!(some(&all, 9, 0).is_empty());
+    }
+
+    #[test]
+    fn what_is_seen_from_one_side_of_two_passes_is_told_by_the_angle_to_the_other() {
+        let at = Vector3::new(40.0, 8.0, 3.0);
+        let scene = street::joined(vec![street::street(15, 2.0, &[at], &[[0.0; 2]]); 2]);
+        let model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
+        // Of the first pass the first half has votes.
+        let rays = scene.usable_rays();
+        let votes: Vec<u32> = rays.iter().copied().filter(|&ray| !(7..15).contains(&ray)).collect();
+        let directions = Directions::of(&scene, &at, &votes);
+        let of = |image: usize, count| directions.angles_to_some(&scene.views[image], &at, count);
+        // The other pass was at the same places; of the own pass the nearest vote but its own is one image away.
+        let next_rad = 2.0 * 8.0 / (40.0_f64.powi(2) + 8.0 * 8.0);
+        assert!(of(3, 1)[1] < 1e-6 && (0.3..3.0).contains(&(of(3, 4)[0] / next_rad)), "{:?}", of(3, 4));
+        assert!(of(3, 16)[0] > WIDEST_RAD && of(3, 4)[1] > WIDEST_RAD);
+        assert!(of(14, 4)[0] > of(8, 4)[0] && of(14, 4)[0] > 4.0 * next_rad);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let object = super::super::energy::object(&model, &lookout, votes, at, Vec::new());
+        let learned = object.map_or(Aspect::ONE, |object| Aspect::learn(&model, &lookout, &[&object], 50.0));
+        let falls = |shares: &[f64; BINS]| shares.iter().any(|share| *share < 0.9);
+        assert!(falls(&learned.within_pass[2]) && !falls(&learned.within_pass[5]), "{learned:?}");
+    }
+}
