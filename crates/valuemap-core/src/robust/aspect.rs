@@ -135,7 +135,7 @@ impl Directions {
     }
 
     /// The angles between the direction of a view and the nearest of so many votes of the same pass but for its own viewpoint, and the nearest vote of
-    /// so many other passes, rad; half a turn and more where there are not so many. Which ones is by chance, so that they are anywhere.
+    /// so many other passes, rad; larger than `WIDEST_RAD` where there are not so many. Which ones depends on the viewpoint, so that they are anywhere.
     fn angles_to_some(&self, view: &View, point: &Vector3<f64>, count: usize) -> [f64; 2] {
         let direction = (view.center - point).normalize();
         let is_own = |pass: usize| self.passes[pass] == view.pass;
@@ -159,7 +159,7 @@ fn some<T>(all: &[T], count: usize, anywhere: u32) -> Vec<&T> {
     (0..count).map(|i| &all[(i * all.len() / count + anywhere as usize) % all.len()]).collect()
 }
 
-/// The angle between a direction and the nearest of some others, rad, up to the third order.
+/// The angle between a direction and the nearest of some others, rad, up to the third order; 2 without any.
 fn angle_rad<'a>(others: impl IntoIterator<Item = &'a Vector3<f64>>, direction: &Vector3<f64>) -> f64 {
     let cosine = others.into_iter().map(|other| other.dot(direction)).fold(-1.0, f64::max);
     (2.0 - 2.0 * cosine).max(0.0).sqrt()
