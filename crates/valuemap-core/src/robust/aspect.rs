@@ -10,14 +10,12 @@ use std::f64::consts::PI;
 use nalgebra::Vector3;
 
 use super::clutter::BINS;
-use super::energy::Object;
-use super::looks::Lookout;
 use super::model::Model;
-use super::reach::{MOST_OBJECTS, relative};
+use super::reach::{LookedAt, Tally, bin, count, relative};
 use super::scene::{Scene, View};
 
 /// Larger angles are another side, rad: what is seen from there says nothing of here.
-pub const WIDEST_RAD: f64 = PI / 12.0;
+const WIDEST_RAD: f64 = PI / 12.0;
 /// Directions nearer to each other than this, rad, are one: half of what rates are told apart by.
 const SAME_DIRECTION_RAD: f64 = 0.5 * WIDEST_RAD / BINS as f64;
 /// From how many votes or passes on: powers of two, to 32.
@@ -54,40 +52,31 @@ impl Aspect {
         Self { within_pass: of(0), between_passes: of(LEVELS) }
     }
 
-    /// The shares of hits by angle that the looks at sure objects up to `farthest_m` tell.
+    /// The shares of hits by angle that the looks at sure objects tell.
     #[must_use]
-    pub fn learn(model: &Model<'_>, lookout: &Lookout, sure: &[&Object], farthest_m: f64) -> Self {
-        let [mut within, mut between] = [[[[0.0; 2]; BINS]; LEVELS]; 2];
-        for object in sure.iter().step_by(sure.len().div_ceil(MOST_OBJECTS).max(1)) {
-            let point = &object.fit.point;
-            let directions = Directions::of(model.scene, point, &object.votes);
-            for (image, is_hit) in lookout.seen(model, point, &object.votes, farthest_m) {
-                let view = &model.scene.views[image as usize];
-                let count = |of_bins: &mut [[f64; 2]; BINS], angle_rad: f64| {
-                    if angle_rad <= WIDEST_RAD {
-                        let of_bin = &mut of_bins[bin(angle_rad)];
-                        *of_bin = [of_bin[0] + f64::from(u8::from(is_hit)), of_bin[1] + 1.0];
+    pub fn learn(model: &Model<'_>, sure: &[LookedAt<'_>]) -> Self {
+        let [mut within, mut between] = [[Tally::default(); LEVELS]; 2];
+        for LookedAt { object, images } in sure {
+            let directions = Directions::of(model.scene, &object.fit.point, &object.votes);
+            for &(image, is_hit) in images {
+                let angles_rad = directions.angles_to_some(&model.scene.views[image as usize], &object.fit.point);
+                for (level, [within_rad, between_rad]) in angles_rad.into_iter().enumerate() {
+                    for (tally, angle_rad) in [(&mut within[level], within_rad), (&mut between[level], between_rad)] {
+                        if angle_rad <= WIDEST_RAD {
+                            count(tally, angle_rad / WIDEST_RAD, is_hit);
+                        }
                     }
-                };
-                for level in 0..LEVELS {
-                    let angles_rad = directions.angles_to_some(view, point, 1 << level);
-                    count(&mut within[level], angles_rad[0]);
-                    count(&mut between[level], angles_rad[1]);
                 }
             }
         }
-        let relative = |of_bins: [[f64; 2]; BINS]| relative(&of_bins).unwrap_or([1.0; BINS]);
-        Self { within_pass: within.map(relative), between_passes: between.map(relative) }
+        let shares = |tally: Tally| relative(&tally).unwrap_or([1.0; BINS]);
+        Self { within_pass: within.map(shares), between_passes: between.map(shares) }
     }
 }
 
 /// Which rates so many votes or passes have.
 fn level(count: usize) -> usize {
     (count.max(1).ilog2() as usize).min(LEVELS - 1)
-}
-
-fn bin(angle_rad: f64) -> usize {
-    ((angle_rad / WIDEST_RAD * BINS as f64) as usize).min(BINS - 1)
 }
 
 /// The directions from which an object is voted for.
@@ -128,26 +117,30 @@ impl Directions {
             let own = &self.of_passes[own];
             let within_rad = angle_rad(own.iter().map(|(_, direction)| direction), direction);
             if within_rad <= WIDEST_RAD {
-                return aspect.within_pass[level(own.len())][bin(within_rad)];
+                return aspect.within_pass[level(own.len())][bin(within_rad / WIDEST_RAD)];
             }
         }
-        aspect.between_passes[level(self.passes.len())][bin(angle_rad(&self.all, direction))]
+        aspect.between_passes[level(self.passes.len())][bin(angle_rad(&self.all, direction) / WIDEST_RAD)]
     }
 
-    /// The angles between the direction of a view and the nearest of so many votes of the same pass but for its own viewpoint, and the nearest vote of
-    /// so many other passes, rad; larger than `WIDEST_RAD` where there are not so many. Which ones depends on the viewpoint, so that they are anywhere.
-    fn angles_to_some(&self, view: &View, point: &Vector3<f64>, count: usize) -> [f64; 2] {
+    /// By level, the angles between the direction of a view and the nearest of so many votes of the same pass but for its own viewpoint, and the nearest
+    /// vote of so many other passes, rad; larger than `WIDEST_RAD` where there are not so many. Which ones depends on the viewpoint, so that they are
+    /// anywhere.
+    fn angles_to_some(&self, view: &View, point: &Vector3<f64>) -> [[f64; 2]; LEVELS] {
         let direction = (view.center - point).normalize();
-        let is_own = |pass: usize| self.passes[pass] == view.pass;
-        let votes = (0..self.passes.len()).filter(|&pass| is_own(pass)).flat_map(|pass| &self.of_passes[pass]);
+        let (own, others): (Vec<usize>, Vec<usize>) =
+            (0..self.passes.len()).partition(|&pass| self.passes[pass] == view.pass);
+        let votes = own.into_iter().flat_map(|pass| &self.of_passes[pass]);
         let votes: Vec<&Vector3<f64>> =
             votes.filter(|(viewpoint, _)| *viewpoint != view.viewpoint).map(|(_, direction)| direction).collect();
-        let others: Vec<usize> = (0..self.passes.len()).filter(|&pass| !is_own(pass)).collect();
-        let of_others = some(&others, count, view.viewpoint).into_iter().flat_map(|&pass| &self.of_passes[pass]);
-        [
-            angle_rad(some(&votes, count, view.viewpoint).into_iter().copied(), &direction),
-            angle_rad(of_others.map(|(_, direction)| direction), &direction),
-        ]
+        std::array::from_fn(|level| {
+            let of_others =
+                some(&others, 1 << level, view.viewpoint).into_iter().flat_map(|&pass| &self.of_passes[pass]);
+            [
+                angle_rad(some(&votes, 1 << level, view.viewpoint).into_iter().copied(), &direction),
+                angle_rad(of_others.map(|(_, direction)| direction), &direction),
+            ]
+        })
     }
 }
 
@@ -167,6 +160,8 @@ fn angle_rad<'a>(others: impl IntoIterator<Item = &'a Vector3<f64>>, direction: 
 
 #[cfg(test)]
 mod tests {
+    use super::super::looks::Lookout;
+    use super::super::reach::looked_at;
     use super::*;
     use crate::street;
 
@@ -221,7 +216,7 @@ mod tests {
         let rays = scene.usable_rays();
         let votes: Vec<u32> = rays.iter().copied().filter(|&ray| !(7..15).contains(&ray)).collect();
         let directions = Directions::of(&scene, &at, &votes);
-        let of = |image: usize, count| directions.angles_to_some(&scene.views[image], &at, count);
+        let of = |image: usize, count: usize| directions.angles_to_some(&scene.views[image], &at)[level(count)];
         // The other pass was at the same places; of the own pass the nearest vote but its own is one image away.
         let next_rad = 2.0 * 8.0 / (40.0_f64.powi(2) + 8.0 * 8.0);
         assert!(of(3, 1)[1] < 1e-6 && (0.3..3.0).contains(&(of(3, 4)[0] / next_rad)), "{:?}", of(3, 4));
@@ -229,7 +224,8 @@ mod tests {
         assert!(of(14, 4)[0] > of(8, 4)[0] && of(14, 4)[0] > 4.0 * next_rad);
         let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
         let object = super::super::energy::object(&model, &lookout, votes, at, Vec::new());
-        let learned = object.map_or(Aspect::ONE, |object| Aspect::learn(&model, &lookout, &[&object], 50.0));
+        let learned =
+            object.map_or(Aspect::ONE, |object| Aspect::learn(&model, &looked_at(&model, &lookout, &[&object], 50.0)));
         let falls = |shares: &[f64; BINS]| shares.iter().any(|share| *share < 0.9);
         assert!(falls(&learned.within_pass[2]) && !falls(&learned.within_pass[5]), "{learned:?}");
     }

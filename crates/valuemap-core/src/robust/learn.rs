@@ -12,7 +12,7 @@ use super::heights::{Heights, ground_m2 as ground_m2_within, height_m};
 use super::looks::Lookout;
 use super::model::{ClassModel, Model, ODD_PASSES, Rates};
 use super::parts::Part;
-use super::reach::reach;
+use super::reach::{looked_at, reach};
 use super::seen::{Looks, Shares};
 
 /// Steps of expectation and maximisation: some ten change the rates by less than a thousandth.
@@ -130,11 +130,12 @@ impl<'a> Evidence<'a> {
             learned.sizes.object = (object.0, object.1.max(learned.sizes.spread));
             learned.heights = if has(Part::Heights) { heights(model, &sure) } else { None };
             learned.ln_births_per_m2 = (of_class.len() as f64 / self.ground_m2).ln();
+            let looked_at = looked_at(model, self.lookout, &sure, learned.farthest_m);
             if has(Part::Reach) {
-                learned.reach = reach(model, self.lookout, &sure, learned.farthest_m);
+                learned.reach = reach(model, &looked_at, learned.farthest_m);
             }
             if has(Part::Aspect) {
-                learned.aspect = Aspect::learn(model, self.lookout, &sure, learned.farthest_m);
+                learned.aspect = Aspect::learn(model, &looked_at);
             }
             if has(Part::Company) {
                 learned.company = company(model, self.objects, &learned, of_class[0].class);

@@ -9,27 +9,57 @@ use super::looks::Lookout;
 use super::model::Model;
 
 /// Objects that tell, at most: a share of some thousand looks is known to 1 %.
-pub const MOST_OBJECTS: usize = 400;
+const MOST_OBJECTS: usize = 400;
+
+/// Hits and looks by bins.
+pub type Tally = [[f64; 2]; BINS];
+
+/// The images that look at a sure object, and whether they have a vote.
+pub struct LookedAt<'a> {
+    /// The object.
+    pub object: &'a Object,
+    /// The images.
+    pub images: Vec<(u32, bool)>,
+}
+
+/// The looks at sure objects up to `farthest_m`, of which no more are asked than tell.
+#[must_use]
+pub fn looked_at<'a>(model: &Model<'_>, lookout: &Lookout, sure: &[&'a Object], farthest_m: f64) -> Vec<LookedAt<'a>> {
+    let images = |object: &Object| lookout.seen(model, &object.fit.point, &object.votes, farthest_m);
+    let some = sure.iter().step_by(sure.len().div_ceil(MOST_OBJECTS).max(1));
+    some.map(|&object| LookedAt { object, images: images(object) }).collect()
+}
 
 /// The share of the looks at sure objects that are hits, by distance up to `farthest_m`, over that where it is largest.
 #[must_use]
-pub fn reach(model: &Model<'_>, lookout: &Lookout, sure: &[&Object], farthest_m: f64) -> Steps {
-    let mut of_bins = [[0.0; 2]; BINS];
-    for object in sure.iter().step_by(sure.len().div_ceil(MOST_OBJECTS).max(1)) {
-        let point = &object.fit.point;
-        for (image, is_hit) in lookout.seen(model, point, &object.votes, farthest_m) {
-            let distance_m = (model.scene.views[image as usize].center - point).norm();
-            let of_bin = &mut of_bins[((distance_m / farthest_m * BINS as f64) as usize).min(BINS - 1)];
-            *of_bin = [of_bin[0] + f64::from(u8::from(is_hit)), of_bin[1] + 1.0];
+pub fn reach(model: &Model<'_>, sure: &[LookedAt<'_>], farthest_m: f64) -> Steps {
+    let mut tally = Tally::default();
+    for LookedAt { object, images } in sure {
+        for &(image, is_hit) in images {
+            let distance_m = (model.scene.views[image as usize].center - object.fit.point).norm();
+            count(&mut tally, distance_m / farthest_m, is_hit);
         }
     }
-    relative(&of_bins).map_or(Steps::ONE, |shares| Steps::even(farthest_m, shares))
+    relative(&tally).map_or(Steps::ONE, |shares| Steps::even(farthest_m, shares))
+}
+
+/// Of the even bins between 0 and 1 the one of a number, the last one of larger ones.
+#[must_use]
+pub fn bin(part: f64) -> usize {
+    ((part * BINS as f64) as usize).min(BINS - 1)
+}
+
+/// Count a look in the bin of a number.
+pub fn count(tally: &mut Tally, part: f64, is_hit: bool) {
+    let [hits, looks] = &mut tally[bin(part)];
+    *hits += f64::from(u8::from(is_hit));
+    *looks += 1.0;
 }
 
 /// The share of hits in each bin, over the largest, of the hits and looks there; nothing without hits. From where few looks were, objects are taken to be
 /// seen as often as elsewhere: one look that is a hit does not make all others rare.
 #[must_use]
-pub fn relative(of_bins: &[[f64; 2]; BINS]) -> Option<[f64; BINS]> {
+pub fn relative(of_bins: &Tally) -> Option<[f64; BINS]> {
     let [hits, looks] = of_bins.iter().fold([0.0; 2], |sum, of_bin| [sum[0] + of_bin[0], sum[1] + of_bin[1]]);
     let shares = of_bins.map(|[of_hits, of_looks]| (of_hits + LEAST_LOOKS * hits / looks) / (of_looks + LEAST_LOOKS));
     let largest = shares.iter().copied().fold(0.0, f64::max);
