@@ -27,6 +27,7 @@ from valuemap.check.contest import _compare, _joined, _Reading, _suspicion, hold
 from valuemap.check.fault import (
     LEAST_CHANCE,
     Convention,
+    Finding,
     View,
     gains_of_all,
     keep_rows,
@@ -468,8 +469,7 @@ def test_nothing_measured_is_given_up_where_another_reading_stands_the_cameras_u
     given = simulate(_LOOSE, seed=300)
     spoiled = INJECTED["inverted_poses"].spoil(given)
     assert spoiled is not None
-    finding = hold_contest(View(spoiled), CONVENTIONS).finding
-    assert finding is not None
+    finding = convention_told(spoiled)
     assert finding.fault == "inverted_poses"
 
 
@@ -517,8 +517,7 @@ def test_an_axis_the_other_way_is_no_other_world_on_flat_ground(good: Dataset) -
     flat = with_poses(good, level_rotations(headings(good)[0], good.frame), center)
     mirrored = INJECTED["mirrored_positions"].spoil(flat)
     assert mirrored is not None
-    finding = hold_contest(View(mirrored), CONVENTIONS).finding
-    assert finding is not None
+    finding = convention_told(mirrored)
     assert finding.fault == "mirrored_positions"
 
 
@@ -553,8 +552,7 @@ def test_every_fault_of_the_registry_is_injected() -> None:
 def test_a_wrong_convention_is_named_and_undone(name: str, good: Dataset, view: View) -> None:
     spoiled = INJECTED[name].spoil(good)
     assert spoiled is not None
-    finding = hold_contest(View(spoiled), CONVENTIONS).finding
-    assert finding is not None
+    finding = convention_told(spoiled)
     assert finding.fault == name
     assert finding.chance is not None
     assert finding.chance < 1e-3
@@ -743,6 +741,13 @@ def test_a_lens_is_named_only_where_it_changes_a_map(
 # ------------------------------------------------------------------------------- mistakes of other sizes and parts
 
 
+def convention_told(dataset: Dataset) -> Finding:
+    """Return what is said of the conventions of a dataset, of which something must be."""
+    finding = hold_contest(View(dataset), CONVENTIONS).finding
+    assert finding is not None
+    return finding
+
+
 def named(dataset: Dataset) -> list[str]:
     return [finding.fault for finding in examine(dataset).findings]
 
@@ -774,8 +779,7 @@ def test_boxes_of_the_square_that_a_detector_saw_are_named_and_undone(is_squeeze
     shown = extent if is_squeezed else np.repeat(extent.max(axis=1, keepdims=True), 2, axis=1)
     center = (good.detections.center_px + (shown - extent) / 2.0) * 416.0 / shown
     spoiled = with_detections(good, center_px=center, size_px=good.detections.size_px * 416.0 / shown)
-    finding = hold_contest(View(spoiled), CONVENTIONS).finding
-    assert finding is not None
+    finding = convention_told(spoiled)
     assert finding.fault == "picture_size"
     assert finding.fix is not None
     np.testing.assert_allclose(finding.fix(spoiled).detections.center_px, good.detections.center_px)
@@ -785,20 +789,17 @@ def test_headings_alone_in_the_wrong_unit_are_told_from_all_angles(good: Dataset
     azimuth, pitch, roll = headings(good)
     rotation = rotations_of(np.radians(azimuth), pitch, roll, good.frame)
     spoiled = with_poses(good, rotation, camera_centers(good.images))
-    finding = hold_contest(View(spoiled), CONVENTIONS).finding
-    assert finding is not None
+    finding = convention_told(spoiled)
     assert finding.figures["reading"] == "headings in radians clockwise from north read as degrees"
 
 
 def test_cameras_on_their_side_and_pictures_turned_by_a_quarter_are_undone(good: Dataset) -> None:
-    finding = hold_contest(View(turned_by(good, "z", 90.0)), CONVENTIONS).finding
-    assert finding is not None
+    finding = convention_told(turned_by(good, "z", 90.0))
     assert finding.fault == "camera_axes"
     extent, center = picture_sizes(good), good.detections.center_px
     turned = np.stack([extent[:, 1] - center[:, 1], center[:, 0]], axis=1)
     spoiled = with_detections(good, center_px=turned, size_px=good.detections.size_px[:, ::-1].copy())
-    finding = hold_contest(View(spoiled), CONVENTIONS).finding
-    assert finding is not None
+    finding = convention_told(spoiled)
     assert finding.figures["reading"] == "turned a quarter to the right"
     assert finding.fix is not None
     np.testing.assert_allclose(finding.fix(spoiled).detections.center_px, center)
