@@ -233,7 +233,7 @@ pub struct Sizes {
 }
 
 /// Detections this many times farther than `max_range_m` still vote.
-const VOTE_RANGE: f64 = 2.5;
+pub const VOTE_RANGE: f64 = 2.5;
 /// A vote's size disagrees with its object's by chance in this share of the votes: half hidden, cut, merged with another. It bounds
 /// what one size can say. 5 % as in robust regression (Huber and Ronchetti, "Robust Statistics", 2009, section 1).
 const ODD_SIZES: f64 = 0.05;
