@@ -33,6 +33,7 @@ from valuemap.refine import footage as refine_footage
 from valuemap.refine import images as refine_images
 from valuemap.refine import select as refine_select
 from valuemap.refine.adjust import Adjustment, Scales
+from valuemap.refine.alias import without_aliases
 from valuemap.refine.delay import _is_gain, delay_alone
 from valuemap.refine.estimate import Estimate, cut_into_segments, mounts_alone, prices
 from valuemap.refine.footage import Footage, Motion, Sigmas, _within, find_motion, gather, in_working_frame
@@ -426,6 +427,131 @@ def test_single_images_are_looked_at_only_where_they_are_off_by_more_than_was_th
     assert len(asked) == 1
     monkeypatch.undo()
     assert not refine_poses(clean, valuemap.MapConfig()).is_noisy
+
+
+def rows_of_signs(moved_m: Floats | None = None) -> tuple[Footage, Estimate]:
+    """Return a city of rows of signs and what is to be found there, one drive `moved_m` from its poses."""
+    dataset = city(has_lights=0, sign_row_spacing_m=30.0, min_row_signs=4)
+    assert dataset.truth_detections is not None
+    ordered = in_driving_order(dataset, viewpoint_step_m=1.0)
+    rotation, center = camera_poses(ordered.dataset.images)
+    drives = ordered.drives
+    drive = a_drive(drives)
+    if moved_m is not None:
+        center[drives.pass_code == drive] -= moved_m
+    moving = dataclasses.replace(
+        ordered.dataset, images=refine_footage.with_poses(ordered.dataset.images, rotation, center)
+    )
+    footage = gather(*in_working_frame(moving, drives, 1.0))
+    shown = ordered.rows_of_detections(dataset.truth_detections.detection_id)
+    place = np.full(len(ordered.dataset.detections), -1)
+    place[footage.detection_row] = np.arange(len(footage.detection_row))
+    kept = place[shown] >= 0
+    detection, thing = place[shown][kept], np.unique(dataset.truth_detections.object_id[kept], return_inverse=True)[1]
+    few = np.bincount(thing) < 8
+    detection, thing = detection[~few[thing]], np.unique(thing[~few[thing]], return_inverse=True)[1]
+    things = int(thing.max()) + 1
+    counts = (drives.count,) * 3 + (1,) * 3
+    truth = dataset.truth
+    assert truth is not None
+    kinds = np.unique(dataset.truth_detections.object_id[kept])[~few]
+    points = refine_footage.points_in_working_frame(
+        moving, truth.position_in_world_m[rows_of(kinds, truth.object_id)], 1.0
+    )
+    state = State.zero(points, len(footage.chain.drive), len(footage.row), counts)
+    if moved_m is not None:
+        state.constants[OFFSET][drive] = moved_m
+    every = np.arange(drives.count)
+    noise = refine_estimate.Noise()
+    estimate = Estimate(
+        detection,
+        thing,
+        footage.rays.class_code[detection[np.unique(thing, return_index=True)[1]]].astype(np.int64),
+        np.full(things, np.nan),
+        Segments(every, np.zeros_like(every)),
+        Links.none(),
+        state,
+        noise,
+        refine_estimate._sigmas(footage, noise),
+        refine_estimate.WIDE,
+        things,
+    )
+    return footage, estimate
+
+
+def a_drive(drives: Drives) -> int:
+    """Return the shortest drive that is no turn at a corner."""
+    images = np.bincount(drives.pass_code)
+    return int(np.argmin(np.where(images < 50, np.inf, images)))
+
+
+def along_the_row(footage: Footage, drive: int, signs: int) -> Floats:
+    """Return a shift by so many signs of a row, which stand 0.9 m apart, along the street of a drive."""
+    center = footage.center_in_world_m[footage.drives.pass_code == drive]
+    way = center[-1] - center[0]
+    way[2] = 0.0
+    return np.asarray(0.9 * signs * way / np.linalg.norm(way))
+
+
+@pytest.mark.parametrize("signs", [1, -1, 2])
+def test_a_drive_that_was_laid_one_sign_further_on_is_put_back(signs: int) -> None:
+    footage, right = rows_of_signs()
+    drive = a_drive(footage.drives)
+    alias = along_the_row(footage, drive, signs)
+    state = dataclasses.replace(
+        right.state, constants=(right.state.constants[OFFSET].copy(), *right.state.constants[1:])
+    )
+    state.constants[OFFSET][drive] = alias
+    images = np.flatnonzero(footage.drives.pass_code == drive)
+    detection, thing, _ = tracks.associate(
+        footage, state, right.class_code, right.size_m, footage.drives.pass_code, right.sigma_px, 60.0, images
+    )
+    others = footage.drives.pass_code[footage.rays.image_row[right.detection]] != drive
+    laid = dataclasses.replace(
+        right,
+        detection=np.append(right.detection[others], detection),
+        thing=np.append(right.thing[others], thing),
+        state=state,
+    )
+    wrong = dict(zip(laid.detection.tolist(), laid.thing.tolist(), strict=True))
+    truth = dict(zip(right.detection.tolist(), right.thing.tolist(), strict=True))
+    assert len(detection) > 10
+    assert sum(wrong[row] == truth.get(row) for row in detection.tolist()) < 0.3 * len(detection)
+    back = without_aliases(footage, laid, 60.0)
+    assert np.linalg.norm(back.state.constants[OFFSET][drive]) < 0.4
+    np.testing.assert_array_equal(
+        np.delete(back.state.constants[OFFSET], drive, axis=0), np.delete(right.state.constants[OFFSET], drive, axis=0)
+    )
+    of_drive = footage.drives.pass_code[footage.rays.image_row[back.detection]] == drive
+    assert of_drive.sum() > 1.05 * len(detection)
+
+
+def test_what_is_selected_is_free_of_aliases(monkeypatch: pytest.MonkeyPatch) -> None:
+    freed: list[Estimate] = []
+
+    def spy(footage: Footage, found: Estimate, range_m: float) -> Estimate:
+        freed.append(dataclasses.replace(without_aliases(footage, found, range_m)))
+        return freed[-1]
+
+    selected: list[Estimate] = []
+
+    def chosen(footage: Footage, found: Estimate) -> Selected | None:
+        selected.append(found)
+        return None
+
+    monkeypatch.setattr(poses, "without_aliases", spy)
+    monkeypatch.setattr(poses, "select", chosen)
+    refine_poses(city(), MapConfig())
+    assert len(selected) == len(freed) == 1
+    assert selected[0] is freed[0]
+
+
+def test_a_drive_that_is_elsewhere_stays_there() -> None:
+    footage, _ = rows_of_signs()
+    drive = a_drive(footage.drives)
+    moved = along_the_row(footage, drive, 3)
+    footage, right = rows_of_signs(moved)
+    assert without_aliases(footage, right, 60.0) is right
 
 
 def test_short_drives_have_the_offset_of_the_one_they_go_on_from() -> None:

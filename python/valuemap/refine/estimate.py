@@ -150,30 +150,32 @@ def go_on(footage: Footage, begun: Estimate, config: MapConfig, told: Trajectori
     now: Estimate | None = begun
     for _ in range(_MORE_ROUNDS):
         now = None if now is None else _round(footage, now, _FINE, config, told)
-    return None if now is None else _associated(footage, _adjusted(footage, now, _FINE), _range_m(config))
+    return None if now is None else associated(footage, _adjusted(footage, now, _FINE), range_of(config))
 
 
 def _round(
     footage: Footage, now: Estimate, tolerances: tuple[float, ...], config: MapConfig, told: Trajectories
 ) -> Estimate | None:
     """Adjust all unknowns, cut drives and associate anew; None where nothing is left."""
-    now = _associated(footage, _cut(footage, _adjusted(footage, now, tolerances), told), _range_m(config))
+    now = associated(footage, _cut(footage, _adjusted(footage, now, tolerances), told), range_of(config))
     return now if len(now.thing) else None
 
 
-def _range_m(config: MapConfig) -> float:
+def range_of(config: MapConfig) -> float:
+    """Return how far from an image its objects are looked for, m."""
     return _RANGES * config.vote.max_range_m
 
 
 def estimate_again(footage: Footage, found: Estimate, told: Trajectories) -> Estimate:
     """Estimate everything anew with the objects and the detections that an estimate has, about where it has them."""
-    now = replace(found, state=triangulate(_seen(footage, found), found.state))
+    now = replace(found, state=triangulate(seen_by(footage, found), found.state))
     for _ in range(_AGAIN):
         now = _cut(footage, _adjusted(footage, now, _FINE), told)
     return _adjusted(footage, now, _FINE)
 
 
-def _seen(footage: Footage, now: Estimate) -> Observations:
+def seen_by(footage: Footage, now: Estimate) -> Observations:
+    """Return the detections that an estimate takes for objects."""
     return footage.observe(now.detection, now.thing, segments_of(footage, now.segments), now.sigma_px)
 
 
@@ -184,7 +186,7 @@ def segments_of(footage: Footage, segments: Segments) -> Ints:
 
 def _adjusted(footage: Footage, now: Estimate, tolerances: tuple[float, ...]) -> Estimate:
     """Return an estimate with all unknowns adjusted, then its noise and drift."""
-    seen = _seen(footage, now)
+    seen = seen_by(footage, now)
     free = everything(footage, now.segments)
     problem = Adjustment(seen, footage.chain, now.scales, free, len(now.class_code), now.links)
     state = adjust(problem, now.state, tolerances=tolerances)
@@ -361,7 +363,7 @@ def _cut(footage: Footage, now: Estimate, told: Trajectories) -> Estimate:
     another one than the trajectory says.
     """
     state, segments, jumps = now.state, now.segments, told.jumps
-    shift, information, image_of = _apparent_shift(footage, _seen(footage, now), state)
+    shift, information, image_of = apparent_shift(footage, seen_by(footage, now), state)
     drives = footage.drives
     begins: list[tuple[int, int]] = []
     offsets: list[Floats] = []
@@ -412,7 +414,7 @@ def _cut(footage: Footage, now: Estimate, told: Trajectories) -> Estimate:
     return replace(now, segments=new, links=jumps.links(new, refuted), state=state)
 
 
-def _apparent_shift(footage: Footage, seen: Observations, state: State) -> tuple[Floats, Floats, Ints]:
+def apparent_shift(footage: Footage, seen: Observations, state: State) -> tuple[Floats, Floats, Ints]:
     """Return where each image (M) that sees objects puts its drive: offset and drift (M, 3) and its information."""
     at = linearised(seen, state)
     weight = weights(seen, at.residual_px, at.depth_m, 2.0)
@@ -480,10 +482,10 @@ def cut_into_segments(value: Floats, precision: Floats, price: Floats) -> list[i
     return starts[::-1]
 
 
-def _associated(footage: Footage, now: Estimate, range_m: float) -> Estimate:
+def associated(footage: Footage, now: Estimate, range_m: float) -> Estimate:
     """Merge objects that are one, give all detections their objects anew, and drop what too few see."""
     count, class_code, size_m = len(now.state.point_in_world_m), now.class_code, now.size_m
-    seen = _seen(footage, now)
+    seen = seen_by(footage, now)
     state = triangulate(seen, now.state, rounds=3)
     number = merge_objects(seen, state, seen.image, class_code, WIDE.drift_m)
     seen = replace(seen, thing=number[seen.thing])
@@ -491,7 +493,7 @@ def _associated(footage: Footage, now: Estimate, range_m: float) -> Estimate:
     alive = np.bincount(seen.thing, minlength=count) >= _LEAST_VOTES
     state, class_code, size_m = _kept(state, alive), class_code[alive], size_m[alive]
     segment = segments_of(footage, now.segments)
-    detection, thing = associate(footage, state, class_code, size_m, segment, now.sigma_px, range_m)
+    detection, thing, _ = associate(footage, state, class_code, size_m, segment, now.sigma_px, range_m)
     alive = np.bincount(thing, minlength=len(class_code)) >= _LEAST_VOTES
     new = np.cumsum(alive) - 1
     stays = alive[thing]

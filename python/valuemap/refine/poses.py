@@ -17,6 +17,7 @@ from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives, InOrder, in_driving_order
 from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
+from valuemap.refine.alias import without_aliases
 from valuemap.refine.delay import delay_alone
 from valuemap.refine.estimate import (
     Estimate,
@@ -27,6 +28,7 @@ from valuemap.refine.estimate import (
     go_on,
     lay,
     mounts_alone,
+    range_of,
 )
 from valuemap.refine.footage import (
     AllImages,
@@ -345,6 +347,7 @@ def _find(
     result = go_on(footage, first, config, told)
     if result is None:
         return None
+    result = without_aliases(footage, result, range_of(config))
     return Found(late_s, footage, told, result, select(footage, result))
 
 

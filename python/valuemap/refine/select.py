@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from valuemap.refine.adjust import Adjustment, Chain, Scales, adjust, triangulate
+from valuemap.refine.alias import BEYOND_DRIFT, agreed_shift
 from valuemap.refine.estimate import DRIFT_FACTOR, WIDE, Estimate, everything, segments_of
 from valuemap.refine.footage import Footage
 from valuemap.refine.jumps import Links
@@ -35,8 +36,6 @@ from valuemap.refine.tracks import unresolved_share
 from valuemap.tables import Bools, Floats, Ints
 
 _LEAST_DRIFT, _LEAST_DRIFT_RAD = 0.02, math.radians(0.02)
-_BEYOND_DRIFT = 2.0
-"""What is no more than so many deviations of drift is drift."""
 _LEAST_FOCAL = 0.003
 _REFIT, _ANEW = (1.5, 1.0, 1.0, 1.0), (1.0, 1.0, 1.0)
 LEAST_CHANCE = 0.01
@@ -240,7 +239,7 @@ class _Trial:
             CAMERA_MOUNT: of_turn,
             DELAY: of_place / speed,
             CAMERA_DELAY: of_place / speed,
-            FOCAL: _LEAST_FOCAL / _BEYOND_DRIFT,
+            FOCAL: _LEAST_FOCAL / BEYOND_DRIFT,
         }
 
     def narrowed(self, narrow: tuple[Bools, ...]) -> Scales:
@@ -347,7 +346,7 @@ class _Trial:
                 if len(thin) and kind in _OF_MANY:
                     theta, square = self._if_wide(fit, kind, index[thin][:, columns], thin, columns)
                     evidence = square - len(columns) * price - 2.0 * math.log(max(len(rows), 1))
-                    is_fault = np.linalg.norm(theta, axis=1) > _BEYOND_DRIFT * smallest[kind]
+                    is_fault = np.linalg.norm(theta, axis=1) > BEYOND_DRIFT * smallest[kind]
                     value[thin[:, None], columns] = np.where(is_fault, evidence, -1.0)[:, None]
                 if not len(rows):
                     continue
@@ -364,7 +363,7 @@ class _Trial:
                 square = np.einsum("ni,ni->n", theta, np.linalg.solve(blocks, theta[:, :, None])[:, :, 0])
                 evidence = square - len(columns) * price - 2.0 * math.log(len(rows))
                 size = np.linalg.norm(theta, axis=1)
-                is_fault = size > _BEYOND_DRIFT * smallest[kind]
+                is_fault = size > BEYOND_DRIFT * smallest[kind]
                 is_fault &= size < _PLAUSIBLE * np.max(self.scales.constant[kind])
                 value[rows[:, None], columns] = np.where(is_fault, evidence, -1.0)[:, None]
             worth.append(value)
@@ -384,21 +383,8 @@ class _Trial:
         return theta, np.einsum("ni,ni->n", theta, right)
 
     def _agreed_shift(self, offset: Floats, active: Bools) -> Floats:
-        """Return the place (3) on which most drives agree: drives that are off do not move it.
-
-        It is the median of the offsets that are free, weighted by their observations.
-        """
-        weight = np.bincount(self.seen.segment, minlength=len(active))
-        shift = np.zeros(3)
-        for axis in range(3):
-            rows = np.flatnonzero(active[:, axis])
-            if len(rows) < 3:
-                continue
-            value, of = offset[rows, axis], weight[rows]
-            order = np.argsort(value, kind="stable")
-            share = np.cumsum(of[order])
-            shift[axis] = value[order[np.searchsorted(share, 0.5 * share[-1])]]
-        return shift
+        """Return the place (3) on which most drives agree, of the offsets that are free."""
+        return agreed_shift(offset, active, np.bincount(self.seen.segment, minlength=len(active)))
 
     def _regauged(self, state: State, active: Bools) -> State:
         """Return the state with everything moved so that the place on which most drives agree stays."""

@@ -30,30 +30,34 @@ def associate(
     segment_of_image: Ints,
     sigma_px: Sigmas,
     range_m: float,
-) -> tuple[Ints, Ints]:
-    """Return pairs of detection (row) and object: one to one in each image, the closest first, within the gate."""
+    images: Ints | None = None,
+) -> tuple[Ints, Ints, Floats]:
+    """Return pairs of detection (row) and object: one to one in each image, the closest first, within the gate.
+
+    Also how far off they are, in squares of sigmas. Detections are those of some of the `images` (rows), None for all.
+    """
     if not len(state.point_in_world_m):
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    detection, thing = _near(footage, state.point_in_world_m, class_code, range_m)
-    if not len(detection):
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    everything = np.arange(len(footage.rays))
-    seen = footage.observe_as_given(everything, np.zeros_like(everything), segment_of_image, sigma_px)
+        return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
+    row, thing = _near(footage, state.point_in_world_m, class_code, range_m, images)
+    if not len(row):
+        return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
+    rows, detection = np.unique(row, return_inverse=True)
+    seen = footage.observe_as_given(rows, np.zeros_like(rows), segment_of_image, sigma_px)
     poses = corrected(seen.views, state)
     from_world = seen.residual_from_cam @ poses.cam_from_world[seen.image]
     offset = -np.einsum("nij,nj->in", from_world, poses.center_in_world_m[seen.image])
-    rows = np.ascontiguousarray(from_world.reshape(-1, 9).T).reshape(3, 3, -1)
+    by_row = np.ascontiguousarray(from_world.reshape(-1, 9).T).reshape(3, 3, -1)
     x, y, z = np.ascontiguousarray(state.point_in_world_m.T)
 
     def project(axis: int) -> Floats:
         """Return a row of the local pinholes of the detections that are left times their objects."""
-        a, b, c = rows[axis]
+        a, b, c = by_row[axis]
         return np.asarray(
             a[detection] * x[thing] + b[detection] * y[thing] + c[detection] * z[thing] + offset[axis][detection]
         )
 
     depth = project(2)
-    box = footage.dataset.detections.size_px[:, 1] / seen.pixels_per_unit()
+    box = footage.dataset.detections.size_px[rows, 1] / seen.pixels_per_unit()
     with np.errstate(divide="ignore", invalid="ignore"):
         fits = ~(np.abs(np.log(box[detection] * depth / size_m[thing])) > np.log(2.0)) & (depth > 0.5)
     detection, thing, depth = detection[fits], thing[fits], depth[fits]
@@ -65,16 +69,17 @@ def associate(
     square /= seen.sigma_px[detection] ** 2
     fits = square < GATE_SIGMAS**2
     detection, thing, square = detection[fits], thing[fits], square[fits]
-    kept = _one_to_one(footage.rays.image_row[detection], detection, thing, square)
-    return detection[kept], thing[kept]
+    kept = _one_to_one(seen.image[detection], detection, thing, square)
+    return rows[detection[kept]], thing[kept], square[kept]
 
 
-def _near(footage: Footage, point: Floats, class_code: Ints, range_m: float) -> tuple[Ints, Ints]:
+def _near(footage: Footage, point: Floats, class_code: Ints, range_m: float, images: Ints | None) -> tuple[Ints, Ints]:
     """Return pairs of detection (row, ascending) and object of its class (ascending) within a range of its image."""
-    tree = scipy.spatial.cKDTree(footage.center_in_world_m)
+    images = np.arange(len(footage.row)) if images is None else images
+    tree = scipy.spatial.cKDTree(footage.center_in_world_m[images])
     near: list[list[int]] = list(tree.query_ball_point(point, range_m))  # type: ignore[arg-type]
     thing = np.repeat(np.arange(len(near)), [len(found) for found in near])
-    image = np.array(list(chain.from_iterable(near)), dtype=np.int64)
+    image = images[np.array(list(chain.from_iterable(near)), dtype=np.int64)]
     order = np.lexsort((thing, image))
     thing = thing[order]
     begins = np.searchsorted(image[order], np.arange(len(footage.row) + 1))
