@@ -36,6 +36,7 @@ BLOCKS: dict[str, dict[str, float]] = {
     "standing": {"frame_spacing_m": 20.0},
     "narrow": {"max_facing_deg": 20.0},
     "trees": {"tree_spacing_m": 8.0, "max_sight_m": 60.0, "passes_per_street": 1, **NO_LIGHTS},
+    "missed": {"tail_share": 0.1, "tree_spacing_m": 8.0, "max_sight_m": 60.0, "passes_per_street": 4, **NO_LIGHTS},
     "uneven trees": {
         "tree_spacing_m": 10.0,
         "side_offset_m": 0.2,
@@ -177,6 +178,7 @@ CASES: dict[str, tuple[str, int, Fails]] = {
     "heights": (FEW_PICTURES, 5, fewer_are_honest),
     "scores": ("poor detector", 5, more_is_wrong),
     "elevations": (FEW_PICTURES, 16, more_is_wrong),
+    "tails": ("missed", 6, more_is_wrong),
     "reach": ("drifts", 5, what_is_there_is_believed_less),
     "aspect": ("narrow", 7, what_is_there_is_believed_less),
     "company": (FEW_PICTURES, 5, more_is_wrong),

@@ -14,6 +14,7 @@ use super::model::{ClassModel, Model, ODD_PASSES, Rates};
 use super::parts::Part;
 use super::reach::{looked_at, reach};
 use super::seen::{Looks, Shares};
+use super::tails::{OfImages, tails};
 
 /// Steps of expectation and maximisation: some ten change the rates by less than a thousandth.
 const STEPS: usize = 20;
@@ -30,6 +31,8 @@ const NEAR_VOTES: f64 = 0.05;
 const LEAST_ELEVATIONS: f64 = 1e-6;
 /// Fewer of these tell nothing, and what was thought before stays.
 const MIN_OBJECTS: usize = 5;
+/// What is seen in less than this part of the looks that are usual is rather false than real.
+const HARDLY: f64 = 0.5;
 /// Rates of fewer looks are known worse than to a tenth.
 pub(super) const LEAST_LOOKS: f64 = 30.0;
 /// The median absolute deviation of a normal distribution, in standard deviations.
@@ -136,6 +139,13 @@ impl<'a> Evidence<'a> {
             }
             if has(Part::Aspect) {
                 learned.aspect = Aspect::learn(model, &looked_at);
+            }
+            if has(Part::Tails) {
+                // What is hardly ever seen where it should be may be made of them.
+                let hardly = of_class.iter().filter(|object| object.seen.share() < HARDLY * learned.rates.recall);
+                let votes = hardly.flat_map(|object| object.votes.iter().copied());
+                let free = OfImages::new(model, clutter.iter().copied().chain(votes));
+                learned.tails = tails(model, &looked_at, &free, ln_clutter_per_sr);
             }
             if has(Part::Company) {
                 learned.company = company(model, self.objects, &learned, of_class[0].class);

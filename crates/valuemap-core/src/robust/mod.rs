@@ -52,6 +52,7 @@ pub mod sizes;
 mod spd;
 pub mod split;
 pub mod switches;
+pub mod tails;
 
 use std::sync::Arc;
 

@@ -47,6 +47,8 @@ pub struct ClassModel {
     pub clutter_by_elevation: Steps,
     /// How much more probable votes have a score than clutter has, in logarithms.
     pub score_ratio: Steps,
+    /// Detections that miss an object which has no vote in an image, per squared sigma, by sigmas.
+    pub tails: Steps,
     /// The share of the looks from some distance, m, that are hits, of that where it is largest.
     pub reach: Steps,
     /// The same of the looks from some angle to the nearest vote.
@@ -84,6 +86,7 @@ impl ClassModel {
             ln_births_per_m2: f64::NAN,
             clutter_by_elevation: Steps::NONE,
             score_ratio: Steps::NONE,
+            tails: Steps::NONE,
             reach: Steps::ONE,
             aspect: Aspect::ONE,
             ln_odds_of_few: [0.0; FEW],
@@ -96,7 +99,7 @@ impl ClassModel {
     }
 
     /// How many numbers it is stored as.
-    pub const NUMBERS: usize = 20 + Heights::NUMBERS + 4 * Steps::NUMBERS + Aspect::NUMBERS + Existing::NUMBERS;
+    pub const NUMBERS: usize = 20 + Heights::NUMBERS + 5 * Steps::NUMBERS + Aspect::NUMBERS + Existing::NUMBERS;
 
     /// All of it as numbers, for storage.
     #[must_use]
@@ -124,7 +127,8 @@ impl ClassModel {
             self.ranges.0,
             self.ranges.1,
         ];
-        let steps = [self.clutter_by_elevation, self.score_ratio, self.reach, self.company].map(|steps| steps.to_row());
+        let steps = [self.clutter_by_elevation, self.score_ratio, self.tails, self.reach, self.company];
+        let steps = steps.map(|steps| steps.to_row());
         let told = self.aspect.to_row().into_iter().chain(self.existing.to_row());
         numbers.into_iter().chain(heights).chain(steps.into_iter().flatten()).chain(told).collect()
     }
@@ -136,6 +140,7 @@ impl ClassModel {
         let (heights, rest) = rest.split_first_chunk::<{ Heights::NUMBERS }>()?;
         let (clutter, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
         let (scores, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
+        let (tails, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
         let (reach, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
         let (company, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
         let (aspect, rest) = rest.split_first_chunk::<{ Aspect::NUMBERS }>()?;
@@ -174,6 +179,7 @@ impl ClassModel {
             heights: Heights::from_row(heights),
             clutter_by_elevation: Steps::from_row(clutter),
             score_ratio: Steps::from_row(scores),
+            tails: Steps::from_row(tails),
             reach: Steps::from_row(reach),
             aspect: Aspect::from_row(aspect),
             ln_odds_of_few: [ln_odds_of_one, ln_odds_of_two, ln_odds_of_more],
@@ -293,6 +299,8 @@ pub struct Model<'a> {
     ranges: Vec<Measured>,
     /// Sine of each ray's elevation; not a number where nobody knows what is up.
     pub sin_elevation: Vec<f64>,
+    /// How much denser clutter is at each ray, in logarithms, as objects are missed there; empty where it is not.
+    pub ln_tails: Vec<f64>,
     /// How many rays there are that may vote.
     usable: usize,
     /// What is learned, by class.
@@ -340,6 +348,7 @@ impl<'a> Model<'a> {
             ln_scale2,
             ranges,
             sin_elevation,
+            ln_tails: Vec::new(),
             usable: usable.len(),
             confusions: Confusions::default(),
             classes,
@@ -407,7 +416,8 @@ impl<'a> Model<'a> {
     #[inline]
     #[must_use]
     pub fn ln_clutter_per_px2(&self, ray: u32) -> f64 {
-        self.class_of(ray).ln_clutter_per_sr - self.ln_scale2[ray as usize]
+        let ln_tails = self.ln_tails.get(ray as usize).copied().unwrap_or(0.0);
+        self.class_of(ray).ln_clutter_per_sr + ln_tails - self.ln_scale2[ray as usize]
     }
 
     /// How much more probable, in logarithms, a vote has the score of a ray than clutter has.

@@ -39,6 +39,8 @@ pub enum Part {
     Scores,
     /// Clutter is denser at some elevations.
     Elevations,
+    /// Clutter is denser beside objects that are missed.
+    Tails,
     /// Objects are detected less from afar.
     Reach,
     /// Objects are detected less from directions that are farther from those of their votes.
@@ -65,7 +67,7 @@ pub enum Part {
 
 impl Part {
     /// All parts with their names.
-    pub const ALL: [(Self, &'static str); 29] = [
+    pub const ALL: [(Self, &'static str); 30] = [
         (Self::Polishing, "polishing"),
         (Self::Assignment, "assignment"),
         (Self::Merging, "merging"),
@@ -84,6 +86,7 @@ impl Part {
         (Self::Heights, "heights"),
         (Self::Scores, "scores"),
         (Self::Elevations, "elevations"),
+        (Self::Tails, "tails"),
         (Self::Reach, "reach"),
         (Self::Aspect, "aspect"),
         (Self::Company, "company"),

@@ -20,24 +20,30 @@ pub struct LookedAt<'a> {
     pub object: &'a Object,
     /// The images.
     pub images: Vec<(u32, bool)>,
+    /// The share that are votes. Looks count by it: what is told of an object that has some votes is told by votes, wherever they are, and what is hardly
+    /// ever seen, as false things are, has few.
+    pub share: f64,
 }
 
 /// The looks at sure objects up to `farthest_m`, of which no more are asked than tell.
 #[must_use]
 pub fn looked_at<'a>(model: &Model<'_>, lookout: &Lookout, sure: &[&'a Object], farthest_m: f64) -> Vec<LookedAt<'a>> {
-    let images = |object: &Object| lookout.seen(model, &object.fit.point, &object.votes, farthest_m);
-    let some = sure.iter().step_by(sure.len().div_ceil(MOST_OBJECTS).max(1));
-    some.map(|&object| LookedAt { object, images: images(object) }).collect()
+    let looked_at = |object: &'a Object| {
+        let images = lookout.seen(model, &object.fit.point, &object.votes, farthest_m);
+        let share = images.iter().filter(|(_, is_hit)| *is_hit).count() as f64 / images.len().max(1) as f64;
+        LookedAt { object, images, share }
+    };
+    sure.iter().step_by(sure.len().div_ceil(MOST_OBJECTS).max(1)).map(|&object| looked_at(object)).collect()
 }
 
 /// The share of the looks at sure objects that are hits, by distance up to `farthest_m`, over that where it is largest.
 #[must_use]
 pub fn reach(model: &Model<'_>, sure: &[LookedAt<'_>], farthest_m: f64) -> Steps {
     let mut tally = Tally::default();
-    for LookedAt { object, images } in sure {
+    for LookedAt { object, images, share } in sure {
         for &(image, is_hit) in images {
             let distance_m = (model.scene.views[image as usize].center - object.fit.point).norm();
-            count(&mut tally, distance_m / farthest_m, is_hit);
+            count(&mut tally, distance_m / farthest_m, is_hit, *share);
         }
     }
     relative(&tally).map_or(Steps::ONE, |shares| Steps::even(farthest_m, shares))
@@ -49,11 +55,11 @@ pub fn bin(part: f64) -> usize {
     ((part * BINS as f64) as usize).min(BINS - 1)
 }
 
-/// Count a look in the bin of a number.
-pub fn count(tally: &mut Tally, part: f64, is_hit: bool) {
+/// Count a look, as a part of one, in the bin of a number.
+pub fn count(tally: &mut Tally, part: f64, is_hit: bool, weight: f64) {
     let [hits, looks] = &mut tally[bin(part)];
-    *hits += f64::from(u8::from(is_hit));
-    *looks += 1.0;
+    *hits += weight * f64::from(u8::from(is_hit));
+    *looks += weight;
 }
 
 /// The share of hits in each bin, over the largest, of the hits and looks there; nothing without hits. From where few looks were, objects are taken to be

@@ -22,6 +22,7 @@ use super::propose::Who;
 use super::rearrange::{TriedPairs, exclude, rearrange_pairs};
 use super::regrow::regrow;
 use super::repair::{Tried, repair};
+use super::tails::of_rays;
 use crate::progress::{Halt, Progress};
 
 /// Rounds, at most.
@@ -69,6 +70,9 @@ pub fn search(
     for round in 0..rounds {
         if learns {
             learn(model, &lookout, rays, &objects);
+        }
+        if !learns {
+            model.ln_tails = of_rays(model, &lookout, rays, &objects);
         }
         let model: &Model<'_> = model;
         let again = |o: Object| object(model, &lookout, o.votes, o.fit.point, o.others);

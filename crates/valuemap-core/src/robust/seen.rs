@@ -204,6 +204,13 @@ impl Seen {
         (looked.count(), missed.map(|pass| -OfSector::new(&[*pass], &shares).usual).sum())
     }
 
+    /// The share of hits of all looks.
+    #[must_use]
+    pub fn share(&self) -> f64 {
+        let (hits, expected) = self.sectors.iter().flatten().fold((0.0, 0.0), |s, p| (s.0 + p.hits, s.1 + p.expected));
+        if expected > 0.0 { hits / expected } else { 0.0 }
+    }
+
     /// The share of hits from where it has most votes.
     #[must_use]
     pub fn main_share(&self) -> Option<f64> {
