@@ -133,7 +133,9 @@ impl<'a> Evidence<'a> {
             learned.sizes.object = (object.0, object.1.max(learned.sizes.spread));
             learned.heights = if has(Part::Heights) { heights(model, &sure) } else { None };
             learned.ln_births_per_m2 = (of_class.len() as f64 / self.ground_m2).ln();
-            let looked_at = looked_at(model, self.lookout, &sure, learned.farthest_m);
+            // False things have many looks and few hits: they would teach that objects are hardly seen, and then look real.
+            let seen: Vec<&Object> = sure.iter().copied().filter(|object| !is_hardly_seen(object, &learned)).collect();
+            let looked_at = looked_at(model, self.lookout, &seen, learned.farthest_m);
             if has(Part::Reach) {
                 learned.reach = reach(model, &looked_at, learned.farthest_m);
             }
@@ -142,7 +144,7 @@ impl<'a> Evidence<'a> {
             }
             if has(Part::Tails) {
                 // What is hardly ever seen where it should be may be made of them.
-                let hardly = of_class.iter().filter(|object| object.seen.share() < HARDLY * learned.rates.recall);
+                let hardly = of_class.iter().filter(|object| is_hardly_seen(object, &learned));
                 let votes = hardly.flat_map(|object| object.votes.iter().copied());
                 let free = OfImages::new(model, clutter.iter().copied().chain(votes));
                 learned.tails = tails(model, &looked_at, &free, ln_clutter_per_sr);
@@ -158,6 +160,11 @@ impl<'a> Evidence<'a> {
     fn like(&self, pooled: &ClassModel, own: &ClassModel, objects: usize) -> ClassModel {
         ClassModel { ln_births_per_m2: ((objects + 1) as f64 / self.ground_m2).ln(), ..pooled.with_own(own) }
     }
+}
+
+/// Whether an object is rather false than real, as it is seen far less often than is usual.
+fn is_hardly_seen(object: &Object, class: &ClassModel) -> bool {
+    object.seen.share() < HARDLY * class.rates.recall
 }
 
 /// Whether an object has many votes, and is real rather than false.
@@ -376,6 +383,28 @@ mod tests {
             *sine = 1e-12 * (i % 3) as f64;
         }
         assert_eq!(few(&model, &sure[1..]), MIN_VOTES);
+    }
+
+    #[test]
+    fn what_is_hardly_seen_does_not_teach_how_objects_are_seen() {
+        let place = |i: usize| Vector3::new(70.0 + 3.0 * (i / 2) as f64, if i % 2 == 0 { 8.0 } else { -8.0 }, 3.0);
+        let all: Vec<Vector3<f64>> = (0..12).map(place).collect();
+        let scene = street::street(90, 1.0, &all, &[[0.0; 2]]);
+        let mut model = Model::new(&scene, &street::NOISE, &SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let rays = scene.usable_rays();
+        // Those on the other side have a vote in each seventh image that shows them, and are thought to be real.
+        let of = |i: usize| -> Option<Object> {
+            let toward = |ray: u32| (all[i] - scene.ray(ray).center).normalize();
+            let of_object = rays.iter().copied().filter(|&ray| (scene.ray(ray).direction - toward(ray)).norm() < 1e-6);
+            let votes = of_object.step_by(if i % 2 == 0 { 1 } else { 7 }).collect();
+            Some(Object { real: 1.0, ..object(&model, &lookout, votes, all[i], Vec::new())? })
+        };
+        let objects: Vec<Object> = (0..all.len()).filter_map(of).collect();
+        assert!(objects.iter().filter(|object| is_sure(object)).count() == all.len());
+        learn(&mut model, &lookout, &rays, &objects);
+        let least = model.classes[0].aspect.within_pass.concat().into_iter().fold(1.0, f64::min);
+        assert!(least > 0.7, "{least}");
     }
 
     #[test]

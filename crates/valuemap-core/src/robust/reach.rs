@@ -20,9 +20,6 @@ pub struct LookedAt<'a> {
     pub object: &'a Object,
     /// The images.
     pub images: Vec<(u32, bool)>,
-    /// The share that are votes. Looks count by it: what is told of an object that has some votes is told by votes, wherever they are, and what is hardly
-    /// ever seen, as false things are, has few.
-    pub share: f64,
 }
 
 /// The looks at sure objects up to `farthest_m`, of which no more are asked than tell.
@@ -30,8 +27,7 @@ pub struct LookedAt<'a> {
 pub fn looked_at<'a>(model: &Model<'_>, lookout: &Lookout, sure: &[&'a Object], farthest_m: f64) -> Vec<LookedAt<'a>> {
     let looked_at = |object: &'a Object| {
         let images = lookout.seen(model, &object.fit.point, &object.votes, farthest_m);
-        let share = images.iter().filter(|(_, is_hit)| *is_hit).count() as f64 / images.len().max(1) as f64;
-        LookedAt { object, images, share }
+        LookedAt { object, images }
     };
     sure.iter().step_by(sure.len().div_ceil(MOST_OBJECTS).max(1)).map(|&object| looked_at(object)).collect()
 }
@@ -40,10 +36,10 @@ pub fn looked_at<'a>(model: &Model<'_>, lookout: &Lookout, sure: &[&'a Object], 
 #[must_use]
 pub fn reach(model: &Model<'_>, sure: &[LookedAt<'_>], farthest_m: f64) -> Steps {
     let mut tally = Tally::default();
-    for LookedAt { object, images, share } in sure {
+    for LookedAt { object, images } in sure {
         for &(image, is_hit) in images {
             let distance_m = (model.scene.views[image as usize].center - object.fit.point).norm();
-            count(&mut tally, distance_m / farthest_m, is_hit, *share);
+            count(&mut tally, distance_m / farthest_m, is_hit);
         }
     }
     relative(&tally).map_or(Steps::ONE, |shares| Steps::even(farthest_m, shares))
@@ -55,11 +51,11 @@ pub fn bin(part: f64) -> usize {
     ((part * BINS as f64) as usize).min(BINS - 1)
 }
 
-/// Count a look, as a part of one, in the bin of a number.
-pub fn count(tally: &mut Tally, part: f64, is_hit: bool, weight: f64) {
+/// Count a look in the bin of a number.
+pub fn count(tally: &mut Tally, part: f64, is_hit: bool) {
     let [hits, looks] = &mut tally[bin(part)];
-    *hits += weight * f64::from(u8::from(is_hit));
-    *looks += weight;
+    *hits += f64::from(u8::from(is_hit));
+    *looks += 1.0;
 }
 
 /// The share of hits in each bin, over the largest, of the hits and looks there; nothing without hits. From where few looks were, objects are taken to be
