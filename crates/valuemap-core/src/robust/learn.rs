@@ -387,7 +387,8 @@ mod tests {
 
     #[test]
     fn what_is_hardly_seen_does_not_teach_how_objects_are_seen() {
-        let place = |i: usize| Vector3::new(70.0 + 3.0 * (i / 2) as f64, if i % 2 == 0 { 8.0 } else { -8.0 }, 3.0);
+        let place =
+            |i: usize| Vector3::new(70.0 + 3.0 * (i / 2) as f64, if i.is_multiple_of(2) { 8.0 } else { -8.0 }, 3.0);
         let all: Vec<Vector3<f64>> = (0..12).map(place).collect();
         let scene = street::street(90, 1.0, &all, &[[0.0; 2]]);
         let mut model = Model::new(&scene, &street::NOISE, &SETTINGS);
@@ -397,7 +398,7 @@ mod tests {
         let of = |i: usize| -> Option<Object> {
             let toward = |ray: u32| (all[i] - scene.ray(ray).center).normalize();
             let of_object = rays.iter().copied().filter(|&ray| (scene.ray(ray).direction - toward(ray)).norm() < 1e-6);
-            let votes = of_object.step_by(if i % 2 == 0 { 1 } else { 7 }).collect();
+            let votes = of_object.step_by(if i.is_multiple_of(2) { 1 } else { 7 }).collect();
             Some(Object { real: 1.0, ..object(&model, &lookout, votes, all[i], Vec::new())? })
         };
         let objects: Vec<Object> = (0..all.len()).filter_map(of).collect();
