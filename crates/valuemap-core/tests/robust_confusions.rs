@@ -79,7 +79,7 @@ fn what_is_taken_for_another_class_is_one_object_of_its_own() {
 #[test]
 fn classes_of_few_objects_are_confused_like_all_together() {
     let objects: Vec<(Vector3<f64>, u32)> =
-        objects().into_iter().filter(|object| object.1 == 0 || object.0.x < 80.0).collect();
+        objects().into_iter().filter(|object| object.1 == 0 || object.0.x < 60.0).collect();
     let confusions = calibrated(&confused_street(&objects)).confusions;
     let share = |object, said| confusions.ln_share(object, said).exp();
     assert!((0.5 * share(0, 1)..share(0, 1)).contains(&share(1, 0)), "{confusions:?}");
