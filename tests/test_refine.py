@@ -447,16 +447,16 @@ def rows_of_signs(moved_m: Floats | None = None) -> tuple[Footage, Estimate]:
     place = np.full(len(ordered.dataset.detections), -1)
     place[footage.detection_row] = np.arange(len(footage.detection_row))
     kept = place[shown] >= 0
-    detection, thing = place[shown][kept], np.unique(dataset.truth_detections.object_id[kept], return_inverse=True)[1]
+    detection = place[shown][kept]
+    kinds, thing = np.unique(dataset.truth_detections.object_id[kept], return_inverse=True)
     few = np.bincount(thing) < 8
     detection, thing = detection[~few[thing]], np.unique(thing[~few[thing]], return_inverse=True)[1]
     things = int(thing.max()) + 1
     counts = (drives.count,) * 3 + (1,) * 3
     truth = dataset.truth
     assert truth is not None
-    kinds = np.unique(dataset.truth_detections.object_id[kept])[~few]
     points = refine_footage.points_in_working_frame(
-        moving, truth.position_in_world_m[rows_of(kinds, truth.object_id)], 1.0
+        moving, truth.position_in_world_m[rows_of(kinds[~few], truth.object_id)], 1.0
     )
     state = State.zero(points, len(footage.chain.drive), len(footage.row), counts)
     if moved_m is not None:

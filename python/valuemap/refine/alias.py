@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from valuemap.refine.adjust import triangulate
-from valuemap.refine.estimate import Estimate, apparent_shift, associated, seen_by, segments_of
+from valuemap.refine.estimate import LEAST_VOTES, Estimate, apparent_shift, associated, seen_by, segments_of
 from valuemap.refine.footage import Footage
 from valuemap.refine.residuals import OFFSET, Observations, State
 from valuemap.refine.tracks import GATE_SIGMAS, associate
@@ -21,8 +21,6 @@ from valuemap.tables import Bools, Floats, Ints
 
 BEYOND_DRIFT = 2.0
 """What is no more than so many deviations of drift is drift."""
-_LEAST_VOTES = 4
-"""Objects that other segments see less often are no witnesses."""
 _ROUNDS = 2
 """Times that a segment is moved by what its residuals say of it, within drift."""
 
@@ -39,9 +37,10 @@ def without_aliases(footage: Footage, found: Estimate, range_m: float) -> Estima
     tried = np.flatnonzero(far & (weight > 0))
     # Two coordinates by Bayes' information criterion, and so many segments were looked at.
     price = 2.0 * math.log(max(len(seen), 2)) + 2.0 * math.log(max(len(tried), 1))
+    of_image = segments_of(footage, found.segments)
     back: dict[int, Floats] = {}
     for segment in tried.tolist():
-        witnesses = _Witnesses.of(footage, found, seen, segment, range_m)
+        witnesses = _Witnesses.of(footage, found, seen, of_image, segment, range_m)
         there, here = witnesses.met(offset[segment]), witnesses.met(agreed)
         if there[0] - here[0] <= price:
             back[segment] = here[1]
@@ -50,7 +49,6 @@ def without_aliases(footage: Footage, found: Estimate, range_m: float) -> Estima
     offset = offset.copy()
     for segment, value in back.items():
         offset[segment] = value
-    of_image = segments_of(footage, found.segments)
     moved = np.isin(of_image, list(back))
     stays = ~moved[footage.rays.image_row[found.detection]]
     state = _at_rest(replace(found.state, constants=(offset, *found.state.constants[1:])), footage, moved)
@@ -77,45 +75,45 @@ def agreed_shift(offset: Floats, active: Bools, weight: Ints) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class _Witnesses:
-    """The objects that other segments see, where these have them, for one segment with its images (rows)."""
+    """The objects `seen` by other segments, where these have them, for one `segment`.
+
+    `of_image` (I) is the segment of each image.
+    """
 
     footage: Footage
-    found: Estimate
-    state: State
-    class_code: Ints
-    size_m: Floats
-    segment: int
+    seen: Estimate
     of_image: Ints
-    images: Ints
+    segment: int
     range_m: float
 
     @staticmethod
-    def of(footage: Footage, found: Estimate, seen: Observations, segment: int, range_m: float) -> _Witnesses:
+    def of(
+        footage: Footage, found: Estimate, seen: Observations, of_image: Ints, segment: int, range_m: float
+    ) -> _Witnesses:
         """Return those of a segment: what it sees itself is placed anew without it."""
         count, own = len(found.class_code), seen.segment == segment
-        of_image = segments_of(footage, found.segments)
-        here = of_image == segment
-        others = np.bincount(seen.thing[~own], minlength=count) >= _LEAST_VOTES
+        others = np.bincount(seen.thing[~own], minlength=count) >= LEAST_VOTES
         shared = np.zeros(count, np.bool_)
         shared[seen.thing[own]] = True
         state = triangulate(seen.take(~own & (shared & others)[seen.thing]), found.state)
-        state = _at_rest(replace(state, point_in_world_m=state.point_in_world_m[others]), footage, here)
-        kinds = (found.class_code[others], found.size_m[others])
-        return _Witnesses(footage, found, state, *kinds, segment, of_image, np.flatnonzero(here), range_m)
+        state = replace(state, point_in_world_m=state.point_in_world_m[others])
+        state = _at_rest(state, footage, of_image == segment)
+        by_others = replace(found, state=state, class_code=found.class_code[others], size_m=found.size_m[others])
+        return _Witnesses(footage, by_others, of_image, segment, range_m)
 
     def met(self, offset: Floats) -> tuple[float, Floats]:
         """Return how much of what the segment sees meets objects, and where, when it is laid about there.
 
         Each detection that meets one is worth what it is nearer than the gate, in squares of sigmas.
         """
-        best, at = -1.0, offset
+        best, at, seen = -1.0, offset, self.seen
+        images = np.flatnonzero(self.of_image == self.segment)
         for _ in range(_ROUNDS + 1):
-            constants = self.state.constants[OFFSET].copy()
+            constants = seen.state.constants[OFFSET].copy()
             constants[self.segment] = at
-            state = replace(self.state, constants=(constants, *self.state.constants[1:]))
-            sigma_px = self.found.sigma_px
+            state = replace(seen.state, constants=(constants, *seen.state.constants[1:]))
             detection, thing, square = associate(
-                self.footage, state, self.class_code, self.size_m, self.of_image, sigma_px, self.range_m, self.images
+                self.footage, state, seen.class_code, seen.size_m, self.of_image, seen.sigma_px, self.range_m, images
             )
             worth = float(np.sum(GATE_SIGMAS**2 - square))
             if worth <= best:
@@ -123,9 +121,9 @@ class _Witnesses:
             best, offset = worth, at
             if not len(detection):
                 break
-            shown = self.footage.observe(detection, thing, self.of_image, sigma_px)
+            shown = self.footage.observe(detection, thing, self.of_image, seen.sigma_px)
             shift, information, _ = apparent_shift(self.footage, shown, state)
-            total = information.sum(axis=0) + np.eye(3) / self.found.scales.drift_m**2
+            total = information.sum(axis=0) + np.eye(3) / seen.scales.drift_m**2
             pull = np.einsum("nij,nj->i", information, shift - offset)
             at = offset + np.linalg.solve(total, pull)
         return best, offset

@@ -31,7 +31,8 @@ _NEW_SEGMENT_M = 1.0
 _SEGMENT_PRICE = 8.0
 """What a new segment has to explain, in squares of sigmas, where the trajectory shows the jump: by Bayes' information
 criterion, the price of two offsets that 55 coordinates tell."""
-_LEAST_VOTES, _LEAST_OF_SEGMENT = 4, 8
+LEAST_VOTES = 4
+"""An object that fewer detections show is dropped."""
 _RANGES = 1.5
 _SURE = 4.0
 """Turns of drives are none of chance if their squares exceed their variances by so many deviations."""
@@ -490,11 +491,11 @@ def associated(footage: Footage, now: Estimate, range_m: float) -> Estimate:
     number = merge_objects(seen, state, seen.image, class_code, WIDE.drift_m)
     seen = replace(seen, thing=number[seen.thing])
     state = triangulate(seen, state, rounds=4)
-    alive = np.bincount(seen.thing, minlength=count) >= _LEAST_VOTES
+    alive = np.bincount(seen.thing, minlength=count) >= LEAST_VOTES
     state, class_code, size_m = _kept(state, alive), class_code[alive], size_m[alive]
     segment = segments_of(footage, now.segments)
     detection, thing, _ = associate(footage, state, class_code, size_m, segment, now.sigma_px, range_m)
-    alive = np.bincount(thing, minlength=len(class_code)) >= _LEAST_VOTES
+    alive = np.bincount(thing, minlength=len(class_code)) >= LEAST_VOTES
     new = np.cumsum(alive) - 1
     stays = alive[thing]
     return replace(

@@ -146,7 +146,7 @@ impl<'a> Evidence<'a> {
                 // What is hardly ever seen where it should be may be made of them.
                 let hardly = of_class.iter().filter(|object| is_hardly_seen(object, &learned));
                 let votes = hardly.flat_map(|object| object.votes.iter().copied());
-                let free = OfImages::new(model, clutter.iter().copied().chain(votes));
+                let free = OfImages::new(model.scene, clutter.iter().copied().chain(votes));
                 learned.tails = tails(model, &looked_at, &free, ln_clutter_per_sr);
             }
             if has(Part::Company) {

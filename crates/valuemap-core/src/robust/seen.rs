@@ -178,6 +178,11 @@ impl Judged {
     }
 }
 
+/// The hits and the looks of some passes.
+fn sum<'a>(passes: impl Iterator<Item = &'a Looks>) -> (f64, f64) {
+    passes.fold((0.0, 0.0), |sum, pass| (sum.0 + pass.hits, sum.1 + pass.expected))
+}
+
 impl Seen {
     /// How probable the looks are at an object of a class.
     pub(super) fn judged(&self, shares: &Shares<'_>) -> Judged {
@@ -207,15 +212,15 @@ impl Seen {
     /// The share of hits of all looks.
     #[must_use]
     pub fn share(&self) -> f64 {
-        let (hits, expected) = self.sectors.iter().flatten().fold((0.0, 0.0), |s, p| (s.0 + p.hits, s.1 + p.expected));
+        let (hits, expected) = sum(self.sectors.iter().flatten());
         if expected > 0.0 { hits / expected } else { 0.0 }
     }
 
     /// The share of hits from where it has most votes.
     #[must_use]
     pub fn main_share(&self) -> Option<f64> {
-        let sum = |passes: &Vec<Looks>| passes.iter().fold((0.0, 0.0), |sum, p| (sum.0 + p.hits, sum.1 + p.expected));
-        let (hits, expected) = self.sectors.iter().map(sum).max_by(|a, b| a.0.total_cmp(&b.0))?;
+        let (hits, expected) =
+            self.sectors.iter().map(|passes| sum(passes.iter())).max_by(|a, b| a.0.total_cmp(&b.0))?;
         (expected > 0.0).then(|| hits / expected)
     }
 

@@ -15,6 +15,7 @@ use super::looks::Lookout;
 use super::model::{ClassModel, Model};
 use super::parts::Part;
 use super::reach::{LookedAt, bin};
+use super::scene::Scene;
 
 /// What misses an object by more gates than this does not show it.
 const WIDEST_GATES: f64 = 4.0;
@@ -22,33 +23,36 @@ const WIDEST_GATES: f64 = 4.0;
 const LEAST_SIGMAS: f64 = 2.0;
 
 /// Rays by image.
-pub struct OfImages {
+pub struct OfImages<'a> {
+    scene: &'a Scene,
     rays: Vec<u32>,
-    begins: Vec<usize>,
 }
 
-impl OfImages {
-    /// Some rays of a scene with so many images.
+impl<'a> OfImages<'a> {
+    /// Some rays of a scene.
     #[must_use]
-    pub fn new(model: &Model<'_>, rays: impl Iterator<Item = u32>) -> Self {
-        let image = |ray: u32| model.scene.rays.image[ray as usize];
+    pub fn new(scene: &'a Scene, rays: impl Iterator<Item = u32>) -> Self {
         let mut rays: Vec<u32> = rays.collect();
-        rays.sort_unstable_by_key(|&ray| (image(ray), ray));
-        let begins =
-            (0..=model.scene.views.len() as u32).map(|first| rays.partition_point(|&ray| image(ray) < first)).collect();
-        Self { rays, begins }
+        rays.sort_unstable_by_key(|&ray| (scene.rays.image[ray as usize], ray));
+        Self { scene, rays }
     }
 
     fn of(&self, image: u32) -> &[u32] {
-        &self.rays[self.begins[image as usize]..self.begins[image as usize + 1]]
+        let begins = |image: u32| self.rays.partition_point(|&ray| self.scene.rays.image[ray as usize] < image);
+        &self.rays[begins(image)..begins(image + 1)]
     }
+}
+
+/// What misses an object by more sigmas than this does not show it.
+fn widest_sigmas(model: &Model<'_>) -> f64 {
+    WIDEST_GATES * model.settings.gate_sigmas
 }
 
 /// How many detections of a class miss an object that has no vote in an image, per squared sigma of what a detection is off by, by sigmas; of the images
 /// that look at sure objects, and the rays of no object.
 #[must_use]
-pub fn tails(model: &Model<'_>, sure: &[LookedAt<'_>], free: &OfImages, ln_clutter_per_sr: f64) -> Steps {
-    let widest = WIDEST_GATES * model.settings.gate_sigmas;
+pub fn tails(model: &Model<'_>, sure: &[LookedAt<'_>], free: &OfImages<'_>, ln_clutter_per_sr: f64) -> Steps {
+    let widest = widest_sigmas(model);
     let ring = |bin: usize| {
         let [inner, outer] = [bin, bin + 1].map(|edge| widest * edge as f64 / BINS as f64);
         PI * (outer * outer - inner * inner)
@@ -86,8 +90,8 @@ pub fn of_rays(model: &Model<'_>, lookout: &Lookout, rays: &[u32], objects: &[Ob
     if !model.settings.has(Part::Tails) || !model.classes.iter().any(has_tails) {
         return Vec::new();
     }
-    let of_images = OfImages::new(model, rays.iter().copied());
-    let widest = WIDEST_GATES * model.settings.gate_sigmas;
+    let of_images = OfImages::new(model.scene, rays.iter().copied());
+    let widest = widest_sigmas(model);
     let beside = |object: &Object| -> Vec<(u32, f64)> {
         let class = &model.classes[object.class as usize];
         if !has_tails(class) {
@@ -144,7 +148,6 @@ mod tests {
     use super::super::energy::object;
     use super::super::reach::looked_at;
     use super::*;
-    use crate::robust::scene::Scene;
     use crate::street;
 
     const OBJECTS: usize = 6;
@@ -179,7 +182,7 @@ mod tests {
         let lookout = Lookout::new(scene, street::VIABILITY.max_range_m);
         let (objects, free) = found(&model, &lookout);
         let looked_at = looked_at(&model, &lookout, &objects.iter().collect::<Vec<_>>(), 50.0);
-        tails(&model, &looked_at, &OfImages::new(&model, free.into_iter()), -3.0)
+        tails(&model, &looked_at, &OfImages::new(scene, free.into_iter()), -3.0)
     }
 
     #[test]
