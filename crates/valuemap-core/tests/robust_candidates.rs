@@ -9,14 +9,16 @@ use std::sync::Arc;
 use nalgebra::{Rotation3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;
+use valuemap_core::hypothesis::Viability;
 use valuemap_core::progress::Progress;
+use valuemap_core::robust::Settings;
 use valuemap_core::robust::estimate::{Care, estimate};
 use valuemap_core::robust::index::{RayIndex, chi2};
 use valuemap_core::robust::initial::adjust::adjust;
 use valuemap_core::robust::initial::associate::Association;
 use valuemap_core::robust::initial::gather::gather;
 use valuemap_core::robust::initial::label::Label;
-use valuemap_core::robust::model::Model;
+use valuemap_core::robust::model::{Model, VOTE_RANGE};
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::propose::{Who, propose};
 use valuemap_core::robust::quick::quick_estimate;
@@ -88,6 +90,20 @@ proptest! {
         prop_assert!((best.point - object).norm() < 0.5, "{}", (best.point - object).norm());
         // So few images all propose.
         prop_assert_eq!(of(Who::Part), all);
+    }
+
+    #[test]
+    fn rays_meet_as_far_away_as_detections_vote(errors in errors_px()) {
+        // From 47 to 29 m away; from two images it is within 32 m, from one within 30 m.
+        let scene = street(10, 2.0, &[Vector3::new(46.0, 8.0, 3.0)], &errors);
+        let meet = |reach_m: f64| {
+            let viability = Viability { max_range_m: reach_m / VOTE_RANGE, ..SETTINGS.viability };
+            let settings = Settings { viability, ..SETTINGS };
+            let model = Model::new(&scene, &NOISE, &settings);
+            let all = propose(&model, &scene.usable_rays(), Who::All, &Progress::default()).unwrap();
+            all.iter().any(|hypothesis| hypothesis.rays[0] != hypothesis.rays[1])
+        };
+        prop_assert!(meet(45.0) && !meet(30.0));
     }
 
     #[test]

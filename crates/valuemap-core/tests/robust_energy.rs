@@ -19,7 +19,7 @@ use valuemap_core::robust::energy::{Object, fit, object as object_of};
 use valuemap_core::robust::index::RayIndex;
 use valuemap_core::robust::learn::learn;
 use valuemap_core::robust::looks::Lookout;
-use valuemap_core::robust::model::{ClassModel, Model};
+use valuemap_core::robust::model::{ClassModel, Model, VOTE_RANGE};
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::objects_of;
 use valuemap_core::robust::rearrange::{TriedPairs, rearrange_pairs};
@@ -370,12 +370,13 @@ fn a_viewpoint_is_as_much_of_a_hit_as_the_share_of_its_images_that_see() {
 }
 
 #[test]
-fn what_nobody_sees_within_the_range_is_no_object() {
+fn what_nobody_sees_from_where_detections_vote_is_no_object() {
     // From 46 to 37 m away.
     let object = Vector3::new(46.0, 5.0, 3.0);
     let scene = street(10, 1.0, &[object], &[[0.2, 0.1], [-0.1, -0.2]]);
     let with = |max_range_m: f64| {
-        let settings = Settings { viability: Viability { max_range_m, ..SETTINGS.viability }, ..SETTINGS };
+        let viability = Viability { max_range_m: max_range_m / VOTE_RANGE, ..SETTINGS.viability };
+        let settings = Settings { viability, ..SETTINGS };
         fit(&Model::new(&scene, &NOISE, &settings), &scene.usable_rays(), object).is_some()
     };
     assert!(with(60.0) && with(40.0) && !with(30.0));

@@ -64,7 +64,8 @@ class VoteConfig(Settings):
         unit="m",
         open_low=True,
         high=LONGEST_M,
-        effect="a proposed point farther than this from either of its cameras is dropped (r_max of the paper)",
+        effect="a proposed point farther than this from either of its cameras is dropped (r_max of the paper); "
+        "`robust` takes points and detections up to 2.5 times as far",
     )
     min_vote_ratio: float = declare(
         1.0,

@@ -32,6 +32,12 @@ impl Sure {
         Self(RTree::bulk_load(places.map(|(row, object)| GeomWithData::new(object.fit.point.into(), row)).collect()))
     }
 
+    /// Those of each class.
+    #[must_use]
+    pub fn of_classes(model: &Model<'_>, objects: &[Object]) -> Vec<Self> {
+        (0..model.classes.len() as u32).map(|class| Self::of(objects, class)).collect()
+    }
+
     /// Minus the distance to the nearest one but one, m; not a number where there is none.
     #[must_use]
     pub fn nearness(&self, place: &Vector3<f64>, but: Option<usize>) -> f64 {

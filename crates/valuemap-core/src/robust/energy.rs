@@ -98,7 +98,7 @@ impl Terms {
 }
 
 /// The position of an object, by damped Gauss-Newton with Huber's weights from a point nearby. Nothing if it is behind a voter, if the votes do not
-/// fix it, or if all voters are out of range: without parallax, whatever the detector's noise is runs to infinity.
+/// fix it, or if all voters are too far away to vote: without parallax, whatever the detector's noise is runs to infinity.
 #[must_use]
 pub fn fit(model: &Model<'_>, votes: &[u32], start: Vector3<f64>) -> Option<Fit> {
     let fitting = Fitting::new(model, votes);
@@ -131,7 +131,7 @@ pub fn fit(model: &Model<'_>, votes: &[u32], start: Vector3<f64>) -> Option<Fit>
     }
     let cholesky = here.information.cholesky()?;
     let ln_information = 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
-    is_in_range(model, votes, &point).then(|| Fit {
+    is_in_reach(model, votes, &point).then(|| Fit {
         point,
         covariance: cholesky.inverse(),
         energy: here.energy + ln_information,
@@ -139,10 +139,10 @@ pub fn fit(model: &Model<'_>, votes: &[u32], start: Vector3<f64>) -> Option<Fit>
     })
 }
 
-/// Whether any of some votes is cast from within the range.
-fn is_in_range(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> bool {
-    let range_m = model.settings.viability.max_range_m;
-    votes.iter().any(|&ray| (model.scene.ray(ray).center - point).norm() <= range_m)
+/// Whether any of some votes is cast from as near as detections vote.
+fn is_in_reach(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> bool {
+    let reach_m = model.reach_m();
+    votes.iter().any(|&ray| (model.scene.ray(ray).center - point).norm() <= reach_m)
 }
 
 /// Set weights to Huber's of some squared residuals; whether any is another one now.

@@ -42,7 +42,7 @@ pub fn objects_of_few(
     let free: Vec<u32> = rays.iter().copied().filter(is_free).collect();
     let index = RayIndex::new(model.scene, &model.spreads, model.settings.gate_sigmas, free.iter().copied());
     let beside = Beside::new(model, objects);
-    let sure: Vec<Sure> = (0..model.classes.len() as u32).map(|class| Sure::of(objects, class)).collect();
+    let sure = Sure::of_classes(model, objects);
     let nursery = Nursery { model, lookout, index: &index, beside: &beside, sure: &sure };
     let begin = |&ray: &u32| {
         progress.check()?;
@@ -74,6 +74,21 @@ pub(super) fn add_odds(model: &Model<'_>, objects: &mut [Object]) {
     for object in objects {
         object.energy -= 2.0 * ln_odds(&model.classes[object.class as usize], object.votes.len());
     }
+}
+
+/// How much more probable, in logarithms, what [`most_probable`] rather than its rays found is by the terms that J has for such objects alone: equations
+/// (6) to (8).
+pub(super) fn ln_terms(model: &Model<'_>, sure: &[Sure], object: &Object) -> f64 {
+    let density = ln_density(model, &sure[object.class as usize], object.class, &object.votes, &object.fit.point);
+    density + ln_odds(&model.classes[object.class as usize], object.votes.len())
+}
+
+/// How much denser objects of a class are at a place, with the company they have there, than clutter is at the elevations of some rays, in logarithms.
+fn ln_density(model: &Model<'_>, sure: &Sure, class: u32, votes: &[u32], place: &Vector3<f64>) -> f64 {
+    let learned = &model.classes[class as usize];
+    let sines = votes.iter().map(|&vote| model.sin_elevation[vote as usize]);
+    let clutter: f64 = sines.map(|sine| learned.clutter_by_elevation.at(sine)).sum();
+    learned.company.at(sure.nearness(place, None)) - clutter
 }
 
 /// Logarithm of the odds of objects of so many votes, among what is left.
@@ -130,7 +145,7 @@ impl Nursery<'_> {
             return None;
         }
         let mut best = self.joined(alone, ray, votes, may_vote)?;
-        best.energy -= 2.0 * self.ln_density(class, best.class, &best.votes, &best.fit.point);
+        best.energy -= 2.0 * self.ln_density(best.class, &best.votes, &best.fit.point);
         (!self.beside.explains(model, &best)).then_some(best)
     }
 
@@ -153,7 +168,7 @@ impl Nursery<'_> {
 
     /// Whether an object of some votes may be there, about where one of them alone stands. They are worth no more together than each is to that one.
     fn may_be(&self, class: &ClassModel, alone: &Object, votes: &[u32], gain: f64) -> bool {
-        let density = self.ln_density(class, alone.class, votes, &alone.fit.point);
+        let density = self.ln_density(alone.class, votes, &alone.fit.point);
         let at_most = ln_odds(class, votes.len()) + density - 0.5 * alone.energy + gain;
         if at_most <= LEAST_LN_ODDS {
             return false;
@@ -163,11 +178,8 @@ impl Nursery<'_> {
         at_most + judged.ln_likelihood() > LEAST_LN_ODDS && judged.real().ln() > LEAST_LN_ODDS
     }
 
-    /// How much denser objects are at a place, with the company they have there, than clutter is at the elevations of some rays, in logarithms.
-    fn ln_density(&self, learned: &ClassModel, class: u32, votes: &[u32], place: &Vector3<f64>) -> f64 {
-        let sines = votes.iter().map(|&vote| self.model.sin_elevation[vote as usize]);
-        let clutter: f64 = sines.map(|sine| learned.clutter_by_elevation.at(sine)).sum();
-        learned.company.at(self.sure[class as usize].nearness(place, None)) - clutter
+    fn ln_density(&self, class: u32, votes: &[u32], place: &Vector3<f64>) -> f64 {
+        ln_density(self.model, &self.sure[class as usize], class, votes, place)
     }
 }
 

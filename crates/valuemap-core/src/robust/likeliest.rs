@@ -10,12 +10,11 @@ use rayon::prelude::*;
 
 use super::calibrate::{Known, Placed, calibrate};
 use super::energy::{Object, fit};
-use super::model::{Model, VOTE_RANGE};
+use super::model::Model;
 use super::noise::Noise;
 use super::scene::Scene;
 use super::search::{Depth, search};
 use super::{CALIBRATION_RAYS, Settings, Tally, initial, placed, sample};
-use crate::hypothesis::Viability;
 use crate::progress::{Halt, Progress};
 
 /// How much wider the gate is while the noise is estimated: what a gate cuts off is missing in the estimate.
@@ -78,9 +77,6 @@ fn of_more(mut noise: Noise, step: impl Fn(&Noise) -> Result<Round, Halt>) -> Re
 /// A search may end above the least value, and in one scene farther above it than in the other. So each scene is offered the map of the other as
 /// well: it goes on with the noise that makes it likeliest there.
 ///
-/// An object stands as far away as a detection votes, not only within `max_range_m` of an image: a sample has a few images of some objects,
-/// the farthest, and which of these are within a range changes with the poses.
-///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
 pub fn misfits(
@@ -96,7 +92,7 @@ pub fn misfits(
     let mut first = sample::places(scenes[0], CALIBRATION_RAYS.0, settings.viability.max_range_m);
     first.retain(|&ray| scenes[0].ray(ray).is_usable() && scenes[1].ray(second_of_first[ray as usize]).is_usable());
     let second = renamed(&first, second_of_first);
-    let of = |scene, rays| Sample { scene, rays, known, settings: farther(&wider(settings)), progress };
+    let of = |scene, rays| Sample { scene, rays, known, settings: wider(settings), progress };
     let samples = [of(scenes[0], &first), of(scenes[1], &second)];
     // Side by side: samples are so small that threads wait for each other within each of them.
     let sought = |here: usize| Likeliest::of_starts(&samples[here], guess);
@@ -123,12 +119,6 @@ fn renamed(rays: &[u32], numbers: &[u32]) -> Vec<u32> {
 /// Settings with the gate that the noise is estimated with.
 fn wider(settings: &Settings) -> Settings {
     Settings { gate_sigmas: settings.gate_sigmas * CALIBRATION_GATE, ..*settings }
-}
-
-/// Settings with which an object stands as far away as a detection votes.
-fn farther(settings: &Settings) -> Settings {
-    let max_range_m = settings.viability.max_range_m * VOTE_RANGE;
-    Settings { viability: Viability { max_range_m, ..settings.viability }, ..*settings }
 }
 
 /// Some rays of a scene whose noise is sought.
@@ -399,7 +389,7 @@ mod tests {
         };
         // From where the second drive says that it was, some objects are within the range; from where it was, none is.
         let (right, wrong) = (drives(0.0), drives(4.0));
-        let viability = Viability { max_range_m: 31.0, ..street::VIABILITY };
+        let viability = crate::hypothesis::Viability { max_range_m: 31.0, ..street::VIABILITY };
         let settings = Settings { viability, ..street::SETTINGS };
         let same: Vec<u32> = (0..right.rays.rays.len() as u32).collect();
         let scenes = [&right, &wrong];

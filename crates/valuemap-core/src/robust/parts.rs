@@ -47,7 +47,7 @@ pub enum Part {
     Aspect,
     /// Objects are denser near others.
     Company,
-    /// Scores and company tell which objects exist.
+    /// Scores, company and approach tell which objects exist.
     Existence,
     /// Who should have seen an object and did not.
     Looks,

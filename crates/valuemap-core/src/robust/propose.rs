@@ -266,8 +266,8 @@ impl<'a> Neighborhood<'a> {
         let (along_own, along_other) = (baseline.dot(&own.ray.direction), baseline.dot(&other.ray.direction));
         let scale = 1.0 / (1.0 - cosine * cosine);
         let ranges = [(along_own - cosine * along_other) * scale, (cosine * along_own - along_other) * scale];
-        let viability = &self.model.settings.viability;
-        let in_range = |&r: &f64| r >= viability.min_range_m && r <= viability.max_range_m;
+        let (nearest_m, reach_m) = (self.model.settings.viability.min_range_m, self.model.reach_m());
+        let in_range = |&r: &f64| r >= nearest_m && r <= reach_m;
         if !ranges.iter().all(in_range) {
             return None;
         }

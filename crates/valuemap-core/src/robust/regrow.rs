@@ -3,13 +3,17 @@
 //! Rays of one approach hardly differ in direction and propose no point, but size and height locate an object on one of them. If
 //! it has lost a vote to another object, what is left is too little for a birth, and the other object fits well enough to keep
 //! the vote. Only both changes together lower J.
+//!
+//! Without a vote of others it stands where objects of few votes stand, and must be worth what they must: many rays from far away agree on some place at
+//! the usual height by chance.
 
 use rayon::prelude::*;
 use rustc_hash::FxHashSet;
 
 use super::assign::{gain_alone, places_of};
+use super::company::Sure;
 use super::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, object, owners, unseen, visits};
-use super::few::{most_probable, votes_on};
+use super::few::{ln_terms, most_probable, votes_on};
 use super::index::RayIndex;
 use super::looks::Lookout;
 use super::model::Model;
@@ -45,8 +49,15 @@ pub fn regrow(
     let free: Vec<u32> = rays.iter().copied().filter(|&ray| owner[ray as usize] == NOBODY).collect();
     let index_of =
         |rays: &[u32]| RayIndex::new(model.scene, &model.spreads, model.settings.gate_sigmas, rays.iter().copied());
-    let garden =
-        Garden { model, lookout, free: &index_of(&free), of_few: &index_of(&of_few), objects: &objects, owner: &owner };
+    let garden = Garden {
+        model,
+        lookout,
+        free: &index_of(&free),
+        of_few: &index_of(&of_few),
+        objects: &objects,
+        owner: &owner,
+        sure: &Sure::of_classes(model, &objects),
+    };
     let try_one = |&ray: &u32| {
         progress.check()?;
         Ok(garden.birth_on(ray))
@@ -90,6 +101,8 @@ struct Garden<'a> {
     objects: &'a [Object],
     /// The object of each ray.
     owner: &'a [u32],
+    /// The sure objects of each class.
+    sure: &'a [Sure],
 }
 
 impl Garden<'_> {
@@ -131,6 +144,9 @@ impl Garden<'_> {
                 born = more;
                 birth.push((other, left));
             }
+        }
+        if birth.is_empty() {
+            change -= 2.0 * ln_terms(model, self.sure, &born);
         }
         let is_one = born.votes.len() >= model.settings.min_votes as usize && born.energy < 0.0;
         (is_one && change < -LEAST_GAIN_OF_MOVE).then_some(Birth { change, born, others: birth })
@@ -174,8 +190,24 @@ impl Garden<'_> {
 mod tests {
     use nalgebra::Vector3;
 
+    use super::super::heights::Heights;
     use super::*;
     use crate::street;
+
+    #[test]
+    fn what_takes_no_vote_is_born_only_where_an_object_of_few_votes_would_be() -> Result<(), Halt> {
+        let scene = street::street(20, 1.0, &[Vector3::new(40.0, 4.0, 3.0)], &[[0.4, -0.3], [-0.2, 0.5], [0.1, 0.2]]);
+        let mut model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
+        model.classes[0].ln_births_per_m2 = -2.0 * street::VIABILITY.max_range_m.ln();
+        model.classes[0].heights = Heights::learn(&[3.0; 60], &[0.1; 60], street::VIABILITY.max_range_m);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        for (ln_odds, is_born) in [(0.0, true), (-1e3, false)] {
+            model.classes[0].ln_odds_of_few.fill(ln_odds);
+            let (born, any) = regrow(&model, &lookout, &scene.usable_rays(), Vec::new(), &Progress::default())?;
+            assert_eq!((any, born.len()), (is_born, usize::from(is_born)));
+        }
+        Ok(())
+    }
 
     #[test]
     fn objects_of_many_visits_lose_no_votes() {
