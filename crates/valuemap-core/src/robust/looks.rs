@@ -21,7 +21,7 @@ use super::seen::{Looks, Seen};
 const CUBE_SHARE: f64 = 1.0 / 6.0;
 /// Half of the angle of a sector (cosine of 15 degrees): housings and faces are detected about so much farther to the side than
 /// the farthest vote, and no more is known.
-const SECTOR_COSINE: f64 = 0.966;
+pub(super) const SECTOR_COSINE: f64 = 0.966;
 /// A look at a point where another detection is counts so much: hidden as often as not.
 const HIDDEN_LOOK: f64 = 0.5;
 

@@ -53,6 +53,7 @@ mod spd;
 pub mod split;
 pub mod switches;
 pub mod tails;
+pub mod untangle;
 
 use std::sync::Arc;
 

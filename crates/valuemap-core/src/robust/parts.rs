@@ -25,6 +25,8 @@ pub enum Part {
     Births,
     /// Objects are born with votes of others.
     TakenVotes,
+    /// Images that show both of two neighbours say which is which.
+    Untangling,
     /// Solid things are not in one place.
     Exclusion,
     /// What begins to be seen where another object ends is that object.
@@ -67,7 +69,7 @@ pub enum Part {
 
 impl Part {
     /// All parts with their names.
-    pub const ALL: [(Self, &'static str); 30] = [
+    pub const ALL: [(Self, &'static str); 31] = [
         (Self::Polishing, "polishing"),
         (Self::Assignment, "assignment"),
         (Self::Merging, "merging"),
@@ -79,6 +81,7 @@ impl Part {
         (Self::TwoForOne, "two_for_one"),
         (Self::Births, "births"),
         (Self::TakenVotes, "taken_votes"),
+        (Self::Untangling, "untangling"),
         (Self::Exclusion, "exclusion"),
         (Self::IdentitySwitches, "identity_switches"),
         (Self::Sizes, "sizes"),

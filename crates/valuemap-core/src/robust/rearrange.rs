@@ -23,7 +23,7 @@ use crate::progress::{Halt, Progress};
 /// Objects have to do with each other if one of them may have this share of the other's votes.
 const LEAST_SHARE: f64 = 0.1;
 /// So do objects nearer to each other than this share of the range: rays from two directions meet crosswise not far from where they should.
-const NEAR_SHARE: f64 = 0.05;
+pub(super) const NEAR_SHARE: f64 = 0.05;
 /// What looks from directions within this angle of each other looks from one side (cosine of 25 degrees).
 const SIDE_COSINE: f64 = 0.906;
 /// Two objects of a class are no nearer to each other than this share of their size: things are solid, and boxes show their middle to

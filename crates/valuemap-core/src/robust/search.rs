@@ -1,7 +1,8 @@
 //! The search for the map with the least J: moves from an initial map, committed only if J falls.
 //!
 //! Each round has assignment, merges and swaps, destroy and repair, and births, until no move lowers J. Births with votes of
-//! others come last. Where all moves are not worth their time, there is one round of assignment, deaths and births. A search that
+//! others come last. Where all moves are not worth their time, there is one round of assignment, deaths and births. At the end images that show both of
+//! two neighbours say which is which. A search that
 //! `learns` learns the classes of its model anew in each round.
 
 use std::sync::Arc;
@@ -23,6 +24,7 @@ use super::rearrange::{TriedPairs, exclude, rearrange_pairs};
 use super::regrow::regrow;
 use super::repair::{Tried, repair};
 use super::tails::of_rays;
+use super::untangle::untangle;
 use crate::progress::{Halt, Progress};
 
 /// Rounds, at most.
@@ -116,6 +118,9 @@ pub fn search(
         if !any {
             break;
         }
+    }
+    if model.settings.has(Part::Untangling) && depth >= Depth::Once {
+        objects = untangle(model, &lookout, objects, progress)?;
     }
     if model.settings.has(Part::Exclusion) {
         objects = exclude(model, &lookout, &index, objects, progress)?;

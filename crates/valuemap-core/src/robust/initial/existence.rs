@@ -13,7 +13,8 @@ use rstar::RTree;
 use rstar::primitives::GeomWithData;
 use rustc_hash::FxHashMap;
 
-use super::label::{Label, SECTOR_COSINE, direction_to, sector_middles};
+use super::label::{Label, direction_to, sector_middles};
+use crate::robust::looks::SECTOR_COSINE;
 use crate::robust::noise::Spread;
 use crate::robust::scene::Scene;
 

@@ -11,6 +11,7 @@ use rustc_hash::FxHasher;
 
 use crate::robust::calibrate;
 use crate::robust::estimate::{Care, Elsewhere, Estimate, Joint, Limits, Start};
+use crate::robust::looks::SECTOR_COSINE;
 use crate::robust::noise::Noise;
 use crate::robust::scene::{Scene, View};
 
@@ -21,8 +22,6 @@ const SMALL_TURN: f64 = 0.1;
 
 /// Voters whose directions have a mean at least this long are all on one side of the label.
 const ONE_SIDED: f64 = 0.6;
-/// Half of the angle of a sector, and the least between the middles of two (cosine of 15 degrees).
-pub const SECTOR_COSINE: f64 = 0.966;
 /// What is seen from one side is not seen from directions farther than this from their mean (cosine of 80 degrees).
 const SIDE_COSINE: f64 = 0.17;
 

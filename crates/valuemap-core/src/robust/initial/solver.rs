@@ -136,7 +136,7 @@ impl<'a> Solver<'a> {
         let &mut Self { scene, noise, settings, .. } = self;
         let gate = settings.gate_sigmas;
         let min_votes = settings.min_votes as usize;
-        let labels = exchange::exchange(scene, noise, gate, labels);
+        let labels = exchange::exchange(self.model, labels);
         let labels = self.associate(labels, tally, progress)?;
         let associated = labels.len();
         let labels = adjust(scene, noise, gate, min_votes, &labels);

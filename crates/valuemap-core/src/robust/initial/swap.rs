@@ -11,10 +11,11 @@ use rayon::prelude::*;
 use rustc_hash::FxHashSet;
 
 use super::associate::Association;
-use super::label::{Label, SECTOR_COSINE, by_place, direction_to, from_voters, sector_middles};
+use super::label::{Label, by_place, direction_to, from_voters, sector_middles};
 use super::pairs::{nearest_pairs, replaced};
 use crate::robust::Settings;
 use crate::robust::estimate::{Care, Joint, Limits, Start};
+use crate::robust::looks::SECTOR_COSINE;
 use crate::robust::parts::Part;
 
 /// Labels farther apart than this do not have each other's votes, m.
