@@ -6,6 +6,7 @@
 //!    [`initial`]: the map that the search begins with.
 //! 4. [`search`](mod@search): moves that are committed only if J ([`energy`]) falls. [`assign`](mod@assign): all detections of an image.
 //!    [`rearrange`]: merges and exchanges of two objects. [`repair`](mod@repair): neighbourhoods. [`births`](mod@births), [`regrow`](mod@regrow): births.
+//!    [`untangle`](mod@untangle): which of two neighbours is which.
 //! 5. [`finish`](mod@finish): positions and covariances, objects of a place together ([`estimate`](mod@estimate), [`drift`], [`contest`]).
 //! 6. [`few`]: objects of one or two votes. [`existence`]: which objects exist. [`switches`]: identity switches are left out.
 

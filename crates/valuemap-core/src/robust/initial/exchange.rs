@@ -21,10 +21,11 @@ pub fn exchange(model: &Model<'_>, labels: Vec<Label>) -> Vec<Label> {
 /// The two labels after an exchange; nothing if they are best as they are.
 fn exchanged(model: &Model<'_>, of: [&Label; 2]) -> Option<Vec<Label>> {
     let votes = of.map(|label| label.voters.as_slice());
-    let shown = which_is_which(model.scene, model.noise, votes, of.map(|label| label.estimate.point), reach_m(model))?;
+    let exchange =
+        which_is_which(model.scene, model.noise, votes, of.map(|label| label.estimate.point), reach_m(model))?;
     let label = |(voters, old): (Vec<u32>, &Label)| {
         let found = from_voters(model.scene, model.noise, model.settings.gate_sigmas, voters, old.estimate.point)?;
         Some(Label { unseen_from: old.unseen_from.clone(), ..found })
     };
-    votes_of_both(&shown).into_iter().zip(of).map(label).collect()
+    votes_of_both(&exchange.shown).into_iter().zip(of).map(label).collect()
 }
