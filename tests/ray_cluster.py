@@ -92,10 +92,15 @@ def error_of(run: Callable[[], object]) -> ValuemapError:
 
 
 class InOrder(RayEngine):
-    """Shards are told of in their order: whichever gets done first, an interrupted run has done the first."""
+    """Tasks are told of in their order: whichever gets done first, an interrupted run has the first, not all."""
 
     def run(self, work: Work[T, R], tasks: Iterable[T], *, on_gpus: bool = False) -> Iterator[tuple[int, R]]:
-        yield from sorted(super().run(work, tasks, on_gpus=on_gpus), key=lambda done: done[0])
+        ahead, number = dict[int, R](), 0
+        for done, result in super().run(work, tasks, on_gpus=on_gpus):
+            ahead[done] = result
+            while number in ahead:
+                yield number, ahead.pop(number)
+                number += 1
 
 
 def detect_as_threads(folder: Path, engine: Engine) -> None:
