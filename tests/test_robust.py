@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import math
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError
-from valuemap.robust import Noise, calibration_from_json
+from valuemap.robust import Calibration, Noise, calibration_from_json, calibration_to_json
 from valuemap.simulate import simulate
 from valuemap.tables import Categories
 
@@ -203,9 +205,26 @@ def test_a_stricter_existence_keeps_fewer() -> None:
 
 
 def test_a_calibration_of_another_version_is_refused() -> None:
-    row = [0.5] * _core.CLASS_NUMBERS
+    row = tuple(0.5 + number for number in range(sum(count for _, count in _core.CLASS_FIELDS)))
     noise = dict.fromkeys((each.name for each in dataclasses.fields(Noise)), 0.1)
-    value = {"noise": noise, "is_deep": False, "classes": {"light": row}, "pooled": row, "confusions": {}}
-    assert calibration_from_json(value, source="run.json").classes == {"light": tuple(row)}
-    with pytest.raises(InputError, match="run.json: is no calibration: expected [0-9]+ numbers of each class"):
-        calibration_from_json({**value, "classes": {"light": row[1:]}}, source="run.json")
+    known = Calibration(Noise(**noise), False, {"light": row}, row, {})
+    value = calibration_to_json(known)
+    assert calibration_from_json(value, source="run.json") == known
+    fields = value["classes"]["light"]
+    assert fields["recall"] == row[1]
+    for name, changed in (
+        ("recall", {key: number for key, number in fields.items() if key != "recall"}),
+        ("score_edges", {**fields, "score_edges": fields["score_edges"][1:]}),
+        ("score_edges", {**fields, "score_edges": 0.5}),
+    ):
+        with pytest.raises(InputError, match=f"run.json: is no calibration: .*({name}|not iterable)"):
+            calibration_from_json({**value, "classes": {"light": changed}}, source="run.json")
+
+
+def test_what_is_not_known_of_a_class_is_null() -> None:
+    row = [math.nan] * sum(count for _, count in _core.CLASS_FIELDS)
+    value = calibration_to_json(Calibration(Noise(), False, {"light": tuple(row)}, tuple(row), {}))
+    assert value["pooled"]["nearest_m"] is None
+    assert set(value["classes"]["light"]["score_edges"]) == {None}
+    again = calibration_from_json(json.loads(json.dumps(value, allow_nan=False)), source="run.json")
+    assert all(math.isnan(number) for number in again.pooled)

@@ -9,7 +9,7 @@ _Floats = NDArray[np.float64]
 _Offsets = NDArray[np.int64]
 _Indices = NDArray[np.uint32]
 
-CLASS_NUMBERS: int
+CLASS_FIELDS: list[tuple[str, int]]
 CALIBRATION_STEPS: int
 MISFIT_STEPS: int
 SEARCH_STEPS: int

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, dataclass, replace
 from functools import cached_property
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -74,9 +75,12 @@ class Calibration:
 
 
 def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
-    """Return a calibration as an object of JSON; numbers that are not finite are null."""
-    classes = {name: _finite(row) for name, row in calibration.classes.items()}
-    return {**asdict(calibration), "classes": classes, "pooled": _finite(calibration.pooled)}
+    """Return a calibration as an object of JSON; numbers that are not finite are null.
+
+    What is learned of a class has the names of the core's `ClassModel::FIELDS`, which `docs/tables.md` explains.
+    """
+    classes = {name: _named(row) for name, row in calibration.classes.items()}
+    return {**asdict(calibration), "classes": classes, "pooled": _named(calibration.pooled)}
 
 
 def calibration_from_json(value: Any, *, source: str) -> Calibration:
@@ -85,7 +89,7 @@ def calibration_from_json(value: Any, *, source: str) -> Calibration:
         return Calibration(
             noise=Noise(**{name: float(number) for name, number in value["noise"].items()}),
             is_deep=bool(value["is_deep"]),
-            classes={name: _numbers(row) for name, row in value["classes"].items()},
+            classes={name: _numbers(fields) for name, fields in value["classes"].items()},
             pooled=_numbers(value["pooled"]),
             confusions={
                 name: {said: float(share) for said, share in shares.items()}
@@ -96,14 +100,26 @@ def calibration_from_json(value: Any, *, source: str) -> Calibration:
         raise InputError(f"{source}: is no calibration: {error}", hint="make the map again") from error
 
 
-def _finite(row: Sequence[float]) -> list[float | None]:
-    return [number if math.isfinite(number) else None for number in row]
+def _named(row: Sequence[float]) -> dict[str, Any]:
+    """Return the numbers of a class by the names of the core's fields, single ones as such."""
+    named: dict[str, Any] = {}
+    left = iter(number if math.isfinite(number) else None for number in row)
+    for name, count in _core.CLASS_FIELDS:
+        numbers = list(islice(left, count))
+        named[name] = numbers[0] if count == 1 else numbers
+    return named
 
 
-def _numbers(row: Sequence[float | None]) -> tuple[float, ...]:
-    if len(row) != _core.CLASS_NUMBERS:
-        raise ValueError(f"expected {_core.CLASS_NUMBERS} numbers of each class, as this version of valuemap has")
-    return tuple(math.nan if number is None else float(number) for number in row)
+def _numbers(fields: dict[str, Any]) -> tuple[float, ...]:
+    """Return what `_named` was given; raises `ValueError` naming the field where it is of another version."""
+    row: list[float] = []
+    for name, count in _core.CLASS_FIELDS:
+        value = fields.get(name, ())
+        numbers = [value] if count == 1 and name in fields else list(value)
+        if len(numbers) != count:
+            raise ValueError(f"expected {count} numbers as {name} of each class, as this version of valuemap has")
+        row.extend(math.nan if number is None else float(number) for number in numbers)
+    return tuple(row)
 
 
 class Scene:

@@ -253,12 +253,14 @@ fn parts() -> Vec<&'static str> {
 
 #[pymodule]
 mod _core {
+    use valuemap_core::robust::model::ClassModel;
+
     #[pymodule_export]
     use super::drives::{camera_centers, revisits, viewpoint_openings};
     #[pymodule_export]
     use super::robust::{Scene, calibrate, find_labels, misfits, objects_of};
     #[pymodule_export]
-    const CLASS_NUMBERS: usize = valuemap_core::robust::model::ClassModel::NUMBERS;
+    const CLASS_FIELDS: [(&str, usize); ClassModel::FIELDS.len()] = ClassModel::FIELDS;
     #[pymodule_export]
     const CALIBRATION_STEPS: usize = valuemap_core::robust::CALIBRATION_STEPS;
     #[pymodule_export]

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 
 use super::aspect::Aspect;
-use super::clutter::Steps;
+use super::clutter::{BINS, Steps};
 use super::confusion::Confusions;
 use super::counts::FEW;
 use super::existence::Existing;
@@ -98,8 +98,58 @@ impl ClassModel {
         }
     }
 
+    /// The names that its numbers are stored under, in the order of [`to_row`](Self::to_row), each with how many there are. What is a function of
+    /// something is stored as the edges between which it is constant, and its values.
+    pub const FIELDS: [(&'static str, usize); 38] = [
+        ("is_learned", 1),
+        ("recall", 1),
+        ("recall_concentration_looks", 1),
+        ("recall_between_sides_logit", 1),
+        ("nearest_m", 1),
+        ("farthest_m", 1),
+        ("odd_passes", 1),
+        ("ln_clutter_per_sr", 1),
+        ("ln_births_per_m3", 1),
+        ("ln_births_per_m2", 1),
+        ("box_angle_mean_ln_rad", 1),
+        ("box_angle_sigma_ln_rad", 1),
+        ("object_size_mean_ln_m", 1),
+        ("object_size_sigma_ln_m", 1),
+        ("size_in_one_box_sigma_ln", 1),
+        ("ln_odds_of_one_two_more_votes", FEW),
+        ("range_mean_ln_m", 1),
+        ("range_sigma_ln_m", 1),
+        ("heights_share_mean_m_sigma_m", Heights::NUMBERS - 1),
+        ("ln_elsewhere_per_m", 1),
+        ("clutter_edges_sine_of_elevation", BINS - 1),
+        ("clutter_ln_ratio", BINS),
+        ("score_edges", BINS - 1),
+        ("score_ln_ratio", BINS),
+        ("tails_edges_sigmas", BINS - 1),
+        ("tails_per_squared_sigma", BINS),
+        ("reach_edges_m", BINS - 1),
+        ("reach_share", BINS),
+        ("company_edges_minus_m", BINS - 1),
+        ("company_ln_ratio", BINS),
+        ("aspect_share", Aspect::NUMBERS),
+        ("existence_score_edges", BINS - 1),
+        ("existence_score_ln_odds", BINS),
+        ("existence_nearness_edges", BINS - 1),
+        ("existence_nearness_ln_odds", BINS),
+        ("existence_approach_edges", BINS - 1),
+        ("existence_approach_ln_odds", BINS),
+        ("existence_ln_odds", 1),
+    ];
+
     /// How many numbers it is stored as.
-    pub const NUMBERS: usize = 20 + Heights::NUMBERS + 5 * Steps::NUMBERS + Aspect::NUMBERS + Existing::NUMBERS;
+    pub const NUMBERS: usize = {
+        let (mut sum, mut field) = (0, 0);
+        while field < Self::FIELDS.len() {
+            sum += Self::FIELDS[field].1;
+            field += 1;
+        }
+        sum
+    };
 
     /// All of it as numbers, for storage.
     #[must_use]
@@ -576,6 +626,86 @@ pub fn mean_and_sd(values: &[f64]) -> (f64, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn numbers_are_stored_under_their_names() {
+        let steps = |first: f64| Steps::even(first, std::array::from_fn(|bin| first + bin as f64));
+        let heights = Heights::learn(&[3.0; 30], &[0.1; 30], 50.0);
+        let model = ClassModel {
+            is_learned: true,
+            rates: Rates { recall: 0.61, concentration: 7.0, between: 0.4 },
+            nearest_m: 4.0,
+            farthest_m: 61.0,
+            odd_passes: 0.02,
+            ln_clutter_per_sr: -1.0,
+            ln_births_per_m3: -9.0,
+            ln_births_per_m2: -6.0,
+            heights,
+            clutter_by_elevation: steps(100.0),
+            score_ratio: steps(200.0),
+            tails: steps(300.0),
+            reach: steps(400.0),
+            aspect: Aspect::ONE,
+            ln_odds_of_few: [-3.0, -2.0, 0.5],
+            company: steps(500.0),
+            existing: Existing {
+                by_score: steps(600.0),
+                by_nearness: steps(700.0),
+                by_approach: steps(800.0),
+                ln_odds: 0.25,
+            },
+            sizes: Sizes { angle: (-4.0, 0.7), object: (-0.5, 0.2), spread: 0.1 },
+            ranges: (2.5, 0.6),
+        };
+        let row = model.to_row();
+        assert_eq!(row.len(), ClassModel::NUMBERS);
+        let stored = |name: &str| -> &[f64] {
+            let before = ClassModel::FIELDS.iter().take_while(|field| field.0 != name);
+            let first = before.map(|field| field.1).sum::<usize>();
+            let count = ClassModel::FIELDS.iter().find(|field| field.0 == name).map_or(0, |field| field.1);
+            &row[first..first + count]
+        };
+        for (name, numbers) in [
+            ("is_learned", vec![1.0]),
+            ("recall", vec![0.61]),
+            ("recall_concentration_looks", vec![7.0]),
+            ("recall_between_sides_logit", vec![0.4]),
+            ("nearest_m", vec![4.0]),
+            ("farthest_m", vec![61.0]),
+            ("odd_passes", vec![0.02]),
+            ("ln_clutter_per_sr", vec![-1.0]),
+            ("ln_births_per_m3", vec![-9.0]),
+            ("ln_births_per_m2", vec![-6.0]),
+            ("box_angle_mean_ln_rad", vec![-4.0]),
+            ("box_angle_sigma_ln_rad", vec![0.7]),
+            ("object_size_mean_ln_m", vec![-0.5]),
+            ("object_size_sigma_ln_m", vec![0.2]),
+            ("size_in_one_box_sigma_ln", vec![0.1]),
+            ("ln_odds_of_one_two_more_votes", vec![-3.0, -2.0, 0.5]),
+            ("range_mean_ln_m", vec![2.5]),
+            ("range_sigma_ln_m", vec![0.6]),
+            ("ln_elsewhere_per_m", heights.iter().filter_map(|heights| heights.to_row().last().copied()).collect()),
+            ("existence_ln_odds", vec![0.25]),
+            ("aspect_share", vec![1.0; Aspect::NUMBERS]),
+        ] {
+            assert_eq!(stored(name), numbers, "{name}");
+        }
+        // The first component of heights has the mean second.
+        assert!((stored("heights_share_mean_m_sigma_m")[1] - 3.0).abs() < 0.1);
+        for (edges, values, first) in [
+            ("clutter_edges_sine_of_elevation", "clutter_ln_ratio", 100.0),
+            ("score_edges", "score_ln_ratio", 200.0),
+            ("tails_edges_sigmas", "tails_per_squared_sigma", 300.0),
+            ("reach_edges_m", "reach_share", 400.0),
+            ("company_edges_minus_m", "company_ln_ratio", 500.0),
+            ("existence_score_edges", "existence_score_ln_odds", 600.0),
+            ("existence_nearness_edges", "existence_nearness_ln_odds", 700.0),
+            ("existence_approach_edges", "existence_approach_ln_odds", 800.0),
+        ] {
+            assert!((stored(edges)[0] - first / BINS as f64).abs() < 1e-9, "{edges}");
+            assert!((stored(values)[0] - first).abs() < 1e-9, "{values}");
+        }
+    }
 
     #[test]
     fn the_beta_binomial_is_that_of_whole_numbers() {
