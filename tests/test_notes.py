@@ -25,6 +25,7 @@ from valuemap.notes import (
     no_labels,
     no_overlap,
     noise_at_bound,
+    untested_covariances,
     unused_detections,
 )
 from valuemap.pipeline import build_map
@@ -148,6 +149,16 @@ def test_passes_without_overlap(image_id: list[int], label_id: list[int], told: 
 def test_a_single_pass_overlaps_with_nothing() -> None:
     result = with_votes([10, 20], [0, 1])
     assert no_overlap(replace(findings(result), passes=1)) is None
+
+
+def test_covariances_that_no_second_pass_tests_are_told() -> None:
+    result = with_votes([10, 20], [0, 1])
+    assert untested_covariances(findings(result)) is None
+    one_pass = replace(findings(result), passes=1)
+    assert str(untested_covariances(one_pass)).startswith("all images are of one pass: standard deviations of labels")
+    none_stated = result.labels.replace(covariance_m2=np.zeros_like(result.labels.covariance_m2))
+    assert untested_covariances(replace(one_pass, labels=none_stated)) is None
+    assert untested_covariances(replace(findings(map_of([])), passes=1)) is None
 
 
 @pytest.mark.parametrize(

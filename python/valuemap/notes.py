@@ -132,6 +132,17 @@ def no_overlap(findings: Findings) -> str | None:
     )
 
 
+def untested_covariances(findings: Findings) -> str | None:
+    """Say that no second pass tests the covariances, which are known then from the scatter along one drive alone."""
+    labels = findings.labels
+    if findings.passes != 1 or not np.any(labels.covariance_m2 > 0.0):
+        return None
+    return (
+        "all images are of one pass: standard deviations of labels leave out what poses or boxes get wrong all along "
+        "it, which a second pass or surveyed objects (valuemap evaluate) would show"
+    )
+
+
 def classes_spelled_alike(findings: Findings) -> str | None:
     """Say that classes differ in capitals, spaces, hyphens or underscores only: their detections never meet."""
     groups: dict[str, list[str]] = {}
@@ -174,6 +185,7 @@ NOTES: tuple[Callable[[Findings], str | None], ...] = (
     implausible_size,
     close_twins,
     no_overlap,
+    untested_covariances,
     classes_spelled_alike,
 )
 """All of them, in the order in which they are told."""
