@@ -114,9 +114,9 @@ def _numbers(fields: dict[str, Any]) -> tuple[float, ...]:
     """Return what `_named` was given; raises `ValueError` naming the field where it is of another version."""
     row: list[float] = []
     for name, count in _core.CLASS_FIELDS:
-        value = fields.get(name, ())
-        numbers = [value] if count == 1 and name in fields else list(value)
-        if len(numbers) != count:
+        value = fields.get(name)
+        numbers = [value] if count == 1 and name in fields else value
+        if not isinstance(numbers, list) or len(numbers) != count:
             raise ValueError(f"expected {count} numbers as {name} of each class, as this version of valuemap has")
         row.extend(math.nan if number is None else float(number) for number in numbers)
     return tuple(row)
