@@ -156,6 +156,7 @@ def test_covariances_that_no_second_pass_tests_are_told() -> None:
     assert untested_covariances(findings(result)) is None
     one_pass = replace(findings(result), passes=1)
     assert str(untested_covariances(one_pass)).startswith("all images are of one pass: standard deviations of labels")
+    assert untested_covariances(one_pass) in find_notes(one_pass)
     none_stated = result.labels.replace(covariance_m2=np.zeros_like(result.labels.covariance_m2))
     assert untested_covariances(replace(one_pass, labels=none_stated)) is None
     assert untested_covariances(replace(findings(map_of([])), passes=1)) is None
