@@ -126,6 +126,7 @@ SCENES: dict[str, Scene] = {
     "tails-trees": Scene(along_streets(tree_spacing_m=10.0, max_sight_m=60.0, tail_share=0.1), 40.0),
     "tails-signs": Scene(along_streets(sign_row_spacing_m=30.0, sign_apart_m=0.9, tail_share=0.1), 45.0),
     "shapes": with_lights(size_spread=0.2, side_offset_m=0.15),
+    "shapes-lamps": Scene(along_streets(lamp_spacing_m=25.0, side_offset_m=0.15), 60.0),
     "middle": with_lights(**MIDDLE),
     "classes": with_lights(class_confusion=0.1, sign_row_spacing_m=40.0),
     "two-cameras": with_lights(cameras=2, camera_folders=0),

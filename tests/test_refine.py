@@ -355,6 +355,40 @@ def test_numbers_of_images_and_detections_do_not_matter_where_poses_are_correcte
     assert laws.compare_maps(before, after, shuffled).holds
 
 
+def lamps_of_four_sides() -> Dataset:
+    """Return lamps that show other middles to other sides, of images that are off and show few of them."""
+    config = dataclasses.replace(CITY, has_lights=0, lamp_spacing_m=25.0, side_offset_m=0.25)
+    return simulate(dataclasses.replace(config, position_white_m=0.15, rotation_white_deg=0.2), seed=4)
+
+
+def test_middles_that_differ_by_side_are_no_errors_of_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    lamps = lamps_of_four_sides()
+    assert lamps.truth is not None
+    result = valuemap.build_map(lamps)
+    assert result.run["poses"]["found"] == "errors of images"
+    assert len(result.labels) <= len(lamps.truth) + 1
+    assert between_neighbors(result, lamps)[1] < 6.0
+    monkeypatch.setattr(pipeline, "_with_sides_of", lambda _, config: config)
+    assert len(valuemap.build_map(lamps).labels) > 1.5 * len(lamps.truth)
+
+
+def test_images_are_moved_by_what_sides_show_each() -> None:
+    lamps, config = lamps_of_four_sides(), MapConfig()
+    calibration, labels, votes, _ = pipeline._map_alone(lamps, config, ThreadEngine(1), silent)
+    assert calibration.noise.side_m > 0.1
+    images = refine_images.gather_images(lamps, config)
+    told, as_one = (
+        refine_images.bundle(images, labels, votes, dataclasses.replace(calibration.noise, side_m=side_m))
+        for side_m in (calibration.noise.side_m, 0.0)
+    )
+    assert len(as_one.label) == len(labels)
+    assert len(told.label) > 1.5 * len(labels)
+    (row, covariance_m2), (row_as_one, _) = told.covariances(), as_one.covariances()
+    assert np.array_equal(row, row_as_one)
+    sides = np.bincount(told.label)[row]
+    assert (np.trace(covariance_m2, axis1=1, axis2=2) > 3.0 * calibration.noise.side_m**2 / sides).all()
+
+
 def test_errors_of_images_are_no_noise_of_detections() -> None:
     """Images whose poses are exact stay, however poor the detector: what one object says another does not confirm."""
     poor = city(pixel_noise_px=5.0, **EXACT_POSES)

@@ -39,7 +39,7 @@ from valuemap.refine import (
 )
 from valuemap.rejected import rejected_of_map
 from valuemap.remote import Place, UrlPath
-from valuemap.robust import Calibration, calibration_to_json
+from valuemap.robust import Calibration, Noise, calibration_to_json
 from valuemap.system import peak_memory_mb
 from valuemap.tables import Labels, Votes, covariance_columns
 from valuemap.tiles.calibration import calibrate
@@ -107,7 +107,7 @@ def build_map(
         refined = _refined(dataset, config, stages, threads, progress)
         with stages.measured("order"):
             source = InMemory(refined.dataset, config)
-        labels, votes, counts, _ = _robust(source, config, stages, ThreadEngine(threads), progress, refined.as_given)
+        labels, votes, counts, _ = _robust(source, config, stages, ThreadEngine(threads), progress, refined)
         labels = _with_errors_of_images(refined, labels, votes)
     size = {"images": len(dataset.images), "detections": len(dataset.detections)}
     passes = len(np.unique(dataset.images.pass_id.codes))
@@ -217,8 +217,7 @@ def build_map_of_folder(
             )
         source, name, frame, size = on_disk, on_disk.name, on_disk.frame, on_disk.counts
         _check_detections(name, size["detections"])
-    as_given = None if refined is None else refined.as_given
-    labels, votes, counts, cells = _robust(source, config, stages, run.engine, progress, as_given, run)
+    labels, votes, counts, cells = _robust(source, config, stages, run.engine, progress, refined, run)
     if refined is not None:
         labels = _with_errors_of_images(refined, labels, votes)
     passes = source.drives_record["passes"]
@@ -287,6 +286,7 @@ def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progr
         if not len(labels):
             return Refined(before, {}, as_given=as_given)
         noise = as_given[0].noise
+        config = _with_sides_of(noise, config)
         told = bundle(images, labels, votes, noise)
         if number == 0:
             is_proven, figures = told.is_proven()
@@ -300,6 +300,14 @@ def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progr
     return Refined(moved, record, is_corrected=True, before_images=(images, noise))
 
 
+def _with_sides_of(noise: Noise, config: MapConfig) -> MapConfig:
+    """Return settings with the middles that sides show, which were told before images were moved.
+
+    Where images show one thing each, errors of images explain all that its sides disagree about.
+    """
+    return replace(config, noise=replace(config.noise, side_sigma_m=noise.side_m))
+
+
 def _with_errors_of_images(refined: Refined, labels: Labels, votes: Votes) -> Labels:
     """Return labels with covariances that know of errors of images, where these were corrected.
 
@@ -310,7 +318,8 @@ def _with_errors_of_images(refined: Refined, labels: Labels, votes: Votes) -> La
     images, noise = refined.before_images
     told = bundle(images, labels, votes, noise)
     columns = labels.covariance_m2.copy()
-    columns[told.label] = covariance_columns(told.covariances())
+    row, covariance_m2 = told.covariances()
+    columns[row] = covariance_columns(covariance_m2)
     return labels.replace(covariance_m2=columns)
 
 
@@ -413,7 +422,7 @@ def _robust(
     stages: _Stages,
     engine: Engine,
     progress: Progress,
-    as_given: Mapped | None,
+    refined: Refined | None,
     run: Run | None = None,
 ) -> tuple[Labels, Votes, dict[str, Any], list[Place]]:
     """Noise estimated from a sample, and in each cell the map with the least J that is found; docs/method.md.
@@ -423,8 +432,10 @@ def _robust(
     given = None if run is None else run.calibration
     store = run.parts / CELLS if run is not None and len(source.cells) > 1 else None
     files: list[Place] = []
-    if as_given is not None and given is None and store is None:
-        calibration, labels, votes, counts = as_given
+    if refined is not None and refined.before_images is not None:
+        config = _with_sides_of(refined.before_images[1], config)
+    if refined is not None and refined.as_given is not None and given is None and store is None:
+        calibration, labels, votes, counts = refined.as_given
     else:
         with stages.measured("calibrate"):
             calibration = calibrate(source, config, given, None if run is None else run.parts, engine, progress)

@@ -32,7 +32,7 @@ class Noise:
     """Standard deviations of what moves a detection off its object; see the core's `noise.rs`.
 
     Each axis; position and rotation have a part that each image has for itself, and a part that drifts and is shared
-    by the images of a pass that see one object.
+    by the images of a pass that see one object. The middle of an object as one side of it shows it is off by `side_m`.
     """
 
     detection_px: float = 2.0
@@ -43,9 +43,10 @@ class Noise:
     rotation_segment_rad: float = math.radians(0.03)
     position_drift_m: float = 0.1
     rotation_drift_rad: float = math.radians(0.1)
+    side_m: float = 0.0
 
     def as_tuple(self) -> tuple[float, ...]:
-        """Return the eight numbers in the order of the fields."""
+        """Return the nine numbers in the order of the fields."""
         return astuple(self)
 
 
@@ -258,7 +259,7 @@ def find_labels(
 def _guess(config: NoiseConfig, least_px: float) -> tuple[Noise, tuple[list[bool], float]]:
     """Return where the estimation starts, and what is known: what the user sets, and that detections are rounded.
 
-    The former are detection, position and rotation; detections are off by at least `least_px`.
+    The former are detection, position, rotation and side; detections are off by at least `least_px`.
     """
     noise = Noise()
     if config.detection_sigma_px is not None:
@@ -270,7 +271,9 @@ def _guess(config: NoiseConfig, least_px: float) -> tuple[Noise, tuple[list[bool
     if config.rotation_sigma_deg is not None:
         part = math.radians(config.rotation_sigma_deg) / math.sqrt(3.0)
         noise = replace(noise, rotation_rad=part, rotation_segment_rad=part, rotation_drift_rad=part)
-    known = [config.detection_sigma_px, config.position_sigma_m, config.rotation_sigma_deg]
+    if config.side_sigma_m is not None:
+        noise = replace(noise, side_m=config.side_sigma_m)
+    known = [config.detection_sigma_px, config.position_sigma_m, config.rotation_sigma_deg, config.side_sigma_m]
     return noise, ([value is not None for value in known], least_px)
 
 

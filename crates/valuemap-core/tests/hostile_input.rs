@@ -219,7 +219,7 @@ fn columns(most_images: usize) -> impl Strategy<Value = Columns> {
 
 /// The noise where it is usual, with a number of it spoiled now and then.
 fn noise() -> impl Strategy<Value = Noise> {
-    let usual = [1.0, 0.05, 0.05, 1e-3, 0.05, 1e-3, 0.05, 1e-3];
+    let usual = [1.0, 0.05, 0.05, 1e-3, 0.05, 1e-3, 0.05, 1e-3, 0.0];
     (0..24_usize, hostile()).prop_map(move |(which, number)| {
         let mut n = usual;
         let number = number.abs().min(FARTHEST);
@@ -235,6 +235,7 @@ fn noise() -> impl Strategy<Value = Noise> {
             rotation_segment_rad: n[5],
             position_drift_m: n[6],
             rotation_drift_rad: n[7],
+            side_m: n[8],
         }
     })
 }
@@ -281,7 +282,7 @@ static LEARNED: LazyLock<Vec<f64>> = LazyLock::new(|| {
     let objects: Vec<Vector3<f64>> =
         (0..12).map(|i| Vector3::new(20.0 + 9.0 * f64::from(i), 6.0 - f64::from(i % 3), 4.0)).collect();
     let scene = street::street(60, 2.0, &objects, &[[0.4, -0.2], [-0.5, 0.3], [0.1, 0.6]]);
-    let known = Known { detection: true, position: true, rotation: true, least_px: 0.0 };
+    let known = Known { detection: true, position: true, rotation: true, side: true, least_px: 0.0 };
     let found = self_calibrate(&scene, &street::NOISE, known, &street::SETTINGS, false, &Progress::default());
     found.unwrap().pooled.to_row()
 });
@@ -427,10 +428,11 @@ fn labels_of_hostile_scenes() {
 }
 
 fn known() -> impl Strategy<Value = Known> {
-    (any::<[bool; 3]>(), any::<f64>()).prop_map(|([detection, position, rotation], least_px)| Known {
+    (any::<[bool; 4]>(), any::<f64>()).prop_map(|([detection, position, rotation, side], least_px)| Known {
         detection,
         position,
         rotation,
+        side,
         least_px,
     })
 }
@@ -443,7 +445,7 @@ fn noise_of_hostile_scenes() {
         let found = self_calibrate(&scene, &guess, known, &settings, is_part, &Progress::default()).unwrap();
         let n = &found.noise;
         all_finite("detection noise", [&n.detection_px, &n.box_share])?;
-        all_finite("noise of positions", [&n.position_m, &n.position_segment_m, &n.position_drift_m])?;
+        all_finite("noise of positions", [&n.position_m, &n.position_segment_m, &n.position_drift_m, &n.side_m])?;
         all_finite("noise of rotations", [&n.rotation_rad, &n.rotation_segment_rad, &n.rotation_drift_rad])?;
         prop_assert!(n.detection_px > 0.0, "detection noise {}", n.detection_px);
         let row = found.pooled.to_row();

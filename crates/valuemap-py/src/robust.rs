@@ -15,6 +15,7 @@ use valuemap_core::robust::model::ClassModel;
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::parts::Without;
 use valuemap_core::robust::scene::{Frustum, Scene as CoreScene, View};
+use valuemap_core::robust::sides::of_directions;
 use valuemap_core::robust::{Calibration, Findings, Settings, find, self_calibrate};
 
 use crate::Rays;
@@ -129,7 +130,7 @@ impl Scene {
 }
 
 /// The fields of the core's `Noise`, in their order.
-type NoiseValues = [f64; 8];
+type NoiseValues = [f64; 9];
 
 fn noise_of(values: NoiseValues) -> PyResult<Noise> {
     check_within("noise", &values, FARTHEST_M)?;
@@ -145,6 +146,7 @@ fn noise_of(values: NoiseValues) -> PyResult<Noise> {
         rotation_segment_rad,
         position_drift_m,
         rotation_drift_rad,
+        side_m,
     ] = values;
     Ok(Noise {
         detection_px,
@@ -155,6 +157,7 @@ fn noise_of(values: NoiseValues) -> PyResult<Noise> {
         rotation_segment_rad,
         position_drift_m,
         rotation_drift_rad,
+        side_m,
     })
 }
 
@@ -216,9 +219,9 @@ fn calibration_of((noise, is_deep, classes, pooled, shares): CalibrationValues) 
     })
 }
 
-/// What is known of the noise: detection, position, rotation, and what detections are off by at least, px.
-fn known_of(([detection, position, rotation], least_px): ([bool; 3], f64)) -> Known {
-    Known { detection, position, rotation, least_px }
+/// What is known of the noise: detection, position, rotation, middles of sides, and what detections are off by at least, px.
+fn known_of(([detection, position, rotation, side], least_px): ([bool; 4], f64)) -> Known {
+    Known { detection, position, rotation, side, least_px }
 }
 
 /// Estimate the noise from the data and learn the classes, `valuemap_core::robust::self_calibrate`.
@@ -228,7 +231,7 @@ pub fn calibrate(
     py: Python<'_>,
     scene: &Scene,
     guess: NoiseValues,
-    known: ([bool; 3], f64),
+    known: ([bool; 4], f64),
     settings: SettingValues,
     is_part: bool,
     threads: usize,
@@ -250,6 +253,7 @@ pub fn calibrate(
         noise.rotation_segment_rad,
         noise.position_drift_m,
         noise.rotation_drift_rad,
+        noise.side_m,
     ];
     let classes = found.classes.iter().map(|class| class.as_ref().map(ClassModel::to_row)).collect();
     Ok((noise, found.is_deep, classes, found.pooled.to_row(), found.confusions.shares().to_vec()))
@@ -263,7 +267,7 @@ pub fn misfits<'py>(
     scenes: (PyRef<'py, Scene>, PyRef<'py, Scene>),
     second_of_first: PyReadonlyArray1<'py, u32>,
     guess: NoiseValues,
-    known: ([bool; 3], f64),
+    known: ([bool; 4], f64),
     settings: SettingValues,
     threads: usize,
     progress: &Bound<'py, PyAny>,
@@ -343,6 +347,30 @@ fn counts_of<'py>(py: Python<'py>, found: &Findings) -> PyResult<Bound<'py, PyDi
     dict.set_item("clutter_per_image", found.clutter_per_image)?;
     dict.set_item("variance_factor", found.variance_factor)?;
     Ok(dict)
+}
+
+/// The side that each visit (V) of some objects looks from, numbered from 0 for each object, whose visits follow each other; `direction` (V, 3) is that
+/// of its rays, of any length. `valuemap_core::robust::sides`.
+#[pyfunction]
+pub fn sides<'py>(
+    py: Python<'py>,
+    object: PyReadonlyArray1<'py, u32>,
+    direction: PyReadonlyArray2<'py, f64>,
+) -> PyResult<Bound<'py, PyArray1<u32>>> {
+    let (object, directions) = (object.as_slice()?, rows_of(&direction)?);
+    if object.len() != directions.len() {
+        return Err(PyValueError::new_err("sides: expected as many directions as visits"));
+    }
+    let mut found = vec![0; object.len()];
+    let mut first = 0;
+    for visits in object.chunk_by(|a, b| a == b) {
+        let directions = directions[first..first + visits.len()].iter().map(|&direction| direction.into());
+        for (number, side) in (0..).zip(of_directions(directions)) {
+            side.iter().for_each(|&visit| found[first + visit as usize] = number);
+        }
+        first += visits.len();
+    }
+    Ok(found.into_pyarray(py))
 }
 
 /// J, votes and positions of objects.

@@ -113,6 +113,13 @@ class NoiseConfig(Settings):
         effect="standard deviation of a camera rotation, each axis",
         method="robust",
     )
+    side_sigma_m: float | None = declare(
+        None,
+        unit="m",
+        high=100.0,
+        effect="standard deviation of the middle of an object's box, as one side of the object shows it, each axis",
+        method="robust",
+    )
 
 
 @dataclass(frozen=True, config=CHECKED)

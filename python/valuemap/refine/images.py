@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+import valuemap._core as _core
 from valuemap.cameras import camera_poses
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
@@ -45,8 +46,9 @@ _RUN = 100
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """The images of a dataset with what they see of the objects (K) of a map, the rows `label` (K) of its labels.
+    """The images of a dataset with what they see of the things (K) of a map, which are of its labels `label` (K).
 
+    A thing is an object, or what a side shows of it where sides show other middles: each is off by `side_m` then.
     `scales` are what errors of images and drift are thought to be a priori, in the working frame.
     """
 
@@ -55,6 +57,7 @@ class Bundle:
     scales: Scales
     state: State
     label: Ints
+    side_m: float
 
     def adjusted(self, seen: Observations) -> State:
         """Return objects, drift and errors of images as some of the observations tell them."""
@@ -102,14 +105,19 @@ class Bundle:
         center = camera_poses(ordered.dataset.images)[1] + self.of.unit_m * step @ axes
         return with_poses_in_order(like, ordered, poses.cam_from_world @ axes, center)
 
-    def covariances(self) -> Floats:
-        """Return the covariances (K, 3, 3) in m² of the objects, errors of all images and drift marginalised."""
+    def covariances(self) -> tuple[Ints, Floats]:
+        """Return labels (L) with their covariances (L, 3, 3) in m², errors of all images and drift marginalised."""
         state = self.adjusted(self.seen)
         with one_blas_thread():
             covariance = self._problem(self.seen).step(state, _TOLERANCES[-1], of_things=True)[0].covariance
         assert covariance is not None
         axes = self.of.ordered.dataset.frame.east_north_up()
-        return np.asarray(self.of.unit_m**2 * axes.T @ covariance @ axes)
+        of_things = self.of.unit_m**2 * axes.T @ covariance @ axes + self.side_m**2 * np.eye(3)
+        label, row = np.unique(self.label, return_inverse=True)
+        information = np.zeros((len(label), 3, 3))
+        np.add.at(information, row, np.linalg.inv(of_things))
+        covariance_m2: Floats = np.linalg.inv(information)
+        return label, covariance_m2
 
 
 def gather_images(dataset: Dataset, config: MapConfig) -> AllImages:
@@ -127,14 +135,16 @@ def bundle(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> Bun
     The map may have been made with other poses of the same images.
     """
     ordered, unit_m, footage = images.ordered, images.unit_m, images.footage
-    detection, thing, kinds, _ = shown_objects(footage, ordered, labels, votes)
+    detection, thing, label, _ = shown_objects(footage, ordered, labels, votes)
+    if noise.side_m:
+        thing, label = _by_side(footage, detection, thing, label)
     box = np.maximum(footage.dataset.detections.size_px[:, 1], 0.0)
     alone = np.hypot(noise.detection_px, noise.box_share * box)
     # As everywhere in this package, a metre of the camera is as many pixels as the box of a thing of a metre.
     of_image = np.hypot(noise.position_m / unit_m * box, noise.rotation_rad * footage.pixels_per_rad())
     segments = _whole_drives(footage)
     seen = footage.observe(detection, thing, footage.drives.pass_code, Sigmas(np.hypot(alone, of_image), alone))
-    points = points_in_working_frame(ordered.dataset, labels.position_in_world_m[kinds], unit_m)
+    points = points_in_working_frame(ordered.dataset, labels.position_in_world_m[label], unit_m)
     counts = tuple(map(len, everything(footage, segments)))
     state = triangulate(seen, State.zero(points, len(footage.chain.drive), len(footage.row), counts))
     scales = Scales(
@@ -144,7 +154,18 @@ def bundle(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> Bun
         own_rad=max(noise.rotation_rad, 1e-5),
         constant=WIDE.constant,
     )
-    return Bundle(images, seen, scales, state, kinds)
+    return Bundle(images, seen, scales, state, label, noise.side_m)
+
+
+def _by_side(footage: Footage, detection: Ints, thing: Ints, label: Ints) -> tuple[Ints, Ints]:
+    """Return what sides show of objects as things: that of each detection (N), and the label of each (K)."""
+    image = footage.rays.image_row[detection]
+    visit, of_visit = np.unique(np.stack([thing, footage.drives.pass_code[image]]), axis=1, return_inverse=True)
+    direction = np.zeros((visit.shape[1], 3))
+    np.add.at(direction, of_visit.ravel(), footage.rays.direction_in_world[detection])
+    side = np.asarray(_core.sides(visit[0].astype(np.uint32), direction), np.int64)
+    things, thing = np.unique(np.stack([visit[0], side])[:, of_visit.ravel()], axis=1, return_inverse=True)
+    return thing.ravel(), label[things[0]]
 
 
 def _in_runs(things: int) -> Bools:

@@ -244,9 +244,10 @@ pub(super) fn places_of(model: &Model<'_>, object: &Object) -> Vec<Vector3<f64>>
 
 /// What an object gains by a ray over leaving it to clutter; negative infinity outside its gate.
 fn gain(model: &Model<'_>, object: &Object, ray: u32, pose: &PoseError) -> f64 {
-    let Some(look) = Look::of(model.scene, model.noise, ray, 0, &object.fit.point) else { return f64::NEG_INFINITY };
+    let (point, covariance) = object.fit.seen_along(&model.scene.ray(ray).direction);
+    let Some(look) = Look::of(model.scene, model.noise, ray, 0, &point) else { return f64::NEG_INFINITY };
     let by_point = SMatrix::<f64, 2, 3>::from_rows(&[look.by_point[0].transpose(), look.by_point[1].transpose()]);
-    let own = by_point * object.fit.covariance * by_point.transpose()
+    let own = by_point * covariance * by_point.transpose()
         + Matrix2::identity() * model.noise.detection_px2(model.scene, ray);
     let (residual, covariance) = pose.expected(&look, &own);
     let Some(inverse) = covariance.try_inverse() else { return f64::NEG_INFINITY };
@@ -254,7 +255,7 @@ fn gain(model: &Model<'_>, object: &Object, ray: u32, pose: &PoseError) -> f64 {
     if chi2 > model.settings.gate_sigmas.powi(2) {
         return f64::NEG_INFINITY;
     }
-    let depth_m = model.scene.ray(ray).project(&object.fit.point).z;
+    let depth_m = model.scene.ray(ray).project(&point).z;
     model.vote_gain(object.class, ray, chi2, covariance.determinant(), depth_m, object.ln_size)
 }
 

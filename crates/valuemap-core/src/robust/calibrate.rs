@@ -3,13 +3,14 @@
 //! Positions are marginalised, so that they take no freedom from the noise. Depth tells errors of position from those in pixels,
 //! and box size tells the part that grows with the box. Residuals of one focal length do not tell rotation from detection: each
 //! gets half, until images that show several objects tell ([`split`](mod@super::split)). The error that a pass shares shows only
-//! where passes meet: it makes the positions that each pass alone would give a label differ as much as they do. Errors of this
-//! kind are the C of equation (1) of `docs/method.md`.
+//! where passes meet: it makes the positions that each pass alone would give a label differ as much as they do
+//! ([`agreement`](super::agreement)). Errors of this kind are the C of equation (1) of `docs/method.md`.
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::Vector3;
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
+use super::agreement::{LEAST_DRIFT, agreeing_ratio};
 use super::drift::{Drive, Look};
 use super::estimate::{by_pass, looks_at};
 use super::noise::Noise;
@@ -21,8 +22,6 @@ const MIN_VOTES: usize = 6;
 /// tenth from fifty squares, each of the five that are sought.
 const ENOUGH_VOTES: usize = 250;
 const LEAST_VOTES: usize = 3;
-/// A pass with fewer voters does not say where it would put a label alone.
-const MIN_VOTES_OF_PASS: usize = 4;
 /// A visit with fewer voters has no residuals.
 const MIN_VOTES_OF_VISIT: usize = 2;
 /// The part of the labels that serves, those that fit best.
@@ -38,22 +37,11 @@ const ROTATION_PART: f64 = 0.5;
 /// The part of the variance of what the images of a segment share that each of them has for itself all the same: errors that forget 63 % of
 /// themselves along a segment differ by twice this between images that are a tenth of a segment apart, as viewpoints are (Ornstein-Uhlenbeck).
 const ROUGHNESS: f64 = 0.1;
-/// Where fewer labels are seen by several passes, the shared part is taken to be as large as the own part.
-const MIN_SHARED_LABELS: usize = 5;
-/// One label says no more than this about the disagreement of passes, as a multiple of what is expected.
-const MOST_DISAGREEMENT: f64 = 5.0;
-/// Where the noise is sought, how much passes of a label disagree counts up to this many standard deviations: 95 % efficient where errors are Gaussian (Huber, "Robust
-/// estimation of a location parameter", 1964).
-const HUBER_SIGMAS: f64 = 1.345;
-
 /// What is searched for, and where: least and most. Boxes of objects of one size grow as errors of position do, with one over
 /// the distance: a detector that is off by more than this share of its boxes is not one, what is more is the position's.
 const DETECTION_PX: (f64, f64) = (0.05, 30.0);
 pub(super) const BOX_SHARE: (f64, f64) = (1e-3, 0.15);
 const POSITION_M: (f64, f64) = (1e-4, 5.0);
-/// Shared errors over own errors of a pose.
-const DRIFT_RATIO: (f64, f64) = (0.1, 1000.0);
-
 /// Votes (ascending) and a position.
 pub type Placed = (Vec<u32>, Vector3<f64>);
 
@@ -66,6 +54,8 @@ pub struct Known {
     pub position: bool,
     /// The rotations' part.
     pub rotation: bool,
+    /// The part of the middles that sides show.
+    pub side: bool,
     /// Detections are off by at least this, px: they are rounded.
     pub least_px: f64,
 }
@@ -101,7 +91,7 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
     };
     // Where poses state their errors, what images and segments do not have for themselves drifts.
     let stated = [scene.usual(|view| view.position_sigma_m), scene.usual(|view| view.rotation_sigma_rad)];
-    let rest = |total: f64, part: f64| (total * total - part * part).max((DRIFT_RATIO.0 * part).powi(2)).sqrt();
+    let rest = |total: f64, part: f64| (total * total - part * part).max((LEAST_DRIFT * part).powi(2)).sqrt();
     let noise_of = |p: &[f64; 5], ratio: f64| {
         let [position_segment_m, rotation_segment_rad] = [p[3], p[4]];
         // What images of a segment share is not quite the same for all of them.
@@ -120,6 +110,7 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
             rotation_segment_rad,
             position_drift_m: stated[0].map_or(of_position * ratio, |total_m| rest(total_m, of_position)),
             rotation_drift_rad: stated[1].map_or(of_rotation, |total_rad| rest(total_rad, of_rotation)),
+            side_m: guess.side_m,
         }
     };
     let fixed = [known.detection && known.rotation, known.detection, known.position, known.position, known.rotation];
@@ -144,83 +135,6 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
         return noise_of(&found, 1.0);
     }
     noise_of(&found, agreeing_ratio(scene, &sample, &|ratio| noise_of(&found, ratio)))
-}
-
-/// The ratio of the drift of positions to the errors of images and segments at which the passes of objects disagree as much as expected: by bisection, since
-/// the larger the drift is taken for, the less remains unexplained.
-fn agreeing_ratio(scene: &Scene, objects: &[&Placed], noise_of: &(dyn Fn(f64) -> Noise + Sync)) -> f64 {
-    let (mut low, mut high) = (DRIFT_RATIO.0.ln(), DRIFT_RATIO.1.ln());
-    for _ in 0..12 {
-        let middle = 0.5 * (low + high);
-        match excess(disagreements(scene, &noise_of(middle.exp()), objects)) {
-            None => return 1.0,
-            Some(excess) if excess > 0.0 => low = middle,
-            Some(_) => high = middle,
-        }
-    }
-    (0.5 * (low + high)).exp()
-}
-
-/// How much larger than they are said to be the errors are that labels of several passes show: the mean disagreement of
-/// their passes, at least 1. The variance of positions is to be multiplied by it. About `most` of the labels serve.
-#[must_use]
-pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Placed], most: usize) -> f64 {
-    let labels: Vec<&Placed> = labels.iter().step_by((labels.len() / most).max(1)).collect();
-    mean(disagreements(scene, noise, &labels)).unwrap_or(1.0).max(1.0)
-}
-
-fn disagreements(scene: &Scene, noise: &Noise, labels: &[&Placed]) -> Vec<Option<Disagreement>> {
-    labels.par_iter().map(|label| disagreement(scene, noise, label)).collect()
-}
-
-/// The mean of those that are known, a degree of freedom, without letting one say too much.
-#[must_use]
-pub fn mean(of_labels: Vec<Option<Disagreement>>) -> Option<f64> {
-    let known: Vec<f64> =
-        of_labels.into_iter().flatten().map(|one| (one.square / one.freedom).min(MOST_DISAGREEMENT)).collect();
-    (known.len() >= MIN_SHARED_LABELS).then(|| known.iter().sum::<f64>() / known.len() as f64)
-}
-
-/// By how many standard deviations disagreements are larger than expected, of most labels: Huber's psi, summed. A label of two objects disagrees
-/// whatever the noise is; where a fifth of the labels are such, no drift is so large that the mean is as expected.
-fn excess(of_labels: Vec<Option<Disagreement>>) -> Option<f64> {
-    let known: Vec<f64> =
-        of_labels.into_iter().flatten().map(|one| one.sigmas().clamp(-HUBER_SIGMAS, HUBER_SIGMAS)).collect();
-    (known.len() >= MIN_SHARED_LABELS).then(|| known.iter().sum())
-}
-
-/// How far the positions that the passes of a label give it alone lie from their mean.
-#[derive(Debug, Clone, Copy)]
-pub struct Disagreement {
-    /// Squared, in sigmas.
-    square: f64,
-    /// Degrees of freedom.
-    freedom: f64,
-}
-
-impl Disagreement {
-    /// By how many standard deviations it is larger than expected: its cubic root is nearly Gaussian (Wilson and Hilferty, "The distribution of
-    /// chi-square", 1931).
-    fn sigmas(&self) -> f64 {
-        let variance = 2.0 / (9.0 * self.freedom);
-        ((self.square / self.freedom).cbrt() - (1.0 - variance)) / variance.sqrt()
-    }
-}
-
-/// How far the positions that the passes of a label give it alone lie from their mean. Nothing for labels of a single pass.
-#[must_use]
-pub fn disagreement(scene: &Scene, noise: &Noise, (votes, point): &Placed) -> Option<Disagreement> {
-    let (mut information, mut gradient, mut alone, mut passes) = (Matrix3::zeros(), Vector3::zeros(), 0.0, 0);
-    for pass in by_pass(scene, votes).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS) {
-        let looks = looks_at(scene, noise, noise, pass, point)?;
-        let (of_pass, by_pass) = Drive::at_one(&looks)?.normals.of_one();
-        alone += by_pass.dot(&of_pass.cholesky()?.solve(&by_pass));
-        information += of_pass;
-        gradient += by_pass;
-        passes += 1;
-    }
-    let together = gradient.dot(&information.cholesky()?.solve(&gradient));
-    (passes >= 2).then(|| Disagreement { square: (alone - together).max(0.0), freedom: 3.0 * f64::from(passes - 1) })
 }
 
 /// Minimise a cost over positive parameters by a pattern search in their logarithms, with a prior around the start.
@@ -267,7 +181,7 @@ fn search<const N: usize>(
 
 /// Well supported labels, evenly over the map, together about as many voters as needed. Those whose residuals fit the
 /// guess worst are left out: wrong associations would be taken for noise.
-fn sample<'a>(scene: &Scene, guess: &Noise, labels: &'a [Placed]) -> Vec<&'a Placed> {
+pub(super) fn sample<'a>(scene: &Scene, guess: &Noise, labels: &'a [Placed]) -> Vec<&'a Placed> {
     let votes: usize = labels.iter().map(|label| label.0.len()).filter(|&votes| votes >= MIN_VOTES).sum();
     let least = if votes < ENOUGH_VOTES { LEAST_VOTES } else { MIN_VOTES };
     let mut good: Vec<(f64, &Placed)> = labels

@@ -211,11 +211,12 @@ impl Look {
         (first * second > 0.0).then_some((white, (first * second).powi(2)))
     }
 
-    /// What is known of the height of its label above its image, as one more look of that image: the label is higher than expected by so much, m, with
+    /// What is known of the height of a label above its image, as one more look of that image: the label is higher than expected by so much, m, with
     /// that variance, m². Where the image is higher than said, so is the label.
     #[must_use]
-    pub fn at_height(&self, up: &Vector3<f64>, higher_m: f64, variance_m2: f64) -> Self {
+    pub fn at_height(&self, label: usize, up: &Vector3<f64>, higher_m: f64, variance_m2: f64) -> Self {
         Self {
+            label,
             residual: [higher_m, 0.0],
             by_point: [*up, Vector3::zeros()],
             by_turn: [Vector3::zeros(); 2],

@@ -3,7 +3,7 @@
 //! J is a sum over objects. The symbols are those of `docs/method.md`; for an object of class c with n votes i in visits v:
 //!
 //! ```text
-//! J = sum_v [ r' C^-1 r + ln|C| ] + 2 n ln 2 pi       (1) residuals, pose errors marginalised
+//! J = sum_v [ r' C^-1 r + ln|C| ] + 2 n ln 2 pi       (1) residuals, errors of poses and middles marginalised
 //!   + ln|information| - 3 ln 2 pi - 2 ln births_c     (2) the position, marginalised, and the price of a birth
 //!   + 2 sum_i ln clutter_c                            (3) what the votes are otherwise
 //!   - 2 sum_i [ ln ratio(size_i) + ln ratio(range_i) + ln ratio(score_i) + ln share_c(class_i) ]
@@ -16,6 +16,7 @@
 //! alone or in fewer of the looks (see [`super::seen`]).
 
 use std::f64::consts::PI;
+use std::ops::Range;
 
 use nalgebra::{Matrix3, Vector3};
 use rstar::RTree;
@@ -29,6 +30,7 @@ use super::model::{Model, Sizes};
 use super::parts::Part;
 use super::scene::Scene;
 use super::seen::{Seen, Shares};
+use super::sides::{Middle, Said, marginalised, sides};
 use super::sizes::size_terms;
 
 /// Residuals beyond this many sigmas count less, in proportion (Huber): 95 % efficient where errors are Gaussian at 1.35, more above.
@@ -73,6 +75,17 @@ pub struct Fit {
     pub energy: f64,
     /// Squared residual of each vote in sigmas, the drift of its visit taken out.
     pub chi2: Vec<f64>,
+    /// What each side shows, by a direction from there; none where all show one middle.
+    pub(super) shown: Vec<(Vector3<f64>, Middle)>,
+}
+
+impl Fit {
+    /// The middle that is seen in a direction, with its covariance, m²: that of its side.
+    #[must_use]
+    pub fn seen_along(&self, direction: &Vector3<f64>) -> (Vector3<f64>, Matrix3<f64>) {
+        let nearest = self.shown.iter().max_by(|a, b| a.0.dot(direction).total_cmp(&b.0.dot(direction)));
+        nearest.map_or((self.point, self.covariance), |(_, middle)| middle.of(&self.point, &self.covariance))
+    }
 }
 
 /// The terms of one evaluation.
@@ -88,6 +101,8 @@ pub(super) struct Terms {
     of_priors: f64,
     /// Squared residual of each vote in sigmas, the drift of its visit taken out.
     pub(super) chi2: Vec<f64>,
+    /// What each side shows.
+    middles: Vec<Middle>,
 }
 
 impl Terms {
@@ -131,11 +146,13 @@ pub fn fit(model: &Model<'_>, votes: &[u32], start: Vector3<f64>) -> Option<Fit>
     }
     let cholesky = here.information.cholesky()?;
     let ln_information = 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
+    let shown = fitting.shown(here.middles);
     is_in_reach(model, votes, &point).then(|| Fit {
         point,
         covariance: cholesky.inverse(),
         energy: here.energy + ln_information,
         chi2: here.chi2,
+        shown,
     })
 }
 
@@ -165,6 +182,7 @@ impl Terms {
             energy: 0.0,
             of_priors: 0.0,
             chi2: Vec::new(),
+            middles: Vec::new(),
         }
     }
 
@@ -174,6 +192,12 @@ impl Terms {
         self.gradient += visit.gradient;
         self.energy += visit.energy;
         self.chi2.extend(&visit.chi2);
+    }
+
+    fn add_said(&mut self, said: &Said) {
+        self.information += said.information;
+        self.gradient += said.gradient;
+        self.energy += said.energy;
     }
 
     /// Add what is known of sizes, ranges and heights; `camera_m2` is the [variance](camera_m2) of the cameras' heights.
@@ -198,44 +222,68 @@ struct Fitting<'a> {
     votes: &'a [u32],
     /// From where each is cast.
     vantages: Vec<Vantage>,
-    /// How many votes each visit has.
-    of_visits: Vec<usize>,
+    /// The votes of each visit.
+    of_visits: Vec<Range<usize>>,
+    /// The numbers of the visits from each side; none where all show one middle.
+    sides: Vec<Vec<u32>>,
     camera_m2: f64,
 }
 
 impl<'a> Fitting<'a> {
     fn new(model: &'a Model<'a>, votes: &'a [u32]) -> Self {
         let vantages = vantages_of(model, votes);
-        let of_visits = visits(model.scene, votes).map(<[u32]>::len).collect();
-        Self { model, votes, vantages, of_visits, camera_m2: camera_m2(model, votes) }
+        let mut end = 0;
+        let of_visit = |visit: &[u32]| {
+            end += visit.len();
+            end - visit.len()..end
+        };
+        let of_visits = visits(model.scene, votes).map(of_visit).collect();
+        let has_sides = model.noise.side_m > 0.0;
+        let sides = if has_sides { sides(model.scene, visits(model.scene, votes)) } else { Vec::new() };
+        Self { model, votes, vantages, of_visits, sides, camera_m2: camera_m2(model, votes) }
     }
 
     /// Equation (1) at a point, with what a step needs.
     fn terms(&self, weights: &[f64], point: &Vector3<f64>) -> Option<Terms> {
         let mut sum = Terms { chi2: Vec::with_capacity(self.votes.len()), ..Terms::none() };
-        for &count in &self.of_visits {
-            let first = sum.chi2.len();
-            let visit = first..first + count;
-            let said = say(&self.vantages[visit.clone()], &weights[visit], point, &mut sum.chi2)?;
-            sum.information += said.information;
-            sum.gradient += said.gradient;
-            sum.energy += said.energy;
+        for visit in self.of_visits.iter().filter(|_| self.sides.is_empty()) {
+            let said = say(&self.vantages[visit.clone()], &weights[visit.clone()], point, &mut sum.chi2)?;
+            sum.add_said(&said);
+        }
+        if !self.sides.is_empty() {
+            sum.chi2.resize(self.votes.len(), 0.0);
+        }
+        for side in &self.sides {
+            let (said, middle) = marginalised(self.model.noise.side_m, point, |middle| {
+                let mut of_side = Terms::none();
+                for &visit in side {
+                    let visit = self.of_visits[visit as usize].clone();
+                    of_side.chi2.clear();
+                    let said = say(&self.vantages[visit.clone()], &weights[visit.clone()], middle, &mut of_side.chi2)?;
+                    of_side.add_said(&said);
+                    sum.chi2[visit].copy_from_slice(&of_side.chi2);
+                }
+                let Terms { information, gradient, energy, .. } = of_side;
+                Some(Said { information, gradient, energy })
+            })?;
+            sum.add_said(&said);
+            sum.middles.push(middle);
         }
         sum.add_priors(self.model, self.votes, point, self.camera_m2);
         sum.cost().is_finite().then_some(sum)
+    }
+
+    /// What each side shows, by the direction in which its first vote sees it.
+    fn shown(&self, middles: Vec<Middle>) -> Vec<(Vector3<f64>, Middle)> {
+        let first = |side: &Vec<u32>| self.of_visits[side[0] as usize].start;
+        let directions = self.sides.iter().map(|side| self.model.scene.ray(self.votes[first(side)]).direction);
+        directions.zip(middles).collect()
     }
 }
 
 /// From where some votes are cast.
 fn vantages_of(model: &Model<'_>, votes: &[u32]) -> Vec<Vantage> {
     votes.iter().map(|&ray| Vantage::of(model.scene, model.noise, ray)).collect()
-}
-
-/// Equation (1) of the votes of one visit, but for their squared residuals.
-struct Said {
-    information: Matrix3<f64>,
-    gradient: Vector3<f64>,
-    energy: f64,
 }
 
 /// What the votes of one visit say of a point; their squared residuals are added to `chi2`.
@@ -277,7 +325,7 @@ pub(super) fn weighted_terms_of_visit(model: &Model<'_>, visit: &[u32], point: &
         said = say(&vantages, &weights, point, &mut chi2)?;
     }
     let Said { information, gradient, energy } = said;
-    Some(Terms { information, gradient, energy, of_priors: 0.0, chi2 })
+    Some(Terms { information, gradient, energy, chi2, ..Terms::none() })
 }
 
 /// What the heights of its class say of an object with some votes at a point, with a variance of the cameras' heights, m²; and what is up. Nothing before
@@ -491,7 +539,8 @@ impl Object {
 /// For unit tests of what looks at votes and looks alone: an object somewhere.
 #[cfg(test)]
 pub(super) fn anywhere(votes: usize, seen: Seen, energy: f64) -> Object {
-    let fit = Fit { point: Vector3::zeros(), covariance: Matrix3::identity(), energy: 0.0, chi2: vec![1.0; votes] };
+    let (chi2, shown) = (vec![1.0; votes], Vec::new());
+    let fit = Fit { point: Vector3::zeros(), covariance: Matrix3::identity(), energy: 0.0, chi2, shown };
     Object {
         class: 0,
         votes: (0..votes as u32).collect(),

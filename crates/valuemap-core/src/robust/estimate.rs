@@ -14,6 +14,7 @@ use super::model::Model;
 use super::noise::Noise;
 use super::ranges::range_terms;
 use super::scene::{Scene, View};
+use super::sides::sides;
 use super::sizes::size_terms;
 use super::spd::Vector6;
 
@@ -110,17 +111,26 @@ pub struct Limits {
 }
 
 /// Labels that are estimated together.
+///
+/// Where each side of a label shows another middle, the middles are points as well, each tied to its label.
 #[derive(Clone)]
 pub struct Joint<'a> {
     scene: &'a Scene,
     /// Label and ray of each vote, by visit and image.
     votes: Vec<(usize, u32)>,
+    /// The point that each of them sees: the label's, or the middle of its side.
+    seen: Vec<usize>,
     /// From where each is cast.
     vantages: Vec<Vantage>,
     weights: Vec<f64>,
     /// The most probable pose error of the image of each vote, m and rad.
     pose_errors: Vec<Vector6>,
+    /// Those of the labels, then those of middles.
     points: Vec<Vector3<f64>>,
+    /// The label of each middle.
+    label_of_middle: Vec<usize>,
+    /// Standard deviation of a middle beside its label, each axis, m.
+    side_m: f64,
     care: Care,
     /// What is learned about sizes and heights, if they serve.
     model: Option<&'a Model<'a>>,
@@ -149,8 +159,56 @@ impl<'a> Joint<'a> {
         counted.sort_by_key(|&((label, ray), _)| (scene.view(ray).pass, ray, label));
         let pose_errors = vec![Vector6::zeros(); counted.len()];
         let vantages = counted.iter().map(|&((_, ray), _)| Vantage::of(scene, noise, ray)).collect();
-        let (votes, weights) = counted.into_iter().unzip();
-        Self { scene, votes, vantages, weights, pose_errors, points, care, model: None }
+        let (votes, weights): (Vec<(usize, u32)>, Vec<f64>) = counted.into_iter().unzip();
+        let seen = votes.iter().map(|(label, _)| *label).collect();
+        let (label_of_middle, side_m) = (Vec::new(), noise.side_m);
+        let all = Self {
+            scene,
+            votes,
+            seen,
+            vantages,
+            weights,
+            pose_errors,
+            points,
+            label_of_middle,
+            side_m,
+            care,
+            model: None,
+        };
+        if side_m > 0.0 { all.with_middles() } else { all }
+    }
+
+    /// Let the votes from each side of a label see a point of their own.
+    fn with_middles(mut self) -> Self {
+        let mut of_labels: Vec<Vec<(u32, usize)>> = vec![Vec::new(); self.points.len()];
+        for (i, &(label, ray)) in self.votes.iter().enumerate() {
+            of_labels[label].push((ray, i));
+        }
+        for (label, votes) in of_labels.iter().enumerate() {
+            let rays: Vec<u32> = votes.iter().map(|(ray, _)| *ray).collect();
+            let visits: Vec<&[u32]> = by_pass(self.scene, &rays).collect();
+            let sides = sides(self.scene, visits.iter().copied());
+            let mut end = 0;
+            for (visit, rays) in (0..).zip(&visits) {
+                let side = sides.iter().position(|side| side.contains(&visit)).unwrap_or(0);
+                for &(_, i) in &votes[end..end + rays.len()] {
+                    self.seen[i] = self.points.len() + side;
+                }
+                end += rays.len();
+            }
+            self.points.extend(vec![self.points[label]; sides.len()]);
+            self.label_of_middle.extend(vec![label; sides.len()]);
+        }
+        self
+    }
+
+    /// Information about a middle beside its label, 1/m².
+    fn tie(&self) -> Matrix3<f64> {
+        Matrix3::identity() / (self.side_m * self.side_m)
+    }
+
+    fn labels(&self) -> usize {
+        self.points.len() - self.label_of_middle.len()
     }
 
     /// Let sizes and heights tell where labels are, too.
@@ -179,7 +237,7 @@ impl<'a> Joint<'a> {
         let information = loop {
             let information = here.normals.information.clone().cholesky()?;
             let step = -information.solve(&here.normals.gradient);
-            let length_sigmas = (-step.dot(&here.normals.gradient) / self.points.len() as f64).sqrt();
+            let length_sigmas = (-step.dot(&here.normals.gradient) / self.labels() as f64).sqrt();
             self.step(&step);
             self.weights = here.own.iter().map(|chi2| (HUBER_SIGMAS / chi2.sqrt()).min(1.0)).collect();
             if self.care == Care::Exact {
@@ -200,7 +258,8 @@ impl<'a> Joint<'a> {
         };
         // The last step may have gone behind a voter.
         self.is_in_front().then_some(())?;
-        let estimates = self.estimates(&information.inverse());
+        let mut estimates = self.estimates(&information.inverse());
+        estimates.truncate(self.labels());
         Some(Solution { joint: self, here, refused, estimates })
     }
 
@@ -210,7 +269,7 @@ impl<'a> Joint<'a> {
         if !leaves.contains(&true) {
             return false;
         }
-        let mut left = vec![0; self.points.len()];
+        let mut left = vec![0; self.labels()];
         for ((label, _), leaves) in self.votes.iter().zip(&leaves) {
             left[*label] += usize::from(!leaves);
         }
@@ -224,6 +283,7 @@ impl<'a> Joint<'a> {
 
     fn leave_out(&mut self, leaves: &[bool]) {
         retain(&mut self.votes, leaves);
+        retain(&mut self.seen, leaves);
         retain(&mut self.vantages, leaves);
         retain(&mut self.weights, leaves);
         retain(&mut self.pose_errors, leaves);
@@ -245,7 +305,10 @@ impl<'a> Joint<'a> {
 
     /// Whether all points are in front of their voters.
     fn is_in_front(&self) -> bool {
-        self.votes.iter().all(|&(label, ray)| self.scene.ray(ray).project(&self.points[label]).z > 0.0)
+        self.votes
+            .iter()
+            .zip(&self.seen)
+            .all(|(&(_, ray), &point)| self.scene.ray(ray).project(&self.points[point]).z > 0.0)
     }
 
     fn estimates(&self, covariance: &DMatrix<f64>) -> Vec<Estimate> {
@@ -261,6 +324,7 @@ impl<'a> Joint<'a> {
         let of_labels = if self.model.is_some() { self.votes_of_labels() } else { Vec::new() };
         let OfVisits { looks, weights, is_vote, visits } = self.looks(&of_labels)?;
         let mut normals = Normals::nothing(self.points.len());
+        self.add_ties(&mut normals);
         let (mut of_visits, mut pose_errors) = (Vec::with_capacity(visits.len()), Vec::new());
         let mut left: Vec<Vector2<f64>> = Vec::with_capacity(looks.len());
         for (labels, end) in visits {
@@ -276,22 +340,27 @@ impl<'a> Joint<'a> {
         }
         let votes = || {
             let of_votes = (0..looks.len()).filter(|&i| is_vote[i]).map(|i| (&looks[i], weights[i], &left[i]));
-            self.votes.iter().map(|(label, _)| *label).zip(of_votes)
+            self.seen.iter().copied().zip(of_votes)
         };
         let mut alone = vec![Matrix3::zeros(); self.points.len()];
-        for (label, (look, weight, _)) in votes() {
+        alone[self.labels()..].fill(self.tie());
+        for (point, (look, weight, _)) in votes() {
             for column in &look.by_point {
-                alone[label] += column * column.transpose() * (weight / look.variance);
+                alone[point] += column * column.transpose() * (weight / look.variance);
             }
         }
+        let mut has_votes = vec![false; self.labels()];
+        self.votes.iter().for_each(|(label, _)| has_votes[*label] = true);
         // Labels without votes stay where they are.
-        for (label, alone) in alone.iter_mut().enumerate().filter(|(_, alone)| **alone == Matrix3::zeros()) {
-            *alone = Matrix3::identity();
-            normals.add(label, label, alone);
+        for (label, _) in has_votes.iter().enumerate().filter(|(_, has_votes)| !**has_votes) {
+            normals.add(label, label, &Matrix3::identity());
         }
-        let alone: Vec<Matrix3<f64>> =
-            alone.into_iter().map(|alone| Some(alone.cholesky()?.inverse())).collect::<Option<_>>()?;
-        let own = votes().map(|(label, (look, weight, left))| look.studentised(left, &alone[label], weight)).collect();
+        let covariance = |alone: Matrix3<f64>| {
+            let is_nothing = alone == Matrix3::zeros();
+            if is_nothing { Some(Matrix3::identity()) } else { Some(alone.cholesky()?.inverse()) }
+        };
+        let alone: Vec<Matrix3<f64>> = alone.into_iter().map(covariance).collect::<Option<_>>()?;
+        let own = votes().map(|(point, (look, weight, left))| look.studentised(left, &alone[point], weight)).collect();
         self.add_priors(&of_labels, &mut normals);
         Some(Evaluation { normals, of_visits, own, pose_errors })
     }
@@ -299,11 +368,11 @@ impl<'a> Joint<'a> {
 
 /// The looks of some votes, visit by visit, and what heights say as further ones.
 struct OfVisits {
-    /// Each at a label by its place among those of its visit: most visits see few of many.
+    /// Each at a point by its place among those of its visit: most visits see few of many.
     looks: Vec<Look>,
     weights: Vec<f64>,
     is_vote: Vec<bool>,
-    /// The labels of each visit, ascending, and where it ends.
+    /// The points of each visit, ascending, and where it ends.
     visits: Vec<(Vec<usize>, usize)>,
 }
 
@@ -321,17 +390,18 @@ impl Joint<'_> {
         };
         let mut at = 0;
         for votes in self.visits() {
-            let mut labels: Vec<usize> = votes.iter().map(|(label, _)| *label).collect();
-            labels.sort_unstable();
-            labels.dedup();
+            let mut points = self.seen[at..at + votes.len()].to_vec();
+            points.extend((at..).zip(votes).filter(|(i, _)| heights.contains_key(i)).map(|(_, (label, _))| *label));
+            points.sort_unstable();
+            points.dedup();
+            let place = |point: usize| points.partition_point(|&before| before < point);
             for (i, &(label, _)) in (at..).zip(votes) {
-                let (vantage, point) = (&self.vantages[i], &self.points[label]);
-                let place = labels.partition_point(|&before| before < label);
+                let (vantage, point) = (&self.vantages[i], &self.points[self.seen[i]]);
                 let look = match self.care {
-                    Care::Rough => vantage.look(place, point)?.by_itself(),
-                    Care::Exact => vantage.look_where_it_was(place, point, &self.pose_errors[i])?,
+                    Care::Rough => vantage.look(place(self.seen[i]), point)?.by_itself(),
+                    Care::Exact => vantage.look_where_it_was(place(self.seen[i]), point, &self.pose_errors[i])?,
                 };
-                let height = heights.get(&i).map(|(up, higher_m, m2)| look.at_height(up, *higher_m, *m2));
+                let height = heights.get(&i).map(|(up, higher_m, m2)| look.at_height(place(label), up, *higher_m, *m2));
                 found.looks.push(look);
                 found.weights.push(self.weights[i]);
                 found.is_vote.push(true);
@@ -342,9 +412,23 @@ impl Joint<'_> {
                 }
             }
             at += votes.len();
-            found.visits.push((labels, found.looks.len()));
+            found.visits.push((points, found.looks.len()));
         }
         Some(found)
+    }
+
+    /// Add that each middle is about where its label is.
+    fn add_ties(&self, normals: &mut Normals) {
+        let tie = self.tie();
+        for (middle, &label) in (self.labels()..).zip(&self.label_of_middle) {
+            let pull = tie * (self.points[middle] - self.points[label]);
+            normals.add(middle, middle, &tie);
+            normals.add(label, label, &tie);
+            normals.add(middle, label, &-tie);
+            normals.add(label, middle, &-tie);
+            normals.add_gradient(middle, &pull);
+            normals.add_gradient(label, &-pull);
+        }
     }
 
     /// Add what measured ranges and sizes say of the labels.
@@ -364,7 +448,7 @@ impl Joint<'_> {
 
     /// The rays that vote for each label.
     fn votes_of_labels(&self) -> Vec<Vec<u32>> {
-        let mut votes: Vec<Vec<u32>> = vec![Vec::new(); self.points.len()];
+        let mut votes: Vec<Vec<u32>> = vec![Vec::new(); self.labels()];
         for &(label, ray) in &self.votes {
             votes[label].push(ray);
         }
@@ -377,7 +461,7 @@ impl Joint<'_> {
     fn heights(&self, of_labels: &[Vec<u32>]) -> FxHashMap<usize, (Vector3<f64>, f64, f64)> {
         let mut found = FxHashMap::default();
         let Some(model) = self.model else { return found };
-        let mut nearest: Vec<Vec<(f64, usize)>> = vec![Vec::new(); self.points.len()];
+        let mut nearest: Vec<Vec<(f64, usize)>> = vec![Vec::new(); self.labels()];
         let mut at = 0;
         for votes in self.visits() {
             let mut of_visit: FxHashMap<usize, (f64, usize)> = FxHashMap::default();
@@ -442,7 +526,9 @@ impl Solution<'_> {
         let Evaluation { normals, .. } = rest.evaluate()?;
         let information = normals.information.cholesky()?;
         rest.step(&-information.solve(&normals.gradient));
-        Some(rest.estimates(&information.inverse()))
+        let mut estimates = rest.estimates(&information.inverse());
+        estimates.truncate(rest.labels());
+        Some(estimates)
     }
 
     /// For each label, where all visits but one put it, for each that votes for it: votes of a visit that went to the wrong one of
@@ -450,29 +536,35 @@ impl Solution<'_> {
     #[must_use]
     pub fn elsewhere(&self) -> Vec<Vec<Elsewhere>> {
         let Self { joint, here, .. } = self;
-        let mut found = vec![Vec::new(); joint.points.len()];
-        let mut voters = vec![0_usize; joint.points.len()];
+        let mut found = vec![Vec::new(); joint.labels()];
+        let mut voters = vec![0_usize; joint.labels()];
         for &(label, _) in &joint.votes {
             voters[label] += 1;
         }
-        for (votes, (labels, of_visit)) in joint.visits().zip(&here.of_visits) {
+        let mut at = 0;
+        for (votes, (points, of_visit)) in joint.visits().zip(&here.of_visits) {
             let mut all = Normals::nothing(joint.points.len());
-            all.add_those_of(labels, of_visit);
+            all.add_those_of(points, of_visit);
+            // What the visit sees of each label that it votes for.
+            let seen: FxHashMap<usize, usize> =
+                votes.iter().zip(&joint.seen[at..]).map(|(&(label, _), &point)| (label, point)).collect();
+            at += votes.len();
             let rest = &here.normals.information - all.information * OTHERS_SHARE;
             let Some(rest) = rest.cholesky() else { continue };
             let step = rest.solve(&(all.gradient * OTHERS_SHARE - &here.normals.gradient));
             let others = joint.estimates(&rest.inverse());
-            let mut of_visit = vec![0_usize; joint.points.len()];
+            let mut of_visit = vec![0_usize; joint.labels()];
             for &(label, _) in votes {
                 of_visit[label] += 1;
             }
             let view = |vote: &(usize, u32)| joint.scene.view(vote.1);
             let driven_m = [view(&votes[0]), view(&votes[votes.len() - 1])].map(|view| view.driven_m);
-            for (label, mut estimate) in others.into_iter().enumerate() {
-                let step = step.fixed_rows::<3>(3 * label);
-                if of_visit[label] > 0 && voters[label] >= of_visit[label] + 2 && step.norm() < LONGEST_MOVE_M {
+            for (label, found) in found.iter_mut().enumerate() {
+                let Some(&point) = seen.get(&label) else { continue };
+                let (step, mut estimate) = (step.fixed_rows::<3>(3 * point), others[point]);
+                if voters[label] >= of_visit[label] + 2 && step.norm() < LONGEST_MOVE_M {
                     estimate.point += step;
-                    found[label].push(Elsewhere { pass: view(&votes[0]).pass, driven_m, estimate });
+                    found.push(Elsewhere { pass: view(&votes[0]).pass, driven_m, estimate });
                 }
             }
         }
@@ -507,7 +599,7 @@ fn retain<T>(all: &mut Vec<T>, leaves: &[bool]) {
 /// The normal equations of all votes, and how well each fits.
 struct Evaluation {
     normals: Normals,
-    /// Of the labels of each visit, ascending.
+    /// Of the points of each visit, ascending.
     of_visits: Vec<(Vec<usize>, Normals)>,
     /// See [`Solution::own_chi2`].
     own: Vec<f64>,

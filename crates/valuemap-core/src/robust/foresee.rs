@@ -30,7 +30,7 @@ pub(super) struct Foresight<'a> {
 }
 
 impl<'a> Foresight<'a> {
-    /// Nothing if both are of few visits.
+    /// Nothing if both are of few visits, or if visits share the error of the middle that their side shows: then J is no sum over visits.
     pub(super) fn new(
         model: &'a Model<'a>,
         lookout: &'a Lookout,
@@ -39,7 +39,14 @@ impl<'a> Foresight<'a> {
     ) -> Option<Self> {
         let stays = of.map(|object| visits(model.scene, &object.votes).count() > FEW_VISITS);
         let known = [FxHashMap::default(), FxHashMap::default()];
-        stays.contains(&true).then_some(Self { model, lookout, of, others, stays, known })
+        (stays.contains(&true) && model.noise.side_m <= 0.0).then_some(Self {
+            model,
+            lookout,
+            of,
+            others,
+            stays,
+            known,
+        })
     }
 
     /// Whether J may fall with other votes (ascending). What is foreseen is wrong where a vote turns out to fit, or not to: by what is known of any vote.
@@ -88,7 +95,8 @@ impl<'a> Foresight<'a> {
         let step = -cholesky.solve(&terms.gradient);
         let ln_information = 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
         let energy = terms.energy + step.dot(&terms.gradient) + ln_information;
-        let fit = Fit { point: from + step, covariance: cholesky.inverse(), energy, chi2: terms.chi2 };
+        let fit =
+            Fit { point: from + step, covariance: cholesky.inverse(), energy, chi2: terms.chi2, shown: Vec::new() };
         let (energy, ln_size) = energy_of_votes(model, class, &votes, &fit);
         Some(Object { class, votes, fit, ln_size, others: Vec::new(), seen: Seen::default(), real: 1.0, energy })
     }

@@ -8,10 +8,12 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
+use super::agreement::{with_sides, with_sides_for_sure};
 use super::calibrate::{Known, Placed, calibrate};
 use super::energy::{Object, fit};
 use super::model::Model;
 use super::noise::Noise;
+use super::parts::Part;
 use super::scene::Scene;
 use super::search::{Depth, search};
 use super::{CALIBRATION_RAYS, Settings, Tally, initial, placed, sample};
@@ -23,6 +25,8 @@ const CALIBRATION_GATE: f64 = 1.4;
 const CALIBRATION_ROUNDS: usize = 3;
 /// Times that it is estimated from more rays than that.
 const MORE_ROUNDS: usize = 2;
+/// Times that the middles of sides are learned anew, from a map that is made with them.
+pub(super) const MIDDLES_ROUNDS: usize = 2;
 /// Passes that should have seen objects and did not are expected to cost no more than this, whatever is expected of them: twice the most that
 /// `-p ln p` can be.
 const MOST_UNSEEN: f64 = 2.0 / std::f64::consts::E;
@@ -31,8 +35,8 @@ const STARTS: [f64; 5] = [0.15, 0.5, 1.5, 5.0, 15.0];
 
 /// Steps from all starts at most, as progress counts them.
 const START_STEPS: usize = STARTS.len() * CALIBRATION_ROUNDS;
-/// Steps of [`misfits`] at most: in each scene those from all starts, and from the map of the other.
-pub const MISFIT_STEPS: usize = 2 * (START_STEPS + 1);
+/// Steps of [`misfits`] at most: in each scene those from all starts, with middles of sides, and from the map of the other.
+pub const MISFIT_STEPS: usize = 2 * (START_STEPS + 2);
 /// Steps of the search for the noise at most.
 pub(super) const NOISE_STEPS: usize = START_STEPS + MORE_ROUNDS;
 
@@ -70,6 +74,29 @@ fn of_more(mut noise: Noise, step: impl Fn(&Noise) -> Result<Round, Halt>) -> Re
     Ok(best)
 }
 
+/// A noise with the error of the [middles that sides show](super::sides), if sides disagree in a map of some rays, and in one that is made with such an
+/// error as well: the former may hold some things once for each side.
+pub(super) fn with_middles(
+    scene: &Scene,
+    noise: &Noise,
+    known: Known,
+    settings: &Settings,
+    map: &[Placed],
+    rays: &[u32],
+    progress: &Progress,
+) -> Result<Noise, Halt> {
+    let plain = Model::new(scene, noise, settings);
+    let mut found = with_sides(&plain, known, map);
+    for _ in 0..MIDDLES_ROUNDS {
+        let Some(with) = found else { break };
+        let mut model = Model::new(scene, &with, settings);
+        let begun = initial::labels_of_few(&model, rays, progress)?;
+        let objects = search(&mut model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
+        found = with_sides_for_sure(&plain, known, &placed(&objects));
+    }
+    Ok(found.unwrap_or(*noise))
+}
+
 /// Minus twice the logarithm of how likely the same rays, of a sample of places, are in two scenes, each with the noise that makes them likeliest
 /// there, up to a constant of these rays; and how many they are. It compares poses: what is true makes the same rays likelier. `second_of_first`
 /// has the number in the second scene of each ray of the first.
@@ -95,7 +122,7 @@ pub fn misfits(
     let of = |scene, rays| Sample { scene, rays, known, settings: wider(settings), progress };
     let samples = [of(scenes[0], &first), of(scenes[1], &second)];
     // Side by side: samples are so small that threads wait for each other within each of them.
-    let sought = |here: usize| Likeliest::of_starts(&samples[here], guess);
+    let sought = |here: usize| Likeliest::of_starts(&samples[here], guess)?.with_sides(&samples[here]);
     let (first_found, second_found) = rayon::join(|| sought(0), || sought(1));
     let found = [first_found?.best, second_found?.best];
     let least = |here: usize, numbers: &[u32]| -> Result<f64, Halt> {
@@ -284,6 +311,17 @@ impl Likeliest {
             self.last = last;
         }
         Ok(())
+    }
+
+    /// One step more with the middles that sides seem to show in the best map.
+    fn with_sides(mut self, sample: &Sample<'_>) -> Result<Self, Halt> {
+        if let Some(best) = self.best.as_ref().filter(|_| sample.settings.has(Part::Sides) && !sample.known.side) {
+            let model = Model::new(sample.scene, &best.noise, &sample.settings);
+            if let Some(noise) = with_sides(&model, sample.known, &best.map) {
+                self.steps(1, noise, |noise| sample.round(noise))?;
+            }
+        }
+        Ok(self)
     }
 
     fn noise(&self) -> Option<Noise> {

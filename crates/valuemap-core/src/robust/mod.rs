@@ -1,7 +1,8 @@
 //! The robust method: one energy J, and a search for the map with the least.
 //!
 //! 1. [`scene`], [`noise`], [`model`]: what was seen, its errors, and what is learned about each class.
-//! 2. [`likeliest`], [`calibrate`], [`split`](mod@split): the noise, by restricted maximum likelihood. [`learn`](mod@learn), [`confusion`]: the classes.
+//! 2. [`likeliest`], [`calibrate`], [`split`](mod@split): the noise, by restricted maximum likelihood. [`agreement`]: what passes and [`sides`](mod@sides) of
+//!    objects disagree about. [`learn`](mod@learn), [`confusion`]: the classes.
 //! 3. [`propose`](mod@propose): each ray meets few partners ([`sample`]) and proposes the point that a sample of images supports best.
 //!    [`initial`]: the map that the search begins with.
 //! 4. [`search`](mod@search): moves that are committed only if J ([`energy`]) falls. [`assign`](mod@assign): all detections of an image.
@@ -10,6 +11,7 @@
 //! 5. [`finish`](mod@finish): positions and covariances, objects of a place together ([`estimate`](mod@estimate), [`drift`], [`contest`]).
 //! 6. [`few`]: objects of one or two votes. [`existence`]: which objects exist. [`switches`]: identity switches are left out.
 
+pub mod agreement;
 pub mod aspect;
 pub mod assign;
 pub mod births;
@@ -49,6 +51,7 @@ pub mod sample;
 pub mod scene;
 pub mod search;
 pub mod seen;
+pub mod sides;
 pub mod sizes;
 mod spd;
 pub mod split;
@@ -124,7 +127,7 @@ const LEAST_EXPECTED: f64 = 5.0;
 const PARTS_OF_PLACES: usize = 5;
 
 /// Steps of [`self_calibrate`] at most, as progress counts them, but for the search that tells whether all moves pay: the noise, and the classes.
-pub const CALIBRATION_STEPS: usize = likeliest::NOISE_STEPS + 1;
+pub const CALIBRATION_STEPS: usize = likeliest::NOISE_STEPS + likeliest::MIDDLES_ROUNDS + 1;
 
 /// What is estimated once of a scene, or of a sample of it, before any part of it is mapped.
 #[derive(Debug, Clone)]
@@ -208,6 +211,11 @@ pub fn self_calibrate(
     let wide = sample::places(scene, CLASS_RAYS, WIDE * settings.viability.max_range_m);
     let objects = learn_from(&mut model, &wide, progress)?;
     let noise = if settings.has(Part::NoiseSplit) { split::split(&model, known, &objects) } else { noise };
+    let noise = if settings.has(Part::Sides) && !known.side {
+        likeliest::with_middles(scene, &noise, known, settings, &placed(&objects), &wide, progress)?
+    } else {
+        noise
+    };
     let noise = if settings.has(Part::SharedNoise) || is_known { noise } else { noise.all_own() };
     let is_small = !is_part && scene.usable_rays().len() <= MOST_RAYS;
     let is_deep = is_small || all_moves_pay(&mut model, &objects, progress)?;
@@ -344,7 +352,7 @@ pub fn find(
     let objects = search(&mut model, &rays, begun, depth, false, &mut tally, progress)?;
     let estimates = finish(&model, &objects);
     let variance_factor = if settings.has(Part::Scaling) {
-        calibrate::variance_factor(scene, noise, &placed(&objects), objects.len().max(1))
+        agreement::variance_factor(scene, noise, &placed(&objects), objects.len().max(1))
     } else {
         1.0
     };
@@ -440,6 +448,7 @@ mod tests {
             covariance: Matrix3::identity(),
             energy: 0.0,
             chi2: Vec::new(),
+            shown: Vec::new(),
         };
         let (ln_size, others, seen) = (f64::NAN, Vec::new(), seen::Seen::default());
         let votes = (first..first + count).collect();

@@ -30,6 +30,8 @@ pub struct Noise {
     pub position_drift_m: f64,
     /// Of the camera rotation, each axis, drifting along a pass, rad.
     pub rotation_drift_rad: f64,
+    /// Of the middle that a side of an object shows, each axis, shared by all images from that side, m.
+    pub side_m: f64,
 }
 
 /// Standard deviations of a pose error, each axis.
@@ -112,6 +114,7 @@ impl Noise {
             rotation_segment_rad: scale(self.rotation_segment_rad, known.rotation),
             position_drift_m: scale(self.position_drift_m, known.position),
             rotation_drift_rad: scale(self.rotation_drift_rad, known.rotation),
+            side_m: scale(self.side_m, known.side),
         }
     }
 
@@ -123,7 +126,7 @@ impl Noise {
         let scale2 = scene.scale2[ray as usize];
         Spread {
             far_px2: own.far_px2 + scale2 * rotation_rad * rotation_rad,
-            near_px2: own.near_px2 + scale2 * position_m * position_m,
+            near_px2: own.near_px2 + scale2 * (position_m * position_m + self.side_m * self.side_m),
         }
     }
 

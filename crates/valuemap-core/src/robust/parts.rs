@@ -61,6 +61,8 @@ pub enum Part {
     SharedNoise,
     /// The noise is split between poses and detections by what the objects of an image have in common.
     NoiseSplit,
+    /// Sides of an object show other middles.
+    Sides,
     /// Contested votes widen covariances.
     Contest,
     /// Covariances are scaled by how far passes disagree.
@@ -69,7 +71,7 @@ pub enum Part {
 
 impl Part {
     /// All parts with their names.
-    pub const ALL: [(Self, &'static str); 31] = [
+    pub const ALL: [(Self, &'static str); 32] = [
         (Self::Polishing, "polishing"),
         (Self::Assignment, "assignment"),
         (Self::Merging, "merging"),
@@ -99,6 +101,7 @@ impl Part {
         (Self::Confusions, "confusions"),
         (Self::SharedNoise, "shared_noise"),
         (Self::NoiseSplit, "noise_split"),
+        (Self::Sides, "sides"),
         (Self::Contest, "contest"),
         (Self::Scaling, "scaling"),
     ];

@@ -38,6 +38,7 @@ pub const NOISE: Noise = Noise {
     rotation_segment_rad: 0.0,
     position_drift_m: 0.0,
     rotation_drift_rad: 0.0,
+    side_m: 0.0,
 };
 
 /// A drive along x that sees all of the objects within 50 m ahead, each a little off.

@@ -9,7 +9,7 @@ use rstar::RTree;
 use rstar::primitives::GeomWithData;
 use rustc_hash::FxHasher;
 
-use crate::robust::calibrate;
+use crate::robust::agreement;
 use crate::robust::estimate::{Care, Elsewhere, Estimate, Joint, Limits, Start};
 use crate::robust::looks::SECTOR_COSINE;
 use crate::robust::noise::Noise;
@@ -69,8 +69,8 @@ pub struct Revision {
 /// What was found out about a label as it is; forgotten when it changes.
 #[derive(Debug, Clone, Default)]
 pub struct Known {
-    /// How far its visits disagree, see [`variance_factor`](crate::robust::calibrate::variance_factor).
-    pub disagreement: OnceLock<Option<calibrate::Disagreement>>,
+    /// How far its visits disagree, see [`variance_factor`](crate::robust::agreement::variance_factor).
+    pub disagreement: OnceLock<Option<agreement::Disagreement>>,
     /// Whether it was found not to be two.
     pub is_one: bool,
     /// Neighbors, as they were, that it was found to have no votes to exchange with.
@@ -151,9 +151,9 @@ pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Label], most: usi
     let labels: Vec<&Label> = labels.iter().step_by((labels.len() / most).max(1)).collect();
     let of_label = |label: &&Label| {
         let placed = || (label.voters.clone(), label.estimate.point);
-        *label.known.disagreement.get_or_init(|| calibrate::disagreement(scene, noise, &placed()))
+        *label.known.disagreement.get_or_init(|| agreement::disagreement(scene, noise, &placed()))
     };
-    calibrate::mean(labels.par_iter().map(of_label).collect()).unwrap_or(1.0).max(1.0)
+    agreement::mean(labels.par_iter().map(of_label).collect()).unwrap_or(1.0).max(1.0)
 }
 
 /// Labels by place.

@@ -1,0 +1,321 @@
+//! How far the passes and the sides of objects agree about where they are.
+//!
+//! The error that a pass shares makes the positions that each pass alone would give an object differ. The error of the [middle that a side
+//! shows](super::sides) makes those of its sides differ by more than those of the passes of one side. So the drift, the middles, and what the covariances
+//! are off by are learned of as much disagreement as there is.
+
+use nalgebra::{Matrix3, Vector3};
+use rayon::prelude::*;
+
+use super::calibrate::{Known, Placed};
+use super::drift::Drive;
+use super::energy::implied_size;
+use super::estimate::{Care, Estimate, by_pass, estimate, looks_at};
+use super::model::Model;
+use super::noise::Noise;
+use super::scene::Scene;
+use super::sides::sides;
+
+/// Labels with fewer voters do not tell whether their sides agree: chance meetings have few.
+const MIN_VOTES: usize = 6;
+/// A pass with fewer voters does not say where it would put a label alone.
+const MIN_VOTES_OF_PASS: usize = 4;
+/// Where fewer labels are seen by several passes, the shared part is taken to be as large as the own part.
+const MIN_SHARED_LABELS: usize = 5;
+/// One label says no more than this about the disagreement of passes, as a multiple of what is expected.
+const MOST_DISAGREEMENT: f64 = 5.0;
+/// Where the noise is sought, how much passes of a label disagree counts up to this many standard deviations: 95 % efficient where errors are Gaussian (Huber, "Robust
+/// estimation of a location parameter", 1964).
+const HUBER_SIGMAS: f64 = 1.345;
+/// Shared errors over own errors of a pose: least and most.
+pub(super) const LEAST_DRIFT: f64 = 0.1;
+const MOST_DRIFT: f64 = 1000.0;
+/// Sides of labels that disagree by fewer standard deviations than this more than expected, all together, agree: as chance has it in 98 cases of 100.
+const SUSPECTED_SIGMAS: f64 = 2.0;
+/// By more than this they do not: chance has it in one case of a thousand.
+const CERTAIN_SIGMAS: f64 = 3.0;
+/// Middles are sought down to this share of the usual size: less is an error of the detector, if it is one.
+const LEAST_SHARE: f64 = 1e-3;
+/// Times that an interval is cut in half where a value is sought: to a thousandth.
+const HALVINGS: usize = 12;
+
+/// How far positions that parts of what is known of a label give it lie from their mean.
+#[derive(Debug, Clone, Copy)]
+pub struct Disagreement {
+    /// Squared, in sigmas.
+    square: f64,
+    /// Degrees of freedom.
+    freedom: f64,
+}
+
+impl Disagreement {
+    /// By how many standard deviations it is larger than expected: its cubic root is nearly Gaussian (Wilson and Hilferty, "The distribution of
+    /// chi-square", 1931).
+    fn sigmas(&self) -> f64 {
+        let variance = 2.0 / (9.0 * self.freedom);
+        ((self.square / self.freedom).cbrt() - (1.0 - variance)) / variance.sqrt()
+    }
+}
+
+/// What the passes of one side say of a label.
+struct Side {
+    /// Where they put it together, beside where it is, m.
+    offset_m: Vector3<f64>,
+    /// Covariance of that, m².
+    covariance: Matrix3<f64>,
+    /// Squared distances of where each puts it alone from there, in sigmas.
+    square: f64,
+    passes: u32,
+}
+
+/// What the passes of a label say of it, side by side.
+struct Sides(Vec<Side>);
+
+impl Sides {
+    /// Of the passes with enough votes. Nothing if they do not fix the label.
+    fn of(scene: &Scene, noise: &Noise, (votes, point): &Placed, care: Care) -> Option<Self> {
+        let passes: Vec<&[u32]> = by_pass(scene, votes).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS).collect();
+        let of_side = |side: &Vec<u32>| {
+            let (mut information, mut gradient, mut alone) = (Matrix3::zeros(), Vector3::zeros(), 0.0);
+            for &pass in side {
+                let looks = looks_at(scene, noise, noise, passes[pass as usize], point)?;
+                let (of_pass, by_pass) = Drive::at_one(&looks)?.normals.of_one();
+                alone += by_pass.dot(&of_pass.cholesky()?.solve(&by_pass));
+                information += of_pass;
+                gradient += by_pass;
+            }
+            let covariance = information.cholesky()?.inverse();
+            let offset_m = -covariance * gradient;
+            let square = (alone + gradient.dot(&offset_m)).max(0.0);
+            let rough = Side { offset_m, covariance, square, passes: side.len() as u32 };
+            if care == Care::Rough {
+                return Some(rough);
+            }
+            let votes: Vec<u32> = side.iter().flat_map(|&pass| passes[pass as usize]).copied().collect();
+            let Estimate { point: there, covariance } = estimate(scene, noise, &votes, *point, care)?;
+            Some(Side { offset_m: there - point, covariance, ..rough })
+        };
+        sides(scene, passes.iter().copied()).iter().map(of_side).collect::<Option<_>>().map(Self)
+    }
+
+    /// Of the passes of each side with each other. Nothing if no side has two.
+    fn within(&self) -> Option<Disagreement> {
+        let freedom = self.0.iter().map(|side| 3.0 * f64::from(side.passes - 1)).sum();
+        let square = self.0.iter().map(|side| side.square).sum();
+        (freedom > 0.0).then_some(Disagreement { square, freedom })
+    }
+
+    /// Of the sides with each other, if each shows another middle. Nothing if there are no two.
+    fn between(&self, side_m: f64) -> Option<Disagreement> {
+        let freedom = 3.0 * (self.0.len().checked_sub(1)? as f64);
+        let (mut information, mut sum, mut square) = (Matrix3::zeros(), Vector3::zeros(), 0.0);
+        for side in &self.0 {
+            let of_side = (side.covariance + Matrix3::identity() * (side_m * side_m)).cholesky()?.inverse();
+            let weighted = of_side * side.offset_m;
+            information += of_side;
+            sum += weighted;
+            square += side.offset_m.dot(&weighted);
+        }
+        square -= sum.dot(&information.cholesky()?.solve(&sum));
+        (freedom > 0.0).then(|| Disagreement { square: square.max(0.0), freedom })
+    }
+
+    /// Of all passes with each other. Nothing if there is only one.
+    fn all(&self, side_m: f64) -> Option<Disagreement> {
+        let parts = [self.within(), self.between(side_m)];
+        parts
+            .into_iter()
+            .flatten()
+            .reduce(|a, b| Disagreement { square: a.square + b.square, freedom: a.freedom + b.freedom })
+    }
+}
+
+/// How far the positions that the passes of a label give it alone lie from their mean. Nothing for labels of a single pass.
+#[must_use]
+pub fn disagreement(scene: &Scene, noise: &Noise, label: &Placed) -> Option<Disagreement> {
+    Sides::of(scene, noise, label, Care::Rough)?.all(noise.side_m)
+}
+
+fn sides_of_all(scene: &Scene, noise: &Noise, labels: &[&Placed], care: Care) -> Vec<Option<Sides>> {
+    labels.par_iter().map(|label| Sides::of(scene, noise, label, care)).collect()
+}
+
+/// The ratio of the drift of positions to the errors of images and segments at which the passes of objects disagree as much as expected: the larger the
+/// drift is taken for, the less remains unexplained.
+pub(super) fn agreeing_ratio(scene: &Scene, objects: &[&Placed], noise_of: &(dyn Fn(f64) -> Noise + Sync)) -> f64 {
+    let excess_of = |ratio: f64| {
+        let noise = noise_of(ratio);
+        excess(sides_of_all(scene, &noise, objects, Care::Rough).iter().map(|sides| sides.as_ref()?.all(noise.side_m)))
+    };
+    agreeing(LEAST_DRIFT, MOST_DRIFT, excess_of).unwrap_or(1.0)
+}
+
+/// The value between two of which nothing is in excess: by bisection of its logarithm, of what falls with it. Nothing where too little is known.
+fn agreeing(low: f64, high: f64, excess_of: impl Fn(f64) -> Option<f64>) -> Option<f64> {
+    let (mut low, mut high) = (low.ln(), high.ln());
+    for _ in 0..HALVINGS {
+        let middle = 0.5 * (low + high);
+        if excess_of(middle.exp())? > 0.0 { low = middle } else { high = middle }
+    }
+    Some((0.5 * (low + high)).exp())
+}
+
+/// By how many standard deviations disagreements are larger than expected, of most labels: Huber's psi, summed. A label of two objects disagrees
+/// whatever the noise is; where a fifth of the labels are such, no drift is so large that the mean is as expected.
+fn excess(of_labels: impl Iterator<Item = Option<Disagreement>>) -> Option<f64> {
+    let known: Vec<f64> = of_labels.flatten().map(|one| one.sigmas().clamp(-HUBER_SIGMAS, HUBER_SIGMAS)).collect();
+    (known.len() >= MIN_SHARED_LABELS).then(|| known.iter().sum())
+}
+
+/// The noise of a model with the error of the middles that sides of some labels show, and with the drift that is left for their passes; nothing where
+/// sides agree as far as the passes of one side do, or where nothing has a size: middles are those of boxes.
+#[must_use]
+pub(super) fn with_sides(model: &Model<'_>, known: Known, labels: &[Placed]) -> Option<Noise> {
+    let labels: Vec<&Placed> = labels.iter().filter(|label| label.0.len() >= MIN_VOTES).collect();
+    noise_of_sides(model, known, &labels, Care::Rough, SUSPECTED_SIGMAS)
+}
+
+/// The same beyond doubt: of labels that stand alone, as one of two neighbours may have what the other shows to a side, and as exactly as labels are
+/// estimated in the end, as sides that are seen often differ by what a rough estimate is off by.
+#[must_use]
+pub(super) fn with_sides_for_sure(model: &Model<'_>, known: Known, labels: &[Placed]) -> Option<Noise> {
+    let stands_alone = |(votes, point): &Placed| {
+        let off_m = |&ray: &u32| {
+            let depth_m = model.scene.ray(ray).project(point).z;
+            depth_m * (model.spreads[ray as usize].variance(depth_m) / model.scene.scale2[ray as usize]).sqrt()
+        };
+        let near_m = model.settings.gate_sigmas * votes.iter().map(off_m).fold(0.0, f64::max);
+        labels.iter().filter(|other| (other.1 - point).norm() < near_m).count() == 1
+    };
+    let alone: Vec<&Placed> =
+        labels.par_iter().filter(|label| label.0.len() >= MIN_VOTES && stands_alone(label)).collect();
+    noise_of_sides(model, known, &alone, Care::Exact, CERTAIN_SIGMAS)
+}
+
+fn noise_of_sides(model: &Model<'_>, known: Known, labels: &[&Placed], care: Care, least_sigmas: f64) -> Option<Noise> {
+    let (scene, noise) = (model.scene, model.noise);
+    let size_m = usual_size_m(model, labels)?;
+    let own_m = noise.position_m.hypot(noise.position_segment_m);
+    let drifting = |ratio: f64| Noise { position_drift_m: ratio * own_m, ..*noise };
+    let of_one_side = |ratio: f64| {
+        let sides = sides_of_all(scene, &drifting(ratio), labels, Care::Rough);
+        excess(sides.iter().map(|sides| sides.as_ref()?.within()))
+    };
+    let is_known = known.position || scene.usual(|view| view.position_sigma_m).is_some();
+    let ratio = if is_known { None } else { agreeing(LEAST_DRIFT, MOST_DRIFT, of_one_side) };
+    let of_passes = ratio.map_or(*noise, drifting);
+    let sides = sides_of_all(scene, &of_passes, labels, care);
+    let between = |side_m: f64| sides.iter().map(move |sides| sides.as_ref()?.between(side_m));
+    let count = between(0.0).flatten().count() as f64;
+    if excess(between(0.0))? < least_sigmas * count.sqrt() {
+        return None;
+    }
+    let side_m = agreeing(LEAST_SHARE * size_m, size_m, |side_m| excess(between(side_m)))?;
+    Some(Noise { side_m, ..of_passes })
+}
+
+/// The median size that boxes of some labels imply, m; nothing if there are none.
+fn usual_size_m(model: &Model<'_>, labels: &[&Placed]) -> Option<f64> {
+    let of_label =
+        |(votes, point): &Placed| votes.iter().map(|&ray| implied_size(model, ray, point)).collect::<Vec<f64>>();
+    let mut sizes: Vec<f64> = labels.iter().flat_map(|label| of_label(label)).filter(|size| size.is_finite()).collect();
+    let middle = sizes.len() / 2;
+    (!sizes.is_empty()).then(|| sizes.select_nth_unstable_by(middle, f64::total_cmp).1.exp())
+}
+
+/// How much larger than they are said to be the errors are that labels of several passes show: the mean disagreement of
+/// their passes, at least 1. The variance of positions is to be multiplied by it. About `most` of the labels serve.
+#[must_use]
+pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Placed], most: usize) -> f64 {
+    let labels: Vec<&Placed> = labels.iter().step_by((labels.len() / most).max(1)).collect();
+    let all = sides_of_all(scene, noise, &labels, Care::Rough);
+    mean(all.iter().map(|sides| sides.as_ref()?.all(noise.side_m)).collect()).unwrap_or(1.0).max(1.0)
+}
+
+/// The mean of those that are known, a degree of freedom, without letting one say too much.
+#[must_use]
+pub fn mean(of_labels: Vec<Option<Disagreement>>) -> Option<f64> {
+    let known: Vec<f64> =
+        of_labels.into_iter().flatten().map(|one| (one.square / one.freedom).min(MOST_DISAGREEMENT)).collect();
+    (known.len() >= MIN_SHARED_LABELS).then(|| known.iter().sum::<f64>() / known.len() as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::PI;
+
+    use nalgebra::{Isometry3, Point3};
+
+    use super::*;
+    use crate::robust::sample::scramble;
+    use crate::street;
+
+    /// With a standard deviation of 1.
+    fn uniform(number: u64) -> f64 {
+        (scramble(number) as f64 / u64::MAX as f64 - 0.5) * 12.0_f64.sqrt()
+    }
+
+    /// Objects of a street, so far apart, and their votes from six drives, in turn from either end, to each of which they show a middle that is so
+    /// far off.
+    fn street_from_both_ends(apart_m: f64, off_m: f64) -> (Scene, Vec<Placed>) {
+        let back = Isometry3::new(Vector3::new(300.0, 0.0, 0.0), Vector3::new(0.0, 0.0, PI));
+        let objects: Vec<Vector3<f64>> =
+            (0..24).map(|i| Vector3::new(100.0 + apart_m * f64::from(i), 6.0, 3.0)).collect();
+        let errors: Vec<[f64; 2]> = (0..997).map(|i| [uniform(2 * i), uniform(2 * i + 1)]).collect();
+        let of_drive = |number: u64, drive: u64| {
+            let there = if drive.is_multiple_of(2) { Isometry3::identity() } else { back };
+            let off = Vector3::from_fn(|axis, _| off_m * uniform(5000 + 8 * number + 4 * (drive % 2) + axis as u64));
+            let shown = there.inverse() * Point3::from(objects[number as usize] + off);
+            street::moved(street::street(300, 2.0, &[shown.coords], &errors[(13 * number + drive) as usize..]), &there)
+        };
+        let parts = (0..24).flat_map(|number| (0..6).map(move |drive| (number, drive)));
+        let mut scene = street::joined(parts.map(|(number, drive)| of_drive(number, drive)).collect());
+        let mut labels: Vec<Placed> = objects.iter().map(|&object| (Vec::new(), object)).collect();
+        for (ray, &image) in (0..).zip(&scene.rays.image) {
+            labels[image as usize / 300 / 6].0.push(ray);
+        }
+        scene.views.iter_mut().for_each(|view| view.pass %= 6);
+        (scene, labels)
+    }
+
+    #[test]
+    fn middles_of_sides_are_learned_where_there_are_any() {
+        let noise = Noise { position_drift_m: 0.03, ..street::NOISE };
+        for (off_m, is_found) in [(0.2, true), (0.0, false)] {
+            let (scene, labels) = street_from_both_ends(20.0, off_m);
+            let model = Model::new(&scene, &noise, &street::SETTINGS);
+            for found in [with_sides, with_sides_for_sure].map(|learn| learn(&model, Known::default(), &labels)) {
+                assert_eq!(found.is_some(), is_found, "{found:?}");
+                let side_m = found.map_or(off_m, |found| found.side_m);
+                assert!((0.7 * off_m..=1.3 * off_m).contains(&side_m), "{side_m}");
+            }
+        }
+    }
+
+    #[test]
+    fn neighbours_do_not_tell_for_sure_whether_sides_show_other_middles() {
+        let noise = Noise { position_drift_m: 0.03, ..street::NOISE };
+        let (scene, labels) = street_from_both_ends(0.3, 0.2);
+        let model = Model::new(&scene, &noise, &street::SETTINGS);
+        assert!(with_sides(&model, Known::default(), &labels).is_some());
+        assert_eq!(with_sides_for_sure(&model, Known::default(), &labels), None);
+    }
+
+    #[test]
+    fn nothing_without_a_size_shows_other_middles() {
+        let noise = Noise { position_drift_m: 0.03, ..street::NOISE };
+        let (mut scene, labels) = street_from_both_ends(20.0, 0.2);
+        scene.box_px.fill(0.0);
+        let model = Model::new(&scene, &noise, &street::SETTINGS);
+        assert_eq!(with_sides(&model, Known::default(), &labels), None);
+    }
+
+    #[test]
+    fn what_sides_disagree_about_is_no_drift_of_their_passes() {
+        let noise = Noise { position_drift_m: 0.2, ..street::NOISE };
+        let (scene, labels) = street_from_both_ends(20.0, 0.2);
+        let model = Model::new(&scene, &noise, &street::SETTINGS);
+        let found = with_sides(&model, Known::default(), &labels);
+        assert!(found.is_some_and(|found| found.position_drift_m < 0.05), "{found:?}");
+    }
+}
