@@ -366,7 +366,9 @@ pub fn sides<'py>(
     for visits in object.chunk_by(|a, b| a == b) {
         let directions = directions[first..first + visits.len()].iter().map(|&direction| direction.into());
         for (number, side) in (0..).zip(of_directions(directions)) {
-            side.iter().for_each(|&visit| found[first + visit as usize] = number);
+            for visit in side {
+                found[first + visit as usize] = number;
+            }
         }
         first += visits.len();
     }

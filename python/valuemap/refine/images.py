@@ -116,8 +116,7 @@ class Bundle:
         label, row = np.unique(self.label, return_inverse=True)
         information = np.zeros((len(label), 3, 3))
         np.add.at(information, row, np.linalg.inv(of_things))
-        covariance_m2: Floats = np.linalg.inv(information)
-        return label, covariance_m2
+        return label, np.asarray(np.linalg.inv(information), np.float64)
 
 
 def gather_images(dataset: Dataset, config: MapConfig) -> AllImages:
