@@ -11,6 +11,7 @@ use super::calibrate::{Known, Placed};
 use super::drift::Drive;
 use super::energy::implied_size;
 use super::estimate::{Care, Estimate, by_pass, estimate, looks_at};
+use super::learn::median;
 use super::model::Model;
 use super::noise::Noise;
 use super::scene::Scene;
@@ -136,6 +137,10 @@ pub fn disagreement(scene: &Scene, noise: &Noise, label: &Placed) -> Option<Disa
     Sides::of(scene, noise, label, Care::Rough)?.all(noise.side_m)
 }
 
+fn disagreements(scene: &Scene, noise: &Noise, labels: &[&Placed]) -> Vec<Option<Disagreement>> {
+    labels.par_iter().map(|label| disagreement(scene, noise, label)).collect()
+}
+
 fn sides_of_all(scene: &Scene, noise: &Noise, labels: &[&Placed], care: Care) -> Vec<Option<Sides>> {
     labels.par_iter().map(|label| Sides::of(scene, noise, label, care)).collect()
 }
@@ -143,10 +148,7 @@ fn sides_of_all(scene: &Scene, noise: &Noise, labels: &[&Placed], care: Care) ->
 /// The ratio of the drift of positions to the errors of images and segments at which the passes of objects disagree as much as expected: the larger the
 /// drift is taken for, the less remains unexplained.
 pub(super) fn agreeing_ratio(scene: &Scene, objects: &[&Placed], noise_of: &(dyn Fn(f64) -> Noise + Sync)) -> f64 {
-    let excess_of = |ratio: f64| {
-        let noise = noise_of(ratio);
-        excess(sides_of_all(scene, &noise, objects, Care::Rough).iter().map(|sides| sides.as_ref()?.all(noise.side_m)))
-    };
+    let excess_of = |ratio: f64| excess(disagreements(scene, &noise_of(ratio), objects).into_iter());
     agreeing(LEAST_DRIFT, MOST_DRIFT, excess_of).unwrap_or(1.0)
 }
 
@@ -216,11 +218,8 @@ fn noise_of_sides(model: &Model<'_>, known: Known, labels: &[&Placed], care: Car
 
 /// The median size that boxes of some labels imply, m; nothing if there are none.
 fn usual_size_m(model: &Model<'_>, labels: &[&Placed]) -> Option<f64> {
-    let of_label =
-        |(votes, point): &Placed| votes.iter().map(|&ray| implied_size(model, ray, point)).collect::<Vec<f64>>();
-    let mut sizes: Vec<f64> = labels.iter().flat_map(|label| of_label(label)).filter(|size| size.is_finite()).collect();
-    let middle = sizes.len() / 2;
-    (!sizes.is_empty()).then(|| sizes.select_nth_unstable_by(middle, f64::total_cmp).1.exp())
+    let sizes = labels.iter().flat_map(|(votes, point)| votes.iter().map(|&ray| implied_size(model, ray, point)));
+    median(&mut sizes.filter(|size| size.is_finite()).collect::<Vec<f64>>()).map(f64::exp)
 }
 
 /// How much larger than they are said to be the errors are that labels of several passes show: the mean disagreement of
@@ -228,8 +227,7 @@ fn usual_size_m(model: &Model<'_>, labels: &[&Placed]) -> Option<f64> {
 #[must_use]
 pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Placed], most: usize) -> f64 {
     let labels: Vec<&Placed> = labels.iter().step_by((labels.len() / most).max(1)).collect();
-    let all = sides_of_all(scene, noise, &labels, Care::Rough);
-    mean(all.iter().map(|sides| sides.as_ref()?.all(noise.side_m)).collect()).unwrap_or(1.0).max(1.0)
+    mean(disagreements(scene, noise, &labels)).unwrap_or(1.0).max(1.0)
 }
 
 /// The mean of those that are known, a degree of freedom, without letting one say too much.

@@ -246,13 +246,21 @@ impl<'a> Fitting<'a> {
     /// Equation (1) at a point, with what a step needs.
     fn terms(&self, weights: &[f64], point: &Vector3<f64>) -> Option<Terms> {
         let mut sum = Terms { chi2: Vec::with_capacity(self.votes.len()), ..Terms::none() };
-        for visit in self.of_visits.iter().filter(|_| self.sides.is_empty()) {
-            let said = say(&self.vantages[visit.clone()], &weights[visit.clone()], point, &mut sum.chi2)?;
-            sum.add_said(&said);
+        if self.sides.is_empty() {
+            for visit in &self.of_visits {
+                let said = say(&self.vantages[visit.clone()], &weights[visit.clone()], point, &mut sum.chi2)?;
+                sum.add_said(&said);
+            }
+        } else {
+            self.add_sides(weights, point, &mut sum)?;
         }
-        if !self.sides.is_empty() {
-            sum.chi2.resize(self.votes.len(), 0.0);
-        }
+        sum.add_priors(self.model, self.votes, point, self.camera_m2);
+        sum.cost().is_finite().then_some(sum)
+    }
+
+    /// Add what each side says, the error of its middle marginalised.
+    fn add_sides(&self, weights: &[f64], point: &Vector3<f64>, sum: &mut Terms) -> Option<()> {
+        sum.chi2.resize(self.votes.len(), 0.0);
         for side in &self.sides {
             let (said, middle) = marginalised(self.model.noise.side_m, point, |middle| {
                 let mut of_side = Terms::none();
@@ -269,8 +277,7 @@ impl<'a> Fitting<'a> {
             sum.add_said(&said);
             sum.middles.push(middle);
         }
-        sum.add_priors(self.model, self.votes, point, self.camera_m2);
-        sum.cost().is_finite().then_some(sum)
+        Some(())
     }
 
     /// What each side shows, by the direction in which its first vote sees it.

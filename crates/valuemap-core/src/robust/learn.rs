@@ -243,7 +243,7 @@ fn sizes(model: &Model<'_>, objects: &[&Object]) -> (f64, (f64, f64)) {
     (spread, (middle, median(&mut medians).unwrap_or(f64::NAN) / MAD_OF_NORMAL))
 }
 
-fn median(values: &mut [f64]) -> Option<f64> {
+pub(super) fn median(values: &mut [f64]) -> Option<f64> {
     let middle = values.len() / 2;
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }

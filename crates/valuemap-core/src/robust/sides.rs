@@ -10,6 +10,7 @@ use super::scene::Scene;
 
 /// Visits whose mean directions are within 45 degrees look from one side: a box has four.
 const LEAST_COSINE: f64 = std::f64::consts::FRAC_1_SQRT_2;
+
 /// The numbers of the visits (of rays, in their order) that look from one side each. It depends on the rays alone, not on where their object is.
 pub(super) fn sides<'v>(scene: &Scene, visits: impl Iterator<Item = &'v [u32]>) -> Vec<Vec<u32>> {
     of_directions(visits.map(|visit| visit.iter().map(|&ray| scene.ray(ray).direction).sum()))
