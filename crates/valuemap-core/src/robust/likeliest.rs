@@ -301,11 +301,16 @@ impl Likeliest {
         let (mut last, mut is_best) = (None, false);
         for _ in 0..count {
             let found = Arc::new(step(&noise)?);
+            // What stays as it is makes the same map again.
+            let stays = found.again == noise;
             noise = found.again;
             if self.best.as_ref().is_none_or(|best| found.value < best.value) {
                 (self.best, is_best) = (Some(Arc::clone(&found)), true);
             }
             last = Some(found);
+            if stays {
+                break;
+            }
         }
         if is_best {
             self.last = last;
@@ -425,8 +430,9 @@ mod tests {
             let drive = street::street(20, 1.0, &objects, &errors);
             street::joined(vec![drive.clone(), street::moved(drive, &Isometry3::translation(ahead_m, 0.0, 0.0))])
         };
-        // From where the second drive says that it was, some objects are within the range; from where it was, none is.
-        let (right, wrong) = (drives(0.0), drives(4.0));
+        // From where the second drive says that it was, some objects are within the range; from where it was, none is. Objects are whole metres apart:
+        // moved by whole metres, one would stand where another one does.
+        let (right, wrong) = (drives(0.0), drives(4.5));
         let viability = crate::hypothesis::Viability { max_range_m: 31.0, ..street::VIABILITY };
         let settings = Settings { viability, ..street::SETTINGS };
         let same: Vec<u32> = (0..right.rays.rays.len() as u32).collect();
@@ -488,6 +494,23 @@ mod tests {
         };
         assert!((with(-10.0)?.detection_px - 1.0).abs() < 1e-12);
         assert!((with(10.0)?.detection_px - 0.5).abs() < 1e-12);
+        Ok(())
+    }
+
+    #[test]
+    fn a_noise_that_stays_as_it_is_takes_no_further_step() -> Result<(), Halt> {
+        let steps = |change_px: f64| {
+            let taken = std::cell::Cell::new(0);
+            let step = |noise: &Noise| {
+                taken.set(taken.get() + 1);
+                let left = Left { chi2: 0.0, votes: Vec::new(), clutter: Vec::new(), passes: (0, 0.0) };
+                let again = Noise { detection_px: noise.detection_px + change_px, ..*noise };
+                Ok(Round { noise: *noise, map: Vec::new(), value: 0.0, again, change: 0.0, left })
+            };
+            Likeliest::default().steps(3, street::NOISE, step)?;
+            Ok(taken.get())
+        };
+        assert_eq!([steps(0.0)?, steps(0.1)?], [1, 3]);
         Ok(())
     }
 }

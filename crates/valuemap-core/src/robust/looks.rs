@@ -75,8 +75,11 @@ impl Lookout {
         let sectors = Sectors::of(scene, point, voters, distances_m);
         let mut looks: Vec<Look> = Vec::with_capacity(2 * voters.len());
         for &ray in voters {
-            let view = scene.view(ray);
-            let sector = sectors.nearest(&(view.center - point));
+            let away = scene.ray(ray).center - point;
+            let sector = sectors.nearest(&away);
+            if away.norm() > sectors.0[sector].farthest_m {
+                continue;
+            }
             looks.push(Look { sector, image: scene.rays.image[ray as usize], weight: 1.0, is_hit: true });
         }
         let hits = images_of(scene, voters);
@@ -200,11 +203,17 @@ struct Sector {
     direction: Vector3<f64>,
     /// What is nearer is seen by few: that of the nearest vote, or of the class.
     nearest_m: f64,
+    /// What is farther is seen by few: that of the second farthest vote, or of the class.
     farthest_m: f64,
+    farthest_vote_m: f64,
 }
 
 impl Sectors {
+    /// Those of some votes, from at least so near and as far as those two distances say. One vote from farther away may be a stray one, and is no
+    /// look: all images that are nearer would count against an object that is detected from so far away once in a hundred times. Where
+    /// nothing is known (0 m), sides reach as far as their farthest vote.
     fn of(scene: &Scene, point: &Vector3<f64>, voters: &[u32], (nearest_m, farthest_m): (f64, f64)) -> Self {
+        let is_known = farthest_m > 0.0;
         let mut sectors: Vec<Sector> = Vec::new();
         for &ray in voters {
             let away = scene.ray(ray).center - point;
@@ -212,12 +221,16 @@ impl Sectors {
             let direction = away / distance;
             if let Some(sector) = sectors.iter_mut().find(|sector| sector.direction.dot(&direction) >= SECTOR_COSINE) {
                 sector.nearest_m = sector.nearest_m.min(distance);
-                sector.farthest_m = sector.farthest_m.max(distance);
+                let (nearer_m, farther_m) =
+                    (sector.farthest_vote_m.min(distance), sector.farthest_vote_m.max(distance));
+                sector.farthest_m = sector.farthest_m.max(if is_known { nearer_m } else { farther_m });
+                sector.farthest_vote_m = farther_m;
             } else {
                 sectors.push(Sector {
                     direction,
                     nearest_m: nearest_m.min(distance),
-                    farthest_m: farthest_m.max(distance),
+                    farthest_m: if is_known { farthest_m } else { distance },
+                    farthest_vote_m: distance,
                 });
             }
         }
@@ -284,6 +297,26 @@ mod tests {
         let without = Without::named(&["turns".to_owned()]).unwrap_or_default();
         let (one, two) = energies(&Settings { without, ..street::SETTINGS });
         assert!(two < one, "{one} {two}");
+    }
+
+    #[test]
+    fn one_vote_from_farther_than_a_class_is_detected_is_no_look_and_two_are() {
+        let at = Vector3::new(60.0, 4.0, 3.0);
+        let scene = street::street(51, 1.0, &[at], &[[0.0, 0.0]]);
+        let mut model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
+        (model.classes[0].is_learned, model.classes[0].farthest_m) = (true, 30.0);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let looks = |votes: &[u32]| {
+            let passes = lookout.looks(&model, &at, votes, &[]).sectors.concat();
+            let sum = |of: fn(&Looks) -> f64| passes.iter().map(of).sum::<f64>();
+            (sum(|looks| looks.hits), sum(|looks| looks.expected))
+        };
+        // All rays but the first twenty are from no farther than 29.4 m.
+        let near: Vec<u32> = (20..40).collect();
+        let with = |far: &[u32]| looks(&[far, &near].concat());
+        assert_eq!(with(&[]), (20.0, 20.0));
+        assert_eq!(with(&[2]), with(&[]));
+        assert_eq!(with(&[2, 12]), (21.0, 28.0));
     }
 
     #[test]

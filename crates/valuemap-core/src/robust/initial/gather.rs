@@ -14,10 +14,13 @@ use crate::robust::parts::Part;
 use crate::robust::propose::{Hypothesis, Who, propose};
 use crate::robust::quick::quick_estimate;
 
-/// Hypothesiss that are polished side by side.
+/// Hypotheses that are polished side by side.
 const BATCH: usize = 16;
 /// Who nominates, round after round, each time with the rays that are left over.
 const ROUNDS: [Who; 4] = [Who::Part, Who::All, Who::All, Who::All];
+/// A ray is gathered so often for no label: as often as it is tried with others (`MEETINGS` of propose.rs). Where gates are as wide as streets, as with
+/// the largest starts of the noise, each hypothesis would gather most rays otherwise.
+const MOST_REFUSALS: u8 = 24;
 /// Rounds of estimating and gathering voters again, at most.
 const MAX_ROUNDS: usize = 8;
 
@@ -39,31 +42,35 @@ pub fn gather(model: &Model<'_>, rays: &[u32], progress: &Progress) -> Result<(V
         counts[0] += nominations.len() as u64;
         let index = RayIndex::new(scene, spreads, settings.gate_sigmas, free.into_iter());
         let before = labels.len();
+        let mut refusals = Refusals(vec![0; scene.rays.rays.len()]);
         // The best nominations of all places are polished side by side; where two claim the same ray, the better one
         // has it, and the other is polished again on what is left.
         for batch in nominations.chunks(BATCH) {
             progress.check()?;
-            let polish_one = |nomination: &Hypothesis, claimed: &[bool]| {
+            let polish_one = |nomination: &Hypothesis, claimed: &[bool], refusals: &Refusals| {
                 if nomination.rays.iter().any(|&ray| claimed[ray as usize]) {
-                    return None;
+                    return Err(Vec::new());
                 }
                 let class = scene.rays.class[nomination.rays[0] as usize];
                 let keep = |ray: u32| !claimed[ray as usize];
-                polish(model, &index, nomination.point, class, range_m, &keep)
+                polish(model, &index, nomination.point, class, range_m, &keep, refusals)
             };
-            let polished: Vec<Option<Label>> =
-                batch.par_iter().map(|nomination| polish_one(nomination, &claimed)).collect();
+            let polished: Vec<Result<Label, Vec<u32>>> =
+                batch.par_iter().map(|nomination| polish_one(nomination, &claimed, &refusals)).collect();
             for (nomination, label) in batch.iter().zip(polished) {
                 let is_free = |label: &Label| label.voters.iter().all(|&ray| !claimed[ray as usize]);
                 let settled = match label {
-                    Some(label) if !is_free(&label) => polish_one(nomination, &claimed),
+                    Ok(label) if !is_free(&label) => polish_one(nomination, &claimed, &refusals),
                     label => label,
                 };
-                if let Some(label) = settled {
-                    for &ray in &label.voters {
-                        claimed[ray as usize] = true;
+                match settled {
+                    Ok(label) => {
+                        for &ray in &label.voters {
+                            claimed[ray as usize] = true;
+                        }
+                        labels.push(label);
                     }
-                    labels.push(label);
+                    Err(gathered) => refusals.count(&gathered),
                 }
             }
         }
@@ -76,11 +83,26 @@ pub fn gather(model: &Model<'_>, rays: &[u32], progress: &Progress) -> Result<(V
     Ok((labels, counts))
 }
 
+/// How often each ray was gathered for no label.
+struct Refusals(Vec<u8>);
+
+impl Refusals {
+    fn count(&mut self, gathered: &[u32]) {
+        for &ray in gathered {
+            self.0[ray as usize] = self.0[ray as usize].saturating_add(1);
+        }
+    }
+
+    /// Whether rays are not worth another try: each of them was gathered for nothing as often as it may be.
+    fn are_enough(&self, gathered: &[u32]) -> bool {
+        gathered.iter().all(|&ray| self.0[ray as usize] >= MOST_REFUSALS)
+    }
+}
+
 /// Estimate a point on its voters and gather voters from the estimate, quickly, until they stay the same; then once with
 /// the estimate that settling uses, without the voters that disagree.
 ///
-/// Nothing if fewer than `min_votes` remain.
-#[must_use]
+/// What it gathered last if fewer than `min_votes` remain, or only rays that made no label often enough.
 fn polish(
     model: &Model<'_>,
     index: &RayIndex<'_>,
@@ -88,7 +110,8 @@ fn polish(
     class: u32,
     range_m: f64,
     keep: &dyn Fn(u32) -> bool,
-) -> Option<Label> {
+    refusals: &Refusals,
+) -> Result<Label, Vec<u32>> {
     let Model { scene, noise, settings, .. } = *model;
     let min_votes = settings.min_votes as usize;
     let rounds = if settings.has(Part::Polishing) { MAX_ROUNDS } else { 0 };
@@ -99,10 +122,11 @@ fn polish(
     let mut gathered = voters_at(&start);
     let mut point = start;
     for _ in 0..rounds {
-        if gathered.len() < min_votes {
-            return None;
+        if gathered.len() < min_votes || refusals.are_enough(&gathered) {
+            return Err(gathered);
         }
-        point = quick_estimate(scene, index.spreads(), &gathered, point)?;
+        let Some(estimate) = quick_estimate(scene, index.spreads(), &gathered, point) else { return Err(gathered) };
+        point = estimate;
         let again = voters_at(&point);
         if again == gathered {
             break;
@@ -110,8 +134,35 @@ fn polish(
         gathered = again;
     }
     if gathered.len() < min_votes {
-        return None;
+        return Err(gathered);
     }
-    let label = from_voters(scene, noise, index.gate_sigmas(), gathered, point)?;
-    (label.voters.len() >= min_votes).then_some(label)
+    let label = from_voters(scene, noise, index.gate_sigmas(), gathered.clone(), point);
+    label.filter(|label| label.voters.len() >= min_votes).ok_or(gathered)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::street;
+
+    #[test]
+    fn what_was_gathered_for_nothing_again_and_again_is_not_tried_any_more() {
+        let at = Vector3::new(30.0, 4.0, 3.0);
+        let scene = street::street(12, 2.0, &[at], &[[0.0, 0.0]]);
+        let model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
+        let rays = scene.usable_rays();
+        let index = RayIndex::new(&scene, &model.spreads, street::SETTINGS.gate_sigmas, rays.iter().copied());
+        let mut refusals = Refusals(vec![0; rays.len()]);
+        let mut tried = |times: u8| {
+            (0..times).for_each(|_| refusals.count(&rays[1..]));
+            polish(&model, &index, at, 0, model.reach_m(), &|_| true, &refusals).map(|label| label.voters.len())
+        };
+        // One ray that is left is enough.
+        assert_eq!(tried(MOST_REFUSALS), Ok(rays.len()));
+        refusals.0[rays[0] as usize] = MOST_REFUSALS - 1;
+        let tried = |refusals: &Refusals| polish(&model, &index, at, 0, model.reach_m(), &|_| true, refusals).is_ok();
+        assert!(tried(&refusals));
+        refusals.count(&rays[..1]);
+        assert!(!tried(&refusals));
+    }
 }
