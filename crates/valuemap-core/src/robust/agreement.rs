@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use super::calibrate::{Known, Placed};
 use super::drift::Drive;
 use super::energy::implied_size;
-use super::estimate::{Care, Estimate, by_pass, estimate, looks_at};
+use super::estimate::{Care, Estimate, estimate, looks_at, visits};
 use super::learn::median;
 use super::model::Model;
 use super::noise::Noise;
@@ -75,7 +75,7 @@ struct Sides(Vec<Side>);
 impl Sides {
     /// Of the passes with enough votes. Nothing if they do not fix the label.
     fn of(scene: &Scene, noise: &Noise, (votes, point): &Placed, care: Care) -> Option<Self> {
-        let passes: Vec<&[u32]> = by_pass(scene, votes).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS).collect();
+        let passes: Vec<&[u32]> = visits(scene, votes).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS).collect();
         let of_side = |side: &Vec<u32>| {
             let (mut information, mut gradient, mut alone) = (Matrix3::zeros(), Vector3::zeros(), 0.0);
             for &pass in side {

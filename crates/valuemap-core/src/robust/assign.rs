@@ -368,6 +368,7 @@ fn belief_of(model: &Model<'_>, object: &Object, ray: u32) -> Option<Belief> {
 mod tests {
     use super::super::energy::anywhere;
     use super::super::seen::Seen;
+    use super::super::sides::{Said, marginalised};
     use super::*;
     use crate::street;
 
@@ -383,5 +384,23 @@ mod tests {
         assert!((reach_m - 2.0 * 4.0 * REACH_SIGMAS).abs() < 1e-9, "{reach_m}");
         let gate_m = street::GATE_SIGMAS * noise.position_m;
         assert!(places.windows(2).all(|pair| (pair[1] - pair[0]).norm() <= gate_m));
+    }
+    #[test]
+    fn a_ray_is_asked_for_the_middle_that_its_side_shows() {
+        let (point, off_m) = (Vector3::new(20.0, 3.0, 2.0), Vector3::new(0.0, 0.3, 0.0));
+        let scene = street::street(4, 1.0, &[point + off_m], &[[0.0, 0.0]]);
+        let model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
+        let mut object = anywhere(3, Seen::default(), -10.0);
+        (object.fit.point, object.fit.covariance) = (point, nalgebra::Matrix3::identity() * 1e-4);
+        let pose = PoseError { mean: nalgebra::zero(), covariance: nalgebra::zero() };
+        let gain_of_ray = |object: &Object| gain(&model, object, 0, &pose);
+        assert_eq!(gain_of_ray(&object), f64::NEG_INFINITY);
+        // The side that looks along the street shows another middle.
+        let information = nalgebra::Matrix3::identity() * 1e6;
+        let say =
+            |at: &Vector3<f64>| Some(Said { information, gradient: information * (at - point - off_m), energy: 0.0 });
+        let (_, middle) = marginalised(1.0, &point, say).unwrap();
+        object.fit.shown = vec![(Vector3::x(), middle)];
+        assert!(gain_of_ray(&object) > 0.0);
     }
 }

@@ -12,7 +12,7 @@ use rustc_hash::FxHashMap;
 
 use super::agreement::{LEAST_DRIFT, agreeing_ratio};
 use super::drift::{Drive, Look};
-use super::estimate::{by_pass, looks_at};
+use super::estimate::{looks_at, visits};
 use super::noise::Noise;
 use super::scene::Scene;
 
@@ -203,7 +203,7 @@ pub(super) fn sample<'a>(scene: &Scene, guess: &Noise, labels: &'a [Placed]) -> 
 
 /// Squared residuals of a label in sigmas, shared errors taken out, a residual.
 fn misfit(scene: &Scene, noise: &Noise, label: &Placed) -> f64 {
-    let passes = by_pass(scene, &label.0);
+    let passes = visits(scene, &label.0);
     let of_pass = |pass| Some(Drive::at_one(&looks_at(scene, noise, noise, pass, &label.1)?)?.normals.square);
     passes.filter_map(of_pass).sum::<f64>() / label.0.len() as f64
 }
@@ -219,7 +219,7 @@ impl VisitOf {
             let depths_m = visit.iter().map(|&ray| scene.ray(ray).project(point).z);
             Some(Self(visit.iter().copied().zip(depths_m).zip(looks).map(|((ray, m), look)| (ray, m, look)).collect()))
         };
-        by_pass(scene, votes).filter(|visit| visit.len() >= MIN_VOTES_OF_VISIT).map(of_visit).collect()
+        visits(scene, votes).filter(|visit| visit.len() >= MIN_VOTES_OF_VISIT).map(of_visit).collect()
     }
 
     /// Minus twice the logarithm of the restricted likelihood of its residuals, up to a constant, in three terms: each visit may
@@ -257,7 +257,7 @@ mod tests {
         let placed = (scene.usable_rays(), point);
         let visits = VisitOf::all(&scene, &street::NOISE, &placed).unwrap_or_default();
         assert_eq!(visits.len(), 3);
-        for (VisitOf(looks), votes) in visits.iter().zip(by_pass(&scene, &placed.0)) {
+        for (VisitOf(looks), votes) in visits.iter().zip(self::visits(&scene, &placed.0)) {
             let again: Vec<Look> =
                 looks.iter().map(|(ray, depth_m, look)| look.with_noise(&scene, &noise, *ray, *depth_m)).collect();
             assert_eq!(Some(again), looks_at(&scene, &noise, &street::NOISE, votes, &point));

@@ -23,7 +23,7 @@ use rstar::RTree;
 use rstar::primitives::GeomWithData;
 
 use super::drift::{Drive, Look, OneLook, Vantage};
-use super::estimate::is_one_visit;
+use super::estimate::visits;
 use super::heights::{HeightTerms, height_m};
 use super::looks::Lookout;
 use super::model::{Model, Sizes};
@@ -358,11 +358,6 @@ pub(super) fn camera_m2(model: &Model<'_>, votes: &[u32]) -> f64 {
         visits_count += 1.0;
     }
     sum / (visits_count * visits_count)
-}
-
-/// Votes in runs of one visit.
-pub(super) fn visits<'v>(scene: &'v Scene, votes: &'v [u32]) -> impl Iterator<Item = &'v [u32]> {
-    votes.chunk_by(|&a, &b| is_one_visit(scene.view(a), scene.view(b)))
 }
 
 /// Rays in groups that look from one side each: from directions with no less than a cosine to the first of the group.

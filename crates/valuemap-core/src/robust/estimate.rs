@@ -186,7 +186,7 @@ impl<'a> Joint<'a> {
         }
         for (label, votes) in of_labels.iter().enumerate() {
             let rays: Vec<u32> = votes.iter().map(|(ray, _)| *ray).collect();
-            let visits: Vec<&[u32]> = by_pass(self.scene, &rays).collect();
+            let visits: Vec<&[u32]> = visits(self.scene, &rays).collect();
             let sides = sides(self.scene, visits.iter().copied());
             let mut end = 0;
             for (visit, rays) in (0..).zip(&visits) {
@@ -625,7 +625,7 @@ pub fn is_one_visit(a: &View, b: &View) -> bool {
 }
 
 /// Voters in runs of one visit.
-pub fn by_pass<'a>(scene: &'a Scene, voters: &'a [u32]) -> impl Iterator<Item = &'a [u32]> {
+pub fn visits<'a>(scene: &'a Scene, voters: &'a [u32]) -> impl Iterator<Item = &'a [u32]> {
     voters.chunk_by(|&a, &b| is_one_visit(scene.view(a), scene.view(b)))
 }
 

@@ -5,7 +5,8 @@
 
 use rustc_hash::FxHashMap;
 
-use super::energy::{Fit, Object, Terms, camera_m2, energy_of_votes, fitting_unseen, visits, weighted_terms_of_visit};
+use super::energy::{Fit, Object, Terms, camera_m2, energy_of_votes, fitting_unseen, weighted_terms_of_visit};
+use super::estimate::visits;
 use super::looks::Lookout;
 use super::model::Model;
 use super::seen::Seen;
@@ -123,6 +124,7 @@ mod tests {
 
     use super::super::energy::{fitting, object};
     use super::super::learn::learn;
+    use super::super::noise::Noise;
     use super::*;
     use crate::street;
 
@@ -175,11 +177,14 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_foreseen_of_two_objects_of_few_visits() {
+    fn nothing_is_foreseen_of_two_objects_of_few_visits_nor_where_sides_show_other_middles() {
         let both = [Vector3::new(30.0, 4.0, 3.0), Vector3::new(30.0, 5.0, 3.0)];
-        for (drives, is_foreseen) in [(FEW_VISITS, false), (FEW_VISITS + 1, true)] {
+        for (drives, side_m, is_foreseen) in
+            [(FEW_VISITS, 0.0, false), (FEW_VISITS + 1, 0.0, true), (FEW_VISITS + 1, 0.1, false)]
+        {
             let scene = street::joined((0..drives).map(|_| street::street(10, 2.0, &both, &[[0.0, 0.0]])).collect());
-            let model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
+            let noise = Noise { side_m, ..street::NOISE };
+            let model = Model::new(&scene, &noise, &street::SETTINGS);
             let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
             let votes = |i: usize| scene.usable_rays().into_iter().skip(i).step_by(2).collect();
             let objects: Vec<Object> =

@@ -10,7 +10,8 @@ use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::assign::{Claim, claims_of_all, gain_alone, images_of};
-use super::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, by_place, by_side, fitting_unseen, object, owners, visits};
+use super::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, by_place, by_side, fitting_unseen, object, owners};
+use super::estimate::visits;
 use super::foresee::Foresight;
 use super::index::RayIndex;
 use super::looks::Lookout;

@@ -12,7 +12,8 @@ use rustc_hash::FxHashSet;
 
 use super::assign::{gain_alone, places_of};
 use super::company::Sure;
-use super::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, object, owners, unseen, visits};
+use super::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, object, owners, unseen};
+use super::estimate::visits;
 use super::few::{ln_terms, most_probable, votes_on};
 use super::index::RayIndex;
 use super::looks::Lookout;

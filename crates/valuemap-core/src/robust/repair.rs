@@ -9,7 +9,8 @@ use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::assign::{Claim, Trajectories, assign_among, claims_of_all, images_of};
-use super::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, by_side, fit, implied_size, object, owners, size_of, visits};
+use super::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, by_side, fit, implied_size, object, owners, size_of};
+use super::estimate::visits;
 use super::few::most_probable;
 use super::index::{RayIndex, chi2};
 use super::looks::Lookout;

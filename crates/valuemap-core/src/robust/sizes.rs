@@ -7,7 +7,8 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::energy::{usual_size, visits};
+use super::energy::usual_size;
+use super::estimate::visits;
 use super::model::Model;
 use super::prior::Prior;
 

@@ -5,7 +5,8 @@
 //! so their residuals at a place nearby differ by errors of single images alone, however wrong the place and the poses are.
 
 use super::drift::SEGMENT_M;
-use super::energy::{Object, implied_size, visits};
+use super::energy::{Object, implied_size};
+use super::estimate::visits;
 use super::looks::looks_among;
 use super::model::Model;
 use super::parts::Part;
