@@ -40,16 +40,16 @@ def main() -> None:
     options = parser.parse_args()
     config = valuemap.MapConfig().with_settings(options.settings)
     outcomes: list[Outcome] = []
-    each: list[dict[str, Any]] = []
+    results: list[dict[str, Any]] = []
     for seed in seeds_from(options.seeds):
         drawn, outcome = outcome_of(seed, config)
         outcomes.append(outcome)
         figures = add_up([outcome])
-        each.append({"seed": seed, "drawn": drawn, **figures})
+        results.append({"name": f"seed {seed}", "drawn": drawn, **figures})
         print(_line(f"{seed:4d}", figures), " ".join(f"{name}={value}" for name, value in drawn.items()), flush=True)
-    figures = add_up(outcomes)
-    print(_line(" all", figures))
-    write_record(options.json, {"all": figures, "each": each})
+    results.append({"name": "all", **add_up(outcomes)})
+    print(_line(" all", results[-1]))
+    write_record(options.json, results)
 
 
 def outcome_of(seed: int, config: valuemap.MapConfig) -> tuple[dict[str, float], Outcome]:
@@ -130,8 +130,8 @@ def draw(random: np.random.Generator) -> dict[str, float]:
 
 def _line(name: str, figures: dict[str, Any]) -> str:
     return (
-        f"{name}  objects {figures['objects']:4d}  labels {figures['labels']:4d}  recall {figures['recall']:.3f}  "
-        f"precision {figures['precision']:.3f}  normalised error {figures['mean_normalised_error']:6.2f} "
+        f"{name}  objects {figures['objects']:4d}  labels {figures['labels']:4d}  recall {figures['recall']:.4f}  "
+        f"precision {figures['precision']:.4f}  normalised error {figures['mean_normalised_error']:6.2f} "
         f"(median {figures['median_normalised_error']:.2f})  {figures['detections']:6d} detections  "
         f"{figures['seconds']:5.1f} s"
     )

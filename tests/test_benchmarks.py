@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import any_city
 import dense
 import fleets
 import pictures
@@ -305,6 +306,20 @@ def block_driven(passes: int) -> SimulationConfig:
     return block(passes_per_street=passes, lookalikes_per_light=0.0)
 
 
+def block_drawn(_random: np.random.Generator) -> dict[str, float]:
+    """Stands for what is drawn."""
+    drawn = dataclasses.asdict(block_driven(2))
+    return {name: value for name, value in drawn.items() if value != getattr(SimulationConfig(), name)}
+
+
+def test_a_drawn_city_is_one_that_the_simulator_takes_and_the_same_again() -> None:
+    drawn = [any_city.draw(np.random.default_rng(seed)) for seed in range(100)]
+    assert [any_city.draw(np.random.default_rng(seed)) for seed in range(100)] == drawn
+    assert len({tuple(one.items()) for one in drawn}) == 100
+    for one in drawn:
+        dataclasses.replace(SimulationConfig(), **one)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("script", "arguments", "rows"),
     [
@@ -313,6 +328,7 @@ def block_driven(passes: int) -> SimulationConfig:
         ("more_data", "--seeds 0 --tours 1 2", 2),
         ("fleets", "--seeds 1 --small --only clean", 1),
         ("dense", "--seeds 0 --small --radius 30 --only lamps-25", 1),
+        ("any_city", "--seeds 0", 2),
         ("ablation", "--seeds 0 --passes 1 --without nothing", 1),
     ],
 )
@@ -327,7 +343,8 @@ def test_a_benchmark_writes_what_it_found(
     """On one block instead of the city."""
     path = tmp_path / "figures.json"
     module = importlib.import_module(script)
-    for name, small in {"city": block_driven, "SMALL": {"passes_per_street": 2}}.items():
+    small_ones = {"city": block_driven, "SMALL": {"passes_per_street": 2}, "draw": block_drawn}
+    for name, small in small_ones.items():
         if hasattr(module, name):
             monkeypatch.setattr(module, name, small)
     monkeypatch.setattr("sys.argv", [f"benchmarks/{script}.py", *arguments.split(), "--json", str(path)])
