@@ -3,7 +3,7 @@
     python benchmarks/any_city.py [--seeds N|FIRST..LAST [N|FIRST..LAST ...]] [--set name=value ...] [--json FILE]
 
 Each seed draws a city, its objects, a car, a detector and errors of poses, each setting from a range that is written
-below (simulated). Faults are there or not: a draw has about a third of them. What is counted is what `dense.py` counts,
+below (simulated). Each fault is there or not: a draw has about a third of them. Counted is what `dense.py` counts,
 for objects whose bound is at most 0.5 m. A line for each seed says what was drawn, so that what is odd can be looked
 at; the last line is all seeds together. Nothing may be chosen on the seeds that are reported.
 """
@@ -19,13 +19,13 @@ import numpy as np
 
 import valuemap
 from cities import seeds_from
-from dense import Outcome, Scene, add_up, measure
+from dense import Outcome, Scene, add_up, line, measure
 from machine import write_record
 from valuemap.config import SimulationConfig
 from valuemap.simulate import record_city
 
 FAULT_SHARE = 0.3
-"""How often a draw has a fault: about as many have some as are clean but for one or two."""
+"""How often a draw has each fault: about four of fourteen, so that faults meet each other."""
 
 MOST_DETECTIONS = 25_000
 """Of a city; one with more is drawn again, driven less often, so that a seed takes no minutes."""
@@ -44,11 +44,10 @@ def main() -> None:
     for seed in seeds_from(options.seeds):
         drawn, outcome = outcome_of(seed, config)
         outcomes.append(outcome)
-        figures = add_up([outcome])
-        results.append({"name": f"seed {seed}", "drawn": drawn, **figures})
-        print(_line(f"{seed:4d}", figures), " ".join(f"{name}={value}" for name, value in drawn.items()), flush=True)
+        results.append({"name": f"seed {seed}", "drawn": drawn, **add_up([outcome])})
+        print(line(results[-1]), " ".join(f"{name}={value}" for name, value in drawn.items()), flush=True)
     results.append({"name": "all", **add_up(outcomes)})
-    print(_line(" all", results[-1]))
+    print(line(results[-1]))
     write_record(options.json, results)
 
 
@@ -126,15 +125,6 @@ def draw(random: np.random.Generator) -> dict[str, float]:
     for fault in faults:
         drawn |= fault if some() else {}
     return drawn
-
-
-def _line(name: str, figures: dict[str, Any]) -> str:
-    return (
-        f"{name}  objects {figures['objects']:4d}  labels {figures['labels']:4d}  recall {figures['recall']:.4f}  "
-        f"precision {figures['precision']:.4f}  normalised error {figures['mean_normalised_error']:6.2f} "
-        f"(median {figures['median_normalised_error']:.2f})  {figures['detections']:6d} detections  "
-        f"{figures['seconds']:5.1f} s"
-    )
 
 
 if __name__ == "__main__":

@@ -157,7 +157,7 @@ def main() -> None:
     results: list[dict[str, Any]] = []
     if options.nyc:
         results.append(_time_of_nyc(config))
-        print(_line(results[-1]), flush=True)
+        print(line(results[-1]), flush=True)
     for name in options.only:
         scene, outcomes = SCENES[name], []
         if options.small and options.radius and scene.small_radius_m:
@@ -172,7 +172,7 @@ def main() -> None:
             cpu_times = figures["cpu_microseconds_per_detection"] / results[0]["cpu_microseconds_per_detection"]
             figures["cpu_times_nyc"] = round(cpu_times, 4)
         results.append(figures)
-        print(_line(results[-1]), flush=True)
+        print(line(results[-1]), flush=True)
     write_record(options.json, results)
 
 
@@ -322,7 +322,8 @@ def _time_of_nyc(config: valuemap.MapConfig) -> dict[str, Any]:
     }
 
 
-def _line(figures: dict[str, Any]) -> str:
+def line(figures: dict[str, Any]) -> str:
+    """Return the figures of a scene in one line."""
     cost = (
         f"{figures['detections']:7d} detections ({figures['detections_per_image']:.1f} per image)  "
         f"{figures['microseconds_per_detection']:.0f} us per detection (cpu "

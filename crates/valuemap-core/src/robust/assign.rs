@@ -385,6 +385,7 @@ mod tests {
         let gate_m = street::GATE_SIGMAS * noise.position_m;
         assert!(places.windows(2).all(|pair| (pair[1] - pair[0]).norm() <= gate_m));
     }
+
     #[test]
     fn a_ray_is_asked_for_the_middle_that_its_side_shows() {
         let (point, off_m) = (Vector3::new(20.0, 3.0, 2.0), Vector3::new(0.0, 0.3, 0.0));

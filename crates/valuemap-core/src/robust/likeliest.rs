@@ -69,6 +69,9 @@ fn of_more(mut noise: Noise, step: impl Fn(&Noise) -> Result<Round, Halt>) -> Re
         if value < least {
             (best, least) = (*found.likelier_noise(), value);
         }
+        if found.stays() {
+            break;
+        }
         noise = found.again;
     }
     Ok(best)
@@ -245,6 +248,11 @@ impl Round {
         if self.change < 0.0 { &self.again } else { &self.noise }
     }
 
+    /// Whether the noise stays as it is, and would make the same map again.
+    fn stays(&self) -> bool {
+        self.again == self.noise
+    }
+
     /// Whether a larger noise may make the rays likelier. If it explained the votes without any residual, and the rays of no object as well,
     /// each of them would still be as improbable as a residual of 0 is: how much more so than now, grows with the noise. But passes that
     /// disagree by more than is thought do not see each other's objects, and that is no residual.
@@ -301,16 +309,14 @@ impl Likeliest {
         let (mut last, mut is_best) = (None, false);
         for _ in 0..count {
             let found = Arc::new(step(&noise)?);
-            // What stays as it is makes the same map again.
-            let stays = found.again == noise;
-            noise = found.again;
             if self.best.as_ref().is_none_or(|best| found.value < best.value) {
                 (self.best, is_best) = (Some(Arc::clone(&found)), true);
             }
-            last = Some(found);
-            if stays {
+            last = Some(Arc::clone(&found));
+            if found.stays() {
                 break;
             }
+            noise = found.again;
         }
         if is_best {
             self.last = last;

@@ -210,8 +210,8 @@ struct Sector {
 
 impl Sectors {
     /// Those of some votes, from at least so near and as far as those two distances say. One vote from farther away may be a stray one, and is no
-    /// look: all images that are nearer would count against an object that is detected from so far away once in a hundred times. Where
-    /// nothing is known (0 m), sides reach as far as their farthest vote.
+    /// look: all images that are nearer would count against the object, from where it is hardly ever detected. Where nothing is known (0 m), sides reach
+    /// as far as their farthest vote.
     fn of(scene: &Scene, point: &Vector3<f64>, voters: &[u32], (nearest_m, farthest_m): (f64, f64)) -> Self {
         let is_known = farthest_m > 0.0;
         let mut sectors: Vec<Sector> = Vec::new();

@@ -19,7 +19,7 @@ use crate::ray::Ray;
 /// Images around an image among which partners are sought and votes are sampled, at most.
 const SAMPLE_IMAGES: usize = 40;
 /// Meetings that a ray is tried with, at most.
-const MEETINGS: usize = 24;
+pub const MEETINGS: usize = 24;
 /// So many images within the range of an image are enough to propose what they see.
 const PROPOSING_IMAGES: usize = 80;
 /// Images that look from farther aside than this should not all have seen a point (cosine of 30 degrees).

@@ -11,16 +11,13 @@ use crate::progress::{Halt, Progress};
 use crate::robust::index::RayIndex;
 use crate::robust::model::Model;
 use crate::robust::parts::Part;
-use crate::robust::propose::{Hypothesis, Who, propose};
+use crate::robust::propose::{Hypothesis, MEETINGS, Who, propose};
 use crate::robust::quick::quick_estimate;
 
 /// Hypotheses that are polished side by side.
 const BATCH: usize = 16;
 /// Who nominates, round after round, each time with the rays that are left over.
 const ROUNDS: [Who; 4] = [Who::Part, Who::All, Who::All, Who::All];
-/// A ray is gathered so often for no label: as often as it is tried with others (`MEETINGS` of propose.rs). Where gates are as wide as streets, as with
-/// the largest starts of the noise, each hypothesis would gather most rays otherwise.
-const MOST_REFUSALS: u8 = 24;
 /// Rounds of estimating and gathering voters again, at most.
 const MAX_ROUNDS: usize = 8;
 
@@ -83,7 +80,8 @@ pub fn gather(model: &Model<'_>, rays: &[u32], progress: &Progress) -> Result<(V
     Ok((labels, counts))
 }
 
-/// How often each ray was gathered for no label.
+/// How often each ray was gathered for no label. Where gates are as wide as streets, as with the largest starts of the noise, each hypothesis would
+/// gather most rays otherwise.
 struct Refusals(Vec<u8>);
 
 impl Refusals {
@@ -93,9 +91,9 @@ impl Refusals {
         }
     }
 
-    /// Whether rays are not worth another try: each of them was gathered for nothing as often as it may be.
+    /// Whether rays are not worth another try: each of them was gathered for nothing as often as it is tried with others.
     fn are_enough(&self, gathered: &[u32]) -> bool {
-        gathered.iter().all(|&ray| self.0[ray as usize] >= MOST_REFUSALS)
+        gathered.iter().all(|&ray| usize::from(self.0[ray as usize]) >= MEETINGS)
     }
 }
 
@@ -153,16 +151,15 @@ mod tests {
         let rays = scene.usable_rays();
         let index = RayIndex::new(&scene, &model.spreads, street::SETTINGS.gate_sigmas, rays.iter().copied());
         let mut refusals = Refusals(vec![0; rays.len()]);
-        let mut tried = |times: u8| {
-            (0..times).for_each(|_| refusals.count(&rays[1..]));
-            polish(&model, &index, at, 0, model.reach_m(), &|_| true, &refusals).map(|label| label.voters.len())
+        let voters = |refusals: &Refusals| {
+            let label = polish(&model, &index, at, 0, model.reach_m(), &|_| true, refusals);
+            label.map(|label| label.voters.len())
         };
         // One ray that is left is enough.
-        assert_eq!(tried(MOST_REFUSALS), Ok(rays.len()));
-        refusals.0[rays[0] as usize] = MOST_REFUSALS - 1;
-        let tried = |refusals: &Refusals| polish(&model, &index, at, 0, model.reach_m(), &|_| true, refusals).is_ok();
-        assert!(tried(&refusals));
+        (0..MEETINGS).for_each(|_| refusals.count(&rays[1..]));
+        (1..MEETINGS).for_each(|_| refusals.count(&rays[..1]));
+        assert_eq!(voters(&refusals), Ok(rays.len()));
         refusals.count(&rays[..1]);
-        assert!(!tried(&refusals));
+        assert_eq!(voters(&refusals), Err(rays));
     }
 }
