@@ -27,6 +27,7 @@ from valuemap.refine.residuals import (
     Observations,
     State,
     linearised,
+    poses_of,
     weights,
 )
 from valuemap.tables import Bools, Floats, Ints
@@ -511,8 +512,9 @@ def triangulate(seen: Observations, state: State, *, rounds: int = 8, tolerance:
     """Return the state with the objects placed anew and all else as it is."""
     groups = Groups(seen.thing)
     thing = seen.thing[groups.row]
+    poses = poses_of(seen, state)
     for _ in range(rounds):
-        at = linearised(seen, state)
+        at = linearised(seen, state, poses)
         weight = weights(seen, at.residual_px, at.depth_m, tolerance)
         basis = np.concatenate([at.by_point, at.residual_px[:, :, None]], axis=2)
         basis[weight == 0.0] = 0.0

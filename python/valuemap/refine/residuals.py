@@ -185,18 +185,26 @@ def rotations(vector_rad: Floats) -> Floats:
     return np.asarray(matrix)
 
 
-def corrected(views: Views, state: State) -> Poses:
-    """Return the poses of the images as the state has them."""
+def corrected(views: Views, state: State, rows: Ints | slice = slice(None)) -> Poses:
+    """Return the poses of the images as the state has them, or of those `rows` of them."""
     offset, mount, delay, _, camera_mount, camera_delay = state.constants
-    late_s = (delay[views.vehicle, 0] + camera_delay[views.camera, 0])[:, None]
-    velocity = np.where(late_s >= 0.0, views.forward_mps, views.backward_mps)
-    rate = np.where(late_s >= 0.0, views.forward_radps, views.backward_radps)
-    drift = state.drift[views.node]
-    center = views.center_in_world_m + velocity * late_s + offset[views.segment] + drift[:, :3] + state.own[:, :3]
-    turn = mount[views.vehicle] + camera_mount[views.camera] + state.own[:, 3:]
-    turn = turn + np.einsum("nij,nj->ni", views.cam_from_node, drift[:, 3:])
-    moved = rotations(rate * late_s) @ views.cam_from_world if late_s.any() else views.cam_from_world
+    own, vehicle, camera = state.own[rows], views.vehicle[rows], views.camera[rows]
+    late_s = (delay[vehicle, 0] + camera_delay[camera, 0])[:, None]
+    velocity = np.where(late_s >= 0.0, views.forward_mps[rows], views.backward_mps[rows])
+    rate = np.where(late_s >= 0.0, views.forward_radps[rows], views.backward_radps[rows])
+    drift, of_segment = state.drift[views.node[rows]], offset[views.segment[rows]]
+    center = views.center_in_world_m[rows] + velocity * late_s + of_segment + drift[:, :3] + own[:, :3]
+    turn = mount[vehicle] + camera_mount[camera] + own[:, 3:]
+    turn = turn + np.einsum("nij,nj->ni", views.cam_from_node[rows], drift[:, 3:])
+    cam_from_world = views.cam_from_world[rows]
+    moved = rotations(rate * late_s) @ cam_from_world if late_s.any() else cam_from_world
     return Poses(rotations(turn) @ moved, center, velocity, rate)
+
+
+def poses_of(seen: Observations, state: State) -> tuple[Poses, Ints]:
+    """Return the poses of the images that observations (N) are of, and the row there of each."""
+    images, row = np.unique(seen.image, return_inverse=True)
+    return corrected(seen.views, state, images), row
 
 
 def _in_pinhole(seen: Observations, state: State, poses: Poses) -> tuple[Floats, Floats]:
@@ -232,13 +240,16 @@ def cost(seen: Observations, state: State) -> Floats:
     return np.asarray(np.where((at.depth_m > 0.1) & np.isfinite(square), value, width * np.log1p(100.0)))
 
 
-def linearised(seen: Observations, state: State) -> Linearised:
-    """Return residuals without the images' own errors, to first order around them, and derivatives."""
-    poses = corrected(seen.views, state)
+def linearised(seen: Observations, state: State, poses: tuple[Poses, Ints] | None = None) -> Linearised:
+    """Return residuals without the images' own errors, to first order around them, and derivatives.
+
+    `poses` are `poses_of` them, where these are known: they are the same wherever objects are.
+    """
+    of_images, row = poses or poses_of(seen, state)
     # Number by number: sums over the last, shortest axis take several times as long.
-    r = np.take(np.ascontiguousarray(poses.cam_from_world.reshape(-1, 9).T), seen.image, axis=1).reshape(3, 3, -1)
+    r = np.take(np.ascontiguousarray(of_images.cam_from_world.reshape(-1, 9).T), row, axis=1).reshape(3, 3, -1)
     m = np.ascontiguousarray(seen.residual_from_cam.reshape(-1, 9).T).reshape(3, 3, -1)
-    center, velocity, rate = (_of(values, seen.image) for values in poses.vectors())
+    center, velocity, rate = (_of(values, row) for values in of_images.vectors())
     apart = _of(state.point_in_world_m, seen.thing) - center
     p = [_dot(row, apart) for row in r]
     a, b, c = (_dot(row, p) for row in m)

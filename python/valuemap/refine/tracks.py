@@ -9,7 +9,7 @@ import scipy
 
 from valuemap.refine.adjust import Groups
 from valuemap.refine.footage import Footage, Sigmas
-from valuemap.refine.residuals import FOCAL, Observations, State, corrected, linearised, weights
+from valuemap.refine.residuals import FOCAL, Observations, State, corrected, linearised, poses_of, weights
 from valuemap.tables import Floats, Ints
 
 GATE_SIGMAS = 5.0
@@ -43,9 +43,9 @@ def associate(
         return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
     rows, detection = np.unique(row, return_inverse=True)
     seen = footage.observe_as_given(rows, np.zeros_like(rows), segment_of_image, sigma_px)
-    poses = corrected(seen.views, state)
-    from_world = seen.residual_from_cam @ poses.cam_from_world[seen.image]
-    offset = -np.einsum("nij,nj->in", from_world, poses.center_in_world_m[seen.image])
+    poses, row_of_pose = poses_of(seen, state)
+    from_world = seen.residual_from_cam @ poses.cam_from_world[row_of_pose]
+    offset = -np.einsum("nij,nj->in", from_world, poses.center_in_world_m[row_of_pose])
     by_row = np.ascontiguousarray(from_world.reshape(-1, 9).T).reshape(3, 3, -1)
     x, y, z = np.ascontiguousarray(state.point_in_world_m.T)
 
