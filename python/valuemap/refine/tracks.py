@@ -9,7 +9,7 @@ import scipy
 
 from valuemap.refine.adjust import Groups
 from valuemap.refine.footage import Footage, Sigmas
-from valuemap.refine.residuals import FOCAL, Observations, State, corrected, linearised, poses_of, weights
+from valuemap.refine.residuals import FOCAL, Observations, State, linearised, poses_of, weights
 from valuemap.tables import Floats, Ints
 
 GATE_SIGMAS = 5.0
@@ -144,7 +144,8 @@ def unresolved_share(seen: Observations, state: State, class_code: Ints) -> floa
     pairs = scipy.spatial.cKDTree(state.point_in_world_m).query_pairs(_BESIDE_M, output_type="ndarray")
     pairs = pairs[class_code[pairs[:, 0]] == class_code[pairs[:, 1]]]
     shows = [set(seen.image[rows].tolist()) for rows in _rows_of(seen.thing, count)]
-    toward = state.point_in_world_m[seen.thing] - corrected(seen.views, state).center_in_world_m[seen.image]
+    poses, row_of_pose = poses_of(seen, state)
+    toward = state.point_in_world_m[seen.thing] - poses.center_in_world_m[row_of_pose]
     toward = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
     side = np.stack([np.bincount(seen.thing, weights=axis, minlength=count) for axis in toward.T], axis=1)
     side = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
