@@ -6,7 +6,7 @@ import json
 import os
 import platform
 import sys
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +35,18 @@ def describe_machine() -> dict[str, Any]:
         "machine": {"platform": platform.platform(), "cpu": _cpu_model(), "cores": os.cpu_count()},
         "versions": {
             "python": platform.python_version(),
-            **{name: version(name) for name in ("valuemap", "numpy", "scipy", "pyarrow", "pycolmap", "onnxruntime")},
+            **{name: version(name) for name in ("valuemap", "numpy", "scipy", "pyarrow", "pycolmap")},
+            "onnxruntime": _version_of_onnxruntime(),
         },
     }
+
+
+def _version_of_onnxruntime() -> str:
+    """Return its version; that for GPUs has another name."""
+    try:
+        return version("onnxruntime")
+    except PackageNotFoundError:
+        return version("onnxruntime-gpu")
 
 
 def _cpu_model() -> str:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnxruntime
 import pyarrow as pa
 import pycolmap
 import pytest
@@ -456,6 +457,7 @@ def test_pictures_looked_at_elsewhere_in_any_order_give_the_same_bytes(
     assert engine.ran == [(4, False)]  # Six at a time: whole groups.
     assert (folder / "detections.parquet").read_bytes() == (whole / "detections.parquet").read_bytes()
     # Of pictures that go to GPUs only the cluster need have one.
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
     with pytest.raises(SettingError, match="--provider cuda"):
         detect_dataset("data", finder, DetectConfig(provider="cuda"), engine=engine)
     assert engine.ran[1:] == [(3, True)]

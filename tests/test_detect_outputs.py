@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnxruntime
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -293,7 +294,7 @@ def test_wanted_classes_by_name_number_and_new_name() -> None:
         choose_classes("80", COCO_80).columns(80)
 
 
-def test_models_that_cannot_be_used(tmp_path: Path) -> None:
+def test_models_that_cannot_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "text.onnx").write_text("no model")
     odd = says(tmp_path / "odd.onnx", {"a": np.zeros((1, 7), np.float32)})
     grey = says(tmp_path / "grey.onnx", {"a": np.zeros((1, 9, 9), np.float32)}, picture=(1, 1, 8, 8))
@@ -308,8 +309,40 @@ def test_models_that_cannot_be_used(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=message) as error:
             load_model(file, DetectConfig())
         assert "\n" not in str(error.value)
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
     with pytest.raises(SettingError, match="--provider cuda"):
         load_model(two, DetectConfig(provider="cuda"))
+
+
+@pytest.mark.parametrize(
+    ("reason", "is_loaded"),
+    [("no CUDA-capable device is detected", True), ("libcublas.so.13: cannot open shared object file", False)],
+)
+def test_a_gpu_that_cannot_be_used_is_told_of_and_not_replaced_by_the_cpu(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    *,
+    reason: str,
+    is_loaded: bool,
+) -> None:
+    model = red_finder(tmp_path / "red.onnx")
+    create = onnxruntime.InferenceSession._create_inference_session
+
+    def without_device(session: Any, providers: Any, *rest: Any) -> None:
+        if is_loaded and any(provider[0] == "CUDAExecutionProvider" for provider in providers):
+            raise RuntimeError(f"cuda_call.cc:154 CudaCall(...) CUDA failure 100: {reason} ; GPU=-1 ; \n\n")
+        create(session, [], *rest)
+
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CUDAExecutionProvider"])
+    monkeypatch.setattr(
+        onnxruntime, "preload_dlls", lambda: None if is_loaded else print(f"Failed to load x: {reason}")
+    )
+    monkeypatch.setattr(onnxruntime, "set_default_logger_severity", lambda _: None)
+    monkeypatch.setattr(onnxruntime.InferenceSession, "_create_inference_session", without_device)
+    with pytest.raises(SettingError, match=f"--provider cuda: .*: {reason}$"):
+        load_model(model, DetectConfig(provider="cuda"))
+    assert capsys.readouterr() == ("", "")
 
 
 def literal_suppression(boxes: Boxes, max_iou: float) -> set[int]:

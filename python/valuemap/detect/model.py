@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import hashlib
+import io
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +26,12 @@ Array = NDArray[Any]
 
 _KIND_HINT = f"say what it is with --kind: one of {', '.join(get_args(ModelKind))}"
 _PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
+_PROVIDER_OPTIONS: Mapping[str, Mapping[str, str]] = {
+    "cpu": {},
+    # The best algorithm for a size is chosen by rule: trying all of them takes long and may choose another next time.
+    "cuda": {"cudnn_conv_algo_search": "HEURISTIC", "use_tf32": "0"},
+}
+_CUDA_FAILURE = re.compile(r"CUDA failure \d+: ([^;\n]+)")
 _DTYPES: Mapping[str, type[np.floating[Any]]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
@@ -185,14 +194,20 @@ def _open(path: Path, content: bytes, provider: str, threads: int) -> Any:
     wanted = _PROVIDERS[provider]
     if wanted not in onnxruntime.get_available_providers():
         raise _no_provider(provider)
+    missing = _load_cuda() if provider == "cuda" else ""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 4  # Errors come as exceptions; warnings are about the export.
     # Threads that wait for work would otherwise spin, on the cores that decode the next pictures.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        session = onnxruntime.InferenceSession(content, options, providers=[wanted])
+        # With its fallback it would print that a provider fails, and go on with the CPU.
+        session = onnxruntime.InferenceSession(
+            content, options, providers=[(wanted, _PROVIDER_OPTIONS[provider])], enable_fallback=0
+        )
     except Exception as error:  # ONNX Runtime's errors have no base of their own.
+        if provider == "cuda" and (reason := _CUDA_FAILURE.search(str(error))):
+            raise _no_provider(provider, reason[1].strip()) from error
         other = _other_file(content)
         if other is not None:
             raise InputError(
@@ -202,9 +217,18 @@ def _open(path: Path, content: bytes, provider: str, threads: int) -> Any:
         raise InputError(
             f"{path}: cannot be read as an ONNX model: {_first_line(error)}", hint="is it whole? Export it again"
         ) from error
-    if wanted not in session.get_providers():  # Without a driver it would go on with the CPU and say nothing.
-        raise _no_provider(provider)
+    if wanted not in session.get_providers():  # Without CUDA's libraries it would go on with the CPU.
+        raise _no_provider(provider, missing)
     return session
+
+
+def _load_cuda() -> str:
+    """Load CUDA's libraries: those that pip installs are not where libraries are looked for; return what is missing."""
+    onnxruntime.set_default_logger_severity(4)  # What it cannot load is said in the error.
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        onnxruntime.preload_dlls()
+    told = (line for line in printed.getvalue().splitlines() if line.startswith("Failed to load"))
+    return next(told, "").partition(": ")[2]
 
 
 def _other_file(content: bytes) -> str | None:
@@ -219,9 +243,9 @@ def _other_file(content: bytes) -> str | None:
     return next((str(entry.value) for entry in entries if entry.key == "location"), None)
 
 
-def _no_provider(provider: str) -> SettingError:
+def _no_provider(provider: str, reason: str = "") -> SettingError:
     return SettingError(
-        f"--provider {provider}: this ONNX Runtime cannot do that here",
+        f"--provider {provider}: this ONNX Runtime cannot do that here" + (f": {reason}" if reason else ""),
         hint="install onnxruntime-gpu in place of onnxruntime, with CUDA and a driver, or use --provider cpu",
     )
 

@@ -78,8 +78,8 @@ def train(
     one_class
         Take every label as this class; otherwise every class of the labels has an output of its own.
     seed
-        Of the network's first weights, the split and all variation. On a CPU the same seed gives the same
-        network.
+        Of the network's first weights, the split and all variation. On one kind of machine and GPU the same seed
+        gives the same network.
     threads
         Threads of the network, 0 as PyTorch chooses.
     progress
