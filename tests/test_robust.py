@@ -186,6 +186,15 @@ def test_the_noise_is_estimated() -> None:
     assert 0.5 < far_px / true_far_px < 2.0
 
 
+def test_a_noisy_detector_is_no_drive_that_turns() -> None:
+    """Where images of several objects tell that the detector is off, passes do not turn by half of that."""
+    poses = {"position_white_m": 0.03, "position_drift_m": 0.06, "rotation_white_deg": 0.03, "rotation_drift_deg": 0.03}
+    config = block(pixel_noise_px=2.5, pixel_noise_share=0.0, focal_px=400.0, passes_per_street=3, **poses)
+    noise = valuemap.build_map(simulate(config, seed=5, name="block")).run["counts"]["noise"]
+    assert noise["rotation_drift_rad"] < 0.5 * config.pixel_noise_px / config.focal_px * np.sqrt(0.5)
+    assert 0.4 < noise["position_drift_m"] / config.position_drift_m < 2.5
+
+
 def test_existence_and_expected_views_are_told(driven_block: tuple[Dataset, valuemap.Map]) -> None:
     _, result = driven_block
     labels = result.labels

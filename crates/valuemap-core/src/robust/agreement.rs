@@ -29,7 +29,7 @@ const MOST_DISAGREEMENT: f64 = 5.0;
 /// estimation of a location parameter", 1964).
 const HUBER_SIGMAS: f64 = 1.345;
 /// Shared errors over own errors of a pose: least and most.
-pub(super) const LEAST_DRIFT: f64 = 0.1;
+const LEAST_DRIFT: f64 = 0.1;
 const MOST_DRIFT: f64 = 1000.0;
 /// Sides of labels that disagree by fewer standard deviations than this more than expected, all together, agree: as chance has it in 98 cases of 100.
 const SUSPECTED_SIGMAS: f64 = 2.0;
@@ -145,11 +145,34 @@ fn sides_of_all(scene: &Scene, noise: &Noise, labels: &[&Placed], care: Care) ->
     labels.par_iter().map(|label| Sides::of(scene, noise, label, care)).collect()
 }
 
-/// The ratio of the drift of positions to the errors of images and segments at which the passes of objects disagree as much as expected: the larger the
-/// drift is taken for, the less remains unexplained.
-pub(super) fn agreeing_ratio(scene: &Scene, objects: &[&Placed], noise_of: &(dyn Fn(f64) -> Noise + Sync)) -> f64 {
-    let excess_of = |ratio: f64| excess(disagreements(scene, &noise_of(ratio), objects).into_iter());
-    agreeing(LEAST_DRIFT, MOST_DRIFT, excess_of).unwrap_or(1.0)
+/// What poses state of their errors all in all: position, m, and rotation, rad; nothing where they do not.
+pub(super) type Stated = [Option<f64>; 2];
+
+/// What the poses of a scene state.
+pub(super) fn stated(scene: &Scene) -> Stated {
+    [scene.usual(|view| view.position_sigma_m), scene.usual(|view| view.rotation_sigma_rad)]
+}
+
+/// A noise of which positions drift by a ratio to the errors of images and segments. Passes that disagree are shifted: they turn no more than their images and
+/// segments do. Where poses state their errors, what images and segments do not have for themselves drifts.
+pub(super) fn drifting(noise: &Noise, ratio: f64, [position_m, rotation_rad]: Stated) -> Noise {
+    let rest = |total: f64, part: f64| (total * total - part * part).max((LEAST_DRIFT * part).powi(2)).sqrt();
+    let of_position = noise.position_m.hypot(noise.position_segment_m);
+    let of_rotation = noise.rotation_rad.hypot(noise.rotation_segment_rad);
+    Noise {
+        position_drift_m: position_m.map_or(of_position * ratio, |total_m| rest(total_m, of_position)),
+        rotation_drift_rad: rotation_rad.map_or(of_rotation, |total_rad| rest(total_rad, of_rotation)),
+        ..*noise
+    }
+}
+
+/// A noise with the drift of positions at which the passes of objects disagree as much as expected: the larger the drift is taken for, the less remains
+/// unexplained.
+pub(super) fn with_drift(scene: &Scene, objects: &[&Placed], noise: &Noise) -> Noise {
+    let stated = stated(scene);
+    let excess_of = |ratio: f64| excess(disagreements(scene, &drifting(noise, ratio, stated), objects).into_iter());
+    let ratio = if stated[0].is_some() { None } else { agreeing(LEAST_DRIFT, MOST_DRIFT, excess_of) };
+    drifting(noise, ratio.unwrap_or(1.0), stated)
 }
 
 /// The value between two of which nothing is in excess: by bisection of its logarithm, of what falls with it. Nothing where too little is known.
@@ -197,13 +220,13 @@ pub(super) fn with_sides_for_sure(model: &Model<'_>, known: Known, labels: &[Pla
 fn noise_of_sides(model: &Model<'_>, known: Known, labels: &[&Placed], care: Care, least_sigmas: f64) -> Option<Noise> {
     let (scene, noise) = (model.scene, model.noise);
     let size_m = usual_size_m(model, labels)?;
-    let own_m = noise.position_m.hypot(noise.position_segment_m);
-    let drifting = |ratio: f64| Noise { position_drift_m: ratio * own_m, ..*noise };
+    let stated = stated(scene);
+    let drifting = |ratio: f64| drifting(noise, ratio, stated);
     let of_one_side = |ratio: f64| {
         let sides = sides_of_all(scene, &drifting(ratio), labels, Care::Rough);
         excess(sides.iter().map(|sides| sides.as_ref()?.within()))
     };
-    let is_known = known.position || scene.usual(|view| view.position_sigma_m).is_some();
+    let is_known = known.position || stated[0].is_some();
     let ratio = if is_known { None } else { agreeing(LEAST_DRIFT, MOST_DRIFT, of_one_side) };
     let of_passes = ratio.map_or(*noise, drifting);
     let sides = sides_of_all(scene, &of_passes, labels, care);

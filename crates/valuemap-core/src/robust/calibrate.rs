@@ -10,7 +10,7 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use super::agreement::{LEAST_DRIFT, agreeing_ratio};
+use super::agreement::{drifting, stated, with_drift};
 use super::drift::{Drive, Look};
 use super::estimate::{looks_at, visits};
 use super::noise::Noise;
@@ -90,29 +90,23 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
         (false, true) => ((px2 - scale2 * known_rad2).max(least_px.powi(2)).sqrt(), guess.rotation_rad),
         (false, false) => (((1.0 - ROTATION_PART) * px2).sqrt(), (ROTATION_PART * px2 / scale2).sqrt()),
     };
-    // Where poses state their errors, what images and segments do not have for themselves drifts.
-    let stated = [scene.usual(|view| view.position_sigma_m), scene.usual(|view| view.rotation_sigma_rad)];
-    let rest = |total: f64, part: f64| (total * total - part * part).max((LEAST_DRIFT * part).powi(2)).sqrt();
-    let noise_of = |p: &[f64; 5], ratio: f64| {
+    let stated = stated(scene);
+    let noise_of = |p: &[f64; 5]| {
         let [position_segment_m, rotation_segment_rad] = [p[3], p[4]];
         // What images of a segment share is not quite the same for all of them.
         let rough = |of_segment: f64| if of_segment > 0.0 { ROUGHNESS * of_segment * of_segment } else { 0.0 };
         let (detection_px, rotation_rad) = far_of(p[0] * p[0] + scale2 * rough(rotation_segment_rad));
-        // Passes that disagree are shifted: they turn no more than their images and segments do.
-        let rotation_share_rad = rotation_rad.hypot(rotation_segment_rad);
         let position_m = if known.position { p[2] } else { (p[2] * p[2] + rough(position_segment_m)).sqrt() };
-        let (of_position, of_rotation) = (position_m.hypot(position_segment_m), rotation_share_rad);
-        Noise {
+        let own = Noise {
             detection_px,
             box_share: p[1],
             position_m,
             rotation_rad,
             position_segment_m,
             rotation_segment_rad,
-            position_drift_m: stated[0].map_or(of_position * ratio, |total_m| rest(total_m, of_position)),
-            rotation_drift_rad: stated[1].map_or(of_rotation, |total_rad| rest(total_rad, of_rotation)),
-            side_m: guess.side_m,
-        }
+            ..*guess
+        };
+        drifting(&own, 1.0, stated)
     };
     let fixed = [known.detection && known.rotation, known.detection, known.position, known.position, known.rotation];
     let start = [
@@ -124,7 +118,7 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
     ];
     let rotation_rad = (DETECTION_PX.0 / scale2.sqrt(), DETECTION_PX.1 / scale2.sqrt());
     let found = search(start, [(least_px, most_px), BOX_SHARE, POSITION_M, POSITION_M, rotation_rad], fixed, &|p| {
-        let noise = noise_of(p, 1.0);
+        let noise = noise_of(p);
         let of_label = |visits: &Option<Vec<VisitOf>>| {
             let all = visits.iter().flatten().map(|visit| visit.minus_log_likelihood(scene, &noise));
             all.collect::<Option<Vec<[f64; 3]>>>().map_or(0.0, |terms| terms.iter().flatten().sum())
@@ -132,10 +126,7 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
         // Summed in the order of the labels, so that threads do not change the result.
         visits.par_iter().with_max_len(1).map(of_label).collect::<Vec<f64>>().iter().sum()
     });
-    if stated[0].is_some() {
-        return noise_of(&found, 1.0);
-    }
-    noise_of(&found, agreeing_ratio(scene, &sample, &|ratio| noise_of(&found, ratio)))
+    with_drift(scene, &sample, &noise_of(&found))
 }
 
 /// Minimise a cost over positive parameters by a pattern search in their logarithms, with a prior around the start.

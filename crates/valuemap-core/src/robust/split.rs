@@ -8,13 +8,15 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use super::calibrate::{BOX_SHARE, Known};
+use super::agreement::{stated, with_drift};
+use super::calibrate::{self, BOX_SHARE, Known};
 use super::drift::{Drive, Look, Normals, Vantage};
 use super::energy::Object;
 use super::estimate::is_one_visit;
 use super::finish::places;
 use super::model::Model;
 use super::noise::Noise;
+use super::placed;
 
 /// Votes that serve, about: of a thousand images that show several objects each, a share is known to a few hundredths.
 const SAMPLE_VOTES: usize = 5_000;
@@ -44,9 +46,7 @@ struct Place {
 pub fn split(model: &Model<'_>, known: Known, objects: &[Object]) -> Noise {
     let (noise, scene) = (*model.noise, model.scene);
     // Where poses state their errors, the shares of these are known as well.
-    let is_stated =
-        scene.usual(|view| view.position_sigma_m).is_some() || scene.usual(|view| view.rotation_sigma_rad).is_some();
-    if known.detection || is_stated {
+    if known.detection || stated(scene).iter().any(Option::is_some) {
         return noise;
     }
     let places = sample(model, objects);
@@ -67,7 +67,13 @@ pub fn split(model: &Model<'_>, known: Known, objects: &[Object]) -> Noise {
             best = least(best, LEAST_SHARE, &|share| scale.with_rotation(&best.1, share, least_px), &value);
         }
     }
-    if before - best.0 > LEAST_FALL { best.1 } else { noise }
+    if before - best.0 > LEAST_FALL { redrifted(model, objects, &best.1) } else { noise }
+}
+
+/// Noise with the drift that poses have which are off by so much: what passes disagree about was laid to poses that were off by more, or less.
+fn redrifted(model: &Model<'_>, objects: &[Object], noise: &Noise) -> Noise {
+    let labels = placed(objects);
+    with_drift(model.scene, &calibrate::sample(model.scene, noise, &labels), noise)
 }
 
 /// The noise with the least value among those of shares from `lowest` on, or the one that is the best so far.
