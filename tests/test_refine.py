@@ -83,6 +83,22 @@ def map_of_shifted_city() -> tuple[Dataset, valuemap.Map]:
     return faulty, valuemap.build_map(faulty)
 
 
+@functools.cache
+def map_of_dashcam_city() -> tuple[Dataset, valuemap.Map]:
+    """Return a city with the poses of a dash camera, and its map: images are put in order once, for all maps."""
+    faulty, ordered = city(**DASHCAM), []
+
+    def in_order(dataset: Dataset, **options: Any) -> InOrder:
+        ordered.append(dataset)
+        return in_driving_order(dataset, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(refine_images, "in_driving_order", in_order)
+        result = valuemap.build_map(faulty)
+    assert len(ordered) == 1
+    return faulty, result
+
+
 def shifted_city() -> tuple[Dataset, Refined]:
     """Return a city with every pass shifted by 3 m, and what is made of its poses when it is mapped."""
     faulty, result = map_of_shifted_city()
@@ -322,18 +338,8 @@ def between_neighbors(result: valuemap.Map, dataset: Dataset) -> tuple[float, fl
     return float(np.sqrt(np.mean(np.sum((error[a] - error[b]) ** 2, axis=1)))), float(square.mean())
 
 
-def test_all_that_images_show_tells_what_they_are_off_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = dataclasses.replace(CITY, passes_per_street=5)
-    clean, faulty = (simulate(dataclasses.replace(config, **faults), seed=0) for faults in ({}, DASHCAM))  # type: ignore[arg-type]
-    ordered: list[Dataset] = []
-
-    def in_order(dataset: Dataset, **options: Any) -> InOrder:
-        ordered.append(dataset)
-        return in_driving_order(dataset, **options)
-
-    monkeypatch.setattr(refine_images, "in_driving_order", in_order)
-    result = valuemap.build_map(faulty)
-    assert len(ordered) == 1  # For all maps.
+def test_all_that_images_show_tells_what_they_are_off_by_themselves() -> None:
+    clean, (faulty, result) = city(), map_of_dashcam_city()
     alone = valuemap.build_map(faulty, valuemap.MapConfig().with_settings(["correct_poses=0"]))
     assert result.run["poses"]["found"] == "errors of images"
     assert result.corrected is not None
@@ -344,15 +350,15 @@ def test_all_that_images_show_tells_what_they_are_off_by_themselves(monkeypatch:
     assert square < 6.0
 
 
-@pytest.mark.parametrize("faults", [DASHCAM, {"pass_shift_m": 1.5}], ids=["of images", "of drives"])
-def test_numbers_of_images_and_detections_do_not_matter_where_poses_are_corrected(faults: dict[str, float]) -> None:
-    faulty = city(**faults)
-    random, config = np.random.default_rng(0), MapConfig()
+@pytest.mark.parametrize("mapped", [map_of_dashcam_city, map_of_shifted_city], ids=["of images", "of drives"])
+def test_numbers_of_images_and_detections_do_not_matter_where_poses_are_corrected(
+    mapped: Callable[[], tuple[Dataset, valuemap.Map]],
+) -> None:
+    (faulty, before), random, config = mapped(), np.random.default_rng(0), MapConfig()
     shuffled = laws.shuffle_images(faulty, config, random)
     shuffled = laws.shuffle_detections(shuffled.dataset, config, random)
-    before, after = (valuemap.build_map(dataset) for dataset in (faulty, shuffled.dataset))
     assert before.run["poses"]["found"] != "nothing"
-    assert laws.compare_maps(before, after, shuffled).holds
+    assert laws.compare_maps(before, valuemap.build_map(shuffled.dataset), shuffled).holds
 
 
 def lamps_of_four_sides() -> Dataset:
@@ -397,7 +403,7 @@ def test_errors_of_images_are_no_noise_of_detections() -> None:
 
 
 def test_poses_that_stay_are_mapped_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    poor, mapped = city(pixel_noise_px=5.0, **EXACT_POSES), []
+    poor, mapped = city(pixel_noise_px=5.0, passes_per_street=2, frame_spacing_m=4.0, **EXACT_POSES), []
     run = pipeline.Run(tmp_path, ThreadEngine(1))
 
     def solve(source: InMemory, *arguments: Any, **options: Any) -> tuple[list[Solved], list[Place]]:
@@ -423,7 +429,9 @@ def test_poses_that_stay_are_mapped_once(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
 
 def test_a_map_without_objects_says_nothing_of_images() -> None:
-    result = valuemap.build_map(city(**DASHCAM), MapConfig().with_settings(["min_votes=5000"]))
+    dashcam = city(passes_per_street=2, frame_spacing_m=4.0, **DASHCAM)
+    assert refine_poses(dashcam, MapConfig()).is_noisy
+    result = valuemap.build_map(dashcam, MapConfig().with_settings(["min_votes=5000"]))
     assert (len(result.labels), result.run["poses"]["found"]) == (0, "nothing")
 
 
