@@ -166,13 +166,21 @@ pub(super) fn drifting(noise: &Noise, ratio: f64, [position_m, rotation_rad]: St
     }
 }
 
-/// A noise with the drift of positions at which the passes of objects disagree as much as expected: the larger the drift is taken for, the less remains
-/// unexplained.
+/// A noise with the drift of positions of which nothing is in excess: the larger it is taken for, the less remains unexplained. Nothing where poses state it, or
+/// too little is known.
+fn agreeing_drift(noise: &Noise, stated: Stated, excess_of: impl Fn(&Noise) -> Option<f64>) -> Option<Noise> {
+    if stated[0].is_some() {
+        return None;
+    }
+    let of = |ratio: f64| drifting(noise, ratio, stated);
+    agreeing(LEAST_DRIFT, MOST_DRIFT, |ratio| excess_of(&of(ratio))).map(of)
+}
+
+/// A noise with the drift at which the passes of objects disagree as much as expected; as large as the errors of images and segments where nothing tells.
 pub(super) fn with_drift(scene: &Scene, objects: &[&Placed], noise: &Noise) -> Noise {
     let stated = stated(scene);
-    let excess_of = |ratio: f64| excess(disagreements(scene, &drifting(noise, ratio, stated), objects).into_iter());
-    let ratio = if stated[0].is_some() { None } else { agreeing(LEAST_DRIFT, MOST_DRIFT, excess_of) };
-    drifting(noise, ratio.unwrap_or(1.0), stated)
+    let excess_of = |noise: &Noise| excess(disagreements(scene, noise, objects).into_iter());
+    agreeing_drift(noise, stated, excess_of).unwrap_or_else(|| drifting(noise, 1.0, stated))
 }
 
 /// The value between two of which nothing is in excess: by bisection of its logarithm, of what falls with it. Nothing where too little is known.
@@ -220,15 +228,12 @@ pub(super) fn with_sides_for_sure(model: &Model<'_>, known: Known, labels: &[Pla
 fn noise_of_sides(model: &Model<'_>, known: Known, labels: &[&Placed], care: Care, least_sigmas: f64) -> Option<Noise> {
     let (scene, noise) = (model.scene, model.noise);
     let size_m = usual_size_m(model, labels)?;
-    let stated = stated(scene);
-    let drifting = |ratio: f64| drifting(noise, ratio, stated);
-    let of_one_side = |ratio: f64| {
-        let sides = sides_of_all(scene, &drifting(ratio), labels, Care::Rough);
+    let of_one_side = |noise: &Noise| {
+        let sides = sides_of_all(scene, noise, labels, Care::Rough);
         excess(sides.iter().map(|sides| sides.as_ref()?.within()))
     };
-    let is_known = known.position || stated[0].is_some();
-    let ratio = if is_known { None } else { agreeing(LEAST_DRIFT, MOST_DRIFT, of_one_side) };
-    let of_passes = ratio.map_or(*noise, drifting);
+    let drifted = if known.position { None } else { agreeing_drift(noise, stated(scene), of_one_side) };
+    let of_passes = drifted.unwrap_or(*noise);
     let sides = sides_of_all(scene, &of_passes, labels, care);
     let between = |side_m: f64| sides.iter().map(move |sides| sides.as_ref()?.between(side_m));
     let count = between(0.0).flatten().count() as f64;

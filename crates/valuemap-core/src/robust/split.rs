@@ -3,7 +3,8 @@
 //! At one object alone the two cannot be told apart: an error of position moves a box by `f / depth`, and so does an error that
 //! grows with the box of an object of one size; a rotation is as good as an error in pixels. But a pose moves all objects of an
 //! image alike, and each detection is off by itself. So the two shares make the residuals of all objects of a place together
-//! likeliest (restricted maximum likelihood, positions and drift marginalised). The noise in all stays as large as it is.
+//! likeliest (restricted maximum likelihood, positions and drift marginalised). The noise in all stays as large as it is,
+//! but for the drift, which follows from the share of the poses.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -70,7 +71,7 @@ pub fn split(model: &Model<'_>, known: Known, objects: &[Object]) -> Noise {
     if before - best.0 > LEAST_FALL { redrifted(model, objects, &best.1) } else { noise }
 }
 
-/// Noise with the drift that poses have which are off by so much: what passes disagree about was laid to poses that were off by more, or less.
+/// The noise with its drift told anew: the one before followed from poses that turned by more, or less.
 fn redrifted(model: &Model<'_>, objects: &[Object], noise: &Noise) -> Noise {
     let labels = placed(objects);
     with_drift(model.scene, &calibrate::sample(model.scene, noise, &labels), noise)
