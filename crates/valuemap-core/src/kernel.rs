@@ -239,3 +239,14 @@ fn bits(bytes: &[u8; LANES]) -> u64 {
     }
     word
 }
+
+/// The set bits of a word, ascending.
+pub fn ones(mut bits: u64) -> impl Iterator<Item = u32> {
+    std::iter::from_fn(move || {
+        (bits != 0).then(|| {
+            let bit = bits.trailing_zeros();
+            bits &= bits - 1;
+            bit
+        })
+    })
+}

@@ -5,14 +5,15 @@ use nalgebra::{Matrix3, Rotation3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
-use valuemap_core::ballot::Ballot;
-use valuemap_core::hypothesis::{Viability, propose};
 use valuemap_core::kernel::{Gate, Gates, LANES, instruction_sets};
-use valuemap_core::merge::merge;
+use valuemap_core::paper::ballot::Ballot;
+use valuemap_core::paper::hypothesis::propose;
+use valuemap_core::paper::merge::merge;
+use valuemap_core::paper::triangulate::refine;
+use valuemap_core::paper::vote::Candidate;
 use valuemap_core::progress::Progress;
 use valuemap_core::ray::{Ray, Rays};
-use valuemap_core::triangulate::refine;
-use valuemap_core::vote::Candidate;
+use valuemap_core::viability::Viability;
 
 const FOCAL_PX: f64 = 500.0;
 

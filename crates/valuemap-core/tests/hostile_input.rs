@@ -20,22 +20,24 @@ use proptest::sample::{Index, select};
 use proptest::test_runner::{RngSeed, TestRunner};
 use rayon::ThreadPoolBuilder;
 use valuemap_core::evidence::{max_angle, median, sight};
-use valuemap_core::hypothesis::Viability;
-use valuemap_core::merge::merge;
-use valuemap_core::partition::partition;
+use valuemap_core::paper::merge::merge;
+use valuemap_core::paper::partition::partition;
+use valuemap_core::paper::select::Stop;
+use valuemap_core::paper::triangulate::unit_covariance;
+use valuemap_core::paper::vote::{Candidate, count_units, vote};
 use valuemap_core::progress::Progress;
 use valuemap_core::ray::{Ray, Rays};
-use valuemap_core::robust::calibrate::Known;
-use valuemap_core::robust::confusion::Confusions;
-use valuemap_core::robust::likeliest::misfits;
+use valuemap_core::robust::calibrate::likeliest::misfits;
+use valuemap_core::robust::calibrate::{Calibration, self_calibrate};
 use valuemap_core::robust::model::ClassModel;
+use valuemap_core::robust::model::confusions::Confusions;
+use valuemap_core::robust::noise::Known;
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::parts::{Part, Without};
 use valuemap_core::robust::scene::{Frustum, Scene, View};
-use valuemap_core::robust::{Calibration, Settings, find, objects_of, self_calibrate};
-use valuemap_core::select::Stop;
-use valuemap_core::triangulate::unit_covariance;
-use valuemap_core::vote::{Candidate, count_units, vote};
+use valuemap_core::robust::settings::Settings;
+use valuemap_core::robust::{find, objects_of};
+use valuemap_core::viability::Viability;
 
 /// Numbers that are seldom thought of.
 const NUMBERS: [f64; 28] = [

@@ -9,13 +9,16 @@ use std::sync::Arc;
 use nalgebra::{Isometry3, Rotation3, Vector3};
 use street::{NOISE, SETTINGS, joined, moved, street};
 use valuemap_core::progress::Progress;
-use valuemap_core::robust::agreement::{disagreement, mean};
-use valuemap_core::robust::calibrate::{Known, Placed, calibrate};
+use valuemap_core::robust::calibrate::residuals::calibrate;
+use valuemap_core::robust::calibrate::{Calibration, self_calibrate};
+use valuemap_core::robust::energy::Placed;
+use valuemap_core::robust::energy::agreement::{disagreement, mean};
+use valuemap_core::robust::noise::Known;
 use valuemap_core::robust::noise::Noise;
-use valuemap_core::robust::quick::quick_estimate;
-use valuemap_core::robust::sample::scramble;
+use valuemap_core::robust::noise::spreads_of;
 use valuemap_core::robust::scene::Scene;
-use valuemap_core::robust::{Calibration, self_calibrate, spreads_of};
+use valuemap_core::robust::scene::sample::scramble;
+use valuemap_core::robust::search::quick::quick_estimate;
 
 /// The sum of twelve uniform numbers less 6 is as good as normal.
 fn normal(number: u64) -> f64 {

@@ -7,10 +7,13 @@ use std::sync::Arc;
 
 use nalgebra::Vector3;
 use valuemap_core::progress::Progress;
-use valuemap_core::robust::calibrate::Known;
-use valuemap_core::robust::confusion::Confusions;
+use valuemap_core::robust::calibrate::{Calibration, self_calibrate};
+use valuemap_core::robust::find;
+use valuemap_core::robust::finish::Finding;
+use valuemap_core::robust::model::confusions::Confusions;
+use valuemap_core::robust::noise::Known;
 use valuemap_core::robust::scene::Scene;
-use valuemap_core::robust::{Calibration, Finding, Settings, find, self_calibrate};
+use valuemap_core::robust::settings::Settings;
 
 use street::{NOISE, SETTINGS, joined, street};
 

@@ -2,9 +2,9 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use proptest::prelude::*;
-use valuemap_core::robust::drift::{DRIFT_LENGTH_M, Drive, Look, Normals, OneLook, SEGMENT_M};
 use valuemap_core::robust::noise::Sigmas;
-use valuemap_core::robust::poses::{Belief, Segments, smooth};
+use valuemap_core::robust::noise::drift::{DRIFT_LENGTH_M, Drive, Look, Normals, OneLook, SEGMENT_M};
+use valuemap_core::robust::noise::poses::{Belief, Segments, smooth};
 use valuemap_core::robust::scene::View;
 
 type Vector6 = nalgebra::SVector<f64, 6>;

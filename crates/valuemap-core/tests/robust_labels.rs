@@ -10,19 +10,19 @@ use nalgebra::{Isometry3, Point3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use valuemap_core::progress::Progress;
-use valuemap_core::robust::contest::Contest;
+use valuemap_core::robust::energy::estimate::{Care, Joint, Limits, Start};
+use valuemap_core::robust::energy::looks::Lookout;
 use valuemap_core::robust::energy::object as object_of;
-use valuemap_core::robust::estimate::{Care, Joint, Limits, Start};
-use valuemap_core::robust::index::RayIndex;
+use valuemap_core::robust::finish::contest::Contest;
 use valuemap_core::robust::initial::associate::Association;
+use valuemap_core::robust::initial::keyframes::Keyframes;
 use valuemap_core::robust::initial::label::{Label, from_voters};
 use valuemap_core::robust::initial::swap::swap_votes;
-use valuemap_core::robust::keyframes::Keyframes;
-use valuemap_core::robust::looks::Lookout;
 use valuemap_core::robust::model::Model;
 use valuemap_core::robust::noise::Noise;
+use valuemap_core::robust::noise::index::RayIndex;
+use valuemap_core::robust::noise::spreads_of;
 use valuemap_core::robust::scene::{Scene, View};
-use valuemap_core::robust::spreads_of;
 
 use street::{GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, joined, moved, object, street};
 

@@ -6,8 +6,8 @@ mod street;
 use std::f64::consts::PI;
 
 use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
+use valuemap_core::robust::energy::estimate::{Care, Estimate, Joint, Start};
 use valuemap_core::robust::energy::{fit, unseen};
-use valuemap_core::robust::estimate::{Care, Estimate, Joint, Start};
 use valuemap_core::robust::model::Model;
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::scene::Scene;

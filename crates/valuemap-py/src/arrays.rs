@@ -5,7 +5,7 @@ use numpy::{
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use valuemap_core::vote::Candidate;
+use valuemap_core::paper::vote::Candidate;
 use valuemap_core::{SMatrix, Vector3};
 
 /// Groups of rays: offsets (N + 1) into the members, and the members.

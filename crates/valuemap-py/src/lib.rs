@@ -14,12 +14,14 @@ use numpy::{
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use valuemap_core::hypothesis::{PairCounts, Viability};
+use valuemap_core::evidence;
 use valuemap_core::matrix_from_rows;
+use valuemap_core::paper::hypothesis::PairCounts;
+use valuemap_core::paper::select::Stop;
+use valuemap_core::paper::vote::Candidate;
+use valuemap_core::paper::{merge, partition, triangulate, vote};
 use valuemap_core::ray::Ray;
-use valuemap_core::select::Stop;
-use valuemap_core::vote::Candidate;
-use valuemap_core::{evidence, merge, partition, triangulate, vote};
+use valuemap_core::viability::Viability;
 
 use crate::arrays::{
     FARTHEST_M, Groups, candidates_from, check_finite, check_within, check_within_or_none, groups_of, matrices_of,
@@ -99,7 +101,7 @@ impl Rays {
     }
 }
 
-/// The cluster of each image, `valuemap_core::partition`.
+/// The cluster of each image, `valuemap_core::paper::partition`.
 #[pyfunction(name = "partition")]
 fn partition_images<'py>(
     py: Python<'py>,
@@ -115,7 +117,7 @@ fn partition_images<'py>(
 /// Points, their groups of voters, the cluster of each, and the counts of pairs.
 type Voted<'py> = (Bound<'py, PyArray2<f64>>, Groups<'py>, Bound<'py, PyArray1<u32>>, Bound<'py, PyDict>);
 
-/// Algorithm 1 in every cluster, `valuemap_core::vote`.
+/// Algorithm 1 in every cluster, `valuemap_core::paper::vote`.
 #[pyfunction(name = "vote")]
 #[pyo3(signature = (rays, cluster, *, max_reprojection_error_px, min_parallax_rad, min_range_m, max_range_m,
     min_vote_ratio, min_votes, threads, progress))]
@@ -159,7 +161,7 @@ fn counts_of<'py>(py: Python<'py>, counts: &PairCounts) -> PyResult<Bound<'py, P
     Ok(dict)
 }
 
-/// Merge labels of different clusters, `valuemap_core::merge`.
+/// Merge labels of different clusters, `valuemap_core::paper::merge`.
 #[pyfunction(name = "merge")]
 fn merge_labels<'py>(
     py: Python<'py>,
@@ -182,7 +184,7 @@ fn merge_labels<'py>(
     Ok((points_of(py, &merged)?, groups_of(py, &merged)))
 }
 
-/// Covariances for 1 px detections (N, 9), `valuemap_core::triangulate::unit_covariance`.
+/// Covariances for 1 px detections (N, 9), `valuemap_core::paper::triangulate::unit_covariance`.
 #[pyfunction]
 fn unit_covariance<'py>(
     py: Python<'py>,
@@ -262,9 +264,9 @@ mod _core {
     #[pymodule_export]
     const CLASS_FIELDS: [(&str, usize); ClassModel::FIELDS.len()] = ClassModel::FIELDS;
     #[pymodule_export]
-    const CALIBRATION_STEPS: usize = valuemap_core::robust::CALIBRATION_STEPS;
+    const CALIBRATION_STEPS: usize = valuemap_core::robust::calibrate::CALIBRATION_STEPS;
     #[pymodule_export]
-    const MISFIT_STEPS: usize = valuemap_core::robust::likeliest::MISFIT_STEPS;
+    const MISFIT_STEPS: usize = valuemap_core::robust::calibrate::likeliest::MISFIT_STEPS;
     #[pymodule_export]
     const SEARCH_STEPS: usize = valuemap_core::robust::search::SEARCH_STEPS;
     #[pymodule_export]

@@ -8,15 +8,17 @@ use numpy::{
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use valuemap_core::hypothesis::Viability;
-use valuemap_core::robust::calibrate::Known;
-use valuemap_core::robust::confusion::Confusions;
+use valuemap_core::robust::calibrate::{Calibration, self_calibrate};
+use valuemap_core::robust::energy::sides::of_directions;
 use valuemap_core::robust::model::ClassModel;
+use valuemap_core::robust::model::confusions::Confusions;
+use valuemap_core::robust::noise::Known;
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::parts::Without;
 use valuemap_core::robust::scene::{Frustum, Scene as CoreScene, View};
-use valuemap_core::robust::sides::of_directions;
-use valuemap_core::robust::{Calibration, Findings, Settings, find, self_calibrate};
+use valuemap_core::robust::settings::Settings;
+use valuemap_core::robust::{Findings, find};
+use valuemap_core::viability::Viability;
 
 use crate::Rays;
 use crate::arrays::{
@@ -224,7 +226,7 @@ fn known_of(([detection, position, rotation, side], least_px): ([bool; 4], f64))
     Known { detection, position, rotation, side, least_px }
 }
 
-/// Estimate the noise from the data and learn the classes, `valuemap_core::robust::self_calibrate`.
+/// Estimate the noise from the data and learn the classes, `valuemap_core::robust::calibrate::self_calibrate`.
 #[pyfunction]
 #[allow(clippy::too_many_arguments)]
 pub fn calibrate(
@@ -259,7 +261,7 @@ pub fn calibrate(
     Ok((noise, found.is_deep, classes, found.pooled.to_row(), found.confusions.shares().to_vec()))
 }
 
-/// How badly the same rays fit in two scenes, and how many they are, `valuemap_core::robust::likeliest::misfits`.
+/// How badly the same rays fit in two scenes, and how many they are, `valuemap_core::robust::calibrate::likeliest::misfits`.
 #[pyfunction]
 #[allow(clippy::too_many_arguments)]
 pub fn misfits<'py>(
@@ -285,7 +287,7 @@ pub fn misfits<'py>(
         return Err(PyValueError::new_err("second_of_first: expected each ray of two scenes of the same rays once"));
     }
     with_progress(py, threads, 0, progress, |progress| {
-        valuemap_core::robust::likeliest::misfits(scenes, numbers, &guess, known, &settings, progress)
+        valuemap_core::robust::calibrate::likeliest::misfits(scenes, numbers, &guess, known, &settings, progress)
     })
 }
 
@@ -350,7 +352,7 @@ fn counts_of<'py>(py: Python<'py>, found: &Findings) -> PyResult<Bound<'py, PyDi
 }
 
 /// The side that each visit (V) of some objects looks from, numbered from 0 for each object, whose visits follow each other; `direction` (V, 3) is that
-/// of its rays, of any length. `valuemap_core::robust::sides`.
+/// of its rays, of any length. `valuemap_core::robust::energy::sides`.
 #[pyfunction]
 pub fn sides<'py>(
     py: Python<'py>,

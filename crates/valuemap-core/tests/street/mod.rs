@@ -7,12 +7,12 @@ use nalgebra::{Isometry3, Matrix3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
-use valuemap_core::hypothesis::Viability;
 use valuemap_core::ray::{Ray, Rays};
-use valuemap_core::robust::Settings;
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::parts::Without;
 use valuemap_core::robust::scene::{Frustum, Scene, View};
+use valuemap_core::robust::settings::Settings;
+use valuemap_core::viability::Viability;
 
 pub const FOCAL_PX: f64 = 600.0;
 pub const GATE_SIGMAS: f64 = 3.5;

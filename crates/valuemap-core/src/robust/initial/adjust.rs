@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use rustc_hash::FxHasher;
 
 use super::label::{Label, by_place, fingerprint, first_voter, side_of};
-use crate::robust::estimate::{Care, Joint, Limits, Start};
+use crate::robust::energy::estimate::{Care, Joint, Limits, Start};
 use crate::robust::noise::Noise;
 use crate::robust::scene::Scene;
 

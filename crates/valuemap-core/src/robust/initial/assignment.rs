@@ -9,9 +9,9 @@ use pathfinding::prelude::{Matrix, kuhn_munkres_min};
 use rustc_hash::FxHashSet;
 
 use super::label::Label;
-use crate::robust::drift::Look;
 use crate::robust::noise::Noise;
-use crate::robust::poses::{Belief, PoseError};
+use crate::robust::noise::drift::Look;
+use crate::robust::noise::poses::{Belief, PoseError};
 use crate::robust::scene::Scene;
 
 /// Times that the assignment of an image is made anew, with the pose error from the last one.

@@ -1,6 +1,6 @@
 //! Association: all labels compete for all detections, image by image.
 //!
-//! The pose error of each image is estimated first, from the votes along the drive ([`poses`](crate::robust::poses)). Then each
+//! The pose error of each image is estimated first, from the votes along the drive ([`poses`](crate::robust::noise::poses)). Then each
 //! image is decided for itself ([`assignment`](mod@super::assignment)), and rivals for a whole pass ([`rivals`](super::rivals)).
 
 use std::sync::Arc;
@@ -12,10 +12,10 @@ use rustc_hash::{FxHashMap, FxHashSet};
 use super::assignment::{Case, Claim, Decision, Fit, assigned, belief_of_votes, decide, overrule, report};
 use super::label::{Label, fingerprint};
 use crate::progress::{Halt, Progress};
-use crate::robust::estimate::Estimate;
-use crate::robust::index::{Hit, RayIndex, chi2_in_gate};
+use crate::robust::energy::estimate::Estimate;
 use crate::robust::noise::Noise;
-use crate::robust::poses::{Belief, SEGMENTS_AROUND, Segments, smooth};
+use crate::robust::noise::index::{Hit, RayIndex, chi2_in_gate};
+use crate::robust::noise::poses::{Belief, SEGMENTS_AROUND, Segments, smooth};
 use crate::robust::scene::Scene;
 
 /// Detections are looked for as far from a label as this many of its standard deviations, in steps of one.

@@ -1,12 +1,12 @@
 //! Exchange: two neighbours may have each other's votes from some directions, and have moved so that these votes fit; then no
-//! single vote changes sides. The images that show both say so ([`untangle`](crate::robust::untangle)).
+//! single vote changes sides. The images that show both say so ([`untangle`](crate::robust::search::untangle)).
 
 use rayon::prelude::*;
 
 use super::label::{Label, from_voters};
 use super::pairs::{nearest_pairs, replaced};
 use crate::robust::model::Model;
-use crate::robust::untangle::{reach_m, votes_of_both, which_is_which};
+use crate::robust::search::untangle::{reach_m, votes_of_both, which_is_which};
 
 /// Let neighbours exchange votes where their images say so; what only one of them has in an image is given anew. The
 /// nearest pairs first, each label in one pair.

@@ -14,7 +14,7 @@ use rstar::primitives::GeomWithData;
 use rustc_hash::FxHashMap;
 
 use super::label::{Label, direction_to, sector_middles};
-use crate::robust::looks::SECTOR_COSINE;
+use crate::robust::energy::looks::SECTOR_COSINE;
 use crate::robust::noise::Spread;
 use crate::robust::scene::Scene;
 

@@ -8,11 +8,11 @@ use rayon::prelude::*;
 
 use super::label::{Label, first_voter, from_voters};
 use crate::progress::{Halt, Progress};
-use crate::robust::index::RayIndex;
 use crate::robust::model::Model;
+use crate::robust::noise::index::RayIndex;
 use crate::robust::parts::Part;
-use crate::robust::propose::{Hypothesis, MEETINGS, Who, propose};
-use crate::robust::quick::quick_estimate;
+use crate::robust::search::propose::{Hypothesis, MEETINGS, Who, propose};
+use crate::robust::search::quick::quick_estimate;
 
 /// Hypotheses that are polished side by side.
 const BATCH: usize = 16;

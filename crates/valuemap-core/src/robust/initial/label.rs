@@ -9,9 +9,9 @@ use rstar::RTree;
 use rstar::primitives::GeomWithData;
 use rustc_hash::FxHasher;
 
-use crate::robust::agreement;
-use crate::robust::estimate::{Care, Elsewhere, Estimate, Joint, Limits, Start};
-use crate::robust::looks::SECTOR_COSINE;
+use crate::robust::energy::agreement;
+use crate::robust::energy::estimate::{Care, Elsewhere, Estimate, Joint, Limits, Start};
+use crate::robust::energy::looks::SECTOR_COSINE;
 use crate::robust::noise::Noise;
 use crate::robust::scene::{Scene, View};
 
@@ -69,7 +69,7 @@ pub struct Revision {
 /// What was found out about a label as it is; forgotten when it changes.
 #[derive(Debug, Clone, Default)]
 pub struct Known {
-    /// How far its visits disagree, see [`variance_factor`](crate::robust::agreement::variance_factor).
+    /// How far its visits disagree, see [`variance_factor`](crate::robust::energy::agreement::variance_factor).
     pub disagreement: OnceLock<Option<agreement::Disagreement>>,
     /// Whether it was found not to be two.
     pub is_one: bool,

@@ -10,6 +10,7 @@ pub mod associate;
 pub mod exchange;
 pub mod existence;
 pub mod gather;
+pub mod keyframes;
 pub mod label;
 pub mod pairs;
 pub mod rivals;
@@ -19,10 +20,9 @@ pub mod swap;
 
 use nalgebra::Vector3;
 
-use super::keyframes::Keyframes;
-use super::model::Model;
 use crate::progress::{Halt, Progress};
-
+use crate::robust::model::Model;
+use keyframes::Keyframes;
 use label::Label;
 use solver::Solver;
 

@@ -8,9 +8,9 @@ use rustc_hash::{FxHashMap, FxHashSet};
 use super::assignment::{Fit, assigned, belief_of_votes, open};
 use super::associate::Run;
 use crate::progress::{Halt, Progress};
-use crate::robust::drift::{Drive, Look};
 use crate::robust::noise::Sigmas;
-use crate::robust::poses::{PoseError, SEGMENTS_AROUND, smooth};
+use crate::robust::noise::drift::{Drive, Look};
+use crate::robust::noise::poses::{PoseError, SEGMENTS_AROUND, smooth};
 
 /// Images of a pass that show one of two labels, which may be either, before it is concluded that there is but one.
 const LEAST_RIVALRY: u32 = 8;

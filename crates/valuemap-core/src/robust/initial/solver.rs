@@ -8,17 +8,17 @@ use rustc_hash::FxHashMap;
 
 use super::adjust::adjust;
 use super::associate::Association;
-use super::existence::{self, Lookout, Looks, Rates, Sector};
+use super::existence::{Lookout, Looks, Rates, Sector};
 use super::gather::gather;
-use super::label::{self, Label, fingerprint};
-use super::{Schedule, Tally, exchange, settle, swap};
+use super::label::{Label, fingerprint};
+use super::{Schedule, Tally, exchange, existence, label, settle, swap};
 use crate::progress::{Halt, Progress};
-use crate::robust::Settings;
-use crate::robust::index::RayIndex;
 use crate::robust::model::Model;
+use crate::robust::noise::index::RayIndex;
 use crate::robust::noise::{Noise, Spread};
 use crate::robust::parts::Part;
 use crate::robust::scene::Scene;
+use crate::robust::settings::Settings;
 
 /// Labels are dropped below these multiples of the probability that is asked for, one after the other, and then below that.
 const PRUNED_BELOW: [f64; 3] = [1e-5, 1e-2, 0.3];

@@ -13,10 +13,10 @@ use rustc_hash::FxHashSet;
 use super::associate::Association;
 use super::label::{Label, by_place, direction_to, from_voters, sector_middles};
 use super::pairs::{nearest_pairs, replaced};
-use crate::robust::Settings;
-use crate::robust::estimate::{Care, Joint, Limits, Start};
-use crate::robust::looks::SECTOR_COSINE;
+use crate::robust::energy::estimate::{Care, Joint, Limits, Start};
+use crate::robust::energy::looks::SECTOR_COSINE;
 use crate::robust::parts::Part;
+use crate::robust::settings::Settings;
 
 /// Labels farther apart than this do not have each other's votes, m.
 const PAIR_M: f64 = 3.0;

@@ -1,0 +1,524 @@
+//! Search for the noise that makes the rays likeliest: from several starts, each time with a map found anew.
+//!
+//! A map depends on the noise and the noise on the map, so that one start may end at a poor pair. Starts are compared by J with
+//! the density of clutter ([`calibrate`](super::residuals) does a step).
+
+use std::f64::consts::PI;
+use std::sync::Arc;
+
+use rayon::prelude::*;
+
+use super::CALIBRATION_RAYS;
+use super::residuals::calibrate;
+use super::shared::{with_sides, with_sides_for_sure};
+use crate::progress::{Halt, Progress};
+use crate::robust::energy::{Object, Placed, fit, placed};
+use crate::robust::initial;
+use crate::robust::model::Model;
+use crate::robust::noise::{Known, Noise};
+use crate::robust::parts::Part;
+use crate::robust::scene::{Scene, sample};
+use crate::robust::search::{Depth, Tally, search};
+use crate::robust::settings::Settings;
+
+/// How much wider the gate is while the noise is estimated: what a gate cuts off is missing in the estimate.
+const CALIBRATION_GATE: f64 = 1.4;
+/// Times that the noise is estimated anew, from labels found with the last estimate.
+const CALIBRATION_ROUNDS: usize = 3;
+/// Times that it is estimated from more rays than that.
+const MORE_ROUNDS: usize = 2;
+/// Times that the middles of sides are learned anew, from a map that is made with them.
+pub(crate) const MIDDLES_ROUNDS: usize = 2;
+/// Passes that should have seen objects and did not are expected to cost no more than this, whatever is expected of them: twice the most that
+/// `-p ln p` can be.
+const MOST_UNSEEN: f64 = 2.0 / std::f64::consts::E;
+/// The noise is sought from starts that differ by these factors.
+const STARTS: [f64; 5] = [0.15, 0.5, 1.5, 5.0, 15.0];
+
+/// Steps from all starts at most, as progress counts them.
+const START_STEPS: usize = STARTS.len() * CALIBRATION_ROUNDS;
+/// Steps of [`misfits`] at most: in each scene those from all starts, with middles of sides, and from the map of the other.
+pub const MISFIT_STEPS: usize = 2 * (START_STEPS + 2);
+/// Steps of the search for the noise at most.
+pub(crate) const NOISE_STEPS: usize = START_STEPS + MORE_ROUNDS;
+
+/// The noise that makes the rays of some places likeliest, `more` and some of them, and from how many starts it was sought.
+pub(crate) fn likeliest_noise(
+    scene: &Scene,
+    guess: &Noise,
+    known: Known,
+    settings: &Settings,
+    more: &[u32],
+    progress: &Progress,
+) -> Result<(Noise, usize), Halt> {
+    let few = sample::places(scene, CALIBRATION_RAYS.0, settings.viability.max_range_m);
+    let of = |rays| Sample { scene, rays, known, settings: wider(settings), progress };
+    let likeliest = Likeliest::of_starts(&of(&few), guess)?;
+    let (noise, starts) = (likeliest.noise().unwrap_or(*guess), likeliest.starts);
+    if more.len() == few.len() {
+        return Ok((noise, starts));
+    }
+    Ok((of_more(noise, |noise| of(more).round(noise))?, starts))
+}
+
+/// The noise that makes more rays likeliest, some steps on from one: the one that a map was found with, or the one that was estimated from it, if
+/// the map is likelier with that. Starts are not compared so: what makes the map of a poor one likeliest is a wrong noise.
+fn of_more(mut noise: Noise, step: impl Fn(&Noise) -> Result<Round, Halt>) -> Result<Noise, Halt> {
+    let (mut best, mut least) = (noise, f64::INFINITY);
+    for _ in 0..MORE_ROUNDS {
+        let found = step(&noise)?;
+        let value = found.value + found.change.min(0.0);
+        if value < least {
+            (best, least) = (*found.likelier_noise(), value);
+        }
+        if found.stays() {
+            break;
+        }
+        noise = found.again;
+    }
+    Ok(best)
+}
+
+/// A noise with the error of the [middles that sides show](crate::robust::energy::sides), if sides disagree in a map of some rays, and in one that is made with such an
+/// error as well: the former may hold some things once for each side.
+pub(crate) fn with_middles(
+    scene: &Scene,
+    noise: &Noise,
+    known: Known,
+    settings: &Settings,
+    map: &[Placed],
+    rays: &[u32],
+    progress: &Progress,
+) -> Result<Noise, Halt> {
+    let plain = Model::new(scene, noise, settings);
+    let mut found = with_sides(&plain, known, map);
+    for _ in 0..MIDDLES_ROUNDS {
+        let Some(with) = found else { break };
+        let mut model = Model::new(scene, &with, settings);
+        let begun = initial::labels_of_few(&model, rays, progress)?;
+        let objects = search(&mut model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
+        found = with_sides_for_sure(&plain, known, &placed(&objects));
+    }
+    Ok(found.unwrap_or(*noise))
+}
+
+/// Minus twice the logarithm of how likely the same rays, of a sample of places, are in two scenes, each with the noise that makes them likeliest
+/// there, up to a constant of these rays; and how many they are. It compares poses: what is true makes the same rays likelier. `second_of_first`
+/// has the number in the second scene of each ray of the first.
+///
+/// A search may end above the least value, and in one scene farther above it than in the other. So each scene is offered the map of the other as
+/// well: it goes on with the noise that makes it likeliest there.
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn misfits(
+    scenes: [&Scene; 2],
+    second_of_first: &[u32],
+    guess: &Noise,
+    known: Known,
+    settings: &Settings,
+    progress: &Progress,
+) -> Result<([f64; 2], usize), Halt> {
+    let mut first_of_second = vec![0; second_of_first.len()];
+    (0..).zip(second_of_first).for_each(|(ray, &there): (u32, &u32)| first_of_second[there as usize] = ray);
+    let mut first = sample::places(scenes[0], CALIBRATION_RAYS.0, settings.viability.max_range_m);
+    first.retain(|&ray| scenes[0].ray(ray).is_usable() && scenes[1].ray(second_of_first[ray as usize]).is_usable());
+    let second = renamed(&first, second_of_first);
+    let of = |scene, rays| Sample { scene, rays, known, settings: wider(settings), progress };
+    let samples = [of(scenes[0], &first), of(scenes[1], &second)];
+    // Side by side: samples are so small that threads wait for each other within each of them.
+    let sought = |here: usize| Likeliest::of_starts(&samples[here], guess)?.with_sides(&samples[here]);
+    let (first_found, second_found) = rayon::join(|| sought(0), || sought(1));
+    let found = [first_found?.best, second_found?.best];
+    let least = |here: usize, numbers: &[u32]| -> Result<f64, Halt> {
+        let [Some(own), Some(other)] = [&found[here], &found[1 - here]] else { return Ok(f64::INFINITY) };
+        let rename = |(votes, point): &Placed| (renamed(votes, numbers), *point);
+        let map: Vec<Placed> = other.map.iter().map(rename).collect();
+        let noise = samples[here].noise_of(&other.noise, &map);
+        Ok(own.value.min(samples[here].round_from(&noise, map)?.value))
+    };
+    let (of_first, of_second) = rayon::join(|| least(0, &first_of_second), || least(1, second_of_first));
+    Ok(([of_first?, of_second?], first.len()))
+}
+
+/// Rays by other numbers, ascending.
+fn renamed(rays: &[u32], numbers: &[u32]) -> Vec<u32> {
+    let mut rays: Vec<u32> = rays.iter().map(|&ray| numbers[ray as usize]).collect();
+    rays.sort_unstable();
+    rays
+}
+
+/// Settings with the gate that the noise is estimated with.
+fn wider(settings: &Settings) -> Settings {
+    Settings { gate_sigmas: settings.gate_sigmas * CALIBRATION_GATE, ..*settings }
+}
+
+/// Some rays of a scene whose noise is sought.
+struct Sample<'a> {
+    scene: &'a Scene,
+    rays: &'a [u32],
+    known: Known,
+    settings: Settings,
+    progress: &'a Progress,
+}
+
+impl Sample<'_> {
+    /// One step: how likely the rays are with a noise, and the noise that is estimated from the map that it makes.
+    fn round(&self, noise: &Noise) -> Result<Round, Halt> {
+        let model = Model::new(self.scene, noise, &self.settings);
+        let begun = initial::labels_of_few(&model, self.rays, self.progress)?;
+        self.searched(model, begun)
+    }
+
+    /// The same from a map that is there.
+    fn round_from(&self, noise: &Noise, begun: Vec<Placed>) -> Result<Round, Halt> {
+        self.searched(Model::new(self.scene, noise, &self.settings), begun)
+    }
+
+    fn searched(&self, mut model: Model<'_>, begun: Vec<Placed>) -> Result<Round, Halt> {
+        let noise = model.noise;
+        let objects = search(&mut model, self.rays, begun, Depth::Shallow, true, &mut Tally::default(), self.progress)?;
+        let (value, left) = (likelihood(&model, &objects, self.rays), Left::of(&model, &objects, self.rays));
+        let map = placed(&objects);
+        let again = calibrate(self.scene, noise, &map, self.known);
+        let change = change_of_fits(&model.with_noise(&again), &objects);
+        Ok(Round { noise: *noise, map, value, change, again, left })
+    }
+
+    /// The noise that is estimated from a map whose objects are put where another noise has them.
+    fn noise_of(&self, noise: &Noise, map: &[Placed]) -> Noise {
+        let model = Model::new(self.scene, noise, &self.settings);
+        let place = |(votes, point): &Placed| Some((votes.clone(), fit(&model, votes, *point)?.point));
+        calibrate(self.scene, noise, &map.par_iter().filter_map(place).collect::<Vec<Placed>>(), self.known)
+    }
+}
+
+/// What J of some objects changes by, their votes as they are, with the noise of a model.
+fn change_of_fits(model: &Model<'_>, objects: &[Object]) -> f64 {
+    let of_object = |object: &Object| {
+        fit(model, &object.votes, object.fit.point).map_or(f64::INFINITY, |fit| fit.energy - object.fit.energy)
+    };
+    objects.par_iter().map(of_object).collect::<Vec<f64>>().iter().sum()
+}
+
+/// What a step of the calibration finds with a noise.
+struct Round {
+    noise: Noise,
+    /// The objects of the map that it makes.
+    map: Vec<Placed>,
+    /// Minus twice the logarithm of how likely the rays are with it.
+    value: f64,
+    /// The noise that is estimated from the map that it makes.
+    again: Noise,
+    /// What the value changes by with that, the map as it is.
+    change: f64,
+    left: Left,
+}
+
+/// What a larger noise could still explain of some rays.
+struct Left {
+    /// Squared residuals of the votes, in sigmas.
+    chi2: f64,
+    /// Votes, each with the depth of its object, m.
+    votes: Vec<(u32, f64)>,
+    /// The rays of no object, each with minus twice the logarithm of the density of clutter there, 1/px².
+    clutter: Vec<(u32, f64)>,
+    /// Passes that see objects, or should have; and minus twice the logarithm of how probable it is of those that do not.
+    passes: (usize, f64),
+}
+
+impl Left {
+    fn of(model: &Model<'_>, objects: &[Object], rays: &[u32]) -> Self {
+        let depth_m = |ray: u32, object: &Object| model.scene.ray(ray).project(&object.fit.point).z;
+        let of_object = |object: &Object| -> Vec<(u32, f64)> {
+            object.votes.iter().map(|&ray| (ray, depth_m(ray, object))).collect()
+        };
+        let mut votes: Vec<(u32, f64)> = objects.iter().flat_map(of_object).collect();
+        votes.sort_unstable_by_key(|vote| vote.0);
+        let is_left = |ray: &&u32| votes.binary_search_by_key(*ray, |vote| vote.0).is_err();
+        let price = |&ray: &u32| (ray, -2.0 * model.ln_clutter_per_px2(ray));
+        let clutter = rays.iter().filter(is_left).map(price).collect();
+        let of_passes = objects.iter().map(|object| object.seen.missed(&model.classes[object.class as usize]));
+        let passes = of_passes.fold((0, 0.0), |sum, one| (sum.0 + one.0, sum.1 + 2.0 * one.1));
+        Self { chi2: objects.iter().flat_map(|object| &object.fit.chi2).sum(), votes, clutter, passes }
+    }
+}
+
+impl Round {
+    /// That of the two noises with which the map is likelier.
+    fn likelier_noise(&self) -> &Noise {
+        if self.change < 0.0 { &self.again } else { &self.noise }
+    }
+
+    /// Whether the noise stays as it is, and would make the same map again.
+    fn stays(&self) -> bool {
+        self.again == self.noise
+    }
+
+    /// Whether a larger noise may make the rays likelier. If it explained the votes without any residual, and the rays of no object as well,
+    /// each of them would still be as improbable as a residual of 0 is: how much more so than now, grows with the noise. But passes that
+    /// disagree by more than is thought do not see each other's objects, and that is no residual.
+    fn may_be_larger(&self, scene: &Scene, noise: &Noise) -> bool {
+        let (passes, unseen) = self.left.passes;
+        if unseen > MOST_UNSEEN * passes as f64 {
+            return true;
+        }
+        let wider = |&(ray, depth_m): &(u32, f64)| {
+            let [now, then] = [&self.noise, noise].map(|noise| noise.total(scene, ray).variance(depth_m));
+            2.0 * (then / now).ln()
+        };
+        let explained =
+            |&(ray, price): &(u32, f64)| (price - 2.0 * (2.0 * PI * noise.total(scene, ray).far_px2).ln()).max(0.0);
+        let gain = self.left.chi2 + self.left.clutter.iter().map(explained).sum::<f64>();
+        self.left.votes.iter().map(wider).sum::<f64>() <= gain
+    }
+}
+
+/// What makes the same rays likeliest so far.
+#[derive(Default)]
+struct Likeliest {
+    best: Option<Arc<Round>>,
+    /// The last step from the same start: what it leaves over is no longer that of a start.
+    last: Option<Arc<Round>>,
+    /// From how many starts it was sought.
+    starts: usize,
+}
+
+impl Likeliest {
+    /// From each start some steps: it takes one to learn what passes disagree about, and another to see what that explains. What it starts with
+    /// is no estimate, and not kept, however likely it makes the rays: too small, it may have an object for every few of them. Larger starts than
+    /// may be likelier are left out.
+    fn of_starts(sample: &Sample<'_>, guess: &Noise) -> Result<Self, Halt> {
+        let mut likeliest = Self::default();
+        for factor in STARTS {
+            let start = guess.scaled(factor, sample.known);
+            if likeliest.last.as_ref().is_some_and(|last| !last.may_be_larger(sample.scene, &start)) {
+                break;
+            }
+            likeliest.starts += 1;
+            likeliest.steps(CALIBRATION_ROUNDS - 1, sample.round(&start)?.again, |noise| sample.round(noise))?;
+        }
+        Ok(likeliest)
+    }
+
+    /// Some steps on from a noise that was estimated. What makes the rays likelier is kept.
+    fn steps(
+        &mut self,
+        count: usize,
+        mut noise: Noise,
+        step: impl Fn(&Noise) -> Result<Round, Halt>,
+    ) -> Result<(), Halt> {
+        let (mut last, mut is_best) = (None, false);
+        for _ in 0..count {
+            let found = Arc::new(step(&noise)?);
+            if self.best.as_ref().is_none_or(|best| found.value < best.value) {
+                (self.best, is_best) = (Some(Arc::clone(&found)), true);
+            }
+            last = Some(Arc::clone(&found));
+            if found.stays() {
+                break;
+            }
+            noise = found.again;
+        }
+        if is_best {
+            self.last = last;
+        }
+        Ok(())
+    }
+
+    /// One step more with the middles that sides seem to show in the best map.
+    fn with_sides(mut self, sample: &Sample<'_>) -> Result<Self, Halt> {
+        if let Some(best) = self.best.as_ref().filter(|_| sample.settings.has(Part::Sides) && !sample.known.side) {
+            let model = Model::new(sample.scene, &best.noise, &sample.settings);
+            if let Some(noise) = with_sides(&model, sample.known, &best.map) {
+                self.steps(1, noise, |noise| sample.round(noise))?;
+            }
+        }
+        Ok(self)
+    }
+
+    fn noise(&self) -> Option<Noise> {
+        self.best.as_ref().map(|best| best.noise)
+    }
+}
+
+/// Minus twice the logarithm of the likelihood of some rays, clutter and votes, up to a constant: J, and the Poisson process of what is clutter
+/// otherwise, whose density is that of the rays of no object, and whose scores have that of all rays once those of votes are taken out:
+/// `p(score) = (share ratio + 1 - share) p_clutter(score)`.
+fn likelihood(model: &Model<'_>, objects: &[Object], rays: &[u32]) -> f64 {
+    let scene = model.scene;
+    let of_class = |class: usize| {
+        let of_class = || rays.iter().filter(|&&ray| scene.rays.class[ray as usize] as usize == class);
+        let here = || objects.iter().filter(|object| object.class as usize == class);
+        let votes: usize = here().map(|object| object.votes.len()).sum();
+        let clutter = of_class().count() - votes;
+        let ln_clutter = ((clutter + 1) as f64 / model.solid_angle_sr(rays.len())).ln();
+        let change = ln_clutter - model.classes[class].ln_clutter_per_sr;
+        let share = (votes as f64 / of_class().count().max(1) as f64).min(1.0);
+        let ln_score = |ray: u32| -(share * model.ln_score_ratio(ray).exp() + 1.0 - share).ln();
+        let all: f64 = of_class().map(|&ray| -2.0 * (model.ln_clutter_per_px2(ray) + change + ln_score(ray))).sum();
+        all + here().map(|object| object.energy + 2.0 * change * object.votes.len() as f64).sum::<f64>()
+    };
+    (0..model.classes.len()).map(of_class).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Isometry3, Vector3};
+
+    use super::*;
+    use crate::robust::energy::looks::Lookout;
+    use crate::robust::energy::object;
+    use crate::robust::learn::learn;
+    use crate::street;
+
+    /// Between minus a half and a half.
+    fn uniform(number: u64) -> f64 {
+        sample::scramble(number) as f64 / u64::MAX as f64 - 0.5
+    }
+
+    /// Two rows of three, 0.5 m apart, as four drives see them that are off by up to half of some metres on each axis.
+    fn rows(off_m: f64, seed: u64) -> Vec<Scene> {
+        let in_row = |i: i32| Vector3::new(25.0 + 12.0 * f64::from(i / 3), 4.0 + 0.5 * f64::from(i % 3), 3.0);
+        let objects: Vec<Vector3<f64>> = (0..6).map(in_row).collect();
+        let errors: Vec<[f64; 2]> = (0..997).map(|i| [2 * i, 2 * i + 1].map(|number| 4.0 * uniform(number))).collect();
+        let drive = |drive: u64| {
+            let [x, y, z] = [0, 1, 2].map(|axis| off_m * uniform(seed + 3 * drive + axis));
+            street::moved(street::street(20, 2.5, &objects, &errors), &Isometry3::translation(x, y, z))
+        };
+        (0..4).map(drive).collect()
+    }
+
+    fn whole<'a>(scene: &'a Scene, rays: &'a [u32], progress: &'a Progress) -> Sample<'a> {
+        Sample { scene, rays, known: Known::default(), settings: wider(&street::SETTINGS), progress }
+    }
+
+    fn misfits_of(scenes: [&Scene; 2], second_of_first: &[u32]) -> Result<([f64; 2], usize), Halt> {
+        let (known, progress) = (Known::default(), Progress::default());
+        misfits(scenes, second_of_first, &street::NOISE, known, &street::SETTINGS, &progress)
+    }
+
+    fn eight_in_a_street() -> Scene {
+        let objects: Vec<Vector3<f64>> = (0..8).map(|i| Vector3::new(25.0 + 9.0 * f64::from(i), 5.0, 3.0)).collect();
+        street::street(80, 1.0, &objects, &[[0.7, -0.4], [-0.9, 0.8], [0.3, -0.5]])
+    }
+
+    #[test]
+    fn rays_that_are_none_do_not_count() -> Result<(), Halt> {
+        let mut scene = eight_in_a_street();
+        std::sync::Arc::make_mut(&mut scene.rays).rays[7].residual_from_world.fill(f64::NAN);
+        let same: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
+        let ([one, other], rays) = misfits_of([&scene, &scene], &same)?;
+        assert!(one.is_finite() && rays == scene.usable_rays().len(), "{one} {rays}");
+        assert_eq!(one.to_bits(), other.to_bits());
+        Ok(())
+    }
+
+    #[test]
+    fn a_scene_is_offered_the_map_of_the_other() -> Result<(), Halt> {
+        // In the second scene the drives are where they say, and in the other order.
+        let (first, second) = (street::joined(rows(0.8, 1000)), rows(0.0, 0));
+        let second = street::joined(second.into_iter().rev().collect());
+        let (rays, progress) = (first.usable_rays(), Progress::default());
+        let sample = whole(&first, &rays, &progress);
+        let alone = Likeliest::of_starts(&sample, &street::NOISE)?.best.map_or(f64::NAN, |best| best.value);
+        let of_drive = rays.len() as u32 / 4;
+        let second_of_first: Vec<u32> =
+            rays.iter().map(|ray| (3 - ray / of_drive) * of_drive + ray % of_drive).collect();
+        let [offered, there] = misfits_of([&first, &second], &second_of_first)?.0;
+        assert!(there < offered && offered < alone - 20.0, "{there} {offered} {alone}");
+        Ok(())
+    }
+
+    #[test]
+    fn what_no_image_of_a_sample_is_near_counts_as_well() -> Result<(), Halt> {
+        let objects: Vec<Vector3<f64>> = (0..6).map(|i| Vector3::new(51.0 + f64::from(i), 4.0, 3.0)).collect();
+        let errors = [[0.7, -0.4], [-0.9, 0.8], [0.3, -0.5]];
+        let drives = |ahead_m: f64| {
+            let drive = street::street(20, 1.0, &objects, &errors);
+            street::joined(vec![drive.clone(), street::moved(drive, &Isometry3::translation(ahead_m, 0.0, 0.0))])
+        };
+        // From where the second drive says that it was, some objects are within the range; from where it was, none is. Objects are whole metres apart:
+        // moved by whole metres, one would stand where another one does.
+        let (right, wrong) = (drives(0.0), drives(4.5));
+        let viability = crate::viability::Viability { max_range_m: 31.0, ..street::VIABILITY };
+        let settings = Settings { viability, ..street::SETTINGS };
+        let same: Vec<u32> = (0..right.rays.rays.len() as u32).collect();
+        let scenes = [&right, &wrong];
+        let (known, progress) = (Known::default(), Progress::default());
+        let ([right, wrong], _) = misfits(scenes, &same, &street::NOISE, known, &settings, &progress)?;
+        assert!(right < wrong, "{right} {wrong}");
+        Ok(())
+    }
+
+    #[test]
+    fn scores_say_no_more_than_which_rays_are_votes() -> Result<(), Halt> {
+        let mut scene = eight_in_a_street();
+        let (rays, progress) = (scene.usable_rays(), Progress::default());
+        let map = whole(&scene, &rays, &progress).round(&street::NOISE)?.map;
+        // Two objects are left out: what they have is clutter, and has lower scores.
+        let map = &map[..map.len() - 2];
+        let votes: usize = map.iter().map(|(votes, _)| votes.len()).sum();
+        let share = votes as f64 / rays.len() as f64;
+        let entropy = -share * share.ln() - (1.0 - share) * (1.0 - share).ln();
+        let value = |scene: &Scene| {
+            let mut model = Model::new(scene, &street::NOISE, &street::SETTINGS);
+            let lookout = Lookout::new(scene, street::VIABILITY.max_range_m);
+            let place = |model: &Model<'_>| -> Vec<Object> {
+                map.iter().filter_map(|(votes, at)| object(model, &lookout, votes.clone(), *at, Vec::new())).collect()
+            };
+            let objects = place(&model);
+            learn(&mut model, &lookout, &rays, &objects);
+            likelihood(&model, &place(&model), &rays)
+        };
+        scene.score.fill(f64::NAN);
+        let without = value(&scene);
+        scene.score.fill(0.3);
+        map.iter().flat_map(|(votes, _)| votes).for_each(|&ray| scene.score[ray as usize] = 0.8);
+        let gain = without - value(&scene);
+        let most = 2.0 * rays.len() as f64 * entropy;
+        assert!(gain > 0.8 * most && gain <= most, "{gain} {most}");
+        Ok(())
+    }
+
+    #[test]
+    fn of_more_rays_the_noise_that_makes_a_map_likeliest_is_kept_not_the_one_that_it_was_found_with() -> Result<(), Halt>
+    {
+        let noise_of = |detection_px: f64| Noise { detection_px, ..street::NOISE };
+        let with = |change: f64| {
+            of_more(noise_of(0.5), |noise| {
+                let left = Left { chi2: 0.0, votes: Vec::new(), clutter: Vec::new(), passes: (0, 0.0) };
+                // The first map is the likeliest.
+                let value = if noise.detection_px < 1.0 { 0.0 } else { 100.0 };
+                Ok(Round {
+                    noise: *noise,
+                    map: Vec::new(),
+                    value,
+                    again: noise_of(noise.detection_px + 0.5),
+                    change,
+                    left,
+                })
+            })
+        };
+        assert!((with(-10.0)?.detection_px - 1.0).abs() < 1e-12);
+        assert!((with(10.0)?.detection_px - 0.5).abs() < 1e-12);
+        Ok(())
+    }
+
+    #[test]
+    fn a_noise_that_stays_as_it_is_takes_no_further_step() -> Result<(), Halt> {
+        let steps = |change_px: f64| {
+            let taken = std::cell::Cell::new(0);
+            let step = |noise: &Noise| {
+                taken.set(taken.get() + 1);
+                let left = Left { chi2: 0.0, votes: Vec::new(), clutter: Vec::new(), passes: (0, 0.0) };
+                let again = Noise { detection_px: noise.detection_px + change_px, ..*noise };
+                Ok(Round { noise: *noise, map: Vec::new(), value: 0.0, again, change: 0.0, left })
+            };
+            Likeliest::default().steps(3, street::NOISE, step)?;
+            Ok(taken.get())
+        };
+        assert_eq!([steps(0.0)?, steps(0.1)?], [1, 3]);
+        Ok(())
+    }
+}

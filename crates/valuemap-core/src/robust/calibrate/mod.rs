@@ -1,0 +1,122 @@
+//! What is estimated once of a scene, or of a sample of it: the noise, and what each class is like.
+//!
+//! [`likeliest`] seeks the noise from several starts, by maps of a sample of places and their [`residuals`]. [`split`](mod@split) divides it between poses and
+//! detections, and [`shared`] tells what passes and sides of objects disagree about. The classes are learned from a map of wider places. [`depth`] tells
+//! whether all moves of the search pay.
+
+pub mod depth;
+pub mod likeliest;
+pub mod residuals;
+pub mod shared;
+pub mod split;
+
+use std::sync::Arc;
+
+use crate::progress::{Halt, Progress};
+use crate::robust::energy::looks::Lookout;
+use crate::robust::energy::{Object, placed};
+use crate::robust::initial;
+use crate::robust::learn::confusion::confusions;
+use crate::robust::learn::counts::learn_counts;
+use crate::robust::learn::existence::learn_existence;
+use crate::robust::learn::learn;
+use crate::robust::model::confusions::Confusions;
+use crate::robust::model::{ClassModel, Model};
+use crate::robust::noise::index::RayIndex;
+use crate::robust::noise::{Known, Noise};
+use crate::robust::parts::Part;
+use crate::robust::scene::{Scene, sample};
+use crate::robust::search::{Depth, Tally, few, search};
+use crate::robust::settings::Settings;
+use depth::all_moves_pay;
+use likeliest::likeliest_noise;
+
+/// Rays of the places that the noise is estimated from, about: from each start, and from the best in the end.
+const CALIBRATION_RAYS: (usize, usize) = (4_000, 10_000);
+/// Rays that classes are learned from, about: some hundred objects of some hundred votes each. Of fifty, a few that are hardly seen tell whether the
+/// others are seen alike.
+const CLASS_RAYS: usize = 30_000;
+/// Places that classes are learned from are so many ranges wide: most objects in them are seen by no other images.
+const WIDE: f64 = 3.0;
+/// Scenes with more rays than this are searched less deeply, if that changes little.
+const MOST_RAYS: usize = 100_000;
+
+/// Steps of [`self_calibrate`] at most, as progress counts them, but for the search that tells whether all moves pay: the noise, and the classes.
+pub const CALIBRATION_STEPS: usize = likeliest::NOISE_STEPS + likeliest::MIDDLES_ROUNDS + 1;
+
+/// What is estimated once of a scene, or of a sample of it, before any part of it is mapped.
+#[derive(Debug, Clone)]
+pub struct Calibration {
+    /// Errors of poses and detections.
+    pub noise: Noise,
+    /// What is learned of each class; nothing of those that are nowhere in the sample.
+    pub classes: Vec<Option<ClassModel>>,
+    /// What is learned of all classes together: what others are like.
+    pub pooled: ClassModel,
+    /// Which classes are taken for which.
+    pub confusions: Confusions,
+    /// Whether all moves pay, from all images.
+    pub is_deep: bool,
+    /// From how many starts the noise was sought; 0 if it was known.
+    pub starts: usize,
+}
+
+/// Estimate the noise from the data, starting from a guess: labels of a sample of places with the noise as it is thought
+/// to be, then the noise that makes their residuals most likely, and again. `known` parts stay as they are. Then learn the classes.
+/// All moves pay where a scene is small; if it `is_part` of a larger one, where they change the map of a sample.
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn self_calibrate(
+    scene: &Scene,
+    guess: &Noise,
+    known: Known,
+    settings: &Settings,
+    is_part: bool,
+    progress: &Progress,
+) -> Result<Calibration, Halt> {
+    let more = sample::places(scene, CALIBRATION_RAYS.1, settings.viability.max_range_m);
+    let is_known = known.detection && known.position && known.rotation;
+    let (noise, starts) =
+        if is_known { (*guess, 0) } else { likeliest_noise(scene, guess, known, settings, &more, progress)? };
+    let mut model = Model::new(scene, &noise, settings);
+    let wide = sample::places(scene, CLASS_RAYS, WIDE * settings.viability.max_range_m);
+    let objects = learn_from(&mut model, &wide, progress)?;
+    let noise = if settings.has(Part::NoiseSplit) { split::split(&model, known, &objects) } else { noise };
+    let noise = if settings.has(Part::Sides) && !known.side {
+        likeliest::with_middles(scene, &noise, known, settings, &placed(&objects), &wide, progress)?
+    } else {
+        noise
+    };
+    let noise = if settings.has(Part::SharedNoise) || is_known { noise } else { noise.all_own() };
+    let is_small = !is_part && scene.usable_rays().len() <= MOST_RAYS;
+    let is_deep = is_small || all_moves_pay(&mut model, &objects, progress)?;
+    let classes = model.classes.iter().copied().map(Some).collect();
+    Ok(Calibration { noise, classes, pooled: model.pooled, confusions: model.confusions, is_deep, starts })
+}
+
+/// Learn the classes of a model from the map of some rays, and return that. Where classes are taken for each other, all competes once more.
+fn learn_from(model: &mut Model<'_>, rays: &[u32], progress: &Progress) -> Result<Vec<Object>, Halt> {
+    let begun = initial::labels_of_few(model, rays, progress)?;
+    let mut objects = search(model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
+    let lookout = Lookout::new(model.scene, model.settings.viability.max_range_m);
+    learn(model, &lookout, rays, &objects);
+    if model.classes.len() > 1 && model.settings.has(Part::Confusions) {
+        let spreads = Arc::clone(&model.spreads);
+        let index = RayIndex::new(model.scene, &spreads, model.settings.gate_sigmas, rays.iter().copied());
+        model.confusions = confusions(model, &lookout, &index, &objects);
+        if model.confusions.is_any() {
+            objects = search(model, rays, placed(&objects), Depth::Shallow, true, &mut Tally::default(), progress)?;
+            learn(model, &lookout, rays, &objects);
+        }
+    }
+    let few = few::objects_of_few(model, &lookout, rays, &objects, 1, progress)?;
+    let [whole, mut whole_of_few] = {
+        let is_whole = lookout.whole(model, rays);
+        [&objects, &few].map(|all| all.iter().filter(|object| is_whole(object)).cloned().collect::<Vec<Object>>())
+    };
+    learn_counts(model, &whole, &whole_of_few);
+    few::add_odds(model, &mut whole_of_few);
+    learn_existence(model, &whole, &whole_of_few);
+    Ok(objects)
+}

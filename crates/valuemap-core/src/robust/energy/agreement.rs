@@ -1,0 +1,150 @@
+//! How far the passes and the sides of objects agree about where they are.
+//!
+//! The error that a pass shares makes the positions that each pass alone would give an object differ. The error of the [middle that a side
+//! shows](mod@super::sides) makes those of its sides differ by more than those of the passes of one side. So the covariances are off by as much disagreement
+//! as there is; the drift and the middles are learned of it.
+
+use nalgebra::{Matrix3, Vector3};
+use rayon::prelude::*;
+
+use super::Placed;
+use super::estimate::{Care, Estimate, estimate, looks_at, visits};
+use super::sides::sides;
+use crate::robust::noise::Noise;
+use crate::robust::noise::drift::Drive;
+use crate::robust::scene::Scene;
+
+/// A pass with fewer voters does not say where it would put a label alone.
+const MIN_VOTES_OF_PASS: usize = 4;
+/// Where fewer labels are seen by several passes, the shared part is taken to be as large as the own part.
+pub const MIN_SHARED_LABELS: usize = 5;
+/// One label says no more than this about the disagreement of passes, as a multiple of what is expected.
+const MOST_DISAGREEMENT: f64 = 5.0;
+
+/// How far positions that parts of what is known of a label give it lie from their mean.
+#[derive(Debug, Clone, Copy)]
+pub struct Disagreement {
+    /// Squared, in sigmas.
+    square: f64,
+    /// Degrees of freedom.
+    freedom: f64,
+}
+
+impl Disagreement {
+    /// By how many standard deviations it is larger than expected: its cubic root is nearly Gaussian (Wilson and Hilferty, "The distribution of
+    /// chi-square", 1931).
+    #[must_use]
+    pub fn sigmas(&self) -> f64 {
+        let variance = 2.0 / (9.0 * self.freedom);
+        ((self.square / self.freedom).cbrt() - (1.0 - variance)) / variance.sqrt()
+    }
+}
+
+/// What the passes of one side say of a label.
+struct Side {
+    /// Where they put it together, beside where it is, m.
+    offset_m: Vector3<f64>,
+    /// Covariance of that, m².
+    covariance: Matrix3<f64>,
+    /// Squared distances of where each puts it alone from there, in sigmas.
+    square: f64,
+    passes: u32,
+}
+
+/// What the passes of a label say of it, side by side.
+pub struct Sides(Vec<Side>);
+
+impl Sides {
+    /// Of the passes with enough votes. Nothing if they do not fix the label.
+    fn of(scene: &Scene, noise: &Noise, (votes, point): &Placed, care: Care) -> Option<Self> {
+        let passes: Vec<&[u32]> = visits(scene, votes).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS).collect();
+        let of_side = |side: &Vec<u32>| {
+            let (mut information, mut gradient, mut alone) = (Matrix3::zeros(), Vector3::zeros(), 0.0);
+            for &pass in side {
+                let looks = looks_at(scene, noise, noise, passes[pass as usize], point)?;
+                let (of_pass, by_pass) = Drive::at_one(&looks)?.normals.of_one();
+                alone += by_pass.dot(&of_pass.cholesky()?.solve(&by_pass));
+                information += of_pass;
+                gradient += by_pass;
+            }
+            let covariance = information.cholesky()?.inverse();
+            let offset_m = -covariance * gradient;
+            let square = (alone + gradient.dot(&offset_m)).max(0.0);
+            let rough = Side { offset_m, covariance, square, passes: side.len() as u32 };
+            if care == Care::Rough {
+                return Some(rough);
+            }
+            let votes: Vec<u32> = side.iter().flat_map(|&pass| passes[pass as usize]).copied().collect();
+            let Estimate { point: there, covariance } = estimate(scene, noise, &votes, *point, care)?;
+            Some(Side { offset_m: there - point, covariance, ..rough })
+        };
+        sides(scene, passes.iter().copied()).iter().map(of_side).collect::<Option<_>>().map(Self)
+    }
+
+    /// Of the passes of each side with each other. Nothing if no side has two.
+    #[must_use]
+    pub fn within(&self) -> Option<Disagreement> {
+        let freedom = self.0.iter().map(|side| 3.0 * f64::from(side.passes - 1)).sum();
+        let square = self.0.iter().map(|side| side.square).sum();
+        (freedom > 0.0).then_some(Disagreement { square, freedom })
+    }
+
+    /// Of the sides with each other, if each shows another middle. Nothing if there are no two.
+    #[must_use]
+    pub fn between(&self, side_m: f64) -> Option<Disagreement> {
+        let freedom = 3.0 * (self.0.len().checked_sub(1)? as f64);
+        let (mut information, mut sum, mut square) = (Matrix3::zeros(), Vector3::zeros(), 0.0);
+        for side in &self.0 {
+            let of_side = (side.covariance + Matrix3::identity() * (side_m * side_m)).cholesky()?.inverse();
+            let weighted = of_side * side.offset_m;
+            information += of_side;
+            sum += weighted;
+            square += side.offset_m.dot(&weighted);
+        }
+        square -= sum.dot(&information.cholesky()?.solve(&sum));
+        (freedom > 0.0).then(|| Disagreement { square: square.max(0.0), freedom })
+    }
+
+    /// Of all passes with each other. Nothing if there is only one.
+    fn all(&self, side_m: f64) -> Option<Disagreement> {
+        let parts = [self.within(), self.between(side_m)];
+        parts
+            .into_iter()
+            .flatten()
+            .reduce(|a, b| Disagreement { square: a.square + b.square, freedom: a.freedom + b.freedom })
+    }
+}
+
+/// How far the positions that the passes of a label give it alone lie from their mean. Nothing for labels of a single pass.
+#[must_use]
+pub fn disagreement(scene: &Scene, noise: &Noise, label: &Placed) -> Option<Disagreement> {
+    Sides::of(scene, noise, label, Care::Rough)?.all(noise.side_m)
+}
+
+/// That of each of some labels.
+#[must_use]
+pub fn disagreements(scene: &Scene, noise: &Noise, labels: &[&Placed]) -> Vec<Option<Disagreement>> {
+    labels.par_iter().map(|label| disagreement(scene, noise, label)).collect()
+}
+
+/// What the passes of each of some labels say of it.
+#[must_use]
+pub fn sides_of_all(scene: &Scene, noise: &Noise, labels: &[&Placed], care: Care) -> Vec<Option<Sides>> {
+    labels.par_iter().map(|label| Sides::of(scene, noise, label, care)).collect()
+}
+
+/// How much larger than they are said to be the errors are that labels of several passes show: the mean disagreement of
+/// their passes, at least 1. The variance of positions is to be multiplied by it. About `most` of the labels serve.
+#[must_use]
+pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Placed], most: usize) -> f64 {
+    let labels: Vec<&Placed> = labels.iter().step_by((labels.len() / most).max(1)).collect();
+    mean(disagreements(scene, noise, &labels)).unwrap_or(1.0).max(1.0)
+}
+
+/// The mean of those that are known, a degree of freedom, without letting one say too much.
+#[must_use]
+pub fn mean(of_labels: Vec<Option<Disagreement>>) -> Option<f64> {
+    let known: Vec<f64> =
+        of_labels.into_iter().flatten().map(|one| (one.square / one.freedom).min(MOST_DISAGREEMENT)).collect();
+    (known.len() >= MIN_SHARED_LABELS).then(|| known.iter().sum::<f64>() / known.len() as f64)
+}

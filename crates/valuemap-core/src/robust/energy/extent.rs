@@ -1,0 +1,53 @@
+//! Where an object may be.
+
+use nalgebra::Vector3;
+
+use super::Object;
+use crate::robust::model::Model;
+use crate::robust::noise::{Noise, norm};
+
+/// Detections are looked for as far from an object as this many of its standard deviations.
+const REACH_SIGMAS: f64 = 4.0;
+/// In so many steps at most: an object whose depth is hardly known is looked for where it may be by its size, not for ever.
+const MOST_STEPS: f64 = 32.0;
+
+/// Where an object may be: along the direction that it is least known in, so densely that gates leave no gap.
+#[must_use]
+pub fn places_of(model: &Model<'_>, object: &Object) -> Vec<Vector3<f64>> {
+    let axes = object.fit.covariance.symmetric_eigen();
+    let longest = axes.eigenvalues.imax();
+    let sigma = axes.eigenvalues[longest].max(0.0).sqrt();
+    let across = axes.eigenvalues.sum() - axes.eigenvalues[longest];
+    if sigma * sigma < 4.0 * across.max(0.0) {
+        return vec![object.fit.point];
+    }
+    let reach = axes.eigenvectors.column(longest) * (sigma * REACH_SIGMAS);
+    // A gate is at least as wide as errors of position make it.
+    let Noise { position_m, position_segment_m, position_drift_m, .. } = *model.noise;
+    let gate_m = model.settings.gate_sigmas * norm(norm(position_m, position_segment_m), position_drift_m);
+    let gates = sigma * REACH_SIGMAS / gate_m;
+    let steps = if gates > REACH_SIGMAS { gates.ceil().min(MOST_STEPS) } else { REACH_SIGMAS };
+    (-steps as i32..=steps as i32).map(|step| object.fit.point + reach * (f64::from(step) / steps)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::anywhere;
+    use super::super::seen::Seen;
+    use super::*;
+    use crate::street;
+
+    #[test]
+    fn places_along_a_badly_known_axis_leave_no_gap_between_gates() {
+        let noise = Noise { position_m: 0.5, ..street::NOISE };
+        let scene = street::street(4, 1.0, &[Vector3::new(20.0, 3.0, 2.0)], &[[0.0, 0.0]]);
+        let model = Model::new(&scene, &noise, &street::SETTINGS);
+        let mut object = anywhere(3, Seen::default(), -10.0);
+        object.fit.covariance = nalgebra::Matrix3::from_diagonal(&Vector3::new(16.0, 0.04, 0.04));
+        let places = places_of(&model, &object);
+        let reach_m = (places[places.len() - 1] - places[0]).norm();
+        assert!((reach_m - 2.0 * 4.0 * REACH_SIGMAS).abs() < 1e-9, "{reach_m}");
+        let gate_m = street::GATE_SIGMAS * noise.position_m;
+        assert!(places.windows(2).all(|pair| (pair[1] - pair[0]).norm() <= gate_m));
+    }
+}

@@ -1,0 +1,84 @@
+//! Final positions and covariances: the objects of one place are estimated together.
+//!
+//! Objects of one place share the pose errors of their images ([`estimate`](crate::robust::energy::estimate)). Votes that a neighbour might have
+//! widen the covariance ([`contest`](super::contest)).
+
+use rayon::prelude::*;
+
+use super::contest::{Contest, widened};
+use crate::robust::energy::Object;
+use crate::robust::energy::estimate::{Care, Estimate, Joint, Start};
+use crate::robust::energy::places::places;
+use crate::robust::model::Model;
+use crate::robust::parts::Part;
+
+/// Objects within this share of the range of the one with the most votes are estimated with it.
+const PLACE_SHARE: f64 = 0.4;
+/// The estimate of every object, in their order.
+#[must_use]
+pub fn positions(model: &Model<'_>, objects: &[Object]) -> Vec<Estimate> {
+    let contest = Contest::new(model, objects);
+    let mut estimates: Vec<Estimate> =
+        objects.iter().map(|object| Estimate { point: object.fit.point, covariance: object.fit.covariance }).collect();
+    let places = places(objects, model.settings.viability.max_range_m * PLACE_SHARE);
+    // One at a time: the first ones are the largest.
+    let found: Vec<Vec<(usize, Estimate)>> =
+        places.par_iter().with_max_len(1).map(|place| together(model, objects, place, &contest)).collect();
+    for (i, estimate) in found.into_iter().flatten() {
+        estimates[i] = estimate;
+    }
+    estimates
+}
+
+/// Objects that cannot be estimated together are estimated one by one.
+fn together(model: &Model<'_>, objects: &[Object], place: &[usize], contest: &Contest<'_>) -> Vec<(usize, Estimate)> {
+    let starts = place.iter().map(|&i| Start { voters: &objects[i].votes, weights: &[], point: objects[i].fit.point });
+    let Some(solution) = Joint::new(model.scene, model.noise, starts, Care::Exact).with_priors(model).solve() else {
+        if place.len() == 1 {
+            return Vec::new();
+        }
+        return place.iter().flat_map(|&i| together(model, objects, &[i], contest)).collect();
+    };
+    let contested = contest.contested(&solution);
+    let is_contested = contested.contains(&true) && model.settings.has(Part::Contest);
+    let sure = is_contested.then(|| solution.without(&contested)).flatten();
+    let sure = sure.as_ref().unwrap_or(&solution.estimates);
+    place.iter().zip(&solution.estimates).zip(sure).map(|((&i, found), sure)| (i, widened(found, sure))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+    use crate::robust::energy::looks::Lookout;
+    use crate::robust::energy::object;
+    use crate::robust::model::heights::Heights;
+    use crate::robust::noise::Noise;
+    use crate::street;
+
+    #[test]
+    fn heights_tell_how_far_objects_are_but_not_how_high_the_cameras_were() {
+        let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
+        let objects: Vec<Vector3<f64>> =
+            (0..10).map(|i| Vector3::new(30.0 + f64::from(i), f64::from(i - 5), 3.0)).collect();
+        let scene = street::street(4, 2.0, &objects, &errors);
+        let noise = Noise { position_drift_m: 0.2, ..street::NOISE };
+        let mut model = Model::new(&scene, &noise, &street::SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let votes = |i: usize| scene.usable_rays().into_iter().skip(i).step_by(objects.len()).collect();
+        let found: Vec<Object> =
+            (0..10).filter_map(|i| object(&model, &lookout, votes(i), objects[i], Vec::new())).collect();
+        assert_eq!(found.len(), objects.len());
+        let without = positions(&model, &found);
+        let heights: Vec<f64> = (0..60).map(|i| 3.0 + 0.01 * f64::from(i % 5 - 2)).collect();
+        model.classes[0].heights = Heights::learn(&heights, &[0.02; 60], 50.0);
+        let with = positions(&model, &found);
+        let sigma_m = |estimate: &Estimate, axis: usize| estimate.covariance[(axis, axis)].sqrt();
+        // Those that are not begun near their height are taken for objects that are elsewhere.
+        let told = with.iter().zip(&without).filter(|(with, without)| sigma_m(with, 0) < 0.5 * sigma_m(without, 0));
+        assert!(told.count() >= 7);
+        // All cameras may be 0.2 m higher or lower than is said, and all objects with them.
+        assert!(with.iter().all(|with| sigma_m(with, 2) > 0.19));
+    }
+}

@@ -1,0 +1,180 @@
+//! Identity switches: an object that begins to be seen where another one ends, and never beside it, is that other one.
+//!
+//! Poses that are off by some metres put what is seen from there somewhere else, and two objects then have less J than one. In
+//! the pictures it is one: its box hardly moves from one image to the next. Images a few metres apart have the same pose error,
+//! so their residuals at a place nearby differ by errors of single images alone, however wrong the place and the poses are.
+
+use crate::robust::energy::estimate::visits;
+use crate::robust::energy::looks::looks_among;
+use crate::robust::energy::{Object, implied_size};
+use crate::robust::model::Model;
+use crate::robust::noise::drift::SEGMENT_M;
+use crate::robust::parts::Part;
+use crate::robust::search::rearrange::may_be_one;
+
+/// That an object is missed in all images that show another one is chance where it is more probable than one in a thousand: so many objects has a map.
+const LN_BY_CHANCE: f64 = -6.9;
+
+/// Whether each of some objects is another one of them in the pictures, which J would miss more.
+#[must_use]
+pub fn are_others(model: &Model<'_>, objects: &[&Object]) -> Vec<bool> {
+    let mut switches = if model.settings.has(Part::IdentitySwitches) { switches(model, objects) } else { Vec::new() };
+    let energy = |i: usize| objects[i].energy;
+    switches
+        .sort_by(|a, b| energy(a.0).total_cmp(&energy(b.0)).then(energy(a.1).total_cmp(&energy(b.1))).then(a.cmp(b)));
+    let mut is_left_out = vec![false; objects.len()];
+    for (stronger, weaker) in switches {
+        is_left_out[weaker] |= !is_left_out[stronger];
+    }
+    is_left_out
+}
+
+/// Pairs of objects that are one in the pictures, the stronger one first.
+fn switches(model: &Model<'_>, objects: &[&Object]) -> Vec<(usize, usize)> {
+    let mut votes: Vec<(u32, usize)> =
+        objects.iter().enumerate().flat_map(|(i, object)| object.votes.iter().map(move |&ray| (ray, i))).collect();
+    votes.sort_unstable();
+    let in_order = |(i, k): (usize, usize)| if objects[i].energy <= objects[k].energy { (i, k) } else { (k, i) };
+    let pairs = (0..votes.len()).filter_map(|at| goes_on_as(model, objects, &votes[at..]));
+    let mut pairs: Vec<(usize, usize)> = pairs.map(in_order).collect();
+    pairs.sort_unstable();
+    pairs.dedup();
+    pairs.retain(|&(stronger, weaker)| are_exclusive(model, objects[stronger], objects[weaker]));
+    pairs
+}
+
+/// The object of the first of some votes (ray and object, ascending), and another one that the camera sees in its place in the next images.
+fn goes_on_as(model: &Model<'_>, objects: &[&Object], votes: &[(u32, usize)]) -> Option<(usize, usize)> {
+    let (&(ray, here), after) = votes.split_first()?;
+    let (scene, view) = (model.scene, model.scene.view(ray));
+    let image = |vote: &(u32, usize)| scene.rays.image[vote.0 as usize];
+    for next in after.chunk_by(|a, b| image(a) == image(b)) {
+        let there = scene.view(next[0].0);
+        if there.pass != view.pass || there.driven_m - view.driven_m > SEGMENT_M {
+            return None;
+        }
+        if there.camera != view.camera || image(&next[0]) == image(&votes[0]) {
+            continue;
+        }
+        if next.iter().any(|vote| vote.1 == here) {
+            return None;
+        }
+        let goes_on = |vote: &&(u32, usize)| show_one(model, [objects[here], objects[vote.1]], [ray, vote.0]);
+        if let Some(&(_, other)) = next.iter().find(goes_on) {
+            return Some((here, other));
+        }
+    }
+    None
+}
+
+/// Whether no image shows both of two objects, the weaker one is seen on one visit alone, and that each is missed in all images of the other that
+/// look at it is more than chance.
+fn are_exclusive(model: &Model<'_>, stronger: &Object, weaker: &Object) -> bool {
+    if weaker.is_seen_beside(model.scene, stronger) {
+        return false;
+    }
+    let looks = looks_among(model, stronger, &weaker.votes).min(looks_among(model, weaker, &stronger.votes));
+    let recall = model.classes[stronger.class as usize].rates.recall;
+    visits(model.scene, &weaker.votes).count() == 1 && looks * (1.0 - recall).ln() < LN_BY_CHANCE
+}
+
+/// Whether two rays, one of each of two objects, show one thing in two images nearby: as near to each other, and as large, as one thing would be.
+fn show_one(model: &Model<'_>, objects: [&Object; 2], rays: [u32; 2]) -> bool {
+    let (scene, gate) = (model.scene, model.settings.gate_sigmas);
+    let is_one = |object: &Object| {
+        let point = object.fit.point;
+        let [a, b] = rays.map(|ray| scene.ray(ray).project(&point));
+        let [x, y] = [a, b].map(|projected| projected.xy() / projected.z);
+        let own_px2 = |ray: u32, depth_m: f64| model.noise.own(scene, ray).variance(depth_m);
+        let is_near = (x - y).norm_squared() <= gate * gate * (own_px2(rays[0], a.z) + own_px2(rays[1], b.z));
+        let [s, t] = rays.map(|ray| implied_size(model, ray, &point));
+        a.z > 0.0 && b.z > 0.0 && is_near && model.class_of(rays[0]).sizes.agree(s, t, gate)
+    };
+    may_be_one(model, objects[0], objects[1]) && objects.into_iter().any(is_one)
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+    use crate::robust::energy::looks::Lookout;
+    use crate::robust::energy::object;
+    use crate::robust::scene::Scene;
+    use crate::street::{NOISE, SETTINGS, joined, street};
+
+    const SIGN: [f64; 3] = [40.0, 2.0, 1.0];
+
+    /// A sign, and another one three metres behind it.
+    fn drive() -> Scene {
+        let other = Vector3::from(SIGN) + Vector3::new(3.0, 1.0, 0.0);
+        street(60, 1.0, &[SIGN.into(), other], &[[0.3, -0.2], [-0.4, 0.1], [0.2, 0.4]])
+    }
+
+    /// The votes of two objects, by number of the sign, image and pass; the second one is where wrong poses put it. Whether each is the other one.
+    fn of_votes(scene: &Scene, votes: [&dyn Fn(usize, u32, u32) -> bool; 2]) -> Vec<bool> {
+        let model = Model::new(scene, &NOISE, &SETTINGS);
+        let lookout = Lookout::new(scene, SETTINGS.viability.max_range_m);
+        let number =
+            |ray: u32| ray as usize - scene.rays.image.partition_point(|&image| image < scene.rays.image[ray as usize]);
+        let first_of_pass = |pass: u32| scene.views.partition_point(|view| view.pass < pass) as u32;
+        let begun = |is_vote: &dyn Fn(usize, u32, u32) -> bool| -> Option<Object> {
+            let of = |ray: &u32| {
+                let pass = scene.view(*ray).pass;
+                is_vote(number(*ray), scene.rays.image[*ray as usize] - first_of_pass(pass), pass)
+            };
+            let votes: Vec<u32> = (0..scene.rays.rays.len() as u32).filter(of).collect();
+            object(&model, &lookout, votes, SIGN.into(), Vec::new())
+        };
+        let [Some(whole), Some(mut part)] = votes.map(begun) else { return Vec::new() };
+        part.fit.point += Vector3::new(1.5, 1.0, 0.3);
+        assert!(whole.energy < part.energy);
+        are_others(&model, &[&whole, &part])
+    }
+
+    #[test]
+    fn what_takes_an_object_s_place_in_the_pictures_is_that_object() {
+        let far = |sign, image, _| sign == 0 && image < 25;
+        let near = |sign, image, _| sign == 0 && image >= 25;
+        assert_eq!(of_votes(&drive(), [&far, &near]), [false, true]);
+    }
+
+    #[test]
+    fn what_is_elsewhere_in_the_pictures_is_not() {
+        let far = |sign, image, _| sign == 0 && image < 25;
+        let of_other = |sign, image, _| sign == 1 && image >= 25;
+        assert_eq!(of_votes(&drive(), [&far, &of_other]), [false, false]);
+    }
+
+    #[test]
+    fn what_is_much_larger_is_not() {
+        let mut scene = drive();
+        let rays = scene.rays.clone();
+        scene.box_px.iter_mut().zip(&rays.image).filter(|(_, image)| **image >= 25).for_each(|(size, _)| *size *= 50.0);
+        let far = |sign, image, _| sign == 0 && image < 25;
+        let near = |sign, image, _| sign == 0 && image >= 25;
+        assert_eq!(of_votes(&scene, [&far, &near]), [false, false]);
+    }
+
+    #[test]
+    fn what_is_seen_beside_it_is_not() {
+        let far = |sign, image, _| sign == 0 && image < 25;
+        let near = |sign, image, _| sign == 0 && image >= 25 || sign == 1 && image == 10;
+        assert_eq!(of_votes(&drive(), [&far, &near]), [false, false]);
+    }
+
+    #[test]
+    fn what_is_seen_on_two_visits_is_not() {
+        let scene = joined(vec![drive(), drive()]);
+        let far = |sign, image, pass| sign == 0 && image < 25 && pass == 0;
+        let near = |sign, image, _| sign == 0 && image >= 25;
+        assert_eq!(of_votes(&scene, [&far, &near]), [false, false]);
+    }
+
+    #[test]
+    fn what_few_images_show_is_not() {
+        let far = |sign, image, _| sign == 0 && image < 25;
+        let near = |sign, image, _| sign == 0 && (25..28).contains(&image);
+        assert_eq!(of_votes(&drive(), [&far, &near]), [false, false]);
+    }
+}

@@ -1,0 +1,515 @@
+//! What a map tells about each class: detection rates, sizes, heights, distances, birth density, clutter and scores.
+//!
+//! Robust moments over sure objects, and expectation maximisation for the rates. Classes of too few sure objects are taken to be like all together.
+
+pub mod aspect;
+pub mod company;
+pub mod confusion;
+pub mod counts;
+pub mod existence;
+pub mod reach;
+pub mod tails;
+
+use rayon::prelude::*;
+
+use crate::robust::energy::looks::Lookout;
+use crate::robust::energy::seen::{Looks, Shares};
+use crate::robust::energy::{Object, implied_size};
+use crate::robust::model::heights::{Heights, ground_m2 as ground_m2_within, height_m};
+use crate::robust::model::steps::{elevation_factor, score_ratio};
+use crate::robust::model::{ClassModel, Model, ODD_PASSES, Rates};
+use crate::robust::parts::Part;
+use aspect::aspect;
+use company::company;
+use reach::{looked_at, reach};
+use tails::{OfImages, tails};
+
+/// Steps of expectation and maximisation: some ten change the rates by less than a thousandth.
+const STEPS: usize = 20;
+/// Objects with fewer votes do not serve where there are better ones.
+const MIN_VOTES: usize = 6;
+/// If fewer than `MIN_OBJECTS` of all classes have so many, those with at least this many serve where elevations are measured: rays alone tell where they
+/// are, with three residuals to spare. Of bearings alone there would be one.
+const LEAST_VOTES: usize = 3;
+/// Shares of odd passes that are compared: so many that a tenth of their deviation is between two where a thousand passes tell.
+const ODD_SHARES: usize = 45;
+/// The part of the votes that is nearer than what counts as seen from everywhere.
+const NEAR_VOTES: f64 = 0.05;
+/// Boxes that are all put on one elevation, as those of bearings are on the horizon, differ in its sine by no more than rounding.
+const LEAST_ELEVATIONS: f64 = 1e-6;
+/// Fewer of these tell nothing, and what was thought before stays.
+const MIN_OBJECTS: usize = 5;
+/// What is seen in less than this part of the looks that are usual is rather false than real.
+const HARDLY: f64 = 0.5;
+/// Rates of fewer looks are known worse than to a tenth.
+pub(crate) const LEAST_LOOKS: f64 = 30.0;
+/// The median absolute deviation of a normal distribution, in standard deviations.
+const MAD_OF_NORMAL: f64 = 0.6745;
+/// A spread of sizes is no smaller: boxes are whole pixels, and edges are not the same all around.
+const LEAST_SPREAD: f64 = 0.03;
+
+/// Learn the classes of a model from the objects that some rays make. Classes of few objects are taken to be like all objects together, but for how
+/// many there are and how much clutter.
+pub fn learn(model: &mut Model<'_>, lookout: &Lookout, rays: &[u32], objects: &[Object]) {
+    let evidence = Evidence::new(model, lookout, rays, objects);
+    let all: Vec<&Object> = objects.iter().collect();
+    let pooled = evidence.learned(&all, rays, &model.pooled);
+    let is_only = |before: &ClassModel| model.classes.len() == 1 && has_same_numbers(before, &model.pooled);
+    let classes: Vec<ClassModel> = (0..)
+        .zip(&model.classes)
+        .map(|(class, before)| {
+            // All together are the only one.
+            if pooled.is_learned && is_only(before) {
+                return pooled;
+            }
+            let of_class: Vec<&Object> = all.iter().copied().filter(|object| object.class == class).collect();
+            let rays: Vec<u32> =
+                rays.iter().copied().filter(|&ray| model.scene.rays.class[ray as usize] == class).collect();
+            let learned = evidence.learned(&of_class, &rays, before);
+            if learned.is_learned { learned } else { evidence.like(&pooled, &learned, of_class.len()) }
+        })
+        .collect();
+    (model.pooled, model.classes) = (pooled, classes);
+}
+
+/// Whether two classes are alike to the bit, what is no number as well.
+fn has_same_numbers(a: &ClassModel, b: &ClassModel) -> bool {
+    a.to_row().iter().map(|number| number.to_bits()).eq(b.to_row().iter().map(|number| number.to_bits()))
+}
+
+/// What classes are learned from.
+struct Evidence<'a> {
+    model: &'a Model<'a>,
+    lookout: &'a Lookout,
+    objects: &'a [Object],
+    /// Whether each ray is a vote.
+    is_vote: Vec<bool>,
+    solid_angle_sr: f64,
+    ground_m2: f64,
+    looked_at: (f64, f64),
+    /// Objects with fewer votes do not serve.
+    least_votes: usize,
+}
+
+impl<'a> Evidence<'a> {
+    fn new(model: &'a Model<'a>, lookout: &'a Lookout, rays: &[u32], objects: &'a [Object]) -> Self {
+        let mut is_vote = vec![false; model.scene.rays.rays.len()];
+        objects.iter().flat_map(|object| &object.votes).for_each(|&ray| is_vote[ray as usize] = true);
+        let sure = objects.iter().filter(|object| is_sure(object)).count();
+        let looked_at = span(&model.sin_elevation);
+        let are_elevations_measured = looked_at.1 - looked_at.0 > LEAST_ELEVATIONS;
+        let least_votes = if sure < MIN_OBJECTS && are_elevations_measured { LEAST_VOTES } else { MIN_VOTES };
+        Self {
+            model,
+            lookout,
+            objects,
+            is_vote,
+            solid_angle_sr: model.solid_angle_sr(rays.len()),
+            ground_m2: ground_m2(model, objects, least_votes) * model.share_of(rays.len()),
+            looked_at,
+            least_votes,
+        }
+    }
+
+    /// What objects and rays of a class tell.
+    fn learned(&self, of_class: &[&Object], rays: &[u32], before: &ClassModel) -> ClassModel {
+        let model = self.model;
+        let (in_class, clutter): (Vec<u32>, Vec<u32>) = rays.iter().partition(|&&ray| self.is_vote[ray as usize]);
+        // One detection more than is seen: no clutter at all is never known for sure.
+        let ln_clutter_per_sr = ((clutter.len() + 1) as f64 / self.solid_angle_sr).ln();
+        let mut learned = ClassModel { ln_clutter_per_sr, ..*before };
+        let of = |column: &[f64], rays: &[u32]| rays.iter().map(|&ray| column[ray as usize]).collect::<Vec<f64>>();
+        let has = |part: Part| model.settings.has(part);
+        if has(Part::Scores) {
+            learned.score_ratio = score_ratio(&of(&model.scene.score, &in_class), &of(&model.scene.score, &clutter));
+        }
+        if has(Part::Elevations) {
+            let mut sigmas: Vec<f64> = clutter.iter().map(|&ray| far_sigma_rad(model, ray)).collect();
+            let resolution = median(&mut sigmas).unwrap_or(0.0);
+            learned.clutter_by_elevation =
+                elevation_factor(&of(&model.sin_elevation, &clutter), self.looked_at, resolution);
+        }
+        let many: Vec<&Object> =
+            of_class.iter().copied().filter(|object| object.votes.len() >= self.least_votes).collect();
+        let sure: Vec<&Object> = many.iter().copied().filter(|object| object.real > 0.5).collect();
+        if sure.len() >= MIN_OBJECTS {
+            learned.is_learned = true;
+            (learned.rates, learned.odd_passes) = rates(&many, before);
+            (learned.nearest_m, learned.farthest_m) = distances_between_m(model, &sure);
+            let (spread, object) = sizes(model, &sure);
+            learned.sizes.spread = spread.max(LEAST_SPREAD);
+            learned.sizes.object = (object.0, object.1.max(learned.sizes.spread));
+            learned.heights = if has(Part::Heights) { heights(model, &sure) } else { None };
+            learned.ln_births_per_m2 = (of_class.len() as f64 / self.ground_m2).ln();
+            // False things have many looks and few hits: they would teach that objects are hardly seen, and then look real.
+            let seen: Vec<&Object> = sure.iter().copied().filter(|object| !is_hardly_seen(object, &learned)).collect();
+            let looked_at = looked_at(model, self.lookout, &seen, learned.farthest_m);
+            if has(Part::Reach) {
+                learned.reach = reach(model, &looked_at, learned.farthest_m);
+            }
+            if has(Part::Aspect) {
+                learned.aspect = aspect(model, &looked_at);
+            }
+            if has(Part::Tails) {
+                // What is hardly ever seen where it should be may be made of them.
+                let hardly = of_class.iter().filter(|object| is_hardly_seen(object, &learned));
+                let votes = hardly.flat_map(|object| object.votes.iter().copied());
+                let free = OfImages::new(model.scene, clutter.iter().copied().chain(votes));
+                learned.tails = tails(model, &looked_at, &free, ln_clutter_per_sr);
+            }
+            if has(Part::Company) {
+                learned.company = company(model, self.objects, &learned, of_class[0].class);
+            }
+        }
+        learned
+    }
+
+    /// A class of few objects, `own`, that are like those of all classes.
+    fn like(&self, pooled: &ClassModel, own: &ClassModel, objects: usize) -> ClassModel {
+        ClassModel { ln_births_per_m2: ((objects + 1) as f64 / self.ground_m2).ln(), ..pooled.with_own(own) }
+    }
+}
+
+/// Whether an object is rather false than real, as it is seen far less often than is usual.
+fn is_hardly_seen(object: &Object, class: &ClassModel) -> bool {
+    object.seen.share() < HARDLY * class.rates.recall
+}
+
+/// Whether an object has many votes, and is real rather than false.
+pub(crate) fn is_sure(object: &Object) -> bool {
+    object.votes.len() >= MIN_VOTES && object.real > 0.5
+}
+
+/// The ground from which objects are seen, m²: as far from the cameras as all but few votes are; nothing where nobody knows what is up.
+fn ground_m2(model: &Model<'_>, objects: &[Object], least_votes: usize) -> f64 {
+    let sure: Vec<&Object> = objects.iter().filter(|object| object.votes.len() >= least_votes).collect();
+    let mut distances = distances_m(model, &sure);
+    let place = (distances.len() as f64 * (1.0 - NEAR_VOTES)) as usize;
+    match model.up {
+        Some(up) if place < distances.len() => {
+            ground_m2_within(model.scene, &up, *distances.select_nth_unstable_by(place, f64::total_cmp).1)
+        }
+        _ => f64::NAN,
+    }
+}
+
+/// How high objects are above the cameras.
+fn heights(model: &Model<'_>, objects: &[&Object]) -> Option<Heights> {
+    let up = model.up?;
+    let of_object = |object: &&Object| {
+        let height_m = height_m(model.scene, model.up, &object.votes, &object.fit.point)?;
+        Some((height_m, up.dot(&(object.fit.covariance * up)).sqrt()))
+    };
+    let (heights_m, sigmas_m): (Vec<f64>, Vec<f64>) = objects.iter().filter_map(of_object).unzip();
+    Heights::learn(&heights_m, &sigmas_m, model.settings.viability.max_range_m)
+}
+
+/// Standard deviation of the direction of a ray, each axis, rad.
+fn far_sigma_rad(model: &Model<'_>, ray: u32) -> f64 {
+    (model.spreads[ray as usize].far_px2 / model.scene.scale2[ray as usize]).sqrt()
+}
+
+/// The least and the greatest of some numbers, those that are not numbers aside.
+fn span(numbers: &[f64]) -> (f64, f64) {
+    numbers
+        .iter()
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(least, most), &number| (least.min(number), most.max(number)))
+}
+
+/// The distances between which all but few votes are cast, m: those nearer, and those farther, are as few.
+fn distances_between_m(model: &Model<'_>, objects: &[&Object]) -> (f64, f64) {
+    let mut distances = distances_m(model, objects);
+    distances.sort_by(f64::total_cmp);
+    let few = (distances.len() as f64 * NEAR_VOTES) as usize;
+    (distances[few], distances[distances.len() - 1 - few])
+}
+
+/// How far all votes are from their objects, m.
+fn distances_m(model: &Model<'_>, objects: &[&Object]) -> Vec<f64> {
+    let of_object = |object: &&Object| -> Vec<f64> {
+        object.votes.iter().map(|&ray| (model.scene.ray(ray).center - object.fit.point).norm()).collect()
+    };
+    objects.iter().flat_map(of_object).collect()
+}
+
+/// The spread of the sizes of one object, and mean and standard deviation of those of all.
+fn sizes(model: &Model<'_>, objects: &[&Object]) -> (f64, (f64, f64)) {
+    let (mut away, mut medians) = (Vec::new(), Vec::new());
+    for object in objects {
+        let sizes = object.votes.iter().map(|&ray| implied_size(model, ray, &object.fit.point));
+        let mut sizes: Vec<f64> = sizes.filter(|size| size.is_finite()).collect();
+        if let Some(median) = median(&mut sizes) {
+            away.extend(sizes.iter().map(|size| (size - median).abs()));
+            medians.push(median);
+        }
+    }
+    let spread = median(&mut away).unwrap_or(f64::NAN) / MAD_OF_NORMAL;
+    let middle = median(&mut medians).unwrap_or(f64::NAN);
+    for size in &mut medians {
+        *size = (*size - middle).abs();
+    }
+    (spread, (middle, median(&mut medians).unwrap_or(f64::NAN) / MAD_OF_NORMAL))
+}
+
+pub(crate) fn median(values: &mut [f64]) -> Option<f64> {
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+/// How often objects are detected in the usual pass from where they have most votes, how much that differs between them, and the share of odd
+/// passes: by expectation and maximisation, so that what is false in the end has told nothing. From two starts, the likelier: objects that differ
+/// much, of which few are false, and objects that are alike.
+fn rates(objects: &[&Object], before: &ClassModel) -> (Rates, f64) {
+    let mut shares: Vec<f64> = objects.iter().filter_map(|object| object.seen.main_share()).collect();
+    let alike = median(&mut shares).map_or(Rates::ALIKE, |share| Rates { recall: recall(share), ..Rates::ALIKE });
+    let from = |rates: Rates| {
+        let class = learned_rates(objects, ClassModel { rates, odd_passes: ODD_PASSES.1, ..*before })?;
+        Some((ln_likelihood(objects, &class), class))
+    };
+    let (differing, alike) = rayon::join(|| from(Rates::GUESS), || from(alike));
+    let starts = [differing, alike].into_iter().flatten();
+    let Some((_, likeliest)) = starts.max_by(|a, b| a.0.total_cmp(&b.0)) else {
+        return (before.rates, before.odd_passes);
+    };
+    (likeliest.rates, odd_passes(objects, &likeliest))
+}
+
+/// The share of odd passes to expect, whatever it is within its bounds: where few objects tell, the likeliest share is as good as any other.
+fn odd_passes(objects: &[&Object], class: &ClassModel) -> f64 {
+    let (least, _, most) = ODD_PASSES;
+    let shares: [f64; ODD_SHARES] =
+        std::array::from_fn(|k| least + (most - least) * (k as f64 + 0.5) / ODD_SHARES as f64);
+    let ln_likelihood = |&odd_passes: &f64| ln_likelihood(objects, &ClassModel { odd_passes, ..*class });
+    let ln_likelihoods: Vec<f64> = shares.par_iter().map(ln_likelihood).collect();
+    let highest = ln_likelihoods.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let weights: Vec<f64> = ln_likelihoods.iter().map(|of_share| (of_share - highest).exp()).collect();
+    let sum: f64 = weights.iter().zip(shares).map(|(weight, share)| weight * share).sum();
+    sum / weights.iter().sum::<f64>()
+}
+
+/// Logarithm of how probable the looks at some objects are.
+fn ln_likelihood(objects: &[&Object], class: &ClassModel) -> f64 {
+    let shares = Shares::of(class);
+    objects.iter().map(|object| object.seen.judged(&shares).ln_likelihood()).sum()
+}
+
+/// The same from one start; nothing if there are few looks.
+fn learned_rates(objects: &[&Object], mut class: ClassModel) -> Option<ClassModel> {
+    for _ in 0..STEPS {
+        let shares = Shares::of(&class);
+        let of_object = |object: &&Object| {
+            let passes = object.seen.usual(&shares).into_iter();
+            passes.filter(|(pass, ..)| pass.expected >= 3.0).collect::<Vec<(Looks, f64, f64)>>()
+        };
+        let sides: Vec<Vec<(Looks, f64, f64)>> = objects.par_iter().map(of_object).collect();
+        let real: f64 = sides.iter().flatten().map(|pass| pass.1).sum();
+        let odd = 1.0 - sides.iter().flatten().map(|pass| pass.2).sum::<f64>() / real;
+        let of_side =
+            |passes: Vec<(Looks, f64, f64)>| passes.into_iter().map(|(pass, _, usual)| (pass, usual)).collect();
+        let sides: Vec<Vec<(Looks, f64)>> = sides.into_iter().map(of_side).collect();
+        let rates = rates_of(&sides)?;
+        class = ClassModel { rates, odd_passes: odd.clamp(ODD_PASSES.0, ODD_PASSES.2), ..class };
+    }
+    Some(class)
+}
+
+/// A share of hits as a rate: no detector sees all, and none that serves sees nothing.
+fn recall(share: f64) -> f64 {
+    share.clamp(0.05, 0.98)
+}
+
+/// Detection rates by the method of moments, from looks by side and pass that each count in part. Nothing of few looks.
+#[must_use]
+pub(crate) fn rates_of(sides: &[Vec<(Looks, f64)>]) -> Option<Rates> {
+    let all = || sides.iter().flatten();
+    let expected: f64 = all().map(|(looks, share)| share * looks.expected).sum();
+    let hits: f64 = all().map(|(looks, share)| share * looks.hits).sum();
+    if expected < LEAST_LOOKS {
+        return None;
+    }
+    let recall = recall(hits / expected);
+    let variance = recall * (1.0 - recall);
+    // The variance of a share of n looks is p (1 - p) (1 + (n - 1) / (1 + s)) / n.
+    let (mut excess, mut most) = (0.0, 0.0);
+    for (looks, share) in all() {
+        let n = looks.expected;
+        let away = looks.hits / n - recall;
+        excess += share * (n * away * away - variance);
+        most += share * (n - 1.0) * variance;
+    }
+    let of_all = f64::clamp(excess / most, 0.01, 0.5);
+    // Two passes of one side have in common what sides differ by.
+    let (mut common, mut pairs) = (0.0, 0.0);
+    for passes in sides {
+        let [mut away, mut looks, mut away2, mut looks2] = [0.0; 4];
+        for (pass, share) in passes {
+            let (a, n) = (share * (pass.hits - recall * pass.expected), share * pass.expected);
+            (away, looks, away2, looks2) = (away + a, looks + n, away2 + a * a, looks2 + n * n);
+        }
+        if looks > 0.0 {
+            common += (away * away - away2) / looks;
+            pairs += (looks * looks - looks2) / looks;
+        }
+    }
+    let of_sides = if pairs > 0.0 { f64::clamp(common / (pairs * variance), 0.0, of_all - 0.01) } else { 0.0 };
+    let within = f64::clamp((of_all - of_sides) / (1.0 - of_sides), 0.01, 0.5);
+    // The derivative of the logit is 1 / (p (1 - p)).
+    Some(Rates { recall, concentration: 1.0 / within - 1.0, between: (of_sides / variance).sqrt() })
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+    use crate::robust::energy::seen::Seen;
+    use crate::robust::energy::{anywhere, object};
+    use crate::robust::scene::Scene;
+    use crate::street;
+    use crate::street::SETTINGS;
+
+    /// An object that all passes see as usual from one side, and hardly any from another.
+    fn seen_from_one_side() -> Object {
+        let pass = |hits: f64| Looks { expected: 20.0, hits };
+        let sectors = [[20.0, 8.0, 16.0, 12.0, 18.0, 10.0], [0.0, 0.0, 1.0, 0.0, 2.0, 0.0]]
+            .map(|hits| hits.into_iter().map(pass).collect())
+            .to_vec();
+        anywhere(1, Seen { sectors, ln_turns: 0.0 }, -100.0)
+    }
+
+    #[test]
+    fn objects_of_few_votes_teach_only_where_there_are_no_others_and_elevations_are_measured() {
+        let scene = street::street(12, 2.0, &[Vector3::new(30.0, 4.0, 3.0)], &[[0.0, 0.0]]);
+        let mut model = Model::new(&scene, &street::NOISE, &SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let rays = scene.usable_rays();
+        let few = |model: &Model<'_>, objects: &[Object]| Evidence::new(model, &lookout, &rays, objects).least_votes;
+        let sure: Vec<Object> = (0..MIN_OBJECTS).map(|_| anywhere(MIN_VOTES, Seen::default(), -100.0)).collect();
+        assert_eq!(few(&model, &sure), MIN_VOTES);
+        assert_eq!(few(&model, &sure[1..]), LEAST_VOTES);
+        // Bearings: all boxes are put on the horizon, but for rounding.
+        for (i, sine) in model.sin_elevation.iter_mut().enumerate() {
+            *sine = 1e-12 * (i % 3) as f64;
+        }
+        assert_eq!(few(&model, &sure[1..]), MIN_VOTES);
+    }
+
+    #[test]
+    fn what_is_hardly_seen_does_not_teach_how_objects_are_seen() {
+        let place =
+            |i: usize| Vector3::new(70.0 + 3.0 * (i / 2) as f64, if i.is_multiple_of(2) { 8.0 } else { -8.0 }, 3.0);
+        let all: Vec<Vector3<f64>> = (0..12).map(place).collect();
+        let scene = street::street(90, 1.0, &all, &[[0.0; 2]]);
+        let mut model = Model::new(&scene, &street::NOISE, &SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let rays = scene.usable_rays();
+        // Those on the other side have a vote in each seventh image that shows them, and are thought to be real.
+        let of = |i: usize| -> Option<Object> {
+            let toward = |ray: u32| (all[i] - scene.ray(ray).center).normalize();
+            let of_object = rays.iter().copied().filter(|&ray| (scene.ray(ray).direction - toward(ray)).norm() < 1e-6);
+            let votes = of_object.step_by(if i.is_multiple_of(2) { 1 } else { 7 }).collect();
+            Some(Object { real: 1.0, ..object(&model, &lookout, votes, all[i], Vec::new())? })
+        };
+        let objects: Vec<Object> = (0..all.len()).filter_map(of).collect();
+        assert!(objects.iter().filter(|object| is_sure(object)).count() == all.len());
+        learn(&mut model, &lookout, &rays, &objects);
+        let least = model.classes[0].aspect.within_pass.concat().into_iter().fold(1.0, f64::min);
+        assert!(least > 0.7, "{least}");
+    }
+
+    #[test]
+    fn the_only_class_is_all_classes_together() {
+        let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
+        let all: Vec<Vector3<f64>> = (0..6).map(|i| Vector3::new(25.0 + 3.0 * f64::from(i), 4.0, 3.0)).collect();
+        let scene = street::joined((0..3).map(|i| street::street(12, 2.0, &all, &errors[7 * i..])).collect());
+        let mut model = Model::new(&scene, &street::NOISE, &SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let rays = scene.usable_rays();
+        let votes = |i: usize| rays.iter().copied().skip(i).step_by(all.len()).collect();
+        let objects: Vec<Object> =
+            (0..all.len()).filter_map(|i| object(&model, &lookout, votes(i), all[i], Vec::new())).collect();
+        let by_itself = {
+            let evidence = Evidence::new(&model, &lookout, &rays, &objects);
+            evidence.learned(&objects.iter().collect::<Vec<_>>(), &rays, &model.classes[0])
+        };
+        learn(&mut model, &lookout, &rays, &objects);
+        assert!(by_itself.is_learned && has_same_numbers(&model.classes[0], &by_itself));
+        assert!(has_same_numbers(&model.pooled, &by_itself));
+    }
+
+    #[test]
+    fn passes_are_not_odd_from_where_an_object_is_not_seen() {
+        let objects: Vec<Object> = (0..9).map(|_| seen_from_one_side()).collect();
+        let (rates, odd_passes) = rates(&objects.iter().collect::<Vec<_>>(), &guess());
+        assert!((rates.recall - 0.7).abs() < 0.05, "{rates:?}");
+        assert!(odd_passes < 0.1, "{odd_passes}");
+    }
+
+    #[test]
+    fn few_objects_do_not_tell_that_hardly_any_pass_is_odd() {
+        let seen = |hits: f64| {
+            let passes = vec![Looks { expected: 20.0, hits }];
+            anywhere(1, Seen { sectors: vec![passes], ln_turns: 0.0 }, -100.0)
+        };
+        let of = |count: usize| -> Vec<Object> { (0..count).map(|i| seen(16.0 + (i % 3) as f64)).collect() };
+        let class_of = |count: usize| {
+            let objects = of(count);
+            let (rates, odd_passes) = rates(&objects.iter().collect::<Vec<_>>(), &guess());
+            ClassModel { rates, odd_passes, ..guess() }
+        };
+        let (few, many) = (class_of(6), class_of(600));
+        assert!(few.odd_passes > 0.12 && many.odd_passes < 0.06, "{} {}", few.odd_passes, many.odd_passes);
+        // So what is seen less there may be real after all.
+        let less = seen(3.0).seen;
+        let [by_few, by_many] = [&few, &many].map(|class| less.judged(&Shares::of(class)).real());
+        assert!(by_few > 0.5 && by_many < 0.4, "{by_few} {by_many}");
+    }
+
+    #[test]
+    fn what_looks_like_an_object_at_times_does_not_tell_how_often_objects_are_seen() {
+        let seen = |hits: &[f64]| {
+            let passes = hits.iter().map(|&hits| Looks { expected: 40.0, hits }).collect();
+            anywhere(1, Seen { sectors: vec![passes], ln_turns: 0.0 }, -100.0)
+        };
+        let objects = (0..60).map(|i| seen(&[34.0 + f64::from(i % 5), 38.0 - f64::from(i % 3)]));
+        let lookalikes = (0..12).map(|i| seen(&[17.0 + f64::from(i % 9), 22.0 - f64::from(i % 7)]));
+        let all: Vec<Object> = objects.chain(lookalikes).collect();
+        let (rates, odd_passes) = rates(&all.iter().collect::<Vec<_>>(), &guess());
+        assert!(rates.recall > 0.88 && rates.concentration > 15.0, "{rates:?}");
+        let class = ClassModel { rates, odd_passes, ..guess() };
+        let least = all[..60].iter().map(|object| object.seen.judged(&Shares::of(&class)).real()).fold(1.0, f64::min);
+        let most = all[60..].iter().map(|object| object.seen.judged(&Shares::of(&class)).real()).fold(0.0, f64::max);
+        assert!(least > 0.9 && most < 0.5, "{least} {most}");
+    }
+
+    #[test]
+    fn objects_that_all_looks_see_have_rates_as_well() {
+        let passes = || vec![Looks { expected: 12.0, hits: 12.0 }];
+        let objects: Vec<Object> =
+            (0..20).map(|_| anywhere(1, Seen { sectors: vec![passes()], ln_turns: 0.0 }, -100.0)).collect();
+        let (rates, odd_passes) = rates(&objects.iter().collect::<Vec<_>>(), &guess());
+        assert!(rates.recall > 0.9 && rates.concentration > 1.0 && rates.between >= 0.0, "{rates:?}");
+        let class = ClassModel { rates, odd_passes, ..guess() };
+        assert!(objects[0].seen.judged(&Shares::of(&class)).real() > 0.9);
+    }
+
+    /// What is thought of a class at first.
+    fn guess() -> ClassModel {
+        ClassModel::guess(&Scene::default(), &SETTINGS, 0, (f64::NAN, f64::NAN), (f64::NAN, f64::NAN))
+    }
+
+    #[test]
+    fn what_sides_differ_by_is_told_from_what_passes_differ_by() {
+        let pass = |hits: f64| (Looks { expected: 20.0, hits }, 1.0);
+        let of_sides = |hits: &[[f64; 4]]| {
+            let sides: Vec<Vec<(Looks, f64)>> =
+                hits.iter().map(|side| side.iter().map(|&h| pass(h)).collect()).collect();
+            rates_of(&sides).unwrap_or(Rates::ANY)
+        };
+        let by_side = of_sides(&[[18.0, 17.0, 18.0, 19.0], [8.0, 9.0, 8.0, 7.0], [13.0, 14.0, 12.0, 13.0]]);
+        let by_pass = of_sides(&[[18.0, 8.0, 13.0, 14.0], [17.0, 9.0, 12.0, 13.0], [18.0, 8.0, 19.0, 7.0]]);
+        assert!(by_side.between > 0.6 && by_side.concentration > 50.0, "{by_side:?}");
+        assert!(by_pass.between < 0.1 && by_pass.concentration < 20.0, "{by_pass:?}");
+        assert!((by_side.recall - by_pass.recall).abs() < 1e-9);
+    }
+}

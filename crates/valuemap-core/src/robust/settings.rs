@@ -1,0 +1,30 @@
+//! Settings of the robust method.
+
+use crate::robust::parts::{Part, Without};
+use crate::viability::Viability;
+
+/// What a map is made with.
+#[derive(Debug, Clone, Copy)]
+pub struct Settings {
+    /// Which pairs propose points; the error in pixels is not used.
+    pub viability: Viability,
+    /// The gate, in sigmas.
+    pub gate_sigmas: f64,
+    /// Labels with fewer voters are dropped.
+    pub min_votes: u32,
+    /// Objects of which heights are known need no more than so many.
+    pub least_votes: u32,
+    /// Labels that exist with a smaller probability are dropped.
+    pub min_existence: f64,
+    /// Parts that are left out, to see what they are worth.
+    pub without: Without,
+}
+
+impl Settings {
+    /// Whether a part of the method is in use.
+    #[inline]
+    #[must_use]
+    pub const fn has(&self, part: Part) -> bool {
+        !self.without.has(part)
+    }
+}
