@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 import laws
 import valuemap
 from test_simulate import EXACT_BOXES, EXACT_POSES
-from valuemap import camera_models, pipeline
+from valuemap import camera_models, correction, pipeline
 from valuemap.cameras import camera_poses, cast_rays
 from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import Dataset, rows_of, write_dataset
@@ -46,6 +46,7 @@ from valuemap.refine.tracks import merge_objects
 from valuemap.remote import Place
 from valuemap.robust import calibration_from_json
 from valuemap.simulate import simulate
+from valuemap.stages import Stages
 from valuemap.tables import Bools, Floats, Images, Ints, covariance_matrices
 from valuemap.tiles.compare import Comparison
 from valuemap.tiles.mapping import solve_cells
@@ -265,7 +266,7 @@ def test_a_map_proves_what_single_drives_leave_in_doubt() -> None:
     assert doubtful.found is not None
     assert doubtful.dataset is faulty
     assert not doubtful.is_corrected
-    refined = pipeline._told_by_a_map(faulty, doubtful, config, 1, silent)
+    refined = correction._told_by_a_map(faulty, doubtful, config, 1, silent)
     assert refined.is_corrected
     assert refined.record["cameras"][0]["focal_length_factor"] == pytest.approx(0.98, abs=0.005)
 
@@ -289,7 +290,7 @@ def test_what_is_proven_is_compared_before_a_map_tells_more_and_what_is_in_doubt
     monkeypatch.setattr(pipeline, "refine_poses", lambda *_, **__: at_last if is_proven else at_first)
     monkeypatch.setattr(pipeline, "_told_by_a_map", told)
     monkeypatch.setattr(pipeline, "compare_poses", compared)
-    refined = pipeline._proven(dataset, valuemap.MapConfig(), pipeline._Stages(), 1, silent)
+    refined = correction._proven(dataset, valuemap.MapConfig(), Stages(), 1, silent)
     assert refined.is_corrected == is_told
     assert done == (["compare", "map"] if is_proven else ["map", "compare"] if is_told else ["map"])
 
@@ -380,7 +381,7 @@ def test_middles_that_differ_by_side_are_no_errors_of_images(monkeypatch: pytest
 
 def test_images_are_moved_by_what_sides_show_each() -> None:
     lamps, config = lamps_of_four_sides(), MapConfig()
-    calibration, labels, votes, _ = pipeline._map_alone(lamps, config, ThreadEngine(1), silent)
+    calibration, labels, votes, _ = correction._map_alone(lamps, config, ThreadEngine(1), silent)
     assert calibration.noise.side_m > 0.1
     images = refine_images.gather_images(lamps, config)
     told, as_one = (
@@ -399,7 +400,7 @@ def test_errors_of_images_are_no_noise_of_detections() -> None:
     """Images whose poses are exact stay, however poor the detector: what one object says another does not confirm."""
     poor = city(pixel_noise_px=5.0, **EXACT_POSES)
     assert refine_poses(poor, valuemap.MapConfig()).is_noisy
-    assert not pipeline._by_images(poor, valuemap.MapConfig(), 1, silent).is_corrected
+    assert not correction._by_images(poor, valuemap.MapConfig(), 1, silent).is_corrected
 
 
 def test_poses_that_stay_are_mapped_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -437,7 +438,7 @@ def test_a_map_without_objects_says_nothing_of_images() -> None:
 
 def test_one_object_has_no_other_half(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refine_images, "halves", lambda points: np.zeros(len(points), np.int64))
-    assert not pipeline._by_images(city(**DASHCAM), MapConfig(), 1, silent).is_corrected
+    assert not correction._by_images(city(**DASHCAM), MapConfig(), 1, silent).is_corrected
 
 
 def test_a_part_of_many_objects_says_whether_images_are_off() -> None:
@@ -465,7 +466,7 @@ def test_single_images_are_looked_at_only_where_they_are_off_by_more_than_was_th
             "refine_poses",
             lambda dataset, *_, is_noisy=is_noisy, **__: Refined(dataset, {}, is_noisy=is_noisy),
         )
-        pipeline._proven(clean, valuemap.MapConfig(), pipeline._Stages(), 1, silent)
+        correction._proven(clean, valuemap.MapConfig(), Stages(), 1, silent)
     assert len(asked) == 1
     monkeypatch.undo()
     assert not refine_poses(clean, valuemap.MapConfig()).is_noisy

@@ -20,7 +20,7 @@ from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, number_passes
 from valuemap.errors import InputError, OutputError, SettingError
 from valuemap.experiment import MARKER, RESULT, PassesResult, _curve, _ranks, experiment_passes, read_passes
-from valuemap.partition import partition_images
+from valuemap.paper.partition import partition_images
 
 QUICK = MapConfig(method="paper")
 """An experiment makes many maps: those of this method are made a hundred times as fast."""

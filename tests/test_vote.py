@@ -11,8 +11,8 @@ from literal import Settings, algorithm_1
 from scenes import Scene, as_dataset, random_scene
 from valuemap.cameras import cast_rays
 from valuemap.config import VoteConfig
+from valuemap.paper.vote import vote_in_clusters
 from valuemap.tables import Candidates
-from valuemap.vote import vote_in_clusters
 
 
 def vote(scene: Scene, config: VoteConfig, *, threads: int = 1) -> Candidates:

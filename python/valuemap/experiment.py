@@ -29,7 +29,7 @@ from valuemap.evaluate import TrueObjects, match_labels, recoverable_objects
 from valuemap.evidence import Evidence
 from valuemap.folders import new_file
 from valuemap.map_folder import Map
-from valuemap.partition import partition_images
+from valuemap.paper.partition import partition_images
 from valuemap.pipeline import build_map
 from valuemap.progress import Progress, silent
 from valuemap.tables import Categories, Floats, Ints

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -12,58 +10,42 @@ from typing import Any
 
 import numpy as np
 
-from valuemap.cameras import Rays, camera_centers, cast_rays, directions_down
+from valuemap.cameras import Rays, cast_rays, directions_down
 from valuemap.config import MapConfig, bounded_threads
+from valuemap.correction import MOST_CORRECTED, TOO_LARGE, correct_poses, with_errors_of_images, with_sides_of
 from valuemap.dataset import Dataset, Frame, ensure_checked, read_dataset, write_dataset
 from valuemap.describe import describe_labels
 from valuemap.engine.engine import Engine
 from valuemap.engine.threads import ThreadEngine
 from valuemap.errors import InputError
 from valuemap.map_folder import Map
-from valuemap.merge import merge_clusters
 from valuemap.notes import Findings, cameras_not_upright, find_notes, heights_not_measured
-from valuemap.partition import partition_images
+from valuemap.paper.merge import merge_clusters
+from valuemap.paper.partition import partition_images
+from valuemap.paper.vote import vote_in_clusters
 from valuemap.portions import rows_on_disk
 from valuemap.progress import Progress, silent
 from valuemap.refine import (
-    FITS_NO_BETTER,
-    Mapped,
     Refined,
-    bundle,
-    expose_rows,
-    gather_images,
-    keyframes_of,
-    noise_left,
-    refine_again,
-    refine_poses,
 )
 from valuemap.rejected import rejected_of_map
 from valuemap.remote import Place, UrlPath
-from valuemap.robust import Calibration, Noise, calibration_to_json
-from valuemap.system import peak_memory_mb
-from valuemap.tables import Labels, Votes, covariance_columns
+from valuemap.robust import Calibration, calibration_to_json
+from valuemap.stages import Stages
+from valuemap.tables import Labels, Votes
 from valuemap.tiles.calibration import calibrate
-from valuemap.tiles.compare import compare_poses
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.seams import join_cells
 from valuemap.tiles.source import InMemory, Source
 from valuemap.tiles.work import CELLS
-from valuemap.vote import vote_in_clusters
 
 LARGEST_IN_MEMORY = 2_000_000
 """Datasets with more images and detections are cut into pieces on disk: about 2 GB."""
-MOST_CORRECTED = 300_000
-"""Poses are looked at in datasets of no more images and detections: a minute or two."""
-_TOO_LARGE = "large dataset: poses were taken as they are"
 _NOTE_ON_SIZE = (
     "the dataset is larger than what poses are looked at of: they were taken as they are (map a part of it to learn "
     "what whole drives are off by; correct_poses=0 says that this is known)"
 )
-_MAPS_OF_IMAGES = 5
-"""Maps that tell errors of images, at most, before the one that stays."""
-_SETTLED = 0.1
-"""Images that move by less than this share of what they are off by have settled: they add a hundredth to its square."""
 CORRECTED = "corrected"
 """Where in the folder of work a dataset is kept whose poses were corrected."""
 
@@ -99,16 +81,16 @@ def build_map(
     config, threads = config or MapConfig(), bounded_threads(threads)
     _check_detections(dataset.name, len(dataset.detections))
     dataset = ensure_checked(dataset)
-    stages = _Stages()
+    stages = Stages()
     refined = None
     if config.method == "paper":
         labels, votes, counts = _paper(dataset, config, stages, threads, progress)
     else:
-        refined = _refined(dataset, config, stages, threads, progress)
+        refined = correct_poses(dataset, config, stages, threads, progress)
         with stages.measured("order"):
             source = InMemory(refined.dataset, config)
         labels, votes, counts, _ = _robust(source, config, stages, ThreadEngine(threads), progress, refined)
-        labels = _with_errors_of_images(refined, labels, votes)
+        labels = with_errors_of_images(refined, labels, votes)
     size = {"images": len(dataset.images), "detections": len(dataset.detections)}
     passes = len(np.unique(dataset.images.pass_id.codes))
     poses = None if refined is None else refined.record
@@ -189,7 +171,7 @@ def build_map_of_folder(
         The files of its cells; none of a dataset that is no wider than one.
     """
     images, detections = rows_on_disk(folder) if held is None else (len(held.images), len(held.detections))
-    stages = _Stages()
+    stages = Stages()
     refined: Refined | None = None
     notes: list[str] = []
     threads = run.engine.threads_of_task(1)
@@ -198,7 +180,7 @@ def build_map_of_folder(
         if config.method == "paper":
             return build_map(dataset, config, threads=threads, progress=progress), []
         _check_detections(dataset.name, len(dataset.detections))
-        refined = _refined(dataset, config, stages, threads, progress)
+        refined = correct_poses(dataset, config, stages, threads, progress)
         if on_posed is not None:
             on_posed(refined.dataset)
         with stages.measured("order"):
@@ -207,7 +189,7 @@ def build_map_of_folder(
         name, frame, notes = dataset.name, dataset.frame, _notes_on_input(dataset)
     else:
         if images + detections <= MOST_CORRECTED and detections:
-            refined = _refined(ensure_checked(held or read_dataset(folder)), config, stages, threads, progress)
+            refined = correct_poses(ensure_checked(held or read_dataset(folder)), config, stages, threads, progress)
             if refined.is_corrected:
                 folder = run.work / CORRECTED
                 write_dataset(refined.dataset, folder)
@@ -219,9 +201,9 @@ def build_map_of_folder(
         _check_detections(name, size["detections"])
     labels, votes, counts, cells = _robust(source, config, stages, run.engine, progress, refined, run)
     if refined is not None:
-        labels = _with_errors_of_images(refined, labels, votes)
+        labels = with_errors_of_images(refined, labels, votes)
     passes = source.drives_record["passes"]
-    untouched = _TOO_LARGE if config.poses.correct_poses else "correct_poses is 0"
+    untouched = TOO_LARGE if config.poses.correct_poses else "correct_poses is 0"
     poses = {"found": "nothing", "because": untouched} if refined is None else refined.record
     result = _as_map(name, frame, size, passes, config, labels, votes, counts, stages, poses)
     if refined is not None and refined.is_corrected:
@@ -231,127 +213,7 @@ def build_map_of_folder(
     return _with_notes(result, notes), cells
 
 
-def _refined(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, progress: Progress) -> Refined:
-    """Give images the poses of the rows of their detections, then correct what poses of drives are proven wrong by."""
-    exposed, rows = expose_rows(dataset)
-    refined = _proven(exposed, config, stages, threads, progress)
-    return replace(refined, record={**refined.record, **rows}, is_corrected=True) if rows else refined
-
-
-def _proven(dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, progress: Progress) -> Refined:
-    """Correct what whole drives' poses are proven wrong by, if that makes the same detections likelier."""
-    if len(dataset.images) + len(dataset.detections) > MOST_CORRECTED and config.poses.correct_poses:
-        return Refined(dataset, {"found": "nothing", "because": _TOO_LARGE})
-
-    with stages.measured("poses"):
-        refined = refine_poses(dataset, config, threads=threads, progress=progress)
-        if not refined.is_noisy:
-            return _of_drives(dataset, refined, config, threads, progress)
-        # Where single images are far off, what whole drives seem to be off by is mostly theirs.
-        of_images = _by_images(dataset, config, threads, progress)
-        if of_images.is_corrected:
-            return of_images
-        refined = _of_drives(dataset, refined, config, threads, progress)
-        return refined if refined.is_corrected else replace(refined, as_given=of_images.as_given)
-
-
-def _of_drives(dataset: Dataset, refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:
-    """Keep what whole drives were found to be off by if it makes detections likelier, and estimate it with a map."""
-    is_proven = refined.is_corrected
-    if not is_proven:
-        refined = _told_by_a_map(dataset, refined, config, threads, progress)
-    if not refined.is_corrected:
-        return replace(refined, found=None)
-    parameters = refined.record.get("parameters", 0)
-    found = compare_poses(dataset, refined.dataset, parameters, config, threads=threads, progress=progress)
-    record = {**refined.record, **found.figures()}
-    if not found.is_better:
-        return Refined(dataset, {**record, "found": "nothing", "because": FITS_NO_BETTER})
-    if is_proven:
-        refined = _told_by_a_map(dataset, refined, config, threads, progress)
-    return replace(refined, record={**record, **refined.record}, found=None)
-
-
-def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progress) -> Refined:
-    """Correct what single images are probably off by, given a map, where that is proven.
-
-    It is proven with the map of the poses as they were: each half of its objects places the images for the other half.
-    """
-    engine, moved, images = ThreadEngine(threads), before, gather_images(before, config)
-    as_given: Mapped | None = None
-    figures: dict[str, float] = {}
-    for number in range(_MAPS_OF_IMAGES):
-        _, labels, votes, _ = mapped = _map_alone(moved, config, engine, progress)
-        as_given = as_given or mapped
-        if not len(labels):
-            return Refined(before, {}, as_given=as_given)
-        noise = as_given[0].noise
-        config = _with_sides_of(noise, config)
-        told = bundle(images, labels, votes, noise)
-        if number == 0:
-            is_proven, figures = told.is_proven()
-            if not is_proven:
-                return Refined(before, {}, as_given=as_given)
-        last, moved = moved, replace(before, images=told.images(before.images))
-        step_m = camera_centers(moved.images) - camera_centers(last.images)
-        if np.sqrt(np.mean(step_m**2)) < _SETTLED * noise.position_m:
-            break
-    record = {"found": "errors of images", "images": len(before.images), **figures}
-    return Refined(moved, record, is_corrected=True, before_images=(images, noise))
-
-
-def _with_sides_of(noise: Noise, config: MapConfig) -> MapConfig:
-    """Return settings with the middles that sides show, which were told before images were moved.
-
-    Where images show one thing each, errors of images explain all that its sides disagree about.
-    """
-    return replace(config, noise=replace(config.noise, side_sigma_m=noise.side_m))
-
-
-def _with_errors_of_images(refined: Refined, labels: Labels, votes: Votes) -> Labels:
-    """Return labels with covariances that know of errors of images, where these were corrected.
-
-    What is left of residuals once images are moved does not say how well they were.
-    """
-    if refined.before_images is None or not len(labels):
-        return labels
-    images, noise = refined.before_images
-    told = bundle(images, labels, votes, noise)
-    columns = labels.covariance_m2.copy()
-    row, covariance_m2 = told.covariances()
-    columns[row] = covariance_columns(covariance_m2)
-    return labels.replace(covariance_m2=columns)
-
-
-def _told_by_a_map(dataset: Dataset, refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:
-    """Estimate once more what poses are wrong by, where anything was found: a map knows better what is one object."""
-    if refined.found is None:
-        return refined
-    labels, votes = _map_of_keyframes(dataset, refined, config, ThreadEngine(threads), progress)
-    return refine_again(dataset, refined, labels, votes, config, progress=progress)
-
-
-def _map_of_keyframes(
-    dataset: Dataset, refined: Refined, config: MapConfig, engine: Engine, progress: Progress
-) -> tuple[Labels, Votes]:
-    """Return a map that says which detection shows which object, and no more.
-
-    It is of the images that poses are estimated with. Its noise is what was left there, and not sought.
-    """
-    config = replace(config, noise=noise_left(refined, config))
-    _, labels, votes, _ = _map_alone(keyframes_of(dataset, refined, config), config, engine, progress)
-    return labels, votes
-
-
-def _map_alone(dataset: Dataset, config: MapConfig, engine: Engine, progress: Progress) -> Mapped:
-    """Return the map of a dataset in memory, and keep nothing."""
-    source = InMemory(dataset, config)
-    calibration = calibrate(source, config, None, None, engine, progress)
-    cells, _ = solve_cells(source, calibration, config, engine, progress)
-    return calibration, *join_cells(cells, source.grid, config)
-
-
-def _with_rejected(result: Map, read: Callable[[], Dataset], stages: _Stages) -> Map:
+def _with_rejected(result: Map, read: Callable[[], Dataset], stages: Stages) -> Map:
     """Add the best hypotheses that became no labels; `read` gives the dataset that the labels were found in."""
     with stages.measured("rejected"):
         rejected = rejected_of_map(result, read)
@@ -365,7 +227,7 @@ def _notes_on_input(dataset: Dataset) -> list[str]:
 
 
 def _with_notes(result: Map, notes: list[str]) -> Map:
-    is_too_large = result.run.get("poses", {}).get("because") == _TOO_LARGE
+    is_too_large = result.run.get("poses", {}).get("because") == TOO_LARGE
     notes = [*notes, *([_NOTE_ON_SIZE] if is_too_large else [])]
     return replace(result, run={**result.run, "notes": [*notes, *result.run["notes"]]}) if notes else result
 
@@ -387,7 +249,7 @@ def _as_map(
     labels: Labels,
     votes: Votes,
     counts: dict[str, Any],
-    stages: _Stages,
+    stages: Stages,
     poses: dict[str, Any] | None,
 ) -> Map:
     without = size["detections"] - len(votes)
@@ -398,7 +260,7 @@ def _as_map(
 
 
 def _paper(
-    dataset: Dataset, config: MapConfig, stages: _Stages, threads: int, progress: Progress
+    dataset: Dataset, config: MapConfig, stages: Stages, threads: int, progress: Progress
 ) -> tuple[Labels, Votes, dict[str, Any]]:
     """Algorithm 1 of Dabisias et al., "VALUE", ICRA 2018, in clusters, with merging."""
     with stages.measured("rays"):
@@ -419,7 +281,7 @@ def _paper(
 def _robust(
     source: Source,
     config: MapConfig,
-    stages: _Stages,
+    stages: Stages,
     engine: Engine,
     progress: Progress,
     refined: Refined | None,
@@ -433,7 +295,7 @@ def _robust(
     store = run.parts / CELLS if run is not None and len(source.cells) > 1 else None
     files: list[Place] = []
     if refined is not None and refined.before_images is not None:
-        config = _with_sides_of(refined.before_images[1], config)
+        config = with_sides_of(refined.before_images[1], config)
     if refined is not None and refined.as_given is not None and given is None and store is None:
         calibration, labels, votes, counts = refined.as_given
     else:
@@ -453,21 +315,7 @@ def _without_ray(rays: Rays) -> dict[str, int]:
     return {"detections_without_ray": int(np.isnan(rays.direction_in_world[:, 0]).sum())}
 
 
-class _Stages:
-    """Seconds and peak memory of each stage, in the order they ran."""
-
-    def __init__(self) -> None:
-        self.records: list[dict[str, Any]] = []
-
-    @contextmanager
-    def measured(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        seconds = time.perf_counter() - start
-        self.records.append({"stage": stage, "seconds": round(seconds, 3), "peak_memory_mb": peak_memory_mb()})
-
-
-def _record(name: str, config: MapConfig, counts: dict[str, Any], stages: _Stages) -> dict[str, Any]:
+def _record(name: str, config: MapConfig, counts: dict[str, Any], stages: Stages) -> dict[str, Any]:
     drives, calibration = counts.pop("drives", None), counts.pop("calibration", None)
     return {
         "valuemap": version("valuemap"),

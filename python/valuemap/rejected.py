@@ -19,9 +19,9 @@ from valuemap.config import PartitionConfig, VoteConfig
 from valuemap.dataset import Dataset, evenly, rows_of
 from valuemap.evidence import Evidence
 from valuemap.map_folder import Map
-from valuemap.partition import partition_images
+from valuemap.paper.partition import partition_images
+from valuemap.paper.vote import vote_in_clusters
 from valuemap.tables import Bools, Candidates, Categories, Floats, Ints, Rejected, covariance_matrices
-from valuemap.vote import vote_in_clusters
 
 MOST_KEPT = 10_000
 """So many rejected hypotheses a map keeps, those with most votes."""

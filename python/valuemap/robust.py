@@ -22,14 +22,14 @@ from valuemap.rounding import rounding_px
 from valuemap.tables import Candidates, Floats, Ints
 
 PARTS: tuple[str, ...] = tuple(_core.parts())
-"""Parts of the method: moves of the search, terms of J, and what is done before and after; the core's `parts.rs`."""
+"""Parts of the method: moves of the search, terms of J, and what is done before and after; the core's `parts`."""
 LEFT_OUT: set[str] = set()
 """Those to leave out. For tests and the ablation benchmark; not a setting."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of what moves a detection off its object; see the core's `noise.rs`.
+    """Standard deviations of what moves a detection off its object; see the core's `noise`.
 
     Each axis; position and rotation have a part that each image has for itself, and a part that drifts and is shared
     by the images of a pass that see one object. The middle of an object as one side of it shows it is off by `side_m`.

@@ -29,8 +29,8 @@ from valuemap.cameras import Rays, camera_centers, cast_rays, rotation_matrices
 from valuemap.config import VoteConfig
 from valuemap.dataset import Dataset
 from valuemap.errors import SettingError
+from valuemap.paper.vote import vote_in_clusters
 from valuemap.tables import Candidates, Floats, Ints
-from valuemap.vote import vote_in_clusters
 
 COST_OF_A_POINT = 1.5
 """A point has three coordinates to please three residuals of its own with: half of them are no evidence."""

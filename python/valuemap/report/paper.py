@@ -14,7 +14,7 @@ from valuemap.config import PartitionConfig
 from valuemap.dataset import Dataset, rows_of
 from valuemap.evaluate import Evaluation
 from valuemap.map_folder import Map
-from valuemap.partition import partition_images
+from valuemap.paper.partition import partition_images
 from valuemap.report.errors import error_m
 
 Cell = int | float | str | None

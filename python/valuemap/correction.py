@@ -1,0 +1,162 @@
+"""Poses of a dataset, corrected where maps prove them wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from valuemap.cameras import camera_centers
+from valuemap.config import MapConfig
+from valuemap.dataset import Dataset
+from valuemap.engine.engine import Engine
+from valuemap.engine.threads import ThreadEngine
+from valuemap.progress import Progress
+from valuemap.refine import (
+    FITS_NO_BETTER,
+    Mapped,
+    Refined,
+    bundle,
+    expose_rows,
+    gather_images,
+    keyframes_of,
+    noise_left,
+    refine_again,
+    refine_poses,
+)
+from valuemap.robust import Noise
+from valuemap.stages import Stages
+from valuemap.tables import Labels, Votes, covariance_columns
+from valuemap.tiles.calibration import calibrate
+from valuemap.tiles.compare import compare_poses
+from valuemap.tiles.mapping import solve_cells
+from valuemap.tiles.seams import join_cells
+from valuemap.tiles.source import InMemory
+
+MOST_CORRECTED = 300_000
+"""Poses are looked at in datasets of no more images and detections: a minute or two."""
+TOO_LARGE = "large dataset: poses were taken as they are"
+_MAPS_OF_IMAGES = 5
+"""Maps that tell errors of images, at most, before the one that stays."""
+_SETTLED = 0.1
+"""Images that move by less than this share of what they are off by have settled: they add a hundredth to its square."""
+
+
+def correct_poses(dataset: Dataset, config: MapConfig, stages: Stages, threads: int, progress: Progress) -> Refined:
+    """Give images the poses of the rows of their detections, then correct what poses of drives are proven wrong by."""
+    exposed, rows = expose_rows(dataset)
+    refined = _proven(exposed, config, stages, threads, progress)
+    return replace(refined, record={**refined.record, **rows}, is_corrected=True) if rows else refined
+
+
+def _proven(dataset: Dataset, config: MapConfig, stages: Stages, threads: int, progress: Progress) -> Refined:
+    """Correct what whole drives' poses are proven wrong by, if that makes the same detections likelier."""
+    if len(dataset.images) + len(dataset.detections) > MOST_CORRECTED and config.poses.correct_poses:
+        return Refined(dataset, {"found": "nothing", "because": TOO_LARGE})
+
+    with stages.measured("poses"):
+        refined = refine_poses(dataset, config, threads=threads, progress=progress)
+        if not refined.is_noisy:
+            return _of_drives(dataset, refined, config, threads, progress)
+        # Where single images are far off, what whole drives seem to be off by is mostly theirs.
+        of_images = _by_images(dataset, config, threads, progress)
+        if of_images.is_corrected:
+            return of_images
+        refined = _of_drives(dataset, refined, config, threads, progress)
+        return refined if refined.is_corrected else replace(refined, as_given=of_images.as_given)
+
+
+def _of_drives(dataset: Dataset, refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:
+    """Keep what whole drives were found to be off by if it makes detections likelier, and estimate it with a map."""
+    is_proven = refined.is_corrected
+    if not is_proven:
+        refined = _told_by_a_map(dataset, refined, config, threads, progress)
+    if not refined.is_corrected:
+        return replace(refined, found=None)
+    parameters = refined.record.get("parameters", 0)
+    found = compare_poses(dataset, refined.dataset, parameters, config, threads=threads, progress=progress)
+    record = {**refined.record, **found.figures()}
+    if not found.is_better:
+        return Refined(dataset, {**record, "found": "nothing", "because": FITS_NO_BETTER})
+    if is_proven:
+        refined = _told_by_a_map(dataset, refined, config, threads, progress)
+    return replace(refined, record={**record, **refined.record}, found=None)
+
+
+def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progress) -> Refined:
+    """Correct what single images are probably off by, given a map, where that is proven.
+
+    It is proven with the map of the poses as they were: each half of its objects places the images for the other half.
+    """
+    engine, moved, images = ThreadEngine(threads), before, gather_images(before, config)
+    as_given: Mapped | None = None
+    figures: dict[str, float] = {}
+    for number in range(_MAPS_OF_IMAGES):
+        _, labels, votes, _ = mapped = _map_alone(moved, config, engine, progress)
+        as_given = as_given or mapped
+        if not len(labels):
+            return Refined(before, {}, as_given=as_given)
+        noise = as_given[0].noise
+        config = with_sides_of(noise, config)
+        told = bundle(images, labels, votes, noise)
+        if number == 0:
+            is_proven, figures = told.is_proven()
+            if not is_proven:
+                return Refined(before, {}, as_given=as_given)
+        last, moved = moved, replace(before, images=told.images(before.images))
+        step_m = camera_centers(moved.images) - camera_centers(last.images)
+        if np.sqrt(np.mean(step_m**2)) < _SETTLED * noise.position_m:
+            break
+    record = {"found": "errors of images", "images": len(before.images), **figures}
+    return Refined(moved, record, is_corrected=True, before_images=(images, noise))
+
+
+def with_sides_of(noise: Noise, config: MapConfig) -> MapConfig:
+    """Return settings with the middles that sides show, which were told before images were moved.
+
+    Where images show one thing each, errors of images explain all that its sides disagree about.
+    """
+    return replace(config, noise=replace(config.noise, side_sigma_m=noise.side_m))
+
+
+def with_errors_of_images(refined: Refined, labels: Labels, votes: Votes) -> Labels:
+    """Return labels with covariances that know of errors of images, where these were corrected.
+
+    What is left of residuals once images are moved does not say how well they were.
+    """
+    if refined.before_images is None or not len(labels):
+        return labels
+    images, noise = refined.before_images
+    told = bundle(images, labels, votes, noise)
+    columns = labels.covariance_m2.copy()
+    row, covariance_m2 = told.covariances()
+    columns[row] = covariance_columns(covariance_m2)
+    return labels.replace(covariance_m2=columns)
+
+
+def _told_by_a_map(dataset: Dataset, refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:
+    """Estimate once more what poses are wrong by, where anything was found: a map knows better what is one object."""
+    if refined.found is None:
+        return refined
+    labels, votes = _map_of_keyframes(dataset, refined, config, ThreadEngine(threads), progress)
+    return refine_again(dataset, refined, labels, votes, config, progress=progress)
+
+
+def _map_of_keyframes(
+    dataset: Dataset, refined: Refined, config: MapConfig, engine: Engine, progress: Progress
+) -> tuple[Labels, Votes]:
+    """Return a map that says which detection shows which object, and no more.
+
+    It is of the images that poses are estimated with. Its noise is what was left there, and not sought.
+    """
+    config = replace(config, noise=noise_left(refined, config))
+    _, labels, votes, _ = _map_alone(keyframes_of(dataset, refined, config), config, engine, progress)
+    return labels, votes
+
+
+def _map_alone(dataset: Dataset, config: MapConfig, engine: Engine, progress: Progress) -> Mapped:
+    """Return the map of a dataset in memory, and keep nothing."""
+    source = InMemory(dataset, config)
+    calibration = calibrate(source, config, None, None, engine, progress)
+    cells, _ = solve_cells(source, calibration, config, engine, progress)
+    return calibration, *join_cells(cells, source.grid, config)
