@@ -32,6 +32,7 @@ lint: setup
 	$(RUN) lint-imports
 	cargo fmt --check
 	cargo clippy --locked --all-targets -- --deny warnings
+	RUSTDOCFLAGS="--deny warnings --document-private-items" cargo doc --locked --no-deps --package valuemap-core
 
 # valuemap and other methods on the same real data: see benchmarks/README.md.
 bench-field: setup
