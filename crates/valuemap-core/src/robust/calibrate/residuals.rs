@@ -10,18 +10,15 @@ use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
 use super::shared::{drifting, stated, with_drift};
-use crate::robust::energy::Placed;
 use crate::robust::energy::estimate::{looks_at, visits};
+use crate::robust::energy::{LEAST_VOTES, Placed, SURE_VOTES};
 use crate::robust::noise::drift::{Drive, Look};
 use crate::robust::noise::{Known, Noise};
 use crate::robust::scene::Scene;
 
-/// Labels with fewer voters do not serve where there are better ones: chance meetings have few.
-const MIN_VOTES: usize = 6;
 /// If labels with so many voters have fewer than this together, those with at least `LEAST_VOTES` serve: a standard deviation is known to a
 /// tenth from fifty squares, each of the five that are sought.
 const ENOUGH_VOTES: usize = 250;
-const LEAST_VOTES: usize = 3;
 /// A visit with fewer voters has no residuals.
 const MIN_VOTES_OF_VISIT: usize = 2;
 /// The part of the labels that serves, those that fit best.
@@ -154,8 +151,8 @@ fn search<const N: usize>(
 /// Well supported labels, evenly over the map, together about as many voters as needed. Those whose residuals fit the
 /// guess worst are left out: wrong associations would be taken for noise.
 pub(crate) fn sample<'a>(scene: &Scene, guess: &Noise, labels: &'a [Placed]) -> Vec<&'a Placed> {
-    let votes: usize = labels.iter().map(|label| label.0.len()).filter(|&votes| votes >= MIN_VOTES).sum();
-    let least = if votes < ENOUGH_VOTES { LEAST_VOTES } else { MIN_VOTES };
+    let votes: usize = labels.iter().map(|label| label.0.len()).filter(|&votes| votes >= SURE_VOTES).sum();
+    let least = if votes < ENOUGH_VOTES { LEAST_VOTES } else { SURE_VOTES };
     let mut good: Vec<(f64, &Placed)> = labels
         .iter()
         .filter(|label| label.0.len() >= least)

@@ -4,14 +4,12 @@ use rayon::prelude::*;
 
 use crate::robust::energy::agreement::{Disagreement, MIN_SHARED_LABELS, disagreements, sides_of_all};
 use crate::robust::energy::estimate::Care;
-use crate::robust::energy::{Placed, implied_size};
+use crate::robust::energy::{Placed, SURE_VOTES, implied_size};
 use crate::robust::learn::median;
 use crate::robust::model::Model;
 use crate::robust::noise::{Known, Noise};
 use crate::robust::scene::Scene;
 
-/// Labels with fewer voters do not tell whether their sides agree: chance meetings have few.
-const MIN_VOTES: usize = 6;
 /// Where the noise is sought, how much passes of a label disagree counts up to this many standard deviations: 95 % efficient where errors are Gaussian (Huber, "Robust
 /// estimation of a location parameter", 1964).
 const HUBER_SIGMAS: f64 = 1.345;
@@ -86,7 +84,7 @@ fn excess(of_labels: impl Iterator<Item = Option<Disagreement>>) -> Option<f64> 
 /// sides agree as far as the passes of one side do, or where nothing has a size: middles are those of boxes.
 #[must_use]
 pub(crate) fn with_sides(model: &Model<'_>, known: Known, labels: &[Placed]) -> Option<Noise> {
-    let labels: Vec<&Placed> = labels.iter().filter(|label| label.0.len() >= MIN_VOTES).collect();
+    let labels: Vec<&Placed> = labels.iter().filter(|label| label.0.len() >= SURE_VOTES).collect();
     noise_of_sides(model, known, &labels, Care::Rough, SUSPECTED_SIGMAS)
 }
 
@@ -103,7 +101,7 @@ pub(crate) fn with_sides_for_sure(model: &Model<'_>, known: Known, labels: &[Pla
         labels.iter().filter(|other| (other.1 - point).norm() < near_m).count() == 1
     };
     let alone: Vec<&Placed> =
-        labels.par_iter().filter(|label| label.0.len() >= MIN_VOTES && stands_alone(label)).collect();
+        labels.par_iter().filter(|label| label.0.len() >= SURE_VOTES && stands_alone(label)).collect();
     noise_of_sides(model, known, &alone, Care::Exact, CERTAIN_SIGMAS)
 }
 

@@ -17,6 +17,7 @@ use crate::robust::energy::places::places;
 use crate::robust::energy::{Object, placed};
 use crate::robust::model::Model;
 use crate::robust::noise::drift::{Drive, Look, Normals, Vantage};
+use crate::robust::noise::huber::huber_weight;
 use crate::robust::noise::{Known, Noise};
 
 /// Votes that serve, about: of a thousand images that show several objects each, a share is known to a few hundredths.
@@ -31,8 +32,6 @@ const TURNS: usize = 2;
 const LEAST_SHARE: f64 = 0.02;
 /// Shares are taken for what they seem if minus twice the logarithm of the likelihood falls by more than this: what two parameters gain by chance (Akaike).
 const LEAST_FALL: f64 = 4.0;
-/// Residuals beyond this many sigmas count less, in proportion (Huber).
-const HUBER_SIGMAS: f64 = 2.0;
 
 /// Objects of one place, with what their votes see.
 struct Place {
@@ -185,7 +184,7 @@ impl Place {
     fn of(model: &Model<'_>, objects: &[Object], members: &[usize]) -> Self {
         let mut counted: Vec<((usize, u32), f64)> = Vec::new();
         for (label, &i) in members.iter().enumerate() {
-            let weight = |chi2: &f64| (HUBER_SIGMAS / chi2.sqrt()).min(1.0);
+            let weight = |chi2: &f64| huber_weight(*chi2);
             counted.extend(
                 objects[i].votes.iter().zip(&objects[i].fit.chi2).map(|(&ray, chi2)| ((label, ray), weight(chi2))),
             );

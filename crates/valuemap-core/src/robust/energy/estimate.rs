@@ -15,6 +15,7 @@ use crate::robust::model::Model;
 use crate::robust::model::ranges::range_terms;
 use crate::robust::noise::Noise;
 use crate::robust::noise::drift::{Drive, Look, Normals, Vantage};
+use crate::robust::noise::huber::huber_weight;
 use crate::robust::noise::spd::Vector6;
 use crate::robust::scene::{Scene, View};
 
@@ -22,15 +23,14 @@ use crate::robust::scene::{Scene, View};
 pub const ROUGH_M: f64 = 1e-2;
 /// A pass that comes back after so long a drive has another drift, m.
 const FORGOTTEN_M: f64 = 250.0;
-const LONGEST_STEP_M: f64 = 5.0;
+/// A longer step is shortened to this, m.
+pub const LONGEST_STEP_M: f64 = 5.0;
 /// A step that leads behind a voter is cut to a quarter, so many times at most.
 const MAX_CUTS: i32 = 6;
 /// Votes are judged once a step is shorter than this, in sigmas, root mean square of the labels.
 const NEAR_SIGMAS: f64 = 0.3;
 /// Rounds of leaving out votes, at most.
 const MAX_TRIMS: usize = 10;
-/// Residuals beyond this many sigmas count less, in proportion (Huber).
-const HUBER_SIGMAS: f64 = 2.0;
 /// How much of what a visit says is left out when it is judged: a little stays, for where the others tell nothing.
 const OTHERS_SHARE: f64 = 0.95;
 /// Farther than this the linear step to where the other visits put a label is not trusted, m.
@@ -239,7 +239,7 @@ impl<'a> Joint<'a> {
             let step = -information.solve(&here.normals.gradient);
             let length_sigmas = (-step.dot(&here.normals.gradient) / self.labels() as f64).sqrt();
             self.step(&step);
-            self.weights = here.own.iter().map(|chi2| (HUBER_SIGMAS / chi2.sqrt()).min(1.0)).collect();
+            self.weights = here.own.iter().map(|&chi2| huber_weight(chi2)).collect();
             if self.care == Care::Exact {
                 self.pose_errors.clone_from(&here.pose_errors);
             }

@@ -1,9 +1,7 @@
 //! Where an object may be.
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix3, Vector3};
 
-use super::Object;
-use crate::robust::model::Model;
 use crate::robust::noise::{Noise, norm};
 
 /// Detections are looked for as far from an object as this many of its standard deviations.
@@ -13,41 +11,47 @@ const MOST_STEPS: f64 = 32.0;
 
 /// Where an object may be: along the direction that it is least known in, so densely that gates leave no gap.
 #[must_use]
-pub fn places_of(model: &Model<'_>, object: &Object) -> Vec<Vector3<f64>> {
-    let axes = object.fit.covariance.symmetric_eigen();
+pub fn places_of(
+    point: &Vector3<f64>,
+    covariance: &Matrix3<f64>,
+    noise: &Noise,
+    gate_sigmas: f64,
+) -> Vec<Vector3<f64>> {
+    let axes = covariance.symmetric_eigen();
     let longest = axes.eigenvalues.imax();
-    let sigma = axes.eigenvalues[longest].max(0.0).sqrt();
-    let across = axes.eigenvalues.sum() - axes.eigenvalues[longest];
-    if sigma * sigma < 4.0 * across.max(0.0) {
-        return vec![object.fit.point];
+    let variance_m2 = axes.eigenvalues[longest].max(0.0);
+    let across_m2 = axes.eigenvalues.sum() - axes.eigenvalues[longest];
+    if variance_m2 < 4.0 * across_m2.max(0.0) {
+        return vec![*point];
     }
-    let reach = axes.eigenvectors.column(longest) * (sigma * REACH_SIGMAS);
+    let reach_m = REACH_SIGMAS * variance_m2.sqrt();
     // A gate is at least as wide as errors of position make it.
-    let Noise { position_m, position_segment_m, position_drift_m, .. } = *model.noise;
-    let gate_m = model.settings.gate_sigmas * norm(norm(position_m, position_segment_m), position_drift_m);
-    let gates = sigma * REACH_SIGMAS / gate_m;
+    let Noise { position_m, position_segment_m, position_drift_m, .. } = *noise;
+    let gate_m = gate_sigmas * norm(norm(position_m, position_segment_m), position_drift_m);
+    let gates = reach_m / gate_m;
     let steps = if gates > REACH_SIGMAS { gates.ceil().min(MOST_STEPS) } else { REACH_SIGMAS };
-    (-steps as i32..=steps as i32).map(|step| object.fit.point + reach * (f64::from(step) / steps)).collect()
+    let reach = axes.eigenvectors.column(longest) * reach_m;
+    (-steps as i32..=steps as i32).map(|step| point + reach * (f64::from(step) / steps)).collect()
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::anywhere;
-    use super::super::seen::Seen;
     use super::*;
     use crate::street;
 
     #[test]
     fn places_along_a_badly_known_axis_leave_no_gap_between_gates() {
         let noise = Noise { position_m: 0.5, ..street::NOISE };
-        let scene = street::street(4, 1.0, &[Vector3::new(20.0, 3.0, 2.0)], &[[0.0, 0.0]]);
-        let model = Model::new(&scene, &noise, &street::SETTINGS);
-        let mut object = anywhere(3, Seen::default(), -10.0);
-        object.fit.covariance = nalgebra::Matrix3::from_diagonal(&Vector3::new(16.0, 0.04, 0.04));
-        let places = places_of(&model, &object);
+        let of = |sigma_m: f64| {
+            let covariance = Matrix3::from_diagonal(&Vector3::new(sigma_m * sigma_m, 0.04, 0.04));
+            places_of(&Vector3::zeros(), &covariance, &noise, street::GATE_SIGMAS)
+        };
+        let places = of(4.0);
         let reach_m = (places[places.len() - 1] - places[0]).norm();
         assert!((reach_m - 2.0 * 4.0 * REACH_SIGMAS).abs() < 1e-9, "{reach_m}");
         let gate_m = street::GATE_SIGMAS * noise.position_m;
         assert!(places.windows(2).all(|pair| (pair[1] - pair[0]).norm() <= gate_m));
+        // What is known as well in all directions is where it is; what is not known at all is not looked for everywhere.
+        assert_eq!((of(0.3).len(), of(1e6).len()), (1, 1 + 2 * MOST_STEPS as usize));
     }
 }

@@ -34,16 +34,16 @@ use rstar::primitives::GeomWithData;
 use crate::robust::model::heights::{HeightTerms, height_m};
 use crate::robust::model::{Model, Sizes};
 use crate::robust::noise::drift::{Drive, Look, OneLook, Vantage};
+use crate::robust::noise::huber::{HUBER_SIGMAS, huber_weight};
 use crate::robust::parts::Part;
 use crate::robust::scene::Scene;
 use estimate::visits;
+use extent::places_of;
 use looks::Lookout;
 use seen::{Seen, Shares};
 use sides::{Middle, Said, marginalised, sides};
 use sizes::size_terms;
 
-/// Residuals beyond this many sigmas count less, in proportion (Huber): 95 % efficient where errors are Gaussian at 1.35, more above.
-const HUBER_SIGMAS: f64 = 2.0;
 /// The position is found when a step is shorter than this, in its own sigmas.
 const STEP_SIGMAS: f64 = 0.03;
 const MAX_STEPS: usize = 12;
@@ -51,6 +51,11 @@ const MAX_STEPS: usize = 12;
 const MAX_HALVINGS: usize = 6;
 /// Residuals that are larger by rounding are not larger.
 const LEAST_FALL: f64 = 1e-9;
+
+/// Objects of fewer votes tell nothing of others where there are better ones: chance meetings have few.
+pub const SURE_VOTES: usize = 6;
+/// Rays alone tell where objects of so many votes are, with three residuals to spare.
+pub const LEAST_VOTES: usize = 3;
 
 /// An object: what the map consists of.
 #[derive(Debug, Clone)]
@@ -184,7 +189,7 @@ fn is_in_reach(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> bool {
 fn weights_of(chi2: &[f64], weights: &mut [f64]) -> bool {
     let mut any = false;
     for (weight, chi2) in weights.iter_mut().zip(chi2) {
-        let new = (HUBER_SIGMAS / chi2.sqrt()).min(1.0);
+        let new = huber_weight(*chi2);
         any |= new.to_bits() != weight.to_bits();
         *weight = new;
     }
@@ -526,6 +531,12 @@ pub fn by_place(objects: &[Object]) -> RTree<GeomWithData<[f64; 3], usize>> {
 }
 
 impl Object {
+    /// Where it may be ([`places_of`]).
+    #[must_use]
+    pub fn places(&self, model: &Model<'_>) -> Vec<Vector3<f64>> {
+        places_of(&self.fit.point, &self.fit.covariance, model.noise, model.settings.gate_sigmas)
+    }
+
     /// Whether an image shows both this and another object.
     #[must_use]
     pub fn is_seen_beside(&self, scene: &Scene, other: &Self) -> bool {

@@ -3,7 +3,7 @@
 use super::{Object, by_place};
 
 /// Objects that are estimated together, at most: the cost grows with the square of their number.
-const MOST_OBJECTS: usize = 12;
+pub const MOST_OBJECTS: usize = 12;
 
 /// The objects around those with the most votes, each object in one place.
 #[must_use]

@@ -11,9 +11,7 @@ use super::estimate::visits;
 use super::usual_size;
 use crate::robust::model::Model;
 use crate::robust::model::prior::Prior;
-
-/// Sizes that disagree by more than this many standard deviations count less, in proportion (Huber): boxes are cut and hidden in part.
-const HUBER_SIGMAS: f64 = 2.0;
+use crate::robust::noise::huber::HUBER_SIGMAS;
 
 /// What the boxes of votes of one object say about its position, linearised at a point; nothing where boxes tell nothing.
 #[must_use]

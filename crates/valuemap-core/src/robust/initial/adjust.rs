@@ -9,13 +9,12 @@ use rustc_hash::FxHasher;
 
 use super::label::{Label, by_place, fingerprint, first_voter, side_of};
 use crate::robust::energy::estimate::{Care, Joint, Limits, Start};
+use crate::robust::energy::places::MOST_OBJECTS;
 use crate::robust::noise::Noise;
 use crate::robust::scene::Scene;
 
 /// Labels within this distance of the one with the most votes are estimated with it, m.
-const PLACE_M: f64 = 25.0;
-/// Labels that are estimated together, at most: the cost grows with the square of their number.
-const MOST_LABELS: usize = 12;
+pub const PLACE_M: f64 = 25.0;
 
 /// Estimate all labels anew, place by place; those that keep fewer than `min_votes` are dropped.
 #[must_use]
@@ -41,7 +40,7 @@ fn places(labels: &[Label]) -> Vec<Vec<usize>> {
         }
         let near = tree.nearest_neighbor_iter_with_distance_2(labels[middle].estimate.point.into());
         let near = near.take_while(|(_, distance2)| *distance2 <= PLACE_M * PLACE_M).map(|(near, _)| near.data);
-        let mut place: Vec<usize> = near.filter(|&i| !taken[i]).take(MOST_LABELS).collect();
+        let mut place: Vec<usize> = near.filter(|&i| !taken[i]).take(MOST_OBJECTS).collect();
         place.sort_unstable();
         for &i in &place {
             taken[i] = true;

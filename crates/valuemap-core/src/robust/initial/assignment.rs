@@ -11,15 +11,13 @@ use rustc_hash::FxHashSet;
 use super::label::Label;
 use crate::robust::noise::Noise;
 use crate::robust::noise::drift::Look;
+use crate::robust::noise::huber::huber_weight;
 use crate::robust::noise::poses::{Belief, PoseError};
 use crate::robust::scene::Scene;
+use crate::robust::search::assign::GAIN_UNIT;
 
 /// Times that the assignment of an image is made anew, with the pose error from the last one.
 const ROUNDS: usize = 3;
-/// Costs are whole numbers of this part, so that sums do not depend on their order.
-const COST_UNIT: f64 = 1e-6;
-/// Squared residuals beyond this many squared sigmas count less in the drift, in proportion to their root.
-const HUBER_CHI2: f64 = 4.0;
 
 /// A detection that a label may have.
 #[derive(Debug, Clone, Copy, Default)]
@@ -74,7 +72,7 @@ impl<'a> Case<'a> {
 pub(super) fn belief_of_votes<'c>(cases: impl Iterator<Item = &'c Case<'c>>) -> Belief {
     cases.filter(|case| case.claim.is_vote).fold(Belief::nothing(), |sum, case| {
         let of_label_px2 = 0.5 * case.own.trace() - case.detection_px2;
-        let robust = (HUBER_CHI2 / case.claim.chi2).sqrt().min(1.0);
+        let robust = huber_weight(case.claim.chi2);
         sum.and(&Belief::of_vote(&case.look, (case.look.variance + of_label_px2) / robust))
     })
 }
@@ -203,7 +201,7 @@ fn assign_tied(cases: &[Case<'_>], costs: &[f64], limit: f64, open: Vec<usize>) 
     let mut labels: Vec<u32> = open.iter().map(|&i| cases[i].claim.label).collect();
     labels.sort_unstable();
     labels.dedup();
-    let none = (limit / COST_UNIT) as i64;
+    let none = (limit / GAIN_UNIT) as i64;
     // One more column for each detection: it shows no label.
     let mut table = Matrix::new(rays.len(), labels.len() + rays.len(), 2 * none);
     for row in 0..rays.len() {
@@ -214,7 +212,7 @@ fn assign_tied(cases: &[Case<'_>], costs: &[f64], limit: f64, open: Vec<usize>) 
     for &i in &open {
         let at = (rays.binary_search(&cases[i].claim.ray), labels.binary_search(&cases[i].claim.label));
         if let (Ok(row), Ok(column)) = at {
-            table[(row, column)] = (costs[i] / COST_UNIT) as i64;
+            table[(row, column)] = (costs[i] / GAIN_UNIT) as i64;
         }
     }
     let (_, columns) = kuhn_munkres_min(&table);

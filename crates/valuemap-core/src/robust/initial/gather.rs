@@ -11,6 +11,7 @@ use crate::progress::{Halt, Progress};
 use crate::robust::model::Model;
 use crate::robust::noise::index::RayIndex;
 use crate::robust::parts::Part;
+use crate::robust::search::births::MAX_ROUNDS;
 use crate::robust::search::propose::{Hypothesis, MEETINGS, Who, propose};
 use crate::robust::search::quick::quick_estimate;
 
@@ -18,8 +19,6 @@ use crate::robust::search::quick::quick_estimate;
 const BATCH: usize = 16;
 /// Who nominates, round after round, each time with the rays that are left over.
 const ROUNDS: [Who; 4] = [Who::Part, Who::All, Who::All, Who::All];
-/// Rounds of estimating and gathering voters again, at most.
-const MAX_ROUNDS: usize = 8;
 
 /// Find labels among some rays (ascending) with a given noise, round after round, and count nominations and labels;
 /// `spreads` are those of all rays of the scene.

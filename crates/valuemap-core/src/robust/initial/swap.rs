@@ -10,6 +10,7 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use rustc_hash::FxHashSet;
 
+use super::adjust::PLACE_M;
 use super::associate::Association;
 use super::label::{Label, by_place, direction_to, from_voters, sector_middles};
 use super::pairs::{nearest_pairs, replaced};
@@ -28,7 +29,6 @@ const MOST_BOTH: f64 = 0.2;
 const CLAIMED_SHARE: f64 = 0.5;
 /// Other labels that are estimated with the two, at most, and how far they may be, m: they tell the drift of the passes.
 const COMPANIONS: usize = 5;
-const AROUND_M: f64 = 25.0;
 /// Times that detections nobody has are gathered, without companions and with them.
 const GATHERINGS: (usize, usize) = (1, 2);
 /// Swaps that explain so much less without companions are not tried with them.
@@ -75,7 +75,7 @@ fn better_pairs(
     let tree = by_place(labels);
     let of_pair = |&(a, b): &(usize, usize)| {
         let near = tree.nearest_neighbor_iter_with_distance_2(labels[a].estimate.point.into());
-        let near = near.take_while(|(_, distance2)| *distance2 <= AROUND_M * AROUND_M).map(|(near, _)| near.data);
+        let near = near.take_while(|(_, distance2)| *distance2 <= PLACE_M * PLACE_M).map(|(near, _)| near.data);
         let companions = near.filter(|&i| i != a && i != b).take(COMPANIONS).map(|i| &labels[i]).collect();
         Pair { association, settings, is_taken: &is_taken, labels: [&labels[a], &labels[b]], companions }.better()
     };

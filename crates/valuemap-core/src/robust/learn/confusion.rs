@@ -8,7 +8,6 @@ use std::collections::BTreeMap;
 
 use super::is_sure;
 use crate::robust::energy::Object;
-use crate::robust::energy::extent::places_of;
 use crate::robust::energy::looks::Lookout;
 use crate::robust::model::Model;
 use crate::robust::model::confusions::Confusions;
@@ -65,7 +64,7 @@ impl Tally {
         let votes = voting.len() as f64;
         let missing = f64::from(lookout.expected(scene, &object.fit.point, &object.votes)) - votes;
         let reach_m = model.classes[object.class as usize].farthest_m;
-        let hits = index.hits_of_any(&places_of(model, object), &|said| said != object.class, reach_m);
+        let hits = index.hits_of_any(&object.places(model), &|said| said != object.class, reach_m);
         let mut said: Vec<(u32, u32)> =
             hits.iter().map(|hit| (scene.rays.class[hit.ray as usize], hit.image)).collect();
         said.sort_unstable();

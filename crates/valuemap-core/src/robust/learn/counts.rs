@@ -4,7 +4,7 @@
 //! it: `N1 N3 <= N2²` and `N2 N4 <= N3²`. Where too few have three or four votes to tell, they are those of the likeliest negative binomial
 //! distribution. The odds of objects of few votes are lowered until their expected number is within these bounds.
 
-use crate::robust::energy::Object;
+use crate::robust::energy::{LEAST_VOTES, Object};
 use crate::robust::model::{FEW, Model, ln_gamma, mean_and_sd};
 
 /// The ratio of two numbers as large as this is known to a half.
@@ -17,8 +17,6 @@ pub(crate) const MOST: f64 = 50.0;
 const LEAST_DISPERSION: f64 = 1e3;
 /// Votes of an object, on average, are no fewer: objects that nobody sees are not counted.
 const LEAST_MEAN: f64 = 1.0;
-/// Objects of so many votes are there without those of few.
-const LEAST_VOTES: usize = 3;
 /// Objects of little parallax have hardly more votes.
 const MOST_VOTES: usize = 6;
 

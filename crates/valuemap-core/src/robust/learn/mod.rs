@@ -14,7 +14,7 @@ use rayon::prelude::*;
 
 use crate::robust::energy::looks::Lookout;
 use crate::robust::energy::seen::{Looks, Shares};
-use crate::robust::energy::{Object, implied_size};
+use crate::robust::energy::{LEAST_VOTES, Object, SURE_VOTES, implied_size};
 use crate::robust::model::heights::{Heights, ground_m2 as ground_m2_within, height_m};
 use crate::robust::model::steps::{elevation_factor, score_ratio};
 use crate::robust::model::{ClassModel, Model, ODD_PASSES, Rates};
@@ -26,11 +26,6 @@ use tails::{OfImages, tails};
 
 /// Steps of expectation and maximisation: some ten change the rates by less than a thousandth.
 const STEPS: usize = 20;
-/// Objects with fewer votes do not serve where there are better ones.
-const MIN_VOTES: usize = 6;
-/// If fewer than `MIN_OBJECTS` of all classes have so many, those with at least this many serve where elevations are measured: rays alone tell where they
-/// are, with three residuals to spare. Of bearings alone there would be one.
-const LEAST_VOTES: usize = 3;
 /// Shares of odd passes that are compared: so many that a tenth of their deviation is between two where a thousand passes tell.
 const ODD_SHARES: usize = 45;
 /// The part of the votes that is nearer than what counts as seen from everywhere.
@@ -98,7 +93,7 @@ impl<'a> Evidence<'a> {
         let sure = objects.iter().filter(|object| is_sure(object)).count();
         let looked_at = span(&model.sin_elevation);
         let are_elevations_measured = looked_at.1 - looked_at.0 > LEAST_ELEVATIONS;
-        let least_votes = if sure < MIN_OBJECTS && are_elevations_measured { LEAST_VOTES } else { MIN_VOTES };
+        let least_votes = if sure < MIN_OBJECTS && are_elevations_measured { LEAST_VOTES } else { SURE_VOTES };
         Self {
             model,
             lookout,
@@ -177,7 +172,7 @@ fn is_hardly_seen(object: &Object, class: &ClassModel) -> bool {
 
 /// Whether an object has many votes, and is real rather than false.
 pub(crate) fn is_sure(object: &Object) -> bool {
-    object.votes.len() >= MIN_VOTES && object.real > 0.5
+    object.votes.len() >= SURE_VOTES && object.real > 0.5
 }
 
 /// The ground from which objects are seen, m²: as far from the cameras as all but few votes are; nothing where nobody knows what is up.
@@ -384,14 +379,14 @@ mod tests {
         let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
         let rays = scene.usable_rays();
         let few = |model: &Model<'_>, objects: &[Object]| Evidence::new(model, &lookout, &rays, objects).least_votes;
-        let sure: Vec<Object> = (0..MIN_OBJECTS).map(|_| anywhere(MIN_VOTES, Seen::default(), -100.0)).collect();
-        assert_eq!(few(&model, &sure), MIN_VOTES);
+        let sure: Vec<Object> = (0..MIN_OBJECTS).map(|_| anywhere(SURE_VOTES, Seen::default(), -100.0)).collect();
+        assert_eq!(few(&model, &sure), SURE_VOTES);
         assert_eq!(few(&model, &sure[1..]), LEAST_VOTES);
         // Bearings: all boxes are put on the horizon, but for rounding.
         for (i, sine) in model.sin_elevation.iter_mut().enumerate() {
             *sine = 1e-12 * (i % 3) as f64;
         }
-        assert_eq!(few(&model, &sure[1..]), MIN_VOTES);
+        assert_eq!(few(&model, &sure[1..]), SURE_VOTES);
     }
 
     #[test]

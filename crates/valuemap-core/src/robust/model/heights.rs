@@ -9,14 +9,13 @@ use std::f64::consts::PI;
 use nalgebra::Vector3;
 use rustc_hash::FxHashSet;
 
+use super::ODD;
 use crate::robust::scene::Scene;
 
 /// Normal distributions that are tried, at most.
 const MOST_COMPONENTS: usize = 3;
 /// Rounds of expectation and maximisation, at most.
 const ROUNDS: usize = 50;
-/// The share of objects that are anywhere: on bridges, on hills. As of sizes that are odd by chance (model.rs).
-const ELSEWHERE: f64 = 0.05;
 
 /// A normal distribution among others.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -43,7 +42,7 @@ impl Heights {
     #[must_use]
     pub fn learn(heights_m: &[f64], sigmas_m: &[f64], range_m: f64) -> Option<Self> {
         let floor_m = median(sigmas_m)?;
-        let ln_elsewhere = ELSEWHERE.ln() - (2.0 * range_m).ln();
+        let ln_elsewhere = ODD.ln() - (2.0 * range_m).ln();
         let of_components = (1..=MOST_COMPONENTS).map(|count| {
             let heights = Self { components: components(heights_m, count, floor_m), ln_elsewhere };
             let likelihood: f64 = heights_m.iter().map(|&height| heights.ln_density(height)).sum();
@@ -83,7 +82,7 @@ impl Heights {
     pub fn ln_density(&self, height_m: f64) -> f64 {
         let of_components: f64 =
             self.components.iter().map(|component| component.share * component.density(height_m)).sum();
-        ((1.0 - ELSEWHERE) * of_components + self.ln_elsewhere.exp()).ln()
+        ((1.0 - ODD) * of_components + self.ln_elsewhere.exp()).ln()
     }
 
     /// Their mean, m.
@@ -98,7 +97,7 @@ impl Heights {
         let (mut density, mut slope, mut bend) = (self.ln_elsewhere.exp(), 0.0, 0.0);
         for component in &self.components {
             let component = Component { sigma_m: component.sigma_m.hypot(variance_m2.sqrt()), ..*component };
-            let of_component = (1.0 - ELSEWHERE) * component.share * component.density(height_m);
+            let of_component = (1.0 - ODD) * component.share * component.density(height_m);
             let precision = component.sigma_m.powi(-2);
             let pull = (height_m - component.mean_m) * precision;
             density += of_component;

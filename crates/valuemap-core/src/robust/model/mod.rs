@@ -31,6 +31,10 @@ use steps::{BINS, Steps};
 
 /// Objects of one vote, of two, and of more that rays alone do not tell.
 pub const FEW: usize = 3;
+/// What is said of an object is said of another thing in this share of the cases: a box is half hidden or merged with another, a range is that of what
+/// is behind it, what stands as high as no other stands on a bridge. It bounds what one of them can say. 5 % as in robust regression (Huber and Ronchetti,
+/// "Robust Statistics", 2009, section 1).
+pub const ODD: f64 = 0.05;
 /// What is learned about the objects and the clutter of one class.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ClassModel {
@@ -299,9 +303,6 @@ pub struct Sizes {
 
 /// Detections this many times farther than `max_range_m` still vote.
 pub const VOTE_RANGE: f64 = 2.5;
-/// A vote's size disagrees with its object's by chance in this share of the votes: half hidden, cut, merged with another. It bounds
-/// what one size can say. 5 % as in robust regression (Huber and Ronchetti, "Robust Statistics", 2009, section 1).
-const ODD_SIZES: f64 = 0.05;
 /// Sizes that say nothing: boxes of one size in all pictures, or no boxes.
 const LEAST_ANGLE_SD: f64 = 1e-3;
 
@@ -329,7 +330,7 @@ impl Sizes {
         let as_clutter = (angle - self.angle.0) / self.angle.1;
         let ratio =
             self.angle.1 / self.spread * (0.5 * (as_clutter * as_clutter - at_object * at_object)).min(30.0).exp();
-        ((1.0 - ODD_SIZES) * ratio + ODD_SIZES).ln()
+        ((1.0 - ODD) * ratio + ODD).ln()
     }
 
     /// Whether two implied sizes may be of one object.
@@ -729,6 +730,6 @@ mod tests {
     fn a_size_that_disagrees_says_no_more_than_that_sizes_are_odd_at_times() {
         let sizes = Sizes { angle: (-3.0, 0.8), object: (0.0, 0.5), spread: 0.1 };
         assert!(sizes.log_ratio(-3.0, 3.0_f64.exp(), 0.0) > 1.5);
-        assert!((sizes.log_ratio(-3.0, 5.0_f64.exp(), 0.0) - ODD_SIZES.ln()).abs() < 1e-6);
+        assert!((sizes.log_ratio(-3.0, 5.0_f64.exp(), 0.0) - ODD.ln()).abs() < 1e-6);
     }
 }

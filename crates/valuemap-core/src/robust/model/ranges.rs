@@ -6,13 +6,10 @@
 
 use nalgebra::Vector3;
 
+use super::ODD;
 use super::prior::Prior;
+use crate::robust::noise::huber::huber_weight;
 use crate::robust::scene::Scene;
-
-/// A range is another thing's in this share of the votes: of what is behind the object or before it. As of sizes that are odd by chance (model.rs).
-const ODD_RANGES: f64 = 0.05;
-/// Residuals of more standard deviations count less, in proportion (Huber).
-const HUBER_SIGMAS: f64 = 2.0;
 
 /// A measured range.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -52,7 +49,7 @@ impl Measured {
         let at_object = (depth_m.ln() - self.ln_depth) / self.share;
         let as_clutter = (self.ln_depth - usual.0) / usual.1;
         let ratio = usual.1 / self.share * (0.5 * (as_clutter * as_clutter - at_object * at_object)).min(30.0).exp();
-        ((1.0 - ODD_RANGES) * ratio + ODD_RANGES).ln()
+        ((1.0 - ODD) * ratio + ODD).ln()
     }
 }
 
@@ -64,7 +61,7 @@ pub fn range_terms([range_m, sigma_m]: [f64; 2], center: &Vector3<f64>, point: &
         let away = point - center;
         let direction = away.normalize();
         let residual = (away.norm() - range_m) / sigma_m;
-        let weight = (HUBER_SIGMAS / residual.abs()).min(1.0) / sigma_m;
+        let weight = huber_weight(residual * residual) / sigma_m;
         Prior {
             information: direction * direction.transpose() * (weight / sigma_m),
             gradient: direction * (weight * residual),
@@ -82,7 +79,7 @@ mod tests {
         let range = Measured { ln_depth: 20.0_f64.ln(), share: 0.1 };
         let usual = (15.0_f64.ln(), 0.6);
         assert!(range.log_ratio(20.0, usual) > 1.5);
-        assert!((range.log_ratio(60.0, usual) - ODD_RANGES.ln()).abs() < 1e-6);
+        assert!((range.log_ratio(60.0, usual) - ODD.ln()).abs() < 1e-6);
         assert!(range.log_ratio(20.0, (15.0_f64.ln(), 0.05)) == 0.0, "all are as far away");
         let none = Measured { ln_depth: f64::NAN, share: f64::NAN };
         assert!(none.log_ratio(20.0, usual) == 0.0);

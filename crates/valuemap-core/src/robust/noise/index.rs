@@ -9,8 +9,7 @@ use rstar::primitives::GeomWithData;
 use rustc_hash::FxHashMap;
 
 use super::Spread;
-use crate::kernel::ones;
-use crate::kernel::{Gates, LANES};
+use crate::kernel::{Gates, LANES, ones};
 use crate::ray::Ray;
 use crate::robust::scene::Scene;
 

@@ -4,6 +4,7 @@
 //! m, so no single radius in pixels fits. A part of `sigma_px` grows with the box.
 
 pub mod drift;
+pub mod huber;
 pub mod index;
 pub mod poses;
 pub mod spd;

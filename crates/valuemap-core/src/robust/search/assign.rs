@@ -10,18 +10,16 @@ use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
 use crate::progress::{Halt, Progress};
-use crate::robust::energy::extent::places_of;
 use crate::robust::energy::looks::Lookout;
 use crate::robust::energy::{Object, fitting};
 use crate::robust::model::Model;
 use crate::robust::noise::drift::Look;
+use crate::robust::noise::huber::huber_weight;
 use crate::robust::noise::index::{Hit, RayIndex};
 use crate::robust::noise::poses::{Belief, PoseError, Segments, smooth};
 
 /// Gains are whole numbers of this part, so that sums do not depend on their order.
-const GAIN_UNIT: f64 = 1e-6;
-/// Squared residuals beyond this many squared sigmas count less in the drift, in proportion to their root.
-const HUBER_CHI2: f64 = 4.0;
+pub const GAIN_UNIT: f64 = 1e-6;
 
 /// A detection that an object may have.
 #[derive(Debug, Clone, Copy)]
@@ -207,7 +205,7 @@ pub fn claims_of_all(
     let of_object = |(i, object): (usize, &Object)| {
         progress.check()?;
         let hits =
-            index.hits_of_any(&places_of(model, object), &|said| model.confusions.may_be(object.class, said), range_m);
+            index.hits_of_any(&object.places(model), &|said| model.confusions.may_be(object.class, said), range_m);
         let claim = |hit: Hit| Claim {
             image: hit.image,
             object: i as u32,
@@ -338,7 +336,7 @@ fn belief_of(model: &Model<'_>, object: &Object, ray: u32) -> Option<Belief> {
         (0..2).map(|axis| look.by_point[axis].dot(&(object.fit.covariance * look.by_point[axis]))).sum::<f64>() * 0.5;
     let variance = look.variance + of_point;
     let chi2 = (look.residual[0].powi(2) + look.residual[1].powi(2)) / variance;
-    let robust = (HUBER_CHI2 / chi2).sqrt().min(1.0);
+    let robust = huber_weight(chi2);
     Some(Belief::of_vote(&look, variance / robust))
 }
 

@@ -17,7 +17,7 @@ use crate::robust::noise::index::{Hit, RayIndex};
 /// Hypotheses that are tried side by side.
 const BATCH: usize = 64;
 /// Rounds of estimating and gathering votes again, at most.
-const MAX_ROUNDS: usize = 8;
+pub const MAX_ROUNDS: usize = 8;
 
 /// Let objects be born among the rays of no object, round after round; `is_taken` (one per ray) says which rays have one, and is kept up to date.
 /// Also how many hypotheses there were.

@@ -9,7 +9,6 @@ use rayon::prelude::*;
 
 use super::assign::gain_alone;
 use crate::progress::{Halt, Progress};
-use crate::robust::energy::extent::places_of;
 use crate::robust::energy::looks::Lookout;
 use crate::robust::energy::seen::Shares;
 use crate::robust::energy::{Object, by_place, object, unseen};
@@ -222,7 +221,7 @@ pub(crate) fn votes_on(
 ) -> (Vec<u32>, f64) {
     let image = model.scene.rays.image[ray as usize];
     let may_be = |said| model.confusions.may_be(object.class, said);
-    let hits = index.hits_of_any(&places_of(model, object), &may_be, model.class_of(ray).farthest_m);
+    let hits = index.hits_of_any(&object.places(model), &may_be, model.class_of(ray).farthest_m);
     let mut others: Vec<(u32, f64, u32)> = hits
         .into_iter()
         .filter(|hit| hit.image != image && may_vote(hit.ray))

@@ -6,8 +6,7 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use crate::kernel::ones;
-use crate::kernel::{Gates, LANES};
+use crate::kernel::{Gates, LANES, ones};
 use crate::progress::{Halt, Progress};
 use crate::ray::Ray;
 use crate::robust::model::{Model, Sizes, VotesFor};

@@ -5,16 +5,13 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use crate::robust::energy::estimate::{ROUGH_M, shares_of_step};
+use crate::robust::energy::estimate::{LONGEST_STEP_M, ROUGH_M, shares_of_step};
 use crate::robust::noise::Spread;
+use crate::robust::noise::huber::huber_weight;
 use crate::robust::noise::index::chi2;
 use crate::robust::scene::Scene;
 
 const MAX_ITERATIONS: usize = 8;
-/// Residuals beyond this many squared sigmas count less, in proportion to their root (Huber).
-const HUBER_CHI2: f64 = 4.0;
-/// A longer step is shortened to this, m.
-const LONGEST_STEP_M: f64 = 5.0;
 
 /// Estimate a position from its voters, starting nearby, to a few millimetres.
 ///
@@ -28,7 +25,7 @@ pub fn quick_estimate(scene: &Scene, spreads: &[Spread], voters: &[u32], start: 
             let (ray, spread) = (scene.ray(voter), &spreads[voter as usize]);
             let projected = ray.project(&point);
             let (residual, rows) = ray.linearize_beside(&projected, spread.share_of_position(projected.z))?;
-            let robust = (HUBER_CHI2 / chi2(&projected, spread)).sqrt().min(1.0);
+            let robust = huber_weight(chi2(&projected, spread));
             let weight = robust / spread.variance(projected.z);
             for (r, row) in residual.into_iter().zip(rows) {
                 let column = row.transpose() * weight;

@@ -15,7 +15,6 @@ use super::few::{ln_terms, most_probable, votes_on};
 use super::repair::MOST_VISITS;
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::estimate::visits;
-use crate::robust::energy::extent::places_of;
 use crate::robust::energy::looks::Lookout;
 use crate::robust::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, object, owners, unseen};
 use crate::robust::learn::company::Sure;
@@ -161,7 +160,7 @@ impl Garden<'_> {
         let images: Vec<u32> = born.votes.iter().map(|&ray| image(ray)).collect();
         let may_be = |said| model.confusions.may_be(born.class, said);
         let range_m = model.reach_m();
-        let hits = self.of_few.hits_of_any(&places_of(model, born), &may_be, range_m);
+        let hits = self.of_few.hits_of_any(&born.places(model), &may_be, range_m);
         let mut takes: Vec<(u32, f64)> = hits
             .into_iter()
             .filter(|hit| !images.contains(&hit.image))
