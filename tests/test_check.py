@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -36,7 +35,7 @@ from valuemap.check.fault import (
     with_images,
     with_poses,
 )
-from valuemap.check.fit import Changed, Estimate, Parameter, apply, estimate
+from valuemap.check.fit import Changed, Estimate, Parameter, apply
 from valuemap.check.frames import WorldAxes
 from valuemap.check.headings import headings, level_rotations, rotations_of
 from valuemap.check.loose import Correction, Loose
@@ -259,7 +258,7 @@ def test_what_agrees_the_more_the_farther_is_followed_so_far_and_no_farther(
 
     monkeypatch.setattr("valuemap.check.cameras.gains_of_all", gains)
     given = np.zeros(40)
-    start = Correction(Parameter("along", change, 0.1), 1.0, 1e-12, 1e-9, compare(given, given), _ESTIMATE)
+    start = Correction(Parameter("along", change), 1.0, 1e-12, 1e-9, compare(given, given), _ESTIMATE)
     found = _followed(View(good), start, given)
     assert 64.0 <= found.value <= 128.0
     assert len(tried) <= 1 + 6 + 12
@@ -279,15 +278,15 @@ def test_what_the_opposite_gives_as_well_is_no_correction(view: View, monkeypatc
 
 
 def test_a_vote_whose_camera_has_no_ray_a_step_away_is_left_out(view: View, monkeypatch: pytest.MonkeyPatch) -> None:
-    residuals = fit._residuals
+    over_depth = fit._over_depth
 
-    def without_one(*given: Any) -> Floats:
-        found = residuals(*given)
+    def without_one(local: Floats) -> Floats:
+        found = over_depth(local)
         found[0] = np.inf
         return found
 
-    monkeypatch.setattr(fit, "_residuals", without_one)
-    found = estimate(view.dataset, view.many_places, view.gate_px, PARAMETERS[:1])
+    monkeypatch.setattr(fit, "_over_depth", without_one)
+    found = cameras.estimate_of(view, PARAMETERS[:1])
     assert found is not None
     assert abs(found.value[0]) < 3.0 * found.of("pitch")[1]
 
@@ -297,13 +296,27 @@ def test_the_images_of_a_sample_change_as_they_do_in_the_whole(good: Dataset, vi
     sample = view.stretches
     value = np.array([0.02, -0.03, 0.01, 0.04, 1.5])
     changed, whole = Changed(good, sample, PARAMETERS, value), apply(good, PARAMETERS, value)
-    pairs = [(changed.images, sample.of(whole))]
-    pairs += [(changed.by(each, 0.1), sample.of(each.change(whole, 0.1))) for each in PARAMETERS]
-    for part, expected in pairs:
-        np.testing.assert_allclose(rotation_matrices(part.images), rotation_matrices(expected.images), atol=1e-12)
-        np.testing.assert_allclose(camera_centers(part.images), camera_centers(expected.images), atol=1e-9)
-        np.testing.assert_allclose(part.cameras.params[0], expected.cameras.params[0])
+    part, expected = changed.images, sample.of(whole)
+    np.testing.assert_allclose(rotation_matrices(part.images), rotation_matrices(expected.images), atol=1e-12)
+    np.testing.assert_allclose(camera_centers(part.images), camera_centers(expected.images), atol=1e-9)
+    np.testing.assert_allclose(part.cameras.params[0], expected.cameras.params[0])
     assert not np.allclose(camera_centers(changed.images.images), camera_centers(sample.of(good).images))
+
+
+def test_images_move_with_a_parameter_as_its_changes_do(good: Dataset, view: View) -> None:
+    sample, step = view.stretches, 1e-4
+    value = np.array([0.02, -0.03, 0.01, 0.04, 1.5])
+    changed, whole = Changed(good, sample, PARAMETERS, value), apply(good, PARAMETERS, value)
+    for parameter in PARAMETERS:
+        motion = changed.motion(parameter)
+        if motion is None:
+            assert parameter.name == "log_focal"
+            continue
+        ahead, behind = (sample.of(parameter.change(whole, way * step)).images for way in (1.0, -1.0))
+        move = (camera_centers(ahead) - camera_centers(behind)) / (2.0 * step)
+        np.testing.assert_allclose(motion.move, move, atol=1e-3)
+        between = Rotation.from_matrix(rotation_matrices(behind).transpose(0, 2, 1) @ rotation_matrices(ahead))
+        np.testing.assert_allclose(motion.turn, between.as_rotvec() / (2.0 * step), atol=1e-5)
 
 
 def test_a_pass_that_drives_its_streets_again_and_again_is_a_drive() -> None:
@@ -610,8 +623,7 @@ def test_agreement_does_not_depend_on_where_the_world_begins(good: Dataset, view
 def test_common_errors_are_estimated_in_size_and_direction(good: Dataset, view: View) -> None:
     pitch, focal = PARAMETERS[0], PARAMETERS[3]
     spoiled = focal.change(pitch.change(good, np.radians(1.5)), 0.08)
-    before = estimate(good, view.many_places, view.gate_px, PARAMETERS)
-    after = estimate(spoiled, View(spoiled).many_places, view.gate_px, PARAMETERS)
+    before, after = (cameras.estimate_of(each, PARAMETERS) for each in (view, View(spoiled)))
     assert before is not None
     assert after is not None
     assert after.of("pitch")[0] - before.of("pitch")[0] == pytest.approx(-np.radians(1.5), rel=0.15)

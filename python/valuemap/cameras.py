@@ -23,7 +23,7 @@ import valuemap._core as _core
 from valuemap import camera_models
 from valuemap.camera_models import Lens
 from valuemap.dataset import Dataset, rows_of
-from valuemap.tables import Cameras, Floats, Images, Ints
+from valuemap.tables import Cameras, Detections, Floats, Images, Ints
 
 if TYPE_CHECKING:
     from valuemap.colmap import pycolmap
@@ -128,8 +128,22 @@ def _model_of(cameras: Cameras, row: int) -> tuple[str, int, int, Floats]:
     return model, int(cameras.width_px[row]), int(cameras.height_px[row]), cameras.params[row]
 
 
-def cast_rays(dataset: Dataset, *, is_left_out: NDArray[np.bool_] | None = None) -> Rays:
-    """Return the viewing ray of every detection of a dataset; those that are left out (N) have none."""
+@dataclass(frozen=True, eq=False)
+class Pinholes:
+    """The local pinhole of each detection, wherever its camera is.
+
+    `residual_from_cam` (N, 3, 3) is M above in camera axes and `direction_in_cam` (N, 3) the unit ray, NaN where the
+    camera model has no ray for the pixel; `image_row` and `camera_row` (N) are as of `Rays`.
+    """
+
+    residual_from_cam: Floats
+    direction_in_cam: Floats
+    image_row: Ints
+    camera_row: Ints
+
+
+def local_pinholes(dataset: Dataset) -> Pinholes:
+    """Return what every detection of a dataset sees by its camera alone."""
     images, cameras, detections = dataset.images, dataset.cameras, dataset.detections
     image_row = rows_of(detections.image_id, images.image_id)
     camera_row = rows_of(images.camera_id, cameras.camera_id)[image_row]
@@ -142,17 +156,32 @@ def cast_rays(dataset: Dataset, *, is_left_out: NDArray[np.bool_] | None = None)
                 camera, detections.center_px[members]
             )
     has_no_ray = ~(np.abs(residual_from_cam).max(axis=(1, 2)) <= _STEEPEST)
-    if is_left_out is not None:
-        has_no_ray |= is_left_out
     residual_from_cam[has_no_ray], direction_in_cam[has_no_ray] = np.nan, np.nan
+    return Pinholes(residual_from_cam, direction_in_cam, image_row, camera_row)
+
+
+def cast_rays(dataset: Dataset, *, is_left_out: NDArray[np.bool_] | None = None) -> Rays:
+    """Return the viewing ray of every detection of a dataset; those that are left out (N) have none."""
+    pinholes = local_pinholes(dataset)
+    if is_left_out is not None:
+        pinholes.residual_from_cam[is_left_out], pinholes.direction_in_cam[is_left_out] = np.nan, np.nan
+    return rays_of_pinholes(pinholes, dataset.detections, *camera_poses(dataset.images))
+
+
+def rays_of_pinholes(
+    pinholes: Pinholes, detections: Detections, cam_from_world: Floats, center_in_world_m: Floats
+) -> Rays:
+    """Return the viewing rays of detections whose images have these rotations (M, 3, 3) and camera centres (M, 3)."""
+    class_code = detections.class_name.codes
     core = _core.Rays(
-        residual_from_cam,
-        direction_in_cam,
-        image_row.astype(np.uint32),
-        detections.class_name.codes.astype(np.uint32),
-        *camera_poses(images),
+        pinholes.residual_from_cam,
+        pinholes.direction_in_cam,
+        pinholes.image_row.astype(np.uint32),
+        class_code.astype(np.uint32),
+        cam_from_world,
+        center_in_world_m,
     )
-    return Rays(core, image_row, camera_row, detections.class_name.codes)
+    return Rays(core, pinholes.image_row, pinholes.camera_row, class_code)
 
 
 def _blocks(rows: Ints) -> list[Ints]:

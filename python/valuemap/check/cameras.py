@@ -14,7 +14,7 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check.agreement import compare, measure_agreement
+from valuemap.check.agreement import agreement_on, compare
 from valuemap.check.fault import (
     GATE_RAD,
     LEAST_CHANCE,
@@ -28,12 +28,11 @@ from valuemap.check.fault import (
     with_centers,
     with_detections,
     with_images,
-    with_poses,
 )
-from valuemap.check.fit import Estimate, Parameter, estimate
+from valuemap.check.fit import Estimate, Motion, Parameter, estimate
 from valuemap.check.groups import Group, OfGroup, groups_of
 from valuemap.check.lenses import Focal, focals, with_params
-from valuemap.check.loose import Correction, Loose
+from valuemap.check.loose import Correction, loose_of
 from valuemap.check.passes import find_height_of_pass, moved_along, seen_m
 from valuemap.check.sample import pixels_per_radian
 from valuemap.dataset import Dataset
@@ -43,14 +42,33 @@ _MOST_DOUBLINGS, _MOST_STEPS = 6, 12
 """Of a search that ends by itself as soon as the agreement falls: of turns it need not."""
 
 
-def _turn(axis: int) -> Any:
-    def change(dataset: Dataset, angle_rad: float) -> Dataset:
-        vector = np.zeros(3)
-        vector[axis] = angle_rad
-        rotation = Rotation.from_rotvec(vector).as_matrix() @ rotation_matrices(dataset.images)
-        return with_poses(dataset, rotation, camera_centers(dataset.images))
+class _Turn:
+    """Cameras turned about one of their own axes."""
 
-    return change
+    def __init__(self, axis: int) -> None:
+        self._axis = axis
+
+    def change(self, dataset: Dataset, angle_rad: float) -> Dataset:
+        """Return a dataset whose cameras are turned by an angle, in their places."""
+        turn = Rotation.from_rotvec(angle_rad * np.eye(3)[self._axis])
+        return with_images(
+            dataset,
+            cam_from_world_quat=_product(
+                turn.as_quat(canonical=True, scalar_first=True), dataset.images.cam_from_world_quat
+            ),
+            cam_from_world_m=dataset.images.cam_from_world_m @ turn.as_matrix().T,
+        )
+
+    def motion(self, dataset: Dataset) -> Motion:
+        """Return the axis in the world, about which no centre moves."""
+        axis = rotation_matrices(dataset.images)[:, self._axis]
+        return Motion(axis, np.zeros_like(axis))
+
+
+def _product(first: Floats, second: Floats) -> Floats:
+    """Return the quaternions (N, 4), w x y z, of turns by the second ones (N, 4) and then by the first (4)."""
+    a, u, w, v = first[0], first[1:], second[:, :1], second[:, 1:]
+    return np.concatenate([a * w - v @ u[:, None], a * v + w * u + np.cross(u, v)], axis=1)
 
 
 def with_focal(dataset: Dataset, log_factor: float) -> Dataset:
@@ -62,12 +80,18 @@ def _shift_along(dataset: Dataset, forward_m: float) -> Dataset:
     return with_centers(dataset, moved_along(dataset, forward_m))
 
 
+_STEP_ALONG_M = 1e-3
+
+
+def _motion_along(dataset: Dataset) -> Motion:
+    ahead, behind = (moved_along(dataset, way * _STEP_ALONG_M) for way in (1.0, -1.0))
+    return Motion(np.zeros_like(ahead), (ahead - behind) / (2.0 * _STEP_ALONG_M))
+
+
 PARAMETERS = (
-    Parameter("pitch", _turn(0), 1e-5),
-    Parameter("yaw", _turn(1), 1e-5),
-    Parameter("roll", _turn(2), 1e-5),
-    Parameter("log_focal", with_focal, 1e-5),
-    Parameter("along", _shift_along, 1e-3, is_length=True, of_drives=True),
+    *(Parameter(name, _Turn(axis).change, _Turn(axis).motion) for axis, name in enumerate(("pitch", "yaw", "roll"))),
+    Parameter("log_focal", with_focal),
+    Parameter("along", _shift_along, _motion_along, is_length=True, of_drives=True),
 )
 
 
@@ -75,14 +99,25 @@ def _raised(dataset: Dataset, up_m: float) -> Dataset:
     return with_centers(dataset, camera_centers(dataset.images) + up_m * np.array(dataset.frame.up))
 
 
-_OF_A_MOUNT = (*PARAMETERS[:3], Parameter("up", _raised, 1e-3, is_length=True))
+def _motion_up(dataset: Dataset) -> Motion:
+    up = np.tile(dataset.frame.up, (len(dataset.images), 1))
+    return Motion(np.zeros_like(up), up)
+
+
+_OF_A_MOUNT = (*PARAMETERS[:3], Parameter("up", _raised, _motion_up, is_length=True))
 """How one camera of several hangs: its own rays do not know how high, but those of the others do."""
+
+
+def estimate_of(view: View, parameters: tuple[Parameter, ...], *, start: Estimate | None = None) -> Estimate | None:
+    """Return the estimate of parameters at the many places of a view."""
+    given = view.agreement_at_many_places
+    return estimate(view.dataset, view.many_places, view.gate_px, parameters, start=start, given=given)
 
 
 def common_errors(view: View) -> Estimate | None:
     """Return the estimate of what all images may share, worked out once a view."""
     if "common_errors" not in view.memory:
-        view.memory["common_errors"] = estimate(view.dataset, view.many_places, view.gate_px, parameters_of(view))
+        view.memory["common_errors"] = estimate_of(view, parameters_of(view))
     found: Estimate | None = view.memory["common_errors"]
     return found
 
@@ -92,8 +127,7 @@ def settled_errors(view: View) -> Estimate:
     if "settled_errors" not in view.memory:
         start = common_errors(view)
         assert start is not None
-        settled = estimate(view.dataset, view.many_places, view.gate_px, parameters_of(view), start=start)
-        view.memory["settled_errors"] = settled
+        view.memory["settled_errors"] = estimate_of(view, parameters_of(view), start=start)
     found: Estimate = view.memory["settled_errors"]
     return found
 
@@ -138,7 +172,7 @@ def _find_of_one_group(view: View) -> Correction | None:
         for own in told:
             compared += 1
             correction = replace(own, group=group)
-            comparison = compare(gains_of_all(view, correction(view.dataset)), _given_gains(view))
+            comparison = compare(gains_of_all(view, correction(view.dataset)), gains_of_all(view, view.dataset))
             correction = replace(correction, comparison=comparison, chance=max(own.chance, comparison.chance))
             if best is None or comparison.difference > best.comparison.difference:
                 best = correction
@@ -179,13 +213,13 @@ def _estimates_by_others(view: View, group: Group, alone: View, groups: int) -> 
     What one camera sees little of alone, others see as well; and only they tell how high it is.
     """
     own = tuple(_of_group(parameter, group) for parameter in _OF_A_MOUNT)
-    first = estimate(view.dataset, view.many_places, view.gate_px, own)
+    first = estimate_of(view, own)
     if first is None:
         return
     # Of a camera that is off by gates few votes are right, and the first rounds see little of it.
-    found = estimate(view.dataset, view.many_places, view.gate_px, own, start=first)
+    found = estimate_of(view, own, start=first)
     assert found is not None
-    given, least_rise = _given_gains(view), LEAST_RISE * float(gains_of_all(alone, alone.dataset).sum())
+    given, least_rise = gains_of_all(view, view.dataset), LEAST_RISE * float(gains_of_all(alone, alone.dataset).sum())
     for parameter, changes in zip(_OF_A_MOUNT, own, strict=True):
         value, sigma = found.of(parameter.name)
         chance = _chance_of(found, parameter.name, groups)
@@ -197,19 +231,16 @@ def _estimates_by_others(view: View, group: Group, alone: View, groups: int) -> 
             yield Correction(parameter, value, sigma, chance, rise, found)
 
 
-def _given_gains(view: View) -> Floats:
-    """Return what rays gain as the dataset is given, worked out once a view."""
-    if "given_gains" not in view.memory:
-        view.memory["given_gains"] = gains_of_all(view, view.dataset)
-    found: Floats = view.memory["given_gains"]
-    return found
-
-
 def _of_group(parameter: Parameter, group: Group) -> Parameter:
     def change(dataset: Dataset, value: float) -> Dataset:
         return OfGroup(group, lambda part: parameter.change(part, value))(dataset)
 
-    return replace(parameter, change=change)
+    def motion(dataset: Dataset) -> Motion:
+        assert parameter.motion is not None
+        of_all, mine = parameter.motion(dataset), group.images_of(dataset)[:, None]
+        return Motion(of_all.turn * mine, of_all.move * mine)
+
+    return replace(parameter, change=change, motion=motion)
 
 
 def _chance_of(found: Estimate, name: str, groups: int) -> float:
@@ -244,7 +275,7 @@ def _find_correction(view: View) -> Correction | None:
         chance = _chance_of(found, name, 1)
         if chance > LEAST_CHANCE:
             continue
-        given = _given_gains(view)
+        given = gains_of_all(view, view.dataset)
         parameter = next(p for p in PARAMETERS if p.name == name)
         gains = gains_of_all(view, parameter.change(view.dataset, value))
         value, sigma, gains = _better(view, parameter, value, sigma, gains)
@@ -273,7 +304,7 @@ def _find_beyond_noise(view: View) -> Correction | None:
     """
     focal = next((each for each in parameters_of(view) if each.name == "log_focal"), None)
     others = tuple(each for each in PARAMETERS if each.name != "log_focal")
-    return Loose(view).correction(others, frozenset({"pitch", "yaw", "along"}), focal)
+    return loose_of(view).correction(others, frozenset({"pitch", "yaw", "along"}), focal)
 
 
 def _is_wider_gate_only(view: View, dataset: Dataset) -> bool:
@@ -585,7 +616,7 @@ def _best_cameras(view: View) -> tuple[list[dict[str, Any]], float]:
     for row, camera in enumerate(cameras.camera_id.tolist()):
         version = with_images(sample.dataset, camera_id=np.full(len(images), camera))
         gate_px = view.gate_px * pixels_per_radian_of(view.dataset, row) / pixels_per_radian(view.dataset)
-        gains[camera] = measure_agreement(version, sample.place_of_image, gate_px).gain
+        gains[camera] = agreement_on(sample, version, gate_px).gain
     best: list[dict[str, Any]] = []
     better: list[Floats] = []
     worse: list[Floats] = []

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from valuemap.cameras import rotation_matrices
-from valuemap.check.agreement import Agreement, Comparison, compare, gains_of_objects, measure_agreement
+from valuemap.check.agreement import Agreement, Comparison, agreement_on, compare, gains_of_objects
 from valuemap.check.cameras import PARAMETERS, WrongCamera
 from valuemap.check.fault import LEAST_CHANCE, WIDER_GATE, Convention, Finding, Fix, View, gains_of_all, uprightness
 from valuemap.check.groups import Group, OfGroup, fits_one_group, groups_of
@@ -221,7 +221,7 @@ def _try_all(view: View, conventions: Sequence[Convention], progress: Progress) 
 
 def _measure(dataset: Dataset, sample: Sample, gate_px: float, fix: Fix | None) -> Agreement:
     # Where pixels become larger, so do their errors.
-    return measure_agreement(dataset, sample.place_of_image, gate_px * getattr(fix, "gate_factor", 1.0))
+    return agreement_on(sample, dataset, gate_px * getattr(fix, "gate_factor", 1.0))
 
 
 def _judge(view: View, readings: Sequence[_Reading], top: _Reading) -> Finding | None:
@@ -274,7 +274,7 @@ def _is_small_turn(view: View, total: float) -> bool:
     turned = (
         turn.change(sample.dataset, way * angle) for turn in turns for angle in _SMALL_TURNS_RAD for way in (-1, 1)
     )
-    return any(measure_agreement(each, sample.place_of_image, view.gate_px).gain.sum() >= total for each in turned)
+    return any(agreement_on(sample, each, view.gate_px).gain.sum() >= total for each in turned)
 
 
 def _suspicion(given: _Reading, top: _Reading) -> str | None:
@@ -331,6 +331,8 @@ def _compare(better: Sequence[Agreement], worse: Sequence[Agreement], *, may_spl
 
 def _everywhere(view: View, reading: _Reading) -> list[Agreement]:
     """Return how well rays agree on the stretches and at the places."""
+    if reading.fix is None:
+        return [reading.agreement, view.agreement_at_places]
     # Places have parts of passes: what depends on the image before or after needs the whole.
-    dataset = view.places.dataset if reading.fix is None else view.places.of(reading.fix(view.dataset))
-    return [reading.agreement, _measure(dataset, view.places, view.gate_px, reading.fix)]
+    read = view.places.of(reading.fix(view.dataset))
+    return [reading.agreement, _measure(read, view.places, view.gate_px, reading.fix)]

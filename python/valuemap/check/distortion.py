@@ -10,9 +10,9 @@ import numpy as np
 from scipy import stats
 
 from valuemap.check.agreement import Comparison, compare
-from valuemap.check.cameras import PARAMETERS, parameters_of
+from valuemap.check.cameras import PARAMETERS, estimate_of, parameters_of
 from valuemap.check.fault import LEAST_CHANCE, LEAST_RISE, Fault, Finding, Fix, Stage, View, gains_of_all
-from valuemap.check.fit import Parameter, estimate
+from valuemap.check.fit import Parameter
 from valuemap.check.lenses import FOCAL_LENGTHS, Focal, focals, with_params
 from valuemap.dataset import Dataset
 from valuemap.tables import Categories, Floats
@@ -69,7 +69,7 @@ class LensModel(Fault):
         """Return the distortion that the votes tell beside all else that images share, if it is more than none."""
         if len(parameters_of(view)) < len(PARAMETERS):  # Panoramas have no lens.
             return None
-        found = estimate(view.dataset, view.many_places, view.gate_px, (*parameters_of(view), _DISTORTION))
+        found = estimate_of(view, (*parameters_of(view), _DISTORTION))
         if found is None:
             return None
         value, sigma = found.of("distortion")
@@ -104,7 +104,7 @@ def with_distortion(dataset: Dataset, k1: float) -> Dataset:
     return Dataset(**{**vars(dataset), "cameras": changed_cameras})
 
 
-_DISTORTION = Parameter("distortion", with_distortion, 1e-4)
+_DISTORTION = Parameter("distortion", with_distortion, step=1e-4)
 _FOCAL_FACTORS = (0.7, 0.8, 0.9, 1.1, 1.25, 1.4)
 """Steps of about a tenth and more, to beyond the nearest sizes that pictures are scaled to, 3/4 and 4/3."""
 

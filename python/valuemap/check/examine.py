@@ -68,13 +68,12 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
         )
     findings: list[Finding] = []
     notes: list[str] = []
-    gate_share, meets = 1.0, True
-    is_part = drives is not None
+    view, meets = View(dataset, drives=drives), True
     rivals: tuple[str, ...] = ()
     for stage in STAGES:
         for _ in range(_MOST_ROUNDS):
             known = frozenset(finding.fault for finding in findings)
-            view = View(dataset, gate_share=gate_share, known=known, meets=meets, rivals=rivals, drives=drives)
+            view, gate_share = view.again(known=known, meets=meets, rivals=rivals), view.gate_share
             if stage == "conventions":
                 verdict = hold_contest(view, CONVENTIONS, progress)
                 if verdict.suspicion is not None:
@@ -106,12 +105,13 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
             fixes: list[Fix] = [each.fix for each in found if each.fix is not None]
             for fix in fixes:
                 dataset = fix(dataset)
-            if fixes and is_part:  # They put pieces of passes right, not these.
+            if fixes and drives is not None:  # They put pieces of passes right, not these.
                 drives = dataset.images[:0]
+            if fixes or gate_share != view.gate_share:
+                view = View(dataset, gate_share=gate_share, drives=drives)
             if not fixes:
                 break
-    prospects = describe_prospects(View(dataset, gate_share=gate_share, drives=drives))
-    return Examination(tuple(findings), prospects, dataset, tuple(notes))
+    return Examination(tuple(findings), describe_prospects(view), dataset, tuple(notes))
 
 
 def _is_rest(finding: Finding, before: Sequence[Finding]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check.agreement import Agreement, chance_agreement, measure_agreement
+from valuemap.check.agreement import Agreement, agreement_on, chance_agreement
 from valuemap.check.sample import (
     MOST_DETECTIONS,
     Sample,
@@ -106,6 +107,13 @@ class View:
         self.memory: dict[str, Any] = {}
         """What several faults of one family share."""
 
+    def again(self, *, known: frozenset[str], meets: bool, rivals: tuple[str, ...]) -> View:
+        """Return a view of the same dataset of which other things are known; what was worked out stays."""
+        view = copy.copy(self)
+        view.known, view.meets, view.rivals = known, meets, rivals
+        view.memory = self.memory if meets == self.meets else {}
+        return view
+
     @cached_property
     def gate_px(self) -> float:
         """How close rays must pass to agree, at the images' own resolution."""
@@ -134,12 +142,17 @@ class View:
     @cached_property
     def agreement(self) -> Agreement:
         """How well the rays of the stretches agree."""
-        return measure_agreement(self.stretches.dataset, self.stretches.place_of_image, self.gate_px)
+        return agreement_on(self.stretches, self.stretches.dataset, self.gate_px)
+
+    @cached_property
+    def agreement_at_many_places(self) -> Agreement:
+        """How well the rays of the many places agree."""
+        return agreement_on(self.many_places, self.many_places.dataset, self.gate_px)
 
     @cached_property
     def agreement_at_places(self) -> Agreement:
         """How well the rays of several passes agree."""
-        return measure_agreement(self.places.dataset, self.places.place_of_image, self.gate_px)
+        return agreement_on(self.places, self.places.dataset, self.gate_px)
 
     @cached_property
     def chance(self) -> Agreement:
@@ -172,10 +185,12 @@ def gains_of_all(view: View, dataset: Dataset, *, is_gate_an_angle: bool = False
 
     The gate is so many pixels, as errors of boxes are; or the same angle in every version, as errors of poses are.
     """
+    if dataset is view.dataset:
+        return np.concatenate([view.agreement.gain, view.agreement_at_many_places.gain])
     samples = (view.stretches, view.many_places)
     scale = pixels_per_radian(dataset) / pixels_per_radian(view.dataset) if is_gate_an_angle else 1.0
     gate_px = view.gate_px * scale
-    return np.concatenate([measure_agreement(s.of(dataset), s.place_of_image, gate_px).gain for s in samples])
+    return np.concatenate([agreement_on(s, s.of(dataset), gate_px).gain for s in samples])
 
 
 class Fault(ABC):

@@ -9,40 +9,54 @@ the number of detections. Where errors of poses last longer than a place, whole 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from valuemap.cameras import Rays, cast_rays
-from valuemap.check.agreement import measure_agreement
+from valuemap.cameras import Rays, local_pinholes, rotation_matrices
+from valuemap.check.agreement import Agreement, agreement_on
 from valuemap.check.sample import Sample
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats, Ints
+from valuemap.tables import Cameras, Floats, Ints
 
 Change = Callable[[Dataset, float], Dataset]
 """A dataset with one parameter changed by a value."""
 _ROUNDS = 4
 _MOST_ROUNDS = 40
 """Of an error that is there: each vote is at a place that the last round left, so the way to it is many short steps."""
-_SETTLED = 0.1
-"""Of a standard error: steps below it change nothing."""
+_SETTLED, _SAME = 0.1, 1e-4
+"""Of a standard error: steps below the first change nothing, and estimates nearer than the second are one."""
 _LEAST_VOTES = 4
 _LEAST_PLACES = 6
 _CAUCHY = 2.4
 """Residuals of so many median deviations have half the weight."""
 
 
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How images move with a parameter, by its unit, in the world.
+
+    `turn` (N, 3) is the axis that each camera turns about, times the angle in radians; `move` (N, 3) is the way of its
+    centre.
+    """
+
+    turn: Floats
+    move: Floats
+
+
 @dataclass(frozen=True)
 class Parameter:
-    """One thing to estimate, an angle or a length: how it changes a dataset, and the step of the derivative.
+    """One thing to estimate, an angle or a length: how it changes a dataset, and how it moves its images.
 
-    One `of_drives` changes an image by those before and after it; others change each image or camera by itself.
+    A `motion` of None is that of a parameter of cameras: what that does is told by differences of a `step`. One
+    `of_drives` changes an image by those before and after it; others change each image or camera by itself.
     """
 
     name: str
     change: Change
-    step: float
+    motion: Callable[[Dataset], Motion] | None = None
+    step: float = 1e-5
     is_length: bool = False
     of_drives: bool = False
 
@@ -75,25 +89,46 @@ def estimate(
     *,
     start: Estimate | None = None,
     blocks: int | None = None,
+    given: Agreement,
 ) -> Estimate | None:
     """Estimate parameters on a sample of a dataset; None where there is too little to go by.
 
     A few rounds tell whether there is an error at all. From a `start` that says so it goes on until it stays. Places
-    are joined to so many `blocks`, if given, whose scatter standard errors come from.
+    are joined to so many `blocks`, if set, whose scatter standard errors come from. `given` is what the sample came to
+    as it is.
     """
     if not len(sample.dataset.detections):
         return start
     value = np.zeros(len(parameters)) if start is None else start.value
-    result = start
-    for _ in range(_ROUNDS if start is None else _MOST_ROUNDS):
-        found = _solve(Changed(dataset, sample, parameters, value), gate_px, blocks)
+    results: list[Estimate] = []
+    rounds = _ROUNDS if start is None else _MOST_ROUNDS
+    while len(results) < rounds:
+        changed = Changed(dataset, sample, parameters, value)
+        agreement = agreement_on(sample, changed.images, gate_px) if value.any() else given
+        found = _solve(changed, agreement, blocks)
         if found is None:
             return start
         value = value + found.value
-        result = Estimate(found.names, value.copy(), found.covariance, found.places, found.points)
+        results.append(Estimate(found.names, value.copy(), found.covariance, found.places, found.points))
         if np.all(np.abs(found.value) < _SETTLED * np.sqrt(np.diag(found.covariance))):
             break
-    return result
+        period = _period(results)
+        if period:
+            return results[-1 - period + (rounds - len(results)) % period]
+    return results[-1]
+
+
+def _period(results: list[Estimate]) -> int:
+    """Return how many rounds ago the estimate was where it is: it goes round in a circle; 0 where it was never there.
+
+    Votes that come and go with the estimate pull it to and fro, the same votes to the same place.
+    """
+    last = results[-1]
+    near = _SAME * np.sqrt(np.diag(last.covariance))
+    for back in range(1, len(results)):
+        if np.all(np.abs(results[-1 - back].value - last.value) < near):
+            return back
+    return 0
 
 
 def apply(dataset: Dataset, parameters: tuple[Parameter, ...], value: Floats | Mapping[str, float]) -> Dataset:
@@ -110,39 +145,33 @@ class Changed:
 
     def __init__(self, dataset: Dataset, sample: Sample, parameters: tuple[Parameter, ...], value: Floats) -> None:
         self.sample, self.parameters = sample, parameters
-        self._whole = apply(dataset, parameters, {p.name: v for p, v in _pairs(parameters, value) if p.of_drives})
-        self._alone = {p.name: v for p, v in _pairs(parameters, value) if not p.of_drives}
-        self.images = self._of(self._whole)
+        pairs = [(p, float(v)) for p, v in zip(parameters, value, strict=True)]
+        self._whole = apply(dataset, parameters, {p.name: v for p, v in pairs if p.of_drives})
+        alone = {p.name: v for p, v in pairs if not p.of_drives}
+        self.images = apply(sample.of(self._whole), parameters, alone)
 
-    def by(self, parameter: Parameter, change: float) -> Dataset:
-        """Return the images with one parameter changed further."""
-        if parameter.of_drives:
-            return self._of(parameter.change(self._whole, change))
-        return parameter.change(self.images, change)
-
-    def _of(self, whole: Dataset) -> Dataset:
-        return apply(self.sample.of(whole), self.parameters, self._alone)
-
-
-def _pairs(parameters: tuple[Parameter, ...], value: Floats) -> Iterator[tuple[Parameter, float]]:
-    return zip(parameters, value.tolist(), strict=True)
+    def motion(self, parameter: Parameter) -> Motion | None:
+        """Return how the images move with one parameter; None where it is their cameras that change."""
+        if parameter.motion is None:
+            return None
+        if not parameter.of_drives:
+            return parameter.motion(self.images)
+        of_all = parameter.motion(self._whole)
+        return Motion(of_all.turn[self.sample.image_row], of_all.move[self.sample.image_row])
 
 
-def _solve(changed: Changed, gate_px: float, blocks: int | None) -> Estimate | None:
-    sample, parameters = changed.sample, changed.parameters
-    agreement = measure_agreement(changed.images, sample.place_of_image, gate_px)
-    found, rays = agreement.found, cast_rays(changed.images)
+def _solve(changed: Changed, agreement: Agreement, blocks: int | None) -> Estimate | None:
+    sample, parameters, found = changed.sample, changed.parameters, agreement.found
     votes = np.diff(found.voter_offsets)
     kept = np.flatnonzero(votes >= _LEAST_VOTES)
     if len(kept) < 3 * len(parameters):
         return None
     voters = found.voters.astype(np.int64)
     rows = np.concatenate([np.arange(found.voter_offsets[k], found.voter_offsets[k + 1]) for k in kept])
-    voter, point_of = voters[rows], np.repeat(np.arange(len(kept)), votes[kept])
-    point = agreement.points_in_world_m[kept]
-    residual = _residuals(rays, voter, point[point_of])
-    slope = np.stack([_slope(changed, p, voter, point[point_of]) for p in parameters], axis=2)
-    of_point = _slopes_of_points(rays, voter, point[point_of])
+    point_of = np.repeat(np.arange(len(kept)), votes[kept])
+    meet = _Votes(changed.images, agreement.rays, voters[rows], found.position_in_world_m[kept][point_of])
+    residual, of_point = meet.residual, meet.slope_of_points()
+    slope = np.stack([_slope(changed, p, meet) for p in parameters], axis=2)
     # A step may take a pixel to where its camera has no ray.
     tells = np.all(
         [np.isfinite(each).reshape(len(rows), -1).all(axis=1) for each in (residual, slope, of_point)], axis=0
@@ -152,7 +181,7 @@ def _solve(changed: Changed, gate_px: float, blocks: int | None) -> Estimate | N
     size = np.linalg.norm(residual, axis=1)
     scale = _CAUCHY * max(float(np.median(size)), 1e-9)
     weight = tells / (1.0 + (size / scale) ** 2)
-    place = sample.place_of_image[rays.image_row[voter]].astype(np.int64)
+    place = sample.place_of_image[meet.image_row].astype(np.int64)
     if blocks is not None:  # Places are numbered along the drives.
         place = place * blocks // max(sample.places, blocks)
     gradient, curvature = _eliminate(residual, slope, of_point, weight, point_of, place)
@@ -164,31 +193,60 @@ def _solve(changed: Changed, gate_px: float, blocks: int | None) -> Estimate | N
     # At the solution: what each place pulls.
     pull = gradient + np.einsum("kij,j->ki", curvature, value)
     count = len(pull)
-    meat = pull.T @ pull * count / max(count - len(parameters), 1)
-    return Estimate(tuple(p.name for p in parameters), value, inverse @ meat @ inverse, count, len(kept))
+    scatter = pull @ inverse
+    covariance = scatter.T @ scatter * count / max(count - len(parameters), 1)
+    return Estimate(tuple(p.name for p in parameters), value, covariance, count, len(kept))
 
 
-def _slope(changed: Changed, parameter: Parameter, voter: Ints, point: Floats) -> Floats:
+class _Votes:
+    """Rays (N) of a dataset that vote for points (N, 3), and how their residuals change."""
+
+    def __init__(self, dataset: Dataset, rays: Rays, voter: Ints, point: Floats) -> None:
+        self.voter, self.image_row = voter, rays.image_row[voter]
+        self._dataset = dataset
+        self._matrix = rays.residual_from_world[voter]
+        self._to_point = point - rays.center_in_world_m[voter]
+        self._local = _times(self._matrix, self._to_point)
+        self.residual = _over_depth(self._local)
+
+    def slope_of_points(self) -> Floats:
+        """Return d residual / d point (N, 2, 3)."""
+        rows = self._matrix[:, :2] - self.residual[:, :, None] * self._matrix[:, 2:]
+        return np.asarray(rows / self._local[:, 2, None, None])
+
+    def slope_of_motion(self, motion: Motion) -> Floats:
+        """Return d residual / d parameter (N, 2) of one by which the images move."""
+        turn, move = motion.turn[self.image_row], motion.move[self.image_row]
+        change = _times(self._matrix, np.cross(turn, self._to_point) - move)
+        return np.asarray((change[:, :2] - self.residual * change[:, 2:]) / self._local[:, 2:])
+
+    def residual_by(self, cameras: Cameras) -> Floats:
+        """Return the residuals (N, 2) by other cameras with the same poses."""
+        pinholes = local_pinholes(Dataset(**{**vars(self._dataset), "cameras": cameras}))
+        in_cam = _times(rotation_matrices(self._dataset.images)[self.image_row], self._to_point)
+        return _over_depth(_times(pinholes.residual_from_cam[self.voter], in_cam))
+
+
+def _slope(changed: Changed, parameter: Parameter, votes: _Votes) -> Floats:
     """Return d residual / d parameter (N, 2)."""
+    motion = changed.motion(parameter)
+    if motion is not None:
+        return votes.slope_of_motion(motion)
     ahead, behind = (
-        _residuals(cast_rays(changed.by(parameter, way * parameter.step)), voter, point) for way in (1.0, -1.0)
+        votes.residual_by(parameter.change(changed.images, way * parameter.step).cameras) for way in (1.0, -1.0)
     )
     with np.errstate(invalid="ignore"):
         return np.asarray((ahead - behind) / (2.0 * parameter.step))
 
 
-def _residuals(rays: Rays, voter: Ints, point: Floats) -> Floats:
-    local = np.einsum("nij,nj->ni", rays.residual_from_world[voter], point - rays.center_in_world_m[voter])
+def _times(matrix: Floats, vector: Floats) -> Floats:
+    """Return the products (N, 3) of matrices (N, 3, 3) and vectors (N, 3)."""
+    return np.asarray((matrix @ vector[:, :, None])[:, :, 0])
+
+
+def _over_depth(local: Floats) -> Floats:
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(local[:, :2] / local[:, 2:])
-
-
-def _slopes_of_points(rays: Rays, voter: Ints, point: Floats) -> Floats:
-    """Return d residual / d point (N, 2, 3)."""
-    matrix = rays.residual_from_world[voter]
-    local = np.einsum("nij,nj->ni", matrix, point - rays.center_in_world_m[voter])
-    ratio = local[:, :2] / local[:, 2:]
-    return np.asarray((matrix[:, :2] - ratio[:, :, None] * matrix[:, 2:]) / local[:, 2][:, None, None])
 
 
 def _eliminate(

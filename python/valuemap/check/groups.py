@@ -49,8 +49,12 @@ class Group:
         return Dataset(**{**vars(part), "cameras": part.cameras.take(used)})
 
     def alone(self, view: View) -> View:
-        """Return a view of the group alone."""
-        return View(self.part(view.dataset), gate_share=view.gate_share, known=view.known)
+        """Return a view of the group alone, made once a view."""
+        views: dict[Any, View] = view.memory.setdefault("alone", {})
+        key = self, view.known
+        if key not in views:
+            views[key] = View(self.part(view.dataset), gate_share=view.gate_share, known=view.known)
+        return views[key]
 
 
 def groups_of(dataset: Dataset) -> tuple[Group, ...]:

@@ -14,12 +14,13 @@ not estimated here.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import stats
 
 import valuemap._core as _core
-from valuemap.check.agreement import Comparison, compare, measure_agreement
+from valuemap.check.agreement import Agreement, Comparison, agreement_on, compare
 from valuemap.check.fault import GATE_RAD, LEAST_CHANCE, MANY_DETECTIONS, WIDER_GATE, View
 from valuemap.check.fit import Estimate, Parameter, apply, estimate
 from valuemap.check.groups import Group, OfGroup
@@ -69,6 +70,14 @@ class Correction:
         return OfGroup(self.group, lambda part: self.parameter.change(part, self.value))(dataset)
 
 
+def loose_of(view: View) -> Loose:
+    """Return the dataset of a view at that gate, made once a view."""
+    if "loose" not in view.memory:
+        view.memory["loose"] = Loose(view)
+    found: Loose = view.memory["loose"]
+    return found
+
+
 class Loose:
     """A dataset at a gate wide enough for all rays of an object, however loose its poses are."""
 
@@ -79,7 +88,7 @@ class Loose:
 
     def misses(self, dataset: Dataset) -> Misses | None:
         """Return what votes miss by with the poses of a version of the dataset; None where nothing votes."""
-        agreement = measure_agreement(self._sample.of(dataset), self._sample.place_of_image, self._gate_px)
+        agreement = self._agreement(dataset)
         found, rays = agreement.found, agreement.rays
         if not len(found):
             return None
@@ -122,22 +131,36 @@ class Loose:
 
     def _settled(self, parameters: tuple[Parameter, ...]) -> Estimate | None:
         """Return the estimate followed to its end, if after the first rounds it may be one of an error."""
-        first = estimate(self._dataset, self._sample, self._gate_px, parameters, blocks=_BLOCKS)
+        first = self._estimate(parameters)
         misses = None if first is None else self.misses(apply(self._dataset, parameters, first.value))
         if first is None or misses is None:
             return None
         least = LEAST_TIMES * _HALF_WAY
         if all(abs(first.of(each.name)[0]) < least * misses.of(each) for each in parameters):
             return None
-        return estimate(self._dataset, self._sample, self._gate_px, parameters, start=first, blocks=_BLOCKS)
+        return self._estimate(parameters, start=first)
 
     def _beside(self, parameters: tuple[Parameter, ...], rival: Parameter | None, name: str) -> float:
         """Return the estimate of a parameter beside a rival one."""
         every = parameters if rival is None else (*parameters, rival)
-        found = estimate(self._dataset, self._sample, self._gate_px, every, blocks=_BLOCKS)
+        found = self._estimate(every)
         if found is not None:
-            found = estimate(self._dataset, self._sample, self._gate_px, every, start=found, blocks=_BLOCKS)
+            found = self._estimate(every, start=found)
         return 0.0 if found is None else found.of(name)[0]
 
     def _gain(self, dataset: Dataset) -> Floats:
-        return measure_agreement(self._sample.of(dataset), self._sample.place_of_image, self._gate_px).gain
+        return self._agreement(dataset).gain
+
+    def _estimate(self, parameters: tuple[Parameter, ...], *, start: Estimate | None = None) -> Estimate | None:
+        return estimate(
+            self._dataset, self._sample, self._gate_px, parameters, start=start, blocks=_BLOCKS, given=self._given
+        )
+
+    def _agreement(self, dataset: Dataset) -> Agreement:
+        if dataset is self._dataset:
+            return self._given
+        return agreement_on(self._sample, self._sample.of(dataset), self._gate_px)
+
+    @cached_property
+    def _given(self) -> Agreement:
+        return agreement_on(self._sample, self._sample.dataset, self._gate_px)

@@ -9,7 +9,7 @@ import numpy as np
 import valuemap._core as _core
 from valuemap.cameras import camera_centers
 from valuemap.check.fault import View
-from valuemap.check.loose import LEAST_TIMES, Loose
+from valuemap.check.loose import LEAST_TIMES, loose_of
 from valuemap.check.sample import driving_order
 
 _GAP_TIMES = 10.0
@@ -29,7 +29,7 @@ def describe_prospects(view: View) -> dict[str, Any]:
         "scores": "none" if np.ptp(dataset.detections.score) == 0.0 else "vary",
         **_gaps(view),
     }
-    misses = Loose(view).misses(dataset)
+    misses = loose_of(view).misses(dataset)
     if misses is not None:
         facts["turn_of_all_cameras_seen_from_deg"] = round(LEAST_TIMES * float(np.degrees(misses.angle_rad)), 2)
         facts["shift_of_all_poses_seen_from_m"] = round(LEAST_TIMES * misses.distance_m, 2)

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 import valuemap._core as _core
-from valuemap.cameras import camera_centers
+from valuemap.cameras import Pinholes, camera_centers, local_pinholes
 from valuemap.dataset import Dataset, rows_of
 from valuemap.tables import Floats, Images, Ints
 
@@ -35,26 +36,33 @@ FASTER = 3.0
 class Sample:
     """Part of a dataset, all of whose images are in a place: `place_of_image` (images) counts from 0.
 
-    `image_row` and `detection_row` are the rows in the whole dataset.
+    `image_row` are the rows in the `whole` dataset.
     """
 
     dataset: Dataset
     place_of_image: NDArray[np.uint32]
     image_row: Ints
-    detection_row: Ints
+    whole: Dataset
 
     def of(self, whole: Dataset) -> Dataset:
         """Return the same images of another version of the whole dataset, with what it detects in them."""
         images = whole.images.take(self.image_row)
-        stays = np.isin(whole.detections.image_id, images.image_id)
-        return Dataset(
-            **{
-                **vars(whole),
-                "images": images,
-                "detections": whole.detections.take(stays),
-                "truth_detections": None,
-            }
-        )
+        if whole.detections is self.whole.detections:
+            detections = self.dataset.detections
+        else:
+            detections = whole.detections.take(np.isin(whole.detections.image_id, images.image_id))
+        return Dataset(**{**vars(whole), "images": images, "detections": detections, "truth_detections": None})
+
+    def pinholes_of(self, version: Dataset) -> Pinholes:
+        """Return what the detections of another version of these images see by their cameras alone."""
+        is_same = version.detections is self.dataset.detections and version.cameras is self.dataset.cameras
+        if is_same and np.array_equal(version.images.camera_id, self.dataset.images.camera_id):
+            return self._pinholes
+        return local_pinholes(version)
+
+    @cached_property
+    def _pinholes(self) -> Pinholes:
+        return local_pinholes(self.dataset)
 
     @property
     def places(self) -> int:
@@ -185,7 +193,7 @@ def _take_places(dataset: Dataset, of_image: Ints, most_detections: int) -> Samp
             "truth_detections": None,
         }
     )
-    return Sample(part, place[image_row].astype(np.uint32), image_row, detection_row)
+    return Sample(part, place[image_row].astype(np.uint32), image_row, dataset)
 
 
 def pixels_per_radian(dataset: Dataset) -> float:

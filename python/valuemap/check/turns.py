@@ -59,9 +59,8 @@ def rotations_from_degrees(dataset: Dataset, *, zero_rad: float, clockwise: bool
         wanted_deg = np.degrees(_wrap(way * (looks_rad - zero_rad), np.pi))
         remainder_deg = way * (azimuth[order] - zero_rad)
         weight = _weight_of_changes(off_deg, _change_deg(remainder_deg, wanted_deg, travel))
-        for rows in travel.stretches:
-            heading_deg = _headings_deg(remainder_deg[rows], wanted_deg[rows], travel.is_moving[rows], weight)
-            right[order[rows]] = zero_rad + way * np.radians(heading_deg)
+        heading_deg = _headings_deg(remainder_deg, wanted_deg, travel.is_moving, travel.stretches, weight)
+        right[order] = zero_rad + way * np.radians(heading_deg)
         outwards_m = travel.outwards_m(right[order])
         off_deg = travel.off_deg(right[order], outwards_m)
     unit = np.radians(1.0) if tilts else 1.0
@@ -164,25 +163,37 @@ def _steady(angle: Floats, usual: float) -> Floats:
     return np.asarray(own - _TURN * np.round((np.median(own) - usual) / _TURN))
 
 
-def _headings_deg(heading: Floats, wanted_deg: Floats, is_moving: Bools, weight_of_changes: float) -> Floats:
-    """Return headings (K) in degrees, -180 to 180, known but for multiples of 2 pi, so that their changes and
-    themselves are as near as can be to the directions of travel: the cheapest path through all multiples.
+def _headings_deg(
+    heading: Floats, wanted_deg: Floats, is_moving: Bools, stretches: list[Ints], weight_of_changes: float
+) -> Floats:
+    """Return headings (N) in degrees, -180 to 180, known but for multiples of 2 pi, so that in each stretch of rows
+    their changes and themselves are as near as can be to the directions of travel: the cheapest path through all
+    multiples. All stretches are gone along at once.
     """
     multiples = np.arange(np.ceil(-180.0 / _TURN), np.floor(180.0 / _TURN) + 2.0)
+    count = len(multiples)
     choices = np.mod(heading + 180.0, _TURN)[:, None] - 180.0 + _TURN * (multiples - multiples[0])
     off = np.minimum(np.abs(_wrap(choices - wanted_deg[:, None], 180.0)), _MOST_OFF_DEG)
     off = np.where(is_moving[:, None], off, 0.0) + np.where(choices > 180.0, np.inf, 0.0)
-    change = _changes(wanted_deg, is_moving)
-    cost, came_from = off[0], np.zeros(choices.shape, dtype=np.int64)
-    for i in range(1, len(choices)):
-        step = choices[i] - choices[i - 1][:, None] - change[i - 1]
-        total = cost[:, None] + weight_of_changes * np.abs(_wrap(step, 180.0))
-        came_from[i] = total.argmin(axis=0)
-        cost = total.min(axis=0) + off[i]
+    step = np.diff(choices[:, 0]) - _changes(wanted_deg, is_moving)
+    # A step costs by how many multiples it goes over, whichever they are: from each (last axis) to each is a window.
+    over = np.arange(count - 1, -count, -1)
+    cost_of_step = weight_of_changes * np.abs(_wrap(step[:, None] + _TURN * over, 180.0))
+    cost_of_pair = np.lib.stride_tricks.sliding_window_view(cost_of_step, count, axis=1)[:, ::-1]
+    longest_first = sorted(stretches, key=len, reverse=True)
+    start, length = (np.array([each(rows) for rows in longest_first]) for each in (lambda rows: rows[0], len))
+    cost, came_from = off.copy(), np.zeros(choices.shape, dtype=np.int64)
+    for i in range(1, int(length[0])):
+        row = start[: np.searchsorted(-length, -i)] + i
+        total = cost[row - 1][:, None] + cost_of_pair[row - 1]
+        came_from[row] = total.argmin(axis=2)
+        cost[row] += np.take_along_axis(total, came_from[row][:, :, None], axis=2)[:, :, 0]
     path = np.empty(len(choices), dtype=np.int64)
-    path[-1] = cost.argmin()
-    for i in range(len(choices) - 1, 0, -1):
-        path[i - 1] = came_from[i, path[i]]
+    last = start + length - 1
+    path[last] = cost[last].argmin(axis=1)
+    for i in range(int(length[0]) - 1, 0, -1):
+        row = start[: np.searchsorted(-length, -i)] + i
+        path[row - 1] = came_from[row, path[row]]
     return np.asarray(choices[np.arange(len(choices)), path])
 
 
