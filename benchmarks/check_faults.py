@@ -100,9 +100,9 @@ def with_second_camera(dataset: Dataset, *, scale: float) -> Dataset:
     )
 
 
-def good_rig(seed: int) -> Dataset:
+def good_rig(seed: int, **changes: float) -> Dataset:
     """Return a simulated city that cars with three cameras drive, 60 degrees from each other."""
-    config = replace(PRESETS["small"], cameras=3, camera_spread_deg=60.0, write_pose_sigmas=1)
+    config = replace(PRESETS["small"], cameras=3, camera_spread_deg=60.0, write_pose_sigmas=1, **changes)  # type: ignore[arg-type]
     return simulate(config, seed=seed, name=f"rig-{seed}")
 
 
