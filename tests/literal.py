@@ -74,38 +74,40 @@ def triangulate(cameras: list[Pinhole], sightings: list[Sighting], start: Floats
         start = solution[:3] / solution[3]
     point = start
 
+    rotation = np.array([camera.rotation for camera in cameras])
+    translation = np.array([camera.translation for camera in cameras])
+    focal = np.array([camera.intrinsics[[0, 1], [0, 1]] for camera in cameras])
+    principal = np.array([camera.intrinsics[[0, 1], [2, 2]] for camera in cameras])
+    pixel = np.array([sighting.pixel for sighting in sightings])
+
     def residuals(at: Floats) -> tuple[Floats, Floats] | None:
-        values, jacobian = [], []
-        for camera, sighting in zip(cameras, sightings, strict=True):
-            pixel, depth = camera.project(at)
-            if depth <= 0:
-                return None
-            in_camera = camera.rotation @ at + camera.translation
-            fx, fy = camera.intrinsics[0, 0], camera.intrinsics[1, 1]
-            by_camera = np.array(
-                [[fx / depth, 0, -fx * in_camera[0] / depth**2], [0, fy / depth, -fy * in_camera[1] / depth**2]]
-            )
-            values.append(pixel - sighting.pixel)
-            jacobian.append(by_camera @ camera.rotation)
-        return np.concatenate(values), np.concatenate(jacobian)
+        in_camera = rotation @ at + translation
+        depth = in_camera[:, 2:]
+        if (depth <= 0).any():
+            return None
+        values = focal * in_camera[:, :2] / depth + principal - pixel
+        by_camera = np.zeros((len(values), 2, 3))
+        by_camera[:, [0, 1], [0, 1]] = focal / depth
+        by_camera[:, :, 2] = -focal * in_camera[:, :2] / depth**2
+        return values.ravel(), (by_camera @ rotation).reshape(-1, 3)
 
     current = residuals(point)
     if current is None:
         return None
-    for _ in range(200):
+    for _ in range(50):
         values, jacobian = current
         step = np.linalg.lstsq(jacobian, -values, rcond=None)[0]
         scale = 1.0
         while scale > 1e-6:
             candidate = residuals(point + scale * step)
-            if candidate is not None and candidate[0] @ candidate[0] <= values @ values:
+            if candidate is not None and candidate[0] @ candidate[0] < (1.0 - 1e-14) * (values @ values):
                 break
             scale /= 2
         else:
             break
         point = point + scale * step
         current = candidate
-        if np.linalg.norm(scale * step) < 1e-12:
+        if np.linalg.norm(scale * step) < 1e-9:
             break
     return point
 
@@ -143,20 +145,18 @@ def algorithm_1(cameras: list[Pinhole], sightings: list[Sighting], settings: Set
         for a, b in pairs
         if sightings[a].image != sightings[b].image and (point := viable(a, b)) is not None
     }
+    errors_px = {pair: [error_px(cameras[s.image], s, point) for s in sightings] for pair, point in proposed.items()}
     labels: list[Label] = []
     left = set(range(len(sightings)))
     while True:
         support: dict[tuple[int, int], tuple[list[int], float]] = {}
-        for (a, b), point in proposed.items():
+        shown = [[k for k in sorted(left) if sightings[k].image == image] for image in range(len(cameras))]
+        for (a, b), of_sighting in errors_px.items():
             if a not in left or b not in left:
                 continue
             voters, cost = [], 0.0
-            for image in range(len(cameras)):
-                errors = [
-                    (error_px(cameras[image], sightings[k], point), k)
-                    for k in sorted(left)
-                    if sightings[k].image == image
-                ]
+            for in_image in shown:
+                errors = [(of_sighting[k], k) for k in in_image]
                 if errors and min(errors)[0] < settings.d_max_px:
                     voters.append(min(errors)[1])
                     cost += min(errors)[0] ** 2
