@@ -41,7 +41,7 @@ ray = import_ray()
 
 T = TypeVar("T")
 R = TypeVar("R")
-KNOWN = MapConfig(detection_sigma_px=1.5, position_sigma_m=0.05, rotation_sigma_deg=0.05)
+KNOWN = MapConfig(detection_sigma_px=1.5, position_sigma_m=0.05, rotation_sigma_deg=0.05, correct_poses=0)
 
 
 def mapped(folder: Path, engine: Engine, name: str, progress: Progress) -> dict[str, bytes]:

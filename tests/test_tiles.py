@@ -50,7 +50,7 @@ from valuemap.tiles.work import MARKER, open_work, remove_work, written
 
 GRID = Grid.of(Frame(), 60.0)
 # With all noise known, only the classes are learned.
-KNOWN = MapConfig(detection_sigma_px=1.5, position_sigma_m=0.05, rotation_sigma_deg=0.05)
+KNOWN = MapConfig(detection_sigma_px=1.5, position_sigma_m=0.05, rotation_sigma_deg=0.05, correct_poses=0)
 
 
 # The grid.
@@ -468,7 +468,7 @@ def mapped(dataset: Path, out: Path, *options: str) -> dict[str, bytes]:
     return files(out)
 
 
-SET = {"detection_sigma_px": 1.5, "position_sigma_m": 0.05, "rotation_sigma_deg": 0.05}
+SET = {"detection_sigma_px": 1.5, "position_sigma_m": 0.05, "rotation_sigma_deg": 0.05, "correct_poses": 0}
 
 
 @pytest.fixture(scope="module")
