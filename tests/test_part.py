@@ -14,7 +14,8 @@ from check_faults import FAULTS as INJECTED
 from check_faults import good_city
 from report_city import write_city
 from valuemap import portions
-from valuemap.check import Examination, examine, far_images
+from valuemap.check import examine, far_images
+from valuemap.check.examine import Examination
 from valuemap.check.fault import View
 from valuemap.check.prospects import describe_prospects
 from valuemap.cli import check as check_module
@@ -31,10 +32,9 @@ from valuemap.tiles.grid import Grid, smallest_squares
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Dataset]:
-    folder, dataset = (
-        tmp_path_factory.mktemp("good") / "city",
-        good_city(1, streets_north_south=5, streets_east_west=5, lights=60, passes_per_street=2),
-    )
+    sparse = {"passes_per_street": 2, "frame_spacing_m": 4.0, "standing_interval_s": 2.0}
+    dataset = good_city(1, streets_north_south=5, lights=40, streets_east_west=4, **sparse)
+    folder = tmp_path_factory.mktemp("good") / "city"
     write_dataset(dataset, folder)
     return folder, read_dataset(folder)
 
@@ -49,8 +49,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (check_module, report_module):
         monkeypatch.setattr(module, "read_dataset", never)
     monkeypatch.setattr(part, "LARGEST_WHOLE", 0)
-    monkeypatch.setattr(part, "LARGEST_PART", 2500)
-    monkeypatch.setattr(portions, "ROWS", 1000)
+    monkeypatch.setattr(part, "LARGEST_PART", 900)
+    monkeypatch.setattr(portions, "ROWS", 200)
 
 
 def none_far(place_m: Any) -> Any:
@@ -83,13 +83,13 @@ def test_check_looks_at_a_part_of_a_large_dataset_and_says_so(
     good: tuple[Path, Dataset], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, whole = good
-    outcomes: list[Examination] = []
+    found: list[Examination] = []
 
-    def examine_once(*given: Any, **settings: Any) -> Examination:
-        outcomes.append(outcomes[0] if outcomes else examine(*given, **settings))
-        return outcomes[-1]
+    def once(*given: Any, **more: Any) -> Examination:
+        found.extend([] if found else [examine(*given, **more)])
+        return found[0]
 
-    monkeypatch.setattr("valuemap.check.examine", examine_once)
+    monkeypatch.setattr("valuemap.check.examine", once)
     run = CliRunner().invoke(app, ["check", str(folder), "--json"])
     assert run.exit_code == 0, run.output
     told, of_whole = json.loads(run.stdout), describe_prospects(View(whole))
