@@ -28,7 +28,7 @@ def shifted(dataset: Dataset, shift_m: float) -> Dataset:
 
 @pytest.fixture(scope="module")
 def city() -> Dataset:
-    return simulate(block(), seed=3, name="city")
+    return simulate(block(frame_spacing_m=4.0, standing_interval_s=2.0), seed=3, name="city")
 
 
 def compared(before: Dataset, after: Dataset, parameters: int = 1) -> Comparison:
@@ -65,10 +65,10 @@ def test_a_correction_that_is_not_worth_its_parameters_is_not_taken(
 ) -> None:
     right = Refined(city, {"found": "faults", "parameters": 3}, is_corrected=True)
     monkeypatch.setattr(pipeline, "refine_poses", lambda *_, **__: right)
-    wrong = shifted(city, 3.0)
-    assert valuemap.build_map(wrong).corrected is not None
+    given = shifted(city, 3.0), valuemap.MapConfig(), pipeline._Stages(), 1, silent
+    assert pipeline._proven(*given).is_corrected
     right.record["parameters"] = 10**6
-    assert valuemap.build_map(wrong).corrected is None
+    assert not pipeline._proven(*given).is_corrected
 
 
 def test_a_sample_pays_its_share_of_the_price(city: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
