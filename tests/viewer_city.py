@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -49,11 +50,17 @@ def write_pictures(dataset: Dataset, folder: Path) -> None:
         picture.save(path, quality=80)
 
 
+@cache
+def mapped(*passes: str) -> tuple[Dataset, Map]:
+    """Return the images of some passes, and their map; their poses are those of the simulation."""
+    dataset = part(street(), *passes)
+    return dataset, valuemap.build_map(dataset, valuemap.MapConfig(correct_poses=0), threads=1)
+
+
 def write_city(folder: Path, *passes: str) -> Map:
     """Write a dataset, its pictures and its map below a folder."""
-    dataset = part(street(), *passes)
+    dataset, result = mapped(*passes)
     valuemap.write_dataset(dataset, folder / "dataset")
     write_pictures(dataset, folder / "dataset" / "images")
-    result = valuemap.build_map(dataset, threads=1)
     valuemap.write_map(result, folder / "map")
     return result
