@@ -287,12 +287,13 @@ def _adjust(labels: _Labels, points: _Points, match: Ints, found: Georeference, 
         part = design[:, :, columns]
         weight_of = np.ones(len(rows))
         for _ in range(20):
-            weight = np.linalg.inv(own + spread2 * np.eye(used)) * weight_of[:, None, None]
+            information = np.linalg.inv(own + spread2 * np.eye(used))
+            weight = information * weight_of[:, None, None]
             normal = np.einsum("nki,nkl,nlj->ij", part, weight, part)
             covariance_part = np.linalg.inv(normal)
             values = covariance_part @ np.einsum("nki,nkl,nl->i", part, weight, difference)
             left = difference - part @ values
-            square = np.einsum("ni,nij,nj->n", left, np.linalg.inv(own + spread2 * np.eye(used)), left)
+            square = np.einsum("ni,nij,nj->n", left, information, left)
             weight_of = np.minimum(1.0, _HUBER / np.sqrt(np.maximum(square, 1e-12)))
             # The spread at which what is left is as large as it should be, a step at a time.
             freedom = max(used * len(rows) - len(columns), 1)
