@@ -207,7 +207,7 @@ def test_existence_and_expected_views_are_told(driven_block: tuple[Dataset, valu
 def test_a_stricter_existence_keeps_fewer() -> None:
     """Things that stood there during one pass only are believed a little."""
     dataset = simulate(block(temporary_per_1000_images=10.0), seed=4, name="block")
-    known = ["detection_sigma_px=1.2", "position_sigma_m=0.12", "rotation_sigma_deg=0.15"]
+    known = ["detection_sigma_px=1.2", "position_sigma_m=0.12", "rotation_sigma_deg=0.15", "correct_poses=0"]
     configs = [MapConfig().with_settings([*known, f"min_existence={least}"]) for least in (0.0, 0.97)]
     kept = [len(valuemap.build_map(dataset, config).labels) for config in configs]
     assert kept[0] > kept[1] > 0
