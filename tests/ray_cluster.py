@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from valuemap import pipeline
+from valuemap import correction
 from valuemap.cameras import rotation_matrices
 from valuemap.config import DetectConfig, MapConfig
 from valuemap.dataset import Dataset
@@ -162,12 +162,12 @@ def main(folder: Path) -> None:
     expected = mapped(folder, ThreadEngine(2), "threads", lambda *_: None)
     assert mapped(folder, engine, "ray", lambda *_: None) == expected
     # Poses that were corrected go to the tasks by the dataset that is written with them.
-    setattr(pipeline, "refine_poses", moved_by_a_metre)  # noqa: B010
-    setattr(pipeline, "compare_poses", lambda *_, **__: Comparison(2.0, 1.0, 0.0, 10))  # noqa: B010
+    setattr(correction, "refine_poses", moved_by_a_metre)  # noqa: B010
+    setattr(correction, "compare_poses", lambda *_, **__: Comparison(2.0, 1.0, 0.0, 10))  # noqa: B010
     corrected = mapped(folder, ThreadEngine(2), "threads-moved", lambda *_: None)
     assert corrected["labels.parquet"] != expected["labels.parquet"]
     assert mapped(folder, engine, "ray-moved", lambda *_: None) == corrected
-    setattr(pipeline, "refine_poses", lambda dataset, *_, **__: Refined(dataset, {"found": "nothing"}))  # noqa: B010
+    setattr(correction, "refine_poses", lambda dataset, *_, **__: Refined(dataset, {"found": "nothing"}))  # noqa: B010
     tell(folder, "identical")
 
     assert sorted(engine.run(dies, [str(folder / f"dead-{i}") for i in range(3)])) == [(0, 1), (1, 1), (2, 1)]

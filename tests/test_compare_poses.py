@@ -9,11 +9,12 @@ import pytest
 
 import valuemap
 from block import block
-from valuemap import pipeline
+from valuemap import correction
 from valuemap.dataset import Dataset
 from valuemap.progress import silent
 from valuemap.refine import Refined
 from valuemap.simulate import simulate
+from valuemap.stages import Stages
 from valuemap.tables import Ints
 from valuemap.tiles import compare
 from valuemap.tiles.compare import Comparison, compare_poses
@@ -64,11 +65,11 @@ def test_a_correction_that_is_not_worth_its_parameters_is_not_taken(
     city: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     right = Refined(city, {"found": "faults", "parameters": 3}, is_corrected=True)
-    monkeypatch.setattr(pipeline, "refine_poses", lambda *_, **__: right)
-    given = shifted(city, 3.0), valuemap.MapConfig(), pipeline._Stages(), 1, silent
-    assert pipeline._proven(*given).is_corrected
+    monkeypatch.setattr(correction, "refine_poses", lambda *_, **__: right)
+    given = shifted(city, 3.0), valuemap.MapConfig(), Stages(), 1, silent
+    assert correction._proven(*given).is_corrected
     right.record["parameters"] = 10**6
-    assert not pipeline._proven(*given).is_corrected
+    assert not correction._proven(*given).is_corrected
 
 
 def test_a_sample_pays_its_share_of_the_price(city: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,7 +88,7 @@ def test_a_sample_pays_its_share_of_the_price(city: Dataset, monkeypatch: pytest
 def test_a_correction_that_fits_worse_is_not_taken(city: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     alone = valuemap.build_map(city, valuemap.MapConfig(correct_poses=0))
     wrong = Refined(shifted(city, 1.0), {"found": "faults"}, is_corrected=True)
-    monkeypatch.setattr(pipeline, "refine_poses", lambda *_, **__: wrong)
+    monkeypatch.setattr(correction, "refine_poses", lambda *_, **__: wrong)
     result = valuemap.build_map(city)
     assert result.run["poses"]["because"] == "the poses as given fit better"
     assert result.run["poses"]["misfit_after"] > result.run["poses"]["misfit_before"]

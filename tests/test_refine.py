@@ -298,9 +298,9 @@ def test_what_is_proven_is_compared_before_a_map_tells_more_and_what_is_in_doubt
         done.append("compare")
         return Comparison(2.0, 1.0, 0.0, 10)
 
-    monkeypatch.setattr(pipeline, "refine_poses", lambda *_, **__: at_last if is_proven else at_first)
-    monkeypatch.setattr(pipeline, "_told_by_a_map", told)
-    monkeypatch.setattr(pipeline, "compare_poses", compared)
+    monkeypatch.setattr(correction, "refine_poses", lambda *_, **__: at_last if is_proven else at_first)
+    monkeypatch.setattr(correction, "_told_by_a_map", told)
+    monkeypatch.setattr(correction, "compare_poses", compared)
     refined = correction._proven(dataset, valuemap.MapConfig(), Stages(), 1, silent)
     assert refined.is_corrected == is_told
     assert done == (["compare", "map"] if is_proven else ["map", "compare"] if is_told else ["map"])
@@ -395,7 +395,8 @@ def test_middles_that_differ_by_side_are_no_errors_of_images(monkeypatch: pytest
     assert result.run["poses"]["found"] == "errors of images"
     assert len(result.labels) <= len(lamps.truth) + 1
     assert between_neighbors(result, lamps)[1] < 6.0
-    monkeypatch.setattr(pipeline, "_with_sides_of", lambda _, config: config)
+    for module in (correction, pipeline):
+        monkeypatch.setattr(module, "with_sides_of", lambda _, config: config)
     assert len(valuemap.build_map(lamps).labels) > 1.5 * len(lamps.truth)
 
 
@@ -434,14 +435,15 @@ def test_poses_that_stay_are_mapped_once(monkeypatch: pytest.MonkeyPatch, tmp_pa
     def build(made: pipeline.Run) -> valuemap.Map:
         return pipeline.build_map_of_folder(tmp_path, MapConfig(), made, held=poor)[0]
 
-    monkeypatch.setattr(pipeline, "solve_cells", solve)
+    for module in (correction, pipeline):
+        monkeypatch.setattr(module, "solve_cells", solve)
     once, in_folder = valuemap.build_map(poor), build(run)
     assert sum(mapped) == 2
     calibration = calibration_from_json(once.run["calibration"], source="")
     other = build(dataclasses.replace(run, calibration=dataclasses.replace(calibration, is_deep=False)))
     assert sum(mapped) == 4  # Of another calibration, it is another map.
     assert other.run["calibration"] != once.run["calibration"]
-    monkeypatch.setattr(pipeline, "_by_images", lambda dataset, *_: Refined(dataset, {}))
+    monkeypatch.setattr(correction, "_by_images", lambda dataset, *_: Refined(dataset, {}))
     twice = valuemap.build_map(poor)
     for same in (once, in_folder):
         assert np.array_equal(same.labels.position_in_world_m, twice.labels.position_in_world_m)
@@ -479,10 +481,10 @@ def test_single_images_are_looked_at_only_where_they_are_off_by_more_than_was_th
         asked.append(dataset)
         return Refined(dataset, {})
 
-    monkeypatch.setattr(pipeline, "_by_images", by_images)
+    monkeypatch.setattr(correction, "_by_images", by_images)
     for is_noisy in (False, True):
         monkeypatch.setattr(
-            pipeline,
+            correction,
             "refine_poses",
             lambda dataset, *_, is_noisy=is_noisy, **__: Refined(dataset, {}, is_noisy=is_noisy),
         )
@@ -630,7 +632,7 @@ def test_short_drives_have_the_offset_of_the_one_they_go_on_from() -> None:
 def test_cells_on_disk_get_the_poses_that_were_corrected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     faulty, result = map_of_shifted_city()
     write_dataset(faulty, tmp_path / "data")
-    monkeypatch.setattr(pipeline, "_proven", lambda *_: shifted_city()[1])
+    monkeypatch.setattr(correction, "_proven", lambda *_: shifted_city()[1])
     (tmp_path / "work").mkdir()
     run = pipeline.Run(tmp_path / "work", ThreadEngine(1), tile_size_m=150.0)
     with open_work(tmp_path / "work", resume=False) as work:
@@ -643,7 +645,8 @@ def test_cells_on_disk_get_the_poses_that_were_corrected(tmp_path: Path, monkeyp
 
 def test_what_is_too_large_to_be_looked_at_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_dataset(simulate(dataclasses.replace(CITY, passes_per_street=1, **FEWER_IMAGES), seed=1), tmp_path / "data")
-    monkeypatch.setattr(pipeline, "MOST_CORRECTED", 100)
+    for module in (correction, pipeline):
+        monkeypatch.setattr(module, "MOST_CORRECTED", 100)
     results = [valuemap.build_map(valuemap.read_dataset(tmp_path / "data"), valuemap.MapConfig())]
     for tile_size_m in (None, 500.0):
         with open_work(tmp_path / f"work{tile_size_m}", resume=False) as work:

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 import valuemap
 from literal import Pinhole, Sighting
 from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
-from valuemap import map_folder, pipeline, portions
+from valuemap import correction, map_folder, pipeline, portions
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, ensure_checked, rows_of, write_dataset_in_pieces
@@ -676,8 +676,8 @@ def test_an_update_is_one_run_where_poses_are_corrected(tmp_path: Path, monkeypa
             return Refined(dataset, {"found": "nothing"})
         return Refined(moved(dataset, -1.0, keep_mean=True), {"found": "faults", "drives": [{"drive": 0}]}, True)
 
-    monkeypatch.setattr(pipeline, "refine_poses", corrected)
-    monkeypatch.setattr(pipeline, "compare_poses", lambda *_, **__: Comparison(2.0, 1.0, 0.0, 10))
+    monkeypatch.setattr(correction, "refine_poses", corrected)
+    monkeypatch.setattr(correction, "compare_poses", lambda *_, **__: Comparison(2.0, 1.0, 0.0, 10))
     valuemap.write_dataset(moved(first, 1.0), tmp_path / "first")
     valuemap.write_dataset(moved(second, 1.0), tmp_path / "second")
     run("map", tmp_path / "first", "--out", tmp_path / "map", *(f"--set={each}" for each in SET))
