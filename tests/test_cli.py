@@ -171,7 +171,8 @@ from valuemap.cli.load import COMMANDS, load_commands
 load_commands(sys.argv[1:])
 print(*(name for name in COMMANDS if f"valuemap.cli.{name}" in sys.modules))
 """
-    for words, imported in ((["info", "map"], "info"), (["evaluate-detections"], "evaluate_detections")):
+    asked = ((["info", "map"], "info"), (["evaluate-detections"], "evaluate_detections"), (["--version"], ""))
+    for words, imported in asked:
         done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
         assert done.stdout == f"{imported}\n"
 

@@ -33,7 +33,9 @@ def name_of(module: str) -> str:
 
 
 def load_commands(words: Sequence[str] = ()) -> None:
-    """Import the command that the first word names, or all of them where it names none."""
+    """Import the command that the first word names, none for the version, or all of them where it names none."""
+    if words[:1] == ["--version"]:
+        return
     asked = [module for module in COMMANDS if name_of(module) in words[:1]]
     for module in asked or COMMANDS:
         import_module(f"valuemap.cli.{module}")
