@@ -25,7 +25,6 @@ def city() -> Evidence:
         signalised_share=1.0,
         lights=16,
         frame_spacing_m=4.0,
-        standing_interval_s=2.0,
         passes_per_street=3,
     )
     dataset = simulate(config, seed=3)

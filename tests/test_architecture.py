@@ -21,8 +21,8 @@ def named(section: str) -> set[str]:
 @pytest.mark.parametrize("word", list(FOLDERS))
 def test_every_file_that_is_named_is_there(word: str) -> None:
     (section,) = (text for text in SECTIONS if text.startswith(word))
-    # `detect/` has a table of its own, of files in that folder.
-    folders = [ROOT, ROOT / FOLDERS[word], ROOT / FOLDERS[word] / "detect"]
+    # `detect/` and `robust/` have tables of their own, of files in those folders.
+    folders = [ROOT, *(ROOT / FOLDERS[word] / folder for folder in ("", "detect", "robust"))]
     paths = named(section)
     assert len(paths) > 10
     assert [path for path in sorted(paths) if not any((folder / path).exists() for folder in folders)] == []
