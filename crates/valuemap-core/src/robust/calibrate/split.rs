@@ -13,8 +13,7 @@ use super::residuals;
 use super::residuals::{BOX_SHARE, detection_px};
 use super::shared::{stated, with_drift};
 use crate::robust::energy::estimate::is_one_visit;
-use crate::robust::energy::places::places;
-use crate::robust::energy::{Object, placed};
+use crate::robust::energy::{Object, placed, places_of_all};
 use crate::robust::model::Model;
 use crate::robust::noise::drift::{Drive, Look, Normals, Vantage};
 use crate::robust::noise::huber::huber_weight;
@@ -171,7 +170,7 @@ impl Scale {
 
 /// Places of which images show several objects, every so many of them.
 fn sample(model: &Model<'_>, objects: &[Object]) -> Vec<Place> {
-    let places = places(objects, model.settings.viability.max_range_m);
+    let places = places_of_all(objects, model.settings.viability.max_range_m);
     let votes = |place: &Vec<usize>| place.iter().map(|&i| objects[i].votes.len()).sum::<usize>();
     let several: Vec<&Vec<usize>> = places.iter().filter(|place| place.len() > 1).collect();
     let every = several.iter().map(|place| votes(place)).sum::<usize>().div_ceil(SAMPLE_VOTES).max(1);

@@ -28,8 +28,6 @@ use std::f64::consts::PI;
 use std::ops::Range;
 
 use nalgebra::{Matrix3, Vector3};
-use rstar::RTree;
-use rstar::primitives::GeomWithData;
 
 use crate::robust::model::heights::{HeightTerms, height_m};
 use crate::robust::model::{Model, Sizes};
@@ -40,6 +38,7 @@ use crate::robust::scene::Scene;
 use estimate::visits;
 use extent::places_of;
 use looks::Lookout;
+use places::ByPlace;
 use seen::{Seen, Shares};
 use sides::{Middle, Said, marginalised, sides};
 use sizes::size_terms;
@@ -526,8 +525,14 @@ fn prior_of_size(sizes: &Sizes, ln_size: f64) -> f64 {
 
 /// Objects by place.
 #[must_use]
-pub fn by_place(objects: &[Object]) -> RTree<GeomWithData<[f64; 3], usize>> {
-    RTree::bulk_load(objects.iter().enumerate().map(|(i, o)| GeomWithData::new(o.fit.point.into(), i)).collect())
+pub fn by_place(objects: &[Object]) -> ByPlace {
+    places::by_place(objects.iter().map(|object| object.fit.point))
+}
+
+/// Objects of one place together.
+#[must_use]
+pub fn places_of_all(objects: &[Object], radius_m: f64) -> Vec<Vec<usize>> {
+    places::places(&objects.iter().map(|object| (object.votes.len(), object.fit.point)).collect::<Vec<_>>(), radius_m)
 }
 
 impl Object {

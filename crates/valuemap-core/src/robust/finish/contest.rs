@@ -6,8 +6,7 @@
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
-use rstar::RTree;
-use rstar::primitives::GeomWithData;
+use crate::robust::energy::places::ByPlace;
 use rustc_hash::FxHashSet;
 
 use crate::robust::energy::estimate::{Estimate, Solution};
@@ -27,7 +26,7 @@ const LEAST_DIFFERENCE: f64 = 1e-2;
 pub struct Contest<'a> {
     model: &'a Model<'a>,
     labels: &'a [Object],
-    tree: RTree<GeomWithData<[f64; 3], usize>>,
+    tree: ByPlace,
     /// The images that show each label.
     shown_in: Vec<FxHashSet<u32>>,
 }

@@ -6,9 +6,8 @@
 use rayon::prelude::*;
 
 use super::contest::{Contest, widened};
-use crate::robust::energy::Object;
 use crate::robust::energy::estimate::{Care, Estimate, Joint, Start};
-use crate::robust::energy::places::places;
+use crate::robust::energy::{Object, places_of_all};
 use crate::robust::model::Model;
 use crate::robust::parts::Part;
 
@@ -20,7 +19,7 @@ pub fn positions(model: &Model<'_>, objects: &[Object]) -> Vec<Estimate> {
     let contest = Contest::new(model, objects);
     let mut estimates: Vec<Estimate> =
         objects.iter().map(|object| Estimate { point: object.fit.point, covariance: object.fit.covariance }).collect();
-    let places = places(objects, model.settings.viability.max_range_m * PLACE_SHARE);
+    let places = places_of_all(objects, model.settings.viability.max_range_m * PLACE_SHARE);
     // One at a time: the first ones are the largest.
     let found: Vec<Vec<(usize, Estimate)>> =
         places.par_iter().with_max_len(1).map(|place| together(model, objects, place, &contest)).collect();

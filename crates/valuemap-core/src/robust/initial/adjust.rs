@@ -7,9 +7,9 @@ use std::hash::{Hash, Hasher};
 use rayon::prelude::*;
 use rustc_hash::FxHasher;
 
-use super::label::{Label, by_place, fingerprint, first_voter, side_of};
+use super::label::{Label, fingerprint, first_voter, side_of};
 use crate::robust::energy::estimate::{Care, Joint, Limits, Start};
-use crate::robust::energy::places::MOST_OBJECTS;
+use crate::robust::energy::places::places;
 use crate::robust::noise::Noise;
 use crate::robust::scene::Scene;
 
@@ -22,32 +22,10 @@ pub fn adjust(scene: &Scene, noise: &Noise, gate_sigmas: f64, min_votes: usize, 
     let adjustment = Adjustment { scene, noise, gate_sigmas, min_votes };
     let of_place = |place: &Vec<usize>| adjustment.of_place(place.iter().map(|&i| labels[i].clone()).collect());
     // One at a time: the first ones are the largest.
-    let mut labels: Vec<Label> = places(labels).par_iter().with_max_len(1).flat_map_iter(of_place).collect();
+    let placed: Vec<_> = labels.iter().map(|label| (label.voters.len(), label.estimate.point)).collect();
+    let mut labels: Vec<Label> = places(&placed, PLACE_M).par_iter().with_max_len(1).flat_map_iter(of_place).collect();
     labels.sort_by_cached_key(first_voter);
     labels
-}
-
-/// The labels around those with the most votes, each label in one place.
-fn places(labels: &[Label]) -> Vec<Vec<usize>> {
-    let tree = by_place(labels);
-    let mut order: Vec<usize> = (0..labels.len()).collect();
-    order.sort_by_key(|&i| (std::cmp::Reverse(labels[i].voters.len()), i));
-    let mut taken = vec![false; labels.len()];
-    let mut places = Vec::new();
-    for middle in order {
-        if taken[middle] {
-            continue;
-        }
-        let near = tree.nearest_neighbor_iter_with_distance_2(labels[middle].estimate.point.into());
-        let near = near.take_while(|(_, distance2)| *distance2 <= PLACE_M * PLACE_M).map(|(near, _)| near.data);
-        let mut place: Vec<usize> = near.filter(|&i| !taken[i]).take(MOST_OBJECTS).collect();
-        place.sort_unstable();
-        for &i in &place {
-            taken[i] = true;
-        }
-        places.push(place);
-    }
-    places
 }
 
 /// How labels are estimated.

@@ -5,13 +5,12 @@ use std::sync::OnceLock;
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
-use rstar::RTree;
-use rstar::primitives::GeomWithData;
 use rustc_hash::FxHasher;
 
-use crate::robust::energy::agreement;
 use crate::robust::energy::estimate::{Care, Elsewhere, Estimate, Joint, Limits, Start};
 use crate::robust::energy::looks::SECTOR_COSINE;
+use crate::robust::energy::places::ByPlace;
+use crate::robust::energy::{agreement, places};
 use crate::robust::noise::Noise;
 use crate::robust::scene::{Scene, View};
 
@@ -158,8 +157,8 @@ pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Label], most: usi
 
 /// Labels by place.
 #[must_use]
-pub fn by_place(labels: &[Label]) -> RTree<GeomWithData<[f64; 3], usize>> {
-    RTree::bulk_load(labels.iter().enumerate().map(|(i, l)| GeomWithData::new(l.estimate.point.into(), i)).collect())
+pub fn by_place(labels: &[Label]) -> ByPlace {
+    places::by_place(labels.iter().map(|label| label.estimate.point))
 }
 
 /// The lowest ray of a label: what labels are ordered by.
