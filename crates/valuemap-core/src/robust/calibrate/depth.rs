@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    pub fn all_moves_pay_if_they_change_more_than_one_object_in_ten_and_that_is_no_chance() {
+    fn all_moves_pay_if_they_change_more_than_one_object_in_ten_and_that_is_no_chance() {
         let some: Vec<Object> = (0..100).map(|i| with_votes(10 * i, 10)).collect();
         // Each of the first is two halves: none of them is what it was.
         let halved = |count: u32| -> Vec<Object> {

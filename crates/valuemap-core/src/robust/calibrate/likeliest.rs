@@ -79,8 +79,8 @@ fn of_more(mut noise: Noise, step: impl Fn(&Noise) -> Result<Round, Halt>) -> Re
     Ok(best)
 }
 
-/// A noise with the error of the [middles that sides show](crate::robust::energy::sides), if sides disagree in a map of some rays, and in one that is made with such an
-/// error as well: the former may hold some things once for each side.
+/// A noise with the error of the [middles that sides show](crate::robust::energy::sides), if sides disagree in a map of some rays, and in one that is made
+/// with such an error as well: the former may hold some things once for each side.
 pub(crate) fn with_middles(
     scene: &Scene,
     noise: &Noise,

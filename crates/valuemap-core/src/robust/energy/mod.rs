@@ -36,7 +36,6 @@ use crate::robust::noise::huber::{HUBER_SIGMAS, huber_weight};
 use crate::robust::parts::Part;
 use crate::robust::scene::Scene;
 use estimate::visits;
-use extent::places_of;
 use looks::Lookout;
 use places::ByPlace;
 use seen::{Seen, Shares};
@@ -536,12 +535,6 @@ pub fn places_of_all(objects: &[Object], radius_m: f64) -> Vec<Vec<usize>> {
 }
 
 impl Object {
-    /// Where it may be ([`places_of`]).
-    #[must_use]
-    pub fn places(&self, model: &Model<'_>) -> Vec<Vector3<f64>> {
-        places_of(&self.fit.point, &self.fit.covariance, model.noise, model.settings.gate_sigmas)
-    }
-
     /// Whether an image shows both this and another object.
     #[must_use]
     pub fn is_seen_beside(&self, scene: &Scene, other: &Self) -> bool {

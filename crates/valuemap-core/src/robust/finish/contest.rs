@@ -4,9 +4,9 @@
 //! position is estimated once more without the contested votes. If the two positions differ by more than their covariances allow
 //! (Hausman, "Specification Tests in Econometrics", 1978), their difference widens the covariance.
 
+use crate::robust::energy::places::ByPlace;
 use nalgebra::Vector3;
 use rayon::prelude::*;
-use crate::robust::energy::places::ByPlace;
 use rustc_hash::FxHashSet;
 
 use crate::robust::energy::estimate::{Estimate, Solution};

@@ -27,7 +27,7 @@ const LEAST_ALONE: usize = 6;
 const MOST_BOTH: f64 = 0.2;
 /// This part of them must be in the other's gate.
 const CLAIMED_SHARE: f64 = 0.5;
-/// Other labels that are estimated with the two, at most, and how far they may be, m: they tell the drift of the passes.
+/// Other labels of their place that are estimated with the two, at most: they tell the drift of the passes.
 const COMPANIONS: usize = 5;
 /// Times that detections nobody has are gathered, without companions and with them.
 const GATHERINGS: (usize, usize) = (1, 2);
