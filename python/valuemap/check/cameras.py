@@ -51,11 +51,10 @@ class _Turn:
     def change(self, dataset: Dataset, angle_rad: float) -> Dataset:
         """Return a dataset whose cameras are turned by an angle, in their places."""
         turn = Rotation.from_rotvec(angle_rad * np.eye(3)[self._axis])
+        turned = turn * Rotation.from_quat(dataset.images.cam_from_world_quat, scalar_first=True)
         return with_images(
             dataset,
-            cam_from_world_quat=_product(
-                turn.as_quat(canonical=True, scalar_first=True), dataset.images.cam_from_world_quat
-            ),
+            cam_from_world_quat=turned.as_quat(scalar_first=True),
             cam_from_world_m=dataset.images.cam_from_world_m @ turn.as_matrix().T,
         )
 
@@ -63,12 +62,6 @@ class _Turn:
         """Return the axis in the world, about which no centre moves."""
         axis = rotation_matrices(dataset.images)[:, self._axis]
         return Motion(axis, np.zeros_like(axis))
-
-
-def _product(first: Floats, second: Floats) -> Floats:
-    """Return the quaternions (N, 4), w x y z, of turns by the second ones (N, 4) and then by the first (4)."""
-    a, u, w, v = first[0], first[1:], second[:, :1], second[:, 1:]
-    return np.concatenate([a * w - v @ u[:, None], a * v + w * u + np.cross(u, v)], axis=1)
 
 
 def with_focal(dataset: Dataset, log_factor: float) -> Dataset:
