@@ -16,6 +16,8 @@ use crate::ray::Ray;
 pub const LANES: usize = 64;
 const COEFFICIENTS: usize = 13;
 const FLOOR: usize = 12;
+/// Lanes that are tested at once; those of a block without any ray are left out.
+const GROUP: usize = 16;
 /// Points that are tested against a block while it is in the nearest cache.
 const TILE: usize = 64;
 /// Relative width of the band between `sure` and `maybe`.
@@ -188,10 +190,11 @@ impl Pass<'_> {
         let answers = self.maybe.chunks_mut(TILE * words).zip(self.sure.chunks_mut(TILE * words));
         for (points, (maybe, sure)) in self.points.chunks(TILE).zip(answers) {
             for (word, (block, used)) in self.gates.blocks.iter().zip(&self.gates.used).enumerate() {
+                let groups = (u64::BITS - used.leading_zeros()).div_ceil(GROUP as u32) as usize;
                 for (i, point) in points.iter().enumerate() {
                     let x = [point.x as f32, point.y as f32, point.z as f32];
                     let at = i * words + word;
-                    let (may, must) = test_block::<FUSED>(block, x, self.margins);
+                    let (may, must) = test_block::<FUSED>(block, groups, x, self.margins);
                     (maybe[at], sure[at]) = (may & used, must & used);
                 }
             }
@@ -199,28 +202,30 @@ impl Pass<'_> {
     }
 }
 
-/// The answers of one block, as bits. Plain loops over lanes, which compile to vector instructions.
+/// The answers of the first groups of lanes of one block, as bits. Plain loops over lanes, which compile to vector instructions.
 #[inline(always)]
-fn test_block<const FUSED: bool>(block: &Block, x: [f32; 3], margins: Margins) -> (u64, u64) {
-    let m = &block.0;
-    let mut maybe = [0_u8; LANES];
-    let mut sure = [0_u8; LANES];
-    for lane in 0..LANES {
-        let dot = |row: usize| {
-            let r = row * 4;
-            let sum = multiply_add::<FUSED>(m[r][lane], x[0], m[r + 3][lane]);
-            let sum = multiply_add::<FUSED>(m[r + 1][lane], x[1], sum);
-            multiply_add::<FUSED>(m[r + 2][lane], x[2], sum)
-        };
-        let (a, b, c) = (dot(0), dot(1), dot(2));
-        let error2 = multiply_add::<FUSED>(a, a, b * b);
-        let c2 = multiply_add::<FUSED>(c, c, m[FLOOR][lane]);
-        maybe[lane] =
-            u8::from(error2 < multiply_add::<FUSED>(c2, 1.0 + BAND, margins.maybe)) & u8::from(c > -margins.depth);
-        sure[lane] =
-            u8::from(error2 < multiply_add::<FUSED>(c2, 1.0 - BAND, -margins.sure)) & u8::from(c > margins.depth);
+fn test_block<const FUSED: bool>(block: &Block, groups: usize, x: [f32; 3], margins: Margins) -> (u64, u64) {
+    let mut maybe = [[0_u8; GROUP]; LANES / GROUP];
+    let mut sure = [[0_u8; GROUP]; LANES / GROUP];
+    for (group, (maybe, sure)) in maybe.iter_mut().zip(&mut sure).take(groups).enumerate() {
+        let m: [&[f32; GROUP]; COEFFICIENTS] = std::array::from_fn(|row| &block.0[row].as_chunks().0[group]);
+        for lane in 0..GROUP {
+            let dot = |row: usize| {
+                let r = row * 4;
+                let sum = multiply_add::<FUSED>(m[r][lane], x[0], m[r + 3][lane]);
+                let sum = multiply_add::<FUSED>(m[r + 1][lane], x[1], sum);
+                multiply_add::<FUSED>(m[r + 2][lane], x[2], sum)
+            };
+            let (a, b, c) = (dot(0), dot(1), dot(2));
+            let error2 = multiply_add::<FUSED>(a, a, b * b);
+            let c2 = multiply_add::<FUSED>(c, c, m[FLOOR][lane]);
+            maybe[lane] =
+                u8::from(error2 < multiply_add::<FUSED>(c2, 1.0 + BAND, margins.maybe)) & u8::from(c > -margins.depth);
+            sure[lane] =
+                u8::from(error2 < multiply_add::<FUSED>(c2, 1.0 - BAND, -margins.sure)) & u8::from(c > margins.depth);
+        }
     }
-    (bits(&maybe), bits(&sure))
+    (bits(maybe.as_flattened()), bits(sure.as_flattened()))
 }
 
 #[inline(always)]
@@ -230,7 +235,7 @@ fn multiply_add<const FUSED: bool>(a: f32, b: f32, c: f32) -> f32 {
 
 /// Pack 64 bytes of 0 or 1 into a word, byte 0 to bit 0.
 #[inline(always)]
-fn bits(bytes: &[u8; LANES]) -> u64 {
+fn bits(bytes: &[u8]) -> u64 {
     let mut word = 0;
     for (i, eight) in bytes.as_chunks::<8>().0.iter().enumerate() {
         // The product gathers bit 0 of each byte in the top byte, in order.

@@ -3,6 +3,7 @@
 
 mod street;
 
+use std::collections::BTreeMap;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
@@ -70,6 +71,26 @@ proptest! {
                 prop_assert_eq!(hits.iter().map(|hit| hit.ray).collect::<Vec<_>>(), closest);
             }
         }
+    }
+
+    #[test]
+    fn what_some_points_hit_is_what_any_of_them_does(
+        objects in vec(object(), 1..6), errors in errors_px(), points in vec(object(), 1..6), apart_m in 0.0..200.0_f64,
+        range_m in 10.0..80.0_f64
+    ) {
+        let scene = street(60, 2.0, &objects, &errors);
+        let spreads = spreads_of(&scene, &NOISE);
+        let index = RayIndex::new(&scene, &spreads, GATE_SIGMAS, 0..scene.rays.rays.len() as u32);
+        let spread_out = points.iter().enumerate().map(|(i, point)| point + Vector3::x() * (apart_m * i as f64));
+        let points: Vec<Vector3<f64>> = spread_out.chain(objects).collect();
+        let mut nearest: BTreeMap<u32, f64> = BTreeMap::new();
+        for hit in points.iter().flat_map(|point| index.all_hits(point, 0, range_m)) {
+            let chi2 = nearest.entry(hit.ray).or_insert(hit.chi2);
+            *chi2 = chi2.min(hit.chi2);
+        }
+        let found: BTreeMap<u32, f64> =
+            index.hits_of_any(&points, &|class| class == 0, range_m).iter().map(|hit| (hit.ray, hit.chi2)).collect();
+        prop_assert_eq!(found, nearest);
     }
 
     #[test]

@@ -107,21 +107,27 @@ impl<'a> RayIndex<'a> {
         let span = points.iter().map(|point| (point - middle).norm()).fold(0.0, f64::max);
         let reach = range_m + span + self.reach_m;
         let mut hits = Vec::new();
-        let mut around = vec![Vector3::zeros(); points.len()];
+        let mut near_points = Vec::with_capacity(points.len());
+        let mut around = Vec::with_capacity(points.len());
         let (mut maybe, mut sure) = (Vec::new(), Vec::new());
         for near in self.tree.locate_within_distance(middle.into(), reach * reach) {
             let place = &self.places[near.data];
+            near_points.clear();
+            near_points.extend(
+                points.iter().filter(|point| (*point - place.origin).norm() <= range_m + self.reach_m).copied(),
+            );
+            around.clear();
+            around.extend(near_points.iter().map(|point| point - place.origin));
             let words = place.gates.words();
-            around.iter_mut().zip(points).for_each(|(around, point)| *around = point - place.origin);
-            maybe.resize(words * points.len(), 0);
-            sure.resize(words * points.len(), 0);
+            maybe.resize(words * around.len(), 0);
+            sure.resize(words * around.len(), 0);
             place.gates.test(&around, &mut maybe, &mut sure);
             for word in 0..words {
                 let bits_of = |point: usize| maybe[point * words + word];
-                let any = (0..points.len()).fold(0, |any, point| any | bits_of(point));
+                let any = (0..around.len()).fold(0, |any, point| any | bits_of(point));
                 let lane_of = |bit: u32| word * LANES + bit as usize;
                 let nearest = |bit: u32| {
-                    let near = points.iter().enumerate().filter(|(point, _)| bits_of(*point) >> bit & 1 == 1);
+                    let near = near_points.iter().enumerate().filter(|(point, _)| bits_of(*point) >> bit & 1 == 1);
                     let of_ray = near.filter_map(|(_, point)| self.hit(place.rays[lane_of(bit)], point, range_m));
                     of_ray.min_by(|a, b| a.chi2.total_cmp(&b.chi2))
                 };
