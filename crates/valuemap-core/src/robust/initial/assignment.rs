@@ -70,11 +70,13 @@ impl<'a> Case<'a> {
 
 /// What the votes of one image say about the drift of its pass.
 pub(super) fn belief_of_votes<'c>(cases: impl Iterator<Item = &'c Case<'c>>) -> Belief {
-    cases.filter(|case| case.claim.is_vote).fold(Belief::nothing(), |sum, case| {
+    let mut belief = Belief::nothing();
+    for case in cases.filter(|case| case.claim.is_vote) {
         let of_label_px2 = 0.5 * case.own.trace() - case.detection_px2;
         let robust = huber_weight(case.claim.chi2);
-        sum.and(&Belief::of_vote(&case.look, (case.look.variance + of_label_px2) / robust))
-    })
+        belief.add(&Belief::of_vote(&case.look, (case.look.variance + of_label_px2) / robust));
+    }
+    belief
 }
 
 /// What became of a claim.
@@ -94,11 +96,20 @@ pub(super) fn decide(cases: &[Case<'_>], limit: f64, pose: &PoseError) -> Vec<Fi
     }
     let mut assigned = assign(cases, &costs, limit);
     for _ in 1..ROUNDS {
+        // The pose error after the first of the assigned claims, after two, and so on: what all share that are independent of these.
+        let mut after = vec![*pose];
+        for &j in &assigned {
+            after.push(after[after.len() - 1].after(&cases[j].look, &cases[j].own));
+        }
         for &i in &contested {
             let case = &cases[i];
-            let others = assigned.iter().map(|&j| &cases[j]);
-            let independent = others.filter(|o| o.claim.label != case.claim.label && o.claim.ray != case.claim.ray);
-            let known = independent.fold(*pose, |pose, other| pose.after(&other.look, &other.own));
+            let is_independent = |j: usize| {
+                let other = cases[j].claim;
+                other.label != case.claim.label && other.ray != case.claim.ray
+            };
+            let first = assigned.iter().position(|&j| !is_independent(j)).unwrap_or(assigned.len());
+            let rest = assigned[first..].iter().filter(|&&j| is_independent(j));
+            let known = rest.fold(after[first], |pose, &j| pose.after(&cases[j].look, &cases[j].own));
             costs[i] = case.cost(&known);
         }
         let again = assign(cases, &costs, limit);

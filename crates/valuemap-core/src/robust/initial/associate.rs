@@ -314,7 +314,7 @@ impl<'a> Run<'a> {
             of_segments[segment] = Belief::nothing();
         }
         for (vote, &segment) in votes.iter().zip(&segment_of) {
-            of_segments[segment] = of_segments[segment].and(vote);
+            of_segments[segment].add(vote);
         }
         let starts_m = segments.start_m[around.clone()].to_vec();
         let first_segment = around.start;

@@ -93,8 +93,10 @@ impl Run<'_> {
         let from = self.segment_of.partition_point(|&segment| segment < first);
         let to = self.segment_of.partition_point(|&segment| segment < end);
         for (cases, segment) in self.images[from..to].iter().zip(&self.segment_of[from..to]) {
-            let theirs = cases.iter().filter(|case| labels.contains(&case.claim.label));
-            of_segments[segment - first] = of_segments[segment - first].without(&belief_of_votes(theirs));
+            let theirs = cases.iter().filter(|case| case.claim.is_vote && labels.contains(&case.claim.label));
+            if theirs.clone().next().is_some() {
+                of_segments[segment - first].take(&belief_of_votes(theirs));
+            }
         }
         let smoothed = smooth(&self.starts_m[first..end], &of_segments);
         let of_ray = |&(i, ray): &(usize, u32)| {

@@ -44,14 +44,28 @@ impl Belief {
 
     /// Both beliefs, which must not rest on the same looks.
     #[must_use]
-    pub fn and(&self, other: &Self) -> Self {
-        Self { information: self.information + other.information, gradient: self.gradient + other.gradient }
+    pub fn and(mut self, other: &Self) -> Self {
+        self.add(other);
+        self
+    }
+
+    /// Add another belief, which must not rest on the same looks.
+    pub fn add(&mut self, other: &Self) {
+        self.information += other.information;
+        self.gradient += other.gradient;
     }
 
     /// What it was before another belief, which is part of it, was added.
     #[must_use]
-    pub fn without(&self, other: &Self) -> Self {
-        Self { information: self.information - other.information, gradient: self.gradient - other.gradient }
+    pub fn without(mut self, other: &Self) -> Self {
+        self.take(other);
+        self
+    }
+
+    /// Take another belief, which is part of it, out.
+    pub fn take(&mut self, other: &Self) {
+        self.information -= other.information;
+        self.gradient -= other.gradient;
     }
 
     /// What a vote says; `variance` is that of its residual, px², each axis.
@@ -166,7 +180,8 @@ pub fn smooth(starts_m: &[f64], looks: &[Belief]) -> Vec<Belief> {
     let mut after = Belief::nothing();
     let mut smoothed = before;
     for segment in (0..looks.len()).rev() {
-        smoothed[segment] = smoothed[segment].and(&looks[segment]).and(&after);
+        smoothed[segment].add(&looks[segment]);
+        smoothed[segment].add(&after);
         if segment > 0 {
             after = after.and(&looks[segment]).carried(distance(segment - 1), false);
         }

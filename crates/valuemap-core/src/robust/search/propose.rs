@@ -227,8 +227,9 @@ impl<'a> Neighborhood<'a> {
         self.gates.test(&points, &mut maybe, &mut sure);
         let votes_for = self.model.votes_for(own.class);
         let mut best: Option<(f64, usize)> = None;
+        let mut gains = Vec::with_capacity(self.images.len());
         for (i, meeting) in meetings.iter().enumerate() {
-            let gains = self.gains(&own, &votes_for, meeting, &maybe[i * words..(i + 1) * words]);
+            self.gains(&own, &votes_for, meeting, &maybe[i * words..(i + 1) * words], &mut gains);
             let (votes, at_most) = self.votes(&own, meeting, &gains);
             // Who should have seen it and did not makes no meeting more probable, and takes long to find.
             if votes < 2 || best.is_some_and(|(most, _)| !(at_most > most)) {
@@ -283,9 +284,10 @@ impl<'a> Neighborhood<'a> {
         agree.then_some(Meeting { point, partner: other.number, ln_size: 0.5 * (of_own + of_other) })
     }
 
-    /// What each image of the sample gains by a meeting: that of its best ray in whose gate the point lies; of none less than nothing.
-    fn gains(&self, own: &Partner, votes_for: &VotesFor<'_>, meeting: &Meeting, maybe: &[u64]) -> Vec<f64> {
-        let mut gains = vec![f64::NEG_INFINITY; self.images.len()];
+    /// Set `gains` to what each image of the sample gains by a meeting: that of its best ray in whose gate the point lies; of none less than nothing.
+    fn gains(&self, own: &Partner, votes_for: &VotesFor<'_>, meeting: &Meeting, maybe: &[u64], gains: &mut Vec<f64>) {
+        gains.clear();
+        gains.resize(self.images.len(), f64::NEG_INFINITY);
         for (word, &maybe) in maybe.iter().enumerate() {
             for bit in ones(maybe) {
                 let partner = &self.partners[word * LANES + bit as usize];
@@ -300,7 +302,6 @@ impl<'a> Neighborhood<'a> {
                 *best = best.max(gain);
             }
         }
-        gains
     }
 
     /// Images of the sample that gain by a meeting, and how much more probable that makes it, whoever else should have seen it.
@@ -374,7 +375,8 @@ mod tests {
             let votes_for = model.votes_for(own.class);
             let mut best: Option<(f64, Vector3<f64>)> = None;
             for meeting in neighborhood.meetings(&own) {
-                let gains = neighborhood.gains(&own, &votes_for, &meeting, &everybody);
+                let mut gains = Vec::new();
+                neighborhood.gains(&own, &votes_for, &meeting, &everybody, &mut gains);
                 let (votes, at_most) = neighborhood.votes(&own, &meeting, &gains);
                 let support = neighborhood.support(&own, &meeting, &gains);
                 assert!(support <= at_most);
