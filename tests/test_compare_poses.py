@@ -13,6 +13,7 @@ from valuemap import correction
 from valuemap.dataset import Dataset
 from valuemap.progress import silent
 from valuemap.refine import Refined
+from valuemap.robust import Calibration, calibrate
 from valuemap.simulate import simulate
 from valuemap.stages import Stages
 from valuemap.tables import Ints
@@ -75,8 +76,10 @@ def test_a_correction_that_is_not_worth_its_parameters_is_not_taken(
 def test_a_sample_pays_its_share_of_the_price(city: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     """A fleet has hundreds of parameters, estimated from ten times the detections that are compared."""
 
-    def of_a_tenth(scenes: object, second_of_first: Ints, *_: object, **__: object) -> tuple[tuple[float, float], int]:
-        return (100.0, 90.0), len(second_of_first) // 10
+    def of_a_tenth(
+        scenes: object, second_of_first: Ints, *_: object, **__: object
+    ) -> tuple[tuple[float, float], int, None]:
+        return (100.0, 90.0), len(second_of_first) // 10, None
 
     monkeypatch.setattr(compare, "misfits", of_a_tenth)
     found, all_of_it = compared(city, city, parameters=10), len(city.detections)
@@ -89,7 +92,16 @@ def test_a_correction_that_fits_worse_is_not_taken(city: Dataset, monkeypatch: p
     alone = valuemap.build_map(city, valuemap.MapConfig(correct_poses=0))
     wrong = Refined(shifted(city, 1.0), {"found": "faults"}, is_corrected=True)
     monkeypatch.setattr(correction, "refine_poses", lambda *_, **__: wrong)
+    sought: list[object] = []
+
+    def spied(*given: object, **named: object) -> Calibration:
+        sought.append(named["sought"])
+        return calibrate(*given, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("valuemap.tiles.calibration.calibrate_scene", spied)
     result = valuemap.build_map(city)
+    # The noise of the poses as they are is known from the comparison.
+    assert [given is None for given in sought] == [False]
     assert result.run["poses"]["because"] == "the poses as given fit better"
     assert result.run["poses"]["misfit_after"] > result.run["poses"]["misfit_before"]
     assert result.corrected is None

@@ -95,6 +95,7 @@ def calibrate(
     known: tuple[list[bool], float],
     settings: _Settings,
     is_part: bool,
+    sought: tuple[_Noise, int] | None,
     threads: int,
     progress: Callable[[int, int], None],
 ) -> _Calibration: ...
@@ -106,7 +107,7 @@ def misfits(
     settings: _Settings,
     threads: int,
     progress: Callable[[int, int], None],
-) -> tuple[tuple[float, float], int]: ...
+) -> tuple[tuple[float, float], int, tuple[_Noise, int] | None]: ...
 def find_labels(
     scene: Scene, calibration: _Calibration, settings: _Settings, threads: int, progress: Callable[[int, int], None]
 ) -> tuple[_Floats, _Indices, tuple[_Offsets, _Indices], _Floats, _Floats, _Offsets, dict[str, float]]: ...

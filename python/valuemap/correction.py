@@ -77,7 +77,7 @@ def _of_drives(dataset: Dataset, refined: Refined, config: MapConfig, threads: i
     found = compare_poses(dataset, refined.dataset, parameters, config, threads=threads, progress=progress)
     record = {**refined.record, **found.figures()}
     if not found.is_better:
-        return Refined(dataset, {**record, "found": "nothing", "because": FITS_NO_BETTER})
+        return Refined(dataset, {**record, "found": "nothing", "because": FITS_NO_BETTER}, sought=found.sought)
     if is_proven:
         refined = _told_by_a_map(dataset, refined, config, threads, progress)
     return replace(refined, record={**record, **refined.record}, found=None)

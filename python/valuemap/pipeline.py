@@ -300,7 +300,9 @@ def _robust(
         calibration, labels, votes, counts = refined.as_given
     else:
         with stages.measured("calibrate"):
-            calibration = calibrate(source, config, given, None if run is None else run.parts, engine, progress)
+            sought = None if refined is None else refined.sought
+            parts = None if run is None else run.parts
+            calibration = calibrate(source, config, given, parts, engine, progress, sought)
         with stages.measured("find"):
             known = None if run is None else run.known
             solved, files = solve_cells(source, calibration, config, engine, progress, store=store, known=known)

@@ -170,18 +170,36 @@ MISFIT_STEPS: int = _core.MISFIT_STEPS
 """Maps that the core makes to find the likeliest noise, at most."""
 
 
+Sought = tuple[tuple[float, ...], int]
+"""The noise that makes the rays of a few places likeliest, and from how many starts it was sought, for the core."""
+
+
 def calibrate(
-    scene: Scene, config: MapConfig, *, is_part: bool = False, threads: int = 0, progress: Progress = silent
+    scene: Scene,
+    config: MapConfig,
+    *,
+    is_part: bool = False,
+    sought: Sought | None = None,
+    threads: int = 0,
+    progress: Progress = silent,
 ) -> Calibration:
     """Estimate the noise from the residuals of labels in a sample of places, and learn what its classes are like.
 
-    What the config sets of the noise stays as it is. The scene may be a part of what is mapped.
+    What the config sets of the noise stays as it is. The scene may be a part of what is mapped. `sought` is what
+    `misfits` found of the same scene with the same config: it is the most work, and done once.
     """
     guess, known = _guess(config.noise, scene.rounding_px)
     steps = _core.CALIBRATION_STEPS + (2 * _core.SEARCH_STEPS if is_part else 0)
     with counted(progress, "estimating the noise", steps) as tell:
         noise, is_deep, classes, pooled, shares = _core.calibrate(
-            scene.core, guess.as_tuple(), known, _settings(config), is_part, threads, lambda done, _total: tell(done)
+            scene.core,
+            guess.as_tuple(),
+            known,
+            _settings(config),
+            is_part,
+            sought,
+            threads,
+            lambda done, _total: tell(done),
         )
     return Calibration(
         noise=Noise(*noise),
@@ -205,15 +223,17 @@ def misfits(
     *,
     threads: int,
     tell: Callable[[int], None],
-) -> tuple[tuple[float, float], int]:
+) -> tuple[tuple[float, float], int, Sought | None]:
     """Return how badly the same detections, those of a sample of places, fit in two scenes, and how many they are.
+
+    Also the noise that `calibrate` would seek in the first scene from all starts again, None where it has others.
 
     Minus twice the logarithm of their likelihood, up to a constant of theirs. What is true makes them likelier.
     `second_of_first` (N) is the row in the second scene of each detection of the first. `tell` hears again and again
     how many of `MISFIT_STEPS` are done, and stops the work by an exception.
     """
     guess, known = _guess(config.noise, scenes[0].rounding_px)
-    (first, second), count = _core.misfits(
+    (first, second), count, sought = _core.misfits(
         (scenes[0].core, scenes[1].core),
         second_of_first.astype(np.uint32),
         guess.as_tuple(),
@@ -222,7 +242,7 @@ def misfits(
         threads,
         lambda done, _total: tell(done),
     )
-    return (first, second), count
+    return (first, second), count, sought
 
 
 def steps_of_labels(calibration: Calibration) -> int:

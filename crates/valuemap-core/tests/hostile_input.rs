@@ -285,7 +285,7 @@ static LEARNED: LazyLock<Vec<f64>> = LazyLock::new(|| {
         (0..12).map(|i| Vector3::new(20.0 + 9.0 * f64::from(i), 6.0 - f64::from(i % 3), 4.0)).collect();
     let scene = street::street(60, 2.0, &objects, &[[0.4, -0.2], [-0.5, 0.3], [0.1, 0.6]]);
     let known = Known { detection: true, position: true, rotation: true, side: true, least_px: 0.0 };
-    let found = self_calibrate(&scene, &street::NOISE, known, &street::SETTINGS, false, &Progress::default());
+    let found = self_calibrate(&scene, &street::NOISE, known, &street::SETTINGS, false, None, &Progress::default());
     found.unwrap().pooled.to_row()
 });
 
@@ -444,7 +444,7 @@ fn noise_of_hostile_scenes() {
     let cases = (columns(10), noise(), known(), settings(), any::<bool>());
     run("calibrate", 50, &cases, |(columns, guess, known, settings, is_part)| {
         let scene = columns.scene();
-        let found = self_calibrate(&scene, &guess, known, &settings, is_part, &Progress::default()).unwrap();
+        let found = self_calibrate(&scene, &guess, known, &settings, is_part, None, &Progress::default()).unwrap();
         let n = &found.noise;
         all_finite("detection noise", [&n.detection_px, &n.box_share])?;
         all_finite("noise of positions", [&n.position_m, &n.position_segment_m, &n.position_drift_m, &n.side_m])?;
@@ -466,8 +466,8 @@ fn misfits_of_hostile_scenes() {
         let second = if second.rays.rays.len() == count { second } else { first.clone() };
         let numbers = 0..count as u32;
         let numbers: Vec<u32> = if turns { numbers.rev().collect() } else { numbers.collect() };
-        let (_, used) = misfits([&first, &second], &numbers, &guess, known, &settings, &Progress::default()).unwrap();
-        prop_assert!(used <= count);
+        let found = misfits([&first, &second], &numbers, &guess, known, &settings, &Progress::default()).unwrap();
+        prop_assert!(found.rays <= count);
         Ok(())
     });
 }

@@ -9,6 +9,7 @@ use std::sync::Arc;
 use nalgebra::{Isometry3, Rotation3, Vector3};
 use street::{NOISE, SETTINGS, joined, moved, street};
 use valuemap_core::progress::Progress;
+use valuemap_core::robust::calibrate::likeliest::{Sought, misfits};
 use valuemap_core::robust::calibrate::residuals::calibrate;
 use valuemap_core::robust::calibrate::{Calibration, self_calibrate};
 use valuemap_core::robust::energy::Placed;
@@ -33,12 +34,16 @@ fn calibrated(sigma_px: f64) -> Calibration {
 
 /// The same where detections are rounded, which they are off by at least.
 fn calibrated_of_rounded(sigma_px: f64, least_px: f64) -> Calibration {
+    let known = Known { least_px, ..Known::default() };
+    self_calibrate(&off_by(sigma_px), &NOISE, known, &SETTINGS, false, None, &Progress::default()).unwrap()
+}
+
+/// A street whose detections are off by a standard deviation.
+fn off_by(sigma_px: f64) -> Scene {
     let objects: Vec<Vector3<f64>> =
         (0..12).map(|i| Vector3::new(25.0 + 9.0 * f64::from(i), if i % 2 == 0 { 5.0 } else { -6.0 }, 3.0)).collect();
     let errors: Vec<[f64; 2]> = (0..997).map(|i| [2 * i, 2 * i + 1].map(|number| sigma_px * normal(number))).collect();
-    let scene = street(120, 1.0, &objects, &errors);
-    let known = Known { least_px, ..Known::default() };
-    self_calibrate(&scene, &NOISE, known, &SETTINGS, false, &Progress::default()).unwrap()
+    street(120, 1.0, &objects, &errors)
 }
 
 fn far_px(calibration: &Calibration) -> f64 {
@@ -61,6 +66,29 @@ fn where_little_fits_it_is_tried_and_found() {
 }
 
 /// Pins that few bearings which meet by chance are not more exact than they are written down.
+#[test]
+fn what_poses_were_compared_with_is_not_sought_again() {
+    let scene = off_by(1.0);
+    let numbers: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
+    let with = |second: &Scene| {
+        misfits([&scene, second], &numbers, &NOISE, Known::default(), &SETTINGS, &Progress::default()).unwrap().of_first
+    };
+    let calibrated = |sought: Option<Sought>| {
+        let found =
+            self_calibrate(&scene, &NOISE, Known::default(), &SETTINGS, false, sought, &Progress::default()).unwrap();
+        (found.noise, found.starts)
+    };
+    let sought = with(&scene).unwrap();
+    assert_eq!(calibrated(Some(sought)), calibrated(None));
+    // It is taken as it is.
+    let other = Sought { starts: sought.starts + 1, ..sought };
+    assert_eq!(calibrated(Some(other)).1, other.starts);
+    // Not where a ray that tells nothing in the second scene was left out.
+    let mut without_one = scene.clone();
+    Arc::make_mut(&mut without_one.rays).rays[0].center.x = f64::NAN;
+    assert_eq!(with(&without_one), None);
+}
+
 #[test]
 fn noise_is_not_below_that_of_rounding() {
     assert!(far_px(&calibrated(0.5)) < 1.0);
@@ -217,7 +245,7 @@ fn noise_of(are_of_poses: bool) -> Noise {
     };
     let scene = joined((0..2).map(drive).collect());
     let guess = Noise { box_share: 0.04, position_m: 0.1, ..NOISE };
-    self_calibrate(&scene, &guess, Known::default(), &SETTINGS, false, &Progress::default()).unwrap().noise
+    self_calibrate(&scene, &guess, Known::default(), &SETTINGS, false, None, &Progress::default()).unwrap().noise
 }
 
 #[test]

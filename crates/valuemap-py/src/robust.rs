@@ -8,6 +8,7 @@ use numpy::{
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use valuemap_core::robust::calibrate::likeliest::{self, Sought};
 use valuemap_core::robust::calibrate::{Calibration, self_calibrate};
 use valuemap_core::robust::energy::sides::of_directions;
 use valuemap_core::robust::model::ClassModel;
@@ -134,6 +135,20 @@ impl Scene {
 /// The fields of the core's `Noise`, in their order.
 type NoiseValues = [f64; 9];
 
+fn values_of(noise: &Noise) -> NoiseValues {
+    [
+        noise.detection_px,
+        noise.box_share,
+        noise.position_m,
+        noise.rotation_rad,
+        noise.position_segment_m,
+        noise.rotation_segment_rad,
+        noise.position_drift_m,
+        noise.rotation_drift_rad,
+        noise.side_m,
+    ]
+}
+
 fn noise_of(values: NoiseValues) -> PyResult<Noise> {
     check_within("noise", &values, FARTHEST_M)?;
     if values.iter().any(|&value| value < 0.0) || values[0] == 0.0 {
@@ -236,32 +251,27 @@ pub fn calibrate(
     known: ([bool; 4], f64),
     settings: SettingValues,
     is_part: bool,
+    sought: Option<SoughtValues>,
     threads: usize,
     progress: &Bound<'_, PyAny>,
 ) -> PyResult<CalibrationValues> {
     let settings = settings_of(settings)?;
     let guess = noise_of(guess)?;
     let known = known_of(known);
+    let sought =
+        sought.map(|(noise, starts)| Ok::<_, PyErr>(Sought { noise: noise_of(noise)?, starts })).transpose()?;
     let found = with_progress(py, threads, 0, progress, |progress| {
-        self_calibrate(&scene.0, &guess, known, &settings, is_part, progress)
+        self_calibrate(&scene.0, &guess, known, &settings, is_part, sought, progress)
     })?;
-    let noise = &found.noise;
-    let noise = [
-        noise.detection_px,
-        noise.box_share,
-        noise.position_m,
-        noise.rotation_rad,
-        noise.position_segment_m,
-        noise.rotation_segment_rad,
-        noise.position_drift_m,
-        noise.rotation_drift_rad,
-        noise.side_m,
-    ];
     let classes = found.classes.iter().map(|class| class.as_ref().map(ClassModel::to_row)).collect();
-    Ok((noise, found.is_deep, classes, found.pooled.to_row(), found.confusions.shares().to_vec()))
+    Ok((values_of(&found.noise), found.is_deep, classes, found.pooled.to_row(), found.confusions.shares().to_vec()))
 }
 
-/// How badly the same rays fit in two scenes, and how many they are, `valuemap_core::robust::calibrate::likeliest::misfits`.
+/// A noise, and from how many starts it was sought.
+type SoughtValues = (NoiseValues, usize);
+
+/// How badly the same rays fit in two scenes, how many they are, and the noise that was sought in the first one,
+/// `valuemap_core::robust::calibrate::likeliest::misfits`.
 #[pyfunction]
 #[allow(clippy::too_many_arguments)]
 pub fn misfits<'py>(
@@ -273,7 +283,7 @@ pub fn misfits<'py>(
     settings: SettingValues,
     threads: usize,
     progress: &Bound<'py, PyAny>,
-) -> PyResult<([f64; 2], usize)> {
+) -> PyResult<([f64; 2], usize, Option<SoughtValues>)> {
     let settings = settings_of(settings)?;
     let guess = noise_of(guess)?;
     let known = known_of(known);
@@ -286,9 +296,10 @@ pub fn misfits<'py>(
     {
         return Err(PyValueError::new_err("second_of_first: expected each ray of two scenes of the same rays once"));
     }
-    with_progress(py, threads, 0, progress, |progress| {
-        valuemap_core::robust::calibrate::likeliest::misfits(scenes, numbers, &guess, known, &settings, progress)
-    })
+    let found = with_progress(py, threads, 0, progress, |progress| {
+        likeliest::misfits(scenes, numbers, &guess, known, &settings, progress)
+    })?;
+    Ok((found.values, found.rays, found.of_first.map(|sought| (values_of(&sought.noise), sought.starts))))
 }
 
 /// Positions, classes, voters, covariances (N, 9), existence, expected images, and counts.

@@ -46,7 +46,7 @@ from valuemap.refine.jumps import Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import find_landmarks
 from valuemap.refine.residuals import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
 from valuemap.refine.select import Selected, select
-from valuemap.robust import Calibration, Noise
+from valuemap.robust import Calibration, Noise, Sought
 from valuemap.tables import Bools, Floats, Labels, Votes
 
 USUAL_RANGE_M = 60.0
@@ -86,7 +86,8 @@ class Refined:
 
     `found` is what a map may tell more of: it was corrected, or is in doubt. Where `is_noisy`, single images are off by
     more than was thought possible. `before_images` is what errors of single images were taken from, where they were.
-    `as_given` is the map of the dataset as it was, where one was made and nothing is corrected.
+    `as_given` is the map of the dataset as it was, where one was made and nothing is corrected. `sought` is its noise,
+    where it was compared with what could have been corrected.
     """
 
     dataset: Dataset
@@ -96,6 +97,7 @@ class Refined:
     is_noisy: bool = False
     before_images: tuple[AllImages, Noise] | None = None
     as_given: Mapped | None = None
+    sought: Sought | None = None
 
 
 def refine_poses(

@@ -14,7 +14,7 @@ from valuemap.errors import InputError
 from valuemap.map_folder import CALIBRATION, read_json
 from valuemap.progress import Progress
 from valuemap.remote import Place
-from valuemap.robust import Calibration, Scene, calibration_from_json, calibration_to_json
+from valuemap.robust import Calibration, Scene, Sought, calibration_from_json, calibration_to_json
 from valuemap.robust import calibrate as calibrate_scene
 from valuemap.sightings import cast_sightings
 from valuemap.tiles.fingerprint import Fingerprints
@@ -32,18 +32,22 @@ def calibrate(
     work: Place | None,
     engine: Engine,
     progress: Progress,
+    sought: Sought | None = None,
 ) -> Calibration:
-    """Return the calibration that is given, or kept in the folder of work, or else estimated on the sample."""
+    """Return the calibration that is given, or kept in the folder of work, or else estimated on the sample.
+
+    `sought` is the noise that was found when these poses were compared with others.
+    """
     if given is not None:
         return given
     sample = source.sample()
     is_part = source.cells != [WHOLE] and len(sample.detection_id) >= SAMPLE_DETECTIONS
     if work is None:
-        return _estimated(sample, is_part, config, engine, progress)
+        return _estimated(sample, is_part, sought, config, engine, progress)
     rows, settings = np.arange(len(sample.image_id)), hash_settings(source.grid, None, config)
     file = work / f"calibration.{Fingerprints(sample).of(rows, WHOLE, settings)}.json"
     if not file.is_file():
-        calibration = _estimated(sample, is_part, config, engine, progress)
+        calibration = _estimated(sample, is_part, sought, config, engine, progress)
         put(file, json.dumps(calibration_to_json(calibration)).encode())
     return calibration_from_json(json.loads(file.read_bytes()), source=str(file))
 
@@ -59,7 +63,14 @@ def read_calibration(path: Path) -> Calibration:
     return calibration_from_json(read_json(file), source=str(file))
 
 
-def _estimated(sample: InOrder, is_part: bool, config: MapConfig, engine: Engine, progress: Progress) -> Calibration:
+def _estimated(
+    sample: InOrder,
+    is_part: bool,
+    sought: Sought | None,
+    config: MapConfig,
+    engine: Engine,
+    progress: Progress,
+) -> Calibration:
     scene = Scene(sample.dataset, sample.drives, cast_sightings(sample.dataset)[0])
     threads = engine.threads_of_task(1)
-    return calibrate_scene(scene, config, is_part=is_part, threads=threads, progress=progress)
+    return calibrate_scene(scene, config, is_part=is_part, sought=sought, threads=threads, progress=progress)

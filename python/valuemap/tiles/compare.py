@@ -11,7 +11,7 @@ from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
 from valuemap.drives import InOrder, in_driving_order
 from valuemap.progress import Progress, counted
-from valuemap.robust import MISFIT_STEPS, Scene, misfits
+from valuemap.robust import MISFIT_STEPS, Scene, Sought, misfits
 from valuemap.sightings import cast_sightings
 from valuemap.tiles.piece import piece_of_rows
 from valuemap.tiles.source import VIEWPOINT_SHARE, InMemory
@@ -23,13 +23,15 @@ class Comparison:
 
     Each has the noise that is likeliest for it. `price` is that of the parameters by which poses differ, by the
     Bayesian information criterion (Schwarz 1978), where each detection has two coordinates. A sample pays its share,
-    since the parameters were estimated from all detections, and explain all of them.
+    since the parameters were estimated from all detections, and explain all of them. `sought` is the noise of the poses
+    before, which a map of these need not seek again.
     """
 
     before: float
     after: float
     price: float
     detections: int
+    sought: Sought | None = None
 
     @property
     def is_better(self) -> bool:
@@ -56,9 +58,9 @@ def compare_poses(
     order = np.argsort(new.detection_id)
     second_of_first = order[np.searchsorted(new.detection_id, old.detection_id, sorter=order)]
     with counted(progress, "comparing poses", MISFIT_STEPS) as tell:
-        (of_old, of_new), rays = misfits((first, second), second_of_first, config, threads=threads, tell=tell)
+        (of_old, of_new), rays, sought = misfits((first, second), second_of_first, config, threads=threads, tell=tell)
     price = parameters * math.log(2 * len(before.detections)) * rays / len(before.detections)
-    return Comparison(of_old, of_new, price, rays)
+    return Comparison(of_old, of_new, price, rays, sought)
 
 
 def _same_images(dataset: Dataset, like: InOrder, config: MapConfig) -> InOrder:

@@ -42,23 +42,45 @@ pub const MISFIT_STEPS: usize = 2 * (START_STEPS + 2);
 /// Steps of the search for the noise at most.
 pub(crate) const NOISE_STEPS: usize = START_STEPS + MORE_ROUNDS;
 
-/// The noise that makes the rays of some places likeliest, `more` and some of them, and from how many starts it was sought.
+/// The noise that was found to make the rays of some places likeliest, and from how many starts it was sought.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sought {
+    /// The noise.
+    pub noise: Noise,
+    /// The starts, 0 if it was known.
+    pub starts: usize,
+}
+
+/// Some places of a scene, whose rays tell the noise.
+pub(crate) fn few_places(scene: &Scene, settings: &Settings) -> Vec<u32> {
+    sample::places(scene, CALIBRATION_RAYS.0, settings.viability.max_range_m)
+}
+
+/// The noise that makes the rays of some places likeliest, sought from all starts.
 pub(crate) fn likeliest_noise(
     scene: &Scene,
     guess: &Noise,
     known: Known,
     settings: &Settings,
+    few: &[u32],
+    progress: &Progress,
+) -> Result<Sought, Halt> {
+    let sample = Sample { scene, rays: few, known, settings: wider(settings), progress };
+    let likeliest = Likeliest::of_starts(&sample, guess)?;
+    Ok(likeliest.sought().unwrap_or(Sought { noise: *guess, starts: likeliest.starts }))
+}
+
+/// The noise that makes the rays of more places likeliest, some steps on from that of a few of them.
+pub(crate) fn noise_of_more(
+    scene: &Scene,
+    of_few: Noise,
+    known: Known,
+    settings: &Settings,
     more: &[u32],
     progress: &Progress,
-) -> Result<(Noise, usize), Halt> {
-    let few = sample::places(scene, CALIBRATION_RAYS.0, settings.viability.max_range_m);
-    let of = |rays| Sample { scene, rays, known, settings: wider(settings), progress };
-    let likeliest = Likeliest::of_starts(&of(&few), guess)?;
-    let (noise, starts) = (likeliest.noise().unwrap_or(*guess), likeliest.starts);
-    if more.len() == few.len() {
-        return Ok((noise, starts));
-    }
-    Ok((of_more(noise, |noise| of(more).round(noise))?, starts))
+) -> Result<Noise, Halt> {
+    let sample = Sample { scene, rays: more, known, settings: wider(settings), progress };
+    of_more(of_few, |noise| sample.round(noise))
 }
 
 /// The noise that makes more rays likeliest, some steps on from one: the one that a map was found with, or the one that was estimated from it, if
@@ -102,9 +124,20 @@ pub(crate) fn with_middles(
     Ok(found.unwrap_or(*noise))
 }
 
-/// Minus twice the logarithm of how likely the same rays, of a sample of places, are in two scenes, each with the noise that makes them likeliest
-/// there, up to a constant of these rays; and how many they are. It compares poses: what is true makes the same rays likelier. `second_of_first`
-/// has the number in the second scene of each ray of the first.
+/// How badly the same rays fit in two scenes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Misfits {
+    /// Minus twice the logarithm of how likely they are in each, up to a constant of theirs.
+    pub values: [f64; 2],
+    /// How many they are.
+    pub rays: usize,
+    /// The noise of the first scene that [`self_calibrate`](super::self_calibrate) would seek from all starts again; nothing if it has other rays to
+    /// seek it from.
+    pub of_first: Option<Sought>,
+}
+
+/// How likely the same rays, of a sample of places, are in two scenes, each with the noise that makes them likeliest there. It compares poses: what is
+/// true makes the same rays likelier. `second_of_first` has the number in the second scene of each ray of the first.
 ///
 /// A search may end above the least value, and in one scene farther above it than in the other. So each scene is offered the map of the other as
 /// well: it goes on with the noise that makes it likeliest there.
@@ -118,18 +151,23 @@ pub fn misfits(
     known: Known,
     settings: &Settings,
     progress: &Progress,
-) -> Result<([f64; 2], usize), Halt> {
+) -> Result<Misfits, Halt> {
     let mut first_of_second = vec![0; second_of_first.len()];
     (0..).zip(second_of_first).for_each(|(ray, &there): (u32, &u32)| first_of_second[there as usize] = ray);
-    let mut first = sample::places(scenes[0], CALIBRATION_RAYS.0, settings.viability.max_range_m);
+    let mut first = few_places(scenes[0], settings);
+    let all = first.len();
     first.retain(|&ray| scenes[0].ray(ray).is_usable() && scenes[1].ray(second_of_first[ray as usize]).is_usable());
     let second = renamed(&first, second_of_first);
     let of = |scene, rays| Sample { scene, rays, known, settings: wider(settings), progress };
     let samples = [of(scenes[0], &first), of(scenes[1], &second)];
     // Side by side: samples are so small that threads wait for each other within each of them.
-    let sought = |here: usize| Likeliest::of_starts(&samples[here], guess)?.with_sides(&samples[here]);
-    let (first_found, second_found) = rayon::join(|| sought(0), || sought(1));
-    let found = [first_found?.best, second_found?.best];
+    let seek = |here: usize| -> Result<(Option<Sought>, Likeliest), Halt> {
+        let likeliest = Likeliest::of_starts(&samples[here], guess)?;
+        Ok((likeliest.sought(), likeliest.with_sides(&samples[here])?))
+    };
+    let (first_found, second_found) = rayon::join(|| seek(0), || seek(1));
+    let ((of_first, first_found), (_, second_found)) = (first_found?, second_found?);
+    let found = [first_found.best, second_found.best];
     let least = |here: usize, numbers: &[u32]| -> Result<f64, Halt> {
         let [Some(own), Some(other)] = [&found[here], &found[1 - here]] else { return Ok(f64::INFINITY) };
         let rename = |(votes, point): &Placed| (renamed(votes, numbers), *point);
@@ -137,8 +175,9 @@ pub fn misfits(
         let noise = samples[here].noise_of(&other.noise, &map);
         Ok(own.value.min(samples[here].round_from(&noise, map)?.value))
     };
-    let (of_first, of_second) = rayon::join(|| least(0, &first_of_second), || least(1, second_of_first));
-    Ok(([of_first?, of_second?], first.len()))
+    let (least_first, least_second) = rayon::join(|| least(0, &first_of_second), || least(1, second_of_first));
+    let of_first = of_first.filter(|_| first.len() == all);
+    Ok(Misfits { values: [least_first?, least_second?], rays: first.len(), of_first })
 }
 
 /// Rays by other numbers, ascending.
@@ -337,8 +376,8 @@ impl Likeliest {
         Ok(self)
     }
 
-    fn noise(&self) -> Option<Noise> {
-        self.best.as_ref().map(|best| best.noise)
+    fn sought(&self) -> Option<Sought> {
+        self.best.as_ref().map(|best| Sought { noise: best.noise, starts: self.starts })
     }
 }
 

@@ -29,7 +29,7 @@ use crate::robust::scene::{Scene, sample};
 use crate::robust::search::{Depth, Tally, few, search};
 use crate::robust::settings::Settings;
 use depth::all_moves_pay;
-use likeliest::likeliest_noise;
+use likeliest::{Sought, few_places, likeliest_noise, noise_of_more};
 
 /// Rays of the places that the noise is estimated from, about: from each start, and from the best in the end.
 const CALIBRATION_RAYS: (usize, usize) = (4_000, 10_000);
@@ -62,7 +62,8 @@ pub struct Calibration {
 }
 
 /// Estimate the noise from the data, starting from a guess: labels of a sample of places with the noise as it is thought
-/// to be, then the noise that makes their residuals most likely, and again. `known` parts stay as they are. Then learn the classes.
+/// to be, then the noise that makes their residuals most likely, and again. `known` parts stay as they are; what was `sought` from all starts when
+/// [poses were compared](likeliest::misfits) is not sought again. Then learn the classes.
 /// All moves pay where a scene is small; if it `is_part` of a larger one, where they change the map of a sample.
 ///
 /// # Errors
@@ -73,12 +74,21 @@ pub fn self_calibrate(
     known: Known,
     settings: &Settings,
     is_part: bool,
+    sought: Option<Sought>,
     progress: &Progress,
 ) -> Result<Calibration, Halt> {
-    let more = sample::places(scene, CALIBRATION_RAYS.1, settings.viability.max_range_m);
     let is_known = known.detection && known.position && known.rotation;
-    let (noise, starts) =
-        if is_known { (*guess, 0) } else { likeliest_noise(scene, guess, known, settings, &more, progress)? };
+    let Sought { noise, starts } = if is_known {
+        Sought { noise: *guess, starts: 0 }
+    } else {
+        let few = few_places(scene, settings);
+        let more = sample::places(scene, CALIBRATION_RAYS.1, settings.viability.max_range_m);
+        let of_few = sought.map_or_else(|| likeliest_noise(scene, guess, known, settings, &few, progress), Ok)?;
+        let is_all = more.len() == few.len();
+        let noise =
+            if is_all { of_few.noise } else { noise_of_more(scene, of_few.noise, known, settings, &more, progress)? };
+        Sought { noise, ..of_few }
+    };
     let mut model = Model::new(scene, &noise, settings);
     let wide = sample::places(scene, CLASS_RAYS, WIDE * settings.viability.max_range_m);
     let objects = learn_from(&mut model, &wide, progress)?;
