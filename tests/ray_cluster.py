@@ -24,6 +24,7 @@ from valuemap.config import DetectConfig, MapConfig
 from valuemap.dataset import Dataset
 from valuemap.detect import BUNDLED_MODEL, shards
 from valuemap.detect.run import RECORD, detect_dataset
+from valuemap.engine import ray as ray_engine
 from valuemap.engine.engine import Engine, Work
 from valuemap.engine.ray import RayEngine, import_ray
 from valuemap.engine.threads import ThreadEngine
@@ -35,8 +36,9 @@ from valuemap.refine import Refined
 from valuemap.tiles.compare import Comparison
 from valuemap.tiles.work import open_work
 
-# Nodes of a busy machine take longer to begin than Ray waits.
-os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "a" * 64, "RAY_raylet_start_wait_time_s": "120"}
+# Nodes of a busy machine take longer to begin than Ray waits. One that is gone is asked for its health five times.
+os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "a" * 64}
+os.environ |= {"RAY_raylet_start_wait_time_s": "120", "RAY_health_check_period_ms": "500"}
 ray = import_ray()
 
 T = TypeVar("T")
@@ -74,7 +76,10 @@ def dies(path: str, _progress: Progress) -> int:
     return 1
 
 
-def always_dies(_number: int, _progress: Progress) -> int:
+def always_dies(path: str, _progress: Progress) -> int:
+    """Leave a mark, then end the worker with SIGKILL."""
+    with Path(path).open("a", encoding="utf-8") as file:
+        file.write("+")
     os.kill(os.getpid(), signal.SIGKILL)
     return 0
 
@@ -89,6 +94,17 @@ def error_of(run: Callable[[], object]) -> ValuemapError:
     except ValuemapError as error:
         return error
     raise AssertionError("nothing went wrong")
+
+
+def is_lost(marks: Path, engine: Engine, *, on_gpus: bool) -> None:
+    """Run a task that ends its worker whenever it is tried, with one retry: each needs a worker of its own."""
+    retries = ray_engine.RETRIES
+    setattr(ray_engine, "RETRIES", 1)  # noqa: B010
+    error = error_of(lambda: list(engine.run(always_dies, [str(marks)], on_gpus=on_gpus)))
+    setattr(ray_engine, "RETRIES", retries)  # noqa: B010
+    assert isinstance(error, ClusterError), error
+    assert str(error).startswith("task 0 was lost 2 times"), error
+    assert marks.read_text(encoding="utf-8") == "++"
 
 
 class InOrder(RayEngine):
@@ -140,8 +156,7 @@ def gpus_stay(folder: Path, engine: Engine) -> None:
     assert len({pid for _, pid in engine.run(same_process, range(5), on_gpus=True)}) == 1
     assert list(engine.run(dies, [str(folder / "gpu")], on_gpus=True)) == [(0, 1)]
     assert str(error_of(lambda: list(engine.run(fails, range(6), on_gpus=True)))) == "the fourth cannot be"
-    error = error_of(lambda: list(engine.run(always_dies, range(1), on_gpus=True)))
-    assert str(error).startswith("task 0 was lost 4 times"), error
+    is_lost(folder / "lost-gpu", engine, on_gpus=True)
 
 
 def tell(folder: Path, what: str) -> None:
@@ -173,9 +188,7 @@ def main(folder: Path) -> None:
     assert sorted(engine.run(dies, [str(folder / f"dead-{i}") for i in range(3)])) == [(0, 1), (1, 1), (2, 1)]
     tell(folder, "workers killed")
     assert str(error_of(lambda: list(engine.run(fails, range(6))))) == "the fourth cannot be"
-    error = error_of(lambda: list(engine.run(always_dies, range(1))))
-    assert isinstance(error, ClusterError), error
-    assert str(error).startswith("task 0 was lost 4 times"), error
+    is_lost(folder / "lost", engine, on_gpus=False)
     tell(folder, "failures told")
     gpus_stay(folder, engine)
     tell(folder, "GPUs stay")
