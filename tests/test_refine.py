@@ -262,12 +262,11 @@ def test_the_map_that_tells_votes_is_of_the_images_that_poses_are_estimated_with
 
 def test_a_map_tells_better_than_what_single_drives_see_how_drives_lie_to_each_other() -> None:
     # Of two lights beside each other a drive alone does not know which another one saw.
-    of_fewer = dataclasses.replace(CITY, **FEWER_IMAGES)
-    faulty, clean = (simulate(dataclasses.replace(of_fewer, pass_shift_m=m), seed=7) for m in (1.5, 0.0))
+    of_fewest = dataclasses.replace(CITY, **FEWEST_IMAGES)
+    faulty, clean = (simulate(dataclasses.replace(of_fewest, pass_shift_m=m), seed=7) for m in (1.5, 0.0))
     at_first = refine_poses(faulty, valuemap.MapConfig())
-    at_last = valuemap.build_map(faulty).corrected
-    assert at_last is not None
-    assert errors(at_last, clean)[0] < min(0.25, 0.75 * errors(at_first.dataset, clean)[0])
+    at_last = correction.correct_poses(faulty, valuemap.MapConfig(), Stages(), 1, silent)
+    assert errors(at_last.dataset, clean)[0] < min(0.25, 0.75 * errors(at_first.dataset, clean)[0])
 
 
 def test_a_map_proves_what_single_drives_leave_in_doubt() -> None:
@@ -452,7 +451,7 @@ def test_poses_that_stay_are_mapped_once(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
 
 def test_a_map_without_objects_says_nothing_of_images() -> None:
-    dashcam = city(**FEWEST_IMAGES, **DASHCAM)
+    dashcam = city(lights=12, **FEWEST_IMAGES, **DASHCAM)
     assert refine_poses(dashcam, MapConfig()).is_noisy
     result = valuemap.build_map(dashcam, MapConfig().with_settings(["min_votes=5000"]))
     assert (len(result.labels), result.run["poses"]["found"]) == (0, "nothing")
@@ -460,7 +459,7 @@ def test_a_map_without_objects_says_nothing_of_images() -> None:
 
 def test_one_object_has_no_other_half(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refine_images, "halves", lambda points: np.zeros(len(points), np.int64))
-    assert not correction._by_images(city(**FEWEST_IMAGES, **DASHCAM), MapConfig(), 1, silent).is_corrected
+    assert not correction._by_images(city(lights=12, **FEWEST_IMAGES, **DASHCAM), MapConfig(), 1, silent).is_corrected
 
 
 def test_a_part_of_many_objects_says_whether_images_are_off() -> None:
