@@ -10,7 +10,7 @@
 #[cfg(test)]
 extern crate self as valuemap_core;
 #[cfg(test)]
-#[path = "../tests/street/mod.rs"]
+#[path = "../tests/core/street.rs"]
 mod street;
 
 pub mod drives;

@@ -1,7 +1,4 @@
 //! The energy J and the search for the map with the least of it, on small random streets.
-#![allow(clippy::unwrap_used, clippy::expect_used, missing_docs)]
-
-mod street;
 
 use std::collections::BTreeSet;
 use std::f64::consts::FRAC_PI_2;
@@ -30,7 +27,7 @@ use valuemap_core::robust::search::{Depth, search};
 use valuemap_core::robust::settings::Settings;
 use valuemap_core::viability::Viability;
 
-use street::{FOCAL_PX, GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, joined, moved, object, street};
+use crate::street::{FOCAL_PX, GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, joined, moved, object, street};
 
 /// What the streets' errors are.
 const DRIFTING: Noise = Noise { position_drift_m: 0.05, rotation_drift_rad: 5e-4, ..NOISE };

@@ -4,15 +4,13 @@
 //! infinities, which `benchmarks/fuzz.py` tries from Python. No case may panic, and what comes out is finite and in its bounds.
 //!
 //! `VALUEMAP_FUZZ_CASES=N` sets the cases of each test, `VALUEMAP_FUZZ_SEED=N` which.
-#![allow(clippy::unwrap_used, clippy::expect_used, missing_docs)]
-
-mod street;
 
 use std::env::var;
 use std::fmt::Debug;
 use std::str::FromStr;
 use std::sync::{Arc, LazyLock};
 
+use crate::street;
 use nalgebra::{Matrix3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;

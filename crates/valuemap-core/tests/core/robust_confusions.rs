@@ -1,7 +1,4 @@
 //! A detector that takes what is of one class for another one.
-#![allow(clippy::unwrap_used, missing_docs)]
-
-mod street;
 
 use std::sync::Arc;
 
@@ -15,7 +12,7 @@ use valuemap_core::robust::noise::Known;
 use valuemap_core::robust::scene::Scene;
 use valuemap_core::robust::settings::Settings;
 
-use street::{NOISE, SETTINGS, joined, street};
+use crate::street::{NOISE, SETTINGS, joined, street};
 
 /// Twenty lights on the left and twenty signs on the right, and their classes.
 fn objects() -> Vec<(Vector3<f64>, u32)> {

@@ -1,7 +1,4 @@
 //! How the robust method finds candidates, against the same thing done the slow way, on random streets.
-#![allow(clippy::unwrap_used, clippy::expect_used, missing_docs)]
-
-mod street;
 
 use std::collections::BTreeMap;
 use std::collections::BTreeSet;
@@ -27,7 +24,7 @@ use valuemap_core::robust::search::quick::quick_estimate;
 use valuemap_core::robust::settings::Settings;
 use valuemap_core::viability::Viability;
 
-use street::{GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, joined, object, street};
+use crate::street::{GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, joined, object, street};
 
 proptest! {
     #![proptest_config(config())]

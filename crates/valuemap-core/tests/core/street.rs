@@ -1,5 +1,5 @@
 //! Random streets, and what the tests on them share.
-#![allow(dead_code, missing_docs, clippy::unwrap_used)] // Each test uses a part of it.
+#![allow(dead_code, missing_docs, clippy::unwrap_used)] // The tests within the core use a part of it.
 
 use std::sync::Arc;
 

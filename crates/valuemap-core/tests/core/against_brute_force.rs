@@ -1,5 +1,4 @@
 //! The fast paths of the core against the same thing done the slow way, on random scenes.
-#![allow(clippy::unwrap_used, clippy::expect_used, missing_docs)]
 
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use proptest::collection::vec;

@@ -1,7 +1,4 @@
 //! Things of which each side shows another middle, seen by drives from both ends of a street.
-#![allow(clippy::unwrap_used, clippy::expect_used, missing_docs)]
-
-mod street;
 
 use std::f64::consts::PI;
 
@@ -12,7 +9,7 @@ use valuemap_core::robust::model::Model;
 use valuemap_core::robust::noise::Noise;
 use valuemap_core::robust::scene::Scene;
 
-use street::{NOISE, SETTINGS, joined, moved, street};
+use crate::street::{NOISE, SETTINGS, joined, moved, street};
 
 const SIDE_M: f64 = 0.3;
 /// Poses that are known well, and sides that differ.

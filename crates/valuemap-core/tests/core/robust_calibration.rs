@@ -1,13 +1,9 @@
 //! The noise is sought from starts that differ, but from none so large that it cannot be likelier.
 
-#![allow(clippy::unwrap_used)]
-
-mod street;
-
 use std::sync::Arc;
 
+use crate::street::{self, NOISE, SETTINGS, joined, moved, street};
 use nalgebra::{Isometry3, Rotation3, Vector3};
-use street::{NOISE, SETTINGS, joined, moved, street};
 use valuemap_core::progress::Progress;
 use valuemap_core::robust::calibrate::likeliest::{Sought, misfits};
 use valuemap_core::robust::calibrate::residuals::calibrate;

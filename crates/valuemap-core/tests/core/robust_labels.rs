@@ -1,7 +1,4 @@
 //! Labels of a part of the images, and votes that might be a neighbor's, on random streets.
-#![allow(clippy::unwrap_used, clippy::expect_used, missing_docs)]
-
-mod street;
 
 use std::collections::BTreeSet;
 use std::f64::consts::FRAC_PI_2;
@@ -24,7 +21,7 @@ use valuemap_core::robust::noise::index::RayIndex;
 use valuemap_core::robust::noise::spreads_of;
 use valuemap_core::robust::scene::{Scene, View};
 
-use street::{GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, joined, moved, object, street};
+use crate::street::{GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, joined, moved, object, street};
 
 const DRIFTING: Noise = Noise { position_drift_m: 0.05, rotation_drift_rad: 5e-4, ..NOISE };
 
