@@ -20,7 +20,7 @@ import pycolmap
 
 from machine import write_record
 from valuemap.cameras import colmap_camera
-from valuemap.config import SimulationConfig
+from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import Dataset
 from valuemap.pipeline import build_map
 from valuemap.simulate import PRESETS, simulate
@@ -66,10 +66,10 @@ def cameras_like(dataset: Dataset) -> dict[str, tuple[str, tuple[int, int], list
     }
 
 
-def distances_m(dataset: Dataset) -> tuple[Floats, int, int]:
+def distances_m(dataset: Dataset, config: MapConfig | None = None) -> tuple[Floats, int, int]:
     """Return the distance of each true object that has a label within 1 m to it, all objects, and labels of none."""
     assert dataset.truth is not None
-    truth, labels = dataset.truth.position_in_world_m, build_map(dataset).labels.position_in_world_m
+    truth, labels = dataset.truth.position_in_world_m, build_map(dataset, config).labels.position_in_world_m
     away = np.linalg.norm(labels[:, None] - truth[None], axis=2)
     nearest = away.min(axis=0, initial=np.inf)
     return nearest[nearest < MATCH_M], len(truth), int((away.min(axis=1, initial=np.inf) >= MATCH_M).sum())

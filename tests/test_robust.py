@@ -23,6 +23,8 @@ from valuemap.simulate import simulate
 from valuemap.tables import Categories
 
 INTRINSICS = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+POSES_AS_THEY_ARE = MapConfig().with_settings(["correct_poses=0"])
+"""Of cities where nothing is found that poses are off by: their maps are the same, and made in half the time."""
 ALONG_X = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
@@ -72,7 +74,7 @@ def test_what_seems_one_light_is_two_where_both_together_are_likelier() -> None:
     )
     dataset = simulate(config, seed=1)
     # One of them is seen by hardly more than one pass, as what stands there for a day is.
-    config_of_map = MapConfig().with_settings(["min_existence=0.1"])
+    config_of_map = POSES_AS_THEY_ARE.with_settings(["min_existence=0.1"])
     result = valuemap.evaluate_map(valuemap.build_map(dataset, config_of_map), dataset)
     assert (result.recall, result.precision) == (1.0, 1.0)
 
@@ -138,12 +140,12 @@ def test_the_class_with_most_votes_has_the_place_and_others_do_not_vote() -> Non
 
 
 def test_a_detector_that_confuses_classes_makes_hardly_a_label_more() -> None:
-    city = block(passes_per_street=3, lookalikes_per_light=0.0, sign_row_spacing_m=20.0, class_confusion=0.15)
+    city = block(lookalikes_per_light=0.0, sign_row_spacing_m=30.0, class_confusion=0.15)
     dataset = simulate(city, seed=5, name="block")
-    result = valuemap.build_map(dataset)
+    result = valuemap.build_map(dataset, POSES_AS_THEY_ARE)
     score = valuemap.evaluate_map(result, dataset)
     assert score.recall > 0.9
-    assert score.precision > 0.9  # 0.6 where each class is for itself.
+    assert score.precision > 0.9  # 0.7 where each class is for itself.
     confusions = result.run["calibration"]["confusions"]
     assert confusions["traffic_sign"]["traffic_light"] == pytest.approx(0.15, abs=0.05)
     # Twelve lights are too few to tell: they are confused like all objects.
@@ -160,7 +162,7 @@ def test_a_detector_that_confuses_classes_makes_hardly_a_label_more() -> None:
 @pytest.fixture(scope="module")
 def driven_block() -> tuple[Dataset, valuemap.Map]:
     dataset = simulate(block(passes_per_street=4, lookalikes_per_light=0.0), seed=5, name="block")
-    return dataset, valuemap.build_map(dataset)
+    return dataset, valuemap.build_map(dataset, POSES_AS_THEY_ARE)
 
 
 def test_it_beats_the_paper_on_a_city_with_pose_noise(driven_block: tuple[Dataset, valuemap.Map]) -> None:
