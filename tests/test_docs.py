@@ -223,8 +223,9 @@ def write_colmap_model(dataset: Dataset, folder: Path) -> None:
 def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with what the tutorials say that the reader has, which it goes to."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(PRESETS, "small", block())
-    city = simulate(block(), seed=0)
+    few = block(frame_spacing_m=4.0, standing_interval_s=2.0)
+    monkeypatch.setitem(PRESETS, "small", few)
+    city = simulate(few, seed=0)
     write_colmap_model(city, tmp_path / "model")
     names = dict(zip(city.images.image_id.tolist(), city.images.name.to_pylist(), strict=True))
     found = city.detections
