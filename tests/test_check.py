@@ -447,7 +447,7 @@ def test_pitch_and_roll_of_a_phone_are_not_given_up(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_camera_that_looks_too_low_is_not_upside_down(monkeypatch: pytest.MonkeyPatch) -> None:
-    given = good_city(300)
+    given = good_city(300, passes_per_street=2)
     rotation = Rotation.from_euler("x", 4.0, degrees=True).as_matrix() @ rotation_matrices(given.images)
     low = with_poses(given, rotation, camera_centers(given.images))
     verdict = hold_contest(View(low), CONVENTIONS)
