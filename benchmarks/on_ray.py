@@ -53,7 +53,7 @@ def main() -> int:
             results = {"map": compare_maps(city, folder, on_ray)}
             results["detect"] = compare_detections(folder, options.pictures, on_ray)
         finally:
-            cluster.shutdown()  # type: ignore[no-untyped-call]
+            cluster.shutdown()
     print(json.dumps(results, indent=2))
     keep_record(
         options.json,

@@ -206,7 +206,7 @@ def main(folder: Path) -> None:
     assert killed
     tell(folder, "node killed")
     ray.shutdown()
-    cluster.shutdown()  # type: ignore[no-untyped-call]
+    cluster.shutdown()
 
 
 if __name__ == "__main__":
