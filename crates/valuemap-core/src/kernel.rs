@@ -126,6 +126,20 @@ impl Gates {
         self.test_on(Arch::new(), points, maybe, sure);
     }
 
+    /// The first of the two answers alone: no point that is inside is missing.
+    ///
+    /// `maybe` has `points.len() * self.words()` words and is overwritten, point after point.
+    ///
+    /// # Panics
+    /// If `maybe` has another length.
+    pub fn test_maybe(&self, points: &[Vector3<f64>], maybe: &mut [u64]) {
+        assert_eq!(maybe.len(), points.len() * self.words(), "one word of maybe for each point and block");
+        if !maybe.is_empty() {
+            let margins = self.margins(points);
+            Arch::new().dispatch(Pass { gates: self, points, margins, maybe, sure: &mut [] });
+        }
+    }
+
     /// [`Gates::test`] with given instructions, to compare them.
     ///
     /// # Panics
@@ -169,6 +183,7 @@ struct Pass<'a> {
     points: &'a [Vector3<f64>],
     margins: Margins,
     maybe: &'a mut [u64],
+    /// As long, or empty: then it is not asked.
     sure: &'a mut [u64],
 }
 
@@ -186,25 +201,36 @@ impl WithSimd for Pass<'_> {
 impl Pass<'_> {
     #[inline(always)]
     fn run<const FUSED: bool>(self) {
-        let words = self.gates.words();
-        let answers = self.maybe.chunks_mut(TILE * words).zip(self.sure.chunks_mut(TILE * words));
-        for (points, (maybe, sure)) in self.points.chunks(TILE).zip(answers) {
-            for (word, (block, used)) in self.gates.blocks.iter().zip(&self.gates.used).enumerate() {
+        let Self { gates, points, margins, maybe, sure } = self;
+        let words = gates.words();
+        let is_sure_asked = !sure.is_empty();
+        for (tile, points) in points.chunks(TILE).enumerate() {
+            for (word, (block, used)) in gates.blocks.iter().zip(&gates.used).enumerate() {
                 let groups = (u64::BITS - used.leading_zeros()).div_ceil(GROUP as u32) as usize;
                 for (i, point) in points.iter().enumerate() {
                     let x = [point.x as f32, point.y as f32, point.z as f32];
-                    let at = i * words + word;
-                    let (may, must) = test_block::<FUSED>(block, groups, x, self.margins);
-                    (maybe[at], sure[at]) = (may & used, must & used);
+                    let at = (tile * TILE + i) * words + word;
+                    if is_sure_asked {
+                        let (may, must) = test_block::<FUSED, true>(block, groups, x, margins);
+                        (maybe[at], sure[at]) = (may & used, must & used);
+                    } else {
+                        maybe[at] = test_block::<FUSED, false>(block, groups, x, margins).0 & used;
+                    }
                 }
             }
         }
     }
 }
 
-/// The answers of the first groups of lanes of one block, as bits. Plain loops over lanes, which compile to vector instructions.
+/// The answers of the first groups of lanes of one block, as bits; the second one where it is asked. Plain loops over lanes, which compile to vector
+/// instructions.
 #[inline(always)]
-fn test_block<const FUSED: bool>(block: &Block, groups: usize, x: [f32; 3], margins: Margins) -> (u64, u64) {
+fn test_block<const FUSED: bool, const SURE: bool>(
+    block: &Block,
+    groups: usize,
+    x: [f32; 3],
+    margins: Margins,
+) -> (u64, u64) {
     let mut maybe = [[0_u8; GROUP]; LANES / GROUP];
     let mut sure = [[0_u8; GROUP]; LANES / GROUP];
     for (group, (maybe, sure)) in maybe.iter_mut().zip(&mut sure).take(groups).enumerate() {
@@ -221,11 +247,13 @@ fn test_block<const FUSED: bool>(block: &Block, groups: usize, x: [f32; 3], marg
             let c2 = multiply_add::<FUSED>(c, c, m[FLOOR][lane]);
             maybe[lane] =
                 u8::from(error2 < multiply_add::<FUSED>(c2, 1.0 + BAND, margins.maybe)) & u8::from(c > -margins.depth);
-            sure[lane] =
-                u8::from(error2 < multiply_add::<FUSED>(c2, 1.0 - BAND, -margins.sure)) & u8::from(c > margins.depth);
+            if SURE {
+                sure[lane] = u8::from(error2 < multiply_add::<FUSED>(c2, 1.0 - BAND, -margins.sure))
+                    & u8::from(c > margins.depth);
+            }
         }
     }
-    (bits(maybe.as_flattened()), bits(sure.as_flattened()))
+    (bits(maybe.as_flattened()), if SURE { bits(sure.as_flattened()) } else { 0 })
 }
 
 #[inline(always)]

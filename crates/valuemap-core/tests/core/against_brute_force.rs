@@ -110,6 +110,10 @@ proptest! {
                 prop_assert_eq!(idle.filter(|&lane| bit(&maybe, lane)).count(), 0, "{}", name);
             }
         }
+        let [mut maybe, mut sure, mut alone] = [0, 0, u64::MAX].map(|word| vec![word; points.len() * gates.words()]);
+        gates.test(&points, &mut maybe, &mut sure);
+        gates.test_maybe(&points, &mut alone);
+        prop_assert_eq!(alone, maybe);
     }
 
     #[test]

@@ -109,7 +109,7 @@ impl<'a> RayIndex<'a> {
         let mut hits = Vec::new();
         let mut near_points = Vec::with_capacity(points.len());
         let mut around = Vec::with_capacity(points.len());
-        let (mut maybe, mut sure) = (Vec::new(), Vec::new());
+        let mut maybe = Vec::new();
         for near in self.tree.locate_within_distance(middle.into(), reach * reach) {
             let place = &self.places[near.data];
             near_points.clear();
@@ -120,8 +120,7 @@ impl<'a> RayIndex<'a> {
             around.extend(near_points.iter().map(|point| point - place.origin));
             let words = place.gates.words();
             maybe.resize(words * around.len(), 0);
-            sure.resize(words * around.len(), 0);
-            place.gates.test(&around, &mut maybe, &mut sure);
+            place.gates.test_maybe(&around, &mut maybe);
             for word in 0..words {
                 let bits_of = |point: usize| maybe[point * words + word];
                 let any = (0..around.len()).fold(0, |any, point| any | bits_of(point));

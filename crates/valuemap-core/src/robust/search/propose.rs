@@ -223,8 +223,8 @@ impl<'a> Neighborhood<'a> {
         let meetings = self.meetings(&own);
         let points: Vec<Vector3<f64>> = meetings.iter().map(|meeting| meeting.point).collect();
         let words = self.gates.words();
-        let (mut maybe, mut sure) = (vec![0; points.len() * words], vec![0; points.len() * words]);
-        self.gates.test(&points, &mut maybe, &mut sure);
+        let mut maybe = vec![0; points.len() * words];
+        self.gates.test_maybe(&points, &mut maybe);
         let votes_for = self.model.votes_for(own.class);
         let mut best: Option<(f64, usize)> = None;
         let mut gains = Vec::with_capacity(self.images.len());
