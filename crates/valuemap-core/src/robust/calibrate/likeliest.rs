@@ -432,7 +432,7 @@ mod tests {
         Sample { scene, rays, known: Known::default(), settings: wider(&street::SETTINGS), progress }
     }
 
-    fn misfits_of(scenes: [&Scene; 2], second_of_first: &[u32]) -> Result<([f64; 2], usize), Halt> {
+    fn misfits_of(scenes: [&Scene; 2], second_of_first: &[u32]) -> Result<Misfits, Halt> {
         let (known, progress) = (Known::default(), Progress::default());
         misfits(scenes, second_of_first, &street::NOISE, known, &street::SETTINGS, &progress)
     }
@@ -447,7 +447,7 @@ mod tests {
         let mut scene = eight_in_a_street();
         std::sync::Arc::make_mut(&mut scene.rays).rays[7].residual_from_world.fill(f64::NAN);
         let same: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
-        let ([one, other], rays) = misfits_of([&scene, &scene], &same)?;
+        let Misfits { values: [one, other], rays, .. } = misfits_of([&scene, &scene], &same)?;
         assert!(one.is_finite() && rays == scene.usable_rays().len(), "{one} {rays}");
         assert_eq!(one.to_bits(), other.to_bits());
         Ok(())
@@ -464,7 +464,7 @@ mod tests {
         let of_drive = rays.len() as u32 / 4;
         let second_of_first: Vec<u32> =
             rays.iter().map(|ray| (3 - ray / of_drive) * of_drive + ray % of_drive).collect();
-        let [offered, there] = misfits_of([&first, &second], &second_of_first)?.0;
+        let [offered, there] = misfits_of([&first, &second], &second_of_first)?.values;
         assert!(there < offered && offered < alone - 20.0, "{there} {offered} {alone}");
         Ok(())
     }
@@ -485,7 +485,7 @@ mod tests {
         let same: Vec<u32> = (0..right.rays.rays.len() as u32).collect();
         let scenes = [&right, &wrong];
         let (known, progress) = (Known::default(), Progress::default());
-        let ([right, wrong], _) = misfits(scenes, &same, &street::NOISE, known, &settings, &progress)?;
+        let [right, wrong] = misfits(scenes, &same, &street::NOISE, known, &settings, &progress)?.values;
         assert!(right < wrong, "{right} {wrong}");
         Ok(())
     }
