@@ -23,6 +23,7 @@ from valuemap.check.agreement import Agreement, compare, gains_of_objects, measu
 from valuemap.check.boxes import PictureSize, _chance_of_gap, _Ends, _OfSquare, picture_sizes, rows_in_images
 from valuemap.check.cameras import PARAMETERS, _followed, _is_wider_gate_only, with_focal
 from valuemap.check.contest import _compare, _joined, _Reading, _suspicion, hold_contest
+from valuemap.check.examine import _look
 from valuemap.check.fault import (
     LEAST_CHANCE,
     Convention,
@@ -58,6 +59,7 @@ from valuemap.check.sizes import are_outside, object_heights
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, read_dataset, write_dataset
 from valuemap.errors import InputError
+from valuemap.progress import silent
 from valuemap.simulate import PRESETS, simulate
 from valuemap.tables import Categories, Floats
 
@@ -937,6 +939,16 @@ def test_a_camera_that_sees_little_is_turned_by_what_the_others_see(
     assert np.degrees(Rotation.from_matrix(off).magnitude()).max() < 0.5
     monkeypatch.setattr(cameras, "_estimates_by_others", lambda *_: [])
     assert cameras._find_of_one_group(View(spoiled)) is None
+
+
+def test_a_camera_that_no_other_pass_has_is_told_from_the_height_of_its_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it sees is as much lower where it looks higher than its poses say, as far away as most of it is."""
+    city = good_city(2, passes_per_street=3)
+    tilted, low = (of_camera(city, each, 1) for each in (turned_by(city, "x", 3.0), lowered(city)))
+    assert [(found.fault, found.of) for found in _look(View(tilted), "fine", silent)] == [("camera_tilt", "camera 1")]
+    assert [(found.fault, found.of) for found in _look(View(low), "fine", silent)] == [("camera_height", None)]
+    monkeypatch.setattr(cameras.CameraHeight, "rivals", frozenset())
+    assert [found.fault for found in _look(View(tilted), "fine", silent)] == ["camera_height"]
 
 
 def test_a_camera_that_is_too_low_is_named_and_the_others_stay(few_rig: Dataset) -> None:

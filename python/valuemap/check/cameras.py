@@ -33,7 +33,7 @@ from valuemap.check.fit import Estimate, Motion, Parameter, estimate
 from valuemap.check.groups import Group, OfGroup, groups_of
 from valuemap.check.lenses import Focal, focals, with_params
 from valuemap.check.loose import Correction, loose_of
-from valuemap.check.passes import find_height_of_pass, moved_along, seen_m
+from valuemap.check.passes import OF_ITS_CAMERA, find_height_of_pass, moved_along, seen_m
 from valuemap.check.sample import pixels_per_radian
 from valuemap.dataset import Dataset
 from valuemap.tables import Floats
@@ -405,6 +405,7 @@ class CameraHeight(_CommonError):
     """Cameras of a pass, or one of several on a car, that are at another height than their poses say."""
 
     name: ClassVar[str] = "camera_height"
+    rivals: ClassVar[frozenset[str]] = OF_ITS_CAMERA
     parameters: ClassVar[tuple[str, ...]] = ("up",)
     completes: ClassVar[frozenset[str]] = frozenset({"camera_height"})
     do: ClassVar[str] = "Correct the position of the camera on the car."

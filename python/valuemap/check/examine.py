@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from valuemap.check.contest import find_odd_group, hold_contest
-from valuemap.check.fault import STAGES, Finding, Fix, View
+from valuemap.check.fault import STAGES, Fault, Finding, Fix, View, gains_of_all
 from valuemap.check.prospects import describe_prospects
 from valuemap.check.registry import CONVENTIONS, FAULTS
 from valuemap.dataset import Dataset
@@ -131,12 +131,25 @@ def _look(view: View, stage: str, progress: Progress) -> list[Finding]:
         if fault.explained_by & (view.known | {finding.fault for finding in found}):
             continue
         finding = fault.find(view)
+        if finding is not None and finding.fix is not None and fault.rivals:
+            finding = _best_of(view, finding, [each for each in faults if each.name in fault.rivals])
         if finding is not None and not (finding.fix is None and finding.fault in view.known):
             found.append(finding)
             if finding.fix is not None:
                 break
     progress(_WORK[stage], len(faults), len(faults))
     return found
+
+
+def _best_of(view: View, finding: Finding, rivals: Sequence[Fault]) -> Finding:
+    """Return the finding, or that of a rival whose fix lets all rays agree better."""
+    others = [other for rival in rivals if (other := rival.find(view)) is not None and other.fix is not None]
+
+    def agreement(of: Finding) -> float:
+        assert of.fix is not None
+        return float(gains_of_all(view, of.fix(view.dataset)).sum())
+
+    return max([finding, *others], key=agreement) if others else finding
 
 
 _WORK = {

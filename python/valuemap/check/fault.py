@@ -202,6 +202,8 @@ class Fault(ABC):
     """Faults that look like this one too: where one of them was found, this one is not looked for."""
     completes: ClassVar[frozenset[str]] = frozenset()
     """Faults whose fix leaves a rest that this one measures: after them it is put right, and no finding of its own."""
+    rivals: ClassVar[frozenset[str]] = frozenset()
+    """Faults that move what is seen about as this one does: the one whose fix lets all rays agree best is there."""
 
     @abstractmethod
     def find(self, view: View) -> Finding | None:

@@ -163,11 +163,16 @@ class PassShift:
     seam: Seam | None = None
 
 
+OF_ITS_CAMERA = frozenset({"focal_length", "camera_tilt", "camera_yaw"})
+"""Errors of a camera that no other pass has put what its pass sees elsewhere, as far away as most of it is."""
+
+
 class PassOffset(Fault):
     """A pass that is off by some metres."""
 
     name: ClassVar[str] = "pass_offset"
     stage: ClassVar[Stage] = "fine"
+    rivals: ClassVar[frozenset[str]] = OF_ITS_CAMERA
 
     def find(self, view: View) -> Finding | None:
         """Take the offset of the pass that is farthest from good."""
@@ -185,6 +190,7 @@ class PassTimeShift(Fault):
 
     name: ClassVar[str] = "pass_time_shift"
     stage: ClassVar[Stage] = "fine"
+    rivals: ClassVar[frozenset[str]] = OF_ITS_CAMERA
 
     def find(self, view: View) -> Finding | None:
         """Take the shift along the drive of the pass that is farthest from good."""
