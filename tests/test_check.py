@@ -858,6 +858,23 @@ def test_one_camera_upside_down_is_named_alone_and_undone(few: Dataset, monkeypa
     assert contest.find_odd_group(View(spoiled), CONVENTIONS) is None
 
 
+def test_rays_of_a_camera_that_agree_by_chance_alone_do_not_hide_what_is_wrong_with_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """More than half of how well they agree is chance here: they agree more than half as well as those of the other."""
+    city = good_city(4, passes_per_street=4)
+    spoiled = View(of_camera(city, INJECTED["quaternion_order"].spoil(city), 1))
+    found = contest.find_odd_group(spoiled, CONVENTIONS)
+    assert found is not None
+    assert (found.fault, found.of) == ("quaternion_order", "camera 1")
+
+    def with_chance(view: View) -> float:
+        return float(view.agreement.gain.sum()) / view.agreement.detections
+
+    monkeypatch.setattr(contest, "_worth_of", with_chance)
+    assert contest.find_odd_group(spoiled, CONVENTIONS) is None
+
+
 def test_what_leaves_rays_of_a_group_in_disagreement_is_not_what_is_wrong_with_it(
     few: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:

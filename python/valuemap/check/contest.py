@@ -40,7 +40,7 @@ _FROM_RAYS = 0.05
 _SUSPICIOUS = 0.05
 """What good data would give with a probability above this, all that was tried counted, is not even told."""
 _FAR_WORSE = 0.5
-"""A group whose detections agree less than half as well as those of others has a contest of its own."""
+"""A group whose detections agree less than half as well as those of others, beyond chance, has a contest of its own."""
 _LEAST_PRODUCT = 1e-300
 _TIE = 1e-3
 """Gains as close as this are the same: readings that differ in the last digits only."""
@@ -168,8 +168,8 @@ def _better_explained(view: View, camera: Finding | None, odd: Finding) -> Findi
 
 
 def _worth_of(view: View) -> float:
-    """Return how well a detection agrees with others."""
-    return float(view.agreement.gain.sum()) / max(view.agreement.detections, 1)
+    """Return how much better a detection agrees with others than by chance."""
+    return float(view.agreement.gain.sum() - view.chance.gain.sum()) / max(view.agreement.detections, 1)
 
 
 class _OfOneGroup(Convention):
