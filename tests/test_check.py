@@ -863,7 +863,9 @@ def test_rays_of_a_camera_that_agree_by_chance_alone_do_not_hide_what_is_wrong_w
 ) -> None:
     """More than half of how well they agree is chance here: they agree more than half as well as those of the other."""
     city = good_city(4, passes_per_street=4)
-    spoiled = View(of_camera(city, INJECTED["quaternion_order"].spoil(city), 1))
+    other_order = INJECTED["quaternion_order"].spoil(city)
+    assert other_order is not None
+    spoiled = View(of_camera(city, other_order, 1))
     found = contest.find_odd_group(spoiled, CONVENTIONS)
     assert found is not None
     assert (found.fault, found.of) == ("quaternion_order", "camera 1")
