@@ -18,7 +18,7 @@ from check_faults import RIG_FAULTS, exchanged, good_city, lowered, of_camera
 from check_faults import good_rig as rig
 from small_dataset import small_dataset
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check import cameras, contest, distortion, examine, fit, mounts
+from valuemap.check import cameras, contest, distortion, examine, fit, mounts, passes
 from valuemap.check.agreement import Agreement, compare, gains_of_objects, measure_agreement
 from valuemap.check.boxes import PictureSize, _chance_of_gap, _Ends, _OfSquare, picture_sizes, rows_in_images
 from valuemap.check.cameras import PARAMETERS, _followed, _is_wider_gate_only, with_focal
@@ -27,6 +27,7 @@ from valuemap.check.examine import _look
 from valuemap.check.fault import (
     LEAST_CHANCE,
     Convention,
+    Fault,
     Finding,
     View,
     gains_of_all,
@@ -968,6 +969,21 @@ def test_a_camera_that_no_other_pass_has_is_told_from_the_height_of_its_pass(mon
     assert [(found.fault, found.of) for found in _look(View(low), "fine", silent)] == [("camera_height", None)]
     monkeypatch.setattr(cameras.CameraHeight, "rivals", frozenset())
     assert [found.fault for found in _look(View(tilted), "fine", silent)] == ["camera_height"]
+
+
+@pytest.mark.parametrize(("fault", "is_along"), [(passes.PassOffset, False), (passes.PassTimeShift, True)])
+def test_a_camera_that_no_other_pass_has_is_told_from_any_shift_of_its_pass(
+    fault: type[Fault], is_along: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    city = good_city(2, passes_per_street=3)
+    tilted = View(of_camera(city, turned_by(city, "x", 3.0), 1))
+    shift = passes.worst_pass(tilted)
+    assert shift is not None
+    aside = replace(shift, offset_m=np.array([1.0, 0.0, 0.0]), is_along=is_along)
+    monkeypatch.setattr(passes, "worst_pass", lambda _: aside)
+    assert [found.fault for found in _look(tilted, "fine", silent)] == ["camera_tilt"]
+    monkeypatch.setattr(fault, "rivals", frozenset())
+    assert [found.fault for found in _look(tilted, "fine", silent)] == [fault.name]
 
 
 def test_a_camera_that_is_too_low_is_named_and_the_others_stay(few_rig: Dataset) -> None:

@@ -24,6 +24,7 @@ from valuemap.check.fault import (
     Finding,
     Stage,
     View,
+    agreement_after,
     gains_of_all,
     with_centers,
     with_detections,
@@ -253,8 +254,7 @@ def _better_explained(view: View, every: Correction | None, one: Correction | No
     """Return which of two corrections, of all images and of one group, lets all rays agree better."""
     if every is None or one is None:
         return every or one
-    of_every, of_one = (float(gains_of_all(view, each(view.dataset)).sum()) for each in (every, one))
-    return one if of_one > of_every else every
+    return one if agreement_after(view, one) > agreement_after(view, every) else every
 
 
 def _find_correction(view: View) -> Correction | None:

@@ -22,7 +22,7 @@ import numpy as np
 from valuemap.cameras import rotation_matrices
 from valuemap.check.agreement import Agreement, Comparison, agreement_on, compare, gains_of_objects
 from valuemap.check.cameras import PARAMETERS, WrongCamera
-from valuemap.check.fault import LEAST_CHANCE, WIDER_GATE, Convention, Finding, Fix, View, gains_of_all, uprightness
+from valuemap.check.fault import LEAST_CHANCE, WIDER_GATE, Convention, Finding, Fix, View, agreement_after, uprightness
 from valuemap.check.groups import Group, OfGroup, fits_one_group, groups_of
 from valuemap.check.sample import Sample
 from valuemap.dataset import Dataset
@@ -161,9 +161,7 @@ def _better_explained(view: View, camera: Finding | None, odd: Finding) -> Findi
     """
     if camera is None:
         return odd
-    of_camera, of_odd = (
-        float(gains_of_all(view, each.fix(view.dataset)).sum()) for each in (camera, odd) if each.fix is not None
-    )
+    of_camera, of_odd = (agreement_after(view, each.fix) for each in (camera, odd) if each.fix is not None)
     return camera if of_camera > (1.0 - _TIE) * of_odd else odd
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from valuemap.check.contest import find_odd_group, hold_contest
-from valuemap.check.fault import STAGES, Fault, Finding, Fix, View, gains_of_all
+from valuemap.check.fault import STAGES, Fault, Finding, Fix, View, agreement_after
 from valuemap.check.prospects import describe_prospects
 from valuemap.check.registry import CONVENTIONS, FAULTS
 from valuemap.dataset import Dataset
@@ -147,7 +147,7 @@ def _best_of(view: View, finding: Finding, rivals: Sequence[Fault]) -> Finding:
 
     def agreement(of: Finding) -> float:
         assert of.fix is not None
-        return float(gains_of_all(view, of.fix(view.dataset)).sum())
+        return agreement_after(view, of.fix)
 
     return max([finding, *others], key=agreement) if others else finding
 

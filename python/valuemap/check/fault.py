@@ -193,6 +193,11 @@ def gains_of_all(view: View, dataset: Dataset, *, is_gate_an_angle: bool = False
     return np.concatenate([agreement_on(s, s.of(dataset), gate_px).gain for s in samples])
 
 
+def agreement_after(view: View, fix: Fix) -> float:
+    """Return how well all rays agree once the dataset is put right so."""
+    return float(gains_of_all(view, fix(view.dataset)).sum())
+
+
 class Fault(ABC):
     """A mistake that data may have; `name` is how reports and tests call it."""
 
