@@ -22,7 +22,7 @@ from valuemap.check import cameras, contest, distortion, examine, fit, mounts, p
 from valuemap.check.agreement import Agreement, compare, gains_of_objects, measure_agreement
 from valuemap.check.boxes import PictureSize, _chance_of_gap, _Ends, _OfSquare, picture_sizes, rows_in_images
 from valuemap.check.cameras import PARAMETERS, _followed, _is_wider_gate_only, with_focal
-from valuemap.check.contest import _compare, _joined, _Reading, _suspicion, hold_contest
+from valuemap.check.contest import _compare, _joined, _Reading, _suspicion, hold_contest, spoils_a_group
 from valuemap.check.examine import _look
 from valuemap.check.fault import (
     LEAST_CHANCE,
@@ -462,6 +462,90 @@ def test_a_camera_that_looks_too_low_is_not_upside_down(monkeypatch: pytest.Monk
     assert wrong.fault in ("mirrored_pictures", "tilt_convention")
 
 
+def test_a_turn_of_as_much_as_magnetic_north_is_off_is_no_other_convention(
+    monkeypatch: pytest.MonkeyPatch, few: Dataset
+) -> None:
+    turn = Rotation.from_euler("y", 9.0, degrees=True).as_matrix()
+    aside = with_poses(few, turn @ rotation_matrices(few.images), camera_centers(few.images))
+    verdict = hold_contest(View(aside), CONVENTIONS)
+    assert verdict.finding is None
+    assert verdict.suspicion is None
+    monkeypatch.setattr(contest, "_SMALL_TURNS_RAD", np.radians([2.0, 4.0, 6.0]))
+    assert hold_contest(View(aside), CONVENTIONS).finding is not None
+
+
+def _to_world(dataset: Dataset, axes: list[list[int]], order: list[int]) -> Dataset:
+    """Return poses that take cameras with other axes into the world, and quaternions in another order."""
+    rotation = rotation_matrices(dataset.images).transpose(0, 2, 1) @ np.array(axes)
+    quaternion = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)[:, order]
+    return with_images(
+        dataset, cam_from_world_quat=np.ascontiguousarray(quaternion), cam_from_world_m=camera_centers(dataset.images)
+    )
+
+
+@pytest.mark.parametrize(
+    ("fault", "axes", "order"),
+    [
+        ("inverted_poses", [[1, 0, 0], [0, -1, 0], [0, 0, -1]], [0, 1, 2, 3]),  # As radiance fields have them.
+        ("quaternion_order", [[0, -1, 0], [0, 0, -1], [1, 0, 0]], [1, 2, 3, 0]),  # As ROS has them.
+    ],
+)
+def test_poses_of_cameras_with_other_axes_that_go_the_wrong_way_are_undone_at_once(
+    one: Dataset, fault: str, axes: list[list[int]], order: list[int]
+) -> None:
+    finding = hold_contest(View(_to_world(one, axes, order)), CONVENTIONS).finding
+    assert finding is not None
+    assert finding.fault == fault
+    assert finding.fix is not None
+    fixed = finding.fix(_to_world(one, axes, order))
+    assert np.allclose(rotation_matrices(fixed.images), rotation_matrices(one.images), atol=1e-9)
+    assert np.allclose(camera_centers(fixed.images), camera_centers(one.images), atol=1e-6)
+
+
+def test_shares_of_one_side_of_the_picture_that_were_multiplied_by_the_other_are_named(one: Dataset) -> None:
+    extent = picture_sizes(one)
+    factor = extent[:, ::-1] / extent
+    boxes = one.detections
+    spoiled = with_detections(one, center_px=boxes.center_px * factor, size_px=boxes.size_px * factor)
+    finding = hold_contest(View(spoiled), CONVENTIONS).finding
+    assert finding is not None
+    assert finding.fault == "picture_size"
+    assert finding.fix is not None
+    assert np.allclose(finding.fix(spoiled).detections.center_px, boxes.center_px)
+
+
+def test_what_is_wrong_with_the_main_camera_is_not_put_right_in_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = rig(1, passes_per_street=2)
+    extent = picture_sizes(given)
+    factor = 640.0 / extent.max(axis=1, keepdims=True)
+    center = given.detections.center_px * factor + (640.0 - extent * factor) / 2.0
+    fitted = with_detections(given, center_px=center, size_px=given.detections.size_px * factor)
+    spoiled = of_camera(given, fitted, 1)
+    wide = hold_contest(View(spoiled), CONVENTIONS).finding
+    assert wide is not None
+    assert wide.of is None
+    assert wide.fix is not None
+    assert spoils_a_group(View(spoiled), wide.fix)
+    assert [(finding.fault, finding.of) for finding in examine(spoiled).findings] == [("picture_size", "camera 1")]
+    everywhere = hold_contest(View(fitted), CONVENTIONS).finding
+    assert everywhere is not None
+    assert everywhere.fix is not None
+    assert not spoils_a_group(View(fitted), everywhere.fix)
+
+
+def test_of_a_car_one_of_whose_cameras_has_the_poses_of_another_time_no_images_are_of_several_drives() -> None:
+    given = rig(1, passes_per_street=1)
+    center, images = camera_centers(given.images), given.images
+    late = (images.camera_id == 1)[:, None] * [6.0, 0.0, 0.0]
+    assert _jumping_passes(with_centers(given, center + late).images) == []
+
+
+def test_passes_of_one_image_each_tell_nothing_and_say_so(one: Dataset) -> None:
+    names = [f"pass-{row}" for row in range(len(one.images))]
+    outcome = examine(with_images(one, pass_id=Categories.from_texts(names)))
+    assert any("cannot be told" in note for note in outcome.notes)
+
+
 def test_names_of_one_camera_after_the_other_are_no_clock_that_starts_over() -> None:
     images = small_dataset().images.take(np.zeros(60, dtype=np.int64))
     camera, frame = np.divmod(np.arange(60), 30)
@@ -542,9 +626,9 @@ def test_images_with_the_camera_of_others_are_no_pictures_of_another_size(good: 
     assert camera is not None
     assert camera.fix is not None
     scaled = replace(camera, fault="picture_size", fix=lambda dataset: dataset)
-    assert contest._better_explained(view, camera, scaled) is camera
-    assert contest._better_explained(view, replace(camera, fix=scaled.fix), replace(scaled, fix=camera.fix)) != camera
-    assert contest._better_explained(view, None, scaled) is scaled
+    assert contest.better_explained(view, camera, scaled) is camera
+    assert contest.better_explained(view, replace(camera, fix=scaled.fix), replace(scaled, fix=camera.fix)) != camera
+    assert contest.better_explained(view, None, scaled) is scaled
 
 
 def test_an_axis_the_other_way_is_no_other_world_on_flat_ground(few: Dataset) -> None:

@@ -33,8 +33,9 @@ _ALONG_AXIS = 0.985
 """The cosine of 10 degrees, which cars and their cameras lean at most."""
 _ENOUGH_PLACES = 12
 """What a sample is cut into where there are detections enough."""
-_SMALL_TURNS_RAD = np.radians([2.0, 4.0, 6.0])
-"""At most a degree from any turn that a mount may be off by."""
+_SMALL_TURNS_RAD = np.radians(np.arange(2.0, 17.0, 2.0))
+"""At most a degree from any turn that a mount may be off by, that magnetic north has from north where most streets are,
+or that pictures seem to be turned by which were cropped at one side."""
 _FROM_RAYS = 0.05
 """However upright cameras stand under a reading, rays must prefer it beyond this chance."""
 _SUSPICIOUS = 0.05
@@ -98,6 +99,8 @@ class Verdict:
 def hold_contest(view: View, conventions: Sequence[Convention], progress: Progress = silent) -> Verdict:
     """Compare all readings. The gate is widened where rays, read in any way, meet no better than by chance."""
     rivals: tuple[str, ...] = ()
+    if not len(view.stretches.dataset.detections):
+        return Verdict(None, None)
     for gate_share in (view.gate_share, view.gate_share * WIDER_GATE):
         at_gate = view if gate_share == view.gate_share else View(view.dataset, gate_share=gate_share, known=view.known)
         tried = _try_all(at_gate, conventions, progress)
@@ -150,19 +153,33 @@ def find_odd_group(view: View, conventions: Sequence[Convention], progress: Prog
             fix=OfGroup(group, finding.fix),
             of=group.text,
         )
-        return _better_explained(view, WrongCamera().find(view), odd)
+        # Pictures of another size are those of a camera of the table, where there is one of that size.
+        return better_explained(view, WrongCamera().find(view), odd)
     return None
 
 
-def _better_explained(view: View, camera: Finding | None, odd: Finding) -> Finding:
-    """Return which of two findings lets all rays agree better: images with the camera of others, or an odd group.
+def better_explained(view: View, wide: Finding | None, odd: Finding | None) -> Finding | None:
+    """Return which of two findings lets all rays agree better: one of any images, or that of an odd group."""
+    if wide is None or odd is None:
+        return wide or odd
+    of_wide, of_odd = (agreement_after(view, each.fix) for each in (wide, odd) if each.fix is not None)
+    return wide if of_wide > (1.0 - _TIE) * of_odd else odd
 
-    Pictures of another size are those of a camera of the table, where there is one of that size.
+
+def spoils_a_group(view: View, fix: Fix) -> bool:
+    """Return whether a fix makes the rays of a camera or a pass agree worse: what it puts right is not wrong with all.
+
+    What is wrong with one camera only makes all rays together agree better where it is put right in every camera, too.
     """
-    if camera is None:
-        return odd
-    of_camera, of_odd = (agreement_after(view, each.fix) for each in (camera, odd) if each.fix is not None)
-    return camera if of_camera > (1.0 - _TIE) * of_odd else odd
+    alone = [group.alone(view) for group in groups_of(view.dataset)]
+    return any(
+        compare(
+            each.agreement.gain, _measure(fix(each.stretches.dataset), each.stretches, each.gate_px, fix).gain
+        ).chance
+        * len(alone)
+        < LEAST_CHANCE
+        for each in alone
+    )
 
 
 def _worth_of(view: View) -> float:

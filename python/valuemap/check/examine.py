@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from valuemap.check.contest import find_odd_group, hold_contest
+from valuemap.check.contest import better_explained, find_odd_group, hold_contest, spoils_a_group
 from valuemap.check.fault import STAGES, Fault, Finding, Fix, View, agreement_after
 from valuemap.check.prospects import describe_prospects
 from valuemap.check.registry import CONVENTIONS, FAULTS
@@ -96,8 +96,8 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
                     )
                 gate_share = verdict.gate_share or gate_share
                 finding = verdict.finding
-                if finding is None and meets:
-                    finding = find_odd_group(view, CONVENTIONS, progress)
+                if meets and (finding is None or finding.fix is None or spoils_a_group(view, finding.fix)):
+                    finding = better_explained(view, finding, find_odd_group(view, CONVENTIONS, progress))
                 found = [] if finding is None else [finding]
             else:
                 found = _look(view, stage, progress)

@@ -393,7 +393,9 @@ def _jumping_passes(images: Images) -> list[dict[str, Any]]:
             continue
         way = np.diff(center[moving], axis=0)
         step = np.linalg.norm(way, axis=1)
-        nearest = _typical_gap(center[moving])
+        # Cameras of a car are nearer to each other than its images are, and one may have the poses of another time.
+        camera, count = np.unique(images.camera_id[moving], return_counts=True)
+        nearest = _typical_gap(center[moving[images.camera_id[moving] == camera[count.argmax()]]])
         if nearest <= 0.0:
             continue
         jumps = float(((step > _JUMP_TIMES * nearest) & ~_leads_on(way)).mean())

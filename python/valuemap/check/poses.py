@@ -11,11 +11,11 @@ from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.fault import Convention, Fix, with_centers, with_images, with_poses
 from valuemap.check.headings import headings, rotations_of
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats
 
+_ROS_BODY = "x forward, y left, z up, as in ROS bodies"
 _CAMERA_AXES: dict[str, list[list[float]]] = {
     "y up and z back, as in OpenGL": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
-    "x forward, y left, z up, as in ROS bodies": [[0, -1, 0], [0, 0, -1], [1, 0, 0]],
+    _ROS_BODY: [[0, -1, 0], [0, 0, -1], [1, 0, 0]],
     "x forward, y right, z down, as in aircraft": [[0, 1, 0], [0, 0, 1], [1, 0, 0]],
     "x right, y forward, z up": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
     "x left, y up, z forward": [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
@@ -38,9 +38,11 @@ class InvertedPoses(Convention):
     do: ClassVar[str] = "Invert them: cam_from_world has R^T and -R^T t."
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
-        """Yield both inverted, and the rotation alone."""
+        """Yield both inverted, as they are and of cameras with the axes of other fields, and the rotation alone."""
         yield "world_from_cam", _invert
         yield "world_from_cam in the rotation, the camera centre as it is", _invert_rotation
+        for name, axes in _CAMERA_AXES.items():
+            yield f"world_from_cam of cameras with {name}", _Inverted(_OtherAxes(axes))
 
 
 class CenterAsTranslation(Convention):
@@ -63,11 +65,13 @@ class QuaternionOrder(Convention):
     do: ClassVar[str] = "Write qw qx qy qz; SciPy, ROS and Eigen's memory have x y z w."
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
-        """Yield both orders, with the translation or the camera centre as it is, and both ways."""
+        """Yield both orders, with the translation or the camera centre as it is, both ways; of ROS bodies too."""
         for order, columns in (("x y z w", [3, 0, 1, 2]), ("y z w x", [1, 2, 3, 0])):
             yield f"{order}, the translation as it is", _Reordered(columns, keeps_center=False)
             yield f"{order}, the camera centre as it is", _Reordered(columns, keeps_center=True)
-            yield f"{order}, world_from_cam", _Reordered(columns, keeps_center=False, inverts=True)
+            yield f"{order}, world_from_cam", _Reordered(columns, then=_invert)
+        of_ros = _Reordered([3, 0, 1, 2], then=_Inverted(_OtherAxes(_CAMERA_AXES[_ROS_BODY])))
+        yield f"x y z w, world_from_cam of cameras with {_ROS_BODY}", of_ros
 
 
 class CameraAxes(Convention):
@@ -80,7 +84,7 @@ class CameraAxes(Convention):
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield the axes of other fields."""
         for name, axes in _CAMERA_AXES.items():
-            yield name, _OtherAxes(np.array(axes, dtype=np.float64))
+            yield name, _OtherAxes(axes)
 
 
 class PitchAndRoll(Convention):
@@ -128,26 +132,36 @@ def steadied(dataset: Dataset) -> Dataset:
 
 
 class _Reordered:
-    """Takes the parts of the quaternions from other columns."""
+    """Takes the parts of the quaternions from other columns, and then reads the poses as another fix does."""
 
-    def __init__(self, columns: list[int], *, keeps_center: bool, inverts: bool = False) -> None:
-        self._columns, self._keeps_center, self._inverts = columns, keeps_center, inverts
+    def __init__(self, columns: list[int], *, keeps_center: bool = False, then: Fix | None = None) -> None:
+        self._columns, self._keeps_center, self._then = columns, keeps_center, then
 
     def __call__(self, dataset: Dataset) -> Dataset:
         quaternion = np.ascontiguousarray(dataset.images.cam_from_world_quat[:, self._columns])
         other = with_images(dataset, cam_from_world_quat=quaternion)
-        if self._inverts:
-            return _invert(other)
+        if self._then is not None:
+            return self._then(other)
         if not self._keeps_center:
             return other
         return with_poses(dataset, rotation_matrices(other.images), camera_centers(dataset.images))
 
 
+class _Inverted:
+    """Inverts the poses, and then reads them as another fix does."""
+
+    def __init__(self, then: Fix) -> None:
+        self._then = then
+
+    def __call__(self, dataset: Dataset) -> Dataset:
+        return self._then(_invert(dataset))
+
+
 class _OtherAxes:
     """Turns the cameras in their places."""
 
-    def __init__(self, axes: Floats) -> None:
-        self._axes = axes
+    def __init__(self, axes: list[list[float]]) -> None:
+        self._axes = np.array(axes, dtype=np.float64)
 
     def __call__(self, dataset: Dataset) -> Dataset:
         rotation = self._axes @ rotation_matrices(dataset.images)
