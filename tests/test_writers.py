@@ -15,10 +15,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from small_dataset import ANCHOR, map_of, small_dataset
-from valuemap.dataset import Frame
+from valuemap.dataset import Frame, write_dataset
 from valuemap.errors import InputError, OutputError
+from valuemap.folders import new_file
 from valuemap.geodesy import lon_lat_height_from_enu
-from valuemap.map_folder import Map
+from valuemap.map_folder import Map, write_map
 from valuemap.tables import Labels, read_table, table_to_arrow
 from valuemap.writers import SUFFIXES, export_map
 
@@ -171,6 +172,30 @@ def test_a_file_of_somebody_else_is_replaced_by_force_only(tmp_path: Path) -> No
     assert (tmp_path / "map.csv").read_text() == "mine"
     export_map(local_map(), tmp_path / "map.csv", force=True)
     assert len(rows_of_csv(tmp_path / "map.csv")) == 2
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_files_of_datasets_and_maps_are_not_written_over(tmp_path: Path, force: bool) -> None:
+    write_dataset(small_dataset(), tmp_path / "data")
+    write_map(local_map(), tmp_path / "map")
+    with new_file(tmp_path / "map" / "review.json") as fresh:
+        fresh.write_text("{}")
+    (tmp_path / "map" / "cells").mkdir()
+    with new_file(tmp_path / "map" / "cells" / "cell.arrow") as fresh:
+        fresh.write_text("solved")
+    before = {path: path.read_bytes() for path in sorted(tmp_path.rglob("*")) if path.is_file()}
+    for kind, names in (
+        ("dataset", ("images.parquet", "truth.parquet", "dataset.json", "rejected.parquet")),
+        ("map", ("labels.parquet", "run.json", "review.json", "cells/cell.arrow")),
+    ):
+        for name in names:
+            path = tmp_path / {"dataset": "data", "map": "map"}[kind] / name
+            with pytest.raises(OutputError, match=f"{name}: is a file of a {kind}, which would be lost") as refusal:
+                export_map(local_map(), path, format_name="parquet", force=force)
+            assert refusal.value.hint == "name another file"
+    assert {path: path.read_bytes() for path in sorted(tmp_path.rglob("*")) if path.is_file()} == before
+    for _ in range(2):  # What is not a file of the map may be beside them.
+        export_map(local_map(), tmp_path / "map" / "export.parquet")
 
 
 @pytest.mark.parametrize(

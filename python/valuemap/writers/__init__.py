@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from pathlib import Path
 
+from valuemap import dataset as dataset_folder
+from valuemap import map_folder
 from valuemap.dataset import Dataset
 from valuemap.errors import OutputError
 from valuemap.folders import new_file, new_folder
@@ -62,6 +64,12 @@ SUFFIXES: dict[str, str] = {
 }
 """How a file must end to be of a format without being told; of several that fit, the longest."""
 
+_OWN_FILES = (
+    ("dataset", dataset_folder.MARKER, dataset_folder.PARTS, dataset_folder.PART_FOLDERS),
+    ("map", map_folder.MARKER, (*map_folder.PARTS, map_folder.REVIEW), (map_folder.CELLS,)),
+)
+"""Folders of valuemap's that no export writes over: their marker, their files, and their folders."""
+
 
 def export_map(
     result: Map,
@@ -95,8 +103,8 @@ def export_map(
     Raises
     ------
     OutputError
-        There is no such format, it cannot hold what is asked for, a file of somebody else is there, or the place cannot
-        be written.
+        There is no such format, it cannot hold what is asked for, a file of somebody else is there, the file is one of
+        a dataset or a map, or the place cannot be written.
     InputError
         The format needs a geo-referenced map and this one is not, or the dataset is not that of the map.
     SettingError
@@ -113,8 +121,19 @@ def export_map(
             writer(export, folder)
         return
     writer = WRITERS[_format(path, format_name)]
+    _refuse_own(path)
     with new_file(path, force=force) as temporary:
         writer(export, temporary)
+
+
+def _refuse_own(path: Path) -> None:
+    """Keep an export from taking the place of a file of a dataset or a map, which is ours to replace elsewhere."""
+    folder = path.absolute().parent
+    for kind, marker, parts, part_folders in _OWN_FILES:
+        is_part = path.name in parts and (folder / marker).is_file()
+        is_in_part = folder.name in part_folders and (folder.parent / marker).is_file() and path.exists()
+        if is_part or is_in_part:
+            raise OutputError(f"{path}: is a file of a {kind}, which would be lost", hint="name another file")
 
 
 def _format(path: Path, name: str | None) -> str:
