@@ -368,8 +368,14 @@ def test_a_link_or_a_pipe_in_the_place_of_a_file_is_refused(tmp_path: Path) -> N
     for force in (True, False):
         with pytest.raises(OutputError, match="is a link"), new_file(tmp_path / "link.csv", force=force) as path:
             path.write_text("new")
-    with pytest.raises(OutputError, match="is not ours"), new_file(tmp_path / "pipe.csv") as path:
-        path.write_text("new")
+        refused = pytest.raises(OutputError, match=r"pipe\.csv: is a pipe, a socket or a device, not a file")
+        with refused, new_file(tmp_path / "pipe.csv", force=force) as path:
+            path.write_text("new")
+        with refused:
+            remove_file(tmp_path / "pipe.csv", force=force)
+        with refused, new_folder(tmp_path, parts=("pipe.csv",), force=force):
+            pass
+    assert (tmp_path / "pipe.csv").is_fifo()
     assert (tmp_path / "target.csv").read_text() == "mine"
 
 

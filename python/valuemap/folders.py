@@ -99,7 +99,7 @@ def check_files(folder: Path, names: Collection[str], *, force: bool = False) ->
     ------
     OutputError
         One is there that valuemap did not write, or that was changed since, and `force` does not say to replace it;
-        or a folder is in its place.
+        or a folder, a pipe, a socket or a device is in its place.
     """
     for name in names:
         path = folder / name
@@ -109,6 +109,8 @@ def check_files(folder: Path, names: Collection[str], *, force: bool = False) ->
             continue
         if path.is_dir() and not path.is_symlink():
             raise OutputError(f"{path}: is a folder, a file is to be written there", hint="choose another place")
+        if not stat.S_ISREG(kind := path.lstat().st_mode) and not stat.S_ISLNK(kind):
+            raise OutputError(f"{path}: is a pipe, a socket or a device, not a file", hint="choose another place")
         if not force and not _is_ours(path):
             raise OutputError(
                 f"{path}: is not ours to replace: valuemap did not write it, or it was changed since",
