@@ -293,8 +293,9 @@ def test_a_ledger_does_not_grow_with_each_set_of_files(tmp_path: Path) -> None:
 
 def test_a_file_in_the_place_of_a_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("mine")
-    with pytest.raises(OutputError, match="out: is a file, a folder is to be written there"):
+    with pytest.raises(OutputError, match="out: is a file, a folder is to be written there") as refusal:
         write_folder(tmp_path / "out", "new")
+    assert refusal.value.hint == "choose another folder"  # The option is not called --out everywhere.
     assert content(tmp_path) == {"out": "mine"}
 
 
@@ -393,6 +394,7 @@ def test_a_map_is_not_written_over_a_dataset_nor_the_other_way_round(tmp_path: P
     write_folder(tmp_path / "map", "given")
     before = content(tmp_path)
     for path, parts in ((tmp_path / "data", PARTS), (tmp_path / "map", datasets)):
-        with pytest.raises(OutputError, match=r"holds a (dataset|map), which would be lost"):
+        with pytest.raises(OutputError, match=r"holds a (dataset|map), which would be lost") as refusal:
             check_place(path, parts=parts, force=force)
+        assert refusal.value.hint == "choose another folder"
     assert content(tmp_path) == before

@@ -122,7 +122,7 @@ def _refuse_other_kind(folder: Path, parts: Collection[str]) -> None:
     """Keep a map from being written over a dataset, and a dataset over a map: some of their files have one name."""
     other = next((head for head in _KIND_OF if head not in parts and (folder / head).exists()), None)
     if other is not None and not _KIND_OF.keys().isdisjoint(parts):
-        raise OutputError(f"{folder}: holds {_KIND_OF[other]}, which would be lost", hint="choose another --out")
+        raise OutputError(f"{folder}: holds {_KIND_OF[other]}, which would be lost", hint="choose another folder")
 
 
 DATASET_MARKER, MAP_MARKER = "dataset.json", "run.json"
@@ -217,9 +217,9 @@ def _followed(path: Path) -> Path:
     """Return the folder that a path means, through links."""
     path = path.absolute()
     if path.is_symlink() and not path.exists():
-        raise OutputError(f"{path}: is a link to nothing", hint="choose another --out, or remove the link")
+        raise OutputError(f"{path}: is a link to nothing", hint="choose another folder, or remove the link")
     if path.exists() and not path.is_dir():
-        raise OutputError(f"{path}: is a file, a folder is to be written there", hint="choose another --out")
+        raise OutputError(f"{path}: is a file, a folder is to be written there", hint="choose another folder")
     return path.resolve() if path.is_symlink() else path
 
 
