@@ -380,6 +380,13 @@ def test_a_link_or_a_pipe_in_the_place_of_a_file_is_refused(tmp_path: Path) -> N
     assert (tmp_path / "target.csv").read_text() == "mine"
 
 
+def test_a_name_with_a_line_break_is_refused_as_it_is_written(tmp_path: Path) -> None:
+    with pytest.raises(OutputError) as refusal, new_file(tmp_path / "two\nlines.csv") as path:
+        path.write_text("new")
+    assert str(refusal.value) == f"{tmp_path}/two\\nlines.csv: a line break in a name cannot be kept on record"
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_folder_in_the_place_of_a_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="is a folder, a file is to be written there"), new_file(tmp_path):
         pass

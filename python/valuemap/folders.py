@@ -370,7 +370,7 @@ def _write_lines(folder: Path, lines: Iterable[tuple[bytes, str]]) -> None:
     for digest, name in lines:
         if "\n" in name:
             raise OutputError(
-                f"{folder / name!r}: a line break in a name cannot be kept on record", hint="choose another name"
+                f"{folder / name}: a line break in a name cannot be kept on record", hint="choose another name"
             )
         content += digest + b"  " + os.fsencode(name) + b"\n"
     folder.mkdir(parents=True, exist_ok=True)
