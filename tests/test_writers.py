@@ -208,6 +208,21 @@ def test_an_unknown_format_is_refused(name: str, found: str, tmp_path: Path) -> 
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("url", ["s3://bucket/map.csv", "http://me:secret@host/map.csv", "file:///map.csv"])
+@pytest.mark.parametrize("format_name", [None, "csv", "colmap"])
+def test_a_url_that_no_writer_takes_is_refused(
+    url: str, format_name: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    scheme = url.partition(":")[0]
+    told = "expected a file, or the URL of a database, which begins with postgresql:// or postgres://"
+    with pytest.raises(OutputError, match=f"^{scheme}://: {told}$"):
+        export_map(local_map(), url, format_name=format_name)
+    with pytest.raises(OutputError, match="a database takes no --format"):
+        export_map(local_map(), "postgresql://host/maps", format_name="csv")
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("name", EVERY_FILE)
 def test_a_place_that_cannot_be_written_is_refused(name: str, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")

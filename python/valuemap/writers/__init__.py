@@ -25,7 +25,7 @@ from valuemap.writers.maproulette import write_maproulette
 from valuemap.writers.opendrive import write_opendrive
 from valuemap.writers.osm import write_osm
 from valuemap.writers.parquet import write_parquet
-from valuemap.writers.postgis import is_database, without_password, write_postgis
+from valuemap.writers.postgis import SCHEMES, is_database, without_password, write_postgis
 from valuemap.writers.rerun import write_rerun
 
 __all__ = ["FOLDER_WRITERS", "SUFFIXES", "WRITERS", "export_map", "without_password"]
@@ -103,8 +103,8 @@ def export_map(
     Raises
     ------
     OutputError
-        There is no such format, it cannot hold what is asked for, a file of somebody else is there, the file is one of
-        a dataset or a map, or the place cannot be written.
+        There is no such format, it cannot hold what is asked for, nothing writes to such a URL, a file of somebody else
+        is there, the file is one of a dataset or a map, or the place cannot be written.
     InputError
         The format needs a geo-referenced map and this one is not, or the dataset is not that of the map.
     SettingError
@@ -114,6 +114,7 @@ def export_map(
     if format_name is None and is_database(str(target)):
         write_postgis(export, str(target))
         return
+    _refuse_url(str(target))
     path = Path(target)
     if format_name in FOLDER_WRITERS:
         writer, parts = FOLDER_WRITERS[format_name]
@@ -124,6 +125,20 @@ def export_map(
     _refuse_own(path)
     with new_file(path, force=force) as temporary:
         writer(export, temporary)
+
+
+def _refuse_url(target: str) -> None:
+    """Refuse what would become a folder with the name of its scheme."""
+    scheme, separator, _ = target.partition("://")
+    if not separator or "/" in scheme:
+        return
+    databases = " or ".join(f"{each}://" for each in SCHEMES)
+    if scheme in SCHEMES:
+        raise OutputError(f"{scheme}://: a database takes no --format", hint="leave --format away")
+    raise OutputError(
+        f"{scheme}://: expected a file, or the URL of a database, which begins with {databases}",
+        hint="export to a file on this machine and copy it there",
+    )
 
 
 def _refuse_own(path: Path) -> None:
