@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from valuemap.config import (
     VoteConfig,
     describe_settings,
 )
-from valuemap.config.setting import declared
+from valuemap.config.setting import Method, declared
 from valuemap.errors import SettingError
 
 NAMES = [name for name, *_ in describe_settings()]
@@ -69,7 +69,8 @@ def test_every_setting_is_described() -> None:
         ("alpha=1", "there is no setting named 'alpha'", "settings are: cluster_radius_m, "),
         ("method=robust", "there is no setting named 'method'", "settings are: "),
         ("=3", "there is no setting named ''", "settings are: "),
-        ("max_range_m", "--set max_range_m: expected name=value", "for example --set "),
+        ("max_range_m", "--set max_range_m: expected name=value", "for example --set max_range_m=60.0"),
+        ("max_rnage_m", "there is no setting named 'max_rnage_m'", "did you mean max_range_m?"),
         (
             "max_range_m=far",
             r"max_range_m: expected a number \(m\), found 'far'",
@@ -107,10 +108,25 @@ def test_every_setting_is_described() -> None:
     ],
 )
 def test_a_wrong_assignment_is_refused(assignment: str, message: str, hint: str) -> None:
+    method = MapConfig().ignored_settings().get(assignment.partition("=")[0], "robust")
     with pytest.raises(SettingError, match=message) as refusal:
-        MapConfig().with_settings([assignment])
+        MapConfig(method=method).with_settings([assignment])
     assert hint in refusal.value.hint
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("method", get_args(Method))
+def test_the_example_of_a_setting_without_a_value_is_taken(method: Method) -> None:
+    config = MapConfig(method=method)
+    for name in config.as_dict().keys() - config.ignored_settings() - {"method"}:
+        with pytest.raises(SettingError, match=f"--set {name}: expected name=value") as refusal:
+            config.with_settings([name])
+        example = refusal.value.hint.removeprefix("for example --set ")
+        assert example.startswith(f"{name}=")
+        config.with_settings([example])
+    for name in config.ignored_settings():
+        with pytest.raises(SettingError, match=f"--set {name}: the method {method} has no such setting"):
+            config.with_settings([name])
 
 
 def test_a_number_that_nothing_can_hold_is_refused() -> None:

@@ -231,7 +231,6 @@ class MapConfig:
             A name that no stage has, or that the method ignores; a value that is not a number, or out of range.
         """
         assignments = list(assignments)
-        changed = dataclasses.replace(self, **assign(self._stages(), assignments))
         owner = self.ignored_settings()
         for name in (assignment.partition("=")[0].strip() for assignment in assignments):
             if name in owner:  # A user would look for an effect that cannot be.
@@ -239,7 +238,7 @@ class MapConfig:
                     f"--set {name}: the method {self.method} has no such setting, only {owner[name]} has it",
                     hint=f"leave it away, or use --method {owner[name]}",
                 )
-        return changed
+        return dataclasses.replace(self, **assign(self._stages(), assignments))
 
     def ignored_settings(self) -> dict[str, Method]:
         """Return the settings that the method does not have, each with the only method that has it."""

@@ -53,6 +53,11 @@ class Setting:
         return "estimated" if self.default is None else str(self.default)
 
     @property
+    def example(self) -> float:
+        """A value that the setting takes: the default, or 1, which is in the range of each that is estimated."""
+        return 1.0 if self.default is None else self.default
+
+    @property
     def shown_effect(self) -> str:
         """The effect, with the only method that has the setting, if there is one."""
         return f"{self.effect}{f' ({self.method})' if self.method else ''}"
@@ -152,12 +157,13 @@ def assign(stages: Mapping[str, Settings], assignments: Iterable[str]) -> dict[s
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
         name = name.strip()
+        stage = owner_of(name, stages, f"--set {assignment}")
         if not equals:
-            example, (_, setting) = next(iter(_owners(stages).items()))
+            setting = _owners(stages)[name][1]
             raise SettingError(
-                f"--set {assignment}: expected name=value", hint=f"for example --set {example}={setting.default}"
+                f"--set {assignment}: expected name=value", hint=f"for example --set {name}={setting.example}"
             )
-        changes.setdefault(owner_of(name, stages, f"--set {assignment}"), {})[name] = text.strip()
+        changes.setdefault(stage, {})[name] = text.strip()
     return {stage: _from_texts(settings, changes.get(stage, {})) for stage, settings in stages.items()}
 
 
