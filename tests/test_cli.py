@@ -244,6 +244,14 @@ def test_misspelt_settings_are_refused_with_a_suggestion(street: Path, tmp_path:
     assert "expected above 0" in complains("map", street, "--out", tmp_path / "map", "--set", "max_range_m=-1")
 
 
+def test_an_option_that_the_method_ignores_is_refused(street: Path, tmp_path: Path) -> None:
+    options = ("--out", tmp_path / "map", "--method", "paper", "--calibration", tmp_path / "other")
+    line = complains("map", street, *options)
+    assert "other: the method paper has no such option, only robust has it" in line
+    assert "--method robust" in line
+    assert not (tmp_path / "map").exists()
+
+
 def test_an_unwritable_output_is_found_before_the_work(street: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     assert "cannot be written" in complains("map", street, "--out", tmp_path / "file" / "map")

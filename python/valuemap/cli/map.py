@@ -28,7 +28,7 @@ from valuemap.config import MapConfig
 from valuemap.control import apply_control
 from valuemap.dataset import Dataset, read_dataset
 from valuemap.engine.choose import engine_named
-from valuemap.errors import InputError
+from valuemap.errors import InputError, SettingError
 from valuemap.evaluate import evaluate_map
 from valuemap.evaluate.truth import read_truth
 from valuemap.evidence import dataset_reference
@@ -80,6 +80,11 @@ def map_command(
 ) -> None:
     """Turn the detections of a dataset into a map of labels."""
     config = MapConfig(method=method).with_settings(assignments or [])
+    if calibration is not None and method != "robust":  # A user would look for an effect that cannot be.
+        raise SettingError(
+            f"--calibration {calibration}: the method {method} has no such option, only robust has it",
+            hint="leave it away, or use --method robust",
+        )
     check_place(out, parts=map_folder.PARTS, force=force)
     if picture is not None:
         check_format(picture)
