@@ -150,10 +150,19 @@ def test_the_command_moves_map_and_written_poses_alike(tmp_path: Path) -> None:
     assert np.linalg.norm(moved, axis=1) == pytest.approx(np.linalg.norm(shift), abs=0.02)
 
 
-def test_control_that_is_no_file_is_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("no.csv", "no.csv: no such file"),
+        ("data", "data: is a folder, expected a table of objects"),
+        ("data/dataset.json", "dataset.json: control points of an unknown kind: .json"),
+    ],
+)
+def test_control_that_is_no_table_is_one_line(name: str, told: str, tmp_path: Path) -> None:
     write_dataset(simulate(SimulationConfig(streets_north_south=2, streets_east_west=2), seed=1), tmp_path / "data")
-    done = map_in(tmp_path, "--control", tmp_path / "no.csv")
+    done = map_in(tmp_path, "--control", tmp_path / name)
     assert done.returncode != 0
-    assert "no.csv: no such file" in done.stderr
+    assert told in done.stderr
+    assert "hint: give a table of objects as one of .csv, .parquet, .geojson, .gpkg, .fgb" in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "map").exists()

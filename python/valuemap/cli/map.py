@@ -28,9 +28,9 @@ from valuemap.config import MapConfig
 from valuemap.control import apply_control
 from valuemap.dataset import Dataset, read_dataset
 from valuemap.engine.choose import engine_named
-from valuemap.errors import InputError, SettingError
+from valuemap.errors import SettingError
 from valuemap.evaluate import evaluate_map
-from valuemap.evaluate.truth import read_truth
+from valuemap.evaluate.truth import check_objects_file, read_objects
 from valuemap.evidence import dataset_reference
 from valuemap.folders import check_files, check_place
 from valuemap.map_folder import Map, write_map
@@ -91,8 +91,8 @@ def map_command(
         check_files(picture.parent, [picture.name], force=force)
     if write_poses_to is not None:
         check_poses_place(write_poses_to, force=force)
-    if control is not None and not control.is_file():
-        raise InputError(f"{control}: no such file", hint="give a table of surveyed objects, such as a .csv")
+    if control is not None:
+        check_objects_file(control, "control points")
     given = None if calibration is None else read_calibration(calibration)
     with working(work, out, resume=resume) as place, progress_bars() as progress:
         run = Run(
@@ -125,9 +125,6 @@ def map_command(
 
 def _controlled(result: Map, data: Dataset, control: Path) -> tuple[Map, Dataset]:
     """Return the map and its dataset moved to control points."""
-    points = read_truth(control, result)
-    if isinstance(points, Dataset):
-        raise InputError(f"{control}: is a dataset", hint="give a table of surveyed objects, such as a .csv")
-    result, moved = apply_control(result, points, data)
+    result, moved = apply_control(result, read_objects(control, result), data)
     assert moved is not None
     return result, moved

@@ -84,15 +84,45 @@ def read_truth(path: Path, result: Map) -> Dataset | TrueObjects:
     """
     if path.is_dir():
         return read_dataset(path)
+    check_objects_file(path, "truth", "a dataset folder or ")
+    return read_objects(path, result)
+
+
+def check_objects_file(path: Path, what: str, or_else: str = "") -> None:
+    """Find out before long work whether `read_objects` knows what a file is by its name.
+
+    `what` the file is for, and what may be given `or_else`, go into what is said.
+
+    Raises
+    ------
+    InputError
+        The file is missing or of an unknown kind.
+    """
+    hint = f"give {or_else}a table of objects as one of {', '.join(_TRUTH_READERS)}"
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, expected a table of objects", hint=hint)
     if not path.is_file():
-        raise InputError(f"{path}: no such file or folder", hint="give a dataset folder or a file of objects")
-    suffix = Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
+        told = "is no file" if path.exists() else f"no such file{' or folder' if or_else else ''}"
+        raise InputError(f"{path}: {told}", hint=hint)
+    suffix = _suffix(path)
     if suffix not in _TRUTH_READERS or (suffix != ".csv" and path.suffix.lower() == ".gz"):
-        raise InputError(
-            f"{path}: truth of an unknown kind: {path.suffix or 'no suffix'}",
-            hint=f"give a dataset folder or one of {', '.join(_TRUTH_READERS)}",
-        )
-    table = _with_numbered_objects(_TRUTH_READERS[suffix](path))
+        raise InputError(f"{path}: {what} of an unknown kind: {path.suffix or 'no suffix'}", hint=hint)
+
+
+def _suffix(path: Path) -> str:
+    """Return what says the kind of a file."""
+    return (Path(path.stem) if path.suffix.lower() == ".gz" else path).suffix.lower()
+
+
+def read_objects(path: Path, result: Map) -> TrueObjects:
+    """Read a file of objects, as `read_truth` describes them, that `check_objects_file` lets pass.
+
+    Raises
+    ------
+    InputError
+        The file is damaged, or cannot be brought to the frame of the map.
+    """
+    table = _with_numbered_objects(_TRUTH_READERS[_suffix(path)](path))
     columns = {*table.column_names}
     has_position, has_place = {"x", "y", "z"} <= columns, {"lon", "lat"} <= columns
     anchor = result.frame.anchor
