@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -128,6 +129,16 @@ def test_a_file_of_points_has_geographic_places_and_deviations(tmp_path: Path) -
     moved, _ = apply_control(result, points)
     assert moved.labels.lon_lat_height is not None
     assert moved.labels.lon_lat_height[:, :2] == pytest.approx(places[:, :2], abs=1e-6)
+
+
+@pytest.mark.parametrize("columns", ["x,y,z", "lat,lon,height"])
+@pytest.mark.parametrize(("sigma", "shown"), [("-1", "-1"), ("0", "0"), ("1e30", "1e+30"), ("100.5", "100.5")])
+def test_a_deviation_that_is_none_is_refused_with_its_row(columns: str, sigma: str, shown: str, tmp_path: Path) -> None:
+    file = tmp_path / "points.csv"
+    file.write_text(f"{columns},sigma\n1,2,3,100\n4,5,6,\n7,8,9,{sigma}\n")
+    told = rf"points\.csv row 2: sigma: expected above 0 and at most 100 \(m\), or no value, found {re.escape(shown)} "
+    with pytest.raises(InputError, match=told):
+        read_truth(file, map_of(labels_around(7, 5), frame=Frame(anchor=ANCHOR)))
 
 
 def test_the_command_moves_map_and_written_poses_alike(tmp_path: Path) -> None:

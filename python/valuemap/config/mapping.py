@@ -10,6 +10,7 @@ from pydantic.dataclasses import dataclass
 
 from valuemap.config.setting import (
     CHECKED,
+    LARGEST_SIGMA_M,
     LONGEST_M,
     WIDEST_PX,
     Method,
@@ -102,7 +103,7 @@ class NoiseConfig(Settings):
     position_sigma_m: float | None = declare(
         None,
         unit="m",
-        high=100.0,
+        high=LARGEST_SIGMA_M,
         effect="standard deviation of a camera position, each axis",
         method="robust",
     )
@@ -116,7 +117,7 @@ class NoiseConfig(Settings):
     side_sigma_m: float | None = declare(
         None,
         unit="m",
-        high=100.0,
+        high=LARGEST_SIGMA_M,
         effect="standard deviation of the middle of an object's box, as one side of the object shows it, each axis",
         method="robust",
     )

@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from valuemap.config import VoteConfig
+from valuemap.config.setting import LARGEST_SIGMA_M
 from valuemap.csv_table import read_csv_arrow
 from valuemap.dataset import Dataset, Frame, read_dataset
 from valuemap.errors import InputError, SettingError
@@ -128,6 +129,7 @@ def read_objects(path: Path, result: Map) -> TrueObjects:
     anchor = result.frame.anchor
     if has_place and anchor is not None and ("height" in columns or not has_position):
         places = table_from_arrow(GeographicTruth, table, source=str(path))
+        _check_sigmas(places.sigma_m, path)
         return _objects_on_earth(places, anchor, result.labels)
     if has_place and not has_position:
         raise InputError(
@@ -135,7 +137,21 @@ def read_objects(path: Path, result: Map) -> TrueObjects:
             hint="give x, y, z in the frame of the map",
         )
     points = table_from_arrow(TruthPoints, table, source=str(path))
+    _check_sigmas(points.sigma_m, path)
     return _sorted_objects(points, points.position_in_world_m)
+
+
+def _check_sigmas(sigma_m: Floats | None, path: Path) -> None:
+    """Refuse standard deviations that are none; those that are not known are NaN."""
+    if sigma_m is None:
+        return
+    wrong = np.flatnonzero((sigma_m <= 0.0) | (sigma_m > LARGEST_SIGMA_M))
+    if len(wrong):
+        raise InputError(
+            f"{path} row {wrong[0]}: sigma: expected above 0 and at most {LARGEST_SIGMA_M:g} (m), or no value, found "
+            f"{sigma_m[wrong[0]]:g} ({len(wrong)} rows)",
+            hint="it is the standard deviation of the position on each axis; leave it empty where it is not known",
+        )
 
 
 def _with_numbered_objects(table: pa.Table) -> pa.Table:
