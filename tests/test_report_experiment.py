@@ -95,6 +95,26 @@ def test_too_few_passes_are_refused(tmp_path: Path) -> None:
     assert "try --min-passes" in caught.value.hint
     with pytest.raises(SettingError, match="seeds: expected at least 1, found 0"):
         experiment_passes(city().dataset, tmp_path / "b", seeds=0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_experiment_that_fails_before_its_first_map_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: Any, **__: Any) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patched, pytest.raises(MemoryError):
+        patched.setattr(experiment, "_measure", failing)
+        experiment_passes(city().dataset, tmp_path / "out", QUICK, seeds=1, min_passes=3)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_for_an_experiment_is_tried_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("mine")
+    monkeypatch.delattr(experiment, "build_map")
+    with pytest.raises(OutputError, match="cannot be written"):
+        experiment_passes(city().dataset, tmp_path / "file" / "out", QUICK, min_passes=3)
 
 
 @pytest.mark.parametrize("content", [None, "", "[]", '{"curves": {}}', '{"curves": {"recall": [{"x": 1}]}}'])

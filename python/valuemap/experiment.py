@@ -27,7 +27,7 @@ from valuemap.dataset import Dataset, number_passes, rows_of
 from valuemap.errors import InputError, OutputError, SettingError
 from valuemap.evaluate import TrueObjects, match_labels, recoverable_objects
 from valuemap.evidence import Evidence
-from valuemap.folders import new_file
+from valuemap.folders import check_place, new_file
 from valuemap.map_folder import Map
 from valuemap.paper.partition import partition_images
 from valuemap.pipeline import build_map
@@ -138,7 +138,8 @@ def experiment_passes(
     cluster = partition_images(dataset.images, config.partition).astype(np.int64)
     pass_number = number_passes(dataset.images)
     passes_of_cluster = _passes_of(cluster, pass_number)
-    _begin(out, _identity(dataset, config, radius_m))
+    identity = _identity(dataset, config, radius_m)
+    _check_folder(out, identity)
 
     everything = build_map(dataset, config, threads=threads, progress=progress)
     reference = _reference(dataset, everything, cluster)
@@ -152,6 +153,8 @@ def experiment_passes(
         run = _read_run(path)
         if run is None:
             run = _measure(dataset, config, reference, cluster, pass_number, seed, passes, radius_m, threads)
+            if not (out / MARKER).is_file():  # Not before there is anything to go on from.
+                _write_json(identity, out / MARKER)
             _write_json(run, path, force=True)  # One that is damaged is there, and is no use to anybody.
         runs.append(run)
     progress("maps of some passes", len(jobs), len(jobs))
@@ -375,21 +378,19 @@ def _bytes_of(value: Any) -> Iterable[bytes]:
         yield "\0".join(value.to_pylist()).encode()
 
 
-def _begin(out: Path, identity: dict[str, Any]) -> None:
-    """Make the folder, or find out that it holds the same experiment."""
+def _check_folder(out: Path, identity: dict[str, Any]) -> None:
+    """Find out whether the folder can be written to, and holds the same experiment if it holds any; nothing is made."""
     head = out / MARKER
     if out.is_dir() and any(out.iterdir()) and not head.is_file():
         raise OutputError(
             f"{out}: is a folder without {MARKER}, so it is not ours to write to", hint="choose another --out"
         )
-    if not head.is_file():
-        _write_json(identity, head)
-        return
-    if _read_run(head) != json.loads(json.dumps(identity)):
+    if head.is_file() and _read_run(head) != json.loads(json.dumps(identity)):
         raise SettingError(
             f"{out}: holds an experiment on other data or with other settings",
             hint="choose another --out, or remove the folder",
         )
+    check_place(out, parts=(RESULT,))
 
 
 def _read_run(path: Path) -> dict[str, Any] | None:
