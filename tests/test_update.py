@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from typer.testing import CliRunner
 
@@ -653,6 +654,38 @@ def test_what_cannot_be_updated_says_so(years: Path, tmp_path: Path) -> None:
     assert result.exit_code == 1
     assert "is not a map" in result.output
     assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize(("before", "again"), [("map", "first"), ("map2", "first"), ("map2", "second")])
+@pytest.mark.parametrize("in_portions", [False, True])
+def test_what_a_map_has_is_not_added_again(
+    before: str, again: str, in_portions: bool, years: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if in_portions:
+        monkeypatch.setattr(update, "LARGEST_IN_MEMORY", 0)
+    options = ["--add", years / again, "--out", tmp_path / "x"]
+    result = CliRunner().invoke(app, ["update", str(years / before), *map(str, options)])
+    assert result.exit_code == 1
+    count = len(valuemap.read_dataset(years / again).images)
+    told = f"expected images that the map does not have, found {count} of {count} that it has, such as '000.jpg'"
+    assert told in " ".join(result.output.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_images_are_the_same_by_name_pose_and_time(years: Path) -> None:
+    first = valuemap.read_dataset(years / "first").images
+    some = np.arange(10, 20)
+    same = first.take(some)
+    renamed = same.replace(pass_id=Categories.from_texts(["another"] * 10), image_id=same.image_id + 1000)
+    assert np.array_equal(join._same_images(first, renamed), np.arange(10))
+    assert np.array_equal(join._same_images(first, renamed.replace(timestamp_s=None)), np.arange(10))
+    assert np.array_equal(join._same_images(first.replace(timestamp_s=None), renamed), np.arange(10))
+    assert same.timestamp_s is not None
+    later = same.replace(timestamp_s=same.timestamp_s + np.where(some < 15, 0.0, 60.0))
+    assert np.array_equal(join._same_images(first, later), np.arange(5))
+    aside = same.replace(cam_from_world_m=same.cam_from_world_m + [0.0, 1e-9, 0.0])
+    assert len(join._same_images(first, aside)) == 0
+    assert len(join._same_images(first, same.replace(name=pa.array([f"{i}.png" for i in range(10)])))) == 0
 
 
 def test_an_update_is_one_run_where_poses_are_corrected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

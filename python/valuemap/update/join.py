@@ -10,7 +10,7 @@ import numpy as np
 
 from valuemap.dataset import Dataset, checked_as
 from valuemap.errors import InputError
-from valuemap.tables import Categories, Detections, Floats, Ints, Table, join_tables
+from valuemap.tables import Categories, Detections, Floats, Images, Ints, Table, join_tables
 
 T = TypeVar("T", bound=Table)
 _MOST_RUNS = 1000
@@ -26,7 +26,7 @@ def join_datasets(first: Dataset, second: Dataset) -> Dataset:
     Raises
     ------
     InputError
-        They are not in one frame.
+        They are not in one frame, or share images.
     """
     joined, added = _join_images(first, second)
     ids = _beyond(added.detection_id, first.detections.detection_id)
@@ -65,6 +65,7 @@ def _join_images(first: Dataset, second: Dataset) -> tuple[Dataset, Detections]:
             f"{second.frame.to_json()}",
             hint="import it again with the same origin",
         )
+    _refuse_same(first, second)
     cameras = second.cameras.replace(camera_id=_beyond(second.cameras.camera_id, first.cameras.camera_id))
     images = second.images.replace(
         image_id=_beyond(second.images.image_id, first.images.image_id),
@@ -86,6 +87,46 @@ def _join_images(first: Dataset, second: Dataset) -> tuple[Dataset, Detections]:
     )
     image_id = _renumbered(second.detections.image_id, second.images.image_id, images.image_id)
     return joined, second.detections.replace(image_id=image_id)
+
+
+def _refuse_same(first: Dataset, second: Dataset) -> None:
+    """Refuse images of the second that the first has: what they see would count twice, as if two drives had seen it."""
+    same = _same_images(first.images, second.images)
+    if len(same):
+        raise InputError(
+            f"{second.name}: expected images that the map does not have, found {len(same)} of "
+            f"{len(second.images)} that it has, such as {second.images.name[same[0]].as_py()!r}",
+            hint="add new passes only; new images of a camera that stands still need times or names of their own",
+        )
+
+
+def _same_images(first: Images, second: Images) -> Ints:
+    """Return the rows of the second that are images of the first, whatever their passes are called.
+
+    They have the same name, the same pose and, where both say it, the same time. No two drives are in the same place to
+    the last bit; names alone say nothing, as many cameras count from 1.
+    """
+    x, x_of_second = first.cam_from_world_m[:, 0], second.cam_from_world_m[:, 0]
+    rows = np.flatnonzero(np.isin(x_of_second, x))
+    times: dict[_NameAndPose, set[float | None]] = {}
+    for image, time in _identities(first.take(np.flatnonzero(np.isin(x, x_of_second[rows])))):
+        times.setdefault(image, set()).add(time)
+    is_same = [
+        image in times and (time is None or None in times[image] or time in times[image])
+        for image, time in _identities(second.take(rows))
+    ]
+    return rows[np.array(is_same, np.bool_)]
+
+
+_NameAndPose = tuple[str, tuple[float, ...]]
+
+
+def _identities(images: Images) -> Iterator[tuple[_NameAndPose, float | None]]:
+    """Yield name with pose, and time, of each image; a time that is not known is None."""
+    poses = np.column_stack([images.cam_from_world_quat, images.cam_from_world_m]).tolist()
+    times = _missing(len(images)) if images.timestamp_s is None else images.timestamp_s
+    for name, pose, time in zip(images.name.to_pylist(), poses, times.tolist(), strict=True):
+        yield (name, tuple(pose)), None if np.isnan(time) else time
 
 
 def _joined(first: T, second: T) -> T:

@@ -92,7 +92,8 @@ def update_map(
     Raises
     ------
     InputError
-        One of the folders is not what it should be, the map was not made by this version, or the frames differ.
+        One of the folders is not what it should be, the map was not made by this version, the frames differ, or the
+        map has images of the dataset already.
     """
     place = find_dataset(old, read_record(old), dataset)
     if place is None:
