@@ -37,6 +37,7 @@ PAGES = [*sorted((ROOT / "docs").rglob("*.md")), *sorted(ROOT.glob("*.md")), ROO
 TUTORIALS = ("colmap", "panoramas", "detector", "large")
 NEEDS_A_BROWSER = ("view", "demo")
 _LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+_PRINTED = re.compile(r"^print\(.*\)  # (.*)$", re.MULTILINE)
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 
 
@@ -259,14 +260,17 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("tutorial", TUTORIALS)
-def test_tutorials_run_as_they_stand(tutorial: str, desk: Path) -> None:
-    """All blocks in their order; what opens a browser is only looked up."""
+def test_tutorials_run_as_they_stand(tutorial: str, desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """All blocks in their order; what opens a browser is only looked up, and what Python prints is as the page says."""
     page = ROOT / "docs" / "tutorials" / f"{tutorial}.md"
     if tutorial in ("detector", "large"):  # These begin with a dataset.
         write_dataset(small_dataset(), desk / "my-data")
     for language, code in _FENCE.findall(page.read_text(encoding="utf-8")):
         if language == "python":
+            capsys.readouterr()
             exec(compile(code, page.name, "exec"), {})
+            printed = capsys.readouterr().out
+            assert [said for said in _PRINTED.findall(code) if said not in printed] == [], printed
         elif language == "sh":
             for line in code.splitlines():
                 run(shlex.split(line.split(" # ")[0]))
