@@ -122,6 +122,9 @@ def test_an_image_between_two_poses_of_tum_is_between_them(tmp_path: Path) -> No
     assert_allclose(turned, [0, 0, 22.5], atol=1e-9)
     only_exact = read_tum(tmp_path / "t.txt", **{**options, "longest_gap_s": 0.5})
     assert only_exact.images.name.to_pylist() == ["rgb/b.png"]
+    for gap in (np.nan, np.inf, -1.0):
+        said = refusal(lambda gap=gap: read_tum(tmp_path / "t.txt", **{**options, "longest_gap_s": gap}))  # type: ignore[misc]
+        assert f"longest-gap: expected seconds from 0 to 1e+09, found {gap:g}" in said
 
 
 # kapture.

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
-from valuemap.errors import InputError
+from valuemap.errors import InputError, SettingError
 from valuemap.geodesy import (
     enu_axes_at,
     enu_from_lon_lat_height,
@@ -24,6 +24,8 @@ from valuemap.tables import Bools, Categories, Floats, Images, Ints
 
 _ROTATION_TOLERANCE = 1e-3
 _LARGEST_M = 1e8
+_LONGEST_GAP_S = 1e9
+_NANO = 1_000_000_000
 
 # Columns are the axes of a level camera that looks north: x east, y down, z north.
 LOOKING_NORTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -235,6 +237,22 @@ def rigs_by_time(
         together.add(cameras[row])
         rigs[row] = f"{number:012d}"
     return rigs
+
+
+def nanoseconds_of_gap(longest_gap_s: float) -> int:
+    """Return how long a gap between poses may be, of seconds that somebody set, in nanoseconds.
+
+    Raises
+    ------
+    SettingError
+        It is below 0, or no number of seconds.
+    """
+    if not 0.0 <= longest_gap_s <= _LONGEST_GAP_S:
+        raise SettingError(
+            f"longest-gap: expected seconds from 0 to {_LONGEST_GAP_S:g}, found {longest_gap_s:g}",
+            hint="for example 0.2; 0 takes only images at the time of a pose",
+        )
+    return int(longest_gap_s * _NANO)
 
 
 def interpolate_poses(

@@ -17,7 +17,7 @@ from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, FoundBoxes, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
-from valuemap.readers.poses import interpolate_poses, make_images, rigs_by_time
+from valuemap.readers.poses import interpolate_poses, make_images, nanoseconds_of_gap, rigs_by_time
 from valuemap.readers.reader import Reader
 from valuemap.tables import Floats, Images, Ints
 
@@ -137,6 +137,7 @@ def read_ros(
         There is no such topic or frame, or the package rosbags is not installed.
     """
     bag = _Bag()
+    longest = nanoseconds_of_gap(longest_gap_s)
     with _open(bags) as reader:
         _read_messages(reader, bag, pose_topic, body_frame, rectified, progress)
     if not bag.cameras:
@@ -148,7 +149,7 @@ def read_ros(
     names, rotations, centers, frames, times = [], [], [], [], []
     for frame in sorted(frame_of):
         stamps = np.array([stamp for other, stamp in images_at if other == frame], dtype=np.int64)
-        rotation, center = _chain(frame_of[frame], world_frame, bag, stamps, int(longest_gap_s / _NANO), bags[0])
+        rotation, center = _chain(frame_of[frame], world_frame, bag, stamps, longest, bags[0])
         rotations.append(rotation)
         centers.append(center)
         times.append(stamps)

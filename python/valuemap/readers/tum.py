@@ -12,7 +12,13 @@ from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
 from valuemap.readers.cameras_of import make_cameras, parse_camera
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import read_text
-from valuemap.readers.poses import AXES, interpolate_poses, make_images, rotations_of_quaternions
+from valuemap.readers.poses import (
+    AXES,
+    interpolate_poses,
+    make_images,
+    nanoseconds_of_gap,
+    rotations_of_quaternions,
+)
 from valuemap.readers.reader import Reader
 from valuemap.tables import Floats, Ints
 
@@ -66,6 +72,7 @@ def read_tum(
     """
     if axes not in AXES:
         raise SettingError(f"axes {axes}: there are none such", hint=f"one of {', '.join(AXES)}")
+    longest = nanoseconds_of_gap(longest_gap_s)
     progress("reading the trajectory", 0, 2)
     texts, rows = _rows(trajectory)
     time = _nanoseconds(texts, trajectory)
@@ -76,7 +83,7 @@ def read_tum(
     names = [f"{text}.png" for text in texts]
     if image_list is not None:
         image_time, names = _read_list(image_list)
-        rotation, center, usable = interpolate_poses(image_time, time, rotation, center, int(longest_gap_s * _NANO))
+        rotation, center, usable = interpolate_poses(image_time, time, rotation, center, longest)
         if not usable.any():
             raise InputError(
                 f"{image_list}: no image is within the time of the trajectory, {texts[0]} to {texts[-1]}",
