@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
+from valuemap.anchor import is_place
 from valuemap.cli.app import app
 from valuemap.cli.options import AsJson, Force
 from valuemap.cli.show import log, out, show
@@ -20,6 +21,8 @@ from valuemap.rejected import find_rejected
 
 if TYPE_CHECKING:
     from valuemap.tables import Floats
+
+_FARTHEST_M = 1e9
 
 
 @app.command("show")
@@ -53,6 +56,7 @@ def show_command(
             "show: expected a label, or a place as --at X Y or as --lat and --lon",
             hint="for example valuemap show MAP 12, or valuemap show MAP --at 105.2 48.9",
         )
+    _check_place(at, lat, lon)
     picture = file if file is not None else Path(f"label-{label}.png" if label is not None else "place.png")
     check_format(picture)
     result = read_map(map_)
@@ -109,6 +113,19 @@ def _label_facts(evidence: Evidence, label: int) -> dict[str, Any]:
     if labels.lon_lat_height is not None:
         facts |= dict(zip(("lon", "lat", "height"), map(float, labels.lon_lat_height[row]), strict=True))
     return facts
+
+
+def _check_place(at: tuple[float, float] | None, lat: float | None, lon: float | None) -> None:
+    if at is not None and not all(abs(metres) <= _FARTHEST_M for metres in at):
+        raise SettingError(
+            f"--at {at[0]:g} {at[1]:g}: expected metres, at most {_FARTHEST_M:g} from the origin of the map",
+            hint="for example --at 105.2 48.9; valuemap view shows where the map is",
+        )
+    if lat is not None and lon is not None and not is_place(lat, lon, 0.0):
+        raise SettingError(
+            f"--lat {lat:g} --lon {lon:g}: expected a latitude from -90 to 90 and a longitude from -360 to 360",
+            hint="both are in degrees: for example --lat 51.5 --lon -0.14",
+        )
 
 
 def _place(evidence: Evidence, at: tuple[float, float] | None, lat: float | None, lon: float | None) -> Floats:
