@@ -872,6 +872,13 @@ def test_impossible_kitti_cameras_are_setting_errors(tmp_path: Path, spoil: dict
         read_kitti(**{**write_kitti(tmp_path), **spoil})
 
 
+@pytest.mark.parametrize("heading", [np.nan, np.inf, 361.0])
+def test_a_heading_that_is_none_is_not_blamed_on_the_anchor(tmp_path: Path, heading: float) -> None:
+    arguments = write_kitti(tmp_path)
+    said = refusal(lambda: read_kitti(**arguments, anchor=(51.0, 0.0, 5.0), heading_deg=heading))
+    assert said.startswith(f"heading: expected degrees from -360 to 360, found {heading:g} | ")
+
+
 def test_missing_kitti_files(tmp_path: Path) -> None:
     for name in ("poses", "detections"):
         arguments = {**write_kitti(tmp_path), name: tmp_path / "absent"}

@@ -177,7 +177,12 @@ def _centers(world_from_cam0: Floats, projection: Floats) -> Floats:
 
 
 def _turned(world_from_cam: Floats, heading_deg: float, anchor: tuple[float, float, float] | None) -> Floats:
-    if anchor is None or not np.isfinite(heading_deg):
+    if not abs(heading_deg) <= 360.0:
+        raise SettingError(
+            f"heading: expected degrees from -360 to 360, found {heading_deg:g}",
+            hint="it counts clockwise from north: 90 is east",
+        )
+    if anchor is None:
         raise SettingError(f"heading {heading_deg:g}: goes with an anchor", hint="give --anchor LAT LON HEIGHT too")
     turn = local_from_cam(np.radians([heading_deg]), np.zeros(1), np.zeros(1))[0]
     turned: Floats = turn @ world_from_cam
