@@ -323,6 +323,13 @@ def test_bad_tables(tmp_path: Path, header: str, row: str, options: dict[str, An
     assert said in refusal(lambda: read_csv_poses(poses, **{"camera": CAMERA, **options}))
 
 
+def test_boxes_that_cannot_be_used_are_said_to_be_in_their_file(tmp_path: Path) -> None:
+    poses = poses_of(tmp_path, "image,lat,lon,heading_deg", "a.jpg,52,4,1")
+    boxes = boxes_of(tmp_path, ("a.jpg", 3, 1e6))
+    said = refusal(lambda: read_csv_poses(poses, camera=CAMERA, detections=boxes))
+    assert said.startswith(f"{boxes}: 1 of 1 boxes cannot be used")
+
+
 @pytest.mark.parametrize("how", SPOILS)
 def test_files_that_are_no_tables(tmp_path: Path, how: str) -> None:
     poses = poses_of(tmp_path, "image,lat,lon,heading_deg", "a.jpg,52,4,1")

@@ -51,6 +51,8 @@ class FoundBoxes:
         Standard deviations (N) of the centre's y, NaN where it is that of its x.
     are_points
         The boxes are directions without a size, so that a size of 0 is right.
+    source
+        What errors name as the place of the boxes, where it is not that of the images.
     """
 
     image_row: Ints
@@ -65,6 +67,7 @@ class FoundBoxes:
     range_sigma_m: Floats | None = None
     vertical_sigma_px: Floats | None = None
     are_points: bool = False
+    source: str | None = None
 
     @staticmethod
     def none() -> FoundBoxes:
@@ -105,6 +108,7 @@ class FoundBoxes:
             where=self.where,
             has_ids=self.detection_id is not None,
             are_points=self.are_points,
+            source=self.source,
         )
 
 
@@ -127,6 +131,8 @@ class FiledBoxes:
         Whether all have ids of their own.
     are_points
         The boxes are directions without a size.
+    source
+        As of `FoundBoxes`.
     picture_px
         Width and height (M, 2) of the pictures of which centres and sizes are fractions.
     shift_px, full_score
@@ -140,6 +146,7 @@ class FiledBoxes:
     where: Callable[[int], str]
     has_ids: bool = False
     are_points: bool = False
+    source: str | None = None
     picture_px: Floats | None = None
     shift_px: float = 0.0
     full_score: float = 1.0

@@ -272,5 +272,6 @@ def _detections(
         score=(table.numbers("score") if table.has_optional("score") else np.full(len(frame), file.full_score))
         / file.full_score,
         where=table.line,
+        source=str(file.path),
         image_names=[f"frame {number:.17g}" for number in frame.tolist()],
     )

@@ -151,11 +151,11 @@ class Rejections:
                 of_table[text] = of_table.get(text, 0) + count
         return {table: dict(sorted(by.items(), key=lambda item: (-item[1], item[0]))) for table, by in counts.items()}
 
-    def add(self, part: _LeftOut) -> None:
-        """Take rows; raise `InputError` where they are too many of all."""
+    def add(self, part: _LeftOut, source: str | None = None) -> None:
+        """Take rows, of another source where it is given; raise `InputError` where they are too many of all."""
         if len(part.rows):
             self._parts.append(part)
-            part.refuse_too_many(self.source, self.max_share)
+            part.refuse_too_many(source or self.source, self.max_share)
 
     def add_unreadable(self, reason_of: Mapping[str, str]) -> None:
         """Take pictures that cannot be read at all, by name."""
@@ -304,7 +304,7 @@ def vet_boxes(
             by_number.append(part, part["detection_id"])
         else:
             in_order.append(part[_order(*(part[name] for name in ("image", "class", "center", "size", "score")))])
-    rejections.add(left_out.all())
+    rejections.add(left_out.all(), boxes.source)
 
     def portions() -> Iterator[Detections]:
         for ids, part in _by_id(by_number) if has_ids else _counted(in_order):

@@ -130,6 +130,7 @@ def find_images(boxes: NamedBoxes, images: Images, cameras: Cameras, file: Detec
         where=boxes.where,
         has_ids=boxes.has_ids,
         are_points=boxes.are_points,
+        source=str(file.path),
         picture_px=picture_px if boxes.fractions else None,
         shift_px=0.5 - file.pixel_center,
         full_score=file.full_score,
