@@ -215,6 +215,12 @@ PINHOLE_PARAMS = [[500.0, 500.0, 320.0, 240.0], [600.0, 600.0, 400.0, 300.0, 0.0
         ),
         (
             "images",
+            with_value("qw", 1, 1e200),
+            r"row with image_id 20: qw qx qy qz: expected a quaternion of length 1, found length inf",
+            "w, x, y, z",
+        ),
+        (
+            "images",
             lambda t: with_value("qw", 1, 0.0)(with_value("qx", 1, 0.0)(t)),
             r"row with image_id 20: qw qx qy qz: expected a quaternion of length 1, found length 0 ",
             "w, x, y, z",

@@ -455,12 +455,12 @@ IMAGES_TXT = "11 1 0 0 0 0 0 0 3 a/0.jpg\n\n12 1 0 0 0 -1 0 0 3 a/1.jpg\n1 2 -1 
         (
             CAMERAS_TXT,
             IMAGES_TXT.replace("12 1", "12 2"),
-            "1 of 2 images cannot be used, more than 1 %: its quaternion is not of length 1 (1, the first is ",
+            "1 of 2 images cannot be used, more than 1 %: its quaternion is not of length 1, or ",
         ),
         (
             CAMERAS_TXT,
             IMAGES_TXT.replace("12 1", "12 0"),
-            "1 of 2 images cannot be used, more than 1 %: its quaternion is not of length 1 (1, the first is ",
+            "1 of 2 images cannot be used, more than 1 %: its quaternion is not of length 1, or ",
         ),
     ],
 )

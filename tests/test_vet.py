@@ -209,7 +209,7 @@ def test_a_quaternion_that_is_none_is_no_pose() -> None:
         **{**vars(small), "cam_from_world_quat": spoilt(small.cam_from_world_quat, 3, [0.0, 0.0, 0.0, 0.0])}
     )
     dataset = assembled(boxes(), images, max_rejected=0.25, where_image=lambda row: f"poses.csv line {row + 2}")
-    assert reasons(dataset)[0] == ("poses.csv line 5", "its quaternion is not of length 1")
+    assert reasons(dataset)[0] == ("poses.csv line 5", "its quaternion is not of length 1, or its matrix no rotation")
 
 
 def test_the_order_of_boxes_does_not_matter() -> None:

@@ -23,7 +23,6 @@ from valuemap.readers.files import check_names
 from valuemap.tables import Bools, Categories, Floats, Images, Ints
 
 _ROTATION_TOLERANCE = 1e-3
-_LARGEST_M = 1e8
 _LONGEST_GAP_S = 1e9
 _NANO = 1_000_000_000
 
@@ -131,10 +130,14 @@ def local_from_cam(heading_rad: Floats, pitch_rad: Floats, roll_rad: Floats) -> 
 
 
 def rotations_of_quaternions(quaternion_wxyz: Floats) -> Floats:
-    """Return rotations (N, 3, 3) of quaternions (N, 4) in the order w, x, y, z; NaN where one is not of unit length."""
-    length = np.linalg.norm(quaternion_wxyz, axis=1)
+    """Return rotations (N, 3, 3) of quaternions (N, 4) in the order w, x, y, z.
+
+    They are zeros where a quaternion is not of unit length, and NaN where it has none.
+    """
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(quaternion_wxyz, axis=1)
     fine: Bools = np.abs(length - 1.0) < _ROTATION_TOLERANCE
-    matrix = np.full((len(fine), 3, 3), np.nan)
+    matrix = np.where(np.isfinite(quaternion_wxyz).all(axis=1), 0.0, np.nan)[:, None, None] * np.ones((1, 3, 3))
     if fine.any():
         matrix[fine] = Rotation.from_quat(quaternion_wxyz[fine], scalar_first=True).as_matrix()
     return matrix
@@ -154,7 +157,9 @@ def make_images(
     position_sigma_m: Floats | None = None,
     rotation_sigma_rad: Floats | None = None,
 ) -> Images:
-    """Return images of poses in any order; a pose that is no rigid motion becomes NaN, to be left out with its reason.
+    """Return images of poses in any order, with what is wrong with a pose kept, to be left out with its reason.
+
+    A pose of which a number is missing becomes NaN, and a rotation that is none a quaternion of zeros.
 
     Parameters
     ----------
@@ -187,7 +192,7 @@ def make_images(
             f"{source}: {len(repeated)} image names occur more than once, the first is {min(repeated)!r}",
             hint="detections are matched by file name: give every image a name of its own",
         )
-    usable = _usable(world_from_cam, center_in_world_m)
+    is_given, is_motion = _given_and_motions(world_from_cam, center_in_world_m)
     if image_id is None:
         order = np.array(sorted(range(len(names)), key=lambda row: names[row]), dtype=np.int64)
         ids: Ints = np.arange(len(names), dtype=np.int64)
@@ -195,7 +200,8 @@ def make_images(
         order = np.argsort(image_id, kind="stable")
         ids = image_id[order]
     quaternion, translation = np.full((len(names), 4), np.nan), np.full((len(names), 3), np.nan)
-    fine = usable[order]
+    quaternion[is_given[order]] = translation[is_given[order]] = 0.0
+    fine = is_motion[order]
     if fine.any():
         cam_from_world = Rotation.from_matrix(world_from_cam[order][fine]).inv()
         quaternion[fine] = cam_from_world.as_quat(canonical=True, scalar_first=True)
@@ -262,9 +268,9 @@ def interpolate_poses(
 
     Poses turn about one axis and move straight between neighbours. There is none outside the known times, nor in gaps
     longer than `longest`, in which it may have been anywhere. Known times (M) are in any order, and distinct; poses
-    that hold no numbers are not known.
+    that hold no numbers, or no rotation, are not known.
     """
-    fine: Bools = np.asarray(np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(center_m).all(axis=1))
+    _, fine = _given_and_motions(rotation, center_m)
     if not fine.any():
         count = len(time)
         return np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan), np.zeros(count, dtype=np.bool_)
@@ -284,12 +290,11 @@ def interpolate_poses(
     return turned.as_matrix(), moved, usable
 
 
-def _usable(rotation: Floats, center_m: Floats) -> Bools:
-    """Return which poses (N) are rigid motions of sensible lengths; the others are left out when all is assembled."""
-    finite: Bools = np.asarray(np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(center_m).all(axis=1))
+def _given_and_motions(rotation: Floats, center_m: Floats) -> tuple[Bools, Bools]:
+    """Return which poses (N) have all their numbers, and which are rigid motions."""
+    is_given: Bools = np.asarray(np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(center_m).all(axis=1))
     with np.errstate(invalid="ignore", over="ignore"):
         error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        near = np.abs(center_m).max(axis=1) < _LARGEST_M
-    right = np.linalg.det(np.where(finite[:, None, None], rotation, 0.0)) > 0.0
-    usable: Bools = finite & near & (error <= _ROTATION_TOLERANCE) & right
-    return usable
+    is_rotation = error <= _ROTATION_TOLERANCE
+    right = np.linalg.det(np.where((is_given & is_rotation)[:, None, None], rotation, 0.0)) > 0.0
+    return is_given, is_given & is_rotation & right

@@ -21,6 +21,7 @@ MAX_REJECTED = 0.01
 
 _QUATERNION_TOLERANCE = 1e-3
 _MAX_SIZE_OF_PICTURE = 2.0
+_FARTHEST_M = 1e8
 _SHOWN_REASONS = 3
 
 
@@ -59,7 +60,11 @@ _TWICE = _Reason("the same box is there already", "was the file put together fro
 _LEFT_OUT = _Reason("its image was left out", "repair the image first", counts=False)
 _POSE_NOT_FINITE = _Reason("a number of its pose is missing or not finite", "repair the poses of these images")
 _NO_ROTATION = _Reason(
-    "its quaternion is not of length 1", "quaternions are w, x, y, z and rotate the world into the camera"
+    "its quaternion is not of length 1, or its matrix no rotation",
+    "are the numbers in the order that the format says, as w, x, y, z?",
+)
+_TOO_FAR = _Reason(
+    f"it is more than {_FARTHEST_M:g} m from the origin", "are the positions in metres, in one frame of the world?"
 )
 
 
@@ -244,6 +249,7 @@ def vet_images(
     with np.errstate(invalid="ignore", over="ignore"):
         length = np.linalg.norm(images.cam_from_world_quat, axis=1)
         why.mark(~(np.abs(length - 1.0) <= _QUATERNION_TOLERANCE), _NO_ROTATION)
+        why.mark(~(np.linalg.norm(images.cam_from_world_m, axis=1) <= _FARTHEST_M), _TOO_FAR)
 
     def described(rows: Ints, texts: Sequence[str]) -> Iterator[RejectedRows]:
         names = [str(images.name[row].as_py()) for row in rows.tolist()]
