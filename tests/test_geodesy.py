@@ -160,13 +160,18 @@ def test_what_heights_cannot_count_from(crs: str | None, vertical: str, said: st
 
 def test_heights_of_a_vertical_system_need_its_grid() -> None:
     """In London the geoid EGM96 lies 46 m above the ellipsoid; where PROJ lacks the grid, that is one line."""
-    system, zero_m = with_heights("EPSG:32630", "EPSG:5773")
-    assert system is not None
-    assert zero_m == 0.0
-    place = np.array([[-0.14, 51.5, 100.0]])
     if PROJ_DATA.is_absolute() and any(PROJ_DATA.rglob("us_nga_egm96_15.tif")):
+        system, zero_m = with_heights("EPSG:32630", "EPSG:5773")
+        assert system is not None
+        assert zero_m == 0.0
+        place = np.array([[-0.14, 51.5, 100.0]])
         assert crs_from_lon_lat_height(place, system)[0, 2] == pytest.approx(100.0 - 46.0, abs=1.5)
         return
-    with pytest.raises(SettingError) as refusal:
-        crs_from_lon_lat_height(place, system)
-    assert "--vertical with the metres" in refusal.value.hint
+    for crs in (None, "EPSG:32630"):  # With the first PROJ has a system of its own, EPSG:9707.
+        with pytest.raises(SettingError) as refusal:
+            with_heights(crs, "EPSG:5773")
+        assert str(refusal.value) == (
+            "vertical EPSG:5773: its heights cannot be brought to the ellipsoid: "
+            "Grid us_nga_egm96_15.tif is not available"
+        )
+        assert "--vertical in metres" in refusal.value.hint

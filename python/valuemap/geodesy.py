@@ -7,6 +7,7 @@ Earth below it. Who knows a heading, or a pose relative to the horizon, at some 
 
 from __future__ import annotations
 
+import re
 import warnings
 from typing import Any
 
@@ -104,7 +105,7 @@ def with_heights(crs: str | None, vertical: str | None) -> tuple[str | None, flo
     Raises
     ------
     SettingError
-        There is no such vertical system, or `crs` has heights of its own.
+        There is no such vertical system, PROJ lacks the grid that it needs, or `crs` has heights of its own.
     """
     if vertical is None:
         return crs, 0.0
@@ -131,12 +132,21 @@ def with_heights(crs: str | None, vertical: str | None) -> tuple[str | None, flo
             raise SettingError(
                 f"vertical {vertical}: {above.name} is no vertical system", hint="for example EPSG:5773, which is EGM96"
             )
-        return CompoundCRS(f"{below.name} + {above.name}", [below, above]).to_string(), 0.0
+        system = CompoundCRS(f"{below.name} + {above.name}", [below, above]).to_string()
     except ProjError as error:
-        reason = " ".join(str(error).split())[:200]
+        reason = _reason(error)
         raise SettingError(
             f"vertical {vertical}: there is no such system: {reason}", hint="for example EPSG:5773, or metres: 47.2"
         ) from error
+    try:
+        _transformer(system)
+    except ProjError as error:
+        raise SettingError(
+            f"vertical {vertical}: its heights cannot be brought to the ellipsoid: {_reason(error)}",
+            hint="projsync or PROJ_NETWORK=ON gets a grid that PROJ lacks; or give --vertical in metres, how far the "
+            "sea level lies above the ellipsoid of WGS84",
+        ) from error
+    return system, 0.0
 
 
 _GREATEST_UNDULATION_M = 150.0
@@ -153,7 +163,7 @@ def _known_system(crs: str) -> Any:
     try:
         return _system(crs)
     except ProjError as error:
-        reason = " ".join(str(error).split())[:200]
+        reason = _reason(error)
         raise SettingError(f"crs {crs!r}: there is no such system: {reason}", hint="for example EPSG:32610") from error
 
 
@@ -198,17 +208,29 @@ def true_axes_of_crs(position: Floats, crs: str) -> Floats:
     return np.array(rows).transpose(2, 0, 1)
 
 
-def _to_wgs84(crs: str) -> Any:
+def _reason(error: Exception) -> str:
+    """Return what PROJ says in one line, of a grid that it lacks only its name."""
+    text = " ".join(str(error).split())
+    lacking = re.search(r"Grid \S+ is not available", text)
+    return lacking.group() if lacking else text[:200]
+
+
+def _transformer(crs: str) -> Any:
     from pyproj import Transformer
+
+    system = _system(crs)
+    # Without a vertical axis heights stay those of WGS84: those of other ellipsoids differ by up to 100 m and more.
+    target = "EPSG:4979" if len(system.axis_info) == 3 else "EPSG:4326"
+    return Transformer.from_crs(system, target, always_xy=True, only_best=True, allow_ballpark=False)
+
+
+def _to_wgs84(crs: str) -> Any:
     from pyproj.exceptions import ProjError
 
     try:
-        system = _system(crs)
-        # Without a vertical axis heights stay those of WGS84: those of other ellipsoids differ by up to 100 m and more.
-        target = "EPSG:4979" if len(system.axis_info) == 3 else "EPSG:4326"
-        return Transformer.from_crs(system, target, always_xy=True, only_best=True, allow_ballpark=False)
+        return _transformer(crs)
     except ProjError as error:
-        reason = " ".join(str(error).split())[:200]
+        reason = _reason(error)
         raise SettingError(
             f"crs {crs!r}: cannot be brought to WGS84: {reason}",
             hint="give a code such as EPSG:32610, or 4979; heights above the sea need a grid that PROJ must have "
