@@ -270,12 +270,6 @@ PINHOLE_PARAMS = [[500.0, 500.0, 320.0, 240.0], [600.0, 600.0, 400.0, 300.0, 0.0
         ),
         (
             "detections",
-            with_column("score", [1.0000001, 1.0, 2.0, -0.1, 0.0]),
-            r"row with detection_id 102: score: expected 0 to 1, found 2\.0 \(2 rows\)$",
-            "percentages",
-        ),
-        (
-            "detections",
             with_column("range_m", [None, 5.0, 0.0, -1.0, 5.0]),
             r"row with detection_id 102: range_m: expected above 0, or no value, found 0\.0 \(2 rows\)$",
             "repair",

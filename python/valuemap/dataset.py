@@ -60,8 +60,6 @@ _FOCAL_LENGTHS = ("f", "fx", "fy")
 _LONGEST_READOUT_S = 1.0
 """Of a picture: rolling shutters take hundredths of a second, so that more is milliseconds."""
 _ROUNDING = 1e-12
-_ROUNDING_OF_SCORES = 1e-6
-"""Detectors compute in float32, where a probability may come out a little above 1."""
 _LEADS_OUT = r"^/|^[A-Za-z]:|^\\\\|(^|[/\\])\.\.([/\\]|$)|\x00"
 
 
@@ -309,7 +307,7 @@ def check_dataset(dataset: Dataset, *, source: str, are_boxes_checked: bool = Tr
     ------
     InputError
         An unknown camera model or id, a quaternion that is not of unit length, a detection of an unknown
-        image, outside its picture by more than a box, or with a size or score that cannot be.
+        image, outside its picture by more than a box, or with a size that cannot be.
     """
     check_cameras(dataset.cameras, source)
     images = check_images(dataset.images, dataset.cameras, source)
@@ -513,15 +511,6 @@ def check_detections(
     for i, name in enumerate(("width", "height")):
         _refuse(is_negative[:, i], size_px[:, i], ids, *where, name, "expected at least 0 px")
         _refuse(is_too_large[:, i], size_px[:, i], ids, *where, name, f"expected at most {_LARGEST_PX:g} px")
-    _refuse(
-        (detections.score < -_ROUNDING_OF_SCORES) | (detections.score > 1.0 + _ROUNDING_OF_SCORES),
-        detections.score,
-        ids,
-        *where,
-        "score",
-        "expected 0 to 1",
-        hint="scores are probabilities: divide percentages by 100",
-    )
     for name in ("range_m", "range_sigma_m", "vertical_sigma_px"):
         _check_positive(getattr(detections, name), ids, *where, name)
     extent_px = np.column_stack([cameras.width_px, cameras.height_px])
