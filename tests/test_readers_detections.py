@@ -303,7 +303,7 @@ def test_options_that_cannot_be(tmp_path: Path) -> None:
     path = detections_in(tmp_path, "csv")
     assert "there is no such format" in refusal(lambda: read(tmp_path, DetectionFile(path, format="voc")))
     assert "full-score: expected above 0" in refusal(lambda: DetectionFile(path, full_score=0.0))
-    assert "pixel-center: expected 0 or 0.5" in refusal(lambda: DetectionFile(path, pixel_center=1.0))
+    assert "detection-pixel-center: expected 0 or 0.5" in refusal(lambda: DetectionFile(path, pixel_center=1.0))
     path.rename(tmp_path / "boxes.dat")
     assert "does not say the format" in refusal(lambda: read(tmp_path, tmp_path / "boxes.dat"))
     assert len(read(tmp_path, DetectionFile(tmp_path / "boxes.dat", format="csv")).detections) == 1

@@ -52,7 +52,9 @@ class DetectionFile:
         if not 0.0 < self.full_score < float("inf"):
             raise SettingError(f"full-score: expected above 0, found {self.full_score:g}", hint="for example 100")
         if self.pixel_center not in (0.0, 0.5):
-            raise SettingError(f"pixel-center: expected 0 or 0.5, found {self.pixel_center:g}", hint="COLMAP has 0.5")
+            raise SettingError(
+                f"detection-pixel-center: expected 0 or 0.5, found {self.pixel_center:g}", hint="COLMAP has 0.5"
+            )
 
 
 @dataclass(frozen=True, eq=False)
