@@ -305,6 +305,18 @@ def test_key_points_as_fractions_of_a_panorama(tmp_path: Path) -> None:
         ),
         ("image,lat,lon,heading_deg", "a.jpg,52,4,1", {"camera": None}, "where no camera is given"),
         (
+            "image,lat,lon,heading_deg",
+            "a.jpg,52,4,1",
+            {"camera": "PINHOLE 640 480 500 nan 320 240"},
+            "camera 'PINHOLE 640 480 500 nan 320 240': fy: expected a finite number",
+        ),
+        (
+            "image,lat,lon,heading_deg",
+            "a.jpg,52,4,1",
+            {"camera": "PINHOLE 640 480 500"},
+            "PINHOLE has the parameters fx, fy, cx, cy, found 1 numbers",
+        ),
+        (
             "image,x,y,heading_deg",
             "a.jpg,52,4,1",
             {"crs": "EPSG:123456"},

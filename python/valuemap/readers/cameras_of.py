@@ -101,7 +101,7 @@ def parse_camera(text: str, pixel_center: float = 0.5) -> Camera:
     Raises
     ------
     SettingError
-        There is no such model, or it has another number of parameters.
+        There is no such model, it has another number of parameters, or one of them is not finite.
     """
     hint = 'for example "PINHOLE 1242 375 721.5 721.5 609.6 172.9" or "EQUIRECTANGULAR 8192 4096"'
     name, *rest = text.split() or [""]
@@ -118,8 +118,13 @@ def parse_camera(text: str, pixel_center: float = 0.5) -> Camera:
     if name == "EQUIRECTANGULAR":
         params = params or [float(width), float(height)]
     names = [part.strip() for part in expected.split(",")]
-    if len(params) != len(names) or not np.isfinite(params).all():
-        raise SettingError(f"camera {text!r}: {name} has the parameters {', '.join(names)}", hint=hint)
+    if len(params) != len(names):
+        raise SettingError(
+            f"camera {text!r}: {name} has the parameters {', '.join(names)}, found {len(params)} numbers", hint=hint
+        )
+    odd = [key for key, value in zip(names, params, strict=True) if not np.isfinite(value)]
+    if odd:
+        raise SettingError(f"camera {text!r}: {odd[0]}: expected a finite number", hint=hint)
     shifted = [
         value + 0.5 - pixel_center if key in ("cx", "cy") else value for key, value in zip(names, params, strict=True)
     ]
