@@ -316,6 +316,10 @@ def test_key_points_as_fractions_of_a_panorama(tmp_path: Path) -> None:
             {"camera": "PINHOLE 640 480 500"},
             "PINHOLE has the parameters fx, fy, cx, cy, found 1 numbers",
         ),
+        ("image,lat,lon,heading_deg,position_sigma_m", "a.jpg,52,4,1,-1", {}, "poses.csv line 2: position_sigma_m: "),
+        ("image,lat,lon,heading_deg,position_sigma_m", "a.jpg,52,4,1,x", {}, "above 0, or no value, found 'x'"),
+        ("image,lat,lon,heading_deg,rotation_sigma_deg", "a.jpg,52,4,1,0", {}, "line 2: rotation_sigma_deg: expected"),
+        ("image,lat,lon,heading_deg,readout_s", "a.jpg,52,4,1,30", {}, "poses.csv line 2: readout_s: expected at most"),
         (
             "image,x,y,heading_deg",
             "a.jpg,52,4,1",

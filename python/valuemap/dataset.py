@@ -57,7 +57,7 @@ _FARTHEST_M = 1e12
 _LARGEST_PX = 1e9
 """Of a box or a parameter of a camera: no picture has so many."""
 _FOCAL_LENGTHS = ("f", "fx", "fy")
-_LONGEST_READOUT_S = 1.0
+LONGEST_READOUT_S = 1.0
 """Of a picture: rolling shutters take hundredths of a second, so that more is milliseconds."""
 _ROUNDING = 1e-12
 _LEADS_OUT = r"^/|^[A-Za-z]:|^\\\\|(^|[/\\])\.\.([/\\]|$)|\x00"
@@ -421,14 +421,14 @@ def check_cameras(cameras: Cameras, source: str) -> None:
             )
     if cameras.readout_s is not None:
         _refuse(
-            np.abs(cameras.readout_s) > _LONGEST_READOUT_S,
+            np.abs(cameras.readout_s) > LONGEST_READOUT_S,
             cameras.readout_s,
             cameras.camera_id,
             source,
             "cameras",
             "camera_id",
             "readout_s",
-            f"expected at most {_LONGEST_READOUT_S:g} s, or no value",
+            f"expected at most {LONGEST_READOUT_S:g} s, or no value",
             hint="it is in seconds, from the first row of a picture to the last; 30 ms are 0.03",
         )
 

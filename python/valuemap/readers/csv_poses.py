@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from valuemap.dataset import LONGEST_READOUT_S
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
@@ -133,8 +134,8 @@ def read_csv_poses(
         source=str(poses),
         timestamp_s=_timestamps(table) if table.has("timestamp") else None,
         rigs=table.filled_texts("rig") if table.has("rig") else None,
-        position_sigma_m=_optional(table, "position_sigma_m"),
-        rotation_sigma_rad=_radians(_optional(table, "rotation_sigma_deg")),
+        position_sigma_m=_sigma(table, "position_sigma_m"),
+        rotation_sigma_rad=_radians(_sigma(table, "rotation_sigma_deg")),
     )
     progress("reading the detections", 1, 2)
     dataset = assemble(
@@ -255,6 +256,7 @@ def _with_readout(table: CsvFile, cameras: list[Camera]) -> list[Camera]:
     readout_s = _optional(table, "readout_s")
     if readout_s is None:
         return cameras
+    table.refuse(np.abs(readout_s) > LONGEST_READOUT_S, "readout_s", f"at most {LONGEST_READOUT_S:g} s, or no value")
     known = [None if math.isnan(seconds) else seconds for seconds in readout_s.tolist()]
     return [replace(camera, readout_s=seconds) for camera, seconds in zip(cameras, known, strict=True)]
 
@@ -287,6 +289,13 @@ def _seconds(text: str, table: CsvFile, row: int) -> float:
 
 def _optional(table: CsvFile, name: str) -> Floats | None:
     return table.numbers_or_none(name) if table.has(name) else None
+
+
+def _sigma(table: CsvFile, name: str) -> Floats | None:
+    values = _optional(table, name)
+    if values is not None:
+        table.refuse((values <= 0.0) | np.isinf(values), name, "above 0, or no value")
+    return values
 
 
 def _radians(degrees: Floats | None) -> Floats | None:
