@@ -321,6 +321,13 @@ def test_key_points_as_fractions_of_a_panorama(tmp_path: Path) -> None:
         ("image,lat,lon,heading_deg,rotation_sigma_deg", "a.jpg,52,4,1,0", {}, "line 2: rotation_sigma_deg: expected"),
         ("image,lat,lon,heading_deg,readout_s", "a.jpg,52,4,1,30", {}, "poses.csv line 2: readout_s: expected at most"),
         (
+            "image,lat,lon,heading_deg",
+            "a.jpg,52,4,1",
+            {"camera_height_m": 1e12},
+            "poses.csv: expected heights of at most 1e+08 m, found 1e+12 (1 images)",
+        ),
+        ("image,lat,lon,height,heading_deg", "a.jpg,52,4,1e12,1", {}, "heights of at most 1e+08 m, found 1e+12"),
+        (
             "image,x,y,heading_deg",
             "a.jpg,52,4,1",
             {"crs": "EPSG:123456"},

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from valuemap.errors import InputError
 
-_HIGHEST_M = 1e8
+HIGHEST_M = 1e8
 
 
 def is_place(lat: float, lon: float, height_m: float) -> bool:
     """Return whether there is such a latitude and longitude (degrees) and height (m)."""
-    return abs(lat) <= 90.0 and abs(lon) <= 360.0 and abs(height_m) <= _HIGHEST_M
+    return abs(lat) <= 90.0 and abs(lon) <= 360.0 and abs(height_m) <= HIGHEST_M
 
 
 def check_anchor(anchor: tuple[float, float, float]) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
+from valuemap.anchor import HIGHEST_M
 from valuemap.errors import InputError, SettingError
 from valuemap.geodesy import (
     enu_axes_at,
@@ -71,7 +72,7 @@ def place_on_earth(
     Raises
     ------
     InputError
-        A latitude is beyond 90 degrees: often latitude and longitude are swapped.
+        A latitude is beyond 90 degrees: often latitude and longitude are swapped. Or a height is none.
     """
     fine: Bools = np.asarray(np.isfinite(lon_lat_height).all(axis=1))
     beyond = (np.abs(lon_lat_height[:, 1]) > 90.0) | (np.abs(lon_lat_height[:, 0]) > 360.0)
@@ -81,6 +82,13 @@ def place_on_earth(
         raise InputError(
             f"{source}: expected degrees, found latitude {lat:g} and longitude {lon:g} ({len(wrong)} images)",
             hint="are latitude and longitude swapped, or are these metres of a map projection (--crs)?",
+        )
+    height = lon_lat_height[:, 2]
+    wrong = np.flatnonzero(fine & (np.abs(height) > HIGHEST_M))
+    if len(wrong):
+        raise InputError(
+            f"{source}: expected heights of at most {HIGHEST_M:g} m, found {height[wrong[0]]:g} ({len(wrong)} images)",
+            hint="heights, and those of cameras that have none, are in metres",
         )
     if not fine.any():
         raise InputError(f"{source}: no image has a place", hint="are latitude and longitude numbers in degrees?")
