@@ -327,6 +327,8 @@ def test_key_points_as_fractions_of_a_panorama(tmp_path: Path) -> None:
             "poses.csv: expected heights of at most 1e+08 m, found 1e+12 (1 images)",
         ),
         ("image,lat,lon,height,heading_deg", "a.jpg,52,4,1e12,1", {}, "heights of at most 1e+08 m, found 1e+12"),
+        ("image,lat,lon,heading_deg", f"{'a' * 2000}.jpg,52,4,1", {}, "expected at most 1000 letters, found 2004"),
+        ("image,lat,lon,heading_deg", '"a\nb.jpg",52,4,1', {}, "expected letters that can be printed, found '\\n'"),
         (
             "image,x,y,heading_deg",
             "a.jpg,52,4,1",

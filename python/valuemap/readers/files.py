@@ -54,6 +54,17 @@ def file_in(folder: Path, name: str, expected: str) -> Path:
 def check_names(names: list[str], source: str) -> None:
     """Refuse names of images that could mean a file outside the folder of the pictures, or none at all."""
     for name in names:
+        if len(name) > _MAX_NAME:
+            raise InputError(
+                f"{source}: image name {_short(name)}: expected at most {_MAX_NAME} letters, found {len(name)}",
+                hint="give the pictures shorter names",
+            )
+        if not name.isprintable():
+            odd = next(letter for letter in name if not letter.isprintable())
+            raise InputError(
+                f"{source}: image name {_short(name)}: expected letters that can be printed, found {odd!r}",
+                hint="is a quotation mark missing in the file, or is it in another encoding?",
+            )
         if not _stays_inside(name):
             raise InputError(
                 f"{source}: image name {_short(name)}: expected a relative name that stays in the folder",
