@@ -212,6 +212,7 @@ def test_cameras_passes_times_rigs_and_sigmas_come_from_columns(tmp_path: Path) 
         "a.jpg,0,0,0,1242,375,721.5,609.5,172.5,mon,1700000000.25,1,,",
         "c.jpg,0,0.0002,0,640,480,500,320,240,tue,,2,0.3,1",
     )
+    assert "pixel-center: expected 0 or 0.5" in refusal(lambda: read_csv_poses(poses, pixel_center=1.0))
     dataset = read_csv_poses(poses, pixel_center=0.0)
     assert dataset.images.name.to_pylist() == ["a.jpg", "b.jpg", "c.jpg"]
     assert dataset.images.pass_id.texts() == ["mon", "mon", "tue"]

@@ -102,6 +102,8 @@ def test_tum_has_pixels_of_another_convention_where_it_says_so(tmp_path: Path) -
     trajectory, _ = tum_in(tmp_path)
     dataset = read_tum(trajectory, camera="PINHOLE 640 480 500 500 319.5 239.5", pixel_center=0.0)
     assert dataset.cameras.params[0].tolist() == [500, 500, 320, 240]
+    said = refusal(lambda: read_tum(trajectory, camera=CAMERA, pixel_center=7.0))
+    assert "pixel-center: expected 0 or 0.5, found 7" in said
 
 
 def test_an_image_between_two_poses_of_tum_is_between_them(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from valuemap.camera_models import names_of_params
 from valuemap.errors import InputError, SettingError
+from valuemap.readers.pixel_center import shift_to_corner_px
 from valuemap.tables import Cameras, Categories, Floats, Ints
 
 _LARGEST_PX = 1_000_000
@@ -101,7 +102,8 @@ def parse_camera(text: str, pixel_center: float = 0.5) -> Camera:
     Raises
     ------
     SettingError
-        There is no such model, it has another number of parameters, or one of them is not finite.
+        There is no such model, it has another number of parameters, one of them is not finite, or pixels count from
+        elsewhere than 0 or 0.5.
     """
     hint = 'for example "PINHOLE 1242 375 721.5 721.5 609.6 172.9" or "EQUIRECTANGULAR 8192 4096"'
     name, *rest = text.split() or [""]
@@ -125,7 +127,6 @@ def parse_camera(text: str, pixel_center: float = 0.5) -> Camera:
     odd = [key for key, value in zip(names, params, strict=True) if not np.isfinite(value)]
     if odd:
         raise SettingError(f"camera {text!r}: {odd[0]}: expected a finite number", hint=hint)
-    shifted = [
-        value + 0.5 - pixel_center if key in ("cx", "cy") else value for key, value in zip(names, params, strict=True)
-    ]
+    shift_px = shift_to_corner_px(pixel_center, "pixel-center")
+    shifted = [value + shift_px if key in ("cx", "cy") else value for key, value in zip(names, params, strict=True)]
     return Camera(name, width, height, tuple(shifted))

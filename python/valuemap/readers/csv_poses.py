@@ -17,6 +17,7 @@ from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras, parse_camera
 from valuemap.readers.csv_file import CsvFile
 from valuemap.readers.detections import DetectionFile, read_detections
+from valuemap.readers.pixel_center import shift_to_corner_px
 from valuemap.readers.poses import (
     AXES,
     OnEarth,
@@ -225,6 +226,7 @@ def _local_from_cam(table: CsvFile, rotation: str, axes: str) -> Floats:
 
 
 def _cameras(table: CsvFile, camera: str | None, pixel_center: float) -> list[Camera]:
+    shift_px = shift_to_corner_px(pixel_center, "pixel-center")
     if table.has("model", "width_px", "height_px", "params"):
         sizes = zip(table.whole_numbers("width_px"), table.whole_numbers("height_px"), strict=True)
         parts = zip(table.filled_texts("model"), sizes, table.texts("params"), strict=True)
@@ -240,8 +242,7 @@ def _cameras(table: CsvFile, camera: str | None, pixel_center: float) -> list[Ca
     if table.has("width_px", "height_px", "fx", "cx", "cy"):
         fx, cx, cy = (table.finite_numbers(name) for name in ("fx", "cx", "cy"))
         fy = table.finite_numbers("fy") if table.has("fy") else fx
-        shift = 0.5 - pixel_center
-        params = np.stack([fx, fy, cx + shift, cy + shift], axis=1).tolist()
+        params = np.stack([fx, fy, cx + shift_px, cy + shift_px], axis=1).tolist()
         sizes = zip(table.whole_numbers("width_px"), table.whole_numbers("height_px"), strict=True)
         return [Camera("PINHOLE", *size, tuple(values)) for size, values in zip(sizes, params, strict=True)]
     if camera is None:

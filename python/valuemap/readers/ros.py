@@ -17,6 +17,7 @@ from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, FoundBoxes, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
+from valuemap.readers.pixel_center import shift_to_corner_px
 from valuemap.readers.poses import interpolate_poses, make_images, nanoseconds_of_gap, rigs_by_time
 from valuemap.readers.reader import Reader
 from valuemap.tables import Floats, Images, Ints
@@ -385,7 +386,7 @@ def _found_boxes(bag: _Bag, images: Images, pixel_center: float) -> FoundBoxes:
     return FoundBoxes(
         image_row=np.array([row_of[name] for name, _, _ in rows], dtype=np.int64),
         class_names=[box[0] for _, _, box in rows],
-        center_px=values[:, :2] + 0.5 - pixel_center,
+        center_px=values[:, :2] + shift_to_corner_px(pixel_center, "box-pixel-center"),
         size_px=values[:, 2:4],
         score=values[:, 4],
         where=lambda row: f"{rows[row][0]}: detections[{rows[row][1]}]",

@@ -13,8 +13,11 @@ from valuemap.dataset import rows_of
 from valuemap.errors import InputError, SettingError
 from valuemap.readers.boxes import BoxWriter, FiledBoxes
 from valuemap.readers.names import match_images
+from valuemap.readers.pixel_center import shift_to_corner_px
 from valuemap.readers.row_file import RowFile
 from valuemap.tables import Cameras, Floats, Images, Ints
+
+_PIXEL_CENTER = "detection-pixel-center"
 
 
 @dataclass(frozen=True)
@@ -51,10 +54,7 @@ class DetectionFile:
     def __post_init__(self) -> None:
         if not 0.0 < self.full_score < float("inf"):
             raise SettingError(f"full-score: expected above 0, found {self.full_score:g}", hint="for example 100")
-        if self.pixel_center not in (0.0, 0.5):
-            raise SettingError(
-                f"detection-pixel-center: expected 0 or 0.5, found {self.pixel_center:g}", hint="COLMAP has 0.5"
-            )
+        shift_to_corner_px(self.pixel_center, _PIXEL_CENTER)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ def find_images(boxes: NamedBoxes, images: Images, cameras: Cameras, file: Detec
         are_points=boxes.are_points,
         source=str(file.path),
         picture_px=picture_px if boxes.fractions else None,
-        shift_px=0.5 - file.pixel_center,
+        shift_px=shift_to_corner_px(file.pixel_center, _PIXEL_CENTER),
         full_score=file.full_score,
     )
 
