@@ -208,10 +208,13 @@ class PictureSize(Convention):
             is_possible = factor * reach <= 1.0 if factor > 1.0 else reach > 1.0 or not is_all_round
             if is_possible:
                 yield f"boxes {name} times as large", _Scaled(factor)
-        exchanged = _OfOtherSides(dataset)
-        after = exchanged(dataset).detections.center_px / picture_sizes(dataset)
-        if exchanged.is_any and float(np.quantile(after.max(axis=1), _NEARLY_ALL)) <= 1.0:
-            yield "shares of the width that were multiplied by the height, and of the height by the width", exchanged
+        extent, exchanged = picture_sizes(dataset), _of_other_sides(dataset).detections.center_px
+        is_inside = float(np.quantile((exchanged / extent).max(axis=1), _NEARLY_ALL)) <= 1.0
+        if is_inside and (extent[:, 0] != extent[:, 1]).any():
+            yield (
+                "shares of the width that were multiplied by the height, and of the height by the width",
+                _of_other_sides,
+            )
         farthest = float(np.quantile(dataset.detections.center_px.max(axis=1), _NEARLY_ALL))
         for side in _SQUARES_PX:
             if farthest > side:
@@ -353,21 +356,11 @@ class _Scaled:
         )
 
 
-class _OfOtherSides:
-    """Boxes whose place in the picture, as a share of it, was multiplied by the other side of the picture."""
-
-    def __init__(self, dataset: Dataset) -> None:
-        factor = self._factor(dataset)
-        self.is_any = bool((factor != 1.0).any())
-        self.gate_factor = float(np.exp(np.median(np.log(factor).mean(axis=1))))
-
-    def _factor(self, dataset: Dataset) -> Floats:
-        extent = picture_sizes(dataset)
-        return np.asarray(extent / extent[:, ::-1])
-
-    def __call__(self, dataset: Dataset) -> Dataset:
-        detections, factor = dataset.detections, self._factor(dataset)
-        return with_detections(dataset, center_px=detections.center_px * factor, size_px=detections.size_px * factor)
+def _of_other_sides(dataset: Dataset) -> Dataset:
+    """Put right boxes whose place in the picture, as a share of it, was multiplied by the other side of the picture."""
+    extent, detections = picture_sizes(dataset), dataset.detections
+    factor = extent / extent[:, ::-1]
+    return with_detections(dataset, center_px=detections.center_px * factor, size_px=detections.size_px * factor)
 
 
 class _OfSquare:

@@ -42,7 +42,7 @@ class InvertedPoses(Convention):
         yield "world_from_cam", _invert
         yield "world_from_cam in the rotation, the camera centre as it is", _invert_rotation
         for name, axes in _CAMERA_AXES.items():
-            yield f"world_from_cam of cameras with {name}", _Inverted(_OtherAxes(axes))
+            yield f"world_from_cam of cameras with {name}", _InTurn(_invert, _OtherAxes(axes))
 
 
 class CenterAsTranslation(Convention):
@@ -69,8 +69,9 @@ class QuaternionOrder(Convention):
         for order, columns in (("x y z w", [3, 0, 1, 2]), ("y z w x", [1, 2, 3, 0])):
             yield f"{order}, the translation as it is", _Reordered(columns, keeps_center=False)
             yield f"{order}, the camera centre as it is", _Reordered(columns, keeps_center=True)
-            yield f"{order}, world_from_cam", _Reordered(columns, then=_invert)
-        of_ros = _Reordered([3, 0, 1, 2], then=_Inverted(_OtherAxes(_CAMERA_AXES[_ROS_BODY])))
+            yield f"{order}, world_from_cam", _InTurn(_Reordered(columns, keeps_center=False), _invert)
+        reordered = _Reordered([3, 0, 1, 2], keeps_center=False)
+        of_ros = _InTurn(reordered, _invert, _OtherAxes(_CAMERA_AXES[_ROS_BODY]))
         yield f"x y z w, world_from_cam of cameras with {_ROS_BODY}", of_ros
 
 
@@ -132,29 +133,29 @@ def steadied(dataset: Dataset) -> Dataset:
 
 
 class _Reordered:
-    """Takes the parts of the quaternions from other columns, and then reads the poses as another fix does."""
+    """Takes the parts of the quaternions from other columns."""
 
-    def __init__(self, columns: list[int], *, keeps_center: bool = False, then: Fix | None = None) -> None:
-        self._columns, self._keeps_center, self._then = columns, keeps_center, then
+    def __init__(self, columns: list[int], *, keeps_center: bool) -> None:
+        self._columns, self._keeps_center = columns, keeps_center
 
     def __call__(self, dataset: Dataset) -> Dataset:
         quaternion = np.ascontiguousarray(dataset.images.cam_from_world_quat[:, self._columns])
         other = with_images(dataset, cam_from_world_quat=quaternion)
-        if self._then is not None:
-            return self._then(other)
         if not self._keeps_center:
             return other
         return with_poses(dataset, rotation_matrices(other.images), camera_centers(dataset.images))
 
 
-class _Inverted:
-    """Inverts the poses, and then reads them as another fix does."""
+class _InTurn:
+    """Several fixes, one after the other."""
 
-    def __init__(self, then: Fix) -> None:
-        self._then = then
+    def __init__(self, *fixes: Fix) -> None:
+        self._fixes = fixes
 
     def __call__(self, dataset: Dataset) -> Dataset:
-        return self._then(_invert(dataset))
+        for fix in self._fixes:
+            dataset = fix(dataset)
+        return dataset
 
 
 class _OtherAxes:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from valuemap.tables import Floats
 
 _FARTHEST_M = 1e9
+"""Of a place that is asked about: farther in metres than anything on the Earth is from the origin of a map."""
 
 
 @app.command("show")

@@ -22,6 +22,7 @@ MAX_REJECTED = 0.01
 _QUATERNION_TOLERANCE = 1e-3
 _MAX_SIZE_OF_PICTURE = 2.0
 _FARTHEST_M = 1e8
+"""Beyond the Earth and all that people count positions on it from, in metres."""
 _SHOWN_REASONS = 3
 
 
