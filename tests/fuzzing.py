@@ -37,6 +37,7 @@ from valuemap.readers.colmap import read_colmap
 from valuemap.readers.csv_poses import read_csv_poses
 from valuemap.readers.detections import DETECTIONS
 from valuemap.readers.kitti import read_kitti
+from valuemap.robust import Noise
 from valuemap.tables import Categories
 
 NUMBERS: tuple[float, ...] = (
@@ -360,26 +361,30 @@ def _spoiled_column(random: Random, value: Any) -> Any:
 
 def core_border(random: Random) -> None:
     """Call the core with arrays of other lengths, indices beyond the end and numbers that are none."""
-    rays, images = random.randrange(1, 6), random.randrange(1, 4)
+    rays, images = random.randrange(1, 12), random.randrange(1, 4)
+    # One array in so many is spoiled. What is refused at the door says nothing of what is behind it.
+    rate = random.choice([0.0, 0.02, 0.1])
+
+    def length(count: int) -> int:
+        return max(0, count + random.choice([-1, 1])) if random.random() < rate / 2 else count
 
     def floats(*shape: int) -> Any:
-        shape = tuple(max(0, n + random.choice([0] * 12 + [-1, 1])) for n in shape)
+        shape = tuple(length(n) for n in shape)
         values = np.array([random.uniform(-5.0, 5.0) for _ in range(int(np.prod(shape)))]).reshape(shape)
-        if values.size and random.random() < 0.3:
+        if values.size and random.random() < rate:
             values.flat[random.randrange(values.size)] = float(hostile_number(random))
         return values
 
     def indices(count: int, below: int, dtype: Any = np.uint32) -> Any:
-        count = max(0, count + random.choice([0] * 12 + [-1, 1]))
-        values = np.array([random.randrange(max(below, 1)) for _ in range(count)], dtype=dtype)
-        if values.size and random.random() < 0.1:
+        values = np.array([random.randrange(max(below, 1)) for _ in range(length(count))], dtype=dtype)
+        if values.size and random.random() < rate:
             values[random.randrange(values.size)] = random.choice([below, 2**31, 2**32 - 1])
         return values
 
     def call(function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
         try:
             return function(*arguments, **named)
-        except (ValueError, TypeError, OverflowError, MemoryError):
+        except (ValueError, OverflowError, MemoryError):
             return None
 
     made = call(
@@ -389,12 +394,14 @@ def core_border(random: Random) -> None:
     if made is None:
         return
     count = len(made)
-    groups = sorted(random.randrange(count + 1) for _ in range(random.randrange(3)))
-    offsets = np.array([0, *groups, count], dtype=np.int64)
-    if random.random() < 0.2:
+    ends = sorted({random.randrange(1, count + 1) for _ in range(random.randrange(3))} | {count})
+    offsets = np.array([0, *ends], dtype=np.int64)
+    if random.random() < rate:
         offsets[random.randrange(len(offsets))] = random.choice([-1, 10**9, 2**62, -(2**63)])
-    voters, points = indices(count, count), floats(len(offsets) - 1, 3)
-    which = random.randrange(7)
+    voters, points = np.sort(indices(count, count)), floats(len(offsets) - 1, 3)
+    if random.random() < 0.8:
+        voters = np.arange(count, dtype=np.uint32)
+    which = random.randrange(12)
     if which == 0:
         call(_core.partition, floats(images, 3), float(hostile_number(random)))
     elif which == 1:
@@ -438,30 +445,26 @@ def _border_of_scene(
     )  # fmt: skip
     if scene is None:
         return
-    noise = tuple(abs(float(hostile_number(random))) if random.random() < 0.2 else 0.5 for _ in range(8))
-    settings = (
-        random.choice([0.02, 0.0, -1.0, float("nan")]), random.choice([1.0, 0.0, float("nan"), -1e308]),
-        random.choice([80.0, 0.0, float("inf"), float("nan")]), random.choice([3.0, 0.0, float("nan"), 1e308]),
-        random.choice([2, 0, 2**31]), random.choice([1, 0, 2**31]), random.choice([0.5, float("nan"), 2.0, -1.0]),
-        False, False,
-    )  # fmt: skip
-    which, quiet = random.randrange(3), lambda *_: None
+    noise = tuple(abs(float(hostile_number(random))) if random.random() < 0.02 else 0.5 for _ in fields(Noise))
+    choices: list[tuple[Any, ...]] = [  # The first is good.
+        (0.02, 0.0, -1.0, float("nan")), (0.1, 0.0, float("nan"), -1e308), (80.0, 0.0, float("inf"), float("nan")),
+        (3.0, 0.0, float("nan"), 1e308), (2, 0, 2**31), (1, 0, 2**31), (0.5, float("nan"), 2.0, -1.0),
+        ([], [random.choice(_core.parts())], ["no part"]),
+    ]  # fmt: skip
+    settings = tuple(values[0] if random.random() < 0.95 else random.choice(values) for values in choices)
+    known = ([random.random() < 0.5 for _ in range(4)], random.choice([0.0, 0.5, float(hostile_number(random))]))
+    which, quiet = random.randrange(4), lambda *_: None
     if which == 0:
-        numbers = random.choice([120, 0, 3])
-        row = [float(hostile_number(random)) if random.random() < 0.2 else 0.5 for _ in range(numbers)]
+        numbers = sum(count for _, count in _core.CLASS_FIELDS) if random.random() < 0.9 else random.choice([0, 3])
+        row = [float(hostile_number(random)) if random.random() < 0.01 else 0.5 for _ in range(numbers)]
         classes = [random.choice([None, row, [1.0]]) for _ in range(random.randrange(3))]
-        call(_core.find_labels, scene, (noise, random.random() < 0.5, classes, row), settings, 1, quiet)
+        shares = [[(0, float(hostile_number(random)))] for _ in range(random.randrange(2))]
+        call(_core.find_labels, scene, (noise, random.random() < 0.5, classes, row, shares), settings, 1, quiet)
     elif which == 1:
-        call(
-            _core.calibrate,
-            scene,
-            noise,
-            [random.random() < 0.5 for _ in range(3)],
-            settings,
-            random.random() < 0.5,
-            1,
-            quiet,
-        )
+        begin = random.choice([None, (noise, random.randrange(3))])
+        call(_core.calibrate, scene, noise, known, settings, random.random() < 0.5, begin, 1, quiet)
+    elif which == 2:
+        call(_core.misfits, (scene, scene), indices(count, count), noise, known, settings, 1, quiet)
     else:
         call(_core.objects_of, scene, noise, settings, points, offsets, voters, random.random() < 0.5, 1, quiet)
 

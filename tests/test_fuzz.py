@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from random import Random
+from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -19,6 +21,7 @@ from fuzzing import (
     spoil_file,
     spoil_lines,
 )
+from valuemap import _core
 from valuemap.errors import InputError
 from valuemap.readers import READERS
 from valuemap.readers.detections import DETECTIONS
@@ -58,6 +61,50 @@ def test_settings_never_end_in_a_traceback(random: Random) -> None:
 @given(random=st.randoms(use_true_random=False))
 def test_the_core_never_panics(random: Random) -> None:
     core_border(random)
+
+
+def test_each_function_of_the_core_is_called_with_what_it_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pins that what is behind the door is fuzzed: a call that is always refused finds nothing."""
+    reached: set[str] = set()
+
+    class Seen:
+        def __getattr__(self, name: str) -> Any:
+            function = getattr(_core, name)
+
+            def called(*arguments: Any, **named: Any) -> Any:
+                result = function(*arguments, **named)
+                reached.add(name)
+                return result
+
+            return called if callable(function) else function
+
+    monkeypatch.setattr("fuzzing._core", Seen())
+    for seed in range(400):
+        core_border(Random(seed))
+    assert reached >= {
+        "Rays", "partition", "vote", "merge", "unit_covariance", "see", "medians",
+        "Scene", "calibrate", "misfits", "find_labels", "objects_of",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("number", [2**16, 2**32 - 1])
+def test_numbers_of_classes_end_somewhere(number: int) -> None:
+    one = np.eye(3)[None]
+    with pytest.raises(ValueError, match="class: expected numbers below 65536"):
+        _core.Rays(one, one[:, 0], *np.array([[0], [number]], np.uint32), one, one[:, 0])
+
+
+def test_votes_are_sought_within_a_range_that_is_one() -> None:
+    one = np.eye(3)[None]
+    rays, of_one = _core.Rays(one, one[:, 2], *np.zeros((2, 1), np.uint32), one, one[:, 0]), np.zeros(1, np.uint32)
+    good: dict[str, Any] = {
+        "max_reprojection_error_px": 6.0, "min_parallax_rad": 0.02, "min_range_m": 2.0, "max_range_m": 60.0,
+        "min_vote_ratio": 0.1, "min_votes": 3, "threads": 1, "progress": lambda *_: None,
+    }  # fmt: skip
+    assert len(_core.vote(rays, of_one, **good)[0]) == 0
+    for ranges in ({"max_range_m": 1e-320}, {"max_range_m": 1e7}, {"min_range_m": 60.0}, {"min_range_m": -1.0}):
+        with pytest.raises(ValueError, match="expected 0 <= min_range_m < max_range_m"):
+            _core.vote(rays, of_one, **(good | ranges))
 
 
 def test_what_the_fuzzer_lets_pass_and_what_not() -> None:

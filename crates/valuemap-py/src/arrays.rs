@@ -72,6 +72,21 @@ pub fn check_finite(name: &str, values: &[f64]) -> PyResult<()> {
     Err(PyValueError::new_err(format!("{name}: expected finite numbers")))
 }
 
+/// No range is longer, m: the voting kernel counts in single precision.
+const LONGEST_M: f64 = 1e6;
+/// No greatest range is shorter, m: places are looked up in cubes of that size.
+const SHORTEST_M: f64 = 1e-6;
+
+/// The least and the largest range of objects must leave room between them.
+pub fn check_ranges(min_range_m: f64, max_range_m: f64) -> PyResult<()> {
+    if 0.0 <= min_range_m && min_range_m < max_range_m && (SHORTEST_M..=LONGEST_M).contains(&max_range_m) {
+        return Ok(());
+    }
+    Err(PyValueError::new_err(format!(
+        "settings: expected 0 <= min_range_m < max_range_m, and max_range_m from {SHORTEST_M} to {LONGEST_M}"
+    )))
+}
+
 /// All values must be finite numbers, or NaN, which stands for none.
 pub fn check_not_infinite(name: &str, values: &[f64]) -> PyResult<()> {
     if values.iter().all(|value| !value.is_infinite()) {

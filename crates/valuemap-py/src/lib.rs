@@ -24,14 +24,17 @@ use valuemap_core::ray::Ray;
 use valuemap_core::viability::Viability;
 
 use crate::arrays::{
-    FARTHEST_M, Groups, candidates_from, check_finite, check_within, check_within_or_none, groups_of, matrices_of,
-    points_of, rays_in, rows_of,
+    FARTHEST_M, Groups, candidates_from, check_finite, check_ranges, check_within, check_within_or_none, groups_of,
+    matrices_of, points_of, rays_in, rows_of,
 };
 use crate::run::with_progress;
 
 /// Many threads allocate small matrices and large columns all the time.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+/// Classes are numbered below this: a table of what is learned of them has a row for each.
+const MOST_CLASSES: u32 = 1 << 16;
 
 /// Viewing rays, one a detection, copied once and used by every stage.
 #[pyclass(frozen, module = "valuemap._core")]
@@ -70,6 +73,9 @@ impl Rays {
         }
         if rotations.len() != centers.len() || image.iter().any(|&image| image as usize >= centers.len()) {
             return Err(PyValueError::new_err("rays: every image must have a pose"));
+        }
+        if class.iter().any(|&class| class >= MOST_CLASSES) {
+            return Err(PyValueError::new_err(format!("class: expected numbers below {MOST_CLASSES}")));
         }
         let of_ray = |((matrix, &direction), &image): ((&[f64; 9], &[f64; 3]), &u32)| {
             let cam_from_world = matrix_from_rows(&rotations[image as usize]);
@@ -140,6 +146,7 @@ fn vote_in_clusters<'py>(
         return Err(PyValueError::new_err("vote: one cluster a ray is needed"));
     }
     check_finite("settings", &[max_reprojection_error_px, min_parallax_rad, min_range_m, max_range_m, min_vote_ratio])?;
+    check_ranges(min_range_m, max_range_m)?;
     let viability = Viability { max_reprojection_error_px, min_parallax_rad, min_range_m, max_range_m };
     let stop = Stop { min_vote_ratio, min_votes };
     let total = vote::count_units(&rays.0, cluster);

@@ -23,8 +23,8 @@ use valuemap_core::viability::Viability;
 
 use crate::Rays;
 use crate::arrays::{
-    FARTHEST_M, Groups, check_finite, check_length, check_not_infinite, check_within, check_within_or_none,
-    matrices_of, matrix, rays_in, rows_of,
+    FARTHEST_M, Groups, check_finite, check_length, check_not_infinite, check_ranges, check_within,
+    check_within_or_none, matrices_of, matrix, rays_in, rows_of,
 };
 use crate::run::with_progress;
 
@@ -182,11 +182,6 @@ fn noise_of(values: NoiseValues) -> PyResult<Noise> {
 const WIDEST_GATE: f64 = 1e3;
 /// Nothing that is learned is larger: logarithms, sizes and ranges.
 const LARGEST_LEARNED: f64 = 1e6;
-/// No range is longer, m: the voting kernel counts in single precision.
-const LONGEST_M: f64 = 1e6;
-/// No greatest range is shorter, m: places are looked up in cubes of that size.
-const SHORTEST_M: f64 = 1e-6;
-
 /// Least parallax (rad), least and largest range (m), gate (sigmas), least votes without and with heights, least existence; the
 /// names of parts that are left out.
 type SettingValues = (f64, f64, f64, f64, u32, u32, f64, Vec<String>);
@@ -195,13 +190,9 @@ fn settings_of(
     (min_parallax_rad, min_range_m, max_range_m, gate_sigmas, min_votes, least_votes, min_existence, without): SettingValues,
 ) -> PyResult<Settings> {
     check_finite("settings", &[min_parallax_rad, min_range_m, max_range_m, gate_sigmas, min_existence])?;
-    check_within("settings", &[min_range_m, max_range_m], LONGEST_M)?;
-    let is_gate = gate_sigmas > 0.0 && gate_sigmas <= WIDEST_GATE;
-    if !is_gate || min_range_m < 0.0 || max_range_m <= min_range_m || max_range_m < SHORTEST_M {
-        return Err(PyValueError::new_err(format!(
-            "settings: expected gate_sigmas above 0 and up to {WIDEST_GATE}, 0 <= min_range_m < max_range_m, and \
-             max_range_m of {SHORTEST_M} and more"
-        )));
+    check_ranges(min_range_m, max_range_m)?;
+    if !(gate_sigmas > 0.0 && gate_sigmas <= WIDEST_GATE) {
+        return Err(PyValueError::new_err(format!("settings: expected gate_sigmas above 0 and up to {WIDEST_GATE}")));
     }
     let viability = Viability { max_reprojection_error_px: f64::NAN, min_parallax_rad, min_range_m, max_range_m };
     let without = Without::named(&without)
@@ -237,8 +228,12 @@ fn calibration_of((noise, is_deep, classes, pooled, shares): CalibrationValues) 
 }
 
 /// What is known of the noise: detection, position, rotation, middles of sides, and what detections are off by at least, px.
-fn known_of(([detection, position, rotation, side], least_px): ([bool; 4], f64)) -> Known {
-    Known { detection, position, rotation, side, least_px }
+fn known_of(([detection, position, rotation, side], least_px): ([bool; 4], f64)) -> PyResult<Known> {
+    check_within("least_px", &[least_px], FARTHEST_M)?;
+    if least_px < 0.0 {
+        return Err(PyValueError::new_err("least_px: expected 0 or more"));
+    }
+    Ok(Known { detection, position, rotation, side, least_px })
 }
 
 /// Estimate the noise from the data and learn the classes, `valuemap_core::robust::calibrate::self_calibrate`.
@@ -257,7 +252,7 @@ pub fn calibrate(
 ) -> PyResult<CalibrationValues> {
     let settings = settings_of(settings)?;
     let guess = noise_of(guess)?;
-    let known = known_of(known);
+    let known = known_of(known)?;
     let sought =
         sought.map(|(noise, starts)| Ok::<_, PyErr>(Sought { noise: noise_of(noise)?, starts })).transpose()?;
     let found = with_progress(py, threads, 0, progress, |progress| {
@@ -286,7 +281,7 @@ pub fn misfits<'py>(
 ) -> PyResult<([f64; 2], usize, Option<SoughtValues>)> {
     let settings = settings_of(settings)?;
     let guess = noise_of(guess)?;
-    let known = known_of(known);
+    let known = known_of(known)?;
     let scenes = [&scenes.0.0, &scenes.1.0];
     let numbers = second_of_first.as_slice()?;
     let mut sorted = numbers.to_vec();
