@@ -91,12 +91,13 @@ def test_each_function_of_the_core_is_called_with_what_it_takes(monkeypatch: pyt
 def test_numbers_of_classes_end_somewhere(number: int) -> None:
     one = np.eye(3)[None]
     with pytest.raises(ValueError, match="class: expected numbers below 65536"):
-        _core.Rays(one, one[:, 0], *np.array([[0], [number]], np.uint32), one, one[:, 0])
+        _core.Rays(one, one[:, 0], np.zeros(1, np.uint32), np.array([number], np.uint32), one, one[:, 0])
 
 
 def test_votes_are_sought_within_a_range_that_is_one() -> None:
     one = np.eye(3)[None]
-    rays, of_one = _core.Rays(one, one[:, 2], *np.zeros((2, 1), np.uint32), one, one[:, 0]), np.zeros(1, np.uint32)
+    of_one = np.zeros(1, np.uint32)
+    rays = _core.Rays(one, one[:, 2], of_one, of_one, one, one[:, 0])
     good: dict[str, Any] = {
         "max_reprojection_error_px": 6.0, "min_parallax_rad": 0.02, "min_range_m": 2.0, "max_range_m": 60.0,
         "min_vote_ratio": 0.1, "min_votes": 3, "threads": 1, "progress": lambda *_: None,

@@ -416,6 +416,20 @@ def test_images_are_moved_by_what_sides_show_each() -> None:
     assert (np.trace(covariance_m2, axis1=1, axis2=2) > 3.0 * calibration.noise.side_m**2 / sides).all()
 
 
+def test_images_that_were_moved_state_no_errors() -> None:
+    """What poses state they were off by before: a map of moved ones would take them for as wrong as they were."""
+    sigmas = {"position_sigma_m": 0.8, "rotation_sigma_rad": 0.01}
+    few = city(lights=12, **FEWEST_IMAGES, **DASHCAM)
+    stating = few.images.replace(**{name: np.full(len(few.images), sigma) for name, sigma in sigmas.items()})
+    few, config = dataclasses.replace(few, images=stating), MapConfig()
+    calibration, labels, votes, _ = correction._map_alone(few, config, ThreadEngine(1), silent)
+    moved = refine_images.bundle(refine_images.gather_images(few, config), labels, votes, calibration.noise).images(
+        few.images
+    )
+    assert not np.array_equal(moved.cam_from_world_m, few.images.cam_from_world_m)
+    assert all(getattr(moved, name) is None for name in sigmas)
+
+
 def test_errors_of_images_are_no_noise_of_detections() -> None:
     """Images whose poses are exact stay, however poor the detector: what one object says another does not confirm."""
     poor = city(pixel_noise_px=5.0, **FEWEST_IMAGES, **EXACT_POSES)

@@ -98,12 +98,16 @@ class Bundle:
         return chance < LEAST_CHANCE, {"gain_on_held_out": round(gain, 1), "chance_of_that": float(f"{chance:.2g}")}
 
     def images(self, like: Images) -> Images:
-        """Return images `like` those of the dataset with the poses that they probably have."""
+        """Return images `like` those of the dataset with the poses that they probably have.
+
+        They state no errors: what the poses stated is what they were off by before.
+        """
         poses = corrected(self.seen.views, self.adjusted(self.seen))
         ordered, step = self.of.ordered, poses.center_in_world_m - self.of.footage.center_in_world_m
         axes = ordered.dataset.frame.east_north_up()
         center = camera_poses(ordered.dataset.images)[1] + self.of.unit_m * step @ axes
-        return with_poses_in_order(like, ordered, poses.cam_from_world @ axes, center)
+        moved = with_poses_in_order(like, ordered, poses.cam_from_world @ axes, center)
+        return moved.replace(position_sigma_m=None, rotation_sigma_rad=None)
 
     def covariances(self) -> tuple[Ints, Floats]:
         """Return labels (L) with their covariances (L, 3, 3) in m², errors of all images and drift marginalised."""

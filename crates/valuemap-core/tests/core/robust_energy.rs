@@ -1,7 +1,7 @@
 //! The energy J and the search for the map with the least of it, on small random streets.
 
 use std::collections::BTreeSet;
-use std::f64::consts::FRAC_PI_2;
+use std::f64::consts::{FRAC_PI_2, PI};
 use std::sync::Arc;
 
 use nalgebra::{Isometry3, Point3, Vector3};
@@ -55,6 +55,11 @@ fn with_sizes(mut scene: Scene, objects: &[Vector3<f64>], sizes_m: &[f64]) -> Sc
         }
     }
     scene
+}
+
+/// What some objects are with a noise, as they are or searched.
+fn as_found(scene: &Scene, noise: &Noise, begun: Vec<Placed>, is_searched: bool) -> Vec<Object> {
+    objects_of(scene, noise, &SETTINGS, begun, is_searched, &Progress::default()).unwrap()
 }
 
 fn energy(objects: &[Object]) -> f64 {
@@ -234,6 +239,22 @@ proptest! {
         let expected: BTreeSet<Vec<u32>> = right.into_iter().map(|(votes, _)| votes).collect();
         prop_assert_eq!(found.len(), 2);
         prop_assert_eq!(votes(&searched(&scene, placed(&world.objects))), expected);
+    }
+
+    /// Pins that objects of many visits are tried in the parts that each side sees: rays of two back to back meet in between them, and drift explains it.
+    #[test]
+    fn what_many_drives_see_as_one_of_two_back_to_back_becomes_two(errors in errors_px(), apart_m in 1.5..1.9_f64) {
+        let objects = [0.0, apart_m].map(|y| Vector3::new(45.0, 4.0 + y, 3.0));
+        let back = Isometry3::new(Vector3::new(90.0, 8.0, 0.0), Vector3::z() * PI);
+        let shown = back.inverse() * Point3::from(objects[1]);
+        let drive = |i: usize| street(16, 2.0, &objects[..1], &errors[i..]);
+        let drive_back = |i: usize| moved(street(16, 2.0, &[shown.coords], &errors[i..]), &back);
+        let scene = joined((0..5).flat_map(|i| [drive(i), drive_back(i)]).collect());
+        let noise = Noise { position_drift_m: 0.3, ..NOISE };
+        let middle = 0.5 * (objects[0] + objects[1]);
+        let all = vec![(scene.usable_rays(), middle)];
+        prop_assert_eq!(as_found(&scene, &noise, all.clone(), false).len(), 1);
+        prop_assert_eq!(as_found(&scene, &noise, all, true).len(), 2);
     }
 
     /// Pins that nothing stays whose J is positive, and the looks and the clutter in J: three of many images have a ray that meets by chance, the

@@ -35,7 +35,8 @@ const ROUNDS: usize = 3;
 const CANDIDATES: usize = 4;
 /// Times that a hypothesis is estimated on what votes for it.
 const POLISHINGS: usize = 4;
-/// Objects of more visits are not tried in parts: rays of two objects do not meet in one place on so many.
+/// Of more visits, single ones are not tried as parts of an object: one of many moves it little. What looks from one side is, however many they are: where
+/// two stand back to back, drift explains that the rays of all visits meet between them.
 pub const MOST_VISITS: usize = 6;
 /// Votes are of one side if their directions differ by less than 30 degrees (cosine).
 const SIDE_COSINE: f64 = 0.866;
@@ -323,9 +324,12 @@ fn polished(model: &Model<'_>, rays: &[u32], hypothesis: &Hypothesis) -> Option<
 
 /// Votes of an object from one visit or one side alone, and from all others: rays of two objects, each seen from one side, meet where none is.
 fn parts_of(model: &Model<'_>, object: &Object) -> Vec<Vec<u32>> {
-    let mut groups: Vec<Vec<u32>> = visits(model.scene, &object.votes).map(<[u32]>::to_vec).collect();
-    if groups.len() > MOST_VISITS || !model.settings.has(Part::Halves) {
+    if !model.settings.has(Part::Halves) {
         return Vec::new();
+    }
+    let mut groups: Vec<Vec<u32>> = visits(model.scene, &object.votes).map(<[u32]>::to_vec).collect();
+    if groups.len() > MOST_VISITS {
+        groups.clear();
     }
     let looks = object.votes.iter().map(|&ray| (ray, model.scene.ray(ray).direction));
     groups.extend(by_side(looks, SIDE_COSINE));
