@@ -30,6 +30,13 @@ BLOCKS: dict[str, dict[str, float]] = {
     "drifts": {"position_drift_m": 0.4, "position_white_m": 0.05, "passes_per_street": 3},
     "poor detector": {"recall_mean": 0.35, "clutter_per_image": 0.5, "passes_per_street": 3},
     "temporary": {"temporary_per_1000_images": 10.0},
+    "reflections": {
+        "reflections_per_1000_images": 8.0,
+        "reflection_images": 30.0,
+        "frame_spacing_m": 1.0,
+        "pixel_noise_px": 0.6,
+        "passes_per_street": 1,
+    },
     "confused classes": {
         "class_confusion": 0.15,
         "sign_row_spacing_m": 20.0,
@@ -189,6 +196,7 @@ CASES: dict[str, tuple[str, int, Fails]] = {
     "reach": ("drifts", 5, what_is_there_is_believed_less),
     "aspect": ("narrow", 7, what_is_there_is_believed_less),
     "company": (FEW_PICTURES, 5, more_is_wrong),
+    "carried": ("reflections", 5, more_is_wrong),
     "looks": ("lights", 5, more_is_wrong),
     "turns": ("standing", 16, more_is_wrong),
     "confusions": ("confused classes", 6, more_is_wrong),

@@ -51,6 +51,8 @@ pub enum Part {
     Company,
     /// Scores, company and approach tell which objects exist.
     Existence,
+    /// What stays at its place of the picture is no object.
+    Carried,
     /// Who should have seen an object and did not.
     Looks,
     /// Images of one viewpoint do not show now one of two objects and now the other.
@@ -71,7 +73,7 @@ pub enum Part {
 
 impl Part {
     /// All parts with their names.
-    pub const ALL: [(Self, &'static str); 32] = [
+    pub const ALL: [(Self, &'static str); 33] = [
         (Self::Polishing, "polishing"),
         (Self::Assignment, "assignment"),
         (Self::Merging, "merging"),
@@ -96,6 +98,7 @@ impl Part {
         (Self::Aspect, "aspect"),
         (Self::Company, "company"),
         (Self::Existence, "existence"),
+        (Self::Carried, "carried"),
         (Self::Looks, "looks"),
         (Self::Turns, "turns"),
         (Self::Confusions, "confusions"),
@@ -109,7 +112,7 @@ impl Part {
 
 /// Parts that are left out.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Without(u32);
+pub struct Without(u64);
 
 impl Without {
     /// None.
@@ -122,7 +125,7 @@ impl Without {
     pub fn named(names: &[String]) -> Result<Self, &str> {
         names.iter().try_fold(Self::NOTHING, |without, name| {
             let (part, _) = Part::ALL.iter().find(|(_, of_part)| of_part == name).ok_or(name.as_str())?;
-            Ok(Self(without.0 | 1 << *part as u32))
+            Ok(Self(without.0 | 1 << *part as u64))
         })
     }
 
@@ -130,6 +133,6 @@ impl Without {
     #[inline]
     #[must_use]
     pub const fn has(self, part: Part) -> bool {
-        self.0 >> part as u32 & 1 == 1
+        self.0 >> part as u64 & 1 == 1
     }
 }

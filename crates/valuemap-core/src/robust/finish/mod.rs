@@ -1,8 +1,9 @@
 //! From objects to labels: final positions and covariances, which objects exist, and which are others that were taken for new ones.
 //!
 //! Objects of one place are estimated together ([`positions`](mod@positions)). Votes that a neighbour might have widen the covariance ([`contest`]).
-//! Identity switches are left out ([`switches`]).
+//! Identity switches are left out ([`switches`]), and so is what the car carries ([`carried`]).
 
+pub mod carried;
 pub mod contest;
 pub mod positions;
 pub mod switches;
@@ -47,6 +48,10 @@ pub fn labels(model: &Model<'_>, lookout: &Lookout, objects: Vec<Object>, few: V
     let as_they_are = few.iter().map(|object| Estimate { point: object.fit.point, covariance: object.fit.covariance });
     let estimates: Vec<Estimate> = estimates.into_iter().map(scaled).chain(as_they_are).collect();
     let all: Vec<Object> = objects.into_iter().chain(few).collect();
+    let has_carried = model.settings.has(Part::Carried);
+    let not_carried = |object: &Object| if has_carried { carried::not_carried(model, object) } else { 1.0 };
+    let existences = existences.into_iter().zip(&all).map(|(existence, object)| existence * not_carried(object));
+    let existences: Vec<f64> = existences.collect();
     let are_others = are_others(model, &all.iter().collect::<Vec<_>>());
     let mut findings: Vec<Finding> = all
         .into_iter()
