@@ -75,11 +75,11 @@ fn votes(objects: &[Object]) -> BTreeSet<Vec<u32>> {
 }
 
 fn as_it_is(scene: &Scene, begun: Vec<Placed>) -> Vec<Object> {
-    objects_of(scene, &DRIFTING, &SETTINGS, begun, false, &Progress::default()).unwrap()
+    as_found(scene, &DRIFTING, begun, false)
 }
 
 fn searched(scene: &Scene, begun: Vec<Placed>) -> Vec<Object> {
-    objects_of(scene, &DRIFTING, &SETTINGS, begun, true, &Progress::default()).unwrap()
+    as_found(scene, &DRIFTING, begun, true)
 }
 
 /// A model of a scene that has learned what some objects tell, with all that a move needs.

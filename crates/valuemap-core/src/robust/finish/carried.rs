@@ -2,7 +2,8 @@
 //!
 //! It stays at its place of the picture while the car drives, so that its rays are about parallel and meet anywhere far away. J knows no such thing, and clutter
 //! does not come again at the same place: so each of its rays speaks for an object. Here what an object is otherwise has a second term beside clutter:
-//! that all its votes show one thing which the car carries. Of such things one is expected in all images together, anywhere in the picture.
+//! that all its votes show one thing which the car carries. The first of them is one more box of clutter then, and the others come where it is: so the price
+//! depends on what is learned of the class alone, and not on how many images are mapped together.
 
 use std::f64::consts::TAU;
 
@@ -10,12 +11,13 @@ use nalgebra::Vector3;
 
 use crate::robust::energy::Object;
 use crate::robust::model::Model;
+use crate::robust::parts::Part;
 
 /// The probability that an object is none which the car carries: of the one, of the other and of clutter, all of which explain its votes.
 #[must_use]
 pub fn not_carried(model: &Model<'_>, object: &Object) -> f64 {
     let carried = energy_if_carried(model, object);
-    if carried == f64::INFINITY {
+    if carried == f64::INFINITY || !model.settings.has(Part::Carried) {
         return 1.0;
     }
     let there = -0.5 * object.energy;
@@ -39,13 +41,12 @@ fn energy_if_carried(model: &Model<'_>, object: &Object) -> f64 {
     let votes = || object.votes.iter().copied();
     let information: f64 = votes().map(|ray| 1.0 / variance(ray)).sum();
     let middle = votes().map(|ray| direction(ray) / variance(ray)).sum::<Vector3<f64>>().normalize();
-    let of_vote = |ray: u32| {
-        let chi2 = (direction(ray) - middle).norm_squared() / variance(ray);
-        let ln_clutter_per_sr = model.ln_clutter_per_px2(ray) + scene.scale2[ray as usize].ln();
-        chi2 + 2.0 * ((TAU * variance(ray)).ln() + ln_clutter_per_sr)
-    };
-    let anywhere = information * scene.frusta[first.camera as usize].solid_angle_sr / TAU;
-    votes().map(of_vote).sum::<f64>() + 2.0 * (anywhere.ln() + (scene.views.len() as f64).ln())
+    let of_vote =
+        |ray: u32| (direction(ray) - middle).norm_squared() / variance(ray) + 2.0 * (TAU * variance(ray)).ln();
+    let ln_clutter_per_sr = |ray: u32| model.ln_clutter_per_px2(ray) + scene.scale2[ray as usize].ln();
+    votes().map(of_vote).sum::<f64>()
+        + 2.0 * votes().skip(1).map(ln_clutter_per_sr).sum::<f64>()
+        + 2.0 * (information / TAU).ln()
 }
 
 #[cfg(test)]

@@ -15,6 +15,7 @@ use crate::robust::energy::{Object, placed};
 use crate::robust::learn::existence::existences;
 use crate::robust::model::Model;
 use crate::robust::parts::Part;
+use carried::not_carried;
 use positions::positions;
 use switches::are_others;
 
@@ -48,10 +49,8 @@ pub fn labels(model: &Model<'_>, lookout: &Lookout, objects: Vec<Object>, few: V
     let as_they_are = few.iter().map(|object| Estimate { point: object.fit.point, covariance: object.fit.covariance });
     let estimates: Vec<Estimate> = estimates.into_iter().map(scaled).chain(as_they_are).collect();
     let all: Vec<Object> = objects.into_iter().chain(few).collect();
-    let has_carried = model.settings.has(Part::Carried);
-    let not_carried = |object: &Object| if has_carried { carried::not_carried(model, object) } else { 1.0 };
-    let existences = existences.into_iter().zip(&all).map(|(existence, object)| existence * not_carried(object));
-    let existences: Vec<f64> = existences.collect();
+    let unless_carried = |(existence, object)| existence * not_carried(model, object);
+    let existences: Vec<f64> = existences.into_iter().zip(&all).map(unless_carried).collect();
     let are_others = are_others(model, &all.iter().collect::<Vec<_>>());
     let mut findings: Vec<Finding> = all
         .into_iter()
