@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::robust::energy::agreement::{Disagreement, MIN_SHARED_LABELS, Sides, disagreements, sides_of_all};
+use crate::robust::energy::agreement::{Disagreement, MIN_SHARED_LABELS, disagreements, sides_of_all};
 use crate::robust::energy::estimate::Care;
 use crate::robust::energy::{Placed, SURE_VOTES, implied_size};
 use crate::robust::learn::median;
@@ -114,10 +114,7 @@ fn noise_of_sides(model: &Model<'_>, known: Known, labels: &[&Placed], care: Car
     };
     let drifted = if known.position { None } else { agreeing_drift(noise, stated(scene), of_one_side) };
     let of_passes = drifted.unwrap_or(*noise);
-    // Sides that disagree by more than things are large are those of two.
-    let is_one = |sides: &Sides| sides.between(size_m).is_none_or(|most| most.sigmas() < CERTAIN_SIGMAS);
-    let mut sides = sides_of_all(scene, &of_passes, labels, care);
-    sides.retain(|sides| sides.as_ref().is_some_and(is_one));
+    let sides = sides_of_all(scene, &of_passes, labels, care);
     let between = |side_m: f64| sides.iter().map(move |sides| sides.as_ref()?.between(side_m));
     let count = between(0.0).flatten().count() as f64;
     if excess(between(0.0))? < least_sigmas * count.sqrt() {
@@ -140,7 +137,6 @@ mod tests {
     use nalgebra::{Isometry3, Point3, Vector3};
 
     use super::*;
-    use crate::robust::energy::estimate::visits;
     use crate::robust::scene::sample::scramble;
     use crate::street;
 
@@ -184,36 +180,6 @@ mod tests {
                 assert!((0.7 * off_m..=1.3 * off_m).contains(&side_m), "{side_m}");
             }
         }
-    }
-
-    #[test]
-    fn what_no_pass_tells_alone_its_side_does() {
-        let noise = Noise { position_drift_m: 0.03, ..street::NOISE };
-        let (scene, mut labels) = street_from_both_ends(20.0, 0.2);
-        for (votes, _) in &mut labels {
-            let few = |visit: &[u32]| -> Vec<u32> { visit.iter().copied().step_by(visit.len().div_ceil(3)).collect() };
-            *votes = visits(&scene, votes).flat_map(few).collect();
-        }
-        let model = Model::new(&scene, &noise, &street::SETTINGS);
-        let found = with_sides(&model, Known::default(), &labels);
-        assert!(found.is_some_and(|found| (0.14..=0.26).contains(&found.side_m)), "{found:?}");
-    }
-
-    #[test]
-    fn labels_of_two_things_do_not_tell_how_far_off_the_middles_of_sides_are() {
-        let noise = Noise { position_drift_m: 0.03, ..street::NOISE };
-        let (scene, mut labels) = street_from_both_ends(8.0, 0.2);
-        // Beside all things, every second one as its front and the back of the next.
-        let of_side = |(votes, _): &Placed, side: u32| -> Vec<u32> {
-            votes.iter().copied().filter(|&ray| scene.view(ray).pass % 2 == side).collect()
-        };
-        let two =
-            |pair: &[Placed]| ([of_side(&pair[0], 0), of_side(&pair[1], 1)].concat(), (pair[0].1 + pair[1].1) / 2.0);
-        let of_two: Vec<Placed> = labels.chunks(2).map(two).collect();
-        labels.extend(of_two);
-        let model = Model::new(&scene, &noise, &street::SETTINGS);
-        let found = with_sides(&model, Known::default(), &labels);
-        assert!(found.is_some_and(|found| (0.14..=0.26).contains(&found.side_m)), "{found:?}");
     }
 
     #[test]

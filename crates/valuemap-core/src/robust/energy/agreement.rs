@@ -14,8 +14,8 @@ use crate::robust::noise::Noise;
 use crate::robust::noise::drift::Drive;
 use crate::robust::scene::Scene;
 
-/// A pass, or a side, with fewer voters does not say where it would put a label alone.
-const LEAST_ALONE: usize = 4;
+/// A pass with fewer voters does not say where it would put a label alone.
+const MIN_VOTES_OF_PASS: usize = 4;
 /// Where fewer labels are seen by several passes, the shared part is taken to be as large as the own part.
 pub const MIN_SHARED_LABELS: usize = 5;
 /// One label says no more than this about the disagreement of passes, as a multiple of what is expected.
@@ -31,11 +31,6 @@ pub struct Disagreement {
 }
 
 impl Disagreement {
-    /// That of both.
-    fn and(self, other: Self) -> Self {
-        Self { square: self.square + other.square, freedom: self.freedom + other.freedom }
-    }
-
     /// By how many standard deviations it is larger than expected: its cubic root is nearly Gaussian (Wilson and Hilferty, "The distribution of
     /// chi-square", 1931).
     #[must_use]
@@ -45,77 +40,53 @@ impl Disagreement {
     }
 }
 
-/// What some passes say of a label together: information, 1/m², and gradient, 1/m; and the squared distances of where each puts it alone from where it
-/// is, in sigmas.
-#[derive(Default)]
-struct Said {
-    information: Matrix3<f64>,
-    gradient: Vector3<f64>,
-    square: f64,
-    passes: u32,
-}
-
-impl Said {
-    fn add(&mut self, information: Matrix3<f64>, gradient: Vector3<f64>, square: f64) {
-        self.information += information;
-        self.gradient += gradient;
-        self.square += square;
-        self.passes += 1;
-    }
-
-    /// How far they lie from their mean. Nothing if they do not fix it.
-    fn disagreement(&self) -> Option<Disagreement> {
-        let of_mean = self.gradient.dot(&self.information.cholesky()?.solve(&self.gradient));
-        Some(Disagreement { square: (self.square - of_mean).max(0.0), freedom: 3.0 * f64::from(self.passes - 1) })
-    }
-}
-
 /// What the passes of one side say of a label.
 struct Side {
     /// Where they put it together, beside where it is, m.
     offset_m: Vector3<f64>,
     /// Covariance of that, m².
     covariance: Matrix3<f64>,
-    /// How far those of its passes that put it somewhere alone lie from their mean; nothing if no two do.
-    within: Option<Disagreement>,
+    /// Squared distances of where each puts it alone from there, in sigmas.
+    square: f64,
+    passes: u32,
 }
 
 /// What the passes of a label say of it, side by side.
 pub struct Sides(Vec<Side>);
 
 impl Sides {
-    /// Of the sides with enough votes, whichever of their passes have them. Nothing if one of them does not fix the label.
-    fn of(scene: &Scene, noise: &Noise, passes: &[&[u32]], point: &Vector3<f64>, care: Care) -> Option<Self> {
-        let of_side = |passes: Vec<&[u32]>| {
-            let (mut all, mut alone) = (Said::default(), Said::default());
-            for pass in &passes {
-                let (information, gradient) =
-                    Drive::at_one(&looks_at(scene, noise, noise, pass, point)?)?.normals.of_one();
-                all.add(information, gradient, 0.0);
-                if pass.len() >= LEAST_ALONE {
-                    alone.add(information, gradient, gradient.dot(&information.cholesky()?.solve(&gradient)));
-                }
+    /// Of the passes with enough votes. Nothing if they do not fix the label.
+    fn of(scene: &Scene, noise: &Noise, (votes, point): &Placed, care: Care) -> Option<Self> {
+        let passes: Vec<&[u32]> = visits(scene, votes).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS).collect();
+        let of_side = |side: &Vec<u32>| {
+            let (mut information, mut gradient, mut alone) = (Matrix3::zeros(), Vector3::zeros(), 0.0);
+            for &pass in side {
+                let looks = looks_at(scene, noise, noise, passes[pass as usize], point)?;
+                let (of_pass, by_pass) = Drive::at_one(&looks)?.normals.of_one();
+                alone += by_pass.dot(&of_pass.cholesky()?.solve(&by_pass));
+                information += of_pass;
+                gradient += by_pass;
             }
-            let within = if alone.passes > 1 { Some(alone.disagreement()?) } else { None };
-            let covariance = all.information.cholesky()?.inverse();
-            let rough = Side { offset_m: -covariance * all.gradient, covariance, within };
+            let covariance = information.cholesky()?.inverse();
+            let offset_m = -covariance * gradient;
+            let square = (alone + gradient.dot(&offset_m)).max(0.0);
+            let rough = Side { offset_m, covariance, square, passes: side.len() as u32 };
             if care == Care::Rough {
                 return Some(rough);
             }
-            let votes: Vec<u32> = passes.into_iter().flatten().copied().collect();
+            let votes: Vec<u32> = side.iter().flat_map(|&pass| passes[pass as usize]).copied().collect();
             let Estimate { point: there, covariance } = estimate(scene, noise, &votes, *point, care)?;
             Some(Side { offset_m: there - point, covariance, ..rough })
         };
-        let passes_of = |side: Vec<u32>| side.into_iter().map(|pass| passes[pass as usize]).collect::<Vec<&[u32]>>();
-        let sides = sides(scene, passes.iter().copied()).into_iter().map(passes_of);
-        let is_known = |side: &Vec<&[u32]>| side.iter().map(|pass| pass.len()).sum::<usize>() >= LEAST_ALONE;
-        sides.filter(is_known).map(of_side).collect::<Option<_>>().map(Self)
+        sides(scene, passes.iter().copied()).iter().map(of_side).collect::<Option<_>>().map(Self)
     }
 
     /// Of the passes of each side with each other. Nothing if no side has two.
     #[must_use]
     pub fn within(&self) -> Option<Disagreement> {
-        self.0.iter().filter_map(|side| side.within).reduce(Disagreement::and)
+        let freedom = self.0.iter().map(|side| 3.0 * f64::from(side.passes - 1)).sum();
+        let square = self.0.iter().map(|side| side.square).sum();
+        (freedom > 0.0).then_some(Disagreement { square, freedom })
     }
 
     /// Of the sides with each other, if each shows another middle. Nothing if there are no two.
@@ -136,15 +107,18 @@ impl Sides {
 
     /// Of all passes with each other. Nothing if there is only one.
     fn all(&self, side_m: f64) -> Option<Disagreement> {
-        [self.within(), self.between(side_m)].into_iter().flatten().reduce(Disagreement::and)
+        let parts = [self.within(), self.between(side_m)];
+        parts
+            .into_iter()
+            .flatten()
+            .reduce(|a, b| Disagreement { square: a.square + b.square, freedom: a.freedom + b.freedom })
     }
 }
 
 /// How far the positions that the passes of a label give it alone lie from their mean. Nothing for labels of a single pass.
 #[must_use]
 pub fn disagreement(scene: &Scene, noise: &Noise, label: &Placed) -> Option<Disagreement> {
-    let alone: Vec<&[u32]> = visits(scene, &label.0).filter(|pass| pass.len() >= LEAST_ALONE).collect();
-    Sides::of(scene, noise, &alone, &label.1, Care::Rough)?.all(noise.side_m)
+    Sides::of(scene, noise, label, Care::Rough)?.all(noise.side_m)
 }
 
 /// That of each of some labels.
@@ -156,9 +130,7 @@ pub fn disagreements(scene: &Scene, noise: &Noise, labels: &[&Placed]) -> Vec<Op
 /// What the passes of each of some labels say of it.
 #[must_use]
 pub fn sides_of_all(scene: &Scene, noise: &Noise, labels: &[&Placed], care: Care) -> Vec<Option<Sides>> {
-    let of_label =
-        |(votes, point): &&Placed| Sides::of(scene, noise, &visits(scene, votes).collect::<Vec<&[u32]>>(), point, care);
-    labels.par_iter().map(of_label).collect()
+    labels.par_iter().map(|label| Sides::of(scene, noise, label, care)).collect()
 }
 
 /// How much larger than they are said to be the errors are that labels of several passes show: the mean disagreement of
