@@ -76,7 +76,11 @@ mod tests {
 
     /// The probability that it is not carried, if J of it is -100.
     fn of(scene: &Scene) -> f64 {
-        not_carried(&Model::new(scene, &street::NOISE, &street::SETTINGS), &anywhere(10, Seen::default(), -100.0))
+        of_model(&Model::new(scene, &street::NOISE, &street::SETTINGS))
+    }
+
+    fn of_model(model: &Model<'_>) -> f64 {
+        not_carried(model, &anywhere(10, Seen::default(), -100.0))
     }
 
     #[test]
@@ -84,6 +88,22 @@ mod tests {
         let [stays, moves] = [true, false].map(|stays| of(&seen_by_ten(stays)));
         assert!(stays < 0.1, "{stays}");
         assert!(moves > 0.999, "{moves}");
+    }
+
+    #[test]
+    fn images_that_are_mapped_with_it_do_not_change_whether_it_is_carried() {
+        // As a tile and the whole have it.
+        let tile = seen_by_ten(true);
+        let mut whole = tile.clone();
+        whole.views.extend_from_within(..);
+        let [of_tile, of_whole] = [&tile, &whole].map(|scene| {
+            let mut model = Model::new(scene, &street::NOISE, &street::SETTINGS);
+            // What is learned of classes is learned once for all tiles. So dense that both are probable.
+            model.classes[0].ln_clutter_per_sr = 4.6;
+            of_model(&model)
+        });
+        assert_eq!(of_tile.to_bits(), of_whole.to_bits());
+        assert!((0.01..0.99).contains(&of_tile), "{of_tile}");
     }
 
     #[test]
