@@ -48,6 +48,13 @@ BLOCKS: dict[str, dict[str, float]] = {
     "standing": {"frame_spacing_m": 20.0},
     "narrow": {"max_facing_deg": 20.0},
     "trees": {"tree_spacing_m": 8.0, "max_sight_m": 60.0, "passes_per_street": 1, **NO_LIGHTS},
+    "far off": {
+        "tail_share": 0.2,
+        "max_sight_m": 100.0,
+        "frame_spacing_m": 1.2,
+        "passes_per_street": 2,
+        "lookalikes_per_light": 0.0,
+    },
     "missed": {"tail_share": 0.1, "tree_spacing_m": 8.0, "max_sight_m": 60.0, "passes_per_street": 1, **NO_LIGHTS},
     "uneven trees": {
         "tree_spacing_m": 10.0,
@@ -196,6 +203,7 @@ CASES: dict[str, tuple[str, int, Fails]] = {
     "reach": ("drifts", 5, what_is_there_is_believed_less),
     "aspect": ("narrow", 7, what_is_there_is_believed_less),
     "company": (FEW_PICTURES, 5, more_is_wrong),
+    "ghosts": ("far off", 6, more_is_wrong),
     "carried": ("reflections", 5, more_is_wrong),
     "looks": ("lights", 5, more_is_wrong),
     "turns": ("standing", 16, more_is_wrong),

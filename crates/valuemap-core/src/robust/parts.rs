@@ -51,6 +51,8 @@ pub enum Part {
     Company,
     /// Scores, company and approach tell which objects exist.
     Existence,
+    /// What hardly any look sees is a ghost, as many are.
+    Ghosts,
     /// What stays at its place of the picture is no object.
     Carried,
     /// Who should have seen an object and did not.
@@ -73,7 +75,7 @@ pub enum Part {
 
 impl Part {
     /// All parts with their names.
-    pub const ALL: [(Self, &'static str); 33] = [
+    pub const ALL: [(Self, &'static str); 34] = [
         (Self::Polishing, "polishing"),
         (Self::Assignment, "assignment"),
         (Self::Merging, "merging"),
@@ -98,6 +100,7 @@ impl Part {
         (Self::Aspect, "aspect"),
         (Self::Company, "company"),
         (Self::Existence, "existence"),
+        (Self::Ghosts, "ghosts"),
         (Self::Carried, "carried"),
         (Self::Looks, "looks"),
         (Self::Turns, "turns"),

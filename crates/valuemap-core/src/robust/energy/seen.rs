@@ -1,8 +1,8 @@
 //! The likelihood of the looks at an object, if it is real and if it is false: equation (5) of `docs/method.md`.
 //!
 //! The hit rate of a real object differs from side to side (logit-normal) and, around that, from pass to pass (beta-binomial); an odd pass may have any
-//! rate. A false thing is there on one pass alone, or is seen less than a real object from everywhere. Only the side with most hits decides, since from
-//! other sides a real object may be seen less as well.
+//! rate. A false thing is there on one pass alone, or is seen less than a real object from everywhere, or is a ghost: rays that meet by chance, so that
+//! hardly any look is a hit. Only the side with most hits decides, since from other sides a real object may be seen less as well.
 
 use std::cmp::Ordering;
 use std::f64::consts::LN_2;
@@ -30,6 +30,9 @@ pub struct Seen {
     pub ln_turns: f64,
 }
 
+/// Ghosts have less than this part of the usual hits. An object that is hardly seen has about half of them, and what is false for other reasons any part.
+const GHOSTLY: f64 = 0.25;
+
 /// The shares of hits that the sides of objects of a class may have.
 pub(crate) struct Shares<'a> {
     class: &'a ClassModel,
@@ -45,9 +48,10 @@ struct Share {
     miss: f64,
     /// Logarithms of the gamma function of both.
     ln_gamma: (f64, f64),
-    /// How probable it is that a side has it: as usual, and where it is seen less.
+    /// How probable it is that a side has it: as usual, where it is seen less, and that of a ghost.
     ln_usual: f64,
     ln_less: f64,
+    ln_ghost: f64,
 }
 
 impl<'a> Shares<'a> {
@@ -56,11 +60,14 @@ impl<'a> Shares<'a> {
         let shares: [f64; SHARES] = std::array::from_fn(|k| (k as f64 + 0.5) / SHARES as f64);
         let usual = shares.map(|share| class.rates.density(share));
         let less = shares.map(|share| f64::from(u8::from(share < recall)));
+        // As finely as shares are told apart.
+        let ghost = shares.map(|share| f64::from(u8::from(share < (GHOSTLY * recall).max(1.0 / SHARES as f64))));
         let ln_of = |weights: &[f64; SHARES], k: usize| (weights[k] / weights.iter().sum::<f64>()).ln();
         let each = std::array::from_fn(|k| {
             let (hit, miss) = (shares[k] * concentration, (1.0 - shares[k]) * concentration);
             let ln_gamma = (ln_gamma(hit), ln_gamma(miss));
-            Share { hit, miss, ln_gamma, ln_usual: ln_of(&usual, k), ln_less: ln_of(&less, k) }
+            let [ln_usual, ln_less, ln_ghost] = [&usual, &less, &ghost].map(|weights| ln_of(weights, k));
+            Share { hit, miss, ln_gamma, ln_usual, ln_less, ln_ghost }
         });
         Self { class, each, ln_gamma: ln_gamma(concentration) }
     }
@@ -86,13 +93,14 @@ fn ln_any(pass: &Looks) -> f64 {
 }
 
 /// Logarithms of how probable the looks of one sector are: if the object is seen from there as usual, if less or differently on each pass,
-/// and if it is false.
+/// if it is false, and if it is a ghost.
 struct OfSector {
     /// From a side of each share.
     of_shares: [f64; SHARES],
     usual: f64,
     any: f64,
     falsely: f64,
+    ghost: f64,
     hits: f64,
     expected: f64,
 }
@@ -121,7 +129,8 @@ impl OfSector {
         // What two passes meet at one place does not pass by.
         let passing = if present == 1 { of_present + ln_met_by_one(passes.len()) } else { f64::NEG_INFINITY };
         let (falsely, any) = (ln_sum(passing, less) - LN_2, ln_sum(each, less) - LN_2);
-        Self { of_shares, usual: with(|share| share.ln_usual), any, falsely, hits, expected }
+        let (usual, ghost) = (with(|share| share.ln_usual), with(|share| share.ln_ghost));
+        Self { of_shares, usual, any, falsely, ghost, hits, expected }
     }
 
     /// That from where an object has most votes is the greatest.
@@ -160,22 +169,42 @@ pub(crate) struct Judged {
     sectors: Vec<OfSector>,
     /// The sector from where it has most votes; nothing if nobody looks.
     main: Option<usize>,
-    /// If it is real, seen as usual from where it has most votes; and if it is false. From other sides both may be seen as usual or not.
+    /// If it is real, seen as usual from where it has most votes; if it is false; and if it is a ghost. From other sides all may be seen as usual or not.
     ln_real: f64,
     ln_false: f64,
+    ln_ghost: f64,
     ln_turns: f64,
 }
 
 impl Judged {
-    /// Logarithm of how probable the looks are at anything, real or false.
+    /// Logarithm of how probable the looks are at anything, real or not.
     pub(crate) fn ln_likelihood(&self) -> f64 {
-        ln_sum(self.ln_real, self.ln_false) - self.ln_turns
+        self.ln_any() - self.ln_turns
     }
 
-    /// Probability that what has these looks is real rather than false.
+    /// Probability that what has these looks is real rather than false or a ghost.
     pub(crate) fn real(&self) -> f64 {
-        (self.ln_real - ln_sum(self.ln_real, self.ln_false)).exp()
+        (self.ln_real - self.ln_any()).exp()
     }
+
+    /// Probability that it is a ghost.
+    fn ghost(&self) -> f64 {
+        (self.ln_ghost - self.ln_any()).exp()
+    }
+
+    fn ln_any(&self) -> f64 {
+        ln_sum(ln_sum(self.ln_real, self.ln_false), self.ln_ghost)
+    }
+}
+
+/// What the looks at an object tell of how often objects are detected, and of ghosts.
+pub(crate) struct Told {
+    /// Probability that it is real.
+    pub real: f64,
+    /// Probability that it is a ghost.
+    pub ghost: f64,
+    /// The looks of all passes from where it has most votes, each with the probability that it is real and seen as usual on this pass.
+    pub usual: Vec<(Looks, f64)>,
 }
 
 /// The hits and the looks of some passes.
@@ -189,13 +218,20 @@ impl Seen {
         let sectors: Vec<OfSector> = self.sectors.iter().map(|passes| OfSector::new(passes, shares)).collect();
         let all: f64 = sectors.iter().map(OfSector::either).sum();
         let main = sectors.iter().enumerate().max_by(|(_, a), (_, b)| a.by_hits(b)).map(|(place, _)| place);
-        let (usual, falsely) = main.map_or((0.0, 0.0), |main| {
+        let [usual, falsely, ghost] = main.map_or([0.0; 3], |main| {
             let main = &sectors[main];
-            let others = all - main.either();
-            (others + main.usual, others + main.falsely)
+            [main.usual, main.falsely, main.ghost].map(|of_main| all - main.either() + of_main)
         });
-        let (ln_real, ln_false) = (usual + (-FALSE_SHARE).ln_1p(), falsely + FALSE_SHARE.ln());
-        Judged { sectors, main, ln_real, ln_false, ln_turns: self.ln_turns }
+        let ghosts = shares.class.ghost_share;
+        let ln_no_ghost = (-ghosts).ln_1p();
+        Judged {
+            sectors,
+            main,
+            ln_real: usual + (-FALSE_SHARE).ln_1p() + ln_no_ghost,
+            ln_false: falsely + FALSE_SHARE.ln() + ln_no_ghost,
+            ln_ghost: ghost + ghosts.ln(),
+            ln_turns: self.ln_turns,
+        }
     }
 
     /// Passes that see an object from where it has most votes, or should have; and minus the logarithm of how probable it is of those without a hit
@@ -224,20 +260,21 @@ impl Seen {
         (expected > 0.0).then(|| hits / expected)
     }
 
-    /// The looks of all passes from where the object has most votes; how probable it is that it is seen as usual from there, and that it is on this
-    /// pass as well.
-    pub(crate) fn usual(&self, shares: &Shares<'_>) -> Vec<(Looks, f64, f64)> {
+    /// What the looks tell of those at objects of the class.
+    pub(crate) fn told(&self, shares: &Shares<'_>) -> Told {
         let judged = self.judged(shares);
-        let Some(main) = judged.main else { return Vec::new() };
-        let (real, of_main) = (judged.real(), &judged.sectors[main]);
+        let (real, ghost) = (judged.real(), judged.ghost());
+        let Some(main) = judged.main else { return Told { real, ghost, usual: Vec::new() } };
+        let of_main = &judged.sectors[main];
         let weights: [f64; SHARES] =
             std::array::from_fn(|k| (of_main.of_shares[k] + shares.each[k].ln_usual - of_main.usual).exp());
         let of_pass = |pass: &Looks| {
             let (usual, any) = shares.of_pass(pass, ln_any(pass));
             let usual = weights.iter().zip(usual).map(|(weight, usual)| weight * usual / (usual + any));
-            (*pass, real, real * usual.sum::<f64>())
+            (*pass, real * usual.sum::<f64>())
         };
-        self.sectors[main].iter().map(of_pass).collect()
+        let usual = self.sectors[main].iter().map(of_pass).collect();
+        Told { real, ghost, usual }
     }
 }
 
@@ -310,6 +347,20 @@ mod tests {
     fn what_is_seen_now_and_then_from_everywhere_is_false() {
         let now_and_then = seen(&[&[(2.0, 20.0), (1.0, 20.0), (3.0, 20.0), (2.0, 20.0)]]);
         assert!(real(&now_and_then, 0.3) < 0.05, "{}", real(&now_and_then, 0.3));
+    }
+
+    #[test]
+    fn what_hardly_any_look_sees_is_a_ghost_where_many_are() {
+        let class = |ghost_share: f64| {
+            // Objects differ so much that some are hardly ever seen.
+            let rates = Rates { recall: 0.4, concentration: 30.0, between: 1.4 };
+            ClassModel { rates, ghost_share, ..class(0.0) }
+        };
+        let judged = |seen: &Seen, share: f64| seen.judged(&Shares::of(&class(share))).real();
+        let hardly = seen(&[&[(1.0, 40.0), (0.0, 40.0), (2.0, 40.0), (1.0, 40.0)]]);
+        assert!(judged(&hardly, 0.0) > 0.8 && judged(&hardly, 0.6) < 0.2);
+        let often = seen(&[&[(20.0, 40.0), (24.0, 40.0), (18.0, 40.0), (22.0, 40.0)]]);
+        assert!(judged(&often, 0.0) > 0.9 && judged(&often, 0.6) > 0.9);
     }
 
     #[test]

@@ -7,27 +7,22 @@ pub mod company;
 pub mod confusion;
 pub mod counts;
 pub mod existence;
+pub mod rates;
 pub mod reach;
 pub mod tails;
 
-use rayon::prelude::*;
-
 use crate::robust::energy::looks::Lookout;
-use crate::robust::energy::seen::{Looks, Shares};
 use crate::robust::energy::{LEAST_VOTES, Object, SURE_VOTES, implied_size};
 use crate::robust::model::heights::{Heights, ground_m2 as ground_m2_within, height_m};
 use crate::robust::model::steps::{elevation_factor, score_ratio};
-use crate::robust::model::{ClassModel, Model, ODD_PASSES, Rates};
+use crate::robust::model::{ClassModel, Model};
 use crate::robust::parts::Part;
 use aspect::aspect;
 use company::company;
+use rates::with_rates;
 use reach::{looked_at, reach};
 use tails::{OfImages, tails};
 
-/// Steps of expectation and maximisation: some ten change the rates by less than a thousandth.
-const STEPS: usize = 20;
-/// Shares of odd passes that are compared: so many that a tenth of their deviation is between two where a thousand passes tell.
-const ODD_SHARES: usize = 45;
 /// The part of the votes that is nearer than what counts as seen from everywhere.
 const NEAR_VOTES: f64 = 0.05;
 /// Boxes that are all put on one elevation, as those of bearings are on the horizon, differ in its sine by no more than rounding.
@@ -36,8 +31,6 @@ const LEAST_ELEVATIONS: f64 = 1e-6;
 const MIN_OBJECTS: usize = 5;
 /// What is seen in less than this part of the looks that are usual is rather false than real.
 const HARDLY: f64 = 0.5;
-/// Rates of fewer looks are known worse than to a tenth.
-pub(crate) const LEAST_LOOKS: f64 = 30.0;
 /// The median absolute deviation of a normal distribution, in standard deviations.
 const MAD_OF_NORMAL: f64 = 0.6745;
 /// A spread of sizes is no smaller: boxes are whole pixels, and edges are not the same all around.
@@ -129,7 +122,7 @@ impl<'a> Evidence<'a> {
         let sure: Vec<&Object> = many.iter().copied().filter(|object| object.real > 0.5).collect();
         if sure.len() >= MIN_OBJECTS {
             learned.is_learned = true;
-            (learned.rates, learned.odd_passes) = rates(&many, before);
+            learned = with_rates(&many, &learned, has(Part::Ghosts));
             (learned.nearest_m, learned.farthest_m) = distances_between_m(model, &sure);
             let (spread, object) = sizes(model, &sure);
             learned.sizes.spread = spread.max(LEAST_SPREAD);
@@ -251,107 +244,6 @@ pub(crate) fn median(values: &mut [f64]) -> Option<f64> {
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
-/// How often objects are detected in the usual pass from where they have most votes, how much that differs between them, and the share of odd
-/// passes: by expectation and maximisation, so that what is false in the end has told nothing. From two starts, the likelier: objects that differ
-/// much, of which few are false, and objects that are alike.
-fn rates(objects: &[&Object], before: &ClassModel) -> (Rates, f64) {
-    let mut shares: Vec<f64> = objects.iter().filter_map(|object| object.seen.main_share()).collect();
-    let alike = median(&mut shares).map_or(Rates::ALIKE, |share| Rates { recall: recall(share), ..Rates::ALIKE });
-    let from = |rates: Rates| {
-        let class = learned_rates(objects, ClassModel { rates, odd_passes: ODD_PASSES.1, ..*before })?;
-        Some((ln_likelihood(objects, &class), class))
-    };
-    let (differing, alike) = rayon::join(|| from(Rates::GUESS), || from(alike));
-    let starts = [differing, alike].into_iter().flatten();
-    let Some((_, likeliest)) = starts.max_by(|a, b| a.0.total_cmp(&b.0)) else {
-        return (before.rates, before.odd_passes);
-    };
-    (likeliest.rates, odd_passes(objects, &likeliest))
-}
-
-/// The share of odd passes to expect, whatever it is within its bounds: where few objects tell, the likeliest share is as good as any other.
-fn odd_passes(objects: &[&Object], class: &ClassModel) -> f64 {
-    let (least, _, most) = ODD_PASSES;
-    let shares: [f64; ODD_SHARES] =
-        std::array::from_fn(|k| least + (most - least) * (k as f64 + 0.5) / ODD_SHARES as f64);
-    let ln_likelihood = |&odd_passes: &f64| ln_likelihood(objects, &ClassModel { odd_passes, ..*class });
-    let ln_likelihoods: Vec<f64> = shares.par_iter().map(ln_likelihood).collect();
-    let highest = ln_likelihoods.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    let weights: Vec<f64> = ln_likelihoods.iter().map(|of_share| (of_share - highest).exp()).collect();
-    let sum: f64 = weights.iter().zip(shares).map(|(weight, share)| weight * share).sum();
-    sum / weights.iter().sum::<f64>()
-}
-
-/// Logarithm of how probable the looks at some objects are.
-fn ln_likelihood(objects: &[&Object], class: &ClassModel) -> f64 {
-    let shares = Shares::of(class);
-    objects.iter().map(|object| object.seen.judged(&shares).ln_likelihood()).sum()
-}
-
-/// The same from one start; nothing if there are few looks.
-fn learned_rates(objects: &[&Object], mut class: ClassModel) -> Option<ClassModel> {
-    for _ in 0..STEPS {
-        let shares = Shares::of(&class);
-        let of_object = |object: &&Object| {
-            let passes = object.seen.usual(&shares).into_iter();
-            passes.filter(|(pass, ..)| pass.expected >= 3.0).collect::<Vec<(Looks, f64, f64)>>()
-        };
-        let sides: Vec<Vec<(Looks, f64, f64)>> = objects.par_iter().map(of_object).collect();
-        let real: f64 = sides.iter().flatten().map(|pass| pass.1).sum();
-        let odd = 1.0 - sides.iter().flatten().map(|pass| pass.2).sum::<f64>() / real;
-        let of_side =
-            |passes: Vec<(Looks, f64, f64)>| passes.into_iter().map(|(pass, _, usual)| (pass, usual)).collect();
-        let sides: Vec<Vec<(Looks, f64)>> = sides.into_iter().map(of_side).collect();
-        let rates = rates_of(&sides)?;
-        class = ClassModel { rates, odd_passes: odd.clamp(ODD_PASSES.0, ODD_PASSES.2), ..class };
-    }
-    Some(class)
-}
-
-/// A share of hits as a rate: no detector sees all, and none that serves sees nothing.
-fn recall(share: f64) -> f64 {
-    share.clamp(0.05, 0.98)
-}
-
-/// Detection rates by the method of moments, from looks by side and pass that each count in part. Nothing of few looks.
-#[must_use]
-pub(crate) fn rates_of(sides: &[Vec<(Looks, f64)>]) -> Option<Rates> {
-    let all = || sides.iter().flatten();
-    let expected: f64 = all().map(|(looks, share)| share * looks.expected).sum();
-    let hits: f64 = all().map(|(looks, share)| share * looks.hits).sum();
-    if expected < LEAST_LOOKS {
-        return None;
-    }
-    let recall = recall(hits / expected);
-    let variance = recall * (1.0 - recall);
-    // The variance of a share of n looks is p (1 - p) (1 + (n - 1) / (1 + s)) / n.
-    let (mut excess, mut most) = (0.0, 0.0);
-    for (looks, share) in all() {
-        let n = looks.expected;
-        let away = looks.hits / n - recall;
-        excess += share * (n * away * away - variance);
-        most += share * (n - 1.0) * variance;
-    }
-    let of_all = f64::clamp(excess / most, 0.01, 0.5);
-    // Two passes of one side have in common what sides differ by.
-    let (mut common, mut pairs) = (0.0, 0.0);
-    for passes in sides {
-        let [mut away, mut looks, mut away2, mut looks2] = [0.0; 4];
-        for (pass, share) in passes {
-            let (a, n) = (share * (pass.hits - recall * pass.expected), share * pass.expected);
-            (away, looks, away2, looks2) = (away + a, looks + n, away2 + a * a, looks2 + n * n);
-        }
-        if looks > 0.0 {
-            common += (away * away - away2) / looks;
-            pairs += (looks * looks - looks2) / looks;
-        }
-    }
-    let of_sides = if pairs > 0.0 { f64::clamp(common / (pairs * variance), 0.0, of_all - 0.01) } else { 0.0 };
-    let within = f64::clamp((of_all - of_sides) / (1.0 - of_sides), 0.01, 0.5);
-    // The derivative of the logit is 1 / (p (1 - p)).
-    Some(Rates { recall, concentration: 1.0 / within - 1.0, between: (of_sides / variance).sqrt() })
-}
-
 #[cfg(test)]
 mod tests {
     use nalgebra::Vector3;
@@ -359,18 +251,8 @@ mod tests {
     use super::*;
     use crate::robust::energy::seen::Seen;
     use crate::robust::energy::{anywhere, object};
-    use crate::robust::scene::Scene;
     use crate::street;
     use crate::street::SETTINGS;
-
-    /// An object that all passes see as usual from one side, and hardly any from another.
-    fn seen_from_one_side() -> Object {
-        let pass = |hits: f64| Looks { expected: 20.0, hits };
-        let sectors = [[20.0, 8.0, 16.0, 12.0, 18.0, 10.0], [0.0, 0.0, 1.0, 0.0, 2.0, 0.0]]
-            .map(|hits| hits.into_iter().map(pass).collect())
-            .to_vec();
-        anywhere(1, Seen { sectors, ln_turns: 0.0 }, -100.0)
-    }
 
     #[test]
     fn objects_of_few_votes_teach_only_where_there_are_no_others_and_elevations_are_measured() {
@@ -430,81 +312,5 @@ mod tests {
         learn(&mut model, &lookout, &rays, &objects);
         assert!(by_itself.is_learned && has_same_numbers(&model.classes[0], &by_itself));
         assert!(has_same_numbers(&model.pooled, &by_itself));
-    }
-
-    #[test]
-    fn passes_are_not_odd_from_where_an_object_is_not_seen() {
-        let objects: Vec<Object> = (0..9).map(|_| seen_from_one_side()).collect();
-        let (rates, odd_passes) = rates(&objects.iter().collect::<Vec<_>>(), &guess());
-        assert!((rates.recall - 0.7).abs() < 0.05, "{rates:?}");
-        assert!(odd_passes < 0.1, "{odd_passes}");
-    }
-
-    #[test]
-    fn few_objects_do_not_tell_that_hardly_any_pass_is_odd() {
-        let seen = |hits: f64| {
-            let passes = vec![Looks { expected: 20.0, hits }];
-            anywhere(1, Seen { sectors: vec![passes], ln_turns: 0.0 }, -100.0)
-        };
-        let of = |count: usize| -> Vec<Object> { (0..count).map(|i| seen(16.0 + (i % 3) as f64)).collect() };
-        let class_of = |count: usize| {
-            let objects = of(count);
-            let (rates, odd_passes) = rates(&objects.iter().collect::<Vec<_>>(), &guess());
-            ClassModel { rates, odd_passes, ..guess() }
-        };
-        let (few, many) = (class_of(6), class_of(600));
-        assert!(few.odd_passes > 0.12 && many.odd_passes < 0.06, "{} {}", few.odd_passes, many.odd_passes);
-        // So what is seen less there may be real after all.
-        let less = seen(3.0).seen;
-        let [by_few, by_many] = [&few, &many].map(|class| less.judged(&Shares::of(class)).real());
-        assert!(by_few > 0.5 && by_many < 0.4, "{by_few} {by_many}");
-    }
-
-    #[test]
-    fn what_looks_like_an_object_at_times_does_not_tell_how_often_objects_are_seen() {
-        let seen = |hits: &[f64]| {
-            let passes = hits.iter().map(|&hits| Looks { expected: 40.0, hits }).collect();
-            anywhere(1, Seen { sectors: vec![passes], ln_turns: 0.0 }, -100.0)
-        };
-        let objects = (0..60).map(|i| seen(&[34.0 + f64::from(i % 5), 38.0 - f64::from(i % 3)]));
-        let lookalikes = (0..12).map(|i| seen(&[17.0 + f64::from(i % 9), 22.0 - f64::from(i % 7)]));
-        let all: Vec<Object> = objects.chain(lookalikes).collect();
-        let (rates, odd_passes) = rates(&all.iter().collect::<Vec<_>>(), &guess());
-        assert!(rates.recall > 0.88 && rates.concentration > 15.0, "{rates:?}");
-        let class = ClassModel { rates, odd_passes, ..guess() };
-        let least = all[..60].iter().map(|object| object.seen.judged(&Shares::of(&class)).real()).fold(1.0, f64::min);
-        let most = all[60..].iter().map(|object| object.seen.judged(&Shares::of(&class)).real()).fold(0.0, f64::max);
-        assert!(least > 0.9 && most < 0.5, "{least} {most}");
-    }
-
-    #[test]
-    fn objects_that_all_looks_see_have_rates_as_well() {
-        let passes = || vec![Looks { expected: 12.0, hits: 12.0 }];
-        let objects: Vec<Object> =
-            (0..20).map(|_| anywhere(1, Seen { sectors: vec![passes()], ln_turns: 0.0 }, -100.0)).collect();
-        let (rates, odd_passes) = rates(&objects.iter().collect::<Vec<_>>(), &guess());
-        assert!(rates.recall > 0.9 && rates.concentration > 1.0 && rates.between >= 0.0, "{rates:?}");
-        let class = ClassModel { rates, odd_passes, ..guess() };
-        assert!(objects[0].seen.judged(&Shares::of(&class)).real() > 0.9);
-    }
-
-    /// What is thought of a class at first.
-    fn guess() -> ClassModel {
-        ClassModel::guess(&Scene::default(), &SETTINGS, 0, (f64::NAN, f64::NAN), (f64::NAN, f64::NAN))
-    }
-
-    #[test]
-    fn what_sides_differ_by_is_told_from_what_passes_differ_by() {
-        let pass = |hits: f64| (Looks { expected: 20.0, hits }, 1.0);
-        let of_sides = |hits: &[[f64; 4]]| {
-            let sides: Vec<Vec<(Looks, f64)>> =
-                hits.iter().map(|side| side.iter().map(|&h| pass(h)).collect()).collect();
-            rates_of(&sides).unwrap_or(Rates::ANY)
-        };
-        let by_side = of_sides(&[[18.0, 17.0, 18.0, 19.0], [8.0, 9.0, 8.0, 7.0], [13.0, 14.0, 12.0, 13.0]]);
-        let by_pass = of_sides(&[[18.0, 8.0, 13.0, 14.0], [17.0, 9.0, 12.0, 13.0], [18.0, 8.0, 19.0, 7.0]]);
-        assert!(by_side.between > 0.6 && by_side.concentration > 50.0, "{by_side:?}");
-        assert!(by_pass.between < 0.1 && by_pass.concentration < 20.0, "{by_pass:?}");
-        assert!((by_side.recall - by_pass.recall).abs() < 1e-9);
     }
 }

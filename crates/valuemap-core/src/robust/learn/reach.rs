@@ -2,7 +2,7 @@
 //!
 //! It weighs looks from afar in equation (5) of `docs/method.md`, where a miss says less.
 
-use super::LEAST_LOOKS;
+use super::rates::LEAST_LOOKS;
 use crate::robust::energy::Object;
 use crate::robust::energy::looks::Lookout;
 use crate::robust::model::Model;

@@ -48,6 +48,8 @@ pub struct ClassModel {
     pub farthest_m: f64,
     /// The share of the passes in which an object is seen in any share of the looks, or none: hidden, or from where it is not detected.
     pub odd_passes: f64,
+    /// The share of what is born that is a ghost: rays that meet by chance, again and again where many boxes are far off.
+    pub ghost_share: f64,
     /// Logarithm of the clutter: detections per image and steradian that show no object.
     pub ln_clutter_per_sr: f64,
     /// Logarithm of the density of objects, 1/m³.
@@ -94,6 +96,7 @@ impl ClassModel {
             nearest_m: f64::INFINITY,
             farthest_m: settings.viability.max_range_m,
             odd_passes: ODD_PASSES.1,
+            ghost_share: 0.0,
             ln_clutter_per_sr: (detections.max(1) as f64 / scene.solid_angle_sr()).ln(),
             ln_births_per_m3: -3.0 * settings.viability.max_range_m.ln(),
             ln_births_per_m2: f64::NAN,
@@ -113,7 +116,7 @@ impl ClassModel {
 
     /// The names that its numbers are stored under, in the order of [`to_row`](Self::to_row), each with how many there are. What is a function of
     /// something is stored as the edges between which it is constant, and its values.
-    pub const FIELDS: [(&'static str, usize); 38] = [
+    pub const FIELDS: [(&'static str, usize); 39] = [
         ("is_learned", 1),
         ("recall", 1),
         ("recall_concentration_looks", 1),
@@ -121,6 +124,7 @@ impl ClassModel {
         ("nearest_m", 1),
         ("farthest_m", 1),
         ("odd_passes", 1),
+        ("ghost_share", 1),
         ("ln_clutter_per_sr", 1),
         ("ln_births_per_m3", 1),
         ("ln_births_per_m2", 1),
@@ -176,6 +180,7 @@ impl ClassModel {
             self.nearest_m,
             self.farthest_m,
             self.odd_passes,
+            self.ghost_share,
             self.ln_clutter_per_sr,
             self.ln_births_per_m3,
             self.ln_births_per_m2,
@@ -199,7 +204,7 @@ impl ClassModel {
     /// What `to_row` returned; nothing of another number of numbers.
     #[must_use]
     pub fn from_row(row: &[f64]) -> Option<Self> {
-        let (numbers, rest) = row.split_first_chunk::<20>()?;
+        let (numbers, rest) = row.split_first_chunk::<21>()?;
         let (heights, rest) = rest.split_first_chunk::<{ Heights::NUMBERS }>()?;
         let (clutter, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
         let (scores, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
@@ -216,6 +221,7 @@ impl ClassModel {
             nearest_m,
             farthest_m,
             odd_passes,
+            ghost_share,
             ln_clutter_per_sr,
             ln_births_per_m3,
             ln_births_per_m2,
@@ -236,6 +242,7 @@ impl ClassModel {
             nearest_m,
             farthest_m,
             odd_passes,
+            ghost_share,
             ln_clutter_per_sr,
             ln_births_per_m3,
             ln_births_per_m2,
@@ -558,8 +565,8 @@ impl VotesFor<'_> {
     }
 }
 
-/// The share of false things among what is born. It is not learned: of two passes, a real object that one of them missed and a thing that the other
-/// did not meet look the same, and whatever is thought of them confirms itself.
+/// The share of false things among what is born and no ghost. It is not learned: of two passes, a real object that one of them missed and a thing that
+/// the other did not meet look the same, and whatever is thought of them confirms itself.
 pub const FALSE_SHARE: f64 = 0.1;
 
 /// Standard deviation of the share of hits between sides, at least.
@@ -647,6 +654,7 @@ mod tests {
             nearest_m: 4.0,
             farthest_m: 61.0,
             odd_passes: 0.02,
+            ghost_share: 0.3,
             ln_clutter_per_sr: -1.0,
             ln_births_per_m3: -9.0,
             ln_births_per_m2: -6.0,
@@ -683,6 +691,7 @@ mod tests {
             ("nearest_m", vec![4.0]),
             ("farthest_m", vec![61.0]),
             ("odd_passes", vec![0.02]),
+            ("ghost_share", vec![0.3]),
             ("ln_clutter_per_sr", vec![-1.0]),
             ("ln_births_per_m3", vec![-9.0]),
             ("ln_births_per_m2", vec![-6.0]),
