@@ -395,7 +395,7 @@ def test_middles_that_differ_by_side_are_no_errors_of_images(monkeypatch: pytest
     assert len(result.labels) <= len(lamps.truth) + 1
     assert between_neighbors(result, lamps)[1] < 6.0
     for module in (correction, pipeline):
-        monkeypatch.setattr(module, "with_sides_of", lambda _, config: config)
+        monkeypatch.setattr(module, "with_sides", lambda _, config: config)
     assert len(valuemap.build_map(lamps).labels) > 1.5 * len(lamps.truth)
 
 

@@ -14,17 +14,18 @@ from valuemap.engine.threads import ThreadEngine
 from valuemap.progress import Progress
 from valuemap.refine import (
     FITS_NO_BETTER,
+    AllImages,
     Mapped,
     Refined,
     bundle,
     expose_rows,
     gather_images,
     keyframes_of,
+    middles,
     noise_left,
     refine_again,
     refine_poses,
 )
-from valuemap.robust import Noise
 from valuemap.stages import Stages
 from valuemap.tables import Labels, Votes, covariance_columns
 from valuemap.tiles.calibration import calibrate
@@ -63,7 +64,9 @@ def _proven(dataset: Dataset, config: MapConfig, stages: Stages, threads: int, p
         if of_images.is_corrected:
             return of_images
         refined = _of_drives(dataset, refined, config, threads, progress)
-        return refined if refined.is_corrected else replace(refined, as_given=of_images.as_given)
+        if refined.is_corrected:
+            return refined
+        return replace(refined, as_given=of_images.as_given, side_m=of_images.side_m)
 
 
 def _of_drives(dataset: Dataset, refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:
@@ -88,35 +91,55 @@ def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progr
 
     It is proven with the map of the poses as they were: each half of its objects places the images for the other half.
     """
-    engine, moved, images = ThreadEngine(threads), before, gather_images(before, config)
-    as_given: Mapped | None = None
-    figures: dict[str, float] = {}
-    for number in range(_MAPS_OF_IMAGES):
-        _, labels, votes, _ = mapped = _map_alone(moved, config, engine, progress)
-        as_given = as_given or mapped
-        if not len(labels):
-            return Refined(before, {}, as_given=as_given)
-        noise = as_given[0].noise
-        config = with_sides_of(noise, config)
-        told = bundle(images, labels, votes, noise)
-        if number == 0:
-            is_proven, figures = told.is_proven()
-            if not is_proven:
-                return Refined(before, {}, as_given=as_given)
+    engine, images = ThreadEngine(threads), gather_images(before, config)
+    as_given, side_m = _map_with_sides(before, images, config, engine, progress)
+    calibration, labels, votes, _ = as_given
+    uncorrected = Refined(before, {}, as_given=as_given, side_m=side_m)
+    if not len(labels):
+        return uncorrected
+    noise, moved = calibration.noise, before
+    config = with_sides(noise.side_m, config)
+    told = bundle(images, labels, votes, noise)
+    is_proven, figures = told.is_proven()
+    if not is_proven:
+        return uncorrected
+    for maps in range(1, _MAPS_OF_IMAGES + 1):
         last, moved = moved, replace(before, images=told.images(before.images))
         step_m = camera_centers(moved.images) - camera_centers(last.images)
-        if np.sqrt(np.mean(step_m**2)) < _SETTLED * noise.position_m:
+        if np.sqrt(np.mean(step_m**2)) < _SETTLED * noise.position_m or maps == _MAPS_OF_IMAGES:
             break
+        _, labels, votes, _ = _map_alone(moved, config, engine, progress)
+        if not len(labels):
+            return uncorrected
+        told = bundle(images, labels, votes, noise)
     record = {"found": "errors of images", "images": len(before.images), **figures}
-    return Refined(moved, record, is_corrected=True, before_images=(images, noise))
+    return Refined(moved, record, is_corrected=True, before_images=(images, noise), side_m=noise.side_m)
 
 
-def with_sides_of(noise: Noise, config: MapConfig) -> MapConfig:
+def _map_with_sides(
+    dataset: Dataset, images: AllImages, config: MapConfig, engine: Engine, progress: Progress
+) -> tuple[Mapped, float | None]:
+    """Return a map of a dataset, and what the middles that sides show are off by, m, if all its objects tell that.
+
+    A map tells middles of what sides of one object disagree about, by more than their poses may be off by. All objects
+    together tell what poses are off by, and so they tell smaller ones: the map is made again with these.
+    """
+    mapped = _map_alone(dataset, config, engine, progress)
+    calibration, labels, votes, _ = mapped
+    if config.noise.side_sigma_m is not None or not len(labels):
+        return mapped, None
+    side_m = middles(images, labels, votes, calibration.noise)
+    if side_m is not None:
+        mapped = _map_alone(dataset, with_sides(side_m, config), engine, progress)
+    return mapped, side_m
+
+
+def with_sides(side_m: float, config: MapConfig) -> MapConfig:
     """Return settings with the middles that sides show, which were told before images were moved.
 
     Where images show one thing each, errors of images explain all that its sides disagree about.
     """
-    return replace(config, noise=replace(config.noise, side_sigma_m=noise.side_m))
+    return replace(config, noise=replace(config.noise, side_sigma_m=side_m))
 
 
 def with_errors_of_images(refined: Refined, labels: Labels, votes: Votes) -> Labels:

@@ -12,7 +12,7 @@ import numpy as np
 
 from valuemap.cameras import Rays, cast_rays, directions_down
 from valuemap.config import MapConfig, bounded_threads
-from valuemap.correction import MOST_CORRECTED, TOO_LARGE, correct_poses, with_errors_of_images, with_sides_of
+from valuemap.correction import MOST_CORRECTED, TOO_LARGE, correct_poses, with_errors_of_images, with_sides
 from valuemap.dataset import Dataset, Frame, ensure_checked, read_dataset, write_dataset
 from valuemap.describe import describe_labels
 from valuemap.engine.engine import Engine
@@ -294,8 +294,8 @@ def _robust(
     given = None if run is None else run.calibration
     store = run.parts / CELLS if run is not None and len(source.cells) > 1 else None
     files: list[Place] = []
-    if refined is not None and refined.before_images is not None:
-        config = with_sides_of(refined.before_images[1], config)
+    if refined is not None and refined.side_m is not None:
+        config = with_sides(refined.side_m, config)
     if refined is not None and refined.as_given is not None and given is None and store is None:
         calibration, labels, votes, counts = refined.as_given
     else:

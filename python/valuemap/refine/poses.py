@@ -87,7 +87,8 @@ class Refined:
     `found` is what a map may tell more of: it was corrected, or is in doubt. Where `is_noisy`, single images are off by
     more than was thought possible. `before_images` is what errors of single images were taken from, where they were.
     `as_given` is the map of the dataset as it was, where one was made and nothing is corrected. `sought` is its noise,
-    where it was compared with what could have been corrected.
+    where it was compared with what could have been corrected. `side_m` is what the middles that sides show are off by,
+    where that was told.
     """
 
     dataset: Dataset
@@ -98,6 +99,7 @@ class Refined:
     before_images: tuple[AllImages, Noise] | None = None
     as_given: Mapped | None = None
     sought: Sought | None = None
+    side_m: float | None = None
 
 
 def refine_poses(
