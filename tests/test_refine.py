@@ -392,7 +392,7 @@ def test_middles_that_differ_by_side_are_no_errors_of_images(monkeypatch: pytest
     assert lamps.truth is not None
     result = valuemap.build_map(lamps)
     assert result.run["poses"]["found"] == "errors of images"
-    assert len(result.labels) <= len(lamps.truth) + 1
+    assert len(result.labels) <= len(lamps.truth) + 2
     assert between_neighbors(result, lamps)[1] < 6.0
     for module in (correction, pipeline):
         monkeypatch.setattr(module, "with_sides", lambda _, config: config)
@@ -1220,11 +1220,17 @@ def test_a_step_is_that_of_all_unknowns_in_one_matrix(dense_limit: int, monkeypa
         np.testing.assert_allclose(ours, theirs, atol=1e-4)
     assert gain == pytest.approx(right @ expected, rel=1e-3)
     np.testing.assert_allclose(after.covariance, np.linalg.inv(hessian)[last:, last:], rtol=1e-2, atol=1e-7)
-    of_things = problem.step(state, 2.0, of_things=True)[0].covariance
-    assert of_things is not None
     things = np.arange(first // 3)
     literal_of_things = np.linalg.inv(hessian)[:first, :first].reshape(len(things), 3, len(things), 3)
-    np.testing.assert_allclose(of_things, literal_of_things[things, :, things, :], rtol=1e-2, atol=1e-5)
+    of_each = problem.step(state, 2.0, of_groups=things[:, None])[0].covariance
+    assert of_each is not None
+    np.testing.assert_allclose(of_each, literal_of_things[things, :, things, :], rtol=1e-2, atol=1e-5)
+    groups = np.array([[2, 0], [1, 2]])
+    of_groups = problem.step(state, 2.0, of_groups=groups)[0].covariance
+    assert of_groups is not None
+    for group, covariance in zip(groups, of_groups, strict=True):
+        literal_of_group = literal_of_things[np.ix_(group, range(3), group, range(3))].reshape(6, 6)
+        np.testing.assert_allclose(covariance, literal_of_group, rtol=1e-2, atol=1e-5)
 
 
 def test_equations_tell_what_others_are_without_a_group_as_a_fit_without_it_does() -> None:
@@ -1252,7 +1258,7 @@ def test_poses_that_are_right_cost_few_steps(monkeypatch: pytest.MonkeyPatch) ->
     taken = 0
     step = Adjustment.step
 
-    def counted(self: Adjustment, state: State, tolerance: float, **more: bool) -> tuple[State, float]:
+    def counted(self: Adjustment, state: State, tolerance: float, **more: Any) -> tuple[State, float]:
         nonlocal taken
         taken += 1
         return step(self, state, tolerance, **more)

@@ -26,6 +26,7 @@ from valuemap.refine import (
     refine_again,
     refine_poses,
 )
+from valuemap.robust import Sought
 from valuemap.stages import Stages
 from valuemap.tables import Labels, Votes, covariance_columns
 from valuemap.tiles.calibration import calibrate
@@ -58,15 +59,25 @@ def _proven(dataset: Dataset, config: MapConfig, stages: Stages, threads: int, p
     with stages.measured("poses"):
         refined = refine_poses(dataset, config, threads=threads, progress=progress)
         if not refined.is_noisy:
-            return _of_drives(dataset, refined, config, threads, progress)
+            return _with_sides_told(_of_drives(dataset, refined, config, threads, progress), config, threads, progress)
         # Where single images are far off, what whole drives seem to be off by is mostly theirs.
         of_images = _by_images(dataset, config, threads, progress)
         if of_images.is_corrected:
             return of_images
         refined = _of_drives(dataset, refined, config, threads, progress)
         if refined.is_corrected:
-            return refined
+            return _with_sides_told(refined, config, threads, progress)
         return replace(refined, as_given=of_images.as_given, side_m=of_images.side_m)
+
+
+def _with_sides_told(refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:
+    """Add the map of what was refined, or not, and the middles that its sides show."""
+    if not config.poses.correct_poses:
+        return refined
+    images = gather_images(refined.dataset, config)
+    engine = ThreadEngine(threads)
+    mapped, side_m = _map_with_sides(refined.dataset, images, config, engine, progress, refined.sought)
+    return replace(refined, as_given=mapped, side_m=side_m)
 
 
 def _of_drives(dataset: Dataset, refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:
@@ -117,25 +128,30 @@ def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progr
 
 
 def _map_with_sides(
-    dataset: Dataset, images: AllImages, config: MapConfig, engine: Engine, progress: Progress
+    dataset: Dataset,
+    images: AllImages,
+    config: MapConfig,
+    engine: Engine,
+    progress: Progress,
+    sought: Sought | None = None,
 ) -> tuple[Mapped, float | None]:
-    """Return a map of a dataset, and what the middles that sides show are off by, m, if all its objects tell that.
+    """Return a map of a dataset, and what the middles that sides show are off by, m; None where that is set.
 
     A map tells middles of what sides of one object disagree about, by more than their poses may be off by. All objects
-    together tell what poses are off by, and so they tell smaller ones: the map is made again with these.
+    together tell what poses are off by, and so they tell smaller ones. The map is made again with what they tell.
     """
-    mapped = _map_alone(dataset, config, engine, progress)
+    if config.noise.side_sigma_m is not None:
+        return _map_alone(dataset, config, engine, progress, sought), None
+    mapped = _map_alone(dataset, with_sides(0.0, config), engine, progress, sought)
     calibration, labels, votes, _ = mapped
-    if config.noise.side_sigma_m is not None or not len(labels):
-        return mapped, None
-    side_m = middles(images, labels, votes, calibration.noise)
-    if side_m is not None:
-        mapped = _map_alone(dataset, with_sides(side_m, config), engine, progress)
-    return mapped, side_m
+    side_m = middles(images, labels, votes, calibration.noise) if len(labels) else None
+    if side_m is None:
+        return mapped, 0.0
+    return _map_alone(dataset, with_sides(side_m, config), engine, progress), side_m
 
 
 def with_sides(side_m: float, config: MapConfig) -> MapConfig:
-    """Return settings with the middles that sides show, which were told before images were moved.
+    """Return settings with the middles that sides show, as all objects told them with images as they were.
 
     Where images show one thing each, errors of images explain all that its sides disagree about.
     """
@@ -177,9 +193,11 @@ def _map_of_keyframes(
     return labels, votes
 
 
-def _map_alone(dataset: Dataset, config: MapConfig, engine: Engine, progress: Progress) -> Mapped:
+def _map_alone(
+    dataset: Dataset, config: MapConfig, engine: Engine, progress: Progress, sought: Sought | None = None
+) -> Mapped:
     """Return the map of a dataset in memory, and keep nothing."""
     source = InMemory(dataset, config)
-    calibration = calibrate(source, config, None, None, engine, progress)
+    calibration = calibrate(source, config, None, None, engine, progress, sought)
     cells, _ = solve_cells(source, calibration, config, engine, progress)
     return calibration, *join_cells(cells, source.grid, config)

@@ -9,9 +9,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use valuemap_core::robust::calibrate::likeliest::{self, Sought};
-use valuemap_core::robust::calibrate::shared::middles_for_sure;
 use valuemap_core::robust::calibrate::{Calibration, self_calibrate};
-use valuemap_core::robust::energy::agreement::Sides;
 use valuemap_core::robust::energy::sides::of_directions;
 use valuemap_core::robust::model::ClassModel;
 use valuemap_core::robust::model::confusions::Confusions;
@@ -22,7 +20,6 @@ use valuemap_core::robust::scene::{Frustum, Scene as CoreScene, View};
 use valuemap_core::robust::settings::Settings;
 use valuemap_core::robust::{Findings, find};
 use valuemap_core::viability::Viability;
-use valuemap_core::{Vector3, matrix_from_rows};
 
 use crate::Rays;
 use crate::arrays::{
@@ -384,36 +381,6 @@ pub fn sides<'py>(
         first += visits.len();
     }
     Ok(found.into_pyarray(py))
-}
-
-/// The error, m, of the middles that sides of labels of a usual size show, told by where each of K sides puts its label and how well that is known, m²; those
-/// of one label follow each other. None where sides agree, `valuemap_core::robust::calibrate::shared::middles_for_sure`.
-#[pyfunction]
-pub fn middles(
-    label: PyReadonlyArray1<'_, u32>,
-    point_in_world_m: PyReadonlyArray2<'_, f64>,
-    covariance_m2: PyReadonlyArray3<'_, f64>,
-    size_m: f64,
-) -> PyResult<Option<f64>> {
-    let (label, points) = (label.as_slice()?, rows_of(&point_in_world_m)?);
-    let covariances = matrices_of("covariance_m2", &covariance_m2)?;
-    check_length("label", label.len(), points.len())?;
-    check_length("covariance_m2", covariances.len(), points.len())?;
-    check_within("point_in_world_m", points.as_flattened(), FARTHEST_M)?;
-    check_within("covariance_m2", covariances.as_flattened(), FARTHEST_M * FARTHEST_M)?;
-    if !(size_m > 0.0 && size_m <= FARTHEST_M) {
-        return Err(PyValueError::new_err(format!("size_m: expected a positive number up to {FARTHEST_M:e}")));
-    }
-    let (mut sides, mut first) = (Vec::new(), 0);
-    for of_label in label.chunk_by(|a, b| a == b) {
-        let of = first..first + of_label.len();
-        // Beside the first: what is left of numbers that are large is the same wherever the map is.
-        let begin = Vector3::from(points[first]);
-        let side = |k: usize| (Vector3::from(points[k]) - begin, matrix_from_rows(&covariances[k]));
-        first = of.end;
-        sides.push(Sides::known(&of.map(side).collect::<Vec<_>>()));
-    }
-    Ok(middles_for_sure(&sides, size_m))
 }
 
 /// J, votes and positions of objects.

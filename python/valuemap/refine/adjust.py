@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import scipy
@@ -228,12 +228,12 @@ class Adjustment:
             )
 
     def step(
-        self, state: State, tolerance: float, *, with_variance: bool = False, of_things: bool = False
+        self, state: State, tolerance: float, *, with_variance: bool = False, of_groups: Ints | None = None
     ) -> tuple[State, float]:
         """Return the state after one step of Gauss-Newton with weights of this tolerance, and what it gains.
 
         The gain is that of chi-squared if the residuals were linear and the weights stayed. The covariance is that of
-        the constants, or those (K, 3, 3) `of_things`.
+        the constants, or those (G, 3 M, 3 M) of groups (G, M) of objects.
         """
         rows, own = self._weighted(state, tolerance)
         products, of_image = self.finest.products(rows), self._shared_by_image(rows, own)
@@ -268,7 +268,7 @@ class Adjustment:
         nodes[self.node[self.by_node_and_part.row[self.by_node.row]]] = node_products
         sums = (_TO_DRIFT.T @ beside_thing, _TO_DRIFT.T @ both @ _TO_CONSTANTS, _TO_DRIFT.T @ nodes)
         eliminated = [self._eliminate(drives, sums, state.drift, system) for drives in self.drives]
-        step, covariance = system.solve(3 * self.things if with_variance else None, of_things=of_things)
+        step, covariance = system.solve(3 * self.things if with_variance else None, of_groups)
         gain = float(system.right @ step)
         drift = state.drift.copy()
         for drives, (factor, solved) in zip(self.drives, eliminated, strict=True):
@@ -460,13 +460,14 @@ class _System:
         rows, columns = np.broadcast_to(rows, values.shape)[used], np.broadcast_to(columns, values.shape)[used]
         self.entries.append((values[used], rows, columns))
 
-    def solve(self, first: int | None, *, of_things: bool = False) -> tuple[Floats, Floats | None]:
-        """Return the solution, and the covariance of the columns from `first` on, or those (K, 3, 3) `of_things`."""
+    def solve(self, first: int | None, of_groups: Ints | None = None) -> tuple[Floats, Floats | None]:
+        """Return the solution, and the covariance of the columns from `first` on, or those of groups of objects."""
         if self.matrix is not None:
             factor = scipy.linalg.cho_factor(self.matrix[:-1, :-1], lower=True, overwrite_a=True, check_finite=False)
             solution = scipy.linalg.cho_solve(factor, self.right, check_finite=False)
-            if of_things:
-                return solution, self._blocks(lambda units: scipy.linalg.cho_solve(factor, units, check_finite=False))
+            if of_groups is not None:
+                solved = partial(scipy.linalg.cho_solve, factor, check_finite=False)
+                return solution, self._blocks(solved, of_groups)
             if first is None:
                 return solution, None
             # The factor of what is left once the objects are eliminated is its lower right corner.
@@ -477,8 +478,8 @@ class _System:
             scipy.sparse.csc_matrix((values, (rows, columns)), shape=(self.columns, self.columns))
         )
         solution = np.asarray(sparse_factor.solve(self.right))
-        if of_things:
-            return solution, self._blocks(sparse_factor.solve)
+        if of_groups is not None:
+            return solution, self._blocks(sparse_factor.solve, of_groups)
         if first is None:
             return solution, None
         covariance = np.empty((self.columns - first, self.columns - first))
@@ -488,14 +489,18 @@ class _System:
             covariance[:, column - first] = sparse_factor.solve(unit)[first:]
         return solution, covariance
 
-    def _blocks(self, solved: Callable[[Floats], Floats]) -> Floats:
-        """Return the covariances (K, 3, 3) of objects, few at a time: that of all is as large as they are squared."""
-        blocks = np.empty((self.things, 3, 3))
-        for first in range(0, self.things, _AT_ONCE):
-            things = np.arange(min(_AT_ONCE, self.things - first))
-            units = np.eye(self.columns, 3 * len(things), -3 * first)
-            covariance = solved(units)[3 * first : 3 * (first + len(things))].reshape(len(things), 3, len(things), 3)
-            blocks[first + things] = covariance[things, :, things, :]
+    def _blocks(self, solved: Callable[[Floats], Floats], groups: Ints) -> Floats:
+        """Return the covariances of groups of objects, few at a time: that of all is as large as they are squared."""
+        columns = (3 * groups[:, :, None] + np.arange(3)).reshape(len(groups), -1)
+        blocks = np.empty((*columns.shape, columns.shape[1]))
+        at_once = max(1, _AT_ONCE // groups.shape[1])
+        for first in range(0, len(groups), at_once):
+            some = columns[first : first + at_once]
+            units = np.zeros((self.columns, some.size))
+            units[some.ravel(), np.arange(some.size)] = 1.0
+            covariance = solved(units)[some.ravel()].reshape(*some.shape, *some.shape)
+            number = np.arange(len(some))
+            blocks[first : first + at_once] = covariance[number, :, number, :]
         return blocks
 
 

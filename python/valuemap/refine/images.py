@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import valuemap._core as _core
-from valuemap import robust
 from valuemap.cameras import camera_poses
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
@@ -43,10 +42,6 @@ _MOST_ASKED = 1000
 """Objects that say whether images are off, at most about: a part of them tells that as surely, in less time."""
 _RUN = 100
 """Objects side by side along drives that are asked together: what an image shows lies side by side."""
-
-
-_LEAST_VOTES_OF_SIDE = 4
-"""Sides of fewer votes do not say where they would put an object alone, as in the core."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,21 +109,23 @@ class Bundle:
         moved = with_poses_in_order(like, ordered, poses.cam_from_world @ axes, center)
         return moved.replace(position_sigma_m=None, rotation_sigma_rad=None)
 
-    def things(self) -> tuple[Floats, Floats]:
-        """Return where things probably are (K, 3), m, and covariances (K, 3, 3), m²: all images and drift marginalised.
+    def placed(self, groups: Ints) -> tuple[Floats, Floats]:
+        """Return where things (K, 3) probably are, m, and how well that is known of groups (G, M) of them together, m².
 
-        Both are in the working frame, and in metres.
+        The covariances are (G, 3 M, 3 M), with errors of all images and drift marginalised. All is in the working
+        frame.
         """
         state = self.adjusted(self.seen)
         with one_blas_thread():
-            covariance = self._problem(self.seen).step(state, _TOLERANCES[-1], of_things=True)[0].covariance
+            covariance = self._problem(self.seen).step(state, _TOLERANCES[-1], of_groups=groups)[0].covariance
         assert covariance is not None
         return self.of.unit_m * state.point_in_world_m, self.of.unit_m**2 * covariance
 
     def covariances(self) -> tuple[Ints, Floats]:
         """Return labels (L) with their covariances (L, 3, 3) in m², errors of all images and drift marginalised."""
         axes = self.of.ordered.dataset.frame.east_north_up()
-        of_things = axes.T @ self.things()[1] @ axes + self.side_m**2 * np.eye(3)
+        each = np.arange(len(self.label))[:, None]
+        of_things = axes.T @ self.placed(each)[1] @ axes + self.side_m**2 * np.eye(3)
         label, row = np.unique(self.label, return_inverse=True)
         information = np.zeros((len(label), 3, 3))
         np.add.at(information, row, np.linalg.inv(of_things))
@@ -171,24 +168,6 @@ def bundle(images: AllImages, labels: Labels, votes: Votes, noise: Noise, *, by_
         constant=WIDE.constant,
     )
     return Bundle(images, seen, scales, state, label, noise.side_m)
-
-
-def middles(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> float | None:
-    """Return what the middles that sides show are off by, m, each axis; None where they are not beyond doubt.
-
-    Each side of each object is placed as a thing of its own, all of them together: what images and drives are off by
-    moves all that they show, and what sides of an object disagree about besides are middles. What is not known well,
-    as depth, says little of them.
-    """
-    height_m = labels.object_height_m[labels.object_height_m > 0.0]
-    if not len(height_m) or "sides" in robust.LEFT_OUT:  # Middles are those of boxes.
-        return None
-    told = bundle(images, labels, votes, replace(noise, side_m=0.0), by_side=True)
-    point_m, covariance_m2 = told.things()
-    known = np.flatnonzero(np.bincount(told.seen.thing, minlength=len(told.label)) >= _LEAST_VOTES_OF_SIDE)
-    known = known[np.argsort(told.label[known], kind="stable")]
-    of_label = told.label[known].astype(np.uint32)
-    return _core.middles(of_label, point_m[known], covariance_m2[known], float(np.median(height_m)))
 
 
 def _by_side(footage: Footage, detection: Ints, thing: Ints, label: Ints) -> tuple[Ints, Ints]:

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::robust::energy::agreement::{Disagreement, MIN_SHARED_LABELS, Sides, disagreements, sides_of_all};
+use crate::robust::energy::agreement::{Disagreement, MIN_SHARED_LABELS, disagreements, sides_of_all};
 use crate::robust::energy::estimate::Care;
 use crate::robust::energy::{Placed, SURE_VOTES, implied_size};
 use crate::robust::learn::median;
@@ -115,25 +115,13 @@ fn noise_of_sides(model: &Model<'_>, known: Known, labels: &[&Placed], care: Car
     let drifted = if known.position { None } else { agreeing_drift(noise, stated(scene), of_one_side) };
     let of_passes = drifted.unwrap_or(*noise);
     let sides = sides_of_all(scene, &of_passes, labels, care);
-    let side_m = middles(&sides.iter().map(Option::as_ref).collect::<Vec<_>>(), size_m, least_sigmas)?;
-    Some(Noise { side_m, ..of_passes })
-}
-
-/// The error, m, of the middles that sides of some labels of a usual size show, beyond doubt; nothing where they agree, or too little is known.
-#[must_use]
-pub fn middles_for_sure(sides: &[Sides], size_m: f64) -> Option<f64> {
-    let known: Vec<Option<&Sides>> = sides.iter().map(Some).collect();
-    middles(&known, size_m, CERTAIN_SIGMAS)
-}
-
-/// The error of middles with which sides disagree as much as expected; nothing where, all together, they do so without it but for fewer standard deviations.
-fn middles(sides: &[Option<&Sides>], size_m: f64, least_sigmas: f64) -> Option<f64> {
     let between = |side_m: f64| sides.iter().map(move |sides| sides.as_ref()?.between(side_m));
     let count = between(0.0).flatten().count() as f64;
     if excess(between(0.0))? < least_sigmas * count.sqrt() {
         return None;
     }
-    agreeing(LEAST_SHARE * size_m, size_m, |side_m| excess(between(side_m)))
+    let side_m = agreeing(LEAST_SHARE * size_m, size_m, |side_m| excess(between(side_m)))?;
+    Some(Noise { side_m, ..of_passes })
 }
 
 /// The median size that boxes of some labels imply, m; nothing if there are none.
@@ -146,7 +134,7 @@ fn usual_size_m(model: &Model<'_>, labels: &[&Placed]) -> Option<f64> {
 mod tests {
     use std::f64::consts::PI;
 
-    use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
+    use nalgebra::{Isometry3, Point3, Vector3};
 
     use super::*;
     use crate::robust::scene::sample::scramble;
@@ -192,28 +180,6 @@ mod tests {
                 assert!((0.7 * off_m..=1.3 * off_m).contains(&side_m), "{side_m}");
             }
         }
-    }
-
-    #[test]
-    fn middles_are_told_of_sides_that_are_known_from_elsewhere() {
-        // Known to 5 cm, but along the line of sight, where they are off by a metre.
-        let sigma_m = Vector3::new(1.0, 0.05, 0.05);
-        let covariance = Matrix3::from_diagonal(&sigma_m.component_mul(&sigma_m));
-        let of_label = |number: u64, off_m: f64| {
-            let side = |side: u64| {
-                let error = |axis: usize| 8 * number + 4 * side + axis as u64;
-                let at = Vector3::from_fn(|axis, _| {
-                    sigma_m[axis] * uniform(error(axis)) + off_m * uniform(9000 + error(axis))
-                });
-                (at, covariance)
-            };
-            Sides::known(&[side(0), side(1)])
-        };
-        let of = |off_m: f64| middles_for_sure(&(0..60).map(|i| of_label(i, off_m)).collect::<Vec<_>>(), 0.6);
-        assert!(of(0.2).is_some_and(|side_m| (side_m - 0.2).abs() < 0.05), "{:?}", of(0.2));
-        assert_eq!(of(0.0), None);
-        let one_side: Vec<Sides> = (0..60).map(|_| Sides::known(&[(Vector3::zeros(), covariance)])).collect();
-        assert_eq!(middles_for_sure(&one_side, 0.6), None);
     }
 
     #[test]

@@ -55,13 +55,6 @@ struct Side {
 pub struct Sides(Vec<Side>);
 
 impl Sides {
-    /// Of where sides put a label, m, with covariances, m², however that was found: of their passes nothing is known.
-    #[must_use]
-    pub fn known(sides: &[(Vector3<f64>, Matrix3<f64>)]) -> Self {
-        let of_side = |&(offset_m, covariance): &_| Side { offset_m, covariance, square: 0.0, passes: 1 };
-        Self(sides.iter().map(of_side).collect())
-    }
-
     /// Of the passes with enough votes. Nothing if they do not fix the label.
     fn of(scene: &Scene, noise: &Noise, (votes, point): &Placed, care: Care) -> Option<Self> {
         let passes: Vec<&[u32]> = visits(scene, votes).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS).collect();

@@ -1,0 +1,146 @@
+"""What middles the sides of objects show, told by all objects of a map together.
+
+A box shows the middle of what its side of an object is. Sides of one object disagree about where it is by what these
+middles are off by, and by what poses are off by there. Of one object alone that cannot be told apart where passes drift
+by more than middles are off. But poses are off for all that images show, and middles are each object's own: so all
+sides are placed in one adjustment, and what is off by is told by the likelihood of how they disagree, all together
+(restricted maximum likelihood; Patterson and Thompson 1971).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+import scipy.stats
+
+from valuemap import robust
+from valuemap.refine.footage import AllImages
+from valuemap.refine.images import Bundle, bundle
+from valuemap.refine.poses import one_blas_thread
+from valuemap.robust import Noise
+from valuemap.tables import Bools, Floats, Ints, Labels, Votes
+
+_LEAST_VOTES = 4
+"""Sides of fewer votes do not say where they would put an object alone, as in the core."""
+_LEAST_OBJECTS = 5
+"""Fewer objects of several sides do not tell what sides show, as in the core."""
+_MOST_OBJECTS = 200
+"""Objects that are asked, at most about: they tell it to a twentieth, and how all disagree is one dense matrix."""
+_CERTAIN = 9.0
+"""Middles are there where twice the logarithm of the likelihood gains more: chance has it in one case of a thousand."""
+_ODD = scipy.stats.chi2.sf(_CERTAIN, 1)
+"""Objects that disagree by what chance has in fewer cases, given all others, are two, or have votes of others."""
+_LEAST_SHARE = 1e-3
+"""Middles are sought down to this share of the usual size: less is an error of the detector, if it is one."""
+_VALUES = 60
+"""Values between that and the usual size, at which the likelihood is compared: they differ by an eighth."""
+_ROUNDS = 10
+"""Rounds in which objects are taken in and left out, at most: three or four do."""
+
+
+def middles(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> float | None:
+    """Return what the middles that sides show are off by, m, each axis; None where that is not beyond doubt.
+
+    `noise` is that of the map of `labels` and `votes`. What is not known well, as depth is, says little of middles.
+    """
+    height_m = labels.object_height_m[labels.object_height_m > 0.0]
+    if not len(height_m) or "sides" in robust.LEFT_OUT:  # Middles are those of boxes.
+        return None
+    told = bundle(images, labels, votes, replace(noise, side_m=0.0), by_side=True)
+    sides = _asked(_sides(told))
+    if len(sides) < _LEAST_OBJECTS:
+        return None
+    point_m, covariance_m2 = told.placed(np.concatenate(sides)[None])
+    with one_blas_thread():
+        contrasts = Contrasts.of_sides([point_m[things] for things in sides], covariance_m2[0])
+        return contrasts.middles_m(float(np.median(height_m)))
+
+
+def _sides(told: Bundle) -> list[Ints]:
+    """Return the things that have enough votes, label by label, of those labels that have several."""
+    known = np.flatnonzero(np.bincount(told.seen.thing, minlength=len(told.label)) >= _LEAST_VOTES)
+    known = known[np.argsort(told.label[known], kind="stable")]
+    of_labels = np.split(known, np.flatnonzero(np.diff(told.label[known])) + 1)
+    return [things for things in of_labels if len(things) > 1]
+
+
+def _asked(sides: list[Ints]) -> list[Ints]:
+    """Return about as many objects as are asked, evenly spread."""
+    return sides[:: -(-len(sides) // _MOST_OBJECTS)] if sides else sides
+
+
+@dataclass(frozen=True, eq=False)
+class Contrasts:
+    """By what the sides of objects disagree: orthonormal contrasts (N), m, with their covariance (N, N), m².
+
+    `of` (N) is the object of each. Middles that are off by s each axis add s² to the variance of each.
+    """
+
+    apart_m: Floats
+    covariance_m2: Floats
+    of: Ints
+
+    @classmethod
+    def of_sides(cls, point_m: list[Floats], covariance_m2: Floats) -> Contrasts:
+        """Return those of the sides (M, 3) of objects, that are known together as said, in their order."""
+        # Beside the first side: of large numbers little would be left.
+        by_object = [np.kron(scipy.linalg.null_space(np.ones((1, len(points)))).T, np.eye(3)) for points in point_m]
+        apart = [by @ (points - points[0]).ravel() for by, points in zip(by_object, point_m, strict=True)]
+        by = scipy.linalg.block_diag(*by_object)
+        return cls(
+            np.concatenate(apart), by @ covariance_m2 @ by.T, np.repeat(np.arange(len(apart)), list(map(len, apart)))
+        )
+
+    def middles_m(self, size_m: float) -> float | None:
+        """Return what middles of things of a usual size are off by, m; None where it is not beyond doubt.
+
+        Objects that disagree by more than middles and poses explain, given all others, are left out, and the others
+        tell it again.
+        """
+        values_m = size_m * np.geomspace(_LEAST_SHARE, 1.0, _VALUES)
+        is_one = np.ones(self.of[-1] + 1, np.bool_)
+        likeliest_m, gain = self._likeliest(is_one, values_m)
+        # Objects that are two hide each other where all tell what is usual: the half that agrees best begins.
+        chances = self._chances(is_one, likeliest_m)
+        is_one = chances >= np.median(chances)
+        for _ in range(_ROUNDS):
+            if is_one.sum() < _LEAST_OBJECTS:
+                return None
+            likeliest_m, gain = self._likeliest(is_one, values_m)
+            before, is_one = is_one, self._chances(is_one, likeliest_m) > _ODD
+            if np.array_equal(is_one, before):
+                break
+        # Sides that disagree by as much as things are large are those of several things.
+        return likeliest_m if gain > _CERTAIN and likeliest_m < size_m else None
+
+    def _likeliest(self, is_one: Bools, values_m: Floats) -> tuple[float, float]:
+        """Return which value is likeliest for some of the objects, and twice what its log-likelihood gains."""
+        rows = np.flatnonzero(is_one[self.of])
+        variance, axes = scipy.linalg.eigh(self.covariance_m2[np.ix_(rows, rows)])
+        square = (axes.T @ self.apart_m[rows]) ** 2
+        total = np.maximum(variance, 0.0) + values_m[:, None] ** 2
+        twice_ln = -(np.log(total) + square / total).sum(axis=1)
+        best = int(np.argmax(twice_ln))
+        return float(values_m[best]), float(twice_ln[best] - twice_ln[0])
+
+    def _chances(self, is_one: Bools, middles_m: float) -> Floats:
+        """Return how probable it is that an object disagrees by so much or more, given the others of some, of each."""
+        covariance_m2 = self.covariance_m2 + middles_m**2 * np.eye(len(self.of))
+        rows = np.flatnonzero(is_one[self.of])
+        precision = np.linalg.inv(covariance_m2[np.ix_(rows, rows)])
+        pull = precision @ self.apart_m[rows]
+        chances = np.empty(len(is_one))
+        for one, is_among in enumerate(is_one):
+            if is_among:  # The block of the inverse is the inverse of what is known given the others.
+                own = np.flatnonzero(self.of[rows] == one)
+                square = pull[own] @ np.linalg.solve(precision[np.ix_(own, own)], pull[own])
+            else:
+                own = np.flatnonzero(self.of == one)
+                across = covariance_m2[np.ix_(own, rows)]
+                off_m = self.apart_m[own] - across @ pull
+                known_m2 = covariance_m2[np.ix_(own, own)] - across @ precision @ across.T
+                square = off_m @ np.linalg.solve(known_m2, off_m)
+            chances[one] = scipy.stats.chi2.sf(square, len(own))
+        return chances

@@ -1,0 +1,100 @@
+"""Middles that sides show are told by how all objects' sides disagree, together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.stats
+
+import valuemap
+from test_refine import CITY
+from valuemap import MapConfig
+from valuemap.dataset import Dataset
+from valuemap.refine.middles import Contrasts
+from valuemap.simulate import simulate
+from valuemap.tables import Floats
+
+SIZE_M = 1.0
+DRIFT_M = 0.5
+
+
+def sides(middles_m: float, *, objects: int = 40, seed: int = 0) -> tuple[list[Floats], Floats]:
+    """Return where two drives put both sides of objects, each along its own line of sight worse, and covariances.
+
+    Each drive is off by half a metre at all objects alike, and by 2 cm at each.
+    """
+    rng = np.random.default_rng(seed)
+    own = np.tile(np.diag([0.3, 0.02, 0.02, 0.02, 0.3, 0.02]) ** 2, (objects, 1, 1))
+    by_drive = np.kron(np.ones((objects, 1)), np.eye(6))
+    covariance_m2 = DRIFT_M**2 * by_drive @ by_drive.T
+    for number, block in enumerate(own):
+        covariance_m2[6 * number : 6 * number + 6, 6 * number : 6 * number + 6] += block
+    off_m = rng.multivariate_normal(np.zeros(len(covariance_m2)), covariance_m2)
+    off_m += middles_m * rng.normal(size=len(off_m))
+    return list(1e5 + off_m.reshape(objects, 2, 3)), covariance_m2
+
+
+@pytest.mark.parametrize("middles_m", [0.05, 0.1, 0.3])
+def test_middles_are_told_where_drives_are_off_by_more(middles_m: float) -> None:
+    told_m = Contrasts.of_sides(*sides(middles_m)).middles_m(SIZE_M)
+    assert told_m == pytest.approx(middles_m, rel=0.25)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_drives_are_off_by_at_all_objects_alike_is_no_middle(seed: int) -> None:
+    assert Contrasts.of_sides(*sides(0.0, seed=seed)).middles_m(SIZE_M) is None
+
+
+def test_objects_that_are_two_tell_nothing_of_middles() -> None:
+    points, covariance_m2 = sides(0.0)
+    for two in points[::8]:
+        two[1] += [0.0, 0.0, 1.0]
+    contrasts = Contrasts.of_sides(points, covariance_m2)
+    assert contrasts.middles_m(SIZE_M) is None
+    _, gain = contrasts._likeliest(np.ones(len(points), np.bool_), SIZE_M * np.geomspace(1e-3, 1.0, 60))
+    assert gain > 100.0  # With them, middles are off by far more than chance.
+
+
+def test_sides_that_disagree_by_as_much_as_things_are_large_are_of_several_things() -> None:
+    assert Contrasts.of_sides(*sides(3.0)).middles_m(SIZE_M) is None
+
+
+def test_how_far_an_object_disagrees_is_judged_by_all_others() -> None:
+    """Against the others one by one: their distribution given what is known of the rest."""
+    contrasts = Contrasts.of_sides(*sides(0.1, objects=8))
+    is_one = np.arange(8) % 3 != 0
+    whole = contrasts.covariance_m2 + 0.1**2 * np.eye(len(contrasts.of))
+    for one, chance in enumerate(contrasts._chances(is_one, 0.1)):
+        own, rest = contrasts.of == one, is_one[contrasts.of] & (contrasts.of != one)
+        gain = whole[np.ix_(own, rest)] @ np.linalg.inv(whole[np.ix_(rest, rest)])
+        off_m = contrasts.apart_m[own] - gain @ contrasts.apart_m[rest]
+        known_m2 = whole[np.ix_(own, own)] - gain @ whole[np.ix_(rest, own)]
+        square = off_m @ np.linalg.solve(known_m2, off_m)
+        assert chance == pytest.approx(scipy.stats.chi2.sf(square, own.sum()), rel=1e-6, abs=1e-12)
+
+
+def lamps_beside_drives_that_drift(side_offset_m: float, seed: int) -> Dataset:
+    lamps = replace(CITY, has_lights=0, lamp_spacing_m=15.0, side_offset_m=side_offset_m)
+    return simulate(replace(lamps, position_drift_m=0.4, passes_per_street=4), seed=seed)
+
+
+def test_a_map_knows_of_middles_that_are_smaller_than_the_drift() -> None:
+    city = lamps_beside_drives_that_drift(0.2, seed=4)
+    result, alone = valuemap.build_map(city), valuemap.build_map(city, MapConfig(correct_poses=0))
+    assert alone.run["counts"]["noise"]["side_m"] == 0.0
+    assert result.run["counts"]["noise"]["side_m"] == pytest.approx(0.2, rel=0.3)
+
+
+def test_drift_is_not_taken_for_middles() -> None:
+    city = lamps_beside_drives_that_drift(0.0, seed=6)
+    result, alone = valuemap.build_map(city), valuemap.build_map(city, MapConfig(correct_poses=0))
+    assert alone.run["counts"]["noise"]["side_m"] > 0.1
+    assert result.run["counts"]["noise"]["side_m"] == 0.0
+
+
+def test_middles_that_are_set_stay() -> None:
+    city = lamps_beside_drives_that_drift(0.2, seed=4)
+    known = MapConfig().with_settings(["side_sigma_m=0.07"])
+    assert valuemap.build_map(city, known).run["counts"]["noise"]["side_m"] == 0.07
