@@ -109,6 +109,10 @@ def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progr
     if not len(labels):
         return uncorrected
     noise, moved = calibration.noise, before
+    if side_m:
+        # Images are moved by what each side shows: what is left unknown of poses between sides is told one by one.
+        one_by_one = calibrate(InMemory(before, config), config, None, None, engine, progress).noise
+        noise = replace(noise, side_m=max(noise.side_m, one_by_one.side_m))
     config = with_sides(noise.side_m, config)
     told = bundle(images, labels, votes, noise)
     is_proven, figures = told.is_proven()
