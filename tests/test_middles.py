@@ -10,8 +10,10 @@ import scipy.stats
 
 import valuemap
 from test_refine import CITY
-from valuemap import MapConfig
-from valuemap.dataset import Dataset
+from valuemap import MapConfig, correction
+from valuemap.engine.threads import ThreadEngine
+from valuemap.progress import silent
+from valuemap.refine import gather_images
 from valuemap.refine.middles import Contrasts
 from valuemap.simulate import simulate
 from valuemap.tables import Floats
@@ -75,26 +77,32 @@ def test_how_far_an_object_disagrees_is_judged_by_all_others() -> None:
         assert chance == pytest.approx(scipy.stats.chi2.sf(square, own.sum()), rel=1e-6, abs=1e-12)
 
 
-def lamps_beside_drives_that_drift(side_offset_m: float, seed: int) -> Dataset:
+def told(side_offset_m: float, seed: int) -> tuple[float, float | None]:
+    """Return what middles of lamps beside drives that drift by 0.4 m are off by: one by one, and of all together."""
     lamps = replace(CITY, has_lights=0, lamp_spacing_m=15.0, side_offset_m=side_offset_m)
-    return simulate(replace(lamps, position_drift_m=0.4, passes_per_street=4), seed=seed)
+    city = simulate(replace(lamps, position_drift_m=0.4, passes_per_street=4), seed=seed)
+    one_by_one = valuemap.build_map(city, MapConfig(correct_poses=0)).run["counts"]["noise"]["side_m"]
+    images = gather_images(city, MapConfig())
+    _, together = correction._map_with_sides(city, images, MapConfig(), ThreadEngine(1), silent)
+    return one_by_one, together
 
 
-def test_a_map_knows_of_middles_that_are_smaller_than_the_drift() -> None:
-    city = lamps_beside_drives_that_drift(0.2, seed=4)
-    result, alone = valuemap.build_map(city), valuemap.build_map(city, MapConfig(correct_poses=0))
-    assert alone.run["counts"]["noise"]["side_m"] == 0.0
-    assert result.run["counts"]["noise"]["side_m"] == pytest.approx(0.2, rel=0.3)
+def test_middles_that_are_smaller_than_the_drift_are_told_together() -> None:
+    one_by_one, together = told(0.2, seed=4)
+    assert one_by_one == 0.0
+    assert together == pytest.approx(0.2, rel=0.3)
 
 
 def test_drift_is_not_taken_for_middles() -> None:
-    city = lamps_beside_drives_that_drift(0.0, seed=6)
-    result, alone = valuemap.build_map(city), valuemap.build_map(city, MapConfig(correct_poses=0))
-    assert alone.run["counts"]["noise"]["side_m"] > 0.1
-    assert result.run["counts"]["noise"]["side_m"] == 0.0
+    one_by_one, together = told(0.0, seed=6)
+    assert one_by_one > 0.1
+    assert together == 0.0
 
 
-def test_middles_that_are_set_stay() -> None:
-    city = lamps_beside_drives_that_drift(0.2, seed=4)
-    known = MapConfig().with_settings(["side_sigma_m=0.07"])
-    assert valuemap.build_map(city, known).run["counts"]["noise"]["side_m"] == 0.07
+def test_middles_that_are_set_are_not_told() -> None:
+    city, known = simulate(CITY, seed=4), MapConfig().with_settings(["side_sigma_m=0.07"])
+    (calibration, *_), side_m = correction._map_with_sides(
+        city, gather_images(city, known), known, ThreadEngine(1), silent
+    )
+    assert side_m is None
+    assert calibration.noise.side_m == 0.07

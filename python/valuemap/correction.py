@@ -26,7 +26,6 @@ from valuemap.refine import (
     refine_again,
     refine_poses,
 )
-from valuemap.robust import Sought
 from valuemap.stages import Stages
 from valuemap.tables import Labels, Votes, covariance_columns
 from valuemap.tiles.calibration import calibrate
@@ -59,25 +58,15 @@ def _proven(dataset: Dataset, config: MapConfig, stages: Stages, threads: int, p
     with stages.measured("poses"):
         refined = refine_poses(dataset, config, threads=threads, progress=progress)
         if not refined.is_noisy:
-            return _with_sides_told(_of_drives(dataset, refined, config, threads, progress), config, threads, progress)
+            return _of_drives(dataset, refined, config, threads, progress)
         # Where single images are far off, what whole drives seem to be off by is mostly theirs.
         of_images = _by_images(dataset, config, threads, progress)
         if of_images.is_corrected:
             return of_images
         refined = _of_drives(dataset, refined, config, threads, progress)
         if refined.is_corrected:
-            return _with_sides_told(refined, config, threads, progress)
+            return refined
         return replace(refined, as_given=of_images.as_given, side_m=of_images.side_m)
-
-
-def _with_sides_told(refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:
-    """Add the map of what was refined, or not, and the middles that its sides show."""
-    if not config.poses.correct_poses:
-        return refined
-    images = gather_images(refined.dataset, config)
-    engine = ThreadEngine(threads)
-    mapped, side_m = _map_with_sides(refined.dataset, images, config, engine, progress, refined.sought)
-    return replace(refined, as_given=mapped, side_m=side_m)
 
 
 def _of_drives(dataset: Dataset, refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:
@@ -132,12 +121,7 @@ def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progr
 
 
 def _map_with_sides(
-    dataset: Dataset,
-    images: AllImages,
-    config: MapConfig,
-    engine: Engine,
-    progress: Progress,
-    sought: Sought | None = None,
+    dataset: Dataset, images: AllImages, config: MapConfig, engine: Engine, progress: Progress
 ) -> tuple[Mapped, float | None]:
     """Return a map of a dataset, and what the middles that sides show are off by, m; None where that is set.
 
@@ -145,8 +129,8 @@ def _map_with_sides(
     together tell what poses are off by, and so they tell smaller ones. The map is made again with what they tell.
     """
     if config.noise.side_sigma_m is not None:
-        return _map_alone(dataset, config, engine, progress, sought), None
-    mapped = _map_alone(dataset, with_sides(0.0, config), engine, progress, sought)
+        return _map_alone(dataset, config, engine, progress), None
+    mapped = _map_alone(dataset, with_sides(0.0, config), engine, progress)
     calibration, labels, votes, _ = mapped
     side_m = middles(images, labels, votes, calibration.noise) if len(labels) else None
     if side_m is None:
@@ -197,11 +181,9 @@ def _map_of_keyframes(
     return labels, votes
 
 
-def _map_alone(
-    dataset: Dataset, config: MapConfig, engine: Engine, progress: Progress, sought: Sought | None = None
-) -> Mapped:
+def _map_alone(dataset: Dataset, config: MapConfig, engine: Engine, progress: Progress) -> Mapped:
     """Return the map of a dataset in memory, and keep nothing."""
     source = InMemory(dataset, config)
-    calibration = calibrate(source, config, None, None, engine, progress, sought)
+    calibration = calibrate(source, config, None, None, engine, progress)
     cells, _ = solve_cells(source, calibration, config, engine, progress)
     return calibration, *join_cells(cells, source.grid, config)

@@ -289,19 +289,16 @@ def _robust(
 ) -> tuple[Labels, Votes, dict[str, Any], list[Place]]:
     """Noise estimated from a sample, and in each cell the map with the least J that is found; docs/method.md.
 
-    A map of the same poses that was made before stays, unless another calibration is given. Where cells are to be kept,
-    its calibration does.
+    A map of the same poses that was made before stays, unless cells are to be kept, or another calibration is given.
     """
     given = None if run is None else run.calibration
     store = run.parts / CELLS if run is not None and len(source.cells) > 1 else None
     files: list[Place] = []
     if refined is not None and refined.side_m is not None:
         config = with_sides(refined.side_m, config)
-    as_given = None if refined is None or given is not None else refined.as_given
-    if as_given is not None and store is None:
-        calibration, labels, votes, counts = as_given
+    if refined is not None and refined.as_given is not None and given is None and store is None:
+        calibration, labels, votes, counts = refined.as_given
     else:
-        given = as_given[0] if as_given is not None else given
         with stages.measured("calibrate"):
             sought = None if refined is None else refined.sought
             parts = None if run is None else run.parts

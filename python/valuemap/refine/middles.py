@@ -12,8 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
-import scipy.stats
+import scipy
 
 from valuemap import robust
 from valuemap.refine.footage import AllImages
@@ -30,8 +29,8 @@ _MOST_OBJECTS = 200
 """Objects that are asked, at most about: they tell it to a twentieth, and how all disagree is one dense matrix."""
 _CERTAIN = 9.0
 """Middles are there where twice the logarithm of the likelihood gains more: chance has it in one case of a thousand."""
-_ODD = scipy.stats.chi2.sf(_CERTAIN, 1)
-"""Objects that disagree by what chance has in fewer cases, given all others, are two, or have votes of others."""
+_ODD = 0.0027
+"""Objects that disagree by what chance has in fewer cases, three standard deviations, given all others, are two."""
 _LEAST_SHARE = 1e-3
 """Middles are sought down to this share of the usual size: less is an error of the detector, if it is one."""
 _VALUES = 60
@@ -142,5 +141,5 @@ class Contrasts:
                 off_m = self.apart_m[own] - across @ pull
                 known_m2 = covariance_m2[np.ix_(own, own)] - across @ precision @ across.T
                 square = off_m @ np.linalg.solve(known_m2, off_m)
-            chances[one] = scipy.stats.chi2.sf(square, len(own))
+            chances[one] = scipy.special.chdtrc(len(own), square)
         return chances
