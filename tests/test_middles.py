@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -10,14 +13,18 @@ import scipy.stats
 
 import valuemap
 from test_refine import CITY
-from valuemap import MapConfig, correction
+from valuemap import MapConfig, correction, robust
+from valuemap.dataset import Dataset
 from valuemap.engine.threads import ThreadEngine
 from valuemap.progress import silent
 from valuemap.refine import gather_images
+from valuemap.refine.images import Bundle
 from valuemap.refine.middles import Contrasts
 from valuemap.simulate import simulate
 from valuemap.tables import Floats
 
+refine_middles = importlib.import_module("valuemap.refine.middles")
+"""The module, which the package hides behind its function of the same name."""
 SIZE_M = 1.0
 DRIFT_M = 0.5
 
@@ -77,10 +84,44 @@ def test_how_far_an_object_disagrees_is_judged_by_all_others() -> None:
         assert chance == pytest.approx(scipy.stats.chi2.sf(square, own.sum()), rel=1e-6, abs=1e-12)
 
 
-def told(side_offset_m: float, seed: int) -> tuple[float, float | None]:
-    """Return what middles of lamps beside drives that drift by 0.4 m are off by: one by one, and of all together."""
+def test_sides_of_few_votes_and_objects_of_one_side_tell_nothing() -> None:
+    label = np.array([7, 3, 7, 3, 5, 9, 9])
+    thing = np.repeat(np.arange(len(label)), [4, 6, 5, 4, 9, 3, 8])
+    told = SimpleNamespace(label=label, seen=SimpleNamespace(thing=thing))
+    assert [things.tolist() for things in refine_middles._sides(cast(Bundle, told))] == [[1, 3], [0, 2]]
+
+
+@pytest.mark.parametrize(("objects", "asked"), [(0, 0), (3, 3), (200, 200), (201, 101), (1000, 200)])
+def test_no_more_objects_are_asked_than_tell_it(objects: int, asked: int) -> None:
+    sides = [np.array([number]) for number in range(objects)]
+    chosen = np.array([int(things[0]) for things in refine_middles._asked(sides)])
+    assert len(chosen) == asked
+    assert len(set(np.diff(chosen))) <= 1
+
+
+def test_middles_are_not_told_without_boxes_or_the_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    city, config = lamps_beside_drives_that_drift(0.2, seed=4), MapConfig(side_sigma_m=0.0)
+    images = gather_images(city, config)
+    calibration, labels, votes, _ = correction._map_alone(city, config, ThreadEngine(1), silent)
+    assert refine_middles.middles(images, labels, votes, calibration.noise) is not None
+    without_boxes = labels.replace(object_height_m=np.zeros(len(labels)))
+    assert refine_middles.middles(images, without_boxes, votes, calibration.noise) is None
+    monkeypatch.setattr(refine_middles, "_LEAST_OBJECTS", len(labels))
+    assert refine_middles.middles(images, labels, votes, calibration.noise) is None
+    monkeypatch.undo()
+    monkeypatch.setattr(robust, "LEFT_OUT", {"sides"})
+    assert refine_middles.middles(images, labels, votes, calibration.noise) is None
+
+
+def lamps_beside_drives_that_drift(side_offset_m: float, seed: int) -> Dataset:
+    """Return lamps whose sides show other middles, seen by drives that drift by 0.4 m."""
     lamps = replace(CITY, has_lights=0, lamp_spacing_m=15.0, side_offset_m=side_offset_m)
-    city = simulate(replace(lamps, position_drift_m=0.4, passes_per_street=4), seed=seed)
+    return simulate(replace(lamps, position_drift_m=0.4, passes_per_street=4), seed=seed)
+
+
+def told(side_offset_m: float, seed: int) -> tuple[float, float | None]:
+    """Return what middles are told to be off by: one by one, and of all together."""
+    city = lamps_beside_drives_that_drift(side_offset_m, seed)
     one_by_one = valuemap.build_map(city, MapConfig(correct_poses=0)).run["counts"]["noise"]["side_m"]
     images = gather_images(city, MapConfig())
     _, together = correction._map_with_sides(city, images, MapConfig(), ThreadEngine(1), silent)
