@@ -16,7 +16,7 @@ from valuemap.refine import Refined
 from valuemap.robust import Calibration, calibrate
 from valuemap.simulate import simulate
 from valuemap.stages import Stages
-from valuemap.tables import Ints
+from valuemap.tables import Candidates, Ints
 from valuemap.tiles import compare
 from valuemap.tiles.compare import Comparison, compare_poses
 
@@ -94,11 +94,11 @@ def test_a_correction_that_fits_worse_is_not_taken(city: Dataset, monkeypatch: p
     monkeypatch.setattr(correction, "refine_poses", lambda *_, **__: wrong)
     sought: list[object] = []
 
-    def spied(*given: object, **named: object) -> Calibration:
+    def spied(*given: object, **named: object) -> tuple[Calibration, Candidates]:
         sought.append(named["sought"])
         return calibrate(*given, **named)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("valuemap.tiles.calibration.calibrate_scene", spied)
+    monkeypatch.setattr("valuemap.calibration.calibrate_scene", spied)
     result = valuemap.build_map(city)
     # The noise of the poses as they are is known from the comparison.
     assert [given is None for given in sought] == [False]

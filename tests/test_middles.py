@@ -13,7 +13,7 @@ import scipy.stats
 
 import valuemap
 from test_refine import CITY
-from valuemap import MapConfig, correction, robust
+from valuemap import MapConfig, calibration, correction, robust
 from valuemap.dataset import Dataset
 from valuemap.engine.threads import ThreadEngine
 from valuemap.progress import silent
@@ -22,6 +22,7 @@ from valuemap.refine.images import Bundle
 from valuemap.refine.middles import Contrasts
 from valuemap.simulate import simulate
 from valuemap.tables import Floats
+from valuemap.tiles.source import InMemory
 
 refine_middles = importlib.import_module("valuemap.refine.middles")
 """The module, which the package hides behind its function of the same name."""
@@ -99,18 +100,15 @@ def test_no_more_objects_are_asked_than_tell_it(objects: int, asked: int) -> Non
     assert len(set(np.diff(chosen))) <= 1
 
 
-def test_middles_are_not_told_without_boxes_or_the_part(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_middles_are_not_told_without_boxes_or_objects(monkeypatch: pytest.MonkeyPatch) -> None:
     city, config = lamps_beside_drives_that_drift(0.2, seed=4), MapConfig(side_sigma_m=0.0)
     images = gather_images(city, config)
-    calibration, labels, votes, _ = correction._map_alone(city, config, ThreadEngine(1), silent)
-    assert refine_middles.middles(images, labels, votes, calibration.noise) is not None
+    mapped, labels, votes, _ = correction._map_alone(city, config, ThreadEngine(1), silent)
+    assert refine_middles.middles(images, labels, votes, mapped.noise) is not None
     without_boxes = labels.replace(object_height_m=np.zeros(len(labels)))
-    assert refine_middles.middles(images, without_boxes, votes, calibration.noise) is None
+    assert refine_middles.middles(images, without_boxes, votes, mapped.noise) is None
     monkeypatch.setattr(refine_middles, "_LEAST_OBJECTS", len(labels))
-    assert refine_middles.middles(images, labels, votes, calibration.noise) is None
-    monkeypatch.undo()
-    monkeypatch.setattr(robust, "LEFT_OUT", {"sides"})
-    assert refine_middles.middles(images, labels, votes, calibration.noise) is None
+    assert refine_middles.middles(images, labels, votes, mapped.noise) is None
 
 
 def lamps_beside_drives_that_drift(side_offset_m: float, seed: int) -> Dataset:
@@ -119,31 +117,31 @@ def lamps_beside_drives_that_drift(side_offset_m: float, seed: int) -> Dataset:
     return simulate(replace(lamps, position_drift_m=0.4, passes_per_street=4), seed=seed)
 
 
-def told(side_offset_m: float, seed: int) -> tuple[float, float | None]:
-    """Return what middles are told to be off by: one by one, and of all together."""
-    city = lamps_beside_drives_that_drift(side_offset_m, seed)
-    one_by_one = valuemap.build_map(city, MapConfig(correct_poses=0)).run["counts"]["noise"]["side_m"]
-    images = gather_images(city, MapConfig())
-    _, together = correction._map_with_sides(city, images, MapConfig(), ThreadEngine(1), silent)
-    return one_by_one, together
+def told(city: Dataset, *settings: str) -> float:
+    """Return what the calibration of a dataset says that middles are off by."""
+    config = MapConfig().with_settings(settings)
+    return calibration.calibrate(InMemory(city, config), config, None, None, ThreadEngine(1), silent).noise.side_m
 
 
-def test_middles_that_are_smaller_than_the_drift_are_told_together() -> None:
-    one_by_one, together = told(0.2, seed=4)
-    assert one_by_one == 0.0
-    assert together == pytest.approx(0.2, rel=0.3)
+def test_middles_that_are_smaller_than_the_drift_are_told() -> None:
+    assert told(lamps_beside_drives_that_drift(0.2, seed=4)) == pytest.approx(0.2, rel=0.3)
 
 
 def test_drift_is_not_taken_for_middles() -> None:
-    one_by_one, together = told(0.0, seed=6)
-    assert one_by_one > 0.1
-    assert together == 0.0
+    assert told(lamps_beside_drives_that_drift(0.0, seed=6)) == 0.0
 
 
-def test_middles_that_are_set_are_not_told() -> None:
-    city, known = simulate(CITY, seed=4), MapConfig().with_settings(["side_sigma_m=0.07"])
-    (calibration, *_), side_m = correction._map_with_sides(
-        city, gather_images(city, known), known, ThreadEngine(1), silent
-    )
-    assert side_m is None
-    assert calibration.noise.side_m == 0.07
+def test_middles_that_are_told_are_in_the_map_and_its_calibration() -> None:
+    city = lamps_beside_drives_that_drift(0.2, seed=4)
+    run = valuemap.build_map(city, MapConfig(correct_poses=0)).run
+    assert run["counts"]["noise"]["side_m"] == run["calibration"]["noise"]["side_m"] == told(city)
+
+
+def test_middles_that_are_set_are_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(calibration, "middles", None)
+    assert told(simulate(CITY, seed=4), "side_sigma_m=0.07") == 0.07
+
+
+def test_without_the_part_there_are_no_middles(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(robust, "LEFT_OUT", {"sides"})
+    assert told(lamps_beside_drives_that_drift(0.2, seed=4)) == 0.0

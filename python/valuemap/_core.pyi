@@ -98,7 +98,7 @@ def calibrate(
     sought: tuple[_Noise, int] | None,
     threads: int,
     progress: Callable[[int, int], None],
-) -> _Calibration: ...
+) -> tuple[_Calibration, _Floats, tuple[_Offsets, _Indices]]: ...
 def misfits(
     scenes: tuple[Scene, Scene],
     second_of_first: NDArray[np.uint32],

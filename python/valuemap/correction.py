@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from valuemap.calibration import calibrate, with_sides
 from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
@@ -14,21 +15,18 @@ from valuemap.engine.threads import ThreadEngine
 from valuemap.progress import Progress
 from valuemap.refine import (
     FITS_NO_BETTER,
-    AllImages,
     Mapped,
     Refined,
     bundle,
     expose_rows,
     gather_images,
     keyframes_of,
-    middles,
     noise_left,
     refine_again,
     refine_poses,
 )
 from valuemap.stages import Stages
 from valuemap.tables import Labels, Votes, covariance_columns
-from valuemap.tiles.calibration import calibrate
 from valuemap.tiles.compare import compare_poses
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.seams import join_cells
@@ -66,7 +64,7 @@ def _proven(dataset: Dataset, config: MapConfig, stages: Stages, threads: int, p
         refined = _of_drives(dataset, refined, config, threads, progress)
         if refined.is_corrected:
             return refined
-        return replace(refined, as_given=of_images.as_given, side_m=of_images.side_m)
+        return replace(refined, as_given=of_images.as_given)
 
 
 def _of_drives(dataset: Dataset, refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:
@@ -92,16 +90,13 @@ def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progr
     It is proven with the map of the poses as they were: each half of its objects places the images for the other half.
     """
     engine, images = ThreadEngine(threads), gather_images(before, config)
-    as_given, side_m = _map_with_sides(before, images, config, engine, progress)
+    as_given = _map_alone(before, config, engine, progress)
     calibration, labels, votes, _ = as_given
-    uncorrected = Refined(before, {}, as_given=as_given, side_m=side_m)
+    uncorrected = Refined(before, {}, as_given=as_given)
     if not len(labels):
         return uncorrected
     noise, moved = calibration.noise, before
-    if side_m:
-        # Images are moved by what each side shows: what is left unknown of poses between sides is told one by one.
-        one_by_one = calibrate(InMemory(before, config), config, None, None, engine, progress).noise
-        noise = replace(noise, side_m=max(noise.side_m, one_by_one.side_m))
+    # Where images show one thing each, errors of images explain all that its sides disagree about.
     config = with_sides(noise.side_m, config)
     told = bundle(images, labels, votes, noise)
     is_proven, figures = told.is_proven()
@@ -118,32 +113,6 @@ def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progr
         told = bundle(images, labels, votes, noise)
     record = {"found": "errors of images", "images": len(before.images), **figures}
     return Refined(moved, record, is_corrected=True, before_images=(images, noise), side_m=noise.side_m)
-
-
-def _map_with_sides(
-    dataset: Dataset, images: AllImages, config: MapConfig, engine: Engine, progress: Progress
-) -> tuple[Mapped, float | None]:
-    """Return a map of a dataset, and what the middles that sides show are off by, m; None where that is set.
-
-    A map tells middles of what sides of one object disagree about, by more than their poses may be off by. All objects
-    together tell what poses are off by, and so they tell smaller ones. The map is made again with what they tell.
-    """
-    if config.noise.side_sigma_m is not None:
-        return _map_alone(dataset, config, engine, progress), None
-    mapped = _map_alone(dataset, with_sides(0.0, config), engine, progress)
-    calibration, labels, votes, _ = mapped
-    side_m = middles(images, labels, votes, calibration.noise) if len(labels) else None
-    if side_m is None:
-        return mapped, 0.0
-    return _map_alone(dataset, with_sides(side_m, config), engine, progress), side_m
-
-
-def with_sides(side_m: float, config: MapConfig) -> MapConfig:
-    """Return settings with the middles that sides show, as all objects told them with images as they were.
-
-    Where images show one thing each, errors of images explain all that its sides disagree about.
-    """
-    return replace(config, noise=replace(config.noise, side_sigma_m=side_m))
 
 
 def with_errors_of_images(refined: Refined, labels: Labels, votes: Votes) -> Labels:

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.calibration import calibrate, with_sides
 from valuemap.cameras import Rays, cast_rays, directions_down
 from valuemap.config import MapConfig, bounded_threads
-from valuemap.correction import MOST_CORRECTED, TOO_LARGE, correct_poses, with_errors_of_images, with_sides
+from valuemap.correction import MOST_CORRECTED, TOO_LARGE, correct_poses, with_errors_of_images
 from valuemap.dataset import Dataset, Frame, ensure_checked, read_dataset, write_dataset
 from valuemap.describe import describe_labels
 from valuemap.engine.engine import Engine
@@ -33,7 +34,6 @@ from valuemap.remote import Place, UrlPath
 from valuemap.robust import Calibration, calibration_to_json
 from valuemap.stages import Stages
 from valuemap.tables import Labels, Votes
-from valuemap.tiles.calibration import calibrate
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.seams import join_cells

@@ -182,8 +182,10 @@ def calibrate(
     sought: Sought | None = None,
     threads: int = 0,
     progress: Progress = silent,
-) -> Calibration:
+) -> tuple[Calibration, Candidates]:
     """Estimate the noise from the residuals of labels in a sample of places, and learn what its classes are like.
+
+    Also the objects that classes are learned from, which are the map of a sample of places.
 
     What the config sets of the noise stays as it is. The scene may be a part of what is mapped. `sought` is what
     `misfits` found of the same scene with the same config: it is the most work, and done once.
@@ -191,7 +193,7 @@ def calibrate(
     guess, known = _guess(config.noise, scene.rounding_px)
     steps = _core.CALIBRATION_STEPS + (2 * _core.SEARCH_STEPS if is_part else 0)
     with counted(progress, "estimating the noise", steps) as tell:
-        noise, is_deep, classes, pooled, shares = _core.calibrate(
+        (noise, is_deep, classes, pooled, shares), position, (offsets, voters) = _core.calibrate(
             scene.core,
             guess.as_tuple(),
             known,
@@ -201,13 +203,14 @@ def calibrate(
             threads,
             lambda done, _total: tell(done),
         )
-    return Calibration(
+    calibration = Calibration(
         noise=Noise(*noise),
         is_deep=is_deep,
         classes={name: tuple(row) for name, row in zip(scene.class_names, classes, strict=False) if row is not None},
         pooled=tuple(pooled),
         confusions=_by_name(shares, scene.class_names),
     )
+    return calibration, Candidates(position, offsets, voters)
 
 
 def _by_name(shares: Sequence[Sequence[tuple[int, float]]], class_names: Sequence[str]) -> dict[str, dict[str, float]]:
@@ -279,7 +282,7 @@ def find_labels(
 def _guess(config: NoiseConfig, least_px: float) -> tuple[Noise, tuple[list[bool], float]]:
     """Return where the estimation starts, and what is known: what the user sets, and that detections are rounded.
 
-    The former are detection, position, rotation and side; detections are off by at least `least_px`.
+    The former are detection, position and rotation; detections are off by at least `least_px`.
     """
     noise = Noise()
     if config.detection_sigma_px is not None:
@@ -293,7 +296,7 @@ def _guess(config: NoiseConfig, least_px: float) -> tuple[Noise, tuple[list[bool
         noise = replace(noise, rotation_rad=part, rotation_segment_rad=part, rotation_drift_rad=part)
     if config.side_sigma_m is not None:
         noise = replace(noise, side_m=config.side_sigma_m)
-    known = [config.detection_sigma_px, config.position_sigma_m, config.rotation_sigma_deg, config.side_sigma_m]
+    known = [config.detection_sigma_px, config.position_sigma_m, config.rotation_sigma_deg]
     return noise, ([value is not None for value in known], least_px)
 
 

@@ -11,6 +11,16 @@ use valuemap_core::{SMatrix, Vector3};
 /// Groups of rays: offsets (N + 1) into the members, and the members.
 pub type Groups<'py> = (Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<u32>>);
 
+/// Groups of rays, one after the other.
+pub fn groups_of<'py, 'a>(py: Python<'py>, groups: impl Iterator<Item = &'a [u32]>) -> Groups<'py> {
+    let (mut offsets, mut members) = (vec![0_i64], Vec::new());
+    for group in groups {
+        members.extend_from_slice(group);
+        offsets.push(members.len() as i64);
+    }
+    (offsets.into_pyarray(py), members.into_pyarray(py))
+}
+
 /// Rows of an (N, WIDTH) array, without a copy.
 pub fn rows_of<'a, const WIDTH: usize>(array: &'a PyReadonlyArray2<'_, f64>) -> PyResult<&'a [[f64; WIDTH]]> {
     if array.shape()[1] != WIDTH {
@@ -149,15 +159,4 @@ pub fn candidates_from(
 /// Positions of candidates, (N, 3).
 pub fn points_of<'py>(py: Python<'py>, candidates: &[Candidate]) -> PyResult<Bound<'py, PyArray2<f64>>> {
     matrix(py, candidates.iter().map(|candidate| candidate.point))
-}
-
-/// Voters of candidates.
-pub fn groups_of<'py>(py: Python<'py>, candidates: &[Candidate]) -> Groups<'py> {
-    let mut offsets = vec![0_i64];
-    let mut members = Vec::new();
-    for candidate in candidates {
-        members.extend_from_slice(&candidate.voters);
-        offsets.push(members.len() as i64);
-    }
-    (offsets.into_pyarray(py), members.into_pyarray(py))
 }

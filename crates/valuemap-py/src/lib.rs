@@ -154,7 +154,12 @@ fn vote_in_clusters<'py>(
         vote::vote(&rays.0, cluster, &viability, &stop, progress)
     })?;
     let cluster: Vec<u32> = candidates.iter().map(|candidate| candidate.clusters[0]).collect();
-    Ok((points_of(py, &candidates)?, groups_of(py, &candidates), cluster.into_pyarray(py), counts_of(py, &counts)?))
+    Ok((
+        points_of(py, &candidates)?,
+        groups_of(py, candidates.iter().map(|candidate| &candidate.voters[..])),
+        cluster.into_pyarray(py),
+        counts_of(py, &counts)?,
+    ))
 }
 
 fn counts_of<'py>(py: Python<'py>, counts: &PairCounts) -> PyResult<Bound<'py, PyDict>> {
@@ -188,7 +193,7 @@ fn merge_labels<'py>(
         cluster.as_slice()?,
     )?;
     let merged = py.detach(|| merge::merge(&rays.0, candidates, merge_radius_m));
-    Ok((points_of(py, &merged)?, groups_of(py, &merged)))
+    Ok((points_of(py, &merged)?, groups_of(py, merged.iter().map(|candidate| &candidate.voters[..]))))
 }
 
 /// Covariances for 1 px detections (N, 9), `valuemap_core::paper::triangulate::unit_covariance`.

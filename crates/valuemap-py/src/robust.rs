@@ -24,7 +24,7 @@ use valuemap_core::viability::Viability;
 use crate::Rays;
 use crate::arrays::{
     FARTHEST_M, Groups, check_finite, check_length, check_not_infinite, check_ranges, check_within,
-    check_within_or_none, matrices_of, matrix, rays_in, rows_of,
+    check_within_or_none, groups_of, matrices_of, matrix, rays_in, rows_of,
 };
 use crate::run::with_progress;
 
@@ -227,39 +227,43 @@ fn calibration_of((noise, is_deep, classes, pooled, shares): CalibrationValues) 
     })
 }
 
-/// What is known of the noise: detection, position, rotation, middles of sides, and what detections are off by at least, px.
-fn known_of(([detection, position, rotation, side], least_px): ([bool; 4], f64)) -> PyResult<Known> {
+/// What is known of the noise: detection, position, rotation, and what detections are off by at least, px.
+fn known_of(([detection, position, rotation], least_px): ([bool; 3], f64)) -> PyResult<Known> {
     check_within("least_px", &[least_px], FARTHEST_M)?;
     if least_px < 0.0 {
         return Err(PyValueError::new_err("least_px: expected 0 or more"));
     }
-    Ok(Known { detection, position, rotation, side, least_px })
+    Ok(Known { detection, position, rotation, least_px })
 }
 
-/// Estimate the noise from the data and learn the classes, `valuemap_core::robust::calibrate::self_calibrate`.
+/// Estimate the noise from the data and learn the classes, `valuemap_core::robust::calibrate::self_calibrate`: also the objects of the map that the
+/// classes are learned from, their positions and voters.
 #[pyfunction]
 #[allow(clippy::too_many_arguments)]
-pub fn calibrate(
-    py: Python<'_>,
+pub fn calibrate<'py>(
+    py: Python<'py>,
     scene: &Scene,
     guess: NoiseValues,
-    known: ([bool; 4], f64),
+    known: ([bool; 3], f64),
     settings: SettingValues,
     is_part: bool,
     sought: Option<SoughtValues>,
     threads: usize,
     progress: &Bound<'_, PyAny>,
-) -> PyResult<CalibrationValues> {
+) -> PyResult<(CalibrationValues, Bound<'py, PyArray2<f64>>, Groups<'py>)> {
     let settings = settings_of(settings)?;
     let guess = noise_of(guess)?;
     let known = known_of(known)?;
     let sought =
         sought.map(|(noise, starts)| Ok::<_, PyErr>(Sought { noise: noise_of(noise)?, starts })).transpose()?;
-    let found = with_progress(py, threads, 0, progress, |progress| {
+    let (found, map) = with_progress(py, threads, 0, progress, |progress| {
         self_calibrate(&scene.0, &guess, known, &settings, is_part, sought, progress)
     })?;
     let classes = found.classes.iter().map(|class| class.as_ref().map(ClassModel::to_row)).collect();
-    Ok((values_of(&found.noise), found.is_deep, classes, found.pooled.to_row(), found.confusions.shares().to_vec()))
+    let calibration =
+        (values_of(&found.noise), found.is_deep, classes, found.pooled.to_row(), found.confusions.shares().to_vec());
+    let points = matrix(py, map.iter().map(|(_, point)| *point))?;
+    Ok((calibration, points, groups_of(py, map.iter().map(|(votes, _)| &votes[..]))))
 }
 
 /// A noise, and from how many starts it was sought.
@@ -274,7 +278,7 @@ pub fn misfits<'py>(
     scenes: (PyRef<'py, Scene>, PyRef<'py, Scene>),
     second_of_first: PyReadonlyArray1<'py, u32>,
     guess: NoiseValues,
-    known: ([bool; 4], f64),
+    known: ([bool; 3], f64),
     settings: SettingValues,
     threads: usize,
     progress: &Bound<'py, PyAny>,
@@ -324,19 +328,13 @@ pub fn find_labels<'py>(
         find(&scene.0, &calibration, &settings, progress)
     })?;
     let labels = || found.findings.iter();
-    let mut offsets = vec![0_i64];
-    let mut voters: Vec<u32> = Vec::new();
-    for label in labels() {
-        voters.extend(&label.votes);
-        offsets.push(voters.len() as i64);
-    }
     let existence: Vec<f64> = found.findings.iter().map(|finding| finding.existence).collect();
     let expected: Vec<i64> = found.findings.iter().map(|finding| i64::from(finding.expected)).collect();
     let class: Vec<u32> = labels().map(|label| label.class).collect();
     Ok((
         matrix(py, labels().map(|label| label.estimate.point))?,
         class.into_pyarray(py),
-        (offsets.into_pyarray(py), voters.into_pyarray(py)),
+        groups_of(py, labels().map(|label| &label.votes[..])),
         matrix(py, labels().map(|label| label.estimate.covariance))?,
         existence.into_pyarray(py),
         expected.into_pyarray(py),
@@ -414,16 +412,10 @@ pub fn objects_of<'py>(
     let found = with_progress(py, threads, 0, progress, |progress| {
         valuemap_core::robust::objects_of(&scene.0, &noise, &settings, begun, is_searched, progress)
     })?;
-    let mut offsets = vec![0_i64];
-    let mut voters: Vec<u32> = Vec::new();
-    for object in &found {
-        voters.extend(&object.votes);
-        offsets.push(voters.len() as i64);
-    }
     let energy: Vec<f64> = found.iter().map(|object| object.energy).collect();
     Ok((
         energy.into_pyarray(py),
-        (offsets.into_pyarray(py), voters.into_pyarray(py)),
+        groups_of(py, found.iter().map(|object| &object.votes[..])),
         matrix(py, found.iter().map(|object| object.fit.point))?,
     ))
 }

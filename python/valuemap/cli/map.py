@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from valuemap import map_folder
+from valuemap.calibration import read_calibration
 from valuemap.cli.app import app
 from valuemap.cli.options import (
     DEFAULT_METHOD,
@@ -38,7 +39,6 @@ from valuemap.pipeline import Run, build_map_of_folder
 from valuemap.report.above import draw_map
 from valuemap.report.style import check_format
 from valuemap.summary import summarize_map
-from valuemap.tiles.calibration import read_calibration
 from valuemap.writers.poses import check_poses_place, write_poses
 
 

@@ -26,6 +26,7 @@ from valuemap.refine.residuals import (
     OFFSET,
     Observations,
     State,
+    cauchy,
     linearised,
     poses_of,
     weights,
@@ -65,6 +66,24 @@ class Scales:
     own_m: float
     own_rad: float
     constant: tuple[float | Floats, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Ties:
+    """What of the objects are the same (N): object `first` is where `second` is, but for `sigma`, each axis.
+
+    `total` is what they may be apart by with poses as they are a priori.
+    """
+
+    first: Ints
+    second: Ints
+    sigma: float
+    total: float
+
+    @classmethod
+    def none(cls) -> Ties:
+        """Return that none are the same."""
+        return cls(np.empty(0, np.int64), np.empty(0, np.int64), 1.0, 1.0)
 
 
 class Groups:
@@ -147,8 +166,9 @@ class Adjustment:
         active: tuple[Bools, ...],
         things: int,
         links: Links,
+        ties: Ties | None = None,
     ) -> None:
-        self.links = links
+        self.links, self.ties = links, ties or Ties.none()
         self.seen, self.chain, self.scales, self.active, self.things = seen, chain, scales, active, things
         # Columns of the constants after those of the objects.
         self.column_of: list[Ints] = []
@@ -264,6 +284,7 @@ class Adjustment:
             sigma = np.broadcast_to(np.asarray(self.scales.constant[kind], np.float64), free.shape)[free]
             system.add_diagonal(index[free], sigma**-2, -(sigma**-2) * state.constants[kind][free])
         self._link(system, state.constants[OFFSET])
+        self._tie(system, state.point_in_world_m, tolerance)
         nodes = np.zeros((len(self.chain.drive), _BASIS, _BASIS))
         nodes[self.node[self.by_node_and_part.row[self.by_node.row]]] = node_products
         sums = (_TO_DRIFT.T @ beside_thing, _TO_DRIFT.T @ both @ _TO_CONSTANTS, _TO_DRIFT.T @ nodes)
@@ -297,6 +318,17 @@ class Adjustment:
         left = offset[pair[:, 1], :2] - offset[pair[:, 0], :2] - self.links.apart_m
         pull = np.einsum("nij,nj->ni", self.links.information, left)
         system.add(columns, columns, blocks, np.concatenate([pull, -pull], axis=1))
+
+    def _tie(self, system: _System, point: Floats, tolerance: float) -> None:
+        """Add what is known of objects that are the same, with weights as those of observations."""
+        apart = point[self.ties.first] - point[self.ties.second]
+        square = np.sum(apart**2, axis=1) / self.ties.total**2
+        information = cauchy(square, tolerance)[:, None] / self.ties.sigma**2
+        columns = 3 * np.stack([self.ties.first, self.ties.second], axis=1)[:, :, None] + np.arange(3)
+        columns = columns.reshape(-1, 6)
+        block = np.kron([[1.0, -1.0], [-1.0, 1.0]], np.eye(3))
+        pull = information * apart
+        system.add(columns, columns, information[:, :, None] * block, np.concatenate([-pull, pull], axis=1))
 
     def _weighted(self, state: State, tolerance: float) -> tuple[Floats, Floats]:
         """Return derivatives with residuals (N, 2, 12), and those by the image's own error (N, 2, 6), both weighted."""

@@ -16,8 +16,8 @@ import valuemap._core as _core
 from valuemap.cameras import camera_poses
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
-from valuemap.drives import in_driving_order
-from valuemap.refine.adjust import Adjustment, Scales, adjust, triangulate
+from valuemap.drives import InOrder, in_driving_order
+from valuemap.refine.adjust import Adjustment, Scales, Ties, adjust, triangulate
 from valuemap.refine.estimate import WIDE, everything
 from valuemap.refine.footage import (
     AllImages,
@@ -48,8 +48,9 @@ _RUN = 100
 class Bundle:
     """The images of a dataset with what they see of the things (K) of a map, which are of its labels `label` (K).
 
-    A thing is an object, or what a side shows of it where sides show other middles: each is off by `side_m` then.
-    `scales` are what errors of images and drift are thought to be a priori, in the working frame.
+    A thing is an object, or what a side shows of it where sides show other middles: `ties` are to the objects then,
+    which are things behind these. `scales` are what errors of images and drift are thought to be a priori, in the
+    working frame.
     """
 
     of: AllImages
@@ -57,7 +58,7 @@ class Bundle:
     scales: Scales
     state: State
     label: Ints
-    side_m: float
+    ties: Ties
 
     def adjusted(self, seen: Observations) -> State:
         """Return objects, drift and errors of images as some of the observations tell them."""
@@ -67,14 +68,17 @@ class Bundle:
     def _problem(self, seen: Observations) -> Adjustment:
         footage = self.of.footage
         none = tuple(np.zeros_like(flags) for flags in everything(footage, _whole_drives(footage)))
-        return Adjustment(seen, footage.chain, self.scales, none, len(self.label), Links.none())
+        return Adjustment(
+            seen, footage.chain, self.scales, none, len(self.state.point_in_world_m), Links.none(), self.ties
+        )
 
     def gain(self) -> tuple[float, float]:
         """Return by how much rays of objects meet better that had no part in it, and the chance that it is luck.
 
         The gain is in units of chi-squared, of poses as each half of the objects has them for the other half.
         """
-        half, things = halves(self.state.point_in_world_m), len(self.label)
+        things = len(self.label)
+        half = halves(self.state.point_in_world_m[:things])
         asked = self.seen.take(_in_runs(things)[self.seen.thing])
         if len(np.unique(half[asked.thing])) < 2:  # There is no other half.
             return 0.0, 1.0
@@ -124,21 +128,32 @@ class Bundle:
     def covariances(self) -> tuple[Ints, Floats]:
         """Return labels (L) with their covariances (L, 3, 3) in m², errors of all images and drift marginalised."""
         axes = self.of.ordered.dataset.frame.east_north_up()
-        each = np.arange(len(self.label))[:, None]
-        of_things = axes.T @ self.placed(each)[1] @ axes + self.side_m**2 * np.eye(3)
-        label, row = np.unique(self.label, return_inverse=True)
-        information = np.zeros((len(label), 3, 3))
-        np.add.at(information, row, np.linalg.inv(of_things))
-        return label, np.asarray(np.linalg.inv(information), np.float64)
+        label, thing = np.unique(self.label, return_index=True)
+        covariance_m2 = self.placed(self.object_of(thing)[:, None])[1]
+        return label, np.asarray(axes.T @ covariance_m2 @ axes, np.float64)
+
+    def object_of(self, thing: Ints) -> Ints:
+        """Return the objects (N) that things (N) are, or are sides of."""
+        object_of_thing = np.arange(len(self.label))
+        object_of_thing[self.ties.first] = self.ties.second
+        return np.asarray(object_of_thing[thing])
 
 
 def gather_images(dataset: Dataset, config: MapConfig) -> AllImages:
     """Return all images of a dataset as maps are bundled with them."""
-    unit_m = config.vote.max_range_m / USUAL_RANGE_M
-    ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
+    return images_in_order(in_driving_order(dataset, viewpoint_step_m=_unit_m(config)), config)
+
+
+def images_in_order(ordered: InOrder, config: MapConfig) -> AllImages:
+    """Return the same of a dataset that is in driving order."""
+    unit_m = _unit_m(config)
     return AllImages(
         ordered, unit_m, gather(*in_working_frame(ordered.dataset, ordered.drives, unit_m), every_image=True)
     )
+
+
+def _unit_m(config: MapConfig) -> float:
+    return config.vote.max_range_m / USUAL_RANGE_M
 
 
 def bundle(images: AllImages, labels: Labels, votes: Votes, noise: Noise, *, by_side: bool = False) -> Bundle:
@@ -157,9 +172,6 @@ def bundle(images: AllImages, labels: Labels, votes: Votes, noise: Noise, *, by_
     of_image = np.hypot(noise.position_m / unit_m * box, noise.rotation_rad * footage.pixels_per_rad())
     segments = _whole_drives(footage)
     seen = footage.observe(detection, thing, footage.drives.pass_code, Sigmas(np.hypot(alone, of_image), alone))
-    points = points_in_working_frame(ordered.dataset, labels.position_in_world_m[label], unit_m)
-    counts = tuple(map(len, everything(footage, segments)))
-    state = triangulate(seen, State.zero(points, len(footage.chain.drive), len(footage.row), counts))
     scales = Scales(
         drift_m=max(math.hypot(noise.position_drift_m, noise.position_segment_m) / unit_m, 1e-3),
         drift_rad=max(math.hypot(noise.rotation_drift_rad, noise.rotation_segment_rad), 1e-5),
@@ -167,7 +179,21 @@ def bundle(images: AllImages, labels: Labels, votes: Votes, noise: Noise, *, by_
         own_rad=max(noise.rotation_rad, 1e-5),
         constant=WIDE.constant,
     )
-    return Bundle(images, seen, scales, state, label, noise.side_m)
+    points = points_in_working_frame(ordered.dataset, labels.position_in_world_m[label], unit_m)
+    ties, objects = Ties.none(), points[:0]
+    if noise.side_m:
+        ties = _to_objects(label, noise.side_m / unit_m, scales)
+        objects = points[np.sort(np.unique(label, return_index=True)[1])]
+    counts = tuple(map(len, everything(footage, segments)))
+    state = State.zero(np.concatenate([points, objects]), len(footage.chain.drive), len(footage.row), counts)
+    return Bundle(images, seen, scales, triangulate(seen, state), label, ties)
+
+
+def _to_objects(label: Ints, side: float, scales: Scales) -> Ties:
+    """Return that sides (K) of labels are where their objects are but for `side`; these are behind, in their order."""
+    _, first, code = np.unique(label, return_index=True, return_inverse=True)
+    along = np.argsort(np.argsort(first))[code]
+    return Ties(np.arange(len(label)), len(label) + along, side, math.hypot(side, math.sqrt(2.0) * scales.drift_m))
 
 
 def _by_side(footage: Footage, detection: Ints, thing: Ints, label: Ints) -> tuple[Ints, Ints]:

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from valuemap import robust
 from valuemap.refine.footage import AllImages
 from valuemap.refine.images import Bundle, bundle
 from valuemap.refine.poses import one_blas_thread
@@ -45,7 +44,7 @@ def middles(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> fl
     `noise` is that of the map of `labels` and `votes`. What is not known well, as depth is, says little of middles.
     """
     height_m = labels.object_height_m[labels.object_height_m > 0.0]
-    if not len(height_m) or "sides" in robust.LEFT_OUT:  # Middles are those of boxes.
+    if not len(height_m):  # Middles are those of boxes.
         return None
     told = bundle(images, labels, votes, replace(noise, side_m=0.0), by_side=True)
     sides = _asked(_sides(told))

@@ -222,11 +222,16 @@ def residuals(seen: Observations, state: State) -> tuple[Floats, Floats]:
         return (1.0 + stretch) * abc[:, :2] / abc[:, 2:] + stretch * seen.from_middle_px, abc[:, 2]
 
 
+def cauchy(square: Floats, tolerance: float) -> Floats:
+    """Return Cauchy's weights (N) of squared residuals (N), in variances."""
+    return np.asarray(1.0 / (1.0 + square / (tolerance * _CAUCHY) ** 2))
+
+
 def weights(seen: Observations, residual_px: Floats, depth_m: Floats, tolerance: float) -> Floats:
     """Return Cauchy's weights (N) over variance; what is behind its camera weighs nothing."""
     square = np.sum(residual_px**2, axis=1) / seen.sigma_px**2
     with np.errstate(invalid="ignore"):
-        weight = 1.0 / (1.0 + square / (tolerance * _CAUCHY) ** 2) / seen.sigma_px**2
+        weight = cauchy(square, tolerance) / seen.sigma_px**2
     return np.where((depth_m > 0.1) & np.isfinite(square), weight, 0.0)
 
 

@@ -10,6 +10,7 @@ from threading import Event
 
 import numpy as np
 
+from valuemap.calibration import read_calibration
 from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig
 from valuemap.dataset import (
@@ -45,7 +46,6 @@ from valuemap.tables import (
     join_tables,
     write_table,
 )
-from valuemap.tiles.calibration import read_calibration
 from valuemap.tiles.source import VIEWPOINT_SHARE
 from valuemap.update.changes import STATES, Verdicts, first_rows, judge, match_labels, match_places, number, tell
 from valuemap.update.join import join_datasets, join_in_portions

@@ -282,9 +282,9 @@ static LEARNED: LazyLock<Vec<f64>> = LazyLock::new(|| {
     let objects: Vec<Vector3<f64>> =
         (0..12).map(|i| Vector3::new(20.0 + 9.0 * f64::from(i), 6.0 - f64::from(i % 3), 4.0)).collect();
     let scene = street::street(60, 2.0, &objects, &[[0.4, -0.2], [-0.5, 0.3], [0.1, 0.6]]);
-    let known = Known { detection: true, position: true, rotation: true, side: true, least_px: 0.0 };
+    let known = Known { detection: true, position: true, rotation: true, least_px: 0.0 };
     let found = self_calibrate(&scene, &street::NOISE, known, &street::SETTINGS, false, None, &Progress::default());
-    found.unwrap().pooled.to_row()
+    found.unwrap().0.pooled.to_row()
 });
 
 fn class_model() -> impl Strategy<Value = ClassModel> {
@@ -428,11 +428,10 @@ fn labels_of_hostile_scenes() {
 }
 
 fn known() -> impl Strategy<Value = Known> {
-    (any::<[bool; 4]>(), any::<f64>()).prop_map(|([detection, position, rotation, side], least_px)| Known {
+    (any::<[bool; 3]>(), any::<f64>()).prop_map(|([detection, position, rotation], least_px)| Known {
         detection,
         position,
         rotation,
-        side,
         least_px,
     })
 }
@@ -442,7 +441,7 @@ fn noise_of_hostile_scenes() {
     let cases = (columns(10), noise(), known(), settings(), any::<bool>());
     run("calibrate", 50, &cases, |(columns, guess, known, settings, is_part)| {
         let scene = columns.scene();
-        let found = self_calibrate(&scene, &guess, known, &settings, is_part, None, &Progress::default()).unwrap();
+        let found = self_calibrate(&scene, &guess, known, &settings, is_part, None, &Progress::default()).unwrap().0;
         let n = &found.noise;
         all_finite("detection noise", [&n.detection_px, &n.box_share])?;
         all_finite("noise of positions", [&n.position_m, &n.position_segment_m, &n.position_drift_m, &n.side_m])?;

@@ -31,7 +31,7 @@ fn calibrated(sigma_px: f64) -> Calibration {
 /// The same where detections are rounded, which they are off by at least.
 fn calibrated_of_rounded(sigma_px: f64, least_px: f64) -> Calibration {
     let known = Known { least_px, ..Known::default() };
-    self_calibrate(&off_by(sigma_px), &NOISE, known, &SETTINGS, false, None, &Progress::default()).unwrap()
+    self_calibrate(&off_by(sigma_px), &NOISE, known, &SETTINGS, false, None, &Progress::default()).unwrap().0
 }
 
 /// A street whose detections are off by a standard deviation.
@@ -71,7 +71,7 @@ fn what_poses_were_compared_with_is_not_sought_again() {
     };
     let calibrated = |sought: Option<Sought>| {
         let found =
-            self_calibrate(&scene, &NOISE, Known::default(), &SETTINGS, false, sought, &Progress::default()).unwrap();
+            self_calibrate(&scene, &NOISE, Known::default(), &SETTINGS, false, sought, &Progress::default()).unwrap().0;
         (found.noise, found.starts)
     };
     let sought = with(&scene).unwrap();
@@ -241,7 +241,7 @@ fn noise_of(are_of_poses: bool) -> Noise {
     };
     let scene = joined((0..2).map(drive).collect());
     let guess = Noise { box_share: 0.04, position_m: 0.1, ..NOISE };
-    self_calibrate(&scene, &guess, Known::default(), &SETTINGS, false, None, &Progress::default()).unwrap().noise
+    self_calibrate(&scene, &guess, Known::default(), &SETTINGS, false, None, &Progress::default()).unwrap().0.noise
 }
 
 #[test]

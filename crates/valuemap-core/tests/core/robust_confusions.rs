@@ -46,8 +46,8 @@ fn class_of(scene: &Scene, objects: &[(Vector3<f64>, u32)], ray: u32) -> u32 {
 }
 
 fn calibrated(scene: &Scene) -> Calibration {
-    let known = Known { detection: true, position: true, rotation: true, side: true, least_px: 0.0 };
-    self_calibrate(scene, &NOISE, known, &SETTINGS, false, None, &Progress::default()).unwrap()
+    let known = Known { detection: true, position: true, rotation: true, least_px: 0.0 };
+    self_calibrate(scene, &NOISE, known, &SETTINGS, false, None, &Progress::default()).unwrap().0
 }
 
 fn found(scene: &Scene, calibration: &Calibration) -> Vec<Finding> {

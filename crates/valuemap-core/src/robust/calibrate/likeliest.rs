@@ -10,13 +10,11 @@ use rayon::prelude::*;
 
 use super::CALIBRATION_RAYS;
 use super::residuals::calibrate;
-use super::shared::{with_sides, with_sides_for_sure};
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::{Object, Placed, fit, placed};
 use crate::robust::initial;
 use crate::robust::model::Model;
 use crate::robust::noise::{Known, Noise};
-use crate::robust::parts::Part;
 use crate::robust::scene::{Scene, sample};
 use crate::robust::search::{Depth, Tally, search};
 use crate::robust::settings::Settings;
@@ -27,8 +25,6 @@ const CALIBRATION_GATE: f64 = 1.4;
 const CALIBRATION_ROUNDS: usize = 3;
 /// Times that it is estimated from more rays than that.
 const MORE_ROUNDS: usize = 2;
-/// Times that the middles of sides are learned anew, from a map that is made with them.
-pub(crate) const MIDDLES_ROUNDS: usize = 2;
 /// Passes that should have seen objects and did not are expected to cost no more than this, whatever is expected of them: twice the most that
 /// `-p ln p` can be.
 const MOST_UNSEEN: f64 = 2.0 / std::f64::consts::E;
@@ -37,8 +33,8 @@ const STARTS: [f64; 5] = [0.15, 0.5, 1.5, 5.0, 15.0];
 
 /// Steps from all starts at most, as progress counts them.
 const START_STEPS: usize = STARTS.len() * CALIBRATION_ROUNDS;
-/// Steps of [`misfits`] at most: in each scene those from all starts, with middles of sides, and from the map of the other.
-pub const MISFIT_STEPS: usize = 2 * (START_STEPS + 2);
+/// Steps of [`misfits`] at most: in each scene those from all starts, and from the map of the other.
+pub const MISFIT_STEPS: usize = 2 * (START_STEPS + 1);
 /// Steps of the search for the noise at most.
 pub(crate) const NOISE_STEPS: usize = START_STEPS + MORE_ROUNDS;
 
@@ -101,29 +97,6 @@ fn of_more(mut noise: Noise, step: impl Fn(&Noise) -> Result<Round, Halt>) -> Re
     Ok(best)
 }
 
-/// A noise with the error of the [middles that sides show](crate::robust::energy::sides), if sides disagree in a map of some rays, and in one that is made
-/// with such an error as well: the former may hold some things once for each side.
-pub(crate) fn with_middles(
-    scene: &Scene,
-    noise: &Noise,
-    known: Known,
-    settings: &Settings,
-    map: &[Placed],
-    rays: &[u32],
-    progress: &Progress,
-) -> Result<Noise, Halt> {
-    let plain = Model::new(scene, noise, settings);
-    let mut found = with_sides(&plain, known, map);
-    for _ in 0..MIDDLES_ROUNDS {
-        let Some(with) = found else { break };
-        let mut model = Model::new(scene, &with, settings);
-        let begun = initial::labels_of_few(&model, rays, progress)?;
-        let objects = search(&mut model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
-        found = with_sides_for_sure(&plain, known, &placed(&objects));
-    }
-    Ok(found.unwrap_or(*noise))
-}
-
 /// How badly the same rays fit in two scenes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Misfits {
@@ -161,12 +134,10 @@ pub fn misfits(
     let of = |scene, rays| Sample { scene, rays, known, settings: wider(settings), progress };
     let samples = [of(scenes[0], &first), of(scenes[1], &second)];
     // Side by side: samples are so small that threads wait for each other within each of them.
-    let seek = |here: usize| -> Result<(Option<Sought>, Likeliest), Halt> {
-        let likeliest = Likeliest::of_starts(&samples[here], guess)?;
-        Ok((likeliest.sought(), likeliest.with_sides(&samples[here])?))
-    };
+    let seek = |here: usize| Likeliest::of_starts(&samples[here], guess);
     let (first_found, second_found) = rayon::join(|| seek(0), || seek(1));
-    let ((of_first, first_found), (_, second_found)) = (first_found?, second_found?);
+    let (first_found, second_found) = (first_found?, second_found?);
+    let of_first = first_found.sought().filter(|_| first.len() == all);
     let found = [first_found.best, second_found.best];
     let least = |here: usize, numbers: &[u32]| -> Result<f64, Halt> {
         let [Some(own), Some(other)] = [&found[here], &found[1 - here]] else { return Ok(f64::INFINITY) };
@@ -176,7 +147,6 @@ pub fn misfits(
         Ok(own.value.min(samples[here].round_from(&noise, map)?.value))
     };
     let (least_first, least_second) = rayon::join(|| least(0, &first_of_second), || least(1, second_of_first));
-    let of_first = of_first.filter(|_| first.len() == all);
     Ok(Misfits { values: [least_first?, least_second?], rays: first.len(), of_first })
 }
 
@@ -363,17 +333,6 @@ impl Likeliest {
             self.last = last;
         }
         Ok(())
-    }
-
-    /// One step more with the middles that sides seem to show in the best map.
-    fn with_sides(mut self, sample: &Sample<'_>) -> Result<Self, Halt> {
-        if let Some(best) = self.best.as_ref().filter(|_| sample.settings.has(Part::Sides) && !sample.known.side) {
-            let model = Model::new(sample.scene, &best.noise, &sample.settings);
-            if let Some(noise) = with_sides(&model, sample.known, &best.map) {
-                self.steps(1, noise, |noise| sample.round(noise))?;
-            }
-        }
-        Ok(self)
     }
 
     fn sought(&self) -> Option<Sought> {

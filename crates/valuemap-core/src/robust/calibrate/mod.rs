@@ -1,7 +1,7 @@
 //! What is estimated once of a scene, or of a sample of it: the noise, and what each class is like.
 //!
 //! [`likeliest`] seeks the noise from several starts, by maps of a sample of places and their [`residuals`]. [`split`](mod@split) divides it between poses and
-//! detections, and [`shared`] tells what passes and sides of objects disagree about. The classes are learned from a map of wider places. [`depth`] tells
+//! detections, and [`shared`] tells what passes disagree about. The classes are learned from a map of wider places. [`depth`] tells
 //! whether all moves of the search pay.
 
 pub mod depth;
@@ -14,7 +14,7 @@ use std::sync::Arc;
 
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::looks::Lookout;
-use crate::robust::energy::{Object, placed};
+use crate::robust::energy::{Object, Placed, placed};
 use crate::robust::initial;
 use crate::robust::learn::confusion::confusions;
 use crate::robust::learn::counts::learn_counts;
@@ -42,7 +42,7 @@ const WIDE: f64 = 3.0;
 const MOST_RAYS: usize = 100_000;
 
 /// Steps of [`self_calibrate`] at most, as progress counts them, but for the search that tells whether all moves pay: the noise, and the classes.
-pub const CALIBRATION_STEPS: usize = likeliest::NOISE_STEPS + likeliest::MIDDLES_ROUNDS + 1;
+pub const CALIBRATION_STEPS: usize = likeliest::NOISE_STEPS + 1;
 
 /// What is estimated once of a scene, or of a sample of it, before any part of it is mapped.
 #[derive(Debug, Clone)]
@@ -62,8 +62,8 @@ pub struct Calibration {
 }
 
 /// Estimate the noise from the data, starting from a guess: labels of a sample of places with the noise as it is thought
-/// to be, then the noise that makes their residuals most likely, and again. `known` parts stay as they are; what was `sought` from all starts when
-/// [poses were compared](likeliest::misfits) is not sought again. Then learn the classes.
+/// to be, then the noise that makes their residuals most likely, and again. `known` parts, and middles that sides show, stay as they are; what was `sought` from all starts when
+/// [poses were compared](likeliest::misfits) is not sought again. Then learn the classes, from a map of wider places, which is returned beside.
 /// All moves pay where a scene is small; if it `is_part` of a larger one, where they change the map of a sample.
 ///
 /// # Errors
@@ -76,7 +76,8 @@ pub fn self_calibrate(
     is_part: bool,
     sought: Option<Sought>,
     progress: &Progress,
-) -> Result<Calibration, Halt> {
+) -> Result<(Calibration, Vec<Placed>), Halt> {
+    let guess = &Noise { side_m: if settings.has(Part::Sides) { guess.side_m } else { 0.0 }, ..*guess };
     let is_known = known.detection && known.position && known.rotation;
     let Sought { noise, starts } = if is_known {
         Sought { noise: *guess, starts: 0 }
@@ -93,16 +94,13 @@ pub fn self_calibrate(
     let wide = sample::places(scene, CLASS_RAYS, WIDE * settings.viability.max_range_m);
     let objects = learn_from(&mut model, &wide, progress)?;
     let noise = if settings.has(Part::NoiseSplit) { split::split(&model, known, &objects) } else { noise };
-    let noise = if settings.has(Part::Sides) && !known.side {
-        likeliest::with_middles(scene, &noise, known, settings, &placed(&objects), &wide, progress)?
-    } else {
-        noise
-    };
     let noise = if settings.has(Part::SharedNoise) || is_known { noise } else { noise.all_own() };
     let is_small = !is_part && scene.usable_rays().len() <= MOST_RAYS;
     let is_deep = is_small || all_moves_pay(&mut model, &objects, progress)?;
     let classes = model.classes.iter().copied().map(Some).collect();
-    Ok(Calibration { noise, classes, pooled: model.pooled, confusions: model.confusions, is_deep, starts })
+    let calibration =
+        Calibration { noise, classes, pooled: model.pooled, confusions: model.confusions, is_deep, starts };
+    Ok((calibration, placed(&objects)))
 }
 
 /// Learn the classes of a model from the map of some rays, and return that. Where classes are taken for each other, all competes once more.

@@ -2,13 +2,13 @@
 //!
 //! The error that a pass shares makes the positions that each pass alone would give an object differ. The error of the [middle that a side
 //! shows](mod@super::sides) makes those of its sides differ by more than those of the passes of one side. So the covariances are off by as much disagreement
-//! as there is; the drift and the middles are learned of it.
+//! as there is; the drift is learned of it.
 
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 
 use super::Placed;
-use super::estimate::{Care, Estimate, estimate, looks_at, visits};
+use super::estimate::{looks_at, visits};
 use super::sides::sides;
 use crate::robust::noise::Noise;
 use crate::robust::noise::drift::Drive;
@@ -52,11 +52,11 @@ struct Side {
 }
 
 /// What the passes of a label say of it, side by side.
-pub struct Sides(Vec<Side>);
+struct Sides(Vec<Side>);
 
 impl Sides {
     /// Of the passes with enough votes. Nothing if they do not fix the label.
-    fn of(scene: &Scene, noise: &Noise, (votes, point): &Placed, care: Care) -> Option<Self> {
+    fn of(scene: &Scene, noise: &Noise, (votes, point): &Placed) -> Option<Self> {
         let passes: Vec<&[u32]> = visits(scene, votes).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS).collect();
         let of_side = |side: &Vec<u32>| {
             let (mut information, mut gradient, mut alone) = (Matrix3::zeros(), Vector3::zeros(), 0.0);
@@ -70,28 +70,20 @@ impl Sides {
             let covariance = information.cholesky()?.inverse();
             let offset_m = -covariance * gradient;
             let square = (alone + gradient.dot(&offset_m)).max(0.0);
-            let rough = Side { offset_m, covariance, square, passes: side.len() as u32 };
-            if care == Care::Rough {
-                return Some(rough);
-            }
-            let votes: Vec<u32> = side.iter().flat_map(|&pass| passes[pass as usize]).copied().collect();
-            let Estimate { point: there, covariance } = estimate(scene, noise, &votes, *point, care)?;
-            Some(Side { offset_m: there - point, covariance, ..rough })
+            Some(Side { offset_m, covariance, square, passes: side.len() as u32 })
         };
         sides(scene, passes.iter().copied()).iter().map(of_side).collect::<Option<_>>().map(Self)
     }
 
     /// Of the passes of each side with each other. Nothing if no side has two.
-    #[must_use]
-    pub fn within(&self) -> Option<Disagreement> {
+    fn within(&self) -> Option<Disagreement> {
         let freedom = self.0.iter().map(|side| 3.0 * f64::from(side.passes - 1)).sum();
         let square = self.0.iter().map(|side| side.square).sum();
         (freedom > 0.0).then_some(Disagreement { square, freedom })
     }
 
     /// Of the sides with each other, if each shows another middle. Nothing if there are no two.
-    #[must_use]
-    pub fn between(&self, side_m: f64) -> Option<Disagreement> {
+    fn between(&self, side_m: f64) -> Option<Disagreement> {
         let freedom = 3.0 * (self.0.len().checked_sub(1)? as f64);
         let (mut information, mut sum, mut square) = (Matrix3::zeros(), Vector3::zeros(), 0.0);
         for side in &self.0 {
@@ -118,19 +110,13 @@ impl Sides {
 /// How far the positions that the passes of a label give it alone lie from their mean. Nothing for labels of a single pass.
 #[must_use]
 pub fn disagreement(scene: &Scene, noise: &Noise, label: &Placed) -> Option<Disagreement> {
-    Sides::of(scene, noise, label, Care::Rough)?.all(noise.side_m)
+    Sides::of(scene, noise, label)?.all(noise.side_m)
 }
 
 /// That of each of some labels.
 #[must_use]
 pub fn disagreements(scene: &Scene, noise: &Noise, labels: &[&Placed]) -> Vec<Option<Disagreement>> {
     labels.par_iter().map(|label| disagreement(scene, noise, label)).collect()
-}
-
-/// What the passes of each of some labels say of it.
-#[must_use]
-pub fn sides_of_all(scene: &Scene, noise: &Noise, labels: &[&Placed], care: Care) -> Vec<Option<Sides>> {
-    labels.par_iter().map(|label| Sides::of(scene, noise, label, care)).collect()
 }
 
 /// How much larger than they are said to be the errors are that labels of several passes show: the mean disagreement of

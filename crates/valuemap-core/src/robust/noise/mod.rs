@@ -105,8 +105,6 @@ pub struct Known {
     pub position: bool,
     /// The rotations' part.
     pub rotation: bool,
-    /// The part of the middles that sides show.
-    pub side: bool,
     /// Detections are off by at least this, px: they are rounded.
     pub least_px: f64,
 }
@@ -124,7 +122,7 @@ impl Noise {
         }
     }
 
-    /// The same with all parts that are not known larger by a factor.
+    /// The same with all parts that are not known larger by a factor, but for the middles that sides show: these are told beside.
     #[must_use]
     pub fn scaled(&self, factor: f64, known: Known) -> Self {
         let scale = |value: f64, is_known: bool| if is_known { value } else { value * factor };
@@ -137,7 +135,7 @@ impl Noise {
             rotation_segment_rad: scale(self.rotation_segment_rad, known.rotation),
             position_drift_m: scale(self.position_drift_m, known.position),
             rotation_drift_rad: scale(self.rotation_drift_rad, known.rotation),
-            side_m: scale(self.side_m, known.side),
+            ..*self
         }
     }
 

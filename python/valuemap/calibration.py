@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from valuemap.config import MapConfig
+from valuemap.describe import describe_labels
 from valuemap.drives import InOrder
 from valuemap.engine.engine import Engine
 from valuemap.errors import InputError
 from valuemap.map_folder import CALIBRATION, read_json
 from valuemap.progress import Progress
+from valuemap.refine import images_in_order, middles
 from valuemap.remote import Place
 from valuemap.robust import Calibration, Scene, Sought, calibration_from_json, calibration_to_json
 from valuemap.robust import calibrate as calibrate_scene
 from valuemap.sightings import cast_sightings
+from valuemap.tables import Candidates
 from valuemap.tiles.fingerprint import Fingerprints
 from valuemap.tiles.grid import WHOLE
 from valuemap.tiles.sample import SAMPLE_DETECTIONS
@@ -63,6 +67,11 @@ def read_calibration(path: Path) -> Calibration:
     return calibration_from_json(read_json(file), source=str(file))
 
 
+def with_sides(side_m: float, config: MapConfig) -> MapConfig:
+    """Return settings with what the middles that sides show are off by, m, each axis."""
+    return replace(config, noise=replace(config.noise, side_sigma_m=side_m))
+
+
 def _estimated(
     sample: InOrder,
     is_part: bool,
@@ -71,6 +80,17 @@ def _estimated(
     engine: Engine,
     progress: Progress,
 ) -> Calibration:
+    """Estimate all but middles that sides show, which all objects tell together, and all again with these if any."""
     scene = Scene(sample.dataset, sample.drives, cast_sightings(sample.dataset)[0])
-    threads = engine.threads_of_task(1)
-    return calibrate_scene(scene, config, is_part=is_part, sought=sought, threads=threads, progress=progress)
+
+    def estimated(config: MapConfig, sought: Sought | None) -> tuple[Calibration, Candidates]:
+        threads = engine.threads_of_task(1)
+        return calibrate_scene(scene, config, is_part=is_part, sought=sought, threads=threads, progress=progress)
+
+    if config.noise.side_sigma_m is not None:
+        return estimated(config, sought)[0]
+    calibration, found = estimated(with_sides(0.0, config), sought)
+    labels, votes = describe_labels(sample.dataset, scene.rays, found, config.noise)
+    votes = replace(votes, detection_id=sample.detection_id[votes.detection_id])
+    side_m = middles(images_in_order(sample, config), labels, votes, calibration.noise)
+    return calibration if side_m is None else estimated(with_sides(side_m, config), None)[0]
