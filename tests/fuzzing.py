@@ -452,7 +452,7 @@ def _border_of_scene(
         ([], [random.choice(_core.parts())], ["no part"]),
     ]  # fmt: skip
     settings = tuple(values[0] if random.random() < 0.95 else random.choice(values) for values in choices)
-    known = ([random.random() < 0.5 for _ in range(4)], random.choice([0.0, 0.5, float(hostile_number(random))]))
+    known = ([random.random() < 0.5 for _ in range(3)], random.choice([0.0, 0.5, float(hostile_number(random))]))
     which, quiet = random.randrange(4), lambda *_: None
     if which == 0:
         numbers = sum(count for _, count in _core.CLASS_FIELDS) if random.random() < 0.9 else random.choice([0, 3])
