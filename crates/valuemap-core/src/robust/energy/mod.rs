@@ -39,7 +39,7 @@ use estimate::visits;
 use looks::Lookout;
 use places::ByPlace;
 use seen::{Seen, Shares};
-use sides::{Middle, Said, marginalised, sides};
+use sides::{LEAST_COSINE, Middle, Said, marginalised, sides};
 use sizes::size_terms;
 
 /// The position is found when a step is shorter than this, in its own sigmas.
@@ -97,8 +97,11 @@ pub struct Fit {
     /// Squared residual of each vote in sigmas, the drift of its visit taken out.
     pub chi2: Vec<f64>,
     /// What each side shows, by a direction from there; none where all show one middle.
-    pub(crate) shown: Vec<(Vector3<f64>, Middle)>,
+    pub(crate) shown: Vec<Shown>,
 }
+
+/// In which direction a side is seen, and the middle that it shows.
+pub(crate) type Shown = (Vector3<f64>, Middle);
 
 impl Fit {
     /// The middle that is seen in a direction, with its covariance, m²: that of its side.
@@ -106,6 +109,11 @@ impl Fit {
     pub fn seen_along(&self, direction: &Vector3<f64>) -> (Vector3<f64>, Matrix3<f64>) {
         let nearest = self.shown.iter().max_by(|a, b| a.0.dot(direction).total_cmp(&b.0.dot(direction)));
         nearest.map_or((self.point, self.covariance), |(_, middle)| middle.of(&self.point, &self.covariance))
+    }
+
+    /// The number of the side that is seen in a direction, if any is.
+    pub(crate) fn side_along(&self, direction: &Vector3<f64>) -> Option<usize> {
+        self.shown.iter().position(|(of_side, _)| of_side.dot(direction) >= LEAST_COSINE)
     }
 }
 
@@ -215,7 +223,13 @@ impl Terms {
         self.chi2.extend(&visit.chi2);
     }
 
-    fn add_said(&mut self, said: &Said) {
+    /// What is said of the position, without priors.
+    pub(crate) fn said(&self) -> Said {
+        Said { information: self.information, gradient: self.gradient, energy: self.energy }
+    }
+
+    /// Add what a visit or a side says.
+    pub(crate) fn add_said(&mut self, said: &Said) {
         self.information += said.information;
         self.gradient += said.gradient;
         self.energy += said.energy;
@@ -292,8 +306,7 @@ impl<'a> Fitting<'a> {
                     of_side.add_said(&said);
                     sum.chi2[visit].copy_from_slice(&of_side.chi2);
                 }
-                let Terms { information, gradient, energy, .. } = of_side;
-                Some(Said { information, gradient, energy })
+                Some(of_side.said())
             })?;
             sum.add_said(&said);
             sum.middles.push(middle);
@@ -302,7 +315,7 @@ impl<'a> Fitting<'a> {
     }
 
     /// What each side shows, by the direction in which its first vote sees it.
-    fn shown(&self, middles: Vec<Middle>) -> Vec<(Vector3<f64>, Middle)> {
+    fn shown(&self, middles: Vec<Middle>) -> Vec<Shown> {
         let first = |side: &Vec<u32>| self.of_visits[side[0] as usize].start;
         let directions = self.sides.iter().map(|side| self.model.scene.ray(self.votes[first(side)]).direction);
         directions.zip(middles).collect()

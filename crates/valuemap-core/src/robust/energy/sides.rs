@@ -1,7 +1,7 @@
 //! Sides: boxes of a thing that is not a point have another middle from each side.
 //!
 //! The middle that a side shows is the object's position plus an error of its own, of [`side_m`](crate::robust::noise::Noise::side_m) on each axis. It is one more error that equation
-//! (1) marginalises: all visits of a side share it, whatever their passes drift. How large it is, [`agreement`](crate::robust::energy::agreement) learns.
+//! (1) marginalises: all visits of a side share it, whatever their passes drift. How large it is, all objects tell together (`refine/middles.py`).
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -9,7 +9,7 @@ use super::by_side;
 use crate::robust::scene::Scene;
 
 /// Visits whose mean directions are within 45 degrees look from one side: a box has four.
-const LEAST_COSINE: f64 = std::f64::consts::FRAC_1_SQRT_2;
+pub(crate) const LEAST_COSINE: f64 = std::f64::consts::FRAC_1_SQRT_2;
 
 /// The numbers of the visits (of rays, in their order) that look from one side each. It depends on the rays alone, not on where their object is.
 pub(crate) fn sides<'v>(scene: &Scene, visits: impl Iterator<Item = &'v [u32]>) -> Vec<Vec<u32>> {
@@ -49,7 +49,13 @@ pub(crate) fn marginalised(
     let stiffness = Matrix3::identity() / (side_m * side_m);
     let at_point = say(point)?;
     let offset_m = -(at_point.information + stiffness).cholesky()?.solve(&at_point.gradient);
-    let Said { information, gradient, energy } = say(&(point + offset_m))?;
+    at_middle(side_m, offset_m, &say(&(point + offset_m))?)
+}
+
+/// The same from what a side says of where its middle is expected, so far from the point, m.
+pub(crate) fn at_middle(side_m: f64, offset_m: Vector3<f64>, said: &Said) -> Option<(Said, Middle)> {
+    let stiffness = Matrix3::identity() / (side_m * side_m);
+    let Said { information, gradient, energy } = *said;
     let covariance = (information + stiffness).cholesky()?.inverse();
     // What is left of the step to the likeliest middle: nothing where residuals are linear.
     let rest = gradient + stiffness * offset_m;

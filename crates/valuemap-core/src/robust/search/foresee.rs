@@ -3,12 +3,16 @@
 //! Equation (1) of `docs/method.md` is a sum over visits, so only visits of which votes change hands are evaluated anew. An
 //! object of many visits stays about where it is, so its J is predicted closely. An object of few visits is fitted.
 
+use nalgebra::Vector3;
 use rustc_hash::FxHashMap;
 
 use crate::robust::energy::estimate::visits;
 use crate::robust::energy::looks::Lookout;
 use crate::robust::energy::seen::Seen;
-use crate::robust::energy::{Fit, Object, Terms, camera_m2, energy_of_votes, fitting_unseen, weighted_terms_of_visit};
+use crate::robust::energy::sides::{at_middle, sides};
+use crate::robust::energy::{
+    Fit, Object, Shown, Terms, camera_m2, energy_of_votes, fitting_unseen, weighted_terms_of_visit,
+};
 use crate::robust::model::Model;
 
 /// An object of more visits rests mostly on what stays as it is, whatever is exchanged of one of them.
@@ -26,12 +30,12 @@ pub(crate) struct Foresight<'a> {
     others: [Vec<u32>; 2],
     /// Whether they are of many visits.
     stays: [bool; 2],
-    /// What the votes of a visit say where each of the two is.
-    known: [FxHashMap<Vec<u32>, Option<Terms>>; 2],
+    /// What the votes of a visit say where each of the two is, and where each of its sides shows its middle.
+    known: [Vec<FxHashMap<Vec<u32>, Option<Terms>>>; 2],
 }
 
 impl<'a> Foresight<'a> {
-    /// Nothing if both are of few visits, or if visits share the error of the middle that their side shows: then J is no sum over visits.
+    /// Nothing if both are of few visits.
     pub(crate) fn new(
         model: &'a Model<'a>,
         lookout: &'a Lookout,
@@ -39,15 +43,8 @@ impl<'a> Foresight<'a> {
         others: [Vec<u32>; 2],
     ) -> Option<Self> {
         let stays = of.map(|object| visits(model.scene, &object.votes).count() > FEW_VISITS);
-        let known = [FxHashMap::default(), FxHashMap::default()];
-        (stays.contains(&true) && model.noise.side_m <= 0.0).then_some(Self {
-            model,
-            lookout,
-            of,
-            others,
-            stays,
-            known,
-        })
+        let known = of.map(|object| (0..=object.fit.shown.len()).map(|_| FxHashMap::default()).collect());
+        stays.contains(&true).then_some(Self { model, lookout, of, others, stays, known })
     }
 
     /// Whether J may fall with other votes (ascending). What is foreseen is wrong where a vote turns out to fit, or not to: by what is known of any vote.
@@ -82,11 +79,11 @@ impl<'a> Foresight<'a> {
     fn where_it_is(&mut self, one: usize, mut votes: Vec<u32>) -> Option<Object> {
         let (model, from) = (self.model, self.of[one].fit.point);
         let limit = model.settings.gate_sigmas.powi(2);
-        let mut terms = self.terms(one, &votes)?;
+        let (mut terms, mut shown) = self.terms(one, &votes)?;
         if terms.chi2.iter().any(|chi2| *chi2 > limit) {
             let fits = votes.iter().zip(&terms.chi2).filter(|(_, chi2)| **chi2 <= limit);
             votes = fits.map(|(&ray, _)| ray).collect();
-            terms = self.terms(one, &votes)?;
+            (terms, shown) = self.terms(one, &votes)?;
         }
         if votes.len() < model.settings.min_votes as usize {
             return None;
@@ -96,31 +93,72 @@ impl<'a> Foresight<'a> {
         let step = -cholesky.solve(&terms.gradient);
         let ln_information = 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
         let energy = terms.energy + step.dot(&terms.gradient) + ln_information;
-        let fit =
-            Fit { point: from + step, covariance: cholesky.inverse(), energy, chi2: terms.chi2, shown: Vec::new() };
+        let fit = Fit { point: from + step, covariance: cholesky.inverse(), energy, chi2: terms.chi2, shown };
         let (energy, ln_size) = energy_of_votes(model, class, &votes, &fit);
         Some(Object { class, votes, fit, ln_size, others: Vec::new(), seen: Seen::default(), real: 1.0, energy })
     }
 
-    /// What some votes say where one of the two is.
-    fn terms(&mut self, one: usize, votes: &[u32]) -> Option<Terms> {
+    /// What some votes say where one of the two is, and what its sides show then.
+    fn terms(&mut self, one: usize, votes: &[u32]) -> Option<(Terms, Vec<Shown>)> {
         let (model, point) = (self.model, self.of[one].fit.point);
-        let known = &mut self.known[one];
-        let mut sum = Terms::none();
-        for visit in visits(model.scene, votes) {
-            if !known.contains_key(visit) {
-                known.insert(visit.to_vec(), weighted_terms_of_visit(model, visit, &point));
+        let (mut sum, mut shown) = (Terms::none(), Vec::new());
+        if model.noise.side_m > 0.0 {
+            shown = self.add_sides(one, votes, &mut sum)?;
+        } else {
+            for visit in visits(model.scene, votes) {
+                sum.add(self.of_visit(one, 0, visit, &point)?);
             }
-            sum.add(known.get(visit)?.as_ref()?);
         }
         sum.add_priors(model, votes, &point, camera_m2(model, votes));
-        Some(sum)
+        Some((sum, shown))
+    }
+
+    /// Add what each side of some votes says, from where the object shows its middle to it now; what it shows then.
+    fn add_sides(&mut self, one: usize, votes: &[u32], sum: &mut Terms) -> Option<Vec<Shown>> {
+        let (model, fit) = (self.model, &self.of[one].fit);
+        let of_visits: Vec<&[u32]> = visits(model.scene, votes).collect();
+        let first_of_visit: Vec<usize> = of_visits
+            .iter()
+            .scan(0, |end, visit| {
+                *end += visit.len();
+                Some(*end - visit.len())
+            })
+            .collect();
+        sum.chi2.resize(votes.len(), 0.0);
+        let mut shown = Vec::new();
+        for side in sides(model.scene, of_visits.iter().copied()) {
+            let direction = model.scene.ray(of_visits[side[0] as usize][0]).direction;
+            let number = fit.side_along(&direction);
+            let middle = number.map_or(fit.point, |side| fit.shown[side].1.of(&fit.point, &fit.covariance).0);
+            let mut of_side = Terms::none();
+            for &visit in &side {
+                let (votes, first) = (of_visits[visit as usize], first_of_visit[visit as usize]);
+                let of_visit = self.of_visit(one, number.map_or(0, |side| side + 1), votes, &middle)?;
+                sum.chi2[first..first + votes.len()].copy_from_slice(&of_visit.chi2);
+                of_side.add(of_visit);
+            }
+            let (said, of_middle) = at_middle(model.noise.side_m, middle - fit.point, &of_side.said())?;
+            sum.add_said(&said);
+            shown.push((direction, of_middle));
+        }
+        Some(shown)
+    }
+
+    /// What the votes of a visit say of a point: where one of the two is (0), or where a side shows its middle (from 1 on).
+    fn of_visit(&mut self, one: usize, number: usize, visit: &[u32], point: &Vector3<f64>) -> Option<&Terms> {
+        let known = &mut self.known[one][number];
+        if !known.contains_key(visit) {
+            known.insert(visit.to_vec(), weighted_terms_of_visit(self.model, visit, point));
+        }
+        known.get(visit)?.as_ref()
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Vector3;
+    use std::f64::consts::PI;
+
+    use nalgebra::{Isometry3, Vector3};
 
     use super::*;
     use crate::robust::energy::{fitting, object};
@@ -132,11 +170,18 @@ mod tests {
     fn what_is_foreseen_of_objects_of_many_visits_is_about_what_a_fit_ends_at() {
         let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
         let mut verdicts = [0, 0];
-        for apart_m in [0.05, 0.2, 0.5, 1.0] {
+        for (apart_m, side_m) in [0.05, 0.2, 0.5, 1.0].into_iter().flat_map(|apart_m| [(apart_m, 0.0), (apart_m, 0.1)])
+        {
             let both = [Vector3::new(30.0, 4.0, 3.0), Vector3::new(30.0, 4.0 + apart_m, 3.0)];
-            let drive = |i: usize| street::street(10, 2.0, &both, &errors[7 * i..]);
+            // Every other drive comes from the other end.
+            let there = [Isometry3::identity(), Isometry3::new(Vector3::new(60.0, 8.0, 0.0), Vector3::z() * PI)];
+            let drive = |i: usize| {
+                let shown = both.map(|object| there[i % 2].inverse_transform_point(&object.into()).coords);
+                street::moved(street::street(10, 2.0, &shown, &errors[7 * i..]), &there[i % 2])
+            };
             let scene = street::joined((0..FEW_VISITS + 2).map(drive).collect());
-            let mut model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
+            let noise = Noise { side_m, ..street::NOISE };
+            let mut model = Model::new(&scene, &noise, &street::SETTINGS);
             let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
             let rays = scene.usable_rays();
             // The votes of the last drive are exchanged in the second map, from which an exchange leads back.
@@ -163,7 +208,10 @@ mod tests {
                 };
                 let foreseen = energy(foresight.unseen(&after).unwrap_or_default());
                 let fitted = energy(from().filter_map(|(votes, point)| fitting_unseen(&model, votes, point)).collect());
-                assert!((foreseen - fitted).abs() < 0.05 * fitted.abs(), "{apart_m} m: {foreseen} {fitted}");
+                assert!(
+                    (foreseen - fitted).abs() < 0.05 * fitted.abs(),
+                    "{apart_m} m, {side_m} m: {foreseen} {fitted}"
+                );
                 let ends_at = energy(
                     from().filter_map(|(votes, point)| fitting(&model, &lookout, votes, point, Vec::new())).collect(),
                 );
@@ -177,14 +225,11 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_foreseen_of_two_objects_of_few_visits_nor_where_sides_show_other_middles() {
+    fn nothing_is_foreseen_of_two_objects_of_few_visits() {
         let both = [Vector3::new(30.0, 4.0, 3.0), Vector3::new(30.0, 5.0, 3.0)];
-        for (drives, side_m, is_foreseen) in
-            [(FEW_VISITS, 0.0, false), (FEW_VISITS + 1, 0.0, true), (FEW_VISITS + 1, 0.1, false)]
-        {
+        for (drives, is_foreseen) in [(FEW_VISITS, false), (FEW_VISITS + 1, true)] {
             let scene = street::joined((0..drives).map(|_| street::street(10, 2.0, &both, &[[0.0, 0.0]])).collect());
-            let noise = Noise { side_m, ..street::NOISE };
-            let model = Model::new(&scene, &noise, &street::SETTINGS);
+            let model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
             let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
             let votes = |i: usize| scene.usable_rays().into_iter().skip(i).step_by(2).collect();
             let objects: Vec<Object> =
