@@ -186,10 +186,18 @@ def shown_objects(footage: Footage, ordered: InOrder, labels: Labels, votes: Vot
     label[ordered.rows_of_detections(votes.detection_id)] = rows_of(votes.label_id, labels.label_id)
     label = label[footage.dataset.detections.detection_id]
     detection = np.flatnonzero(label >= 0)
-    kinds, first, code = np.unique(label[detection], return_index=True, return_inverse=True)
-    # Numbered along the drives, so that the order of labels does not show in the last digits.
+    number, first = numbered_along(label[detection])
+    return detection, number, label[detection][first], first
+
+
+def numbered_along(label: Ints) -> tuple[Ints, Ints]:
+    """Return the numbers of labels (N), each with what it is first of (K), in the order in which they come.
+
+    Numbered along the drives, the order of labels does not show in the last digits.
+    """
+    _, first, code = np.unique(label, return_index=True, return_inverse=True)
     along = np.argsort(first)
-    return detection, np.argsort(along)[code], kinds[along], first[along]
+    return np.argsort(along)[code], first[along]
 
 
 def gather(dataset: Dataset, drives: Drives, *, every_image: bool = False) -> Footage:

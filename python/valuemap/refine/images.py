@@ -25,6 +25,7 @@ from valuemap.refine.footage import (
     Sigmas,
     gather,
     in_working_frame,
+    numbered_along,
     points_in_working_frame,
     shown_objects,
     with_poses_in_order,
@@ -182,18 +183,13 @@ def bundle(images: AllImages, labels: Labels, votes: Votes, noise: Noise, *, by_
     points = points_in_working_frame(ordered.dataset, labels.position_in_world_m[label], unit_m)
     ties, objects = Ties.none(), points[:0]
     if noise.side_m:
-        ties = _to_objects(label, noise.side_m / unit_m, scales)
-        objects = points[np.sort(np.unique(label, return_index=True)[1])]
+        # Sides are where their objects are, but for their middles; objects are numbered behind them.
+        of_side, first = numbered_along(label)
+        side, apart = noise.side_m / unit_m, math.hypot(noise.side_m / unit_m, math.sqrt(2.0) * scales.drift_m)
+        ties, objects = Ties(np.arange(len(label)), len(label) + of_side, side, apart), points[first]
     counts = tuple(map(len, everything(footage, segments)))
     state = State.zero(np.concatenate([points, objects]), len(footage.chain.drive), len(footage.row), counts)
     return Bundle(images, seen, scales, triangulate(seen, state), label, ties)
-
-
-def _to_objects(label: Ints, side: float, scales: Scales) -> Ties:
-    """Return that sides (K) of labels are where their objects are but for `side`; these are behind, in their order."""
-    _, first, code = np.unique(label, return_index=True, return_inverse=True)
-    along = np.argsort(np.argsort(first))[code]
-    return Ties(np.arange(len(label)), len(label) + along, side, math.hypot(side, math.sqrt(2.0) * scales.drift_m))
 
 
 def _by_side(footage: Footage, detection: Ints, thing: Ints, label: Ints) -> tuple[Ints, Ints]:

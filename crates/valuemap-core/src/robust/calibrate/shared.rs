@@ -11,7 +11,7 @@ const HUBER_SIGMAS: f64 = 1.345;
 /// Shared errors over own errors of a pose: least and most.
 const LEAST_DRIFT: f64 = 0.1;
 const MOST_DRIFT: f64 = 1000.0;
-/// Times that an interval is cut in half where a value is sought: to a thousandth.
+/// Times that the interval of that ratio is cut in half: to a thousandth.
 const HALVINGS: usize = 12;
 
 /// What poses state of their errors all in all: position, m, and rotation, rad; nothing where they do not.
@@ -35,26 +35,18 @@ pub(crate) fn drifting(noise: &Noise, ratio: f64, [position_m, rotation_rad]: St
     }
 }
 
-/// A noise with the drift of positions of which nothing is in excess: the larger it is taken for, the less remains unexplained. Nothing where poses state it, or
-/// too little is known.
-fn agreeing_drift(noise: &Noise, stated: Stated, excess_of: impl Fn(&Noise) -> Option<f64>) -> Option<Noise> {
-    if stated[0].is_some() {
-        return None;
-    }
-    let of = |ratio: f64| drifting(noise, ratio, stated);
-    agreeing(LEAST_DRIFT, MOST_DRIFT, |ratio| excess_of(&of(ratio))).map(of)
-}
-
-/// A noise with the drift at which the passes of objects disagree as much as expected; as large as the errors of images and segments where nothing tells.
+/// A noise with the drift at which the passes of objects disagree as much as expected; as large as the errors of images and segments where poses state it,
+/// or nothing tells.
 pub(crate) fn with_drift(scene: &Scene, objects: &[&Placed], noise: &Noise) -> Noise {
     let stated = stated(scene);
-    let excess_of = |noise: &Noise| excess(disagreements(scene, noise, objects).into_iter());
-    agreeing_drift(noise, stated, excess_of).unwrap_or_else(|| drifting(noise, 1.0, stated))
+    let of = |ratio: f64| drifting(noise, ratio, stated);
+    let told = stated[0].is_none().then(|| agreeing_ratio(|ratio| excess(disagreements(scene, &of(ratio), objects))));
+    of(told.flatten().unwrap_or(1.0))
 }
 
-/// The value between two of which nothing is in excess: by bisection of its logarithm, of what falls with it. Nothing where too little is known.
-fn agreeing(low: f64, high: f64, excess_of: impl Fn(f64) -> Option<f64>) -> Option<f64> {
-    let (mut low, mut high) = (low.ln(), high.ln());
+/// The ratio at which nothing is in excess, by bisection of its logarithm: the larger it is, the less remains unexplained. Nothing where too little is known.
+fn agreeing_ratio(excess_of: impl Fn(f64) -> Option<f64>) -> Option<f64> {
+    let (mut low, mut high) = (LEAST_DRIFT.ln(), MOST_DRIFT.ln());
     for _ in 0..HALVINGS {
         let middle = 0.5 * (low + high);
         if excess_of(middle.exp())? > 0.0 { low = middle } else { high = middle }
@@ -64,8 +56,9 @@ fn agreeing(low: f64, high: f64, excess_of: impl Fn(f64) -> Option<f64>) -> Opti
 
 /// By how many standard deviations disagreements are larger than expected, of most labels: Huber's psi, summed. A label of two objects disagrees
 /// whatever the noise is; where a fifth of the labels are such, no drift is so large that the mean is as expected.
-fn excess(of_labels: impl Iterator<Item = Option<Disagreement>>) -> Option<f64> {
-    let known: Vec<f64> = of_labels.flatten().map(|one| one.sigmas().clamp(-HUBER_SIGMAS, HUBER_SIGMAS)).collect();
+fn excess(of_labels: Vec<Option<Disagreement>>) -> Option<f64> {
+    let known: Vec<f64> =
+        of_labels.into_iter().flatten().map(|one| one.sigmas().clamp(-HUBER_SIGMAS, HUBER_SIGMAS)).collect();
     (known.len() >= MIN_SHARED_LABELS).then(|| known.iter().sum())
 }
 

@@ -5,6 +5,8 @@
 //! own position; its neighbours in the same images can. So labels may be estimated together: a bundle adjustment with priors on
 //! the poses.
 
+use std::ops::Range;
+
 use nalgebra::{DMatrix, DVector, Matrix3, Vector2, Vector3};
 use rustc_hash::FxHashMap;
 
@@ -627,6 +629,16 @@ pub fn is_one_visit(a: &View, b: &View) -> bool {
 /// Voters in runs of one visit.
 pub fn visits<'a>(scene: &'a Scene, voters: &'a [u32]) -> impl Iterator<Item = &'a [u32]> {
     voters.chunk_by(|&a, &b| is_one_visit(scene.view(a), scene.view(b)))
+}
+
+/// Where the runs of one visit each are among voters.
+pub(crate) fn ranges_of_visits(scene: &Scene, voters: &[u32]) -> Vec<Range<usize>> {
+    let mut end = 0;
+    let of_visit = |visit: &[u32]| {
+        end += visit.len();
+        end - visit.len()..end
+    };
+    visits(scene, voters).map(of_visit).collect()
 }
 
 /// The looks of the voters of one visit at a point, each by itself, along the lines of sight that a noise makes probable; nothing if it is behind

@@ -35,7 +35,7 @@ use crate::robust::noise::drift::{Drive, Look, OneLook, Vantage};
 use crate::robust::noise::huber::{HUBER_SIGMAS, huber_weight};
 use crate::robust::parts::Part;
 use crate::robust::scene::Scene;
-use estimate::visits;
+use estimate::{ranges_of_visits, visits};
 use looks::Lookout;
 use places::ByPlace;
 use seen::{Seen, Shares};
@@ -267,12 +267,7 @@ struct Fitting<'a> {
 impl<'a> Fitting<'a> {
     fn new(model: &'a Model<'a>, votes: &'a [u32]) -> Self {
         let vantages = vantages_of(model, votes);
-        let mut end = 0;
-        let of_visit = |visit: &[u32]| {
-            end += visit.len();
-            end - visit.len()..end
-        };
-        let of_visits = visits(model.scene, votes).map(of_visit).collect();
+        let of_visits = ranges_of_visits(model.scene, votes);
         let has_sides = model.noise.side_m > 0.0;
         let sides = if has_sides { sides(model.scene, visits(model.scene, votes)) } else { Vec::new() };
         Self { model, votes, vantages, of_visits, sides, camera_m2: camera_m2(model, votes) }

@@ -97,7 +97,6 @@ impl Spread {
 
 /// Which parts of the noise the user knows; they stay as they are.
 #[derive(Debug, Clone, Copy, Default)]
-#[allow(clippy::struct_excessive_bools)] // One for each part.
 pub struct Known {
     /// The detections' part.
     pub detection: bool,

@@ -6,7 +6,7 @@
 use nalgebra::Vector3;
 use rustc_hash::FxHashMap;
 
-use crate::robust::energy::estimate::visits;
+use crate::robust::energy::estimate::{ranges_of_visits, visits};
 use crate::robust::energy::looks::Lookout;
 use crate::robust::energy::seen::Seen;
 use crate::robust::energy::sides::{at_middle, sides};
@@ -116,25 +116,18 @@ impl<'a> Foresight<'a> {
     /// Add what each side of some votes says, from where the object shows its middle to it now; what it shows then.
     fn add_sides(&mut self, one: usize, votes: &[u32], sum: &mut Terms) -> Option<Vec<Shown>> {
         let (model, fit) = (self.model, &self.of[one].fit);
-        let of_visits: Vec<&[u32]> = visits(model.scene, votes).collect();
-        let first_of_visit: Vec<usize> = of_visits
-            .iter()
-            .scan(0, |end, visit| {
-                *end += visit.len();
-                Some(*end - visit.len())
-            })
-            .collect();
+        let of_visits = ranges_of_visits(model.scene, votes);
         sum.chi2.resize(votes.len(), 0.0);
         let mut shown = Vec::new();
-        for side in sides(model.scene, of_visits.iter().copied()) {
-            let direction = model.scene.ray(of_visits[side[0] as usize][0]).direction;
+        for side in sides(model.scene, visits(model.scene, votes)) {
+            let direction = model.scene.ray(votes[of_visits[side[0] as usize].start]).direction;
             let number = fit.side_along(&direction);
             let middle = number.map_or(fit.point, |side| fit.shown[side].1.of(&fit.point, &fit.covariance).0);
             let mut of_side = Terms::none();
             for &visit in &side {
-                let (votes, first) = (of_visits[visit as usize], first_of_visit[visit as usize]);
-                let of_visit = self.of_visit(one, number.map_or(0, |side| side + 1), votes, &middle)?;
-                sum.chi2[first..first + votes.len()].copy_from_slice(&of_visit.chi2);
+                let visit = of_visits[visit as usize].clone();
+                let of_visit = self.of_visit(one, number.map_or(0, |side| side + 1), &votes[visit.clone()], &middle)?;
+                sum.chi2[visit].copy_from_slice(&of_visit.chi2);
                 of_side.add(of_visit);
             }
             let (said, of_middle) = at_middle(model.noise.side_m, middle - fit.point, &of_side.said())?;
