@@ -459,7 +459,7 @@ def _border_of_scene(
         row = [float(hostile_number(random)) if random.random() < 0.01 else 0.5 for _ in range(numbers)]
         classes = [random.choice([None, row, [1.0]]) for _ in range(random.randrange(3))]
         shares = [[(0, float(hostile_number(random)))] for _ in range(random.randrange(2))]
-        call(_core.find_labels, scene, (noise, random.random() < 0.5, classes, row, shares), settings, 1, quiet)
+        call(_core.find_labels, scene, (noise, noise, random.random() < 0.5, classes, row, shares), settings, 1, quiet)
     elif which == 1:
         begin = random.choice([None, (noise, random.randrange(3))])
         call(_core.calibrate, scene, noise, known, settings, random.random() < 0.5, begin, 1, quiet)

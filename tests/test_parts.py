@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -53,6 +54,15 @@ BLOCKS: dict[str, dict[str, float]] = {
         "max_sight_m": 100.0,
         "frame_spacing_m": 1.2,
         "passes_per_street": 2,
+        "lookalikes_per_light": 0.0,
+    },
+    "wandering boxes": {
+        "noise_memory_images": 10.0,
+        "pixel_noise_px": 2.0,
+        "position_white_m": 0.02,
+        "rotation_white_deg": 0.02,
+        "frame_spacing_m": 1.0,
+        "passes_per_street": 1,
         "lookalikes_per_light": 0.0,
     },
     "missed": {"tail_share": 0.1, "tree_spacing_m": 8.0, "max_sight_m": 60.0, "passes_per_street": 1, **NO_LIGHTS},
@@ -171,6 +181,12 @@ def errors_are_larger_than_said(best: Score, without: Score) -> bool:
     return bool(without.chi2.mean() > 1.2 * best.chi2.mean())
 
 
+def covariances_are_less_honest(best: Score, without: Score) -> bool:
+    """Squared normalised errors of three axes are 3 on average."""
+    off, of_without = (abs(math.log(one.chi2.mean() / 3.0)) for one in (best, without))
+    return of_without > off + math.log(1.2)
+
+
 def less_is_said_of_what_is_contested(best: Score, without: Score) -> bool:
     return bool(without.variance_m2.sum() < 0.999 * best.variance_m2.sum() and without.chi2.mean() > best.chi2.mean())
 
@@ -210,6 +226,7 @@ CASES: dict[str, tuple[str, int, Fails]] = {
     "confusions": ("confused classes", 6, more_is_wrong),
     "shared_noise": ("drifts", 5, errors_are_larger_than_said),
     "noise_split": ("close rows", 17, more_is_wrong),
+    "memory": ("wandering boxes", 5, covariances_are_less_honest),
     "sides": ("uneven lamps", 5, more_is_wrong),
     "contest": ("close rows", 17, less_is_said_of_what_is_contested),
     "scaling": ("drifts", 7, errors_are_larger_than_said),

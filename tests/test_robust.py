@@ -218,7 +218,7 @@ def test_a_stricter_existence_keeps_fewer() -> None:
 def test_a_calibration_of_another_version_is_refused() -> None:
     row = tuple(0.5 + number for number in range(sum(count for _, count in _core.CLASS_FIELDS)))
     noise = dict.fromkeys((each.name for each in dataclasses.fields(Noise)), 0.1)
-    known = Calibration(Noise(**noise), False, {"light": row}, row, {})
+    known = Calibration(Noise(**noise), Noise(), False, {"light": row}, row, {})
     value = calibration_to_json(known)
     assert calibration_from_json(value, source="run.json") == known
     fields = value["classes"]["light"]
@@ -235,7 +235,7 @@ def test_a_calibration_of_another_version_is_refused() -> None:
 
 def test_what_is_not_known_of_a_class_is_null() -> None:
     row = [math.nan] * sum(count for _, count in _core.CLASS_FIELDS)
-    value = calibration_to_json(Calibration(Noise(), False, {"light": tuple(row)}, tuple(row), {}))
+    value = calibration_to_json(Calibration(Noise(), Noise(), False, {"light": tuple(row)}, tuple(row), {}))
     assert value["pooled"]["nearest_m"] is None
     assert set(value["classes"]["light"]["score_edges"]) == {None}
     again = calibration_from_json(json.loads(json.dumps(value, allow_nan=False)), source="run.json")

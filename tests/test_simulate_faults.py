@@ -25,7 +25,7 @@ from test_simulate import (
     truth_in_cam,
 )
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.dataset import check_dataset
+from valuemap.dataset import Dataset, check_dataset, rows_of
 from valuemap.errors import SettingError
 from valuemap.simulate import Recording, record_city
 from valuemap.simulate.pose_errors import pose_errors
@@ -277,6 +277,30 @@ def test_some_boxes_are_far_off() -> None:
     # 69 % of normal numbers of deviation 10 are above 4 on one axis; of deviation 1, none.
     assert abs(far.mean() / (0.1 * 0.69) - 1.0) < 0.2
     assert sightings_of(dataset) == sightings_of(small(**settings))
+
+
+def test_errors_of_boxes_last() -> None:
+    settings = EXACT_VIEWS | {"pixel_noise_px": 1.0, "pixel_noise_share": 0.0}
+
+    def errors(dataset: Dataset) -> tuple[Floats, Ints]:
+        _, exact_px = truth_in_cam(dataset)
+        pairs, images = dataset.truth_detections, dataset.images
+        assert pairs is not None
+        image = rows_of(dataset.detections.image_id[pairs.detection_id], images.image_id)
+        order = np.lexsort((image, pairs.object_id, images.pass_id.codes[image]))
+        error = (dataset.detections.center_px[pairs.detection_id] - exact_px)[order]
+        return error, np.stack([images.pass_id.codes[image], pairs.object_id, image], axis=1)[order]
+
+    for images, expected in ((0.0, 0.0), (4.0, np.exp(-0.25))):
+        dataset = small(**settings, noise_memory_images=images)
+        assert sightings_of(dataset) == sightings_of(small(**settings))
+        error, of = errors(dataset)
+        # Seen in one image and the next of the same pass.
+        follows = np.all(np.diff(of, axis=0) == [0, 0, 1], axis=1)
+        assert np.count_nonzero(follows) > 1000
+        shared = (error[1:][follows] * error[:-1][follows]).mean()
+        assert abs(error.std() - 1.0) < 0.1
+        assert abs(shared - expected) < 0.1
 
 
 @pytest.mark.parametrize("share", [0.08, 1.0])

@@ -86,7 +86,7 @@ _Noise = tuple[float, ...]
 _Settings = tuple[float, float, float, float, int, int, float, list[str]]
 
 _Calibration = tuple[
-    _Noise, bool, Sequence[Sequence[float] | None], Sequence[float], Sequence[Sequence[tuple[int, float]]]
+    _Noise, _Noise, bool, Sequence[Sequence[float] | None], Sequence[float], Sequence[Sequence[tuple[int, float]]]
 ]
 
 def calibrate(

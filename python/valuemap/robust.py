@@ -55,6 +55,8 @@ class Calibration:
     """All that is estimated once of a dataset, before any part of it is mapped."""
 
     noise: Noise
+    noise_of_covariances: Noise
+    """The same where successive looks count as many as independent ones: what covariances are estimated with."""
     is_deep: bool
     """Whether all moves of the search pay."""
     classes: dict[str, tuple[float, ...]]
@@ -72,7 +74,7 @@ class Calibration:
             [(code[said], share) for said, share in self.confusions.get(name, {}).items() if said in code]
             for name in class_names
         ]
-        return self.noise.as_tuple(), self.is_deep, classes, self.pooled, shares
+        return self.noise.as_tuple(), self.noise_of_covariances.as_tuple(), self.is_deep, classes, self.pooled, shares
 
 
 def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
@@ -88,7 +90,8 @@ def calibration_from_json(value: Any, *, source: str) -> Calibration:
     """Read what `calibration_to_json` returned; raises `InputError` naming the `source` where it is something else."""
     try:
         return Calibration(
-            noise=Noise(**{name: float(number) for name, number in value["noise"].items()}),
+            noise=_noise(value["noise"]),
+            noise_of_covariances=_noise(value["noise_of_covariances"]),
             is_deep=bool(value["is_deep"]),
             classes={name: _numbers(fields) for name, fields in value["classes"].items()},
             pooled=_numbers(value["pooled"]),
@@ -99,6 +102,10 @@ def calibration_from_json(value: Any, *, source: str) -> Calibration:
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{source}: is no calibration: {error}", hint="make the map again") from error
+
+
+def _noise(value: dict[str, Any]) -> Noise:
+    return Noise(**{name: float(number) for name, number in value.items()})
 
 
 def _named(row: Sequence[float]) -> dict[str, Any]:
@@ -193,7 +200,7 @@ def calibrate(
     guess, known = _guess(config.noise, scene.rounding_px)
     steps = _core.CALIBRATION_STEPS + (2 * _core.SEARCH_STEPS if is_part else 0)
     with counted(progress, "estimating the noise", steps) as tell:
-        (noise, is_deep, classes, pooled, shares), position, (offsets, voters) = _core.calibrate(
+        (noise, of_covariances, is_deep, classes, pooled, shares), position, (offsets, voters) = _core.calibrate(
             scene.core,
             guess.as_tuple(),
             known,
@@ -205,6 +212,7 @@ def calibrate(
         )
     calibration = Calibration(
         noise=Noise(*noise),
+        noise_of_covariances=Noise(*of_covariances),
         is_deep=is_deep,
         classes={name: tuple(row) for name, row in zip(scene.class_names, classes, strict=False) if row is not None},
         pooled=tuple(pooled),

@@ -200,11 +200,13 @@ fn settings_of(
     Ok(Settings { viability, gate_sigmas, min_votes, least_votes, min_existence, without })
 }
 
-/// A calibration: the noise, whether all moves pay, numbers of each class where anything is known of it, those of all classes together, and, of
+/// A calibration: the noise, that of covariances, whether all moves pay, numbers of each class where anything is known of it, those of all classes together, and, of
 /// the detections of each class, which others some are said to be of, with their shares.
-type CalibrationValues = (NoiseValues, bool, Vec<Option<Vec<f64>>>, Vec<f64>, Vec<Vec<(u32, f64)>>);
+type CalibrationValues = (NoiseValues, NoiseValues, bool, Vec<Option<Vec<f64>>>, Vec<f64>, Vec<Vec<(u32, f64)>>);
 
-fn calibration_of((noise, is_deep, classes, pooled, shares): CalibrationValues) -> PyResult<Calibration> {
+fn calibration_of(
+    (noise, noise_of_covariances, is_deep, classes, pooled, shares): CalibrationValues,
+) -> PyResult<Calibration> {
     let of = |row: Vec<f64>| {
         // Edges of steps may be infinite.
         let finite: Vec<f64> = row.iter().copied().filter(|number| !number.is_infinite()).collect();
@@ -221,6 +223,7 @@ fn calibration_of((noise, is_deep, classes, pooled, shares): CalibrationValues) 
         starts: 0,
         confusions: Confusions::of_shares(shares),
         noise: noise_of(noise)?,
+        noise_of_covariances: noise_of(noise_of_covariances)?,
         is_deep,
         classes: classes.into_iter().map(|row| row.map(of).transpose()).collect::<PyResult<_>>()?,
         pooled: of(pooled)?,
@@ -260,8 +263,14 @@ pub fn calibrate<'py>(
         self_calibrate(&scene.0, &guess, known, &settings, is_part, sought, progress)
     })?;
     let classes = found.classes.iter().map(|class| class.as_ref().map(ClassModel::to_row)).collect();
-    let calibration =
-        (values_of(&found.noise), found.is_deep, classes, found.pooled.to_row(), found.confusions.shares().to_vec());
+    let calibration = (
+        values_of(&found.noise),
+        values_of(&found.noise_of_covariances),
+        found.is_deep,
+        classes,
+        found.pooled.to_row(),
+        found.confusions.shares().to_vec(),
+    );
     let points = matrix(py, map.iter().map(|(_, point)| *point))?;
     Ok((calibration, points, groups_of(py, map.iter().map(|(votes, _)| &votes[..]))))
 }

@@ -239,6 +239,12 @@ class SimulationConfig(Settings):
         high=0.5,
         effect="part of that standard deviation that grows with the box, as share of its height",
     )
+    noise_memory_images: float = declare(
+        0.0,
+        unit="1",
+        effect="images of a pass over which errors of the centres of one object's boxes forget 63 % of themselves; "
+        "0 for none",
+    )
     tail_share: float = declare(
         0.0, unit="1", high=1.0, effect="share of boxes whose centre is far more wrong than that"
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,7 +86,10 @@ def detect(
     if config.tail_share:
         is_far_off = random_stream(seed, kind, "tails").random(count) < config.tail_share
         sigma_px = np.where(is_far_off, config.tail_factor, 1.0) * sigma_px
-    shift_px = random_stream(seed, kind, "center").standard_normal((count, 2)) * sigma_px[:, None]
+    error = random_stream(seed, kind, "center").standard_normal((count, 2))
+    if config.noise_memory_images:
+        error = _remembered(error, sightings, frames, config.noise_memory_images)
+    shift_px = error * sigma_px[:, None]
     stretch = np.exp(config.size_noise * random_stream(seed, kind, "size").standard_normal((count, 2)))
     best = config.score_true if kind in TRUE_KINDS else (config.score_true + config.score_false) / 2.0
     score = config.score_false + (best - config.score_false) * quality
@@ -171,12 +175,31 @@ def _without_part(center_px: Floats, size_px: Floats, part: Floats) -> tuple[Flo
     return center_px + shift * size_px, size_px * np.stack([1.0 - left - right, 1.0 - below], axis=1)
 
 
+def _remembered(error: Floats, sightings: Sightings, frames: Frames, images: float) -> Floats:
+    """Return errors (N, 2) of views that forget 63 % of themselves over so many views of a target in a pass: AR(1)."""
+    keep = math.exp(-1.0 / images)
+    order, is_next = _views_of_passes(sightings, frames)
+    remembered = error.copy()
+    before = order[0] if len(order) else 0
+    for row, goes_on in zip(order[1:].tolist(), is_next.tolist(), strict=True):
+        if goes_on:
+            remembered[row] = keep * remembered[before] + math.sqrt(1.0 - keep * keep) * error[row]
+        before = row
+    return remembered
+
+
+def _views_of_passes(sightings: Sightings, frames: Frames) -> tuple[Ints, Bools]:
+    """Return the rows (N) of views by pass, target and time, and whether each but the first goes on from the last."""
+    pass_row = frames.pass_row[sightings.frame_row]
+    order = np.lexsort((sightings.frame_row, sightings.target_row, pass_row))
+    return order, (np.diff(pass_row[order]) == 0) & (np.diff(sightings.target_row[order]) == 0)
+
+
 def _states(sightings: Sightings, frames: Frames, config: SimulationConfig, random: np.random.Generator) -> Floats:
     """Return a uniform random number (N) for each view, which stays for a while from a target's view to the next."""
-    pass_row, time_s = frames.pass_row[sightings.frame_row], frames.time_s[sightings.frame_row]
-    order = np.lexsort((sightings.frame_row, sightings.target_row, pass_row))
+    order, is_next = _views_of_passes(sightings, frames)
+    time_s = frames.time_s[sightings.frame_row]
     redraw, state = random.random((len(order), 2)).T
-    is_next = (np.diff(pass_row[order]) == 0) & (np.diff(sightings.target_row[order]) == 0)
     with np.errstate(divide="ignore", invalid="ignore"):  # A time of 0 s draws anew for every view.
         stays = np.exp(-np.abs(np.diff(time_s[order])) / config.occlusion_s)
     is_anew = np.ones(len(order), dtype=np.bool_)

@@ -65,6 +65,8 @@ pub enum Part {
     SharedNoise,
     /// The noise is split between poses and detections by what the objects of an image have in common.
     NoiseSplit,
+    /// Successive looks of a visit err alike.
+    Memory,
     /// Sides of an object show other middles.
     Sides,
     /// Contested votes widen covariances.
@@ -75,7 +77,7 @@ pub enum Part {
 
 impl Part {
     /// All parts with their names.
-    pub const ALL: [(Self, &'static str); 34] = [
+    pub const ALL: [(Self, &'static str); 35] = [
         (Self::Polishing, "polishing"),
         (Self::Assignment, "assignment"),
         (Self::Merging, "merging"),
@@ -107,6 +109,7 @@ impl Part {
         (Self::Confusions, "confusions"),
         (Self::SharedNoise, "shared_noise"),
         (Self::NoiseSplit, "noise_split"),
+        (Self::Memory, "memory"),
         (Self::Sides, "sides"),
         (Self::Contest, "contest"),
         (Self::Scaling, "scaling"),

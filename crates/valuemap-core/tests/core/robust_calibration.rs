@@ -61,6 +61,33 @@ fn where_little_fits_it_is_tried_and_found() {
     assert!(found.starts > calibrated(1.0).starts, "{}", found.starts);
 }
 
+/// What is estimated of objects by a street each, whose successive detections have errors of 1 px with a correlation.
+fn of_wandering(correlation: f64) -> Calibration {
+    let of_object = |number: u64| {
+        let mut errors: Vec<[f64; 2]> = Vec::new();
+        for image in 0..40 {
+            let new = [0, 1].map(|axis| normal(200 * number + 2 * image + axis));
+            let fresh = (1.0 - correlation * correlation).sqrt();
+            errors.push(
+                errors.last().map_or(new, |last| [0, 1].map(|axis| correlation * last[axis] + fresh * new[axis])),
+            );
+        }
+        street(40, 1.0, &[Vector3::new(42.0, if number % 2 == 0 { 5.0 } else { -6.0 }, 3.0)], &errors)
+    };
+    let scene = joined((0..24).map(of_object).collect());
+    self_calibrate(&scene, &NOISE, Known::default(), &SETTINGS, false, None, &Progress::default()).unwrap().0
+}
+
+#[test]
+fn looks_that_remember_their_errors_count_as_fewer() {
+    let times = |found: &Calibration| (found.noise_of_covariances.detection_px / found.noise.detection_px).powi(2);
+    let independent = of_wandering(0.0);
+    assert!(times(&independent) < 1.5, "{}", times(&independent));
+    // Nine of a correlation of 0.8 count as one.
+    let remembering = of_wandering(0.8);
+    assert!((4.0..20.0).contains(&times(&remembering)), "{} {:?}", times(&remembering), remembering.noise);
+}
+
 /// Pins that few bearings which meet by chance are not more exact than they are written down.
 #[test]
 fn what_poses_were_compared_with_is_not_sought_again() {
@@ -187,7 +214,7 @@ fn quick_estimates_from_one_side_are_off_to_neither() {
 }
 
 #[test]
-fn the_noise_of_positions_is_found_from_drives_of_two_sides() {
+fn the_noise_of_covariances_is_found_from_drives_of_two_sides() {
     let (scene, labels) = from_two_sides();
     for position_m in [0.15, 1.0] {
         let guess = Noise { position_m, position_segment_m: 0.03, rotation_segment_rad: 5e-4, ..NOISE };

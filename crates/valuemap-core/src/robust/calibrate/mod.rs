@@ -1,11 +1,12 @@
 //! What is estimated once of a scene, or of a sample of it: the noise, and what each class is like.
 //!
 //! [`likeliest`] seeks the noise from several starts, by maps of a sample of places and their [`residuals`]. [`split`](mod@split) divides it between poses and
-//! detections, and [`shared`] tells what passes disagree about. The classes are learned from a map of wider places. [`depth`] tells
+//! detections, and [`shared`] tells what passes disagree about. [`memory`] tells how far successive looks err alike. The classes are learned from a map of wider places. [`depth`] tells
 //! whether all moves of the search pay.
 
 pub mod depth;
 pub mod likeliest;
+pub mod memory;
 pub mod residuals;
 pub mod shared;
 pub mod split;
@@ -49,6 +50,8 @@ pub const CALIBRATION_STEPS: usize = likeliest::NOISE_STEPS + 1;
 pub struct Calibration {
     /// Errors of poses and detections.
     pub noise: Noise,
+    /// The same where successive looks count as many as independent ones: what covariances are estimated with.
+    pub noise_of_covariances: Noise,
     /// What is learned of each class; nothing of those that are nowhere in the sample.
     pub classes: Vec<Option<ClassModel>>,
     /// What is learned of all classes together: what others are like.
@@ -95,12 +98,26 @@ pub fn self_calibrate(
     let objects = learn_from(&mut model, &wide, progress)?;
     let noise = if settings.has(Part::NoiseSplit) { split::split(&model, known, &objects) } else { noise };
     let noise = if settings.has(Part::SharedNoise) || is_known { noise } else { noise.all_own() };
+    let map = placed(&objects);
+    let remembered = if settings.has(Part::SharedNoise) && settings.has(Part::Memory) {
+        memory::remembered(scene, &noise, known, &residuals::sample(scene, &noise, &map))
+    } else {
+        None
+    };
+    let noise_of_covariances = remembered.unwrap_or(noise);
     let is_small = !is_part && scene.usable_rays().len() <= MOST_RAYS;
     let is_deep = is_small || all_moves_pay(&mut model, &objects, progress)?;
     let classes = model.classes.iter().copied().map(Some).collect();
-    let calibration =
-        Calibration { noise, classes, pooled: model.pooled, confusions: model.confusions, is_deep, starts };
-    Ok((calibration, placed(&objects)))
+    let calibration = Calibration {
+        noise,
+        noise_of_covariances,
+        classes,
+        pooled: model.pooled,
+        confusions: model.confusions,
+        is_deep,
+        starts,
+    };
+    Ok((calibration, map))
 }
 
 /// Learn the classes of a model from the map of some rays, and return that. Where classes are taken for each other, all competes once more.

@@ -107,7 +107,7 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
 }
 
 /// Minimise a cost over positive parameters by a pattern search in their logarithms, with a prior around the start.
-fn search<const N: usize>(
+pub(crate) fn search<const N: usize>(
     start: [f64; N],
     bounds: [(f64, f64); N],
     fixed: [bool; N],
@@ -177,11 +177,11 @@ fn misfit(scene: &Scene, noise: &Noise, label: &Placed) -> f64 {
 }
 
 /// A visit of a label: what stays the same of its looks while the noise is sought, with ray and depth, m.
-struct VisitOf(Vec<(u32, f64, Look)>);
+pub(crate) struct VisitOf(Vec<(u32, f64, Look)>);
 
 impl VisitOf {
     /// The visits of a label along the lines of sight that a noise makes probable; nothing if the label is behind a voter.
-    fn all(scene: &Scene, of_sight: &Noise, (votes, point): &Placed) -> Option<Vec<Self>> {
+    pub(crate) fn all(scene: &Scene, of_sight: &Noise, (votes, point): &Placed) -> Option<Vec<Self>> {
         let of_visit = |visit: &[u32]| {
             let looks = looks_at(scene, of_sight, of_sight, visit, point)?;
             let depths_m = visit.iter().map(|&ray| scene.ray(ray).project(point).z);
@@ -190,22 +190,24 @@ impl VisitOf {
         visits(scene, votes).filter(|visit| visit.len() >= MIN_VOTES_OF_VISIT).map(of_visit).collect()
     }
 
-    /// Minus twice the logarithm of the restricted likelihood of its residuals, up to a constant, in three terms: each visit may
-    /// put the object elsewhere, so that what visits disagree about is not taken for errors within them. Nothing if numbers overflow.
-    fn minus_log_likelihood(&self, scene: &Scene, noise: &Noise) -> Option<[f64; 3]> {
-        let Self(looks) = self;
-        let looks: Vec<Look> =
-            looks.iter().map(|(ray, depth_m, look)| look.with_noise(scene, noise, *ray, *depth_m)).collect();
-        let drive = Drive::at_one(&looks)?;
-        let (information, gradient) = drive.normals.of_one();
-        let cholesky = information.cholesky()?;
-        let ln_information = 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
-        Some([
-            drive.normals.square + drive.log_determinant(),
-            ln_information,
-            -gradient.dot(&cholesky.solve(&gradient)),
-        ])
+    /// Its looks with another noise.
+    pub(crate) fn looks(&self, scene: &Scene, noise: &Noise) -> Vec<Look> {
+        self.0.iter().map(|(ray, depth_m, look)| look.with_noise(scene, noise, *ray, *depth_m)).collect()
     }
+
+    fn minus_log_likelihood(&self, scene: &Scene, noise: &Noise) -> Option<[f64; 3]> {
+        minus_log_likelihood(&self.looks(scene, noise))
+    }
+}
+
+/// Minus twice the logarithm of the restricted likelihood of the residuals of a visit, up to a constant, in three terms: each visit may
+/// put the object elsewhere, so that what visits disagree about is not taken for errors within them. Nothing if numbers overflow.
+pub(crate) fn minus_log_likelihood(looks: &[Look]) -> Option<[f64; 3]> {
+    let drive = Drive::at_one(looks)?;
+    let (information, gradient) = drive.normals.of_one();
+    let cholesky = information.cholesky()?;
+    let ln_information = 2.0 * cholesky.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
+    Some([drive.normals.square + drive.log_determinant(), ln_information, -gradient.dot(&cholesky.solve(&gradient))])
 }
 
 #[cfg(test)]

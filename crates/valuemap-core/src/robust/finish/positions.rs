@@ -9,20 +9,21 @@ use super::contest::{Contest, widened};
 use crate::robust::energy::estimate::{Care, Estimate, Joint, Start};
 use crate::robust::energy::{Object, places_of_all};
 use crate::robust::model::Model;
+use crate::robust::noise::Noise;
 use crate::robust::parts::Part;
 
 /// Objects within this share of the range of the one with the most votes are estimated with it.
 const PLACE_SHARE: f64 = 0.4;
-/// The estimate of every object, in their order.
+/// The estimate of every object with a noise, in their order.
 #[must_use]
-pub fn positions(model: &Model<'_>, objects: &[Object]) -> Vec<Estimate> {
+pub fn positions(model: &Model<'_>, noise: &Noise, objects: &[Object]) -> Vec<Estimate> {
     let contest = Contest::new(model, objects);
     let mut estimates: Vec<Estimate> =
         objects.iter().map(|object| Estimate { point: object.fit.point, covariance: object.fit.covariance }).collect();
     let places = places_of_all(objects, model.settings.viability.max_range_m * PLACE_SHARE);
     // One at a time: the first ones are the largest.
     let found: Vec<Vec<(usize, Estimate)>> =
-        places.par_iter().with_max_len(1).map(|place| together(model, objects, place, &contest)).collect();
+        places.par_iter().with_max_len(1).map(|place| together(model, noise, objects, place, &contest)).collect();
     for (i, estimate) in found.into_iter().flatten() {
         estimates[i] = estimate;
     }
@@ -30,13 +31,19 @@ pub fn positions(model: &Model<'_>, objects: &[Object]) -> Vec<Estimate> {
 }
 
 /// Objects that cannot be estimated together are estimated one by one.
-fn together(model: &Model<'_>, objects: &[Object], place: &[usize], contest: &Contest<'_>) -> Vec<(usize, Estimate)> {
+fn together(
+    model: &Model<'_>,
+    noise: &Noise,
+    objects: &[Object],
+    place: &[usize],
+    contest: &Contest<'_>,
+) -> Vec<(usize, Estimate)> {
     let starts = place.iter().map(|&i| Start { voters: &objects[i].votes, weights: &[], point: objects[i].fit.point });
-    let Some(solution) = Joint::new(model.scene, model.noise, starts, Care::Exact).with_priors(model).solve() else {
+    let Some(solution) = Joint::new(model.scene, noise, starts, Care::Exact).with_priors(model).solve() else {
         if place.len() == 1 {
             return Vec::new();
         }
-        return place.iter().flat_map(|&i| together(model, objects, &[i], contest)).collect();
+        return place.iter().flat_map(|&i| together(model, noise, objects, &[i], contest)).collect();
     };
     let contested = contest.contested(&solution);
     let is_contested = contested.contains(&true) && model.settings.has(Part::Contest);
@@ -53,7 +60,6 @@ mod tests {
     use crate::robust::energy::looks::Lookout;
     use crate::robust::energy::object;
     use crate::robust::model::heights::Heights;
-    use crate::robust::noise::Noise;
     use crate::street;
 
     #[test]
@@ -69,10 +75,10 @@ mod tests {
         let found: Vec<Object> =
             (0..10).filter_map(|i| object(&model, &lookout, votes(i), objects[i], Vec::new())).collect();
         assert_eq!(found.len(), objects.len());
-        let without = positions(&model, &found);
+        let without = positions(&model, &noise, &found);
         let heights: Vec<f64> = (0..60).map(|i| 3.0 + 0.01 * f64::from(i % 5 - 2)).collect();
         model.classes[0].heights = Heights::learn(&heights, &[0.02; 60], 50.0);
-        let with = positions(&model, &found);
+        let with = positions(&model, &noise, &found);
         let sigma_m = |estimate: &Estimate, axis: usize| estimate.covariance[(axis, axis)].sqrt();
         // Those that are not begun near their height are taken for objects that are elsewhere.
         let told = with.iter().zip(&without).filter(|(with, without)| sigma_m(with, 0) < 0.5 * sigma_m(without, 0));

@@ -190,6 +190,28 @@ impl Look {
         }
     }
 
+    /// What is new in a look [by itself](Self::by_itself) after the one before it, whose error, in sigmas, it shares with a correlation: a look of variance 1. With it the
+    /// logarithm of the determinant of what is new, px⁴.
+    #[must_use]
+    pub fn innovation(&self, before: Option<&Self>, correlation: f64) -> (Self, f64) {
+        let correlation = if before.is_some() { correlation } else { 0.0 };
+        let sigma_px = (self.detection_px2 * (1.0 - correlation * correlation)).sqrt();
+        let mut new = self.clone();
+        for axis in 0..2 {
+            new.residual[axis] /= sigma_px;
+            new.by_point[axis] /= sigma_px;
+            new.by_turn[axis] /= sigma_px;
+            if let Some(before) = before {
+                let share = correlation * (self.detection_px2 / before.detection_px2).sqrt() / sigma_px;
+                new.residual[axis] -= before.residual[axis] * share;
+                new.by_point[axis] -= before.by_point[axis] * share;
+                new.by_turn[axis] -= before.by_turn[axis] * share;
+            }
+        }
+        (new.detection_px2, new.variance) = (1.0, 1.0);
+        (new, 4.0 * sigma_px.ln())
+    }
+
     /// The look, which counts with a weight, with the error that its image has for itself added to the detection's: mixed so that
     /// both residuals are independent, with variance 1; and the determinant of their covariance, px⁴. Only for the one look of an image; nothing if
     /// numbers overflow.
@@ -709,7 +731,8 @@ impl Segment {
 }
 
 /// How many looks, from the first one on, share one drift.
-fn segment_length(looks: &[Look]) -> usize {
+#[must_use]
+pub fn segment_length(looks: &[Look]) -> usize {
     let is_far = |look: &Look| (look.driven_m - looks[0].driven_m).abs() > SEGMENT_M;
     looks.iter().position(is_far).unwrap_or(looks.len())
 }

@@ -1,0 +1,167 @@
+//! Noise of detections that remember their errors: what covariances are estimated with.
+//!
+//! Boxes of one object wander from image to image: a detector errs alike where pictures are alike, and who draws boxes by hand moves them along. Then many
+//! images of a visit say less than as many independent ones. The errors that images have for themselves are taken for an autoregression along each segment of
+//! a visit, AR(1): those of successive looks at an object have one correlation, which restricted maximum likelihood tells with the sizes of the errors.
+//! Looks count as fewer independent ones then, by the integrated autocorrelation time (Sokal, "Monte Carlo methods in statistical mechanics", 1997, section 3): their
+//! variance is that many times as large. Who votes for what is told by single residuals, which are no larger for that, and positions stay where independent looks
+//! put them, as least squares do with covariances that heed correlations (Newey and West, "A simple, positive semi-definite, heteroskedasticity and
+//! autocorrelation consistent covariance matrix", 1987).
+
+use rayon::prelude::*;
+
+use super::residuals::{VisitOf, minus_log_likelihood, search};
+use super::shared::stated;
+use crate::robust::energy::Placed;
+use crate::robust::noise::drift::{Look, segment_length};
+use crate::robust::noise::{Known, Noise};
+use crate::robust::scene::Scene;
+
+/// Detections remember if minus twice the logarithm of the likelihood falls by more than this: what one parameter gains by chance (Akaike).
+const LEAST_FALL: f64 = 2.0;
+/// Variances become larger or smaller by this factor at most.
+const MOST_CHANGE: f64 = 100.0;
+
+/// The noise with which the looks at some labels count as many as independent ones; nothing where they are independent, or poses state their errors.
+pub(crate) fn remembered(scene: &Scene, noise: &Noise, known: Known, labels: &[&Placed]) -> Option<Noise> {
+    if stated(scene).iter().any(Option::is_some) {
+        return None;
+    }
+    let visits: Vec<VisitOf> = labels.iter().filter_map(|label| VisitOf::all(scene, noise, label)).flatten().collect();
+    let cost = |p: &[f64; 4]| -> f64 {
+        let (noise, correlation) = (changed(noise, p), correlation(p[3]));
+        let of_visit = |visit: &VisitOf| of_remembering(&visit.looks(scene, &noise), correlation).unwrap_or(0.0);
+        // Summed in the order of the visits, so that threads do not change the result.
+        visits.par_iter().map(of_visit).collect::<Vec<f64>>().iter().sum()
+    };
+    let change = (1.0 / MOST_CHANGE, MOST_CHANGE);
+    let is_own_known = known.detection || known.position || known.rotation;
+    let found = |most_looks: f64| {
+        let bounds = [change, change, change, (1.0, most_looks)];
+        search([1.0; 4], bounds, [is_own_known, known.position, known.rotation, most_looks <= 1.0], &cost)
+    };
+    let remembering = found(looks_of_segment(&visits.iter().map(|v| v.looks(scene, noise)).collect::<Vec<_>>()));
+    (remembering[3] > 1.0 && cost(&found(1.0)) - cost(&remembering) > LEAST_FALL).then(|| {
+        let noise = changed(noise, &remembering);
+        let times = remembering[3].sqrt();
+        Noise {
+            detection_px: noise.detection_px * times,
+            box_share: noise.box_share * times,
+            position_m: noise.position_m * times,
+            rotation_rad: noise.rotation_rad * times,
+            ..noise
+        }
+    })
+}
+
+/// The correlation of successive errors of an autoregression of which so many count as one.
+fn correlation(looks_as_one: f64) -> f64 {
+    (looks_as_one - 1.0) / (looks_as_one + 1.0)
+}
+
+/// A noise with other variances: of what images have for themselves, of the positions of segments, and of their rotations. What drifts keeps its ratio to
+/// both.
+fn changed(noise: &Noise, &[own, position, rotation, _]: &[f64; 4]) -> Noise {
+    let own = own.sqrt();
+    let new = Noise {
+        detection_px: noise.detection_px * own,
+        box_share: noise.box_share * own,
+        position_m: noise.position_m * own,
+        rotation_rad: noise.rotation_rad * own,
+        position_segment_m: noise.position_segment_m * position.sqrt(),
+        rotation_segment_rad: noise.rotation_segment_rad * rotation.sqrt(),
+        ..*noise
+    };
+    let of_poses = |noise: &Noise| {
+        [noise.position_m.hypot(noise.position_segment_m), noise.rotation_rad.hypot(noise.rotation_segment_rad)]
+    };
+    let ratio = |is: f64, was: f64| if was > 0.0 { is / was } else { 1.0 };
+    let [position, rotation] = [0, 1].map(|part| ratio(of_poses(&new)[part], of_poses(noise)[part]));
+    Noise {
+        position_drift_m: noise.position_drift_m * position,
+        rotation_drift_rad: noise.rotation_drift_rad * rotation,
+        ..new
+    }
+}
+
+/// How many looks a segment of some visits has on average: what lasts longer is the segment's error.
+fn looks_of_segment(visits: &[Vec<Look>]) -> f64 {
+    let looks: usize = visits.iter().map(Vec::len).sum();
+    let segments: usize = visits.iter().map(|visit| segments(visit).count()).sum();
+    looks as f64 / segments.max(1) as f64
+}
+
+/// The looks of each segment of a visit.
+fn segments(mut looks: &[Look]) -> impl Iterator<Item = &[Look]> {
+    std::iter::from_fn(move || {
+        let (segment, rest) = looks.split_at(segment_length(looks));
+        looks = rest;
+        (!segment.is_empty()).then_some(segment)
+    })
+}
+
+/// Minus twice the logarithm of the restricted likelihood of the residuals of a visit, if successive looks of a segment have that correlation. Nothing if
+/// numbers overflow.
+fn of_remembering(looks: &[Look], correlation: f64) -> Option<f64> {
+    let (mut new, mut ln_determinant) = (Vec::with_capacity(looks.len()), 0.0);
+    for segment in segments(looks) {
+        for (at, look) in segment.iter().enumerate() {
+            let (look, ln) = look.innovation(at.checked_sub(1).map(|before| &segment[before]), correlation);
+            new.push(look);
+            ln_determinant += ln;
+        }
+    }
+    Some(minus_log_likelihood(&new)?.iter().sum::<f64>() + ln_determinant)
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{DMatrix, DVector, Vector3};
+
+    use super::*;
+    use crate::robust::noise::drift::SEGMENT_M;
+    use crate::street;
+
+    #[test]
+    fn the_likelihood_of_looks_that_remember_is_that_of_one_gaussian() {
+        let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
+        let point = Vector3::new(50.0, 4.0, 3.0);
+        let scene = street::street(12, 3.0, &[point], &errors);
+        let visits = VisitOf::all(&scene, &street::NOISE, &(scene.usable_rays(), point)).unwrap_or_default();
+        assert_eq!(visits.len(), 1);
+        let looks = visits[0].looks(&scene, &street::NOISE);
+        assert!(looks.len() > 8 && segments(&looks).all(|segment| segment.len() > 1) && segments(&looks).count() > 2);
+        let (correlation, rows) = (0.6_f64, 2 * looks.len());
+        let begins = |at: usize| {
+            looks[..=at].len()
+                - segments(&looks)
+                    .scan(0, |end, segment| {
+                        *end += segment.len();
+                        Some(*end)
+                    })
+                    .filter(|&end| end <= at)
+                    .last()
+                    .unwrap_or(0)
+        };
+        let covariance = DMatrix::from_fn(rows, rows, |a, b| {
+            let (i, k) = (a / 2, b / 2);
+            let apart_m = (looks[i].driven_m - looks[k].driven_m).abs();
+            let is_one = apart_m <= SEGMENT_M && i + 1 - begins(i) == k + 1 - begins(k);
+            let variance = (looks[i].detection_px2 * looks[k].detection_px2).sqrt();
+            if a % 2 == b % 2 && is_one { variance * correlation.powi(i.abs_diff(k) as i32) } else { 0.0 }
+        });
+        let residual = DVector::from_fn(rows, |row, _| looks[row / 2].residual[row % 2]);
+        let by_point = DMatrix::from_fn(rows, 3, |row, axis| looks[row / 2].by_point[row % 2][axis]);
+        let inverse = covariance.clone().try_inverse().unwrap_or_default();
+        let information = by_point.transpose() * &inverse * &by_point;
+        let gradient = by_point.transpose() * &inverse * &residual;
+        let expected =
+            residual.dot(&(&inverse * &residual)) + covariance.determinant().ln() + information.determinant().ln()
+                - gradient.dot(&(information.try_inverse().unwrap_or_default() * &gradient));
+        let found = of_remembering(&looks, correlation).unwrap_or(f64::NAN);
+        assert!((found - expected).abs() < 1e-6, "{found} {expected}");
+        let independent: f64 = minus_log_likelihood(&looks).map_or(f64::NAN, |terms| terms.iter().sum());
+        let alone = of_remembering(&looks, 0.0).unwrap_or(f64::NAN);
+        assert!((alone - independent).abs() < 1e-6, "{alone} {independent}");
+    }
+}
