@@ -72,7 +72,7 @@ fn of_wandering(correlation: f64) -> Calibration {
                 errors.last().map_or(new, |last| [0, 1].map(|axis| correlation * last[axis] + fresh * new[axis])),
             );
         }
-        street(40, 1.0, &[Vector3::new(42.0, if number % 2 == 0 { 5.0 } else { -6.0 }, 3.0)], &errors)
+        street(40, 1.0, &[Vector3::new(42.0, if number.is_multiple_of(2) { 5.0 } else { -6.0 }, 3.0)], &errors)
     };
     let scene = joined((0..24).map(of_object).collect());
     self_calibrate(&scene, &NOISE, Known::default(), &SETTINGS, false, None, &Progress::default()).unwrap().0
