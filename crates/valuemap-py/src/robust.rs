@@ -133,7 +133,7 @@ impl Scene {
 }
 
 /// The fields of the core's `Noise`, in their order.
-type NoiseValues = [f64; 9];
+type NoiseValues = [f64; 10];
 
 fn values_of(noise: &Noise) -> NoiseValues {
     [
@@ -146,6 +146,7 @@ fn values_of(noise: &Noise) -> NoiseValues {
         noise.position_drift_m,
         noise.rotation_drift_rad,
         noise.side_m,
+        noise.look_correlation,
     ]
 }
 
@@ -153,6 +154,9 @@ fn noise_of(values: NoiseValues) -> PyResult<Noise> {
     check_within("noise", &values, FARTHEST_M)?;
     if values.iter().any(|&value| value < 0.0) || values[0] == 0.0 {
         return Err(PyValueError::new_err("noise: expected standard deviations, that of a detection above 0"));
+    }
+    if values[9] >= 1.0 {
+        return Err(PyValueError::new_err("noise: expected a correlation of looks below 1"));
     }
     let [
         detection_px,
@@ -164,6 +168,7 @@ fn noise_of(values: NoiseValues) -> PyResult<Noise> {
         position_drift_m,
         rotation_drift_rad,
         side_m,
+        look_correlation,
     ] = values;
     Ok(Noise {
         detection_px,
@@ -175,6 +180,7 @@ fn noise_of(values: NoiseValues) -> PyResult<Noise> {
         position_drift_m,
         rotation_drift_rad,
         side_m,
+        look_correlation,
     })
 }
 
@@ -200,12 +206,12 @@ fn settings_of(
     Ok(Settings { viability, gate_sigmas, min_votes, least_votes, min_existence, without })
 }
 
-/// A calibration: the noise, that of covariances, whether all moves pay, numbers of each class where anything is known of it, those of all classes together, and, of
+/// A calibration: the noise, that of final positions, whether all moves pay, numbers of each class where anything is known of it, those of all classes together, and, of
 /// the detections of each class, which others some are said to be of, with their shares.
 type CalibrationValues = (NoiseValues, NoiseValues, bool, Vec<Option<Vec<f64>>>, Vec<f64>, Vec<Vec<(u32, f64)>>);
 
 fn calibration_of(
-    (noise, noise_of_covariances, is_deep, classes, pooled, shares): CalibrationValues,
+    (noise, noise_of_positions, is_deep, classes, pooled, shares): CalibrationValues,
 ) -> PyResult<Calibration> {
     let of = |row: Vec<f64>| {
         // Edges of steps may be infinite.
@@ -223,7 +229,7 @@ fn calibration_of(
         starts: 0,
         confusions: Confusions::of_shares(shares),
         noise: noise_of(noise)?,
-        noise_of_covariances: noise_of(noise_of_covariances)?,
+        noise_of_positions: noise_of(noise_of_positions)?,
         is_deep,
         classes: classes.into_iter().map(|row| row.map(of).transpose()).collect::<PyResult<_>>()?,
         pooled: of(pooled)?,
@@ -265,7 +271,7 @@ pub fn calibrate<'py>(
     let classes = found.classes.iter().map(|class| class.as_ref().map(ClassModel::to_row)).collect();
     let calibration = (
         values_of(&found.noise),
-        values_of(&found.noise_of_covariances),
+        values_of(&found.noise_of_positions),
         found.is_deep,
         classes,
         found.pooled.to_row(),

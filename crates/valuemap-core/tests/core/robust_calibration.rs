@@ -80,12 +80,10 @@ fn of_wandering(correlation: f64) -> Calibration {
 
 #[test]
 fn looks_that_remember_their_errors_count_as_fewer() {
-    let times = |found: &Calibration| (found.noise_of_covariances.detection_px / found.noise.detection_px).powi(2);
-    let independent = of_wandering(0.0);
-    assert!(times(&independent) < 1.5, "{}", times(&independent));
-    // Nine of a correlation of 0.8 count as one.
-    let remembering = of_wandering(0.8);
-    assert!((4.0..20.0).contains(&times(&remembering)), "{} {:?}", times(&remembering), remembering.noise);
+    let independent = of_wandering(0.0).noise_of_positions;
+    assert!(independent.look_correlation < 0.2, "{independent:?}");
+    let remembering = of_wandering(0.8).noise_of_positions;
+    assert!((0.6..0.95).contains(&remembering.look_correlation), "{remembering:?}");
 }
 
 /// Pins that few bearings which meet by chance are not more exact than they are written down.
@@ -214,7 +212,7 @@ fn quick_estimates_from_one_side_are_off_to_neither() {
 }
 
 #[test]
-fn the_noise_of_covariances_is_found_from_drives_of_two_sides() {
+fn the_noise_of_positions_is_found_from_drives_of_two_sides() {
     let (scene, labels) = from_two_sides();
     for position_m in [0.15, 1.0] {
         let guess = Noise { position_m, position_segment_m: 0.03, rotation_segment_rad: 5e-4, ..NOISE };

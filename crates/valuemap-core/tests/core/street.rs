@@ -39,6 +39,7 @@ pub const NOISE: Noise = Noise {
     position_drift_m: 0.0,
     rotation_drift_rad: 0.0,
     side_m: 0.0,
+    look_correlation: 0.0,
 };
 
 /// A drive along x that sees all of the objects within 50 m ahead, each a little off.

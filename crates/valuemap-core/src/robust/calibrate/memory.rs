@@ -1,12 +1,10 @@
-//! Noise of detections that remember their errors: what covariances are estimated with.
+//! Noise of detections that remember their errors: what final positions are estimated with.
 //!
 //! Boxes of one object wander from image to image: a detector errs alike where pictures are alike, and who draws boxes by hand moves them along. Then many
 //! images of a visit say less than as many independent ones. The errors that images have for themselves are taken for an autoregression along each segment of
 //! a visit, AR(1): those of successive looks at an object have one correlation, which restricted maximum likelihood tells with the sizes of the errors.
-//! Looks count as fewer independent ones then, by the integrated autocorrelation time (Sokal, "Monte Carlo methods in statistical mechanics", 1997, section 3): their
-//! variance is that many times as large. Who votes for what is told by single residuals, which are no larger for that, and positions stay where independent looks
-//! put them, as least squares do with covariances that heed correlations (Newey and West, "A simple, positive semi-definite, heteroskedasticity and
-//! autocorrelation consistent covariance matrix", 1987).
+//! Looks count as fewer independent ones then ([`variance_of_alike`](crate::robust::noise::variance_of_alike)). Who votes for what is told by single residuals, which are no larger for
+//! that.
 
 use rayon::prelude::*;
 
@@ -22,7 +20,7 @@ const LEAST_FALL: f64 = 2.0;
 /// Variances become larger or smaller by this factor at most.
 const MOST_CHANGE: f64 = 100.0;
 
-/// The noise with which the looks at some labels count as many as independent ones; nothing where they are independent, or poses state their errors.
+/// The noise of which the looks at some labels have a correlation; nothing where they are independent, or poses state their errors.
 pub(crate) fn remembered(scene: &Scene, noise: &Noise, known: Known, labels: &[&Placed]) -> Option<Noise> {
     if stated(scene).iter().any(Option::is_some) {
         return None;
@@ -41,17 +39,8 @@ pub(crate) fn remembered(scene: &Scene, noise: &Noise, known: Known, labels: &[&
         search([1.0; 4], bounds, [is_own_known, known.position, known.rotation, most_looks <= 1.0], &cost)
     };
     let remembering = found(looks_of_segment(&visits.iter().map(|v| v.looks(scene, noise)).collect::<Vec<_>>()));
-    (remembering[3] > 1.0 && cost(&found(1.0)) - cost(&remembering) > LEAST_FALL).then(|| {
-        let noise = changed(noise, &remembering);
-        let times = remembering[3].sqrt();
-        Noise {
-            detection_px: noise.detection_px * times,
-            box_share: noise.box_share * times,
-            position_m: noise.position_m * times,
-            rotation_rad: noise.rotation_rad * times,
-            ..noise
-        }
-    })
+    (remembering[3] > 1.0 && cost(&found(1.0)) - cost(&remembering) > LEAST_FALL)
+        .then(|| Noise { look_correlation: correlation(remembering[3]), ..changed(noise, &remembering) })
 }
 
 /// The correlation of successive errors of an autoregression of which so many count as one.

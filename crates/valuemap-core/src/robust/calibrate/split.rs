@@ -236,6 +236,7 @@ mod tests {
             position_drift_m: 0.0,
             rotation_drift_rad: 0.0,
             side_m: 0.0,
+            look_correlation: 0.0,
         };
         let of = |least_px| scale.with_rotation(&noise, 0.98, least_px);
         assert!(of(0.0).detection_px < 0.21 && of(0.5).detection_px.to_bits() == 0.5_f64.to_bits());

@@ -15,10 +15,10 @@ use super::sides::sides;
 use super::sizes::size_terms;
 use crate::robust::model::Model;
 use crate::robust::model::ranges::range_terms;
-use crate::robust::noise::Noise;
-use crate::robust::noise::drift::{Drive, Look, Normals, Vantage};
+use crate::robust::noise::drift::{Drive, Look, Normals, SEGMENT_M, Vantage};
 use crate::robust::noise::huber::huber_weight;
 use crate::robust::noise::spd::Vector6;
+use crate::robust::noise::{Noise, variance_of_alike};
 use crate::robust::scene::{Scene, View};
 
 /// Good enough while votes may still change, m.
@@ -177,7 +177,34 @@ impl<'a> Joint<'a> {
             care,
             model: None,
         };
+        let all = if noise.look_correlation > 0.0 { all.with_memory(noise.look_correlation) } else { all };
         if side_m > 0.0 { all.with_middles() } else { all }
+    }
+
+    /// Let successive looks at a label be off alike. What an image is off by itself all its labels share: it counts as for the one with the most looks.
+    fn with_memory(mut self, correlation: f64) -> Self {
+        let mut of_labels: Vec<Vec<usize>> = vec![Vec::new(); self.points.len()];
+        for (i, &(label, _)) in self.votes.iter().enumerate() {
+            of_labels[label].push(i);
+        }
+        let mut times = vec![1.0; self.votes.len()];
+        for of_label in of_labels {
+            let rays: Vec<u32> = of_label.iter().map(|&i| self.votes[i].1).collect();
+            for (i, of_look) in of_label.into_iter().zip(times_of_alike(self.scene, &rays, correlation)) {
+                times[i] = of_look;
+            }
+        }
+        let image = |vote: &(usize, u32)| self.scene.rays.image[vote.1 as usize];
+        let mut at = 0;
+        for of_image in self.votes.chunk_by(|a, b| image(a) == image(b)) {
+            let votes = at..at + of_image.len();
+            let most = times[votes.clone()].iter().copied().fold(1.0, f64::max);
+            for i in votes.clone() {
+                self.vantages[i] = self.vantages[i].clone().with_variance(most, times[i]);
+            }
+            at = votes.end;
+        }
+        self
     }
 
     /// Let the votes from each side of a label see a point of their own.
@@ -657,5 +684,25 @@ pub fn looks_at(
         let vantage = Vantage::of(scene, noise, ray).with_sight_of(scene, of_sight, ray);
         looks.push(vantage.look(0, point)?.by_itself());
     }
+    if noise.look_correlation > 0.0 {
+        for (look, times) in looks.iter_mut().zip(times_of_alike(scene, voters, noise.look_correlation)) {
+            (look.detection_px2, look.variance) = (look.detection_px2 * times, look.variance * times);
+        }
+    }
     Some(looks)
+}
+
+/// How many times as large the variance of each voter of one label is, if successive looks of a segment are off alike.
+fn times_of_alike(scene: &Scene, voters: &[u32], correlation: f64) -> Vec<f64> {
+    let mut times = Vec::with_capacity(voters.len());
+    for visit in visits(scene, voters) {
+        let mut left = visit;
+        while let Some(&first) = left.first() {
+            let is_far = |&ray: &u32| (scene.view(ray).driven_m - scene.view(first).driven_m).abs() > SEGMENT_M;
+            let looks = left.iter().position(is_far).unwrap_or(left.len());
+            times.extend(std::iter::repeat_n(variance_of_alike(looks, correlation), looks));
+            left = &left[looks..];
+        }
+    }
+    times
 }

@@ -99,6 +99,17 @@ impl Vantage {
         self
     }
 
+    /// The same with variances so many times as large: of what its image is off by itself, and its detection.
+    #[must_use]
+    pub fn with_variance(mut self, of_image: f64, of_detection: f64) -> Self {
+        self.own_sigma.position_m *= of_image.sqrt();
+        self.own_sigma.rotation_rad *= of_image.sqrt();
+        self.detection_px2 *= of_detection;
+        self.spread.far_px2 *= of_detection;
+        self.spread.near_px2 *= of_detection;
+        self
+    }
+
     /// The camera centre, m.
     #[must_use]
     pub fn center(&self) -> &Vector3<f64> {

@@ -39,6 +39,8 @@ pub struct Noise {
     pub rotation_drift_rad: f64,
     /// Of the middle that a side of an object shows, each axis, shared by all images from that side, m.
     pub side_m: f64,
+    /// Correlation of what successive looks at an object are off by themselves, within a segment.
+    pub look_correlation: f64,
 }
 
 /// Standard deviations of a pose error, each axis.
@@ -205,6 +207,15 @@ impl Noise {
             rotation_rad: known_share(view.rotation_sigma_rad, rotation_rad, rotation),
         }
     }
+}
+
+/// How many times as large as that of independent ones the variance of so many looks of one segment is, if successive ones have a correlation: of their mean it is
+/// that of an autoregression, AR(1). One look is as good as ever, and many are (1 + correlation) / (1 - correlation) times as bad, by the integrated
+/// autocorrelation time (Sokal, "Monte Carlo methods in statistical mechanics", 1997, section 3).
+#[must_use]
+pub fn variance_of_alike(looks: usize, correlation: f64) -> f64 {
+    let looks = looks as f64;
+    looks * (1.0 + correlation) / (looks - (looks - 2.0) * correlation)
 }
 
 /// A part of a total that may be known.
