@@ -109,7 +109,18 @@ mod tests {
 
     use super::*;
     use crate::robust::noise::drift::SEGMENT_M;
+    use crate::robust::noise::variance_of_alike;
     use crate::street;
+
+    #[test]
+    fn looks_that_are_alike_are_worth_what_their_mean_is() {
+        for (looks, correlation) in [(1, 0.9), (2, 0.5), (7, 0.0), (7, 0.8), (40, 0.9)] {
+            let of = DMatrix::from_fn(looks, looks, |i, k| f64::powi(correlation, i.abs_diff(k) as i32));
+            let independent = of.try_inverse().map_or(f64::NAN, |inverse| inverse.sum());
+            let found = variance_of_alike(looks, correlation);
+            assert!((found - looks as f64 / independent).abs() < 1e-9, "{looks} {correlation} {found}");
+        }
+    }
 
     #[test]
     fn the_likelihood_of_looks_that_remember_is_that_of_one_gaussian() {
