@@ -57,8 +57,8 @@ class Calibration:
     """All that is estimated once of a dataset, before any part of it is mapped."""
 
     noise: Noise
-    noise_of_positions: Noise
-    """The same where successive looks may be off alike: what final positions are estimated with."""
+    noise_of_covariances: Noise
+    """The same where successive looks may be off alike: what covariances are estimated with."""
     is_deep: bool
     """Whether all moves of the search pay."""
     classes: dict[str, tuple[float, ...]]
@@ -76,7 +76,7 @@ class Calibration:
             [(code[said], share) for said, share in self.confusions.get(name, {}).items() if said in code]
             for name in class_names
         ]
-        return self.noise.as_tuple(), self.noise_of_positions.as_tuple(), self.is_deep, classes, self.pooled, shares
+        return self.noise.as_tuple(), self.noise_of_covariances.as_tuple(), self.is_deep, classes, self.pooled, shares
 
 
 def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def calibration_from_json(value: Any, *, source: str) -> Calibration:
     try:
         return Calibration(
             noise=_noise(value["noise"]),
-            noise_of_positions=_noise(value["noise_of_positions"]),
+            noise_of_covariances=_noise(value["noise_of_covariances"]),
             is_deep=bool(value["is_deep"]),
             classes={name: _numbers(fields) for name, fields in value["classes"].items()},
             pooled=_numbers(value["pooled"]),
@@ -202,7 +202,7 @@ def calibrate(
     guess, known = _guess(config.noise, scene.rounding_px)
     steps = _core.CALIBRATION_STEPS + (2 * _core.SEARCH_STEPS if is_part else 0)
     with counted(progress, "estimating the noise", steps) as tell:
-        (noise, of_positions, is_deep, classes, pooled, shares), position, (offsets, voters) = _core.calibrate(
+        (noise, of_covariances, is_deep, classes, pooled, shares), position, (offsets, voters) = _core.calibrate(
             scene.core,
             guess.as_tuple(),
             known,
@@ -214,7 +214,7 @@ def calibrate(
         )
     calibration = Calibration(
         noise=Noise(*noise),
-        noise_of_positions=Noise(*of_positions),
+        noise_of_covariances=Noise(*of_covariances),
         is_deep=is_deep,
         classes={name: tuple(row) for name, row in zip(scene.class_names, classes, strict=False) if row is not None},
         pooled=tuple(pooled),

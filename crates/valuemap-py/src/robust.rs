@@ -206,12 +206,12 @@ fn settings_of(
     Ok(Settings { viability, gate_sigmas, min_votes, least_votes, min_existence, without })
 }
 
-/// A calibration: the noise, that of final positions, whether all moves pay, numbers of each class where anything is known of it, those of all classes together, and, of
+/// A calibration: the noise, that of covariances, whether all moves pay, numbers of each class where anything is known of it, those of all classes together, and, of
 /// the detections of each class, which others some are said to be of, with their shares.
 type CalibrationValues = (NoiseValues, NoiseValues, bool, Vec<Option<Vec<f64>>>, Vec<f64>, Vec<Vec<(u32, f64)>>);
 
 fn calibration_of(
-    (noise, noise_of_positions, is_deep, classes, pooled, shares): CalibrationValues,
+    (noise, noise_of_covariances, is_deep, classes, pooled, shares): CalibrationValues,
 ) -> PyResult<Calibration> {
     let of = |row: Vec<f64>| {
         // Edges of steps may be infinite.
@@ -229,7 +229,7 @@ fn calibration_of(
         starts: 0,
         confusions: Confusions::of_shares(shares),
         noise: noise_of(noise)?,
-        noise_of_positions: noise_of(noise_of_positions)?,
+        noise_of_covariances: noise_of(noise_of_covariances)?,
         is_deep,
         classes: classes.into_iter().map(|row| row.map(of).transpose()).collect::<PyResult<_>>()?,
         pooled: of(pooled)?,
@@ -271,7 +271,7 @@ pub fn calibrate<'py>(
     let classes = found.classes.iter().map(|class| class.as_ref().map(ClassModel::to_row)).collect();
     let calibration = (
         values_of(&found.noise),
-        values_of(&found.noise_of_positions),
+        values_of(&found.noise_of_covariances),
         found.is_deep,
         classes,
         found.pooled.to_row(),

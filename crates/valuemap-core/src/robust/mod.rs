@@ -81,7 +81,7 @@ pub fn find(
     };
     let claimed: usize = objects.iter().map(|object| object.votes.len()).sum();
     let energy = objects.iter().map(|object| object.energy).sum();
-    let (findings, variance_factor) = finish::labels(&model, &calibration.noise_of_positions, &lookout, objects, few);
+    let (findings, variance_factor) = finish::labels(&model, &calibration.noise_of_covariances, &lookout, objects, few);
     Ok(Findings {
         findings,
         tally,

@@ -411,10 +411,10 @@ fn labels_of_hostile_scenes() {
     let classes = vec(proptest::option::of(class_model()), 0..3);
     let shares = vec(vec((0..4_u32, 0.0..=1.0_f64), 0..3), 0..3);
     let cases = (columns(12), [noise(), noise()], any::<bool>(), classes, class_model(), shares, settings());
-    run("find", 200, &cases, |(columns, [noise, noise_of_positions], is_deep, classes, pooled, shares, settings)| {
+    run("find", 200, &cases, |(columns, [noise, noise_of_covariances], is_deep, classes, pooled, shares, settings)| {
         let scene = columns.scene();
         let confusions = Confusions::of_shares(shares.clone());
-        let calibration = Calibration { noise, noise_of_positions, is_deep, classes, pooled, confusions, starts: 0 };
+        let calibration = Calibration { noise, noise_of_covariances, is_deep, classes, pooled, confusions, starts: 0 };
         let found = find(&scene, &calibration, &settings, &Progress::default()).unwrap();
         for finding in &found.findings {
             all_finite("point", finding.estimate.point.iter())?;
@@ -443,7 +443,7 @@ fn noise_of_hostile_scenes() {
     run("calibrate", 50, &cases, |(columns, guess, known, settings, is_part)| {
         let scene = columns.scene();
         let found = self_calibrate(&scene, &guess, known, &settings, is_part, None, &Progress::default()).unwrap().0;
-        for n in [&found.noise, &found.noise_of_positions] {
+        for n in [&found.noise, &found.noise_of_covariances] {
             all_finite("detection noise", [&n.detection_px, &n.box_share])?;
             all_finite("noise of positions", [&n.position_m, &n.position_segment_m, &n.position_drift_m, &n.side_m])?;
             all_finite("noise of rotations", [&n.rotation_rad, &n.rotation_segment_rad, &n.rotation_drift_rad])?;

@@ -80,9 +80,9 @@ fn of_wandering(correlation: f64) -> Calibration {
 
 #[test]
 fn looks_that_remember_their_errors_count_as_fewer() {
-    let independent = of_wandering(0.0).noise_of_positions;
+    let independent = of_wandering(0.0).noise_of_covariances;
     assert!(independent.look_correlation < 0.2, "{independent:?}");
-    let remembering = of_wandering(0.8).noise_of_positions;
+    let remembering = of_wandering(0.8).noise_of_covariances;
     assert!((0.6..0.95).contains(&remembering.look_correlation), "{remembering:?}");
 }
 
@@ -212,7 +212,7 @@ fn quick_estimates_from_one_side_are_off_to_neither() {
 }
 
 #[test]
-fn the_noise_of_positions_is_found_from_drives_of_two_sides() {
+fn the_noise_of_covariances_is_found_from_drives_of_two_sides() {
     let (scene, labels) = from_two_sides();
     for position_m in [0.15, 1.0] {
         let guess = Noise { position_m, position_segment_m: 0.03, rotation_segment_rad: 5e-4, ..NOISE };

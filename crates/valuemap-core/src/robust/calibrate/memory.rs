@@ -1,10 +1,11 @@
-//! Noise of detections that remember their errors: what final positions are estimated with.
+//! Noise of detections that remember their errors: what covariances are estimated with.
 //!
 //! Boxes of one object wander from image to image: a detector errs alike where pictures are alike, and who draws boxes by hand moves them along. Then many
 //! images of a visit say less than as many independent ones. The errors that images have for themselves are taken for an autoregression along each segment of
 //! a visit, AR(1): those of successive looks at an object have one correlation, which restricted maximum likelihood tells with the sizes of the errors.
 //! Looks count as fewer independent ones then ([`variance_of_alike`](crate::robust::noise::variance_of_alike)). Who votes for what is told by single residuals, which are no larger for
-//! that.
+//! that, and positions stay where independent looks put them, as least squares do with covariances that heed correlations (Newey and West, "A simple, positive
+//! semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix", 1987).
 
 use rayon::prelude::*;
 

@@ -50,8 +50,8 @@ pub const CALIBRATION_STEPS: usize = likeliest::NOISE_STEPS + 1;
 pub struct Calibration {
     /// Errors of poses and detections.
     pub noise: Noise,
-    /// The same where successive looks may be off alike: what final positions are estimated with.
-    pub noise_of_positions: Noise,
+    /// The same where successive looks may be off alike: what covariances are estimated with.
+    pub noise_of_covariances: Noise,
     /// What is learned of each class; nothing of those that are nowhere in the sample.
     pub classes: Vec<Option<ClassModel>>,
     /// What is learned of all classes together: what others are like.
@@ -104,13 +104,13 @@ pub fn self_calibrate(
     } else {
         None
     };
-    let noise_of_positions = remembered.unwrap_or(noise);
+    let noise_of_covariances = remembered.unwrap_or(noise);
     let is_small = !is_part && scene.usable_rays().len() <= MOST_RAYS;
     let is_deep = is_small || all_moves_pay(&mut model, &objects, progress)?;
     let classes = model.classes.iter().copied().map(Some).collect();
     let calibration = Calibration {
         noise,
-        noise_of_positions,
+        noise_of_covariances,
         classes,
         pooled: model.pooled,
         confusions: model.confusions,

@@ -36,18 +36,22 @@ pub struct Finding {
 }
 
 /// The labels that some objects make, and some of few votes: those that are no others and exist probably enough, ordered by their lowest vote. With it
-/// what the covariances were multiplied by, so that the passes agree. Positions are estimated with a noise of their own.
+/// what the covariances were multiplied by, so that the passes agree. Covariances have a noise of their own.
 #[must_use]
 pub fn labels(
     model: &Model<'_>,
-    noise: &Noise,
+    of_covariances: &Noise,
     lookout: &Lookout,
     objects: Vec<Object>,
     few: Vec<Object>,
 ) -> (Vec<Finding>, f64) {
-    let estimates = positions(model, noise, &objects);
+    let mut estimates = positions(model, model.noise, &objects);
+    if of_covariances != model.noise {
+        let honest = positions(model, of_covariances, &objects);
+        estimates.iter_mut().zip(honest).for_each(|(estimate, honest)| estimate.covariance = honest.covariance);
+    }
     let factor = if model.settings.has(Part::Scaling) {
-        variance_factor(model.scene, noise, &placed(&objects), objects.len().max(1))
+        variance_factor(model.scene, of_covariances, &placed(&objects), objects.len().max(1))
     } else {
         1.0
     };
