@@ -206,8 +206,8 @@ fn settings_of(
     Ok(Settings { viability, gate_sigmas, min_votes, least_votes, min_existence, without })
 }
 
-/// A calibration: the noise, that of covariances, whether all moves pay, numbers of each class where anything is known of it, those of all classes together, and, of
-/// the detections of each class, which others some are said to be of, with their shares.
+/// A calibration: the noise, that of covariances, whether all moves pay, numbers of each class where anything is known of it, those of all classes
+/// together, and, of the detections of each class, which others some are said to be of, with their shares.
 type CalibrationValues = (NoiseValues, NoiseValues, bool, Vec<Option<Vec<f64>>>, Vec<f64>, Vec<Vec<(u32, f64)>>);
 
 fn calibration_of(

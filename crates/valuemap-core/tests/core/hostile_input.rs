@@ -219,7 +219,7 @@ fn columns(most_images: usize) -> impl Strategy<Value = Columns> {
 
 /// The noise where it is usual, with a number of it spoiled now and then.
 fn noise() -> impl Strategy<Value = Noise> {
-    let usual = [1.0, 0.05, 0.05, 1e-3, 0.05, 1e-3, 0.05, 1e-3, 0.0];
+    let usual = [1.0, 0.05, 0.05, 1e-3, 0.05, 1e-3, 0.05, 1e-3, 0.0, 0.5];
     (0..24_usize, hostile()).prop_map(move |(which, number)| {
         let mut n = usual;
         let number = number.abs().min(FARTHEST);
@@ -236,7 +236,8 @@ fn noise() -> impl Strategy<Value = Noise> {
             position_drift_m: n[6],
             rotation_drift_rad: n[7],
             side_m: n[8],
-            look_correlation: 0.0,
+            // At the border it is below 1.
+            look_correlation: if n[9] < 1.0 { n[9] } else { 0.0 },
         }
     })
 }

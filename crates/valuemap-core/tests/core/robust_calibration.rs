@@ -212,7 +212,7 @@ fn quick_estimates_from_one_side_are_off_to_neither() {
 }
 
 #[test]
-fn the_noise_of_covariances_is_found_from_drives_of_two_sides() {
+fn the_noise_of_positions_is_found_from_drives_of_two_sides() {
     let (scene, labels) = from_two_sides();
     for position_m in [0.15, 1.0] {
         let guess = Noise { position_m, position_segment_m: 0.03, rotation_segment_rad: 5e-4, ..NOISE };

@@ -3,8 +3,8 @@
 //! Boxes of one object wander from image to image: a detector errs alike where pictures are alike, and who draws boxes by hand moves them along. Then many
 //! images of a visit say less than as many independent ones. The errors that images have for themselves are taken for an autoregression along each segment of
 //! a visit, AR(1): those of successive looks at an object have one correlation, which restricted maximum likelihood tells with the sizes of the errors.
-//! Looks count as fewer independent ones then ([`variance_of_alike`](crate::robust::noise::variance_of_alike)). Who votes for what is told by single residuals, which are no larger for
-//! that, and positions stay where independent looks put them, as least squares do with covariances that heed correlations (Newey and West, "A simple, positive
+//! Looks count as fewer independent ones then ([`variance_of_alike`](crate::robust::noise::variance_of_alike)). Who votes for what is told by single
+//! residuals, which are no larger for that, and positions stay where independent looks put them, as least squares do with covariances that heed correlations (Newey and West, "A simple, positive
 //! semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix", 1987).
 
 use rayon::prelude::*;
@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use super::residuals::{VisitOf, minus_log_likelihood, search};
 use super::shared::stated;
 use crate::robust::energy::Placed;
-use crate::robust::noise::drift::{Look, segment_length};
+use crate::robust::noise::drift::{self, Look};
 use crate::robust::noise::{Known, Noise};
 use crate::robust::scene::Scene;
 
@@ -82,12 +82,8 @@ fn looks_of_segment(visits: &[Vec<Look>]) -> f64 {
 }
 
 /// The looks of each segment of a visit.
-fn segments(mut looks: &[Look]) -> impl Iterator<Item = &[Look]> {
-    std::iter::from_fn(move || {
-        let (segment, rest) = looks.split_at(segment_length(looks));
-        looks = rest;
-        (!segment.is_empty()).then_some(segment)
-    })
+fn segments(looks: &[Look]) -> impl Iterator<Item = &[Look]> {
+    drift::segments(looks, |look| look.driven_m)
 }
 
 /// Minus twice the logarithm of the restricted likelihood of the residuals of a visit, if successive looks of a segment have that correlation. Nothing if
@@ -109,7 +105,6 @@ mod tests {
     use nalgebra::{DMatrix, DVector, Vector3};
 
     use super::*;
-    use crate::robust::noise::drift::SEGMENT_M;
     use crate::robust::noise::variance_of_alike;
     use crate::street;
 
@@ -133,23 +128,13 @@ mod tests {
         let looks = visits[0].looks(&scene, &street::NOISE);
         assert!(looks.len() > 8 && segments(&looks).all(|segment| segment.len() > 1) && segments(&looks).count() > 2);
         let (correlation, rows) = (0.6_f64, 2 * looks.len());
-        let begins = |at: usize| {
-            looks[..=at].len()
-                - segments(&looks)
-                    .scan(0, |end, segment| {
-                        *end += segment.len();
-                        Some(*end)
-                    })
-                    .filter(|&end| end <= at)
-                    .last()
-                    .unwrap_or(0)
-        };
+        let of_segment = |(number, looks): (usize, &[Look])| vec![number; looks.len()];
+        let segment: Vec<usize> = segments(&looks).enumerate().flat_map(of_segment).collect();
         let covariance = DMatrix::from_fn(rows, rows, |a, b| {
             let (i, k) = (a / 2, b / 2);
-            let apart_m = (looks[i].driven_m - looks[k].driven_m).abs();
-            let is_one = apart_m <= SEGMENT_M && i + 1 - begins(i) == k + 1 - begins(k);
             let variance = (looks[i].detection_px2 * looks[k].detection_px2).sqrt();
-            if a % 2 == b % 2 && is_one { variance * correlation.powi(i.abs_diff(k) as i32) } else { 0.0 }
+            let is_alike = a % 2 == b % 2 && segment[i] == segment[k];
+            if is_alike { variance * correlation.powi(i.abs_diff(k) as i32) } else { 0.0 }
         });
         let residual = DVector::from_fn(rows, |row, _| looks[row / 2].residual[row % 2]);
         let by_point = DMatrix::from_fn(rows, 3, |row, axis| looks[row / 2].by_point[row % 2][axis]);

@@ -1,8 +1,8 @@
 //! What is estimated once of a scene, or of a sample of it: the noise, and what each class is like.
 //!
 //! [`likeliest`] seeks the noise from several starts, by maps of a sample of places and their [`residuals`]. [`split`](mod@split) divides it between poses and
-//! detections, and [`shared`] tells what passes disagree about. [`memory`] tells how far successive looks err alike. The classes are learned from a map of wider places. [`depth`] tells
-//! whether all moves of the search pay.
+//! detections, and [`shared`] tells what passes disagree about. The classes are learned from a map of wider places. [`memory`] tells how far successive
+//! looks err alike, and [`depth`] whether all moves of the search pay.
 
 pub mod depth;
 pub mod likeliest;

@@ -5,6 +5,7 @@
 //! own position; its neighbours in the same images can. So labels may be estimated together: a bundle adjustment with priors on
 //! the poses.
 
+use std::iter::repeat_n;
 use std::ops::Range;
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector2, Vector3};
@@ -15,7 +16,7 @@ use super::sides::sides;
 use super::sizes::size_terms;
 use crate::robust::model::Model;
 use crate::robust::model::ranges::range_terms;
-use crate::robust::noise::drift::{Drive, Look, Normals, SEGMENT_M, Vantage};
+use crate::robust::noise::drift::{Drive, Look, Normals, Vantage, segments};
 use crate::robust::noise::huber::huber_weight;
 use crate::robust::noise::spd::Vector6;
 use crate::robust::noise::{Noise, variance_of_alike};
@@ -694,15 +695,7 @@ pub fn looks_at(
 
 /// How many times as large the variance of each voter of one label is, if successive looks of a segment are off alike.
 fn times_of_alike(scene: &Scene, voters: &[u32], correlation: f64) -> Vec<f64> {
-    let mut times = Vec::with_capacity(voters.len());
-    for visit in visits(scene, voters) {
-        let mut left = visit;
-        while let Some(&first) = left.first() {
-            let is_far = |&ray: &u32| (scene.view(ray).driven_m - scene.view(first).driven_m).abs() > SEGMENT_M;
-            let looks = left.iter().position(is_far).unwrap_or(left.len());
-            times.extend(std::iter::repeat_n(variance_of_alike(looks, correlation), looks));
-            left = &left[looks..];
-        }
-    }
-    times
+    let driven_m = |&ray: &u32| scene.view(ray).driven_m;
+    let segments = visits(scene, voters).flat_map(|visit| segments(visit, driven_m));
+    segments.flat_map(|looks| repeat_n(variance_of_alike(looks.len(), correlation), looks.len())).collect()
 }

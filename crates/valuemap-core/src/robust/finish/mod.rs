@@ -45,11 +45,7 @@ pub fn labels(
     objects: Vec<Object>,
     few: Vec<Object>,
 ) -> (Vec<Finding>, f64) {
-    let mut estimates = positions(model, model.noise, &objects);
-    if of_covariances != model.noise {
-        let honest = positions(model, of_covariances, &objects);
-        estimates.iter_mut().zip(honest).for_each(|(estimate, honest)| estimate.covariance = honest.covariance);
-    }
+    let estimates = positions(model, of_covariances, &objects);
     let factor = if model.settings.has(Part::Scaling) {
         variance_factor(model.scene, of_covariances, &placed(&objects), objects.len().max(1))
     } else {

@@ -14,18 +14,30 @@ use crate::robust::parts::Part;
 
 /// Objects within this share of the range of the one with the most votes are estimated with it.
 const PLACE_SHARE: f64 = 0.4;
-/// The estimate of every object with a noise, in their order.
+
+/// The estimate of every object, in their order; covariances have a noise of their own.
 #[must_use]
-pub fn positions(model: &Model<'_>, noise: &Noise, objects: &[Object]) -> Vec<Estimate> {
+pub fn positions(model: &Model<'_>, of_covariances: &Noise, objects: &[Object]) -> Vec<Estimate> {
     let contest = Contest::new(model, objects);
-    let mut estimates: Vec<Estimate> =
-        objects.iter().map(|object| Estimate { point: object.fit.point, covariance: object.fit.covariance }).collect();
     let places = places_of_all(objects, model.settings.viability.max_range_m * PLACE_SHARE);
-    // One at a time: the first ones are the largest.
-    let found: Vec<Vec<(usize, Estimate)>> =
-        places.par_iter().with_max_len(1).map(|place| together(model, noise, objects, place, &contest)).collect();
-    for (i, estimate) in found.into_iter().flatten() {
-        estimates[i] = estimate;
+    let estimated = |noise: &Noise| {
+        let mut estimates: Vec<Estimate> = objects
+            .iter()
+            .map(|object| Estimate { point: object.fit.point, covariance: object.fit.covariance })
+            .collect();
+        // One at a time: the first ones are the largest.
+        let found: Vec<Vec<(usize, Estimate)>> =
+            places.par_iter().with_max_len(1).map(|place| together(model, noise, objects, place, &contest)).collect();
+        for (i, estimate) in found.into_iter().flatten() {
+            estimates[i] = estimate;
+        }
+        estimates
+    };
+    let mut estimates = estimated(model.noise);
+    if of_covariances != model.noise {
+        for (estimate, honest) in estimates.iter_mut().zip(estimated(of_covariances)) {
+            estimate.covariance = honest.covariance;
+        }
     }
     estimates
 }
@@ -57,10 +69,35 @@ mod tests {
     use nalgebra::Vector3;
 
     use super::*;
+    use crate::robust::energy::estimate::looks_at;
     use crate::robust::energy::looks::Lookout;
     use crate::robust::energy::object;
     use crate::robust::model::heights::Heights;
+    use crate::robust::noise::variance_of_alike;
     use crate::street;
+
+    #[test]
+    fn looks_that_are_off_alike_say_less_of_positions_and_move_none() {
+        let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
+        let point = Vector3::new(48.0, 5.0, 3.0);
+        // Images at 0 to 34 m: three segments of six.
+        let scene = street::street(18, 2.0, &[point], &errors);
+        let votes = scene.usable_rays();
+        assert_eq!(votes.len(), 18);
+        let model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let found: Vec<Object> = object(&model, &lookout, votes.clone(), point, Vec::new()).into_iter().collect();
+        assert_eq!(found.len(), 1);
+        let alike = Noise { look_correlation: 0.8, ..street::NOISE };
+        let times = variance_of_alike(6, 0.8);
+        let [before, after] = [&street::NOISE, &alike].map(|noise| positions(&model, noise, &found)[0]);
+        assert_eq!(before.point, after.point);
+        assert!((after.covariance - before.covariance * times).norm() < 0.01 * after.covariance.norm());
+        let looks = |noise| looks_at(&scene, noise, noise, &votes, &point).unwrap_or_default();
+        for (before, after) in looks(&street::NOISE).iter().zip(looks(&alike)) {
+            assert!((after.detection_px2 / before.detection_px2 - times).abs() < 1e-9);
+        }
+    }
 
     #[test]
     fn heights_tell_how_far_objects_are_but_not_how_high_the_cameras_were() {

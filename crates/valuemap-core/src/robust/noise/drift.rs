@@ -201,8 +201,8 @@ impl Look {
         }
     }
 
-    /// What is new in a look [by itself](Self::by_itself) after the one before it, whose error, in sigmas, it shares with a correlation: a look of variance 1. With it the
-    /// logarithm of the determinant of what is new, px⁴.
+    /// What is new in a look [by itself](Self::by_itself) after the one before it, whose error, in sigmas, it shares with a correlation: a look of
+    /// variance 1. With it the logarithm of the determinant of what is new, px⁴.
     #[must_use]
     pub fn innovation(&self, before: Option<&Self>, correlation: f64) -> (Self, f64) {
         let correlation = if before.is_some() { correlation } else { 0.0 };
@@ -422,7 +422,7 @@ impl<'a> Drive<'a> {
         let mut ln_determinant_of_images = 0.0;
         let mut start = 0;
         while start < looks.len() {
-            let end = start + segment_length(&looks[start..]);
+            let end = start + segment_length(&looks[start..], |look| look.driven_m);
             let mut at = start;
             let mut segment = Segment::nothing();
             for image in looks[start..end].chunk_by(|a, b| a.image == b.image) {
@@ -741,9 +741,17 @@ impl Segment {
     }
 }
 
-/// How many looks, from the first one on, share one drift.
-#[must_use]
-pub fn segment_length(looks: &[Look]) -> usize {
-    let is_far = |look: &Look| (look.driven_m - looks[0].driven_m).abs() > SEGMENT_M;
+/// How many looks, from the first one on, share one drift: anything that knows how far its pass had driven, m.
+fn segment_length<T>(looks: &[T], driven_m: impl Fn(&T) -> f64) -> usize {
+    let is_far = |look: &T| (driven_m(look) - driven_m(&looks[0])).abs() > SEGMENT_M;
     looks.iter().position(is_far).unwrap_or(looks.len())
+}
+
+/// The looks of a visit that share one drift each: anything that knows how far its pass had driven, m.
+pub fn segments<T>(mut looks: &[T], driven_m: impl Fn(&T) -> f64) -> impl Iterator<Item = &[T]> {
+    std::iter::from_fn(move || {
+        let (segment, rest) = looks.split_at(segment_length(looks, &driven_m));
+        looks = rest;
+        (!segment.is_empty()).then_some(segment)
+    })
 }

@@ -209,9 +209,9 @@ impl Noise {
     }
 }
 
-/// How many times as large as that of independent ones the variance of so many looks of one segment is, if successive ones have a correlation: of their mean it is
-/// that of an autoregression, AR(1). One look is as good as ever, and many are (1 + correlation) / (1 - correlation) times as bad, by the integrated
-/// autocorrelation time (Sokal, "Monte Carlo methods in statistical mechanics", 1997, section 3).
+/// How many times as large as that of independent ones the variance of so many looks of one segment is, if successive ones have a correlation: of their
+/// mean it is that of an autoregression, AR(1). One look is as good as ever, and many are (1 + correlation) / (1 - correlation) times as bad, by the
+/// integrated autocorrelation time (Sokal, "Monte Carlo methods in statistical mechanics", 1997, section 3).
 #[must_use]
 pub fn variance_of_alike(looks: usize, correlation: f64) -> f64 {
     let looks = looks as f64;
