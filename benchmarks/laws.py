@@ -44,6 +44,7 @@ from valuemap.dataset import Dataset, Frame
 from valuemap.errors import ValuemapError
 from valuemap.map_folder import Map
 from valuemap.pipeline import build_map
+from valuemap.reach import with_usual_range
 from valuemap.tables import Categories, Floats, Ints
 
 SAME_M = 1e-3
@@ -245,7 +246,11 @@ def _placed(dataset: Dataset, config: MapConfig, scale: float, turn: Rotation, s
 
 
 def _scaled_settings(config: MapConfig, scale: float) -> MapConfig:
-    """Return the settings with all that are in metres multiplied, but for those that are estimated."""
+    """Return the settings with all that are in metres multiplied, but for those that are estimated.
+
+    Ranges, which are told from the data where they are not given, are multiplied too: those of streets.
+    """
+    config = with_usual_range(config)
     value = config.as_dict()
     metres = [name for name, _, unit, _ in describe_settings() if unit == "m" and value.get(name) is not None]
     metres = [name for name in metres if name not in config.ignored_settings()]

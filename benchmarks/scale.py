@@ -394,7 +394,7 @@ def split(dataset: Path, folder: Path) -> tuple[Path, Path, dict[str, Any]]:
     through a new tile and not through too many.
     """
     whole = valuemap.read_dataset(dataset)
-    images, grid = whole.images, Grid.of(whole.frame, MapConfig().vote.max_range_m)
+    images, grid = whole.images, Grid.of(whole.frame, MapConfig().vote.farthest_m)
     place_m = grid.images_on_ground(images)
     tile = np.floor((place_m + 0.5 * grid.side_m) / grid.side_m).astype(np.int64)
     code, time_s = images.pass_id.codes, images.timestamp_s

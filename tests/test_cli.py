@@ -241,7 +241,7 @@ def test_misspelt_settings_are_refused_with_a_suggestion(street: Path, tmp_path:
     line = complains("map", street, "--out", tmp_path / "map", "--set", "min_vote=4")
     assert "did you mean min_votes?" in line
     assert "expected a whole number" in complains("map", street, "--out", tmp_path / "map", "--set", "min_votes=many")
-    assert "expected above 0" in complains("map", street, "--out", tmp_path / "map", "--set", "max_range_m=-1")
+    assert "expected at least 1e-06" in complains("map", street, "--out", tmp_path / "map", "--set", "max_range_m=-1")
 
 
 def test_an_option_that_the_method_ignores_is_refused(street: Path, tmp_path: Path) -> None:

@@ -69,14 +69,14 @@ def test_every_setting_is_described() -> None:
         ("alpha=1", "there is no setting named 'alpha'", "settings are: cluster_radius_m, "),
         ("method=robust", "there is no setting named 'method'", "settings are: "),
         ("=3", "there is no setting named ''", "settings are: "),
-        ("max_range_m", "--set max_range_m: expected name=value", "for example --set max_range_m=60.0"),
+        ("min_votes", "--set min_votes: expected name=value", "for example --set min_votes=3"),
         ("max_rnage_m", "there is no setting named 'max_rnage_m'", "did you mean max_range_m?"),
         (
             "max_range_m=far",
             r"max_range_m: expected a number \(m\), found 'far'",
-            "the default is max_range_m=60",
+            "the default is max_range_m=estimated",
         ),
-        ("max_range_m=", r"max_range_m: expected a number \(m\), found ''", "the default is max_range_m=60"),
+        ("max_range_m=", r"max_range_m: expected a number \(m\), found ''", "the default is max_range_m=estimated"),
         (
             "min_votes=3.5",
             r"min_votes: expected a whole number \(images\), found '3.5'",
@@ -97,8 +97,8 @@ def test_every_setting_is_described() -> None:
             r"merge_radius_m: expected at least 0 and at most 100000 \(m\), found -1",
             "merge_radius_m=1",
         ),
-        ("max_range_m=inf", r"max_range_m: expected above 0 and at most 100000 \(m\), found inf", "max_range_m=60"),
-        ("max_range_m=nan", r"max_range_m: expected above 0 and at most 100000 \(m\), found nan", "max_range_m=60"),
+        ("max_range_m=inf", r"max_range_m: expected at least 1e-06 and at most 100000 \(m\), found inf", "=estimated"),
+        ("max_range_m=nan", r"max_range_m: expected at least 1e-06 and at most 100000 \(m\), found nan", "=estimated"),
         (
             "min_parallax_deg=91",
             r"min_parallax_deg: expected at least 0 and at most 90 \(deg\), found 91",
@@ -165,7 +165,7 @@ def test_settings_have_the_type_that_they_declare() -> None:
     ("kind", "given", "line"),
     [
         (VoteConfig, {"max_range_m": "80"}, r"max_range_m: expected a number \(m\), found '80'"),
-        (VoteConfig, {"max_range_m": None}, r"max_range_m: expected a number \(m\), found None"),
+        (VoteConfig, {"min_parallax_deg": None}, r"min_parallax_deg: expected a number \(deg\), found None"),
         (VoteConfig, {"min_votes": 3.5}, r"min_votes: expected a whole number \(images\), found 3.5"),
         (VoteConfig, {"min_votes": True}, r"min_votes: expected a whole number \(images\), found True"),
         (MapConfig, {"max_range_m": "80"}, r"max_range_m: expected a number \(m\), found '80'"),

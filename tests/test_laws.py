@@ -9,10 +9,11 @@ import pytest
 
 import laws
 from scenes import as_dataset, random_scene
-from valuemap.config import MapConfig
+from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import Dataset
 from valuemap.map_folder import Map
 from valuemap.pipeline import build_map
+from valuemap.simulate import simulate
 from valuemap.tables import Categories
 
 ONE_CLUSTER = MapConfig(method="paper").with_settings(["cluster_radius_m=500"])
@@ -75,7 +76,7 @@ def test_every_law_changes_something(dataset: Dataset, name: str) -> None:
 def test_a_larger_world_has_larger_settings(dataset: Dataset, before: Map) -> None:
     changed = laws.LAWS["x 10"](dataset, ONE_CLUSTER, np.random.default_rng(0))
     assert changed is not None
-    assert changed.config.vote.max_range_m == 10 * ONE_CLUSTER.vote.max_range_m
+    assert changed.config.vote.max_range_m == 10 * ONE_CLUSTER.vote.farthest_m
     assert changed.config.vote.max_reprojection_error_px == ONE_CLUSTER.vote.max_reprojection_error_px
     assert changed.config.noise.position_sigma_m is None
     without = build_map(changed.dataset, ONE_CLUSTER)
@@ -101,3 +102,11 @@ def test_what_differs_is_told(dataset: Dataset, before: Map) -> None:
     assert (
         laws.compare_maps(before, dataclasses.replace(before, labels=labels.replace(class_name=other)), same).same == 0
     )
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_world_of_another_size_with_its_settings_is_the_same_map(seed: int) -> None:
+    """Every length of the method is in proportion to `max_range_m`, in the core and where poses are compared."""
+    few = SimulationConfig(passes_per_street=2, streets_north_south=2, streets_east_west=2, frame_spacing_m=4.0)
+    verdicts = laws.check_laws(simulate(few, seed=seed), MapConfig(), ["x 10", "x 0.1"])
+    assert {name: str(verdict) for name, verdict in verdicts.items()} == {"x 10": "holds", "x 0.1": "holds"}

@@ -249,7 +249,7 @@ def test_a_scene_fails_without(part: str) -> None:
 
 def test_what_is_left_over_is_born_where_not_all_moves_pay(monkeypatch: pytest.MonkeyPatch) -> None:
     ordered = InMemory(scene("trees", 2)[0], POSES_AS_THEY_ARE).sample()
-    seen = robust.Scene(ordered.dataset, ordered.drives, cast_sightings(ordered.dataset)[0])
+    seen = robust.Scene(ordered.dataset, ordered.drives, cast_sightings(ordered.dataset)[0], 1.0)
     known = replace(robust.calibrate(seen, POSES_AS_THEY_ARE)[0], is_deep=False)
     _, counts = robust.find_labels(seen, known, POSES_AS_THEY_ARE)
     monkeypatch.setattr(robust, "LEFT_OUT", {"births"})

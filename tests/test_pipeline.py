@@ -226,7 +226,7 @@ def test_a_map_survives_its_folder(tmp_path: Path) -> None:
     assert table_to_arrow(again.rejected).equals(table_to_arrow(result.rejected))
     assert same_tables(result, again)
     assert again.frame == result.frame
-    assert again.run["settings"] == valuemap.MapConfig().as_dict()
+    assert again.run["settings"] == {**valuemap.MapConfig().as_dict(), "max_range_m": 60.0, "min_range_m": 2.0}
 
 
 @both_methods

@@ -667,7 +667,7 @@ def test_cells_on_disk_get_the_poses_that_were_corrected(tmp_path: Path, monkeyp
 def test_what_is_too_large_to_be_looked_at_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_dataset(simulate(dataclasses.replace(CITY, passes_per_street=1, **FEWER_IMAGES), seed=1), tmp_path / "data")
     for module in (correction, pipeline):
-        monkeypatch.setattr(module, "MOST_CORRECTED", 100)
+        monkeypatch.setattr(module, "MOST_LOOKED_AT", 100)
     results = [valuemap.build_map(valuemap.read_dataset(tmp_path / "data"), valuemap.MapConfig())]
     for tile_size_m in (None, 500.0):
         with open_work(tmp_path / f"work{tile_size_m}", resume=False) as work:

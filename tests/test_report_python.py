@@ -104,7 +104,7 @@ def test_single_settings_are_given_by_name() -> None:
     ("settings", "message"),
     [
         ({"max_rang_m": 80}, "there is no setting named 'max_rang_m'"),
-        ({"max_range_m": -1.0}, "max_range_m: expected above 0"),
+        ({"max_range_m": -1.0}, "max_range_m: expected at least 1e-06"),
         ({"max_range_m": "80"}, "max_range_m: expected a number"),
         ({"max_range_m": True}, "max_range_m: expected a number"),
         ({"min_votes": 2.5}, "min_votes: expected a whole number"),

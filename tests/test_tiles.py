@@ -375,7 +375,7 @@ def crossing(passes: int) -> InOrder:
 
 
 def learned(piece: InOrder) -> Calibration:
-    return calibrate(Scene(piece.dataset, piece.drives, cast_sightings(piece.dataset)[0]), KNOWN)[0]
+    return calibrate(Scene(piece.dataset, piece.drives, cast_sightings(piece.dataset)[0], 1.0), KNOWN)[0]
 
 
 def test_a_dense_place_is_solved_some_drives_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:

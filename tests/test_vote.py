@@ -25,8 +25,8 @@ def literal_settings(config: VoteConfig) -> Settings:
     return Settings(
         d_max_px=config.max_reprojection_error_px,
         theta_min_rad=math.radians(config.min_parallax_deg),
-        r_min_m=config.min_range_m,
-        r_max_m=config.max_range_m,
+        r_min_m=config.nearest_m,
+        r_max_m=config.farthest_m,
         alpha=config.min_vote_ratio,
         min_votes=config.min_votes,
     )

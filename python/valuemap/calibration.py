@@ -81,7 +81,7 @@ def _estimated(
     progress: Progress,
 ) -> Calibration:
     """Estimate all but middles that sides show, which all objects tell together, and all again with these if any."""
-    scene = Scene(sample.dataset, sample.drives, cast_sightings(sample.dataset)[0])
+    scene = Scene(sample.dataset, sample.drives, cast_sightings(sample.dataset)[0], config.vote.unit_m)
 
     def estimated(config: MapConfig, sought: Sought | None) -> tuple[Calibration, Candidates]:
         threads = engine.threads_of_task(1)

@@ -13,6 +13,7 @@ from valuemap.dataset import Dataset
 from valuemap.engine.engine import Engine
 from valuemap.engine.threads import ThreadEngine
 from valuemap.progress import Progress
+from valuemap.reach import MOST_LOOKED_AT
 from valuemap.refine import (
     FITS_NO_BETTER,
     Mapped,
@@ -32,8 +33,6 @@ from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.seams import join_cells
 from valuemap.tiles.source import InMemory
 
-MOST_CORRECTED = 300_000
-"""Poses are looked at in datasets of no more images and detections: a minute or two."""
 TOO_LARGE = "large dataset: poses were taken as they are"
 _MAPS_OF_IMAGES = 5
 """Maps that tell errors of images, at most, before the one that stays."""
@@ -50,7 +49,7 @@ def correct_poses(dataset: Dataset, config: MapConfig, stages: Stages, threads: 
 
 def _proven(dataset: Dataset, config: MapConfig, stages: Stages, threads: int, progress: Progress) -> Refined:
     """Correct what whole drives' poses are proven wrong by, if that makes the same detections likelier."""
-    if len(dataset.images) + len(dataset.detections) > MOST_CORRECTED and config.poses.correct_poses:
+    if len(dataset.images) + len(dataset.detections) > MOST_LOOKED_AT and config.poses.correct_poses:
         return Refined(dataset, {"found": "nothing", "because": TOO_LARGE})
 
     with stages.measured("poses"):

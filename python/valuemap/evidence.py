@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from valuemap.cameras import Rays, camera_centers, cast_rays, lens_of, rotation_of
+from valuemap.config import USUAL_RANGE_M
 from valuemap.dataset import MARKER, Dataset, number_passes, rows_of
 from valuemap.drives import find_drives
 from valuemap.errors import InputError
@@ -167,7 +168,7 @@ class Evidence:
         """How far away the map looked for objects."""
         settings = self.result.run.get("settings")
         value = settings.get("max_range_m") if isinstance(settings, dict) else None
-        return float(value) if isinstance(value, int | float) else 60.0
+        return float(value) if isinstance(value, int | float) else USUAL_RANGE_M
 
     def label_row(self, label_id: int) -> int:
         """Return the row of a label in the labels table.

@@ -80,7 +80,7 @@ def noise_at_bound(findings: Findings) -> str | None:
         "detection_px": (noise.get("detection_px", 0.0), given.detection_sigma_px),
         "box_share": (noise.get("box_share", 0.0), given.detection_sigma_px),
         "position_m": (
-            math.hypot(noise.get("position_m", 0.0), noise.get("position_drift_m", 0.0)),
+            math.hypot(noise.get("position_m", 0.0), noise.get("position_drift_m", 0.0)) / findings.config.vote.unit_m,
             given.position_sigma_m,
         ),
     }

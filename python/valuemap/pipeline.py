@@ -13,7 +13,7 @@ import numpy as np
 from valuemap.calibration import calibrate, with_sides
 from valuemap.cameras import Rays, cast_rays, directions_down
 from valuemap.config import MapConfig, bounded_threads
-from valuemap.correction import MOST_CORRECTED, TOO_LARGE, correct_poses, with_errors_of_images
+from valuemap.correction import TOO_LARGE, correct_poses, with_errors_of_images
 from valuemap.dataset import Dataset, Frame, ensure_checked, read_dataset, write_dataset
 from valuemap.describe import describe_labels
 from valuemap.engine.engine import Engine
@@ -26,6 +26,7 @@ from valuemap.paper.partition import partition_images
 from valuemap.paper.vote import vote_in_clusters
 from valuemap.portions import rows_on_disk
 from valuemap.progress import Progress, silent
+from valuemap.reach import MOST_LOOKED_AT, with_range, with_usual_range
 from valuemap.refine import (
     Refined,
 )
@@ -81,6 +82,7 @@ def build_map(
     config, threads = config or MapConfig(), bounded_threads(threads)
     _check_detections(dataset.name, len(dataset.detections))
     dataset = ensure_checked(dataset)
+    config, odd_range = with_range(dataset, config)
     stages = Stages()
     refined = None
     if config.method == "paper":
@@ -98,7 +100,7 @@ def build_map(
     if refined is not None and refined.is_corrected:
         result = replace(result, corrected=refined.dataset)
     result = _with_rejected(result, lambda: result.corrected or dataset, stages)
-    return _with_notes(result, _notes_on_input(dataset))
+    return _with_notes(result, _notes_on_input(dataset, odd_range))
 
 
 @dataclass(frozen=True)
@@ -180,19 +182,24 @@ def build_map_of_folder(
         if config.method == "paper":
             return build_map(dataset, config, threads=threads, progress=progress), []
         _check_detections(dataset.name, len(dataset.detections))
+        config, odd_range = with_range(dataset, config)
         refined = correct_poses(dataset, config, stages, threads, progress)
         if on_posed is not None:
             on_posed(refined.dataset)
         with stages.measured("order"):
             source: Source = InMemory(refined.dataset, config)
         size = {"images": len(dataset.images), "detections": len(dataset.detections)}
-        name, frame, notes = dataset.name, dataset.frame, _notes_on_input(dataset)
+        name, frame, notes = dataset.name, dataset.frame, _notes_on_input(dataset, odd_range)
     else:
-        if images + detections <= MOST_CORRECTED and detections:
-            refined = correct_poses(ensure_checked(held or read_dataset(folder)), config, stages, threads, progress)
+        if images + detections <= MOST_LOOKED_AT and detections:
+            dataset = ensure_checked(held or read_dataset(folder))
+            config, odd_range = with_range(dataset, config)
+            notes = [] if odd_range is None else [odd_range]
+            refined = correct_poses(dataset, config, stages, threads, progress)
             if refined.is_corrected:
                 folder = run.work / CORRECTED
                 write_dataset(refined.dataset, folder)
+        config = with_usual_range(config)
         with stages.measured("partition"):
             on_disk = partition_dataset(
                 folder, run.work, config, store=run.store, tile_size_m=run.tile_size_m, progress=progress
@@ -220,9 +227,10 @@ def _with_rejected(result: Map, read: Callable[[], Dataset], stages: Stages) -> 
     return replace(result, rejected=rejected, run={**result.run, "stages": stages.records})
 
 
-def _notes_on_input(dataset: Dataset) -> list[str]:
+def _notes_on_input(dataset: Dataset, odd_range: str | None) -> list[str]:
     cosine_to_sky = -directions_down(dataset.images) @ np.array(dataset.frame.up)
-    notes = (cameras_not_upright(cosine_to_sky), heights_not_measured(dataset.detections.vertical_sigma_px))
+    upright = cameras_not_upright(cosine_to_sky)
+    notes = (odd_range, upright, heights_not_measured(dataset.detections.vertical_sigma_px))
     return [note for note in notes if note is not None]
 
 

@@ -35,7 +35,8 @@ _MOST_AROUND = 300
 """Detections of one place and class that are looked at, evenly spread where there are more: work is cubic in them."""
 _SAME_PLACE = 16.27
 """Squared distance in sigmas up to which a point and a label can be one: chi-square, 3 axes, 99.9 %."""
-_SAME_PLACE_M = 3.0
+_SAME_PLACE_RANGES = 0.05
+"""Labels so many ranges away are asked whether they are what a point is: 3 m in streets."""
 _WIDER = 1.5
 """Points so many times farther away than the map looks are proposed, to be refused for it."""
 _NO_LABEL = -1
@@ -245,7 +246,8 @@ def _labels_there(evidence: Evidence, left: _LeftOver, found: Candidates) -> tup
     )
     spread = covariance_matrices(labels.covariance_m2)
     names = left.dataset.detections.class_name.take(found.voters[found.voter_offsets[:-1]].astype(np.int64))
-    near = scipy.spatial.cKDTree(labels.position_in_world_m).query_ball_point(found.position_in_world_m, _SAME_PLACE_M)
+    around_m = _SAME_PLACE_RANGES * evidence.max_range_m
+    near = scipy.spatial.cKDTree(labels.position_in_world_m).query_ball_point(found.position_in_world_m, around_m)
     for row, rows in enumerate(near):
         if not rows:
             continue

@@ -13,10 +13,10 @@ import numpy as np
 
 import valuemap._core as _core
 from valuemap.cameras import Rays, camera_poses, picture_bounds
-from valuemap.config import MapConfig, NoiseConfig
+from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives
-from valuemap.errors import InputError
+from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, counted, silent
 from valuemap.rounding import rounding_px
 from valuemap.tables import Candidates, Floats, Ints
@@ -51,10 +51,23 @@ class Noise:
         """Return the ten numbers in the order of the fields."""
         return astuple(self)
 
+    def in_units(self, unit_m: float) -> Noise:
+        """Return it with lengths in units of so many metres."""
+        return replace(
+            self,
+            position_m=self.position_m / unit_m,
+            position_segment_m=self.position_segment_m / unit_m,
+            position_drift_m=self.position_drift_m / unit_m,
+            side_m=self.side_m / unit_m,
+        )
+
 
 @dataclass(frozen=True)
 class Calibration:
-    """All that is estimated once of a dataset, before any part of it is mapped."""
+    """All that is estimated once of a dataset, before any part of it is mapped.
+
+    What is learned of classes has lengths in the unit of the settings that it was learned with, `VoteConfig.unit_m`.
+    """
 
     noise: Noise
     noise_of_covariances: Noise
@@ -68,7 +81,7 @@ class Calibration:
     confusions: dict[str, dict[str, float]]
     """By class of the object and said class: the share of its detections. Only where classes are taken for others."""
 
-    def as_tuple(self, class_names: Sequence[str]) -> tuple[Any, ...]:
+    def as_tuple(self, class_names: Sequence[str], unit_m: float) -> tuple[Any, ...]:
         """Return it as the core takes it, for classes in this order."""
         classes = [self.classes.get(name) for name in class_names]
         code = {name: number for number, name in enumerate(class_names)}
@@ -76,7 +89,8 @@ class Calibration:
             [(code[said], share) for said, share in self.confusions.get(name, {}).items() if said in code]
             for name in class_names
         ]
-        return self.noise.as_tuple(), self.noise_of_covariances.as_tuple(), self.is_deep, classes, self.pooled, shares
+        noise = (each.in_units(unit_m).as_tuple() for each in (self.noise, self.noise_of_covariances))
+        return *noise, self.is_deep, classes, self.pooled, shares
 
 
 def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
@@ -133,12 +147,13 @@ def _numbers(fields: dict[str, Any]) -> tuple[float, ...]:
 
 
 class Scene:
-    """A dataset as the core's robust method holds it."""
+    """A dataset as the core's robust method holds it: in units of `unit_m`, which its lengths in metres are of."""
 
-    def __init__(self, dataset: Dataset, drives: Drives, rays: Rays) -> None:
+    def __init__(self, dataset: Dataset, drives: Drives, rays: Rays, unit_m: float) -> None:
         self._dataset = dataset
         self._drives = drives
         self.rays = rays
+        self.unit_m = unit_m
 
     @property
     def class_names(self) -> Sequence[str]:
@@ -156,23 +171,32 @@ class Scene:
         images, detections = self._dataset.images, self._dataset.detections
         normals, solid_angle_sr = picture_bounds(self._dataset.cameras)
         cam_from_world, center_in_world_m = camera_poses(images)
+        self._check_unit(center_in_world_m)
         return _core.Scene(
-            self.rays.core,
+            self.rays.core if self.unit_m == 1.0 else self.rays.core.in_units(self.unit_m),
             box_px=np.ascontiguousarray(detections.size_px[:, 1]),
             score=_or_nan(detections.score, len(detections)),
-            range_m=_or_nan(detections.range_m, len(detections)),
-            range_sigma_m=_or_nan(detections.range_sigma_m, len(detections)),
-            center_in_world_m=center_in_world_m,
+            range_m=_or_nan(detections.range_m, len(detections)) / self.unit_m,
+            range_sigma_m=_or_nan(detections.range_sigma_m, len(detections)) / self.unit_m,
+            center_in_world_m=center_in_world_m / self.unit_m,
             cam_from_world=cam_from_world,
             camera=rows_of(images.camera_id, self._dataset.cameras.camera_id).astype(np.uint32),
             pass_code=self._drives.pass_code.astype(np.uint32),
             viewpoint=self._drives.viewpoint.astype(np.uint32),
-            driven_m=self._drives.driven_m,
-            position_sigma_m=_or_nan(images.position_sigma_m, len(images)),
+            driven_m=self._drives.driven_m / self.unit_m,
+            position_sigma_m=_or_nan(images.position_sigma_m, len(images)) / self.unit_m,
             rotation_sigma_rad=_or_nan(images.rotation_sigma_rad, len(images)),
             frustum_normals=normals,
             solid_angle_sr=solid_angle_sr,
         )
+
+    def _check_unit(self, center_in_world_m: Floats) -> None:
+        farthest_m = float(np.abs(center_in_world_m).max(initial=0.0))
+        if farthest_m > _core.FARTHEST_M * self.unit_m:
+            raise SettingError(
+                f"max_range_m: images are up to {farthest_m:.3g} m from the origin, too far for so short a range",
+                hint="leave max_range_m away to have it told from the data",
+            )
 
 
 MISFIT_STEPS: int = _core.MISFIT_STEPS
@@ -199,12 +223,12 @@ def calibrate(
     What the config sets of the noise stays as it is. The scene may be a part of what is mapped. `sought` is what
     `misfits` found of the same scene with the same config: it is the most work, and done once.
     """
-    guess, known = _guess(config.noise, scene.rounding_px)
+    guess, known = _guess(config, scene.rounding_px)
     steps = _core.CALIBRATION_STEPS + (2 * _core.SEARCH_STEPS if is_part else 0)
     with counted(progress, "estimating the noise", steps) as tell:
         (noise, of_covariances, is_deep, classes, pooled, shares), position, (offsets, voters) = _core.calibrate(
             scene.core,
-            guess.as_tuple(),
+            guess,
             known,
             _settings(config),
             is_part,
@@ -212,15 +236,16 @@ def calibrate(
             threads,
             lambda done, _total: tell(done),
         )
+    metre = 1.0 / scene.unit_m
     calibration = Calibration(
-        noise=Noise(*noise),
-        noise_of_covariances=Noise(*of_covariances),
+        noise=Noise(*noise).in_units(metre),
+        noise_of_covariances=Noise(*of_covariances).in_units(metre),
         is_deep=is_deep,
         classes={name: tuple(row) for name, row in zip(scene.class_names, classes, strict=False) if row is not None},
         pooled=tuple(pooled),
         confusions=_by_name(shares, scene.class_names),
     )
-    return calibration, Candidates(position, offsets, voters)
+    return calibration, Candidates(position * scene.unit_m, offsets, voters)
 
 
 def _by_name(shares: Sequence[Sequence[tuple[int, float]]], class_names: Sequence[str]) -> dict[str, dict[str, float]]:
@@ -245,11 +270,11 @@ def misfits(
     `second_of_first` (N) is the row in the second scene of each detection of the first. `tell` hears again and again
     how many of `MISFIT_STEPS` are done, and stops the work by an exception.
     """
-    guess, known = _guess(config.noise, scenes[0].rounding_px)
+    guess, known = _guess(config, scenes[0].rounding_px)
     (first, second), count, sought = _core.misfits(
         (scenes[0].core, scenes[1].core),
         second_of_first.astype(np.uint32),
-        guess.as_tuple(),
+        guess,
         known,
         _settings(config),
         threads,
@@ -274,48 +299,49 @@ def find_labels(
     with counted(progress, "finding labels", steps_of_labels(calibration)) as tell:
         position, class_code, (offsets, voters), covariance, existence, expected, counts = _core.find_labels(
             scene.core,
-            calibration.as_tuple(scene.class_names),
+            calibration.as_tuple(scene.class_names, scene.unit_m),
             _settings(config),
             threads,
             lambda done, _total: tell(done),
         )
-    covariance = covariance.reshape(-1, 3, 3)
+    covariance = covariance.reshape(-1, 3, 3) * scene.unit_m**2
     said = scene.rays.class_code[voters.astype(np.int64)]
     is_confused = said != np.repeat(class_code, np.diff(offsets))
     counts = {"votes_of_another_class": int(is_confused.sum()), **counts}
     counts = {_COUNTED_AS.get(name, name): value for name, value in counts.items()}
     return Candidates(
-        position, offsets, voters, None, covariance, existence, expected, class_code.astype(np.int64)
+        position * scene.unit_m, offsets, voters, None, covariance, existence, expected, class_code.astype(np.int64)
     ), counts
 
 
-def _guess(config: NoiseConfig, least_px: float) -> tuple[Noise, tuple[list[bool], float]]:
-    """Return where the estimation starts, and what is known: what the user sets, and that detections are rounded.
+def _guess(config: MapConfig, least_px: float) -> tuple[tuple[float, ...], tuple[list[bool], float]]:
+    """Return where the estimation starts, for the core, and what is known: what the user sets, and that detections are
+    rounded.
 
     The former are detection, position and rotation; detections are off by at least `least_px`.
     """
-    noise = Noise()
-    if config.detection_sigma_px is not None:
-        noise = replace(noise, detection_px=config.detection_sigma_px, box_share=0.0)
+    noise, given, unit_m = Noise(), config.noise, config.vote.unit_m
+    if given.detection_sigma_px is not None:
+        noise = replace(noise, detection_px=given.detection_sigma_px, box_share=0.0)
     # A known total says nothing about its parts: a third of the variance each.
-    if config.position_sigma_m is not None:
-        part = config.position_sigma_m / math.sqrt(3.0)
+    if given.position_sigma_m is not None:
+        part = given.position_sigma_m / unit_m / math.sqrt(3.0)
         noise = replace(noise, position_m=part, position_segment_m=part, position_drift_m=part)
-    if config.rotation_sigma_deg is not None:
-        part = math.radians(config.rotation_sigma_deg) / math.sqrt(3.0)
+    if given.rotation_sigma_deg is not None:
+        part = math.radians(given.rotation_sigma_deg) / math.sqrt(3.0)
         noise = replace(noise, rotation_rad=part, rotation_segment_rad=part, rotation_drift_rad=part)
-    if config.side_sigma_m is not None:
-        noise = replace(noise, side_m=config.side_sigma_m)
-    known = [config.detection_sigma_px, config.position_sigma_m, config.rotation_sigma_deg]
-    return noise, ([value is not None for value in known], least_px)
+    if given.side_sigma_m is not None:
+        noise = replace(noise, side_m=given.side_sigma_m / unit_m)
+    known = [given.detection_sigma_px, given.position_sigma_m, given.rotation_sigma_deg]
+    return noise.as_tuple(), ([value is not None for value in known], least_px)
 
 
 def _settings(config: MapConfig) -> tuple[float, float, float, float, int, int, float, list[str]]:
     vote = config.vote
     return (
         math.radians(vote.min_parallax_deg),
-        vote.min_range_m,
-        vote.max_range_m,
+        vote.nearest_m / vote.unit_m,
+        vote.farthest_m / vote.unit_m,
         config.noise.gate_sigmas,
         vote.min_votes,
         config.existence.least_votes,

@@ -102,6 +102,13 @@ impl Rays {
         arrays::matrix(py, self.0.rays.iter().map(|ray| ray.direction))
     }
 
+    /// The same rays in a world whose lengths are in units of so many metres.
+    fn in_units(&self, unit_m: f64) -> PyResult<Self> {
+        arrays::check_within("unit_m", &[unit_m, 1.0 / unit_m], arrays::FARTHEST_M)?;
+        let rays = self.0.rays.iter().map(|ray| valuemap_core::ray::Ray { center: ray.center / unit_m, ..*ray });
+        Ok(Self(Arc::new(valuemap_core::ray::Rays { rays: rays.collect(), ..(*self.0).clone() })))
+    }
+
     fn __len__(&self) -> usize {
         self.0.rays.len()
     }
@@ -277,6 +284,8 @@ mod _core {
     const CLASS_FIELDS: [(&str, usize); ClassModel::FIELDS.len()] = ClassModel::FIELDS;
     #[pymodule_export]
     const CALIBRATION_STEPS: usize = valuemap_core::robust::calibrate::CALIBRATION_STEPS;
+    #[pymodule_export]
+    const FARTHEST_M: f64 = super::arrays::FARTHEST_M;
     #[pymodule_export]
     const MISFIT_STEPS: usize = valuemap_core::robust::calibrate::likeliest::MISFIT_STEPS;
     #[pymodule_export]

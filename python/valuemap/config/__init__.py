@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from valuemap.config.mapping import (
+    USUAL_RANGE_M,
     ExistenceConfig,
     MapConfig,
     MergeConfig,
@@ -40,6 +41,7 @@ _MODULE_OF = {
 __all__ = [
     "MAX_CANVAS_PX",
     "MAX_THREADS",
+    "USUAL_RANGE_M",
     "DetectConfig",
     "ExistenceConfig",
     "MapConfig",

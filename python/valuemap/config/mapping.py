@@ -12,6 +12,7 @@ from valuemap.config.setting import (
     CHECKED,
     LARGEST_SIGMA_M,
     LONGEST_M,
+    SHORTEST_M,
     WIDEST_PX,
     Method,
     Setting,
@@ -22,6 +23,11 @@ from valuemap.config.setting import (
     owner_of,
 )
 from valuemap.errors import SettingError
+
+USUAL_RANGE_M = 60.0
+"""How far away objects of a street are at most, from where they tell their place."""
+NEAREST = 1.0 / 30.0
+"""How near, as a share of it: 2 m."""
 
 
 @dataclass(frozen=True, config=CHECKED)
@@ -57,16 +63,19 @@ class VoteConfig(Settings):
         high=90.0,
         effect="two rays closer than this in angle propose no point (theta_min of the paper)",
     )
-    min_range_m: float = declare(
-        2.0, unit="m", high=LONGEST_M, effect="a proposed point nearer than this to either of its cameras is dropped"
-    )
-    max_range_m: float = declare(
-        60.0,
+    min_range_m: float | None = declare(
+        None,
         unit="m",
-        open_low=True,
+        high=LONGEST_M,
+        effect="a proposed point nearer than this to either of its cameras is dropped; a thirtieth of max_range_m",
+    )
+    max_range_m: float | None = declare(
+        None,
+        unit="m",
+        low=SHORTEST_M,
         high=LONGEST_M,
         effect="a proposed point farther than this from either of its cameras is dropped (r_max of the paper); "
-        "`robust` takes points and detections up to 2.5 times as far",
+        "`robust` takes points and detections up to 2.5 times as far, and without it tells it from the data",
     )
     min_vote_ratio: float = declare(
         1.0,
@@ -79,6 +88,21 @@ class VoteConfig(Settings):
     min_votes: int = declare(
         3, unit="images", low=2, high=10**6, effect="a point is accepted only with votes from at least this many images"
     )
+
+    @property
+    def farthest_m(self) -> float:
+        """`max_range_m`, or what is usual in streets."""
+        return USUAL_RANGE_M if self.max_range_m is None else self.max_range_m
+
+    @property
+    def nearest_m(self) -> float:
+        """`min_range_m`, or what is usual where points are so far away at most."""
+        return NEAREST * self.farthest_m if self.min_range_m is None else self.min_range_m
+
+    @property
+    def unit_m(self) -> float:
+        """The unit, in metres, of what has none of its own: a metre where points are as far away as in streets."""
+        return self.farthest_m / USUAL_RANGE_M
 
 
 @dataclass(frozen=True, config=CHECKED)
@@ -217,9 +241,9 @@ class MapConfig:
                     f"{name}: expected {type(getattr(MapConfig, name)).__name__}, found {stage!r}",
                     hint="single settings go by their names: MapConfig(max_range_m=80)",
                 )
-        if self.vote.min_range_m >= self.vote.max_range_m:
+        if self.vote.nearest_m >= self.vote.farthest_m:
             raise SettingError(
-                f"min_range_m ({self.vote.min_range_m}) must be less than max_range_m ({self.vote.max_range_m})",
+                f"min_range_m ({self.vote.nearest_m}) must be less than max_range_m ({self.vote.farthest_m})",
                 hint="set both, e.g. --set min_range_m=2 --set max_range_m=60",
             )
 

@@ -24,6 +24,8 @@ Method = Literal["robust", "paper"]
 
 LONGEST_M = 1e5
 """Nothing in the world of one map is farther apart; beyond it squares of metres swallow the metres."""
+SHORTEST_M = 1e-6
+"""No camera pictures anything so near."""
 LARGEST_SIGMA_M = 100.0
 """What is known no better is not known."""
 WIDEST_PX = 1e5

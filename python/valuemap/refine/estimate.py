@@ -164,7 +164,7 @@ def _round(
 
 def range_of(config: MapConfig) -> float:
     """Return how far from an image its objects are looked for, m."""
-    return _RANGES * config.vote.max_range_m
+    return _RANGES * config.vote.farthest_m
 
 
 def estimate_again(footage: Footage, found: Estimate, told: Trajectories) -> Estimate:

@@ -31,7 +31,7 @@ from valuemap.refine.footage import (
     with_poses_in_order,
 )
 from valuemap.refine.jumps import Links, Segments
-from valuemap.refine.poses import USUAL_RANGE_M, one_blas_thread
+from valuemap.refine.poses import one_blas_thread
 from valuemap.refine.residuals import Observations, State, corrected, cost
 from valuemap.refine.select import LEAST_CHANCE, chance_of_gain, halves
 from valuemap.robust import Noise
@@ -142,19 +142,15 @@ class Bundle:
 
 def gather_images(dataset: Dataset, config: MapConfig) -> AllImages:
     """Return all images of a dataset as maps are bundled with them."""
-    return images_in_order(in_driving_order(dataset, viewpoint_step_m=_unit_m(config)), config)
+    return images_in_order(in_driving_order(dataset, viewpoint_step_m=config.vote.unit_m), config)
 
 
 def images_in_order(ordered: InOrder, config: MapConfig) -> AllImages:
     """Return the same of a dataset that is in driving order."""
-    unit_m = _unit_m(config)
+    unit_m = config.vote.unit_m
     return AllImages(
         ordered, unit_m, gather(*in_working_frame(ordered.dataset, ordered.drives, unit_m), every_image=True)
     )
-
-
-def _unit_m(config: MapConfig) -> float:
-    return config.vote.max_range_m / USUAL_RANGE_M
 
 
 def bundle(images: AllImages, labels: Labels, votes: Votes, noise: Noise, *, by_side: bool = False) -> Bundle:

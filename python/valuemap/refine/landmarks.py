@@ -107,8 +107,8 @@ def vote_on_stretches(
     vote = VoteConfig(
         max_reprojection_error_px=gate_px,
         min_parallax_deg=config.vote.min_parallax_deg,
-        min_range_m=config.vote.min_range_m,
-        max_range_m=_RANGES * config.vote.max_range_m,
+        min_range_m=config.vote.nearest_m,
+        max_range_m=_RANGES * config.vote.farthest_m,
         min_votes=_LEAST_VOTES,
     )
     return vote_in_clusters(rays, stretch, vote, threads=threads)[0]
@@ -116,6 +116,6 @@ def vote_on_stretches(
 
 def stretches(drives: Drives, segment: Ints, config: MapConfig) -> NDArray[np.uint32]:
     """Return the stretch (N) of each image: segments cut into pieces of about the same length."""
-    piece = np.floor(drives.driven_m / (_STRETCH_RANGES * config.vote.max_range_m)).astype(np.int64)
+    piece = np.floor(drives.driven_m / (_STRETCH_RANGES * config.vote.farthest_m)).astype(np.int64)
     code = segment * (int(piece.max(initial=0)) + 1) + piece
     return np.asarray(np.unique(code, return_inverse=True)[1], np.uint32)

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from valuemap.camera_models import places_of_params
 from valuemap.cameras import camera_poses
-from valuemap.config import MapConfig, NoiseConfig
+from valuemap.config import USUAL_RANGE_M, MapConfig, NoiseConfig
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives, InOrder, in_driving_order
 from valuemap.errors import SettingError
@@ -49,8 +49,6 @@ from valuemap.refine.select import Selected, select
 from valuemap.robust import Calibration, Noise, Sought
 from valuemap.tables import Bools, Floats, Labels, Votes
 
-USUAL_RANGE_M = 60.0
-"""Lengths in this package are metres where `max_range_m` is this; they grow with it."""
 _SAMPLE = 4_000
 """So many detections, where most drives meet, tell whether anything is wrong."""
 _PLACE = 3.0
@@ -146,11 +144,11 @@ def one_blas_thread() -> threadpool_limits:
 
 
 def _refined(dataset: Dataset, config: MapConfig, threads: int, progress: Progress) -> Refined:
-    unit_m = config.vote.max_range_m / USUAL_RANGE_M
+    unit_m = config.vote.unit_m
     ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
     if ordered.drives.count < 2:
         return Refined(dataset, {"found": "nothing", "because": "one drive"})
-    ranges = replace(config.vote, max_range_m=USUAL_RANGE_M, min_range_m=config.vote.min_range_m / unit_m)
+    ranges = replace(config.vote, max_range_m=USUAL_RANGE_M, min_range_m=config.vote.nearest_m / unit_m)
     config = MapConfig(config.method, config.partition, ranges, config.noise, config.existence, config.merge)
     moved, drives = in_working_frame(ordered.dataset, ordered.drives, unit_m)
     progress("comparing drives", 0, 2)
@@ -198,7 +196,7 @@ def refine_again(
         return refined
     progress("comparing drives", 0, 1)
     with one_blas_thread():
-        unit_m = config.vote.max_range_m / USUAL_RANGE_M
+        unit_m = config.vote.unit_m
         ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
         footage = before.footage
         detection, thing, kinds, first = shown_objects(footage, ordered, labels, votes)
@@ -228,7 +226,7 @@ def keyframes_of(dataset: Dataset, refined: Refined, config: MapConfig) -> Datas
     found = refined.found
     assert found is not None
     assert found.selected is not None
-    unit_m = config.vote.max_range_m / USUAL_RANGE_M
+    unit_m = config.vote.unit_m
     ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
     shown = refined.dataset if refined.is_corrected else _moved(dataset, ordered, found, found.selected, unit_m)
     image_id = ordered.image_id[found.footage.row]
@@ -248,7 +246,7 @@ def noise_left(refined: Refined, config: MapConfig) -> NoiseConfig:
     """
     assert refined.found is not None
     noise, scales = refined.found.result.noise, refined.found.result.scales
-    unit_m = config.vote.max_range_m / USUAL_RANGE_M
+    unit_m = config.vote.unit_m
     given = config.noise
     left = (noise.px, unit_m * math.hypot(noise.image_m, scales.drift_m), math.degrees(scales.drift_rad))
     names = ("detection_sigma_px", "position_sigma_m", "rotation_sigma_deg")

@@ -53,7 +53,9 @@ def compare_poses(
     """
     old = InMemory(before, config).sample()
     new = _same_images(after, old, config)
-    first, second = (Scene(one.dataset, one.drives, cast_sightings(one.dataset)[0]) for one in (old, new))
+    first, second = (
+        Scene(one.dataset, one.drives, cast_sightings(one.dataset)[0], config.vote.unit_m) for one in (old, new)
+    )
     # They are in another order where poses tell the order.
     order = np.argsort(new.detection_id)
     second_of_first = order[np.searchsorted(new.detection_id, old.detection_id, sorter=order)]
@@ -65,5 +67,5 @@ def compare_poses(
 
 def _same_images(dataset: Dataset, like: InOrder, config: MapConfig) -> InOrder:
     """Return the images that something holds, in driving order, from another dataset of the same images."""
-    ordered = in_driving_order(dataset, viewpoint_step_m=config.vote.max_range_m * VIEWPOINT_SHARE)
+    ordered = in_driving_order(dataset, viewpoint_step_m=config.vote.farthest_m * VIEWPOINT_SHARE)
     return piece_of_rows(ordered, np.flatnonzero(np.isin(ordered.image_id, like.image_id)))

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from valuemap.config import MapConfig
+from valuemap.config import USUAL_RANGE_M
 from valuemap.dataset import Dataset, check_detections, checked_as, rows_of
 from valuemap.map_folder import Map
 from valuemap.nearby import Nearby
@@ -122,7 +122,7 @@ def part_of_map(result: Map, folder: Path) -> tuple[Map, Dataset]:
     census = Census.of(rows.grid, place_m, labels.votes)
     chosen = np.flatnonzero(is_sampled(rows.grid, census, place_m, LARGEST_PART))
     votes = result.votes.take(np.isin(result.votes.label_id, labels.label_id[chosen]))
-    reach_m = float(result.run.get("settings", {}).get("max_range_m", MapConfig().vote.max_range_m))
+    reach_m = float(result.run.get("settings", {}).get("max_range_m") or USUAL_RANGE_M)
     is_part = Nearby(place_m[chosen]).have_any(rows.place_m, reach_m)
     dataset = rows.part(is_part | np.isin(rows.image_id, votes.image_id))
     note = (
@@ -140,7 +140,7 @@ class _Rows:
     def __init__(self, folder: Path, *, are_boxes_checked: bool = True) -> None:
         self._folder, self._are_boxes_checked = folder, are_boxes_checked
         self._reader = DatasetReader(folder)
-        self.grid = Grid.of(self._reader.frame, MapConfig().vote.max_range_m)
+        self.grid = Grid.of(self._reader.frame, USUAL_RANGE_M)
         self.images_of_pass: dict[str, int] = {}
         parts = []
         for images in self._reader.images():

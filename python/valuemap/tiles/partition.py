@@ -210,7 +210,7 @@ class _Writer:
         progress: Progress,
     ) -> None:
         self.folder, self.aside, self.progress = folder, aside, progress
-        self.max_range_m = config.vote.max_range_m
+        self.max_range_m = config.vote.farthest_m
         self.reader = DatasetReader(dataset)
         self.grid = Grid.of(self.reader.frame, self.max_range_m)
         self.cells_across = cells_across_tile(self.grid, tile_size_m)
@@ -313,7 +313,7 @@ def _key(dataset: Path, config: MapConfig, tile_size_m: float | None) -> str:
         if path.is_file():
             with path.open("rb") as file:
                 digest.update(hashlib.file_digest(file, "sha256").digest())
-    settings = [version("valuemap"), config.vote.max_range_m, tile_size_m]
+    settings = [version("valuemap"), config.vote.farthest_m, tile_size_m]
     digest.update(json.dumps(settings).encode())
     return digest.hexdigest()[:32]
 

@@ -51,7 +51,7 @@ def solve_cell(
     rays, is_double = cast_sightings(piece.dataset)
     groups = groups_of_drives(piece, grid.most_detections)
     if len(groups) == 1:
-        scene = Scene(piece.dataset, piece.drives, rays)
+        scene = Scene(piece.dataset, piece.drives, rays, config.vote.unit_m)
         found, counts = find_labels(scene, calibration, config, threads=threads, progress=progress)
     else:
         found, counts = _by_groups(piece, groups, calibration, config, threads, progress)
@@ -93,7 +93,7 @@ def _by_groups(
         for number, rows in enumerate(groups):
             part = piece_of_rows(piece, rows)
             detection_row = np.flatnonzero(np.isin(piece.dataset.detections.image_id, rows))
-            scene = Scene(part.dataset, part.drives, cast_sightings(part.dataset)[0])
+            scene = Scene(part.dataset, part.drives, cast_sightings(part.dataset)[0], config.vote.unit_m)
 
             def go_on(_what: str, done: int, _total: int, before: int = steps * number) -> None:
                 tell(before + done)

@@ -59,7 +59,7 @@ class InMemory:
     """The pieces of a dataset that is in memory whole."""
 
     def __init__(self, dataset: Dataset, config: MapConfig) -> None:
-        max_range_m = config.vote.max_range_m
+        max_range_m = config.vote.farthest_m
         self.grid: Grid = Grid.of(dataset.frame, max_range_m)
         # Nothing that comes after looks at names, as there are none of pieces on disk.
         step_m = max_range_m * VIEWPOINT_SHARE

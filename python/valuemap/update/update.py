@@ -262,7 +262,7 @@ def _judged(
     """Return what became of labels, how both epochs looked at those that were asked for, and the share of drives that
     are blind to an object; `seen` keeps how labels with the same votes in the same place were seen.
     """
-    max_range_m = _settings(before).vote.max_range_m
+    max_range_m = _settings(before).vote.farthest_m
     is_near = Nearby(center_m[is_new]).have_any(rows.labels.position_in_world_m, max_range_m)
     is_asked = is_near | (rows.before < 0)
     # What an epoch alone has elsewhere is no sight of this object.

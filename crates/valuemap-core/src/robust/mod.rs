@@ -10,6 +10,8 @@
 //! 6. [`calibrate`]: the noise and the classes, from maps of samples.
 //! 7. [`finish`]: from objects to labels.
 //!
+//! Lengths, named `_m`, are in the scene's own unit: a metre if its largest range is 60 of them, as in streets.
+//!
 //! [`calibrate::self_calibrate`] and [`find`] are the method: what is estimated once, and then the map.
 
 pub mod calibrate;
