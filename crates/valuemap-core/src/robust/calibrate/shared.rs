@@ -1,7 +1,7 @@
 //! What the images of a pass share: the drift.
 
 use crate::robust::energy::Placed;
-use crate::robust::energy::agreement::{Disagreement, MIN_SHARED_LABELS, disagreements};
+use crate::robust::energy::agreement::{Disagreement, disagreements, enough};
 use crate::robust::noise::Noise;
 use crate::robust::scene::Scene;
 
@@ -57,9 +57,7 @@ fn agreeing_ratio(excess_of: impl Fn(f64) -> Option<f64>) -> Option<f64> {
 /// By how many standard deviations disagreements are larger than expected, of most labels: Huber's psi, summed. A label of two objects disagrees
 /// whatever the noise is; where a fifth of the labels are such, no drift is so large that the mean is as expected.
 fn excess(of_labels: Vec<Option<Disagreement>>) -> Option<f64> {
-    let known: Vec<f64> =
-        of_labels.into_iter().flatten().map(|one| one.sigmas().clamp(-HUBER_SIGMAS, HUBER_SIGMAS)).collect();
-    (known.len() >= MIN_SHARED_LABELS).then(|| known.iter().sum())
+    Some(enough(of_labels)?.iter().map(|one| one.sigmas().clamp(-HUBER_SIGMAS, HUBER_SIGMAS)).sum())
 }
 
 #[cfg(test)]
@@ -96,6 +94,31 @@ mod tests {
         }
         scene.views.iter_mut().for_each(|view| view.pass %= 6);
         (scene, labels)
+    }
+
+    #[test]
+    fn two_objects_that_many_drives_see_tell_how_far_these_drift() {
+        let objects = [Vector3::new(60.0, 6.0, 3.0), Vector3::new(75.0, -5.0, 4.0)];
+        let errors: Vec<[f64; 2]> = (0..997).map(|i| [uniform(2 * i), uniform(2 * i + 1)]).collect();
+        let drives = |count: u64| {
+            let of_drive = |drive: u64| {
+                let [x, y, z] = [0, 1, 2].map(|axis| 0.3 * uniform(9000 + 3 * drive + axis));
+                street::moved(street::street(60, 2.0, &objects, &errors), &Isometry3::translation(x, y, z))
+            };
+            street::joined((0..count).map(of_drive).collect())
+        };
+        let drift_m = |count: u64| {
+            let scene = drives(count);
+            let mut labels: Vec<Placed> = objects.map(|object| (Vec::new(), object)).into();
+            for ray in scene.usable_rays() {
+                let [first, second] = objects.map(|object| scene.ray(ray).squared_error(&object));
+                labels[usize::from(second < first)].0.push(ray);
+            }
+            let noise = Noise { position_m: 0.02, ..street::NOISE };
+            with_drift(&scene, &labels.iter().collect::<Vec<_>>(), &noise).position_drift_m
+        };
+        assert!((0.15..0.6).contains(&drift_m(6)), "{}", drift_m(6));
+        assert!(drift_m(2) < 0.05, "{}", drift_m(2));
     }
 
     #[test]

@@ -16,8 +16,8 @@ use crate::robust::scene::Scene;
 
 /// A pass with fewer voters does not say where it would put a label alone.
 const MIN_VOTES_OF_PASS: usize = 4;
-/// Where fewer labels are seen by several passes, the shared part is taken to be as large as the own part.
-pub const MIN_SHARED_LABELS: usize = 5;
+/// Where passes can disagree in fewer ways, the shared part is taken to be as large as the own part: of so many squares a variance is known to a third.
+const LEAST_FREEDOM: f64 = 15.0;
 /// One label says no more than this about the disagreement of passes, as a multiple of what is expected.
 const MOST_DISAGREEMENT: f64 = 5.0;
 
@@ -127,10 +127,16 @@ pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Placed], most: us
     mean(disagreements(scene, noise, &labels)).unwrap_or(1.0).max(1.0)
 }
 
+/// Those that are known; nothing if they are too few to tell anything.
+#[must_use]
+pub fn enough(of_labels: Vec<Option<Disagreement>>) -> Option<Vec<Disagreement>> {
+    let known: Vec<Disagreement> = of_labels.into_iter().flatten().collect();
+    (known.iter().map(|one| one.freedom).sum::<f64>() >= LEAST_FREEDOM).then_some(known)
+}
+
 /// The mean of those that are known, a degree of freedom, without letting one say too much.
 #[must_use]
 pub fn mean(of_labels: Vec<Option<Disagreement>>) -> Option<f64> {
-    let known: Vec<f64> =
-        of_labels.into_iter().flatten().map(|one| (one.square / one.freedom).min(MOST_DISAGREEMENT)).collect();
-    (known.len() >= MIN_SHARED_LABELS).then(|| known.iter().sum::<f64>() / known.len() as f64)
+    let known = enough(of_labels)?;
+    Some(known.iter().map(|one| (one.square / one.freedom).min(MOST_DISAGREEMENT)).sum::<f64>() / known.len() as f64)
 }
