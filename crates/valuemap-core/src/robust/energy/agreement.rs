@@ -12,6 +12,7 @@ use super::estimate::{looks_at, visits};
 use super::sides::sides;
 use crate::robust::noise::Noise;
 use crate::robust::noise::drift::Drive;
+use crate::robust::noise::told::Told;
 use crate::robust::scene::Scene;
 
 /// A pass with fewer voters does not say where it would put a label alone.
@@ -48,7 +49,8 @@ struct Side {
     covariance: Matrix3<f64>,
     /// Squared distances of where each puts it alone from there, in sigmas.
     square: f64,
-    passes: u32,
+    /// Along how many axes passes can disagree: those that each tells, but for the three of the position.
+    freedom: u32,
 }
 
 /// What the passes of a label say of it, side by side.
@@ -59,25 +61,27 @@ impl Sides {
     fn of(scene: &Scene, noise: &Noise, (votes, point): &Placed) -> Option<Self> {
         let passes: Vec<&[u32]> = visits(scene, votes).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS).collect();
         let of_side = |side: &Vec<u32>| {
-            let (mut information, mut gradient, mut alone) = (Matrix3::zeros(), Vector3::zeros(), 0.0);
+            let (mut information, mut gradient, mut alone, mut axes) = (Matrix3::zeros(), Vector3::zeros(), 0.0, 0);
             for &pass in side {
                 let looks = looks_at(scene, noise, noise, passes[pass as usize], point)?;
                 let (of_pass, by_pass) = Drive::at_one(&looks)?.normals.of_one();
-                alone += by_pass.dot(&of_pass.cholesky()?.solve(&by_pass));
+                let told = Told::of(&of_pass)?;
+                alone += by_pass.dot(&told.solve(&by_pass));
+                axes += told.axes();
                 information += of_pass;
                 gradient += by_pass;
             }
             let covariance = information.cholesky()?.inverse();
             let offset_m = -covariance * gradient;
             let square = (alone + gradient.dot(&offset_m)).max(0.0);
-            Some(Side { offset_m, covariance, square, passes: side.len() as u32 })
+            Some(Side { offset_m, covariance, square, freedom: axes.saturating_sub(3) })
         };
         sides(scene, passes.iter().copied()).iter().map(of_side).collect::<Option<_>>().map(Self)
     }
 
     /// Of the passes of each side with each other. Nothing if no side has two.
     fn within(&self) -> Option<Disagreement> {
-        let freedom = self.0.iter().map(|side| 3.0 * f64::from(side.passes - 1)).sum();
+        let freedom = self.0.iter().map(|side| f64::from(side.freedom)).sum();
         let square = self.0.iter().map(|side| side.square).sum();
         (freedom > 0.0).then_some(Disagreement { square, freedom })
     }

@@ -669,8 +669,12 @@ pub(crate) fn ranges_of_visits(scene: &Scene, voters: &[u32]) -> Vec<Range<usize
     visits(scene, voters).map(of_visit).collect()
 }
 
+/// Cameras no farther apart than this share of the distance are in one place: what crosses at so small an angle is less than a pixel apart.
+const ONE_PLACE: f64 = 1e-3;
+
 /// The looks of the voters of one visit at a point, each by itself, along the lines of sight that a noise makes probable; nothing if it is behind
-/// one of them.
+/// one of them. Lines from where cameras of one place probably are would cross anywhere, and a step along them would explain all residuals: these look from
+/// where they are said to be.
 #[must_use]
 pub fn looks_at(
     scene: &Scene,
@@ -681,8 +685,10 @@ pub fn looks_at(
 ) -> Option<Vec<Look>> {
     // Not collected: an iterator of options does not say how many there will be.
     let mut looks = Vec::with_capacity(voters.len());
+    let is_one_place = are_in_one_place(scene, voters, point);
     for &ray in voters {
         let vantage = Vantage::of(scene, noise, ray).with_sight_of(scene, of_sight, ray);
+        let vantage = if is_one_place { vantage.as_said() } else { vantage };
         looks.push(vantage.look(0, point)?.by_itself());
     }
     if noise.look_correlation > 0.0 {
@@ -691,6 +697,14 @@ pub fn looks_at(
         }
     }
     Some(looks)
+}
+
+/// Whether the cameras of some voters are in one place, as of a car that stands or on a mast, as far as a point tells.
+fn are_in_one_place(scene: &Scene, voters: &[u32], point: &Vector3<f64>) -> bool {
+    let Some(&first) = voters.first() else { return true };
+    let here = scene.ray(first).center;
+    let reach_m = ONE_PLACE * (point - here).norm();
+    voters.iter().all(|&ray| (scene.ray(ray).center - here).norm_squared() <= reach_m * reach_m)
 }
 
 /// How many times as large the variance of each voter of one label is, if successive looks of a segment are off alike.

@@ -99,6 +99,13 @@ impl Vantage {
         self
     }
 
+    /// The same, but looked at from where its camera is said to be.
+    #[must_use]
+    pub fn as_said(mut self) -> Self {
+        self.of_sight.near_px2 = 0.0;
+        self
+    }
+
     /// The same with variances so many times as large: of what its image is off by itself, and its detection.
     #[must_use]
     pub fn with_variance(mut self, of_image: f64, of_detection: f64) -> Self {

@@ -8,6 +8,7 @@ pub mod huber;
 pub mod index;
 pub mod poses;
 pub mod spd;
+pub mod told;
 
 use rayon::prelude::*;
 
