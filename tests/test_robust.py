@@ -240,3 +240,43 @@ def test_what_is_not_known_of_a_class_is_null() -> None:
     assert set(value["classes"]["light"]["score_edges"]) == {None}
     again = calibration_from_json(json.loads(json.dumps(value, allow_nan=False)), source="run.json")
     assert all(math.isnan(number) for number in again.pooled)
+
+
+def test_cameras_that_stand_see_no_distance_and_tell_the_noise_all_the_same() -> None:
+    """Four cameras on masts with 60 images each: what one of them sees from its place is no parallax."""
+    random = np.random.default_rng(1)
+    objects = np.stack([random.uniform(low, high, 12) for low, high in ((5.0, 60.0), (5.0, 30.0), (0.0, 4.0))], axis=1)
+    focal_px, width, height = 1000.0, 1920, 1080
+    intrinsics = np.array([[focal_px, 0.0, width / 2], [0.0, focal_px, height / 2], [0.0, 0.0, 1.0]])
+    cameras: list[Pinhole] = []
+    sightings: list[Sighting] = []
+    size_px: list[float] = []
+    passes: list[str] = []
+    for number, (x, y) in enumerate(((0.0, 0.0), (40.0, 5.0), (20.0, 30.0), (60.0, 30.0))):
+        center = np.array([x, y, 6.0])
+        forward = np.array([30.0, 15.0, 2.0]) - center
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        for _ in range(60):
+            camera = Pinhole(intrinsics, rotation, -rotation @ center)
+            for place in objects:
+                pixel, depth = camera.project(place)
+                if depth > 1.0 and 0 <= pixel[0] < width and 0 <= pixel[1] < height and random.random() < 0.85:
+                    sightings.append(Sighting(len(cameras), "light", pixel + random.normal(0.0, 1.5, 2)))
+                    size_px.append(0.8 * focal_px / depth * np.exp(random.normal(0.0, 0.1)))
+            cameras.append(camera)
+            passes.append(f"mast {number}")
+    dataset = as_dataset(Scene(cameras, sightings, objects), passes=passes)
+    sizes = np.repeat(np.array(size_px)[:, None], 2, axis=1)
+    whole = np.array([focal_px, focal_px, width / 2, height / 2])
+    one = dataclasses.replace(dataset.cameras, width_px=np.array([width]), height_px=np.array([height]), params=[whole])
+    dataset = dataclasses.replace(dataset, cameras=one, detections=dataset.detections.replace(size_px=sizes))
+    result = valuemap.build_map(dataset)
+    near = np.linalg.norm(result.labels.position_in_world_m[:, None] - objects[None], axis=2).min(axis=1)
+    assert len(result.labels) == len(objects)
+    assert near.max() < 0.3
+    noise = result.run["counts"]["noise"]
+    assert 1.0 < noise["detection_px"] < 2.0
+    assert noise["position_drift_m"] < 0.05

@@ -257,7 +257,7 @@ mod tests {
             let votes = |number: u32| scene.usable_rays().into_iter().filter(|ray| ray / 160 == number).collect();
             let labels: Vec<Placed> = (0..6).map(|number| (votes(number), objects[number as usize])).collect();
             let found = calibrate(&scene, &street::NOISE, &labels, Known::default());
-            let off_px = found.total(&scene, 0).far_px2.sqrt();
+            let off_px = found.own(&scene, 0).variance(50.0).sqrt();
             assert!((off_px - 1.5).abs() < 0.3, "{off_px} {found:?}");
         }
     }
