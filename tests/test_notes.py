@@ -99,6 +99,13 @@ def test_noise_at_its_bound(noise: dict[str, float], told: str | None) -> None:
     assert note is None if told is None else told in str(note)
 
 
+def test_the_bound_of_positions_grows_with_the_range() -> None:
+    counts = {"noise": {"position_m": 0.4, "position_drift_m": 0.3}}
+    of_a_room = findings(sized(1.0), config=MapConfig(max_range_m=6.0), counts=counts)
+    assert "position_m 0.5)" in str(noise_at_bound(of_a_room))
+    assert noise_at_bound(findings(sized(1.0), counts=counts)) is None
+
+
 def test_noise_that_was_given_is_at_no_bound() -> None:
     config = MapConfig().with_settings(["position_sigma_m=5"])
     counts = {"noise": {"position_m": 4.0, "position_drift_m": 3.0}}

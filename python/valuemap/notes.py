@@ -19,7 +19,7 @@ _UPRIGHT = 0.5
 _TWIN_SIGMAS = 1.0
 _AT_BOUND = 0.99
 _LARGEST_NOISE = {"detection_px": 30.0, "box_share": 0.15, "position_m": 5.0}
-"""Where the estimation of the noise in the core ends."""
+"""Where the estimation of the noise in the core ends; metres are units of `VoteConfig.unit_m`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,14 +80,15 @@ def noise_at_bound(findings: Findings) -> str | None:
         "detection_px": (noise.get("detection_px", 0.0), given.detection_sigma_px),
         "box_share": (noise.get("box_share", 0.0), given.detection_sigma_px),
         "position_m": (
-            math.hypot(noise.get("position_m", 0.0), noise.get("position_drift_m", 0.0)) / findings.config.vote.unit_m,
+            math.hypot(noise.get("position_m", 0.0), noise.get("position_drift_m", 0.0)),
             given.position_sigma_m,
         ),
     }
+    bounds = {**_LARGEST_NOISE, "position_m": _LARGEST_NOISE["position_m"] * findings.config.vote.unit_m}
     largest = [
         f"{name} {value:.3g}"
         for name, (value, known) in found.items()
-        if known is None and value >= _AT_BOUND * _LARGEST_NOISE[name]
+        if known is None and value >= _AT_BOUND * bounds[name]
     ]
     if not largest:
         return None

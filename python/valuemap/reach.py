@@ -13,11 +13,12 @@ off by more than a metre. It is believed if twice as many detections vote as whe
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from valuemap.cameras import cast_rays
+from valuemap.cameras import Rays, cast_rays
 from valuemap.config import MapConfig, VoteConfig
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import driving_order, find_drives
@@ -77,17 +78,20 @@ def usual_distance_m(dataset: Dataset, vote: VoteConfig) -> float | None:
     looked_at = detections.take(np.flatnonzero(stretch[image_row] >= 0))
     sample = replace(dataset, images=images, detections=looked_at, truth_detections=None)
     of_image = stretch[stretch >= 0].astype(np.uint32)
-    dealt = _dealt(sample, of_image)
+    rays, dealt = cast_rays(sample), cast_rays(_dealt(sample, of_image))
     for gate in _GATES:
         gate_px = gate * vote.max_reprojection_error_px
-        distance_m = _distances_m(sample, of_image, gate_px, vote)
-        by_chance = _distances_m(dealt, of_image, gate_px, vote)
+        try:
+            distance_m = _distances_m(rays, of_image, gate_px, vote)
+            by_chance = _distances_m(dealt, of_image, gate_px, vote)
+        except SettingError:  # So many rays through one point that their votes fill the memory.
+            return None
         if len(distance_m) >= max(_TOLD_BY * len(looked_at), _BEYOND_CHANCE * len(by_chance)):
             return float(np.median(distance_m))
     return None
 
 
-def _distances_m(dataset: Dataset, stretch: NDArray[np.uint32], gate_px: float, vote: VoteConfig) -> Floats:
+def _distances_m(rays: Rays, stretch: NDArray[np.uint32], gate_px: float, vote: VoteConfig) -> Floats:
     """Return how far from its camera each vote is, m, for points that are told on each stretch (N) alone."""
     through = VoteConfig(
         max_reprojection_error_px=gate_px,
@@ -96,11 +100,7 @@ def _distances_m(dataset: Dataset, stretch: NDArray[np.uint32], gate_px: float, 
         max_range_m=_LONGEST_M,
         min_votes=vote.min_votes,
     )
-    rays = cast_rays(dataset)
-    try:
-        found, _ = vote_in_clusters(rays, stretch, through)
-    except SettingError:  # So many rays through one point that their votes fill the memory.
-        return np.empty(0)
+    found, _ = vote_in_clusters(rays, stretch, through)
     voters = found.voters.astype(np.int64)
     point = np.repeat(found.position_in_world_m, np.diff(found.voter_offsets), axis=0)
     return np.asarray(np.linalg.norm(rays.center_in_world_m[voters] - point, axis=1))
@@ -108,14 +108,18 @@ def _distances_m(dataset: Dataset, stretch: NDArray[np.uint32], gate_px: float, 
 
 def _dealt(dataset: Dataset, stretch: NDArray[np.uint32]) -> Dataset:
     """Return a dataset whose detections are dealt to other images of their stretch (N): what is left is chance."""
-    image_row = rows_of(dataset.detections.image_id, dataset.images.image_id)
-    center_px = dataset.detections.center_px
-    of_detection = stretch[image_row]
-    order = np.lexsort((*center_px.T, of_detection))
-    dealt_px = center_px.copy()
-    for rows in np.split(order, np.flatnonzero(np.diff(of_detection[order])) + 1):
-        dealt_px[rows] = center_px[rows[np.random.default_rng(len(rows)).permutation(len(rows))]]
-    return replace(dataset, detections=dataset.detections.replace(center_px=dealt_px))
+    detections = dataset.detections
+    of_detection = stretch[rows_of(detections.image_id, dataset.images.image_id)]
+    dealt = deal(of_detection, np.lexsort((*detections.center_px.T, of_detection)))
+    return replace(dataset, detections=detections.replace(center_px=detections.center_px[dealt]))
+
+
+def deal(place: NDArray[Any], order: Ints) -> Ints:
+    """Return which row each row (N) gets if those of each place are dealt, in an `order` that has places together."""
+    dealt = np.arange(len(place))
+    for rows in np.split(order, np.flatnonzero(np.diff(place[order])) + 1):
+        dealt[rows] = np.random.default_rng(len(rows)).permutation(rows)
+    return dealt
 
 
 def _stretches(dataset: Dataset) -> Ints:

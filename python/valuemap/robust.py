@@ -13,7 +13,7 @@ import numpy as np
 
 import valuemap._core as _core
 from valuemap.cameras import Rays, camera_poses, picture_bounds
-from valuemap.config import MapConfig
+from valuemap.config import MapConfig, NoiseConfig
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives
 from valuemap.errors import InputError, SettingError
@@ -223,14 +223,14 @@ def calibrate(
     What the config sets of the noise stays as it is. The scene may be a part of what is mapped. `sought` is what
     `misfits` found of the same scene with the same config: it is the most work, and done once.
     """
-    guess, known = _guess(config, scene.rounding_px)
+    guess, known = _guess(config.noise, scene)
     steps = _core.CALIBRATION_STEPS + (2 * _core.SEARCH_STEPS if is_part else 0)
     with counted(progress, "estimating the noise", steps) as tell:
         (noise, of_covariances, is_deep, classes, pooled, shares), position, (offsets, voters) = _core.calibrate(
             scene.core,
             guess,
             known,
-            _settings(config),
+            _settings(config, scene.unit_m),
             is_part,
             sought,
             threads,
@@ -270,13 +270,13 @@ def misfits(
     `second_of_first` (N) is the row in the second scene of each detection of the first. `tell` hears again and again
     how many of `MISFIT_STEPS` are done, and stops the work by an exception.
     """
-    guess, known = _guess(config, scenes[0].rounding_px)
+    guess, known = _guess(config.noise, scenes[0])
     (first, second), count, sought = _core.misfits(
         (scenes[0].core, scenes[1].core),
         second_of_first.astype(np.uint32),
         guess,
         known,
-        _settings(config),
+        _settings(config, scenes[0].unit_m),
         threads,
         lambda done, _total: tell(done),
     )
@@ -300,7 +300,7 @@ def find_labels(
         position, class_code, (offsets, voters), covariance, existence, expected, counts = _core.find_labels(
             scene.core,
             calibration.as_tuple(scene.class_names, scene.unit_m),
-            _settings(config),
+            _settings(config, scene.unit_m),
             threads,
             lambda done, _total: tell(done),
         )
@@ -314,13 +314,12 @@ def find_labels(
     ), counts
 
 
-def _guess(config: MapConfig, least_px: float) -> tuple[tuple[float, ...], tuple[list[bool], float]]:
-    """Return where the estimation starts, for the core, and what is known: what the user sets, and that detections are
-    rounded.
+def _guess(given: NoiseConfig, scene: Scene) -> tuple[tuple[float, ...], tuple[list[bool], float]]:
+    """Return where the estimation starts, in units, and what is known: what the user sets, and that boxes are rounded.
 
-    The former are detection, position and rotation; detections are off by at least `least_px`.
+    The former are detection, position and rotation; detections are off by at least as much as they are rounded, px.
     """
-    noise, given, unit_m = Noise(), config.noise, config.vote.unit_m
+    noise, unit_m = Noise(), scene.unit_m
     if given.detection_sigma_px is not None:
         noise = replace(noise, detection_px=given.detection_sigma_px, box_share=0.0)
     # A known total says nothing about its parts: a third of the variance each.
@@ -333,15 +332,15 @@ def _guess(config: MapConfig, least_px: float) -> tuple[tuple[float, ...], tuple
     if given.side_sigma_m is not None:
         noise = replace(noise, side_m=given.side_sigma_m / unit_m)
     known = [given.detection_sigma_px, given.position_sigma_m, given.rotation_sigma_deg]
-    return noise.as_tuple(), ([value is not None for value in known], least_px)
+    return noise.as_tuple(), ([value is not None for value in known], scene.rounding_px)
 
 
-def _settings(config: MapConfig) -> tuple[float, float, float, float, int, int, float, list[str]]:
+def _settings(config: MapConfig, unit_m: float) -> tuple[float, float, float, float, int, int, float, list[str]]:
     vote = config.vote
     return (
         math.radians(vote.min_parallax_deg),
-        vote.nearest_m / vote.unit_m,
-        vote.farthest_m / vote.unit_m,
+        vote.nearest_m / unit_m,
+        vote.farthest_m / unit_m,
         config.noise.gate_sigmas,
         vote.min_votes,
         config.existence.least_votes,

@@ -31,6 +31,7 @@ from valuemap.config import VoteConfig
 from valuemap.dataset import Dataset
 from valuemap.errors import SettingError
 from valuemap.paper.vote import vote_in_clusters
+from valuemap.reach import deal
 from valuemap.tables import Candidates, Floats, Ints
 
 COST_OF_A_POINT = 1.5
@@ -118,10 +119,7 @@ def chance_agreement(dataset: Dataset, place_of_image: NDArray[np.uint32], gate_
     """Measure the same with the detections of each place dealt to other images of it: what is left is chance."""
     detections = dataset.detections
     place = place_of_image[np.searchsorted(dataset.images.image_id, detections.image_id)]
-    order = np.argsort(place, kind="stable")
-    dealt = np.arange(len(detections))
-    for rows in np.split(order, np.flatnonzero(np.diff(place[order])) + 1):
-        dealt[rows] = np.random.default_rng(len(rows)).permutation(rows)
+    dealt = deal(place, np.argsort(place, kind="stable"))
     moved = detections.replace(center_px=detections.center_px[dealt], size_px=detections.size_px[dealt])
     return measure_agreement(Dataset(**{**vars(dataset), "detections": moved}), place_of_image, gate_px)
 

@@ -214,10 +214,9 @@ pub(crate) fn minus_log_likelihood(looks: &[Look]) -> Option<[f64; 3]> {
 mod tests {
     use std::cell::RefCell;
 
-    use nalgebra::{Isometry3, Point3, Vector3};
+    use nalgebra::Vector3;
 
     use super::*;
-    use crate::robust::scene::sample::scramble;
     use crate::street;
 
     #[test]
@@ -234,31 +233,6 @@ mod tests {
             let again: Vec<Look> =
                 looks.iter().map(|(ray, depth_m, look)| look.with_noise(&scene, &noise, *ray, *depth_m)).collect();
             assert_eq!(Some(again), looks_at(&scene, &noise, &street::NOISE, votes, &point));
-        }
-    }
-
-    #[test]
-    fn cameras_that_stand_tell_how_far_detections_are_off() {
-        // Four cars stand 8 m apart, with 40 images each that are off by 1.5 px.
-        let uniform = |number: u64| (scramble(number) as f64 / u64::MAX as f64 - 0.5) * 12.0_f64.sqrt();
-        let errors: Vec<[f64; 2]> = (0..997).map(|i| [2 * i, 2 * i + 1].map(|number| 1.5 * uniform(number))).collect();
-        let objects: Vec<Vector3<f64>> = (0..6).map(|i| Vector3::new(50.0, f64::from(4 * i - 10), 3.0)).collect();
-        let of_object = |number: usize, tremble_m: f64| {
-            let car = |car: usize| {
-                let there = Isometry3::translation(8.0 * car as f64, f64::from(car as u32 % 2), 0.0);
-                let object = there.inverse() * Point3::from(objects[number]);
-                street::moved(street::street(40, tremble_m, &[object.coords], &errors[17 * number + 5 * car..]), &there)
-            };
-            street::joined((0..4).map(car).collect())
-        };
-        for tremble_m in [0.0, 1e-4] {
-            let mut scene = street::joined((0..6).map(|number| of_object(number, tremble_m)).collect());
-            scene.views.iter_mut().for_each(|view| view.pass %= 4);
-            let votes = |number: u32| scene.usable_rays().into_iter().filter(|ray| ray / 160 == number).collect();
-            let labels: Vec<Placed> = (0..6).map(|number| (votes(number), objects[number as usize])).collect();
-            let found = calibrate(&scene, &street::NOISE, &labels, Known::default());
-            let off_px = found.own(&scene, 0).variance(50.0).sqrt();
-            assert!((off_px - 1.5).abs() < 0.3, "{off_px} {found:?}");
         }
     }
 

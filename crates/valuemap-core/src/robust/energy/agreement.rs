@@ -144,3 +144,24 @@ pub fn mean(of_labels: Vec<Option<Disagreement>>) -> Option<f64> {
     let known = enough(of_labels)?;
     Some(known.iter().map(|one| (one.square / one.freedom).min(MOST_DISAGREEMENT)).sum::<f64>() / known.len() as f64)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::street;
+
+    #[test]
+    fn a_pass_that_stands_can_disagree_along_two_axes() {
+        let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
+        let point = Vector3::new(47.0, 5.0, 3.0);
+        let freedom = |spacing_m: f64| {
+            let drives = [2.0, 2.0, spacing_m].map(|spacing_m| street::street(20, spacing_m, &[point], &errors));
+            let scene = street::joined(drives.into());
+            let label = (scene.usable_rays(), point);
+            disagreement(&scene, &street::NOISE, &label).map(|one| one.freedom)
+        };
+        assert_eq!(freedom(2.0), Some(6.0));
+        // However a car trembles that stands.
+        assert_eq!((freedom(0.0), freedom(1e-7)), (Some(5.0), Some(5.0)));
+    }
+}
