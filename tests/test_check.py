@@ -71,6 +71,8 @@ _RECOVERED = {"degrees_for_radians": 0.6}
 """Degrees read as radians lose whole turns, which the direction of travel does not always give back."""
 _NEEDS_ALL = {"mirrored_pictures", "boxes_top_left", "lens_model"}
 """What half as many passes do not prove."""
+_NEEDS_FEW = {"pass_offset", "pass_time_shift", "camera_height", "wrong_camera"}
+"""What one pass has not, or does not prove."""
 _FAULT = {fault.name: fault for fault in FAULTS}
 
 
@@ -94,6 +96,11 @@ def one() -> Dataset:
     return good_city(1, passes_per_street=1)
 
 
+def enough_for(name: str) -> str:
+    """Return the fixture with the fewest passes that prove a fault."""
+    return "good" if name in _NEEDS_ALL else "few" if name in _NEEDS_FEW else "one"
+
+
 @pytest.fixture(scope="module")
 def view(good: Dataset) -> View:
     return View(good)
@@ -102,6 +109,11 @@ def view(good: Dataset) -> View:
 @pytest.fixture(scope="module")
 def view_of_few(few: Dataset) -> View:
     return View(few)
+
+
+@pytest.fixture(scope="module")
+def view_of_one(one: Dataset) -> View:
+    return View(one)
 
 
 def test_key_points_have_no_size_that_could_be_wrong(few: Dataset) -> None:
@@ -669,8 +681,8 @@ def test_every_fault_of_the_registry_is_injected() -> None:
 
 @pytest.mark.parametrize("name", sorted(set(INJECTED) & _CONVENTIONS))
 def test_a_wrong_convention_is_named_and_undone(name: str, request: pytest.FixtureRequest) -> None:
-    good = request.getfixturevalue("good" if name in _NEEDS_ALL else "few")
-    view = request.getfixturevalue("view" if name in _NEEDS_ALL else "view_of_few")
+    good = request.getfixturevalue(enough_for(name))
+    view = request.getfixturevalue({"good": "view", "few": "view_of_few", "one": "view_of_one"}[enough_for(name)])
     spoiled = INJECTED[name].spoil(good)
     assert spoiled is not None
     finding = convention_told(spoiled)
@@ -686,12 +698,13 @@ def test_a_wrong_convention_is_named_and_undone(name: str, request: pytest.Fixtu
 
 @pytest.mark.parametrize("name", sorted(set(INJECTED) - _CONVENTIONS))
 def test_a_fault_is_named(name: str, request: pytest.FixtureRequest) -> None:
-    good = request.getfixturevalue("good" if name in _NEEDS_ALL else "few")
+    good = request.getfixturevalue(enough_for(name))
     spoiled = INJECTED[name].spoil(good)
     assert spoiled is not None
     finding = _FAULT[name].find(View(spoiled))
     assert finding is not None
     assert finding.fault == name
+    assert finding.of is None
     assert (finding.fix is not None) == INJECTED[name].has_fix
     if finding.fix is not None and name not in _SEEN_AGAIN:
         assert _FAULT[name].find(View(finding.fix(spoiled))) is None

@@ -11,8 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from valuemap.cameras import Rays, local_pinholes, rotation_matrices
 from valuemap.check.agreement import Agreement, agreement_on
@@ -222,9 +224,14 @@ class _Votes:
 
     def residual_by(self, cameras: Cameras) -> Floats:
         """Return the residuals (N, 2) by other cameras with the same poses."""
-        pinholes = local_pinholes(Dataset(**{**vars(self._dataset), "cameras": cameras}))
-        in_cam = _times(rotation_matrices(self._dataset.images)[self.image_row], self._to_point)
-        return _over_depth(_times(pinholes.residual_from_cam[self.voter], in_cam))
+        detections = self._dataset.detections.take(self.voter)
+        pinholes = local_pinholes(Dataset(**{**vars(self._dataset), "cameras": cameras, "detections": detections}))
+        return _over_depth(_times(pinholes.residual_from_cam, self._in_cam))
+
+    @cached_property
+    def _in_cam(self) -> Floats:
+        """The way from each camera to the point (N, 3), in camera axes."""
+        return _times(rotation_matrices(self._dataset.images)[self.image_row], self._to_point)
 
 
 def _slope(changed: Changed, parameter: Parameter, votes: _Votes) -> Floats:
@@ -253,26 +260,33 @@ def _eliminate(
     residual: Floats, slope: Floats, of_point: Floats, weight: Floats, point_of: Ints, place: Ints
 ) -> tuple[Floats, Floats]:
     """Return gradients (K, P) and curvatures (K, P, P) of each place, the points eliminated."""
-    count = int(point_of.max()) + 1
     parts = slope.shape[2]
-    a = np.zeros((count, 3, 3))
-    b = np.zeros((count, 3, parts))
-    c = np.zeros((count, 3))
-    g = np.zeros((count, parts))
-    h = np.zeros((count, parts, parts))
-    np.add.at(a, point_of, np.einsum("n,nki,nkj->nij", weight, of_point, of_point))
-    np.add.at(b, point_of, np.einsum("n,nki,nkp->nip", weight, of_point, slope))
-    np.add.at(c, point_of, np.einsum("n,nki,nk->ni", weight, of_point, residual))
-    np.add.at(g, point_of, np.einsum("n,nkp,nk->np", weight, slope, residual))
-    np.add.at(h, point_of, np.einsum("n,nkp,nkq->npq", weight, slope, slope))
+    weighted, of_points = weight[:, None, None], _Sums(point_of)
+    a = of_points(_products(weighted * of_point, of_point))
+    b = of_points(_products(weighted * of_point, slope))
+    c = of_points(_products(weighted * of_point, residual[:, :, None]))[:, :, 0]
+    g = of_points(_products(weighted * slope, residual[:, :, None]))[:, :, 0]
+    h = of_points(_products(weighted * slope, slope))
     trace = np.trace(a, axis1=1, axis2=2)
     inverse = np.linalg.inv(a + np.maximum(1e-9 * trace, 1e-12)[:, None, None] * np.eye(3))
     g = g - np.einsum("nip,nij,nj->np", b, inverse, c)
     h = h - np.einsum("nip,nij,njq->npq", b, inverse, b)
-    first = np.searchsorted(point_of, np.arange(count))
-    _, group = np.unique(place[first], return_inverse=True)
-    groups = int(group.max()) + 1
-    gradient, curvature = np.zeros((groups, parts)), np.zeros((groups, parts, parts))
-    np.add.at(gradient, group, g)
-    np.add.at(curvature, group, h)
-    return gradient, curvature
+    _, group = np.unique(place[np.searchsorted(point_of, np.arange(len(a)))], return_inverse=True)
+    of_groups = _Sums(group)
+    return of_groups(g), of_groups(h)
+
+
+def _products(first: Floats, second: Floats) -> Floats:
+    """Return the products (N, P, Q) of vectors (N, 2, P) and (N, 2, Q), summed over both coordinates of a residual."""
+    return np.asarray(sum(first[:, axis, :, None] * second[:, axis, None, :] for axis in (0, 1)))
+
+
+class _Sums:
+    """Adds up rows that belong together: all those (N) of one number, from 0 without gaps."""
+
+    def __init__(self, number: Ints) -> None:
+        self._sum = csr_matrix((np.ones(len(number)), (number, np.arange(len(number)))))
+
+    def __call__(self, values: Floats) -> Floats:
+        """Return the sums (K, ...) of rows (N, ...), added in their order."""
+        return np.asarray(self._sum @ values.reshape(len(values), -1)).reshape(-1, *values.shape[1:])

@@ -49,9 +49,9 @@ class Group:
         return Dataset(**{**vars(part), "cameras": part.cameras.take(used)})
 
     def alone(self, view: View) -> View:
-        """Return a view of the group alone, made once a view."""
+        """Return a view of the group alone, made once a view: a camera of one pass has the images of that pass."""
         views: dict[Any, View] = view.memory.setdefault("alone", {})
-        key = self, view.known
+        key = self.images_of(view.dataset).tobytes(), view.known
         if key not in views:
             views[key] = View(self.part(view.dataset), gate_share=view.gate_share, known=view.known)
         return views[key]
