@@ -179,15 +179,15 @@ def _headings_deg(
     # A step costs by how many multiples it goes over, whichever they are: from each (last axis) to each is a window.
     over = np.arange(count - 1, -count, -1)
     cost_of_step = weight_of_changes * np.abs(_wrap(step[:, None] + _TURN * over, 180.0))
+    cost_of_pair = np.lib.stride_tricks.sliding_window_view(cost_of_step, count, axis=1)[:, ::-1]
     longest_first = sorted(stretches, key=len, reverse=True)
     start, length = (np.array([each(rows) for rows in longest_first]) for each in (lambda rows: rows[0], len))
     cost, came_from = off.copy(), np.zeros(choices.shape, dtype=np.int64)
     for i in range(1, int(length[0])):
         row = start[: np.searchsorted(-length, -i)] + i
-        cost_of_pair = np.lib.stride_tricks.sliding_window_view(cost_of_step[row - 1], count, axis=1)[:, ::-1]
-        total = cost[row - 1][:, None] + cost_of_pair
+        total = cost[row - 1][:, None] + cost_of_pair[row - 1]
         came_from[row] = total.argmin(axis=2)
-        cost[row] += total.min(axis=2)
+        cost[row] += np.take_along_axis(total, came_from[row][:, :, None], axis=2)[:, :, 0]
     path = np.empty(len(choices), dtype=np.int64)
     last = start + length - 1
     path[last] = cost[last].argmin(axis=1)
