@@ -260,7 +260,6 @@ def _eliminate(
     residual: Floats, slope: Floats, of_point: Floats, weight: Floats, point_of: Ints, place: Ints
 ) -> tuple[Floats, Floats]:
     """Return gradients (K, P) and curvatures (K, P, P) of each place, the points eliminated."""
-    parts = slope.shape[2]
     weighted, of_points = weight[:, None, None], _Sums(point_of)
     a = of_points(_products(weighted * of_point, of_point))
     b = of_points(_products(weighted * of_point, slope))
