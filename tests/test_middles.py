@@ -17,7 +17,7 @@ from valuemap import MapConfig, calibration, correction, robust
 from valuemap.dataset import Dataset
 from valuemap.engine.threads import ThreadEngine
 from valuemap.progress import silent
-from valuemap.refine import gather_images
+from valuemap.refine import Mapped, gather_images
 from valuemap.refine.images import Bundle
 from valuemap.refine.middles import Contrasts
 from valuemap.simulate import simulate
@@ -100,21 +100,29 @@ def test_no_more_objects_are_asked_than_tell_it(objects: int, asked: int) -> Non
     assert len(set(np.diff(chosen))) <= 1
 
 
-def test_middles_are_not_told_without_boxes_or_objects(monkeypatch: pytest.MonkeyPatch) -> None:
-    city, config = lamps_beside_drives_that_drift(0.2, seed=4), MapConfig(side_sigma_m=0.0)
-    images = gather_images(city, config)
-    mapped, labels, votes, _ = correction._map_alone(city, config, ThreadEngine(1), silent)
-    assert refine_middles.middles(images, labels, votes, mapped.noise) is not None
-    without_boxes = labels.replace(object_height_m=np.zeros(len(labels)))
-    assert refine_middles.middles(images, without_boxes, votes, mapped.noise) is None
-    monkeypatch.setattr(refine_middles, "_LEAST_OBJECTS", len(labels))
-    assert refine_middles.middles(images, labels, votes, mapped.noise) is None
-
-
 def lamps_beside_drives_that_drift(side_offset_m: float, seed: int) -> Dataset:
     """Return lamps whose sides show other middles, seen by drives that drift by 0.4 m."""
-    lamps = replace(CITY, has_lights=0, lamp_spacing_m=15.0, side_offset_m=side_offset_m)
-    return simulate(replace(lamps, position_drift_m=0.4, passes_per_street=4), seed=seed)
+    lamps = replace(CITY, has_lights=0, lamp_spacing_m=15.0, side_offset_m=side_offset_m, frame_spacing_m=4.0)
+    return simulate(replace(lamps, position_drift_m=0.4), seed=seed)
+
+
+@pytest.fixture(scope="module")
+def mapped() -> tuple[Dataset, Mapped]:
+    """Return lamps whose middles are off by 0.2 m, and a map of them that knows of no middles."""
+    city = lamps_beside_drives_that_drift(0.2, seed=4)
+    return city, correction._map_alone(city, MapConfig(side_sigma_m=0.0), ThreadEngine(1), silent)
+
+
+def test_middles_are_not_told_without_boxes_or_objects(
+    mapped: tuple[Dataset, Mapped], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    city, (calibration, labels, votes, _) = mapped
+    images, noise = gather_images(city, MapConfig()), calibration.noise
+    assert refine_middles.middles(images, labels, votes, noise) == pytest.approx(0.2, rel=0.3)
+    without_boxes = labels.replace(object_height_m=np.zeros(len(labels)))
+    assert refine_middles.middles(images, without_boxes, votes, noise) is None
+    monkeypatch.setattr(refine_middles, "_LEAST_OBJECTS", len(labels))
+    assert refine_middles.middles(images, labels, votes, noise) is None
 
 
 def told(city: Dataset, *settings: str) -> float:
@@ -123,25 +131,27 @@ def told(city: Dataset, *settings: str) -> float:
     return calibration.calibrate(InMemory(city, config), config, None, None, ThreadEngine(1), silent).noise.side_m
 
 
-def test_middles_that_are_smaller_than_the_drift_are_told() -> None:
-    assert told(lamps_beside_drives_that_drift(0.2, seed=4)) == pytest.approx(0.2, rel=0.3)
+def test_middles_that_are_smaller_than_the_drift_are_in_the_map_and_its_calibration(
+    mapped: tuple[Dataset, Mapped],
+) -> None:
+    run = valuemap.build_map(mapped[0], MapConfig(correct_poses=0)).run
+    side_m = run["calibration"]["noise"]["side_m"]
+    assert run["counts"]["noise"]["side_m"] == side_m == pytest.approx(0.2, rel=0.3)
 
 
 def test_drift_is_not_taken_for_middles() -> None:
     assert told(lamps_beside_drives_that_drift(0.0, seed=6)) == 0.0
 
 
-def test_middles_that_are_told_are_in_the_map_and_its_calibration() -> None:
-    city = lamps_beside_drives_that_drift(0.2, seed=4)
-    run = valuemap.build_map(city, MapConfig(correct_poses=0)).run
-    assert run["counts"]["noise"]["side_m"] == run["calibration"]["noise"]["side_m"] == told(city)
-
-
 def test_middles_that_are_set_are_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration, "middles", None)
-    assert told(simulate(CITY, seed=4), "side_sigma_m=0.07") == 0.07
+    city = simulate(replace(CITY, lights=12, passes_per_street=1, frame_spacing_m=4.0), seed=4)
+    assert told(city, "side_sigma_m=0.07") == 0.07
 
 
-def test_without_the_part_there_are_no_middles(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_part_there_are_no_middles(mapped: tuple[Dataset, Mapped], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not even those that are told."""
     monkeypatch.setattr(robust, "LEFT_OUT", {"sides"})
-    assert told(lamps_beside_drives_that_drift(0.2, seed=4)) == 0.0
+    monkeypatch.setattr(calibration, "middles", lambda *_: 0.2)
+    city = simulate(replace(CITY, lights=12, passes_per_street=1, frame_spacing_m=4.0), seed=4)
+    assert told(city) == 0.0
