@@ -95,9 +95,17 @@ def clean_city() -> Dataset:
 
 
 @functools.cache
-def map_of_dashcam_city() -> tuple[Dataset, valuemap.Map]:
-    """Return a city with the poses of a dash camera, and its map: images are put in order once, for all maps."""
-    faulty, ordered = city(**DASHCAM, **FEWEST_IMAGES), []
+def maps_of_dashcam_city() -> tuple[Dataset, valuemap.Map, valuemap.Map]:
+    """Return a city with the poses of a dash camera, its map, and the first one that was made, of the poses as given.
+
+    Images are put in order once, for all maps.
+    """
+    faulty, ordered, made = city(**DASHCAM, **FEWEST_IMAGES), [], []
+    map_alone = correction._map_alone
+
+    def noted(*given: Any) -> Any:
+        made.append(map_alone(*given))
+        return made[-1]
 
     def in_order(dataset: Dataset, **options: Any) -> InOrder:
         ordered.append(dataset)
@@ -105,9 +113,87 @@ def map_of_dashcam_city() -> tuple[Dataset, valuemap.Map]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(refine_images, "in_driving_order", in_order)
+        patch.setattr(correction, "_map_alone", noted)
         result = valuemap.build_map(faulty)
     assert len(ordered) == 1
-    return faulty, result
+    _, labels, votes, _ = made[0]
+    return faulty, result, dataclasses.replace(result, labels=labels, votes=votes)
+
+
+def map_of_dashcam_city() -> tuple[Dataset, valuemap.Map]:
+    """Return a city with the poses of a dash camera, and its map."""
+    return maps_of_dashcam_city()[:2]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Watched:
+    """What correcting poses made of a city, and what was done: `fitted` are the equations, by the kinds judged."""
+
+    city: Dataset
+    refined: Refined
+    done: list[str]
+    steps: int
+    fitted: list[list[tuple[object, ...]]]
+    freed: list[Estimate]
+    selected: list[Estimate]
+
+
+@functools.cache
+def watched(shift_m: float) -> Watched:
+    """Correct the poses of a city with every pass shifted by so much, once for all tests of what is done then."""
+    dataset = city(pass_shift_m=shift_m)
+    done: list[str] = []
+    steps: list[int] = []
+    fitted: list[list[tuple[object, ...]]] = []
+    last: list[tuple[object, ...]] = []
+    freed: list[Estimate] = []
+    selected: list[Estimate] = []
+    step, prune = Adjustment.step, _Trial.prune
+
+    def noted(name: str, make: Callable[..., Any]) -> Callable[..., Any]:
+        def told(*given: Any, **more: Any) -> Any:
+            done.append(name)
+            return make(*given, **more)
+
+        return told
+
+    def counted(*given: Any, **more: Any) -> tuple[State, float]:
+        steps.append(1)
+        return step(*given, **more)
+
+    def adjusted(problem: Adjustment, state: State, **more: Any) -> State:
+        of = (*(flags.tobytes() for flags in problem.active), *map(repr, problem.scales.constant))
+        last.append(of)
+        return adjust.adjust(problem, state, **more)
+
+    def pruned(*given: Any) -> Any:
+        last.clear()
+        after = prune(*given)
+        fitted.append(last.copy())
+        return after
+
+    def freed_of_aliases(*given: Any) -> Estimate:
+        freed.append(dataclasses.replace(without_aliases(*given)))
+        return freed[-1]
+
+    def chosen(footage: Footage, found: Estimate) -> Selected | None:
+        selected.append(found)
+        return refine_select.select(footage, found)
+
+    def asked(*_: Any) -> None:
+        raise AssertionError("pycolmap is asked for the rays of pinholes")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(camera_models, "colmap_camera", asked)
+        patch.setattr(poses, "begin", noted("begin", refine_estimate.begin))
+        patch.setattr(poses, "go_on", noted("go_on", refine_estimate.go_on))
+        patch.setattr(poses, "without_aliases", freed_of_aliases)
+        patch.setattr(poses, "select", chosen)
+        patch.setattr(Adjustment, "step", counted)
+        patch.setattr(refine_select, "adjust", adjusted)
+        patch.setattr(_Trial, "prune", pruned)
+        refined = refine_poses(dataset, valuemap.MapConfig())
+    return Watched(dataset, refined, done, len(steps), fitted, freed, selected)
 
 
 def shifted_city() -> tuple[Dataset, Refined]:
@@ -128,9 +214,8 @@ def errors(dataset: Dataset, clean: Dataset) -> tuple[float, float]:
 
 
 def test_a_city_without_faults_stays_bit_for_bit() -> None:
-    dataset = city()
-    refined = refine_poses(dataset, valuemap.MapConfig())
-    assert refined.dataset is dataset
+    refined = watched(0.0).refined
+    assert refined.dataset is watched(0.0).city
     assert refined.record["found"] == "nothing"
     assert refined.record["shared_objects"] > 10
 
@@ -147,12 +232,9 @@ def test_shifts_of_passes_of_three_metres_are_found_to_three_decimetres() -> Non
     assert np.abs(mean.mean(axis=0)).max() < 0.3
 
 
-def test_poses_of_pinholes_are_corrected_without_pycolmap(monkeypatch: pytest.MonkeyPatch) -> None:
-    def asked(*_: Any) -> None:
-        raise AssertionError("pycolmap is asked")
-
-    monkeypatch.setattr(camera_models, "colmap_camera", asked)
-    assert refine_poses(city(pass_shift_m=3.0), valuemap.MapConfig()).is_corrected
+def test_poses_of_pinholes_are_corrected_without_pycolmap() -> None:
+    """Asking it fails where poses are corrected under watch."""
+    assert watched(3.0).refined.is_corrected
 
 
 def test_all_that_multiplies_matrices_has_one_thread_from_the_beginning() -> None:
@@ -202,46 +284,18 @@ def test_a_sample_tells_how_late_all_poses_are(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize("shift_m", [0.0, 3.0])
-def test_drives_that_are_far_off_are_laid_anew_after_a_first_estimate(
-    shift_m: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    done: list[str] = []
-
-    def noted(name: str, make: Callable[..., Any]) -> Callable[..., Any]:
-        def told(*given: Any, **more: Any) -> Any:
-            done.append(name)
-            return make(*given, **more)
-
-        return told
-
-    monkeypatch.setattr(poses, "begin", noted("begin", refine_estimate.begin))
-    monkeypatch.setattr(poses, "go_on", noted("go_on", refine_estimate.go_on))
-    refine_poses(city(pass_shift_m=shift_m), valuemap.MapConfig())
-    assert done == (["begin", "begin", "go_on"] if shift_m else ["begin", "go_on"])
+def test_drives_that_are_far_off_are_laid_anew_after_a_first_estimate(shift_m: float) -> None:
+    assert watched(shift_m).done == (["begin", "begin", "go_on"] if shift_m else ["begin", "go_on"])
 
 
-def test_the_same_equations_are_not_fitted_again_where_other_kinds_are_judged(monkeypatch: pytest.MonkeyPatch) -> None:
-    fitted: list[tuple[object, ...]] = []
-    prune = _Trial.prune
-
-    def noted(problem: Adjustment, state: State, **more: Any) -> State:
-        fitted.append((*(flags.tobytes() for flags in problem.active), *map(repr, problem.scales.constant)))
-        return adjust.adjust(problem, state, **more)
-
-    def pruned(self: _Trial, *given: Any) -> Any:
-        fitted.clear()
-        after = prune(self, *given)
-        assert len(fitted) == len(set(fitted))
-        return after
-
-    monkeypatch.setattr(refine_select, "adjust", noted)
-    monkeypatch.setattr(_Trial, "prune", pruned)
-    assert refine_poses(city(pass_shift_m=3.0), valuemap.MapConfig()).is_corrected
+def test_the_same_equations_are_not_fitted_again_where_other_kinds_are_judged() -> None:
+    fitted = watched(3.0).fitted
+    assert any(len(of_kinds) > 1 for of_kinds in fitted)
+    assert all(len(of_kinds) == len(set(of_kinds)) for of_kinds in fitted)
 
 
 def test_the_map_that_tells_votes_is_of_the_images_that_poses_are_estimated_with() -> None:
-    faulty, config = city(pass_shift_m=3.0), valuemap.MapConfig()
-    refined = refine_poses(faulty, config)
+    faulty, refined, config = watched(3.0).city, watched(3.0).refined, valuemap.MapConfig()
     assert refined.found is not None
     shown = poses.keyframes_of(faulty, refined, config)
     assert len(shown.images) == len(refined.found.footage.row) < len(faulty.images)
@@ -260,12 +314,18 @@ def test_the_map_that_tells_votes_is_of_the_images_that_poses_are_estimated_with
     assert poses.noise_left(refined, stated).position_sigma_m == 0.5
 
 
+@functools.cache
+def told_by_a_map() -> tuple[Dataset, Refined, Refined]:
+    """Return a city with every pass shifted by 1.5 m, what is made of its poses, and then with a map."""
+    faulty = simulate(dataclasses.replace(CITY, **FEWEST_IMAGES, pass_shift_m=1.5), seed=7)
+    at_first = refine_poses(faulty, valuemap.MapConfig())
+    return faulty, at_first, correction._told_by_a_map(faulty, at_first, valuemap.MapConfig(), 1, silent)
+
+
 def test_a_map_tells_better_than_what_single_drives_see_how_drives_lie_to_each_other() -> None:
     # Of two lights beside each other a drive alone does not know which another one saw.
-    of_fewest = dataclasses.replace(CITY, **FEWEST_IMAGES)
-    faulty, clean = (simulate(dataclasses.replace(of_fewest, pass_shift_m=m), seed=7) for m in (1.5, 0.0))
-    at_first = refine_poses(faulty, valuemap.MapConfig())
-    at_last = correction.correct_poses(faulty, valuemap.MapConfig(), Stages(), 1, silent)
+    clean = simulate(dataclasses.replace(CITY, **FEWEST_IMAGES), seed=7)
+    _, at_first, at_last = told_by_a_map()
     assert errors(at_last.dataset, clean)[0] < min(0.25, 0.75 * errors(at_first.dataset, clean)[0])
 
 
@@ -318,12 +378,15 @@ def test_poses_are_estimated_with_a_map_only_where_some_were_corrected() -> None
 
 def test_what_drives_are_off_by_is_found_before_their_objects_are() -> None:
     faulty, result = map_of_shifted_city()
-    as_it_is = valuemap.build_map(faulty, valuemap.MapConfig(correct_poses=0))
-    assert as_it_is.corrected is None
-    assert as_it_is.run["poses"] == {"found": "nothing", "because": "correct_poses is 0"}
     assert valuemap.evaluate_map(result, faulty, radius_m=4.0).precision > 0.97
-    with_poses, without = (off_from_each_other(one, faulty) for one in (result, as_it_is))
-    assert 2.0 * with_poses < without
+    assert off_from_each_other(result, faulty) < 0.57  # 1.14 where poses stay as they are.
+
+
+def test_poses_stay_where_they_are_not_to_be_corrected() -> None:
+    faulty = watched(3.0).city
+    as_it_is = refine_poses(faulty, valuemap.MapConfig(correct_poses=0))
+    assert as_it_is.dataset is faulty
+    assert as_it_is.record == {"found": "nothing", "because": "correct_poses is 0"}
 
 
 def off_from_each_other(result: valuemap.Map, dataset: Dataset) -> float:
@@ -350,8 +413,7 @@ def between_neighbors(result: valuemap.Map, dataset: Dataset) -> tuple[float, fl
 
 
 def test_all_that_images_show_tells_what_they_are_off_by_themselves() -> None:
-    clean, (faulty, result) = city(**FEWEST_IMAGES), map_of_dashcam_city()
-    alone = valuemap.build_map(faulty, valuemap.MapConfig().with_settings(["correct_poses=0"]))
+    clean, (faulty, result, alone) = city(**FEWEST_IMAGES), maps_of_dashcam_city()
     assert result.run["poses"]["found"] == "errors of images"
     assert result.corrected is not None
     assert errors(result.corrected, clean)[0] < 0.7 * errors(faulty, clean)[0]
@@ -361,41 +423,59 @@ def test_all_that_images_show_tells_what_they_are_off_by_themselves() -> None:
     assert square < 6.0
 
 
-@pytest.mark.parametrize("mapped", [map_of_dashcam_city, map_of_shifted_city], ids=["of images", "of drives"])
 def test_numbers_of_images_and_detections_do_not_matter_where_poses_are_corrected(
-    mapped: Callable[[], tuple[Dataset, valuemap.Map]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    (faulty, before), random, config = mapped(), np.random.default_rng(0), MapConfig()
-    shuffled = laws.shuffle_images(faulty, config, random)
-    shuffled = laws.shuffle_detections(shuffled.dataset, config, random)
-    assert before.run["poses"]["found"] != "nothing"
-    after = valuemap.build_map(shuffled.dataset)
-    assert laws.compare_maps(before, after, shuffled).holds
-    assert np.array_equal(places_by_name(before), places_by_name(after))
+    shifted, at_first, at_last = told_by_a_map()
+    assert at_last is not at_first
+    monkeypatch.setattr(correction, "_MAPS_OF_IMAGES", 1)
+    config = MapConfig()
+
+    def by_images(dataset: Dataset) -> Refined:
+        return correction._by_images(dataset, config, 1, silent)
+
+    def by_drives(dataset: Dataset) -> Refined:
+        return correction._told_by_a_map(dataset, refine_poses(dataset, config), config, 1, silent)
+
+    dashcam = city(lights=12, **FEWEST_IMAGES, **DASHCAM)
+    for faulty, before, correct in ((shifted, at_last, by_drives), (dashcam, by_images(dashcam), by_images)):
+        random = np.random.default_rng(0)
+        shuffled = laws.shuffle_images(faulty, config, random)
+        shuffled = laws.shuffle_detections(shuffled.dataset, config, random)
+        after = correct(shuffled.dataset)
+        assert before.is_corrected
+        assert after.record == before.record
+        assert np.array_equal(places_by_name(before.dataset), places_by_name(after.dataset))
 
 
-def places_by_name(result: valuemap.Map) -> Floats:
-    """Return where images are (N, 3) that a map corrected, in the order of their names."""
-    assert result.corrected is not None
-    images = result.corrected.images
+def places_by_name(dataset: Dataset) -> Floats:
+    """Return where images are (N, 3) in the order of their names."""
+    images = dataset.images
     return images.cam_from_world_m[np.argsort(images.name.to_numpy(zero_copy_only=False))]
 
 
 def lamps_of_four_sides() -> Dataset:
     """Return lamps that show other middles to other sides, of images that are off and show few of them."""
-    config = dataclasses.replace(CITY, has_lights=0, lamp_spacing_m=25.0, side_offset_m=0.25, frame_spacing_m=4.0)
+    config = dataclasses.replace(CITY, has_lights=0, lamp_spacing_m=25.0, side_offset_m=0.25, **FEWER_IMAGES)
     return simulate(dataclasses.replace(config, position_white_m=0.15, rotation_white_deg=0.2), seed=4)
 
 
 def test_middles_that_differ_by_side_are_no_errors_of_images(monkeypatch: pytest.MonkeyPatch) -> None:
     lamps = lamps_of_four_sides()
     assert lamps.truth is not None
-    result = valuemap.build_map(lamps)
+    made, map_alone = [], correction._map_alone
+
+    def noted(*given: Any) -> Any:
+        made.append(map_alone(*given))
+        return made[-1]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(correction, "_map_alone", noted)
+        result = valuemap.build_map(lamps)
     assert result.run["poses"]["found"] == "errors of images"
     assert len(result.labels) <= len(lamps.truth) + 1
     # What they are off by is told once, of images as they were.
-    calibration = correction._map_alone(lamps, MapConfig(), ThreadEngine(1), silent)[0]
-    assert result.run["counts"]["noise"]["side_m"] == calibration.noise.side_m > 0.0
+    assert result.run["counts"]["noise"]["side_m"] == made[0][0].noise.side_m > 0.0
     assert between_neighbors(result, lamps)[1] < 6.0
     for module in (correction, pipeline):
         monkeypatch.setattr(module, "with_sides", lambda _, config: config)
@@ -440,7 +520,7 @@ def test_images_that_were_moved_state_no_errors() -> None:
 
 def test_errors_of_images_are_no_noise_of_detections() -> None:
     """Images whose poses are exact stay, however poor the detector: what one object says another does not confirm."""
-    poor = city(pixel_noise_px=5.0, **FEWEST_IMAGES, **EXACT_POSES)
+    poor = city(pixel_noise_px=5.0, lights=12, **FEWEST_IMAGES, **EXACT_POSES)
     assert refine_poses(poor, valuemap.MapConfig()).is_noisy
     assert not correction._by_images(poor, valuemap.MapConfig(), 1, silent).is_corrected
 
@@ -496,7 +576,7 @@ def test_a_part_of_many_objects_says_whether_images_are_off() -> None:
 def test_single_images_are_looked_at_only_where_they_are_off_by_more_than_was_thought(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    clean, asked = city(), []
+    clean, asked = watched(0.0).city, []
 
     def by_images(dataset: Dataset, *_: Any) -> Refined:
         asked.append(dataset)
@@ -511,8 +591,7 @@ def test_single_images_are_looked_at_only_where_they_are_off_by_more_than_was_th
         )
         correction._proven(clean, valuemap.MapConfig(), Stages(), 1, silent)
     assert len(asked) == 1
-    monkeypatch.undo()
-    assert not refine_poses(clean, valuemap.MapConfig()).is_noisy
+    assert not watched(0.0).refined.is_noisy
 
 
 def rows_of_signs(moved_m: Floats | None = None) -> tuple[Footage, Estimate]:
@@ -612,24 +691,10 @@ def test_a_drive_that_was_laid_one_sign_further_on_is_put_back(signs: int) -> No
     assert of_drive.sum() > 1.05 * len(detection)
 
 
-def test_what_is_selected_is_free_of_aliases(monkeypatch: pytest.MonkeyPatch) -> None:
-    freed: list[Estimate] = []
-
-    def spy(footage: Footage, found: Estimate, range_m: float) -> Estimate:
-        freed.append(dataclasses.replace(without_aliases(footage, found, range_m)))
-        return freed[-1]
-
-    selected: list[Estimate] = []
-
-    def chosen(footage: Footage, found: Estimate) -> Selected | None:
-        selected.append(found)
-        return None
-
-    monkeypatch.setattr(poses, "without_aliases", spy)
-    monkeypatch.setattr(poses, "select", chosen)
-    refine_poses(city(), MapConfig())
-    assert len(selected) == len(freed) == 1
-    assert selected[0] is freed[0]
+def test_what_is_selected_is_free_of_aliases() -> None:
+    seen = watched(0.0)
+    assert len(seen.selected) == len(seen.freed) == 1
+    assert seen.selected[0] is seen.freed[0]
 
 
 def test_a_drive_that_is_elsewhere_stays_there() -> None:
@@ -830,7 +895,7 @@ def replace_cameras(dataset: Dataset, readout_s: Floats) -> Dataset:
 
 
 def test_a_rolling_shutter_costs_a_map_nothing_where_it_is_stated() -> None:
-    rolling = city(**ROLLING)
+    rolling = city(**ROLLING, passes_per_street=2)
     result = valuemap.build_map(rolling, MapConfig().with_settings(["correct_poses=0"]))
     assert result.corrected is not None
     assert result.corrected.cameras.readout_s is None
@@ -1270,18 +1335,8 @@ def test_equations_tell_what_others_are_without_a_group_as_a_fit_without_it_does
     np.testing.assert_allclose(told.covariance / np.outer(sigma, sigma), covariance / np.outer(sigma, sigma), atol=1e-4)
 
 
-def test_poses_that_are_right_cost_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    taken = 0
-    step = Adjustment.step
-
-    def counted(self: Adjustment, state: State, tolerance: float, **more: Any) -> tuple[State, float]:
-        nonlocal taken
-        taken += 1
-        return step(self, state, tolerance, **more)
-
-    monkeypatch.setattr(Adjustment, "step", counted)
-    refine_poses(city(), valuemap.MapConfig())
-    assert 10 < taken < 60
+def test_poses_that_are_right_cost_few_steps() -> None:
+    assert 10 < watched(0.0).steps < 60
 
 
 def test_velocities_change_at_once_where_a_car_stops_beside_images_that_are_missing() -> None:
