@@ -57,6 +57,23 @@ def test_what_drives_are_off_by_at_all_objects_alike_is_no_middle(seed: int) -> 
     assert Contrasts.of_sides(*sides(0.0, seed=seed)).middles_m(SIZE_M) is None
 
 
+@pytest.mark.parametrize("objects", [5, 8])
+def test_a_few_objects_tell_middles_beyond_what_their_sides_are_known_to(objects: int) -> None:
+    told_m = [Contrasts.of_sides(*sides(0.2, objects=objects, seed=seed)).middles_m(SIZE_M) for seed in range(5)]
+    assert None not in told_m
+    assert np.median([float(one_m or 0.0) for one_m in told_m]) == pytest.approx(0.2, rel=0.3)
+
+
+def test_the_half_that_agrees_best_says_what_all_objects_would() -> None:
+    contrasts = Contrasts.of_sides(*sides(0.2, objects=200))
+    values_m = SIZE_M * np.geomspace(1e-3, 1.0, 60)
+    everyone = np.ones(200, np.bool_)
+    is_best = refine_middles._best_half(contrasts._chances(everyone, 0.2))
+    assert is_best.sum() == 100
+    assert contrasts._as_of_all(is_best)._likeliest(is_best, values_m)[0] == pytest.approx(0.2, rel=0.15)
+    assert contrasts._likeliest(is_best, values_m)[0] < 0.15
+
+
 def test_objects_that_are_two_tell_nothing_of_middles() -> None:
     points, covariance_m2 = sides(0.0)
     for two in points[::8]:

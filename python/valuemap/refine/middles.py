@@ -26,8 +26,8 @@ _LEAST_OBJECTS = 5
 """Fewer objects of several sides do not tell what sides show, as in the core."""
 _MOST_OBJECTS = 200
 """Objects that are asked, at most about: they tell it to a twentieth, and how all disagree is one dense matrix."""
-_CERTAIN = 9.0
-"""Middles are there where twice the logarithm of the likelihood gains more: chance has it in one case of a thousand."""
+_LEAST_GAIN = 2.0
+"""Middles are there where twice the log-likelihood gains more: what one parameter gains by chance (Akaike)."""
 _ODD = 0.0027
 """Objects that disagree by what chance has in fewer cases, three standard deviations, given all others, are two."""
 _LEAST_SHARE = 1e-3
@@ -39,7 +39,7 @@ _ROUNDS = 10
 
 
 def middles(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> float | None:
-    """Return what the middles that sides show are off by, m, each axis; None where that is not beyond doubt.
+    """Return what the middles that sides show are off by, m, each axis; None where nothing tells that they are.
 
     `noise` is that of the map of `labels` and `votes`. What is not known well, as depth is, says little of middles.
     """
@@ -69,6 +69,12 @@ def _asked(sides: list[Ints]) -> list[Ints]:
     return sides[:: -(-len(sides) // _MOST_OBJECTS)] if sides else sides
 
 
+def _best_half(chances: Floats) -> Bools:
+    """Return which objects are the half that agrees best, or as many as tell what sides show."""
+    count = max(-(-len(chances) // 2), _LEAST_OBJECTS)
+    return np.asarray(chances >= np.sort(chances)[-count])
+
+
 @dataclass(frozen=True, eq=False)
 class Contrasts:
     """By what the sides of objects disagree: orthonormal contrasts (N), m, with their covariance (N, N), m².
@@ -92,26 +98,39 @@ class Contrasts:
         )
 
     def middles_m(self, size_m: float) -> float | None:
-        """Return what middles of things of a usual size are off by, m; None where it is not beyond doubt.
+        """Return what middles of things of a usual size are off by, m; None where nothing tells that they are.
 
         Objects that disagree by more than middles and poses explain, given all others, are left out, and the others
         tell it again.
         """
         values_m = size_m * np.geomspace(_LEAST_SHARE, 1.0, _VALUES)
-        is_one = np.ones(self.of[-1] + 1, np.bool_)
-        likeliest_m, gain = self._likeliest(is_one, values_m)
+        everyone = np.ones(self.of[-1] + 1, np.bool_)
+        if len(everyone) < _LEAST_OBJECTS:
+            return None
         # Objects that are two hide each other where all tell what is usual: the half that agrees best begins.
-        chances = self._chances(is_one, likeliest_m)
-        is_one = chances >= np.median(chances)
+        is_one = _best_half(self._chances(everyone, self._likeliest(everyone, values_m)[0]))
+        likeliest_m, gain = self._as_of_all(is_one)._likeliest(is_one, values_m)
         for _ in range(_ROUNDS):
+            before, is_one = is_one, self._chances(is_one, likeliest_m) > _ODD
             if is_one.sum() < _LEAST_OBJECTS:
                 return None
-            likeliest_m, gain = self._likeliest(is_one, values_m)
-            before, is_one = is_one, self._chances(is_one, likeliest_m) > _ODD
             if np.array_equal(is_one, before):
                 break
+            likeliest_m, gain = self._likeliest(is_one, values_m)
         # Sides that disagree by as much as things are large are those of several things.
-        return likeliest_m if gain > _CERTAIN and likeliest_m < size_m else None
+        return likeliest_m if gain > _LEAST_GAIN and likeliest_m < size_m else None
+
+    def _as_of_all(self, is_best: Bools) -> Contrasts:
+        """Return contrasts of which those of the objects that agree best are as large as all would be.
+
+        A share of squares from the least on has a mean below that of all, by a factor that is known for a Gaussian
+        (Croux and Haesbroeck 1999, of the minimum covariance determinant).
+        """
+        share, freedom = is_best.mean(), np.bincount(self.of)
+        if share == 1.0:
+            return self
+        factor = share / scipy.special.chdtr(freedom + 2, scipy.special.chdtri(freedom, 1.0 - share))
+        return replace(self, apart_m=self.apart_m * np.sqrt(factor)[self.of])
 
     def _likeliest(self, is_one: Bools, values_m: Floats) -> tuple[float, float]:
         """Return which value is likeliest for some of the objects, and twice what its log-likelihood gains."""
