@@ -1,4 +1,4 @@
-"""Runs that end before they are done, as processes of their own: by a signal, and by a full disk."""
+"""Runs that end before they are done: by a signal, as processes of their own, and by a full disk."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 import valuemap
 from test_tiles import SET, files, streets
+from valuemap.cli.commands import app
 
 LIMIT_S = 300.0
 
@@ -22,14 +24,30 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of several cells, and the map of it."""
     folder = tmp_path_factory.mktemp("interrupted")
     valuemap.write_dataset(streets(0.0, 445.0, 3000.0), folder / "street")
-    assert finish(start(folder, folder / "whole"))[0] == 0
+    assert run(mapping(folder, folder / "whole"))[0] == 0
     return folder
 
 
-def start(folder: Path, out: Path, *options: str) -> subprocess.Popen[str]:
+def mapping(folder: Path, out: Path, *options: str) -> list[str]:
     settings = [f"--set={name}={value}" for name, value in SET.items()]
-    command = [sys.executable, "-m", "valuemap.cli", "map", str(folder / "street"), "--out", str(out), "--threads=1"]
-    command += [*settings, "--tile-size=500", *options]
+    command = ["map", str(folder / "street"), "--out", str(out), "--threads=1"]
+    return [*command, *settings, "--tile-size=500", *options]
+
+
+def updating(folder: Path, out: Path, *options: str) -> list[str]:
+    command = ["update", str(folder / "whole"), "--out", str(out), "--threads=1"]
+    return [*command, "--add", str(folder / "added"), "--tile-size=500", *options]
+
+
+def run(command: list[str]) -> tuple[int, str]:
+    """Run a command to its end, in this process; return how it ended, and what it said on stderr."""
+    done = CliRunner().invoke(app, command)
+    return done.exit_code, done.stderr
+
+
+def start(command: list[str]) -> subprocess.Popen[str]:
+    """Start a command that is ended before it is done, in a process of its own."""
+    command = [sys.executable, "-m", "valuemap.cli", *command]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -46,7 +64,7 @@ def parts(work: Path) -> list[Path]:
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM that a process can hear")
 def test_a_terminated_run_says_so_in_one_line_and_goes_on(street: Path, tmp_path: Path) -> None:
     work = tmp_path / "map.work"
-    process = start(street, tmp_path / "map")
+    process = start(mapping(street, tmp_path / "map"))
     until = time.monotonic() + LIMIT_S
     while not parts(work) and process.poll() is None and time.monotonic() < until:
         time.sleep(0.002)
@@ -60,7 +78,7 @@ def test_a_terminated_run_says_so_in_one_line_and_goes_on(street: Path, tmp_path
     # Nothing temporary is left, there or beside it.
     assert [path.name for path in tmp_path.iterdir()] == ["map.work"]
     assert [path for path in work.rglob("*") if path.name.startswith(".tmp-")] == []
-    assert finish(start(street, tmp_path / "map", "--resume"))[0] == 0
+    assert run(mapping(street, tmp_path / "map", "--resume"))[0] == 0
     assert files(tmp_path / "map") == files(street / "whole")
     assert [path.name for path in tmp_path.iterdir()] == ["map"]
 
@@ -69,32 +87,30 @@ def test_a_terminated_run_says_so_in_one_line_and_goes_on(street: Path, tmp_path
 MOMENTS = ("dataset/detections.parquet", "cells/*.arrow", "added/detections.parquet")
 
 
+@pytest.fixture(scope="module")
+def updated(street: Path) -> dict[str, bytes]:
+    """What an update of the map is that nobody ends."""
+    valuemap.write_dataset(streets(0.0, 445.0, seed=11), street / "added")
+    assert run(updating(street, street / "updated"))[0] == 0
+    return everything(street / "updated")
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_an_update_that_is_killed_goes_on_to_the_same_map(
-    street: Path, tmp_path_factory: pytest.TempPathFactory, moment: str
+    street: Path, updated: dict[str, bytes], tmp_path: Path, moment: str
 ) -> None:
-    folder = street / "updates"
-    if not folder.is_dir():
-        valuemap.write_dataset(streets(0.0, 445.0, seed=11), folder / "added")
-        assert finish(update(street, folder / "whole"))[0] == 0
-    out = tmp_path_factory.mktemp("killed") / "map"
-    process = update(street, out)
+    out = tmp_path / "map"
+    process = start(updating(street, out))
     until = time.monotonic() + LIMIT_S
     while not any(out.with_name("map.work").glob(moment)) and process.poll() is None and time.monotonic() < until:
         time.sleep(0.001)
     process.kill()
     assert finish(process)[0] == -signal.SIGKILL
     assert not out.exists()
-    assert finish(update(street, out, "--resume"))[0] == 0
-    assert everything(out) == everything(folder / "whole")
-    assert [path.name for path in out.parent.iterdir()] == ["map"]
-
-
-def update(folder: Path, out: Path, *options: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "valuemap.cli", "update", str(folder / "whole"), "--out", str(out), "--threads=1"]
-    command += ["--add", str(folder / "updates" / "added"), "--tile-size=500", *options]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert run(updating(street, out, "--resume"))[0] == 0
+    assert everything(out) == updated
+    assert [path.name for path in tmp_path.iterdir()] == ["map"]
 
 
 def everything(folder: Path) -> dict[str, bytes]:
@@ -125,7 +141,7 @@ def mount(place: Path, *options: str) -> None:
 def test_on_a_full_disk_a_run_says_so_and_goes_on_when_there_is_room(
     street: Path, small_disk: Path, tmp_path: Path
 ) -> None:
-    code, told = finish(start(street, tmp_path / "map", f"--work={small_disk / 'work'}"))
+    code, told = run(mapping(street, tmp_path / "map", f"--work={small_disk / 'work'}"))
     assert code == 1, told
     assert told.startswith(f"error: {small_disk / 'work'}: cannot be written: No space left on device"), told
     assert "--resume" in told
@@ -133,7 +149,7 @@ def test_on_a_full_disk_a_run_says_so_and_goes_on_when_there_is_room(
     assert not (tmp_path / "map").exists()
     assert [path for path in small_disk.rglob("*") if path.name.startswith(".tmp-")] == []
     mount(small_disk, "-o", "remount,size=100m")
-    assert finish(start(street, tmp_path / "map", f"--work={small_disk / 'work'}", "--resume"))[0] == 0
+    assert run(mapping(street, tmp_path / "map", f"--work={small_disk / 'work'}", "--resume"))[0] == 0
     assert files(tmp_path / "map") == files(street / "whole")
 
 
@@ -141,11 +157,11 @@ def test_a_map_that_does_not_fit_leaves_nothing_behind(street: Path, small_disk:
     # The parts fit elsewhere, the map does not.
     (small_disk / "map").mkdir()
     (small_disk / "letter").write_bytes(b"x" * 50_000)
-    code, told = finish(start(street, small_disk / "map", f"--work={tmp_path / 'work'}"))
+    code, told = run(mapping(street, small_disk / "map", f"--work={tmp_path / 'work'}"))
     assert code == 1, told
     assert "No space left on device" in told
     assert sorted(path.name for path in small_disk.rglob("*")) == ["letter", "map"]
     (small_disk / "letter").unlink()
     mount(small_disk, "-o", "remount,size=100m")
-    assert finish(start(street, small_disk / "map", f"--work={tmp_path / 'work'}", "--resume"))[0] == 0
+    assert run(mapping(street, small_disk / "map", f"--work={tmp_path / 'work'}", "--resume"))[0] == 0
     assert files(small_disk / "map") == files(street / "whole")
