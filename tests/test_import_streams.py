@@ -31,15 +31,15 @@ from valuemap.text_files import read_json
 HEADER = "image,class,left,top,width,height,score,range_m"
 
 
-def write(folder: Path, *, separator: str = ",", bad: bool = True) -> Path:
-    """Write poses of 40 images and 2000 boxes in them, some of which cannot be used."""
+def write(folder: Path, *, separator: str = ",", bad: bool = True, count: int = 2000) -> Path:
+    """Write poses of 40 images and so many boxes in them, some of which cannot be used."""
     random = np.random.default_rng(5)
     folder.mkdir()
     poses = ["image,x,y,z,heading_deg,pass,width_px,height_px,fx,cx,cy"]
     poses += [f"{i // 20}/{i}.jpg,{2.0 * i},0,1.5,90,{i // 20},640,480,500,320,240" for i in range(40)]
     (folder / "poses.csv").write_text("\n".join(poses) + "\n")
     rows = []
-    for i in range(2000):
+    for i in range(count):
         left, top, width, height = random.uniform([0, 0, 5, 5], [600, 440, 40, 40]).round(2)
         image, kind = f"{i % 2}/{random.integers(0, 20) + 20 * (i % 2)}.jpg", ("light", " sign ", "light")[i % 3]
         rows.append([image, kind, left, top, width, height, round(random.uniform(), 3), 30.5])
@@ -149,7 +149,7 @@ def test_texts_that_repeat_are_held_once() -> None:
 # COCO's files.
 
 
-def coco(folder: Path, *, results: bool = False, after: int = 0) -> Path:
+def coco(folder: Path, *, results: bool = False, corners: int = 5) -> Path:
     """Write the boxes of `write` as COCO's, with what is not needed in them, and some that cannot be used."""
     lines = (folder / "boxes.csv").read_text().splitlines()[1:]
     rows = [line.split(",") for line in lines]
@@ -161,7 +161,7 @@ def coco(folder: Path, *, results: bool = False, after: int = 0) -> Path:
             "category_id": {"light": 1, " sign ": 2}.get(kind, 9),
             "bbox": [float(left), float(top), float(width), float(height)],
             "score": float(score),
-            "segmentation": [[0.25] * 99, '\\"ü]}\u00fc' * 9],
+            "segmentation": [[0.25] * corners, '\\"ü]}\u00fc' * 9],
         }
         for name, kind, left, top, width, height, score, _ in rows
     ]
@@ -229,10 +229,10 @@ def many(folder: Path, count: int, kind: str) -> Path:
 def test_memory_does_not_grow_with_the_boxes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     poses = write(tmp_path / "data") / "poses.csv"
     in_small_portions(monkeypatch)
-    monkeypatch.setattr(row_file, "PORTION", 1000)
-    monkeypatch.setattr(csv_table, "_BLOCK", 20_000)
-    monkeypatch.setattr(json_lists, "_BLOCK", 20_000)
-    monkeypatch.setattr(tables, "ROWS_OF_GROUP", 1000)
+    monkeypatch.setattr(row_file, "PORTION", 500)
+    monkeypatch.setattr(csv_table, "_BLOCK", 10_000)
+    monkeypatch.setattr(json_lists, "_BLOCK", 10_000)
+    monkeypatch.setattr(tables, "ROWS_OF_GROUP", 500)
 
     in_arrow: list[int] = []
     append = row_file.RowFile.append
@@ -255,15 +255,15 @@ def test_memory_does_not_grow_with_the_boxes(tmp_path: Path, monkeypatch: pytest
         return python, max(in_arrow)
 
     peak(1000)  # What is imported is no part of it.
-    few, more = peak(5_000), peak(30_000)
-    # Less than the boxes take: what is listed of a group of those left out is texts, half a megabyte.
-    assert more[0] - few[0] < 20 * 25_000
+    few, more = peak(2_000), peak(10_000)
+    # Less than the boxes take: what is listed of a group of those left out is texts, a quarter of a megabyte.
+    assert more[0] - few[0] < 20 * 8_000
     assert more[1] < 1.5 * few[1] + 10_000
     # The same with all in one portion, and of a table in one block.
     monkeypatch.setattr(row_file, "PORTION", 10**6)
     monkeypatch.setattr(csv_table, "_BLOCK", 2_000_000)
-    whole = peak(30_000)
-    assert whole[0] - few[0] > 50 * 25_000
+    whole = peak(10_000)
+    assert whole[0] - few[0] > 50 * 8_000
     if kind == "csv":
         assert whole[1] > 3 * more[1]
 
@@ -332,7 +332,7 @@ def test_ids_that_do_not_ascend_are_told_apart_in_parts(monkeypatch: pytest.Monk
 
 
 def test_a_large_coco_file_is_never_in_memory_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = coco(write(tmp_path / "data"))
+    path = coco(write(tmp_path / "data"), corners=99)
     monkeypatch.setattr(json_lists, "_BLOCK", 2**14)
     monkeypatch.setattr(json_lists, "PORTION", 20)
     tracemalloc.start()
@@ -346,7 +346,7 @@ def test_a_large_coco_file_is_never_in_memory_whole(tmp_path: Path, monkeypatch:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda c: c["annotations"].__setitem__(1500, 3), r"annotations\[1500\]: expected an object, found 3"),
+        (lambda c: c["annotations"].__setitem__(50, 3), r"annotations\[50\]: expected an object, found 3"),
         (lambda c: c["images"][39].pop("id"), r"images\[39\]: id: expected a whole number or a text, found None"),
         (lambda c: c["images"][38].update(id=90), r"images\[38\]: id 90 is there twice"),
         (lambda c: c["categories"][1].update(id=1), r"categories\[1\]: id 1 is there twice"),
@@ -359,7 +359,7 @@ def test_a_large_coco_file_is_never_in_memory_whole(tmp_path: Path, monkeypatch:
 def test_errors_of_coco_in_portions_say_the_entry(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: Any, message: str
 ) -> None:
-    path = coco(write(tmp_path / "data"))
+    path = coco(write(tmp_path / "data", bad=False, count=60))
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))
@@ -369,7 +369,7 @@ def test_errors_of_coco_in_portions_say_the_entry(
 
 
 def test_of_lists_of_one_name_the_last_counts(tmp_path: Path) -> None:
-    path = coco(write(tmp_path / "data"))
+    path = coco(write(tmp_path / "data", bad=False, count=60))
     box = '{"image_id": 100, "category_id": 1, "bbox": [1, 2, 3, 4], "id": 1}'
     path.write_text(
         path.read_text().rstrip()[:-1] + f', "annotations": [{box}], "images": 3, "images": [], "images": []}}'
