@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import io
 import itertools
 import json
 import os
 import shutil
 import threading
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -379,19 +380,29 @@ def test_only_a_few_pictures_are_decoded_ahead(tmp_path: Path, finder: Path, mon
 # Interrupted runs.
 
 
+@cache
+def noisy_png(number: int) -> bytes:
+    """Return a file of noise with a red rectangle, whose place is that of the number."""
+    pixels = painted((640, 120), [(30 * number, 40, 30 * number + 17, 90)])
+    noise = np.random.default_rng(number).normal(0, 25, pixels.shape)
+    file = io.BytesIO()
+    Image.fromarray(np.clip(pixels + noise, 0, 255).astype(np.uint8)).save(file, "PNG")
+    return file.getvalue()
+
+
 def noisy_pictures(folder: Path) -> Path:
     """Write a dataset of 20 images with a noisy picture each, but for one that is damaged."""
     base = small_dataset()
+    cameras = base.cameras.replace(height_px=np.full(len(base.cameras), 120))
     images = base.images.take(np.repeat(0, 20)).replace(
         image_id=np.arange(20), name=pa.array([f"{i}.png" for i in range(20)])
     )
-    detections = base.detections.take(np.array([0])).replace(image_id=np.array([0]))
-    write_dataset(Dataset("long", base.frame, base.cameras, images, detections), folder)
-    random = np.random.default_rng(2)
+    detections = base.detections.take(np.array([0]))
+    detections = detections.replace(image_id=np.array([0]), center_px=np.array([[400.0, 60.0]]))
+    write_dataset(Dataset("long", base.frame, cameras, images, detections), folder)
+    (folder / "images").mkdir()
     for i in range(20):
-        pixels = painted((640, 480), [(30 * i, 40, 30 * i + 17, 90)])
-        noisy = np.clip(pixels + random.normal(0, 25, pixels.shape), 0, 255).astype(np.uint8)
-        save(folder / "images" / f"{i}.png", noisy)
+        (folder / "images" / f"{i}.png").write_bytes(noisy_png(i))
     (folder / "images" / "3.png").write_text("damaged")
     return folder
 
