@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from valuemap import build_map
-from valuemap.config import SimulationConfig
+from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import write_dataset
 from valuemap.evidence import Evidence
 from valuemap.map_folder import write_map
@@ -28,7 +28,7 @@ def city() -> Evidence:
         passes_per_street=3,
     )
     dataset = simulate(config, seed=3)
-    return Evidence(build_map(dataset), dataset)
+    return Evidence(build_map(dataset, MapConfig(correct_poses=0)), dataset)
 
 
 def write_city(folder: Path, *, pictures: int = 0) -> tuple[Path, Path]:

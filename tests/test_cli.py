@@ -169,9 +169,10 @@ def test_only_the_command_that_is_asked_for_is_imported() -> None:
 import sys
 from valuemap.cli.load import COMMANDS, load_commands
 load_commands(sys.argv[1:])
-print(*(name for name in COMMANDS if f"valuemap.cli.{name}" in sys.modules))
+print(*(name for name in (*COMMANDS, "import_.colmap") if f"valuemap.cli.{name}" in sys.modules))
+assert not {"valuemap.readers.colmap", "pycolmap", "scipy.spatial"} & set(sys.modules)
 """
-    asked = ((["info", "map"], "info"), (["evaluate-detections"], "evaluate_detections"), (["--version"], ""))
+    asked = ((["info", "map"], "info"), (["import"], "import_ import_.colmap"), (["--version"], ""))
     for words, imported in asked:
         done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
         assert done.stdout == f"{imported}\n"
@@ -188,14 +189,14 @@ def test_settings_are_listed_with_their_effects() -> None:
 
 
 def test_a_map_replaces_an_older_one_and_nothing_else(street: Path, tmp_path: Path) -> None:
-    works("map", street, "--out", tmp_path / "map")
-    works("map", street, "--out", tmp_path / "map", "--set", "min_votes=5")
+    works("map", street, "--out", tmp_path / "map", "--method", "paper")
+    works("map", street, "--out", tmp_path / "map", "--method", "paper", "--set", "min_votes=5")
     assert valuemap.read_map(tmp_path / "map").run["settings"]["min_votes"] == 5
     (tmp_path / "map" / "thesis.txt").write_text("years of work")
     (tmp_path / "map" / "votes.parquet").write_text("by hand")
     assert "votes.parquet: is not ours to replace" in complains("map", street, "--out", tmp_path / "map")
     assert (tmp_path / "map" / "votes.parquet").read_text() == "by hand"
-    works("map", street, "--out", tmp_path / "map", "--force")
+    works("map", street, "--out", tmp_path / "map", "--method", "paper", "--force")
     assert (tmp_path / "map" / "thesis.txt").read_text() == "years of work"
     works("export", tmp_path / "map", tmp_path / "labels.csv")
     works("export", tmp_path / "map", tmp_path / "labels.csv")
@@ -339,7 +340,7 @@ def test_a_signal_to_end_leaves_nothing_behind(
     with subprocess.Popen(
         dense, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heard_by_default
     ) as process:
-        while process.poll() is None and cpu_seconds(process.pid) < 2.5:  # Starting takes a second.
+        while process.poll() is None and cpu_seconds(process.pid) < 1.7:  # Starting takes a second.
             time.sleep(0.05)
         assert process.poll() is None, "the work was too short to be interrupted"
         process.send_signal(number)

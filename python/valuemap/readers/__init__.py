@@ -2,38 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING
 
-from valuemap.readers.argoverse2 import read_argoverse2
-from valuemap.readers.bearings import read_bearings
-from valuemap.readers.colmap import read_colmap
-from valuemap.readers.csv_poses import read_csv_poses
-from valuemap.readers.kapture import read_kapture
-from valuemap.readers.kitti import read_kitti
-from valuemap.readers.kitti360 import read_kitti360
-from valuemap.readers.mapillary import read_mapillary
-from valuemap.readers.nuscenes import read_nuscenes
-from valuemap.readers.opensfm import read_opensfm
-from valuemap.readers.panoramax import read_panoramax
-from valuemap.readers.pictures import read_pictures
-from valuemap.readers.reader import Reader
-from valuemap.readers.ros import read_ros
-from valuemap.readers.tum import read_tum
+if TYPE_CHECKING:
+    from valuemap.readers.reader import Reader
 
-READERS: Mapping[str, Reader[...]] = {
-    "argoverse2": read_argoverse2,
-    "bearings": read_bearings,
-    "colmap": read_colmap,
-    "csv": read_csv_poses,
-    "kapture": read_kapture,
-    "kitti": read_kitti,
-    "kitti360": read_kitti360,
-    "mapillary": read_mapillary,
-    "nuscenes": read_nuscenes,
-    "opensfm": read_opensfm,
-    "panoramax": read_panoramax,
-    "pictures": read_pictures,
-    "ros": read_ros,
-    "tum": read_tum,
+_MODULE_OF = {
+    "argoverse2": "argoverse2",
+    "bearings": "bearings",
+    "colmap": "colmap",
+    "csv": "csv_poses",
+    "kapture": "kapture",
+    "kitti": "kitti",
+    "kitti360": "kitti360",
+    "mapillary": "mapillary",
+    "nuscenes": "nuscenes",
+    "opensfm": "opensfm",
+    "panoramax": "panoramax",
+    "pictures": "pictures",
+    "ros": "ros",
+    "tum": "tum",
 }
+"""The function of a module has its name, with `read_` before it."""
+
+
+class _Readers(Mapping[str, "Reader[...]"]):
+    """A reader is imported when it is asked for: all of them, with what they need, take half a second."""
+
+    def __getitem__(self, name: str) -> Reader[...]:
+        module = _MODULE_OF[name]
+        reader: Reader[...] = getattr(import_module(f"{__name__}.{module}"), f"read_{module}")
+        return reader
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_MODULE_OF)
+
+    def __len__(self) -> int:
+        return len(_MODULE_OF)
+
+
+READERS: Mapping[str, Reader[...]] = _Readers()
 """What `valuemap import NAME` calls; paths may be given as texts."""

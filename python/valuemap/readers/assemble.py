@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.dataset import Dataset, Frame, check_dataset, write_dataset_in_portions
@@ -193,7 +193,7 @@ def _check_steps(images: Images, source: str) -> None:
         # A car that waits says nothing about scale: its images are one place.
         places = np.unique((center_m[images.pass_id.codes == code] / _STILL_M).round(), axis=0) * _STILL_M
         if len(places) > 1:
-            distance_m, _ = cKDTree(places).query(places, k=[2])
+            distance_m, _ = scipy.spatial.cKDTree(places).query(places, k=[2])
             steps.append(np.ravel(distance_m))
     if np.bincount(images.pass_id.codes).max() < 2:
         return

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 import pyarrow as pa
-from scipy.spatial.transform import Rotation
+import scipy
 
 from valuemap.anchor import HIGHEST_M
 from valuemap.errors import InputError, SettingError
@@ -132,7 +132,7 @@ def local_from_cam(heading_rad: Floats, pitch_rad: Floats, roll_rad: Floats) -> 
     The heading counts clockwise from north as seen from above, the pitch up, and the roll clockwise as seen from
     behind the camera, so that its right side is down. The heading is applied last.
     """
-    turn = Rotation.from_euler("ZXY", np.stack([-heading_rad, pitch_rad, roll_rad], axis=1))
+    turn = scipy.spatial.transform.Rotation.from_euler("ZXY", np.stack([-heading_rad, pitch_rad, roll_rad], axis=1))
     matrix: Floats = turn.as_matrix() @ LOOKING_NORTH
     return matrix
 
@@ -147,7 +147,7 @@ def rotations_of_quaternions(quaternion_wxyz: Floats) -> Floats:
     fine: Bools = np.abs(length - 1.0) < _ROTATION_TOLERANCE
     matrix = np.where(np.isfinite(quaternion_wxyz).all(axis=1), 0.0, np.nan)[:, None, None] * np.ones((1, 3, 3))
     if fine.any():
-        matrix[fine] = Rotation.from_quat(quaternion_wxyz[fine], scalar_first=True).as_matrix()
+        matrix[fine] = scipy.spatial.transform.Rotation.from_quat(quaternion_wxyz[fine], scalar_first=True).as_matrix()
     return matrix
 
 
@@ -211,7 +211,7 @@ def make_images(
     quaternion[is_given[order]] = translation[is_given[order]] = 0.0
     fine = is_motion[order]
     if fine.any():
-        cam_from_world = Rotation.from_matrix(world_from_cam[order][fine]).inv()
+        cam_from_world = scipy.spatial.transform.Rotation.from_matrix(world_from_cam[order][fine]).inv()
         quaternion[fine] = cam_from_world.as_quat(canonical=True, scalar_first=True)
         translation[fine] = -cam_from_world.apply(center_in_world_m[order][fine])
     optional = {
@@ -284,7 +284,7 @@ def interpolate_poses(
         return np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan), np.zeros(count, dtype=np.bool_)
     known_time, rotation, center_m = known_time[fine], rotation[fine], center_m[fine]
     order = np.argsort(known_time, kind="stable")
-    known, rotations, centers = known_time[order], Rotation.from_matrix(rotation[order]), center_m[order]
+    known, rotations, centers = known_time[order], scipy.spatial.transform.Rotation.from_matrix(rotation[order]), center_m[order]
     after = np.clip(np.searchsorted(known, time), 1 if len(known) > 1 else 0, len(known) - 1)
     before = np.maximum(after - 1, 0)
     gap = known[after] - known[before]
@@ -293,7 +293,7 @@ def interpolate_poses(
     usable: Bools = inside & ((gap <= longest) | (share == 0.0) | (share == 1.0))
     share = np.clip(share, 0.0, 1.0)
     step = rotations[before].inv() * rotations[after]
-    turned = rotations[before] * Rotation.from_rotvec(step.as_rotvec() * share[:, None])
+    turned = rotations[before] * scipy.spatial.transform.Rotation.from_rotvec(step.as_rotvec() * share[:, None])
     moved: Floats = centers[before] + (centers[after] - centers[before]) * share[:, None]
     return turned.as_matrix(), moved, usable
 
