@@ -28,7 +28,9 @@ from literal import Pinhole, Sighting
 from more_data import part_of, reprojection_errors_px, tour_of_images
 from scenes import Scene, as_dataset
 from small_dataset import map_of
+from valuemap import correction
 from valuemap.config import SimulationConfig
+from valuemap.refine import Refined
 from valuemap.simulate import PRESETS, Recording, record_city
 from valuemap.simulate.detector import KINDS
 from valuemap.simulate.pose_errors import pose_errors
@@ -37,7 +39,7 @@ from valuemap.tables import Categories, Floats, Ints, Truth, TruthDetections, Vo
 
 @pytest.fixture(scope="module")
 def small_city() -> Recording:
-    return record_city(PRESETS["small"], seed=0)
+    return record_city(dataclasses.replace(PRESETS["small"], passes_per_street=2), seed=0)
 
 
 # The Cramer-Rao bound.
@@ -303,7 +305,7 @@ def test_seeds_are_numbers_and_ranges() -> None:
 
 def block_driven(passes: int) -> SimulationConfig:
     """Stands for the city of the benchmarks."""
-    return block(passes_per_street=passes, lookalikes_per_light=0.0)
+    return block(passes_per_street=passes, lookalikes_per_light=0.0, frame_spacing_m=4.0, standing_interval_s=2.0)
 
 
 def block_drawn(_random: np.random.Generator) -> dict[str, float]:
@@ -340,7 +342,8 @@ def test_a_benchmark_writes_what_it_found(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """On one block instead of the city."""
+    """On one block instead of the city, whose poses stay."""
+    monkeypatch.setattr(correction, "refine_poses", lambda dataset, *_, **__: Refined(dataset, {"found": "nothing"}))
     path = tmp_path / "figures.json"
     module = importlib.import_module(script)
     small_ones = {"city": block_driven, "SMALL": {"passes_per_street": 2}, "draw": block_drawn}
