@@ -24,11 +24,12 @@ import valuemap
 from block import block
 from small_dataset import small_dataset
 from tiny_models import red_finder
-from valuemap import tables
+from valuemap import correction, tables
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, write_dataset
 from valuemap.readers import READERS
 from valuemap.readers.detections import DETECTIONS
+from valuemap.refine import Refined
 from valuemap.simulate import PRESETS, simulate
 from valuemap.writers import SUFFIXES
 
@@ -222,9 +223,10 @@ def write_colmap_model(dataset: Dataset, folder: Path) -> None:
 
 @pytest.fixture
 def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with what the tutorials say that the reader has, which it goes to."""
+    """A folder with what the tutorials say that the reader has, which it goes to; poses stay, as finding that is slow."""
     monkeypatch.chdir(tmp_path)
-    few = block(frame_spacing_m=4.0, standing_interval_s=2.0)
+    monkeypatch.setattr(correction, "refine_poses", lambda dataset, *_, **__: Refined(dataset, {"found": "nothing"}))
+    few = block(frame_spacing_m=6.0, standing_interval_s=4.0, passes_per_street=1)
     monkeypatch.setitem(PRESETS, "small", few)
     city = simulate(few, seed=0)
     write_colmap_model(city, tmp_path / "model")
