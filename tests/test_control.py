@@ -27,6 +27,12 @@ from valuemap.tables import Categories, Floats, Rejected
 SHIFT = np.array([-0.4, 0.25, 0.1])
 
 
+@pytest.fixture(autouse=True)
+def few_splits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave points out ten times instead of fifty."""
+    monkeypatch.setattr("valuemap.control._SPLITS", 10)
+
+
 def surveyed(places: Floats, classes: list[str] | None = None, **changes: object) -> TrueObjects:
     names = None if classes is None else Categories.from_texts(classes)
     return TrueObjects(np.arange(len(places)), places, names, **changes)  # type: ignore[arg-type]
