@@ -130,6 +130,7 @@ def test_rows_that_are_not_in_the_part_are_checked_too(good: tuple[Path, Dataset
 def test_a_report_shows_a_part_of_a_large_map_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data, result = write_city(tmp_path)
     labels = len(read_map(result).labels)
+    monkeypatch.setattr("valuemap.report.write._figures", lambda *_: [])  # Drawn in other tests.
     monkeypatch.setattr(part, "LARGEST_PART", 300)
     some, dataset = part.part_of_map(read_map(result), data)
     assert 0 < len(some.labels) < labels

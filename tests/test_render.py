@@ -162,7 +162,7 @@ def test_lights_are_painted_where_the_boxes_are() -> None:
 
 def test_lights_that_traffic_hides_are_not_in_the_picture() -> None:
     checked = 0
-    for row in np.unique(recording().sightings.frame_row[recording().is_hidden])[::25]:
+    for row in np.unique(recording().sightings.frame_row[recording().is_hidden])[::50]:
         scene = look(world(), int(row))
         shown, hidden = world().sightings_in(int(row))
         is_hidden = np.isin(scene.housings.light_row, shown.target_row[hidden])
