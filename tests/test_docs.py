@@ -223,7 +223,7 @@ def write_colmap_model(dataset: Dataset, folder: Path) -> None:
 
 @pytest.fixture
 def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with what the tutorials say that the reader has, which it goes to; poses stay, as finding that is slow."""
+    """A folder with what the tutorials say that the reader has, which it goes to; poses stay, for speed."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(correction, "refine_poses", lambda dataset, *_, **__: Refined(dataset, {"found": "nothing"}))
     few = block(frame_spacing_m=6.0, standing_interval_s=4.0, passes_per_street=1)

@@ -27,7 +27,7 @@ from valuemap.evaluate import Evaluation, evaluate_map
 from valuemap.evidence import Evidence
 from valuemap.experiment import CURVES, PassesResult, Quartiles
 from valuemap.map_folder import Map
-from valuemap.report.figures import density_of_chi2, existence, normalized_errors, passes, residuals_by_depth
+from valuemap.report.figures import existence, normalized_errors, passes, residuals_by_depth
 from valuemap.report.page import inline_data, shown
 from valuemap.report.paper import ReportTable, paper_tables
 from valuemap.report.run_tables import accuracy_tables, doubtful_rows, run_tables, worst_rows
@@ -342,12 +342,6 @@ def test_honest_covariances_are_called_honest() -> None:
     squared, dimensions = normalized_errors(result, evaluation)
     assert dimensions == 3
     assert squared.mean() == pytest.approx(3.0, abs=0.35)
-
-
-def test_the_line_of_honest_errors_is_the_density_of_chi_squared() -> None:
-    squared = np.linspace(0.0, 24.0, 200)
-    assert_allclose(density_of_chi2(squared, 2), 0.5 * np.exp(-0.5 * squared), rtol=1e-12)
-    assert_allclose(density_of_chi2(squared, 3), np.sqrt(squared / (2.0 * np.pi)) * np.exp(-0.5 * squared), rtol=1e-12)
 
 
 @pytest.mark.parametrize(

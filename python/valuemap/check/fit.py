@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import csr_matrix
+import scipy
 
 from valuemap.cameras import Rays, local_pinholes, rotation_matrices
 from valuemap.check.agreement import Agreement, agreement_on
@@ -284,7 +284,7 @@ class _Sums:
     """Adds up rows that belong together: all those (N) of one number, from 0 without gaps."""
 
     def __init__(self, number: Ints) -> None:
-        self._sum = csr_matrix((np.ones(len(number)), (number, np.arange(len(number)))))
+        self._sum = scipy.sparse.csr_matrix((np.ones(len(number)), (number, np.arange(len(number)))))
 
     def __call__(self, values: Floats) -> Floats:
         """Return the sums (K, ...) of rows (N, ...), added in their order."""

@@ -284,7 +284,8 @@ def interpolate_poses(
         return np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan), np.zeros(count, dtype=np.bool_)
     known_time, rotation, center_m = known_time[fine], rotation[fine], center_m[fine]
     order = np.argsort(known_time, kind="stable")
-    known, rotations, centers = known_time[order], scipy.spatial.transform.Rotation.from_matrix(rotation[order]), center_m[order]
+    rotations = scipy.spatial.transform.Rotation.from_matrix(rotation[order])
+    known, centers = known_time[order], center_m[order]
     after = np.clip(np.searchsorted(known, time), 1 if len(known) > 1 else 0, len(known) - 1)
     before = np.maximum(after - 1, 0)
     gap = known[after] - known[before]

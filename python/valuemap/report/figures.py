@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy
 
 from valuemap.evaluate import Evaluation
 from valuemap.evaluate.reliability import LIMITS, ExistenceRange
@@ -166,7 +165,9 @@ def covariance(result: Map, evaluation: Evaluation | None) -> ReportFigure | Non
     squared, dimensions = normalized_errors(result, evaluation)
     if len(squared) < 3:
         return None
-    claimed = np.sort(scipy.special.chdtr(dimensions, squared))
+    from scipy.stats import chi2  # Slow to import, and only this figure needs it.
+
+    claimed = np.sort(chi2.cdf(squared, dimensions))
     share = (np.arange(len(claimed)) + 1.0) / len(claimed)
     line = np.linspace(0.0, 1.0, 101)
     band = 1.36 / math.sqrt(len(claimed))  # Kolmogorov and Smirnov's, at 95 %.
@@ -194,8 +195,9 @@ def covariance(result: Map, evaluation: Evaluation | None) -> ReportFigure | Non
         top = float(np.clip(np.quantile(squared, 0.98), 3.0 * dimensions, 8.0 * dimensions))
         edges = np.linspace(0.0, top, 25).tolist()
         bars.hist(np.minimum(squared, top), edges, density=True, color=BLUE, alpha=0.75, label="this map")
-        x = np.linspace(0.0, top, 200)
-        bars.plot(x, density_of_chi2(x, dimensions), color=INK, label=f"chi², {dimensions} degrees")
+        bars.plot(
+            x := np.linspace(0.0, top, 200), chi2.pdf(x, dimensions), color=INK, label=f"chi², {dimensions} degrees"
+        )
         bars.set_xlabel("squared error in sigmas (last bar: and more)")
         bars.set_ylabel("density")
         bars.legend()
@@ -206,13 +208,6 @@ def covariance(result: Map, evaluation: Evaluation | None) -> ReportFigure | Non
         f"{dimensions} would be right. Larger is overconfident, smaller too careful.",
         figure,
     )
-
-
-def density_of_chi2(squared: Floats, dimensions: int) -> Floats:
-    """Return the density of squared errors in so many dimensions; all distributions of SciPy take a second to import."""
-    half = 0.5 * dimensions
-    logarithm = scipy.special.xlogy(half - 1.0, squared) - 0.5 * squared
-    return np.asarray(np.exp(logarithm - scipy.special.gammaln(half) - half * math.log(2.0)))
 
 
 def normalized_errors(result: Map, evaluation: Evaluation) -> tuple[Floats, int]:
