@@ -26,8 +26,8 @@ _LEAST_OBJECTS = 5
 """Fewer objects of several sides do not tell what sides show, as in the core."""
 _MOST_OBJECTS = 200
 """Objects that are asked, at most about: they tell it to a twentieth, and how all disagree is one dense matrix."""
-_LEAST_GAIN = 2.0
-"""Middles are there where twice the log-likelihood gains more: what one parameter gains by chance (Akaike)."""
+_CERTAIN = 9.0
+"""Middles are there where twice the logarithm of the likelihood gains more: chance has it in one case of a thousand."""
 _ODD = 0.0027
 """Objects that disagree by what chance has in fewer cases, three standard deviations, given all others, are two."""
 _LEAST_SHARE = 1e-3
@@ -39,7 +39,7 @@ _ROUNDS = 10
 
 
 def middles(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> float | None:
-    """Return what the middles that sides show are off by, m, each axis; None where nothing tells that they are.
+    """Return what the middles that sides show are off by, m, each axis; None where that is not beyond doubt.
 
     `noise` is that of the map of `labels` and `votes`. What is not known well, as depth is, says little of middles.
     """
@@ -98,7 +98,7 @@ class Contrasts:
         )
 
     def middles_m(self, size_m: float) -> float | None:
-        """Return what middles of things of a usual size are off by, m; None where nothing tells that they are.
+        """Return what middles of things of a usual size are off by, m; None where it is not beyond doubt.
 
         Objects that disagree by more than middles and poses explain, given all others, are left out, and the others
         tell it again.
@@ -118,7 +118,7 @@ class Contrasts:
                 break
             likeliest_m, gain = self._likeliest(is_one, values_m)
         # Sides that disagree by as much as things are large are those of several things.
-        return likeliest_m if gain > _LEAST_GAIN and likeliest_m < size_m else None
+        return likeliest_m if gain > _CERTAIN and likeliest_m < size_m else None
 
     def _as_of_all(self, is_best: Bools) -> Contrasts:
         """Return contrasts of which those of the objects that agree best are as large as all would be.
