@@ -92,5 +92,10 @@ def _estimated(
     calibration, found = estimated(with_sides(0.0, config), sought)
     labels, votes = describe_labels(sample.dataset, scene.rays, found, config.noise)
     votes = replace(votes, detection_id=sample.detection_id[votes.detection_id])
-    side_m = middles(images_in_order(sample, config), labels, votes, calibration.noise)
-    return calibration if side_m is None else estimated(with_sides(side_m, config), None)[0]
+    told = middles(images_in_order(sample, config), labels, votes, calibration.noise)
+    if told is None:
+        return calibration
+    if told.is_certain:
+        return estimated(with_sides(told.off_m, config), None)[0]
+    # Who votes for what stays; how well it is known had better not rest on a doubt.
+    return replace(calibration, noise_of_covariances=replace(calibration.noise_of_covariances, side_m=told.off_m))

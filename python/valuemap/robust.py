@@ -71,7 +71,7 @@ class Calibration:
 
     noise: Noise
     noise_of_covariances: Noise
-    """The same where successive looks may be off alike: what covariances are estimated with."""
+    """The same where successive looks, or middles that sides show, may be off: what covariances are estimated with."""
     is_deep: bool
     """Whether all moves of the search pay."""
     classes: dict[str, tuple[float, ...]]

@@ -28,6 +28,8 @@ _MOST_OBJECTS = 200
 """Objects that are asked, at most about: they tell it to a twentieth, and how all disagree is one dense matrix."""
 _CERTAIN = 9.0
 """Middles are there where twice the logarithm of the likelihood gains more: chance has it in one case of a thousand."""
+_LEAST_GAIN = 2.0
+"""Covariances reckon with middles where it gains more: what one parameter gains by chance (Akaike)."""
 _ODD = 0.0027
 """Objects that disagree by what chance has in fewer cases, three standard deviations, given all others, are two."""
 _LEAST_SHARE = 1e-3
@@ -38,8 +40,16 @@ _ROUNDS = 10
 """Rounds in which objects are taken in and left out, at most: three or four do."""
 
 
-def middles(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> float | None:
-    """Return what the middles that sides show are off by, m, each axis; None where that is not beyond doubt.
+@dataclass(frozen=True)
+class Middles:
+    """What the middles that sides show are off by, m, each axis, and whether that is beyond doubt."""
+
+    off_m: float
+    is_certain: bool
+
+
+def middles(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> Middles | None:
+    """Return what middles are off by; None where nothing tells that they are.
 
     `noise` is that of the map of `labels` and `votes`. What is not known well, as depth is, says little of middles.
     """
@@ -53,7 +63,7 @@ def middles(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> fl
     point_m, covariance_m2 = told.placed(np.concatenate(sides)[None])
     with one_blas_thread():
         contrasts = Contrasts.of_sides([point_m[things] for things in sides], covariance_m2[0])
-        return contrasts.middles_m(float(np.median(height_m)))
+        return contrasts.middles(float(np.median(height_m)))
 
 
 def _sides(told: Bundle) -> list[Ints]:
@@ -97,8 +107,8 @@ class Contrasts:
             np.concatenate(apart), by @ covariance_m2 @ by.T, np.repeat(np.arange(len(apart)), list(map(len, apart)))
         )
 
-    def middles_m(self, size_m: float) -> float | None:
-        """Return what middles of things of a usual size are off by, m; None where it is not beyond doubt.
+    def middles(self, size_m: float) -> Middles | None:
+        """Return what middles of things of a usual size, m, are off by; None where nothing tells that they are.
 
         Objects that disagree by more than middles and poses explain, given all others, are left out, and the others
         tell it again.
@@ -118,7 +128,9 @@ class Contrasts:
                 break
             likeliest_m, gain = self._likeliest(is_one, values_m)
         # Sides that disagree by as much as things are large are those of several things.
-        return likeliest_m if gain > _CERTAIN and likeliest_m < size_m else None
+        if gain <= _LEAST_GAIN or likeliest_m >= size_m:
+            return None
+        return Middles(likeliest_m, is_certain=gain > _CERTAIN)
 
     def _as_of_all(self, is_best: Bools) -> Contrasts:
         """Return contrasts of which those of the objects that agree best are as large as all would be.
