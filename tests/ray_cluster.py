@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from still_poses import nothing_found
 from valuemap import correction
 from valuemap.cameras import rotation_matrices
 from valuemap.config import DetectConfig, MapConfig
@@ -193,7 +194,7 @@ def main(folder: Path) -> None:
     corrected = mapped(folder, ThreadEngine(2), "threads-moved", lambda *_: None)
     assert corrected["labels.parquet"] != expected["labels.parquet"]
     assert mapped(folder, engine, "ray-moved", lambda *_: None) == corrected
-    setattr(correction, "refine_poses", lambda dataset, *_, **__: Refined(dataset, {"found": "nothing"}))  # noqa: B010
+    setattr(correction, "refine_poses", nothing_found)  # noqa: B010
     tell(folder, "identical")
 
     # What ends workers comes last: others take seconds to begin.

@@ -28,9 +28,9 @@ from literal import Pinhole, Sighting
 from more_data import part_of, reprojection_errors_px, tour_of_images
 from scenes import Scene, as_dataset
 from small_dataset import map_of
+from still_poses import nothing_found
 from valuemap import correction
 from valuemap.config import SimulationConfig
-from valuemap.refine import Refined
 from valuemap.simulate import PRESETS, Recording, record_city
 from valuemap.simulate.detector import KINDS
 from valuemap.simulate.pose_errors import pose_errors
@@ -343,7 +343,7 @@ def test_a_benchmark_writes_what_it_found(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """On one block instead of the city, whose poses stay."""
-    monkeypatch.setattr(correction, "refine_poses", lambda dataset, *_, **__: Refined(dataset, {"found": "nothing"}))
+    monkeypatch.setattr(correction, "refine_poses", nothing_found)
     path = tmp_path / "figures.json"
     module = importlib.import_module(script)
     small_ones = {"city": block_driven, "SMALL": {"passes_per_street": 2}, "draw": block_drawn}

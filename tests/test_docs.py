@@ -23,13 +23,13 @@ from typer.testing import CliRunner
 import valuemap
 from block import block
 from small_dataset import small_dataset
+from still_poses import nothing_found
 from tiny_models import red_finder
 from valuemap import correction, tables
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, write_dataset
 from valuemap.readers import READERS
 from valuemap.readers.detections import DETECTIONS
-from valuemap.refine import Refined
 from valuemap.simulate import PRESETS, simulate
 from valuemap.writers import SUFFIXES
 
@@ -225,7 +225,7 @@ def write_colmap_model(dataset: Dataset, folder: Path) -> None:
 def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with what the tutorials say that the reader has, which it goes to; poses stay, for speed."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(correction, "refine_poses", lambda dataset, *_, **__: Refined(dataset, {"found": "nothing"}))
+    monkeypatch.setattr(correction, "refine_poses", nothing_found)
     few = block(frame_spacing_m=6.0, standing_interval_s=4.0, passes_per_street=1)
     monkeypatch.setitem(PRESETS, "small", few)
     city = simulate(few, seed=0)

@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 import valuemap
 from literal import Pinhole, Sighting
 from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
+from still_poses import nothing_found
 from valuemap import correction, map_folder, pipeline, portions
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.cli.commands import app
@@ -93,7 +94,7 @@ def drives(objects: list[list[float]], seed: int, *, starts_m: tuple[float, ...]
 def poses_stay() -> Iterator[None]:
     """Find nothing wrong with poses, which takes two thirds of an update of so few drives."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(correction, "refine_poses", lambda dataset, *_, **__: Refined(dataset, {"found": "nothing"}))
+        patched.setattr(correction, "refine_poses", nothing_found)
         yield
 
 
@@ -714,7 +715,7 @@ def test_an_update_is_one_run_where_poses_are_corrected(tmp_path: Path, monkeypa
 
     def corrected(dataset: Dataset, config: valuemap.MapConfig, **_: object) -> Refined:
         if not config.poses.correct_poses:
-            return Refined(dataset, {"found": "nothing"})
+            return nothing_found(dataset)
         return Refined(moved(dataset, -1.0, keep_mean=True), {"found": "faults", "drives": [{"drive": 0}]}, True)
 
     monkeypatch.setattr(correction, "refine_poses", corrected)

@@ -115,8 +115,6 @@ class Contrasts:
         """
         values_m = size_m * np.geomspace(_LEAST_SHARE, 1.0, _VALUES)
         everyone = np.ones(self.of[-1] + 1, np.bool_)
-        if len(everyone) < _LEAST_OBJECTS:
-            return None
         # Objects that are two hide each other where all tell what is usual: the half that agrees best begins.
         is_one = _best_half(self._chances(everyone, self._likeliest(everyone, values_m)[0]))
         likeliest_m, gain = self._as_of_all(is_one)._likeliest(is_one, values_m)
