@@ -37,7 +37,17 @@ from valuemap.refine.adjust import Adjustment, Scales, Ties
 from valuemap.refine.alias import without_aliases
 from valuemap.refine.delay import _is_gain, delay_alone
 from valuemap.refine.estimate import Estimate, cut_into_segments, mounts_alone, prices
-from valuemap.refine.footage import Footage, Motion, Sigmas, _within, find_motion, gather, in_working_frame
+from valuemap.refine.footage import (
+    Footage,
+    Rates,
+    Sigmas,
+    Steps,
+    _sudden,
+    find_motion,
+    find_steps,
+    gather,
+    in_working_frame,
+)
 from valuemap.refine.jumps import Links, Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
 from valuemap.refine.register import register
@@ -1087,16 +1097,20 @@ def test_a_waiting_car_gives_the_middle_one_of_its_images() -> None:
 def test_velocities_are_found_once_and_only_where_they_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     found: list[Dataset] = []
 
-    def find(dataset: Dataset, drives: Drives, **options: Any) -> Motion:
+    def find(dataset: Dataset, drives: Drives) -> Steps:
         found.append(dataset)
-        return find_motion(dataset, drives, **options)
+        return find_steps(dataset, drives)
 
-    monkeypatch.setattr(refine_footage, "find_motion", find)
+    monkeypatch.setattr(refine_footage, "find_steps", find)
     ordered = in_driving_order(city())
     footage = gather(ordered.dataset, ordered.drives)
     assert not found
     assert footage.motion is footage.motion
     assert len(found) == 1
+    # Once more for what is laid without a delay, and not for each of those that are tried.
+    segment, turned = footage.drives.pass_code, np.zeros((footage.drives.count, 3))
+    delay_alone(lambda late_s: poses._laid(footage, turned, late_s), segment, valuemap.MapConfig(), threads=1)
+    assert len(found) == 2
 
 
 def test_velocities_are_those_of_the_trajectory() -> None:
@@ -1348,13 +1362,14 @@ def test_velocities_change_at_once_where_a_car_stops_beside_images_that_are_miss
     speed = np.column_stack([np.diff(at_m) / step_s, np.zeros((len(step_s), 2))])
     usable: Bools = np.asarray(step_s < 1.0)
     true = (8.0 * np.minimum(time_s[:-1] + 0.2, 3.1) - at_m[:-1]) / 0.2
-    found = _within(speed, step_s, np.full(len(step_s), 0.2), usable)
+    found = Rates(speed, *_sudden(speed, step_s, usable)).within(np.full(len(step_s), 0.2))
     np.testing.assert_allclose(found[:, 0], true, atol=1e-9)
     # A turn that goes on where nothing is seen: the mean rate until images are there again tells nothing of it.
     rate = np.where(time_s[:-1] < 3.5, 0.0, 60.0)
     rate[14], rate[16] = 24.0, 5.0
     for is_usable, first in ((usable, 0.0), (np.ones_like(usable), 24.0)):
-        found = _within(np.column_stack([rate] * 3), step_s, np.full(len(step_s), 0.1), is_usable)
+        rates = np.column_stack([rate] * 3)
+        found = Rates(rates, *_sudden(rates, step_s, is_usable)).within(np.full(len(step_s), 0.1))
         np.testing.assert_allclose(found[14], first, atol=1e-9)
 
 
@@ -1387,7 +1402,7 @@ def test_a_turn_that_begins_or_ends_between_two_images_is_none_before_or_after(l
         viewpoint=np.arange(count),
     )
     for known, worst_deg in ((np.full(count, late_s), 1e-3), (None, 0.5)):
-        motion = find_motion(recorded, drives, late_s=known)
+        motion = find_steps(recorded, drives).motion(known)
         rate = motion.forward_radps if late_s > 0.0 else motion.backward_radps
         turned = rotations(late_s * rate) @ camera_poses(recorded.images)[0]
         off = Rotation.from_matrix(turned @ camera_poses(true.images)[0].transpose(0, 2, 1)).magnitude()

@@ -69,9 +69,13 @@ class Footage:
     @cached_property
     def motion(self) -> Motion:
         """How keyframes move; where it is known how `late_s` poses are, in that part of each step alone."""
-        late_s = None if self.late_s is None else np.full(len(self.whole.images), self.late_s)
-        motion = find_motion(self.whole, self.whole_drives, late_s=late_s)
+        motion = self.steps.motion(None if self.late_s is None else np.full(len(self.whole.images), self.late_s))
         return Motion(**{name: value[self.row] for name, value in vars(motion).items()})
+
+    @cached_property
+    def steps(self) -> Steps:
+        """The steps from each image of the whole dataset to those beside it."""
+        return find_steps(self.whole, self.whole_drives)
 
     @property
     def cameras(self) -> int:
@@ -139,6 +143,44 @@ class Motion:
     forward_radps: Floats
     backward_radps: Floats
     is_timed: Bools
+
+
+@dataclass(frozen=True, eq=False)
+class Rates:
+    """Rates (N, 3) over one step of each image: the mean, and those until `until_s` (N) and from then on."""
+
+    mean: Floats
+    first: Floats
+    then: Floats
+    until_s: Floats
+
+    def within(self, late_s: Floats) -> Floats:
+        """Return the mean rates (N, 3) of the first `late_s` (N) of each step."""
+        before = np.where(late_s > self.until_s, self.until_s / np.where(late_s > 0.0, late_s, 1.0), 1.0)[:, None]
+        return np.asarray(before * self.first + (1.0 - before) * self.then)
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """What `Motion` is made of: how images (N) move and turn in the step until the next and since the last one."""
+
+    forward_mps: Rates
+    backward_mps: Rates
+    forward_radps: Rates
+    backward_radps: Rates
+    is_timed: Bools
+
+    def motion(self, late_s: Floats | None = None) -> Motion:
+        """Return how images move.
+
+        Where it is known how `late_s` (N) they are, rates are those of so much of the step alone: where a turn begins
+        or ends within it, it turns before or after that only.
+        """
+        forward, backward, turn_on, turn_back = (
+            rates.mean if late_s is None else rates.within(np.abs(late_s))
+            for rates in (self.forward_mps, self.backward_mps, self.forward_radps, self.backward_radps)
+        )
+        return Motion(forward, backward, turn_on, turn_back, self.is_timed)
 
 
 def with_poses(images: Images, rotation: Floats, center: Floats) -> Images:
@@ -264,18 +306,19 @@ def _from_middle(dataset: Dataset, rays: Rays) -> Floats:
     return offset
 
 
-def find_motion(dataset: Dataset, drives: Drives, *, late_s: Floats | None = None) -> Motion:
-    """Return how all images move, from the images of the same camera before and after them in the drive.
+def find_motion(dataset: Dataset, drives: Drives) -> Motion:
+    """Return how all images move, from the images of the same camera before and after them in the drive."""
+    return find_steps(dataset, drives).motion()
 
-    Where it is known how `late_s` (N) they are, rates are those of so much of the step alone: where a turn begins or
-    ends within it, it turns before or after that only.
-    """
+
+def find_steps(dataset: Dataset, drives: Drives) -> Steps:
+    """Return the steps from all images to those of the same camera before and after them in the drive."""
     images = dataset.images
     rotation, center = camera_poses(images)
     time = np.full(len(images), np.nan) if images.timestamp_s is None else images.timestamp_s
     is_timed = np.zeros(len(images), np.bool_)
-    forward, backward = np.zeros((len(images), 3)), np.zeros((len(images), 3))
-    turn_on, turn_back = np.zeros((len(images), 3)), np.zeros((len(images), 3))
+    speeds = _still(len(images)), _still(len(images))
+    turns = _still(len(images)), _still(len(images))
     camera = np.unique(images.camera_id, return_inverse=True)[1]
     stream = drives.pass_code * (int(camera.max(initial=0)) + 1) + camera
     order = np.lexsort((drives.order, stream))
@@ -284,29 +327,43 @@ def find_motion(dataset: Dataset, drives: Drives, *, late_s: Floats | None = Non
         timed = bool(np.all(np.isfinite(when)) and np.all(np.diff(when) > 0.0))
         when = when if timed else np.arange(len(rows), dtype=np.float64)
         is_timed[rows] = timed
-        step = np.diff(when)
-        if not len(step):
+        step_s = np.diff(when)
+        if not len(step_s):
             continue
-        usable = step <= _MOST_STEPS * np.median(step)
-        seconds = np.where(usable, step, np.inf)[:, None]
-        speed = np.diff(center[rows], axis=0) / seconds
-        rate = _turns(rotation[rows]) / seconds
-        for values, on, back in ((speed, forward, backward), (rate, turn_on, turn_back)):
-            after = before = values
-            if late_s is not None:
-                after = _within(values, step, np.abs(late_s[rows[:-1]]), usable)
-                before = _within(values[::-1], step[::-1], np.abs(late_s[rows[:0:-1]]), usable[::-1])[::-1]
-            on[rows[:-1]], back[rows[1:]] = values, values
-            # At an end, as on the other side.
-            starts, ends = np.append(True, ~usable), np.append(~usable, True)
-            back[rows[starts]], on[rows[ends]] = on[rows[starts]], back[rows[ends]]
-            same = _trembles(on[rows], back[rows])
-            mean = 0.5 * (on[rows] + back[rows])
-            # At an end, both are those of the one step that there is.
-            on[rows[:-1]] = np.where(starts[:-1, None] | ends[:-1, None], on[rows[:-1]], after)
-            back[rows[1:]] = np.where(starts[1:, None] | ends[1:, None], back[rows[1:]], before)
-            on[rows], back[rows] = np.where(same, mean, on[rows]), np.where(same, mean, back[rows])
-    return Motion(forward, backward, turn_on, turn_back, is_timed)
+        usable = step_s <= _MOST_STEPS * np.median(step_s)
+        seconds = np.where(usable, step_s, np.inf)[:, None]
+        _fill(*speeds, rows, np.diff(center[rows], axis=0) / seconds, step_s, usable)
+        _fill(*turns, rows, _turns(rotation[rows]) / seconds, step_s, usable)
+    return Steps(*speeds, *turns, is_timed)
+
+
+def _still(images: int) -> Rates:
+    mean, first, then = np.zeros((3, images, 3))
+    return Rates(mean, first, then, np.full(images, np.inf))
+
+
+def _fill(forward: Rates, backward: Rates, rows: Ints, rate: Floats, step_s: Floats, usable: Bools) -> None:
+    """Write the rates of one camera in one drive, whose images are `rows` (N), from the means over steps (N - 1, 3)."""
+    # At an end, as on the other side.
+    starts, ends = np.append(True, ~usable), np.append(~usable, True)
+    forward.mean[rows[:-1]], backward.mean[rows[1:]] = rate, rate
+    backward.mean[rows[starts]] = forward.mean[rows[starts]]
+    forward.mean[rows[ends]] = backward.mean[rows[ends]]
+    same = _trembles(forward.mean[rows], backward.mean[rows])
+    both = 0.5 * (forward.mean[rows] + backward.mean[rows])
+    # At an end, both are those of the one step that there is.
+    inside = ~(starts | ends)
+    on, back = slice(None, -1), slice(None, 0, -1)
+    for rates, images, steps in ((forward, on, slice(None)), (backward, back, slice(None, None, -1))):
+        has_step = inside[images]
+        of = rows[images][has_step]
+        rates.first[rows], rates.then[rows] = rates.mean[rows], rates.mean[rows]
+        rates.first[of], rates.then[of], rates.until_s[of] = (
+            values[has_step] for values in _sudden(rate[steps], step_s[steps], usable[steps])
+        )
+        for values in (rates.mean, rates.first, rates.then):
+            values[rows[same]] = both[same]
+        rates.until_s[rows[same]] = np.inf
 
 
 def moved_on(motion: Motion, rotation: Floats, center: Floats, late_s: Floats) -> tuple[Floats, Floats]:
@@ -318,36 +375,34 @@ def moved_on(motion: Motion, rotation: Floats, center: Floats, late_s: Floats) -
 
 
 def _trembles(on: Floats, back: Floats) -> Bools:
-    """Return at which images (N, 1) only poses' trembling tells velocities (N, 3) after and before them apart.
+    """Return at which images (N) only poses' trembling tells velocities (N, 3) after and before them apart.
 
     The mean of both has no part of the error of the image itself.
     """
     apart = np.linalg.norm(on - back, axis=1)
-    return np.asarray((apart <= _TREMBLES * np.median(apart))[:, None])
+    return np.asarray(apart <= _TREMBLES * np.median(apart))
 
 
-def _within(rate: Floats, step_s: Floats, late_s: Floats, usable: Bools) -> Floats:
-    """Return the mean rates (N, 3) of the first `late_s` (N) of each step, from those of whole steps (N, 3).
+def _sudden(rate: Floats, step_s: Floats, usable: Bools) -> tuple[Floats, Floats, Floats]:
+    """Return the rates (N, 3) at the beginning and at the end of each step, and when (N), s, the first one ends.
 
     Steps that are not `usable` (N) tell nothing of those beside them. Rates, of places or of rotations, are means over
     steps. Where one is between those beside it, and they differ by far more than each of them from the one beyond it,
     the rate changes at once within the step, where it explains the mean (the subcell resolution of
-    Harten 1989). Elsewhere it is the mean.
+    Harten 1989). Elsewhere it is the mean, which never ends.
     """
-    mean = rate.copy()
+    first, then, until_s = rate.copy(), rate.copy(), np.full(len(rate), np.inf)
     if len(rate) < 5:
-        return mean
+        return first, then, until_s
     change = np.where(usable[1:] & usable[:-1], np.linalg.norm(np.diff(rate, axis=0), axis=1), 0.0)
     across = rate[1:-3] - rate[3:-1]
     square = np.sum(across**2, axis=1)
     is_sudden = np.sqrt(square) > _SUDDEN * np.maximum(change[:-3], change[3:])
     share = np.sum((rate[2:-2] - rate[3:-1]) * across, axis=1) / np.where(square > 0.0, square, 1.0)
     is_sudden &= (share > 0.0) & (share < 1.0) & usable[1:-3] & usable[2:-2] & usable[3:-1]
-    until = share * step_s[2:-2]
-    late = late_s[2:-2]
-    before = np.where(late > until, until / np.where(late > 0.0, late, 1.0), 1.0)[:, None]
-    mean[2:-2] = np.where(is_sudden[:, None], before * rate[1:-3] + (1.0 - before) * rate[3:-1], rate[2:-2])
-    return mean
+    at = 2 + np.flatnonzero(is_sudden)
+    first[at], then[at], until_s[at] = rate[at - 1], rate[at + 1], share[at - 2] * step_s[at]
+    return first, then, until_s
 
 
 def _turns(rotation: Floats) -> Floats:

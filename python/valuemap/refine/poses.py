@@ -33,7 +33,7 @@ from valuemap.refine.estimate import (
 from valuemap.refine.footage import (
     AllImages,
     Footage,
-    find_motion,
+    find_steps,
     gather,
     in_working_frame,
     moved_on,
@@ -273,7 +273,7 @@ def _moved(dataset: Dataset, ordered: InOrder, found: Found, selected: Selected,
     segment = found.result.segments.of(drive, drives.order)
     rotation, center = camera_poses(images)
     late_s = delay[drive, 0] + camera_delay[camera, 0]
-    rotation, center = moved_on(find_motion(ordered.dataset, drives, late_s=late_s), rotation, center, late_s)
+    rotation, center = moved_on(find_steps(ordered.dataset, drives).motion(late_s), rotation, center, late_s)
     center = center + unit_m * offset[segment] @ dataset.frame.east_north_up()
     rotation = rotations(mount[drive] + camera_mount[camera]) @ rotation
     params = []
@@ -370,8 +370,7 @@ def _laid(
     rotation, center = camera_poses(images)
     if late_s:
         late = np.full(len(center), late_s)
-        motion = find_motion(footage.whole, drives, late_s=late)
-        rotation, center = moved_on(motion, rotation, center, late)
+        rotation, center = moved_on(footage.steps.motion(late), rotation, center, late)
     rotation = rotations(turned_rad[drives.pass_code]) @ rotation
     if known is not None:
         center = center + known[1][known[0].of(drives.pass_code, drives.order)]
