@@ -19,7 +19,7 @@ from check_faults import RIG_FAULTS, exchanged, good_city, lowered, of_camera
 from check_faults import good_rig as rig
 from small_dataset import small_dataset
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check import cameras, contest, distortion, examine, fit, mounts, passes
+from valuemap.check import boxes, cameras, contest, distortion, examine, fit, mounts, passes, sizes
 from valuemap.check.agreement import Agreement, compare, gains_of_objects, measure_agreement
 from valuemap.check.boxes import PictureSize, _chance_of_gap, _Ends, _OfSquare, picture_sizes, rows_in_images
 from valuemap.check.cameras import PARAMETERS, _followed, _is_wider_gate_only, with_focal
@@ -40,6 +40,7 @@ from valuemap.check.fault import (
 )
 from valuemap.check.fit import Changed, Estimate, Parameter, apply
 from valuemap.check.frames import WorldAxes
+from valuemap.check.groups import Group
 from valuemap.check.headings import headings, level_rotations, rotations_of
 from valuemap.check.loose import Correction, Loose
 from valuemap.check.offsets import find_shift
@@ -1041,6 +1042,55 @@ def test_one_camera_has_no_world_of_its_own(few: Dataset, monkeypatch: pytest.Mo
     assert finding.of == "camera 1"
 
 
+def one_camera_in_another_order(dataset: Dataset, camera_id: int) -> View:
+    """Return a dataset one camera of which has quaternions x, y, z, w."""
+    quaternion, mine = dataset.images.cam_from_world_quat, dataset.images.camera_id == camera_id
+    reordered = np.where(mine[:, None], quaternion[:, [1, 2, 3, 0]], quaternion)
+    return View(with_images(dataset, cam_from_world_quat=reordered))
+
+
+def test_a_main_camera_that_still_agrees_as_well_as_those_at_the_sides_is_looked_at(one_rig: Dataset) -> None:
+    """Those see little of what lights the way: half of what their rays agree by is little."""
+    spoiled = one_camera_in_another_order(one_rig, 1)
+    order = conventions("quaternion_order")
+    verdict = hold_contest(spoiled, order)
+    assert verdict.suspects == (Group(camera_id=1),)
+    assert hold_contest(View(one_rig), order).suspects == ()
+    assert contest.find_odd_group(spoiled, order) is None
+    found = contest.find_odd_group(spoiled, order, suspects=verdict.suspects)
+    assert found is not None
+    assert (found.fault, found.of) == ("quaternion_order", "camera 1")
+
+
+def test_of_a_camera_that_sees_little_the_rays_of_the_others_decide(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = rig(0, passes_per_street=1)
+    spoiled, order = one_camera_in_another_order(given, 2), conventions("quaternion_order")
+    suspects = hold_contest(spoiled, order).suspects
+    found = contest.find_odd_group(spoiled, order, suspects=suspects)
+    assert found is not None
+    assert (found.fault, found.of) == ("quaternion_order", "camera 2")
+    assert found.fix is not None
+    fixed = found.fix(spoiled.dataset).images
+    np.testing.assert_allclose(rotation_matrices(fixed), rotation_matrices(given.images), atol=1e-9)
+    monkeypatch.setattr(contest._AmongOthers, "readings", lambda *_: iter(()))
+    assert contest.find_odd_group(spoiled, order, suspects=suspects) is None
+
+
+def test_boxes_that_keep_to_a_part_of_the_picture_of_one_camera_are_of_smaller_pictures_there(
+    one_rig: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    detections = one_rig.detections
+    smaller = with_detections(one_rig, center_px=detections.center_px / 2.0, size_px=detections.size_px / 2.0)
+    spoiled = of_camera(one_rig, smaller, 1)
+    finding = hold_contest(View(spoiled), conventions("picture_size")).finding
+    assert finding is not None
+    assert (finding.of, finding.what[:14]) == ("camera 1", "Only camera 1:")
+    assert finding.fix is not None
+    np.testing.assert_allclose(finding.fix(spoiled).detections.center_px, detections.center_px, rtol=0.02)
+    monkeypatch.setattr(boxes, "groups_of", lambda _: ())
+    assert hold_contest(View(spoiled), conventions("picture_size")).finding is None
+
+
 @pytest.fixture(scope="module")
 def good_rig() -> Dataset:
     return rig(11)
@@ -1100,6 +1150,19 @@ def test_a_camera_that_sees_little_is_turned_by_what_the_others_see(
     assert finding.fix is not None
     assert degrees_off(finding.fix(spoiled), one_rig).max() < 0.5
     monkeypatch.setattr(cameras, "_estimates_by_others", lambda *_: [])
+    assert cameras._find_of_one_group(View(spoiled)) is None
+
+
+def test_a_turn_by_gates_is_told_where_hardly_a_ray_is_right(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the gate at which good rays meet, the estimate stays where chance votes pull."""
+    given = rig(1, passes_per_street=1)
+    spoiled = of_camera(given, turned_by(given, "y", 3.0), 2)
+    found = cameras._find_of_one_group(View(spoiled))
+    assert found is not None
+    assert found.group == Group(camera_id=2)
+    assert found.parameter.name == "yaw"
+    assert degrees_off(found(spoiled), given).max() < 0.3
+    monkeypatch.setattr(cameras, "_at_wider_gate", lambda view: view)
     assert cameras._find_of_one_group(View(spoiled)) is None
 
 
@@ -1170,6 +1233,20 @@ def test_half_sizes_of_one_camera_are_named_and_the_others_stay(camera_id: int, 
     assert finding.fix is not None
     fixed = finding.fix(spoiled)
     np.testing.assert_allclose(fixed.detections.size_px, good_rig.detections.size_px)
+
+
+def test_half_sizes_of_a_camera_that_sees_little_are_told_by_what_others_see_as_well(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Four objects, far more than twice as high as each other: each is compared with itself."""
+    given = rig(2, passes_per_street=1)
+    half = with_detections(given, size_px=given.detections.size_px / 2.0)
+    found = sizes.half_sized_group(View(of_camera(given, half, 2)))
+    assert found is not None
+    assert found[0].camera_id == 2
+    assert sizes.half_sized_group(View(given)) is None
+    monkeypatch.setattr(sizes._Heights, "pairs", lambda *_: {})
+    assert sizes.half_sized_group(View(of_camera(given, half, 2))) is None
 
 
 @pytest.mark.parametrize("factor", [0.9, 0.6])

@@ -32,7 +32,7 @@ from valuemap.dataset import Dataset
 from valuemap.errors import SettingError
 from valuemap.paper.vote import vote_in_clusters
 from valuemap.reach import deal
-from valuemap.tables import Candidates, Floats, Ints
+from valuemap.tables import Bools, Candidates, Floats, Ints
 
 COST_OF_A_POINT = 1.5
 """A point has three coordinates to please three residuals of its own with: half of them are no evidence."""
@@ -50,13 +50,15 @@ _ROUNDING = 1e-6
 class Agreement:
     """What voting on a sample of places came to.
 
-    `gain` (places) is the sum over the votes of a place, `gain_of_point` (P) that of the points; `voters` counts all
-    votes, `detections` all detections; `rays`, of the detections `detection_id` (N), and `found` are what was voted on
-    and the points that were found, relative to `middle_in_world_m` (3).
+    `gain` (places) is the sum over the votes of a place, `gain_of_point` (P) that of the points, each of which its
+    votes have an equal share in the cost of: `gain_of_vote` (V). `voters` counts all votes, `detections` all
+    detections; `rays`, of the detections `detection_id` (N), and `found` are what was voted on and the points that were
+    found, relative to `middle_in_world_m` (3).
     """
 
     gain: Floats
     gain_of_point: Floats
+    gain_of_vote: Floats
     detection_id: Ints
     voters: int
     detections: int
@@ -68,6 +70,13 @@ class Agreement:
     def points_in_world_m(self) -> Floats:
         """The points (N, 3) where rays meet, in the frame of the dataset."""
         return self.found.position_in_world_m + self.middle_in_world_m
+
+    def gain_of_images(self, place_of_image: NDArray[np.uint32], which: Bools) -> Floats:
+        """Return the sum over the votes of each place (places) that are of some images (N, by mask)."""
+        image = self.rays.image_row[self.found.voters.astype(np.int64)]
+        mine = which[image]
+        sums = np.bincount(place_of_image[image[mine]], weights=self.gain_of_vote[mine], minlength=len(self.gain))
+        return np.asarray(sums, dtype=np.float64)
 
     @property
     def share(self) -> float:
@@ -104,15 +113,19 @@ def measure_agreement(
         found, _ = vote_in_clusters(rays, place_of_image, config)
     except SettingError:  # So many rays through one point that their votes fill the memory: no convention of the world.
         found = Candidates(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0, np.uint32), np.empty(0, np.uint32))
-    gain, of_point = np.zeros(places), np.zeros(len(found))
+    gain, of_point, of_vote = np.zeros(places), np.zeros(len(found)), np.zeros(len(found.voters))
     if len(found):
         residual_px, _, _ = _core.see(rays.core, found.position_in_world_m, found.voter_offsets, found.voters)
         worth = np.maximum(1.0 - (residual_px / gate_px) ** 2, 0.0)
         of_point = np.add.reduceat(worth, found.voter_offsets[:-1]) - COST_OF_A_POINT
+        votes = np.diff(found.voter_offsets)
+        of_vote = worth - np.repeat(COST_OF_A_POINT / votes, votes)
         first = found.voters[found.voter_offsets[:-1]].astype(np.int64)
         gain += np.bincount(place_of_image[rays.image_row[first]], weights=of_point, minlength=places)
     detection_id = dataset.detections.detection_id
-    return Agreement(gain, of_point, detection_id, len(found.voters), len(rays), rays, found, middle_in_world_m)
+    return Agreement(
+        gain, of_point, of_vote, detection_id, len(found.voters), len(rays), rays, found, middle_in_world_m
+    )
 
 
 def chance_agreement(dataset: Dataset, place_of_image: NDArray[np.uint32], gate_px: float) -> Agreement:

@@ -24,7 +24,7 @@ from valuemap.check.fault import (
     View,
     with_detections,
 )
-from valuemap.check.groups import Group, OfGroup
+from valuemap.check.groups import Group, OfGroup, groups_of
 from valuemap.check.lenses import focals
 from valuemap.dataset import Dataset, rows_of
 from valuemap.tables import Bools, Floats, Ints
@@ -37,6 +37,11 @@ _STRAYS = 0.02
 """A gap with more boxes in it than this share of those beside it is none."""
 _NEARLY_ALL = 0.99
 """Of the boxes have their middle in the picture."""
+
+
+def _reach(dataset: Dataset) -> float:
+    """Return how far from the first pixel nearly all boxes have their middle, in shares of their pictures."""
+    return float(np.quantile((dataset.detections.center_px / picture_sizes(dataset)).max(axis=1), _NEARLY_ALL))
 
 
 def picture_sizes(dataset: Dataset) -> Floats:
@@ -196,10 +201,14 @@ class PictureSize(Convention):
     do: ClassVar[str] = "Give width, height and parameters of the cameras for the pictures that were looked at."
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
-        """Yield boxes of pictures enlarged or shrunk, but not so much that they would be outside of theirs."""
+        """Yield boxes of pictures enlarged or shrunk, but not so much that they would be outside of theirs.
+
+        What is possible in one camera and not in all is tried in that camera.
+        """
         # In panoramas things are seen all round: there is no border that boxes keep from.
         is_all_round = not any(focals(dataset.cameras, row) for row in range(len(dataset.cameras)))
-        reach = float(np.quantile((dataset.detections.center_px / picture_sizes(dataset)).max(axis=1), _NEARLY_ALL))
+        reach, of_cameras = _reach(dataset), [each for each in groups_of(dataset) if each.pass_name is None]
+        reach_of = {camera: _reach(camera.part(dataset)) for camera in of_cameras}
         for name, factor in (
             ("4", 4.0), ("3", 3.0), ("2", 2.0), ("1.5", 1.5), ("4/3", 4 / 3), ("5/4", 1.25), ("6/5", 1.2),
             ("10/9", 10 / 9), ("20/19", 20 / 19), ("19/20", 0.95), ("9/10", 0.9),
@@ -208,6 +217,12 @@ class PictureSize(Convention):
             is_possible = factor * reach <= 1.0 if factor > 1.0 else reach > 1.0 or not is_all_round
             if is_possible:
                 yield f"boxes {name} times as large", _Scaled(factor)
+            for camera, its_reach in reach_of.items():
+                is_possible_in_one = (
+                    factor * its_reach <= 1.0 < factor * reach if factor > 1.0 else reach <= 1.0 < its_reach
+                )
+                if is_possible_in_one:
+                    yield f"boxes {name} times as large", OfGroup(camera, _Scaled(factor))
         extent, exchanged = picture_sizes(dataset), _of_other_sides(dataset).detections.center_px
         is_inside = float(np.quantile((exchanged / extent).max(axis=1), _NEARLY_ALL)) <= 1.0
         if is_inside and (extent[:, 0] != extent[:, 1]).any():
@@ -227,19 +242,24 @@ class PictureSize(Convention):
 
     def refined(self, view: View, how: str, fix: Fix) -> tuple[str, Fix]:
         """Look for the size between those that are tried: pictures are scaled by any number."""
-        if not isinstance(fix, _Scaled):
+        scaled = fix.own if isinstance(fix, OfGroup) else fix
+        if not isinstance(scaled, _Scaled):
             return how, fix
         sample = view.stretches
 
-        def gain(scaled: _Scaled) -> float:
-            gate_px = view.gate_px * scaled.gate_factor
-            return float(measure_agreement(scaled(sample.dataset), sample.place_of_image, gate_px).gain.sum())
+        def of_camera(scaled: _Scaled) -> Fix:
+            return OfGroup(fix.group, scaled) if isinstance(fix, OfGroup) else scaled
 
-        beside = fix.gate_factor * np.exp(np.arange(-_HALF_A_STEP, _HALF_A_STEP, GATE_RAD))
+        def gain(scaled: _Scaled) -> float:
+            changed = of_camera(scaled)
+            gate_px = view.gate_px * getattr(changed, "gate_factor", 1.0)
+            return float(measure_agreement(changed(sample.dataset), sample.place_of_image, gate_px).gain.sum())
+
+        beside = scaled.gate_factor * np.exp(np.arange(-_HALF_A_STEP, _HALF_A_STEP, GATE_RAD))
         best = max((_Scaled(float(factor)) for factor in beside), key=gain)
-        if gain(best) < (1.0 + LEAST_RISE) * gain(fix):
+        if gain(best) < (1.0 + LEAST_RISE) * gain(scaled):
             return how, fix
-        return f"boxes {best.gate_factor:.3g} times as large", best
+        return f"boxes {best.gate_factor:.3g} times as large", of_camera(best)
 
 
 _HALF_A_STEP = math.log(3.0 / 2.0) / 2.0

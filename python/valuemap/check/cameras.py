@@ -33,7 +33,7 @@ from valuemap.check.fault import (
 from valuemap.check.fit import Estimate, Motion, Parameter, estimate
 from valuemap.check.groups import Group, OfGroup, groups_of
 from valuemap.check.lenses import Focal, focals, with_params
-from valuemap.check.loose import Correction, loose_of
+from valuemap.check.loose import HALF_WAY, Correction, loose_of
 from valuemap.check.passes import OF_ITS_CAMERA, find_height_of_pass, moved_along, seen_m
 from valuemap.check.sample import pixels_per_radian
 from valuemap.dataset import Dataset
@@ -207,22 +207,31 @@ def _estimates_by_others(view: View, group: Group, alone: View, groups: int) -> 
     What one camera sees little of alone, others see as well; and only they tell how high it is.
     """
     own = tuple(_of_group(parameter, group) for parameter in _OF_A_MOUNT)
-    first = estimate_of(view, own)
-    if first is None:
+    # Of a camera that is off by gates few votes are right at the gate at which good rays meet.
+    first = estimate_of(_at_wider_gate(view), own)
+    turn_rad = _LEAST_GATES * GATE_RAD * view.gate_share
+    least = {each.name: seen_m(view) if each.is_length else turn_rad for each in own}
+    if first is None or all(abs(first.of(name)[0]) < HALF_WAY * smallest for name, smallest in least.items()):
         return
-    # Of a camera that is off by gates few votes are right, and the first rounds see little of it.
     found = estimate_of(view, own, start=first)
     assert found is not None
     given, least_rise = gains_of_all(view, view.dataset), LEAST_RISE * float(gains_of_all(alone, alone.dataset).sum())
     for parameter, changes in zip(_OF_A_MOUNT, own, strict=True):
         value, sigma = found.of(parameter.name)
         chance = _chance_of(found, parameter.name, groups)
-        least = seen_m(view) if parameter.is_length else _LEAST_GATES * GATE_RAD * view.gate_share
-        if chance > LEAST_CHANCE or abs(value) < least:
+        if chance > LEAST_CHANCE or abs(value) < least[parameter.name]:
             continue
         rise = compare(gains_of_all(view, changes.change(view.dataset, value)), given)
         if rise.difference >= least_rise:
             yield Correction(parameter, value, sigma, chance, rise, found)
+
+
+def _at_wider_gate(view: View) -> View:
+    """Return a view of the same dataset at which rays of cameras that are a few gates off vote, too; made once."""
+    if "wider" not in view.memory:
+        view.memory["wider"] = View(view.dataset, gate_share=view.gate_share * WIDER_GATE, known=view.known)
+    found: View = view.memory["wider"]
+    return found
 
 
 def _of_group(parameter: Parameter, group: Group) -> Parameter:

@@ -22,7 +22,18 @@ import numpy as np
 from valuemap.cameras import rotation_matrices
 from valuemap.check.agreement import Agreement, Comparison, agreement_on, compare, gains_of_objects
 from valuemap.check.cameras import PARAMETERS, WrongCamera
-from valuemap.check.fault import LEAST_CHANCE, WIDER_GATE, Convention, Finding, Fix, View, agreement_after, uprightness
+from valuemap.check.fault import (
+    LEAST_CHANCE,
+    LEAST_RISE,
+    WIDER_GATE,
+    Convention,
+    Finding,
+    Fix,
+    View,
+    agreement_after,
+    uprightness,
+)
+from valuemap.check.fit import Parameter
 from valuemap.check.groups import Group, OfGroup, fits_one_group, groups_of
 from valuemap.check.sample import Sample
 from valuemap.dataset import Dataset
@@ -42,6 +53,8 @@ _SUSPICIOUS = 0.05
 """What good data would give with a probability above this, all that was tried counted, is not even told."""
 _FAR_WORSE = 0.5
 """A group whose detections agree less than half as well as those of others, beyond chance, has a contest of its own."""
+_MAY_BE = 0.05
+"""Of so many good cameras one is looked at alone for each reading that rays do not object to."""
 _LEAST_PRODUCT = 1e-300
 _TIE = 1e-3
 """Gains as close as this are the same: readings that differ in the last digits only."""
@@ -88,42 +101,70 @@ class Verdict:
     `gate_share` is the share of the gate at which rays meet better than by chance; None where they cannot be told to,
     however they are read. `suspicion` is a reading that is better than the given one, but by less than so few places
     can prove. `rivals` are readings, in words, under which cameras stand that as given lie, where rays cannot tell.
+    `suspects` are cameras that something else may be wrong with than with all.
     """
 
     finding: Finding | None
     gate_share: float | None
     suspicion: str | None = None
     rivals: tuple[str, ...] = ()
+    suspects: tuple[Group, ...] = ()
 
 
-def hold_contest(view: View, conventions: Sequence[Convention], progress: Progress = silent) -> Verdict:
-    """Compare all readings. The gate is widened where rays, read in any way, meet no better than by chance."""
+def hold_contest(
+    view: View, conventions: Sequence[Convention], progress: Progress = silent, group: Group | None = None
+) -> Verdict:
+    """Compare all readings. The gate is widened where rays, read in any way, meet no better than by chance.
+
+    Of a `group`, readings are those of its images alone, and compared by how its rays meet those of all others, too.
+    """
     rivals: tuple[str, ...] = ()
     if not len(view.stretches.dataset.detections):
         return Verdict(None, None)
     for gate_share in (view.gate_share, view.gate_share * WIDER_GATE):
         at_gate = view if gate_share == view.gate_share else View(view.dataset, gate_share=gate_share, known=view.known)
-        tried = _try_all(at_gate, conventions, progress)
+        tried = _try_all(at_gate, conventions, progress, group)
         readings = [each for each in tried if each.is_worth(tried[0])]
         top = max(readings, key=lambda reading: reading.total)
         rivals = _rivals(readings)
         by_rays = _compare([top.agreement], [at_gate.chance]).chance
         if _joined(by_rays, top, readings[0]) * top.tests > LEAST_CHANCE:
             continue
+        suspects = _suspects(at_gate, tried) if group is None else ()
         finding = _judge(at_gate, readings, top)
         suspicion = None if finding is not None else _suspicion(readings[0], top)
-        if (finding or suspicion) and _is_small_turn(at_gate, top.total):
-            return Verdict(None, gate_share)
-        return Verdict(finding, gate_share, suspicion, () if finding is not None else rivals)
+        if (finding or suspicion) and _is_small_turn(at_gate, top.total, group):
+            return Verdict(None, gate_share, suspects=suspects)
+        return Verdict(finding, gate_share, suspicion, () if finding is not None else rivals, suspects)
     return Verdict(None, None, rivals=rivals)
 
 
-def find_odd_group(view: View, conventions: Sequence[Convention], progress: Progress = silent) -> Finding | None:
+def _suspects(view: View, readings: Sequence[_Reading]) -> tuple[Group, ...]:
+    """Return the cameras of several whose rays another reading of all cameras may suit better than the given one.
+
+    This only says where to look, so it need not be sure.
+    """
+    sample, given = view.stretches, readings[0].agreement
+    found = []
+    for group in groups_of(view.dataset):
+        mine = group.images_of(sample.dataset)
+        if group.pass_name is not None or not mine.any():
+            continue
+        gain = given.gain_of_images(sample.place_of_image, mine)
+        others = (each.agreement.gain_of_images(sample.place_of_image, mine) for each in readings[1:])
+        if any(other.sum() > gain.sum() and compare(other, gain).chance < _MAY_BE for other in others):
+            found.append(group)
+    return tuple(found)
+
+
+def find_odd_group(
+    view: View, conventions: Sequence[Convention], progress: Progress = silent, suspects: Sequence[Group] = ()
+) -> Finding | None:
     """Look for a camera or a pass whose rays alone agree far worse than those of others, and hold its own contest.
 
     What is good in all others is no mistake of the frame, and what changes more than the group is not tried. A reading
     is believed if rays agree with it about as well as those of others do: else it fits by chance what is otherwise
-    wrong.
+    wrong. Of `suspects` all rays decide where their own are too few to.
     """
     groups = groups_of(view.dataset)
     alone = {group: group.alone(view) for group in groups}
@@ -134,28 +175,39 @@ def find_odd_group(view: View, conventions: Sequence[Convention], progress: Prog
             worth[each] for each in groups if each != group and (each.pass_name is None) == (group.pass_name is None)
         ]
         least = _FAR_WORSE * float(np.median(others)) if others else 0.0
-        if worth[group] >= least:
+        if worth[group] >= least and group not in suspects:
             continue
         part = alone[group].dataset
         may_be = [each for each in conventions if group.pass_name is not None or not each.is_of_world]
         own = [_OfOneGroup(convention, part, group) for convention in may_be]
         finding = hold_contest(alone[group], own, progress).finding
+        if finding is not None and finding.fix is not None:
+            finding = _only(group, finding)
+        elif group in suspects:
+            finding = hold_contest(view, [_AmongOthers(each, group) for each in own], progress, group).finding
         if finding is None or finding.fix is None or finding.chance is None:
             continue
-        chance, mended = finding.chance * len(groups), View(finding.fix(part), gate_share=view.gate_share)
-        if chance > LEAST_CHANCE or _worth_of(mended) < least:
+        chance = finding.chance * len(groups)
+        mended = View(group.part(finding.fix(view.dataset)), gate_share=view.gate_share)
+        # Cameras see more or less: it is enough to agree as well as the least of those that agree.
+        enough = _FAR_WORSE * min((each for each in others if each >= least), default=0.0)
+        if chance > LEAST_CHANCE or _worth_of(mended) < enough:
             continue
-        odd = replace(
-            finding,
-            what=f"Only {group.text}: {finding.what}",
-            chance=chance,
-            figures={"of": group.text, **finding.figures},
-            fix=OfGroup(group, finding.fix),
-            of=group.text,
-        )
         # Pictures of another size are those of a camera of the table, where there is one of that size.
-        return better_explained(view, WrongCamera().find(view), odd)
+        return better_explained(view, WrongCamera().find(view), replace(finding, chance=chance))
     return None
+
+
+def _only(group: Group, finding: Finding) -> Finding:
+    """Return what is found in a group on its own as a finding of the whole."""
+    assert finding.fix is not None
+    return replace(
+        finding,
+        what=f"Only {group.text}: {finding.what}",
+        figures={"of": group.text, **finding.figures},
+        fix=OfGroup(group, finding.fix),
+        of=group.text,
+    )
 
 
 def better_explained(view: View, wide: Finding | None, odd: Finding | None) -> Finding | None:
@@ -167,19 +219,17 @@ def better_explained(view: View, wide: Finding | None, odd: Finding | None) -> F
 
 
 def spoils_a_group(view: View, fix: Fix) -> bool:
-    """Return whether a fix makes the rays of a camera or a pass agree worse: what it puts right is not wrong with all.
+    """Return whether a fix makes the rays of a camera or a pass agree worse: what it puts right may not be wrong there.
 
     What is wrong with one camera only makes all rays together agree better where it is put right in every camera, too.
+    Of a camera that sees little this is never sure.
     """
-    alone = [group.alone(view) for group in groups_of(view.dataset)]
-    return any(
-        compare(
-            each.agreement.gain, _measure(fix(each.stretches.dataset), each.stretches, each.gate_px, fix).gain
-        ).chance
-        * len(alone)
-        < LEAST_CHANCE
-        for each in alone
-    )
+
+    def loss(each: View) -> float:
+        after = _measure(fix(each.stretches.dataset), each.stretches, each.gate_px, fix)
+        return 1.0 - float(after.gain.sum()) / max(float(each.agreement.gain.sum()), _LEAST_PRODUCT)
+
+    return any(loss(group.alone(view)) > LEAST_RISE for group in groups_of(view.dataset))
 
 
 def _worth_of(view: View) -> float:
@@ -204,6 +254,27 @@ class _OfOneGroup(Convention):
                 yield how, fix
 
 
+class _AmongOthers(Convention):
+    """The readings of one group, in a dataset that has all other groups, too."""
+
+    def __init__(self, own: _OfOneGroup, group: Group) -> None:
+        self._own, self._group = own, group
+        self.name, self.what, self.do = own.name, own.what, own.do  # type: ignore[misc]
+        self.is_guess, self.least_times = own.is_guess, own.least_times  # type: ignore[misc]
+        self.explained_by = own.explained_by  # type: ignore[misc]
+
+    def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
+        """Yield them with what they make of the whole dataset."""
+        for how, fix in self._own.readings(self._group.part(dataset)):
+            yield how, OfGroup(self._group, fix)
+
+    def refined(self, view: View, how: str, fix: Fix) -> tuple[str, Fix]:
+        """Return the reading that rays of the group agree with best."""
+        assert isinstance(fix, OfGroup)
+        how, own = self._own.refined(self._group.alone(view), how, fix.own)
+        return how, OfGroup(self._group, own)
+
+
 def _rivals(readings: Sequence[_Reading]) -> tuple[str, ...]:
     """Return readings that stand the cameras up by more than a chance of all that was tried, if rays do not object."""
     given = readings[0]
@@ -218,18 +289,27 @@ def _rivals(readings: Sequence[_Reading]) -> tuple[str, ...]:
     )
 
 
-def _try_all(view: View, conventions: Sequence[Convention], progress: Progress) -> list[_Reading]:
+def _try_all(
+    view: View, conventions: Sequence[Convention], progress: Progress, group: Group | None = None
+) -> list[_Reading]:
     sample = view.stretches
+
+    def part(dataset: Dataset) -> Dataset:
+        return dataset if group is None else group.part(dataset)
+
     possible = [convention for convention in conventions if not convention.explained_by & view.known]
     of_each = [(convention, list(convention.readings(sample.dataset))) for convention in possible]
     shares = sum(bool(found) for _, found in of_each)
     tried = [(convention, how, fix, shares * len(found)) for convention, found in of_each for how, fix in found]
-    readings = [_Reading(None, "as given", None, view.agreement, view.uprightness, _is_along_axis(view.dataset))]
+    stands = uprightness(part(view.dataset))
+    # An axis of a frame that others stand in is not its up.
+    is_along_axis = _is_along_axis(view.dataset) if group is None else view.uprightness <= _LEAST_UPRIGHT
+    readings = [_Reading(None, "as given", None, view.agreement, stands, is_along_axis)]
     for number, (convention, how, fix, tests) in enumerate(tried):
         progress("trying other conventions", number, len(tried))
         other = fix(sample.dataset)
         agreement = _measure(other, sample, view.gate_px, fix)
-        readings.append(_Reading(convention, how, fix, agreement, uprightness(other), tests=tests))
+        readings.append(_Reading(convention, how, fix, agreement, uprightness(part(other)), tests=tests))
     progress("trying other conventions", len(tried), len(tried))
     return readings
 
@@ -260,16 +340,20 @@ def _judge(view: View, readings: Sequence[_Reading], top: _Reading) -> Finding |
     how, fix = chosen.convention.refined(view, chosen.how, chosen.fix)
     comparison = _compare_readings(chosen, given, everywhere)
     # What the stretches alone have decided, places that few passes meet do not take back.
-    chance = min(_chance(chosen, given, given), _chance(chosen, given, given, everywhere))
+    chance = min(_chance(chosen, given, given), _chance(chosen, given, given, everywhere)) * chosen.tests
+    if chance > LEAST_CHANCE:
+        return None
+    group = fix.group if isinstance(fix, OfGroup) else None
     return Finding(
         fault=chosen.convention.name,
-        what=chosen.convention.what,
+        what=chosen.convention.what if group is None else f"Only {group.text}: {chosen.convention.what}",
         why=f"Read as {how}, {chosen.agreement.share:.0%} of {chosen.agreement.detections} detections meet "
         f"others, with an agreement of {chosen.total:.0f}; as given {given.agreement.share:.0%} and {given.total:.0f}, "
         f"by chance {view.chance.share:.0%} and {view.chance.gain.sum():.0f} ({comparison.places} {comparison.of}).",
         do=chosen.convention.do,
-        chance=min(chance * chosen.tests, 1.0),
+        chance=chance,
         figures={
+            **({} if group is None else {"of": group.text}),
             "reading": how,
             "agreement_as_given": round(given.total, 1),
             "agreement_if_read_so": round(chosen.total, 1),
@@ -277,19 +361,23 @@ def _judge(view: View, readings: Sequence[_Reading], top: _Reading) -> Finding |
             **comparison.to_json(),
         },
         fix=fix,
+        of=None if group is None else group.text,
     )
 
 
-def _is_small_turn(view: View, total: float) -> bool:
+def _is_small_turn(view: View, total: float, group: Group | None) -> bool:
     """Return whether rays agree as well if cameras are turned a little, which is a smaller mistake than any other.
 
     Cameras that look too low, read upside down, look too high: up to half as much.
     """
     sample, turns = view.stretches, (turn for turn in PARAMETERS if turn.name in ("pitch", "yaw"))
-    turned = (
-        turn.change(sample.dataset, way * angle) for turn in turns for angle in _SMALL_TURNS_RAD for way in (-1, 1)
-    )
-    return any(agreement_on(sample, each, view.gate_px).gain.sum() >= total for each in turned)
+    tried = (_turned(turn, way * angle) for turn in turns for angle in _SMALL_TURNS_RAD for way in (-1, 1))
+    fixes: Iterator[Fix] = tried if group is None else (OfGroup(group, each) for each in tried)
+    return any(agreement_on(sample, fix(sample.dataset), view.gate_px).gain.sum() >= total for fix in fixes)
+
+
+def _turned(turn: Parameter, angle_rad: float) -> Fix:
+    return lambda dataset: turn.change(dataset, angle_rad)
 
 
 def _suspicion(given: _Reading, top: _Reading) -> str | None:

@@ -97,7 +97,9 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
                 gate_share = verdict.gate_share or gate_share
                 finding = verdict.finding
                 if meets and (finding is None or (finding.fix is not None and spoils_a_group(view, finding.fix))):
-                    finding = better_explained(view, finding, find_odd_group(view, CONVENTIONS, progress))
+                    finding = better_explained(
+                        view, finding, find_odd_group(view, CONVENTIONS, progress, verdict.suspects)
+                    )
                 found = [] if finding is None else [finding]
             else:
                 found = _look(view, stage, progress)

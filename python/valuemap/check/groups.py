@@ -81,12 +81,12 @@ class OfGroup:
     """Puts one group of a dataset right and leaves the rest as it is."""
 
     def __init__(self, group: Group, fix: Fix) -> None:
-        self._group, self._fix = group, fix
+        self.group, self.own = group, fix
 
     def __call__(self, dataset: Dataset) -> Dataset:
         """Return the dataset with poses, boxes and the group's own camera as the fix makes them."""
-        changed = self._fix(self._group.part(dataset))
-        mine = self._group.images_of(dataset)
+        changed = self.own(self.group.part(dataset))
+        mine = self.group.images_of(dataset)
         boxes = mine[rows_of(dataset.detections.image_id, dataset.images.image_id)]
         images, detections = dataset.images, dataset.detections
         result = Dataset(
@@ -105,7 +105,7 @@ class OfGroup:
                 ),
             }
         )
-        return result if self._group.pass_name is not None else _with_camera(result, changed.cameras)
+        return result if self.group.pass_name is not None else _with_camera(result, changed.cameras)
 
 
 def fits_one_group(fix: Fix, part: Dataset, group: Group) -> bool:

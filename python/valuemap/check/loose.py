@@ -30,7 +30,7 @@ from valuemap.tables import Floats
 
 LEAST_TIMES = 3.0
 """An error of all images is seen from so many times what single rays miss by."""
-_HALF_WAY = 0.5
+HALF_WAY = 0.5
 """The first rounds go at least so far."""
 _BLOCKS = 8
 """Of hundreds of metres each, longer than poses drift together."""
@@ -135,7 +135,7 @@ class Loose:
         misses = None if first is None else self.misses(apply(self._dataset, parameters, first.value))
         if first is None or misses is None:
             return None
-        least = LEAST_TIMES * _HALF_WAY
+        least = LEAST_TIMES * HALF_WAY
         if all(abs(first.of(each.name)[0]) < least * misses.of(each) for each in parameters):
             return None
         return self._estimate(parameters, start=first)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 
 import valuemap._core as _core
+from valuemap.check.agreement import Agreement
 from valuemap.check.fault import GATE_RAD, LEAST_CHANCE, View
 from valuemap.check.groups import Group, groups_of
-from valuemap.tables import Floats
+from valuemap.check.sample import Sample
+from valuemap.tables import Bools, Floats, Ints
 
 _LEAST_VOTES = 5
 _LEAST_GATES = 6.0
@@ -66,8 +69,16 @@ def object_heights(view: View, group: Group | None = None, *, is_without: bool =
     Classes whose detections are points without a size are left out, and points whose rays are too near each other to
     tell how far they are.
     """
-    heights = {name: _medians(of_votes) for name, of_votes in _heights_of_votes(view, group, is_without).items()}
-    return {name: values for name, values in heights.items() if len(values)}
+    heights = _heights(view, at_places=False)
+    if heights is None:
+        return {}
+    height_m = heights.of_points(heights.is_of(group, is_without=is_without))
+    is_seen = np.isfinite(height_m)
+    found: dict[str, Floats] = {}
+    for name, of_class in heights.classes(is_usual=True).items():
+        if np.any(of_class & is_seen):
+            found[name] = height_m[of_class & is_seen]
+    return found
 
 
 def heights_of_groups(view: View) -> dict[Group, dict[str, Floats]]:
@@ -102,53 +113,124 @@ def half_sized_group(view: View) -> tuple[Group, str, float, float, float] | Non
     """Return the camera or pass by whose boxes things are half as high as by all others', if one is.
 
     With it the class, both heights in metres, and the chance: that in logarithms they are nearer to equal than to a
-    half (Welch's t). None where no group is.
+    half. Objects that both see are compared each with itself (Student's t), else all those of one with all those of the
+    others (Welch's t). None where no group is.
     """
-    of_groups = heights_of_groups(view)
+    of_groups, at_places = heights_of_groups(view), _heights(view, at_places=True)
     found: list[tuple[Group, str, float, float, float]] = []
     for group, heights in of_groups.items():
         others = object_heights(view, group, is_without=True)
-        for name in heights.keys() & others.keys():
-            own, rest = np.log(heights[name]), np.log(others[name])
-            if min(len(own), len(rest)) < _LEAST_OBJECTS:
+        pairs = {} if at_places is None else at_places.pairs(group)
+        for name in heights.keys() | pairs.keys():
+            told = [_half(*np.log(pairs[name]), is_paired=True)] if name in pairs else []
+            own_m, others_m = heights.get(name, _NONE), others.get(name, _NONE)
+            if min(len(own_m), len(others_m)) >= _LEAST_OBJECTS:
+                told.append(_half(np.log(own_m), np.log(others_m), is_paired=False))
+            if not told:
                 continue
-            test = stats.ttest_ind(own + math.log(2.0) / 2.0, rest, equal_var=False, alternative="less")
-            chance, ratio = float(test.pvalue) * len(of_groups) * len(heights), float(own.mean() - rest.mean())
-            if chance < LEAST_CHANCE and ratio > _HALF_OR_A_QUARTER:
-                found.append((group, name, math.exp(np.median(own)), math.exp(np.median(rest)), chance))
+            best = min(told, key=lambda each: each.chance)
+            chance = best.chance * len(told) * len(of_groups) * len(heights.keys() | pairs.keys())
+            if chance < LEAST_CHANCE and best.ratio > _HALF_OR_A_QUARTER:
+                found.append((group, name, best.own_m, best.others_m, chance))
     return min(found, key=lambda each: each[4], default=None)
 
 
-def _heights_of_votes(view: View, group: Group | None, is_without: bool) -> dict[str, list[Floats]]:
-    """Return, for each class and point, the heights in metres by the votes of a group (None: all), or by all others."""
-    agreement = view.agreement
-    found = agreement.found
-    votes = np.diff(found.voter_offsets)
+_NONE = np.empty(0)
+
+
+@dataclass(frozen=True)
+class _Half:
+    """The chance that heights are nearer to equal than to a half, their mean ratio in logarithms, and their medians."""
+
+    chance: float
+    ratio: float
+    own_m: float
+    others_m: float
+
+
+def _half(own: Floats, others: Floats, *, is_paired: bool) -> _Half:
+    """Compare logarithms of heights (N and M, or pairs) by a group with those by others."""
+    ratio, own_m, others_m = float(own.mean() - others.mean()), math.exp(np.median(own)), math.exp(np.median(others))
+    nearer = own + math.log(2.0) / 2.0
+    if is_paired:
+        test = stats.ttest_rel(nearer, others, alternative="less")
+    else:
+        test = stats.ttest_ind(nearer, others, equal_var=False, alternative="less")
+    return _Half(float(test.pvalue), ratio, own_m, others_m)
+
+
+@dataclass(frozen=True, eq=False)
+class _Heights:
+    """How high points (P) where rays meet are by their votes (V), in metres, at the distance of the point.
+
+    `is_told` (P) are those whose rays say how far they are and whose detections have a size; `is_usual` (P) those that
+    have as many votes as most of their class: chance makes points of few votes, and what most votes are for is there.
+    """
+
+    sample: Sample
+    height_m: Floats
+    image_row: Ints
+    offsets: Ints
+    class_code: Ints
+    is_told: Bools
+    is_usual: Bools
+
+    def is_of(self, group: Group | None, *, is_without: bool = False) -> Bools:
+        """Return which votes (V) are of images of a group (None: all), or of all others."""
+        if group is None:
+            return np.ones(len(self.image_row), np.bool_)
+        return np.asarray(group.images_of(self.sample.dataset)[self.image_row] != is_without)
+
+    def of_points(self, which: Bools) -> Floats:
+        """Return the median height (P) of each point by some votes (V, by mask), NaN where it has none of them."""
+        votes = np.add.reduceat(which.astype(np.int64), self.offsets[:-1])
+        seen = votes > 0
+        result = np.full(len(votes), np.nan)
+        if seen.any():
+            offsets = np.append(0, np.cumsum(votes[seen])).astype(self.offsets.dtype)
+            result[seen] = _core.medians(self.height_m[which].copy(), offsets)
+        return result
+
+    def classes(self, *, is_usual: bool) -> dict[str, Bools]:
+        """Return which points (P) are of each class and told."""
+        told = self.is_told & self.is_usual if is_usual else self.is_told
+        names = self.sample.dataset.detections.class_name.names
+        return {name: told & (self.class_code == code) for code, name in enumerate(names)}
+
+    def pairs(self, group: Group) -> dict[str, Floats]:
+        """Return for each class the heights (2, N) of points by votes of a group, and by those of others."""
+        mine = self.is_of(group)
+        both = np.stack([self.of_points(mine), self.of_points(~mine)])
+        is_both = np.all(both > 0.0, axis=0)
+        of_classes = {name: both[:, of_class & is_both] for name, of_class in self.classes(is_usual=False).items()}
+        return {name: values for name, values in of_classes.items() if values.shape[1] >= _LEAST_OBJECTS}
+
+
+def _heights(view: View, *, at_places: bool) -> _Heights | None:
+    """Return the heights of what the stretches show, or the places, worked out once a view; None where nothing does."""
+    key = "heights at places" if at_places else "heights"
+    if key not in view.memory:
+        agreement, sample = (view.agreement_at_places, view.places) if at_places else (view.agreement, view.stretches)
+        view.memory[key] = _heights_of(view, agreement, sample)
+    found: _Heights | None = view.memory[key]
+    return found
+
+
+def _heights_of(view: View, agreement: Agreement, sample: Sample) -> _Heights | None:
+    found, detections = agreement.found, sample.dataset.detections
     if not len(found) or not view.meets:
-        return {}
-    detections = view.stretches.dataset.detections
+        return None
+    voters, votes = found.voters.astype(np.int64), np.diff(found.voter_offsets)
     _, metres_per_px, parallax_rad = _core.see(
         agreement.rays.core, found.position_in_world_m, found.voter_offsets, found.voters
     )
-    height_m = detections.size_px[found.voters.astype(np.int64), 1] * metres_per_px[:, 1]
-    median = _core.medians(height_m.copy(), found.voter_offsets)
-    class_code = detections.class_name.codes[found.voters[found.voter_offsets[:-1]].astype(np.int64)]
-    row = agreement.rays.image_row[found.voters.astype(np.int64)]
-    is_told = np.ones(len(row), np.bool_)
-    if group is not None:
-        is_told = group.images_of(view.stretches.dataset)[row] != is_without
-    result: dict[str, list[Floats]] = {}
-    for code, name in enumerate(detections.class_name.names):
-        of_class = (class_code == code) & (votes >= _LEAST_VOTES)
-        # Chance makes points of few votes; what most votes are for is what is there.
-        of_class &= votes >= np.median(votes[of_class]) if np.any(of_class) else of_class
-        of_class &= median > 0.0  # Key points have no size.
-        of_class &= parallax_rad > _LEAST_GATES * GATE_RAD * view.gate_share
-        if np.any(of_class):
-            spans = zip(found.voter_offsets[:-1][of_class], found.voter_offsets[1:][of_class], strict=True)
-            result[name] = [height_m[first:last][is_told[first:last]] for first, last in spans]
-    return result
-
-
-def _medians(of_votes: list[Floats]) -> Floats:
-    return np.array([np.median(values) for values in of_votes if len(values)])
+    height_m = detections.size_px[voters, 1] * metres_per_px[:, 1]
+    class_code = detections.class_name.codes[voters[found.voter_offsets[:-1]]]
+    enough = votes >= _LEAST_VOTES
+    is_usual = enough.copy()
+    for code in np.unique(class_code[enough]):
+        is_usual &= (class_code != code) | (votes >= np.median(votes[enough & (class_code == code)]))
+    is_told = enough & (_core.medians(height_m.copy(), found.voter_offsets) > 0.0)  # Key points have no size.
+    is_told &= parallax_rad > _LEAST_GATES * GATE_RAD * view.gate_share
+    image_row = agreement.rays.image_row[voters]
+    return _Heights(sample, height_m, image_row, found.voter_offsets, class_code.astype(np.int64), is_told, is_usual)
