@@ -803,7 +803,42 @@ def lowered(dataset: Dataset) -> Dataset:
     return posed(dataset, rotation, center - np.array(dataset.frame.up))
 
 
+def inverted_mounts(dataset: Dataset) -> Dataset:
+    """Take vehicle_from_cam for cam_from_vehicle: a level vehicle, x forward, y left, z up, amid its cameras."""
+    rotation, center = _poses(dataset)
+    up = np.array(dataset.frame.up)
+    _, at = np.unique(np.stack([dataset.images.pass_id.codes, _frames(dataset)]), axis=1, return_inverse=True)
+    forward, middle = (_mean_of(at.ravel(), values) for values in (rotation[:, 2], center))
+    forward -= np.outer(forward @ up, up)
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    vehicle = np.stack([forward, np.cross(up, forward), np.broadcast_to(up, forward.shape)], axis=1)
+    mount = rotation @ vehicle.transpose(0, 2, 1)
+    aside = np.einsum("nij,nj->ni", mount @ vehicle, middle - center)
+    return posed(dataset, mount.transpose(0, 2, 1) @ vehicle, middle + np.einsum("nji,nj->ni", vehicle, aside))
+
+
+def _frames(dataset: Dataset) -> NDArray[np.int64]:
+    """Return the number of the exposure (N) of each image."""
+    return np.unique(np.asarray(dataset.images.timestamp_s), return_inverse=True)[1].ravel()
+
+
+def _mean_of(group: NDArray[np.int64], values: Floats) -> Floats:
+    """Return for each row the mean of the values (N, 3) of its group."""
+    total = np.stack([np.bincount(group, weights=column) for column in values.T], axis=1)
+    return (total / np.bincount(group)[:, None])[group]
+
+
+def upside_down(dataset: Dataset) -> Dataset:
+    """Cameras mounted upside down, whose poses say so no more."""
+    rotation, center = _poses(dataset)
+    return posed(dataset, np.diag([-1.0, -1.0, 1.0]) @ rotation, center)
+
+
 RIG_FAULTS: dict[str, Fault] = {
+    "inverted_mounts": Fault(inverted_mounts),
+    "quaternion_order": Fault(lambda good: of_camera(good, quaternion_order(good), 0), of="camera 0"),
+    "camera_axes": Fault(lambda good: of_camera(good, upside_down(good), 1), of="camera 1"),
+    "picture_size": Fault(lambda good: of_camera(good, picture_size(good), 1), of="camera 1"),
     "cameras_exchanged": Fault(lambda good: exchanged(good, 0, 1)),
     "boxes_half_size": Fault(lambda good: of_camera(good, boxes_half_size(good), 1), of="camera 1"),
     "camera_yaw": Fault(lambda good: of_camera(good, camera_yaw(good), 2), of="camera 2"),

@@ -41,7 +41,7 @@ from valuemap.check.fault import (
 from valuemap.check.fit import Changed, Estimate, Parameter, apply
 from valuemap.check.frames import WorldAxes
 from valuemap.check.groups import Group
-from valuemap.check.headings import headings, level_rotations, rotations_of
+from valuemap.check.headings import driving_azimuths, headings, level_rotations, rotations_of
 from valuemap.check.loose import Correction, Loose
 from valuemap.check.offsets import find_shift
 from valuemap.check.passes import (
@@ -1115,6 +1115,39 @@ def test_exchanged_cameras_are_named_and_put_back(pair: tuple[int, int], one_rig
     assert finding.fix is not None
     fixed = finding.fix(spoiled).images
     np.testing.assert_allclose(rotation_matrices(fixed), rotation_matrices(one_rig.images), atol=1e-9)
+
+
+def test_inverted_mounts_are_named_and_the_cameras_turned(one_rig: Dataset) -> None:
+    spoiled = RIG_FAULTS["inverted_mounts"].spoil(one_rig)
+    assert spoiled is not None
+    finding = hold_contest(View(spoiled), conventions("inverted_poses", "camera_axes", "inverted_mounts")).finding
+    assert finding is not None
+    assert finding.fault == "inverted_mounts"
+    assert finding.fix is not None
+    assert degrees_off(finding.fix(spoiled), one_rig).max() < 3.0
+
+
+def test_mounts_that_are_what_they_are_inverted_are_not_tried(one: Dataset, one_rig: Dataset) -> None:
+    """Cameras that look ahead, on a vehicle with their axes, are not turned by the way back, and one alone has axes."""
+    assert list(mounts.InvertedMounts().readings(one)) == []
+    tried = [how for how, _ in mounts.InvertedMounts().readings(one_rig)]
+    assert len(tried) == 3
+    azimuth, _ = driving_azimuths(one_rig)
+    level = with_poses(one_rig, level_rotations(azimuth, one_rig.frame), camera_centers(one_rig.images))
+    ahead = [how for how, _ in mounts.InvertedMounts().readings(level)]
+    assert ahead == [how for how in tried if "looks ahead" not in how]
+
+
+def test_each_camera_of_a_car_goes_its_own_way(good_rig: Dataset) -> None:
+    """One hangs two metres to the left of the others, from which no way was driven."""
+    center = camera_centers(good_rig.images)
+    aside = np.where((good_rig.images.camera_id == 0)[:, None], [2.0, 0.0, 0.0], 0.0)
+    moved = with_centers(good_rig, center + aside)
+    np.testing.assert_allclose(moved_along(moved, 0.0), center + aside, atol=1e-9)
+    np.testing.assert_allclose(moved_along(moved, 1.5), moved_along(good_rig, 1.5) + aside, atol=1e-9)
+    azimuth, moves = driving_azimuths(moved)
+    right, _ = driving_azimuths(good_rig)
+    np.testing.assert_allclose(azimuth[moves], right[moves], atol=1e-9)
 
 
 def test_cameras_that_expose_a_little_later_are_one_rig(good_rig: Dataset) -> None:

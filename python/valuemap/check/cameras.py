@@ -368,7 +368,7 @@ class CameraTilt(_CommonError):
     name: ClassVar[str] = "camera_tilt"
     parameters: ClassVar[tuple[str, ...]] = ("pitch", "roll")
     # The noise of pitch and roll hides how cameras are mounted.
-    completes: ClassVar[frozenset[str]] = frozenset({"camera_tilt", "pitch_and_roll"})
+    completes: ClassVar[frozenset[str]] = frozenset({"camera_tilt", "pitch_and_roll", "inverted_mounts"})
     do: ClassVar[str] = "Correct the rotation between car and camera, or the principal point's y."
 
     def says(self, view: View, name: str, value: float) -> str:
@@ -384,7 +384,7 @@ class CameraYaw(_CommonError):
 
     name: ClassVar[str] = "camera_yaw"
     parameters: ClassVar[tuple[str, ...]] = ("yaw",)
-    completes: ClassVar[frozenset[str]] = frozenset({"camera_yaw"})
+    completes: ClassVar[frozenset[str]] = frozenset({"camera_yaw", "inverted_mounts"})
     do: ClassVar[str] = "Correct the rotation between car and camera, or the principal point's x."
 
     def says(self, view: View, name: str, value: float) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check.sample import driving_order
+from valuemap.check.sample import drive_of_camera, order_by_camera
 from valuemap.dataset import Dataset, Frame
 from valuemap.tables import Bools, Floats
 
@@ -60,11 +60,12 @@ def turned(dataset: Dataset, by_rad: Floats) -> Floats:
 def driving_azimuths(dataset: Dataset) -> tuple[Floats, Bools]:
     """Return the azimuth (N) in radians in which each image moves, and which images (N) move.
 
-    Of a standing image it is that of the image before it.
+    Of a standing image it is that of the image before it. Each camera moves by itself: from one of a car to the next
+    there is no way that was driven.
     """
-    order = driving_order(dataset.images)
+    order = order_by_camera(dataset.images)
     center = camera_centers(dataset.images)[order]
-    codes = dataset.images.pass_id.codes[order]
+    codes = drive_of_camera(dataset.images)[order]
     east, north = dataset.frame.east_north()
     step = np.zeros((len(order), 3))
     same = np.diff(codes) == 0

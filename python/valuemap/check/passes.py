@@ -33,7 +33,7 @@ from valuemap.check.fault import (
 )
 from valuemap.check.headings import driving_azimuths
 from valuemap.check.offsets import densest, pairs_within
-from valuemap.check.sample import FASTER, driving_order, order_by_camera, standing_m
+from valuemap.check.sample import FASTER, drive_of_camera, driving_order, order_by_camera, standing_m
 from valuemap.check.seams import Seam, worst_seam
 from valuemap.dataset import Dataset
 from valuemap.tables import Bools, Categories, Floats, Images, Ints
@@ -793,13 +793,13 @@ class _Realigned:
 
 
 def moved_along(dataset: Dataset, forward_m: float) -> Floats:
-    """Return camera centres (N, 3) moved forward along their passes as far as a shift in time does.
+    """Return camera centres (N, 3) moved forward along their passes, each camera's own, as a shift in time does.
 
     The shift is that of an image that moves by the median step; slower ones move less, standing ones not at all.
     """
-    order = driving_order(dataset.images)
+    order = order_by_camera(dataset.images)
     center = camera_centers(dataset.images)[order]
-    codes = dataset.images.pass_id.codes[order]
+    codes = drive_of_camera(dataset.images)[order]
     time = dataset.images.timestamp_s
     seconds = np.arange(len(order), dtype=np.float64) if time is None or not np.all(np.isfinite(time)) else time[order]
     step = np.linalg.norm(np.diff(center, axis=0), axis=1)

@@ -35,7 +35,7 @@ from valuemap.check.frames import (
     WorldAxes,
 )
 from valuemap.check.lenses import FocalUnit, PrincipalPoint
-from valuemap.check.mounts import CamerasExchanged
+from valuemap.check.mounts import CamerasExchanged, InvertedMounts
 from valuemap.check.passes import (
     InterleavedPasses,
     NoDrives,
@@ -72,6 +72,7 @@ CONVENTIONS: tuple[Convention, ...] = (
     MirroredPictures(),
     ShiftedDetections(),
     CamerasExchanged(),
+    InvertedMounts(),
     FocalUnit(),
     PrincipalPoint(),
     HeldPositions(),

@@ -83,6 +83,12 @@ def order_by_camera(images: Images, *, by_time: bool = True) -> Ints:
     return order[np.lexsort((images.camera_id[order], images.pass_id.codes[order]))]
 
 
+def drive_of_camera(images: Images) -> Ints:
+    """Return a number (N) that images of one pass and camera share, and no others."""
+    pass_and_camera = np.stack([images.pass_id.codes, images.camera_id], axis=1)
+    return np.unique(pass_and_camera, axis=0, return_inverse=True)[1].ravel().astype(np.int64)
+
+
 def _rank_of_names(images: Images) -> Ints:
     """Return the place (N) of each name among all, where numbers count as numbers."""
     keys = [
