@@ -215,13 +215,11 @@ def test_without_the_part_there_are_no_middles(mapped: tuple[Dataset, Mapped], m
 def test_middles_that_are_in_doubt_widen_covariances_and_change_no_vote(
     mapped: tuple[Dataset, Mapped], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def map_with(told: Middles | None) -> valuemap.Map:
-        monkeypatch.setattr(calibration, "middles", lambda *_: told)
-        return valuemap.build_map(mapped[0], MapConfig(correct_poses=0))
-
-    without, doubted = map_with(None), map_with(Middles(0.2, is_certain=False))
-    assert np.array_equal(without.labels.position_in_world_m, doubted.labels.position_in_world_m)
-    assert np.array_equal(without.votes.detection_id, doubted.votes.detection_id)
-    trace_m2 = (covariance_matrices(one.labels.covariance_m2).trace(axis1=1, axis2=2) for one in (without, doubted))
+    monkeypatch.setattr(calibration, "middles", lambda *_: Middles(0.2, is_certain=False))
+    city, (_, labels, votes, _) = mapped
+    _, labels_of_doubt, votes_of_doubt, _ = correction._map_alone(city, MapConfig(), ThreadEngine(1), silent)
+    assert np.array_equal(labels.position_in_world_m, labels_of_doubt.position_in_world_m)
+    assert np.array_equal(votes.detection_id, votes_of_doubt.detection_id)
+    trace_m2 = (covariance_matrices(each.covariance_m2).trace(axis1=1, axis2=2) for each in (labels, labels_of_doubt))
     known_m2, doubted_m2 = trace_m2
     assert np.median(doubted_m2 / known_m2) > 1.2
