@@ -185,9 +185,10 @@ def _headings_deg(
     cost, came_from = off.copy(), np.zeros(choices.shape, dtype=np.int64)
     for i in range(1, int(length[0])):
         row = start[: np.searchsorted(-length, -i)] + i
-        total = cost[row - 1][:, None] + cost_of_pair[row - 1]
-        came_from[row] = total.argmin(axis=2)
-        cost[row] += np.take_along_axis(total, came_from[row][:, :, None], axis=2)[:, :, 0]
+        total = (cost[row - 1][:, None] + cost_of_pair[row - 1]).reshape(-1, count)
+        cheapest = total.argmin(axis=1)
+        came_from[row] = cheapest.reshape(-1, count)
+        cost[row] += total[np.arange(len(total)), cheapest].reshape(-1, count)
     path = np.empty(len(choices), dtype=np.int64)
     last = start + length - 1
     path[last] = cost[last].argmin(axis=1)
