@@ -21,14 +21,13 @@ from valuemap.refine import Mapped, gather_images
 from valuemap.refine.images import Bundle
 from valuemap.refine.middles import Contrasts, Middles
 from valuemap.simulate import simulate
-from valuemap.tables import Categories, Floats, covariance_matrices
+from valuemap.tables import Floats, covariance_matrices
 from valuemap.tiles.source import InMemory
 
 refine_middles = importlib.import_module("valuemap.refine.middles")
 """The module, which the package hides behind its function of the same name."""
 SIZE_M = 1.0
 DRIFT_M = 0.5
-GATE_SIGMAS = MapConfig().noise.gate_sigmas
 
 
 def sides(middles_m: float, *, objects: int = 40, seed: int = 0) -> tuple[list[Floats], Floats]:
@@ -146,38 +145,13 @@ def test_middles_are_not_told_without_boxes_or_objects(
 ) -> None:
     city, (calibration, labels, votes, _) = mapped
     images, noise = gather_images(city, MapConfig()), calibration.noise
-    told = refine_middles.middles(images, labels, votes, noise, GATE_SIGMAS)
+    told = refine_middles.middles(images, labels, votes, noise)
     assert told is not None
     assert told.off_m == pytest.approx(0.2, rel=0.3)
     without_boxes = labels.replace(object_height_m=np.zeros(len(labels)))
-    assert refine_middles.middles(images, without_boxes, votes, noise, GATE_SIGMAS) is None
+    assert refine_middles.middles(images, without_boxes, votes, noise) is None
     monkeypatch.setattr(refine_middles, "_LEAST_OBJECTS", len(labels))
-    assert refine_middles.middles(images, labels, votes, noise, GATE_SIGMAS) is None
-
-
-def beside(city: Dataset, class_name: str, apart_px: float) -> Dataset:
-    """Return a dataset that has a detection of a class beside each."""
-    count, number, seen = len(city.detections), city.detections.detection_id, city.detections.class_name.texts()
-    both = city.detections.take(np.tile(np.arange(count), 2))
-    others = both.replace(
-        detection_id=np.concatenate([number, number.max() + 1 + number]),
-        center_px=both.center_px + np.repeat([0.0, apart_px], count)[:, None] * [1.0, 0.0],
-        class_name=Categories.from_texts(seen + [class_name] * count),
-    )
-    return replace(city, detections=others, truth_detections=None)
-
-
-@pytest.mark.parametrize(
-    ("class_name", "apart_px", "tells"),
-    [("street_lamp", 3.0, False), ("street_lamp", 300.0, True), ("post", 3.0, True)],
-)
-def test_objects_beside_others_of_their_class_tell_nothing_of_middles(
-    mapped: tuple[Dataset, Mapped], class_name: str, apart_px: float, tells: bool
-) -> None:
-    city, (calibration, labels, votes, _) = mapped
-    images = gather_images(beside(city, class_name, apart_px), MapConfig())
-    found = refine_middles.middles(images, labels, votes, calibration.noise, GATE_SIGMAS)
-    assert (found is not None) == tells
+    assert refine_middles.middles(images, labels, votes, noise) is None
 
 
 def told(city: Dataset, *settings: str) -> float:

@@ -92,7 +92,7 @@ def _estimated(
     calibration, found = estimated(with_sides(0.0, config), sought)
     labels, votes = describe_labels(sample.dataset, scene.rays, found, config.noise)
     votes = replace(votes, detection_id=sample.detection_id[votes.detection_id])
-    told = middles(images_in_order(sample, config), labels, votes, calibration.noise, config.noise.gate_sigmas)
+    told = middles(images_in_order(sample, config), labels, votes, calibration.noise)
     if told is None:
         return calibration
     if told.is_certain:

@@ -4,19 +4,17 @@ A box shows the middle of what its side of an object is. Sides of one object dis
 middles are off by, and by what poses are off by there. Of one object alone that cannot be told apart where passes drift
 by more than middles are off. But poses are off for all that images show, and middles are each object's own: so all
 sides are placed in one adjustment, and what is off by is told by the likelihood of how they disagree, all together
-(restricted maximum likelihood; Patterson and Thompson 1971). Objects that stand alone tell it: where they stand side by
-side, sides may have votes of several, and disagree by how far these are apart.
+(restricted maximum likelihood; Patterson and Thompson 1971).
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
 
-from valuemap.refine.footage import AllImages, shown_objects
+from valuemap.refine.footage import AllImages
 from valuemap.refine.images import Bundle, bundle
 from valuemap.refine.poses import one_blas_thread
 from valuemap.robust import Noise
@@ -50,43 +48,22 @@ class Middles:
     is_certain: bool
 
 
-def middles(images: AllImages, labels: Labels, votes: Votes, noise: Noise, gate_sigmas: float) -> Middles | None:
+def middles(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> Middles | None:
     """Return what middles are off by; None where nothing tells that they are.
 
-    `noise` is that of the map of `labels` and `votes`, of which none is farther off than `gate_sigmas`. What is not
-    known well, as depth is, says little of middles.
+    `noise` is that of the map of `labels` and `votes`. What is not known well, as depth is, says little of middles.
     """
     height_m = labels.object_height_m[labels.object_height_m > 0.0]
     if not len(height_m):  # Middles are those of boxes.
         return None
     told = bundle(images, labels, votes, replace(noise, side_m=0.0), by_side=True)
-    is_alone = _are_alone(images, labels, votes, noise, gate_sigmas)
-    sides = _asked([things for things in _sides(told) if is_alone[told.label[things[0]]]])
+    sides = _asked(_sides(told))
     if len(sides) < _LEAST_OBJECTS:
         return None
     point_m, covariance_m2 = told.placed(np.concatenate(sides)[None])
     with one_blas_thread():
         contrasts = Contrasts.of_sides([point_m[things] for things in sides], covariance_m2[0])
         return contrasts.middles(float(np.median(height_m)))
-
-
-def _are_alone(images: AllImages, labels: Labels, votes: Votes, noise: Noise, gate_sigmas: float) -> Bools:
-    """Return which labels (L) stand alone: most of their images have no other detection of the class in the gate."""
-    footage = images.footage
-    rays, box_px, per_rad = footage.rays, footage.dataset.detections.size_px[:, 1], footage.pixels_per_rad()
-    position_m = math.hypot(noise.position_m, noise.position_segment_m, noise.position_drift_m) / images.unit_m
-    rotation_rad = math.hypot(noise.rotation_rad, noise.rotation_segment_rad, noise.rotation_drift_rad)
-    # As in a bundle, a metre of the camera is as many pixels as the box of a thing of a metre.
-    of_box = math.hypot(noise.box_share, position_m) * np.maximum(box_px, 0.0)
-    sigma_px = np.sqrt(noise.detection_px**2 + of_box**2 + (rotation_rad * per_rad) ** 2)
-    # Directions are at most 2 apart: detections of other images and classes are farther.
-    place = np.column_stack([rays.direction_in_world, 3.0 * rays.image_row, 3.0 * rays.class_code])
-    detection, thing, label, _ = shown_objects(footage, images.ordered, labels, votes)
-    to_next = np.asarray(scipy.spatial.cKDTree(place).query(place[detection], k=2)[0])[:, 1]
-    is_free = to_next * per_rad[detection] > gate_sigmas * sigma_px[detection]
-    is_alone = np.zeros(len(labels), np.bool_)
-    is_alone[label] = np.bincount(thing, weights=is_free) > 0.5 * np.bincount(thing)
-    return is_alone
 
 
 def _sides(told: Bundle) -> list[Ints]:
