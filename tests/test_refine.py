@@ -44,7 +44,6 @@ from valuemap.refine.footage import (
     Sigmas,
     Steps,
     _sudden,
-    find_motion,
     find_steps,
     gather,
     in_working_frame,
@@ -852,7 +851,7 @@ def test_errors_are_estimated_with_the_rates_of_the_delay_that_poses_start_with(
     footage, late_s = seen[0]
     assert late_s == pytest.approx(0.1, abs=0.03)
     turned = {}
-    for name, motion in (("mean", find_motion(ordered.dataset, ordered.drives)), ("found", footage.motion)):
+    for name, motion in (("mean", find_steps(ordered.dataset, ordered.drives).motion()), ("found", footage.motion)):
         rate = motion.forward_radps[footage.row] if name == "mean" else motion.forward_radps
         turned[name] = rotations(0.1 * rate) @ footage.cam_from_world
     clean = camera_poses(in_driving_order(city(), viewpoint_step_m=1.0).dataset.images)[0][footage.row]
@@ -895,7 +894,7 @@ def test_poses_that_are_moved_on_tremble_as_before() -> None:
     # Moved towards the next image by two fifths of the way, an image would lose a quarter of its own error.
     dataset = city(position_drift_m=0.0, position_white_m=0.3)
     drives = find_drives(dataset.images)
-    motion, center = find_motion(dataset, drives), camera_poses(dataset.images)[1]
+    motion, center = find_steps(dataset, drives).motion(), camera_poses(dataset.images)[1]
     for late_s, velocity in ((0.1, motion.forward_mps), (-0.1, motion.backward_mps)):
         assert trembling(center + late_s * velocity, drives) > 0.95 * trembling(center, drives)
 
@@ -1163,7 +1162,7 @@ def test_velocities_are_found_once_and_only_where_they_are_asked_for(monkeypatch
 def test_velocities_are_those_of_the_trajectory() -> None:
     dataset = city(position_white_m=0.0, position_drift_m=0.0)
     drives = find_drives(dataset.images)
-    motion = find_motion(dataset, drives)
+    motion = find_steps(dataset, drives).motion()
     speed = np.linalg.norm(motion.forward_mps, axis=1)
     assert motion.is_timed.all()
     assert np.median(speed[speed > 1.0]) == pytest.approx(CITY.speed_mps, rel=0.02)

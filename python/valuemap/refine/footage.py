@@ -306,11 +306,6 @@ def _from_middle(dataset: Dataset, rays: Rays) -> Floats:
     return offset
 
 
-def find_motion(dataset: Dataset, drives: Drives) -> Motion:
-    """Return how all images move, from the images of the same camera before and after them in the drive."""
-    return find_steps(dataset, drives).motion()
-
-
 def find_steps(dataset: Dataset, drives: Drives) -> Steps:
     """Return the steps from all images to those of the same camera before and after them in the drive."""
     images = dataset.images

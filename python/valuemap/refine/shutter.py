@@ -15,7 +15,7 @@ import numpy as np
 from valuemap.cameras import camera_poses
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import find_drives
-from valuemap.refine.footage import find_motion, moved_on, with_poses
+from valuemap.refine.footage import find_steps, moved_on, with_poses
 from valuemap.tables import Floats
 
 
@@ -29,7 +29,7 @@ def expose_rows(dataset: Dataset) -> tuple[Dataset, dict[str, Any]]:
     if readout_s is None or not np.nan_to_num(readout_s).any():
         return dataset, {}
     images = dataset.images
-    motion = find_motion(dataset, find_drives(images))
+    motion = find_steps(dataset, find_drives(images)).motion()
     late_s = np.where(motion.is_timed, _lateness(dataset, np.nan_to_num(readout_s)), 0.0)
     rotation, center = camera_poses(images)
     moved_rotation, moved_center = moved_on(motion, rotation, center, late_s)
