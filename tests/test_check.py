@@ -481,7 +481,7 @@ def test_a_turn_of_as_much_as_magnetic_north_is_off_is_no_other_convention(
     verdict = hold_contest(View(aside), CONVENTIONS)
     assert verdict.finding is None
     assert verdict.suspicion is None
-    monkeypatch.setattr(contest, "_SMALL_TURNS_RAD", np.radians([2.0, 4.0, 6.0]))
+    monkeypatch.setattr(contest, "SMALL_TURNS_RAD", np.radians([2.0, 4.0, 6.0]))
     assert hold_contest(View(aside), CONVENTIONS).finding is not None
 
 

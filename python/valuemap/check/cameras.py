@@ -315,7 +315,7 @@ def _is_wider_gate_only(view: View, dataset: Dataset) -> bool:
     Errors of poses are angles: pictures said to be six times as wide make them a sixth of the pixels. So the gate is
     one angle, and so wide that all rays of an object vote either way: how close they pass counts, not how many do.
     """
-    wide = View(view.dataset, gate_share=view.gate_share * WIDER_GATE)
+    wide = _at_wider_gate(view)
     at_one_angle = float(gains_of_all(wide, dataset, is_gate_an_angle=True).sum())
     return at_one_angle < float(gains_of_all(wide, view.dataset).sum())
 

@@ -25,6 +25,7 @@ from valuemap.check.cameras import PARAMETERS, WrongCamera
 from valuemap.check.fault import (
     LEAST_CHANCE,
     LEAST_RISE,
+    SMALL_TURNS_RAD,
     WIDER_GATE,
     Convention,
     Finding,
@@ -44,9 +45,6 @@ _ALONG_AXIS = 0.985
 """The cosine of 10 degrees, which cars and their cameras lean at most."""
 _ENOUGH_PLACES = 12
 """What a sample is cut into where there are detections enough."""
-_SMALL_TURNS_RAD = np.radians(np.arange(2.0, 17.0, 2.0))
-"""At most a degree from any turn that a mount may be off by, that magnetic north has from north where most streets are,
-or that pictures seem to be turned by which were cropped at one side."""
 _FROM_RAYS = 0.05
 """However upright cameras stand under a reading, rays must prefer it beyond this chance."""
 _SUSPICIOUS = 0.05
@@ -237,14 +235,22 @@ def _worth_of(view: View) -> float:
     return float(view.agreement.gain.sum() - view.chance.gain.sum()) / max(view.agreement.detections, 1)
 
 
-class _OfOneGroup(Convention):
-    """A convention with those of its readings that change nothing but one group."""
+class _LikeAnother(Convention):
+    """A convention that has other readings, for a group, than the one that it is called like."""
 
-    def __init__(self, convention: Convention, part: Dataset, group: Group) -> None:
-        self._convention, self._part, self._group = convention, part, group
+    def __init__(self, convention: Convention, group: Group) -> None:
+        self._convention, self._group = convention, group
         self.name, self.what, self.do = convention.name, convention.what, convention.do  # type: ignore[misc]
         self.is_guess, self.least_times = convention.is_guess, convention.least_times  # type: ignore[misc]
         self.explained_by = convention.explained_by  # type: ignore[misc]
+
+
+class _OfOneGroup(_LikeAnother):
+    """A convention with those of its readings that change nothing but one group."""
+
+    def __init__(self, convention: Convention, part: Dataset, group: Group) -> None:
+        super().__init__(convention, group)
+        self._part = part
         self.refined = convention.refined  # type: ignore[method-assign]
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
@@ -254,24 +260,18 @@ class _OfOneGroup(Convention):
                 yield how, fix
 
 
-class _AmongOthers(Convention):
+class _AmongOthers(_LikeAnother):
     """The readings of one group, in a dataset that has all other groups, too."""
-
-    def __init__(self, own: _OfOneGroup, group: Group) -> None:
-        self._own, self._group = own, group
-        self.name, self.what, self.do = own.name, own.what, own.do  # type: ignore[misc]
-        self.is_guess, self.least_times = own.is_guess, own.least_times  # type: ignore[misc]
-        self.explained_by = own.explained_by  # type: ignore[misc]
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield them with what they make of the whole dataset."""
-        for how, fix in self._own.readings(self._group.part(dataset)):
+        for how, fix in self._convention.readings(self._group.part(dataset)):
             yield how, OfGroup(self._group, fix)
 
     def refined(self, view: View, how: str, fix: Fix) -> tuple[str, Fix]:
         """Return the reading that rays of the group agree with best."""
         assert isinstance(fix, OfGroup)
-        how, own = self._own.refined(self._group.alone(view), how, fix.own)
+        how, own = self._convention.refined(self._group.alone(view), how, fix.own)
         return how, OfGroup(self._group, own)
 
 
@@ -371,7 +371,7 @@ def _is_small_turn(view: View, total: float, group: Group | None) -> bool:
     Cameras that look too low, read upside down, look too high: up to half as much.
     """
     sample, turns = view.stretches, (turn for turn in PARAMETERS if turn.name in ("pitch", "yaw"))
-    tried = (_turned(turn, way * angle) for turn in turns for angle in _SMALL_TURNS_RAD for way in (-1, 1))
+    tried = (_turned(turn, way * angle) for turn in turns for angle in SMALL_TURNS_RAD for way in (-1, 1))
     fixes: Iterator[Fix] = tried if group is None else (OfGroup(group, each) for each in tried)
     return any(agreement_on(sample, fix(sample.dataset), view.gate_px).gain.sum() >= total for fix in fixes)
 

@@ -33,6 +33,9 @@ GATE_RAD = 0.012
 """Rays that pass closer than this agree: 0.7 degrees, 6 px at a focal length of 500 px."""
 WIDER_GATE = 4.0
 """Detections of heat maps or panoramas with compass headings may be off by degrees."""
+SMALL_TURNS_RAD = np.radians(np.arange(2.0, 17.0, 2.0))
+"""At most a degree from any turn that a mount may be off by, that magnetic north has from north where most streets are,
+or that pictures seem to be turned by which were cropped at one side."""
 MANY_DETECTIONS = 8000
 LEAST_RISE = 0.02
 """Passes have errors of their own, which few passes do not average out: what costs less than one part in fifty of the

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check.fault import Convention, Fix, with_images, with_poses
+from valuemap.check.fault import SMALL_TURNS_RAD, Convention, Fix, with_images, with_poses
 from valuemap.check.headings import driving_azimuths, level_rotations
 from valuemap.dataset import Dataset
 from valuemap.tables import Floats, Images, Ints
@@ -89,8 +89,8 @@ class _InvertedMounts:
         return turns
 
 
-_NO_TURN = 1.0 + 2.0 * np.cos(np.radians(16.0))
-"""The trace of a turn by less than that, which a contest takes for a turn in the mount."""
+_NO_TURN = 1.0 + 2.0 * np.cos(SMALL_TURNS_RAD.max())
+"""The trace of a turn by so much: by less, a contest takes it for a turn in the mount."""
 
 
 class _Exchanged:

@@ -255,8 +255,7 @@ def _by_name(images: Images) -> tuple[Ints, Bools]:
     Names of a car with several cameras often are those of one camera after the other.
     """
     order = order_by_camera(images, by_time=False)
-    pass_and_camera = np.stack([images.pass_id.codes[order], images.camera_id[order]])
-    return order, np.append(True, (np.diff(pass_and_camera, axis=1) != 0).any(axis=0))
+    return order, np.append(True, np.diff(drive_of_camera(images)[order]) != 0)
 
 
 def _unrolled(dataset: Dataset) -> Dataset:
