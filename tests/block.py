@@ -7,6 +7,9 @@ import dataclasses
 from valuemap.config import SimulationConfig
 from valuemap.simulate import PRESETS
 
+SHORT_STREETS = {"block_east_m": 60.0, "block_north_m": 60.0}
+"""As short as streets may be: all of a city with fewer images."""
+
 
 def block(**changes: float) -> SimulationConfig:
     """Return the settings of the block: all its streets are driven twice in each direction."""

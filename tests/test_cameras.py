@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from block import block
+from block import SHORT_STREETS, block
 from camera_models import cameras_like, distances_m, measure, seen_through
 from small_dataset import small_dataset
 from valuemap.camera_models import Pinhole, camera_models, names_of_params, places_of_params
@@ -317,7 +317,7 @@ POSES_STAY = MapConfig().with_settings(["correct_poses=0"])
 def test_a_city_is_mapped_as_well_through_any_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same rays, so the same angular noise: as many objects, as exactly, whatever pixels they are in."""
     monkeypatch.setattr("camera_models.build_map", lambda dataset, _: build_map(dataset, POSES_STAY))
-    result = measure(block(frame_spacing_m=4.0, standing_interval_s=2.0), [5])
+    result = measure(block(frame_spacing_m=4.0, standing_interval_s=2.0, **SHORT_STREETS), [5])
     found = {name: result[name]["found"] for name in ("pinhole", "opencv", "fisheye", "equirectangular")}
     assert found["pinhole"] >= 0.9 * result["pinhole"]["objects"]
     assert all(abs(other - found["pinhole"]) <= 1 for other in found.values()), found

@@ -12,6 +12,7 @@ import pytest
 import scipy.stats
 
 import valuemap
+from block import SHORT_STREETS
 from test_refine import CITY
 from valuemap import MapConfig, calibration, correction, robust
 from valuemap.dataset import Dataset
@@ -129,8 +130,8 @@ def test_no_more_objects_are_asked_than_tell_it(objects: int, asked: int) -> Non
 
 def lamps_beside_drives_that_drift(side_offset_m: float, seed: int) -> Dataset:
     """Return lamps whose sides show other middles, seen by drives that drift by 0.4 m."""
-    lamps = replace(CITY, has_lights=0, lamp_spacing_m=15.0, side_offset_m=side_offset_m, frame_spacing_m=4.0)
-    return simulate(replace(lamps, position_drift_m=0.4), seed=seed)
+    lamps = replace(CITY, has_lights=0, lamp_spacing_m=12.0, side_offset_m=side_offset_m, frame_spacing_m=4.0)
+    return simulate(replace(lamps, position_drift_m=0.4, **SHORT_STREETS), seed=seed)
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 
 import valuemap
-from block import block
+from block import SHORT_STREETS, block
 from test_few import some_pictures
 from valuemap import robust
 from valuemap.calibration import calibrate
@@ -38,12 +38,11 @@ HONEST_CHI2 = 16.0
 CONFIG = valuemap.MapConfig().with_settings(["side_sigma_m=0"])
 WITH_SIDES = valuemap.MapConfig()
 """Where sides show other middles: they are told."""
-SMALL = {"block_east_m": 60.0, "block_north_m": 60.0}
 NO_LIGHTS = {"has_lights": 0, "lookalikes_per_light": 0.0}
 UNEVEN = "uneven lamps"
 BLOCKS: dict[str, dict[str, float]] = {
-    "lights": {"passes_per_street": 1, **SMALL},
-    "drifts": {"position_drift_m": 0.4, "position_white_m": 0.05, **SMALL},
+    "lights": {"passes_per_street": 1, **SHORT_STREETS},
+    "drifts": {"position_drift_m": 0.4, "position_white_m": 0.05, **SHORT_STREETS},
     "poor detector": {"recall_mean": 0.35, "clutter_per_image": 0.5, "passes_per_street": 3},
     "temporary": {"temporary_per_1000_images": 10.0},
     "reflections": {
@@ -58,13 +57,19 @@ BLOCKS: dict[str, dict[str, float]] = {
         "sign_row_spacing_m": 20.0,
         "lookalikes_per_light": 0.0,
         "passes_per_street": 1,
-        **SMALL,
+        **SHORT_STREETS,
     },
-    "close rows": {"sign_row_spacing_m": 30.0, "sign_apart_m": 0.5, "passes_per_street": 1, **NO_LIGHTS, **SMALL},
-    "more close rows": {"sign_row_spacing_m": 30.0, "sign_apart_m": 0.5, **NO_LIGHTS, **SMALL},
+    "close rows": {
+        "sign_row_spacing_m": 30.0,
+        "sign_apart_m": 0.5,
+        "passes_per_street": 1,
+        **NO_LIGHTS,
+        **SHORT_STREETS,
+    },
+    "more close rows": {"sign_row_spacing_m": 30.0, "sign_apart_m": 0.5, **NO_LIGHTS, **SHORT_STREETS},
     "standing": {"frame_spacing_m": 20.0},
     "narrow": {"max_facing_deg": 20.0},
-    "trees": {"tree_spacing_m": 8.0, "max_sight_m": 60.0, "passes_per_street": 1, **NO_LIGHTS, **SMALL},
+    "trees": {"tree_spacing_m": 8.0, "max_sight_m": 60.0, "passes_per_street": 1, **NO_LIGHTS, **SHORT_STREETS},
     "far off": {
         "tail_share": 0.2,
         "max_sight_m": 100.0,

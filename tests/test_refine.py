@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 import laws
 import valuemap
+from block import SHORT_STREETS
 from test_simulate import EXACT_BOXES, EXACT_POSES
 from valuemap import camera_models, correction, pipeline
 from valuemap.calibration import with_sides
@@ -141,12 +142,12 @@ def clean_city() -> Dataset:
 
 def few_of_dashcam() -> Dataset:
     """Return a city of few lights with the poses of a dash camera."""
-    return city(lights=12, **FEWEST_IMAGES, **DASHCAM)
+    return city(lights=12, **FEWEST_IMAGES, **SHORT_STREETS, **DASHCAM)
 
 
 def poor_detector() -> Dataset:
     """Return a city of few lights with exact poses and a poor detector."""
-    return city(pixel_noise_px=5.0, lights=12, **FEWEST_IMAGES, **EXACT_POSES)
+    return city(pixel_noise_px=5.0, lights=12, **FEWEST_IMAGES, **SHORT_STREETS, **EXACT_POSES)
 
 
 @functools.cache

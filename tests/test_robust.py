@@ -11,7 +11,7 @@ import pytest
 
 import valuemap
 import valuemap._core as _core
-from block import block
+from block import SHORT_STREETS, block
 from literal import Floats, Pinhole, Sighting
 from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
 from valuemap.cameras import camera_centers
@@ -140,8 +140,7 @@ def test_the_class_with_most_votes_has_the_place_and_others_do_not_vote() -> Non
 
 
 def test_a_detector_that_confuses_classes_makes_hardly_a_label_more() -> None:
-    small = {"block_east_m": 60.0, "block_north_m": 60.0}
-    city = block(lookalikes_per_light=0.0, sign_row_spacing_m=30.0, class_confusion=0.15, **small)
+    city = block(lookalikes_per_light=0.0, sign_row_spacing_m=30.0, class_confusion=0.15, **SHORT_STREETS)
     dataset = simulate(city, seed=5, name="block")
     result = valuemap.build_map(dataset, POSES_AS_THEY_ARE)
     score = valuemap.evaluate_map(result, dataset)
