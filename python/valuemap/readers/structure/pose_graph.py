@@ -91,7 +91,8 @@ def start_of(
     count = len(drive)
     pairs = _of_one_place(pairs, drive)
     rotation = _rotations(pairs, count)
-    pairs = [pair for pair in pairs if np.linalg.norm(_turn_off(pair, rotation)) < _LARGEST_TURN_RAD]
+    off_rad = np.linalg.norm(_turns_off(pairs, rotation), axis=1)
+    pairs = [pair for pair, off in zip(pairs, off_rad, strict=True) if off < _LARGEST_TURN_RAD]
     ways = [find_way(pair.ray[0] @ rotation[pair.first], pair.ray[1] @ rotation[pair.second]) for pair in pairs]
     edges, part = _edges(pairs, ways)
     group = _components(edges.one, edges.two, count)
@@ -128,7 +129,8 @@ def _of_one_place(pairs: Sequence[Pair], drive: Ints) -> list[Pair]:
         return list(pairs)
     rotation = _rotations(along, count)
     agrees = follows.copy()
-    agrees[follows] = [np.linalg.norm(_turn_off(pair, rotation)) < _LARGEST_TURN_RAD for pair in along]
+    off_rad = np.linalg.norm(_turns_off(pairs, rotation), axis=1)
+    agrees[follows] = off_rad[follows] < _LARGEST_TURN_RAD
     group = _components(one[agrees], two[agrees], count)
     weight = 1.0 / sigma[agrees] ** 2
     between = coo_matrix((-weight, (one[agrees], two[agrees])), shape=(count, count))
@@ -140,7 +142,7 @@ def _of_one_place(pairs: Sequence[Pair], drive: Ints) -> list[Pair]:
             way = np.zeros(count)
             way[pair.first], way[pair.second] = 1.0, -1.0
             sure = 3.0 * math.sqrt(max(float(way @ factors.solve(way)), 0.0))
-            if np.linalg.norm(_turn_off(pair, rotation)) > _OTHER_PLACE_RAD + sure:
+            if off_rad[number] > _OTHER_PLACE_RAD + sure:
                 continue
         kept.append(pair)
     return kept
@@ -160,7 +162,7 @@ def _rotations(pairs: Sequence[Pair], count: int) -> Floats:
     one, two, sigma = _between(pairs)
     for loss in _losses():
         # R_two exp(w_two) = turn R_one exp(w_one), in the world's axes.
-        edges = _Edges(one, two, np.array([_turn_off(pair, rotation) for pair in pairs]).reshape(-1, 3), sigma)
+        edges = _Edges(one, two, _turns_off(pairs, rotation), sigma)
         weight = _weight(np.linalg.norm(edges.wanted, axis=1) / sigma, loss) / sigma**2
         step = _linear(edges, count, weight, np.zeros((count, 3)), np.zeros((count, 3)))
         rotation = rotation @ Rotation.from_rotvec(step).as_matrix()
@@ -290,11 +292,17 @@ def _look(pair: Pair, row: int, rotation: Floats) -> _Look:
     return _Look(pair, other, row, rotation[other])
 
 
-def _turn_off(pair: Pair, rotation: Floats) -> Floats:
-    """Return by what turn (3), rad, a pair is off the rotations of all: the least of those that it allows."""
-    off = rotation[pair.second].T @ pair.second_from_first @ rotation[pair.first]
-    turn = Rotation.from_matrix(off).as_rotvec()
-    return np.asarray(turn[np.linalg.norm(turn, axis=1).argmin()])
+def _turns_off(pairs: Sequence[Pair], rotation: Floats) -> Floats:
+    """Return by what turns (M, 3), rad, pairs are off the rotations of all: the least of those that each allows."""
+    if not pairs:
+        return np.empty((0, 3))
+    allowed = np.array([len(pair.second_from_first) for pair in pairs])
+    one, two = (np.repeat([getattr(pair, name) for pair in pairs], allowed) for name in ("first", "second"))
+    turn = np.concatenate([pair.second_from_first for pair in pairs])
+    turn = Rotation.from_matrix(np.swapaxes(rotation[two], 1, 2) @ turn @ rotation[one]).as_rotvec()
+    # Those of a pair stay together, the least of them first.
+    ordered = np.lexsort((np.linalg.norm(turn, axis=1), np.repeat(np.arange(len(pairs)), allowed)))
+    return np.asarray(turn[ordered[np.cumsum(allowed) - allowed]])
 
 
 def _edges(pairs: Sequence[Pair], ways: Sequence[Way]) -> tuple[_Edges, Ints]:
