@@ -196,7 +196,7 @@ class Watched:
 @functools.cache
 def watched(shift_m: float) -> Watched:
     """Correct the poses of a city with every pass shifted by so much, once for all tests of what is done then."""
-    dataset = city(pass_shift_m=shift_m)
+    dataset = city(pass_shift_m=shift_m, **SHORT_STREETS)
     done: list[str] = []
     steps: list[int] = []
     fitted: list[list[tuple[object, ...]]] = []
@@ -831,14 +831,14 @@ def test_the_drift_of_a_drive_of_any_length_says_nothing_of_that_of_the_next() -
 
 
 def test_cameras_mounted_askew_are_turned_back() -> None:
-    clean, faulty = city(), city(pass_yaw_deg=1.5)
+    clean, faulty = city(**SHORT_STREETS), city(pass_yaw_deg=1.5, **SHORT_STREETS)
     refined = refine_poses(faulty, valuemap.MapConfig())
     assert errors(faulty, clean)[1] == pytest.approx(1.5, abs=0.01)
     assert errors(refined.dataset, clean)[1] < 0.4
 
 
 def test_a_delay_of_all_poses_is_one_number_of_the_camera() -> None:
-    refined = refine_poses(city(pose_delay_s=0.15), valuemap.MapConfig())
+    refined = refine_poses(city(pose_delay_s=0.15, **SHORT_STREETS), valuemap.MapConfig())
     assert refined.record["cameras"][0]["delay_s"] == pytest.approx(0.15, abs=0.01)
 
 
