@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 from valuemap.config import SimulationConfig
 from valuemap.simulate import PRESETS
 
-SHORT_STREETS = {"block_east_m": 60.0, "block_north_m": 60.0}
+SHORT_STREETS: dict[str, Any] = {"block_east_m": 60.0, "block_north_m": 60.0}
 """As short as streets may be: all of a city with fewer images."""
 
 
