@@ -27,7 +27,7 @@ from valuemap.tiles.source import InMemory
 
 refine_middles = importlib.import_module("valuemap.refine.middles")
 """The module, which the package hides behind its function of the same name."""
-SIZE_M = 1.0
+MOST_M = 1.0
 DRIFT_M = 0.5
 
 
@@ -49,7 +49,7 @@ def sides(middles_m: float, *, objects: int = 40, seed: int = 0) -> tuple[list[F
 
 @pytest.mark.parametrize("middles_m", [0.05, 0.1, 0.3])
 def test_middles_are_told_where_drives_are_off_by_more(middles_m: float) -> None:
-    told = Contrasts.of_sides(*sides(middles_m)).middles(SIZE_M)
+    told = Contrasts.of_sides(*sides(middles_m)).middles(MOST_M)
     assert told is not None
     assert told.is_certain
     assert told.off_m == pytest.approx(middles_m, rel=0.25)
@@ -57,19 +57,19 @@ def test_middles_are_told_where_drives_are_off_by_more(middles_m: float) -> None
 
 @pytest.mark.parametrize("seed", range(5))
 def test_what_drives_are_off_by_at_all_objects_alike_is_no_middle(seed: int) -> None:
-    assert Contrasts.of_sides(*sides(0.0, seed=seed)).middles(SIZE_M) is None
+    assert Contrasts.of_sides(*sides(0.0, seed=seed)).middles(MOST_M) is None
 
 
 @pytest.mark.parametrize("objects", [5, 8])
 def test_a_few_objects_tell_middles_beyond_what_their_sides_are_known_to(objects: int) -> None:
-    told = [Contrasts.of_sides(*sides(0.2, objects=objects, seed=seed)).middles(SIZE_M) for seed in range(5)]
+    told = [Contrasts.of_sides(*sides(0.2, objects=objects, seed=seed)).middles(MOST_M) for seed in range(5)]
     assert all(one is not None and one.is_certain for one in told)
     assert np.median([one.off_m for one in told if one is not None]) == pytest.approx(0.2, rel=0.3)
 
 
 def test_middles_that_are_in_doubt_are_told_as_such() -> None:
     """Where they are as large as what sides are known to, five objects tell them in some cases, and seldom for sure."""
-    told = [Contrasts.of_sides(*sides(0.02, objects=5, seed=seed)).middles(SIZE_M) for seed in range(40)]
+    told = [Contrasts.of_sides(*sides(0.02, objects=5, seed=seed)).middles(MOST_M) for seed in range(40)]
     in_doubt = [one for one in told if one is not None and not one.is_certain]
     assert len(in_doubt) > sum(one is not None and one.is_certain for one in told)
     assert all(0.01 < one.off_m < 0.1 for one in in_doubt)
@@ -77,7 +77,7 @@ def test_middles_that_are_in_doubt_are_told_as_such() -> None:
 
 def test_the_half_that_agrees_best_says_what_all_objects_would() -> None:
     contrasts = Contrasts.of_sides(*sides(0.2, objects=200))
-    values_m = SIZE_M * np.geomspace(1e-3, 1.0, 60)
+    values_m = MOST_M * np.geomspace(1e-3, 1.0, 60)
     everyone = np.ones(200, np.bool_)
     is_best = refine_middles._best_half(contrasts._chances(everyone, 0.2))
     assert is_best.sum() == 100
@@ -90,13 +90,13 @@ def test_objects_that_are_two_tell_nothing_of_middles() -> None:
     for two in points[::8]:
         two[1] += [0.0, 0.0, 1.0]
     contrasts = Contrasts.of_sides(points, covariance_m2)
-    assert contrasts.middles(SIZE_M) is None
-    _, gain = contrasts._likeliest(np.ones(len(points), np.bool_), SIZE_M * np.geomspace(1e-3, 1.0, 60))
+    assert contrasts.middles(MOST_M) is None
+    _, gain = contrasts._likeliest(np.ones(len(points), np.bool_), MOST_M * np.geomspace(1e-3, 1.0, 60))
     assert gain > 100.0  # With them, middles are off by far more than chance.
 
 
 def test_sides_that_disagree_by_as_much_as_things_are_large_are_of_several_things() -> None:
-    assert Contrasts.of_sides(*sides(3.0)).middles(SIZE_M) is None
+    assert Contrasts.of_sides(*sides(3.0)).middles(MOST_M) is None
 
 
 def test_how_far_an_object_disagrees_is_judged_by_all_others() -> None:
@@ -149,10 +149,23 @@ def test_middles_are_not_told_without_boxes_or_objects(
     told = refine_middles.middles(images, labels, votes, noise)
     assert told is not None
     assert told.off_m == pytest.approx(0.2, rel=0.3)
-    without_boxes = labels.replace(object_height_m=np.zeros(len(labels)))
+    without_boxes = labels.replace(object_width_m=np.zeros(len(labels)), object_height_m=np.zeros(len(labels)))
     assert refine_middles.middles(images, without_boxes, votes, noise) is None
     monkeypatch.setattr(refine_middles, "_LEAST_OBJECTS", len(labels))
     assert refine_middles.middles(images, labels, votes, noise) is None
+
+
+def test_middles_are_no_farther_off_than_half_of_the_larger_side_of_a_box(mapped: tuple[Dataset, Mapped]) -> None:
+    city, (calibration, labels, votes, _) = mapped
+    images = gather_images(city, MapConfig())
+
+    def told_of(width_m: float, height_m: float) -> Middles | None:
+        of_size = {"object_width_m": np.full(len(labels), width_m), "object_height_m": np.full(len(labels), height_m)}
+        return refine_middles.middles(images, labels.replace(**of_size), votes, calibration.noise)
+
+    assert told_of(0.7, 0.1) is not None
+    assert told_of(0.1, 0.7) is not None
+    assert told_of(0.3, 0.3) is None
 
 
 def told(city: Dataset, *settings: str) -> float:

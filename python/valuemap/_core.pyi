@@ -97,7 +97,7 @@ def calibrate(
     known: tuple[list[bool], float],
     settings: _Settings,
     is_part: bool,
-    sought: tuple[_Noise, int] | None,
+    sought: _Noise | None,
     threads: int,
     progress: Callable[[int, int], None],
 ) -> tuple[_Calibration, _Floats, tuple[_Offsets, _Indices]]: ...
@@ -109,7 +109,7 @@ def misfits(
     settings: _Settings,
     threads: int,
     progress: Callable[[int, int], None],
-) -> tuple[tuple[float, float], int, tuple[_Noise, int] | None]: ...
+) -> tuple[tuple[float, float], int, _Noise | None]: ...
 def find_labels(
     scene: Scene, calibration: _Calibration, settings: _Settings, threads: int, progress: Callable[[int, int], None]
 ) -> tuple[_Floats, _Indices, tuple[_Offsets, _Indices], _Floats, _Floats, _Offsets, dict[str, float]]: ...

@@ -17,7 +17,7 @@ from valuemap.map_folder import CALIBRATION, read_json
 from valuemap.progress import Progress
 from valuemap.refine import images_in_order, middles
 from valuemap.remote import Place
-from valuemap.robust import Calibration, Scene, Sought, calibration_from_json, calibration_to_json
+from valuemap.robust import Calibration, Noise, Scene, calibration_from_json, calibration_to_json
 from valuemap.robust import calibrate as calibrate_scene
 from valuemap.sightings import cast_sightings
 from valuemap.tables import Candidates
@@ -36,7 +36,7 @@ def calibrate(
     work: Place | None,
     engine: Engine,
     progress: Progress,
-    sought: Sought | None = None,
+    sought: Noise | None = None,
 ) -> Calibration:
     """Return the calibration that is given, or kept in the folder of work, or else estimated on the sample.
 
@@ -75,7 +75,7 @@ def with_sides(side_m: float, config: MapConfig) -> MapConfig:
 def _estimated(
     sample: InOrder,
     is_part: bool,
-    sought: Sought | None,
+    sought: Noise | None,
     config: MapConfig,
     engine: Engine,
     progress: Progress,
@@ -83,7 +83,7 @@ def _estimated(
     """Estimate all but middles that sides show, which all objects tell together, and all again with these if any."""
     scene = Scene(sample.dataset, sample.drives, cast_sightings(sample.dataset)[0], config.vote.unit_m)
 
-    def estimated(config: MapConfig, sought: Sought | None) -> tuple[Calibration, Candidates]:
+    def estimated(config: MapConfig, sought: Noise | None) -> tuple[Calibration, Candidates]:
         threads = engine.threads_of_task(1)
         return calibrate_scene(scene, config, is_part=is_part, sought=sought, threads=threads, progress=progress)
 
@@ -96,6 +96,6 @@ def _estimated(
     if told is None:
         return calibration
     if told.is_certain:
-        return estimated(with_sides(told.off_m, config), None)[0]
+        return estimated(with_sides(told.off_m, config), calibration.noise)[0]
     # Who votes for what stays; how well it is known had better not rest on a doubt.
     return replace(calibration, noise_of_covariances=replace(calibration.noise_of_covariances, side_m=told.off_m))

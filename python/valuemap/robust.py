@@ -203,16 +203,12 @@ MISFIT_STEPS: int = _core.MISFIT_STEPS
 """Maps that the core makes to find the likeliest noise, at most."""
 
 
-Sought = tuple[tuple[float, ...], int]
-"""The noise that makes the rays of a few places likeliest, and from how many starts it was sought, for the core."""
-
-
 def calibrate(
     scene: Scene,
     config: MapConfig,
     *,
     is_part: bool = False,
-    sought: Sought | None = None,
+    sought: Noise | None = None,
     threads: int = 0,
     progress: Progress = silent,
 ) -> tuple[Calibration, Candidates]:
@@ -221,7 +217,8 @@ def calibrate(
     Also the objects that classes are learned from, which are the map of a sample of places.
 
     What the config sets of the noise stays as it is. The scene may be a part of what is mapped. `sought` is what
-    `misfits` found of the same scene with the same config: it is the most work, and done once.
+    `misfits` found of the same scene with the same config, or what was estimated without the middles that sides show:
+    to seek it from all starts is the most work, and done once.
     """
     guess, known = _guess(config.noise, scene)
     steps = _core.CALIBRATION_STEPS + (2 * _core.SEARCH_STEPS if is_part else 0)
@@ -232,7 +229,7 @@ def calibrate(
             known,
             _settings(config, scene.unit_m),
             is_part,
-            sought,
+            None if sought is None else sought.in_units(scene.unit_m).as_tuple(),
             threads,
             lambda done, _total: tell(done),
         )
@@ -261,7 +258,7 @@ def misfits(
     *,
     threads: int,
     tell: Callable[[int], None],
-) -> tuple[tuple[float, float], int, Sought | None]:
+) -> tuple[tuple[float, float], int, Noise | None]:
     """Return how badly the same detections, those of a sample of places, fit in two scenes, and how many they are.
 
     Also the noise that `calibrate` would seek in the first scene from all starts again, None where it has others.
@@ -280,7 +277,7 @@ def misfits(
         threads,
         lambda done, _total: tell(done),
     )
-    return (first, second), count, sought
+    return (first, second), count, None if sought is None else Noise(*sought).in_units(1.0 / scenes[0].unit_m)
 
 
 def steps_of_labels(calibration: Calibration) -> int:

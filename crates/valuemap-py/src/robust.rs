@@ -8,7 +8,7 @@ use numpy::{
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use valuemap_core::robust::calibrate::likeliest::{self, Sought};
+use valuemap_core::robust::calibrate::likeliest;
 use valuemap_core::robust::calibrate::{Calibration, self_calibrate};
 use valuemap_core::robust::energy::sides::of_directions;
 use valuemap_core::robust::model::ClassModel;
@@ -226,7 +226,6 @@ fn calibration_of(
         return Err(PyValueError::new_err("calibration: expected shares of confused detections between 0 and 1"));
     }
     Ok(Calibration {
-        starts: 0,
         confusions: Confusions::of_shares(shares),
         noise: noise_of(noise)?,
         noise_of_covariances: noise_of(noise_of_covariances)?,
@@ -256,15 +255,14 @@ pub fn calibrate<'py>(
     known: ([bool; 3], f64),
     settings: SettingValues,
     is_part: bool,
-    sought: Option<SoughtValues>,
+    sought: Option<NoiseValues>,
     threads: usize,
     progress: &Bound<'_, PyAny>,
 ) -> PyResult<(CalibrationValues, Bound<'py, PyArray2<f64>>, Groups<'py>)> {
     let settings = settings_of(settings)?;
     let guess = noise_of(guess)?;
     let known = known_of(known)?;
-    let sought =
-        sought.map(|(noise, starts)| Ok::<_, PyErr>(Sought { noise: noise_of(noise)?, starts })).transpose()?;
+    let sought = sought.map(noise_of).transpose()?;
     let (found, map) = with_progress(py, threads, 0, progress, |progress| {
         self_calibrate(&scene.0, &guess, known, &settings, is_part, sought, progress)
     })?;
@@ -281,9 +279,6 @@ pub fn calibrate<'py>(
     Ok((calibration, points, groups_of(py, map.iter().map(|(votes, _)| &votes[..]))))
 }
 
-/// A noise, and from how many starts it was sought.
-type SoughtValues = (NoiseValues, usize);
-
 /// How badly the same rays fit in two scenes, how many they are, and the noise that was sought in the first one,
 /// `valuemap_core::robust::calibrate::likeliest::misfits`.
 #[pyfunction]
@@ -297,7 +292,7 @@ pub fn misfits<'py>(
     settings: SettingValues,
     threads: usize,
     progress: &Bound<'py, PyAny>,
-) -> PyResult<([f64; 2], usize, Option<SoughtValues>)> {
+) -> PyResult<([f64; 2], usize, Option<NoiseValues>)> {
     let settings = settings_of(settings)?;
     let guess = noise_of(guess)?;
     let known = known_of(known)?;
@@ -313,7 +308,7 @@ pub fn misfits<'py>(
     let found = with_progress(py, threads, 0, progress, |progress| {
         likeliest::misfits(scenes, numbers, &guess, known, &settings, progress)
     })?;
-    Ok((found.values, found.rays, found.of_first.map(|sought| (values_of(&sought.noise), sought.starts))))
+    Ok((found.values, found.rays, found.of_first.map(|noise| values_of(&noise))))
 }
 
 /// Positions, classes, voters, covariances (N, 9), existence, expected images, and counts.

@@ -32,10 +32,12 @@ _LEAST_GAIN = 2.0
 """Covariances reckon with middles where it gains more: what one parameter gains by chance (Akaike)."""
 _ODD = 0.0027
 """Objects that disagree by what chance has in fewer cases, three standard deviations, given all others, are two."""
+_MOST_SHARE = 0.5
+"""What a side shows is a part of its thing, so its middle is no farther off than this share of how large that is."""
 _LEAST_SHARE = 1e-3
-"""Middles are sought down to this share of the usual size: less is an error of the detector, if it is one."""
+"""Middles are sought down to this share of the most: less is an error of the detector, if it is one."""
 _VALUES = 60
-"""Values between that and the usual size, at which the likelihood is compared: they differ by an eighth."""
+"""Values between that and the most, at which the likelihood is compared: they differ by an eighth."""
 _ROUNDS = 10
 """Rounds in which objects are taken in and left out, at most: three or four do."""
 
@@ -53,8 +55,9 @@ def middles(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> Mi
 
     `noise` is that of the map of `labels` and `votes`. What is not known well, as depth is, says little of middles.
     """
-    height_m = labels.object_height_m[labels.object_height_m > 0.0]
-    if not len(height_m):  # Middles are those of boxes.
+    size_m = np.maximum(labels.object_width_m, labels.object_height_m)
+    size_m = size_m[size_m > 0.0]
+    if not len(size_m):  # Middles are those of boxes.
         return None
     told = bundle(images, labels, votes, replace(noise, side_m=0.0), by_side=True)
     sides = _asked(_sides(told))
@@ -63,7 +66,7 @@ def middles(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> Mi
     point_m, covariance_m2 = told.placed(np.concatenate(sides)[None])
     with one_blas_thread():
         contrasts = Contrasts.of_sides([point_m[things] for things in sides], covariance_m2[0])
-        return contrasts.middles(float(np.median(height_m)))
+        return contrasts.middles(_MOST_SHARE * float(np.median(size_m)))
 
 
 def _sides(told: Bundle) -> list[Ints]:
@@ -107,13 +110,13 @@ class Contrasts:
             np.concatenate(apart), by @ covariance_m2 @ by.T, np.repeat(np.arange(len(apart)), list(map(len, apart)))
         )
 
-    def middles(self, size_m: float) -> Middles | None:
-        """Return what middles of things of a usual size, m, are off by; None where nothing tells that they are.
+    def middles(self, most_m: float) -> Middles | None:
+        """Return what middles are off by, m, less than the most; None where nothing tells that they are.
 
         Objects that disagree by more than middles and poses explain, given all others, are left out, and the others
         tell it again.
         """
-        values_m = size_m * np.geomspace(_LEAST_SHARE, 1.0, _VALUES)
+        values_m = most_m * np.geomspace(_LEAST_SHARE, 1.0, _VALUES)
         everyone = np.ones(self.of[-1] + 1, np.bool_)
         # Objects that are two hide each other where all tell what is usual: the half that agrees best begins.
         is_one = _best_half(self._chances(everyone, self._likeliest(everyone, values_m)[0]))
@@ -125,8 +128,8 @@ class Contrasts:
             if np.array_equal(is_one, before):
                 break
             likeliest_m, gain = self._likeliest(is_one, values_m)
-        # Sides that disagree by as much as things are large are those of several things.
-        if gain <= _LEAST_GAIN or likeliest_m >= size_m:
+        # Sides that disagree by more than things are large are those of several things.
+        if gain <= _LEAST_GAIN or likeliest_m >= most_m:
             return None
         return Middles(likeliest_m, is_certain=gain > _CERTAIN)
 

@@ -46,7 +46,7 @@ from valuemap.refine.jumps import Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import find_landmarks
 from valuemap.refine.residuals import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
 from valuemap.refine.select import Selected, select
-from valuemap.robust import Calibration, Noise, Sought
+from valuemap.robust import Calibration, Noise
 from valuemap.tables import Bools, Floats, Labels, Votes
 
 _SAMPLE = 4_000
@@ -96,7 +96,7 @@ class Refined:
     is_noisy: bool = False
     before_images: tuple[AllImages, Noise] | None = None
     as_given: Mapped | None = None
-    sought: Sought | None = None
+    sought: Noise | None = None
     side_m: float | None = None
 
 

@@ -11,7 +11,7 @@ from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
 from valuemap.drives import InOrder, in_driving_order
 from valuemap.progress import Progress, counted
-from valuemap.robust import MISFIT_STEPS, Scene, Sought, misfits
+from valuemap.robust import MISFIT_STEPS, Noise, Scene, misfits
 from valuemap.sightings import cast_sightings
 from valuemap.tiles.piece import piece_of_rows
 from valuemap.tiles.source import VIEWPOINT_SHARE, InMemory
@@ -31,7 +31,7 @@ class Comparison:
     after: float
     price: float
     detections: int
-    sought: Sought | None = None
+    sought: Noise | None = None
 
     @property
     def is_better(self) -> bool:

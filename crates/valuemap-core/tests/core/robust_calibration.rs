@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::street::{self, NOISE, SETTINGS, joined, moved, street};
 use nalgebra::{Isometry3, Rotation3, Vector3};
 use valuemap_core::progress::Progress;
-use valuemap_core::robust::calibrate::likeliest::{Sought, misfits};
+use valuemap_core::robust::calibrate::likeliest::misfits;
 use valuemap_core::robust::calibrate::residuals::calibrate;
 use valuemap_core::robust::calibrate::{Calibration, self_calibrate};
 use valuemap_core::robust::energy::Placed;
@@ -94,16 +94,16 @@ fn what_poses_were_compared_with_is_not_sought_again() {
     let with = |second: &Scene| {
         misfits([&scene, second], &numbers, &NOISE, Known::default(), &SETTINGS, &Progress::default()).unwrap().of_first
     };
-    let calibrated = |sought: Option<Sought>| {
-        let found =
-            self_calibrate(&scene, &NOISE, Known::default(), &SETTINGS, false, sought, &Progress::default()).unwrap().0;
-        (found.noise, found.starts)
+    let calibrated = |sought: Option<Noise>, guess: &Noise| {
+        self_calibrate(&scene, guess, Known::default(), &SETTINGS, false, sought, &Progress::default()).unwrap().0.noise
     };
     let sought = with(&scene).unwrap();
-    assert_eq!(calibrated(Some(sought)), calibrated(None));
-    // It is taken as it is.
-    let other = Sought { starts: sought.starts + 1, ..sought };
-    assert_eq!(calibrated(Some(other)).1, other.starts);
+    assert_eq!(calibrated(Some(sought), &NOISE), calibrated(None, &NOISE));
+    // It is taken as it is, unless middles were not known: then it is a start.
+    let other = Noise { box_share: 0.12, ..sought };
+    assert_eq!(calibrated(Some(other), &NOISE).box_share.to_bits(), other.box_share.to_bits());
+    let with_sides = calibrated(Some(other), &Noise { side_m: 0.05, ..NOISE });
+    assert!(with_sides.side_m == 0.05 && with_sides.box_share < 0.5 * other.box_share, "{with_sides:?}");
     // Not where a ray that tells nothing in the second scene was left out.
     let mut without_one = scene.clone();
     Arc::make_mut(&mut without_one.rays).rays[0].center.x = f64::NAN;

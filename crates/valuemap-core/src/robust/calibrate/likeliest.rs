@@ -38,15 +38,6 @@ pub const MISFIT_STEPS: usize = 2 * (START_STEPS + 1);
 /// Steps of the search for the noise at most.
 pub(crate) const NOISE_STEPS: usize = START_STEPS + MORE_ROUNDS;
 
-/// The noise that was found to make the rays of some places likeliest, and from how many starts it was sought.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Sought {
-    /// The noise.
-    pub noise: Noise,
-    /// The starts, 0 if it was known.
-    pub starts: usize,
-}
-
 /// Some places of a scene, whose rays tell the noise.
 pub(crate) fn few_places(scene: &Scene, settings: &Settings) -> Vec<u32> {
     sample::places(scene, CALIBRATION_RAYS.0, settings.viability.max_range_m)
@@ -60,23 +51,22 @@ pub(crate) fn likeliest_noise(
     settings: &Settings,
     few: &[u32],
     progress: &Progress,
-) -> Result<Sought, Halt> {
+) -> Result<Noise, Halt> {
     let sample = Sample { scene, rays: few, known, settings: wider(settings), progress };
-    let likeliest = Likeliest::of_starts(&sample, guess)?;
-    Ok(likeliest.sought().unwrap_or(Sought { noise: *guess, starts: likeliest.starts }))
+    Ok(Likeliest::of_starts(&sample, guess)?.noise().unwrap_or(*guess))
 }
 
-/// The noise that makes the rays of more places likeliest, some steps on from that of a few of them.
+/// The noise that makes the rays of more places likeliest, some steps on from one.
 pub(crate) fn noise_of_more(
     scene: &Scene,
-    of_few: Noise,
+    from: Noise,
     known: Known,
     settings: &Settings,
     more: &[u32],
     progress: &Progress,
 ) -> Result<Noise, Halt> {
     let sample = Sample { scene, rays: more, known, settings: wider(settings), progress };
-    of_more(of_few, |noise| sample.round(noise))
+    of_more(from, |noise| sample.round(noise))
 }
 
 /// The noise that makes more rays likeliest, some steps on from one: the one that a map was found with, or the one that was estimated from it, if
@@ -106,7 +96,7 @@ pub struct Misfits {
     pub rays: usize,
     /// The noise of the first scene that [`self_calibrate`](super::self_calibrate) would seek from all starts again; nothing if it has other rays to
     /// seek it from.
-    pub of_first: Option<Sought>,
+    pub of_first: Option<Noise>,
 }
 
 /// How likely the same rays, of a sample of places, are in two scenes, each with the noise that makes them likeliest there. It compares poses: what is
@@ -137,7 +127,7 @@ pub fn misfits(
     let seek = |here: usize| Likeliest::of_starts(&samples[here], guess);
     let (first_found, second_found) = rayon::join(|| seek(0), || seek(1));
     let (first_found, second_found) = (first_found?, second_found?);
-    let of_first = first_found.sought().filter(|_| first.len() == all);
+    let of_first = first_found.noise().filter(|_| first.len() == all);
     let found = [first_found.best, second_found.best];
     let least = |here: usize, numbers: &[u32]| -> Result<f64, Halt> {
         let [Some(own), Some(other)] = [&found[here], &found[1 - here]] else { return Ok(f64::INFINITY) };
@@ -289,8 +279,6 @@ struct Likeliest {
     best: Option<Arc<Round>>,
     /// The last step from the same start: what it leaves over is no longer that of a start.
     last: Option<Arc<Round>>,
-    /// From how many starts it was sought.
-    starts: usize,
 }
 
 impl Likeliest {
@@ -304,7 +292,6 @@ impl Likeliest {
             if likeliest.last.as_ref().is_some_and(|last| !last.may_be_larger(sample.scene, &start)) {
                 break;
             }
-            likeliest.starts += 1;
             likeliest.steps(CALIBRATION_ROUNDS - 1, sample.round(&start)?.again, |noise| sample.round(noise))?;
         }
         Ok(likeliest)
@@ -335,8 +322,8 @@ impl Likeliest {
         Ok(())
     }
 
-    fn sought(&self) -> Option<Sought> {
-        self.best.as_ref().map(|best| Sought { noise: best.noise, starts: self.starts })
+    fn noise(&self) -> Option<Noise> {
+        self.best.as_ref().map(|best| best.noise)
     }
 }
 

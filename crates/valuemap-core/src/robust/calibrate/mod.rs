@@ -30,7 +30,7 @@ use crate::robust::scene::{Scene, sample};
 use crate::robust::search::{Depth, Tally, few, search};
 use crate::robust::settings::Settings;
 use depth::all_moves_pay;
-use likeliest::{Sought, few_places, likeliest_noise, noise_of_more};
+use likeliest::{few_places, likeliest_noise, noise_of_more};
 
 /// Rays of the places that the noise is estimated from, about: from each start, and from the best in the end.
 const CALIBRATION_RAYS: (usize, usize) = (4_000, 10_000);
@@ -60,13 +60,11 @@ pub struct Calibration {
     pub confusions: Confusions,
     /// Whether all moves pay, from all images.
     pub is_deep: bool,
-    /// From how many starts the noise was sought; 0 if it was known.
-    pub starts: usize,
 }
 
 /// Estimate the noise from the data, starting from a guess: labels of a sample of places with the noise as it is thought
-/// to be, then the noise that makes their residuals most likely, and again. `known` parts, and middles that sides show, stay as they are; what was `sought` from all starts when
-/// [poses were compared](likeliest::misfits) is not sought again. Then learn the classes, from a map of wider places, which is returned beside.
+/// to be, then the noise that makes their residuals most likely, and again. `known` parts, and middles that sides show, stay as they are; what was `sought` before is not
+/// sought from all starts again, when [poses were compared](likeliest::misfits) or without the middles. Then learn the classes, from a map of wider places, which is returned beside.
 /// All moves pay where a scene is small; if it `is_part` of a larger one, where they change the map of a sample.
 ///
 /// # Errors
@@ -77,22 +75,12 @@ pub fn self_calibrate(
     known: Known,
     settings: &Settings,
     is_part: bool,
-    sought: Option<Sought>,
+    sought: Option<Noise>,
     progress: &Progress,
 ) -> Result<(Calibration, Vec<Placed>), Halt> {
     let guess = &Noise { side_m: if settings.has(Part::Sides) { guess.side_m } else { 0.0 }, ..*guess };
     let is_known = known.detection && known.position && known.rotation;
-    let Sought { noise, starts } = if is_known {
-        Sought { noise: *guess, starts: 0 }
-    } else {
-        let few = few_places(scene, settings);
-        let more = sample::places(scene, CALIBRATION_RAYS.1, settings.viability.max_range_m);
-        let of_few = sought.map_or_else(|| likeliest_noise(scene, guess, known, settings, &few, progress), Ok)?;
-        let is_all = more.len() == few.len();
-        let noise =
-            if is_all { of_few.noise } else { noise_of_more(scene, of_few.noise, known, settings, &more, progress)? };
-        Sought { noise, ..of_few }
-    };
+    let noise = if is_known { *guess } else { noise(scene, guess, known, settings, sought, progress)? };
     let mut model = Model::new(scene, &noise, settings);
     let wide = sample::places(scene, CLASS_RAYS, WIDE * settings.viability.max_range_m);
     let objects = learn_from(&mut model, &wide, progress)?;
@@ -115,9 +103,28 @@ pub fn self_calibrate(
         pooled: model.pooled,
         confusions: model.confusions,
         is_deep,
-        starts,
     };
     Ok((calibration, map))
+}
+
+/// The noise that makes the rays of a sample likeliest: of a few places, and then of more of them.
+fn noise(
+    scene: &Scene,
+    guess: &Noise,
+    known: Known,
+    settings: &Settings,
+    sought: Option<Noise>,
+    progress: &Progress,
+) -> Result<Noise, Halt> {
+    let few = few_places(scene, settings);
+    let more = sample::places(scene, CALIBRATION_RAYS.1, settings.viability.max_range_m);
+    let of_few = sought.map_or_else(|| likeliest_noise(scene, guess, known, settings, &few, progress), Ok)?;
+    // What was sought without middles has taken what these are off by for other errors.
+    let from = Noise { side_m: guess.side_m, ..of_few };
+    if more.len() == few.len() && from == of_few {
+        return Ok(of_few);
+    }
+    noise_of_more(scene, from, known, settings, &more, progress)
 }
 
 /// Learn the classes of a model from the map of some rays, and return that. Where classes are taken for each other, all competes once more.
