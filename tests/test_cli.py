@@ -188,6 +188,13 @@ def test_settings_are_listed_with_their_effects() -> None:
     assert all(name in told for name, *_ in describe_settings())
 
 
+def test_what_cannot_be_is_said_before_the_work_begins(street: Path, tmp_path: Path) -> None:
+    said = complains("map", street, "--out", tmp_path / "m", "--write-poses", tmp_path / "." / "m")
+    assert "is the folder of the map too" in said
+    assert "expected metres above 0" in complains("map", street, "--out", tmp_path / "m", "--tile-size", "0")
+    assert list(tmp_path.iterdir()) == [street]
+
+
 def test_a_map_replaces_an_older_one_and_nothing_else(street: Path, tmp_path: Path) -> None:
     works("map", street, "--out", tmp_path / "map", "--method", "paper")
     works("map", street, "--out", tmp_path / "map", "--method", "paper", "--set", "min_votes=5")

@@ -18,7 +18,7 @@ from valuemap.dataset import Dataset, Frame, ensure_checked, read_dataset, write
 from valuemap.describe import describe_labels
 from valuemap.engine.engine import Engine
 from valuemap.engine.threads import ThreadEngine
-from valuemap.errors import InputError
+from valuemap.errors import InputError, SettingError
 from valuemap.map_folder import Map
 from valuemap.notes import Findings, cameras_not_upright, find_notes, heights_not_measured
 from valuemap.paper.merge import merge_clusters
@@ -121,6 +121,12 @@ class Run:
     known: Path | None = None
     store: UrlPath | None = None
     keeps_rejected: bool = True
+
+    def __post_init__(self) -> None:
+        if self.tile_size_m is not None and not self.tile_size_m > 0.0:
+            raise SettingError(
+                f"--tile-size {self.tile_size_m}: expected metres above 0", hint="leave it away for the default"
+            )
 
     @property
     def parts(self) -> Place:

@@ -90,6 +90,10 @@ def map_command(
         check_format(picture)
         check_files(picture.parent, [picture.name], force=force)
     if write_poses_to is not None:
+        if write_poses_to.resolve() == out.resolve():
+            raise SettingError(
+                f"--write-poses {write_poses_to}: is the folder of the map too", hint="give each a folder of its own"
+            )
         check_poses_place(write_poses_to, force=force)
     if control is not None:
         check_objects_file(control, "control points")

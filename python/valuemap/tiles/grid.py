@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Frame
 from valuemap.drives import bounds
-from valuemap.errors import SettingError
 from valuemap.tables import Bools, Floats, Images, Ints
 
 SIDE_RANGES = 16.0
@@ -247,15 +246,7 @@ class Places:
 
 
 def cells_across_tile(grid: Grid, tile_size_m: float | None) -> int:
-    """Return how many cells a tile of about this size has across: at least one.
-
-    Raises
-    ------
-    SettingError
-        The size is not above 0.
-    """
+    """Return how many cells a tile of about this size (above 0) has across: at least one."""
     if tile_size_m is None:
         return 1
-    if not tile_size_m > 0.0:
-        raise SettingError(f"--tile-size {tile_size_m}: expected metres above 0", hint="leave it away for the default")
     return max(1, math.ceil(min(tile_size_m / grid.side_m, 2.0**31)))
