@@ -74,9 +74,9 @@ def test_every_setting_is_described() -> None:
         (
             "max_range_m=far",
             r"max_range_m: expected a number \(m\), found 'far'",
-            "the default is max_range_m=estimated",
+            "leave it away: it is estimated",
         ),
-        ("max_range_m=", r"max_range_m: expected a number \(m\), found ''", "the default is max_range_m=estimated"),
+        ("max_range_m=", r"max_range_m: expected a number \(m\), found ''", "leave it away: it is estimated"),
         (
             "min_votes=3.5",
             r"min_votes: expected a whole number \(images\), found '3.5'",
@@ -97,8 +97,16 @@ def test_every_setting_is_described() -> None:
             r"merge_radius_m: expected at least 0 and at most 100000 \(m\), found -1",
             "merge_radius_m=1",
         ),
-        ("max_range_m=inf", r"max_range_m: expected at least 1e-06 and at most 100000 \(m\), found inf", "=estimated"),
-        ("max_range_m=nan", r"max_range_m: expected at least 1e-06 and at most 100000 \(m\), found nan", "=estimated"),
+        (
+            "max_range_m=inf",
+            r"max_range_m: expected at least 1e-06 and at most 100000 \(m\), found inf",
+            "it is estimated",
+        ),
+        (
+            "max_range_m=nan",
+            r"max_range_m: expected at least 1e-06 and at most 100000 \(m\), found nan",
+            "it is estimated",
+        ),
         (
             "min_parallax_deg=91",
             r"min_parallax_deg: expected at least 0 and at most 90 \(deg\), found 91",

@@ -74,9 +74,10 @@ class Setting:
         else:
             upper = f" and at most {self.high:g}" if math.isfinite(self.high) else ""
             expected = f"{'above' if self.open_low else 'at least'} {self.low:g}{upper} ({self.unit}), found {value}"
-        return SettingError(
-            f"{self.name}: expected {expected}", hint=f"the default is {self.name}={self.shown_default}"
+        usual = (
+            "leave it away: it is estimated" if self.default is None else f"the default is {self.name}={self.default}"
         )
+        return SettingError(f"{self.name}: expected {expected}", hint=usual)
 
 
 def declare(
