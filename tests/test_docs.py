@@ -25,7 +25,7 @@ from block import block
 from small_dataset import small_dataset
 from still_poses import nothing_found
 from tiny_models import red_finder
-from valuemap import correction, tables
+from valuemap import _core, correction, tables
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, write_dataset
 from valuemap.readers import READERS
@@ -162,6 +162,14 @@ def test_every_column_of_every_table_is_explained() -> None:
         assert told == {column for field in fields(kind) for column in field.metadata["names"]}, name
     for reason in tables.REJECTION_REASONS:
         assert f"`{reason}`" in sections["rejected.parquet of a map"]
+
+
+def test_everything_that_is_learned_of_a_class_is_explained() -> None:
+    text = (ROOT / "docs" / "tables.md").read_text(encoding="utf-8")
+    section = re.search(r"^### What was learned.*?(?=^###)", text, flags=re.DOTALL | re.MULTILINE)
+    assert section is not None
+    told = re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`[^|]*) \|", section[0], flags=re.MULTILINE)))
+    assert set(told) == {name for name, _ in _core.CLASS_FIELDS}
 
 
 def test_the_table_of_figures_is_that_of_the_results() -> None:
