@@ -508,6 +508,43 @@ def test_truth_from_files_of_points(suffix: str, has_height: bool, tmp_path: Pat
     assert math.isnan(evaluation.vertical_rmse_m) != has_height
 
 
+def test_objects_are_the_layer_of_labels_where_a_file_has_several(tmp_path: Path) -> None:
+    """A map that was exported has layers of cameras and votes too."""
+    import geopandas
+
+    lon, lat, height = truth_places().T
+    frame = geopandas.GeoDataFrame(geometry=geopandas.points_from_xy(lon, lat, height), crs="EPSG:4326")
+    for layer in ("cameras", "labels"):
+        frame.iloc[: 3 if layer == "labels" else 1].to_file(tmp_path / "a.gpkg", layer=layer)
+        frame.to_file(tmp_path / "b.gpkg", layer=f"{layer} of others")
+    assert_found_at(evaluate_map(geographic_map(), tmp_path / "a.gpkg"), 0.3)
+    with pytest.raises(InputError, match="has the layers cameras of others, labels of others"):
+        evaluate_map(geographic_map(), tmp_path / "b.gpkg")
+
+
+def test_heights_of_a_file_count_from_where_its_system_says(tmp_path: Path) -> None:
+    """Heights above the sea are none above the ellipsoid: they need a grid, without which there is no way."""
+    import geopandas
+
+    lon, lat, height = truth_places().T
+    points = geopandas.points_from_xy(lon, lat, height)
+    frame = geopandas.GeoDataFrame(geometry=points, crs="EPSG:4326").to_crs("EPSG:25830")
+    frame.set_crs("EPSG:25830+5621", allow_override=True).to_file(tmp_path / "t.gpkg")
+    with pytest.raises(SettingError, match="cannot be brought to WGS84"):
+        evaluate_map(geographic_map(), tmp_path / "t.gpkg")
+
+
+def test_truth_that_is_elsewhere_is_told(tmp_path: Path) -> None:
+    lon, lat, height = truth_places().T
+    there = write_csv(tmp_path / "there.csv", {"lon": lat, "lat": lon, "height": height})
+    below = write_csv(tmp_path / "below.csv", {"lon": lon, "lat": lat, "height": height - 47.2})
+    assert "are latitude and longitude not exchanged?" in " ".join(evaluate_map(geographic_map(), there).notes)
+    told = " ".join(evaluate_map(geographic_map(), below).notes)
+    assert "true objects are 47.2 m below the labels beside them: do the heights of both count" in told
+    found = evaluate_map(geographic_map(), write_csv(tmp_path / "t.csv", lon_lat(truth_places())))
+    assert not any("true object" in note and "labels beside" in note for note in found.notes)
+
+
 def test_geographic_positions_come_first_where_they_are_complete(tmp_path: Path) -> None:
     """x, y, z may belong to another anchor; an exported map has both."""
     wrong = xyz(truth_positions() + 1000.0)
@@ -556,7 +593,7 @@ def test_a_dataset_with_another_anchor() -> None:
         ("t.txt", "x,y,z\n1,2,3\n", r"t\.txt: truth of an unknown kind: \.txt$", ".csv, .parquet, .geojson"),
         ("t.csv", "", r"t\.csv: cannot be read as CSV: Empty CSV file", "commas"),
         ("t.csv", "x,y,z\n", r"t\.csv: the table is empty$", "at least one row"),
-        ("t.csv", "x,y\n1,2\n", r"t\.csv: column 'z' is missing; found x, y$", "add the column 'z'"),
+        ("t.csv", "x,y\n1,2\n", r"t\.csv: expected columns lon, lat or x, y, z, found x, y$", "WGS84 degrees"),
         ("t.csv", "x,y,z\n1,2,3\n1,a,3\n", r"t\.csv: cannot be read as CSV: .*[Rr]ow #3.* 'a'", "commas"),
         (
             "t.csv",

@@ -201,7 +201,7 @@ def _measure(
         objects=len(objects),
         recoverable_objects=recoverable,
         radius_m=radius_m,
-        notes=(*notes, *accuracy.notes),
+        notes=(*notes, *_note_elsewhere(result, matches, radius_m), *accuracy.notes),
         accuracy=accuracy,
         completeness=measure_completeness(matches),
         chance=measure_chance(result.labels, objects, result.frame, radius_m=radius_m),
@@ -221,6 +221,34 @@ def _notes(objects: TrueObjects) -> tuple[str, ...]:
         ),
     }
     return tuple(note for note, applies in notes.items() if applies)
+
+
+def _note_elsewhere(result: Map, matches: Matches, radius_m: float) -> tuple[str, ...]:
+    """Return what is told where no object is matched and all are far away, or all far above or below."""
+    labels, objects = result.labels.position_in_world_m, matches.objects.position_in_world_m
+    if not len(labels) or not len(objects) or np.any(matches.object_of_label >= 0):
+        return ()
+    from scipy.spatial import KDTree  # Slow to import, and only evaluation needs it.
+
+    up = np.array(result.frame.up)
+    on_ground = [place - np.outer(place @ up, up) for place in (labels, objects)]
+    distance_m, nearest = (np.asarray(part) for part in KDTree(on_ground[1]).query(on_ground[0]))
+    if distance_m.min() > _ELSEWHERE_M:
+        return (
+            f"the nearest true object is {distance_m.min() / 1000.0:.4g} km from a label: is the truth of this place, "
+            "and are latitude and longitude not exchanged?",
+        )
+    beside = np.flatnonzero(distance_m <= radius_m)
+    above_m = float(np.median((objects[nearest] - labels)[beside] @ up)) if len(beside) else 0.0
+    if not matches.objects.has_height or abs(above_m) <= radius_m:
+        return ()
+    return (
+        f"true objects are {abs(above_m):.1f} m {'above' if above_m > 0.0 else 'below'} the labels beside them: do the "
+        "heights of both count from the ellipsoid?",
+    )
+
+
+_ELSEWHERE_M = 1000.0
 
 
 def _root_mean_square(values: Floats) -> float:

@@ -16,7 +16,7 @@ from valuemap.csv_table import read_csv_arrow
 from valuemap.dataset import Dataset, Frame, read_dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.evaluate.recoverable import recoverable_objects
-from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
+from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_crs, lon_lat_height_from_enu
 from valuemap.map_folder import Map
 from valuemap.tables import (
     Bools,
@@ -30,6 +30,9 @@ from valuemap.tables import (
     read_arrow,
     table_from_arrow,
 )
+
+LABELS = "labels"
+"""The layer of objects in what `valuemap export` writes, which has others too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +138,11 @@ def read_objects(path: Path, result: Map) -> TrueObjects:
         raise InputError(
             f"{path}: has longitude and latitude, but the map is not geo-referenced",
             hint="give x, y, z in the frame of the map",
+        )
+    if not has_position:
+        raise InputError(
+            f"{path}: expected columns lon, lat or x, y, z, found {', '.join(table.column_names)[:300]}",
+            hint="columns have these names; lon and lat are WGS84 degrees, x, y, z metres in the frame of the map",
         )
     points = table_from_arrow(TruthPoints, table, source=str(path))
     _check_sigmas(points.sigma_m, path)
@@ -259,7 +267,12 @@ def _read_points(path: Path) -> pa.Table:
     import pyogrio
 
     try:
-        points = geopandas.read_file(path)
+        layers = pyogrio.list_layers(path)[:, 0].tolist()
+        if len(layers) > 1 and LABELS not in layers:
+            raise InputError(
+                f"{path}: has the layers {', '.join(layers)[:300]}", hint="save the one with the objects alone"
+            )
+        points = geopandas.read_file(path, layer=LABELS if LABELS in layers else layers[0])
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, OSError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"{path}: cannot be read: {reason}", hint="is it a file of points that QGIS opens?") from error
@@ -272,10 +285,12 @@ def _read_points(path: Path) -> pa.Table:
             f"{path} row {wrong[0]}: expected a point, found {kinds[wrong[0]]} ({len(wrong)} rows)",
             hint="give every object as one point",
         )
-    coordinates = points.to_crs("EPSG:4326").get_coordinates(include_z=True)
-    columns = {"lon": coordinates["x"], "lat": coordinates["y"]}
-    if not coordinates["z"].isna().all():
-        columns["height"] = coordinates["z"]
+    coordinates = points.get_coordinates(include_z=True).to_numpy()
+    has_height = ~np.isnan(coordinates[:, 2])
+    lon, lat, height = lon_lat_height_from_crs(np.nan_to_num(coordinates), points.crs.to_string()).T
+    columns = {"lon": lon, "lat": lat}
+    if has_height.any():
+        columns["height"] = np.where(has_height, height, np.nan)
     columns |= {name: points[name] for name in ("class", "object_id") if name in points}
     return pa.table({name: pa.array(column, from_pandas=True) for name, column in columns.items()})
 
