@@ -582,6 +582,15 @@ def test_names_match_exactly_or_by_a_base_name_that_is_nobody_elses() -> None:
     assert match_images(["cam1/1.jpg", "cam2/1.jpg"], known) == {}
 
 
+def test_names_are_found_whatever_system_wrote_them() -> None:
+    """Windows does not tell capitals from others, and macOS writes an accent as a character of its own."""
+    known = ["stra\u00dfe/caf\u00e9.jpg", "monday/1.jpg", "Monday/2.jpg", "monday/2.jpg"]
+    assert match_images(["stra\u00dfe/cafe\u0301.jpg"], known) == {"stra\u00dfe/cafe\u0301.jpg": 0}
+    assert match_images(["MONDAY\\1.JPG"], known) == {"MONDAY\\1.JPG": 1}
+    assert match_images(["Monday/2.jpg"], known) == {"Monday/2.jpg": 2}
+    assert match_images(["MONDAY/2.jpg"], known) == {}
+
+
 def changed(change: Callable[[dict[str, Any]], Any]) -> Callable[[dict[str, Any]], Any]:
     """Make a change in place look like a function from content to content."""
 

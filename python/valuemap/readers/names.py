@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from pathlib import PurePosixPath
@@ -10,10 +11,11 @@ from pathlib import PurePosixPath
 def match_images(names: Collection[str], known: Sequence[str]) -> dict[str, int]:
     """Return the index in `known` of each of `names` that can be told for sure; the others are left out.
 
-    The exact name counts first, then the name with Windows' separators turned, the name without its suffix, the base
-    name (without folders), and the base name without its suffix. Each counts only if no other name and no other known
-    image has the same. `cam1/7.jpg` must not become `cam0/7.jpg` only because `cam1` is not among the known, nor
-    `7.png` become `7.jpg` beside another `7.jpg`.
+    The exact name counts first, then the name with Windows' separators turned and accents as one character (macOS
+    writes two), the name without its suffix, the base name (without folders), and the base name without its suffix;
+    then all these in any case. Each counts only if no other name and no other known image has the same. `cam1/7.jpg`
+    must not become `cam0/7.jpg` only because `cam1` is not among the known, nor `7.png` become `7.jpg` beside another
+    `7.jpg`.
     """
     distinct = set(names)
     found: dict[str, int] = {}
@@ -31,7 +33,7 @@ def match_images(names: Collection[str], known: Sequence[str]) -> dict[str, int]
 
 
 def _slashed(name: str) -> str:
-    return name.replace("\\", "/")
+    return unicodedata.normalize("NFC", name.replace("\\", "/"))
 
 
 def _without_suffix(name: str) -> str:
@@ -48,10 +50,14 @@ _PICTURES = frozenset(
     for lower in (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".ppm", ".txt")
     for suffix in (lower, lower.upper())
 )
-_KEYS: tuple[Callable[[str], str], ...] = (
-    str,
+_PARTS: tuple[Callable[[str], str], ...] = (
     _slashed,
     _without_suffix,
     _base,
     lambda name: _base(_without_suffix(name)),
+)
+_KEYS: tuple[Callable[[str], str], ...] = (
+    str,
+    *_PARTS,
+    *(lambda name, part=part: part(name.casefold()) for part in _PARTS),
 )
