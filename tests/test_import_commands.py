@@ -78,3 +78,13 @@ def test_bearings_from_the_command_line(tmp_path: Path) -> None:
     dataset = read_dataset(tmp_path / "out")
     assert dataset.detections.range_sigma_m is not None
     assert_allclose(dataset.detections.range_sigma_m, [0.5, 0.5])
+
+
+def test_options_of_detections_need_some(tmp_path: Path) -> None:
+    poses = write(tmp_path / "p.csv", "image,lat,lon,heading_deg\na.jpg,52,4,0\n")
+    arguments = ["import", "csv", str(poses), "--camera", "EQUIRECTANGULAR 64 32", "--out", str(tmp_path / "out")]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    for option in (["--class", "light"], ["--fractions"], ["--full-score", "100"], ["--detection-column", "x=a"]):
+        done = CliRunner().invoke(app, [*arguments, *option])
+        assert done.exit_code == 1
+        assert "options say how to read a file of them, and there is none" in done.stderr

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from valuemap.errors import SettingError
 from valuemap.readers.csv_file import parse_columns
 from valuemap.readers.detections import DetectionFile
 
@@ -104,6 +105,14 @@ def _detection_file(
     boxes_full_score: float,
 ) -> DetectionFile | None:
     if boxes is None:
+        given = [boxes_format, boxes_class, boxes_columns or None, boxes_pixel_center, boxes_fractions]
+        given.append(boxes_full_score)
+        usual = [default for name, (_, default) in _DETECTION_OPTIONS.items() if name != "boxes"]
+        if given != usual:  # A user would look for an effect that cannot be.
+            raise SettingError(
+                "detections: options say how to read a file of them, and there is none",
+                hint="name the file with --detections, or leave these options away",
+            )
         return None
     return DetectionFile(
         boxes,
