@@ -122,8 +122,16 @@ def test_an_image_between_two_poses_of_tum_is_between_them(tmp_path: Path) -> No
     assert_allclose(camera_centers(dataset.images), [[0.25, 0.0, 0.0], [0.0, 0.0, 0.0]], atol=1e-12)
     turned = Rotation.from_quat(dataset.images.cam_from_world_quat[0], scalar_first=True).inv().as_rotvec(degrees=True)
     assert_allclose(turned, [0, 0, 22.5], atol=1e-9)
+    assert dataset.rejected is not None
+    assert dataset.rejected.image_name.to_pylist() == ["rgb/early.png", "rgb/late.png"]
+    assert set(dataset.rejected.reason.texts()) == {
+        "it is before or after all poses, or in a gap of them that is longer than 2 s"
+    }
     only_exact = read_tum(tmp_path / "t.txt", **{**options, "longest_gap_s": 0.5})
     assert only_exact.images.name.to_pylist() == ["rgb/b.png"]
+    write(tmp_path / "rgb.txt", "10.5 a.png\n")
+    said = refusal(lambda: read_tum(tmp_path / "t.txt", **{**options, "longest_gap_s": 0.5}))
+    assert "no image is between two poses of the trajectory, 10 to 11, that are at most 0.5 s apart" in said
     for gap in (np.nan, np.inf, -1.0):
         said = refusal(lambda gap=gap: read_tum(tmp_path / "t.txt", **{**options, "longest_gap_s": gap}))  # type: ignore[misc]
         assert f"longest-gap: expected seconds from 0 to 1e+09, found {gap:g}" in said
@@ -464,10 +472,13 @@ def test_cameras_of_argoverse_that_fire_together_are_a_rig(tmp_path: Path) -> No
         pyarrow.feather.write_feather(pa.concat_tables([table, left]), folder / path)
     for stamp in STAMPS_NS[:2] + 20_000_000:
         write(folder / "sensors" / "cameras" / "ring_side_left" / f"{stamp}.jpg", "picture")
-    images = read_argoverse2(folder, up=(0.0, 0.0, 1.0), max_rejected=0.5).images
+    dataset = read_argoverse2(folder, up=(0.0, 0.0, 1.0))
+    images = dataset.images
     assert images.rig_id is not None
     # Between poses half a second apart there is none, but the exact ones stay.
     assert len(images) == 3
+    assert dataset.rejected is not None
+    assert len(dataset.rejected) == 2
     table = pyarrow.feather.read_table(folder / "city_SE3_egovehicle.feather").to_pydict()
     denser = {name: np.repeat(np.array(values), 4)[:-3] for name, values in table.items()}
     denser["timestamp_ns"] = np.linspace(STAMPS_NS[0], STAMPS_NS[2], 9).astype(np.int64)

@@ -184,7 +184,7 @@ def test_pictures_may_be_a_part_of_what_a_camera_sees_and_smaller(
 
 def test_images_in_gaps_of_the_poses_have_none(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "bag")
-    assert "a number of its pose is missing" in refusal(lambda: read_ros([path], longest_gap_s=0.3))
+    assert "in a gap of them that is longer than 0.3 s" in refusal(lambda: read_ros([path], longest_gap_s=0.3))
     assert "longest-gap: expected seconds from 0" in refusal(lambda: read_ros([path], longest_gap_s=np.nan))
 
 

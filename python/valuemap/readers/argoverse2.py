@@ -17,6 +17,7 @@ from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_folder, file_in
 from valuemap.readers.poses import (
+    images_without_poses,
     interpolate_poses,
     make_images,
     place_in_crs,
@@ -113,14 +114,15 @@ def read_argoverse2(
     kept = [(folder, log) for folder, log in zip(folders, read, strict=True) if log.city in (None, city)]
     images = [log for _, log in kept]
     names = [name for log in images for name in log.names]
-    if not names:
-        raise InputError(
-            f"{logs}: there are no images in sensors/cameras", hint="the names of the pictures are the times"
-        )
     passes = [folder.name for folder, log in kept for _ in log.names]
     time_ns = np.concatenate([log.time_ns for log in images])
     rotation = np.concatenate([log.world_from_cam for log in images])
     center = np.concatenate([log.center_m for log in images])
+    if not np.isfinite(center).any():
+        raise InputError(
+            f"{logs}: {len(names)} images in sensors/cameras, and none has a pose",
+            hint="the names of the pictures are their times, in nanoseconds of the clock of the poses",
+        )
     if city is not None and up is None:
         placed = place_in_crs(*_utm(center, city), anchor, names.index(min(names)), source=str(logs))
         rotation, center, anchor = placed.world_from_local @ rotation, placed.position_in_world_m, placed.anchor
@@ -146,6 +148,7 @@ def read_argoverse2(
         anchor=anchor,
         source=str(logs),
         max_rejected=max_rejected,
+        unposed=images_without_poses(table, _LONGEST_GAP_NS * _NANO),
     )
     progress("reading the logs", len(folders), len(folders))
     return dataset
@@ -171,18 +174,17 @@ def _read_log(folder: Path, prefix: str) -> _Log:
     names, sensors, times = _pictures(folder, set(intrinsics) & set(row_of))
     time = np.array(times, dtype=np.int64)
     known = np.array(_numbers(poses, "timestamp_ns", folder), dtype=np.int64)
-    rotation, center, usable = interpolate_poses(time, known, world_from_ego, ego_m, _LONGEST_GAP_NS)
-    kept = np.flatnonzero(usable)
-    sensor = np.array([row_of[name] for name in sensors], dtype=np.int64)[kept]
+    rotation, center, _ = interpolate_poses(time, known, world_from_ego, ego_m, _LONGEST_GAP_NS)
+    sensor = np.array([row_of[name] for name in sensors], dtype=np.int64)
     maps = sorted((folder / "map").glob("*____*_city_*.json")) if (folder / "map").is_dir() else []
     cities = {path.name.split("____")[-1].split("_city_")[0] for path in maps} & set(_CITIES)
     return _Log(
-        names=[prefix + names[row] for row in kept],
-        cameras=[intrinsics[sensors[row]] for row in kept],
-        sensors=[sensors[row] for row in kept],
-        time_ns=time[kept],
-        world_from_cam=rotation[kept] @ ego_from_sensor[sensor],
-        center_m=np.einsum("nij,nj->ni", rotation[kept], sensor_m[sensor]) + center[kept],
+        names=[prefix + name for name in names],
+        cameras=[intrinsics[name] for name in sensors],
+        sensors=sensors,
+        time_ns=time,
+        world_from_cam=rotation @ ego_from_sensor[sensor],
+        center_m=np.einsum("nij,nj->ni", rotation, sensor_m[sensor]) + center,
         city=cities.pop() if len(cities) == 1 else None,
     )
 

@@ -26,6 +26,8 @@ from valuemap.tables import Bools, Categories, Floats, Images, Ints
 _ROTATION_TOLERANCE = 1e-3
 _LONGEST_GAP_S = 1e9
 _NANO = 1_000_000_000
+_LEAST_COSINE_TO_ANCHOR = np.cos(np.radians(10.0))
+"""Farther from the anchor than a quarter of a continent, up is no longer up."""
 
 # Columns are the axes of a level camera that looks north: x east, y down, z north.
 LOOKING_NORTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -73,6 +75,8 @@ def place_on_earth(
     ------
     InputError
         A latitude is beyond 90 degrees: often latitude and longitude are swapped. Or a height is none.
+    SettingError
+        The anchor is another place on the Earth.
     """
     fine: Bools = np.asarray(np.isfinite(lon_lat_height).all(axis=1))
     beyond = (np.abs(lon_lat_height[:, 1]) > 90.0) | (np.abs(lon_lat_height[:, 0]) > 360.0)
@@ -92,13 +96,17 @@ def place_on_earth(
         )
     if not fine.any():
         raise InputError(f"{source}: no image has a place", hint="are latitude and longitude numbers in degrees?")
-    if anchor is None:
-        lon, lat, height = lon_lat_height[first if fine[first] else np.argmax(fine)].tolist()
-        anchor = (lat, lon, height)
+    lon, lat, height = lon_lat_height[first if fine[first] else np.argmax(fine)].tolist()
+    origin = (lat, lon, height) if anchor is None else anchor
     position, axes = np.full((len(fine), 3), np.nan), np.full((len(fine), 3, 3), np.nan)
-    position[fine] = enu_from_lon_lat_height(lon_lat_height[fine], anchor)
-    axes[fine] = enu_axes_at(lon_lat_height[fine], anchor)
-    return OnEarth(position, axes, anchor)
+    position[fine] = enu_from_lon_lat_height(lon_lat_height[fine], origin)
+    axes[fine] = enu_axes_at(lon_lat_height[fine], origin)
+    if axes[fine, 2, 2].max() < _LEAST_COSINE_TO_ANCHOR:  # Up there against up at the anchor.
+        raise SettingError(
+            f"anchor: expected a place near the images, as at {lat:.6g} {lon:.6g}, found {origin[0]:g} {origin[1]:g}",
+            hint="the latitude comes first; leave it away for the place of the first image",
+        )
+    return OnEarth(position, axes, origin)
 
 
 def place_in_crs(
@@ -274,9 +282,9 @@ def interpolate_poses(
 ) -> tuple[Floats, Floats, Bools]:
     """Return rotations (N, 3, 3) and centres (N, 3) at times (N) between known poses, and which there are (N).
 
-    Poses turn about one axis and move straight between neighbours. There is none outside the known times, nor in gaps
-    longer than `longest`, in which it may have been anywhere. Known times (M) are in any order, and distinct; poses
-    that hold no numbers, or no rotation, are not known.
+    Poses turn about one axis and move straight between neighbours. There is none (NaN) outside the known times, nor in
+    gaps longer than `longest`, in which it may have been anywhere. Known times (M) are in any order, and distinct;
+    poses that hold no numbers, or no rotation, are not known.
     """
     _, fine = _given_and_motions(rotation, center_m)
     if not fine.any():
@@ -296,7 +304,15 @@ def interpolate_poses(
     step = rotations[before].inv() * rotations[after]
     turned = rotations[before] * scipy.spatial.transform.Rotation.from_rotvec(step.as_rotvec() * share[:, None])
     moved: Floats = centers[before] + (centers[after] - centers[before]) * share[:, None]
-    return turned.as_matrix(), moved, usable
+    matrix = turned.as_matrix()
+    matrix[~usable], moved[~usable] = np.nan, np.nan
+    return matrix, moved, usable
+
+
+def images_without_poses(images: Images, longest_gap_s: float) -> dict[int, str]:
+    """Return why images have no pose, by row, where all poses that there are were interpolated between others."""
+    reason = f"it is before or after all poses, or in a gap of them that is longer than {longest_gap_s:g} s"
+    return dict.fromkeys(np.flatnonzero(np.isnan(images.cam_from_world_m).any(axis=1)).tolist(), reason)
 
 
 def _given_and_motions(rotation: Floats, center_m: Floats) -> tuple[Bools, Bools]:

@@ -18,7 +18,13 @@ from valuemap.readers.assemble import MAX_REJECTED, FoundBoxes, Imported, assemb
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.pixel_center import shift_to_corner_px
-from valuemap.readers.poses import interpolate_poses, make_images, nanoseconds_of_gap, rigs_by_time
+from valuemap.readers.poses import (
+    images_without_poses,
+    interpolate_poses,
+    make_images,
+    nanoseconds_of_gap,
+    rigs_by_time,
+)
 from valuemap.readers.reader import Reader
 from valuemap.tables import Floats, Images, Ints
 
@@ -70,8 +76,7 @@ class _Edge:
                 np.broadcast_to(values[-1, :3], (len(time_ns), 3)).copy(),
             )
         known, first = np.unique(np.array(self.time_ns, dtype=np.int64), return_index=True)
-        turned, moved, usable = interpolate_poses(time_ns, known, rotation[first], values[first, :3], longest_ns)
-        turned[~usable], moved[~usable] = np.nan, np.nan
+        turned, moved, _ = interpolate_poses(time_ns, known, rotation[first], values[first, :3], longest_ns)
         return turned, moved
 
 
@@ -180,6 +185,7 @@ def read_ros(
         anchor=anchor,
         source=str(bags[0]),
         max_rejected=max_rejected,
+        unposed=images_without_poses(images, longest_gap_s),
     )
     progress("reading the bags", 1, 1)
     return dataset

@@ -14,6 +14,7 @@ from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import read_text
 from valuemap.readers.poses import (
     AXES,
+    images_without_poses,
     interpolate_poses,
     make_images,
     nanoseconds_of_gap,
@@ -52,8 +53,8 @@ def read_tum(
         As in `parse_camera`.
     image_list
         Text file of `timestamp filename` (`rgb.txt`). The pose of an image is that between the two poses next in
-        time; images outside the trajectory, or in a gap longer than `longest_gap_s`, are left out. Without it there is
-        an image `TIMESTAMP.png`, as written in the file, for every pose.
+        time; images outside the trajectory, or in a gap longer than `longest_gap_s`, are left out and listed. Without
+        it there is an image `TIMESTAMP.png`, as written in the file, for every pose.
     detections
         As in `read_detections`.
     axes
@@ -86,11 +87,11 @@ def read_tum(
         rotation, center, usable = interpolate_poses(image_time, time, rotation, center, longest)
         if not usable.any():
             raise InputError(
-                f"{image_list}: no image is within the time of the trajectory, {texts[0]} to {texts[-1]}",
-                hint="are both in seconds, of one clock?",
+                f"{image_list}: no image is between two poses of the trajectory, {texts[0]} to {texts[-1]}, that are "
+                f"at most {longest_gap_s:g} s apart",
+                hint="are both in seconds, of one clock? --longest-gap allows longer gaps between poses",
             )
-        rotation, center, time = rotation[usable], center[usable], image_time[usable]
-        names = [name for name, use in zip(names, usable, strict=True) if use]
+        time = image_time
     cameras, camera_id = make_cameras([parse_camera(camera, pixel_center)] * len(names), str(trajectory))
     images = make_images(
         names=names,
@@ -111,6 +112,7 @@ def read_tum(
         anchor=anchor,
         source=str(trajectory),
         max_rejected=max_rejected,
+        unposed=images_without_poses(images, longest_gap_s),
     )
     progress("reading the detections", 2, 2)
     return dataset

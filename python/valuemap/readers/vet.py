@@ -244,7 +244,10 @@ def vet_images(
     why = Verdicts(len(images))
     for reason in sorted(set((unposed or {}).values())):
         rows = [row for row, text in (unposed or {}).items() if text == reason]
-        why.mark(np.isin(np.arange(len(images)), rows), _Reason(reason, "see docs/formats/pictures.md", counts=False))
+        why.mark(
+            np.isin(np.arange(len(images)), rows),
+            _Reason(reason, "the page of the format in docs/formats says when images have poses", counts=False),
+        )
     pose = np.hstack([images.cam_from_world_quat, images.cam_from_world_m])
     why.mark(~np.isfinite(pose).all(axis=1), _POSE_NOT_FINITE)
     with np.errstate(invalid="ignore", over="ignore"):
