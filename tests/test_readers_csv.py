@@ -50,6 +50,29 @@ def test_a_heading_counts_clockwise_from_north_and_right_of_it_is_more(tmp_path:
     assert_allclose(camera_centers(dataset.images)[1], [0.0, 1e-4 * DEGREE_NORTH_M, 0.0], atol=1e-4)
 
 
+def test_up_is_z_where_angles_say_how_cameras_are_turned(tmp_path: Path) -> None:
+    """Pictures on their side, as of a telephone, and cameras that look down have their own up elsewhere."""
+    for angles in ("0,90", "-90,0", "20,0"):
+        poses = poses_of(tmp_path, "image,x,y,heading_deg,pitch_deg,roll_deg", f"a.jpg,0,0,0,{angles}")
+        assert read_csv_poses(poses, camera=CAMERA).frame.up == (0.0, 0.0, 1.0)
+        assert read_csv_poses(poses, camera=CAMERA, up=(0.0, 2.0, 0.0)).frame.up == (0.0, 1.0, 0.0)
+        assert read_csv_poses(poses, camera=CAMERA, anchor=(52.0, 4.0, 0.0)).frame.anchor == (52.0, 4.0, 0.0)
+
+
+def test_a_map_projection_that_counts_to_the_west_is_refused(tmp_path: Path) -> None:
+    """That of Cape Town counts to the west and south: its y is no north that a heading could count from."""
+    poses = poses_of(tmp_path, "image,x,y,heading_deg", "a.jpg,55496,3752730,0")
+    said = refusal(lambda: read_csv_poses(poses, camera=CAMERA, crs="EPSG:2048"))
+    assert "crs EPSG:2048: expected a system of eastings and northings, found axes to the west and south" in said
+
+
+def test_an_anchor_elsewhere_on_the_earth_is_refused(tmp_path: Path) -> None:
+    poses = poses_of(tmp_path, "image,lat,lon,heading_deg", "a.jpg,52,4,0")
+    said = refusal(lambda: read_csv_poses(poses, camera=CAMERA, anchor=(4.0, 52.0, 0.0)))
+    assert "anchor: expected a place near the images, as at 52 4, found 4 52" in said
+    assert read_csv_poses(poses, camera=CAMERA, anchor=(52.5, 5.0, 0.0)).frame.anchor == (52.5, 5.0, 0.0)
+
+
 @pytest.mark.parametrize(
     ("header", "row", "said", "hint"),
     [
@@ -441,6 +464,8 @@ def test_bearings_of_one_place_are_of_one_image_unless_they_say_otherwise(tmp_pa
     assert len(read_bearings(write(tmp_path / "a.csv", f"lat,lon,bearing\n{rows}")).images) == 2
     named = "a,1,2,10\nb,1,2,20\nc,1,2.0001,30\n"
     assert len(read_bearings(write(tmp_path / "b.csv", f"image,lat,lon,bearing\n{named}")).images) == 3
+    close = "1,2,50.00001,10\n1,2,50.00002,20\n1.0000000001,2,50,30\n1,2,51,10\n"
+    assert len(read_bearings(write(tmp_path / "d.csv", f"lat,lon,height,bearing\n{close}")).images) == 2
     moved = write(tmp_path / "c.csv", "image,lat,lon,bearing\na,1,2,10\na,1,2.1,20\n")
     assert "line 3: image 'a' is at two places" in refusal(lambda: read_bearings(moved))
 

@@ -190,8 +190,19 @@ def true_axes_of_crs(position: Floats, crs: str) -> Floats:
     """Return rotations (N, 3, 3) from the axes of a map's grid into east, north, up at coordinates (N, 3) in it.
 
     Grid north differs from north by the convergence, 3 degrees at the edge of a UTM zone at 60 degrees of latitude.
+
+    Raises
+    ------
+    SettingError
+        The system counts to the west, as those of southern Africa do: what north and a heading are in it nobody knows.
     """
     transformer = _to_wgs84(crs)
+    directions = [axis.direction for axis in _system(crs).axis_info]
+    if "west" in directions:
+        raise SettingError(
+            f"crs {crs}: expected a system of eastings and northings, found axes to the {' and '.join(directions[:2])}",
+            hint="bring the positions into another one first, such as UTM",
+        )
     step = 1e-5 if transformer.source_crs is not None and transformer.source_crs.is_geographic else 1.0
     north = np.zeros_like(position)
     north[:, 1] = step

@@ -38,6 +38,8 @@ _NUMBERS = (
     *("heading_deg", "heading_rad", "yaw_deg", "yaw_rad", "width_px", "height_px", "fx", "fy", "cx", "cy"),
     *("position_sigma_m", "rotation_sigma_deg", "readout_s"),
 )
+_SKY = (0.0, 0.0, 1.0)
+"""Up where orientations are angles: these are about the horizon, however cameras are turned."""
 _HEADINGS = ("heading_deg", "heading_rad", "yaw_deg", "yaw_rad")
 _NO_DEGREES = "write decimal degrees, as 52.5123 or -0.1276, without letters and signs"
 _NO_METRES = "write metres as plain numbers, as 1234.5"
@@ -107,7 +109,8 @@ def read_csv_poses(
     vertical
         What the heights of `lat, lon` or `crs` count from, as in `with_heights`; without, the ellipsoid.
     up, anchor, max_rejected
-        As in `assemble`. With `lat, lon` or `crs` the anchor is the origin, by default the first image by name.
+        As in `assemble`, but that up is z where orientations are angles. With `lat, lon` or `crs` the anchor is the
+        origin, by default the first image by name.
 
     Raises
     ------
@@ -139,14 +142,15 @@ def read_csv_poses(
         rotation_sigma_rad=_radians(_sigma(table, "rotation_sigma_deg")),
     )
     progress("reading the detections", 1, 2)
+    has_angles = not table.has(*_QUATERNION)
     dataset = assemble(
         name=poses.stem,
         cameras=cameras,
         images=images,
         detections=read_detections(detections, images, cameras),
-        up=up,
+        up=_SKY if has_angles and up is None and where.anchor is None else up,
         anchor=where.anchor,
-        is_on_earth=not table.has(*_QUATERNION),  # Angles are about the horizon, whatever they are.
+        is_on_earth=has_angles,
         source=str(poses),
         max_rejected=max_rejected,
     )

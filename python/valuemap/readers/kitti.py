@@ -262,7 +262,7 @@ def _detections(
     elif len(numbers) == 1:
         camera = np.zeros(len(frame), dtype=np.int64)
     else:
-        raise table.missing("a column 'camera', as there are several")
+        raise table.missing("a column 'camera' for several cameras")
     known = (camera >= 0) & (frame >= 0) & (frame < frames) & (frame % 1.0 == 0.0)
     return FoundBoxes(
         image_row=np.where(known, camera * frames + np.where(known, frame, 0.0), -1.0).astype(np.int64),
