@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -193,6 +194,21 @@ def test_what_cannot_be_is_said_before_the_work_begins(street: Path, tmp_path: P
     assert "is the folder of the map too" in said
     assert "expected metres above 0" in complains("map", street, "--out", tmp_path / "m", "--tile-size", "0")
     assert list(tmp_path.iterdir()) == [street]
+
+
+def test_pictures_of_another_dataset_are_not_exported(street: Path, tmp_path: Path) -> None:
+    works("map", street, "--out", tmp_path / "map", "--method", "paper")
+    dataset = valuemap.read_dataset(street)
+    moved = dataset.detections.replace(image_id=np.roll(dataset.detections.image_id, 1))
+    valuemap.write_dataset(dataclasses.replace(dataset, detections=moved), tmp_path / "other")
+    export = ("export", tmp_path / "map", tmp_path / "labels.csv")
+    assert "is of another image in the dataset" in complains(*export, "--dataset", tmp_path / "other")
+    shutil.rmtree(street)
+    (tmp_path / "other").rename(street)
+    done = CliRunner().invoke(app, [*map(str, export)])
+    assert done.exit_code == 0
+    assert "cannot be used for pictures and cameras" in done.stderr
+    assert "picture_1" not in (tmp_path / "labels.csv").read_text()
 
 
 def test_a_map_replaces_an_older_one_and_nothing_else(street: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,10 @@ def test_rays_past_a_label_are_its_votes_and_past_an_empty_place_there_are_none(
 def test_votes_of_another_dataset_are_refused() -> None:
     with pytest.raises(InputError, match=r"votes.parquet row 0: detection_id 0 is not in the dataset small"):
         Evidence(map_of([[0.0, 20.0, 3.0]], residual_px=[1.0]), small_dataset())
+    swapped = city().result.votes.image_id[::-1].copy()
+    result = dataclasses.replace(city().result, votes=city().result.votes.replace(image_id=swapped))
+    with pytest.raises(InputError, match=r"votes.parquet row 0: detection_id \d+ is of another image in the dataset"):
+        Evidence(result, city().dataset)
     with pytest.raises(InputError, match="no label 99"):
         city().voters(99)
 

@@ -507,6 +507,8 @@ def test_what_is_missing_is_said(city: tuple[Path, Map], tmp_path: Path) -> None
         Scene(city[0] / "map", dataset_folder=write_part(tmp_path / "part"))
     with pytest.raises(InputError, match="is not a folder"):
         Scene(city[0] / "map", pictures=tmp_path / "nowhere")
+    with pytest.raises(InputError, match="no such file or folder"):
+        Scene(city[0] / "map", truth=tmp_path / "nowhere.csv")
 
 
 def write_part(folder: Path) -> Path:

@@ -34,6 +34,7 @@ from valuemap.tables import (
     TableWriter,
     Truth,
     TruthDetections,
+    Votes,
     check_table,
     in_groups,
     read_table,
@@ -354,6 +355,37 @@ def rows_of(ids: Ints, keys: Ints) -> Ints:
     if len(keys) and keys[-1] - keys[0] == len(keys) - 1:  # Without gaps, as most ids are: nothing is to be looked for.
         return np.asarray(ids - keys[0], np.int64)
     return np.searchsorted(keys, ids).astype(np.int64)
+
+
+def rows_of_votes(votes: Votes, dataset: Dataset) -> tuple[Ints, Ints]:
+    """Return the rows of votes in the tables of detections and images of the dataset that the map was made from.
+
+    Raises
+    ------
+    InputError
+        A vote is by a detection or an image that the dataset does not have, or has elsewhere.
+    """
+    hint = "give the dataset that the map was made from (--dataset)"
+    for column, ids, known in (
+        ("detection_id", votes.detection_id, dataset.detections.detection_id),
+        ("image_id", votes.image_id, dataset.images.image_id),
+    ):
+        strange = np.flatnonzero(~np.isin(ids, known))
+        if len(strange):
+            raise InputError(
+                f"votes.parquet row {strange[0]}: {column} {ids[strange[0]]} is not in the dataset {dataset.name} "
+                f"({len(strange)} rows)",
+                hint=hint,
+            )
+    detection_row: Ints = rows_of(votes.detection_id, dataset.detections.detection_id)
+    moved = np.flatnonzero(dataset.detections.image_id[detection_row] != votes.image_id)
+    if len(moved):  # Ids are small numbers, which other datasets have too.
+        raise InputError(
+            f"votes.parquet row {moved[0]}: detection_id {votes.detection_id[moved[0]]} is of another image in the "
+            f"dataset {dataset.name} ({len(moved)} rows)",
+            hint=hint,
+        )
+    return detection_row, rows_of(votes.image_id, dataset.images.image_id)
 
 
 def evenly(rows: Ints, most: int) -> Ints:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from valuemap.cameras import Rays, camera_centers, cast_rays, lens_of, rotation_of
 from valuemap.config import USUAL_RANGE_M
-from valuemap.dataset import MARKER, Dataset, number_passes, rows_of
+from valuemap.dataset import MARKER, Dataset, number_passes, rows_of, rows_of_votes
 from valuemap.drives import find_drives
 from valuemap.errors import InputError
 from valuemap.map_folder import Map
@@ -108,28 +108,14 @@ class Evidence:
     Raises
     ------
     InputError
-        A vote of the map is by a detection or an image that the dataset does not have.
+        A vote of the map is by a detection or an image that the dataset does not have, or has elsewhere.
     """
 
     def __init__(self, result: Map, dataset: Dataset) -> None:
         self.result = result
         self.dataset = dataset
-        votes = result.votes
-        for column, ids, known in (
-            ("detection_id", votes.detection_id, dataset.detections.detection_id),
-            ("image_id", votes.image_id, dataset.images.image_id),
-        ):
-            strange = np.flatnonzero(~np.isin(ids, known))
-            if len(strange):
-                raise InputError(
-                    f"votes.parquet row {strange[0]}: {column} {ids[strange[0]]} is not in the dataset {dataset.name} "
-                    f"({len(strange)} rows)",
-                    hint="give the dataset that the map was made from",
-                )
-        self.detection_row: Ints = rows_of(votes.detection_id, dataset.detections.detection_id)
-        """The row in the detections table (votes) of each vote."""
-        self.image_row: Ints = rows_of(votes.image_id, dataset.images.image_id)
-        """The row in the images table (votes) of each vote."""
+        self.detection_row, self.image_row = rows_of_votes(result.votes, dataset)
+        """The rows in the tables of detections and images (votes) of each vote."""
 
     @cached_property
     def center_in_world_m(self) -> Floats:

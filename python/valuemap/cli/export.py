@@ -10,7 +10,7 @@ import typer
 from valuemap.cli.app import app
 from valuemap.cli.options import Force, Vertical
 from valuemap.cli.show import log, show_notes
-from valuemap.dataset import Dataset, read_dataset
+from valuemap.dataset import Dataset, read_dataset, rows_of_votes
 from valuemap.errors import InputError
 from valuemap.evidence import find_dataset
 from valuemap.geodesy import accuracy_note
@@ -62,12 +62,21 @@ def export_command(
 
 
 def _dataset(map_: Path, result: Map, given: Path | None) -> Dataset | None:
-    """Return the dataset of a map: the given one, else one that is found, if it is the map's by name."""
+    """Return the dataset of a map: the given one, else one that is found, if it is the map's by name and votes."""
     folder = find_dataset(map_, result.run, given)
     if folder is None:
         return None
     dataset = read_dataset(folder)
-    return dataset if given is not None or dataset.name == result.run.get("dataset") else None
+    if given is None and dataset.name != result.run.get("dataset"):
+        return None
+    try:
+        rows_of_votes(result.votes, dataset)
+    except InputError as error:
+        if given is not None:
+            raise
+        show_notes([f"the dataset {folder.name} cannot be used for pictures and cameras: {error}"])
+        return None
+    return dataset
 
 
 def _reviewed(result: Map, folder: Path, review: Path | None, dataset: Dataset | None) -> Map:

@@ -18,6 +18,7 @@ from valuemap.cameras import rotation_matrices
 from valuemap.dataset import read_dataset
 from valuemap.errors import InputError
 from valuemap.evaluate import Evaluation, evaluate_map
+from valuemap.evaluate.truth import check_objects_file
 from valuemap.evidence import PICTURES, Evidence, find_dataset
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import read_map
@@ -64,6 +65,8 @@ class Scene:
         self.notes: list[str] = []
         self.evidence = self._find_evidence(dataset_folder)
         self.pictures = self._find_pictures(pictures)
+        if truth is not None and not truth.is_dir():
+            check_objects_file(truth, "truth", "a dataset folder or ")
         self._truth = truth
         self.rejected = self.result.rejected
         self.lock = threading.Lock()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from valuemap.dataset import Dataset, rows_of
+from valuemap.dataset import Dataset, rows_of_votes
 from valuemap.errors import InputError, OutputError
 from valuemap.geodesy import crs_from_lon_lat_height
 from valuemap.map_folder import Map
@@ -131,25 +131,13 @@ class Export:
     def image_row_of_vote(self) -> Ints:
         """The row in the images of the dataset (votes) of each vote."""
         assert self.dataset is not None
-        votes = self.result.votes
-        for column, ids, known in (
-            ("image_id", votes.image_id, self.dataset.images.image_id),
-            ("detection_id", votes.detection_id, self.dataset.detections.detection_id),
-        ):
-            strange = np.flatnonzero(~np.isin(ids, known))
-            if len(strange):
-                raise InputError(
-                    f"votes.parquet row {strange[0]}: {column} {ids[strange[0]]} is not in the dataset "
-                    f"{self.dataset.name} ({len(strange)} rows)",
-                    hint="give the dataset that the map was made from as --dataset",
-                )
-        return rows_of(votes.image_id, self.dataset.images.image_id)
+        return rows_of_votes(self.result.votes, self.dataset)[1]
 
     def _best_pictures(self, dataset: Dataset) -> list[list[str | None]]:
         """Return the names (PICTURES, labels) of pictures that show each label largest, of different passes first."""
         votes, images, labels = self.result.votes, dataset.images, self.result.labels
-        image = self.image_row_of_vote
-        size_px = dataset.detections.size_px[rows_of(votes.detection_id, dataset.detections.detection_id)]
+        detection, image = rows_of_votes(votes, dataset)
+        size_px = dataset.detections.size_px[detection]
         area_px = size_px[:, 0] * size_px[:, 1]
         label = np.searchsorted(labels.label_id, votes.label_id)
         pass_code = images.pass_id.codes[image]
