@@ -572,6 +572,15 @@ def test_images_without_detections_may_be_unknown_to_the_model(tmp_path: Path, m
     assert same(with_dropped, read_colmap(model_dir, detections=coco))
 
 
+def test_whole_numbers_of_coco_may_have_a_point(model_dir: Path, coco: Path, tmp_path: Path) -> None:
+    """pandas writes 3.0 where a column has gaps."""
+    content = json.loads(coco.read_text())
+    for box in content["annotations"]:
+        box |= {"image_id": float(box["image_id"]), "category_id": float(box["category_id"])}
+    pointed = read_colmap(model_dir, detections=write_json(content, tmp_path / "pointed.json"))
+    assert same(pointed, read_colmap(model_dir, detections=coco))
+
+
 def test_names_match_exactly_or_by_a_base_name_that_is_nobody_elses() -> None:
     known = ["cam0/1.jpg", "cam0/2.jpg", "cam1/2.jpg"]
     assert match_images(["cam0/2.jpg"], known) == {"cam0/2.jpg": 1}

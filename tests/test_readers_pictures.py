@@ -176,6 +176,16 @@ def test_panoramas_need_no_structure_from_motion(tmp_path: Path) -> None:
     assert_allclose(rotation_matrices(dataset.images)[0][2], [0, -1, 0], atol=1e-9)
 
 
+def test_damaged_pictures_are_counted_together(tmp_path: Path) -> None:
+    picture(tmp_path / "a.jpg", tags(52.0, 4.0, GPSImgDirection=90.0))
+    for name in ("b.jpg", "c.jpg"):
+        write(tmp_path / name, "hello")
+    rejected = read_pictures(tmp_path, poses="exif", max_rejected=0.9).rejected
+    assert rejected is not None
+    assert set(rejected.reason.texts()) == {"cannot be read as a picture: cannot identify image file"}
+    assert rejected.place.to_pylist() == [f"{tmp_path}/{name}" for name in ("b.jpg", "c.jpg")]
+
+
 def test_folders_that_cannot_be_used(tmp_path: Path) -> None:
     assert "no such folder" in refusal(lambda: read_pictures(tmp_path / "absent"))
     assert "there are no pictures in it" in refusal(lambda: read_pictures(tmp_path))
@@ -185,7 +195,8 @@ def test_folders_that_cannot_be_used(tmp_path: Path) -> None:
     assert "no picture has a heading" in refusal(lambda: read_pictures(tmp_path, poses="exif"))
     assert "needs a folder to work in" in refusal(lambda: read_pictures(tmp_path))
     write(tmp_path / "b.jpg", "hello")
-    assert "1 of 2 pictures cannot be used" in refusal(lambda: read_pictures(tmp_path, poses="exif"))
+    said = refusal(lambda: read_pictures(tmp_path, poses="exif"))
+    assert "1 of 2 pictures cannot be used: b.jpg: cannot be read as a picture: cannot identify image file" in said
     (tmp_path / "b.jpg").unlink()
     outside = picture(tmp_path.parent / f"{tmp_path.name}-outside.jpg", tags(52.0, 4.0))
     (tmp_path / "b.jpg").symlink_to(outside)

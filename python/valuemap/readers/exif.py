@@ -59,7 +59,7 @@ def read_exif(path: Path) -> Exif:
             xmp = picture.info.get("xmp", b"")
             main = dict(tags)
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError, KeyError, Image.DecompressionBombError) as error:
-        reason = " ".join(str(error).split())[:150]
+        reason = " ".join(str(error).replace(f" {str(path)!r}", "").split())[:150]
         raise InputError(f"{path}: cannot be read as a picture: {reason}", hint="remove or replace it") from error
     if width * height > _LARGEST_PX:
         raise InputError(f"{path}: has {width} x {height} pixels", hint="make it smaller")

@@ -201,13 +201,13 @@ def _read_all(
             exif = read_exif(file_in(folder, name, _EXPECTED))
             check_whole(path)
         except InputError as error:
-            unreadable[name] = str(error)
+            unreadable[name] = str(error).removeprefix(f"{path}: ")
         else:
             found.append(exif)
             names.append(name)
     progress("reading the pictures' tags", len(paths), len(paths))
     if len(unreadable) > max_rejected * len(paths):
-        shown = "; ".join(list(unreadable.values())[:_SHOWN])
+        shown = "; ".join(f"{name}: {reason}" for name, reason in list(unreadable.items())[:_SHOWN])
         raise InputError(
             f"{folder}: {len(unreadable)} of {len(paths)} pictures cannot be used: {shown}",
             hint="remove or replace them; or leave them out with --max-rejected",

@@ -74,8 +74,13 @@ class _Numbered:
     def codes_of(self, values: list[Any]) -> Ints:
         """Return the number of each value (N)."""
         number = self._number
-        keys = (value if ID.accepts(value) else (reprlib.repr(value),) for value in values)
+        keys = (_whole(value) if ID.accepts(_whole(value)) else (reprlib.repr(value),) for value in values)
         return np.fromiter((number.setdefault(key, len(number)) for key in keys), np.int64, len(values))
+
+
+def _whole(value: Any) -> Any:
+    """Return a whole number as such that is written as 3.0, as programs do where a column has gaps."""
+    return int(value) if type(value) is float and value.is_integer() else value
 
 
 class _Boxes:
