@@ -600,6 +600,13 @@ def test_names_are_found_whatever_system_wrote_them() -> None:
     assert match_images(["MONDAY/2.jpg"], known) == {}
 
 
+def test_names_of_paths_in_another_folder_are_found_by_how_they_end() -> None:
+    known = ["monday/cam0/7.jpg", "monday/cam1/7.jpg", "friday/cam0/7.jpg"]
+    paths = {"C:\\run\\monday\\cam1\\7.png": 1, "/data/run/friday/cam0/7.jpg": 2, "cam0/7.jpg": None, "7.jpg": None}
+    assert match_images(list(paths), known) == {path: row for path, row in paths.items() if row is not None}
+    assert match_images(["cam1/7.jpg"], known) == {"cam1/7.jpg": 1}
+
+
 def changed(change: Callable[[dict[str, Any]], Any]) -> Callable[[dict[str, Any]], Any]:
     """Make a change in place look like a function from content to content."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from pathlib import PurePosixPath
 
 
@@ -12,10 +13,10 @@ def match_images(names: Collection[str], known: Sequence[str]) -> dict[str, int]
     """Return the index in `known` of each of `names` that can be told for sure; the others are left out.
 
     The exact name counts first, then the name with Windows' separators turned and accents as one character (macOS
-    writes two), the name without its suffix, the base name (without folders), and the base name without its suffix;
-    then all these in any case. Each counts only if no other name and no other known image has the same. `cam1/7.jpg`
-    must not become `cam0/7.jpg` only because `cam1` is not among the known, nor `7.png` become `7.jpg` beside another
-    `7.jpg`.
+    writes two). After that capitals do not count: the name without its suffix, its last three, two and one parts, as
+    of a path in another folder, and these without their suffix. Each counts only if no other name and no other known
+    image has the same. `cam1/7.jpg` must not become `cam0/7.jpg` only because `cam1` is not among the known, nor
+    `7.png` become `7.jpg` beside another `7.jpg`.
     """
     distinct = set(names)
     found: dict[str, int] = {}
@@ -37,27 +38,22 @@ def _slashed(name: str) -> str:
 
 
 def _without_suffix(name: str) -> str:
-    path = PurePosixPath(_slashed(name))
+    path = PurePosixPath(_slashed(name).casefold())
     return str(path.with_suffix("")) if path.suffix in _PICTURES else str(path)
 
 
-def _base(name: str) -> str:
-    return PurePosixPath(_slashed(name)).name
+def _end(name: str, parts: int) -> str:
+    return "/".join(_slashed(name).casefold().split("/")[-parts:])
 
 
-_PICTURES = frozenset(
-    suffix
-    for lower in (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".ppm", ".txt")
-    for suffix in (lower, lower.upper())
-)
-_PARTS: tuple[Callable[[str], str], ...] = (
-    _slashed,
-    _without_suffix,
-    _base,
-    lambda name: _base(_without_suffix(name)),
-)
+def _end_without_suffix(name: str, parts: int) -> str:
+    return "/".join(_without_suffix(name).split("/")[-parts:])
+
+
+_PICTURES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".ppm", ".txt"))
 _KEYS: tuple[Callable[[str], str], ...] = (
     str,
-    *_PARTS,
-    *(lambda name, part=part: part(name.casefold()) for part in _PARTS),
+    _slashed,
+    _without_suffix,
+    *(partial(end, parts=parts) for parts in (3, 2, 1) for end in (_end, _end_without_suffix)),
 )
