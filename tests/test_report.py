@@ -39,6 +39,7 @@ from valuemap.report.ground import (
     horizontal_axes,
     look_down,
 )
+from valuemap.report.style import figure_bytes
 from valuemap.tables import Categories, Floats, Images
 
 VERMILION, ORANGE, BLUE, GREEN = ((213, 94, 0), (230, 159, 0), (0, 114, 178), (0, 158, 115))
@@ -311,6 +312,14 @@ def test_classes_are_told_apart_and_the_rarest_share_a_mark() -> None:
     assert [style.text for style, _ in groups] == ["c11", "c10", "c9", "c8", "c7", "c6", "c5", "5 other classes"]
     assert [len(rows) for _, rows in groups] == [12, 11, 10, 9, 8, 7, 6, 1 + 2 + 3 + 4 + 5]
     assert len({(style.marker, style.face) for style, _ in groups}) == 8
+
+
+@pytest.mark.parametrize("suffix", [".png", ".svg"])
+def test_letters_that_no_font_has_raise_no_warning(suffix: str, recwarn: pytest.WarningsRecorder) -> None:
+    figure = Figure()
+    figure.text(0.5, 0.5, "\u4fe1\u53f7")
+    figure_bytes(figure, suffix)
+    assert [str(each.message) for each in recwarn] == []
 
 
 def test_names_are_no_formulas(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -57,7 +58,8 @@ def drawing() -> Iterator[None]:
     """Make figures in the style of the reports inside the block."""
     from matplotlib import rc_context  # Slow to import, and only pictures need it.
 
-    with rc_context(_SETTINGS):  # type: ignore[arg-type]
+    with rc_context(_SETTINGS), warnings.catch_warnings():  # type: ignore[arg-type]
+        warnings.filterwarnings("ignore", message="Glyph")  # A class may be written in letters that no font has here.
         yield
 
 
