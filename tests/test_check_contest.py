@@ -1,0 +1,76 @@
+"""How the contest of conventions stops: what is too likely an accident, what costs a group too much, who stands."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from check_faults import good_city, of_camera, upside_down
+from valuemap.check import contest
+from valuemap.check.agreement import Agreement, agreement_on
+from valuemap.check.contest import _AmongOthers, _judge, _Reading, _try_all, spoils_a_group
+from valuemap.check.fault import LEAST_RISE, Fix, View, keep_rows
+from valuemap.check.groups import Group
+from valuemap.check.poses import CameraAxes
+from valuemap.check.registry import CONVENTIONS
+from valuemap.check.sample import Sample
+from valuemap.dataset import Dataset
+from valuemap.progress import silent
+
+
+@pytest.fixture(scope="module")
+def view() -> View:
+    """A small city in which every second pass has a camera of its own."""
+    return View(good_city(1, passes_per_street=2))
+
+
+def test_a_reading_that_is_no_better_than_given_is_not_told_for_being_as_good_as_the_best(
+    view: View, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The best is far better than given, but does not stand; the one that stands may be better by luck."""
+
+    def reading(gain: np.ndarray, number: int | None, uprightness: float) -> _Reading:
+        convention = None if number is None else CONVENTIONS[number]
+        fix = None if number is None else lambda dataset: dataset
+        return _Reading(convention, str(number), fix, replace(view.agreement, gain=gain), uprightness)
+
+    scatter = 12.0 * np.array([1.0, -1.0] * 6) + np.arange(12.0)
+    given, best = reading(np.zeros(12), None, 1.0), reading(10.0 + np.arange(12.0) / 12.0, 0, 0.0)
+    lucky, sure = reading(8.0 + scatter, 1, 1.0), reading(9.9 + np.arange(12.0) / 10.0, 2, 1.0)
+    monkeypatch.setattr(contest, "_everywhere", lambda _, each: [each.agreement])
+    found = _judge(view, [given, best, sure], best)
+    assert found is not None
+    assert found.fault == CONVENTIONS[2].name
+    assert _judge(view, [given, best, lucky], best) is None
+
+
+@pytest.mark.parametrize(("share", "is_spoilt"), [(0.5, False), (1.5, True)])
+def test_a_group_is_spoilt_by_more_than_what_good_passes_differ_by(
+    share: float, is_spoilt: bool, view: View, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine = Group(camera_id=1)
+    of_camera_1 = len(mine.part(view.dataset).detections)
+
+    def measured(dataset: Dataset, sample: Sample, gate_px: float, _: Fix | None) -> Agreement:
+        agreement = agreement_on(sample, dataset, gate_px)
+        is_mine = len(sample.whole.detections) == of_camera_1
+        return replace(agreement, gain=(1.0 - is_mine * share * LEAST_RISE) * agreement.gain)
+
+    monkeypatch.setattr(contest, "_measure", measured)
+    assert spoils_a_group(view, lambda dataset: dataset) is is_spoilt
+
+
+@pytest.mark.parametrize(("images", "is_up_unknown"), [(100, False), (10_000, True)])
+def test_of_one_camera_it_counts_whether_that_one_stands(images: int, is_up_unknown: bool, view: View) -> None:
+    """Whether all stand says only how sure the frame's up is, which cameras that lie along an axis may have wrong."""
+    whole, group = view.dataset, Group(camera_id=1)
+    mine = whole.images.camera_id == 1
+    some = keep_rows(whole, images=~mine | (np.cumsum(mine) <= images))
+    spoiled = View(of_camera(some, upside_down(some), 1))
+    tried = _try_all(spoiled, [_AmongOthers(CameraAxes(), group)], silent, group)
+    given, turned = tried[0], next(each for each in tried if each.how == "x left, y up, z forward")
+    assert (given.is_upright, turned.is_upright) == (False, True)
+    assert given.uprightness == pytest.approx(-turned.uprightness, abs=1e-9)
+    assert given.is_along_axis is is_up_unknown
