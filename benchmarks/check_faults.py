@@ -484,9 +484,9 @@ def _later(dataset: Dataset, seconds: float, is_moved: NDArray[np.bool_]) -> Dat
     rotation, center = _poses(dataset)
     time_s = dataset.images.timestamp_s
     assert time_s is not None
-    moved = center.copy()
-    for code in np.unique(dataset.images.pass_id.codes):
-        members = np.flatnonzero(dataset.images.pass_id.codes == code)
+    moved, drive = center.copy(), np.stack([dataset.images.pass_id.codes, dataset.images.camera_id])
+    for code, camera in np.unique(drive, axis=1).T:
+        members = np.flatnonzero((drive[0] == code) & (drive[1] == camera))
         members = members[np.argsort(time_s[members], kind="stable")]
         for axis in range(3):
             moved[members, axis] = np.interp(time_s[members] + seconds, time_s[members], center[members, axis])
@@ -806,20 +806,25 @@ def lowered(dataset: Dataset) -> Dataset:
 def inverted_mounts(dataset: Dataset) -> Dataset:
     """Take vehicle_from_cam for cam_from_vehicle: a level vehicle, x forward, y left, z up, amid its cameras."""
     rotation, center = _poses(dataset)
-    up = np.array(dataset.frame.up)
-    _, at = np.unique(np.stack([dataset.images.pass_id.codes, _frames(dataset)]), axis=1, return_inverse=True)
-    forward, middle = (_mean_of(at.ravel(), values) for values in (rotation[:, 2], center))
-    forward -= np.outer(forward @ up, up)
-    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    vehicle = np.stack([forward, np.cross(up, forward), np.broadcast_to(up, forward.shape)], axis=1)
+    vehicle, middle = _vehicles(dataset), _mean_of(_frames(dataset), center)
     mount = rotation @ vehicle.transpose(0, 2, 1)
     aside = np.einsum("nij,nj->ni", mount @ vehicle, middle - center)
     return posed(dataset, mount.transpose(0, 2, 1) @ vehicle, middle + np.einsum("nji,nj->ni", vehicle, aside))
 
 
+def _vehicles(dataset: Dataset) -> Floats:
+    """Return the rotations (N, 3, 3) from the world to the level vehicle of each image, x forward, y left, z up."""
+    up = np.array(dataset.frame.up)
+    forward = _mean_of(_frames(dataset), rotation_matrices(dataset.images)[:, 2])
+    forward -= np.outer(forward @ up, up)
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    return np.stack([forward, np.cross(up, forward), np.broadcast_to(up, forward.shape)], axis=1)
+
+
 def _frames(dataset: Dataset) -> NDArray[np.int64]:
     """Return the number of the exposure (N) of each image."""
-    return np.unique(np.asarray(dataset.images.timestamp_s), return_inverse=True)[1].ravel()
+    exposure = np.stack([dataset.images.pass_id.codes, np.asarray(dataset.images.timestamp_s)])
+    return np.unique(exposure, axis=1, return_inverse=True)[1].ravel()
 
 
 def _mean_of(group: NDArray[np.int64], values: Floats) -> Floats:
@@ -834,6 +839,20 @@ def upside_down(dataset: Dataset) -> Dataset:
     return posed(dataset, np.diag([-1.0, -1.0, 1.0]) @ rotation, center)
 
 
+def mount_in_degrees(dataset: Dataset, camera_id: int) -> Dataset:
+    """Read the rotation vector of a mount, which is in degrees, as radians: of a vehicle x forward, y left, z up."""
+    rotation, center = _poses(dataset)
+    mine = dataset.images.camera_id == camera_id
+    mount = Rotation.from_matrix((rotation @ _vehicles(dataset).transpose(0, 2, 1))[mine]).mean()
+    wrong = Rotation.from_rotvec(np.degrees(mount.as_rotvec())) * mount.inv()
+    return posed(dataset, np.where(mine[:, None, None], wrong.as_matrix() @ rotation, rotation), center)
+
+
+def camera_late(dataset: Dataset, camera_id: int) -> Dataset:
+    """Set the clock of one camera 0.3 s off."""
+    return of_camera(dataset, _later(dataset, 0.3, np.ones(len(dataset.images), dtype=np.bool_)), camera_id)
+
+
 RIG_FAULTS: dict[str, Fault] = {
     "inverted_mounts": Fault(inverted_mounts),
     "quaternion_order": Fault(lambda good: of_camera(good, quaternion_order(good), 0), of="camera 0"),
@@ -843,6 +862,8 @@ RIG_FAULTS: dict[str, Fault] = {
     "boxes_half_size": Fault(lambda good: of_camera(good, boxes_half_size(good), 1), of="camera 1"),
     "camera_yaw": Fault(lambda good: of_camera(good, camera_yaw(good), 2), of="camera 2"),
     "camera_height": Fault(lambda good: of_camera(good, lowered(good), 0), of="camera 0"),
+    "camera_mount": Fault(lambda good: mount_in_degrees(good, 2), of="camera 2"),
+    "time_shift": Fault(lambda good: camera_late(good, 1), of="camera 1"),
 }
 """What only one camera of several has."""
 

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.agreement import agreement_on, compare
 from valuemap.check.fault import (
+    AGAINST,
     GATE_RAD,
     LEAST_CHANCE,
     LEAST_RISE,
@@ -98,8 +99,10 @@ def _motion_up(dataset: Dataset) -> Motion:
     return Motion(np.zeros_like(up), up)
 
 
-_OF_A_MOUNT = (*PARAMETERS[:3], Parameter("up", _raised, _motion_up, is_length=True))
-"""How one camera of several hangs: its own rays do not know how high, but those of the others do."""
+_ALONG = next(each for each in PARAMETERS if each.name == "along")
+_OF_ONE_CAMERA = (*PARAMETERS[:3], Parameter("up", _raised, _motion_up, is_length=True), _ALONG)
+"""How one camera of several hangs, and when it exposes: its own rays do not know how high, nor on a straight road how
+late, but those of the others do."""
 
 
 def estimate_of(view: View, parameters: tuple[Parameter, ...], *, start: Estimate | None = None) -> Estimate | None:
@@ -153,21 +156,22 @@ _OF_A_CAMERA, _OF_A_PASS = frozenset({"pitch", "yaw", "roll", "log_focal"}), fro
 def _find_of_one_group(view: View) -> Correction | None:
     """Return the change of one camera, or of the cameras of one pass, by which rays gain most.
 
-    Its size is estimated from the group's own rays, or of a camera from how they meet those of the others; that it is
-    no accident must show in how they meet all others.
+    Its size is estimated from the group's own rays, or of a camera from how they meet those of the others. That it is
+    no accident must show in how all rays meet; where how they do has told the size, it need not show as surely again.
     """
     groups, compared = groups_of(view.dataset), 0
     best: Correction | None = None
     for group in groups:
         alone = group.alone(view)
-        told = list(_estimates_of(alone, _OF_A_CAMERA if group.pass_name is None else _OF_A_PASS, len(groups)))
-        if group.pass_name is None:
-            told += _estimates_by_others(view, group, alone, len(groups))
-        for own in told:
+        told = _estimates_of(alone, _OF_A_CAMERA if group.pass_name is None else _OF_A_PASS, len(groups))
+        by_others = _estimates_by_others(view, group, alone, len(groups)) if group.pass_name is None else ()
+        for own, is_by_others in (*((each, False) for each in told), *((each, True) for each in by_others)):
             compared += 1
             correction = replace(own, group=group)
             comparison = compare(gains_of_all(view, correction(view.dataset)), gains_of_all(view, view.dataset))
-            correction = replace(correction, comparison=comparison, chance=max(own.chance, comparison.chance))
+            is_borne_out = is_by_others and comparison.chance * len(groups) < AGAINST
+            chance = own.chance if is_borne_out else max(own.chance, comparison.chance)
+            correction = replace(correction, comparison=comparison, chance=chance)
             if best is None or comparison.difference > best.comparison.difference:
                 best = correction
     if best is None or best.chance * compared > LEAST_CHANCE:
@@ -206,7 +210,7 @@ def _estimates_by_others(view: View, group: Group, alone: View, groups: int) -> 
 
     What one camera sees little of alone, others see as well; and only they tell how high it is.
     """
-    own = tuple(_of_group(parameter, group) for parameter in _OF_A_MOUNT)
+    own = tuple(_of_group(parameter, group) for parameter in _OF_ONE_CAMERA)
     # Of a camera that is off by gates few votes are right at the gate at which good rays meet.
     first = estimate_of(_at_wider_gate(view), own)
     turn_rad = _LEAST_GATES * GATE_RAD * view.gate_share
@@ -216,14 +220,15 @@ def _estimates_by_others(view: View, group: Group, alone: View, groups: int) -> 
     found = estimate_of(view, own, start=first)
     assert found is not None
     given, least_rise = gains_of_all(view, view.dataset), LEAST_RISE * float(gains_of_all(alone, alone.dataset).sum())
-    for parameter, changes in zip(_OF_A_MOUNT, own, strict=True):
+    for parameter, changes in zip(_OF_ONE_CAMERA, own, strict=True):
         value, sigma = found.of(parameter.name)
         chance = _chance_of(found, parameter.name, groups)
         if chance > LEAST_CHANCE or abs(value) < least[parameter.name]:
             continue
         rise = compare(gains_of_all(view, changes.change(view.dataset, value)), given)
         if rise.difference >= least_rise:
-            yield Correction(parameter, value, sigma, chance, rise, found)
+            followed = _followed(view, Correction(changes, value, sigma, chance, rise, found), given)
+            yield replace(followed, parameter=parameter, chance=chance)
 
 
 def _at_wider_gate(view: View) -> View:
@@ -368,7 +373,9 @@ class CameraTilt(_CommonError):
     name: ClassVar[str] = "camera_tilt"
     parameters: ClassVar[tuple[str, ...]] = ("pitch", "roll")
     # The noise of pitch and roll hides how cameras are mounted.
-    completes: ClassVar[frozenset[str]] = frozenset({"camera_tilt", "pitch_and_roll", "inverted_mounts"})
+    completes: ClassVar[frozenset[str]] = frozenset(
+        {"camera_tilt", "camera_mount", "pitch_and_roll", "inverted_mounts"}
+    )
     do: ClassVar[str] = "Correct the rotation between car and camera, or the principal point's y."
 
     def says(self, view: View, name: str, value: float) -> str:
@@ -384,7 +391,7 @@ class CameraYaw(_CommonError):
 
     name: ClassVar[str] = "camera_yaw"
     parameters: ClassVar[tuple[str, ...]] = ("yaw",)
-    completes: ClassVar[frozenset[str]] = frozenset({"camera_yaw", "inverted_mounts"})
+    completes: ClassVar[frozenset[str]] = frozenset({"camera_yaw", "camera_mount", "inverted_mounts"})
     do: ClassVar[str] = "Correct the rotation between car and camera, or the principal point's x."
 
     def says(self, view: View, name: str, value: float) -> str:
@@ -447,7 +454,7 @@ class TimeShift(_CommonError):
         """Return what is wrong."""
         side = "behind" if value > 0 else "ahead of"
         images = abs(value) / view.step_m
-        return f"All poses are {abs(value):.2f} m along the road ({images:.1f} images) {side} their pictures."
+        return f"The poses are {abs(value):.2f} m along the road ({images:.1f} images) {side} their pictures."
 
     def shows(self, view: View, name: str, value: float, sigma: float) -> str:
         """Return metres."""

@@ -42,6 +42,9 @@ LEAST_RISE = 0.02
 agreement is within them, and changes no map."""
 LEAST_CHANCE = 1e-3
 """A finding that good data would give with a probability above this, all that was tried counted, is none."""
+AGAINST = 0.05
+"""What is told from something else than how well rays agree, that must bear out beyond this chance: rays agree better
+with a correction than without, and than with its opposite."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from scipy import stats
 
 import valuemap._core as _core
 from valuemap.check.agreement import Agreement, Comparison, agreement_on, compare
-from valuemap.check.fault import GATE_RAD, LEAST_CHANCE, MANY_DETECTIONS, WIDER_GATE, View
+from valuemap.check.fault import AGAINST, GATE_RAD, LEAST_CHANCE, MANY_DETECTIONS, WIDER_GATE, View
 from valuemap.check.fit import Estimate, Parameter, apply, estimate
 from valuemap.check.groups import Group, OfGroup
 from valuemap.check.sample import Sample, pixels_per_radian, sample_stretches
@@ -34,8 +34,6 @@ HALF_WAY = 0.5
 """The first rounds go at least so far."""
 _BLOCKS = 8
 """Of hundreds of metres each, longer than poses drift together."""
-_AGAINST = 0.05
-"""Rays must agree better with a correction than with its opposite, and than without, beyond this chance."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +117,7 @@ class Loose:
                 continue
             gain, opposite = (self._gain(parameter.change(self._dataset, way * value)) for way in (1.0, -1.0))
             comparison = compare(gain, opposite if opposite.sum() > given.sum() else given)
-            if comparison.chance * len(parameters) > _AGAINST:
+            if comparison.chance * len(parameters) > AGAINST:
                 continue
             # What another focal length explains as well is none of it.
             beside = self._beside(parameters, rival, parameter.name)

@@ -1,19 +1,40 @@
-"""How cameras hang on their car: two may be exchanged, and vehicle_from_cam may be taken for cam_from_vehicle."""
+"""How cameras hang on their car: two may be exchanged, vehicle_from_cam may be taken for cam_from_vehicle, and one may
+look any other way: by an angle in degrees that was read as radians, a sign, or the order of angles.
+"""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check.fault import SMALL_TURNS_RAD, Convention, Fix, with_images, with_poses
-from valuemap.check.headings import driving_azimuths, level_rotations
+from valuemap.check.agreement import Comparison, compare
+from valuemap.check.fault import (
+    AGAINST,
+    GATE_RAD,
+    LEAST_CHANCE,
+    LEAST_RISE,
+    SMALL_TURNS_RAD,
+    Convention,
+    Fault,
+    Finding,
+    Fix,
+    Stage,
+    View,
+    gains_of_all,
+    with_images,
+    with_poses,
+)
+from valuemap.check.groups import Group, OfGroup, groups_of
+from valuemap.check.headings import driving_azimuths, headings, level_rotations
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats, Images, Ints
+from valuemap.tables import Bools, Floats, Images, Ints
 
 
 class CamerasExchanged(Convention):
@@ -91,6 +112,233 @@ class _InvertedMounts:
 
 _NO_TURN = 1.0 + 2.0 * np.cos(SMALL_TURNS_RAD.max())
 """The trace of a turn by so much: by less, a contest takes it for a turn in the mount."""
+
+
+class CameraMount(Fault):
+    """One camera of several, or those of one pass, that look another way than their poses say, whichever it is."""
+
+    name: ClassVar[str] = "camera_mount"
+    stage: ClassVar[Stage] = "fine"
+
+    def find(self, view: View) -> Finding | None:
+        """Turn each group so that its rays meet most points that others see; take the turn by which all rays gain most.
+
+        How many points it must be, chance says; that all rays agree better is to bear it out. Turns as small as those
+        that mounts are off by are measured, not sought.
+        """
+        groups = groups_of(view.dataset)
+        found = [told for group in groups if (told := _turned_by_others(view, group)) is not None]
+        if not found:
+            return None
+        best = max(found, key=lambda each: each.comparison.difference)
+        chance = best.turn.chance * len(groups)
+        if chance > LEAST_CHANCE or best.comparison.chance * len(groups) > AGAINST:
+            return None
+        fix, turn_deg = OfGroup(best.group, best.turn), np.degrees(best.turn.angle_rad)
+        yaw_deg, pitch_deg = np.degrees(_looks(best.group.part(fix(view.dataset))))
+        side = "right" if yaw_deg > 0.0 else "left"
+        return Finding(
+            fault=self.name,
+            what=f"Only {best.group.text}: it looks another way than its poses say: {abs(yaw_deg):.0f} degrees to the "
+            f"{side} of where it is driven, and {pitch_deg:.0f} degrees up.",
+            why=f"Turned by {turn_deg:.0f} degrees in its mount, its rays meet {best.turn.points} of {best.turn.of} "
+            f"points that others see around it; the agreement of all rays rises by {best.comparison.difference:.0f} "
+            f"({best.comparison.places} places).",
+            do="Correct the rotation between car and camera: degrees for radians, a sign, the order of its angles?",
+            chance=chance,
+            figures={
+                "of": best.group.text,
+                "turn_deg": round(float(turn_deg), 2),
+                "yaw_deg": round(float(yaw_deg), 2),
+                "pitch_deg": round(float(pitch_deg), 2),
+                **best.comparison.to_json(),
+            },
+            fix=fix,
+            of=best.group.text,
+        )
+
+
+def _looks(dataset: Dataset) -> tuple[float, float]:
+    """Return how far most images look to the right of where they are driven, and how far up, in radians."""
+    azimuth_rad, pitch_rad, _ = headings(dataset)
+    way_rad, moves = driving_azimuths(dataset)
+    aside = np.exp(1j * (azimuth_rad - way_rad)[moves])
+    middle = np.mean(aside)
+    return float(np.angle(middle) + np.median(np.angle(aside / middle))), float(np.median(pitch_rad[moves]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Turn:
+    """Cameras turned in their mount, so that their rays meet so many `points` `of` those that others see.
+
+    `chance` is how likely any turn would make them meet as many by accident.
+    """
+
+    rotation: Rotation
+    points: int
+    of: int
+    chance: float = 1.0
+
+    @property
+    def angle_rad(self) -> float:
+        """By how much they are turned."""
+        return float(self.rotation.magnitude())
+
+    def __call__(self, dataset: Dataset) -> Dataset:
+        turned = self.rotation.as_matrix() @ rotation_matrices(dataset.images)
+        return with_poses(dataset, turned, camera_centers(dataset.images))
+
+
+@dataclass(frozen=True, eq=False)
+class _TurnOfGroup:
+    """The turn of a group, and how much better all rays agree with it."""
+
+    group: Group
+    turn: _Turn
+    comparison: Comparison
+
+
+def _turned_by_others(view: View, group: Group) -> _TurnOfGroup | None:
+    bearings = _bearings(view, group)
+    turn = None if bearings is None else _best_turn(bearings, GATE_RAD * view.gate_share)
+    if turn is None or turn.angle_rad < SMALL_TURNS_RAD[-1]:
+        return None
+    given = gains_of_all(view, view.dataset)
+    comparison = compare(gains_of_all(view, OfGroup(group, turn)(view.dataset)), given)
+    alone = group.alone(view)
+    if comparison.difference < LEAST_RISE * float(gains_of_all(alone, alone.dataset).sum()):
+        return None
+    return _TurnOfGroup(group, turn, comparison)
+
+
+_LEAST_OTHERS = 3
+"""Votes of others that make a point: two rays of different images nearly always meet somewhere."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Bearings:
+    """All pairs (N) of a ray of a group and a point of its place and class that others see, some of which meet.
+
+    Unit vectors to the `point` in a level camera that looks where the image is driven, to the point in the camera as
+    its pose has it, and along the ray in the camera. Only the second depends on how it is said to be mounted.
+    """
+
+    to_point_level: Floats
+    to_point_in_cam: Floats
+    ray_in_cam: Floats
+    point: Ints
+
+
+def _bearings(view: View, group: Group) -> _Bearings | None:
+    sample, agreement = view.many_places, view.agreement_at_many_places
+    found, rays, images = agreement.found, agreement.rays, sample.dataset.images
+    if not len(found):
+        return None
+    mine, starts = group.images_of(sample.dataset), found.voter_offsets[:-1]
+    voters = found.voters.astype(np.int64)
+    votes_of_others = np.add.reduceat((~mine[rays.image_row[voters]]).astype(np.int64), starts)
+    first = voters[starts]
+    place_of_point = sample.place_of_image[rays.image_row[first]]
+    of_others = votes_of_others >= _LEAST_OTHERS
+    is_own: Bools = mine[rays.image_row] & np.isfinite(rays.direction_in_world[:, 0])
+    rows, points = [], []
+    for place in np.unique(place_of_point[of_others]):
+        own = np.flatnonzero(is_own & (sample.place_of_image[rays.image_row] == place))
+        others = np.flatnonzero(of_others & (place_of_point == place))
+        row, point = np.nonzero(rays.class_code[own][:, None] == rays.class_code[first[others]])
+        rows.append(own[row])
+        points.append(others[point])
+    ray, point = (np.concatenate([*each, np.empty(0, np.int64)]) for each in (rows, points))
+    if not len(ray):
+        return None
+    image = rays.image_row[ray]
+    to_point = found.position_in_world_m[point] - rays.center_in_world_m[ray]
+    to_point /= np.linalg.norm(to_point, axis=1, keepdims=True)
+    azimuth_rad, _ = driving_azimuths(view.dataset)
+    level = level_rotations(azimuth_rad[sample.image_row], view.dataset.frame)[image]
+    given = rotation_matrices(images)[image]
+    return _Bearings(
+        to_point_level=np.einsum("nij,nj->ni", level, to_point),
+        to_point_in_cam=np.einsum("nij,nj->ni", given, to_point),
+        ray_in_cam=np.einsum("nij,nj->ni", given, rays.direction_in_world[ray]),
+        point=point,
+    )
+
+
+_MOST_PITCH_RAD = np.radians(25.0)
+"""Cameras for the street look no higher or lower; and so far yaw and pitch of a ray and of its camera add up."""
+_CELL_GATES = 8.0
+"""Width of a cell of yaw and pitch: errors of poses, of headings along a drive, and of sums for turns in it."""
+_MET_GATES = 2.0
+_PEAKS, _ROUNDS = 3, 4
+_SHIFTS = tuple(itertools.product((0.0, 0.5), repeat=2))
+"""Grids of cells, in shares of a cell: what lies at the border of two is in the middle of one of another grid."""
+
+
+def _best_turn(bearings: _Bearings, gate_rad: float) -> _Turn | None:
+    """Return the turn by which rays meet most points, each counted once however often a standing car sees it.
+
+    Every pair says how the camera would look, were they one: the right ones say the same. The fullest cells of yaw and
+    pitch are followed to the rotation that their pairs have in common (Wahba's problem).
+    """
+    level, ray = _yaw_and_pitch(bearings.to_point_level), _yaw_and_pitch(bearings.ray_in_cam)
+    looks = np.stack([np.angle(np.exp(1j * (level[0] - ray[0]))), level[1] - ray[1]])
+    may_be = np.flatnonzero(np.abs(looks[1]) < _MOST_PITCH_RAD)
+    found = []
+    for shift in _SHIFTS:
+        grid = _Grid(looks[:, may_be], bearings.point[may_be], _CELL_GATES * gate_rad, shift)
+        found += [may_be[grid.cell == peak] for peak in np.argsort(-grid.points, kind="stable")[:_PEAKS]]
+    followed = [_followed(bearings, near, _MET_GATES * gate_rad) for near in found]
+    best = max((each for each in followed if each is not None), key=lambda each: each.points, default=None)
+    if best is None:
+        return None
+    grid = _Grid(looks[:, may_be], bearings.point[may_be], 2.0 * _MET_GATES * gate_rad, _SHIFTS[0])
+    tried = grid.columns * grid.rows * len(_SHIFTS) * _ROUNDS
+    return replace(best, chance=tried * float(stats.poisson.sf(best.points - 1, grid.usual_points)))
+
+
+class _Grid:
+    """Which `cell` of yaw and pitch each pair (N) is in, and how many different `points` (K) the pairs of each have."""
+
+    def __init__(self, looks: Floats, point: Ints, width_rad: float, shift: tuple[float, float]) -> None:
+        self.columns = max(int(2.0 * np.pi / width_rad), 1)
+        self.rows = max(int(2.0 * _MOST_PITCH_RAD / width_rad), 1)
+        column = np.floor(looks[0] / (2.0 * np.pi) * self.columns + shift[0]).astype(np.int64) % self.columns
+        self._row = np.floor(looks[1] / width_rad + shift[1]).astype(np.int64)
+        (_, self._row_of_cell), self.cell = np.unique(np.stack([column, self._row]), axis=1, return_inverse=True)
+        self.cell = self.cell.ravel()
+        pairs = np.unique(np.stack([self.cell, point]), axis=1)
+        self.points = np.bincount(pairs[0], minlength=len(self._row_of_cell))
+
+    @property
+    def usual_points(self) -> float:
+        """How many a cell has on average, at the pitch at which it is most."""
+        if not len(self.points):
+            return 0.0
+        row = self._row_of_cell - self._row_of_cell.min()
+        return float(np.bincount(row, weights=self.points).max()) / self.columns
+
+
+def _followed(bearings: _Bearings, near: Ints, met_rad: float) -> _Turn | None:
+    for _ in range(_ROUNDS):
+        if len(np.unique(bearings.point[near])) < _LEAST_OTHERS:
+            return None
+        weight = 1.0 / np.bincount(bearings.point[near])[bearings.point[near]]
+        turn = _turn_between(bearings.to_point_in_cam[near], bearings.ray_in_cam[near], weight)
+        missed_by = np.linalg.norm(turn.apply(bearings.to_point_in_cam) - bearings.ray_in_cam, axis=1)
+        near = np.flatnonzero(missed_by < met_rad)
+    return _Turn(turn, *(len(np.unique(each)) for each in (bearings.point[near], bearings.point)))
+
+
+def _turn_between(first: Floats, second: Floats, weight: Floats) -> Rotation:
+    """Return the rotation that takes unit vectors (N, 3) nearest to others, by weighted squares (Markley, 1988)."""
+    left, _, right = np.linalg.svd((weight[:, None] * second).T @ first)
+    return Rotation.from_matrix(left @ np.diag([1.0, 1.0, np.linalg.det(left) * np.linalg.det(right)]) @ right)
+
+
+def _yaw_and_pitch(direction: Floats) -> tuple[Floats, Floats]:
+    """Return how far directions (N, 3) in a level camera are to its right, and up, in radians."""
+    return np.arctan2(direction[:, 0], direction[:, 2]), np.arcsin(np.clip(-direction[:, 1], -1.0, 1.0))
 
 
 class _Exchanged:

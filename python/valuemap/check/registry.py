@@ -35,7 +35,7 @@ from valuemap.check.frames import (
     WorldAxes,
 )
 from valuemap.check.lenses import FocalUnit, PrincipalPoint
-from valuemap.check.mounts import CamerasExchanged, InvertedMounts
+from valuemap.check.mounts import CameraMount, CamerasExchanged, InvertedMounts
 from valuemap.check.passes import (
     InterleavedPasses,
     NoDrives,
@@ -101,6 +101,7 @@ FAULTS: tuple[Fault, ...] = (
     TimeUnit(),
     HeightZero(),
     WrongCamera(),
+    CameraMount(),
     PassOffset(),
     PassTimeShift(),
     CameraHeight(),
