@@ -56,6 +56,7 @@ class NormalisedBoxes(Fault):
 
     name: ClassVar[str] = "boxes_normalised"
     stage: ClassVar[Stage] = "tables"
+    is_of_rows: ClassVar[bool] = True
 
     def find(self, view: View) -> Finding | None:
         """Look for boxes that all lie in the first pixel."""
@@ -78,6 +79,7 @@ class CornersAsCenter(Fault):
 
     name: ClassVar[str] = "boxes_as_corners"
     stage: ClassVar[Stage] = "tables"
+    is_of_rows: ClassVar[bool] = True
 
     def find(self, view: View) -> Finding | None:
         """See whether width and height are always beyond x and y, and still in the picture."""
@@ -107,6 +109,7 @@ class TopLeftAsCenter(Fault):
 
     name: ClassVar[str] = "boxes_top_left"
     stage: ClassVar[Stage] = "tables"
+    is_of_rows: ClassVar[bool] = True
 
     def find(self, view: View) -> Finding | None:
         """Compare how boxes end at the left and top of pictures with how they end at the right and bottom."""

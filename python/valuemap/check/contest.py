@@ -35,7 +35,7 @@ from valuemap.check.fault import (
     uprightness,
 )
 from valuemap.check.fit import Parameter
-from valuemap.check.groups import Group, OfGroup, fits_one_group, groups_of
+from valuemap.check.groups import Group, OfGroup, fits_one_group, groups_of, only
 from valuemap.check.sample import Sample
 from valuemap.dataset import Dataset
 from valuemap.progress import Progress, silent
@@ -180,7 +180,7 @@ def find_odd_group(
         own = [_OfOneGroup(convention, part, group) for convention in may_be]
         finding = hold_contest(alone[group], own, progress).finding
         if finding is not None and finding.fix is not None:
-            finding = _only(group, finding)
+            finding = only(group, finding)
         elif group in suspects:
             finding = hold_contest(view, [_AmongOthers(each, group) for each in own], progress, group).finding
         if finding is None or finding.fix is None or finding.chance is None:
@@ -194,18 +194,6 @@ def find_odd_group(
         # Pictures of another size are those of a camera of the table, where there is one of that size.
         return better_explained(view, WrongCamera().find(view), replace(finding, chance=chance))
     return None
-
-
-def _only(group: Group, finding: Finding) -> Finding:
-    """Return what is found in a group on its own as a finding of the whole."""
-    assert finding.fix is not None
-    return replace(
-        finding,
-        what=f"Only {group.text}: {finding.what}",
-        figures={"of": group.text, **finding.figures},
-        fix=OfGroup(group, finding.fix),
-        of=group.text,
-    )
 
 
 def better_explained(view: View, wide: Finding | None, odd: Finding | None) -> Finding | None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from valuemap.check.contest import better_explained, find_odd_group, hold_contest, spoils_a_group
 from valuemap.check.fault import STAGES, Fault, Finding, Fix, View, agreement_after
+from valuemap.check.groups import find_in_groups
 from valuemap.check.prospects import describe_prospects
 from valuemap.check.registry import CONVENTIONS, FAULTS
 from valuemap.dataset import Dataset
@@ -128,11 +129,13 @@ def _look(view: View, stage: str, progress: Progress) -> list[Finding]:
     found: list[Finding] = []
     for number, fault in enumerate(faults):
         progress(_WORK[stage], number, len(faults))
-        if fault.name in view.known and stage != "fine":
+        if fault.name in view.known and stage != "fine" and not fault.is_of_rows:
             continue
         if fault.explained_by & (view.known | {finding.fault for finding in found}):
             continue
         finding = fault.find(view)
+        if finding is None and fault.is_of_rows:
+            finding = find_in_groups(view, fault)
         if finding is not None and finding.fix is not None and fault.rivals:
             finding = _best_of(view, finding, [each for each in faults if each.name in fault.rivals])
         if finding is not None and not (finding.fix is None and finding.fault in view.known):

@@ -216,6 +216,9 @@ class Fault(ABC):
     rivals: ClassVar[frozenset[str]] = frozenset()
     """Faults that move what is seen about as this one does: the one whose fix lets all rays agree best is there."""
 
+    is_of_rows: ClassVar[bool] = False
+    """Whether single rows show it, so that one camera or pass may have it alone."""
+
     @abstractmethod
     def find(self, view: View) -> Finding | None:
         """Return what is wrong, or None."""

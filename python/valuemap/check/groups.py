@@ -7,13 +7,13 @@ says little of it. So each group is looked at as a dataset of its own, and what 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from valuemap.check.fault import Fix, View, keep_rows
+from valuemap.check.fault import LEAST_CHANCE, Fault, Finding, Fix, View, keep_rows
 from valuemap.dataset import Dataset, rows_of
 from valuemap.tables import Bools, Cameras, Categories
 
@@ -106,6 +106,31 @@ class OfGroup:
             }
         )
         return result if self.group.pass_name is not None else _with_camera(result, changed.cameras)
+
+
+def only(group: Group, finding: Finding) -> Finding:
+    """Return what is found in a group on its own as a finding of the whole."""
+    assert finding.fix is not None
+    return replace(
+        finding,
+        what=f"Only {group.text}: {finding.what}",
+        figures={"of": group.text, **finding.figures},
+        fix=OfGroup(group, finding.fix),
+        of=group.text,
+    )
+
+
+def find_in_groups(view: View, fault: Fault) -> Finding | None:
+    """Return what is wrong with the rows of one camera or pass alone, by as small a chance as that of the whole."""
+    groups = groups_of(view.dataset)
+    for group in groups:
+        finding = fault.find(group.alone(view))
+        if finding is None or finding.fix is None:
+            continue
+        chance = None if finding.chance is None else finding.chance * len(groups)
+        if chance is None or chance < LEAST_CHANCE:
+            return only(group, replace(finding, chance=chance))
+    return None
 
 
 def fits_one_group(fix: Fix, part: Dataset, group: Group) -> bool:
