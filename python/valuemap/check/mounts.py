@@ -271,7 +271,7 @@ _CELL_GATES = 8.0
 """Width of a cell of yaw and pitch: errors of poses, of headings along a drive, and of sums for turns in it."""
 _MET_GATES = 2.0
 _PEAKS, _ROUNDS = 3, 4
-_SHIFTS = tuple(itertools.product((0.0, 0.5), repeat=2))
+_SHIFTS = ((0.0, 0.0), (0.0, 0.5), (0.5, 0.0), (0.5, 0.5))
 """Grids of cells, in shares of a cell: what lies at the border of two is in the middle of one of another grid."""
 
 

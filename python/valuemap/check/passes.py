@@ -161,6 +161,8 @@ class PassShift:
     chance: float
     passes: int
     seam: Seam | None = None
+    points: int = 0
+    """How many points of the pass are where others have one, where it is told from these."""
 
 
 OF_ITS_CAMERA = frozenset({"focal_length", "camera_tilt", "camera_yaw"})
@@ -576,7 +578,7 @@ def meeting_of_passes(view: View) -> Meeting | None:
 
 def _worst_pass(view: View) -> PassShift | None:
     """See whether a pass's rays meet the points of the others better when it is moved, or its poses jump at an end."""
-    return _apart_from_others(view) or _at_a_seam(view)
+    return _apart_from_others(view) or _far_from_others(view) or _at_a_seam(view)
 
 
 def seen_m(view: View) -> float:
@@ -639,6 +641,48 @@ def _apart_from_others(view: View) -> PassShift | None:
             candidates.append((shift.pairs - shift.pairs_at_zero, code, is_along, shift.offset_m))
     candidates.sort(key=lambda each: (-each[0], each[1], each[2]))
     return _best_shift(view, meeting, candidates[:_MOST_CANDIDATES], len(tried), tolerance_m)
+
+
+def _far_from_others(view: View) -> PassShift | None:
+    """Return the shift by which what a pass sees is what the others see, where it is farther off than rays tell.
+
+    Then its points are in other places than theirs. The right shift stands out of all others: by the next best one
+    fewer of its points have another, beyond what chance makes of two that are alike.
+    """
+    points = _pass_points(view)
+    if points is None:
+        return None
+    meeting, tolerance_m = points.meeting, view.step_m / 2.0
+    codes, number = np.unique(meeting.pass_of_point, return_counts=True)
+    tried = codes[np.argsort(-number, kind="stable")][:_MOST_PASSES]
+    found: list[tuple[int, PassShift]] = []
+    for code in tried.tolist():
+        own, others = np.flatnonzero(meeting.pass_of_point == code), np.flatnonzero(meeting.pass_of_point != code)
+        i, j = pairs_within(meeting.point[own], meeting.point[others], within_m=None)
+        same = meeting.class_of_point[own[i]] == meeting.class_of_point[others[j]]
+        own_point, difference = own[i[same]], meeting.point[others[j[same]]] - meeting.point[own[i[same]]]
+        shift = densest(difference, tolerance_m)
+        if shift is None or np.linalg.norm(shift.offset_m) <= _SEARCH_STEPS * view.step_m:
+            continue
+        away_m = np.linalg.norm(difference - shift.offset_m, axis=1)
+        next_best = densest(difference[away_m > _NEXT_TIMES * tolerance_m], tolerance_m)
+        met = len(np.unique(own_point[away_m <= tolerance_m]))
+        met_by_next = 0
+        if next_best is not None:
+            is_next = np.linalg.norm(difference - next_best.offset_m, axis=1) <= tolerance_m
+            met_by_next = len(np.unique(own_point[is_next]))
+        chance = float(stats.binom.sf(met - 1, met + met_by_next, 0.5)) * len(tried)
+        if chance < LEAST_CHANCE:
+            name = view.dataset.images.pass_id.names[code]
+            offset_m = shift.offset_m
+            found.append(
+                (met - met_by_next, PassShift(name, offset_m, False, 0.0, 0.0, chance, len(tried), points=met))
+            )
+    return max(found, key=lambda each: each[0])[1] if found else None
+
+
+_NEXT_TIMES = 4.0
+"""So many tolerances away from the best shift, no pair of points agrees with it and with another."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -743,12 +787,18 @@ def _is_vertical(view: View, offset_m: Floats) -> bool:
 def _shift_finding(fault: str, shift: PassShift, what: str, do: str) -> Finding:
     frame = "forward, left, up" if shift.is_along else "x, y, z"
     numbers = ", ".join(f"{part:.2f}" for part in shift.offset_m)
-    if shift.seam is None:
+    if shift.points:
+        why = (
+            f"Moved by {numbers} m ({frame}), {shift.points} things that it sees are where others see such; by no "
+            "other shift nearly as many are."
+        )
+        figures: dict[str, Any] = {"points_if_moved": shift.points}
+    elif shift.seam is None:
         why = (
             f"Moved by {numbers} m ({frame}), what it sees is where other passes see it: the agreement of its rays "
             f"with the others' points rises from {shift.gain_without:.0f} to {shift.gain:.0f}."
         )
-        figures: dict[str, Any] = {
+        figures = {
             "agreement_as_given": round(shift.gain_without, 1),
             "agreement_if_moved": round(shift.gain, 1),
         }
