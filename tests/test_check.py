@@ -998,7 +998,7 @@ def test_one_camera_upside_down_is_named_and_undone(
     fixed = odd.fix(upside_down.dataset).images
     np.testing.assert_allclose(rotation_matrices(fixed), rotation_matrices(few.images), atol=1e-9)
     assert told_of_convention("camera_axes", upside_down.dataset, monkeypatch) == [("camera_axes", "camera 1")]
-    monkeypatch.setattr(contest, "_FAR_WORSE", 0.0)
+    monkeypatch.setattr(contest, "FAR_WORSE", 0.0)
     assert contest.find_odd_group(upside_down, CONVENTIONS) is None
 
 

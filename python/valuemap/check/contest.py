@@ -23,9 +23,11 @@ from valuemap.cameras import rotation_matrices
 from valuemap.check.agreement import Agreement, Comparison, agreement_on, compare, gains_of_objects
 from valuemap.check.cameras import PARAMETERS, WrongCamera
 from valuemap.check.fault import (
+    FAR_WORSE,
     LEAST_CHANCE,
     LEAST_RISE,
     SMALL_TURNS_RAD,
+    TIE,
     WIDER_GATE,
     Convention,
     Finding,
@@ -49,13 +51,9 @@ _FROM_RAYS = 0.05
 """However upright cameras stand under a reading, rays must prefer it beyond this chance."""
 _SUSPICIOUS = 0.05
 """What good data would give with a probability above this, all that was tried counted, is not even told."""
-_FAR_WORSE = 0.5
-"""A group whose detections agree less than half as well as those of others, beyond chance, has a contest of its own."""
 _MAY_BE = 0.05
 """Of so many good cameras one is looked at alone for each reading that rays do not object to."""
 _LEAST_PRODUCT = 1e-300
-_TIE = 1e-3
-"""Gains as close as this are the same: readings that differ in the last digits only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +170,7 @@ def find_odd_group(
         others = [
             worth[each] for each in groups if each != group and (each.pass_name is None) == (group.pass_name is None)
         ]
-        least = _FAR_WORSE * float(np.median(others)) if others else 0.0
+        least = FAR_WORSE * float(np.median(others)) if others else 0.0
         if worth[group] >= least and group not in suspects:
             continue
         part = alone[group].dataset
@@ -188,7 +186,7 @@ def find_odd_group(
         chance = finding.chance * len(groups)
         mended = View(group.part(finding.fix(view.dataset)), gate_share=view.gate_share)
         # Cameras see more or less: it is enough to agree as well as the least of those that agree.
-        enough = _FAR_WORSE * min((each for each in others if each >= least), default=0.0)
+        enough = FAR_WORSE * min((each for each in others if each >= least), default=0.0)
         if chance > LEAST_CHANCE or _worth_of(mended) < enough:
             continue
         # Pictures of another size are those of a camera of the table, where there is one of that size.
@@ -201,7 +199,7 @@ def better_explained(view: View, wide: Finding | None, odd: Finding | None) -> F
     if wide is None or odd is None:
         return wide or odd
     of_wide, of_odd = (agreement_after(view, each.fix) for each in (wide, odd) if each.fix is not None)
-    return wide if of_wide > (1.0 - _TIE) * of_odd else odd
+    return wide if of_wide > (1.0 - TIE) * of_odd else odd
 
 
 def spoils_a_group(view: View, fix: Fix) -> bool:
@@ -321,7 +319,7 @@ def _judge(view: View, readings: Sequence[_Reading], top: _Reading) -> Finding |
     if not given.is_upright:  # What was measured may well stand: nothing need be given up for a guess.
         alike = [reading for reading in alike if not reading.is_guess] or alike
     most = max(total[id(reading)] for reading in alike)
-    chosen = next(reading for reading in alike if total[id(reading)] > (1.0 - _TIE) * most)
+    chosen = next(reading for reading in alike if total[id(reading)] > (1.0 - TIE) * most)
     assert chosen.convention is not None
     everywhere[id(given)] = _everywhere(view, given)
     assert chosen.fix is not None

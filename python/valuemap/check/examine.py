@@ -9,6 +9,7 @@ from typing import Any
 from valuemap.check.contest import better_explained, find_odd_group, hold_contest, spoils_a_group
 from valuemap.check.fault import STAGES, Fault, Finding, Fix, View, agreement_after
 from valuemap.check.groups import find_in_groups
+from valuemap.check.others import find_by_others
 from valuemap.check.prospects import describe_prospects
 from valuemap.check.registry import CONVENTIONS, FAULTS
 from valuemap.dataset import Dataset
@@ -98,9 +99,9 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
                 gate_share = verdict.gate_share or gate_share
                 finding = verdict.finding
                 if meets and (finding is None or (finding.fix is not None and spoils_a_group(view, finding.fix))):
-                    finding = better_explained(
-                        view, finding, find_odd_group(view, CONVENTIONS, progress, verdict.suspects)
-                    )
+                    odd = find_odd_group(view, CONVENTIONS, progress, verdict.suspects)
+                    finding = better_explained(view, finding, odd)
+                    finding = better_explained(view, finding, find_by_others(view, CONVENTIONS))
                 found = [] if finding is None else [finding]
             else:
                 found = _look(view, stage, progress)

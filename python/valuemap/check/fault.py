@@ -42,6 +42,10 @@ LEAST_RISE = 0.02
 agreement is within them, and changes no map."""
 LEAST_CHANCE = 1e-3
 """A finding that good data would give with a probability above this, all that was tried counted, is none."""
+FAR_WORSE = 0.5
+"""What agrees less than half as well as others do, or as it would if it were read otherwise, has more than errors."""
+TIE = 1e-3
+"""Gains as close as this share are the same: readings that differ in the last digits only."""
 AGAINST = 0.05
 """What is told from something else than how well rays agree, that must bear out beyond this chance: rays agree better
 with a correction than without, and than with its opposite."""

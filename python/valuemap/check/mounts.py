@@ -33,8 +33,9 @@ from valuemap.check.fault import (
 )
 from valuemap.check.groups import Group, OfGroup, groups_of
 from valuemap.check.headings import driving_azimuths, headings, level_rotations
+from valuemap.check.others import points_of_others, rays_relative_to
 from valuemap.dataset import Dataset
-from valuemap.tables import Bools, Floats, Images, Ints
+from valuemap.tables import Floats, Images, Ints
 
 
 class CamerasExchanged(Convention):
@@ -211,10 +212,6 @@ def _turned_by_others(view: View, group: Group) -> _TurnOfGroup | None:
     return _TurnOfGroup(group, turn, comparison)
 
 
-_LEAST_OTHERS = 3
-"""Votes of others that make a point: two rays of different images nearly always meet somewhere."""
-
-
 @dataclass(frozen=True, eq=False)
 class _Bearings:
     """All pairs (N) of a ray of a group and a point of its place and class that others see, some of which meet.
@@ -230,33 +227,20 @@ class _Bearings:
 
 
 def _bearings(view: View, group: Group) -> _Bearings | None:
-    sample, agreement = view.many_places, view.agreement_at_many_places
-    found, rays, images = agreement.found, agreement.rays, sample.dataset.images
-    if not len(found):
+    parts = points_of_others(view, group)
+    if parts is None:
         return None
-    mine, starts = group.images_of(sample.dataset), found.voter_offsets[:-1]
-    voters = found.voters.astype(np.int64)
-    votes_of_others = np.add.reduceat((~mine[rays.image_row[voters]]).astype(np.int64), starts)
-    first = voters[starts]
-    place_of_point = sample.place_of_image[rays.image_row[first]]
-    of_others = votes_of_others >= _LEAST_OTHERS
-    is_own: Bools = mine[rays.image_row] & np.isfinite(rays.direction_in_world[:, 0])
-    rows, points = [], []
-    for place in np.unique(place_of_point[of_others]):
-        own = np.flatnonzero(is_own & (sample.place_of_image[rays.image_row] == place))
-        others = np.flatnonzero(of_others & (place_of_point == place))
-        row, point = np.nonzero(rays.class_code[own][:, None] == rays.class_code[first[others]])
-        rows.append(own[row])
-        points.append(others[point])
-    ray, point = (np.concatenate([*each, np.empty(0, np.int64)]) for each in (rows, points))
+    part, points = parts
+    rays = rays_relative_to(part, points.middle_in_world_m)
+    ray, point = points.pairs(rays)
     if not len(ray):
         return None
     image = rays.image_row[ray]
-    to_point = found.position_in_world_m[point] - rays.center_in_world_m[ray]
+    to_point = points.position_m[point] - rays.center_in_world_m[ray]
     to_point /= np.linalg.norm(to_point, axis=1, keepdims=True)
     azimuth_rad, _ = driving_azimuths(view.dataset)
-    level = level_rotations(azimuth_rad[sample.image_row], view.dataset.frame)[image]
-    given = rotation_matrices(images)[image]
+    azimuth_rad = azimuth_rad[view.many_places.image_row][group.images_of(view.many_places.dataset)]
+    level, given = level_rotations(azimuth_rad, view.dataset.frame)[image], rotation_matrices(part.images)[image]
     return _Bearings(
         to_point_level=np.einsum("nij,nj->ni", level, to_point),
         to_point_in_cam=np.einsum("nij,nj->ni", given, to_point),
@@ -271,6 +255,8 @@ _CELL_GATES = 8.0
 """Width of a cell of yaw and pitch: errors of poses, of headings along a drive, and of sums for turns in it."""
 _MET_GATES = 2.0
 _PEAKS, _ROUNDS = 3, 4
+_LEAST_POINTS = 3
+"""Two points fit two rays by many turns."""
 _SHIFTS = ((0.0, 0.0), (0.0, 0.5), (0.5, 0.0), (0.5, 0.5))
 """Grids of cells, in shares of a cell: what lies at the border of two is in the middle of one of another grid."""
 
@@ -321,7 +307,7 @@ class _Grid:
 
 def _followed(bearings: _Bearings, near: Ints, met_rad: float) -> _Turn | None:
     for _ in range(_ROUNDS):
-        if len(np.unique(bearings.point[near])) < _LEAST_OTHERS:
+        if len(np.unique(bearings.point[near])) < _LEAST_POINTS:
             return None
         weight = 1.0 / np.bincount(bearings.point[near])[bearings.point[near]]
         turn = _turn_between(bearings.to_point_in_cam[near], bearings.ray_in_cam[near], weight)

@@ -1,0 +1,186 @@
+"""What others see of the places of one camera or pass, and whether its own rays meet that.
+
+A group of few rays, or one whose rays agree among themselves as well if they are read wrongly (a mirrored picture of a
+straight road is one, too), still has the points that others see to meet. They are there whatever is wrong with it.
+Each point counts once, however often a standing car sees it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from valuemap.cameras import Rays, camera_poses, local_pinholes, rays_of_pinholes
+from valuemap.check.agreement import compare
+from valuemap.check.fault import (
+    AGAINST,
+    FAR_WORSE,
+    LEAST_CHANCE,
+    TIE,
+    Convention,
+    Finding,
+    Fix,
+    View,
+    gains_of_all,
+)
+from valuemap.check.groups import Group, OfGroup, fits_one_group, groups_of
+from valuemap.dataset import Dataset
+from valuemap.tables import Floats, Ints
+
+LEAST_OTHERS = 3
+"""Votes of others that make a point: two rays of different images nearly always meet somewhere."""
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points (P, 3) that others than a group see, relative to `middle_in_world_m` (3), with their places and classes.
+
+    `place_of_image` (N) is the place of each image of the group, of those that are in any.
+    """
+
+    position_m: Floats
+    middle_in_world_m: Floats
+    place: Ints
+    class_code: NDArray[np.int32]
+    place_of_image: Ints
+
+    def pairs(self, rays: Rays) -> tuple[Ints, Ints]:
+        """Return the rows of rays of the group, and of points in the same place and of the same class, of all pairs."""
+        place, rows, points = self.place_of_image[rays.image_row], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+        has_ray = np.isfinite(rays.direction_in_world[:, 0])
+        for each in np.unique(self.place).tolist():
+            own, others = np.flatnonzero(has_ray & (place == each)), np.flatnonzero(self.place == each)
+            row, point = np.nonzero(rays.class_code[own][:, None] == self.class_code[others])
+            rows.append(own[row])
+            points.append(others[point])
+        return np.concatenate(rows), np.concatenate(points)
+
+    def worth(self, part: Dataset, gate_px: float) -> Floats:
+        """Return how well the rays of a version of the group meet each point (P); each ray meets the nearest one."""
+        rays = rays_relative_to(part, self.middle_in_world_m)
+        row, point = self.pairs(rays)
+        to_point = self.position_m[point] - rays.center_in_world_m[row]
+        local = np.einsum("nij,nj->ni", rays.residual_from_world[row], to_point)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            error2_px = (local[:, 0] ** 2 + local[:, 1] ** 2) / local[:, 2] ** 2
+        worth = np.where(local[:, 2] > 0.0, np.maximum(1.0 - error2_px / gate_px**2, 0.0), 0.0)
+        order = np.lexsort((worth, row))
+        nearest = order[np.append(np.diff(row[order]) != 0, True)] if len(order) else order
+        return np.asarray(
+            np.bincount(point[nearest], weights=worth[nearest], minlength=len(self.place)), dtype=np.float64
+        )
+
+
+def rays_relative_to(dataset: Dataset, middle_in_world_m: Floats) -> Rays:
+    """Return the rays of all detections, from camera centres relative to a point (3)."""
+    cam_from_world, center_in_world_m = camera_poses(dataset.images)
+    return rays_of_pinholes(
+        local_pinholes(dataset), dataset.detections, cam_from_world, center_in_world_m - middle_in_world_m
+    )
+
+
+def points_of_others(view: View, group: Group) -> tuple[Dataset, Points] | None:
+    """Return the images of a group that are in the places of a view, and what others see there; None where nothing."""
+    sample, agreement = view.many_places, view.agreement_at_many_places
+    found, rays = agreement.found, agreement.rays
+    mine = group.images_of(sample.dataset)
+    if not len(found) or not mine.any():
+        return None
+    starts, voters = found.voter_offsets[:-1], found.voters.astype(np.int64)
+    votes_of_others = np.add.reduceat((~mine[rays.image_row[voters]]).astype(np.int64), starts)
+    first, kept = voters[starts], votes_of_others >= LEAST_OTHERS
+    if not kept.any():
+        return None
+    points = Points(
+        found.position_in_world_m[kept],
+        agreement.middle_in_world_m,
+        sample.place_of_image[rays.image_row[first[kept]]].astype(np.int64),
+        rays.class_code[first[kept]],
+        sample.place_of_image[mine].astype(np.int64),
+    )
+    return group.part(sample.dataset), points
+
+
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    """A reading of a group, and how well its rays meet each point of others then."""
+
+    convention: Convention
+    how: str
+    fix: Fix
+    worth: Floats
+
+
+def find_by_others(view: View, conventions: Sequence[Convention]) -> Finding | None:
+    """Look for a camera or pass whose rays meet little of what others see, but do if they are read another way.
+
+    Little is less than half: good rays may meet a little more if read otherwise, by errors of poses and of lenses.
+    The points are compared one by one, each with itself, and all readings of all groups are counted. That all rays
+    agree better is to bear it out.
+    """
+    groups = groups_of(view.dataset)
+    given = gains_of_all(view, view.dataset)
+    found: list[tuple[float, Finding]] = []
+    for group in groups:
+        finding = _of_group(view, conventions, group, len(groups))
+        if finding is None or finding.fix is None:
+            continue
+        gain = compare(gains_of_all(view, finding.fix(view.dataset)), given)
+        if gain.chance * len(groups) < AGAINST:
+            found.append((gain.difference, finding))
+    return max(found, key=lambda each: each[0])[1] if found else None
+
+
+def _of_group(view: View, conventions: Sequence[Convention], group: Group, groups: int) -> Finding | None:
+    parts = points_of_others(view, group)
+    if parts is None:
+        return None
+    part, points = parts
+    given = points.worth(part, view.gate_px)
+    readings = list(_readings(view, conventions, group, part, points))
+    if not readings:
+        return None
+    most = max(float(each.worth.sum()) for each in readings)
+    best = next(each for each in readings if float(each.worth.sum()) >= (1.0 - TIE) * most)
+    if float(given.sum()) > FAR_WORSE * most:
+        return None
+    comparison = compare(best.worth, given)
+    chance = comparison.chance * len(readings) * groups
+    if chance > LEAST_CHANCE:
+        return None
+    how, own = best.convention.refined(group.alone(view), best.how, best.fix)
+    met, met_as_given = (int(np.sum(each > 0.0)) for each in (best.worth, given))
+    return Finding(
+        fault=best.convention.name,
+        what=f"Only {group.text}: {best.convention.what}",
+        why=f"Read as {how}, its rays meet {met} of {len(given)} points that others see around it, as given "
+        f"{met_as_given}; the agreement with them rises from {given.sum():.0f} to {best.worth.sum():.0f}.",
+        do=best.convention.do,
+        chance=chance,
+        figures={
+            "of": group.text,
+            "reading": how,
+            "points": len(given),
+            "met_as_given": met_as_given,
+            "met_if_read_so": met,
+            "difference": round(comparison.difference, 2),
+        },
+        fix=OfGroup(group, own),
+        of=group.text,
+    )
+
+
+def _readings(
+    view: View, conventions: Sequence[Convention], group: Group, part: Dataset, points: Points
+) -> Iterator[_Reading]:
+    """Yield all readings that measure and change nothing but the group; the world is that of all cameras of a pass."""
+    for convention in conventions:
+        if convention.is_guess or (group.pass_name is None and convention.is_of_world):
+            continue
+        for how, fix in convention.readings(part):
+            if fits_one_group(fix, part, group):
+                gate_px = view.gate_px * getattr(fix, "gate_factor", 1.0)
+                yield _Reading(convention, how, fix, points.worth(fix(part), gate_px))
