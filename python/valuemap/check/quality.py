@@ -367,8 +367,42 @@ _STRAY_STEPS, _MOST_STRAYS = 50.0, 10
 """No car is fifty steps away for some images, without having been seen on the way, and back at once."""
 
 
+def nowhere(images: Images) -> Bools:
+    """Return which images (N) are at a place that drives jump to and back from again and again, to the millimetre.
+
+    It is what a receiver without a fix writes: 0, 0 as a rule. No car comes back so exactly.
+    """
+    order = order_by_camera(images)
+    center = np.round(camera_centers(images)[order], _MILLIMETRES)
+    ends = (np.diff(images.pass_id.codes[order]) != 0) | (np.diff(images.camera_id[order]) != 0)
+    step_m = np.linalg.norm(np.diff(center, axis=0), axis=1)
+    moving, found = step_m[~ends & (step_m > 0.0)], np.zeros(len(order), dtype=np.bool_)
+    if not len(moving):
+        return found
+    jumps = ~ends & (step_m > _NOWHERE_STEPS * float(np.median(moving)))
+    visit = np.append(0, np.cumsum(ends | (step_m > 0.0)))
+    first = np.flatnonzero(np.diff(visit, prepend=-1))
+    last = np.append(first[1:], len(order)) - 1
+    (comes, is_first), (goes, is_last) = (
+        (np.append(False, jumps)[first], np.append(True, ends)[first]),
+        (np.append(jumps, False)[last], np.append(ends, True)[last]),
+    )
+    is_reached = (comes & (goes | is_last)) | (goes & is_first)
+    _, place, visits = np.unique(center[first[is_reached]], axis=0, return_inverse=True, return_counts=True)
+    at_none = np.zeros(len(first), dtype=np.bool_)
+    at_none[is_reached] = visits[place.ravel()] >= _LEAST_VISITS
+    found[order] = at_none[visit]
+    return found
+
+
+_MILLIMETRES = 3
+"""Decimals of a metre: positions are made of rotations and translations, and exact to less."""
+_NOWHERE_STEPS, _LEAST_VISITS = 8.0, 3
+"""Positions that are rounded come back, too, but from the next ones on their grid."""
+
+
 def _far_or_stray(images: Images) -> Bools:
-    return far_images(camera_centers(images)) | strays(images)
+    return far_images(camera_centers(images)) | strays(images) | nowhere(images)
 
 
 def _without_far(dataset: Dataset) -> Dataset:
