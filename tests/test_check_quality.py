@@ -31,6 +31,7 @@ def test_images_without_a_fix_are_left_out_however_many_they_are(place: list[flo
     spoiled = with_centers(city, np.where(lost[:, None], place, camera_centers(city.images)))
     (finding,) = _look(View(spoiled), "positions", silent)
     assert finding.fault == "far_images"
+    assert "again and again" in finding.why
     assert finding.fix is not None
     left = finding.fix(spoiled).images.image_id
     assert set(left) == set(city.images.image_id[~lost])

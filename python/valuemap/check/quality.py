@@ -88,11 +88,16 @@ class FarImages(Fault):
         nearest = float(np.linalg.norm(center[far] - middle, axis=1).min())
         extent = float(np.linalg.norm(center[~far] - middle, axis=1).max())
         names = view.dataset.images.name.take(np.flatnonzero(far)[:3]).to_pylist()
+        is_nowhere = bool(nowhere(view.dataset.images).all(where=far))
+        where = (
+            "at places that their drives jump to and back from again and again"
+            if is_nowhere
+            else f"{nearest:.4g} m or more from the middle, the others within {extent:.4g} m"
+        )
         return Finding(
             fault=self.name,
-            what="Some images are far from all others.",
-            why=f"{count} of {len(far)} images are {nearest:.4g} m or more from the middle, the others within "
-            f"{extent:.4g} m: {', '.join(names)}{' and more' if count > 3 else ''}.",
+            what=f"Some images are {'where no car was' if is_nowhere else 'far from all others'}.",
+            why=f"{count} of {len(far)} images are {where}: {', '.join(names)}{' and more' if count > 3 else ''}.",
             do="Remove them, or repair their positions (no GPS fix? 0, 0?).",
             figures={"far": count, "from_m": round(nearest, 1), "others_within_m": round(extent, 1)},
             fix=lambda dataset: _without_far(dataset),
