@@ -415,7 +415,7 @@ fn labels_of_hostile_scenes() {
     run("find", 200, &cases, |(columns, [noise, noise_of_covariances], is_deep, classes, pooled, shares, settings)| {
         let scene = columns.scene();
         let confusions = Confusions::of_shares(shares.clone());
-        let calibration = Calibration { noise, noise_of_covariances, is_deep, classes, pooled, confusions, starts: 0 };
+        let calibration = Calibration { noise, noise_of_covariances, is_deep, classes, pooled, confusions };
         let found = find(&scene, &calibration, &settings, &Progress::default()).unwrap();
         for finding in &found.findings {
             all_finite("point", finding.estimate.point.iter())?;
