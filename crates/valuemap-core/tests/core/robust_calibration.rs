@@ -117,6 +117,19 @@ fn what_poses_were_compared_with_is_not_sought_again() {
 }
 
 #[test]
+fn poses_that_state_large_errors_still_tell_how_small_those_of_single_images_are() {
+    for stated_m in [0.5, 6.0] {
+        let mut scene = joined(vec![off_by(1.0), moved(off_by(1.0), &Isometry3::translation(0.4, -0.3, 0.0))]);
+        scene.views.iter_mut().for_each(|view| view.position_sigma_m = stated_m);
+        let found =
+            self_calibrate(&scene, &NOISE, Known::default(), &SETTINGS, false, None, &Progress::default()).unwrap().0;
+        assert!((0.5..1.5).contains(&far_px(&found)), "{stated_m} m: {:?}", found.noise);
+        assert!(found.noise.position_m < 0.1, "{stated_m} m: {:?}", found.noise);
+        assert!((found.noise.position_drift_m / stated_m - 1.0).abs() < 0.05, "{stated_m} m: {:?}", found.noise);
+    }
+}
+
+#[test]
 fn noise_is_not_below_that_of_rounding() {
     assert!(far_px(&calibrated(0.5)) < 1.0);
     assert!(far_px(&calibrated_of_rounded(0.5, 3.0)) > 2.99);

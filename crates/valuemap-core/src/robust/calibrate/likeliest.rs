@@ -10,6 +10,7 @@ use rayon::prelude::*;
 
 use super::CALIBRATION_RAYS;
 use super::residuals::calibrate;
+use super::shared::{as_stated, stated};
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::{Object, Placed, fit, placed};
 use crate::robust::initial;
@@ -53,7 +54,7 @@ pub(crate) fn likeliest_noise(
     progress: &Progress,
 ) -> Result<Noise, Halt> {
     let sample = Sample { scene, rays: few, known, settings: wider(settings), progress };
-    Ok(Likeliest::of_starts(&sample, guess)?.noise().unwrap_or(*guess))
+    Ok(Likeliest::of_starts(&sample, guess)?.noise().unwrap_or_else(|| as_stated(guess, stated(scene))))
 }
 
 /// The noise that makes the rays of more places likeliest, some steps on from one.
@@ -286,13 +287,17 @@ impl Likeliest {
     /// is no estimate, and not kept, however likely it makes the rays: too small, it may have an object for every few of them. Larger starts than
     /// may be likelier are left out.
     fn of_starts(sample: &Sample<'_>, guess: &Noise) -> Result<Self, Halt> {
-        let mut likeliest = Self::default();
+        let (mut likeliest, stated) = (Self::default(), stated(sample.scene));
         for factor in STARTS {
-            let start = guess.scaled(factor, sample.known);
+            let start = as_stated(&guess.scaled(factor, sample.known), stated);
             if likeliest.last.as_ref().is_some_and(|last| !last.may_be_larger(sample.scene, &start)) {
                 break;
             }
-            likeliest.steps(CALIBRATION_ROUNDS - 1, sample.round(&start)?.again, |noise| sample.round(noise))?;
+            let first = sample.round(&start)?;
+            // A map of too few objects tells no noise: what it is then is where it began, and no estimate.
+            if !first.stays() {
+                likeliest.steps(CALIBRATION_ROUNDS - 1, first.again, |noise| sample.round(noise))?;
+            }
         }
         Ok(likeliest)
     }

@@ -35,6 +35,16 @@ pub(crate) fn drifting(noise: &Noise, ratio: f64, [position_m, rotation_rad]: St
     }
 }
 
+/// A noise whose images and segments have for themselves what it says, whatever poses state of their errors: what these state beyond that drifts.
+pub(crate) fn as_stated(noise: &Noise, stated: Stated) -> Noise {
+    let drifting = drifting(noise, 1.0, stated);
+    Noise {
+        position_drift_m: stated[0].map_or(noise.position_drift_m, |_| drifting.position_drift_m),
+        rotation_drift_rad: stated[1].map_or(noise.rotation_drift_rad, |_| drifting.rotation_drift_rad),
+        ..*noise
+    }
+}
+
 /// A noise with the drift at which the passes of objects disagree as much as expected; as large as the errors of images and segments where poses state it,
 /// or nothing tells.
 pub(crate) fn with_drift(scene: &Scene, objects: &[&Placed], noise: &Noise) -> Noise {
