@@ -84,7 +84,7 @@ def test_one_light_of_passes_that_disagree_stays_one() -> None:
     beside = [[50.0, -6.0, 4.0], [38.0, 7.0, 4.5], [60.0, 5.0, 4.2], [55.0, -7.0, 5.0], [64.0, -4.0, 4.0]]
     lights = np.array([[45.0, 4.0, 5.0], *beside])
     for seed in range(4):
-        result = valuemap.build_map(drive(lights, passes=4, seed=seed, offset_m=0.25), POSES_AS_THEY_ARE)
+        result = valuemap.build_map(drive(lights, passes=4, seed=seed, offset_m=0.25))
         assert len(result.labels) == len(lights)
         assert result.labels.passes.min() >= 3
 

@@ -31,7 +31,7 @@ from valuemap.check.fault import (
     with_images,
     with_poses,
 )
-from valuemap.check.groups import Group, OfGroup, groups_of
+from valuemap.check.groups import Group, OfGroup, groups_of, only
 from valuemap.check.headings import driving_azimuths, headings, level_rotations
 from valuemap.check.others import points_of_others, rays_relative_to
 from valuemap.dataset import Dataset
@@ -135,28 +135,27 @@ class CameraMount(Fault):
         chance = best.turn.chance * len(groups)
         if chance > LEAST_CHANCE or best.comparison.chance * len(groups) > AGAINST:
             return None
-        fix, turn_deg = OfGroup(best.group, best.turn), np.degrees(best.turn.angle_rad)
-        yaw_deg, pitch_deg = np.degrees(_looks(best.group.part(fix(view.dataset))))
+        turn_deg = np.degrees(best.turn.angle_rad)
+        yaw_deg, pitch_deg = np.degrees(_looks(best.turn(best.group.part(view.dataset))))
         side = "right" if yaw_deg > 0.0 else "left"
-        return Finding(
+        finding = Finding(
             fault=self.name,
-            what=f"Only {best.group.text}: it looks another way than its poses say: {abs(yaw_deg):.0f} degrees to the "
-            f"{side} of where it is driven, and {pitch_deg:.0f} degrees up.",
+            what=f"it looks another way than its poses say: {abs(yaw_deg):.0f} degrees to the {side} of where it is "
+            f"driven, and {pitch_deg:.0f} degrees up.",
             why=f"Turned by {turn_deg:.0f} degrees in its mount, its rays meet {best.turn.points} of {best.turn.of} "
             f"points that others see around it; the agreement of all rays rises by {best.comparison.difference:.0f} "
             f"({best.comparison.places} places).",
             do="Correct the rotation between car and camera: degrees for radians, a sign, the order of its angles?",
             chance=chance,
             figures={
-                "of": best.group.text,
                 "turn_deg": round(float(turn_deg), 2),
                 "yaw_deg": round(float(yaw_deg), 2),
                 "pitch_deg": round(float(pitch_deg), 2),
                 **best.comparison.to_json(),
             },
-            fix=fix,
-            of=best.group.text,
+            fix=best.turn,
         )
+        return only(best.group, finding)
 
 
 def _looks(dataset: Dataset) -> tuple[float, float]:
@@ -254,7 +253,9 @@ _MOST_PITCH_RAD = np.radians(25.0)
 _CELL_GATES = 8.0
 """Width of a cell of yaw and pitch: errors of poses, of headings along a drive, and of sums for turns in it."""
 _MET_GATES = 2.0
+"""A ray meets a point within this: good rays are off by a gate at most, and so is the point."""
 _PEAKS, _ROUNDS = 3, 4
+"""Cells that are followed of each grid, and for so long: both cost time, and are counted in the chance."""
 _LEAST_POINTS = 3
 """Two points fit two rays by many turns."""
 _SHIFTS = ((0.0, 0.0), (0.0, 0.5), (0.5, 0.0), (0.5, 0.5))
@@ -290,8 +291,8 @@ class _Grid:
         self.columns = max(int(2.0 * np.pi / width_rad), 1)
         self.rows = max(int(2.0 * _MOST_PITCH_RAD / width_rad), 1)
         column = np.floor(looks[0] / (2.0 * np.pi) * self.columns + shift[0]).astype(np.int64) % self.columns
-        self._row = np.floor(looks[1] / width_rad + shift[1]).astype(np.int64)
-        (_, self._row_of_cell), self.cell = np.unique(np.stack([column, self._row]), axis=1, return_inverse=True)
+        row = np.floor(looks[1] / width_rad + shift[1]).astype(np.int64)
+        (_, self._row_of_cell), self.cell = np.unique(np.stack([column, row]), axis=1, return_inverse=True)
         self.cell = self.cell.ravel()
         pairs = np.unique(np.stack([self.cell, point]), axis=1)
         self.points = np.bincount(pairs[0], minlength=len(self._row_of_cell))

@@ -26,7 +26,7 @@ from valuemap.check.fault import (
     View,
     gains_of_all,
 )
-from valuemap.check.groups import Group, OfGroup, fits_one_group, groups_of
+from valuemap.check.groups import Group, fits_one_group, groups_of, only
 from valuemap.dataset import Dataset
 from valuemap.tables import Floats, Ints
 
@@ -153,24 +153,23 @@ def _of_group(view: View, conventions: Sequence[Convention], group: Group, group
         return None
     how, own = best.convention.refined(group.alone(view), best.how, best.fix)
     met, met_as_given = (int(np.sum(each > 0.0)) for each in (best.worth, given))
-    return Finding(
+    finding = Finding(
         fault=best.convention.name,
-        what=f"Only {group.text}: {best.convention.what}",
+        what=best.convention.what,
         why=f"Read as {how}, its rays meet {met} of {len(given)} points that others see around it, as given "
         f"{met_as_given}; the agreement with them rises from {given.sum():.0f} to {best.worth.sum():.0f}.",
         do=best.convention.do,
         chance=chance,
         figures={
-            "of": group.text,
             "reading": how,
             "points": len(given),
             "met_as_given": met_as_given,
             "met_if_read_so": met,
             "difference": round(comparison.difference, 2),
         },
-        fix=OfGroup(group, own),
-        of=group.text,
+        fix=own,
     )
+    return only(group, finding)
 
 
 def _readings(

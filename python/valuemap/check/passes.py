@@ -619,20 +619,13 @@ def _apart_from_others(view: View) -> PassShift | None:
     if points is None:
         return None
     meeting, heading = points.meeting, points.heading
-    point, of_pass, class_code = meeting.point, meeting.pass_of_point, meeting.class_of_point
-    within_m = _SEARCH_STEPS * view.step_m
     # Offsets as small as rays can see, if that is less than images are apart.
     tolerance_m = min(view.step_m / 2.0, seen_m(view) or view.step_m / 2.0)
-    codes, number = np.unique(of_pass, return_counts=True)
-    tried = codes[np.argsort(-number, kind="stable")][:_MOST_PASSES]
+    tried = meeting.passes_of_most_points()
     candidates: list[tuple[int, int, bool, Floats]] = []
-    for code in tried.tolist():
-        own, others = np.flatnonzero(of_pass == code), np.flatnonzero(of_pass != code)
-        i, j = pairs_within(point[own], point[others], within_m=within_m)
-        same = class_code[own[i]] == class_code[others[j]]
-        i, j = own[i[same]], others[j[same]]
-        difference = point[j] - point[i]
-        for is_along, turned in ((False, difference), (True, _along(difference, heading[i], view))):
+    for code in tried:
+        own, difference = meeting.differences(code, within_m=_SEARCH_STEPS * view.step_m)
+        for is_along, turned in ((False, difference), (True, _along(difference, heading[own], view))):
             shift = densest(turned, tolerance_m)
             if shift is None or shift.pairs < _LEAST_PAIRS or np.linalg.norm(shift.offset_m) <= tolerance_m:
                 continue
@@ -653,31 +646,25 @@ def _far_from_others(view: View) -> PassShift | None:
     if points is None:
         return None
     meeting, tolerance_m = points.meeting, view.step_m / 2.0
-    codes, number = np.unique(meeting.pass_of_point, return_counts=True)
-    tried = codes[np.argsort(-number, kind="stable")][:_MOST_PASSES]
+    tried = meeting.passes_of_most_points()
     found: list[tuple[int, PassShift]] = []
-    for code in tried.tolist():
-        own, others = np.flatnonzero(meeting.pass_of_point == code), np.flatnonzero(meeting.pass_of_point != code)
-        i, j = pairs_within(meeting.point[own], meeting.point[others], within_m=None)
-        same = meeting.class_of_point[own[i]] == meeting.class_of_point[others[j]]
-        own_point, difference = own[i[same]], meeting.point[others[j[same]]] - meeting.point[own[i[same]]]
+    for code in tried:
+        own, difference = meeting.differences(code, within_m=None)
         shift = densest(difference, tolerance_m)
         if shift is None or np.linalg.norm(shift.offset_m) <= _SEARCH_STEPS * view.step_m:
             continue
         away_m = np.linalg.norm(difference - shift.offset_m, axis=1)
         next_best = densest(difference[away_m > _NEXT_TIMES * tolerance_m], tolerance_m)
-        met = len(np.unique(own_point[away_m <= tolerance_m]))
+        met = len(np.unique(own[away_m <= tolerance_m]))
         met_by_next = 0
         if next_best is not None:
             is_next = np.linalg.norm(difference - next_best.offset_m, axis=1) <= tolerance_m
-            met_by_next = len(np.unique(own_point[is_next]))
+            met_by_next = len(np.unique(own[is_next]))
         chance = float(stats.binom.sf(met - 1, met + met_by_next, 0.5)) * len(tried)
         if chance < LEAST_CHANCE:
             name = view.dataset.images.pass_id.names[code]
-            offset_m = shift.offset_m
-            found.append(
-                (met - met_by_next, PassShift(name, offset_m, False, 0.0, 0.0, chance, len(tried), points=met))
-            )
+            told = PassShift(name, shift.offset_m, False, 0.0, 0.0, chance, len(tried), points=met)
+            found.append((met - met_by_next, told))
     return max(found, key=lambda each: each[0])[1] if found else None
 
 
@@ -697,6 +684,19 @@ class Meeting:
     class_of_point: NDArray[np.int32]
     place_of_point: Ints
     gate_px: float
+
+    def passes_of_most_points(self) -> list[int]:
+        """Return the codes of the passes that find most points, as many as are looked at."""
+        codes, number = np.unique(self.pass_of_point, return_counts=True)
+        return [int(code) for code in codes[np.argsort(-number, kind="stable")][:_MOST_PASSES]]
+
+    def differences(self, code: int, *, within_m: float | None) -> tuple[Ints, Floats]:
+        """Return from which points of a pass (M) how far it is (M, 3) to points of their class that others find."""
+        own, others = np.flatnonzero(self.pass_of_point == code), np.flatnonzero(self.pass_of_point != code)
+        i, j = pairs_within(self.point[own], self.point[others], within_m=within_m)
+        same = self.class_of_point[own[i]] == self.class_of_point[others[j]]
+        i, j = own[i[same]], others[j[same]]
+        return i, self.point[j] - self.point[i]
 
     def gain(self, code: int, offset_m: Floats) -> Floats:
         """Return how well the rays of a pass, whose images (N, 3) are moved, meet the points of the others (places)."""

@@ -14,9 +14,9 @@ from valuemap.cameras import camera_centers
 from valuemap.check.boxes import rows_in_images
 from valuemap.check.fault import LEAST_CHANCE, Fault, Finding, Stage, View, keep_rows, with_detections
 from valuemap.check.offsets import find_shift
-from valuemap.check.sample import FASTER, order_by_camera
+from valuemap.check.sample import FASTER, drive_of_camera, order_by_camera
 from valuemap.dataset import Dataset
-from valuemap.tables import Bools, Categories, Floats, Images, Truth
+from valuemap.tables import Bools, Categories, Floats, Images, Ints, Truth
 
 _SAME_SHARE = 0.05
 """Boxes of one class whose centres and sizes differ by less than this share of their size are one box, twice."""
@@ -349,13 +349,8 @@ def strays(images: Images) -> Bools:
     """Return which images (N) are a jump away from their drive, which goes on behind them where it was before them."""
     order = order_by_camera(images)
     center = camera_centers(images)[order]
-    starts = (np.diff(images.pass_id.codes[order]) != 0) | (np.diff(images.camera_id[order]) != 0)
-    step_m = np.linalg.norm(np.diff(center, axis=0), axis=1)
-    moving = step_m[~starts & (step_m > 0.0)]
+    step_m, starts, usual_m = _steps_along_drives(center, drive_of_camera(images)[order])
     found = np.zeros(len(order), dtype=np.bool_)
-    if not len(moving):
-        return found
-    usual_m = float(np.median(moving))
     jumps = ~starts & (step_m > _STRAY_STEPS * usual_m)
     if jumps.sum() > _MOST_FAR * len(order):
         return found  # Of images in no order all steps are jumps.
@@ -366,6 +361,15 @@ def strays(images: Images) -> Bools:
         if returns and last - first <= _MOST_STRAYS and way_on_m <= FASTER * usual_m * (last - first + 1):
             found[order[first:last]] = True
     return found
+
+
+def _steps_along_drives(center: Floats, drive: Ints) -> tuple[Floats, Bools, float]:
+    """Return the lengths of the steps between images (N) of drives in their order (N - 1), and which of these lead to
+    another drive; and how long one is as a rule, infinite where nothing moves.
+    """
+    step_m, leaves = np.linalg.norm(np.diff(center, axis=0), axis=1), np.diff(drive) != 0
+    moving = step_m[~leaves & (step_m > 0.0)]
+    return step_m, leaves, float(np.median(moving)) if len(moving) else np.inf
 
 
 _STRAY_STEPS, _MOST_STRAYS = 50.0, 10
@@ -379,12 +383,11 @@ def nowhere(images: Images) -> Bools:
     """
     order = order_by_camera(images)
     center = np.round(camera_centers(images)[order], _MILLIMETRES)
-    ends = (np.diff(images.pass_id.codes[order]) != 0) | (np.diff(images.camera_id[order]) != 0)
-    step_m = np.linalg.norm(np.diff(center, axis=0), axis=1)
-    moving, found = step_m[~ends & (step_m > 0.0)], np.zeros(len(order), dtype=np.bool_)
-    if not len(moving):
+    step_m, ends, usual_m = _steps_along_drives(center, drive_of_camera(images)[order])
+    found = np.zeros(len(order), dtype=np.bool_)
+    if not np.isfinite(usual_m):
         return found
-    jumps = ~ends & (step_m > _NOWHERE_STEPS * float(np.median(moving)))
+    jumps = ~ends & (step_m > _NOWHERE_STEPS * usual_m)
     visit = np.append(0, np.cumsum(ends | (step_m > 0.0)))
     first = np.flatnonzero(np.diff(visit, prepend=-1))
     last = np.append(first[1:], len(order)) - 1

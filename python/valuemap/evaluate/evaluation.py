@@ -249,6 +249,7 @@ def _note_elsewhere(result: Map, matches: Matches, radius_m: float) -> tuple[str
 
 
 _ELSEWHERE_M = 1000.0
+"""Truth whose nearest object is farther from all labels is of another place: objects are seen from 100 m or so."""
 
 
 def _root_mean_square(values: Floats) -> float:
