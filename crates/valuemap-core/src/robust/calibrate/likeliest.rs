@@ -17,7 +17,7 @@ use crate::robust::initial;
 use crate::robust::model::Model;
 use crate::robust::noise::{Known, Noise};
 use crate::robust::scene::{Scene, sample};
-use crate::robust::search::{Depth, Tally, search};
+use crate::robust::search::{Depth, STEPS_OF_ONCE, Tally, search};
 use crate::robust::settings::Settings;
 
 /// How much wider the gate is while the noise is estimated: what a gate cuts off is missing in the estimate.
@@ -33,11 +33,11 @@ const MOST_UNSEEN: f64 = 2.0 / std::f64::consts::E;
 const STARTS: [f64; 5] = [0.15, 0.5, 1.5, 5.0, 15.0];
 
 /// Steps from all starts at most, as progress counts them.
-const START_STEPS: usize = STARTS.len() * CALIBRATION_ROUNDS;
+const START_STEPS: usize = STARTS.len() * CALIBRATION_ROUNDS * STEPS_OF_ONCE;
 /// Steps of [`misfits`] at most: in each scene those from all starts, and from the map of the other.
-pub const MISFIT_STEPS: usize = 2 * (START_STEPS + 1);
+pub const MISFIT_STEPS: usize = 2 * (START_STEPS + STEPS_OF_ONCE);
 /// Steps of the search for the noise at most.
-pub(crate) const NOISE_STEPS: usize = START_STEPS + MORE_ROUNDS;
+pub(crate) const NOISE_STEPS: usize = START_STEPS + MORE_ROUNDS * STEPS_OF_ONCE;
 
 /// Some places of a scene, whose rays tell the noise.
 pub(crate) fn few_places(scene: &Scene, settings: &Settings) -> Vec<u32> {
@@ -177,7 +177,8 @@ impl Sample<'_> {
 
     fn searched(&self, mut model: Model<'_>, begun: Vec<Placed>) -> Result<Round, Halt> {
         let noise = model.noise;
-        let objects = search(&mut model, self.rays, begun, Depth::Shallow, true, &mut Tally::default(), self.progress)?;
+        // What is left over gives birth: an object that a map lacks would count against its noise.
+        let objects = search(&mut model, self.rays, begun, Depth::Once, true, &mut Tally::default(), self.progress)?;
         let (value, left) = (likelihood(&model, &objects, self.rays), Left::of(&model, &objects, self.rays));
         let map = placed(&objects);
         let again = calibrate(self.scene, noise, &map, self.known);
@@ -394,6 +395,18 @@ mod tests {
     }
 
     #[test]
+    fn an_object_that_a_map_lacks_does_not_count_against_its_noise() -> Result<(), Halt> {
+        let (scene, progress) = (eight_in_a_street(), Progress::default());
+        let rays = scene.usable_rays();
+        let sample = whole(&scene, &rays, &progress);
+        let all = sample.round(&street::NOISE)?;
+        let lacking = sample.round_from(&street::NOISE, all.map[1..].to_vec())?;
+        assert_eq!((all.map.len(), lacking.map.len()), (8, 8));
+        assert!((lacking.value - all.value).abs() < 10.0, "{} {}", lacking.value, all.value);
+        Ok(())
+    }
+
+    #[test]
     fn rays_that_are_none_do_not_count() -> Result<(), Halt> {
         let mut scene = eight_in_a_street();
         std::sync::Arc::make_mut(&mut scene.rays).rays[7].residual_from_world.fill(f64::NAN);
@@ -407,7 +420,7 @@ mod tests {
     #[test]
     fn a_scene_is_offered_the_map_of_the_other() -> Result<(), Halt> {
         // In the second scene the drives are where they say, and in the other order.
-        let (first, second) = (street::joined(rows(0.8, 1000)), rows(0.0, 0));
+        let (first, second) = (street::joined(rows(0.8, 1400)), rows(0.0, 0));
         let second = street::joined(second.into_iter().rev().collect());
         let (rays, progress) = (first.usable_rays(), Progress::default());
         let sample = whole(&first, &rays, &progress);

@@ -104,7 +104,7 @@ pub fn calibrate(scene: &Scene, guess: &Noise, labels: &[Placed], known: Known) 
         // Summed in the order of the labels, so that threads do not change the result.
         visits.par_iter().with_max_len(1).map(of_label).collect::<Vec<f64>>().iter().sum()
     });
-    with_drift(scene, &sample, &noise_of(&found))
+    with_drift(scene, &sample, &noise_of(&found), guess.position_drift_m)
 }
 
 /// Minimise a cost over positive parameters by a pattern search in their logarithms, with a prior around the start.

@@ -1,8 +1,15 @@
 //! What the images of a pass share: the drift.
 
-use crate::robust::energy::Placed;
+use nalgebra::Vector3;
+use rayon::prelude::*;
+
 use crate::robust::energy::agreement::{Disagreement, disagreements, enough};
+use crate::robust::energy::estimate::{looks_at, visits};
+use crate::robust::energy::sides::{Said, at_middle, sides};
+use crate::robust::energy::{Placed, Terms};
 use crate::robust::noise::Noise;
+use crate::robust::noise::drift::Drive;
+use crate::robust::noise::told::Told;
 use crate::robust::scene::Scene;
 
 /// Where the noise is sought, how much passes of a label disagree counts up to this many standard deviations: 95 % efficient where errors are Gaussian (Huber, "Robust
@@ -45,13 +52,44 @@ pub(crate) fn as_stated(noise: &Noise, stated: Stated) -> Noise {
     }
 }
 
-/// A noise with the drift at which the passes of objects disagree as much as expected; as large as the errors of images and segments where poses state it,
-/// or nothing tells.
-pub(crate) fn with_drift(scene: &Scene, objects: &[&Placed], noise: &Noise) -> Noise {
+/// A noise with the drift at which the passes of objects disagree as much as expected, or with that which was thought, m, if it makes what they say likelier:
+/// passes of what is two objects in truth disagree whatever the drift is. As large as the errors of images and segments where poses state it, or nothing
+/// tells.
+pub(crate) fn with_drift(scene: &Scene, objects: &[&Placed], noise: &Noise, thought_m: f64) -> Noise {
     let stated = stated(scene);
     let of = |ratio: f64| drifting(noise, ratio, stated);
     let told = stated[0].is_none().then(|| agreeing_ratio(|ratio| excess(disagreements(scene, &of(ratio), objects))));
-    of(told.flatten().unwrap_or(1.0))
+    let Some(told) = told.flatten().map(of) else { return of(1.0) };
+    let thought = Noise { position_drift_m: thought_m, ..told };
+    let unlikeliness = |drifting: &Noise| -> f64 {
+        let of_object =
+            |object: &&Placed| minus_log_likelihood(scene, drifting, noise, object).unwrap_or(f64::INFINITY);
+        // Summed in the order of the objects, so that threads do not change the result.
+        objects.par_iter().map(of_object).collect::<Vec<f64>>().iter().sum()
+    };
+    if unlikeliness(&thought) < unlikeliness(&told) { thought } else { told }
+}
+
+/// Minus twice the logarithm of the restricted likelihood of the residuals of all visits of an object, along the lines of sight that a noise makes probable,
+/// up to a constant: its position, and what the middle of each side is off by, are marginalised.
+fn minus_log_likelihood(scene: &Scene, noise: &Noise, of_sight: &Noise, (votes, point): &Placed) -> Option<f64> {
+    let visits: Vec<&[u32]> = visits(scene, votes).collect();
+    let mut all = Terms::none();
+    for side in sides(scene, visits.iter().copied()) {
+        let mut of_side = Terms::none();
+        for visit in side {
+            let looks = looks_at(scene, noise, of_sight, visits[visit as usize], point)?;
+            let drive = Drive::at_one(&looks)?;
+            let (information, gradient) = drive.normals.of_one();
+            of_side.add_said(&Said { information, gradient, energy: drive.normals.square + drive.log_determinant() });
+        }
+        let said = of_side.said();
+        let has_middle = noise.side_m > 0.0;
+        let said = if has_middle { at_middle(noise.side_m, Vector3::zeros(), &said)?.0 } else { said };
+        all.add_said(&said);
+    }
+    let told = Told::of(&all.information)?;
+    Some(all.energy + told.ln_determinant() - all.gradient.dot(&told.solve(&all.gradient)))
 }
 
 /// The ratio at which nothing is in excess, by bisection of its logarithm: the larger it is, the less remains unexplained. Nothing where too little is known.
@@ -125,10 +163,40 @@ mod tests {
                 labels[usize::from(second < first)].0.push(ray);
             }
             let noise = Noise { position_m: 0.02, ..street::NOISE };
-            with_drift(&scene, &labels.iter().collect::<Vec<_>>(), &noise).position_drift_m
+            with_drift(&scene, &labels.iter().collect::<Vec<_>>(), &noise, noise.position_m).position_drift_m
         };
         assert!((0.15..0.6).contains(&drift_m(6)), "{}", drift_m(6));
         assert!(drift_m(2) < 0.05, "{}", drift_m(2));
+    }
+
+    #[test]
+    fn passes_of_what_is_two_objects_are_no_drift() {
+        let errors: Vec<[f64; 2]> = (0..997).map(|i| [uniform(2 * i), uniform(2 * i + 1)]).collect();
+        let noise = Noise { position_m: 0.02, ..street::NOISE };
+        let objects: Vec<Vector3<f64>> = (0..8).map(|i| Vector3::new(60.0 + 30.0 * f64::from(i), 6.0, 3.0)).collect();
+        let drift_m = |mixed: usize, thought_m: f64| {
+            // The second drive sees other objects in the place of some: a metre farther along the street.
+            let elsewhere = |i: usize| Vector3::x() * if i < mixed { 1.0 } else { 0.0 };
+            let of_drive = |drive: usize| {
+                let there = |(i, object): (usize, &Vector3<f64>)| object + elsewhere(i) * drive as f64;
+                let seen: Vec<Vector3<f64>> = objects.iter().enumerate().map(there).collect();
+                let off = Isometry3::translation(0.1 * drive as f64, 0.1 * drive as f64, 0.0);
+                street::moved(street::street(150, 2.0, &seen, &errors[7 * drive..]), &off)
+            };
+            let scene = street::joined((0..2).map(of_drive).collect());
+            let mut labels: Vec<Placed> =
+                objects.iter().enumerate().map(|(i, object)| (Vec::new(), object + 0.5 * elsewhere(i))).collect();
+            for ray in scene.usable_rays() {
+                let near = |label: &&mut Placed| scene.ray(ray).squared_error(&label.1);
+                if let Some(label) = labels.iter_mut().min_by(|a, b| near(a).total_cmp(&near(b))) {
+                    label.0.push(ray);
+                }
+            }
+            with_drift(&scene, &labels.iter().collect::<Vec<_>>(), &noise, thought_m).position_drift_m
+        };
+        assert!((0.03..0.1).contains(&drift_m(0, 0.1)), "{}", drift_m(0, 0.1));
+        // Half of them disagree whatever the drift is; what the others agree about says that it is not so large.
+        assert!((drift_m(4, 0.1), drift_m(5, 0.1)) == (0.1, 0.1) && drift_m(4, 100.0) > 0.2);
     }
 
     #[test]
@@ -138,7 +206,7 @@ mod tests {
         let labels: Vec<&Placed> = labels[..10].iter().collect();
         let drift_m = |side_m: f64| {
             let noise = Noise { position_m: 0.02, side_m, ..street::NOISE };
-            with_drift(&scene, &labels, &noise).position_drift_m
+            with_drift(&scene, &labels, &noise, 0.2).position_drift_m
         };
         assert!(drift_m(0.2) < 0.05, "{}", drift_m(0.2));
         assert!(drift_m(0.0) > 0.1, "{}", drift_m(0.0));

@@ -72,7 +72,7 @@ pub fn split(model: &Model<'_>, known: Known, objects: &[Object]) -> Noise {
 /// The noise with its drift told anew: the one before followed from poses that turned by more, or less.
 fn redrifted(model: &Model<'_>, objects: &[Object], noise: &Noise) -> Noise {
     let labels = placed(objects);
-    with_drift(model.scene, &residuals::sample(model.scene, noise, &labels), noise)
+    with_drift(model.scene, &residuals::sample(model.scene, noise, &labels), noise, noise.position_drift_m)
 }
 
 /// The noise with the least value among those of shares from `lowest` on, or the one that is the best so far.
