@@ -165,9 +165,10 @@ fn drift_m(wrong: usize) -> f64 {
 
 #[test]
 fn a_few_labels_of_two_objects_say_nothing_about_how_far_passes_drift() {
-    let (of_right, of_some_wrong) = (drift_m(0), drift_m(5));
-    assert!((0.08..0.25).contains(&of_right), "{of_right}");
-    assert!((0.6..1.5).contains(&(of_some_wrong / of_right)), "{of_right} {of_some_wrong}");
+    // It is 0.15 m.
+    for drift_m in [drift_m(0), drift_m(5)] {
+        assert!((0.08..0.25).contains(&drift_m), "{drift_m}");
+    }
 }
 
 /// Standard deviation of where images are said to be, each for itself, of [`from_two_sides`].

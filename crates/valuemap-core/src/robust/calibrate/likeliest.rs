@@ -17,7 +17,7 @@ use crate::robust::initial;
 use crate::robust::model::Model;
 use crate::robust::noise::{Known, Noise};
 use crate::robust::scene::{Scene, sample};
-use crate::robust::search::{Depth, STEPS_OF_ONCE, Tally, search};
+use crate::robust::search::{Depth, Tally, born_of_rest, search};
 use crate::robust::settings::Settings;
 
 /// How much wider the gate is while the noise is estimated: what a gate cuts off is missing in the estimate.
@@ -33,11 +33,11 @@ const MOST_UNSEEN: f64 = 2.0 / std::f64::consts::E;
 const STARTS: [f64; 5] = [0.15, 0.5, 1.5, 5.0, 15.0];
 
 /// Steps from all starts at most, as progress counts them.
-const START_STEPS: usize = STARTS.len() * CALIBRATION_ROUNDS * STEPS_OF_ONCE;
+const START_STEPS: usize = STARTS.len() * CALIBRATION_ROUNDS;
 /// Steps of [`misfits`] at most: in each scene those from all starts, and from the map of the other.
-pub const MISFIT_STEPS: usize = 2 * (START_STEPS + STEPS_OF_ONCE);
+pub const MISFIT_STEPS: usize = 2 * (START_STEPS + 1);
 /// Steps of the search for the noise at most.
-pub(crate) const NOISE_STEPS: usize = START_STEPS + MORE_ROUNDS * STEPS_OF_ONCE;
+pub(crate) const NOISE_STEPS: usize = START_STEPS + MORE_ROUNDS;
 
 /// Some places of a scene, whose rays tell the noise.
 pub(crate) fn few_places(scene: &Scene, settings: &Settings) -> Vec<u32> {
@@ -177,11 +177,13 @@ impl Sample<'_> {
 
     fn searched(&self, mut model: Model<'_>, begun: Vec<Placed>) -> Result<Round, Halt> {
         let noise = model.noise;
-        // What is left over gives birth: an object that a map lacks would count against its noise.
-        let objects = search(&mut model, self.rays, begun, Depth::Once, true, &mut Tally::default(), self.progress)?;
+        let mut objects =
+            search(&mut model, self.rays, begun, Depth::Shallow, true, &mut Tally::default(), self.progress)?;
+        let again = calibrate(self.scene, noise, &placed(&objects), self.known);
+        // What is left over gives birth: an object that a map lacks would count against its noise. But it tells no noise: it may be born of nonsense.
+        objects.extend(born_of_rest(&model, self.rays, &objects, self.progress)?);
         let (value, left) = (likelihood(&model, &objects, self.rays), Left::of(&model, &objects, self.rays));
         let map = placed(&objects);
-        let again = calibrate(self.scene, noise, &map, self.known);
         let change = change_of_fits(&model.with_noise(&again), &objects);
         Ok(Round { noise: *noise, map, value, change, again, left })
     }

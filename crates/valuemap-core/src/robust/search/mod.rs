@@ -65,6 +65,25 @@ pub enum Depth {
     Deep,
 }
 
+/// Objects that are born of what some objects leave over of some rays.
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn born_of_rest(
+    model: &Model<'_>,
+    rays: &[u32],
+    objects: &[Object],
+    progress: &Progress,
+) -> Result<Vec<Object>, Halt> {
+    if !model.settings.has(Part::Births) {
+        return Ok(Vec::new());
+    }
+    let lookout = Lookout::new(model.scene, model.settings.viability.max_range_m);
+    let mut is_taken = vec![false; model.scene.rays.rays.len()];
+    objects.iter().flat_map(|o| &o.votes).for_each(|&ray| is_taken[ray as usize] = true);
+    Ok(births(model, &lookout, rays, &mut is_taken, &[Who::All], progress)?.0)
+}
+
 /// The map of some rays with the least J that is found from what is there to begin with.
 ///
 /// # Errors
