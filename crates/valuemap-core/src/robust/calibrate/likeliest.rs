@@ -12,6 +12,7 @@ use super::CALIBRATION_RAYS;
 use super::residuals::calibrate;
 use super::shared::{as_stated, stated};
 use crate::progress::{Halt, Progress};
+use crate::robust::energy::looks::Lookout;
 use crate::robust::energy::{Object, Placed, fit, placed};
 use crate::robust::initial;
 use crate::robust::model::Model;
@@ -181,7 +182,8 @@ impl Sample<'_> {
             search(&mut model, self.rays, begun, Depth::Shallow, true, &mut Tally::default(), self.progress)?;
         let again = calibrate(self.scene, noise, &placed(&objects), self.known);
         // What is left over gives birth: an object that a map lacks would count against its noise. But it tells no noise: it may be born of nonsense.
-        objects.extend(born_of_rest(&model, self.rays, &objects, self.progress)?);
+        let lookout = Lookout::new(self.scene, self.settings.viability.max_range_m);
+        objects.extend(born_of_rest(&model, &lookout, self.rays, &objects, self.progress)?.0);
         let (value, left) = (likelihood(&model, &objects, self.rays), Left::of(&model, &objects, self.rays));
         let map = placed(&objects);
         let change = change_of_fits(&model.with_noise(&again), &objects);
@@ -360,7 +362,6 @@ mod tests {
     use nalgebra::{Isometry3, Vector3};
 
     use super::*;
-    use crate::robust::energy::looks::Lookout;
     use crate::robust::energy::object;
     use crate::robust::learn::learn;
     use crate::street;

@@ -79,13 +79,10 @@ fn minus_log_likelihood(scene: &Scene, noise: &Noise, of_sight: &Noise, (votes, 
         let mut of_side = Terms::none();
         for visit in side {
             let looks = looks_at(scene, noise, of_sight, visits[visit as usize], point)?;
-            let drive = Drive::at_one(&looks)?;
-            let (information, gradient) = drive.normals.of_one();
-            of_side.add_said(&Said { information, gradient, energy: drive.normals.square + drive.log_determinant() });
+            of_side.add_said(&Said::of(&Drive::at_one(&looks)?));
         }
         let said = of_side.said();
-        let has_middle = noise.side_m > 0.0;
-        let said = if has_middle { at_middle(noise.side_m, Vector3::zeros(), &said)?.0 } else { said };
+        let said = if noise.side_m > 0.0 { at_middle(noise.side_m, Vector3::zeros(), &said)?.0 } else { said };
         all.add_said(&said);
     }
     let told = Told::of(&all.information)?;

@@ -338,9 +338,8 @@ fn say(visit: &[Vantage], weights: &[f64], point: &Vector3<f64>, chi2: &mut Vec<
             looks.push(look_from(vantage)?);
         }
         let drive = Drive::along(&looks, weights, 1)?;
-        let (information, gradient) = drive.normals.of_one();
         chi2.extend(looks.iter().zip(drive.left()).map(|(look, left)| left.norm_squared() / look.variance));
-        Said { information, gradient, energy: drive.normals.square + drive.log_determinant() }
+        Said::of(&drive)
     };
     for (&chi2, &weight) in chi2[first..].iter().zip(weights) {
         // Huber's loss is 2 c |r| - c² beyond c, of which the weighted square is c |r|.
@@ -414,6 +413,13 @@ pub(crate) fn owners(scene: &Scene, objects: &[Object]) -> Vec<u32> {
         object.votes.iter().for_each(|&ray| owner[ray as usize] = i);
     }
     owner
+}
+
+/// Which rays of a scene vote for one of some objects.
+pub(crate) fn are_taken(scene: &Scene, objects: &[Object]) -> Vec<bool> {
+    let mut is_taken = vec![false; scene.rays.rays.len()];
+    objects.iter().flat_map(|object| &object.votes).for_each(|&ray| is_taken[ray as usize] = true);
+    is_taken
 }
 
 /// Logarithm of the physical size that a ray's box implies at a point, m.

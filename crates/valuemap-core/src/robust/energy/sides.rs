@@ -6,6 +6,7 @@
 use nalgebra::{Matrix3, Vector3};
 
 use super::by_side;
+use crate::robust::noise::drift::Drive;
 use crate::robust::scene::Scene;
 
 /// Visits whose mean directions are within 45 degrees look from one side: a box has four.
@@ -21,12 +22,20 @@ pub fn of_directions(directions: impl Iterator<Item = Vector3<f64>>) -> Vec<Vec<
     by_side((0..).zip(directions.map(|direction| direction.normalize())), LEAST_COSINE)
 }
 
-/// What a side says of an object: information, 1/m², and gradient, 1/m, of half of its squared residuals, and its part of equation (1).
+/// What a visit or a side says of an object: information, 1/m², and gradient, 1/m, of half of its squared residuals, and its part of equation (1).
 #[derive(Debug, Clone)]
 pub(crate) struct Said {
     pub(crate) information: Matrix3<f64>,
     pub(crate) gradient: Vector3<f64>,
     pub(crate) energy: f64,
+}
+
+impl Said {
+    /// What a visit at one object says of it.
+    pub(crate) fn of(drive: &Drive<'_>) -> Self {
+        let (information, gradient) = drive.normals.of_one();
+        Self { information, gradient, energy: drive.normals.square + drive.log_determinant() }
+    }
 }
 
 /// The middle that a side shows.

@@ -11,7 +11,7 @@ use super::assign::gain_alone;
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::looks::Lookout;
 use crate::robust::energy::seen::Shares;
-use crate::robust::energy::{Object, by_place, object, unseen};
+use crate::robust::energy::{Object, are_taken, by_place, object, unseen};
 use crate::robust::learn::company::Sure;
 use crate::robust::model::{ClassModel, Model};
 use crate::robust::noise::index::RayIndex;
@@ -35,8 +35,7 @@ pub fn objects_of_few(
     least_votes: usize,
     progress: &Progress,
 ) -> Result<Vec<Object>, Halt> {
-    let mut is_taken = vec![false; model.scene.rays.rays.len()];
-    objects.iter().flat_map(|object| &object.votes).for_each(|&ray| is_taken[ray as usize] = true);
+    let mut is_taken = are_taken(model.scene, objects);
     let tells = |ray: u32| model.class_of(ray).heights.is_some() || model.has_range(ray);
     let is_free = |ray: &u32| !is_taken[*ray as usize] && tells(*ray);
     let free: Vec<u32> = rays.iter().copied().filter(is_free).collect();

@@ -22,7 +22,7 @@ use rayon::prelude::*;
 
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::looks::Lookout;
-use crate::robust::energy::{Object, Placed, object, unseen};
+use crate::robust::energy::{Object, Placed, are_taken, object, unseen};
 use crate::robust::learn::learn;
 use crate::robust::learn::tails::of_rays;
 use crate::robust::model::Model;
@@ -65,23 +65,21 @@ pub enum Depth {
     Deep,
 }
 
-/// Objects that are born of what some objects leave over of some rays.
+/// Objects that are born of what some objects leave over of some rays, and how many hypotheses there were.
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
 pub fn born_of_rest(
     model: &Model<'_>,
+    lookout: &Lookout,
     rays: &[u32],
     objects: &[Object],
     progress: &Progress,
-) -> Result<Vec<Object>, Halt> {
+) -> Result<(Vec<Object>, u64), Halt> {
     if !model.settings.has(Part::Births) {
-        return Ok(Vec::new());
+        return Ok((Vec::new(), 0));
     }
-    let lookout = Lookout::new(model.scene, model.settings.viability.max_range_m);
-    let mut is_taken = vec![false; model.scene.rays.rays.len()];
-    objects.iter().flat_map(|o| &o.votes).for_each(|&ray| is_taken[ray as usize] = true);
-    Ok(births(model, &lookout, rays, &mut is_taken, &[Who::All], progress)?.0)
+    births(model, lookout, rays, &mut are_taken(model.scene, objects), &[Who::All], progress)
 }
 
 /// The map of some rays with the least J that is found from what is there to begin with.
@@ -98,7 +96,6 @@ pub fn search(
     progress: &Progress,
 ) -> Result<Vec<Object>, Halt> {
     let lookout = Lookout::new(model.scene, model.settings.viability.max_range_m);
-    let mut is_taken = vec![false; model.scene.rays.rays.len()];
     let spreads = Arc::clone(&model.spreads);
     let index = RayIndex::new(model.scene, &spreads, model.settings.gate_sigmas, rays.iter().copied());
     // Who should have seen objects tells what classes are like; of each it is asked below.
@@ -138,10 +135,8 @@ pub fn search(
             progress.advance()?;
             objects = repaired;
         }
-        if depth >= Depth::Once && has(Part::Births) {
-            is_taken.fill(false);
-            objects.iter().flat_map(|o| &o.votes).for_each(|&ray| is_taken[ray as usize] = true);
-            let (born, hypotheses) = births(model, &lookout, rays, &mut is_taken, &[Who::All], progress)?;
+        if depth >= Depth::Once {
+            let (born, hypotheses) = born_of_rest(model, &lookout, rays, &objects, progress)?;
             tally.hypotheses += hypotheses;
             tally.births += born.len() as u64;
             any |= !born.is_empty();
