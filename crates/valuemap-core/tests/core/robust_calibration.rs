@@ -67,6 +67,15 @@ fn where_little_fits_it_is_tried_and_found() {
     assert!(steps > calibrated_in_steps(1.0, 0.0).1, "{steps}");
 }
 
+#[test]
+fn one_drive_does_not_say_how_far_drives_are_off() {
+    let guess = Noise { position_drift_m: 0.5, ..NOISE };
+    let (known, progress) = (Known::default(), Progress::default());
+    let found = self_calibrate(&off_by(1.0), &guess, known, &SETTINGS, false, None, &progress).unwrap().0;
+    assert_eq!(found.noise_of_covariances.position_drift_m, 0.5);
+    assert!(found.noise.position_drift_m < 0.25, "{:?}", found.noise);
+}
+
 /// What is estimated of objects by a street each, whose successive detections have errors of 1 px with a correlation.
 fn of_wandering(correlation: f64) -> Calibration {
     let of_object = |number: u64| {

@@ -31,6 +31,7 @@ use crate::robust::search::{Depth, Tally, few, search};
 use crate::robust::settings::Settings;
 use depth::all_moves_pay;
 use likeliest::{few_places, likeliest_noise, noise_of_more};
+use shared::with_drift_at_least;
 
 /// Rays of the places that the noise is estimated from, about: from each start, and from the best in the end.
 const CALIBRATION_RAYS: (usize, usize) = (4_000, 10_000);
@@ -87,12 +88,18 @@ pub fn self_calibrate(
     let noise = if settings.has(Part::NoiseSplit) { split::split(&model, known, &objects) } else { noise };
     let noise = if settings.has(Part::SharedNoise) || is_known { noise } else { noise.all_own() };
     let map = placed(&objects);
+    let told = residuals::sample(scene, &noise, &map);
     let remembered = if settings.has(Part::SharedNoise) && settings.has(Part::Memory) {
-        memory::remembered(scene, &noise, known, &residuals::sample(scene, &noise, &map))
+        memory::remembered(scene, &noise, known, &told)
     } else {
         None
     };
     let noise_of_covariances = remembered.unwrap_or(noise);
+    let noise_of_covariances = if known.position || !settings.has(Part::SharedNoise) {
+        noise_of_covariances
+    } else {
+        with_drift_at_least(scene, &told, &noise_of_covariances, guess.position_drift_m)
+    };
     let is_small = !is_part && scene.usable_rays().len() <= MOST_RAYS;
     let is_deep = is_small || all_moves_pay(&mut model, &objects, progress)?;
     let classes = model.classes.iter().copied().map(Some).collect();

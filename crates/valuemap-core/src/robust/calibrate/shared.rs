@@ -52,22 +52,32 @@ pub(crate) fn as_stated(noise: &Noise, stated: Stated) -> Noise {
     }
 }
 
-/// A noise with the drift at which the passes of objects disagree as much as expected, or with that which was thought, m, if it makes what they say likelier:
-/// passes of what is two objects in truth disagree whatever the drift is. As large as the errors of images and segments where poses state it, or nothing
-/// tells.
+/// A noise whose positions drift at least as far as was thought, m, where no objects tell how far: what all images of a drive share shows nowhere, and is not small for that.
+pub(crate) fn with_drift_at_least(scene: &Scene, objects: &[&Placed], noise: &Noise, thought_m: f64) -> Noise {
+    let is_told = stated(scene)[0].is_some() || enough(disagreements(scene, noise, objects)).is_some();
+    if is_told { *noise } else { Noise { position_drift_m: noise.position_drift_m.max(thought_m), ..*noise } }
+}
+
+/// A noise with the drift at which the passes of objects disagree as much as expected, or with that which was thought, m, if it is smaller and makes what
+/// they say likelier: passes of what is two objects in truth disagree whatever the drift is, and a larger one always makes them likelier. As large as the
+/// errors of images and segments where poses state it, or nothing tells.
 pub(crate) fn with_drift(scene: &Scene, objects: &[&Placed], noise: &Noise, thought_m: f64) -> Noise {
     let stated = stated(scene);
     let of = |ratio: f64| drifting(noise, ratio, stated);
     let told = stated[0].is_none().then(|| agreeing_ratio(|ratio| excess(disagreements(scene, &of(ratio), objects))));
     let Some(told) = told.flatten().map(of) else { return of(1.0) };
+    if told.position_drift_m <= thought_m {
+        return told;
+    }
     let thought = Noise { position_drift_m: thought_m, ..told };
-    let unlikeliness = |drifting: &Noise| -> f64 {
-        let of_object =
-            |object: &&Placed| minus_log_likelihood(scene, drifting, noise, object).unwrap_or(f64::INFINITY);
-        // Summed in the order of the objects, so that threads do not change the result.
-        objects.par_iter().map(of_object).collect::<Vec<f64>>().iter().sum()
+    // Of an object behind one of its voters nothing is said.
+    let change = |object: &&Placed| {
+        let [before, after] = [&thought, &told].map(|drifting| minus_log_likelihood(scene, drifting, noise, object));
+        Some(after? - before?)
     };
-    if unlikeliness(&thought) < unlikeliness(&told) { thought } else { told }
+    // Summed in the order of the objects, so that threads do not change the result.
+    let change: f64 = objects.par_iter().filter_map(change).collect::<Vec<f64>>().iter().sum();
+    if change > 0.0 { thought } else { told }
 }
 
 /// Minus twice the logarithm of the restricted likelihood of the residuals of all visits of an object, along the lines of sight that a noise makes probable,
@@ -167,6 +177,20 @@ mod tests {
     }
 
     #[test]
+    fn where_nothing_tells_the_drift_it_is_no_smaller_than_thought() {
+        let noise = Noise { position_drift_m: 0.02, ..street::NOISE };
+        let (scene, labels) = street_from_both_ends(0.0);
+        let drift_m = |drives: u32, noise: &Noise| {
+            let is_of = |ray: &u32| scene.view(*ray).pass < drives;
+            let of_drives = |(votes, point): &Placed| (votes.iter().copied().filter(is_of).collect(), *point);
+            let labels: Vec<Placed> = labels.iter().map(of_drives).collect();
+            with_drift_at_least(&scene, &labels.iter().collect::<Vec<_>>(), noise, 0.1).position_drift_m
+        };
+        assert_eq!((drift_m(1, &noise), drift_m(6, &noise)), (0.1, 0.02));
+        assert_eq!(drift_m(1, &Noise { position_drift_m: 0.3, ..noise }), 0.3);
+    }
+
+    #[test]
     fn passes_of_what_is_two_objects_are_no_drift() {
         let errors: Vec<[f64; 2]> = (0..997).map(|i| [uniform(2 * i), uniform(2 * i + 1)]).collect();
         let noise = Noise { position_m: 0.02, ..street::NOISE };
@@ -189,6 +213,8 @@ mod tests {
                     label.0.push(ray);
                 }
             }
+            // One that nothing can be said of changes nothing.
+            labels.push((labels[0].0.clone(), -labels[0].1));
             with_drift(&scene, &labels.iter().collect::<Vec<_>>(), &noise, thought_m).position_drift_m
         };
         assert!((0.03..0.1).contains(&drift_m(0, 0.1)), "{}", drift_m(0, 0.1));
