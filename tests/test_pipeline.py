@@ -35,8 +35,8 @@ from valuemap.tiles.source import InMemory
 
 def street(seed: int = 7) -> Dataset:
     """A drive of several clusters, with clutter and two passes."""
-    scene = random_scene(seed, images=60, objects=8, clutter=30)
-    return as_dataset(scene, passes=[f"pass-{i % 2}" for i in range(60)])
+    scene = random_scene(seed, images=30, objects=8, clutter=30)
+    return as_dataset(scene, passes=[f"pass-{i % 2}" for i in range(30)])
 
 
 def paper() -> valuemap.MapConfig:
