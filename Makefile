@@ -14,9 +14,8 @@ demo: setup
 	$(RUN) valuemap demo
 
 # A file is tried in one process, for what its tests share; in the order of the names, long and short ones mixed.
-# Compiled modules are kept, whatever the environment says: each program that a test starts would compile all anew.
 test: setup
-	PYTHONDONTWRITEBYTECODE= EXTRAS="$(EXTRAS)" $(RUN) pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
+	EXTRAS="$(EXTRAS)" $(RUN) pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 
 rust-test:
 	cargo test --locked --package valuemap-core

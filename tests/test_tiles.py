@@ -264,9 +264,9 @@ def test_votes_of_several_are_those_of_detections_counted_one_by_one(spread: int
 
 def streets(*places_m: float, seed: int = 7) -> Dataset:
     """Drives of 40 m past the same objects, at several places along x."""
-    scene = random_scene(seed, images=60, objects=8, clutter=30)
+    scene = random_scene(seed, images=30, objects=8, clutter=15)
     parts = [
-        shifted(as_dataset(scene, passes=[f"pass-{k}-{i % 2}" for i in range(60)]), x, 10_000 * k)
+        shifted(as_dataset(scene, passes=[f"pass-{k}-{i % 2}" for i in range(30)]), x, 10_000 * k)
         for k, x in enumerate(places_m)
     ]
     return joined_datasets(parts)
