@@ -175,11 +175,6 @@ def maps_of_dashcam_city() -> tuple[Dataset, valuemap.Map, valuemap.Map]:
     return faulty, result, dataclasses.replace(result, labels=labels, votes=votes)
 
 
-def map_of_dashcam_city() -> tuple[Dataset, valuemap.Map]:
-    """Return a city with the poses of a dash camera, and its map."""
-    return maps_of_dashcam_city()[:2]
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Watched:
     """What correcting poses made of a city, and what was done: `fitted` are the equations, by the kinds judged."""
@@ -372,21 +367,21 @@ def test_the_map_that_tells_votes_is_of_the_images_that_poses_are_estimated_with
 @functools.cache
 def told_by_a_map() -> tuple[Dataset, Refined, Refined]:
     """Return a city with every pass shifted by 1.5 m, what is made of its poses, and then with a map."""
-    faulty = simulate(dataclasses.replace(CITY, **FEWEST_IMAGES, pass_shift_m=1.5), seed=7)
+    faulty = simulate(dataclasses.replace(CITY, **FEWEST_IMAGES, **SHORT_STREETS, pass_shift_m=1.5), seed=2)
     at_first = refined_once(faulty, USUAL)
     return faulty, at_first, correction._told_by_a_map(faulty, at_first, valuemap.MapConfig(), 1, silent)
 
 
 def test_a_map_tells_better_than_what_single_drives_see_how_drives_lie_to_each_other() -> None:
     # Of two lights beside each other a drive alone does not know which another one saw.
-    clean = simulate(dataclasses.replace(CITY, **FEWEST_IMAGES), seed=7)
+    clean = simulate(dataclasses.replace(CITY, **FEWEST_IMAGES, **SHORT_STREETS), seed=2)
     _, at_first, at_last = told_by_a_map()
     assert errors(at_last.dataset, clean)[0] < min(0.25, 0.75 * errors(at_first.dataset, clean)[0])
 
 
 def test_a_map_proves_what_single_drives_leave_in_doubt() -> None:
     config = valuemap.MapConfig()
-    faulty = simulate(dataclasses.replace(CITY, focal_error_share=0.02), seed=25)
+    faulty = city(focal_error_share=0.02, **FEWER_IMAGES, **SHORT_STREETS)
     doubtful = refine_poses(faulty, config)
     assert doubtful.found is not None
     assert doubtful.dataset is faulty
@@ -514,8 +509,8 @@ def places_by_name(dataset: Dataset) -> Floats:
 @functools.cache
 def lamps_of_four_sides() -> Dataset:
     """Return lamps that show other middles to other sides, of images that are off and show few of them."""
-    config = dataclasses.replace(CITY, has_lights=0, lamp_spacing_m=25.0, side_offset_m=0.25, **FEWER_IMAGES)
-    config = dataclasses.replace(config, position_white_m=0.15, rotation_white_deg=0.2)
+    config = dataclasses.replace(CITY, has_lights=0, lamp_spacing_m=15.0, side_offset_m=0.25, **FEWER_IMAGES)
+    config = dataclasses.replace(config, position_white_m=0.15, rotation_white_deg=0.2, **SHORT_STREETS)
     return ensure_checked(simulate(config, seed=4))
 
 
@@ -953,7 +948,7 @@ def replace_cameras(dataset: Dataset, readout_s: Floats) -> Dataset:
 
 
 def test_a_rolling_shutter_costs_a_map_nothing_where_it_is_stated() -> None:
-    rolling = city(**ROLLING, passes_per_street=2)
+    rolling = city(**ROLLING, **EXACT_BOXES, lights=12, **FEWEST_IMAGES, **SHORT_STREETS)
     result = valuemap.build_map(rolling, MapConfig().with_settings(["correct_poses=0"]))
     assert result.corrected is not None
     assert result.corrected.cameras.readout_s is None
