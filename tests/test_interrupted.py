@@ -23,7 +23,8 @@ LIMIT_S = 300.0
 def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of several cells, and the map of it."""
     folder = tmp_path_factory.mktemp("interrupted")
-    valuemap.write_dataset(streets(0.0, 445.0, 3000.0), folder / "street")
+    # So many images that a cell takes longer than it takes to see that one is there, and to end the run.
+    valuemap.write_dataset(streets(0.0, 445.0, 3000.0, images=60), folder / "street")
     assert run(mapping(folder, folder / "whole"))[0] == 0
     return folder
 
@@ -90,7 +91,7 @@ MOMENTS = ("dataset/detections.parquet", "cells/*.arrow", "added/detections.parq
 @pytest.fixture(scope="module")
 def updated(street: Path) -> dict[str, bytes]:
     """What an update of the map is that nobody ends."""
-    valuemap.write_dataset(streets(0.0, 445.0, seed=11), street / "added")
+    valuemap.write_dataset(streets(0.0, 445.0, seed=11, images=60), street / "added")
     assert run(updating(street, street / "updated"))[0] == 0
     return everything(street / "updated")
 

@@ -28,7 +28,8 @@ LIMIT_S = 400.0
 
 @pytest.mark.skipif(not IS_INSTALLED, reason="ray is not installed: pip install 'valuemap[ray]'")
 def test_two_nodes_give_the_map_of_threads_whatever_is_killed(tmp_path: Path) -> None:
-    valuemap.write_dataset(streets(0.0, 445.0, 3000.0), tmp_path / "street")
+    # So many images that cells are still being solved when workers are killed.
+    valuemap.write_dataset(streets(0.0, 445.0, 3000.0, images=60), tmp_path / "street")
     noisy_pictures(tmp_path / "pictures")
     red_finder(tmp_path / "finder.onnx")
     # As below `uv run` in another project: Ray looks at the command lines of all processes above.

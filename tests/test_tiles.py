@@ -262,11 +262,11 @@ def test_votes_of_several_are_those_of_detections_counted_one_by_one(spread: int
 # Whole maps.
 
 
-def streets(*places_m: float, seed: int = 7) -> Dataset:
+def streets(*places_m: float, seed: int = 7, images: int = 30) -> Dataset:
     """Drives of 40 m past the same objects, at several places along x."""
-    scene = random_scene(seed, images=30, objects=8, clutter=15)
+    scene = random_scene(seed, images=images, objects=8, clutter=images // 2)
     parts = [
-        shifted(as_dataset(scene, passes=[f"pass-{k}-{i % 2}" for i in range(30)]), x, 10_000 * k)
+        shifted(as_dataset(scene, passes=[f"pass-{k}-{i % 2}" for i in range(images)]), x, 10_000 * k)
         for k, x in enumerate(places_m)
     ]
     return joined_datasets(parts)
