@@ -84,7 +84,7 @@ def test_one_light_of_passes_that_disagree_stays_one() -> None:
     beside = [[50.0, -6.0, 4.0], [38.0, 7.0, 4.5], [60.0, 5.0, 4.2], [55.0, -7.0, 5.0], [64.0, -4.0, 4.0]]
     lights = np.array([[45.0, 4.0, 5.0], *beside])
     for seed in range(4):
-        result = valuemap.build_map(drive(lights, passes=4, seed=seed, offset_m=0.25))
+        result = valuemap.build_map(drive(lights, passes=4, seed=seed, offset_m=0.25), POSES_AS_THEY_ARE)
         assert len(result.labels) == len(lights)
         assert result.labels.passes.min() >= 3
 
@@ -161,7 +161,7 @@ def test_a_detector_that_confuses_classes_makes_hardly_a_label_more() -> None:
 
 @pytest.fixture(scope="module")
 def driven_block() -> tuple[Dataset, valuemap.Map]:
-    dataset = simulate(block(passes_per_street=4, lookalikes_per_light=0.0), seed=5, name="block")
+    dataset = simulate(block(passes_per_street=4, lookalikes_per_light=0.0, **SHORT_STREETS), seed=5, name="block")
     return dataset, valuemap.build_map(dataset, POSES_AS_THEY_ARE)
 
 
@@ -191,7 +191,8 @@ def test_the_noise_is_estimated() -> None:
 def test_a_noisy_detector_is_no_drive_that_turns() -> None:
     """Where images of several objects tell that the detector is off, passes do not turn by half of that."""
     poses = {"position_white_m": 0.03, "position_drift_m": 0.06, "rotation_white_deg": 0.03, "rotation_drift_deg": 0.03}
-    config = block(pixel_noise_px=2.5, pixel_noise_share=0.0, focal_px=400.0, passes_per_street=3, **poses)
+    detector = {"pixel_noise_px": 2.5, "pixel_noise_share": 0.0, "focal_px": 400.0}
+    config = block(passes_per_street=3, **detector, **poses, **SHORT_STREETS)
     noise = valuemap.build_map(simulate(config, seed=5, name="block"), POSES_AS_THEY_ARE).run["counts"]["noise"]
     assert noise["rotation_drift_rad"] < 0.5 * config.pixel_noise_px / config.focal_px * np.sqrt(0.5)
     assert 0.4 < noise["position_drift_m"] / config.position_drift_m < 2.5
