@@ -278,10 +278,8 @@ def scene_of_views(centers: list[Floats], positions: Floats, *, same_image_twice
 def widest_angle(centers: Floats, position: Floats) -> float:
     """Try every pair of views."""
     direction = (position - centers) / np.linalg.norm(position - centers, axis=1, keepdims=True)
-    angles = [
-        math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b)) for a, b in itertools.combinations(direction, 2)
-    ]
-    return max(angles, default=-1.0)
+    apart = np.linalg.norm(np.cross(direction[:, None], direction), axis=2)
+    return float(np.arctan2(apart, direction @ direction.T).max())
 
 
 def test_recoverable_objects_are_those_of_all_pairs() -> None:
