@@ -15,7 +15,7 @@ from valuemap.check.boxes import MirroredPictures
 from valuemap.check.fault import Convention, Fix, View
 from valuemap.check.frames import HeadingsUseless, WorldAxes
 from valuemap.check.groups import Group
-from valuemap.check.others import find_by_others, points_of_others, rays_relative_to
+from valuemap.check.others import find_by_others, points_of_others
 from valuemap.check.registry import CONVENTIONS
 from valuemap.dataset import Dataset
 
@@ -76,21 +76,20 @@ def test_good_rays_meet_what_others_see_best_as_they_are(
 def test_points_to_meet_are_those_of_others(mirrored: View) -> None:
     """Else what a camera sees itself, wherever it looks, is what it should see."""
     group, agreement = Group(camera_id=1), mirrored.agreement_at_many_places
-    parts = points_of_others(mirrored, group)
-    assert parts is not None
+    points = points_of_others(mirrored, group)
+    assert points is not None
     image = agreement.rays.image_row[agreement.found.voters.astype(np.int64)]
     is_other = ~group.images_of(mirrored.many_places.dataset)[image]
     votes = np.add.reduceat(is_other.astype(np.int64), agreement.found.voter_offsets[:-1])
     assert votes.min() < 3
-    assert len(parts[1].place) == (votes >= 3).sum()
+    assert len(points.place) == (votes >= 3).sum()
 
 
 def test_a_ray_is_worth_one_point_and_only_one_of_its_place_and_class(mirrored: View) -> None:
-    parts = points_of_others(mirrored, Group(camera_id=1))
-    assert parts is not None
-    part, points = parts
-    ray, point = points.pairs(rays_relative_to(part, points.middle_in_world_m))
-    rays = rays_relative_to(part, points.middle_in_world_m)
+    points = points_of_others(mirrored, Group(camera_id=1))
+    assert points is not None
+    part, rays = points.part, points.rays(points.part)
+    ray, point = points.pairs(rays)
     assert (points.place_of_image[rays.image_row[ray]] == points.place[point]).all()
     assert (rays.class_code[ray] == points.class_code[point]).all()
     once = points.worth(part, mirrored.gate_px)
@@ -129,8 +128,8 @@ def test_of_readings_that_are_the_same_the_first_is_told(mirrored: View) -> None
 @pytest.mark.parametrize("convention", [WorldAxes(), HeadingsUseless()])
 def test_a_camera_has_no_world_of_its_own_and_nothing_is_guessed(convention: Convention, mirrored: View) -> None:
     group = Group(camera_id=1)
-    parts = points_of_others(mirrored, group)
-    assert parts is not None
-    fixes: list[Fix] = [fix for _, fix in convention.readings(parts[0])]
+    points = points_of_others(mirrored, group)
+    assert points is not None
+    fixes: list[Fix] = [fix for _, fix in convention.readings(points.part)]
     assert fixes
-    assert list(others._readings(mirrored, [convention], group, *parts)) == []
+    assert list(others._readings(mirrored, [convention], group, points)) == []

@@ -37,7 +37,7 @@ from valuemap.check.fault import (
     uprightness,
 )
 from valuemap.check.fit import Parameter
-from valuemap.check.groups import Group, OfGroup, fits_one_group, groups_of, only
+from valuemap.check.groups import Group, OfGroup, groups_of, is_of_one_group, only
 from valuemap.check.sample import Sample
 from valuemap.dataset import Dataset
 from valuemap.progress import Progress, silent
@@ -242,7 +242,7 @@ class _OfOneGroup(_LikeAnother):
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield those."""
         for how, fix in self._convention.readings(dataset):
-            if fits_one_group(fix, self._part, self._group):
+            if is_of_one_group(fix(self._part), self._part, self._group):
                 yield how, fix
 
 

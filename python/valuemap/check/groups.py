@@ -133,9 +133,8 @@ def find_in_groups(view: View, fault: Fault) -> Finding | None:
     return None
 
 
-def fits_one_group(fix: Fix, part: Dataset, group: Group) -> bool:
-    """Return whether a fix changes nothing that a group shares with others: the frame, and of a pass its cameras."""
-    changed = fix(part)
+def is_of_one_group(changed: Dataset, part: Dataset, group: Group) -> bool:
+    """Return whether nothing is changed that a group shares with others: the frame, and of a pass its cameras."""
     return changed.frame == part.frame and (group.pass_name is None or changed.cameras is part.cameras)
 
 

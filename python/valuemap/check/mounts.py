@@ -33,7 +33,7 @@ from valuemap.check.fault import (
 )
 from valuemap.check.groups import Group, OfGroup, groups_of, only
 from valuemap.check.headings import driving_azimuths, headings, level_rotations
-from valuemap.check.others import points_of_others, rays_relative_to
+from valuemap.check.others import points_of_others
 from valuemap.dataset import Dataset
 from valuemap.tables import Floats, Images, Ints
 
@@ -226,11 +226,10 @@ class _Bearings:
 
 
 def _bearings(view: View, group: Group) -> _Bearings | None:
-    parts = points_of_others(view, group)
-    if parts is None:
+    points = points_of_others(view, group)
+    if points is None:
         return None
-    part, points = parts
-    rays = rays_relative_to(part, points.middle_in_world_m)
+    rays = points.rays(points.part)
     ray, point = points.pairs(rays)
     if not len(ray):
         return None
@@ -239,7 +238,7 @@ def _bearings(view: View, group: Group) -> _Bearings | None:
     to_point /= np.linalg.norm(to_point, axis=1, keepdims=True)
     azimuth_rad, _ = driving_azimuths(view.dataset)
     azimuth_rad = azimuth_rad[view.many_places.image_row][group.images_of(view.many_places.dataset)]
-    level, given = level_rotations(azimuth_rad, view.dataset.frame)[image], rotation_matrices(part.images)[image]
+    level, given = level_rotations(azimuth_rad, view.dataset.frame)[image], rotation_matrices(points.part.images)[image]
     return _Bearings(
         to_point_level=np.einsum("nij,nj->ni", level, to_point),
         to_point_in_cam=np.einsum("nij,nj->ni", given, to_point),

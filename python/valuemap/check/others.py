@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from valuemap.cameras import Rays, camera_poses, local_pinholes, rays_of_pinholes
+from valuemap.cameras import Pinholes, Rays, camera_poses, local_pinholes, rays_of_pinholes
 from valuemap.check.agreement import compare
 from valuemap.check.fault import (
     AGAINST,
@@ -26,7 +27,8 @@ from valuemap.check.fault import (
     View,
     gains_of_all,
 )
-from valuemap.check.groups import Group, fits_one_group, groups_of, only
+from valuemap.check.groups import Group, groups_of, is_of_one_group, only
+from valuemap.check.sample import see_the_same
 from valuemap.dataset import Dataset
 from valuemap.tables import Floats, Ints
 
@@ -38,14 +40,31 @@ LEAST_OTHERS = 3
 class Points:
     """Points (P, 3) that others than a group see, relative to `middle_in_world_m` (3), with their places and classes.
 
-    `place_of_image` (N) is the place of each image of the group, of those that are in any.
+    `part` has the images of the group that are in any place, `place_of_image` (N) their places.
     """
 
     position_m: Floats
     middle_in_world_m: Floats
     place: Ints
     class_code: NDArray[np.int32]
+    part: Dataset
     place_of_image: Ints
+
+    def rays(self, version: Dataset) -> Rays:
+        """Return the rays of a version of the group, from camera centres relative to the middle."""
+        pinholes = self._pinholes if see_the_same(version, self.part) else local_pinholes(version)
+        cam_from_world, center_in_world_m = camera_poses(version.images)
+        return rays_of_pinholes(
+            pinholes, version.detections, cam_from_world, center_in_world_m - self.middle_in_world_m
+        )
+
+    @cached_property
+    def _pinholes(self) -> Pinholes:
+        return local_pinholes(self.part)
+
+    @cached_property
+    def _pairs_as_given(self) -> tuple[Ints, Ints]:
+        return self.pairs(self.rays(self.part))
 
     def pairs(self, rays: Rays) -> tuple[Ints, Ints]:
         """Return the rows of rays of the group, and of points in the same place and of the same class, of all pairs."""
@@ -58,15 +77,19 @@ class Points:
             points.append(others[point])
         return np.concatenate(rows), np.concatenate(points)
 
-    def worth(self, part: Dataset, gate_px: float) -> Floats:
-        """Return how well the rays of a version of the group meet each point (P); each ray meets the nearest one."""
-        rays = rays_relative_to(part, self.middle_in_world_m)
-        row, point = self.pairs(rays)
+    def worth(self, version: Dataset, gate_px: float) -> Floats:
+        """Return how well the rays of a version of the group meet each point (P); each ray meets the nearest one.
+
+        What a ray is worth is at most 1.
+        """
+        rays = self.rays(version)
+        row, point = self._pairs_as_given if see_the_same(version, self.part) else self.pairs(rays)
         to_point = self.position_m[point] - rays.center_in_world_m[row]
         local = np.einsum("nij,nj->ni", rays.residual_from_world[row], to_point)
         with np.errstate(divide="ignore", invalid="ignore"):
-            error2_px = (local[:, 0] ** 2 + local[:, 1] ** 2) / local[:, 2] ** 2
-        worth = np.where(local[:, 2] > 0.0, np.maximum(1.0 - error2_px / gate_px**2, 0.0), 0.0)
+            worth = 1.0 - (local[:, 0] ** 2 + local[:, 1] ** 2) / (gate_px * local[:, 2]) ** 2
+        meets = (local[:, 2] > 0.0) & (worth > 0.0)  # Few of all pairs do.
+        row, point, worth = row[meets], point[meets], worth[meets]
         order = np.lexsort((worth, row))
         nearest = order[np.append(np.diff(row[order]) != 0, True)] if len(order) else order
         return np.asarray(
@@ -74,16 +97,8 @@ class Points:
         )
 
 
-def rays_relative_to(dataset: Dataset, middle_in_world_m: Floats) -> Rays:
-    """Return the rays of all detections, from camera centres relative to a point (3)."""
-    cam_from_world, center_in_world_m = camera_poses(dataset.images)
-    return rays_of_pinholes(
-        local_pinholes(dataset), dataset.detections, cam_from_world, center_in_world_m - middle_in_world_m
-    )
-
-
-def points_of_others(view: View, group: Group) -> tuple[Dataset, Points] | None:
-    """Return the images of a group that are in the places of a view, and what others see there; None where nothing."""
+def points_of_others(view: View, group: Group) -> Points | None:
+    """Return what others than a group see where it has images, at the places of a view; None where nothing."""
     sample, agreement = view.many_places, view.agreement_at_many_places
     found, rays = agreement.found, agreement.rays
     mine = group.images_of(sample.dataset)
@@ -94,14 +109,14 @@ def points_of_others(view: View, group: Group) -> tuple[Dataset, Points] | None:
     first, kept = voters[starts], votes_of_others >= LEAST_OTHERS
     if not kept.any():
         return None
-    points = Points(
+    return Points(
         found.position_in_world_m[kept],
         agreement.middle_in_world_m,
         sample.place_of_image[rays.image_row[first[kept]]].astype(np.int64),
         rays.class_code[first[kept]],
+        group.part(sample.dataset),
         sample.place_of_image[mine].astype(np.int64),
     )
-    return group.part(sample.dataset), points
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,12 +150,14 @@ def find_by_others(view: View, conventions: Sequence[Convention]) -> Finding | N
 
 
 def _of_group(view: View, conventions: Sequence[Convention], group: Group, groups: int) -> Finding | None:
-    parts = points_of_others(view, group)
-    if parts is None:
+    points = points_of_others(view, group)
+    if points is None:
         return None
-    part, points = parts
-    given = points.worth(part, view.gate_px)
-    readings = list(_readings(view, conventions, group, part, points))
+    given = points.worth(points.part, view.gate_px)
+    # However they are read, rays are worth no more than their number.
+    if float(given.sum()) > FAR_WORSE * len(points.part.detections):
+        return None
+    readings = list(_readings(view, conventions, group, points))
     if not readings:
         return None
     most = max(float(each.worth.sum()) for each in readings)
@@ -172,14 +189,13 @@ def _of_group(view: View, conventions: Sequence[Convention], group: Group, group
     return only(group, finding)
 
 
-def _readings(
-    view: View, conventions: Sequence[Convention], group: Group, part: Dataset, points: Points
-) -> Iterator[_Reading]:
+def _readings(view: View, conventions: Sequence[Convention], group: Group, points: Points) -> Iterator[_Reading]:
     """Yield all readings that measure and change nothing but the group; the world is that of all cameras of a pass."""
     for convention in conventions:
         if convention.is_guess or (group.pass_name is None and convention.is_of_world):
             continue
-        for how, fix in convention.readings(part):
-            if fits_one_group(fix, part, group):
+        for how, fix in convention.readings(points.part):
+            read = fix(points.part)
+            if is_of_one_group(read, points.part, group):
                 gate_px = view.gate_px * getattr(fix, "gate_factor", 1.0)
-                yield _Reading(convention, how, fix, points.worth(fix(part), gate_px))
+                yield _Reading(convention, how, fix, points.worth(read, gate_px))
