@@ -13,6 +13,7 @@ cameras, say) is better or worse for whole stretches, and always compared by pla
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -41,6 +42,7 @@ from valuemap.check.groups import Group, OfGroup, groups_of, is_of_one_group, on
 from valuemap.check.sample import Sample
 from valuemap.dataset import Dataset
 from valuemap.progress import Progress, silent
+from valuemap.tables import Floats
 
 _LEAST_UPRIGHT = 0.5
 _ALONG_AXIS = 0.985
@@ -54,6 +56,8 @@ _SUSPICIOUS = 0.05
 _MAY_BE = 0.05
 """Of so many good cameras one is looked at alone for each reading that rays do not object to."""
 _LEAST_PRODUCT = 1e-300
+_HEAT, _LEAST_IN_HEAT = 4, 5
+"""Every so many stretches a reading is tried on first, if there are so many of these."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,9 +177,8 @@ def find_odd_group(
         least = FAR_WORSE * float(np.median(others)) if others else 0.0
         if worth[group] >= least and group not in suspects:
             continue
-        part = alone[group].dataset
         may_be = [each for each in conventions if group.pass_name is not None or not each.is_of_world]
-        own = [_OfOneGroup(convention, part, group) for convention in may_be]
+        own = [_OfOneGroup(convention, group) for convention in may_be]
         finding = hold_contest(alone[group], own, progress).finding
         if finding is not None and finding.fix is not None:
             finding = only(group, finding)
@@ -234,15 +237,14 @@ class _LikeAnother(Convention):
 class _OfOneGroup(_LikeAnother):
     """A convention with those of its readings that change nothing but one group."""
 
-    def __init__(self, convention: Convention, part: Dataset, group: Group) -> None:
+    def __init__(self, convention: Convention, group: Group) -> None:
         super().__init__(convention, group)
-        self._part = part
         self.refined = convention.refined  # type: ignore[method-assign]
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield those."""
         for how, fix in self._convention.readings(dataset):
-            if is_of_one_group(fix(self._part), self._part, self._group):
+            if is_of_one_group(fix(dataset), dataset, self._group):
                 yield how, fix
 
 
@@ -290,14 +292,49 @@ def _try_all(
     stands = uprightness(part(view.dataset))
     # An axis of a frame that others stand in is not its up.
     is_along_axis = _is_along_axis(view.dataset) if group is None else view.uprightness <= _LEAST_UPRIGHT
-    readings = [_Reading(None, "as given", None, view.agreement, stands, is_along_axis)]
-    for number, (convention, how, fix, tests) in enumerate(tried):
-        progress("trying other conventions", number, len(tried))
+    given = _Reading(None, "as given", None, view.agreement, stands, is_along_axis)
+    readings = [given]
+    # One camera's part in how all rays meet is too small to tell by a few stretches.
+    stays = [True] * len(tried) if group else _leaders(view, given, [fix for _, _, fix, _ in tried], progress)
+    for convention, how, fix, tests in itertools.compress(tried, stays):
         other = fix(sample.dataset)
         agreement = _measure(other, sample, view.gate_px, fix)
         readings.append(_Reading(convention, how, fix, agreement, uprightness(part(other)), tests=tests))
     progress("trying other conventions", len(tried), len(tried))
     return readings
+
+
+def _leaders(view: View, given: _Reading, fixes: Sequence[Fix], progress: Progress) -> list[bool]:
+    """Return which of the ways to read the data are worth a look at all stretches: a few refute most of them.
+
+    Out is what agrees less than half as well as the best, chance taken off both, and by the rays of each camera less
+    than half as well as given. All stay where a few stretches do not say that rays meet at all, and where the cameras
+    lie though their rays may be right: then it counts which readings rays cannot refute.
+    """
+    heat = view.stretches.every(_HEAT)
+    if heat.places < _LEAST_IN_HEAT:
+        return [True] * len(fixes)
+    cameras = [each for each in groups_of(view.dataset) if each.pass_name is None]
+    as_given, by_chance = (
+        _gains_by_camera(each, view.stretches, cameras)[:, ::_HEAT] for each in (view.agreement, view.chance)
+    )
+    gains = [as_given]
+    for number, fix in enumerate(fixes):
+        progress("trying other conventions", number, len(fixes))
+        gains.append(_gains_by_camera(_measure(fix(heat.dataset), heat, view.gate_px, fix), heat, cameras))
+    best = max(gains, key=lambda each: float(each[0].sum()))
+    beyond_chance = np.stack([(each - by_chance).sum(axis=1) for each in gains])
+    enough = FAR_WORSE * np.append(beyond_chance[:, 0].max(), beyond_chance[0, 1:])
+    stays = (beyond_chance >= enough).any(axis=1)
+    if compare(best[0], by_chance[0]).chance > LEAST_CHANCE or (stays[0] and not given.is_upright):
+        return [True] * len(fixes)
+    return stays[1:].tolist()
+
+
+def _gains_by_camera(agreement: Agreement, sample: Sample, cameras: Sequence[Group]) -> Floats:
+    """Return the gains (1 + cameras, places) of all images of a sample, and of those of each camera."""
+    masks = [np.ones(len(sample.image_row), np.bool_), *(each.images_of(sample.dataset) for each in cameras)]
+    return np.stack([agreement.gain_of_images(sample.place_of_image, mine) for mine in masks])
 
 
 def _measure(dataset: Dataset, sample: Sample, gate_px: float, fix: Fix | None) -> Agreement:

@@ -61,6 +61,18 @@ class Sample:
     def _pinholes(self) -> Pinholes:
         return local_pinholes(self.dataset)
 
+    def every(self, nth: int) -> Sample:
+        """Return every so many of the places, with the same images in each."""
+        row = np.flatnonzero(self.place_of_image % nth == 0)
+        images, detections = self.dataset.images.take(row), self.dataset.detections
+        part = {"images": images, "detections": detections.take(np.isin(detections.image_id, images.image_id))}
+        return Sample(
+            Dataset(**{**vars(self.dataset), **part}),
+            self.place_of_image[row] // np.uint32(nth),
+            self.image_row[row],
+            self.whole,
+        )
+
     @property
     def places(self) -> int:
         """How many there are."""
