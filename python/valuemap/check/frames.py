@@ -154,12 +154,44 @@ class DegreesForRadians(Convention):
     explained_by: ClassVar[frozenset[str]] = frozenset({"headings_constant", "headings_useless"})
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
-        """Yield degrees that were read as radians, and radians read as degrees, as compass or mathematical angles."""
+        """Yield degrees that were read as radians, and radians read as degrees, as compass or mathematical angles.
+
+        Headings that follow the drive are in their unit, and the tilts beside them, too.
+        """
+        if _follow_the_drive(dataset):
+            return
         for name, zero in (("clockwise from north", 0.0), ("counter-clockwise from east", np.pi / 2.0)):
             yield f"degrees {name} read as radians", _DegreesReadAsRadians(zero)
             yield f"radians {name} read as degrees", _RadiansReadAsDegrees(zero)
             yield f"headings in degrees {name} read as radians", _DegreesReadAsRadians(zero, tilts=False)
             yield f"headings in radians {name} read as degrees", _RadiansReadAsDegrees(zero, tilts=False)
+
+
+def _follow_the_drive(dataset: Dataset) -> bool:
+    """Return whether most images of each camera keep to where it is driven, as the drive turns.
+
+    In degrees that were read as radians they would look any way, and in radians read as degrees always the same one.
+    """
+    azimuth_rad, _, _ = headings(dataset)
+    way_rad, is_moving = driving_azimuths(dataset)
+    for camera in np.unique(dataset.images.camera_id):
+        moving = is_moving & (dataset.images.camera_id == camera)
+        if moving.sum() < _LEAST_MOVING:
+            return False
+        turns_rad = _usual_off_rad(way_rad[moving])
+        if turns_rad < _WAYS_RAD or _usual_off_rad((azimuth_rad - way_rad)[moving]) > _FOLLOWS * turns_rad:
+            return False
+    return True
+
+
+def _usual_off_rad(azimuth_rad: Floats) -> float:
+    """Return how far the middle one of azimuths (N) is off their mean."""
+    each = np.exp(1j * azimuth_rad)
+    return float(np.median(np.abs(np.angle(each * np.conj(each.mean())))))
+
+
+_FOLLOWS = 0.05
+"""Headings that jitter by a twentieth of a degree are off by as much in the wrong unit, on a way of many turns."""
 
 
 class HeadingsUseless(Convention):
