@@ -31,10 +31,10 @@ from valuemap.check.fault import (
     with_detections,
     with_images,
 )
-from valuemap.check.fit import Estimate, Motion, Parameter, estimate
+from valuemap.check.fit import ROUNDS, Estimate, Motion, Parameter, estimate
 from valuemap.check.groups import Group, OfGroup, groups_of
 from valuemap.check.lenses import Focal, focals, with_params
-from valuemap.check.loose import HALF_WAY, Correction, loose_of
+from valuemap.check.loose import FIRST_ROUNDS, Correction, loose_of
 from valuemap.check.passes import OF_ITS_CAMERA, find_height_of_pass, moved_along, seen_m
 from valuemap.check.sample import pixels_per_radian
 from valuemap.dataset import Dataset
@@ -105,10 +105,12 @@ _OF_ONE_CAMERA = (*PARAMETERS[:3], Parameter("up", _raised, _motion_up, is_lengt
 late, but those of the others do."""
 
 
-def estimate_of(view: View, parameters: tuple[Parameter, ...], *, start: Estimate | None = None) -> Estimate | None:
+def estimate_of(
+    view: View, parameters: tuple[Parameter, ...], *, start: Estimate | None = None, rounds: int = ROUNDS
+) -> Estimate | None:
     """Return the estimate of parameters at the many places of a view."""
     given = view.agreement_at_many_places
-    return estimate(view.dataset, view.many_places, view.gate_px, parameters, start=start, given=given)
+    return estimate(view.dataset, view.many_places, view.gate_px, parameters, start=start, rounds=rounds, given=given)
 
 
 def common_errors(view: View) -> Estimate | None:
@@ -211,12 +213,14 @@ def _estimates_by_others(view: View, group: Group, alone: View, groups: int) -> 
     What one camera sees little of alone, others see as well; and only they tell how high it is.
     """
     own = tuple(_of_group(parameter, group) for parameter in _OF_ONE_CAMERA)
-    # Of a camera that is off by gates few votes are right at the gate at which good rays meet.
-    first = estimate_of(_at_wider_gate(view), own)
     turn_rad = _LEAST_GATES * GATE_RAD * view.gate_share
     least = {each.name: seen_m(view) if each.is_length else turn_rad for each in own}
-    if first is None or all(abs(first.of(name)[0]) < HALF_WAY * smallest for name, smallest in least.items()):
-        return
+    first: Estimate | None = None
+    for rounds, share in FIRST_ROUNDS:
+        # Of a camera that is off by gates few votes are right at the gate at which good rays meet.
+        first = estimate_of(_at_wider_gate(view), own, rounds=rounds)
+        if first is None or all(abs(first.of(name)[0]) < share * smallest for name, smallest in least.items()):
+            return
     found = estimate_of(view, own, start=first)
     assert found is not None
     given, least_rise = gains_of_all(view, view.dataset), LEAST_RISE * float(gains_of_all(alone, alone.dataset).sum())

@@ -24,7 +24,7 @@ from valuemap.tables import Cameras, Floats, Ints
 
 Change = Callable[[Dataset, float], Dataset]
 """A dataset with one parameter changed by a value."""
-_ROUNDS = 4
+ROUNDS = 4
 _MOST_ROUNDS = 40
 """Of an error that is there: each vote is at a place that the last round left, so the way to it is many short steps."""
 _SETTLED, _SAME = 0.1, 1e-4
@@ -90,12 +90,13 @@ def estimate(
     parameters: tuple[Parameter, ...],
     *,
     start: Estimate | None = None,
+    rounds: int = ROUNDS,
     blocks: int | None = None,
     given: Agreement,
 ) -> Estimate | None:
     """Estimate parameters on a sample of a dataset; None where there is too little to go by.
 
-    A few rounds tell whether there is an error at all. From a `start` that says so it goes on until it stays. Places
+    A few `rounds` tell whether there is an error at all. From a `start` that says so it goes on until it stays. Places
     are joined to so many `blocks`, if set, whose scatter standard errors come from. `given` is what the sample came to
     as it is.
     """
@@ -103,7 +104,7 @@ def estimate(
         return start
     value = np.zeros(len(parameters)) if start is None else start.value
     results: list[Estimate] = []
-    rounds = _ROUNDS if start is None else _MOST_ROUNDS
+    rounds = rounds if start is None else _MOST_ROUNDS
     while len(results) < rounds:
         changed = Changed(dataset, sample, parameters, value)
         agreement = agreement_on(sample, changed.images, gate_px) if value.any() else given
