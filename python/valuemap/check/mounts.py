@@ -226,8 +226,9 @@ class _Bearings:
 
 
 def _bearings(view: View, group: Group) -> _Bearings | None:
+    """Return the pairs of a group; None where there are none, or its rays meet what others see as they are."""
     points = points_of_others(view, group)
-    if points is None:
+    if points is None or points.are_met(view.gate_px):
         return None
     rays = points.rays(points.part)
     ray, point = points.pairs(rays)

@@ -77,10 +77,14 @@ class Points:
             points.append(others[point])
         return np.concatenate(rows), np.concatenate(points)
 
+    def are_met(self, gate_px: float) -> bool:
+        """Return whether rays of the group, as given, are worth more than half of what rays are worth at most."""
+        return float(self.worth(self.part, gate_px).sum()) > FAR_WORSE * len(self.part.detections)
+
     def worth(self, version: Dataset, gate_px: float) -> Floats:
         """Return how well the rays of a version of the group meet each point (P); each ray meets the nearest one.
 
-        What a ray is worth is at most 1.
+        A ray is worth 1 at most.
         """
         rays = self.rays(version)
         row, point = self._pairs_as_given if see_the_same(version, self.part) else self.pairs(rays)
@@ -151,12 +155,9 @@ def find_by_others(view: View, conventions: Sequence[Convention]) -> Finding | N
 
 def _of_group(view: View, conventions: Sequence[Convention], group: Group, groups: int) -> Finding | None:
     points = points_of_others(view, group)
-    if points is None:
+    if points is None or points.are_met(view.gate_px):  # However they are read, no rays are worth twice as much.
         return None
     given = points.worth(points.part, view.gate_px)
-    # However they are read, rays are worth no more than their number.
-    if float(given.sum()) > FAR_WORSE * len(points.part.detections):
-        return None
     readings = list(_readings(view, conventions, group, points))
     if not readings:
         return None
