@@ -19,7 +19,7 @@ from check_faults import RIG_FAULTS, exchanged, good_city, lowered, of_camera
 from check_faults import good_rig as rig
 from small_dataset import small_dataset
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check import boxes, cameras, contest, distortion, examine, fit, mounts, passes, sizes
+from valuemap.check import boxes, cameras, contest, distortion, examine, fit, frames, mounts, passes, sizes
 from valuemap.check.agreement import Agreement, compare, gains_of_objects, measure_agreement
 from valuemap.check.boxes import PictureSize, _chance_of_gap, _Ends, _OfSquare, picture_sizes, rows_in_images
 from valuemap.check.cameras import PARAMETERS, _followed, _is_wider_gate_only, with_focal
@@ -482,6 +482,7 @@ def test_a_turn_of_as_much_as_magnetic_north_is_off_is_no_other_convention(
     assert verdict.finding is None
     assert verdict.suspicion is None
     monkeypatch.setattr(contest, "SMALL_TURNS_RAD", np.radians([2.0, 4.0, 6.0]))
+    monkeypatch.setattr(frames, "_follow_the_drive", lambda _: False)  # Headings taken from the drive are not aside.
     assert hold_contest(View(aside), CONVENTIONS).finding is not None
 
 
@@ -942,6 +943,18 @@ def test_boxes_of_the_square_that_a_detector_saw_are_named_and_undone(is_squeeze
     assert finding.fault == "picture_size"
     assert finding.fix is not None
     np.testing.assert_allclose(finding.fix(spoiled).detections.center_px, one.detections.center_px)
+
+
+def test_headings_that_follow_the_drive_are_in_no_other_unit(one: Dataset, one_rig: Dataset) -> None:
+    unit = frames.DegreesForRadians()
+    for given in (one, one_rig):
+        assert list(unit.readings(given)) == []
+        azimuth, pitch, roll = headings(given)
+        for factor in (np.radians(1.0), np.degrees(1.0)):
+            rotation = rotations_of(factor * azimuth, pitch, roll, given.frame)
+            assert len(list(unit.readings(with_poses(given, rotation, camera_centers(given.images))))) == 8
+    straight = street(one, 0, 40)
+    assert len(list(unit.readings(straight))) == 8  # It has no turns to follow.
 
 
 def test_headings_alone_in_the_wrong_unit_are_told_from_all_angles(one: Dataset) -> None:
@@ -1414,7 +1427,11 @@ def test_rotation_sigmas_that_rays_give_the_lie_to_are_degrees(good: Dataset) ->
 
 def test_a_plural_is_another_spelling(one: Dataset) -> None:
     names = [f"{name}s" if row % 4 == 0 else name for row, name in enumerate(one.detections.class_name.texts())]
-    assert named(with_detections(one, class_name=Categories.from_texts(names))) == ["class_spelling"]
+    spoiled = with_detections(one, class_name=Categories.from_texts(names))
+    (finding,) = _look(View(spoiled), "tables", silent)
+    assert finding.fault == "class_spelling"
+    assert finding.fix is not None
+    assert finding.fix(spoiled).detections.class_name.texts() == one.detections.class_name.texts()
 
 
 @pytest.mark.parametrize("factor", [0.3048, 1.0 / 0.3048])

@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from check_faults import FAULTS as INJECTED
 from check_faults import good_city, of_camera, upside_down
+from valuemap.cameras import camera_centers
 from valuemap.check import contest
 from valuemap.check.agreement import Agreement, agreement_on
-from valuemap.check.contest import _AmongOthers, _judge, _Reading, _try_all, spoils_a_group
-from valuemap.check.fault import LEAST_RISE, Fix, View, keep_rows
+from valuemap.check.contest import (
+    _AmongOthers,
+    _judge,
+    _leaders,
+    _measure,
+    _Reading,
+    _try_all,
+    hold_contest,
+    spoils_a_group,
+)
+from valuemap.check.fault import LEAST_RISE, Fix, View, keep_rows, with_centers
 from valuemap.check.groups import Group
 from valuemap.check.poses import CameraAxes
 from valuemap.check.registry import CONVENTIONS
@@ -74,3 +86,40 @@ def test_of_one_camera_it_counts_whether_that_one_stands(images: int, is_up_unkn
     assert (given.is_upright, turned.is_upright) == (False, True)
     assert given.uprightness == pytest.approx(-turned.uprightness, abs=1e-9)
     assert given.is_along_axis is is_up_unknown
+
+
+def test_a_few_stretches_refute_most_readings_and_no_good_one(view: View, monkeypatch: pytest.MonkeyPatch) -> None:
+    spoiled = INJECTED["heading_convention"].spoil(view.dataset)
+    assert spoiled is not None
+    raced = View(spoiled)
+    measured: list[Dataset] = []
+
+    def measure(dataset: Dataset, *given: Any) -> Agreement:
+        measured.append(dataset)
+        return _measure(dataset, *given)
+
+    monkeypatch.setattr(contest, "_measure", measure)
+    told = hold_contest(raced, CONVENTIONS)
+    assert told.finding is not None
+    assert told.finding.fault == "heading_convention"
+    few = [each for each in measured if len(each.images) < len(raced.stretches.image_row)]
+    assert 0 < len(measured) - len(few) < len(few) / 2
+    monkeypatch.setattr(contest, "_leaders", lambda _view, _given, fixes, _progress: [True] * len(fixes))
+    by_all = hold_contest(View(spoiled), CONVENTIONS)
+    assert by_all.finding is not None
+    assert by_all.finding.to_json() == told.finding.to_json()
+
+
+def test_all_readings_stay_where_few_stretches_cannot_tell_or_cameras_lie(view: View) -> None:
+    given = _Reading(None, "as given", None, view.agreement, 1.0)
+    nothing: list[Fix] = [
+        lambda dataset: dataset,
+        lambda dataset: with_centers(dataset, -camera_centers(dataset.images)),
+    ]
+    assert _leaders(view, given, nothing, silent) == [True, False]
+    assert _leaders(view, replace(given, uprightness=0.0), nothing, silent) == [True, True]
+    noise = View(with_centers(view.dataset, 1e3 * np.random.default_rng(0).normal(size=(len(view.dataset.images), 3))))
+    assert _leaders(noise, given, nothing, silent) == [True, True]
+    few = View(keep_rows(view.dataset, images=np.arange(len(view.dataset.images)) < 60))
+    assert few.stretches.every(4).places < 5
+    assert _leaders(few, given, nothing, silent) == [True, True]

@@ -95,7 +95,9 @@ def test_a_ray_is_worth_one_point_and_only_one_of_its_place_and_class(mirrored: 
     once = points.worth(part, mirrored.gate_px)
     double = replace(
         points,
-        **{name: np.concatenate([getattr(points, name)] * 2) for name in ("position_m", "place", "class_code")},
+        position_m=np.concatenate([points.position_m] * 2),
+        place=np.concatenate([points.place] * 2),
+        class_code=np.concatenate([points.class_code] * 2),
     )
     assert double.worth(part, mirrored.gate_px).sum() == pytest.approx(once.sum())
 

@@ -307,9 +307,9 @@ def _try_all(
 def _leaders(view: View, given: _Reading, fixes: Sequence[Fix], progress: Progress) -> list[bool]:
     """Return which of the ways to read the data are worth a look at all stretches: a few refute most of them.
 
-    Out is what agrees less than half as well as the best, chance taken off both, and by the rays of each camera less
-    than half as well as given. All stay where a few stretches do not say that rays meet at all, and where the cameras
-    lie though their rays may be right: then it counts which readings rays cannot refute.
+    Out is what agrees less than half as well as the best, chance taken off both; if the data may be right as given,
+    what suits one camera about as well stays, too. All stay where a few stretches do not say that rays meet at all, and
+    where the cameras lie though their rays may be right: then it counts which readings rays cannot refute.
     """
     heat = view.stretches.every(_HEAT)
     if heat.places < _LEAST_IN_HEAT:
@@ -324,11 +324,12 @@ def _leaders(view: View, given: _Reading, fixes: Sequence[Fix], progress: Progre
         gains.append(_gains_by_camera(_measure(fix(heat.dataset), heat, view.gate_px, fix), heat, cameras))
     best = max(gains, key=lambda each: float(each[0].sum()))
     beyond_chance = np.stack([(each - by_chance).sum(axis=1) for each in gains])
-    enough = FAR_WORSE * np.append(beyond_chance[:, 0].max(), beyond_chance[0, 1:])
-    stays = (beyond_chance >= enough).any(axis=1)
-    if compare(best[0], by_chance[0]).chance > LEAST_CHANCE or (stays[0] and not given.is_upright):
+    leads = beyond_chance[:, 0] >= FAR_WORSE * beyond_chance[:, 0].max()
+    if compare(best[0], by_chance[0]).chance > LEAST_CHANCE or (leads[0] and not given.is_upright):
         return [True] * len(fixes)
-    return stays[1:].tolist()
+    if leads[0]:
+        leads |= (beyond_chance[:, 1:] >= FAR_WORSE * beyond_chance[0, 1:]).any(axis=1)
+    return [bool(each) for each in leads[1:]]
 
 
 def _gains_by_camera(agreement: Agreement, sample: Sample, cameras: Sequence[Group]) -> Floats:

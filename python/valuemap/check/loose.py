@@ -22,7 +22,7 @@ from scipy import stats
 import valuemap._core as _core
 from valuemap.check.agreement import Agreement, Comparison, agreement_on, compare
 from valuemap.check.fault import AGAINST, GATE_RAD, LEAST_CHANCE, MANY_DETECTIONS, WIDER_GATE, View
-from valuemap.check.fit import ROUNDS, Estimate, Parameter, apply, estimate
+from valuemap.check.fit import Estimate, Parameter, apply, estimate
 from valuemap.check.groups import Group, OfGroup
 from valuemap.check.sample import Sample, pixels_per_radian, sample_stretches
 from valuemap.dataset import Dataset
@@ -30,9 +30,8 @@ from valuemap.tables import Floats
 
 LEAST_TIMES = 3.0
 """An error of all images is seen from so many times what single rays miss by."""
-FIRST_ROUNDS = (1, 0.2), (ROUNDS, 0.5)
-"""At a wide gate so many rounds of an estimate go at least so far. In simulated rigs with a camera that is turned by
-1.6 to 4 degrees, a metre too low or 0.3 s late, the first round goes a quarter to all of the way."""
+HALF_WAY = 0.5
+"""The first rounds go at least so far."""
 _BLOCKS = 8
 """Of hundreds of metres each, longer than poses drift together."""
 
@@ -130,15 +129,13 @@ class Loose:
 
     def _settled(self, parameters: tuple[Parameter, ...]) -> Estimate | None:
         """Return the estimate followed to its end, if after the first rounds it may be one of an error."""
-        first: Estimate | None = None
-        for rounds, share in FIRST_ROUNDS:
-            first = self._estimate(parameters, rounds=rounds)
-            misses = None if first is None else self.misses(apply(self._dataset, parameters, first.value))
-            if first is None or misses is None:
-                return None
-            least = LEAST_TIMES * share
-            if all(abs(first.of(each.name)[0]) < least * misses.of(each) for each in parameters):
-                return None
+        first = self._estimate(parameters)
+        misses = None if first is None else self.misses(apply(self._dataset, parameters, first.value))
+        if first is None or misses is None:
+            return None
+        least = LEAST_TIMES * HALF_WAY
+        if all(abs(first.of(each.name)[0]) < least * misses.of(each) for each in parameters):
+            return None
         return self._estimate(parameters, start=first)
 
     def _beside(self, parameters: tuple[Parameter, ...], rival: Parameter | None, name: str) -> float:
@@ -152,18 +149,9 @@ class Loose:
     def _gain(self, dataset: Dataset) -> Floats:
         return self._agreement(dataset).gain
 
-    def _estimate(
-        self, parameters: tuple[Parameter, ...], *, start: Estimate | None = None, rounds: int = ROUNDS
-    ) -> Estimate | None:
+    def _estimate(self, parameters: tuple[Parameter, ...], *, start: Estimate | None = None) -> Estimate | None:
         return estimate(
-            self._dataset,
-            self._sample,
-            self._gate_px,
-            parameters,
-            start=start,
-            rounds=rounds,
-            blocks=_BLOCKS,
-            given=self._given,
+            self._dataset, self._sample, self._gate_px, parameters, start=start, blocks=_BLOCKS, given=self._given
         )
 
     def _agreement(self, dataset: Dataset) -> Agreement:
