@@ -50,7 +50,7 @@ _ALONG_AXIS = 0.985
 _ENOUGH_PLACES = 12
 """What a sample is cut into where there are detections enough."""
 _FROM_RAYS = 0.05
-"""However upright cameras stand under a reading, rays must prefer it beyond this chance."""
+"""Rays must agree better beyond this chance, however upright cameras stand, and before a few stretches refute any."""
 _SUSPICIOUS = 0.05
 """What good data would give with a probability above this, all that was tried counted, is not even told."""
 _MAY_BE = 0.05
@@ -325,7 +325,7 @@ def _leaders(view: View, given: _Reading, fixes: Sequence[Fix], progress: Progre
     best = max(gains, key=lambda each: float(each[0].sum()))
     beyond_chance = np.stack([(each - by_chance).sum(axis=1) for each in gains])
     leads = beyond_chance[:, 0] >= FAR_WORSE * beyond_chance[:, 0].max()
-    if compare(best[0], by_chance[0]).chance > LEAST_CHANCE or (leads[0] and not given.is_upright):
+    if compare(best[0], by_chance[0]).chance > _FROM_RAYS or (leads[0] and not given.is_upright):
         return [True] * len(fixes)
     if leads[0]:
         leads |= (beyond_chance[:, 1:] >= FAR_WORSE * beyond_chance[0, 1:]).any(axis=1)
