@@ -321,6 +321,28 @@ def tilt_convention(dataset: Dataset) -> Dataset | None:
 LEAST_PITCH_RAD = np.radians(2.0)
 
 
+def rounded_headings(dataset: Dataset) -> Dataset:
+    """Headings in steps of five degrees."""
+    azimuth, pitch, roll = _angles(dataset)
+    return _from_angles(dataset, np.radians(5.0 * np.round(np.degrees(azimuth) / 5.0)), pitch, roll)
+
+
+def sides_exchanged(dataset: Dataset) -> Dataset:
+    """Give the pictures' heights for their widths."""
+    cameras = dataset.cameras
+    return replace(dataset, cameras=cameras.replace(width_px=cameras.height_px, height_px=cameras.width_px))
+
+
+def two_names(dataset: Dataset) -> Dataset:
+    """Call what is in every second image by another name, as a second source does."""
+    other = rows(dataset) % 2 == 1
+    names = [
+        f"{name} of another source" if is_other else name
+        for name, is_other in zip(dataset.detections.class_name.texts(), other, strict=True)
+    ]
+    return replace(dataset, detections=dataset.detections.replace(class_name=Categories.from_texts(names)))
+
+
 def pitch_and_roll(dataset: Dataset) -> Dataset:
     """Pitch and roll of a poor sensor."""
     azimuth, _, _ = _angles(dataset)
@@ -758,6 +780,9 @@ FAULTS: dict[str, Fault] = {
     "lens_model": Fault(lens_model),
     "held_positions": Fault(held_positions, has_fix=False),  # Between the fixes the way is guessed.
     "rounded_positions": Fault(rounded_positions, has_fix=False),
+    "rounded_headings": Fault(rounded_headings, has_fix=False),
+    "sides_exchanged": Fault(sides_exchanged),
+    "two_names": Fault(two_names),
     "height_zero": Fault(height_zero),
     "quantised_boxes": Fault(quantised_boxes, has_fix=False),
     "class_spelling": Fault(class_spelling),

@@ -60,7 +60,7 @@ from valuemap.check.sample import driving_order
 from valuemap.check.seams import worst_seam
 from valuemap.check.sizes import are_outside, object_heights
 from valuemap.cli.commands import app
-from valuemap.dataset import Dataset, read_dataset, write_dataset
+from valuemap.dataset import Dataset, Frame, read_dataset, write_dataset
 from valuemap.errors import InputError
 from valuemap.progress import silent
 from valuemap.simulate import PRESETS, simulate
@@ -1442,6 +1442,19 @@ def test_truth_tells_feet_from_metres(factor: float, few: Dataset) -> None:
     assert finding.fix is not None
     fixed = finding.fix(spoiled)
     np.testing.assert_allclose(camera_centers(fixed.images), camera_centers(few.images), atol=1e-6)
+
+
+def test_truth_tells_metres_of_web_mercator(few: Dataset) -> None:
+    """At the latitude of London they are 62 cm; and near the equator they are metres."""
+    assert few.frame.anchor is not None
+    spoiled = with_centers(few, camera_centers(few.images) / np.cos(np.radians(few.frame.anchor[0])))
+    finding = _FAULT["scale"].find(View(spoiled))
+    assert finding is not None
+    assert "Web Mercator" in finding.why
+    assert finding.fix is not None
+    np.testing.assert_allclose(camera_centers(finding.fix(spoiled).images), camera_centers(few.images), atol=1e-6)
+    assert _FAULT["scale"].find(View(few)) is None
+    assert frames._units_m(Frame(anchor=(5.0, 0.0, 0.0))) == frames._units_m(Frame(up=(0.0, 0.0, 1.0)))
 
 
 def test_feet_are_not_taken_for_half_sizes(one: Dataset) -> None:

@@ -374,15 +374,16 @@ def _scale_by_truth(view: View) -> Finding | None:
         return None
     tolerance_m = max(view.step_m / 2.0, 1e-9)
     points, objects = flattened(points, truth, view), flattened(truth.position_in_world_m, truth, view)
-    matched = {unit: _matched_in(unit_m, points, objects, tolerance_m) for unit, unit_m in _UNITS_M.items()}
+    units_m = _units_m(view.dataset.frame)
+    matched = {unit: _matched_in(unit_m, points, objects, tolerance_m) for unit, unit_m in units_m.items()}
     unit = max(matched, key=lambda each: matched[each])
     if unit == "metres" or matched[unit] < 2 * matched["metres"]:
         return None
-    tests = len(points) * len(objects) * len(_UNITS_M)
+    tests = len(points) * len(objects) * len(units_m)
     chance = float(stats.binom.sf(matched[unit] - 1, matched[unit] + matched["metres"], 0.5)) * tests
     if chance > LEAST_CHANCE:
         return None
-    factor = _UNITS_M[unit]
+    factor = units_m[unit]
     return Finding(
         fault=Scale.name,
         what="The world is not in metres.",
@@ -401,6 +402,18 @@ _UNITS_M = {
     "feet": 0.3048, "inches": 0.0254, "miles": 1609.344, "metres taken for feet": 1 / 0.3048,
     "metres taken for centimetres": 100.0, "metres taken for decimetres": 10.0,
 }  # fmt: skip
+
+
+def _units_m(frame: Frame) -> dict[str, float]:
+    """Return how long units are that positions may be in; those of a map in Web Mercator are shorter than a metre."""
+    if frame.anchor is None:
+        return _UNITS_M
+    mercator_m = math.cos(math.radians(frame.anchor[0]))
+    return _UNITS_M if mercator_m > _NEAR_THE_EQUATOR else {**_UNITS_M, "metres of Web Mercator": mercator_m}
+
+
+_NEAR_THE_EQUATOR = 0.95
+"""A twentieth of a scale is within what maps of one city differ by."""
 
 
 def _matched_in(unit_m: float, points: Floats, objects: Floats, tolerance: float) -> int:

@@ -1,4 +1,4 @@
-"""Mistakes in what a camera is said to be: the unit of its focal length, its principal point, its lens."""
+"""Mistakes in what a camera is said to be: the unit of its focal length, its principal point, its sides."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from valuemap.check.fault import Convention, Fix
-from valuemap.dataset import Dataset
+from valuemap.check.fault import Convention, Fault, Finding, Fix, Stage, View
+from valuemap.dataset import Dataset, rows_of
 from valuemap.tables import Cameras, Floats
 
 _ONE_FOCAL_LENGTH = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
@@ -105,17 +105,66 @@ class PrincipalPoint(Convention):
         yield "in the middle of the picture", lambda whole: _with_principal_points(whole, lambda _, size: size / 2.0)
 
 
+class SidesExchanged(Fault):
+    """The width of a picture where its height is expected, and the height for the width."""
+
+    name: ClassVar[str] = "sides_exchanged"
+    stage: ClassVar[Stage] = "tables"  # Rays are the same, but what is in the picture is not.
+
+    def find(self, view: View) -> Finding | None:
+        """Look for principal points in the middle of the lying picture, and boxes that only this one has room for."""
+        cameras, detections, images = view.dataset.cameras, view.dataset.detections, view.dataset.images
+        image_row = rows_of(detections.image_id, images.image_id)
+        camera_row = rows_of(images.camera_id, cameras.camera_id)[image_row]
+        found, outside = [], 0
+        for row in range(len(cameras)):
+            size = np.array([cameras.width_px[row], cameras.height_px[row]], dtype=np.float64)
+            center_px = detections.center_px[camera_row == row]
+            is_out, is_out_if_exchanged = ((center_px > each).any(axis=1) for each in (size, size[::-1]))
+            is_room = is_out.sum() >= _LEAST_OUT and is_out.mean() > _NEARLY_NONE >= is_out_if_exchanged.mean()
+            if is_room and _is_in_middle(cameras, row, size[::-1]) and _is_off_middle(cameras, row):
+                found.append(row)
+                outside += int(is_out.sum())
+        if not found:
+            return None
+        first = found[0]
+        return Finding(
+            fault=self.name,
+            what="The widths and heights of pictures are exchanged.",
+            why=f"{len(found)} of {len(cameras)} cameras have their principal points in the middle of pictures whose "
+            f"width is their height ({cameras.height_px[first]} x {cameras.width_px[first]}), and {outside} boxes are "
+            "in these pictures that are outside of those given.",
+            do="Exchange width and height of these cameras.",
+            figures={"cameras": len(found), "boxes_outside": outside},
+            fix=lambda dataset: _with_sides_exchanged(dataset, found),
+        )
+
+
+_LEAST_OUT, _NEARLY_NONE = 3, 0.01
+"""Boxes outside of their picture are a detector's slips, or of another picture."""
+
+
+def _with_sides_exchanged(dataset: Dataset, rows: list[int]) -> Dataset:
+    cameras = dataset.cameras
+    width_px, height_px = cameras.width_px.copy(), cameras.height_px.copy()
+    width_px[rows], height_px[rows] = cameras.height_px[rows], cameras.width_px[rows]
+    return Dataset(**{**vars(dataset), "cameras": cameras.replace(width_px=width_px, height_px=height_px)})
+
+
 def focals(cameras: Cameras, row: int) -> int:
     """Return how many focal lengths a camera has: its first parameters; 0 where its model has none."""
     return FOCAL_LENGTHS.get(cameras.model.names[cameras.model.codes[row]], 0)
 
 
 def _is_off_middle(cameras: Cameras, row: int) -> bool:
-    if not focals(cameras, row):
-        return False
-    at = focals(cameras, row)
     size = np.array([cameras.width_px[row], cameras.height_px[row]], dtype=np.float64)
-    return bool(np.any(np.abs(cameras.params[row][at : at + 2] / size - 0.5) > _OFF_MIDDLE))
+    return bool(focals(cameras, row)) and not _is_in_middle(cameras, row, size)
+
+
+def _is_in_middle(cameras: Cameras, row: int, size: Floats) -> bool:
+    """Return whether the principal point of a camera is in the middle of a picture of a size (2)."""
+    at = focals(cameras, row)
+    return bool(np.all(np.abs(cameras.params[row][at : at + 2] / size - 0.5) <= _OFF_MIDDLE))
 
 
 def with_params(dataset: Dataset, params: list[Floats]) -> Dataset:

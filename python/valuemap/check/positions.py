@@ -1,4 +1,4 @@
-"""Faults of positions: held until the next fix, rounded, heights above two zeros."""
+"""Faults of positions: held until the next fix, heights above two zeros."""
 
 from __future__ import annotations
 
@@ -14,16 +14,10 @@ from valuemap.check.fault import LEAST_CHANCE, Convention, Fault, Finding, Fix, 
 from valuemap.check.passes import meeting_of_passes
 from valuemap.check.sample import driving_order
 from valuemap.dataset import Dataset
-from valuemap.geodesy import lon_lat_height_from_enu
-from valuemap.tables import Bools, Floats, Images, Ints
+from valuemap.tables import Bools, Images, Ints
 
 _HELD_MORE_OFTEN = 0.5
 _LEAST_FIXES = 10
-_ROUNDED_STEPS = 0.1
-"""Rounding to more than this share of the way from image to image is coarse."""
-_DIGITS = (1, 2, 3, 4, 5, 6)
-_UNITS_M = (1000.0, 100.0, 10.0, 1.0, 0.5, 0.1)
-_ON_GRID = 0.02
 _OTHER_LEVEL_STEPS = 4.0
 _ALIKE = 0.25
 _MOSTLY = 0.8
@@ -44,30 +38,6 @@ class HeldPositions(Convention):
         """Yield positions between the fixes, where most images that follow a move do not move."""
         if np.sum(_is_new(dataset.images)) >= _LEAST_FIXES and _held_share(dataset.images) > _HELD_MORE_OFTEN:
             yield "positions between those that are held", _interpolated
-
-
-class RoundedPositions(Fault):
-    """Latitudes and longitudes, or metres, with too few digits."""
-
-    name: ClassVar[str] = "rounded_positions"
-    stage: ClassVar[Stage] = "tables"
-
-    def find(self, view: View) -> Finding | None:
-        """Look for a number of digits that all positions keep to."""
-        grid = _grid(view)
-        if grid is None:
-            return None
-        said, step_m = grid
-        if step_m <= _ROUNDED_STEPS * view.step_m:
-            return None
-        return Finding(
-            fault=self.name,
-            what="The positions of the images are rounded.",
-            why=f"All of them are {said}: that is {step_m:.3g} m, and the images are {view.step_m:.3g} m apart.",
-            do="Write all digits: seven decimals of a degree are a centimetre. "
-            f"If there are none, give --set position_sigma_m={max(step_m / 3.46, 0.01):.2g}.",
-            figures={"step_m": round(step_m, 4), "grid": said},
-        )
 
 
 class HeightZero(Fault):
@@ -141,29 +111,6 @@ def _interpolated(dataset: Dataset) -> Dataset:
             between[late] = value[fix[-1]] + speed * (when[late] - when[fix[-1]])
             moved[order[rows], axis] = between
     return with_centers(dataset, moved)
-
-
-def _grid(view: View) -> tuple[str, float] | None:
-    """Return in words on which grid all positions are, and its step in metres; None where on none."""
-    center = view.center_in_world_m
-    if len(np.unique(np.round(center, 3), axis=0)) < _LEAST_FIXES:
-        return None
-    if view.dataset.frame.anchor is not None:
-        degrees = lon_lat_height_from_enu(center, view.dataset.frame.anchor)[:, :2]
-        for digits in _DIGITS:
-            if _are_multiples(degrees, 10.0**-digits):
-                return f"multiples of {10.0**-digits:g} degrees", 111_000.0 * 10.0**-digits
-    up = int(np.argmax(np.abs(view.dataset.frame.up)))
-    level = np.delete(center, up, axis=1)
-    for unit_m in _UNITS_M:
-        if _are_multiples(level, unit_m):
-            return f"multiples of {unit_m:g} m", unit_m
-    return None
-
-
-def _are_multiples(values: Floats, unit: float) -> bool:
-    share = values / unit
-    return bool(np.all(np.abs(share - np.round(share)) < _ON_GRID)) and bool(np.all(np.ptp(share, axis=0) >= 1.0))
 
 
 def _levels(view: View) -> dict[str, float]:

@@ -34,8 +34,9 @@ from valuemap.check.frames import (
     UpDirection,
     WorldAxes,
 )
-from valuemap.check.lenses import FocalUnit, PrincipalPoint
+from valuemap.check.lenses import FocalUnit, PrincipalPoint, SidesExchanged
 from valuemap.check.mounts import CameraMount, CamerasExchanged, InvertedMounts
+from valuemap.check.names import TwoNames
 from valuemap.check.passes import (
     InterleavedPasses,
     NoDrives,
@@ -46,7 +47,7 @@ from valuemap.check.passes import (
     TimeUnit,
 )
 from valuemap.check.poses import CameraAxes, CenterAsTranslation, InvertedPoses, PitchAndRoll, QuaternionOrder
-from valuemap.check.positions import HeightZero, HeldPositions, RoundedPositions
+from valuemap.check.positions import HeightZero, HeldPositions
 from valuemap.check.quality import (
     ClassSpelling,
     EqualScores,
@@ -56,6 +57,7 @@ from valuemap.check.quality import (
     RepeatedImages,
     TruthElsewhere,
 )
+from valuemap.check.rounding import RoundedHeadings, RoundedPositions
 
 CONVENTIONS: tuple[Convention, ...] = (
     InvertedPoses(),
@@ -83,6 +85,7 @@ CONVENTIONS: tuple[Convention, ...] = (
 
 FAULTS: tuple[Fault, ...] = (
     NormalisedBoxes(),
+    SidesExchanged(),  # Of other pictures are then only boxes that are outside of both.
     CornersAsCenter(),
     FarImages(),
     RepeatedBoxes(),
@@ -90,6 +93,7 @@ FAULTS: tuple[Fault, ...] = (
     ClassSpelling(),
     EqualScores(),
     RoundedPositions(),
+    RoundedHeadings(),
     TopLeftAsCenter(),
     HalfPixel(),
     UpDirection(),
@@ -110,6 +114,7 @@ FAULTS: tuple[Fault, ...] = (
     CameraTilt(),
     CameraYaw(),
     TimeShift(),
+    TwoNames(),
     HalfSizes(),
     Scale(),
     QuantisedBoxes(),
