@@ -496,6 +496,16 @@ def pass_offset(dataset: Dataset) -> Dataset | None:
     return _moved_pass(dataset, 4.0 * east + 3.0 * north)
 
 
+def pass_frame(dataset: Dataset) -> Dataset | None:
+    """Positions of one pass in feet, where z is up."""
+    code = _met_pass(dataset)
+    if code is None or dataset.frame.up != (0.0, 0.0, 1.0):
+        return None
+    rotation, center = _poses(dataset)
+    in_feet = (dataset.images.pass_id.codes == code)[:, None]
+    return posed(dataset, rotation, np.where(in_feet, center / 0.3048, center))
+
+
 def camera_height(dataset: Dataset) -> Dataset | None:
     """Put the camera of one pass 1.8 m too low."""
     return _moved_pass(dataset, -1.8 * np.array(dataset.frame.up))
@@ -764,6 +774,7 @@ FAULTS: dict[str, Fault] = {
     "mirrored_pictures": Fault(mirrored_pictures),
     "scale": Fault(scale, has_fix=False),
     "pass_offset": Fault(pass_offset),
+    "pass_frame": Fault(pass_frame),
     "pass_time_shift": Fault(pass_time_shift),
     "time_shift": Fault(time_shift, compared=going_on),
     "camera_height": Fault(camera_height),

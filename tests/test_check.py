@@ -73,7 +73,15 @@ _RECOVERED = {"degrees_for_radians": 0.6}
 """Degrees read as radians lose whole turns, which the direction of travel does not always give back."""
 _NEEDS_ALL = {"mirrored_pictures", "boxes_top_left", "lens_model"}
 """What half as many passes do not prove."""
-_NEEDS_FEW = {"pass_offset", "pass_time_shift", "camera_height", "height_zero", "interleaved_passes", "wrong_camera"}
+_NEEDS_FEW = {
+    "pass_offset",
+    "pass_frame",
+    "pass_time_shift",
+    "camera_height",
+    "height_zero",
+    "interleaved_passes",
+    "wrong_camera",
+}
 """What one pass and one camera cannot have."""
 _FAULT = {fault.name: fault for fault in FAULTS}
 

@@ -541,6 +541,14 @@ class _PassPoints:
 
 
 def _pass_points(view: View) -> _PassPoints | None:
+    """Return what each pass finds alone, worked out once a view; None where there is nothing to compare."""
+    if "pass_points" not in view.memory:
+        view.memory["pass_points"] = _vote_of_passes(view)
+    found: _PassPoints | None = view.memory["pass_points"]
+    return found
+
+
+def _vote_of_passes(view: View) -> _PassPoints | None:
     """Vote on each pass alone at each place; None where there is nothing to compare."""
     sample = view.places_of_passes
     dataset, pass_code = sample.dataset, sample.dataset.images.pass_id.codes.astype(np.int64)
@@ -562,6 +570,7 @@ def _pass_points(view: View) -> _PassPoints | None:
         place_of_image=sample.place_of_image,
         pass_of_image=pass_code,
         point=found.position_in_world_m,
+        middle_in_world_m=agreement.middle_in_world_m,
         pass_of_point=pass_code[first_image],
         class_of_point=agreement.rays.class_code[first],
         place_of_point=sample.place_of_image[first_image].astype(np.int64),
@@ -649,22 +658,14 @@ def _far_from_others(view: View) -> PassShift | None:
     tried = meeting.passes_of_most_points()
     found: list[tuple[int, PassShift]] = []
     for code in tried:
-        own, difference = meeting.differences(code, within_m=None)
-        shift = densest(difference, tolerance_m)
-        if shift is None or np.linalg.norm(shift.offset_m) <= _SEARCH_STEPS * view.step_m:
+        match = meeting.best_match(code, tolerance_m)
+        if match is None or np.linalg.norm(match.offset_m) <= _SEARCH_STEPS * view.step_m:
             continue
-        away_m = np.linalg.norm(difference - shift.offset_m, axis=1)
-        next_best = densest(difference[away_m > _NEXT_TIMES * tolerance_m], tolerance_m)
-        met = len(np.unique(own[away_m <= tolerance_m]))
-        met_by_next = 0
-        if next_best is not None:
-            is_next = np.linalg.norm(difference - next_best.offset_m, axis=1) <= tolerance_m
-            met_by_next = len(np.unique(own[is_next]))
-        chance = float(stats.binom.sf(met - 1, met + met_by_next, 0.5)) * len(tried)
+        chance = match.chance_against(match.met_by_next) * len(tried)
         if chance < LEAST_CHANCE:
             name = view.dataset.images.pass_id.names[code]
-            told = PassShift(name, shift.offset_m, False, 0.0, 0.0, chance, len(tried), points=met)
-            found.append((met - met_by_next, told))
+            told = PassShift(name, match.offset_m, False, 0.0, 0.0, chance, len(tried), points=match.met)
+            found.append((match.met - match.met_by_next, told))
     return max(found, key=lambda each: each[0])[1] if found else None
 
 
@@ -673,13 +674,27 @@ _NEXT_TIMES = 4.0
 
 
 @dataclass(frozen=True, eq=False)
+class Match:
+    """The shift (3) by which so many points of a pass are `met` by those of others, and how many by the next."""
+
+    offset_m: Floats
+    met: int
+    met_by_next: int
+
+    def chance_against(self, others: int) -> float:
+        """Return how likely so many are met, and so many others otherwise, by two ways that are alike."""
+        return float(stats.binom.sf(self.met - 1, self.met + others, 0.5))
+
+
+@dataclass(frozen=True, eq=False)
 class Meeting:
-    """Rays of a sample, and the points that each of its passes finds alone."""
+    """Rays of a sample, and the points (P, 3) that each pass finds alone, relative to `middle_in_world_m` (3)."""
 
     rays: Rays
     place_of_image: NDArray[np.uint32]
     pass_of_image: Ints
     point: Floats
+    middle_in_world_m: Floats
     pass_of_point: Ints
     class_of_point: NDArray[np.int32]
     place_of_point: Ints
@@ -697,6 +712,20 @@ class Meeting:
         same = self.class_of_point[own[i]] == self.class_of_point[others[j]]
         i, j = own[i[same]], others[j[same]]
         return i, self.point[j] - self.point[i]
+
+    def best_match(self, code: int, tolerance_m: float) -> Match | None:
+        """Return the shift, however far, by which most points of a pass fall on those of others; None where none do."""
+        own, difference = self.differences(code, within_m=None)
+        shift = densest(difference, tolerance_m)
+        if shift is None:
+            return None
+        away_m = np.linalg.norm(difference - shift.offset_m, axis=1)
+        next_best = densest(difference[away_m > _NEXT_TIMES * tolerance_m], tolerance_m)
+        met_by_next = 0
+        if next_best is not None:
+            is_next = np.linalg.norm(difference - next_best.offset_m, axis=1) <= tolerance_m
+            met_by_next = len(np.unique(own[is_next]))
+        return Match(shift.offset_m, len(np.unique(own[away_m <= tolerance_m])), met_by_next)
 
     def gain(self, code: int, offset_m: Floats) -> Floats:
         """Return how well the rays of a pass, whose images (N, 3) are moved, meet the points of the others (places)."""

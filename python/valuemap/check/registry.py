@@ -37,6 +37,7 @@ from valuemap.check.frames import (
 from valuemap.check.lenses import FocalUnit, PrincipalPoint, SidesExchanged
 from valuemap.check.mounts import CameraMount, CamerasExchanged, InvertedMounts
 from valuemap.check.names import TwoNames
+from valuemap.check.pass_frames import PassFrame
 from valuemap.check.passes import (
     InterleavedPasses,
     NoDrives,
@@ -106,6 +107,7 @@ FAULTS: tuple[Fault, ...] = (
     HeightZero(),
     WrongCamera(),
     CameraMount(),
+    PassFrame(),
     PassOffset(),
     PassTimeShift(),
     CameraHeight(),
