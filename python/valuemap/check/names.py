@@ -85,9 +85,20 @@ class _Joined:
 
 
 def _with_one_name(dataset: Dataset, name: str, rarer: str) -> Dataset:
-    column = dataset.detections.class_name
-    texts = np.array([name if each == rarer else each for each in column.names], dtype=object)
-    return with_detections(dataset, class_name=Categories.from_texts(texts[column.codes].tolist()))
+    """Return the dataset with one name for both, in the truth, too."""
+
+    def renamed(column: Categories) -> Categories:
+        return Categories.from_texts([name if each == rarer else each for each in column.texts()])
+
+    truth = dataset.truth
+    if truth is not None:
+        truth = truth.replace(class_name=renamed(truth.class_name))
+    return Dataset(
+        **{
+            **vars(with_detections(dataset, class_name=renamed(dataset.detections.class_name))),
+            "truth": truth,
+        }
+    )
 
 
 def _joined(view: View, name: str, rarer: str) -> _Joined:
