@@ -30,8 +30,8 @@ _LEAST_VOTES = 4
 _LEAST_OBJECTS = 6
 _NEAR_STEPS = 2.0
 """Rays of one drive leave open how far an object is, by some of the steps between images."""
-_OFTEN = 0.25
-"""A detector that takes one kind for another does so less often than in one of four pictures."""
+_OFTEN = 1.0 / 3.0
+"""Of a detector that takes one kind for another in one of four pictures few objects have both names so often."""
 
 
 class TwoNames(Fault):
