@@ -88,8 +88,8 @@ def test_of_one_camera_it_counts_whether_that_one_stands(images: int, is_up_unkn
     assert given.is_along_axis is is_up_unknown
 
 
-def test_a_few_stretches_refute_most_readings_and_no_good_one(view: View, monkeypatch: pytest.MonkeyPatch) -> None:
-    spoiled = INJECTED["heading_convention"].spoil(view.dataset)
+def test_a_few_stretches_refute_most_readings_and_no_good_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    spoiled = INJECTED["heading_convention"].spoil(good_city(1, passes_per_street=1))
     assert spoiled is not None
     raced = View(spoiled)
     measured: list[Dataset] = []
