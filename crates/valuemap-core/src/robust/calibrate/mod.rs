@@ -51,7 +51,7 @@ pub const CALIBRATION_STEPS: usize = likeliest::NOISE_STEPS + 1;
 pub struct Calibration {
     /// Errors of poses and detections.
     pub noise: Noise,
-    /// The same where successive looks may be off alike: what covariances are estimated with.
+    /// The same where successive looks may be off alike, and drives by more than they tell: what covariances are estimated with.
     pub noise_of_covariances: Noise,
     /// What is learned of each class; nothing of those that are nowhere in the sample.
     pub classes: Vec<Option<ClassModel>>,
@@ -88,9 +88,9 @@ pub fn self_calibrate(
     let noise = if settings.has(Part::NoiseSplit) { split::split(&model, known, &objects) } else { noise };
     let noise = if settings.has(Part::SharedNoise) || is_known { noise } else { noise.all_own() };
     let map = placed(&objects);
-    let told = residuals::sample(scene, &noise, &map);
+    let sure = residuals::sample(scene, &noise, &map);
     let remembered = if settings.has(Part::SharedNoise) && settings.has(Part::Memory) {
-        memory::remembered(scene, &noise, known, &told)
+        memory::remembered(scene, &noise, known, &sure)
     } else {
         None
     };
@@ -98,7 +98,7 @@ pub fn self_calibrate(
     let noise_of_covariances = if known.position || !settings.has(Part::SharedNoise) {
         noise_of_covariances
     } else {
-        with_drift_at_least(scene, &told, &noise_of_covariances, guess.position_drift_m)
+        with_drift_at_least(scene, &sure, &noise_of_covariances, guess.position_drift_m)
     };
     let is_small = !is_part && scene.usable_rays().len() <= MOST_RAYS;
     let is_deep = is_small || all_moves_pay(&mut model, &objects, progress)?;

@@ -52,32 +52,29 @@ pub(crate) fn as_stated(noise: &Noise, stated: Stated) -> Noise {
     }
 }
 
-/// A noise whose positions drift at least as far as was thought, m, where no objects tell how far: what all images of a drive share shows nowhere, and is not small for that.
+/// A noise whose positions drift at least as far as was thought, m, where no objects tell how far: what all images of a drive share shows nowhere, and is
+/// not small for that.
 pub(crate) fn with_drift_at_least(scene: &Scene, objects: &[&Placed], noise: &Noise, thought_m: f64) -> Noise {
     let is_told = stated(scene)[0].is_some() || enough(disagreements(scene, noise, objects)).is_some();
     if is_told { *noise } else { Noise { position_drift_m: noise.position_drift_m.max(thought_m), ..*noise } }
 }
 
-/// A noise with the drift at which the passes of objects disagree as much as expected, or with that which was thought, m, if it is smaller and makes what
-/// they say likelier: passes of what is two objects in truth disagree whatever the drift is, and a larger one always makes them likelier. As large as the
+/// A noise with the drift at which the passes of objects disagree as much as expected, or with that which was thought, m, if it makes what they say likelier:
+/// passes of what is two objects in truth disagree whatever the drift is. An object behind one of its voters decides for the former. As large as the
 /// errors of images and segments where poses state it, or nothing tells.
 pub(crate) fn with_drift(scene: &Scene, objects: &[&Placed], noise: &Noise, thought_m: f64) -> Noise {
     let stated = stated(scene);
     let of = |ratio: f64| drifting(noise, ratio, stated);
     let told = stated[0].is_none().then(|| agreeing_ratio(|ratio| excess(disagreements(scene, &of(ratio), objects))));
     let Some(told) = told.flatten().map(of) else { return of(1.0) };
-    if told.position_drift_m <= thought_m {
-        return told;
-    }
     let thought = Noise { position_drift_m: thought_m, ..told };
-    // Of an object behind one of its voters nothing is said.
-    let change = |object: &&Placed| {
-        let [before, after] = [&thought, &told].map(|drifting| minus_log_likelihood(scene, drifting, noise, object));
-        Some(after? - before?)
+    let unlikeliness = |drifting: &Noise| -> f64 {
+        let of_object =
+            |object: &&Placed| minus_log_likelihood(scene, drifting, noise, object).unwrap_or(f64::INFINITY);
+        // Summed in the order of the objects, so that threads do not change the result.
+        objects.par_iter().map(of_object).collect::<Vec<f64>>().iter().sum()
     };
-    // Summed in the order of the objects, so that threads do not change the result.
-    let change: f64 = objects.par_iter().filter_map(change).collect::<Vec<f64>>().iter().sum();
-    if change > 0.0 { thought } else { told }
+    if unlikeliness(&thought) < unlikeliness(&told) { thought } else { told }
 }
 
 /// Minus twice the logarithm of the restricted likelihood of the residuals of all visits of an object, along the lines of sight that a noise makes probable,
@@ -213,8 +210,6 @@ mod tests {
                     label.0.push(ray);
                 }
             }
-            // One that nothing can be said of changes nothing.
-            labels.push((labels[0].0.clone(), -labels[0].1));
             with_drift(&scene, &labels.iter().collect::<Vec<_>>(), &noise, thought_m).position_drift_m
         };
         assert!((0.03..0.1).contains(&drift_m(0, 0.1)), "{}", drift_m(0, 0.1));
