@@ -385,7 +385,10 @@ def test_images_in_another_georeferenced_frame_are_converted() -> None:
     images = small_dataset(Frame(anchor=ANCHOR))
     evaluation = evaluate_map(map_of([], frame=Frame(anchor=other)), truth, images=images, seen_within_m=25.0)
     assert evaluation.recoverable_objects == 1
-    with pytest.raises(InputError, match="the images are in frame .* the map in "):
+    there = f"{ANCHOR[0]:g}, longitude {ANCHOR[1]:g}"
+    with pytest.raises(
+        InputError, match=f"the images are in a frame at latitude {there}, .*, the map in one of its own"
+    ):
         evaluate_map(map_of([]), truth, images=images, seen_within_m=25.0)
 
 
@@ -659,7 +662,7 @@ def test_a_dataset_without_truth_is_refused() -> None:
     "frame", [Frame(anchor=ANCHOR), Frame(up=(0.0, -1.0, 0.0))], ids=["geo-referenced", "another up"]
 )
 def test_truth_in_another_frame_is_refused(frame: Frame) -> None:
-    with pytest.raises(InputError, match="the truth is in frame .* the map in "):
+    with pytest.raises(InputError, match="the truth is in a frame .*, the map in one "):
         evaluate_map(map_of([], frame=frame), small_dataset())
 
 

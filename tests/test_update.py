@@ -643,7 +643,7 @@ def test_datasets_become_one(years: Path) -> None:
     times = join_datasets(first, untimed).images.timestamp_s
     assert times is not None
     assert np.isnan(times).sum() == len(second.images)
-    with pytest.raises(InputError, match="expected the frame of"):
+    with pytest.raises(InputError, match="expected the frame of .*, found one of its own, with 0 -1 0 up"):
         join_datasets(first, Dataset(**{**vars(second), "frame": valuemap.Frame(up=(0.0, -1.0, 0.0))}))
 
 

@@ -80,6 +80,13 @@ class Frame:
         if self.anchor is not None:
             check_anchor(self.anchor)
 
+    def __str__(self) -> str:
+        """Say it in words, for messages."""
+        if self.anchor is not None:
+            lat, lon, height_m = self.anchor
+            return f"at latitude {lat:.7g}, longitude {lon:.7g}, height {height_m:.4g} m"
+        return f"of its own, with {' '.join(f'{part + 0.0:.3g}' for part in self.up)} up"
+
     @property
     def is_georeferenced(self) -> bool:
         """Whether positions can be given as longitude, latitude and height."""

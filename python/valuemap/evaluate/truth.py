@@ -219,7 +219,7 @@ def positions_in_frame(position_in_world_m: Floats, dataset: Dataset, frame: Fra
         return enu_from_lon_lat_height(lon_lat_height_from_enu(position_in_world_m, dataset.frame.anchor), frame.anchor)
     if frame.is_georeferenced or dataset.frame.is_georeferenced or not np.allclose(frame.up, dataset.frame.up):
         raise InputError(
-            f"{dataset.name}: {what} in frame {dataset.frame.to_json()}, the map in {frame.to_json()}",
+            f"{dataset.name}: {what} in a frame {dataset.frame}, the map in one {frame}",
             hint="evaluate with the dataset that the map was made from, or with one in the same frame",
         )
     return position_in_world_m

@@ -61,8 +61,7 @@ def _join_images(first: Dataset, second: Dataset) -> tuple[Dataset, Detections]:
     """Return both datasets as one without detections, and those of the second, of images with their ids in it."""
     if first.frame != second.frame:
         raise InputError(
-            f"{second.name}: expected the frame of {first.name}, {first.frame.to_json()}, found "
-            f"{second.frame.to_json()}",
+            f"{second.name}: expected the frame of {first.name}, {first.frame}, found one {second.frame}",
             hint="import it again with the same origin",
         )
     _refuse_same(first, second)
