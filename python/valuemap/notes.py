@@ -139,8 +139,8 @@ def untested_covariances(findings: Findings) -> str | None:
     if findings.passes != 1 or not np.any(labels.covariance_m2 > 0.0):
         return None
     return (
-        "all images are of one pass: standard deviations of labels leave out what poses or boxes get wrong all along "
-        "it, which a second pass or surveyed objects (valuemap evaluate) would show"
+        "all images are of one pass: standard deviations of labels assume what poses get wrong all along it, and leave "
+        "out what boxes do, which a second pass or surveyed objects (valuemap evaluate) would show"
     )
 
 
