@@ -241,6 +241,7 @@ def test_show_and_report_from_the_command_line(tmp_path: Path, capsys: pytest.Ca
         (["show", "MAP"], "expected a label, or a place"),
         (["show", "MAP", "1", "--at", "0", "0"], "expected a label, or a place"),
         (["show", "MAP", "--lat", "1"], "expected a label, or a place"),
+        (["show", "MAP", "1", "--radius", "5"], "around a place, not around a label"),
         (["show", "MAP", "--lat", "1", "--lon", "2"], "the map is not geo-referenced"),
         (["show", "MAP", "--lat", "91", "--lon", "1"], "--lat 91 --lon 1: expected a latitude from -90 to 90"),
         (["show", "MAP", "--lat", "1", "--lon", "nan"], "--lat 1 --lon nan: expected a latitude from -90 to 90"),

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 _FARTHEST_M = 1e9
 """Of a place that is asked about: farther in metres than anything on the Earth is from the origin of a map."""
 
+_RADIUS_M = 2.0
+"""Around a place: what is evaluated within as much is one object."""
+
 
 @app.command("show")
 def show_command(
@@ -36,7 +39,9 @@ def show_command(
     ] = None,
     lat: Annotated[float | None, typer.Option(help="The same place in WGS84 degrees, with --lon.")] = None,
     lon: Annotated[float | None, typer.Option(help="See --lat.")] = None,
-    radius: Annotated[float, typer.Option(min=0.1, help="Metres around the place that count.")] = 2.0,
+    radius: Annotated[
+        float | None, typer.Option(min=0.1, help="Metres around the place that count; default: 2.", show_default=False)
+    ] = None,
     file: Annotated[
         Path | None, typer.Option("--out", help="Picture to write, .png or .svg; default: label-ID.png or place.png.")
     ] = None,
@@ -56,6 +61,10 @@ def show_command(
         raise SettingError(
             "show: expected a label, or a place as --at X Y or as --lat and --lon",
             hint="for example valuemap show MAP 12, or valuemap show MAP --at 105.2 48.9",
+        )
+    if label is not None and radius is not None:
+        raise SettingError(
+            "show: --radius is around a place, not around a label", hint="leave it out, or give --at X Y"
         )
     _check_place(at, lat, lon)
     picture = file if file is not None else Path(f"label-{label}.png" if label is not None else "place.png")
@@ -80,7 +89,7 @@ def show_command(
         rejected = evidence.result.rejected
         if rejected is None:
             rejected = find_rejected(evidence, point)
-        answer = explain_place(evidence, point, rejected, radius_m=radius)
+        answer = explain_place(evidence, point, rejected, radius_m=_RADIUS_M if radius is None else radius)
         save_figure(plot_place(evidence, answer, rejected, pictures), picture, force=force)
         if as_json:
             print(json.dumps(answer.to_json(), indent=2))
