@@ -24,7 +24,7 @@ from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import Map
 from valuemap.tables import Detections, Votes
 from valuemap.writers import SUFFIXES, export_map
-from valuemap.writers.attributes import Export, iso_times
+from valuemap.writers.attributes import Export, azimuth_in_degrees, iso_times
 from valuemap.writers.geopackage import ELLIPSE_SIGMAS, ellipse_rings_in_world_m
 from valuemap.writers.sign_codes import SIGNS, find_sign, osm_tags
 
@@ -79,6 +79,7 @@ def test_times_are_iso_where_they_are_dates() -> None:
 
 def test_facing_is_in_degrees() -> None:
     assert Export(map_of([[0.0, 0.0, 0.0]])).attributes["facing_deg"][0] == pytest.approx(np.degrees(4.7))
+    assert_allclose(azimuth_in_degrees(np.array([-1e-17, -np.pi / 2.0, np.nan])), [0.0, 270.0, np.nan], atol=1e-9)
 
 
 def voted_map(votes: list[tuple[int, int]], labels: int = 2, frame: Frame | None = None) -> Map:

@@ -32,6 +32,12 @@ _CODES_OF_WGS84 = ("4326", "4979", "OGC:CRS84")
 """What people call it: coordinates are east before north whatever the order of its own axes."""
 
 
+def azimuth_in_degrees(azimuth_rad: Floats) -> Floats:
+    """Return azimuths (N) from 0 to less than 360 degrees, NaN where there is none."""
+    turned = np.degrees(azimuth_rad) % 360.0
+    return np.where(turned == 360.0, 0.0, turned)  # What remains of a little less than 0 is rounded to 360.
+
+
 @dataclass(frozen=True, eq=False)
 class Places:
     """Coordinates (N, 3) of labels, east before north, and the reference system that they are in, None for none."""
@@ -67,7 +73,7 @@ class Export:
         table["ellipse_major_m"] = ellipse.major_m
         table["ellipse_minor_m"] = ellipse.minor_m
         table["ellipse_azimuth_deg"] = ellipse.azimuth_deg
-        table["facing_deg"] = np.degrees(labels.facing_azimuth_rad) % 360.0
+        table["facing_deg"] = azimuth_in_degrees(labels.facing_azimuth_rad)
         table["first_seen_time"] = iso_times(labels.first_seen_s)
         table["last_seen_time"] = iso_times(labels.last_seen_s)
         if self.dataset is not None:

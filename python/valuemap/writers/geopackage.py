@@ -16,7 +16,7 @@ from valuemap.errors import OutputError
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.tables import Floats, Ints
 from valuemap.writers import qgis_style
-from valuemap.writers.attributes import Export, iso_times
+from valuemap.writers.attributes import Export, azimuth_in_degrees, iso_times
 
 if TYPE_CHECKING:
     import geopandas
@@ -132,7 +132,7 @@ def _cameras(export: Export) -> geopandas.GeoDataFrame:
             "picture": images.name.to_pandas(),
             "camera_id": images.camera_id,
             "pass": images.pass_id.texts(),
-            "heading_deg": np.degrees(np.arctan2(ahead[:, 0], ahead[:, 1])) % 360.0,
+            "heading_deg": azimuth_in_degrees(np.arctan2(ahead[:, 0], ahead[:, 1])),
         }
     )
     if images.timestamp_s is not None:
