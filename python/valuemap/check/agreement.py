@@ -181,6 +181,11 @@ class Comparison:
         return {"difference": round(self.difference, 2), "chance": float(f"{self.chance:.2g}"), self.of: self.places}
 
 
+def chance_of_majority(count: int, of: int) -> float:
+    """Return how likely so many and more of some are on one side, where both sides are as likely (a sign test)."""
+    return float(stats.binom.sf(count - 1, of, 0.5))
+
+
 def compare(better: Floats, worse: Floats) -> Comparison:
     """Test the paired differences of gains (places) against their scatter, one-sided.
 

@@ -25,7 +25,7 @@ from valuemap.check.fault import (
     with_detections,
 )
 from valuemap.check.groups import Group, OfGroup, groups_of
-from valuemap.check.lenses import focals
+from valuemap.check.lenses import camera_rows, focals
 from valuemap.dataset import Dataset, rows_of
 from valuemap.tables import Bools, Floats, Ints
 
@@ -46,8 +46,7 @@ def _reach(dataset: Dataset) -> float:
 
 def picture_sizes(dataset: Dataset) -> Floats:
     """Return width and height (N, 2) in pixels of the picture of each detection."""
-    camera_row = rows_of(dataset.images.camera_id, dataset.cameras.camera_id)
-    camera = camera_row[rows_of(dataset.detections.image_id, dataset.images.image_id)]
+    camera = camera_rows(dataset)
     return np.stack([dataset.cameras.width_px[camera], dataset.cameras.height_px[camera]], axis=1).astype(np.float64)
 
 

@@ -44,6 +44,8 @@ LEAST_CHANCE = 1e-3
 """A finding that good data would give with a probability above this, all that was tried counted, is none."""
 FAR_WORSE = 0.5
 """What agrees less than half as well as others do, or as it would if it were read otherwise, has more than errors."""
+NEAR_STEPS = 2.0
+"""Rays of one drive leave open how far an object is, by some of the steps between images."""
 TIE = 1e-3
 """Gains as close as this share are the same: readings that differ in the last digits only."""
 AGAINST = 0.05

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from typing import ClassVar
 
 import numpy as np
-from scipy import stats
 
 from valuemap.cameras import camera_centers, rotation_matrices
+from valuemap.check.agreement import chance_of_majority
 from valuemap.check.fault import (
     GATE_RAD,
     LEAST_CHANCE,
@@ -380,7 +380,7 @@ def _scale_by_truth(view: View) -> Finding | None:
     if unit == "metres" or matched[unit] < 2 * matched["metres"]:
         return None
     tests = len(points) * len(objects) * len(units_m)
-    chance = float(stats.binom.sf(matched[unit] - 1, matched[unit] + matched["metres"], 0.5)) * tests
+    chance = chance_of_majority(matched[unit], matched[unit] + matched["metres"]) * tests
     if chance > LEAST_CHANCE:
         return None
     factor = units_m[unit]

@@ -9,7 +9,7 @@ import numpy as np
 
 from valuemap.check.fault import Convention, Fault, Finding, Fix, Stage, View
 from valuemap.dataset import Dataset, rows_of
-from valuemap.tables import Cameras, Floats
+from valuemap.tables import Cameras, Floats, Ints
 
 _ONE_FOCAL_LENGTH = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 _TWO_FOCAL_LENGTHS = ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE")
@@ -113,9 +113,7 @@ class SidesExchanged(Fault):
 
     def find(self, view: View) -> Finding | None:
         """Look for principal points in the middle of the lying picture, and boxes that only this one has room for."""
-        cameras, detections, images = view.dataset.cameras, view.dataset.detections, view.dataset.images
-        image_row = rows_of(detections.image_id, images.image_id)
-        camera_row = rows_of(images.camera_id, cameras.camera_id)[image_row]
+        cameras, detections, camera_row = view.dataset.cameras, view.dataset.detections, camera_rows(view.dataset)
         found, outside = [], 0
         for row in range(len(cameras)):
             size = np.array([cameras.width_px[row], cameras.height_px[row]], dtype=np.float64)
@@ -149,6 +147,12 @@ def _with_sides_exchanged(dataset: Dataset, rows: list[int]) -> Dataset:
     width_px, height_px = cameras.width_px.copy(), cameras.height_px.copy()
     width_px[rows], height_px[rows] = cameras.height_px[rows], cameras.width_px[rows]
     return Dataset(**{**vars(dataset), "cameras": cameras.replace(width_px=width_px, height_px=height_px)})
+
+
+def camera_rows(dataset: Dataset) -> Ints:
+    """Return the row of the camera (N) that each detection is of."""
+    camera_row = rows_of(dataset.images.camera_id, dataset.cameras.camera_id)
+    return camera_row[rows_of(dataset.detections.image_id, dataset.images.image_id)]
 
 
 def focals(cameras: Cameras, row: int) -> int:

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from scipy import stats
 from scipy.spatial import cKDTree
 
-from valuemap.check.agreement import Comparison, agreement_on, compare
+from valuemap.check.agreement import Comparison, agreement_on, chance_of_majority, compare
 from valuemap.check.fault import (
     AGAINST,
     FAR_WORSE,
     LEAST_CHANCE,
     LEAST_RISE,
+    NEAR_STEPS,
     Fault,
     Finding,
     Stage,
@@ -28,8 +28,6 @@ from valuemap.tables import Categories, Floats
 _LEAST_VOTES = 4
 """Fewer rays may meet by chance."""
 _LEAST_OBJECTS = 6
-_NEAR_STEPS = 2.0
-"""Rays of one drive leave open how far an object is, by some of the steps between images."""
 _OFTEN = 1.0 / 3.0
 """Of a detector that takes one kind for another in one of four pictures few objects have both names so often."""
 
@@ -48,7 +46,7 @@ class TwoNames(Fault):
         classes, told = _points_of_classes(view), []
         pairs = list(itertools.combinations(sorted(classes, key=lambda each: (-len(classes[each]), each)), 2))
         for name, rarer in pairs:
-            if not _are_near(classes[name], classes[rarer], _NEAR_STEPS * view.step_m):
+            if not _are_near(classes[name], classes[rarer], NEAR_STEPS * view.step_m):
                 continue
             joined = _joined(view, name, rarer)
             if joined.chance * len(pairs) < LEAST_CHANCE and joined.is_borne_out(len(pairs)):
@@ -74,7 +72,7 @@ class _Joined:
     @property
     def chance(self) -> float:
         """How likely so many are shared, were it as many as not at most."""
-        return float(stats.binom.sf(self.shared - 1, self.objects, 0.5))
+        return chance_of_majority(self.shared, self.objects)
 
     def is_borne_out(self, pairs: int) -> bool:
         """Return whether rays agree better, as they do not if two objects are side by side."""

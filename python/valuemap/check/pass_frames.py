@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check.fault import LEAST_CHANCE, Fault, Finding, Stage, View, with_poses
+from valuemap.check.fault import LEAST_CHANCE, NEAR_STEPS, Fault, Finding, Stage, View, with_poses
 from valuemap.check.passes import Match, Meeting, meeting_of_passes
 from valuemap.dataset import Dataset
 from valuemap.tables import Floats
@@ -40,7 +40,7 @@ class PassFrame(Fault):
         tried = meeting.passes_of_most_points()
         tests, found = len(tried) * len(_WORLDS), []
         for code in tried:
-            if _sees_what_others_see(meeting, code, _NEAR_STEPS * view.step_m):
+            if _sees_what_others_see(meeting, code, NEAR_STEPS * view.step_m):
                 continue
             as_given = meeting.best_match(code, view.step_m / 2.0)
             for world, axes in _WORLDS.items():
@@ -53,10 +53,6 @@ class PassFrame(Fault):
                     name = view.dataset.images.pass_id.names[code]
                     found.append((match.met - others, _finding(meeting, code, name, world, match, others, chance)))
         return max(found, key=lambda each: each[0])[1] if found else None
-
-
-_NEAR_STEPS = 2.0
-"""Rays of one drive leave open how far an object is, by some of the steps between images."""
 
 
 def _sees_what_others_see(meeting: Meeting, code: int, within_m: float) -> bool:

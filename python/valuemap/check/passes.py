@@ -9,13 +9,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from valuemap.cameras import Rays, camera_centers, rotation_matrices
-from valuemap.check.agreement import compare, measure_agreement
+from valuemap.check.agreement import chance_of_majority, compare, measure_agreement
 from valuemap.check.boxes import rows_in_images
 from valuemap.check.fault import (
     GATE_RAD,
@@ -364,7 +363,7 @@ def _passes_in_turn(images: Images) -> tuple[dict[str, str], float, float] | Non
     for members in drives:
         shorter = np.delete(members, np.argmax(length[members]))
         in_turn, most = int(turns[shorter].sum()), int(length[shorter].sum())
-        chance = float(stats.binom.sf(in_turn - 1, most, 0.5)) * len(drives)
+        chance = chance_of_majority(in_turn, most) * len(drives)
         if chance < LEAST_CHANCE:
             told.append((chance, in_turn, most))
             names |= {images.pass_id.names[code]: images.pass_id.names[members[0]] for code in members.tolist()}
@@ -683,7 +682,7 @@ class Match:
 
     def chance_against(self, others: int) -> float:
         """Return how likely so many are met, and so many others otherwise, by two ways that are alike."""
-        return float(stats.binom.sf(self.met - 1, self.met + others, 0.5))
+        return chance_of_majority(self.met, self.met + others)
 
 
 @dataclass(frozen=True, eq=False)

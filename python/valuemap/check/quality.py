@@ -7,10 +7,10 @@ from collections import defaultdict
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy import stats
 from scipy.spatial import cKDTree
 
 from valuemap.cameras import camera_centers
+from valuemap.check.agreement import chance_of_majority
 from valuemap.check.boxes import rows_in_images
 from valuemap.check.fault import LEAST_CHANCE, Fault, Finding, Stage, View, keep_rows, with_detections
 from valuemap.check.offsets import find_shift
@@ -200,7 +200,7 @@ class TruthElsewhere(Fault):
                 fix = _MovedTruth(np.array(axes, dtype=np.float64), shift.offset_m)
         # By a shift to any pair, in any axes, chance matches some: those that are then matched are counted anew.
         tests = len(points) * len(objects) * len(_TRUTH_AXES)
-        chance = float(stats.binom.sf(there - 1, there + here, 0.5)) * tests if there > here else 1.0
+        chance = chance_of_majority(there, there + here) * tests if there > here else 1.0
         fits = fix is not None and chance < LEAST_CHANCE
         if not fits and (here > 0 or _is_nearest_where_it_is(points, objects, view)):
             return None  # It may well know other objects than are seen here, or poses are metres off.

@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 _FARTHEST_M = 1e9
 """Of a place that is asked about: farther in metres than anything on the Earth is from the origin of a map."""
 
-_RADIUS_M = 2.0
-"""Around a place: what is evaluated within as much is one object."""
-
 
 @app.command("show")
 def show_command(
@@ -53,7 +50,7 @@ def show_command(
 ) -> None:
     """Show one label as a picture: its votes, the images that missed it, its rays; or why there is none at a place."""
     from valuemap.report.label_sheet import plot_label
-    from valuemap.report.place_sheet import explain_place, plot_place
+    from valuemap.report.place_sheet import RADIUS_M, explain_place, plot_place
     from valuemap.report.style import check_format, save_figure
 
     asked = [label is not None, at is not None, lat is not None or lon is not None]
@@ -89,7 +86,7 @@ def show_command(
         rejected = evidence.result.rejected
         if rejected is None:
             rejected = find_rejected(evidence, point)
-        answer = explain_place(evidence, point, rejected, radius_m=_RADIUS_M if radius is None else radius)
+        answer = explain_place(evidence, point, rejected, radius_m=RADIUS_M if radius is None else radius)
         save_figure(plot_place(evidence, answer, rejected, pictures), picture, force=force)
         if as_json:
             print(json.dumps(answer.to_json(), indent=2))

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+RADIUS_M = 2.0
+"""Around a place: what is evaluated within as much is one object."""
+
 _WIDTH_PX, _MARGIN_PX, _GAP_PX = 1600.0, 44.0, 14.0
 _CROPS = 9
 _CROP_PX = (_WIDTH_PX - 2 * _MARGIN_PX - (_CROPS - 1) * _GAP_PX) / _CROPS
@@ -80,7 +83,7 @@ def place_in_world(evidence: Evidence, right_m: float, top_m: float) -> Floats:
 
 
 def explain_place(
-    evidence: Evidence, point_in_world_m: Floats, rejected: Rejected | None, *, radius_m: float = 2.0
+    evidence: Evidence, point_in_world_m: Floats, rejected: Rejected | None, *, radius_m: float = RADIUS_M
 ) -> PlaceAnswer:
     """Say why there is no label within a horizontal distance of a place, whatever its height.
 

@@ -88,17 +88,10 @@ pub fn self_calibrate(
     let noise = if settings.has(Part::NoiseSplit) { split::split(&model, known, &objects) } else { noise };
     let noise = if settings.has(Part::SharedNoise) || is_known { noise } else { noise.all_own() };
     let map = placed(&objects);
-    let sure = residuals::sample(scene, &noise, &map);
-    let remembered = if settings.has(Part::SharedNoise) && settings.has(Part::Memory) {
-        memory::remembered(scene, &noise, known, &sure)
+    let noise_of_covariances = if settings.has(Part::SharedNoise) {
+        noise_of_covariances(scene, &noise, guess, known, settings, &map)
     } else {
-        None
-    };
-    let noise_of_covariances = remembered.unwrap_or(noise);
-    let noise_of_covariances = if known.position || !settings.has(Part::SharedNoise) {
-        noise_of_covariances
-    } else {
-        with_drift_at_least(scene, &sure, &noise_of_covariances, guess.position_drift_m)
+        noise
     };
     let is_small = !is_part && scene.usable_rays().len() <= MOST_RAYS;
     let is_deep = is_small || all_moves_pay(&mut model, &objects, progress)?;
@@ -112,6 +105,21 @@ pub fn self_calibrate(
         is_deep,
     };
     Ok((calibration, map))
+}
+
+/// A noise whose detections remember their errors, and whose positions drift as far as was guessed where nothing tells it.
+fn noise_of_covariances(
+    scene: &Scene,
+    noise: &Noise,
+    guess: &Noise,
+    known: Known,
+    settings: &Settings,
+    map: &[Placed],
+) -> Noise {
+    let sure = residuals::sample(scene, noise, map);
+    let remembered =
+        settings.has(Part::Memory).then(|| memory::remembered(scene, noise, known, &sure)).flatten().unwrap_or(*noise);
+    if known.position { remembered } else { with_drift_at_least(scene, &sure, &remembered, guess.position_drift_m) }
 }
 
 /// The noise that makes the rays of a sample likeliest: of a few places, and then of more of them.
