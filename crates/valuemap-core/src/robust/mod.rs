@@ -76,6 +76,8 @@ pub fn find(
     let depth = if calibration.is_deep { Depth::Deep } else { Depth::Once };
     let objects = search(&mut model, &rays, begun, depth, false, &mut tally, progress)?;
     let lookout = Lookout::new(scene, settings.viability.max_range_m);
+    let of_covariances = &calibration.noise_of_covariances;
+    let (objects, estimates) = finish::positions::apart(&model, of_covariances, &lookout, &rays, objects, progress)?;
     let few = if settings.least_votes < settings.min_votes {
         few::objects_of_few(&model, &lookout, &rays, &objects, settings.least_votes as usize, progress)?
     } else {
@@ -83,7 +85,7 @@ pub fn find(
     };
     let claimed: usize = objects.iter().map(|object| object.votes.len()).sum();
     let energy = objects.iter().map(|object| object.energy).sum();
-    let (findings, variance_factor) = finish::labels(&model, &calibration.noise_of_covariances, &lookout, objects, few);
+    let (findings, variance_factor) = finish::labels(&model, of_covariances, &lookout, (objects, estimates), few);
     Ok(Findings {
         findings,
         tally,

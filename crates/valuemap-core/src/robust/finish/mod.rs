@@ -17,7 +17,6 @@ use crate::robust::model::Model;
 use crate::robust::noise::Noise;
 use crate::robust::parts::Part;
 use carried::not_carried;
-use positions::positions;
 use switches::are_others;
 
 /// A label with what speaks for it.
@@ -35,17 +34,16 @@ pub struct Finding {
     pub expected: u32,
 }
 
-/// The labels that some objects make, and some of few votes: those that are no others and exist probably enough, ordered by their lowest vote. With it
+/// The labels that some objects make where they are estimated, and some of few votes: those that are no others and exist probably enough, ordered by their lowest vote. With it
 /// what the covariances were multiplied by, so that the passes agree. Covariances have a noise of their own.
 #[must_use]
 pub fn labels(
     model: &Model<'_>,
     of_covariances: &Noise,
     lookout: &Lookout,
-    objects: Vec<Object>,
+    (objects, estimates): (Vec<Object>, Vec<Estimate>),
     few: Vec<Object>,
 ) -> (Vec<Finding>, f64) {
-    let estimates = positions(model, of_covariances, &objects);
     let factor = if model.settings.has(Part::Scaling) {
         variance_factor(model.scene, of_covariances, &placed(&objects), objects.len().max(1))
     } else {

@@ -6,14 +6,45 @@
 use rayon::prelude::*;
 
 use super::contest::{Contest, widened};
+use crate::progress::{Halt, Progress};
 use crate::robust::energy::estimate::{Care, Estimate, Joint, Start};
+use crate::robust::energy::looks::Lookout;
 use crate::robust::energy::{Object, places_of_all};
 use crate::robust::model::Model;
 use crate::robust::noise::Noise;
+use crate::robust::noise::index::RayIndex;
 use crate::robust::parts::Part;
+use crate::robust::search::rearrange::{exclude, too_near};
 
 /// Objects within this share of the range of the one with the most votes are estimated with it.
 const PLACE_SHARE: f64 = 0.4;
+
+/// Objects of some rays that are apart where those of a place are estimated together, with their estimates; covariances have a noise of their own. Two
+/// sides of one thing, of which each drive has put its own elsewhere, are two objects until the others of the place tell the drift.
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn apart(
+    model: &Model<'_>,
+    of_covariances: &Noise,
+    lookout: &Lookout,
+    rays: &[u32],
+    mut objects: Vec<Object>,
+    progress: &Progress,
+) -> Result<(Vec<Object>, Vec<Estimate>), Halt> {
+    loop {
+        let estimates = positions(model, of_covariances, &objects);
+        let mut there = objects.clone();
+        for (object, estimate) in there.iter_mut().zip(&estimates) {
+            object.fit.point = estimate.point;
+        }
+        if !model.settings.has(Part::Exclusion) || too_near(&there).is_empty() {
+            return Ok((objects, estimates));
+        }
+        let index = RayIndex::new(model.scene, &model.spreads, model.settings.gate_sigmas, rays.iter().copied());
+        objects = exclude(model, lookout, &index, there, progress)?;
+    }
+}
 
 /// The estimate of every object, in their order; covariances have a noise of their own.
 #[must_use]
@@ -66,14 +97,15 @@ fn together(
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Vector3;
+    use nalgebra::{Translation3, Vector3};
 
     use super::*;
     use crate::robust::energy::estimate::looks_at;
-    use crate::robust::energy::looks::Lookout;
     use crate::robust::energy::object;
     use crate::robust::model::heights::Heights;
     use crate::robust::noise::variance_of_alike;
+    use crate::robust::parts::Without;
+    use crate::robust::settings::Settings;
     use crate::street;
 
     #[test]
@@ -97,6 +129,41 @@ mod tests {
         for (before, after) in looks(&street::NOISE).iter().zip(looks(&alike)) {
             assert!((after.detection_px2 / before.detection_px2 - times).abs() < 1e-9);
         }
+    }
+
+    #[test]
+    fn what_each_of_two_drives_has_put_elsewhere_is_one_where_neighbours_tell_the_drift() {
+        let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
+        let objects: Vec<Vector3<f64>> =
+            (0..8).map(|i| Vector3::new(40.0 + f64::from(i), 2.5 * f64::from(i - 4), 3.0)).collect();
+        let off = Vector3::new(0.0, 0.4, 0.0);
+        let drive = || street::street(12, 2.0, &objects, &errors);
+        let scene = street::joined(vec![drive(), street::moved(drive(), &Translation3::from(off).into())]);
+        let noise = Noise { position_drift_m: 0.3, ..street::NOISE };
+        let apart_of = |settings: &Settings, twice: usize| {
+            let model = Model::new(&scene, &noise, settings);
+            let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+            let rays = scene.usable_rays();
+            let of = |i: usize| rays.iter().copied().skip(i).step_by(objects.len());
+            let seen_by = |i: usize, pass: u32| of(i).filter(|&ray| scene.view(ray).pass == pass).collect();
+            let object = |votes, point| object(&model, &lookout, votes, point, Vec::new());
+            let drives = |i: usize| [object(seen_by(i, 0), objects[i]), object(seen_by(i, 1), objects[i] + off)];
+            let of_drives = (0..twice).flat_map(drives);
+            let found = of_drives.chain((twice..8).map(|i| object(of(i).collect(), objects[i] + 0.5 * off)));
+            let found: Vec<Object> = found.flatten().collect();
+            assert_eq!((found.len(), too_near(&found).len()), (8 + twice, 0));
+            apart(&model, &noise, &lookout, &rays, found, &Progress::default())
+        };
+        let count = |settings: &Settings, twice: usize| {
+            let (found, estimates) = apart_of(settings, twice).unwrap_or_default();
+            assert_eq!(found.len(), estimates.len());
+            found.len()
+        };
+        assert_eq!(count(&street::SETTINGS, 1), 8);
+        let without = Without::named(&["exclusion".to_owned()]).unwrap_or_default();
+        assert_eq!(count(&Settings { without, ..street::SETTINGS }, 1), 9);
+        // Where no neighbour is seen by both drives, nothing tells that they are off.
+        assert_eq!(count(&street::SETTINGS, 8), 16);
     }
 
     #[test]

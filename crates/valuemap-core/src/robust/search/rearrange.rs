@@ -102,18 +102,12 @@ pub fn exclude(
 ) -> Result<Vec<Object>, Halt> {
     loop {
         progress.check()?;
-        let tree = by_place(&objects);
-        let mut near: Vec<(f64, usize, usize)> = Vec::new();
-        for (i, object) in objects.iter().enumerate().filter(|(_, object)| object.ln_size.is_finite()) {
-            let reach = EXCLUSIVE_SHARE * object.ln_size.exp();
-            let others = tree.locate_within_distance(object.fit.point.into(), reach * reach);
-            near.extend(others.filter(|other| other.data != i).map(|other| {
-                ((objects[other.data].fit.point - object.fit.point).norm(), i.min(other.data), i.max(other.data))
-            }));
+        let near = too_near(&objects);
+        if near.is_empty() {
+            return Ok(objects);
         }
-        near.sort_by(|x, y| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2))));
-        let mut kept: Vec<Option<Object>> = objects.iter().cloned().map(Some).collect();
-        for (_, a, b) in near {
+        let mut kept: Vec<Option<Object>> = objects.into_iter().map(Some).collect();
+        for (a, b) in near {
             let (Some(first), Some(second)) = (&kept[a], &kept[b]) else { continue };
             let claims = claims_of_all(model, index, &[first.clone(), second.clone()], progress)?;
             let pair = Pair::new(model, lookout, [first, second], [&claims[0], &claims[1]]);
@@ -128,13 +122,24 @@ pub fn exclude(
                 kept.push(Some(merged));
             }
         }
-        let left: Vec<Object> = kept.into_iter().flatten().collect();
-        if left.len() == objects.len() {
-            return Ok(left);
-        }
-        objects = left;
+        objects = kept.into_iter().flatten().collect();
         objects.sort_by_key(|object| object.votes[0]);
     }
+}
+
+/// Pairs of objects that are nearer to each other than solid things can be, the nearest first.
+pub(crate) fn too_near(objects: &[Object]) -> Vec<(usize, usize)> {
+    let tree = by_place(objects);
+    let mut near: Vec<(f64, usize, usize)> = Vec::new();
+    for (i, object) in objects.iter().enumerate().filter(|(_, object)| object.ln_size.is_finite()) {
+        let reach = EXCLUSIVE_SHARE * object.ln_size.exp();
+        let others = tree.locate_within_distance(object.fit.point.into(), reach * reach);
+        near.extend(others.filter(|other| other.data != i).map(|other| {
+            ((objects[other.data].fit.point - object.fit.point).norm(), i.min(other.data), i.max(other.data))
+        }));
+    }
+    near.sort_by(|x, y| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2))));
+    near.into_iter().map(|(_, a, b)| (a, b)).collect()
 }
 
 /// Whether two objects may be one by their classes.
