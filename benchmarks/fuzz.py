@@ -12,7 +12,7 @@ be run again:
 
 The JSON file is written as the run goes, and with `--go-on` an interrupted run goes on from it.
 
-With `--core-cases` so many cases of `crates/valuemap-core/tests/core/hostile_input.rs` go through the core without
+With `--core-cases` so many cases of `crates/valuemap-core/src/tests/hostile_input.rs` go through the core without
 Python before, built with its assertions and with overflows as faults: needs cargo.
 
 The targets are those of `tests/test_fuzz.py` (see `tests/fuzzing.py`), where hypothesis draws the cases.
@@ -102,7 +102,7 @@ def place_of(error: BaseException) -> str:
 
 def run_core(cases: int, seed: int) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, Any]]]:
     """Run the tests of the core, `cases` all together; return cases and seconds of each, and faults."""
-    command = ["cargo", "test", "--quiet", "--locked", "--package", "valuemap-core", "--test", "core"]
+    command = ["cargo", "test", "--quiet", "--locked", "--package", "valuemap-core", "--lib"]
     command += ["--release", *(part for each in STRICT for part in ("--config", f"profile.release.{each}"))]
     repository = Path(__file__).parents[1]
     subprocess.run([*command, "--no-run"], cwd=repository, check=True)
@@ -117,7 +117,7 @@ def run_core(cases: int, seed: int) -> tuple[dict[str, dict[str, float]], dict[s
         }
         start = time.perf_counter()
         outcome = subprocess.run(
-            [*command, "--", "--exact", f"hostile_input::{name}"],
+            [*command, "--", "--exact", f"tests::hostile_input::{name}"],
             cwd=repository, env=environment, capture_output=True, text=True, check=False,
         )  # fmt: skip
         done[name] = {"cases": own, "seconds": round(time.perf_counter() - start, 1)}

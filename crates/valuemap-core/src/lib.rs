@@ -6,12 +6,10 @@
 //! Everything is `f64` in the caller's world frame, but for the kernel, which sees `f32` relative to an origin nearby and errs only towards testing too
 //! much. The result does not depend on the number of threads.
 
-// The streets of the integration tests serve the unit tests too; they name the crate as its users do.
 #[cfg(test)]
-extern crate self as valuemap_core;
+mod tests;
 #[cfg(test)]
-#[path = "../tests/core/street.rs"]
-mod street;
+use tests::street;
 
 pub mod drives;
 pub mod evidence;

@@ -3,23 +3,23 @@
 use std::collections::BTreeSet;
 use std::f64::consts::FRAC_PI_2;
 
+use crate::progress::Progress;
+use crate::robust::energy::estimate::{Care, Joint, Limits, Start};
+use crate::robust::energy::looks::Lookout;
+use crate::robust::energy::object as object_of;
+use crate::robust::finish::contest::Contest;
+use crate::robust::initial::associate::Association;
+use crate::robust::initial::keyframes::Keyframes;
+use crate::robust::initial::label::{Label, from_voters};
+use crate::robust::initial::swap::swap_votes;
+use crate::robust::model::Model;
+use crate::robust::noise::Noise;
+use crate::robust::noise::index::RayIndex;
+use crate::robust::noise::spreads_of;
+use crate::robust::scene::{Scene, View};
 use nalgebra::{Isometry3, Point3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;
-use valuemap_core::progress::Progress;
-use valuemap_core::robust::energy::estimate::{Care, Joint, Limits, Start};
-use valuemap_core::robust::energy::looks::Lookout;
-use valuemap_core::robust::energy::object as object_of;
-use valuemap_core::robust::finish::contest::Contest;
-use valuemap_core::robust::initial::associate::Association;
-use valuemap_core::robust::initial::keyframes::Keyframes;
-use valuemap_core::robust::initial::label::{Label, from_voters};
-use valuemap_core::robust::initial::swap::swap_votes;
-use valuemap_core::robust::model::Model;
-use valuemap_core::robust::noise::Noise;
-use valuemap_core::robust::noise::index::RayIndex;
-use valuemap_core::robust::noise::spreads_of;
-use valuemap_core::robust::scene::{Scene, View};
 
 use crate::street::{GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, joined, moved, object, street};
 

@@ -1,18 +1,18 @@
 //! The fast paths of the core against the same thing done the slow way, on random scenes.
 
+use crate::kernel::{Gate, Gates, LANES, instruction_sets};
+use crate::paper::ballot::Ballot;
+use crate::paper::hypothesis::propose;
+use crate::paper::merge::merge;
+use crate::paper::triangulate::refine;
+use crate::paper::vote::Candidate;
+use crate::progress::Progress;
+use crate::ray::{Ray, Rays};
+use crate::viability::Viability;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
-use valuemap_core::kernel::{Gate, Gates, LANES, instruction_sets};
-use valuemap_core::paper::ballot::Ballot;
-use valuemap_core::paper::hypothesis::propose;
-use valuemap_core::paper::merge::merge;
-use valuemap_core::paper::triangulate::refine;
-use valuemap_core::paper::vote::Candidate;
-use valuemap_core::progress::Progress;
-use valuemap_core::ray::{Ray, Rays};
-use valuemap_core::viability::Viability;
 
 const FOCAL_PX: f64 = 500.0;
 

@@ -1,4 +1,4 @@
-//! The tests of the core that use what it shows to others. They are one program, as each links the whole core.
+//! The tests of the core that are of no file alone. They are in one program with those of single files, so that the core is compiled once for all.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 mod against_brute_force;
@@ -11,4 +11,4 @@ mod robust_energy;
 mod robust_labels;
 mod robust_order;
 mod robust_sides;
-mod street;
+pub(crate) mod street;

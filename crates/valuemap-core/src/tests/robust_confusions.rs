@@ -2,15 +2,15 @@
 
 use std::sync::Arc;
 
+use crate::progress::Progress;
+use crate::robust::calibrate::{Calibration, self_calibrate};
+use crate::robust::find;
+use crate::robust::finish::Finding;
+use crate::robust::model::confusions::Confusions;
+use crate::robust::noise::Known;
+use crate::robust::scene::Scene;
+use crate::robust::settings::Settings;
 use nalgebra::Vector3;
-use valuemap_core::progress::Progress;
-use valuemap_core::robust::calibrate::{Calibration, self_calibrate};
-use valuemap_core::robust::find;
-use valuemap_core::robust::finish::Finding;
-use valuemap_core::robust::model::confusions::Confusions;
-use valuemap_core::robust::noise::Known;
-use valuemap_core::robust::scene::Scene;
-use valuemap_core::robust::settings::Settings;
 
 use crate::street::{NOISE, SETTINGS, joined, street};
 

@@ -10,32 +10,32 @@ use std::fmt::Debug;
 use std::str::FromStr;
 use std::sync::{Arc, LazyLock};
 
+use crate::evidence::{max_angle, median, sight};
+use crate::paper::merge::merge;
+use crate::paper::partition::partition;
+use crate::paper::select::Stop;
+use crate::paper::triangulate::unit_covariance;
+use crate::paper::vote::{Candidate, count_units, vote};
+use crate::progress::Progress;
+use crate::ray::{Ray, Rays};
+use crate::robust::calibrate::likeliest::misfits;
+use crate::robust::calibrate::{Calibration, self_calibrate};
+use crate::robust::model::ClassModel;
+use crate::robust::model::confusions::Confusions;
+use crate::robust::noise::Known;
+use crate::robust::noise::Noise;
+use crate::robust::parts::{Part, Without};
+use crate::robust::scene::{Frustum, Scene, View};
+use crate::robust::settings::Settings;
+use crate::robust::{find, objects_of};
 use crate::street;
+use crate::viability::Viability;
 use nalgebra::{Matrix3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::sample::{Index, select};
 use proptest::test_runner::{RngSeed, TestRunner};
 use rayon::ThreadPoolBuilder;
-use valuemap_core::evidence::{max_angle, median, sight};
-use valuemap_core::paper::merge::merge;
-use valuemap_core::paper::partition::partition;
-use valuemap_core::paper::select::Stop;
-use valuemap_core::paper::triangulate::unit_covariance;
-use valuemap_core::paper::vote::{Candidate, count_units, vote};
-use valuemap_core::progress::Progress;
-use valuemap_core::ray::{Ray, Rays};
-use valuemap_core::robust::calibrate::likeliest::misfits;
-use valuemap_core::robust::calibrate::{Calibration, self_calibrate};
-use valuemap_core::robust::model::ClassModel;
-use valuemap_core::robust::model::confusions::Confusions;
-use valuemap_core::robust::noise::Known;
-use valuemap_core::robust::noise::Noise;
-use valuemap_core::robust::parts::{Part, Without};
-use valuemap_core::robust::scene::{Frustum, Scene, View};
-use valuemap_core::robust::settings::Settings;
-use valuemap_core::robust::{find, objects_of};
-use valuemap_core::viability::Viability;
 
 /// Numbers that are seldom thought of.
 const NUMBERS: [f64; 28] = [
@@ -159,7 +159,7 @@ impl Columns {
     }
 
     fn scene(&self) -> Scene {
-        let matrix = valuemap_core::matrix_from_rows;
+        let matrix = crate::matrix_from_rows;
         let of_ray = |((m, &direction), &image): ((&[f64; 9], &[f64; 3]), &u32)| {
             let image = image as usize;
             Ray::of_camera(
@@ -415,7 +415,7 @@ fn labels_of_hostile_scenes() {
     run("find", 200, &cases, |(columns, [noise, noise_of_covariances], is_deep, classes, pooled, shares, settings)| {
         let scene = columns.scene();
         let confusions = Confusions::of_shares(shares.clone());
-        let calibration = Calibration { noise, noise_of_covariances, is_deep, classes, pooled, confusions };
+        let calibration = Calibration { noise, noise_of_covariances, classes, pooled, confusions, is_deep };
         let found = find(&scene, &calibration, &settings, &Progress::default()).unwrap();
         for finding in &found.findings {
             all_finite("point", finding.estimate.point.iter())?;

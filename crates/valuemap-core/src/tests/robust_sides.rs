@@ -2,12 +2,12 @@
 
 use std::f64::consts::PI;
 
+use crate::robust::energy::estimate::{Care, Estimate, Joint, Start};
+use crate::robust::energy::{fit, unseen};
+use crate::robust::model::Model;
+use crate::robust::noise::Noise;
+use crate::robust::scene::Scene;
 use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
-use valuemap_core::robust::energy::estimate::{Care, Estimate, Joint, Start};
-use valuemap_core::robust::energy::{fit, unseen};
-use valuemap_core::robust::model::Model;
-use valuemap_core::robust::noise::Noise;
-use valuemap_core::robust::scene::Scene;
 
 use crate::street::{NOISE, SETTINGS, joined, moved, street};
 

@@ -2,20 +2,20 @@
 
 use std::sync::Arc;
 
+use crate::progress::Progress;
+use crate::robust::calibrate::likeliest::misfits;
+use crate::robust::calibrate::residuals::calibrate;
+use crate::robust::calibrate::{CALIBRATION_STEPS, Calibration, self_calibrate};
+use crate::robust::energy::Placed;
+use crate::robust::energy::agreement::{disagreement, mean};
+use crate::robust::noise::Known;
+use crate::robust::noise::Noise;
+use crate::robust::noise::spreads_of;
+use crate::robust::scene::Scene;
+use crate::robust::scene::sample::scramble;
+use crate::robust::search::quick::quick_estimate;
 use crate::street::{self, NOISE, SETTINGS, joined, moved, street};
 use nalgebra::{Isometry3, Rotation3, Vector3};
-use valuemap_core::progress::Progress;
-use valuemap_core::robust::calibrate::likeliest::misfits;
-use valuemap_core::robust::calibrate::residuals::calibrate;
-use valuemap_core::robust::calibrate::{CALIBRATION_STEPS, Calibration, self_calibrate};
-use valuemap_core::robust::energy::Placed;
-use valuemap_core::robust::energy::agreement::{disagreement, mean};
-use valuemap_core::robust::noise::Known;
-use valuemap_core::robust::noise::Noise;
-use valuemap_core::robust::noise::spreads_of;
-use valuemap_core::robust::scene::Scene;
-use valuemap_core::robust::scene::sample::scramble;
-use valuemap_core::robust::search::quick::quick_estimate;
 
 /// The sum of twelve uniform numbers less 6 is as good as normal.
 fn normal(number: u64) -> f64 {
@@ -263,7 +263,7 @@ fn noise_of(are_of_poses: bool) -> Noise {
     let drive = |number: u64| {
         let of_axis = |part: u64, at: u64, axis: u64| normal((100 * number + part) * 10_000 + 3 * at + axis);
         let without = street(80, 1.0, &objects, &[[0.0, 0.0]]);
-        let depth_m = |ray: &valuemap_core::ray::Ray| {
+        let depth_m = |ray: &crate::ray::Ray| {
             objects.iter().map(|object| ray.project(object)).find(|at| at.x.hypot(at.y) < 1e-6 * at.z).unwrap().z
         };
         let depths: Vec<f64> = without.rays.rays.iter().map(depth_m).collect();

@@ -3,16 +3,16 @@
 
 use std::sync::Arc;
 
+use crate::ray::{Ray, Rays};
+use crate::robust::noise::Noise;
+use crate::robust::parts::Without;
+use crate::robust::scene::{Frustum, Scene, View};
+use crate::robust::settings::Settings;
+use crate::viability::Viability;
 use nalgebra::{Isometry3, Matrix3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
-use valuemap_core::ray::{Ray, Rays};
-use valuemap_core::robust::noise::Noise;
-use valuemap_core::robust::parts::Without;
-use valuemap_core::robust::scene::{Frustum, Scene, View};
-use valuemap_core::robust::settings::Settings;
-use valuemap_core::viability::Viability;
 
 pub const FOCAL_PX: f64 = 600.0;
 pub const GATE_SIGMAS: f64 = 3.5;

@@ -1,11 +1,11 @@
 //! Pose errors against dense linear algebra: the whole covariance of all residuals, written out.
 
+use crate::robust::noise::Sigmas;
+use crate::robust::noise::drift::{DRIFT_LENGTH_M, Drive, Look, Normals, OneLook, SEGMENT_M};
+use crate::robust::noise::poses::{Belief, Segments, smooth};
+use crate::robust::scene::View;
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use proptest::prelude::*;
-use valuemap_core::robust::noise::Sigmas;
-use valuemap_core::robust::noise::drift::{DRIFT_LENGTH_M, Drive, Look, Normals, OneLook, SEGMENT_M};
-use valuemap_core::robust::noise::poses::{Belief, Segments, smooth};
-use valuemap_core::robust::scene::View;
 
 type Vector6 = nalgebra::SVector<f64, 6>;
 
