@@ -3,6 +3,7 @@
 //! Objects of one place share the pose errors of their images ([`estimate`](crate::robust::energy::estimate)). Votes that a neighbour might have
 //! widen the covariance ([`contest`](super::contest)).
 
+use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use super::contest::{Contest, widened};
@@ -34,15 +35,15 @@ pub fn apart(
 ) -> Result<(Vec<Object>, Vec<Estimate>), Halt> {
     loop {
         let estimates = positions(model, of_covariances, &objects);
-        let mut there = objects.clone();
-        for (object, estimate) in there.iter_mut().zip(&estimates) {
-            object.fit.point = estimate.point;
-        }
-        if !model.settings.has(Part::Exclusion) || too_near(&there).is_empty() {
+        let points: Vec<Vector3<f64>> = estimates.iter().map(|estimate| estimate.point).collect();
+        if !model.settings.has(Part::Exclusion) || too_near(&objects, &points).is_empty() {
             return Ok((objects, estimates));
         }
+        for (object, point) in objects.iter_mut().zip(points) {
+            object.fit.point = point;
+        }
         let index = RayIndex::new(model.scene, &model.spreads, model.settings.gate_sigmas, rays.iter().copied());
-        objects = exclude(model, lookout, &index, there, progress)?;
+        objects = exclude(model, lookout, &index, objects, progress)?;
     }
 }
 
@@ -97,7 +98,7 @@ fn together(
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{Translation3, Vector3};
+    use nalgebra::Translation3;
 
     use super::*;
     use crate::robust::energy::estimate::looks_at;
@@ -151,7 +152,8 @@ mod tests {
             let of_drives = (0..twice).flat_map(drives);
             let found = of_drives.chain((twice..8).map(|i| object(of(i).collect(), objects[i] + 0.5 * off)));
             let found: Vec<Object> = found.flatten().collect();
-            assert_eq!((found.len(), too_near(&found).len()), (8 + twice, 0));
+            let points: Vec<Vector3<f64>> = found.iter().map(|object| object.fit.point).collect();
+            assert_eq!((found.len(), too_near(&found, &points).len()), (8 + twice, 0));
             apart(&model, &noise, &lookout, &rays, found, &Progress::default())
         };
         let count = |settings: &Settings, twice: usize| {

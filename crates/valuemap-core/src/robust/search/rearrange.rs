@@ -15,7 +15,9 @@ use super::repair::MOST_VISITS;
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::estimate::visits;
 use crate::robust::energy::looks::Lookout;
-use crate::robust::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, by_place, by_side, fitting_unseen, object, owners};
+use crate::robust::energy::{
+    LEAST_GAIN_OF_MOVE, NOBODY, Object, by_place, by_side, fitting_unseen, object, owners, places,
+};
 use crate::robust::model::Model;
 use crate::robust::noise::index::RayIndex;
 use crate::robust::parts::Part;
@@ -102,7 +104,8 @@ pub fn exclude(
 ) -> Result<Vec<Object>, Halt> {
     loop {
         progress.check()?;
-        let near = too_near(&objects);
+        let points: Vec<Vector3<f64>> = objects.iter().map(|object| object.fit.point).collect();
+        let near = too_near(&objects, &points);
         if near.is_empty() {
             return Ok(objects);
         }
@@ -127,16 +130,17 @@ pub fn exclude(
     }
 }
 
-/// Pairs of objects that are nearer to each other than solid things can be, the nearest first.
-pub(crate) fn too_near(objects: &[Object]) -> Vec<(usize, usize)> {
-    let tree = by_place(objects);
+/// Pairs of objects at some points that are nearer to each other than solid things can be, the nearest first.
+pub(crate) fn too_near(objects: &[Object], points: &[Vector3<f64>]) -> Vec<(usize, usize)> {
+    let tree = places::by_place(points.iter().copied());
     let mut near: Vec<(f64, usize, usize)> = Vec::new();
-    for (i, object) in objects.iter().enumerate().filter(|(_, object)| object.ln_size.is_finite()) {
+    for (i, (object, point)) in objects.iter().zip(points).enumerate() {
         let reach = EXCLUSIVE_SHARE * object.ln_size.exp();
-        let others = tree.locate_within_distance(object.fit.point.into(), reach * reach);
-        near.extend(others.filter(|other| other.data != i).map(|other| {
-            ((objects[other.data].fit.point - object.fit.point).norm(), i.min(other.data), i.max(other.data))
-        }));
+        if reach.is_finite() {
+            let others = tree.locate_within_distance((*point).into(), reach * reach);
+            let apart = |other: usize| (points[other] - point).norm();
+            near.extend(others.filter(|o| o.data != i).map(|o| (apart(o.data), i.min(o.data), i.max(o.data))));
+        }
     }
     near.sort_by(|x, y| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2))));
     near.into_iter().map(|(_, a, b)| (a, b)).collect()
