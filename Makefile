@@ -13,7 +13,7 @@ FIELD_DATA ?= ../shared/data
 demo: setup
 	$(RUN) valuemap demo
 
-# A file is tried in one process, for what its tests share; in the order of the names, long and short ones mixed.
+# A file is tried in one process, for what its tests share; in the order of the names, but for the longest (tests/conftest.py).
 test: setup
 	EXTRAS="$(EXTRAS)" $(RUN) pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 

@@ -11,7 +11,16 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"
 
+import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 settings.register_profile("same-cases", derandomize=True, deadline=None)
 settings.load_profile("same-cases")
+
+LONGEST = ("test_train.py", "test_viewer_page.py")
+"""Files of some minutes whose names come late: begun first, no process is left alone with one of them in the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put tests of the longest files first; else they run in the order of their names."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
