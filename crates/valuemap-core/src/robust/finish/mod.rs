@@ -34,8 +34,8 @@ pub struct Finding {
     pub expected: u32,
 }
 
-/// The labels that some objects make where they are estimated, and some of few votes: those that are no others and exist probably enough, ordered by their lowest vote. With it
-/// what the covariances were multiplied by, so that the passes agree. Covariances have a noise of their own.
+/// The labels that some objects make where they are estimated, and some of few votes: those that are no others and exist probably enough, ordered by
+/// their lowest vote. With it what the covariances were multiplied by, so that the passes agree. Covariances have a noise of their own.
 #[must_use]
 pub fn labels(
     model: &Model<'_>,
