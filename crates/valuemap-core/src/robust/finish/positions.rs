@@ -15,7 +15,7 @@ use crate::robust::model::Model;
 use crate::robust::noise::Noise;
 use crate::robust::noise::index::RayIndex;
 use crate::robust::parts::Part;
-use crate::robust::search::rearrange::{exclude, too_near};
+use crate::robust::search::rearrange::{as_one, too_near};
 
 /// Objects within this share of the range of the one with the most votes are estimated with it.
 const PLACE_SHARE: f64 = 0.4;
@@ -36,14 +36,12 @@ pub fn apart(
     loop {
         let estimates = positions(model, of_covariances, &objects);
         let points: Vec<Vector3<f64>> = estimates.iter().map(|estimate| estimate.point).collect();
-        if !model.settings.has(Part::Exclusion) || too_near(&objects, &points).is_empty() {
+        let near = if model.settings.has(Part::Exclusion) { too_near(&objects, &points) } else { Vec::new() };
+        if near.is_empty() {
             return Ok((objects, estimates));
         }
-        for (object, point) in objects.iter_mut().zip(points) {
-            object.fit.point = point;
-        }
         let index = RayIndex::new(model.scene, &model.spreads, model.settings.gate_sigmas, rays.iter().copied());
-        objects = exclude(model, lookout, &index, objects, progress)?;
+        objects = as_one(model, lookout, &index, objects, near, progress)?;
     }
 }
 

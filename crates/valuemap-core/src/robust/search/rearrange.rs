@@ -109,25 +109,37 @@ pub fn exclude(
         if near.is_empty() {
             return Ok(objects);
         }
-        let mut kept: Vec<Option<Object>> = objects.into_iter().map(Some).collect();
-        for (a, b) in near {
-            let (Some(first), Some(second)) = (&kept[a], &kept[b]) else { continue };
-            let claims = claims_of_all(model, index, &[first.clone(), second.clone()], progress)?;
-            let pair = Pair::new(model, lookout, [first, second], [&claims[0], &claims[1]]);
-            let (weaker, class) =
-                if first.votes.len() < second.votes.len() { (a, second.class) } else { (b, first.class) };
-            // A detector takes one thing for another now and then: the class with more votes has the place.
-            let merged = if may_be_one(model, first, second) { pair.merged() } else { None };
-            let merged = merged.filter(|merged| merged.class == class);
-            kept[weaker] = None;
-            if let Some(merged) = merged {
-                (kept[a], kept[b]) = (None, None);
-                kept.push(Some(merged));
-            }
-        }
-        objects = kept.into_iter().flatten().collect();
-        objects.sort_by_key(|object| object.votes[0]);
+        objects = as_one(model, lookout, index, objects, near, progress)?;
     }
+}
+
+/// Objects of which those of some pairs are one, the first pairs first; the weaker of two that cannot be is left out.
+pub(crate) fn as_one(
+    model: &Model<'_>,
+    lookout: &Lookout,
+    index: &RayIndex<'_>,
+    objects: Vec<Object>,
+    pairs: Vec<(usize, usize)>,
+    progress: &Progress,
+) -> Result<Vec<Object>, Halt> {
+    let mut kept: Vec<Option<Object>> = objects.into_iter().map(Some).collect();
+    for (a, b) in pairs {
+        let (Some(first), Some(second)) = (&kept[a], &kept[b]) else { continue };
+        let claims = claims_of_all(model, index, &[first.clone(), second.clone()], progress)?;
+        let pair = Pair::new(model, lookout, [first, second], [&claims[0], &claims[1]]);
+        let (weaker, class) = if first.votes.len() < second.votes.len() { (a, second.class) } else { (b, first.class) };
+        // A detector takes one thing for another now and then: the class with more votes has the place.
+        let merged = if may_be_one(model, first, second) { pair.merged() } else { None };
+        let merged = merged.filter(|merged| merged.class == class);
+        kept[weaker] = None;
+        if let Some(merged) = merged {
+            (kept[a], kept[b]) = (None, None);
+            kept.push(Some(merged));
+        }
+    }
+    let mut left: Vec<Object> = kept.into_iter().flatten().collect();
+    left.sort_by_key(|object| object.votes[0]);
+    Ok(left)
 }
 
 /// Pairs of objects at some points that are nearer to each other than solid things can be, the nearest first.
