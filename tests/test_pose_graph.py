@@ -140,6 +140,34 @@ def test_houses_alike_in_another_street_do_not_close_a_round() -> None:
     assert kept[-1] is closing
 
 
+def broken_at_the_corner() -> tuple[list[Pair], Floats, Floats]:
+    """Pairs of a drive whose two streets one pair alone holds together, turned by 40 degrees too much."""
+    rotation, center = drive()
+    pairs = [pair for pair in pairs_of(rotation, center, 6) if not pair.first <= 15 < pair.second]
+    twist = Rotation.from_rotvec([0.0, 0.7, 0.0]).as_matrix()
+    true = next(pair for pair in pairs_of(rotation, center, 6) if pair.first == 15 and pair.second == 16)
+    pairs.append(replace(true, second_from_first=twist @ true.second_from_first, feature=true.feature + 10_000))
+    return pairs, rotation, center
+
+
+def test_a_wrong_rotation_between_two_streets_leaves_two_pieces_on_their_gps() -> None:
+    pairs, rotation, center = broken_at_the_corner()
+    random, sigma_m = np.random.default_rng(7), np.full(COUNT, 0.3)
+    poses = start_of(pairs, np.zeros(COUNT, np.int64), center + random.normal(0.0, 0.3, center.shape), sigma_m)
+    assert sorted(poses) == list(range(COUNT))
+    for street in (range(16), range(16, COUNT)):
+        turned = [np.degrees(Rotation.from_matrix(poses[row][0].T @ rotation[row]).magnitude()) for row in street]
+        assert max(turned) < 5.0
+        assert max(np.linalg.norm(poses[row][1] - center[row]) for row in street) < 0.6
+
+
+def test_a_piece_whose_gps_tells_no_north_is_left_out_where_rotations_are_wrong() -> None:
+    pairs, _, center = broken_at_the_corner()
+    random, sigma_m = np.random.default_rng(7), np.full(COUNT, 9.0)
+    poses = start_of(pairs, np.zeros(COUNT, np.int64), center + random.normal(0.0, 0.3, center.shape), sigma_m)
+    assert sorted(poses) == list(range(16))
+
+
 def test_pictures_of_a_car_that_stands_are_at_one_place() -> None:
     """Their GPS is not: without parallax a pair says how near its pictures are, as others know the depths."""
     rotation, center = drive()

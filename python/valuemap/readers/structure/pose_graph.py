@@ -99,17 +99,15 @@ def start_of(
     poses: dict[int, tuple[Floats, Floats]] = {}
     for each in np.unique(group[edges.one[part >= 0]]):
         mine = np.flatnonzero((group[edges.one] == each) & (part >= 0))
-        placed = _onto_earth(edges.take(mine), part[mine], rotation, gps_in_world_m, sigma_m)
-        if placed is None:
-            continue
-        turn, metric = placed
-        rows = np.unique([metric.one, metric.two])
-        place = np.zeros(count, dtype=np.int64)
-        place[rows] = np.arange(len(rows))
-        local = _Edges(place[metric.one], place[metric.two], metric.wanted, metric.sigma)
-        gps_sigma = sigma_m[rows][:, None] * [1.0, 1.0, _HEIGHT_SHARE]
-        center = _solve(local, len(rows), gps_in_world_m[rows], gps_sigma)
-        poses |= {row: (rotation[row] @ turn.T, center[i]) for i, row in enumerate(rows.tolist())}
+        for turn, metric in _onto_earth(edges.take(mine), part[mine], rotation, gps_in_world_m, sigma_m):
+            rows = np.unique([metric.one, metric.two])
+            place = np.zeros(count, dtype=np.int64)
+            place[rows] = np.arange(len(rows))
+            local = _Edges(place[metric.one], place[metric.two], metric.wanted, metric.sigma)
+            gps_sigma = sigma_m[rows][:, None] * [1.0, 1.0, _HEIGHT_SHARE]
+            center = _solve(local, len(rows), gps_in_world_m[rows], gps_sigma)
+            # A picture of two pieces is of the larger, which comes first.
+            poses = {row: (rotation[row] @ turn.T, center[i]) for i, row in enumerate(rows.tolist())} | poses
     return poses
 
 
@@ -372,11 +370,29 @@ def _components(one: Ints, two: Ints, count: int) -> Ints:
     return found
 
 
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """The ways `which` of `pictures` of one part, and the scale and turn that take them onto the GPS.
+
+    `north_sigma_rad` is how well their GPS says where north is.
+    """
+
+    pictures: int
+    which: Ints
+    scale: float
+    turn: Floats
+    north_sigma_rad: float
+
+
 def _onto_earth(
     edges: _Edges, part: Ints, rotation: Floats, gps_in_world_m: Floats, sigma_m: Floats
-) -> tuple[Floats, _Edges] | None:
-    """Return the turn (3, 3) from the world of the rotations to that of the GPS, and ways there in metres, or None."""
-    found = []
+) -> list[tuple[Floats, _Edges]]:
+    """Return pieces, the largest first: turns (3, 3) from the world of rotations to that of the GPS, ways in metres.
+
+    Parts are of one piece where their GPS has north in one direction. Where it has not, rotations are wrong between
+    them, if it is long enough to tell; else it is the GPS that is, and the smaller part is left out.
+    """
+    placed = []
     for each in np.unique(part):
         which = np.flatnonzero(part == each)
         rows, place = np.unique([edges.one[which], edges.two[which]], return_inverse=True)
@@ -388,19 +404,36 @@ def _onto_earth(
         piece = _components(one, two, len(rows))
         main = piece == np.bincount(piece).argmax()
         center = _solve(_Edges(one, two, edges.wanted[which], edges.sigma[which]), len(rows), free, free)
-        moved = similarity_onto(center[main], -rotation[rows[main], 1], gps_in_world_m[rows[main]], sigma_m[rows[main]])
+        gps, sigma = gps_in_world_m[rows[main]], sigma_m[rows[main]]
+        moved = similarity_onto(center[main], -rotation[rows[main], 1], gps, sigma)
         if moved is not None:
-            found.append((int(main.sum()), which[main[one]], *moved[:2]))
-    if not found:
-        return None
-    found.sort(key=lambda each: -each[0])
-    turn, kept = found[0][3], []
-    for _, which, scale, own in found:
-        if Rotation.from_matrix(own @ turn.T).magnitude() < _SAME_NORTH_RAD:
-            sigma = np.maximum(scale * edges.sigma[which], _STILL_M)
-            kept.append(_Edges(edges.one[which], edges.two[which], scale * edges.wanted[which] @ turn.T, sigma))
-    names = ("one", "two", "wanted", "sigma")
-    return turn, _Edges(*(np.concatenate([getattr(each, name) for each in kept]) for name in names))
+            placed.append(_Placed(int(main.sum()), which[main[one]], *moved[:2], _north_sigma_rad(gps, sigma)))
+    placed.sort(key=lambda each: -each.pictures)
+    pieces = []
+    while placed:
+        turn = placed[0].turn
+        off = [float(Rotation.from_matrix(each.turn @ turn.T).magnitude()) for each in placed]
+        kept = []
+        for each, off_rad in zip(placed, off, strict=True):
+            if off_rad < _SAME_NORTH_RAD:
+                sigma = np.maximum(each.scale * edges.sigma[each.which], _STILL_M)
+                way = each.scale * edges.wanted[each.which] @ turn.T
+                kept.append(_Edges(edges.one[each.which], edges.two[each.which], way, sigma))
+        names = ("one", "two", "wanted", "sigma")
+        pieces.append((turn, _Edges(*(np.concatenate([getattr(each, name) for each in kept]) for name in names))))
+        is_other = [
+            off_rad > max(_SAME_NORTH_RAD, 3.0 * each.north_sigma_rad)
+            for each, off_rad in zip(placed, off, strict=True)
+        ]
+        placed = [each for each, is_it in zip(placed, is_other, strict=True) if is_it]
+    return pieces
+
+
+def _north_sigma_rad(gps_m: Floats, sigma_m: Floats) -> float:
+    """Return how well positions (N, 3) say in which direction a drive goes."""
+    known = np.isfinite(gps_m).all(axis=1)
+    away = gps_m[known, :2] - gps_m[known, :2].mean(axis=0)
+    return float(1.0 / np.sqrt(max(((away / sigma_m[known, None]) ** 2).sum(), 1e-12)))
 
 
 def _losses() -> Iterator[str]:
