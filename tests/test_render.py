@@ -21,7 +21,7 @@ from valuemap.dataset import write_dataset
 from valuemap.detect.labels import read_labels
 from valuemap.folders import LEDGER
 from valuemap.simulate import PRESETS, Recording, record_city
-from valuemap.simulate.canvas import ENLARGED, Picture, View
+from valuemap.simulate.canvas import ENLARGED, Picture, View, fill, fill_all, inset
 from valuemap.simulate.housings import lamp_px, paint_housing
 from valuemap.simulate.paint import Painter
 from valuemap.simulate.render import render_images, render_pictures
@@ -101,6 +101,27 @@ def test_a_housing_covers_its_box_and_nothing_else(
     height = width * stretch
     box = np.array([x - width / 2.0, y - height / 2.0, x + width / 2.0, y + height / 2.0])
     assert edges_px(box, turn) == pytest.approx(box, abs=0.01)
+
+
+@pytest.mark.parametrize("all_at_once", [False, True])
+@pytest.mark.parametrize("clockwise", [False, True])
+def test_what_is_painted_is_as_large_as_its_outline(all_at_once: bool, clockwise: bool) -> None:
+    # OpenCV paints what an outline touches, too: everything would be a quarter of a pixel larger on all sides.
+    random, larger_px, away_px = np.random.default_rng(0), [], []
+    for _ in range(200):
+        middle, half, turn = random.uniform(20.0, 28.0, 2), random.uniform(1.0, 12.0, 2), random.uniform(0.0, np.pi)
+        aside = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])[:: 1 if clockwise else -1] * half
+        outline = middle + aside @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+        canvas = np.zeros((48 * ENLARGED, 48 * ENLARGED, 3), np.uint8)
+        if all_at_once:
+            fill_all(canvas, inset(outline[None]), [255.0] * 3)
+        else:
+            fill(canvas, outline, [255.0] * 3)
+        y, x = (np.argwhere(canvas[:, :, 0]).T + 0.5) / ENLARGED
+        larger_px.append((len(x) / ENLARGED**2 - 4.0 * half.prod()) / (4.0 * half.sum()))
+        away_px.append([x.mean() - middle[0], y.mean() - middle[1]])
+    assert abs(np.mean(larger_px)) < 0.05
+    assert np.abs(np.mean(away_px, axis=0)).max() < 0.03
 
 
 @pytest.mark.parametrize(("lamp", "channel"), [(RED, 0), (GREEN, 1)])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valuemap.simulate.canvas import NEAR_M, Picture, View, far_to_near, fill, fill_all
+from valuemap.simulate.canvas import NEAR_M, Picture, View, far_to_near, fill, fill_all, inset
 from valuemap.simulate.houses import Fronts
 from valuemap.simulate.streams import hash01
 from valuemap.simulate.weather import Light
@@ -41,7 +41,7 @@ def paint_fronts(canvas: Picture, fronts: Fronts, view: View, light: Light, *, s
     frame = light.through_haze(np.clip(fronts.color * 1.22 + 16.0, 0.0, 250.0) * lit, distance_m)
     board = light.through_haze(_BOARDS[fronts.number % len(_BOARDS)] * lit, distance_m)
     window_of, number, windows = _windows(fronts, view, is_seen & (distance_m < _WINDOWS_M))
-    frames = _grown(windows)
+    bands, frames, windows = inset(bands), inset(_grown(windows)), inset(windows)
     is_lit = hash01(number + 1000 * fronts.number[window_of], seed, 7) < light.weather.lit_windows
     band_at = np.searchsorted(band_of, np.arange(len(fronts) + 1))
     window_at = np.searchsorted(window_of, np.arange(len(fronts) + 1))
