@@ -3,6 +3,10 @@
 Gauss-Newton with Levenberg's damping over all poses, cameras and points, the points eliminated (Schur's complement).
 Outliers of features and of the GPS lose weight (Cauchy).
 
+By Cauchy's loss what is far off pulls for ever, if less and less. Many features are where two edges cross that are not
+of one thing, and slide as the camera moves. So once poses have settled features lose their weight faster (Geman and
+McClure, 1987).
+
 Errors of features last: one is off in a picture as it was in the one before, while features of one picture know nothing
 of each other. So the covariance of the poses is that of the scatter between points (the sandwich of Huber, 1967, and of
 Liang and Zeger, 1986): what all sights of a point pull together counts, not how many they are.
@@ -36,7 +40,9 @@ _DAMPING = (1e-6, 1e-12, 1e3)
 """At first, at least and at most."""
 _LEAST_SIGMA_PX = 0.2
 _NEAREST_M = 0.3
-_CAUCHY, _BEHIND = 2.5, 30.0
+_CAUCHY, _GEMAN = 1, 2
+"""Losses by their power: weights 1 / (1 + x^2) and 1 / (1 + x^2)^2, with errors x in units of `_HALF` sigmas."""
+_HALF, _BEHIND = 2.5, 30.0
 _GROWTHS = 2.0 ** np.arange(0.0, 6.5, 0.5)
 """Of variances: no growth, up to eight times the standard deviation."""
 _SURE = 2.71
@@ -137,8 +143,8 @@ class _Linear:
 class _Weights:
     """Square roots of the weights of features (M), of GPS positions (N, 3) and of roll and pitch (N, 2).
 
-    `sigma_px` is the standard deviation of features that are no outliers. `growth` is that of the variance of what they
-    say together of the shape of streets.
+    `sigma_px` is the standard deviation of features that are no outliers, `power` the loss of those that are. `growth`
+    is that of the variance of what they say together of the shape of streets.
     """
 
     sigma_px: float
@@ -146,21 +152,24 @@ class _Weights:
     gps: Floats
     level: Floats
     growth: float
+    power: int
 
 
-def adjust(sights: Sights, part: Ints) -> Adjusted:
+def adjust(sights: Sights, part: Ints, *, is_last: bool = True) -> Adjusted:
     """Return the poses and cameras that agree best, with their standard deviations.
 
-    `part` (N) says which pictures hang together by what they see.
+    `part` (N) says which pictures hang together by what they see. Points are made anew from these poses unless this
+    `is_last`: by then poses have settled.
     """
+    power = _GEMAN if is_last else _CAUCHY
     # First the GPS is taken at its word: what is wrong yet would look like errors of it that follow each other.
     worse = np.ones(len(sights.row))
     here = _settled(_converged(sights, sights, worse), part, sights, worse)
     worse = gps_inflation(_gps_off(here), here.drive)
-    here = _settled(_converged(here, sights, worse), part, sights, worse)
-    growth = _growth_of_features(here, sights, worse, part)
-    here = _settled(_converged(here, sights, worse, growth), part, sights, worse, growth)
-    weights = _weigh(here, worse, growth)
+    here = _settled(_converged(here, sights, worse, power=power), part, sights, worse)
+    growth = _growth_of_features(here, sights, worse, part, power)
+    here = _settled(_converged(here, sights, worse, growth, power), part, sights, worse, growth)
+    weights = _weigh(here, worse, growth, power)
     # Weights are less by the growth, and what features pull is more than these say.
     scatter = growth * _scatter(_linearised(here, weights), here)
     meat = scatter + _priors(here, weights, sights, scatter.shape[0])[0]
@@ -172,14 +181,14 @@ def adjust(sights: Sights, part: Ints) -> Adjusted:
     return Adjusted(here.cam_from_world, here.center_in_world_m, here.cameras, np.sqrt(variance), np.sqrt(in_part))
 
 
-def _growth_of_features(here: Sights, first: Sights, worse: Floats, part: Ints) -> float:
+def _growth_of_features(here: Sights, first: Sights, worse: Floats, part: Ints, power: int) -> float:
     """Return by how much the variance of what features say of the shape of parts must grow, at least 1.
 
     With what features say, F, and priors, P, about where both agree best, positions by GPS have a variance of
     g F^-1 + P^-1 about the shape by features. Of all g tried that is taken under which they are likeliest, if it is
     more than chance. Moves of a part as a whole (7) are none of its shape.
     """
-    weights = _weigh(here, worse)
+    weights = _weigh(here, worse, power=power)
     matrix, right, _ = _equations(here, weights, first).without_points(0.0)
     priors, right_of_priors = _priors(here, weights, first, matrix.shape[0])
     features, right_of_features = matrix - priors, right - right_of_priors
@@ -195,11 +204,11 @@ def _growth_of_features(here: Sights, first: Sights, worse: Floats, part: Ints) 
     return float(_GROWTHS[best]) if cost[0] - cost[best] > _SURE else 1.0
 
 
-def _converged(here: Sights, first: Sights, worse: Floats, growth: float = 1.0) -> Sights:
+def _converged(here: Sights, first: Sights, worse: Floats, growth: float = 1.0, power: int = _CAUCHY) -> Sights:
     """Return the sights with all moved to where they agree best, the GPS with sigmas `worse` (N) times as large."""
     damping, least, most = _DAMPING
     for _ in range(_MOST_STEPS):
-        weights = _weigh(here, worse, growth)
+        weights = _weigh(here, worse, growth, power)
         equations = _equations(here, weights, first)
         cost = _cost(here, weights, first)
         while damping < most:
@@ -239,31 +248,35 @@ def _residuals(sights: Sights) -> Floats:
     return np.asarray(_project(sights, _in_camera(sights)) - sights.pixel)
 
 
-def _weigh(sights: Sights, worse: Floats, growth: float = 1.0) -> _Weights:
+def _weigh(sights: Sights, worse: Floats, growth: float = 1.0, power: int = _CAUCHY) -> _Weights:
     residual = np.linalg.norm(_residuals(sights), axis=1)
     fine = np.isfinite(residual)
     # The length of two normal errors has a median of 1.18 sigmas.
     sigma_px = max(float(np.median(residual[fine])) / 1.18, _LEAST_SIGMA_PX)
     feature = np.zeros(len(residual))
-    feature[fine] = 1.0 / sigma_px / np.sqrt(growth * (1.0 + (residual[fine] / (_CAUCHY * sigma_px)) ** 2))
+    size = residual[fine] / (_HALF * sigma_px)
+    feature[fine] = 1.0 / sigma_px / np.sqrt(growth * (1.0 + size**2) ** power)
     off = _gps_off(sights)
     known = np.isfinite(off).all(axis=1)
     gps = np.zeros_like(off)
     if known.any():
         length = np.linalg.norm(off[known], axis=1) / worse[known]
-        sigma = worse[known] * sights.sigma_m[known] * np.sqrt(1.0 + (length / (1.7 * _CAUCHY)) ** 2)
+        sigma = worse[known] * sights.sigma_m[known] * np.sqrt(1.0 + (length / (1.7 * _HALF)) ** 2)
         gps[known] = 1.0 / sigma[:, None] / [1.0, 1.0, _HEIGHT_SHARE]
     count = np.bincount(sights.drive)[sights.drive]
     level = 1.0 / (np.array([_ROLL_SIGMA_RAD, _PITCH_SIGMA_RAD]) * np.sqrt(count)[:, None])
-    return _Weights(sigma_px, feature, gps, level, growth)
+    return _Weights(sigma_px, feature, gps, level, growth, power)
 
 
 def _slope_share(sights: Sights, weights: _Weights) -> float:
-    """Return how much what features pull changes with their errors, as a share of their weights."""
+    """Return how much what features pull changes with their errors, as a share of their weights.
+
+    Along an error x with the weight w = (1 + x^2)^-p that is w (1 + x^2 - 2 p x^2) / (1 + x^2), across it w: the mean.
+    """
     residual = np.linalg.norm(_residuals(sights), axis=1)
     fine = np.isfinite(residual)
-    weight = weights.feature[fine] ** 2
-    return float((weight / (1.0 + (residual[fine] / (_CAUCHY * weights.sigma_px)) ** 2)).sum() / weight.sum())
+    weight, square = weights.feature[fine] ** 2, (residual[fine] / (_HALF * weights.sigma_px)) ** 2
+    return float((weight * (1.0 - (weights.power - 1) * square) / (1.0 + square)).sum() / weight.sum())
 
 
 def _gps_off(sights: Sights) -> Floats:
@@ -328,9 +341,11 @@ def _intrinsic_weights(sights: Sights, first: Sights) -> list[tuple[int, float, 
 
 def _cost(sights: Sights, weights: _Weights, first: Sights) -> float:
     """Return the sum of squares in sigmas: of features with Cauchy's loss, of the rest with the weights as they are."""
-    size = np.linalg.norm(_residuals(sights), axis=1) / (_CAUCHY * weights.sigma_px)
+    size = np.linalg.norm(_residuals(sights), axis=1) / (_HALF * weights.sigma_px)
     # What comes to lie behind its camera is an outlier like others.
-    total = _CAUCHY**2 / weights.growth * float(np.log1p(np.where(np.isfinite(size), size, _BEHIND) ** 2).sum())
+    square = np.where(np.isfinite(size), size, _BEHIND) ** 2
+    loss = np.log1p(square) if weights.power == _CAUCHY else square / (1.0 + square)
+    total = _HALF**2 / weights.growth * float(loss.sum())
     total += float(np.nansum(((sights.center_in_world_m - sights.gps_in_world_m) * weights.gps) ** 2))
     total += float(((_slopes(sights) * weights.level) ** 2).sum())
     total += sum((root * off) ** 2 for _, root, off in _intrinsic_weights(sights, first))

@@ -174,7 +174,7 @@ def _unite(
         model = _triangulated(job, workspace, ids, whole, tolerance_px, threads)
         if step == last:
             model = _with_the_rest(job, workspace, model, ids, threads, progress)
-        found, row, part = _settle(job, model, ids, whole, why_not)
+        found, row, part = _settle(job, model, ids, whole, why_not, is_last=step == last)
     progress("adjusting poses", last + 1, last + 1)
     return found, row, part
 
@@ -232,7 +232,13 @@ def _with_the_rest(
 
 
 def _settle(
-    job: Job, model: pycolmap.Reconstruction, ids: dict[int, int], whole: _Whole, why_not: dict[int, str]
+    job: Job,
+    model: pycolmap.Reconstruction,
+    ids: dict[int, int],
+    whole: _Whole,
+    why_not: dict[int, str],
+    *,
+    is_last: bool,
 ) -> tuple[Adjusted, Ints, Ints]:
     """Adjust the model, without the pictures that do not belong to it, until all that are left do."""
     row_of = {image_id: row for row, image_id in ids.items()}
@@ -251,7 +257,7 @@ def _settle(
                 bad[row] = NO_GPS
         found = None
         if not bad:
-            found = adjust(sights, part)
+            found = adjust(sights, part, is_last=is_last)
             wrong = contradicts_gps(found.center_in_world_m, sights.gps_in_world_m, sights.sigma_m)
             bad = dict.fromkeys(sights.row[wrong].tolist(), NOT_THERE)
         if found is not None and not bad:
