@@ -1,7 +1,7 @@
 """From a folder of rendered street pictures with a GPS position in each, and nothing else, to poses and a map.
 
     python benchmarks/pictures.py [--seed 1] [--pass-row 1] [--pictures N] [--gps-sigma 2] [--spacing 2.5]
-                                  [--work DIR] [--json FILE]
+                                  [--camera WIDTH HEIGHT FOCAL] [--work DIR] [--json FILE]
 
 A drive round the blocks of a simulated city by day is rendered. EXIF gets a position with noise of `--gps-sigma` on
 each axis, the time and the focal length. `valuemap import pictures` finds the poses. They are compared with the true
@@ -59,6 +59,7 @@ START_S = 1.7e9
 GPS_SIGMA_M = 2.0
 SPACING_M = 2.5
 FILM_MM = 36.0
+_CAMERA = ("WIDTH", "HEIGHT", "FOCAL")
 
 
 def main() -> None:
@@ -69,6 +70,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=int, default=1000, help="of its beginning; the default is the whole drive")
     parser.add_argument("--gps-sigma", type=float, default=GPS_SIGMA_M, help="noise of each axis, m")
     parser.add_argument("--spacing", type=float, default=SPACING_M, help="way from picture to picture, m")
+    parser.add_argument("--camera", nargs=3, type=float, metavar=_CAMERA, help="px; the default is the simulator's")
     parser.add_argument("--work", type=Path, help="folder for everything, to go on after an interruption")
     parser.add_argument("--json", type=Path, help="file to write the figures to, beside those of other drives")
     options = parser.parse_args()
@@ -89,6 +91,8 @@ def record_of(options: argparse.Namespace, result: dict[str, Any]) -> dict[str, 
         drive += f", GPS of {options.gps_sigma:g} m"
     if options.spacing != SPACING_M:
         drive += f", every {options.spacing:g} m"
+    if options.camera:
+        drive += ", {:g} x {:g} px, focal length {:g} px".format(*options.camera)
     return {
         "benchmark": "pictures",
         "command": "python benchmarks/pictures.py --seed SEED --pass-row PASS --json FILE, drive by drive",
@@ -101,7 +105,7 @@ def run(work: Path, options: argparse.Namespace) -> dict[str, Any]:
     """Return all figures."""
     work.mkdir(parents=True, exist_ok=True)
     seed, pass_row, gps_sigma_m = options.seed, options.pass_row, options.gps_sigma
-    city = (*CITY, f"frame_spacing_m={options.spacing:g}")
+    city = (*CITY, f"frame_spacing_m={options.spacing:g}", *_settings_of_camera(options.camera or []))
     recording = record_city(PRESETS["small"].with_settings(city), seed=seed)
     rows = np.flatnonzero(recording.frames.pass_row == pass_row)[: options.pictures]
     photos, truth, found = work / "photos", work / "truth", work / "found"
@@ -141,6 +145,12 @@ def run(work: Path, options: argparse.Namespace) -> dict[str, Any]:
     judged = {dataset.name: judge(dataset, lights) for dataset in (truth, found)}
     ratio = judged["found"]["recall"] / max(judged["truth"]["recall"], 1e-9)
     return {**result, "map": judged, "recall_over_that_of_true_poses": round(ratio, 3)}
+
+
+def _settings_of_camera(camera: list[float]) -> list[str]:
+    """Return the simulator's settings for width, height and focal length in pixels, where they are given."""
+    names = ("image_width_px", "image_height_px", "focal_px")
+    return [f"{name}={value:g}" for name, value in zip(names, camera, strict=False)]
 
 
 def with_detections(found: Dataset, detected: Dataset) -> Dataset:
