@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from valuemap.readers.structure.pose_graph import _of_one_place, start_of
+from valuemap.readers.structure.pose_graph import _north_sigma_rad, _of_one_place, start_of
 from valuemap.readers.structure.two_views import Pair, _turns_by_plane, find_way
 from valuemap.tables import Bools, Floats
 
@@ -166,6 +166,14 @@ def test_a_piece_whose_gps_tells_no_north_is_left_out_where_rotations_are_wrong(
     random, sigma_m = np.random.default_rng(7), np.full(COUNT, 9.0)
     poses = start_of(pairs, np.zeros(COUNT, np.int64), center + random.normal(0.0, 0.3, center.shape), sigma_m)
     assert sorted(poses) == list(range(16))
+
+
+def test_noise_of_a_car_that_stands_tells_no_north() -> None:
+    noise, sigma_m = np.random.default_rng(3).normal(0.0, 2.0, (60, 3)), np.full(60, 2.0)
+    street = noise + np.outer(np.arange(60.0), [2.0, 0.0, 0.0])
+    assert _north_sigma_rad(noise, sigma_m) > 0.12
+    # 2 m over the root of the sum of squares of ways from the middle.
+    assert _north_sigma_rad(street, sigma_m) == pytest.approx(2.0 / np.sqrt(4.0 * 60.0**3 / 12.0), rel=0.1)
 
 
 def test_pictures_of_a_car_that_stands_are_at_one_place() -> None:

@@ -60,7 +60,8 @@ _CLEAR = 300.0
 """So many matches must agree more with one way to go on than with another, which then is given up: what three full
 pairs (`_ENOUGH`) say, so that no one pair decides."""
 _SAME_NORTH_RAD = 0.35
-"""Parts whose GPS turns them by more than this, 20 degrees, against the largest are too short for their GPS to tell."""
+"""Parts whose GPS turns them by more than this, 20 degrees, against the largest are of a piece of their own, or too
+short for their GPS to tell."""
 _HEIGHT_SHARE = 2.0
 """Heights by GPS are so much worse than positions: satellites are above only."""
 _RIDGE = 1e-9
@@ -412,28 +413,33 @@ def _onto_earth(
     pieces = []
     while placed:
         turn = placed[0].turn
-        off = [float(Rotation.from_matrix(each.turn @ turn.T).magnitude()) for each in placed]
-        kept = []
-        for each, off_rad in zip(placed, off, strict=True):
-            if off_rad < _SAME_NORTH_RAD:
-                sigma = np.maximum(each.scale * edges.sigma[each.which], _STILL_M)
-                way = each.scale * edges.wanted[each.which] @ turn.T
-                kept.append(_Edges(edges.one[each.which], edges.two[each.which], way, sigma))
-        names = ("one", "two", "wanted", "sigma")
-        pieces.append((turn, _Edges(*(np.concatenate([getattr(each, name) for each in kept]) for name in names))))
-        is_other = [
-            off_rad > max(_SAME_NORTH_RAD, 3.0 * each.north_sigma_rad)
-            for each, off_rad in zip(placed, off, strict=True)
+        off_rad = [float(Rotation.from_matrix(each.turn @ turn.T).magnitude()) for each in placed]
+        same = [each for each, off in zip(placed, off_rad, strict=True) if off < _SAME_NORTH_RAD]
+        pieces.append((turn, _in_metres(edges, same, turn)))
+        placed = [
+            each
+            for each, off in zip(placed, off_rad, strict=True)
+            if off > max(_SAME_NORTH_RAD, 3.0 * each.north_sigma_rad)
         ]
-        placed = [each for each, is_it in zip(placed, is_other, strict=True) if is_it]
     return pieces
 
 
+def _in_metres(edges: _Edges, placed: Sequence[_Placed], turn: Floats) -> _Edges:
+    """Return the ways of parts, each by its own scale, in the axes of the world."""
+    which = np.concatenate([each.which for each in placed])
+    scale = np.concatenate([np.full(len(each.which), each.scale) for each in placed])
+    sigma = np.maximum(scale * edges.sigma[which], _STILL_M)
+    return _Edges(edges.one[which], edges.two[which], scale[:, None] * edges.wanted[which] @ turn.T, sigma)
+
+
 def _north_sigma_rad(gps_m: Floats, sigma_m: Floats) -> float:
-    """Return how well positions (N, 3) say in which direction a drive goes."""
+    """Return how well positions (N, 3) say in which direction a drive goes, by how far they are apart.
+
+    What noise alone makes of that, two a position in variances, says nothing.
+    """
     known = np.isfinite(gps_m).all(axis=1)
-    away = gps_m[known, :2] - gps_m[known, :2].mean(axis=0)
-    return float(1.0 / np.sqrt(max(((away / sigma_m[known, None]) ** 2).sum(), 1e-12)))
+    away = (gps_m[known, :2] - gps_m[known, :2].mean(axis=0)) / sigma_m[known, None]
+    return float(1.0 / np.sqrt(max((away**2).sum() - 2.0 * known.sum(), 1e-12)))
 
 
 def _losses() -> Iterator[str]:
