@@ -30,7 +30,7 @@ from valuemap.readers.cameras_of import Camera
 from valuemap.readers.pictures import read_pictures
 from valuemap.readers.poses import LOOKING_NORTH
 from valuemap.readers.structure import Picture, Posed, find_poses, mapping, process
-from valuemap.readers.structure.adjust import Sights, adjust, gps_inflation
+from valuemap.readers.structure.adjust import Sights, _residuals, _slope_share, _weigh, adjust, gps_inflation
 from valuemap.readers.structure.features import find_features, image_ids
 from valuemap.readers.structure.job import Job, prepare, read_answer, read_job, write_answer
 from valuemap.readers.structure.mapping import _triangulated, _Whole, confirmed, contradicts_gps
@@ -160,6 +160,22 @@ def test_points_that_slide_bend_less_in_the_last_adjustment() -> None:
 
     last, before = (np.mean([error_m(seed, is_last=is_last) for seed in range(4)]) for is_last in (True, False))
     assert last < 0.75 * before
+
+
+@pytest.mark.parametrize("power", [1, 2])
+def test_how_much_pulls_change_with_errors_is_their_slope(power: int) -> None:
+    sights, _, _ = drive_with_points(0, pixel_sigma=2.0)
+    weights = _weigh(sights, np.ones(len(sights.row)), 1.0, power)
+    error = _residuals(sights)
+
+    def pull(moved: Floats) -> Floats:
+        square = (moved**2).sum(axis=1, keepdims=True) / (2.5 * weights.sigma_px) ** 2
+        return np.asarray(moved / (1.0 + square) ** power)
+
+    steps = np.eye(2) * 1e-5
+    slope = sum((pull(error + step) - pull(error - step)) @ step / 2e-10 for step in steps) / 2.0
+    share = np.nansum(slope) / np.nansum(np.linalg.norm(pull(error), axis=1) / np.linalg.norm(error, axis=1))
+    assert _slope_share(sights, weights) == pytest.approx(share, rel=1e-4)
 
 
 def test_only_the_last_of_the_rounds_takes_the_loss_of_settled_poses(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,7 @@ from valuemap.dataset import write_dataset
 from valuemap.detect.labels import read_labels
 from valuemap.folders import LEDGER
 from valuemap.simulate import PRESETS, Recording, record_city
-from valuemap.simulate.canvas import ENLARGED, Picture, View, fill, fill_all, inset
+from valuemap.simulate.canvas import ENLARGED, Picture, View, bar_outlines_px, fill, fill_all, inset
 from valuemap.simulate.housings import lamp_px, paint_housing
 from valuemap.simulate.paint import Painter
 from valuemap.simulate.render import render_images, render_pictures
@@ -122,6 +122,20 @@ def test_what_is_painted_is_as_large_as_its_outline(all_at_once: bool, clockwise
         away_px.append([x.mean() - middle[0], y.mean() - middle[1]])
     assert abs(np.mean(larger_px)) < 0.05
     assert np.abs(np.mean(away_px, axis=0)).max() < 0.03
+
+
+def test_what_is_thin_is_painted_as_thin_as_a_pixel_of_the_canvas() -> None:
+    for turn in np.linspace(0.1, 3.0, 9):
+        along = np.array([np.cos(turn), np.sin(turn)])
+        start, end = 24.0 - 12.0 * along, 24.0 + 12.0 * along
+        canvas = np.zeros((48 * ENLARGED, 48 * ENLARGED, 3), np.uint8)
+        fill(canvas, bar_outlines_px(start[None], end[None], np.full((1, 2), 0.05))[0], [255.0] * 3)
+        assert np.count_nonzero(canvas[:, :, 0]) / ENLARGED**2 / 24.0 < 0.6
+
+
+def test_the_tip_of_a_needle_stays_near() -> None:
+    needle = np.array([[[4.0, 20.0], [40.0, 24.0], [40.0, 28.0]], [[4.0, 20.0], [40.0, 20.0], [40.0, 20.0]]])
+    assert np.abs(inset(needle) - needle).max() < 0.8
 
 
 @pytest.mark.parametrize(("lamp", "channel"), [(RED, 0), (GREEN, 1)])

@@ -340,7 +340,7 @@ def _intrinsic_weights(sights: Sights, first: Sights) -> list[tuple[int, float, 
 
 
 def _cost(sights: Sights, weights: _Weights, first: Sights) -> float:
-    """Return the sum of squares in sigmas: of features with Cauchy's loss, of the rest with the weights as they are."""
+    """Return the sum of squares in sigmas: of features with their loss, of the rest with the weights as they are."""
     size = np.linalg.norm(_residuals(sights), axis=1) / (_HALF * weights.sigma_px)
     # What comes to lie behind its camera is an outlier like others.
     square = np.where(np.isfinite(size), size, _BEHIND) ** 2
