@@ -641,6 +641,33 @@ def repeated_boxes(dataset: Dataset) -> Dataset:
     return replace(dataset, detections=copies, truth_detections=None)
 
 
+def carried_boxes(dataset: Dataset) -> Dataset:
+    """Dirt on the windscreen in two of three pictures of the pass with most detections, at one place up to a pixel."""
+    images, detections = dataset.images, dataset.detections
+    codes = images.pass_id.codes
+    of_pass = np.flatnonzero(codes == np.argmax(np.bincount(codes[rows(dataset)])))
+    random = np.random.default_rng(0)
+    dirty = of_pass[random.random(len(of_pass)) < 2.0 / 3.0]
+    camera = int(images.camera_id[dirty[0]])
+    dirty = dirty[images.camera_id[dirty] == camera]
+    row = rows_of(np.array([camera]), dataset.cameras.camera_id)[0]
+    place = np.array([0.3 * dataset.cameras.width_px[row], 0.4 * dataset.cameras.height_px[row]])
+    count = len(detections)
+    boxes = detections.take(np.concatenate([np.arange(count), np.zeros(len(dirty), np.int64)]))
+    center_px, size_px = boxes.center_px.copy(), boxes.size_px.copy()
+    center_px[count:] = place + random.normal(0.0, 1.0, (len(dirty), 2))
+    size_px[count:] = np.median(detections.size_px, axis=0)
+    boxes = boxes.replace(
+        detection_id=np.concatenate(
+            [detections.detection_id, detections.detection_id.max() + 1 + np.arange(len(dirty))]
+        ),
+        image_id=np.concatenate([detections.image_id, images.image_id[dirty]]),
+        center_px=center_px,
+        size_px=size_px,
+    )
+    return replace(dataset, detections=boxes)
+
+
 def repeated_images(dataset: Dataset) -> Dataset:
     """Give a tenth of the images twice, under other names."""
     images, detections = dataset.images, dataset.detections
@@ -785,6 +812,7 @@ FAULTS: dict[str, Fault] = {
     "detections_shifted": Fault(detections_shifted),
     "repeated_boxes": Fault(repeated_boxes),
     "repeated_images": Fault(repeated_images),
+    "carried_boxes": Fault(carried_boxes),
     "far_images": Fault(far_images),
     "focal_unit": Fault(focal_unit),
     "principal_point": Fault(principal_point),

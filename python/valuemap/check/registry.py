@@ -19,6 +19,7 @@ from valuemap.check.cameras import (
     TimeShift,
     WrongCamera,
 )
+from valuemap.check.carried import CarriedBoxes
 from valuemap.check.distortion import LensModel
 from valuemap.check.fault import Convention, Fault
 from valuemap.check.frames import (
@@ -91,6 +92,7 @@ FAULTS: tuple[Fault, ...] = (
     FarImages(),
     RepeatedBoxes(),
     RepeatedImages(),
+    CarriedBoxes(),
     ClassSpelling(),
     EqualScores(),
     RoundedPositions(),
