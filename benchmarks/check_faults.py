@@ -37,7 +37,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from kitti_signs import SEQUENCES, import_sequence, read_points
-from machine import describe_machine, keep_record
+from machine import command_as_typed, describe_machine, keep_record
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.examine import Examination, examine
 from valuemap.check.fault import keep_rows
@@ -1100,7 +1100,7 @@ def record_of(records: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """Return what is kept: where and how it was measured, totals and all."""
     return {
         "benchmark": "check_faults",
-        "command": "python benchmarks/check_faults.py --kitti-signs DIR --kitti-ts DIR",
+        "command": command_as_typed(),
         **describe_machine(),
         "totals": summarise(records),
         "results": records,

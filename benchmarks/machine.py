@@ -16,10 +16,14 @@ from valuemap.folders import new_file
 def write_record(path: Path | None, results: Any, **more: Any) -> None:
     """Write the figures of a benchmark on simulated data with its command, machine and versions, if a file is named."""
     if path is not None:
-        arguments = ("PATH" if Path(argument).is_absolute() else argument for argument in sys.argv[1:])
-        command = " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *arguments])
-        record = {"command": command, "data": "simulated", **describe_machine(), **more, "results": results}
+        record = {"command": command_as_typed(), "data": "simulated", **describe_machine(), **more, "results": results}
         keep_record(path, record)
+
+
+def command_as_typed() -> str:
+    """Return the command that runs, with `PATH` for places of this machine."""
+    arguments = ("PATH" if Path(argument).is_absolute() else argument for argument in sys.argv[1:])
+    return " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *arguments])
 
 
 def keep_record(path: Path | None, record: dict[str, Any]) -> None:
