@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 from pathlib import Path
@@ -17,10 +18,11 @@ from reading import SPOILS, azimuths_deg, meeting_point, refusal, spoiled, write
 from valuemap.cameras import camera_centers, cast_rays, rotation_matrices
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, read_dataset, write_dataset
-from valuemap.errors import InputError
+from valuemap.errors import InputError, SettingError
 from valuemap.readers.bearings import VERTICAL_SIGMA_PX, read_bearings
 from valuemap.readers.csv_poses import read_csv_poses
 from valuemap.readers.detections import DetectionFile
+from valuemap.readers.panoramax import read_panoramax
 from valuemap.tables import Floats
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -556,3 +558,17 @@ def test_kitti_ts_imports_without_a_script() -> None:
     dataset = kitti_ts()
     assert (len(dataset.images), len(dataset.detections), dataset.rejected) == (1756, 2363, None)
     assert len(set(dataset.images.pass_id.texts())) == 37
+
+
+@pytest.mark.parametrize("height_m", [math.nan, math.inf])
+def test_a_height_of_cameras_that_is_no_number_is_named(tmp_path: Path, height_m: float) -> None:
+    bearings = write(tmp_path / "bearings.csv", "lat,lon,bearing\n44,-121.3,90\n44.0001,-121.3,100\n")
+    poses = write(tmp_path / "poses.csv", "image,lat,lon,heading\na.jpg,44,-121.3,0\n")
+    export = write(tmp_path / "items.json", '{"type": "FeatureCollection", "features": []}')
+    detections = DetectionFile(write(tmp_path / "boxes.csv", "image,class,x,y,w,h\n"))
+    with pytest.raises(SettingError, match=r"camera-height: expected a finite number, found (nan|inf)"):
+        read_bearings(bearings, camera_height_m=height_m)
+    with pytest.raises(SettingError, match=r"camera-height: expected a finite number"):
+        read_csv_poses(poses, detections=detections, camera="EQUIRECTANGULAR 4000 2000", camera_height_m=height_m)
+    with pytest.raises(SettingError, match=r"camera-height: expected a finite number"):
+        read_panoramax(export, camera_height_m=height_m)

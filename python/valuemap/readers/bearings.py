@@ -13,7 +13,7 @@ from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
 from valuemap.readers.cameras_of import make_cameras, parse_camera
 from valuemap.readers.csv_file import CsvFile
-from valuemap.readers.poses import local_from_cam, make_images, place_on_earth
+from valuemap.readers.poses import height_where_none, local_from_cam, make_images, place_on_earth
 from valuemap.readers.reader import Reader
 from valuemap.tables import Floats, Ints
 
@@ -68,11 +68,12 @@ def read_bearings(
     """
     if not 0.0 < depth_sigma < math.inf:
         raise SettingError(f"depth-sigma: expected above 0, found {depth_sigma:g}", hint="0.3 is 30 % of the depth")
+    level_m = height_where_none(camera_height_m)
     progress("reading the bearings", 0, 1)
     table = CsvFile(bearings, _EXPECTED, texts=_TEXTS, numbers=_NUMBERS, columns=columns)
     lat, lon = (table.finite_numbers(name) for name in ("lat", "lon"))
     bearing_deg = table.numbers("bearing")
-    height = table.finite_numbers("height") if table.has("height") else np.full(len(table), camera_height_m)
+    height = table.finite_numbers("height") if table.has("height") else np.full(len(table), level_m)
     place = np.stack([lon, lat, height], axis=1)
     passes = table.filled_texts("pass") if table.has("pass") else [ONE_PASS] * len(table)
     names, first, image_of = _images(table, place, passes)

@@ -21,6 +21,7 @@ from valuemap.readers.pixel_center import shift_to_corner_px
 from valuemap.readers.poses import (
     AXES,
     OnEarth,
+    height_where_none,
     local_from_cam,
     make_images,
     place_in_crs,
@@ -167,7 +168,7 @@ def _place(
     up: tuple[float, float, float] | None,
     camera_height_m: float,
 ) -> _Where:
-    level = np.full(len(table), camera_height_m)
+    level = np.full(len(table), height_where_none(camera_height_m))
     first = min(range(len(names)), key=names.__getitem__)
     source = str(table.path)
     if table.has("lat", "lon"):

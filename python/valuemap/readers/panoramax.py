@@ -16,7 +16,7 @@ from valuemap.readers.cameras_of import Camera, make_cameras, panorama
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_file, file_in, read_json
 from valuemap.readers.json_values import Json, Told
-from valuemap.readers.poses import local_from_cam, make_images, place_on_earth
+from valuemap.readers.poses import height_where_none, local_from_cam, make_images, place_on_earth
 from valuemap.readers.reader import Reader
 from valuemap.tables import Images
 
@@ -76,7 +76,10 @@ def read_panoramax(
     ------
     InputError
         A file is missing, damaged or of another format, or an item lacks its size or field of view.
+    SettingError
+        `camera_height_m` is no number.
     """
+    level_m = height_where_none(camera_height_m)
     paths = (
         [file_in(export, path.name, _EXPECTED) for path in sorted(export.glob("*.*json"))]
         if export.is_dir()
@@ -90,7 +93,7 @@ def read_panoramax(
         content = Json(read_json(path, _EXPECTED), str(path), f"expected {_EXPECTED}")
         items = [content] if content.object().get("type") == "Feature" else list(content["features"].entries())
         for item in items:
-            _add_item(item, found, class_key, camera_height_m)
+            _add_item(item, found, class_key, level_m)
     if not found.ids:
         raise InputError(f"{export}: there are no items in it", hint=f"expected {_EXPECTED}")
     names = [f"{key}.jpg" for key in found.ids]

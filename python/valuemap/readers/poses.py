@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -57,6 +58,21 @@ class OnEarth:
     position_in_world_m: Floats
     world_from_local: Floats
     anchor: tuple[float, float, float]
+
+
+def height_where_none(camera_height_m: float) -> float:
+    """Return the height of cameras that state none, m.
+
+    Raises
+    ------
+    SettingError
+        It is no number.
+    """
+    if not math.isfinite(camera_height_m):
+        raise SettingError(
+            f"camera-height: expected a finite number, found {camera_height_m:g}", hint="2.5 is 2.5 m above the zero"
+        )
+    return camera_height_m
 
 
 def place_on_earth(
