@@ -86,7 +86,13 @@ BLOCKS: dict[str, dict[str, float]] = {
         "passes_per_street": 1,
         "lookalikes_per_light": 0.0,
     },
-    "missed": {"tail_share": 0.1, "tree_spacing_m": 8.0, "max_sight_m": 60.0, "passes_per_street": 1, **NO_LIGHTS},
+    "clutter": {
+        "clutter_per_image": 3.0,
+        "frame_spacing_m": 1.5,
+        "max_sight_m": 35.0,
+        "position_drift_m": 0.3,
+    },
+    "missed": {"tail_share": 0.2, "tree_spacing_m": 8.0, "max_sight_m": 60.0, "passes_per_street": 1, **NO_LIGHTS},
     UNEVEN: {"lamp_spacing_m": 15.0, "side_offset_m": 0.15, "passes_per_street": 3, **NO_LIGHTS, **SHORT_STREETS},
 }
 """Changes of the block's settings; scenes of few pictures are those of `test_few.py`."""
@@ -248,6 +254,7 @@ CASES: dict[str, tuple[str, int, Fails]] = {
     "elevations": (FEW_PICTURES, 7, more_is_wrong),
     "tails": ("missed", 2, more_is_wrong),
     "reach": ("drifts", 3, what_is_there_is_believed_less),
+    "far_hits": ("clutter", 3, more_is_wrong),
     "aspect": ("narrow", 7, what_is_there_is_believed_less),
     "company": (FEW_PICTURES, 5, more_is_wrong),
     "ghosts": ("far off", 0, more_is_wrong),
@@ -269,6 +276,7 @@ OF_CALIBRATION = {
     "scores",
     "elevations",
     "reach",
+    "far_hits",
     "aspect",
     "company",
     "ghosts",

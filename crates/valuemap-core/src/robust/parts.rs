@@ -45,6 +45,8 @@ pub enum Part {
     Tails,
     /// Objects are detected less from afar.
     Reach,
+    /// A hit is as rare as a look from so far is light.
+    FarHits,
     /// Objects are detected less from directions that are farther from those of their votes.
     Aspect,
     /// Objects are denser near others.
@@ -77,7 +79,7 @@ pub enum Part {
 
 impl Part {
     /// All parts with their names.
-    pub const ALL: [(Self, &'static str); 35] = [
+    pub const ALL: [(Self, &'static str); 36] = [
         (Self::Polishing, "polishing"),
         (Self::Assignment, "assignment"),
         (Self::Merging, "merging"),
@@ -99,6 +101,7 @@ impl Part {
         (Self::Elevations, "elevations"),
         (Self::Tails, "tails"),
         (Self::Reach, "reach"),
+        (Self::FarHits, "far_hits"),
         (Self::Aspect, "aspect"),
         (Self::Company, "company"),
         (Self::Existence, "existence"),

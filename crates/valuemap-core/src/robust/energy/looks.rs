@@ -2,8 +2,9 @@
 //!
 //! A look is a viewpoint of a pass that has the point in its picture, from a side from which the object was voted for, at a distance from which its class
 //! is detected; it counts less where fewer are detected, and half where another detection in the gate may hide the object. It is as much of a hit as the
-//! share of its images that have a vote. Which of the images have one is one of equally probable choices, the last term of equation (5) of
-//! `docs/method.md`: without this price a standing car would see two objects in turn.
+//! share of its images that have a vote. Which of the looks are hits has a price, the last two terms of equation (5) of `docs/method.md`. Of the images of a
+//! viewpoint it is one of equally probable choices: a standing car would see two objects in turn otherwise. And a hit is as rare as a look there is light:
+//! looks from afar would be for what meets by chance, and never against it.
 
 use nalgebra::Vector3;
 use rstar::RTree;
@@ -72,6 +73,7 @@ impl Lookout {
         // Before anything is learned, objects are seen from between their nearest and their farthest vote.
         let distances_m = if class.is_learned { (0.0, class.farthest_m) } else { (f64::INFINITY, 0.0) };
         let scene = model.scene;
+        let has = |part: Part| model.settings.has(part);
         let sectors = Sectors::of(scene, point, voters, distances_m);
         let mut looks: Vec<Look> = Vec::with_capacity(2 * voters.len());
         for &ray in voters {
@@ -80,7 +82,8 @@ impl Lookout {
             if away.norm() > sectors.0[sector].farthest_m {
                 continue;
             }
-            looks.push(Look { sector, image: scene.rays.image[ray as usize], weight: 1.0, is_hit: true });
+            let rate = if has(Part::FarHits) { class.reach.at(away.norm()) } else { 1.0 };
+            looks.push(Look { sector, image: scene.rays.image[ray as usize], weight: 1.0, hit: Some(rate) });
         }
         let hits = images_of(scene, voters);
         let seen_from = Directions::of(scene, point, voters);
@@ -89,31 +92,27 @@ impl Lookout {
                 let hidden = if others.binary_search(&image).is_ok() { HIDDEN_LOOK } else { 1.0 };
                 let view = &scene.views[image as usize];
                 let weight = hidden * rate(class, &seen_from, view, point);
-                looks.push(Look { sector, image, weight, is_hit: false });
+                looks.push(Look { sector, image, weight, hit: None });
             }
         }
         // Images are numbered along the drives: sorted, those of a viewpoint are side by side.
         looks.sort_unstable_by_key(|look| (look.sector, look.image));
         let view = |look: &Look| &scene.views[look.image as usize];
-        let mut ln_turns = 0.0;
+        let mut ln_which = 0.0;
         let mut of_pass = |pass: &[Look]| {
             let mut sum = Looks { expected: 0.0, hits: 0.0 };
             for images in pass.chunk_by(|a, b| view(a).viewpoint == view(b).viewpoint) {
-                let hits = images.iter().filter(|image| image.is_hit).count() as f64;
-                let all: f64 = images.iter().map(|image| image.weight).sum();
-                let most = images.iter().map(|image| image.weight).fold(0.0, f64::max);
-                sum.hits += if hits > 0.0 { most * hits / all } else { 0.0 };
-                sum.expected += most;
-                if hits > 0.0 && hits < all && model.settings.has(Part::Turns) {
-                    ln_turns += ln_choices(all, hits);
-                }
+                let (one, ln_which_images) = of_viewpoint(images, has(Part::Turns));
+                sum.hits += one.hits;
+                sum.expected += one.expected;
+                ln_which += ln_which_images;
             }
             sum
         };
         let mut of_sector =
             |sector: &[Look]| sector.chunk_by(|a, b| view(a).pass == view(b).pass).map(&mut of_pass).collect();
         let sectors = looks.chunk_by(|a, b| a.sector == b.sector).map(&mut of_sector).collect();
-        Seen { sectors, ln_turns }
+        Seen { sectors, ln_which }
     }
 
     /// Tells of objects whether all images in reach of them have only detections among some rays: their votes are counted in full.
@@ -166,7 +165,22 @@ struct Look {
     sector: usize,
     image: u32,
     weight: f64,
-    is_hit: bool,
+    /// If it has a vote, how much rarer than at best these are from so far.
+    hit: Option<f64>,
+}
+
+/// The images of a viewpoint are one look: it, and the logarithm of how probable it is that those of them are hits that are.
+fn of_viewpoint(images: &[Look], has_turns: bool) -> (Looks, f64) {
+    let rates = images.iter().filter_map(|image| image.hit);
+    let hits = rates.clone().count() as f64;
+    let expected = images.iter().map(|image| image.weight).fold(0.0, f64::max);
+    if hits == 0.0 {
+        return (Looks { expected, hits }, 0.0);
+    }
+    let all: f64 = images.iter().map(|image| image.weight).sum();
+    let turns = if has_turns && hits < all { ln_choices(all, hits) } else { 0.0 };
+    let hit = expected * hits / all;
+    (Looks { expected, hits: hit }, hit * rates.map(f64::ln).sum::<f64>() / hits - turns)
 }
 
 /// How many looks at an object the images of some rays are: those that have it in their picture, from where and as far as its class is detected.
@@ -267,6 +281,7 @@ impl Sectors {
 mod tests {
     use super::super::object;
     use super::*;
+    use crate::robust::model::steps::{BINS, Steps};
     use crate::robust::parts::Without;
     use crate::robust::scene::Scene;
     use crate::robust::settings::Settings;
@@ -297,6 +312,30 @@ mod tests {
         let without = Without::named(&["turns".to_owned()]).unwrap_or_default();
         let (one, two) = energies(&Settings { without, ..street::SETTINGS });
         assert!(two < one, "{one} {two}");
+    }
+
+    #[test]
+    fn hits_are_as_rare_as_looks_from_there_are_light() {
+        let at = Vector3::new(60.0, 4.0, 3.0);
+        let mut scene = street::street(51, 1.0, &[at], &[[0.0, 0.0]]);
+        // Two images are one viewpoint.
+        scene.views[16].viewpoint = scene.views[15].viewpoint;
+        let ln_which = |votes: &[u32], rate: f64, settings: &Settings| {
+            let mut model = Model::new(&scene, &street::NOISE, settings);
+            (model.classes[0].is_learned, model.classes[0].farthest_m) = (true, 60.0);
+            let rates = std::array::from_fn(|bin| if bin < BINS / 2 { 1.0 } else { rate });
+            model.classes[0].reach = Steps::even(60.0, rates);
+            Lookout::new(&scene, street::VIABILITY.max_range_m).looks(&model, &at, votes, &[]).ln_which
+        };
+        let price = |votes: &[u32], settings: &Settings| {
+            ln_which(votes, 1.0, &street::SETTINGS) - ln_which(votes, 0.1, settings)
+        };
+        // From less than 20 m, and from 40 to 47 m: eight votes of seven viewpoints.
+        let (near, far): (Vec<u32>, Vec<u32>) = ((32..40).collect(), (2..10).collect());
+        assert!(price(&near, &street::SETTINGS).abs() < 1e-9);
+        assert!((price(&far, &street::SETTINGS) - 7.0 * 10.0_f64.ln()).abs() < 1e-9);
+        let without = Without::named(&["far_hits".to_owned()]).unwrap_or_default();
+        assert!(price(&far, &Settings { without, ..street::SETTINGS }).abs() < 1e-9);
     }
 
     #[test]

@@ -26,8 +26,8 @@ pub struct Looks {
 pub struct Seen {
     /// By sector, and there by pass.
     pub sectors: Vec<Vec<Looks>>,
-    /// Logarithm of how many choices of so many of the images of each viewpoint there are: those with the hits are one of them.
-    pub ln_turns: f64,
+    /// Logarithm of how probable it is that of all looks, and of the images of each, those are the hits that are.
+    pub ln_which: f64,
 }
 
 /// Ghosts have less than this part of the usual hits. An object that is hardly seen has about half of them, and what is false for other reasons any part.
@@ -173,13 +173,13 @@ pub(crate) struct Judged {
     ln_real: f64,
     ln_false: f64,
     ln_ghost: f64,
-    ln_turns: f64,
+    ln_which: f64,
 }
 
 impl Judged {
     /// Logarithm of how probable the looks are at anything, real or not.
     pub(crate) fn ln_likelihood(&self) -> f64 {
-        self.ln_any() - self.ln_turns
+        self.ln_any() + self.ln_which
     }
 
     /// Probability that what has these looks is real rather than false or a ghost.
@@ -230,7 +230,7 @@ impl Seen {
             ln_real: usual + (-FALSE_SHARE).ln_1p() + ln_no_ghost,
             ln_false: falsely + FALSE_SHARE.ln() + ln_no_ghost,
             ln_ghost: ghost + ghosts.ln(),
-            ln_turns: self.ln_turns,
+            ln_which: self.ln_which,
         }
     }
 
@@ -295,7 +295,7 @@ mod tests {
 
     fn seen(sectors: &[&[(f64, f64)]]) -> Seen {
         let pass = |&(hits, expected): &(f64, f64)| Looks { expected, hits };
-        Seen { sectors: sectors.iter().map(|passes| passes.iter().map(pass).collect()).collect(), ln_turns: 0.0 }
+        Seen { sectors: sectors.iter().map(|passes| passes.iter().map(pass).collect()).collect(), ln_which: 0.0 }
     }
 
     fn real(seen: &Seen, between: f64) -> f64 {

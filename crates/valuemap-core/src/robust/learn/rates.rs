@@ -132,7 +132,7 @@ mod tests {
         let sectors = [[20.0, 8.0, 16.0, 12.0, 18.0, 10.0], [0.0, 0.0, 1.0, 0.0, 2.0, 0.0]]
             .map(|hits| hits.into_iter().map(pass).collect())
             .to_vec();
-        anywhere(1, Seen { sectors, ln_turns: 0.0 }, -100.0)
+        anywhere(1, Seen { sectors, ln_which: 0.0 }, -100.0)
     }
 
     #[test]
@@ -147,7 +147,7 @@ mod tests {
     fn few_objects_do_not_tell_that_hardly_any_pass_is_odd() {
         let seen = |hits: f64| {
             let passes = vec![Looks { expected: 20.0, hits }];
-            anywhere(1, Seen { sectors: vec![passes], ln_turns: 0.0 }, -100.0)
+            anywhere(1, Seen { sectors: vec![passes], ln_which: 0.0 }, -100.0)
         };
         let of = |count: usize| -> Vec<Object> { (0..count).map(|i| seen(16.0 + (i % 3) as f64)).collect() };
         let (few, many) = (taught_by(&of(6)), taught_by(&of(600)));
@@ -162,7 +162,7 @@ mod tests {
     fn what_looks_like_an_object_at_times_does_not_tell_how_often_objects_are_seen() {
         let seen = |hits: &[f64]| {
             let passes = hits.iter().map(|&hits| Looks { expected: 40.0, hits }).collect();
-            anywhere(1, Seen { sectors: vec![passes], ln_turns: 0.0 }, -100.0)
+            anywhere(1, Seen { sectors: vec![passes], ln_which: 0.0 }, -100.0)
         };
         let objects = (0..60).map(|i| seen(&[34.0 + f64::from(i % 5), 38.0 - f64::from(i % 3)]));
         let lookalikes = (0..12).map(|i| seen(&[17.0 + f64::from(i % 9), 22.0 - f64::from(i % 7)]));
@@ -178,7 +178,7 @@ mod tests {
     fn objects_that_all_looks_see_have_rates_as_well() {
         let passes = || vec![Looks { expected: 12.0, hits: 12.0 }];
         let objects: Vec<Object> =
-            (0..20).map(|_| anywhere(1, Seen { sectors: vec![passes()], ln_turns: 0.0 }, -100.0)).collect();
+            (0..20).map(|_| anywhere(1, Seen { sectors: vec![passes()], ln_which: 0.0 }, -100.0)).collect();
         let class = taught_by(&objects);
         let Rates { recall, concentration, between } = class.rates;
         assert!(recall > 0.9 && concentration > 1.0 && between >= 0.0, "{:?}", class.rates);
@@ -189,7 +189,7 @@ mod tests {
     fn objects_and_ghosts(objects: usize, ghosts: usize) -> Vec<Object> {
         let seen = |hits: [f64; 4]| {
             let passes = hits.iter().map(|&hits| Looks { expected: 50.0, hits }).collect();
-            anywhere(1, Seen { sectors: vec![passes], ln_turns: 0.0 }, -100.0)
+            anywhere(1, Seen { sectors: vec![passes], ln_which: 0.0 }, -100.0)
         };
         let real = (0..objects).map(|i| i as f64).map(|i| seen([37.0 + i % 5.0, 40.0, 42.0 - i % 4.0, 39.0]));
         let hardly = (0..ghosts).map(|i| i as f64).map(|i| seen([i % 4.0, 2.0 + i % 7.0, i % 3.0, 1.0]));
