@@ -29,7 +29,6 @@ WITHOUT: dict[str, list[str]] = {
         f"position_sigma_m={math.hypot(_GUESS.position_m, _GUESS.position_drift_m)}",
         f"rotation_sigma_deg={math.degrees(math.hypot(_GUESS.rotation_rad, _GUESS.rotation_drift_rad))}",
     ],
-    "existence": ["min_existence=0"],
     **{part: [] for part in robust.PARTS},
 }
 """What is left out, and the settings that leave it out; parts that none does by their names in `valuemap.robust`."""
@@ -54,7 +53,8 @@ def main() -> None:
         print(line(f"without {part}", figures), flush=True)
         if options.field:
             results[-1]["field"] = of_field(options.field, config)
-    write_record(options.json, results)
+    data = "simulated; real under field" if options.field else "simulated"
+    write_record(options.json, results, data=data)
 
 
 def of_field(data_root: Path, config: valuemap.MapConfig) -> dict[str, dict[str, float | None]]:
