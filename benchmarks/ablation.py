@@ -11,10 +11,9 @@ import math
 from pathlib import Path
 from typing import Any
 
+import field
 import valuemap
 from cities import add_up, city, line, measure, prepare
-from field import RUNS, SHOWN
-from field_data import as_it_is
 from machine import write_record
 from valuemap import robust
 from valuemap.robust import Noise
@@ -58,14 +57,9 @@ def main() -> None:
 
 
 def of_field(data_root: Path, config: valuemap.MapConfig) -> dict[str, dict[str, float | None]]:
-    """Return the figures that `field.py` shows of the data that is there, and print them."""
-    figures = {}
-    for name, run in RUNS.items():
-        if (data_root / name).is_dir():
-            total = list(run(data_root / name, config, as_it_is).values())[-1]
-            figures[name] = {figure: total[figure] for figure, *_ in SHOWN[name]}
-            print(" " * 4, name, "  ".join(f"{figure} {value}" for figure, value in figures[name].items()), flush=True)
-    return figures
+    """Return the figures that `field.py` shows of the data that is there."""
+    totals = {name: list(parts.values())[-1] for name, parts in field.run(data_root, config).items()}
+    return {name: {figure: total[figure] for figure, *_ in field.SHOWN[name]} for name, total in totals.items()}
 
 
 if __name__ == "__main__":
