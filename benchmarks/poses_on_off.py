@@ -7,7 +7,8 @@ The simulated cities are those of `fleets.py --small` without a fault: four bloc
 directions, with poses as good as those of a survey. All settings are the defaults.
 
 Where the stage corrects nothing, poses are those that were given, bit for bit, and so is the map: `off` is then not
-made again. With --json, parts that the file has from earlier runs stay.
+made again. With --json, parts that the file has from earlier runs stay; its command and machine are those
+of the last run.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def main() -> None:
         print(f"{name:18} found {results[name]['found']:8} {results[name]['on']}", flush=True)
         if not results[name]["same"]:
             print(f"{'':18}     without   {results[name]['off']}", flush=True)
-        write_record(options.json, dict(sorted(results.items())))
+        write_record(options.json, dict(sorted(results.items())), data="city-...: simulated; all others: real")
 
 
 def _on_and_off(dataset: Dataset, score: Callable[[Map], dict[str, Any]]) -> dict[str, Any]:

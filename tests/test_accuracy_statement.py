@@ -139,6 +139,14 @@ def test_a_mean_error_that_is_unsure_or_small_is_no_shift(errors_m: tuple[float,
     assert not any("shifted" in note for note in evaluate_errors(errors).notes)
 
 
+@pytest.mark.parametrize(("shift_m", "told"), [(0.0049, False), (0.0051, True)])
+def test_a_shift_of_less_than_half_a_centimetre_is_none(shift_m: float, told: bool) -> None:
+    """It would be told as 0.00 m."""
+    errors = np.column_stack([np.full(40, shift_m), np.tile([0.01, -0.01], 20), np.zeros(40)])
+    notes = [note for note in evaluate_errors(errors).notes if "shifted" in note]
+    assert ["0.01 m east" in note for note in notes] == [True] * told
+
+
 def test_stated_sigmas_that_are_too_small_are_told() -> None:
     """Errors of twice the stated sigmas in each direction have squared errors of 4 sigmas², 4 / 1.3863 the median."""
     errors = [[0.4, 0.0, 0.0], [-0.4, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, -0.2, 0.0]]

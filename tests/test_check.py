@@ -679,6 +679,12 @@ def test_headings_that_were_never_filled_are_in_no_unit(one: Dataset) -> None:
 def test_images_of_one_time_have_no_speed(good: Dataset) -> None:
     images = good.images.replace(timestamp_s=np.floor(np.asarray(good.images.timestamp_s)))
     worst_seam(replace(good, images=images), camera_centers(images))
+    drive = one_drive_in_two(good)
+    time_s = np.asarray(drive.images.timestamp_s).copy()
+    time_s[101] = time_s[100]
+    center = camera_centers(drive.images)
+    center[1700:] += [3.0, 2.0, 0.0]
+    assert worst_seam(replace(drive, images=drive.images.replace(timestamp_s=time_s)), center) is not None
 
 
 def test_every_fault_of_the_registry_is_injected() -> None:

@@ -493,7 +493,7 @@ def commands_in_the_docs() -> dict[str, list[str]]:
     """The commands that docs/formats/published_data.md gives for published data, by the folder that they read."""
     text = (Path(__file__).parents[1] / "docs" / "formats" / "published_data.md").read_text(encoding="utf-8")
     blocks = re.findall(r"(?:^    .+\n)+", text, re.MULTILINE)
-    commands = [shlex.split(" ".join(block.split("\n"))) for block in blocks]
+    commands = [shlex.split(line) for block in blocks for line in block.replace("\\\n", " ").splitlines()]
     return {command[3].partition("/")[0]: command for command in commands}
 
 

@@ -148,9 +148,10 @@ def test_a_dataset_made_by_hand_is_checked(dataset: Dataset, message: str) -> No
 
 def test_a_good_dataset_made_by_hand_is_mapped() -> None:
     valuemap.build_map(replace(small_dataset(), truth_detections=None))
-    scaled = small_dataset()
-    long = scaled.images.replace(cam_from_world_quat=scaled.images.cam_from_world_quat * (1.0 + 1e-5))
-    assert len(valuemap.build_map(replace(scaled, images=long)).votes) >= 0
+    made, paper = city().dataset, MapConfig("paper")
+    long = made.images.replace(cam_from_world_quat=made.images.cam_from_world_quat * (1.0 + 1e-5))
+    given, scaled = (valuemap.build_map(each, paper) for each in (made, replace(made, images=long)))
+    assert len(given.votes) == len(scaled.votes) > 0
 
 
 def test_readers_take_texts(tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ def confused_classes(findings: Findings) -> str | None:
         return None
     return (
         f"{100.0 * confused / votes:.1f} % of the votes are detections of another class than their label's: the "
-        "detector takes objects of one class for another (run.json: calibration, confusions)"
+        "detector takes objects of one class for another (calibration.json: confusions)"
     )
 
 

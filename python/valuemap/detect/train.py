@@ -99,7 +99,7 @@ def train(
     if importlib.util.find_spec("torch") is None or importlib.util.find_spec("onnxscript") is None:
         raise ValuemapError(
             "training needs PyTorch and onnxscript, which are not installed",
-            hint="install the extra: pip install 'valuemap[train]', or uv sync --extra train in the repository",
+            hint="install the extra: pip install 'valuemap[train]', or make setup EXTRAS=train in a clone",
         )
     from valuemap.detect.training import Training  # PyTorch is large, slow to import and an extra.
 

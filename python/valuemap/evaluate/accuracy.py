@@ -26,6 +26,8 @@ MAX_BIAS_SHARE = 0.25
 """ASPRS, Edition 2: a mean error beyond this share of the RMSE calls for an explanation."""
 MIN_STANDARD_ERRORS = 3.0
 """A mean error of fewer standard errors may be chance."""
+MIN_BIAS_M = 0.005
+"""A smaller mean error is none in whole centimetres, as it is told."""
 NSSDA_HORIZONTAL = 1.7308
 NSSDA_VERTICAL = 1.9600
 MIN_CIRCULARITY = 0.6
@@ -110,7 +112,7 @@ class PositionalAccuracy:
             (self.bias_up_m, self.sigma_up_m, self.rmse_up_m, ("up", "down")),
         ):
             is_sure = abs(bias) > MIN_STANDARD_ERRORS * sigma / math.sqrt(self.check_points)
-            if is_sure and abs(bias) > MAX_BIAS_SHARE * rmse:
+            if is_sure and abs(bias) > MAX_BIAS_SHARE * rmse and abs(bias) >= MIN_BIAS_M:
                 told.append(f"{abs(bias):.2f} m {names[bias < 0.0]}")
         if not told:
             return None
