@@ -22,7 +22,7 @@ from valuemap.refine import Mapped, gather_images
 from valuemap.refine.images import Bundle
 from valuemap.refine.middles import Contrasts, Middles
 from valuemap.simulate import simulate
-from valuemap.tables import Floats, covariance_matrices
+from valuemap.tables import Bools, Floats, covariance_matrices
 from valuemap.tiles.source import InMemory
 
 refine_middles = importlib.import_module("valuemap.refine.middles")
@@ -113,14 +113,40 @@ def test_how_far_an_object_disagrees_is_judged_by_all_others() -> None:
         assert chance == pytest.approx(scipy.stats.chi2.sf(square, own.sum()), rel=1e-6, abs=1e-12)
 
 
-def test_sides_of_few_votes_and_objects_of_one_side_tell_nothing() -> None:
-    label = np.array([7, 3, 7, 3, 5, 9, 9])
-    thing = np.repeat(np.arange(len(label)), [4, 6, 5, 4, 9, 3, 8])
-    told = SimpleNamespace(label=label, seen=SimpleNamespace(thing=thing))
-    assert [things.tolist() for things in refine_middles._sides(cast(Bundle, told))] == [[1, 3], [0, 2]]
+def test_objects_of_one_side_tell_nothing() -> None:
+    told = SimpleNamespace(label=np.array([7, 3, 7, 3, 5, 9, 9]))
+    assert [things.tolist() for things in refine_middles._sides(cast(Bundle, told))] == [[1, 3], [0, 2], [5, 6]]
 
 
-@pytest.mark.parametrize(("objects", "asked"), [(0, 0), (3, 3), (200, 200), (201, 101), (1000, 200)])
+def with_tie(points: list[Floats], covariance_m2: Floats, tie_m: float, unknown: Bools) -> Contrasts:
+    """Return contrasts as they are with middles that are thought to be off by so much; axes `unknown` are not seen."""
+    given = Contrasts.of_sides(points, covariance_m2)
+    seen = np.diag((~unknown).astype(np.float64))
+    information = seen @ np.linalg.inv(given.covariance_m2) @ seen
+    covariance = np.asarray(np.linalg.inv(information + np.eye(len(unknown)) / tie_m**2), np.float64)
+    return replace(given, apart_m=covariance @ information @ given.apart_m, covariance_m2=covariance)
+
+
+def test_what_sides_disagree_by_does_not_depend_on_what_they_were_tied_by() -> None:
+    points, covariance_m2 = sides(0.2)
+    given, all_seen = Contrasts.of_sides(points, covariance_m2), np.zeros(120, np.bool_)
+    untied = with_tie(points, covariance_m2, 0.5, all_seen).untied(0.5)
+    assert untied.apart_m == pytest.approx(given.apart_m, abs=1e-6)
+    assert untied.covariance_m2 == pytest.approx(given.covariance_m2, abs=1e-6)
+
+
+def test_what_no_vote_tells_of_sides_is_no_agreement() -> None:
+    """As far as it is not seen where sides are, ties alone keep them together."""
+    unknown = np.arange(120) % 3 != 0
+    tied = with_tie(*sides(0.2, seed=1), 0.5, unknown)
+    told = tied.untied(0.5).middles(MOST_M)
+    assert told is not None
+    assert told.off_m == pytest.approx(0.2, rel=0.35)
+    as_if_seen = tied.middles(MOST_M)
+    assert as_if_seen is None or as_if_seen.off_m < 0.1
+
+
+@pytest.mark.parametrize(("objects", "asked"), [(0, 0), (3, 3), (100, 100), (101, 51), (1000, 100)])
 def test_no_more_objects_are_asked_than_tell_it(objects: int, asked: int) -> None:
     sides = [np.array([number]) for number in range(objects)]
     chosen = np.array([int(things[0]) for things in refine_middles._asked(sides)])
@@ -181,6 +207,13 @@ def test_middles_that_are_smaller_than_the_drift_are_in_the_map_and_its_calibrat
     run = valuemap.build_map(mapped[0], MapConfig(correct_poses=0)).run
     side_m = run["calibration"]["noise"]["side_m"]
     assert run["counts"]["noise"]["side_m"] == side_m == pytest.approx(0.2, rel=0.3)
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.2])
+def test_sides_of_one_or_two_votes_tell_middles_together(off_m: float) -> None:
+    lamps = replace(CITY, has_lights=0, lamp_spacing_m=12.0, side_offset_m=off_m, frame_spacing_m=8.0)
+    city = simulate(replace(lamps, recall_mean=0.4, position_drift_m=0.05, **SHORT_STREETS), seed=1)
+    assert told(city) == pytest.approx(off_m, rel=0.4)
 
 
 def test_drift_is_not_taken_for_middles() -> None:

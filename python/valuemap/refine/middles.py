@@ -20,11 +20,9 @@ from valuemap.refine.poses import one_blas_thread
 from valuemap.robust import Noise
 from valuemap.tables import Bools, Floats, Ints, Labels, Votes
 
-_LEAST_VOTES = 4
-"""Sides of fewer votes do not say where they would put an object alone, as in the core."""
 _LEAST_OBJECTS = 5
 """Fewer objects of several sides do not tell what sides show, as in the core."""
-_MOST_OBJECTS = 200
+_MOST_OBJECTS = 100
 """Objects that are asked, at most about: they tell it to a twentieth, and how all disagree is one dense matrix."""
 _CERTAIN = 9.0
 """Middles are there where twice the logarithm of the likelihood gains more: chance has it in one case of a thousand."""
@@ -38,6 +36,8 @@ _LEAST_SHARE = 1e-3
 """Middles are sought down to this share of the most: less is an error of the detector, if it is one."""
 _VALUES = 60
 """Values between that and the most, at which the likelihood is compared: they differ by an eighth."""
+_UNKNOWN = 10.0
+"""What is known to so many times the most that middles are off by says nothing of them."""
 _ROUNDS = 10
 """Rounds in which objects are taken in and left out, at most: three or four do."""
 
@@ -59,21 +59,24 @@ def middles(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> Mi
     size_m = size_m[size_m > 0.0]
     if not len(size_m):  # Middles are those of boxes.
         return None
-    told = bundle(images, labels, votes, replace(noise, side_m=0.0), by_side=True)
+    most_m = _MOST_SHARE * float(np.median(size_m))
+    # One vote does not say where it would put an object. So sides are placed with middles that are off by the most.
+    # That is taken out of what is known of them then.
+    told = bundle(images, labels, votes, replace(noise, side_m=most_m))
+    told = replace(told, ties=replace(told.ties, total=np.inf))
     sides = _asked(_sides(told))
     if len(sides) < _LEAST_OBJECTS:
         return None
     point_m, covariance_m2 = told.placed(np.concatenate(sides)[None])
     with one_blas_thread():
         contrasts = Contrasts.of_sides([point_m[things] for things in sides], covariance_m2[0])
-        return contrasts.middles(_MOST_SHARE * float(np.median(size_m)))
+        return contrasts.untied(most_m).middles(most_m)
 
 
 def _sides(told: Bundle) -> list[Ints]:
-    """Return the things that have enough votes, label by label, of those labels that have several."""
-    known = np.flatnonzero(np.bincount(told.seen.thing, minlength=len(told.label)) >= _LEAST_VOTES)
-    known = known[np.argsort(told.label[known], kind="stable")]
-    of_labels = np.split(known, np.flatnonzero(np.diff(told.label[known])) + 1)
+    """Return the things that are sides, label by label, of those labels that have several."""
+    things = np.argsort(told.label, kind="stable")
+    of_labels = np.split(things, np.flatnonzero(np.diff(told.label[things])) + 1)
     return [things for things in of_labels if len(things) > 1]
 
 
@@ -109,6 +112,17 @@ class Contrasts:
         return cls(
             np.concatenate(apart), by @ covariance_m2 @ by.T, np.repeat(np.arange(len(apart)), list(map(len, apart)))
         )
+
+    def untied(self, tie_m: float) -> Contrasts:
+        """Return what these are without middles that were thought to be off by `tie_m`.
+
+        What is not known otherwise is known to ten times of that, so that it says nothing of less.
+        """
+        precision = np.linalg.inv(self.covariance_m2)
+        pull = precision @ self.apart_m
+        own, axes = scipy.linalg.eigh(precision - np.eye(len(pull)) / tie_m**2)
+        covariance_m2 = (axes / np.maximum(own, 1.0 / (_UNKNOWN * tie_m) ** 2)) @ axes.T
+        return replace(self, apart_m=covariance_m2 @ pull, covariance_m2=covariance_m2)
 
     def middles(self, most_m: float) -> Middles | None:
         """Return what middles are off by, m, less than the most; None where nothing tells that they are.
