@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,9 @@ import pyarrow as pa
 import pytest
 from scipy.spatial.transform import Rotation
 
+from scenes import as_dataset, random_scene
 from valuemap.config import SimulationConfig
-from valuemap.drives import Drives, find_drives
+from valuemap.drives import Drives, are_dates, find_drives, in_driving_order
 from valuemap.simulate import simulate
 from valuemap.tables import Categories, Floats, Images, Ints
 
@@ -73,12 +75,6 @@ def same(a: Drives, b: Drives) -> bool:
     )
 
 
-def of_rows(drives: Drives, rows: Ints) -> Drives:
-    return Drives(
-        drives.pass_code[rows], drives.order[rows], drives.driven_m[rows], drives.viewpoint[rows], drives.record
-    )
-
-
 def shuffled(images: Images, seed: int) -> tuple[Images, Ints]:
     """Return the same images in another order, with other ids of images and cameras and other names of passes."""
     random = np.random.default_rng(seed)
@@ -112,6 +108,28 @@ def test_times_tell_the_order_and_pauses_and_jumps_end_a_drive() -> None:
     assert found.order.tolist() == [*range(20)] * 3
     assert found.record["cut_at"] == {"pauses": 1, "jumps": 1}
     assert found.record["images_ordered_by"] == {"time": 60}
+
+
+def test_images_without_a_time_make_no_date_of_the_times_of_others() -> None:
+    time = np.arange(60.0)
+    time[20:40] = np.nan
+    images = posed(street(60), time_s=time)
+    assert not are_dates(images).any()
+    assert find_drives(images).record["images_ordered_by"] == {"time": 40, "chain": 20}
+    assert are_dates(images.replace(timestamp_s=np.where(np.isnan(time), 7e4, time))).all()
+
+
+def test_of_one_box_the_class_and_then_the_score_come_first_and_ids_say_nothing() -> None:
+    dataset = as_dataset(random_scene(3, images=6, objects=4, clutter=12))
+    detections, count = dataset.detections, len(dataset.detections)
+    names, score = ["sign"] * count + ["light"] * 2 * count, np.repeat([0.5, 0.9, 0.6], count)
+    thrice = detections.take(np.tile(np.arange(count), 3)).replace(class_name=Categories.from_texts(names), score=score)
+    for seed in range(2):
+        rows = np.random.default_rng(seed).permutation(3 * count)
+        mixed = replace(dataset, detections=thrice.take(rows).replace(detection_id=np.arange(3 * count)))
+        found = in_driving_order(mixed).dataset.detections
+        assert found.class_name.texts() == ["light", "light", "sign"] * count
+        assert found.score.tolist() == [0.6, 0.9, 0.5] * count
 
 
 def test_a_red_light_and_a_stretch_without_images_end_no_drive() -> None:
@@ -300,7 +318,7 @@ def test_ids_rows_and_names_of_passes_mean_nothing(kind: str, seed: int) -> None
         if kind == "one pass":
             images = images.replace(pass_id=Categories.from_texts(["all"] * len(images)))
     mixed, rows = shuffled(images, seed)
-    assert same(find_drives(mixed), of_rows(find_drives(images), rows))
+    assert same(find_drives(mixed), find_drives(images).take(rows))
 
 
 def test_a_city_has_the_passes_that_were_driven() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -18,6 +19,7 @@ import valuemap._core as _core
 from literal import Pinhole, Sighting
 from scenes import Scene, as_dataset, random_scene
 from told import Told
+from valuemap import pipeline
 from valuemap.calibration import calibrate
 from valuemap.cameras import cast_rays
 from valuemap.config import NoiseConfig
@@ -31,6 +33,10 @@ from valuemap.tiles.compare import compare_poses
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.seams import join_cells
 from valuemap.tiles.source import InMemory
+from valuemap.tiles.work import open_work
+
+# Nothing is estimated, and poses stay.
+KNOWN = valuemap.MapConfig(detection_sigma_px=1.5, position_sigma_m=0.05, rotation_sigma_deg=0.05, correct_poses=0)
 
 
 def street(seed: int = 7) -> Dataset:
@@ -291,3 +297,44 @@ def test_covariance_is_that_of_the_scatter(method: Literal["robust", "paper"]) -
     whitened = np.linalg.inv(np.linalg.cholesky(expected)) @ np.cov(np.array(points).T)
     whitened = whitened @ np.linalg.inv(np.linalg.cholesky(expected)).T
     np.testing.assert_allclose(np.linalg.eigvalsh(whitened), 1.0, atol=0.35)
+
+
+def test_what_is_cut_on_disk_is_read_once_and_has_the_notes_of_what_is_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = street()
+    uncertain = dataset.detections.replace(vertical_sigma_px=np.full(len(dataset.detections), 5.0))
+    valuemap.write_dataset(dataclasses.replace(dataset, detections=uncertain), tmp_path / "data")
+    reads: list[Path] = []
+
+    def read(folder: Path) -> Dataset:
+        reads.append(folder)
+        return valuemap.read_dataset(folder)
+
+    monkeypatch.setattr(pipeline, "read_dataset", read)
+    results = []
+    for tile_size_m in (None, 500.0):
+        with open_work(tmp_path / f"work{tile_size_m}", resume=False) as work:
+            run = pipeline.Run(work, ThreadEngine(1), tile_size_m=tile_size_m)
+            results.append(pipeline.build_map_of_folder(tmp_path / "data", KNOWN, run)[0])
+    assert len(reads) == 2
+    assert "vertical_sigma_px" in results[0].run["notes"][0]
+    assert results[0].run["notes"] == results[1].run["notes"]
+    assert results[1].rejected is not None
+
+
+def test_it_is_said_where_a_rolling_shutter_is_not_corrected_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = street()
+    monkeypatch.setattr(pipeline, "MOST_LOOKED_AT", 10)
+    told = []
+    for readout_s in (0.03, 0.0):
+        cameras = dataset.cameras.replace(readout_s=np.full(len(dataset.cameras), readout_s))
+        valuemap.write_dataset(dataclasses.replace(dataset, cameras=cameras), tmp_path / f"{readout_s}")
+        for tile_size_m in (None, 500.0):
+            with open_work(tmp_path / "work", resume=False) as work:
+                run = pipeline.Run(work, ThreadEngine(1), tile_size_m=tile_size_m)
+                result, _ = pipeline.build_map_of_folder(tmp_path / f"{readout_s}", KNOWN, run)
+            told.append([note for note in result.run["notes"] if "readout" in note])
+    assert list(map(len, told)) == [0, 1, 0, 0]

@@ -71,7 +71,7 @@ def test_coarse_boxes_are_seen_through_a_wider_gate(monkeypatch: pytest.MonkeyPa
     moved_px = detections.center_px + random.normal(0.0, 10.0, detections.center_px.shape)
     coarse = dataclasses.replace(city(2), detections=detections.replace(center_px=moved_px))
     assert usual_m(coarse) == pytest.approx(usual_m(city(2)), rel=0.4)
-    monkeypatch.setattr(reach, "_GATES", (1.0,))
+    monkeypatch.setattr(reach, "GATES", (1.0,))
     assert usual_m(coarse) is None
 
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,13 @@ from scipy.spatial.transform import Rotation
 import laws
 import valuemap
 from block import SHORT_STREETS
+from test_drives import posed
 from test_simulate import EXACT_BOXES, EXACT_POSES
 from valuemap import camera_models, correction, pipeline
 from valuemap.calibration import with_sides
 from valuemap.cameras import camera_poses, cast_rays
 from valuemap.config import MapConfig, SimulationConfig
-from valuemap.dataset import Dataset, ensure_checked, rows_of, write_dataset
+from valuemap.dataset import Dataset, Frame, ensure_checked, rows_of, write_dataset
 from valuemap.drives import Drives, InOrder, find_drives, in_driving_order
 from valuemap.engine.threads import ThreadEngine
 from valuemap.progress import silent
@@ -37,8 +39,8 @@ from valuemap.refine import images as refine_images
 from valuemap.refine import select as refine_select
 from valuemap.refine.adjust import Adjustment, Scales, Ties
 from valuemap.refine.alias import without_aliases
-from valuemap.refine.delay import _is_gain, delay_alone
-from valuemap.refine.estimate import Estimate, cut_into_segments, mounts_alone, prices
+from valuemap.refine.delay import _gate_px, _is_gain, delay_alone
+from valuemap.refine.estimate import WIDE, Estimate, Noise, cut_into_segments, mounts_alone, own_scales, prices
 from valuemap.refine.footage import (
     Footage,
     Rates,
@@ -51,15 +53,16 @@ from valuemap.refine.footage import (
 )
 from valuemap.refine.jumps import Links, Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
-from valuemap.refine.register import register
+from valuemap.refine.register import _order_of_laying, register
 from valuemap.refine.residuals import MOUNT, OFFSET, Observations, State, residuals, rotations, weights
-from valuemap.refine.select import Selected, _Equations, _Trial
+from valuemap.refine.select import Selected, _Equations, _Trial, chance_of_gain
+from valuemap.refine.ties import tie
 from valuemap.refine.tracks import merge_objects
 from valuemap.remote import Place
 from valuemap.robust import calibration_from_json
 from valuemap.simulate import simulate
 from valuemap.stages import Stages
-from valuemap.tables import Bools, Floats, Images, Ints, covariance_matrices
+from valuemap.tables import Bools, Detections, Floats, Images, Ints, covariance_matrices
 from valuemap.tiles.compare import Comparison
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.solve import Solved
@@ -766,6 +769,19 @@ def test_short_drives_have_the_offset_of_the_one_they_go_on_from() -> None:
     assert np.linalg.norm(off[short[drives.pass_code]], axis=1).max() < 0.6
 
 
+@pytest.mark.parametrize("is_dated", [False, True])
+def test_drives_go_on_from_each_other_by_times_but_not_by_dates(is_dated: bool) -> None:
+    images = posed(np.zeros((40, 2)), time_s=np.full(40, 7e4) if is_dated else 0.2 * np.arange(40.0))
+    drive = np.repeat([0, 1], 20)
+    drives = Drives(drive, np.arange(40), np.zeros(40), np.arange(40), {})
+    whole = SimpleNamespace(images=images)
+    footage: Any = SimpleNamespace(whole=whole, drives=drives, whole_drives=drives)
+    # The first sees ten objects, the second one of them.
+    seen: Any = SimpleNamespace(drive=np.repeat([0, 1], [10, 1]), thing=np.append(np.arange(10), 0))
+    ties = tie(footage, Segments(np.array([0, 1]), np.zeros(2, np.int64)), seen)
+    assert ties.vehicle.tolist() == ties.segment.tolist() == ([0, 1] if is_dated else [0, 0])
+
+
 def test_cells_on_disk_get_the_poses_that_were_corrected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     faulty, result = map_of_shifted_city()
     write_dataset(faulty, tmp_path / "data")
@@ -979,6 +995,20 @@ def test_constellations_tell_how_drives_lie_to_each_other() -> None:
     total = found.shift_m.reshape(6, 20, 3) + shift[:, None]
     assert np.abs(total - total.mean(axis=(0, 1))).max() < 1.0
     assert len(np.unique(found.object_of_landmark)) == 20
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_drives_are_laid_after_those_that_they_meet_most_of(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    point, drive = random.uniform(0.0, 40.0, (60, 3)), np.sort(random.integers(0, 8, 60))
+    rows = [np.flatnonzero(drive == number) for number in np.unique(drive)]
+    near = np.linalg.norm(point[:, None] - point, axis=2) <= 6.0
+    known: list[int] = []
+    while len(known) < len(rows):
+        met = [len(of) * sum(bool(near[np.ix_(of, rows[k])].any()) for k in known) for of in rows]
+        left = [number for number in range(len(rows)) if number not in known]
+        known.append(max(left, key=lambda i: (met[i], len(rows[i]), -i)))
+    assert _order_of_laying(point, rows) == known
 
 
 def test_two_vague_landmarks_that_another_shift_fits_make_no_jump() -> None:
@@ -1228,6 +1258,19 @@ def test_jumps_are_taken_back_one_after_the_other_and_links_say_the_same() -> No
     assert len(jumps.links(jumps.segments, refuted).second) == len(links.second) - 1
 
 
+@pytest.mark.parametrize("jumps", [(9,), (5, 12), (5, 10, 15)])
+def test_of_a_drive_that_jumps_in_more_than_one_of_ten_steps_no_jump_is_proven(jumps: tuple[int, ...]) -> None:
+    place = np.column_stack([2.0 * np.arange(20), np.zeros(20)])
+    place += np.random.default_rng(0).normal(0.0, 0.01, place.shape)
+    for row in jumps:
+        place[row:, 1] += 2.0
+    images = posed(place, time_s=0.2 * np.arange(20.0))
+    drives = Drives(np.zeros(20, np.int64), np.arange(20), 2.0 * np.arange(20.0), np.arange(20), {})
+    cameras = city().cameras
+    found = mend(Dataset("drive", Frame(), cameras, images, Detections.none()), drives)
+    assert found.begins.tolist() == (list(jumps) if len(jumps) <= 0.1 * 17 else [])
+
+
 def few_observations() -> tuple[Observations, State, Footage]:
     """Return what some drives see of a few objects, with all kinds of errors somewhat wrong, and the footage."""
     ordered = in_driving_order(city(pass_shift_m=0.3, focal_error_share=0.01), viewpoint_step_m=1.0)
@@ -1249,6 +1292,23 @@ def few_observations() -> tuple[Observations, State, Footage]:
     constants[OFFSET][:] = random.normal(0.0, 0.3, constants[OFFSET].shape)
     drift = random.normal(0.0, 0.01, state.drift.shape) * [1, 1, 1, 0, 0, 0]
     return seen, dataclasses.replace(state, constants=constants, drift=drift), footage
+
+
+def test_a_detection_without_a_ray_says_nothing_of_how_far_others_move() -> None:
+    *_, footage = few_observations()
+    from_cam = footage.residual_from_cam.copy()
+    from_cam[7] = np.nan
+    without = dataclasses.replace(footage, residual_from_cam=from_cam)
+    assert own_scales(without, Noise(), WIDE).own_rad == pytest.approx(own_scales(footage, Noise(), WIDE).own_rad, 1e-3)
+    narrow = MapConfig(max_reprojection_error_px=0.01)
+    assert _gate_px(without, narrow) == pytest.approx(_gate_px(footage, narrow), 1e-3) != 0.01
+    from_cam[:] = np.nan
+    assert _gate_px(dataclasses.replace(footage, residual_from_cam=from_cam), narrow) == 0.01
+
+
+@pytest.mark.parametrize(("gain", "is_luck"), [(0.0, True), (-1.0, True), (1.0, False)])
+def test_what_all_objects_gain_alike_is_luck_unless_it_is_more_than_nothing(gain: float, is_luck: bool) -> None:
+    assert chance_of_gain(np.full(20, gain)) == pytest.approx(1.0 if is_luck else 0.0, abs=1e-4)
 
 
 def test_a_step_is_that_of_all_unknowns_in_one_matrix(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from report_city import city, write_city
 from valuemap import rejected
 from valuemap.cli.commands import app
 from valuemap.config import MapConfig
+from valuemap.dataset import rows_of
 from valuemap.evidence import Evidence
 from valuemap.map_folder import read_map, write_map
 from valuemap.rejected import figures_in_words, find_rejected, rejected_of_map
@@ -104,6 +105,30 @@ def test_a_place_is_answered_as_the_whole_map_is() -> None:
     assert len(here) <= len(whole)
     assert here.reason.texts()[at(here, point)] == whole.reason.texts()[at(whole, point)] == "existence"
     assert len(find_rejected(evidence, point + [9e3, 0.0, 0.0])) == 0
+
+
+def test_numbers_of_images_and_detections_say_nothing_of_what_was_rejected() -> None:
+    evidence, *_ = without_its_best_label()
+    dataset, result = evidence.dataset, evidence.result
+    images, detections, votes = dataset.images, dataset.detections, result.votes
+    random = np.random.default_rng(1)
+    image_id, detection_id = random.permutation(len(images)), random.permutation(len(detections))
+    image_of = image_id[rows_of(detections.image_id, images.image_id)]
+    renumbered = replace(
+        dataset,
+        images=images.replace(image_id=image_id).by_key(),
+        detections=detections.replace(detection_id=detection_id, image_id=image_of).by_key(),
+        truth_detections=None,
+    )
+    votes = votes.replace(
+        detection_id=detection_id[rows_of(votes.detection_id, detections.detection_id)],
+        image_id=image_id[rows_of(votes.image_id, images.image_id)],
+    )
+    before, after = find_rejected(evidence), find_rejected(Evidence(replace(result, votes=votes), renumbered))
+    assert len(before) > 5
+    assert np.array_equal(before.position_in_world_m, after.position_in_world_m)
+    assert np.array_equal(before.votes, after.votes)
+    assert before.reason.texts() == after.reason.texts()
 
 
 def test_what_is_kept_is_bounded_and_has_most_votes_first(monkeypatch: pytest.MonkeyPatch) -> None:

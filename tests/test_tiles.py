@@ -573,6 +573,23 @@ def test_pieces_on_disk_are_those_in_memory(long_street: Path, tmp_path: Path, m
     assert np.array_equal(on_disk.sample().detection_id, in_memory.sample().detection_id)
 
 
+@pytest.mark.parametrize("lights_first", [True, False])
+def test_boxes_of_two_classes_are_in_one_order_on_disk_and_in_memory(lights_first: bool, tmp_path: Path) -> None:
+    dataset = streets(0.0)
+    detections, count = dataset.detections, len(dataset.detections)
+    names = ["light"] * count + ["sign"] * count
+    ids = np.concatenate([2 * np.arange(count) + 1 - lights_first, 2 * np.arange(count) + lights_first])
+    twice = detections.take(np.tile(np.arange(count), 2))
+    twice = twice.replace(class_name=Categories.from_texts(names), detection_id=ids).by_key()
+    valuemap.write_dataset(replace(dataset, detections=twice), tmp_path / "data")
+    with open_work(tmp_path / "work", resume=False) as work:
+        on_disk = partition_dataset(tmp_path / "data", work, KNOWN).piece(WHOLE)
+    in_memory = InMemory(valuemap.read_dataset(tmp_path / "data"), KNOWN).piece(WHOLE)
+    assert in_memory.dataset.detections.class_name.texts() == ["light", "sign"] * count
+    assert on_disk.dataset.detections.class_name.texts() == ["light", "sign"] * count
+    assert np.array_equal(on_disk.detection_id, in_memory.detection_id)
+
+
 PLAIN: dict[str, float] = {"block_east_m": 300.0, "shuffle_ids": 1}
 
 
@@ -585,6 +602,7 @@ PLAIN: dict[str, float] = {"block_east_m": 300.0, "shuffle_ids": 1}
         ({"cameras": 2, "write_rigs": 1, "some untimed": 1}, 1),
         ({"write_timestamps": 0}, 1),
         ({"some untimed": 1}, 3),
+        ({"some of a pass untimed": 1}, 3),
         ({"some dated": 1}, 3),
     ],
 )
@@ -599,6 +617,11 @@ def test_drives_are_the_same_batch_by_batch(
     if "some untimed" in changes:
         assert time_s is not None
         dataset = replace(dataset, images=images.replace(timestamp_s=np.where(chosen, np.nan, time_s)))
+    if "some of a pass untimed" in changes:
+        assert time_s is not None
+        time_s = time_s.copy()
+        time_s[np.flatnonzero(images.pass_id.codes == 0)[10:40]] = np.nan
+        dataset = replace(dataset, images=images.replace(timestamp_s=time_s))
     if "some dated" in changes:
         assert time_s is not None
         dataset = replace(dataset, images=images.replace(timestamp_s=np.where(chosen, 7e4, time_s)))

@@ -24,6 +24,7 @@ from still_poses import nothing_found
 from valuemap import correction, map_folder, pipeline, portions
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.cli.commands import app
+from valuemap.control import labels_before_control
 from valuemap.dataset import Dataset, ensure_checked, rows_of, write_dataset_in_pieces
 from valuemap.drives import find_drives
 from valuemap.errors import InputError, OutputError
@@ -735,6 +736,32 @@ def test_an_update_is_one_run_where_poses_are_corrected(tmp_path: Path, monkeypa
     # What it is compared with is where the corrected poses put it.
     changes = read_table(Changes, tmp_path / "map2" / "changes.parquet")
     assert changes.change.texts() == ["unchanged"] * len(STAYS)
+
+
+def test_a_map_that_control_points_moved_is_compared_where_its_dataset_is(years: Path, tmp_path: Path) -> None:
+    truth = np.array([np.add(each, [start, 0.0, 0.0]) for start in (0.0, FAR_M) for each in STAYS])
+    turn, middle = np.radians(0.05), truth.mean(axis=0)
+    rotation = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    points = (truth - middle) @ rotation.T + middle + [1.0, 0.6, 0.2]
+    lines = [",".join(f"{value:.4f}" for value in point) for point in points]
+    (tmp_path / "points.csv").write_text("\n".join(["x,y,z", *lines]) + "\n")
+    control = ("--control", tmp_path / "points.csv", *(f"--set={each}" for each in SET))
+    run("map", years / "first", "--out", tmp_path / "map", *control)
+    moved, plain = valuemap.read_map(tmp_path / "map"), valuemap.read_map(years / "map")
+    assert moved.run["control"]["turn_deg"] != 0.0
+    back = labels_before_control(moved)
+    for name in ("position_in_world_m", "facing_azimuth_rad"):
+        assert getattr(back, name) == pytest.approx(getattr(plain.labels, name), abs=1e-3)
+    run("update", tmp_path / "map", "--add", years / "second", "--out", tmp_path / "map2")
+    assert "control points" in valuemap.read_map(tmp_path / "map2").run["notes"][0]
+    ours, theirs = (read_table(Changes, folder / "map2" / "changes.parquet") for folder in (tmp_path, years))
+    assert ours.change.texts() == theirs.change.texts()
+    assert ours.position_in_world_m == pytest.approx(theirs.position_in_world_m, abs=1e-3)
+    assert ours.from_m == pytest.approx(theirs.from_m, abs=1e-3, nan_ok=True)
+    # Where the dataset was moved too, the map is where it is.
+    as_it_is, is_put_back = update._in_frame_of(moved, moved)
+    assert as_it_is.labels is moved.labels
+    assert not is_put_back
 
 
 def test_joined_dataset_need_not_be_checked_again(years: Path) -> None:

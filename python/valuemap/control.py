@@ -30,8 +30,11 @@ _USUAL_M = 3.0
 _FIRST_SPREAD_M = 0.5
 """What labels and points disagree by, each axis, before anything is known."""
 _CLUTTER = 0.02
+"""What a point with no label in its place counts, where one with a label exactly there counts one more."""
 _GATE = 3.5
+"""A label farther from a point than so many sigmas is not that of the point."""
 _HUBER = 2.0
+"""What points and labels disagree by beyond so many sigmas weighs less, in inverse proportion."""
 _LEAST_POINTS = 3
 _LEAST_FOR_ROTATION = 6
 _TURN_PRICE = 10.0
@@ -128,16 +131,8 @@ def apply_control(result: Map, points: TrueObjects, dataset: Dataset | None = No
     found = find_georeference(result, points)
     proof = leave_out(result, points, found)
     axes = result.frame.east_north_up()
-    labels = result.labels
-    place = labels.position_in_world_m @ axes.T
-    moved = _moved(place, found) @ axes
-    anchor = result.frame.anchor
-    labels = labels.replace(
-        position_in_world_m=moved,
-        absolute_covariance_m2=_absolute(labels, place, found, axes),
-        facing_azimuth_rad=(labels.facing_azimuth_rad - found.turn_rad) % (2.0 * np.pi),
-        lon_lat_height=None if anchor is None else lon_lat_height_from_enu(moved, anchor),
-    )
+    place = result.labels.position_in_world_m @ axes.T
+    labels = _moved_labels(result, found).replace(absolute_covariance_m2=_absolute(result.labels, place, found, axes))
     rejected = result.rejected
     if rejected is not None:
         rejected = rejected.replace(position_in_world_m=_moved(rejected.position_in_world_m @ axes.T, found) @ axes)
@@ -145,6 +140,16 @@ def apply_control(result: Map, points: TrueObjects, dataset: Dataset | None = No
     if dataset is not None:
         dataset = _moved_dataset(dataset, found, axes)
     return replace(result, labels=labels, run=run, rejected=rejected), dataset
+
+
+def labels_before_control(result: Map) -> Labels:
+    """Return the labels of a map that was moved to control points where they were before, as `run["control"]` says."""
+    told = result.run["control"]
+    shift = np.array(told["shift_east_north_up_m"])
+    pivot = result.frame.east_north_up() @ np.array(told["pivot_m"])
+    none = np.full(int(told["points"]), -1)
+    back = Georeference(-shift, -math.radians(told["turn_deg"]), pivot + shift, np.zeros((4, 4)), none, 0.0)
+    return _moved_labels(result, back).replace(absolute_covariance_m2=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,6 +248,17 @@ def _moved(place_m: Floats, found: Georeference) -> Floats:
     cos, sin = math.cos(found.turn_rad), math.sin(found.turn_rad)
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     return np.asarray((place_m - found.pivot_m) @ turn.T + found.pivot_m + found.shift_m)
+
+
+def _moved_labels(result: Map, found: Georeference) -> Labels:
+    """Return the labels of a map turned and shifted."""
+    labels, axes, anchor = result.labels, result.frame.east_north_up(), result.frame.anchor
+    moved = _moved(labels.position_in_world_m @ axes.T, found) @ axes
+    return labels.replace(
+        position_in_world_m=moved,
+        facing_azimuth_rad=(labels.facing_azimuth_rad - found.turn_rad) % (2.0 * np.pi),
+        lon_lat_height=None if anchor is None else lon_lat_height_from_enu(moved, anchor),
+    )
 
 
 def _match(labels: _Labels, points: _Points, point: Ints, label: Ints, found: Georeference, used: int) -> Ints:

@@ -28,7 +28,7 @@ import valuemap._core as _core
 from valuemap.arrow import no_texts, take_texts
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.dataset import Dataset, rows_of
-from valuemap.tables import Bools, Floats, Images, Ints
+from valuemap.tables import Bools, Detections, Floats, Images, Ints
 
 _MOST_CAMERAS = 16
 """More images of one camera and pass with one time than this are no rig: the time is a date, and tells no order."""
@@ -95,6 +95,10 @@ class Drives:
     def count(self) -> int:
         """The number of drives."""
         return int(self.pass_code.max(initial=-1)) + 1
+
+    def take(self, rows: Ints | Bools) -> Drives:
+        """Return what some images have, by their rows or by a mask; drives and viewpoints keep their numbers."""
+        return Drives(self.pass_code[rows], self.order[rows], self.driven_m[rows], self.viewpoint[rows], self.record)
 
 
 def find_drives(images: Images, *, viewpoint_step_m: float = 1.0) -> Drives:
@@ -276,7 +280,8 @@ class _Shots:
 def _is_a_date(images: Images, time_s: Floats) -> Bools:
     """Return the images (N) of passes that have many images of one camera at one time."""
     order = np.argsort(time_s, kind="stable")
-    same = np.concatenate([_equal_to_next(time_s[order]), [False]])[: len(order)]
+    ordered = time_s[order]
+    same = np.concatenate([ordered[1:] == ordered[:-1], [False]])[: len(order)]  # What has no time shares none.
     if not same.any():
         return np.zeros(len(images), np.bool_)
     tied = order[same | np.concatenate([[False], same[:-1]])]
@@ -938,11 +943,26 @@ def driving_order(images: Images, drives: Drives) -> Ints:
     return np.lexsort((*images.cam_from_world_m.T, *images.cam_from_world_quat.T, order))
 
 
+def from_left_to_right(detections: Detections, image_row: Ints) -> Ints:
+    """Return the rows of detections by image (N), then from left to right; of one box by class, then score.
+
+    Only what is the same in all of that is told apart by ids.
+    """
+    box = (*detections.size_px.T[::-1], *detections.center_px.T[::-1], image_row)
+    rows = np.lexsort(box)
+    same = np.arange(len(rows) - 1)
+    for key in box[::-1]:
+        same = same[key[rows[same]] == key[rows[same + 1]]]
+    if not len(same):  # As nearly always.
+        return rows
+    return np.lexsort((detections.detection_id, detections.score, detections.class_name.codes, *box))
+
+
 def in_driving_order(dataset: Dataset, *, viewpoint_step_m: float = 1.0, keeps_names: bool = True) -> InOrder:
     """Return a dataset with its rows in an order that ids, names and the order of rows do not change.
 
     Images follow the drives, those of one exposure by place and direction; the detections of an image go from left
-    to right. Without `keeps_names` those of images are empty.
+    to right, those of one box by class and score. Without `keeps_names` those of images are empty.
     """
     images, detections = dataset.images, dataset.detections
     drives = find_drives(images, viewpoint_step_m=viewpoint_step_m)
@@ -952,16 +972,13 @@ def in_driving_order(dataset: Dataset, *, viewpoint_step_m: float = 1.0, keeps_n
     rows = driving_order(images, drives)
     if np.any(np.diff(rows) <= 0):
         images = images.take(rows)
-        columns = {name: getattr(drives, name)[rows] for name in ("pass_code", "order", "driven_m", "viewpoint")}
-        drives = replace(drives, **columns)
+        drives = drives.take(rows)
         rank = np.empty(len(rows), dtype=np.int64)
         rank[rows] = np.arange(len(rows))
         image_row = rank[image_row]
-    x, y = detections.center_px.T
-    step = np.diff(image_row)
+    x, step = detections.center_px[:, 0], np.diff(image_row)
     if np.any((step < 0) | ((step == 0) & (np.diff(x) <= 0))):
-        width, height = detections.size_px.T
-        rows = np.lexsort((height, width, y, x, image_row))
+        rows = from_left_to_right(detections, image_row)
         detections, image_row = detections.take(rows), image_row[rows]
     image_id, detection_id = images.image_id, detections.detection_id
     images = images.replace(image_id=np.arange(len(images)))

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
 
+ONE_PLACE_CHI2 = 16.27
+"""Squared distance, in sigmas, that two measures of one place exceed in one case of a thousand (chi-square, 3 axes)."""
 _AT_ONCE = 2**20
 """So many pairs are looked at in one go: 0.1 GB."""
 _ROUNDING = 1.0 + 1e-9

@@ -34,7 +34,7 @@ from valuemap.rejected import rejected_of_map
 from valuemap.remote import Place, UrlPath
 from valuemap.robust import Calibration, calibration_to_json
 from valuemap.stages import Stages
-from valuemap.tables import Labels, Votes
+from valuemap.tables import Cameras, Labels, Votes, read_table
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.seams import join_cells
@@ -46,6 +46,10 @@ LARGEST_IN_MEMORY = 2_000_000
 _NOTE_ON_SIZE = (
     "the dataset is larger than what poses are looked at of: they were taken as they are (map a part of it to learn "
     "what whole drives are off by; correct_poses=0 says that this is known)"
+)
+_NOTE_ON_ROWS = (
+    "cameras state a readout time, but poses were taken to be those of all rows, as the dataset is large and cut into "
+    "pieces (map a part of it to learn what that moves)"
 )
 CORRECTED = "corrected"
 """Where in the folder of work a dataset is kept whose poses were corrected."""
@@ -179,12 +183,14 @@ def build_map_of_folder(
         The files of its cells; none of a dataset that is no wider than one.
     """
     images, detections = rows_on_disk(folder) if held is None else (len(held.images), len(held.detections))
+    is_cut = config.method != "paper" and run.cuts_on_disk(images + detections)
+    is_looked_at = 0 < detections <= MOST_LOOKED_AT - images
+    dataset = ensure_checked(held or read_dataset(folder)) if is_looked_at or not is_cut else None
     stages = Stages()
     refined: Refined | None = None
     notes: list[str] = []
     threads = run.engine.threads_of_task(1)
-    if config.method == "paper" or not run.cuts_on_disk(images + detections):
-        dataset = ensure_checked(held or read_dataset(folder))
+    if dataset is not None and not is_cut:
         if config.method == "paper":
             return build_map(dataset, config, threads=threads, progress=progress), []
         _check_detections(dataset.name, len(dataset.detections))
@@ -197,10 +203,9 @@ def build_map_of_folder(
         size = {"images": len(dataset.images), "detections": len(dataset.detections)}
         name, frame, notes = dataset.name, dataset.frame, _notes_on_input(dataset, odd_range)
     else:
-        if images + detections <= MOST_LOOKED_AT and detections:
-            dataset = ensure_checked(held or read_dataset(folder))
+        if dataset is not None:
             config, odd_range = with_range(dataset, config)
-            notes = [] if odd_range is None else [odd_range]
+            notes = _notes_on_input(dataset, odd_range)
             refined = correct_poses(dataset, config, stages, threads, progress)
             if refined.is_corrected:
                 folder = run.work / CORRECTED
@@ -212,6 +217,8 @@ def build_map_of_folder(
             )
         source, name, frame, size = on_disk, on_disk.name, on_disk.frame, on_disk.counts
         _check_detections(name, size["detections"])
+        if refined is None and _has_rolling_shutter(folder):
+            notes = [_NOTE_ON_ROWS]
     labels, votes, counts, cells = _robust(source, config, stages, run.engine, progress, refined, run)
     if refined is not None:
         labels = with_errors_of_images(refined, labels, votes)
@@ -222,15 +229,20 @@ def build_map_of_folder(
     if refined is not None and refined.is_corrected:
         result = replace(result, corrected=refined.dataset)
     if run.keeps_rejected:
-        result = _with_rejected(result, lambda: result.corrected or held or read_dataset(folder), stages)
+        result = _with_rejected(result, lambda: result.corrected or dataset or held or read_dataset(folder), stages)
     return _with_notes(result, notes), cells
 
 
 def _with_rejected(result: Map, read: Callable[[], Dataset], stages: Stages) -> Map:
     """Add the best hypotheses that became no labels; `read` gives the dataset that the labels were found in."""
     with stages.measured("rejected"):
-        rejected = rejected_of_map(result, read)
-    return replace(result, rejected=rejected, run={**result.run, "stages": stages.records})
+        return replace(result, rejected=rejected_of_map(result, read))
+
+
+def _has_rolling_shutter(folder: Path) -> bool:
+    """Return whether a camera of a dataset states how long it reads its rows."""
+    readout_s = read_table(Cameras, folder / "cameras.parquet").readout_s
+    return readout_s is not None and bool(np.nan_to_num(readout_s).any())
 
 
 def _notes_on_input(dataset: Dataset, odd_range: str | None) -> list[str]:

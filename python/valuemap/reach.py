@@ -24,6 +24,7 @@ from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import driving_order, find_drives
 from valuemap.errors import SettingError
 from valuemap.paper.vote import vote_in_clusters
+from valuemap.refine.landmarks import GATES
 from valuemap.tables import Floats, Ints
 
 MOST_LOOKED_AT = 300_000
@@ -37,8 +38,6 @@ _OF_A_STRETCH = (8, 100)
 """Images of a stretch at least, and detections at least: an object is seen by several, and work is cubic in them."""
 _PARALLAX_DEG = 10.0
 """Rays that cross at narrower angles do so anywhere, where poses are off."""
-_GATES = (1.0, 2.0, 4.0)
-"""Multiples of `max_reprojection_error_px` that are tried: coarse boxes, and poses that tremble, need a wider one."""
 _TOLD_BY, _BEYOND_CHANCE = 0.1, 2.0
 """A gate tells if at least this share of the detections vote, and so many times as many as by chance."""
 _LEAST_DETECTIONS = 50
@@ -79,7 +78,7 @@ def usual_distance_m(dataset: Dataset, vote: VoteConfig) -> float | None:
     sample = replace(dataset, images=images, detections=looked_at, truth_detections=None)
     of_image = stretch[stretch >= 0].astype(np.uint32)
     rays, dealt = cast_rays(sample), cast_rays(_dealt(sample, of_image))
-    for gate in _GATES:
+    for gate in GATES:
         gate_px = gate * vote.max_reprojection_error_px
         try:
             distance_m = _distances_m(rays, of_image, gate_px, vote)

@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 import valuemap._core as _core
 from valuemap.cameras import Rays, cast_rays
 from valuemap.config import PartitionConfig, VoteConfig
 from valuemap.dataset import Dataset, evenly, rows_of
+from valuemap.drives import in_driving_order
 from valuemap.evidence import Evidence
 from valuemap.map_folder import Map
+from valuemap.nearby import ONE_PLACE_CHI2
 from valuemap.paper.partition import partition_images
 from valuemap.paper.vote import vote_in_clusters
 from valuemap.tables import Bools, Candidates, Categories, Floats, Ints, Rejected, covariance_matrices
@@ -33,8 +36,6 @@ _GATE_PX = (2.0, 30.0)
 """A detection votes for a point as near as that share of the map's votes are to their labels, within these limits."""
 _MOST_AROUND = 300
 """Detections of one place and class that are looked at, evenly spread where there are more: work is cubic in them."""
-_SAME_PLACE = 16.27
-"""Squared distance in sigmas up to which a point and a label can be one: chi-square, 3 axes, 99.9 %."""
 _SAME_PLACE_RANGES = 0.05
 """Labels so many ranges away are asked whether they are what a point is: 3 m in streets."""
 _WIDER = 1.5
@@ -44,10 +45,14 @@ _NO_LABEL = -1
 
 @dataclass(frozen=True, eq=False)
 class _LeftOver:
-    """The detections that no label has, with their images, as a dataset; `image_row` (N) are rows of the whole one."""
+    """The detections that no label has, with their images, as a dataset; `image_row` (N) are rows of the whole one.
+
+    `cluster` (N) are the images that are looked at together.
+    """
 
     dataset: Dataset
     image_row: Ints
+    cluster: NDArray[np.uint32]
     rays: Rays
 
 
@@ -128,13 +133,16 @@ def _left_over(evidence: Evidence, around_in_world_m: Floats | None) -> _LeftOve
         near = evidence.images_around(around_in_world_m, evidence.max_range_m, horizontally=True)
         is_near = np.isin(image_row, near)
         rows, image_row = rows[is_near], image_row[is_near]
-    kept, number = np.unique(image_row, return_inverse=True)
-    images = dataset.images.take(kept)
-    clusters = partition_images(images, PartitionConfig())[number] if len(kept) else number
-    code = dataset.detections.class_name.codes[rows]
-    rows = rows[_thinned(clusters.astype(np.int64), code.astype(np.int64))]
-    part = Dataset(dataset.name, dataset.frame, dataset.cameras, images, dataset.detections.take(rows))
-    return _LeftOver(part, kept, cast_rays(part))
+    images = dataset.images.take(np.unique(image_row))
+    left = Dataset(dataset.name, dataset.frame, dataset.cameras, images, dataset.detections.take(rows))
+    # In driving order, ids say nothing of what is looked at together and what is not looked at.
+    ordered = in_driving_order(left)
+    images, detections = ordered.dataset.images, ordered.dataset.detections
+    cluster = partition_images(images, PartitionConfig())
+    of_detection = cluster[detections.image_id].astype(np.int64)
+    chosen = _thinned(of_detection, detections.class_name.codes.astype(np.int64))
+    part = replace(ordered.dataset, detections=detections.take(chosen))
+    return _LeftOver(part, rows_of(ordered.image_id, dataset.images.image_id), cluster, cast_rays(part))
 
 
 def _thinned(cluster: Ints, code: Ints) -> Ints:
@@ -162,8 +170,7 @@ def _hypotheses(evidence: Evidence, left: _LeftOver) -> Candidates:
         min_vote_ratio=0.0,
         min_votes=2,
     )
-    clusters = partition_images(left.dataset.images, PartitionConfig())
-    return vote_in_clusters(left.rays, clusters, config, threads=1)[0]
+    return vote_in_clusters(left.rays, left.cluster, config, threads=1)[0]
 
 
 def _usual_share(evidence: Evidence) -> float:
@@ -205,7 +212,7 @@ def _judged(evidence: Evidence, left: _LeftOver, found: Candidates) -> _Verdicts
         _decisive(of, _setting(evidence, "min_range_m", 2.0), evidence.max_range_m, min_votes) for of in by_point
     ]
     range_m, limit_m = np.array(decisive).T
-    largest = np.full(len(found), math.sqrt(_SAME_PLACE))
+    largest = np.full(len(found), math.sqrt(ONE_PLACE_CHI2))
     tests = (
         ("merged", (rival >= 0) & is_same_class, sigmas, largest),
         ("class", rival >= 0, sigmas, largest),
@@ -256,7 +263,7 @@ def _labels_there(evidence: Evidence, left: _LeftOver, found: Candidates) -> tup
         apart = np.einsum(
             "ni,ni->n", away, np.linalg.solve(spread[around] + own.reshape(-1, 3, 3)[row], away[..., None])[..., 0]
         )
-        if apart.min() <= _SAME_PLACE:
+        if apart.min() <= ONE_PLACE_CHI2:
             best = around[int(np.argmin(apart))]
             rival[row], sigmas[row] = labels.label_id[best], math.sqrt(max(float(apart.min()), 0.0))
             is_same[row] = labels.class_name.names[labels.class_name.codes[best]] == names.names[names.codes[row]]

@@ -24,6 +24,7 @@ from valuemap.errors import InputError
 from valuemap.folders import new_file
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import Map
+from valuemap.nearby import ONE_PLACE_CHI2
 from valuemap.tables import Categories, Floats, Ints, Labels, covariance_matrices
 
 Verdict = Literal["accepted", "rejected", "noted"]
@@ -33,8 +34,6 @@ _FORMAT_VERSION = 1
 _POSITION_FLOOR_M = 0.5
 """Standard deviation per axis by which a label may move between two maps on top of its covariances: other passes, other
 pose errors."""
-_GATE = 16.27
-"""Squared distance in sigmas up to which a label can be the one that was decided on: chi-square, 3 axes, 99.9 %."""
 _SAME_VOTERS = 0.5
 """A label with this share of the voters that were decided on, as far as their images are still there, is the same one,
 wherever it is and whatever its class."""
@@ -174,7 +173,7 @@ def match_decisions(decisions: Sequence[Decision], result: Map, dataset: Dataset
     for claimant, share in enumerate(shares):
         for row, part in share.items():
             if part >= _SAME_VOTERS:
-                cost[claimant, row] = min(_GATE * (1.0 - part), cost.get((claimant, row), math.inf))
+                cost[claimant, row] = min(ONE_PLACE_CHI2 * (1.0 - part), cost.get((claimant, row), math.inf))
     assigned = _assign(cost)
     for claimant, row in assigned:
         if claimant < len(decisions):
@@ -412,7 +411,7 @@ def _claims_of_places(decisions: Sequence[Decision], labels: Labels) -> list[tup
     largest_label_m2 = float(np.max(labels.covariance_m2[:, [0, 3, 5]].sum(axis=1)))
     claims = []
     for claimant, (center, covariance, code) in enumerate(zip(centers, covariances, classes, strict=True)):
-        reach = math.sqrt(_GATE * (float(np.trace(covariance)) + largest_label_m2 + _POSITION_FLOOR_M**2))
+        reach = math.sqrt(ONE_PLACE_CHI2 * (float(np.trace(covariance)) + largest_label_m2 + _POSITION_FLOOR_M**2))
         rows = np.array(sorted(tree.query_ball_point(center, reach)), dtype=np.int64)
         if code != _ANY_CLASS:
             rows = rows[labels.class_name.codes[rows] == code]
@@ -420,7 +419,7 @@ def _claims_of_places(decisions: Sequence[Decision], labels: Labels) -> list[tup
             away = labels.position_in_world_m[row] - center
             spread = covariance + covariance_matrices(labels.covariance_m2[row]) + _POSITION_FLOOR_M**2 * np.eye(3)
             price = float(away @ np.linalg.solve(spread, away))
-            if price <= _GATE:
+            if price <= ONE_PLACE_CHI2:
                 claims.append((claimant, int(row), price))
     return claims
 
@@ -478,7 +477,7 @@ def _assign(cost: dict[tuple[int, int], float]) -> list[tuple[int, int]]:
     for together in members.values():
         mine, theirs = sorted({c for c, _ in together}), sorted({r for _, r in together})
         matrix = np.full((len(mine), len(theirs) + len(mine)), 1e6)
-        matrix[np.arange(len(mine)), len(theirs) + np.arange(len(mine))] = _GATE
+        matrix[np.arange(len(mine)), len(theirs) + np.arange(len(mine))] = ONE_PLACE_CHI2
         for claimant, row in together:
             matrix[mine.index(claimant), theirs.index(row)] = cost[claimant, row]
         for i, j in zip(*linear_sum_assignment(matrix), strict=True):
@@ -494,7 +493,7 @@ def _cost_of_exchange(
     mine, other = row_of.get(claimant), row_of[neighbor]
 
     def of(who: int, row: int | None) -> float:
-        return _GATE if row is None else price.get((who, row), _GATE)
+        return ONE_PLACE_CHI2 if row is None else price.get((who, row), ONE_PLACE_CHI2)
 
     return of(claimant, other) + of(neighbor, mine) - of(claimant, mine) - of(neighbor, other)
 

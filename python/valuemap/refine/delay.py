@@ -56,8 +56,8 @@ def _is_gain(gains: Ints) -> bool:
 
 def _gate_px(footage: Footage, config: MapConfig) -> float:
     """Return a gate as wide as what the delay that is nearest to the right one leaves where cars turn, or wider."""
-    turned_px = 0.5 * _STEP_S * _turning_radps(footage.motion.forward_radps) * np.median(footage.pixels_per_rad())
-    return max(config.vote.max_reprojection_error_px, float(turned_px))
+    turned_px = 0.5 * _STEP_S * _turning_radps(footage.motion.forward_radps) * footage.usual_pixels_per_rad
+    return max(config.vote.max_reprojection_error_px, turned_px)
 
 
 def _turning_radps(rate_radps: Floats) -> float:

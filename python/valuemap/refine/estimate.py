@@ -12,7 +12,7 @@ from valuemap.config import MapConfig
 from valuemap.refine.adjust import Adjustment, Groups, Scales, adjust, triangulate
 from valuemap.refine.footage import DRIFT_LENGTH_M, Footage, Sigmas
 from valuemap.refine.jumps import RARE, Hints, Jumps, Links, Segments
-from valuemap.refine.landmarks import Landmarks
+from valuemap.refine.landmarks import RANGES, Landmarks
 from valuemap.refine.register import Registration, register
 from valuemap.refine.residuals import CAMERA_DELAY, MOUNT, OFFSET, WIDTH, Observations, State, linearised, weights
 from valuemap.refine.tracks import associate, merge_objects
@@ -22,7 +22,7 @@ WIDE = Scales(
     0.2, math.radians(0.2), 0.1, math.radians(0.1), (3.0, math.radians(2.0), 0.2, 0.05, math.radians(2.0), 0.2)
 )
 """What errors are thought to be before anything is known: drift; offset, mounting, delay, focal length."""
-DRIFT_FACTOR = 1.5
+_DRIFT_FACTOR = 1.5
 """Drift is thought to be so many times as large as what is found of it: data pull it towards zero."""
 _FIRST_PX, _FIRST_SHARE, _FIRST_M = 2.0, 0.05, 0.1
 _LANDMARK_PX, _LANDMARK_M = 3.0, 0.2
@@ -33,7 +33,6 @@ _SEGMENT_PRICE = 8.0
 criterion, the price of two offsets that 55 coordinates tell."""
 LEAST_VOTES = 4
 """An object that fewer detections show is dropped."""
-_RANGES = 1.5
 _SURE = 4.0
 """Turns of drives are none of chance if their squares exceed their variances by so many deviations."""
 _TOLD_RAD = math.radians(0.5)
@@ -119,26 +118,24 @@ def begin(
     config: MapConfig,
     told: Trajectories,
     *,
-    known: tuple[Segments, Floats] | None = None,
-    turned_rad: Floats | None = None,
-    late_s: float = 0.0,
+    known: tuple[Segments, Floats],
+    turned_rad: Floats,
+    late_s: float,
 ) -> Estimate | None:
     """Return a first estimate of all that drives may be wrong by, None where there is too little that drives share.
 
-    Where segments and their offsets (L, 3) are `known` about, or how the cameras of drives are turned (D, 3), or how
-    late poses are, the landmarks are those of the footage laid so.
+    The landmarks are those of the footage laid by segments that are `known` and their offsets (L, 3), by how the
+    cameras of drives are turned (D, 3), and by how late poses are.
     """
     landmarks, registration = marks.landmarks, marks.registration
     segments, offset = _first_segments(footage, landmarks, registration, told.seen_cuts)
-    if known is not None:
-        segments, offset = _added(segments, offset, *known)
+    segments, offset = _added(segments, offset, *known)
     thing_of_mark, class_code, size_m, points = _objects(landmarks, registration)
     detection, thing = landmarks.voters, thing_of_mark[landmarks.landmark_of_voter()]
     counts = (len(segments), footage.drives.count, footage.drives.count) + (footage.cameras,) * 3
     state = State.zero(points, len(footage.chain.drive), len(footage.row), counts)
     state.constants[OFFSET][:] = offset
-    if turned_rad is not None:
-        state.constants[MOUNT][:] = turned_rad
+    state.constants[MOUNT][:] = turned_rad
     state.constants[CAMERA_DELAY][:] = late_s
     noise, links = Noise(), told.jumps.links(segments, set())
     errors = (noise, _sigmas(footage, noise), WIDE)
@@ -164,7 +161,7 @@ def _round(
 
 def range_of(config: MapConfig) -> float:
     """Return how far from an image its objects are looked for, m."""
-    return _RANGES * config.vote.farthest_m
+    return RANGES * config.vote.farthest_m
 
 
 def estimate_again(footage: Footage, found: Estimate, told: Trajectories) -> Estimate:
@@ -331,17 +328,23 @@ def _sigmas(footage: Footage, noise: Noise) -> Sigmas:
     return Sigmas(np.sqrt(square + (noise.image_m * box) ** 2), np.sqrt(own))
 
 
+def drift_of(state: State) -> tuple[float, float]:
+    """Return how large drift is thought to be, m and rad, each axis, by what is found of it."""
+    found = np.sqrt(np.mean(state.drift**2, axis=0))
+    of_places, of_turns = (_DRIFT_FACTOR * float(np.sqrt(np.mean(part**2))) for part in (found[:3], found[3:]))
+    return of_places, of_turns
+
+
 def _grown(scales: Scales, state: State) -> Scales:
     """Return scales with more drift where more is found than was thought possible."""
-    found = np.sqrt(np.mean(state.drift**2, axis=0))
-    drift_m, drift_rad = (DRIFT_FACTOR * float(np.sqrt(np.mean(part**2))) for part in (found[:3], found[3:]))
+    drift_m, drift_rad = drift_of(state)
     return replace(scales, drift_m=max(scales.drift_m, drift_m), drift_rad=max(scales.drift_rad, drift_rad))
 
 
 def own_scales(footage: Footage, noise: Noise, scales: Scales) -> Scales:
     """Return scales with the noise's own errors of images."""
-    per_rad = float(np.median(footage.pixels_per_rad()))
-    return replace(scales, own_m=max(noise.image_m, 1e-6), own_rad=math.sqrt(0.5) * noise.px / per_rad)
+    own_rad = math.sqrt(0.5) * noise.px / footage.usual_pixels_per_rad
+    return replace(scales, own_m=max(noise.image_m, 1e-6), own_rad=own_rad)
 
 
 def fit_noise(seen: Observations, state: State, noise: Noise) -> Noise:
@@ -431,13 +434,9 @@ def apparent_shift(footage: Footage, seen: Observations, state: State) -> tuple[
     information, right = products[:, :3, :3], products[:, :3, 3]
     shift = np.linalg.solve(information + 0.1 * np.eye(3), right[:, :, None])[:, :, 0]
     # What drifts along the way is no jump: so many images share one value of the process.
-    per_length = max(1.0, DRIFT_LENGTH_M * len(kinds) / max(1.0, _length_m(footage)))
+    per_length = max(1.0, DRIFT_LENGTH_M * len(kinds) / max(1.0, footage.length_m))
     spread = np.linalg.inv(information + 0.1 * np.eye(3)) + per_length * (0.5 * WIDE.drift_m) ** 2 * np.eye(3)
     return np.asarray(shift), np.asarray(np.linalg.inv(spread)), kinds
-
-
-def _length_m(footage: Footage) -> float:
-    return float(sum(footage.drives.driven_m[footage.drives.pass_code == d].max() for d in range(footage.drives.count)))
 
 
 def prices(evidence: Floats, is_shown: Bools) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,6 +14,7 @@ from valuemap.cameras import Rays, camera_centers, camera_poses, cast_rays, rota
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import Drives, InOrder
 from valuemap.refine.adjust import Chain
+from valuemap.refine.jumps import MOST_STEPS
 from valuemap.refine.landmarks import keyframes
 from valuemap.refine.residuals import Observations, Views, rotations
 from valuemap.tables import Bools, Floats, Images, Ints, Labels, Votes
@@ -21,8 +23,6 @@ NODE_M = 10.0
 """Drift is the same within so much of a drive."""
 DRIFT_LENGTH_M = 100.0
 """The way over which drift forgets 63 % of itself."""
-_MOST_STEPS = 4.0
-"""Images farther apart in time than so many usual steps say nothing of the velocity between them."""
 _SUDDEN = 3.0
 """A rate that changes from the step before to the step after by so many times what it does beside them changes at once.
 
@@ -77,16 +77,30 @@ class Footage:
         """The steps from each image of the whole dataset to those beside it."""
         return find_steps(self.whole, self.whole_drives)
 
+    @cached_property
+    def length_m(self) -> float:
+        """How far all drives came."""
+        farthest_m = np.zeros(self.drives.count)
+        np.maximum.at(farthest_m, self.drives.pass_code, self.drives.driven_m)
+        return float(farthest_m.sum())
+
     @property
     def cameras(self) -> int:
         """The number of cameras."""
         return len(self.dataset.cameras)
 
+    @cached_property
     def pixels_per_rad(self) -> Floats:
-        """Return how far (detections), px, a detection moves when its image turns."""
+        """How far (detections), px, a detection moves when its image turns; NaN of one that has no ray."""
         square = np.sum(self.residual_from_cam[:, :2] ** 2, axis=(1, 2))
         along = np.einsum("nij,nj->ni", self.residual_from_cam[:, :2], self.residual_from_cam[:, 2])
         return np.asarray(np.sqrt(0.5 * (square - np.sum(along**2, axis=1))))
+
+    @property
+    def usual_pixels_per_rad(self) -> float:
+        """The median of that of all detections that have a ray; NaN where none has."""
+        known = self.pixels_per_rad[np.isfinite(self.pixels_per_rad)]
+        return float(np.median(known)) if len(known) else math.nan
 
     def observe(self, detection: Ints, thing: Ints, segment_of_image: Ints, sigma_px: Sigmas) -> Observations:
         """Return detections (rows) as observations of things, sorted by drive and node."""
@@ -250,8 +264,7 @@ def gather(dataset: Dataset, drives: Drives, *, every_image: bool = False) -> Fo
     image_row = rows_of(dataset.detections.image_id, dataset.images.image_id)
     detection_row = np.flatnonzero(chosen[image_row])
     part = replace(dataset, images=images, detections=dataset.detections.take(detection_row), truth_detections=None)
-    names = ("pass_code", "order", "driven_m", "viewpoint")
-    part_drives = replace(drives, **{name: getattr(drives, name)[row] for name in names})
+    part_drives = drives.take(row)
     rays = cast_rays(part)
     rotation, center = camera_poses(images)
     camera = rows_of(images.camera_id, dataset.cameras.camera_id)
@@ -325,7 +338,7 @@ def find_steps(dataset: Dataset, drives: Drives) -> Steps:
         step_s = np.diff(when)
         if not len(step_s):
             continue
-        usable = step_s <= _MOST_STEPS * np.median(step_s)
+        usable = step_s <= MOST_STEPS * np.median(step_s)
         seconds = np.where(usable, step_s, np.inf)[:, None]
         _fill(*speeds, rows, np.diff(center[rows], axis=0) / seconds, step_s, usable)
         _fill(*turns, rows, _turns(rotation[rows]) / seconds, step_s, usable)

@@ -120,9 +120,10 @@ class Bundle:
         The covariances are (G, 3 M, 3 M), with errors of all images and drift marginalised. All is in the working
         frame.
         """
-        state = self.adjusted(self.seen)
         with one_blas_thread():
-            covariance = self._problem(self.seen).step(state, _TOLERANCES[-1], of_groups=groups)[0].covariance
+            problem = self._problem(self.seen)
+            state = adjust(problem, self.state, tolerances=_TOLERANCES)
+            covariance = problem.step(state, _TOLERANCES[-1], of_groups=groups)[0].covariance
         assert covariance is not None
         return self.of.unit_m * state.point_in_world_m, self.of.unit_m**2 * covariance
 
@@ -153,20 +154,20 @@ def images_in_order(ordered: InOrder, config: MapConfig) -> AllImages:
     )
 
 
-def bundle(images: AllImages, labels: Labels, votes: Votes, noise: Noise, *, by_side: bool = False) -> Bundle:
+def bundle(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> Bundle:
     """Return images with what they see of a map; `noise` is that of maps of their poses.
 
     The map may have been made with other poses of the same images. Sides are things of their own where they show other
-    middles, and `by_side`.
+    middles.
     """
     ordered, unit_m, footage = images.ordered, images.unit_m, images.footage
     detection, thing, label, _ = shown_objects(footage, ordered, labels, votes)
-    if noise.side_m or by_side:
+    if noise.side_m:
         thing, label = _by_side(footage, detection, thing, label)
     box = np.maximum(footage.dataset.detections.size_px[:, 1], 0.0)
     alone = np.hypot(noise.detection_px, noise.box_share * box)
     # As everywhere in this package, a metre of the camera is as many pixels as the box of a thing of a metre.
-    of_image = np.hypot(noise.position_m / unit_m * box, noise.rotation_rad * footage.pixels_per_rad())
+    of_image = np.hypot(noise.position_m / unit_m * box, noise.rotation_rad * footage.pixels_per_rad)
     segments = _whole_drives(footage)
     seen = footage.observe(detection, thing, footage.drives.pass_code, Sigmas(np.hypot(alone, of_image), alone))
     scales = Scales(

@@ -17,7 +17,9 @@ _FASTER = 1.2
 _SIGMAS = 8.0
 """A step farther than so many usual deviations from what a vehicle can make is a jump."""
 _LEAST_M = 0.3
-_MOST_STEPS = 4.0
+"""A step outside of what a vehicle can make by less than this is no jump, however little poses tremble."""
+MOST_STEPS = 4.0
+"""Images farther apart in time than so many usual steps say nothing of the velocity between them."""
 _JUMP_M = 2.0
 """Deviation of jumps, each axis."""
 _LEAST_SIGMA_M = 0.02
@@ -28,6 +30,7 @@ _FARTHEST_M = 6.0
 _TOLD_M = 0.5
 """Jumps that a trajectory tells worse, as the vehicle stops or turns there, are left to objects."""
 _MOST_JUMPS = 0.1
+"""A drive with jumps in more than this share of its steps does not go as a vehicle does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +183,7 @@ def mend(dataset: Dataset, drives: Drives) -> Jumps:
             which = int(np.argmin(left))
             at, track = here[which], tried[which]
             jumps.append((int(track.order[steps.row[at]]), test.jump_m[at], test.covariance_m2[at]))
-        if len(jumps) <= _MOST_JUMPS * len(track.order):
+        if len(jumps) <= _MOST_JUMPS * len(steps.row):
             found[track.drive] = sorted(jumps, key=lambda jump: jump[0])
     cuts, offsets, told = [], [], []
     for drive in range(drives.count):
@@ -234,7 +237,7 @@ class _Track:
     def steps(self) -> _Steps:
         """Return its steps."""
         seconds, step = np.diff(self.when_s), np.diff(self.center_m, axis=0)
-        near = seconds <= _MOST_STEPS * np.median(seconds)
+        near = seconds <= MOST_STEPS * np.median(seconds)
         velocity = step / seconds[:, None]
         inner = np.flatnonzero(near[1:-1] & near[:-2] & near[2:]) + 1
         two, last = 0.5 * (velocity[1:] + velocity[:-1]), len(step) - 1

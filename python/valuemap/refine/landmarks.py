@@ -21,12 +21,12 @@ from valuemap.tables import Candidates, Floats, Ints
 
 _STRETCH_RANGES = 1.5
 """A stretch is as long as so many largest ranges: an object is seen from before it on one of two of them."""
-_GATES = (1.0, 2.0, 4.0)
-"""Multiples of `max_reprojection_error_px` that are tried: poses that tremble need a wider one."""
+GATES = (1.0, 2.0, 4.0)
+"""Multiples of `max_reprojection_error_px` that are tried: coarse boxes, and poses that tremble, need a wider one."""
 _ENOUGH = 0.7
 """A gate is wide enough if this share of the detections vote."""
 _LEAST_VOTES = 4
-_RANGES = 1.5
+RANGES = 1.5
 """Points may be so many largest ranges away: poses that are off stretch what they see."""
 
 
@@ -77,7 +77,7 @@ def find_landmarks(
     """Vote on every stretch of every drive alone, with the narrowest gate through which most detections agree."""
     stretch = stretches(drives, segment, config)
     best: Candidates | None = None
-    for gate in _GATES:
+    for gate in GATES:
         gate_px = gate * config.vote.max_reprojection_error_px
         found = vote_on_stretches(rays, stretch, config, gate_px, threads=threads)
         if best is None or len(found.voters) > len(best.voters):
@@ -108,7 +108,7 @@ def vote_on_stretches(
         max_reprojection_error_px=gate_px,
         min_parallax_deg=config.vote.min_parallax_deg,
         min_range_m=config.vote.nearest_m,
-        max_range_m=_RANGES * config.vote.farthest_m,
+        max_range_m=RANGES * config.vote.farthest_m,
         min_votes=_LEAST_VOTES,
     )
     return vote_in_clusters(rays, stretch, vote, threads=threads)[0]

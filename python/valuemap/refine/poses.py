@@ -149,7 +149,7 @@ def _refined(dataset: Dataset, config: MapConfig, threads: int, progress: Progre
     if ordered.drives.count < 2:
         return Refined(dataset, {"found": "nothing", "because": "one drive"})
     ranges = replace(config.vote, max_range_m=USUAL_RANGE_M, min_range_m=config.vote.nearest_m / unit_m)
-    config = MapConfig(config.method, config.partition, ranges, config.noise, config.existence, config.merge)
+    config = replace(config, vote=ranges)
     moved, drives = in_working_frame(ordered.dataset, ordered.drives, unit_m)
     progress("comparing drives", 0, 2)
     sample = _sample(moved, drives)
@@ -399,10 +399,8 @@ def _part(dataset: Dataset, drives: Drives, chosen: Bools) -> tuple[Dataset, Dri
     """Return some images with their detections, and their drives, numbered anew."""
     row = np.flatnonzero(chosen)
     image_row = rows_of(dataset.detections.image_id, dataset.images.image_id)
-    code = np.unique(drives.pass_code[row], return_inverse=True)[1]
-    part = replace(
-        drives, pass_code=code, order=drives.order[row], driven_m=drives.driven_m[row], viewpoint=drives.viewpoint[row]
-    )
+    part = drives.take(row)
+    part = replace(part, pass_code=np.unique(part.pass_code, return_inverse=True)[1])
     detections = dataset.detections.take(chosen[image_row])
     return replace(dataset, images=dataset.images.take(row), detections=detections, truth_detections=None), part
 

@@ -38,12 +38,15 @@ _SHARED = 0.7
 _HIGH_M = 4.0
 """Objects are spread over so much height."""
 _PRIOR_M = 3.0
+"""Deviation of shifts, each axis, before landmarks say anything: of a drive where it begins, or where a jump ends."""
 _SMOOTH_M = 0.35
 """What drives disagree by within a cell and a stretch, each axis."""
 _GATE2 = 12.0
 """Squared distance in sigmas within which a landmark is an object; 0.993 of chi-squared with three degrees."""
 _SAME_SIZE = 1.6
+"""A landmark that is higher or lower than an object by more than this factor is another thing."""
 _ROUNDS = 2
+"""Times that each drive is laid anew onto what all others see."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,14 +90,19 @@ def _order_of_laying(point: Floats, by_drive: list[Ints]) -> list[int]:
     """Return the drives, the one with most landmarks first, then always one that meets most of what is known."""
     if not by_drive:
         return []
-    tree = [scipy.spatial.cKDTree(point[rows]) for rows in by_drive]
-    met = np.array([[int(a.count_neighbors(b, _REACH_M)) if a is not b else 0 for b in tree] for a in tree])
-    seen = (met > 0) * np.array([len(rows) for rows in by_drive])[:, None]
+    drive = np.empty(len(point), np.int64)
+    for number, rows in enumerate(by_drive):
+        drive[rows] = number
+    near = drive[scipy.spatial.cKDTree(point).query_pairs(_REACH_M, output_type="ndarray")]
+    met = np.zeros((len(by_drive), len(by_drive)), np.bool_)
+    met[near[:, 0], near[:, 1]] = met[near[:, 1], near[:, 0]] = True
+    np.fill_diagonal(met, val=False)
+    seen = met * np.array([len(rows) for rows in by_drive])[:, None]
     left = set(range(len(by_drive)))
     first = max(left, key=lambda i: (len(by_drive[i]), -i))
     chosen = [first]
     left.discard(first)
-    score = seen[:, first].astype(np.int64)
+    score = seen[:, first]
     while left:
         best = max(left, key=lambda i: (score[i], len(by_drive[i]), -i))
         chosen.append(best)

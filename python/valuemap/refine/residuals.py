@@ -95,13 +95,6 @@ class Observations:
         """The camera (N) of each."""
         return self.views.camera[self.image]
 
-    def pixels_per_unit(self) -> Floats:
-        """Return the local focal length (N), px: that of a pinhole along the detection's own ray."""
-        square = np.sum(self.residual_from_cam[:, :2] ** 2, axis=(1, 2)) - np.sum(
-            np.einsum("nij,nj->ni", self.residual_from_cam[:, :2], self.residual_from_cam[:, 2]) ** 2, axis=1
-        )
-        return np.asarray(np.sqrt(0.5 * square))
-
     def take(self, rows: Any) -> Observations:
         """Return some of them."""
         return Observations(self.views, **{name: value[rows] for name, value in vars(self).items() if name != "views"})
@@ -121,8 +114,8 @@ class State:
     own: Floats
     constants: tuple[Floats, ...]
     covariance: Floats | None = None
-    """Of the constants that are free (C, C), in the order of `Adjustment.column_of`, all else marginalised; or that of
-    each object (K, 3, 3), if it was asked for."""
+    """Of the constants that are free (C, C), in the order of `Adjustment.column_of`, all else marginalised; or those of
+    groups (G, M) of objects (G, 3 M, 3 M), if they were asked for."""
 
     @staticmethod
     def zero(points: Floats, nodes: int, images: int, counts: tuple[int, ...]) -> State:

@@ -17,7 +17,7 @@ import numpy as np
 
 from valuemap.refine.adjust import Adjustment, Chain, Scales, adjust, triangulate
 from valuemap.refine.alias import BEYOND_DRIFT, agreed_shift
-from valuemap.refine.estimate import DRIFT_FACTOR, WIDE, Estimate, everything, segments_of
+from valuemap.refine.estimate import WIDE, Estimate, drift_of, everything, seen_by, segments_of
 from valuemap.refine.footage import Footage
 from valuemap.refine.jumps import Links
 from valuemap.refine.residuals import (
@@ -36,7 +36,9 @@ from valuemap.refine.tracks import unresolved_share
 from valuemap.tables import Bools, Floats, Ints
 
 _LEAST_DRIFT, _LEAST_DRIFT_RAD = 0.02, math.radians(0.02)
+"""Drift is thought to be no less than this, m and rad, each axis."""
 _LEAST_FOCAL = 0.003
+"""What is less than this share of a focal length is no error of it."""
 _REFIT, _ANEW = (1.5, 1.0, 1.0, 1.0), (1.0, 1.0, 1.0)
 LEAST_CHANCE = 0.01
 """What is less likely luck than this is to be looked at: whether all detections are likelier is asked afterwards."""
@@ -83,12 +85,11 @@ class Selected:
 
 def select(footage: Footage, found: Estimate) -> Selected | None:
     """Return what pays, None where nothing does."""
-    seen = footage.observe(found.detection, found.thing, segments_of(footage, found.segments), found.sigma_px)
     shared = _shared(footage, found)
-    if shared is None or unresolved_share(seen, found.state, found.class_code) > _MOST_UNRESOLVED:
+    if shared is None or unresolved_share(seen_by(footage, found), found.state, found.class_code) > _MOST_UNRESOLVED:
         return None
     found = shared
-    seen = footage.observe(found.detection, found.thing, segments_of(footage, found.segments), found.sigma_px)
+    seen = seen_by(footage, found)
     ties = tie(footage, found.segments, seen)
     views = replace(seen.views, segment=ties.segment[seen.views.segment], vehicle=ties.vehicle[seen.views.vehicle])
     seen = replace(seen, views=views)
@@ -187,13 +188,11 @@ def _objects_of(part: Ints, thing: Ints, count: int) -> Ints:
 
 def _scales(footage: Footage, found: Estimate) -> Scales:
     """Return priors with a drift as large as what is found of it, and offsets as claimed where they are."""
-    drift = np.sqrt(np.mean(found.state.drift**2, axis=0))
-    drift_m = max(DRIFT_FACTOR * float(np.sqrt(np.mean(drift[:3] ** 2))), _LEAST_DRIFT)
-    drift_rad = max(DRIFT_FACTOR * float(np.sqrt(np.mean(drift[3:] ** 2))), _LEAST_DRIFT_RAD)
+    drift_m, drift_rad = drift_of(found.state)
     return replace(
         found.scales,
-        drift_m=drift_m,
-        drift_rad=drift_rad,
+        drift_m=max(drift_m, _LEAST_DRIFT),
+        drift_rad=max(drift_rad, _LEAST_DRIFT_RAD),
         constant=(_offset_sigma(footage, found)[:, None], *WIDE.constant[1:]),
     )
 
@@ -507,10 +506,10 @@ def chance_of_gain(gain: Floats) -> float:
     """Return the probability that what objects (N) gain is luck, by their mean and by their ranks."""
     from scipy import stats  # Slow to import, and only this test needs it.
 
-    if len(gain) < _LEAST_OBJECTS:
+    if len(gain) < _LEAST_OBJECTS or not gain.any():
         return 1.0
-    scatter = float(gain.std(ddof=1)) / math.sqrt(len(gain))
-    chance = float(stats.t.sf(float(gain.mean()) / scatter, len(gain) - 1)) if scatter > 0.0 else 0.0
+    mean, scatter = float(gain.mean()), float(gain.std(ddof=1)) / math.sqrt(len(gain))
+    chance = float(stats.t.sf(mean / scatter, len(gain) - 1)) if scatter > 0.0 else float(mean <= 0.0)
     by_rank = float(stats.wilcoxon(gain, alternative="greater").pvalue)
     return min(1.0, 2.0 * min(chance, by_rank))
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.drives import are_dates
 from valuemap.refine.footage import Footage
 from valuemap.refine.jumps import Segments
 from valuemap.refine.residuals import DELAY, MOUNT, OFFSET, Observations
@@ -39,11 +40,13 @@ def tie(footage: Footage, segments: Segments, seen: Observations) -> Ties:
     images = footage.whole.images
     if images.timestamp_s is None:
         return Ties(segment, vehicle)
-    drive = footage.whole_drives.pass_code
+    # A date is that of many drives: it tells none of them that another one ended right before.
+    timed = np.flatnonzero(np.isfinite(images.timestamp_s) & ~are_dates(images))
+    drive, time_s = footage.whole_drives.pass_code, images.timestamp_s[timed]
     count = footage.drives.count
     begins, ends = np.full(count, np.inf), np.full(count, -np.inf)
-    np.minimum.at(begins, drive, images.timestamp_s)
-    np.maximum.at(ends, drive, images.timestamp_s)
+    np.minimum.at(begins, drive[timed], time_s)
+    np.maximum.at(ends, drive[timed], time_s)
     pass_of = np.zeros(count, np.int64)
     pass_of[drive] = images.pass_id.codes
     objects = np.bincount(np.unique(np.stack([seen.drive, seen.thing]), axis=1)[0], minlength=count)

@@ -13,13 +13,17 @@ from valuemap.refine.residuals import FOCAL, Observations, State, linearised, po
 from valuemap.tables import Floats, Ints
 
 GATE_SIGMAS = 5.0
+"""A detection farther than this from where an object should be seen does not show it."""
 _ONE_M = 2.5
+"""Objects farther apart than this are two, however badly their places are known."""
 _BESIDE_M = 4.0
+"""Objects nearer to each other than this may be one that drives do not agree about."""
 _TOGETHER = 0.1
 """Two objects are one only if fewer than this share of the images that see the one show both."""
 _SAME_SIDE = 0.7
 """Cosine between mean directions of view: within 45 degrees is the same side."""
 _CLOSE2 = 16.0
+"""Objects are one only if they are apart by less than this in squared sigmas: four sigmas."""
 
 
 def associate(
@@ -57,7 +61,7 @@ def associate(
         )
 
     depth = project(2)
-    box = footage.dataset.detections.size_px[rows, 1] / seen.pixels_per_unit()
+    box = footage.dataset.detections.size_px[rows, 1] / footage.pixels_per_rad[rows]
     with np.errstate(divide="ignore", invalid="ignore"):
         fits = ~(np.abs(np.log(box[detection] * depth / size_m[thing])) > np.log(2.0)) & (depth > 0.5)
     detection, thing, depth = detection[fits], thing[fits], depth[fits]

@@ -13,10 +13,9 @@ import math
 import numpy as np
 
 from valuemap.drives import InOrder
+from valuemap.nearby import ONE_PLACE_CHI2
 from valuemap.tables import Candidates, Floats, Ints
 
-_SAME_CHI2 = 16.27
-"""Squared sigmas (chi-square, 3 axes, 99.9 %) within which labels of two groups are one object."""
 _LEAST_SHARE = 0.5
 
 
@@ -108,7 +107,7 @@ def _near(
     away = position[rows] - mean
     inverse = np.linalg.inv(covariance[rows] + spread) if len(rows) else covariance[rows]
     apart = np.einsum("ni,nij,nj->n", away, inverse, away)
-    same = (apart <= _SAME_CHI2) & (code[rows] == code[members[0]])
+    same = (apart <= ONE_PLACE_CHI2) & (code[rows] == code[members[0]])
     return list(zip(apart[same].tolist(), rows[same].tolist(), strict=True))
 
 

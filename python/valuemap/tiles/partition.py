@@ -29,7 +29,7 @@ import pyarrow.parquet as pq
 from valuemap.arrow import no_texts, numbers_from_arrow, numbers_to_arrow
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, Frame, rows_of
-from valuemap.drives import Drives, InOrder
+from valuemap.drives import Drives, InOrder, from_left_to_right
 from valuemap.portions import DatasetReader, rows_on_disk
 from valuemap.progress import Progress, silent
 from valuemap.remote import Place, UrlPath, read_all
@@ -133,11 +133,10 @@ class OnDisk:
         place = numbers_from_arrow(images.column("place"))
         along = np.argsort(place)
         images, place = images.take(numbers_to_arrow(along)), place[along]
-        row, center = rows_of(numbers_from_arrow(found.column("place")), place), ("x", "y", "width", "height")
-        x, y, width, height = (numbers_from_arrow(found.column(name)) for name in center)
-        detection_id = numbers_from_arrow(found.column("detection_id"))
-        order = np.lexsort((detection_id, height, width, y, x, row))
-        detections = _from_columns(Detections, found, self._meta["classes"]).take(order)
+        row = rows_of(numbers_from_arrow(found.column("place")), place)
+        detections = _from_columns(Detections, found, self._meta["classes"])
+        order = from_left_to_right(detections, row)
+        detections = detections.take(order)
         table = _from_columns(Images, images, [""])
         dataset = Dataset(
             name=self.name,
@@ -147,7 +146,7 @@ class OnDisk:
             detections=detections.replace(detection_id=np.arange(len(order)), image_id=row[order]),
         )
         drives = Drives(**{name: numbers_from_arrow(images.column(name)) for name in _DRIVES}, record={})
-        return InOrder(dataset, drives, table.image_id, detection_id[order])
+        return InOrder(dataset, drives, table.image_id, detections.detection_id)
 
     def _tables(self, tiles: list[tuple[int, int]], squares: Ints | None) -> tuple[pa.Table, pa.Table]:
         """Return the images and detections of `_read`, in any order."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from valuemap.drives import Drives, InOrder
+from valuemap.drives import InOrder
 from valuemap.tables import Ints
 
 
@@ -19,7 +19,7 @@ def piece_of_rows(ordered: InOrder, rows: Ints) -> InOrder:
     first = ordered.first_detection[rows]
     count = ordered.first_detection[rows + 1] - first
     detection_rows = np.repeat(first - (np.cumsum(count) - count), count) + np.arange(int(count.sum()))
-    drives, cameras = ordered.drives, ordered.dataset.cameras
+    drives, cameras = ordered.drives.take(rows), ordered.dataset.cameras
     return InOrder(
         replace(
             ordered.dataset,
@@ -32,13 +32,7 @@ def piece_of_rows(ordered: InOrder, rows: Ints) -> InOrder:
             truth_detections=None,
             rejected=None,
         ),
-        Drives(
-            pass_code=renumbered(drives.pass_code[rows]),
-            order=drives.order[rows],
-            driven_m=drives.driven_m[rows],
-            viewpoint=renumbered(drives.viewpoint[rows]),
-            record={},
-        ),
+        replace(drives, pass_code=renumbered(drives.pass_code), viewpoint=renumbered(drives.viewpoint), record={}),
         ordered.image_id[rows],
         ordered.detection_id[detection_rows],
     )

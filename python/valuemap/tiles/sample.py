@@ -12,7 +12,8 @@ from valuemap.tables import Bools, Floats, Ints
 from valuemap.tiles.grid import Census, Grid, smallest_squares
 
 SAMPLE_DETECTIONS = 60_000
-"""About as many detections are calibrated on; all of a dataset that has no more."""
+"""So many detections are calibrated on, and at most those of one place more; all of a dataset that has no more, or that
+is one cell."""
 _NEAR = 2
 """Places are this many of the smallest squares of the grid wide: objects in most of one are seen from it alone."""
 

@@ -12,7 +12,7 @@ import scipy
 
 from valuemap.dataset import rows_of
 from valuemap.drives import connected
-from valuemap.nearby import Nearby
+from valuemap.nearby import ONE_PLACE_CHI2, Nearby
 from valuemap.tables import Bools, Categories, Changes, Floats, IdBridge, Ints, Labels, Votes, covariance_matrices
 from valuemap.update.looks import Looks
 
@@ -22,9 +22,7 @@ MOVED_WITHIN_M = 5.0
 """What is gone here and new there, no farther away, is one object that was moved."""
 SAME_PLACE_CHI2 = 30.0
 """Squared sigmas up to which labels of two epochs may be one object. Of objects that stand still one in a thousand is
-beyond 16.3 if covariances are right, and beyond this if deviations are 1.35 times what they say."""
-CHANGED_CHI2 = 16.27
-"""Squared sigmas (chi-square, 3 axes, 99.9 %) from which on a label is elsewhere than before."""
+beyond `ONE_PLACE_CHI2` if covariances are right, and beyond this if deviations are 1.35 times what they say."""
 
 FEW_WAYS = 1000
 """Of so few ways to pair labels all are looked at: that takes less time than importing SciPy does, 0.5 s."""
@@ -262,7 +260,7 @@ def _differ(old: Labels, before: Ints, new: Labels, rows: Ints) -> Bools:
     code_of = {name: code for code, name in enumerate(new.class_name.names)}
     code = np.array([code_of.get(name, -1) for name in old.class_name.names], np.int64)
     is_other = code[old.class_name.codes[before]] != new.class_name.codes[rows]
-    return np.asarray(is_other | (_apart(old, before, new, rows) > CHANGED_CHI2))
+    return np.asarray(is_other | (_apart(old, before, new, rows) > ONE_PLACE_CHI2))
 
 
 def _apart(old: Labels, i: Ints, new: Labels, j: Ints) -> Floats:

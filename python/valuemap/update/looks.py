@@ -22,7 +22,8 @@ from valuemap.tables import Bools, Floats, Ints, Votes
 
 HIDDEN_OF = 50
 """Before anything is learned one in so many drives cannot see an object that is there: as much as so many drives say.
-While it is that few, one drive alone shows that a thing is gone if it had three looks or more."""
+While it is that few, one drive alone shows that a thing is gone if it had looks enough: three where seven or eight of
+ten looks see what is there, two where nine do, eleven where three do."""
 FALSE_LOOKS = 0.02
 """The share of looks in which something else is taken for an object that is not there."""
 RECALL_BOUNDS = (0.3, 0.95)

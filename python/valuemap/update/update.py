@@ -13,6 +13,7 @@ import numpy as np
 from valuemap.calibration import read_calibration
 from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig
+from valuemap.control import labels_before_control
 from valuemap.dataset import (
     MARKER,
     Dataset,
@@ -53,6 +54,10 @@ from valuemap.update.looks import Chances, Lookout, Looks, Sights
 
 ADDED = "added"
 """Where in the folder of work the dataset of the added passes is kept."""
+_NOTE_ON_CONTROL = (
+    "the map had been moved to control points, and its dataset had not: this one is in the frame of the dataset "
+    "(valuemap map with --control moves a map of all the data to them)"
+)
 DRIVES_OF_NEW = 2
 """So many drives must have met what only the added passes have: a parked van is met by one."""
 _DATASET_FILES = (MARKER, "cameras.parquet", "images.parquet", "detections.parquet")
@@ -116,8 +121,10 @@ def update_map(
             rebuilt, cells, alone, posed, images_before = _updated_in_memory(*both, before, run, beside, progress)
             if not is_cut:  # Beside what comes next: both take one core.
                 written = beside.submit(_write, both[0], run)
-        before = _in_frame_of(rebuilt, before)
+        before, is_put_back = _in_frame_of(rebuilt, before)
         result, changes, bridge = compare(before, rebuilt, alone, posed, images_before, progress=progress)
+        if is_put_back:
+            result = replace(result, run={**result.run, "notes": [_NOTE_ON_CONTROL, *result.run["notes"]]})
         result = replace(result, rejected=rejected_of_map(result, lambda: _with_detections(posed, run)))
         if written is not None:
             written.result()
@@ -315,20 +322,34 @@ def has_appeared(first: Looks, second: Looks) -> bool:
     return first.say_gone and second.say_there and second.seen_by >= DRIVES_OF_NEW
 
 
-def _in_frame_of(rebuilt: Map, before: Map) -> Map:
-    """Return the map before where the rebuilt one is, if poses were corrected for either.
+def _in_frame_of(rebuilt: Map, before: Map) -> tuple[Map, bool]:
+    """Return the map before where the rebuilt one is, and whether it was put back from its control points.
 
-    Corrected poses are about the mean of all drives, and that of more drives is elsewhere.
+    Control points move a map, and its dataset only where that is written. Corrected poses are about the mean of all
+    drives, and that of more drives is elsewhere.
     """
     was_corrected = before.run.get("poses", {}).get("drives") and before.run["poses"]["found"] != "nothing"
-    if rebuilt.corrected is None and not was_corrected:
-        return before
+    is_corrected, was_moved = rebuilt.corrected is not None or was_corrected, "control" in before.run
+    if not (is_corrected or was_moved):
+        return before, False
     row, _ = match_labels(before.labels, before.votes, rebuilt.labels, rebuilt.votes)
-    moved = rebuilt.labels.position_in_world_m[row >= 0] - before.labels.position_in_world_m[row[row >= 0]]
-    if not len(moved):
-        return before
-    position = before.labels.position_in_world_m + np.median(moved, axis=0)
-    return replace(before, labels=before.labels.replace(position_in_world_m=position))
+    place_m, labels = rebuilt.labels.position_in_world_m[row >= 0], before.labels
+    if not len(place_m):
+        return before, False
+
+    def away_m(labels: Labels) -> Floats:
+        return place_m - labels.position_in_world_m[row[row >= 0]]
+
+    is_put_back = False
+    if was_moved:
+        back = labels_before_control(before)
+        far_m, near_m = (float(np.median(np.linalg.norm(away_m(each), axis=1))) for each in (labels, back))
+        if is_put_back := near_m < far_m:
+            labels = back
+    if is_corrected:
+        position = labels.position_in_world_m + np.median(away_m(labels), axis=0)
+        labels = labels.replace(position_in_world_m=position)
+    return replace(before, labels=labels), is_put_back
 
 
 def _map_alone(added: Dataset, before: Map, run: Run, progress: Progress) -> Map:
@@ -475,10 +496,8 @@ def _lookout(
     # Whole passes, since an order is told by all of it.
     of_passes = np.flatnonzero(np.isin(images.pass_id.codes, images.pass_id.codes[near]))
     drives = find_drives(images.take(of_passes), viewpoint_step_m=max_range_m * VIEWPOINT_SHARE)
-    among = np.searchsorted(of_passes, near)
-    columns = ("pass_code", "order", "driven_m", "viewpoint")
+    drives = drives.take(np.searchsorted(of_passes, near))
     part = replace(joined, images=images.take(near), detections=Detections.none())
-    drives = replace(drives, **{name: getattr(drives, name)[among] for name in columns})
     labels = replace(asked, votes=votes[:0])
     return Lookout(Evidence(labels, part), drives, is_new[near], votes)
 
