@@ -1,4 +1,4 @@
-"""Pictures whose width and height are exchanged."""
+"""Pictures whose width and height are exchanged, and focal lengths in other units."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from check_faults import good_city, sides_exchanged
+from valuemap.check.contest import hold_contest
 from valuemap.check.fault import View, with_detections
-from valuemap.check.lenses import SidesExchanged, with_params
+from valuemap.check.lenses import FocalUnit, SidesExchanged, with_params
 from valuemap.dataset import Dataset
 
 
@@ -49,3 +50,38 @@ def test_boxes_and_principal_points_both_tell(city: Dataset) -> None:
     assert SidesExchanged().find(View(with_params(city, params))) is None
     assert SidesExchanged().find(View(with_params(exchanged, params))) is None
     assert SidesExchanged().find(View(city)) is None
+
+
+@pytest.mark.parametrize(
+    ("width_mm", "how"),
+    [
+        (5.8, "focal lengths in millimetres of a sensor 5.8 mm wide"),
+        (23.5, "focal lengths in millimetres of a sensor 23.5 mm wide"),
+        (36.0, "focal lengths in millimetres of film 36 mm wide"),
+        (1.0, "focal lengths in shares of the longer side of the picture"),
+    ],
+)
+def test_focal_lengths_are_in_the_unit_that_lenses_have(city: Dataset, width_mm: float, how: str) -> None:
+    """What EXIF says of a phone, 4.2 mm, is no share of its picture."""
+    params = [each.copy() for each in city.cameras.params]
+    longer = np.maximum(city.cameras.width_px, city.cameras.height_px)
+    for each, px in zip(params, longer.tolist(), strict=True):
+        each[:2] *= width_mm / px
+    given = with_params(city, params)
+    finding = hold_contest(View(given), [FocalUnit()]).finding
+    assert finding is not None
+    assert f"Read as {how}," in finding.why
+    assert finding.fix is not None
+    for fixed, right in zip(finding.fix(given).cameras.params, city.cameras.params, strict=True):
+        np.testing.assert_allclose(fixed, right)
+
+
+def test_units_are_tried_that_a_lens_can_have(city: Dataset) -> None:
+    def units(focal: float) -> list[str]:
+        params = [np.array([focal, focal, *each[2:]]) for each in city.cameras.params]
+        return [how for how, _ in FocalUnit().readings(with_params(city, params))]
+
+    assert not any("share" in how for how in units(2.1))
+    assert any("share" in how for how in units(1.9))
+    assert sum("sensor" in how for how in units(1.6)) == 8
+    assert not any("sensor" in how for how in units(1.4))

@@ -1,4 +1,4 @@
-"""Images at a place where no car was."""
+"""Images at a place where no car was, and names of classes that are spelled in several ways."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from check_faults import good_city, good_rig
 from valuemap.cameras import camera_centers
 from valuemap.check import quality
 from valuemap.check.examine import _look
-from valuemap.check.fault import View, with_centers, with_images
-from valuemap.check.quality import nowhere
+from valuemap.check.fault import View, with_centers, with_detections, with_images
+from valuemap.check.quality import ClassSpelling, nowhere
 from valuemap.dataset import Dataset
 from valuemap.progress import silent
 from valuemap.tables import Bools, Categories
@@ -61,3 +61,29 @@ def test_passes_of_one_image_jump_nowhere(city: Dataset) -> None:
     center = np.where(without_fix(city, 0.15)[:, None], 0.0, camera_centers(city.images))
     names = Categories.from_texts([f"pass-{row}" for row in range(len(city.images))])
     assert not nowhere(with_images(with_centers(city, center), pass_id=names).images).any()
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "is_one"),
+    [
+        ("W1-11", "W11-1", False),
+        ("speed limit 3.5", "speed limit 35", False),
+        ("274-1", "2741", False),
+        ("C3", "C3s", False),
+        ("R1 1", "r1-1", True),
+        ("traffic_light", "Traffic Lights", True),
+        ("stop-sign-2", "stopsign2", True),
+        ("ÉCOLES", "école", True),
+        ("--", "-", True),
+    ],
+)
+def test_codes_that_digits_make_are_no_spellings_of_each_other(
+    one: str, other: str, is_one: bool, city: Dataset
+) -> None:
+    names = [other if row % 3 else one for row in range(len(city.detections))]
+    spoiled = with_detections(city, class_name=Categories.from_texts(names))
+    finding = ClassSpelling().find(View(spoiled))
+    assert (finding is not None) == is_one
+    if finding is not None:
+        assert finding.fix is not None
+        assert finding.fix(spoiled).detections.class_name.names == (other,)

@@ -9,6 +9,7 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
+from valuemap import csv_table
 from valuemap.csv_table import odd_fields, read_csv_arrow
 from valuemap.errors import InputError
 
@@ -63,6 +64,21 @@ def test_empty_rows_at_the_end_of_a_large_file_are_none(tmp_path: Path) -> None:
     content = "x,y,z,class\n" + "\n".join(rows) + "\n"
     assert len(read(tmp_path, content.encode())) == len(rows)
     assert len(read(tmp_path, (content + ",,,\n,,,\n").encode())) == len(rows)
+
+
+@pytest.mark.parametrize("block", [997, 2**24])
+@pytest.mark.parametrize("comment", ['"first line\nsecond, ""line"""', '6" wide'])
+def test_line_breaks_in_quotation_marks_are_no_ends_of_rows(
+    comment: str, block: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a file of 1.7 MB: Arrow looks at one after the other."""
+    monkeypatch.setattr(csv_table, "_START", 1000)
+    monkeypatch.setattr(csv_table, "_BLOCK", block)
+    count = 300 if block < 1000 else 40_000
+    rows = [f"{number},2,3.5,light,{comment}" for number in range(count)]
+    found = read(tmp_path, ("x,y,z,class,comment\n" + "\n".join(rows) + "\n").encode())
+    assert [row["x"] for row in found] == list(range(count))
+    assert {row["class"] for row in found} == {"light"}
 
 
 def test_which_fields_are_no_numbers_is_known(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from valuemap.errors import InputError, SettingError
 from valuemap.geodesy import (
     accuracy_note,
     crs_from_lon_lat_height,
+    degrees_outside,
     enu_from_lon_lat_height,
     lon_lat_height_from_crs,
     lon_lat_height_from_enu,
@@ -175,3 +176,19 @@ def test_heights_of_a_vertical_system_need_its_grid() -> None:
             "Grid us_nga_egm96_15.tif is not available"
         )
         assert "--vertical in metres" in refusal.value.hint
+
+
+@pytest.mark.parametrize(
+    ("crs", "outside"),
+    [
+        ("EPSG:32632", [0.0, 0.5, 1.0, 4.0, 172.0]),  # 6 to 12 E, 0 to 84 N.
+        ("EPSG:32632+5773", [0.0, 0.5, 1.0, 4.0, 172.0]),
+        ("EPSG:3832", [80.0, 80.5, 75.0, 80.0, 0.0]),  # 98.69 E to 68 W, across the date line.
+        ("EPSG:4326", [0.0] * 5),
+        ("+proj=utm +zone=32", None),
+    ],
+)
+def test_how_far_places_are_from_where_a_system_is_for(crs: str, outside: list[float] | None) -> None:
+    lon_lat = [[12.0, 50.0], [12.5, 50.0], [7.0, -1.0], [12.0, -4.0], [-176.0, 50.0]]
+    found = degrees_outside(np.array([[*each, 0.0] for each in lon_lat]), crs)
+    assert (None if found is None else found.round(9).tolist()) == outside

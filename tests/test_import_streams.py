@@ -137,13 +137,7 @@ def test_texts_that_repeat_are_held_once() -> None:
     assert texts.distinct == ["b", "a", ""]
     assert (texts[2], list(texts[1:3]), texts.index("a"), len(texts)) == ("b", ["a", "b"], 1, 5)
     assert Texts.of(texts) is texts
-    categories = texts.categories(str.upper)
-    assert categories.names == ("", "A", "B")
-    assert categories.texts() == ["B", "A", "B", "", "A"]
-    # What no row has is no category.
-    assert texts[1:3].categories(str).names == ("a", "b")
     assert list(Texts.repeated("x", 2)) == ["x", "x"]
-    assert Texts.of([]).categories(str).names == ()
 
 
 # COCO's files.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import runpy
 import shutil
@@ -14,15 +15,19 @@ import numpy as np
 import pyarrow.csv
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 from reading import refusal
 from valuemap.cameras import camera_centers, cast_rays
+from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, read_dataset, write_dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.readers import READERS
 from valuemap.readers.colmap import read_colmap
+from valuemap.readers.detections import DetectionFile
 from valuemap.readers.kitti import read_kitti
 from valuemap.readers.names import match_images
 from valuemap.tables import table_to_arrow
@@ -356,7 +361,7 @@ def test_passes_from_a_file(tmp_path: Path, model_dir: Path, coco: Path) -> None
         (None, "expected folder, none or a CSV file"),
         ("", "Empty CSV"),
         ("image,pass\n", "no rows"),
-        ("name,pass\na/0.jpg,1\n", "expected one column 'image'"),
+        ("name,pass\na/0.jpg,1\n", "expected a column 'image' in the first line, found name, pass"),
         ("image,pass\na/0.jpg\n", "Expected 2 columns"),
         ("image,pass\na/0.jpg,1\na/1.jpg,1\n", "image 'a/2.jpg' of the model is not in it (4 of 6 images)"),
         ("image,pass\na/0.jpg,1\na/0.jpg,2\n", "image 'a/0.jpg' is in two passes, '1' and '2'"),
@@ -777,6 +782,42 @@ def test_kitti_pixels_get_half_a_pixel(tmp_path: Path) -> None:
     assert dataset.detections.size_px.tolist() == [[13.0, 25.0]]
     assert dataset.detections.class_name.texts() == ["sign"]
     assert dataset.detections.score.tolist() == [1.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "center"),
+    [
+        ("boxes.csv", {"pixel_center": 0.0}, [318.0, 151.0]),
+        ("boxes.csv", {"pixel_center": 0.5}, [317.5, 150.5]),
+        ("boxes.csv.gz", {}, [318.0, 151.0]),
+        ("boxes.tsv", {"format": "csv"}, [318.0, 151.0]),
+        ("boxes.csv", {"fractions": True}, [317.5, 150.5]),
+        ("boxes.csv", {"fractions": True, "pixel_center": 0.0}, [318.0, 151.0]),
+    ],
+)
+def test_kitti_boxes_are_read_as_somebody_says(
+    name: str, options: dict[str, Any], center: list[float], tmp_path: Path
+) -> None:
+    corners = np.array([[311.0, 138.0], [324.0, 163.0]])
+    if "fractions" in options:
+        corners /= IMAGE_SIZE
+    text = "frame,x1,y1,x2,y2\n1," + ",".join(map(repr, corners.ravel().tolist())) + "\n"
+    arguments = write_kitti(tmp_path, boxes=text)
+    path = tmp_path / name
+    path.write_bytes(gzip.compress(text.encode()) if name.endswith(".gz") else text.encode())
+    dataset = read_kitti(**{**arguments, "detections": DetectionFile(path, **options)})
+    assert_allclose(dataset.detections.center_px, [center])
+    assert_allclose(dataset.detections.size_px, [[13.0, 25.0]])
+
+
+def test_the_pixels_of_kitti_from_the_command_line(tmp_path: Path) -> None:
+    arguments = write_kitti(tmp_path, boxes="frame,x1,y1,x2,y2\n1,311,138,324,163\n")
+    command = ["import", "kitti", "--poses", str(arguments["poses"]), "--detections", str(arguments["detections"])]
+    command += ["--intrinsics", *map(str, INTRINSICS), "--image-size", *map(str, IMAGE_SIZE)]
+    for options, x in (([], 318.0), (["--detection-pixel-center", "0.5"], 317.5)):
+        done = CliRunner().invoke(app, [*command, "--force", "--out", str(tmp_path / "out"), *options])
+        assert done.exit_code == 0, done.output
+        assert read_dataset(tmp_path / "out").detections.center_px[0, 0] == x
 
 
 def test_kitti_class_score_and_any_order_of_rows(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from valuemap.cameras import camera_centers, cast_rays, rotation_matrices
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, read_dataset, write_dataset
 from valuemap.errors import InputError, SettingError
+from valuemap.geodesy import accuracy_note
 from valuemap.readers.bearings import VERTICAL_SIGMA_PX, read_bearings
 from valuemap.readers.csv_poses import read_csv_poses
 from valuemap.readers.detections import DetectionFile
@@ -172,6 +173,45 @@ def test_a_heading_in_a_map_projection_is_that_of_its_grid(tmp_path: Path) -> No
     assert_allclose(np.linalg.norm(step), 100.0 / 0.99994, atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("crs", "x", "y", "step", "said", "hint"),
+    [
+        ("EPSG:32632", 691000.0, 5335000.0, 10.0, "lat 4.79, lon 48.94", "x is the easting, y the northing"),
+        ("EPSG:4258", 11.5, 48.1, 1e-4, "lat 11.5, lon 48.1", "x is the longitude, y the latitude"),
+    ],
+)
+def test_exchanged_eastings_and_northings_are_far_from_where_the_system_is_for(
+    tmp_path: Path, crs: str, x: float, y: float, step: float, said: str, hint: str
+) -> None:
+    """An image without a fix, at 0, 0, says nothing about the others."""
+    header, lost = "image,x,y,heading_deg", "c.jpg,0,0,0"
+    rows = [f"a.jpg,{y},{x},0", f"b.jpg,{y},{x + step},0", lost]
+    with pytest.raises(InputError, match=f"crs {crs}: positions are at {said}, .* degrees outside the area") as error:
+        read_csv_poses(poses_of(tmp_path, header, *rows), camera=CAMERA, crs=crs)
+    assert error.value.hint == f"{hint}: are they exchanged?"
+    right = [f"a.jpg,{x},{y},0", f"b.jpg,{x},{y + step},0", lost]
+    told: list[str] = []
+    assert len(read_csv_poses(poses_of(tmp_path, header, *right), camera=CAMERA, crs=crs, tell=told.append).images) == 3
+    assert not told
+
+
+def test_a_system_of_all_of_a_country_may_be_used_outside_of_its_zone(tmp_path: Path) -> None:
+    """The east of Norway is in zone 33 by law."""
+    x, y = Transformer.from_crs("EPSG:4326", "EPSG:25833", always_xy=True).transform(30.6, 69.9)
+    poses = poses_of(tmp_path, "image,x,y,heading_deg", f"a.jpg,{x!r},{y!r},0", f"b.jpg,{x!r},{y + 10.0!r},0")
+    told: list[str] = []
+    assert len(read_csv_poses(poses, camera=CAMERA, crs="EPSG:25833", tell=told.append).images) == 2
+    (line,) = told
+    said = "crs EPSG:25833: positions are at lat 69.9, lon 30.6, 13 degrees outside the area it is made for"
+    assert line == said
+    arguments = ["import", "csv", str(poses), "--crs", "EPSG:25833", "--camera", CAMERA]
+    assert f"note: {said}\n" in CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "d")]).stderr
+    britain = poses_of(tmp_path, "image,x,y,heading_deg", "a.jpg,530000,180000,0", "b.jpg,530000,180010,0")
+    arguments = ["import", "csv", str(britain), "--crs", "EPSG:27700", "--camera", CAMERA]
+    done = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "e")])
+    assert f"note: {accuracy_note('EPSG:27700')}\n" in done.stderr
+
+
 def earth_centred(lon_lat_height: Floats) -> Floats:
     to_earth = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
     return np.stack(to_earth.transform(*lon_lat_height.T), axis=1)
@@ -218,6 +258,23 @@ def test_heights_above_the_sea_are_brought_to_the_ellipsoid(
     assert plain.frame.anchor is not None
     assert above_sea.frame.anchor[2] == pytest.approx(plain.frame.anchor[2] + 43.5, abs=1e-6)
     assert_allclose(camera_centers(above_sea.images), camera_centers(plain.images), atol=1e-4)
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_times_and_parameters_have_decimal_commas_too(separator: str, tmp_path: Path) -> None:
+    table = """image,lat,lon,heading_deg,timestamp,width_px,height_px,model,params
+a.jpg,52.5,4.25,0.5,1700000000.25,1280,720,PINHOLE,800.5 801 640 360.25
+b.jpg,52.5001,4.25,0.5,2023-11-14T22:13:21.5Z,1280,720,PINHOLE,800.5 801 640 360.25
+"""
+    table = table.replace(",", separator).replace(".", ",").replace(",jpg", ".jpg")
+    dataset = read_csv_poses(write(tmp_path / "poses.csv", table))
+    assert dataset.images.timestamp_s is not None
+    assert_allclose(dataset.images.timestamp_s, [1700000000.25, 1700000001.5])
+    assert [params.tolist() for params in dataset.cameras.params] == [[800.5, 801.0, 640.0, 360.25]]
+    assert dataset.frame.anchor == (52.5, 4.25, 0.0)
+    quoted = 'image,lat,lon,heading_deg,timestamp\na.jpg,52,4,0,"1700000000,25"\n'
+    said = refusal(lambda: read_csv_poses(write(tmp_path / "quoted.csv", quoted), camera=CAMERA))
+    assert "timestamp: expected seconds or an ISO 8601 time, found '1700000000,25'" in said
 
 
 def test_heights_in_a_frame_of_its_own_have_no_zero(tmp_path: Path) -> None:

@@ -79,7 +79,7 @@ def test_tags_of_a_picture(tmp_path: Path) -> None:
     assert found.lat_lon is not None
     assert_allclose(np.array(found.lat_lon), [-33.5, -70.25], atol=1e-9)
     assert (found.height_m, found.sigma_m, found.heading_deg, found.roll_deg) == (-12.0, 2.5, 271.5, 90.0)
-    assert found.time_s == 1_700_000_000.5
+    assert (found.gps_time_s, found.camera_time_s) == (1_700_000_000.5, None)
     # A film is 36 mm wide.
     assert found.focal_px == 300.0
     assert not found.is_panorama
@@ -91,8 +91,8 @@ def test_times_of_a_camera_with_a_zone_and_parts_of_a_second(tmp_path: Path) -> 
         "OffsetTimeOriginal": "+01:00",
         "SubsecTimeOriginal": "25",
     }
-    assert read_exif(picture(tmp_path / "a.jpg", tags(1, 2, **options))).time_s == 1_700_000_000.25
-    assert read_exif(picture(tmp_path / "b.jpg", tags(1, 2, DateTimeOriginal="yesterday"))).time_s is None
+    assert read_exif(picture(tmp_path / "a.jpg", tags(1, 2, **options))).camera_time_s == 1_700_000_000.25
+    assert read_exif(picture(tmp_path / "b.jpg", tags(1, 2, DateTimeOriginal="yesterday"))).camera_time_s is None
 
 
 def test_tags_that_make_no_sense_are_taken_for_missing(tmp_path: Path) -> None:
@@ -109,9 +109,89 @@ def test_a_panorama_says_so_in_its_xmp(tmp_path: Path) -> None:
     for name, body in (("a.jpg", f"<rdf:Description {attributes}/>"), ("b.jpg", elements)):
         found = read_exif(picture(tmp_path / name, tags(1, 2), (64, 32), xmp=f"<x>{body}</x>".encode()))
         assert found.is_panorama
+        assert not found.is_cut
     first = read_exif(tmp_path / "a.jpg")
     assert (first.heading_deg, first.pitch_deg, first.roll_deg) == (90.5, 0.0, -2.0)
     assert read_exif(tmp_path / "b.jpg").pitch_deg == 3.0
+
+
+def panorama(path: Path, size: tuple[int, int], lat: float, **pano: float) -> Path:
+    attributes = "".join(f' GPano:{name}="{value}"' for name, value in pano.items())
+    xmp = f'<x><rdf:Description GPano:ProjectionType="equirectangular"{attributes}/></x>'
+    return picture(path, tags(lat, 4.0), size, xmp=xmp.encode())
+
+
+def test_panoramas_that_are_cut_are_listed_and_left_out(tmp_path: Path) -> None:
+    """By their tags, by their shape alone, or by both; one made smaller may be a pixel off."""
+    full = {"FullPanoWidthPixels": 128, "FullPanoHeightPixels": 64, "PoseHeadingDegrees": 90}
+    panorama(tmp_path / "whole.jpg", (129, 64), 52.0, **full, CroppedAreaImageHeightPixels=64)
+    panorama(tmp_path / "wide.jpg", (128, 64), 52.0001, **full, CroppedAreaImageWidthPixels=96)
+    panorama(tmp_path / "low.jpg", (128, 40), 52.0002, **full, CroppedAreaImageHeightPixels=40)
+    panorama(tmp_path / "untold.jpg", (128, 40), 52.0003, PoseHeadingDegrees=90)
+    dataset = read_pictures(tmp_path, max_rejected=0.9)
+    assert dataset.images.name.to_pylist() == ["whole.jpg"]
+    assert dataset.rejected is not None
+    assert sorted(dataset.rejected.image_name.to_pylist()) == ["low.jpg", "untold.jpg", "wide.jpg"]
+    assert all("a panorama that is cut" in reason for reason in dataset.rejected.reason.texts())
+    assert "3 of 4 pictures cannot be used" in refusal(lambda: read_pictures(tmp_path))
+    assert len(read_pictures(tmp_path, camera="EQUIRECTANGULAR 128 64").images) == 4
+
+
+def test_pictures_without_the_time_of_the_gps_have_the_corrected_one_of_the_camera(tmp_path: Path) -> None:
+    """A camera's clock is two hours and some seconds ahead; in another folder nobody knows."""
+
+    def taken(name: str, minute: int, *, off_s: float | None = None) -> None:
+        gps: dict[str, Any] = {}
+        if off_s is not None:
+            gps = {"GPSDateStamp": "2023:11:14", "GPSTimeStamp": (20.0, float(minute), 10.0 - off_s)}
+        local = f"2023:11:14 22:{minute:02d}:10"
+        lat = 52.0 + minute * 1e-4
+        picture(tmp_path / name, tags(lat, 4.0, GPSImgDirection=0.0, DateTimeOriginal=local, **gps))
+
+    taken("a/3.jpg", 1, off_s=5.0)
+    taken("a/2.jpg", 2)
+    taken("a/1.jpg", 3, off_s=4.0)
+    taken("a/0.jpg", 4, off_s=6.0)
+    taken("b/0.jpg", 1)
+    taken("b/1.jpg", 2)
+    images = read_pictures(tmp_path, poses="exif").images
+    assert images.timestamp_s is not None
+    at_20 = 1_699_992_000.0
+    expected = {
+        "a/3.jpg": 65.0,
+        "a/2.jpg": 125.0,
+        "a/1.jpg": 186.0,
+        "a/0.jpg": 244.0,
+        "b/0.jpg": 7270.0,
+        "b/1.jpg": 7330.0,
+    }
+    found = dict(zip(images.name.to_pylist(), (images.timestamp_s - at_20).tolist(), strict=True))
+    assert found == expected
+
+
+def test_altitudes_above_the_sea_are_brought_to_the_ellipsoid(tmp_path: Path) -> None:
+    """Those that EXIF 3.0 says to be above the ellipsoid (0, 1) stay; there 2 and 3 are above and below the sea."""
+    references = [
+        (b"\x00", b"0232", 10.0),
+        (b"\x01", b"0232", -10.0),
+        (b"\x00", b"0300", 10.0),
+        (b"\x03", b"0300", -10.0),
+    ]
+    for number, (reference, version, _) in enumerate(references):
+        more: dict[str, Any] = {"GPSAltitudeRef": reference, "ExifVersion": version, "GPSImgDirection": 0.0}
+        picture(tmp_path / f"{number}.jpg", tags(52.0 + number * 1e-4, 4.0, 10.0, **more))
+    without = tags(52.0005, 4.0, GPSImgDirection=0.0)
+    del without._ifds[IFD.GPSInfo][GPS.GPSAltitude]
+    picture(tmp_path / "4.jpg", without)
+    assert read_exif(tmp_path / "4.jpg").height_m is None
+
+    def heights(vertical: str | None) -> list[float]:
+        images = read_pictures(tmp_path, poses="exif", vertical=vertical, anchor=(52.0, 4.0, 0.0)).images
+        found: list[float] = camera_centers(images)[:, 2].round(2).tolist()
+        return found
+
+    assert heights(None) == [10.0, -10.0, 10.0, -10.0, 0.0]
+    assert heights("40") == [50.0, 30.0, 10.0, 30.0, 30.0]
 
 
 # Headings as they are.

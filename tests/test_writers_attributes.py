@@ -258,7 +258,7 @@ def test_sign_codes_know_classes_by_their_words() -> None:
         assert found is not None
         assert (found[0].vienna, found[0].mutcd) == ("B,2a", "R1-1")
     for name in ("regulatory--maximum-speed-limit-50--g1", "speed_limit_50", "Speed limit 50"):
-        assert osm_tags(name) == {"traffic_sign": "maxspeed", "maxspeed": "50"}
+        assert osm_tags(name) == {"traffic_sign": "maxspeed", "valuemap:number": "50"}
     assert osm_tags("traffic_light") == {"highway": "traffic_signals"}
     assert osm_tags("object--street-light") == {"highway": "street_lamp"}
     assert find_sign("dragon {} 7") is None

@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import geopandas
 import numpy as np
+import pyarrow as pa
 import pycolmap
 import pyogrio
 import pytest
@@ -23,10 +24,12 @@ from valuemap.dataset import Frame
 from valuemap.errors import InputError
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import Map
+from valuemap.readers.colmap import read_colmap
 from valuemap.tables import Floats, Votes
 from valuemap.writers import export_map
 from valuemap.writers.attributes import Export
 from valuemap.writers.lanelet2 import lower_edges
+from valuemap.writers.poses import write_poses
 
 GEOREFERENCED = Frame(anchor=ANCHOR)
 POSITIONS = np.array([[4.0, 25.0, 5.0], [12.0, 20.0, 2.0], [-30.0, 50.0, 3.0]])
@@ -126,6 +129,27 @@ def test_geopackage_has_labels_ellipses_votes_and_cameras(tmp_path: Path) -> Non
     assert first[:2] == (cameras.geometry.x[0], cameras.geometry.y[0])
     assert last[:2] == (labels.geometry.x[0], labels.geometry.y[0])
     assert votes["picture"].tolist()[0] == "a/1.jpg"
+
+
+def test_a_map_with_y_down_is_seen_from_above(tmp_path: Path) -> None:
+    """As KITTI has it: x right is east, z ahead is north."""
+    frame = Frame(up=(0.0, -1.0, 0.0))
+    dataset, result = small_dataset(frame), a_map(frame)
+    for name in ("map.gpkg", "map.fgb"):
+        export_map(result, tmp_path / name, dataset=dataset)
+        labels = geopandas.read_file(tmp_path / name, layer="labels").sort_values("label_id")
+        assert_allclose(labels[["x", "y", "z"]], POSITIONS)
+        points = labels.geometry
+        assert_allclose(np.stack([points.x, points.y, points.z], axis=1), POSITIONS[:, [0, 2, 1]] * [1.0, 1.0, -1.0])
+    ellipses, votes, cameras = (
+        geopandas.read_file(tmp_path / "map.gpkg", layer=name) for name in ("ellipses", "votes", "cameras")
+    )
+    points = geopandas.read_file(tmp_path / "map.gpkg", layer="labels").geometry
+    assert ellipses.geometry.contains(points).all()
+    centers = camera_centers(dataset.images)[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+    assert_allclose(np.stack([cameras.geometry.x, cameras.geometry.y, cameras.geometry.z], axis=1), centers, atol=1e-9)
+    assert_allclose(votes.geometry[0].coords[0], centers[0], atol=1e-9)
+    assert votes.geometry[0].coords[-1] == points[0].coords[0]
 
 
 def test_lines_and_areas_of_a_geopackage_do_not_go_around_the_earth(tmp_path: Path) -> None:
@@ -348,6 +372,26 @@ def test_colmap_opens_the_map(tmp_path: Path) -> None:
     image = model.images[10]
     assert_allclose(image.projection_center(), camera_centers(dataset.images)[0], atol=1e-12)
     assert image.name == "a/1.jpg"
+
+
+@pytest.mark.parametrize("space", [" ", "\t", "\u3000"])
+def test_names_with_white_space_make_a_binary_model_that_is_read_back(space: str, tmp_path: Path) -> None:
+    plain = small_dataset()
+    names = [f"a{space}drive/{number}.jpg" for number in range(len(plain.images))]
+    dataset = dataclasses.replace(plain, images=plain.images.replace(name=pa.array(names)))
+    export_map(a_map(Frame()), tmp_path / "model", format_name="colmap", dataset=plain)
+    assert (tmp_path / "model" / "images.txt").exists()
+    export_map(a_map(Frame()), tmp_path / "model", format_name="colmap", dataset=dataset)
+    files = sorted(path.name for path in (tmp_path / "model").glob("[!.]*"))
+    assert files == ["cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin"]
+    model = pycolmap.Reconstruction(str(tmp_path / "model"))
+    assert sorted(image.name for image in model.images.values()) == names
+    assert len(model.points3D[0].track.elements) == 3
+    write_poses(a_map(Frame()), dataset, tmp_path / "poses")
+    for folder in (tmp_path / "model", tmp_path / "poses" / "colmap"):
+        read = read_colmap(folder, up=(0.0, 0.0, 1.0))
+        assert read.images.name.to_pylist() == names
+        assert_allclose(camera_centers(read.images), camera_centers(dataset.images), atol=1e-12)
 
 
 def test_colmap_needs_the_dataset(tmp_path: Path) -> None:

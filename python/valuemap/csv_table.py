@@ -76,7 +76,7 @@ def read_csv_portions(
             if any(field.type != types.get(field.name, field.type) for field in table.schema):
                 raise InputError(f"{path}: the first line has a quotation mark that is not closed", hint=hint)
             rows += len(table)
-            yield table
+            yield table.replace_schema_metadata({_MARK: _decimal_mark(separator)})
     except (pa.ArrowException, OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
         # A portion begins behind the header line, but for the first.
         reason = _ROW.sub(lambda row: f"Row #{int(row[1]) + (rows + 1 if names else 0)}", str(error).splitlines()[0])
@@ -84,10 +84,15 @@ def read_csv_portions(
 
 
 def _blocks(path: Path) -> Iterator[bytes]:
-    """Yield a text in blocks of whole lines."""
+    """Yield a text in blocks of whole lines, none of which ends in a field that a quotation mark begins."""
     with path.open("rb") as file:
         while block := file.read(_BLOCK):
-            yield block + file.readline()
+            lines = [block, file.readline()]
+            marks = sum(each.count(_QUOTE) for each in lines)
+            while marks % 2 and lines[-1]:  # Within a field they are there twice.
+                lines.append(file.readline())
+                marks += lines[-1].count(_QUOTE)
+            yield b"".join(lines)
 
 
 def _joined(tables: list[pa.Table]) -> pa.Table:
@@ -100,7 +105,8 @@ def _joined(tables: list[pa.Table]) -> pa.Table:
         odd = [_odd_fields(table.schema.field(column)) for table in tables]
         rows = np.concatenate([at + found for at, (found, _) in zip(first, odd, strict=False)])
         fields.append(field.with_metadata(_metadata(rows, next((text for found, text in odd if len(found)), ""))))
-    return pa.concat_tables([table.cast(pa.schema(fields)) for table in tables])
+    schema = pa.schema(fields, metadata=tables[0].schema.metadata)
+    return pa.concat_tables([table.cast(schema) for table in tables])
 
 
 def _start_of_large(path: Path) -> bytes | None:
@@ -121,6 +127,15 @@ def _start_of_large(path: Path) -> bytes | None:
     return start if len(start) == _START and is_plain and b"\n" in start else None
 
 
+def has_decimal_commas(table: pa.Table) -> bool:
+    """Say whether numbers of a table may have decimal commas, in its texts, too: no commas separate its fields."""
+    return bool(table.schema.metadata[_MARK] == b",")
+
+
+def _decimal_mark(separator: str) -> str:
+    return "." if separator == "," else ","
+
+
 def odd_fields(table: pa.Table, name: str) -> tuple[NDArray[np.int64], str]:
     """Return the rows of the fields of a column of numbers that are other texts, and the first of these."""
     return _odd_fields(table.schema.field(name))
@@ -135,6 +150,7 @@ def _metadata(odd_rows: NDArray[np.int64], text: str) -> dict[bytes, bytes] | No
     return {_ODD: text.encode(), _ODD_ROWS: odd_rows.tobytes()} if len(odd_rows) else None
 
 
+_MARK = b"valuemap: decimal mark"
 _ODD, _ODD_ROWS = b"valuemap: first field that is no number", b"valuemap: rows of fields that are no numbers"
 _NOTHING = frozenset({"", "nan", "na", "n/a", "none", "null", "-"})
 """How tables say that nothing is known."""
@@ -203,6 +219,7 @@ _BLOCK = 2**24
 _ROW = re.compile(r"Row #(\d+)")
 _NO_TEXT = (b"PK\3\4", b"PAR1")
 _SEPARATORS = b" \t\r\n,;"
+_QUOTE = b'"'
 _LOOKED_AT = 1000
 """Bytes that say what a file is."""
 
@@ -227,7 +244,7 @@ def _parse_csv(source: bytes, separator: str, options: Mapping[str, Any], names:
     return pa_csv.read_csv(
         pa.BufferReader(source),
         read_options=pa_csv.ReadOptions(use_threads=False, column_names=names),  # With threads errors say no row.
-        parse_options=pa_csv.ParseOptions(delimiter=separator),
+        parse_options=pa_csv.ParseOptions(delimiter=separator, newlines_in_values=_QUOTE in source),
         convert_options=pa_csv.ConvertOptions(**options),
     )
 
@@ -236,7 +253,7 @@ def _parse_odd_csv(
     source: bytes, separator: str, options: dict[str, Any], names: list[str] | None, bad_numbers_are_nan: bool
 ) -> pa.Table:
     """Read what cannot be read at once: decimal commas, or fields that should be numbers and are none."""
-    decimal = "." if separator == "," else ","
+    decimal = _decimal_mark(separator)
     try:
         return _parse_csv(source, separator, {**options, "decimal_point": decimal}, names)
     except pa.ArrowInvalid:

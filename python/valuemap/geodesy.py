@@ -71,6 +71,29 @@ def lon_lat_height_from_crs(position: Floats, crs: str) -> Floats:
     return found
 
 
+def degrees_outside(lon_lat_height: Floats, crs: str) -> Floats | None:
+    """Return how many degrees places (N, 3) are outside of the area that a system is made for, 0 inside.
+
+    These are degrees of longitude or latitude, whichever are more. None where the area is not known.
+    """
+    system = _system(crs)
+    area = (system.sub_crs_list[0] if system.is_compound else system).area_of_use
+    if area is None:
+        return None
+    west, south, east, north = area.bounds
+    lon, lat, _ = lon_lat_height.T
+    width = (east - west) % 360.0 or 360.0  # West of the date line longitudes go on with the negative ones.
+    beyond_east = (lon - west) % 360.0 - width
+    beside = np.minimum(beyond_east, 360.0 - width - beyond_east)
+    outside: Floats = np.max([beside, south - lat, lat - north, np.zeros(len(lat))], axis=0)
+    return outside
+
+
+def is_geographic(crs: str) -> bool:
+    """Say whether coordinates in a system are longitude and latitude."""
+    return bool(_system(crs).is_geographic)
+
+
 def crs_from_lon_lat_height(lon_lat_height: Floats, crs: str) -> Floats:
     """Return coordinates in a reference system: easting (or longitude), northing (or latitude) and height (N, 3).
 

@@ -133,15 +133,17 @@ class TiltConvention(Convention):
     name: ClassVar[str] = "tilt_convention"
     is_of_world: ClassVar[bool] = True
     what: ClassVar[str] = "Pitch or roll count the other way than they were read, or are taken for each other."
-    do: ClassVar[str] = "Say what the angles mean: pitch counts upwards, roll counts to the left."
+    do: ClassVar[str] = "Say what the angles mean: pitch counts upwards, roll with the right side down."
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield pitch, roll and both negated, and the one for the other."""
         yield "pitch the other way", _Tilts([[-1, 0], [0, 1]])
+        yield "roll the other way", _Tilts([[1, 0], [0, -1]])
         yield "pitch and roll the other way", _Tilts([[-1, 0], [0, -1]])
         yield "pitch and roll exchanged", _Tilts([[0, 1], [1, 0]])
         yield "pitch and roll exchanged, one the other way", _Tilts([[0, -1], [1, 0]])
         yield "pitch and roll exchanged, the other the other way", _Tilts([[0, 1], [-1, 0]])
+        yield "pitch and roll exchanged, both the other way", _Tilts([[0, -1], [-1, 0]])
 
 
 class DegreesForRadians(Convention):

@@ -18,6 +18,10 @@ FOCAL_LENGTHS = dict.fromkeys(_ONE_FOCAL_LENGTH, 1) | dict.fromkeys(_TWO_FOCAL_L
 _SHORT = 0.2
 """No camera has a focal length of less than this share of its picture's longer side: its unit is another one."""
 _FILM_MM = 36.0
+_SENSORS_MM = (4.8, 5.8, 6.4, 7.2, 8.8, 13.2, 17.3, 23.5)
+"""Common widths of sensors: those called 1/3, 1/2.5, 1/2, 1/1.8, 2/3 and 1 inch, Four Thirds and APS-C."""
+_SHORTEST_MM, _LONGEST_SHARE = 1.5, 2.0
+"""Lenses of common sensors are longer, and those of twice a picture's longer side see 28 degrees of it."""
 _OFF_MIDDLE = 0.05
 """Principal points are nearer to the middle than this share of the picture, or were mistaken for something else."""
 
@@ -30,7 +34,7 @@ class FocalUnit(Convention):
     do: ClassVar[str] = "Give fx and fy in pixels: for a picture w wide, w / 2 / tan(half the field of view)."
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
-        """Yield focal lengths in millimetres of film, in shares of the picture, and as angles."""
+        """Yield focal lengths in millimetres of film or of a sensor, in shares of the picture, and as angles."""
         cameras = dataset.cameras
         longer = np.maximum(cameras.width_px, cameras.height_px).astype(np.float64)
         focal = np.array([params[0] if focals(cameras, row) else np.nan for row, params in enumerate(cameras.params)])
@@ -42,9 +46,12 @@ class FocalUnit(Convention):
                     shares = _Shares(cameras, of_longer=of_longer)
                     if _are_square(shares(dataset).cameras):
                         yield f"all parameters in shares of {name}", shares
-            else:
+            elif np.nanmax(focal) <= _LONGEST_SHARE:
                 yield "focal lengths in shares of the longer side of the picture", Focal(longer)
             yield "focal lengths in millimetres of film 36 mm wide", Focal(longer / _FILM_MM)
+            if np.nanmin(focal) > _SHORTEST_MM:
+                for width in _SENSORS_MM:
+                    yield f"focal lengths in millimetres of a sensor {width:g} mm wide", Focal(longer / width)
             half = np.radians(np.clip(focal, 1.0, 179.0)) / 2.0
             yield "fields of view in degrees for focal lengths", Focal(cameras.width_px / 2.0 / np.tan(half) / focal)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections import defaultdict
 from typing import Any, ClassVar
 
@@ -433,8 +434,16 @@ def _grid_step(values: Floats) -> float | None:
 
 
 def _key(name: str) -> str:
-    letters = "".join(letter for letter in name.casefold() if letter.isalnum())
-    return letters[:-1] if letters.endswith("s") else letters
+    """Return a name without capitals, what separates its words, and a plural's s; codes as W1-11, 3.5 and C3s stay."""
+    parts = [part for part in _NO_LETTERS.split(name.casefold()) if part]
+    key = parts[0] if parts else ""
+    for part in parts[1:]:
+        key += f"-{part}" if key[-1].isdigit() and part[0].isdigit() else part
+    return _PLURAL.sub("", key)
+
+
+_NO_LETTERS = re.compile(r"[\W_]+")
+_PLURAL = re.compile(r"(?<=[^\W\d_]{3})s$")
 
 
 def _spellings(dataset: Dataset) -> list[set[str]]:

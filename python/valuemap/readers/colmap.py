@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import codecs
 import tempfile
-from collections import Counter
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -15,13 +14,15 @@ from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
 from valuemap.readers.colmap_files import copy_without_points, find_model, has_mark
-from valuemap.readers.csv_file import read_csv
+from valuemap.readers.csv_file import CsvFile
 from valuemap.readers.detections import DetectionFile, read_detections
+from valuemap.readers.files import refuse_repeated_names
 from valuemap.readers.names import match_images
 from valuemap.readers.reader import Reader
 from valuemap.tables import Cameras, Categories, Images, Ints
 
 _LARGEST_PX = 2**31
+_EXPECTED_PASSES = "a CSV file with columns image and pass"
 
 
 @Reader
@@ -133,12 +134,7 @@ def _with_poses(images: list[pycolmap.Image], names: list[str], pass_id: Categor
     poses = [image.cam_from_world() for image in images]
     quaternion = np.array([pose.rotation.quat for pose in poses])[:, [3, 0, 1, 2]]  # pycolmap: x, y, z, w.
     translation_m = np.array([pose.translation for pose in poses])
-    repeated = [name for name, count in Counter(names).items() if count > 1]
-    if repeated:
-        raise InputError(
-            f"{model_dir}: {len(repeated)} image names occur more than once, the first is {min(repeated)!r}",
-            hint="detections are matched by file name: give every image a name of its own",
-        )
+    refuse_repeated_names(names, str(model_dir))
     return Images(
         image_id=np.array([image.image_id for image in images], dtype=np.int64),
         name=pa.array(names, pa.string()),
@@ -167,9 +163,9 @@ def _passes(names: list[str], pass_from: str) -> list[str]:
             f"pass-from: expected folder, none or a CSV file, found {pass_from!r}: no such file",
             hint="a CSV file has the columns image and pass",
         )
-    table = read_csv(path, {"image": pa.string(), "pass": pa.string()}, {})
+    table = CsvFile(path, _EXPECTED_PASSES, texts=("image", "pass"), numbers=())
     pass_of: dict[str, str] = {}
-    for image, name in zip(table["image"].to_pylist(), table["pass"].to_pylist(), strict=True):
+    for image, name in zip(table.texts("image"), table.texts("pass"), strict=True):
         if pass_of.setdefault(image, name) != name:
             raise InputError(
                 f"{path}: image {image!r} is in two passes, {pass_of[image]!r} and {name!r}",

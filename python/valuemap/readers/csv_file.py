@@ -10,47 +10,17 @@ import numpy as np
 import pyarrow as pa
 
 from valuemap.arrow import numbers_from_arrow
-from valuemap.csv_table import odd_fields, read_csv_arrow, read_csv_portions
+from valuemap.csv_table import has_decimal_commas, odd_fields, read_csv_arrow, read_csv_portions
 from valuemap.errors import InputError, SettingError
 from valuemap.readers.files import check_file
 from valuemap.readers.texts import Texts
 from valuemap.tables import Bools, Floats
 
-_NAMES = {pa.int64(): "whole numbers", pa.float64(): "numbers", pa.string(): "texts"}
 _NAMES_OF_OTHERS = {
     "class": ("label", "category", "class_name", "category_name", "class_id", "category_id"),
     "score": ("conf", "confidence", "probability"),
 }
 """What detectors and their tools call these columns."""
-
-
-def read_csv(path: Path, required: Mapping[str, pa.DataType], optional: Mapping[str, pa.DataType]) -> pa.Table:
-    """Return the named columns of a CSV file with a header line, in the types given.
-
-    Optional columns that are absent are left out, as are columns that nobody asked for. What should be a float64 and
-    is no number is NaN, to be vetted; an empty field is an empty text.
-
-    Raises
-    ------
-    InputError
-        The file is missing, empty or no CSV, lacks a column, or a value is not of its type.
-    """
-    if not path.exists():
-        raise InputError(f"{path}: no such file", hint="check the path")
-    expected = ", ".join(f"{name} ({_NAMES[kind]})" for name, kind in required.items())
-    hint = f"expected a CSV file with columns {expected}"
-    table = read_csv_arrow(path, {**required, **optional}, has_missing=False, hint=hint, bad_numbers_are_nan=True)
-    columns = [name for name in (*required, *optional) if name in required or name in table.column_names]
-    for name in columns:
-        if table.column_names.count(name) != 1:
-            found = ", ".join(table.column_names)
-            raise InputError(
-                f"{path}: expected one column {name!r} in the first line, found {found}",
-                hint=hint,
-            )
-    if table.num_rows == 0:
-        raise InputError(f"{path}: no rows after the first line", hint="check what wrote the file")
-    return table.select(columns)
 
 
 class CsvFile:
@@ -159,6 +129,10 @@ class CsvFile:
         """Return a column as numbers (N), NaN where there is none or another text."""
         values: Floats = numbers_from_arrow(self._column(name)).astype(np.float64)
         return values
+
+    def with_points(self, text: str) -> str:
+        """Return a text of numbers with decimal points, where the file may have commas."""
+        return text.replace(",", ".") if has_decimal_commas(self._table) else text
 
     def some_numbers(self, name: str, hint: str) -> Floats:
         """Return a column as numbers (N), not all of which are NaN; `hint` says what to do where they are."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.pixel_center import shift_to_corner_px
 from valuemap.readers.poses import (
     AXES,
-    OnEarth,
+    Placed,
     height_where_none,
     local_from_cam,
     make_images,
@@ -48,15 +48,6 @@ _NO_HEIGHT = "write metres as plain numbers, or remove the column and give --cam
 _NO_NUMBER = "write plain numbers, or remove the column if nothing of it is known"
 
 
-@dataclass(frozen=True)
-class _Where:
-    """Positions, and what turns the local axes of each image into the world."""
-
-    position_m: Floats
-    world_from_local: Floats
-    anchor: tuple[float, float, float] | None
-
-
 @Reader
 def read_csv_poses(
     poses: Path,
@@ -74,6 +65,7 @@ def read_csv_poses(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
+    tell: Callable[[str], None] | None = None,
 ) -> Imported:
     """Read a table with one row an image.
 
@@ -112,6 +104,8 @@ def read_csv_poses(
     up, anchor, max_rejected
         As in `assemble`, but that up is z where orientations are angles. With `lat, lon` or `crs` the anchor is the
         origin, by default the first image by name.
+    tell
+        Called with each line that is worth knowing about the positions.
 
     Raises
     ------
@@ -128,13 +122,13 @@ def read_csv_poses(
     progress("reading the poses", 0, 2)
     table = CsvFile(poses, _EXPECTED, texts=_TEXTS, numbers=_NUMBERS, columns=columns)
     names = table.filled_texts("image")
-    where = _place(table, names, crs, vertical, anchor, up, camera_height_m)
+    where = _place(table, names, crs, vertical, anchor, up, camera_height_m, tell)
     cameras, camera_id = make_cameras(_with_readout(table, _cameras(table, camera, pixel_center)), str(poses))
     images = make_images(
         names=names,
         camera_id=camera_id,
         world_from_cam=where.world_from_local @ _local_from_cam(table, rotation, axes),
-        center_in_world_m=where.position_m,
+        center_in_world_m=where.position_in_world_m,
         passes=table.filled_texts("pass") if table.has("pass") else [ONE_PASS] * len(table),
         source=str(poses),
         timestamp_s=_timestamps(table) if table.has("timestamp") else None,
@@ -167,7 +161,8 @@ def _place(
     anchor: tuple[float, float, float] | None,
     up: tuple[float, float, float] | None,
     camera_height_m: float,
-) -> _Where:
+    tell: Callable[[str], None] | None,
+) -> Placed:
     level = np.full(len(table), height_where_none(camera_height_m))
     first = min(range(len(names)), key=names.__getitem__)
     source = str(table.path)
@@ -179,8 +174,8 @@ def _place(
         height = table.some_numbers("height", _NO_HEIGHT) if table.has("height") else level
         place = np.stack([table.some_numbers(name, _NO_DEGREES) for name in ("lon", "lat")] + [height], axis=1)
         if vertical is None:
-            return _on_earth(place_on_earth(place, anchor, first, source=source))
-        return _on_earth(place_in_crs(place, "EPSG:4326", anchor, first, vertical=vertical, source=source))
+            return place_on_earth(place, anchor, first, source=source)
+        return place_in_crs(place, "EPSG:4326", anchor, first, vertical=vertical, source=source)
     if not table.has("x", "y"):
         raise table.missing("lat, lon or x, y")
     height = next((table.some_numbers(name, _NO_HEIGHT) for name in ("z", "height") if table.has(name)), level)
@@ -188,16 +183,12 @@ def _place(
     if crs is not None:
         if up is not None:
             raise SettingError("up: does not go with crs", hint="leave it away: heights are along z")
-        return _on_earth(place_in_crs(position, crs, anchor, first, vertical=vertical, source=source))
+        return place_in_crs(position, crs, anchor, first, vertical=vertical, source=source, tell=tell)
     if vertical is not None:
         raise SettingError(
             f"vertical {vertical}: does not go with x, y in a frame of their own", hint="give --crs, or leave it away"
         )
-    return _Where(position, np.broadcast_to(np.eye(3), (len(table), 3, 3)), anchor)
-
-
-def _on_earth(placed: OnEarth) -> _Where:
-    return _Where(placed.position_in_world_m, placed.world_from_local, placed.anchor)
+    return Placed(position, np.broadcast_to(np.eye(3), (len(table), 3, 3)), anchor)
 
 
 def _local_from_cam(table: CsvFile, rotation: str, axes: str) -> Floats:
@@ -235,7 +226,7 @@ def _cameras(table: CsvFile, camera: str | None, pixel_center: float) -> list[Ca
     if table.has("model", "width_px", "height_px", "params"):
         sizes = zip(table.whole_numbers("width_px"), table.whole_numbers("height_px"), strict=True)
         parts = zip(table.filled_texts("model"), sizes, table.texts("params"), strict=True)
-        joined = [f"{model} {width} {height} {params}" for model, (width, height), params in parts]
+        joined = [f"{model} {width} {height} {table.with_points(params)}" for model, (width, height), params in parts]
         parsed: dict[str, Camera] = {}
         for row, text in enumerate(joined):
             if text not in parsed:
@@ -276,7 +267,7 @@ def _seconds(text: str, table: CsvFile, row: int) -> float:
     if not text:
         return math.nan
     try:
-        seconds = float(text)
+        seconds = float(table.with_points(text))
     except ValueError:
         try:
             time = datetime.fromisoformat(text)

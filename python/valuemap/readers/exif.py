@@ -26,21 +26,26 @@ class Exif:
     """What is known of one picture; None where it does not say.
 
     `lat_lon` in degrees, `height_m`, `sigma_m` (horizontal), `heading_deg` clockwise from north, `pitch_deg` up and
-    `roll_deg` right side down, `focal_px`, `time_s` since 1970. Pictures of one `camera` have the same intrinsics.
+    `roll_deg` right side down, `focal_px`, `gps_time_s` and `camera_time_s` since 1970. Pictures of one `camera` have
+    the same intrinsics. A panorama that `is_cut` does not show the whole sphere. Heights count from the sea, unless
+    `is_ellipsoidal` says that they count from the ellipsoid.
     """
 
     width: int
     height: int
     is_panorama: bool
+    is_cut: bool
     camera: tuple[Any, ...]
     lat_lon: tuple[float, float] | None = None
     height_m: float | None = None
+    is_ellipsoidal: bool = False
     sigma_m: float | None = None
     heading_deg: float | None = None
     pitch_deg: float = 0.0
     roll_deg: float = 0.0
     focal_px: float | None = None
-    time_s: float | None = None
+    gps_time_s: float | None = None
+    camera_time_s: float | None = None
 
 
 def read_exif(path: Path) -> Exif:
@@ -71,15 +76,18 @@ def read_exif(path: Path) -> Exif:
         width=width,
         height=height,
         is_panorama="equirectangular" in pano,
+        is_cut="equirectangular" in pano and _is_cut(pano, width, height),
         camera=(str(main.get(Base.Make)), str(main.get(Base.Model)), width, height, focal_px),
         lat_lon=_lat_lon(gps),
         height_m=_height(gps),
+        is_ellipsoidal=_is_ellipsoidal(exif, gps),
         sigma_m=_positive(gps.get(GPS.GPSHPositioningError)),
         heading_deg=None if heading is None else heading % 360.0,
         pitch_deg=pano.get("PosePitchDegrees", 0.0),
         roll_deg=pano.get("PoseRollDegrees", ROLL_DEG.get(orientation, 0.0) if isinstance(orientation, int) else 0.0),
         focal_px=focal_px,
-        time_s=_time(exif, gps),
+        gps_time_s=_gps_time(gps),
+        camera_time_s=_camera_time(exif),
     )
 
 
@@ -135,8 +143,18 @@ def _lat_lon(gps: dict[int, Any]) -> tuple[float, float] | None:
 
 def _height(gps: dict[int, Any]) -> float | None:
     height = _number(gps.get(GPS.GPSAltitude))
-    below = gps.get(GPS.GPSAltitudeRef) in (1, b"\x01")
-    return None if height is None else (-height if below else height)
+    return None if height is None else (-height if _altitude_reference(gps) in (1, 3) else height)
+
+
+def _altitude_reference(gps: dict[int, Any]) -> int:
+    """Return 0 for above and 1 for below the sea; since EXIF 3.0 these are of the ellipsoid, and 2 and 3 of the sea."""
+    value = gps.get(GPS.GPSAltitudeRef)
+    return value[0] if isinstance(value, bytes) and value else value if isinstance(value, int) else 0
+
+
+def _is_ellipsoidal(exif: dict[int, Any], gps: dict[int, Any]) -> bool:
+    version = exif.get(Base.ExifVersion)
+    return isinstance(version, bytes) and version >= b"0300" and _altitude_reference(gps) in (0, 1)
 
 
 def _focal_px(exif: dict[int, Any], width: int, height: int) -> float | None:
@@ -152,15 +170,18 @@ def _focal_px(exif: dict[int, Any], width: int, height: int) -> float | None:
     return focal_mm * per_unit / unit_mm * width / stored
 
 
-def _time(exif: dict[int, Any], gps: dict[int, Any]) -> float | None:
-    """Return the GPS's time, which is UTC, else the camera's, in UTC where it does not say its zone."""
+def _gps_time(gps: dict[int, Any]) -> float | None:
     day, clock = str(gps.get(GPS.GPSDateStamp, "")), gps.get(GPS.GPSTimeStamp)
     try:
         hours, minutes, seconds = (float(part) for part in clock or ())
         start = datetime.strptime(day.strip("\0 "), "%Y:%m:%d").replace(tzinfo=UTC)
         return start.timestamp() + hours * 3600.0 + minutes * 60.0 + seconds
     except (TypeError, ValueError, ZeroDivisionError):
-        pass
+        return None
+
+
+def _camera_time(exif: dict[int, Any]) -> float | None:
+    """Return the camera's time, in UTC where it does not say its zone."""
     text = str(exif.get(Base.DateTimeOriginal, "")).strip("\0 ")
     zone = str(exif.get(Base.OffsetTimeOriginal, "")).strip("\0 ") or "+00:00"
     part = str(exif.get(Base.SubsecTimeOriginal, "")).strip("\0 ")
@@ -181,3 +202,14 @@ def _panorama(xmp: str) -> dict[str, float]:
         elif (number := _number(text)) is not None:
             found[name] = number
     return found
+
+
+def _is_cut(pano: dict[str, float], width: int, height: int) -> bool:
+    """Return whether an equirectangular picture is not of the whole sphere, by its tags or by its shape."""
+    sides = ((f"CroppedAreaImage{side}Pixels", f"FullPano{side}Pixels") for side in ("Width", "Height"))
+    by_tags = any(part in pano and whole in pano and pano[part] != pano[whole] for part, whole in sides)
+    return by_tags or abs(width - 2 * height) > _ROUNDING_PX
+
+
+_ROUNDING_PX = 2
+"""By which the sides of a picture that was made smaller may miss 2 to 1."""

@@ -9,14 +9,25 @@ from __future__ import annotations
 
 import reprlib
 import xml.parsers.expat
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from valuemap.errors import InputError
 from valuemap.text_files import check_file, first_line, read_json, read_text
 
-__all__ = ["check_file", "check_folder", "check_names", "file_in", "read_json", "read_text", "read_xml", "read_yaml"]
+__all__ = [
+    "check_file",
+    "check_folder",
+    "check_names",
+    "file_in",
+    "read_json",
+    "read_text",
+    "read_xml",
+    "read_yaml",
+    "refuse_repeated_names",
+]
 
 _MAX_NAME = 1000
 
@@ -70,6 +81,16 @@ def check_names(names: list[str], source: str) -> None:
                 f"{source}: image name {_short(name)}: expected a relative name that stays in the folder",
                 hint="names must be texts without .. and not absolute, e.g. monday/cam0/000123.jpg",
             )
+
+
+def refuse_repeated_names(names: Sequence[str], source: str) -> None:
+    """Refuse names of images that are there twice."""
+    repeated = [name for name, count in Counter(names).items() if count > 1]
+    if repeated:
+        raise InputError(
+            f"{source}: {len(repeated)} image names occur more than once, the first is {min(repeated)!r}",
+            hint="detections are matched by file name: give every image a name of its own",
+        )
 
 
 def _stays_inside(name: str) -> bool:

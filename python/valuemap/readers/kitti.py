@@ -12,7 +12,8 @@ from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.csv_file import CsvFile
-from valuemap.readers.detections import DetectionFile, read_detections
+from valuemap.readers.detections import DetectionFile, format_of, read_detections
+from valuemap.readers.detections.named_boxes import CORNER
 from valuemap.readers.files import read_text
 from valuemap.readers.poses import local_from_cam, make_images
 from valuemap.readers.reader import Reader
@@ -48,7 +49,8 @@ def read_kitti(
     """Read the poses of one drive with one or several rectified cameras, and the detections in its frames.
 
     Everything in pixels follows the source's convention, that the centre of the top-left pixel is (0, 0), and
-    gets half a pixel added here: cx and cy, and the corners of the boxes. All frames are one pass.
+    gets half a pixel added here: cx and cy, and the corners of the boxes, unless `detections` says that these count
+    from the picture's corner or are fractions. All frames are one pass.
 
     Parameters
     ----------
@@ -113,12 +115,12 @@ def read_kitti(
         rigs=[f"{number:09d}" for number in frame] if len(projections) > 1 else None,
     )
     progress("reading the detections", 1, 2)
-    found = _detections(detections, images, projections, class_name) or read_detections(detections, images, table)
+    of_frames = _detections(detections, images, image_size, projections, class_name)
     dataset = assemble(
         name=poses.stem,
         cameras=table,
         images=images,
-        detections=found,
+        detections=read_detections(detections, images, table) if of_frames is None else of_frames,
         up=up,
         anchor=anchor,
         source=str(poses),
@@ -237,11 +239,15 @@ def _read_times(path: Path, frames: int) -> Floats:
 
 
 def _detections(
-    detections: DetectionFile | Path | None, images: Images, projections: Mapping[int, Floats], class_name: str
+    detections: DetectionFile | Path | None,
+    images: Images,
+    image_size: tuple[int, int],
+    projections: Mapping[int, Floats],
+    class_name: str,
 ) -> FoundBoxes | None:
     """Return the boxes of a CSV file that names frames by their numbers; None where it is something else."""
     file = DetectionFile(detections, class_name=class_name) if isinstance(detections, Path) else detections
-    if file is None or file.format not in ("auto", "csv") or file.path.suffix.lower() not in (".csv", ".txt"):
+    if file is None or format_of(file) != "csv":
         return None
     table = CsvFile(
         file.path,
@@ -263,12 +269,14 @@ def _detections(
         camera = np.zeros(len(frame), dtype=np.int64)
     else:
         raise table.missing("a column 'camera' for several cameras")
+    picture_px = np.array(image_size, dtype=np.float64) if file.fractions else np.ones(2)
+    shift_px = file.shift_to_corner_px(CORNER if file.fractions else 0.0)
     known = (camera >= 0) & (frame >= 0) & (frame < frames) & (frame % 1.0 == 0.0)
     return FoundBoxes(
         image_row=np.where(known, camera * frames + np.where(known, frame, 0.0), -1.0).astype(np.int64),
         class_names=table.texts("class") if table.has_optional("class") else [file.class_name] * len(frame),
-        center_px=(corners_px[:, :2] + corners_px[:, 2:]) / 2.0 + _PIXEL_CENTER,
-        size_px=corners_px[:, 2:] - corners_px[:, :2],
+        center_px=(corners_px[:, :2] + corners_px[:, 2:]) / 2.0 * picture_px + shift_px,
+        size_px=(corners_px[:, 2:] - corners_px[:, :2]) * picture_px,
         score=(table.numbers("score") if table.has_optional("score") else np.full(len(frame), file.full_score))
         / file.full_score,
         where=table.line,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -11,13 +12,14 @@ from typing import Literal, get_args
 import numpy as np
 
 from valuemap.errors import InputError, SettingError
+from valuemap.geodesy import lon_lat_height_from_crs, with_heights
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras, parse_camera
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.exif import Exif, check_whole, read_exif
 from valuemap.readers.files import check_folder, check_names, file_in
-from valuemap.readers.poses import OnEarth, local_from_cam, make_images, place_on_earth
+from valuemap.readers.poses import Placed, local_from_cam, make_images, place_on_earth
 from valuemap.readers.reader import Reader
 from valuemap.readers.structure import Picture, Posed, find_poses
 from valuemap.tables import Floats
@@ -29,6 +31,7 @@ _FOCAL_GUESS = 1.2
 """Focal length over the larger side where nothing is known: about 45 degrees."""
 _SHOWN = 3
 _NO_PLACE = "it has no GPS position"
+_CUT = "is a panorama that is cut: it does not show the whole sphere"
 _TURNED = (
     "it was taken on its side or upside down (EXIF orientation), and structure from motion takes cameras for level"
 )
@@ -43,8 +46,9 @@ class _Found:
 
     names: list[str]
     exif: list[Exif]
+    time_s: list[float]
     passes: list[str]
-    placed: OnEarth
+    placed: Placed
     sigma_m: Floats
     unreadable: dict[str, str]
 
@@ -58,6 +62,7 @@ def read_pictures(
     camera: str | None = None,
     gps_sigma_m: float = 3.0,
     detections: DetectionFile | Path | None = None,
+    vertical: str | None = None,
     anchor: tuple[float, float, float] | None = None,
     threads: int = 0,
     max_rejected: float = MAX_REJECTED,
@@ -69,7 +74,7 @@ def read_pictures(
     Panoramas (equirectangular by their GPano tags, or by `camera`) stand at their GPS position with their heading,
     pitch and roll. Other pictures get their poses by structure from motion (`find_poses`), or with `poses` "exif" are
     taken level with the heading that the GPS tags give. A pass is a folder; times are those of the GPS, else of the
-    camera.
+    camera, less what both differ by in the folder.
 
     Parameters
     ----------
@@ -85,6 +90,9 @@ def read_pictures(
         Standard deviation of GPS positions that do not say theirs.
     detections
         As in `read_detections`; without, they are still to be found in the pictures.
+    vertical
+        What altitudes count from, as in `with_heights`; without, the ellipsoid. Those that EXIF 3.0 says to count from
+        the ellipsoid do.
     anchor
         Latitude, longitude and height of the origin; by default the place of the first picture by name.
     threads
@@ -104,8 +112,8 @@ def read_pictures(
             f"poses {poses}, gps-sigma {gps_sigma_m:g}: expected {', '.join(get_args(PosesFrom))}, and metres above 0",
             hint="leave them away",
         )
-    found = _read_all(folder, gps_sigma_m, anchor, max_rejected, progress)
     given = None if camera is None else parse_camera(camera)
+    found = _read_all(folder, gps_sigma_m, vertical, anchor, max_rejected, progress, is_whole=given is not None)
     cameras = [given or _guess(exif) for exif in found.exif]
     by_heading = np.array([poses == "exif" or (poses == "auto" and c.model == "EQUIRECTANGULAR") for c in cameras])
     rotation, center = _level_poses(found)
@@ -160,7 +168,7 @@ def read_pictures(
         center_in_world_m=center,
         passes=[f"{name}/{part[row]}" if parts > 1 else name for row, name in enumerate(found.passes)],
         source=str(folder),
-        timestamp_s=np.array([math.nan if exif.time_s is None else exif.time_s for exif in found.exif]),
+        timestamp_s=np.array(found.time_s),
         position_sigma_m=sigma_m,
         rotation_sigma_rad=sigma_rad,
     )
@@ -183,10 +191,14 @@ def read_pictures(
 def _read_all(
     folder: Path,
     gps_sigma_m: float,
+    vertical: str | None,
     anchor: tuple[float, float, float] | None,
     max_rejected: float,
     progress: Progress,
+    *,
+    is_whole: bool,
 ) -> _Found:
+    """Read all pictures; panoramas that are cut cannot be used, unless somebody says how all pictures are made."""
     check_folder(folder, _EXPECTED)
     paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _SUFFIXES)
     if not paths:
@@ -203,6 +215,9 @@ def _read_all(
         except InputError as error:
             unreadable[name] = str(error).removeprefix(f"{path}: ")
         else:
+            if exif.is_cut and not is_whole:
+                unreadable[name] = _CUT
+                continue
             found.append(exif)
             names.append(name)
     progress("reading the pictures' tags", len(paths), len(paths))
@@ -215,12 +230,12 @@ def _read_all(
     check_names(names, str(folder))
     passes = [str(parent) if str(parent := PurePosixPath(name).parent) != "." else ONE_PASS for name in names]
     # Driving order: by time where a whole folder has times, else by name.
-    timed = set(passes) - {each for each, exif in zip(passes, found, strict=True) if exif.time_s is None}
+    times = _times(found, passes)
+    timed = set(passes) - {each for each, time_s in zip(passes, times, strict=True) if math.isnan(time_s)}
     order = sorted(
-        range(len(names)), key=lambda row: (passes[row], found[row].time_s if passes[row] in timed else 0.0, names[row])
+        range(len(names)), key=lambda row: (passes[row], times[row] if passes[row] in timed else 0.0, names[row])
     )
-    names, found, passes = ([values[row] for row in order] for values in (names, found, passes))  # type: ignore[assignment]
-    height = _heights(found)
+    names, found, times, passes = ([values[row] for row in order] for values in (names, found, times, passes))  # type: ignore[assignment]
     lon_lat = np.array([(math.nan, math.nan) if e.lat_lon is None else (e.lat_lon[1], e.lat_lon[0]) for e in found])
     if not np.isfinite(lon_lat).any():
         raise InputError(
@@ -228,16 +243,41 @@ def _read_all(
             hint="were they exported without tags? For poses of your own see import csv and import colmap",
         )
     first = min(range(len(names)), key=lambda row: (not np.isfinite(lon_lat[row]).all(), names[row]))
-    placed = place_on_earth(np.column_stack([lon_lat, height]), anchor, first, source=str(folder))
+    place = np.column_stack([lon_lat, _heights(found, lon_lat, vertical)])
+    placed = place_on_earth(place, anchor, first, source=str(folder))
     sigma = np.array([exif.sigma_m or gps_sigma_m for exif in found])
-    return _Found(list(names), list(found), list(passes), placed, sigma, unreadable)
+    return _Found(list(names), list(found), list(times), list(passes), placed, sigma, unreadable)
 
 
-def _heights(found: Sequence[Exif]) -> Floats:
-    """Return heights (N); pictures without one are at the median of the others, or at 0."""
-    heights = [exif.height_m for exif in found if exif.height_m is not None]
-    median = float(np.median(heights)) if heights else 0.0
-    return np.array([median if exif.height_m is None else exif.height_m for exif in found])
+def _times(found: Sequence[Exif], passes: Sequence[str]) -> list[float]:
+    """Return seconds (N) of the GPS's clock, else of the camera's, NaN where there are none.
+
+    What the clock of the camera is off by, its zone too, is the median of the pictures of a pass that have both.
+    """
+    off_s = defaultdict(list)
+    for exif, name in zip(found, passes, strict=True):
+        if exif.gps_time_s is not None and exif.camera_time_s is not None:
+            off_s[name].append(exif.gps_time_s - exif.camera_time_s)
+    median_s = {name: float(np.median(each)) for name, each in off_s.items()}
+    times = []
+    for exif, name in zip(found, passes, strict=True):
+        by_camera_s = math.nan if exif.camera_time_s is None else exif.camera_time_s + median_s.get(name, 0.0)
+        times.append(by_camera_s if exif.gps_time_s is None else exif.gps_time_s)
+    return times
+
+
+def _heights(found: Sequence[Exif], lon_lat: Floats, vertical: str | None) -> Floats:
+    """Return heights (N) at places (N, 2); pictures without one are at the median of the others, or at 0."""
+    heights = np.array([math.nan if exif.height_m is None else exif.height_m for exif in found])
+    is_above_sea = np.array([not exif.is_ellipsoidal for exif in found])
+    if np.isnan(heights).all():
+        heights, is_above_sea = np.zeros(len(found)), np.ones(len(found), dtype=np.bool_)
+    system, zero_m = with_heights(None, vertical)
+    rows = is_above_sea & np.isfinite(heights) & np.isfinite(lon_lat).all(axis=1)
+    if system is not None and rows.any():
+        place = np.column_stack([lon_lat, heights + zero_m])[rows]
+        heights[rows] = lon_lat_height_from_crs(place, system)[:, 2]
+    return np.where(np.isnan(heights), np.nanmedian(heights), heights)
 
 
 def _level_poses(found: _Found) -> tuple[Floats, Floats]:

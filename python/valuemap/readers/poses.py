@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,13 +14,15 @@ import scipy
 from valuemap.anchor import HIGHEST_M
 from valuemap.errors import InputError, SettingError
 from valuemap.geodesy import (
+    degrees_outside,
     enu_axes_at,
     enu_from_lon_lat_height,
+    is_geographic,
     lon_lat_height_from_crs,
     true_axes_of_crs,
     with_heights,
 )
-from valuemap.readers.files import check_names
+from valuemap.readers.files import check_names, refuse_repeated_names
 from valuemap.tables import Bools, Categories, Floats, Images, Ints
 
 _ROTATION_TOLERANCE = 1e-3
@@ -48,16 +49,16 @@ and those of a vehicle (ROS, Waymo)."""
 
 
 @dataclass(frozen=True, eq=False)
-class OnEarth:
+class Placed:
     """Where images are: positions (N, 3) in the ENU frame of the anchor, and there the local axes of each.
 
     `world_from_local` (N, 3, 3) takes east, north, up at the image into the frame of the anchor; 20 km away these
-    differ by a fifth of a degree.
+    differ by a fifth of a degree. Without an anchor both are one frame of its own.
     """
 
     position_in_world_m: Floats
     world_from_local: Floats
-    anchor: tuple[float, float, float]
+    anchor: tuple[float, float, float] | None
 
 
 def height_where_none(camera_height_m: float) -> float:
@@ -77,7 +78,7 @@ def height_where_none(camera_height_m: float) -> float:
 
 def place_on_earth(
     lon_lat_height: Floats, anchor: tuple[float, float, float] | None, first: int = 0, *, source: str
-) -> OnEarth:
+) -> Placed:
     """Place images (N, 3) at longitude, latitude (degrees) and ellipsoidal height (m); NaN stays NaN.
 
     Parameters
@@ -122,7 +123,7 @@ def place_on_earth(
             f"anchor: expected a place near the images, as at {lat:.6g} {lon:.6g}, found {origin[0]:g} {origin[1]:g}",
             hint="the latitude comes first; leave it away for the place of the first image",
         )
-    return OnEarth(position, axes, origin)
+    return Placed(position, axes, origin)
 
 
 def place_in_crs(
@@ -133,11 +134,21 @@ def place_in_crs(
     *,
     vertical: str | None = None,
     source: str,
-) -> OnEarth:
+    tell: Callable[[str], None] | None = None,
+) -> Placed:
     """Place images at coordinates (N, 3) of a reference system such as `EPSG:32610`, easting first, height last.
 
     The local axes are those of the grid: its north is not north, and poses in it are turned by the convergence.
-    Heights are those of the vertical system, as in `with_heights`.
+    Heights are those of the vertical system, as in `with_heights`. Places that are a little outside of what the system
+    is made for are told.
+
+    Raises
+    ------
+    InputError
+        A place is none, or most are far outside of what the system is made for: often easting and northing are
+        exchanged.
+    SettingError
+        There is no such system, or the anchor is another place on the Earth.
     """
     system, zero_m = with_heights(crs, vertical)
     assert system is not None
@@ -146,8 +157,33 @@ def place_in_crs(
     lon_lat_height, true_from_grid = np.full((len(fine), 3), np.nan), np.full((len(fine), 3, 3), np.nan)
     lon_lat_height[fine] = lon_lat_height_from_crs(position[fine], system)
     true_from_grid[fine] = true_axes_of_crs(position[fine], crs)
+    _check_area(lon_lat_height[fine], crs, tell)
     placed = place_on_earth(lon_lat_height, anchor, first, source=source)
-    return OnEarth(placed.position_in_world_m, placed.world_from_local @ true_from_grid, placed.anchor)
+    return Placed(placed.position_in_world_m, placed.world_from_local @ true_from_grid, placed.anchor)
+
+
+def _check_area(lon_lat_height: Floats, crs: str, tell: Callable[[str], None] | None) -> None:
+    """Refuse places (N, 3) most of which are far outside of what a system is made for; tell where they are outside."""
+    outside = degrees_outside(lon_lat_height, crs)
+    if outside is None or not len(outside):
+        return
+    row = int(np.argsort(outside, kind="stable")[(len(outside) - 1) // 2])  # Some may be at 0, 0, without a fix.
+    if not outside[row] > 0.0:
+        return
+    lon, lat, _ = lon_lat_height[row]
+    said = (
+        f"crs {crs}: positions are at lat {lat:.4g}, lon {lon:.4g}, {outside[row]:.2g} degrees outside the area it is "
+        "made for"
+    )
+    if outside[row] > _FAR_OUTSIDE_DEG:
+        x, y = ("longitude", "latitude") if is_geographic(crs) else ("easting", "northing")
+        raise InputError(said, hint=f"x is the {x}, y the {y}: are they exchanged?")
+    if tell is not None:
+        tell(said)
+
+
+_FAR_OUTSIDE_DEG = 15.0
+"""Norway uses one zone for all of the country, which lies up to 13 degrees outside of it."""
 
 
 def local_from_cam(heading_rad: Floats, pitch_rad: Floats, roll_rad: Floats) -> Floats:
@@ -218,12 +254,7 @@ def make_images(
     if not len(names):
         raise InputError(f"{source}: there is no image with a pose", hint="is this the whole of it?")
     check_names(list(names), source)
-    repeated = [name for name, count in Counter(names).items() if count > 1]
-    if repeated:
-        raise InputError(
-            f"{source}: {len(repeated)} image names occur more than once, the first is {min(repeated)!r}",
-            hint="detections are matched by file name: give every image a name of its own",
-        )
+    refuse_repeated_names(names, source)
     is_given, is_motion = _given_and_motions(world_from_cam, center_in_world_m)
     if image_id is None:
         order = np.array(sorted(range(len(names)), key=lambda row: names[row]), dtype=np.int64)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
-
-from valuemap.tables import Categories
 
 
 class Texts(Sequence[str]):
@@ -30,14 +28,6 @@ class Texts(Sequence[str]):
     def repeated(cls, text: str, count: int) -> Texts:
         """Return one text so many times."""
         return cls(np.zeros(count, np.int32), [text])
-
-    def categories(self, written: Callable[[str], str]) -> Categories:
-        """Return the texts as they are written."""
-        found = [written(text) for text in self.distinct]
-        names = sorted({found[code] for code in np.flatnonzero(np.bincount(self.codes, minlength=len(found)))})
-        rank = {name: i for i, name in enumerate(names)}
-        recode = np.array([rank.get(text, -1) for text in found], np.int32)
-        return Categories(recode[self.codes] if len(found) else self.codes, tuple(names))
 
     def __len__(self) -> int:
         return len(self.codes)

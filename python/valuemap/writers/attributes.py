@@ -98,7 +98,7 @@ class Export:
                     f"the map is not geo-referenced, so that it has no place in {self.crs}",
                     hint="leave --crs away, or import the data with a geo-reference",
                 )
-            return Places(labels.position_in_world_m, None)
+            return Places(self.on_the_ground(labels.position_in_world_m), None)
         if self.crs is None:
             return Places(labels.lon_lat_height, WGS84)
         return Places(self.placed(labels.lon_lat_height), self.crs)
@@ -108,6 +108,11 @@ class Export:
         if self.crs is None:
             return lon_lat_height
         return crs_from_lon_lat_height(lon_lat_height, self.crs) - [0.0, 0.0, self.zero_height_m]
+
+    def on_the_ground(self, position_in_world_m: Floats) -> Floats:
+        """Return positions (N, 3) in the frame of the map as east, north, up: a GIS shows the first two."""
+        turned: Floats = position_in_world_m @ self.result.frame.east_north_up().T
+        return turned
 
     @cached_property
     def ellipses(self) -> Ellipses:

@@ -18,13 +18,16 @@ if TYPE_CHECKING:
 _COLORS = ((230, 75, 53), (77, 187, 213), (0, 160, 135), (60, 84, 136), (243, 155, 127), (132, 145, 180))
 
 
-FILES = ("cameras.txt", "frames.txt", "images.txt", "points3D.txt", "rigs.txt")
-"""What a model is made of."""
+FILES = tuple(
+    f"{name}{suffix}" for suffix in (".bin", ".txt") for name in ("cameras", "frames", "images", "points3D", "rigs")
+)
+"""What a model may be made of."""
 
 
 def write_colmap(export: Export, folder: Path) -> None:
-    """Write a whole model as text into a folder: cameras, images with their detections as 2D points, and the labels.
+    """Write a whole model into a folder: cameras, images with their detections as 2D points, and the labels.
 
+    It is text, but where names of images have white space, which ends a name in text: then it is binary.
     `ERROR` of a point is its reprojection error in pixels, its track the votes.
 
     Raises
@@ -50,7 +53,10 @@ def write_colmap(export: Export, folder: Path) -> None:
         model.add_camera_with_trivial_rig(camera)
     first_point = _add_images(model, dataset)
     _add_labels(model, export, dataset, first_point)
-    model.write_text(str(folder))
+    if any(name.split() != [name] for name in dataset.images.name.to_pylist()):
+        model.write_binary(str(folder))
+    else:
+        model.write_text(str(folder))
 
 
 def _add_images(model: pycolmap.Reconstruction, dataset: Dataset) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

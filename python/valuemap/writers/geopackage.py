@@ -145,7 +145,7 @@ def _placed(export: Export, position_in_world_m: Floats) -> Floats:
     """Return positions (N, 3) in the map's frame where the labels are written to."""
     anchor = export.result.frame.anchor
     if export.places.crs is None or anchor is None:
-        return position_in_world_m
+        return export.on_the_ground(position_in_world_m)
     geographic = lon_lat_height_from_enu(position_in_world_m, anchor)
     return export.placed(geographic)
 

@@ -69,7 +69,7 @@ SIGNS = (
     Sign("regulatory--no-overtaking", _sign("overtaking"), "C,13a", "R4-1", ("no overtaking", "do not pass")),
     Sign(
         "regulatory--maximum-speed-limit-{}",
-        {**_sign("maxspeed"), "maxspeed": "{}"},
+        {**_sign("maxspeed"), "valuemap:number": "{}"},  # `maxspeed` is in km/h, and a class does not say its unit.
         "C,14",
         "R2-1",
         ("speed limit {}", "maximum speed limit {}", "maxspeed {}"),

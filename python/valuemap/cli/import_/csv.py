@@ -10,7 +10,8 @@ import typer
 from valuemap.cli.import_.app import check_out, finish_import, import_app
 from valuemap.cli.import_.options import Anchor, CameraHeight, CameraText, Columns, PixelCenter, with_detections
 from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected, Up, Vertical
-from valuemap.cli.show import progress_bars
+from valuemap.cli.show import progress_bars, show_notes
+from valuemap.geodesy import accuracy_note
 from valuemap.readers.csv_file import parse_columns
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.poses import Axes, RotationName
@@ -41,6 +42,7 @@ def import_csv(
     from valuemap.readers import READERS
 
     check_out(out, force=force)
+    notes: list[str] = []
     with progress_bars() as progress:
         found = READERS["csv"].in_portions(
             poses,
@@ -57,5 +59,8 @@ def import_csv(
             anchor=anchor,
             max_rejected=max_rejected,
             progress=progress,
+            tell=notes.append,
         )
+    note = None if crs is None else accuracy_note(crs)
     finish_import(found, out, force=force, as_json=as_json)
+    show_notes(notes if note is None else [*notes, note])

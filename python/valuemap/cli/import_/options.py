@@ -57,10 +57,13 @@ _DETECTION_OPTIONS: dict[str, tuple[Any, Any]] = {
     ),
     "boxes_pixel_center": (
         Annotated[
-            float,
-            typer.Option("--detection-pixel-center", help="In boxes: the centre of the top-left pixel, 0.5 or 0."),
+            float | None,
+            typer.Option(
+                "--detection-pixel-center",
+                help="In boxes: the centre of the top-left pixel, 0.5 or 0; default: 0.5, in KITTI's tables 0.",
+            ),
         ],
-        0.5,
+        None,
     ),
     "boxes_fractions": (
         Annotated[bool, typer.Option("--fractions", help="A CSV file of boxes has fractions of width and height.")],
@@ -100,7 +103,7 @@ def _detection_file(
     boxes_format: DetectionFormat,
     boxes_class: str,
     boxes_columns: list[str] | None,
-    boxes_pixel_center: float,
+    boxes_pixel_center: float | None,
     boxes_fractions: bool,
     boxes_full_score: float,
 ) -> DetectionFile | None:

@@ -9,7 +9,7 @@ import typer
 
 from valuemap.cli.import_.app import check_out, finish_import, import_app
 from valuemap.cli.import_.options import Anchor, CameraText, with_detections
-from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected
+from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected, Vertical
 from valuemap.cli.show import progress_bars, show_notes
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.vet import MAX_REJECTED
@@ -30,6 +30,7 @@ def import_pictures(
     camera: CameraText = None,
     gps_sigma: Annotated[float, typer.Option(help="Metres, of GPS positions that do not say theirs.")] = 3.0,
     threads: Annotated[int, typer.Option(min=0, max=1024, help="Of structure from motion, 0 for one per core.")] = 0,
+    vertical: Vertical = None,
     anchor: Anchor = None,
     max_rejected: MaxRejected = MAX_REJECTED,
     force: Force = False,
@@ -48,6 +49,7 @@ def import_pictures(
             camera=camera,
             gps_sigma_m=gps_sigma,
             detections=detections,
+            vertical=vertical,
             anchor=anchor,
             threads=threads,
             max_rejected=max_rejected,

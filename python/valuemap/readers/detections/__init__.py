@@ -18,7 +18,7 @@ from valuemap.readers.detections.yolo import read_yolo
 from valuemap.readers.files import check_file
 from valuemap.tables import Cameras, Images
 
-__all__ = ["DETECTIONS", "DetectionFile", "read_detections"]
+__all__ = ["DETECTIONS", "DetectionFile", "format_of", "read_detections"]
 
 DETECTIONS: dict[str, Callable[[DetectionFile], NamedBoxes]] = {
     "coco": read_coco,
@@ -46,12 +46,21 @@ def read_detections(file: DetectionFile | Path | None, images: Images, cameras: 
         return FoundBoxes.none()
     if isinstance(file, Path):
         file = DetectionFile(file)
-    boxes = DETECTIONS[_format_of(file)](file)
+    boxes = DETECTIONS[format_of(file)](file)
     pa.default_memory_pool().release_unused()  # Of the file as it was read, which Arrow would keep for what comes next.
     return find_images(boxes, images, cameras, file)
 
 
-def _format_of(file: DetectionFile) -> str:
+def format_of(file: DetectionFile) -> str:
+    """Return the format of detections, a name in `DETECTIONS`: the one that is given, else what the path says.
+
+    Raises
+    ------
+    InputError
+        The path does not say.
+    SettingError
+        There is no such format.
+    """
     if file.format != "auto":
         if file.format not in DETECTIONS:
             raise SettingError(

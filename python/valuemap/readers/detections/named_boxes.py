@@ -17,6 +17,8 @@ from valuemap.readers.pixel_center import shift_to_corner_px
 from valuemap.readers.row_file import RowFile
 from valuemap.tables import Cameras, Floats, Images, Ints
 
+CORNER = 0.5
+"""The centre of the top-left pixel where pixels count from the picture's corner."""
 _PIXEL_CENTER = "detection-pixel-center"
 
 
@@ -34,7 +36,7 @@ class DetectionFile:
         The class of boxes that have none.
     pixel_center
         Coordinates of the centre of the top-left pixel: 0.5 where they count from the picture's corner (COLMAP, COCO),
-        0 where from that pixel (OpenCV, KITTI).
+        0 where from that pixel (OpenCV, KITTI). None for what is usual: 0.5, and 0 in KITTI's tables of frames.
     full_score
         The score that means certain: scores are divided by it.
     columns
@@ -46,7 +48,7 @@ class DetectionFile:
     path: Path
     format: str = "auto"
     class_name: str = "object"
-    pixel_center: float = 0.5
+    pixel_center: float | None = None
     full_score: float = 1.0
     columns: Mapping[str, str] = field(default_factory=dict)
     fractions: bool = False
@@ -54,7 +56,11 @@ class DetectionFile:
     def __post_init__(self) -> None:
         if not 0.0 < self.full_score < float("inf"):
             raise SettingError(f"full-score: expected above 0, found {self.full_score:g}", hint="for example 100")
-        shift_to_corner_px(self.pixel_center, _PIXEL_CENTER)
+        self.shift_to_corner_px()
+
+    def shift_to_corner_px(self, usual: float = CORNER) -> float:
+        """Return what has to be added to pixels, where `usual` is where they count from unless something is given."""
+        return shift_to_corner_px(usual if self.pixel_center is None else self.pixel_center, _PIXEL_CENTER)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +140,7 @@ def find_images(boxes: NamedBoxes, images: Images, cameras: Cameras, file: Detec
         are_points=boxes.are_points,
         source=str(file.path),
         picture_px=picture_px if boxes.fractions else None,
-        shift_px=shift_to_corner_px(file.pixel_center, _PIXEL_CENTER),
+        shift_px=file.shift_to_corner_px(),
         full_score=file.full_score,
     )
 
