@@ -19,7 +19,7 @@ use crate::robust::scene::{Frustum, Scene};
 use crate::robust::search::Tally;
 use crate::robust::search::assign::{claims_of_all, images_of};
 use crate::robust::search::rearrange::{TriedPairs, rearrange_pairs};
-use crate::robust::search::repair::{Tried, repair};
+use crate::robust::search::repair::repair;
 use crate::robust::search::{Depth, search};
 use crate::robust::settings::Settings;
 use crate::viability::Viability;
@@ -233,9 +233,8 @@ proptest! {
         let world = World::new(&scene, &[(between.into_iter().collect(), 0.5 * (objects[0] + objects[1]))]);
         prop_assert_eq!(world.objects.len(), 1);
         let index = world.index();
-        let (mut tried, progress) = (Tried::default(), Progress::default());
-        let found =
-            repair(&world.model, &world.lookout, &index, world.objects.clone(), &mut tried, 0, &progress).unwrap().0;
+        let objects = world.objects.clone();
+        let found = repair(&world.model, &world.lookout, &index, objects, 0, &Progress::default()).unwrap().0;
         let expected: BTreeSet<Vec<u32>> = right.into_iter().map(|(votes, _)| votes).collect();
         prop_assert_eq!(found.len(), 2);
         prop_assert_eq!(votes(&searched(&scene, placed(&world.objects))), expected);

@@ -33,7 +33,7 @@ use births::births;
 use propose::Who;
 use rearrange::{TriedPairs, exclude, rearrange_pairs};
 use regrow::regrow;
-use repair::{Tried, repair};
+use repair::repair;
 use untangle::untangle;
 
 /// Rounds, at most.
@@ -103,7 +103,7 @@ pub fn search(
         if learns { object(model, &lookout, votes, point, Vec::new()) } else { unseen(model, votes, point) }
     };
     let mut objects: Vec<Object> = begun.into_par_iter().filter_map(begin).collect();
-    let (mut tried, mut tried_pairs) = (Tried::default(), TriedPairs::default());
+    let mut tried = TriedPairs::default();
     let rounds = if depth == Depth::Deep { ROUNDS } else { 1 };
     for round in 0..rounds {
         if learns {
@@ -123,11 +123,11 @@ pub fn search(
         tally.deaths += (before - objects.len()) as u64;
         progress.advance()?;
         if depth == Depth::Deep {
-            let (rearranged, better) = rearrange_pairs(model, &lookout, &index, objects, &mut tried_pairs, progress)?;
+            let (rearranged, better) = rearrange_pairs(model, &lookout, &index, objects, &mut tried, progress)?;
             any |= better;
             progress.advance()?;
             let (repaired, better) = if has(Part::Repair) {
-                repair(model, &lookout, &index, rearranged, &mut tried, round as u64, progress)?
+                repair(model, &lookout, &index, rearranged, round as u64, progress)?
             } else {
                 (rearranged, false)
             };

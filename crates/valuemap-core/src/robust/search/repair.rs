@@ -43,11 +43,7 @@ const SIDE_COSINE: f64 = 0.866;
 /// The gate of these votes, as a share of the gate of all.
 const CLOSE: f64 = 0.5;
 
-/// Neighborhoods that were tried in vain, by the votes of their objects.
-#[derive(Default)]
-pub struct Tried(FxHashSet<u64>);
-
-/// Repair all neighborhoods that were not tried yet; whether any got better.
+/// Repair all neighborhoods; whether any got better. Each `attempt` has other proposers.
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
@@ -56,15 +52,13 @@ pub fn repair(
     lookout: &Lookout,
     index: &RayIndex<'_>,
     objects: Vec<Object>,
-    tried: &mut Tried,
     attempt: u64,
     progress: &Progress,
 ) -> Result<(Vec<Object>, bool), Halt> {
     let claims = claims_of_all(model, index, &objects, progress)?;
     let poses = Trajectories::of(model, &objects);
     let owner = owners(model.scene, &objects);
-    let mut open = neighborhoods(model, &objects, &claims, &owner);
-    open.retain(|place| !tried.0.contains(&fingerprint(&objects, place, attempt)));
+    let open = neighborhoods(model, &objects, &claims, &owner);
     let mut any = false;
     let mut objects: Vec<Option<Object>> = objects.into_iter().map(Some).collect();
     let mut is_free = vec![true; objects.len()];
@@ -90,21 +84,14 @@ pub fn repair(
         anew(&Place { model, lookout, index, poses: &poses, rays: &rays }, &old, attempt, progress)
     };
     let solved: Vec<Option<Vec<Object>>> = places.par_iter().with_max_len(1).map(solve).collect::<Result<_, Halt>>()?;
-    let all: Vec<Object> = objects.iter().flatten().cloned().collect();
     let mut born = Vec::new();
     for (place, new) in places.iter().zip(solved) {
-        match new {
-            None => {
-                tried.0.insert(fingerprint(&all, place, attempt));
-            }
-            Some(new) => {
-                any = true;
-                for &i in place {
-                    objects[i] = None;
-                }
-                born.extend(new);
-            }
+        let Some(new) = new else { continue };
+        any = true;
+        for &i in place {
+            objects[i] = None;
         }
+        born.extend(new);
     }
     // Leftovers at the edge of two neighborhoods may have been taken by both: the one that comes first has them.
     let mut taken: FxHashSet<u32> = FxHashSet::default();
@@ -460,9 +447,4 @@ fn neighborhoods(model: &Model<'_>, objects: &[Object], claims: &[Vec<Claim>], o
 fn fits_badly(object: &Object) -> bool {
     let n = object.votes.len() as f64;
     object.fit.chi2.iter().sum::<f64>() > 2.0 * n + BAD_FIT_SIGMAS * 2.0 * n.sqrt()
-}
-
-fn fingerprint(objects: &[Object], place: &[usize], attempt: u64) -> u64 {
-    let votes = place.iter().flat_map(|&i| &objects[i].votes);
-    votes.fold(attempt, |sum, &ray| scramble(sum ^ u64::from(ray)))
 }
