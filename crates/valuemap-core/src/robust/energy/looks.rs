@@ -48,7 +48,7 @@ impl Lookout {
     }
 
     /// All images within a distance of a point, and some farther ones, in no order.
-    fn around(&self, point: &Vector3<f64>, distance_m: f64) -> impl Iterator<Item = u32> {
+    pub(crate) fn around(&self, point: &Vector3<f64>, distance_m: f64) -> impl Iterator<Item = u32> {
         let reach = distance_m + self.reach_m;
         self.cubes.locate_within_distance((*point).into(), reach * reach).flat_map(|near| near.data.iter().copied())
     }

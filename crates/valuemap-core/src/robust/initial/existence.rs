@@ -9,12 +9,9 @@ use std::f64::consts::PI;
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
-use rstar::RTree;
-use rstar::primitives::GeomWithData;
-use rustc_hash::FxHashMap;
 
 use super::label::{Label, direction_to, sector_middles};
-use crate::robust::energy::looks::SECTOR_COSINE;
+use crate::robust::energy::looks::{Lookout, SECTOR_COSINE};
 use crate::robust::noise::Spread;
 use crate::robust::scene::Scene;
 
@@ -22,8 +19,6 @@ use crate::robust::scene::Scene;
 const CLUTTER_LOG_ODDS: f64 = 5.0;
 /// More hits in a sector than this are no accident.
 const MOST_HITS_OF_CLUTTER: u32 = 2;
-/// Side of the cubes that images are grouped by, m.
-const CUBE_M: f64 = 10.0;
 
 /// Nearer than this nothing is expected to be seen, m.
 const NEAREST_M: f64 = 4.0;
@@ -70,71 +65,42 @@ pub struct Rates {
     pub concentration: f64,
 }
 
-/// All images by place, to find the looks at labels.
-pub struct Lookout<'a> {
-    scene: &'a Scene,
-    /// The middles of the cubes with images.
-    cubes: RTree<GeomWithData<[f64; 3], Vec<u32>>>,
-}
-
-impl<'a> Lookout<'a> {
-    /// Index all images of a scene.
-    #[must_use]
-    pub fn new(scene: &'a Scene) -> Self {
-        let mut images: FxHashMap<[i64; 3], Vec<u32>> = FxHashMap::default();
-        for (image, view) in (0..).zip(&scene.views) {
-            let cube = [0, 1, 2].map(|axis| (view.center[axis] / CUBE_M).floor() as i64);
-            images.entry(cube).or_default().push(image);
+/// The sectors that a label was seen from at least once.
+#[must_use]
+pub fn sectors(lookout: &Lookout, scene: &Scene, label: &Label) -> Vec<Sector> {
+    let point = label.estimate.point;
+    let mut voters = label.voters.clone();
+    voters.sort_unstable();
+    let (middles, farthest) = middles_of(scene, &point, &voters);
+    let range = farthest.iter().copied().fold(0.0, f64::max);
+    let voted = label.images(scene);
+    let mut looks: Vec<Vec<(u32, u32, bool)>> = vec![Vec::new(); middles.len()];
+    let mut expected = vec![0; middles.len()];
+    for image in lookout.around(&point, range) {
+        let view = &scene.views[image as usize];
+        let away = view.center - point;
+        let distance = away.norm();
+        if distance > range * (1.0 + 1e-9) {
+            continue;
         }
-        let middle = |cube: [i64; 3]| cube.map(|index| (index as f64 + 0.5) * CUBE_M);
-        let cubes = images.into_iter().map(|(cube, images)| GeomWithData::new(middle(cube), images));
-        Self { scene, cubes: RTree::bulk_load(cubes.collect()) }
-    }
-
-    /// All images within a distance of a point, and some farther ones, in no order.
-    fn around(&self, point: &Vector3<f64>, distance_m: f64) -> impl Iterator<Item = u32> {
-        let reach = distance_m + 0.5 * CUBE_M * 3.0_f64.sqrt();
-        self.cubes.locate_within_distance((*point).into(), reach * reach).flat_map(|near| near.data.iter().copied())
-    }
-
-    /// The sectors that a label was seen from at least once.
-    #[must_use]
-    pub fn sectors(&self, label: &Label) -> Vec<Sector> {
-        let scene = self.scene;
-        let point = label.estimate.point;
-        let mut voters = label.voters.clone();
-        voters.sort_unstable();
-        let (middles, farthest) = middles_of(scene, &point, &voters);
-        let range = farthest.iter().copied().fold(0.0, f64::max);
-        let voted = label.images(scene);
-        let mut looks: Vec<Vec<(u32, u32, bool)>> = vec![Vec::new(); middles.len()];
-        let mut expected = vec![0; middles.len()];
-        for image in self.around(&point, range) {
-            let view = &scene.views[image as usize];
-            let away = view.center - point;
-            let distance = away.norm();
-            if distance > range * (1.0 + 1e-9) {
-                continue;
-            }
-            let hit = voted.binary_search(&image).is_ok();
-            let (cosine, sector) = nearest(&middles, &(away / distance));
-            let should = distance >= NEAREST_M
-                && distance <= farthest[sector] * (1.0 + 1e-9)
-                && cosine >= SECTOR_COSINE
-                && scene.is_in_picture(view, &point);
-            expected[sector] += u32::from(hit || should);
-            if (hit || should) && label.undecided.binary_search(&image).is_err() {
-                looks[sector].push((view.pass, view.viewpoint, hit));
-            }
+        let hit = voted.binary_search(&image).is_ok();
+        let (cosine, sector) = nearest(&middles, &(away / distance));
+        let should = distance >= NEAREST_M
+            && distance <= farthest[sector] * (1.0 + 1e-9)
+            && cosine >= SECTOR_COSINE
+            && scene.is_in_picture(view, &point);
+        expected[sector] += u32::from(hit || should);
+        if (hit || should) && label.undecided.binary_search(&image).is_err() {
+            looks[sector].push((view.pass, view.viewpoint, hit));
         }
-        let sectors = middles.into_iter().zip(looks).zip(expected);
-        sectors
-            .map(|((direction, mut looks), expected)| {
-                looks.sort_unstable();
-                Sector { direction, looks: count_looks(&looks), expected }
-            })
-            .collect()
     }
+    let sectors = middles.into_iter().zip(looks).zip(expected);
+    sectors
+        .map(|((direction, mut looks), expected)| {
+            looks.sort_unstable();
+            Sector { direction, looks: count_looks(&looks), expected }
+        })
+        .collect()
 }
 
 /// The middles of the sectors that some voters look from, and the farthest voter of each, m.

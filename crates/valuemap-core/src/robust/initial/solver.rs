@@ -8,11 +8,12 @@ use rustc_hash::FxHashMap;
 
 use super::adjust::adjust;
 use super::associate::Association;
-use super::existence::{Lookout, Looks, Rates, Sector};
+use super::existence::{Looks, Rates, Sector, sectors};
 use super::gather::gather;
 use super::label::{Label, fingerprint};
 use super::{Schedule, Tally, exchange, existence, label, settle, swap};
 use crate::progress::{Halt, Progress};
+use crate::robust::energy::looks::Lookout;
 use crate::robust::model::Model;
 use crate::robust::noise::index::RayIndex;
 use crate::robust::noise::{Noise, Spread};
@@ -34,7 +35,7 @@ pub(super) struct Solver<'a> {
     settings: &'a Settings,
     model: &'a Model<'a>,
     association: Association<'a>,
-    lookout: OnceLock<Lookout<'a>>,
+    lookout: OnceLock<Lookout>,
     /// The sectors of the labels as they last were.
     seen_from: FxHashMap<(u64, u64), Arc<[Sector]>>,
 }
@@ -177,7 +178,8 @@ impl<'a> Solver<'a> {
     }
 
     fn sectors_of(&self, label: &Label) -> Arc<[Sector]> {
-        self.lookout.get_or_init(|| Lookout::new(self.scene)).sectors(label).into()
+        let lookout = || Lookout::new(self.scene, self.settings.viability.max_range_m);
+        sectors(self.lookout.get_or_init(lookout), self.scene, label).into()
     }
 
     /// The sectors that each label is seen from.
