@@ -41,8 +41,6 @@ pub struct Sector {
     pub direction: Vector3<f64>,
     /// Its looks, by pass, ascending.
     pub looks: Vec<Looks>,
-    /// Images that should have seen the label.
-    pub expected: u32,
 }
 
 /// Looks of one pass at a label.
@@ -75,7 +73,6 @@ pub fn sectors(lookout: &Lookout, scene: &Scene, label: &Label) -> Vec<Sector> {
     let range = farthest.iter().copied().fold(0.0, f64::max);
     let voted = label.images(scene);
     let mut looks: Vec<Vec<(u32, u32, bool)>> = vec![Vec::new(); middles.len()];
-    let mut expected = vec![0; middles.len()];
     for image in lookout.around(&point, range) {
         let view = &scene.views[image as usize];
         let away = view.center - point;
@@ -89,18 +86,15 @@ pub fn sectors(lookout: &Lookout, scene: &Scene, label: &Label) -> Vec<Sector> {
             && distance <= farthest[sector] * (1.0 + 1e-9)
             && cosine >= SECTOR_COSINE
             && scene.is_in_picture(view, &point);
-        expected[sector] += u32::from(hit || should);
         if (hit || should) && label.undecided.binary_search(&image).is_err() {
             looks[sector].push((view.pass, view.viewpoint, hit));
         }
     }
-    let sectors = middles.into_iter().zip(looks).zip(expected);
-    sectors
-        .map(|((direction, mut looks), expected)| {
-            looks.sort_unstable();
-            Sector { direction, looks: count_looks(&looks), expected }
-        })
-        .collect()
+    let sector = |(direction, mut looks): (Vector3<f64>, Vec<(u32, u32, bool)>)| {
+        looks.sort_unstable();
+        Sector { direction, looks: count_looks(&looks) }
+    };
+    middles.into_iter().zip(looks).map(sector).collect()
 }
 
 /// The middles of the sectors that some voters look from, and the farthest voter of each, m.

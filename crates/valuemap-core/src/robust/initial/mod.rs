@@ -18,9 +18,8 @@ pub mod settle;
 mod solver;
 pub mod swap;
 
-use nalgebra::Vector3;
-
 use crate::progress::{Halt, Progress};
+use crate::robust::energy::Placed;
 use crate::robust::model::Model;
 use keyframes::Keyframes;
 use label::Label;
@@ -50,22 +49,17 @@ pub struct Tally {
     pub nominations: u64,
     /// Nominations that were polished to labels.
     pub accepted: u64,
-    /// Labels that became part of another one.
-    pub fused: u64,
     /// Labels that lost too many votes to others.
     pub outvoted: u64,
     /// Labels that probably do not exist.
     pub pruned: u64,
 }
 
-/// Votes (ascending) and a position.
-pub type Begun = (Vec<u32>, Vector3<f64>);
-
 /// Labels of some rays (ascending) alone, quickly.
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
-pub fn labels_of_few(model: &Model<'_>, rays: &[u32], progress: &Progress) -> Result<Vec<Begun>, Halt> {
+pub fn labels_of_few(model: &Model<'_>, rays: &[u32], progress: &Progress) -> Result<Vec<Placed>, Halt> {
     let (mut labels, _) = gather::gather(model, rays, progress)?;
     let mut solver = Solver::new(model, rays.iter().copied());
     for _ in 0..WHOLE.rounds {
@@ -78,7 +72,7 @@ pub fn labels_of_few(model: &Model<'_>, rays: &[u32], progress: &Progress) -> Re
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
-pub fn labels(model: &Model<'_>, is_quick: bool, progress: &Progress) -> Result<(Vec<Begun>, Tally), Halt> {
+pub fn labels(model: &Model<'_>, is_quick: bool, progress: &Progress) -> Result<(Vec<Placed>, Tally), Halt> {
     let mut tally = Tally::default();
     let keyframes = is_quick.then(|| Keyframes::of(model.scene)).flatten();
     let first = match &keyframes {
@@ -99,7 +93,7 @@ pub fn labels(model: &Model<'_>, is_quick: bool, progress: &Progress) -> Result<
     Ok((begun(labels), tally))
 }
 
-fn begun(labels: Vec<Label>) -> Vec<Begun> {
+fn begun(labels: Vec<Label>) -> Vec<Placed> {
     let votes = |label: Label| {
         let mut votes = label.voters;
         votes.sort_unstable();

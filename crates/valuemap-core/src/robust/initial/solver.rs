@@ -141,12 +141,9 @@ impl<'a> Solver<'a> {
         let labels = self.associate(labels, tally, progress)?;
         let associated = labels.len();
         let labels = adjust(scene, noise, gate, min_votes, &labels);
-        let left = labels.len();
+        tally.outvoted += (associated - labels.len()) as u64;
         let labels = if may_split { settle::split(scene, noise, gate, labels, min_votes) } else { labels };
-        let labels = if settings.has(Part::Merging) { settle::fuse(scene, noise, gate, labels) } else { labels };
-        tally.outvoted += (associated - left) as u64;
-        tally.fused += left.saturating_sub(labels.len()) as u64;
-        Ok(labels)
+        Ok(if settings.has(Part::Merging) { settle::fuse(scene, noise, gate, labels) } else { labels })
     }
 
     /// All labels compete for all rays; those that get too few are dropped.
@@ -197,11 +194,10 @@ impl<'a> Solver<'a> {
         let old = labels.len();
         labels.extend(new);
         let sectors = self.sectors(&labels);
-        let judgement = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.pruned);
+        let existences = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.pruned);
         let before = labels.len();
-        let admitted = labels.into_iter().zip(judgement.of_labels).enumerate();
-        let admitted =
-            admitted.filter(|(i, (_, (existence, _)))| *i < old || *existence >= self.settings.min_existence);
+        let admitted = labels.into_iter().zip(existences).enumerate();
+        let admitted = admitted.filter(|(i, (_, existence))| *i < old || *existence >= self.settings.min_existence);
         let labels: Vec<Label> = admitted.map(|(_, (label, _))| label).collect();
         tally.pruned += (before - labels.len()) as u64;
         labels
@@ -266,33 +262,26 @@ impl<'a> Solver<'a> {
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
         let (labels, sectors) = self.look_around(labels, tally);
-        let judgement = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.pruned);
+        let existences = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.pruned);
         let before = labels.len();
-        let judged = labels.into_iter().zip(judgement.of_labels);
-        let existing = judged.filter(|(_, (existence, _))| *existence >= share * self.settings.min_existence);
+        let judged = labels.into_iter().zip(existences);
+        let existing = judged.filter(|(_, existence)| *existence >= share * self.settings.min_existence);
         let labels: Vec<Label> = existing.map(|(label, _)| label).collect();
         tally.pruned += (before - labels.len()) as u64;
         if labels.len() == before { Ok(labels) } else { self.settle(labels, false, tally, progress) }
     }
 }
 
-/// How probable it is that labels exist, and what that rests on.
-pub(super) struct Judgement {
-    /// Probability of existence of each label, and the images that should have seen it.
-    pub(super) of_labels: Vec<(f64, u32)>,
-}
-
-/// Judge all labels of a scene.
-pub(super) fn judge(
+/// The probability that each label of a scene exists.
+fn judge(
     scene: &Scene,
     spreads: &[Spread],
     sectors: &[Arc<[Sector]>],
     labels: &[Label],
     settings: &Settings,
     pruned: u64,
-) -> Judgement {
+) -> Vec<f64> {
     let looks: Vec<Vec<Looks>> = sectors.par_iter().map(|sectors| existence::looks_of(sectors.iter())).collect();
-    let expected = sectors.iter().map(|sectors| sectors.iter().map(|sector| sector.expected).sum());
     let rates = Rates::learn(&looks);
     let claimed: usize = labels.iter().map(|label| label.voters.len()).sum();
     let clutter_per_image = (scene.rays.rays.len() - claimed) as f64 / scene.views.len() as f64;
@@ -303,6 +292,5 @@ pub(super) fn judge(
         .par_iter()
         .map(|label| existence::chance_of(label, scene, spreads, settings.gate_sigmas, clutter_per_sr))
         .collect();
-    let existence = existence::probabilities(&looks, &rates, &chance, pruned);
-    Judgement { of_labels: existence.into_iter().zip(expected).collect() }
+    existence::probabilities(&looks, &rates, &chance, pruned)
 }
