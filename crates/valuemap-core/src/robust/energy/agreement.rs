@@ -124,11 +124,10 @@ pub fn disagreements(scene: &Scene, noise: &Noise, labels: &[&Placed]) -> Vec<Op
 }
 
 /// How much larger than they are said to be the errors are that labels of several passes show: the mean disagreement of
-/// their passes, at least 1. The variance of positions is to be multiplied by it. About `most` of the labels serve.
+/// their passes, at least 1. The variance of positions is to be multiplied by it.
 #[must_use]
-pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Placed], most: usize) -> f64 {
-    let labels: Vec<&Placed> = labels.iter().step_by((labels.len() / most).max(1)).collect();
-    mean(disagreements(scene, noise, &labels)).unwrap_or(1.0).max(1.0)
+pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Placed]) -> f64 {
+    mean(disagreements(scene, noise, &labels.iter().collect::<Vec<_>>())).unwrap_or(1.0).max(1.0)
 }
 
 /// Those that are known; nothing if they are too few to tell anything.

@@ -45,7 +45,7 @@ pub fn labels(
     few: Vec<Object>,
 ) -> (Vec<Finding>, f64) {
     let factor = if model.settings.has(Part::Scaling) {
-        variance_factor(model.scene, of_covariances, &placed(&objects), objects.len().max(1))
+        variance_factor(model.scene, of_covariances, &placed(&objects))
     } else {
         1.0
     };

@@ -18,6 +18,8 @@ use crate::robust::scene::{Scene, View};
 const SMALL_MOVE_CHI2: f64 = 0.3;
 /// A label whose mean direction of sight changed by less is seen from where it was.
 const SMALL_TURN: f64 = 0.1;
+/// So many labels tell about how far their passes disagree.
+const DISAGREEING: usize = 400;
 
 /// Voters whose directions have a mean at least this long are all on one side of the label.
 const ONE_SIDED: f64 = 0.6;
@@ -144,10 +146,10 @@ pub fn sector_middles(directions: impl Iterator<Item = Vector3<f64>>) -> Vec<Vec
     middles
 }
 
-/// How much larger than they are said to be the errors are that labels of several passes show, at least 1. About `most` of the labels serve.
+/// How much larger than they are said to be the errors are that labels of several passes show, at least 1.
 #[must_use]
-pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Label], most: usize) -> f64 {
-    let labels: Vec<&Label> = labels.iter().step_by((labels.len() / most).max(1)).collect();
+pub fn variance_factor(scene: &Scene, noise: &Noise, labels: &[Label]) -> f64 {
+    let labels: Vec<&Label> = labels.iter().step_by((labels.len() / DISAGREEING).max(1)).collect();
     let of_label = |label: &&Label| {
         let placed = || (label.voters.clone(), label.estimate.point);
         *label.known.disagreement.get_or_init(|| agreement::disagreement(scene, noise, &placed()))

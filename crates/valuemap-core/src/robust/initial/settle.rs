@@ -20,15 +20,13 @@ const SIDES_COSINE: f64 = 0.5;
 const NEIGHBOR_M: f64 = 6.0;
 /// Two labels may share this part of the images of the smaller one and still be one object: clutter beside it.
 const SHARED_IMAGES: f64 = 0.15;
-/// So many labels tell about how far their passes disagree.
-const DISAGREEING: usize = 400;
 
 /// Make one of any two labels of a class whose positions agree within their covariances, unless their images say that
 /// they are two: images in which both have a detection of their own. The nearest pair first.
 #[must_use]
 pub fn fuse(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) -> Vec<Label> {
     let mut labels = labels;
-    let factor = variance_factor(scene, noise, &labels, DISAGREEING);
+    let factor = variance_factor(scene, noise, &labels);
     loop {
         let agreeing = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor, |a, b| a.class == b.class);
         if agreeing.is_empty() {
@@ -45,7 +43,7 @@ pub fn fuse(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) 
 /// detector takes one object for another now and then.
 #[must_use]
 pub fn outclass(scene: &Scene, noise: &Noise, labels: Vec<Label>) -> Vec<Label> {
-    let factor = variance_factor(scene, noise, &labels, DISAGREEING);
+    let factor = variance_factor(scene, noise, &labels);
     let pairs = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor, |a, b| a.class != b.class);
     let mut is_outclassed = vec![false; labels.len()];
     for (_, a, b) in pairs {
@@ -59,7 +57,7 @@ pub fn outclass(scene: &Scene, noise: &Noise, labels: Vec<Label>) -> Vec<Label> 
 /// which no image shows together.
 #[must_use]
 pub fn split(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>, min_votes: usize) -> Vec<Label> {
-    let factor = variance_factor(scene, noise, &labels, DISAGREEING);
+    let factor = variance_factor(scene, noise, &labels);
     let parts = |mut label: Label| -> Vec<Label> {
         if label.known.is_one {
             return vec![label];

@@ -19,8 +19,8 @@ const BATCH: usize = 64;
 /// Rounds of estimating and gathering votes again, at most.
 pub const MAX_ROUNDS: usize = 8;
 
-/// Let objects be born among the rays of no object, round after round; `is_taken` (one per ray) says which rays have one, and is kept up to date.
-/// Also how many hypotheses there were.
+/// Let objects be born among the rays of no object; `is_taken` (one per ray) says which rays have one, and is kept up to date. Also how many hypotheses
+/// there were.
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
@@ -29,44 +29,35 @@ pub fn births(
     lookout: &Lookout,
     rays: &[u32],
     is_taken: &mut [bool],
-    rounds: &[Who],
     progress: &Progress,
 ) -> Result<(Vec<Object>, u64), Halt> {
+    let free: Vec<u32> = rays.iter().copied().filter(|&ray| !is_taken[ray as usize]).collect();
+    let mut hypotheses = propose(model, &free, Who::All, progress)?;
+    hypotheses.par_sort_by(|a, b| b.support.total_cmp(&a.support).then(a.rays.cmp(&b.rays)));
+    let index = RayIndex::new(model.scene, &model.spreads, model.settings.gate_sigmas, free.into_iter());
+    let nursery = Nursery { model, lookout, index: &index };
     let mut born: Vec<Object> = Vec::new();
-    let mut count = 0;
-    for &who in rounds {
-        let free: Vec<u32> = rays.iter().copied().filter(|&ray| !is_taken[ray as usize]).collect();
-        let mut hypotheses = propose(model, &free, who, progress)?;
-        hypotheses.par_sort_by(|a, b| b.support.total_cmp(&a.support).then(a.rays.cmp(&b.rays)));
-        count += hypotheses.len() as u64;
-        let index = RayIndex::new(model.scene, &model.spreads, model.settings.gate_sigmas, free.into_iter());
-        let nursery = Nursery { model, lookout, index: &index };
-        let before = born.len();
-        // The best hypotheses of all places are tried side by side; where two want the same ray, the better one has it, and
-        // the other is tried again on what is left.
-        for batch in hypotheses.chunks(BATCH) {
-            progress.check()?;
-            let tried: Vec<Option<Object>> =
-                batch.par_iter().map(|hypothesis| nursery.try_one(hypothesis, is_taken)).collect();
-            for (hypothesis, object) in batch.iter().zip(tried) {
-                let is_free = |object: &Object| object.votes.iter().all(|&ray| !is_taken[ray as usize]);
-                let settled = match object {
-                    Some(object) if !is_free(&object) => nursery.try_one(hypothesis, is_taken),
-                    object => object,
-                };
-                if let Some(object) = settled {
-                    for &ray in &object.votes {
-                        is_taken[ray as usize] = true;
-                    }
-                    born.push(object);
+    // The best hypotheses of all places are tried side by side; where two want the same ray, the better one has it, and
+    // the other is tried again on what is left.
+    for batch in hypotheses.chunks(BATCH) {
+        progress.check()?;
+        let tried: Vec<Option<Object>> =
+            batch.par_iter().map(|hypothesis| nursery.try_one(hypothesis, is_taken)).collect();
+        for (hypothesis, object) in batch.iter().zip(tried) {
+            let is_free = |object: &Object| object.votes.iter().all(|&ray| !is_taken[ray as usize]);
+            let settled = match object {
+                Some(object) if !is_free(&object) => nursery.try_one(hypothesis, is_taken),
+                object => object,
+            };
+            if let Some(object) = settled {
+                for &ray in &object.votes {
+                    is_taken[ray as usize] = true;
                 }
+                born.push(object);
             }
         }
-        if who == Who::All && born.len() == before {
-            break;
-        }
     }
-    Ok((born, count))
+    Ok((born, hypotheses.len() as u64))
 }
 
 /// Where objects are born.

@@ -30,7 +30,6 @@ use crate::robust::noise::index::RayIndex;
 use crate::robust::parts::Part;
 use assign::assign;
 use births::births;
-use propose::Who;
 use rearrange::{TriedPairs, exclude, rearrange_pairs};
 use regrow::regrow;
 use repair::repair;
@@ -79,7 +78,7 @@ pub fn born_of_rest(
     if !model.settings.has(Part::Births) {
         return Ok((Vec::new(), 0));
     }
-    births(model, lookout, rays, &mut are_taken(model.scene, objects), &[Who::All], progress)
+    births(model, lookout, rays, &mut are_taken(model.scene, objects), progress)
 }
 
 /// The map of some rays with the least J that is found from what is there to begin with.
