@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use crate::progress::Progress;
-use crate::robust::energy::estimate::{Care, estimate};
+use crate::robust::energy::estimate::{Care, Estimate, Joint, Start};
 use crate::robust::initial::adjust::adjust;
 use crate::robust::initial::associate::Association;
 use crate::robust::initial::gather::gather;
@@ -247,6 +247,12 @@ fn with_image_at(object: Vector3<f64>, ahead_m: f64) -> Scene {
     Arc::make_mut(&mut there.rays).rays[0].center = center;
     there.views[0].center = center;
     joined(vec![street(10, 1.0, &[object], &[[0.3, -0.2]]), there])
+}
+
+/// The position of one label from its voters, starting nearby.
+fn estimate(scene: &Scene, noise: &Noise, voters: &[u32], start: Vector3<f64>, care: Care) -> Option<Estimate> {
+    let start = Start { voters, weights: &[], point: start };
+    Joint::new(scene, noise, std::iter::once(start), care).solve()?.estimates.pop()
 }
 
 #[test]

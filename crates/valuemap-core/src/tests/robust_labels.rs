@@ -164,7 +164,7 @@ proptest! {
         let solution = Joint::new(&scene, &DRIFTING, starts, Care::Exact).solve().unwrap();
         let contested = Contest::new(&model, &labels).contested(&solution);
         let shows_twin: BTreeSet<u32> = labels[1].votes.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
-        for (((of, ray), _), is_contested) in solution.own_chi2().into_iter().zip(contested) {
+        for (&(of, ray), is_contested) in solution.votes().iter().zip(contested) {
             let seen = scene.ray(ray);
             let projected = seen.project(&labels[1].fit.point);
             let variance = DRIFTING.total(&scene, ray).variance(projected.z);

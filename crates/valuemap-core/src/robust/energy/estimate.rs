@@ -293,7 +293,7 @@ impl<'a> Joint<'a> {
         Some(Solution { joint: self, here, refused, estimates })
     }
 
-    /// Leave out votes with the residuals `own`, see [`Solution::own_chi2`], that do not fit; whether there were any.
+    /// Leave out votes with the residuals `own`, see [`Evaluation`], that do not fit; whether there were any.
     fn trim(&mut self, own: &[f64], limits: &Limits, refused: &mut Vec<(usize, u32)>) -> bool {
         let mut leaves = unfit(&self.votes, own, limits.gate_sigmas);
         if !leaves.contains(&true) {
@@ -534,21 +534,13 @@ impl Solution<'_> {
         &self.joint.votes
     }
 
-    /// Label and ray of each vote with its squared residual in its own sigmas, after the drift of its visit is taken out,
-    /// studentised: a vote that pulls the point towards itself has a small residual, and is expected to.
-    #[must_use]
-    pub fn own_chi2(&self) -> Vec<((usize, u32), f64)> {
-        self.joint.votes.iter().copied().zip(self.here.own.iter().copied()).collect()
-    }
-
-    /// How much each vote counts that [`own_chi2`](Self::own_chi2) lists.
+    /// How much each of the [votes](Self::votes) counts.
     #[must_use]
     pub fn weights(&self) -> &[f64] {
         &self.joint.weights
     }
 
-    /// To first order, the estimates without the votes of which `leaves` says so, in the order of
-    /// [`own_chi2`](Self::own_chi2); nothing if the others do not fix them.
+    /// To first order, the estimates without those of the [votes](Self::votes) of which `leaves` says so; nothing if the others do not fix them.
     #[must_use]
     pub fn without(&self, leaves: &[bool]) -> Option<Vec<Estimate>> {
         let mut rest = self.joint.clone();
@@ -631,21 +623,11 @@ struct Evaluation {
     normals: Normals,
     /// Of the points of each visit, ascending.
     of_visits: Vec<(Vec<usize>, Normals)>,
-    /// See [`Solution::own_chi2`].
+    /// Squared residual of each vote in its own sigmas, after the drift of its visit is taken out, studentised: a vote that pulls the point towards
+    /// itself has a small residual, and is expected to.
     own: Vec<f64>,
     /// The most probable pose error of the image of each vote; none while estimates are rough.
     pose_errors: Vec<Vector6>,
-}
-
-/// Estimate the position of one label from its voters, starting nearby.
-///
-/// Nothing if the point ends up behind a voter, or the voters do not fix it.
-#[must_use]
-pub fn estimate(scene: &Scene, noise: &Noise, voters: &[u32], start: Vector3<f64>, care: Care) -> Option<Estimate> {
-    Joint::new(scene, noise, std::iter::once(Start { voters, weights: &[], point: start }), care)
-        .solve()?
-        .estimates
-        .pop()
 }
 
 /// Whether two views, successive among those of something, are of one visit: of a pass that has not forgotten its drift.

@@ -48,8 +48,7 @@ impl<'a> Contest<'a> {
             near.map(|near| near.data).collect()
         };
         let near: Vec<Vec<usize>> = solution.estimates.iter().map(neighbors).collect();
-        let votes = solution.own_chi2();
-        votes.iter().map(|&((label, ray), _)| near[label].iter().any(|&i| self.might_have(i, ray))).collect()
+        solution.votes().iter().map(|&(label, ray)| near[label].iter().any(|&i| self.might_have(i, ray))).collect()
     }
 
     /// Never the label that has it: its images are those that show it.

@@ -12,7 +12,7 @@ pub mod reach;
 pub mod tails;
 
 use crate::robust::energy::looks::Lookout;
-use crate::robust::energy::{LEAST_VOTES, Object, SURE_VOTES, implied_size};
+use crate::robust::energy::{LEAST_VOTES, Object, SURE_VOTES, are_taken, implied_size};
 use crate::robust::model::heights::{Heights, ground_m2 as ground_m2_within, height_m};
 use crate::robust::model::steps::{elevation_factor, score_ratio};
 use crate::robust::model::{ClassModel, Model};
@@ -81,8 +81,6 @@ struct Evidence<'a> {
 
 impl<'a> Evidence<'a> {
     fn new(model: &'a Model<'a>, lookout: &'a Lookout, rays: &[u32], objects: &'a [Object]) -> Self {
-        let mut is_vote = vec![false; model.scene.rays.rays.len()];
-        objects.iter().flat_map(|object| &object.votes).for_each(|&ray| is_vote[ray as usize] = true);
         let sure = objects.iter().filter(|object| is_sure(object)).count();
         let looked_at = span(&model.sin_elevation);
         let are_elevations_measured = looked_at.1 - looked_at.0 > LEAST_ELEVATIONS;
@@ -91,7 +89,7 @@ impl<'a> Evidence<'a> {
             model,
             lookout,
             objects,
-            is_vote,
+            is_vote: are_taken(model.scene, objects),
             solid_angle_sr: model.solid_angle_sr(rays.len()),
             ground_m2: ground_m2(model, objects, least_votes) * model.share_of(rays.len()),
             looked_at,

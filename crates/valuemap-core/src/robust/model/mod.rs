@@ -525,15 +525,7 @@ impl<'a> Model<'a> {
         (2.0 * PI * variance_px2).ln() + self.ln_clutter_per_px2(ray) < 0.0
     }
 
-    /// How much more probable, in logarithms, a detection is as a vote than as clutter, if its object, of a class and of size `ln_size`, is where the
-    /// residual has a squared length of `chi2` sigmas with a covariance of determinant `px4`.
-    #[inline]
-    #[must_use]
-    pub fn vote_gain(&self, class: u32, ray: u32, chi2: f64, px4: f64, depth_m: f64, ln_size: f64) -> f64 {
-        self.votes_for(class).gain(ray, chi2, px4, depth_m, ln_size)
-    }
-
-    /// The same for many votes.
+    /// What votes for objects of a class are worth.
     #[inline]
     #[must_use]
     pub fn votes_for(&self, class: u32) -> VotesFor<'_> {
@@ -551,7 +543,8 @@ pub struct VotesFor<'a> {
 }
 
 impl VotesFor<'_> {
-    /// See [`Model::vote_gain`].
+    /// How much more probable, in logarithms, a detection is as a vote than as clutter, if its object, of size `ln_size`, is where the residual has a
+    /// squared length of `chi2` sigmas with a covariance of determinant `px4`.
     #[inline]
     #[must_use]
     pub fn gain(&self, ray: u32, chi2: f64, px4: f64, depth_m: f64, ln_size: f64) -> f64 {

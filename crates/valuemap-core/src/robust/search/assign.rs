@@ -232,7 +232,7 @@ fn gain(model: &Model<'_>, object: &Object, ray: u32, pose: &PoseError) -> f64 {
         return f64::NEG_INFINITY;
     }
     let depth_m = model.scene.ray(ray).project(&point).z;
-    model.vote_gain(object.class, ray, chi2, covariance.determinant(), depth_m, object.ln_size)
+    model.votes_for(object.class).gain(ray, chi2, covariance.determinant(), depth_m, object.ln_size)
 }
 
 /// What an object gains by a ray if nothing is known of the pose error of its image.
