@@ -237,7 +237,7 @@ def test_a_calibration_of_another_version_is_refused() -> None:
 def test_what_is_not_known_of_a_class_is_null() -> None:
     row = [math.nan] * sum(count for _, count in _core.CLASS_FIELDS)
     value = calibration_to_json(Calibration(Noise(), Noise(), False, {"light": tuple(row)}, tuple(row), {}))
-    assert value["pooled"]["nearest_m"] is None
+    assert value["pooled"]["farthest_m"] is None
     assert set(value["classes"]["light"]["score_edges"]) == {None}
     again = calibration_from_json(json.loads(json.dumps(value, allow_nan=False)), source="run.json")
     assert all(math.isnan(number) for number in again.pooled)

@@ -21,6 +21,12 @@ pub struct Settings {
 }
 
 impl Settings {
+    /// Logarithm of the density of objects where nothing tells it, 1/m³: one per cube as wide as the range.
+    #[must_use]
+    pub fn ln_births_per_m3(&self) -> f64 {
+        -3.0 * self.viability.max_range_m.ln()
+    }
+
     /// Whether a part of the method is in use.
     #[inline]
     #[must_use]

@@ -524,7 +524,7 @@ pub fn energy_of_votes(model: &Model<'_>, of_class: u32, votes: &[u32], fit: &Fi
         })
         .sum();
     let of_size = prior_of_size(&class.sizes, ln_size);
-    let births = class.ln_births(height_m(model.scene, model.up, votes, &fit.point));
+    let births = class.ln_births(model.settings, height_m(model.scene, model.up, votes, &fit.point));
     let energy = fit.energy + 2.0 * n * ln_2_pi - 3.0 * ln_2_pi - 2.0 * births + 2.0 * (clutter - sizes - of_size);
     (energy, ln_size)
 }

@@ -23,8 +23,8 @@ use rates::with_rates;
 use reach::{looked_at, reach};
 use tails::{OfImages, tails};
 
-/// The part of the votes that is nearer than what counts as seen from everywhere.
-const NEAR_VOTES: f64 = 0.05;
+/// The part of the votes that is from farther away than objects are taken to be seen from.
+const FAR_VOTES: f64 = 0.05;
 /// Boxes that are all put on one elevation, as those of bearings are on the horizon, differ in its sine by no more than rounding.
 const LEAST_ELEVATIONS: f64 = 1e-6;
 /// Fewer of these tell nothing, and what was thought before stays.
@@ -121,7 +121,7 @@ impl<'a> Evidence<'a> {
         if sure.len() >= MIN_OBJECTS {
             learned.is_learned = true;
             learned = with_rates(&many, &learned, has(Part::Ghosts));
-            (learned.nearest_m, learned.farthest_m) = distances_between_m(model, &sure);
+            learned.farthest_m = farthest_m(model, &sure);
             let (spread, object) = sizes(model, &sure);
             learned.sizes.spread = spread.max(LEAST_SPREAD);
             learned.sizes.object = (object.0, object.1.max(learned.sizes.spread));
@@ -170,7 +170,7 @@ pub(crate) fn is_sure(object: &Object) -> bool {
 fn ground_m2(model: &Model<'_>, objects: &[Object], least_votes: usize) -> f64 {
     let sure: Vec<&Object> = objects.iter().filter(|object| object.votes.len() >= least_votes).collect();
     let mut distances = distances_m(model, &sure);
-    let place = (distances.len() as f64 * (1.0 - NEAR_VOTES)) as usize;
+    let place = (distances.len() as f64 * (1.0 - FAR_VOTES)) as usize;
     match model.up {
         Some(up) if place < distances.len() => {
             ground_m2_within(model.scene, &up, *distances.select_nth_unstable_by(place, f64::total_cmp).1)
@@ -202,12 +202,12 @@ fn span(numbers: &[f64]) -> (f64, f64) {
         .fold((f64::INFINITY, f64::NEG_INFINITY), |(least, most), &number| (least.min(number), most.max(number)))
 }
 
-/// The distances between which all but few votes are cast, m: those nearer, and those farther, are as few.
-fn distances_between_m(model: &Model<'_>, objects: &[&Object]) -> (f64, f64) {
+/// The distance up to which all but few votes are cast, m.
+fn farthest_m(model: &Model<'_>, objects: &[&Object]) -> f64 {
     let mut distances = distances_m(model, objects);
     distances.sort_by(f64::total_cmp);
-    let few = (distances.len() as f64 * NEAR_VOTES) as usize;
-    (distances[few], distances[distances.len() - 1 - few])
+    let few = (distances.len() as f64 * FAR_VOTES) as usize;
+    distances[distances.len() - 1 - few]
 }
 
 /// How far all votes are from their objects, m.

@@ -42,8 +42,6 @@ pub struct ClassModel {
     pub is_learned: bool,
     /// How often objects are detected.
     pub rates: Rates,
-    /// Objects are detected from this distance on, m; infinite before anything is learned.
-    pub nearest_m: f64,
     /// Objects are detected up to this distance, m.
     pub farthest_m: f64,
     /// The share of the passes in which an object is seen in any share of the looks, or none: hidden, or from where it is not detected.
@@ -52,8 +50,6 @@ pub struct ClassModel {
     pub ghost_share: f64,
     /// Logarithm of the clutter: detections per image and steradian that show no object.
     pub ln_clutter_per_sr: f64,
-    /// Logarithm of the density of objects, 1/m³.
-    pub ln_births_per_m3: f64,
     /// Logarithm of the density of objects on the ground, 1/m², where heights are known.
     pub ln_births_per_m2: f64,
     /// How high objects are; nothing before anything is learned.
@@ -93,12 +89,10 @@ impl ClassModel {
         Self {
             is_learned: false,
             rates: Rates::GUESS,
-            nearest_m: f64::INFINITY,
             farthest_m: settings.viability.max_range_m,
             odd_passes: ODD_PASSES.1,
             ghost_share: 0.0,
             ln_clutter_per_sr: (detections.max(1) as f64 / scene.solid_angle_sr()).ln(),
-            ln_births_per_m3: -3.0 * settings.viability.max_range_m.ln(),
             ln_births_per_m2: f64::NAN,
             clutter_by_elevation: Steps::NONE,
             score_ratio: Steps::NONE,
@@ -116,17 +110,15 @@ impl ClassModel {
 
     /// The names that its numbers are stored under, in the order of [`to_row`](Self::to_row), each with how many there are. What is a function of
     /// something is stored as the edges between which it is constant, and its values.
-    pub const FIELDS: [(&'static str, usize); 39] = [
+    pub const FIELDS: [(&'static str, usize); 37] = [
         ("is_learned", 1),
         ("recall", 1),
         ("recall_concentration_looks", 1),
         ("recall_between_sides_logit", 1),
-        ("nearest_m", 1),
         ("farthest_m", 1),
         ("odd_passes", 1),
         ("ghost_share", 1),
         ("ln_clutter_per_sr", 1),
-        ("ln_births_per_m3", 1),
         ("ln_births_per_m2", 1),
         ("box_angle_mean_ln_rad", 1),
         ("box_angle_sigma_ln_rad", 1),
@@ -177,12 +169,10 @@ impl ClassModel {
             self.rates.recall,
             self.rates.concentration,
             self.rates.between,
-            self.nearest_m,
             self.farthest_m,
             self.odd_passes,
             self.ghost_share,
             self.ln_clutter_per_sr,
-            self.ln_births_per_m3,
             self.ln_births_per_m2,
             self.sizes.angle.0,
             self.sizes.angle.1,
@@ -204,7 +194,7 @@ impl ClassModel {
     /// What `to_row` returned; nothing of another number of numbers.
     #[must_use]
     pub fn from_row(row: &[f64]) -> Option<Self> {
-        let (numbers, rest) = row.split_first_chunk::<21>()?;
+        let (numbers, rest) = row.split_first_chunk::<19>()?;
         let (heights, rest) = rest.split_first_chunk::<{ Heights::NUMBERS }>()?;
         let (clutter, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
         let (scores, rest) = rest.split_first_chunk::<{ Steps::NUMBERS }>()?;
@@ -218,12 +208,10 @@ impl ClassModel {
             recall,
             concentration,
             between,
-            nearest_m,
             farthest_m,
             odd_passes,
             ghost_share,
             ln_clutter_per_sr,
-            ln_births_per_m3,
             ln_births_per_m2,
             angle_mean,
             angle_sd,
@@ -239,12 +227,10 @@ impl ClassModel {
         Some(Self {
             is_learned: is_learned > 0.0,
             rates: Rates { recall, concentration, between },
-            nearest_m,
             farthest_m,
             odd_passes,
             ghost_share,
             ln_clutter_per_sr,
-            ln_births_per_m3,
             ln_births_per_m2,
             heights: Heights::from_row(heights),
             clutter_by_elevation: Steps::from_row(clutter),
@@ -277,10 +263,10 @@ impl ClassModel {
 
     /// Logarithm of the density of objects at a height above the cameras, m, 1/m³.
     #[must_use]
-    pub fn ln_births(&self, height_m: Option<f64>) -> f64 {
+    pub fn ln_births(&self, settings: &Settings, height_m: Option<f64>) -> f64 {
         match (&self.heights, height_m) {
             (Some(heights), Some(height_m)) => self.ln_births_per_m2 + heights.ln_density(height_m),
-            _ => self.ln_births_per_m3,
+            _ => settings.ln_births_per_m3(),
         }
     }
 }
@@ -644,12 +630,10 @@ mod tests {
         let model = ClassModel {
             is_learned: true,
             rates: Rates { recall: 0.61, concentration: 7.0, between: 0.4 },
-            nearest_m: 4.0,
             farthest_m: 61.0,
             odd_passes: 0.02,
             ghost_share: 0.3,
             ln_clutter_per_sr: -1.0,
-            ln_births_per_m3: -9.0,
             ln_births_per_m2: -6.0,
             heights,
             clutter_by_elevation: steps(100.0),
@@ -681,12 +665,10 @@ mod tests {
             ("recall", vec![0.61]),
             ("recall_concentration_looks", vec![7.0]),
             ("recall_between_sides_logit", vec![0.4]),
-            ("nearest_m", vec![4.0]),
             ("farthest_m", vec![61.0]),
             ("odd_passes", vec![0.02]),
             ("ghost_share", vec![0.3]),
             ("ln_clutter_per_sr", vec![-1.0]),
-            ("ln_births_per_m3", vec![-9.0]),
             ("ln_births_per_m2", vec![-6.0]),
             ("box_angle_mean_ln_rad", vec![-4.0]),
             ("box_angle_sigma_ln_rad", vec![0.7]),

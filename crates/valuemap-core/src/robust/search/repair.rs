@@ -280,7 +280,7 @@ impl Candidate {
         }
         let votes = gains.iter().map(|&(place, _)| rays[place]).collect();
         // The volume that its position is known to.
-        let birth = -of_class.ln_births_per_m3 - 1.5 * (variance_m2 / gains.len().max(1) as f64).ln();
+        let birth = -model.settings.ln_births_per_m3() - 1.5 * (variance_m2 / gains.len().max(1) as f64).ln();
         let cost = birth.max(0.0) - images as f64 * of_class.rates.log_miss();
         Self { point, gains, votes, cost }
     }
