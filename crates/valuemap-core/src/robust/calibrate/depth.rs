@@ -5,14 +5,12 @@ use rustc_hash::{FxHashMap, FxHashSet};
 use super::{CLASS_RAYS, WIDE};
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::{Object, Placed, placed};
-use crate::robust::model::Model;
+use crate::robust::model::{CHANCE_SIGMAS, Model};
 use crate::robust::scene::sample;
 use crate::robust::search::{Depth, Tally, search};
 
-/// All moves take some ten times as long: they pay if they change more than one object in ten of those that are kept.
+/// All moves take some ten times as long: they pay if they change more than one object in ten of those that are kept, by more than chance.
 const LEAST_CHANGE: f64 = 0.1;
-/// By so many standard deviations of the share more: what a sample says by chance pays nowhere.
-const LEAST_CHANGE_SIGMAS: f64 = 2.0;
 /// Below so many expected changes the normal distribution says nothing of their number.
 const LEAST_EXPECTED: f64 = 5.0;
 /// It is asked of so many parts of the places that classes are learned from, one after the other, until they tell: a part has some twenty objects.
@@ -98,7 +96,7 @@ impl Change {
         }
         let chance = (LEAST_CHANGE * (1.0 - LEAST_CHANGE) / count).sqrt();
         let more = 1.0 - 2.0 * self.kept as f64 / count - LEAST_CHANGE;
-        (more.abs() > LEAST_CHANGE_SIGMAS * chance).then_some(more > 0.0)
+        (more.abs() > CHANCE_SIGMAS * chance).then_some(more > 0.0)
     }
 }
 

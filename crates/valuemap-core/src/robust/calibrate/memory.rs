@@ -9,6 +9,7 @@
 
 use rayon::prelude::*;
 
+use super::AKAIKE;
 use super::residuals::{VisitOf, minus_log_likelihood, search};
 use super::shared::stated;
 use crate::robust::energy::Placed;
@@ -16,8 +17,6 @@ use crate::robust::noise::drift::{self, Look};
 use crate::robust::noise::{Known, Noise};
 use crate::robust::scene::Scene;
 
-/// Detections remember if minus twice the logarithm of the likelihood falls by more than this: what one parameter gains by chance (Akaike).
-const LEAST_FALL: f64 = 2.0;
 /// Variances become larger or smaller by this factor at most.
 const MOST_CHANGE: f64 = 100.0;
 
@@ -40,7 +39,7 @@ pub(crate) fn remembered(scene: &Scene, noise: &Noise, known: Known, labels: &[&
         search([1.0; 4], bounds, [is_own_known, known.position, known.rotation, most_looks <= 1.0], &cost)
     };
     let remembering = found(looks_of_segment(&visits.iter().map(|v| v.looks(scene, noise)).collect::<Vec<_>>()));
-    (remembering[3] > 1.0 && cost(&found(1.0)) - cost(&remembering) > LEAST_FALL)
+    (remembering[3] > 1.0 && cost(&found(1.0)) - cost(&remembering) > AKAIKE)
         .then(|| Noise { look_correlation: correlation(remembering[3]), ..changed(noise, &remembering) })
 }
 

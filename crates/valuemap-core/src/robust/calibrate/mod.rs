@@ -40,6 +40,8 @@ const CALIBRATION_RAYS: (usize, usize) = (4_000, 10_000);
 const CLASS_RAYS: usize = 30_000;
 /// Places that classes are learned from are so many ranges wide: most objects in them are seen by no other images.
 const WIDE: f64 = 3.0;
+/// One parameter more lowers minus twice the logarithm of the likelihood by no more than this by chance (Akaike).
+const AKAIKE: f64 = 2.0;
 /// Scenes with more rays than this are searched less deeply, if that changes little.
 const MOST_RAYS: usize = 100_000;
 

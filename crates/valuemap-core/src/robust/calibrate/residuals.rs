@@ -12,6 +12,7 @@ use rustc_hash::FxHashMap;
 use super::shared::{drifting, stated, with_drift};
 use crate::robust::energy::estimate::{looks_at, visits};
 use crate::robust::energy::{LEAST_VOTES, Placed, SURE_VOTES};
+use crate::robust::model::FALSE_SHARE;
 use crate::robust::noise::drift::{Drive, Look};
 use crate::robust::noise::told::Told;
 use crate::robust::noise::{Known, Noise};
@@ -22,14 +23,10 @@ use crate::robust::scene::Scene;
 const ENOUGH_VOTES: usize = 250;
 /// A visit with fewer voters has no residuals.
 const MIN_VOTES_OF_VISIT: usize = 2;
-/// The part of the labels that serves, those that fit best.
-const FIT_SHARE: f64 = 0.9;
 /// Voters that are used, about.
 const SAMPLE_VOTES: usize = 6000;
 /// The parameters are searched between these factors of a step, from coarse to fine.
 const STEPS: [f64; 5] = [2.0, 1.5, 1.25, 1.12, 1.06];
-/// The guess is trusted to about this factor (standard deviation of the logarithm): what the data do not tell stays near it.
-const TRUST_LOG_SD: f64 = 1.0;
 /// The part of the variance of distant objects' residuals that is taken for rotation.
 const ROTATION_PART: f64 = 0.5;
 /// The part of the variance of what the images of a segment share that each of them has for itself all the same: errors that forget 63 % of
@@ -119,8 +116,9 @@ pub(crate) fn search<const N: usize>(
         best[i] = best[i].clamp(bounds[i].0, bounds[i].1);
     }
     let center = best;
+    // The start is trusted to a factor of e (standard deviation of the logarithm): what the data do not tell stays near it.
     let of = |parameters: &[f64; N]| {
-        let away = (0..N).filter(|&i| !fixed[i]).map(|i| (parameters[i] / center[i]).ln() / TRUST_LOG_SD);
+        let away = (0..N).filter(|&i| !fixed[i]).map(|i| (parameters[i] / center[i]).ln());
         cost(parameters) + away.map(|away| away * away).sum::<f64>()
     };
     // Where a round of all parameters changed none of them, the next one tries the same.
@@ -150,7 +148,7 @@ pub(crate) fn search<const N: usize>(
 }
 
 /// Well supported labels, evenly over the map, together about as many voters as needed. Those whose residuals fit the
-/// guess worst are left out: wrong associations would be taken for noise.
+/// guess worst are left out, as many as are false: wrong associations would be taken for noise.
 pub(crate) fn sample<'a>(scene: &Scene, guess: &Noise, labels: &'a [Placed]) -> Vec<&'a Placed> {
     let votes: usize = labels.iter().map(|label| label.0.len()).filter(|&votes| votes >= SURE_VOTES).sum();
     let least = if votes < ENOUGH_VOTES { LEAST_VOTES } else { SURE_VOTES };
@@ -161,7 +159,7 @@ pub(crate) fn sample<'a>(scene: &Scene, guess: &Noise, labels: &'a [Placed]) -> 
         .collect();
     let mut misfits: Vec<f64> = good.iter().map(|(misfit, _)| *misfit).collect();
     misfits.sort_by(f64::total_cmp);
-    if let Some(&limit) = misfits.get((misfits.len() as f64 * FIT_SHARE) as usize) {
+    if let Some(&limit) = misfits.get((misfits.len() as f64 * (1.0 - FALSE_SHARE)) as usize) {
         good.retain(|(misfit, _)| *misfit <= limit);
     }
     let good: Vec<&Placed> = good.into_iter().map(|(_, label)| label).collect();

@@ -14,7 +14,7 @@ use crate::robust::scene::Scene;
 
 /// Where the noise is sought, how much passes of a label disagree counts up to this many standard deviations: 95 % efficient where errors are Gaussian (Huber, "Robust
 /// estimation of a location parameter", 1964).
-const HUBER_SIGMAS: f64 = 1.345;
+const EFFICIENT_SIGMAS: f64 = 1.345;
 /// Shared errors over own errors of a pose: least and most.
 const LEAST_DRIFT: f64 = 0.1;
 const MOST_DRIFT: f64 = 1000.0;
@@ -109,7 +109,7 @@ fn agreeing_ratio(excess_of: impl Fn(f64) -> Option<f64>) -> Option<f64> {
 /// By how many standard deviations disagreements are larger than expected, of most labels: Huber's psi, summed. A label of two objects disagrees
 /// whatever the noise is; where a fifth of the labels are such, no drift is so large that the mean is as expected.
 fn excess(of_labels: Vec<Option<Disagreement>>) -> Option<f64> {
-    Some(enough(of_labels)?.iter().map(|one| one.sigmas().clamp(-HUBER_SIGMAS, HUBER_SIGMAS)).sum())
+    Some(enough(of_labels)?.iter().map(|one| one.sigmas().clamp(-EFFICIENT_SIGMAS, EFFICIENT_SIGMAS)).sum())
 }
 
 #[cfg(test)]

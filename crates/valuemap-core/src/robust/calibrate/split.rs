@@ -9,8 +9,8 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use super::residuals;
-use super::residuals::{BOX_SHARE, detection_px};
+use super::AKAIKE;
+use super::residuals::{self, BOX_SHARE, detection_px};
 use super::shared::{stated, with_drift};
 use crate::robust::energy::estimate::is_one_visit;
 use crate::robust::energy::{Object, placed, places_of_all};
@@ -29,8 +29,6 @@ const HALVINGS: usize = 4;
 const TURNS: usize = 2;
 /// The share of the pose is no less than this, and no more than 1 less this: no noise is no density.
 const LEAST_SHARE: f64 = 0.02;
-/// Shares are taken for what they seem if minus twice the logarithm of the likelihood falls by more than this: what two parameters gain by chance (Akaike).
-const LEAST_FALL: f64 = 4.0;
 
 /// Objects of one place, with what their votes see.
 struct Place {
@@ -66,7 +64,8 @@ pub fn split(model: &Model<'_>, known: Known, objects: &[Object]) -> Noise {
             best = least(best, LEAST_SHARE, &|share| scale.with_rotation(&best.1, share, least_px), &value);
         }
     }
-    if before - best.0 > LEAST_FALL { redrifted(model, objects, &best.1) } else { noise }
+    // What two parameters gain by chance tells no shares.
+    if before - best.0 > 2.0 * AKAIKE { redrifted(model, objects, &best.1) } else { noise }
 }
 
 /// The noise with its drift told anew: the one before followed from poses that turned by more, or less.

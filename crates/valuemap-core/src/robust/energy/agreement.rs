@@ -7,16 +7,14 @@
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 
-use super::Placed;
 use super::estimate::{looks_at, visits};
 use super::sides::sides;
+use super::{Placed, TELLING_VOTES};
 use crate::robust::noise::Noise;
 use crate::robust::noise::drift::Drive;
 use crate::robust::noise::told::Told;
 use crate::robust::scene::Scene;
 
-/// A pass with fewer voters does not say where it would put a label alone.
-const MIN_VOTES_OF_PASS: usize = 4;
 /// Where passes can disagree in fewer ways, the shared part is taken to be as large as the own part: of so many squares a variance is known to a third.
 const LEAST_FREEDOM: f64 = 15.0;
 /// One label says no more than this about the disagreement of passes, as a multiple of what is expected.
@@ -57,9 +55,9 @@ struct Side {
 struct Sides(Vec<Side>);
 
 impl Sides {
-    /// Of the passes with enough votes. Nothing if they do not fix the label.
+    /// Of the passes with enough votes to say where they would put the label alone. Nothing if they do not fix the label.
     fn of(scene: &Scene, noise: &Noise, (votes, point): &Placed) -> Option<Self> {
-        let passes: Vec<&[u32]> = visits(scene, votes).filter(|pass| pass.len() >= MIN_VOTES_OF_PASS).collect();
+        let passes: Vec<&[u32]> = visits(scene, votes).filter(|pass| pass.len() >= TELLING_VOTES).collect();
         let of_side = |side: &Vec<u32>| {
             let (mut information, mut gradient, mut alone, mut axes) = (Matrix3::zeros(), Vector3::zeros(), 0.0, 0);
             for &pass in side {

@@ -22,8 +22,6 @@ use crate::robust::noise::spd::Vector6;
 use crate::robust::noise::{Noise, variance_of_alike};
 use crate::robust::scene::{Scene, View};
 
-/// Good enough while votes may still change, m.
-pub const ROUGH_M: f64 = 1e-2;
 /// A pass that comes back after so long a drive has another drift, m.
 const FORGOTTEN_M: f64 = 250.0;
 /// A longer step is shortened to this, m.
@@ -53,7 +51,7 @@ impl Care {
     fn tolerance_sigmas(self) -> f64 {
         match self {
             Self::Rough => 0.05,
-            Self::Exact => 0.03,
+            Self::Exact => super::STEP_SIGMAS,
         }
     }
 

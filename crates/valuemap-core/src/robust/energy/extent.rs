@@ -7,8 +7,10 @@ use crate::robust::model::Model;
 use crate::robust::noise::{Noise, norm};
 
 /// Detections are looked for as far from an object as this many of its standard deviations.
-const REACH_SIGMAS: f64 = 4.0;
-/// In so many steps at most: an object whose depth is hardly known is looked for where it may be by its size, not for ever.
+pub(crate) const REACH_SIGMAS: f64 = 4.0;
+/// In so many steps at least, which are no longer than a standard deviation.
+const LEAST_STEPS: f64 = 4.0;
+/// And at most: an object whose depth is hardly known is looked for where it may be by its size, not for ever.
 const MOST_STEPS: f64 = 32.0;
 
 impl Object {
@@ -27,8 +29,7 @@ impl Object {
         // A gate is at least as wide as errors of position make it.
         let Noise { position_m, position_segment_m, position_drift_m, .. } = *model.noise;
         let gate_m = model.settings.gate_sigmas * norm(norm(position_m, position_segment_m), position_drift_m);
-        let gates = reach_m / gate_m;
-        let steps = if gates > REACH_SIGMAS { gates.ceil().min(MOST_STEPS) } else { REACH_SIGMAS };
+        let steps = (reach_m / gate_m).ceil().clamp(LEAST_STEPS, MOST_STEPS);
         let reach = axes.eigenvectors.column(longest) * reach_m;
         (-steps as i32..=steps as i32).map(|step| point + reach * (f64::from(step) / steps)).collect()
     }

@@ -46,7 +46,7 @@ use sizes::size_terms;
 const STEP_SIGMAS: f64 = 0.03;
 const MAX_STEPS: usize = 12;
 /// Times that a step after which the residuals are larger is cut to a quarter.
-const MAX_HALVINGS: usize = 6;
+const MAX_CUTS: usize = 6;
 /// Residuals that are larger by rounding are not larger.
 const LEAST_FALL: f64 = 1e-9;
 
@@ -54,6 +54,8 @@ const LEAST_FALL: f64 = 1e-9;
 pub const SURE_VOTES: usize = 6;
 /// Rays alone tell where objects of so many votes are, with three residuals to spare.
 pub const LEAST_VOTES: usize = 3;
+/// So many tell it with residuals to spare.
+pub const TELLING_VOTES: usize = LEAST_VOTES + 1;
 
 /// An object: what the map consists of.
 #[derive(Debug, Clone)]
@@ -158,7 +160,7 @@ pub fn fit(model: &Model<'_>, votes: &[u32], start: Vector3<f64>) -> Option<Fit>
         if -step.dot(&here.gradient) < STEP_SIGMAS * STEP_SIGMAS {
             break;
         }
-        let better = (0..MAX_HALVINGS).find_map(|_| {
+        let better = (0..MAX_CUTS).find_map(|_| {
             let next = fitting.terms(&weights, &(point + step)).filter(|next| next.cost() <= here.cost() + LEAST_FALL);
             if next.is_none() {
                 step *= 0.25;
@@ -387,6 +389,9 @@ pub(crate) fn camera_m2(model: &Model<'_>, votes: &[u32]) -> f64 {
     }
     sum / (visits_count * visits_count)
 }
+
+/// What looks from directions that differ by less than 30 degrees looks from one side (cosine).
+pub(crate) const ONE_SIDE_COSINE: f64 = 0.866;
 
 /// Rays in groups that look from one side each: from directions with no less than a cosine to the first of the group.
 pub(crate) fn by_side(looks: impl Iterator<Item = (u32, Vector3<f64>)>, least_cosine: f64) -> Vec<Vec<u32>> {

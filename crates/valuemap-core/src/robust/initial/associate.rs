@@ -13,13 +13,12 @@ use super::assignment::{Case, Claim, Decision, Fit, assigned, belief_of_votes, d
 use super::label::{Label, fingerprint};
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::estimate::Estimate;
+use crate::robust::energy::extent::REACH_SIGMAS;
 use crate::robust::noise::Noise;
 use crate::robust::noise::index::{Hit, RayIndex, chi2_in_gate};
 use crate::robust::noise::poses::{Belief, SEGMENTS_AROUND, Segments, smooth};
 use crate::robust::scene::Scene;
 
-/// Detections are looked for as far from a label as this many of its standard deviations, in steps of one.
-const REACH_SIGMAS: i32 = 4;
 /// Where a label's place is known this well, its uncertainty widens no gate, m.
 const CERTAIN_M: f64 = 0.1;
 
@@ -264,7 +263,7 @@ fn with_votes_of(label: &Label, mut claims: Vec<Claim>) -> Vec<Claim> {
     claims
 }
 
-/// Where a label may be: along the direction that it is least known in.
+/// Where a label may be: along the direction that it is least known in, in steps of a standard deviation.
 fn places_of(estimate: &Estimate) -> Vec<Vector3<f64>> {
     let axes = estimate.covariance.symmetric_eigen();
     let longest = axes.eigenvalues.imax();
@@ -273,7 +272,8 @@ fn places_of(estimate: &Estimate) -> Vec<Vector3<f64>> {
         return vec![estimate.point];
     }
     let axis = axes.eigenvectors.column(longest) * sigma;
-    (-REACH_SIGMAS..=REACH_SIGMAS).map(|step| estimate.point + axis * f64::from(step)).collect()
+    let steps = REACH_SIGMAS as i32;
+    (-steps..=steps).map(|step| estimate.point + axis * f64::from(step)).collect()
 }
 
 /// What is claimed on some segments of one pass: the cases, image by image, and what the votes say about the drift.

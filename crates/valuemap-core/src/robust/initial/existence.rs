@@ -12,6 +12,8 @@ use rayon::prelude::*;
 
 use super::label::{Label, direction_to, sector_middles};
 use crate::robust::energy::looks::{Lookout, SECTOR_COSINE};
+use crate::robust::learn::rates::{CORRELATION, LEAST_LOOKS, LEAST_LOOKS_OF_PASS, recall};
+use crate::robust::model;
 use crate::robust::noise::Spread;
 use crate::robust::scene::Scene;
 
@@ -147,14 +149,15 @@ impl Rates {
             .iter()
             .filter(|passes| passes.iter().map(|p| p.hits).sum::<u32>() >= 8)
             .flatten()
-            .filter(|pass| pass.expected >= 3)
+            .filter(|pass| f64::from(pass.expected) >= LEAST_LOOKS_OF_PASS)
             .collect();
         let (hits, expected) =
             sure.iter().fold((0.0_f64, 0.0_f64), |(h, n), p| (h + f64::from(p.hits), n + f64::from(p.expected)));
-        if expected < 30.0 {
-            return Self { recall: 0.7, concentration: 3.0 };
+        if expected < LEAST_LOOKS {
+            let model::Rates { recall, concentration, .. } = model::Rates::GUESS;
+            return Self { recall, concentration };
         }
-        let recall = (hits / expected).clamp(0.05, 0.98);
+        let recall = recall(hits / expected);
         // Method of moments: the variance of a pass's share is p (1 - p) (1 + (n - 1) / (1 + s)) / n.
         let mut excess = (0.0, 0.0);
         for pass in &sure {
@@ -163,7 +166,7 @@ impl Rates {
             excess.0 += n * share * share - recall * (1.0 - recall);
             excess.1 += (n - 1.0) * recall * (1.0 - recall);
         }
-        let correlation = (excess.0 / excess.1).clamp(0.01, 0.5);
+        let correlation = f64::clamp(excess.0 / excess.1, CORRELATION.0, CORRELATION.1);
         Self { recall, concentration: 1.0 / correlation - 1.0 }
     }
 

@@ -7,13 +7,11 @@ use nalgebra::Vector3;
 use rstar::RTree;
 use rstar::primitives::GeomWithData;
 
-use crate::robust::energy::Object;
+use crate::robust::energy::{Object, TELLING_VOTES};
 use crate::robust::model::heights::level_axes;
 use crate::robust::model::steps::{Steps, score_ratio};
 use crate::robust::model::{ClassModel, Model};
 
-/// Votes that make an object sure.
-const SURE_VOTES: usize = 4;
 /// Cameras of which the surroundings tell, at most.
 const MOST_VIEWS: usize = 1_000;
 /// Places around a camera: rings of equal area, and directions.
@@ -27,7 +25,7 @@ impl Sure {
     /// Those among some objects.
     #[must_use]
     pub fn of(objects: &[Object], class: u32) -> Self {
-        let is_sure = |(_, object): &(usize, &Object)| object.class == class && object.votes.len() >= SURE_VOTES;
+        let is_sure = |(_, object): &(usize, &Object)| object.class == class && object.votes.len() >= TELLING_VOTES;
         let places = objects.iter().enumerate().filter(is_sure);
         Self(RTree::bulk_load(places.map(|(row, object)| GeomWithData::new(object.fit.point.into(), row)).collect()))
     }

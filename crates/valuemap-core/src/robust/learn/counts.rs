@@ -5,10 +5,9 @@
 //! distribution. The odds of objects of few votes are lowered until their expected number is within these bounds.
 
 use crate::robust::energy::{LEAST_VOTES, Object};
+use crate::robust::model::steps::LEAST_DETECTIONS;
 use crate::robust::model::{FEW, Model, ln_gamma, mean_and_sd};
 
-/// The ratio of two numbers as large as this is known to a half.
-const ENOUGH: f64 = 10.0;
 /// Rounds of bisection: odds are right to a millionth.
 const ROUNDS: usize = 60;
 /// No odds are changed by more than this factor, in logarithms.
@@ -42,7 +41,7 @@ pub fn ln_odds_of_few(objects: &[&Object], few: &[&Object]) -> [f64; FEW] {
     let counts = Counts::of(&votes);
     let usual = |n: usize| counts.at(n);
     let bound = |here: f64, next: f64, n: usize| {
-        if here.min(next) < ENOUGH { usual(n) } else { here * here / next }
+        if here.min(next) < LEAST_DETECTIONS { usual(n) } else { here * here / next }
     };
     let most = few.iter().map(|object| object.votes.len()).max().unwrap_or(0);
     let more = |ln_odds: f64| (LEAST_VOTES..=most).map(|votes| expected(votes, ln_odds)).sum::<f64>();

@@ -14,9 +14,11 @@ const STEPS: usize = 20;
 /// Shares of odd passes that are compared: so many that a tenth of their deviation is between two where a thousand passes tell.
 const ODD_SHARES: usize = 45;
 /// Passes of fewer looks do not tell how much passes differ.
-const LEAST_LOOKS_OF_PASS: f64 = 3.0;
+pub(crate) const LEAST_LOOKS_OF_PASS: f64 = 3.0;
 /// Rates of fewer looks are known worse than to a tenth.
 pub(crate) const LEAST_LOOKS: f64 = 30.0;
+/// How alike looks of one pass are: at least, at most.
+pub(crate) const CORRELATION: (f64, f64) = (0.01, 0.5);
 /// Ghosts are as rare as if no more objects than these had been met, none of them a ghost: of fewer, one cannot be told from other false things, which
 /// are one in so many.
 const NO_GHOSTS: f64 = 1.0 / FALSE_SHARE;
@@ -76,7 +78,7 @@ fn learned_rates(objects: &[&Object], mut class: ClassModel) -> Option<ClassMode
 }
 
 /// A share of hits as a rate: no detector sees all, and none that serves sees nothing.
-fn recall(share: f64) -> f64 {
+pub(crate) fn recall(share: f64) -> f64 {
     share.clamp(0.05, 0.98)
 }
 
@@ -98,7 +100,7 @@ fn rates_of(sides: &[Vec<(Looks, f64)>]) -> Option<Rates> {
         excess += share * (n * away * away - variance);
         most += share * (n - 1.0) * variance;
     }
-    let of_all = f64::clamp(excess / most, 0.01, 0.5);
+    let of_all = f64::clamp(excess / most, CORRELATION.0, CORRELATION.1);
     // Two passes of one side have in common what sides differ by.
     let (mut common, mut pairs) = (0.0, 0.0);
     for passes in sides {
@@ -112,8 +114,8 @@ fn rates_of(sides: &[Vec<(Looks, f64)>]) -> Option<Rates> {
             pairs += (looks * looks - looks2) / looks;
         }
     }
-    let of_sides = if pairs > 0.0 { f64::clamp(common / (pairs * variance), 0.0, of_all - 0.01) } else { 0.0 };
-    let within = f64::clamp((of_all - of_sides) / (1.0 - of_sides), 0.01, 0.5);
+    let of_sides = if pairs > 0.0 { f64::clamp(common / (pairs * variance), 0.0, of_all - CORRELATION.0) } else { 0.0 };
+    let within = f64::clamp((of_all - of_sides) / (1.0 - of_sides), CORRELATION.0, CORRELATION.1);
     // The derivative of the logit is 1 / (p (1 - p)).
     Some(Rates { recall, concentration: 1.0 / within - 1.0, between: (of_sides / variance).sqrt() })
 }

@@ -13,14 +13,12 @@ use super::reach::LookedAt;
 use crate::robust::energy::Object;
 use crate::robust::energy::looks::Lookout;
 use crate::robust::model::steps::{BINS, Steps, bin};
-use crate::robust::model::{ClassModel, Model};
+use crate::robust::model::{CHANCE_SIGMAS, ClassModel, Model};
 use crate::robust::parts::Part;
 use crate::robust::scene::Scene;
 
 /// What misses an object by more gates than this does not show it.
 const WIDEST_GATES: f64 = 4.0;
-/// An excess by fewer standard deviations of a count is chance.
-const LEAST_SIGMAS: f64 = 2.0;
 
 /// Rays by image.
 pub struct OfImages<'a> {
@@ -76,7 +74,7 @@ pub fn tails(model: &Model<'_>, sure: &[LookedAt<'_>], free: &OfImages<'_>, ln_c
     // Within the gate a detection is a vote.
     let is_beyond = |bin: usize| WIDEST_GATES * bin as f64 >= BINS as f64;
     let density = |bin: usize| {
-        let excess = found[bin] - expected[bin] - LEAST_SIGMAS * found[bin].sqrt();
+        let excess = found[bin] - expected[bin] - CHANCE_SIGMAS * found[bin].sqrt();
         if is_beyond(bin) && excess > 0.0 { excess / (looks * ring(bin)) } else { 0.0 }
     };
     let densities: [f64; BINS] = std::array::from_fn(density);

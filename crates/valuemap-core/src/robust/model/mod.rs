@@ -35,6 +35,9 @@ pub const FEW: usize = 3;
 /// is behind it, what stands as high as no other stands on a bridge. It bounds what one of them can say. 5 % as in robust regression (Huber and Ronchetti,
 /// "Robust Statistics", 2009, section 1).
 pub const ODD: f64 = 0.05;
+/// What is off by fewer of its standard deviations is chance: one in twenty is off by more.
+pub(crate) const CHANCE_SIGMAS: f64 = 2.0;
+
 /// What is learned about the objects and the clutter of one class.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ClassModel {
@@ -552,7 +555,7 @@ pub const FALSE_SHARE: f64 = 0.1;
 const LEAST_BETWEEN: f64 = 0.05;
 
 /// The share of odd passes: at least, before anything is learned, at most.
-pub const ODD_PASSES: (f64, f64, f64) = (0.05, 0.2, 0.5);
+pub const ODD_PASSES: (f64, f64, f64) = (ODD, 0.2, 0.5);
 
 impl Rates {
     /// Of things of which nothing is known (Jeffreys).
@@ -560,7 +563,7 @@ impl Rates {
     /// Before anything is learned.
     pub const GUESS: Self = Self { recall: 0.7, concentration: 3.0, between: 0.0 };
     /// Of objects of which each is seen in the same share of the looks: as many tell a tenth from none.
-    pub const ALIKE: Self = Self { recall: 0.7, concentration: 100.0, between: 0.0 };
+    pub const ALIKE: Self = Self { concentration: 100.0, ..Self::GUESS };
 
     /// How probable it is that a side has a share of hits, but for a factor: the logit is normal.
     #[must_use]

@@ -5,8 +5,8 @@
 
 /// Values are sorted into so many bins of about as many detections each.
 pub const BINS: usize = 12;
-/// Fewer of one kind tell nothing: their number is known no better than to a third (Poisson).
-const LEAST_DETECTIONS: f64 = 10.0;
+/// Fewer of one kind tell nothing: their number is known no better than to a third, and a ratio to one as large no better than to a half (Poisson).
+pub(crate) const LEAST_DETECTIONS: f64 = 10.0;
 
 /// A function that is constant between some edges.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -11,7 +11,7 @@ use rustc_hash::FxHashMap;
 
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::looks::Lookout;
-use crate::robust::energy::{Object, fitting};
+use crate::robust::energy::{LEAST_GAIN_OF_MOVE, Object, fitting};
 use crate::robust::model::Model;
 use crate::robust::noise::drift::Look;
 use crate::robust::noise::huber::huber_weight;
@@ -145,7 +145,7 @@ fn commit(
     let mut any = false;
     let mut kept = Vec::with_capacity(objects.len());
     for (i, (object, change)) in objects.into_iter().zip(changes).enumerate() {
-        let falls = gain[group.of(i)] < -1e-6;
+        let falls = gain[group.of(i)] < -LEAST_GAIN_OF_MOVE;
         match change {
             Change::To(moved) if falls => {
                 any = true;

@@ -21,7 +21,7 @@ const PLACES_PER_DECADE: f64 = 30.0;
 /// What is less probable than one in a hundred is not asked about: even all of it would be few.
 const LEAST_LN_ODDS: f64 = -4.6;
 /// Times that an object gathers votes and is estimated again, at most.
-const ROUNDS: usize = 3;
+pub(super) const ROUNDS: usize = 3;
 
 /// The objects that rays of no other object make, the surest first; those with fewer votes than `least_votes` aside.
 ///

@@ -9,6 +9,7 @@ use rustc_hash::FxHashMap;
 use crate::kernel::{Gates, LANES, ones};
 use crate::progress::{Halt, Progress};
 use crate::ray::Ray;
+use crate::robust::energy::ONE_SIDE_COSINE;
 use crate::robust::model::{Model, Sizes, VotesFor};
 use crate::robust::noise::Spread;
 use crate::robust::noise::index::chi2;
@@ -20,9 +21,7 @@ const SAMPLE_IMAGES: usize = 40;
 /// Meetings that a ray is tried with, at most.
 pub const MEETINGS: usize = 24;
 /// So many images within the range of an image are enough to propose what they see.
-const PROPOSING_IMAGES: usize = 80;
-/// Images that look from farther aside than this should not all have seen a point (cosine of 30 degrees).
-const ASIDE_COSINE: f64 = 0.866;
+const PROPOSING_IMAGES: usize = 2 * SAMPLE_IMAGES;
 
 /// Which images propose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -81,7 +80,7 @@ pub fn propose_among(model: &Model<'_>, rays: &[u32], proposers: &[u32]) -> Vec<
     let mut images: Vec<u32> = rays.iter().map(|&ray| image_of(ray)).collect();
     images.dedup();
     images.sort_by_cached_key(|&image| scramble(u64::from(image)));
-    let stride = images.len().div_ceil(2 * SAMPLE_IMAGES).max(1);
+    let stride = images.len().div_ceil(PROPOSING_IMAGES).max(1);
     let images: Vec<u32> = images.into_iter().step_by(stride).collect();
     let mut chosen: FxHashMap<u32, Vec<u32>> = FxHashMap::default();
     for &ray in rays.iter().filter(|&&ray| model.scene.ray(ray).is_usable()) {
@@ -340,8 +339,9 @@ impl<'a> Neighborhood<'a> {
             }
             let away = meeting.point - center;
             let length = away.norm();
+            // Images that look from farther aside should not all have seen it.
             let should = length <= farthest
-                && away.dot(&to_point) >= ASIDE_COSINE * length * range
+                && away.dot(&to_point) >= ONE_SIDE_COSINE * length * range
                 && scene.is_in_picture(&scene.views[image as usize], &(meeting.point + self.origin));
             if should {
                 support += log_miss;

@@ -5,12 +5,14 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use crate::robust::energy::estimate::{LONGEST_STEP_M, ROUGH_M, shares_of_step};
+use crate::robust::energy::estimate::{LONGEST_STEP_M, shares_of_step};
 use crate::robust::noise::Spread;
 use crate::robust::noise::huber::huber_weight;
 use crate::robust::noise::index::chi2;
 use crate::robust::scene::Scene;
 
+/// Good enough while votes may still change, m.
+const ROUGH_M: f64 = 1e-2;
 const MAX_ITERATIONS: usize = 8;
 
 /// Estimate a position from its voters, starting nearby, to a few millimetres.

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use rustc_hash::FxHashSet;
 
 use super::assign::gain_alone;
-use super::few::{ln_terms, most_probable, votes_on};
+use super::few::{ROUNDS, ln_terms, most_probable, votes_on};
 use super::repair::MOST_VISITS;
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::estimate::visits;
@@ -21,8 +21,6 @@ use crate::robust::learn::company::Sure;
 use crate::robust::model::Model;
 use crate::robust::noise::index::RayIndex;
 
-/// Times that an object gathers rays of no other and is estimated again, at most.
-const ROUNDS: usize = 3;
 /// Votes of others that it tries to take, at most: those that it explains best.
 const MOST_TAKEN: usize = 8;
 

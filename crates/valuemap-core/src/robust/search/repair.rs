@@ -15,8 +15,10 @@ use super::quick::quick_estimate;
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::estimate::visits;
 use crate::robust::energy::looks::Lookout;
-use crate::robust::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, by_side, fit, implied_size, object, owners, size_of};
-use crate::robust::model::Model;
+use crate::robust::energy::{
+    LEAST_GAIN_OF_MOVE, NOBODY, ONE_SIDE_COSINE, Object, by_side, fit, implied_size, object, owners, size_of,
+};
+use crate::robust::model::{CHANCE_SIGMAS, Model};
 use crate::robust::noise::index::{RayIndex, chi2};
 use crate::robust::parts::Part;
 use crate::robust::scene::sample::scramble;
@@ -27,8 +29,6 @@ const MOST_OBJECTS: usize = 6;
 const PROPOSERS: usize = 8;
 /// Objects that may have fewer of each other's votes than this are no neighbors.
 const LEAST_SHARED: usize = 2;
-/// Objects whose residuals are larger than expected by so many standard deviations of their sum may be two.
-const BAD_FIT_SIGMAS: f64 = 2.0;
 /// Times that what was born competes among itself.
 const ROUNDS: usize = 3;
 /// Hypotheses of them that are estimated, for each object.
@@ -38,8 +38,6 @@ const POLISHINGS: usize = 4;
 /// Of more visits, single ones are not tried as parts of an object: one of many moves it little. What looks from one side is, however many they are: where
 /// two stand back to back, drift explains that the rays of all visits meet between them.
 pub const MOST_VISITS: usize = 6;
-/// Votes are of one side if their directions differ by less than 30 degrees (cosine).
-const SIDE_COSINE: f64 = 0.866;
 /// The gate of these votes, as a share of the gate of all.
 const CLOSE: f64 = 0.5;
 
@@ -319,7 +317,7 @@ fn parts_of(model: &Model<'_>, object: &Object) -> Vec<Vec<u32>> {
         groups.clear();
     }
     let looks = object.votes.iter().map(|&ray| (ray, model.scene.ray(ray).direction));
-    groups.extend(by_side(looks, SIDE_COSINE));
+    groups.extend(by_side(looks, ONE_SIDE_COSINE));
     let others = |group: &Vec<u32>| object.votes.iter().copied().filter(|ray| !group.contains(ray)).collect();
     let mut parts: Vec<Vec<u32>> = groups.iter().map(others).chain(groups.iter().cloned()).collect();
     let least = (model.settings.min_votes as usize).max(1);
@@ -443,8 +441,8 @@ fn neighborhoods(model: &Model<'_>, objects: &[Object], claims: &[Vec<Claim>], o
     places.into_iter().map(|(_, place)| place).collect()
 }
 
-/// Whether the residuals of an object are larger than chance makes them: chi² with two degrees of freedom per vote.
+/// Whether the residuals of an object are larger than chance makes them, so that it may be two: chi² with two degrees of freedom per vote.
 fn fits_badly(object: &Object) -> bool {
     let n = object.votes.len() as f64;
-    object.fit.chi2.iter().sum::<f64>() > 2.0 * n + BAD_FIT_SIGMAS * 2.0 * n.sqrt()
+    object.fit.chi2.iter().sum::<f64>() > 2.0 * n + CHANCE_SIGMAS * 2.0 * n.sqrt()
 }
