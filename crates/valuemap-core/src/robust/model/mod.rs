@@ -37,6 +37,16 @@ pub const FEW: usize = 3;
 pub const ODD: f64 = 0.05;
 /// What is off by fewer of its standard deviations is chance: one in twenty is off by more.
 pub(crate) const CHANCE_SIGMAS: f64 = 2.0;
+/// Ratios of densities are no larger than e to this, which stays finite.
+const MOST_LN_RATIO: f64 = 30.0;
+
+/// How much more probable, in logarithms, a number is of an object than of clutter, if it may be [`ODD`]: it lies so many standard deviations from what
+/// each of the two has, of which that of clutter is so many `times` that of the object.
+#[inline]
+fn bounded_ln_ratio(times: f64, at_object: f64, as_clutter: f64) -> f64 {
+    let ratio = times * (0.5 * (as_clutter * as_clutter - at_object * at_object)).min(MOST_LN_RATIO).exp();
+    ((1.0 - ODD) * ratio + ODD).ln()
+}
 
 /// What is learned about the objects and the clutter of one class.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -324,9 +334,7 @@ impl Sizes {
         }
         let at_object = (angle + depth_m.ln() - size) / self.spread;
         let as_clutter = (angle - self.angle.0) / self.angle.1;
-        let ratio =
-            self.angle.1 / self.spread * (0.5 * (as_clutter * as_clutter - at_object * at_object)).min(30.0).exp();
-        ((1.0 - ODD) * ratio + ODD).ln()
+        bounded_ln_ratio(self.angle.1 / self.spread, at_object, as_clutter)
     }
 
     /// Whether two implied sizes may be of one object.

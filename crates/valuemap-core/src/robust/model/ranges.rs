@@ -6,7 +6,7 @@
 
 use nalgebra::Vector3;
 
-use super::ODD;
+use super::bounded_ln_ratio;
 use super::prior::Prior;
 use crate::robust::noise::huber::huber_weight;
 use crate::robust::scene::Scene;
@@ -48,8 +48,7 @@ impl Measured {
         }
         let at_object = (depth_m.ln() - self.ln_depth) / self.share;
         let as_clutter = (self.ln_depth - usual.0) / usual.1;
-        let ratio = usual.1 / self.share * (0.5 * (as_clutter * as_clutter - at_object * at_object)).min(30.0).exp();
-        ((1.0 - ODD) * ratio + ODD).ln()
+        bounded_ln_ratio(usual.1 / self.share, at_object, as_clutter)
     }
 }
 
@@ -72,6 +71,7 @@ pub fn range_terms([range_m, sigma_m]: [f64; 2], center: &Vector3<f64>, point: &
 
 #[cfg(test)]
 mod tests {
+    use super::super::ODD;
     use super::*;
 
     #[test]
