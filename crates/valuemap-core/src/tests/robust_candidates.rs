@@ -228,13 +228,14 @@ proptest! {
             Association::new(&scene, &noise, index, 150.0)
         };
         let rays: Vec<u32> = all.clone().collect();
-        let (mut labels, _) = gather(&Model::new(&scene, &noise, &SETTINGS), &rays, &progress).unwrap();
+        let model = Model::new(&scene, &noise, &SETTINGS);
+        let (mut labels, _) = gather(&model, &rays, &progress).unwrap();
         let mut with_memory = begin();
         for _ in 0..6 {
             let given = with_memory.associate(labels.clone(), &progress).unwrap();
             prop_assert_eq!(voters(&given), voters(&begin().associate(labels, &progress).unwrap()));
             let enough: Vec<Label> = given.into_iter().filter(|label| label.voters.len() >= 3).collect();
-            labels = adjust(&scene, &noise, GATE_SIGMAS, 3, &enough);
+            labels = adjust(&model, &enough);
         }
         prop_assert!(!labels.is_empty());
     }

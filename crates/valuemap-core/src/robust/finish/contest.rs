@@ -4,18 +4,17 @@
 //! position is estimated once more without the contested votes. If the two positions differ by more than their covariances allow
 //! (Hausman, "Specification Tests in Econometrics", 1978), their difference widens the covariance.
 
-use crate::robust::energy::places::ByPlace;
 use nalgebra::Vector3;
 use rayon::prelude::*;
 use rustc_hash::FxHashSet;
 
 use crate::robust::energy::estimate::{Estimate, Solution};
+use crate::robust::energy::places::ByPlace;
 use crate::robust::energy::{Object, by_place};
 use crate::robust::model::Model;
 use crate::robust::noise::index::chi2_in_gate;
+use crate::robust::search::rearrange::near_m;
 
-/// Labels farther apart do not contest each other's votes, m.
-const NEIGHBOR_M: f64 = 3.0;
 /// Squared distance in sigmas up to which the positions with and without contested votes agree: the 95 % quantile of chi²
 /// with 3 degrees of freedom.
 const AGREEMENT_CHI2: f64 = 7.8;
@@ -43,8 +42,9 @@ impl<'a> Contest<'a> {
     /// For each vote of a solution whether a neighbor that its image does not show might have it.
     #[must_use]
     pub fn contested(&self, solution: &Solution<'_>) -> Vec<bool> {
+        let reach_m = near_m(self.model);
         let neighbors = |estimate: &Estimate| -> Vec<usize> {
-            let near = self.tree.locate_within_distance(estimate.point.into(), NEIGHBOR_M * NEIGHBOR_M);
+            let near = self.tree.locate_within_distance(estimate.point.into(), reach_m * reach_m);
             near.map(|near| near.data).collect()
         };
         let near: Vec<Vec<usize>> = solution.estimates.iter().map(neighbors).collect();

@@ -10,17 +10,15 @@ use rustc_hash::FxHasher;
 use super::label::{Label, fingerprint, first_voter, side_of};
 use crate::robust::energy::estimate::{Care, Joint, Limits, Start};
 use crate::robust::energy::places::places;
-use crate::robust::noise::Noise;
-use crate::robust::scene::Scene;
+use crate::robust::model::Model;
 
 /// Labels within this distance of the one with the most votes are estimated with it, m.
 pub const PLACE_M: f64 = 25.0;
 
-/// Estimate all labels anew, place by place; those that keep fewer than `min_votes` are dropped.
+/// Estimate all labels anew, place by place; those that keep too few votes are dropped.
 #[must_use]
-pub fn adjust(scene: &Scene, noise: &Noise, gate_sigmas: f64, min_votes: usize, labels: &[Label]) -> Vec<Label> {
-    let adjustment = Adjustment { scene, noise, gate_sigmas, min_votes };
-    let of_place = |place: &Vec<usize>| adjustment.of_place(place.iter().map(|&i| labels[i].clone()).collect());
+pub fn adjust(model: &Model<'_>, labels: &[Label]) -> Vec<Label> {
+    let of_place = |place: &Vec<usize>| of_place(model, place.iter().map(|&i| labels[i].clone()).collect());
     // One at a time: the first ones are the largest.
     let placed: Vec<_> = labels.iter().map(|label| (label.voters.len(), label.estimate.point)).collect();
     let mut labels: Vec<Label> = places(&placed, PLACE_M).par_iter().with_max_len(1).flat_map_iter(of_place).collect();
@@ -28,68 +26,56 @@ pub fn adjust(scene: &Scene, noise: &Noise, gate_sigmas: f64, min_votes: usize, 
     labels
 }
 
-/// How labels are estimated.
-struct Adjustment<'a> {
-    scene: &'a Scene,
-    noise: &'a Noise,
-    gate_sigmas: f64,
-    min_votes: usize,
+/// The labels of a place: as they are if their votes are those that they were estimated with.
+fn of_place(model: &Model<'_>, place: Vec<Label>) -> Vec<Label> {
+    let votes = votes_of(&place);
+    if place.iter().all(|label| label.revision.place == votes) {
+        return place;
+    }
+    let mut together = together(model, place);
+    let votes = votes_of(&together);
+    for label in &mut together {
+        label.revise();
+        label.revision.place = votes;
+    }
+    together
 }
 
-impl Adjustment<'_> {
-    fn of_place(&self, place: Vec<Label>) -> Vec<Label> {
-        let votes = votes_of(&place);
-        if place.iter().all(|label| label.revision.place == votes) {
-            return place;
-        }
-        let mut together = self.together(place);
-        let votes = votes_of(&together);
-        for label in &mut together {
-            label.revise();
-            label.revision.place = votes;
-        }
-        together
+/// Labels that cannot be estimated together are estimated one by one.
+fn together(model: &Model<'_>, place: Vec<Label>) -> Vec<Label> {
+    match estimate(model, &place) {
+        None if place.len() == 1 => Vec::new(),
+        None => place.into_iter().flat_map(|label| together(model, vec![label])).collect(),
+        Some(together) => together,
     }
+}
 
-    /// Labels that cannot be estimated together are estimated one by one.
-    fn together(&self, place: Vec<Label>) -> Vec<Label> {
-        match self.estimate(&place) {
-            None if place.len() == 1 => Vec::new(),
-            None => place.into_iter().flat_map(|label| self.together(vec![label])).collect(),
-            Some(together) => together,
-        }
+/// Estimate labels together and leave votes out that do not fit.
+fn estimate(model: &Model<'_>, place: &[Label]) -> Option<Vec<Label>> {
+    let starts =
+        place.iter().map(|label| Start { voters: &label.voters, weights: &label.weights, point: label.estimate.point });
+    let limits = Limits { gate_sigmas: model.settings.gate_sigmas, min_votes: model.settings.min_votes as usize };
+    let solution = Joint::new(model.scene, model.noise, starts, Care::Rough).solve_within(&limits)?;
+    let mut labels = place.to_vec();
+    for ((label, estimate), elsewhere) in labels.iter_mut().zip(&solution.estimates).zip(solution.elsewhere()) {
+        (label.estimate, label.elsewhere) = (*estimate, elsewhere);
     }
-
-    /// Estimate labels together and leave votes out that do not fit.
-    fn estimate(&self, place: &[Label]) -> Option<Vec<Label>> {
-        let starts = place.iter().map(|label| Start {
-            voters: &label.voters,
-            weights: &label.weights,
-            point: label.estimate.point,
-        });
-        let limits = Limits { gate_sigmas: self.gate_sigmas, min_votes: self.min_votes };
-        let solution = Joint::new(self.scene, self.noise, starts, Care::Rough).solve_within(&limits)?;
-        let mut labels = place.to_vec();
-        for ((label, estimate), elsewhere) in labels.iter_mut().zip(&solution.estimates).zip(solution.elsewhere()) {
-            (label.estimate, label.elsewhere) = (*estimate, elsewhere);
-        }
-        for label in &mut labels {
-            label.voters.clear();
-            label.weights.clear();
-        }
-        for (&(label, ray), &weight) in solution.votes().iter().zip(solution.weights()) {
-            labels[label].voters.push(ray);
-            labels[label].weights.push(weight);
-        }
-        for &(label, ray) in &solution.refused {
-            labels[label].refused.push(ray);
-        }
-        labels.retain(|label| label.voters.len() >= self.min_votes);
-        for label in &mut labels {
-            label.side = side_of(self.scene, &label.voters, &label.estimate.point);
-        }
-        Some(labels)
+    for label in &mut labels {
+        label.voters.clear();
+        label.weights.clear();
     }
+    for (&(label, ray), &weight) in solution.votes().iter().zip(solution.weights()) {
+        labels[label].voters.push(ray);
+        labels[label].weights.push(weight);
+    }
+    for &(label, ray) in &solution.refused {
+        labels[label].refused.push(ray);
+    }
+    labels.retain(|label| label.voters.len() >= limits.min_votes);
+    for label in &mut labels {
+        label.side = side_of(model.scene, &label.voters, &label.estimate.point);
+    }
+    Some(labels)
 }
 
 /// A fingerprint of the votes of some labels.

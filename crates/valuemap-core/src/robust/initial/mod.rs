@@ -88,7 +88,7 @@ pub fn labels(model: &Model<'_>, is_quick: bool, progress: &Progress) -> Result<
     let mut solver = Solver::new(model, 0..model.scene.rays.rays.len() as u32);
     let labels = solver.solve(first, &schedule, &mut tally, progress)?;
     let before = labels.len();
-    let labels = settle::outclass(model.scene, model.noise, labels);
+    let labels = settle::outclass(model, labels);
     tally.outvoted += (before - labels.len()) as u64;
     Ok((begun(labels), tally))
 }

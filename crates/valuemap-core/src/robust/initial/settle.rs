@@ -7,8 +7,9 @@ use rayon::prelude::*;
 
 use super::label::{Label, direction_to, first_voter, from_voters, variance_factor};
 use super::pairs::{disjoint, near_pairs, replaced};
-use crate::robust::noise::Noise;
+use crate::robust::model::Model;
 use crate::robust::scene::Scene;
+use crate::robust::search::untangle::reach_m;
 
 /// Squared Mahalanobis distance up to which two positions agree: the 99.7 % quantile of chi² with 3 degrees of freedom.
 const AGREEMENT_CHI2: f64 = 14.0;
@@ -16,24 +17,22 @@ const AGREEMENT_CHI2: f64 = 14.0;
 const DISAGREEMENT_CHI2: f64 = 30.0;
 /// Two sides are at least 60 degrees apart (cosine).
 const SIDES_COSINE: f64 = 0.5;
-/// Labels farther apart than this are never compared, m.
-const NEIGHBOR_M: f64 = 6.0;
 /// Two labels may share this part of the images of the smaller one and still be one object: clutter beside it.
 const SHARED_IMAGES: f64 = 0.15;
 
 /// Make one of any two labels of a class whose positions agree within their covariances, unless their images say that
 /// they are two: images in which both have a detection of their own. The nearest pair first.
 #[must_use]
-pub fn fuse(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) -> Vec<Label> {
+pub fn fuse(model: &Model<'_>, labels: Vec<Label>) -> Vec<Label> {
     let mut labels = labels;
-    let factor = variance_factor(scene, noise, &labels);
+    let factor = variance_factor(model.scene, model.noise, &labels);
     loop {
-        let agreeing = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor, |a, b| a.class == b.class);
+        let agreeing = agreeing_pairs(model, &labels, AGREEMENT_CHI2 * factor, |a, b| a.class == b.class);
         if agreeing.is_empty() {
             return labels;
         }
         let pairs = disjoint(agreeing);
-        let fused = pairs.iter().map(|&(a, b)| Some(vec![union(scene, noise, gate_sigmas, &labels[a], &labels[b])]));
+        let fused = pairs.iter().map(|&(a, b)| Some(vec![union(model, &labels[a], &labels[b])]));
         let fused = fused.collect();
         labels = replaced(labels, &pairs, fused, |_, _| ());
     }
@@ -42,9 +41,9 @@ pub fn fuse(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>) 
 /// Of two labels of different classes that agree, and that no images show side by side, keep the one with more votes: a
 /// detector takes one object for another now and then.
 #[must_use]
-pub fn outclass(scene: &Scene, noise: &Noise, labels: Vec<Label>) -> Vec<Label> {
-    let factor = variance_factor(scene, noise, &labels);
-    let pairs = agreeing_pairs(scene, &labels, AGREEMENT_CHI2 * factor, |a, b| a.class != b.class);
+pub fn outclass(model: &Model<'_>, labels: Vec<Label>) -> Vec<Label> {
+    let factor = variance_factor(model.scene, model.noise, &labels);
+    let pairs = agreeing_pairs(model, &labels, AGREEMENT_CHI2 * factor, |a, b| a.class != b.class);
     let mut is_outclassed = vec![false; labels.len()];
     for (_, a, b) in pairs {
         let strength = |i: usize| (labels[i].voters.len(), std::cmp::Reverse(i));
@@ -56,19 +55,20 @@ pub fn outclass(scene: &Scene, noise: &Noise, labels: Vec<Label>) -> Vec<Label> 
 /// Make two of any label whose voters on two sides of it put it to places that do not agree: two lights back to back, say,
 /// which no image shows together.
 #[must_use]
-pub fn split(scene: &Scene, noise: &Noise, gate_sigmas: f64, labels: Vec<Label>, min_votes: usize) -> Vec<Label> {
-    let factor = variance_factor(scene, noise, &labels);
+pub fn split(model: &Model<'_>, labels: Vec<Label>) -> Vec<Label> {
+    let min_votes = model.settings.min_votes as usize;
+    let factor = variance_factor(model.scene, model.noise, &labels);
     let parts = |mut label: Label| -> Vec<Label> {
         if label.known.is_one {
             return vec![label];
         }
         label.known.is_one = true;
-        let sides = two_sides(scene, &label);
+        let sides = two_sides(model.scene, &label);
         if sides.iter().any(|side| side.len() < min_votes) {
             return vec![label];
         }
         let start = label.estimate.point;
-        let apart = sides.map(|side| from_voters(scene, noise, gate_sigmas, side, start));
+        let apart = sides.map(|side| from_voters(model.scene, model.noise, model.settings.gate_sigmas, side, start));
         match apart {
             [Some(a), Some(b)]
                 if a.voters.len().min(b.voters.len()) >= min_votes
@@ -112,7 +112,7 @@ fn two_sides(scene: &Scene, label: &Label) -> [Vec<u32>; 2] {
 
 /// Squared Mahalanobis distance and numbers of labels that may be paired, agree, and are not told apart.
 fn agreeing_pairs(
-    scene: &Scene,
+    model: &Model<'_>,
     labels: &[Label],
     most: f64,
     may_pair: impl Fn(&Label, &Label) -> bool + Sync,
@@ -120,9 +120,9 @@ fn agreeing_pairs(
     let agreeing = |(a, b): (usize, usize)| {
         let (first, second) = (&labels[a], &labels[b]);
         let distance2 = may_pair(first, second).then(|| distance2(first, second)).flatten()?;
-        (distance2 < most && !told_apart(scene, first, second)).then_some((distance2, a, b))
+        (distance2 < most && !told_apart(model.scene, first, second)).then_some((distance2, a, b))
     };
-    near_pairs(labels, NEIGHBOR_M).into_par_iter().filter_map(agreeing).collect()
+    near_pairs(labels, reach_m(model)).into_par_iter().filter_map(agreeing).collect()
 }
 
 /// Squared Mahalanobis distance of two labels.
@@ -138,11 +138,12 @@ fn told_apart(scene: &Scene, a: &Label, b: &Label) -> bool {
 }
 
 /// Of images that both have, the larger label's detection stays.
-fn union(scene: &Scene, noise: &Noise, gate_sigmas: f64, a: &Label, b: &Label) -> Label {
+fn union(model: &Model<'_>, a: &Label, b: &Label) -> Label {
+    let Model { scene, noise, settings, .. } = *model;
     let (large, small) = if b.voters.len() > a.voters.len() { (b, a) } else { (a, b) };
     let images = large.images(scene);
     let mut voters = large.voters.clone();
     let new = |ray: &&u32| images.binary_search(&scene.rays.image[**ray as usize]).is_err();
     voters.extend(small.voters.iter().filter(new));
-    from_voters(scene, noise, gate_sigmas, voters, large.estimate.point).unwrap_or_else(|| large.clone())
+    from_voters(scene, noise, settings.gate_sigmas, voters, large.estimate.point).unwrap_or_else(|| large.clone())
 }

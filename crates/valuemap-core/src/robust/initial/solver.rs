@@ -16,10 +16,7 @@ use crate::progress::{Halt, Progress};
 use crate::robust::energy::looks::Lookout;
 use crate::robust::model::Model;
 use crate::robust::noise::index::RayIndex;
-use crate::robust::noise::{Noise, Spread};
 use crate::robust::parts::Part;
-use crate::robust::scene::Scene;
-use crate::robust::settings::Settings;
 
 /// Labels are dropped below these multiples of the probability that is asked for, one after the other, and then below that.
 const PRUNED_BELOW: [f64; 3] = [1e-5, 1e-2, 0.3];
@@ -29,10 +26,6 @@ const MAX_PRUNE_ROUNDS: usize = 6;
 
 /// Where labels compete for the rays.
 pub(super) struct Solver<'a> {
-    scene: &'a Scene,
-    noise: &'a Noise,
-    spreads: &'a [Spread],
-    settings: &'a Settings,
     model: &'a Model<'a>,
     association: Association<'a>,
     lookout: OnceLock<Lookout>,
@@ -47,10 +40,6 @@ impl<'a> Solver<'a> {
         let index = RayIndex::new(scene, spreads, settings.gate_sigmas, rays);
         let range_m = model.reach_m();
         Self {
-            scene,
-            noise,
-            spreads,
-            settings,
             model,
             association: Association::new(scene, noise, index, range_m),
             lookout: OnceLock::new(),
@@ -99,7 +88,7 @@ impl<'a> Solver<'a> {
         tally: &mut Tally,
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
-        let scene = self.scene;
+        let scene = self.model.scene;
         let mut is_taken = vec![false; scene.rays.rays.len()];
         for &ray in labels.iter().flat_map(|label| &label.voters) {
             is_taken[ray as usize] = true;
@@ -134,23 +123,21 @@ impl<'a> Solver<'a> {
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
         progress.check()?;
-        let &mut Self { scene, noise, settings, .. } = self;
-        let gate = settings.gate_sigmas;
-        let min_votes = settings.min_votes as usize;
-        let labels = exchange::exchange(self.model, labels);
+        let model = self.model;
+        let labels = exchange::exchange(model, labels);
         let labels = self.associate(labels, tally, progress)?;
         let associated = labels.len();
-        let labels = adjust(scene, noise, gate, min_votes, &labels);
+        let labels = adjust(model, &labels);
         tally.outvoted += (associated - labels.len()) as u64;
-        let labels = if may_split { settle::split(scene, noise, gate, labels, min_votes) } else { labels };
-        Ok(if settings.has(Part::Merging) { settle::fuse(scene, noise, gate, labels) } else { labels })
+        let labels = if may_split { settle::split(model, labels) } else { labels };
+        Ok(if model.settings.has(Part::Merging) { settle::fuse(model, labels) } else { labels })
     }
 
     /// All labels compete for all rays; those that get too few are dropped.
     fn associate(&mut self, labels: Vec<Label>, tally: &mut Tally, progress: &Progress) -> Result<Vec<Label>, Halt> {
         let before = labels.len();
         let mut labels = self.association.associate(labels, progress)?;
-        labels.retain(|label| label.voters.len() >= self.settings.min_votes as usize);
+        labels.retain(|label| label.voters.len() >= self.model.settings.min_votes as usize);
         tally.outvoted += (before - labels.len()) as u64;
         Ok(labels)
     }
@@ -165,7 +152,7 @@ impl<'a> Solver<'a> {
     ) -> Result<(Vec<Label>, bool), Halt> {
         for round in 0..rounds {
             let is_any;
-            (labels, is_any) = swap::swap_votes(&self.association, self.settings, labels);
+            (labels, is_any) = swap::swap_votes(self.model, &self.association, labels);
             if !is_any {
                 return Ok((labels, round > 0));
             }
@@ -175,8 +162,8 @@ impl<'a> Solver<'a> {
     }
 
     fn sectors_of(&self, label: &Label) -> Arc<[Sector]> {
-        let lookout = || Lookout::new(self.scene, self.settings.viability.max_range_m);
-        sectors(self.lookout.get_or_init(lookout), self.scene, label).into()
+        let lookout = || Lookout::new(self.model.scene, self.model.settings.viability.max_range_m);
+        sectors(self.lookout.get_or_init(lookout), self.model.scene, label).into()
     }
 
     /// The sectors that each label is seen from.
@@ -194,10 +181,11 @@ impl<'a> Solver<'a> {
         let old = labels.len();
         labels.extend(new);
         let sectors = self.sectors(&labels);
-        let existences = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.pruned);
+        let existences = judge(self.model, &sectors, &labels, tally.pruned);
         let before = labels.len();
         let admitted = labels.into_iter().zip(existences).enumerate();
-        let admitted = admitted.filter(|(i, (_, existence))| *i < old || *existence >= self.settings.min_existence);
+        let admitted =
+            admitted.filter(|(i, (_, existence))| *i < old || *existence >= self.model.settings.min_existence);
         let labels: Vec<Label> = admitted.map(|(_, (label, _))| label).collect();
         tally.pruned += (before - labels.len()) as u64;
         labels
@@ -215,10 +203,11 @@ impl<'a> Solver<'a> {
             }
             let unseen_from = [label.unseen_from.as_slice(), &clutter].concat();
             let label = Label { unseen_from: unseen_from.clone(), ..label };
-            let seen = label.voters.iter().copied().filter(|&ray| label.faces(self.scene, ray)).collect();
+            let seen = label.voters.iter().copied().filter(|&ray| label.faces(self.model.scene, ray)).collect();
             let start = label.estimate.point;
-            let found = label::from_voters(self.scene, self.noise, self.settings.gate_sigmas, seen, start)?;
-            let enough = found.voters.len() >= self.settings.min_votes as usize;
+            let found =
+                label::from_voters(self.model.scene, self.model.noise, self.model.settings.gate_sigmas, seen, start)?;
+            let enough = found.voters.len() >= self.model.settings.min_votes as usize;
             let left = enough.then_some(Label { undecided: label.undecided, unseen_from, ..found })?;
             let sectors = self.sectors_of(&left);
             Some((left, sectors))
@@ -262,10 +251,10 @@ impl<'a> Solver<'a> {
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
         let (labels, sectors) = self.look_around(labels, tally);
-        let existences = judge(self.scene, self.spreads, &sectors, &labels, self.settings, tally.pruned);
+        let existences = judge(self.model, &sectors, &labels, tally.pruned);
         let before = labels.len();
         let judged = labels.into_iter().zip(existences);
-        let existing = judged.filter(|(_, existence)| *existence >= share * self.settings.min_existence);
+        let existing = judged.filter(|(_, existence)| *existence >= share * self.model.settings.min_existence);
         let labels: Vec<Label> = existing.map(|(label, _)| label).collect();
         tally.pruned += (before - labels.len()) as u64;
         if labels.len() == before { Ok(labels) } else { self.settle(labels, false, tally, progress) }
@@ -273,14 +262,8 @@ impl<'a> Solver<'a> {
 }
 
 /// The probability that each label of a scene exists.
-fn judge(
-    scene: &Scene,
-    spreads: &[Spread],
-    sectors: &[Arc<[Sector]>],
-    labels: &[Label],
-    settings: &Settings,
-    pruned: u64,
-) -> Vec<f64> {
+fn judge(model: &Model<'_>, sectors: &[Arc<[Sector]>], labels: &[Label], pruned: u64) -> Vec<f64> {
+    let Model { scene, ref spreads, settings, .. } = *model;
     let looks: Vec<Vec<Looks>> = sectors.par_iter().map(|sectors| existence::looks_of(sectors.iter())).collect();
     let rates = Rates::learn(&looks);
     let claimed: usize = labels.iter().map(|label| label.voters.len()).sum();

@@ -16,11 +16,10 @@ use super::label::{Label, by_place, direction_to, from_voters, sector_middles};
 use super::pairs::{nearest_pairs, replaced};
 use crate::robust::energy::estimate::{Care, Joint, Limits, Start};
 use crate::robust::energy::looks::SECTOR_COSINE;
+use crate::robust::model::Model;
 use crate::robust::parts::Part;
-use crate::robust::settings::Settings;
+use crate::robust::search::rearrange::near_m;
 
-/// Labels farther apart than this do not have each other's votes, m.
-const PAIR_M: f64 = 3.0;
 /// So many images must show one of the two alone from about one direction.
 const LEAST_ALONE: usize = 6;
 /// For each of them, images that show both from there, at most.
@@ -45,14 +44,14 @@ const MAYBE_LOST: f64 = 1.5;
 /// Make one of two neighbors, or give the other what it explains better; whether there was anything. The nearest
 /// pairs first, each label in one pair; other pairs once these are best as they are.
 #[must_use]
-pub fn swap_votes(association: &Association<'_>, settings: &Settings, mut labels: Vec<Label>) -> (Vec<Label>, bool) {
+pub fn swap_votes(model: &Model<'_>, association: &Association<'_>, mut labels: Vec<Label>) -> (Vec<Label>, bool) {
     let is_open = |a: &Label, b: &Label| a.class == b.class && !a.known.satisfied.contains(&b.identity());
     loop {
-        let pairs = nearest_pairs(&labels, PAIR_M, is_open);
+        let pairs = nearest_pairs(&labels, near_m(model), is_open);
         if pairs.is_empty() {
             return (labels, false);
         }
-        let better = better_pairs(association, settings, &labels, &pairs);
+        let better = better_pairs(model, association, &labels, &pairs);
         let is_any = better.iter().any(Option::is_some);
         labels = replaced(labels, &pairs, better, |known, neighbor| known.satisfied.push(neighbor));
         if is_any {
@@ -63,8 +62,8 @@ pub fn swap_votes(association: &Association<'_>, settings: &Settings, mut labels
 
 /// What some disjoint pairs of labels are better; nothing for those that are best as they are.
 fn better_pairs(
+    model: &Model<'_>,
     association: &Association<'_>,
-    settings: &Settings,
     labels: &[Label],
     pairs: &[(usize, usize)],
 ) -> Vec<Option<Vec<Label>>> {
@@ -77,15 +76,15 @@ fn better_pairs(
         let near = tree.nearest_neighbor_iter_with_distance_2(labels[a].estimate.point.into());
         let near = near.take_while(|(_, distance2)| *distance2 <= PLACE_M * PLACE_M).map(|(near, _)| near.data);
         let companions = near.filter(|&i| i != a && i != b).take(COMPANIONS).map(|i| &labels[i]).collect();
-        Pair { association, settings, is_taken: &is_taken, labels: [&labels[a], &labels[b]], companions }.better()
+        Pair { model, association, is_taken: &is_taken, labels: [&labels[a], &labels[b]], companions }.better()
     };
     pairs.par_iter().with_max_len(1).map(of_pair).collect()
 }
 
 /// Two neighbors.
 struct Pair<'a> {
+    model: &'a Model<'a>,
     association: &'a Association<'a>,
-    settings: &'a Settings,
     /// Of each ray, whether a label has it.
     is_taken: &'a [bool],
     labels: [&'a Label; 2],
@@ -177,7 +176,7 @@ impl Pair<'_> {
         let mut voters = [Vec::new(), Vec::new()];
         voters[1 - smaller] = [many.voters.as_slice(), &new].concat();
         let may_be_one = shared as f64 <= MOST_SHARED * few.voters.len() as f64;
-        (may_be_one && self.settings.has(Part::Merging)).then_some(voters)
+        (may_be_one && self.model.settings.has(Part::Merging)).then_some(voters)
     }
 
     /// What one of the two might give away: what looks from one direction, for each, or all that.
@@ -221,7 +220,7 @@ impl Pair<'_> {
     /// labels estimated with the two.
     fn explain(&self, mut voters: [Vec<u32>; 2], companions: &[&Label]) -> Option<Explanation> {
         let &Association { scene, noise, ref index, .. } = self.association;
-        let limits = Limits { gate_sigmas: index.gate_sigmas(), min_votes: self.settings.min_votes as usize };
+        let limits = Limits { gate_sigmas: index.gate_sigmas(), min_votes: self.model.settings.min_votes as usize };
         let gatherings = if companions.is_empty() { GATHERINGS.0 } else { GATHERINGS.1 };
         let is_there = [0, 1].map(|side| !voters[side].is_empty());
         let mut points = self.labels.map(|label| label.estimate.point);

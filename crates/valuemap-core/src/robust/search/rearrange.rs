@@ -26,7 +26,7 @@ use crate::robust::scene::sample::scramble;
 /// Objects have to do with each other if one of them may have this share of the other's votes.
 const LEAST_SHARE: f64 = 0.1;
 /// So do objects nearer to each other than this share of the range: rays from two directions meet crosswise not far from where they should.
-pub(crate) const NEAR_SHARE: f64 = 0.05;
+const NEAR_SHARE: f64 = 0.05;
 /// What looks from directions within this angle of each other looks from one side (cosine of 25 degrees).
 const SIDE_COSINE: f64 = 0.906;
 /// Two objects of a class are no nearer to each other than this share of their size: things are solid, and boxes show their middle to
@@ -158,6 +158,11 @@ pub(crate) fn too_near(objects: &[Object], points: &[Vector3<f64>]) -> Vec<(usiz
     near.into_iter().map(|(_, a, b)| (a, b)).collect()
 }
 
+/// How near to each other two are that may have each other's votes, m.
+pub(crate) fn near_m(model: &Model<'_>) -> f64 {
+    NEAR_SHARE * model.settings.viability.max_range_m
+}
+
 /// Whether two objects may be one by their classes.
 pub(crate) fn may_be_one(model: &Model<'_>, a: &Object, b: &Object) -> bool {
     model.confusions.may_be(a.class, b.class) || model.confusions.may_be(b.class, a.class)
@@ -180,7 +185,7 @@ fn pairs(model: &Model<'_>, objects: &[Object], claims: &[Vec<Claim>]) -> Vec<(u
     let mut pairs: Vec<(usize, usize)> =
         shared.iter().filter(enough).map(|(&(a, b), _)| (a.min(b), a.max(b))).collect();
     // Where rays of two objects from two directions meet crosswise, neither is in the other's gate.
-    let reach_m = NEAR_SHARE * model.settings.viability.max_range_m;
+    let reach_m = near_m(model);
     let tree = by_place(objects);
     for (i, object) in objects.iter().enumerate() {
         let near = tree.locate_within_distance(object.fit.point.into(), reach_m * reach_m).map(|near| near.data);

@@ -9,7 +9,7 @@ use nalgebra::{Matrix2x3, Matrix3, Vector2, Vector3};
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use super::rearrange::{NEAR_SHARE, may_be_one};
+use super::rearrange::{may_be_one, near_m};
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::estimate::is_one_visit;
 use crate::robust::energy::looks::{Lookout, SECTOR_COSINE};
@@ -36,7 +36,7 @@ const ROUNDS: usize = 3;
 /// How far from each other two may be found that have each other's votes, m: each as far from where it should be as rays that meet crosswise.
 #[must_use]
 pub fn reach_m(model: &Model<'_>) -> f64 {
-    2.0 * NEAR_SHARE * model.settings.viability.max_range_m
+    2.0 * near_m(model)
 }
 
 /// The objects, with what images say that belongs to the other of two.
