@@ -235,7 +235,7 @@ proptest! {
             let given = with_memory.associate(labels.clone(), &progress).unwrap();
             prop_assert_eq!(voters(&given), voters(&begin().associate(labels, &progress).unwrap()));
             let enough: Vec<Label> = given.into_iter().filter(|label| label.voters.len() >= 3).collect();
-            labels = adjust(&model, &enough);
+            labels = adjust(&model, &enough, &progress).unwrap();
         }
         prop_assert!(!labels.is_empty());
     }

@@ -39,7 +39,8 @@ fn rays_of(scene: &Scene, object: &Vector3<f64>) -> Vec<u32> {
 fn after_swap(scene: &Scene, noise: &Noise, labels: Vec<Label>) -> (Vec<Label>, bool) {
     let spreads = spreads_of(scene, noise);
     let index = RayIndex::new(scene, &spreads, GATE_SIGMAS, 0..scene.rays.rays.len() as u32);
-    swap_votes(&Model::new(scene, noise, &SETTINGS), &Association::new(scene, noise, index, 150.0), labels)
+    let association = Association::new(scene, noise, index, 150.0);
+    swap_votes(&Model::new(scene, noise, &SETTINGS), &association, labels, &Progress::default()).unwrap()
 }
 
 proptest! {

@@ -34,7 +34,7 @@ pub fn apart(
     progress: &Progress,
 ) -> Result<(Vec<Object>, Vec<Estimate>), Halt> {
     loop {
-        let estimates = positions(model, of_covariances, &objects);
+        let estimates = positions(model, of_covariances, &objects, progress)?;
         let points: Vec<Vector3<f64>> = estimates.iter().map(|estimate| estimate.point).collect();
         let near = if model.settings.has(Part::Exclusion) { too_near(&objects, &points) } else { Vec::new() };
         if near.is_empty() {
@@ -46,30 +46,38 @@ pub fn apart(
 }
 
 /// The estimate of every object, in their order; covariances have a noise of their own.
-#[must_use]
-pub fn positions(model: &Model<'_>, of_covariances: &Noise, objects: &[Object]) -> Vec<Estimate> {
+fn positions(
+    model: &Model<'_>,
+    of_covariances: &Noise,
+    objects: &[Object],
+    progress: &Progress,
+) -> Result<Vec<Estimate>, Halt> {
     let contest = Contest::new(model, objects);
     let places = places_of_all(objects, model.settings.viability.max_range_m * PLACE_SHARE);
-    let estimated = |noise: &Noise| {
+    let estimated = |noise: &Noise| -> Result<Vec<Estimate>, Halt> {
         let mut estimates: Vec<Estimate> = objects
             .iter()
             .map(|object| Estimate { point: object.fit.point, covariance: object.fit.covariance })
             .collect();
+        let of_place = |place: &Vec<usize>| {
+            progress.check()?;
+            Ok(together(model, noise, objects, place, &contest))
+        };
         // One at a time: the first ones are the largest.
         let found: Vec<Vec<(usize, Estimate)>> =
-            places.par_iter().with_max_len(1).map(|place| together(model, noise, objects, place, &contest)).collect();
+            places.par_iter().with_max_len(1).map(of_place).collect::<Result<_, Halt>>()?;
         for (i, estimate) in found.into_iter().flatten() {
             estimates[i] = estimate;
         }
-        estimates
+        Ok(estimates)
     };
-    let mut estimates = estimated(model.noise);
+    let mut estimates = estimated(model.noise)?;
     if of_covariances != model.noise {
-        for (estimate, honest) in estimates.iter_mut().zip(estimated(of_covariances)) {
+        for (estimate, honest) in estimates.iter_mut().zip(estimated(of_covariances)?) {
             estimate.covariance = honest.covariance;
         }
     }
-    estimates
+    Ok(estimates)
 }
 
 /// Objects that cannot be estimated together are estimated one by one.
@@ -107,6 +115,10 @@ mod tests {
     use crate::robust::settings::Settings;
     use crate::street;
 
+    fn estimates_of(model: &Model<'_>, of_covariances: &Noise, objects: &[Object]) -> Vec<Estimate> {
+        positions(model, of_covariances, objects, &Progress::default()).unwrap_or_default()
+    }
+
     #[test]
     fn looks_that_are_off_alike_say_less_of_positions_and_move_none() {
         let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
@@ -121,7 +133,7 @@ mod tests {
         assert_eq!(found.len(), 1);
         let alike = Noise { look_correlation: 0.8, ..street::NOISE };
         let times = variance_of_alike(6, 0.8);
-        let [before, after] = [&street::NOISE, &alike].map(|noise| positions(&model, noise, &found)[0]);
+        let [before, after] = [&street::NOISE, &alike].map(|noise| estimates_of(&model, noise, &found)[0]);
         assert_eq!(before.point, after.point);
         assert!((after.covariance - before.covariance * times).norm() < 0.01 * after.covariance.norm());
         let looks = |noise| looks_at(&scene, noise, noise, &votes, &point).unwrap_or_default();
@@ -179,10 +191,10 @@ mod tests {
         let found: Vec<Object> =
             (0..10).filter_map(|i| object(&model, &lookout, votes(i), objects[i], Vec::new())).collect();
         assert_eq!(found.len(), objects.len());
-        let without = positions(&model, &noise, &found);
+        let without = estimates_of(&model, &noise, &found);
         let heights: Vec<f64> = (0..60).map(|i| 3.0 + 0.01 * f64::from(i % 5 - 2)).collect();
         model.classes[0].heights = Heights::learn(&heights, &[0.02; 60], 50.0);
-        let with = positions(&model, &noise, &found);
+        let with = estimates_of(&model, &noise, &found);
         let sigma_m = |estimate: &Estimate, axis: usize| estimate.covariance[(axis, axis)].sqrt();
         // Those that are not begun near their height are taken for objects that are elsewhere.
         let told = with.iter().zip(&without).filter(|(with, without)| sigma_m(with, 0) < 0.5 * sigma_m(without, 0));

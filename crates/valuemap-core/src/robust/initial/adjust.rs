@@ -8,6 +8,7 @@ use rayon::prelude::*;
 use rustc_hash::FxHasher;
 
 use super::label::{Label, fingerprint, first_voter, side_of};
+use crate::progress::{Halt, Progress};
 use crate::robust::energy::estimate::{Care, Joint, Limits, Start};
 use crate::robust::energy::places::places;
 use crate::robust::model::Model;
@@ -16,14 +17,21 @@ use crate::robust::model::Model;
 pub const PLACE_M: f64 = 25.0;
 
 /// Estimate all labels anew, place by place; those that keep too few votes are dropped.
-#[must_use]
-pub fn adjust(model: &Model<'_>, labels: &[Label]) -> Vec<Label> {
-    let of_place = |place: &Vec<usize>| of_place(model, place.iter().map(|&i| labels[i].clone()).collect());
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn adjust(model: &Model<'_>, labels: &[Label], progress: &Progress) -> Result<Vec<Label>, Halt> {
+    let of_place = |place: &Vec<usize>| {
+        progress.check()?;
+        Ok(of_place(model, place.iter().map(|&i| labels[i].clone()).collect()))
+    };
     // One at a time: the first ones are the largest.
     let placed: Vec<_> = labels.iter().map(|label| (label.voters.len(), label.estimate.point)).collect();
-    let mut labels: Vec<Label> = places(&placed, PLACE_M).par_iter().with_max_len(1).flat_map_iter(of_place).collect();
+    let places = places(&placed, PLACE_M);
+    let adjusted: Vec<Vec<Label>> = places.par_iter().with_max_len(1).map(of_place).collect::<Result<_, Halt>>()?;
+    let mut labels: Vec<Label> = adjusted.into_iter().flatten().collect();
     labels.sort_by_cached_key(first_voter);
-    labels
+    Ok(labels)
 }
 
 /// The labels of a place: as they are if their votes are those that they were estimated with.

@@ -127,7 +127,7 @@ impl<'a> Solver<'a> {
         let labels = exchange::exchange(model, labels);
         let labels = self.associate(labels, tally, progress)?;
         let associated = labels.len();
-        let labels = adjust(model, &labels);
+        let labels = adjust(model, &labels, progress)?;
         tally.outvoted += (associated - labels.len()) as u64;
         let labels = if may_split { settle::split(model, labels) } else { labels };
         Ok(if model.settings.has(Part::Merging) { settle::fuse(model, labels) } else { labels })
@@ -152,7 +152,7 @@ impl<'a> Solver<'a> {
     ) -> Result<(Vec<Label>, bool), Halt> {
         for round in 0..rounds {
             let is_any;
-            (labels, is_any) = swap::swap_votes(self.model, &self.association, labels);
+            (labels, is_any) = swap::swap_votes(self.model, &self.association, labels, progress)?;
             if !is_any {
                 return Ok((labels, round > 0));
             }

@@ -14,6 +14,7 @@ use super::adjust::PLACE_M;
 use super::associate::Association;
 use super::label::{Label, by_place, direction_to, from_voters, sector_middles};
 use super::pairs::{nearest_pairs, replaced};
+use crate::progress::{Halt, Progress};
 use crate::robust::energy::estimate::{Care, Joint, Limits, Start};
 use crate::robust::energy::looks::SECTOR_COSINE;
 use crate::robust::model::Model;
@@ -43,19 +44,26 @@ const MAYBE_LOST: f64 = 1.5;
 
 /// Make one of two neighbors, or give the other what it explains better; whether there was anything. The nearest
 /// pairs first, each label in one pair; other pairs once these are best as they are.
-#[must_use]
-pub fn swap_votes(model: &Model<'_>, association: &Association<'_>, mut labels: Vec<Label>) -> (Vec<Label>, bool) {
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn swap_votes(
+    model: &Model<'_>,
+    association: &Association<'_>,
+    mut labels: Vec<Label>,
+    progress: &Progress,
+) -> Result<(Vec<Label>, bool), Halt> {
     let is_open = |a: &Label, b: &Label| a.class == b.class && !a.known.satisfied.contains(&b.identity());
     loop {
         let pairs = nearest_pairs(&labels, near_m(model), is_open);
         if pairs.is_empty() {
-            return (labels, false);
+            return Ok((labels, false));
         }
-        let better = better_pairs(model, association, &labels, &pairs);
+        let better = better_pairs(model, association, &labels, &pairs, progress)?;
         let is_any = better.iter().any(Option::is_some);
         labels = replaced(labels, &pairs, better, |known, neighbor| known.satisfied.push(neighbor));
         if is_any {
-            return (labels, true);
+            return Ok((labels, true));
         }
     }
 }
@@ -66,17 +74,19 @@ fn better_pairs(
     association: &Association<'_>,
     labels: &[Label],
     pairs: &[(usize, usize)],
-) -> Vec<Option<Vec<Label>>> {
+    progress: &Progress,
+) -> Result<Vec<Option<Vec<Label>>>, Halt> {
     let mut is_taken = vec![false; association.scene.rays.rays.len()];
     for &ray in labels.iter().flat_map(|label| &label.voters) {
         is_taken[ray as usize] = true;
     }
     let tree = by_place(labels);
     let of_pair = |&(a, b): &(usize, usize)| {
+        progress.check()?;
         let near = tree.nearest_neighbor_iter_with_distance_2(labels[a].estimate.point.into());
         let near = near.take_while(|(_, distance2)| *distance2 <= PLACE_M * PLACE_M).map(|(near, _)| near.data);
         let companions = near.filter(|&i| i != a && i != b).take(COMPANIONS).map(|i| &labels[i]).collect();
-        Pair { model, association, is_taken: &is_taken, labels: [&labels[a], &labels[b]], companions }.better()
+        Ok(Pair { model, association, is_taken: &is_taken, labels: [&labels[a], &labels[b]], companions }.better())
     };
     pairs.par_iter().with_max_len(1).map(of_pair).collect()
 }
