@@ -54,10 +54,10 @@ impl<'a> Contest<'a> {
     /// Never the label that has it: its images are those that show it.
     fn might_have(&self, neighbor: usize, ray: u32) -> bool {
         let (scene, gate_sigmas) = (self.model.scene, self.model.settings.gate_sigmas);
-        let (seen, spread) = (scene.ray(ray), self.model.noise.total(scene, ray));
+        let (seen, spread) = (scene.ray(ray), &self.model.spreads[ray as usize]);
         self.model.confusions.may_be(self.labels[neighbor].class, scene.rays.class[ray as usize])
             && !self.shown_in[neighbor].contains(&scene.rays.image[ray as usize])
-            && chi2_in_gate(seen, &self.labels[neighbor].fit.point, &spread, gate_sigmas).is_some()
+            && chi2_in_gate(seen, &self.labels[neighbor].fit.point, spread, gate_sigmas).is_some()
     }
 }
 

@@ -52,16 +52,16 @@ fn positions(
     objects: &[Object],
     progress: &Progress,
 ) -> Result<Vec<Estimate>, Halt> {
-    let contest = Contest::new(model, objects);
+    let contest = model.settings.has(Part::Contest).then(|| Contest::new(model, objects));
     let places = places_of_all(objects, model.settings.viability.max_range_m * PLACE_SHARE);
-    let estimated = |noise: &Noise| -> Result<Vec<Estimate>, Halt> {
+    let estimated = |noise: &Noise, contest: Option<&Contest<'_>>| -> Result<Vec<Estimate>, Halt> {
         let mut estimates: Vec<Estimate> = objects
             .iter()
             .map(|object| Estimate { point: object.fit.point, covariance: object.fit.covariance })
             .collect();
         let of_place = |place: &Vec<usize>| {
             progress.check()?;
-            Ok(together(model, noise, objects, place, &contest))
+            Ok(together(model, noise, objects, place, contest))
         };
         // One at a time: the first ones are the largest.
         let found: Vec<Vec<(usize, Estimate)>> =
@@ -71,22 +71,24 @@ fn positions(
         }
         Ok(estimates)
     };
-    let mut estimates = estimated(model.noise)?;
-    if of_covariances != model.noise {
-        for (estimate, honest) in estimates.iter_mut().zip(estimated(of_covariances)?) {
-            estimate.covariance = honest.covariance;
-        }
+    if of_covariances == model.noise {
+        return estimated(model.noise, contest.as_ref());
+    }
+    // Contested votes move nothing.
+    let mut estimates = estimated(model.noise, None)?;
+    for (estimate, honest) in estimates.iter_mut().zip(estimated(of_covariances, contest.as_ref())?) {
+        estimate.covariance = honest.covariance;
     }
     Ok(estimates)
 }
 
-/// Objects that cannot be estimated together are estimated one by one.
+/// Objects that cannot be estimated together are estimated one by one. Contested votes widen their covariances, where a contest is held.
 fn together(
     model: &Model<'_>,
     noise: &Noise,
     objects: &[Object],
     place: &[usize],
-    contest: &Contest<'_>,
+    contest: Option<&Contest<'_>>,
 ) -> Vec<(usize, Estimate)> {
     let starts = place.iter().map(|&i| Start { voters: &objects[i].votes, weights: &[], point: objects[i].fit.point });
     let Some(solution) = Joint::new(model.scene, noise, starts, Care::Exact).with_priors(model).solve() else {
@@ -95,9 +97,8 @@ fn together(
         }
         return place.iter().flat_map(|&i| together(model, noise, objects, &[i], contest)).collect();
     };
-    let contested = contest.contested(&solution);
-    let is_contested = contested.contains(&true) && model.settings.has(Part::Contest);
-    let sure = is_contested.then(|| solution.without(&contested)).flatten();
+    let contested = contest.map(|contest| contest.contested(&solution)).filter(|contested| contested.contains(&true));
+    let sure = contested.and_then(|contested| solution.without(&contested));
     let sure = sure.as_ref().unwrap_or(&solution.estimates);
     place.iter().zip(&solution.estimates).zip(sure).map(|((&i, found), sure)| (i, widened(found, sure))).collect()
 }
