@@ -14,7 +14,7 @@ use super::residuals::{self, BOX_SHARE, detection_px};
 use super::shared::{stated, with_drift};
 use crate::robust::energy::estimate::is_one_visit;
 use crate::robust::energy::{Object, placed, places_of_all};
-use crate::robust::model::Model;
+use crate::robust::model::{Model, median};
 use crate::robust::noise::drift::{Drive, Look, Normals, Vantage};
 use crate::robust::noise::huber::huber_weight;
 use crate::robust::noise::{Known, Noise};
@@ -127,11 +127,7 @@ impl Scale {
             })
             .filter(|size| size.is_finite() && *size > 0.0)
             .collect();
-        if sizes.is_empty() {
-            return None;
-        }
-        let middle = sizes.len() / 2;
-        let size_m = *sizes.select_nth_unstable_by(middle, f64::total_cmp).1;
+        let size_m = median(&mut sizes)?;
         let px2 = votes().map(|(_, ray)| model.scene.scale2[ray as usize]).sum::<f64>() / votes().count() as f64;
         Some(Self { px2, size_m })
     }

@@ -30,7 +30,7 @@ use std::ops::Range;
 use nalgebra::{Matrix3, Vector3};
 
 use crate::robust::model::heights::{HeightTerms, height_m};
-use crate::robust::model::{Model, Sizes};
+use crate::robust::model::{Model, Sizes, median};
 use crate::robust::noise::drift::{Drive, Look, OneLook, Vantage};
 use crate::robust::noise::huber::{HUBER_SIGMAS, huber_weight};
 use crate::robust::parts::Part;
@@ -444,11 +444,7 @@ pub fn size_of(model: &Model<'_>, votes: &[u32], point: &Vector3<f64>) -> f64 {
 pub(crate) fn usual_size(model: &Model<'_>, votes: &[u32], implied: impl Iterator<Item = f64>) -> f64 {
     let mut sizes: Vec<f64> = Vec::with_capacity(votes.len());
     sizes.extend(implied.filter(|size| size.is_finite()));
-    if sizes.is_empty() {
-        return f64::NAN;
-    }
-    let middle = sizes.len() / 2;
-    let median = *sizes.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let Some(median) = median(&mut sizes) else { return f64::NAN };
     let Some(class) = model.class_of_votes(votes) else { return median };
     let Sizes { object: (mean, sd), spread, .. } = class.sizes;
     if mean.is_nan() {

@@ -15,7 +15,7 @@ use crate::robust::energy::looks::Lookout;
 use crate::robust::energy::{LEAST_VOTES, Object, SURE_VOTES, are_taken, implied_size};
 use crate::robust::model::heights::{Heights, ground_m2 as ground_m2_within, height_m};
 use crate::robust::model::steps::{elevation_factor, score_ratio};
-use crate::robust::model::{ClassModel, Model};
+use crate::robust::model::{ClassModel, Model, median};
 use crate::robust::parts::Part;
 use aspect::aspect;
 use company::company;
@@ -235,11 +235,6 @@ fn sizes(model: &Model<'_>, objects: &[&Object]) -> (f64, (f64, f64)) {
         *size = (*size - middle).abs();
     }
     (spread, (middle, median(&mut medians).unwrap_or(f64::NAN) / MAD_OF_NORMAL))
-}
-
-pub(crate) fn median(values: &mut [f64]) -> Option<f64> {
-    let middle = values.len() / 2;
-    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
 #[cfg(test)]

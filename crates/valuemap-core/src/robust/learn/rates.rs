@@ -4,10 +4,9 @@
 
 use rayon::prelude::*;
 
-use super::median;
 use crate::robust::energy::Object;
 use crate::robust::energy::seen::{Looks, Shares, Told};
-use crate::robust::model::{ClassModel, FALSE_SHARE, ODD_PASSES, Rates};
+use crate::robust::model::{ClassModel, FALSE_SHARE, ODD_PASSES, Rates, median};
 
 /// Steps of expectation and maximisation: some ten change the rates by less than a thousandth.
 const STEPS: usize = 20;

@@ -9,7 +9,7 @@ use std::f64::consts::PI;
 use nalgebra::Vector3;
 use rustc_hash::FxHashSet;
 
-use super::ODD;
+use super::{ODD, median};
 use crate::robust::scene::Scene;
 
 /// Normal distributions that are tried, at most.
@@ -41,7 +41,8 @@ impl Heights {
     /// Those of some objects, m, each known with a standard deviation, m; what is anywhere is within `range_m` of the cameras. Nothing of no objects.
     #[must_use]
     pub fn learn(heights_m: &[f64], sigmas_m: &[f64], range_m: f64) -> Option<Self> {
-        let floor_m = median(sigmas_m)?;
+        let mut known_m: Vec<f64> = sigmas_m.iter().copied().filter(|sigma_m| sigma_m.is_finite()).collect();
+        let floor_m = median(&mut known_m)?;
         let ln_elsewhere = ODD.ln() - (2.0 * range_m).ln();
         let of_components = (1..=MOST_COMPONENTS).map(|count| {
             let heights = Self { components: components(heights_m, count, floor_m), ln_elsewhere };
@@ -223,12 +224,6 @@ pub fn ground_m2(scene: &Scene, up: &Vector3<f64>, distance_m: f64) -> f64 {
     let cells: FxHashSet<[i64; 2]> =
         places.iter().flat_map(|[x, y]| around.iter().map(move |[dx, dy]| [x + dx, y + dy])).collect();
     cells.len() as f64 * side_m * side_m
-}
-
-fn median(values: &[f64]) -> Option<f64> {
-    let mut values: Vec<f64> = values.iter().copied().filter(|value| value.is_finite()).collect();
-    let middle = values.len() / 2;
-    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
 #[cfg(test)]

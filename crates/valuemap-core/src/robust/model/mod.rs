@@ -621,6 +621,12 @@ pub(crate) fn ln_gamma(mut x: f64) -> f64 {
     (x - 0.5) * x.ln() - x + 0.5 * (2.0 * PI).ln() + series - product.ln()
 }
 
+/// The median of some numbers, which are put into another order; of an even number of them the larger of the two in the middle. Nothing of nothing.
+pub(crate) fn median(numbers: &mut [f64]) -> Option<f64> {
+    let middle = numbers.len() / 2;
+    (!numbers.is_empty()).then(|| *numbers.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
 /// Mean and standard deviation; 0 of nothing.
 #[must_use]
 pub fn mean_and_sd(values: &[f64]) -> (f64, f64) {
