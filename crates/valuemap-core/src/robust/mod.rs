@@ -90,7 +90,7 @@ pub fn find(
         findings,
         tally,
         rates: model.classes.first().map_or(Rates::GUESS, |class| class.rates),
-        clutter_per_image: (rays.len() - claimed) as f64 / scene.views.len() as f64,
+        clutter_per_image: (rays.len() - claimed) as f64 / scene.views.len().max(1) as f64,
         energy,
         variance_factor,
     })

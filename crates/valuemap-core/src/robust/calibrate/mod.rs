@@ -45,8 +45,9 @@ const AKAIKE: f64 = 2.0;
 /// Scenes with more rays than this are searched less deeply, if that changes little.
 const MOST_RAYS: usize = 100_000;
 
-/// Steps of [`self_calibrate`] at most, as progress counts them, but for the search that tells whether all moves pay: the noise, and the classes.
-pub const CALIBRATION_STEPS: usize = likeliest::NOISE_STEPS + 1;
+/// Steps of [`self_calibrate`] at most, as progress counts them, but for the search that tells whether all moves pay: the noise, and the classes, once more
+/// where they are taken for each other.
+pub const CALIBRATION_STEPS: usize = likeliest::NOISE_STEPS + 2;
 
 /// What is estimated once of a scene, or of a sample of it, before any part of it is mapped.
 #[derive(Debug, Clone)]

@@ -15,7 +15,7 @@ use crate::robust::noise::drift::Drive;
 use crate::robust::noise::told::Told;
 use crate::robust::scene::Scene;
 
-/// Where passes can disagree in fewer ways, the shared part is taken to be as large as the own part: of so many squares a variance is known to a third.
+/// Where passes can disagree in fewer ways, the shared part is taken to be as large as the own part: of so many squares a variance is known to 37 %.
 const LEAST_FREEDOM: f64 = 15.0;
 /// One label says no more than this about the disagreement of passes, as a multiple of what is expected.
 const MOST_DISAGREEMENT: f64 = 5.0;

@@ -223,7 +223,7 @@ struct Sector {
 }
 
 impl Sectors {
-    /// Those of some votes, from at least so near and as far as those two distances say. One vote from farther away may be a stray one, and is no
+    /// Those of some votes, from at least so near and as far as those two distances say. One vote from farther away may be clutter, and is no
     /// look: all images that are nearer would count against the object, from where it is hardly ever detected. Where nothing is known (0 m), sides reach
     /// as far as their farthest vote.
     fn of(scene: &Scene, point: &Vector3<f64>, voters: &[u32], (nearest_m, farthest_m): (f64, f64)) -> Self {

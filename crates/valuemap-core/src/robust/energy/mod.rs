@@ -8,12 +8,12 @@
 //!   + 2 sum_i ln clutter_c                            (3) what the votes are otherwise
 //!   - 2 sum_i [ ln ratio(size_i) + ln ratio(range_i) + ln ratio(score_i) + ln share_c(class_i) ]
 //!   - 2 ln prior_c(size)                              (4) what a detection says beyond its centre
-//!   - 2 ln [ real(looks) + false(looks) ] + 2 sum_w ln binomial(images_w, hits_w)
+//!   - 2 ln [ real(looks) + false(looks) ] + 2 sum_w [ ln binomial(images_w, hits_w) - hit_w ln reach_c(distance_w) ]
 //!                                                     (5) the looks, by side, pass and viewpoint w
 //! ```
 //!
 //! In (5) `false` is a false thing: parked, reflected, or regularly mistaken for an object. Its detections meet as those of an object do, but on one pass
-//! alone or in fewer of the looks (see [`seen`]).
+//! alone or in fewer of the looks. Or it is a ghost: rays that meet by chance, in hardly any of the looks (see [`seen`]).
 
 pub mod agreement;
 pub mod estimate;

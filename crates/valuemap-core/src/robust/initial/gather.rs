@@ -20,8 +20,7 @@ const BATCH: usize = 16;
 /// Who nominates, round after round, each time with the rays that are left over.
 const ROUNDS: [Who; 4] = [Who::Part, Who::All, Who::All, Who::All];
 
-/// Find labels among some rays (ascending) with a given noise, round after round, and count nominations and labels;
-/// `spreads` are those of all rays of the scene.
+/// Find labels among some rays (ascending), round after round, and count nominations and labels.
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.

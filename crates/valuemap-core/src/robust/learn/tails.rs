@@ -1,4 +1,4 @@
-//! Heavy tails: detections that show an object and miss it by far more than the noise, equation (3) of `docs/method.md`.
+//! Heavy tails: detections that show an object and miss it by far more than the noise, equation (3a) of `docs/method.md`.
 //!
 //! A box that is half hidden, or merged with another, lies beside its object: it is no vote, and no clutter of the kind that is anywhere. Where many objects
 //! stand, such boxes meet each other. So around an object that should have a vote in an image and has none, clutter is denser: by as much as detections of

@@ -389,7 +389,7 @@ struct Segment {
 }
 
 /// The error that a segment has for itself, taken out: what it is once its drift is known.
-struct OwnOfLeg {
+struct OwnOfSegment {
     /// What its looks say of the error of the segment, drift and own, in sigmas of the drift.
     information: Matrix6,
     gradient: Vector6,
@@ -409,7 +409,7 @@ struct Solved {
     /// How stiff this pull is.
     stiffness: f64,
     /// The error that the segment has for itself; nothing if it has none.
-    own: Option<OwnOfLeg>,
+    own: Option<OwnOfSegment>,
 }
 
 impl<'a> Drive<'a> {
@@ -683,12 +683,12 @@ impl Segment {
     }
 
     /// Take the error out that the segment has for itself; what remains is said of its drift. Nothing if numbers overflow.
-    fn take_own_out(&mut self, own: Sigmas, drift: Sigmas, normals: &mut Normals) -> Option<OwnOfLeg> {
+    fn take_own_out(&mut self, own: Sigmas, drift: Sigmas, normals: &mut Normals) -> Option<OwnOfSegment> {
         let share = own.each().zip_map(&drift.each(), |own, drift| if drift > 0.0 { own / drift } else { 0.0 });
         let share = share.map(|share| share.max(LEAST_SHARE));
         let known = Inverse::of(&(Matrix6::identity() + scaled(&self.information, &share)))?;
         let covariance = scaled(&known.matrix, &share);
-        let of_segment = OwnOfLeg {
+        let of_segment = OwnOfSegment {
             information: self.information,
             gradient: self.gradient,
             covariance,
@@ -719,7 +719,7 @@ impl Segment {
         self,
         keep: f64,
         looks: Range<usize>,
-        own: Option<OwnOfLeg>,
+        own: Option<OwnOfSegment>,
         normals: &mut Normals,
     ) -> Option<(Solved, Self)> {
         let stiffness = 1.0 / (1.0 - keep * keep);

@@ -18,7 +18,7 @@ pub struct Scene {
     pub rays: Arc<Rays>,
     /// Squared pixels that a unit of each ray's virtual image plane spans, see [`Ray::pixels_per_unit2`].
     pub scale2: Vec<f64>,
-    /// Size of each ray's box, px (geometric mean of width and height).
+    /// Height of each ray's box, px.
     pub box_px: Vec<f64>,
     /// Score of each ray's detection; NaN where there is none.
     pub score: Vec<f64>,
