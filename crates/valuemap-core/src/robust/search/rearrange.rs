@@ -80,7 +80,7 @@ pub fn rearrange_pairs(
         better.sort_by(|x, y| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2))));
         let mut kept: Vec<Option<Object>> = objects.into_iter().map(Some).collect();
         for (_, a, b, new) in better {
-            if a.max(b) < prints.len() && kept[a].is_some() && kept[b].is_some() {
+            if kept[a].is_some() && kept[b].is_some() {
                 (kept[a], kept[b]) = (None, None);
                 kept.extend(new.into_iter().map(Some));
             }
@@ -203,15 +203,16 @@ struct Pair<'a> {
     model: &'a Model<'a>,
     lookout: &'a Lookout,
     of: [&'a Object; 2],
-    claims: [&'a [Claim]; 2],
-    /// The rays of these.
+    /// The rays that each may have.
     gates: [FxHashSet<u32>; 2],
+    /// The images of these, ascending.
+    others: [Vec<u32>; 2],
 }
 
 impl<'a> Pair<'a> {
-    fn new(model: &'a Model<'a>, lookout: &'a Lookout, of: [&'a Object; 2], claims: [&'a [Claim]; 2]) -> Self {
+    fn new(model: &'a Model<'a>, lookout: &'a Lookout, of: [&'a Object; 2], claims: [&[Claim]; 2]) -> Self {
         let gates = claims.map(|claims| claims.iter().map(|claim| claim.ray).collect());
-        Self { model, lookout, of, claims, gates }
+        Self { model, lookout, of, gates, others: claims.map(images_of) }
     }
 
     /// Both as one, if that lowers J; else the exchange that lowers it most. And by how much.
@@ -225,7 +226,7 @@ impl<'a> Pair<'a> {
         if let Some(merged) = merged.and_then(|object| better(vec![object])) {
             return Some(merged);
         }
-        let mut foresight = Foresight::new(self.model, self.lookout, self.of, self.claims.map(images_of));
+        let mut foresight = Foresight::new(self.model, self.lookout, self.of, self.others.clone());
         let (parts, near) = self.parts();
         let (mut found, mut helpful) = (Vec::new(), Vec::new());
         for part in &parts {
@@ -273,7 +274,7 @@ impl<'a> Pair<'a> {
         votes.dedup_by_key(|vote| vote.0);
         let mut votes: Vec<u32> = votes.into_iter().map(|vote| vote.2).collect();
         votes.sort_unstable();
-        let mut others: Vec<u32> = self.claims.iter().flat_map(|claims| images_of(claims)).collect();
+        let mut others = self.others.concat();
         others.sort_unstable();
         others.dedup();
         object(self.model, self.lookout, votes, larger.fit.point, others)
@@ -369,8 +370,8 @@ impl<'a> Pair<'a> {
         let unseen = self.unseen_with_votes(votes, from);
         let unseen = unseen.filter(|both| both.iter().map(|object| object.energy).sum::<f64>() < most)?;
         let with_looks =
-            |(object, claims): (Object, &&[Claim])| object.with_looks(self.model, self.lookout, images_of(claims));
-        let found: Vec<Object> = unseen.into_iter().zip(&self.claims).map(with_looks).collect::<Option<_>>()?;
+            |(object, others): (Object, &Vec<u32>)| object.with_looks(self.model, self.lookout, others.clone());
+        let found: Vec<Object> = unseen.into_iter().zip(&self.others).map(with_looks).collect::<Option<_>>()?;
         found.iter().all(|object| object.energy < 0.0).then_some(found)
     }
 
