@@ -37,7 +37,7 @@ const MAD_OF_NORMAL: f64 = 0.6745;
 const LEAST_SPREAD: f64 = 0.03;
 
 /// Learn the classes of a model from the objects that some rays make. Classes of few objects are taken to be like all objects together, but for how
-/// many there are and how much clutter.
+/// much clutter there is.
 pub fn learn(model: &mut Model<'_>, lookout: &Lookout, rays: &[u32], objects: &[Object]) {
     let evidence = Evidence::new(model, lookout, rays, objects);
     let all: Vec<&Object> = objects.iter().collect();
@@ -54,7 +54,7 @@ pub fn learn(model: &mut Model<'_>, lookout: &Lookout, rays: &[u32], objects: &[
             let rays: Vec<u32> =
                 rays.iter().copied().filter(|&ray| model.scene.rays.class[ray as usize] == class).collect();
             let learned = evidence.learned(&of_class, &rays, before);
-            if learned.is_learned { learned } else { evidence.like(&pooled, &learned, of_class.len()) }
+            if learned.is_learned { learned } else { pooled.with_own(&learned) }
         })
         .collect();
     (model.pooled, model.classes) = (pooled, classes);
@@ -148,11 +148,6 @@ impl<'a> Evidence<'a> {
             }
         }
         learned
-    }
-
-    /// A class of few objects, `own`, that are like those of all classes.
-    fn like(&self, pooled: &ClassModel, own: &ClassModel, objects: usize) -> ClassModel {
-        ClassModel { ln_births_per_m2: ((objects + 1) as f64 / self.ground_m2).ln(), ..pooled.with_own(own) }
     }
 }
 
