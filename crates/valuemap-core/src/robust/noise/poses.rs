@@ -110,6 +110,13 @@ impl Belief {
 }
 
 impl PoseError {
+    /// Before anything is seen: standard deviations of the drift, and of the error that an image has for itself.
+    #[must_use]
+    pub fn prior(drift: Sigmas, own: Sigmas) -> Self {
+        let [drift_2, own_2] = [drift, own].map(|sigmas| sigmas.each().component_mul(&sigmas.each()));
+        Self { mean: Vector6::zeros(), covariance: Matrix6::from_diagonal(&(drift_2 + own_2)) }
+    }
+
     /// Residual of a look, px, with this error taken out, and its covariance; `own` is the covariance of all that is not the
     /// pose's, px².
     #[must_use]
@@ -187,4 +194,16 @@ pub fn smooth(starts_m: &[f64], looks: &[Belief]) -> Vec<Belief> {
         }
     }
     smoothed
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_not_seen_is_off_by_drift_and_own_error() {
+        let drift = Sigmas { position_m: 0.3, rotation_rad: 0.007 };
+        let own = Sigmas { position_m: 0.1, rotation_rad: 0.002 };
+        assert_eq!(PoseError::prior(drift, own), Belief::prior().pose_error(drift, own));
+    }
 }

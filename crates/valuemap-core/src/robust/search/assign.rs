@@ -239,7 +239,7 @@ fn gain(model: &Model<'_>, object: &Object, ray: u32, pose: &PoseError) -> f64 {
 #[must_use]
 pub fn gain_alone(model: &Model<'_>, object: &Object, ray: u32) -> f64 {
     let view = model.scene.view(ray);
-    gain(model, object, ray, &Belief::prior().pose_error(model.noise.shared(view), model.noise.of_image(view)))
+    gain(model, object, ray, &PoseError::prior(model.noise.shared(view), model.noise.of_image(view)))
 }
 
 /// The objects and rays of one image that go together.
