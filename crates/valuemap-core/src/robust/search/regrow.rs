@@ -117,17 +117,17 @@ impl Garden<'_> {
             }
             born = unseen(model, votes, born.fit.point)?;
         }
-        let mut born = born.with_looks(model, lookout, Vec::new())?;
-        let mut birth = Vec::new();
-        let mut change = born.energy;
         let taken = self.takes(&born);
         // Each is worth no more to it than it would be at its best.
         let at_most: f64 = taken.iter().map(|(_, gain)| gain).sum();
-        if born.votes.len() + taken.len() < model.settings.min_votes as usize
-            || change - 2.0 * at_most > -LEAST_GAIN_OF_MOVE
-        {
+        let is_in_vain = |born: &Object| born.energy - 2.0 * at_most > -LEAST_GAIN_OF_MOVE;
+        // Before it is asked who should have seen it, which takes most of the time and makes it no more probable.
+        if born.votes.len() + taken.len() < model.settings.min_votes as usize || is_in_vain(&born) {
             return None;
         }
+        let mut born = born.with_looks(model, lookout, Vec::new()).filter(|born| !is_in_vain(born))?;
+        let mut birth = Vec::new();
+        let mut change = born.energy;
         for (vote, _) in taken {
             let other = self.owner[vote as usize] as usize;
             if birth.iter().any(|(i, _): &(usize, Option<Object>)| *i == other) {
