@@ -68,7 +68,7 @@ pub(crate) fn noise_of_more(
     progress: &Progress,
 ) -> Result<Noise, Halt> {
     let sample = Sample { scene, rays: more, known, settings: wider(settings), progress };
-    of_more(from, |noise| sample.round(noise))
+    of_more(from, |noise| sample.round(noise, true))
 }
 
 /// The noise that makes more rays likeliest, some steps on from one: the one that a map was found with, or the one that was estimated from it, if
@@ -77,14 +77,15 @@ fn of_more(mut noise: Noise, step: impl Fn(&Noise) -> Result<Round, Halt>) -> Re
     let (mut best, mut least) = (noise, f64::INFINITY);
     for _ in 0..MORE_ROUNDS {
         let found = step(&noise)?;
-        let value = found.value + found.change.min(0.0);
+        let (again, change) = found.again.unwrap_or((noise, 0.0));
+        let value = found.value + change.min(0.0);
         if value < least {
-            (best, least) = (*found.likelier_noise(), value);
+            (best, least) = (if change < 0.0 { again } else { noise }, value);
         }
-        if found.stays() {
+        if again == noise {
             break;
         }
-        noise = found.again;
+        noise = again;
     }
     Ok(best)
 }
@@ -164,30 +165,30 @@ struct Sample<'a> {
 }
 
 impl Sample<'_> {
-    /// One step: how likely the rays are with a noise, and the noise that is estimated from the map that it makes.
-    fn round(&self, noise: &Noise) -> Result<Round, Halt> {
+    /// One step: how likely the rays are with a noise, and the noise that is estimated from the map that it makes, if that is asked for.
+    fn round(&self, noise: &Noise, goes_on: bool) -> Result<Round, Halt> {
         let model = Model::new(self.scene, noise, &self.settings);
         let begun = initial::labels_of_few(&model, self.rays, self.progress)?;
-        self.searched(model, begun)
+        self.searched(model, begun, goes_on)
     }
 
-    /// The same from a map that is there.
+    /// The last step, from a map that is there.
     fn round_from(&self, noise: &Noise, begun: Vec<Placed>) -> Result<Round, Halt> {
-        self.searched(Model::new(self.scene, noise, &self.settings), begun)
+        self.searched(Model::new(self.scene, noise, &self.settings), begun, false)
     }
 
-    fn searched(&self, mut model: Model<'_>, begun: Vec<Placed>) -> Result<Round, Halt> {
+    fn searched(&self, mut model: Model<'_>, begun: Vec<Placed>, goes_on: bool) -> Result<Round, Halt> {
         let noise = model.noise;
         let mut objects =
             search(&mut model, self.rays, begun, Depth::Shallow, true, &mut Tally::default(), self.progress)?;
-        let again = calibrate(self.scene, noise, &placed(&objects), self.known);
+        let again = goes_on.then(|| calibrate(self.scene, noise, &placed(&objects), self.known));
         // What is left over gives birth: an object that a map lacks would count against its noise. But it tells no noise: it may be born of nonsense.
         let lookout = Lookout::new(self.scene, self.settings.viability.max_range_m);
         objects.extend(born_of_rest(&model, &lookout, self.rays, &objects, self.progress)?.0);
         let (value, left) = (likelihood(&model, &objects, self.rays), Left::of(&model, &objects, self.rays));
         let map = placed(&objects);
-        let change = change_of_fits(&model.with_noise(&again), &objects);
-        Ok(Round { noise: *noise, map, value, change, again, left })
+        let again = again.map(|again| (again, change_of_fits(&model.with_noise(&again), &objects)));
+        Ok(Round { noise: *noise, map, value, again, left })
     }
 
     /// The noise that is estimated from a map whose objects are put where another noise has them.
@@ -213,10 +214,8 @@ struct Round {
     map: Vec<Placed>,
     /// Minus twice the logarithm of how likely the rays are with it.
     value: f64,
-    /// The noise that is estimated from the map that it makes.
-    again: Noise,
-    /// What the value changes by with that, the map as it is.
-    change: f64,
+    /// The noise that is estimated from the map that it makes, and what the value changes by with that, the map as it is; nothing at the last step.
+    again: Option<(Noise, f64)>,
     left: Left,
 }
 
@@ -250,14 +249,9 @@ impl Left {
 }
 
 impl Round {
-    /// That of the two noises with which the map is likelier.
-    fn likelier_noise(&self) -> &Noise {
-        if self.change < 0.0 { &self.again } else { &self.noise }
-    }
-
-    /// Whether the noise stays as it is, and would make the same map again.
-    fn stays(&self) -> bool {
-        self.again == self.noise
+    /// The noise of the next step; nothing if there is none, or the noise stays as it is and would make the same map again.
+    fn next(&self) -> Option<Noise> {
+        self.again.map(|(again, _)| again).filter(|again| *again != self.noise)
     }
 
     /// Whether a larger noise may make the rays likelier. If it explained the votes without any residual, and the rays of no object as well,
@@ -298,10 +292,9 @@ impl Likeliest {
             if likeliest.last.as_ref().is_some_and(|last| !last.may_be_larger(sample.scene, &start)) {
                 break;
             }
-            let first = sample.round(&start)?;
             // A map of too few objects tells no noise: what it is then is where it began, and no estimate.
-            if !first.stays() {
-                likeliest.steps(CALIBRATION_ROUNDS - 1, first.again, |noise| sample.round(noise))?;
+            if let Some(noise) = sample.round(&start, true)?.next() {
+                likeliest.steps(CALIBRATION_ROUNDS - 1, noise, |noise, goes_on| sample.round(noise, goes_on))?;
             }
         }
         Ok(likeliest)
@@ -312,19 +305,17 @@ impl Likeliest {
         &mut self,
         count: usize,
         mut noise: Noise,
-        step: impl Fn(&Noise) -> Result<Round, Halt>,
+        step: impl Fn(&Noise, bool) -> Result<Round, Halt>,
     ) -> Result<(), Halt> {
         let (mut last, mut is_best) = (None, false);
-        for _ in 0..count {
-            let found = Arc::new(step(&noise)?);
+        for left in (0..count).rev() {
+            let found = Arc::new(step(&noise, left > 0)?);
             if self.best.as_ref().is_none_or(|best| found.value < best.value) {
                 (self.best, is_best) = (Some(Arc::clone(&found)), true);
             }
             last = Some(Arc::clone(&found));
-            if found.stays() {
-                break;
-            }
-            noise = found.again;
+            let Some(next) = found.next() else { break };
+            noise = next;
         }
         if is_best {
             self.last = last;
@@ -402,7 +393,7 @@ mod tests {
         let (scene, progress) = (eight_in_a_street(), Progress::default());
         let rays = scene.usable_rays();
         let sample = whole(&scene, &rays, &progress);
-        let all = sample.round(&street::NOISE)?;
+        let all = sample.round(&street::NOISE, false)?;
         let lacking = sample.round_from(&street::NOISE, all.map[1..].to_vec())?;
         assert_eq!((all.map.len(), lacking.map.len()), (8, 8));
         assert!((lacking.value - all.value).abs() < 10.0, "{} {}", lacking.value, all.value);
@@ -461,7 +452,7 @@ mod tests {
     fn scores_say_no_more_than_which_rays_are_votes() -> Result<(), Halt> {
         let mut scene = eight_in_a_street();
         let (rays, progress) = (scene.usable_rays(), Progress::default());
-        let map = whole(&scene, &rays, &progress).round(&street::NOISE)?.map;
+        let map = whole(&scene, &rays, &progress).round(&street::NOISE, false)?.map;
         // Two objects are left out: what they have is clutter, and has lower scores.
         let map = &map[..map.len() - 2];
         let votes: usize = map.iter().map(|(votes, _)| votes.len()).sum();
@@ -496,14 +487,8 @@ mod tests {
                 let left = Left { chi2: 0.0, votes: Vec::new(), clutter: Vec::new(), passes: (0, 0.0) };
                 // The first map is the likeliest.
                 let value = if noise.detection_px < 1.0 { 0.0 } else { 100.0 };
-                Ok(Round {
-                    noise: *noise,
-                    map: Vec::new(),
-                    value,
-                    again: noise_of(noise.detection_px + 0.5),
-                    change,
-                    left,
-                })
+                let again = Some((noise_of(noise.detection_px + 0.5), change));
+                Ok(Round { noise: *noise, map: Vec::new(), value, again, left })
             })
         };
         assert!((with(-10.0)?.detection_px - 1.0).abs() < 1e-12);
@@ -515,11 +500,11 @@ mod tests {
     fn a_noise_that_stays_as_it_is_takes_no_further_step() -> Result<(), Halt> {
         let steps = |change_px: f64| {
             let taken = std::cell::Cell::new(0);
-            let step = |noise: &Noise| {
+            let step = |noise: &Noise, _| {
                 taken.set(taken.get() + 1);
                 let left = Left { chi2: 0.0, votes: Vec::new(), clutter: Vec::new(), passes: (0, 0.0) };
-                let again = Noise { detection_px: noise.detection_px + change_px, ..*noise };
-                Ok(Round { noise: *noise, map: Vec::new(), value: 0.0, again, change: 0.0, left })
+                let again = Some((Noise { detection_px: noise.detection_px + change_px, ..*noise }, 0.0));
+                Ok(Round { noise: *noise, map: Vec::new(), value: 0.0, again, left })
             };
             Likeliest::default().steps(3, street::NOISE, step)?;
             Ok(taken.get())
