@@ -20,6 +20,7 @@ use crate::robust::noise::drift::{Drive, Look, Normals, Vantage, segments};
 use crate::robust::noise::huber::huber_weight;
 use crate::robust::noise::spd::Vector6;
 use crate::robust::noise::{Noise, variance_of_alike};
+use crate::robust::parts::Part;
 use crate::robust::scene::{Scene, View};
 
 /// A pass that comes back after so long a drive has another drift, m.
@@ -461,9 +462,11 @@ impl Joint<'_> {
 
     /// Add what measured ranges and sizes say of the labels.
     fn add_priors(&self, of_labels: &[Vec<u32>], normals: &mut Normals) {
-        let of_ranges = self.votes.iter().zip(&self.vantages).filter_map(|(&(label, _), vantage)| {
-            Some((label, range_terms(vantage.range_m, vantage.center(), &self.points[label])?))
-        });
+        let has_ranges = self.model.is_none_or(|model| model.settings.has(Part::Ranges));
+        let of_ranges =
+            self.votes.iter().zip(&self.vantages).filter(|_| has_ranges).filter_map(|(&(label, _), vantage)| {
+                Some((label, range_terms(vantage.range_m, vantage.center(), &self.points[label])?))
+            });
         let of_sizes = of_labels
             .iter()
             .enumerate()

@@ -71,7 +71,8 @@ impl Lookout {
     pub fn looks(&self, model: &Model<'_>, point: &Vector3<f64>, voters: &[u32], others: &[u32]) -> Seen {
         let Some(class) = model.class_of_votes(voters) else { return Seen::default() };
         // Before anything is learned, objects are seen from between their nearest and their farthest vote.
-        let distances_m = if class.is_learned { (0.0, class.farthest_m) } else { (f64::INFINITY, 0.0) };
+        let distances_m =
+            if class.is_learned || model.pooled.is_learned { (0.0, class.farthest_m) } else { (f64::INFINITY, 0.0) };
         let scene = model.scene;
         let has = |part: Part| model.settings.has(part);
         let sectors = Sectors::of(scene, point, voters, distances_m);

@@ -17,6 +17,7 @@ use crate::robust::energy::looks::Lookout;
 use crate::robust::model::Model;
 use crate::robust::noise::index::RayIndex;
 use crate::robust::parts::Part;
+use crate::robust::scene::Frustum;
 
 /// Labels are dropped below these multiples of the probability that is asked for, one after the other, and then below that.
 const PRUNED_BELOW: [f64; 3] = [1e-5, 1e-2, 0.3];
@@ -268,8 +269,7 @@ fn judge(model: &Model<'_>, sectors: &[Arc<[Sector]>], labels: &[Label], pruned:
     let rates = Rates::learn(&looks);
     let claimed: usize = labels.iter().map(|label| label.voters.len()).sum();
     let clutter_per_image = (scene.rays.rays.len() - claimed) as f64 / scene.views.len() as f64;
-    let solid_angle =
-        scene.frusta.iter().map(|frustum| frustum.solid_angle_sr).sum::<f64>() / scene.frusta.len() as f64;
+    let solid_angle = scene.frusta.iter().map(Frustum::searched_sr).sum::<f64>() / scene.frusta.len() as f64;
     let clutter_per_sr = clutter_per_image / solid_angle;
     let chance: Vec<f64> = labels
         .par_iter()

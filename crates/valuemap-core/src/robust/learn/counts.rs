@@ -47,8 +47,10 @@ pub fn ln_odds_of_few(objects: &[&Object], few: &[&Object]) -> [f64; FEW] {
     let more = |ln_odds: f64| (LEAST_VOTES..=most).map(|votes| expected(votes, ln_odds)).sum::<f64>();
     let of_more = at_most((LEAST_VOTES..=MOST_VOTES).map(usual).sum(), 0.0, more);
     let (three, four) = (count(3), count(4));
-    let of_two = at_most(bound(three, four, 2), 0.0, |ln_odds| expected(2, ln_odds));
-    let of_one = at_most(bound(expected(2, of_two), three, 1), 0.0, |ln_odds| expected(1, ln_odds));
+    // Where two votes are enough, some of two are objects of their own.
+    let two = objects.iter().filter(|object| object.votes.len() == 2).count() as f64;
+    let of_two = at_most((bound(three, four, 2) - two).max(0.0), 0.0, |ln_odds| expected(2, ln_odds));
+    let of_one = at_most(bound(two + expected(2, of_two), three, 1), 0.0, |ln_odds| expected(1, ln_odds));
     [of_one, of_two, of_more]
 }
 
@@ -200,5 +202,17 @@ mod tests {
         let (one, two) = (expected(&of(1), odds[0]), expected(&of(2), odds[1]));
         assert!((two - 40.0 * 40.0 / 60.0).abs() < 0.01, "{two}");
         assert!((one - two * two / 40.0).abs() < 0.01, "{one}");
+    }
+
+    #[test]
+    fn where_two_votes_are_enough_some_objects_have_no_more() {
+        let many: Vec<Object> = [(2, 40), (3, 40), (4, 60)]
+            .into_iter()
+            .flat_map(|(votes, count)| (0..count).map(move |_| of_votes(votes, -60.0)))
+            .collect();
+        let few = vec![of_votes(1, -6.0); 80];
+        let odds = ln_odds_of_few(&many.iter().collect::<Vec<_>>(), &few.iter().collect::<Vec<_>>());
+        let one = expected(&few, odds[0]);
+        assert!((one - 40.0).abs() < 0.01, "{one}");
     }
 }

@@ -60,6 +60,11 @@ pub fn learn(model: &mut Model<'_>, lookout: &Lookout, rays: &[u32], objects: &[
     (model.pooled, model.classes) = (pooled, classes);
 }
 
+/// How dense some detections are, 1/sr, in logarithms. One more than there are: no clutter at all is never known for sure.
+fn ln_per_sr(clutter: usize, solid_angle_sr: f64) -> f64 {
+    ((clutter + 1) as f64 / solid_angle_sr).ln()
+}
+
 /// Whether two classes are alike to the bit, what is no number as well.
 fn has_same_numbers(a: &ClassModel, b: &ClassModel) -> bool {
     a.to_row().iter().map(|number| number.to_bits()).eq(b.to_row().iter().map(|number| number.to_bits()))
@@ -73,6 +78,8 @@ struct Evidence<'a> {
     /// Whether each ray is a vote.
     is_vote: Vec<bool>,
     solid_angle_sr: f64,
+    /// How dense the clutter of each class is.
+    ln_clutter_per_sr: Vec<f64>,
     ground_m2: f64,
     looked_at: (f64, f64),
     /// Objects with fewer votes do not serve.
@@ -81,6 +88,12 @@ struct Evidence<'a> {
 
 impl<'a> Evidence<'a> {
     fn new(model: &'a Model<'a>, lookout: &'a Lookout, rays: &[u32], objects: &'a [Object]) -> Self {
+        let is_vote = are_taken(model.scene, objects);
+        let solid_angle_sr = model.solid_angle_sr(rays.len());
+        let mut clutter = vec![0; model.classes.len()];
+        let of_none = rays.iter().filter(|&&ray| !is_vote[ray as usize]);
+        of_none.for_each(|&ray| clutter[model.scene.rays.class[ray as usize] as usize] += 1);
+        let ln_clutter_per_sr = clutter.into_iter().map(|clutter| ln_per_sr(clutter, solid_angle_sr)).collect();
         let sure = objects.iter().filter(|object| is_sure(object)).count();
         let looked_at = span(&model.sin_elevation);
         let are_elevations_measured = looked_at.1 - looked_at.0 > LEAST_ELEVATIONS;
@@ -89,8 +102,9 @@ impl<'a> Evidence<'a> {
             model,
             lookout,
             objects,
-            is_vote: are_taken(model.scene, objects),
-            solid_angle_sr: model.solid_angle_sr(rays.len()),
+            is_vote,
+            solid_angle_sr,
+            ln_clutter_per_sr,
             ground_m2: ground_m2(model, objects, least_votes) * model.share_of(rays.len()),
             looked_at,
             least_votes,
@@ -101,9 +115,7 @@ impl<'a> Evidence<'a> {
     fn learned(&self, of_class: &[&Object], rays: &[u32], before: &ClassModel) -> ClassModel {
         let model = self.model;
         let (in_class, clutter): (Vec<u32>, Vec<u32>) = rays.iter().partition(|&&ray| self.is_vote[ray as usize]);
-        // One detection more than is seen: no clutter at all is never known for sure.
-        let ln_clutter_per_sr = ((clutter.len() + 1) as f64 / self.solid_angle_sr).ln();
-        let mut learned = ClassModel { ln_clutter_per_sr, ..*before };
+        let mut learned = ClassModel { ln_clutter_per_sr: ln_per_sr(clutter.len(), self.solid_angle_sr), ..*before };
         let of = |column: &[f64], rays: &[u32]| rays.iter().map(|&ray| column[ray as usize]).collect::<Vec<f64>>();
         let has = |part: Part| model.settings.has(part);
         if has(Part::Scores) {
@@ -141,7 +153,7 @@ impl<'a> Evidence<'a> {
                 let hardly = of_class.iter().filter(|object| is_hardly_seen(object, &learned));
                 let votes = hardly.flat_map(|object| object.votes.iter().copied());
                 let free = OfImages::new(model.scene, clutter.iter().copied().chain(votes));
-                learned.tails = tails(model, &looked_at, &free, ln_clutter_per_sr);
+                learned.tails = tails(model, &looked_at, &free, &self.ln_clutter_per_sr);
             }
             if has(Part::Company) {
                 learned.company = company(model, self.objects, &learned, of_class[0].class);
@@ -239,6 +251,7 @@ mod tests {
     use super::*;
     use crate::robust::energy::seen::Seen;
     use crate::robust::energy::{anywhere, object};
+    use crate::robust::model::steps::Steps;
     use crate::street;
     use crate::street::SETTINGS;
 
@@ -300,5 +313,30 @@ mod tests {
         learn(&mut model, &lookout, &rays, &objects);
         assert!(by_itself.is_learned && has_same_numbers(&model.classes[0], &by_itself));
         assert!(has_same_numbers(&model.pooled, &by_itself));
+    }
+
+    #[test]
+    fn a_rare_class_is_like_all_together_each_time_that_it_is_learned() {
+        let all: Vec<Vector3<f64>> = (0..8).map(|i| Vector3::new(25.0 + 3.0 * f64::from(i), 4.0, 3.0)).collect();
+        let mut scene =
+            street::joined((0..3).map(|_| street::street(12, 2.0, &all, &[[0.3, -0.2], [-0.1, 0.4]])).collect());
+        let rays = scene.usable_rays();
+        let of_last = rays.iter().copied().skip(all.len() - 1).step_by(all.len());
+        let class = &mut std::sync::Arc::make_mut(&mut scene.rays).class;
+        of_last.for_each(|ray| class[ray as usize] = 1);
+        let mut model = Model::new(&scene, &street::NOISE, &SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let votes = |i: usize| rays.iter().copied().skip(i).step_by(all.len()).collect();
+        for _ in 0..2 {
+            let found = (0..all.len()).filter_map(|i| object(&model, &lookout, votes(i), all[i], Vec::new()));
+            let objects: Vec<Object> = found.map(|object| Object { real: 1.0, ..object }).collect();
+            learn(&mut model, &lookout, &rays, &objects);
+            assert!(model.pooled.is_learned && !model.classes[1].is_learned);
+            assert_eq!(model.classes[1].rates, model.pooled.rates);
+            assert_eq!(model.classes[1].company, Steps::NONE);
+            // It is seen from as far as others are.
+            let seen = lookout.looks(&model, &all[7], &votes(7), &[]);
+            assert!(seen.sectors.concat().iter().any(|looks| looks.expected > 0.0));
+        }
     }
 }

@@ -47,9 +47,9 @@ fn widest_sigmas(model: &Model<'_>) -> f64 {
 }
 
 /// How many detections of a class miss an object that has no vote in an image, per squared sigma of what a detection is off by, by sigmas; of the images
-/// that look at sure objects, and the rays of no object.
+/// that look at sure objects, and the rays of no object. `ln_clutter_per_sr` is how dense those of each class are.
 #[must_use]
-pub fn tails(model: &Model<'_>, sure: &[LookedAt<'_>], free: &OfImages<'_>, ln_clutter_per_sr: f64) -> Steps {
+pub fn tails(model: &Model<'_>, sure: &[LookedAt<'_>], free: &OfImages<'_>, ln_clutter_per_sr: &[f64]) -> Steps {
     let widest = widest_sigmas(model);
     let ring = |bin: usize| {
         let [inner, outer] = [bin, bin + 1].map(|edge| widest * edge as f64 / BINS as f64);
@@ -61,7 +61,7 @@ pub fn tails(model: &Model<'_>, sure: &[LookedAt<'_>], free: &OfImages<'_>, ln_c
             let look = Look::new(model, object, image);
             looks += 1.0;
             for (bin, expected) in expected.iter_mut().enumerate() {
-                *expected += ln_clutter_per_sr.exp() * ring(bin) * look.variance_rad2;
+                *expected += ln_clutter_per_sr[object.class as usize].exp() * ring(bin) * look.variance_rad2;
             }
             for &ray in free.of(image) {
                 let sigmas = look.sigmas(model, object, ray);
@@ -180,7 +180,7 @@ mod tests {
         let lookout = Lookout::new(scene, street::VIABILITY.max_range_m);
         let (objects, free) = found(&model, &lookout);
         let looked_at = looked_at(&model, &lookout, &objects.iter().collect::<Vec<_>>(), 50.0);
-        tails(&model, &looked_at, &OfImages::new(scene, free.into_iter()), -3.0)
+        tails(&model, &looked_at, &OfImages::new(scene, free.into_iter()), &[-3.0])
     }
 
     #[test]
@@ -211,5 +211,17 @@ mod tests {
         let before = price(&model, free[0]);
         model.ln_tails = told;
         assert!(price(&model, free[0]) >= before && free.iter().any(|&ray| price(&model, ray) > before + 1.0));
+    }
+
+    #[test]
+    fn a_class_is_missed_beside_the_clutter_of_its_own() {
+        let scene = missing_by(7.0);
+        let model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let (objects, free) = found(&model, &lookout);
+        let looked_at = looked_at(&model, &lookout, &objects.iter().collect::<Vec<_>>(), 50.0);
+        let free = OfImages::new(&scene, free.into_iter());
+        let of = |densities: &[f64]| tails(&model, &looked_at, &free, densities);
+        assert!(of(&[-3.0, 20.0]) == of(&[-3.0]) && of(&[20.0, -3.0]) == Steps::NONE);
     }
 }

@@ -270,6 +270,8 @@ impl ClassModel {
             sizes: Sizes { spread: self.sizes.spread, ..own.sizes },
             heights: None,
             ranges: own.ranges,
+            company: Steps::NONE,
+            is_learned: false,
             ..*self
         }
     }

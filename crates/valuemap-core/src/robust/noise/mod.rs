@@ -116,8 +116,10 @@ impl Noise {
     #[must_use]
     pub fn all_own(&self) -> Self {
         Self {
-            position_m: self.position_m.hypot(self.position_drift_m),
-            rotation_rad: self.rotation_rad.hypot(self.rotation_drift_rad),
+            position_m: self.position_m.hypot(self.position_segment_m).hypot(self.position_drift_m),
+            rotation_rad: self.rotation_rad.hypot(self.rotation_segment_rad).hypot(self.rotation_drift_rad),
+            position_segment_m: 0.0,
+            rotation_segment_rad: 0.0,
             position_drift_m: 0.0,
             rotation_drift_rad: 0.0,
             ..*self

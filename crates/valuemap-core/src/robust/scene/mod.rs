@@ -65,6 +65,14 @@ pub struct Frustum {
     pub blind: Option<BlindSide>,
 }
 
+impl Frustum {
+    /// How much of the sphere it covers but for its blind side, sr.
+    #[must_use]
+    pub fn searched_sr(&self) -> f64 {
+        self.solid_angle_sr * self.blind.map_or(1.0, |blind| 1.0 - blind.half_width_rad / PI)
+    }
+}
+
 /// Directions from a camera in which nothing is ever detected: of panoramas often a part alone is searched.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BlindSide {
@@ -107,10 +115,10 @@ impl Scene {
         &self.rays.rays[ray as usize]
     }
 
-    /// What all images picture together, sr.
+    /// What all images picture together, sr, but for blind sides.
     #[must_use]
     pub fn solid_angle_sr(&self) -> f64 {
-        self.views.iter().map(|view| self.frusta[view.camera as usize].solid_angle_sr).sum()
+        self.views.iter().map(|view| self.frusta[view.camera as usize].searched_sr()).sum()
     }
 
     /// Whether a point lies in the picture of a view.
@@ -177,6 +185,9 @@ mod tests {
         assert!(scene.frusta[0].blind.is_some());
         assert!(!sees(&scene, &left) && !sees(&scene, &-ahead));
         assert!(sees(&scene, &(ahead + right)));
+        // Clutter is as dense as it is where anything is detected.
+        let share = scene.frusta[0].searched_sr() / scene.frusta[0].solid_angle_sr;
+        assert!((0.1..0.2).contains(&share), "{share}");
         // A camera with bounds has no other side, and few detections tell none.
         scene.frusta[0].normals = vec![Vector3::z()];
         scene.find_blind_sides();

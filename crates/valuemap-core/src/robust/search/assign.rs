@@ -30,7 +30,6 @@ pub struct Claim {
     pub object: u32,
     /// The ray.
     pub ray: u32,
-    is_vote: bool,
     gain: f64,
 }
 
@@ -69,12 +68,7 @@ pub fn assign_among(
     let images: Vec<&mut [Claim]> = by_image.chunk_by_mut(|a, b| a.image == b.image).collect();
     let decide = |of_image: &mut [Claim]| {
         progress.check()?;
-        let pose = poses.of_image(
-            model,
-            of_image[0].image,
-            of_image.iter().filter(|claim| claim.is_vote).map(|claim| (claim.object, claim.ray)),
-            &objects,
-        );
+        let pose = poses.of_image(model, of_image[0].image);
         for claim in of_image.iter_mut() {
             claim.gain = gain(model, &objects[claim.object as usize], claim.ray, &pose);
         }
@@ -206,13 +200,7 @@ pub fn claims_of_all(
         progress.check()?;
         let hits =
             index.hits_of_any(&object.places(model), &|said| model.confusions.may_be(object.class, said), range_m);
-        let claim = |hit: Hit| Claim {
-            image: hit.image,
-            object: i as u32,
-            ray: hit.ray,
-            is_vote: object.votes.binary_search(&hit.ray).is_ok(),
-            gain: 0.0,
-        };
+        let claim = |hit: Hit| Claim { image: hit.image, object: i as u32, ray: hit.ray, gain: 0.0 };
         Ok(hits.into_iter().map(claim).collect())
     };
     objects.par_iter().enumerate().map(of_object).collect()
@@ -280,6 +268,8 @@ pub struct Trajectories {
     segments: Segments,
     /// The drift of each segment.
     smoothed: Vec<Belief>,
+    /// What the votes of each image tell of it.
+    of_images: FxHashMap<u32, Belief>,
 }
 
 impl Trajectories {
@@ -288,16 +278,16 @@ impl Trajectories {
     pub fn of(model: &Model<'_>, objects: &[Object]) -> Self {
         let segments = Segments::new(&model.scene.views);
         let of_object = |object: &Object| -> Vec<(u32, Belief)> {
-            let belief = |&ray: &u32| {
-                let segment = segments.of_view[model.scene.rays.image[ray as usize] as usize];
-                belief_of(model, object, ray).map(|belief| (segment, belief))
-            };
-            object.votes.iter().filter_map(belief).collect()
+            let image = |ray: u32| model.scene.rays.image[ray as usize];
+            object.votes.iter().filter_map(|&ray| Some((image(ray), belief_of(model, object, ray)?))).collect()
         };
         let beliefs: Vec<Vec<(u32, Belief)>> = objects.par_iter().map(of_object).collect();
         let mut of_segments = vec![Belief::nothing(); segments.pass.len()];
-        for (segment, belief) in beliefs.into_iter().flatten() {
-            of_segments[segment as usize] = of_segments[segment as usize].and(&belief);
+        let mut of_images: FxHashMap<u32, Belief> = FxHashMap::default();
+        for (image, belief) in beliefs.into_iter().flatten() {
+            let segment = &mut of_segments[segments.of_view[image as usize] as usize];
+            let of_image = of_images.entry(image).or_insert_with(Belief::nothing);
+            (*segment, *of_image) = (segment.and(&belief), of_image.and(&belief));
         }
         let mut passes: Vec<(usize, usize)> = Vec::new();
         for segment in 0..segments.pass.len() {
@@ -310,21 +300,14 @@ impl Trajectories {
             .par_iter()
             .flat_map_iter(|&(first, end)| smooth(&segments.start_m[first..end], &of_segments[first..end]));
         let smoothed = smoothed.collect();
-        Self { segments, smoothed }
+        Self { segments, smoothed, of_images }
     }
 
     /// The pose error of an image, as the votes of other images tell it.
-    fn of_image(
-        &self,
-        model: &Model<'_>,
-        image: u32,
-        votes: impl Iterator<Item = (u32, u32)>,
-        objects: &[Object],
-    ) -> PoseError {
+    fn of_image(&self, model: &Model<'_>, image: u32) -> PoseError {
         let view = &model.scene.views[image as usize];
-        let belief = self.smoothed[self.segments.of_view[image as usize] as usize];
-        let own = votes.filter_map(|(object, ray)| belief_of(model, &objects[object as usize], ray));
-        let belief = own.fold(belief, |belief, own| belief.without(&own));
+        let smoothed = self.smoothed[self.segments.of_view[image as usize] as usize];
+        let belief = self.of_images.get(&image).map_or(smoothed, |own| smoothed.without(own));
         belief.pose_error(model.noise.shared(view), model.noise.of_image(view))
     }
 }

@@ -130,7 +130,7 @@ pub(crate) fn as_one(
         let (weaker, class) = if first.votes.len() < second.votes.len() { (a, second.class) } else { (b, first.class) };
         // A detector takes one thing for another now and then: the class with more votes has the place.
         let merged = if may_be_one(model, first, second) { pair.merged() } else { None };
-        let merged = merged.filter(|merged| merged.class == class);
+        let merged = merged.filter(|merged| merged.class == class && merged.energy < 0.0);
         kept[weaker] = None;
         if let Some(merged) = merged {
             (kept[a], kept[b]) = (None, None);
@@ -558,6 +558,29 @@ mod tests {
             assert!(pair.barred(0, &few, &other).count() == 0);
         }
         assert!(taken > 0 && refused > 0, "{taken} {refused}");
+        Ok(())
+    }
+
+    #[test]
+    fn of_two_that_no_place_has_room_for_the_stronger_stays_if_both_as_one_are_none() -> Result<(), Halt> {
+        let both = [Vector3::new(30.0, 4.0, 3.0), Vector3::new(30.0, 4.05, 3.0)];
+        let scene = street::joined((0..2).map(|_| street::street(10, 2.0, &both, &[[0.2, -0.1]])).collect());
+        let mut model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let rays = scene.usable_rays();
+        // One image shows the second alone.
+        let of_first = rays.iter().copied().step_by(2).enumerate().filter(|(image, _)| *image != 3).map(|(_, ray)| ray);
+        let votes: [Vec<u32>; 2] = [of_first.collect(), rays.iter().copied().skip(1).step_by(2).take(6).collect()];
+        let of = |(votes, at): (Vec<u32>, &Vector3<f64>)| object(&model, &lookout, votes, *at, Vec::new());
+        let objects: Vec<Object> = votes.into_iter().zip(&both).filter_map(of).collect();
+        let index = RayIndex::new(&scene, &model.spreads, street::GATE_SIGMAS, rays.iter().copied());
+        let as_one =
+            |model: &Model<'_>| as_one(model, &lookout, &index, objects.clone(), vec![(0, 1)], &Progress::default());
+        assert_eq!(as_one(&model)?.iter().map(|one| one.votes.len()).collect::<Vec<_>>(), [20]);
+        // No object is worth its price.
+        model.classes[0].ln_clutter_per_sr = 40.0;
+        let left = as_one(&model)?;
+        assert_eq!(left.iter().map(|object| &object.votes).collect::<Vec<_>>(), [&objects[0].votes]);
         Ok(())
     }
 }

@@ -82,34 +82,20 @@ pub fn repair(
         anew(&Place { model, lookout, index, poses: &poses, rays: &rays }, &old, attempt, progress)
     };
     let solved: Vec<Option<Vec<Object>>> = places.par_iter().with_max_len(1).map(solve).collect::<Result<_, Halt>>()?;
-    let mut born = Vec::new();
+    // Leftovers at the edge of two neighborhoods may be wanted by both: the one that comes first has them, and the other stays as it was.
+    let (mut taken, mut born) = (FxHashSet::default(), Vec::new());
     for (place, new) in places.iter().zip(solved) {
         let Some(new) = new else { continue };
-        any = true;
-        for &i in place {
-            objects[i] = None;
+        let votes = || new.iter().flat_map(|object| &object.votes);
+        if votes().any(|ray| taken.contains(ray)) {
+            continue;
         }
+        any = true;
+        taken.extend(votes().copied());
+        place.iter().for_each(|&i| objects[i] = None);
         born.extend(new);
     }
-    // Leftovers at the edge of two neighborhoods may have been taken by both: the one that comes first has them.
-    let mut taken: FxHashSet<u32> = FxHashSet::default();
-    objects.iter().flatten().for_each(|object| taken.extend(&object.votes));
-    let mut kept: Vec<Object> = objects.into_iter().flatten().collect();
-    for object in born {
-        if object.votes.iter().all(|ray| !taken.contains(ray)) {
-            taken.extend(&object.votes);
-            kept.push(object);
-        } else {
-            let votes: Vec<u32> = object.votes.iter().copied().filter(|ray| !taken.contains(ray)).collect();
-            if votes.len() >= model.settings.min_votes as usize {
-                let again = crate::robust::energy::object(model, lookout, votes, object.fit.point, object.others);
-                if let Some(again) = again.filter(|again| again.energy < 0.0) {
-                    taken.extend(&again.votes);
-                    kept.push(again);
-                }
-            }
-        }
-    }
+    let mut kept: Vec<Object> = objects.into_iter().flatten().chain(born).collect();
     kept.sort_by_key(|object| object.votes[0]);
     Ok((kept, any))
 }
