@@ -331,6 +331,8 @@ mod tests {
     use crate::robust::energy::anywhere;
     use crate::robust::energy::seen::Seen;
     use crate::robust::energy::sides::{Said, marginalised};
+    use crate::robust::energy::unseen;
+    use crate::robust::noise::Noise;
     use crate::street;
 
     #[test]
@@ -350,5 +352,24 @@ mod tests {
         object.fit.shown =
             marginalised(1.0, &point, say).map(|(_, middle)| (Vector3::x(), middle)).into_iter().collect();
         assert!(gain_of_ray(&object) > 0.0);
+    }
+
+    #[test]
+    fn the_pose_of_an_image_is_told_by_the_votes_of_others_whoever_competes_in_it() {
+        let at = [Vector3::new(30.0, 4.0, 3.0), Vector3::new(34.0, -4.0, 4.0)];
+        let scene = street::street(8, 1.0, &at, &[[1.5, 0.5], [0.5, -1.0], [-2.0, 0.3]]);
+        let noise = Noise { position_drift_m: 0.2, ..street::NOISE };
+        let model = Model::new(&scene, &noise, &street::SETTINGS);
+        let votes = |i: usize| scene.usable_rays().into_iter().skip(i).step_by(2).collect();
+        let objects: Vec<Object> = (0..2).filter_map(|i| unseen(&model, votes(i), at[i])).collect();
+        let image = 3;
+        let mut others = objects.clone();
+        for object in &mut others {
+            object.votes.retain(|&ray| scene.rays.image[ray as usize] != image);
+        }
+        let [told, expected] = [&objects, &others].map(|all| Trajectories::of(&model, all).of_image(&model, image));
+        assert!((told.mean - expected.mean).norm() < 1e-9 && (told.covariance - expected.covariance).norm() < 1e-9);
+        let with_own = Trajectories { of_images: FxHashMap::default(), ..Trajectories::of(&model, &objects) };
+        assert!((with_own.of_image(&model, image).mean - expected.mean).norm() > 1e-6);
     }
 }

@@ -57,8 +57,6 @@ pub fn repair(
     let poses = Trajectories::of(model, &objects);
     let owner = owners(model.scene, &objects);
     let open = neighborhoods(model, &objects, &claims, &owner);
-    let mut any = false;
-    let mut objects: Vec<Option<Object>> = objects.into_iter().map(Some).collect();
     let mut is_free = vec![true; objects.len()];
     // Neighborhoods without common objects, side by side; an object has one chance per call.
     let mut places: Vec<Vec<usize>> = Vec::new();
@@ -72,7 +70,7 @@ pub fn repair(
     }
     let solve = |place: &Vec<usize>| {
         progress.check()?;
-        let old: Vec<&Object> = place.iter().filter_map(|&i| objects[i].as_ref()).collect();
+        let old: Vec<&Object> = place.iter().map(|&i| &objects[i]).collect();
         let mut rays: Vec<u32> = old.iter().flat_map(|object| object.votes.iter().copied()).collect();
         let leftover =
             place.iter().flat_map(|&i| &claims[i]).map(|claim| claim.ray).filter(|&ray| owner[ray as usize] == NOBODY);
@@ -82,8 +80,14 @@ pub fn repair(
         anew(&Place { model, lookout, index, poses: &poses, rays: &rays }, &old, attempt, progress)
     };
     let solved: Vec<Option<Vec<Object>>> = places.par_iter().with_max_len(1).map(solve).collect::<Result<_, Halt>>()?;
-    // Leftovers at the edge of two neighborhoods may be wanted by both: the one that comes first has them, and the other stays as it was.
-    let (mut taken, mut born) = (FxHashSet::default(), Vec::new());
+    Ok(taken_over(objects, &places, solved))
+}
+
+/// Objects with those of the places that became others; whether any did. Leftovers at the edge of two places may be wanted by both: the one that comes
+/// first has them, and the other stays as it was.
+fn taken_over(objects: Vec<Object>, places: &[Vec<usize>], solved: Vec<Option<Vec<Object>>>) -> (Vec<Object>, bool) {
+    let mut objects: Vec<Option<Object>> = objects.into_iter().map(Some).collect();
+    let (mut taken, mut born, mut any) = (FxHashSet::default(), Vec::new(), false);
     for (place, new) in places.iter().zip(solved) {
         let Some(new) = new else { continue };
         let votes = || new.iter().flat_map(|object| &object.votes);
@@ -97,7 +101,7 @@ pub fn repair(
     }
     let mut kept: Vec<Object> = objects.into_iter().flatten().chain(born).collect();
     kept.sort_by_key(|object| object.votes[0]);
-    Ok((kept, any))
+    (kept, any)
 }
 
 /// Other objects for the rays of some objects, with less J; nothing if there are none.
@@ -431,4 +435,27 @@ fn neighborhoods(model: &Model<'_>, objects: &[Object], claims: &[Vec<Claim>], o
 fn fits_badly(object: &Object) -> bool {
     let n = object.votes.len() as f64;
     object.fit.chi2.iter().sum::<f64>() > 2.0 * n + CHANCE_SIGMAS * 2.0 * n.sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::robust::energy::anywhere;
+    use crate::robust::energy::seen::Seen;
+
+    #[test]
+    fn of_two_places_that_want_one_leftover_the_second_stays_as_it_was() {
+        let with_votes = |votes: &[u32]| Object { votes: votes.to_vec(), ..anywhere(1, Seen::default(), -10.0) };
+        let begun = [[0, 1], [2, 3], [6, 7]].map(|votes| with_votes(&votes)).to_vec();
+        let (places, kept) = (vec![vec![0], vec![1], vec![2]], |objects: Vec<Object>| -> Vec<Vec<u32>> {
+            objects.into_iter().map(|object| object.votes).collect()
+        });
+        let solved = vec![Some(vec![with_votes(&[0, 1, 5])]), Some(vec![with_votes(&[2, 3, 5])]), None];
+        let (objects, any) = taken_over(begun.clone(), &places, solved);
+        assert!(any);
+        assert_eq!(kept(objects), [vec![0, 1, 5], vec![2, 3], vec![6, 7]]);
+        let (objects, any) = taken_over(begun.clone(), &places, vec![None, None, None]);
+        assert!(!any);
+        assert_eq!(kept(objects), kept(begun));
+    }
 }
