@@ -34,9 +34,8 @@ use finish::Finding;
 use learn::learn;
 use model::{Model, Rates};
 use noise::Noise;
-use noise::index::RayIndex;
 use scene::Scene;
-use search::{Depth, Tally, assign, few, search};
+use search::{Depth, Tally, few, search};
 use settings::Settings;
 
 /// The labels of a scene, and what became of the rest.
@@ -115,12 +114,8 @@ pub fn objects_of(
     }
     let lookout = Lookout::new(scene, settings.viability.max_range_m);
     let objects: Vec<Object> =
-        begun.into_iter().filter_map(|(votes, point)| object(&model, &lookout, votes, point, Vec::new())).collect();
+        begun.into_iter().filter_map(|(votes, point)| object(&model, &lookout, votes, point)).collect();
     learn(&mut model, &lookout, &rays, &objects);
-    let index = RayIndex::new(scene, &model.spreads, settings.gate_sigmas, rays.into_iter());
-    let claims = assign::claims_of_all(&model, &index, &objects, progress)?;
-    let again = |(o, claims): (Object, Vec<assign::Claim>)| {
-        object(&model, &lookout, o.votes, o.fit.point, assign::images_of(&claims))
-    };
-    Ok(objects.into_iter().zip(claims).filter_map(again).collect())
+    let again = |o: Object| object(&model, &lookout, o.votes, o.fit.point);
+    Ok(objects.into_iter().filter_map(again).collect())
 }

@@ -17,7 +17,6 @@ use crate::robust::noise::index::RayIndex;
 use crate::robust::objects_of;
 use crate::robust::scene::{Frustum, Scene};
 use crate::robust::search::Tally;
-use crate::robust::search::assign::{claims_of_all, images_of};
 use crate::robust::search::rearrange::{TriedPairs, rearrange_pairs};
 use crate::robust::search::repair::repair;
 use crate::robust::search::{Depth, search};
@@ -94,7 +93,7 @@ impl<'a> World<'a> {
         let mut model = Model::new(scene, &DRIFTING, &SETTINGS);
         let lookout = Lookout::new(scene, SETTINGS.viability.max_range_m);
         let of = |model: &Model<'_>, begun: &[Placed]| -> Vec<Object> {
-            let one = |(votes, point): &Placed| object_of(model, &lookout, votes.clone(), *point, Vec::new());
+            let one = |(votes, point): &Placed| object_of(model, &lookout, votes.clone(), *point);
             begun.iter().filter_map(one).collect()
         };
         let objects = of(&model, begun);
@@ -112,13 +111,6 @@ impl<'a> World<'a> {
         let mut tried = TriedPairs::default();
         let (index, progress) = (self.index(), Progress::default());
         rearrange_pairs(&self.model, &self.lookout, &index, self.objects.clone(), &mut tried, &progress).unwrap().0
-    }
-
-    /// What some votes are worth, with the images that may hide them.
-    fn one(&self, index: &RayIndex<'_>, votes: &[u32], start: Vector3<f64>) -> Option<Object> {
-        let object = object_of(&self.model, &self.lookout, votes.to_vec(), start, Vec::new())?;
-        let claims = claims_of_all(&self.model, index, std::slice::from_ref(&object), &Progress::default()).unwrap();
-        object_of(&self.model, &self.lookout, votes.to_vec(), start, images_of(&claims[0]))
     }
 }
 
@@ -167,7 +159,7 @@ proptest! {
         let lookout = Lookout::new(&scene, SETTINGS.viability.max_range_m);
         learn(&mut model, &lookout, &scene.usable_rays(), &found);
         for one in found {
-            let again = object_of(&model, &lookout, one.votes, one.fit.point, one.others).unwrap();
+            let again = object_of(&model, &lookout, one.votes, one.fit.point).unwrap();
             prop_assert!((again.energy - one.energy).abs() < 1e-6 * one.energy.abs(), "{} {}", again.energy, one.energy);
         }
     }
@@ -378,7 +370,7 @@ fn a_viewpoint_is_as_much_of_a_hit_as_the_share_of_its_images_that_see() {
     let model = Model::new(&scene, &NOISE, &SETTINGS);
     let hits = |every: usize| {
         let votes: Vec<u32> = scene.usable_rays().into_iter().step_by(every).collect();
-        let seen = Lookout::new(&scene, 60.0).looks(&model, &object, &votes, &[]);
+        let seen = Lookout::new(&scene, 60.0).looks(&model, &object, &votes);
         let sum = |of: fn(&Looks) -> f64| seen.sectors.iter().flatten().map(of).sum::<f64>();
         (sum(|looks| looks.hits), sum(|looks| looks.expected))
     };
@@ -468,14 +460,13 @@ proptest! {
         for begun in [truth, Vec::new()] {
             let found = searched(&scene, begun);
             let world = World::new(&scene, &placed(&found));
-            let index = world.index();
             // Of each image no ray, or one of both.
             let mut sets: Vec<(Vec<u32>, f64)> = Vec::new();
             for code in 0..81_u32 {
                 let choice = (0..4).map(|image| (image, code / 3_u32.pow(image) % 3));
                 let set: Vec<u32> = choice.filter(|(_, which)| *which > 0).map(|(image, which)| 2 * image + which - 1).collect();
                 if set.len() >= 3 {
-                    let of_starts = objects.iter().filter_map(|start| world.one(&index, &set, *start));
+                    let of_starts = objects.iter().filter_map(|start| object_of(&world.model, &world.lookout, set.clone(), *start));
                     let least = of_starts.map(|one| one.energy).fold(0.0, f64::min);
                     sets.push((set, least));
                 }
@@ -489,7 +480,7 @@ proptest! {
                     }
                 }
             }
-            let of_found: f64 = found.iter().map(|one| world.one(&index, &one.votes, one.fit.point).unwrap().energy).sum();
+            let of_found: f64 = found.iter().map(|one| object_of(&world.model, &world.lookout, one.votes.clone(), one.fit.point).unwrap().energy).sum();
             // A fit ends within a fraction of its sigmas.
             prop_assert!((of_found - least).abs() < 0.05, "{of_found} {least}");
         }

@@ -160,7 +160,7 @@ proptest! {
         let model = Model::new(&scene, &DRIFTING, &SETTINGS);
         let lookout = Lookout::new(&scene, 60.0);
         let labels = [(of_object, object), (of_twin, twin)]
-            .map(|(votes, point)| object_of(&model, &lookout, votes, point, Vec::new()).unwrap());
+            .map(|(votes, point)| object_of(&model, &lookout, votes, point).unwrap());
         let starts = labels.iter().map(|label| Start { voters: &label.votes, weights: &[], point: label.fit.point });
         let solution = Joint::new(&scene, &DRIFTING, starts, Care::Exact).solve().unwrap();
         let contested = Contest::new(&model, &labels).contested(&solution);

@@ -116,9 +116,9 @@ mod tests {
             chi2: Vec::new(),
             shown: Vec::new(),
         };
-        let (ln_size, others, seen) = (f64::NAN, Vec::new(), Seen::default());
+        let (ln_size, seen) = (f64::NAN, Seen::default());
         let votes = (first..first + count).collect();
-        Object { class: 0, votes, fit, ln_size, others, seen, real: 1.0, energy: -100.0 }
+        Object { class: 0, votes, fit, ln_size, seen, real: 1.0, energy: -100.0 }
     }
 
     #[test]

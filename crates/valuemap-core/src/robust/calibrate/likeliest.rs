@@ -462,7 +462,7 @@ mod tests {
             let mut model = Model::new(scene, &street::NOISE, &street::SETTINGS);
             let lookout = Lookout::new(scene, street::VIABILITY.max_range_m);
             let place = |model: &Model<'_>| -> Vec<Object> {
-                map.iter().filter_map(|(votes, at)| object(model, &lookout, votes.clone(), *at, Vec::new())).collect()
+                map.iter().filter_map(|(votes, at)| object(model, &lookout, votes.clone(), *at)).collect()
             };
             let objects = place(&model);
             learn(&mut model, &lookout, &rays, &objects);

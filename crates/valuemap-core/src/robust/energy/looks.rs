@@ -23,8 +23,6 @@ const CUBE_SHARE: f64 = 1.0 / 6.0;
 /// Half of the angle of a sector (cosine of 15 degrees): housings and faces are detected about so much farther to the side than
 /// the farthest vote, and no more is known.
 pub(crate) const SECTOR_COSINE: f64 = 0.966;
-/// A look at a point where another detection is counts so much: hidden as often as not.
-const HIDDEN_LOOK: f64 = 0.5;
 
 /// All images by place.
 pub struct Lookout {
@@ -68,7 +66,7 @@ impl Lookout {
     /// The looks at a point that some rays (one per image, ascending) vote for, from as near and as far as their class is detected; `others` are
     /// images (ascending) with a detection in its gate.
     #[must_use]
-    pub fn looks(&self, model: &Model<'_>, point: &Vector3<f64>, voters: &[u32], others: &[u32]) -> Seen {
+    pub fn looks(&self, model: &Model<'_>, point: &Vector3<f64>, voters: &[u32]) -> Seen {
         let Some(class) = model.class_of_votes(voters) else { return Seen::default() };
         // Before anything is learned, objects are seen from between their nearest and their farthest vote.
         let distances_m =
@@ -90,9 +88,8 @@ impl Lookout {
         let seen_from = Directions::of(scene, point, voters);
         for (image, sector) in self.looking(scene, point, &sectors) {
             if hits.binary_search(&image).is_err() {
-                let hidden = if others.binary_search(&image).is_ok() { HIDDEN_LOOK } else { 1.0 };
                 let view = &scene.views[image as usize];
-                let weight = hidden * rate(class, &seen_from, view, point);
+                let weight = rate(class, &seen_from, view, point);
                 looks.push(Look { sector, image, weight, hit: None });
             }
         }
@@ -299,7 +296,7 @@ mod tests {
         let scene = street::joined(vec![Scene { views, ..standing }, driving]);
         let model = Model::new(&scene, &street::NOISE, settings);
         let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
-        let energy = |votes: Vec<u32>| object(&model, &lookout, votes, at, Vec::new()).map_or(f64::NAN, |o| o.energy);
+        let energy = |votes: Vec<u32>| object(&model, &lookout, votes, at).map_or(f64::NAN, |o| o.energy);
         let is_first =
             |ray: &u32| if *ray < 160 { errors[*ray as usize % errors.len()][0] > 0.0 } else { ray.is_multiple_of(2) };
         let (first, second) = scene.usable_rays().iter().partition(|ray| is_first(ray));
@@ -326,7 +323,7 @@ mod tests {
             (model.classes[0].is_learned, model.classes[0].farthest_m) = (true, 60.0);
             let rates = std::array::from_fn(|bin| if bin < BINS / 2 { 1.0 } else { rate });
             model.classes[0].reach = Steps::even(60.0, rates);
-            Lookout::new(&scene, street::VIABILITY.max_range_m).looks(&model, &at, votes, &[]).ln_which
+            Lookout::new(&scene, street::VIABILITY.max_range_m).looks(&model, &at, votes).ln_which
         };
         let price = |votes: &[u32], settings: &Settings| {
             ln_which(votes, 1.0, &street::SETTINGS) - ln_which(votes, 0.1, settings)
@@ -347,7 +344,7 @@ mod tests {
         (model.classes[0].is_learned, model.classes[0].farthest_m) = (true, 30.0);
         let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
         let looks = |votes: &[u32]| {
-            let passes = lookout.looks(&model, &at, votes, &[]).sectors.concat();
+            let passes = lookout.looks(&model, &at, votes).sectors.concat();
             let sum = |of: fn(&Looks) -> f64| passes.iter().map(of).sum::<f64>();
             (sum(|looks| looks.hits), sum(|looks| looks.expected))
         };

@@ -68,8 +68,6 @@ pub struct Object {
     pub fit: Fit,
     /// Logarithm of its physical size, m; not a number if its boxes do not tell.
     pub ln_size: f64,
-    /// Images, ascending, with a detection in its gate: those that are no votes may hide it.
-    pub others: Vec<u32>,
     /// The looks at it.
     pub seen: Seen,
     /// Probability that it is real rather than false, if it is anything.
@@ -455,30 +453,18 @@ pub(crate) fn usual_size(model: &Model<'_>, votes: &[u32], implied: impl Iterato
     (median * of_votes + mean * of_class) / (of_votes + of_class)
 }
 
-/// An object with some votes (ascending), and what it is worth; `others` are images (ascending) with detections in its gate.
+/// An object with some votes (ascending), and what it is worth.
 ///
 /// Nothing if it has no position.
 #[must_use]
-pub fn object(
-    model: &Model<'_>,
-    lookout: &Lookout,
-    votes: Vec<u32>,
-    start: Vector3<f64>,
-    others: Vec<u32>,
-) -> Option<Object> {
-    unseen(model, votes, start)?.with_looks(model, lookout, others)
+pub fn object(model: &Model<'_>, lookout: &Lookout, votes: Vec<u32>, start: Vector3<f64>) -> Option<Object> {
+    unseen(model, votes, start)?.with_looks(model, lookout)
 }
 
 /// An object with those of some votes (ascending) that fit it, all together; nothing if too few do.
 #[must_use]
-pub fn fitting(
-    model: &Model<'_>,
-    lookout: &Lookout,
-    votes: Vec<u32>,
-    start: Vector3<f64>,
-    others: Vec<u32>,
-) -> Option<Object> {
-    fitting_unseen(model, votes, start)?.with_looks(model, lookout, others)
+pub fn fitting(model: &Model<'_>, lookout: &Lookout, votes: Vec<u32>, start: Vector3<f64>) -> Option<Object> {
+    fitting_unseen(model, votes, start)?.with_looks(model, lookout)
 }
 
 /// The same before it is asked who should have seen it.
@@ -503,7 +489,7 @@ pub fn unseen(model: &Model<'_>, votes: Vec<u32>, start: Vector3<f64>) -> Option
     let class = model.likeliest_class(&votes)?;
     let fit = fit(model, &votes, start)?;
     let (energy, ln_size) = energy_of_votes(model, class, &votes, &fit);
-    Some(Object { class, votes, fit, ln_size, others: Vec::new(), seen: Seen::default(), real: 1.0, energy })
+    Some(Object { class, votes, fit, ln_size, seen: Seen::default(), real: 1.0, energy })
 }
 
 /// J of an object but for the looks at it, equations (1) to (4), of which it is not less; and the logarithm of its size, m.
@@ -558,18 +544,17 @@ impl Object {
         self.votes.iter().any(|ray| images.binary_search(&image(ray)).is_ok())
     }
 
-    /// One that was [`unseen`], with the looks at it; `others` are images (ascending) with detections in its gate.
+    /// One that was [`unseen`], with the looks at it.
     #[must_use]
-    pub fn with_looks(mut self, model: &Model<'_>, lookout: &Lookout, others: Vec<u32>) -> Option<Self> {
+    pub fn with_looks(mut self, model: &Model<'_>, lookout: &Lookout) -> Option<Self> {
         if !model.settings.has(Part::Looks) {
-            return Some(Self { others, ..self });
+            return Some(self);
         }
         let class = &model.classes[self.class as usize];
-        self.seen = lookout.looks(model, &self.fit.point, &self.votes, &others);
+        self.seen = lookout.looks(model, &self.fit.point, &self.votes);
         let judged = self.seen.judged(&Shares::of(class));
         self.energy -= 2.0 * judged.ln_likelihood();
         self.real = judged.real();
-        self.others = others;
         self.energy.is_finite().then_some(self)
     }
 
@@ -585,14 +570,5 @@ impl Object {
 pub(crate) fn anywhere(votes: usize, seen: Seen, energy: f64) -> Object {
     let (chi2, shown) = (vec![1.0; votes], Vec::new());
     let fit = Fit { point: Vector3::zeros(), covariance: Matrix3::identity(), energy: 0.0, chi2, shown };
-    Object {
-        class: 0,
-        votes: (0..votes as u32).collect(),
-        fit,
-        ln_size: 0.0,
-        others: Vec::new(),
-        seen,
-        real: 1.0,
-        energy,
-    }
+    Object { class: 0, votes: (0..votes as u32).collect(), fit, ln_size: 0.0, seen, real: 1.0, energy }
 }

@@ -130,7 +130,7 @@ mod tests {
         assert_eq!(votes.len(), 18);
         let model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
         let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
-        let found: Vec<Object> = object(&model, &lookout, votes.clone(), point, Vec::new()).into_iter().collect();
+        let found: Vec<Object> = object(&model, &lookout, votes.clone(), point).into_iter().collect();
         assert_eq!(found.len(), 1);
         let alike = Noise { look_correlation: 0.8, ..street::NOISE };
         let times = variance_of_alike(6, 0.8);
@@ -158,7 +158,7 @@ mod tests {
             let rays = scene.usable_rays();
             let of = |i: usize| rays.iter().copied().skip(i).step_by(objects.len());
             let seen_by = |i: usize, pass: u32| of(i).filter(|&ray| scene.view(ray).pass == pass).collect();
-            let object = |votes, point| object(&model, &lookout, votes, point, Vec::new());
+            let object = |votes, point| object(&model, &lookout, votes, point);
             let drives = |i: usize| [object(seen_by(i, 0), objects[i]), object(seen_by(i, 1), objects[i] + off)];
             let of_drives = (0..twice).flat_map(drives);
             let found = of_drives.chain((twice..8).map(|i| object(of(i).collect(), objects[i] + 0.5 * off)));
@@ -189,8 +189,7 @@ mod tests {
         let mut model = Model::new(&scene, &noise, &street::SETTINGS);
         let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
         let votes = |i: usize| scene.usable_rays().into_iter().skip(i).step_by(objects.len()).collect();
-        let found: Vec<Object> =
-            (0..10).filter_map(|i| object(&model, &lookout, votes(i), objects[i], Vec::new())).collect();
+        let found: Vec<Object> = (0..10).filter_map(|i| object(&model, &lookout, votes(i), objects[i])).collect();
         assert_eq!(found.len(), objects.len());
         let without = estimates_of(&model, &noise, &found);
         let heights: Vec<f64> = (0..60).map(|i| 3.0 + 0.01 * f64::from(i % 5 - 2)).collect();

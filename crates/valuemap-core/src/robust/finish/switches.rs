@@ -124,7 +124,7 @@ mod tests {
                 is_vote(number(*ray), scene.rays.image[*ray as usize] - first_of_pass(pass), pass)
             };
             let votes: Vec<u32> = (0..scene.rays.rays.len() as u32).filter(of).collect();
-            object(&model, &lookout, votes, SIGN.into(), Vec::new())
+            object(&model, &lookout, votes, SIGN.into())
         };
         let [Some(whole), Some(mut part)] = votes.map(begun) else { return Vec::new() };
         part.fit.point += Vector3::new(1.5, 1.0, 0.3);

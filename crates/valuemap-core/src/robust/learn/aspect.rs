@@ -52,7 +52,7 @@ mod tests {
         assert!(of(3, 16)[0] > WIDEST_RAD && of(3, 4)[1] > WIDEST_RAD);
         assert!(of(14, 4)[0] > of(8, 4)[0] && of(14, 4)[0] > 4.0 * next_rad);
         let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
-        let object = crate::robust::energy::object(&model, &lookout, votes, at, Vec::new());
+        let object = crate::robust::energy::object(&model, &lookout, votes, at);
         let learned =
             object.map_or(Aspect::ONE, |object| aspect(&model, &looked_at(&model, &lookout, &[&object], 50.0)));
         let falls = |shares: &[f64; BINS]| shares.iter().any(|share| *share < 0.9);

@@ -286,7 +286,7 @@ mod tests {
             let toward = |ray: u32| (all[i] - scene.ray(ray).center).normalize();
             let of_object = rays.iter().copied().filter(|&ray| (scene.ray(ray).direction - toward(ray)).norm() < 1e-6);
             let votes = of_object.step_by(if i.is_multiple_of(2) { 1 } else { 7 }).collect();
-            Some(Object { real: 1.0, ..object(&model, &lookout, votes, all[i], Vec::new())? })
+            Some(Object { real: 1.0, ..object(&model, &lookout, votes, all[i])? })
         };
         let objects: Vec<Object> = (0..all.len()).filter_map(of).collect();
         assert!(objects.iter().filter(|object| is_sure(object)).count() == all.len());
@@ -304,8 +304,7 @@ mod tests {
         let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
         let rays = scene.usable_rays();
         let votes = |i: usize| rays.iter().copied().skip(i).step_by(all.len()).collect();
-        let objects: Vec<Object> =
-            (0..all.len()).filter_map(|i| object(&model, &lookout, votes(i), all[i], Vec::new())).collect();
+        let objects: Vec<Object> = (0..all.len()).filter_map(|i| object(&model, &lookout, votes(i), all[i])).collect();
         let by_itself = {
             let evidence = Evidence::new(&model, &lookout, &rays, &objects);
             evidence.learned(&objects.iter().collect::<Vec<_>>(), &rays, &model.classes[0])
@@ -328,14 +327,14 @@ mod tests {
         let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
         let votes = |i: usize| rays.iter().copied().skip(i).step_by(all.len()).collect();
         for _ in 0..2 {
-            let found = (0..all.len()).filter_map(|i| object(&model, &lookout, votes(i), all[i], Vec::new()));
+            let found = (0..all.len()).filter_map(|i| object(&model, &lookout, votes(i), all[i]));
             let objects: Vec<Object> = found.map(|object| Object { real: 1.0, ..object }).collect();
             learn(&mut model, &lookout, &rays, &objects);
             assert!(model.pooled.is_learned && !model.classes[1].is_learned);
             assert_eq!(model.classes[1].rates, model.pooled.rates);
             assert_eq!(model.classes[1].company, Steps::NONE);
             // It is seen from as far as others are.
-            let seen = lookout.looks(&model, &all[7], &votes(7), &[]);
+            let seen = lookout.looks(&model, &all[7], &votes(7));
             assert!(seen.sectors.concat().iter().any(|looks| looks.expected > 0.0));
         }
     }

@@ -167,7 +167,7 @@ mod tests {
                 let ray = model.scene.ray(*ray);
                 (ray.direction - (at - ray.center).normalize()).norm() * street::FOCAL_PX < 2.0
             };
-            object(model, lookout, rays.iter().copied().filter(near).collect(), *at, Vec::new())
+            object(model, lookout, rays.iter().copied().filter(near).collect(), *at)
         };
         let objects: Vec<Object> = objects_m().iter().filter_map(of).collect();
         let is_free = |ray: &u32| !objects.iter().any(|object| object.votes.contains(ray));

@@ -155,7 +155,7 @@ mod tests {
         // The first images of the first pass have votes, the last are 20 degrees aside.
         let votes = scene.usable_rays()[..8].to_vec();
         let expected = |model: &Model<'_>| {
-            let seen = lookout.looks(model, &at, &votes, &[]);
+            let seen = lookout.looks(model, &at, &votes);
             let of_pass = |pass: usize| seen.sectors[0].get(pass).map_or(0.0, |looks| looks.expected);
             [of_pass(0), of_pass(1)]
         };

@@ -82,16 +82,7 @@ pub fn assign_among(
     for votes in &mut votes {
         votes.sort_unstable();
     }
-    commit(model, lookout, objects, &votes, &claims, progress)
-}
-
-/// The images (ascending) with a claim of an object.
-#[must_use]
-pub fn images_of(claims: &[Claim]) -> Vec<u32> {
-    let mut images: Vec<u32> = claims.iter().map(|claim| claim.image).collect();
-    images.sort_unstable();
-    images.dedup();
-    images
+    commit(model, lookout, objects, &votes, progress)
 }
 
 /// Take over what lowers J.
@@ -100,7 +91,6 @@ fn commit(
     lookout: &Lookout,
     objects: Vec<Object>,
     votes: &[Vec<u32>],
-    claims: &[Vec<Claim>],
     progress: &Progress,
 ) -> Result<(Vec<Object>, bool), Halt> {
     let min_votes = model.settings.min_votes as usize;
@@ -112,7 +102,7 @@ fn commit(
         if votes.len() < min_votes {
             return Ok(Change::Death);
         }
-        let moved = fitting(model, lookout, votes.clone(), objects[i].fit.point, images_of(&claims[i]));
+        let moved = fitting(model, lookout, votes.clone(), objects[i].fit.point);
         Ok(moved.filter(|moved| moved.energy < 0.0).map_or(Change::Death, |moved| Change::To(Box::new(moved))))
     };
     let changes: Vec<Change> = votes.par_iter().enumerate().map(changed).collect::<Result<_, Halt>>()?;

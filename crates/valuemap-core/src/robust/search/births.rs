@@ -90,9 +90,8 @@ impl Nursery<'_> {
         let mut ln_size = sizes.iter().sum::<f64>() / sizes.len() as f64;
         let mut point = start;
         let mut votes: Vec<u32> = Vec::new();
-        let mut hits = Vec::new();
         for _ in 0..MAX_ROUNDS {
-            hits = index.all_hits(&point, class, range_m);
+            let hits = index.all_hits(&point, class, range_m);
             let again = best_votes(model, class, &hits, &point, ln_size, may_vote);
             if again.len() < min_votes {
                 return None;
@@ -104,10 +103,8 @@ impl Nursery<'_> {
             point = quick_estimate(model.scene, &model.spreads, &votes, point)?;
             ln_size = size_of(model, &votes, &point);
         }
-        let mut others: Vec<u32> = hits.iter().map(|hit| hit.image).collect();
-        others.sort_unstable();
         // Votes that do not fit once the drift of their visit is known are clutter's.
-        let found = fitting(model, lookout, votes, point, others)?;
+        let found = fitting(model, lookout, votes, point)?;
         (found.energy < 0.0).then_some(found)
     }
 }

@@ -151,12 +151,12 @@ impl Nursery<'_> {
     /// The object that one of a ray alone becomes with the other votes that it may have, with those who should have seen it.
     fn joined(&self, alone: Object, ray: u32, mut votes: Vec<u32>, may_vote: &dyn Fn(u32) -> bool) -> Option<Object> {
         let model = self.model;
-        let mut best = alone.with_looks(model, self.lookout, Vec::new())?;
+        let mut best = alone.with_looks(model, self.lookout)?;
         for _ in 0..ROUNDS {
             if votes == best.votes {
                 break;
             }
-            match object(model, self.lookout, votes, best.fit.point, Vec::new()) {
+            match object(model, self.lookout, votes, best.fit.point) {
                 Some(more) if more.energy < best.energy => best = more,
                 _ => break,
             }
@@ -172,7 +172,7 @@ impl Nursery<'_> {
         if at_most <= LEAST_LN_ODDS {
             return false;
         }
-        let seen = self.lookout.looks(self.model, &alone.fit.point, votes, &[]);
+        let seen = self.lookout.looks(self.model, &alone.fit.point, votes);
         let judged = seen.judged(&Shares::of(class));
         at_most + judged.ln_likelihood() > LEAST_LN_ODDS && judged.real().ln() > LEAST_LN_ODDS
     }

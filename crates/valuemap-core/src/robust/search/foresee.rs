@@ -26,8 +26,6 @@ pub(crate) struct Foresight<'a> {
     model: &'a Model<'a>,
     lookout: &'a Lookout,
     of: [&'a Object; 2],
-    /// Images, ascending, with a detection in the gate of each.
-    others: [Vec<u32>; 2],
     /// Whether they are of many visits.
     stays: [bool; 2],
     /// What the votes of a visit say where each of the two is, and where each of its sides shows its middle.
@@ -36,15 +34,10 @@ pub(crate) struct Foresight<'a> {
 
 impl<'a> Foresight<'a> {
     /// Nothing if both are of few visits.
-    pub(crate) fn new(
-        model: &'a Model<'a>,
-        lookout: &'a Lookout,
-        of: [&'a Object; 2],
-        others: [Vec<u32>; 2],
-    ) -> Option<Self> {
+    pub(crate) fn new(model: &'a Model<'a>, lookout: &'a Lookout, of: [&'a Object; 2]) -> Option<Self> {
         let stays = of.map(|object| visits(model.scene, &object.votes).count() > FEW_VISITS);
         let known = of.map(|object| (0..=object.fit.shown.len()).map(|_| FxHashMap::default()).collect());
-        stays.contains(&true).then_some(Self { model, lookout, of, others, stays, known })
+        stays.contains(&true).then_some(Self { model, lookout, of, stays, known })
     }
 
     /// Whether J may fall with other votes (ascending). What is foreseen is wrong where a vote turns out to fit, or not to: by what is known of any vote.
@@ -54,9 +47,8 @@ impl<'a> Foresight<'a> {
         let energy = |both: &[Object]| both.iter().map(|object| object.energy).sum::<f64>();
         // J is not less than that of an object before it is asked who should have seen it.
         let Some(both) = self.unseen(votes).filter(|both| energy(both) < most) else { return false };
-        let seen = both.into_iter().zip(&self.others);
         let seen: Option<Vec<Object>> =
-            seen.map(|(object, others)| object.with_looks(self.model, self.lookout, others.clone())).collect();
+            both.into_iter().map(|object| object.with_looks(self.model, self.lookout)).collect();
         seen.is_some_and(|both| energy(&both) < most)
     }
 
@@ -95,7 +87,7 @@ impl<'a> Foresight<'a> {
         let energy = terms.energy + step.dot(&terms.gradient) + ln_information;
         let fit = Fit { point: from + step, covariance: cholesky.inverse(), energy, chi2: terms.chi2, shown };
         let (energy, ln_size) = energy_of_votes(model, class, &votes, &fit);
-        Some(Object { class, votes, fit, ln_size, others: Vec::new(), seen: Seen::default(), real: 1.0, energy })
+        Some(Object { class, votes, fit, ln_size, seen: Seen::default(), real: 1.0, energy })
     }
 
     /// What some votes say where one of the two is, and what its sides show then.
@@ -184,7 +176,7 @@ mod tests {
                 rays.iter().copied().enumerate().filter(of).map(|(_, ray)| ray).collect()
             };
             let map = |model: &Model<'_>, is_exchanged: bool| -> Vec<Object> {
-                (0..2).filter_map(|i| object(model, &lookout, votes(i, is_exchanged), both[i], Vec::new())).collect()
+                (0..2).filter_map(|i| object(model, &lookout, votes(i, is_exchanged), both[i])).collect()
             };
             let begun = map(&model, false);
             learn(&mut model, &lookout, &rays, &begun);
@@ -192,7 +184,7 @@ mod tests {
                 let objects = map(&model, !is_right);
                 let of = [&objects[0], &objects[1]];
                 let after = [0, 1].map(|one| votes(one, is_right));
-                let foresight = &mut Foresight::new(&model, &lookout, of, [Vec::new(), Vec::new()]);
+                let foresight = &mut Foresight::new(&model, &lookout, of);
                 let Some(foresight) = foresight else { unreachable!("both are of many visits") };
                 let from = || after.iter().zip(of).map(|(votes, from)| (votes.clone(), from.fit.point));
                 let energy = |both: Vec<Object>| {
@@ -205,9 +197,8 @@ mod tests {
                     (foreseen - fitted).abs() < 0.05 * fitted.abs(),
                     "{apart_m} m, {side_m} m: {foreseen} {fitted}"
                 );
-                let ends_at = energy(
-                    from().filter_map(|(votes, point)| fitting(&model, &lookout, votes, point, Vec::new())).collect(),
-                );
+                let ends_at =
+                    energy(from().filter_map(|(votes, point)| fitting(&model, &lookout, votes, point)).collect());
                 let before = of[0].energy + of[1].energy;
                 let may = foresight.may_help(&after);
                 assert!(may || ends_at >= before, "{apart_m} m: J falls from {before} to {ends_at}");
@@ -225,9 +216,8 @@ mod tests {
             let model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
             let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
             let votes = |i: usize| scene.usable_rays().into_iter().skip(i).step_by(2).collect();
-            let objects: Vec<Object> =
-                (0..2).filter_map(|i| object(&model, &lookout, votes(i), both[i], Vec::new())).collect();
-            let foresight = Foresight::new(&model, &lookout, [&objects[0], &objects[1]], [Vec::new(), Vec::new()]);
+            let objects: Vec<Object> = (0..2).filter_map(|i| object(&model, &lookout, votes(i), both[i])).collect();
+            let foresight = Foresight::new(&model, &lookout, [&objects[0], &objects[1]]);
             assert_eq!(foresight.is_some(), is_foreseen);
         }
     }

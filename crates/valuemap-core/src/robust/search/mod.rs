@@ -99,7 +99,7 @@ pub fn search(
     let index = RayIndex::new(model.scene, &spreads, model.settings.gate_sigmas, rays.iter().copied());
     // Who should have seen objects tells what classes are like; of each it is asked below.
     let begin = |(votes, point): Placed| {
-        if learns { object(model, &lookout, votes, point, Vec::new()) } else { unseen(model, votes, point) }
+        if learns { object(model, &lookout, votes, point) } else { unseen(model, votes, point) }
     };
     let mut objects: Vec<Object> = begun.into_par_iter().filter_map(begin).collect();
     let mut tried = TriedPairs::default();
@@ -112,7 +112,7 @@ pub fn search(
             model.ln_tails = of_rays(model, &lookout, rays, &objects);
         }
         let model: &Model<'_> = model;
-        let again = |o: Object| object(model, &lookout, o.votes, o.fit.point, o.others);
+        let again = |o: Object| object(model, &lookout, o.votes, o.fit.point);
         objects = objects.into_par_iter().filter_map(again).filter(|object| object.energy < 0.0).collect();
         let before = objects.len();
         let has = |part: Part| model.settings.has(part);

@@ -9,7 +9,7 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
-use super::assign::{Claim, claims_of_all, gain_alone, images_of};
+use super::assign::{Claim, claims_of_all, gain_alone};
 use super::foresee::Foresight;
 use super::repair::MOST_VISITS;
 use crate::progress::{Halt, Progress};
@@ -205,14 +205,12 @@ struct Pair<'a> {
     of: [&'a Object; 2],
     /// The rays that each may have.
     gates: [FxHashSet<u32>; 2],
-    /// The images of these, ascending.
-    others: [Vec<u32>; 2],
 }
 
 impl<'a> Pair<'a> {
     fn new(model: &'a Model<'a>, lookout: &'a Lookout, of: [&'a Object; 2], claims: [&[Claim]; 2]) -> Self {
         let gates = claims.map(|claims| claims.iter().map(|claim| claim.ray).collect());
-        Self { model, lookout, of, gates, others: claims.map(images_of) }
+        Self { model, lookout, of, gates }
     }
 
     /// Both as one, if that lowers J; else the exchange that lowers it most. And by how much.
@@ -226,7 +224,7 @@ impl<'a> Pair<'a> {
         if let Some(merged) = merged.and_then(|object| better(vec![object])) {
             return Some(merged);
         }
-        let mut foresight = Foresight::new(self.model, self.lookout, self.of, self.others.clone());
+        let mut foresight = Foresight::new(self.model, self.lookout, self.of);
         let (parts, near) = self.parts();
         let (mut found, mut helpful) = (Vec::new(), Vec::new());
         for part in &parts {
@@ -274,10 +272,7 @@ impl<'a> Pair<'a> {
         votes.dedup_by_key(|vote| vote.0);
         let mut votes: Vec<u32> = votes.into_iter().map(|vote| vote.2).collect();
         votes.sort_unstable();
-        let mut others = self.others.concat();
-        others.sort_unstable();
-        others.dedup();
-        object(self.model, self.lookout, votes, larger.fit.point, others)
+        object(self.model, self.lookout, votes, larger.fit.point)
     }
 
     /// Images, ascending, whose votes may be exchanged together: those of a visit, and those that look from one side; all of them, and those that show
@@ -369,9 +364,8 @@ impl<'a> Pair<'a> {
         // J is not less than that of an object before it is asked who should have seen it.
         let unseen = self.unseen_with_votes(votes, from);
         let unseen = unseen.filter(|both| both.iter().map(|object| object.energy).sum::<f64>() < most)?;
-        let with_looks =
-            |(object, others): (Object, &Vec<u32>)| object.with_looks(self.model, self.lookout, others.clone());
-        let found: Vec<Object> = unseen.into_iter().zip(&self.others).map(with_looks).collect::<Option<_>>()?;
+        let with_looks = |object: Object| object.with_looks(self.model, self.lookout);
+        let found: Vec<Object> = unseen.into_iter().map(with_looks).collect::<Option<_>>()?;
         found.iter().all(|object| object.energy < 0.0).then_some(found)
     }
 
@@ -447,7 +441,7 @@ mod tests {
             |rays: &[u32], first: usize| -> Vec<u32> { rays.iter().copied().skip(first).step_by(2).collect() };
         let votes = |i: usize| [every_other(&of_both, i), every_other(&of_one, i)].concat();
         let of = |model: &Model<'_>| -> Vec<Object> {
-            (0..2).filter_map(|i| object(model, &lookout, votes(i), both[i], Vec::new())).collect()
+            (0..2).filter_map(|i| object(model, &lookout, votes(i), both[i])).collect()
         };
         let begun = of(&model);
         crate::robust::learn::learn(&mut model, &lookout, &rays, &begun);
@@ -481,7 +475,7 @@ mod tests {
                 .collect()
         };
         let of = |model: &Model<'_>| -> Vec<Object> {
-            (0..2).filter_map(|i| object(model, &lookout, swapped(i), both[i], Vec::new())).collect()
+            (0..2).filter_map(|i| object(model, &lookout, swapped(i), both[i])).collect()
         };
         let begun = of(&model);
         crate::robust::learn::learn(&mut model, &lookout, &rays, &begun);
@@ -504,8 +498,7 @@ mod tests {
         let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
         let rays = scene.usable_rays();
         let votes = |i: usize| rays.iter().copied().skip(i).step_by(2).collect();
-        let objects: Vec<Object> =
-            (0..2).filter_map(|i| object(&model, &lookout, votes(i), both[i], Vec::new())).collect();
+        let objects: Vec<Object> = (0..2).filter_map(|i| object(&model, &lookout, votes(i), both[i])).collect();
         let index = RayIndex::new(&scene, &model.spreads, street::GATE_SIGMAS, rays.iter().copied());
         let claims = claims_of_all(&model, &index, &objects, &Progress::default())?;
         let pair = Pair::new(&model, &lookout, [&objects[0], &objects[1]], [&claims[0], &claims[1]]);
@@ -532,7 +525,7 @@ mod tests {
             let rays = scene.usable_rays();
             let of = |model: &Model<'_>| -> Vec<Object> {
                 let votes = |i: usize| rays.iter().copied().skip(i).step_by(2).collect();
-                (0..2).filter_map(|i| object(model, &lookout, votes(i), both[i], Vec::new())).collect()
+                (0..2).filter_map(|i| object(model, &lookout, votes(i), both[i])).collect()
             };
             let begun = of(&model);
             crate::robust::learn::learn(&mut model, &lookout, &rays, &begun);
@@ -547,7 +540,7 @@ mod tests {
             let [_, other] = visit(&objects[1].votes);
             let mut votes = [kept.clone(), other.clone()].concat();
             votes.sort_unstable();
-            let after = object(&model, &lookout, votes, first, Vec::new());
+            let after = object(&model, &lookout, votes, first);
             let limit = street::GATE_SIGMAS.powi(2);
             let is_kept = after.is_some_and(|after| after.fit.chi2.iter().all(|chi2| *chi2 <= limit));
             let may = pair.barred(0, &kept, &other).count() == 0;
@@ -571,7 +564,7 @@ mod tests {
         // One image shows the second alone.
         let of_first = rays.iter().copied().step_by(2).enumerate().filter(|(image, _)| *image != 3).map(|(_, ray)| ray);
         let votes: [Vec<u32>; 2] = [of_first.collect(), rays.iter().copied().skip(1).step_by(2).take(6).collect()];
-        let of = |(votes, at): (Vec<u32>, &Vector3<f64>)| object(&model, &lookout, votes, *at, Vec::new());
+        let of = |(votes, at): (Vec<u32>, &Vector3<f64>)| object(&model, &lookout, votes, *at);
         let objects: Vec<Object> = votes.into_iter().zip(&both).filter_map(of).collect();
         let index = RayIndex::new(&scene, &model.spreads, street::GATE_SIGMAS, rays.iter().copied());
         let as_one =

@@ -125,7 +125,7 @@ impl Garden<'_> {
         if born.votes.len() + taken.len() < model.settings.min_votes as usize || is_in_vain(&born) {
             return None;
         }
-        let mut born = born.with_looks(model, lookout, Vec::new()).filter(|born| !is_in_vain(born))?;
+        let mut born = born.with_looks(model, lookout).filter(|born| !is_in_vain(born))?;
         let mut birth = Vec::new();
         let mut change = born.energy;
         for (vote, _) in taken {
@@ -136,7 +136,7 @@ impl Garden<'_> {
             let mut votes = born.votes.clone();
             votes.push(vote);
             votes.sort_unstable();
-            let Some(more) = object(model, lookout, votes, born.fit.point, Vec::new()) else { continue };
+            let Some(more) = object(model, lookout, votes, born.fit.point) else { continue };
             let (left, lost) = self.without(other, vote);
             if more.energy - born.energy + lost < -LEAST_GAIN_OF_MOVE {
                 change += more.energy - born.energy + lost;
@@ -177,8 +177,7 @@ impl Garden<'_> {
         let old = &self.objects[other];
         let votes: Vec<u32> = old.votes.iter().copied().filter(|&ray| ray != vote).collect();
         let is_enough = votes.len() >= self.model.settings.min_votes as usize;
-        let left =
-            is_enough.then(|| object(self.model, self.lookout, votes, old.fit.point, old.others.clone())).flatten();
+        let left = is_enough.then(|| object(self.model, self.lookout, votes, old.fit.point)).flatten();
         let left = left.filter(|left| left.energy < 0.0);
         let energy = left.as_ref().map_or(0.0, |left| left.energy);
         (left, energy - old.energy)
@@ -216,7 +215,7 @@ mod tests {
             let scene = street::joined((0..drives).map(|_| drive()).collect());
             let model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
             let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
-            let one = object(&model, &lookout, scene.usable_rays(), at, Vec::new());
+            let one = object(&model, &lookout, scene.usable_rays(), at);
             let open = open_to_others(&model, &one.into_iter().collect::<Vec<Object>>());
             assert_eq!(open, if is_open { scene.usable_rays() } else { Vec::new() });
         }

@@ -8,7 +8,7 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
-use super::assign::{Claim, Trajectories, assign_among, claims_of_all, images_of};
+use super::assign::{Claim, Trajectories, assign_among, claims_of_all};
 use super::few::most_probable;
 use super::propose::{Hypothesis, propose_among};
 use super::quick::quick_estimate;
@@ -193,7 +193,7 @@ impl Place<'_> {
         for &c in chosen {
             let votes = votes_of(c);
             if votes.len() >= model.settings.min_votes as usize {
-                born.extend(object(model, lookout, votes, candidates[c].point, Vec::new()));
+                born.extend(object(model, lookout, votes, candidates[c].point));
             }
         }
         let may_vote = |ray: u32| rays.binary_search(&ray).is_ok();
@@ -204,11 +204,8 @@ impl Place<'_> {
                 break;
             }
         }
-        // What hides them is known only now.
-        let claims = claims_of_all(model, index, &born, progress)?;
-        let again = born.into_iter().zip(&claims);
-        let again = again.filter_map(|(o, claims)| object(model, lookout, o.votes, o.fit.point, images_of(claims)));
-        Ok(again.filter(|object| object.energy < 0.0).collect())
+        born.retain(|object| object.energy < 0.0);
+        Ok(born)
     }
 }
 

@@ -93,7 +93,7 @@ fn exchanged(model: &Model<'_>, lookout: &Lookout, of: [&Object; 2]) -> Option<[
     let exchange = which_is_which(model.scene, model.noise, votes, of.map(|object| object.fit.point), reach_m(model))?;
     let energy = |both: [&Object; 2]| both.iter().map(|object| object.energy).sum::<f64>();
     let object = |(votes, old): (Vec<u32>, &Object)| {
-        let found = fitting_unseen(model, votes, old.fit.point)?.with_looks(model, lookout, old.others.clone())?;
+        let found = fitting_unseen(model, votes, old.fit.point)?.with_looks(model, lookout)?;
         (found.energy < 0.0).then_some(found)
     };
     let with = |is_whole_visit: bool| -> Option<[Object; 2]> {
@@ -317,7 +317,7 @@ mod tests {
             let is_its = |ray: &u32| ray % 2 == (one + u32::from(swapped.contains(&(ray / 2)))) % 2;
             scene.usable_rays().into_iter().filter(|ray| !missing.contains(ray)).filter(is_its).collect()
         };
-        let place = |one: u32| object(&model, &lookout, votes(one, swapped), at[one as usize], Vec::new());
+        let place = |one: u32| object(&model, &lookout, votes(one, swapped), at[one as usize]);
         let found = untangle(&model, &lookout, (0..2).filter_map(place).collect(), &Progress::default())?;
         let found = found.into_iter().map(|object| object.votes).collect();
         Ok([found, vec![votes(0, &[]), votes(1, &[])]])
