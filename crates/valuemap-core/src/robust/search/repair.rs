@@ -96,7 +96,9 @@ fn taken_over(objects: Vec<Object>, places: &[Vec<usize>], solved: Vec<Option<Ve
         }
         any = true;
         taken.extend(votes().copied());
-        place.iter().for_each(|&i| objects[i] = None);
+        for &i in place {
+            objects[i] = None;
+        }
         born.extend(new);
     }
     let mut kept: Vec<Object> = objects.into_iter().flatten().chain(born).collect();
