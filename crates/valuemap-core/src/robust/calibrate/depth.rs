@@ -11,9 +11,10 @@ use crate::robust::search::{Depth, Tally, search};
 
 /// All moves take some ten times as long: they pay if they change more than one object in ten of those that are kept, by more than chance.
 const LEAST_CHANGE: f64 = 0.1;
-/// Below so many expected changes the normal distribution says nothing of their number.
+/// Below so many expected changes the normal distribution says nothing of their number. Five is the usual rule for binomial counts.
 const LEAST_EXPECTED: f64 = 5.0;
-/// It is asked of so many parts of the places that classes are learned from, one after the other, until they tell: a part has some twenty objects.
+/// It is asked of so many parts of the places that classes are learned from, one after the other, until they tell: a part has some twenty objects. Asked of one
+/// and then of all, it took five times as long in a large city (`docs/notes/method.md`).
 const PARTS_OF_PLACES: usize = 5;
 
 /// Whether all moves change many objects of the places that classes are learned from, of which the map is known.

@@ -21,16 +21,19 @@ use crate::robust::scene::{Scene, sample};
 use crate::robust::search::{Depth, Tally, born_of_rest, search};
 use crate::robust::settings::Settings;
 
-/// How much wider the gate is while the noise is estimated: what a gate cuts off is missing in the estimate.
+/// How much wider the gate is while the noise is estimated: what a gate cuts off is missing in the estimate. It cuts off no more of errors that are 1.4 times
+/// as large as thought than the gate does of those that are as thought.
 const CALIBRATION_GATE: f64 = 1.4;
-/// Times that the noise is estimated anew, from labels found with the last estimate.
+/// Times that the noise is estimated anew, from labels found with the last estimate. What the first begins with is no estimate; it takes one to learn what
+/// passes disagree about, and another to see what that explains.
 const CALIBRATION_ROUNDS: usize = 3;
-/// Times that it is estimated from more rays than that.
+/// Times that it is estimated from more rays than that. One tries what few places told, and the other what is estimated from that.
 const MORE_ROUNDS: usize = 2;
 /// Passes that should have seen objects and did not are expected to cost no more than this, whatever is expected of them: twice the most that
 /// `-p ln p` can be.
 const MOST_UNSEEN: f64 = 2.0 / std::f64::consts::E;
-/// The noise is sought from starts that differ by these factors.
+/// The noise is sought from starts that differ by these factors. What lies between them is within a factor of two of one. Without the smallest, maps of real
+/// data are worse, and a start of a third of it is never likeliest (`docs/notes/method.md`).
 const STARTS: [f64; 5] = [0.15, 0.5, 1.5, 5.0, 15.0];
 
 /// Steps from all starts at most, as progress counts them.

@@ -17,7 +17,7 @@ use crate::robust::noise::drift::{self, Look};
 use crate::robust::noise::{Known, Noise};
 use crate::robust::scene::Scene;
 
-/// Variances become larger or smaller by this factor at most.
+/// Variances become larger or smaller by this factor at most. A tenth of its standard deviation is left of an error then, which is next to nothing.
 const MOST_CHANGE: f64 = 100.0;
 
 /// The noise of which the looks at some labels have a correlation; nothing where they are independent, or poses state their errors.

@@ -33,7 +33,8 @@ use depth::all_moves_pay;
 use likeliest::{few_places, likeliest_noise, noise_of_more};
 use shared::with_drift_at_least;
 
-/// Rays of the places that the noise is estimated from, about: from each start, and from the best in the end.
+/// Rays of the places that the noise is estimated from, about: from each start, and from the best in the end. From the starts there are up to fifteen steps and
+/// in the end two, so that those have fewer rays.
 const CALIBRATION_RAYS: (usize, usize) = (4_000, 10_000);
 /// Rays that classes are learned from, about: some hundred objects of some hundred votes each. Of fifty, a few that are hardly seen tell whether the
 /// others are seen alike.
@@ -42,7 +43,7 @@ const CLASS_RAYS: usize = 30_000;
 const WIDE: f64 = 3.0;
 /// One parameter more lowers minus twice the logarithm of the likelihood by no more than this by chance (Akaike).
 const AKAIKE: f64 = 2.0;
-/// Scenes with more rays than this are searched less deeply, if that changes little.
+/// Scenes with more rays than this are searched less deeply, if that changes little. It bounds the work: all moves take some ten times as long.
 const MOST_RAYS: usize = 100_000;
 
 /// Steps of [`self_calibrate`] at most, as progress counts them, but for the search that tells whether all moves pay: the noise, and the classes, once more

@@ -23,19 +23,24 @@ use crate::robust::scene::Scene;
 const ENOUGH_VOTES: usize = 250;
 /// A visit with fewer voters has no residuals.
 const MIN_VOTES_OF_VISIT: usize = 2;
-/// Voters that are used, about.
+/// Voters that are used, about. It bounds the work: by the reckoning above, a standard deviation is known to a fiftieth from so many.
 const SAMPLE_VOTES: usize = 6000;
-/// The parameters are searched between these factors of a step, from coarse to fine.
+/// The parameters are searched between these factors of a step, from coarse to fine. Each is about the root of the one before. The last is finer than a
+/// standard deviation is known from the fewest voters that serve.
 const STEPS: [f64; 5] = [2.0, 1.5, 1.25, 1.12, 1.06];
-/// The part of the variance of distant objects' residuals that is taken for rotation.
+/// The part of the variance of distant objects' residuals that is taken for rotation. Residuals of one focal length do not tell it from detection, so each has
+/// half until images that show several objects tell (`split`).
 const ROTATION_PART: f64 = 0.5;
 /// The part of the variance of what the images of a segment share that each of them has for itself all the same: errors that forget 63 % of
 /// themselves along a segment differ by twice this between images that are a tenth of a segment apart, as viewpoints are (Ornstein-Uhlenbeck).
 const ROUGHNESS: f64 = 0.1;
-/// What is searched for, and where: least and most. Boxes of objects of one size grow as errors of position do, with one over
-/// the distance: a detector that is off by more than this share of its boxes is not one, what is more is the position's.
+/// What is searched for, and where: least and most. No detector is exact to a twentieth of a pixel, and where 30 px were reached nothing was found
+/// (`docs/notes/method.md`).
 const DETECTION_PX: (f64, f64) = (0.05, 30.0);
+/// Boxes of objects of one size grow as errors of position do, with one over the distance: a detector that is off by more than this share of its boxes is not
+/// one, what is more is the position's. The least is a tenth of a pixel of a box of 100 px.
 pub(crate) const BOX_SHARE: (f64, f64) = (1e-3, 0.15);
+/// Of positions, m: no survey is so exact as the least, and poses of a car are off by some metres.
 const POSITION_M: (f64, f64) = (1e-4, 5.0);
 
 /// Within what the noise of detections is, px.

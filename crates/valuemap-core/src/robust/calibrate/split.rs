@@ -21,13 +21,14 @@ use crate::robust::noise::{Known, Noise};
 
 /// Votes that serve, about: of a thousand images that show several objects each, a share is known to a few hundredths.
 const SAMPLE_VOTES: usize = 5_000;
-/// Shares are tried in so many steps first.
+/// Shares are tried in so many steps first. What lies between two of them is within reach of the halvings that follow.
 const STEPS: usize = 5;
-/// Then so many times on both sides of the best, each time in steps half as long: to a hundredth.
+/// Then so many times on both sides of the best, each time in steps half as long: to a hundredth, as shares are known to a few.
 const HALVINGS: usize = 4;
-/// The two shares are sought in turn, so many times.
+/// The two shares are sought in turn, so many times. Each is sought once with the other as it was, and once with what was found of the other.
 const TURNS: usize = 2;
-/// The share of the pose is no less than this, and no more than 1 less this: no noise is no density.
+/// The share of the pose is no less than this, and no more than 1 less this: no noise is no density. A smaller one is not told from it: shares are known to a
+/// few hundredths.
 const LEAST_SHARE: f64 = 0.02;
 
 /// Objects of one place, with what their votes see.

@@ -18,7 +18,7 @@ use crate::robust::noise::huber::huber_weight;
 use crate::robust::noise::index::{Hit, RayIndex};
 use crate::robust::noise::poses::{Belief, PoseError, Segments, smooth};
 
-/// Gains are whole numbers of this part, so that sums do not depend on their order.
+/// Gains are whole numbers of this part, so that sums do not depend on their order. It is as fine as what a move has to lower J by.
 pub const GAIN_UNIT: f64 = 1e-6;
 
 /// A detection that an object may have.

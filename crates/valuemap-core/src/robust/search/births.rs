@@ -14,9 +14,9 @@ use crate::robust::energy::{Object, fitting, implied_size, size_of};
 use crate::robust::model::Model;
 use crate::robust::noise::index::{Hit, RayIndex};
 
-/// Hypotheses that are tried side by side.
+/// Hypotheses that are tried side by side. More keep more threads busy, but more of them want rays that a better one has taken.
 const BATCH: usize = 64;
-/// Rounds of estimating and gathering votes again, at most.
+/// Rounds of estimating and gathering votes again, at most. It bounds the work where votes come and go.
 pub const MAX_ROUNDS: usize = 8;
 
 /// Let objects be born among the rays of no object; `is_taken` (one per ray) says which rays have one, and is kept up to date. Also how many hypotheses

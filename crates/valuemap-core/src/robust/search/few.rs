@@ -20,7 +20,7 @@ use crate::robust::noise::index::RayIndex;
 const PLACES_PER_DECADE: f64 = 30.0;
 /// What is less probable than one in a hundred is not asked about: even all of it would be few.
 const LEAST_LN_ODDS: f64 = -4.6;
-/// Times that an object gathers votes and is estimated again, at most.
+/// Times that an object gathers votes and is estimated again, at most. They are fewer than for a birth (`births`), as there are few votes to gather.
 pub(super) const ROUNDS: usize = 3;
 
 /// The objects that rays of no other object make, the surest first; those with fewer votes than `least_votes` aside.

@@ -35,7 +35,7 @@ use regrow::regrow;
 use repair::repair;
 use untangle::untangle;
 
-/// Rounds, at most.
+/// Rounds, at most. It bounds the work, and more changed nothing beyond chance where images are sparse (`docs/notes/method.md`).
 const ROUNDS: usize = 6;
 /// Steps of a search with all moves at most, as progress counts them: the four kinds of moves of each round.
 pub const SEARCH_STEPS: usize = 4 * ROUNDS;

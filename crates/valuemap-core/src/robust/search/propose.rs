@@ -16,11 +16,12 @@ use crate::robust::noise::index::chi2;
 use crate::robust::scene::Scene;
 use crate::robust::scene::sample::{Sampler, level_of, scramble};
 
-/// Images around an image among which partners are sought and votes are sampled, at most.
+/// Images around an image among which partners are sought and votes are sampled, at most. It bounds the work for an image, however many passes there are: each
+/// meeting is tried on all of them.
 const SAMPLE_IMAGES: usize = 40;
-/// Meetings that a ray is tried with, at most.
+/// Meetings that a ray is tried with, at most. It bounds the work for a ray. They come in random order, so that with fewer the right one is missed more often.
 pub const MEETINGS: usize = 24;
-/// So many images within the range of an image are enough to propose what they see.
+/// So many images within the range of an image are enough to propose what they see. Of what is left over then, all images propose.
 const PROPOSING_IMAGES: usize = 2 * SAMPLE_IMAGES;
 
 /// Which images propose.

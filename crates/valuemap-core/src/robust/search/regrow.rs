@@ -21,7 +21,7 @@ use crate::robust::learn::company::Sure;
 use crate::robust::model::Model;
 use crate::robust::noise::index::RayIndex;
 
-/// Votes of others that it tries to take, at most: those that it explains best.
+/// Votes of others that it tries to take, at most: those that it explains best. It bounds the work: each costs two estimates, of both objects.
 const MOST_TAKEN: usize = 8;
 
 /// An object that may be born, and what becomes of those whose votes it takes.

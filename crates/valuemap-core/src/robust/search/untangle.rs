@@ -18,19 +18,20 @@ use crate::robust::model::Model;
 use crate::robust::noise::Noise;
 use crate::robust::scene::Scene;
 
-/// So many images must show both.
+/// So many images must show both. They have twelve numbers, for the three of a difference and a sign each: three are to spare, as with three votes for a
+/// position.
 const MIN_IMAGES: usize = 6;
-/// Images whose pairs propose how the two lie to each other, at most.
+/// Images whose pairs propose how the two lie to each other, at most. It bounds the work: they are 120 pairs with two proposals each.
 const PROPOSERS: usize = 16;
-/// Images that proposals are tried on, about.
+/// Images that proposals are tried on, about. It bounds the work: all images judge what comes of the best.
 const SAMPLE_IMAGES: usize = 64;
-/// Times that the best proposal is fitted to all images that agree with it.
+/// Times that the best proposal is fitted to all images that agree with it. It bounds the work: what has not settled then is judged as it is, by all images.
 const REFINEMENTS: usize = 3;
-/// No image speaks stronger against a proposal.
+/// No image speaks stronger against a proposal. By chance one in 3,000 would (four sigmas on two axes): the others have a vote that is wrong.
 const CUT_CHI2: f64 = 16.0;
-/// An exchange must lower the sum of squared residuals by so much.
+/// An exchange must lower the sum of squared residuals by so much. Then what they show is more than fifty times as likely (e to the power of half of it).
 const LEAST_GAIN: f64 = 8.0;
-/// Times that those whose neighbours changed are looked at once more, at most.
+/// Times that those whose neighbours changed are looked at once more, at most. Three that stand together are three pairs, of which a round exchanges one.
 const ROUNDS: usize = 3;
 
 /// How far from each other two may be found that have each other's votes, m: each as far from where it should be as rays that meet crosswise.
