@@ -23,19 +23,21 @@ use crate::robust::noise::{Noise, variance_of_alike};
 use crate::robust::parts::Part;
 use crate::robust::scene::{Scene, View};
 
-/// A pass that comes back after so long a drive has another drift, m.
+/// A pass that comes back after so long a drive has another drift, m. Less than a tenth of the old one is left then (`DRIFT_LENGTH_M`).
 const FORGOTTEN_M: f64 = 250.0;
-/// A longer step is shortened to this, m.
+/// A longer step is shortened to this, m. Over more, residuals of nearby cameras are not linear.
 pub const LONGEST_STEP_M: f64 = 5.0;
-/// A step that leads behind a voter is cut to a quarter, so many times at most.
+/// A step that leads behind a voter is cut to a quarter, so many times at most. The last leaves a millimetre of the longest step.
 const MAX_CUTS: i32 = 6;
-/// Votes are judged once a step is shorter than this, in sigmas, root mean square of the labels.
+/// Votes are judged once a step is shorter than this, in sigmas, root mean square of the labels. Residuals hardly change by more then, which is little beside
+/// the gate.
 const NEAR_SIGMAS: f64 = 0.3;
-/// Rounds of leaving out votes, at most.
+/// Rounds of leaving out votes, at most. It bounds the work: after each the labels are estimated anew.
 const MAX_TRIMS: usize = 10;
 /// How much of what a visit says is left out when it is judged: a little stays, for where the others tell nothing.
 const OTHERS_SHARE: f64 = 0.95;
-/// Farther than this the linear step to where the other visits put a label is not trusted, m.
+/// Farther than this the linear step to where the other visits put a label is not trusted, m. It is less than `LONGEST_STEP_M`, as nothing is evaluated anew
+/// where it leads.
 const LONGEST_MOVE_M: f64 = 3.0;
 
 /// How much care an estimate takes.

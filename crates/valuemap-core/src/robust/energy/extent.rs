@@ -6,7 +6,7 @@ use super::{Fit, Object};
 use crate::robust::model::Model;
 use crate::robust::noise::{Noise, norm};
 
-/// Detections are looked for as far from an object as this many of its standard deviations.
+/// Detections are looked for as far from an object as this many of its standard deviations. One in 16,000 is farther off (normal distribution).
 pub(crate) const REACH_SIGMAS: f64 = 4.0;
 /// In so many steps at least, which are no longer than a standard deviation.
 const LEAST_STEPS: f64 = 4.0;

@@ -42,15 +42,16 @@ use seen::{Seen, Shares};
 use sides::{LEAST_COSINE, Middle, Said, marginalised, sides};
 use sizes::size_terms;
 
-/// The position is found when a step is shorter than this, in its own sigmas.
+/// The position is found when a step is shorter than this, in its own sigmas. What is left adds a thousandth to the variance of the position.
 const STEP_SIGMAS: f64 = 0.03;
+/// Steps, at most: it bounds the work where weights and position follow each other slowly.
 const MAX_STEPS: usize = 12;
-/// Times that a step after which the residuals are larger is cut to a quarter.
+/// Times that a step after which the residuals are larger is cut to a quarter. The last that is tried is a thousandth of it, and less is taken for no way down.
 const MAX_CUTS: usize = 6;
 /// Residuals that are larger by rounding are not larger.
 const LEAST_FALL: f64 = 1e-9;
 
-/// Objects of fewer votes tell nothing of others where there are better ones: chance meetings have few.
+/// Objects of fewer votes tell nothing of others where there are better ones: chance meetings have few. Six rays leave nine residuals to spare.
 pub const SURE_VOTES: usize = 6;
 /// Rays alone tell where objects of so many votes are, with three residuals to spare.
 pub const LEAST_VOTES: usize = 3;
@@ -388,7 +389,8 @@ pub(crate) fn camera_m2(model: &Model<'_>, votes: &[u32]) -> f64 {
     sum / (visits_count * visits_count)
 }
 
-/// What looks from directions that differ by less than 30 degrees looks from one side (cosine).
+/// What looks from directions that differ by less than 30 degrees looks from one side (cosine). What is within 15 degrees of one direction, as a sector of
+/// looks is (`SECTOR_COSINE`), differs by no more.
 pub(crate) const ONE_SIDE_COSINE: f64 = 0.866;
 
 /// Rays in groups that look from one side each: from directions with no less than a cosine to the first of the group.

@@ -13,7 +13,8 @@ use crate::robust::energy::estimate::{Care, Joint, Limits, Start};
 use crate::robust::energy::places::places;
 use crate::robust::model::Model;
 
-/// Labels within this distance of the one with the most votes are estimated with it, m.
+/// Labels within this distance of the one with the most votes are estimated with it, m. Within 15 m neighbors are missing, and 40 m are as accurate for more
+/// work.
 pub const PLACE_M: f64 = 25.0;
 
 /// Estimate all labels anew, place by place; those that keep too few votes are dropped.

@@ -16,7 +16,8 @@ use crate::robust::noise::poses::{Belief, PoseError};
 use crate::robust::scene::Scene;
 use crate::robust::search::assign::GAIN_UNIT;
 
-/// Times that the assignment of an image is made anew, with the pose error from the last one.
+/// Times that the assignment of an image is made anew, with the pose error from the last one. It bounds the work: they end where the assignment stays the same,
+/// and others may go back and forth.
 const ROUNDS: usize = 3;
 
 /// A detection that a label may have.

@@ -17,20 +17,22 @@ use crate::robust::model;
 use crate::robust::noise::Spread;
 use crate::robust::scene::Scene;
 
-/// So many times more probable must be that the hits in a sector are not the label's, before its votes are taken away (logarithm).
+/// So many times more probable must be that the hits in a sector are not the label's, before its votes are taken away (logarithm). Where both are as probable
+/// before, one in 150 is wrong.
 const CLUTTER_LOG_ODDS: f64 = 5.0;
-/// More hits in a sector than this are no accident.
+/// More hits in a sector than this are no accident. Three rays tell where an object is by themselves (`LEAST_VOTES`).
 const MOST_HITS_OF_CLUTTER: u32 = 2;
 
-/// Nearer than this nothing is expected to be seen, m.
+/// Nearer than this nothing is expected to be seen, m. An error of a decimetre in the camera's position moves what is nearer by more than a degree.
 const NEAREST_M: f64 = 4.0;
 
-/// Share of looks in which detections of other objects happen to lie in the gate of nothing.
+/// Share of looks in which detections of other objects happen to lie in the gate of nothing. Larger: objects that are hardly seen are taken for nothing;
+/// smaller: nothing beside objects is taken for one.
 const COINCIDENCE: f64 = 0.05;
-/// How little that share varies between passes, see [`Rates::concentration`].
+/// How little that share varies between passes, see [`Rates::concentration`]. Its standard deviation is about as large as the share then.
 const COINCIDENCE_CONCENTRATION: f64 = 15.0;
 /// Odds that a point which gathered enough votes to be judged is nothing, where hardly any was found to be: it was chosen as
-/// the best of many, so plain odds would flatter it.
+/// the best of many, so plain odds would flatter it. With harder odds for all, objects that one pass sees are lost.
 const ODDS_AGAINST: f64 = 10.0;
 /// How much they grow with the number of those, for each label, that were found to be nothing: what is left is the best of
 /// so many more.

@@ -15,9 +15,10 @@ use crate::robust::search::births::MAX_ROUNDS;
 use crate::robust::search::propose::{Hypothesis, MEETINGS, Who, propose};
 use crate::robust::search::quick::quick_estimate;
 
-/// Hypotheses that are polished side by side.
+/// Hypotheses that are polished side by side. More keep more threads busy, but more of them claim the same rays and are polished again.
 const BATCH: usize = 16;
-/// Who nominates, round after round, each time with the rays that are left over.
+/// Who nominates, round after round, each time with the rays that are left over. A part comes first, which costs less where many images show the same; a round
+/// of all that finds nothing is the last.
 const ROUNDS: [Who; 4] = [Who::Part, Who::All, Who::All, Who::All];
 
 /// Find labels among some rays (ascending), round after round, and count nominations and labels.

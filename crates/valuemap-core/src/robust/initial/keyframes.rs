@@ -11,9 +11,10 @@ use super::label::{Known, Label, Revision};
 use crate::ray::Rays;
 use crate::robust::scene::Scene;
 
-/// Of the images of one camera and pass, the first of each stretch of this length is kept, m driven.
+/// Of the images of one camera and pass, the first of each stretch of this length is kept, m driven. With 6 m 0.3 % of the lights of a simulated city are lost,
+/// with 8 m 1 %.
 const STRETCH_M: f64 = 4.0;
-/// If more than this share of the rays would stay, it is not worth it.
+/// If more than this share of the rays would stay, it is not worth it. All images are gone through afterwards all the same.
 const MOST_LEFT: f64 = 0.5;
 
 /// A part of the images of a scene with their rays.

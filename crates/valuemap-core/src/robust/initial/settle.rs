@@ -13,11 +13,12 @@ use crate::robust::search::untangle::reach_m;
 
 /// Squared Mahalanobis distance up to which two positions agree: the 99.7 % quantile of chi² with 3 degrees of freedom.
 const AGREEMENT_CHI2: f64 = 14.0;
-/// Squared Mahalanobis distance from which on they disagree: far beyond chance.
+/// Squared Mahalanobis distance from which on they disagree: far beyond chance. One in 700,000 that agree is as far off.
 const DISAGREEMENT_CHI2: f64 = 30.0;
-/// Two sides are at least 60 degrees apart (cosine).
+/// Two sides are at least 60 degrees apart (cosine). Sides that reach 30 degrees around each (`ONE_SIDE_COSINE`) do not overlap then.
 const SIDES_COSINE: f64 = 0.5;
-/// Two labels may share this part of the images of the smaller one and still be one object: clutter beside it.
+/// Two labels may share this part of the images of the smaller one and still be one object: clutter beside it. Larger: two that images show side by side become
+/// one; smaller: clutter beside an object keeps two labels of it.
 const SHARED_IMAGES: f64 = 0.15;
 
 /// Make one of any two labels of a class whose positions agree within their covariances, unless their images say that

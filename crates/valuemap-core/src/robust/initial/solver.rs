@@ -19,10 +19,11 @@ use crate::robust::noise::index::RayIndex;
 use crate::robust::parts::Part;
 use crate::robust::scene::Frustum;
 
-/// Labels are dropped below these multiples of the probability that is asked for, one after the other, and then below that.
+/// Labels are dropped below these multiples of the probability that is asked for, one after the other, and then below that. The least probable go first, as
+/// what they give back may be what a doubtful one lacks.
 const PRUNED_BELOW: [f64; 3] = [1e-5, 1e-2, 0.3];
 
-/// Rounds of dropping and giving back at the end, at most.
+/// Rounds of dropping and giving back at the end, at most. It bounds the work: they end where nothing is dropped any more.
 const MAX_PRUNE_ROUNDS: usize = 6;
 
 /// Where labels compete for the rays.

@@ -21,24 +21,25 @@ use crate::robust::model::Model;
 use crate::robust::parts::Part;
 use crate::robust::search::rearrange::near_m;
 
-/// So many images must show one of the two alone from about one direction.
+/// So many images must show one of the two alone from about one direction. As many must show both for an exchange (`untangle`).
 const LEAST_ALONE: usize = 6;
-/// For each of them, images that show both from there, at most.
+/// For each of them, images that show both from there, at most. It spares trials: what is tried must explain more.
 const MOST_BOTH: f64 = 0.2;
-/// This part of them must be in the other's gate.
+/// This part of them must be in the other's gate. Otherwise most of them would not fit there.
 const CLAIMED_SHARE: f64 = 0.5;
-/// Other labels of their place that are estimated with the two, at most: they tell the drift of the passes.
+/// Other labels of their place that are estimated with the two, at most: they tell the drift of the passes. The work grows with the square of their number.
 const COMPANIONS: usize = 5;
-/// Times that detections nobody has are gathered, without companions and with them.
+/// Times that detections nobody has are gathered, without companions and with them. Without them it is asked only what is worth a try.
 const GATHERINGS: (usize, usize) = (1, 2);
-/// Swaps that explain so much less without companions are not tried with them.
+/// Swaps that explain so much less without companions are not tried with them. Two votes without a residual explain about as much, with a gate of four sigmas.
 const PROMISING: f64 = -30.0;
-/// A swap must explain so much more.
+/// A swap must explain so much more. It is 150 times more probable then, as squared sigmas are twice the logarithm.
 const LEAST_GAIN: f64 = 10.0;
-/// For each image that shows the one with fewer votes, images that show both, at most, for them to be one object.
+/// For each image that shows the one with fewer votes, images that show both, at most, for them to be one object. It is less than where positions agree
+/// (`SHARED_IMAGES`), as these need not.
 const MOST_SHARED: f64 = 0.05;
 /// One object may explain so much less for each vote of the one with fewer votes; how much without companions for it to be
-/// worth a try with them.
+/// worth a try with them. By chance a vote has a squared residual of 2: of that a quarter, and three quarters.
 const MOST_LOST: f64 = 0.5;
 const MAYBE_LOST: f64 = 1.5;
 

@@ -12,9 +12,9 @@ use crate::robust::model::heights::level_axes;
 use crate::robust::model::steps::{Steps, score_ratio};
 use crate::robust::model::{ClassModel, Model};
 
-/// Cameras of which the surroundings tell, at most.
+/// Cameras of which the surroundings tell, at most. With 32 places each, bins have some thousand places; more cost time.
 const MOST_VIEWS: usize = 1_000;
-/// Places around a camera: rings of equal area, and directions.
+/// Places around a camera: rings of equal area, and directions. Few are enough, as the places around other cameras lie between.
 const RINGS: usize = 4;
 const DIRECTIONS: usize = 8;
 

@@ -10,7 +10,7 @@ use crate::robust::model::{FEW, Model, ln_gamma, mean_and_sd};
 
 /// Rounds of bisection: odds are right to a millionth.
 const ROUNDS: usize = 60;
-/// No odds are changed by more than this factor, in logarithms.
+/// No odds are changed by more than this factor, in logarithms. It stays finite: what is surer than that stays, whatever the numbers of others say.
 pub(crate) const MOST: f64 = 50.0;
 /// The largest k: a Poisson distribution, for all that is known.
 const LEAST_DISPERSION: f64 = 1e3;

@@ -23,17 +23,18 @@ use rates::with_rates;
 use reach::{looked_at, reach};
 use tails::{OfImages, tails};
 
-/// The part of the votes that is from farther away than objects are taken to be seen from.
+/// The part of the votes that is from farther away than objects are taken to be seen from. So many may be of another thing (`ODD`), and would make misses of
+/// all looks up to where they are from.
 const FAR_VOTES: f64 = 0.05;
 /// Boxes that are all put on one elevation, as those of bearings are on the horizon, differ in its sine by no more than rounding.
 const LEAST_ELEVATIONS: f64 = 1e-6;
-/// Fewer of these tell nothing, and what was thought before stays.
+/// Fewer of these tell nothing, and what was thought before stays. Of five a standard deviation is known no better than to a third.
 const MIN_OBJECTS: usize = 5;
-/// What is seen in less than this part of the looks that are usual is rather false than real.
+/// What is seen in less than this part of the looks that are usual is rather false than real. Objects that face another street are still seen in about half.
 const HARDLY: f64 = 0.5;
 /// The median absolute deviation of a normal distribution, in standard deviations.
 const MAD_OF_NORMAL: f64 = 0.6745;
-/// A spread of sizes is no smaller: boxes are whole pixels, and edges are not the same all around.
+/// A spread of sizes is no smaller: boxes are whole pixels, and edges are not the same all around. A pixel is 3 % of a box of 33 px.
 const LEAST_SPREAD: f64 = 0.03;
 
 /// Learn the classes of a model from the objects that some rays make. Classes of few objects are taken to be like all objects together, but for how

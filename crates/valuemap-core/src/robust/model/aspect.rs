@@ -12,11 +12,11 @@ use nalgebra::Vector3;
 use super::steps::{BINS, bin};
 use crate::robust::scene::{Scene, View};
 
-/// Larger angles are another side, rad: what is seen from there says nothing of here.
+/// Larger angles are another side, rad: what is seen from there says nothing of here. 15 degrees: looks are within so much of some vote (`SECTOR_COSINE`).
 pub const WIDEST_RAD: f64 = PI / 12.0;
 /// Directions nearer to each other than this, rad, are one: half of what rates are told apart by.
 const SAME_DIRECTION_RAD: f64 = 0.5 * WIDEST_RAD / BINS as f64;
-/// From how many votes or passes on: powers of two, to 32.
+/// From how many votes or passes on: powers of two, to 32. So many across a side are nearer to each other than angles are told apart.
 pub const LEVELS: usize = 6;
 
 /// The share of the looks at a class that are hits, over that where it is largest, by the angle to the nearest vote.

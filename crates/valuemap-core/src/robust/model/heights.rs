@@ -12,9 +12,10 @@ use rustc_hash::FxHashSet;
 use super::{ODD, median};
 use crate::robust::scene::Scene;
 
-/// Normal distributions that are tried, at most.
+/// Normal distributions that are tried, at most. One more than lights have, which hang on masts and stand on poles; how many serve the Bayesian information
+/// criterion tells.
 const MOST_COMPONENTS: usize = 3;
-/// Rounds of expectation and maximisation, at most.
+/// Rounds of expectation and maximisation, at most. It bounds the work: they end where no mean moves by a thousandth of what heights are known to.
 const ROUNDS: usize = 50;
 
 /// A normal distribution among others.
@@ -210,6 +211,7 @@ pub fn level_axes(scene: &Scene, up: &Vector3<f64>) -> [Vector3<f64>; 2] {
 /// The ground within a distance of any camera, m², in cells of a quarter of the distance.
 #[must_use]
 pub fn ground_m2(scene: &Scene, up: &Vector3<f64>, distance_m: f64) -> f64 {
+    /// The 49 cells around one camera cover its circle to 3 %.
     const CELLS: i64 = 4;
     let side_m = distance_m / CELLS as f64;
     let axes = level_axes(scene, up);

@@ -309,9 +309,10 @@ pub struct Sizes {
     pub spread: f64,
 }
 
-/// Detections this many times farther than `max_range_m` still vote.
+/// Detections this many times farther than `max_range_m` still vote. Some objects are seen from beyond `max_range_m` alone; without any bound a position
+/// without parallax may run to infinity.
 pub const VOTE_RANGE: f64 = 2.5;
-/// Sizes that say nothing: boxes of one size in all pictures, or no boxes.
+/// Sizes that say nothing: boxes of one size in all pictures, or no boxes. What boxes of one object differ by is far more.
 const LEAST_ANGLE_SD: f64 = 1e-3;
 
 impl Sizes {
@@ -558,19 +559,21 @@ impl VotesFor<'_> {
 }
 
 /// The share of false things among what is born and no ghost. It is not learned: of two passes, a real object that one of them missed and a thing that
-/// the other did not meet look the same, and whatever is thought of them confirms itself.
+/// the other did not meet look the same, and whatever is thought of them confirms itself. Larger: objects that one of few passes missed are lost; smaller: what
+/// one of few passes alone met is taken for real.
 pub const FALSE_SHARE: f64 = 0.1;
 
-/// Standard deviation of the share of hits between sides, at least.
+/// Standard deviation of the share of hits between sides, at least. The shares that are compared are a twelfth apart: with less, a mean between two of them
+/// would be far from both.
 const LEAST_BETWEEN: f64 = 0.05;
 
-/// The share of odd passes: at least, before anything is learned, at most.
+/// The share of odd passes: at least, before anything is learned, at most. More than a half would not be odd.
 pub const ODD_PASSES: (f64, f64, f64) = (ODD, 0.2, 0.5);
 
 impl Rates {
     /// Of things of which nothing is known (Jeffreys).
     pub const ANY: Self = Self { recall: 0.5, concentration: 1.0, between: 0.0 };
-    /// Before anything is learned.
+    /// Before anything is learned. It claims little: of such a beta distribution any share may be, large ones rather than small ones.
     pub const GUESS: Self = Self { recall: 0.7, concentration: 3.0, between: 0.0 };
     /// Of objects of which each is seen in the same share of the looks: as many tell a tenth from none.
     pub const ALIKE: Self = Self { concentration: 100.0, ..Self::GUESS };

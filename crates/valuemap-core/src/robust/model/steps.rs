@@ -3,7 +3,7 @@
 //! Both are densities by bins, learned from the map. The ratio of scores is monotone (isotonic regression, pool adjacent violators); elevations of clutter
 //! are compared with all that the cameras look at, and are told apart no better than they are measured.
 
-/// Values are sorted into so many bins of about as many detections each.
+/// Values are sorted into so many bins of about as many detections each. More would have fewer detections each to tell them, fewer would be coarser.
 pub const BINS: usize = 12;
 /// Fewer of one kind tell nothing: their number is known no better than to a third, and a ratio to one as large no better than to a half (Poisson).
 pub(crate) const LEAST_DETECTIONS: f64 = 10.0;

@@ -10,7 +10,7 @@ use super::drift::{DRIFT_LENGTH_M, Look, SEGMENT_M};
 use super::spd::{Inverse, Matrix6, Vector6, product, product_transposed, scaled};
 use crate::robust::scene::View;
 
-/// Segments before and after those in question that say something about their drift.
+/// Segments before and after those in question that say something about their drift. Of a drift farther away less than a seventh is left (`DRIFT_LENGTH_M`).
 pub(crate) const SEGMENTS_AROUND: usize = 20;
 
 /// What is known of the drift of a segment, in sigmas of the drift: information and gradient.
