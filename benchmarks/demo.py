@@ -2,7 +2,7 @@
 
     python benchmarks/demo.py --work DIR [--seeds 0 2 3] [--json FILE]
 
-The seeds 2 and 3 are cities that neither the training nor the least score of the boxes was chosen on. The load says
+The training saw no picture of the seeds 2 and 3, and the least score of the boxes was chosen on 0 and 1. The load says
 how many other processes wanted the processor in the minute before: above 0.5 or so the seconds are those of a shared
 machine.
 """
