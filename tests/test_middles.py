@@ -21,8 +21,9 @@ from valuemap.progress import silent
 from valuemap.refine import Mapped, gather_images
 from valuemap.refine.images import Bundle
 from valuemap.refine.middles import Contrasts, Middles
+from valuemap.refine.residuals import cauchy
 from valuemap.simulate import simulate
-from valuemap.tables import Bools, Floats, covariance_matrices
+from valuemap.tables import Bools, Floats, Ints, covariance_matrices
 from valuemap.tiles.source import InMemory
 
 refine_middles = importlib.import_module("valuemap.refine.middles")
@@ -179,6 +180,23 @@ def test_middles_are_not_told_without_boxes_or_objects(
     assert refine_middles.middles(images, without_boxes, votes, noise) is None
     monkeypatch.setattr(refine_middles, "_LEAST_OBJECTS", len(labels))
     assert refine_middles.middles(images, labels, votes, noise) is None
+
+
+def test_ties_hold_alike_however_far_sides_are_apart(
+    mapped: tuple[Dataset, Mapped], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only then can they be taken out again: one that gives way would be taken out in full."""
+    city, (calibration, labels, votes, _) = mapped
+    weights: list[Floats] = []
+
+    def spy(told: Bundle, groups: Ints) -> tuple[Floats, Floats]:
+        weights.append(cauchy(np.array([0.0, 1e6]) / told.ties.total**2, 3.0))
+        return placed(told, groups)
+
+    placed = Bundle.placed
+    monkeypatch.setattr(Bundle, "placed", spy)
+    assert refine_middles.middles(gather_images(city, MapConfig()), labels, votes, calibration.noise) is not None
+    assert np.array_equal(weights, [[1.0, 1.0]])
 
 
 def test_middles_are_no_farther_off_than_half_of_the_larger_side_of_a_box(mapped: tuple[Dataset, Mapped]) -> None:

@@ -237,3 +237,26 @@ pub(crate) fn norm(a: f64, b: f64) -> f64 {
 pub fn spreads_of(scene: &Scene, noise: &Noise) -> Vec<Spread> {
     (0..scene.rays.rays.len() as u32).into_par_iter().map(|ray| noise.total(scene, ray)).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::street;
+
+    #[test]
+    fn noise_of_which_images_share_nothing_is_as_large() {
+        let shared = Noise {
+            position_m: 0.03,
+            position_segment_m: 0.04,
+            position_drift_m: 0.12,
+            rotation_rad: 3e-3,
+            rotation_segment_rad: 4e-3,
+            rotation_drift_rad: 12e-3,
+            ..street::NOISE
+        };
+        let own = shared.all_own();
+        assert!((own.position_m - 0.13).abs() < 1e-12 && (own.rotation_rad - 13e-3).abs() < 1e-12);
+        let left = [own.position_segment_m, own.position_drift_m, own.rotation_segment_rad, own.rotation_drift_rad];
+        assert_eq!(left.map(f64::to_bits), [0; 4]);
+    }
+}

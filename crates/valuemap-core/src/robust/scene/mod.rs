@@ -188,6 +188,8 @@ mod tests {
         // Clutter is as dense as it is where anything is detected.
         let share = scene.frusta[0].searched_sr() / scene.frusta[0].solid_angle_sr;
         assert!((0.1..0.2).contains(&share), "{share}");
+        let whole_sr = scene.frusta[0].solid_angle_sr * scene.views.len() as f64;
+        assert!((scene.solid_angle_sr() / whole_sr - share).abs() < 1e-9);
         // A camera with bounds has no other side, and few detections tell none.
         scene.frusta[0].normals = vec![Vector3::z()];
         scene.find_blind_sides();
