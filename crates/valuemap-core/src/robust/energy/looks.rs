@@ -1,10 +1,9 @@
 //! The looks at an object: the viewpoints that should see it.
 //!
 //! A look is a viewpoint of a pass that has the point in its picture, from a side from which the object was voted for, at a distance from which its class
-//! is detected; it counts less where fewer are detected, and half where another detection in the gate may hide the object. It is as much of a hit as the
-//! share of its images that have a vote. Which of the looks are hits has a price, the last two terms of equation (5) of `docs/method.md`. Of the images of a
-//! viewpoint it is one of equally probable choices: a standing car would see two objects in turn otherwise. And a hit is as rare as a look there is light:
-//! looks from afar would be for what meets by chance, and never against it.
+//! is detected; it counts less where fewer are detected. It is as much of a hit as the share of its images that have a vote. Which of the looks are hits has
+//! a price, the last two terms of equation (5) of `docs/method.md`. Of the images of a viewpoint it is one of equally probable choices: a standing car would
+//! see two objects in turn otherwise. And a hit is as rare as a look there is light: looks from afar would be for what meets by chance, and never against it.
 
 use nalgebra::Vector3;
 use rstar::RTree;
@@ -63,8 +62,7 @@ impl Lookout {
             .filter_map(move |image| Some((image, sectors.looked_from(scene, &scene.views[image as usize], point)?)))
     }
 
-    /// The looks at a point that some rays (one per image, ascending) vote for, from as near and as far as their class is detected; `others` are
-    /// images (ascending) with a detection in its gate.
+    /// The looks at a point that some rays (one per image, ascending) vote for, from as near and as far as their class is detected.
     #[must_use]
     pub fn looks(&self, model: &Model<'_>, point: &Vector3<f64>, voters: &[u32]) -> Seen {
         let Some(class) = model.class_of_votes(voters) else { return Seen::default() };

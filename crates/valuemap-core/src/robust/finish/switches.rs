@@ -12,8 +12,8 @@ use crate::robust::noise::drift::SEGMENT_M;
 use crate::robust::parts::Part;
 use crate::robust::search::rearrange::may_be_one;
 
-/// That an object is missed in all images that show another one is chance where it is more probable than one in a thousand: so many objects has a map.
-const LN_BY_CHANCE: f64 = -6.9;
+/// Two objects look like one by chance where that is more probable than one in a thousand: so many objects has a map.
+const BY_CHANCE: f64 = 1e-3;
 
 /// Whether each of some objects is another one of them in the pictures, which J would miss more.
 #[must_use]
@@ -39,8 +39,16 @@ fn switches(model: &Model<'_>, objects: &[&Object]) -> Vec<(usize, usize)> {
     let mut pairs: Vec<(usize, usize)> = pairs.map(in_order).collect();
     pairs.sort_unstable();
     pairs.dedup();
-    pairs.retain(|&(stronger, weaker)| are_exclusive(model, objects[stronger], objects[weaker]));
-    pairs
+    let are_two = |&(stronger, weaker): &(usize, usize)| are_seen_as_two(model, objects[stronger], objects[weaker]);
+    let (two, mut one): (Vec<_>, Vec<_>) = pairs.into_iter().partition(are_two);
+    let visits_count: usize = objects.iter().map(|object| visits(model.scene, &object.votes).count()).sum();
+    // How often what is two for certain goes on like one; the pair itself may do so as well.
+    let in_line = (two.len() + 1) as f64 / (visits_count + 1) as f64;
+    let are_one = |&(stronger, weaker): &(usize, usize)| {
+        in_line * missed_by_each_other(model, objects[stronger], objects[weaker]) < BY_CHANCE
+    };
+    one.retain(are_one);
+    one
 }
 
 /// The object of the first of some votes (ray and object, ascending), and another one that the camera sees in its place in the next images.
@@ -67,15 +75,15 @@ fn goes_on_as(model: &Model<'_>, objects: &[&Object], votes: &[(u32, usize)]) ->
     None
 }
 
-/// Whether no image shows both of two objects, the weaker one is seen on one visit alone, and that each is missed in all images of the other that
-/// look at it is more than chance.
-fn are_exclusive(model: &Model<'_>, stronger: &Object, weaker: &Object) -> bool {
-    if weaker.is_seen_beside(model.scene, stronger) {
-        return false;
-    }
+/// Whether an image shows both of two objects, or the weaker one is seen on more than one visit.
+fn are_seen_as_two(model: &Model<'_>, stronger: &Object, weaker: &Object) -> bool {
+    weaker.is_seen_beside(model.scene, stronger) || visits(model.scene, &weaker.votes).count() > 1
+}
+
+/// How probable it is that each of two objects is missed in all images of the other that look at it.
+fn missed_by_each_other(model: &Model<'_>, stronger: &Object, weaker: &Object) -> f64 {
     let looks = looks_among(model, stronger, &weaker.votes).min(looks_among(model, weaker, &stronger.votes));
-    let recall = model.classes[stronger.class as usize].rates.recall;
-    visits(model.scene, &weaker.votes).count() == 1 && looks * (1.0 - recall).ln() < LN_BY_CHANCE
+    (1.0 - model.classes[stronger.class as usize].rates.recall).powf(looks)
 }
 
 /// Whether two rays, one of each of two objects, show one thing in two images nearby: as near to each other, and as large, as one thing would be.
@@ -111,8 +119,8 @@ mod tests {
         street(60, 1.0, &[SIGN.into(), other], &[[0.3, -0.2], [-0.4, 0.1], [0.2, 0.4]])
     }
 
-    /// The votes of two objects, by number of the sign, image and pass; the second one is where wrong poses put it. Whether each is the other one.
-    fn of_votes(scene: &Scene, votes: [&dyn Fn(usize, u32, u32) -> bool; 2]) -> Vec<bool> {
+    /// The votes of objects, by number of the sign, image and pass; the second one is where wrong poses put it. Whether each is another one.
+    fn of_votes(scene: &Scene, votes: &[&dyn Fn(usize, u32, u32) -> bool]) -> Vec<bool> {
         let model = Model::new(scene, &NOISE, &SETTINGS);
         let lookout = Lookout::new(scene, SETTINGS.viability.max_range_m);
         let number =
@@ -126,24 +134,24 @@ mod tests {
             let votes: Vec<u32> = (0..scene.rays.rays.len() as u32).filter(of).collect();
             object(&model, &lookout, votes, SIGN.into())
         };
-        let [Some(whole), Some(mut part)] = votes.map(begun) else { return Vec::new() };
-        part.fit.point += Vector3::new(1.5, 1.0, 0.3);
-        assert!(whole.energy < part.energy);
-        are_others(&model, &[&whole, &part])
+        let mut objects: Vec<Object> = votes.iter().filter_map(|of| begun(*of)).collect();
+        objects[1].fit.point += Vector3::new(1.5, 1.0, 0.3);
+        assert!(objects[0].energy < objects[1].energy);
+        are_others(&model, &objects.iter().collect::<Vec<_>>())
     }
 
     #[test]
     fn what_takes_an_object_s_place_in_the_pictures_is_that_object() {
         let far = |sign, image, _| sign == 0 && image < 25;
         let near = |sign, image, _| sign == 0 && image >= 25;
-        assert_eq!(of_votes(&drive(), [&far, &near]), [false, true]);
+        assert_eq!(of_votes(&drive(), &[&far, &near]), [false, true]);
     }
 
     #[test]
     fn what_is_elsewhere_in_the_pictures_is_not() {
         let far = |sign, image, _| sign == 0 && image < 25;
         let of_other = |sign, image, _| sign == 1 && image >= 25;
-        assert_eq!(of_votes(&drive(), [&far, &of_other]), [false, false]);
+        assert_eq!(of_votes(&drive(), &[&far, &of_other]), [false, false]);
     }
 
     #[test]
@@ -153,14 +161,14 @@ mod tests {
         scene.box_px.iter_mut().zip(&rays.image).filter(|(_, image)| **image >= 25).for_each(|(size, _)| *size *= 50.0);
         let far = |sign, image, _| sign == 0 && image < 25;
         let near = |sign, image, _| sign == 0 && image >= 25;
-        assert_eq!(of_votes(&scene, [&far, &near]), [false, false]);
+        assert_eq!(of_votes(&scene, &[&far, &near]), [false, false]);
     }
 
     #[test]
     fn what_is_seen_beside_it_is_not() {
         let far = |sign, image, _| sign == 0 && image < 25;
         let near = |sign, image, _| sign == 0 && image >= 25 || sign == 1 && image == 10;
-        assert_eq!(of_votes(&drive(), [&far, &near]), [false, false]);
+        assert_eq!(of_votes(&drive(), &[&far, &near]), [false, false]);
     }
 
     #[test]
@@ -168,13 +176,22 @@ mod tests {
         let scene = joined(vec![drive(), drive()]);
         let far = |sign, image, pass| sign == 0 && image < 25 && pass == 0;
         let near = |sign, image, _| sign == 0 && image >= 25;
-        assert_eq!(of_votes(&scene, [&far, &near]), [false, false]);
+        assert_eq!(of_votes(&scene, &[&far, &near]), [false, false]);
     }
 
     #[test]
     fn what_few_images_show_is_not() {
         let far = |sign, image, _| sign == 0 && image < 25;
         let near = |sign, image, _| sign == 0 && (25..28).contains(&image);
-        assert_eq!(of_votes(&drive(), [&far, &near]), [false, false]);
+        assert_eq!(of_votes(&drive(), &[&far, &near]), [false, false]);
+    }
+
+    #[test]
+    fn fewer_images_suffice_where_others_do_not_go_on_like_one() {
+        let far = |sign, image, _| sign == 0 && image < 25;
+        let near = |sign, image, _| sign == 0 && (25..30).contains(&image);
+        assert_eq!(of_votes(&drive(), &[&far, &near]), [false, true]);
+        let goes_on_beside = |sign, image, _| sign == 0 && image >= 30 || sign == 1 && image == 26;
+        assert_eq!(of_votes(&drive(), &[&far, &near, &goes_on_beside]), [false, false, false]);
     }
 }
