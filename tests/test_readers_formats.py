@@ -323,6 +323,49 @@ def test_two_reconstructions_of_opensfm_share_no_pass(tmp_path: Path) -> None:
     assert "have different origins" in refusal(lambda: read_opensfm(path))
 
 
+def test_a_camera_of_opensfm_without_shots_may_be_of_any_type(tmp_path: Path) -> None:
+    """It lists those of pictures that it could not place, too."""
+    path = opensfm_in(tmp_path)
+    parts = json.loads(path.read_text())
+    parts[0]["cameras"]["other"] = {"projection_type": "dual", "width": 0, "height": 0, "focal": 0.8}
+    write(path, json.dumps(parts))
+    assert len(read_opensfm(path).cameras) == 1
+    parts[0]["shots"]["1.jpg"]["camera"] = "other"
+    write(path, json.dumps(parts))
+    assert "cameras['other']: " in refusal(lambda: read_opensfm(path))
+
+
+def test_of_opendronemap_what_is_east_north_up_is_read(tmp_path: Path) -> None:
+    """Its reconstruction.json is in a map projection, and still says where the origin of the other one is."""
+    true = opensfm_in(tmp_path / "opensfm").rename(tmp_path / "opensfm" / "reconstruction.topocentric.json")
+    parts = json.loads(true.read_text())
+    convergence = Rotation.from_euler("z", 1.0, degrees=True)
+    for shot in parts[0]["shots"].values():
+        shot["rotation"] = (Rotation.from_rotvec(shot["rotation"]) * convergence).as_rotvec().tolist()
+    projected = write(tmp_path / "opensfm" / "reconstruction.json", json.dumps(parts))
+    undistorted = write(tmp_path / "opensfm" / "undistorted" / "reconstruction.json", json.dumps(parts))
+    detections = boxes(tmp_path, ["0.jpg", "1.jpg", "2.jpg"])
+    for given in (true, true.parent):
+        check_scene(read_opensfm(given, detections=detections))
+    for given in (projected, undistorted, undistorted.parent):
+        said = refusal(lambda given=given: read_opensfm(given))  # type: ignore[misc]
+        assert "reconstruction.json: is in OpenDroneMap's map projection" in said
+        assert f"give {true}" in said
+
+
+def test_coordinates_of_a_map_projection_are_not_those_of_an_anchor(tmp_path: Path) -> None:
+    """As of `export_geocoords`, which leaves the origin as it was: UTM counts 5,760 km north of the equator here."""
+    path = opensfm_in(tmp_path)
+    parts = json.loads(path.read_text())
+    for shot in parts[0]["shots"].values():
+        cam_from_world = Rotation.from_rotvec(shot["rotation"])
+        center = -cam_from_world.inv().apply(shot["translation"]) + [568_600.0, 5_761_500.0, 0.0]
+        shot["translation"] = (-cam_from_world.apply(center)).tolist()
+    write(path, json.dumps(parts))
+    said = refusal(lambda: read_opensfm(path))
+    assert "expected positions in metres east, north, up of the anchor, found (568600, 5761500, " in said
+
+
 # nuScenes.
 
 

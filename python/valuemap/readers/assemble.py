@@ -27,6 +27,8 @@ _PLAUSIBLE_STEP_M = (1e-3, 1e3)
 _STILL_M = 1e-6
 _MIN_MEAN_UP = 0.1
 _MAX_TILT_FROM_ENU_RAD = math.radians(60.0)
+_FARTHEST_FROM_ANCHOR_M = 1.5e6
+"""Readers that place images by latitude and longitude allow 10 degrees, 1,100 km."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +112,7 @@ def assemble(
         `up`, `anchor` or `max_rejected` is impossible, or `up` and `anchor` are both given.
     InputError
         Too many boxes or images cannot be used; the tables are inconsistent, the poses cannot be metric, have no
-        mean up, or contradict `anchor`.
+        mean up, or contradict `anchor` or are far from it.
     """
     rejections = Rejections(source, max_rejected)
     rejections.add_unreadable(unreadable or {})
@@ -150,6 +152,7 @@ def _frame(
     length = float(np.linalg.norm(mean_up))
     if anchor is not None:
         _check_anchor(anchor)
+        _check_is_near(images, source)
         if not is_on_earth and length >= _MIN_MEAN_UP:
             _check_is_enu(mean_up / length, source)
         return Frame(anchor=anchor)
@@ -168,6 +171,18 @@ def _check_anchor(anchor: tuple[float, float, float]) -> None:
         raise SettingError(
             f"anchor: expected latitude, longitude (degrees) and height (m), found {lat} {lon} {height}",
             hint="for example 52.3702 4.8952 43.0: latitude first",
+        )
+
+
+def _check_is_near(images: Images, source: str) -> None:
+    """Refuse positions that are not about an anchor: those of a map projection, or from the middle of the Earth."""
+    center_m = camera_centers(images)
+    if np.median(np.linalg.norm(center_m, axis=1)) > _FARTHEST_FROM_ANCHOR_M:
+        x, y, z = center_m[0].tolist()
+        raise InputError(
+            f"{source}: expected positions in metres east, north, up of the anchor, found ({x:.0f}, {y:.0f}, {z:.0f})",
+            hint="are these coordinates of a map projection, or from the middle of the Earth? Bring them into the "
+            "frame of the anchor first",
         )
 
 

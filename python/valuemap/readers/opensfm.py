@@ -19,6 +19,8 @@ from valuemap.readers.reader import Reader
 
 _EXPECTED = "OpenSfM's reconstruction.json: a list of reconstructions with cameras and shots"
 _REFERENCE = "reference_lla.json"
+_RECONSTRUCTION, _TOPOCENTRIC = "reconstruction.json", "reconstruction.topocentric.json"
+"""OpenDroneMap gives what OpenSfM wrote the second name, and the first to the same in a map projection."""
 
 
 @Reader
@@ -35,12 +37,13 @@ def read_opensfm(
 
     Rotations are axis-angle, world to camera. Lengths are fractions of the larger side of the picture about its middle,
     and become pixels with the centre of the top-left one at 0.5. A pass is the sequence of a shot (`skey`), else the
-    folder of its name; separate reconstructions share no pass. Rig instances are rigs.
+    folder of its name; separate reconstructions share no pass. Rig instances are rigs. Nothing is asked of cameras
+    without shots.
 
     Parameters
     ----------
     reconstruction
-        The file, or the folder with it.
+        The file, or the folder with it. In a folder of OpenDroneMap it is `reconstruction.topocentric.json`.
     detections
         As in `read_detections`.
     up, anchor, max_rejected
@@ -49,22 +52,26 @@ def read_opensfm(
     Raises
     ------
     InputError
-        A file is missing, damaged or of another format, or a camera is of a type that COLMAP's models do not have.
+        A file is missing, damaged, of another format or in OpenDroneMap's map projection, or a camera is of a type that
+        COLMAP's models do not have.
     SettingError
         `anchor` or `up` contradicts the reference of the file.
     """
     progress("reading the reconstruction", 0, 2)
-    path = reconstruction / "reconstruction.json" if reconstruction.is_dir() else reconstruction
+    path = _file(reconstruction)
     content = Json(read_json(path, _EXPECTED), str(path), f"expected {_EXPECTED}")
     parts = list(content.entries())
     names, passes, rigs, time, rotation, translation, camera_of = [], [], [], [], [], [], []
     for number, part in enumerate(parts):
-        cameras_here = {key: _camera(value) for key, value in part["cameras"].items()}
+        listed = dict(part["cameras"].items())
+        cameras_here: dict[str, Camera] = {}  # Of those with shots alone: all of a project are listed.
         rig_of = _rigs(part, number)
         for name, shot in part["shots"].items():
             key = shot["camera"].text()
-            if key not in cameras_here:
+            if key not in listed:
                 raise shot["camera"].wrong("expected one of cameras")
+            if key not in cameras_here:
+                cameras_here[key] = _camera(listed[key])
             names.append(name)
             camera_of.append(cameras_here[key])
             rotation.append(shot["rotation"].numbers(3))
@@ -109,6 +116,22 @@ def read_opensfm(
     )
     progress("reading the detections", 2, 2)
     return dataset
+
+
+def _file(reconstruction: Path) -> Path:
+    """Return the file to read; refuse those of OpenDroneMap that are in a map projection but name OpenSfM's origin."""
+    is_folder = reconstruction.is_dir()
+    folder = reconstruction if is_folder else reconstruction.parent
+    if is_folder and (folder / _TOPOCENTRIC).is_file():
+        return folder / _TOPOCENTRIC
+    path = folder / _RECONSTRUCTION if is_folder else reconstruction
+    for place in (folder, folder.parent):  # Undistorted pictures have a folder of their own in it.
+        if path.name == _RECONSTRUCTION and (place / _TOPOCENTRIC).is_file():
+            raise InputError(
+                f"{path}: is in OpenDroneMap's map projection, as {place / _TOPOCENTRIC} tells",
+                hint=f"give {place / _TOPOCENTRIC}, which is the same in metres east, north and up",
+            )
+    return path
 
 
 def _camera(value: Json) -> Camera:
