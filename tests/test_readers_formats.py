@@ -137,6 +137,34 @@ def test_an_image_between_two_poses_of_tum_is_between_them(tmp_path: Path) -> No
         assert f"longest-gap: expected seconds from 0 to 1e+09, found {gap:g}" in said
 
 
+def test_nanoseconds_of_orb_slam3_are_times_of_pictures(tmp_path: Path) -> None:
+    """It writes them with a fraction of 0; pictures of EuRoC are named by whole ones, and listed with commas."""
+    trajectory, _ = tum_in(tmp_path)
+    texts = [f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in STAMPS_NS.tolist()]
+    rows = trajectory.read_text()
+    for text, stamp in zip(texts, STAMPS_NS.tolist(), strict=True):
+        rows = rows.replace(text, f"{stamp}.000000")
+    write(trajectory, rows)
+    names = [f"{stamp}.png" for stamp in STAMPS_NS.tolist()]
+    detections = boxes(tmp_path, names)
+    listed = [f"{stamp},cam0/data/{name}" for stamp, name in zip(STAMPS_NS.tolist(), names, strict=True)]
+    lines = write(tmp_path / "data.csv", "\n".join(["#timestamp [ns],filename", *listed]) + "\n")
+    check_scene(read_tum(trajectory, camera=CAMERA, detections=detections))
+    check_scene(read_tum(trajectory, camera=CAMERA, detections=detections, image_list=lines))
+
+
+def test_trajectories_whose_quaternions_begin_with_w_are_not_tum(tmp_path: Path) -> None:
+    """As of EuRoC and Basalt, with a comment that says so, and of VINS, without; both with commas and nanoseconds."""
+    row = "1403636760113555456,1,2,3,1,0,0,0"
+    basalt = f"#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n{row}\n"
+    vins, own = f"{row},\n", "# t x y z qw qx qy qz\n1 1 2 3 1 0 0 0\n"
+    for text, line in ((basalt, "line 1: says"), (vins, "line 1: has commas"), (own, "line 1: says")):
+        said = refusal(lambda text=text: read_tum(write(tmp_path / "t.csv", text), camera=CAMERA))  # type: ignore[misc]
+        assert line in said
+        assert "quaternions begin with w" in said
+        assert "w last" in said
+
+
 # kapture.
 
 

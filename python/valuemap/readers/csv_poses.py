@@ -27,6 +27,7 @@ from valuemap.readers.poses import (
     place_in_crs,
     place_on_earth,
     rotations_of_quaternions,
+    seconds_of_unit,
 )
 from valuemap.readers.reader import Reader
 from valuemap.tables import Floats
@@ -70,8 +71,9 @@ def read_csv_poses(
     """Read a table with one row an image.
 
     Columns: `image` (name); a place, `lat, lon` in degrees or `x, y`, with `height` or `z`; an orientation; and as far
-    as known a camera, `pass`, `timestamp` (seconds, or ISO 8601, in UTC where it says no zone), `rig` (equal for images
-    taken at one time by one car), `position_sigma_m`, `rotation_sigma_deg` and `readout_s` of the camera.
+    as known a camera, `pass`, `timestamp` (as in `seconds_of_unit`, or ISO 8601, in UTC where it says no zone), `rig`
+    (equal for images taken at one time by one car), `position_sigma_m`, `rotation_sigma_deg` and `readout_s` of the
+    camera.
 
     An orientation is a quaternion `qw, qx, qy, qz`, or one of `heading_deg`, `heading_rad` (clockwise from north) and
     `yaw_deg`, `yaw_rad` (counter-clockwise from east) of the middle of the picture, with `pitch_deg` (up) and
@@ -281,7 +283,7 @@ def _seconds(text: str, table: CsvFile, row: int) -> float:
         raise InputError(
             f"{table.line(row)}: timestamp: expected a finite number", hint="leave it empty where not known"
         )
-    return seconds
+    return seconds * seconds_of_unit(seconds)
 
 
 def _optional(table: CsvFile, name: str) -> Floats | None:

@@ -14,7 +14,7 @@ from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras, parse_camera
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_folder, file_in, read_text
-from valuemap.readers.poses import make_images
+from valuemap.readers.poses import make_images, seconds_of_unit
 from valuemap.readers.reader import Reader
 from valuemap.tables import Floats
 
@@ -211,7 +211,7 @@ def _seconds(stamp: str, row: _Row) -> float:
         raise row.wrong("a timestamp", stamp) from error
     if not abs(value) < 1e30:
         raise row.wrong("a timestamp", stamp)
-    return next((value * unit for least, unit in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)) if value >= least), value)
+    return value * seconds_of_unit(value)
 
 
 def _passes(names: list[str], device_of: list[str]) -> list[str]:

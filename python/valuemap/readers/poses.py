@@ -308,6 +308,11 @@ def rigs_by_time(
     return rigs
 
 
+def seconds_of_unit(stamp: float) -> float:
+    """Return the unit of a timestamp, s: 1, or milli-, micro- or nanoseconds, in which it is as large as today's."""
+    return next((unit for least, unit in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)) if stamp >= least), 1.0)
+
+
 def nanoseconds_of_gap(longest_gap_s: float) -> int:
     """Return how long a gap between poses may be, of seconds that somebody set, in nanoseconds.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,7 @@ from valuemap.readers.poses import (
     make_images,
     nanoseconds_of_gap,
     rotations_of_quaternions,
+    seconds_of_unit,
 )
 from valuemap.readers.reader import Reader
 from valuemap.tables import Floats, Ints
@@ -26,6 +29,8 @@ from valuemap.tables import Floats, Ints
 _EXPECTED = "a text file with rows: timestamp tx ty tz qx qy qz qw, camera to world"
 _EXPECTED_LIST = "a text file with rows: timestamp filename"
 _NANO = 1_000_000_000
+_COMPONENT = re.compile(r"\bq\w*([wxyz])\b", re.IGNORECASE)
+"""How comments name the parts of a quaternion: qw, quat_x, q_RS_w."""
 
 
 @Reader
@@ -43,7 +48,9 @@ def read_tum(
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
 ) -> Imported:
-    """Read a trajectory of `timestamp tx ty tz qx qy qz qw` (x first!), camera to world, in seconds and metres.
+    """Read a trajectory of `timestamp tx ty tz qx qy qz qw` (x first!), camera to world, in metres.
+
+    Timestamps are seconds; those as large as today's in nano-, micro- or milliseconds are taken for these.
 
     Parameters
     ----------
@@ -54,7 +61,8 @@ def read_tum(
     image_list
         Text file of `timestamp filename` (`rgb.txt`). The pose of an image is that between the two poses next in
         time; images outside the trajectory, or in a gap longer than `longest_gap_s`, are left out and listed. Without
-        it there is an image `TIMESTAMP.png`, as written in the file, for every pose.
+        it there is an image `TIMESTAMP.png` for every pose, as written in the file, but for a fraction of 0 of
+        nanoseconds.
     detections
         As in `read_detections`.
     axes
@@ -67,7 +75,8 @@ def read_tum(
     Raises
     ------
     InputError
-        A file is missing or no such table, two poses have one time, or no image has a pose.
+        A file is missing or no such table, or one whose quaternions begin with w; two poses have one time, or no image
+        has a pose.
     SettingError
         An option is impossible.
     """
@@ -81,7 +90,7 @@ def read_tum(
         raise InputError(f"{trajectory}: two poses have the same timestamp", hint="keep one of them")
     rotation = rotations_of_quaternions(rows[:, [6, 3, 4, 5]]) @ AXES[axes]
     center = rows[:, :3]
-    names = [f"{text}.png" for text in texts]
+    names = [f"{_picture(text)}.png" for text in texts]
     if image_list is not None:
         image_time, names = _read_list(image_list)
         rotation, center, usable = interpolate_poses(image_time, time, rotation, center, longest)
@@ -123,17 +132,21 @@ def _rows(path: Path) -> tuple[list[str], Floats]:
     for number, line in enumerate(read_text(path, _EXPECTED).splitlines(), start=1):
         fields = line.replace(",", " ").split()
         if not fields or fields[0].startswith("#"):
+            if "".join(_COMPONENT.findall(line)).lower().startswith("w"):
+                raise _w_first(f"{path} line {number}: says that quaternions begin with w")
             continue
         try:
-            values = [float(field) for field in fields[1:]]
+            values = [float(field) for field in fields]
         except ValueError:
             values = []
-        if len(values) != 7 or not np.isfinite(values).all():
+        if len(values) != 8 or not np.isfinite(values).all():
             raise InputError(
                 f"{path} line {number}: expected 8 finite numbers, found {line[:80]!r}", hint=f"expected {_EXPECTED}"
             )
+        if "," in line and seconds_of_unit(values[0]) != 1.0:
+            raise _w_first(f"{path} line {number}: has commas and nanoseconds, as where quaternions begin with w")
         texts.append(fields[0])
-        rows.append(values)
+        rows.append(values[1:])
     if not rows:
         raise InputError(f"{path}: there are no poses in it", hint=f"expected {_EXPECTED}")
     return texts, np.array(rows)
@@ -144,7 +157,7 @@ def _read_list(path: Path) -> tuple[Ints, list[str]]:
     for number, line in enumerate(read_text(path, _EXPECTED_LIST).splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        fields = line.split(maxsplit=1)
+        fields = re.split(r"[\s,]+", line.strip(), maxsplit=1)
         if len(fields) != 2:
             raise InputError(f"{path} line {number}: found {line[:80]!r}", hint=f"expected {_EXPECTED_LIST}")
         texts.append(fields[0])
@@ -154,23 +167,33 @@ def _read_list(path: Path) -> tuple[Ints, list[str]]:
     return _nanoseconds(texts, path), names
 
 
+def _w_first(what: str) -> InputError:
+    return InputError(
+        what,
+        hint="EuRoC, VINS and Basalt write these: write rows timestamp tx ty tz qx qy qz qw, with spaces, and w last",
+    )
+
+
 def _nanoseconds(texts: list[str], path: Path) -> Ints:
-    """Return seconds in texts as whole nanoseconds (N): in float64 two images at 10 kHz would be one today."""
+    """Return times in texts as whole nanoseconds (N): in float64 two images at 10 kHz would be one today."""
     found = []
     for text in texts:
-        whole, _, part = text.partition(".")
-        if whole.isdecimal() and len(whole) <= 10 and (part.isdecimal() or not part):
-            found.append(int(whole) * _NANO + int(part[:9].ljust(9, "0")))
-        else:
-            try:
-                value = float(text)
-                found.append(round(value * _NANO))
-            except (ValueError, OverflowError) as error:
-                raise InputError(
-                    f"{path}: expected a timestamp in seconds, found {text[:40]!r}", hint="is it TUM?"
-                ) from error
-            if not -(2**62) < found[-1] < 2**62:
-                raise InputError(
-                    f"{path}: expected a timestamp in seconds, found {text[:40]!r}", hint="are these nanoseconds?"
-                )
+        try:
+            value = Decimal(text)
+            found.append(round(value * round(_NANO * seconds_of_unit(float(value)))))
+        except (InvalidOperation, ValueError, OverflowError) as error:
+            raise InputError(
+                f"{path}: expected a timestamp in seconds, found {text[:40]!r}", hint="is it TUM?"
+            ) from error
+        if not -(2**62) < found[-1] < 2**62:
+            raise InputError(
+                f"{path}: expected a timestamp in seconds, found {text[:40]!r}",
+                hint="today's may be in seconds, or in milli-, micro- or nanoseconds",
+            )
     return np.array(found, dtype=np.int64)
+
+
+def _picture(text: str) -> str:
+    """Return how pictures are named by a time: not with the `.000000` that ORB-SLAM3 writes behind nanoseconds."""
+    whole, _, part = text.partition(".")
+    return text if part.strip("0") or seconds_of_unit(float(text)) == 1.0 else whole
