@@ -53,6 +53,44 @@ def test_a_heading_counts_clockwise_from_north_and_right_of_it_is_more(tmp_path:
     assert_allclose(camera_centers(dataset.images)[1], [0.0, 1e-4 * DEGREE_NORTH_M, 0.0], atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("omega_phi_kappa", "heading_pitch_roll"),
+    [
+        ("90,0,0", "0,0,0"),
+        ("90,-30,0", "30,0,0"),
+        ("100,0,0", "0,10,0"),
+        ("90,0,-5", "0,0,5"),
+        ("0,0,0", "0,-90,0"),
+        ("0,0,-20", "20,-90,0"),
+    ],
+)
+def test_omega_phi_kappa_are_the_angles_of_photogrammetry(
+    omega_phi_kappa: str, heading_pitch_roll: str, tmp_path: Path
+) -> None:
+    """About x, the new y and the new z of a camera with x right, y up in the picture, z back: derived on paper."""
+    photo = poses_of(tmp_path / "1", "image,lat,lon,omega_deg,phi_deg,kappa_deg", f"a.jpg,0,0,{omega_phi_kappa}")
+    level = poses_of(tmp_path / "2", "image,lat,lon,heading_deg,pitch_deg,roll_deg", f"a.jpg,0,0,{heading_pitch_roll}")
+    found, expected = (rotation_matrices(read_csv_poses(poses, camera=CAMERA).images) for poses in (photo, level))
+    assert_allclose(found, expected, atol=1e-12)
+
+
+def test_an_orientation_is_said_in_one_way(tmp_path: Path) -> None:
+    poses = poses_of(tmp_path, "image,x,y,omega_deg,phi_deg,kappa_deg,yaw_deg", "a.jpg,0,0,90,0,0,0")
+    assert "has both omega, phi, kappa and yaw_deg" in refusal(lambda: read_csv_poses(poses, camera=CAMERA))
+
+
+def test_cameras_that_look_up_are_told(tmp_path: Path) -> None:
+    """The pitch of Metashape counts from straight down: that of a camera on a car is about 90."""
+    told: list[str] = []
+    header = "image,lat,lon,heading_deg,pitch_deg"
+    read_csv_poses(poses_of(tmp_path, header, "a.jpg,0,0,0,10"), camera=CAMERA, tell=told.append)
+    assert told == []
+    rows = ("a.jpg,0,0,0,88", "b.jpg,0,0.0001,0,92", "c.jpg,0,0.0002,0,90")
+    read_csv_poses(poses_of(tmp_path, header, *rows), camera=CAMERA, tell=told.append)
+    assert len(told) == 1
+    assert "cameras look 90 degrees above the horizon" in told[0]
+
+
 def test_up_is_z_where_angles_say_how_cameras_are_turned(tmp_path: Path) -> None:
     """Pictures on their side, as of a telephone, and cameras that look down have their own up elsewhere."""
     for angles in ("0,90", "-90,0", "20,0"):

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from valuemap.dataset import LONGEST_READOUT_S
 from valuemap.errors import InputError, SettingError
@@ -32,17 +33,23 @@ from valuemap.readers.poses import (
 from valuemap.readers.reader import Reader
 from valuemap.tables import Floats
 
-_EXPECTED = "a CSV file with columns image; lat, lon or x, y; and heading_deg, yaw_rad or qw, qx, qy, qz"
+_EXPECTED = (
+    "a CSV file with columns image; lat, lon or x, y; and heading_deg, yaw_rad, omega_deg, phi_deg, kappa_deg or "
+    "qw, qx, qy, qz"
+)
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _TEXTS = ("image", "pass", "rig", "timestamp", "model", "params")
 _NUMBERS = (
     *("lat", "lon", "height", "x", "y", "z", "qw", "qx", "qy", "qz", "pitch_deg", "roll_deg"),
+    *("omega_deg", "phi_deg", "kappa_deg"),
     *("heading_deg", "heading_rad", "yaw_deg", "yaw_rad", "width_px", "height_px", "fx", "fy", "cx", "cy"),
     *("position_sigma_m", "rotation_sigma_deg", "readout_s"),
 )
 _SKY = (0.0, 0.0, 1.0)
 """Up where orientations are angles: these are about the horizon, however cameras are turned."""
 _HEADINGS = ("heading_deg", "heading_rad", "yaw_deg", "yaw_rad")
+_OMEGA_PHI_KAPPA = ("omega_deg", "phi_deg", "kappa_deg")
+_UP_IN_THE_SKY_DEG = 60.0
 _NO_DEGREES = "write decimal degrees, as 52.5123 or -0.1276, without letters and signs"
 _NO_METRES = "write metres as plain numbers, as 1234.5"
 _NO_HEIGHT = "write metres as plain numbers, or remove the column and give --camera-height"
@@ -75,10 +82,12 @@ def read_csv_poses(
     (equal for images taken at one time by one car), `position_sigma_m`, `rotation_sigma_deg` and `readout_s` of the
     camera.
 
-    An orientation is a quaternion `qw, qx, qy, qz`, or one of `heading_deg`, `heading_rad` (clockwise from north) and
-    `yaw_deg`, `yaw_rad` (counter-clockwise from east) of the middle of the picture, with `pitch_deg` (up) and
-    `roll_deg` (right side down), which are 0 for level cameras. A camera is `width_px, height_px` with `model, params`
-    (numbers with spaces between), or with `fx, cx, cy` and maybe `fy`; else it is `camera` for all.
+    An orientation is a quaternion `qw, qx, qy, qz`; or `omega_deg, phi_deg, kappa_deg`, the angles of photogrammetry,
+    which turn x (right), y (up in the picture), z (back) into the axes of the positions, about x, then the new y, then
+    the new z; or one of `heading_deg`, `heading_rad` (clockwise from north) and `yaw_deg`, `yaw_rad` (counter-clockwise
+    from east) of the middle of the picture, with `pitch_deg` (up) and `roll_deg` (right side down), which are 0 for
+    level cameras. A camera is `width_px, height_px` with `model, params` (numbers with spaces between), or with
+    `fx, cx, cy` and maybe `fy`; else it is `camera` for all.
 
     Parameters
     ----------
@@ -107,7 +116,7 @@ def read_csv_poses(
         As in `assemble`, but that up is z where orientations are angles. With `lat, lon` or `crs` the anchor is the
         origin, by default the first image by name.
     tell
-        Called with each line that is worth knowing about the positions.
+        Called with each line that is worth knowing about the positions and angles.
 
     Raises
     ------
@@ -129,7 +138,7 @@ def read_csv_poses(
     images = make_images(
         names=names,
         camera_id=camera_id,
-        world_from_cam=where.world_from_local @ _local_from_cam(table, rotation, axes),
+        world_from_cam=where.world_from_local @ _local_from_cam(table, rotation, axes, tell),
         center_in_world_m=where.position_in_world_m,
         passes=table.filled_texts("pass") if table.has("pass") else [ONE_PASS] * len(table),
         source=str(poses),
@@ -193,21 +202,30 @@ def _place(
     return Placed(position, np.broadcast_to(np.eye(3), (len(table), 3, 3)), anchor)
 
 
-def _local_from_cam(table: CsvFile, rotation: str, axes: str) -> Floats:
+def _local_from_cam(table: CsvFile, rotation: str, axes: str, tell: Callable[[str], None] | None) -> Floats:
     """Return rotations (N, 3, 3) from camera axes into the frame of the positions, or east, north, up at the image."""
     headings = [name for name in _HEADINGS if table.has(name)]
+    ways = [
+        *(["a quaternion"] if table.has(*_QUATERNION) else []),
+        *(["omega, phi, kappa"] if table.has(*_OMEGA_PHI_KAPPA) else []),
+        *headings[:1],
+    ]
+    if len(ways) > 1:
+        raise InputError(f"{table.path}: has both {ways[0]} and {ways[1]}", hint="remove the columns that do not count")
+    if table.has(*_OMEGA_PHI_KAPPA):
+        angles = np.stack([table.some_numbers(name, _NO_NUMBER) for name in _OMEGA_PHI_KAPPA], axis=1)
+        local_from_photo: Floats = Rotation.from_euler("XYZ", angles, degrees=True).as_matrix() @ AXES["right-up-back"]
+        return local_from_photo
     if table.has(*_QUATERNION):
-        if headings:
-            raise InputError(
-                f"{table.path}: has both a quaternion and {headings[0]}", hint="remove the columns that do not count"
-            )
         quaternion = np.stack([table.some_numbers(name, _NO_NUMBER) for name in _QUATERNION], axis=1)
         matrix = rotations_of_quaternions(quaternion)
         local_from_axes = matrix if rotation == "world_from_cam" else matrix.transpose(0, 2, 1)
         turned: Floats = local_from_axes @ AXES[axes]
         return turned
     if len(headings) != 1:
-        raise table.missing(f"one of {', '.join(_HEADINGS)}, or {', '.join(_QUATERNION)}")
+        raise table.missing(
+            f"one of {', '.join(_HEADINGS)}, or {', '.join(_OMEGA_PHI_KAPPA)}, or {', '.join(_QUATERNION)}"
+        )
     name = headings[0]
     angle_rad = table.some_numbers(name, _NO_NUMBER) * (math.pi / 180.0 if name.endswith("_deg") else 1.0)
     if name.endswith("_rad") and np.nanmax(np.abs(angle_rad), initial=0.0) > 4.0 * math.pi:
@@ -220,6 +238,12 @@ def _local_from_cam(table: CsvFile, rotation: str, axes: str) -> Floats:
         np.radians(table.some_numbers(column, _NO_NUMBER)) if table.has(column) else np.zeros(len(table))
         for column in ("pitch_deg", "roll_deg")
     )
+    pitch_deg = float(np.degrees(np.nanmedian(pitch)))
+    if tell is not None and pitch_deg > _UP_IN_THE_SKY_DEG:
+        tell(
+            f"pitch_deg: cameras look {pitch_deg:.0f} degrees above the horizon; Metashape and Pix4D count from below, "
+            "so that 90 is level: take 90 away, or give their omega, phi, kappa"
+        )
     return local_from_cam(heading_rad, pitch, roll)
 
 
