@@ -435,6 +435,7 @@ IMAGES_TXT = "11 1 0 0 0 0 0 0 3 a/0.jpg\n\n12 1 0 0 0 -1 0 0 3 a/1.jpg\n1 2 -1 
         (CAMERAS_TXT, "", "no image with a pose"),
         (CAMERAS_TXT, "hello\n\n", "images.txt line 1: expected IMAGE_ID"),
         (CAMERAS_TXT, "11 1 0 0 0 0 nan 0 3 a/0.jpg\n\n", "images.txt line 1: expected IMAGE_ID"),
+        (CAMERAS_TXT, IMAGES_TXT.replace("a/0", "a/no 0"), "write other letters for the spaces"),
         (CAMERAS_TXT, "4294967296 1 0 0 0 0 0 0 3 a/0.jpg\n\n", "line 1: IMAGE_ID: expected a whole number from 0"),
         (CAMERAS_TXT, "11 1 0 0 0 0 0 0 7 a/0.jpg\n\n", "line 1: camera 7 of image 'a/0.jpg' is not in cameras.txt"),
         (CAMERAS_TXT * 2, IMAGES_TXT, "cameras.txt line 2: CAMERA_ID 3 is there twice"),

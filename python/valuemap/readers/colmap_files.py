@@ -198,8 +198,8 @@ def _check_images(path: Path, lines: list[str]) -> int:
             raise InputError(
                 f"{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, found {_short(lines[row])} "
                 f"({len(fields)} fields)",
-                hint="all but the name are finite numbers; image names with spaces are only possible in a binary model "
-                "(COLMAP's model_converter)",
+                hint="all but the name are finite numbers; names with spaces are whole only in a model binary from its "
+                "start: write other letters for the spaces, here and in the detections",
             )
         _add_id("IMAGE_ID", fields[0], known, where)
         _refuse_no_ids({"CAMERA_ID": fields[8]}, where)
