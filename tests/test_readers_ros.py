@@ -193,6 +193,11 @@ def test_the_distortion_of_a_bag_is_opencvs(tmp_path: Path) -> None:
     camera = read_ros([plumb], longest_gap_s=1.0).cameras
     assert camera.model.texts() == ["FULL_OPENCV"]
     assert camera.params[0].tolist() == [FX, FY, CX + 0.5, CY + 0.5, -0.2, 0.05, 0.001, -0.002, 0.003, 0, 0, 0]
+    rational = (-0.2, 0.05, 0.001, -0.002, 0.003, 0.4, 0.5, 0.6)
+    filled = write_bag(tmp_path / "filled", model="rational_polynomial", d=(*rational, *[0.0] * 6))  # As DepthAI does.
+    assert read_ros([filled], longest_gap_s=1.0).cameras.params[0].tolist()[4:] == list(rational)
+    prism = write_bag(tmp_path / "prism", model="rational_polynomial", d=(*rational, 0.1, *[0.0] * 5))
+    assert "distortion_model 'rational_polynomial' with 14 parameters" in refusal(lambda: read_ros([prism]))
     fisheye = write_bag(tmp_path / "fisheye", model="equidistant", d=(0.1, 0.2, 0.3, 0.4))
     assert read_ros([fisheye], longest_gap_s=1.0).cameras.model.texts() == ["OPENCV_FISHEYE"]
     rectified = read_ros([plumb], longest_gap_s=1.0, rectified=True).cameras

@@ -320,10 +320,13 @@ def _add_camera(message: Any, bag: _Bag, rectified: bool) -> None:
 
 
 def _distortion(model: str, d: Floats, frame: str) -> tuple[str, tuple[float, ...]]:
-    """Return COLMAP's model and its parameters after the pinhole's, of OpenCV's k1, k2, p1, p2, k3 .. k6."""
+    """Return COLMAP's model and its parameters after the pinhole's, of OpenCV's k1, k2, p1, p2, k3 .. k6.
+
+    Thin prisms and tilts, which OpenCV has after these, must be 0, as drivers fill them up.
+    """
     if not d.any():
         return "PINHOLE", ()
-    if model in ("plumb_bob", "rational_polynomial") and len(d) in (4, 5, 8):
+    if model in ("plumb_bob", "rational_polynomial") and len(d) in (4, 5, 8, 12, 14) and not d[8:].any():
         k1, k2, p1, p2, k3, k4, k5, k6 = (*d.tolist(), *[0.0] * 4)[:8]
         return "FULL_OPENCV", (k1, k2, p1, p2, k3, k4, k5, k6)
     if model in ("equidistant", "fisheye") and len(d) == 4:
