@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -663,8 +664,8 @@ def test_kitti360(tmp_path: Path) -> None:
 def test_the_fisheye_of_kitti360_is_that_of_mei(tmp_path: Path) -> None:
     """By the formula of Mei and Rives: onto the unit sphere, to z + xi, distorted, scaled."""
     dataset = read_kitti360(kitti360_in(tmp_path), sequence="drive", cameras=(2, 0))
-    assert dataset.cameras.model.texts() == ["OPENCV_FISHEYE", "PINHOLE"]
-    camera = colmap_camera(dataset.cameras, 0)
+    assert dataset.cameras.model.texts() == ["PINHOLE", "THIN_PRISM_FISHEYE"]
+    camera = colmap_camera(dataset.cameras, 1)
     xi, k1, k2, p1, p2 = (
         2.213404750785489,
         0.016798235660113681,
@@ -679,9 +680,28 @@ def test_the_fisheye_of_kitti360_is_that_of_mei(tmp_path: Path) -> None:
         radial = 1.0 + k1 * r2 + k2 * r2**2
         u = 1336.3220825849971 * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + 716.94323510126321 + 0.5
         v = 1335.7883350012958 * (y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)) + 705.76498308221585 + 0.5
-        assert_allclose(np.asarray(camera.img_from_cam(ray[None]))[0], [u, v], atol=0.5)
+        assert_allclose(np.asarray(camera.img_from_cam(ray[None]))[0], [u, v], atol=0.05)
     assert dataset.images.rig_id is not None
     assert dataset.images.rig_id.tolist() == [0, 1, 2, 0, 1, 2]
+
+
+def test_a_fisheye_of_kitti360_may_have_tangential_distortion(tmp_path: Path) -> None:
+    """Like its camera 3, of which no fisheye with radial distortion alone is within half a pixel."""
+    folder = kitti360_in(tmp_path)
+    path = folder / "calibration" / "image_02.yaml"
+    text = re.sub(r"(?m)^   (\w+):.*$", "   \\1: NUMBER", path.read_text())
+    for number in (2.55, 0.05, 4.5, 0.00135, -0.0007, 1485.0, 1485.0, 699.5, 699.5):
+        text = text.replace("NUMBER", str(number), 1)
+    write(path, text)
+    camera = colmap_camera(read_kitti360(folder, sequence="drive", cameras=(2,)).cameras, 0)
+    # To the left, up and 45 degrees off the axis.
+    x = -0.5 / (0.5**0.5 + 2.55)
+    r2 = 2.0 * x * x
+    radial = x * (1.0 + 0.05 * r2 + 4.5 * r2 * r2)
+    u = 1485.0 * (radial + 2 * 0.00135 * x * x - 0.0007 * (r2 + 2 * x * x)) + 700.0
+    v = 1485.0 * (radial - 2 * 0.0007 * x * x + 0.00135 * (r2 + 2 * x * x)) + 700.0
+    ray = np.array([[-0.5, -0.5, 0.5**0.5]])
+    assert_allclose(np.asarray(camera.img_from_cam(ray))[0], [u, v], atol=0.1)
 
 
 # Mapillary.
