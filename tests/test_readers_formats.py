@@ -204,6 +204,20 @@ def test_kapture(tmp_path: Path) -> None:
     assert len(set(dataset.images.rig_id.tolist())) == 3
 
 
+def test_records_of_kapture_without_a_pose_are_listed(tmp_path: Path) -> None:
+    rejected = read_kapture(kapture_in(tmp_path)).rejected
+    assert rejected is not None
+    assert rejected.image_name.to_pylist() == ["day1/unposed.jpg"]
+    assert rejected.reason.texts() == ["it has no pose in trajectories.txt, and no rig of its camera has one"]
+
+
+def test_timestamps_of_kapture_are_whole_numbers_however_they_are_written(tmp_path: Path) -> None:
+    folder = kapture_in(tmp_path)
+    trajectories = folder / "sensors" / "trajectories.txt"
+    write(trajectories, re.sub(r"(?m)^(?=\d)", "000", trajectories.read_text()))
+    assert len(read_kapture(folder).images) == 3
+
+
 def test_a_camera_of_kapture_that_has_no_pose_may_be_unknown(tmp_path: Path) -> None:
     """Queries come with UNKNOWN_CAMERA, width and height; nothing is asked of what is skipped."""
     sensors = kapture_in(tmp_path) / "sensors" / "sensors.txt"

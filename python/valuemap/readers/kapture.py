@@ -20,6 +20,7 @@ from valuemap.tables import Floats
 
 _EXPECTED = "a kapture folder with sensors/sensors.txt, sensors/records_camera.txt and sensors/trajectories.txt"
 _DEEPEST_RIG = 10
+_NO_POSE = "it has no pose in trajectories.txt, and no rig of its camera has one"
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,9 @@ def read_kapture(
     """Read a kapture folder, version 1.
 
     Poses take the world into the device (quaternion w, x, y, z, then translation), and rigs the rig into the sensor;
-    camera models are COLMAP's. Images without a pose are left out. A pass is the folder of an image's name without its
-    last part where that is one camera's, images of one rig at one time are a rig, and timestamps are taken for
-    nanoseconds, micro- or milliseconds since 1970 where they are as large as today's.
+    camera models are COLMAP's. Images without a pose are left out and listed. A pass is the folder of an image's name
+    without its last part where that is one camera's, images of one rig at one time are a rig, and timestamps are taken
+    for nanoseconds, micro- or milliseconds since 1970 where they are as large as today's.
 
     Parameters
     ----------
@@ -73,21 +74,24 @@ def read_kapture(
     poses = _trajectories(folder)
     cameras_of: dict[str, Camera] = {}  # Of those with a pose alone: kapture need not know the others.
     names, camera_of, found, rig, time, device_of = [], [], [], [], [], []
+    unposed: dict[str, str] = {}
     for row in _table(folder, "records_camera.txt", 3):
-        stamp, device, name = row.fields[0], row.fields[1], ",".join(row.fields[2:])
+        stamp, device, name = row.stamp(), row.fields[1], ",".join(row.fields[2:])
         if device not in sensors:
             raise row.wrong("a camera of sensors.txt", device)
         posed = _pose(stamp, device, poses, rigs)
-        if posed is not None:
-            pose, owner = posed
-            names.append(name)
-            if device not in cameras_of:
-                cameras_of[device] = _camera(sensors[device])
-            camera_of.append(cameras_of[device])
-            found.append(pose)
-            rig.append(f"{stamp}/{owner}")
-            time.append(_seconds(stamp, row))
-            device_of.append(device)
+        if posed is None:
+            unposed[name] = _NO_POSE
+            continue
+        pose, owner = posed
+        names.append(name)
+        if device not in cameras_of:
+            cameras_of[device] = _camera(sensors[device])
+        camera_of.append(cameras_of[device])
+        found.append(pose)
+        rig.append(f"{stamp}/{owner}")
+        time.append(_seconds(stamp, row))
+        device_of.append(device)
     if not names:
         raise InputError(f"{folder}: no record of a camera has a pose", hint="is trajectories.txt of the same data?")
     cameras, camera_id = make_cameras(camera_of, str(folder))
@@ -113,6 +117,7 @@ def read_kapture(
         anchor=anchor,
         source=str(folder),
         max_rejected=max_rejected,
+        unreadable=unposed,
     )
     progress("reading the detections", 2, 2)
     return dataset
@@ -125,6 +130,11 @@ class _Row:
 
     def wrong(self, expected: str, found: str) -> InputError:
         return InputError(f"{self.where}: expected {expected}, found {found[:60]!r}", hint=f"expected {_EXPECTED}")
+
+    def stamp(self) -> str:
+        """Return the timestamp, a whole number, in one way of writing it."""
+        text = self.fields[0]
+        return text.lstrip("0") or "0" if text.isascii() and text.isdigit() else text
 
     def pose(self, first: int) -> _Pose | None:
         """Return the pose in the fields from `first` on; None where it is not whole."""
@@ -182,7 +192,7 @@ def _trajectories(folder: Path) -> dict[tuple[str, str], _Pose]:
     for row in _table(folder, "trajectories.txt", 9):
         pose = row.pose(2)
         if pose is not None:
-            found[row.fields[0], row.fields[1]] = pose
+            found[row.stamp(), row.fields[1]] = pose
     return found
 
 
