@@ -315,10 +315,16 @@ b.jpg,52.5001,4.25,0.5,2023-11-14T22:13:21.5Z,1280,720,PINHOLE,800.5 801 640 360
     assert "timestamp: expected seconds or an ISO 8601 time, found '1700000000,25'" in said
 
 
-@pytest.mark.parametrize("digits", ["1700000000.25", "1700000000250", "1700000000250000", "1700000000250000000"])
-def test_times_as_large_as_todays_may_count_parts_of_seconds(digits: str, tmp_path: Path) -> None:
-    """Telephones and Mapillary count milliseconds, ROS nanoseconds."""
-    poses = poses_of(tmp_path, "image,lat,lon,heading_deg,timestamp", f"a.jpg,0,0,0,{digits}")
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("1700000000.25", "1700000000250", "1700000000250000", "1700000000250000000"),
+        *("2023:11:14 22:13:20.25", "2023:11:14 23:13:20.25+01:00"),
+    ],
+)
+def test_times_as_others_write_them(text: str, tmp_path: Path) -> None:
+    """Telephones and Mapillary count milliseconds, ROS nanoseconds; ExifTool writes EXIF's dates."""
+    poses = poses_of(tmp_path, "image,lat,lon,heading_deg,timestamp", f"a.jpg,0,0,0,{text}")
     times = read_csv_poses(poses, camera=CAMERA).images.timestamp_s
     assert times is not None
     assert_allclose(times, [1700000000.25], rtol=0.0, atol=1e-6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -50,6 +51,8 @@ _SKY = (0.0, 0.0, 1.0)
 _HEADINGS = ("heading_deg", "heading_rad", "yaw_deg", "yaw_rad")
 _OMEGA_PHI_KAPPA = ("omega_deg", "phi_deg", "kappa_deg")
 _UP_IN_THE_SKY_DEG = 60.0
+_EXIF_DATE = re.compile(r"^(\d{4}):(\d\d):(\d\d)(?=\s)")
+"""As ExifTool writes it."""
 _NO_DEGREES = "write decimal degrees, as 52.5123 or -0.1276, without letters and signs"
 _NO_METRES = "write metres as plain numbers, as 1234.5"
 _NO_HEIGHT = "write metres as plain numbers, or remove the column and give --camera-height"
@@ -78,9 +81,9 @@ def read_csv_poses(
     """Read a table with one row an image.
 
     Columns: `image` (name); a place, `lat, lon` in degrees or `x, y`, with `height` or `z`; an orientation; and as far
-    as known a camera, `pass`, `timestamp` (as in `seconds_of_unit`, or ISO 8601, in UTC where it says no zone), `rig`
-    (equal for images taken at one time by one car), `position_sigma_m`, `rotation_sigma_deg` and `readout_s` of the
-    camera.
+    as known a camera, `pass`, `timestamp` (as in `seconds_of_unit`, or a date of ISO 8601 or EXIF, in UTC without a
+    zone), `rig` (equal for images taken at one time by one car), `position_sigma_m`, `rotation_sigma_deg` and
+    `readout_s` of the camera.
 
     An orientation is a quaternion `qw, qx, qy, qz`; or `omega_deg, phi_deg, kappa_deg`, the angles of photogrammetry,
     which turn x (right), y (up in the picture), z (back) into the axes of the positions, about x, then the new y, then
@@ -296,7 +299,7 @@ def _seconds(text: str, table: CsvFile, row: int) -> float:
         seconds = float(table.with_points(text))
     except ValueError:
         try:
-            time = datetime.fromisoformat(text)
+            time = datetime.fromisoformat(_EXIF_DATE.sub(r"\1-\2-\3", text))
         except ValueError as error:
             raise InputError(
                 f"{table.line(row)}: timestamp: expected seconds or an ISO 8601 time, found {text[:40]!r}",
