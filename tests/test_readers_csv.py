@@ -473,6 +473,12 @@ def test_key_points_as_fractions_of_a_panorama(tmp_path: Path) -> None:
         ),
         ("image,x,y,heading_deg", "a.jpg,1e9,4,1", {"crs": "EPSG:32632"}, "is no place in it"),
         ("image,lat,lon,heading_deg,timestamp", "a.jpg,52,4,1,noon", {}, "line 2: timestamp: expected seconds"),
+        (
+            "image,lat,lon,heading_deg,timestamp",
+            "a.jpg,52,4,1,20231114221320",
+            {},
+            "line 2: timestamp: expected seconds",
+        ),
         ("image,lat,lon,qw,qx,qy,qz", "a.jpg,52,4,1,2,3,4", {}, "its quaternion is not of length 1"),
         ("image,x,y,qw,qx,qy,qz", "a.jpg,52,4,0,0,0,0", {}, "its quaternion is not of length 1"),
         ("image,x,y,qw,qx,qy,qz", "a.jpg,52,4,1e200,0,0,0", {}, "its quaternion is not of length 1"),

@@ -51,6 +51,8 @@ _SKY = (0.0, 0.0, 1.0)
 _HEADINGS = ("heading_deg", "heading_rad", "yaw_deg", "yaw_rad")
 _OMEGA_PHI_KAPPA = ("omega_deg", "phi_deg", "kappa_deg")
 _UP_IN_THE_SKY_DEG = 60.0
+_LATEST_S = 1e10
+"""In the year 2286: 20231114221320 is a date without marks, not a number of milliseconds."""
 _EXIF_DATE = re.compile(r"^(\d{4}):(\d\d):(\d\d)(?=\s)")
 """As ExifTool writes it."""
 _NO_DEGREES = "write decimal degrees, as 52.5123 or -0.1276, without letters and signs"
@@ -301,16 +303,23 @@ def _seconds(text: str, table: CsvFile, row: int) -> float:
         try:
             time = datetime.fromisoformat(_EXIF_DATE.sub(r"\1-\2-\3", text))
         except ValueError as error:
-            raise InputError(
-                f"{table.line(row)}: timestamp: expected seconds or an ISO 8601 time, found {text[:40]!r}",
-                hint="for example 1700000000.25 or 2023-11-14T22:13:20.25Z",
-            ) from error
+            raise _no_time(text, table, row) from error
         return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
     if not math.isfinite(seconds):
         raise InputError(
             f"{table.line(row)}: timestamp: expected a finite number", hint="leave it empty where not known"
         )
-    return seconds * seconds_of_unit(seconds)
+    seconds *= seconds_of_unit(seconds)
+    if seconds > _LATEST_S:
+        raise _no_time(text, table, row)
+    return seconds
+
+
+def _no_time(text: str, table: CsvFile, row: int) -> InputError:
+    return InputError(
+        f"{table.line(row)}: timestamp: expected seconds or an ISO 8601 time, found {text[:40]!r}",
+        hint="for example 1700000000.25 or 2023-11-14T22:13:20.25Z",
+    )
 
 
 def _optional(table: CsvFile, name: str) -> Floats | None:
