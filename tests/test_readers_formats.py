@@ -844,6 +844,51 @@ def test_mapillary_without_structure_from_motion_is_level_with_its_compass(tmp_p
     assert "its width or height is not above 0" in refusal(lambda: read_mapillary(tmp_path))
 
 
+@pytest.mark.parametrize("kept", ["by id", "features", "lines"])
+def test_answers_of_mapillary_as_people_keep_them(tmp_path: Path, kept: str) -> None:
+    """Asked for many ids it answers with an object of them; programs write GeoJSON, or an image a line."""
+    images = json.loads(mapillary_in(tmp_path / "asked").read_text())["data"]
+    if kept == "by id":
+        path = write(tmp_path / "images.json", json.dumps({image["id"]: image for image in images}))
+    elif kept == "features":
+        features = [
+            {"type": "Feature", "geometry": image.pop("computed_geometry"), "properties": image} for image in images
+        ]
+        for image in images:
+            del image["geometry"]
+        path = write(tmp_path / "a.geojson", json.dumps({"type": "FeatureCollection", "features": features}))
+    else:
+        lines = [*map(json.dumps, images), "", json.dumps({"__complete__": True})]
+        path = write(tmp_path / "metadata.jsonl", "\n".join(lines))
+    check_scene(read_mapillary(path, anchor=(LAT, LON, 0.0)), within_m=0.01)
+    if kept == "lines":
+        write(path, "\n".join(lines).replace('"1001"', "?"))
+        assert "metadata.jsonl line 2: cannot be read as JSON" in refusal(lambda: read_mapillary(tmp_path))
+
+
+def test_altitudes_of_mapillary_are_of_one_kind(tmp_path: Path) -> None:
+    """Computed ones count from near the ground, stated ones from the sea."""
+    path = mapillary_in(tmp_path)
+    content = json.loads(path.read_text())
+    first, second, third = content["data"]
+
+    def heights() -> list[float]:
+        write(path, json.dumps(content))
+        found: list[float] = camera_centers(read_mapillary(path, anchor=(LAT, LON, 0.0)).images)[:, 2].round(2).tolist()
+        return found
+
+    first |= {"computed_altitude": 3.0, "altitude": 80.0, "sequence": "a"}
+    second |= {"computed_altitude": None, "altitude": 81.0, "sequence": "a"}
+    third |= {"computed_altitude": 7.0, "altitude": 82.0, "sequence": "b"}
+    assert heights() == [3.0, 3.0, 7.0]
+    second["sequence"] = "c"
+    assert heights() == [3.0, 5.0, 7.0]
+    first["computed_altitude"] = third["computed_altitude"] = second["altitude"] = None
+    assert heights() == [80.0, 81.0, 82.0]
+    first["altitude"] = third["altitude"] = None
+    assert heights() == [2.0, 2.0, 2.0]
+
+
 @pytest.mark.parametrize("geometry", ["", "?", "AAAA", "GgA=", base64.b64encode(b"\x1a\xff\xff\xff").decode(), 5, None])
 def test_outlines_that_are_no_tiles(tmp_path: Path, geometry: Any) -> None:
     path = mapillary_in(tmp_path)
@@ -979,25 +1024,49 @@ def test_a_box_without_a_class_is_left_out_and_listed(tmp_path: Path, name: str)
     assert len(read(path, max_rejected=0.5).detections) == (2 if name == "mapillary" else 1)
 
 
-@pytest.mark.parametrize("name", ["opensfm", "mapillary", "panoramax"])
-def test_panoramas_that_are_cut_are_refused(tmp_path: Path, name: str) -> None:
+def test_panoramas_that_are_cut_are_refused(tmp_path: Path) -> None:
     """Their heights are angles too: taken for half a turn, all that is off the horizon is somewhere else."""
-    if name == "opensfm":
-        path = opensfm_in(tmp_path, {"projection_type": "spherical", "width": 4096, "height": 1024})
-    elif name == "mapillary":
-        path = mapillary_in(tmp_path)
-        content = json.loads(path.read_text())
-        content["data"][1] |= {"camera_type": "spherical", "camera_parameters": [], "width": 4096, "height": 1024}
-        write(path, json.dumps(content))
-    else:
-        path = panoramax_in(tmp_path)
-        write(path, path.read_text().replace("[2000, 1000]", "[4096, 1024]"))
-    read: dict[str, Callable[[Path], Any]] = {
-        "opensfm": read_opensfm,
-        "mapillary": read_mapillary,
-        "panoramax": read_panoramax,
-    }
-    assert "expected a panorama twice as wide as high, found 4096 x 1024" in refusal(lambda: read[name](path))
+    path = opensfm_in(tmp_path, {"projection_type": "spherical", "width": 4096, "height": 1024})
+    assert "expected a panorama twice as wide as high, found 4096 x 1024" in refusal(lambda: read_opensfm(path))
+
+
+LEFT_OUT: dict[str, tuple[str, dict[str, Any], str]] = {
+    "mapillary, not processed": (
+        "mapillary",
+        {"camera_parameters": None, "camera_type": None},
+        "it has no camera_type, or no camera_parameters: it was not processed, or they were not asked for",
+    ),
+    "mapillary, without parameters": ("mapillary", {"camera_parameters": []}, "it has no camera_type, or no camera_pa"),
+    "mapillary, cut": (
+        "mapillary",
+        {"camera_type": "spherical", "camera_parameters": [], "width": 4096, "height": 1024},
+        "is a panorama that is cut",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", LEFT_OUT)
+def test_images_without_a_usable_camera_are_left_out_with_their_boxes(tmp_path: Path, case: str) -> None:
+    """One of an area that somebody asked for must not stop the others."""
+    _, change, reason = LEFT_OUT[case]
+    path = mapillary_in(tmp_path)
+    content = json.loads(path.read_text())
+    content["data"][1] |= change
+    gone, read = "1001.jpg", read_mapillary
+    write(path, json.dumps(content))
+    said = refusal(lambda: read(path))
+    assert f"1 of 3 pictures cannot be used: {gone}: {reason}" in said
+    assert "--max-rejected 0.34" in said
+    dataset = read(path, max_rejected=0.34)
+    assert gone not in dataset.images.name.to_pylist()
+    assert len(dataset.detections) == len(dataset.images) == 2
+    assert dataset.rejected is not None
+    assert dataset.rejected.image_name.to_pylist() == [gone, gone]
+    assert dataset.rejected.reason.texts()[0].startswith(reason)
+    assert dataset.rejected.reason.texts()[1] == "its image was left out"
+    # Boxes of a file of their own, too.
+    names = ["1000.jpg", "1001.jpg", "1002.jpg"]
+    assert len(read(path, detections=boxes(tmp_path, names), max_rejected=0.34).detections) == 2
 
 
 def test_poses_without_numbers_are_not_interpolated() -> None:

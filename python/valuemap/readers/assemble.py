@@ -104,7 +104,7 @@ def assemble(
     unposed
         Why images have no pose, by row, where poses were to be found: they do not count toward that share.
     unreadable
-        Why pictures are not even in `images`, by name; they are listed.
+        Why pictures are not even in `images`, by name; they and their boxes are listed.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def assemble(
     posed, usable = vet_images(images, rejections, where_image, unposed)
     if isinstance(detections, FoundBoxes):
         detections = detections.filed(images.name)
-    boxes = vet_boxes(detections, images, usable, cameras, rejections)
+    boxes = vet_boxes(detections, images, usable, cameras, rejections, list(unreadable or ()))
     unframed = Dataset(
         name=name,
         frame=Frame(),

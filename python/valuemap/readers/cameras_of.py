@@ -13,6 +13,7 @@ from valuemap.readers.pixel_center import shift_to_corner_px
 from valuemap.tables import Cameras, Categories, Floats, Ints
 
 _LARGEST_PX = 1_000_000
+CUT_PANORAMA = "is a panorama that is cut: it does not show the whole sphere"
 _ROUNDING_PX = 2
 """Each side may be a pixel off where pictures were made smaller: two of the width for one of the height."""
 
@@ -31,6 +32,11 @@ class Camera:
     readout_s: float | None = None
 
 
+def is_whole_panorama(width: int, height: int) -> bool:
+    """Return whether an equirectangular picture shows the whole sphere, as its pixels are as wide as high."""
+    return abs(width - 2 * height) <= _ROUNDING_PX
+
+
 def panorama(width: int, height: int, where: str) -> Camera:
     """Return the camera of an equirectangular picture whose pixels are as wide as high, `where` it stands.
 
@@ -41,7 +47,7 @@ def panorama(width: int, height: int, where: str) -> Camera:
     InputError
         It is not twice as wide as high.
     """
-    if abs(width - 2 * height) > _ROUNDING_PX:
+    if not is_whole_panorama(width, height):
         raise InputError(
             f"{where}: expected a panorama twice as wide as high, found {width} x {height} pixels",
             hint="those that are cut are not read: leave their images out",

@@ -13,6 +13,7 @@ from PIL import Image, UnidentifiedImageError
 from PIL.ExifTags import GPS, IFD, Base
 
 from valuemap.errors import InputError
+from valuemap.readers.cameras_of import is_whole_panorama
 
 _FILM_WIDTH_MM = 36.0
 _LARGEST_PX = 200_000_000
@@ -208,8 +209,4 @@ def _is_cut(pano: dict[str, float], width: int, height: int) -> bool:
     """Return whether an equirectangular picture is not of the whole sphere, by its tags or by its shape."""
     sides = ((f"CroppedAreaImage{side}Pixels", f"FullPano{side}Pixels") for side in ("Width", "Height"))
     by_tags = any(part in pano and whole in pano and pano[part] != pano[whole] for part, whole in sides)
-    return by_tags or abs(width - 2 * height) > _ROUNDING_PX
-
-
-_ROUNDING_PX = 2
-"""By which the sides of a picture that was made smaller may miss 2 to 1."""
+    return by_tags or not is_whole_panorama(width, height)

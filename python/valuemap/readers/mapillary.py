@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,19 +12,25 @@ from scipy.spatial.transform import Rotation
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
-from valuemap.readers.cameras_of import Camera, make_cameras, panorama
+from valuemap.readers.cameras_of import CUT_PANORAMA, Camera, is_whole_panorama, make_cameras, panorama
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.exif import ROLL_DEG
-from valuemap.readers.files import check_file, file_in, read_json
+from valuemap.readers.files import file_in, read_json
+from valuemap.readers.json_documents import documents_of, files_of
 from valuemap.readers.json_values import Json, Told
 from valuemap.readers.poses import local_from_cam, make_images, place_on_earth
 from valuemap.readers.reader import Reader
 from valuemap.readers.vector_tile import outline_of_tile
+from valuemap.readers.vet import refuse_too_many_unreadable
 from valuemap.tables import Floats, Images
 
 _EXPECTED = "JSON of Mapillary's API v4: an image, or data: a list of images, each with id, geometry and camera_type"
+_IN_FOLDERS = (".json", ".jsonl", ".ndjson")
 _MILLI = 1e-3
-_HEIGHT_WITHOUT_SFM_M = 2.0
+_HEIGHT_WITHOUT_ANY_M = 2.0
+_END_OF_DOWNLOAD = "__complete__"
+"""What mapillary_downloader writes behind the images."""
+_NO_CAMERA = "it has no camera_type, or no camera_parameters: it was not processed, or they were not asked for"
 
 _STORED: dict[int, Callable[[float, float, float, float], list[float]]] = {
     3: lambda left, top, right, bottom: [1.0 - right, 1.0 - bottom, 1.0 - left, 1.0 - top],
@@ -43,7 +49,9 @@ class _Found:
     names: list[str] = field(default_factory=list)
     cameras: list[Camera] = field(default_factory=list)
     orientation: list[int] = field(default_factory=list)
-    place: list[list[float]] = field(default_factory=list)
+    lon_lat: list[list[float]] = field(default_factory=list)
+    computed_height_m: list[float] = field(default_factory=list)
+    stated_height_m: list[float] = field(default_factory=list)
     rotation: list[Floats] = field(default_factory=list)
     passes: list[str] = field(default_factory=list)
     time: list[float] = field(default_factory=list)
@@ -51,6 +59,7 @@ class _Found:
     classes: list[str] = field(default_factory=list)
     edges: list[list[float]] = field(default_factory=list)
     where: list[str] = field(default_factory=list)
+    unreadable: dict[str, str] = field(default_factory=dict)
 
 
 @Reader
@@ -65,10 +74,17 @@ def read_mapillary(
     """Read JSON that the API answered with: the fields asked for, for one image or for many; nothing is fetched.
 
     Positions are `computed_geometry` and `computed_altitude` where structure from motion has them, else `geometry`.
+    Computed altitudes count from near the ground and stated ones from the sea: as soon as one image has a computed one,
+    the others have the median of their sequence, else of all.
+
     The rotation is `computed_rotation`, axis-angle from east, north, up at the image into the camera, else level with
     `computed_compass_angle` or `compass_angle`. `camera_parameters` are focal length over the larger side, k1, k2.
     Passes are sequences, images are named `ID.jpg`, and `captured_at` is in milliseconds. Cameras, rotations and sizes
     are those of pictures as stored, compass angles and outlines those of pictures turned by `exif_orientation`.
+    An image without a camera, or of a panorama that is cut, is left out.
+
+    Answers are an image, a list of images, in `data` too, an object of images by their ids, or GeoJSON with what is
+    known of an image as its properties; or one of these a line.
 
     Detections are lists of `value` and `geometry` (a vector tile as base64), in `detections` of an image, or in a file
     `detections.json` beside the export: an object of image ids with such lists, or a list of `data` with `image`.
@@ -76,7 +92,7 @@ def read_mapillary(
     Parameters
     ----------
     export
-        A JSON file, or a folder of them.
+        A file of JSON, or of a JSON document a line (`.jsonl`, `.ndjson`), or a folder of them.
     detections
         As in `read_detections`, instead of Mapillary's own; images are named by their ids.
     anchor
@@ -85,27 +101,32 @@ def read_mapillary(
     Raises
     ------
     InputError
-        A file is missing, damaged or of another format, or an image has no size or camera.
+        A file is missing, damaged or of another format, an image has no size, or too many have no camera.
     """
-    paths = (
-        [file_in(export, path.name, _EXPECTED) for path in sorted(export.glob("*.json")) if path.stem != "detections"]
-        if export.is_dir()
-        else [check_file(export, _EXPECTED)]
-    )
-    if not paths:
-        raise InputError(f"{export}: there are no JSON files in it", hint=f"expected {_EXPECTED}")
+    paths = files_of(export, _IN_FOLDERS, _EXPECTED, besides="detections")
     found = _Found()
     for number, path in enumerate(paths):
         progress("reading Mapillary's answers", number, len(paths))
-        for image in _entries(Json(read_json(path, _EXPECTED), str(path), f"expected {_EXPECTED}")):
-            _add_image(image, found)
+        for answer in documents_of(path, _EXPECTED):
+            for image in _images(answer):
+                _add_image(image, found)
+    refuse_too_many_unreadable(
+        found.unreadable,
+        len(found.ids) + len(found.unreadable),
+        max_rejected,
+        str(export),
+        "ask for the fields camera_type and camera_parameters"
+        if _NO_CAMERA in found.unreadable.values()
+        else "panoramas that are cut are not read",
+    )
     if not found.ids:
         raise InputError(f"{export}: there are no images in it", hint=f"expected {_EXPECTED}")
     folder = export if export.is_dir() else export.parent
     if (folder / "detections.json").exists():
         _add_detections(file_in(folder, "detections.json", "Mapillary's detections"), found)
     first = min(range(len(found.ids)), key=found.names.__getitem__)
-    placed = place_on_earth(np.array(found.place), anchor, first, source=str(export))
+    place = np.column_stack([np.array(found.lon_lat), _heights(found)])
+    placed = place_on_earth(place, anchor, first, source=str(export))
     cameras, camera_id = make_cameras(found.cameras, str(export))
     images = make_images(
         names=found.names,
@@ -126,9 +147,29 @@ def read_mapillary(
         is_on_earth=True,
         source=str(export),
         max_rejected=max_rejected,
+        unreadable=found.unreadable,
     )
     progress("reading Mapillary's answers", len(paths), len(paths))
     return dataset
+
+
+def _images(answer: Json) -> list[Json]:
+    """Return the images of an answer: as `_entries`, or by their ids, or as features."""
+    if not isinstance(answer.value, dict):
+        return list(answer.entries())
+    if "features" in answer:
+        return [_of_feature(feature) for feature in answer["features"].entries()]
+    if answer.value.get("type") == "Feature":
+        return [_of_feature(answer)]
+    if answer.value and all(key.isdecimal() and isinstance(value, dict) for key, value in answer.value.items()):
+        return [image for _, image in answer.items()]
+    return [] if list(answer.value) == [_END_OF_DOWNLOAD] else _entries(answer)
+
+
+def _of_feature(feature: Json) -> Json:
+    """Return the image of a feature of GeoJSON."""
+    properties = feature["properties"]
+    return replace(properties, value={"geometry": feature.object().get("geometry"), **properties.object()})
 
 
 def _entries(content: Json) -> list[Json]:
@@ -146,45 +187,70 @@ def _add_image(image: Json, found: _Found) -> None:
     orientation = image["exif_orientation"].whole() if "exif_orientation" in image else 1
     point = next((image[name] for name in ("computed_geometry", "geometry") if name in image), None)
     lon, lat = (np.nan, np.nan) if point is None else point["coordinates"].numbers(2)
-    altitude = next(
-        (image[name].number() for name in ("computed_altitude", "altitude") if name in image), _HEIGHT_WITHOUT_SFM_M
-    )
+    heights_m = [image[name].number() if name in image else np.nan for name in ("computed_altitude", "altitude")]
     if "computed_rotation" in image:
         rotation = Rotation.from_rotvec(image["computed_rotation"].numbers(3)).inv().as_matrix()
     else:
         angles = ("computed_compass_angle", "compass_angle")
         heading = np.radians([next((image[name].number() for name in angles if name in image), np.nan)])
         rotation = local_from_cam(heading, np.zeros(1), np.radians([ROLL_DEG.get(orientation, 0.0)]))[0]
-    camera, place = _camera(image, width, height), [float(lon), float(lat), altitude]
+    camera, place = _camera(image, width, height), [float(lon), float(lat), *heights_m]
     sequence = image.get("sequence")
     name = ONE_PASS if sequence is None else _sequence(sequence)
     time = image["captured_at"].number() * _MILLI if "captured_at" in image else np.nan
     boxes = _entries(image["detections"]) if "detections" in image else []
     if found.told.again(key, camera, orientation, place, rotation.tolist(), name, time, [box.value for box in boxes]):
         return
+    for detection in boxes:
+        _add_box(detection, key, found)
+    if isinstance(camera, str):
+        found.unreadable[f"{key}.jpg"] = camera
+        return
     found.ids.append(key)
     found.names.append(f"{key}.jpg")
     found.cameras.append(camera)
     found.orientation.append(orientation)
-    found.place.append(place)
+    found.lon_lat.append(place[:2])
+    found.computed_height_m.append(heights_m[0])
+    found.stated_height_m.append(heights_m[1])
     found.rotation.append(rotation)
     found.passes.append(name)
     found.time.append(time)
-    for detection in boxes:
-        _add_box(detection, key, found)
+
+
+def _heights(found: _Found) -> Floats:
+    """Return the heights (N) of images, of one kind: what computed ones count from, stated ones do not."""
+    for given in (found.computed_height_m, found.stated_height_m):
+        heights_m = np.array(given)
+        known = np.isfinite(heights_m)
+        if known.any():
+            break
+    else:
+        return np.full(len(found.ids), _HEIGHT_WITHOUT_ANY_M)
+    passes = np.array(found.passes)
+    of_all_m = np.median(heights_m[known])
+    for name in sorted(set(passes[~known].tolist())):
+        of_pass = passes == name
+        heights_m[of_pass & ~known] = np.median(own) if len(own := heights_m[of_pass & known]) else of_all_m
+    return heights_m
 
 
 def _sequence(value: Json) -> str:
     return value["id"].key() if isinstance(value.value, dict) else value.key()
 
 
-def _camera(image: Json, width: int, height: int) -> Camera:
+def _camera(image: Json, width: int, height: int) -> Camera | str:
+    """Return the camera, or why there is none."""
+    if "camera_type" not in image:
+        return _NO_CAMERA
     kind = image["camera_type"].text()
     if kind in ("spherical", "equirectangular"):
-        return panorama(width, height, image.where)
+        return panorama(width, height, image.where) if is_whole_panorama(width, height) else CUT_PANORAMA
     if kind not in ("perspective", "fisheye", "brown"):
         raise image["camera_type"].wrong("expected perspective, fisheye, spherical or equirectangular")
-    values = [entry.number() for entry in image["camera_parameters"].entries()]
+    values = [entry.number() for entry in image["camera_parameters"].entries()] if "camera_parameters" in image else []
+    if not values:
+        return _NO_CAMERA
     if kind == "brown" or len(values) not in (1, 2, 3):
         raise image["camera_parameters"].wrong("expected focal length, k1 and k2")
     focal, k1, k2 = (*values, 0.0, 0.0)[:3]

@@ -15,13 +15,14 @@ from valuemap.errors import InputError, SettingError
 from valuemap.geodesy import lon_lat_height_from_crs, with_heights
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
-from valuemap.readers.cameras_of import Camera, make_cameras, parse_camera
+from valuemap.readers.cameras_of import CUT_PANORAMA, Camera, make_cameras, parse_camera
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.exif import Exif, check_whole, read_exif
 from valuemap.readers.files import check_folder, check_names, file_in
 from valuemap.readers.poses import Placed, local_from_cam, make_images, place_on_earth
 from valuemap.readers.reader import Reader
 from valuemap.readers.structure import Picture, Posed, find_poses
+from valuemap.readers.vet import refuse_too_many_unreadable
 from valuemap.tables import Floats
 
 PosesFrom = Literal["auto", "sfm", "exif"]
@@ -29,9 +30,7 @@ _SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 _EXPECTED = f"a folder of pictures: {', '.join(_SUFFIXES)}"
 _FOCAL_GUESS = 1.2
 """Focal length over the larger side where nothing is known: about 45 degrees."""
-_SHOWN = 3
 _NO_PLACE = "it has no GPS position"
-_CUT = "is a panorama that is cut: it does not show the whole sphere"
 _TURNED = (
     "it was taken on its side or upside down (EXIF orientation), and structure from motion takes cameras for level"
 )
@@ -216,17 +215,12 @@ def _read_all(
             unreadable[name] = str(error).removeprefix(f"{path}: ")
         else:
             if exif.is_cut and not is_whole:
-                unreadable[name] = _CUT
+                unreadable[name] = CUT_PANORAMA
                 continue
             found.append(exif)
             names.append(name)
     progress("reading the pictures' tags", len(paths), len(paths))
-    if len(unreadable) > max_rejected * len(paths):
-        shown = "; ".join(f"{name}: {reason}" for name, reason in list(unreadable.items())[:_SHOWN])
-        raise InputError(
-            f"{folder}: {len(unreadable)} of {len(paths)} pictures cannot be used: {shown}",
-            hint="remove or replace them; or leave them out with --max-rejected",
-        )
+    refuse_too_many_unreadable(unreadable, len(paths), max_rejected, str(folder), "remove or replace them")
     check_names(names, str(folder))
     passes = [str(parent) if str(parent := PurePosixPath(name).parent) != "." else ONE_PASS for name in names]
     # Driving order: by time where a whole folder has times, else by name.

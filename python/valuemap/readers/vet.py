@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from valuemap.errors import InputError, SettingError
 from valuemap.readers import row_file
 from valuemap.readers.boxes import FiledBoxes, are_distinct, structure
+from valuemap.readers.names import match_images
 from valuemap.readers.row_file import PartFile, RowFile, Rows, bounds_by_count
 from valuemap.tables import Bools, Cameras, Categories, Detections, Floats, Images, Ints, RejectedRows
 
@@ -269,8 +270,27 @@ def vet_images(
     return (images if why.fine.all() else images.take(why.fine)), why.fine
 
 
+def refuse_too_many_unreadable(
+    reason_of: Mapping[str, str], total: int, max_share: float, source: str, hint: str
+) -> None:
+    """Raise `InputError` where too many of all pictures (`total`) cannot be used, by their names; `hint` helps."""
+    if not reason_of or (len(reason_of) < total and len(reason_of) <= max_share * total):
+        return
+    shown = "; ".join(f"{name}: {_text(reason)}" for name, reason in list(reason_of.items())[:_SHOWN_REASONS])
+    share = np.ceil(100.0 * len(reason_of) / total) / 100.0
+    way_round = f"; or leave them out with --max-rejected {share:g}" if len(reason_of) < total else ""
+    raise InputError(
+        f"{source}: {len(reason_of)} of {total} pictures cannot be used: {shown}", hint=f"{hint}{way_round}"
+    )
+
+
 def vet_boxes(
-    boxes: FiledBoxes, images: Images, usable: Bools, cameras: Cameras, rejections: Rejections
+    boxes: FiledBoxes,
+    images: Images,
+    usable: Bools,
+    cameras: Cameras,
+    rejections: Rejections,
+    unreadable: Collection[str] = (),
 ) -> Callable[[], Iterator[Detections]]:
     """Return what yields the boxes that can be used, numbered and in portions; the others go to the rejections.
 
@@ -278,7 +298,11 @@ def vet_boxes(
     by their ids. What is between lies in temporary files.
 
     `images` are those that `image_row` counts, with all that were left out; `usable` (N) says which were not.
+    `unreadable` are names of pictures that are not even among them.
     """
+    missing = {boxes.image_names[code] for code in np.flatnonzero(boxes.image_row < 0).tolist()}
+    gone = match_images(missing, list(unreadable)) if unreadable else {}
+    is_gone = np.array([name in gone for name in boxes.image_names], np.bool_) & (boxes.image_row < 0)
     by_id = np.argsort(images.image_id, kind="stable")
     rank = np.empty(len(images), np.int64)
     rank[by_id] = np.arange(len(images))
@@ -297,7 +321,7 @@ def vet_boxes(
     for first, portion in boxes.portions():
         of = boxes.image_row[portion["image"]]
         kind = class_code[portion["class"]]
-        why = judge.verdicts(portion, of, kind == code_of.get("", -1), left_out.reasons)
+        why = judge.verdicts(portion, of, is_gone[portion["image"]], kind == code_of.get("", -1), left_out.reasons)
         left_out.note(first + np.flatnonzero(~why.fine), why.code[~why.fine].astype(np.int64), kind[~why.fine])
         fine = np.empty(int(why.fine.sum()), of_image.dtype)
         for name in ("center", "size", "score", *more):
@@ -359,10 +383,13 @@ class _Judge:
             f"images are matched by file name, as in {str(images.name[0].as_py())!r}: correct the names",
         )
 
-    def verdicts(self, portion: Rows, image_row: Ints, has_no_class: Bools, reasons: list[_Reason]) -> Verdicts:
+    def verdicts(
+        self, portion: Rows, image_row: Ints, is_gone: Bools, has_no_class: Bools, reasons: list[_Reason]
+    ) -> Verdicts:
         """Return what is wrong with each box."""
         why = Verdicts(len(portion), reasons)
         center, size, score = portion["center"], portion["size"], portion["score"]
+        why.mark(is_gone, _LEFT_OUT)
         why.mark(image_row < 0, self._no_image)
         why.mark((image_row >= 0) & ~self._usable[image_row], _LEFT_OUT)
         why.mark(~np.isfinite(np.column_stack([center, size, score])).all(axis=1), _NOT_FINITE)
