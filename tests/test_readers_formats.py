@@ -952,6 +952,59 @@ def test_panoramax(tmp_path: Path) -> None:
     assert_allclose(camera_centers(by_key.images)[1], away[0], atol=1e-9)
 
 
+def test_classes_and_scores_of_panoramax_as_it_gives_them(tmp_path: Path) -> None:
+    """Tags come in the order of their keys: what a detector says of its tags stands before them."""
+    sign = "osm|traffic_sign"
+    told = {
+        "a=1": ([f"detection_confidence[{sign}=yes]=0.3", f"detection_model[{sign}=yes]=m/1", f"{sign}=yes"], 0.3),
+        "b=2": ([f"classification_confidence[{sign}=A[1]]=0.5", f"{sign}=A[1]"], 0.5),
+        "c=3": (
+            [
+                f"classification_confidence[{sign}=A]=0.5",
+                f"detection_confidence[{sign}=yes]=0.4",
+                f"{sign}=yes",
+                f"{sign}=A",
+            ],
+            0.4,
+        ),
+        "d=4": ([f"detection_confidence[{sign}=*]=0.6", f"{sign}=A"], 0.6),
+        "e=5": (["detection_confidence[osm|amenity=bench]=0.2", f"{sign}=A"], 1.0),
+    }
+    path = panoramax_in(tmp_path)
+    content = json.loads(path.read_text())
+    del content["features"][1]
+    content["features"][0]["properties"]["annotations"] = [
+        {
+            "shape": [100 * i, 100, 100 * i + 20, 120],
+            "semantics": [dict(zip(("key", "value"), tag.rsplit("=", 1), strict=True)) for tag in tags],
+        }
+        for i, (tags, _) in enumerate(told.values())
+    ]
+    boxes = read_panoramax(write(path, json.dumps(content))).detections
+    values = ["yes", "A[1]", "A", "A", "A"]
+    assert boxes.class_name.texts() == [f"{sign}={value}" for value in values]
+    assert boxes.score.tolist() == [score for _, score in told.values()]
+    assert read_panoramax(path, class_key=sign).detections.class_name.texts() == values
+    content["features"][0]["properties"]["annotations"][0]["semantics"][0]["value"] = "high"
+    write(path, json.dumps(content))
+    assert "a number is missing or not finite" in refusal(lambda: read_panoramax(path))
+
+
+@pytest.mark.parametrize("kept", ["list", "lines"])
+def test_older_panoramas_of_panoramax_are_as_large_as_their_tiles(tmp_path: Path, kept: str) -> None:
+    """They say that they show all round, and not how large they are; a list of items, or one a line, will do."""
+    whole = read_panoramax(panoramax_in(tmp_path / "whole"))
+    items = json.loads((tmp_path / "whole" / "items.json").read_text())["features"]
+    del items[0]["properties"]["pers:interior_orientation"]["sensor_array_dimensions"]
+    level = {"tileWidth": 62.5, "tileHeight": 125, "matrixWidth": 32, "matrixHeight": 8}
+    items[0]["properties"]["tiles:tile_matrix_sets"] = {"geovisio": {"tileMatrix": [level]}}
+    if kept == "list":
+        path = write(tmp_path / "items.json", json.dumps(items))
+    else:
+        path = write(tmp_path / "items.ndjson", "\n".join(map(json.dumps, items)))
+    assert_allclose(azimuths_deg(read_panoramax(path)), azimuths_deg(whole))
+
+
 @pytest.mark.parametrize("missing", ["place", "heading"])
 @pytest.mark.parametrize("name", ["mapillary", "panoramax"])
 def test_an_image_without_a_pose_is_left_out_and_listed(tmp_path: Path, name: str, missing: str) -> None:
@@ -1042,31 +1095,67 @@ LEFT_OUT: dict[str, tuple[str, dict[str, Any], str]] = {
         {"camera_type": "spherical", "camera_parameters": [], "width": 4096, "height": 1024},
         "is a panorama that is cut",
     ),
+    "panoramax, without a size": (
+        "panoramax",
+        {"pers:interior_orientation": {"field_of_view": 90}},
+        "it has no size",
+    ),
+    "panoramax, without a field of view": (
+        "panoramax",
+        {"pers:interior_orientation": {"sensor_array_dimensions": [800, 600]}},
+        "it has no field_of_view",
+    ),
+    "panoramax, without a camera": ("panoramax", {"pers:interior_orientation": {}}, "it has no size"),
+    "panoramax, too wide": (
+        "panoramax",
+        {"pers:interior_orientation": {"field_of_view": 215, "sensor_array_dimensions": [800, 600]}},
+        "its field_of_view is not that of a pinhole",
+    ),
+    "panoramax, not twice as wide as high": (
+        "panoramax",
+        {"pers:interior_orientation": {"field_of_view": 360, "sensor_array_dimensions": [4096, 1024]}},
+        "is a panorama that is cut",
+    ),
+    "panoramax, a part of the whole": (
+        "panoramax",
+        {
+            "pers:interior_orientation": {
+                "field_of_view": 360,
+                "sensor_array_dimensions": [4096, 2048],
+                "visible_area": [0, 512, 0, 512],
+            }
+        },
+        "is a panorama that is cut",
+    ),
 }
 
 
 @pytest.mark.parametrize("case", LEFT_OUT)
 def test_images_without_a_usable_camera_are_left_out_with_their_boxes(tmp_path: Path, case: str) -> None:
     """One of an area that somebody asked for must not stop the others."""
-    _, change, reason = LEFT_OUT[case]
-    path = mapillary_in(tmp_path)
+    name, change, reason = LEFT_OUT[case]
+    path = (mapillary_in if name == "mapillary" else panoramax_in)(tmp_path)
     content = json.loads(path.read_text())
-    content["data"][1] |= change
-    gone, read = "1001.jpg", read_mapillary
+    gone, total = ("1001.jpg", 3) if name == "mapillary" else ("b.jpg", 2)
+    (content["data"][1] if name == "mapillary" else content["features"][1]["properties"]).update(change)
+    read: Callable[..., Any] = read_mapillary if name == "mapillary" else read_panoramax
     write(path, json.dumps(content))
     said = refusal(lambda: read(path))
-    assert f"1 of 3 pictures cannot be used: {gone}: {reason}" in said
-    assert "--max-rejected 0.34" in said
-    dataset = read(path, max_rejected=0.34)
+    assert f"1 of {total} pictures cannot be used: {gone}: {reason}" in said
+    assert f"--max-rejected {0.34 if total == 3 else 0.5}" in said
+    dataset = read(path, max_rejected=0.5)
     assert gone not in dataset.images.name.to_pylist()
-    assert len(dataset.detections) == len(dataset.images) == 2
+    assert len(dataset.detections) == len(dataset.images) == total - 1
     assert dataset.rejected is not None
     assert dataset.rejected.image_name.to_pylist() == [gone, gone]
     assert dataset.rejected.reason.texts()[0].startswith(reason)
     assert dataset.rejected.reason.texts()[1] == "its image was left out"
     # Boxes of a file of their own, too.
-    names = ["1000.jpg", "1001.jpg", "1002.jpg"]
-    assert len(read(path, detections=boxes(tmp_path, names), max_rejected=0.34).detections) == 2
+    names = ["1000", "1001", "1002"] if name == "mapillary" else ["a", "b"]
+    table = "\n".join(["image,x1,y1,x2,y2", *(f"{each}.jpg,10,10,20,20" for each in names)])
+    of_file = read(path, detections=write(tmp_path / "boxes.csv", table), max_rejected=0.5)
+    assert len(of_file.detections) == total - 1
+    assert len(of_file.rejected) == 2
 
 
 def test_poses_without_numbers_are_not_interpolated() -> None:

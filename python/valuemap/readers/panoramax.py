@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,16 +13,24 @@ import numpy as np
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
-from valuemap.readers.cameras_of import Camera, make_cameras, panorama
+from valuemap.readers.cameras_of import CUT_PANORAMA, Camera, is_whole_panorama, make_cameras, panorama
 from valuemap.readers.detections import DetectionFile, read_detections
-from valuemap.readers.files import check_file, file_in, read_json
+from valuemap.readers.json_documents import LINES, documents_of, files_of
 from valuemap.readers.json_values import Json, Told
 from valuemap.readers.poses import height_where_none, local_from_cam, make_images, place_on_earth
 from valuemap.readers.reader import Reader
+from valuemap.readers.vet import refuse_too_many_unreadable
 from valuemap.tables import Images
 
 _EXPECTED = "JSON of Panoramax: a STAC item, or a collection of features with geometry, properties and id"
+_IN_FOLDERS = (".json", ".geojson", *LINES)
 _WHOLE_TURN_DEG = 360.0
+_WIDEST_DEG = 170.0
+_NO_SIZE = "it has no size: neither sensor_array_dimensions nor, of a panorama, tiles"
+_NO_VIEW = "it has no field_of_view"
+_TOO_WIDE = f"its field_of_view is not that of a pinhole: not between 0 and {_WIDEST_DEG:g} degrees"
+_QUALIFIER = re.compile(r"([^\[]+)\[(.+)\]")
+"""A tag about another tag, such as `detection_confidence[osm|traffic_sign=stop]`."""
 
 
 @dataclass
@@ -36,10 +45,12 @@ class _Found:
     passes: list[str] = field(default_factory=list)
     time: list[float] = field(default_factory=list)
     sigma_m: list[float] = field(default_factory=list)
-    image_of_box: list[int] = field(default_factory=list)
+    image_of_box: list[str] = field(default_factory=list)
     classes: list[str] = field(default_factory=list)
+    scores: list[float] = field(default_factory=list)
     edges: list[list[float]] = field(default_factory=list)
     where: list[str] = field(default_factory=list)
+    unreadable: dict[str, str] = field(default_factory=dict)
 
 
 @Reader
@@ -57,16 +68,20 @@ def read_panoramax(
 
     The heading of the middle of a picture is `view:azimuth`; `pers:pitch` and `pers:roll` are used where they are
     there. `pers:interior_orientation` has the size (`sensor_array_dimensions`) and the horizontal `field_of_view`: 360
-    degrees is a panorama, less a pinhole camera. `quality:horizontal_accuracy` is the deviation of the position. Passes
-    are collections, and images are named `ID.jpg`. Positions have no height but `camera_height_m`, unless they do.
+    degrees is a panorama, less a pinhole camera. What has tiles is a panorama too, as large as they are where nothing
+    else says it. `quality:horizontal_accuracy` is the deviation of the position. Passes are collections, and images are
+    named `ID.jpg`. Positions have no height but `camera_height_m`, unless they do. Items without a size or a field of
+    view, and panoramas that are cut, are left out.
 
     Annotations are `shape`s in pixels from the top left, polygons or four numbers, whose class is the value of the
-    semantic tag `class_key`, or else `KEY=VALUE` of the first tag.
+    semantic tag `class_key`, or else `KEY=VALUE` of the first tag; what a value says counts before `yes`. Tags about
+    others, as `detection_confidence[KEY=VALUE]`, are no classes. The score is what is told of the tag: its
+    `detection_confidence`, else that of its key, else its `classification_confidence`, else 1.
 
     Parameters
     ----------
     export
-        A JSON file, or a folder of them.
+        A file of JSON, or of a JSON document a line (`.jsonl`, `.ndjson`), or a folder of them.
     detections
         As in `read_detections`, instead of the annotations; images are named by their ids.
     anchor
@@ -75,25 +90,25 @@ def read_panoramax(
     Raises
     ------
     InputError
-        A file is missing, damaged or of another format, or an item lacks its size or field of view.
+        A file is missing, damaged or of another format, or too many items have no camera.
     SettingError
         `camera_height_m` is no number.
     """
     level_m = height_where_none(camera_height_m)
-    paths = (
-        [file_in(export, path.name, _EXPECTED) for path in sorted(export.glob("*.*json"))]
-        if export.is_dir()
-        else [check_file(export, _EXPECTED)]
-    )
-    if not paths:
-        raise InputError(f"{export}: there are no JSON files in it", hint=f"expected {_EXPECTED}")
+    paths = files_of(export, _IN_FOLDERS, _EXPECTED)
     found = _Found()
     for number, path in enumerate(paths):
         progress("reading the items", number, len(paths))
-        content = Json(read_json(path, _EXPECTED), str(path), f"expected {_EXPECTED}")
-        items = [content] if content.object().get("type") == "Feature" else list(content["features"].entries())
-        for item in items:
-            _add_item(item, found, class_key, level_m)
+        for answer in documents_of(path, _EXPECTED):
+            for item in _items(answer):
+                _add_item(item, found, class_key, level_m)
+    refuse_too_many_unreadable(
+        found.unreadable,
+        len(found.ids) + len(found.unreadable),
+        max_rejected,
+        str(export),
+        "import pictures reads what the tags of the pictures themselves say",
+    )
     if not found.ids:
         raise InputError(f"{export}: there are no items in it", hint=f"expected {_EXPECTED}")
     names = [f"{key}.jpg" for key in found.ids]
@@ -114,15 +129,23 @@ def read_panoramax(
         name=export.stem,
         cameras=cameras,
         images=images,
-        detections=_boxes(found, names, images) if detections is None else read_detections(detections, images, cameras),
+        detections=_boxes(found, images) if detections is None else read_detections(detections, images, cameras),
         up=None,
         anchor=placed.anchor,
         is_on_earth=True,
         source=str(export),
         max_rejected=max_rejected,
+        unreadable=found.unreadable,
     )
     progress("reading the items", len(paths), len(paths))
     return dataset
+
+
+def _items(answer: Json) -> list[Json]:
+    """Return the items of an answer: one, a list, or a collection of features."""
+    if isinstance(answer.value, list):
+        return list(answer.entries())
+    return [answer] if answer.object().get("type") == "Feature" else list(answer["features"].entries())
 
 
 def _add_item(item: Json, found: _Found, class_key: str | None, camera_height_m: float) -> None:
@@ -140,6 +163,16 @@ def _add_item(item: Json, found: _Found, class_key: str | None, camera_height_m:
     annotations = [] if holder is None else list(holder["annotations"].entries())
     if found.told.again(key, camera, place, angles_deg, collection, time, sigma, [each.value for each in annotations]):
         return
+    for annotation in annotations:
+        kind, score = _class(annotation, class_key)
+        found.image_of_box.append(f"{key}.jpg")
+        found.classes.append(kind)
+        found.scores.append(score)
+        found.edges.append(_edges(annotation["shape"]))
+        found.where.append(annotation.where)
+    if isinstance(camera, str):
+        found.unreadable[f"{key}.jpg"] = camera
+        return
     found.ids.append(key)
     found.cameras.append(camera)
     found.place.append(place)
@@ -147,11 +180,6 @@ def _add_item(item: Json, found: _Found, class_key: str | None, camera_height_m:
     found.passes.append(collection)
     found.time.append(time)
     found.sigma_m.append(sigma if sigma > 0.0 else math.nan)
-    for annotation in annotations:
-        found.image_of_box.append(len(found.ids) - 1)
-        found.classes.append(_class(annotation, class_key))
-        found.edges.append(_edges(annotation["shape"]))
-        found.where.append(annotation.where)
 
 
 def _place(coordinates: Json, camera_height_m: float) -> list[float]:
@@ -164,16 +192,45 @@ def _number(properties: Json, name: str, default: float) -> float:
     return properties[name].number() if name in properties else default
 
 
-def _camera(properties: Json) -> Camera:
-    orientation = properties["pers:interior_orientation"]
-    width, height = (int(value) for value in orientation["sensor_array_dimensions"].numbers(2))
-    view_deg = orientation["field_of_view"].number()
-    if view_deg == _WHOLE_TURN_DEG:
-        return panorama(width, height, orientation.where)
-    if not 0.0 < view_deg < 170.0:
-        raise orientation["field_of_view"].wrong("expected degrees, 360 for a panorama, else below 170")
+def _camera(properties: Json) -> Camera | str:
+    """Return the camera, or why there is none."""
+    orientation = properties.get("pers:interior_orientation")
+    tiled_px = _tiled_px(properties)
+    view = None if orientation is None else orientation.get("field_of_view")
+    view_deg = math.nan if view is None else view.number()
+    if orientation is not None and "sensor_array_dimensions" in orientation:
+        width, height = (int(value) for value in orientation["sensor_array_dimensions"].numbers(2))
+    elif tiled_px is not None:
+        width, height = tiled_px
+    else:
+        return _NO_SIZE
+    is_cut = orientation is not None and "visible_area" in orientation and orientation["visible_area"].numbers(4).any()
+    if view_deg == _WHOLE_TURN_DEG or tiled_px is not None or is_cut:
+        is_whole = is_whole_panorama(width, height) and not is_cut
+        return panorama(width, height, properties.where) if is_whole else CUT_PANORAMA
+    if not 0.0 < view_deg < _WIDEST_DEG:
+        return _NO_VIEW if view is None else _TOO_WIDE
     focal = width / 2.0 / math.tan(math.radians(view_deg) / 2.0)
     return Camera("SIMPLE_PINHOLE", width, height, (focal, width / 2.0, height / 2.0))
+
+
+def _tiled_px(properties: Json) -> tuple[int, int] | None:
+    """Return width and height of what is there in tiles, as panoramas alone are."""
+    sets = properties.get("tiles:tile_matrix_sets")
+    for _, tiled in () if sets is None else sets.items():
+        largest = max(
+            (
+                tuple(round(level[f"tile{side}"].number() * level[f"matrix{side}"].number()) for side in _SIDES)
+                for level in tiled["tileMatrix"].entries()
+            ),
+            default=None,
+        )
+        if largest is not None:
+            return largest[0], largest[1]
+    return None
+
+
+_SIDES = ("Width", "Height")
 
 
 def _seconds(value: Json) -> float:
@@ -184,12 +241,34 @@ def _seconds(value: Json) -> float:
     return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
 
 
-def _class(annotation: Json, class_key: str | None) -> str:
+def _class(annotation: Json, class_key: str | None) -> tuple[str, float]:
+    """Return class and score; the class is empty where no tag says it."""
     semantics = annotation.get("semantics")
-    tags = [(tag["key"].text(), tag["value"].key()) for tag in (() if semantics is None else semantics.entries())]
+    said = [(tag["key"].text(), tag["value"].key()) for tag in (() if semantics is None else semantics.entries())]
+    tags = [(key, value) for key, value in said if not _QUALIFIER.fullmatch(key)]
     if class_key is not None:
-        return next((value for key, value in tags if key == class_key), "")
-    return "=".join(tags[0]) if tags else ""
+        tags = [(key, value) for key, value in tags if key == class_key]
+    if not tags:
+        return "", 1.0
+    key = tags[0][0]
+    value = next((value for other, value in tags if other == key and value != "yes"), tags[0][1])
+    return value if class_key is not None else f"{key}={value}", _score(key, value, said)
+
+
+def _score(key: str, value: str, said: list[tuple[str, str]]) -> float:
+    """Return what the qualifiers among the tags say of a tag, NaN where that is no number."""
+    confidence = {
+        (match[1], match[2]): text for name, text in said if (match := _QUALIFIER.fullmatch(name)) is not None
+    }
+    of_tag = (f"{key}={value}", f"{key}=*", key)
+    of_key = [about for _, about in confidence if about.startswith(f"{key}=")]
+    asked = [("detection_confidence", about) for about in (*of_tag, *of_key)]
+    asked += [("classification_confidence", about) for about in of_tag]
+    text = next((confidence[each] for each in asked if each in confidence), "1")
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def _edges(shape: Json) -> list[float]:
@@ -203,16 +282,17 @@ def _edges(shape: Json) -> list[float]:
     return [*points.min(axis=0).tolist(), *points.max(axis=0).tolist()]
 
 
-def _boxes(found: _Found, names: list[str], images: Images) -> FoundBoxes:
+def _boxes(found: _Found, images: Images) -> FoundBoxes:
     if not found.edges:
         return FoundBoxes.none()
     row_of = {name: row for row, name in enumerate(images.name.to_pylist())}
     edges = np.array(found.edges)
     return FoundBoxes(
-        image_row=np.array([row_of[names[image]] for image in found.image_of_box], dtype=np.int64),
+        image_row=np.array([row_of.get(name, -1) for name in found.image_of_box], dtype=np.int64),
         class_names=found.classes,
         center_px=(edges[:, :2] + edges[:, 2:]) / 2.0,
         size_px=edges[:, 2:] - edges[:, :2],
-        score=np.ones(len(edges)),
+        score=np.array(found.scores),
         where=found.where.__getitem__,
+        image_names=found.image_of_box,
     )
