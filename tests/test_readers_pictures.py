@@ -115,6 +115,77 @@ def test_a_panorama_says_so_in_its_xmp(tmp_path: Path) -> None:
     assert read_exif(tmp_path / "b.jpg").pitch_deg == 3.0
 
 
+@pytest.mark.parametrize(("direction", "heading"), [(123.0, 123.0), (0.0, 0.0), (None, 10.0)])
+def test_the_heading_of_the_gps_counts_before_that_of_gpano(
+    tmp_path: Path, direction: float | None, heading: float
+) -> None:
+    """Cameras without a compass write a heading of 0, or of the sphere's own north, into GPano."""
+    xmp = b'<x GPano:ProjectionType="equirectangular" GPano:PoseHeadingDegrees="10" GPano:PosePitchDegrees="2"/>'
+    more = {} if direction is None else {"GPSImgDirection": direction}
+    picture(tmp_path / "a.jpg", tags(52.0, 4.0, **more), (64, 32), xmp=xmp)
+    said: list[str] = []
+    dataset = read_pictures(tmp_path, tell=said.append)
+    forward = rotation_matrices(dataset.images)[0][2]
+    level = np.array([np.sin(np.radians(heading)), np.cos(np.radians(heading))]) * np.cos(np.radians(2.0))
+    assert_allclose(forward, [*level, np.sin(np.radians(2.0))], atol=1e-9)
+    assert len(said) == (direction is not None)
+    assert all("1 pictures have another heading in PoseHeadingDegrees" in line for line in said)
+
+
+def test_the_gimbal_of_a_drone_says_where_its_camera_looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """East and down by 30 degrees; straight down; and level by the tags of a drone that does not know."""
+    for name, yaw, pitch in (("30.jpg", "+90.00", "-30.00"), ("90.jpg", "+90.00", "-90.00"), ("0.jpg", "0.0", "+0.0")):
+        angles = f'drone-dji:GimbalYawDegree="{yaw}" drone-dji:GimbalPitchDegree="{pitch}"'
+        xmp = f'<rdf:Description {angles} drone-dji:GimbalRollDegree="+0.00"/>'.encode()
+        lat = 52.0 + abs(float(pitch)) * 1e-5
+        picture(tmp_path / name, tags(lat, 4.0, FocalLengthIn35mmFilm=24), xmp=xmp)
+    assert read_exif(tmp_path / "0.jpg").heading_deg is None
+    images = read_pictures(tmp_path, poses="exif", max_rejected=0.5).images
+    assert images.name.to_pylist() == ["30.jpg", "90.jpg"]
+    slant, down = rotation_matrices(images)
+    assert_allclose(slant[2], [np.cos(np.radians(30.0)), 0.0, -0.5], atol=1e-4)
+    assert_allclose(down[2], [0.0, 0.0, -1.0], atol=1e-4)
+    assert_allclose(down[1], [-1.0, 0.0, 0.0], atol=1e-4)  # What is below in the picture is behind the drone.
+    asked: list[str] = []
+
+    def find_poses(pictures: list[Picture], *_: Any, **__: Any) -> Posed:
+        asked.extend(each.name for each in pictures)
+        raise InputError("asked", hint="nothing")
+
+    monkeypatch.setattr("valuemap.readers.pictures.find_poses", find_poses)
+    assert refusal(lambda: read_pictures(tmp_path, workspace=tmp_path / "work")) == "asked | nothing"
+    assert asked == ["0.jpg", "30.jpg"]
+
+
+def test_pictures_of_the_shape_of_panoramas_are_not_taken_for_flat_ones(tmp_path: Path) -> None:
+    """Programs that blur or shrink pictures lose the tags that say so."""
+    picture(tmp_path / "a.jpg", tags(52.0, 4.0, GPSImgDirection=90.0), (64, 32))
+    assert "as panoramas are, and no tag says what it is: say it with --camera" in refusal(
+        lambda: read_pictures(tmp_path, poses="exif")
+    )
+    assert read_pictures(tmp_path, camera="EQUIRECTANGULAR 64 32").cameras.model.texts() == ["EQUIRECTANGULAR"]
+    picture(tmp_path / "a.jpg", tags(52.0, 4.0, GPSImgDirection=90.0, FocalLengthIn35mmFilm=26), (64, 32))
+    assert read_pictures(tmp_path, poses="exif").cameras.model.texts() == ["SIMPLE_RADIAL"]
+
+
+def test_pictures_in_a_format_that_is_not_read_are_listed(tmp_path: Path) -> None:
+    """Phones keep pictures as HEIC, some beside a JPEG of the same name, which counts."""
+    for name, lat in (("a.jpg", 52.0), ("b.JPG", 52.0001)):
+        picture(tmp_path / name, tags(lat, 4.0, GPSImgDirection=90.0), format="JPEG")
+    for name in ("b.HEIC", "c.heic"):
+        write(tmp_path / name, "ftypheic")
+    assert "1 of 3 pictures cannot be used: c.heic: is HEIC, which is not read" in refusal(
+        lambda: read_pictures(tmp_path, poses="exif")
+    )
+    dataset = read_pictures(tmp_path, poses="exif", max_rejected=0.5)
+    assert dataset.images.name.to_pylist() == ["a.jpg", "b.JPG"]
+    assert dataset.rejected is not None
+    assert dataset.rejected.image_name.to_pylist() == ["c.heic"]
+    for name in ("a.jpg", "b.JPG"):
+        (tmp_path / name).unlink()
+    assert "2 of 2 pictures cannot be used" in refusal(lambda: read_pictures(tmp_path, poses="exif"))
+
+
 def panorama(path: Path, size: tuple[int, int], lat: float, **pano: float) -> Path:
     attributes = "".join(f' GPano:{name}="{value}"' for name, value in pano.items())
     xmp = f'<x><rdf:Description GPano:ProjectionType="equirectangular"{attributes}/></x>'

@@ -28,8 +28,10 @@ class Exif:
 
     `lat_lon` in degrees, `height_m`, `sigma_m` (horizontal), `heading_deg` clockwise from north, `pitch_deg` up and
     `roll_deg` right side down, `focal_px`, `gps_time_s` and `camera_time_s` since 1970. Pictures of one `camera` have
-    the same intrinsics. A panorama that `is_cut` does not show the whole sphere. Heights count from the sea, unless
-    `is_ellipsoidal` says that they count from the ellipsoid.
+    the same intrinsics. A panorama that `is_cut` does not show the whole sphere. A picture that `may_be_panorama` has
+    the shape of one, and neither a tag nor a focal length says what it is. Heights count from the sea, unless
+    `is_ellipsoidal` says that they count from the ellipsoid. The `pose_heading_deg` is that of GPano, which is not used
+    where the GPS tags have one: cameras without a compass write 0.
     """
 
     width: int
@@ -37,11 +39,13 @@ class Exif:
     is_panorama: bool
     is_cut: bool
     camera: tuple[Any, ...]
+    may_be_panorama: bool = False
     lat_lon: tuple[float, float] | None = None
     height_m: float | None = None
     is_ellipsoidal: bool = False
     sigma_m: float | None = None
     heading_deg: float | None = None
+    pose_heading_deg: float | None = None
     pitch_deg: float = 0.0
     roll_deg: float = 0.0
     focal_px: float | None = None
@@ -69,23 +73,28 @@ def read_exif(path: Path) -> Exif:
         raise InputError(f"{path}: cannot be read as a picture: {reason}", hint="remove or replace it") from error
     if width * height > _LARGEST_PX:
         raise InputError(f"{path}: has {width} x {height} pixels", hint="make it smaller")
-    pano = _panorama(xmp.decode("utf-8", "replace") if isinstance(xmp, bytes) else str(xmp))
+    text = xmp.decode("utf-8", "replace") if isinstance(xmp, bytes) else str(xmp)
+    pano, gimbal = _panorama(text), _gimbal(text)
     focal_px = _focal_px(exif, width, height)
     orientation = main.get(Base.Orientation)
-    heading = pano.get("PoseHeadingDegrees", _number(gps.get(GPS.GPSImgDirection)))
+    pose_heading = pano.get("PoseHeadingDegrees", gimbal.get("Yaw"))
+    heading = pose_heading if (direction := _number(gps.get(GPS.GPSImgDirection))) is None else direction
+    upright_roll = ROLL_DEG.get(orientation, 0.0) if isinstance(orientation, int) else 0.0
     return Exif(
         width=width,
         height=height,
         is_panorama="equirectangular" in pano,
         is_cut="equirectangular" in pano and _is_cut(pano, width, height),
         camera=(str(main.get(Base.Make)), str(main.get(Base.Model)), width, height, focal_px),
+        may_be_panorama="equirectangular" not in pano and width == 2 * height and focal_px is None,
         lat_lon=_lat_lon(gps),
         height_m=_height(gps),
         is_ellipsoidal=_is_ellipsoidal(exif, gps),
         sigma_m=_positive(gps.get(GPS.GPSHPositioningError)),
         heading_deg=None if heading is None else heading % 360.0,
-        pitch_deg=pano.get("PosePitchDegrees", 0.0),
-        roll_deg=pano.get("PoseRollDegrees", ROLL_DEG.get(orientation, 0.0) if isinstance(orientation, int) else 0.0),
+        pose_heading_deg=None if pose_heading is None else pose_heading % 360.0,
+        pitch_deg=pano.get("PosePitchDegrees", gimbal.get("Pitch", 0.0)),
+        roll_deg=pano.get("PoseRollDegrees", gimbal.get("Roll", upright_roll)),
         focal_px=focal_px,
         gps_time_s=_gps_time(gps),
         camera_time_s=_camera_time(exif),
@@ -193,11 +202,24 @@ def _camera_time(exif: dict[int, Any]) -> float | None:
     return time + (float(f"0.{part}") if part.isdecimal() else 0.0)
 
 
+def _tags_of(namespace: str, xmp: str) -> list[tuple[str, str]]:
+    """Return the tags of a namespace, be they attributes or elements."""
+    found = re.findall(namespace + r":(\w+)\s*(?:=\s*[\"']([^\"']*)[\"']|>([^<]*)<)", xmp)
+    return [(name, (first or second).strip()) for name, first, second in found]
+
+
+def _gimbal(xmp: str) -> dict[str, float]:
+    """Return Yaw, Pitch and Roll of a camera on DJI's drones, in degrees; all are 0 where the drone does not know."""
+    told = dict(_tags_of("drone-dji", xmp))
+    angles = {name: _number(told.get(f"Gimbal{name}Degree")) for name in ("Yaw", "Pitch", "Roll")}
+    known = {name: angle for name, angle in angles.items() if angle is not None}
+    return known if any(known.values()) else {}
+
+
 def _panorama(xmp: str) -> dict[str, float]:
     """Return the numbers of the GPano namespace, and a key `equirectangular` where that is the projection."""
     found = {}
-    for name, first, second in re.findall(r"GPano:(\w+)\s*(?:=\s*[\"']([^\"']*)[\"']|>([^<]*)<)", xmp):
-        text = (first or second).strip()
+    for name, text in _tags_of("GPano", xmp):
         if name == "ProjectionType" and text.lower() == "equirectangular":
             found["equirectangular"] = 1.0
         elif (number := _number(text)) is not None:

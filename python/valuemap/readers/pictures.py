@@ -23,10 +23,12 @@ from valuemap.readers.poses import Placed, local_from_cam, make_images, place_on
 from valuemap.readers.reader import Reader
 from valuemap.readers.structure import Picture, Posed, find_poses
 from valuemap.readers.vet import refuse_too_many_unreadable
-from valuemap.tables import Floats
+from valuemap.tables import Bools, Floats
 
 PosesFrom = Literal["auto", "sfm", "exif"]
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+_NOT_READ = (".heic", ".heif")
+_HEIC = "is HEIC, which is not read: convert it to JPEG"
 _EXPECTED = f"a folder of pictures: {', '.join(_SUFFIXES)}"
 _FOCAL_GUESS = 1.2
 """Focal length over the larger side where nothing is known: about 45 degrees."""
@@ -36,6 +38,10 @@ _TURNED = (
 )
 _MOST_ROLL_DEG = 45.0
 """Half a quarter turn: EXIF knows quarter turns alone."""
+_TILTED = "it looks far up or down (GimbalPitchDegree), and structure from motion takes cameras for level"
+_MOST_PITCH_DEG = 45.0
+_MAY_BE_PANORAMA = "is twice as wide as high, as panoramas are, and no tag says what it is: say it with --camera"
+_SAME_HEADING_DEG = 1.0
 _NO_HEADING = "it has no heading (GPSImgDirection, or PoseHeadingDegrees of a panorama)"
 
 
@@ -70,10 +76,11 @@ def read_pictures(
 ) -> Imported:
     """Read pictures of a folder and its folders, find their poses, and put them on the Earth.
 
-    Panoramas (equirectangular by their GPano tags, or by `camera`) stand at their GPS position with their heading,
-    pitch and roll. Other pictures get their poses by structure from motion (`find_poses`), or with `poses` "exif" are
-    taken level with the heading that the GPS tags give. A pass is a folder; times are those of the GPS, else of the
-    camera, less what both differ by in the folder.
+    Panoramas (equirectangular by their GPano tags, or by `camera`) stand at their GPS position with their heading (of
+    the GPS tags, else of GPano), pitch and roll. Other pictures get their poses by structure from motion
+    (`find_poses`), or with `poses` "exif" are taken level with the heading that the GPS tags give, or as the gimbal of
+    a drone says. A pass is a folder; times are those of the GPS, else of the camera, less what both differ by in the
+    folder.
 
     Parameters
     ----------
@@ -121,8 +128,15 @@ def read_pictures(
     why_not: dict[int, str] = {}
     is_turned = ~by_heading & (np.abs([exif.roll_deg for exif in found.exif]) > _MOST_ROLL_DEG)
     why_not |= dict.fromkeys(np.flatnonzero(is_turned).tolist(), _TURNED)
+    is_tilted = ~by_heading & ~is_turned & (np.abs([exif.pitch_deg for exif in found.exif]) > _MOST_PITCH_DEG)
+    why_not |= dict.fromkeys(np.flatnonzero(is_tilted).tolist(), _TILTED)
     rotation[~by_heading], center[~by_heading] = np.nan, np.nan
-    rows = np.flatnonzero(~by_heading & ~is_turned)
+    rows = np.flatnonzero(~by_heading & ~is_turned & ~is_tilted)
+    if tell is not None and (others := _told_twice(found, by_heading)):
+        tell(
+            f"{others} pictures have another heading in PoseHeadingDegrees or GimbalYawDegree than in "
+            "GPSImgDirection, which is used"
+        )
     if len(rows):
         if workspace is None:
             raise SettingError("workspace: structure from motion needs a folder to work in", hint="give --workspace")
@@ -197,13 +211,22 @@ def _read_all(
     *,
     is_whole: bool,
 ) -> _Found:
-    """Read all pictures; panoramas that are cut cannot be used, unless somebody says how all pictures are made."""
+    """Read all pictures; panoramas that are cut, and what may be one, cannot be used unless somebody says what all are.
+
+    Of pictures that a phone keeps both as HEIC and as JPEG the latter count.
+    """
     check_folder(folder, _EXPECTED)
-    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _SUFFIXES)
-    if not paths:
+    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in (*_SUFFIXES, *_NOT_READ))
+    paths = [path for path in files if path.suffix.lower() in _SUFFIXES]
+    if not files:
         raise InputError(f"{folder}: there are no pictures in it", hint=f"expected {_EXPECTED}")
     names, found = [], []
-    unreadable: dict[str, str] = {}
+    twins = {path.with_suffix("") for path in paths}
+    unreadable: dict[str, str] = {
+        path.relative_to(folder).as_posix(): _HEIC
+        for path in files
+        if path.suffix.lower() in _NOT_READ and path.with_suffix("") not in twins
+    }
     for number, path in enumerate(paths):
         if number % 50 == 0:
             progress("reading the pictures' tags", number, len(paths))
@@ -214,13 +237,14 @@ def _read_all(
         except InputError as error:
             unreadable[name] = str(error).removeprefix(f"{path}: ")
         else:
-            if exif.is_cut and not is_whole:
-                unreadable[name] = CUT_PANORAMA
+            if (exif.is_cut or exif.may_be_panorama) and not is_whole:
+                unreadable[name] = CUT_PANORAMA if exif.is_cut else _MAY_BE_PANORAMA
                 continue
             found.append(exif)
             names.append(name)
     progress("reading the pictures' tags", len(paths), len(paths))
-    refuse_too_many_unreadable(unreadable, len(paths), max_rejected, str(folder), "remove or replace them")
+    total = len(names) + len(unreadable)
+    refuse_too_many_unreadable(unreadable, total, max_rejected, str(folder), "remove or replace them")
     check_names(names, str(folder))
     passes = [str(parent) if str(parent := PurePosixPath(name).parent) != "." else ONE_PASS for name in names]
     # Driving order: by time where a whole folder has times, else by name.
@@ -287,6 +311,16 @@ def _level_poses(found: _Found) -> tuple[Floats, Floats]:
             heading[known], pitch[known], roll[known]
         )
     return rotation, found.placed.position_in_world_m.copy()
+
+
+def _told_twice(found: _Found, by_heading: Bools) -> int:
+    """Return how many of the pictures with a heading, of those chosen (N), have another one elsewhere in their tags."""
+    apart_deg = [
+        abs((exif.heading_deg - exif.pose_heading_deg + 180.0) % 360.0 - 180.0)
+        for exif, chosen in zip(found.exif, by_heading.tolist(), strict=True)
+        if chosen and exif.heading_deg is not None and exif.pose_heading_deg is not None
+    ]
+    return sum(apart > _SAME_HEADING_DEG for apart in apart_deg)
 
 
 def _guess(exif: Exif) -> Camera:
