@@ -1090,6 +1090,7 @@ LEFT_OUT: dict[str, tuple[str, dict[str, Any], str]] = {
         "it has no camera_type, or no camera_parameters: it was not processed, or they were not asked for",
     ),
     "mapillary, without parameters": ("mapillary", {"camera_parameters": []}, "it has no camera_type, or no camera_pa"),
+    "mapillary, of another camera": ("mapillary", {"camera_type": "brown"}, "its camera_type is none of perspective"),
     "mapillary, cut": (
         "mapillary",
         {"camera_type": "spherical", "camera_parameters": [], "width": 4096, "height": 1024},

@@ -30,6 +30,7 @@ _MILLI = 1e-3
 _HEIGHT_WITHOUT_ANY_M = 2.0
 _END_OF_DOWNLOAD = "__complete__"
 """What mapillary_downloader writes behind the images."""
+_OTHER_CAMERA = "its camera_type is none of perspective, fisheye, spherical and equirectangular"
 _NO_CAMERA = "it has no camera_type, or no camera_parameters: it was not processed, or they were not asked for"
 
 _STORED: dict[int, Callable[[float, float, float, float], list[float]]] = {
@@ -117,7 +118,7 @@ def read_mapillary(
         str(export),
         "ask for the fields camera_type and camera_parameters"
         if _NO_CAMERA in found.unreadable.values()
-        else "panoramas that are cut are not read",
+        else "panoramas that are cut, and other types of cameras, are not read",
     )
     if not found.ids:
         raise InputError(f"{export}: there are no images in it", hint=f"expected {_EXPECTED}")
@@ -246,12 +247,12 @@ def _camera(image: Json, width: int, height: int) -> Camera | str:
     kind = image["camera_type"].text()
     if kind in ("spherical", "equirectangular"):
         return panorama(width, height, image.where) if is_whole_panorama(width, height) else CUT_PANORAMA
-    if kind not in ("perspective", "fisheye", "brown"):
-        raise image["camera_type"].wrong("expected perspective, fisheye, spherical or equirectangular")
+    if kind not in ("perspective", "fisheye"):
+        return _OTHER_CAMERA
     values = [entry.number() for entry in image["camera_parameters"].entries()] if "camera_parameters" in image else []
     if not values:
         return _NO_CAMERA
-    if kind == "brown" or len(values) not in (1, 2, 3):
+    if len(values) not in (1, 2, 3):
         raise image["camera_parameters"].wrong("expected focal length, k1 and k2")
     focal, k1, k2 = (*values, 0.0, 0.0)[:3]
     model = "RADIAL" if kind == "perspective" else "RADIAL_FISHEYE"
