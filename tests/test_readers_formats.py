@@ -550,6 +550,17 @@ def test_argoverse2_on_the_earth(tmp_path: Path) -> None:
     assert_allclose(camera_centers(dataset.images)[:, :2], turned, atol=2e-3)
 
 
+def test_logs_of_argoverse_of_who_knows_which_city_are_not_mixed(tmp_path: Path) -> None:
+    """Whoever downloads poses and pictures alone has no maps, and each city has a frame of its own."""
+    argoverse_in(tmp_path / "a", city="PIT")
+    argoverse_in(tmp_path / "b")
+    assert "1 of 2 logs do not say which city they are of, the first is b" in refusal(lambda: read_argoverse2(tmp_path))
+    assert len(read_argoverse2(tmp_path, city="PIT").images) == 6
+    (tmp_path / "a" / "map" / "log_map_archive_x____PIT_city_1234.json").unlink()
+    assert "2 of 2 logs do not say" in refusal(lambda: read_argoverse2(tmp_path))
+    assert len(read_argoverse2(tmp_path / "a").images) == 3
+
+
 def test_cameras_of_argoverse_that_fire_together_are_a_rig(tmp_path: Path) -> None:
     folder = argoverse_in(tmp_path / "log1")
     for path in ("calibration/egovehicle_SE3_sensor.feather", "calibration/intrinsics.feather"):

@@ -81,7 +81,7 @@ def read_argoverse2(
         As in `read_detections`.
     city
         ATX, DTW, MIA, PAO, PIT or WDC; by default the name of the log's map says it. Where there are several, only the
-        logs of this one are read.
+        logs of this one are read, and those that do not say theirs.
     up
         As in `assemble`: the poses then stay in the frame of the city, and are not placed on the Earth.
     anchor
@@ -92,7 +92,7 @@ def read_argoverse2(
     InputError
         A table is missing or damaged, or there are no images.
     SettingError
-        There is no such city, or several and none is chosen.
+        There is no such city, or none is chosen where there are several, or where one of several logs does not say its.
     """
     check_folder(logs, _EXPECTED)
     if city is not None and city not in _CITIES:
@@ -105,6 +105,13 @@ def read_argoverse2(
     for number, folder in enumerate(folders):
         progress("reading the logs", number, len(folders))
         read.append(_read_log(folder, "" if single else f"{folder.name}/"))
+    unknown = [folder.name for folder, log in zip(folders, read, strict=True) if log.city is None]
+    if unknown and len(read) > 1 and city is None:
+        raise SettingError(
+            f"{logs}: {len(unknown)} of {len(read)} logs do not say which city they are of, the first is {unknown[0]}, "
+            "and each city has a frame of its own",
+            hint="say it with --city, or put the folder map of each log back",
+        )
     found = sorted({log.city or city or "" for log in read})
     if len(found) > 1 and city is None:
         raise SettingError(
