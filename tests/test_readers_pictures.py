@@ -115,6 +115,18 @@ def test_a_panorama_says_so_in_its_xmp(tmp_path: Path) -> None:
     assert read_exif(tmp_path / "b.jpg").pitch_deg == 3.0
 
 
+def test_panoramas_that_a_phone_was_swept_round_for_are_not_taken_for_flat_pictures(tmp_path: Path) -> None:
+    more: dict[str, Any] = {"GPSImgDirection": 90.0, "FocalLengthIn35mmFilm": 26}
+    picture(tmp_path / "a.jpg", tags(52.0, 4.0, **more))
+    picture(tmp_path / "apple.jpg", tags(52.0001, 4.0, **more, CustomRendered=6), (96, 24))
+    xmp = b'<x GPano:ProjectionType="cylindrical"/>'
+    picture(tmp_path / "android.jpg", tags(52.0002, 4.0, **more), (96, 24), xmp=xmp)
+    dataset = read_pictures(tmp_path, poses="exif", max_rejected=0.7)
+    assert dataset.images.name.to_pylist() == ["a.jpg"]
+    assert dataset.rejected is not None
+    assert {reason[:26] for reason in dataset.rejected.reason.texts()} == {"is a panorama that is cut:"}
+
+
 @pytest.mark.parametrize(("direction", "heading"), [(123.0, 123.0), (0.0, 0.0), (None, 10.0)])
 def test_the_heading_of_the_gps_counts_before_that_of_gpano(
     tmp_path: Path, direction: float | None, heading: float
@@ -155,6 +167,12 @@ def test_the_gimbal_of_a_drone_says_where_its_camera_looks(tmp_path: Path, monke
     monkeypatch.setattr("valuemap.readers.pictures.find_poses", find_poses)
     assert refusal(lambda: read_pictures(tmp_path, workspace=tmp_path / "work")) == "asked | nothing"
     assert asked == ["0.jpg", "30.jpg"]
+    # Of a panorama it says where the last picture of it looked.
+    sphere = xmp.replace(b"drone-dji:GimbalRoll", b'GPano:ProjectionType="equirectangular" drone-dji:GimbalRoll')
+    found = read_exif(
+        picture(tmp_path / "sphere" / "a.jpg", tags(52.0, 4.0), (64, 32), xmp=sphere.replace(b"0.0", b"9.0"))
+    )
+    assert (found.heading_deg, found.pitch_deg) == (None, 0.0)
 
 
 def test_pictures_of_the_shape_of_panoramas_are_not_taken_for_flat_ones(tmp_path: Path) -> None:

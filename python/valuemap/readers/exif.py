@@ -74,7 +74,9 @@ def read_exif(path: Path) -> Exif:
     if width * height > _LARGEST_PX:
         raise InputError(f"{path}: has {width} x {height} pixels", hint="make it smaller")
     text = xmp.decode("utf-8", "replace") if isinstance(xmp, bytes) else str(xmp)
-    pano, gimbal = _panorama(text), _gimbal(text)
+    pano = _panorama(text)
+    is_panorama = "equirectangular" in pano
+    gimbal = {} if is_panorama else _gimbal(text)  # Of a panorama it is that of the last of its pictures.
     focal_px = _focal_px(exif, width, height)
     orientation = main.get(Base.Orientation)
     pose_heading = pano.get("PoseHeadingDegrees", gimbal.get("Yaw"))
@@ -83,10 +85,10 @@ def read_exif(path: Path) -> Exif:
     return Exif(
         width=width,
         height=height,
-        is_panorama="equirectangular" in pano,
-        is_cut="equirectangular" in pano and _is_cut(pano, width, height),
+        is_panorama=is_panorama,
+        is_cut=_is_cut(pano, width, height) if is_panorama else _is_swept(pano, exif),
         camera=(str(main.get(Base.Make)), str(main.get(Base.Model)), width, height, focal_px),
-        may_be_panorama="equirectangular" not in pano and width == 2 * height and focal_px is None,
+        may_be_panorama=not is_panorama and width == 2 * height and focal_px is None,
         lat_lon=_lat_lon(gps),
         height_m=_height(gps),
         is_ellipsoidal=_is_ellipsoidal(exif, gps),
@@ -217,14 +219,23 @@ def _gimbal(xmp: str) -> dict[str, float]:
 
 
 def _panorama(xmp: str) -> dict[str, float]:
-    """Return the numbers of the GPano namespace, and a key `equirectangular` where that is the projection."""
+    """Return the numbers of the GPano namespace, and a key `equirectangular` or such where that is the projection."""
     found = {}
     for name, text in _tags_of("GPano", xmp):
-        if name == "ProjectionType" and text.lower() == "equirectangular":
-            found["equirectangular"] = 1.0
+        if name == "ProjectionType":
+            found[text.lower()] = 1.0
         elif (number := _number(text)) is not None:
             found[name] = number
     return found
+
+
+def _is_swept(pano: dict[str, float], exif: dict[int, Any]) -> bool:
+    """Return whether a phone was swept round for the picture: it is no sphere, and no flat picture either."""
+    return "cylindrical" in pano or exif.get(Base.CustomRendered) == _PANORAMA
+
+
+_PANORAMA = 6
+"""What Apple writes into CustomRendered of a panorama."""
 
 
 def _is_cut(pano: dict[str, float], width: int, height: int) -> bool:
