@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -202,6 +203,32 @@ def test_pictures_in_a_format_that_is_not_read_are_listed(tmp_path: Path) -> Non
     for name in ("a.jpg", "b.JPG"):
         (tmp_path / name).unlink()
     assert "2 of 2 pictures cannot be used" in refusal(lambda: read_pictures(tmp_path, poses="exif"))
+
+
+def test_the_description_of_mapillarys_programs_says_what_the_gps_tags_do_not(tmp_path: Path) -> None:
+    described = {
+        "MAPLatitude": 52.5,
+        "MAPLongitude": -4.25,
+        "MAPAltitude": 12.5,
+        "MAPCaptureTime": "2023_11_14_22_13_20_250",
+        "MAPCompassHeading": {"TrueHeading": 33.5, "MagneticHeading": 30.0},
+    }
+    bare, full = Image.Exif(), tags(52.0, 4.0, GPSImgDirection=90.0, DateTimeOriginal="2023:11:14 22:13:21")
+    for name, exif in (("bare.jpg", bare), ("full.jpg", full)):
+        exif[Base.ImageDescription] = json.dumps(described)
+        picture(tmp_path / name, exif)
+    first, second = read_exif(tmp_path / "bare.jpg"), read_exif(tmp_path / "full.jpg")
+    assert (first.lat_lon, first.height_m, first.heading_deg) == ((52.5, -4.25), 12.5, 33.5)
+    assert first.camera_time_s == 1_700_000_000.25
+    assert (second.lat_lon, second.height_m, second.heading_deg) == ((52.0, 4.0), 40.0, 90.0)
+    assert second.camera_time_s == 1_700_000_001.0
+    for odd in ("a street", "[1]", '{"MAPLatitude": "x", "MAPCompassHeading": 3, "MAPCaptureTime": 5}', "{" * 100_000):
+        exif = Image.Exif()
+        exif[Base.ImageDescription] = odd
+        found = read_exif(
+            picture(tmp_path / "odd.jpg", exif) if len(odd) < 1000 else picture(tmp_path / "odd.png", exif)
+        )
+        assert (found.lat_lon, found.heading_deg, found.camera_time_s) == (None, None, None)
 
 
 def panorama(path: Path, size: tuple[int, int], lat: float, **pano: float) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from dataclasses import dataclass
@@ -56,6 +57,8 @@ class Exif:
 def read_exif(path: Path) -> Exif:
     """Read a picture's size and what it says about itself; values that make no sense are taken for missing.
 
+    What the GPS tags do not say may stand in the description that Mapillary's programs write.
+
     Raises
     ------
     InputError
@@ -79,8 +82,20 @@ def read_exif(path: Path) -> Exif:
     gimbal = {} if is_panorama else _gimbal(text)  # Of a panorama it is that of the last of its pictures.
     focal_px = _focal_px(exif, width, height)
     orientation = main.get(Base.Orientation)
+    described = _described(main.get(Base.ImageDescription))
+    lat_lon, height_m = _lat_lon(gps), _height(gps)
+    if lat_lon is None:
+        lat_lon, height_m = _place(_number(described.get("MAPLatitude")), _number(described.get("MAPLongitude"))), None
+    if height_m is None and lat_lon is not None:
+        height_m = _number(described.get("MAPAltitude"))
     pose_heading = pano.get("PoseHeadingDegrees", gimbal.get("Yaw"))
-    heading = pose_heading if (direction := _number(gps.get(GPS.GPSImgDirection))) is None else direction
+    compass = described.get("MAPCompassHeading")
+    directions = (
+        _number(gps.get(GPS.GPSImgDirection)),
+        _number(compass.get("TrueHeading")) if isinstance(compass, dict) else None,
+        pose_heading,
+    )
+    heading = next((each for each in directions if each is not None), None)
     upright_roll = ROLL_DEG.get(orientation, 0.0) if isinstance(orientation, int) else 0.0
     return Exif(
         width=width,
@@ -89,8 +104,8 @@ def read_exif(path: Path) -> Exif:
         is_cut=_is_cut(pano, width, height) if is_panorama else _is_swept(pano, exif),
         camera=(str(main.get(Base.Make)), str(main.get(Base.Model)), width, height, focal_px),
         may_be_panorama=not is_panorama and width == 2 * height and focal_px is None,
-        lat_lon=_lat_lon(gps),
-        height_m=_height(gps),
+        lat_lon=lat_lon,
+        height_m=height_m,
         is_ellipsoidal=_is_ellipsoidal(exif, gps),
         sigma_m=_positive(gps.get(GPS.GPSHPositioningError)),
         heading_deg=None if heading is None else heading % 360.0,
@@ -99,7 +114,7 @@ def read_exif(path: Path) -> Exif:
         roll_deg=pano.get("PoseRollDegrees", gimbal.get("Roll", upright_roll)),
         focal_px=focal_px,
         gps_time_s=_gps_time(gps),
-        camera_time_s=_camera_time(exif),
+        camera_time_s=_camera_time(exif) or _described_time(described.get("MAPCaptureTime")),
     )
 
 
@@ -148,6 +163,10 @@ def _degrees(value: Any, reference: Any, negative: str) -> float | None:
 def _lat_lon(gps: dict[int, Any]) -> tuple[float, float] | None:
     lat = _degrees(gps.get(GPS.GPSLatitude), gps.get(GPS.GPSLatitudeRef), "S")
     lon = _degrees(gps.get(GPS.GPSLongitude), gps.get(GPS.GPSLongitudeRef), "W")
+    return _place(lat, lon)
+
+
+def _place(lat: float | None, lon: float | None) -> tuple[float, float] | None:
     if lat is None or lon is None or abs(lat) > 90.0 or abs(lon) > 180.0 or (lat, lon) == (0.0, 0.0):
         return None
     return lat, lon
@@ -202,6 +221,25 @@ def _camera_time(exif: dict[int, Any]) -> float | None:
     except ValueError:
         return None
     return time + (float(f"0.{part}") if part.isdecimal() else 0.0)
+
+
+def _described(text: Any) -> dict[str, Any]:
+    """Return the values that Mapillary's programs wrote as JSON into the description; none of another text."""
+    try:
+        values = json.loads(str(text).strip("\0 "))
+    except (ValueError, RecursionError):
+        return {}
+    return values if isinstance(values, dict) else {}
+
+
+def _described_time(text: Any) -> float | None:
+    """Return the time in UTC, which has milliseconds at its end."""
+    try:
+        clock, milliseconds = str(text).rsplit("_", 1)
+        time = datetime.strptime(clock, "%Y_%m_%d_%H_%M_%S").replace(tzinfo=UTC)
+        return time.timestamp() + int(milliseconds) * 1e-3
+    except ValueError:
+        return None
 
 
 def _tags_of(namespace: str, xmp: str) -> list[tuple[str, str]]:
