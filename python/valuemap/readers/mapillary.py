@@ -228,11 +228,13 @@ def _heights(found: _Found) -> Floats:
             break
     else:
         return np.full(len(found.ids), _HEIGHT_WITHOUT_ANY_M)
-    passes = np.array(found.passes)
-    of_all_m = np.median(heights_m[known])
-    for name in sorted(set(passes[~known].tolist())):
-        of_pass = passes == name
-        heights_m[of_pass & ~known] = np.median(own) if len(own := heights_m[of_pass & known]) else of_all_m
+    of_pass: dict[str, list[float]] = {}
+    for row in np.flatnonzero(known).tolist():
+        of_pass.setdefault(found.passes[row], []).append(heights_m[row])
+    median_m = {name: float(np.median(each)) for name, each in of_pass.items()}
+    of_all_m = float(np.median(heights_m[known]))
+    for row in np.flatnonzero(~known).tolist():
+        heights_m[row] = median_m.get(found.passes[row], of_all_m)
     return heights_m
 
 
