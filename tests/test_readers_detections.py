@@ -26,7 +26,7 @@ CVAT = """<?xml version="1.0" encoding="utf-8"?>
 <annotations><version>1.1</version>
 <image id="0" name="a/1.jpg" width="640" height="480">
 <box label="light" occluded="0" xtl="100.0" ytl="50.0" xbr="140.0" ybr="70.0" z_order="0"></box>
-<polygon label="light" points="1,2;3,4;5,6"></polygon></image>
+<tag label="night"/></image>
 <image id="1" name="a/2.jpg" width="640" height="480"></image></annotations>
 """
 BOSCH = """- boxes:
@@ -150,6 +150,48 @@ def test_the_box_around_a_turned_box_of_cvat(tmp_path: Path, turn: str, size: tu
     found = read(tmp_path, path).detections
     assert_allclose(found.center_px, [CENTER])
     assert_allclose(found.size_px, [size], atol=1e-4)
+
+
+SHAPES = """<image id="0" name="a/1.jpg" width="640" height="480">
+<box label="box" xtl="100" ytl="50" xbr="140" ybr="70"/>
+<polygon label="polygon" points="100.0,50.0;140.0,60.0;120.0,70.0"/>
+<mask label="mask" rle="2, 796, 2" left="100" top="50" width="40" height="20"/>
+<ellipse label="ellipse" cx="120" cy="60" rx="10" ry="20" rotation="90"/>
+<points label="points" points="7,8"/><polyline label="polyline" points="1,2;3,4;9,9"/>
+<cuboid label="cuboid" xtl1="1" ytl1="2"/><tag label="night"/>
+<skeleton label="skeleton"><points label="head" points="1,2" outside="0"/></skeleton></image>"""
+
+
+def test_shapes_of_cvat_count_as_the_boxes_around_them_and_others_are_counted(tmp_path: Path) -> None:
+    """All four shapes lie within x from 100 to 140 and y from 50 to 70, and touch these edges."""
+    path = write(tmp_path / "a.xml", f"<annotations><version>1.1</version>{SHAPES}</annotations>")
+    dataset = read(tmp_path, path)
+    assert sorted(dataset.detections.class_name.texts()) == ["box", "ellipse", "mask", "polygon"]
+    assert_allclose(dataset.detections.center_px, [CENTER] * 4)
+    assert_allclose(dataset.detections.size_px, [SIZE] * 4)
+    assert dataset.rejected is not None
+    assert sorted(dataset.rejected.class_name.texts()) == ["cuboid", "points", "polyline", "skeleton"]
+    assert set(dataset.rejected.reason.texts()) == {"it is a shape without a box, such as points or a line"}
+
+
+def test_a_crowd_of_coco_is_no_detection_and_no_fault(tmp_path: Path) -> None:
+    content = json.loads(COCO)
+    one = content["annotations"][0]
+    content["annotations"] = [{**one, "iscrowd": 0}, {**one, "iscrowd": 1, "bbox": [0, 0, 600, 400]}]
+    dataset = read(tmp_path, write(tmp_path / "boxes.json", json.dumps(content)))
+    assert_allclose(dataset.detections.size_px, [SIZE])
+    assert dataset.rejected is not None
+    assert dataset.rejected.reason.texts() == ["it is marked as a crowd: a region of many objects"]
+    content["annotations"] += [{**one, "bbox": None}] * 2
+    said = refusal(lambda: read(tmp_path, write(tmp_path / "boxes.json", json.dumps(content))))
+    assert "3 of 4 boxes cannot be used, more than 1 %: a number is missing or not finite (2," in said
+    assert "| repair these rows" in said
+
+
+def test_a_size_of_0_in_coco_says_that_it_is_not_known(tmp_path: Path) -> None:
+    """Datumaro writes it, and CVAT by it."""
+    path = write(tmp_path / "boxes.json", COCO.replace("640", "0").replace("480", "0"))
+    assert_allclose(read(tmp_path, path).detections.center_px, [CENTER])
 
 
 def test_coco_as_tools_write_it(tmp_path: Path) -> None:
@@ -279,6 +321,11 @@ def test_an_outer_entity_is_not_read(tmp_path: Path) -> None:
     [
         ("cvat", lambda text: text.replace('xtl="100.0"', 'xtl="x"'), "line 4: xtl: expected a number, found 'x'"),
         ("cvat", lambda text: text.replace(' label="light"', ""), "line 4: expected label=..."),
+        (
+            "cvat",
+            lambda text: text.replace("<tag label", '<polygon points="1,2;5,6" label'),
+            "line 5: points: expected x,y;x,y;x,y",
+        ),
         ("cvat", lambda text: text.replace("<image ", "<track ").replace("</image>", "</track>"), "tracks name frames"),
         (
             "cvat",

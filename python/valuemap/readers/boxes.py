@@ -14,6 +14,8 @@ from valuemap.readers.texts import Texts
 from valuemap.tables import Floats, Ints
 
 OPTIONAL = ("range_m", "range_sigma_m", "vertical_sigma_px")
+SINGLE, CROWD, NO_BOX = range(3)
+"""What an entry of a file is: a box of one object, a region of many, or a shape that has no box."""
 _COLUMNS: Mapping[str, Any] = {
     "row": np.int64,
     "image": np.int32,
@@ -22,6 +24,7 @@ _COLUMNS: Mapping[str, Any] = {
     "size": (np.float64, 2),
     "score": np.float64,
     "detection_id": np.int64,
+    "entry": np.int8,
     **dict.fromkeys(OPTIONAL, np.float64),
 }
 
@@ -119,7 +122,8 @@ class FiledBoxes:
     Parameters
     ----------
     rows
-        Their numbers, with a number for each distinct text.
+        Their numbers, with a number for each distinct text. A column `entry`, where there is one, says which
+        are `CROWD` or `NO_BOX` instead of `SINGLE`.
     image_row, image_names
         Row of an image (M) in the reader's table of images, -1 where it is not among them, and its name in the file, by
         its number in `rows`.

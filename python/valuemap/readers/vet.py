@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from valuemap.errors import InputError, SettingError
 from valuemap.readers import row_file
-from valuemap.readers.boxes import FiledBoxes, are_distinct, structure
+from valuemap.readers.boxes import CROWD, NO_BOX, FiledBoxes, are_distinct, structure
 from valuemap.readers.names import match_images
 from valuemap.readers.row_file import PartFile, RowFile, Rows, bounds_by_count
 from valuemap.tables import Bools, Cameras, Categories, Detections, Floats, Images, Ints, RejectedRows
@@ -58,6 +58,13 @@ _OUTSIDE = _Reason(
 _SCORE = _Reason("its score is not from 0 to 1", "scores are probabilities: divide percentages by 100")
 _RANGE = _Reason("its range or a sigma is not above 0", "ranges are metres; leave unknown ones empty")
 _TWICE = _Reason("the same box is there already", "was the file put together from parts that overlap?")
+# What people mark so, and draw for other ends, is no fault.
+_OF_ENTRY = {
+    CROWD: _Reason(
+        "it is marked as a crowd: a region of many objects", "mark every object with a box of its own", counts=False
+    ),
+    NO_BOX: _Reason("it is a shape without a box, such as points or a line", "draw boxes or polygons", counts=False),
+}
 # What goes with its image is the image's fault, which was counted.
 _LEFT_OUT = _Reason("its image was left out", "repair the image first", counts=False)
 _POSE_NOT_FINITE = _Reason("a number of its pose is missing or not finite", "repair the poses of these images")
@@ -103,7 +110,8 @@ class _LeftOut:
         if len(self.rows) < self.total and share <= max_share:
             return
         count = self.counts()
-        leading = sorted(count, key=lambda text: -count[text])
+        no_fault = {reason.text for reason in self.reasons if not reason.counts}
+        leading = sorted(count, key=lambda text: (text in no_fault, -count[text]))
         codes = [next(i for i, reason in enumerate(self.reasons) if reason.text == text) for text in leading]
         told = []
         for text, code in zip(leading[:_SHOWN_REASONS], codes, strict=False):
@@ -390,6 +398,10 @@ class _Judge:
         why = Verdicts(len(portion), reasons)
         center, size, score = portion["center"], portion["size"], portion["score"]
         why.mark(is_gone, _LEFT_OUT)
+        if "entry" in (portion.dtype.names or ()):
+            for entry, reason in _OF_ENTRY.items():
+                if (portion["entry"] == entry).any():
+                    why.mark(portion["entry"] == entry, reason)
         why.mark(image_row < 0, self._no_image)
         why.mark((image_row >= 0) & ~self._usable[image_row], _LEFT_OUT)
         why.mark(~np.isfinite(np.column_stack([center, size, score])).all(axis=1), _NOT_FINITE)

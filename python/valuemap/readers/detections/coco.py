@@ -13,7 +13,7 @@ import numpy as np
 from valuemap.coco import EXPECTED, ID, MAYBE_TEXT, TEXT, Entries
 from valuemap.errors import InputError
 from valuemap.json_lists import read_json_lists
-from valuemap.readers.boxes import BoxWriter
+from valuemap.readers.boxes import CROWD, SINGLE, BoxWriter
 from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes
 from valuemap.tables import Ints
 
@@ -24,8 +24,9 @@ def read_coco(file: DetectionFile) -> NamedBoxes:
     An object has `images` (id, file_name), `annotations` (image_id, category_id, bbox, maybe score and id)
     and maybe `categories` (id, name). A list has results (category_id, bbox, score) that name their image in
     `file_name`, or in an `image_id` that is a text. A bbox is x, y, width, height of continuous edges, so its
-    centre needs no further half pixel. Without `categories` the class of id 9 is `class-9`; without `score`
-    the score is 1. Where every annotation has a whole number of its own as `id`, that is its detection_id.
+    centre needs no further half pixel. Where `iscrowd` is 1 it is of many objects, and left out. Without
+    `categories` the class of id 9 is `class-9`; without `score` the score is 1. Where every annotation has a
+    whole number of its own as `id`, that is its detection_id.
 
     The file is read in portions, and of a box its numbers are kept, in a temporary file.
 
@@ -102,6 +103,7 @@ class _Boxes:
             size=bbox_px[:, 2:],
             score=entries.numbers("score", 1.0),
             detection_id=ids,
+            entry=np.array([CROWD if entry.get("iscrowd") == 1 else SINGLE for entry in entries.entries]),
         )
 
 

@@ -106,12 +106,13 @@ class NamedBoxes:
         center: Floats,
         size: Floats,
         score: Floats,
+        entry: Ints | None = None,
         **rest: Any,
     ) -> NamedBoxes:
-        """Return boxes (N) that are in memory; `rest` is as above."""
+        """Return boxes (N) that are in memory; `entry` is as in `FiledBoxes`, `rest` as above."""
         writer = BoxWriter()
         names = writer.images.codes_of(image_names), writer.classes.codes_of(class_names)
-        writer.add(image=names[0], kind=names[1], center=center, size=size, score=score)
+        writer.add(image=names[0], kind=names[1], center=center, size=size, score=score, entry=entry)
         return cls(writer.rows, writer.images.texts, writer.classes.texts, **rest)
 
 
@@ -152,6 +153,10 @@ def _refuse_other_sizes(
     used = set(boxes.image_names)
     for name, size in boxes.pictures.items():
         if name not in used or name not in row_of:
+            continue
+        if any(
+            type(side) in (int, float) and side <= 0 for side in size
+        ):  # Datumaro writes 0 for what it does not know.
             continue
         camera = camera_row[row_of[name]]
         expected = (int(cameras.width_px[camera]), int(cameras.height_px[camera]))
