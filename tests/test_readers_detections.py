@@ -240,6 +240,58 @@ def test_confidences_of_polygons_and_numbers_of_tracks_of_yolo(tmp_path: Path, r
     assert_allclose(found.score, [0.5])
 
 
+BOX = "0.1875 0.125 0.0625 0.0416666666666667"
+OUTLINE = "0.15625 0.125 0.1875 0.104166666667 0.21875 0.125 0.1875 0.145833333333"
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "score"),
+    [
+        (f"0 {BOX} 12", f"0 {BOX} 1", 1.0),  # Tracks without confidences.
+        (f"0 {OUTLINE} 0.5 12", f"0 {OUTLINE} 0.5 1", 0.5),
+        (f"0 {OUTLINE} 12", f"0 {OUTLINE} 1", 1.0),
+        (f"0.0 {BOX} 0.5", f"0.0 {BOX} 0.5", 0.5),  # As NumPy writes whole numbers.
+    ],
+)
+def test_numbers_of_tracks_of_yolo_are_told_from_the_whole_folder(
+    tmp_path: Path, first: str, second: str, score: float
+) -> None:
+    """Where one is larger than 1, which no fraction or confidence is, the others are numbers of tracks too."""
+    labels = detections_in(tmp_path, "yolo")
+    write(labels / "a" / "1.txt", first + "\n")
+    write(labels / "a" / "2.txt", second + "\n")
+    found = read(tmp_path, labels).detections
+    assert_allclose(found.center_px, [CENTER] * 2, atol=1e-6)
+    assert_allclose(found.size_px, [SIZE] * 2, atol=1e-6)
+    assert_allclose(found.score, [score] * 2)
+    assert found.class_name.texts() == ["light"] * 2
+
+
+def test_confidences_of_yolo_in_percent_are_no_numbers_of_tracks(tmp_path: Path) -> None:
+    labels = detections_in(tmp_path, "yolo")
+    write(labels / "a" / "1.txt", f"0 {BOX} 85\n0 0.5 0.5 0.1 0.1 85\n")
+    assert "its score is not from 0 to 1" in refusal(lambda: read(tmp_path, labels))
+
+
+def test_key_points_of_yolo_count_for_nothing_where_it_is_said_how_many_there_are(tmp_path: Path) -> None:
+    labels = detections_in(tmp_path, "yolo")
+    write(tmp_path / "data.yaml", "kpt_shape: [2, 3]\nnames: {0: light}\n")
+    write(labels / "a" / "1.txt", f"0 {BOX} 0.1 0.1 2 0.9 0.9 2 0.5\n")
+    found = read(tmp_path, labels).detections
+    assert_allclose(found.center_px, [CENTER], atol=1e-6)
+    assert_allclose(found.size_px, [SIZE], atol=1e-6)
+    assert_allclose(found.score, [0.5])
+
+
+@pytest.mark.parametrize("layout", ["labels/train", "train/labels"])
+def test_names_of_classes_of_yolo_may_be_two_folders_above_and_numbers(tmp_path: Path, layout: str) -> None:
+    write(tmp_path / layout / "a" / "1.txt", f"0 {BOX}\n1 0.5 0.5 0.1 0.1\n")
+    write(tmp_path / "data.yaml", "names: [50, stop]\n")
+    assert sorted(read(tmp_path, tmp_path / layout).detections.class_name.texts()) == ["50", "stop"]
+    write(tmp_path / "data.yaml", "names: {'0': light, 1: no}\n")
+    assert "expected a class by its number, found 1: False" in refusal(lambda: read(tmp_path, tmp_path / layout))
+
+
 @pytest.mark.parametrize("kind", DETECTIONS)
 def test_boxes_of_unknown_images_are_left_out_and_named(tmp_path: Path, kind: str) -> None:
     path = detections_in(tmp_path, kind)

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import codecs
+import math
+import os.path
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +19,36 @@ from valuemap.readers.files import check_folder, file_in, read_text, read_yaml
 _EXPECTED = "a folder of text files with rows: class cx cy width height [confidence], as fractions of the picture"
 _NAMES_FILES = ("data.yaml", "data.yml", "dataset.yaml", "dataset.yml", "classes.txt", "obj.names")
 _LARGEST_CLASS = 100_000
+_BOX = 4
+"""Numbers of a box: centre x and y, width and height."""
+
+
+@dataclass(frozen=True)
+class _Row:
+    """The numbers of a row after its class, and where and how it is written."""
+
+    where: str
+    text: str
+    code: int
+    values: list[float]
+
+    def wrong(self) -> InputError:
+        """Return the error that says what was expected."""
+        return InputError(
+            f"{self.where}: expected class cx cy width height [confidence], found {self.text.strip()[:60]!r}",
+            hint="the class is a whole number, the others are fractions of the picture's width and height; other text "
+            "files must not be in the folder",
+        )
 
 
 def read_yolo(file: DetectionFile) -> NamedBoxes:
     """Read a folder of files `NAME.txt` for the pictures `NAME.jpg`, with rows of fractions of the picture.
 
-    A row is class, centre x and y, width, height and maybe the confidence, and after it the number of a track. An odd
-    number of values from 7 up is a class and a polygon, of which the box counts, an even one from 10 up has the
-    confidence too. `data.yaml`, `dataset.yaml` (names), `classes.txt` or `obj.names` in the
-    folder or the one above name the classes; else class 9 is `class-9`.
+    A row is class, centre x and y, width, height and maybe the confidence. An odd number of values from 7 up is a
+    class and a polygon, of which the box counts, an even one from 10 up has the confidence too. Numbers of tracks at
+    the end of rows, and key points where `data.yaml` says how many there are, count for nothing. `data.yaml`,
+    `dataset.yaml` (names), `classes.txt` or `obj.names` in the folder or one of the two above name the classes; else
+    class 9 is `class-9`.
 
     Raises
     ------
@@ -36,29 +61,25 @@ def read_yolo(file: DetectionFile) -> NamedBoxes:
     )
     if not paths:
         raise InputError(f"{folder}: there are no .txt files in it", hint=f"expected {_EXPECTED}")
-    names = _class_names(folder)
-    images, classes, places, scores, where = [], [], [], [], []
+    names, key_values = _classes(folder)
+    rows_of: dict[str, list[_Row]] = {}
     for path in paths:
         name = path.relative_to(folder).as_posix()
         if _is_blank(file_in(folder, name, _EXPECTED)):
             continue  # Nothing is in the picture.
-        for line, row in enumerate(read_text(path, _EXPECTED).splitlines(), start=1):
-            if not row.strip():
-                continue
-            code, place, score = _row(row, f"{path} line {line}")
-            images.append(name)
-            classes.append(names.get(code, f"class-{code}") if names is not None else f"class-{code}")
-            places.append(place)
-            scores.append(score * file.full_score)
-            where.append(f"{path} line {line}")
-    boxes = np.array(places, dtype=np.float64).reshape(-1, 4)
+        lines = enumerate(read_text(path, _EXPECTED).splitlines(), start=1)
+        rows_of[name] = [_row(text, f"{path} line {line}", key_values) for line, text in lines if text.strip()]
+    _remove_tracks(list(rows_of.values()))
+    rows = [row for of_picture in rows_of.values() for row in of_picture]
+    found = [_place(row) for row in rows]
+    boxes = np.array([place for place, _ in found], dtype=np.float64).reshape(-1, 4)
     return NamedBoxes.of_columns(
-        image_names=images,
-        class_names=classes,
+        image_names=[name for name, of_picture in rows_of.items() for _ in of_picture],
+        class_names=[names.get(row.code, f"class-{row.code}") for row in rows],
         center=boxes[:, :2],
         size=boxes[:, 2:],
-        score=np.array(scores, dtype=np.float64),
-        where=where.__getitem__,
+        score=np.array([score * file.full_score for _, score in found], dtype=np.float64),
+        where=[row.where for row in rows].__getitem__,
         fractions=True,
     )
 
@@ -71,54 +92,96 @@ _MOST_BLANK = 16
 """Bytes of a file that may hold a mark and the ends of lines, and no row."""
 
 
-def _row(row: str, where: str) -> tuple[int, list[float], float]:
-    """Return class, place and confidence; what Ultralytics writes after these of a track is only a whole number."""
-    fields = row.split()
+def _row(text: str, where: str, key_values: int) -> _Row:
+    """Return a row without the values of its key points."""
     try:
-        code, values = int(fields[0]), [float(field) for field in fields[1:]]
+        code, *values = (float(field) for field in text.split())
     except ValueError:
-        code, values = -1, []
-    is_numbered = fields[-1].isdecimal() and values[-1:] >= [1.0]
-    if len(values) == 6 and is_numbered:
-        values.pop()
-    elif len(values) > 6 and is_numbered and values[-1] > 1.0:
-        code = -1  # Of an outline: its number would be a corner.
+        code, values = math.nan, []
+    is_class = 0.0 <= code < _LARGEST_CLASS and code == int(code)
+    row = _Row(where, text, int(code) if is_class else -1, values)
+    if not is_class or len(values) < _BOX:
+        raise row.wrong()
+    if len(values) >= _BOX + key_values:
+        del values[_BOX : _BOX + key_values]
+    return row
+
+
+def _remove_tracks(pictures: Sequence[Sequence[_Row]]) -> None:
+    """Take the numbers of tracks away, which Ultralytics writes at the end of rows.
+
+    They count from 1, and no other last value, a fraction or a confidence, is larger than that.
+    """
+
+    def may_be_tracks(rows: Sequence[_Row]) -> bool:
+        last = [row.values[-1] for row in rows]
+        is_more = all(len(row.values) > _BOX for row in rows)
+        return is_more and all(each >= 1.0 and each.is_integer() for each in last) and len(set(last)) == len(last)
+
+    tracked = [rows for rows in pictures if may_be_tracks(rows)]
+    if any(row.values[-1] > 1.0 for rows in tracked for row in rows):
+        for rows in tracked:
+            for row in rows:
+                row.values.pop()
+    for rows in pictures:
+        for row in rows:
+            if len(row.values) == _BOX + 2 and row.values[-1] >= 1.0 and row.values[-1].is_integer():
+                row.values.pop()  # A triangle that touches the lower edge is rarer than a box of a first track.
+
+
+def _place(row: _Row) -> tuple[list[float], float]:
+    """Return centre, width and height, and the confidence."""
+    values = list(row.values)
     is_outline = len(values) >= 6 and len(values) % 2 == 0
     is_scored_outline = len(values) >= 9 and len(values) % 2 == 1
-    if not 0 <= code < _LARGEST_CLASS or not (len(values) in (4, 5) or is_outline or is_scored_outline):
-        raise InputError(
-            f"{where}: expected class cx cy width height [confidence], found {row.strip()[:60]!r}",
-            hint="the class is a whole number, the others are fractions of the picture's width and height",
-        )
+    if not (len(values) in (_BOX, _BOX + 1) or is_outline or is_scored_outline):
+        raise row.wrong()
+    if len(values) > _BOX + 1 and values[-1] > 1.0 and values[-1].is_integer():
+        raise row.wrong()  # The number of a track, where others have none: it would be a corner.
     score = values.pop() if len(values) % 2 == 1 else 1.0
-    if len(values) == 4:
-        return code, values, score
+    if len(values) == _BOX:
+        return values, score
     x, y = np.array(values[::2]), np.array(values[1::2])
     low, high = (x.min(), y.min()), (x.max(), y.max())
-    return code, [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, high[0] - low[0], high[1] - low[1]], score
+    return [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, high[0] - low[0], high[1] - low[1]], score
 
 
-def _class_names(folder: Path) -> dict[int, str] | None:
-    for place in (folder, folder.parent):
+def _classes(folder: Path) -> tuple[dict[int, str], int]:
+    """Return the names of classes, and how many values of key points follow a box."""
+    above = Path(os.path.abspath(folder)).parents  # noqa: PTH100 (a link to a folder is where it is)
+    for place in (folder, *above[:2]):
         for name in _NAMES_FILES:
             path = place / name
+            if path.is_file() and path.suffix in (".yaml", ".yml"):
+                content = read_yaml(path, "a YAML file with names")
+                return _names_in(content, path), _key_values_in(content)
             if path.is_file():
-                found = (
-                    _names_in(read_yaml(path, "a YAML file with names"), path)
-                    if path.suffix in (".yaml", ".yml")
-                    else read_text(path, "one name of a class a line").splitlines()
-                )
-                pairs = found.items() if isinstance(found, dict) else enumerate(found)
-                return {int(code): str(text).strip() or f"class-{code}" for code, text in pairs}
-    return None
+                return _numbered(read_text(path, "one name of a class a line").splitlines()), 0
+    return {}, 0
 
 
-def _names_in(content: Any, path: Path) -> Any:
+def _numbered(names: Sequence[str]) -> dict[int, str]:
+    return {code: name.strip() or f"class-{code}" for code, name in enumerate(names)}
+
+
+def _names_in(content: Any, path: Path) -> dict[int, str]:
+    """Return the names of a list or by number; speeds and the like may be written as numbers."""
     names = content.get("names") if isinstance(content, dict) else None
-    is_list = isinstance(names, list) and all(isinstance(name, str) for name in names)
-    is_dict = isinstance(names, dict) and all(
-        type(code) is int and isinstance(name, str) for code, name in names.items()
-    )
-    if not (is_list or is_dict):
+    pairs = list(names.items() if isinstance(names, dict) else enumerate(names) if isinstance(names, list) else [])
+    if not pairs:
         raise InputError(f"{path}: expected names, a list of classes, or numbers and classes", hint="repair the file")
-    return names
+    found = {}
+    for code, name in pairs:
+        if not str(code).isdecimal() or isinstance(name, bool) or not isinstance(name, str | int | float):
+            raise InputError(
+                f"{path}: names: expected a class by its number, found {code!r}: {name!r}",
+                hint="put names such as yes, no, on and off in quotes",
+            )
+        found[int(code)] = str(name).strip() or f"class-{code}"
+    return found
+
+
+def _key_values_in(content: Any) -> int:
+    shape = content.get("kpt_shape")
+    is_shape = isinstance(shape, list) and len(shape) == 2 and all(type(each) is int and each > 0 for each in shape)
+    return math.prod(shape) if is_shape else 0
