@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -186,6 +187,51 @@ def test_a_crowd_of_coco_is_no_detection_and_no_fault(tmp_path: Path) -> None:
     said = refusal(lambda: read(tmp_path, write(tmp_path / "boxes.json", json.dumps(content))))
     assert "3 of 4 boxes cannot be used, more than 1 %: a number is missing or not finite (2," in said
     assert "| repair these rows" in said
+
+
+def test_results_of_coco_with_numbers_only_are_of_the_listed_images(tmp_path: Path) -> None:
+    """As pycocotools, Detectron2 and MMDetection write them: the names are in the file that the detector ran on."""
+    result = {"image_id": 7, "category_id": 3, "bbox": [100, 50, 40, 20], "score": 0.5}
+    path = write(tmp_path / "results.json", json.dumps([result, {**result, "file_name": "a/2.jpg"}]))
+    listed = write(tmp_path / "instances.json", COCO)
+    said = refusal(lambda: read(tmp_path, path))
+    assert "results[0]: image_id 7 does not say which file it is (1 entries)" in said
+    assert "--detection-images" in said
+    dataset = read(tmp_path, DetectionFile(path, image_list=listed))
+    assert dataset.detections.class_name.texts() == ["light", "light"]
+    assert dataset.images.name.take(dataset.detections.image_id).to_pylist() == ["a/1.jpg", "a/2.jpg"]
+    assert_allclose(dataset.detections.center_px, [CENTER] * 2)
+    assert_allclose(dataset.detections.score, [0.5] * 2)
+    write(listed, COCO.replace('"id": 7', '"id": 8'))
+    said = refusal(lambda: read(tmp_path, DetectionFile(path, image_list=listed)))
+    assert "its image is not among the images with a pose (1, the first is" in said
+    assert "'image_id 7'" in said
+    write(listed, COCO.replace("640", "1280"))
+    assert "found 1280 x 480" in refusal(lambda: read(tmp_path, DetectionFile(path, image_list=listed)))
+    for other in (listed, tmp_path / "b.csv"):
+        file = DetectionFile(other, image_list=listed)
+        assert "detection-images" in refusal(partial(read, tmp_path, file))
+
+
+@pytest.mark.parametrize(
+    "name", ["images/0d1f2a3b-1.jpg", "upload\\3\\0D1F2A3B-1.jpg", "1_jpg.rf.034d0c9f9a0edda727b2bc56fd073177.jpg"]
+)
+def test_names_that_tools_for_labels_gave_find_their_images(tmp_path: Path, name: str) -> None:
+    path = write(tmp_path / "boxes.csv", CORNERS.replace("a/1.jpg", name))
+    assert_allclose(read(tmp_path, path).detections.center_px, [CENTER])
+    again = CORNERS.replace("a/1.jpg", name) + name.replace("3", "4") + ",1,2,30,40,light\n"
+    assert "its image is not among" in refusal(lambda: read(tmp_path, write(tmp_path / "boxes.csv", again)))
+
+
+def test_an_empty_row_says_that_nothing_is_in_the_picture(tmp_path: Path) -> None:
+    path = write(tmp_path / "boxes.csv", CORNERS + "a/2.jpg,,,,,\n")
+    dataset = read(tmp_path, path)
+    assert_allclose(dataset.detections.center_px, [CENTER])
+    assert dataset.rejected is not None
+    assert dataset.rejected.reason.texts() == ["its row is empty but for the image: nothing is in the picture"]
+    for row in ("a/2.jpg,x,,,,\n", "a/2.jpg,,,,,light\n", "a/2.jpg,1,,,,\n"):
+        write(path, CORNERS + row)
+        assert "a number is missing or not finite" in refusal(lambda: read(tmp_path, path))
 
 
 def test_a_size_of_0_in_coco_says_that_it_is_not_known(tmp_path: Path) -> None:

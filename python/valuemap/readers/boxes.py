@@ -14,8 +14,8 @@ from valuemap.readers.texts import Texts
 from valuemap.tables import Floats, Ints
 
 OPTIONAL = ("range_m", "range_sigma_m", "vertical_sigma_px")
-SINGLE, CROWD, NO_BOX = range(3)
-"""What an entry of a file is: a box of one object, a region of many, or a shape that has no box."""
+SINGLE, CROWD, NO_BOX, NOTHING = range(4)
+"""What an entry of a file is: a box of one object, a region of many, a shape without a box, or no more than a name."""
 _COLUMNS: Mapping[str, Any] = {
     "row": np.int64,
     "image": np.int32,
@@ -123,7 +123,7 @@ class FiledBoxes:
     ----------
     rows
         Their numbers, with a number for each distinct text. A column `entry`, where there is one, says which
-        are `CROWD` or `NO_BOX` instead of `SINGLE`.
+        are `CROWD`, `NO_BOX` or `NOTHING` instead of `SINGLE`.
     image_row, image_names
         Row of an image (M) in the reader's table of images, -1 where it is not among them, and its name in the file, by
         its number in `rows`.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
@@ -14,7 +15,8 @@ def match_images(names: Collection[str], known: Sequence[str]) -> dict[str, int]
 
     The exact name counts first, then the name with Windows' separators turned and accents as one character (macOS
     writes two). After that capitals do not count: the name without its suffix, its last three, two and one parts, as
-    of a path in another folder, and these without their suffix. Each counts only if no other name and no other known
+    of a path in another folder, these without their suffix, and the last part as it was before a tool for labels got
+    it. Each counts only if no other name and no other known
     image has the same. `cam1/7.jpg` must not become `cam0/7.jpg` only because `cam1` is not among the known, nor
     `7.png` become `7.jpg` beside another `7.jpg`.
     """
@@ -50,10 +52,19 @@ def _end_without_suffix(name: str, parts: int) -> str:
     return "/".join(_without_suffix(name).split("/")[-parts:])
 
 
+def _before_upload(name: str) -> str:
+    """Return the last part without the eight digits that Label Studio puts before it and what Roboflow adds to it."""
+    last = _end_without_suffix(name, 1)
+    return _ROBOFLOW.sub("", _LABEL_STUDIO.sub("", last))
+
+
+_LABEL_STUDIO = re.compile(r"^[0-9a-f]{8}-(?=.)")
+_ROBOFLOW = re.compile(r"_[a-z]{3,4}\.rf\.[0-9a-z]+$")
 _PICTURES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".ppm", ".txt"))
 _KEYS: tuple[Callable[[str], str], ...] = (
     str,
     _slashed,
     _without_suffix,
     *(partial(end, parts=parts) for parts in (3, 2, 1) for end in (_end, _end_without_suffix)),
+    _before_upload,
 )

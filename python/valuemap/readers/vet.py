@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from valuemap.errors import InputError, SettingError
 from valuemap.readers import row_file
-from valuemap.readers.boxes import CROWD, NO_BOX, FiledBoxes, are_distinct, structure
+from valuemap.readers.boxes import CROWD, NO_BOX, NOTHING, FiledBoxes, are_distinct, structure
 from valuemap.readers.names import match_images
 from valuemap.readers.row_file import PartFile, RowFile, Rows, bounds_by_count
 from valuemap.tables import Bools, Cameras, Categories, Detections, Floats, Images, Ints, RejectedRows
@@ -64,6 +64,9 @@ _OF_ENTRY = {
         "it is marked as a crowd: a region of many objects", "mark every object with a box of its own", counts=False
     ),
     NO_BOX: _Reason("it is a shape without a box, such as points or a line", "draw boxes or polygons", counts=False),
+    NOTHING: _Reason(
+        "its row is empty but for the image: nothing is in the picture", "did the detector find anything?", counts=False
+    ),
 }
 # What goes with its image is the image's fault, which was counted.
 _LEFT_OUT = _Reason("its image was left out", "repair the image first", counts=False)

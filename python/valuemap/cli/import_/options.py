@@ -73,6 +73,13 @@ _DETECTION_OPTIONS: dict[str, tuple[Any, Any]] = {
         Annotated[float, typer.Option("--full-score", help="The score that means certain; others are divided by it.")],
         1.0,
     ),
+    "boxes_images": (
+        Annotated[
+            Path | None,
+            typer.Option("--detection-images", help="COCO file that says which files image_id of results are."),
+        ],
+        None,
+    ),
 }
 
 
@@ -106,10 +113,11 @@ def _detection_file(
     boxes_pixel_center: float | None,
     boxes_fractions: bool,
     boxes_full_score: float,
+    boxes_images: Path | None,
 ) -> DetectionFile | None:
     if boxes is None:
-        given = [boxes_format, boxes_class, boxes_columns or None, boxes_pixel_center, boxes_fractions]
-        given.append(boxes_full_score)
+        given: list[Any] = [boxes_format, boxes_class, boxes_columns or None, boxes_pixel_center, boxes_fractions]
+        given += [boxes_full_score, boxes_images]
         usual = [default for name, (_, default) in _DETECTION_OPTIONS.items() if name != "boxes"]
         if given != usual:  # A user would look for an effect that cannot be.
             raise SettingError(
@@ -125,4 +133,5 @@ def _detection_file(
         full_score=boxes_full_score,
         columns=parse_columns(boxes_columns or []),
         fractions=boxes_fractions,
+        image_list=boxes_images,
     )

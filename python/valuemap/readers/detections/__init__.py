@@ -46,7 +46,12 @@ def read_detections(file: DetectionFile | Path | None, images: Images, cameras: 
         return FoundBoxes.none()
     if isinstance(file, Path):
         file = DetectionFile(file)
-    boxes = DETECTIONS[format_of(file)](file)
+    name = format_of(file)
+    if file.image_list is not None and name != "coco":
+        raise SettingError(
+            f"detection-images: goes with results in COCO's format, not with {name}", hint="leave this option away"
+        )
+    boxes = DETECTIONS[name](file)
     pa.default_memory_pool().release_unused()  # Of the file as it was read, which Arrow would keep for what comes next.
     return find_images(boxes, images, cameras, file)
 

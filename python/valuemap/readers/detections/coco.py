@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from valuemap.coco import EXPECTED, ID, MAYBE_TEXT, TEXT, Entries
-from valuemap.errors import InputError
+from valuemap.errors import InputError, SettingError
 from valuemap.json_lists import read_json_lists
 from valuemap.readers.boxes import CROWD, SINGLE, BoxWriter
 from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes
@@ -23,7 +23,8 @@ def read_coco(file: DetectionFile) -> NamedBoxes:
 
     An object has `images` (id, file_name), `annotations` (image_id, category_id, bbox, maybe score and id)
     and maybe `categories` (id, name). A list has results (category_id, bbox, score) that name their image in
-    `file_name`, or in an `image_id` that is a text. A bbox is x, y, width, height of continuous edges, so its
+    `file_name`, or in an `image_id` that is a text, or whose `image_id` and `category_id` are of the lists in
+    `file.image_list`. A bbox is x, y, width, height of continuous edges, so its
     centre needs no further half pixel. Where `iscrowd` is 1 it is of many objects, and left out. Without
     `categories` the class of id 9 is `class-9`; without `score` the score is 1. Where every annotation has a
     whole number of its own as `id`, that is its detection_id.
@@ -34,21 +35,26 @@ def read_coco(file: DetectionFile) -> NamedBoxes:
     ------
     InputError
         The file is no COCO file or has no boxes, or one does not say its image or class.
+    SettingError
+        Images are listed in the file and apart.
     """
     path = file.path
-    lists: dict[str | None, Any] = {}
-    for portion in read_json_lists(path, EXPECTED):
-        key, where = portion.key, f"{path}: {portion.key or 'results'}"
-        if portion.entries is None:  # The last of a name counts.
-            lists[key] = portion.value
-        elif key in _LISTS:
-            if portion.first == 0:
-                lists[key] = _LISTS[key](where)
-            lists[key].add(Entries(where, portion.entries, portion.first))
+    lists = _read_lists(path, _LISTS)
     boxes = lists[None] if isinstance(lists.get(None), _Results) else _list_in(lists, "annotations", path)
     if not len(boxes.writer.rows):
         raise InputError(f"{path}: there are no detections in it", hint="did the detector find anything?")
-    images = _Named("") if isinstance(boxes, _Results) else _list_in(lists, "images", path)
+    if isinstance(boxes, _Annotations):
+        if file.image_list is not None:
+            raise SettingError(
+                f"detection-images: {path} lists its images itself", hint="leave this option away, or name results"
+            )
+        images = _list_in(lists, "images", path)
+    elif file.image_list is not None:
+        lists = _read_lists(file.image_list, _NAMES)
+        images = _list_in(lists, "images", file.image_list)
+    else:
+        boxes.refuse_unnamed()
+        images = _Named("")
     categories = _list_in(lists, "categories", path).name_of if lists.get("categories") else None
     return NamedBoxes(
         rows=boxes.writer.rows,
@@ -59,6 +65,20 @@ def read_coco(file: DetectionFile) -> NamedBoxes:
         pictures=images.sizes,
         other_names=list(images.name_of.values()),
     )
+
+
+def _read_lists(path: Path, kinds: Mapping[str | None, Callable[[str], _Boxes | _Named]]) -> dict[str | None, Any]:
+    """Return what is made of the lists in a file."""
+    lists: dict[str | None, Any] = {}
+    for portion in read_json_lists(path, EXPECTED):
+        key, where = portion.key, f"{path}: {portion.key or 'results'}"
+        if portion.entries is None:  # The last of a name counts.
+            lists[key] = portion.value
+        elif key in kinds:
+            if portion.first == 0:
+                lists[key] = kinds[key](where)
+            lists[key].add(Entries(where, portion.entries, portion.first))
+    return lists
 
 
 class _Numbered:
@@ -124,32 +144,40 @@ class _Annotations(_Boxes):
 
 
 class _Results(_Boxes):
-    """Boxes that name their file: a bare number might be the id of another image elsewhere."""
+    """Boxes that name their file; or a number, which might be the id of another image elsewhere."""
 
     def __init__(self, where: str) -> None:
         super().__init__(where)
-        self._unnamed: list[tuple[int, Any]] = []
+        self._unnamed, self._first_unnamed = 0, (0, "")
 
     def add(self, entries: Entries) -> None:
         image_ids = entries.column("image_id", ID, default="")
-        names: list[str] = [
-            name or (image_id if isinstance(image_id, str) else "")
-            for name, image_id in zip(entries.column("file_name", MAYBE_TEXT, default=""), image_ids, strict=True)
+        names = entries.column("file_name", MAYBE_TEXT, default="")
+        unnamed = [
+            (row, reprlib.repr(image_id))
+            for row, (name, image_id) in enumerate(zip(names, image_ids, strict=True), start=entries.first)
+            if not (name or (image_id and isinstance(image_id, str)))
         ]
-        self._unnamed += [(entries.first + row, image_ids[row]) for row, name in enumerate(names) if not name]
-        self.write(entries, names)
+        self._first_unnamed = self._first_unnamed if self._unnamed or not unnamed else unnamed[0]
+        self._unnamed += len(unnamed)
+        self.write(entries, [name or image_id for name, image_id in zip(names, image_ids, strict=True)])
 
-    def image_names(self, _name_of: Mapping[Any, str]) -> list[str]:
-        """Return the file names of the images."""
+    def refuse_unnamed(self) -> None:
+        """Raise where there are boxes of which nothing says the file."""
         if self._unnamed:
-            row, image_id = self._unnamed[0]
+            row, image_id = self._first_unnamed
             raise InputError(
-                f"{self.where}[{row}]: image_id {image_id!r} does not say which file it is "
-                f"({len(self._unnamed)} entries)",
-                hint="add file_name to every result, or put the results as annotations into an object, beside "
-                "the list named images that the detector ran on",
+                f"{self.where}[{row}]: image_id {image_id} does not say which file it is ({self._unnamed} entries)",
+                hint="name the COCO file that the detector ran on with --detection-images, or add file_name to every "
+                "result",
             )
-        return self.images.keys
+
+    def image_names(self, name_of: Mapping[Any, str]) -> list[str]:
+        """Return the file names of the images; of a number that is not listed that, which is no file name."""
+        return [
+            name_of.get(key) or (key if isinstance(key, str) and key else f"image_id {_written(key)}")
+            for key in self.images.keys
+        ]
 
 
 class _Named:
@@ -184,11 +212,14 @@ def _as_number(value: Any) -> Any:
         return value
 
 
+_NAMES: Mapping[str | None, Callable[[str], _Boxes | _Named]] = {
+    "images": _Named,
+    "categories": partial(_Named, text="name"),
+}
 _LISTS: Mapping[str | None, Callable[[str], _Boxes | _Named]] = {
     None: _Results,
     "annotations": _Annotations,
-    "images": _Named,
-    "categories": partial(_Named, text="name"),
+    **_NAMES,
 }
 """What is made of each list; None is the whole file."""
 

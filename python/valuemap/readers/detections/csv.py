@@ -6,17 +6,18 @@ from functools import partial
 
 import numpy as np
 
-from valuemap.readers.boxes import OPTIONAL, BoxWriter
+from valuemap.readers.boxes import NOTHING, OPTIONAL, SINGLE, BoxWriter
 from valuemap.readers.csv_file import CsvFile, csv_portions, line_of
 from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes
 from valuemap.readers.texts import Texts
-from valuemap.tables import Floats
+from valuemap.tables import Bools, Floats
 
 _EXPECTED = "a CSV file with columns image and x1, y1, x2, y2, or left, top, width, height, or x, y"
 
 
 _TEXTS = ("image", "class")
-_NUMBERS = ("x1", "y1", "x2", "y2", "left", "top", "x", "y", "width", "height", "score", *OPTIONAL)
+_PLACES = ("x1", "y1", "x2", "y2", "left", "top", "x", "y")
+_NUMBERS = (*_PLACES, "width", "height", "score", *OPTIONAL)
 
 
 def read_csv_boxes(file: DetectionFile) -> NamedBoxes:
@@ -24,7 +25,7 @@ def read_csv_boxes(file: DetectionFile) -> NamedBoxes:
 
     `x1, y1, x2, y2` are edges, `left, top, width, height` the top-left corner and the size, `x, y` the centre, with
     `width, height` or, for key points, without. Optional are `class`, `score`, `range_m`, `range_sigma_m` (metres) and
-    `vertical_sigma_px`.
+    `vertical_sigma_px`. A row that has neither place nor class says that nothing is in the picture.
 
     The file is read in portions, and of a box its numbers are kept, in a temporary file.
 
@@ -46,6 +47,7 @@ def read_csv_boxes(file: DetectionFile) -> NamedBoxes:
             center=center,
             size=size,
             score=table.numbers("score") if has_score else np.full(len(table), file.full_score),
+            entry=np.where(_are_empty(table, center, classes), NOTHING, SINGLE),
             **{name: table.numbers_or_none(name) for name in OPTIONAL if table.has(name)},
         )
     return NamedBoxes(
@@ -69,6 +71,15 @@ def _boxes(table: CsvFile) -> tuple[Floats, Floats | None]:
     if table.has("x", "y"):
         return _pair(table, "x", "y"), _pair(table, "width", "height") if table.has("width", "height") else None
     raise table.missing("x1, y1, x2, y2, or left, top, width, height, or x, y (the centre) and maybe width, height")
+
+
+def _are_empty(table: CsvFile, center: Floats, classes: Texts) -> Bools:
+    """Return which rows (N) have nothing in any column of places, and no class where there is such a column."""
+    if not np.isnan(center).any():
+        return np.zeros(len(table), np.bool_)
+    places = [name for name in _PLACES if table.has(name)]
+    empty: Bools = np.all([np.isnan(table.numbers_or_none(name)) for name in places], axis=0)
+    return empty & (np.array([not text for text in classes]) if table.has("class") else True)
 
 
 def _pair(table: CsvFile, first: str, second: str) -> Floats:

@@ -43,6 +43,8 @@ class DetectionFile:
         Under which name a column stands in a CSV file, where it is another one.
     fractions
         Whether the coordinates of a CSV file are fractions of the picture's width and height.
+    image_list
+        A COCO file whose `images` and `categories` say what the ids of results are, which name neither.
     """
 
     path: Path
@@ -52,6 +54,7 @@ class DetectionFile:
     full_score: float = 1.0
     columns: Mapping[str, str] = field(default_factory=dict)
     fractions: bool = False
+    image_list: Path | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 < self.full_score < float("inf"):
