@@ -274,6 +274,35 @@ def test_lanelet2_reads_what_is_written(tmp_path: Path) -> None:
     assert_allclose(ends, lower_edges(Export(a_map()))[0], atol=2e-4)
     nodes = ElementTree.parse(tmp_path / "map.lanelet2.osm").getroot().findall("node")
     assert [float(tags_of(node)["ele"]) for node in nodes[:2]] == pytest.approx([39.55, 39.55], abs=1e-3)
+    # Autoware would take `local_x` for x, whatever the projection of the map of lanes is.
+    assert all(tags_of(node).keys() == {"ele"} for node in nodes)
+
+
+def test_lanelet2_of_a_map_in_a_frame_of_its_own_has_local_coordinates(tmp_path: Path) -> None:
+    """As Autoware has it where a map is not geo-referenced; cameras that look down a little tilt no map."""
+    tilt = np.radians(3.0)
+    result = a_map(Frame(up=(np.sin(tilt), 0.0, np.cos(tilt))))
+    export_map(result, tmp_path / "map.lanelet2.osm")
+    nodes = ElementTree.parse(tmp_path / "map.lanelet2.osm").getroot().findall("node")
+    assert all((node.attrib["lat"], node.attrib["lon"]) == ("0.0", "0.0") for node in nodes)
+    found = [[float(tags_of(node)[key]) for key in ("local_x", "local_y", "ele")] for node in nodes]
+    assert_allclose(found, lower_edges(Export(result)).reshape(-1, 3), atol=1e-4)
+    with pytest.raises(InputError, match="the map is not geo-referenced"):
+        export_map(result, tmp_path / "other.lanelet2.osm", crs="EPSG:32630")
+
+
+def test_lanelet2_does_not_share_ids_with_a_map_of_lanes(tmp_path: Path) -> None:
+    """Editors of such maps count from 1; where ids are the same, merging loses a line or moves another's nodes."""
+    export_map(a_map(), tmp_path / "map.lanelet2.osm")
+    root = ElementTree.parse(tmp_path / "map.lanelet2.osm").getroot()
+    ids = {
+        tags_of(way)["valuemap:label"]: [int(nd.attrib["ref"]) for nd in way.findall("nd")] + [int(way.attrib["id"])]
+        for way in root.findall("way")
+    }
+    assert ids == {str(label): [10**9 + 3 * label + each for each in range(3)] for label in range(3)}
+    assert {int(node.attrib["id"]) for node in root.findall("node")} == {
+        10**9 + 3 * label + each for label in range(3) for each in range(2)
+    }
 
 
 def signals_of(path: Path) -> list[ElementTree.Element]:
@@ -400,7 +429,7 @@ def test_colmap_needs_the_dataset(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["map.kml", "map.osm", "map.geojsonl", "map.lanelet2.osm"])
+@pytest.mark.parametrize("name", ["map.kml", "map.osm", "map.geojsonl"])
 def test_formats_of_the_earth_need_a_geo_reference(name: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="the map is not geo-referenced"):
         export_map(a_map(Frame()), tmp_path / name)

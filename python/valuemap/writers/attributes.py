@@ -32,6 +32,10 @@ _CODES_OF_WGS84 = ("4326", "4979", "OGC:CRS84")
 """What people call it: coordinates are east before north whatever the order of its own axes."""
 
 
+_UP_IS_Z = 0.9
+"""Cosine of 26 degrees: further from z no axis z is meant to be up."""
+
+
 def azimuth_in_degrees(azimuth_rad: Floats) -> Floats:
     """Return azimuths (N) from 0 to less than 360 degrees, NaN where there is none."""
     turned = np.degrees(azimuth_rad) % 360.0
@@ -110,7 +114,12 @@ class Export:
         return crs_from_lon_lat_height(lon_lat_height, self.crs) - [0.0, 0.0, self.zero_height_m]
 
     def on_the_ground(self, position_in_world_m: Floats) -> Floats:
-        """Return positions (N, 3) in the frame of the map as east, north, up: a GIS shows the first two."""
+        """Return positions (N, 3) in the frame of the map as east, north, up: a GIS shows the first two.
+
+        Where z is up, but for a few degrees by which the cameras were tilted, they are x, y, z as the user has them.
+        """
+        if self.result.frame.up[2] > _UP_IS_Z:
+            return position_in_world_m
         turned: Floats = position_in_world_m @ self.result.frame.east_north_up().T
         return turned
 

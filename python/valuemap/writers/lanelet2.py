@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -17,42 +18,54 @@ _LEAST_WIDTH_M = 0.05
 """The end points of a line must differ."""
 
 
+_FIRST_ID = 1_000_000_000
+"""Maps of lanes count from 1: a merged map must not have an id twice. Messages of Autoware hold ids of 31 bits."""
+
+
 def write_lanelet2(export: Export, path: Path) -> None:
     """Write two nodes and a way per label: lights as `traffic_light`, all others as `traffic_sign`.
 
-    Nodes carry `ele` (ellipsoidal height) and `local_x`, `local_y` (metres in the frame of the map). A way carries
-    `height`, and for whoever merges it into a map of lanes `existence`, `sigma_m` and the label's id.
+    Nodes have latitude, longitude and `ele` (ellipsoidal height). Where the map is not geo-referenced they have
+    `local_x`, `local_y` and `ele` in metres in its frame, z up, and latitude and longitude are 0, as Autoware has it:
+    it takes these tags for the truth wherever there are any. A way carries `height`, and for whoever merges it into a
+    map of lanes `existence`, `sigma_m` and the label's id. The ids go with those of the labels.
 
     Raises
     ------
     InputError
-        The map is not geo-referenced.
+        A reference system is asked for, and the map is not geo-referenced.
     OutputError
         Another reference system is asked for.
     """
-    needs_places(export, "Lanelet2")
-    anchor = export.result.frame.anchor
-    assert anchor is not None
     ends = lower_edges(export)
-    ends_geographic = lon_lat_height_from_enu(ends.reshape(-1, 3), anchor).reshape(-1, 2, 3)
     root = ElementTree.Element("osm", version="0.6", generator="valuemap", upload="never")
     child(root, "MetaInfo", format_version="1", map_version="1")
     rows = records(export)
-    for number in range(len(rows)):
+    first_id = [_FIRST_ID + 3 * int(row["label_id"]) for row in rows]
+    for number, (place, tags) in enumerate(_nodes(export, ends.reshape(-1, 3))):
+        identity = first_id[number // 2] + number % 2
+        node = child(root, "node", id=identity, version=1, visible="true", **place)
+        for key, value in tags.items():
+            child(node, "tag", k=key, v=f"{value:.4f}")
+    for identity, row in zip(first_id, rows, strict=True):
+        way = child(root, "way", id=identity + 2, version=1, visible="true")
         for end in (0, 1):
-            lon, lat, height = ends_geographic[number, end].tolist()
-            x, y, _ = ends[number, end].tolist()
-            node = child(root, "node", id=2 * number + end + 1, version=1, visible="true", lat=lat, lon=lon)
-            child(node, "tag", k="ele", v=f"{height:.4f}")
-            child(node, "tag", k="local_x", v=f"{x:.4f}")
-            child(node, "tag", k="local_y", v=f"{y:.4f}")
-    for number, row in enumerate(rows):
-        way = child(root, "way", id=2 * len(rows) + number + 1, version=1, visible="true")
-        for end in (0, 1):
-            child(way, "nd", ref=2 * number + end + 1)
-        for key, value in _tags(row).items():
-            child(way, "tag", k=key, v=value)
+            child(way, "nd", ref=identity + end)
+        for key, text in _tags(row).items():
+            child(way, "tag", k=key, v=text)
     write_xml(root, path)
+
+
+def _nodes(export: Export, position_in_world_m: Floats) -> Iterator[tuple[dict[str, float], dict[str, float]]]:
+    """Yield latitude and longitude, and the tags, of positions (N, 3)."""
+    anchor = export.result.frame.anchor
+    if anchor is None:
+        for x, y, z in export.on_the_ground(position_in_world_m).tolist():
+            yield {"lat": 0.0, "lon": 0.0}, {"ele": z, "local_x": x, "local_y": y}
+        return
+    needs_places(export, "Lanelet2")
+    for lon, lat, height in lon_lat_height_from_enu(position_in_world_m, anchor).tolist():
+        yield {"lat": lat, "lon": lon}, {"ele": height}
 
 
 def lower_edges(export: Export) -> Floats:

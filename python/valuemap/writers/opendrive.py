@@ -93,8 +93,7 @@ def _coordinates(export: Export) -> tuple[Floats, str | None]:
     """Return x, y, z (N, 3) in metres and the PROJ text of their projection, if there is one."""
     frame, labels = export.result.frame, export.result.labels
     if labels.lon_lat_height is None or frame.anchor is None:
-        east, north = frame.east_north()
-        return labels.position_in_world_m @ np.stack([east, north, np.array(frame.up)]).T, None
+        return export.on_the_ground(labels.position_in_world_m), None
     lat, lon, _ = frame.anchor
     projection = f"+proj=tmerc +lat_0={lat!r} +lon_0={lon!r} +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
     return crs_from_lon_lat_height(labels.lon_lat_height, f"{projection} +type=crs"), f"{projection} +vunits=m"
