@@ -234,6 +234,31 @@ def test_an_empty_row_says_that_nothing_is_in_the_picture(tmp_path: Path) -> Non
         assert "a number is missing or not finite" in refusal(lambda: read(tmp_path, path))
 
 
+def test_sizes_of_pictures_in_a_table_of_edges_are_looked_at(tmp_path: Path) -> None:
+    """TensorFlow's table has the size of the picture as width, height; in others they are those of the box."""
+    table = "filename,width,height,class,xmin,ymin,xmax,ymax\na/1.jpg,{},light,100,50,140,70\n"
+    columns = {"image": "filename", "x1": "xmin", "y1": "ymin", "x2": "xmax", "y2": "ymax"}
+    for size in ("640,480", "40,20"):
+        path = write(tmp_path / "boxes.csv", table.format(size))
+        assert_allclose(read(tmp_path, DetectionFile(path, columns=columns)).detections.center_px, [CENTER])
+    assert "--detection-column x1=xmin" in refusal(lambda: read(tmp_path, path))
+    write(path, table.format("320,240"))
+    said = refusal(lambda: read(tmp_path, DetectionFile(path, columns=columns)))
+    assert "'a/1.jpg': expected 640 x 480 px as in the model, found 320 x 240" in said
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ([{"name": "a/1.jpg", "labels": []}], "results[0]: has neither image_id nor file_name (1 entries) | is it a"),
+        ([{"file_name": "a/1.png", "segments_info": []}], "results[0]: is a panoptic segmentation"),
+    ],
+)
+def test_json_that_is_no_list_of_boxes_is_told_apart(tmp_path: Path, content: Any, said: str) -> None:
+    path = write(tmp_path / "boxes.json", json.dumps(content))
+    assert said in refusal(lambda: read(tmp_path, path))
+
+
 def test_a_size_of_0_in_coco_says_that_it_is_not_known(tmp_path: Path) -> None:
     """Datumaro writes it, and CVAT by it."""
     path = write(tmp_path / "boxes.json", COCO.replace("640", "0").replace("480", "0"))

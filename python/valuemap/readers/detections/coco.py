@@ -115,6 +115,12 @@ class _Boxes:
 
     def write(self, entries: Entries, images: list[Any], ids: Ints | None = None) -> None:
         """Keep the boxes of these images."""
+        panoptic = next((row for row, entry in enumerate(entries.entries) if "segments_info" in entry), None)
+        if panoptic is not None:
+            raise InputError(
+                f"{self.where}[{entries.first + panoptic}]: is a panoptic segmentation, not a box",
+                hint="export its things as instances with boxes",
+            )
         bbox_px = entries.boxes().reshape(-1, 4)
         self.writer.add(
             image=self.images.codes_of(images),
@@ -166,6 +172,11 @@ class _Results(_Boxes):
         """Raise where there are boxes of which nothing says the file."""
         if self._unnamed:
             row, image_id = self._first_unnamed
+            if image_id == repr(""):
+                raise InputError(
+                    f"{self.where}[{row}]: has neither image_id nor file_name ({self._unnamed} entries)",
+                    hint="is it a COCO file?",
+                )
             raise InputError(
                 f"{self.where}[{row}]: image_id {image_id} does not say which file it is ({self._unnamed} entries)",
                 hint="name the COCO file that the detector ran on with --detection-images, or add file_name to every "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -10,13 +11,17 @@ from valuemap.readers.boxes import NOTHING, OPTIONAL, SINGLE, BoxWriter
 from valuemap.readers.csv_file import CsvFile, csv_portions, line_of
 from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes
 from valuemap.readers.texts import Texts
-from valuemap.tables import Bools, Floats
+from valuemap.tables import Bools, Floats, Ints
 
-_EXPECTED = "a CSV file with columns image and x1, y1, x2, y2, or left, top, width, height, or x, y"
+_EXPECTED = (
+    "a CSV file with columns image and x1, y1, x2, y2, or left, top, width, height, or x, y; "
+    "--detection-column x1=xmin where x1 is called xmin"
+)
 
 
 _TEXTS = ("image", "class")
-_PLACES = ("x1", "y1", "x2", "y2", "left", "top", "x", "y")
+_EDGES = ("x1", "y1", "x2", "y2")
+_PLACES = (*_EDGES, "left", "top", "x", "y")
 _NUMBERS = (*_PLACES, "width", "height", "score", *OPTIONAL)
 
 
@@ -25,7 +30,8 @@ def read_csv_boxes(file: DetectionFile) -> NamedBoxes:
 
     `x1, y1, x2, y2` are edges, `left, top, width, height` the top-left corner and the size, `x, y` the centre, with
     `width, height` or, for key points, without. Optional are `class`, `score`, `range_m`, `range_sigma_m` (metres) and
-    `vertical_sigma_px`. A row that has neither place nor class says that nothing is in the picture.
+    `vertical_sigma_px`. Beside edges, whole numbers `width, height` that no box exceeds are the size of the picture. A
+    row that has neither place nor class says that nothing is in the picture.
 
     The file is read in portions, and of a box its numbers are kept, in a temporary file.
 
@@ -35,14 +41,16 @@ def read_csv_boxes(file: DetectionFile) -> NamedBoxes:
         The file is no such table.
     """
     writer = BoxWriter()
-    has_sizes = True
+    has_sizes, pictures = True, _Pictures()
     for table in csv_portions(file.path, _EXPECTED, texts=_TEXTS, numbers=_NUMBERS, columns=file.columns):
         center, size = _boxes(table)
         has_sizes = size is not None
         has_class, has_score = table.has_optional("class"), table.has_optional("score")
         classes = table.texts("class") if has_class else Texts.repeated(file.class_name, len(table))
+        images = writer.images.codes_of(table.texts("image"))
+        pictures.add(table, images)
         writer.add(
-            image=writer.images.codes_of(table.texts("image")),
+            image=images,
             kind=writer.classes.codes_of(classes),
             center=center,
             size=size,
@@ -57,12 +65,37 @@ def read_csv_boxes(file: DetectionFile) -> NamedBoxes:
         where=partial(line_of, file.path),
         fractions=file.fractions,
         are_points=not has_sizes,
+        pictures={} if file.fractions else pictures.sizes(writer.images.texts),
     )
+
+
+class _Pictures:
+    """The sizes of pictures as far as a table says them: TensorFlow's has them as `width, height` beside edges."""
+
+    def __init__(self) -> None:
+        self._size_of: dict[int, tuple[float, float]] = {}
+        self._are_sizes = True
+
+    def add(self, table: CsvFile, images: Ints) -> None:
+        """Take a portion, whose rows (N) are of these images."""
+        if not (self._are_sizes and table.has(*_EDGES, "width", "height")):
+            return
+        size, last = _pair(table, "width", "height"), _pair(table, "x2", "y2")
+        # Of a box they would be less than its far edges.
+        self._are_sizes = bool(((size >= last) & (size % 1.0 == 0.0) | np.isnan(last)).all())
+        codes, rows = np.unique(images, return_index=True)
+        for code, (width, height) in zip(codes.tolist(), size[rows].tolist(), strict=True):
+            self._size_of[code] = (width, height)
+
+    def sizes(self, names: Sequence[str]) -> dict[str, tuple[int, int]]:
+        """Return width and height by the names of the images."""
+        known = {code: size for code, size in self._size_of.items() if np.isfinite(size).all()}
+        return {names[code]: (int(size[0]), int(size[1])) for code, size in known.items()} if self._are_sizes else {}
 
 
 def _boxes(table: CsvFile) -> tuple[Floats, Floats | None]:
     """Return centres (N, 2), and sizes (N, 2) where there are any."""
-    if table.has("x1", "y1", "x2", "y2"):
+    if table.has(*_EDGES):
         first, last = _pair(table, "x1", "y1"), _pair(table, "x2", "y2")
         return (first + last) / 2.0, last - first
     if table.has("left", "top", "width", "height"):
