@@ -318,7 +318,8 @@ def test_opendrive_signals_say_where_and_how_exactly(tmp_path: Path) -> None:
     assert place is not None
     # Near the anchor the projection is the local frame; z is ellipsoidal, to the lower edge.
     assert [float(place.attrib[axis]) for axis in "xyz"] == pytest.approx([4.0, 25.0, 35.0 + 5.0 - 0.45], abs=1e-3)
-    assert float(place.attrib["hdg"]) == pytest.approx(-np.pi / 2)  # It faces south.
+    # It faces south, so that those see it who drive north.
+    assert float(place.attrib["hdg"]) == pytest.approx(np.pi / 2)
     error = light.find("dataQuality/error")
     assert error is not None
     assert float(error.attrib["xyAbsolute"]) == pytest.approx(np.hypot(0.2, 0.1), abs=1e-4)
@@ -352,6 +353,18 @@ def test_opendrive_roads_carry_their_signals(tmp_path: Path) -> None:
             y + s * np.sin(heading) + t * np.cos(heading),
         ]
         assert found == pytest.approx([float(place.attrib["x"]), float(place.attrib["y"])], abs=1e-3)
+        turned = heading + float(signal.attrib["hOffset"]) - float(place.attrib["hdg"])
+        assert np.cos(turned) == pytest.approx(1.0)
+
+
+def test_an_opendrive_signal_for_traffic_along_the_road_is_not_turned(tmp_path: Path) -> None:
+    """Of two lights on a road to the east, that which faces west is for those who drive along it."""
+    facing = np.radians([270.0, 90.0])
+    result = map_of([[0.0, 0.0, 5.0], [100.0, 0.0, 5.0]], ["traffic light"] * 2)
+    result = dataclasses.replace(result, labels=result.labels.replace(facing_azimuth_rad=facing))
+    export_map(result, tmp_path / "map.xodr")
+    turned = [float(signal.attrib["hOffset"]) for signal in signals_of(tmp_path / "map.xodr")]
+    assert np.abs(turned) == pytest.approx([0.0, np.pi], abs=1e-5)
 
 
 @pytest.mark.parametrize("frame", [GEOREFERENCED, Frame(up=(0.0, -1.0, 0.0))])

@@ -125,7 +125,9 @@ def _signal(
     code = None if found is None else found[0].vienna or found[0].mapillary
     number = None if found is None else found[1]
     x, y, z = point.tolist()
-    facing = math.pi / 2.0 - math.radians(float(str(row["facing_deg"])))  # From x, counter-clockwise.
+    # From x, counter-clockwise: where those drive whom it faces. A sign that is not turned (`hOffset` 0) is for traffic
+    # along its road, and so looks back.
+    heading = -math.pi / 2.0 - math.radians(float(str(row["facing_deg"])))
     signal = child(
         signals,
         "signal",
@@ -141,7 +143,7 @@ def _signal(
         subtype="-1",
         height=f"{height_m:.3f}" if "object_height_m" in row else None,
         width=f"{row['object_width_m']:.3f}" if "object_width_m" in row else None,
-        hOffset=f"{_turn(facing - road_heading):.6f}",
+        hOffset=f"{_turn(heading - road_heading):.6f}",
     )
     if number is not None:
         signal.set("text", number)  # A value must have a unit, and a class does not say whether km/h or mph.
@@ -151,7 +153,7 @@ def _signal(
         x=f"{x:.4f}",
         y=f"{y:.4f}",
         z=f"{z - height_m / 2.0:.4f}",
-        hdg=f"{_turn(facing):.6f}",
+        hdg=f"{_turn(heading):.6f}",
         pitch="0",
         roll="0",
     )
