@@ -291,6 +291,16 @@ def test_lanelet2_of_a_map_in_a_frame_of_its_own_has_local_coordinates(tmp_path:
         export_map(result, tmp_path / "other.lanelet2.osm", crs="EPSG:32630")
 
 
+def test_lanelet2_has_lights_for_pedestrians_without_yellow(tmp_path: Path) -> None:
+    names = ["object--traffic-light--pedestrians", "object--traffic-light--general-upright"]
+    places = lon_lat_height_from_enu(POSITIONS[:2], ANCHOR)
+    result = map_of(POSITIONS[:2], names, frame=GEOREFERENCED, lon_lat_height=places)
+    export_map(result, tmp_path / "map.lanelet2.osm")
+    ways = ElementTree.parse(tmp_path / "map.lanelet2.osm").getroot().findall("way")
+    assert [tags_of(way)["type"] for way in ways] == ["traffic_light"] * 2
+    assert [tags_of(way)["subtype"] for way in ways] == ["red_green", "red_yellow_green"]
+
+
 def test_lanelet2_does_not_share_ids_with_a_map_of_lanes(tmp_path: Path) -> None:
     """Editors of such maps count from 1; where ids are the same, merging loses a line or moves another's nodes."""
     export_map(a_map(), tmp_path / "map.lanelet2.osm")

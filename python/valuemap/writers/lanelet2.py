@@ -11,7 +11,7 @@ import numpy as np
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.tables import Floats
 from valuemap.writers.attributes import Export, needs_places, records
-from valuemap.writers.sign_codes import find_sign, is_traffic_light
+from valuemap.writers.sign_codes import find_sign, is_for_pedestrians, is_traffic_light
 from valuemap.writers.xml import child, write_xml
 
 _LEAST_WIDTH_M = 0.05
@@ -84,7 +84,7 @@ def lower_edges(export: Export) -> Floats:
 def _tags(row: dict[str, object]) -> dict[str, str]:
     name = str(row["class"])
     if is_traffic_light(name):
-        tags = {"type": "traffic_light", "subtype": "red_yellow_green"}
+        tags = {"type": "traffic_light", "subtype": "red_green" if is_for_pedestrians(name) else "red_yellow_green"}
     else:
         found = find_sign(name)
         code = found[0].vienna or found[0].mapillary if found is not None else name

@@ -156,6 +156,11 @@ def is_traffic_light(class_name: str) -> bool:
     return "traffic light" in _words(class_name.lower()) or _words(class_name.lower()) in ("light", "traffic signal")
 
 
+def is_for_pedestrians(class_name: str) -> bool:
+    """Return whether a class of traffic lights is those of pedestrians: `object--traffic-light--pedestrians`."""
+    return "pedestrian" in _words(class_name.lower())
+
+
 def _words(text: str) -> str:
     return " ".join(_WORDS.sub(" ", text).split())
 
