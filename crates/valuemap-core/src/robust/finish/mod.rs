@@ -56,7 +56,7 @@ pub fn labels(
     let all: Vec<Object> = objects.into_iter().chain(few).collect();
     let unless_carried = |(existence, object)| existence * not_carried(model, object);
     let existences: Vec<f64> = existences.into_iter().zip(&all).map(unless_carried).collect();
-    let are_others = are_others(model, &all.iter().collect::<Vec<_>>());
+    let are_others = are_others(model, &all.iter().collect::<Vec<_>>(), &estimates);
     let mut findings: Vec<Finding> = all
         .into_iter()
         .zip(estimates)

@@ -4,7 +4,7 @@
 //! the pictures it is one: its box hardly moves from one image to the next. Images a few metres apart have the same pose error,
 //! so their residuals at a place nearby differ by errors of single images alone, however wrong the place and the poses are.
 
-use crate::robust::energy::estimate::visits;
+use crate::robust::energy::estimate::{Estimate, visits};
 use crate::robust::energy::looks::looks_among;
 use crate::robust::energy::{Object, implied_size};
 use crate::robust::model::Model;
@@ -15,10 +15,11 @@ use crate::robust::search::rearrange::may_be_one;
 /// Two objects look like one by chance where that is more probable than one in a thousand: so many objects has a map.
 const BY_CHANCE: f64 = 1e-3;
 
-/// Whether each of some objects is another one of them in the pictures, which J would miss more.
+/// Whether each of some objects, with where they are, is another one of them in the pictures, which J would miss more.
 #[must_use]
-pub fn are_others(model: &Model<'_>, objects: &[&Object]) -> Vec<bool> {
-    let mut switches = if model.settings.has(Part::IdentitySwitches) { switches(model, objects) } else { Vec::new() };
+pub fn are_others(model: &Model<'_>, objects: &[&Object], estimates: &[Estimate]) -> Vec<bool> {
+    let mut switches =
+        if model.settings.has(Part::IdentitySwitches) { switches(model, objects, estimates) } else { Vec::new() };
     let energy = |i: usize| objects[i].energy;
     switches
         .sort_by(|a, b| energy(a.0).total_cmp(&energy(b.0)).then(energy(a.1).total_cmp(&energy(b.1))).then(a.cmp(b)));
@@ -30,7 +31,7 @@ pub fn are_others(model: &Model<'_>, objects: &[&Object]) -> Vec<bool> {
 }
 
 /// Pairs of objects that are one in the pictures, the stronger one first.
-fn switches(model: &Model<'_>, objects: &[&Object]) -> Vec<(usize, usize)> {
+fn switches(model: &Model<'_>, objects: &[&Object], estimates: &[Estimate]) -> Vec<(usize, usize)> {
     let mut votes: Vec<(u32, usize)> =
         objects.iter().enumerate().flat_map(|(i, object)| object.votes.iter().map(move |&ray| (ray, i))).collect();
     votes.sort_unstable();
@@ -45,7 +46,8 @@ fn switches(model: &Model<'_>, objects: &[&Object]) -> Vec<(usize, usize)> {
     // How often what is two for certain goes on like one; the pair itself may do so as well.
     let in_line = (two.len() + 1) as f64 / (visits_count + 1) as f64;
     let are_one = |&(stronger, weaker): &(usize, usize)| {
-        in_line * missed_by_each_other(model, objects[stronger], objects[weaker]) < BY_CHANCE
+        let two = in_line * missed_by_each_other(model, objects[stronger], objects[weaker]);
+        two < BY_CHANCE * so_far_apart(&estimates[stronger], &estimates[weaker])
     };
     one.retain(are_one);
     one
@@ -86,6 +88,14 @@ fn missed_by_each_other(model: &Model<'_>, stronger: &Object, weaker: &Object) -
     (1.0 - model.classes[stronger.class as usize].rates.recall).powf(looks)
 }
 
+/// How probable it is at most that one thing is estimated in two places so far apart, whatever its errors are like (Chebyshev's inequality of three
+/// dimensions).
+fn so_far_apart(a: &Estimate, b: &Estimate) -> f64 {
+    let apart_m = a.point - b.point;
+    let inverse = (a.covariance + b.covariance).try_inverse();
+    inverse.map_or(1.0, |inverse| (3.0 / apart_m.dot(&(inverse * apart_m))).min(1.0))
+}
+
 /// Whether two rays, one of each of two objects, show one thing in two images nearby: as near to each other, and as large, as one thing would be.
 fn show_one(model: &Model<'_>, objects: [&Object; 2], rays: [u32; 2]) -> bool {
     let (scene, gate) = (model.scene, model.settings.gate_sigmas);
@@ -103,7 +113,7 @@ fn show_one(model: &Model<'_>, objects: [&Object; 2], rays: [u32; 2]) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Vector3;
+    use nalgebra::{Matrix3, Vector3};
 
     use super::*;
     use crate::robust::energy::looks::Lookout;
@@ -121,6 +131,11 @@ mod tests {
 
     /// The votes of objects, by number of the sign, image and pass; the second one is where wrong poses put it. Whether each is another one.
     fn of_votes(scene: &Scene, votes: &[&dyn Fn(usize, u32, u32) -> bool]) -> Vec<bool> {
+        of_votes_known_to(scene, votes, 1.0)
+    }
+
+    /// The same of objects that are known to so many metres.
+    fn of_votes_known_to(scene: &Scene, votes: &[&dyn Fn(usize, u32, u32) -> bool], sigma_m: f64) -> Vec<bool> {
         let model = Model::new(scene, &NOISE, &SETTINGS);
         let lookout = Lookout::new(scene, SETTINGS.viability.max_range_m);
         let number =
@@ -137,7 +152,10 @@ mod tests {
         let mut objects: Vec<Object> = votes.iter().filter_map(|of| begun(*of)).collect();
         objects[1].fit.point += Vector3::new(1.5, 1.0, 0.3);
         assert!(objects[0].energy < objects[1].energy);
-        are_others(&model, &objects.iter().collect::<Vec<_>>())
+        let covariance = Matrix3::identity() * sigma_m * sigma_m;
+        let estimate = |object: &Object| Estimate { point: object.fit.point, covariance };
+        let estimates: Vec<Estimate> = objects.iter().map(estimate).collect();
+        are_others(&model, &objects.iter().collect::<Vec<_>>(), &estimates)
     }
 
     #[test]
@@ -193,5 +211,14 @@ mod tests {
         assert_eq!(of_votes(&drive(), &[&far, &near]), [false, true]);
         let goes_on_beside = |sign, image, _| sign == 0 && image >= 30 || sign == 1 && image == 26;
         assert_eq!(of_votes(&drive(), &[&far, &near, &goes_on_beside]), [false, false, false]);
+    }
+
+    #[test]
+    fn more_images_are_needed_where_both_are_known_to_be_far_apart() {
+        let far = |sign, image, _| sign == 0 && image < 25;
+        let few = |sign, image, _| sign == 0 && (25..30).contains(&image);
+        let near = |sign, image, _| sign == 0 && image >= 25;
+        assert_eq!(of_votes_known_to(&drive(), &[&far, &few], 0.1), [false, false]);
+        assert_eq!(of_votes_known_to(&drive(), &[&far, &near], 0.1), [false, true]);
     }
 }
