@@ -59,7 +59,7 @@ from valuemap.refine.select import Selected, _Equations, _Trial, chance_of_gain
 from valuemap.refine.ties import tie
 from valuemap.refine.tracks import merge_objects
 from valuemap.remote import Place
-from valuemap.robust import calibration_from_json
+from valuemap.robust import Calibration, calibration_from_json
 from valuemap.simulate import simulate
 from valuemap.stages import Stages
 from valuemap.tables import Bools, Detections, Floats, Images, Ints, covariance_matrices
@@ -554,6 +554,29 @@ def test_images_are_moved_by_what_sides_show_of_one_object() -> None:
     apart = (state.point_in_world_m[told.ties.first] - state.point_in_world_m[told.ties.second])[sides[told.label] > 1]
 
     assert np.sqrt(np.mean(apart**2)) == pytest.approx(calibration.noise.side_m, rel=0.5)
+
+
+def test_middles_in_doubt_widen_covariances_where_images_were_moved(monkeypatch: pytest.MonkeyPatch) -> None:
+    dashcam, config = few_of_dashcam(), USUAL
+    monkeypatch.setattr(correction, "_MAPS_OF_IMAGES", 1)
+    calibration, labels, votes, counts = mapped_once(dashcam, config)
+    assert calibration.noise.side_m == 0.0
+    doubtful = dataclasses.replace(calibration.noise_of_covariances, side_m=0.5)
+    doubted = dataclasses.replace(calibration, noise_of_covariances=doubtful)
+
+    def refined(told: Calibration) -> Refined:
+        monkeypatch.setattr(correction, "_map_alone", lambda *_: (told, labels, votes, counts))
+        return correction._by_images(dashcam, config, 1, silent)
+
+    sure, unsure = refined(calibration), refined(doubted)
+    assert sure.is_corrected
+    assert np.array_equal(sure.dataset.images.cam_from_world_m, unsure.dataset.images.cam_from_world_m)
+    variance_m2, wider_m2 = (
+        covariance_matrices(correction.with_errors_of_images(one, labels, votes).covariance_m2).trace(axis1=1, axis2=2)
+        for one in (sure, unsure)
+    )
+    assert (wider_m2 > variance_m2).all()
+    assert np.median(wider_m2 - variance_m2) > 3 * 0.5**2 / 4  # Lights are seen from four sides at most.
 
 
 def test_images_that_were_moved_state_no_errors() -> None:

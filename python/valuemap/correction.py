@@ -111,7 +111,9 @@ def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progr
             return uncorrected
         told = bundle(images, labels, votes, noise)
     record = {"found": "errors of images", "images": len(before.images), **figures}
-    return Refined(moved, record, is_corrected=True, before_images=(images, noise), side_m=noise.side_m)
+    # Middles in doubt move no image; covariances reckon with them, as those of a map of images that stay do.
+    of_covariances = replace(noise, side_m=calibration.noise_of_covariances.side_m)
+    return Refined(moved, record, is_corrected=True, before_images=(images, of_covariances), side_m=noise.side_m)
 
 
 def with_errors_of_images(refined: Refined, labels: Labels, votes: Votes) -> Labels:
