@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tiny_models import red_finder, says
+from tiny_models import red_finder, says, scales_to_sizes, tensorflow_red
 from valuemap.config import DetectConfig
 from valuemap.detect.boxes import Boxes, overlaps, suppress
 from valuemap.detect.classes import choose_classes
@@ -240,8 +240,12 @@ RECOGNISED: list[tuple[str, dict[str, Array], dict[str, Any], dict[str, Any]]] =
     ("yolox", {"output": np.zeros((1, 84, 13), np.float32)}, {"output": ("batch", "anchors", 13)}, {}),
     ("ultralytics", {"output": np.zeros((1, 13, 84), np.float32)}, {}, {}),
     ("ultralytics", {"output": np.zeros((1, 13, 84), np.float32)}, {"output": ("batch", 13, "anchors")}, {}),
-    ("ultralytics", {"output": np.zeros((1, 84, 13), np.float32)}, {}, {"names": "{0: 'light', 1: 'sign'}"}),
+    ("ultralytics", {"output": np.zeros((1, 6, 5), np.float32)}, {}, {"names": "{0: 'light', 1: 'sign'}"}),
     ("boxes", {"output": np.zeros((1, 300, 6), np.float32)}, {}, {}),
+    # One class: as many columns as boxes that are suppressed in the graph, but a row for each cell, or three.
+    ("yolox", {"output": np.zeros((1, 84, 6), np.float32)}, {}, {}),
+    ("yolov5", {"output": np.zeros((1, 252, 6), np.float32)}, {}, {}),
+    ("yolov5", {"output": np.zeros((1, 252, 13), np.float32)}, {}, {}),
     ("detr", {"logits": np.zeros((1, 9, 3), np.float32), "pred_boxes": np.zeros((1, 9, 4), np.float32)}, {}, {}),
 ]
 
@@ -253,6 +257,172 @@ def test_kinds_are_recognised(
     file = says(tmp_path / "m.onnx", outputs, dims=dims, metadata=metadata)
     assert load_model(file, DetectConfig()).kind == kind
     assert load_model(file, DetectConfig(kind="boxes")).kind == "boxes"
+
+
+ULTRALYTICS = {"task": "detect", "names": "{0: 'light', 1: 'sign'}", "stride": "32"}
+BOX = [20, 30, 10, 8]
+EDGES = [15, 26, 25, 34]
+EXPORTED: list[tuple[str, int, list[float], tuple[int, int], dict[str, str]]] = [
+    ("yolov5", 0, [*BOX, 0.9, 0.1, 0.8], (1200, 7), {"names": "{0: 'light', 1: 'sign'}", "stride": "32"}),
+    ("yolov5", 0, [*BOX, 0.9, 0.1, 0.8], (1200, 7), {"names": "['light', 'sign']", "stride": "32"}),
+    ("yolov5", 0, [*BOX, 0.9, 0.1, 0.8, *[5.0] * 32], (1200, 39), {**ULTRALYTICS, "task": "segment"}),
+    ("ultralytics", 1, [*BOX, 0.1, 0.72], (6, 84), ULTRALYTICS),
+    ("ultralytics", 1, [*BOX, 0.1, 0.72, *[5.0] * 32], (38, 84), {**ULTRALYTICS, "task": "segment"}),
+    ("ultralytics", 1, [*BOX, 0.1, 0.72, *[5.0] * 51], (57, 84), {**ULTRALYTICS, "task": "pose"}),
+    ("boxes", 0, [*EDGES, 0.72, 1], (300, 6), ULTRALYTICS),
+    ("boxes", 0, [*EDGES, 0.72, 1, *[5.0] * 32], (300, 38), {**ULTRALYTICS, "task": "segment"}),
+    ("boxes", 0, [*EDGES, 0.72, 1, *[5.0] * 51], (300, 57), {**ULTRALYTICS, "task": "pose"}),
+    (
+        "rtdetr",
+        0,
+        [20 / 64, 30 / 64, 10 / 64, 8 / 64, 0.1, 0.72, 0.2],
+        (300, 7),
+        {**ULTRALYTICS, "names": "{0: 'light', 1: 'sign', 2: 'sign'}"},
+    ),
+    (
+        "rtdetr",
+        0,
+        [20 / 64, 30 / 64, 10 / 64, 8 / 64, 0.1, 0.72],
+        (300, 6),
+        {**ULTRALYTICS, "description": "Ultralytics rtdetr-l model"},
+    ),
+]
+
+
+@pytest.mark.parametrize(("kind", "axis", "values", "shape", "metadata"), EXPORTED)
+def test_exports_of_yolo_and_rtdetr_say_the_same_box(
+    tmp_path: Path, kind: str, axis: int, values: list[float], shape: tuple[int, int], metadata: dict[str, str]
+) -> None:
+    """With masks and key points behind the scores, suppressed or not: a score is 0.72, its class sign."""
+    table = np.zeros((1, *shape), np.float32)
+    np.moveaxis(table, 1 + axis, 1)[0, 5] = values
+    outputs = {"output0": table}
+    if metadata.get("task") == "segment":
+        outputs["output1"] = np.zeros((1, 32, 16, 16), np.float32)
+    model = load_model(says(tmp_path / "m.onnx", outputs, metadata=metadata), DetectConfig())
+    assert (model.kind, model.preparation.color, model.preparation.std) == (kind, "RGB", (1.0, 1.0, 1.0))
+    found = decode(model, model.run([np.zeros((64, 64, 3), np.uint8)]), model.fit((64, 64), None))
+    np.testing.assert_allclose(found.edges_px, [EDGES], atol=1e-4)
+    assert found.score[0] == pytest.approx(0.72)
+    assert model.class_names[found.class_code[0]] == "sign"
+
+
+def test_free_sizes_of_ultralytics_leave_columns_free(tmp_path: Path) -> None:
+    table = np.zeros((1, 300, 6), np.float32)
+    table[0, 0] = [*EDGES, 0.72, 1]
+    file = says(
+        tmp_path / "m.onnx", {"output0": table}, dims={"output0": ("batch", 300, "anchors")}, metadata=ULTRALYTICS
+    )
+    model = load_model(file, DetectConfig())
+    assert model.kind == "boxes"
+    np.testing.assert_allclose(decode(model, [table], model.fit((64, 64), None)).edges_px, [EDGES])
+
+
+def test_rf_detr_is_a_detr_with_names_of_its_own(tmp_path: Path) -> None:
+    logits = np.full((1, 9, 91), -9.0, np.float32)
+    logits[0, 2, 10] = 2.0
+    places = np.full((1, 9, 4), 0.5, np.float32)
+    model = load_model(says(tmp_path / "m.onnx", {"dets": places, "labels": logits}), DetectConfig())
+    found = decode(model, [places, logits], model.fit((64, 64), None))
+    assert (model.kind, [model.class_names[i] for i in found.class_code]) == ("detr", ["traffic light"])
+    np.testing.assert_allclose(found.edges_px, [[16, 16, 48, 48]])
+
+
+def test_models_that_take_the_size_give_boxes_of_the_canvas(tmp_path: Path) -> None:
+    """RT-DETR and D-FINE; the canvas is square and the picture is not: stretched, as these are trained."""
+    file = scales_to_sizes(tmp_path / "m.onnx", np.array([[0.25, 0.5, 0.5, 0.75]], np.float32))
+    model = load_model(file, DetectConfig())
+    assert (model.kind, model.preparation.fitting) == ("boxes", "stretch")
+    fit = model.fit((128, 32), None)
+    outputs = model.run([fit.draw(np.zeros((32, 128, 3), np.uint8))])
+    np.testing.assert_allclose(decode(model, outputs, fit).edges_px, [[32, 16, 64, 24]])
+
+
+def test_tensorflow_takes_bytes_with_channels_last_and_gives_y_first(tmp_path: Path) -> None:
+    file = tensorflow_red(tmp_path / "m.onnx", np.array([[[0.25, 0.5, 0.5, 0.75]]], np.float32))
+    model = load_model(file, DetectConfig())
+    fit = model.fit((128, 64), None)
+    picture = np.zeros((64, 128, 3), np.uint8)
+    picture[3, 5] = [200, 90, 250]
+    found = decode(model, model.run([fit.draw(picture)]), fit)
+    np.testing.assert_allclose(found.edges_px, [[64, 16, 96, 32]])
+    assert found.score[0] == pytest.approx(200 / 255)
+    assert found.class_code.tolist() == [10]
+
+
+def test_counts_and_sizes_beside_boxes_are_no_classes(tmp_path: Path) -> None:
+    """YOLO-NAS says first how many boxes there are, Detectron2 how large the picture is, and takes BGR to 255."""
+    boxes = np.array([EDGES, [0, 0, 9, 9], [0, 0, 9, 9]], np.float32)
+    scores, classes = np.array([0.9, 0.1, 0.1], np.float32), np.array([4, 5, 6])
+    counted = {
+        "num_predictions": np.array([[1]]),
+        "boxes": boxes[None],
+        "scores": scores[None],
+        "classes": classes[None],
+    }
+    sized = {"boxes": boxes, "image_size": np.array([64, 64]), "classes": classes, "scores": scores}
+    colors = []
+    for name, outputs, picture in (("counted", counted, (1, 3, 64, 64)), ("sized", sized, (3, 64, 64))):
+        model = load_model(says(tmp_path / f"{name}.onnx", outputs, picture=picture), DetectConfig())
+        found = decode(model, model.run([np.zeros((64, 64, 3), np.uint8)]), model.fit((64, 64), None))
+        assert (found.class_code.tolist(), found.edges_px.tolist()) == ([4], [EDGES])
+        colors.append((model.preparation.color, model.preparation.std[0]))
+    assert colors == [("RGB", 1.0), ("BGR", 1 / 255)]
+
+
+def test_mmdeploy_must_say_how_it_wants_colours(tmp_path: Path) -> None:
+    outputs = {"dets": np.array([[[*EDGES, 0.9]]], np.float32), "labels": np.array([[2]])}
+    with pytest.raises(InputError, match="MMDeploy") as error:
+        load_model(says(tmp_path / "m.onnx", outputs), DetectConfig())
+    assert "valuemap.mean" in error.value.hint
+    said = {"valuemap.mean": [0.485, 0.456, 0.406], "valuemap.std": [0.229, 0.224, 0.225]}
+    model = load_model(says(tmp_path / "m.onnx", outputs, metadata=said), DetectConfig())
+    found = decode(model, list(outputs.values()), model.fit((64, 64), None))
+    assert (found.class_code.tolist(), found.edges_px.tolist()) == ([2], [EDGES])
+
+
+def test_outputs_that_mean_something_else_are_refused(tmp_path: Path) -> None:
+    """Decoded boxes where YOLOX's are raw, shares where pixels are, a class for nothing that nobody told."""
+    yolov6 = np.full((1, 84, 8), 20.0, np.float32)
+    shares: dict[str, Array] = {
+        "boxes": np.array([[0.2, 0.2, 0.4, 0.5]], np.float32),
+        "scores": np.ones(1, np.float32),
+        "labels": np.ones(1, np.int64),
+    }
+    logits = np.full((1, 9, 4), -3.0, np.float32)
+    logits[:, :, 3] = 6.0
+    cells = np.zeros((1, 84, 6), np.float32)
+    cases: list[tuple[str, dict[str, Array], str, str]] = [
+        ("yolov6", {"outputs": yolov6}, "boxes in pixels", "--kind yolov5"),
+        ("shares", shares, "shares of the picture", "in pixels"),
+        (
+            "nothing",
+            {"logits": logits, "pred_boxes": np.full((1, 9, 4), 0.5, np.float32)},
+            "nothing",
+            "valuemap.classes",
+        ),
+        ("cells", {"output": cells}, "each cell", "--kind"),
+    ]
+    for name, outputs, message, hint in cases:
+        kind: Any = "boxes" if name == "cells" else None
+        model = load_model(says(tmp_path / f"{name}.onnx", outputs), DetectConfig(kind=kind))
+        with pytest.raises(InputError, match=message) as error:
+            decode(model, list(outputs.values()), model.fit((64, 64), None))
+        assert hint in error.value.hint
+    with pytest.raises(InputError, match="task obb"):
+        load_model(
+            says(
+                tmp_path / "o.onnx",
+                {"output0": np.zeros((1, 7, 84), np.float32)},
+                metadata={**ULTRALYTICS, "task": "obb"},
+            ),
+            DetectConfig(),
+        )
+    weights = tmp_path / "best.pt"
+    weights.write_bytes(b"PK")
+    with pytest.raises(InputError) as error:
+        load_model(weights, DetectConfig())
+    assert "ONNX" in error.value.hint
 
 
 def test_the_file_says_how_it_wants_pictures(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
@@ -55,6 +56,77 @@ def says(
     return _write(path, nodes, {"image": list(picture)}, declared, constants=constants, metadata=metadata or {})
 
 
+def scales_to_sizes(path: Path, shares: NDArray[Any]) -> Path:
+    """Write a model as of RT-DETR: boxes (N, 4) in shares, times the width and height that its second input says."""
+    nodes = [
+        helper.make_node("Cast", ["orig_target_sizes"], ["size"], to=TensorProto.FLOAT),
+        helper.make_node("Concat", ["size", "size"], ["sizes"], axis=1),
+        helper.make_node("Mul", ["sizes", "shares"], ["scaled"]),
+        helper.make_node("Unsqueeze", ["scaled", "first"], ["boxes"]),
+        helper.make_node("ReduceMax", ["images"], ["seen"], keepdims=0),
+        helper.make_node("Mul", ["seen", "none"], ["nothing"]),
+        helper.make_node("Add", ["ones", "nothing"], ["scores"]),
+        helper.make_node("Cast", ["nothing"], ["zero"], to=TensorProto.INT64),
+        helper.make_node("Add", ["zero", "numbers"], ["labels"]),
+    ]
+    count = len(shares)
+    constants = {
+        "shares": shares,
+        "first": np.array([0]),
+        "none": np.zeros((), np.float32),
+        "ones": np.ones((1, count), np.float32),
+        "numbers": np.zeros((1, count), np.int64),
+    }
+    return _write(
+        path,
+        nodes,
+        {"images": ["N", 3, 64, 64], "orig_target_sizes": ["N", 2]},
+        {
+            "labels": (TensorProto.INT64, ["N", count]),
+            "boxes": (TensorProto.FLOAT, ["N", count, 4]),
+            "scores": (TensorProto.FLOAT, ["N", count]),
+        },
+        constants=[numpy_helper.from_array(value, name) for name, value in constants.items()],
+        metadata={},
+        types={"orig_target_sizes": TensorProto.INT64},
+    )
+
+
+def tensorflow_red(path: Path, places: NDArray[Any]) -> Path:
+    """Write a model as of TensorFlow: boxes (1, 1, 4), y first in shares, whose score is the largest red over 255."""
+    nodes = [
+        helper.make_node("Gather", ["image_tensor:0", "first"], ["red"], axis=3),
+        helper.make_node("ReduceMax", ["red"], ["largest"], keepdims=0),
+        helper.make_node("Cast", ["largest"], ["number"], to=TensorProto.FLOAT),
+        helper.make_node("Mul", ["number", "part"], ["detection_scores:0"]),
+        helper.make_node("Identity", ["places"], ["detection_boxes:0"]),
+        helper.make_node("Identity", ["ten"], ["detection_classes:0"]),
+        helper.make_node("Identity", ["one"], ["num_detections:0"]),
+    ]
+    constants = {
+        "first": np.array([0]),
+        "part": np.full((1, 1), 1 / 255, np.float32),
+        "places": places,
+        "ten": np.full((1, 1), 10, np.float32),
+        "one": np.ones(1, np.float32),
+    }
+    floats = {
+        "num_detections:0": [1],
+        "detection_boxes:0": [1, 1, 4],
+        "detection_scores:0": [1, 1],
+        "detection_classes:0": [1, 1],
+    }
+    return _write(
+        path,
+        nodes,
+        {"image_tensor:0": [1, None, None, 3]},
+        {name: (TensorProto.FLOAT, dims) for name, dims in floats.items()},
+        constants=[numpy_helper.from_array(value, name) for name, value in constants.items()],
+        metadata={},
+        types={"image_tensor:0": TensorProto.UINT8},
+    )
+
+
 def _write(
     path: Path,
     nodes: list[Any],
@@ -63,11 +135,16 @@ def _write(
     *,
     metadata: Mapping[str, Any],
     constants: Sequence[Any] = (),
+    types: Mapping[str, int] | None = None,
 ) -> Path:
+    type_of = types or {}
     graph = helper.make_graph(
         nodes,
         "tiny",
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, dims) for name, dims in inputs.items()],
+        [
+            helper.make_tensor_value_info(name, type_of.get(name, TensorProto.FLOAT), dims)
+            for name, dims in inputs.items()
+        ],
         [helper.make_tensor_value_info(name, kind, dims) for name, (kind, dims) in outputs.items()],
         initializer=list(constants),
     )

@@ -12,7 +12,7 @@ from valuemap.errors import SettingError
 MAX_CANVAS_PX = 2**26
 """What goes through a network at once: its layers take hundreds of bytes a pixel."""
 
-ModelKind = Literal["segmentation", "yolox", "ultralytics", "detr", "boxes"]
+ModelKind = Literal["segmentation", "yolox", "yolov5", "ultralytics", "rtdetr", "detr", "boxes"]
 Provider = Literal["cpu", "cuda"]
 
 

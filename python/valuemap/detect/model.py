@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import hashlib
 import io
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,13 +16,22 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from valuemap.config import DetectConfig, ModelKind
-from valuemap.detect.coco_names import COCO_80, COCO_91
-from valuemap.detect.letterbox import Fit, Fitting, Pixels, Size, fit_around, fit_into
+from valuemap.detect.letterbox import Fit, Pixels, Size, fit_around, fit_into
+from valuemap.detect.signature import (
+    KIND_HINT,
+    SIZES_INPUT,
+    Preparation,
+    class_count,
+    coco_names,
+    names_in,
+    plain_name,
+    preparation_of,
+    recognise,
+)
 from valuemap.errors import InputError, SettingError
 
 Array = NDArray[Any]
 
-_KIND_HINT = f"say what it is with --kind: one of {', '.join(get_args(ModelKind))}"
 _PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 _PROVIDER_OPTIONS: Mapping[str, Mapping[str, str]] = {
     "cpu": {},
@@ -32,28 +39,11 @@ _PROVIDER_OPTIONS: Mapping[str, Mapping[str, str]] = {
     "cuda": {"cudnn_conv_algo_search": "HEURISTIC", "use_tf32": "0"},
 }
 _CUDA_FAILURE = re.compile(r"CUDA failure \d+: ([^;\n]+)")
-_DTYPES: Mapping[str, type[np.floating[Any]]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
-_IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-
-
-@dataclass(frozen=True)
-class Preparation:
-    """How pixels become numbers: (pixel / 255 - mean) / std in the order of `color`, and where the picture goes."""
-
-    color: str = "RGB"
-    mean: tuple[float, ...] = (0.0, 0.0, 0.0)
-    std: tuple[float, ...] = (1.0, 1.0, 1.0)
-    fitting: Fitting = "corner"
-
-
-_PREPARATIONS: Mapping[str, Preparation] = {
-    "segmentation": Preparation(),
-    "yolox": Preparation(color="BGR", std=(1 / 255, 1 / 255, 1 / 255)),  # Takes 0 to 255.
-    "ultralytics": Preparation(fitting="center"),
-    "detr": Preparation(mean=_IMAGENET_MEAN, std=_IMAGENET_STD, fitting="stretch"),
-    "boxes": Preparation(),
+_DTYPES: Mapping[str, type[np.number[Any]]] = {
+    "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
+    "tensor(uint8)": np.uint8,
 }
-"""What each kind expects where the file does not say it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +51,8 @@ class Model:
     """A model ready to run.
 
     `class_count` is None where the outputs do not tell; `fixed` is the width and height that it insists on, None if it
-    takes any multiple of `stride`; `fixed_batch` likewise. `threshold` and `minimum_component_px` are of
+    takes any multiple of `stride`; `fixed_batch` likewise. TensorFlow's channels come last; `sizes_input` is the name
+    of a second input, for width and height of the canvas. `threshold` and `minimum_component_px` are of
     segmentations; boxes with a lower score than `min_score` are dropped where the user does not say otherwise;
     pictures with a smaller `coarse_share` than `min_coarse_share` are not looked at; `is_softmax` is of
     DETRs, whose last class is then "nothing".
@@ -76,6 +67,8 @@ class Model:
     fixed: Size | None
     fixed_batch: int | None
     has_batch: bool
+    is_channels_last: bool
+    sizes_input: str | None
     stride: int
     preparation: Preparation
     threshold: float
@@ -105,10 +98,15 @@ class Model:
         for row, canvas in enumerate(canvases):
             self._prepare(canvas, batch[row])
         tensor = batch.astype(_DTYPES[entry.type], copy=False)
+        if self.is_channels_last:
+            tensor = np.ascontiguousarray(np.moveaxis(tensor, 1, 3))
+        width, height = canvases[0].shape[1::-1]
+        feed = {entry.name: tensor if self.has_batch else tensor[0]}
+        if self.sizes_input is not None:
+            feed[self.sizes_input] = np.tile(np.array([width, height], np.int64), (len(batch), 1))
         try:
-            outputs: list[Array] = self.session.run(None, {entry.name: tensor if self.has_batch else tensor[0]})
+            outputs: list[Array] = self.session.run(None, feed)
         except Exception as error:  # ONNX Runtime's errors have no base of their own.
-            width, height = canvases[0].shape[1::-1]
             raise InputError(
                 f"{self.path}: cannot be run on a batch of {len(batch)}, {width} x {height} px: {_first_line(error)}",
                 hint="choose what the network takes with --size and --batch; many take multiples of 32 px only",
@@ -142,31 +140,38 @@ def load_model(path: Path, config: DetectConfig, *, threads: int = 0) -> Model:
     session = _open(path, content, config.provider, threads)
     inputs, outputs = session.get_inputs(), session.get_outputs()
     metadata = session.get_modelmeta().custom_metadata_map
-    if len(inputs) != 1 or inputs[0].type not in _DTYPES or len(inputs[0].shape) not in (3, 4):
+    extra = [entry.name for entry in inputs[1:] if plain_name(entry) == SIZES_INPUT and entry.type == "tensor(int64)"]
+    if len(inputs) != 1 + len(extra) or inputs[0].type not in _DTYPES or len(inputs[0].shape) not in (3, 4):
         found = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
         raise InputError(
             f"{path}: expected one input of pictures, float [batch, 3, height, width], found {found}",
             hint="export the network alone, without what comes before or after it",
         )
     has_batch = len(inputs[0].shape) == 4
+    is_channels_last = has_batch and inputs[0].type == "tensor(uint8)" and inputs[0].shape[3] == 3
     batch, channels, height, width = inputs[0].shape if has_batch else (1, *inputs[0].shape)
+    if is_channels_last:
+        batch, height, width, channels = inputs[0].shape
     if isinstance(channels, int) and channels != 3:
         raise InputError(
             f"{path}: expected an input of 3 channels [batch, 3, height, width], found {inputs[0].shape}",
             hint="export it for colour pictures, channels first",
         )
-    kind = config.kind or metadata.get("valuemap.kind") or _recognise(path, outputs, metadata)
-    if kind not in get_args(ModelKind):
-        raise InputError(f"{path}: kind {kind!r} is not known", hint=_KIND_HINT)
     fixed = (width, height) if isinstance(width, int) and isinstance(height, int) else None
+    names = names_in(path, metadata)
+    kind = config.kind or metadata.get("valuemap.kind")
+    if kind is None:
+        kind = recognise(path, outputs, metadata, names if "names" in metadata else (), fixed)
+    if kind not in get_args(ModelKind):
+        raise InputError(f"{path}: kind {kind!r} is not known", hint=KIND_HINT)
     size = config.size_px
     if fixed is not None and (config.size == "picture" or (size is not None and size != fixed)):
         session = _open(path, _with_free_size(content), config.provider, threads)
         fixed = None
     if kind == "boxes" and all(len(output.shape) != 3 for output in outputs):
         batch = 1  # Its boxes have no batch: they would be those of the first picture.
-    count = _class_count(kind, outputs)
-    names = _class_names(path, metadata, count)
+    count = class_count(kind, outputs, names if "names" in metadata else ())
+    names = names or coco_names(count)
     return Model(
         path=path,
         sha256=hashlib.sha256(content).hexdigest(),
@@ -177,8 +182,10 @@ def load_model(path: Path, config: DetectConfig, *, threads: int = 0) -> Model:
         fixed=fixed,
         fixed_batch=batch if isinstance(batch, int) else None,
         has_batch=has_batch,
+        is_channels_last=is_channels_last,
+        sizes_input=extra[0] if extra else None,
         stride=int(_number(path, metadata, "stride", 32)),
-        preparation=_preparation(path, kind, metadata),
+        preparation=preparation_of(path, kind, inputs, outputs, metadata),
         threshold=_number(path, metadata, "valuemap.threshold", 0.5),
         minimum_component_px=int(_number(path, metadata, "valuemap.minimum_component_px", 1)),
         min_coarse_share=_number(path, metadata, "valuemap.min_coarse_share", 0.0),
@@ -215,7 +222,10 @@ def _open(path: Path, content: bytes, provider: str, threads: int) -> Any:
                 hint="put them into one: onnx.save(onnx.load(IN), OUT), or external_data=False in torch.onnx.export",
             ) from error
         raise InputError(
-            f"{path}: cannot be read as an ONNX model: {_first_line(error)}", hint="is it whole? Export it again"
+            f"{path}: cannot be read as an ONNX model: {_first_line(error)}",
+            hint="is it whole? Export it again"
+            if path.suffix.lower() == ".onnx"
+            else "export the model as ONNX; of other kinds none is read",
         ) from error
     if wanted not in session.get_providers():  # Without CUDA's libraries it would go on with the CPU.
         raise _no_provider(provider, missing)
@@ -256,80 +266,14 @@ def _with_free_size(content: bytes) -> bytes:
 
     model = onnx.load_from_string(content)
     del model.graph.value_info[:]  # They hold the sizes of everything in between.
-    rows = model.graph.input[0].type.tensor_type.shape.dim[-2:]
+    picture = model.graph.input[0].type.tensor_type
+    rows = picture.shape.dim[1:3] if picture.elem_type == onnx.TensorProto.UINT8 else picture.shape.dim[-2:]
     for axis, name in zip(rows, ("height", "width"), strict=True):
         axis.dim_param = name
     for output in model.graph.output:
         output.type.tensor_type.ClearField("shape")
     rewritten: bytes = model.SerializeToString()
     return rewritten
-
-
-def _recognise(path: Path, outputs: Sequence[Any], metadata: Mapping[str, str]) -> str:
-    """Tell the kind from the number, names and shapes of the outputs."""
-    shapes = [output.shape for output in outputs]
-    names = [output.name.lower() for output in outputs]
-    if len(outputs) >= 2 and any("logits" in name for name in names) and any("boxes" in name for name in names):
-        return "detr"
-    if len(outputs) >= 3 and any("int" in output.type for output in outputs):
-        return "boxes"  # Others, as torchvision's masks, are left alone.
-    if len(outputs) == 1 and len(shapes[0]) == 4:
-        return "segmentation"
-    if len(outputs) == 1 and len(shapes[0]) == 3:
-        rows, columns = shapes[0][1:]
-        if columns == 6:
-            return "boxes"
-        if "names" in metadata or (isinstance(rows, int) and (not isinstance(columns, int) or rows < columns)):
-            return "ultralytics"
-        if isinstance(columns, int):
-            return "yolox"
-    found = ", ".join(f"{output.name} {output.shape}" for output in outputs)
-    raise InputError(f"{path}: cannot tell what the outputs mean: {found}", hint=_KIND_HINT)
-
-
-def _class_count(kind: str, outputs: Sequence[Any]) -> int | None:
-    """Return how many classes the outputs have room for, with DETR's "nothing"; None if they do not say."""
-    axis, other = {"segmentation": (1, 0), "yolox": (2, 5), "ultralytics": (1, 4), "detr": (2, 0), "boxes": (0, 0)}[
-        kind
-    ]
-    if kind == "boxes":
-        return None
-    output = next((o for o in outputs if "logits" in o.name.lower()), outputs[0])
-    entries = output.shape[axis] if len(output.shape) > axis else None
-    return entries - other if isinstance(entries, int) else None
-
-
-def _class_names(path: Path, metadata: Mapping[str, str], count: int | None) -> tuple[str, ...]:
-    """Return the names that the file says, else COCO's if the number fits, else none."""
-    try:
-        if "valuemap.classes" in metadata:
-            return tuple(str(name) for name in json.loads(metadata["valuemap.classes"]))
-        if "names" in metadata:  # Ultralytics writes a Python dict.
-            named = {int(i): str(name) for i, name in dict(ast.literal_eval(metadata["names"])).items()}
-            return tuple(named.get(i, f"class-{i}") for i in range(max(named) + 1))
-    except (ValueError, TypeError, SyntaxError) as error:
-        raise InputError(
-            f"{path}: the names of the classes in its metadata cannot be read: {error}", hint="export it again"
-        ) from error
-    return {80: COCO_80, 91: COCO_91, 92: COCO_91}.get(count or 0, ())
-
-
-def _preparation(path: Path, kind: str, metadata: Mapping[str, str]) -> Preparation:
-    default = _PREPARATIONS[kind]
-    try:
-        mean, std = (
-            tuple(float(c) for c in json.loads(metadata[f"valuemap.{name}"])) if f"valuemap.{name}" in metadata else own
-            for name, own in (("mean", default.mean), ("std", default.std))
-        )
-    except (ValueError, TypeError) as error:
-        raise InputError(f"{path}: metadata valuemap.mean, valuemap.std: {error}", hint="export it again") from error
-    color = metadata.get("valuemap.color", default.color)
-    if color not in ("RGB", "BGR") or len(mean) != 3 or len(std) != 3 or not all(std):
-        raise InputError(
-            f"{path}: metadata: expected valuemap.color RGB or BGR, and 3 numbers in valuemap.mean and valuemap.std",
-            hint="export it again",
-        )
-    return Preparation(color, mean, std, default.fitting)
 
 
 def _number(path: Path, metadata: Mapping[str, str], name: str, default: float) -> float:

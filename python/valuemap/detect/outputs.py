@@ -13,12 +13,16 @@ from valuemap.detect.classes import WantedClasses
 from valuemap.detect.components import boxes_of_components
 from valuemap.detect.letterbox import Fit
 from valuemap.detect.model import Model
+from valuemap.detect.signature import ANCHOR_STRIDES, anchor_counts, is_logits, is_places, plain_name
 from valuemap.errors import InputError
 from valuemap.tables import Floats, Ints
 
 Array = NDArray[Any]
 
-_YOLOX_STRIDES = ((8, 16, 32), (8, 16, 32, 64))
+_LARGEST_LOG = 16.0
+"""Of the size of a box in strides: it would be millions of pixels wide."""
+_LARGEST_SHARE = 1.5
+"""Edges of boxes that all are smaller than this many pixels are shares of the picture."""
 _MAX_CANDIDATES = 3000
 """Boxes of one canvas that go into the suppression, best first: bounds the cost where every score is accepted."""
 
@@ -37,7 +41,7 @@ def find_boxes(
     boxes = boxes.take(boxes.score >= min_score)
     boxes = boxes.take(np.argsort(-boxes.score, kind="stable")[:_MAX_CANDIDATES])
     boxes = Boxes(boxes.center_px, boxes.size_px, boxes.score, wanted.one_a_name(boxes.class_code))
-    if model.kind in ("yolox", "ultralytics"):
+    if model.kind in ("yolox", "yolov5", "ultralytics"):
         boxes = boxes.take(suppress(boxes, max_iou))
     return fit.to_picture(boxes).clipped(*fit.picture)
 
@@ -66,6 +70,12 @@ def _from_yolox(model: Model, outputs: list[Array], row: int, fit: Fit, wanted: 
         raise _unexpected(model, outputs, "[batch, anchors, 5 + classes]")
     raw = np.asarray(outputs[0][row], np.float64)
     cell, stride_px = _yolox_grid(model, outputs, fit)
+    if raw[:, 2:4].max(initial=0.0) > _LARGEST_LOG:
+        raise InputError(
+            f"{model.path}: gives boxes in pixels, not what YOLOX gives, sizes up to {raw[:, 2:4].max():.0f}",
+            hint="--kind yolov5 reads such boxes of YOLOv5, YOLOv6 and YOLOv7; "
+            "export YOLOX without --decode_in_inference",
+        )
     score, number = _best_class(raw[:, 5:], wanted)
     with np.errstate(over="ignore"):  # Boxes of infinite size are dropped.
         size_px = np.exp(raw[:, 2:4]) * stride_px
@@ -75,7 +85,7 @@ def _from_yolox(model: Model, outputs: list[Array], row: int, fit: Fit, wanted: 
 def _yolox_grid(model: Model, outputs: list[Array], fit: Fit) -> tuple[Floats, Floats]:
     """Return column and row (N, 2) of the cell of each anchor, and its stride (N, 1)."""
     width, height = fit.canvas
-    for strides in _YOLOX_STRIDES:
+    for strides in ANCHOR_STRIDES:
         shapes = [(height // stride, width // stride) for stride in strides]
         counts = [rows * columns for rows, columns in shapes]
         if sum(counts) == outputs[0].shape[1]:
@@ -84,20 +94,39 @@ def _yolox_grid(model: Model, outputs: list[Array], fit: Fit) -> tuple[Floats, F
     raise _unexpected(model, outputs, f"an anchor for each cell of strides 8, 16, 32 of {width} x {height} px")
 
 
+def _from_yolov5(model: Model, outputs: list[Array], row: int, _: Fit, wanted: WantedClasses) -> Boxes:
+    """Centre x, y, width, height in pixels of the canvas, objectness, then a probability a class; a row an anchor."""
+    if outputs[0].ndim != 3 or outputs[0].shape[2] <= 5:
+        raise _unexpected(model, outputs, "[batch, anchors, 5 + classes]")
+    raw = np.asarray(outputs[0][row], np.float64)
+    score, number = _best_class(raw[:, 5:][:, : model.class_count], wanted)
+    return _from_centers(raw[:, :2], raw[:, 2:4], raw[:, 4] * score, number)
+
+
 def _from_ultralytics(model: Model, outputs: list[Array], row: int, _: Fit, wanted: WantedClasses) -> Boxes:
     """Centre x, y, width, height in pixels of the canvas, then a score a class; one column an anchor."""
     if outputs[0].ndim != 3 or outputs[0].shape[1] <= 4:
         raise _unexpected(model, outputs, "[batch, 4 + classes, anchors]")
     raw = np.asarray(outputs[0][row], np.float64).T
-    score, number = _best_class(raw[:, 4:], wanted)
+    score, number = _best_class(raw[:, 4:][:, : model.class_count], wanted)
     return _from_centers(raw[:, :2], raw[:, 2:4], score, number)
+
+
+def _from_rtdetr(model: Model, outputs: list[Array], row: int, fit: Fit, wanted: WantedClasses) -> Boxes:
+    """Ultralytics' RT-DETR: centre and size as shares of the whole, then a probability a class; a row a query."""
+    if outputs[0].ndim != 3 or outputs[0].shape[2] <= 4:
+        raise _unexpected(model, outputs, "[batch, queries, 4 + classes]")
+    raw = np.asarray(outputs[0][row], np.float64)
+    score, number = _best_class(raw[:, 4:][:, : model.class_count], wanted)
+    place_px = raw[:, :4] * np.tile(fit.canvas, 2)
+    return _from_centers(place_px[:, :2], place_px[:, 2:], score, number)
 
 
 def _from_detr(model: Model, outputs: list[Array], row: int, fit: Fit, wanted: WantedClasses) -> Boxes:
     """Carion et al., "DETR", 2020: a softmax with a last class for nothing; its successors: a sigmoid a class."""
-    named = {entry.name.lower(): output for entry, output in zip(model.session.get_outputs(), outputs, strict=True)}
-    logits = next((output for name, output in named.items() if "logits" in name), None)
-    places = next((output for name, output in named.items() if "boxes" in name), None)
+    named = _by_name(model, outputs)
+    logits = next((output for name, output in named.items() if is_logits(name)), None)
+    places = next((output for name, output in named.items() if is_places(name)), None)
     if logits is None or places is None or logits.ndim != 3 or places.shape[-1] != 4:
         raise _unexpected(model, outputs, "logits [batch, queries, classes] and boxes [batch, queries, 4]")
     value = np.asarray(logits[row], np.float64)
@@ -106,32 +135,60 @@ def _from_detr(model: Model, outputs: list[Array], row: int, fit: Fit, wanted: W
         probability = (odds / odds.sum(axis=1, keepdims=True))[:, :-1]
     else:
         probability = 1.0 / (1.0 + np.exp(np.clip(-value, -60.0, 60.0)))
+        is_last = (np.argmax(value, axis=1) == value.shape[1] - 1) & (probability[:, -1] > 0.5)
+        if not model.class_names and is_last.mean() > 0.5:
+            raise InputError(
+                f"{model.path}: the last of its {value.shape[1]} classes is nearly everywhere, as one for nothing is",
+                hint="write the names of the others into the metadata as valuemap.classes, as docs/detect.md shows",
+            )
     score, number = _best_class(probability, wanted)
     place_px = np.asarray(places[row], np.float64) * np.tile(fit.canvas, 2)  # Centre and size, as shares of the whole.
     return _from_centers(place_px[:, :2], place_px[:, 2:], score, number)
 
 
-def _from_boxes(model: Model, outputs: list[Array], row: int, _: Fit, wanted: WantedClasses) -> Boxes:
-    """Edges, class and score, suppressed in the graph: three outputs as of torchvision, or one [batch, N, 6]."""
-    if len(outputs) == 1:
-        if outputs[0].ndim != 3 or outputs[0].shape[2] != 6:
-            raise _unexpected(model, outputs, "left, top, right, bottom, score, class [batch, N, 6]")
+def _from_boxes(model: Model, outputs: list[Array], row: int, fit: Fit, wanted: WantedClasses) -> Boxes:
+    """Edges, class and score, suppressed in the graph: outputs of their own, or one [batch, N, 6 or more]."""
+    named = _by_name(model, outputs)
+    if len(outputs) == 1 or (outputs[0].ndim == 3 and outputs[1].ndim == 4):
+        expected = "left, top, right, bottom, score, class [batch, N, 6]"
+        if outputs[0].ndim != 3 or outputs[0].shape[2] < 6:
+            raise _unexpected(model, outputs, expected)
+        if outputs[0].shape[1] in [many * count for many in (1, 3) for count in anchor_counts(fit.canvas)]:
+            raise _unexpected(model, outputs, f"{expected}, not a row for each cell of the picture")
         edges_px, score, number = outputs[0][row][:, :4], outputs[0][row][:, 4], outputs[0][row][:, 5]
+    elif "detection_boxes" in named:
+        edges_px = named["detection_boxes"][row][:, [1, 0, 3, 2]] * np.tile(fit.canvas, 2)  # y first, in shares.
+        score, number = named["detection_scores"][row], named["detection_classes"][row]
+    elif "dets" in named and named["dets"].ndim == 3 and named["dets"].shape[2] == 5:
+        edges_px, score, number = named["dets"][row][:, :4], named["dets"][row][:, 4], named["labels"][row]
     else:
         edges_px, score, number = _edges_score_number(model, outputs, row)
     number = np.round(number).astype(np.int64)
     if edges_px.shape != (len(score), 4) or len(number) != len(score):
         raise _unexpected(model, outputs, "boxes [N, 4], labels [N] and scores [N]")
+    largest = np.abs(edges_px[score > 0.0]).max(initial=0.0)
+    if 0.0 < largest <= _LARGEST_SHARE:
+        raise InputError(
+            f"{model.path}: gives boxes as shares of the picture, up to {largest:.3g}, expected pixels",
+            hint="export it with boxes in pixels; if a row of its output is centre, size and a score a class, "
+            "say --kind rtdetr",
+        )
     is_wanted = wanted.are_wanted(number)
     return Boxes.from_edges(edges_px[is_wanted], score[is_wanted], number[is_wanted])
 
 
+def _by_name(model: Model, outputs: list[Array]) -> dict[str, Array]:
+    entries = model.session.get_outputs()
+    return {plain_name(entry): output for entry, output in zip(entries, outputs, strict=True)}
+
+
 def _edges_score_number(model: Model, outputs: list[Array], row: int) -> tuple[Array, Array, Array]:
-    """Tell outputs apart by rank and dtype; some exports have a batch, torchvision's have none."""
+    """Tell outputs apart by shape and dtype; some exports have a batch, torchvision's have none."""
     places = [output for output in outputs if output.ndim in (2, 3) and output.shape[-1] == 4]
     if places:
         edges_px = max(places, key=lambda output: output.ndim)  # Four scores have less dimensions than boxes.
-        flat = [output for output in outputs if output.ndim == edges_px.ndim - 1]
+        # How many boxes there are, and how large the picture is, are outputs of other shapes.
+        flat = [output for output in outputs if output.shape == edges_px.shape[:-1]]
         score = next((output for output in flat if output.dtype.kind == "f"), None)
         number = next((output for output in flat if output.dtype.kind in "iu"), None)
         if score is not None and number is not None:
@@ -142,7 +199,9 @@ def _edges_score_number(model: Model, outputs: list[Array], row: int) -> tuple[A
 _DECODERS: Mapping[str, Callable[[Model, list[Array], int, Fit, WantedClasses], Boxes]] = {
     "segmentation": _from_segmentation,
     "yolox": _from_yolox,
+    "yolov5": _from_yolov5,
     "ultralytics": _from_ultralytics,
+    "rtdetr": _from_rtdetr,
     "detr": _from_detr,
     "boxes": _from_boxes,
 }
