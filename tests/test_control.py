@@ -138,6 +138,19 @@ def test_a_file_of_points_has_geographic_places_and_deviations(tmp_path: Path) -
     assert moved.labels.lon_lat_height[:, :2] == pytest.approx(places[:, :2], abs=1e-6)
 
 
+def test_a_layer_of_points_has_deviations_too_and_what_is_left_out_is_told(tmp_path: Path) -> None:
+    import geopandas
+
+    places = lon_lat_height_from_enu(labels_around(7, 5), ANCHOR)
+    sigma = [0.02] * (len(places) - 1) + [None]
+    points = geopandas.points_from_xy(*places.T)
+    geopandas.GeoDataFrame({"SIGMA": sigma}, geometry=points, crs="EPSG:4326").to_file(tmp_path / "points.gpkg")
+    found = read_truth(tmp_path / "points.gpkg", map_of(labels_around(7, 5), frame=Frame(anchor=ANCHOR)))
+    assert isinstance(found, TrueObjects)
+    assert found.sigma_m is not None
+    assert sorted(found.sigma_m[~np.isnan(found.sigma_m)].tolist()) == [0.02] * (len(places) - 1)
+
+
 @pytest.mark.parametrize("columns", ["x,y,z", "lat,lon,height"])
 @pytest.mark.parametrize(("sigma", "shown"), [("-1", "-1"), ("0", "0"), ("1e30", "1e+30"), ("100.5", "100.5")])
 def test_a_deviation_that_is_none_is_refused_with_its_row(columns: str, sigma: str, shown: str, tmp_path: Path) -> None:
@@ -168,19 +181,32 @@ def test_the_command_moves_map_and_written_poses_alike(tmp_path: Path) -> None:
     assert np.linalg.norm(moved, axis=1) == pytest.approx(np.linalg.norm(shift), abs=0.02)
 
 
+def test_control_points_are_looked_at_before_anything_is_mapped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A map may take hours; a file whose columns have other names is known at once."""
+    write_dataset(simulate(SimulationConfig(streets_north_south=2, streets_east_west=2), seed=1), tmp_path / "data")
+    (tmp_path / "points.csv").write_text("X,Y\n1,2\n")
+    monkeypatch.setattr("valuemap.cli.map.build_map_of_folder", lambda *_, **__: pytest.fail("it was mapped"))
+    done = map_in(tmp_path, "--control", tmp_path / "points.csv")
+    assert "points.csv: expected columns lon, lat or x, y, z, found x, y" in done.stderr
+    assert isinstance(done.exception, SystemExit)
+
+
 @pytest.mark.parametrize(
     ("name", "told"),
     [
         ("no.csv", "no.csv: no such file"),
         ("data", "data: is a folder, expected a table of objects"),
-        ("data/dataset.json", "dataset.json: control points of an unknown kind: .json"),
+        ("data/images.txt", "images.txt: control points of an unknown kind: .txt"),
     ],
 )
 def test_control_that_is_no_table_is_one_line(name: str, told: str, tmp_path: Path) -> None:
     write_dataset(simulate(SimulationConfig(streets_north_south=2, streets_east_west=2), seed=1), tmp_path / "data")
+    (tmp_path / "data" / "images.txt").write_text("x,y,z\n")
     done = map_in(tmp_path, "--control", tmp_path / name)
     assert done.exit_code != 0
     assert told in done.stderr
-    assert "hint: give a table of objects as one of .csv, .parquet, .geojson, .gpkg, .fgb" in done.stderr
+    assert "hint: give a table of objects as one of .csv, .parquet, .geojson, .json, .gpkg, .fgb, .shp" in done.stderr
     assert isinstance(done.exception, SystemExit)  # Nothing else gets out: no traceback.
     assert not (tmp_path / "map").exists()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -509,6 +510,127 @@ def test_truth_from_files_of_points(suffix: str, has_height: bool, tmp_path: Pat
     assert math.isnan(evaluation.vertical_rmse_m) != has_height
 
 
+def features(places: Floats, **more: Any) -> str:
+    """Return GeoJSON of points, as portals give it, with the ends of the collection in `more`."""
+    rows = [
+        {"type": "Feature", "properties": {}, "geometry": {"type": "Point", "coordinates": place}}
+        for place in places[:, :2].tolist()
+    ]
+    return json.dumps({"type": "FeatureCollection", "features": [*rows, *more.pop("others", [])], **more})
+
+
+@pytest.mark.parametrize("suffix", [".shp", ".zip", ".kml", ".gml", ".parquet", ".json"])
+def test_truth_from_files_of_points_of_other_programs(suffix: str, tmp_path: Path) -> None:
+    """A shapefile, packed and not, with capitals and codes; KML, GML, GeoParquet, and Esri's JSON in a projection."""
+    import geopandas
+
+    lon, lat, _ = truth_places().T
+    points = geopandas.points_from_xy(lon, lat)
+    frame = geopandas.GeoDataFrame({"CLASS": ["light"] * 3, "OBJECTID": [1, 2, 3]}, geometry=points, crs="EPSG:4326")
+    path = tmp_path / f"truth{suffix}"
+    if suffix == ".json":
+        projected = frame.to_crs("EPSG:25830").geometry
+        rows = [{"attributes": {"CLASS": "light"}, "geometry": {"x": p.x, "y": p.y}} for p in projected]
+        text = {"geometryType": "esriGeometryPoint", "spatialReference": {"wkid": 25830}, "features": rows}
+        path.write_text(json.dumps(text))
+    elif suffix == ".zip":
+        frame.to_file(tmp_path / "signals.shp")
+        with zipfile.ZipFile(path, "w") as archive:
+            for part in tmp_path.glob("signals.*"):
+                archive.write(part, part.name)
+    elif suffix == ".parquet":
+        frame.to_parquet(path)
+    else:
+        frame.to_file(path, driver="KML" if suffix == ".kml" else None)
+    evaluation = evaluate_map(geographic_map(), path)
+    assert_found_at(evaluation, 0.3)
+    assert math.isnan(evaluation.vertical_rmse_m)  # KML says a height of 0 where there is none.
+    assert evaluation.matches.objects.class_name is not None
+
+
+def test_nodes_of_openstreetmap_are_truth(tmp_path: Path) -> None:
+    lon, lat, _ = truth_places().T
+    nodes = [
+        f'<node id="{10**10 + i}" lat="{lat[i]:.9f}" lon="{lon[i]:.9f}"><tag k="highway" v="traffic_signals"/></node>'
+        for i in range(3)
+    ]
+    (tmp_path / "t.osm").write_text(f'<osm version="0.6">{"".join(nodes)}</osm>')
+    assert_found_at(evaluate_map(geographic_map(), tmp_path / "t.osm"), 0.3)
+    (tmp_path / "t.json").write_text('{"version": 0.6, "elements": [{"type": "node", "lat": 1, "lon": 2}]}')
+    with pytest.raises(InputError, match=r"t\.json: cannot be read") as refusal:
+        evaluate_map(geographic_map(), tmp_path / "t.json")
+    assert "Overpass" in refusal.value.hint
+
+
+def test_rows_without_a_place_are_left_out_and_told(tmp_path: Path) -> None:
+    """No geometry, no numbers, and the point 0, 0."""
+    others = [
+        {"type": "Feature", "properties": {}, "geometry": geometry}
+        for geometry in (None, None, {"type": "Point", "coordinates": [0, 0]})
+    ]
+    (tmp_path / "t.geojson").write_text(features(truth_places(), others=others))
+    evaluation = evaluate_map(geographic_map(), tmp_path / "t.geojson")
+    assert_found_at(evaluation, 0.3)
+    assert "2 of 6 objects have no place and are left out" in evaluation.notes
+    assert "1 of 6 objects lie at longitude 0, latitude 0 and are left out" in evaluation.notes
+    lon, lat, _ = truth_places().T.tolist()
+    table = {"Latitude": [*lat[:1], None, 0, *lat[1:]], "LNG": [*lon[:1], None, 0, *lon[1:]], "note": list("abcde")}
+    evaluation = evaluate_map(geographic_map(), write_csv(tmp_path / "t.csv", table))
+    assert_found_at(evaluation, 0.3)
+    assert evaluation.notes[0] == "1 of 5 objects have no place and are left out"
+
+
+def test_a_point_in_a_collection_of_one_is_a_point(tmp_path: Path) -> None:
+    def as_collections(count: int) -> str:
+        rows = [
+            {
+                "type": "Feature",
+                "properties": {},
+                "geometry": {"type": "MultiPoint", "coordinates": [place] * count},
+            }
+            for place in truth_places()[:, :2].tolist()
+        ]
+        return json.dumps({"type": "FeatureCollection", "features": rows})
+
+    (tmp_path / "t.geojson").write_text(as_collections(1))
+    assert_found_at(evaluate_map(geographic_map(), tmp_path / "t.geojson"), 0.3)
+    (tmp_path / "t.geojson").write_text(as_collections(2))
+    with pytest.raises(InputError, match=r"row 0: expected a point, found MultiPoint of 2 \(3 rows\)"):
+        evaluate_map(geographic_map(), tmp_path / "t.geojson")
+
+
+def test_rows_behind_one_without_a_place_keep_their_numbers(tmp_path: Path) -> None:
+    table = {"lon": [1.0, None, 1.0], "lat": [2.0, None, 2.0], "class": ["light", "light", None]}
+    with pytest.raises(InputError, match=r"t\.csv row 2: class: expected a value"):
+        evaluate_map(geographic_map(), write_csv(tmp_path / "t.csv", table))
+
+
+def test_an_answer_that_a_server_cut_short_is_told(tmp_path: Path) -> None:
+    (tmp_path / "t.geojson").write_text(features(truth_places(), properties={"exceededTransferLimit": True}))
+    evaluation = evaluate_map(geographic_map(), tmp_path / "t.geojson")
+    assert_found_at(evaluation, 0.3)
+    assert sum("exceededTransferLimit" in note for note in evaluation.notes) == 1
+
+
+def test_codes_that_are_numbers_are_classes(tmp_path: Path) -> None:
+    """Of a layer and of Parquet as of CSV, with or without a fraction; an empty column of classes is none."""
+    import geopandas
+
+    lon, lat, _ = truth_places().T
+    result = geographic_map()
+    labels = result.labels.replace(class_name=Categories.from_texts(["205", "205", "206"]))
+    result = Map(**{**vars(result), "labels": labels})
+    for codes in ([205, 205, 206], [205.0, 205.0, 206.0]):
+        points = geopandas.points_from_xy(lon, lat)
+        frame = geopandas.GeoDataFrame({"class": codes}, geometry=points, crs="EPSG:4326")
+        frame.to_file(tmp_path / "t.gpkg")
+        pq.write_table(pa.table({"lon": lon, "lat": lat, "class": codes}), tmp_path / "t.parquet")
+        for name in ("t.gpkg", "t.parquet"):
+            assert_found_at(evaluate_map(result, tmp_path / name), 0.3)
+    empty = {"lon": lon.tolist(), "lat": lat.tolist(), "height": [None] * 3, "class": [None] * 3}
+    assert_found_at(evaluate_map(result, write_csv(tmp_path / "t.csv", empty)), 0.3)
+
+
 def test_objects_are_the_layer_of_labels_where_a_file_has_several(tmp_path: Path) -> None:
     """A map that was exported has layers of cameras and votes too."""
     import geopandas
@@ -647,8 +769,11 @@ def test_truth_that_is_nowhere_is_refused(tmp_path: Path) -> None:
         evaluate_map(map_of([]), tmp_path / "absent.csv")
     with pytest.raises(InputError, match="is not a dataset"):
         evaluate_map(map_of([]), tmp_path)
-    with pytest.raises(InputError, match="no place on the ellipsoid"):
-        evaluate_map(geographic_map(), write_csv(tmp_path / "t.csv", {"lon": [0.0], "lat": [95.0], "height": [0.0]}))
+    for lon, lat in ((0.0, 95.0), (698000.0, 5711000.0)):
+        file = write_csv(tmp_path / "t.csv", {"lon": [lon], "lat": [lat], "height": [0.0]})
+        with pytest.raises(InputError, match=r"t\.csv row 0: expected degrees, found longitude") as refusal:
+            evaluate_map(geographic_map(), file)
+        assert "map projection" in refusal.value.hint
 
 
 def test_a_dataset_without_truth_is_refused() -> None:

@@ -27,11 +27,12 @@ from valuemap.cli.show import log, progress_bars, show, show_notes
 from valuemap.cli.working import working
 from valuemap.config import MapConfig
 from valuemap.control import apply_control
-from valuemap.dataset import Dataset, read_dataset
+from valuemap.dataset import MARKER, Dataset, Frame, read_dataset, read_head
 from valuemap.engine.choose import engine_named
 from valuemap.errors import SettingError
 from valuemap.evaluate import evaluate_map
-from valuemap.evaluate.truth import check_objects_file, read_objects
+from valuemap.evaluate.objects_file import check_objects_file, read_objects_file
+from valuemap.evaluate.truth import read_objects
 from valuemap.evidence import dataset_reference
 from valuemap.folders import check_files, check_place
 from valuemap.map_folder import Map, write_map
@@ -97,6 +98,8 @@ def map_command(
         check_poses_place(write_poses_to, force=force)
     if control is not None:
         check_objects_file(control, "control points")
+        head = read_head(dataset)
+        read_objects_file(control, Frame.from_json(head.get("frame"), source=str(dataset / MARKER)))
     given = None if calibration is None else read_calibration(calibration)
     with working(work, out, resume=resume) as place, progress_bars() as progress:
         run = Run(
@@ -129,6 +132,8 @@ def map_command(
 
 def _controlled(result: Map, data: Dataset, control: Path) -> tuple[Map, Dataset]:
     """Return the map and its dataset moved to control points."""
-    result, moved = apply_control(result, read_objects(control, result), data)
+    points = read_objects(control, result)
+    result, moved = apply_control(result, points, data)
     assert moved is not None
+    result.run["notes"] = [*result.run["notes"], *points.notes]
     return result, moved

@@ -10,9 +10,9 @@ the most matches counts, and of those the one with the smallest sum of distances
 and every object is found, missed, or not recoverable: nobody can place an object that was not detected from
 two sufficiently different directions, so such objects do not count in the recall.
 
-`truth.py` brings the truth to the frame of the map, `recoverable.py` says which objects could be found,
-`matching.py` matches, and `accuracy.py`, `completeness.py`, `chance.py` and `reliability.py` each say one thing about
-the matches; `evaluation.py` puts them together.
+`objects_file.py` reads files of objects, `truth.py` brings the truth to the frame of the map, `recoverable.py` says
+which objects could be found, `matching.py` matches, and `accuracy.py`, `completeness.py`, `chance.py` and
+`reliability.py` each say one thing about the matches; `evaluation.py` puts them together.
 """
 
 from valuemap.evaluate.accuracy import PositionalAccuracy, measure_accuracy

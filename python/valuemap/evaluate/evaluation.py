@@ -220,7 +220,7 @@ def _notes(objects: TrueObjects) -> tuple[str, ...]:
             not objects.has_height
         ),
     }
-    return tuple(note for note, applies in notes.items() if applies)
+    return (*objects.notes, *(note for note, applies in notes.items() if applies))
 
 
 def _note_elsewhere(result: Map, matches: Matches, radius_m: float) -> tuple[str, ...]:
@@ -236,7 +236,7 @@ def _note_elsewhere(result: Map, matches: Matches, radius_m: float) -> tuple[str
     if distance_m.min() > _ELSEWHERE_M:
         return (
             f"the nearest true object is {distance_m.min() / 1000.0:.4g} km from a label: is the truth of this place, "
-            "and are latitude and longitude not exchanged?",
+            "are x, y, z not those of a map projection, and are latitude and longitude not exchanged?",
         )
     beside = np.flatnonzero(distance_m <= radius_m)
     above_m = float(np.median((objects[nearest] - labels)[beside] @ up)) if len(beside) else 0.0

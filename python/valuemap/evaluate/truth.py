@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 
 from valuemap.config import VoteConfig
-from valuemap.config.setting import LARGEST_SIGMA_M
-from valuemap.csv_table import read_csv_arrow
 from valuemap.dataset import Dataset, Frame, read_dataset
 from valuemap.errors import InputError, SettingError
+from valuemap.evaluate.objects_file import check_objects_file, read_objects_file
 from valuemap.evaluate.recoverable import recoverable_objects
-from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_crs, lon_lat_height_from_enu
+from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import Map
 from valuemap.tables import (
     Bools,
@@ -27,12 +24,7 @@ from valuemap.tables import (
     Labels,
     Truth,
     TruthPoints,
-    read_arrow,
-    table_from_arrow,
 )
-
-LABELS = "labels"
-"""The layer of objects in what `valuemap export` writes, which has others too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +43,8 @@ class TrueObjects:
     is_recoverable: Bools | None = None
     has_height: bool = True
     sigma_m: Floats | None = None
+    notes: tuple[str, ...] = ()
+    """What a reader of the figures must know of where they come from."""
 
     def __len__(self) -> int:
         return len(self.object_id)
@@ -76,10 +70,10 @@ def read_truth(path: Path, result: Map) -> Dataset | TrueObjects:
     """Read the truth for a map: a dataset folder, or a file of objects.
 
     A file has one object a row. It is .csv or .parquet with columns x, y, z in the frame of the map or, for
-    geo-referenced maps, lon, lat (WGS84 degrees) and perhaps height (ellipsoidal, m); or .geojson, .gpkg or
-    .fgb with points. Columns `class` and `object_id` are optional. Where a file has both kinds of positions,
-    the geographic ones count if they are complete, because x, y, z may belong to another anchor. Without
-    heights the objects are matched horizontally.
+    geo-referenced maps, lon, lat (WGS84 degrees) and perhaps height (ellipsoidal, m); or a file of points that GDAL
+    reads, such as .geojson, .gpkg or .shp. Columns `class`, `object_id` and `sigma` are optional. Where a file has both
+    kinds of positions, the geographic ones count if they are complete, because x, y, z may belong to another anchor.
+    Without heights the objects are matched horizontally.
 
     Raises
     ------
@@ -92,32 +86,6 @@ def read_truth(path: Path, result: Map) -> Dataset | TrueObjects:
     return read_objects(path, result)
 
 
-def check_objects_file(path: Path, what: str, or_else: str = "") -> None:
-    """Find out before long work whether `read_objects` knows what a file is by its name.
-
-    `what` the file is for, and what may be given `or_else`, go into what is said.
-
-    Raises
-    ------
-    InputError
-        The file is missing or of an unknown kind.
-    """
-    hint = f"give {or_else}a table of objects as one of {', '.join(_TRUTH_READERS)}"
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, expected a table of objects", hint=hint)
-    if not path.is_file():
-        told = "is no file" if path.exists() else f"no such file{' or folder' if or_else else ''}"
-        raise InputError(f"{path}: {told}", hint=hint)
-    suffix = _suffix(path)
-    if suffix not in _TRUTH_READERS or (suffix != ".csv" and path.suffix.lower() == ".gz"):
-        raise InputError(f"{path}: {what} of an unknown kind: {path.suffix or 'no suffix'}", hint=hint)
-
-
-def _suffix(path: Path) -> str:
-    """Return what says the kind of a file."""
-    return (Path(path.stem) if path.suffix.lower() == ".gz" else path).suffix.lower()
-
-
 def read_objects(path: Path, result: Map) -> TrueObjects:
     """Read a file of objects, as `read_truth` describes them, that `check_objects_file` lets pass.
 
@@ -126,56 +94,11 @@ def read_objects(path: Path, result: Map) -> TrueObjects:
     InputError
         The file is damaged, or cannot be brought to the frame of the map.
     """
-    table = _with_numbered_objects(_TRUTH_READERS[_suffix(path)](path))
-    columns = {*table.column_names}
-    has_position, has_place = {"x", "y", "z"} <= columns, {"lon", "lat"} <= columns
-    anchor = result.frame.anchor
-    if has_place and anchor is not None and ("height" in columns or not has_position):
-        places = table_from_arrow(GeographicTruth, table, source=str(path))
-        _check_sigmas(places.sigma_m, path)
-        return _objects_on_earth(places, anchor, result.labels)
-    if has_place and not has_position:
-        raise InputError(
-            f"{path}: has longitude and latitude, but the map is not geo-referenced",
-            hint="give x, y, z in the frame of the map",
-        )
-    if not has_position:
-        raise InputError(
-            f"{path}: expected columns lon, lat or x, y, z, found {', '.join(table.column_names)[:300]}",
-            hint="columns have these names; lon and lat are WGS84 degrees, x, y, z metres in the frame of the map",
-        )
-    points = table_from_arrow(TruthPoints, table, source=str(path))
-    _check_sigmas(points.sigma_m, path)
-    return _sorted_objects(points, points.position_in_world_m)
-
-
-def _check_sigmas(sigma_m: Floats | None, path: Path) -> None:
-    """Refuse standard deviations that are none; those that are not known are NaN."""
-    if sigma_m is None:
-        return
-    wrong = np.flatnonzero((sigma_m <= 0.0) | (sigma_m > LARGEST_SIGMA_M))
-    if len(wrong):
-        raise InputError(
-            f"{path} row {wrong[0]}: sigma: expected above 0 and at most {LARGEST_SIGMA_M:g} (m), or no value, found "
-            f"{sigma_m[wrong[0]]:g} ({len(wrong)} rows)",
-            hint="it is the standard deviation of the position on each axis; leave it empty where it is not known",
-        )
-
-
-def _with_numbered_objects(table: pa.Table) -> pa.Table:
-    """Return the table with whole numbers as ids: surveys have texts, such as TL-17a, whose rows are then the ids."""
-    if table.column_names.count("object_id") != 1:
-        return table
-    ids = table["object_id"]
-    if pa.types.is_dictionary(ids.type):
-        ids = ids.cast(ids.type.value_type)
-    if pa.types.is_string(ids.type) or pa.types.is_large_string(ids.type):
-        try:
-            ids = ids.cast(pa.int64())
-        except pa.ArrowInvalid:
-            ids = pa.chunked_array([pa.array(range(table.num_rows), pa.int64())])
-        table = table.set_column(table.column_names.index("object_id"), "object_id", ids)
-    return table
+    found = read_objects_file(path, result.frame)
+    if isinstance(found.objects, GeographicTruth):
+        assert result.frame.anchor is not None
+        return _objects_on_earth(found.objects, result.frame.anchor, result.labels, found.notes)
+    return _sorted_objects(found.objects, found.objects.position_in_world_m, found.notes)
 
 
 def _min_parallax_of(result: Map) -> float:
@@ -225,7 +148,9 @@ def positions_in_frame(position_in_world_m: Floats, dataset: Dataset, frame: Fra
     return position_in_world_m
 
 
-def _objects_on_earth(truth: GeographicTruth, anchor: tuple[float, float, float], labels: Labels) -> TrueObjects:
+def _objects_on_earth(
+    truth: GeographicTruth, anchor: tuple[float, float, float], labels: Labels, notes: tuple[str, ...]
+) -> TrueObjects:
     """Bring WGS84 places to the ENU frame of a map, at the height of its labels where they have none.
 
     A wrong height shifts a place horizontally by that error times its distance from the anchor over the
@@ -236,11 +161,15 @@ def _objects_on_earth(truth: GeographicTruth, anchor: tuple[float, float, float]
         places = labels.lon_lat_height
         height_m = np.full(len(truth), anchor[2] if places is None or len(places) == 0 else np.median(places[:, 2]))
     position = enu_from_lon_lat_height(np.column_stack([truth.lon_lat, height_m]), anchor)
-    return _sorted_objects(truth, position, has_height=truth.height_m is not None)
+    return _sorted_objects(truth, position, notes, has_height=truth.height_m is not None)
 
 
 def _sorted_objects(
-    truth: TruthPoints | GeographicTruth, position_in_world_m: Floats, *, has_height: bool = True
+    truth: TruthPoints | GeographicTruth,
+    position_in_world_m: Floats,
+    notes: tuple[str, ...],
+    *,
+    has_height: bool = True,
 ) -> TrueObjects:
     """Put objects in an order of their own, because that of the rows must not change any figure."""
     class_code = np.zeros(len(truth), np.int32) if truth.class_name is None else truth.class_name.codes
@@ -252,53 +181,5 @@ def _sorted_objects(
         class_name=None if truth.class_name is None else truth.class_name.take(order),
         has_height=has_height,
         sigma_m=None if truth.sigma_m is None else truth.sigma_m[order],
+        notes=notes,
     )
-
-
-def _read_csv(path: Path) -> pa.Table:
-    numbers = dict.fromkeys(("x", "y", "z", "lon", "lat", "height", "sigma"), pa.float64())
-    types = {**numbers, "class": pa.string(), "object_id": pa.string()}
-    hint = "separate columns by commas, their names in the first line"
-    return read_csv_arrow(path, types, has_missing=True, hint=hint)
-
-
-def _read_points(path: Path) -> pa.Table:
-    import geopandas  # Slow to import, and only files of points need it.
-    import pyogrio
-
-    try:
-        layers = pyogrio.list_layers(path)[:, 0].tolist()
-        if len(layers) > 1 and LABELS not in layers:
-            raise InputError(
-                f"{path}: has the layers {', '.join(layers)[:300]}", hint="save the one with the objects alone"
-            )
-        points = geopandas.read_file(path, layer=LABELS if LABELS in layers else layers[0])
-    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path}: cannot be read: {reason}", hint="is it a file of points that QGIS opens?") from error
-    if not isinstance(points, geopandas.GeoDataFrame) or points.crs is None:
-        raise InputError(f"{path}: has no geometries in a coordinate system", hint="save it as points, e.g. in WGS 84")
-    kinds = points.geom_type.to_numpy()
-    wrong = np.flatnonzero(kinds != "Point")
-    if len(wrong):
-        raise InputError(
-            f"{path} row {wrong[0]}: expected a point, found {kinds[wrong[0]]} ({len(wrong)} rows)",
-            hint="give every object as one point",
-        )
-    coordinates = points.get_coordinates(include_z=True).to_numpy()
-    has_height = ~np.isnan(coordinates[:, 2])
-    lon, lat, height = lon_lat_height_from_crs(np.nan_to_num(coordinates), points.crs.to_string()).T
-    columns = {"lon": lon, "lat": lat}
-    if has_height.any():
-        columns["height"] = np.where(has_height, height, np.nan)
-    columns |= {name: points[name] for name in ("class", "object_id") if name in points}
-    return pa.table({name: pa.array(column, from_pandas=True) for name, column in columns.items()})
-
-
-_TRUTH_READERS: dict[str, Callable[[Path], pa.Table]] = {
-    ".csv": _read_csv,
-    ".parquet": read_arrow,
-    ".geojson": _read_points,
-    ".gpkg": _read_points,
-    ".fgb": _read_points,
-}

@@ -18,7 +18,7 @@ from valuemap.cameras import rotation_matrices
 from valuemap.dataset import read_dataset
 from valuemap.errors import InputError
 from valuemap.evaluate import Evaluation, evaluate_map
-from valuemap.evaluate.truth import check_objects_file
+from valuemap.evaluate.objects_file import check_objects_file
 from valuemap.evidence import PICTURES, Evidence, find_dataset
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import read_map
