@@ -276,6 +276,11 @@ def test_decisions_follow_a_map_to_another_anchor(tmp_path: Path) -> None:
         (lambda content: content["decisions"][0].update(verdict="maybe"), "decision 1: expected a verdict"),
         (lambda content: content["decisions"][0].update(position_m=[1, 2]), "decision 1: cannot be used"),
         (lambda content: content["decisions"][0].update(position_m=[1, 2, float("nan")]), "decision 1: expected"),
+        (lambda content: content["decisions"][0].update(new_position_m=[1, 2, float("nan")]), "decision 1: expected"),
+        (
+            lambda content: content["decisions"].append({**content["decisions"][0], "verdict": "accepted"}),
+            r"decisions 1 \(rejected\) and 2 \(accepted\) are both about label 0 and differ",
+        ),
     ],
 )
 def test_damaged_files_are_refused_in_one_line(tmp_path: Path, change: object, told: str) -> None:
@@ -290,6 +295,15 @@ def test_damaged_files_are_refused_in_one_line(tmp_path: Path, change: object, t
     path.write_text("{")
     with pytest.raises(InputError, match="cannot be read as JSON"):
         read_review(path, result.frame)
+
+
+def test_files_of_two_people_with_the_same_decision_and_a_mark_of_an_editor_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "review.json"
+    result = map_of([[0, 0, 5]])
+    decision = decide(result, 0, "rejected")
+    write_review(path, [decision, decision], result.frame)
+    path.write_text(path.read_text(encoding="utf-8"), encoding="utf-8-sig")
+    assert read_review(path, result.frame) == [decision]
 
 
 def test_the_order_of_decisions_means_nothing() -> None:

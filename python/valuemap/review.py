@@ -277,8 +277,8 @@ def read_review(path: str | Path, frame: Frame) -> list[Decision]:
     if not path.is_file():
         return []
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
+        content = json.loads(path.read_text(encoding="utf-8-sig"))  # Some editors put a mark before it.
+    except (ValueError, OSError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read as JSON: {error}", hint="repair it, or move it away") from error
     if not isinstance(content, dict) or content.get("format_version") != _FORMAT_VERSION:
         found = content.get("format_version") if isinstance(content, dict) else type(content).__name__
@@ -296,7 +296,27 @@ def read_review(path: str | Path, frame: Frame) -> list[Decision]:
     if not isinstance(entries, list):
         raise InputError(f"{path}: decisions: expected a list", hint="repair it, or move it away")
     decisions = [_from_json(entry, f"{path}: decision {number}") for number, entry in enumerate(entries, start=1)]
-    return _moved_to(decisions, written_in, frame)
+    return _moved_to(_once_each(decisions, path), written_in, frame)
+
+
+def _once_each(decisions: list[Decision], path: Path) -> list[Decision]:
+    """Return decisions without those that are there twice, as where files of two people were put together.
+
+    Raises
+    ------
+    InputError
+        Two decisions about one label say different things.
+    """
+    first: dict[tuple[int, str, _Point], int] = {}
+    for number, each in enumerate(decisions):
+        other = first.setdefault((each.label_id, each.class_name, each.position_in_world_m), number)
+        if decisions[other] != each:
+            raise InputError(
+                f"{path}: decisions {other + 1} ({decisions[other].verdict}) and {number + 1} ({each.verdict}) are "
+                f"both about label {each.label_id} and differ",
+                hint="keep the one that is right",
+            )
+    return [decisions[number] for number in first.values()]
 
 
 def _kind(frame: Frame) -> str:
@@ -350,11 +370,12 @@ def _from_json(entry: Any, where: str) -> Decision:
         )
     except (TypeError, ValueError, KeyError, AttributeError) as error:
         raise InputError(f"{where}: cannot be used: {error!r}", hint="repair or remove it") from error
-    numbers = (*decision.position_in_world_m, *decision.covariance_m2)
+    corrected = decision.new_position_in_world_m or ()
+    numbers = (*decision.position_in_world_m, *decision.covariance_m2, *corrected)
     if decision.verdict not in get_args(Verdict) or len(decision.covariance_m2) != 6 or not np.isfinite(numbers).all():
         raise InputError(
-            f"{where}: expected a verdict ({', '.join(get_args(Verdict))}), a position and six covariances, found "
-            f"{decision.verdict!r}, {list(decision.position_in_world_m)}, {list(decision.covariance_m2)}",
+            f"{where}: expected a verdict ({', '.join(get_args(Verdict))}), positions and six covariances, found "
+            f"{decision.verdict!r}, {[*decision.position_in_world_m, *corrected]}, {list(decision.covariance_m2)}",
             hint="repair or remove it",
         )
     return decision
