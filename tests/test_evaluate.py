@@ -612,6 +612,17 @@ def test_an_answer_that_a_server_cut_short_is_told(tmp_path: Path) -> None:
     assert sum("exceededTransferLimit" in note for note in evaluation.notes) == 1
 
 
+def test_deviations_of_check_points_count_where_all_are_stated(tmp_path: Path) -> None:
+    """Of 0.03, 0.04 and 0.05 m the mean of the squares is 0.0050 / 3; the option comes first; one gap is too many."""
+    result = map_of(truth_positions())
+    sigmas: list[Any] = [0.03, 0.04, 0.05]
+    path = write_csv(tmp_path / "t.csv", {**xyz(truth_positions()), "sigma": sigmas})
+    assert evaluate_map(result, path).accuracy.truth_sigma_m == pytest.approx(math.sqrt(0.005 / 3))
+    assert evaluate_map(result, path, truth_sigma_m=0.2).accuracy.truth_sigma_m == 0.2
+    write_csv(path, {**xyz(truth_positions()), "sigma": [0.03, None, 0.05]})
+    assert evaluate_map(result, path).accuracy.truth_sigma_m is None
+
+
 def test_codes_that_are_numbers_are_classes(tmp_path: Path) -> None:
     """Of a layer and of Parquet as of CSV, with or without a fraction; an empty column of classes is none."""
     import geopandas
