@@ -126,6 +126,24 @@ def test_yolo_names_as_list_or_by_number(tmp_path: Path, names: str) -> None:
     assert read_labels(f"yolo:{tmp_path}").pictures[0].classes == ("two", "zero")
 
 
+@pytest.mark.parametrize(
+    ("names", "place"), [("data.yaml", "valid/images"), ("dataset.yml", "valid"), ("obj.names", "valid")]
+)
+def test_yolo_names_stand_above_a_part_of_a_dataset(tmp_path: Path, names: str, place: str) -> None:
+    write_picture(tmp_path / "valid" / "images" / "a.png")
+    write_text(tmp_path / "valid" / "labels" / "a.txt", "1 0.5 0.5 0.1 0.1")
+    write_text(tmp_path / names, *(["zero", "one"] if names == "obj.names" else ["names: [zero, one]"]))
+    assert read_labels(f"yolo:{tmp_path / place}").class_names == ("one",)
+
+
+def test_key_points_of_yolo_are_no_corners_of_a_polygon(tmp_path: Path) -> None:
+    """Two key points of two numbers make eight with the box, as four corners would."""
+    write_picture(tmp_path / "a.jpg")
+    write_text(tmp_path / "a.txt", "0 0.5 0.5 0.1 0.2 0.1 0.1 0.9 0.9")
+    write_text(tmp_path / "data.yaml", "names: [light]", "kpt_shape: [2, 2]")
+    assert np.allclose(read_labels(f"yolo:{tmp_path}").pictures[0].boxes_px, [[100.0, 50.0, 20.0, 20.0]])
+
+
 def test_yolo_names_line_by_line(tmp_path: Path) -> None:
     write_picture(tmp_path / "a.png")
     write_text(tmp_path / "a.txt", "1 0.5 0.5 0.1 0.1")

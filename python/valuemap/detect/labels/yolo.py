@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os.path
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ from valuemap.detect.pictures import list_pictures
 from valuemap.errors import InputError
 from valuemap.yaml_text import load_yaml
 
+_NAMES_FILES = ("data.yaml", "data.yml", "dataset.yaml", "dataset.yml", "classes.txt", "obj.names")
 _TRANSPOSED = frozenset({5, 6, 7, 8})
 """EXIF orientations that swap width and height."""
 
@@ -20,8 +23,10 @@ def read_yolo(folder: Path) -> LabelledPictures:
     The text file lies beside the picture, or below `labels` where the picture lies below `images`. A line is
     `class cx cy w h [confidence]`, or `class x1 y1 x2 y2 x3 y3 ...` for a polygon, which becomes the box around
     it; all as shares of the picture's size. A picture without a text file has no objects. Class names come from
-    `names` in a `data.yaml`, or from the lines of a `classes.txt`; class 3 without a name is `class-3`. The
-    split is what the innermost folder named like one says (train, val, valid, test).
+    `names` in a `data.yaml` or `dataset.yaml`, or from the lines of a `classes.txt` or `obj.names`, in the folder or
+    one of the two above; class 3 without a name is `class-3`. Key points, of which `kpt_shape` in the YAML file says
+    how many there are, count for nothing. The split is what the innermost folder named like one says (train, val,
+    valid, test).
 
     Raises
     ------
@@ -30,7 +35,7 @@ def read_yolo(folder: Path) -> LabelledPictures:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder", hint="give the folder that holds pictures and YOLO text files")
-    names = _class_names(folder)
+    names, key_values = _classes(folder)
     paths = list_pictures(folder)
     if not paths:
         raise InputError(f"{folder}: there are no pictures in it", hint="pictures and text files belong together")
@@ -44,29 +49,34 @@ def read_yolo(folder: Path) -> LabelledPictures:
     pictures = [
         picture
         for path, text in zip(paths, texts, strict=True)
-        if (picture := _picture(path, text, names, _split_of(path, folder), skipped)) is not None
+        if (picture := _picture(path, text, names, key_values, _split_of(path, folder), skipped)) is not None
     ]
     return LabelledPictures(f"yolo:{folder}", tuple(pictures), tuple(skipped))
 
 
-def _class_names(folder: Path) -> dict[int, str]:
-    config, lines = folder / "data.yaml", folder / "classes.txt"
-    if config.is_file():
+def _classes(folder: Path) -> tuple[dict[int, str], int]:
+    """Return the names of the classes, and how many values of key points follow a box."""
+    above = Path(os.path.abspath(folder)).parents  # noqa: PTH100 (a link to a folder is where it is)
+    places = (place / name for place in (folder, *above[:2]) for name in _NAMES_FILES)
+    path = next((path for path in places if path.is_file()), None)
+    if path is None:
+        return {}, 0
+    if path.suffix in (".yaml", ".yml"):
         try:
-            names: Any = load_yaml(config.read_bytes())["names"]
+            content: Any = load_yaml(path.read_bytes())
+            names, shape = content["names"], content.get("kpt_shape")
             items = names.items() if isinstance(names, dict) else enumerate(names)
-            return {int(number): str(name) for number, name in items}
+            values = math.prod(shape) if isinstance(shape, list) and len(shape) == 2 else 0
+            return {int(number): str(name) for number, name in items}, int(values)
         except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
             reason = " ".join(str(error).split())
             raise InputError(
-                f"{config}: expected names of the classes: {reason}", hint="write names: [traffic light] into it"
+                f"{path}: expected names of the classes: {reason}", hint="write names: [traffic light] into it"
             ) from error
-    if lines.is_file():
-        try:
-            return dict(enumerate(map(str.strip, lines.read_text(encoding="utf-8").splitlines())))
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{lines}: cannot be read: {error}", hint="write one name a line, as UTF-8") from error
-    return {}
+    try:
+        return dict(enumerate(map(str.strip, path.read_text(encoding="utf-8-sig").splitlines()))), 0
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read: {error}", hint="write one name a line, as UTF-8") from error
 
 
 def _text_of(path: Path, folder: Path) -> Path:
@@ -84,24 +94,28 @@ def _split_of(path: Path, folder: Path) -> str:
     return next((SPLITS[part] for part in reversed(parts) if part in SPLITS), "")
 
 
-def _picture(path: Path, text: Path, names: dict[int, str], split: str, skipped: list[str]) -> LabelledPicture | None:
+def _picture(
+    path: Path, text: Path, names: dict[int, str], key_values: int, split: str, skipped: list[str]
+) -> LabelledPicture | None:
     size_px = _size_px(path)
     if size_px is None:
         skipped.append(f"{path}: cannot be read as a picture")
         return None
     found = BoxList(skipped)
     try:
-        lines = text.read_text(encoding="utf-8").splitlines() if text.is_file() else []
+        lines = text.read_text(encoding="utf-8-sig").splitlines() if text.is_file() else []
     except (OSError, UnicodeDecodeError) as error:
         skipped.append(f"{text}: cannot be read: {error}")
         return None
     for row, line in enumerate(lines, start=1):
         if line.strip():
-            _add_line(found, line, f"{text} line {row}", names, size_px)
+            _add_line(found, line, f"{text} line {row}", names, key_values, size_px)
     return found.picture(path, split)
 
 
-def _add_line(found: BoxList, line: str, where: str, names: dict[int, str], size_px: tuple[int, int]) -> None:
+def _add_line(
+    found: BoxList, line: str, where: str, names: dict[int, str], key_values: int, size_px: tuple[int, int]
+) -> None:
     try:
         number, *values = map(float, line.split())
         class_number = int(number)
@@ -109,6 +123,8 @@ def _add_line(found: BoxList, line: str, where: str, names: dict[int, str], size
         found.skipped.append(f"{where}: expected a class and numbers, found {line.strip()!r}")
         return
     width_px, height_px = size_px
+    if key_values and len(values) >= 4 + key_values:
+        del values[4 : 4 + key_values]
     if len(values) in (4, 5):
         x, y, width, height = values[:4]
         left, top, right, bottom = x - width / 2, y - height / 2, x + width / 2, y + height / 2
