@@ -623,6 +623,13 @@ def test_deviations_of_check_points_count_where_all_are_stated(tmp_path: Path) -
     assert evaluate_map(result, path).accuracy.truth_sigma_m is None
 
 
+def test_degrees_in_columns_x_and_y_are_no_metres(tmp_path: Path) -> None:
+    """As ArcGIS and QGIS write them; in the frame of the map they would all be objects beside its origin."""
+    with pytest.raises(InputError, match="x and y are longitude and latitude of the place") as refusal:
+        evaluate_map(geographic_map(), write_csv(tmp_path / "t.csv", lon_lat(truth_places(), "X", "Y", "Z")))
+    assert "lon, lat and height" in refusal.value.hint
+
+
 def test_codes_that_are_numbers_are_classes(tmp_path: Path) -> None:
     """Of a layer and of Parquet as of CSV, with or without a fraction; an empty column of classes is none."""
     import geopandas

@@ -30,6 +30,8 @@ _OTHER_NAMES = {
 """What tables call degrees that can be nothing else."""
 _NUMBERS = ("x", "y", "z", "lon", "lat", "height", "sigma")
 _TEXTS = ("class", "object_id")
+_DEGREES_AROUND = 1.0
+"""All x, y that are nearer than this to the longitude and latitude of the anchor are degrees."""
 _CUT_SHORT = re.compile(rb'"exceededTransferLimit"\s*:\s*true')
 _POINT, _MULTIPOINT, _NOTHING = 0, 4, -1
 """Types of geometries by shapely's numbers."""
@@ -107,6 +109,13 @@ def read_objects_file(path: Path, frame: Frame) -> ObjectsFile:
         )
     points = table_from_arrow(TruthPoints, table, source=str(path))
     _check_sigmas(points.sigma_m, path)
+    if frame.anchor is not None:
+        lat, lon, _ = frame.anchor
+        if np.all(np.abs(points.position_in_world_m[:, :2] - [lon, lat]) < _DEGREES_AROUND):
+            raise InputError(
+                f"{path}: x and y are longitude and latitude of the place, expected metres in the frame of the map",
+                hint="call the columns lon, lat and height",
+            )
     return ObjectsFile(points, ())
 
 
