@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -328,6 +329,19 @@ def test_rf_detr_is_a_detr_with_names_of_its_own(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.edges_px, [[16, 16, 48, 48]])
 
 
+@pytest.mark.parametrize(("queries", "classes", "is_plain"), [(300, 80, True), (300, 91, False), (900, 80, False)])
+def test_rt_detr_takes_colours_as_they_are_and_other_detrs_do_not(
+    tmp_path: Path, *, queries: int, classes: int, is_plain: bool
+) -> None:
+    outputs = {
+        "logits": np.zeros((1, queries, classes), np.float32),
+        "pred_boxes": np.zeros((1, queries, 4), np.float32),
+    }
+    model = load_model(says(tmp_path / "m.onnx", outputs), DetectConfig())
+    assert (model.kind, model.preparation.fitting) == ("detr", "stretch")
+    assert (model.preparation.mean == (0.0, 0.0, 0.0)) is is_plain
+
+
 def test_models_that_take_the_size_give_boxes_of_the_canvas(tmp_path: Path) -> None:
     """RT-DETR and D-FINE; the canvas is square and the picture is not: stretched, as these are trained."""
     file = scales_to_sizes(tmp_path / "m.onnx", np.array([[0.25, 0.5, 0.5, 0.75]], np.float32))
@@ -418,6 +432,18 @@ def test_outputs_that_mean_something_else_are_refused(tmp_path: Path) -> None:
             ),
             DetectConfig(),
         )
+    flat = says(tmp_path / "flat.onnx", {"output": np.zeros((4, 7), np.float32)})
+    with pytest.raises(InputError, match="cannot tell what the outputs mean") as error:
+        load_model(flat, DetectConfig())
+    assert "--end2end" in error.value.hint
+    node = onnx.helper.make_node("EfficientNMS_TRT", ["image"], ["boxes"], domain="TRT")
+    ends = [onnx.helper.make_tensor_value_info(name, 1, [1, 3, 64, 64]) for name in ("image", "boxes")]
+    graph = onnx.helper.make_graph([node], "trt", ends[:1], ends[1:])
+    opsets = [onnx.helper.make_opsetid("", 18), onnx.helper.make_opsetid("TRT", 1)]
+    onnx.save(onnx.helper.make_model(graph, opset_imports=opsets, ir_version=10), tmp_path / "trt.onnx")
+    with pytest.raises(InputError, match="cannot be read as an ONNX model") as error:
+        load_model(tmp_path / "trt.onnx", DetectConfig())
+    assert "TensorRT" in error.value.hint
     weights = tmp_path / "best.pt"
     weights.write_bytes(b"PK")
     with pytest.raises(InputError) as error:

@@ -221,12 +221,12 @@ def _open(path: Path, content: bytes, provider: str, threads: int) -> Any:
                 f"{path}: keeps its weights in another file, {other!r}",
                 hint="put them into one: onnx.save(onnx.load(IN), OUT), or external_data=False in torch.onnx.export",
             ) from error
-        raise InputError(
-            f"{path}: cannot be read as an ONNX model: {_first_line(error)}",
-            hint="is it whole? Export it again"
-            if path.suffix.lower() == ".onnx"
-            else "export the model as ONNX; of other kinds none is read",
-        ) from error
+        hint = "is it whole? Export it again"
+        if "is not a registered function/op" in str(error):
+            hint = "it has operators of another program, such as TensorRT: export it for ONNX Runtime, without them"
+        elif path.suffix.lower() != ".onnx":
+            hint = "export the model as ONNX; of other kinds none is read"
+        raise InputError(f"{path}: cannot be read as an ONNX model: {_first_line(error)}", hint=hint) from error
     if wanted not in session.get_providers():  # Without CUDA's libraries it would go on with the CPU.
         raise _no_provider(provider, missing)
     return session

@@ -23,8 +23,11 @@ _ANCHORS_A_CELL = 3
 """Of YOLOv5 and YOLOv7."""
 _MOST_SUPPRESSED = 1000
 """Rows that a graph leaves after its suppression are fewer, cells of a picture are more."""
+_FLAT_COLUMNS = 7
+"""Of boxes of all pictures of a batch below each other: number of the picture, edges, and score and class."""
 _TASKS = ("", "detect", "segment", "pose")
 """Of Ultralytics: those that have upright boxes."""
+_RTDETR_QUERIES = 300
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _TO_255 = (1 / 255, 1 / 255, 1 / 255)
 
@@ -101,7 +104,13 @@ def recognise(
         if kind is not None:
             return kind
     found = ", ".join(f"{output.name} {output.shape}" for output in outputs)
-    raise InputError(f"{path}: cannot tell what the outputs mean: {found}", hint=KIND_HINT)
+    hint = KIND_HINT
+    if ranks == [2] and outputs[0].shape[1] == _FLAT_COLUMNS:
+        hint = (
+            "YOLOv7 and YOLO-NAS have their seven columns in other orders: export YOLOv7 without --end2end, YOLO-NAS "
+        )
+        hint += "with output_predictions_format BATCH_FORMAT"
+    raise InputError(f"{path}: cannot tell what the outputs mean: {found}", hint=hint)
 
 
 def _named_table(
@@ -242,7 +251,18 @@ def _preparation_by_shapes(kind: str, inputs: Sequence[Any], outputs: Sequence[A
         return Preparation(std=_TO_255, fitting=_PREPARATIONS[kind].fitting)
     if kind == "boxes" and any(plain_name(entry) == SIZES_INPUT for entry in inputs):
         return Preparation(fitting="stretch")
+    if kind == "detr" and _is_rtdetr(outputs):
+        return Preparation(fitting="stretch")
     # Detectron2 also gives the size of the picture.
     if kind == "boxes" and any("int" in output.type and output.shape == [2] for output in outputs):
         return Preparation(color="BGR", std=_TO_255)
     return _PREPARATIONS[kind]
+
+
+def _is_rtdetr(outputs: Sequence[Any]) -> bool:
+    """Say whether a DETR is RT-DETR or D-FINE with COCO's classes, of which others have 91, or 900 queries."""
+    logits = next((output for output in outputs if is_logits(plain_name(output))), None)
+    if logits is None or len(logits.shape) != 3 or logits.shape[2] != len(COCO_80):
+        return False
+    queries = logits.shape[1]
+    return queries == _RTDETR_QUERIES or (not isinstance(queries, int) and plain_name(logits) == "logits")
