@@ -406,8 +406,14 @@ def test_outputs_that_mean_something_else_are_refused(tmp_path: Path) -> None:
     logits = np.full((1, 9, 4), -3.0, np.float32)
     logits[:, :, 3] = 6.0
     cells = np.zeros((1, 84, 6), np.float32)
+    # Of NanoDet the rest of a row are logits of edges, of a network for masks they are of masks or before the sigmoid.
+    nanodet, masks = np.full((1, 84, 20), 0.1, np.float32), np.full((1, 3, 64, 64), -4.0, np.float32)
+    nanodet[0, 3, 15] = 7.5
     cases: list[tuple[str, dict[str, Array], str, str]] = [
         ("yolov6", {"outputs": yolov6}, "boxes in pixels", "--kind yolov5"),
+        ("nanodet", {"output": nanodet}, "scores from 0 to 1, found 0.1 to 7.5", "--kind"),
+        ("pose", {"output0": np.full((1, 20, 84), 30.0, np.float32)}, "scores from 0 to 1, found 1 to 30", "metadata"),
+        ("masks", {"out": masks}, "scores from 0 to 1, found -4 to 0", "sigmoid"),
         ("shares", shares, "shares of the picture", "in pixels"),
         (
             "nothing",

@@ -21,6 +21,7 @@ Array = NDArray[Any]
 
 _LARGEST_LOG = 16.0
 """Of the size of a box in strides: it would be millions of pixels wide."""
+_SCORE_ROUNDING = 0.01
 _LARGEST_SHARE = 1.5
 """Edges of boxes that all are smaller than this many pixels are shares of the picture."""
 _MAX_CANDIDATES = 3000
@@ -51,6 +52,7 @@ def _from_segmentation(model: Model, outputs: list[Array], row: int, fit: Fit, w
     if outputs[0].ndim != 4:
         raise _unexpected(model, outputs, "[batch, classes, height, width]")
     maps = np.asarray(outputs[0][row], np.float32)
+    _check_shares(model, maps)
     # A map may be coarser than the canvas; and of the padding nothing is wanted.
     cell_px = np.array(fit.canvas, np.float64) / maps.shape[:0:-1]
     low = np.floor(np.array(fit.offset) / cell_px).astype(int)
@@ -76,7 +78,7 @@ def _from_yolox(model: Model, outputs: list[Array], row: int, fit: Fit, wanted: 
             hint="--kind yolov5 reads such boxes of YOLOv5, YOLOv6 and YOLOv7; "
             "export YOLOX without --decode_in_inference",
         )
-    score, number = _best_class(raw[:, 5:], wanted)
+    score, number = _best_class(model, raw[:, 5:], wanted)
     with np.errstate(over="ignore"):  # Boxes of infinite size are dropped.
         size_px = np.exp(raw[:, 2:4]) * stride_px
     return _from_centers((raw[:, :2] + cell) * stride_px, size_px, raw[:, 4] * score, number)
@@ -99,7 +101,7 @@ def _from_yolov5(model: Model, outputs: list[Array], row: int, _: Fit, wanted: W
     if outputs[0].ndim != 3 or outputs[0].shape[2] <= 5:
         raise _unexpected(model, outputs, "[batch, anchors, 5 + classes]")
     raw = np.asarray(outputs[0][row], np.float64)
-    score, number = _best_class(raw[:, 5:][:, : model.class_count], wanted)
+    score, number = _best_class(model, raw[:, 5:][:, : model.class_count], wanted)
     return _from_centers(raw[:, :2], raw[:, 2:4], raw[:, 4] * score, number)
 
 
@@ -108,7 +110,7 @@ def _from_ultralytics(model: Model, outputs: list[Array], row: int, _: Fit, want
     if outputs[0].ndim != 3 or outputs[0].shape[1] <= 4:
         raise _unexpected(model, outputs, "[batch, 4 + classes, anchors]")
     raw = np.asarray(outputs[0][row], np.float64).T
-    score, number = _best_class(raw[:, 4:][:, : model.class_count], wanted)
+    score, number = _best_class(model, raw[:, 4:][:, : model.class_count], wanted)
     return _from_centers(raw[:, :2], raw[:, 2:4], score, number)
 
 
@@ -117,7 +119,7 @@ def _from_rtdetr(model: Model, outputs: list[Array], row: int, fit: Fit, wanted:
     if outputs[0].ndim != 3 or outputs[0].shape[2] <= 4:
         raise _unexpected(model, outputs, "[batch, queries, 4 + classes]")
     raw = np.asarray(outputs[0][row], np.float64)
-    score, number = _best_class(raw[:, 4:][:, : model.class_count], wanted)
+    score, number = _best_class(model, raw[:, 4:][:, : model.class_count], wanted)
     place_px = raw[:, :4] * np.tile(fit.canvas, 2)
     return _from_centers(place_px[:, :2], place_px[:, 2:], score, number)
 
@@ -141,7 +143,7 @@ def _from_detr(model: Model, outputs: list[Array], row: int, fit: Fit, wanted: W
                 f"{model.path}: the last of its {value.shape[1]} classes is nearly everywhere, as one for nothing is",
                 hint="write the names of the others into the metadata as valuemap.classes, as docs/detect.md shows",
             )
-    score, number = _best_class(probability, wanted)
+    score, number = _best_class(model, probability, wanted)
     place_px = np.asarray(places[row], np.float64) * np.tile(fit.canvas, 2)  # Centre and size, as shares of the whole.
     return _from_centers(place_px[:, :2], place_px[:, 2:], score, number)
 
@@ -207,11 +209,22 @@ _DECODERS: Mapping[str, Callable[[Model, list[Array], int, Fit, WantedClasses], 
 }
 
 
-def _best_class(score: Floats, wanted: WantedClasses) -> tuple[Floats, Ints]:
+def _best_class(model: Model, score: Floats, wanted: WantedClasses) -> tuple[Floats, Ints]:
     """Return the best score (N) among the wanted classes, and which class that is (N)."""
+    _check_shares(model, score)
     columns = wanted.columns(score.shape[1])
     best = np.argmax(score[:, columns], axis=1)
     return score[np.arange(len(score)), columns[best]], columns[best]
+
+
+def _check_shares(model: Model, score: Array) -> None:
+    """Refuse what can be no probabilities: other numbers, as those for masks, or scores before their sigmoid."""
+    low, high = score.min(initial=1.0), score.max(initial=0.0)  # Of nothing, too.
+    if low < -_SCORE_ROUNDING or high > 1.0 + _SCORE_ROUNDING:
+        raise InputError(
+            f"{model.path}: a model of kind {model.kind} gives scores from 0 to 1, found {low:.3g} to {high:.3g}",
+            hint="say what the model is with --kind, or export it with the sigmoid and its metadata (names, task)",
+        )
 
 
 def _from_centers(center_px: Floats, size_px: Floats, score: Floats, number: Ints) -> Boxes:
