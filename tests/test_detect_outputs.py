@@ -413,6 +413,12 @@ def test_outputs_that_mean_something_else_are_refused(tmp_path: Path) -> None:
         ("yolov6", {"outputs": yolov6}, "boxes in pixels", "--kind yolov5"),
         ("nanodet", {"output": nanodet}, "scores from 0 to 1, found 0.1 to 7.5", "--kind"),
         ("pose", {"output0": np.full((1, 20, 84), 30.0, np.float32)}, "scores from 0 to 1, found 1 to 30", "metadata"),
+        (
+            "order",
+            {"output": np.full((1, 3, 6), [[*EDGES, 1.0, 0.6]], np.float32)},
+            "whole numbers as classes",
+            "--kind",
+        ),
         ("masks", {"out": masks}, "scores from 0 to 1, found -4 to 0", "sigmoid"),
         ("shares", shares, "shares of the picture", "in pixels"),
         (

@@ -165,10 +165,14 @@ def _from_boxes(model: Model, outputs: list[Array], row: int, fit: Fit, wanted: 
         edges_px, score, number = named["dets"][row][:, :4], named["dets"][row][:, 4], named["labels"][row]
     else:
         edges_px, score, number = _edges_score_number(model, outputs, row)
-    number = np.round(number).astype(np.int64)
+    exact, number = number, np.round(number).astype(np.int64)
     if edges_px.shape != (len(score), 4) or len(number) != len(score):
         raise _unexpected(model, outputs, "boxes [N, 4], labels [N] and scores [N]")
-    largest = np.abs(edges_px[score > 0.0]).max(initial=0.0)
+    is_used = score > 0.0  # What fills up the rest of the rows is no score.
+    _check_shares(model, score[is_used])
+    if np.any(np.abs(exact - number)[is_used] > _SCORE_ROUNDING):
+        raise _unexpected(model, outputs, "whole numbers as classes, behind the scores,")
+    largest = np.abs(edges_px[is_used]).max(initial=0.0)
     if 0.0 < largest <= _LARGEST_SHARE:
         raise InputError(
             f"{model.path}: gives boxes as shares of the picture, up to {largest:.3g}, expected pixels",
