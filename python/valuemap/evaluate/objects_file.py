@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from valuemap.config.setting import LARGEST_SIGMA_M
 from valuemap.csv_table import read_csv_arrow
@@ -149,6 +148,8 @@ def _with_our_names(table: pa.Table) -> pa.Table:
 
 def _as_texts(column: Any) -> Any:
     """Return a column of texts, or of numbers, which may be codes, as texts: 205 and 205.0 are 205."""
+    import pyarrow.compute as pc  # Slow to import, and only files of objects need it.
+
     kind = column.type
     if pa.types.is_dictionary(kind):
         column, kind = column.cast(kind.value_type), kind.value_type
@@ -175,6 +176,8 @@ def _with_places_everywhere(table: pa.Table) -> tuple[pa.Table, Bools, list[str]
 
     So every row can be checked under its number, and the others left out after it.
     """
+    import pyarrow.compute as pc  # As slow.
+
     lon, lat = table["lon"], table["lat"]
     numbers = all(pa.types.is_floating(c.type) or pa.types.is_integer(c.type) for c in (lon, lat))
     if not numbers or table.num_rows == 0:  # Which is told by the check of columns.
