@@ -153,7 +153,7 @@ def test_yaml_with_aliases_is_refused_and_stars_in_texts_are_not(tmp_path: Path)
         read_labels(f"bosch:{tmp_path / 'labels.yaml'}")
     (tmp_path / "data.yaml").write_text(f"names: [light]\n{ALIAS_BOMB}")
     (tmp_path / "a.txt").write_text("0 0.5 0.5 0.1 0.1\n")
-    with pytest.raises(InputError, match=r"data\.yaml: expected names of the classes: it has an alias"):
+    with pytest.raises(InputError, match=r"data\.yaml: cannot be read as YAML: it has an alias"):
         read_labels(f"yolo:{tmp_path}")
 
 

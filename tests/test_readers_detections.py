@@ -423,7 +423,7 @@ def test_rows_that_are_not_yolos(tmp_path: Path, row: str) -> None:
 def test_an_alias_bomb_is_refused_before_it_goes_off(tmp_path: Path) -> None:
     levels = "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 12))
     path = write(tmp_path / "train.yaml", f"a0: &a0 [x, x]\n{levels}")
-    assert "train.yaml: has an alias, *a0" in refusal(lambda: read(tmp_path, path))
+    assert "train.yaml: cannot be read as YAML: it has an alias, *a0" in refusal(lambda: read(tmp_path, path))
 
 
 def test_an_entity_bomb_is_refused_before_it_goes_off(tmp_path: Path) -> None:

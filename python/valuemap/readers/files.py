@@ -16,6 +16,7 @@ from typing import Any
 
 from valuemap.errors import InputError
 from valuemap.text_files import check_file, first_line, read_json, read_text
+from valuemap.yaml_text import load_yaml
 
 __all__ = [
     "check_file",
@@ -102,21 +103,11 @@ def _stays_inside(name: str) -> bool:
 
 def read_yaml(path: Path, expected: str) -> Any:
     """Return what a YAML file holds, which must not have aliases."""
-    import yaml  # Slow to import, and few formats need it.
-
-    text = read_text(path, expected)
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        for event in yaml.parse(text, Loader=loader):
-            if isinstance(event, yaml.AliasEvent):
-                raise InputError(
-                    f"{path}: has an alias, *{event.anchor}",
-                    hint="write the value out: aliases are not read",
-                )
-        return yaml.load(text, Loader=loader)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        return load_yaml(read_text(path, expected).encode())
+    except ValueError as error:
         raise InputError(
-            f"{path}: cannot be read as YAML: {first_line(error)}", hint="is it whole? Write or download it again"
+            f"{path}: cannot be read as YAML: {error}", hint="is it whole? Write or download it again"
         ) from error
 
 

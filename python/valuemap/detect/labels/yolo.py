@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import math
-import os.path
 from pathlib import Path
-from typing import Any
 
 from valuemap.detect.labels.pictures import SPLITS, BoxList, LabelledPicture, LabelledPictures
 from valuemap.detect.pictures import list_pictures
 from valuemap.errors import InputError
-from valuemap.yaml_text import load_yaml
+from valuemap.yolo_names import YoloNames, yolo_names
 
-_NAMES_FILES = ("data.yaml", "data.yml", "dataset.yaml", "dataset.yml", "classes.txt", "obj.names")
 _TRANSPOSED = frozenset({5, 6, 7, 8})
 """EXIF orientations that swap width and height."""
 
@@ -35,7 +31,7 @@ def read_yolo(folder: Path) -> LabelledPictures:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder", hint="give the folder that holds pictures and YOLO text files")
-    names, key_values = _classes(folder)
+    names = yolo_names(folder)
     paths = list_pictures(folder)
     if not paths:
         raise InputError(f"{folder}: there are no pictures in it", hint="pictures and text files belong together")
@@ -49,34 +45,9 @@ def read_yolo(folder: Path) -> LabelledPictures:
     pictures = [
         picture
         for path, text in zip(paths, texts, strict=True)
-        if (picture := _picture(path, text, names, key_values, _split_of(path, folder), skipped)) is not None
+        if (picture := _picture(path, text, names, _split_of(path, folder), skipped)) is not None
     ]
     return LabelledPictures(f"yolo:{folder}", tuple(pictures), tuple(skipped))
-
-
-def _classes(folder: Path) -> tuple[dict[int, str], int]:
-    """Return the names of the classes, and how many values of key points follow a box."""
-    above = Path(os.path.abspath(folder)).parents  # noqa: PTH100 (a link to a folder is where it is)
-    places = (place / name for place in (folder, *above[:2]) for name in _NAMES_FILES)
-    path = next((path for path in places if path.is_file()), None)
-    if path is None:
-        return {}, 0
-    if path.suffix in (".yaml", ".yml"):
-        try:
-            content: Any = load_yaml(path.read_bytes())
-            names, shape = content["names"], content.get("kpt_shape")
-            items = names.items() if isinstance(names, dict) else enumerate(names)
-            values = math.prod(shape) if isinstance(shape, list) and len(shape) == 2 else 0
-            return {int(number): str(name) for number, name in items}, int(values)
-        except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
-            reason = " ".join(str(error).split())
-            raise InputError(
-                f"{path}: expected names of the classes: {reason}", hint="write names: [traffic light] into it"
-            ) from error
-    try:
-        return dict(enumerate(map(str.strip, path.read_text(encoding="utf-8-sig").splitlines()))), 0
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {error}", hint="write one name a line, as UTF-8") from error
 
 
 def _text_of(path: Path, folder: Path) -> Path:
@@ -94,9 +65,7 @@ def _split_of(path: Path, folder: Path) -> str:
     return next((SPLITS[part] for part in reversed(parts) if part in SPLITS), "")
 
 
-def _picture(
-    path: Path, text: Path, names: dict[int, str], key_values: int, split: str, skipped: list[str]
-) -> LabelledPicture | None:
+def _picture(path: Path, text: Path, names: YoloNames, split: str, skipped: list[str]) -> LabelledPicture | None:
     size_px = _size_px(path)
     if size_px is None:
         skipped.append(f"{path}: cannot be read as a picture")
@@ -109,13 +78,11 @@ def _picture(
         return None
     for row, line in enumerate(lines, start=1):
         if line.strip():
-            _add_line(found, line, f"{text} line {row}", names, key_values, size_px)
+            _add_line(found, line, f"{text} line {row}", names, size_px)
     return found.picture(path, split)
 
 
-def _add_line(
-    found: BoxList, line: str, where: str, names: dict[int, str], key_values: int, size_px: tuple[int, int]
-) -> None:
+def _add_line(found: BoxList, line: str, where: str, names: YoloNames, size_px: tuple[int, int]) -> None:
     try:
         number, *values = map(float, line.split())
         class_number = int(number)
@@ -123,8 +90,7 @@ def _add_line(
         found.skipped.append(f"{where}: expected a class and numbers, found {line.strip()!r}")
         return
     width_px, height_px = size_px
-    if key_values and len(values) >= 4 + key_values:
-        del values[4 : 4 + key_values]
+    values = names.without_key_points(values)
     if len(values) in (4, 5):
         x, y, width, height = values[:4]
         left, top, right, bottom = x - width / 2, y - height / 2, x + width / 2, y + height / 2
@@ -134,8 +100,7 @@ def _add_line(
     else:
         found.skipped.append(f"{where}: expected 4 or 5 numbers after the class, or 3 or more points, found {line!r}")
         return
-    name = names.get(class_number, f"class-{class_number}")
-    found.add(name, (left * width_px, top * height_px, right * width_px, bottom * height_px), where)
+    found.add(names.name(class_number), (left * width_px, top * height_px, right * width_px, bottom * height_px), where)
 
 
 def _size_px(path: Path) -> tuple[int, int] | None:

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import codecs
 import math
-import os.path
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from valuemap.errors import InputError
 from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes
-from valuemap.readers.files import check_folder, file_in, read_text, read_yaml
+from valuemap.readers.files import check_folder, file_in, read_text
+from valuemap.yolo_names import BOX, NAMES_FILES, YoloNames, yolo_names
 
 _EXPECTED = "a folder of text files with rows: class cx cy width height [confidence], as fractions of the picture"
-_NAMES_FILES = ("data.yaml", "data.yml", "dataset.yaml", "dataset.yml", "classes.txt", "obj.names")
 _LARGEST_CLASS = 100_000
-_BOX = 4
-"""Numbers of a box: centre x and y, width and height."""
 
 
 @dataclass(frozen=True)
@@ -56,26 +52,24 @@ def read_yolo(file: DetectionFile) -> NamedBoxes:
         There are no such files, a file is not text, or a row is of another form.
     """
     folder = check_folder(file.path, _EXPECTED)
-    paths = sorted(
-        path for path in folder.rglob("*") if path.suffix.lower() == ".txt" and path.name not in _NAMES_FILES
-    )
+    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() == ".txt" and path.name not in NAMES_FILES)
     if not paths:
         raise InputError(f"{folder}: there are no .txt files in it", hint=f"expected {_EXPECTED}")
-    names, key_values = _classes(folder)
+    names = yolo_names(folder)
     rows_of: dict[str, list[_Row]] = {}
     for path in paths:
         name = path.relative_to(folder).as_posix()
         if _is_blank(file_in(folder, name, _EXPECTED)):
             continue  # Nothing is in the picture.
         lines = enumerate(read_text(path, _EXPECTED).splitlines(), start=1)
-        rows_of[name] = [_row(text, f"{path} line {line}", key_values) for line, text in lines if text.strip()]
+        rows_of[name] = [_row(text, f"{path} line {line}", names) for line, text in lines if text.strip()]
     _remove_tracks(list(rows_of.values()))
     rows = [row for of_picture in rows_of.values() for row in of_picture]
     found = [_place(row) for row in rows]
     boxes = np.array([place for place, _ in found], dtype=np.float64).reshape(-1, 4)
     return NamedBoxes.of_columns(
         image_names=[name for name, of_picture in rows_of.items() for _ in of_picture],
-        class_names=[names.get(row.code, f"class-{row.code}") for row in rows],
+        class_names=[names.name(row.code) for row in rows],
         center=boxes[:, :2],
         size=boxes[:, 2:],
         score=np.array([score * file.full_score for _, score in found], dtype=np.float64),
@@ -92,18 +86,16 @@ _MOST_BLANK = 16
 """Bytes of a file that may hold a mark and the ends of lines, and no row."""
 
 
-def _row(text: str, where: str, key_values: int) -> _Row:
+def _row(text: str, where: str, names: YoloNames) -> _Row:
     """Return a row without the values of its key points."""
     try:
         code, *values = (float(field) for field in text.split())
     except ValueError:
         code, values = math.nan, []
     is_class = 0.0 <= code < _LARGEST_CLASS and code == int(code)
-    row = _Row(where, text, int(code) if is_class else -1, values)
-    if not is_class or len(values) < _BOX:
+    row = _Row(where, text, int(code) if is_class else -1, names.without_key_points(values))
+    if not is_class or len(values) < BOX:
         raise row.wrong()
-    if len(values) >= _BOX + key_values:
-        del values[_BOX : _BOX + key_values]
     return row
 
 
@@ -115,7 +107,7 @@ def _remove_tracks(pictures: Sequence[Sequence[_Row]]) -> None:
 
     def may_be_tracks(rows: Sequence[_Row]) -> bool:
         last = [row.values[-1] for row in rows]
-        is_more = all(len(row.values) > _BOX for row in rows)
+        is_more = all(len(row.values) > BOX for row in rows)
         return is_more and all(each >= 1.0 and each.is_integer() for each in last) and len(set(last)) == len(last)
 
     tracked = [rows for rows in pictures if may_be_tracks(rows)]
@@ -125,7 +117,7 @@ def _remove_tracks(pictures: Sequence[Sequence[_Row]]) -> None:
                 row.values.pop()
     for rows in pictures:
         for row in rows:
-            if len(row.values) == _BOX + 2 and row.values[-1] >= 1.0 and row.values[-1].is_integer():
+            if len(row.values) == BOX + 2 and row.values[-1] >= 1.0 and row.values[-1].is_integer():
                 row.values.pop()  # A triangle that touches the lower edge is rarer than a box of a first track.
 
 
@@ -134,54 +126,13 @@ def _place(row: _Row) -> tuple[list[float], float]:
     values = list(row.values)
     is_outline = len(values) >= 6 and len(values) % 2 == 0
     is_scored_outline = len(values) >= 9 and len(values) % 2 == 1
-    if not (len(values) in (_BOX, _BOX + 1) or is_outline or is_scored_outline):
+    if not (len(values) in (BOX, BOX + 1) or is_outline or is_scored_outline):
         raise row.wrong()
-    if len(values) > _BOX + 1 and values[-1] > 1.0 and values[-1].is_integer():
+    if len(values) > BOX + 1 and values[-1] > 1.0 and values[-1].is_integer():
         raise row.wrong()  # The number of a track, where others have none: it would be a corner.
     score = values.pop() if len(values) % 2 == 1 else 1.0
-    if len(values) == _BOX:
+    if len(values) == BOX:
         return values, score
     x, y = np.array(values[::2]), np.array(values[1::2])
     low, high = (x.min(), y.min()), (x.max(), y.max())
     return [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, high[0] - low[0], high[1] - low[1]], score
-
-
-def _classes(folder: Path) -> tuple[dict[int, str], int]:
-    """Return the names of classes, and how many values of key points follow a box."""
-    above = Path(os.path.abspath(folder)).parents  # noqa: PTH100 (a link to a folder is where it is)
-    for place in (folder, *above[:2]):
-        for name in _NAMES_FILES:
-            path = place / name
-            if path.is_file() and path.suffix in (".yaml", ".yml"):
-                content = read_yaml(path, "a YAML file with names")
-                return _names_in(content, path), _key_values_in(content)
-            if path.is_file():
-                return _numbered(read_text(path, "one name of a class a line").splitlines()), 0
-    return {}, 0
-
-
-def _numbered(names: Sequence[str]) -> dict[int, str]:
-    return {code: name.strip() or f"class-{code}" for code, name in enumerate(names)}
-
-
-def _names_in(content: Any, path: Path) -> dict[int, str]:
-    """Return the names of a list or by number; speeds and the like may be written as numbers."""
-    names = content.get("names") if isinstance(content, dict) else None
-    pairs = list(names.items() if isinstance(names, dict) else enumerate(names) if isinstance(names, list) else [])
-    if not pairs:
-        raise InputError(f"{path}: expected names, a list of classes, or numbers and classes", hint="repair the file")
-    found = {}
-    for code, name in pairs:
-        if not str(code).isdecimal() or isinstance(name, bool) or not isinstance(name, str | int | float):
-            raise InputError(
-                f"{path}: names: expected a class by its number, found {code!r}: {name!r}",
-                hint="put names such as yes, no, on and off in quotes",
-            )
-        found[int(code)] = str(name).strip() or f"class-{code}"
-    return found
-
-
-def _key_values_in(content: Any) -> int:
-    shape = content.get("kpt_shape")
-    is_shape = isinstance(shape, list) and len(shape) == 2 and all(type(each) is int and each > 0 for each in shape)
-    return math.prod(shape) if is_shape else 0
