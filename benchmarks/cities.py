@@ -109,7 +109,7 @@ def compare(
     is_real = matches.object_of_label >= 0
     objects = matches.object_of_label[is_real]
     error = labels.position_in_world_m[is_real] - dataset.truth.position_in_world_m[objects]
-    covariance = covariance_matrices(labels.covariance_m2[is_real])
+    covariance = covariance_matrices(labels.stated_covariance_m2[is_real])
     return Outcome(
         objects=int(counts.sum()),
         found=int((counts & (matches.label_of_object >= 0)).sum()),

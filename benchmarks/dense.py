@@ -212,7 +212,7 @@ def measure(recording: Recording, config: valuemap.MapConfig, scene: Scene) -> O
     counts = is_bound & is_detected
     labels = result.labels
     assert dataset.truth is not None
-    covariance = covariance_matrices(labels.covariance_m2)
+    covariance = covariance_matrices(labels.stated_covariance_m2)
     class_code = np.array([dataset.truth.class_name.code_of(name) for name in labels.class_name.names], dtype=np.int64)
     error = labels.position_in_world_m[:, None] - dataset.truth.position_in_world_m
     squared = np.einsum("loi,lij,loj->lo", error, np.linalg.inv(covariance), error)

@@ -436,6 +436,22 @@ def test_what_drives_are_off_by_is_found_before_their_objects_are() -> None:
     assert off_from_each_other(result, faulty) < 0.57  # 1.14 where poses stay as they are.
 
 
+def test_absolute_covariances_know_that_drives_are_off_together() -> None:
+    faulty, result = map_of_shifted_city()
+    assert faulty.truth is not None
+    assert result.labels.absolute_covariance_m2 is not None
+    added_m2 = covariance_matrices(result.labels.absolute_covariance_m2 - result.labels.covariance_m2)
+    assert np.allclose(added_m2, added_m2[0])
+    level_m = np.sqrt(np.diag(added_m2[0])[:2])
+    # Six passes are off by 3 m in any direction: their mean is by 3 / sqrt(2 * 6) on each axis.
+    assert (np.abs(level_m - 0.87) < 0.4).all()
+    object_row = valuemap.evaluate_map(result, faulty, radius_m=4.0).matches.object_of_label
+    off_m = (result.labels.position_in_world_m - faulty.truth.position_in_world_m[object_row])[object_row >= 0]
+    assert 10.0 * np.sqrt(np.median(result.labels.covariance_m2[:, 0])) < np.linalg.norm(off_m.mean(axis=0)[:2])
+    assert (np.abs(off_m.mean(axis=0)[:2]) < 3.0 * level_m).all()
+    assert valuemap.build_map(clean_city(), valuemap.MapConfig(correct_poses=0)).labels.absolute_covariance_m2 is None
+
+
 def test_poses_stay_where_they_are_not_to_be_corrected() -> None:
     faulty = watched(3.0).city
     as_it_is = refine_poses(faulty, valuemap.MapConfig(correct_poses=0))

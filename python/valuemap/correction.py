@@ -131,6 +131,16 @@ def with_errors_of_images(refined: Refined, labels: Labels, votes: Votes) -> Lab
     return labels.replace(covariance_m2=columns)
 
 
+def with_place_of_drives(refined: Refined, labels: Labels) -> Labels:
+    """Return labels whose absolute covariances know of the place of all drives together, where these were moved.
+
+    Drives that were brought together agree, and are off together.
+    """
+    if refined.place_m2 is None:
+        return labels
+    return labels.replace(absolute_covariance_m2=labels.covariance_m2 + covariance_columns(refined.place_m2[None]))
+
+
 def _told_by_a_map(dataset: Dataset, refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:
     """Estimate once more what poses are wrong by, where anything was found: a map knows better what is one object."""
     if refined.found is None:

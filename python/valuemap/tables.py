@@ -324,8 +324,9 @@ class Labels(Table):
     voters' boxes at their depths; `facing_azimuth_rad` (0 to 2 pi, clockwise from north seen from above) where the
     voters' cameras are from it, and `facing_concentration` (0 to 1) how much they are on one side of it;
     `expected` counts the images that should have seen it and `existence` is the
-    probability that it exists (robust method); `absolute_covariance_m2` (N, 6) is there where control points told how
-    well the whole map is placed, `covariance_m2` is against the labels around; lon, lat in degrees and height in metres
+    probability that it exists (robust method); `absolute_covariance_m2` (N, 6) is there where it is known how well the
+    whole map is placed, from control points or from how far drives were moved to each other, `covariance_m2` is against
+    the labels around; lon, lat in degrees and height in metres
     on WGS84 where geo-referenced; `state` is what `valuemap update` says about it.
     """
 
@@ -372,6 +373,11 @@ class Labels(Table):
     expected: Ints | None = _column("int", ("expected",), optional=True)
     existence: Floats | None = _column("float", ("existence",), optional=True)
     state: Categories | None = _column("category", ("state",), optional=True)
+
+    @property
+    def stated_covariance_m2(self) -> Floats:
+        """The covariance (N, 6) of positions in the world, m²: the absolute one where it is known."""
+        return self.covariance_m2 if self.absolute_covariance_m2 is None else self.absolute_covariance_m2
 
 
 def covariance_matrices(covariance_m2: NDArray[Any] | Sequence[float]) -> Floats:

@@ -152,8 +152,7 @@ def measure_accuracy(
     offset = labels.position_in_world_m[found] - matches.object_in_world_m[matches.object_of_label[found]]
     enu_from_world = frame.east_north_up()
     error = offset @ enu_from_world.T
-    stated = labels.covariance_m2 if labels.absolute_covariance_m2 is None else labels.absolute_covariance_m2
-    covariance = enu_from_world @ covariance_matrices(stated[found]) @ enu_from_world.T
+    covariance = enu_from_world @ covariance_matrices(labels.stated_covariance_m2[found]) @ enu_from_world.T
     if not matches.objects.has_height:
         error[:, 2] = np.nan
     return _statement(error, covariance, truth_sigma_m)

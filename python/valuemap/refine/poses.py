@@ -86,7 +86,8 @@ class Refined:
     more than was thought possible. `before_images` is what errors of single images were taken from, where they were.
     `as_given` is the map of the dataset as it was, where one was made and nothing is corrected. `sought` is its noise,
     where it was compared with what could have been corrected. `side_m` is what the middles that sides show are off by,
-    where that was told.
+    where that was told. `place_m2` is the covariance (3, 3) in the world of where all drives are together, where they
+    were moved.
     """
 
     dataset: Dataset
@@ -98,6 +99,7 @@ class Refined:
     as_given: Mapped | None = None
     sought: Noise | None = None
     side_m: float | None = None
+    place_m2: Floats | None = None
 
 
 def refine_poses(
@@ -262,7 +264,29 @@ def _corrected(dataset: Dataset, ordered: InOrder, found: Found | None, unit_m: 
         return Refined(dataset, {"found": "nothing", **_looked_at(found)}, found=found, is_noisy=is_noisy)
     record = {**_describe(ordered.dataset, found, found.selected, unit_m), **_looked_at(found)}
     moved = _moved(dataset, ordered, found, found.selected, unit_m)
-    return Refined(moved, record, is_corrected=True, found=found, is_noisy=is_noisy)
+    place_m2 = _place_m2(ordered.dataset, found, found.selected, unit_m)
+    if place_m2 is not None:
+        axes = dataset.frame.east_north_up()
+        sigma_m = np.sqrt(np.diag(axes @ place_m2 @ axes.T))
+        record["mean_of_drives_sigma_east_north_up_m"] = [round(float(sigma), 4) for sigma in sigma_m]
+    return Refined(moved, record, is_corrected=True, found=found, is_noisy=is_noisy, place_m2=place_m2)
+
+
+def _place_m2(dataset: Dataset, found: Found, selected: Selected, unit_m: float) -> Floats | None:
+    """Return the covariance of where all drives are together, m²; None where no drive was moved.
+
+    They are where their mean is, which is as far off as one of them over the square root of their number. How far off
+    one is is told by how far they were moved.
+    """
+    is_moved = selected.active[OFFSET].any(axis=1)
+    if not is_moved.any():
+        return None
+    square_m2 = (selected.state.constants[OFFSET][is_moved] * unit_m) ** 2
+    east_m2, north_m2, up_m2 = square_m2.sum(axis=0) / max(len(square_m2) - 1, 1)
+    level_m2 = (east_m2 + north_m2) / 2  # A few drives do not tell in which direction they are off more.
+    drives = len(np.unique(found.result.segments.drive[is_moved]))
+    axes = dataset.frame.east_north_up()
+    return np.asarray(axes.T @ np.diag([level_m2, level_m2, up_m2]) @ axes / drives)
 
 
 def _moved(dataset: Dataset, ordered: InOrder, found: Found, selected: Selected, unit_m: float) -> Dataset:
