@@ -717,7 +717,8 @@ def test_an_update_is_one_run_where_poses_are_corrected(tmp_path: Path, monkeypa
     def corrected(dataset: Dataset, config: valuemap.MapConfig, **_: object) -> Refined:
         if not config.poses.correct_poses:
             return nothing_found(dataset)
-        return Refined(moved(dataset, -1.0, keep_mean=True), {"found": "faults", "drives": [{"drive": 0}]}, True)
+        record = {"found": "faults", "drives": [{"drive": 0}]}
+        return Refined(moved(dataset, -1.0, keep_mean=True), record, True, place_m2=0.25 * np.eye(3))
 
     monkeypatch.setattr(correction, "refine_poses", corrected)
     monkeypatch.setattr(correction, "compare_poses", lambda *_, **__: Comparison(2.0, 1.0, 0.0, 10))
@@ -731,6 +732,9 @@ def test_an_update_is_one_run_where_poses_are_corrected(tmp_path: Path, monkeypa
     assert updated.run["poses"] == once.run["poses"]
     ours, theirs = (m.labels.position_in_world_m[np.lexsort(m.labels.position_in_world_m.T)] for m in (updated, once))
     assert np.array_equal(ours, theirs)
+    for each in (updated, once):
+        added_m2 = each.labels.stated_covariance_m2 - each.labels.covariance_m2
+        assert np.allclose(added_m2, [0.25, 0.0, 0.0, 0.25, 0.0, 0.25], atol=1e-12)
     assert updated.labels.state is not None
     assert updated.labels.state.texts() == ["confirmed"] * len(STAYS)
     # What it is compared with is where the corrected poses put it.

@@ -430,6 +430,7 @@ class _Rows:
             _taken(before, np.concatenate([old[mixed], lost])),
         ]
         table, all_votes = _numbered(parts)
+        table = _placed_as(rebuilt.labels, table)
         kept = int((~mixed).sum())
         none = np.full(len(extra), -1)
         size = (kept, len(extra), int(mixed.sum()), len(lost))
@@ -462,6 +463,14 @@ def _taken(source: Map, rows: Ints) -> tuple[Labels, Votes]:
     """Return some labels of a map with their votes."""
     labels = source.labels.take(rows).replace(state=None)
     return labels, source.votes.take(np.flatnonzero(np.isin(source.votes.label_id, labels.label_id)))
+
+
+def _placed_as(placed: Labels, labels: Labels) -> Labels:
+    """Return labels with absolute covariances where a map has them, of which all labels have one place."""
+    if placed.absolute_covariance_m2 is None or not len(placed):
+        return labels
+    place_m2 = placed.absolute_covariance_m2[0] - placed.covariance_m2[0]
+    return labels.replace(absolute_covariance_m2=labels.covariance_m2 + place_m2)
 
 
 def _numbered(parts: list[tuple[Labels, Votes]]) -> tuple[Labels, Votes]:
