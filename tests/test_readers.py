@@ -607,6 +607,12 @@ def test_names_are_found_whatever_system_wrote_them() -> None:
     assert match_images(["MONDAY/2.jpg"], known) == {}
 
 
+@pytest.mark.parametrize(("known", "name"), [("20231114/1", "20231115-1"), ("00000012-left", "00000013-left")])
+def test_names_that_no_tool_for_labels_gave_are_other_pictures(tmp_path: Path, known: str, name: str) -> None:
+    """A date and a counter have eight digits, too."""
+    assert match_images([f"{name}.jpg"], [f"{known}.jpg"]) == {}
+
+
 def test_names_of_paths_in_another_folder_are_found_by_how_they_end() -> None:
     known = ["monday/cam0/7.jpg", "monday/cam1/7.jpg", "friday/cam0/7.jpg"]
     paths = {"C:\\run\\monday\\cam1\\7.png": 1, "/data/run/friday/cam0/7.jpg": 2, "cam0/7.jpg": None, "7.jpg": None}

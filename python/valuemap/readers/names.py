@@ -16,18 +16,17 @@ def match_images(names: Collection[str], known: Sequence[str]) -> dict[str, int]
     The exact name counts first, then the name with Windows' separators turned and accents as one character (macOS
     writes two). After that capitals do not count: the name without its suffix, its last three, two and one parts, as
     of a path in another folder, these without their suffix, and the last part as it was before a tool for labels got
-    it. Each counts only if no other name and no other known
-    image has the same. `cam1/7.jpg` must not become `cam0/7.jpg` only because `cam1` is not among the known, nor
-    `7.png` become `7.jpg` beside another `7.jpg`.
+    it. Each counts only if no other name and no other known image has the same. `cam1/7.jpg` must not become
+    `cam0/7.jpg` only because `cam1` is not among the known, nor `7.png` become `7.jpg` beside another `7.jpg`.
     """
     distinct = set(names)
     found: dict[str, int] = {}
-    for key in _KEYS:
+    for key, key_of_known in _KEYS:
         missing = distinct - found.keys()
         if not missing:
             break
-        count, known_count = Counter(map(key, distinct)), Counter(map(key, known))
-        row_of = {key(name): row for row, name in enumerate(known)}
+        count, known_count = Counter(map(key, distinct)), Counter(map(key_of_known, known))
+        row_of = {key_of_known(name): row for row, name in enumerate(known)}
         for name in missing:
             part = key(name)
             if count[part] == known_count[part] == 1:
@@ -58,13 +57,18 @@ def _before_upload(name: str) -> str:
     return _ROBOFLOW.sub("", _LABEL_STUDIO.sub("", last))
 
 
-_LABEL_STUDIO = re.compile(r"^[0-9a-f]{8}-(?=.)")
+_LABEL_STUDIO = re.compile(r"^(?!(?:19|20)\d\d[01]\d[0-3]\d-)[0-9a-f]{8}-(?=.)")
+"""Not a date: `20231115-7.jpg` is another picture than `20231114/7.jpg`."""
 _ROBOFLOW = re.compile(r"_[a-z]{3,4}\.rf\.[0-9a-z]+$")
 _PICTURES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".ppm", ".txt"))
-_KEYS: tuple[Callable[[str], str], ...] = (
+_KEYS_OF_BOTH: tuple[Callable[[str], str], ...] = (
     str,
     _slashed,
     _without_suffix,
     *(partial(end, parts=parts) for parts in (3, 2, 1) for end in (_end, _end_without_suffix)),
-    _before_upload,
+)
+# No tool for labels has had the known: `00000012-left.jpg` and `00000013-left.jpg` stay two pictures.
+_KEYS: tuple[tuple[Callable[[str], str], Callable[[str], str]], ...] = (
+    *((key, key) for key in _KEYS_OF_BOTH),
+    (_before_upload, partial(_end_without_suffix, parts=1)),
 )
