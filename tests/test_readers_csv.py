@@ -79,6 +79,13 @@ def test_an_orientation_is_said_in_one_way(tmp_path: Path) -> None:
     assert "has both omega, phi, kappa and yaw_deg" in refusal(lambda: read_csv_poses(poses, camera=CAMERA))
 
 
+def test_images_placed_by_latitude_and_longitude_may_be_far_from_each_other(tmp_path: Path) -> None:
+    """The frame of the first image holds those on another continent, too."""
+    rows = ("a.jpg,52,4,1", "b.jpg,40,-74,1", "c.jpg,40,-74.0001,1")
+    images = read_csv_poses(poses_of(tmp_path, "image,lat,lon,heading_deg", *rows), camera=CAMERA).images
+    assert np.linalg.norm(camera_centers(images)[1]) > 5e6
+
+
 def test_cameras_that_look_up_are_told(tmp_path: Path) -> None:
     """The pitch of Metashape counts from straight down: that of a camera on a car is about 90."""
     told: list[str] = []

@@ -14,6 +14,7 @@ import scipy
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.dataset import Dataset, Frame, check_dataset, write_dataset_in_portions
 from valuemap.errors import InputError, SettingError
+from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.readers.boxes import FiledBoxes, FoundBoxes
 from valuemap.readers.vet import MAX_REJECTED, Rejections, number_detections, vet_boxes, vet_images
 from valuemap.tables import Cameras, Detections, Floats, Images, RejectedRows, Truth, join_tables
@@ -27,8 +28,8 @@ _PLAUSIBLE_STEP_M = (1e-3, 1e3)
 _STILL_M = 1e-6
 _MIN_MEAN_UP = 0.1
 _MAX_TILT_FROM_ENU_RAD = math.radians(60.0)
-_FARTHEST_FROM_ANCHOR_M = 1.5e6
-"""Readers that place images by latitude and longitude allow 10 degrees, 1,100 km."""
+_HIGHEST_ABOVE_ANCHOR_M = 7e3
+"""No street is higher; 300 km from the anchor, the plane that touches the Earth there is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +153,7 @@ def _frame(
     length = float(np.linalg.norm(mean_up))
     if anchor is not None:
         _check_anchor(anchor)
-        _check_is_near(images, source)
+        _check_heights(images, anchor, source)
         if not is_on_earth and length >= _MIN_MEAN_UP:
             _check_is_enu(mean_up / length, source)
         return Frame(anchor=anchor)
@@ -174,11 +175,15 @@ def _check_anchor(anchor: tuple[float, float, float]) -> None:
         )
 
 
-def _check_is_near(images: Images, source: str) -> None:
-    """Refuse positions that are not about an anchor: those of a map projection, or from the middle of the Earth."""
+def _check_heights(images: Images, anchor: tuple[float, float, float], source: str) -> None:
+    """Refuse positions that are not about an anchor: those of a map projection, or from the middle of the Earth.
+
+    These are far from it, and so high above the Earth, which curves away.
+    """
     center_m = camera_centers(images)
-    if np.median(np.linalg.norm(center_m, axis=1)) > _FARTHEST_FROM_ANCHOR_M:
-        x, y, z = center_m[0].tolist()
+    above_m = np.abs(lon_lat_height_from_enu(center_m, anchor)[:, 2] - anchor[2])
+    if np.median(above_m) > _HIGHEST_ABOVE_ANCHOR_M:
+        x, y, z = center_m[np.argmax(above_m)].tolist()
         raise InputError(
             f"{source}: expected positions in metres east, north, up of the anchor, found ({x:.0f}, {y:.0f}, {z:.0f})",
             hint="are these coordinates of a map projection, or from the middle of the Earth? Bring them into the "
