@@ -94,6 +94,15 @@ def tum_in(folder: Path) -> tuple[Path, Path]:
 CAMERA = f"PINHOLE {WIDTH} {HEIGHT} {FX} {FY} {CX} {CY}"
 
 
+@pytest.mark.parametrize("stamp", ["1e99999999", "inf", "nan", "1e-9999999"])
+def test_timestamps_beyond_all_times_are_refused(stamp: str, tmp_path: Path) -> None:
+    trajectory, _ = tum_in(tmp_path)
+    listed = write(tmp_path / "list.txt", f"{stamp} a.png\n")
+    said = refusal(lambda: read_tum(trajectory, camera=CAMERA, image_list=listed))
+    expected = "no image is between two poses" if "-" in stamp else "expected a timestamp in seconds"
+    assert f"list.txt: {expected}" in said
+
+
 def test_tum(tmp_path: Path) -> None:
     trajectory, csv = tum_in(tmp_path)
     check_scene(read_tum(trajectory, camera=CAMERA, detections=csv))
@@ -396,17 +405,23 @@ def test_of_opendronemap_what_is_east_north_up_is_read(tmp_path: Path) -> None:
         assert f"give {true}" in said
 
 
-def test_coordinates_of_a_map_projection_are_not_those_of_an_anchor(tmp_path: Path) -> None:
-    """As of `export_geocoords`, which leaves the origin as it was: UTM counts 5,760 km north of the equator here."""
+@pytest.mark.parametrize(
+    ("easting_m", "northing_m"),
+    [(568_600.0, 5_761_500.0), (371_000.0, 143_800.0)],  # The latter is in Singapore, near the equator.
+)
+def test_coordinates_of_a_map_projection_are_not_those_of_an_anchor(
+    tmp_path: Path, easting_m: float, northing_m: float
+) -> None:
+    """As of `export_geocoords`, which leaves the origin as it was: UTM counts north from the equator."""
     path = opensfm_in(tmp_path)
     parts = json.loads(path.read_text())
     for shot in parts[0]["shots"].values():
         cam_from_world = Rotation.from_rotvec(shot["rotation"])
-        center = -cam_from_world.inv().apply(shot["translation"]) + [568_600.0, 5_761_500.0, 0.0]
+        center = -cam_from_world.inv().apply(shot["translation"]) + [easting_m, northing_m, 0.0]
         shot["translation"] = (-cam_from_world.apply(center)).tolist()
     write(path, json.dumps(parts))
     said = refusal(lambda: read_opensfm(path))
-    assert "expected positions in metres east, north, up of the anchor, found (568600, 5761500, " in said
+    assert f"expected positions in metres east, north, up of the anchor, found ({easting_m // 1000:.0f}" in said
 
 
 # nuScenes.
@@ -900,6 +915,13 @@ def test_altitudes_of_mapillary_are_of_one_kind(tmp_path: Path) -> None:
     assert heights() == [2.0, 2.0, 2.0]
 
 
+def test_detections_of_mapillary_are_in_one_file(tmp_path: Path) -> None:
+    """Those in a file of another form are refused, and not left out without a word."""
+    mapillary_in(tmp_path)
+    write(tmp_path / "detections.jsonl", '{"image": {"id": "11"}, "value": "a", "geometry": "AAAA"}\n')
+    assert "detections.jsonl line 1: expected 'id'" in refusal(lambda: read_mapillary(tmp_path))
+
+
 @pytest.mark.parametrize("geometry", ["", "?", "AAAA", "GgA=", base64.b64encode(b"\x1a\xff\xff\xff").decode(), 5, None])
 def test_outlines_that_are_no_tiles(tmp_path: Path, geometry: Any) -> None:
     path = mapillary_in(tmp_path)
@@ -1014,6 +1036,9 @@ def test_older_panoramas_of_panoramax_are_as_large_as_their_tiles(tmp_path: Path
     else:
         path = write(tmp_path / "items.ndjson", "\n".join(map(json.dumps, items)))
     assert_allclose(azimuths_deg(read_panoramax(path)), azimuths_deg(whole))
+    level |= {"tileWidth": 1e200, "matrixWidth": 1e200}
+    write(path, json.dumps(items) if kept == "list" else "\n".join(map(json.dumps, items)))
+    assert "tileMatrix[0]: expected sizes of tiles" in refusal(lambda: read_panoramax(path))
 
 
 @pytest.mark.parametrize("missing", ["place", "heading"])

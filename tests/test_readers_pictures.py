@@ -222,7 +222,13 @@ def test_the_description_of_mapillarys_programs_says_what_the_gps_tags_do_not(tm
     assert first.camera_time_s == 1_700_000_000.25
     assert (second.lat_lon, second.height_m, second.heading_deg) == ((52.0, 4.0), 40.0, 90.0)
     assert second.camera_time_s == 1_700_000_001.0
-    for odd in ("a street", "[1]", '{"MAPLatitude": "x", "MAPCompassHeading": 3, "MAPCaptureTime": 5}', "{" * 100_000):
+    huge = "9" * 400
+    for odd in (
+        *("a street", "[1]", "{" * 100_000),
+        '{"MAPLatitude": "x", "MAPCompassHeading": 3, "MAPCaptureTime": 5}',
+        f'{{"MAPLatitude": {huge}, "MAPCaptureTime": "2023_11_14_22_13_20_{huge}"}}',
+        '{"MAPCompassHeading": {"TrueHeading": -1, "MagneticHeading": 30}}',  # A telephone that does not know it.
+    ):
         exif = Image.Exif()
         exif[Base.ImageDescription] = odd
         found = read_exif(

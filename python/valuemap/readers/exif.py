@@ -31,8 +31,8 @@ class Exif:
     `roll_deg` right side down, `focal_px`, `gps_time_s` and `camera_time_s` since 1970. Pictures of one `camera` have
     the same intrinsics. A panorama that `is_cut` does not show the whole sphere. A picture that `may_be_panorama` has
     the shape of one, and neither a tag nor a focal length says what it is. Heights count from the sea, unless
-    `is_ellipsoidal` says that they count from the ellipsoid. The `pose_heading_deg` is that of GPano, which is not used
-    where the GPS tags have one: cameras without a compass write 0.
+    `is_ellipsoidal` says that they count from the ellipsoid. The `pose_heading_deg` is that of GPano or of a gimbal,
+    which is not used where the GPS tags or the description have one: cameras without a compass write 0.
     """
 
     width: int
@@ -89,12 +89,7 @@ def read_exif(path: Path) -> Exif:
     if height_m is None and lat_lon is not None:
         height_m = _number(described.get("MAPAltitude"))
     pose_heading = pano.get("PoseHeadingDegrees", gimbal.get("Yaw"))
-    compass = described.get("MAPCompassHeading")
-    directions = (
-        _number(gps.get(GPS.GPSImgDirection)),
-        _number(compass.get("TrueHeading")) if isinstance(compass, dict) else None,
-        pose_heading,
-    )
+    directions = (_number(gps.get(GPS.GPSImgDirection)), _described_heading(described), pose_heading)
     heading = next((each for each in directions if each is not None), None)
     upright_roll = ROLL_DEG.get(orientation, 0.0) if isinstance(orientation, int) else 0.0
     return Exif(
@@ -138,7 +133,7 @@ def check_whole(path: Path) -> None:
 def _number(value: Any) -> float | None:
     try:
         number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
     return number if math.isfinite(number) else None
 
@@ -232,13 +227,20 @@ def _described(text: Any) -> dict[str, Any]:
     return values if isinstance(values, dict) else {}
 
 
+def _described_heading(described: dict[str, Any]) -> float | None:
+    """Return the heading from true north; telephones write -1 where they do not know it."""
+    compass = described.get("MAPCompassHeading")
+    heading = _number(compass.get("TrueHeading")) if isinstance(compass, dict) else None
+    return heading if heading is not None and heading >= 0.0 else None
+
+
 def _described_time(text: Any) -> float | None:
     """Return the time in UTC, which has milliseconds at its end."""
     try:
         clock, milliseconds = str(text).rsplit("_", 1)
         time = datetime.strptime(clock, "%Y_%m_%d_%H_%M_%S").replace(tzinfo=UTC)
         return time.timestamp() + int(milliseconds) * 1e-3
-    except ValueError:
+    except (ValueError, OverflowError):
         return None
 
 

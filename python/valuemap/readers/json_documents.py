@@ -16,7 +16,7 @@ LINES = (".jsonl", ".ndjson", ".geojsonl")
 
 
 def files_of(export: Path, suffixes: tuple[str, ...], expected: str, besides: str | None = None) -> list[Path]:
-    """Return the file, or those of a folder with these suffixes; not the one whose name without suffix is `besides`.
+    """Return the file, or those of a folder with these suffixes; not the one of the name `besides`.
 
     Raises
     ------
@@ -25,7 +25,7 @@ def files_of(export: Path, suffixes: tuple[str, ...], expected: str, besides: st
     """
     if not export.is_dir():
         return [check_file(export, expected)]
-    names = sorted(path.name for path in export.iterdir() if path.suffix in suffixes and path.stem != besides)
+    names = sorted(path.name for path in export.iterdir() if path.suffix in suffixes and path.name != besides)
     if not names:
         raise InputError(f"{export}: there are no JSON files in it", hint=f"expected {expected}")
     return [file_in(export, name, expected) for name in names]

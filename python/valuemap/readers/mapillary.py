@@ -104,7 +104,7 @@ def read_mapillary(
     InputError
         A file is missing, damaged or of another format, an image has no size, or too many have no camera.
     """
-    paths = files_of(export, _IN_FOLDERS, _EXPECTED, besides="detections")
+    paths = files_of(export, _IN_FOLDERS, _EXPECTED, besides="detections.json")
     found = _Found()
     for number, path in enumerate(paths):
         progress("reading Mapillary's answers", number, len(paths))

@@ -219,18 +219,19 @@ def _tiled_px(properties: Json) -> tuple[int, int] | None:
     sets = properties.get("tiles:tile_matrix_sets")
     for _, tiled in () if sets is None else sets.items():
         largest = max(
-            (
-                tuple(round(level[f"tile{side}"].number() * level[f"matrix{side}"].number()) for side in _SIDES)
-                for level in tiled["tileMatrix"].entries()
-            ),
+            ((_side_px(level, "Width"), _side_px(level, "Height")) for level in tiled["tileMatrix"].entries()),
             default=None,
         )
         if largest is not None:
-            return largest[0], largest[1]
+            return largest
     return None
 
 
-_SIDES = ("Width", "Height")
+def _side_px(level: Json, side: str) -> int:
+    pixels = level[f"tile{side}"].number() * level[f"matrix{side}"].number()
+    if not math.isfinite(pixels):
+        raise level.wrong("expected sizes of tiles in pixels")
+    return round(pixels)
 
 
 def _seconds(value: Json) -> float:

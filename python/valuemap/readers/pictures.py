@@ -135,7 +135,7 @@ def read_pictures(
     if tell is not None and (others := _told_twice(found, by_heading)):
         tell(
             f"{others} pictures have another heading in PoseHeadingDegrees or GimbalYawDegree than in "
-            "GPSImgDirection, which is used"
+            "GPSImgDirection or MAPCompassHeading, which is used"
         )
     if len(rows):
         if workspace is None:

@@ -179,17 +179,18 @@ def _nanoseconds(texts: list[str], path: Path) -> Ints:
     found = []
     for text in texts:
         try:
-            value = Decimal(text)
-            found.append(round(value * round(_NANO * seconds_of_unit(float(value)))))
-        except (InvalidOperation, ValueError, OverflowError) as error:
+            value, exact = float(text), Decimal(text)
+        except (InvalidOperation, ValueError) as error:
             raise InputError(
                 f"{path}: expected a timestamp in seconds, found {text[:40]!r}", hint="is it TUM?"
             ) from error
-        if not -(2**62) < found[-1] < 2**62:
+        unit_ns = round(_NANO * seconds_of_unit(value))
+        if not abs(value) * unit_ns < 2**62:
             raise InputError(
                 f"{path}: expected a timestamp in seconds, found {text[:40]!r}",
                 hint="today's may be in seconds, or in milli-, micro- or nanoseconds",
             )
+        found.append(round(exact * unit_ns))
     return np.array(found, dtype=np.int64)
 
 

@@ -82,7 +82,7 @@ class _Pictures:
             return
         size, last = _pair(table, "width", "height"), _pair(table, "x2", "y2")
         # Of a box they would be less than its far edges.
-        self._are_sizes = bool(((size >= last) & (size % 1.0 == 0.0) | np.isnan(last)).all())
+        self._are_sizes = bool(((size >= last) & (size == np.rint(size)) | np.isnan(last)).all())
         codes, rows = np.unique(images, return_index=True)
         for code, (width, height) in zip(codes.tolist(), size[rows].tolist(), strict=True):
             self._size_of[code] = (width, height)

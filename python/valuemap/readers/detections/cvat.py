@@ -142,6 +142,9 @@ def _text(attributes: dict[str, str], key: str, where: str) -> str:
 def _number(attributes: dict[str, str], key: str, where: str) -> float:
     text = _text(attributes, key, where)
     try:
-        return float(text)
-    except ValueError as error:
-        raise InputError(f"{where}: {key}: expected a number, found {text[:40]!r}", hint="repair the file") from error
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(f"{where}: {key}: expected a number, found {text[:40]!r}", hint="repair the file")
+    return number

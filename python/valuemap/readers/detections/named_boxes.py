@@ -157,9 +157,8 @@ def _refuse_other_sizes(
     for name, size in boxes.pictures.items():
         if name not in used or name not in row_of:
             continue
-        if any(
-            type(side) in (int, float) and side <= 0 for side in size
-        ):  # Datumaro writes 0 for what it does not know.
+        # Datumaro writes 0 for what it does not know.
+        if any(type(side) in (int, float) and side <= 0 for side in size):
             continue
         camera = camera_row[row_of[name]]
         expected = (int(cameras.width_px[camera]), int(cameras.height_px[camera]))
