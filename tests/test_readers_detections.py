@@ -206,6 +206,9 @@ def test_results_of_coco_with_numbers_only_are_of_the_listed_images(tmp_path: Pa
     said = refusal(lambda: read(tmp_path, DetectionFile(path, image_list=listed)))
     assert "its image is not among the images with a pose (1, the first is" in said
     assert "'image_id 7'" in said
+    write(listed, json.dumps({**json.loads(COCO), "categories": {"light": 3}}))
+    said = refusal(lambda: read(tmp_path, DetectionFile(path, image_list=listed)))
+    assert said.startswith(f"{listed}: expected a list")
     write(listed, COCO.replace("640", "1280"))
     assert "found 1280 x 480" in refusal(lambda: read(tmp_path, DetectionFile(path, image_list=listed)))
     for other in (listed, tmp_path / "b.csv"):
@@ -341,7 +344,10 @@ def test_numbers_of_tracks_of_yolo_are_told_from_the_whole_folder(
 def test_confidences_of_yolo_in_percent_are_no_numbers_of_tracks(tmp_path: Path) -> None:
     labels = detections_in(tmp_path, "yolo")
     write(labels / "a" / "1.txt", f"0 {BOX} 85\n0 0.5 0.5 0.1 0.1 85\n")
-    assert "its score is not from 0 to 1" in refusal(lambda: read(tmp_path, labels))
+    write(labels / "a" / "2.txt", f"0 {BOX} 90\n")
+    assert "3 of 3 boxes cannot be used, none is left: its score is not from 0 to 1" in refusal(
+        lambda: read(tmp_path, labels)
+    )
 
 
 def test_key_points_of_yolo_count_for_nothing_where_it_is_said_how_many_there_are(tmp_path: Path) -> None:
@@ -444,6 +450,8 @@ def test_an_outer_entity_is_not_read(tmp_path: Path) -> None:
     [
         ("cvat", lambda text: text.replace('xtl="100.0"', 'xtl="x"'), "line 4: xtl: expected a number, found 'x'"),
         ("cvat", lambda text: text.replace(' label="light"', ""), "line 4: expected label=..."),
+        ("cvat", lambda text: text.replace("<box ", '<box rotation="inf" ', 1), "rotation: expected a number"),
+        ("cvat", lambda text: text.replace('width="640"', 'width="inf"'), "width: expected a number"),
         (
             "cvat",
             lambda text: text.replace("<tag label", '<polygon points="1,2;5,6" label'),

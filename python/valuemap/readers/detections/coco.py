@@ -50,8 +50,9 @@ def read_coco(file: DetectionFile) -> NamedBoxes:
             )
         images = _list_in(lists, "images", path)
     elif file.image_list is not None:
-        lists = _read_lists(file.image_list, _NAMES)
-        images = _list_in(lists, "images", file.image_list)
+        path = file.image_list
+        lists = _read_lists(path, _NAMES)
+        images = _list_in(lists, "images", path)
     else:
         boxes.refuse_unnamed()
         images = _Named("")

@@ -102,23 +102,26 @@ def _row(text: str, where: str, names: YoloNames) -> _Row:
 def _remove_tracks(pictures: Sequence[Sequence[_Row]]) -> None:
     """Take the numbers of tracks away, which Ultralytics writes at the end of rows.
 
-    They count from 1, and no other last value, a fraction or a confidence, is larger than that.
+    They count from 1, and no other last value, a fraction or a confidence, is larger than that. Where they are no
+    tracks in one picture, as percentages that are there twice, they are none in any.
     """
 
     def may_be_tracks(rows: Sequence[_Row]) -> bool:
         last = [row.values[-1] for row in rows]
-        is_more = all(len(row.values) > BOX for row in rows)
-        return is_more and all(each >= 1.0 and each.is_integer() for each in last) and len(set(last)) == len(last)
+        return all(map(_is_numbered, rows)) and len(set(last)) == len(last)
 
-    tracked = [rows for rows in pictures if may_be_tracks(rows)]
-    if any(row.values[-1] > 1.0 for rows in tracked for row in rows):
-        for rows in tracked:
-            for row in rows:
-                row.values.pop()
-    for rows in pictures:
-        for row in rows:
-            if len(row.values) == BOX + 2 and row.values[-1] >= 1.0 and row.values[-1].is_integer():
-                row.values.pop()  # A triangle that touches the lower edge is rarer than a box of a first track.
+    beyond_1 = [rows for rows in pictures if any(_is_numbered(row) and row.values[-1] > 1.0 for row in rows)]
+    if beyond_1 and all(map(may_be_tracks, beyond_1)):
+        for row in (row for rows in pictures if may_be_tracks(rows) for row in rows):
+            row.values.pop()
+    for row in (row for rows in pictures for row in rows):
+        if len(row.values) == BOX + 2 and _is_numbered(row):
+            row.values.pop()  # A triangle that touches the lower edge is rarer than a box of a first track.
+
+
+def _is_numbered(row: _Row) -> bool:
+    """Return whether a whole number from 1 up is behind the box."""
+    return len(row.values) > BOX and row.values[-1] >= 1.0 and row.values[-1].is_integer()
 
 
 def _place(row: _Row) -> tuple[list[float], float]:
