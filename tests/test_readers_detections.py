@@ -154,13 +154,13 @@ def test_the_box_around_a_turned_box_of_cvat(tmp_path: Path, turn: str, size: tu
 
 
 SHAPES = """<image id="0" name="a/1.jpg" width="640" height="480">
+<skeleton label="skeleton"><points label="head" points="1,2" outside="0"/></skeleton>
 <box label="box" xtl="100" ytl="50" xbr="140" ybr="70"/>
 <polygon label="polygon" points="100.0,50.0;140.0,60.0;120.0,70.0"/>
 <mask label="mask" rle="2, 796, 2" left="100" top="50" width="40" height="20"/>
 <ellipse label="ellipse" cx="120" cy="60" rx="10" ry="20" rotation="90"/>
 <points label="points" points="7,8"/><polyline label="polyline" points="1,2;3,4;9,9"/>
-<cuboid label="cuboid" xtl1="1" ytl1="2"/><tag label="night"/>
-<skeleton label="skeleton"><points label="head" points="1,2" outside="0"/></skeleton></image>"""
+<cuboid label="cuboid" xtl1="1" ytl1="2"/><tag label="night"/></image>"""
 
 
 def test_shapes_of_cvat_count_as_the_boxes_around_them_and_others_are_counted(tmp_path: Path) -> None:
@@ -183,9 +183,9 @@ def test_a_crowd_of_coco_is_no_detection_and_no_fault(tmp_path: Path) -> None:
     assert_allclose(dataset.detections.size_px, [SIZE])
     assert dataset.rejected is not None
     assert dataset.rejected.reason.texts() == ["it is marked as a crowd: a region of many objects"]
-    content["annotations"] += [{**one, "bbox": None}] * 2
+    content["annotations"] += [*[{**one, "iscrowd": 1}] * 2, *[{**one, "bbox": None}] * 2]
     said = refusal(lambda: read(tmp_path, write(tmp_path / "boxes.json", json.dumps(content))))
-    assert "3 of 4 boxes cannot be used, more than 1 %: a number is missing or not finite (2," in said
+    assert "5 of 6 boxes cannot be used, more than 1 %: a number is missing or not finite (2," in said
     assert "| repair these rows" in said
 
 
@@ -241,13 +241,15 @@ def test_sizes_of_pictures_in_a_table_of_edges_are_looked_at(tmp_path: Path) -> 
     """TensorFlow's table has the size of the picture as width, height; in others they are those of the box."""
     table = "filename,width,height,class,xmin,ymin,xmax,ymax\na/1.jpg,{},light,100,50,140,70\n"
     columns = {"image": "filename", "x1": "xmin", "y1": "ymin", "x2": "xmax", "y2": "ymax"}
-    for size in ("640,480", "40,20"):
+    for size in ("640,480", "40,20", "640.5,480.5"):
         path = write(tmp_path / "boxes.csv", table.format(size))
         assert_allclose(read(tmp_path, DetectionFile(path, columns=columns)).detections.center_px, [CENTER])
     assert "--detection-column x1=xmin" in refusal(lambda: read(tmp_path, path))
-    write(path, table.format("320,240"))
+    write(path, table.format("320,240") + "a/2.jpg,320,240,,,,,\n")
     said = refusal(lambda: read(tmp_path, DetectionFile(path, columns=columns)))
     assert "'a/1.jpg': expected 640 x 480 px as in the model, found 320 x 240" in said
+    write(path, "image,x1,y1,x2,y2,width,height\na/1.jpg,0.15625,0.104166666667,0.21875,0.145833333333,320,240\n")
+    assert_allclose(read(tmp_path, DetectionFile(path, fractions=True)).detections.center_px, [CENTER], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -348,6 +350,12 @@ def test_confidences_of_yolo_in_percent_are_no_numbers_of_tracks(tmp_path: Path)
     assert "3 of 3 boxes cannot be used, none is left: its score is not from 0 to 1" in refusal(
         lambda: read(tmp_path, labels)
     )
+
+
+def test_an_outline_of_yolo_that_touches_the_lower_edge_has_no_number_of_a_track(tmp_path: Path) -> None:
+    labels = detections_in(tmp_path, "yolo")
+    write(labels / "a" / "1.txt", "0 0.25 0.5 0.5 0.5 0.5 0.75 0.25 1\n")
+    assert_allclose(read(tmp_path, labels).detections.center_px, [[240.0, 360.0]])
 
 
 def test_key_points_of_yolo_count_for_nothing_where_it_is_said_how_many_there_are(tmp_path: Path) -> None:

@@ -1002,6 +1002,8 @@ def test_classes_and_scores_of_panoramax_as_it_gives_them(tmp_path: Path) -> Non
         ),
         "d=4": ([f"detection_confidence[{sign}=*]=0.6", f"{sign}=A"], 0.6),
         "e=5": (["detection_confidence[osm|amenity=bench]=0.2", f"{sign}=A"], 1.0),
+        "f=6": ([f"classification_confidence[{sign}=*]=0.7", f"{sign}=A"], 0.7),
+        "g=7": ([f"detection_confidence[{sign}]=0.8", f"{sign}=A"], 0.8),
     }
     path = panoramax_in(tmp_path)
     content = json.loads(path.read_text())
@@ -1014,7 +1016,7 @@ def test_classes_and_scores_of_panoramax_as_it_gives_them(tmp_path: Path) -> Non
         for i, (tags, _) in enumerate(told.values())
     ]
     boxes = read_panoramax(write(path, json.dumps(content))).detections
-    values = ["yes", "A[1]", "A", "A", "A"]
+    values = ["yes", "A[1]", *["A"] * 5]
     assert boxes.class_name.texts() == [f"{sign}={value}" for value in values]
     assert boxes.score.tolist() == [score for _, score in told.values()]
     assert read_panoramax(path, class_key=sign).detections.class_name.texts() == values
@@ -1025,10 +1027,11 @@ def test_classes_and_scores_of_panoramax_as_it_gives_them(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("kept", ["list", "lines"])
 def test_older_panoramas_of_panoramax_are_as_large_as_their_tiles(tmp_path: Path, kept: str) -> None:
-    """They say that they show all round, and not how large they are; a list of items, or one a line, will do."""
+    """They do not say how large they are, nor how much they show; a list of items, or one a line, will do."""
     whole = read_panoramax(panoramax_in(tmp_path / "whole"))
     items = json.loads((tmp_path / "whole" / "items.json").read_text())["features"]
     del items[0]["properties"]["pers:interior_orientation"]["sensor_array_dimensions"]
+    del items[0]["properties"]["pers:interior_orientation"]["field_of_view"]
     level = {"tileWidth": 62.5, "tileHeight": 125, "matrixWidth": 32, "matrixHeight": 8}
     items[0]["properties"]["tiles:tile_matrix_sets"] = {"geovisio": {"tileMatrix": [level]}}
     if kept == "list":
@@ -1151,6 +1154,17 @@ LEFT_OUT: dict[str, tuple[str, dict[str, Any], str]] = {
     "panoramax, not twice as wide as high": (
         "panoramax",
         {"pers:interior_orientation": {"field_of_view": 360, "sensor_array_dimensions": [4096, 1024]}},
+        "is a panorama that is cut",
+    ),
+    "panoramax, a part of the whole that is no flat picture": (
+        "panoramax",
+        {
+            "pers:interior_orientation": {
+                "field_of_view": 100,
+                "sensor_array_dimensions": [640, 480],
+                "visible_area": [0, 512, 0, 512],
+            }
+        },
         "is a panorama that is cut",
     ),
     "panoramax, a part of the whole": (

@@ -222,6 +222,18 @@ def test_the_description_of_mapillarys_programs_says_what_the_gps_tags_do_not(tm
     assert first.camera_time_s == 1_700_000_000.25
     assert (second.lat_lon, second.height_m, second.heading_deg) == ((52.0, 4.0), 40.0, 90.0)
     assert second.camera_time_s == 1_700_000_001.0
+    exif = tags(52.0, 4.0)
+    del exif.get_ifd(IFD.GPSInfo)[GPS.GPSLatitude]
+    exif[Base.ImageDescription] = json.dumps(described)
+    third = read_exif(
+        picture(
+            tmp_path / "third.jpg",
+            exif,
+            (64, 32),
+            xmp=b'<x GPano:ProjectionType="equirectangular" GPano:PoseHeadingDegrees="0"/>',
+        )
+    )
+    assert (third.lat_lon, third.height_m, third.heading_deg) == ((52.5, -4.25), 12.5, 33.5)
     huge = "9" * 400
     for odd in (
         *("a street", "[1]", "{" * 100_000),
