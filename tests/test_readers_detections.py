@@ -241,7 +241,7 @@ def test_sizes_of_pictures_in_a_table_of_edges_are_looked_at(tmp_path: Path) -> 
     """TensorFlow's table has the size of the picture as width, height; in others they are those of the box."""
     table = "filename,width,height,class,xmin,ymin,xmax,ymax\na/1.jpg,{},light,100,50,140,70\n"
     columns = {"image": "filename", "x1": "xmin", "y1": "ymin", "x2": "xmax", "y2": "ymax"}
-    for size in ("640,480", "40,20", "640.5,480.5"):
+    for size in ("640,480", "40,20", "700.5,500.5"):
         path = write(tmp_path / "boxes.csv", table.format(size))
         assert_allclose(read(tmp_path, DetectionFile(path, columns=columns)).detections.center_px, [CENTER])
     assert "--detection-column x1=xmin" in refusal(lambda: read(tmp_path, path))
