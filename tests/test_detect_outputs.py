@@ -395,6 +395,47 @@ def test_mmdeploy_must_say_how_it_wants_colours(tmp_path: Path) -> None:
     assert (found.class_code.tolist(), found.edges_px.tolist()) == ([2], [EDGES])
 
 
+def test_masks_among_outputs_of_their_own_are_left_alone(tmp_path: Path) -> None:
+    boxes, masks = np.array([[EDGES]], np.float32), np.zeros((1, 1, 28, 28), np.float32)
+    outputs = {"boxes": boxes, "masks": masks, "labels": np.array([[2]]), "scores": np.array([[0.9]], np.float32)}
+    model = load_model(says(tmp_path / "m.onnx", outputs), DetectConfig())
+    found = decode(model, list(outputs.values()), model.fit((64, 64), None))
+    assert (found.class_code.tolist(), found.edges_px.tolist()) == ([2], [EDGES])
+
+
+def test_bytes_with_channels_first_are_freed_of_their_size(tmp_path: Path) -> None:
+    """As YOLO-NAS takes them; which of four axes are height and width, the type does not tell."""
+    outputs = {"boxes": np.array([[EDGES]], np.float32), "scores": np.ones((1, 1), np.float32), "n": np.array([[2]])}
+    file = says(tmp_path / "m.onnx", outputs, takes=onnx.TensorProto.UINT8)
+    model = load_model(file, DetectConfig(size="96x32"))
+    found = decode(model, model.run([np.zeros((32, 96, 3), np.uint8)]), model.fit((96, 32), (96, 32)))
+    np.testing.assert_allclose(found.edges_px, [[15, 26, 25, 32]])  # Cut at the lower edge of the picture.
+
+
+ONE = np.ones(1, np.float32)
+COLORS = {"valuemap.mean": [0, 0, 0], "valuemap.std": [1, 1, 1]}
+
+
+@pytest.mark.parametrize(
+    "outputs",
+    [
+        {"detection_boxes": np.ones((1, 4), np.float32), "detection_scores": ONE, "detection_classes": ONE},
+        {"detection_boxes": np.ones((1, 1, 4), np.float32), "detection_scores": ONE, "detection_classes": ONE},
+        {"detection_boxes": np.ones((1, 1, 4), np.float32), "scores": ONE, "classes": np.array([1])},
+        {"dets": np.ones((1, 1, 5), np.float32), "classes": np.array([[1]])},
+        {"dets": np.ones((1, 1, 5), np.float32), "labels": np.array([1])},
+        {"logits": np.ones((1, 2, 3), np.float32), "pred_boxes": np.ones((2, 4), np.float32)},
+        {"output": np.array([[[*EDGES, 0.9, np.nan]]], np.float32)},
+    ],
+)
+def test_outputs_of_known_names_and_other_shapes_are_refused(tmp_path: Path, outputs: dict[str, Array]) -> None:
+    """TensorFlow's and MMDeploy's without a batch or with other names beside them, and a class that is no number."""
+    kind: Any = None if "logits" in outputs else "boxes"
+    model = load_model(says(tmp_path / "m.onnx", outputs, metadata=COLORS), DetectConfig(kind=kind))
+    with pytest.raises(InputError, match=rf"a model of kind {model.kind} gives .* found \["):
+        decode(model, list(outputs.values()), model.fit((64, 64), None))
+
+
 def test_outputs_that_mean_something_else_are_refused(tmp_path: Path) -> None:
     """Decoded boxes where YOLOX's are raw, shares where pixels are, a class for nothing that nobody told."""
     yolov6 = np.full((1, 84, 8), 20.0, np.float32)

@@ -38,8 +38,9 @@ def says(
     picture: Dims = (1, 3, 64, 64),
     dims: Mapping[str, Dims] | None = None,
     metadata: Mapping[str, Any] | None = None,
+    takes: int = TensorProto.FLOAT,
 ) -> Path:
-    """Write a model that gives the same outputs whatever it sees."""
+    """Write a model that gives the same outputs whatever it sees, which are numbers of the type that it `takes`."""
     nodes = []
     constants = []
     declared = {}
@@ -53,7 +54,15 @@ def says(
             helper.make_node("Add", [f"{name}_value", f"{name}_nothing"], [name]),
         ]
         declared[name] = (kind, list((dims or {}).get(name, value.shape)))
-    return _write(path, nodes, {"image": list(picture)}, declared, constants=constants, metadata=metadata or {})
+    return _write(
+        path,
+        nodes,
+        {"image": list(picture)},
+        declared,
+        constants=constants,
+        metadata=metadata or {},
+        types={"image": takes},
+    )
 
 
 def scales_to_sizes(path: Path, shares: NDArray[Any]) -> Path:

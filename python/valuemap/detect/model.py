@@ -166,7 +166,7 @@ def load_model(path: Path, config: DetectConfig, *, threads: int = 0) -> Model:
         raise InputError(f"{path}: kind {kind!r} is not known", hint=KIND_HINT)
     size = config.size_px
     if fixed is not None and (config.size == "picture" or (size is not None and size != fixed)):
-        session = _open(path, _with_free_size(content), config.provider, threads)
+        session = _open(path, _with_free_size(content, is_channels_last), config.provider, threads)
         fixed = None
     if kind == "boxes" and all(len(output.shape) != 3 for output in outputs):
         batch = 1  # Its boxes have no batch: they would be those of the first picture.
@@ -260,15 +260,14 @@ def _no_provider(provider: str, reason: str = "") -> SettingError:
     )
 
 
-def _with_free_size(content: bytes) -> bytes:
+def _with_free_size(content: bytes, is_channels_last: bool) -> bytes:
     """Return the model with height and width left open, as a fully convolutional one can be run."""
     import onnx  # Only models of a fixed size need it.
 
     model = onnx.load_from_string(content)
     del model.graph.value_info[:]  # They hold the sizes of everything in between.
-    picture = model.graph.input[0].type.tensor_type
-    rows = picture.shape.dim[1:3] if picture.elem_type == onnx.TensorProto.UINT8 else picture.shape.dim[-2:]
-    for axis, name in zip(rows, ("height", "width"), strict=True):
+    axes = model.graph.input[0].type.tensor_type.shape.dim
+    for axis, name in zip(axes[1:3] if is_channels_last else axes[-2:], ("height", "width"), strict=True):
         axis.dim_param = name
     for output in model.graph.output:
         output.type.tensor_type.ClearField("shape")

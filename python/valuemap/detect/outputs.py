@@ -13,7 +13,7 @@ from valuemap.detect.classes import WantedClasses
 from valuemap.detect.components import boxes_of_components
 from valuemap.detect.letterbox import Fit
 from valuemap.detect.model import Model
-from valuemap.detect.signature import ANCHOR_STRIDES, anchor_counts, is_logits, is_places, plain_name
+from valuemap.detect.signature import ANCHOR_STRIDES, TENSORFLOW, anchor_counts, is_logits, is_places, plain_name
 from valuemap.errors import InputError
 from valuemap.tables import Floats, Ints
 
@@ -21,7 +21,8 @@ Array = NDArray[Any]
 
 _LARGEST_LOG = 16.0
 """Of the size of a box in strides: it would be millions of pixels wide."""
-_SCORE_ROUNDING = 0.01
+_ROUNDING = 0.01
+"""Of scores from 0 to 1, and of classes that are floats."""
 _LARGEST_SHARE = 1.5
 """Edges of boxes that all are smaller than this many pixels are shares of the picture."""
 _MAX_CANDIDATES = 3000
@@ -129,7 +130,7 @@ def _from_detr(model: Model, outputs: list[Array], row: int, fit: Fit, wanted: W
     named = _by_name(model, outputs)
     logits = next((output for name, output in named.items() if is_logits(name)), None)
     places = next((output for name, output in named.items() if is_places(name)), None)
-    if logits is None or places is None or logits.ndim != 3 or places.shape[-1] != 4:
+    if logits is None or places is None or logits.ndim != 3 or places.shape != (*logits.shape[:2], 4):
         raise _unexpected(model, outputs, "logits [batch, queries, classes] and boxes [batch, queries, 4]")
     value = np.asarray(logits[row], np.float64)
     if model.is_softmax:
@@ -138,7 +139,7 @@ def _from_detr(model: Model, outputs: list[Array], row: int, fit: Fit, wanted: W
     else:
         probability = 1.0 / (1.0 + np.exp(np.clip(-value, -60.0, 60.0)))
         is_last = (np.argmax(value, axis=1) == value.shape[1] - 1) & (probability[:, -1] > 0.5)
-        if not model.class_names and is_last.mean() > 0.5:
+        if not model.class_names and is_last.sum() > len(value) / 2:
             raise InputError(
                 f"{model.path}: the last of its {value.shape[1]} classes is nearly everywhere, as one for nothing is",
                 hint="write the names of the others into the metadata as valuemap.classes, as docs/detect.md shows",
@@ -151,28 +152,29 @@ def _from_detr(model: Model, outputs: list[Array], row: int, fit: Fit, wanted: W
 def _from_boxes(model: Model, outputs: list[Array], row: int, fit: Fit, wanted: WantedClasses) -> Boxes:
     """Edges, class and score, suppressed in the graph: outputs of their own, or one [batch, N, 6 or more]."""
     named = _by_name(model, outputs)
-    if len(outputs) == 1 or (outputs[0].ndim == 3 and outputs[1].ndim == 4):
+    if len(outputs) == 1 or [output.ndim for output in outputs] == [3, 4]:  # With what masks are made of.
         expected = "left, top, right, bottom, score, class [batch, N, 6]"
         if outputs[0].ndim != 3 or outputs[0].shape[2] < 6:
             raise _unexpected(model, outputs, expected)
         if outputs[0].shape[1] in [many * count for many in (1, 3) for count in anchor_counts(fit.canvas)]:
             raise _unexpected(model, outputs, f"{expected}, not a row for each cell of the picture")
         edges_px, score, number = outputs[0][row][:, :4], outputs[0][row][:, 4], outputs[0][row][:, 5]
-    elif "detection_boxes" in named:
+    elif named.keys() >= TENSORFLOW and named["detection_boxes"].ndim == 3:
         edges_px = named["detection_boxes"][row][:, [1, 0, 3, 2]] * np.tile(fit.canvas, 2)  # y first, in shares.
         score, number = named["detection_scores"][row], named["detection_classes"][row]
-    elif "dets" in named and named["dets"].ndim == 3 and named["dets"].shape[2] == 5:
+    elif named.keys() >= {"dets", "labels"} and named["dets"].ndim == 3 and named["dets"].shape[2] == 5:
         edges_px, score, number = named["dets"][row][:, :4], named["dets"][row][:, 4], named["labels"][row]
     else:
         edges_px, score, number = _edges_score_number(model, outputs, row)
-    exact, number = number, np.round(number).astype(np.int64)
-    if edges_px.shape != (len(score), 4) or len(number) != len(score):
+    if edges_px.shape != (*score.shape, 4) or number.shape != score.shape:
         raise _unexpected(model, outputs, "boxes [N, 4], labels [N] and scores [N]")
     is_used = score > 0.0  # What fills up the rest of the rows is no score.
-    _check_shares(model, score[is_used])
-    if np.any(np.abs(exact - number)[is_used] > _SCORE_ROUNDING):
+    edges_px, score, exact = edges_px[is_used], score[is_used], number[is_used]
+    _check_shares(model, score)
+    if not np.all(np.abs(exact - np.round(exact)) <= _ROUNDING):  # None is NaN, either.
         raise _unexpected(model, outputs, "whole numbers as classes, behind the scores,")
-    largest = np.abs(edges_px[is_used]).max(initial=0.0)
+    number = np.round(exact).astype(np.int64)
+    largest = np.abs(edges_px).max(initial=0.0)
     if 0.0 < largest <= _LARGEST_SHARE:
         raise InputError(
             f"{model.path}: gives boxes as shares of the picture, up to {largest:.3g}, expected pixels",
@@ -224,7 +226,7 @@ def _best_class(model: Model, score: Floats, wanted: WantedClasses) -> tuple[Flo
 def _check_shares(model: Model, score: Array) -> None:
     """Refuse what can be no probabilities: other numbers, as those for masks, or scores before their sigmoid."""
     low, high = score.min(initial=1.0), score.max(initial=0.0)  # Of nothing, too.
-    if low < -_SCORE_ROUNDING or high > 1.0 + _SCORE_ROUNDING:
+    if low < -_ROUNDING or high > 1.0 + _ROUNDING:
         raise InputError(
             f"{model.path}: a model of kind {model.kind} gives scores from 0 to 1, found {low:.3g} to {high:.3g}",
             hint="say what the model is with --kind, or export it with the sigmoid and its metadata (names, task)",

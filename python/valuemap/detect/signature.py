@@ -19,6 +19,8 @@ ANCHOR_STRIDES = ((8, 16, 32), (8, 16, 32, 64))
 """Of YOLO, in px: a cell a square of each, from the smallest on."""
 SIZES_INPUT = "orig_target_sizes"
 """The second input of RT-DETR and its kin: width and height that their boxes are to be in."""
+TENSORFLOW = frozenset({"detection_boxes", "detection_scores", "detection_classes"})
+"""Outputs of TensorFlow's models."""
 _ANCHORS_A_CELL = 3
 """Of YOLOv5 and YOLOv7."""
 _MOST_SUPPRESSED = 1000
@@ -88,8 +90,8 @@ def recognise(
         return "detr"
     if not has_ints and {"dets", "labels"} <= named.keys() and len(named["labels"].shape) == 3:
         return "detr"  # RF-DETR.
-    if {"detection_boxes", "detection_scores", "detection_classes"} <= named.keys():
-        return "boxes"  # TensorFlow.
+    if named.keys() >= TENSORFLOW:
+        return "boxes"
     if has_ints and (len(outputs) >= 3 or is_of_mmdeploy(outputs)):
         return "boxes"  # Others, as torchvision's masks, are left alone.
     if ranks == [4]:
