@@ -138,7 +138,7 @@ def test_a_file_of_points_has_geographic_places_and_deviations(tmp_path: Path) -
     assert moved.labels.lon_lat_height[:, :2] == pytest.approx(places[:, :2], abs=1e-6)
 
 
-def test_a_layer_of_points_has_deviations_too_and_what_is_left_out_is_told(tmp_path: Path) -> None:
+def test_a_layer_of_points_has_deviations_too(tmp_path: Path) -> None:
     import geopandas
 
     places = lon_lat_height_from_enu(labels_around(7, 5), ANCHOR)
@@ -163,15 +163,18 @@ def test_a_deviation_that_is_none_is_refused_with_its_row(columns: str, sigma: s
 
 def test_the_command_moves_map_and_written_poses_alike(tmp_path: Path) -> None:
     config = SimulationConfig(streets_north_south=2, streets_east_west=2, lookalikes_per_light=0.0)
-    dataset = simulate(config, seed=1)
+    dataset = replace(simulate(config, seed=1), frame=Frame(anchor=ANCHOR))
     assert dataset.truth is not None
     write_dataset(dataset, tmp_path / "data")
-    places = dataset.truth.position_in_world_m + SHIFT
-    rows = [",".join(f"{v:.4f}" for v in place) for place in places]
-    (tmp_path / "points.csv").write_text("\n".join(["x,y,z", *rows]) + "\n")
+    places = lon_lat_height_from_enu(dataset.truth.position_in_world_m + SHIFT, ANCHOR)
+    rows = [",".join(f"{v:.9f}" for v in place) for place in places]
+    (tmp_path / "points.csv").write_text("\n".join(["lon,lat,height", *rows, "0,0,0"]) + "\n")
     done = map_in(tmp_path, "--write-poses", tmp_path / "better", "--control", tmp_path / "points.csv")
     assert done.exit_code == 0, done.stderr
     result, better = read_map(tmp_path / "map"), read_dataset(tmp_path / "better")
+    left_out = f"1 of {len(rows) + 1} objects lie at longitude 0, latitude 0 and are left out"
+    assert left_out in result.run["notes"]
+    assert left_out in " ".join(done.stderr.split())
     shift = np.array(result.run["control"]["shift_east_north_up_m"])
     assert np.abs(shift - SHIFT)[:2].max() < 0.25
     assert result.labels.absolute_covariance_m2 is not None

@@ -605,6 +605,51 @@ def test_rows_behind_one_without_a_place_keep_their_numbers(tmp_path: Path) -> N
         evaluate_map(geographic_map(), write_csv(tmp_path / "t.csv", table))
 
 
+def test_points_of_geoparquet_come_before_coordinates_of_a_projection(tmp_path: Path) -> None:
+    """As portals have them: X, Y, Z in a system of their own would be metres in the frame of the map."""
+    import geopandas
+
+    lon, lat, _ = truth_places().T
+    columns = {"X": lon + 530000.0, "Y": lat + 180000.0, "Z": [1.0, 2.0, 3.0]}
+    for count in (2, 3):
+        points = geopandas.points_from_xy(lon, lat)
+        frame = geopandas.GeoDataFrame(dict(list(columns.items())[:count]), geometry=points, crs="EPSG:4326")
+        frame.to_parquet(tmp_path / "t.parquet")
+        assert_found_at(evaluate_map(geographic_map(), tmp_path / "t.parquet"), 0.3)
+
+
+@pytest.mark.parametrize("geo", ["{}", "no JSON", None])
+def test_damaged_geoparquet_is_refused_in_a_line(geo: str | None, tmp_path: Path) -> None:
+    column = {"encoding": "WKB", "geometry_types": []}
+    whole = json.dumps({"version": "1.0.0", "primary_column": "geometry", "columns": {"geometry": column}})
+    table = pa.table({"geometry": [b"x"]}).replace_schema_metadata({"geo": whole if geo is None else geo})
+    pq.write_table(table, tmp_path / "t.parquet")
+    with pytest.raises(InputError, match=r"t\.parquet: cannot be read as GeoParquet: .+"):
+        evaluate_map(geographic_map(), tmp_path / "t.parquet")
+
+
+def test_columns_of_rare_types_and_columns_that_are_there_twice(tmp_path: Path) -> None:
+    lon, lat, _ = truth_places().T
+    texts = pa.array(["light"] * 3).cast(pa.string_view())
+    table = {"lon": lon, "lat": lat, "class": texts, "note": texts, "sigma": pa.array([0.5] * 3, pa.float16())}
+    pq.write_table(pa.table(table), tmp_path / "t.parquet")
+    assert_found_at(evaluate_map(geographic_map(), tmp_path / "t.parquet"), 0.3)
+    halves = {"lon": pa.array([1.0], pa.float16()), "lat": pa.array([2.0], pa.float16())}
+    pq.write_table(pa.table(halves), tmp_path / "t.parquet")
+    assert len(evaluate_map(geographic_map(), tmp_path / "t.parquet").matches.objects) == 1
+    (tmp_path / "t.csv").write_text("lat,lat,lon\n51,51,0\n")
+    with pytest.raises(InputError, match="column 'lat' is there twice"):
+        evaluate_map(geographic_map(), tmp_path / "t.csv")
+
+
+def test_a_property_of_our_name_comes_before_one_in_capitals(tmp_path: Path) -> None:
+    content = json.loads(features(truth_places()))
+    for row in content["features"]:
+        row["properties"] = {"class": "light", "CLASS": "A road"}
+    (tmp_path / "t.geojson").write_text(json.dumps(content))
+    assert_found_at(evaluate_map(geographic_map(), tmp_path / "t.geojson"), 0.3)
+
+
 def test_an_answer_that_a_server_cut_short_is_told(tmp_path: Path) -> None:
     (tmp_path / "t.geojson").write_text(features(truth_places(), properties={"exceededTransferLimit": True}))
     evaluation = evaluate_map(geographic_map(), tmp_path / "t.geojson")

@@ -27,7 +27,8 @@ _OTHER_NAMES = {
     "lon": ("longitude", "long", "lng", "lon_dd", "long_dd", "longitude_dd"),
 }
 """What tables call degrees that can be nothing else."""
-_NUMBERS = ("x", "y", "z", "lon", "lat", "height", "sigma")
+_OF_PLACES = ("lon", "lat", "height", "sigma")
+_NUMBERS = ("x", "y", "z", *_OF_PLACES)
 _TEXTS = ("class", "object_id")
 _DEGREES_AROUND = 1.0
 """All x, y that are nearer than this to the longitude and latitude of the anchor are degrees."""
@@ -156,7 +157,8 @@ def _as_texts(column: Any) -> Any:
     if pa.types.is_floating(kind) and pc.all(pc.equal(pc.floor(column), column)).as_py() is not False:
         with contextlib.suppress(pa.ArrowInvalid):  # A number that is too large stays as it is written.
             column, kind = column.cast(pa.int64()), pa.int64()
-    return column.cast(pa.string()) if pa.types.is_integer(kind) or pa.types.is_floating(kind) else column
+    is_other = pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_string_view(kind)
+    return column.cast(pa.string()) if is_other else column
 
 
 def _as_ids(column: Any) -> Any:
@@ -174,14 +176,18 @@ def _as_ids(column: Any) -> Any:
 def _with_places_everywhere(table: pa.Table) -> tuple[pa.Table, Bools, list[str]]:
     """Return the table with a copy of another row where there is no place, which rows have one, and what to say.
 
-    So every row can be checked under its number, and the others left out after it.
+    So every row can be checked under its number, and the others left out after it. What the check of columns refuses,
+    comes back as it is.
     """
     import pyarrow.compute as pc  # As slow.
 
-    lon, lat = table["lon"], table["lat"]
-    numbers = all(pa.types.is_floating(c.type) or pa.types.is_integer(c.type) for c in (lon, lat))
-    if not numbers or table.num_rows == 0:  # Which is told by the check of columns.
+    ours = [name for name in table.column_names if name in (*_OF_PLACES, *_TEXTS)]
+    is_checked_later = table.num_rows == 0 or len({*ours}) < len(ours)
+    kinds = [] if is_checked_later else [table.schema.field(name).type for name in ("lon", "lat")]
+    if is_checked_later or not all(pa.types.is_floating(kind) or pa.types.is_integer(kind) for kind in kinds):
         return table, np.ones(table.num_rows, np.bool_), []
+    table = table.select(ours)  # Of others there may be types that rows cannot be taken of.
+    lon, lat = (table[name].cast(pa.float64()) for name in ("lon", "lat"))
     is_none = pc.and_(pc.is_null(lon, nan_is_null=True), pc.is_null(lat, nan_is_null=True)).to_numpy()
     is_zero = pc.fill_null(pc.and_(pc.equal(lon, 0), pc.equal(lat, 0)), False).to_numpy()
     is_there: Bools = ~(is_none | is_zero)
@@ -236,11 +242,19 @@ def _read_csv(path: Path) -> pa.Table:
 def _read_parquet(path: Path) -> pa.Table:
     table = read_arrow(path)
     names = {name.strip().lower() for name in table.column_names}
-    if b"geo" not in (table.schema.metadata or {}) or names & {"lon", "x", *_OTHER_NAMES["lon"]}:
+    has_places = all(names & {ours, *_OTHER_NAMES[ours]} for ours in ("lon", "lat"))
+    if b"geo" not in (table.schema.metadata or {}) or has_places:
         return table
     import geopandas  # Slow to import, and only files of points need it.
+    import shapely
 
-    return _table_of_points(path, geopandas.read_parquet(path))
+    try:
+        points = geopandas.read_parquet(path)
+    except (ValueError, KeyError, TypeError, AttributeError, pa.ArrowException, shapely.errors.ShapelyError) as error:
+        raise InputError(
+            f"{path}: cannot be read as GeoParquet: {str(error).splitlines()[0]}", hint="is its column of points whole?"
+        ) from error
+    return table if points.crs is None else _table_of_points(path, points)
 
 
 def _read_points(path: Path) -> pa.Table:
@@ -293,8 +307,7 @@ def _table_of_points(path: Path, points: Any) -> pa.Table:
     columns: dict[str, Any] = {"lon": place[:, 0], "lat": place[:, 1]}
     if has_height.any():
         columns["height"] = place[:, 2]
-    given = {str(name).strip().lower(): name for name in points.columns}
-    columns |= {name: points[given[name]] for name in ("sigma", *_TEXTS) if name in given}
+    columns |= {name: points[name] for name in points if str(name).strip().lower() in ("sigma", *_TEXTS)}
     return pa.table({name: pa.array(column, from_pandas=True) for name, column in columns.items()})
 
 
