@@ -275,6 +275,7 @@ def test_decisions_follow_a_map_to_another_anchor(tmp_path: Path) -> None:
         (lambda content: content["decisions"][0].pop("class"), "decision 1: cannot be used"),
         (lambda content: content["decisions"][0].update(verdict="maybe"), "decision 1: expected a verdict"),
         (lambda content: content["decisions"][0].update(position_m=[1, 2]), "decision 1: cannot be used"),
+        (lambda content: content["decisions"][0].update(label_id=float("inf")), "decision 1: cannot be used"),
         (lambda content: content["decisions"][0].update(position_m=[1, 2, float("nan")]), "decision 1: expected"),
         (lambda content: content["decisions"][0].update(new_position_m=[1, 2, float("nan")]), "decision 1: expected"),
         (

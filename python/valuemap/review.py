@@ -368,7 +368,7 @@ def _from_json(entry: Any, where: str) -> Decision:
             new_position_in_world_m=None if moved is None else _point(moved),
             note=str(entry.get("note", "")),
         )
-    except (TypeError, ValueError, KeyError, AttributeError) as error:
+    except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:
         raise InputError(f"{where}: cannot be used: {error!r}", hint="repair or remove it") from error
     corrected = decision.new_position_in_world_m or ()
     numbers = (*decision.position_in_world_m, *decision.covariance_m2, *corrected)
