@@ -243,6 +243,7 @@ RECOGNISED: list[tuple[str, dict[str, Array], dict[str, Any], dict[str, Any]]] =
     ("ultralytics", {"output": np.zeros((1, 13, 84), np.float32)}, {"output": ("batch", 13, "anchors")}, {}),
     ("ultralytics", {"output": np.zeros((1, 6, 5), np.float32)}, {}, {"names": "{0: 'light', 1: 'sign'}"}),
     ("boxes", {"output": np.zeros((1, 300, 6), np.float32)}, {}, {}),
+    ("boxes", {"output": np.zeros((1, 300, 6), np.float32)}, {}, {"names": "{0: 'light', 1: 'sign', 2: 'lane'}"}),
     # One class: as many columns as boxes that are suppressed in the graph, but a row for each cell, or three.
     ("yolox", {"output": np.zeros((1, 84, 6), np.float32)}, {}, {}),
     ("yolov5", {"output": np.zeros((1, 252, 6), np.float32)}, {}, {}),
@@ -267,6 +268,7 @@ EXPORTED: list[tuple[str, int, list[float], tuple[int, int], dict[str, str]]] = 
     ("yolov5", 0, [*BOX, 0.9, 0.1, 0.8], (1200, 7), {"names": "{0: 'light', 1: 'sign'}", "stride": "32"}),
     ("yolov5", 0, [*BOX, 0.9, 0.1, 0.8], (1200, 7), {"names": "['light', 'sign']", "stride": "32"}),
     ("yolov5", 0, [*BOX, 0.9, 0.1, 0.8, *[5.0] * 32], (1200, 39), {**ULTRALYTICS, "task": "segment"}),
+    ("yolov5", 0, [*BOX, 0.9, 0.1, 0.8, *[5.0] * 32], (1200, 39), {"names": "['light', 'sign']", "stride": "32"}),
     ("ultralytics", 1, [*BOX, 0.1, 0.72], (6, 84), ULTRALYTICS),
     ("ultralytics", 1, [*BOX, 0.1, 0.72, *[5.0] * 32], (38, 84), {**ULTRALYTICS, "task": "segment"}),
     ("ultralytics", 1, [*BOX, 0.1, 0.72, *[5.0] * 51], (57, 84), {**ULTRALYTICS, "task": "pose"}),
@@ -298,7 +300,7 @@ def test_exports_of_yolo_and_rtdetr_say_the_same_box(
     table = np.zeros((1, *shape), np.float32)
     np.moveaxis(table, 1 + axis, 1)[0, 5] = values
     outputs = {"output0": table}
-    if metadata.get("task") == "segment":
+    if len(values) > 32 and metadata.get("task") != "pose":
         outputs["output1"] = np.zeros((1, 32, 16, 16), np.float32)
     model = load_model(says(tmp_path / "m.onnx", outputs, metadata=metadata), DetectConfig())
     assert (model.kind, model.preparation.color, model.preparation.std) == (kind, "RGB", (1.0, 1.0, 1.0))
@@ -306,6 +308,27 @@ def test_exports_of_yolo_and_rtdetr_say_the_same_box(
     np.testing.assert_allclose(found.edges_px, [EDGES], atol=1e-4)
     assert found.score[0] == pytest.approx(0.72)
     assert model.class_names[found.class_code[0]] == "sign"
+
+
+def test_anchors_of_yolov5_that_say_the_same_box_are_one(tmp_path: Path) -> None:
+    table = np.zeros((1, 252, 7), np.float32)
+    table[0, [3, 4]] = [*BOX, 0.9, 0.1, 0.8]
+    model = load_model(says(tmp_path / "m.onnx", {"output": table}), DetectConfig())
+    np.testing.assert_allclose(decode(model, [table], model.fit((64, 64), None)).edges_px, [EDGES])
+
+
+def test_rows_that_fill_up_boxes_are_none(tmp_path: Path) -> None:
+    """Of such rows neither the score nor the class nor the edges are anything."""
+    table = np.full((1, 300, 6), -1.0, np.float32)
+    table[0, 1] = [*EDGES, 0.72, 1]
+    model = load_model(says(tmp_path / "m.onnx", {"output": table}), DetectConfig())
+    np.testing.assert_allclose(decode(model, [table], model.fit((64, 64), None)).edges_px, [EDGES])
+
+
+def test_bytes_do_not_change_where_the_picture_goes(tmp_path: Path) -> None:
+    file = says(tmp_path / "m.onnx", {"output": np.zeros((1, 6, 84), np.float32)}, takes=onnx.TensorProto.UINT8)
+    how = load_model(file, DetectConfig()).preparation
+    assert (how.color, how.std[0], how.fitting) == ("RGB", 1 / 255, "center")
 
 
 def test_free_sizes_of_ultralytics_leave_columns_free(tmp_path: Path) -> None:
@@ -329,15 +352,17 @@ def test_rf_detr_is_a_detr_with_names_of_its_own(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.edges_px, [[16, 16, 48, 48]])
 
 
-@pytest.mark.parametrize(("queries", "classes", "is_plain"), [(300, 80, True), (300, 91, False), (900, 80, False)])
+@pytest.mark.parametrize(
+    ("queries", "classes", "is_plain"),
+    [(300, 80, True), ("queries", 80, True), (300, 91, False), ("queries", 91, False), (900, 80, False)],
+)
 def test_rt_detr_takes_colours_as_they_are_and_other_detrs_do_not(
-    tmp_path: Path, *, queries: int, classes: int, is_plain: bool
+    tmp_path: Path, *, queries: int | str, classes: int, is_plain: bool
 ) -> None:
-    outputs = {
-        "logits": np.zeros((1, queries, classes), np.float32),
-        "pred_boxes": np.zeros((1, queries, 4), np.float32),
-    }
-    model = load_model(says(tmp_path / "m.onnx", outputs), DetectConfig())
+    count = queries if isinstance(queries, int) else 300
+    outputs = {"logits": np.zeros((1, count, classes), np.float32), "pred_boxes": np.zeros((1, count, 4), np.float32)}
+    dims = {"logits": (1, queries, classes), "pred_boxes": (1, queries, 4)}
+    model = load_model(says(tmp_path / "m.onnx", outputs, dims=dims), DetectConfig())
     assert (model.kind, model.preparation.fitting) == ("detr", "stretch")
     assert (model.preparation.mean == (0.0, 0.0, 0.0)) is is_plain
 
@@ -446,7 +471,7 @@ def test_outputs_that_mean_something_else_are_refused(tmp_path: Path) -> None:
     }
     logits = np.full((1, 9, 4), -3.0, np.float32)
     logits[:, :, 3] = 6.0
-    cells = np.zeros((1, 84, 6), np.float32)
+    cells, anchors = np.zeros((1, 84, 6), np.float32), np.zeros((1, 252, 6), np.float32)
     # Of NanoDet the rest of a row are logits of edges, of a network for masks they are of masks or before the sigmoid.
     nanodet, masks = np.full((1, 84, 20), 0.1, np.float32), np.full((1, 3, 64, 64), -4.0, np.float32)
     nanodet[0, 3, 15] = 7.5
@@ -469,9 +494,10 @@ def test_outputs_that_mean_something_else_are_refused(tmp_path: Path) -> None:
             "valuemap.classes",
         ),
         ("cells", {"output": cells}, "each cell", "--kind"),
+        ("anchors", {"output": anchors}, "each cell", "--kind"),
     ]
     for name, outputs, message, hint in cases:
-        kind: Any = "boxes" if name == "cells" else None
+        kind: Any = "boxes" if name in ("cells", "anchors") else None
         model = load_model(says(tmp_path / f"{name}.onnx", outputs), DetectConfig(kind=kind))
         with pytest.raises(InputError, match=message) as error:
             decode(model, list(outputs.values()), model.fit((64, 64), None))
@@ -485,6 +511,9 @@ def test_outputs_that_mean_something_else_are_refused(tmp_path: Path) -> None:
             ),
             DetectConfig(),
         )
+    many = says(tmp_path / "many.onnx", {"output": np.zeros((1, 2000, 6), np.float32)})
+    with pytest.raises(InputError, match="cannot tell what the outputs mean"):
+        load_model(many, DetectConfig())
     flat = says(tmp_path / "flat.onnx", {"output": np.zeros((4, 7), np.float32)})
     with pytest.raises(InputError, match="cannot tell what the outputs mean") as error:
         load_model(flat, DetectConfig())

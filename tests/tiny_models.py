@@ -40,18 +40,25 @@ def says(
     metadata: Mapping[str, Any] | None = None,
     takes: int = TensorProto.FLOAT,
 ) -> Path:
-    """Write a model that gives the same outputs whatever it sees, which are numbers of the type that it `takes`."""
+    """Write a model that gives the same outputs whatever it sees, which are numbers of the type that it `takes`.
+
+    Nothing but `dims` says what shapes the outputs will have: with others, names in it would count for nothing.
+    """
     nodes = []
     constants = []
     declared = {}
     for name, value in outputs.items():
         kind = helper.np_dtype_to_tensor_dtype(value.dtype)
         constants.append(numpy_helper.from_array(value, f"{name}_value"))
+        constants.append(numpy_helper.from_array(np.array(value.shape, np.int64), f"{name}_shape"))
         nodes += [
             helper.make_node("ReduceMax", ["image"], [f"{name}_seen"], keepdims=0),
             helper.make_node("Cast", [f"{name}_seen"], [f"{name}_cast"], to=kind),
             helper.make_node("Sub", [f"{name}_cast", f"{name}_cast"], [f"{name}_nothing"]),
-            helper.make_node("Add", [f"{name}_value", f"{name}_nothing"], [name]),
+            helper.make_node("Add", [f"{name}_value", f"{name}_nothing"], [f"{name}_whole"]),
+            helper.make_node("Cast", [f"{name}_nothing"], [f"{name}_zero"], to=TensorProto.INT64),
+            helper.make_node("Add", [f"{name}_shape", f"{name}_zero"], [f"{name}_dims"]),
+            helper.make_node("Reshape", [f"{name}_whole", f"{name}_dims"], [name]),
         ]
         declared[name] = (kind, list((dims or {}).get(name, value.shape)))
     return _write(

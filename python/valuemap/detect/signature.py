@@ -128,8 +128,8 @@ def _named_table(
         if is_rtdetr or (columns == 4 + count and columns != 6):
             return "rtdetr"
         # With free sizes Ultralytics declares the columns as free too.
-        is_suppressed = columns == 6 or not isinstance(columns, int) or (has_more and columns > 6)
-        return "boxes" if is_suppressed and "task" in metadata else None
+        is_wider = not isinstance(columns, int) or (has_more and columns > 6)
+        return "boxes" if columns == 6 or (is_wider and "task" in metadata) else None
     if isinstance(columns, int) and (columns == 5 + count or (has_more and columns > 5 + count)):
         return "yolov5"
     return None
