@@ -544,7 +544,7 @@ def test_truth_from_files_of_points_of_other_programs(suffix: str, tmp_path: Pat
         frame.to_file(path, driver="KML" if suffix == ".kml" else None)
     evaluation = evaluate_map(geographic_map(), path)
     assert_found_at(evaluation, 0.3)
-    assert math.isnan(evaluation.vertical_rmse_m)  # KML says a height of 0 where there is none.
+    assert math.isnan(evaluation.vertical_rmse_m)
     assert evaluation.matches.objects.class_name is not None
 
 
@@ -666,6 +666,39 @@ def test_deviations_of_check_points_count_where_all_are_stated(tmp_path: Path) -
     assert evaluate_map(result, path, truth_sigma_m=0.2).accuracy.truth_sigma_m == 0.2
     write_csv(path, {**xyz(truth_positions()), "sigma": [0.03, None, 0.05]})
     assert evaluate_map(result, path).accuracy.truth_sigma_m is None
+
+
+def test_deviations_say_nothing_where_nothing_is_matched(tmp_path: Path) -> None:
+    result = map_of(truth_positions() + [40.0, 0.0, 0.0])
+    path = write_csv(tmp_path / "t.csv", {**xyz(truth_positions()), "sigma": [0.03, 0.04, 0.05]})
+    assert evaluate_map(result, path).accuracy.truth_sigma_m is None
+
+
+def test_heights_that_are_all_0_are_none_and_told(tmp_path: Path) -> None:
+    """As many programs write them where there are none; one that is not 0 makes them heights."""
+    table = {**lon_lat(truth_places(), "lon", "lat"), "height": [0.0, 0.0, 0.0]}
+    evaluation = evaluate_map(geographic_map(), write_csv(tmp_path / "t.csv", table))
+    assert_found_at(evaluation, 0.3)
+    assert math.isnan(evaluation.vertical_rmse_m)
+    assert "the heights of the objects are all 0, and taken for none" in evaluation.notes
+    table["height"] = [0.0, 0.0, 8.0]
+    evaluation = evaluate_map(geographic_map(), write_csv(tmp_path / "t.csv", table))
+    assert evaluation.matches.objects.has_height
+
+
+@pytest.mark.parametrize(
+    ("given", "ids"), [(["7", "5", "6"], [7, 5, 6]), (["7", "", "6"], [0, 1, 2]), (["TL-1", "2", "3"], [0, 1, 2])]
+)
+def test_rows_are_the_ids_where_those_of_a_file_are_no_numbers(
+    given: list[str], ids: list[int], tmp_path: Path
+) -> None:
+    table = {**xyz(truth_positions()), "object_id": given}
+    encoded = pa.array([text or None for text in given]).dictionary_encode()  # As of categories of pandas.
+    pq.write_table(pa.table({**table, "object_id": encoded}), tmp_path / "t.parquet")
+    for path in (write_csv(tmp_path / "t.csv", table), tmp_path / "t.parquet"):
+        objects = evaluate_map(map_of(truth_positions()), path).matches.objects
+        rows = [truth_positions().tolist().index(place) for place in objects.position_in_world_m.tolist()]
+        assert objects.object_id.tolist() == [ids[row] for row in rows]
 
 
 def test_degrees_in_columns_x_and_y_are_no_metres(tmp_path: Path) -> None:

@@ -144,6 +144,12 @@ def test_key_points_of_yolo_are_no_corners_of_a_polygon(tmp_path: Path) -> None:
     assert np.allclose(read_labels(f"yolo:{tmp_path}").pictures[0].boxes_px, [[100.0, 50.0, 20.0, 20.0]])
 
 
+def test_yolo_labels_may_begin_with_a_mark_of_an_editor(tmp_path: Path) -> None:
+    write_picture(tmp_path / "a.jpg")
+    write_text(tmp_path / "a.txt", "\ufeff0 0.5 0.5 0.1 0.2")
+    assert read_labels(f"yolo:{tmp_path}").class_names == ("class-0",)
+
+
 def test_yolo_names_line_by_line(tmp_path: Path) -> None:
     write_picture(tmp_path / "a.png")
     write_text(tmp_path / "a.txt", "1 0.5 0.5 0.1 0.1")

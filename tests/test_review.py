@@ -298,6 +298,12 @@ def test_damaged_files_are_refused_in_one_line(tmp_path: Path, change: object, t
         read_review(path, result.frame)
 
 
+def test_a_file_of_nothing_but_brackets_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "review.json").write_text("[" * 100_000)
+    with pytest.raises(InputError, match="cannot be read as JSON"):
+        read_review(tmp_path / "review.json", Frame())
+
+
 def test_files_of_two_people_with_the_same_decision_and_a_mark_of_an_editor_are_read(tmp_path: Path) -> None:
     path = tmp_path / "review.json"
     result = map_of([[0, 0, 5]])
