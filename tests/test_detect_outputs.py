@@ -533,6 +533,24 @@ def test_outputs_that_mean_something_else_are_refused(tmp_path: Path) -> None:
     assert "ONNX" in error.value.hint
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("names", "{1e400: 'light'}", "names of the classes"),
+        ("names", "{}", "names of the classes"),
+        ("valuemap.classes", "[" * 100_000, "names of the classes"),
+        ("stride", "0", "stride: expected a number of at least 1, found '0'"),
+        ("stride", "inf", "stride: expected a number"),
+        ("valuemap.minimum_component_px", "nan", "minimum_component_px: expected a number of at least 0"),
+        ("valuemap.threshold", "half", "threshold: expected a number"),
+    ],
+)
+def test_damaged_metadata_are_refused_in_a_line(tmp_path: Path, name: str, value: str, message: str) -> None:
+    file = says(tmp_path / "m.onnx", {"output0": np.zeros((1, 6, 84), np.float32)}, metadata={name: value})
+    with pytest.raises(InputError, match=message):
+        load_model(file, DetectConfig())
+
+
 def test_the_file_says_how_it_wants_pictures(tmp_path: Path) -> None:
     file = red_finder(
         tmp_path / "m.onnx",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -184,7 +185,7 @@ def load_model(path: Path, config: DetectConfig, *, threads: int = 0) -> Model:
         has_batch=has_batch,
         is_channels_last=is_channels_last,
         sizes_input=extra[0] if extra else None,
-        stride=int(_number(path, metadata, "stride", 32)),
+        stride=int(_number(path, metadata, "stride", 32, least=1)),
         preparation=preparation_of(path, kind, inputs, outputs, metadata),
         threshold=_number(path, metadata, "valuemap.threshold", 0.5),
         minimum_component_px=int(_number(path, metadata, "valuemap.minimum_component_px", 1)),
@@ -275,13 +276,17 @@ def _with_free_size(content: bytes, is_channels_last: bool) -> bytes:
     return rewritten
 
 
-def _number(path: Path, metadata: Mapping[str, str], name: str, default: float) -> float:
+def _number(path: Path, metadata: Mapping[str, str], name: str, default: float, *, least: float = 0.0) -> float:
     try:
-        return float(metadata.get(name, default))
+        value = float(metadata.get(name, default))
     except ValueError:
+        value = math.nan
+    if not least <= value < math.inf:
         raise InputError(
-            f"{path}: metadata {name}: expected a number, found {metadata[name]!r}", hint="export it again"
-        ) from None
+            f"{path}: metadata {name}: expected a number of at least {least:g}, found {metadata[name]!r}",
+            hint="export it again",
+        )
+    return value
 
 
 def _first_line(error: Exception) -> str:

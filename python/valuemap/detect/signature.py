@@ -202,7 +202,7 @@ def names_in(path: Path, metadata: Mapping[str, str]) -> tuple[str, ...]:
             pairs = enumerate(entries) if isinstance(entries, list) else dict(entries).items()
             named = {int(i): str(name) for i, name in pairs}
             return tuple(named.get(i, f"class-{i}") for i in range(max(named) + 1))
-    except (ValueError, TypeError, SyntaxError) as error:
+    except (ValueError, TypeError, SyntaxError, OverflowError, RecursionError) as error:
         raise InputError(
             f"{path}: the names of the classes in its metadata cannot be read: {error}", hint="export it again"
         ) from error
