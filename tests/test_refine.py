@@ -445,6 +445,8 @@ def test_absolute_covariances_know_that_drives_are_off_together() -> None:
     level_m = np.sqrt(np.diag(added_m2[0])[:2])
     # Six passes are off by 3 m in any direction: their mean is by 3 / sqrt(2 * 6) on each axis.
     assert (np.abs(level_m - 0.87) < 0.4).all()
+    stated_m = result.run["poses"]["mean_of_drives_sigma_east_north_up_m"]
+    assert stated_m == pytest.approx(np.sqrt(np.diag(added_m2[0])), abs=1e-4)
     object_row = valuemap.evaluate_map(result, faulty, radius_m=4.0).matches.object_of_label
     off_m = (result.labels.position_in_world_m - faulty.truth.position_in_world_m[object_row])[object_row >= 0]
     assert 10.0 * np.sqrt(np.median(result.labels.covariance_m2[:, 0])) < np.linalg.norm(off_m.mean(axis=0)[:2])

@@ -334,6 +334,15 @@ def test_opendrive_signals_say_where_and_how_exactly(tmp_path: Path) -> None:
     assert error is not None
     assert float(error.attrib["xyAbsolute"]) == pytest.approx(np.hypot(0.2, 0.1), abs=1e-4)
     assert float(error.attrib["zAbsolute"]) == pytest.approx(0.3, abs=1e-4)
+    placed = a_map()
+    absolute_m2 = placed.labels.covariance_m2 + [4.0, 0.0, 0.0, 4.0, 0.0, 1.0]
+    placed = dataclasses.replace(placed, labels=placed.labels.replace(absolute_covariance_m2=absolute_m2))
+    export_map(placed, tmp_path / "placed.xodr")
+    error = signals_of(tmp_path / "placed.xodr")[0].find("dataQuality/error")
+    assert error is not None
+    # What the whole map is off by is no error against the labels around.
+    of_place = {"xyAbsolute": np.sqrt(8.05), "zAbsolute": np.sqrt(1.09), "xyRelative": np.sqrt(0.05), "zRelative": 0.3}
+    assert {name: float(value) for name, value in error.attrib.items()} == pytest.approx(of_place, abs=1e-4)
 
 
 def test_the_number_of_a_sign_is_a_text_in_opendrive(tmp_path: Path) -> None:

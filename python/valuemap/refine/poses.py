@@ -264,16 +264,17 @@ def _corrected(dataset: Dataset, ordered: InOrder, found: Found | None, unit_m: 
         return Refined(dataset, {"found": "nothing", **_looked_at(found)}, found=found, is_noisy=is_noisy)
     record = {**_describe(ordered.dataset, found, found.selected, unit_m), **_looked_at(found)}
     moved = _moved(dataset, ordered, found, found.selected, unit_m)
-    place_m2 = _place_m2(ordered.dataset, found, found.selected, unit_m)
-    if place_m2 is not None:
-        axes = dataset.frame.east_north_up()
-        sigma_m = np.sqrt(np.diag(axes @ place_m2 @ axes.T))
-        record["mean_of_drives_sigma_east_north_up_m"] = [round(float(sigma), 4) for sigma in sigma_m]
+    sigma_m = _mean_of_drives_sigma_m(found, found.selected, unit_m)
+    if sigma_m is None:
+        return Refined(moved, record, is_corrected=True, found=found, is_noisy=is_noisy)
+    record["mean_of_drives_sigma_east_north_up_m"] = [round(float(sigma), 4) for sigma in sigma_m]
+    axes = dataset.frame.east_north_up()
+    place_m2 = np.asarray(axes.T @ np.diag(sigma_m**2) @ axes)
     return Refined(moved, record, is_corrected=True, found=found, is_noisy=is_noisy, place_m2=place_m2)
 
 
-def _place_m2(dataset: Dataset, found: Found, selected: Selected, unit_m: float) -> Floats | None:
-    """Return the covariance of where all drives are together, m²; None where no drive was moved.
+def _mean_of_drives_sigma_m(found: Found, selected: Selected, unit_m: float) -> Floats | None:
+    """Return how far all drives are off together, east, north and up, m (3); None where no drive was moved.
 
     They are where their mean is, which is as far off as one of them over the square root of their number. How far off
     one is is told by how far they were moved.
@@ -285,8 +286,7 @@ def _place_m2(dataset: Dataset, found: Found, selected: Selected, unit_m: float)
     east_m2, north_m2, up_m2 = square_m2.sum(axis=0) / max(len(square_m2) - 1, 1)
     level_m2 = (east_m2 + north_m2) / 2  # A few drives do not tell in which direction they are off more.
     drives = len(np.unique(found.result.segments.drive[is_moved]))
-    axes = dataset.frame.east_north_up()
-    return np.asarray(axes.T @ np.diag([level_m2, level_m2, up_m2]) @ axes / drives)
+    return np.sqrt(np.array([level_m2, level_m2, up_m2]) / drives)
 
 
 def _moved(dataset: Dataset, ordered: InOrder, found: Found, selected: Selected, unit_m: float) -> Dataset:

@@ -125,10 +125,18 @@ class Export:
 
     @cached_property
     def ellipses(self) -> Ellipses:
-        """How wrong the positions may be, on the ground and in height."""
+        """How wrong the positions may be, on the ground and in height, the place of the whole map included."""
+        return self._ellipses_of(self.result.labels.stated_covariance_m2)
+
+    @cached_property
+    def ellipses_among_labels(self) -> Ellipses:
+        """How wrong the positions may be against the labels around."""
+        return self._ellipses_of(self.result.labels.covariance_m2)
+
+    def _ellipses_of(self, columns_m2: Floats) -> Ellipses:
         up = np.array(self.result.frame.up)
         east, north = self.result.frame.east_north()
-        covariance_m2 = covariance_matrices(self.result.labels.covariance_m2)
+        covariance_m2 = covariance_matrices(columns_m2)
         ground = np.stack([east, north])
         values, vectors = np.linalg.eigh(ground @ covariance_m2 @ ground.T)
         minor_m, major_m = np.sqrt(np.maximum(values, 0.0)).T

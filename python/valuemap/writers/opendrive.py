@@ -25,8 +25,8 @@ def write_opendrive(export: Export, path: Path) -> None:
     A map holds no roads, and OpenDRIVE wants signals on one: a straight line from the westernmost to the easternmost
     label, named so. Who merges the signals into a road network uses `positionInertial` and works out s and t anew.
     Coordinates are metres: of a transverse Mercator projection at the anchor, which `geoReference` names, or where the
-    map is not geo-referenced in its own frame, z up. `dataQuality` is filled from the covariance: one standard
-    deviation on the ground (root of the sum of squares) and of the height.
+    map is not geo-referenced in its own frame, z up. `dataQuality` is filled from the covariances, in the world and
+    against the labels around: one standard deviation on the ground (root of the sum of squares) and of the height.
 
     Raises
     ------
@@ -71,11 +71,14 @@ def write_opendrive(export: Export, path: Path) -> None:
     _border(section)
     signals = child(road, "signals")
     along = np.array([math.cos(heading), math.sin(heading)])
-    for row, point in zip(records(export), points, strict=True):
+    relative = export.ellipses_among_labels
+    relative_m = np.column_stack([np.hypot(relative.major_m, relative.minor_m), relative.height_m])
+    for row, point, sigmas_m in zip(records(export), points, relative_m, strict=True):
         _signal(
             signals,
             row,
             point,
+            sigmas_m,
             (point[:2] - start) @ np.column_stack([along, [-along[1], along[0]]]),
             heading,
             length_m,
@@ -115,6 +118,7 @@ def _signal(
     signals: ElementTree.Element,
     row: dict[str, object],
     point: Floats,
+    relative_m: Floats,
     s_t: Floats,
     road_heading: float,
     length_m: float,
@@ -158,9 +162,14 @@ def _signal(
         roll="0",
     )
     quality = child(signal, "dataQuality")
-    # The error that a label has towards its neighbors is not known apart: it is at most that.
-    ground, up = f"{row['sigma_m']:.4f}", f"{row['sigma_height_m']:.4f}"
-    child(quality, "error", xyAbsolute=ground, zAbsolute=up, xyRelative=ground, zRelative=up)
+    child(
+        quality,
+        "error",
+        xyAbsolute=f"{row['sigma_m']:.4f}",
+        zAbsolute=f"{row['sigma_height_m']:.4f}",
+        xyRelative=f"{relative_m[0]:.4f}",
+        zRelative=f"{relative_m[1]:.4f}",
+    )
     child(
         quality,
         "rawData",
