@@ -62,6 +62,7 @@ from valuemap.remote import Place
 from valuemap.robust import Calibration, calibration_from_json
 from valuemap.simulate import simulate
 from valuemap.stages import Stages
+from valuemap.summary import summarize_map
 from valuemap.tables import Bools, Detections, Floats, Images, Ints, covariance_matrices
 from valuemap.tiles.compare import Comparison
 from valuemap.tiles.mapping import solve_cells
@@ -447,6 +448,7 @@ def test_absolute_covariances_know_that_drives_are_off_together() -> None:
     assert (np.abs(level_m - 0.87) < 0.4).all()
     stated_m = result.run["poses"]["mean_of_drives_sigma_east_north_up_m"]
     assert stated_m == pytest.approx(np.sqrt(np.diag(added_m2[0])), abs=1e-4)
+    assert summarize_map(result)["corrected_poses"]["mean_of_drives_sigma_east_north_up_m"] == stated_m
     object_row = valuemap.evaluate_map(result, faulty, radius_m=4.0).matches.object_of_label
     off_m = (result.labels.position_in_world_m - faulty.truth.position_in_world_m[object_row])[object_row >= 0]
     assert 10.0 * np.sqrt(np.median(result.labels.covariance_m2[:, 0])) < np.linalg.norm(off_m.mean(axis=0)[:2])

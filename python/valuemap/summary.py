@@ -80,10 +80,15 @@ def summarize_map(result: Map) -> dict[str, Any]:
 
 
 def _poses(record: Any) -> dict[str, Any]:
-    """Return how many cameras and drives were corrected, nothing where nothing was looked for."""
+    """Return how many cameras and drives were corrected, and how well the place of all drives together is known.
+
+    Nothing where nothing was looked for.
+    """
     if not isinstance(record, dict):
         return {}
-    return {"corrected_poses": {name: len(record.get(name, ())) for name in ("cameras", "drives")}}
+    sigma = "mean_of_drives_sigma_east_north_up_m"
+    corrected = {name: len(record.get(name, ())) for name in ("cameras", "drives")}
+    return {"corrected_poses": {**corrected, **({sigma: record[sigma]} if sigma in record else {})}}
 
 
 def _control(record: Any) -> dict[str, Any]:
