@@ -145,6 +145,19 @@ def test_the_heading_of_the_gps_counts_before_that_of_gpano(
     assert all("1 pictures have another heading in PoseHeadingDegrees" in line for line in said)
 
 
+def asked_for(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return the names of the pictures of a folder whose poses structure from motion is asked for, which finds none."""
+    asked: list[str] = []
+
+    def find_poses(pictures: list[Picture], *_: Any, **__: Any) -> Posed:
+        asked.extend(each.name for each in pictures)
+        raise InputError("asked", hint="nothing")
+
+    monkeypatch.setattr("valuemap.readers.pictures.find_poses", find_poses)
+    assert refusal(lambda: read_pictures(folder, workspace=folder / "work")) == "asked | nothing"
+    return asked
+
+
 def test_the_gimbal_of_a_drone_says_where_its_camera_looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """East and down by 30 degrees; straight down; and level by the tags of a drone that does not know."""
     for name, yaw, pitch in (("30.jpg", "+90.00", "-30.00"), ("90.jpg", "+90.00", "-90.00"), ("0.jpg", "0.0", "+0.0")):
@@ -159,14 +172,7 @@ def test_the_gimbal_of_a_drone_says_where_its_camera_looks(tmp_path: Path, monke
     assert_allclose(slant[2], [np.cos(np.radians(30.0)), 0.0, -0.5], atol=1e-4)
     assert_allclose(down[2], [0.0, 0.0, -1.0], atol=1e-4)
     assert_allclose(down[1], [-1.0, 0.0, 0.0], atol=1e-4)  # What is below in the picture is behind the drone.
-    asked: list[str] = []
-
-    def find_poses(pictures: list[Picture], *_: Any, **__: Any) -> Posed:
-        asked.extend(each.name for each in pictures)
-        raise InputError("asked", hint="nothing")
-
-    monkeypatch.setattr("valuemap.readers.pictures.find_poses", find_poses)
-    assert refusal(lambda: read_pictures(tmp_path, workspace=tmp_path / "work")) == "asked | nothing"
+    asked = asked_for(tmp_path, monkeypatch)
     assert asked == ["0.jpg", "30.jpg"]
     # Of a panorama it says where the last picture of it looked.
     sphere = xmp.replace(b"drone-dji:GimbalRoll", b'GPano:ProjectionType="equirectangular" drone-dji:GimbalRoll')
@@ -366,14 +372,7 @@ def test_structure_from_motion_leaves_out_pictures_taken_on_their_side(
 ) -> None:
     for number, orientation in enumerate((1, 6, 1, 8)):
         picture(tmp_path / f"{number}.jpg", tags(52.0 + 1e-4 * number, 4.0, Orientation=orientation))
-    asked: list[str] = []
-
-    def find_poses(pictures: list[Picture], *_: Any, **__: Any) -> Posed:
-        asked.extend(each.name for each in pictures)
-        raise InputError("asked", hint="nothing")
-
-    monkeypatch.setattr("valuemap.readers.pictures.find_poses", find_poses)
-    assert refusal(lambda: read_pictures(tmp_path, workspace=tmp_path / "work")) == "asked | nothing"
+    asked = asked_for(tmp_path, monkeypatch)
     assert asked == ["0.jpg", "2.jpg"]
     for name in asked:
         (tmp_path / name).unlink()

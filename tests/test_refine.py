@@ -592,7 +592,7 @@ def test_middles_in_doubt_widen_covariances_where_images_were_moved(monkeypatch:
     assert sure.is_corrected
     assert np.array_equal(sure.dataset.images.cam_from_world_m, unsure.dataset.images.cam_from_world_m)
     variance_m2, wider_m2 = (
-        covariance_matrices(correction.with_errors_of_images(one, labels, votes).covariance_m2).trace(axis1=1, axis2=2)
+        covariance_matrices(correction.with_errors_of_poses(one, labels, votes).covariance_m2).trace(axis1=1, axis2=2)
         for one in (sure, unsure)
     )
     assert (wider_m2 > variance_m2).all()

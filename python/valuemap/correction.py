@@ -116,7 +116,12 @@ def _by_images(before: Dataset, config: MapConfig, threads: int, progress: Progr
     return Refined(moved, record, is_corrected=True, before_images=(images, of_covariances), side_m=noise.side_m)
 
 
-def with_errors_of_images(refined: Refined, labels: Labels, votes: Votes) -> Labels:
+def with_errors_of_poses(refined: Refined, labels: Labels, votes: Votes) -> Labels:
+    """Return labels with covariances that know of what poses are still off by, where they were corrected."""
+    return _with_place_of_drives(refined, _with_errors_of_images(refined, labels, votes))
+
+
+def _with_errors_of_images(refined: Refined, labels: Labels, votes: Votes) -> Labels:
     """Return labels with covariances that know of errors of images, where these were corrected.
 
     What is left of residuals once images are moved does not say how well they were.
@@ -131,7 +136,7 @@ def with_errors_of_images(refined: Refined, labels: Labels, votes: Votes) -> Lab
     return labels.replace(covariance_m2=columns)
 
 
-def with_place_of_drives(refined: Refined, labels: Labels) -> Labels:
+def _with_place_of_drives(refined: Refined, labels: Labels) -> Labels:
     """Return labels whose absolute covariances know of the place of all drives together, where these were moved.
 
     Drives that were brought together agree, and are off together.

@@ -13,7 +13,7 @@ import numpy as np
 from valuemap.calibration import calibrate, with_sides
 from valuemap.cameras import Rays, cast_rays, directions_down
 from valuemap.config import MapConfig, bounded_threads
-from valuemap.correction import TOO_LARGE, correct_poses, with_errors_of_images, with_place_of_drives
+from valuemap.correction import TOO_LARGE, correct_poses, with_errors_of_poses
 from valuemap.dataset import Dataset, Frame, ensure_checked, read_dataset, write_dataset
 from valuemap.describe import describe_labels
 from valuemap.engine.engine import Engine
@@ -96,7 +96,7 @@ def build_map(
         with stages.measured("order"):
             source = InMemory(refined.dataset, config)
         labels, votes, counts, _ = _robust(source, config, stages, ThreadEngine(threads), progress, refined)
-        labels = with_place_of_drives(refined, with_errors_of_images(refined, labels, votes))
+        labels = with_errors_of_poses(refined, labels, votes)
     size = {"images": len(dataset.images), "detections": len(dataset.detections)}
     passes = len(np.unique(dataset.images.pass_id.codes))
     poses = None if refined is None else refined.record
@@ -221,7 +221,7 @@ def build_map_of_folder(
             notes = [_NOTE_ON_ROWS]
     labels, votes, counts, cells = _robust(source, config, stages, run.engine, progress, refined, run)
     if refined is not None:
-        labels = with_place_of_drives(refined, with_errors_of_images(refined, labels, votes))
+        labels = with_errors_of_poses(refined, labels, votes)
     passes = source.drives_record["passes"]
     untouched = TOO_LARGE if config.poses.correct_poses else "correct_poses is 0"
     poses = {"found": "nothing", "because": untouched} if refined is None else refined.record

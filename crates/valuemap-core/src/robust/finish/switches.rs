@@ -46,7 +46,7 @@ fn switches(model: &Model<'_>, objects: &[&Object], estimates: &[Estimate]) -> V
     // How often what is two for certain goes on like one; the pair itself may do so as well.
     let in_line = (two.len() + 1) as f64 / (visits_count + 1) as f64;
     let are_one = |&(stronger, weaker): &(usize, usize)| {
-        let two = in_line * missed_by_each_other(model, objects[stronger], objects[weaker]);
+        let two = in_line * missed_by_the_other(model, objects[stronger], objects[weaker]);
         two < BY_CHANCE * so_far_apart(&estimates[stronger], &estimates[weaker])
     };
     one.retain(are_one);
@@ -82,8 +82,8 @@ fn are_seen_as_two(model: &Model<'_>, stronger: &Object, weaker: &Object) -> boo
     weaker.is_seen_beside(model.scene, stronger) || visits(model.scene, &weaker.votes).count() > 1
 }
 
-/// How probable it is that each of two objects is missed in all images of the other that look at it.
-fn missed_by_each_other(model: &Model<'_>, stronger: &Object, weaker: &Object) -> f64 {
+/// How probable it is that one of two objects is missed in all images of the other that look at it: the one at which fewer look.
+fn missed_by_the_other(model: &Model<'_>, stronger: &Object, weaker: &Object) -> f64 {
     let looks = looks_among(model, stronger, &weaker.votes).min(looks_among(model, weaker, &stronger.votes));
     (1.0 - model.classes[stronger.class as usize].rates.recall).powf(looks)
 }
