@@ -36,6 +36,20 @@ BOSCH = """- boxes:
 - boxes: []
   path: ./a/2.jpg
 """
+VOC = """<annotation><folder>a</folder><filename>a/1.jpg</filename>
+<size><width>640</width><height>480</height><depth>3</depth></size>
+<object><name>light</name><difficult>0</difficult>
+<bndbox><xmin>100</xmin><ymin>50</ymin><xmax>140</xmax><ymax>70</ymax></bndbox></object></annotation>
+"""
+LABELME = """{"version": "5.5.0", "flags": {}, "shapes": [{"label": "light", "points": [[140.0, 50.0], [100.0, 70.0]],
+"group_id": null, "shape_type": "rectangle", "flags": {}}],
+"imagePath": "a/1.jpg", "imageData": null, "imageHeight": 480, "imageWidth": 640}
+"""
+VIA = """{"_via_settings": {"core": {}}, "_via_img_metadata": {"a/1.jpg99": {"filename": "a/1.jpg", "size": 99,
+"regions": [{"shape_attributes": {"name": "rect", "x": 100, "y": 50, "width": 40, "height": 20},
+"region_attributes": {"kind": "light"}}], "file_attributes": {}},
+"a/2.jpg98": {"filename": "a/2.jpg", "size": 98, "regions": [], "file_attributes": {}}}, "_via_attributes": {}}
+"""
 YOLO = "0 0.1875 0.125 0.0625 0.0416666666666667 0.5\n"
 CORNERS = "image,x1,y1,x2,y2,class\na/1.jpg,100,50,140,70,light\n"
 
@@ -54,6 +68,9 @@ def detections_in(folder: Path, kind: str) -> Path:
     text, name = {
         "coco": (COCO, "boxes.json"),
         "cvat": (CVAT, "annotations.xml"),
+        "voc": (VOC, "1.xml"),
+        "labelme": (LABELME, "1.json"),
+        "via": (VIA, "via.json"),
         "bosch": (BOSCH, "train.yaml"),
         "csv": (CORNERS, "boxes.csv"),
     }[kind]
@@ -74,6 +91,125 @@ def test_a_box_is_where_it_is_in_the_picture(tmp_path: Path, kind: str) -> None:
         assert dataset.detections.class_name.texts() == ["light"]
         assert dataset.images.name.to_pylist()[int(dataset.detections.image_id[0])] == "a/1.jpg"
         assert_allclose(dataset.detections.score, [0.5 if kind in ("coco", "yolo") else 1.0])
+
+
+def test_a_folder_of_voc_has_a_file_a_picture(tmp_path: Path) -> None:
+    """Names without folders are in that of their file; parts of objects are no objects."""
+    part = "<part><name>lens</name><bndbox><xmin>1</xmin><ymin>1</ymin><xmax>9</xmax><ymax>9</ymax></bndbox></part>"
+    text = VOC.replace("a/1.jpg", "1.jpg")
+    write(tmp_path / "voc" / "a" / "1.xml", text.replace("</object>", f"{part}</object>"))
+    write(tmp_path / "voc" / "b" / "1.xml", text.replace("light", "sign"))
+    write(tmp_path / "voc" / "a" / "2.xml", "<annotation><filename/></annotation>")
+    write(tmp_path / "poses.csv", "image,lat,lon,heading_deg\na/1.jpg,52,4,0\nb/1.jpg,52,4.0001,0\na/2.jpg,52,4.1,0\n")
+    dataset = read_csv_poses(
+        tmp_path / "poses.csv", camera="PINHOLE 640 480 500 500 320 240", detections=tmp_path / "voc"
+    )
+    names = dataset.images.name.take(dataset.detections.image_id).to_pylist()
+    assert list(zip(names, dataset.detections.class_name.texts(), strict=True)) == [
+        ("a/1.jpg", "light"),
+        ("b/1.jpg", "sign"),
+    ]
+    assert_allclose(dataset.detections.center_px, [CENTER] * 2)
+
+
+def test_xml_of_cvat_is_no_voc(tmp_path: Path) -> None:
+    path = detections_in(tmp_path, "cvat")
+    said = refusal(lambda: read(tmp_path, DetectionFile(path, format="voc")))
+    assert "annotations.xml line 2: expected <annotation>, found <annotations>" in said
+
+
+def test_shapes_of_labelme_count_as_the_boxes_around_them_and_others_are_counted(tmp_path: Path) -> None:
+    """All lie within x from 100 to 140 and y from 50 to 70, the circle about the same centre; a mask names pixels."""
+    points: dict[str, Any] = {
+        "polygon": [[100, 50], [140, 60], [120, 70]],
+        "circle": [[120, 60], [120, 80]],
+        "mask": [[100, 50], [139, 69]],
+        "line": [[1, 2], [3, 4]],
+        "point": [[5, 6]],
+    }
+    shapes: list[Any] = [{"label": kind, "points": where, "shape_type": kind} for kind, where in points.items()]
+    shapes[0] = {"label": 7, "points": points["polygon"], "score": 0.25}
+    content = {"shapes": shapes, "imagePath": "..\\a\\1.jpg", "imageHeight": None}
+    write(tmp_path / "labels" / "1.json", json.dumps(content))
+    dataset = read(tmp_path, tmp_path / "labels")
+    found = dataset.detections
+    assert_allclose(found.center_px, [CENTER] * 3)
+    sizes = dict(zip(found.class_name.texts(), found.size_px.tolist(), strict=True))
+    assert sizes == {"7": [40.0, 20.0], "mask": [40.0, 20.0], "circle": [40.0, 40.0]}
+    assert dict(zip(found.class_name.texts(), found.score.tolist(), strict=True))["7"] == 0.25
+    assert dataset.rejected is not None
+    assert sorted(dataset.rejected.class_name.texts()) == ["line", "point"]
+    assert set(dataset.rejected.reason.texts()) == {"it is a shape without a box, such as points or a line"}
+
+
+def regions_of_via() -> list[dict[str, Any]]:
+    """Four shapes that touch x = 100, x = 140, y = 50 and y = 70 from inside, and two without a box."""
+    half_turn = {"name": "ellipse", "cx": 120, "cy": 60, "rx": 10, "ry": 20, "theta": 1.5707963267948966}
+    shapes: list[dict[str, Any]] = [
+        {"name": "rect", "x": 100, "y": 50, "width": 40, "height": 20},
+        {"name": "polygon", "all_points_x": [100, 140, 120], "all_points_y": [50, 60, 70]},
+        half_turn,
+        {"name": "point", "cx": 1, "cy": 2},
+        {"name": "polyline", "all_points_x": [1, 2], "all_points_y": [3, 4]},
+    ]
+    return [
+        {"shape_attributes": shape, "region_attributes": {"kind": shape["name"], "lit": {"yes": True}}}
+        for shape in shapes
+    ]
+
+
+@pytest.mark.parametrize("version", ["project", "export 1", "export 2", "table 1", "table 2"])
+def test_regions_of_via_in_all_that_it_writes(tmp_path: Path, version: str) -> None:
+    regions = regions_of_via()
+    if version.startswith("table"):
+        rows = [(json.dumps(each["shape_attributes"]), json.dumps(each["region_attributes"])) for each in regions]
+        lines = [("#" if version.endswith("1") else "") + "filename,file_size,file_attributes,region_count,region_id,"]
+        lines[0] += "region_shape_attributes,region_attributes"
+        quoted = [[text.replace('"', '""') for text in row] for row in rows]
+        lines += [f'a/1.jpg,99,"{{}}",5,{i},"{shape}","{said}"' for i, (shape, said) in enumerate(quoted)]
+        lines.append('a/2.jpg,98,"{}",0,0,"{}","{}"')
+        path = write(tmp_path / "via.csv", "\n".join(lines) + "\n")
+    else:
+        of_picture: Any = {str(i): each for i, each in enumerate(regions)} if version == "export 1" else regions
+        pictures = {
+            "1.jpg99": {"filename": "a/1.jpg", "size": 99, "regions": of_picture},
+            "2.jpg98": {"filename": "a/2.jpg", "size": 98, "regions": {} if version == "export 1" else []},
+        }
+        content = {"_via_settings": {}, "_via_img_metadata": pictures} if version == "project" else pictures
+        path = write(tmp_path / "via.json", json.dumps(content))
+    dataset = read(tmp_path, DetectionFile(path, columns={"class": "kind"}))
+    assert sorted(dataset.detections.class_name.texts()) == ["ellipse", "polygon", "rect"]
+    assert_allclose(dataset.detections.center_px, [CENTER] * 3)
+    assert_allclose(dataset.detections.size_px, [SIZE] * 3)
+    assert dataset.rejected is not None
+    assert sorted(dataset.rejected.class_name.texts()) == ["point", "polyline"]
+    # What is ticked is a class as well; here it is the same of all.
+    ticked = read(tmp_path, DetectionFile(path, columns={"class": "lit"}, class_name="unused"), max_rejected=0.9)
+    assert set(ticked.detections.class_name.texts()) == {"yes"}
+    assert "detection-column class=NAME" in refusal(lambda: read(tmp_path, path))
+    assert "detection-column score" in refusal(lambda: read(tmp_path, DetectionFile(path, columns={"score": "lit"})))
+
+
+def test_regions_of_via_without_attributes_have_the_class_of_the_option(tmp_path: Path) -> None:
+    path = write(tmp_path / "via.json", VIA.replace('"kind": "light"', ""))
+    assert read(tmp_path, DetectionFile(path, class_name="sign")).detections.class_name.texts() == ["sign"]
+
+
+def test_a_folder_of_several_formats_is_not_guessed_at(tmp_path: Path) -> None:
+    folder = detections_in(tmp_path, "yolo")
+    write(folder / "a" / "1.xml", VOC)
+    said = refusal(lambda: read(tmp_path, folder))
+    assert "has files of several formats of detections: .txt, .xml" in said
+    assert "yolo for .txt, voc for .xml" in said
+    for kind in ("yolo", "voc"):
+        assert_allclose(read(tmp_path, DetectionFile(folder, format=kind)).detections.center_px, [CENTER])
+
+
+@pytest.mark.parametrize(("kind", "option"), [("coco", "fractions"), ("yolo", "fractions"), ("voc", "columns")])
+def test_options_that_a_format_does_not_have_are_refused(tmp_path: Path, kind: str, option: str) -> None:
+    value: Any = {"class": "label"} if option == "columns" else True
+    file = DetectionFile(detections_in(tmp_path, kind), **{option: value})
+    assert f"not with {kind}" in refusal(lambda: read(tmp_path, file))
 
 
 @pytest.mark.parametrize(
@@ -388,7 +524,7 @@ def test_boxes_of_unknown_images_are_left_out_and_named(tmp_path: Path, kind: st
     assert "its image is not among the images with a pose" in refusal(lambda: read(tmp_path, path))
 
 
-@pytest.mark.parametrize("kind", ["coco", "cvat"])
+@pytest.mark.parametrize("kind", ["coco", "cvat", "voc", "labelme"])
 def test_boxes_made_on_pictures_of_another_size_are_refused(tmp_path: Path, kind: str) -> None:
     path = detections_in(tmp_path, kind)
     path.write_text(path.read_text().replace("640", "1280"))
@@ -396,7 +532,7 @@ def test_boxes_made_on_pictures_of_another_size_are_refused(tmp_path: Path, kind
 
 
 @pytest.mark.parametrize("how", ["empty", "cut", "binary", "other", "pipe", "folder", "absent"])
-@pytest.mark.parametrize("kind", ["coco", "cvat", "bosch", "csv"])
+@pytest.mark.parametrize("kind", [kind for kind in DETECTIONS if kind != "yolo"])
 def test_files_that_are_of_no_such_format(tmp_path: Path, kind: str, how: str) -> None:
     path = spoiled(detections_in(tmp_path, kind), how)
     if (kind, how) != ("csv", "cut"):  # A cut line of a table is a shorter number.
@@ -471,6 +607,15 @@ def test_an_outer_entity_is_not_read(tmp_path: Path) -> None:
             lambda text: text.replace("<image ", "<picture ").replace("</image>", "</picture>"),
             "no images in it",
         ),
+        ("voc", lambda text: text.replace(">140<", "><"), "a number is missing or not finite (1, the first is"),
+        ("voc", lambda text: text.replace("<name>light</name>", ""), "its class is missing"),
+        ("labelme", lambda text: text.replace(", [100.0, 70.0]", ""), "expected at least 2 points of a rectangle"),
+        ("labelme", lambda text: text.replace("70.0", "NaN"), "points[1]: expected a list of 2 finite numbers"),
+        ("labelme", lambda text: text.replace('"shapes"', '"objects"'), "expected 'shapes', found version, flags"),
+        ("via", lambda text: text.replace('"rect"', '"blob"'), "name: expected rect, polygon, circle"),
+        ("via", lambda text: text.replace('"width": 40', '"width": "wide"'), "width: expected a finite number"),
+        ("via", lambda text: text.replace('"light"', '"light", "lit": "yes"'), "no attribute 'class', but kind, lit"),
+        ("via", lambda _: '{"project": {}, "file": {"1": 1}, "metadata": {"1": 1}, "view": {"1": 1}}', "of VIA 3"),
         ("bosch", lambda text: text.replace("x_max: 140.0", "x_max: wide"), "[0]: boxes[0]: x_max: expected a finite"),
         ("bosch", lambda text: text.replace("path: ./a/1.jpg", "file: ./a/1.jpg"), "[0]: expected 'path'"),
         ("bosch", lambda _: "boxes: []\n", "expected a list"),
@@ -487,7 +632,7 @@ def test_bad_values(tmp_path: Path, kind: str, change: Callable[[str], str], sai
 
 def test_options_that_cannot_be(tmp_path: Path) -> None:
     path = detections_in(tmp_path, "csv")
-    assert "there is no such format" in refusal(lambda: read(tmp_path, DetectionFile(path, format="voc")))
+    assert "there is no such format" in refusal(lambda: read(tmp_path, DetectionFile(path, format="tfrecord")))
     assert "full-score: expected above 0" in refusal(lambda: DetectionFile(path, full_score=0.0))
     assert "detection-pixel-center: expected 0 or 0.5" in refusal(lambda: DetectionFile(path, pixel_center=1.0))
     path.rename(tmp_path / "boxes.dat")

@@ -62,6 +62,7 @@ def pictures_in(folder: Path) -> None:
 
 def boxes_case(kind: str) -> Case:
     file = {"yolo": "labels/a/1.txt", "coco": "boxes.json", "cvat": "annotations.xml", "bosch": "train.yaml"}
+    file |= {"voc": "1.xml", "labelme": "1.json", "via": "via.json"}
     place = {"yolo": "labels"}
     name = file.get(kind, "boxes.csv")
     return Case(

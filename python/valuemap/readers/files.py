@@ -23,6 +23,7 @@ __all__ = [
     "check_folder",
     "check_names",
     "file_in",
+    "files_below",
     "read_json",
     "read_text",
     "read_xml",
@@ -111,7 +112,12 @@ def read_yaml(path: Path, expected: str) -> Any:
         ) from error
 
 
-def read_xml(path: Path, expected: str, on_element: Callable[[str, dict[str, str], int], None]) -> None:
+def read_xml(
+    path: Path,
+    expected: str,
+    on_element: Callable[[str, dict[str, str], int], None],
+    on_text: Callable[[str, str, int], None] | None = None,
+) -> None:
     """Call `on_element(name, attributes, line)` for every opening tag of an XML file, in their order.
 
     Parameters
@@ -120,24 +126,60 @@ def read_xml(path: Path, expected: str, on_element: Callable[[str, dict[str, str
         The file, and in words what should be there.
     on_element
         Called as `on_element(name, attributes, line)` for an opening tag, and with `/name` for a closing one.
+    on_text
+        Called as `on_text(name, text, line)` before the closing tag of an element that has no others in it, with the
+        text between its tags, without spaces around it.
     """
     text = read_text(path, expected)
     parser = xml.parsers.expat.ParserCreate("utf-8")  # Whatever the file says: it is text by now.
+    innermost: list[str] | None = None
+    """The text since the last opening tag, where no other tag came after it."""
 
     def refuse(*_: Any) -> None:
         raise InputError(
             f"{path} line {parser.CurrentLineNumber}: has a document type", hint="remove <!DOCTYPE ...> from the file"
         )
 
+    def start(name: str, attributes: dict[str, str]) -> None:
+        nonlocal innermost
+        innermost = []
+        on_element(name, attributes, parser.CurrentLineNumber)
+
+    def end(name: str) -> None:
+        nonlocal innermost
+        if innermost is not None and on_text is not None:
+            on_text(name, "".join(innermost).strip(), parser.CurrentLineNumber)
+        innermost = None
+        on_element(f"/{name}", {}, parser.CurrentLineNumber)
+
+    def characters(part: str) -> None:
+        if innermost is not None:
+            innermost.append(part)
+
     parser.StartDoctypeDeclHandler = refuse
-    parser.StartElementHandler = lambda name, attributes: on_element(name, attributes, parser.CurrentLineNumber)
-    parser.EndElementHandler = lambda name: on_element(f"/{name}", {}, parser.CurrentLineNumber)
+    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = start, end, characters
     try:
         parser.Parse(text.encode(), True)
     except xml.parsers.expat.ExpatError as error:
         raise InputError(
             f"{path}: cannot be read as XML: {first_line(error)}", hint="is it whole? Write or download it again"
         ) from error
+
+
+def files_below(path: Path, suffix: str, expected: str) -> list[tuple[str, Path]]:
+    """Return the file, or those of a folder and the ones in it with this suffix, each with its name in the folder.
+
+    Raises
+    ------
+    InputError
+        There is no such file, none in the folder, or one is a link that leads out of it.
+    """
+    if not path.is_dir():
+        return [(path.name, check_file(path, expected))]
+    names = sorted(each.relative_to(path).as_posix() for each in path.rglob("*") if each.suffix.lower() == suffix)
+    if not names:
+        raise InputError(f"{path}: there are no {suffix} files in it", hint=f"expected {expected}")
+    return [(name, file_in(path, name, expected)) for name in names]
 
 
 def _short(text: str) -> str:

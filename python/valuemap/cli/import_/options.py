@@ -33,7 +33,7 @@ CameraText = Annotated[
 CameraHeight = Annotated[float, typer.Option(help="Height of cameras that have none, metres.")]
 ClassName = Annotated[str, typer.Option("--class", help="Class of detections without one.")]
 
-DetectionFormat = Literal["auto", "coco", "yolo", "cvat", "bosch", "csv"]
+DetectionFormat = Literal["auto", "coco", "yolo", "cvat", "voc", "labelme", "via", "bosch", "csv"]
 
 _DETECTION_OPTIONS: dict[str, tuple[Any, Any]] = {
     "boxes": (
@@ -44,14 +44,18 @@ _DETECTION_OPTIONS: dict[str, tuple[Any, Any]] = {
         None,
     ),
     "boxes_format": (
-        Annotated[DetectionFormat, typer.Option("--detections-format", help="auto is as the name of the file says.")],
+        Annotated[DetectionFormat, typer.Option("--detections-format", help="auto is as the file or folder looks.")],
         "auto",
     ),
     "boxes_class": (ClassName, "object"),
     "boxes_columns": (
         Annotated[
             list[str] | None,
-            typer.Option("--detection-column", metavar="NAME=THEIRS", help="As --column, of a CSV file of boxes."),
+            typer.Option(
+                "--detection-column",
+                metavar="NAME=THEIRS",
+                help="As --column, of boxes in CSV; in via for class.",
+            ),
         ],
         None,
     ),

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import pyarrow as pa
 
 from valuemap.errors import InputError, SettingError
+from valuemap.json_lists import read_json_lists
 from valuemap.readers.boxes import FiledBoxes, FoundBoxes
 from valuemap.readers.detections.bosch import read_bosch
 from valuemap.readers.detections.coco import read_coco
 from valuemap.readers.detections.csv import read_csv_boxes
 from valuemap.readers.detections.cvat import read_cvat
+from valuemap.readers.detections.labelme import read_labelme
 from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes, find_images
+from valuemap.readers.detections.via import REGIONS, is_via, read_via
+from valuemap.readers.detections.voc import read_voc
 from valuemap.readers.detections.yolo import read_yolo
 from valuemap.readers.files import check_file
 from valuemap.tables import Cameras, Images
+from valuemap.yolo_names import NAMES_FILES
 
 __all__ = ["DETECTIONS", "DetectionFile", "format_of", "read_detections"]
 
@@ -24,12 +30,20 @@ DETECTIONS: dict[str, Callable[[DetectionFile], NamedBoxes]] = {
     "coco": read_coco,
     "yolo": read_yolo,
     "cvat": read_cvat,
+    "voc": read_voc,
+    "labelme": read_labelme,
+    "via": read_via,
     "bosch": read_bosch,
     "csv": read_csv_boxes,
 }
 """What `--detections-format` names."""
 
 _OF_SUFFIX = {".json": "coco", ".xml": "cvat", ".yaml": "bosch", ".yml": "bosch", ".csv": "csv", ".txt": "csv"}
+_IN_FOLDER = {".txt": "yolo", ".xml": "voc", ".json": "labelme"}
+_GOES_WITH = {"detection-images": ("coco",), "detection-column": ("csv", "via"), "fractions": ("csv",)}
+"""Options that not every format has."""
+_START = 4096
+_ROOT = re.compile(rb"<(?![?!])(\w+)")
 
 
 def read_detections(file: DetectionFile | Path | None, images: Images, cameras: Cameras) -> FoundBoxes | FiledBoxes:
@@ -47,22 +61,31 @@ def read_detections(file: DetectionFile | Path | None, images: Images, cameras: 
     if isinstance(file, Path):
         file = DetectionFile(file)
     name = format_of(file)
-    if file.image_list is not None and name != "coco":
-        raise SettingError(
-            f"detection-images: goes with results in COCO's format, not with {name}", hint="leave this option away"
-        )
+    given = {
+        "detection-images": file.image_list is not None,
+        "detection-column": bool(file.columns),
+        "fractions": file.fractions,
+    }
+    for option, formats in _GOES_WITH.items():
+        if given[option] and name not in formats:  # A user would look for an effect that cannot be.
+            raise SettingError(
+                f"{option}: goes with detections in the format {' or '.join(formats)}, not with {name}",
+                hint="leave this option away",
+            )
     boxes = DETECTIONS[name](file)
     pa.default_memory_pool().release_unused()  # Of the file as it was read, which Arrow would keep for what comes next.
     return find_images(boxes, images, cameras, file)
 
 
 def format_of(file: DetectionFile) -> str:
-    """Return the format of detections, a name in `DETECTIONS`: the one that is given, else what the path says.
+    """Return the format of detections, a name in `DETECTIONS`: the one that is given, else that of the files.
+
+    The suffix says it, and where formats share one, how a file begins.
 
     Raises
     ------
     InputError
-        The path does not say.
+        The path does not say, or files of several formats are in the folder.
     SettingError
         There is no such format.
     """
@@ -74,12 +97,51 @@ def format_of(file: DetectionFile) -> str:
             )
         return file.format
     if file.path.is_dir():
-        return "yolo"
+        return _of_folder(file.path)
     found = _OF_SUFFIX.get(Path(file.path.name.lower().removesuffix(".gz")).suffix)
     if found is None:
-        check_file(file.path, "a file with detections, or a folder of YOLO's")
+        check_file(file.path, "a file with detections, or a folder of them")
         raise InputError(
             f"{file.path}: its name does not say the format of the detections",
             hint=f"give --detections-format, one of {', '.join(DETECTIONS)}",
         )
-    return found
+    return _by_content(file.path, found) if file.path.is_file() else found
+
+
+def _of_folder(folder: Path) -> str:
+    suffixes = {path.suffix.lower() for path in folder.rglob("*") if path.name not in NAMES_FILES}
+    found = [suffix for suffix in _IN_FOLDER if suffix in suffixes]
+    if len(found) > 1:
+        raise InputError(
+            f"{folder}: has files of several formats of detections: {', '.join(found)}",
+            hint="name the folder of one of them, or give --detections-format, "
+            + ", ".join(f"{_IN_FOLDER[suffix]} for {suffix}" for suffix in found),
+        )
+    return _IN_FOLDER[found[0]] if found else "yolo"
+
+
+def _by_content(path: Path, by_name: str) -> str:
+    """Return the format of a file by how it begins, where several have its suffix."""
+    with path.open("rb") as file:
+        start = file.read(_START)
+    if by_name == "cvat":
+        root = _ROOT.search(start)
+        return "voc" if root is not None and root[1] == b"annotation" else by_name
+    if by_name == "csv":
+        return "via" if REGIONS.encode() in start.partition(b"\n")[0] else by_name
+    return _of_json(path) if by_name == "coco" else by_name
+
+
+def _of_json(path: Path) -> str:
+    """Return the format of a JSON file by the first members of it that tell; COCO's where none does."""
+    try:
+        for portion in read_json_lists(path, "a JSON file of detections"):
+            if portion.key in (None, "images", "annotations", "categories"):
+                return "coco"
+            if portion.key in ("shapes", "imagePath"):
+                return "labelme"
+            if is_via(portion.key, portion.value):
+                return "via"
+    except InputError:
+        pass  # Who reads all of it says what is wrong.
+    return "coco"
