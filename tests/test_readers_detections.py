@@ -195,6 +195,20 @@ def test_regions_of_via_without_attributes_have_the_class_of_the_option(tmp_path
     assert read(tmp_path, DetectionFile(path, class_name="sign")).detections.class_name.texts() == ["sign"]
 
 
+def test_a_file_of_coco_in_a_folder_is_named(tmp_path: Path) -> None:
+    """As Roboflow writes it, between the pictures."""
+    path = write(tmp_path / "train" / "_annotations.coco.json", COCO)
+    said = refusal(lambda: read(tmp_path, path.parent))
+    assert "_annotations.coco.json is no such file" in said
+    assert f"is it coco? Then name the file itself: --detections {path}" in said
+
+
+def test_labels_of_kitti_are_told_from_rows_of_yolo(tmp_path: Path) -> None:
+    folder = detections_in(tmp_path, "yolo")
+    write(folder / "a" / "1.txt", "Car 0.00 0 -1.58 100.0 50.0 140.0 70.0 1.5 1.5 1.5 -0.5 1.5 40.0 -1.5\n")
+    assert "is it a label of KITTI? Make a CSV table" in refusal(lambda: read(tmp_path, folder))
+
+
 def test_a_folder_of_several_formats_is_not_guessed_at(tmp_path: Path) -> None:
     folder = detections_in(tmp_path, "yolo")
     write(folder / "a" / "1.xml", VOC)
@@ -392,6 +406,11 @@ def test_sizes_of_pictures_in_a_table_of_edges_are_looked_at(tmp_path: Path) -> 
     ("content", "said"),
     [
         ([{"name": "a/1.jpg", "labels": []}], "results[0]: has neither image_id nor file_name (1 entries) | is it a"),
+        (
+            [{"data": {"image": "1.jpg"}, "annotations": []}],
+            "Label Studio, Supervisely, Labelbox and the like export COCO",
+        ),
+        ({"frames": [{"name": "1.jpg", "labels": []}]}, "as BDD100K and nuImages, can be a CSV table"),
         ([{"file_name": "a/1.png", "segments_info": []}], "results[0]: is a panoptic segmentation"),
     ],
 )

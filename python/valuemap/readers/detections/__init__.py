@@ -117,7 +117,16 @@ def _of_folder(folder: Path) -> str:
             hint="name the folder of one of them, or give --detections-format, "
             + ", ".join(f"{_IN_FOLDER[suffix]} for {suffix}" for suffix in found),
         )
-    return _IN_FOLDER[found[0]] if found else "yolo"
+    name = _IN_FOLDER[found[0]] if found else "yolo"
+    if name == "labelme":
+        first = min(path for path in folder.rglob("*") if path.suffix.lower() == ".json")
+        of_first = _of_json(first) if first.is_file() else name
+        if of_first != name:
+            raise InputError(
+                f"{folder}: expected files of LabelMe, one a picture; {first.name} is no such file",
+                hint=f"is it {of_first}? Then name the file itself: --detections {first}",
+            )
+    return name
 
 
 def _by_content(path: Path, by_name: str) -> str:

@@ -17,6 +17,11 @@ from valuemap.readers.boxes import CROWD, SINGLE, BoxWriter
 from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes
 from valuemap.tables import Ints
 
+_OTHERS = (
+    "is it a COCO file? Label Studio, Supervisely, Labelbox and the like export COCO, YOLO or Pascal VOC; what is of "
+    "another kind, as BDD100K and nuImages, can be a CSV table: image,x1,y1,x2,y2,class"
+)
+
 
 def read_coco(file: DetectionFile) -> NamedBoxes:
     """Read boxes; images are known by file name.
@@ -176,7 +181,7 @@ class _Results(_Boxes):
             if image_id == repr(""):
                 raise InputError(
                     f"{self.where}[{row}]: has neither image_id nor file_name ({self._unnamed} entries)",
-                    hint="is it a COCO file?",
+                    hint=_OTHERS,
                 )
             raise InputError(
                 f"{self.where}[{row}]: image_id {image_id} does not say which file it is ({self._unnamed} entries)",
@@ -242,7 +247,7 @@ def _list_in(lists: Mapping[str | None, Any], key: str, path: Path) -> Any:
         raise InputError(
             f"{path}: expected a list of results, or an object with lists named images and annotations; "
             f"there is no list named {key}",
-            hint="is it a COCO file?",
+            hint=_OTHERS,
         )
     return found
 

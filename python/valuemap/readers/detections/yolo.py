@@ -17,6 +17,8 @@ from valuemap.yolo_names import BOX, NAMES_FILES, YoloNames, yolo_names
 
 _EXPECTED = "a folder of text files with rows: class cx cy width height [confidence], as fractions of the picture"
 _LARGEST_CLASS = 100_000
+_KITTI_FIELDS = (15, 16)
+"""Of a label, and of a result, which has a score."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +32,14 @@ class _Row:
 
     def wrong(self) -> InputError:
         """Return the error that says what was expected."""
+        fields = self.text.split()
+        is_kitti = len(fields) in _KITTI_FIELDS and not fields[0][0].isdigit()
         return InputError(
             f"{self.where}: expected class cx cy width height [confidence], found {self.text.strip()[:60]!r}",
-            hint="the class is a whole number, the others are fractions of the picture's width and height; other text "
+            hint="is it a label of KITTI? Make a CSV table image,x1,y1,x2,y2,class of its columns 5 to 8 and 1, "
+            "and give --detection-pixel-center 0"
+            if is_kitti
+            else "the class is a whole number, the others are fractions of the picture's width and height; other text "
             "files must not be in the folder",
         )
 
