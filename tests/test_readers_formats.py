@@ -1044,6 +1044,65 @@ def test_older_panoramas_of_panoramax_are_as_large_as_their_tiles(tmp_path: Path
     assert "tileMatrix[0]: expected sizes of tiles" in refusal(lambda: read_panoramax(path))
 
 
+def notes_of(read: Callable[..., Any], path: Path) -> list[str]:
+    said: list[str] = []
+    read(path, tell=said.append)
+    return said
+
+
+def test_pages_of_mapillary_that_are_not_here_are_told(tmp_path: Path) -> None:
+    """Each names the next one with the cursor after it; the last one names none."""
+    images = json.loads(mapillary_in(tmp_path / "all").read_text())["data"]
+    asked = "https://graph.mapillary.com/images?creator_username=c&limit=1&after="
+    for i, image in enumerate(images):
+        paging = {"cursors": {"before": f"b{i}", "after": f"a{i}"}, **({"next": f"{asked}a{i}"} if i < 2 else {})}
+        write(tmp_path / "pages" / f"{i}.json", json.dumps({"data": [image], "paging": paging}))
+    assert notes_of(read_mapillary, tmp_path / "pages") == []
+    assert len(read_mapillary(tmp_path / "pages").images) == 3
+    (note,) = notes_of(read_mapillary, tmp_path / "pages" / "0.json")
+    assert "0.json: says that a further page follows, which is not here (1 answers)" in note
+    assert "give a folder of all of them" in note
+    write(tmp_path / "pages" / "2.json", "[]")
+    (note,) = notes_of(read_mapillary, tmp_path / "pages")
+    assert "1.json: says that a further page follows" in note
+
+
+def test_detections_of_mapillary_that_are_not_here_are_told(tmp_path: Path) -> None:
+    path = mapillary_in(tmp_path)
+    content = json.loads(path.read_text())
+    content["data"][1]["detections"]["paging"] = {"next": "https://graph.mapillary.com/1001/detections?after=x"}
+    write(path, json.dumps(content))
+    (note,) = notes_of(read_mapillary, path)
+    assert "data[1]: detections: says that there are more detections, which are not here (1 answers)" in note
+
+
+def test_as_many_images_as_mapillary_answers_with_at_most_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("valuemap.readers.mapillary._MOST_AT_ONCE", 3)
+    (note,) = notes_of(read_mapillary, mapillary_in(tmp_path))
+    assert "has 3 images, the most that Mapillary answers with" in note
+
+
+def test_pages_of_panoramax_that_are_not_here_are_told(tmp_path: Path) -> None:
+    """Each says its own address and that of the next one; another collection is whole."""
+    items = json.loads(panoramax_in(tmp_path / "all").read_text())["features"]
+    place = "https://api.example/api/collections/{}/items?limit=1"
+    first, second, other = place.format("c"), place.format("c") + "&startAfterRank=1", place.format("d")
+    for name, item, itself, following in (
+        ("1.json", items[0], first, second),
+        ("2.json", items[1], second, None),
+        ("d.json", {**items[0], "id": "z", "collection": "d"}, other, None),
+    ):
+        links = [{"rel": "self", "href": itself}, *([{"rel": "next", "href": following}] if following else [])]
+        page = {"type": "FeatureCollection", "features": [item], "links": links}
+        write(tmp_path / "pages" / name, json.dumps(page))
+    assert notes_of(read_panoramax, tmp_path / "pages") == []
+    (tmp_path / "pages" / "2.json").unlink()
+    (note,) = notes_of(read_panoramax, tmp_path / "pages")
+    assert "1.json: says that a further page follows, which is not here (1 answers)" in note
+
+
 @pytest.mark.parametrize("missing", ["place", "heading"])
 @pytest.mark.parametrize("name", ["mapillary", "panoramax"])
 def test_an_image_without_a_pose_is_left_out_and_listed(tmp_path: Path, name: str, missing: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from valuemap.readers.cameras_of import CUT_PANORAMA, Camera, is_whole_panorama,
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.exif import ROLL_DEG
 from valuemap.readers.files import file_in, read_json
-from valuemap.readers.json_documents import documents_of, files_of
+from valuemap.readers.json_documents import Pages, documents_of, files_of
 from valuemap.readers.json_values import Json, Told
 from valuemap.readers.poses import local_from_cam, make_images, place_on_earth
 from valuemap.readers.reader import Reader
@@ -28,6 +28,8 @@ _EXPECTED = "JSON of Mapillary's API v4: an image, or data: a list of images, ea
 _IN_FOLDERS = (".json", ".jsonl", ".ndjson")
 _MILLI = 1e-3
 _HEIGHT_WITHOUT_ANY_M = 2.0
+_MOST_AT_ONCE = 2000
+"""Images that the API answers with at most, and unless fewer are asked for; it has no further pages of an area."""
 _END_OF_DOWNLOAD = "__complete__"
 """What mapillary_downloader writes behind the images."""
 _OTHER_CAMERA = "its camera_type is none of perspective, fisheye, spherical and equirectangular"
@@ -46,6 +48,9 @@ class _Found:
     """Images and boxes read so far, and what was told of them."""
 
     told: Told = field(default_factory=Told)
+    pages: Pages = field(default_factory=Pages)
+    full: list[str] = field(default_factory=list)
+    cut: list[str] = field(default_factory=list)
     ids: list[str] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
     cameras: list[Camera] = field(default_factory=list)
@@ -71,6 +76,7 @@ def read_mapillary(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
+    tell: Callable[[str], None] | None = None,
 ) -> Imported:
     """Read JSON that the API answered with: the fields asked for, for one image or for many; nothing is fetched.
 
@@ -98,6 +104,8 @@ def read_mapillary(
         As in `read_detections`, instead of Mapillary's own; images are named by their ids.
     anchor
         Latitude, longitude and height of the origin; by default the place of the first image by name.
+    tell
+        Called with each line that is worth knowing: that there are images or detections that are not here.
 
     Raises
     ------
@@ -109,7 +117,12 @@ def read_mapillary(
     for number, path in enumerate(paths):
         progress("reading Mapillary's answers", number, len(paths))
         for answer in documents_of(path, _EXPECTED):
-            for image in _images(answer):
+            images_here = _images(answer)
+            if isinstance(answer.value, dict) and "data" in answer:
+                found.pages.add(answer.where, _next_page(answer))
+                if len(images_here) == _MOST_AT_ONCE:
+                    found.full.append(answer.where)
+            for image in images_here:
                 _add_image(image, found)
     refuse_too_many_unreadable(
         found.unreadable,
@@ -125,6 +138,9 @@ def read_mapillary(
     folder = export if export.is_dir() else export.parent
     if (folder / "detections.json").exists():
         _add_detections(file_in(folder, "detections.json", "Mapillary's detections"), found)
+    if tell is not None:
+        for line in _told(found):
+            tell(line)
     first = min(range(len(found.ids)), key=found.names.__getitem__)
     place = np.column_stack([np.array(found.lon_lat), _heights(found)])
     placed = place_on_earth(place, anchor, first, source=str(export))
@@ -152,6 +168,28 @@ def read_mapillary(
     )
     progress("reading Mapillary's answers", len(paths), len(paths))
     return dataset
+
+
+def _next_page(answer: Json) -> str | None:
+    """Return the address of the page after an answer."""
+    paging = answer.get("paging") if isinstance(answer.value, dict) else None
+    following = None if paging is None else paging.get("next")
+    return None if following is None else following.text()
+
+
+def _told(found: _Found) -> Iterator[str]:
+    """Yield what is to be told of images and detections that are not here."""
+    yield from found.pages.told()
+    if found.full:
+        yield (
+            f"{found.full[0]}: has {_MOST_AT_ONCE} images, the most that Mapillary answers with ({len(found.full)} "
+            "answers): there may be more; ask for smaller areas, and give a folder of all answers"
+        )
+    if found.cut:
+        yield (
+            f"{found.cut[0]}: says that there are more detections, which are not here ({len(found.cut)} answers): ask "
+            "for ID/detections until there is no next page"
+        )
 
 
 def _images(answer: Json) -> list[Json]:
@@ -200,6 +238,8 @@ def _add_image(image: Json, found: _Found) -> None:
     name = ONE_PASS if sequence is None else _sequence(sequence)
     time = image["captured_at"].number() * _MILLI if "captured_at" in image else np.nan
     boxes = _entries(image["detections"]) if "detections" in image else []
+    if boxes and _next_page(image["detections"]) is not None:
+        found.cut.append(image["detections"].where)
     if found.told.again(key, camera, orientation, place, rotation.tolist(), name, time, [box.value for box in boxes]):
         return
     for detection in boxes:
@@ -263,8 +303,12 @@ def _camera(image: Json, width: int, height: int) -> Camera | str:
 
 def _add_detections(path: Path, found: _Found) -> None:
     content = Json(read_json(path, "Mapillary's detections"), str(path), "expected image ids with lists of detections")
+    if _next_page(content) is not None:
+        found.cut.append(content.where)
     if isinstance(content.value, dict) and "data" not in content:
         for key, listed in content.items():
+            if _next_page(listed) is not None:
+                found.cut.append(listed.where)
             for detection in _entries(listed):
                 _add_box(detection, key, found)
         return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +16,7 @@ from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
 from valuemap.readers.cameras_of import CUT_PANORAMA, Camera, is_whole_panorama, make_cameras, panorama
 from valuemap.readers.detections import DetectionFile, read_detections
-from valuemap.readers.json_documents import LINES, documents_of, files_of
+from valuemap.readers.json_documents import LINES, Pages, documents_of, files_of
 from valuemap.readers.json_values import Json, Told
 from valuemap.readers.poses import height_where_none, local_from_cam, make_images, place_on_earth
 from valuemap.readers.reader import Reader
@@ -38,6 +39,7 @@ class _Found:
     """Images and boxes read so far, and what was told of them."""
 
     told: Told = field(default_factory=Told)
+    pages: Pages = field(default_factory=Pages)
     ids: list[str] = field(default_factory=list)
     cameras: list[Camera] = field(default_factory=list)
     place: list[list[float]] = field(default_factory=list)
@@ -63,6 +65,7 @@ def read_panoramax(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
+    tell: Callable[[str], None] | None = None,
 ) -> Imported:
     """Read items as the API gives them; nothing is fetched.
 
@@ -86,6 +89,8 @@ def read_panoramax(
         As in `read_detections`, instead of the annotations; images are named by their ids.
     anchor
         Latitude, longitude and height of the origin; by default the place of the first image by name.
+    tell
+        Called with each line that is worth knowing: that there are further pages, which are not here.
 
     Raises
     ------
@@ -100,8 +105,12 @@ def read_panoramax(
     for number, path in enumerate(paths):
         progress("reading the items", number, len(paths))
         for answer in documents_of(path, _EXPECTED):
+            _add_page(answer, found.pages)
             for item in _items(answer):
                 _add_item(item, found, class_key, level_m)
+    if tell is not None:
+        for line in found.pages.told():
+            tell(line)
     refuse_too_many_unreadable(
         found.unreadable,
         len(found.ids) + len(found.unreadable),
@@ -146,6 +155,13 @@ def _items(answer: Json) -> list[Json]:
     if isinstance(answer.value, list):
         return list(answer.entries())
     return [answer] if answer.object().get("type") == "Feature" else list(answer["features"].entries())
+
+
+def _add_page(answer: Json, pages: Pages) -> None:
+    """Note what an answer says of the page after it."""
+    if isinstance(answer.value, dict) and "features" in answer and "links" in answer:
+        address_of = {link["rel"].text(): link["href"].text() for link in answer["links"].entries()}
+        pages.add(answer.where, address_of.get("next"), address_of.get("self"))
 
 
 def _add_item(item: Json, found: _Found, class_key: str | None, camera_height_m: float) -> None:
