@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.feather
 import pytest
 from numpy.testing import assert_allclose
-from pyproj import Transformer
+from pyproj import Proj, Transformer
 from scipy.spatial.transform import Rotation
 
 from reading import SPOILS, azimuths_deg, meeting_point, refusal, spoiled, write
@@ -32,6 +32,7 @@ from valuemap.readers.kitti import read_kitti
 from valuemap.readers.kitti360 import read_kitti360
 from valuemap.readers.mapillary import read_mapillary
 from valuemap.readers.nuscenes import read_nuscenes
+from valuemap.readers.opendronemap import read_opendronemap
 from valuemap.readers.opensfm import read_opensfm
 from valuemap.readers.panoramax import read_panoramax
 from valuemap.readers.poses import interpolate_poses
@@ -76,6 +77,12 @@ def check_scene(dataset: Dataset, *, seconds: bool = True, within_m: float = 1e-
     if seconds:
         assert dataset.images.timestamp_s is not None
         assert_allclose(dataset.images.timestamp_s, STAMPS_NS / 1e9, atol=1e-6)
+
+
+def notes_of(read: Callable[..., Any], path: Path) -> list[str]:
+    said: list[str] = []
+    read(path, tell=said.append)
+    return said
 
 
 # TUM.
@@ -422,6 +429,106 @@ def test_coordinates_of_a_map_projection_are_not_those_of_an_anchor(
     write(path, json.dumps(parts))
     said = refusal(lambda: read_opensfm(path))
     assert f"expected positions in metres east, north, up of the anchor, found ({easting_m // 1000:.0f}" in said
+
+
+# OpenDroneMap.
+
+
+def lon_lat_height_of(center: Floats) -> tuple[float, float, float]:
+    """The place of a point in the frame of the scene, whose origin is at height 0."""
+    to_wgs = Transformer.from_pipeline(
+        f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
+        f"+step +proj=topocentric +ellps=WGS84 +lon_0={LON} +lat_0={LAT} +h_0=0"
+    )
+    lon, lat, height = to_wgs.transform(center[0], center[1], center[2], direction="INVERSE")
+    return lon, lat, height
+
+
+def opendronemap_in(folder: Path) -> Path:
+    """A project in zone 31 of UTM, whose grid is turned by 0.79 degrees here, with a lens that is off the middle."""
+    turn = np.radians(Proj("EPSG:32631").get_factors(LON, LAT).meridian_convergence)
+    enu_from_grid = np.array([[np.cos(turn), np.sin(turn), 0], [-np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    features = []
+    for i, (rotation, center) in enumerate(zip(WORLD_FROM_CAM, CENTERS, strict=True)):
+        lon, lat, height = lon_lat_height_of(center)
+        east, north = Transformer.from_crs("EPSG:4326", "EPSG:32631", always_xy=True).transform(lon, lat)
+        properties = {
+            "filename": f"{i}.jpg",
+            "camera": "v2 maker model 640 480 brown 0.85",
+            "focal": FX / WIDTH,
+            "width": WIDTH,
+            "height": HEIGHT,
+            "capture_time": float(STAMPS_NS[i]) / 1e9,
+            "translation": [east, north, height],
+            "rotation": Rotation.from_matrix(rotation.T @ enu_from_grid).as_rotvec().tolist(),
+        }
+        place = {"type": "Point", "coordinates": [lon, lat, height]}
+        features.append({"type": "Feature", "properties": properties, "geometry": place})
+    write(folder / "odm_report" / "shots.geojson", json.dumps({"type": "FeatureCollection", "features": features}))
+    opensfm = opensfm_in(folder / "opensfm")
+    camera = json.loads(opensfm.read_text())[0]["cameras"]["c"]
+    opensfm.unlink()
+    write(folder / "cameras.json", json.dumps({"maker model 640 480 brown 0.85": camera}))
+    return folder
+
+
+@pytest.mark.parametrize("given", [".", "odm_report", "odm_report/shots.geojson"])
+def test_opendronemap(tmp_path: Path, given: str) -> None:
+    project = opendronemap_in(tmp_path / "p")
+    said: list[str] = []
+    dataset = read_opendronemap(
+        project / given,
+        detections=boxes(tmp_path, ["0.jpg", "1.jpg", "2.jpg"]),
+        anchor=(LAT, LON, 0.0),
+        tell=said.append,
+    )
+    check_scene(dataset, within_m=1e-4)
+    assert said == []
+
+
+def test_lenses_of_opendronemap_that_are_not_there_are_told(tmp_path: Path) -> None:
+    """Older versions do not name the camera of a shot: the one of the same size and focal length is it."""
+    project = opendronemap_in(tmp_path)
+    path, lenses = project / "odm_report" / "shots.geojson", project / "cameras.json"
+    content = json.loads(path.read_text())
+    for feature in content["features"]:
+        del feature["properties"]["camera"], feature["properties"]["capture_time"]
+    write(path, json.dumps(content))
+    assert notes_of(read_opendronemap, project) == []
+    assert read_opendronemap(project).cameras.model.texts() == ["FULL_OPENCV"]
+    write(lenses, lenses.read_text().replace(f'"width": {WIDTH}', '"width": 999'))
+    (note,) = notes_of(read_opendronemap, project)
+    assert "3 shots have a focal length alone, as" in note
+    assert "cameras.json has no such camera" in note
+    write(lenses, "[]")
+    assert "cameras.json: expected an object" in refusal(lambda: read_opendronemap(project))
+    lenses.unlink()
+    (note,) = notes_of(read_opendronemap, project)
+    assert "no cameras.json is beside" in note
+    dataset = read_opendronemap(project)
+    assert dataset.cameras.model.texts() == ["SIMPLE_PINHOLE"]
+    assert_allclose(dataset.cameras.params[0], [FX, 320.0, 240.0])
+
+
+def test_shots_of_opendronemap_that_are_there_twice_count_once(tmp_path: Path) -> None:
+    path = opendronemap_in(tmp_path) / "odm_report" / "shots.geojson"
+    content = json.loads(path.read_text())
+    content["features"].append(content["features"][0])
+    write(path, json.dumps(content))
+    (note,) = notes_of(read_opendronemap, path)
+    assert "1 shots are there again" in note
+    assert len(read_opendronemap(path).images) == 3
+
+
+def test_shots_of_opendronemap_in_another_system_are_refused(tmp_path: Path) -> None:
+    """As of projects without GPS, whose coordinates are made up."""
+    path = opendronemap_in(tmp_path) / "odm_report" / "shots.geojson"
+    content = json.loads(path.read_text())
+    for feature, center in zip(content["features"], CENTERS, strict=True):
+        feature["properties"]["translation"] = center.tolist()
+    write(path, json.dumps(content))
+    said = refusal(lambda: read_opendronemap(path))
+    assert "expected translations that are the coordinates in UTM, found [0.0, 0.0, 1.5] for [4.0, 52.0" in said
 
 
 # nuScenes.
@@ -788,11 +895,7 @@ def mapillary_in(folder: Path, orientation: int = 1) -> Path:
         cx, cy = (4096 * part for part in SHOWN[orientation](u / 640, v / 480))
         box = [(cx - half, cy - half), (cx + half, cy - half), (cx + half, cy + half), (cx - half, cy + half)]
         corners = [(round(a), round(b)) for a, b in box]
-        to_wgs = Transformer.from_pipeline(
-            f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
-            f"+step +proj=topocentric +ellps=WGS84 +lon_0={LON} +lat_0={LAT} +h_0=0"
-        )
-        lon, lat, height = to_wgs.transform(center[0], center[1], center[2], direction="INVERSE")
+        lon, lat, height = lon_lat_height_of(center)
         data.append(
             {
                 "id": str(1000 + i),
@@ -1044,12 +1147,6 @@ def test_older_panoramas_of_panoramax_are_as_large_as_their_tiles(tmp_path: Path
     assert "tileMatrix[0]: expected sizes of tiles" in refusal(lambda: read_panoramax(path))
 
 
-def notes_of(read: Callable[..., Any], path: Path) -> list[str]:
-    said: list[str] = []
-    read(path, tell=said.append)
-    return said
-
-
 def test_pages_of_mapillary_that_are_not_here_are_told(tmp_path: Path) -> None:
     """Each names the next one with the cursor after it; the last one names none."""
     images = json.loads(mapillary_in(tmp_path / "all").read_text())["data"]
@@ -1289,6 +1386,7 @@ FORMATS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any], tuple[str
         read_kapture,
         tuple(f"sensors/{name}.txt" for name in ("sensors", "trajectories", "records_camera")),
     ),
+    "opendronemap": (opendronemap_in, read_opendronemap, ("odm_report/shots.geojson",)),
     "opensfm": (opensfm_in, read_opensfm, ("reconstruction.json",)),
     "nuscenes": (
         nuscenes_in,

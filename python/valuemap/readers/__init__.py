@@ -19,6 +19,7 @@ _MODULE_OF = {
     "kitti360": "kitti360",
     "mapillary": "mapillary",
     "nuscenes": "nuscenes",
+    "opendronemap": "opendronemap",
     "opensfm": "opensfm",
     "panoramax": "panoramax",
     "pictures": "pictures",

@@ -10,10 +10,11 @@ from scipy.spatial.transform import Rotation
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
-from valuemap.readers.cameras_of import Camera, make_cameras, panorama
+from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import file_in, read_json
 from valuemap.readers.json_values import Json
+from valuemap.readers.opensfm_cameras import opensfm_camera
 from valuemap.readers.poses import make_images
 from valuemap.readers.reader import Reader
 
@@ -71,7 +72,7 @@ def read_opensfm(
             if key not in listed:
                 raise shot["camera"].wrong("expected one of cameras")
             if key not in cameras_here:
-                cameras_here[key] = _camera(listed[key])
+                cameras_here[key] = opensfm_camera(listed[key])
             names.append(name)
             camera_of.append(cameras_here[key])
             rotation.append(shot["rotation"].numbers(3))
@@ -132,36 +133,6 @@ def _file(reconstruction: Path) -> Path:
                 hint=f"give {place / _TOPOCENTRIC}, which is the same in metres east, north and up",
             )
     return path
-
-
-def _camera(value: Json) -> Camera:
-    """Return one camera; COLMAP's models are the same functions of other names."""
-    kind = value["projection_type"].text() if "projection_type" in value else "perspective"
-    width, height = value["width"].whole(), value["height"].whole()
-    if kind in ("spherical", "equirectangular"):
-        return panorama(width, height, value.where)
-    size = max(width, height)
-
-    def of(name: str, default: float | None = None) -> float:
-        return value[name].number() if default is None or name in value else default
-
-    if "focal_x" in value:
-        fx, fy = size * of("focal_x"), size * of("focal_y")
-    else:
-        fx = fy = size * of("focal")
-    cx, cy = width / 2.0 + size * of("c_x", 0.0), height / 2.0 + size * of("c_y", 0.0)
-    k1, k2, k3, k4, p1, p2 = (of(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    params = {
-        "perspective": ("OPENCV", (fx, fy, cx, cy, k1, k2, 0.0, 0.0)),
-        "simple_radial": ("OPENCV", (fx, fy, cx, cy, k1, 0.0, 0.0, 0.0)),
-        "radial": ("OPENCV", (fx, fy, cx, cy, k1, k2, 0.0, 0.0)),
-        "brown": ("FULL_OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)),
-        "fisheye": ("OPENCV_FISHEYE", (fx, fy, cx, cy, k1, k2, 0.0, 0.0)),
-        "fisheye_opencv": ("OPENCV_FISHEYE", (fx, fy, cx, cy, k1, k2, k3, k4)),
-    }
-    if kind not in params:
-        raise value["projection_type"].wrong(f"expected one of {', '.join(params)}, spherical, equirectangular")
-    return Camera(params[kind][0], width, height, params[kind][1])
 
 
 def _rigs(part: Json, number: int) -> dict[str, str]:

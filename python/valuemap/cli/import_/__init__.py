@@ -14,6 +14,7 @@ READERS = (
     "kitti360",
     "mapillary",
     "nuscenes",
+    "opendronemap",
     "opensfm",
     "panoramax",
     "pictures",
