@@ -362,6 +362,21 @@ def test_errors_of_coco_in_portions_say_the_entry(
         read_coco(DetectionFile(path))
 
 
+def test_the_first_result_of_coco_that_names_no_file_is_named_whatever_the_portion(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Portions of 7 results: none in the first, two in the second, one more in the last."""
+    result = {"category_id": 1, "bbox": [1, 2, 3, 4], "score": 0.5}
+    unnamed = {10: 77, 12: 78, 30: 79}
+    results = [{**result, "image_id": unnamed.get(row, "a.jpg")} for row in range(31)]
+    path = tmp_path / "results.json"
+    path.write_text(json.dumps(results))
+    for portion in (7, 100):
+        monkeypatch.setattr(json_lists, "PORTION", portion)
+        with pytest.raises(InputError, match=r"results\[10\]: image_id 77 does not say which file it is \(3 entries\)"):
+            read_coco(DetectionFile(path))
+
+
 def test_of_lists_of_one_name_the_last_counts(tmp_path: Path) -> None:
     path = coco(write(tmp_path / "data", bad=False, count=60))
     box = '{"image_id": 100, "category_id": 1, "bbox": [1, 2, 3, 4], "id": 1}'

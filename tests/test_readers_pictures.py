@@ -158,6 +158,31 @@ def asked_for(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return asked
 
 
+def test_only_headings_that_are_used_and_differ_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By 0.8 degrees across north they are the same, by 1.2 not; those of flat pictures say nothing of their poses."""
+    pano = 'GPano:ProjectionType="equirectangular" GPano:PoseHeadingDegrees='
+    for name, direction, xmp in (
+        ("same.jpg", 359.6, f'<x {pano}"0.4"/>'),
+        ("other.jpg", 359.4, f'<x {pano}"0.6"/>'),
+        ("once.jpg", 20.0, '<x GPano:ProjectionType="equirectangular"/>'),
+    ):
+        picture(tmp_path / name, tags(52.0, 4.0, GPSImgDirection=direction), (64, 32), xmp=xmp.encode())
+    gimbal = b'<rdf:Description drone-dji:GimbalYawDegree="+90.00" drone-dji:GimbalPitchDegree="-1.00"/>'
+    flat = tags(52.0001, 4.0, GPSImgDirection=10.0, FocalLengthIn35mmFilm=24)
+    picture(tmp_path / "flat.jpg", flat, xmp=gimbal)
+    said: list[str] = []
+    read_pictures(tmp_path, poses="exif", tell=said.append)
+    assert [line.split(" have")[0] for line in said] == ["2 pictures"]
+
+    def find_poses(*_: Any, **__: Any) -> Posed:
+        raise InputError("asked", hint="nothing")
+
+    monkeypatch.setattr("valuemap.readers.pictures.find_poses", find_poses)
+    said.clear()
+    refusal(lambda: read_pictures(tmp_path, workspace=tmp_path / "work", tell=said.append))
+    assert [line.split(" have")[0] for line in said] == ["1 pictures"]
+
+
 def test_the_gimbal_of_a_drone_says_where_its_camera_looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """East and down by 30 degrees; straight down; and level by the tags of a drone that does not know."""
     for name, yaw, pitch in (("30.jpg", "+90.00", "-30.00"), ("90.jpg", "+90.00", "-90.00"), ("0.jpg", "0.0", "+0.0")):
