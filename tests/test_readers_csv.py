@@ -695,3 +695,26 @@ def test_a_height_of_cameras_that_is_no_number_is_named(tmp_path: Path, height_m
         read_csv_poses(poses, detections=detections, camera="EQUIRECTANGULAR 4000 2000", camera_height_m=height_m)
     with pytest.raises(SettingError, match=r"camera-height: expected a finite number"):
         read_panoramax(export, camera_height_m=height_m)
+
+
+@pytest.mark.parametrize("turn", ["heading_deg", "qw,qx,qy,qz"])
+@pytest.mark.parametrize(
+    ("x_m", "y_m", "z_m", "is_plane"),
+    [
+        (200_000.0, 20_000.0, 12.0, True),  # UTM near the equator, at the western edge of a zone.
+        (95_000.0, 10_000.0, 12.0, False),  # The British grid in Scilly: too near to be told.
+        (200_000.0, 20_000.0, -3_150.0, False),  # 200 km away the Earth is 40400 / (2 * 6371) = 3.17 km lower.
+    ],
+)
+def test_coordinates_of_a_map_projection_near_its_origin_are_told_by_their_heights(
+    tmp_path: Path, x_m: float, y_m: float, z_m: float, is_plane: bool, turn: str
+) -> None:
+    side = math.sqrt(0.5)  # Level, to the north.
+    value = "0" if turn == "heading_deg" else f"{side},{side},0,0"
+    rows = [f"{i}.jpg,{x_m},{y_m + 2 * i},{z_m},{value}" for i in range(3)]
+    path = write(tmp_path / "poses.csv", "\n".join([f"image,x,y,z,{turn}", *rows]) + "\n")
+    if is_plane:
+        said = refusal(lambda: read_csv_poses(path, camera=CAMERA, anchor=(0.2, 0.3, 10.0)))
+        assert "expected positions in metres east, north, up of the anchor, found (200000, 20002, 12)" in said
+    else:
+        assert len(read_csv_poses(path, camera=CAMERA, anchor=(0.2, 0.3, 10.0)).images) == 3

@@ -31,6 +31,12 @@ _MAX_TILT_FROM_ENU_RAD = math.radians(60.0)
 _HIGHEST_ABOVE_ANCHOR_M = 7e3
 """No street is higher; 300 km from the anchor, the plane that touches the Earth there is."""
 
+_FAR_FROM_ANCHOR_M = 1.5e5
+"""Eastings of UTM are from 166 km on."""
+_LEVEL = 0.25
+"""Of what the plane is above the Earth: mountains just as high, just as far, are no data of streets."""
+_EARTH_RADIUS_M = 6.371e6
+
 
 @dataclass(frozen=True, eq=False)
 class Imported:
@@ -154,6 +160,8 @@ def _frame(
     if anchor is not None:
         _check_anchor(anchor)
         _check_heights(images, anchor, source)
+        if not is_on_earth:
+            refuse_plane(camera_centers(images), source)
         if not is_on_earth and length >= _MIN_MEAN_UP:
             _check_is_enu(mean_up / length, source)
         return Frame(anchor=anchor)
@@ -183,12 +191,29 @@ def _check_heights(images: Images, anchor: tuple[float, float, float], source: s
     center_m = camera_centers(images)
     above_m = np.abs(lon_lat_height_from_enu(center_m, anchor)[:, 2] - anchor[2])
     if np.median(above_m) > _HIGHEST_ABOVE_ANCHOR_M:
-        x, y, z = center_m[np.argmax(above_m)].tolist()
-        raise InputError(
-            f"{source}: expected positions in metres east, north, up of the anchor, found ({x:.0f}, {y:.0f}, {z:.0f})",
-            hint="are these coordinates of a map projection, or from the middle of the Earth? Bring them into the "
-            "frame of the anchor first",
-        )
+        raise _no_place_about_anchor(center_m[np.argmax(above_m)], source)
+
+
+def refuse_plane(center_m: Floats, source: str) -> None:
+    """Refuse positions (N, 3) that somebody says are about an anchor, but that are far from it and do not curve away.
+
+    In a map projection heights count from the Earth, in the frame of an anchor from the plane that touches it there,
+    which is 1.8 km above the Earth in a distance of 150 km.
+    """
+    middle_m: Floats = np.nanmedian(center_m, axis=0)
+    x, y, z = middle_m.tolist()
+    far_m = math.hypot(x, y)
+    if far_m > _FAR_FROM_ANCHOR_M and abs(z) < _LEVEL * far_m * far_m / (2.0 * _EARTH_RADIUS_M):
+        raise _no_place_about_anchor(middle_m, source)
+
+
+def _no_place_about_anchor(center_m: Floats, source: str) -> InputError:
+    x, y, z = center_m.tolist()
+    return InputError(
+        f"{source}: expected positions in metres east, north, up of the anchor, found ({x:.0f}, {y:.0f}, {z:.0f})",
+        hint="are these coordinates of a map projection, or from the middle of the Earth? Bring them into the "
+        "frame of the anchor first",
+    )
 
 
 def _check_is_enu(mean_up: Floats, source: str) -> None:

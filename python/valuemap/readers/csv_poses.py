@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from valuemap.dataset import LONGEST_READOUT_S
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble, refuse_plane
 from valuemap.readers.cameras_of import Camera, make_cameras, parse_camera
 from valuemap.readers.csv_file import CsvFile
 from valuemap.readers.detections import DetectionFile, read_detections
@@ -204,6 +204,8 @@ def _place(
         raise SettingError(
             f"vertical {vertical}: does not go with x, y in a frame of their own", hint="give --crs, or leave it away"
         )
+    if anchor is not None:
+        refuse_plane(position, source)
     return Placed(position, np.broadcast_to(np.eye(3), (len(table), 3, 3)), anchor)
 
 
