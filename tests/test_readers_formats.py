@@ -412,6 +412,35 @@ def test_of_opendronemap_what_is_east_north_up_is_read(tmp_path: Path) -> None:
         assert f"give {true}" in said
 
 
+@pytest.mark.parametrize(("turn_deg", "is_told"), [(0.788, True), (0.0, False), (-0.788, False), (3.0, False)])
+def test_a_map_projection_is_told_by_the_gps_of_its_cameras(tmp_path: Path, turn_deg: float, is_told: bool) -> None:
+    """In zone 31 at 52 degrees of latitude, 1 degree east of its middle, grid north is sin(52) degrees east of north.
+
+    Forty cameras on a street of 800 m have GPS that is wrong by a metre. In the grid the street is turned the other way
+    as seen from above: counter-clockwise by 0.788 degrees.
+    """
+    random = np.random.default_rng(3)
+    centers = np.column_stack([np.linspace(0.0, 600.0, 40), np.linspace(0.0, 500.0, 40), np.full(40, 2.0)])
+    gps = centers + random.normal(0.0, 1.0, centers.shape)
+    path = opensfm_in(tmp_path)
+    parts = json.loads(path.read_text())
+    turn = Rotation.from_euler("z", turn_deg, degrees=True)
+    looks = Rotation.from_matrix(_LEVEL)
+    parts[0]["shots"] = {
+        f"{i}.jpg": {
+            "camera": "c",
+            "rotation": (turn * looks).inv().as_rotvec().tolist(),
+            "translation": (-(turn * looks).inv().apply(turn.apply(center))).tolist(),
+            "gps_position": where.tolist(),
+        }
+        for i, (center, where) in enumerate(zip(centers, gps, strict=True))
+    }
+    parts[0]["shots"]["3.jpg"]["gps_position"] = "unknown"  # No pose needs it.
+    notes = notes_of(read_opensfm, write(path, json.dumps(parts)))
+    assert len(notes) == is_told
+    assert all("turned by 0.79 degrees against their GPS" in note for note in notes)
+
+
 @pytest.mark.parametrize(
     ("easting_m", "northing_m"),
     [(568_600.0, 5_761_500.0), (371_000.0, 143_800.0)],  # The latter is in Singapore, near the equator.

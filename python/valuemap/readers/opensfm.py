@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from valuemap.errors import InputError, SettingError
+from valuemap.geodesy import crs_from_lon_lat_height, true_axes_of_crs
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
@@ -17,6 +20,7 @@ from valuemap.readers.json_values import Json
 from valuemap.readers.opensfm_cameras import opensfm_camera
 from valuemap.readers.poses import make_images
 from valuemap.readers.reader import Reader
+from valuemap.tables import Floats
 
 _EXPECTED = "OpenSfM's reconstruction.json: a list of reconstructions with cameras and shots"
 _REFERENCE = "reference_lla.json"
@@ -33,6 +37,7 @@ def read_opensfm(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
+    tell: Callable[[str], None] | None = None,
 ) -> Imported:
     """Read all reconstructions of a file, whose origin is `reference_lla` in it or in the file of that name beside it.
 
@@ -49,6 +54,8 @@ def read_opensfm(
         As in `read_detections`.
     up, anchor, max_rejected
         As in `assemble`, for models without a reference.
+    tell
+        Called where the cameras are turned against their GPS as a map projection is.
 
     Raises
     ------
@@ -62,7 +69,7 @@ def read_opensfm(
     path = _file(reconstruction)
     content = Json(read_json(path, _EXPECTED), str(path), f"expected {_EXPECTED}")
     parts = list(content.entries())
-    names, passes, rigs, time, rotation, translation, camera_of = [], [], [], [], [], [], []
+    names, passes, rigs, time, rotation, translation, camera_of, gps_m = [], [], [], [], [], [], [], []
     for number, part in enumerate(parts):
         listed = dict(part["cameras"].items())
         cameras_here: dict[str, Camera] = {}  # Of those with shots alone: all of a project are listed.
@@ -77,6 +84,7 @@ def read_opensfm(
             camera_of.append(cameras_here[key])
             rotation.append(shot["rotation"].numbers(3))
             translation.append(shot["translation"].numbers(3))
+            gps_m.append(_gps_m(shot))
             seconds = shot["capture_time"].number() if "capture_time" in shot else 0.0
             time.append(seconds or np.nan)  # It writes 0 for pictures without a date.
             folder = str(PurePosixPath(name).parent)
@@ -93,11 +101,22 @@ def read_opensfm(
         raise InputError(f"{path}: there are no shots in it", hint="did the reconstruction succeed?")
     cameras, camera_id = make_cameras(camera_of, str(path))
     cam_from_world = Rotation.from_rotvec(np.array(rotation))
+    center_m: Floats = -cam_from_world.inv().apply(np.array(translation))
+    if (
+        tell is not None
+        and reference is not None
+        and (turn_deg := _turn_of_grid_deg(center_m, np.array(gps_m), reference))
+    ):
+        tell(
+            f"{path}: cameras are turned by {turn_deg:.2f} degrees against their GPS, as the grid of UTM is there: it "
+            "may be OpenDroneMap's in a map projection, of which positions and directions are wrong; give "
+            f"{_TOPOCENTRIC}, or import opendronemap its shots.geojson"
+        )
     images = make_images(
         names=names,
         camera_id=camera_id,
         world_from_cam=cam_from_world.inv().as_matrix(),
-        center_in_world_m=-cam_from_world.inv().apply(np.array(translation)),
+        center_in_world_m=center_m,
         passes=passes,
         source=str(path),
         timestamp_s=np.array(time),
@@ -158,3 +177,48 @@ def _reference(parts: list[Json], path: Path) -> tuple[float, float, float] | No
             hint="import them one by one",
         )
     return places[0] if places else None  # type: ignore[return-value]
+
+
+def _gps_m(shot: Json) -> Floats:
+    """Return where the GPS of a picture is, NaN where it says no such thing: no pose needs it."""
+    try:
+        return shot["gps_position"].numbers(3)
+    except InputError:
+        return np.full(3, np.nan)
+
+
+def _turn_of_grid_deg(center_m: Floats, gps_m: Floats, reference: tuple[float, float, float]) -> float | None:
+    """Return how far the grid of UTM is turned at the origin, where cameras (N, 3) are turned as far; else None.
+
+    OpenSfM turns a model so that its cameras fit their GPS, both in east, north, up. OpenDroneMap turns the model on
+    into the grid, and leaves the GPS as it was.
+    """
+    lat, lon, _ = reference
+    known = np.isfinite(gps_m).all(axis=1)
+    if known.sum() < _FEWEST_CAMERAS or not (abs(lat) <= _POLAR_DEG and abs(lon) <= 180.0):
+        return None
+    crs = f"EPSG:{326 if lat >= 0.0 else 327}{int((lon + 180.0) // 6.0) % 60 + 1:02d}"
+    origin = crs_from_lon_lat_height(np.array([[lon, lat, 0.0]]), crs)
+    grid_north = true_axes_of_crs(origin, crs)[0, :, 1]
+    grid_rad = float(np.arctan2(grid_north[0], grid_north[1]))
+    here, gps = (complex_m - complex_m.mean() for complex_m in (_level(center_m[known]), _level(gps_m[known])))
+    turn_rad = float(np.angle(np.vdot(gps, here)))
+    spread_m = float(np.linalg.norm(gps))
+    if not spread_m > 0.0:
+        return None
+    left_m = float(np.linalg.norm(here - gps * np.exp(1j * turn_rad)))
+    sigma_rad = left_m / spread_m / np.sqrt(2.0 * len(gps) - 3.0)
+    is_grid = abs(turn_rad - grid_rad) < abs(grid_rad) / 3.0 and abs(turn_rad) > _SURE_SIGMAS * sigma_rad
+    return float(np.degrees(grid_rad)) if is_grid else None
+
+
+def _level(position_m: Floats) -> NDArray[np.complex128]:
+    """Return east and north (N, 3) as complex numbers."""
+    level: NDArray[np.complex128] = position_m[:, 0] + 1j * position_m[:, 1]
+    return level
+
+
+_FEWEST_CAMERAS = 5
+_POLAR_DEG = 84.0
+"""UTM ends there."""
+_SURE_SIGMAS = 5.0

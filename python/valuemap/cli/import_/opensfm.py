@@ -10,7 +10,7 @@ import typer
 from valuemap.cli.import_.app import check_out, finish_import, import_app
 from valuemap.cli.import_.options import Anchor, with_detections
 from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected, Up
-from valuemap.cli.show import progress_bars
+from valuemap.cli.show import progress_bars, show_notes
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.vet import MAX_REJECTED
 
@@ -31,6 +31,7 @@ def import_opensfm(
     from valuemap.readers import READERS
 
     check_out(out, force=force)
+    notes: list[str] = []
     with progress_bars() as progress:
         found = READERS["opensfm"].in_portions(
             reconstruction,
@@ -39,5 +40,7 @@ def import_opensfm(
             anchor=anchor,
             max_rejected=max_rejected,
             progress=progress,
+            tell=notes.append,
         )
     finish_import(found, out, force=force, as_json=as_json)
+    show_notes(notes)
