@@ -200,7 +200,9 @@ def test_a_file_of_coco_in_a_folder_is_named(tmp_path: Path) -> None:
     path = write(tmp_path / "train" / "_annotations.coco.json", COCO)
     said = refusal(lambda: read(tmp_path, path.parent))
     assert "_annotations.coco.json is no such file" in said
-    assert f"is it coco? Then name the file itself: --detections {path}" in said
+    assert f"it is coco: name the file itself, --detections {path}" in said
+    write(path, '{"imgHeight": 480, "imgWidth": 640, "objects": []}')
+    assert "Cityscapes, can be a CSV table" in refusal(lambda: read(tmp_path, path.parent))
 
 
 def test_labels_of_kitti_are_told_from_rows_of_yolo(tmp_path: Path) -> None:
@@ -410,7 +412,7 @@ def test_sizes_of_pictures_in_a_table_of_edges_are_looked_at(tmp_path: Path) -> 
             [{"data": {"image": "1.jpg"}, "annotations": []}],
             "Label Studio, Supervisely, Labelbox and the like export COCO",
         ),
-        ({"frames": [{"name": "1.jpg", "labels": []}]}, "as BDD100K and nuImages, can be a CSV table"),
+        ({"frames": [{"name": "1.jpg", "labels": []}]}, "as BDD100K, nuImages and Cityscapes, can be a CSV table"),
         ([{"file_name": "a/1.png", "segments_info": []}], "results[0]: is a panoptic segmentation"),
     ],
 )

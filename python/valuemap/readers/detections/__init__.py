@@ -16,7 +16,7 @@ from valuemap.readers.detections.coco import read_coco
 from valuemap.readers.detections.csv import read_csv_boxes
 from valuemap.readers.detections.cvat import read_cvat
 from valuemap.readers.detections.labelme import read_labelme
-from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes, find_images
+from valuemap.readers.detections.named_boxes import OF_OTHERS, DetectionFile, NamedBoxes, find_images
 from valuemap.readers.detections.via import REGIONS, is_via, read_via
 from valuemap.readers.detections.voc import read_voc
 from valuemap.readers.detections.yolo import read_yolo
@@ -124,7 +124,7 @@ def _of_folder(folder: Path) -> str:
         if of_first != name:
             raise InputError(
                 f"{folder}: expected files of LabelMe, one a picture; {first.name} is no such file",
-                hint=f"is it {of_first}? Then name the file itself: --detections {first}",
+                hint=OF_OTHERS if of_first is None else f"it is {of_first}: name the file itself, --detections {first}",
             )
     return name
 
@@ -138,11 +138,11 @@ def _by_content(path: Path, by_name: str) -> str:
         return "voc" if root is not None and root[1] == b"annotation" else by_name
     if by_name == "csv":
         return "via" if REGIONS.encode() in start.partition(b"\n")[0] else by_name
-    return _of_json(path) if by_name == "coco" else by_name
+    return (_of_json(path) or by_name) if by_name == "coco" else by_name
 
 
-def _of_json(path: Path) -> str:
-    """Return the format of a JSON file by the first members of it that tell; COCO's where none does."""
+def _of_json(path: Path) -> str | None:
+    """Return the format of a JSON file by the first members of it that tell; None where none does."""
     try:
         for portion in read_json_lists(path, "a JSON file of detections"):
             if portion.key in (None, "images", "annotations", "categories"):
@@ -153,4 +153,4 @@ def _of_json(path: Path) -> str:
                 return "via"
     except InputError:
         pass  # Who reads all of it says what is wrong.
-    return "coco"
+    return None

@@ -14,13 +14,8 @@ from valuemap.coco import EXPECTED, ID, MAYBE_TEXT, TEXT, Entries
 from valuemap.errors import InputError, SettingError
 from valuemap.json_lists import read_json_lists
 from valuemap.readers.boxes import CROWD, SINGLE, BoxWriter
-from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes
+from valuemap.readers.detections.named_boxes import OF_OTHERS, DetectionFile, NamedBoxes
 from valuemap.tables import Ints
-
-_OTHERS = (
-    "is it a COCO file? Label Studio, Supervisely, Labelbox and the like export COCO, YOLO or Pascal VOC; what is of "
-    "another kind, as BDD100K and nuImages, can be a CSV table: image,x1,y1,x2,y2,class"
-)
 
 
 def read_coco(file: DetectionFile) -> NamedBoxes:
@@ -181,7 +176,7 @@ class _Results(_Boxes):
             if image_id == repr(""):
                 raise InputError(
                     f"{self.where}[{row}]: has neither image_id nor file_name ({self._unnamed} entries)",
-                    hint=_OTHERS,
+                    hint=f"is it a COCO file? {OF_OTHERS}",
                 )
             raise InputError(
                 f"{self.where}[{row}]: image_id {image_id} does not say which file it is ({self._unnamed} entries)",
@@ -247,7 +242,7 @@ def _list_in(lists: Mapping[str | None, Any], key: str, path: Path) -> Any:
         raise InputError(
             f"{path}: expected a list of results, or an object with lists named images and annotations; "
             f"there is no list named {key}",
-            hint=_OTHERS,
+            hint=f"is it a COCO file? {OF_OTHERS}",
         )
     return found
 

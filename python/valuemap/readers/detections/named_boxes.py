@@ -19,6 +19,11 @@ from valuemap.tables import Cameras, Floats, Images, Ints
 
 CORNER = 0.5
 """The centre of the top-left pixel where pixels count from the picture's corner."""
+OF_OTHERS = (
+    "Label Studio, Supervisely, Labelbox and the like export COCO, YOLO or Pascal VOC; what is of another kind, as "
+    "BDD100K, nuImages and Cityscapes, can be a CSV table: image,x1,y1,x2,y2,class"
+)
+"""What to do with boxes in formats that are not read."""
 _PIXEL_CENTER = "detection-pixel-center"
 
 
