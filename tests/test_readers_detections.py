@@ -552,6 +552,11 @@ def test_boxes_made_on_pictures_of_another_size_are_refused(tmp_path: Path, kind
     assert "expected 640 x 480 px as in the model, found 1280 x 480" in refusal(lambda: read(tmp_path, path))
 
 
+def test_a_size_of_voc_may_have_a_decimal_point(tmp_path: Path) -> None:
+    path = write(tmp_path / "1.xml", VOC.replace("640", "1280.0"))
+    assert "expected 640 x 480 px as in the model, found 1280 x 480" in refusal(lambda: read(tmp_path, path))
+
+
 @pytest.mark.parametrize("how", ["empty", "cut", "binary", "other", "pipe", "folder", "absent"])
 @pytest.mark.parametrize("kind", [kind for kind in DETECTIONS if kind != "yolo"])
 def test_files_that_are_of_no_such_format(tmp_path: Path, kind: str, how: str) -> None:

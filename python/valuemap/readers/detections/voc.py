@@ -58,7 +58,7 @@ def _add_picture(name: str, path: Path, found: Drawn) -> None:
         elif inside == ("annotation",) and tag == "filename":
             stated = text
         elif inside == ("annotation", "size") and tag in sizes:
-            sizes[tag] = int(text) if text.isdecimal() else 0
+            sizes[tag] = int(size) if math.isfinite(size := _number(text)) else 0
 
     read_xml(path, _EXPECTED, on_element, on_text)
     picture = picture_beside(name, stated)
