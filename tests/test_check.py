@@ -56,7 +56,7 @@ from valuemap.check.passes import (
 from valuemap.check.poses import PitchAndRoll
 from valuemap.check.quality import TruthElsewhere, strays
 from valuemap.check.registry import CONVENTIONS, FAULTS
-from valuemap.check.sample import driving_order
+from valuemap.check.sample import driving_order, number_rows
 from valuemap.check.seams import worst_seam
 from valuemap.check.sizes import are_outside, object_heights
 from valuemap.cli.commands import app
@@ -156,6 +156,12 @@ def test_a_reading_that_few_places_cannot_prove_is_suspected_not_found(view: Vie
     assert "x y z w" in told
     assert _suspicion(given, reading(quaternions, worse + 0.1 * (better - worse) * [1, -1, 1, 1, -1, 1, 1])) is None
     assert _suspicion(given, given) is None
+
+
+def test_rows_are_numbered_in_the_order_of_their_columns() -> None:
+    rows = np.array([[2, -1, 0], [0, 5, 9], [2, -1, 0], [0, 5, -9], [0, 4, 2**62], [2, -1, 1]])
+    assert number_rows(*rows.T).tolist() == [3, 2, 3, 1, 0, 4]
+    assert number_rows(rows[:0, 0], rows[:0, 1]).tolist() == []
 
 
 def street(good: Dataset, start: int, length: int) -> Dataset:

@@ -34,6 +34,7 @@ from valuemap.check.fault import (
 from valuemap.check.groups import Group, OfGroup, groups_of, only
 from valuemap.check.headings import driving_azimuths, headings, level_rotations
 from valuemap.check.others import points_of_others
+from valuemap.check.sample import number_rows
 from valuemap.dataset import Dataset
 from valuemap.tables import Floats, Images, Ints
 
@@ -292,10 +293,11 @@ class _Grid:
         self.rows = max(int(2.0 * _MOST_PITCH_RAD / width_rad), 1)
         column = np.floor(looks[0] / (2.0 * np.pi) * self.columns + shift[0]).astype(np.int64) % self.columns
         row = np.floor(looks[1] / width_rad + shift[1]).astype(np.int64)
-        (_, self._row_of_cell), self.cell = np.unique(np.stack([column, row]), axis=1, return_inverse=True)
-        self.cell = self.cell.ravel()
-        pairs = np.unique(np.stack([self.cell, point]), axis=1)
-        self.points = np.bincount(pairs[0], minlength=len(self._row_of_cell))
+        self.cell = number_rows(column, row)
+        _, first = np.unique(self.cell, return_index=True)
+        self._row_of_cell = row[first]
+        _, first = np.unique(number_rows(self.cell, point), return_index=True)
+        self.points = np.bincount(self.cell[first], minlength=len(self._row_of_cell))
 
     @property
     def usual_points(self) -> float:

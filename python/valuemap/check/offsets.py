@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from valuemap.check.sample import number_rows
 from valuemap.tables import Floats, Ints
 
 _MOST_PAIRS = 4_000_000
@@ -58,11 +59,12 @@ def densest(difference: Floats, tolerance_m: float) -> Shift | None:
     best_count, best = 0, difference[0]
     for start in (0.0, 0.5):
         cell = np.floor(difference / (2.0 * tolerance_m) + start).astype(np.int64)
-        _, inverse, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+        number = number_rows(*cell.T)
+        count = np.bincount(number)
         fullest = int(np.argmax(count))
         if count[fullest] > best_count:
             best_count = int(count[fullest])
-            best = difference[inverse.ravel() == fullest].mean(axis=0)
+            best = difference[number == fullest].mean(axis=0)
     for _ in range(_ROUNDS):
         near = np.linalg.norm(difference - best, axis=1) <= tolerance_m
         if not np.any(near):

@@ -106,8 +106,19 @@ def order_by_camera(images: Images, *, by_time: bool = True) -> Ints:
 
 def drive_of_camera(images: Images) -> Ints:
     """Return a number (N) that images of one pass and camera share, and no others."""
-    pass_and_camera = np.stack([images.pass_id.codes, images.camera_id], axis=1)
-    return np.unique(pass_and_camera, axis=0, return_inverse=True)[1].ravel().astype(np.int64)
+    return number_rows(images.pass_id.codes, images.camera_id)
+
+
+def number_rows(*columns: NDArray[np.integer]) -> Ints:
+    """Return a number (N) for each row of columns (N), from 0 without gaps and in their order; equal rows share one.
+
+    Several times as fast as `numpy.unique` of whole rows, which compares them field by field.
+    """
+    number = np.zeros(len(columns[0]), dtype=np.int64)
+    for column in columns:
+        _, code = np.unique(column, return_inverse=True)
+        _, number = np.unique(number * (int(code.max(initial=0)) + 1) + code, return_inverse=True)
+    return number.astype(np.int64)
 
 
 def _rank_of_names(images: Images) -> Ints:
