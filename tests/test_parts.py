@@ -254,7 +254,7 @@ CASES: dict[str, tuple[str, int, Fails]] = {
     "elevations": (FEW_PICTURES, 20, more_is_wrong),
     "tails": ("missed", 2, more_is_wrong),
     "reach": ("drifts", 3, what_is_there_is_believed_less),
-    "far_hits": ("clutter", 15, more_is_wrong),
+    "far_hits": (FEW_PICTURES, 2, more_is_wrong),
     "aspect": ("narrow", 7, what_is_there_is_believed_less),
     "company": (FEW_PICTURES, 5, more_is_wrong),
     "ghosts": ("clutter", 0, more_is_wrong),
