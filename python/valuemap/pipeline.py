@@ -12,7 +12,7 @@ import numpy as np
 
 from valuemap.calibration import calibrate, with_sides
 from valuemap.cameras import Rays, cast_rays, directions_down
-from valuemap.config import MapConfig, bounded_threads
+from valuemap.config import MapConfig
 from valuemap.correction import TOO_LARGE, correct_poses, with_errors_of_poses
 from valuemap.dataset import Dataset, Frame, ensure_checked, read_dataset, write_dataset
 from valuemap.describe import describe_labels
@@ -27,9 +27,7 @@ from valuemap.paper.vote import vote_in_clusters
 from valuemap.portions import rows_on_disk
 from valuemap.progress import Progress, silent
 from valuemap.reach import MOST_LOOKED_AT, with_range, with_usual_range
-from valuemap.refine import (
-    Refined,
-)
+from valuemap.refine import Refined
 from valuemap.rejected import rejected_of_map
 from valuemap.remote import Place, UrlPath
 from valuemap.robust import Calibration, calibration_to_json
@@ -83,28 +81,9 @@ def build_map(
     Map
         Labels ordered by their first detection, votes, rejected hypotheses, and the record of the run.
     """
-    config, threads = config or MapConfig(), bounded_threads(threads)
+    engine = ThreadEngine(threads)
     _check_detections(dataset.name, len(dataset.detections))
-    dataset = ensure_checked(dataset)
-    config, odd_range = with_range(dataset, config)
-    stages = Stages()
-    refined = None
-    if config.method == "paper":
-        labels, votes, counts = _paper(dataset, config, stages, threads, progress)
-    else:
-        refined = correct_poses(dataset, config, stages, threads, progress)
-        with stages.measured("order"):
-            source = InMemory(refined.dataset, config)
-        labels, votes, counts, _ = _robust(source, config, stages, ThreadEngine(threads), progress, refined)
-        labels = with_errors_of_poses(refined, labels, votes)
-    size = {"images": len(dataset.images), "detections": len(dataset.detections)}
-    passes = len(np.unique(dataset.images.pass_id.codes))
-    poses = None if refined is None else refined.record
-    result = _as_map(dataset.name, dataset.frame, size, passes, config, labels, votes, counts, stages, poses)
-    if refined is not None and refined.is_corrected:
-        result = replace(result, corrected=refined.dataset)
-    result = _with_rejected(result, lambda: result.corrected or dataset, stages)
-    return _with_notes(result, _notes_on_input(dataset, odd_range))
+    return _held(ensure_checked(dataset), config or MapConfig(), engine, None, None, progress)[0]
 
 
 @dataclass(frozen=True)
@@ -183,60 +162,92 @@ def build_map_of_folder(
         The files of its cells; none of a dataset that is no wider than one.
     """
     images, detections = rows_on_disk(folder) if held is None else (len(held.images), len(held.detections))
-    is_cut = config.method != "paper" and run.cuts_on_disk(images + detections)
-    is_looked_at = 0 < detections <= MOST_LOOKED_AT - images
-    dataset = ensure_checked(held or read_dataset(folder)) if is_looked_at or not is_cut else None
-    stages = Stages()
+    if config.method != "paper" and run.cuts_on_disk(images + detections):
+        is_looked_at = 0 < detections <= MOST_LOOKED_AT - images
+        looked_at = ensure_checked(held or read_dataset(folder)) if is_looked_at else None
+        return _cut(folder, looked_at, config, run, lambda: looked_at or held or read_dataset(folder), progress)
+    dataset = ensure_checked(held or read_dataset(folder))
+    _check_detections(dataset.name, detections)
+    return _held(dataset, config, run.engine, run, on_posed, progress)
+
+
+def _held(
+    dataset: Dataset,
+    config: MapConfig,
+    engine: Engine,
+    run: Run | None,
+    on_posed: Callable[[Dataset], None] | None,
+    progress: Progress,
+) -> tuple[Map, list[Place]]:
+    """Map a checked dataset that is in memory whole."""
+    config, odd_range = with_range(dataset, config)
+    stages, threads = Stages(), engine.threads_of_task(1)
     refined: Refined | None = None
-    notes: list[str] = []
-    threads = run.engine.threads_of_task(1)
-    if dataset is not None and not is_cut:
-        if config.method == "paper":
-            return build_map(dataset, config, threads=threads, progress=progress), []
-        _check_detections(dataset.name, len(dataset.detections))
-        config, odd_range = with_range(dataset, config)
+    cells: list[Place] = []
+    if config.method == "paper":
+        labels, votes, counts = _paper(dataset, config, stages, threads, progress)
+    else:
         refined = correct_poses(dataset, config, stages, threads, progress)
         if on_posed is not None:
             on_posed(refined.dataset)
         with stages.measured("order"):
-            source: Source = InMemory(refined.dataset, config)
-        size = {"images": len(dataset.images), "detections": len(dataset.detections)}
-        name, frame, notes = dataset.name, dataset.frame, _notes_on_input(dataset, odd_range)
-    else:
-        if dataset is not None:
-            config, odd_range = with_range(dataset, config)
-            notes = _notes_on_input(dataset, odd_range)
-            refined = correct_poses(dataset, config, stages, threads, progress)
-            if refined.is_corrected:
-                folder = run.work / CORRECTED
-                write_dataset(refined.dataset, folder)
-        config = with_usual_range(config)
-        with stages.measured("partition"):
-            on_disk = partition_dataset(
-                folder, run.work, config, store=run.store, tile_size_m=run.tile_size_m, progress=progress
-            )
-        source, name, frame, size = on_disk, on_disk.name, on_disk.frame, on_disk.counts
-        _check_detections(name, size["detections"])
-        if refined is None and _has_rolling_shutter(folder):
-            notes = [_NOTE_ON_ROWS]
+            source = InMemory(refined.dataset, config)
+        labels, votes, counts, cells = _robust(source, config, stages, engine, progress, refined, run)
+    size = {"images": len(dataset.images), "detections": len(dataset.detections)}
+    passes = len(np.unique(dataset.images.pass_id.codes))
+    poses = None if refined is None else refined.record
+    result = _as_map(dataset.name, dataset.frame, size, passes, config, labels, votes, counts, stages, refined, poses)
+    if run is None or run.keeps_rejected:
+        result = _with_rejected(result, lambda: dataset, stages)
+    return _with_notes(result, _notes_on_input(dataset, odd_range)), cells
+
+
+def _cut(
+    folder: Path,
+    dataset: Dataset | None,
+    config: MapConfig,
+    run: Run,
+    read: Callable[[], Dataset],
+    progress: Progress,
+) -> tuple[Map, list[Place]]:
+    """Map a dataset folder that is cut into tiles on disk.
+
+    `dataset` is what is in it where that is small enough for its poses to be looked at, `read` gives it in any case.
+    """
+    stages = Stages()
+    refined: Refined | None = None
+    notes: list[str] = []
+    posed = folder
+    if dataset is not None:
+        config, odd_range = with_range(dataset, config)
+        notes = _notes_on_input(dataset, odd_range)
+        refined = correct_poses(dataset, config, stages, run.engine.threads_of_task(1), progress)
+        if refined.is_corrected:
+            posed = run.work / CORRECTED
+            write_dataset(refined.dataset, posed)
+    config = with_usual_range(config)
+    with stages.measured("partition"):
+        source = partition_dataset(
+            posed, run.work, config, store=run.store, tile_size_m=run.tile_size_m, progress=progress
+        )
+    size = source.counts
+    _check_detections(source.name, size["detections"])
+    if refined is None and _has_rolling_shutter(folder):
+        notes = [_NOTE_ON_ROWS]
     labels, votes, counts, cells = _robust(source, config, stages, run.engine, progress, refined, run)
-    if refined is not None:
-        labels = with_errors_of_poses(refined, labels, votes)
     passes = source.drives_record["passes"]
     untouched = TOO_LARGE if config.poses.correct_poses else "correct_poses is 0"
     poses = {"found": "nothing", "because": untouched} if refined is None else refined.record
-    result = _as_map(name, frame, size, passes, config, labels, votes, counts, stages, poses)
-    if refined is not None and refined.is_corrected:
-        result = replace(result, corrected=refined.dataset)
+    result = _as_map(source.name, source.frame, size, passes, config, labels, votes, counts, stages, refined, poses)
     if run.keeps_rejected:
-        result = _with_rejected(result, lambda: result.corrected or dataset or held or read_dataset(folder), stages)
+        result = _with_rejected(result, read, stages)
     return _with_notes(result, notes), cells
 
 
 def _with_rejected(result: Map, read: Callable[[], Dataset], stages: Stages) -> Map:
-    """Add the best hypotheses that became no labels; `read` gives the dataset that the labels were found in."""
+    """Add the best hypotheses that became no labels; `read` gives the dataset as it was, where none is corrected."""
     with stages.measured("rejected"):
-        return replace(result, rejected=rejected_of_map(result, read))
+        return replace(result, rejected=rejected_of_map(result, lambda: result.corrected or read()))
 
 
 def _has_rolling_shutter(folder: Path) -> bool:
@@ -276,13 +287,15 @@ def _as_map(
     votes: Votes,
     counts: dict[str, Any],
     stages: Stages,
+    refined: Refined | None,
     poses: dict[str, Any] | None,
 ) -> Map:
     without = size["detections"] - len(votes)
     counts = {**size, "detections_without_label": without, **counts, "labels": len(labels)}
     notes = find_notes(Findings(passes, config, labels, votes, counts))
     record = {**_record(name, config, counts, stages), "notes": notes}
-    return Map(frame, labels, votes, record if poses is None else {**record, "poses": poses})
+    corrected = refined.dataset if refined is not None and refined.is_corrected else None
+    return Map(frame, labels, votes, record if poses is None else {**record, "poses": poses}, corrected)
 
 
 def _paper(
@@ -334,6 +347,8 @@ def _robust(
             solved, files = solve_cells(source, calibration, config, engine, progress, store=store, known=known)
         with stages.measured("join"):
             labels, votes, counts = join_cells(solved, source.grid, config)
+    if refined is not None:
+        labels = with_errors_of_poses(refined, labels, votes)
     estimated = calibration_to_json(calibration)
     counts = {**counts, "drives": source.drives_record, "noise": estimated["noise"], "calibration": estimated}
     return labels, votes, counts, files
