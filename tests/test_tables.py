@@ -30,6 +30,7 @@ from valuemap.tables import (
     covariance_columns,
     covariance_matrices,
     read_table,
+    rows_in_runs,
     table_from_arrow,
     table_to_arrow,
     write_table,
@@ -144,6 +145,12 @@ def test_rows_can_be_taken_by_index_and_by_mask() -> None:
         by_index = table.take(np.array([1]))
         assert len(by_index) == 1
         assert_same_table(by_index, table.take(np.arange(len(table)) == 1))
+
+
+def test_runs_of_rows_follow_each_other() -> None:
+    assert rows_in_runs(np.array([5, 0, 9]), np.array([2, 0, 3])).tolist() == [5, 6, 9, 10, 11]
+    assert rows_in_runs(0, np.array([3, 0, 1, 2])).tolist() == [0, 1, 2, 0, 0, 1]
+    assert not len(rows_in_runs(np.empty(0, np.int64), np.empty(0, np.int64)))
 
 
 def test_optional_columns_are_none_where_they_are_not() -> None:

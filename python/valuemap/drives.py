@@ -28,7 +28,7 @@ import valuemap._core as _core
 from valuemap.arrow import no_texts, take_texts
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.dataset import Dataset, rows_of
-from valuemap.tables import Bools, Detections, Floats, Images, Ints
+from valuemap.tables import Bools, Detections, Floats, Images, Ints, rows_in_runs
 
 _MOST_CAMERAS = 16
 """More images of one camera and pass with one time than this are no rig: the time is a date, and tells no order."""
@@ -385,9 +385,8 @@ def _streams(shots: _Shots) -> Ints:
     name = np.unique(np.array(shots.names(tied)), return_inverse=True)[1]
     tied = tied[np.lexsort((name, stream[tied], group[tied]))]
     begins = np.concatenate([[True], (np.diff(group[tied]) != 0) | (np.diff(stream[tied]) != 0)])
-    at = np.arange(len(tied))
     rank = np.zeros(len(shots), np.int64)
-    rank[tied] = at - np.maximum.accumulate(np.where(begins, at, 0))
+    rank[tied] = _since(begins)
     return _by_first(stream * (int(rank.max()) + 1) + rank)
 
 
@@ -722,9 +721,7 @@ def _begins(values: Ints) -> Bools:
 
 def _since(begins: Bools) -> Ints:
     """Return how many rows (N) it is since the last one where something begins, as it does in the first."""
-    first = np.flatnonzero(begins)
-    count = np.diff(np.append(first, len(begins)))
-    return np.asarray(np.arange(len(begins)) - np.repeat(first, count))
+    return rows_in_runs(0, np.diff(np.append(np.flatnonzero(begins), len(begins))))
 
 
 def _runs(values: Ints) -> Ints:
@@ -739,8 +736,7 @@ def _is_a_way(place_m: Floats, group: Ints) -> Bools:
     windows are wide, goes ahead nearly everywhere.
     """
     runs = _runs(group)
-    within = np.arange(len(group)) - np.repeat(runs[:-1], np.diff(runs))
-    starts = np.flatnonzero(within % _WINDOW == 0)
+    starts = np.flatnonzero(rows_in_runs(0, np.diff(runs)) % _WINDOW == 0)
     if not len(starts):
         return np.empty(0, np.bool_)
     step_m = _steps_m(place_m)

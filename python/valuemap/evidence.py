@@ -24,7 +24,7 @@ from valuemap.drives import find_drives
 from valuemap.errors import InputError
 from valuemap.map_folder import Map
 from valuemap.nearby import Nearby
-from valuemap.tables import Bools, Floats, Ints
+from valuemap.tables import Bools, Floats, Ints, rows_in_runs
 
 PICTURES = "images"
 """The folder of a dataset that holds its pictures, where it has some."""
@@ -346,9 +346,7 @@ class Evidence:
         """Return which of some images each of their detections is in, 0 for the first, and the detections' rows."""
         order, starts = self._detections_of_image
         begin, count = starts[image_row], starts[image_row + 1] - starts[image_row]
-        before = np.cumsum(count) - count
-        place = np.arange(int(count.sum())) + np.repeat(begin - before, count)
-        return np.repeat(np.arange(len(image_row)), count), order[place]
+        return np.repeat(np.arange(len(image_row)), count), order[rows_in_runs(begin, count)]
 
     def _misses_at(self, image_row: Ints, point: Floats, *, class_name: str | None) -> Misses:
         detections = self.dataset.detections

@@ -277,6 +277,12 @@ class RejectedRows(Table):
     score: Floats = _column("float", ("score",), nullable=True)
 
 
+def rows_in_runs(first: Ints | int, count: Ints) -> Ints:
+    """Return the rows of runs (N) one after the other, of which each has so many rows from its `first` (N) on."""
+    before = np.cumsum(count) - count
+    return np.asarray(np.arange(int(count.sum())) + np.repeat(first - before, count), np.int64)
+
+
 @dataclass(frozen=True, eq=False)
 class Candidates:
     """Points with the rays that support them: what voting finds and merging makes into labels.
@@ -301,9 +307,9 @@ class Candidates:
 
     def take(self, rows: Ints) -> Candidates:
         """Return the candidates given by indices, with their voters."""
-        first, count = self.voter_offsets[rows], np.diff(self.voter_offsets)[rows]
+        count = np.diff(self.voter_offsets)[rows]
         offsets = np.concatenate([[0], np.cumsum(count)])
-        voters = self.voters[np.repeat(first - offsets[:-1], count) + np.arange(offsets[-1])]
+        voters = self.voters[rows_in_runs(self.voter_offsets[rows], count)]
         names = ("cluster", "covariance_m2", "existence", "expected", "class_code")
         columns = {name: _take(getattr(self, name), rows) for name in names}
         return Candidates(self.position_in_world_m[rows], offsets, voters, **columns)

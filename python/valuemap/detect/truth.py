@@ -9,7 +9,17 @@ from scipy.spatial import cKDTree
 
 from valuemap.cameras import camera_poses, lens_of
 from valuemap.dataset import rows_of
-from valuemap.tables import Bools, Cameras, Detections, Floats, Images, Ints, Truth, TruthDetections
+from valuemap.tables import (
+    Bools,
+    Cameras,
+    Detections,
+    Floats,
+    Images,
+    Ints,
+    Truth,
+    TruthDetections,
+    rows_in_runs,
+)
 
 _MAX_RANGE_M = 200.0
 _SLACK_PX = 4.0
@@ -41,8 +51,7 @@ def find_truth_detections(cameras: Cameras, images: Images, detections: Detectio
         # Every detection of an image with every object near it.
         count = (first[1:] - first[:-1])[image]
         pair = np.repeat(np.arange(len(image)), count)
-        step = np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
-        row = order[first[image[pair]] + step]
+        row = order[rows_in_runs(first[image], count)]
         away = np.abs(place_px[pair] - detections.center_px[row]) / (detections.size_px[row] + _SLACK_PX)
         is_shown = (away <= 1.0).all(axis=1) & same_class[detections.class_name.codes[row], known[pair]]
         distance = np.linalg.norm(away[is_shown], axis=1)

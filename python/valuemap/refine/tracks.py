@@ -10,7 +10,7 @@ import scipy
 from valuemap.refine.adjust import Groups
 from valuemap.refine.footage import Footage, Sigmas
 from valuemap.refine.residuals import FOCAL, Observations, State, linearised, poses_of, weights
-from valuemap.tables import Floats, Ints
+from valuemap.tables import Floats, Ints, rows_in_runs
 
 GATE_SIGMAS = 5.0
 """A detection farther than this from where an object should be seen does not show it."""
@@ -90,8 +90,7 @@ def _near(footage: Footage, point: Floats, class_code: Ints, range_m: float, ima
     image_of = footage.rays.image_row
     count = np.diff(begins)[image_of]
     detection = np.repeat(np.arange(len(image_of)), count)
-    place = np.arange(len(detection)) - np.repeat(np.cumsum(count) - count, count)
-    thing = thing[begins[image_of[detection]] + place]
+    thing = thing[rows_in_runs(begins[image_of], count)]
     fits = class_code[thing] == footage.rays.class_code[detection]
     return detection[fits], thing[fits]
 

@@ -14,7 +14,7 @@ from valuemap.simulate.routes import Route, route_at_random, routes_over_every_s
 from valuemap.simulate.rows import join_rows
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import Hills
-from valuemap.tables import Bools, Floats, Ints, Table
+from valuemap.tables import Bools, Floats, Ints, Table, rows_in_runs
 
 KEEP_RANGE = (0.7, 1.5)
 """How far `keep_before_signal_m` may be bent to meet an aimed number of detections."""
@@ -189,7 +189,7 @@ def _expose(
 
     standing = np.floor(wait_s / config.standing_interval_s).astype(np.int64)
     stop = np.repeat(np.arange(len(standing)), standing)
-    in_stop = np.arange(len(stop)) - np.repeat(np.cumsum(standing) - standing, standing)
+    in_stop = rows_in_runs(0, standing)
     standing_s = stop_at_m[stop] / config.speed_mps + waited_s[stop] + (in_stop + 0.5) * config.standing_interval_s
 
     distance_m, time_s = np.concatenate([moving_at_m, stop_at_m[stop]]), np.concatenate([moving_s, standing_s])

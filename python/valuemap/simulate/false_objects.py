@@ -14,7 +14,7 @@ from valuemap.simulate.rows import join_rows
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import Streets
 from valuemap.simulate.targets import Targets, class_of_false
-from valuemap.tables import Floats
+from valuemap.tables import Floats, rows_in_runs
 
 _BOX_HEIGHT_PX = (6.0, 40.0)
 _BOX_ASPECT = 0.4
@@ -69,7 +69,7 @@ def _reflect_in_camera(frames: Frames, config: SimulationConfig, seed: int, *cam
 
     of_box = np.repeat(np.arange(len(first)), length)
     count = len(of_box)
-    frame_row = first[of_box] + np.arange(count) - np.repeat(np.cumsum(length) - length, length)
+    frame_row = rows_in_runs(first, length)
     normal = random_stream(seed, "reflections", *camera, "center").standard_normal((count, 2))
     score = np.full(count, config.score_false)
     boxes = Boxes(

@@ -8,7 +8,7 @@ from valuemap.simulate.canvas import NEAR_M, Picture, View, far_to_near, fill, f
 from valuemap.simulate.houses import Fronts
 from valuemap.simulate.streams import hash01
 from valuemap.simulate.weather import Light
-from valuemap.tables import Bools, Floats, Ints
+from valuemap.tables import Bools, Floats, Ints, rows_in_runs
 
 _WINDOWS_M = 120.0
 _FRAMES_M = 70.0
@@ -91,7 +91,7 @@ def _windows(fronts: Fronts, view: View, is_seen: Bools) -> tuple[Ints, Ints, Fl
     columns, storeys = fronts.windows[rows].T
     counts = columns * storeys
     of = np.repeat(np.arange(len(rows)), counts)
-    number = np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts, counts)
+    number = rows_in_runs(0, counts)
     column, storey = number % columns[of], number // columns[of]
     # Shop windows below, and houses of different habits above.
     is_shop = storey == 0

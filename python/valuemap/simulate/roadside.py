@@ -11,7 +11,7 @@ from valuemap.simulate.rows import join_rows
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import DIRECTIONS, Streets
 from valuemap.simulate.targets import CLASSES, Targets
-from valuemap.tables import Floats, Ints
+from valuemap.tables import Floats, Ints, rows_in_runs
 
 _FREE_OF_CROSSING_M = 3.0
 """How far rows end before the houses at an intersection."""
@@ -64,7 +64,7 @@ def _signs(config: SimulationConfig, streets: Streets, random: np.random.Generat
     facing_rad = direction * (np.pi / 2.0) + np.pi + _SIGN_AIM_JITTER_RAD * random.uniform(-1.0, 1.0, rows)
     count = random.integers(config.min_row_signs, config.max_row_signs + 1, rows)
     row = np.repeat(np.arange(rows), count)
-    number = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
+    number = rows_in_runs(0, count)
     ahead = DIRECTIONS[direction[row]]
     right = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
     jitter_m = _SIGN_JITTER_M * random.uniform(-1.0, 1.0, (len(row), 3))

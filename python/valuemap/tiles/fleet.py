@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from valuemap.cameras import camera_centers
-from valuemap.drives import Drives, Usual, Ways, are_dates, driving_order
+from valuemap.drives import Drives, Usual, Ways, are_dates, connected, driving_order
 from valuemap.portions import DatasetReader
 from valuemap.progress import Progress
 from valuemap.tables import Bools, Categories, Floats, Images, Ints, TableWriter, join_tables, read_table
@@ -303,14 +303,7 @@ class _Passes:
 
     def _groups(self) -> Ints:
         """Return which passes (P) may be of one vehicle, by the lowest of them."""
-        lowest = np.arange(len(self.names))
-
-        def root(i: int) -> int:
-            while lowest[i] != i:
-                lowest[i] = lowest[lowest[i]]
-                i = int(lowest[i])
-            return i
-
+        pairs: list[Ints] = []
         width_m = np.linalg.norm(self.high_m - self.low_m, axis=1)
         driving = np.empty(0, np.int64)
         for here in np.argsort(self.first_s, kind="stable").tolist():
@@ -319,8 +312,7 @@ class _Passes:
             driving = driving[self.last_s[driving] >= self.first_s[here]]
             apart_m = np.maximum(self.low_m[driving] - self.high_m[here], self.low_m[here] - self.high_m[driving])
             near = driving[apart_m.max(axis=1) <= np.maximum(width_m[driving], width_m[here])]
-            for other in near.tolist():
-                one, two = sorted((root(here), root(other)))
-                lowest[two] = one
+            pairs.append(np.stack([np.full(len(near), here), near]))
             driving = np.append(driving, here)
-        return np.array([root(i) for i in range(len(lowest))], np.int64)
+        one, other = np.concatenate([np.empty((2, 0), np.int64), *pairs], axis=1)
+        return connected(one, other, len(self.names))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from valuemap.drives import InOrder
-from valuemap.tables import Ints
+from valuemap.tables import Ints, rows_in_runs
 
 
 def piece_of_rows(ordered: InOrder, rows: Ints) -> InOrder:
@@ -18,7 +18,7 @@ def piece_of_rows(ordered: InOrder, rows: Ints) -> InOrder:
     images, detections = ordered.dataset.images, ordered.dataset.detections
     first = ordered.first_detection[rows]
     count = ordered.first_detection[rows + 1] - first
-    detection_rows = np.repeat(first - (np.cumsum(count) - count), count) + np.arange(int(count.sum()))
+    detection_rows = rows_in_runs(first, count)
     drives, cameras = ordered.drives.take(rows), ordered.dataset.cameras
     return InOrder(
         replace(

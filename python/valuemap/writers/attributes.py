@@ -12,7 +12,7 @@ from valuemap.dataset import Dataset, rows_of_votes
 from valuemap.errors import InputError, OutputError
 from valuemap.geodesy import crs_from_lon_lat_height
 from valuemap.map_folder import Map
-from valuemap.tables import Floats, Ints, covariance_matrices, table_to_arrow
+from valuemap.tables import Floats, Ints, covariance_matrices, rows_in_runs, table_to_arrow
 
 if TYPE_CHECKING:
     import geopandas
@@ -265,6 +265,5 @@ def records(export: Export) -> list[dict[str, Any]]:
 
 def _rank_in_runs(values: Ints) -> Ints:
     """Return how many of a run of equal values (N) come before each."""
-    at = np.arange(len(values))
-    begins = np.diff(values, prepend=values[:1] - 1) != 0
-    return at - np.maximum.accumulate(np.where(begins, at, 0)) if len(at) else at
+    begins = np.flatnonzero(np.diff(values, prepend=values[:1] - 1))
+    return rows_in_runs(0, np.diff(np.append(begins, len(values))))
