@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.assignment import one_to_one
 from valuemap.cameras import camera_poses
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError
@@ -269,18 +270,8 @@ def _match(labels: _Labels, points: _Points, point: Ints, label: Ints, found: Ge
     square = np.einsum("ni,ni->n", apart, np.linalg.solve(total, apart[:, :, None])[:, :, 0])
     match = np.full(len(points.place_m), -1)
     fits = square < _GATE**2
-    if not fits.any():
-        return match
-    ours, i = np.unique(point[fits], return_inverse=True)
-    theirs, j = np.unique(label[fits], return_inverse=True)
-    from scipy.optimize import linear_sum_assignment  # As slow.
-
-    cost = np.full((len(ours), len(theirs) + len(ours)), 1e6)
-    cost[i, j] = square[fits]
-    cost[np.arange(len(ours)), len(theirs) + np.arange(len(ours))] = _GATE**2
-    for a, b in zip(*linear_sum_assignment(cost), strict=True):
-        if b < len(theirs):
-            match[ours[a]] = theirs[b]
+    ours, theirs = one_to_one(point[fits], label[fits], square[fits], _GATE**2)
+    match[ours] = theirs
     return match
 
 

@@ -19,7 +19,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from valuemap.assignment import one_to_one
 from valuemap.dataset import Dataset, Frame, evenly, rows_of
+from valuemap.drives import connected
 from valuemap.errors import InputError
 from valuemap.folders import new_file
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
@@ -479,31 +481,19 @@ def _shares_of_voters(decisions: Sequence[Decision], result: Map, dataset: Datas
 
 def _assign(cost: dict[tuple[int, int], float]) -> list[tuple[int, int]]:
     """Return pairs (claimant, row), each at most once, of the least total cost; to have none costs the gate."""
-    from scipy.optimize import linear_sum_assignment
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     if not cost:
         return []
     pairs = sorted(cost)
-    claimants, rows = sorted({c for c, _ in pairs}), sorted({r for _, r in pairs})
-    place_c, place_r = {c: i for i, c in enumerate(claimants)}, {r: i for i, r in enumerate(rows)}
-    ends = [place_c[c] for c, _ in pairs], [len(claimants) + place_r[r] for _, r in pairs]
-    nodes = len(claimants) + len(rows)
-    _, group = connected_components(coo_array((np.ones(len(pairs)), ends), shape=(nodes, nodes)), directed=False)
-    members: dict[int, list[tuple[int, int]]] = {}
-    for pair, first in zip(pairs, ends[0], strict=True):
-        members.setdefault(int(group[first]), []).append(pair)
-    assigned = []
-    for together in members.values():
-        mine, theirs = sorted({c for c, _ in together}), sorted({r for _, r in together})
-        matrix = np.full((len(mine), len(theirs) + len(mine)), 1e6)
-        matrix[np.arange(len(mine)), len(theirs) + np.arange(len(mine))] = ONE_PLACE_CHI2
-        for claimant, row in together:
-            matrix[mine.index(claimant), theirs.index(row)] = cost[claimant, row]
-        for i, j in zip(*linear_sum_assignment(matrix), strict=True):
-            if j < len(theirs):
-                assigned.append((mine[i], theirs[j]))
+    claimant, row = np.array(pairs, np.int64).T
+    price = np.array([cost[pair] for pair in pairs])
+    # What has nothing to do with each other is assigned by itself.
+    after = int(claimant.max()) + 1
+    group = connected(claimant, after + row, after + int(row.max()) + 1)[claimant]
+    order = np.argsort(group, kind="stable")
+    assigned: list[tuple[int, int]] = []
+    for together in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
+        mine, theirs = one_to_one(claimant[together], row[together], price[together], ONE_PLACE_CHI2)
+        assigned += zip(mine.tolist(), theirs.tolist(), strict=True)
     return assigned
 
 

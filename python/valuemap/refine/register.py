@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from valuemap.assignment import one_to_one
 from valuemap.refine.landmarks import Landmarks
 from valuemap.tables import Floats, Ints
 
@@ -265,16 +266,9 @@ def _match(
     square = np.einsum("ki,kij,kj->k", apart, np.linalg.inv(total), apart)
     fits = square < _GATE2
     mark, target, square = mark[fits], target[fits], square[fits]
-    if len(mark):
-        ours, i = np.unique(mark, return_inverse=True)
-        theirs, j = np.unique(target, return_inverse=True)
-        cost = np.full((len(ours), len(theirs) + len(ours)), 1e6)
-        cost[i, j] = square
-        cost[np.arange(len(ours)), len(theirs) + np.arange(len(ours))] = _GATE2
-        for a, b in zip(*scipy.optimize.linear_sum_assignment(cost), strict=True):
-            if b < len(theirs):
-                row = int(rows[ours[a]])
-                thing[row] = int(objects[theirs[b]])
-                known.join(int(thing[row]), row, shift[row])
+    for ours, theirs in zip(*one_to_one(mark, target, square, _GATE2), strict=True):
+        row = int(rows[ours])
+        thing[row] = objects[theirs]
+        known.join(int(thing[row]), row, shift[row])
     for row in rows[thing[rows] < 0].tolist():
         thing[row] = known.add(row, shift[row])
