@@ -40,6 +40,14 @@ def test_a_map_survives_writing_and_reading(result: Map, tmp_path: Path) -> None
         assert (tmp_path / "map" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
 
 
+def test_a_map_says_how_it_was_made() -> None:
+    settings = {"method": "paper", "min_votes": 4, "max_range_m": None}
+    result = map_of([], run={"settings": settings})
+    assert (result.method, result.setting("min_votes", 3.0)) == ("paper", 4.0)
+    assert [result.setting(name, 60.0) for name in ("max_range_m", "min_range_m", "method")] == [60.0] * 3
+    assert map_of([], run={"dataset": "city"}).method == "?"
+
+
 def test_the_labels_of_a_map_on_earth_are_a_layer(tmp_path: Path) -> None:
     write_map(MAPS[2], tmp_path / "map")
     layer = geopandas.read_parquet(tmp_path / "map" / "labels.parquet")

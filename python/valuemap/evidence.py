@@ -152,9 +152,7 @@ class Evidence:
     @cached_property
     def max_range_m(self) -> float:
         """How far away the map looked for objects."""
-        settings = self.result.run.get("settings")
-        value = settings.get("max_range_m") if isinstance(settings, dict) else None
-        return float(value) if isinstance(value, int | float) else USUAL_RANGE_M
+        return self.result.setting("max_range_m", USUAL_RANGE_M)
 
     def label_row(self, label_id: int) -> int:
         """Return the row of a label in the labels table.

@@ -94,6 +94,16 @@ class Map:
 
         return plot_map(self, dataset)
 
+    @property
+    def method(self) -> str:
+        """The name of the method that made the map; ? where its record does not say it."""
+        return str(self.run.get("settings", {}).get("method", "?"))
+
+    def setting(self, name: str, otherwise: float) -> float:
+        """Return a number that the run which made the map was set to, `otherwise` where its record has none."""
+        value = self.run.get("settings", {}).get(name)
+        return float(value) if isinstance(value, int | float) else otherwise
+
     def to_pandas(self) -> pd.DataFrame:
         """Return the labels as a data frame of pandas, with their columns on disk."""
         return self.labels.to_pandas()

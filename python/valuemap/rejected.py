@@ -158,13 +158,11 @@ def _thinned(cluster: Ints, code: Ints) -> Ints:
 
 def _hypotheses(evidence: Evidence, left: _LeftOver) -> Candidates:
     """Return the points that at least two images vote for; each detection votes for one at most."""
-    residual_px = evidence.result.votes.residual_px
-    gate_px = (
-        float(np.quantile(residual_px, _VOTES_SHARE)) if len(residual_px) else VoteConfig().max_reprojection_error_px
-    )
+    residual_px, usual = evidence.result.votes.residual_px, VoteConfig()
+    gate_px = float(np.quantile(residual_px, _VOTES_SHARE)) if len(residual_px) else usual.max_reprojection_error_px
     config = VoteConfig(
         max_reprojection_error_px=float(np.clip(gate_px, *_GATE_PX)),
-        min_parallax_deg=_setting(evidence, "min_parallax_deg", 2.0) / 4.0,
+        min_parallax_deg=evidence.result.setting("min_parallax_deg", usual.min_parallax_deg) / 4.0,
         min_range_m=0.0,
         max_range_m=_WIDER * evidence.max_range_m,
         min_vote_ratio=0.0,
@@ -203,14 +201,13 @@ def _judged(evidence: Evidence, left: _LeftOver, found: Candidates) -> _Verdicts
     point = np.repeat(position, np.diff(found.voter_offsets), axis=0)
     distance_m = np.linalg.norm(rays.center_in_world_m[voters] - point, axis=1)
     rival, is_same_class, sigmas = _labels_there(evidence, left, found)
-    settings = evidence.result.run.get("settings")
-    last = "ratio" if isinstance(settings, dict) and settings.get("method") == "paper" else "existence"
-    votes, min_votes = np.diff(found.voter_offsets), int(_setting(evidence, "min_votes", 3))
-    parallax_deg, least_deg = np.degrees(parallax_rad), _setting(evidence, "min_parallax_deg", 2.0)
+    result, usual = evidence.result, VoteConfig()
+    last = "ratio" if result.method == "paper" else "existence"
+    votes, min_votes = np.diff(found.voter_offsets), int(result.setting("min_votes", usual.min_votes))
+    parallax_deg, least_deg = np.degrees(parallax_rad), result.setting("min_parallax_deg", usual.min_parallax_deg)
     by_point = np.split(distance_m, found.voter_offsets[1:-1])
-    decisive = [
-        _decisive(of, _setting(evidence, "min_range_m", 2.0), evidence.max_range_m, min_votes) for of in by_point
-    ]
+    least_m = result.setting("min_range_m", usual.nearest_m)
+    decisive = [_decisive(of, least_m, evidence.max_range_m, min_votes) for of in by_point]
     range_m, limit_m = np.array(decisive).T
     largest = np.full(len(found), math.sqrt(ONE_PLACE_CHI2))
     tests = (
@@ -268,10 +265,3 @@ def _labels_there(evidence: Evidence, left: _LeftOver, found: Candidates) -> tup
             rival[row], sigmas[row] = labels.label_id[best], math.sqrt(max(float(apart.min()), 0.0))
             is_same[row] = labels.class_name.names[labels.class_name.codes[best]] == names.names[names.codes[row]]
     return rival, is_same, sigmas
-
-
-def _setting(evidence: Evidence, name: str, otherwise: float) -> float:
-    """Return a number that the run which made the map was set to."""
-    settings = evidence.result.run.get("settings")
-    value = settings.get(name) if isinstance(settings, dict) else None
-    return float(value) if isinstance(value, int | float) else otherwise

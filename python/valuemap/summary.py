@@ -60,7 +60,7 @@ def summarize_map(result: Map) -> dict[str, Any]:
     labels, counts = result.labels, result.run.get("counts", {})
     facts: dict[str, Any] = {
         "map_of": result.run.get("dataset", "?"),
-        "method": result.run.get("settings", {}).get("method", "?"),
+        "method": result.method,
         "frame": result.frame.to_json(),
         "labels": len(labels),
         "classes": _classes(labels.class_name),

@@ -59,8 +59,9 @@ def true_objects(truth: Dataset | Truth | str | Path, result: Map, min_parallax_
     """Return the objects of a dataset, a table, a folder or a file in the frame of a map; raises as `evaluate_map`."""
     source = read_truth(Path(truth), result) if isinstance(truth, str | Path) else truth
     if isinstance(source, Dataset):
-        angle = _min_parallax_of(result) if min_parallax_rad is None else min_parallax_rad
-        return _objects_of_dataset(source, result.frame, angle)
+        if min_parallax_rad is None:
+            min_parallax_rad = math.radians(result.setting("min_parallax_deg", VoteConfig().min_parallax_deg))
+        return _objects_of_dataset(source, result.frame, min_parallax_rad)
     if isinstance(source, Truth):
         return TrueObjects(source.object_id, source.position_in_world_m, source.class_name)
     return source
@@ -99,12 +100,6 @@ def read_objects(path: Path, result: Map) -> TrueObjects:
         assert result.frame.anchor is not None
         return _objects_on_earth(found.objects, result.frame.anchor, result.labels, found.notes)
     return _sorted_objects(found.objects, found.objects.position_in_world_m, found.notes)
-
-
-def _min_parallax_of(result: Map) -> float:
-    settings = result.run.get("settings")
-    degrees = settings.get("min_parallax_deg") if isinstance(settings, dict) else None
-    return math.radians(degrees if isinstance(degrees, int | float) else VoteConfig().min_parallax_deg)
 
 
 def _objects_of_dataset(dataset: Dataset, frame: Frame, min_parallax_rad: float) -> TrueObjects:

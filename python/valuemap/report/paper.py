@@ -54,7 +54,7 @@ class ReportTable:
 
 def paper_tables(result: Map, dataset: Dataset, evaluation: Evaluation | None) -> list[ReportTable]:
     """Return Tables I, II and III of the paper with a column of our own."""
-    radius_m = _cluster_radius_m(result)
+    radius_m = result.setting("cluster_radius_m", PartitionConfig().cluster_radius_m)
     cluster = partition_images(dataset.images, PartitionConfig(radius_m)).astype(np.int64)
     clusters = int(cluster.max()) + 1
     tables = [
@@ -64,12 +64,6 @@ def paper_tables(result: Map, dataset: Dataset, evaluation: Evaluation | None) -
     if evaluation is not None:
         tables.append(_table_3(dataset.name, result, evaluation))
     return tables
-
-
-def _cluster_radius_m(result: Map) -> float:
-    settings = result.run.get("settings")
-    value = settings.get("cluster_radius_m") if isinstance(settings, dict) else None
-    return float(value) if isinstance(value, int | float) else PartitionConfig().cluster_radius_m
 
 
 def _table_1(

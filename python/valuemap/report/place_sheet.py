@@ -241,8 +241,7 @@ def _about_rays(evidence: Evidence, point: Floats, passing: PassingRays, looks: 
 
 def _missing(evidence: Evidence, passing: PassingRays, free: Ints, images: int) -> list[str]:
     """Say which plain test the detections that are left over fail."""
-    settings = evidence.result.run.get("settings")
-    settings = settings if isinstance(settings, dict) else {}
+    settings = evidence.result.run.get("settings", {})
     reasons = []
     least = settings.get("min_votes")
     if isinstance(least, int | float) and images < least:

@@ -216,12 +216,10 @@ def _name(result: Map, dataset: Dataset | None) -> str:
 
 
 def _summary(result: Map, dataset: Dataset | None) -> str:
-    settings = result.run.get("settings")
-    method = settings.get("method", "?") if isinstance(settings, dict) else "?"
     of_what = (
         f" of {len(dataset.detections):,} detections in {len(dataset.images):,} images" if dataset is not None else ""
     )
-    return f"Map{of_what}, by valuemap {result.run.get('valuemap', '?')}, method {method}"
+    return f"Map{of_what}, by valuemap {result.run.get('valuemap', '?')}, method {result.method}"
 
 
 def _in_short(result: Map, dataset: Dataset | None, evaluation: Evaluation | None) -> Iterable[tuple[str, str]]:

@@ -122,7 +122,7 @@ def part_of_map(result: Map, folder: Path) -> tuple[Map, Dataset]:
     census = Census.of(rows.grid, place_m, labels.votes)
     chosen = np.flatnonzero(is_sampled(rows.grid, census, place_m, LARGEST_PART))
     votes = result.votes.take(np.isin(result.votes.label_id, labels.label_id[chosen]))
-    reach_m = float(result.run.get("settings", {}).get("max_range_m") or USUAL_RANGE_M)
+    reach_m = result.setting("max_range_m", USUAL_RANGE_M)
     is_part = Nearby(place_m[chosen]).have_any(rows.place_m, reach_m)
     dataset = rows.part(is_part | np.isin(rows.image_id, votes.image_id))
     note = (
