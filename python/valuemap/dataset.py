@@ -199,18 +199,17 @@ def read_dataset(path: str | Path, *, are_boxes_checked: bool = True) -> Dataset
         A table is missing, damaged or inconsistent; the message names file, row and what to do.
     """
     folder = Path(path)
-    head = read_head(folder)
+    name, frame = read_head(folder)
     optional = {
-        name: read_table(kind, folder / f"{name}.parquet") if (folder / f"{name}.parquet").is_file() else None
-        for name, kind in (("truth", Truth), ("truth_detections", TruthDetections), ("rejected", RejectedRows))
+        table: read_table(kind, folder / f"{table}.parquet") if (folder / f"{table}.parquet").is_file() else None
+        for table, kind in (("truth", Truth), ("truth_detections", TruthDetections), ("rejected", RejectedRows))
     }
-    frame = Frame.from_json(head.get("frame"), source=str(folder / MARKER))
     cameras = read_table(Cameras, folder / "cameras.parquet")
     with ThreadPoolExecutor(1) as beside:
         detections = beside.submit(read_table, Detections, folder / "detections.parquet")
         images = read_table(Images, folder / "images.parquet")
         dataset = Dataset(
-            name=str(head.get("name", folder.name)),
+            name=name,
             frame=frame,
             cameras=cameras,
             images=images,
@@ -410,8 +409,8 @@ def number_passes(images: Images) -> Ints:
     return number[inverse]
 
 
-def read_head(folder: Path) -> dict[str, Any]:
-    """Return what dataset.json holds; raises `InputError` where the folder is no dataset."""
+def read_head(folder: Path) -> tuple[str, Frame]:
+    """Return the name and the frame of a dataset; raises `InputError` where the folder is none."""
     path = folder / MARKER
     settle(folder)
     if not path.is_file():
@@ -429,7 +428,7 @@ def read_head(folder: Path) -> dict[str, Any]:
             f"{path}: format_version: expected {FORMAT_VERSION}, found {found}",
             hint="import the data again with this version of valuemap",
         )
-    return head
+    return str(head.get("name", folder.name)), Frame.from_json(head.get("frame"), source=str(path))
 
 
 def check_cameras(cameras: Cameras, source: str) -> None:

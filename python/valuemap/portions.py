@@ -13,9 +13,7 @@ import pyarrow.parquet as pq
 
 from valuemap.arrow import numbers_from_arrow
 from valuemap.dataset import (
-    MARKER,
     Dataset,
-    Frame,
     check_cameras,
     check_detections,
     check_images,
@@ -40,9 +38,7 @@ class DatasetReader:
 
     def __init__(self, folder: Path, *, rows: int | None = None) -> None:
         self.folder, self.rows = folder, rows or ROWS
-        head = read_head(folder)
-        self.name = str(head.get("name", folder.name))
-        self.frame = Frame.from_json(head.get("frame"), source=str(folder / MARKER))
+        self.name, self.frame = read_head(folder)
         self.cameras = read_table(Cameras, folder / "cameras.parquet")
         check_cameras(self.cameras, str(folder))
         _check_unique(Images, folder / "images.parquet", self.rows)

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from valuemap.cli.app import app
-from valuemap.cli.options import AsJson
+from valuemap.cli.options import AsJson, MapFolder, Radius, SeenWithin, TruthSigma
 from valuemap.cli.show import evaluation_rows, show, show_notes
 from valuemap.evaluate import ChanceFloor, Evaluation, PositionalAccuracy, evaluate_map
 from valuemap.map_folder import read_map
@@ -18,19 +18,14 @@ from valuemap.map_folder import read_map
 
 @app.command("evaluate")
 def evaluate_command(
-    map_: Annotated[Path, typer.Argument(metavar="MAP", help="Folder that valuemap map wrote.")],
+    map_: MapFolder,
     truth: Annotated[Path, typer.Option(help="A dataset with truth, or a file of objects with x, y, z.")],
-    radius: Annotated[float, typer.Option(help="Metres within which a label can be an object.")] = 2.0,
-    truth_sigma: Annotated[
-        float | None,
-        typer.Option(metavar="M", help="Standard deviation of the true positions on each axis, in metres."),
-    ] = None,
+    radius: Radius = 2.0,
+    truth_sigma: TruthSigma = None,
     images: Annotated[
         Path | None, typer.Option(metavar="DATASET", help="The dataset of the map, where the truth is a file.")
     ] = None,
-    seen_within: Annotated[
-        float | None, typer.Option(metavar="M", help="Objects farther than this from every image do not count.")
-    ] = None,
+    seen_within: SeenWithin = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare a map with known objects: counts, an accuracy statement, completeness, and what chance would give."""

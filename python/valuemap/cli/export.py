@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from valuemap.cli.app import app
-from valuemap.cli.options import Force, Vertical
+from valuemap.cli.options import Force, MapFolder, Vertical
 from valuemap.cli.show import log, show_notes
 from valuemap.dataset import Dataset, read_dataset, rows_of_votes
 from valuemap.errors import InputError
@@ -29,7 +29,7 @@ _SHOWN_IDS = 10
     "export", help=f"Write the labels of a map as one file ({', '.join(SUFFIXES)}) or into PostGIS (postgresql://...)."
 )
 def export_command(
-    map_: Annotated[Path, typer.Argument(metavar="MAP", help="Folder that valuemap map wrote.")],
+    map_: MapFolder,
     target: Annotated[
         str, typer.Argument(metavar="FILE|URL", help="File to write, whose suffix says the format, or a database.")
     ],

@@ -20,6 +20,7 @@ from valuemap.cli.options import (
     RayAddress,
     Resume,
     Settings,
+    Threads,
     TileSize,
     Work,
 )
@@ -27,7 +28,7 @@ from valuemap.cli.show import log, progress_bars, show, show_notes
 from valuemap.cli.working import working
 from valuemap.config import MapConfig
 from valuemap.control import apply_control
-from valuemap.dataset import MARKER, Dataset, Frame, read_dataset, read_head
+from valuemap.dataset import Dataset, read_dataset, read_head
 from valuemap.engine.choose import engine_named
 from valuemap.errors import SettingError
 from valuemap.evaluate import evaluate_map
@@ -48,7 +49,7 @@ def map_command(
     dataset: Annotated[Path, typer.Argument(help="Folder that an import or simulate command wrote.")],
     out: Annotated[Path, typer.Option("--out", help="Folder to write the map to.")],
     method: MethodName = DEFAULT_METHOD,
-    threads: Annotated[int, typer.Option(min=0, help="Threads, 0 for one per core; the map is the same.")] = 0,
+    threads: Threads = 0,
     picture: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw the map from above, as .png or .svg.")
     ] = None,
@@ -98,8 +99,7 @@ def map_command(
         check_poses_place(write_poses_to, force=force)
     if control is not None:
         check_objects_file(control, "control points")
-        head = read_head(dataset)
-        read_objects_file(control, Frame.from_json(head.get("frame"), source=str(dataset / MARKER)))
+        read_objects_file(control, read_head(dataset)[1])
     given = None if calibration is None else read_calibration(calibration)
     with working(work, out, resume=resume) as place, progress_bars() as progress:
         run = Run(

@@ -9,6 +9,22 @@ import typer
 
 from valuemap.config import MapConfig, Method
 
+MapFolder = Annotated[Path, typer.Argument(metavar="MAP", help="Folder that valuemap map wrote.")]
+DatasetOfMap = Annotated[
+    Path | None, typer.Option("--dataset", help="What the map was made from; default: where valuemap map found it.")
+]
+TruthSigma = Annotated[
+    float | None,
+    typer.Option(
+        "--truth-sigma", metavar="M", help="Standard deviation of the true positions on each axis, in metres."
+    ),
+]
+SeenWithin = Annotated[
+    float | None,
+    typer.Option("--seen-within", metavar="M", help="Objects farther than this from every image do not count."),
+]
+Radius = Annotated[float, typer.Option("--radius", help="Metres within which a label can be an object.")]
+Threads = Annotated[int, typer.Option("--threads", min=0, help="Threads, 0 for one per core; the map is the same.")]
 DatasetOut = Annotated[Path, typer.Option("--out", help="Folder to write the dataset to.")]
 Up = Annotated[
     tuple[float, float, float] | None,

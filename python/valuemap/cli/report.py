@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from valuemap.cli.app import app
-from valuemap.cli.options import Force
+from valuemap.cli.options import DatasetOfMap, Force, MapFolder, Radius, SeenWithin, TruthSigma
 from valuemap.cli.show import log, progress_bars
 from valuemap.dataset import read_dataset
 from valuemap.errors import OutputError
@@ -20,11 +20,9 @@ from valuemap.tiles.part import is_large, part_of_map
 
 @app.command("report")
 def report_command(
-    map_: Annotated[Path, typer.Argument(metavar="MAP", help="Folder that valuemap map wrote.")],
+    map_: MapFolder,
     out: Annotated[Path, typer.Option("--out", help="HTML file; figures and tables go into a folder beside it.")],
-    dataset: Annotated[
-        Path | None, typer.Option(help="What the map was made from; default: where valuemap map found it.")
-    ] = None,
+    dataset: DatasetOfMap = None,
     truth: Annotated[
         Path | None, typer.Option(help="A dataset with truth, or a file of objects; default: the dataset's own truth.")
     ] = None,
@@ -32,14 +30,9 @@ def report_command(
         Path | None, typer.Option(help="What valuemap experiment passes wrote: recall and errors by number of passes.")
     ] = None,
     force: Force = False,
-    radius: Annotated[float, typer.Option(help="Metres within which a label can be an object.")] = 2.0,
-    truth_sigma: Annotated[
-        float | None,
-        typer.Option(metavar="M", help="Standard deviation of the true positions on each axis, in metres."),
-    ] = None,
-    seen_within: Annotated[
-        float | None, typer.Option(metavar="M", help="Objects farther than this from every image do not count.")
-    ] = None,
+    radius: Radius = 2.0,
+    truth_sigma: TruthSigma = None,
+    seen_within: SeenWithin = None,
 ) -> None:
     """Make one page of everything about a map: labels to click, figures, tables. It needs no network and no server."""
     from valuemap.experiment import read_passes

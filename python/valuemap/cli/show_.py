@@ -11,7 +11,7 @@ import typer
 
 from valuemap.anchor import is_place
 from valuemap.cli.app import app
-from valuemap.cli.options import AsJson, Force
+from valuemap.cli.options import AsJson, DatasetOfMap, Force, MapFolder
 from valuemap.cli.show import log, out, show
 from valuemap.dataset import read_dataset
 from valuemap.errors import InputError, SettingError
@@ -28,7 +28,7 @@ _FARTHEST_M = 1e9
 
 @app.command("show")
 def show_command(
-    map_: Annotated[Path, typer.Argument(metavar="MAP", help="Folder that valuemap map wrote.")],
+    map_: MapFolder,
     label: Annotated[int | None, typer.Argument(metavar="[LABEL]", help="Id of a label.", show_default=False)] = None,
     at: Annotated[
         tuple[float, float] | None,
@@ -42,9 +42,7 @@ def show_command(
     file: Annotated[
         Path | None, typer.Option("--out", help="Picture to write, .png or .svg; default: label-ID.png or place.png.")
     ] = None,
-    dataset: Annotated[
-        Path | None, typer.Option(help="What the map was made from; default: where valuemap map found it.")
-    ] = None,
+    dataset: DatasetOfMap = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:

@@ -10,7 +10,7 @@ import typer
 
 from valuemap import map_folder
 from valuemap.cli.app import app
-from valuemap.cli.options import AsJson, EngineName, Force, RayAddress, Resume, TileSize, Work
+from valuemap.cli.options import AsJson, EngineName, Force, RayAddress, Resume, Threads, TileSize, Work
 from valuemap.cli.show import log, progress_bars, show, show_notes
 from valuemap.cli.working import working
 from valuemap.engine.choose import engine_named
@@ -29,7 +29,7 @@ def update_command(
     dataset: Annotated[
         Path | None, typer.Option(help="Dataset of the map. Default: where the map says that it is.")
     ] = None,
-    threads: Annotated[int, typer.Option(min=0, help="Threads, 0 for one per core; the map is the same.")] = 0,
+    threads: Threads = 0,
     tile_size: TileSize = None,
     engine: EngineName = "threads",
     ray_address: RayAddress = None,

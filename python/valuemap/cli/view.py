@@ -10,12 +10,13 @@ from typing import Annotated
 import typer
 
 from valuemap.cli.app import app
+from valuemap.cli.options import MapFolder
 from valuemap.cli.show import log, show_notes
 
 
 @app.command("view")
 def view_command(
-    map_: Annotated[Path, typer.Argument(metavar="MAP", help="Folder that valuemap map wrote.")],
+    map_: MapFolder,
     dataset: Annotated[
         Path | None, typer.Option(help="The dataset of the map; default: found by itself, or not shown.")
     ] = None,

@@ -60,7 +60,7 @@ def _say(facts: Mapping[str, Any], left_out: Mapping[str, Any], *, as_json: bool
 def finish_dataset_of_pieces(out: Path, *, as_json: bool) -> None:
     """Say how large a dataset is that was written in pieces, as it may not fit into memory."""
     images, detections = rows_on_disk(out)
-    facts = {"dataset": read_head(out)["name"], "images": images, "detections": detections}
+    facts = {"dataset": read_head(out)[0], "images": images, "detections": detections}
     if as_json:
         print(json.dumps(facts, indent=2))
     else:
