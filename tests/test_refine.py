@@ -267,6 +267,12 @@ def errors(dataset: Dataset, clean: Dataset) -> tuple[float, float]:
     return float(np.sqrt(np.mean(off_m**2))), float(np.sqrt(np.mean(turn[:, 1] ** 2)))
 
 
+def test_segments_begin_where_drives_are_cut() -> None:
+    segments = Segments.at([(1, 0), (0, 4), (0, 0), (0, 4)])
+    assert segments.cuts() == [(0, 0), (0, 4), (1, 0)]
+    assert segments.of(np.array([0, 0, 0, 1]), np.array([0, 3, 4, 9])).tolist() == [0, 0, 1, 2]
+
+
 def test_a_city_without_faults_stays_bit_for_bit() -> None:
     refined = watched(0.0).refined
     assert refined.dataset is watched(0.0).city

@@ -51,7 +51,7 @@ def without_aliases(footage: Footage, found: Estimate, range_m: float) -> Estima
         offset[segment] = value
     moved = np.isin(of_image, list(back))
     stays = ~moved[footage.rays.image_row[found.detection]]
-    state = _at_rest(replace(found.state, constants=(offset, *found.state.constants[1:])), footage, moved)
+    state = _at_rest(found.state.with_offset(offset), footage, moved)
     kept = replace(found, detection=found.detection[stays], thing=found.thing[stays], state=state)
     return associated(footage, kept, range_m)
 
@@ -109,9 +109,9 @@ class _Witnesses:
         best, at, seen = -1.0, offset, self.seen
         images = np.flatnonzero(self.of_image == self.segment)
         for _ in range(_ROUNDS + 1):
-            constants = seen.state.constants[OFFSET].copy()
-            constants[self.segment] = at
-            state = replace(seen.state, constants=(constants, *seen.state.constants[1:]))
+            offsets = seen.state.constants[OFFSET].copy()
+            offsets[self.segment] = at
+            state = seen.state.with_offset(offsets)
             detection, thing, square = associate(
                 self.footage, state, seen.class_code, seen.size_m, self.of_image, seen.sigma_px, self.range_m, images
             )

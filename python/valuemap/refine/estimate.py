@@ -271,7 +271,7 @@ def _first_segments(
 ) -> tuple[Segments, Floats]:
     """Return the segments and offsets (L, 3) that jumps and registered shifts of landmarks along the drives suggest."""
     drives = footage.drives
-    cuts = [*zip(seen_cuts.drive.tolist(), seen_cuts.begins.tolist(), strict=True)]
+    cuts = seen_cuts.cuts()
     for drive in range(drives.count):
         rows = np.flatnonzero(landmarks.drive == drive)
         rows = rows[np.argsort(landmarks.driven_m[rows], kind="stable")]
@@ -283,8 +283,7 @@ def _first_segments(
             after = images[drives.driven_m[images] >= at_m]
             if len(after):
                 cuts.append((drive, int(drives.order[after].min())))
-    both = np.unique(np.array(cuts, dtype=np.int64), axis=0)
-    segments = Segments(both[:, 0], both[:, 1])
+    segments = Segments.at(cuts)
     # A landmark is in the segment of most of its voters.
     image = footage.rays.image_row[landmarks.voters]
     segment = segments.of(drives.pass_code[image], drives.order[image])
@@ -301,12 +300,8 @@ def _first_segments(
 
 def _added(segments: Segments, offset: Floats, known: Segments, known_offset: Floats) -> tuple[Segments, Floats]:
     """Return the segments that both have cut, with both offsets (L, 3) added."""
-    both = np.unique(
-        np.stack([np.append(segments.drive, known.drive), np.append(segments.begins, known.begins)]), axis=1
-    )
-    drive, begins = both[0], both[1]
-    total = offset[segments.of(drive, begins)] + known_offset[known.of(drive, begins)]
-    return Segments(drive, begins), total
+    both = Segments.at(cut for of in (segments, known) for cut in of.cuts())
+    return both, offset[segments.of(both.drive, both.begins)] + known_offset[known.of(both.drive, both.begins)]
 
 
 def _objects(landmarks: Landmarks, registration: Registration) -> tuple[Ints, Ints, Floats, Floats]:
@@ -366,56 +361,65 @@ def _cut(footage: Footage, now: Estimate, told: Trajectories) -> Estimate:
     Jumps that trajectories prove are taken back first. They stay cuts; where one more cut pays there, the jump is
     another one than the trajectory says.
     """
-    state, segments, jumps = now.state, now.segments, told.jumps
+    state, jumps = now.state, told.jumps
     shift, information, image_of = apparent_shift(footage, seen_by(footage, now), state)
-    drives = footage.drives
+    drives, offset_now = footage.drives, state.constants[OFFSET]
     begins: list[tuple[int, int]] = []
     offsets: list[Floats] = []
     refuted: set[tuple[int, int]] = set()
-    segment_now = segments_of(footage, segments)
+    segment_now = segments_of(footage, now.segments)
     for drive in range(drives.count):
         rows = np.flatnonzero(drives.pass_code[image_of] == drive)
         rows = rows[np.argsort(drives.order[image_of[rows]], kind="stable")]
-        known = np.flatnonzero(jumps.segments.drive == drive)
         if not len(rows):
-            old = np.flatnonzero(segments.drive == drive)[:1]
+            old = np.flatnonzero(now.segments.drive == drive)[:1]
             begins.append((drive, 0))
-            offsets.append(state.constants[0][old[0]] if len(old) else np.zeros(3))
+            offsets.append(offset_now[old[0]] if len(old) else np.zeros(3))
             continue
-        order = drives.order[image_of[rows]]
-        mended = jumps.offset_m[jumps.segments.of(np.full(len(rows), drive), order), :2]
-        value = shift[rows, :2] - mended
-        precision = np.linalg.inv(np.linalg.inv(information[rows])[:, :2, :2])
-        cut_at = told.seen_cuts.of(drives.pass_code[image_of[rows]], order)
-        is_shown = np.diff(cut_at, prepend=cut_at[0]) != 0
-        starts = cut_into_segments(value, precision, prices(told.hints.between(drive, order), is_shown))
-        cuts: dict[int, Floats] = {}
-        for number, start in enumerate(starts):
-            end = starts[number + 1] if number + 1 < len(starts) else len(rows)
-            total = precision[start:end].sum(axis=0) + np.eye(2) / WIDE.constant[0] ** 2
-            middle = np.linalg.solve(total, np.einsum("nij,nj->i", precision[start:end], value[start:end]))
-            vertical = state.constants[0][segment_now[image_of[rows[start:end]]], 2]
-            first = 0
-            if number > 0:
-                between = jumps.segments.begins[known]
-                between = between[(between > order[start - 1]) & (between <= order[start])]
-                refuted |= {(drive, int(begin)) for begin in between}
-                first = int(between[-1]) if len(between) else int(order[start])
-            cuts[first] = np.append(middle, np.median(vertical))
+        order, known = drives.order[image_of[rows]], jumps.segments.begins[jumps.segments.drive == drive]
+        height_m = offset_now[segment_now[image_of[rows]], 2]
+        pieces, wrong = _pieces(drive, order, shift[rows, :2], information[rows], height_m, known, told)
+        refuted |= {(drive, begin) for begin in wrong}
         # Pieces hold what is left of the offsets once jumps are taken back.
-        pieces = np.array(sorted(cuts))
-        for begin in sorted({*cuts, *jumps.segments.begins[known].tolist()}):
-            left = cuts[int(pieces[np.searchsorted(pieces, begin, side="right") - 1])]
+        first = np.array(sorted(pieces))
+        for begin in sorted({*pieces, *known.tolist()}):
+            left = pieces[int(first[np.searchsorted(first, begin, side="right") - 1])]
             back = jumps.offset_m[jumps.segments.of(np.array([drive]), np.array([begin]))[0]]
             begins.append((drive, begin))
             offsets.append(left + back)
-    both = np.array(begins, dtype=np.int64)
-    new = Segments(both[:, 0], both[:, 1])
-    constants = (np.array(offsets), *state.constants[1:])
+    new = Segments.at(begins)
     drift = state.drift.copy()
     drift[:, :3] = 0.0
-    state = replace(state, constants=constants, drift=drift)
+    state = replace(state.with_offset(np.array(offsets)), drift=drift)
     return replace(now, segments=new, links=jumps.links(new, refuted), state=state)
+
+
+def _pieces(
+    drive: int, order: Ints, shift_m: Floats, information: Floats, height_m: Floats, known: Ints, told: Trajectories
+) -> tuple[dict[int, Floats], list[int]]:
+    """Return what is left of the offset (3) of each piece of a drive, by where it begins, and jumps that are refuted.
+
+    Its images (N), in their `order`, put it so far off on the ground (N, 2), with information (N, 3, 3), and in height
+    (N). Jumps begin where they are `known`: a piece that begins where one does refutes it.
+    """
+    of_drive = np.full(len(order), drive)
+    value = shift_m - told.jumps.offset_m[told.jumps.segments.of(of_drive, order), :2]
+    precision = np.linalg.inv(np.linalg.inv(information)[:, :2, :2])
+    cut_at = told.seen_cuts.of(of_drive, order)
+    is_shown = np.diff(cut_at, prepend=cut_at[0]) != 0
+    starts = cut_into_segments(value, precision, prices(told.hints.between(drive, order), is_shown))
+    pieces: dict[int, Floats] = {}
+    refuted: list[int] = []
+    for start, end in zip(starts, [*starts[1:], len(order)], strict=True):
+        total = precision[start:end].sum(axis=0) + np.eye(2) / WIDE.constant[OFFSET] ** 2
+        middle = np.linalg.solve(total, np.einsum("nij,nj->i", precision[start:end], value[start:end]))
+        begin = 0
+        if start > 0:
+            between = known[(known > order[start - 1]) & (known <= order[start])].tolist()
+            refuted += between
+            begin = between[-1] if between else int(order[start])
+        pieces[begin] = np.append(middle, np.median(height_m[start:end]))
+    return pieces, refuted
 
 
 def apparent_shift(footage: Footage, seen: Observations, state: State) -> tuple[Floats, Floats, Ints]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -97,6 +97,16 @@ class Segments:
     def __len__(self) -> int:
         return len(self.drive)
 
+    @classmethod
+    def at(cls, cuts: Iterable[tuple[int, int]]) -> Segments:
+        """Return those that begin at some places (drive, order), each named once or more, in any order."""
+        drive, begins = np.array(sorted(set(cuts)), np.int64).reshape(-1, 2).T
+        return cls(drive, begins)
+
+    def cuts(self) -> list[tuple[int, int]]:
+        """Return where they begin: drive and order."""
+        return list(zip(self.drive.tolist(), self.begins.tolist(), strict=True))
+
     def of(self, drive: Ints, order: Ints) -> Ints:
         """Return the segment (N) of images, by drive and order."""
         reach = int(max(order.max(initial=0), self.begins.max(initial=0))) + 2
@@ -142,8 +152,7 @@ def find_jumps(dataset: Dataset, drives: Drives) -> Segments:
         usual = float(np.median(np.linalg.norm(steps.unexpected_m(steps.before_mps, steps.after_mps), axis=1)))
         far = outside > max(_SIGMAS * usual / 1.5, _LEAST_M)
         cuts += [(track.drive, int(order)) for order in track.order[steps.row[far]]]
-    both = np.unique(np.array(cuts, dtype=np.int64), axis=0)
-    return Segments(both[:, 0], both[:, 1])
+    return Segments.at(cuts)
 
 
 def find_hints(dataset: Dataset, drives: Drives) -> Hints:
@@ -194,7 +203,7 @@ def mend(dataset: Dataset, drives: Drives) -> Jumps:
         cuts += [(drive, 0), *((drive, int(begin)) for begin in begins)]
         offsets.append(np.column_stack([offset, np.zeros(len(offset))]))
         told += [(drive, *jump) for jump in jumps]
-    both = np.array(cuts, dtype=np.int64)
+    both = np.array(cuts, dtype=np.int64)  # As offsets are: what jumps twice in one place is there twice.
     return Jumps(
         Segments(both[:, 0], both[:, 1]),
         np.concatenate(offsets),

@@ -46,6 +46,8 @@ _GATE2 = 12.0
 """Squared distance in sigmas within which a landmark is an object; 0.993 of chi-squared with three degrees."""
 _SAME_SIZE = 1.6
 """A landmark that is higher or lower than an object by more than this factor is another thing."""
+_AT_ONCE = 2_000_000
+"""Pairs and shifts that are looked at together: 48 MB."""
 _ROUNDS = 2
 """Times that each drive is laid anew onto what all others see."""
 
@@ -184,6 +186,10 @@ def _compatible(rows: Ints, near: list[list[int]], objects: Ints, known: _Object
     return first[fits], second[fits]
 
 
+_SIDE = 2 * round(_REACH_M / _CELL_M) + 1
+"""Cells of the grid of shifts, each way."""
+
+
 def _chain(
     rows: Ints,
     pairs: tuple[Ints, Ints],
@@ -194,57 +200,72 @@ def _chain(
     price: Floats,
 ) -> Floats:
     """Return the likeliest shifts (N, 3) of landmarks by the way driven: Viterbi over a grid of the ground."""
-    steps = np.arange(-round(_REACH_M / _CELL_M), round(_REACH_M / _CELL_M) + 1) * _CELL_M
-    side = len(steps)
-    grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+    steps_m = (np.arange(_SIDE) - _SIDE // 2) * _CELL_M
+    grid_m = np.stack(np.meshgrid(steps_m, steps_m, indexing="ij"), axis=-1).reshape(-1, 2)
     mark, target = pairs
     # What the grid does not move is the height: it is left free up to what passes for it.
     total = covariance[rows[mark]] + spread[target] + np.diag([_SMOOTH_M**2, _SMOOTH_M**2, _HEIGHT_M**2])
-    apart = place[target] - point[rows[mark]]
-    evidence = np.zeros((len(rows), side * side))
-    weight = np.linalg.inv(total)
-    around = np.bincount(mark, minlength=len(rows))
-    volume_m3 = math.pi * _AROUND_M**2 * _HIGH_M
-    height = _SHARED * volume_m3 / around[mark] / np.sqrt(np.linalg.det(2.0 * np.pi * total))
-    block = max(1, 2_000_000 // (side * side))
-    for start in range(0, len(mark), block):
-        part = slice(start, start + block)
-        left = np.empty((len(apart[part]), len(grid), 3))
-        left[:, :, :2] = apart[part, None, :2] - grid
-        left[:, :, 2] = apart[part, None, 2]
-        square = np.einsum("kgi,kij,kgj->kg", left, weight[part], left, optimize=True)
-        np.add.at(evidence, mark[part], height[part, None] * np.exp(-0.5 * square))
-    gain = np.log(1.0 - _SHARED + evidence)
-    prior = -np.sum(grid**2, axis=1) / (2.0 * _PRIOR_M**2)
+    gain = _gain(len(rows), mark, place[target] - point[rows[mark]], total, grid_m)
+    prior = -np.sum(grid_m**2, axis=1) / (2.0 * _PRIOR_M**2)
     prior -= math.log(float(np.exp(prior).sum()))
     value = prior + gain[0]
-    came_from = np.empty((len(rows), side * side), np.int64)
-    here = np.arange(side * side)
+    came_from = np.empty((len(rows), len(grid_m)), np.int64)
     for i in range(1, len(rows)):
-        best, source = value, here
-        cells, index = value.reshape(side, side), here.reshape(side, side)
-        for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
-            moved = np.full((side, side), -np.inf)
-            of = np.zeros((side, side), np.int64)
-            to: list[slice] = [slice(None), slice(None)]
-            fro: list[slice] = [slice(None), slice(None)]
-            to[axis] = slice(1, None) if step > 0 else slice(None, -1)
-            fro[axis] = slice(None, -1) if step > 0 else slice(1, None)
-            moved[tuple(to)] = cells[tuple(fro)] - _CREEP
-            of[tuple(to)] = index[tuple(fro)]
-            better = moved.ravel() > best
-            best, source = np.where(better, moved.ravel(), best), np.where(better, of.ravel(), source)
+        best, source = _stayed_or_crept(value)
         top = int(np.argmax(value))
         jumped = value[top] - price[i - 1] + prior
         better = jumped > best
-        best, source = np.where(better, jumped, best), np.where(better, top, source)
-        came_from[i] = source
+        best, came_from[i] = np.where(better, jumped, best), np.where(better, top, source)
         value = best + gain[i]
     state = np.empty(len(rows), np.int64)
     state[-1] = int(np.argmax(value))
     for i in range(len(rows) - 1, 0, -1):
         state[i - 1] = came_from[i, state[i]]
-    return np.column_stack([grid[state], np.zeros(len(rows))])
+    return np.column_stack([grid_m[state], np.zeros(len(rows))])
+
+
+def _gain(landmarks: int, mark: Ints, apart_m: Floats, total_m2: Floats, grid_m: Floats) -> Floats:
+    """Return the logarithm of L(g) of each landmark at each shift of the grid (landmarks, cells).
+
+    Pairs (K) of a landmark and an object are so far apart (K, 3), with covariances (K, 3, 3) of both.
+    """
+    evidence = np.zeros((landmarks, len(grid_m)))
+    weight = np.linalg.inv(total_m2)
+    around = np.bincount(mark, minlength=landmarks)
+    volume_m3 = math.pi * _AROUND_M**2 * _HIGH_M
+    height = _SHARED * volume_m3 / around[mark] / np.sqrt(np.linalg.det(2.0 * np.pi * total_m2))
+    block = max(1, _AT_ONCE // len(grid_m))
+    for start in range(0, len(mark), block):
+        part = slice(start, start + block)
+        left = np.empty((len(apart_m[part]), len(grid_m), 3))
+        left[:, :, :2] = apart_m[part, None, :2] - grid_m
+        left[:, :, 2] = apart_m[part, None, 2]
+        square = np.einsum("kgi,kij,kgj->kg", left, weight[part], left, optimize=True)
+        np.add.at(evidence, mark[part], height[part, None] * np.exp(-0.5 * square))
+    return np.asarray(np.log(1.0 - _SHARED + evidence))
+
+
+_ALL, _NEXT, _LAST = slice(None), slice(1, None), slice(None, -1)
+_BESIDE = (
+    ((_NEXT, _ALL), (_LAST, _ALL)),
+    ((_LAST, _ALL), (_NEXT, _ALL)),
+    ((_ALL, _NEXT), (_ALL, _LAST)),
+    ((_ALL, _LAST), (_ALL, _NEXT)),
+)
+"""Cells that have one beside them on each of four sides, and those beside them."""
+
+
+def _stayed_or_crept(value: Floats) -> tuple[Floats, Ints]:
+    """Return the best value of each cell if the chain stayed in it or crept to it, and the cell that it came from."""
+    here = np.arange(len(value))
+    best, source = value, here
+    cells, index = value.reshape(_SIDE, _SIDE), here.reshape(_SIDE, _SIDE)
+    for to, beside in _BESIDE:
+        crept, of = np.full_like(cells, -np.inf), np.zeros_like(index)
+        crept[to], of[to] = cells[beside] - _CREEP, index[beside]
+        better = crept.ravel() > best
+        best, source = np.where(better, crept.ravel(), best), np.where(better, of.ravel(), source)
+    return best, source
 
 
 def _match(

@@ -13,7 +13,7 @@ v and turns by w.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -116,6 +116,10 @@ class State:
     covariance: Floats | None = None
     """Of the constants that are free (C, C), in the order of `Adjustment.column_of`, all else marginalised; or those of
     groups (G, M) of objects (G, 3 M, 3 M), if they were asked for."""
+
+    def with_offset(self, offset_m: Floats) -> State:
+        """Return the state with other offsets of segments (L, 3)."""
+        return replace(self, constants=(offset_m, *self.constants[OFFSET + 1 :]))
 
     @staticmethod
     def zero(points: Floats, nodes: int, images: int, counts: tuple[int, ...]) -> State:

@@ -390,7 +390,7 @@ class _Trial:
         shift = self._agreed_shift(state.constants[OFFSET], active)
         offset = np.where(active.any(axis=0), state.constants[OFFSET] - shift, state.constants[OFFSET])
         points = state.point_in_world_m - shift
-        return replace(state, constants=(offset, *state.constants[1:]), point_in_world_m=points)
+        return replace(state.with_offset(offset), point_in_world_m=points)
 
 
 @dataclass(frozen=True, eq=False)
